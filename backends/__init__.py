@@ -1,0 +1,1 @@
+"""Frozen visual foundation models behind one interface."""

@@ -1,0 +1,1 @@
+"""Geometry in OpenCV conventions (see docs/conventions.md)."""

@@ -1,0 +1,119 @@
+"""Pinhole geometry: pixels, rays, points, rigid transforms, intrinsics under resize and crop."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from vg2gt.types import Cameras
+
+
+def pixel_grid(height: int, width: int, like: Tensor) -> Tensor:
+    """Returns integer pixel centres ``[H, W, 2]`` as (x, y), in the dtype and on the device of ``like``."""
+    y, x = torch.meshgrid(
+        torch.arange(height, dtype=like.dtype, device=like.device),
+        torch.arange(width, dtype=like.dtype, device=like.device),
+        indexing="ij",
+    )
+    return torch.stack((x, y), -1)
+
+
+def ray_directions(intrinsics: Tensor, size: tuple[int, int]) -> Tensor:
+    """Returns camera-frame ray directions with unit z.
+
+    Args:
+        intrinsics: ``[..., 3, 3]`` in pixels, integer pixel centres.
+        size: image ``(height, width)``.
+
+    Returns:
+        ``[..., H, W, 3]``; multiplied by z-depth they are camera-frame points.
+    """
+    pixels = pixel_grid(*size, like=intrinsics)
+    focal = intrinsics[..., [0, 1], [0, 1]][..., None, None, :]
+    center = intrinsics[..., [0, 1], [2, 2]][..., None, None, :]
+    xy = (pixels - center) / focal
+    return torch.cat((xy, torch.ones_like(xy[..., :1])), -1)
+
+
+def invert_rigid(transform: Tensor) -> Tensor:
+    """Inverts rigid 4x4 transforms ``[..., 4, 4]`` by transposing the rotation."""
+    rotation = transform[..., :3, :3].transpose(-1, -2)
+    translation = -rotation @ transform[..., :3, 3:]
+    return torch.cat((torch.cat((rotation, translation), -1), transform[..., 3:, :]), -2)
+
+
+def transform_points(transform: Tensor, points: Tensor) -> Tensor:
+    """Applies rigid transforms ``[B, V, 4, 4]`` to points ``[B, V, ..., 3]``."""
+    extra = points.dim() - transform.dim() + 1
+    shape = transform.shape[:-2] + (1,) * (extra - 1)
+    rotation = transform[..., :3, :3].reshape(*shape, 3, 3)
+    translation = transform[..., :3, 3].reshape(*shape, 3)
+    return (rotation @ points[..., None])[..., 0] + translation
+
+
+def unproject(depth: Tensor, cameras: Cameras) -> Tensor:
+    """Lifts z-depth to world points.
+
+    Args:
+        depth: ``[B, V, H, W]``; pixels with depth 0 land on the camera centre, so mask them.
+        cameras: cameras of the same views; their size is the depth's.
+
+    Returns:
+        ``[B, V, H, W, 3]`` in the cameras' world frame.
+    """
+    rays = ray_directions(cameras.intrinsics, (depth.shape[-2], depth.shape[-1]))
+    return transform_points(invert_rigid(cameras.world_to_camera), rays * depth[..., None])
+
+
+def project(points: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
+    """Projects world points into every view.
+
+    Args:
+        points: ``[B, V, ..., 3]`` world points, one set a view.
+        cameras: the views.
+
+    Returns:
+        Pixels ``[B, V, ..., 2]`` as (x, y) and z-depth ``[B, V, ...]``.
+    """
+    local = transform_points(cameras.world_to_camera, points)
+    depth = local[..., 2]
+    shape = cameras.intrinsics.shape[:2] + (1,) * (points.dim() - 3)
+    focal = cameras.intrinsics[..., [0, 1], [0, 1]].reshape(*shape, 2)
+    center = cameras.intrinsics[..., [0, 1], [2, 2]].reshape(*shape, 2)
+    return local[..., :2] / depth[..., None] * focal + center, depth
+
+
+def relative_to_first(cameras: Cameras) -> Cameras:
+    """Moves the world frame into view 0 of every scene, whose pose becomes exactly the identity."""
+    first = invert_rigid(cameras.world_to_camera[:, :1])
+    poses = cameras.world_to_camera @ first
+    identity = torch.eye(4, dtype=poses.dtype, device=poses.device).expand_as(poses[:, :1])
+    return Cameras(torch.cat((identity, poses[:, 1:]), 1), cameras.intrinsics, cameras.size)
+
+
+def scale_translations(cameras: Cameras, scale: Tensor) -> Cameras:
+    """Multiplies the cameras' translations by one factor ``[B]`` a scene."""
+    poses = cameras.world_to_camera
+    translation = poses[..., :3, 3:] * scale[:, None, None, None]
+    top = torch.cat((poses[..., :3, :3], translation), -1)
+    return Cameras(torch.cat((top, poses[..., 3:, :]), -2), cameras.intrinsics, cameras.size)
+
+
+def resize_intrinsics(intrinsics: Tensor, scale_x: float, scale_y: float) -> Tensor:
+    """Intrinsics ``[..., 3, 3]`` of an image resized by the given factors (integer pixel centres).
+
+    A point at c moves to ``s * (c + 1/2) - 1/2``, because resizing maps pixel areas, not pixel centres.
+    """
+    out = intrinsics.clone()
+    for axis, scale in enumerate((scale_x, scale_y)):
+        out[..., axis, axis] = intrinsics[..., axis, axis] * scale
+        out[..., axis, 2] = (intrinsics[..., axis, 2] + 0.5) * scale - 0.5
+    return out
+
+
+def crop_intrinsics(intrinsics: Tensor, left: int, top: int) -> Tensor:
+    """Intrinsics ``[..., 3, 3]`` of an image cropped so that pixel (left, top) becomes (0, 0)."""
+    out = intrinsics.clone()
+    out[..., 0, 2] -= left
+    out[..., 1, 2] -= top
+    return out

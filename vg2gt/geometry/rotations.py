@@ -1,0 +1,38 @@
+"""Quaternions (wxyz) and rotation matrices."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+
+def quat_to_matrix(quats: Tensor) -> Tensor:
+    """Rotation matrices ``[..., 3, 3]`` of quaternions ``[..., 4]`` (wxyz), which are normalised first."""
+    w, x, y, z = F.normalize(quats, dim=-1).unbind(-1)
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return torch.stack([torch.stack(row, -1) for row in rows], -2)
+
+
+def matrix_to_quat(matrix: Tensor) -> Tensor:
+    """Unit quaternions ``[..., 4]`` (wxyz, w >= 0) of rotation matrices ``[..., 3, 3]``.
+
+    Each of the four components is the largest somewhere; the row built on the largest one is numerically safe.
+    """
+    m = matrix
+    diagonal = torch.stack((m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]), -1)
+    trace = diagonal.sum(-1, keepdim=True)
+    squares = torch.cat((1 + trace, 1 + 2 * diagonal - trace), -1)  # four times each squared component
+    wx, wy, wz = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
+    xy, xz, yz = m[..., 1, 0] + m[..., 0, 1], m[..., 2, 0] + m[..., 0, 2], m[..., 2, 1] + m[..., 1, 2]
+    w2, x2, y2, z2 = squares.unbind(-1)
+    outer = torch.stack(
+        [torch.stack(row, -1) for row in ((w2, wx, wy, wz), (wx, x2, xy, xz), (wy, xy, y2, yz), (wz, xz, yz, z2))], -2
+    )
+    best = squares.argmax(-1)[..., None, None].expand(*outer.shape[:-2], 1, 4)
+    quats = F.normalize(torch.gather(outer, -2, best)[..., 0, :], dim=-1)
+    return torch.where(quats[..., :1] < 0, -quats, quats)

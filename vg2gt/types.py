@@ -1,0 +1,281 @@
+"""The frozen records that pass between the parts of VG²GT.
+
+Conventions (``docs/conventions.md``): OpenCV cameras (x right, y down, z forward), ``world_to_camera`` 4x4,
+intrinsics in pixels with integer pixel centres (the centre of pixel (0, 0) is at (0, 0)), z-depth with 0 where invalid.
+Letters in shapes: B scenes, V views, H x W pixels, P patches, M voxels, G Gaussians, K splits.
+Sparse records (voxels, Gaussians) are packed over scenes: one row per element and a sorted ``batch`` index.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+Record = TypeVar("Record", bound="TensorRecord")
+
+
+@dataclass(frozen=True)
+class TensorRecord:
+    """Base of all records: maps a function over every tensor, nested records, tuples and mappings included."""
+
+    def map(self: Record, function: Callable[[Tensor], Tensor]) -> Record:
+        """Returns a copy whose tensors are ``function(tensor)``; everything else is kept."""
+        return replace(self, **{f.name: _map_value(getattr(self, f.name), function) for f in fields(self)})
+
+    def to(self: Record, device: torch.device | str) -> Record:
+        """Returns a copy on ``device``."""
+        return self.map(lambda tensor: tensor.to(device))
+
+    def detach(self: Record) -> Record:
+        """Returns a copy cut from the autograd graph."""
+        return self.map(Tensor.detach)
+
+
+def _map_value(value: Any, function: Callable[[Tensor], Tensor]) -> Any:
+    if isinstance(value, Tensor):
+        return function(value)
+    if isinstance(value, TensorRecord):
+        return value.map(function)
+    if isinstance(value, tuple):
+        return tuple(_map_value(item, function) for item in value)
+    if isinstance(value, Mapping):
+        return {key: _map_value(item, function) for key, item in value.items()}
+    return value
+
+
+@dataclass(frozen=True)
+class Cameras(TensorRecord):
+    """Pinhole cameras of B scenes with V views each.
+
+    Attributes:
+        world_to_camera: ``[B, V, 4, 4]`` rigid OpenCV transforms; translation in scene units.
+        intrinsics: ``[B, V, 3, 3]`` in pixels, integer pixel centres.
+        size: image ``(height, width)`` in pixels.
+    """
+
+    world_to_camera: Tensor
+    intrinsics: Tensor
+    size: tuple[int, int]
+
+    def select(self, views: Tensor | slice) -> Cameras:
+        """Returns the cameras of some views, ``views`` indexing the V axis."""
+        return Cameras(self.world_to_camera[:, views], self.intrinsics[:, views], self.size)
+
+    def scene(self, index: int) -> Cameras:
+        """Returns the cameras of one scene, keeping the B axis (B = 1)."""
+        return Cameras(self.world_to_camera[index : index + 1], self.intrinsics[index : index + 1], self.size)
+
+
+@dataclass(frozen=True)
+class Hints(TensorRecord):
+    """What the data knows and a backend may use (the oracle needs it, DA3 may take the cameras).
+
+    Attributes:
+        depth: ``[B, V, H, W]`` z-depth in the data's unit, 0 = invalid; None if unknown.
+        cameras: cameras in any world frame; None if unknown.
+        scene_key: one name a scene; seeds simulated noise.
+        frame_ids: ``[B, V]`` int64 frame numbers; seed simulated noise.
+    """
+
+    depth: Tensor | None = None
+    cameras: Cameras | None = None
+    scene_key: tuple[str, ...] = ()
+    frame_ids: Tensor | None = None
+
+
+@dataclass(frozen=True)
+class Batch(TensorRecord):
+    """B scenes with V views each; the first ``num_context`` views are the input, the rest are held-out targets.
+
+    Attributes:
+        images: ``[B, V, 3, H, W]`` in [0, 1].
+        depth: ``[B, V, H, W]`` z-depth in the data's unit, 0 = invalid.
+        cameras: ground-truth cameras, world frame of the data.
+        is_metric: ``[B]`` bool, True where the data's unit is the metre.
+        frame_ids: ``[B, V]`` int64.
+        scene: one name a scene.
+        num_context: number of input views, 1 <= num_context <= V.
+    """
+
+    images: Tensor
+    depth: Tensor
+    cameras: Cameras
+    is_metric: Tensor
+    frame_ids: Tensor
+    scene: tuple[str, ...]
+    num_context: int
+
+    def views(self, views: slice) -> Batch:
+        """Returns the batch restricted to a slice of its views, all of them counted as context."""
+        images = self.images[:, views]
+        return Batch(
+            images,
+            self.depth[:, views],
+            self.cameras.select(views),
+            self.is_metric,
+            self.frame_ids[:, views],
+            self.scene,
+            images.shape[1],
+        )
+
+    @property
+    def context(self) -> Batch:
+        """The input views."""
+        return self.views(slice(0, self.num_context))
+
+    @property
+    def target(self) -> Batch:
+        """The held-out views (possibly none)."""
+        return self.views(slice(self.num_context, None))
+
+    @property
+    def hints(self) -> Hints:
+        """What a backend may be told about all views of this batch."""
+        return Hints(self.depth, self.cameras, self.scene, self.frame_ids)
+
+
+@dataclass(frozen=True)
+class Tokens(TensorRecord):
+    """The frozen backbone's output, exactly as its heads take it.
+
+    Attributes:
+        patch: one ``[B, V, P, D]`` tensor a tapped layer, in tap order; P = grid[0] * grid[1], row major.
+        camera: ``[B, V, Dc]`` camera token of the last tap.
+        grid: patches ``(rows, columns)``.
+        size: image ``(height, width)`` in pixels.
+        state: whatever else the backend's own ``decode`` needs; opaque to everyone else.
+    """
+
+    patch: tuple[Tensor, ...]
+    camera: Tensor
+    grid: tuple[int, int]
+    size: tuple[int, int]
+    state: Mapping[str, Any] = field(default_factory=dict)
+
+    def with_patch(self, patch: tuple[Tensor, ...]) -> Tokens:
+        """Returns the same tokens with other patch tokens; the camera token is never changed."""
+        return replace(self, patch=patch)
+
+
+@dataclass(frozen=True)
+class Geometry(TensorRecord):
+    """Decoded geometry of V views.
+
+    Attributes:
+        depth: ``[B, V, H, W]`` z-depth, 0 = invalid, in the unit of the cameras' translations.
+        depth_conf: ``[B, V, H, W]`` confidence > 0 (larger is better).
+        cameras: predicted cameras.
+        scale: ``[B]`` factor that turns the unit into metres where the backend knows it, else 1.
+    """
+
+    depth: Tensor
+    depth_conf: Tensor
+    cameras: Cameras
+    scale: Tensor
+
+
+@dataclass(frozen=True)
+class Voxels(TensorRecord):
+    """Occupied voxels of B scenes, packed and sorted by scene.
+
+    Attributes:
+        features: ``[M, C]``.
+        colors: ``[M, 3]`` confidence-weighted mean image colour in [0, 1].
+        grid: ``[M, 3]`` int64 world-anchored cell index, ``floor(x / voxel_size)``.
+        batch: ``[M]`` int64 scene index, sorted.
+        confidence: ``[M]`` smallest point confidence inside (paper, eqn voxelfeature).
+        count: ``[M]`` points inside, as a float.
+        centroid: ``[M, 3]`` confidence-weighted mean position.
+        voxel_size: ``[B]`` edge length in scene units.
+    """
+
+    features: Tensor
+    colors: Tensor
+    grid: Tensor
+    batch: Tensor
+    confidence: Tensor
+    count: Tensor
+    centroid: Tensor
+    voxel_size: Tensor
+
+    @property
+    def centers(self) -> Tensor:
+        """``[M, 3]`` cell centres in scene units."""
+        return (self.grid.to(self.centroid.dtype) + 0.5) * self.voxel_size[self.batch, None]
+
+
+@dataclass(frozen=True)
+class Gaussians(TensorRecord):
+    """Gaussian primitives of B scenes, packed and sorted by scene.
+
+    Attributes:
+        means: ``[G, 3]`` world position in scene units.
+        quats: ``[G, 4]`` rotation, wxyz (renderers normalise).
+        scales: ``[G, 3]`` standard deviations > 0 in scene units.
+        opacities: ``[G]`` in (0, 1).
+        sh: ``[G, (L + 1)^2, 3]`` real spherical-harmonic colour coefficients, world frame; colour = 1/2 + sum.
+        batch: ``[G]`` int64 scene index, sorted.
+    """
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    sh: Tensor
+    batch: Tensor
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    def scene(self, index: int) -> Gaussians:
+        """Returns one scene's Gaussians, its ``batch`` set to 0."""
+        bounds = torch.searchsorted(self.batch, torch.tensor([index, index + 1], device=self.batch.device))
+        rows = slice(int(bounds[0]), int(bounds[1]))
+        return Gaussians(
+            self.means[rows],
+            self.quats[rows],
+            self.scales[rows],
+            self.opacities[rows],
+            self.sh[rows],
+            torch.zeros_like(self.batch[rows]),
+        )
+
+
+@dataclass(frozen=True)
+class Render(TensorRecord):
+    """Rendered views.
+
+    Attributes:
+        color: ``[B, V, 3, H, W]``, background blended in.
+        depth: ``[B, V, H, W]`` z-depth, 0 where the ray has none (a hole).
+        normal: ``[B, V, 3, H, W]`` blended camera-frame normals (not unit length), facing the camera.
+        alpha: ``[B, V, H, W]`` accumulated opacity in [0, 1].
+    """
+
+    color: Tensor
+    depth: Tensor
+    normal: Tensor
+    alpha: Tensor
+
+
+@dataclass(frozen=True)
+class Prediction(TensorRecord):
+    """Everything one forward pass of VG²GT yields, in the scene unit and the frame of context view 0.
+
+    Attributes:
+        initial: the frozen backbone's geometry, before enhancement.
+        geometry: geometry decoded again from the enhanced tokens.
+        voxels: refined fine voxels.
+        gaussians: the Gaussian scene.
+        unit: ``[B]`` scene units per unit of the backend's raw output (1 where nothing was rescaled).
+    """
+
+    initial: Geometry
+    geometry: Geometry
+    voxels: Voxels
+    gaussians: Gaussians
+    unit: Tensor
