@@ -122,6 +122,19 @@ class Batch(TensorRecord):
             images.shape[1],
         )
 
+    def single(self, index: int) -> Batch:
+        """Returns one scene of the batch (B = 1)."""
+        rows = slice(index, index + 1)
+        return Batch(
+            self.images[rows],
+            self.depth[rows],
+            self.cameras.scene(index),
+            self.is_metric[rows],
+            self.frame_ids[rows],
+            self.scene[rows],
+            self.num_context,
+        )
+
     @property
     def context(self) -> Batch:
         """The input views."""

@@ -1,1 +1,5 @@
-"""To be filled."""
+"""Lightning callbacks of the project."""
+
+from vg2gt.callbacks.stop_on_signal import StopOnSignal
+
+__all__ = ["StopOnSignal"]

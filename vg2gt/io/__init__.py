@@ -1,1 +1,1 @@
-"""To be filled."""
+"""Readers and writers, one file a format."""

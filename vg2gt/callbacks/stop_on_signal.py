@@ -1,0 +1,46 @@
+"""Saves and ends the run when the machine asks it to stop."""
+
+from __future__ import annotations
+
+import logging
+import signal
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import lightning
+
+log = logging.getLogger(__name__)
+
+
+class StopOnSignal(lightning.Callback):
+    """On SIGTERM: finishes the step, writes a checkpoint and ends the training normally (``ckpt=last`` goes on).
+
+    Args:
+        folder: where checkpoints are written, the same as the checkpoint callback's.
+    """
+
+    def __init__(self, folder: str) -> None:
+        self.folder = Path(folder)
+        self.received = False
+        self._previous: Any = None
+
+    def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        """Takes over SIGTERM for the time of the training."""
+        self._previous = signal.signal(signal.SIGTERM, self._note)
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        self.received = True
+
+    def on_train_batch_end(self, trainer: lightning.Trainer, *args: Any) -> None:
+        """Saves and stops at the end of the step in which the signal came (on any rank)."""
+        if trainer.strategy.reduce_boolean_decision(self.received, all=False):
+            path = self.folder / f"step={trainer.global_step}.ckpt"
+            trainer.save_checkpoint(path)
+            trainer.should_stop = True
+            log.warning("stopping as asked by SIGTERM: saved %s, go on with ckpt=last", path)
+
+    def on_train_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        """Gives SIGTERM back."""
+        if self._previous is not None:
+            signal.signal(signal.SIGTERM, self._previous)

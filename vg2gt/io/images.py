@@ -1,0 +1,53 @@
+"""Pictures: PNG files, colours for depth and normals, grids of panels."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from vg2gt.io.files import write_bytes
+
+# Anchors of a perceptually ordered map, near (bright) to far (dark); interpolated linearly.
+_DEPTH_ANCHORS = torch.tensor(
+    [[0.99, 0.91, 0.55], [0.97, 0.60, 0.32], [0.83, 0.28, 0.40], [0.50, 0.15, 0.50], [0.20, 0.07, 0.38], [0.02, 0.02, 0.10]]
+)
+
+
+def colorize_depth(depth: Tensor, near: float, far: float) -> Tensor:
+    """Colours z-depth ``[H, W]`` between ``near`` (bright) and ``far`` (dark); holes (0) are grey. ``[3, H, W]``."""
+    position = ((depth - near) / max(far - near, 1e-9)).clamp(0, 1) * (len(_DEPTH_ANCHORS) - 1)
+    index = position.long().clamp(max=len(_DEPTH_ANCHORS) - 2)
+    anchors = _DEPTH_ANCHORS.to(depth.device)
+    colors = torch.lerp(anchors[index], anchors[index + 1], (position - index)[..., None])
+    colors[depth <= 0] = 0.5
+    return colors.permute(2, 0, 1)
+
+
+def colorize_normals(normals: Tensor) -> Tensor:
+    """Colours camera-frame normals ``[3, H, W]`` (x right, y down, z forward) the usual way; zero normals are grey."""
+    unit = torch.nn.functional.normalize(normals, dim=0)
+    flipped = unit * unit.new_tensor([1.0, -1.0, -1.0])[:, None, None]
+    return (flipped + 1) / 2
+
+
+def grid(rows: Sequence[Sequence[Tensor]], gap: int = 4) -> Tensor:
+    """Arranges equally large panels ``[3, H, W]`` in rows, with white gaps; ``[3, H', W']``."""
+    lines = []
+    for row in rows:
+        padded = [torch.nn.functional.pad(panel, (0, gap, 0, gap), value=1.0) for panel in row]
+        lines.append(torch.cat(padded, -1))
+    return torch.cat(lines, -2)[..., :-gap, :-gap]
+
+
+def write_png(path: str | Path, image: Tensor) -> Path:
+    """Writes an image ``[3, H, W]`` in [0, 1] as an 8-bit PNG, atomically; returns the path."""
+    pixels = (image.detach().cpu().clamp(0, 1).permute(1, 2, 0).numpy() * 255 + 0.5).astype(np.uint8)
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, format="PNG")
+    return write_bytes(path, buffer.getvalue())

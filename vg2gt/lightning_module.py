@@ -1,0 +1,185 @@
+"""The training loop's view of VG²GT: steps, optimiser, logging, checkpoints of the trained part. No maths."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import lightning
+import torch
+from torch import Tensor, nn
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LambdaLR
+from torch.profiler import record_function
+
+from vg2gt.evaluation import evaluate_scene
+from vg2gt.losses import LossReport
+from vg2gt.model import VG2GT
+from vg2gt.protocols import training_cameras
+from vg2gt.rendering import Renderer
+from vg2gt.schedule import cosine_with_warmup, weight_decay_groups
+from vg2gt.types import Batch
+
+log = logging.getLogger(__name__)
+
+BACKBONE_PREFIX = "model.backend."
+
+
+class VG2GTModule(lightning.LightningModule):
+    """Trains everything but the backbone (paper, Training).
+
+    Args:
+        model: the reconstruction model.
+        loss: the training objective.
+        renderer: renders the training and evaluation views.
+        optimizer: makes the optimiser from parameter groups (Hydra partial); its ``lr`` is the initial rate.
+        final_lr: learning rate at the end of the cosine schedule.
+        warmup_steps: steps of linear warm-up.
+        render_views: most views rendered in a training step, held-out views first; None renders all.
+        max_skipped: stop after this many steps in a row whose loss or gradient was not finite.
+        seed: seeds every random draw of a step, together with the step's number and the rank, so that a resumed run
+            draws what the uninterrupted one would have drawn.
+    """
+
+    def __init__(
+        self,
+        model: VG2GT,
+        loss: nn.Module,
+        renderer: Renderer,
+        optimizer: Callable[..., Optimizer],
+        final_lr: float = 1e-8,
+        warmup_steps: int = 0,
+        render_views: int | None = None,
+        max_skipped: int = 20,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        self.model = model
+        self.loss = loss
+        self.renderer = renderer
+        self.make_optimizer = optimizer
+        self.final_lr = final_lr
+        self.warmup_steps = warmup_steps
+        self.render_views = render_views
+        self.max_skipped = max_skipped
+        self.seed = seed
+        self.generator = torch.Generator()
+        self.skipped_in_a_row = 0
+        self.skipped_total = 0
+        self._loss_is_finite = True
+        self._scenes: tuple[str, ...] = ()
+        self.strict_loading = False  # backbone weights are never stored; load_state_dict checks everything else
+
+    # ------------------------------------------------------------------------------------------------- training
+
+    def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
+        """Seeds this step's randomness from (seed, step, rank)."""
+        step_seed = (self.seed * 1_000_003 + self.global_step) * 1009 + self.global_rank
+        torch.manual_seed(step_seed)
+        self.generator.manual_seed(step_seed)
+
+    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        """Reconstructs the context views, renders some views and returns the training loss."""
+        prediction = self.model(batch.context.images, batch.context.hints, self.generator)
+        views = self._draw_views(batch)
+        cameras = training_cameras(self.model, batch, prediction).select(views.to(self.device))
+        with record_function("vg2gt/render"):
+            rendered = self.renderer(prediction.gaussians, cameras)
+        with record_function("vg2gt/loss"):
+            report: LossReport = self.loss(prediction, batch, rendered, views, cameras)
+        self._loss_is_finite = bool(torch.isfinite(report.total.detach()))
+        self._scenes = batch.scene
+        self._log_step(report, batch, prediction.gaussians.means.shape[0], prediction.voxels.grid.shape[0])
+        return report.total
+
+    def _draw_views(self, batch: Batch) -> Tensor:
+        """Indices of the views to render: all held-out views, then a random choice of context views, up to the cap."""
+        total = batch.images.shape[1]
+        held_out = torch.arange(batch.num_context, total)
+        context = torch.randperm(batch.num_context, generator=self.generator)
+        return torch.cat((held_out, context))[: self.render_views]
+
+    def _log_step(self, report: LossReport, batch: Batch, gaussians: int, voxels: int) -> None:
+        scenes = len(batch.scene)
+        pixels = batch.context.depth.numel()
+        self.log("loss", report.total.detach(), prog_bar=True, batch_size=scenes)
+        for name, value in report.terms.items():
+            short = name in ("color_l1", "depth_gt", "depth_reg", "normal")
+            self.log(f"train/{name}", value, prog_bar=short, batch_size=scenes)
+        self.log("train/gaussians_per_view", gaussians / (scenes * batch.num_context), batch_size=scenes)
+        self.log("train/voxels_per_pixel", voxels / pixels, batch_size=scenes)
+        self.log("train/scenes_without_depth", float(report.skipped), batch_size=scenes)
+
+    def configure_gradient_clipping(
+        self,
+        optimizer: Optimizer,
+        gradient_clip_val: int | float | None = None,
+        gradient_clip_algorithm: str | None = None,
+    ) -> None:
+        """Clips the global gradient norm; drops the step on all ranks if a loss or gradient is not finite on any."""
+        limit = float("inf") if gradient_clip_val is None else float(gradient_clip_val)
+        norm = nn.utils.clip_grad_norm_(self.model.trained_parameters(), limit)
+        self.log("train/grad_norm", norm.detach())
+        bad = torch.tensor(float(not (self._loss_is_finite and bool(torch.isfinite(norm)))), device=self.device)
+        bad = self.trainer.strategy.reduce(bad, reduce_op="sum")
+        if float(bad) == 0:
+            self.skipped_in_a_row = 0
+            return
+        # Without gradients the optimiser leaves parameters and moments as they are: no decay, no NaN.
+        optimizer.zero_grad(set_to_none=True)
+        self.skipped_in_a_row += 1
+        self.skipped_total += 1
+        log.warning("step %d skipped: loss or gradient is not finite (%s)", self.global_step, ", ".join(self._scenes))
+        if self.skipped_in_a_row >= self.max_skipped:
+            raise FloatingPointError(
+                f"{self.skipped_in_a_row} steps in a row had a non-finite loss or gradient, the last with scenes "
+                f"{', '.join(self._scenes)}; lower optimizer.lr or look at these scenes"
+            )
+
+    def configure_optimizers(self) -> dict[str, Any]:
+        """Optimiser over the trained parameters and a per-step cosine schedule over the whole run."""
+        optimizer = self.make_optimizer(weight_decay_groups(self.model))
+        initial_lr = optimizer.param_groups[0]["lr"]
+        steps = int(self.trainer.estimated_stepping_batches)
+        factor = cosine_with_warmup(steps, self.warmup_steps, self.final_lr / initial_lr)
+        scheduler = LambdaLR(optimizer, factor)
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
+
+    # ----------------------------------------------------------------------------------------------- evaluation
+
+    def validation_step(self, batch: Batch, batch_idx: int) -> None:
+        """Evaluates one held-out scene batch; every number is logged as ``eval/<name>``."""
+        for index in range(len(batch.scene)):
+            metrics = evaluate_scene(self.model, self.renderer, batch.single(index))
+            for name, value in metrics.items():
+                self.log(f"eval/{name}", value, on_epoch=True, batch_size=1, sync_dist=True)
+
+    # ---------------------------------------------------------------------------------------------- checkpoints
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Keeps the trained part only, and the identity of the backbone it belongs to."""
+        state = checkpoint["state_dict"]
+        checkpoint["state_dict"] = {k: v for k, v in state.items() if not k.startswith(BACKBONE_PREFIX)}
+        checkpoint["backend"] = dict(self.model.backend.identity())
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Refuses a checkpoint that was trained on another backbone."""
+        stored, present = checkpoint.get("backend"), dict(self.model.backend.identity())
+        if stored != present:
+            raise ValueError(
+                f"the checkpoint was trained on backbone {stored}, this run uses {present}: choose the same backend= "
+                "and the same weights, or start a new run from it with init_from="
+            )
+
+    def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False):
+        """Loads the trained part; only backbone weights may be missing."""
+        result = super().load_state_dict(state_dict, strict=False, assign=assign)
+        missing = [key for key in result.missing_keys if not key.startswith(BACKBONE_PREFIX)]
+        if missing or result.unexpected_keys:
+            raise RuntimeError(
+                f"the checkpoint does not fit this model: missing {missing[:3]}, not expected "
+                f"{result.unexpected_keys[:3]}; use the model options it was trained with, or init_from= to start "
+                "from the weights that fit"
+            )
+        return result

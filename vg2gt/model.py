@@ -1,0 +1,144 @@
+"""The whole method in one forward pass (paper, Method; data flow in docs/architecture.md).
+
+    images -> frozen backbone -> tokens -> frozen heads -> depth, confidence, cameras
+                                   |                            |
+                                   +<---- coarse voxels <-------+
+                                   |
+                         enhanced tokens -> the same frozen heads -> geometry
+                                   |                                    |
+                                   +------------> fine voxels <---------+
+                                                      |
+                                          self-splitting Gaussian head -> Gaussians
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Literal, get_args
+
+import torch
+from torch import Tensor, nn
+from torch.profiler import record_function
+
+from backends.base import Backend
+from vg2gt.geometry.alignment import weighted_median_scale
+from vg2gt.geometry.cameras import relative_to_first, scale_translations
+from vg2gt.types import Geometry, Gaussians, Hints, Prediction, Voxels
+
+ScaleSource = Literal["metric", "focal", "normalize", "groundtruth"]
+CANONICAL_FOCAL = 300.0  # appendix A.1: d_metric = f * d_net / 300
+
+
+class SceneScale:
+    """Fixes the unit of a scene before anything is voxelised (paper, appendix A.1): one factor a scene.
+
+    Args:
+        source: ``metric`` (the backend knows metres), ``focal`` (mean focal length / 300, as the paper does with DA3),
+            ``normalize`` (the median depth of the scene becomes ``median_depth``) or ``groundtruth`` (training only:
+            the weighted-median alignment to the depth in the hints).
+        median_depth: the median depth after ``normalize``, in scene units.
+
+    Raises:
+        ValueError: if the source is unknown.
+    """
+
+    def __init__(self, source: ScaleSource = "normalize", median_depth: float = 1.0) -> None:
+        if source not in get_args(ScaleSource):
+            raise ValueError(f"model.scale.source is {source!r}; choose one of {', '.join(get_args(ScaleSource))}")
+        self.source = source
+        self.median_depth = median_depth
+
+    def __call__(self, geometry: Geometry, hints: Hints | None) -> Tensor:
+        """Returns scene units per unit of ``geometry``, ``[B]``, detached."""
+        if self.source == "metric":
+            return geometry.scale.detach()
+        if self.source == "focal":
+            focal = geometry.cameras.intrinsics[..., [0, 1], [0, 1]]
+            return focal.mean((1, 2)).detach() / CANONICAL_FOCAL
+        if self.source == "groundtruth":
+            if hints is None or hints.depth is None:
+                raise ValueError("model.scale.source=groundtruth needs the data's depth; use normalize without it")
+            return weighted_median_scale(geometry.depth.detach(), hints.depth)
+        return torch.stack([self._normalize(depth) for depth in geometry.depth.detach()])
+
+    def _normalize(self, depth: Tensor) -> Tensor:
+        valid = depth[depth > 0]
+        return self.median_depth / valid.median() if valid.numel() else depth.new_ones(())
+
+
+class VG2GT(nn.Module):
+    """Feed-forward Gaussian reconstruction on a frozen backbone.
+
+    Args:
+        backend: the frozen visual foundation model.
+        scale: fixes the scene unit.
+        coarse: makes the coarse-level feature enhancement from ``token_dims`` and ``patch_size``; None leaves it out
+            (ablation w/o Coarse): the geometry is then the backbone's.
+        fine: makes the fine-level voxel module from ``token_dims`` and ``patch_size``.
+        gaussians: makes the self-splitting Gaussian head from ``in_channels``.
+    """
+
+    def __init__(
+        self,
+        backend: Backend,
+        scale: SceneScale,
+        coarse: Callable[..., nn.Module] | None,
+        fine: Callable[..., nn.Module],
+        gaussians: Callable[..., nn.Module],
+    ) -> None:
+        super().__init__()
+        self.backend = backend
+        self.scale = scale
+        dims, patch = backend.token_dims, backend.patch_size
+        self.coarse = coarse(token_dim=dims[-1], num_taps=len(dims), patch_size=patch) if coarse else None
+        self.fine = fine(token_dims=dims, patch_size=patch)
+        self.gaussians = gaussians(in_channels=self.fine.out_channels)
+
+    def forward(
+        self, images: Tensor, hints: Hints | None = None, generator: torch.Generator | None = None
+    ) -> Prediction:
+        """Reconstructs B scenes.
+
+        Args:
+            images: ``[B, V, 3, H, W]`` in [0, 1]; H and W multiples of the backend's patch size.
+            hints: what the data knows, for backends that need it.
+            generator: draws the serialisation order of the coarse module while training.
+
+        Returns:
+            Geometry before and after enhancement, voxels and Gaussians, in scene units and in the frame of view 0.
+        """
+        with record_function("vg2gt/encode"):
+            tokens = self.backend.encode(images, hints)
+        with record_function("vg2gt/decode"), torch.no_grad():
+            raw = self.backend.decode(tokens)
+        unit = self.scale(raw, hints)
+        initial = _to_scene_frame(raw, unit)
+
+        geometry = initial
+        if self.coarse is not None:
+            with record_function("vg2gt/coarse"):
+                tokens = self.coarse(tokens, initial, generator=generator)
+            with record_function("vg2gt/decode_again"):
+                again = self.backend.decode(tokens)
+            # The camera token is untouched, so the cameras are the backbone's: decoded once, used throughout.
+            geometry = replace(
+                initial, depth=again.depth * unit[:, None, None, None], depth_conf=again.depth_conf
+            )
+        with record_function("vg2gt/fine"):
+            voxels: Voxels = self.fine(tokens, geometry, images)
+        with record_function("vg2gt/gaussians"):
+            gaussians: Gaussians = self.gaussians(voxels)
+        return Prediction(initial, geometry, voxels, gaussians, unit)
+
+    def trained_parameters(self) -> list[nn.Parameter]:
+        """The parameters that training changes: everything but the backbone."""
+        return [parameter for parameter in self.parameters() if parameter.requires_grad]
+
+
+def _to_scene_frame(geometry: Geometry, unit: Tensor) -> Geometry:
+    """Scales geometry to scene units and moves the world into context view 0, which becomes exactly the identity."""
+    cameras = scale_translations(relative_to_first(geometry.cameras), unit)
+    return replace(
+        geometry, depth=geometry.depth * unit[:, None, None, None], cameras=cameras, scale=geometry.scale / unit
+    )

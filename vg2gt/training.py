@@ -1,0 +1,144 @@
+"""A training run: build from the configuration, evaluate the untrained head, train, evaluate again, report."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import lightning
+from hydra.utils import instantiate
+from lightning.pytorch import LightningDataModule, Trainer
+from omegaconf import DictConfig, OmegaConf
+
+from vg2gt.checkpoints import AtomicCheckpointIO, initialize_from, newest_valid, read_checkpoint
+from vg2gt.io.files import read_json, write_json, write_text
+from vg2gt.lightning_module import VG2GTModule
+from vg2gt.preview import write_preview
+from vg2gt.report import comparison_table, print_comparison
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a configuration stands for.
+
+    Attributes:
+        module: model, loss, renderer and optimiser.
+        datamodule: training and evaluation scenes.
+        trainer: Lightning's trainer.
+        folder: the run's own folder, ``outputs/<name>``.
+    """
+
+    module: VG2GTModule
+    datamodule: LightningDataModule
+    trainer: Trainer
+    folder: Path
+
+
+def build(config: DictConfig) -> Run:
+    """Instantiates everything the configuration names; each part's constructor is its schema."""
+    lightning.seed_everything(config.seed, workers=True, verbose=False)
+    datamodule = instantiate(config.data)
+    backend = instantiate(config.backend)
+    model = instantiate(config.model, backend=backend)
+    module = VG2GTModule(
+        model=model,
+        loss=instantiate(config.loss),
+        renderer=instantiate(config.renderer),
+        optimizer=instantiate(config.optimizer),
+        **config.training,
+        seed=config.seed,
+    )
+    trainer = instantiate(
+        config.trainer,
+        callbacks=[instantiate(callback) for callback in config.callbacks.values() if callback],
+        logger=[instantiate(logger) for logger in config.logger.values() if logger],
+        plugins=[AtomicCheckpointIO()],
+        default_root_dir=config.output_dir,
+    )
+    return Run(module, datamodule, trainer, Path(config.output_dir))
+
+
+def train(config: DictConfig) -> dict[str, Any]:
+    """Runs the configuration from beginning to end.
+
+    Writes into ``outputs/<name>``: the resolved configuration, checkpoints, ``metrics.json``, ``metrics.md`` and
+    ``preview.png``.
+
+    Returns:
+        The content of ``metrics.json``.
+
+    Raises:
+        FileExistsError: if the folder holds a run and neither ``ckpt`` nor ``overwrite`` says what to do with it.
+        FileNotFoundError: if ``ckpt`` names no valid checkpoint.
+    """
+    checkpoint = _checkpoint_to_resume(config)
+    run = build(config)
+    write_text(run.folder / "config.yaml", OmegaConf.to_yaml(config, resolve=True))
+    if config.init_from and checkpoint is None:
+        initialize_from(run.module, config.init_from)
+
+    untrained = _untrained_metrics(run, resumed=checkpoint is not None)
+    run.trainer.fit(run.module, datamodule=run.datamodule, ckpt_path=checkpoint, weights_only=True)
+    if not run.trainer.fast_dev_run and run.trainer.global_step < run.trainer.max_steps:
+        log.warning("training ended at step %d of %d", run.trainer.global_step, run.trainer.max_steps)
+        return {}
+    trained = _evaluate(run)
+    return _report(run, untrained, trained)
+
+
+def _checkpoint_to_resume(config: DictConfig) -> Path | None:
+    """Resolves ``ckpt``; never restarts a run silently and never mixes two runs in one folder."""
+    folder = Path(config.output_dir) / "checkpoints"
+    if config.ckpt == "last":
+        return newest_valid(folder)
+    if config.ckpt:
+        read_checkpoint(config.ckpt)
+        return Path(config.ckpt)
+    old = sorted(folder.glob("*.ckpt"))
+    if old and not config.trainer.get("fast_dev_run"):
+        if not config.overwrite:
+            raise FileExistsError(
+                f"{folder} already holds a run ({len(old)} checkpoints): go on with ckpt=last, choose another name=, "
+                "or replace it with overwrite=true"
+            )
+        for path in old:
+            path.unlink()
+    return None
+
+
+def _evaluate(run: Run) -> dict[str, float]:
+    results = run.trainer.validate(run.module, datamodule=run.datamodule, verbose=False)
+    return {key.removeprefix("eval/"): float(value) for key, value in results[0].items()} if results else {}
+
+
+def _untrained_metrics(run: Run, resumed: bool) -> dict[str, float]:
+    """Metrics of the head as initialised: measured once a run and kept beside it for resumed runs."""
+    path = run.folder / "untrained.json"
+    if resumed and path.is_file():
+        return read_json(path)
+    if resumed or run.trainer.fast_dev_run:
+        return {}
+    metrics = _evaluate(run)
+    write_json(path, metrics)
+    return metrics
+
+
+def _report(run: Run, untrained: dict[str, float], trained: dict[str, float]) -> dict[str, Any]:
+    report = {"untrained": untrained, "trained": trained, "steps": run.trainer.global_step}
+    if run.trainer.is_global_zero and not run.trainer.fast_dev_run:
+        write_json(run.folder / "metrics.json", report)
+        write_text(run.folder / "metrics.md", comparison_table(untrained, trained))
+        print_comparison(untrained, trained)
+        preview = write_preview(run.module, run.datamodule, run.folder / "preview.png")
+        newest = newest_valid(run.folder / "checkpoints")
+        for name, path in (
+            ("preview (input | rendered colour | depth | normals | ground truth)", preview),
+            ("checkpoint", newest),
+            ("metrics", run.folder / "metrics.json"),
+        ):
+            print(f"{name}: {path}")
+    return report
