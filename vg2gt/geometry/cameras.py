@@ -43,12 +43,15 @@ def invert_rigid(transform: Tensor) -> Tensor:
 
 
 def transform_points(transform: Tensor, points: Tensor) -> Tensor:
-    """Applies rigid transforms ``[B, V, 4, 4]`` to points ``[B, V, ..., 3]``."""
-    extra = points.dim() - transform.dim() + 1
-    shape = transform.shape[:-2] + (1,) * (extra - 1)
-    rotation = transform[..., :3, :3].reshape(*shape, 3, 3)
-    translation = transform[..., :3, 3].reshape(*shape, 3)
-    return (rotation @ points[..., None])[..., 0] + translation
+    """Applies rigid transforms ``[B, V, 4, 4]`` to points ``[B, V, ..., 3]``.
+
+    Elementwise, so that neither autocast nor TF32 can round positions (2 mm voxels need all of float32).
+    """
+    shape = transform.shape[:-2] + (1,) * (points.dim() - transform.dim() + 1)
+    columns = transform[..., :3, :].unbind(-1)
+    rotation_x, rotation_y, rotation_z, translation = (column.reshape(*shape, 3) for column in columns)
+    x, y, z = points.split(1, -1)
+    return torch.addcmul(torch.addcmul(torch.addcmul(translation, rotation_x, x), rotation_y, y), rotation_z, z)
 
 
 def unproject(depth: Tensor, cameras: Cameras) -> Tensor:
