@@ -1,0 +1,234 @@
+"""A simulated foundation model: the data's depth and cameras, made worse; no weights to download.
+
+What it keeps of a real one: depth errs smoothly in the image plane, differently in every view, with a confidence that
+knows about it; the tokens carry what the network believes (image content, predicted depth and place of the patch),
+never the truth; a change of the tokens changes the decoded depth smoothly through fixed weights. So the errors can be
+found where views disagree in space, and token enhancement can be trained and measured.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from backends.base import Backend, full_precision, seeded_initialisation
+from backends.vit import Block, PatchEmbed
+from vg2gt.geometry.cameras import invert_rigid, relative_to_first, unproject
+from vg2gt.geometry.rotations import quat_to_matrix
+from vg2gt.types import Cameras, Geometry, Hints, Tokens
+
+NOISE_GRID = (4, 8)
+SMOOTH_SHARE, VIEW_SHARE = 0.8, 0.6  # 0.8^2 + 0.6^2 = 1
+BLEED_THRESHOLD = 0.02
+INVALID_CONFIDENCE = 1e-3
+CELLS = 2  # the depth residual has CELLS x CELLS values a patch
+WAVELENGTHS = (1.0, 0.5, 0.25)  # of the encoded place of a patch, in median depths
+GEOMETRY_CHANNELS = CELLS * CELLS + 1 + 3 + 3 + 3 + 6 * len(WAVELENGTHS)
+
+
+class OracleBackend(Backend):
+    """Simulated VFM (needs hints).
+
+    Depth is ``gt * (1 + depth_noise * (0.8 s + 0.6 c))`` with a smooth field s (bicubic from 4x8 normal values, unit
+    deviation) and one normal value c a view, then bleeds over depth edges as decoded depth does. Confidence is
+    ``1 + 4 exp(-|relative error| / max(depth_noise, 0.01))`` times log-normal noise. Camera rotations err by
+    ``0.5 * pose_noise`` rad and positions by ``pose_noise`` median depths of their view, per axis; view 0 is exact.
+    All noise is seeded by (seed, scene, frame), whatever the order or number of views.
+
+    Tokens mix, by a fixed rotation of the channels, the image features of a small frozen random ViT and the predicted
+    geometry of the patch. ``decode`` multiplies the depth by ``exp(response * u)``, u the bicubically upsampled mean
+    over the taps of a fixed random projection of the token change: a change of independent unit-variance channels
+    gives u about unit variance.
+
+    Args:
+        patch_size: in pixels.
+        dim: channels of a token; at least twice the 32 geometry channels.
+        taps: tapped layers.
+        depth_noise: standard deviation of the relative depth error.
+        pose_noise: see above; None means ``0.1 * depth_noise``.
+        response: log-depth answer to a unit change of the tokens.
+        seed: of the noise and of the frozen weights.
+
+    Raises:
+        ValueError: if ``dim`` is too small or a noise level is negative.
+    """
+
+    def __init__(
+        self,
+        patch_size: int = 14,
+        dim: int = 64,
+        taps: int = 4,
+        depth_noise: float = 0.02,
+        pose_noise: float | None = None,
+        response: float = 0.02,
+        seed: int = 0,
+    ) -> None:
+        pose_noise = 0.1 * depth_noise if pose_noise is None else pose_noise
+        if dim < 2 * GEOMETRY_CHANNELS or dim % 4:
+            raise ValueError(f"backend.dim must be a multiple of 4 and at least {2 * GEOMETRY_CHANNELS}, got {dim}")
+        if depth_noise < 0 or pose_noise < 0:
+            raise ValueError(f"noise must not be negative: depth_noise {depth_noise}, pose_noise {pose_noise}")
+        super().__init__("oracle", patch_size, (dim,) * taps, licence="Apache-2.0 (no weights)", needs_hints=True)
+        self.depth_noise = depth_noise
+        self.pose_noise = pose_noise
+        self.response = response
+        self.seed = seed
+        image_dim = dim - GEOMETRY_CHANNELS
+        with seeded_initialisation(seed):
+            self.patch_embed = PatchEmbed(patch_size, image_dim)
+            self.blocks = nn.ModuleList(Block(image_dim, 4) for _ in range(taps))
+            self.camera_projection = nn.Linear(16 + 4, dim)
+            mixing = torch.stack([torch.linalg.qr(torch.randn(dim, dim))[0] for _ in range(taps)])
+            readout = torch.randn(taps, dim, CELLS * CELLS) / math.sqrt(dim / taps)
+        self.mixing = nn.Parameter(mixing)
+        self.readout = nn.Parameter(readout)
+        self.freeze()
+
+    @torch.no_grad()
+    def encode(self, images: Tensor, hints: Hints | None = None) -> Tokens:
+        """Simulates the backbone; see :meth:`Backend.encode`. The world frame is view 0's, the unit the data's."""
+        self.check_inputs(images, hints)
+        assert hints is not None
+        assert hints.depth is not None
+        assert hints.cameras is not None
+        height, width = images.shape[-2:]
+        grid = (height // self.patch_size, width // self.patch_size)
+        with full_precision(images):
+            images, depth = images.float(), hints.depth.float()
+            noise = self._draw(hints, (height, width), depth)
+            cameras = self._predict_cameras(hints.cameras, depth, noise)
+            predicted = _bleed(depth * (1 + self.depth_noise * noise.relative))
+            confidence = self._predict_confidence(predicted, depth, noise)
+            geometry = _describe_patches(predicted, confidence, cameras, grid)
+            patch = self._tokens(images, geometry)
+            camera = self.camera_projection(_describe_cameras(cameras, _median_depth(predicted)))
+        state = {"patch": patch, "depth": predicted, "confidence": confidence, "cameras": cameras}
+        return Tokens(patch, camera, grid, (height, width), state)
+
+    def decode(self, tokens: Tokens) -> Geometry:
+        """Answers token changes with a smooth log-depth residual; see :meth:`Backend.decode`."""
+        depth, cameras = tokens.state["depth"], tokens.state["cameras"]
+        rows, columns = tokens.grid
+        with full_precision(depth):
+            changes = [
+                (patch.float() - before) @ readout
+                for patch, before, readout in zip(tokens.patch, tokens.state["patch"], self.readout, strict=True)
+            ]
+            cells = torch.stack(changes).mean(0).flatten(0, 1).transpose(1, 2).unflatten(-1, (rows, columns))
+            residual = F.interpolate(F.pixel_shuffle(cells, CELLS), tokens.size, mode="bicubic", align_corners=False)
+            depth = depth * torch.exp(self.response * residual.reshape(depth.shape))
+        return Geometry(depth, tokens.state["confidence"], cameras, torch.ones_like(depth[:, 0, 0, 0]))
+
+    def _draw(self, hints: Hints, size: tuple[int, int], like: Tensor) -> _Noise:
+        """Draws the noise of every view from its own generator."""
+        assert hints.frame_ids is not None
+        views = [
+            [self._draw_view(scene, frame, size) for frame in frames]
+            for scene, frames in zip(hints.scene_key, hints.frame_ids.tolist(), strict=True)
+        ]
+        fields, constants, poses, confidences = (
+            torch.from_numpy(np.stack([[view[part] for view in row] for row in views])).to(like) for part in range(4)
+        )
+        smooth = F.interpolate(fields, size, mode="bicubic", align_corners=True)
+        smooth = smooth / smooth.std((-2, -1), keepdim=True)
+        return _Noise(SMOOTH_SHARE * smooth + VIEW_SHARE * constants, poses, confidences)
+
+    def _draw_view(self, scene: str, frame: int, size: tuple[int, int]) -> tuple[np.ndarray, ...]:
+        key = hashlib.sha256(f"{self.seed}/{scene}/{frame}".encode()).digest()
+        rng = np.random.default_rng(int.from_bytes(key, "big"))
+        shapes = (NOISE_GRID, (1, 1), (6,), size)
+        return tuple(rng.standard_normal(shape, dtype=np.float32) for shape in shapes)
+
+    def _predict_cameras(self, cameras: Cameras, depth: Tensor, noise: _Noise) -> Cameras:
+        """Moves every camera but the first a little in its own frame, then the world into view 0's frame."""
+        turn = self.pose_noise * 0.5 * noise.pose[..., :3]
+        shift = self.pose_noise * noise.pose[..., 3:] * _median_depth(depth, per_view=True)[..., None]
+        half = turn / 2
+        quats = torch.cat((torch.ones_like(half[..., :1]), half), -1)  # the angle is small: tan is its argument
+        error = torch.eye(4, dtype=depth.dtype, device=depth.device).repeat(*depth.shape[:2], 1, 1)
+        error[..., :3, :3] = quat_to_matrix(quats)
+        error[..., :3, 3] = shift
+        error[:, 0] = torch.eye(4, dtype=depth.dtype, device=depth.device)
+        exact = relative_to_first(cameras.map(Tensor.double)).map(Tensor.float)
+        return Cameras(invert_rigid(error) @ exact.world_to_camera, exact.intrinsics, exact.size)
+
+    def _predict_confidence(self, predicted: Tensor, depth: Tensor, noise: _Noise) -> Tensor:
+        error = (predicted / depth.clamp_min(1e-6) - 1).abs()
+        confidence = 1 + 4 * torch.exp(-error / max(self.depth_noise, 0.01)) * torch.exp(0.3 * noise.confidence)
+        return torch.where(depth > 0, confidence, INVALID_CONFIDENCE)
+
+    def _tokens(self, images: Tensor, geometry: Tensor) -> tuple[Tensor, ...]:
+        """Image features of every tapped block beside the geometry ``[B, V, P, 32]``, channels mixed."""
+        features = self.patch_embed((images.flatten(0, 1) - 0.5) * 4)
+        tokens = []
+        for block, mixing in zip(self.blocks, self.mixing, strict=True):
+            features = block(features)
+            content = F.layer_norm(features, features.shape[-1:]).unflatten(0, images.shape[:2])
+            tokens.append(torch.cat((content, geometry), -1) @ mixing)
+        return tuple(tokens)
+
+
+class _Noise(NamedTuple):
+    """Standard normal noise of B scenes with V views."""
+
+    relative: Tensor  # [B, V, H, W]
+    pose: Tensor  # [B, V, 6]
+    confidence: Tensor  # [B, V, H, W]
+
+
+def _median_depth(depth: Tensor, per_view: bool = False) -> Tensor:
+    """Median of the valid depth ``[B, V, H, W]`` of every scene ``[B]`` or view ``[B, V]``; 1 where none is valid."""
+    flat = depth.flatten(2 if per_view else 1)
+    median = torch.where(flat > 0, flat, torch.nan).nanmedian(-1).values
+    return median.nan_to_num(1.0)
+
+
+def _bleed(depth: Tensor) -> Tensor:
+    """Moves depth ``[B, V, H, W]`` half way to its 3x3 mean where the two differ by more than 2 %: soft edges."""
+    padded = F.pad(depth, (1, 1, 1, 1), mode="replicate")
+    share = F.avg_pool2d((padded > 0).to(depth), 3, 1)
+    mean = F.avg_pool2d(padded, 3, 1) / share.clamp_min(1e-6)
+    soft = (mean - depth).abs() > BLEED_THRESHOLD * depth
+    return torch.where(soft & (depth > 0), (depth + mean) / 2, depth)
+
+
+def _describe_patches(depth: Tensor, confidence: Tensor, cameras: Cameras, grid: tuple[int, int]) -> Tensor:
+    """What the simulated network believes of every patch, ``[B, V, P, 32]``, channels of order one.
+
+    Log-depth of 2x2 cells and log-confidence, the patch's place and ray direction, the camera's place; lengths in
+    median depths; the place also as sines and cosines, so that small distances can be told apart.
+    """
+    unit = _median_depth(depth)[:, None, None, None]
+    cells = (grid[0] * CELLS, grid[1] * CELLS)
+    valid = (depth > 0).to(depth)
+    share = F.adaptive_avg_pool2d(valid, cells)
+    log_depth = F.adaptive_avg_pool2d(torch.where(depth > 0, depth / unit, 1.0).log(), cells) / share.clamp_min(1e-6)
+    log_depth = F.pixel_unshuffle(log_depth.flatten(0, 1)[:, None], CELLS)
+    log_confidence = F.adaptive_avg_pool2d(confidence.log(), grid).flatten(0, 1)[:, None]
+
+    points = unproject(depth, cameras) / unit[..., None]
+    centers = invert_rigid(cameras.world_to_camera)[..., :3, 3] / unit[..., 0]
+    weighted = (points * valid[..., None]).permute(0, 1, 4, 2, 3).flatten(0, 1)
+    weight = F.adaptive_avg_pool2d(valid, grid).flatten(0, 1)[:, None]
+    place = F.adaptive_avg_pool2d(weighted, grid) / weight.clamp_min(1e-6)
+    centers = centers.flatten(0, 1)[..., None, None].expand_as(place)
+    ray = F.normalize(place - centers, dim=1)
+    phases = [2 * math.pi / wavelength * place for wavelength in WAVELENGTHS]
+    waves = [wave for phase in phases for wave in (phase.sin(), phase.cos())]
+    described = torch.cat((log_depth, log_confidence, place, ray, centers, *waves), 1)
+    described = torch.where(weight > 0, described, 0.0)
+    return described.flatten(2).transpose(1, 2).unflatten(0, depth.shape[:2])
+
+
+def _describe_cameras(cameras: Cameras, unit: Tensor) -> Tensor:
+    """Pose and intrinsics as ``[B, V, 20]`` numbers of order one."""
+    poses = cameras.world_to_camera.clone()
+    poses[..., :3, 3] /= unit[:, None, None]
+    intrinsics = cameras.intrinsics[..., :2, :] / max(cameras.size)
+    return torch.cat((poses.flatten(2), intrinsics[..., [0, 1, 0, 1], [0, 1, 2, 2]]), -1)

@@ -1,0 +1,126 @@
+"""Transformer parts that the frozen networks share: attention, feed-forward layers, blocks.
+
+Module names follow the published weight files.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from backends.rope import Rotary, rotate
+
+FeedForward = Literal["mlp", "swiglu"]
+
+
+class Attention(nn.Module):
+    """Multi-head self-attention, optionally with normalised queries and keys and rotary positions."""
+
+    def __init__(self, dim: int, num_heads: int, qk_norm: bool = False) -> None:
+        super().__init__()
+        self.num_heads = num_heads
+        head_dim = dim // num_heads
+        self.qkv = nn.Linear(dim, 3 * dim)
+        self.q_norm = nn.LayerNorm(head_dim, eps=1e-5) if qk_norm else nn.Identity()
+        self.k_norm = nn.LayerNorm(head_dim, eps=1e-5) if qk_norm else nn.Identity()
+        self.proj = nn.Linear(dim, dim)
+
+    def forward(self, x: Tensor, rotary: Rotary | None = None) -> Tensor:
+        """Attends over the N axis of ``x [B, N, C]``; ``rotary`` tables broadcast to ``[B, heads, N, head_dim]``."""
+        query, key, value = self.qkv(x).unflatten(-1, (3, self.num_heads, -1)).permute(2, 0, 3, 1, 4).unbind(0)
+        query, key = self.q_norm(query), self.k_norm(key)
+        if rotary is not None:
+            query, key = rotate(query, rotary), rotate(key, rotary)
+        # Under autocast the normalised queries may stay float32: the three must agree.
+        out = F.scaled_dot_product_attention(query.to(value.dtype), key.to(value.dtype), value)
+        return self.proj(out.transpose(1, 2).flatten(2))
+
+
+class MLP(nn.Module):
+    """Two linear layers with a GELU between."""
+
+    def __init__(self, dim: int, hidden: int, out: int | None = None) -> None:
+        super().__init__()
+        self.fc1 = nn.Linear(dim, hidden)
+        self.fc2 = nn.Linear(hidden, out or dim)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Maps ``[..., dim]`` to ``[..., out]``."""
+        return self.fc2(F.gelu(self.fc1(x)))
+
+
+class SwiGLU(nn.Module):
+    """Gated feed-forward layer; its hidden width is two thirds of ``hidden``, rounded up to a multiple of 8."""
+
+    def __init__(self, dim: int, hidden: int) -> None:
+        super().__init__()
+        hidden = (hidden * 2 // 3 + 7) // 8 * 8
+        self.w12 = nn.Linear(dim, 2 * hidden)
+        self.w3 = nn.Linear(hidden, dim)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Maps ``[..., dim]`` to ``[..., dim]``."""
+        gate, value = self.w12(x).chunk(2, -1)
+        return self.w3(F.silu(gate) * value)
+
+
+class LayerScale(nn.Module):
+    """One factor a channel."""
+
+    def __init__(self, dim: int, value: float) -> None:
+        super().__init__()
+        self.gamma = nn.Parameter(torch.full((dim,), value))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Scales ``[..., dim]``."""
+        return x * self.gamma
+
+
+class Block(nn.Module):
+    """Pre-norm transformer block: attention, then feed-forward, each scaled and added.
+
+    Args:
+        dim: channels.
+        num_heads: attention heads.
+        qk_norm: whether queries and keys are normalised.
+        ffn: feed-forward layer, four times as wide as ``dim`` (before the SwiGLU's two thirds).
+        layer_scale: initial layer scale.
+        eps: of the two block norms (norms of queries and keys always have 1e-5).
+    """
+
+    def __init__(
+        self,
+        dim: int,
+        num_heads: int,
+        qk_norm: bool = False,
+        ffn: FeedForward = "mlp",
+        layer_scale: float = 1.0,
+        eps: float = 1e-6,
+    ) -> None:
+        super().__init__()
+        self.norm1 = nn.LayerNorm(dim, eps=eps)
+        self.attn = Attention(dim, num_heads, qk_norm)
+        self.ls1 = LayerScale(dim, layer_scale)
+        self.norm2 = nn.LayerNorm(dim, eps=eps)
+        self.mlp = SwiGLU(dim, 4 * dim) if ffn == "swiglu" else MLP(dim, 4 * dim)
+        self.ls2 = LayerScale(dim, layer_scale)
+
+    def forward(self, x: Tensor, rotary: Rotary | None = None) -> Tensor:
+        """Maps ``[B, N, dim]`` to ``[B, N, dim]``."""
+        x = x + self.ls1(self.attn(self.norm1(x), rotary))
+        return x + self.ls2(self.mlp(self.norm2(x)))
+
+
+class PatchEmbed(nn.Module):
+    """Linear embedding of square patches."""
+
+    def __init__(self, patch_size: int, dim: int) -> None:
+        super().__init__()
+        self.proj = nn.Conv2d(3, dim, patch_size, patch_size)
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Maps ``[N, 3, H, W]`` to ``[N, P, dim]``, row major."""
+        return self.proj(images).flatten(2).transpose(1, 2)

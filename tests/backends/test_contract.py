@@ -1,0 +1,187 @@
+"""What every backend must keep; ``pytest tests/backends --backend my_pkg.MyBackend`` tests another one."""
+
+import dataclasses
+
+import pytest
+import torch
+from torch import Tensor
+
+from backends.base import Backend
+from vg2gt.geometry.cameras import relative_to_first
+from vg2gt.types import Cameras, Geometry, Hints, Tokens
+
+
+@pytest.fixture(scope="module")
+def scene(backend: Backend, make_scene):
+    return make_scene(2, 3, (4 * backend.patch_size, 6 * backend.patch_size))
+
+
+@pytest.fixture(scope="module")
+def tokens(backend: Backend, scene) -> Tokens:
+    return backend.encode(*scene)
+
+
+@pytest.fixture(scope="module")
+def geometry(backend: Backend, tokens: Tokens) -> Geometry:
+    return backend.decode(tokens)
+
+
+def pick(scene: tuple[Tensor, Hints], scenes: list[int], views: list[int]) -> tuple[Tensor, Hints]:
+    """The same data with some scenes and views, in that order."""
+    images, hints = scene
+    cameras = hints.cameras
+    assert hints.depth is not None
+    assert hints.frame_ids is not None
+    assert cameras is not None
+
+    def rows(tensor: Tensor) -> Tensor:
+        return tensor[scenes][:, views]
+
+    return rows(images), Hints(
+        rows(hints.depth),
+        Cameras(rows(cameras.world_to_camera), rows(cameras.intrinsics), cameras.size),
+        tuple(hints.scene_key[index] for index in scenes),
+        rows(hints.frame_ids),
+    )
+
+
+def assert_same(result: Geometry, expected: Geometry, views: list[int] | None = None) -> None:
+    order = views or list(range(expected.depth.shape[1]))
+    torch.testing.assert_close(result.depth, expected.depth[:, order], rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(result.depth_conf, expected.depth_conf[:, order], rtol=1e-4, atol=1e-5)
+    poses = [relative_to_first(g.cameras).world_to_camera for g in (result, expected)]
+    torch.testing.assert_close(poses[0], poses[1][:, order], rtol=1e-4, atol=1e-4)
+
+
+def test_shapes(backend: Backend, scene, tokens: Tokens, geometry: Geometry) -> None:
+    batch, views, _, height, width = scene[0].shape
+    assert tokens.grid == (height // backend.patch_size, width // backend.patch_size)
+    assert tokens.size == (height, width)
+    patches = tokens.grid[0] * tokens.grid[1]
+    assert [tuple(t.shape) for t in tokens.patch] == [(batch, views, patches, dim) for dim in backend.token_dims]
+    assert tokens.camera.shape[:2] == (batch, views)
+    assert tokens.camera.dim() == 3
+    assert geometry.depth.shape == geometry.depth_conf.shape == (batch, views, height, width)
+    assert geometry.cameras.world_to_camera.shape == (batch, views, 4, 4)
+    assert geometry.cameras.intrinsics.shape == (batch, views, 3, 3)
+    assert geometry.cameras.size == (height, width)
+    assert geometry.scale.shape == (batch,)
+
+
+def test_values_are_usable(geometry: Geometry) -> None:
+    assert geometry.depth.dtype == torch.float32
+    assert torch.isfinite(geometry.depth).all()
+    assert (geometry.depth >= 0).all()
+    assert (geometry.depth_conf > 0).all()
+    rotation = geometry.cameras.world_to_camera[..., :3, :3]
+    torch.testing.assert_close(rotation @ rotation.mT, torch.eye(3).expand_as(rotation), rtol=0, atol=1e-4)
+    last = torch.tensor([0.0, 0.0, 0.0, 1.0]).expand_as(geometry.cameras.world_to_camera[..., 3, :])
+    assert torch.equal(geometry.cameras.world_to_camera[..., 3, :], last)
+    assert (geometry.cameras.intrinsics[..., [0, 1], [0, 1]] > 0).all()
+
+
+def test_is_described(backend: Backend) -> None:
+    assert backend.name
+    assert backend.licence
+    assert backend.identity() == backend.identity()
+    assert set(backend.identity()) == {"name", "weights"}
+
+
+def test_is_frozen(backend: Backend, tokens: Tokens) -> None:
+    assert not any(parameter.requires_grad for parameter in backend.parameters())
+    assert not any(tensor.requires_grad for tensor in (*tokens.patch, tokens.camera))
+
+
+def test_stays_in_eval_mode(backend: Backend) -> None:
+    assert not any(module.training for module in backend.train().modules())
+
+
+def test_other_sizes_than_multiples_of_the_patch_are_refused(backend: Backend, make_scene) -> None:
+    size = (4 * backend.patch_size + 1, 6 * backend.patch_size)
+    with pytest.raises(ValueError, match=r"multiple of the patch size"):
+        backend.encode(*make_scene(1, 2, size))
+
+
+def test_images_out_of_range_are_refused(backend: Backend, scene) -> None:
+    images, hints = scene
+    for bad in (images * 255, images - 0.5, images * torch.nan):
+        with pytest.raises(ValueError, match=r"in \[0, 1\]"):
+            backend.encode(bad, hints)
+
+
+def test_missing_hints_are_named(backend: Backend, scene) -> None:
+    if not backend.needs_hints:
+        pytest.skip("this backend works from images alone")
+    with pytest.raises(ValueError, match="hints"):
+        backend.encode(scene[0])
+
+
+def test_decoding_again_is_bit_equal(backend: Backend, tokens: Tokens, geometry: Geometry) -> None:
+    unchanged = tokens.with_patch(tuple(patch + torch.zeros_like(patch) for patch in tokens.patch))
+    for again in (backend.decode(tokens), backend.decode(unchanged)):
+        assert torch.equal(again.depth, geometry.depth)
+        assert torch.equal(again.depth_conf, geometry.depth_conf)
+        assert torch.equal(again.cameras.world_to_camera, geometry.cameras.world_to_camera)
+        assert torch.equal(again.cameras.intrinsics, geometry.cameras.intrinsics)
+
+
+def test_encoding_again_is_bit_equal(backend: Backend, scene, tokens: Tokens) -> None:
+    torch.manual_seed(1)
+    again = backend.encode(*scene)
+    assert all(torch.equal(a, b) for a, b in zip(again.patch, tokens.patch, strict=True))
+
+
+def test_cameras_ignore_patch_changes(backend: Backend, tokens: Tokens, geometry: Geometry) -> None:
+    changed = backend.decode(tokens.with_patch(tuple(patch + 0.1 for patch in tokens.patch)))
+    assert torch.equal(changed.cameras.world_to_camera, geometry.cameras.world_to_camera)
+
+
+def test_gradient_reaches_the_tokens(backend: Backend, tokens: Tokens) -> None:
+    if not backend.supports_gradient:
+        pytest.skip("this backend decodes without gradient")
+    patch = tuple(patch.detach().clone().requires_grad_() for patch in tokens.patch)
+    depth = backend.decode(tokens.with_patch(patch)).depth
+    weight = torch.linspace(0, 1, depth.numel()).view_as(depth)
+    gradients = torch.autograd.grad((depth * weight).sum(), patch)
+    assert all(gradient.abs().amax((2, 3)).min() > 0 for gradient in gradients)  # in every tap, scene and view
+    assert all(parameter.grad is None for parameter in backend.parameters())
+
+
+def test_gradient_survives_autocast(backend: Backend, tokens: Tokens, geometry: Geometry) -> None:
+    with torch.autocast("cpu", torch.bfloat16):
+        again = backend.decode(tokens)
+    assert again.depth.dtype == torch.float32
+    torch.testing.assert_close(again.depth, geometry.depth, rtol=1e-6, atol=0)
+
+
+def test_view_order(backend: Backend, scene, geometry: Geometry) -> None:
+    """Permuting the views behind the first one permutes the result."""
+    order = [0, 2, 1]
+    result = backend.decode(backend.encode(*pick(scene, [0, 1], order)))
+    assert_same(result, geometry, order)
+
+
+def test_batch_of_two_equals_two_singles(backend: Backend, scene, geometry: Geometry) -> None:
+    for index in (0, 1):
+        single = backend.decode(backend.encode(*pick(scene, [index], [0, 1, 2])))
+        expected = Geometry(
+            geometry.depth[index : index + 1],
+            geometry.depth_conf[index : index + 1],
+            geometry.cameras.scene(index),
+            geometry.scale[index : index + 1],
+        )
+        assert_same(single, expected)
+
+
+@pytest.mark.parametrize("views", [1, 2, 5])
+def test_any_number_of_views(backend: Backend, make_scene, views: int) -> None:
+    size = (3 * backend.patch_size, 5 * backend.patch_size)
+    geometry = backend.decode(backend.encode(*make_scene(1, views, size)))
+    assert geometry.depth.shape == (1, views, *size)
+    assert torch.isfinite(geometry.depth).all()
+
+
+def test_tokens_survive_a_copy(backend: Backend, tokens: Tokens, geometry: Geometry) -> None:
+    """Everything ``decode`` needs is in the record, moved and detached as one."""
+    copy = dataclasses.replace(tokens.detach()).map(torch.clone)
+    assert torch.equal(backend.decode(copy).depth, geometry.depth)

@@ -1,0 +1,176 @@
+import pytest
+import torch
+
+from backends.oracle import OracleBackend
+from vg2gt.geometry.cameras import relative_to_first
+from vg2gt.types import Cameras, Hints
+
+SIZE = (56, 112)
+
+
+def relative_error(geometry, hints: Hints) -> torch.Tensor:
+    return geometry.depth / hints.depth - 1
+
+
+def test_without_noise_it_is_the_data(make_scene) -> None:
+    images, hints = make_scene(2, 3, SIZE)
+    backend = OracleBackend(depth_noise=0)
+    geometry = backend.decode(backend.encode(images, hints))
+    torch.testing.assert_close(geometry.depth, hints.depth)
+    expected = relative_to_first(hints.cameras)
+    torch.testing.assert_close(geometry.cameras.world_to_camera, expected.world_to_camera, rtol=0, atol=1e-6)
+    assert torch.equal(geometry.cameras.intrinsics, hints.cameras.intrinsics)
+
+
+def test_noise_has_the_stated_size_and_is_smooth(make_scene) -> None:
+    images, hints = make_scene(4, 12, SIZE)
+    backend = OracleBackend(depth_noise=0.02)
+    error = relative_error(backend.decode(backend.encode(images, hints)), hints)
+    assert 0.017 < error.square().mean().sqrt() < 0.023
+    assert 0.006 < error.mean((-2, -1)).std() < 0.02  # a constant of every view is part of it
+    assert error.diff(dim=-1).abs().mean() < 0.1 * error.abs().mean()
+
+
+def test_noise_depends_on_seed_scene_and_frame_only(make_scene) -> None:
+    images, hints = make_scene(2, 4, SIZE)
+    backend = OracleBackend()
+    error = relative_error(backend.decode(backend.encode(images, hints)), hints)
+    order = torch.tensor([2, 0, 3, 1])  # another first view too
+    flipped = Hints(
+        hints.depth[:, order].flip(0),
+        Cameras(hints.cameras.world_to_camera[:, order].flip(0), hints.cameras.intrinsics[:, order].flip(0), SIZE),
+        hints.scene_key[::-1],
+        hints.frame_ids[:, order].flip(0),
+    )
+    again = relative_error(backend.decode(backend.encode(images[:, order].flip(0), flipped)), flipped)
+    torch.testing.assert_close(again, error[:, order].flip(0), rtol=0, atol=1e-6)
+    other = relative_error(backend.decode(OracleBackend(seed=1).encode(images, hints)), hints)
+    assert (other - error).abs().mean() > 0.005
+    assert (error[0, 0] - error[1, 0]).abs().mean() > 0.002
+    assert (error[0, 0] - error[0, 1]).abs().mean() > 0.002
+
+
+def test_first_pose_is_exact_and_the_others_err_a_little(make_scene) -> None:
+    images, hints = make_scene(4, 12, SIZE)
+    geometry = OracleBackend().decode(OracleBackend(pose_noise=0.01).encode(images, hints))
+    poses = geometry.cameras.world_to_camera
+    assert torch.equal(poses[:, 0], torch.eye(4).expand(4, 4, 4))
+    exact = relative_to_first(hints.cameras).world_to_camera
+    error = poses[:, 1:] @ torch.linalg.inv(exact[:, 1:])
+    turn = torch.stack((error[..., 2, 1], error[..., 0, 2], error[..., 1, 0]), -1)
+    assert 0.004 < turn.std() < 0.006
+    assert 0.015 < error[..., :3, 3].std() < 0.025  # 0.01 of a depth of about 2
+
+
+def test_invalid_depth_stays_invalid(make_scene) -> None:
+    images, hints = make_scene(1, 2, SIZE)
+    depth = hints.depth.clone()
+    depth[..., 20:40, 30:60] = 0
+    depth[0, 1] = 0
+    backend = OracleBackend()
+    tokens = backend.encode(images, Hints(depth, hints.cameras, hints.scene_key, hints.frame_ids))
+    geometry = backend.decode(tokens.with_patch(tuple(patch + 1 for patch in tokens.patch)))
+    assert torch.equal(geometry.depth == 0, depth == 0)
+    assert geometry.depth_conf[depth == 0].max() < 0.01
+    assert geometry.depth_conf[depth > 0].min() > 1
+    assert all(torch.isfinite(patch).all() for patch in tokens.patch)
+
+
+def test_depth_bleeds_over_edges_only(make_scene) -> None:
+    images, hints = make_scene(1, 1, SIZE)
+    depth = torch.full((1, 1, *SIZE), 2.0)
+    depth[..., 50:] = 3.0
+    backend = OracleBackend(depth_noise=0)
+    geometry = backend.decode(backend.encode(images, Hints(depth, hints.cameras, hints.scene_key, hints.frame_ids)))
+    changed = (geometry.depth != depth).any(-2)[0, 0].nonzero()[:, 0].tolist()
+    assert changed == [49, 50]
+    assert 2 < geometry.depth[0, 0, 20, 49] < geometry.depth[0, 0, 20, 50] < 3
+
+
+def test_confidence_knows_the_error(make_scene) -> None:
+    images, hints = make_scene(2, 4, SIZE)
+    geometry = OracleBackend().decode(OracleBackend().encode(images, hints))
+    error = relative_error(geometry, hints).abs()
+    sure = geometry.depth_conf > geometry.depth_conf.median()
+    assert error[sure].mean() < 0.7 * error[~sure].mean()
+
+
+def test_tokens_do_not_know_the_truth(make_scene) -> None:
+    """Two different truths that look the same to the network (same prediction) have the same tokens."""
+    images, hints = make_scene(1, 2, SIZE)
+    noisy = OracleBackend(depth_noise=0.05, pose_noise=0.0)
+    exact = OracleBackend(depth_noise=0.0)
+    predicted = noisy.decode(noisy.encode(images, hints))
+    truth = Hints(predicted.depth, hints.cameras, hints.scene_key, hints.frame_ids)
+    first, second = noisy.encode(images, hints), exact.encode(images, truth)
+    torch.testing.assert_close(second.state["depth"], first.state["depth"])
+    confidence_only = [(a - b).abs() for a, b in zip(first.patch, second.patch, strict=True)]
+    rank = torch.linalg.matrix_rank(torch.stack([c.flatten(0, 2) for c in confidence_only])[0], rtol=1e-3)
+    assert rank == 1  # the confidence channel alone tells them apart
+
+
+def test_tokens_carry_the_predicted_depth(make_scene) -> None:
+    """A linear read-out finds the patch's predicted log-depth in the tokens of every tap."""
+    images, hints = make_scene(4, 4, SIZE)
+    backend = OracleBackend(depth_noise=0.1)
+    tokens = backend.encode(images, hints)
+    log_depth = torch.nn.functional.avg_pool2d(tokens.state["depth"].log(), 14).flatten(2)
+    target = (log_depth - log_depth.mean((1, 2), keepdim=True)).flatten()[:, None]
+    for patch in tokens.patch:
+        features = torch.cat((patch.flatten(0, 2), torch.ones(target.shape[0], 1)), 1)
+        residual = target - features @ torch.linalg.lstsq(features, target).solution
+        assert residual.std() < 0.2 * target.std()
+
+
+def test_response_is_smooth_and_of_the_stated_size(make_scene) -> None:
+    images, hints = make_scene(2, 4, SIZE)
+    backend = OracleBackend(response=0.03)
+    tokens = backend.encode(images, hints)
+    torch.manual_seed(0)
+    changed = backend.decode(tokens.with_patch(tuple(patch + torch.randn_like(patch) for patch in tokens.patch)))
+    residual = (changed.depth / backend.decode(tokens).depth).log()
+    assert 0.02 < residual.std() < 0.04
+    assert residual.diff(dim=-1).abs().mean() < 0.2 * residual.std()
+
+
+def test_token_changes_can_undo_the_noise(make_scene) -> None:
+    """Fitting the tokens by gradient alone removes most of the error: the decoder can represent the correction."""
+    images, hints = make_scene(1, 2, SIZE)
+    backend = OracleBackend(response=0.05)
+    tokens = backend.encode(images, hints)
+    changes = [torch.zeros_like(patch).requires_grad_() for patch in tokens.patch]
+    optimiser = torch.optim.Adam(changes, lr=0.02)
+    start, error = float("nan"), torch.tensor(torch.nan)
+    for step in range(60):
+        patch = tuple(patch + change for patch, change in zip(tokens.patch, changes, strict=True))
+        error = (backend.decode(tokens.with_patch(patch)).depth.log() - hints.depth.log()).abs().mean()
+        start = error.item() if step == 0 else start
+        optimiser.zero_grad()
+        error.backward()
+        optimiser.step()
+    assert error.item() < 0.2 * start
+
+
+def test_construction_leaves_the_global_generator_alone() -> None:
+    torch.manual_seed(3)
+    expected = torch.rand(2)
+    torch.manual_seed(3)
+    first = OracleBackend()
+    assert torch.equal(torch.rand(2), expected)
+    assert first.identity() == OracleBackend().identity()
+    assert first.identity() != OracleBackend(seed=1).identity()
+
+
+@pytest.mark.parametrize("name", ["depth", "cameras", "frame_ids"])
+def test_each_missing_hint_is_named(make_scene, name: str) -> None:
+    images, hints = make_scene(1, 2, SIZE)
+    fields = {"depth": hints.depth, "cameras": hints.cameras, "frame_ids": hints.frame_ids, name: None}
+    with pytest.raises(ValueError, match=f"missing: {name}\\."):
+        OracleBackend().encode(images, Hints(scene_key=hints.scene_key, **fields))
+
+
+def test_bad_settings_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"backend\.dim"):
+        OracleBackend(dim=32)
+    with pytest.raises(ValueError, match="negative"):
+        OracleBackend(depth_noise=-0.1)
