@@ -1,0 +1,105 @@
+"""Every configuration file composes, instantiates, and names only arguments its constructor has."""
+
+import importlib.util
+import inspect
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.utils import get_class, instantiate
+from omegaconf import DictConfig, OmegaConf
+
+from vg2gt.paths import config_dir
+from vg2gt.training import build
+
+CONFIGS = Path(config_dir())
+OPTIONAL_PACKAGES = {"wandb": "wandb", "tensorboard": "tensorboard"}
+
+
+def names(group: str) -> list[str]:
+    return sorted(path.stem for path in (CONFIGS / group).glob("*.yaml"))
+
+
+def composed(tmp_path: Path, *overrides: str) -> DictConfig:
+    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
+        return compose("train", [f"output_dir={tmp_path}", "hydra/job_logging=default", *overrides])
+
+
+def targets(node: Any, where: str = "") -> Iterator[tuple[str, dict[str, Any]]]:
+    if isinstance(node, dict):
+        if "_target_" in node:
+            yield where, node
+        for key, value in node.items():
+            yield from targets(value, f"{where}.{key}")
+    elif isinstance(node, list):
+        for index, value in enumerate(node):
+            yield from targets(value, f"{where}[{index}]")
+
+
+def assert_signatures_fit(node: Any) -> int:
+    count = 0
+    for where, target in targets(node):
+        signature = inspect.signature(get_class(target["_target_"]))
+        takes_any = any(p.kind is inspect.Parameter.VAR_KEYWORD for p in signature.parameters.values())
+        given = {key for key in target if not (key.startswith("_") and key.endswith("_"))}
+        unknown = given - set(signature.parameters)
+        assert takes_any or not unknown, f"{where}: {target['_target_']} has no argument {sorted(unknown)}"
+        count += 1
+    return count
+
+
+GROUPS = ["backend", "model", "data", "loss", "renderer", "optimizer", "trainer", "callbacks", "logger"]
+
+
+@pytest.mark.parametrize(("group", "name"), [(group, name) for group in GROUPS for name in names(group)])
+def test_every_option_composes_and_fits_its_constructor(tmp_path: Path, group: str, name: str) -> None:
+    if name in OPTIONAL_PACKAGES and importlib.util.find_spec(OPTIONAL_PACKAGES[name]) is None:
+        pytest.skip(f"{name} is not installed (extra: log)")
+    config = composed(tmp_path, f"{group}={name}", *(["data.root=somewhere"] if name == "rgbd" else []))
+    assert assert_signatures_fit(OmegaConf.to_container(config[group], resolve=True)) >= 1
+
+
+@pytest.mark.parametrize("group", ["experiment", "ablation", "debug"])
+def test_every_preset_composes(tmp_path: Path, group: str) -> None:
+    assert names(group)
+    for name in names(group):
+        extra = ["data.root=somewhere"] if name == "paper" else []
+        config = composed(tmp_path, f"{group}={name}", *extra)
+        assert assert_signatures_fit(OmegaConf.to_container(config, resolve=True)) >= 8
+
+
+@pytest.mark.parametrize("group", ["loss", "renderer", "optimizer"])
+def test_parts_instantiate(tmp_path: Path, group: str) -> None:
+    for name in names(group):
+        assert callable(instantiate(composed(tmp_path, f"{group}={name}")[group]))
+
+
+@pytest.mark.parametrize("ablation", names("ablation"))
+def test_every_ablation_builds_what_it_says(tmp_path: Path, ablation: str) -> None:
+    run = build(
+        composed(tmp_path, f"ablation={ablation}", "trainer.accelerator=cpu", "data.cache_dir=" + str(tmp_path))
+    )
+    full = {
+        "rasterized": run.module.renderer.mode == "rasterized",
+        "wo_coarse": run.module.model.coarse is None,
+        "wo_split": run.module.model.gaussians.splits == 1,
+    }
+    assert {name for name, changed in full.items() if changed} == ({ablation} & set(full))
+
+
+def test_paper_experiment_holds_the_papers_numbers(tmp_path: Path) -> None:
+    """Paper, Implementation Details."""
+    config = composed(tmp_path, "experiment=paper", "data.root=somewhere")
+    assert config.trainer.max_steps == 420_000
+    assert config.trainer.devices == 2
+    assert config.optimizer._target_ == "torch.optim.AdamW"
+    assert (config.optimizer.lr, config.training.final_lr) == (3e-6, 1e-8)
+    assert config.model.fine.voxel_size == 0.002
+    assert config.model.fine.min_footprint == 0
+    assert config.model.gaussians.splits == 2
+    assert config.model.scale.source == "focal"
+    assert list(config.data.image_size) == [224, 448]
+    assert (config.data.min_views, config.data.max_views) == (3, 18)
+    assert config.training.render_views is None

@@ -1,0 +1,125 @@
+"""The whole forward pass on a procedural room with the simulated backbone."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.training_helpers import small_config
+from vg2gt.model import SceneScale, VG2GT
+from vg2gt.protocols import ground_truth_target_cameras, training_cameras
+from vg2gt.training import Run, build
+from vg2gt.types import Batch
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    cache = tmp_path_factory.mktemp("rooms")
+    return build(small_config(tmp_path_factory.mktemp("run"), cache, "data.image_size=[112,224]", "data.max_views=8"))
+
+
+@pytest.fixture(scope="module")
+def batch(run: Run) -> Batch:
+    run.datamodule.setup("validate")
+    return next(iter(run.datamodule.val_dataloader())).single(0)
+
+
+@pytest.fixture
+def model(run: Run) -> VG2GT:
+    return run.module.model.eval()
+
+
+def test_at_initialisation_the_second_decoding_is_the_first(model: VG2GT, batch: Batch) -> None:
+    assert model.coarse is not None
+    prediction = model(batch.context.images, batch.context.hints)
+    assert torch.equal(prediction.geometry.depth, prediction.initial.depth)
+    assert torch.equal(prediction.geometry.depth_conf, prediction.initial.depth_conf)
+
+
+def test_world_is_the_frame_of_view_zero_in_scene_units(model: VG2GT, batch: Batch) -> None:
+    prediction = model(batch.context.images, batch.context.hints)
+    assert torch.equal(prediction.geometry.cameras.world_to_camera[:, 0], torch.eye(4)[None])
+    depth = prediction.initial.depth
+    assert float(depth[depth > 0].median()) == pytest.approx(1.0, abs=1e-5)
+
+
+def test_untrained_head_renders_the_room_without_holes(run: Run, model: VG2GT, batch: Batch) -> None:
+    prediction = model(batch.context.images, batch.context.hints)
+    cameras = prediction.geometry.cameras
+    rendered = run.module.renderer(prediction.gaussians, cameras)
+    seen = prediction.geometry.depth > 0
+    assert float((rendered.depth[seen] == 0).float().mean()) < 0.005
+    error = (rendered.color - batch.context.images).abs().mean()
+    assert float(error) < 0.1
+
+
+def test_gradient_reaches_the_last_coarse_layer_first_and_the_transformer_next(run: Run, batch: Batch) -> None:
+    model = run.module.model.train()
+    assert model.coarse is not None
+    names = [name for name, _ in model.coarse.named_parameters()]
+    transformer = [name for name in names if name.startswith("ptv3.")]
+    assert transformer
+
+    def gradients() -> dict[str, float]:
+        model.zero_grad()
+        prediction = model(batch.context.images, batch.context.hints, torch.Generator().manual_seed(0))
+        prediction.geometry.depth.square().mean().backward()
+        return {n: 0.0 if p.grad is None else float(p.grad.abs().sum()) for n, p in model.coarse.named_parameters()}
+
+    saved = {name: value.clone() for name, value in model.coarse.state_dict().items()}
+    first = gradients()
+    assert all(first[name] == 0 for name in transformer)
+    moved = [name for name, size in first.items() if size > 0]
+    assert moved
+    with torch.no_grad():
+        for name, parameter in model.coarse.named_parameters():
+            if name in moved and parameter.grad is not None:
+                parameter -= 0.1 * parameter.grad.sign()
+    second = gradients()
+    assert sum(second[name] > 0 for name in transformer) > 0.9 * len(transformer)
+    prediction = model(batch.context.images, batch.context.hints)
+    assert torch.equal(prediction.geometry.cameras.world_to_camera, prediction.initial.cameras.world_to_camera)
+    assert not torch.equal(prediction.geometry.depth, prediction.initial.depth)
+    model.coarse.load_state_dict(saved)
+
+
+def test_held_out_images_never_touch_the_gaussians(model: VG2GT, batch: Batch) -> None:
+    changed = batch.images.clone()
+    changed[:, batch.num_context :] = 1 - changed[:, batch.num_context :]
+    other = replace(batch, images=changed)
+    one = model(batch.context.images, batch.context.hints).gaussians
+    two = model(other.context.images, other.context.hints).gaussians
+    assert torch.equal(one.means, two.means)
+    assert torch.equal(one.sh, two.sh)
+
+
+def test_target_cameras_of_both_protocols_agree(model: VG2GT, batch: Batch) -> None:
+    prediction = model(batch.context.images, batch.context.hints)
+    joint = training_cameras(model, batch, prediction)
+    truth = ground_truth_target_cameras(batch, prediction)
+    held_out = joint.world_to_camera[:, batch.num_context :]
+    assert joint.world_to_camera.shape[1] == batch.images.shape[1]
+    assert float((held_out[..., :3, :3] - truth.world_to_camera[..., :3, :3]).abs().max()) < 0.02
+    assert float((held_out[..., :3, 3] - truth.world_to_camera[..., :3, 3]).abs().max()) < 0.05
+
+
+def test_unknown_scale_source_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"model\.scale\.source is 'metres'"):
+        SceneScale("metres")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("source", ["metric", "focal", "normalize", "groundtruth"])
+def test_scale_sources(run: Run, batch: Batch, source: str) -> None:
+    geometry = run.module.model.backend.decode(
+        run.module.model.backend.encode(batch.context.images, batch.context.hints)
+    )
+    unit = SceneScale(source, median_depth=2.0)(geometry, batch.context.hints)  # type: ignore[arg-type]
+    valid = geometry.depth[geometry.depth > 0]
+    expected = {
+        "metric": 1.0,
+        "focal": float(geometry.cameras.intrinsics[0, 0, 0, 0]) / 300,
+        "normalize": 2.0 / float(valid.median()),
+        "groundtruth": 1.0,
+    }
+    assert float(unit) == pytest.approx(expected[source], rel=0.02)

@@ -1,0 +1,194 @@
+"""Whole runs: every ablation, backends, resume, bad input."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.training_helpers import SMALL, small_config, with_crash
+from vg2gt.checkpoints import newest_valid, read_checkpoint
+from vg2gt.training import build, train
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("rooms")
+
+
+@pytest.fixture(scope="module")
+def full_run(tmp_path_factory: pytest.TempPathFactory, cache: Path) -> Path:
+    folder = tmp_path_factory.mktemp("full")
+    train(small_config(folder, cache))
+    return folder
+
+
+VARIANTS = [
+    "ablation=rasterized",
+    "ablation=wo_depth",
+    "ablation=wo_coarse",
+    "ablation=wo_enhance",
+    "ablation=wo_split",
+    "model.gaussians.splits=1",
+    "model.gaussians.splits=2",
+    "model.gaussians.splits=4",
+    "loss=release",
+    "backend=vggt_tiny",
+    "backend=da3_tiny",
+    "data.target_views=1",
+    "data.max_images=8",
+]
+
+
+@pytest.mark.parametrize("override", VARIANTS)
+def test_fast_dev_run(tmp_path: Path, cache: Path, override: str) -> None:
+    report = train(small_config(tmp_path, cache, "debug=fast_dev_run", override))
+    assert {"psnr", "abs_rel", "decoded_abs_rel"} <= set(report["trained"])
+    assert all(value == value for value in report["trained"].values())
+    if override == "ablation=wo_coarse":
+        assert report["trained"]["decoded_abs_rel"] == report["trained"]["decoded_abs_rel_before"]
+
+
+def test_a_run_writes_its_results(full_run: Path) -> None:
+    metrics = json.loads((full_run / "metrics.json").read_text())
+    assert metrics["steps"] == 4
+    assert metrics["untrained"].keys() == metrics["trained"].keys()
+    assert "PSNR" in (full_run / "metrics.md").read_text()
+    assert (full_run / "preview.png").stat().st_size > 1000
+    assert newest_valid(full_run / "checkpoints").name == "step=4.ckpt"
+
+
+def test_checkpoint_holds_the_trained_part_only(full_run: Path) -> None:
+    checkpoint = read_checkpoint(newest_valid(full_run / "checkpoints"))
+    assert checkpoint["backend"]["name"] == "oracle"
+    assert checkpoint["state_dict"]
+    assert not [key for key in checkpoint["state_dict"] if ".backend." in key]
+
+
+def test_only_the_trained_part_changes(tmp_path: Path, cache: Path) -> None:
+    run = build(small_config(tmp_path, cache, "trainer.max_steps=2"))
+    before = {name: tensor.clone() for name, tensor in run.module.state_dict().items()}
+    run.trainer.fit(run.module, datamodule=run.datamodule)
+    changed = {name for name, tensor in run.module.state_dict().items() if not torch.equal(tensor, before[name])}
+    assert any(name.startswith("model.gaussians") for name in changed)
+    assert any(name.startswith("model.coarse") for name in changed)
+    assert not any(name.startswith("model.backend") for name in changed)
+    assert not run.module.model.backend.training
+
+
+def test_killed_and_resumed_equals_uninterrupted(tmp_path: Path, cache: Path, full_run: Path) -> None:
+    with pytest.raises(InterruptedError):
+        train(with_crash(small_config(tmp_path, cache), step=3))
+    assert newest_valid(tmp_path / "checkpoints").name == "step=2.ckpt"
+    report = train(small_config(tmp_path, cache, "ckpt=last"))
+    whole = read_checkpoint(newest_valid(full_run / "checkpoints"))
+    resumed = read_checkpoint(newest_valid(tmp_path / "checkpoints"))
+    assert resumed["global_step"] == whole["global_step"] == 4
+    for name, tensor in whole["state_dict"].items():
+        assert torch.equal(tensor, resumed["state_dict"][name]), name
+    assert report["trained"] == json.loads((full_run / "metrics.json").read_text())["trained"]
+    assert report["untrained"] == json.loads((full_run / "metrics.json").read_text())["untrained"]
+
+
+def test_sigterm_saves_and_ends(tmp_path: Path, cache: Path) -> None:
+    overrides = [*SMALL, f"output_dir={tmp_path}", f"hydra.run.dir={tmp_path}", f"data.cache_dir={cache}"]
+    overrides += ["trainer.max_steps=100000", "callbacks.checkpoint.every_n_train_steps=100000"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "vg2gt.cli", "train", *overrides], stderr=subprocess.PIPE, text=True
+    )
+    deadline = time.monotonic() + 240
+    log = tmp_path / "logs" / "metrics.csv"
+    while process.poll() is None and time.monotonic() < deadline and not log.is_file():
+        time.sleep(0.2)
+    process.send_signal(signal.SIGTERM)
+    _, errors = process.communicate(timeout=120)
+    assert process.returncode == 0, errors[-2000:]
+    saved = newest_valid(tmp_path / "checkpoints")
+    assert read_checkpoint(saved)["global_step"] >= 1
+    assert "go on with ckpt=last" in errors
+
+
+def test_a_run_never_restarts_silently(full_run: Path, cache: Path, tmp_path: Path) -> None:
+    with pytest.raises(FileExistsError, match="ckpt=last"):
+        train(small_config(full_run, cache))
+    with pytest.raises(FileNotFoundError, match="no valid checkpoint"):
+        train(small_config(tmp_path, cache, "ckpt=last"))
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        train(small_config(tmp_path, cache, "ckpt=nowhere.ckpt"))
+
+
+def test_another_backbone_is_refused(full_run: Path, cache: Path, tmp_path: Path) -> None:
+    checkpoint = newest_valid(full_run / "checkpoints")
+    with pytest.raises(ValueError, match="trained on backbone"):
+        train(small_config(tmp_path, cache, f'ckpt="{checkpoint}"', "backend.seed=1"))
+
+
+def test_another_architecture_is_refused(full_run: Path, cache: Path, tmp_path: Path) -> None:
+    checkpoint = newest_valid(full_run / "checkpoints")
+    with pytest.raises(RuntimeError):
+        train(small_config(tmp_path, cache, f'ckpt="{checkpoint}"', "model.gaussians.splits=4"))
+
+
+def test_wo_split_starts_from_a_full_model(full_run: Path, cache: Path, tmp_path: Path, caplog) -> None:
+    checkpoint = newest_valid(full_run / "checkpoints")
+    config = small_config(tmp_path, cache, "ablation=wo_split", f'init_from="{checkpoint}"', "trainer.max_steps=1")
+    report = train(config)
+    assert report["steps"] == 1
+    fresh = next(record.getMessage() for record in caplog.records if "re-initialised" in record.getMessage())
+    assert fresh == "re-initialised layers: model.gaussians.out"
+
+
+def test_non_finite_steps_are_skipped_and_then_stop_the_run(tmp_path: Path, cache: Path, caplog) -> None:
+    run = build(small_config(tmp_path, cache, "training.max_skipped=2"))
+    before = {name: tensor.clone() for name, tensor in run.module.model.gaussians.state_dict().items()}
+    forward = run.module.loss.forward
+
+    def poisoned(*args, **kwargs):
+        report = forward(*args, **kwargs)
+        object.__setattr__(report, "total", report.total + float("nan"))
+        return report
+
+    run.module.loss.forward = poisoned
+    with pytest.raises(FloatingPointError, match="2 steps in a row"):
+        run.trainer.fit(run.module, datamodule=run.datamodule)
+    assert all(torch.equal(before[k], v) for k, v in run.module.model.gaussians.state_dict().items())
+    assert "step 0 skipped" in caplog.text
+
+
+def cli(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "vg2gt.cli", "train", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, cwd=folder, timeout=300, check=False)
+
+
+def test_help_lists_every_group(tmp_path: Path) -> None:
+    shown = cli("-h", folder=tmp_path)
+    assert shown.returncode == 0
+    for group in (
+        "ablation",
+        "backend",
+        "data",
+        "debug",
+        "experiment",
+        "logger",
+        "loss",
+        "model",
+        "renderer",
+        "trainer",
+    ):
+        assert f"\n{group}: " in shown.stdout
+
+
+def test_misspelt_and_missing_are_named(tmp_path: Path) -> None:
+    misspelt = cli("model.gausians.splits=4", folder=tmp_path)
+    assert misspelt.returncode != 0
+    assert "gausians" in misspelt.stderr
+    unknown = cli("backend=dav3", folder=tmp_path)
+    assert "oracle" in unknown.stderr
+    missing = cli("data=rgbd", "data.root=not_here", folder=tmp_path)
+    assert missing.returncode != 0
+    assert "not_here" in missing.stderr
+    assert "data.root=" in missing.stderr

@@ -1,0 +1,50 @@
+"""A training run small enough for a test: two rooms of 56x112, four views."""
+
+from pathlib import Path
+from typing import Any
+
+import lightning
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig, open_dict
+
+from vg2gt.paths import config_dir
+
+SMALL = [
+    "data.image_size=[56,112]",
+    "data.train_scenes=2",
+    "data.eval_scenes=1",
+    "data.min_views=4",
+    "data.max_views=4",
+    "trainer.accelerator=cpu",
+    "trainer.enable_progress_bar=false",
+    "trainer.log_every_n_steps=1",
+    "trainer.max_steps=4",
+    "callbacks.progress_bar=null",
+    "callbacks.checkpoint.every_n_train_steps=2",
+    "training.render_views=1",
+]
+
+
+def small_config(folder: Path, cache: Path, *overrides: str) -> DictConfig:
+    """Composes the default configuration with :data:`SMALL` and ``overrides``."""
+    fixed = [f"output_dir={folder}", f"data.cache_dir={cache}", "hydra/job_logging=default"]
+    with initialize_config_dir(config_dir(), version_base="1.3"):
+        return compose("train", [*fixed, *SMALL, *overrides])
+
+
+class CrashAfter(lightning.Callback):
+    """Raises after a step, as a crash would end the process."""
+
+    def __init__(self, step: int) -> None:
+        self.step = step
+
+    def on_train_batch_end(self, trainer: lightning.Trainer, *args: Any) -> None:
+        if trainer.global_step == self.step:
+            raise InterruptedError("simulated crash")
+
+
+def with_crash(config: DictConfig, step: int) -> DictConfig:
+    """Adds a crash after ``step`` to a configuration."""
+    with open_dict(config):
+        config.callbacks.crash = {"_target_": f"{__name__}.CrashAfter", "step": step}
+    return config
