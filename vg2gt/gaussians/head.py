@@ -1,0 +1,96 @@
+"""Self-splitting Gaussian head: every voxel becomes K Gaussians (paper, Fine-level Gaussian Scene Decoding)."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal, get_args
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from vg2gt.geometry.spherical_harmonics import MAX_DEGREE, rgb_to_sh
+from vg2gt.types import Gaussians, Voxels
+
+Anchor = Literal["centroid", "center"]
+MAX_SCALE = 2.0  # voxels: the paper's bound
+INITIAL_ALPHA = 0.95  # of a voxel's K Gaussians together, before training
+
+
+class GaussianHead(nn.Module):
+    """Two-layer MLP from a voxel's feature to K sets of Gaussian parameters.
+
+    Before training a voxel's Gaussians already lie near its anchor with half a voxel's standard deviation, the
+    voxel's colour and a joint opacity of 0.95, so that coloured voxels render without holes.
+
+    Args:
+        in_channels: width of the voxel features.
+        splits: K Gaussians a voxel.
+        sh_degree: degree L of the spherical harmonics, 0 to 3.
+        anchor: means are offsets from the voxel's ``centroid`` or, as in the paper, from its ``center``.
+        max_offset: rho, largest offset along an axis in voxels.
+        hidden: width of the hidden layer; None takes ``in_channels``.
+
+    Attributes:
+        out: the last layer, whose width depends on ``splits`` and ``sh_degree``.
+    """
+
+    def __init__(
+        self,
+        in_channels: int,
+        splits: int = 2,
+        sh_degree: int = 0,
+        anchor: Anchor = "centroid",
+        max_offset: float = 1.0,
+        hidden: int | None = None,
+    ) -> None:
+        super().__init__()
+        if splits < 1:
+            raise ValueError(f"gaussians.splits must be at least 1, got {splits}")
+        if not 0 <= sh_degree <= MAX_DEGREE:
+            raise ValueError(f"gaussians.sh_degree must be 0 to {MAX_DEGREE}, got {sh_degree}")
+        if anchor not in get_args(Anchor):
+            raise ValueError(f"gaussians.anchor is {anchor!r}; choose one of {', '.join(get_args(Anchor))}")
+        self.splits = splits
+        self.sh_degree = sh_degree
+        self.anchor = anchor
+        self.max_offset = max_offset
+        bands = (sh_degree + 1) ** 2
+        self.parts = (3, 3, 4, 1, 3 * bands)
+        self.hidden = nn.Linear(in_channels, hidden or in_channels)
+        self.out = nn.Linear(hidden or in_channels, splits * sum(self.parts))
+        # Small random weights: with zeros the K splits would stay identical for ever.
+        nn.init.normal_(self.out.weight, std=0.02)
+        nn.init.zeros_(self.out.bias)
+        self.opacity_bias = _logit(1 - (1 - INITIAL_ALPHA) ** (1 / splits))
+        degrees = [degree for degree in range(sh_degree + 1) for _ in range(2 * degree + 1)]
+        gains = torch.tensor([0.1 * 0.25**degree if degree else 1.0 for degree in degrees])
+        self.sh_gain: Tensor
+        self.register_buffer("sh_gain", gains[:, None], persistent=False)
+
+    def forward(self, voxels: Voxels) -> Gaussians:
+        """Splits every voxel.
+
+        Args:
+            voxels: refined voxels of B scenes.
+
+        Returns:
+            ``M * splits`` Gaussians, those of a voxel adjacent: scales in (0, 2 v), means within ``max_offset`` v of
+            the anchor along each axis, unit quaternions.
+        """
+        raw = self.out(F.gelu(self.hidden(voxels.features))).float().unflatten(-1, (self.splits, -1))
+        offset, scale, rotation, opacity, color = raw.split(self.parts, -1)
+        size = voxels.voxel_size[voxels.batch][:, None, None]
+        anchor = voxels.centroid if self.anchor == "centroid" else voxels.centers
+        means = anchor[:, None] + self.max_offset * size * torch.tanh(offset)
+        scales = MAX_SCALE * size * torch.sigmoid(scale - math.log(3))  # sigmoid(-ln 3) = 1/4: starts at v / 2
+        quats = F.normalize(rotation + rotation.new_tensor([1.0, 0.0, 0.0, 0.0]), dim=-1)
+        opacities = torch.sigmoid(opacity[..., 0] + self.opacity_bias)
+        base = F.pad(rgb_to_sh(voxels.colors)[:, None, None], (0, 0, 0, len(self.sh_gain) - 1))
+        sh = base + self.sh_gain * color.unflatten(-1, (-1, 3))
+        batch = voxels.batch.repeat_interleave(self.splits)
+        return Gaussians(*(part.flatten(0, 1) for part in (means, quats, scales, opacities, sh)), batch=batch)
+
+
+def _logit(probability: float) -> float:
+    return math.log(probability / (1 - probability))

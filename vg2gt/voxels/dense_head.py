@@ -1,0 +1,134 @@
+"""Trainable dense prediction transformer: tapped patch tokens and the image to features at every pixel."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from vg2gt.types import Tokens
+
+
+class ResidualConvUnit(nn.Module):
+    """``x + conv(relu(conv(relu(x))))`` with 3x3 kernels."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(channels, channels, 3, padding=1)
+        self.conv2 = nn.Conv2d(channels, channels, 3, padding=1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Maps ``[N, C, H, W]`` to the same shape."""
+        return x + self.conv2(F.relu(self.conv1(F.relu(x))))
+
+
+class Reassemble(nn.Module):
+    """Tokens of one tap to a feature map at a multiple of the patch grid's resolution.
+
+    Args:
+        token_dim: token width.
+        tap_channels: width after the projection.
+        channels: width of the map.
+        factor: 4, 2, 1 or 0.5 times the patch grid.
+    """
+
+    def __init__(self, token_dim: int, tap_channels: int, channels: int, factor: float) -> None:
+        super().__init__()
+        self.norm = nn.LayerNorm(token_dim)
+        self.project = nn.Linear(token_dim, tap_channels)
+        if factor > 1:
+            size = int(factor)
+            self.resize: nn.Module = nn.ConvTranspose2d(tap_channels, tap_channels, size, stride=size)
+        elif factor == 1:
+            self.resize = nn.Identity()
+        else:
+            self.resize = nn.Conv2d(tap_channels, tap_channels, 3, stride=2, padding=1)
+        self.smooth = nn.Conv2d(tap_channels, channels, 3, padding=1, bias=False)
+
+    def forward(self, tokens: Tensor, grid: tuple[int, int]) -> Tensor:
+        """Maps ``[N, P, D]`` tokens on a ``(rows, columns)`` grid to ``[N, C, factor rows, factor columns]``."""
+        # Rows of pixels in memory order: the permuted view is already channels-last, the convolutions' fast layout.
+        features = self.project(self.norm(tokens)).unflatten(1, grid).permute(0, 3, 1, 2)
+        return self.smooth(self.resize(features))
+
+
+class DenseHead(nn.Module):
+    """DPT over the tapped layers with a small image merger (paper, Fine-level Gaussian Scene Decoding).
+
+    The tokens' pyramid is fused from coarse to fine as in the depth head; its finest level, brought to full
+    resolution bilinearly, meets a shallow convolution of the image, which alone carries detail below a patch.
+
+    Args:
+        token_dims: width of each tapped layer, shallow to deep.
+        patch_size: pixels a patch.
+        features: width of the pyramid.
+        out_channels: width of the result.
+        merge_channels: width at full resolution before the last convolution; None takes ``out_channels``.
+        tap_channels: width of every tap before fusion; None uses ``features`` for all.
+        finest: resolution of the shallowest tap over the patch grid, 4, 2 or 1; each next tap has half, down to 0.5.
+        views_per_chunk: views decoded at a time, which bounds the peak memory of inference.
+    """
+
+    def __init__(
+        self,
+        token_dims: Sequence[int],
+        patch_size: int,
+        features: int = 256,
+        out_channels: int = 128,
+        merge_channels: int | None = None,
+        tap_channels: Sequence[int] | None = None,
+        finest: int = 4,
+        views_per_chunk: int = 8,
+    ) -> None:
+        super().__init__()
+        widths = [features] * len(token_dims) if tap_channels is None else list(tap_channels)
+        if len(widths) != len(token_dims):
+            raise ValueError(
+                f"dense_head.tap_channels has {len(widths)} entries, but the backend taps {len(token_dims)} layers"
+            )
+        if finest not in (1, 2, 4):
+            raise ValueError(f"dense_head.finest must be 1, 2 or 4, got {finest}")
+        factors = [max(finest / 2**i, 0.5) for i in range(len(token_dims))]
+        self.patch_size = patch_size
+        self.out_channels = out_channels
+        self.views_per_chunk = views_per_chunk
+        self.reassemble = nn.ModuleList(
+            Reassemble(dim, width, features, factor)
+            for dim, width, factor in zip(token_dims, widths, factors, strict=True)
+        )
+        self.refine_skip = nn.ModuleList(ResidualConvUnit(features) for _ in token_dims[1:])
+        self.refine = nn.ModuleList(ResidualConvUnit(features) for _ in token_dims)
+        merge_channels = merge_channels or out_channels
+        self.reduce = nn.Conv2d(features, merge_channels, 3, padding=1)
+        self.image = nn.Conv2d(3, merge_channels, 3, padding=1)
+        self.merge = nn.Conv2d(merge_channels, out_channels, 3, padding=1)
+
+    def forward(self, tokens: Tokens, images: Tensor) -> Tensor:
+        """Decodes features.
+
+        Args:
+            tokens: ``[B, V, P, D]`` a tap.
+            images: ``[B, V, 3, H, W]`` in [0, 1].
+
+        Returns:
+            ``[B * V, out_channels, H, W]``, laid out channels-last in memory.
+        """
+        taps = [tap.flatten(0, 1) for tap in tokens.patch]
+        pictures = images.flatten(0, 1)
+        chunks = [
+            self._decode([tap[rows] for tap in taps], tokens.grid, pictures[rows])
+            for rows in (slice(i, i + self.views_per_chunk) for i in range(0, len(pictures), self.views_per_chunk))
+        ]
+        return chunks[0] if len(chunks) == 1 else torch.cat(chunks)
+
+    def _decode(self, taps: list[Tensor], grid: tuple[int, int], images: Tensor) -> Tensor:
+        maps = [layer(tap, grid) for layer, tap in zip(self.reassemble, taps, strict=True)]
+        fused = self.refine[-1](maps[-1])
+        for i in range(len(maps) - 2, -1, -1):
+            fused = F.interpolate(fused, size=maps[i].shape[-2:], mode="bilinear", align_corners=False)
+            fused = self.refine[i](fused + self.refine_skip[i](maps[i]))
+        coarse = F.interpolate(self.reduce(fused), size=images.shape[-2:], mode="bilinear", align_corners=False)
+        detail = self.image((2 * images - 1).contiguous(memory_format=torch.channels_last))
+        return self.merge(F.gelu(coarse + detail))

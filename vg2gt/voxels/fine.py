@@ -1,0 +1,154 @@
+"""Fine-level voxels: dense features of all views pooled into small cells and refined (paper, Fine-level decoding)."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from vg2gt.geometry.cameras import unproject
+from vg2gt.types import Geometry, Tokens, Voxels
+from vg2gt.voxels.dense_head import DenseHead
+from vg2gt.voxels.grid import VoxelPlan, in_range, plan_voxels, point_cells, pool_mean, pool_min, scene_voxel_size
+from vg2gt.voxels.pointmlp import PointMLP
+
+log = logging.getLogger(__name__)
+
+EXTRA_CHANNELS = 8  # colour (3), position of the centroid in the cell (3), number of points, confidence
+
+
+class FineModule(nn.Module):
+    """Pools the dense features, colours and positions of all pixels into voxels and refines them.
+
+    A pixel's place within its cell enters its feature before pooling, so that the pooled feature can tell how the
+    surface runs through the cell.
+
+    Args:
+        token_dims: width of each tapped layer.
+        patch_size: pixels a patch.
+        dense_head: makes the dense head from ``token_dims`` and ``patch_size``.
+        point_mlp: makes the voxel network from ``in_channels``.
+        voxel_size: edge length in scene units.
+        min_footprint: smallest edge in pixels at the scene's median depth; 0 switches the guard off.
+        max_voxels: most voxels a scene; beyond it the least confident are dropped, with a warning in the log. None
+            keeps all.
+
+    Attributes:
+        out_channels: width of the refined features.
+    """
+
+    def __init__(
+        self,
+        token_dims: Sequence[int],
+        patch_size: int,
+        dense_head: Callable[..., DenseHead],
+        point_mlp: Callable[..., PointMLP],
+        voxel_size: float = 0.002,
+        min_footprint: float = 1.0,
+        max_voxels: int | None = None,
+    ) -> None:
+        super().__init__()
+        self.voxel_size = voxel_size
+        self.min_footprint = min_footprint
+        self.max_voxels = max_voxels
+        self.dense_head = dense_head(token_dims=token_dims, patch_size=patch_size)
+        width = self.dense_head.out_channels
+        self.point_offset = nn.Linear(3, width, bias=False)
+        self.point_mlp = point_mlp(in_channels=width + EXTRA_CHANNELS)
+        self.out_channels = self.point_mlp.out_channels
+
+    def forward(self, tokens: Tokens, geometry: Geometry, images: Tensor) -> Voxels:
+        """Builds the fine voxels of B scenes.
+
+        Args:
+            tokens: enhanced tokens.
+            geometry: decoded depth, confidence and cameras, in scene units and the frame of context view 0.
+            images: ``[B, V, 3, H, W]`` in [0, 1].
+
+        Returns:
+            Refined voxels; differentiable in features, confidence and positions, not in which pixel lies where.
+
+        Raises:
+            ValueError: if a scene spans too many voxels to be numbered.
+        """
+        dense = self.dense_head(tokens, images).permute(0, 2, 3, 1).flatten(0, 2)
+        with torch.autocast(images.device.type, enabled=False):
+            size = scene_voxel_size(geometry, self.voxel_size, self.min_footprint)
+            points = _Points(geometry, size)
+            plan = self._plan(points)
+            features = F.gelu(torch.addmm(dense.float(), points.offset, self.point_offset.weight.t()))
+            pooled = pool_mean(features, points.confidence, plan)
+            colors = pool_mean(images.float().permute(0, 1, 3, 4, 2).reshape(-1, 3), points.confidence, plan)
+            offset = pool_mean(points.offset, points.confidence, plan)
+            confidence = pool_min(points.confidence, plan)
+            count = plan.counts.to(pooled.dtype)
+            density = torch.log(count / _scene_medians(count, plan.batch))
+            extra = torch.cat((2 * colors - 1, 2 * offset, density[:, None], confidence.log()[:, None]), -1)
+            # Not grid * size + ...: centre plus offset keeps the centroid inside its cell in float32.
+            centroid = (plan.grid + 0.5 + offset.double()) * size.double()[plan.batch, None]
+        refined = self.point_mlp(torch.cat((pooled, extra), -1), plan.grid, plan.batch, size)
+        return Voxels(refined, colors, plan.grid, plan.batch, confidence, count, centroid.to(pooled.dtype), size)
+
+    def _plan(self, points: _Points) -> VoxelPlan:
+        plan = plan_voxels(points.cells, points.batch, points.valid)
+        if self.max_voxels is None:
+            return plan
+        keep = _most_confident(pool_min(points.confidence.detach(), plan), plan.batch, self.max_voxels)
+        dropped = int((~keep).sum())
+        if not dropped:
+            return plan
+        lost = int(plan.counts[~keep].sum())
+        log.warning(
+            "fine.max_voxels=%d a scene: dropped the %d least confident of %d voxels (%d of %d points)",
+            self.max_voxels, dropped, len(plan), lost, len(plan.order),
+        )  # fmt: skip
+        return plan.select(keep)
+
+
+class _Points:
+    """All pixels as points, invalid ones replaced by finite stand-ins that no voxel uses.
+
+    Attributes:
+        batch: ``[N]`` scene index.
+        valid: ``[N]`` bool.
+        confidence: ``[N]`` > 0.
+        cells: ``[N, 3]`` float64 positions in voxel units.
+        offset: ``[N, 3]`` positions within the cell, from its centre, in [-1/2, 1/2]; differentiable.
+    """
+
+    def __init__(self, geometry: Geometry, voxel_size: Tensor) -> None:
+        depth, confidence = geometry.depth.float(), geometry.depth_conf.float()
+        usable = torch.isfinite(depth) & (depth > 0) & torch.isfinite(confidence) & (confidence > 0)
+        points = unproject(torch.where(usable, depth, 1.0), geometry.cameras).flatten(0, -2)
+        scenes, per_scene = len(depth), depth[0].numel()
+        self.batch = torch.arange(scenes, device=depth.device).repeat_interleave(per_scene)
+        self.confidence = torch.where(usable, confidence, 1.0).flatten()
+        self.cells = point_cells(points, self.batch, voxel_size)
+        near = in_range(self.cells.detach())
+        self.valid = usable.flatten() & near
+        self.offset = (self.cells - self.cells.detach().floor() - 0.5).float()
+        far = int((usable.flatten() & ~near).sum())
+        if far:
+            log.warning("left out %d of %d points too far away to be numbered", far, usable.numel())
+
+
+def _most_confident(confidence: Tensor, batch: Tensor, limit: int) -> Tensor:
+    """``[M]`` bool: the ``limit`` most confident voxels of every scene."""
+    keep = torch.ones_like(batch, dtype=torch.bool)
+    begin = 0
+    for count in torch.bincount(batch).tolist():
+        if count > limit:
+            least = confidence[begin : begin + count].argsort(stable=True)[: count - limit]
+            keep[begin + least] = False
+        begin += count
+    return keep
+
+
+def _scene_medians(values: Tensor, batch: Tensor) -> Tensor:
+    """The median of ``[M]`` values within each voxel's scene, ``[M]``."""
+    counts = torch.bincount(batch)
+    medians = [part.median() if len(part) else part.new_ones(()) for part in values.split(counts.tolist())]
+    return torch.stack(medians)[batch] if medians else values

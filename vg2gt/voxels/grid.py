@@ -1,0 +1,205 @@
+"""World-anchored voxels: which point lies in which cell, and confidence-weighted pooling (paper, eqn voxelfeature)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from vg2gt.types import Geometry
+
+MAX_CELLS = 1 << 20  # cells either side of the origin; serialisation codes hold 21 bits an axis
+
+
+@dataclass(frozen=True)
+class VoxelPlan:
+    """Membership of N points in M voxels. Voxels are sorted by (scene, x, y, z).
+
+    Attributes:
+        grid: ``[M, 3]`` int64 cell index, ``floor(x / voxel_size)``.
+        batch: ``[M]`` int64 scene index, sorted.
+        order: rows of the points that lie in a voxel, sorted by voxel, ties in input order.
+        starts: ``[M]`` where each voxel begins in ``order``.
+        counts: ``[M]`` int64 points in each voxel.
+        voxel_of: ``[N]`` voxel of every point, -1 for points that were left out.
+    """
+
+    grid: Tensor
+    batch: Tensor
+    order: Tensor
+    starts: Tensor
+    counts: Tensor
+    voxel_of: Tensor
+
+    def __len__(self) -> int:
+        return self.grid.shape[0]
+
+    def select(self, keep: Tensor) -> VoxelPlan:
+        """Returns the plan of the voxels where ``keep`` ``[M]`` bool is true; points of the others are left out."""
+        new_index = torch.where(keep, keep.cumsum(0) - 1, -1)
+        new_index = torch.cat((new_index, new_index.new_tensor([-1])))  # -1 stays -1
+        counts = self.counts[keep]
+        return VoxelPlan(
+            grid=self.grid[keep],
+            batch=self.batch[keep],
+            order=self.order[torch.repeat_interleave(keep, self.counts)],
+            starts=counts.cumsum(0) - counts,
+            counts=counts,
+            voxel_of=new_index[self.voxel_of],
+        )
+
+
+def mixed_radix_keys(grid: Tensor, batch: Tensor, margin: int = 0) -> tuple[Tensor, tuple[int, int, int]]:
+    """One collision-free int64 key a cell, ordered like (scene, x, y, z).
+
+    Args:
+        grid: ``[M, 3]`` int64 cells, any sign.
+        batch: ``[M]`` int64 scene index >= 0.
+        margin: cells to leave free on every side, so that keys of neighbours up to ``margin`` away never wrap.
+
+    Returns:
+        The keys ``[M]`` and the key differences of one step along x, y and z.
+
+    Raises:
+        ValueError: if the cells span more than int64 can number.
+    """
+    if not len(grid):
+        return batch, (1, 1, 1)
+    low = grid.amin(0)
+    extent: list[int] = (grid.amax(0) - low + 1 + 2 * margin).tolist()
+    scenes = int(batch.max()) + 1
+    if scenes * extent[0] * extent[1] * extent[2] >= 1 << 63:
+        raise ValueError(
+            f"{scenes} scenes of {extent[0]} x {extent[1]} x {extent[2]} voxels cannot be numbered in 63 bits; "
+            "raise the voxel size or leave far points out"
+        )
+    steps = (extent[1] * extent[2], extent[2], 1)
+    x, y, z = (grid - low + margin).unbind(-1)
+    return ((batch * extent[0] + x) * extent[1] + y) * extent[2] + z, steps
+
+
+def point_cells(points: Tensor, batch: Tensor, voxel_size: Tensor) -> Tensor:
+    """Positions in units of voxels.
+
+    Args:
+        points: ``[N, 3]``, float32 or better (bfloat16 puts most points into another 2 mm cell).
+        batch: ``[N]`` scene index.
+        voxel_size: ``[B]`` edge length in scene units.
+
+    Returns:
+        ``[N, 3]`` float64. Division, not multiplication by 1/v, so that points on faces fall as the definition says.
+    """
+    sizes = voxel_size.double() if len(voxel_size) == 1 else voxel_size.double()[batch, None]
+    return points.double() / sizes
+
+
+def in_range(cells: Tensor) -> Tensor:
+    """``[N]`` bool: finite cells ``[N, 3]`` close enough to the origin to be numbered."""
+    return (cells.abs() < MAX_CELLS).all(-1)
+
+
+def plan_voxels(cells: Tensor, batch: Tensor, valid: Tensor) -> VoxelPlan:
+    """Groups points by cell.
+
+    Args:
+        cells: ``[N, 3]`` positions in units of voxels; rows that are not valid may hold anything.
+        batch: ``[N]`` int64 scene index.
+        valid: ``[N]`` bool, the points to use; they must be finite.
+
+    Returns:
+        The plan; deterministic, and independent of the order of points up to the order within a voxel.
+
+    Raises:
+        ValueError: if the points span more cells than int64 can number.
+    """
+    everything = bool(valid.all())
+    rows = None if everything else valid.nonzero()[:, 0]
+    floors = torch.floor(cells.detach() if rows is None else cells.detach()[rows]).long()
+    scenes = batch if rows is None else batch[rows]
+    keys, order = torch.sort(mixed_radix_keys(floors, scenes)[0], stable=True)
+    _, inverse, counts = torch.unique_consecutive(keys, return_inverse=True, return_counts=True)
+    starts = counts.cumsum(0) - counts
+    first = order[starts]
+    point_rows = order if rows is None else rows[order]
+    voxel_of = torch.full_like(batch, -1)
+    voxel_of[point_rows] = inverse
+    return VoxelPlan(floors[first], scenes[first], point_rows, starts, counts, voxel_of)
+
+
+class _WeightedMean(torch.autograd.Function):
+    """``sum n f / sum n`` over every voxel; the backward pass only gathers, so it is fast and deterministic."""
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, weights: Tensor, plan: VoxelPlan) -> Tensor:
+        dtype = torch.promote_types(values.dtype, torch.float32)
+        ordered = weights.to(dtype)[plan.order]
+        total = torch.segment_reduce(ordered, "sum", lengths=plan.counts, unsafe=True)
+        share = ordered / torch.repeat_interleave(total, plan.counts)
+        mean = F.embedding_bag(plan.order, values.to(dtype), plan.starts, mode="sum", per_sample_weights=share)
+        ctx.save_for_backward(values, weights, total, mean)
+        ctx.plan = plan
+        return mean
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, Tensor | None, None]:  # pyright: ignore
+        (grad,) = grad_outputs
+        values, weights, total, mean = ctx.saved_tensors
+        plan: VoxelPlan = ctx.plan
+        rows = plan.voxel_of.clamp(min=0)
+        used = plan.voxel_of >= 0
+        inverse_total = torch.where(used, 1 / total.index_select(0, rows), 0)
+        grad_rows = grad.index_select(0, rows)
+        grad_values = grad_weights = None
+        if ctx.needs_input_grad[1]:
+            along = (grad_rows * values).sum(-1) - (grad * mean).sum(-1).index_select(0, rows)
+            grad_weights = torch.where(used, along * inverse_total, 0).to(weights.dtype)
+        if ctx.needs_input_grad[0]:
+            grad_values = grad_rows.mul_((weights * inverse_total)[:, None]).to(values.dtype)
+        return grad_values, grad_weights, None
+
+
+def pool_mean(values: Tensor, weights: Tensor, plan: VoxelPlan) -> Tensor:
+    """Confidence-weighted mean over every voxel (paper, eqn voxelfeature, first line).
+
+    Args:
+        values: ``[N, C]``; points that the plan left out must be finite too.
+        weights: ``[N]`` confidence > 0, finite.
+        plan: the voxels.
+
+    Returns:
+        ``[M, C]``, float32 or better, differentiable in values and weights.
+    """
+    if not len(plan):  # nothing to pool; the sum keeps the autograd graph
+        return values[:0].to(torch.promote_types(values.dtype, torch.float32)) * weights[:0, None]
+    return _WeightedMean.apply(values, weights, plan)  # pyright: ignore[reportReturnType]
+
+
+def pool_min(values: Tensor, plan: VoxelPlan) -> Tensor:
+    """Smallest value ``[M]`` of the points' ``[N]`` in every voxel (paper, eqn voxelfeature, second line)."""
+    ordered = values[plan.order]
+    return torch.segment_reduce(ordered, "min", lengths=plan.counts, unsafe=True) if len(plan) else ordered
+
+
+def scene_voxel_size(geometry: Geometry, voxel_size: float, min_footprint: float) -> Tensor:
+    """Edge length of a scene's voxels: the configured one, but never below a number of pixels at the median depth.
+
+    Args:
+        geometry: depth and cameras in scene units.
+        voxel_size: edge length in scene units.
+        min_footprint: smallest edge in pixels, ``min_footprint * median(depth) / focal``; 0 switches it off.
+
+    Returns:
+        ``[B]`` float32, detached.
+    """
+    sizes = []
+    for depth, intrinsics in zip(geometry.depth.detach(), geometry.cameras.intrinsics.detach(), strict=True):
+        valid = depth[(depth > 0) & torch.isfinite(depth)]
+        size = torch.full((), voxel_size, dtype=torch.float32, device=depth.device)
+        if min_footprint > 0 and valid.numel():
+            focal = intrinsics[..., [0, 1], [0, 1]].mean()
+            size = torch.maximum(size, (min_footprint * valid.median() / focal).float())
+        sizes.append(size)
+    return torch.stack(sizes)

@@ -1,0 +1,73 @@
+"""Nearest voxels and distance-weighted interpolation at points (paper, after eqn ptvzengqiang)."""
+
+from __future__ import annotations
+
+import torch
+from scipy.spatial import KDTree
+from torch import Tensor
+from torch.nn import functional as F
+
+CHUNK = 1 << 26  # distances held at once
+
+
+def nearest_neighbors(queries: Tensor, points: Tensor, neighbors: int) -> Tensor:
+    """Indices of the nearest points, nearest first.
+
+    Args:
+        queries: ``[N, 3]``.
+        points: ``[M, 3]``, M >= 1.
+        neighbors: how many; at most M are found.
+
+    Returns:
+        ``[N, min(neighbors, M)]`` int64. Exact: a k-d tree on the CPU, chunks of all distances elsewhere.
+    """
+    count = min(neighbors, len(points))
+    queries, points = queries.detach(), points.detach()
+    if queries.device.type == "cpu":
+        tree = KDTree(points.numpy())
+        index = tree.query(queries.numpy(), k=list(range(1, count + 1)), workers=torch.get_num_threads())[1]
+        return torch.from_numpy(index).long().reshape(len(queries), count)
+    parts = [
+        torch.cdist(part, points, compute_mode="donot_use_mm_for_euclid_dist").topk(count, largest=False).indices
+        for part in queries.split(max(1, CHUNK // len(points)))
+    ]
+    return torch.cat(parts) if parts else torch.empty((0, count), dtype=torch.int64, device=queries.device)
+
+
+def interpolation_weights(
+    queries: Tensor, query_batch: Tensor, points: Tensor, point_batch: Tensor, neighbors: int
+) -> tuple[Tensor, Tensor]:
+    """Neighbours within each scene and their weights ``1 / (d^2 + 1e-6)``, normalised to sum 1.
+
+    Args:
+        queries: ``[N, 3]`` in voxel units, the unit of d.
+        query_batch: ``[N]`` scene index, sorted.
+        points: ``[M, 3]`` in voxel units.
+        point_batch: ``[M]`` scene index, sorted; every scene with queries has at least one point.
+        neighbors: how many a query; a scene with fewer points uses them all.
+
+    Returns:
+        Rows of ``points`` ``[N, neighbors]`` (row 0 with weight 0 where there is none) and weights ``[N, neighbors]``,
+        differentiable in queries and points.
+    """
+    index = torch.zeros(len(queries), neighbors, dtype=torch.int64, device=queries.device)
+    found = torch.zeros_like(index, dtype=torch.bool)
+    for scene in query_batch.unique().tolist():
+        rows = slice(*_bounds(query_batch, scene))
+        first, last = _bounds(point_batch, scene)
+        nearest = nearest_neighbors(queries[rows], points[first:last], neighbors)
+        index[rows, : nearest.shape[1]] = nearest + first
+        found[rows, : nearest.shape[1]] = True
+    squared = (queries[:, None] - points[index]).square().sum(-1)
+    weights = torch.where(found, 1 / (squared + 1e-6), 0)
+    return index, weights / weights.sum(1, keepdim=True)
+
+
+def interpolate(features: Tensor, index: Tensor, weights: Tensor) -> Tensor:
+    """Weighted sums of neighbours' features: ``[M, C]`` with ``[N, k]`` index and weights gives ``[N, C]``."""
+    return F.embedding_bag(index, features, mode="sum", per_sample_weights=weights)
+
+
+def _bounds(batch: Tensor, scene: int) -> tuple[int, int]:
+    first, last = torch.searchsorted(batch, torch.tensor([scene, scene + 1], device=batch.device)).tolist()
+    return first, last

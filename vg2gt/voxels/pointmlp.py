@@ -1,0 +1,133 @@
+"""PointMLP over windows of serialised voxels, linear in their number (paper, eqn pointmlp)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+from torch.utils.checkpoint import checkpoint
+
+from vg2gt.voxels.serialization import Order, Windows, make_windows, relative_grid, serial_keys
+
+STAGE_ORDERS: tuple[Order, ...] = ("hilbert", "hilbert-trans", "z", "z-trans")
+
+
+class ResidualPointBlock(nn.Module):
+    """``x + W2 relu(W1 LN(x))`` on every row."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.norm = nn.LayerNorm(channels)
+        self.fc1 = nn.Linear(channels, channels)
+        self.fc2 = nn.Linear(channels, channels)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Maps ``[..., C]`` to ``[..., C]``."""
+        return x + self.fc2(F.relu(self.fc1(self.norm(x))))
+
+
+class GeometricStage(nn.Module):
+    """One stage: geometric affine, residual MLP, max over the window, residual MLP, residual update.
+
+    Args:
+        channels: feature width C.
+    """
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.alpha = nn.Parameter(torch.ones(channels + 3))
+        self.beta = nn.Parameter(torch.zeros(channels + 3))
+        self.inner = nn.Linear(2 * channels + 3, channels)
+        self.before = ResidualPointBlock(channels)
+        self.after = ResidualPointBlock(channels)
+        self.out = nn.Linear(2 * channels, channels)
+        self.gamma = nn.Parameter(torch.ones(channels))
+
+    def forward(self, features: Tensor, positions: Tensor, windows: Windows) -> Tensor:
+        """Updates ``[M, C]`` features of voxels at ``[M, 3]`` positions (voxel units)."""
+        updates = []
+        for group in windows.groups:
+            rows = group.rows.flatten()
+            local = features.index_select(0, rows).unflatten(0, group.rows.shape)
+            place = positions.index_select(0, rows).unflatten(0, group.rows.shape).to(local.dtype)
+            normalized = torch.cat((_standardize(local, group.scene), _standardize(place, group.scene)), -1)
+            affine = torch.addcmul(self.beta, self.alpha, normalized)
+            hidden = self.before(self.inner(torch.cat((affine, local), -1)))
+            context = self.after(hidden.amax(1))
+            # W_o [h | g], the window's half computed once a window
+            weight_hidden, weight_context = self.out.weight.chunk(2, 1)
+            update = F.linear(hidden, weight_hidden, self.out.bias) + F.linear(context, weight_context)[:, None]
+            updates.append(update.flatten(0, 1))
+        update = updates[0] if len(updates) == 1 else torch.cat(updates)
+        return features + self.gamma * update.index_select(0, windows.owner)
+
+
+def _standardize(values: Tensor, scene: Tensor) -> Tensor:
+    """Deviations of ``[W, K, C]`` from their window's mean, over one standard deviation a scene."""
+    deviation = values - values.mean(1, keepdim=True)
+    per_window = deviation.square().mean((1, 2))
+    total = per_window.new_zeros(int(scene[-1]) + 1).index_add(0, scene, per_window)
+    windows = torch.bincount(scene).clamp(min=1)
+    sigma = (total / windows + 1e-10).sqrt()[scene]  # the constant keeps the root differentiable for single voxels
+    return deviation / (sigma[:, None, None] + 1e-5)
+
+
+class PointMLP(nn.Module):
+    """Refines voxel features with their neighbours along space-filling curves.
+
+    The original's farthest-point sampling and nearest neighbours are quadratic; here a local group is a window of
+    consecutive voxels of a curve, another curve every stage, odd stages shifted by half a window.
+
+    Args:
+        in_channels: channels of the pooled features.
+        channels: width C.
+        stages: number of stages.
+        window: voxels a local group.
+        checkpoint: recomputes each stage in the backward pass to save memory.
+    """
+
+    def __init__(
+        self, in_channels: int, channels: int = 128, stages: int = 2, window: int = 32, checkpoint: bool = False
+    ) -> None:
+        super().__init__()
+        self.out_channels = channels
+        self.window = window
+        self.checkpoint = checkpoint
+        self.embed = nn.Sequential(nn.Linear(in_channels, channels), nn.LayerNorm(channels), nn.ReLU())
+        self.stages = nn.ModuleList(GeometricStage(channels) for _ in range(stages))
+
+    def forward(self, features: Tensor, grid: Tensor, batch: Tensor, voxel_size: Tensor) -> Tensor:
+        """Refines features.
+
+        Args:
+            features: ``[M, in_channels]``.
+            grid: ``[M, 3]`` int64 cells.
+            batch: ``[M]`` scene index, sorted.
+            voxel_size: ``[B]`` edge lengths, named in errors.
+
+        Returns:
+            ``[M, channels]``.
+
+        Raises:
+            ValueError: if a scene spans too many voxels to be serialised.
+        """
+        features = self.embed(features)
+        if not len(features):
+            return features
+        local = relative_grid(grid, batch)
+        positions = local.float()
+        for stage, windows in zip(self.stages, self._windows(local, batch, voxel_size), strict=True):
+            if self.checkpoint and torch.is_grad_enabled():
+                features = checkpoint(stage, features, positions, windows, use_reentrant=False)
+            else:
+                features = stage(features, positions, windows)
+        return features
+
+    def _windows(self, grid: Tensor, batch: Tensor, voxel_size: Tensor) -> list[Windows]:
+        orders = STAGE_ORDERS[: len(self.stages)]
+        counts = torch.bincount(batch).tolist()
+        curves = [torch.argsort(key) for key in serial_keys(grid, batch, voxel_size, orders)]
+        return [
+            make_windows(curves[i % len(curves)], counts, self.window, shift=self.window // 2 * (i % 2))
+            for i in range(len(self.stages))
+        ]

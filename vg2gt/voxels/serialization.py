@@ -1,0 +1,176 @@
+"""Space-filling curves through voxels, and windows of consecutive voxels along them (Point Transformer V3)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import torch
+from torch import Tensor
+
+Order = Literal["z", "z-trans", "hilbert", "hilbert-trans"]
+ORDERS: tuple[Order, ...] = get_args(Order)
+MAX_BITS = 21  # a code takes three times as many bits of an int64
+
+
+def _spread_bits(values: Tensor) -> Tensor:
+    """Moves bit i of 21-bit integers to bit 3 i, by doubling the gaps between halves."""
+    for shift, mask in (
+        (32, 0x1F00000000FFFF),
+        (16, 0x1F0000FF0000FF),
+        (8, 0x100F00F00F00F00F),
+        (4, 0x10C30C30C30C30C3),
+        (2, 0x1249249249249249),
+    ):
+        values = (values | values << shift) & mask
+    return values
+
+
+def _interleave(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
+    return _spread_bits(x) << 2 | _spread_bits(y) << 1 | _spread_bits(z)
+
+
+def z_codes(grid: Tensor) -> Tensor:
+    """Morton codes ``[M]`` of cells ``[M, 3]`` with 0 <= coordinate < 2^21; x holds the highest bit of each triple."""
+    return _interleave(*grid.unbind(-1))
+
+
+def hilbert_codes(grid: Tensor, bits: int) -> Tensor:
+    """Hilbert codes of cells (J. Skilling, "Programming the Hilbert curve", 2004, vectorised over cells).
+
+    Args:
+        grid: ``[M, 3]`` int64 with 0 <= coordinate < 2^bits.
+        bits: bits an axis, 1 to 21.
+
+    Returns:
+        ``[M]`` int64 < 2^(3 bits); cells with consecutive codes share a face, and dropping the last three bits
+        gives the code of the parent cell.
+    """
+    axes = list(grid.unbind(-1))
+    for level in range(bits - 1, 0, -1):
+        below = (1 << level) - 1
+        for i in range(3):
+            is_set = (axes[i] >> level & 1).bool()
+            swapped = (axes[0] ^ axes[i]) & below
+            # A set bit inverts the lower bits of x; a clear one exchanges them with those of axis i.
+            axes[0] = axes[0] ^ torch.where(is_set, below, swapped)
+            if i:
+                axes[i] = axes[i] ^ torch.where(is_set, 0, swapped)
+    # Gray-encode across the axes, then along the bits.
+    axes[1] = axes[1] ^ axes[0]
+    axes[2] = axes[2] ^ axes[1]
+    flip = torch.zeros_like(axes[0])
+    for level in range(bits - 1, 0, -1):
+        flip = flip ^ torch.where((axes[2] >> level & 1).bool(), (1 << level) - 1, 0)
+    return _interleave(*(axis ^ flip for axis in axes))
+
+
+def serial_codes(grid: Tensor, bits: int, order: Order) -> Tensor:
+    """Codes ``[M]`` of cells ``[M, 3]`` in one of the orders; the transposed ones exchange x and y.
+
+    Unused leading bits turn a Hilbert curve by a third of a full turn each; rounding their number up to a multiple of
+    three makes a cell's code independent of ``bits``, and so of the other scenes in a batch.
+    """
+    if order.endswith("-trans"):
+        grid = grid[:, [1, 0, 2]]
+    return z_codes(grid) if order.startswith("z") else hilbert_codes(grid, -(-bits // 3) * 3)
+
+
+def relative_grid(grid: Tensor, batch: Tensor) -> Tensor:
+    """Cells ``[M, 3]`` relative to their own scene's smallest, so that a code depends on no other scene."""
+    if not len(grid):
+        return grid
+    low = grid.new_zeros(int(batch.max()) + 1, 3)
+    low.scatter_reduce_(0, batch[:, None].expand_as(grid), grid, "amin", include_self=False)
+    return grid - low[batch]
+
+
+def serial_keys(
+    grid: Tensor, batch: Tensor, voxel_size: Tensor, orders: Sequence[Order], min_bits: int = 1
+) -> list[Tensor]:
+    """Sort keys ``scene << 3 bits | code``, one ``[M]`` tensor an order.
+
+    Args:
+        grid: ``[M, 3]`` cells relative to their scene's smallest.
+        batch: ``[M]`` scene index.
+        voxel_size: ``[B]`` edge lengths, for the error's message only.
+        orders: the wanted orders.
+        min_bits: bits an axis at least, so that keys can be shifted to parents this many times.
+
+    Raises:
+        ValueError: if code and scene index do not fit into 63 bits, or an axis not into 21.
+    """
+    extent = int(grid.max()) + 1
+    bits = max(min_bits, (extent - 1).bit_length())
+    if bits > MAX_BITS or 3 * bits + int(batch.max()).bit_length() > 63:
+        sizes = ", ".join(f"{size:g}" for size in voxel_size.tolist())
+        raise ValueError(
+            f"a scene spans {extent} voxels along an axis (voxel size {sizes}, {int(batch.max()) + 1} scenes); with "
+            f"the scene index that exceeds 63 bits of serial code; raise voxel_size or min_footprint"
+        )
+    scene = batch << (3 * bits)
+    return [scene | serial_codes(grid, bits, order) for order in orders]
+
+
+@dataclass(frozen=True)
+class WindowGroup:
+    """Windows of one length. Scenes shorter than the wanted length make a group of their own.
+
+    Attributes:
+        rows: ``[W, K]`` voxels of every window.
+        scene: ``[W]`` the windows' scenes.
+    """
+
+    rows: Tensor
+    scene: Tensor
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Windows of consecutive voxels along a curve, never across scenes; every voxel is owned by exactly one.
+
+    A window that would stick out at an end of its scene slides inwards and overlaps its neighbour, so no padding and
+    no mask is ever needed; of the overlap it owns nothing.
+
+    Attributes:
+        groups: the windows, grouped by length.
+        owner: ``[M]`` for every voxel its place in the concatenation of all groups' ``rows.flatten()``.
+    """
+
+    groups: tuple[WindowGroup, ...]
+    owner: Tensor
+
+
+def make_windows(order: Tensor, counts: list[int], length: int, shift: int = 0) -> Windows:
+    """Cuts the serialised voxels of every scene into windows.
+
+    Args:
+        order: ``[M]`` voxels along the curve, scene after scene.
+        counts: voxels of each scene.
+        length: voxels a window; a scene with fewer makes one window of what it has.
+        shift: the first window starts this many voxels before the scene does, 0 <= shift < length.
+    """
+    by_length: dict[int, list[tuple[Tensor, Tensor, int]]] = {}
+    begin = 0
+    for scene, count in enumerate(counts):
+        if not count:
+            continue
+        size = min(length, count)
+        first = -shift if count > length else 0
+        starts = torch.arange(first, count, size, device=order.device)
+        inside = starts.clamp(0, count - size)
+        places = inside[:, None] + torch.arange(size, device=order.device)
+        owned = (places >= starts[:, None]) & (places < starts[:, None] + size)
+        by_length.setdefault(size, []).append((order[begin + places], owned, scene))
+        begin += count
+    groups, owned_rows = [], []
+    for parts in by_length.values():
+        scenes = torch.cat([torch.full((len(rows),), scene, device=order.device) for rows, _, scene in parts])
+        groups.append(WindowGroup(torch.cat([rows for rows, _, _ in parts]), scenes))
+        owned_rows += [owned.flatten() for _, owned, _ in parts]
+    rows = torch.cat([group.rows.flatten() for group in groups])
+    places = torch.cat(owned_rows).nonzero()[:, 0]
+    owner = torch.empty_like(order)
+    owner[rows[places]] = places
+    return Windows(tuple(groups), owner)
