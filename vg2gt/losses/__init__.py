@@ -1,1 +1,8 @@
-"""To be filled."""
+"""Training losses; :class:`VG2GTLoss` puts them together."""
+
+from vg2gt.losses.enhancement import EnhancementLoss
+from vg2gt.losses.gaussian import GaussianLoss
+from vg2gt.losses.geometry import GeometryLoss
+from vg2gt.losses.objective import LossReport, ScaleAlignment, VG2GTLoss
+
+__all__ = ["EnhancementLoss", "GaussianLoss", "GeometryLoss", "LossReport", "ScaleAlignment", "VG2GTLoss"]

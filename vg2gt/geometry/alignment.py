@@ -1,0 +1,158 @@
+"""Bringing a prediction into another unit or frame: one scale from depth, one similarity from cameras."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+
+from vg2gt.types import Cameras, TensorRecord
+
+SUBSAMPLE = 64
+MIN_DEPTH = 0.01
+
+
+def weighted_median(values: Tensor, weights: Tensor) -> Tensor:
+    """Lower weighted median along the last axis.
+
+    Args:
+        values: ``[..., N]``; entries of weight 0 may be anything.
+        weights: ``[..., N]``, not negative.
+
+    Returns:
+        ``[...]``: the smallest value up to which half of the weight lies, a minimiser of ``sum w |m - x|``; NaN where
+        all weights are 0.
+    """
+    ordered, order = torch.where(weights > 0, values, torch.inf).sort(-1)
+    cumulative = torch.gather(weights, -1, order).double().cumsum(-1)
+    total = cumulative[..., -1:]
+    index = (cumulative < 0.5 * total).sum(-1, keepdim=True)
+    return torch.where(total > 0, torch.gather(ordered, -1, index), torch.nan)[..., 0]
+
+
+def fit_depth_scale(predicted: Tensor, reference: Tensor, valid: Tensor, per_view: bool = False) -> Tensor:
+    """The scale ``argmin_s sum w |s d_hat - d|``, ``w = 1 / max(d, 0.01)``, of each scene (paper, appendix, wmed).
+
+    Its exact solution is the median of ``d / d_hat`` under the weights ``w d_hat``. Every view is first subsampled to
+    at most 64 x 64 pixels, taking in each cell the valid pixel nearest to its centre.
+
+    Args:
+        predicted: ``[B, V, H, W]`` depth in its own unit.
+        reference: ``[B, V, H, W]`` depth in the unit wanted.
+        valid: ``[B, V, H, W]`` bool; pixels where either depth is not positive are left out as well.
+        per_view: fit every view on its own.
+
+    Returns:
+        ``[B]``, or ``[B, V]`` if per view, without a graph; NaN where no pixel is valid.
+    """
+    predicted, reference = predicted.detach(), reference.detach()
+    valid = valid & (predicted > 0) & (reference > 0) & predicted.isfinite() & reference.isfinite()
+    pixels = _nearest_valid_pixels(valid)
+    predicted, reference, valid = (torch.gather(x.flatten(2), 2, pixels) for x in (predicted, reference, valid))
+    weights = torch.where(valid, predicted / reference.clamp(min=MIN_DEPTH), 0.0)
+    ratios = reference / torch.where(valid, predicted, 1.0)
+    if not per_view:
+        ratios, weights = ratios.flatten(1), weights.flatten(1)
+    return weighted_median(ratios, weights)
+
+
+def _nearest_valid_pixels(valid: Tensor) -> Tensor:
+    """Flat indices ``[B, V, cells]`` of the valid pixel nearest to each cell's centre (any pixel if none is valid)."""
+    table = _cell_pixels(valid.shape[-2], valid.shape[-1]).to(valid.device)
+    first = valid.flatten(2)[:, :, table].to(torch.uint8).argmax(-1, keepdim=True)
+    return torch.gather(table.expand(*valid.shape[:2], -1, -1), 3, first)[..., 0]
+
+
+@lru_cache(maxsize=8)
+def _cell_pixels(height: int, width: int) -> Tensor:
+    """Pixels of every subsampling cell, nearest to its centre first: ``[cells, most pixels in a cell]``, padded."""
+    rows, columns = min(height, SUBSAMPLE), min(width, SUBSAMPLE)
+    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    row, column = y * rows // height, x * columns // width
+    cell = (row * columns + column).flatten()
+    off_y = (y + 0.5) / height * rows - row - 0.5
+    off_x = (x + 0.5) / width * columns - column - 0.5
+    distance = ((off_y * height / rows) ** 2 + (off_x * width / columns) ** 2).flatten()
+    nearest_first = distance.argsort(stable=True)
+    order = nearest_first[cell[nearest_first].argsort(stable=True)]
+    count = torch.bincount(cell, minlength=rows * columns)
+    start = count.cumsum(0) - count
+    slot = torch.minimum(torch.arange(int(count.max())), count[:, None] - 1)
+    return order[start[:, None] + slot]
+
+
+@dataclass(frozen=True)
+class Similarity(TensorRecord):
+    """Similarities ``x -> scale * rotation @ x + translation`` of B scenes.
+
+    Attributes:
+        scale: ``[B]`` > 0.
+        rotation: ``[B, 3, 3]``.
+        translation: ``[B, 3]``.
+    """
+
+    scale: Tensor
+    rotation: Tensor
+    translation: Tensor
+
+    def apply(self, points: Tensor) -> Tensor:
+        """Maps points ``[B, ..., 3]``."""
+        flat = points.reshape(points.shape[0], -1, 3) @ self.rotation.transpose(-1, -2)
+        return (self.scale[:, None, None] * flat + self.translation[:, None]).reshape(points.shape)
+
+    def apply_cameras(self, cameras: Cameras) -> Cameras:
+        """Moves cameras into the target frame: centres like points, orientations turned, intrinsics kept."""
+        rotation = cameras.world_to_camera[..., :3, :3] @ self.rotation[:, None].transpose(-1, -2)
+        translation = -rotation @ self.apply(_centers(cameras))[..., None]
+        top = torch.cat((rotation, translation), -1)
+        pose = torch.cat((top, cameras.world_to_camera[..., 3:, :]), -2)
+        return Cameras(pose, cameras.intrinsics, cameras.size)
+
+
+def align_cameras(predicted: Cameras, reference: Cameras) -> Similarity:
+    """The similarity that brings predicted cameras onto reference cameras of the same views.
+
+    The rotation is the orthogonal Procrustes solution for the centres (Umeyama) and the orientations together, both
+    normalised, so that one camera, two cameras or cameras on a line are no special cases. Scale and translation follow
+    from the centres by least squares; cameras that do not move have scale 1.
+
+    Args:
+        predicted: B scenes, V views.
+        reference: the same views in another frame and unit.
+
+    Returns:
+        ``[B]`` similarities from the predicted to the reference frame, computed in float64, in the input's dtype.
+    """
+    dtype = predicted.world_to_camera.dtype
+    source, target = (_centers(cameras).double() for cameras in (predicted, reference))
+    source_mean, target_mean = source.mean(1), target.mean(1)
+    source, target = source - source_mean[:, None], target - target_mean[:, None]
+    spread = source.square().sum((1, 2)).sqrt() * target.square().sum((1, 2)).sqrt()
+
+    covariance = target.transpose(-1, -2) @ source
+    from_centers = covariance / spread.clamp(min=torch.finfo(torch.float64).tiny)[:, None, None]
+    orientations = [cameras.world_to_camera[..., :3, :3].double() for cameras in (predicted, reference)]
+    from_orientations = (orientations[1].transpose(-1, -2) @ orientations[0]).mean(1)
+    rotation = _nearest_rotation(from_centers + from_orientations)
+
+    scale = (covariance * rotation).sum((1, 2)) / source.square().sum((1, 2))
+    moves = source.square().sum((1, 2)).sqrt() > 1e-6 * source_mean.norm(dim=-1).clamp(min=1e-6)
+    scale = torch.where(moves & (scale > 0), scale, 1.0)
+    translation = target_mean - scale[:, None] * (rotation @ source_mean[..., None])[..., 0]
+    return Similarity(scale.to(dtype), rotation.to(dtype), translation.to(dtype))
+
+
+def _centers(cameras: Cameras) -> Tensor:
+    """Camera centres ``[B, V, 3]`` in the world frame."""
+    pose = cameras.world_to_camera
+    return -(pose[..., :3, :3].transpose(-1, -2) @ pose[..., :3, 3:])[..., 0]
+
+
+def _nearest_rotation(matrix: Tensor) -> Tensor:
+    """The rotation R that maximises ``trace(R^T M)`` for each ``[B, 3, 3]``."""
+    u, _, vh = torch.linalg.svd(matrix)
+    sign = torch.ones_like(matrix[:, 0])
+    sign[:, 2] = torch.linalg.det(u @ vh).sign()
+    return (u * sign[:, None]) @ vh

@@ -1,0 +1,67 @@
+"""Surface normals of depth maps, without forming points.
+
+A pixel's ray is ``r = (u, v, 1)`` and its point ``d r``. The chord between the points of its left and right neighbours,
+of depths d0 and d1, is ``(d1 - d0) r + (d1 + d0) / fx e_x``; with the chord of the column, the cross product is
+proportional to ``(gx, gy, -1 - u gx - v gy)``, ``gx = fx (d1 - d0) / (d1 + d0)`` and gy likewise. It depends on depth
+ratios only, never vanishes, and always faces the camera.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+
+def ray_slopes(intrinsics: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """Returns u ``[..., 1, W]`` and v ``[..., H, 1]`` of the rays ``(u, v, 1)`` of all pixels.
+
+    Args:
+        intrinsics: ``[..., 3, 3]`` in pixels, integer pixel centres.
+        size: image ``(height, width)``.
+    """
+    height, width = size
+    x = torch.arange(width, dtype=intrinsics.dtype, device=intrinsics.device)
+    y = torch.arange(height, dtype=intrinsics.dtype, device=intrinsics.device)[:, None]
+    fx, fy, cx, cy = (intrinsics[..., i, j, None, None] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    return (x - cx) / fx, (y - cy) / fy
+
+
+def normal_from_slopes(gx: Tensor, gy: Tensor, u: Tensor, v: Tensor) -> Tensor:
+    """Unit camera-frame normals ``[..., 3, H, W]`` from depth slopes ``[..., H, W]`` (module docstring)."""
+    normal = torch.stack((gx, gy, -1 - u * gx - v * gy), -3)
+    return normal / normal.square().sum(-3, keepdim=True).sqrt()
+
+
+def normals_from_depth(depth: Tensor, intrinsics: Tensor, edge_threshold: float = 0.05) -> tuple[Tensor, Tensor]:
+    """Camera-frame normals by central differences of unprojected points.
+
+    Args:
+        depth: ``[..., H, W]`` z-depth in any unit, 0 = invalid.
+        intrinsics: ``[..., 3, 3]`` in pixels, integer pixel centres.
+        edge_threshold: largest relative depth difference between a pixel and one of its four neighbours; beyond it lies
+            a depth edge, across which no surface has a normal.
+
+    Returns:
+        Unit normals ``[..., 3, H, W]`` facing the camera (0 where invalid), differentiable in the depth with finite
+        gradients, and their validity ``[..., H, W]``: interior pixels that are valid with their four neighbours and do
+        not touch a depth edge.
+    """
+    present = depth > 0
+    filled = torch.where(present, depth, 1.0)
+    center = filled[..., 1:-1, 1:-1]
+    left, right = filled[..., 1:-1, :-2], filled[..., 1:-1, 2:]
+    up, down = filled[..., :-2, 1:-1], filled[..., 2:, 1:-1]
+
+    valid = present[..., 1:-1, 1:-1]
+    neighbours = (present[..., 1:-1, :-2], present[..., 1:-1, 2:], present[..., :-2, 1:-1], present[..., 2:, 1:-1])
+    for neighbour, neighbour_depth in zip(neighbours, (left, right, up, down), strict=True):
+        valid = valid & neighbour & ((neighbour_depth - center).abs() <= edge_threshold * center)
+
+    u, v = ray_slopes(intrinsics, (depth.shape[-2], depth.shape[-1]))
+    gx = intrinsics[..., 0, 0, None, None] * (right - left) / (right + left)
+    gy = intrinsics[..., 1, 1, None, None] * (down - up) / (down + up)
+    gx, gy = torch.where(valid, gx, 0.0), torch.where(valid, gy, 0.0)
+    normals = normal_from_slopes(gx, gy, u[..., 1:-1], v[..., 1:-1, :])
+    normals = torch.where(valid[..., None, :, :], normals, 0.0)
+    return F.pad(normals, (1, 1, 1, 1)), F.pad(valid, (1, 1, 1, 1))

@@ -1,0 +1,133 @@
+"""Losses on rendered views: colour, structure, depth and normals (paper, eqn gsloss)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from kornia.metrics import ssim
+from torch import Tensor
+
+from vg2gt.geometry.normals import normals_from_depth
+from vg2gt.types import Cameras, Render, TensorRecord
+
+NORMAL_TARGETS = ("render", "decoded", "gt")
+SSIM_WINDOW = 11  # kornia's Gaussian window has a standard deviation of 1.5 pixels
+
+
+@dataclass(frozen=True)
+class RenderTargets(TensorRecord):
+    """What R rendered views of one scene are compared with.
+
+    Attributes:
+        images: ``[R, 3, H, W]`` in [0, 1].
+        depth: ``[R, H, W]`` true depth in the losses' unit.
+        valid: ``[R, H, W]`` bool, where the true depth is to be used.
+        intrinsics: ``[R, 3, 3]`` true intrinsics.
+        decoded: ``[R, H, W]`` decoded depth in the losses' unit.
+        decoded_conf: ``[R, H, W]`` its confidence.
+        decoded_valid: ``[R, H, W]`` bool, False for views without decoded depth (held-out ones).
+        comparable: whether decoded and rendered depth are in a known unit.
+    """
+
+    images: Tensor
+    depth: Tensor
+    valid: Tensor
+    intrinsics: Tensor
+    decoded: Tensor
+    decoded_conf: Tensor
+    decoded_valid: Tensor
+    comparable: Tensor
+
+
+@dataclass(frozen=True)
+class GaussianLoss:
+    """Losses of the rendered views of one scene.
+
+    Depth terms count pixels that have a rendered depth and enough opacity: a hole is not a surface at depth 0. Decoded
+    depth and confidence are constants here; otherwise the backbone's enhancement would lower its own confidence to
+    escape the loss.
+
+    Args:
+        weight: of the whole group.
+        color_l1: weight of the L1 colour error.
+        ssim: weight of ``1 - SSIM`` (11 x 11 window, sigma 1.5).
+        depth_consistency: weight of the L1 distance to the decoded depth.
+        depth_gt: weight of the L1 distance to the true depth.
+        normal: weight of ``1 - cos`` between rendered normals and normals of a depth map, in the camera frame.
+        normal_target: the depth map whose normals are meant: ``render``, ``decoded`` or ``gt``.
+        confidence_weighted: weight pixels compared with the decoded depth by its confidence.
+        min_alpha: smallest accumulated opacity of a pixel that counts in depth and normal terms.
+
+    Raises:
+        ValueError: if ``normal_target`` is not one of these.
+    """
+
+    weight: float = 1.0
+    color_l1: float = 1.0
+    ssim: float = 1.0
+    depth_consistency: float = 1.0
+    depth_gt: float = 1.0
+    normal: float = 1.0
+    normal_target: str = "decoded"
+    confidence_weighted: bool = True
+    min_alpha: float = 0.5
+
+    def __post_init__(self) -> None:
+        if self.normal_target not in NORMAL_TARGETS:
+            raise ValueError(f"loss.gaussian.normal_target must be one of {NORMAL_TARGETS}, got {self.normal_target!r}")
+
+    def hits(self, rendered: Render) -> Tensor:
+        """Pixels ``[B, R, H, W]`` that show a surface."""
+        return (rendered.depth > 0) & (rendered.alpha > self.min_alpha)
+
+    def __call__(self, rendered: Render, cameras: Cameras, targets: RenderTargets, scale: Tensor) -> dict[str, Tensor]:
+        """Computes the unweighted terms of one scene.
+
+        Args:
+            rendered: R views of the scene (B = 1), depth in scene units.
+            cameras: the cameras they were rendered with (B = 1).
+            targets: what they should show.
+            scale: ``[R]`` losses' unit per scene unit, a constant.
+
+        Returns:
+            Scalars with graph, named like the weights.
+        """
+        color, hits = rendered.color[0], self.hits(rendered)[0]
+        depth = torch.where(hits, rendered.depth[0], 1.0)
+        scaled = depth * scale[:, None, None]
+        decoded, trust = targets.decoded.detach(), targets.decoded_conf.detach()
+        trust = trust if self.confidence_weighted else torch.ones_like(trust)
+        near_decoded = hits & targets.decoded_valid & targets.comparable
+        return {
+            "color_l1": (color - targets.images).abs().mean(),
+            "ssim": (1 - ssim(color, targets.images, SSIM_WINDOW)).mean(),
+            "depth_consistency": weighted_mean((scaled - decoded).abs(), trust, near_decoded),
+            "depth_gt": weighted_mean((scaled - targets.depth).abs(), torch.ones_like(scaled), hits & targets.valid),
+            "normal": self._normal(rendered, cameras, targets, hits, trust),
+        }
+
+    def total(self, terms: dict[str, Tensor]) -> Tensor:
+        """The weighted sum of the terms."""
+        return self.weight * torch.stack([getattr(self, name) * value for name, value in terms.items()]).sum()
+
+    def _normal(
+        self, rendered: Render, cameras: Cameras, targets: RenderTargets, hits: Tensor, trust: Tensor
+    ) -> Tensor:
+        if self.normal_target == "render":
+            expected, valid = normals_from_depth(torch.where(hits, rendered.depth[0], 0.0), cameras.intrinsics[0])
+        elif self.normal_target == "decoded":
+            decoded = torch.where(targets.decoded_valid, targets.decoded.detach(), 0.0)
+            expected, valid = normals_from_depth(decoded, cameras.intrinsics[0])
+        else:
+            expected, valid = normals_from_depth(torch.where(targets.valid, targets.depth, 0.0), targets.intrinsics)
+        weights = trust if self.normal_target == "decoded" else torch.ones_like(trust)
+        length = (rendered.normal[0].square().sum(1) + 1e-12).sqrt()
+        cosine = (rendered.normal[0] * expected).sum(1) / length
+        return weighted_mean(1 - cosine, weights, hits & valid)
+
+
+def weighted_mean(values: Tensor, weights: Tensor, mask: Tensor) -> Tensor:
+    """Mean of the masked values under positive weights; a zero with graph where the mask is empty."""
+    weights = torch.where(mask, weights, 0.0)
+    return (torch.where(mask, values, 0.0) * weights).sum() / weights.sum().clamp(min=torch.finfo(weights.dtype).tiny)

@@ -1,0 +1,243 @@
+"""VGGT's training losses for depth and point map (paper, Training).
+
+The predicted point map is the unprojected predicted depth, so both tasks are computed in the predicted cameras' frames:
+distances and angles do not change under a common rotation, and the ground truth can be brought there without a graph.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from vg2gt.geometry.cameras import invert_rigid
+from vg2gt.geometry.normals import normal_from_slopes, ray_slopes
+from vg2gt.geometry.rotations import matrix_to_quat
+from vg2gt.losses.truth import Truth
+from vg2gt.types import Cameras
+
+MAX_ERROR = 100.0
+SMALLEST_SQUARE = 1e-20  # keeps the square root's derivative finite
+QUANTILE_PIXELS = 1000
+DEPTH_STRIDES = (1, 2, 4, 8)
+POINT_STRIDES = (1, 2, 4)
+CORNERS = ((1, 1), (1, -1), (-1, 1), (-1, -1))
+
+
+@dataclass(frozen=True)
+class TaskLoss:
+    """The three parts of one task's loss, scalars with graph.
+
+    Attributes:
+        conf: confidence-weighted error.
+        reg: plain error.
+        grad: error of differences between neighbours.
+    """
+
+    conf: Tensor
+    reg: Tensor
+    grad: Tensor
+
+    @property
+    def total(self) -> Tensor:
+        """``conf + reg + grad``."""
+        return self.conf + self.reg + self.grad
+
+
+@dataclass(frozen=True)
+class GeometryLoss:
+    """Depth and point-map losses of one scene.
+
+    For the error ``l = |y_hat - y|`` (not squared) and confidence c: ``conf = mean_q(gamma c l - alpha log c)`` and
+    ``reg = mean_q(l)`` over one set of pixels, those whose l is at or below its ``quantile``, values clamped to 100;
+    ``grad`` compares neighbours at several strides. Scenes with fewer than 100 valid pixels give a zero with graph.
+
+    Args:
+        depth: weight of the depth task.
+        point: weight of the point-map task.
+        gamma: weight of the confidence-weighted error.
+        alpha: weight of the confidence's logarithm.
+        quantile: share of the pixels kept; up to 1000 pixels all are.
+    """
+
+    depth: float = 1.0
+    point: float = 1.0
+    gamma: float = 1.0
+    alpha: float = 0.2
+    quantile: float = 0.98
+
+    def __call__(
+        self, depth: Tensor, depth_conf: Tensor, cameras: Cameras, truth: Truth, valid: Tensor
+    ) -> tuple[TaskLoss, TaskLoss]:
+        """Computes both tasks of one scene.
+
+        Args:
+            depth: ``[1, V, H, W]`` predicted depth in the truth's unit.
+            depth_conf: ``[1, V, H, W]`` its confidence > 0.
+            cameras: predicted cameras in the frame of view 0, translations in the truth's unit.
+            truth: ground truth of the same scene and views.
+            valid: ``[1, V, H, W]`` bool, the pixels to compare.
+
+        Returns:
+            The depth task's and the point-map task's losses.
+        """
+        if not bool(truth.known[0]):
+            nothing = _zero_with_graph(depth, depth_conf)
+            return TaskLoss(nothing, nothing, nothing), TaskLoss(nothing, nothing, nothing)
+        # Where nothing is compared the prediction becomes the truth: no infinity or hole reaches the gradients.
+        depth = torch.where(valid, depth, truth.depth)[0]
+        conf = torch.where(valid, depth_conf, 1.0)[0]
+        reference, mask = truth.depth[0], valid[0]
+        error = depth - reference
+        depth_task = TaskLoss(*self._value_terms(error.abs(), conf, mask), depth_gradient_loss(error, mask))
+        point_task = TaskLoss(
+            *self._value_terms(point_errors(depth, cameras, truth), conf, mask),
+            point_normal_loss(depth, cameras, truth, mask),
+        )
+        return depth_task, point_task
+
+    def _value_terms(self, error: Tensor, conf: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+        keep = trusted_pixels(error, valid, self.quantile)
+        count = keep.sum().clamp(min=1)
+        weighted = (self.gamma * conf * error - self.alpha * conf.log()).clamp(max=MAX_ERROR)
+        return (weighted * keep).sum() / count, (error.clamp(max=MAX_ERROR) * keep).sum() / count
+
+
+def trusted_pixels(error: Tensor, valid: Tensor, quantile: float) -> Tensor:
+    """Marks the valid pixels whose error, clamped to 100, is at or below its quantile; all if they are at most 1000."""
+    clamped = error.detach().clamp(max=MAX_ERROR)
+    values = clamped[valid]
+    if values.numel() <= QUANTILE_PIXELS:
+        return valid
+    # An order statistic keeps the same pixels as an interpolated quantile, and has no limit on their number.
+    rank = math.floor(quantile * (values.numel() - 1)) + 1
+    return valid & (clamped <= values.kthvalue(rank).values)
+
+
+def depth_gradient_loss(error: Tensor, valid: Tensor) -> Tensor:
+    """Differences of the depth error ``[V, H, W]`` between valid neighbours, a valid pixel, averaged over strides."""
+    total = error.new_zeros(())
+    for stride in DEPTH_STRIDES:
+        e, m = error[:, ::stride, ::stride], valid[:, ::stride, ::stride]
+        across = (e[..., 1:] - e[..., :-1]).abs().clamp(max=MAX_ERROR) * (m[..., 1:] & m[..., :-1])
+        down = (e[:, 1:] - e[:, :-1]).abs().clamp(max=MAX_ERROR) * (m[:, 1:] & m[:, :-1])
+        total = total + (across.sum() + down.sum()) / m.sum().clamp(min=1)
+    return total / len(DEPTH_STRIDES)
+
+
+def point_errors(depth: Tensor, cameras: Cameras, truth: Truth) -> Tensor:
+    """Distance ``[V, H, W]`` between predicted and true points, measured in each predicted camera's frame.
+
+    Args:
+        depth: ``[V, H, W]`` predicted, in the truth's unit.
+        cameras: predicted (B = 1), translations in the truth's unit.
+        truth: one scene.
+    """
+    size = (depth.shape[-2], depth.shape[-1])
+    to_predicted = (cameras.world_to_camera @ invert_rigid(truth.cameras.world_to_camera))[0]
+    u, v = ray_slopes(truth.cameras.intrinsics[0], size)
+    local = torch.stack(
+        ((truth.depth[0] * u).flatten(1), (truth.depth[0] * v).flatten(1), truth.depth[0].flatten(1)), 1
+    )
+    true_points = (to_predicted[:, :3, :3] @ local + to_predicted[:, :3, 3:]).unflatten(-1, size)
+    u, v = ray_slopes(cameras.intrinsics[0], size)
+    x, y, z = true_points.unbind(1)
+    squared = (depth * u - x).square() + (depth * v - y).square() + (depth - z).square()
+    return squared.clamp(min=SMALLEST_SQUARE).sqrt()
+
+
+def point_normal_loss(depth: Tensor, cameras: Cameras, truth: Truth, valid: Tensor) -> Tensor:
+    """``mean(1 - cos)`` between predicted and true surface normals at every stride, averaged over strides.
+
+    Each pixel has four normals, one for each pair of a horizontal and a vertical neighbour (VGGT's cross products of
+    the point map's differences), counted where the pixel and both neighbours are valid. Arguments as in
+    :func:`point_errors`; ``valid`` is ``[V, H, W]``.
+    """
+    turn = cameras.world_to_camera[0, :, :3, :3] @ truth.cameras.world_to_camera[0, :, :3, :3].transpose(-1, -2)
+    total = depth.new_zeros(())
+    for stride in POINT_STRIDES:
+        mask = valid[:, ::stride, ::stride]
+        predicted = _corner_normals(depth, cameras.intrinsics[0], stride)
+        with torch.no_grad():
+            expected = _corner_normals(truth.depth[0], truth.cameras.intrinsics[0], stride)
+        disagreement, count = depth.new_zeros(()), mask.new_zeros((), dtype=torch.long)
+        for corner, p, q in zip(CORNERS, predicted, expected, strict=True):
+            q = (turn @ q.flatten(2)).view_as(q)
+            both = _corner_mask(mask, corner)
+            disagreement = disagreement + ((1 - (p * q).sum(1)) * both).sum()
+            count = count + both.sum()
+        total = total + disagreement / count.clamp(min=1)
+    return total / len(POINT_STRIDES)
+
+
+def _corner(image: Tensor, corner: tuple[int, int]) -> Tensor:
+    """The pixels of an image ``[..., H, W]`` that have neighbours on the corner's sides (right/left, down/up)."""
+    across, down = corner
+    rows = slice(None, -1) if down > 0 else slice(1, None)
+    columns = slice(None, -1) if across > 0 else slice(1, None)
+    return image[..., rows, columns]
+
+
+def _corner_mask(valid: Tensor, corner: tuple[int, int]) -> Tensor:
+    across, down = corner
+    horizontal = _corner(valid, (-across, down))
+    vertical = _corner(valid, (across, -down))
+    return _corner(valid, corner) & horizontal & vertical
+
+
+def _corner_normals(depth: Tensor, intrinsics: Tensor, stride: int) -> list[Tensor]:
+    """Camera-frame normals ``[V, 3, h - 1, w - 1]`` for each of the four corners of the strided depth ``[V, H, W]``.
+
+    The differences to the neighbours, ``(d1 - d) r + h d1 / fx e_x`` and its like, have the cross product derived in
+    :mod:`vg2gt.geometry.normals` with ``gx = fx (d1 - d) / (h d1)``.
+    """
+    u, v = ray_slopes(intrinsics, (depth.shape[-2], depth.shape[-1]))
+    u, v = u[..., ::stride], v[..., ::stride, :]
+    depth = depth[:, ::stride, ::stride]
+    fx, fy = intrinsics[:, 0, 0, None, None] / stride, intrinsics[:, 1, 1, None, None] / stride
+    difference_x, difference_y = fx * (depth[..., 1:] - depth[..., :-1]), fy * (depth[:, 1:] - depth[:, :-1])
+    slope_x = {1: difference_x / depth[..., 1:], -1: difference_x / depth[..., :-1]}
+    slope_y = {1: difference_y / depth[:, 1:], -1: difference_y / depth[:, :-1]}
+    normals = []
+    for across, down in CORNERS:
+        rows = slice(None, -1) if down > 0 else slice(1, None)
+        columns = slice(None, -1) if across > 0 else slice(1, None)
+        gx, gy = slope_x[across][:, rows], slope_y[down][..., columns]
+        normals.append(normal_from_slopes(gx, gy, u[..., columns], v[..., rows, :]))
+    return normals
+
+
+@torch.no_grad()
+def camera_errors(cameras: Cameras, truth: Cameras) -> dict[str, Tensor]:
+    """Mean absolute errors of translation, quaternion and field of view (VGGT's pose encoding), to log only.
+
+    Args:
+        cameras: predicted cameras in the frame of view 0, translations in the truth's unit.
+        truth: ground truth of the same views.
+
+    Returns:
+        Scalars ``camera_T``, ``camera_R`` (of the nearer quaternion sign) and ``camera_F`` (radians).
+    """
+    translation = (cameras.world_to_camera[..., :3, 3] - truth.world_to_camera[..., :3, 3]).abs()
+    quats, true_quats = (matrix_to_quat(c.world_to_camera[..., :3, :3]) for c in (cameras, truth))
+    sign = torch.where((quats * true_quats).sum(-1, keepdim=True) < 0, -1.0, 1.0)
+    fields = [_field_of_view(c) for c in (cameras, truth)]
+    return {
+        "camera_T": translation.clamp(max=MAX_ERROR).mean(),
+        "camera_R": (quats * sign - true_quats).abs().mean(),
+        "camera_F": (fields[0] - fields[1]).abs().mean(),
+    }
+
+
+def _field_of_view(cameras: Cameras) -> Tensor:
+    """Vertical and horizontal field of view ``[B, V, 2]`` in radians."""
+    height, width = cameras.size
+    fx, fy = cameras.intrinsics[..., 0, 0], cameras.intrinsics[..., 1, 1]
+    return 2 * torch.stack((torch.atan(height / (2 * fy)), torch.atan(width / (2 * fx))), -1)
+
+
+def _zero_with_graph(*tensors: Tensor) -> Tensor:
+    """A zero that belongs to the graph of the tensors: sums of nothing, so that no value in them can spoil it."""
+    return torch.stack([tensor.flatten()[:0].sum() for tensor in tensors]).sum()

@@ -1,0 +1,72 @@
+"""Camera errors that do not depend on the world frame: relative poses of all pairs of views."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from vg2gt.geometry.cameras import invert_rigid
+from vg2gt.types import Cameras
+
+ACCURACIES = (5, 15, 30)
+AREAS = (3, 5, 15, 30)
+
+
+def relative_pose_errors(predicted: Cameras, reference: Cameras) -> tuple[Tensor, Tensor]:
+    """Errors of the relative pose of every pair of views.
+
+    Args:
+        predicted: B scenes, V views.
+        reference: the same views, in any world frame and unit.
+
+    Returns:
+        Rotation errors ``[B, V (V - 1) / 2]`` and errors of the direction of translation, both in degrees. As in the
+        field's evaluations a direction and its opposite count as equal, so the latter are at most 90. A pair whose
+        reference does not move has no direction and translation error 0.
+    """
+    first, second = torch.triu_indices(*(predicted.world_to_camera.shape[1],) * 2, offset=1)
+    relative = []
+    for cameras in (predicted, reference):
+        poses = cameras.world_to_camera.double()
+        relative.append(poses[:, second] @ invert_rigid(poses[:, first]))
+    difference = relative[0][..., :3, :3].transpose(-1, -2) @ relative[1][..., :3, :3]
+    axis = torch.stack([difference[..., i, j] - difference[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0))], -1)
+    trace = difference.diagonal(dim1=-2, dim2=-1).sum(-1)
+    rotation = torch.atan2(axis.norm(dim=-1), trace - 1).rad2deg()
+
+    t, t_ref = (pose[..., :3, 3] for pose in relative)
+    sine = torch.linalg.cross(t, t_ref, dim=-1).norm(dim=-1)
+    translation = torch.atan2(sine, (t * t_ref).sum(-1).abs()).rad2deg()
+    still = t.norm(dim=-1) == 0
+    translation = torch.where(still, 90.0, translation)
+    return rotation, torch.where(t_ref.norm(dim=-1) < 1e-9, 0.0, translation)
+
+
+def camera_metrics(predicted: Cameras, reference: Cameras) -> dict[str, float]:
+    """Scores the cameras of one or more scenes over all pairs of views.
+
+    Args:
+        predicted: B scenes, V >= 2 views.
+        reference: the same views.
+
+    Returns:
+        ``rra_T`` and ``rta_T``: shares of pairs whose rotation, translation error is below T = 5, 15, 30 degrees;
+        ``auc_T``, T = 3, 5, 15, 30: area under the accuracy curve of the larger of both errors up to T degrees, in
+        steps of one degree.
+
+    Raises:
+        ValueError: if there is no pair.
+    """
+    if predicted.world_to_camera.shape[1] < 2:
+        raise ValueError("camera metrics need at least 2 views a scene, got 1")
+    rotation, translation = relative_pose_errors(predicted, reference)
+    results = {f"rra_{t}": float((rotation < t).double().mean()) for t in ACCURACIES}
+    results |= {f"rta_{t}": float((translation < t).double().mean()) for t in ACCURACIES}
+    worse = torch.maximum(rotation, translation).flatten()
+    return results | {f"auc_{t}": area_under_curve(worse, t) for t in AREAS}
+
+
+def area_under_curve(errors: Tensor, threshold: int) -> float:
+    """Mean over whole degrees t = 1 .. threshold of the share of errors ``[N]`` below t degrees."""
+    steps = torch.arange(1, threshold + 1, dtype=errors.dtype, device=errors.device)
+    return float((errors[:, None] < steps).double().mean())

@@ -1,0 +1,101 @@
+"""Depth errors after alignment (paper, eqn delta_n)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from vg2gt.geometry.alignment import MIN_DEPTH, weighted_median
+
+ALIGNMENTS = ("median", "scene", "wmed", "scale_shift", "none")
+DELTAS = (1.25, 1.05, 1.03)
+SMALLEST = 1e-6
+
+
+def depth_metrics(
+    predicted: Tensor,
+    reference: Tensor,
+    alignment: str = "median",
+    min_depth: float = 0.0,
+    max_depth: float = float("inf"),
+) -> dict[str, float]:
+    """Scores the depth maps of one scene: pixels are averaged per image, images per scene.
+
+    A pixel counts where the reference is valid and in range and the prediction has a depth.
+
+    Args:
+        predicted: ``[V, H, W]`` z-depth, 0 = hole.
+        reference: ``[V, H, W]`` true z-depth, 0 = invalid.
+        alignment: ``median``: one median ratio an image; ``scene``: one median ratio a scene; ``wmed``: an image's
+            ratio that minimises the relative L1 error; ``scale_shift``: least squares an image; ``none``.
+        min_depth: reference depths below it are left out.
+        max_depth: reference depths above it are left out.
+
+    Returns:
+        ``abs_rel``, ``mae``, ``rmse`` (in the reference's unit), ``delta_1.25``, ``delta_1.05``, ``delta_1.03`` over
+        the pixels that count; ``coverage``, the share of usable reference pixels that have a depth; ``delta_*_holes``,
+        where a hole fails the test. Images without any usable pixel are left out; NaN if that leaves none.
+
+    Raises:
+        ValueError: if the shapes differ or the alignment is unknown.
+    """
+    if predicted.shape != reference.shape or predicted.dim() != 3:
+        raise ValueError(
+            f"depth maps must both be [V, H, W], got predicted {tuple(predicted.shape)} and reference "
+            f"{tuple(reference.shape)}"
+        )
+    if alignment not in ALIGNMENTS:
+        raise ValueError(f"alignment must be one of {ALIGNMENTS}, got {alignment!r}")
+    predicted, reference = predicted.double(), reference.double()
+    usable = (reference > 0) & reference.isfinite() & (reference >= min_depth) & (reference <= max_depth)
+    valid = usable & (predicted > 0) & predicted.isfinite()
+    shared = (reference[valid] / predicted[valid]).median() if alignment == "scene" and valid.any() else None
+    images = []
+    for p, r, counts, present in zip(predicted, reference, usable, valid, strict=True):
+        if not counts.any():
+            continue
+        coverage = present.sum() / counts.sum()
+        if shared is not None:
+            aligned = p[present] * shared
+        else:
+            aligned = align_depth(p[present], r[present], "none" if alignment == "scene" else alignment)
+        images.append({**_errors(aligned, r[present], coverage), "coverage": coverage})
+    names = [
+        "abs_rel",
+        "mae",
+        "rmse",
+        *(f"delta_{d}" for d in DELTAS),
+        "coverage",
+        *(f"delta_{d}_holes" for d in DELTAS),
+    ]
+    nothing = torch.tensor([torch.nan])
+    return {name: float(torch.stack([i[name] for i in images] or [nothing[0]]).nanmean()) for name in names}
+
+
+def align_depth(predicted: Tensor, reference: Tensor, alignment: str) -> Tensor:
+    """Brings the depths ``[N]`` of one image onto their references ``[N]``; see :func:`depth_metrics`."""
+    if alignment == "none" or predicted.numel() == 0:
+        return predicted
+    if alignment == "median":
+        return predicted * (reference / predicted).median()
+    if alignment == "wmed":
+        return predicted * weighted_median(reference / predicted, predicted / reference.clamp(min=MIN_DEPTH))
+    centered = predicted - predicted.mean()
+    variance = centered.square().sum()
+    scale = (centered * reference).sum() / variance if variance > 0 else torch.ones_like(variance)
+    return (reference.mean() + scale * centered).clamp(min=SMALLEST)
+
+
+def _errors(predicted: Tensor, reference: Tensor, coverage: Tensor) -> dict[str, Tensor]:
+    error = (predicted - reference).abs()
+    ratio = torch.maximum(predicted / reference, reference / predicted)
+    results = {
+        "abs_rel": (error / reference).mean(),
+        "mae": error.mean(),
+        "rmse": error.square().mean().sqrt(),
+    }
+    for delta in DELTAS:
+        share = (ratio < delta).double().mean()
+        results[f"delta_{delta}"] = share
+        results[f"delta_{delta}_holes"] = share.nan_to_num(0.0) * coverage
+    return results
