@@ -1,1 +1,7 @@
-"""To be filled."""
+"""Datasets: one interface (``SceneSource``), its loaders, view sampling and the data module."""
+
+from vg2gt.data.base import DataError, Frames, SceneSource
+from vg2gt.data.datamodule import SceneDataModule
+from vg2gt.data.synthetic import SyntheticRooms
+
+__all__ = ["DataError", "Frames", "SceneDataModule", "SceneSource", "SyntheticRooms"]

@@ -1,0 +1,73 @@
+"""What a dataset is: scenes of posed frames with depth. Every loader implements ``SceneSource`` and nothing else."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from vg2gt.types import TensorRecord
+
+
+@dataclass(frozen=True)
+class Frames(TensorRecord):
+    """Some frames of one scene, all of one size.
+
+    Attributes:
+        images: ``[V, 3, H, W]`` float32 in [0, 1].
+        depth: ``[V, H, W]`` float32 z-depth in the dataset's unit, 0 = invalid; the same pixels as ``images``.
+        world_to_camera: ``[V, 4, 4]`` float32 rigid OpenCV poses.
+        intrinsics: ``[V, 3, 3]`` float32 in pixels, integer pixel centres.
+    """
+
+    images: Tensor
+    depth: Tensor
+    world_to_camera: Tensor
+    intrinsics: Tensor
+
+
+class SceneSource(ABC):
+    """Scenes of a dataset, in the framework's conventions (``docs/conventions.md``).
+
+    A source says which scenes and frames there are without decoding them, and decodes frames when asked. It neither
+    resizes nor caches decoded frames: the data module does that for all sources. It must be picklable, and what it
+    returns must depend on its arguments only, so that worker processes agree.
+
+    Attributes:
+        is_metric: whether the unit of depth and poses is the metre.
+    """
+
+    is_metric: bool = True
+
+    @property
+    @abstractmethod
+    def scenes(self) -> Sequence[str]:
+        """Names of the scenes, unique and in a fixed order."""
+
+    @abstractmethod
+    def frames(self, scene: str) -> Sequence[int]:
+        """Ids of the scene's usable frames, in the order in which they were taken."""
+
+    def held_out(self, scene: str) -> Sequence[int]:
+        """Ids among ``frames`` that training never sees, kept as evaluation targets; none by default."""
+        return ()
+
+    @abstractmethod
+    def load(self, scene: str, frame_ids: Sequence[int]) -> Frames:
+        """Decodes frames, in the order of ``frame_ids``.
+
+        Raises:
+            DataError: if a file is missing or damaged, naming the file and the scene.
+        """
+
+
+class DataError(ValueError):
+    """A dataset is not what it should be; the message names the file, the scene and the remedy."""
+
+
+def training_frames(source: SceneSource, scene: str) -> list[int]:
+    """Frame ids of a scene that training may see: all but the held-out ones."""
+    held_out = set(source.held_out(scene))
+    return [frame for frame in source.frames(scene) if frame not in held_out]

@@ -1,0 +1,63 @@
+"""Decoded frames kept in memory, least recently used dropped first."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+
+from vg2gt.data.base import Frames, SceneSource
+from vg2gt.data.transforms import from_bytes, resize_to_cover, to_bytes
+
+
+class FrameCache:
+    """Loads frames at their final size; colour is kept as uint8, depth and cameras as they are.
+
+    Args:
+        source: where frames come from.
+        size: image ``(height, width)`` they are resized to.
+        capacity: bytes kept.
+    """
+
+    def __init__(self, source: SceneSource, size: tuple[int, int], capacity: int) -> None:
+        self.source = source
+        self.size = size
+        self.capacity = capacity
+        self._frames: OrderedDict[tuple[str, int], Frames] = OrderedDict()
+        self._used = 0
+
+    def load(self, scene: str, frame_ids: Sequence[int]) -> Frames:
+        """Returns frames of a scene in the given order, decoding those that are not in memory."""
+        missing = [frame for frame in frame_ids if (scene, frame) not in self._frames]
+        fresh = self._decode(scene, missing) if missing else {}
+        chosen = [fresh[frame] if frame in fresh else self._recall(scene, frame) for frame in frame_ids]
+        for frame, value in fresh.items():
+            self._keep((scene, frame), value)
+        return Frames(
+            from_bytes(torch.stack([frame.images for frame in chosen])),
+            torch.stack([frame.depth for frame in chosen]),
+            torch.stack([frame.world_to_camera for frame in chosen]),
+            torch.stack([frame.intrinsics for frame in chosen]),
+        )
+
+    def _decode(self, scene: str, frame_ids: Sequence[int]) -> dict[int, Frames]:
+        frames = resize_to_cover(self.source.load(scene, frame_ids), self.size)
+        frames = replace(frames, images=to_bytes(frames.images))
+        return {frame: frames.map(lambda tensor, row=row: tensor[row].clone()) for row, frame in enumerate(frame_ids)}
+
+    def _recall(self, scene: str, frame: int) -> Frames:
+        self._frames.move_to_end((scene, frame))
+        return self._frames[scene, frame]
+
+    def _keep(self, key: tuple[str, int], frames: Frames) -> None:
+        self._frames[key] = frames
+        self._used += _size(frames)
+        while self._used > self.capacity:
+            _, dropped = self._frames.popitem(last=False)
+            self._used -= _size(dropped)
+
+
+def _size(frames: Frames) -> int:
+    return frames.images.nbytes + frames.depth.nbytes + frames.world_to_camera.nbytes + frames.intrinsics.nbytes

@@ -1,0 +1,242 @@
+"""Furniture composed of boxes, cylinders and ellipsoids, with random proportions and materials.
+
+Every maker draws from the builder's random generator, places parts in its own frame (x is the front, z up, the floor at
+z = 0) and returns the radius of the free floor it needs. Lengths in metres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vg2gt.data.raycast import BOX, CYLINDER, ELLIPSOID
+from vg2gt.data.textures import Pattern
+
+Vector = Sequence[float]  # x, y, z
+
+_CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64)
+
+
+def yaw_rotation(angle: float) -> NDArray[np.float64]:
+    """Rotation by ``angle`` (rad) about the vertical, 3x3."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _tilt_rotation(angle: float) -> NDArray[np.float64]:
+    """Rotation by ``angle`` (rad) about the x axis, 3x3."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
+
+
+class Builder:
+    """Collects parts, their groups and materials while a room is furnished.
+
+    Args:
+        rng: source of every random choice.
+    """
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self.rng = rng
+        self.materials: list[list[float]] = []
+        self.kind: list[int] = []
+        self.center: list[NDArray[np.float64]] = []
+        self.axes: list[NDArray[np.float64]] = []
+        self.half: list[NDArray[np.float64]] = []
+        self.material: list[int] = []
+        self.group_start: list[int] = [0]
+        self._origin = np.zeros(3)
+        self._rotation = np.eye(3)
+
+    def place(self, position: NDArray[np.float64], yaw: float) -> None:
+        """Sets the frame in which the following parts are given, and begins a new group."""
+        self.end_group()
+        self._origin = position
+        self._rotation = yaw_rotation(yaw)
+
+    def end_group(self) -> None:
+        """Closes the current group, if it has parts; parts of a group should be close to each other."""
+        if len(self.kind) > self.group_start[-1]:
+            self.group_start.append(len(self.kind))
+
+    def new_material(self, kinds: tuple[Pattern, ...] = tuple(Pattern), frequency: tuple[float, float] = (1, 8)) -> int:
+        """Draws a material: one of ``kinds`` with a log-uniform pattern ``frequency`` (periods a metre)."""
+        rng = self.rng
+        first = rng.uniform(0.15, 0.95, 3)
+        if rng.random() < 0.4:
+            first = np.clip(first.mean() + rng.normal(0, 0.06, 3), 0.1, 0.95)
+        second = np.clip(first + rng.normal(0, 0.28, 3), 0.03, 1.0)
+        pitch = np.exp(rng.uniform(*np.log(frequency)))
+        slow = (rng.uniform(0.05, 0.25), rng.uniform(0.3, 1.5))
+        fine = (rng.uniform(0.0, 0.25), rng.uniform(8, 30))
+        kind = kinds[rng.integers(len(kinds))]
+        self.materials.append([int(kind), pitch, int(rng.integers(1 << 20)), *first, *second, *slow, *fine])
+        return len(self.materials) - 1
+
+    def box(self, center: Vector, size: Vector, material: int, turn: float = 0.0, tilt: float = 0.0) -> None:
+        """Adds a box of full edge lengths ``size``, turned about the vertical and tilted about its x axis (rad)."""
+        self._add(BOX, center, np.array(size) / 2, material, yaw_rotation(turn) @ _tilt_rotation(tilt))
+
+    def cylinder(self, center: Vector, radius: float, height: float, material: int) -> None:
+        """Adds an upright cylinder."""
+        self._add(CYLINDER, center, np.array([radius, radius, height / 2]), material, np.eye(3))
+
+    def ellipsoid(self, center: Vector, radii: Vector, material: int) -> None:
+        """Adds an ellipsoid."""
+        self._add(ELLIPSOID, center, np.array(radii), material, np.eye(3))
+
+    def _add(self, kind: int, center: Vector, half: NDArray, material: int, own: NDArray) -> None:
+        self.kind.append(kind)
+        self.center.append(self._origin + self._rotation @ np.array(center))
+        self.axes.append((self._rotation @ own).T)
+        self.half.append(half)
+        self.material.append(material)
+
+    def bounding_spheres(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Centres ``[g, 3]`` and radii ``[g]`` of spheres that hold the groups' boxes."""
+        centers, radii = [], []
+        for begin, end in zip(self.group_start[:-1], self.group_start[1:], strict=True):
+            corners = np.concatenate(
+                [self.center[i] + (_CORNERS * self.half[i]) @ self.axes[i] for i in range(begin, end)]
+            )
+            middle = (corners.min(0) + corners.max(0)) / 2
+            centers.append(middle)
+            radii.append(np.linalg.norm(corners - middle, axis=1).max() + 1e-6)
+        return np.array(centers).reshape(-1, 3), np.array(radii)
+
+
+def _legs(b: Builder, x: float, y: float, height: float, thickness: float, material: int) -> None:
+    for sx in (-1, 1):
+        for sy in (-1, 1):
+            b.box((sx * x, sy * y, height / 2), (thickness, thickness, height), material)
+
+
+def crates(b: Builder) -> float:
+    """One box or two on top of each other."""
+    size = b.rng.uniform(0.3, 0.9, 3)
+    b.box((0, 0, size[2] / 2), tuple(size), b.new_material())
+    if b.rng.random() < 0.5:
+        upper = size * b.rng.uniform(0.3, 0.7)
+        b.box((0, 0, size[2] + upper[2] / 2), tuple(upper), b.new_material(), turn=b.rng.normal(0, 0.3))
+    return 0.7 * float(max(size[:2]))
+
+
+def barrel(b: Builder) -> float:
+    """An upright cylinder."""
+    radius, height = b.rng.uniform(0.12, 0.4), b.rng.uniform(0.4, 1.4)
+    b.cylinder((0, 0, height / 2), radius, height, b.new_material())
+    return radius
+
+
+def ball(b: Builder) -> float:
+    """An ellipsoid on the floor."""
+    radius, height = b.rng.uniform(0.2, 0.5), b.rng.uniform(0.2, 0.5)
+    b.ellipsoid((0, 0, height), (radius, radius, height), b.new_material())
+    return radius
+
+
+def table(b: Builder) -> float:
+    """A table with things on it."""
+    rng = b.rng
+    length, depth, height = rng.uniform(0.7, 1.4), rng.uniform(0.6, 0.9), rng.uniform(0.6, 0.8)
+    b.box((0, 0, height), (length, depth, 0.05), b.new_material())
+    _legs(b, length / 2 - 0.06, depth / 2 - 0.06, height, 0.06, b.new_material())
+    for _ in range(rng.integers(0, 4)):
+        x, y = rng.uniform(-0.35, 0.35) * length, rng.uniform(-0.3, 0.3) * depth
+        top = height + 0.025
+        if rng.random() < 0.5:
+            size = rng.uniform(0.08, 0.3, 3)
+            b.box((x, y, top + size[2] / 2), tuple(size), b.new_material(), turn=rng.uniform(0, np.pi))
+        else:
+            tall = rng.uniform(0.1, 0.3)
+            b.cylinder((x, y, top + tall / 2), rng.uniform(0.05, 0.14), tall, b.new_material())
+    return 0.6 * length
+
+
+def chair(b: Builder) -> float:
+    """A chair."""
+    material, seat = b.new_material(), 0.45
+    b.box((0, 0, seat), (0.45, 0.45, 0.06), material)
+    b.box((-0.2, 0, seat + 0.25), (0.05, 0.45, 0.5), material)
+    _legs(b, 0.19, 0.19, seat, 0.05, b.new_material())
+    return 0.35
+
+
+def shelf(b: Builder) -> float:
+    """A shelf with books; every board is a group of its own."""
+    rng = b.rng
+    width, height, boards = rng.uniform(0.7, 1.3), rng.uniform(0.9, 2.0), int(rng.integers(2, 5))
+    material, gap = b.new_material(), height / boards
+    b.box((-0.2, 0, height / 2), (0.03, width, height), b.new_material())
+    for side in (-1, 1):
+        b.box((0, side * width / 2, height / 2), (0.35, 0.04, height), material)
+    for board in range(boards + 1):
+        b.end_group()
+        b.box((0, 0, board * gap), (0.35, width, 0.03), material)
+        y = -width / 2 + 0.06
+        while board < boards and y < width / 2 - 0.12:
+            thick = rng.uniform(0.04, 0.16)
+            if rng.random() < 0.75:
+                tall = gap * rng.uniform(0.4, 0.85)
+                lean = rng.normal(0, 0.04)
+                center = (0.0, y + thick / 2, board * gap + tall / 2 + 0.015)
+                b.box(center, (rng.uniform(0.15, 0.28), 0.85 * thick, tall), b.new_material(), tilt=lean)
+            y += thick
+    return 0.6 * width
+
+
+def sofa(b: Builder) -> float:
+    """A sofa with cushions."""
+    rng = b.rng
+    width, material = rng.uniform(1.2, 1.9), b.new_material()
+    b.box((0, 0, 0.2), (0.8, width, 0.4), material)
+    b.box((-0.3, 0, 0.6), (0.2, width, 0.45), material)
+    for side in (-1, 1):
+        b.box((0, side * (width / 2 - 0.09), 0.5), (0.8, 0.18, 0.25), material)
+    for _ in range(rng.integers(1, 4)):
+        y = rng.uniform(-0.35, 0.35) * width
+        b.box((-0.1, y, 0.58), (0.15, 0.35, 0.35), b.new_material(), turn=rng.normal(0, 0.2), tilt=rng.normal(0, 0.15))
+    return 0.6 * width
+
+
+def lamp(b: Builder) -> float:
+    """A standing lamp."""
+    height, radius = b.rng.uniform(1.2, 1.7), b.rng.uniform(0.12, 0.22)
+    b.cylinder((0, 0, height / 2), 0.03, height, b.new_material())
+    b.cylinder((0, 0, 0.015), 0.18, 0.03, b.new_material())
+    b.ellipsoid((0, 0, height), (radius, radius, 0.8 * radius), b.new_material())
+    return 0.25
+
+
+def plant(b: Builder) -> float:
+    """A pot with leaves."""
+    rng = b.rng
+    pot, height = rng.uniform(0.12, 0.22), rng.uniform(0.2, 0.4)
+    b.cylinder((0, 0, height / 2), pot, height, b.new_material())
+    leaves = b.new_material((Pattern.CLOUDS, Pattern.STRIPES, Pattern.DOTS), (4, 14))
+    for _ in range(rng.integers(4, 9)):
+        x, y = rng.normal(0, 0.13, 2)
+        radii = rng.uniform(0.05, 0.2, 3)
+        b.ellipsoid((x, y, height + rng.uniform(0.1, 0.6)), tuple(radii), leaves)
+    return 0.35
+
+
+def cabinet(b: Builder) -> float:
+    """A chest with drawers and knobs."""
+    rng = b.rng
+    width, height, rows = rng.uniform(0.6, 1.2), rng.uniform(0.6, 1.3), int(rng.integers(2, 5))
+    b.box((0, 0, height / 2), (0.45, width, height), b.new_material())
+    front, knob = b.new_material(), b.new_material((Pattern.PLAIN,))
+    for row in range(rows):
+        z = (row + 0.5) * height / rows
+        b.box((0.235, 0, z), (0.03, 0.92 * width, 0.85 * height / rows), front)
+        for side in (-1, 1):
+            b.ellipsoid((0.27, side * 0.25 * width, z), (0.025, 0.025, 0.025), knob)
+    return 0.6 * width
+
+
+MAKERS: tuple[Callable[[Builder], float], ...] = (
+    crates, barrel, ball, table, chair, shelf, sofa, lamp, plant, cabinet,
+)  # fmt: skip

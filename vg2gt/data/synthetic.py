@@ -1,0 +1,134 @@
+"""Procedural rooms as a dataset: made from a seed when first asked for, then read from a cache folder."""
+
+from __future__ import annotations
+
+import io
+import logging
+import os
+import zipfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from vg2gt.data.base import Frames, SceneSource
+from vg2gt.data.synthetic_rooms import GENERATOR_VERSION, SyntheticRoom
+from vg2gt.data.transforms import from_bytes
+from vg2gt.io.files import write_bytes
+
+log = logging.getLogger(__name__)
+
+
+class SyntheticRooms(SceneSource):
+    """Furnished rooms with exact depth and poses.
+
+    Room k of a source has the seed ``first_seed + k`` and the name ``room-<seed>``, so sources whose seed ranges do not
+    overlap share no scene.
+
+    Args:
+        num_scenes: rooms in this source.
+        first_seed: seed of the first room.
+        num_frames: frames on a room's camera path.
+        size: image ``(height, width)``; best the size that is trained on.
+        cache_dir: folder for the rendered frames (``~`` is the home folder); None keeps nothing on disk.
+    """
+
+    def __init__(
+        self,
+        num_scenes: int = 64,
+        first_seed: int = 0,
+        num_frames: int = 16,
+        size: Sequence[int] = (112, 224),
+        cache_dir: str | None = None,
+    ) -> None:
+        if num_scenes < 1 or num_frames < 1 or first_seed < 0:
+            raise ValueError(
+                "synthetic rooms need num_scenes >= 1, num_frames >= 1 and first_seed >= 0; "
+                f"got {num_scenes}, {num_frames} and {first_seed}"
+            )
+        self.num_frames = num_frames
+        self.size = (int(size[0]), int(size[1]))
+        self.cache_dir = Path(cache_dir).expanduser() if cache_dir else None
+        self._seeds = {f"room-{seed:06d}": seed for seed in range(first_seed, first_seed + num_scenes)}
+        self._names = tuple(self._seeds)
+
+    @property
+    def scenes(self) -> Sequence[str]:
+        """Names of the rooms."""
+        return self._names
+
+    def frames(self, scene: str) -> Sequence[int]:
+        """Frame numbers along the camera path."""
+        return range(self.num_frames)
+
+    def load(self, scene: str, frame_ids: Sequence[int]) -> Frames:
+        """Returns frames of a room, rendering the room if the cache does not hold it."""
+        arrays = self._read_cache(scene)
+        if arrays is None:
+            arrays = self._render(scene)
+            self._write_cache(scene, arrays)
+        rows = list(frame_ids)
+        intrinsics = torch.from_numpy(arrays["intrinsics"]).float().expand(len(rows), 3, 3)
+        return Frames(
+            from_bytes(torch.from_numpy(arrays["images"][rows])).permute(0, 3, 1, 2).contiguous(),
+            torch.from_numpy(arrays["depth"][rows]),
+            torch.from_numpy(arrays["world_to_camera"][rows]).float(),
+            intrinsics.contiguous(),
+        )
+
+    def normals(self, scene: str, frame_ids: Sequence[int]) -> torch.Tensor:
+        """Renders the exact camera-frame unit normals ``[V, 3, H, W]`` of frames; they are not cached."""
+        frames = self._room(scene).render(frame_ids, _threads())
+        return torch.from_numpy(np.stack([frame.normal for frame in frames])).permute(0, 3, 1, 2).contiguous()
+
+    def _room(self, scene: str) -> SyntheticRoom:
+        return SyntheticRoom(self._seeds[scene], self.num_frames, self.size)
+
+    def _render(self, scene: str) -> dict[str, NDArray]:
+        room = self._room(scene)
+        frames = room.render(range(self.num_frames), _threads())
+        return {
+            "images": np.stack([frame.image for frame in frames]),
+            "depth": np.stack([frame.depth for frame in frames]),
+            "world_to_camera": room.world_to_camera,
+            "intrinsics": room.intrinsics,
+        }
+
+    def cache_file(self, scene: str) -> Path | None:
+        """Where a room's frames are kept; the name holds everything that decides the pixels."""
+        if self.cache_dir is None:
+            return None
+        folder = f"rooms-v{GENERATOR_VERSION}-{self.size[0]}x{self.size[1]}x{self.num_frames}"
+        return self.cache_dir / folder / f"{scene}.npz"
+
+    def _read_cache(self, scene: str) -> dict[str, NDArray] | None:
+        """Reads a room from the cache; None, with a warning, where the file is damaged (its checksums do not fit)."""
+        path = self.cache_file(scene)
+        if path is None or not path.is_file():
+            return None
+        try:
+            with np.load(path, allow_pickle=False) as stored:
+                arrays = {name: stored[name] for name in ("images", "depth", "world_to_camera", "intrinsics")}
+        except (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile) as error:
+            log.warning("the cached room %s is damaged (%s) and is made again", path, error)
+            return None
+        shape = (self.num_frames, *self.size)
+        if arrays["images"].shape != (*shape, 3) or arrays["depth"].shape != shape:
+            log.warning("the cached room %s has another shape than %s and is made again", path, shape)
+            return None
+        return arrays
+
+    def _write_cache(self, scene: str, arrays: dict[str, NDArray]) -> None:
+        path = self.cache_file(scene)
+        if path is None:
+            return
+        buffer = io.BytesIO()
+        np.savez(buffer, allow_pickle=False, **arrays)
+        write_bytes(path, buffer.getvalue())
+
+
+def _threads() -> int:
+    """Rendering threads: all cores of this process, or one in a loader's worker, which has siblings."""
+    return 1 if torch.utils.data.get_worker_info() is not None else max(1, len(os.sched_getaffinity(0)))

@@ -1,0 +1,171 @@
+"""Procedural rooms: a furnished room, a camera path through it and the rendered frames, all from one seed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vg2gt.data.furniture import MAKERS, Builder
+from vg2gt.data.raycast import RaycastFrame, Room, render_frame
+from vg2gt.data.textures import Pattern
+
+GENERATOR_VERSION = 1  # raise it whenever the same seed would give other pixels
+
+_FLOOR_PATTERNS = (Pattern.CHECKS, Pattern.BRICKS, Pattern.CLOUDS, Pattern.WOOD, Pattern.MOSAIC, Pattern.PLANKS)
+_CEILING_PATTERNS = (Pattern.PLAIN, Pattern.CLOUDS, Pattern.BRICKS)
+_PICTURE_PATTERNS = tuple(pattern for pattern in Pattern if pattern not in (Pattern.PLAIN, Pattern.BRICKS))
+_WALL_GAP = 0.55  # metres from a wall to the middle of the furniture along it
+_TRIES = 200
+
+
+class SyntheticRoom:
+    """One furnished room with a camera path.
+
+    The world frame has its origin at the middle of the floor, z up, metres.
+
+    Args:
+        seed: decides everything, together with the number of frames.
+        num_frames: cameras on the path, at least 1.
+        size: image ``(height, width)``.
+    """
+
+    def __init__(self, seed: int, num_frames: int, size: tuple[int, int]) -> None:
+        rng = np.random.default_rng((GENERATOR_VERSION, seed))
+        extent = rng.uniform((3.5, 3.5, 2.4), (7.0, 7.0, 3.3))
+        builder = Builder(rng)
+        shell = _shell_materials(builder)
+        _hang_pictures(builder, extent)
+        occupied = _furnish(builder, extent)
+        self.room = _finish(builder, extent, shell)
+        self.size = size
+        camera_to_world = _camera_path(rng, extent, occupied, num_frames)
+        self.world_to_camera = np.linalg.inv(camera_to_world)
+        focal = 0.5 * size[1] / np.tan(rng.uniform(1.2, 1.55) / 2)
+        self.intrinsics = np.array([[focal, 0, (size[1] - 1) / 2], [0, focal, (size[0] - 1) / 2], [0, 0, 1]])
+
+    def render(self, frames: Sequence[int], threads: int) -> list[RaycastFrame]:
+        """Renders the given frames of the path, ``threads`` at a time."""
+        with ThreadPoolExecutor(threads) as pool:
+            return list(pool.map(self._render_frame, frames))
+
+    def _render_frame(self, frame: int) -> RaycastFrame:
+        return render_frame(self.room, self.world_to_camera[frame], self.intrinsics, self.size)
+
+
+def _shell_materials(builder: Builder) -> NDArray[np.int64]:
+    """Materials of the four walls, the floor and the ceiling; in half of the rooms all walls share one."""
+    own = builder.rng.random() < 0.5
+    walls = [builder.new_material() for _ in range(4)] if own else [builder.new_material()] * 4
+    return np.array([*walls, builder.new_material(_FLOOR_PATTERNS), builder.new_material(_CEILING_PATTERNS)])
+
+
+def _hang_pictures(builder: Builder, extent: NDArray[np.float64]) -> None:
+    rng = builder.rng
+    for _ in range(rng.integers(2, 7)):
+        width, height = rng.uniform(0.4, 1.6), rng.uniform(0.4, 1.2)
+        side, axis = rng.choice((-1, 1)), int(rng.integers(2))
+        position = np.array([0.0, 0.0, rng.uniform(1.0, extent[2] - 0.7)])
+        position[axis] = side * (extent[axis] / 2 - 0.02)
+        along = extent[1 - axis] / 2 - 0.8
+        position[1 - axis] = rng.uniform(-along, along)
+        builder.place(position, 0.0 if axis == 0 else np.pi / 2)
+        builder.box((0, 0, 0), (0.05, width, height), builder.new_material(_PICTURE_PATTERNS, (2, 14)))
+
+
+def _furnish(builder: Builder, extent: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Places furniture without overlap; returns ``[n, 3]`` x, y and radius of the occupied floor."""
+    rng = builder.rng
+    occupied: list[tuple[float, float, float]] = []
+    for _ in range(rng.integers(7, 14)):
+        make = MAKERS[rng.integers(len(MAKERS))]
+        for _ in range(10):
+            position, yaw = _candidate_place(rng, extent)
+            if all(np.hypot(position[0] - x, position[1] - y) > radius + 0.45 for x, y, radius in occupied):
+                builder.place(position, yaw)
+                occupied.append((position[0], position[1], make(builder)))
+                break
+    builder.end_group()
+    return np.array(occupied).reshape(-1, 3)
+
+
+def _candidate_place(rng: np.random.Generator, extent: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """A place along a wall, facing the room (60 %), or anywhere in its middle."""
+    position = np.zeros(3)
+    if rng.random() < 0.6:
+        side, axis = rng.choice((-1, 1)), int(rng.integers(2))
+        position[axis] = side * (extent[axis] / 2 - _WALL_GAP)
+        position[1 - axis] = rng.uniform(-0.42, 0.42) * extent[1 - axis]
+        front = (np.pi if side > 0 else 0.0) if axis == 0 else -side * np.pi / 2
+        return position, front + rng.normal(0, 0.1)
+    position[:2] = rng.uniform(-0.38, 0.38, 2) * extent[:2]
+    return position, rng.uniform(0, 2 * np.pi)
+
+
+def _finish(builder: Builder, extent: NDArray[np.float64], shell: NDArray[np.int64]) -> Room:
+    rng = builder.rng
+    count = int(rng.integers(1, 4))
+    position = rng.uniform(-0.4, 0.4, (count, 3)) * extent
+    position[:, 2] = extent[2] - rng.uniform(0.1, 0.5, count)
+    color = rng.uniform(0.8, 1.1, (count, 1)) * (1 + rng.uniform(-0.12, 0.12, (count, 3))) / np.sqrt(count)
+    centers, radii = builder.bounding_spheres()
+    return Room(
+        lower=np.array([-extent[0] / 2, -extent[1] / 2, 0.0]),
+        upper=np.array([extent[0] / 2, extent[1] / 2, extent[2]]),
+        shell=shell,
+        kind=np.array(builder.kind, np.int64),
+        center=np.array(builder.center).reshape(-1, 3),
+        axes=np.array(builder.axes).reshape(-1, 3, 3),
+        half=np.array(builder.half).reshape(-1, 3),
+        material=np.array(builder.material, np.int64),
+        group_start=np.array(builder.group_start, np.int64),
+        group_center=centers,
+        group_radius=radii,
+        materials=np.array(builder.materials),
+        lights=np.concatenate((position, color), 1),
+        ambient=float(rng.uniform(0.35, 0.6)),
+    )
+
+
+def _camera_path(
+    rng: np.random.Generator, extent: NDArray[np.float64], occupied: NDArray[np.float64], count: int
+) -> NDArray[np.float64]:
+    """Camera-to-world poses ``[count, 4, 4]``: an arc around free floor while the view pans and nods smoothly."""
+    s = np.linspace(0, 1, count)
+    floor = _free_arc(rng, extent, occupied, s)
+    height = rng.uniform(1.0, 1.7) + 0.15 * np.sin(s * np.pi * rng.uniform(0.5, 2) + rng.uniform(0, 6))
+    height = np.minimum(height, extent[2] - 0.4)
+    pan = rng.uniform(0, 2 * np.pi) + rng.choice((-1, 1)) * rng.uniform(1.2, 2.4) * s + 0.1 * np.sin(7 * s)
+    nod = -rng.uniform(0, 0.35) + 0.15 * np.sin(s * np.pi * rng.uniform(0.6, 2) + rng.uniform(0, 6))
+
+    forward = np.stack((np.cos(pan) * np.cos(nod), np.sin(pan) * np.cos(nod), np.sin(nod)), 1)
+    right = np.cross(forward, (0.0, 0.0, 1.0))
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, 0] = right
+    poses[:, :3, 1] = np.cross(forward, right)
+    poses[:, :3, 2] = forward
+    poses[:, :2, 3] = floor
+    poses[:, 2, 3] = height
+    return poses
+
+
+def _free_arc(
+    rng: np.random.Generator, extent: NDArray[np.float64], occupied: NDArray[np.float64], s: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Points ``[len(s), 2]`` of a circular arc, the freest of many draws: off the walls and off the furniture."""
+    best, best_clearance = np.zeros((len(s), 2)), -np.inf
+    for _ in range(_TRIES):
+        middle = rng.uniform(-0.25, 0.25, 2) * extent[:2]
+        angle = rng.uniform(0, 2 * np.pi) + rng.choice((-1, 1)) * rng.uniform(1.0, 2.2) * s
+        arc = middle + rng.uniform(0.3, 0.9) * np.stack((np.cos(angle), np.sin(angle)), 1)
+        walls = (extent[:2] / 2 - 0.4 - np.abs(arc)).min()
+        gaps = np.linalg.norm(arc[:, None] - occupied[None, :, :2], axis=-1) - occupied[None, :, 2] - 0.15
+        clearance = min(walls, gaps.min(initial=np.inf))
+        if clearance > 0:
+            return arc
+        if clearance > best_clearance:
+            best, best_clearance = arc, clearance
+    return best

@@ -1,0 +1,180 @@
+"""Procedural surface patterns, low-passed to the footprint of a pixel so that all views of a surface agree.
+
+Every pattern is a function of surface coordinates in metres and of a filter width in the pattern's own periods.
+Piecewise constant patterns are convolved with a box of that width in closed form (difference of their integral at
+both ends); noise loses the octaves that the width cannot resolve.
+"""
+
+from __future__ import annotations
+
+import math
+from enum import IntEnum
+
+import numba
+
+
+class Pattern(IntEnum):
+    """Kinds of pattern, as stored in a material."""
+
+    PLAIN = 0
+    STRIPES = 1
+    CHECKS = 2
+    BRICKS = 3
+    DOTS = 4
+    CLOUDS = 5
+    WOOD = 6
+    MOSAIC = 7
+    WEAVE = 8
+    PLANKS = 9
+
+
+PLAIN, STRIPES, CHECKS, BRICKS, DOTS, CLOUDS, WOOD, MOSAIC, WEAVE, PLANKS = (int(kind) for kind in Pattern)
+
+_MIN_WIDTH = 1e-4  # filter width below which a pattern counts as unfiltered
+
+
+@numba.njit(cache=True, error_model="numpy")
+def hash_cell(x, y, seed):
+    """Pseudo-random number in [0, 1) of an integer lattice cell."""
+    h = (x * 0x27D4EB2D + y * 0x165667B1 + seed * 0x9E3779B1) & 0xFFFFFFFF
+    h = ((h ^ (h >> 15)) * 0x2C1B3C6D) & 0xFFFFFFFF
+    h = ((h ^ (h >> 12)) * 0x297A2D39) & 0xFFFFFFFF
+    return ((h ^ (h >> 15)) & 0xFFFFFF) / 16777216.0
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _blend_cells(x, y, seed, width):
+    """Random value per unit cell, box-filtered: cells are constant, their borders ``width`` cells wide."""
+    width = min(max(width, _MIN_WIDTH), 1.0)
+    x -= 0.5
+    y -= 0.5
+    ix = math.floor(x)
+    iy = math.floor(y)
+    u = min(max((x - ix - 0.5) / width + 0.5, 0.0), 1.0)
+    v = min(max((y - iy - 0.5) / width + 0.5, 0.0), 1.0)
+    i = int(ix)
+    j = int(iy)
+    low = hash_cell(i, j, seed) * (1 - u) + hash_cell(i + 1, j, seed) * u
+    high = hash_cell(i, j + 1, seed) * (1 - u) + hash_cell(i + 1, j + 1, seed) * u
+    return low * (1 - v) + high * v
+
+
+@numba.njit(cache=True, error_model="numpy")
+def value_noise(x, y, seed):
+    """Smooth noise in [-1, 1] with unit lattice spacing."""
+    ix = math.floor(x)
+    iy = math.floor(y)
+    u = x - ix
+    v = y - iy
+    u = u * u * (3 - 2 * u)
+    v = v * v * (3 - 2 * v)
+    i = int(ix)
+    j = int(iy)
+    low = hash_cell(i, j, seed) * (1 - u) + hash_cell(i + 1, j, seed) * u
+    high = hash_cell(i, j + 1, seed) * (1 - u) + hash_cell(i + 1, j + 1, seed) * u
+    return 2 * (low * (1 - v) + high * v) - 1
+
+
+@numba.njit(cache=True, error_model="numpy")
+def fractal_noise(x, y, frequency, octaves, footprint, seed):
+    """Sum of noise octaves, each damped by ``exp(-(frequency * footprint)^2)`` and dropped below 3 %."""
+    total = 0.0
+    amplitude = 1.0
+    for octave in range(octaves):
+        width = frequency * footprint
+        damping = math.exp(-width * width)
+        if damping < 0.03:
+            break
+        total += amplitude * damping * value_noise(x * frequency, y * frequency, seed + octave)
+        amplitude *= 0.6
+        frequency *= 2.1
+    return total
+
+
+@numba.njit(cache=True, error_model="numpy")
+def square_wave(x, width):
+    """Box-filtered wave of period 1: 1 on the first half, 0 on the second."""
+    width = max(width, _MIN_WIDTH)
+    right = x + 0.5 * width
+    left = x - 0.5 * width
+    # The wave minus its mean integrates to a triangle wave.
+    rise = abs(left - math.floor(left) - 0.5) - abs(right - math.floor(right) - 0.5)
+    return 0.5 + 0.5 * rise / width
+
+
+@numba.njit(cache=True, error_model="numpy")
+def pulse_train(x, duty, width):
+    """Box-filtered train of period 1: 1 on a ``duty`` long interval centred at integers, 0 elsewhere."""
+    width = max(width, _MIN_WIDTH)
+    right = x + 0.5 * (duty + width)
+    left = x + 0.5 * (duty - width)
+    until_right = math.floor(right) * duty + min(right - math.floor(right), duty)
+    until_left = math.floor(left) * duty + min(left - math.floor(left), duty)
+    return (until_right - until_left) / width
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _dots(x, y, width):
+    u = x - math.floor(x) - 0.5
+    v = y - math.floor(y) - 0.5
+    inside = min(max((0.3 - math.sqrt(u * u + v * v)) / max(width, _MIN_WIDTH) + 0.5, 0.0), 1.0)
+    fade = min(max(2.0 - 3.0 * width, 0.0), 1.0)  # unresolved dots become their mean coverage
+    return inside * fade + 0.2827 * (1 - fade)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _grain(x, y, frequency, footprint, seed):
+    """Wood grain along x: lines bent by noise that is stretched along them."""
+    bend = fractal_noise(x * 0.3, y * 2.0, frequency, 3, 2.0 * footprint, seed)
+    width = 4.0 * frequency * footprint
+    lines = math.sin(6.2832 * (2.0 * frequency * y + 0.6 * bend)) * math.exp(-width * width)
+    return min(max(0.5 + 0.25 * lines + 0.3 * bend, 0.0), 1.0)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def pattern_value(kind, x, y, frequency, footprint, seed):
+    """Mixing weight in [0, 1] between a material's two colours.
+
+    Args:
+        kind: one of ``Pattern``.
+        x: first surface coordinate in metres.
+        y: second surface coordinate in metres.
+        frequency: pattern periods a metre.
+        footprint: width of the pixel on the surface in metres.
+        seed: chooses the random cells and noise.
+    """
+    width = footprint * frequency
+    u = x * frequency
+    v = y * frequency
+    value = 0.0
+    if kind == STRIPES:
+        value = square_wave(u, width)
+    elif kind == CHECKS:
+        a = 2 * square_wave(u, width) - 1
+        b = 2 * square_wave(v, width) - 1
+        value = 0.5 + 0.5 * a * b
+    elif kind == BRICKS:
+        row = math.floor(2 * v)
+        shifted = u + 0.5 * (row - 2 * math.floor(0.5 * row))
+        mortar = 1 - (1 - pulse_train(shifted, 0.05, width)) * (1 - pulse_train(2 * v, 0.1, 2 * width))
+        tone = hash_cell(math.floor(shifted), int(row), seed)
+        fade = min(max(2.0 - 4.0 * width, 0.0), 1.0)
+        value = (1 - mortar) * (0.5 + fade * 0.8 * (tone - 0.5))
+    elif kind == DOTS:
+        value = _dots(u, v, width)
+    elif kind == CLOUDS:
+        value = 0.5 + 0.45 * fractal_noise(x, y, frequency, 5, footprint, seed)
+    elif kind == WOOD:
+        value = _grain(x, y, frequency, footprint, seed)
+    elif kind == MOSAIC:
+        value = _blend_cells(u, v, seed, width)
+    elif kind == WEAVE:
+        value = 0.5 * pulse_train(u, 0.3, width) + 0.3 * pulse_train(v, 0.3, width)
+        value += 0.2 * pulse_train(3 * u + 0.5, 0.15, 3 * width)
+    elif kind == PLANKS:
+        board = math.floor(v)
+        fade = min(max(2.0 - 4.0 * width, 0.0), 1.0)
+        tone = hash_cell(int(board), 7, seed) * fade + 0.5 * (1 - fade)
+        grain = _grain(x + 10 * tone, y, frequency * 2.0, footprint, seed)
+        value = (1 - pulse_train(v, 0.06, width)) * (0.6 * tone + 0.4 * grain)
+    return min(max(value, 0.0), 1.0)

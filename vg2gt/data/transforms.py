@@ -1,0 +1,61 @@
+"""Resizing and cropping of frames together with their intrinsics."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from vg2gt.data.base import Frames
+from vg2gt.geometry.cameras import crop_intrinsics, resize_intrinsics
+
+
+def resize(frames: Frames, size: tuple[int, int]) -> Frames:
+    """Resizes frames to exactly ``size`` (height, width).
+
+    Colour is antialiased (triangle filter as wide as a target pixel); depth takes the nearest pixel, because a mean
+    across an edge is a point in mid-air.
+    """
+    height, width = frames.depth.shape[-2:]
+    if (height, width) == tuple(size):
+        return frames
+    images = interpolate(frames.images, size, mode="bilinear", antialias=True, align_corners=False).clamp(0, 1)
+    depth = interpolate(frames.depth[:, None], size, mode="nearest-exact")[:, 0]
+    intrinsics = resize_intrinsics(frames.intrinsics, size[1] / width, size[0] / height)
+    return Frames(images, depth, frames.world_to_camera, intrinsics)
+
+
+def crop(frames: Frames, top: int, left: int, size: tuple[int, int]) -> Frames:
+    """Cuts the window of ``size`` (height, width) whose first pixel is (``top``, ``left``)."""
+
+    def window(image: Tensor) -> Tensor:
+        return image[..., top : top + size[0], left : left + size[1]].contiguous()
+
+    return Frames(
+        window(frames.images),
+        window(frames.depth),
+        frames.world_to_camera,
+        crop_intrinsics(frames.intrinsics, left, top),
+    )
+
+
+def resize_to_cover(frames: Frames, size: tuple[int, int]) -> Frames:
+    """Resizes frames, keeping their shape, until they cover ``size`` (height, width), and crops the centre."""
+    height, width = frames.depth.shape[-2:]
+    scale = max(size[0] / height, size[1] / width)
+    # Rounding to whole pixels changes the two scales a little; the intrinsics follow the true ones.
+    covering = (max(size[0], math.floor(height * scale + 0.5)), max(size[1], math.floor(width * scale + 0.5)))
+    resized = resize(frames, covering)
+    return crop(resized, (covering[0] - size[0]) // 2, (covering[1] - size[1]) // 2, size)
+
+
+def to_bytes(images: Tensor) -> Tensor:
+    """Images in [0, 1] as uint8, rounded."""
+    return (images * 255 + 0.5).to(torch.uint8)
+
+
+def from_bytes(images: Tensor) -> Tensor:
+    """uint8 images as float32 in [0, 1]."""
+    return images.to(torch.float32) / 255
