@@ -1,1 +1,5 @@
-"""To be filled."""
+"""Rendering Gaussians as continuous stochastic solids, or by classic rasterisation."""
+
+from vg2gt.rendering.renderer import Renderer, render
+
+__all__ = ["Renderer", "render"]

@@ -1,0 +1,90 @@
+"""Checks at the renderer's public boundary; each error names the argument, what was expected and the remedy."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from vg2gt.geometry.spherical_harmonics import MAX_DEGREE
+from vg2gt.types import Cameras, Gaussians
+
+MIN_SCALE = 1e-10  # smaller ones overflow the inverse covariance in float32
+
+
+def check_gaussians(gaussians: Gaussians, scenes: int) -> None:
+    """Raises ValueError unless shapes agree, values are finite and in range, and scenes are sorted."""
+    count = gaussians.means.shape[0]
+    coefficients = gaussians.sh.shape[1] if gaussians.sh.dim() == 3 else 0
+    if coefficients not in {(degree + 1) ** 2 for degree in range(MAX_DEGREE + 1)}:
+        raise ValueError(f"sh must be [G, (L + 1)^2, 3] with L from 0 to {MAX_DEGREE}, got {tuple(gaussians.sh.shape)}")
+    expected = {
+        "means": (count, 3),
+        "quats": (count, 4),
+        "scales": (count, 3),
+        "opacities": (count,),
+        "sh": (count, coefficients, 3),
+        "batch": (count,),
+    }
+    for name, shape in expected.items():
+        tensor: Tensor = getattr(gaussians, name)
+        if tuple(tensor.shape) != shape:
+            raise ValueError(f"{name} must be {list(shape)} for {count} Gaussians, got {list(tensor.shape)}")
+        if name != "batch":
+            check_finite(name, tensor)
+    if count == 0:
+        return
+    _require("scales", gaussians.scales >= MIN_SCALE, f"at least {MIN_SCALE} (standard deviations in scene units)")
+    _require("opacities", (gaussians.opacities >= 0) & (gaussians.opacities <= 1), "in [0, 1]")
+    _require("quats", gaussians.quats.detach().abs().sum(-1) > 0, "rotations: a quaternion must not be zero")
+    batch = gaussians.batch
+    if batch[0] < 0 or batch[-1] >= scenes or (batch[1:] < batch[:-1]).any():
+        raise ValueError(
+            f"batch must be sorted scene indices from 0 to {scenes - 1} (the cameras hold {scenes} scenes); "
+            "sort the Gaussians by scene"
+        )
+
+
+def check_cameras(cameras: Cameras) -> None:
+    """Raises ValueError unless shapes agree, values are finite, focal lengths positive and the size is not empty."""
+    poses, intrinsics = cameras.world_to_camera, cameras.intrinsics
+    if poses.dim() != 4 or poses.shape[-2:] != (4, 4):
+        raise ValueError(f"world_to_camera must be [B, V, 4, 4], got {list(poses.shape)}")
+    if intrinsics.shape != (*poses.shape[:2], 3, 3):
+        raise ValueError(
+            f"intrinsics must be {[*poses.shape[:2], 3, 3]} like world_to_camera, got {list(intrinsics.shape)}"
+        )
+    check_finite("world_to_camera", poses)
+    check_finite("intrinsics", intrinsics)
+    _require("intrinsics", intrinsics[..., [0, 1], [0, 1]] > 0, "pinhole matrices with positive focal lengths")
+    if min(cameras.size) < 1:
+        raise ValueError(f"the cameras' size must be at least 1 x 1 pixels, got {cameras.size}")
+
+
+def check_finite(name: str, tensor: Tensor) -> None:
+    """Raises ValueError if a tensor holds NaN or infinity, naming it and the first bad position."""
+    finite = torch.isfinite(tensor.detach())
+    if not finite.all():
+        where = torch.nonzero(~finite)
+        raise ValueError(
+            f"{name} holds {len(where)} NaN or infinite values, the first at {where[0].tolist()}; "
+            "look for a diverging loss or an invalid input upstream"
+        )
+
+
+def background_color(background: Tensor | Sequence[float] | None, like: Tensor) -> Tensor:
+    """Background as a ``[3]`` tensor like another one; None is black."""
+    if background is None:
+        return like.new_zeros(3)
+    color = torch.as_tensor(background, dtype=like.dtype, device=like.device)
+    if color.shape != (3,):
+        raise ValueError(f"background must be one colour [3], got {list(color.shape)}")
+    check_finite("background", color)
+    return color
+
+
+def _require(name: str, good: Tensor, expectation: str) -> None:
+    if not good.all():
+        where = torch.nonzero(~good)
+        raise ValueError(f"{name} must be {expectation}; {len(where)} are not, the first at {where[0].tolist()}")

@@ -1,0 +1,98 @@
+"""The reference: every pixel against every Gaussian. Slow, any dtype, and the oracle the other implementations are held to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from vg2gt.geometry.cameras import pixel_grid
+from vg2gt.rendering.median import MedianDepth
+from vg2gt.rendering.options import ALPHA_MIN, TRANSMITTANCE_STOP, Images, RenderOptions, SceneViews
+from vg2gt.rendering.projection import Splats, respond, visible_splats
+
+CELLS_PER_CHUNK = 1 << 21  # pixels times Gaussians held at once
+
+
+@dataclass(frozen=True)
+class DenseRays:
+    """Rows are rays, columns Gaussians."""
+
+    def sum(self, hits: Tensor) -> Tensor:
+        """Sum over columns."""
+        return hits.sum(-1)
+
+    def amin(self, hits: Tensor) -> Tensor:
+        """Minimum over columns."""
+        return hits.amin(-1)
+
+    def amax(self, hits: Tensor) -> Tensor:
+        """Maximum over columns."""
+        return hits.amax(-1)
+
+    def spread(self, rays: Tensor) -> Tensor:
+        """Repeats along columns by broadcasting."""
+        return rays[:, None]
+
+
+def rasterize_dense(scene: SceneViews, options: RenderOptions) -> Images:
+    """Renders every view; differentiable in every tensor of the scene."""
+    return Images.stack([_render_view(scene.view(index), options) for index in range(len(scene.world_to_camera))])
+
+
+def _render_view(scene: SceneViews, options: RenderOptions) -> Images:
+    height, width = scene.size
+    splats, _ = visible_splats(scene, options)
+    pixels = pixel_grid(height, width, like=scene.means).reshape(-1, 2)
+    chunks = pixels.split(max(1, CELLS_PER_CHUNK // max(1, len(splats.depth))))
+    parts = [_render_pixels(splats, chunk, scene.background, options) for chunk in chunks]
+    color, normal, depth, alpha = (torch.cat(part) for part in zip(*parts, strict=True))
+    shape = (1, height, width)
+    return Images(color.view(*shape, 3), normal.view(*shape, 3), depth.view(shape), alpha.view(shape))
+
+
+def _render_pixels(
+    splats: Splats, pixels: Tensor, background: Tensor, options: RenderOptions
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Blends P pixels front to back: paper, eqn gggs_color with ``G(t*) = alpha`` for every Gaussian."""
+    if len(splats.depth) == 0:
+        zero = pixels.new_zeros(len(pixels))
+        return background.expand(len(pixels), 3), zero[:, None].expand(-1, 3), zero, zero
+    response, peak, precision = respond(splats, pixels[:, None])
+    alpha = response.clamp(max=options.alpha_max)
+    alpha = torch.where(response.detach() >= ALPHA_MIN, alpha, torch.zeros_like(alpha))
+    kept = torch.cumprod(1 - alpha.detach(), -1) >= TRANSMITTANCE_STOP
+    alpha = torch.where(kept, alpha, torch.zeros_like(alpha))
+    passed = torch.log1p(-alpha)
+    after = torch.cumsum(passed, -1)
+    before = torch.exp(after - passed)
+    weight = alpha * before
+    final = torch.exp(after[:, -1])
+    color = weight @ splats.color + final[:, None] * background
+    normal, depth = torch.zeros_like(color), torch.zeros_like(final)
+    if options.geometry:
+        normal = weight @ splats.normal
+        depth = _depth(alpha, weight, before.detach(), final, peak, precision, options)
+    return color, normal, depth, 1 - final
+
+
+def _depth(
+    alpha: Tensor,
+    weight: Tensor,
+    before: Tensor,
+    final: Tensor,
+    peak: Tensor,
+    precision: Tensor,
+    options: RenderOptions,
+) -> Tensor:
+    if options.mode == "solid":
+        depth = MedianDepth.apply(alpha, peak, precision, before, DenseRays(), options)
+        assert isinstance(depth, Tensor)
+        return depth
+    if options.depth == "expected":
+        covered = 1 - final
+        hit = covered.detach() > 0
+        return torch.where(hit, (weight * peak).sum(-1) / torch.where(hit, covered, 1.0), 0.0)
+    crossing = (before > 0.5) & (before * (1 - alpha.detach()) <= 0.5)
+    return (crossing * peak).sum(-1)

@@ -1,0 +1,122 @@
+"""Median depth of a ray through stochastic solids, with its implicit gradient.
+
+A Gaussian of opacity alpha whose response peaks at ``t*`` with precision ``lambda`` is the solid of vacancy
+``v(t) = sqrt(1 - g)``, ``g = alpha exp(-lambda (t - t*)^2 / 2)`` (paper, eqn vacancy). A ray has passed it unhit with
+probability ``sqrt(1 - g)`` up to the peak and ``(1 - alpha) / sqrt(1 - g)`` behind it; transmittance T(t) is the product
+over the ray's Gaussians, whatever their order, and the median depth d solves ``T(d) = 1/2``.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from vg2gt.rendering.options import BRACKET_SIGMAS, MEDIAN_MAX_TRANSMITTANCE, RenderOptions
+from vg2gt.rendering.projection import LOG_HALF
+
+
+class Rays(Protocol):
+    """How hits belong to rays, so that one solver serves a dense matrix and a sparse list of hits."""
+
+    def sum(self, hits: Tensor) -> Tensor:
+        """Sum over every ray's hits."""
+        ...
+
+    def amin(self, hits: Tensor) -> Tensor:
+        """Minimum over every ray's hits, inf without any."""
+        ...
+
+    def amax(self, hits: Tensor) -> Tensor:
+        """Maximum over every ray's hits, -inf without any."""
+        ...
+
+    def spread(self, rays: Tensor) -> Tensor:
+        """One value a ray, repeated for every hit."""
+        ...
+
+
+def log_transmittance(t: Tensor, alpha: Tensor, peak: Tensor, precision: Tensor) -> Tensor:
+    """Every hit's share of ``ln T(t)``; all arguments have one value a hit."""
+    occupied = torch.log1p(-alpha * torch.exp(-0.5 * precision * (t - peak) ** 2))
+    return torch.where(t <= peak, 0.5 * occupied, torch.log1p(-alpha) - 0.5 * occupied)
+
+
+def slope(t: Tensor, alpha: Tensor, peak: Tensor, precision: Tensor) -> Tensor:
+    """Every hit's share of ``S = -d ln T / dt >= 0``."""
+    g = alpha * torch.exp(-0.5 * precision * (t - peak) ** 2)
+    return 0.5 * g * precision * (t - peak).abs() / (1 - g)
+
+
+class MedianDepth(torch.autograd.Function):
+    """Median depth by bisection; gradient by the implicit-function theorem (paper, eqn tmed_grad)."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, alpha: Tensor, peak: Tensor, precision: Tensor, before: Tensor, rays: Rays, options: RenderOptions
+    ) -> Tensor:
+        """Solves ``T(d) = 1/2`` for every ray.
+
+        Args:
+            ctx: autograd context.
+            alpha: opacity of every hit, 0 where a dense matrix has none.
+            peak: peak depth of every hit.
+            precision: inverse variance of every hit along its ray.
+            before: transmittance in front of every hit in blending order, without gradient.
+            rays: how hits belong to rays.
+            options: near plane, iterations, slope floor.
+
+        Returns:
+            Depth of every ray, 0 where more than 0.45 is transmitted or the median lies in front of the near plane.
+        """
+
+        def residual(t: Tensor) -> Tensor:
+            return rays.sum(log_transmittance(rays.spread(t), alpha, peak, precision)) - LOG_HALF
+
+        reach = BRACKET_SIGMAS / precision.sqrt()
+        hit = alpha > 0
+        inf = torch.full_like(peak, torch.inf)
+        lo = rays.amin(torch.where(hit, peak - reach, inf)).clamp(min=options.near)
+        # behind the peaks of hits that together pass at most a quarter, T is at most one half
+        near_hits = rays.amax(torch.where(hit & (before > 0.25), peak, -inf))
+        all_hits = rays.amax(torch.where(hit, peak + reach, -inf))
+        final = rays.sum(torch.log1p(-alpha)).exp()
+        hi = torch.where(final <= 0.25, near_hits, all_hits)
+        solvable = final < MEDIAN_MAX_TRANSMITTANCE
+        lo = torch.where(solvable, lo, torch.ones_like(lo))
+        hi = torch.where(solvable, hi, torch.ones_like(hi))
+        solvable &= residual(lo) > 0
+        for _ in range(options.bisections):
+            middle = 0.5 * (lo + hi)
+            nearer = residual(middle) > 0
+            lo, hi = torch.where(nearer, middle, lo), torch.where(nearer, hi, middle)
+        depth = 0.5 * (lo + hi)
+        tiny = torch.finfo(depth.dtype).tiny
+        for _ in range(options.newton_steps):
+            step = residual(depth) / rays.sum(slope(rays.spread(depth), alpha, peak, precision)).clamp(min=tiny)
+            depth = torch.minimum(torch.maximum(depth + step, lo), hi)
+        depth = torch.where(solvable, depth, torch.zeros_like(depth))
+        ctx.save_for_backward(alpha, peak, precision, depth)
+        ctx.rays, ctx.slope_floor = rays, options.slope_floor
+        return depth
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
+        """``dd/dtheta = -(dT/dtheta) / (dT/dd)``; ``dd/dt*`` is non-negative and sums to 1 over a ray."""
+        alpha, peak, precision, depth = ctx.saved_tensors
+        rays: Rays = ctx.rays
+        valid = depth > 0
+        offset = rays.spread(depth) - peak
+        bell = torch.exp(-0.5 * precision * offset**2)
+        g = alpha * bell
+        half = 0.5 / (1 - g)
+        total = rays.sum(half * g * precision * offset.abs())
+        floor = ctx.slope_floor / torch.where(valid, depth, torch.ones_like(depth))
+        total = torch.maximum(total, floor).clamp(min=torch.finfo(total.dtype).tiny)
+        factor = rays.spread(torch.where(valid, grad_outputs[0] / total, torch.zeros_like(depth)))
+        passed = offset > 0
+        grad_alpha = torch.where(passed, half * bell - 1 / (1 - alpha), -half * bell)
+        grad_peak = half * g * precision * offset.abs()
+        grad_precision = torch.where(passed, -0.5, 0.5) * half * g * offset**2
+        return factor * grad_alpha, factor * grad_peak, factor * grad_precision, None, None, None

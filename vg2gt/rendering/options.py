@@ -1,0 +1,114 @@
+"""What a rasteriser is given: its options and one scene with its views."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+Mode = Literal["solid", "rasterized"]
+DepthKind = Literal["median", "expected"]
+
+ALPHA_MIN = 1.0 / 255.0  # a Gaussian weaker than this at a pixel is no hit (3DGS)
+TRANSMITTANCE_STOP = 1e-4  # the hit that would bring transmittance below this is dropped with all behind it (3DGS)
+MEDIAN_MAX_TRANSMITTANCE = 0.45  # a solid ray whose final transmittance is larger has no median depth
+BRACKET_SIGMAS = 4.0  # the median lies within this many standard deviations of the hits' peaks
+JACOBIAN_CLAMP = 1.3  # half fields of view at which 3DGS clamps the projection's Jacobian (rasterized only)
+
+
+@dataclass(frozen=True)
+class RenderOptions:
+    """Options common to all implementations; see :func:`vg2gt.rendering.render`."""
+
+    mode: Mode = "solid"
+    depth: DepthKind = "median"
+    near: float = 0.01
+    lowpass: float = 0.3
+    alpha_max: float = 0.99
+    slope_floor: float = 30.0
+    bisections: int = 12
+    newton_steps: int = 2
+    geometry: bool = True
+
+
+@dataclass(frozen=True)
+class SceneViews:
+    """One scene and V views of it, the argument of every rasteriser.
+
+    Attributes:
+        means: ``[G, 3]`` world positions.
+        quats: ``[G, 4]`` wxyz, any length.
+        scales: ``[G, 3]`` standard deviations.
+        opacities: ``[G]``.
+        colors: ``[V, G, 3]``, or ``[1, G, 3]`` where the colour does not depend on the view.
+        world_to_camera: ``[V, 4, 4]``.
+        intrinsics: ``[V, 3, 3]`` pixels, integer pixel centres, no skew.
+        background: ``[3]``.
+        size: image ``(height, width)``.
+    """
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    colors: Tensor
+    world_to_camera: Tensor
+    intrinsics: Tensor
+    background: Tensor
+    size: tuple[int, int]
+
+    @property
+    def tensors(self) -> tuple[Tensor, ...]:
+        """The differentiable inputs in declaration order."""
+        return (
+            self.means,
+            self.quats,
+            self.scales,
+            self.opacities,
+            self.colors,
+            self.world_to_camera,
+            self.intrinsics,
+            self.background,
+        )
+
+    def view(self, index: int) -> SceneViews:
+        """Returns the scene with one view (V = 1)."""
+        one = slice(index, index + 1)
+        colors = self.colors if self.colors.shape[0] == 1 else self.colors[one]
+        return SceneViews(
+            *self.tensors[:4], colors, self.world_to_camera[one], self.intrinsics[one], self.background, self.size
+        )
+
+    def gather(self, index: Tensor) -> SceneViews:
+        """Returns the Gaussians of the given indices, in that order."""
+        means, quats, scales, opacities = (tensor[index] for tensor in self.tensors[:4])
+        return SceneViews(means, quats, scales, opacities, self.colors[:, index], *self.tensors[5:], self.size)
+
+
+@dataclass(frozen=True)
+class Images:
+    """What a rasteriser returns: V views, channels last.
+
+    Attributes:
+        color: ``[V, H, W, 3]``, background blended in.
+        normal: ``[V, H, W, 3]``.
+        depth: ``[V, H, W]``, 0 where the ray has none.
+        alpha: ``[V, H, W]``.
+    """
+
+    color: Tensor
+    normal: Tensor
+    depth: Tensor
+    alpha: Tensor
+
+    @staticmethod
+    def stack(views: list[Images]) -> Images:
+        """Joins renders of single views along V."""
+        return Images(
+            torch.cat([view.color for view in views]),
+            torch.cat([view.normal for view in views]),
+            torch.cat([view.depth for view in views]),
+            torch.cat([view.alpha for view in views]),
+        )
