@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from vg2gt.data.raycast import BOX, CYLINDER, ELLIPSOID
+from vg2gt.data.raycast import AXES, BOX, CYLINDER, ELLIPSOID, GROUP_COLUMNS, HALF, KIND
 from vg2gt.data.textures import Pattern
 
 Vector = Sequence[float]  # x, y, z
@@ -41,12 +41,9 @@ class Builder:
     def __init__(self, rng: np.random.Generator) -> None:
         self.rng = rng
         self.materials: list[list[float]] = []
-        self.kind: list[int] = []
-        self.center: list[NDArray[np.float64]] = []
-        self.axes: list[NDArray[np.float64]] = []
-        self.half: list[NDArray[np.float64]] = []
-        self.material: list[int] = []
-        self.group_start: list[int] = [0]
+        self.parts: list[NDArray[np.float64]] = []
+        self.part_materials: list[int] = []
+        self._group_start: list[int] = [0]
         self._origin = np.zeros(3)
         self._rotation = np.eye(3)
 
@@ -58,8 +55,8 @@ class Builder:
 
     def end_group(self) -> None:
         """Closes the current group, if it has parts; parts of a group should be close to each other."""
-        if len(self.kind) > self.group_start[-1]:
-            self.group_start.append(len(self.kind))
+        if len(self.parts) > self._group_start[-1]:
+            self._group_start.append(len(self.parts))
 
     def new_material(self, kinds: tuple[Pattern, ...] = tuple(Pattern), frequency: tuple[float, float] = (1, 8)) -> int:
         """Draws a material: one of ``kinds`` with a log-uniform pattern ``frequency`` (periods a metre)."""
@@ -88,23 +85,23 @@ class Builder:
         self._add(ELLIPSOID, center, np.array(radii), material, np.eye(3))
 
     def _add(self, kind: int, center: Vector, half: NDArray, material: int, own: NDArray) -> None:
-        self.kind.append(kind)
-        self.center.append(self._origin + self._rotation @ np.array(center))
-        self.axes.append((self._rotation @ own).T)
-        self.half.append(half)
-        self.material.append(material)
+        position = self._origin + self._rotation @ np.array(center)
+        axes = (self._rotation @ own).T
+        radius2 = (1 + 1e-9) * (half.max() if kind == ELLIPSOID else np.linalg.norm(half)) ** 2
+        self.parts.append(np.concatenate((position, [radius2], axes.ravel(), half, [kind])))
+        self.part_materials.append(material)
 
-    def bounding_spheres(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Centres ``[g, 3]`` and radii ``[g]`` of spheres that hold the groups' boxes."""
-        centers, radii = [], []
-        for begin, end in zip(self.group_start[:-1], self.group_start[1:], strict=True):
+    def groups(self) -> NDArray[np.float64]:
+        """Groups ``[g, GROUP_COLUMNS]`` of the parts, with spheres that hold the boxes around their parts."""
+        rows = []
+        for first, last in zip(self._group_start[:-1], self._group_start[1:], strict=True):
             corners = np.concatenate(
-                [self.center[i] + (_CORNERS * self.half[i]) @ self.axes[i] for i in range(begin, end)]
+                [row[:3] + (_CORNERS * row[HALF:KIND]) @ row[AXES:HALF].reshape(3, 3) for row in self.parts[first:last]]
             )
             middle = (corners.min(0) + corners.max(0)) / 2
-            centers.append(middle)
-            radii.append(np.linalg.norm(corners - middle, axis=1).max() + 1e-6)
-        return np.array(centers).reshape(-1, 3), np.array(radii)
+            radius = np.linalg.norm(corners - middle, axis=1).max() + 1e-6
+            rows.append([*middle, radius, first, last])
+        return np.array(rows, np.float64).reshape(-1, GROUP_COLUMNS)
 
 
 def _legs(b: Builder, x: float, y: float, height: float, thickness: float, material: int) -> None:

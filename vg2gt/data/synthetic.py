@@ -125,7 +125,7 @@ class SyntheticRooms(SceneSource):
         if path is None:
             return
         buffer = io.BytesIO()
-        np.savez(buffer, allow_pickle=False, **arrays)
+        np.savez(buffer, **arrays)  # pyright: ignore[reportArgumentType]
         write_bytes(path, buffer.getvalue())
 
 

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vg2gt.data.furniture import MAKERS, Builder
-from vg2gt.data.raycast import RaycastFrame, Room, render_frame
+from vg2gt.data.raycast import PART_COLUMNS
+from vg2gt.data.room_renderer import Room, RoomFrame, render_frame
 from vg2gt.data.textures import Pattern
 
 GENERATOR_VERSION = 1  # raise it whenever the same seed would give other pixels
@@ -46,12 +47,12 @@ class SyntheticRoom:
         focal = 0.5 * size[1] / np.tan(rng.uniform(1.2, 1.55) / 2)
         self.intrinsics = np.array([[focal, 0, (size[1] - 1) / 2], [0, focal, (size[0] - 1) / 2], [0, 0, 1]])
 
-    def render(self, frames: Sequence[int], threads: int) -> list[RaycastFrame]:
+    def render(self, frames: Sequence[int], threads: int) -> list[RoomFrame]:
         """Renders the given frames of the path, ``threads`` at a time."""
         with ThreadPoolExecutor(threads) as pool:
             return list(pool.map(self._render_frame, frames))
 
-    def _render_frame(self, frame: int) -> RaycastFrame:
+    def _render_frame(self, frame: int) -> RoomFrame:
         return render_frame(self.room, self.world_to_camera[frame], self.intrinsics, self.size)
 
 
@@ -110,19 +111,13 @@ def _finish(builder: Builder, extent: NDArray[np.float64], shell: NDArray[np.int
     position = rng.uniform(-0.4, 0.4, (count, 3)) * extent
     position[:, 2] = extent[2] - rng.uniform(0.1, 0.5, count)
     color = rng.uniform(0.8, 1.1, (count, 1)) * (1 + rng.uniform(-0.12, 0.12, (count, 3))) / np.sqrt(count)
-    centers, radii = builder.bounding_spheres()
+    half = extent[:2] / 2
     return Room(
-        lower=np.array([-extent[0] / 2, -extent[1] / 2, 0.0]),
-        upper=np.array([extent[0] / 2, extent[1] / 2, extent[2]]),
-        shell=shell,
-        kind=np.array(builder.kind, np.int64),
-        center=np.array(builder.center).reshape(-1, 3),
-        axes=np.array(builder.axes).reshape(-1, 3, 3),
-        half=np.array(builder.half).reshape(-1, 3),
-        material=np.array(builder.material, np.int64),
-        group_start=np.array(builder.group_start, np.int64),
-        group_center=centers,
-        group_radius=radii,
+        walls=np.array([[-half[0], -half[1], 0.0], [half[0], half[1], extent[2]]]),
+        wall_materials=shell,
+        parts=np.array(builder.parts).reshape(-1, PART_COLUMNS),
+        part_materials=np.array(builder.part_materials, np.int64),
+        groups=builder.groups(),
         materials=np.array(builder.materials),
         lights=np.concatenate((position, color), 1),
         ambient=float(rng.uniform(0.35, 0.6)),

@@ -1,0 +1,228 @@
+"""Renders a room of textured parts with point lights and shadows: colour, exact z-depth and normals.
+
+One numba kernel renders a frame and releases the interpreter's lock, so frames are rendered by threads. The image is
+worked on in tiles: all rays of a tile are cast first, then shaded with the groups that can throw a shadow on what the
+tile sees.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vg2gt.data.raycast import FAR, find_occluder, groups_in_cone, jit, nearest_hit, surface
+from vg2gt.data.textures import fractal_noise, pattern_value
+
+_TILE = 8
+_SAMPLES = 2  # colour samples per axis and pixel
+_LIFT = 1e-4  # metres by which a shadow ray starts above its surface
+_SHADOW = 0.2  # share of a light that reaches a point in its shadow, standing in for bounced light
+_GAMMA = 1 / 1.8
+
+
+@dataclass(frozen=True)
+class Room:
+    """Geometry, materials and lights of one room. Metres, z up.
+
+    Attributes:
+        walls: ``[2, 3]`` lower and upper corner of the room's inside.
+        wall_materials: ``[6]`` materials of the walls x-, x+, y-, y+, floor, ceiling.
+        parts: ``[n, PART_COLUMNS]`` boxes, cylinders and ellipsoids (columns: ``raycast.py``).
+        part_materials: ``[n]``.
+        groups: ``[g, GROUP_COLUMNS]`` bounding spheres of runs of parts.
+        materials: ``[m, 13]`` pattern, frequency, seed, colour a (3), colour b (3), and strength and frequency of a
+            slow and of a fine tonal variation.
+        lights: ``[l, 6]`` position and colour.
+        ambient: light from everywhere.
+    """
+
+    walls: NDArray[np.float64]
+    wall_materials: NDArray[np.int64]
+    parts: NDArray[np.float64]
+    part_materials: NDArray[np.int64]
+    groups: NDArray[np.float64]
+    materials: NDArray[np.float64]
+    lights: NDArray[np.float64]
+    ambient: float
+
+
+@dataclass(frozen=True)
+class RoomFrame:
+    """One rendered frame.
+
+    Attributes:
+        image: ``[H, W, 3]`` uint8.
+        depth: ``[H, W]`` float32 z-depth in metres at the exact pixel centres.
+        normal: ``[H, W, 3]`` float32 unit camera-frame normals there, facing the camera.
+    """
+
+    image: NDArray[np.uint8]
+    depth: NDArray[np.float32]
+    normal: NDArray[np.float32]
+
+
+def render_frame(
+    room: Room, world_to_camera: NDArray[np.float64], intrinsics: NDArray[np.float64], size: tuple[int, int]
+) -> RoomFrame:
+    """Renders one camera.
+
+    Args:
+        room: what is seen.
+        world_to_camera: ``[4, 4]`` OpenCV; the camera must stand in the room and outside of its parts.
+        intrinsics: ``[3, 3]`` in pixels, integer pixel centres, no skew.
+        size: image ``(height, width)``.
+    """
+    frame = RoomFrame(np.empty((*size, 3), np.uint8), np.empty(size, np.float32), np.empty((*size, 3), np.float32))
+    rotation = np.ascontiguousarray(world_to_camera[:3, :3])
+    origin = -rotation.T @ world_to_camera[:3, 3]
+    camera = (intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2])
+    geometry = (room.parts, room.groups, room.walls)
+    look = (room.part_materials, room.wall_materials, room.materials, room.lights, room.ambient)
+    _render(origin, rotation, camera, geometry, look, frame.image, frame.depth, frame.normal)
+    return frame
+
+
+@jit
+def _ray(x, y, rotation, camera, d):
+    """Writes the unit world direction through image position (x, y) into ``d``; returns its camera-frame z."""
+    cx = (x - camera[2]) / camera[0]
+    cy = (y - camera[3]) / camera[1]
+    z = 1.0 / math.sqrt(cx * cx + cy * cy + 1.0)
+    for axis in range(3):
+        d[axis] = (rotation[0, axis] * cx + rotation[1, axis] * cy + rotation[2, axis]) * z
+    return z
+
+
+@jit
+def _tile_cone(y0, x0, y1, x1, rotation, camera, axis):
+    """Writes the axis of a cone around a tile's rays; returns its half opening angle."""
+    corner = np.empty(3)
+    _ray(0.5 * (x0 + x1 - 1), 0.5 * (y0 + y1 - 1), rotation, camera, axis)
+    cosine = 1.0
+    for x in (x0 - 0.5, x1 - 0.5):
+        for y in (y0 - 0.5, y1 - 0.5):
+            _ray(x, y, rotation, camera, corner)
+            cosine = min(cosine, axis[0] * corner[0] + axis[1] * corner[1] + axis[2] * corner[2])
+    return math.acos(min(cosine, 1.0)) + 1e-6
+
+
+@jit
+def _light_cone(light, points, count, axis):
+    """Writes the axis of a cone from a light around points; returns its half opening angle and length."""
+    low, high = points[0].copy(), points[0].copy()
+    for k in range(count):
+        for i in range(3):
+            low[i] = min(low[i], points[k, i])
+            high[i] = max(high[i], points[k, i])
+    radius = 1e-3 + 0.5 * math.sqrt((high[0] - low[0]) ** 2 + (high[1] - low[1]) ** 2 + (high[2] - low[2]) ** 2)
+    distance = 0.0
+    for i in range(3):
+        axis[i] = 0.5 * (low[i] + high[i]) - light[i]
+        distance += axis[i] * axis[i]
+    distance = math.sqrt(distance)
+    for i in range(3):
+        axis[i] /= max(distance, 1e-9)
+    return (math.asin(radius / distance) if radius < distance else math.pi), distance + radius
+
+
+@jit
+def _shade(hit, t, p, d, footprint, parts, groups, look, shadowing, counts, guesses, color):
+    """Adds the linear colour of one ray's hit to ``color``; ``shadowing`` lists the groups to ask for every light."""
+    part_materials, wall_materials, materials, lights, ambient = look
+    nx, ny, nz, u, v = surface(hit, parts, p[0], p[1], p[2])
+    m = part_materials[hit] if hit >= 0 else wall_materials[-1 - hit]
+    cosine = abs(nx * d[0] + ny * d[1] + nz * d[2])
+    width = footprint * t / max(cosine, 0.15)
+    seed = int(materials[m, 2])
+    mix = pattern_value(int(materials[m, 0]), u, v, materials[m, 1], width, seed)
+    tone = 1.0 + materials[m, 9] * fractal_noise(u, v, materials[m, 10], 2, width, seed + 31)
+    tone += materials[m, 11] * fractal_noise(u, v, materials[m, 12], 2, width, seed + 57)
+    red = green = blue = ambient * (0.85 + 0.15 * nz)
+    for i in range(lights.shape[0]):
+        ex, ey, ez = lights[i, 0] - p[0], lights[i, 1] - p[1], lights[i, 2] - p[2]
+        squared = ex * ex + ey * ey + ez * ez
+        distance = math.sqrt(squared)
+        ex, ey, ez = ex / distance, ey / distance, ez / distance
+        facing = nx * ex + ny * ey + nz * ez
+        if facing <= 0.0:
+            continue
+        sx, sy, sz = p[0] + _LIFT * nx, p[1] + _LIFT * ny, p[2] + _LIFT * nz
+        guess = find_occluder(shadowing[i], counts[i], parts, groups, sx, sy, sz, ex, ey, ez, distance, guesses[i])
+        guesses[i] = guess
+        strength = (_SHADOW if guess >= 0 else 1.0) * facing / (0.5 + 0.25 * squared)
+        red += strength * lights[i, 3]
+        green += strength * lights[i, 4]
+        blue += strength * lights[i, 5]
+    color[0] += tone * (materials[m, 3] + mix * (materials[m, 6] - materials[m, 3])) * red
+    color[1] += tone * (materials[m, 4] + mix * (materials[m, 7] - materials[m, 4])) * green
+    color[2] += tone * (materials[m, 5] + mix * (materials[m, 8] - materials[m, 5])) * blue
+
+
+@jit
+def _cast_centers(y0, x0, y1, x1, origin, rotation, camera, geometry, visible, count, depth, normal):
+    """Depth and normals of a tile at its pixel centres."""
+    parts, groups, walls = geometry
+    ox, oy, oz = origin
+    d = np.empty(3)
+    for y in range(y0, y1):
+        for x in range(x0, x1):
+            z = _ray(x, y, rotation, camera, d)
+            t, hit = nearest_hit(visible, count, parts, groups, walls, ox, oy, oz, d[0], d[1], d[2])
+            n = surface(hit, parts, ox + t * d[0], oy + t * d[1], oz + t * d[2])
+            depth[y, x] = t * z
+            for i in range(3):
+                normal[y, x, i] = rotation[i, 0] * n[0] + rotation[i, 1] * n[1] + rotation[i, 2] * n[2]
+
+
+@jit
+def _render(origin, rotation, camera, geometry, look, image, depth, normal):
+    parts, groups, walls = geometry
+    lights = look[3]
+    height, width = depth.shape
+    ox, oy, oz = origin[0], origin[1], origin[2]
+    per_pixel = _SAMPLES * _SAMPLES
+    step = 1.0 / _SAMPLES
+    size = _TILE * _TILE * per_pixel
+    points, directions = np.empty((size, 3)), np.empty((size, 3))
+    distances, hits = np.empty(size), np.empty(size, np.int64)
+    visible, near = np.empty(len(groups), np.int64), np.empty(len(groups))
+    shadowing = np.empty((len(lights), len(groups)), np.int64)
+    counts, guesses = np.zeros(len(lights), np.int64), np.full(len(lights), -1)
+    axis, color = np.empty(3), np.empty(3)
+    for y0 in range(0, height, _TILE):
+        for x0 in range(0, width, _TILE):
+            y1, x1 = min(y0 + _TILE, height), min(x0 + _TILE, width)
+            spread = _tile_cone(y0, x0, y1, x1, rotation, camera, axis)
+            count = groups_in_cone(origin, axis, spread, FAR, groups, visible, near)
+            _cast_centers(y0, x0, y1, x1, (ox, oy, oz), rotation, camera, geometry, visible, count, depth, normal)
+            k = 0
+            for y in range(y0, y1):
+                for x in range(x0, x1):
+                    for sample in range(per_pixel):
+                        d = directions[k]
+                        sx = x + (sample % _SAMPLES + 0.5) * step - 0.5
+                        sy = y + (sample // _SAMPLES + 0.5) * step - 0.5
+                        _ray(sx, sy, rotation, camera, d)
+                        t, hits[k] = nearest_hit(visible, count, parts, groups, walls, ox, oy, oz, d[0], d[1], d[2])
+                        distances[k] = t
+                        points[k, 0], points[k, 1], points[k, 2] = ox + t * d[0], oy + t * d[1], oz + t * d[2]
+                        k += 1
+            for i in range(len(lights)):
+                spread, reach = _light_cone(lights[i], points, k, axis)
+                counts[i] = groups_in_cone(lights[i, :3], axis, spread, reach, groups, shadowing[i], near)
+            k = 0
+            for y in range(y0, y1):
+                for x in range(x0, x1):
+                    color[:] = 0.0
+                    for _ in range(per_pixel):
+                        _shade(
+                            hits[k], distances[k], points[k], directions[k], step / camera[0],
+                            parts, groups, look, shadowing, counts, guesses, color,
+                        )  # fmt: skip
+                        k += 1
+                    for i in range(3):
+                        value = min(max(color[i] / per_pixel, 0.0), 1.0) ** _GAMMA
+                        image[y, x, i] = int(255.0 * value + 0.5)
