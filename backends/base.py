@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 
 import torch
 from torch import Tensor, nn
@@ -24,7 +24,7 @@ class Backend(nn.Module, ABC):
         patch_size: edge of a patch in pixels; image sizes must be multiples of it.
         token_dims: channels of the patch tokens, one entry a tapped layer, in tap order.
         licence: licence of the weights, printed when they are loaded.
-        is_metric: True if the decoded depth is in metres.
+        is_metric: True if ``Geometry.scale`` turns the decoded depth into metres.
         supports_gradient: True if ``decode`` is differentiable in ``tokens.patch``.
         needs_hints: True if ``encode`` cannot work without what the data knows.
     """
@@ -61,7 +61,7 @@ class Backend(nn.Module, ABC):
             The tokens exactly as the frozen heads take them.
 
         Raises:
-            ValueError: from :meth:`check_inputs`.
+            ValueError: from :meth:`check_images` and, where hints are needed, :meth:`require_hints`.
         """
 
     @abstractmethod
@@ -94,12 +94,11 @@ class Backend(nn.Module, ABC):
             self._identity = {"name": self.name, "weights": digest.hexdigest()}
         return self._identity
 
-    def check_inputs(self, images: Tensor, hints: Hints | None = None) -> None:
+    def check_images(self, images: Tensor) -> None:
         """Checks what ``encode`` is given.
 
         Raises:
-            ValueError: if images or hints have the wrong shape or range, or needed hints are missing; it says what
-                was expected and what to do.
+            ValueError: if the images have the wrong shape, size or range; it says what was expected and what to do.
         """
         if images.dim() != 5 or images.shape[2] != 3 or 0 in images.shape:
             raise ValueError(f"images must be [B, V, 3, H, W] with nothing empty, got {list(images.shape)}")
@@ -116,28 +115,38 @@ class Backend(nn.Module, ABC):
                 f"images must be finite and in [0, 1], got values from {float(low):.4g} to {float(high):.4g}: "
                 "divide 8-bit images by 255 and clamp after resizing"
             )
-        if self.needs_hints:
-            self._check_hints(images, hints)
 
-    def _check_hints(self, images: Tensor, hints: Hints | None) -> None:
+    def require_hints(self, images: Tensor, hints: Hints | None, *names: str) -> Hints:
+        """Returns ``hints`` if they hold the named fields for all views of ``images``.
+
+        Raises:
+            ValueError: naming the missing fields or the wrong shape, and what to do.
+        """
         batch, views, _, height, width = images.shape
-        missing = [
-            name
-            for name in ("depth", "cameras", "scene_key", "frame_ids")
-            if hints is None or getattr(hints, name) is None or (name == "scene_key" and len(hints.scene_key) != batch)
-        ]
-        if missing:
+        missing = [name for name in names if _is_missing(getattr(hints, name, None))]
+        if hints is None or missing:
             raise ValueError(
                 f"backend {self.name} needs hints from the data, missing: {', '.join(missing)}. Pass batch.hints, "
                 "or choose a backend that works from images alone (backend=vggt_1b, backend=da3_small, ...)"
             )
-        assert hints is not None
-        assert hints.depth is not None
-        if hints.depth.shape != (batch, views, height, width):
-            raise ValueError(
-                f"hints.depth must be [B, V, H, W] = {[batch, views, height, width]} as the images are, "
-                f"got {list(hints.depth.shape)}"
-            )
+        shapes = {
+            "depth": ((batch, views, height, width), hints.depth),
+            "cameras": ((batch, views, 4, 4), hints.cameras.world_to_camera if hints.cameras else None),
+            "frame_ids": ((batch, views), hints.frame_ids),
+        }
+        for name in names:
+            expected, value = shapes.get(name, (None, None))
+            if value is not None and value.shape != expected:
+                raise ValueError(
+                    f"hints.{name} must be {list(expected or ())} for these images, got {list(value.shape)}"
+                )
+        if "scene_key" in names and len(hints.scene_key) != batch:
+            raise ValueError(f"hints.scene_key must name {batch} scenes, got {len(hints.scene_key)}")
+        return hints
+
+
+def _is_missing(value: object) -> bool:
+    return value is None or (isinstance(value, tuple) and not value)
 
 
 @contextmanager
@@ -148,6 +157,12 @@ def seeded_initialisation(seed: int) -> Iterator[None]:
         yield
 
 
-def full_precision(like: Tensor) -> torch.autocast:
-    """A context in which autocast is off on the device of ``like``."""
-    return torch.autocast(like.device.type, enabled=False)
+def half_precision_on_gpu(like: Tensor) -> torch.autocast:
+    """A context with bfloat16 autocast if ``like`` is on a GPU, and with autocast off on a CPU."""
+    return torch.autocast(like.device.type, torch.bfloat16, enabled=like.is_cuda)
+
+
+def full_precision(like: Tensor) -> AbstractContextManager[object]:
+    """A context in which autocast is off on the device of ``like``; nothing at all where it already is."""
+    device = like.device.type
+    return torch.autocast(device, enabled=False) if torch.is_autocast_enabled(device) else nullcontext()

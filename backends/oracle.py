@@ -93,8 +93,8 @@ class OracleBackend(Backend):
     @torch.no_grad()
     def encode(self, images: Tensor, hints: Hints | None = None) -> Tokens:
         """Simulates the backbone; see :meth:`Backend.encode`. The world frame is view 0's, the unit the data's."""
-        self.check_inputs(images, hints)
-        assert hints is not None
+        self.check_images(images)
+        hints = self.require_hints(images, hints, "depth", "cameras", "scene_key", "frame_ids")
         assert hints.depth is not None
         assert hints.cameras is not None
         height, width = images.shape[-2:]

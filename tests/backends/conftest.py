@@ -1,16 +1,22 @@
 """Scenes and the choice of backends for the contract test."""
 
 import importlib
+from pathlib import Path
 
 import pytest
 import torch
+from hydra import compose, initialize_config_dir
+from hydra.utils import instantiate
+from omegaconf import DictConfig
 from torch import Tensor
 
+from backends.base import Backend
 from vg2gt.geometry.cameras import invert_rigid, ray_directions
 from vg2gt.geometry.rotations import quat_to_matrix
 from vg2gt.types import Cameras, Hints
 
-BUILT_IN = ("backends.oracle.OracleBackend",)
+BUILT_IN = ("oracle", "vggt_tiny", "da3_tiny")
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -25,8 +31,20 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 @pytest.fixture(scope="session")
 def backend(request: pytest.FixtureRequest):
+    if request.param in BUILT_IN:
+        return make_backend(request.param)
     module, _, name = request.param.rpartition(".")
     return getattr(importlib.import_module(module), name)()
+
+
+def load_config(name: str, *overrides: str) -> DictConfig:
+    """One file of configs/backend with overrides such as ``pretrained=false``."""
+    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
+        return compose(overrides=[f"+backend={name}", *(f"backend.{override}" for override in overrides)]).backend
+
+
+def make_backend(name: str, *overrides: str) -> Backend:
+    return instantiate(load_config(name, *overrides))
 
 
 def plane_scene(batch: int, views: int, size: tuple[int, int], seed: int = 0) -> tuple[Tensor, Hints]:
@@ -48,6 +66,16 @@ def plane_scene(batch: int, views: int, size: tuple[int, int], seed: int = 0) ->
     return images, Hints(depth, cameras, tuple(f"scene{seed}-{index}" for index in range(batch)), frames)
 
 
-@pytest.fixture(scope="session")
-def make_scene():
+@pytest.fixture(scope="session", name="make_scene")
+def make_scene_fixture():
     return plane_scene
+
+
+@pytest.fixture(scope="session", name="load_config")
+def load_config_fixture():
+    return load_config
+
+
+@pytest.fixture(scope="session", name="make_backend")
+def make_backend_fixture():
+    return make_backend

@@ -1,0 +1,174 @@
+"""Depth Anything 3's backbone: one ViT whose later blocks alternate between single views and all views.
+
+Module names follow the published weight files (``model.backbone.pretrained`` there).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from backends.positions import resize_position_embedding
+from backends.rope import Rotary, grid_positions, rotary_2d
+from backends.vit import Block, FeedForward, PatchEmbed
+
+ReferenceView = Literal["first", "middle", "saddle_balanced"]
+MIN_VIEWS_TO_CHOOSE = 3
+
+
+class Backbone(nn.Module):
+    """ViT with a class token that becomes the camera token where the views begin to see each other.
+
+    Args:
+        dim: channels C.
+        depth: blocks.
+        num_heads: attention heads.
+        ffn: feed-forward layer.
+        multiview_from: first block with rotary positions and normalised queries and keys, and from which odd blocks
+            attend over all views; None for a single-view network (metric, mono).
+        image_size: native image edge, which fixes the position embedding.
+        patch_size: in pixels.
+    """
+
+    def __init__(
+        self,
+        dim: int,
+        depth: int,
+        num_heads: int,
+        ffn: FeedForward,
+        multiview_from: int | None,
+        image_size: int,
+        patch_size: int,
+    ) -> None:
+        super().__init__()
+        self.patch_size = patch_size
+        self.head_dim = dim // num_heads
+        self.multiview_from = depth if multiview_from is None else multiview_from
+        self.cls_token = nn.Parameter(torch.zeros(1, 1, dim).normal_(std=0.02))
+        if multiview_from is not None:
+            self.camera_token = nn.Parameter(torch.zeros(1, 2, dim).normal_(std=0.02))  # reference view, other views
+        self.pos_embed = nn.Parameter(torch.zeros(1, (image_size // patch_size) ** 2 + 1, dim).normal_(std=0.02))
+        self.patch_embed = PatchEmbed(patch_size, dim)
+        self.blocks = nn.ModuleList(
+            Block(dim, num_heads, qk_norm=index >= self.multiview_from, ffn=ffn) for index in range(depth)
+        )
+        self.norm = nn.LayerNorm(dim, eps=1e-5)
+
+    def forward(
+        self,
+        images: Tensor,
+        taps: Sequence[int],
+        reference: ReferenceView = "first",
+        camera_tokens: Tensor | None = None,
+    ) -> tuple[list[Tensor], Tensor]:
+        """Runs the blocks.
+
+        Args:
+            images: ``[B, V, 3, H, W]``, normalised.
+            taps: indices of blocks.
+            reference: how the view that defines the predicted world frame is chosen, from three views on; the first
+                where camera tokens are given.
+            camera_tokens: ``[B, V, C]`` from the camera encoder, instead of the learned ones.
+
+        Returns:
+            Patch tokens of every tap and the last tap's camera token ``[B, V, D]``. Multi-view networks: D = 2C, the
+            last single-view output beside the current one, whose patch tokens alone are normalised. Single-view
+            networks: D = C.
+        """
+        batch, views = images.shape[:2]
+        grid = (images.shape[-2] // self.patch_size, images.shape[-1] // self.patch_size)
+        x = self._embed(images.flatten(0, 1), grid).unflatten(0, (batch, views))
+        local_rotary, global_rotary = self._rotary(grid, views, x)
+        choose = camera_tokens is None and reference != "first" and views >= MIN_VIEWS_TO_CHOOSE
+        order: Tensor | None = None
+        local, tapped, camera = x, [], x[:, :, 0]
+        for index, block in enumerate(self.blocks):
+            if choose and index == self.multiview_from - 1:
+                order = reference_first(select_reference(x[:, :, 0], reference), views)
+                x = _take_views(x, order)
+                local = _take_views(local, order)
+            if index == self.multiview_from:
+                x = torch.cat((self._camera_tokens(x, camera_tokens), x[:, :, 1:]), 2)
+            if index >= self.multiview_from and index % 2 == 1:
+                x = block(x.flatten(1, 2), global_rotary).unflatten(1, (views, -1))
+            else:
+                rotary = local_rotary if index >= self.multiview_from else None
+                local = x = block(x.flatten(0, 1), rotary).unflatten(0, (batch, views))
+            if index in taps:
+                patch, camera = self._tap(local, x)
+                if order is not None:
+                    inverse = order.argsort(1)
+                    patch, camera = _take_views(patch, inverse), _take_views(camera, inverse)
+                tapped.append(patch)
+        return tapped, camera
+
+    def _embed(self, images: Tensor, grid: tuple[int, int]) -> Tensor:
+        patches = self.patch_embed(images) + resize_position_embedding(self.pos_embed[0, 1:], grid, "scale")
+        first = (self.cls_token + self.pos_embed[:, :1]).expand(images.shape[0], -1, -1)
+        return torch.cat((first.to(patches.dtype), patches), 1)
+
+    def _rotary(self, grid: tuple[int, int], views: int, like: Tensor) -> tuple[Rotary, Rotary]:
+        """Tables within a view (true positions from 1) and across views (all patches at (1, 1)); class token at 0."""
+        patches = grid_positions(*grid, like=like) + 1
+        special = patches.new_zeros(1, 2)
+        within = rotary_2d(torch.cat((special, patches)), self.head_dim)
+        cos, sin = rotary_2d(torch.cat((special, torch.ones_like(patches))), self.head_dim)
+        return within, (cos.repeat(views, 1), sin.repeat(views, 1))
+
+    def _camera_tokens(self, x: Tensor, given: Tensor | None) -> Tensor:
+        """Camera tokens ``[B, V, 1, C]``."""
+        if given is not None:
+            return given[:, :, None].to(x.dtype)
+        others = self.camera_token[:, 1:].expand(-1, x.shape[1] - 1, -1)
+        tokens = torch.cat((self.camera_token[:, :1], others), 1)
+        return tokens[:, :, None].expand(x.shape[0], -1, -1, -1).to(x.dtype)
+
+    def _tap(self, local: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+        if self.multiview_from == len(self.blocks):
+            return self.norm(x[:, :, 1:]), x[:, :, 0]
+        patch = torch.cat((local[:, :, 1:], self.norm(x[:, :, 1:]).to(local.dtype)), -1)
+        return patch, torch.cat((local[:, :, 0], x[:, :, 0]), -1)
+
+
+class PretrainedBackbone(nn.Module):
+    """Holds a backbone under the name it has in the published files."""
+
+    def __init__(self, pretrained: Backbone) -> None:
+        super().__init__()
+        self.pretrained = pretrained
+
+
+def select_reference(tokens: Tensor, strategy: ReferenceView) -> Tensor:
+    """Chooses one view a scene from class tokens ``[B, V, C]``; returns int64 ``[B]``.
+
+    ``saddle_balanced`` takes the view nearest to the middle of three ranges, each scaled to [0, 1] over the views: mean
+    cosine similarity to the others, token norm, and variance of the normalised token.
+    """
+    batch, views = tokens.shape[:2]
+    if strategy == "first":
+        return torch.zeros(batch, dtype=torch.int64, device=tokens.device)
+    if strategy == "middle":
+        return torch.full((batch,), views // 2, dtype=torch.int64, device=tokens.device)
+    tokens = tokens.float()
+    length = tokens.norm(dim=-1)
+    unit = tokens / length[..., None]
+    similarity = ((unit @ unit.mT).sum(-1) - 1) / (views - 1)
+    measures = torch.stack((similarity, length, unit.var(-1)))
+    low, high = measures.amin(-1, keepdim=True), measures.amax(-1, keepdim=True)
+    scaled = (measures - low) / (high - low + 1e-8)
+    return (scaled - 0.5).abs().sum(0).argmin(-1)
+
+
+def reference_first(reference: Tensor, views: int) -> Tensor:
+    """Order ``[B, V]`` of the views with the reference ``[B]`` first and the others as they were."""
+    index = torch.arange(views, device=reference.device)
+    chosen = reference[:, None]
+    return torch.where(index == 0, chosen, torch.where(index <= chosen, index - 1, index))
+
+
+def _take_views(x: Tensor, order: Tensor) -> Tensor:
+    """Reorders the view axis of ``[B, V, ...]`` by ``[B, V]``."""
+    return torch.take_along_dim(x, order.reshape(*order.shape, *(1,) * (x.dim() - 2)), 1)

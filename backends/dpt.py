@@ -1,0 +1,154 @@
+"""Dense prediction head: four token maps fused coarse to fine into one map at image size.
+
+Module names follow the published weight files, hence ``scratch`` and ``resConfUnit1``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from backends.positions import uv_embedding
+
+POSITION_WEIGHT = 0.1
+HIDDEN = 32
+
+
+class ResidualUnit(nn.Module):
+    """Two 3x3 convolutions with ReLU before each, added to the input.
+
+    Args:
+        channels: in and out.
+        rectified_skip: whether the skip carries ``relu(x)`` (VGGT, whose in-place ReLU overwrites x) or x (DA3).
+    """
+
+    def __init__(self, channels: int, rectified_skip: bool) -> None:
+        super().__init__()
+        self.rectified_skip = rectified_skip
+        self.conv1 = nn.Conv2d(channels, channels, 3, padding=1)
+        self.conv2 = nn.Conv2d(channels, channels, 3, padding=1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Maps ``[N, C, h, w]`` to ``[N, C, h, w]``."""
+        rectified = F.relu(x)
+        change = self.conv2(F.relu(self.conv1(rectified)))
+        return change + (rectified if self.rectified_skip else x)
+
+
+class Fusion(nn.Module):
+    """Adds a finer map to a coarser one, refines, and upsamples."""
+
+    def __init__(self, channels: int, rectified_skip: bool, has_finer: bool = True) -> None:
+        super().__init__()
+        if has_finer:
+            self.resConfUnit1 = ResidualUnit(channels, rectified_skip)
+        self.resConfUnit2 = ResidualUnit(channels, rectified_skip)
+        self.out_conv = nn.Conv2d(channels, channels, 1)
+
+    def forward(self, coarse: Tensor, finer: Tensor | None, size: tuple[int, int]) -> Tensor:
+        """Fuses ``[N, C, h, w]`` maps into one of the given size."""
+        if finer is not None:
+            coarse = coarse + self.resConfUnit1(finer)
+        return self.out_conv(upsample(self.resConfUnit2(coarse), size))
+
+
+def upsample(x: Tensor, size: tuple[int, int]) -> Tensor:
+    """Bilinear, corners aligned."""
+    return F.interpolate(x, size, mode="bilinear", align_corners=True)
+
+
+def output_layers(channels: int, out: int) -> nn.Sequential:
+    """The last layers: 3x3, ReLU, 1x1."""
+    return nn.Sequential(nn.Conv2d(channels, HIDDEN, 3, padding=1), nn.ReLU(), nn.Conv2d(HIDDEN, out, 1))
+
+
+class DPT(nn.Module):
+    """Token maps of four taps to an image-sized map.
+
+    Args:
+        token_dim: channels of the tokens.
+        features: width of the fusion stages.
+        out_channels: channels of the four projected maps.
+        out: channels of the result.
+        patch_size: pixels a token.
+        rectified_skip: see :class:`ResidualUnit`.
+        normalize: whether one LayerNorm, shared by the taps, comes first.
+        position_weight: weight of the sine-cosine coordinates added to the maps; 0 adds none.
+        sky: whether a second output predicts sky from the same fused map.
+    """
+
+    def __init__(
+        self,
+        token_dim: int,
+        features: int,
+        out_channels: Sequence[int],
+        out: int,
+        patch_size: int = 14,
+        rectified_skip: bool = False,
+        normalize: bool = True,
+        position_weight: float = POSITION_WEIGHT,
+        sky: bool = False,
+    ) -> None:
+        super().__init__()
+        self.patch_size = patch_size
+        self.position_weight = position_weight
+        first, second, third, fourth = out_channels
+        self.norm = nn.LayerNorm(token_dim, eps=1e-5) if normalize else nn.Identity()
+        self.projects = nn.ModuleList(nn.Conv2d(token_dim, channels, 1) for channels in out_channels)
+        self.resize_layers = nn.ModuleList(
+            (
+                nn.ConvTranspose2d(first, first, 4, 4),
+                nn.ConvTranspose2d(second, second, 2, 2),
+                nn.Identity(),
+                nn.Conv2d(fourth, fourth, 3, 2, padding=1),
+            )
+        )
+        self.scratch = nn.Module()
+        for level, channels in enumerate((first, second, third, fourth), 1):
+            self.scratch.add_module(f"layer{level}_rn", nn.Conv2d(channels, features, 3, padding=1, bias=False))
+            self.scratch.add_module(f"refinenet{level}", Fusion(features, rectified_skip, has_finer=level < 4))
+        self.scratch.output_conv1 = nn.Conv2d(features, features // 2, 3, padding=1)
+        self.scratch.output_conv2 = output_layers(features // 2, out)
+        if sky:
+            self.scratch.sky_output_conv2 = output_layers(features // 2, 1)
+
+    def fuse(self, tokens: Sequence[Tensor], grid: tuple[int, int]) -> Tensor:
+        """Fuses four ``[N, P, D]`` token maps into ``[N, features / 2, H, W]``, before the output layers."""
+        height, width = grid[0] * self.patch_size, grid[1] * self.patch_size
+        aspect = width / height
+        maps = []
+        for level, (tap, project, resize) in enumerate(zip(tokens, self.projects, self.resize_layers, strict=True), 1):
+            x = project(self.norm(tap).transpose(1, 2).unflatten(-1, grid))
+            x = resize(self._add_position(x, aspect))
+            maps.append(self.scratch.get_submodule(f"layer{level}_rn")(x))
+        fused, finer = maps[3], None
+        for level in (4, 3, 2, 1):
+            finest = level == 1
+            size = (2 * maps[0].shape[-2], 2 * maps[0].shape[-1]) if finest else maps[level - 2].shape[-2:]
+            fused = self.scratch.get_submodule(f"refinenet{level}")(fused, finer, size)
+            finer = None if finest else maps[level - 2]
+        fused = upsample(self.scratch.get_submodule("output_conv1")(fused), (height, width))
+        return self._add_position(fused, aspect)
+
+    def forward(self, tokens: Sequence[Tensor], grid: tuple[int, int]) -> Tensor:
+        """Maps four ``[N, P, D]`` token maps to ``[N, out, H, W]`` without activation."""
+        return self.scratch.get_submodule("output_conv2")(self.fuse(tokens, grid))
+
+    def _add_position(self, x: Tensor, aspect: float) -> Tensor:
+        if self.position_weight == 0:
+            return x
+        return x + self.position_weight * uv_embedding(x.shape[1], (x.shape[-2], x.shape[-1]), aspect, like=x)
+
+
+def in_chunks(head: nn.Module, tokens: Sequence[Tensor], grid: tuple[int, int], chunk: int | None) -> Tensor:
+    """Runs a head over ``[B, V, P, D]`` token maps, at most ``chunk`` views at a time, to ``[B, V, out, H, W]``."""
+    flat = [tap.flatten(0, 1) for tap in tokens]
+    count = flat[0].shape[0]
+    if chunk is None or chunk >= count:
+        out = head(flat, grid)
+    else:
+        out = torch.cat([head([tap[i : i + chunk] for tap in flat], grid) for i in range(0, count, chunk)])
+    return out.unflatten(0, tokens[0].shape[:2])

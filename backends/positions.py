@@ -1,0 +1,94 @@
+"""Position embeddings of patches and feature maps, written as dense products so that sizes stay free under export."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from backends.base import full_precision
+
+Resampling = Literal["size", "scale"]
+
+
+def resize_position_embedding(embedding: Tensor, grid: tuple[int, int], resampling: Resampling) -> Tensor:
+    """Bicubic resize of a square position embedding to another patch grid, as one matrix product an axis.
+
+    Args:
+        embedding: ``[side * side, C]``, row major.
+        grid: wanted ``(rows, columns)``.
+        resampling: ``size`` samples by the ratio of the sizes with an antialiasing kernel (VGGT); ``scale`` samples by
+            the scale factor ``(n + 0.1) / side`` without antialiasing and leaves the native grid alone (DA3).
+
+    Returns:
+        ``[rows * columns, C]``.
+    """
+    side = round(embedding.shape[0] ** 0.5)
+    rows, columns = (torch.ones(size, device=embedding.device, dtype=embedding.dtype).cumsum(0) - 0.5 for size in grid)
+    if resampling == "size":
+        weights = [_antialiased_weights(centers, side) for centers in (rows, columns)]
+    else:
+        # Sizes as tensors: a Python comparison would fix them under export.
+        native = (rows[-1] + 0.5 == side) & (columns[-1] + 0.5 == side)
+        offset = torch.where(native, 0.0, 0.1)
+        weights = [_clamped_weights(centers, offset, side) for centers in (rows, columns)]
+    values = embedding.unflatten(0, (side, side))
+    with full_precision(embedding):
+        return torch.einsum("hy,wx,yxc->hwc", weights[0], weights[1], values).flatten(0, 1)
+
+
+def _cubic(distance: Tensor, a: float) -> Tensor:
+    """Keys' cubic convolution kernel."""
+    x = distance.abs()
+    near = ((a + 2) * x - (a + 3)) * x * x + 1
+    far = ((a * x - 5 * a) * x + 8 * a) * x - 4 * a
+    return torch.where(x <= 1, near, torch.where(x < 2, far, 0.0))
+
+
+def _antialiased_weights(centers: Tensor, side: int) -> Tensor:
+    """``[n, side]`` weights with a kernel (a = -1/2) that widens when shrinking and is cut at the border."""
+    scale = side / (centers[-1] + 0.5)
+    sources = torch.arange(side, device=centers.device, dtype=centers.dtype) + 0.5
+    weights = _cubic((sources - centers[:, None] * scale) / scale.clamp_min(1), a=-0.5)
+    return weights / weights.sum(1, keepdim=True)
+
+
+def _clamped_weights(centers: Tensor, offset: Tensor, side: int) -> Tensor:
+    """``[n, side]`` weights with a fixed kernel (a = -3/4) over a border-replicated source."""
+    positions = centers * (side / (centers[-1] + 0.5 + offset)) - 0.5
+    sources = torch.arange(-2, side + 2, device=centers.device, dtype=centers.dtype)
+    weights = _cubic(sources - positions[:, None], a=-0.75)
+    first = weights[:, :3].sum(1, keepdim=True)
+    last = weights[:, -3:].sum(1, keepdim=True)
+    return torch.cat((first, weights[:, 3:-3], last), 1)
+
+
+def uv_embedding(channels: int, size: tuple[int, int], aspect: float, like: Tensor) -> Tensor:
+    """Sine-cosine embedding ``[channels, h, w]`` of normalised image coordinates.
+
+    Coordinates are those of pixel centres in an image whose half diagonal is 1; half of the channels encode x, half y,
+    at wavelengths growing geometrically to 100 times the shortest.
+
+    Args:
+        channels: a multiple of 4.
+        size: ``(h, w)`` of the feature map.
+        aspect: image width / height.
+        like: gives dtype and device.
+    """
+    height, width = size
+    diagonal = (aspect * aspect + 1) ** 0.5
+    x = _centered(width, like.device) * (aspect / diagonal)
+    y = _centered(height, like.device) * (1 / diagonal)
+    quarter = channels // 4
+    omega = 100.0 ** (-torch.arange(quarter, device=like.device, dtype=torch.float64) / quarter)
+    waves = []
+    for coordinate in (x[None, :].expand(height, width), y[:, None].expand(height, width)):
+        phase = omega[:, None, None] * coordinate
+        waves += [phase.sin(), phase.cos()]
+    return torch.cat(waves).to(like.dtype)
+
+
+def _centered(size: int, device: torch.device) -> Tensor:
+    """Pixel centres from ``-(size - 1) / size`` to ``(size - 1) / size`` in float64."""
+    return (2 * torch.arange(size, device=device, dtype=torch.float64) + 1) / size - 1

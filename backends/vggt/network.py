@@ -1,0 +1,134 @@
+"""VGGT: a DINOv2 encoder a view, then alternating attention within and across views.
+
+Module names follow the published weight file (``facebook/VGGT-1B``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from backends.dpt import DPT
+from backends.normalization import normalize_images
+from backends.positions import resize_position_embedding
+from backends.rope import grid_positions, rotary_2d
+from backends.vggt.camera_head import CameraHead
+from backends.vit import Block, PatchEmbed
+
+REGISTERS = 4
+
+
+class Encoder(nn.Module):
+    """DINOv2 with registers; only its patch tokens are used."""
+
+    def __init__(self, dim: int, depth: int, num_heads: int, image_size: int, patch_size: int) -> None:
+        super().__init__()
+        self.cls_token = nn.Parameter(torch.zeros(1, 1, dim).normal_(std=0.02))
+        self.pos_embed = nn.Parameter(torch.zeros(1, (image_size // patch_size) ** 2 + 1, dim).normal_(std=0.02))
+        self.register_tokens = nn.Parameter(torch.zeros(1, REGISTERS, dim).normal_(std=0.02))
+        self.patch_embed = PatchEmbed(patch_size, dim)
+        self.blocks = nn.ModuleList(Block(dim, num_heads) for _ in range(depth))
+        self.norm = nn.LayerNorm(dim, eps=1e-6)
+
+    def forward(self, images: Tensor, grid: tuple[int, int]) -> Tensor:
+        """Maps normalised images ``[N, 3, H, W]`` to patch tokens ``[N, P, C]``."""
+        x = self.patch_embed(images) + resize_position_embedding(self.pos_embed[0, 1:], grid, "size")
+        first = self.cls_token + self.pos_embed[:, :1]
+        special = torch.cat((first, self.register_tokens), 1).expand(x.shape[0], -1, -1)
+        x = torch.cat((special.to(x.dtype), x), 1)
+        for block in self.blocks:
+            x = block(x)
+        return self.norm(x)[:, 1 + REGISTERS :]
+
+
+class Aggregator(nn.Module):
+    """Encoder, special tokens, and pairs of within-view and across-view blocks."""
+
+    def __init__(
+        self, dim: int, depth: int, encoder_depth: int, num_heads: int, image_size: int, patch_size: int
+    ) -> None:
+        super().__init__()
+        self.patch_size = patch_size
+        self.head_dim = dim // num_heads
+        self.camera_token = nn.Parameter(torch.zeros(1, 2, 1, dim).normal_(std=0.02))  # first view, other views
+        self.register_token = nn.Parameter(torch.zeros(1, 2, REGISTERS, dim).normal_(std=0.02))
+        self.patch_embed = Encoder(dim, encoder_depth, num_heads, image_size, patch_size)
+        self.frame_blocks = nn.ModuleList(_alternating_block(dim, num_heads) for _ in range(depth))
+        self.global_blocks = nn.ModuleList(_alternating_block(dim, num_heads) for _ in range(depth))
+
+    def forward(self, images: Tensor, taps: Sequence[int]) -> tuple[list[Tensor], Tensor]:
+        """Aggregates views.
+
+        Args:
+            images: ``[B, V, 3, H, W]`` in [0, 1].
+            taps: indices of block pairs.
+
+        Returns:
+            Patch tokens ``[B, V, P, 2C]`` of every tap and the last camera token ``[B, V, 2C]``.
+        """
+        batch, views = images.shape[:2]
+        grid = (images.shape[-2] // self.patch_size, images.shape[-1] // self.patch_size)
+        patches = self.patch_embed(normalize_images(images).flatten(0, 1), grid)
+        special = torch.cat((self.camera_token, self.register_token), 2)
+        special = torch.cat((special[:, :1], special[:, 1:].expand(-1, views - 1, -1, -1)), 1)
+        special = special.expand(batch, -1, -1, -1).flatten(0, 1).to(patches.dtype)
+        x = torch.cat((special, patches), 1)
+        count, start = x.shape[1], special.shape[1]
+
+        positions = grid_positions(*grid, like=x) + 1  # 0 is for the special tokens
+        positions = torch.cat((positions.new_zeros(start, 2), positions))
+        frame_rotary = rotary_2d(positions, self.head_dim)
+        global_rotary = tuple(table.repeat(views, 1) for table in frame_rotary)
+        tapped, camera = [], x
+        last = len(self.frame_blocks) - 1
+        for index, (frame_block, global_block) in enumerate(zip(self.frame_blocks, self.global_blocks, strict=True)):
+            within = frame_block(x, frame_rotary)
+            across = global_block(within.reshape(batch, views * count, -1), (global_rotary[0], global_rotary[1]))
+            x = across.reshape(batch * views, count, -1)
+            if index in taps or index == last:
+                both = torch.cat((within, x), -1).unflatten(0, (batch, views))
+                camera = both[:, :, 0]
+                if index in taps:
+                    tapped.append(both[:, :, start:])
+        return tapped, camera
+
+
+def _alternating_block(dim: int, num_heads: int) -> Block:
+    return Block(dim, num_heads, qk_norm=True, layer_scale=0.01, eps=1e-5)
+
+
+class VGGTNetwork(nn.Module):
+    """Aggregator with camera and depth heads; names and shapes as published.
+
+    Args:
+        dim: channels C of the encoder; tokens have 2C.
+        depth: pairs of alternating blocks.
+        encoder_depth: encoder blocks.
+        num_heads: attention heads.
+        features: DPT width.
+        out_channels: DPT channels of the four taps.
+        camera_depth: blocks of the camera head.
+        camera_heads: attention heads of the camera head.
+        image_size: native image edge, which fixes the position embedding.
+        patch_size: in pixels.
+    """
+
+    def __init__(
+        self,
+        dim: int,
+        depth: int,
+        encoder_depth: int,
+        num_heads: int,
+        features: int,
+        out_channels: Sequence[int],
+        camera_depth: int,
+        camera_heads: int,
+        image_size: int,
+        patch_size: int,
+    ) -> None:
+        super().__init__()
+        self.aggregator = Aggregator(dim, depth, encoder_depth, num_heads, image_size, patch_size)
+        self.camera_head = CameraHead(2 * dim, camera_depth, camera_heads)
+        self.depth_head = DPT(2 * dim, features, out_channels, 2, patch_size, rectified_skip=True)

@@ -1,0 +1,37 @@
+"""Every YAML of the group names exactly the arguments of its constructor."""
+
+import inspect
+from pathlib import Path
+
+import pytest
+from hydra.utils import get_class
+from omegaconf import DictConfig
+
+FILES = sorted(path.stem for path in (Path(__file__).resolve().parents[2] / "configs" / "backend").glob("*.yaml"))
+NON_COMMERCIAL = {"da3_large", "da3_giant"}
+
+
+def check_signature(config: DictConfig) -> None:
+    parameters = inspect.signature(get_class(config._target_).__init__).parameters
+    assert set(config) - {"_target_"} == set(parameters) - {"self"}
+    for value in config.values():
+        if isinstance(value, DictConfig):
+            check_signature(value)
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_yaml_is_the_signature(load_config, name: str) -> None:
+    check_signature(load_config(name))
+
+
+@pytest.mark.parametrize("name", sorted(set(FILES) - {"oracle"}))
+def test_licence_and_name_are_stated(load_config, name: str) -> None:
+    config = load_config(name)
+    assert config.name == name
+    if "licence" in config:
+        assert ("NC" in config.licence) == (name in NON_COMMERCIAL)
+
+
+def test_tiny_networks_are_tiny(make_backend) -> None:
+    for name in ("vggt_tiny", "da3_tiny"):
+        assert 1e5 < sum(parameter.numel() for parameter in make_backend(name).parameters()) < 1e6

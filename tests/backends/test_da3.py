@@ -1,0 +1,143 @@
+import pytest
+import torch
+
+from backends.da3.backbone import reference_first, select_reference
+from backends.da3.camera import normalize_cameras
+from backends.da3.metric import fill_sky, fit_scale
+from vg2gt.geometry.cameras import invert_rigid, relative_to_first
+from vg2gt.types import Cameras, Geometry, Hints
+
+SIZE = (56, 84)
+TINY_METRIC = (
+    "pretrained=false",
+    "dim=48",
+    "depth=4",
+    "num_heads=3",
+    "taps=[0,1,2,3]",
+    "features=24",
+    "out_channels=[16,20,28,32]",
+    "image_size=70",
+)
+
+
+def test_order_puts_the_reference_first_and_comes_back() -> None:
+    order = reference_first(torch.tensor([2, 0, 3]), 4)
+    assert order.tolist() == [[2, 0, 1, 3], [0, 1, 2, 3], [3, 0, 1, 2]]
+    views = torch.arange(4).expand(3, 4)
+    assert torch.equal(order.gather(1, order.argsort(1)), views)
+
+
+def test_balanced_reference_is_the_view_in_the_middle() -> None:
+    """Views on a line of growing norm and turning direction: the ends are extreme in every measure."""
+    generator = torch.Generator().manual_seed(0)
+    a, b = torch.randn(2, 64, generator=generator)
+    tokens = torch.stack([(1 + t) * (a + t * b) for t in (0.0, 0.9, 1.0, 2.0)])[None]
+    reference = select_reference(tokens, "saddle_balanced")
+    assert reference.tolist() == [1] or reference.tolist() == [2]
+    shuffled = torch.tensor([3, 1, 0, 2])
+    assert shuffled[select_reference(tokens[:, shuffled], "saddle_balanced")] == reference
+
+
+@pytest.mark.parametrize("views", [2, 4])
+def test_reference_strategies_keep_the_view_order(make_backend, make_scene, views: int) -> None:
+    """Whatever view is the reference, results belong to the views as given; below three views it is the first."""
+    images, _ = make_scene(2, views, SIZE)
+    first, balanced = (make_backend("da3_tiny", f"reference_view={s}") for s in ("first", "saddle_balanced"))
+    a, b = (backend.decode(backend.encode(images)) for backend in (first, balanced))
+    if views == 2:
+        assert torch.equal(a.depth, b.depth)
+    else:
+        assert not torch.equal(a.depth, b.depth)
+        order = torch.randperm(views, generator=torch.Generator().manual_seed(1))
+        shuffled = balanced.decode(balanced.encode(images[:, order]))
+        torch.testing.assert_close(shuffled.depth, b.depth[:, order], rtol=1e-4, atol=1e-5)
+
+
+def test_unknown_strategy_is_refused(make_backend) -> None:
+    with pytest.raises(Exception, match="saddle_balanced"):
+        make_backend("da3_tiny", "reference_view=best")
+
+
+def test_given_poses_are_used_up_to_world_frame_and_scale(make_backend, make_scene) -> None:
+    images, hints = make_scene(1, 3, SIZE)
+    backend = make_backend("da3_tiny", "given_poses=true")
+    with pytest.raises(ValueError, match="cameras"):
+        backend.encode(images)
+    hints = Hints(cameras=Cameras(hints.cameras.world_to_camera, hints.cameras.intrinsics, SIZE))
+    cameras = hints.cameras
+    assert cameras is not None
+    poses = cameras.world_to_camera.clone()
+    poses[..., :3, 3] *= 20  # beyond the smallest distance that is normalised
+    moved = poses @ invert_rigid(relative_to_first(cameras).world_to_camera[:, 1:2])
+    moved[..., :3, 3] *= 3
+    results = [
+        backend.decode(backend.encode(images, Hints(cameras=Cameras(p, cameras.intrinsics, SIZE)))).depth
+        for p in (poses, moved, poses.flip(1))
+    ]
+    torch.testing.assert_close(
+        normalize_cameras(Cameras(poses, cameras.intrinsics, SIZE)).world_to_camera[:, 0], torch.eye(4)[None]
+    )
+    torch.testing.assert_close(results[0], results[1], rtol=1e-4, atol=1e-5)
+    assert not torch.allclose(results[0], results[2], rtol=1e-4)
+
+
+def test_chunked_heads_equal_whole_heads(make_backend, make_scene) -> None:
+    images, _ = make_scene(2, 3, SIZE)
+    whole, chunked = (make_backend("da3_tiny", f"head_chunk={chunk}") for chunk in ("null", "4"))
+    tokens = whole.encode(images)
+    torch.testing.assert_close(chunked.decode(tokens).depth, whole.decode(tokens).depth, rtol=1e-5, atol=1e-6)
+
+
+def test_metric_depth_grows_with_the_focal_length(make_backend, make_scene) -> None:
+    images, hints = make_scene(1, 2, SIZE)
+    backend = make_backend("da3_metric_large", *TINY_METRIC)
+    with pytest.raises(ValueError, match="cameras"):
+        backend.encode(images)
+    twice = hints.cameras.intrinsics * torch.tensor([2.0, 2, 1])[:, None]
+    one = backend.decode(backend.encode(images, hints))
+    two = backend.decode(backend.encode(images, Hints(cameras=Cameras(hints.cameras.world_to_camera, twice, SIZE))))
+    torch.testing.assert_close(two.depth, 2 * one.depth)
+    assert torch.equal(one.cameras.world_to_camera, hints.cameras.world_to_camera)
+    assert torch.equal(one.depth_conf, torch.ones_like(one.depth))
+
+
+def test_sky_is_far() -> None:
+    depth = torch.linspace(1, 2, 800).reshape(1, 2, 20, 20)
+    sky = torch.zeros_like(depth)
+    sky[0, 0, :5] = 0.5
+    filled = fill_sky(depth, sky)
+    torch.testing.assert_close(filled[0, 0, :5], depth[sky == 0].quantile(0.99).expand(5, 20))
+    assert torch.equal(filled[sky == 0], depth[sky == 0])
+    assert torch.equal(fill_sky(depth, torch.ones_like(depth)), depth)  # nothing but sky: nothing to go by
+
+
+def test_nested_scale_ignores_sky_and_doubt() -> None:
+    generator = torch.Generator().manual_seed(0)
+    depth = 1 + torch.rand(2, 2, 20, 20, generator=generator)
+    confidence = 1 + torch.rand(2, 2, 20, 20, generator=generator)
+    factor = torch.tensor([3.0, 0.5])
+    metric = depth * factor[:, None, None, None]
+    sky = torch.zeros_like(depth)
+    sky[:, :, :4] = 1
+    metric[:, :, :4] = 1000
+    metric[confidence < 1.45] = 1000  # below the median whatever the sky is
+    cameras = Cameras(torch.eye(4).repeat(2, 2, 1, 1), torch.eye(3).repeat(2, 2, 1, 1), (20, 20))
+    geometry = Geometry(depth, confidence, cameras, torch.ones(2))
+    torch.testing.assert_close(fit_scale(metric, sky, geometry), factor)
+    assert torch.equal(fit_scale(metric, torch.ones_like(sky), geometry), torch.ones(2))
+
+
+def test_nested_keeps_the_relative_geometry(make_backend, make_scene) -> None:
+    images, _ = make_scene(2, 2, SIZE)
+    shared = [f"relative.{o}" for o in ("ffn=mlp", "multiview_from=2", "taps=[1,3,5,7]", "depth=8")]
+    shared += [f"relative.{o}" for o in TINY_METRIC if not o.startswith(("taps", "depth"))]
+    backend = make_backend("da3_nested", *shared, *(f"metric.{option}" for option in TINY_METRIC))
+    tokens = backend.encode(images)
+    geometry = backend.decode(tokens)
+    expected = backend.relative.decode(backend.relative.encode(images))
+    assert torch.equal(geometry.depth, expected.depth)
+    assert backend.is_metric
+    assert (geometry.scale > 0).all()
+    assert not torch.equal(geometry.scale, torch.ones(2))
+    changed = backend.decode(tokens.with_patch(tuple(patch + 0.1 for patch in tokens.patch)))
+    assert torch.equal(changed.scale, geometry.scale)

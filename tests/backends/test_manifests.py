@@ -1,0 +1,57 @@
+"""Full-size networks have exactly the tensors of the published files, but for those named as not needed."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from torch import nn
+
+from backends.da3 import DA3NestedBackend
+from backends.da3.backend import RAY_BRANCH
+from backends.weights import load_strictly
+
+CASES = {
+    "vggt_1b": ("vggt-1b", ()),
+    "da3_small": ("da3-small", ("given_poses=true",)),
+    "da3_base": ("da3-base", ("given_poses=true",)),
+    "da3_large": ("da3-large", ("given_poses=true",)),
+    "da3_giant": ("da3-giant", ("given_poses=true",)),
+    "da3_metric_large": ("da3metric-large", ()),
+    "da3_nested": ("da3nested-giant-large", ("relative.given_poses=true",)),
+}
+
+
+def tensors(network: nn.Module, prefix: str) -> dict[str, list[int]]:
+    return {prefix + key: list(value.shape) for key, value in network.state_dict().items()}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_names_and_shapes(shared: Path, make_backend, name: str) -> None:
+    file, overrides = CASES[name]
+    manifest = json.loads((shared / "manifests" / f"{file}.json").read_text())
+    nested = name == "da3_nested"
+    random = ["relative.pretrained=false", "metric.pretrained=false"] if nested else ["pretrained=false"]
+    with torch.device("meta"):
+        backend = make_backend(name, *random, *overrides)
+    if isinstance(backend, DA3NestedBackend):
+        ours = tensors(backend.relative.network, "model.da3.") | tensors(backend.metric.network, "model.da3_metric.")
+    else:
+        ours = tensors(backend.network, manifest["hub_prefix"])
+    # Camera encoder and sky are named as not needed, but are part of our networks; the ray branch is not.
+    unused = [key for key in manifest["ignorable_prefixes_for_depth_and_camera"] if "cam_enc" not in key]
+    unused = [key for key in unused if "sky" not in key]
+    unused += ["model.da3." + key for key in RAY_BRANCH] if nested else []
+    published = {key: entry["shape"] for key, entry in manifest["tensors"].items() if not key.startswith(tuple(unused))}
+    assert ours == published
+
+
+@pytest.mark.parametrize("name", ["vggt_1b", "da3_small", "da3_large", "da3_giant"])
+def test_a_published_file_would_load(shared: Path, make_backend, load_config, name: str) -> None:
+    """Without the camera encoder, exactly as the YAML says: every leftover of the file is known."""
+    manifest = json.loads((shared / "manifests" / f"{CASES[name][0]}.json").read_text())
+    assert load_config(name).repo in manifest["hub_repos"]
+    with torch.device("meta"):
+        backend = make_backend(name, "pretrained=false")
+        state = {key: torch.empty(entry["shape"]) for key, entry in manifest["tensors"].items()}
+    load_strictly(backend.network, state, backend.weights.prefix, backend.weights.ignorable, "file")

@@ -1,0 +1,105 @@
+import sys
+import types
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import save_file
+from torch import nn
+
+from backends.weights import find_weights, load_strictly, read_weights
+
+
+def published(backend, prefix: str = "model.") -> dict[str, torch.Tensor]:
+    return {prefix + key: value.clone() for key, value in backend.network.state_dict().items()}
+
+
+@pytest.fixture(scope="module")
+def donor(make_backend):
+    return make_backend("da3_tiny", "seed=5")
+
+
+@pytest.mark.parametrize("name", ["model.safetensors", "model.pt", "other.safetensors"])
+def test_weights_are_loaded_from_file_or_folder(tmp_path: Path, make_backend, donor, capsys, name: str) -> None:
+    state = published(donor) | {"model.head.scratch.output_conv1_aux.0.0.weight": torch.zeros(1)}
+    file = tmp_path / name
+    save_file(state, file) if file.suffix == ".safetensors" else torch.save(state, file)
+    path = file if name.startswith("other") else tmp_path
+    backend = make_backend("da3_tiny", "pretrained=true", f"path={path}", "licence=Example-1.0")
+    assert backend.identity()["weights"] == donor.identity()["weights"]
+    assert "Example-1.0" in capsys.readouterr().out
+    assert not any(parameter.requires_grad for parameter in backend.parameters())
+
+
+def test_random_weights_depend_on_the_seed_alone(make_backend, donor) -> None:
+    torch.manual_seed(0)
+    expected = torch.rand(1)
+    torch.manual_seed(0)
+    again = make_backend("da3_tiny", "seed=5")
+    assert torch.equal(torch.rand(1), expected)
+    assert again.identity() == donor.identity()
+    assert make_backend("da3_tiny").identity() != donor.identity()
+
+
+def test_offending_tensors_are_named() -> None:
+    network = nn.Sequential(nn.Linear(2, 3), nn.Linear(3, 1))
+    state = {f"model.{key}": value for key, value in network.state_dict().items()}
+    state["model.0.weight"] = torch.zeros(3, 4)
+    del state["model.1.bias"]
+    state["model.2.weight"] = torch.zeros(1)
+    state["model.unused.weight"] = torch.zeros(1)
+    with pytest.raises(ValueError, match="does not fit Sequential") as caught:
+        load_strictly(network, state, "model.", ("model.unused.",), "some.pt")
+    message = str(caught.value)
+    assert "some.pt" in message
+    assert "missing model.1.bias [1]" in message
+    assert "model.0.weight is [3, 4], expected [3, 2]" in message
+    assert "unexpected model.2.weight" in message
+    assert "unused" not in message
+
+
+def test_a_file_of_another_model_is_refused_briefly() -> None:
+    network = nn.Sequential(*(nn.Linear(2, 2) for _ in range(8)))
+    with pytest.raises(ValueError, match="and 12 more"):
+        load_strictly(network, {"other": torch.zeros(1)}, "", (), "x")
+
+
+def test_missing_files_are_named(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"model\.safetensors.*backend\.pretrained=false.*some/repo"):
+        find_weights("name", "some/repo", None, str(tmp_path))
+    with pytest.raises(FileNotFoundError, match="no published weights"):
+        find_weights("name", None, None, None)
+
+
+def test_missing_hub_library_is_explained(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "huggingface_hub", None)
+    with pytest.raises(ImportError, match="pip install huggingface_hub"):
+        find_weights("name", "some/repo", None, None)
+
+
+def test_hub_is_asked_for_the_revision(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    asked = {}
+
+    def download(repo: str, file: str, revision: str | None) -> str:
+        asked.update(repo=repo, file=file, revision=revision)
+        return str(tmp_path / file)
+
+    monkeypatch.setitem(sys.modules, "huggingface_hub", types.SimpleNamespace(hf_hub_download=download))
+    assert find_weights("name", "some/repo", "v1", None) == tmp_path / "model.safetensors"
+    assert asked == {"repo": "some/repo", "file": "model.safetensors", "revision": "v1"}
+
+
+def test_an_unreachable_hub_names_repository_and_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
+    def download(*_, **__) -> str:
+        raise OSError("no route to host")
+
+    monkeypatch.setitem(sys.modules, "huggingface_hub", types.SimpleNamespace(hf_hub_download=download))
+    with pytest.raises(FileNotFoundError, match=r"some/repo.*no route to host.*backend\.pretrained=false"):
+        find_weights("name", "some/repo", None, None)
+
+
+def test_files_that_hold_more_than_tensors_are_refused(tmp_path: Path) -> None:
+    file = tmp_path / "model.pt"
+    torch.save({"state_dict": {"a": torch.zeros(1)}}, file)
+    with pytest.raises(ValueError, match="mapping of names to tensors"):
+        read_weights(file)
