@@ -25,7 +25,7 @@ def nearest_neighbors(queries: Tensor, points: Tensor, neighbors: int) -> Tensor
     queries, points = queries.detach(), points.detach()
     if queries.device.type == "cpu":
         tree = KDTree(points.numpy())
-        index = tree.query(queries.numpy(), k=list(range(1, count + 1)), workers=torch.get_num_threads())[1]
+        index = tree.query(queries.numpy(), k=count, workers=torch.get_num_threads())[1]
         return torch.from_numpy(index).long().reshape(len(queries), count)
     parts = [
         torch.cdist(part, points, compute_mode="donot_use_mm_for_euclid_dist").topk(count, largest=False).indices

@@ -5,6 +5,7 @@ Parameter names are those of the official implementation, so that its state dict
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from typing import Literal, get_args
 
@@ -308,8 +309,9 @@ class PTv3(nn.Module):
 
 def _ramp(largest: float, depths: Sequence[int]) -> list[list[float]]:
     """Rates from 0 to ``largest`` over all blocks, split by stage."""
-    rates = torch.linspace(0, largest, sum(depths)).split(list(depths))
-    return [part.tolist() for part in rates]
+    step = largest / max(1, sum(depths) - 1)
+    starts = itertools.accumulate(depths, initial=0)
+    return [[step * (start + i) for i in range(depth)] for start, depth in zip(starts, depths, strict=False)]
 
 
 def _make_norm(kind: Norm, channels: int) -> nn.Module:

@@ -1,0 +1,153 @@
+import math
+
+import pytest
+import torch
+from torch import nn
+
+from vg2gt.gaussians import GaussianHead
+from vg2gt.types import Voxels
+
+
+def wall(rows=8, columns=8, channels=16, size=0.5, scenes=1, seed=0):
+    """Voxels on the plane z = 0 with random features and colours."""
+    generator = torch.Generator().manual_seed(seed)
+    cells = torch.cartesian_prod(torch.arange(rows), torch.arange(columns), torch.tensor([0]))
+    grid = cells.repeat(scenes, 1)
+    count = len(grid)
+    centers = (grid + 0.5) * size
+    return Voxels(
+        features=torch.randn(count, channels, generator=generator),
+        colors=torch.rand(count, 3, generator=generator),
+        grid=grid,
+        batch=torch.arange(scenes).repeat_interleave(len(cells)),
+        confidence=torch.ones(count),
+        count=torch.ones(count),
+        centroid=centers + (torch.rand(count, 3, generator=generator) - 0.5) * size,
+        voxel_size=torch.full((scenes,), size),
+    )
+
+
+def head(seed=0, **options):
+    torch.manual_seed(seed)
+    return GaussianHead(16, **options)
+
+
+@pytest.mark.parametrize("splits", [1, 2, 4])
+@pytest.mark.parametrize("degree", [0, 2])
+@pytest.mark.parametrize("anchor", ["centroid", "center"])
+def test_parameters_stay_within_their_bounds(splits, degree, anchor):
+    voxels = wall(scenes=2)
+    module = head(splits=splits, sh_degree=degree, anchor=anchor, max_offset=0.7)
+    nn.init.normal_(module.out.weight, std=0.5)  # far from the start
+    g = module(voxels)
+    assert len(g) == splits * len(voxels.grid)
+    assert g.sh.shape == (len(g), (degree + 1) ** 2, 3)
+    assert torch.equal(g.batch, voxels.batch.repeat_interleave(splits))
+    v = 0.5
+    assert ((g.scales > 0) & (g.scales < 2 * v)).all()
+    origin = voxels.centroid if anchor == "centroid" else voxels.centers
+    assert ((g.means - origin.repeat_interleave(splits, 0)).abs() <= 0.7 * v * (1 + 1e-5)).all()
+    torch.testing.assert_close(g.quats.norm(dim=-1), torch.ones(len(g)))
+    assert ((g.opacities >= 0) & (g.opacities <= 1)).all()
+
+
+@pytest.mark.parametrize("splits", [1, 2, 4])
+def test_untrained_gaussians_are_coloured_blobs_of_half_a_voxel(splits):
+    voxels = wall()
+    module = head(splits=splits, sh_degree=2)
+    nn.init.zeros_(module.out.weight)
+    g = module(voxels)
+    colors = 0.5 + 0.28209479177387814 * g.sh[:, 0]
+    torch.testing.assert_close(colors, voxels.colors.repeat_interleave(splits, 0))
+    assert g.sh[:, 1:].eq(0).all()
+    torch.testing.assert_close(g.scales, torch.full_like(g.scales, 0.25))
+    torch.testing.assert_close(g.means, voxels.centroid.repeat_interleave(splits, 0))
+    torch.testing.assert_close(g.quats, torch.tensor([1.0, 0, 0, 0]).expand_as(g.quats))
+    joint = 1 - (1 - g.opacities.view(-1, splits)).prod(1)
+    torch.testing.assert_close(joint, torch.full_like(joint, 0.95))
+
+
+def transmittance(g, splits, rows, columns, size, samples=60):
+    """Mean of the product of 1 - alpha over rays along z through the middle of the wall, analytically."""
+    axis = torch.linspace(2.0, rows - 2.0, samples) * size
+    pixels = torch.cartesian_prod(axis, axis * columns / rows)
+    # A ray's largest response to an axis-aligned blob is at its distance in x and y.
+    delta = (pixels[:, None] - g.means[None, :, :2]) / g.scales[None, :, :2]
+    alpha = (g.opacities * torch.exp(-0.5 * delta.square().sum(-1))).clamp(max=0.99)
+    return (1 - alpha).log().sum(1).exp()
+
+
+@pytest.mark.parametrize("splits", [1, 2, 4])
+@pytest.mark.parametrize("anchor", ["center", "centroid"])
+def test_untrained_wall_has_no_holes(splits, anchor):
+    # A single blob a voxel leaves the corners of cells thinner: 0.12 instead of 0.07 at the same joint opacity.
+    voxels = wall(16, 16)
+    g = head(splits=splits, anchor=anchor)(voxels)
+    seen = transmittance(g, splits, 16, 16, 0.5)
+    assert seen.mean() < (0.1 if splits > 1 else 0.16)
+    if anchor == "center":
+        assert seen.max() < 0.5  # a hole has no median depth
+
+
+def separation(module, steps=250):
+    """Median distance, in voxels, between the two slots after fitting two points a voxel to a stripe pattern."""
+    voxels = wall()
+    target = voxels.centers[:, None] + 0.5 * torch.tensor([[-0.3, 0.0, 0.0], [0.3, 0.0, 0.0]])
+    optimizer = torch.optim.Adam(module.parameters(), lr=2e-3)
+    for _ in range(steps):
+        means = module(voxels).means.view(-1, 2, 3)
+        # Each target is claimed by its nearest slot, so nothing says which slot goes where.
+        loss = (means[:, :, None] - target[:, None]).square().sum(-1).amin(1).mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    means = module(voxels).means.detach().view(-1, 2, 3)
+    return float((means[:, 0] - means[:, 1]).norm(dim=-1).median() / 0.5)
+
+
+def test_slots_separate_but_copied_rows_never_do():
+    assert separation(head(anchor="center")) > 0.3
+    copied = head(anchor="center")
+    with torch.no_grad():
+        copied.out.weight.copy_(copied.out.weight[:14].repeat(2, 1))
+    assert separation(copied, steps=50) < 1e-6
+
+
+def test_scaling_voxels_scales_means_and_scales():
+    module = head(sh_degree=1)
+    small, large = module(wall(size=0.5)), module(wall(size=2.0))
+    torch.testing.assert_close(4 * small.means, large.means)
+    torch.testing.assert_close(4 * small.scales, large.scales)
+    for name in ("quats", "opacities", "sh"):
+        assert torch.equal(getattr(small, name), getattr(large, name))
+
+
+def test_higher_bands_learn_slower():
+    module = head(sh_degree=2)
+    gains = module.sh_gain[:, 0].tolist()
+    assert gains == pytest.approx([1, 0.025, 0.025, 0.025] + [0.00625] * 5)
+
+
+def test_no_voxels_give_no_gaussians():
+    voxels = wall().map(lambda t: t[:0] if len(t) > 1 else t)
+    g = head()(voxels)
+    assert len(g) == 0
+    g.means.sum().backward()
+
+
+def test_gradients_reach_every_parameter_and_the_anchor():
+    voxels = wall()
+    voxels.centroid.requires_grad_()
+    module = head(sh_degree=1)
+    g = module(voxels)
+    outputs = torch.cat([x.flatten() for x in (g.means, g.scales, g.quats, g.sh, g.opacities)])
+    (outputs * torch.linspace(0, 1, len(outputs))).sum().backward()
+    assert voxels.centroid.grad is not None
+    assert all(p.grad is not None and torch.isfinite(p.grad).all() for p in module.parameters())
+    assert math.isfinite(module.opacity_bias)
+
+
+@pytest.mark.parametrize("options", [{"splits": 0}, {"sh_degree": 4}, {"anchor": "middle"}])
+def test_bad_options_are_refused_by_name(options):
+    with pytest.raises(ValueError, match=rf"gaussians\.{next(iter(options))}"):
+        head(**options)

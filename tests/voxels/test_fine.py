@@ -1,0 +1,176 @@
+import logging
+from dataclasses import replace
+
+import torch
+
+from vg2gt.geometry.cameras import unproject
+from vg2gt.types import Cameras
+
+
+def test_voxels_hold_the_weighted_means_of_their_pixels(make_fine, make_room):
+    tokens, geometry, images = make_room(scenes=2)
+    voxels = make_fine()(tokens, geometry, images)
+    assert torch.equal(voxels.batch, voxels.batch.sort().values)
+    points = unproject(geometry.depth, geometry.cameras)
+    for scene in (0, 1):
+        rows = voxels.batch == scene
+        cells = torch.floor(points[scene].double().reshape(-1, 3) / 0.125).long()
+        cell, members = cells.unique(dim=0, return_inverse=True)
+        assert torch.equal(voxels.grid[rows], cell)
+        weight = geometry.depth_conf[scene].flatten().double()
+        total = torch.zeros(len(cell), dtype=torch.float64).index_add_(0, members, weight)
+        for ours, values in (
+            (voxels.centroid[rows], points[scene].reshape(-1, 3)),
+            (voxels.colors[rows], images[scene].permute(0, 2, 3, 1).reshape(-1, 3)),
+        ):
+            mean = torch.zeros(len(cell), 3, dtype=torch.float64).index_add_(0, members, values * weight[:, None])
+            torch.testing.assert_close(ours.double(), mean / total[:, None], atol=1e-5, rtol=1e-5)
+        least = torch.full_like(total, 1e9).scatter_reduce_(0, members, weight, "amin")
+        assert torch.equal(voxels.confidence[rows].double(), least)
+        assert torch.equal(voxels.count[rows].long(), torch.bincount(members))
+    half = voxels.voxel_size[voxels.batch, None] / 2
+    assert ((voxels.centroid - voxels.centers).abs() <= half * (1 + 1e-5)).all()
+
+
+def test_gradients_reach_tokens_depth_confidence_and_every_parameter(make_fine, make_room):
+    tokens, geometry, images = make_room()
+    inputs = [*tokens.patch, geometry.depth, geometry.depth_conf]
+    for x in inputs:
+        x.requires_grad_()
+    module = make_fine()
+    voxels = module(tokens, geometry, images)
+    (voxels.features.square().sum() + voxels.centroid.sum()).backward()
+    for x in (*inputs, *module.parameters()):
+        assert x.grad is not None
+        assert torch.isfinite(x.grad).all()
+        assert x.grad.abs().sum() > 0
+
+
+def test_centroid_gradient_is_the_pooling_weight(make_fine, make_room):
+    tokens, geometry, images = make_room(views=1)
+    geometry.depth.requires_grad_()
+    voxels = make_fine()(tokens, geometry, images)
+    (grad,) = torch.autograd.grad(voxels.centroid[:, 2].sum(), geometry.depth)  # view 0 looks almost along z
+    shifted = replace(geometry, depth=geometry.depth.detach() + 1e-4 * (voxels.count.max() * 0 + 1))
+    moved = make_fine()(tokens, shifted, images)
+    if torch.equal(moved.grid, voxels.grid):
+        change = (moved.centroid[:, 2].sum() - voxels.centroid[:, 2].sum()) / 1e-4
+        torch.testing.assert_close(change, grad.sum(), atol=0.5, rtol=0.02)
+    assert grad.abs().sum() > 0
+
+
+def test_sky_and_non_finite_pixels_are_left_out(make_fine, make_room):
+    tokens, geometry, images = make_room()
+    depth, confidence = geometry.depth.clone(), geometry.depth_conf.clone()
+    depth[0, 0, :20] = 0
+    depth[0, 1, :10] = torch.nan
+    depth[0, 2, :10] = torch.inf
+    confidence[0, 1, 10:12] = torch.nan
+    depth[0, 0, 30, 30] = 1e9  # too far to be numbered
+    depth.requires_grad_()
+    module = make_fine()
+    voxels = module(tokens, replace(geometry, depth=depth, depth_conf=confidence), images)
+    assert int(voxels.count.sum()) == 3 * 42 * 84 - 20 * 84 - 10 * 84 - 10 * 84 - 2 * 84 - 1
+    for values in (voxels.features, voxels.colors, voxels.centroid, voxels.confidence):
+        assert torch.isfinite(values).all()
+    (voxels.features.sum() + voxels.centroid.sum()).backward()
+    assert depth.grad is not None
+    assert torch.isfinite(depth.grad).all()
+    assert depth.grad[0, 0, :20].eq(0).all()
+    assert all(torch.isfinite(p.grad).all() for p in module.parameters() if p.grad is not None)
+
+
+def test_a_scene_without_points_has_no_voxels(make_fine, make_room):
+    tokens, geometry, images = make_room(scenes=2)
+    depth = geometry.depth.clone()
+    depth[0] = 0
+    module = make_fine()
+    voxels = module(tokens, replace(geometry, depth=depth), images)
+    assert voxels.batch.unique().tolist() == [1]
+    nothing = module(tokens, replace(geometry, depth=depth * 0), images)
+    assert nothing.features.shape == (0, module.out_channels)
+    nothing.features.sum().backward()
+
+
+def test_a_single_voxel_and_coordinates_of_two_hundred_units(make_fine, make_room):
+    tokens, geometry, images = make_room()
+    voxels = make_fine(voxel_size=1000.0)(tokens, geometry, images)
+    assert len(voxels.grid) <= 8
+    voxels.features.sum().backward()
+    far = replace(geometry, depth=geometry.depth * 140)
+    voxels = make_fine(voxel_size=0.002)(tokens, far, images)
+    assert voxels.centroid.abs().max() > 150
+    assert torch.isfinite(voxels.features).all()
+
+
+def test_autocast_leaves_the_grid_identical(make_fine, make_room):
+    tokens, geometry, images = make_room()
+    module = make_fine()
+    plain = module(tokens, geometry, images)
+    with torch.autocast("cpu", torch.bfloat16):
+        cast = module(tokens, geometry, images)
+    assert torch.equal(plain.grid, cast.grid)
+    assert torch.equal(plain.centroid, cast.centroid)
+    assert torch.equal(plain.colors, cast.colors)
+
+
+def test_scaling_scene_and_voxel_by_a_power_of_two(make_fine, make_room):
+    tokens, geometry, images = make_room()
+    poses = geometry.cameras.world_to_camera.clone()
+    poses[..., :3, 3] *= 4
+    cameras = Cameras(poses, geometry.cameras.intrinsics, geometry.cameras.size)
+    small = make_fine()(tokens, geometry, images)
+    large = make_fine(voxel_size=0.5)(tokens, replace(geometry, depth=geometry.depth * 4, cameras=cameras), images)
+    assert torch.equal(small.grid, large.grid)
+    assert torch.equal(small.features, large.features)
+    torch.testing.assert_close(4 * small.centroid, large.centroid)
+    torch.testing.assert_close(4 * small.voxel_size, large.voxel_size)
+
+
+def take_views(inputs, views):
+    tokens, geometry, images = inputs
+    picked = replace(
+        geometry,
+        depth=geometry.depth[:, views],
+        depth_conf=geometry.depth_conf[:, views],
+        cameras=geometry.cameras.select(torch.tensor(views)),
+    )
+    tokens = replace(tokens, patch=tuple(tap[:, views] for tap in tokens.patch), camera=tokens.camera[:, views])
+    return tokens, picked, images[:, views]
+
+
+def test_duplicated_views_add_no_voxels_and_new_views_few(make_fine, make_room):
+    inputs = make_room(views=6)
+    module = make_fine()
+    three, repeated, six = (
+        module(*take_views(inputs, views)) for views in ([0, 1, 2], [0, 1, 2, 1], [0, 1, 2, 3, 4, 5])
+    )
+    assert torch.equal(three.grid, repeated.grid)
+    assert torch.equal(three.confidence, repeated.confidence)
+    everything = module(*take_views(inputs, [0, 1, 2, 0, 1, 2]))
+    assert torch.equal(three.grid, everything.grid)
+    torch.testing.assert_close(three.centroid, everything.centroid)
+    torch.testing.assert_close(three.features, everything.features, atol=1e-4, rtol=1e-4)
+    assert len(three.grid) < len(six.grid) < 1.8 * len(three.grid)
+
+
+def test_cap_keeps_the_most_confident_and_says_so(make_fine, make_room, caplog):
+    inputs = make_room(scenes=2)
+    everything = make_fine()(*inputs)
+    with caplog.at_level(logging.WARNING, logger="vg2gt.voxels.fine"):
+        capped = make_fine(max_voxels=50)(*inputs)
+    assert "max_voxels=50" in caplog.text
+    assert torch.bincount(capped.batch).tolist() == [50, 50]
+    for scene in (0, 1):
+        best = everything.confidence[everything.batch == scene].sort(descending=True).values[:50]
+        assert torch.equal(capped.confidence[capped.batch == scene].sort(descending=True).values, best)
+    caplog.clear()
+    make_fine(max_voxels=10**6)(*inputs)
+    assert not caplog.text
+
+
+def test_footprint_guard(make_fine, make_room):
+    tokens, geometry, images = make_room()
+    voxels = make_fine(voxel_size=1e-4, min_footprint=3)(tokens, geometry, images)
+    expected = 3 * geometry.depth.median() / geometry.cameras.intrinsics[0, 0, 0, 0]
+    torch.testing.assert_close(voxels.voxel_size, expected[None])

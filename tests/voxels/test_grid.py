@@ -1,0 +1,183 @@
+import math
+
+import pytest
+import torch
+
+from vg2gt.types import Cameras, Geometry
+from vg2gt.voxels.grid import (
+    in_range,
+    mixed_radix_keys,
+    plan_voxels,
+    point_cells,
+    pool_mean,
+    pool_min,
+    scene_voxel_size,
+)
+
+SIZE = torch.tensor([0.125, 0.25])
+
+
+def cloud(count=400, seed=0, dtype=torch.float64):
+    generator = torch.Generator().manual_seed(seed)
+    points = torch.rand(count, 3, generator=generator, dtype=dtype) * 1.2 - 0.6
+    batch = (torch.arange(count) >= count // 3).long()
+    values = torch.randn(count, 5, generator=generator, dtype=dtype)
+    weights = 1 + torch.rand(count, generator=generator, dtype=dtype)
+    return points, batch, values, weights
+
+
+def planned(points, batch, valid=None, size=SIZE):
+    valid = torch.ones_like(batch, dtype=torch.bool) if valid is None else valid
+    return plan_voxels(point_cells(points, batch, size), batch, valid)
+
+
+def brute_force(points, batch, values, weights, valid):
+    cells = {}
+    for i in range(len(points)):
+        if valid[i]:
+            v = float(SIZE[batch[i]])
+            key = (int(batch[i]), *(math.floor(float(x) / v) for x in points[i]))
+            cells.setdefault(key, []).append(i)
+    rows = [cells[key] for key in sorted(cells)]
+    mean = torch.stack([(values[r] * weights[r, None]).sum(0) / weights[r].sum() for r in rows])
+    return sorted(cells), rows, mean, torch.stack([weights[r].min() for r in rows])
+
+
+def test_pooling_equals_a_dictionary_loop():
+    points, batch, values, weights = cloud()
+    valid = torch.rand(len(batch), generator=torch.Generator().manual_seed(1)) > 0.2
+    plan = planned(points, batch, valid)
+    keys, rows, mean, least = brute_force(points, batch, values, weights, valid)
+    assert torch.cat((plan.batch[:, None], plan.grid), 1).tolist() == [list(key) for key in keys]
+    assert plan.counts.tolist() == [len(r) for r in rows]
+    torch.testing.assert_close(pool_mean(values, weights, plan), mean, atol=1e-12, rtol=1e-12)
+    assert torch.equal(pool_min(weights, plan), least)
+    for voxel, members in enumerate(rows):
+        assert plan.voxel_of[members].eq(voxel).all()
+    assert plan.voxel_of[~valid].eq(-1).all()
+
+
+def test_mass_and_constants_are_preserved_and_points_lie_in_their_cell():
+    points, batch, values, weights = cloud()
+    plan = planned(points, batch)
+    mean = pool_mean(values, weights, plan)
+    total = torch.zeros(len(plan), dtype=weights.dtype).index_add_(0, plan.voxel_of, weights)
+    torch.testing.assert_close((total[:, None] * mean).sum(0), (values * weights[:, None]).sum(0))
+    constant = pool_mean(torch.full_like(values, 0.7), weights, plan)
+    torch.testing.assert_close(constant, torch.full_like(constant, 0.7), atol=1e-14, rtol=0)
+    low = plan.grid[plan.voxel_of] * SIZE.double()[batch, None]
+    assert ((points >= low) & (points < low + SIZE.double()[batch, None])).all()
+
+
+@pytest.mark.parametrize("left_out", [0, 12])
+def test_gradients_of_values_and_weights(left_out):
+    points, batch, values, weights = cloud(50)
+    valid = torch.arange(50) >= left_out
+    plan = planned(points, batch, valid)
+    assert plan.counts.max() > 1
+    inputs = (values.requires_grad_(), weights.requires_grad_())
+    assert torch.autograd.gradcheck(lambda f, n: pool_mean(f, n, plan), inputs)
+    assert torch.autograd.gradcheck(lambda n: pool_min(n, plan), (weights,))
+
+
+def test_permuting_points_changes_nothing():
+    points, batch, values, weights = cloud()
+    order = torch.randperm(len(points), generator=torch.Generator().manual_seed(3))
+    plan, other = planned(points, batch), planned(points[order], batch[order])
+    assert torch.equal(plan.grid, other.grid)
+    assert torch.equal(plan.batch, other.batch)
+    mean, shuffled = pool_mean(values, weights, plan), pool_mean(values[order], weights[order], other)
+    torch.testing.assert_close(mean, shuffled, atol=1e-6, rtol=0)
+    assert torch.equal(pool_min(weights, plan), pool_min(weights[order], other))
+
+
+def test_shifting_by_whole_voxels_shifts_the_grid_only():
+    points, _, values, weights = cloud()
+    batch = torch.zeros(len(points), dtype=torch.int64)
+    size = torch.tensor([0.125])
+    shift = torch.tensor([3, -5, 40])
+    plan = planned(points, batch, size=size)
+    moved = planned(points + shift * 0.125, batch, size=size)
+    assert torch.equal(moved.grid, plan.grid + shift)
+    assert torch.equal(pool_mean(values, weights, plan), pool_mean(values, weights, moved))
+
+
+def test_duplicating_all_points():
+    points, batch, values, weights = cloud()
+    twice = [torch.cat((x, x)) for x in (points, batch, values, weights)]
+    plan, double = planned(points, batch), planned(*twice[:2])
+    assert torch.equal(plan.grid, double.grid)
+    assert torch.equal(2 * plan.counts, double.counts)
+    assert torch.equal(pool_min(weights, plan), pool_min(twice[3], double))
+    torch.testing.assert_close(
+        pool_mean(values, weights, plan), pool_mean(twice[2], twice[3], double), atol=1e-12, rtol=0
+    )
+
+
+def test_far_cells_do_not_alias():
+    # 16-bit packed keys put all of these into one voxel
+    cells = torch.tensor([[0, 0, 0], [65536, 0, 0], [0, 65536, 0], [-65536, 0, 0], [0, 0, -65536]])
+    batch = torch.zeros(5, dtype=torch.int64)
+    assert mixed_radix_keys(cells, batch)[0].unique().numel() == 5
+
+
+def test_two_hundred_metres_at_two_millimetres():
+    points = torch.tensor([[-200.0, -200, -200], [200, 200, 200], [0.001, 0.001, 0.001]])
+    batch = torch.zeros(3, dtype=torch.int64)
+    plan = planned(points, batch, size=torch.tensor([0.002]))
+    assert len(plan) == 3
+    assert plan.grid.abs().max() <= 100_001
+
+
+def test_cells_too_far_apart_are_refused_by_name():
+    far = torch.tensor([[0, 0, 0], [1 << 21, 1 << 21, 1 << 21]])
+    batch = torch.tensor([0, 1])
+    with pytest.raises(ValueError, match="raise the voxel size"):
+        mixed_radix_keys(far, batch)
+
+
+def test_non_finite_and_distant_points_are_out_of_range():
+    cells = torch.tensor([[0.0, 1, 2], [math.nan, 0, 0], [0, math.inf, 0], [0, 0, -2e6], [1e6, 0, 0]])
+    assert in_range(cells).tolist() == [True, False, False, False, True]
+
+
+def test_points_on_faces_fall_by_division():
+    size = torch.tensor([0.1])
+    count = torch.arange(-50, 50, dtype=torch.float64)
+    points = torch.stack((count * float(size), count * 0, count * 0), 1)
+    cells = point_cells(points, torch.zeros(100, dtype=torch.int64), size)
+    assert torch.equal(torch.floor(cells[:, 0]), count)
+
+
+def test_select_keeps_some_voxels():
+    points, batch, values, weights = cloud()
+    plan = planned(points, batch)
+    keep = torch.arange(len(plan)) % 3 != 0
+    part = plan.select(keep)
+    assert torch.equal(part.grid, plan.grid[keep])
+    assert torch.equal(pool_mean(values, weights, part), pool_mean(values, weights, plan)[keep])
+    kept_points = (plan.voxel_of >= 0) & keep[plan.voxel_of]
+    assert torch.equal(part.voxel_of >= 0, kept_points)
+    assert torch.equal(part.grid[part.voxel_of[kept_points]], plan.grid[plan.voxel_of[kept_points]])
+
+
+def test_no_valid_point_gives_no_voxel():
+    points, batch, values, weights = cloud(20)
+    plan = planned(points, batch, torch.zeros(20, dtype=torch.bool))
+    values.requires_grad_()
+    mean = pool_mean(values, weights, plan)
+    assert mean.shape == (0, 5)
+    mean.sum().backward()
+    assert values.grad is not None
+    assert pool_min(weights, plan).shape == (0,)
+
+
+def test_voxel_size_guard():
+    depth = torch.full((2, 1, 4, 4), 2.0)
+    depth[1] = 0  # nothing valid: the configured size stands
+    intrinsics = torch.diag(torch.tensor([50.0, 50, 1])).expand(2, 1, 3, 3)
+    cameras = Cameras(torch.eye(4).expand(2, 1, 4, 4), intrinsics, (4, 4))
+    geometry = Geometry(depth, torch.ones_like(depth), cameras, torch.ones(2))
+    torch.testing.assert_close(scene_voxel_size(geometry, 0.002, 1.5), torch.tensor([0.06, 0.002]))
+    torch.testing.assert_close(scene_voxel_size(geometry, 0.1, 1.5), torch.tensor([0.1, 0.1]))
+    torch.testing.assert_close(scene_voxel_size(geometry, 0.002, 0), torch.tensor([0.002, 0.002]))

@@ -1,0 +1,85 @@
+import pytest
+import torch
+
+from vg2gt.voxels import PointMLP
+
+SIZE = torch.full((2,), 0.125)
+
+
+def network(**options):
+    torch.manual_seed(0)
+    return PointMLP(6, **{"channels": 16, "stages": 4, "window": 8, **options}).double()
+
+
+def features_of(grid):
+    return torch.randn(len(grid), 6, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+
+
+def test_permuting_voxels_permutes_the_result(random_voxels):
+    grid, batch = random_voxels()
+    features, net = features_of(grid), network()
+    order = torch.cat((torch.randperm(90), 90 + torch.randperm(60)))
+    out = net(features, grid, batch, SIZE)
+    torch.testing.assert_close(net(features[order], grid[order], batch[order], SIZE), out[order], atol=1e-6, rtol=0)
+
+
+def test_shifting_scenes_by_whole_voxels_changes_nothing(random_voxels):
+    grid, batch = random_voxels()
+    features, net = features_of(grid), network()
+    shift = torch.tensor([[7, -11, 300], [-5, 0, 64]])[batch]
+    assert torch.equal(net(features, grid + shift, batch, SIZE), net(features, grid, batch, SIZE))
+
+
+def test_a_batch_equals_separate_runs(random_voxels):
+    grid, batch = random_voxels((90, 5))
+    grid = grid * torch.where(batch == 1, 9, 1)[:, None]  # extents of different bit lengths
+    features, net = features_of(grid), network()
+    together = net(features, grid, batch, SIZE)
+    for scene in (0, 1):
+        rows = batch == scene
+        alone = net(features[rows], grid[rows], torch.zeros_like(batch[rows]), SIZE[:1])
+        torch.testing.assert_close(together[rows], alone, atol=1e-12, rtol=0)
+
+
+def test_a_voxel_reaches_others_of_its_window(random_voxels):
+    grid, batch = random_voxels((64,))
+    features, net = features_of(grid), network(stages=1)
+    changed = features.clone()
+    changed[10] += 3
+    moved = (net(changed, grid, batch, SIZE) - net(features, grid, batch, SIZE)).abs().amax(1) > 1e-4
+    assert moved.sum() >= 4
+
+
+def test_stages_use_other_neighbourhoods(random_voxels):
+    grid, batch = random_voxels((64,))
+    net = network()
+    windows = net._windows(grid - grid.amin(0), batch, SIZE)
+    neighbours = [
+        {frozenset(row) for group in stage.groups for row in group.rows.sort(1).values.tolist()} for stage in windows
+    ]
+    assert len(set(map(frozenset, neighbours))) == 4
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 7, 8, 9])
+def test_few_voxels_have_finite_gradients(count):
+    grid = torch.arange(3 * count).view(count, 3)
+    batch = torch.zeros(count, dtype=torch.int64)
+    net = network()
+    features = features_of(grid).requires_grad_()
+    net(features, grid, batch, SIZE).square().sum().backward()
+    assert features.grad is not None
+    assert torch.isfinite(features.grad).all()
+    assert all(torch.isfinite(p.grad).all() for p in net.parameters() if p.grad is not None)
+
+
+def test_checkpointing_changes_no_gradient(random_voxels):
+    grid, batch = random_voxels()
+    features = features_of(grid)
+    grads = []
+    for checkpoint in (False, True):
+        net = network(checkpoint=checkpoint)
+        net(features, grid, batch, SIZE).square().sum().backward()
+        grads.append([p.grad for p in net.parameters()])
+    for a, b in zip(*grads, strict=True):
+        assert a is not None
+        torch.testing.assert_close(a, b)

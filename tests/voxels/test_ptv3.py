@@ -1,0 +1,142 @@
+import pytest
+import torch
+
+from vg2gt.voxels import PTv3
+
+SIZE = torch.full((2,), 0.125)
+
+
+def features_of(grid, channels=8):
+    return torch.randn(len(grid), channels, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+
+
+def test_permuting_voxels_permutes_the_result(random_voxels, make_ptv3):
+    grid, batch = random_voxels()
+    features, net = features_of(grid), make_ptv3().double().eval()
+    order = torch.cat((torch.randperm(90), 90 + torch.randperm(60)))
+    out = net(features, grid, batch, SIZE)
+    torch.testing.assert_close(net(features[order], grid[order], batch[order], SIZE), out[order], atol=1e-6, rtol=0)
+
+
+def test_shifting_scenes_by_whole_voxels_changes_nothing(random_voxels, make_ptv3):
+    grid, batch = random_voxels()
+    features, net = features_of(grid), make_ptv3().double().eval()
+    shift = torch.tensor([[7, -11, 300], [-5, 0, 64]])[batch]
+    assert torch.equal(net(features, grid + shift, batch, SIZE), net(features, grid, batch, SIZE))
+
+
+def test_a_batch_equals_separate_runs(random_voxels, make_ptv3):
+    grid, batch = random_voxels((90, 5))
+    grid = grid * torch.where(batch == 1, 9, 1)[:, None]  # extents of different bit lengths
+    features, net = features_of(grid), make_ptv3().double().eval()
+    together = net(features, grid, batch, SIZE)
+    for scene in (0, 1):
+        rows = batch == scene
+        alone = net(features[rows], grid[rows], torch.zeros_like(batch[rows]), SIZE[:1])
+        torch.testing.assert_close(together[rows], alone, atol=1e-10, rtol=0)
+
+
+@pytest.mark.parametrize("count", [1, 15, 16, 17])
+def test_few_voxels_have_finite_gradients(count, make_ptv3):
+    grid = torch.arange(3 * count).view(count, 3)
+    features = features_of(grid).requires_grad_()
+    net = make_ptv3().double()
+    out = net(features, grid, torch.zeros(count, dtype=torch.int64), SIZE)
+    assert out.shape == (count, net.out_channels)
+    out.square().sum().backward()
+    assert all(p.grad is not None and torch.isfinite(p.grad).all() for p in net.parameters())
+
+
+def test_a_voxel_reaches_others_of_its_window(random_voxels, make_ptv3):
+    grid, batch = random_voxels((100,))
+    features, net = features_of(grid), make_ptv3().double().eval()
+    changed = features.clone()
+    changed[10] += 3
+    moved = (net(changed, grid, batch, SIZE) - net(features, grid, batch, SIZE)).abs().amax(1) > 1e-6
+    assert moved.sum() > 16
+
+
+def test_orders_are_shuffled_in_training_only_and_from_the_generator(random_voxels, make_ptv3):
+    grid, batch = random_voxels()
+    features, net = features_of(grid), make_ptv3().double()
+
+    def run(seed):
+        generator = None if seed is None else torch.Generator().manual_seed(seed)
+        return net(features, grid, batch, SIZE, generator=generator)
+
+    net.train()
+    results = [run(seed) for seed in range(4)]
+    assert torch.equal(results[0], run(0))
+    assert any(not torch.equal(results[0], other) for other in results[1:])
+    assert torch.equal(run(None), net.eval()(features, grid, batch, SIZE))
+    assert torch.equal(run(0), run(1))
+
+
+def test_drop_path_acts_in_training_only(random_voxels, make_ptv3):
+    grid, batch = random_voxels()
+    features, net = features_of(grid), make_ptv3(drop_path=0.5).double()
+    torch.manual_seed(0)
+    first = net(features, grid, batch, SIZE)
+    assert not torch.equal(first, net(features, grid, batch, SIZE))
+    net.eval()
+    assert torch.equal(net(features, grid, batch, SIZE), make_ptv3().double().eval()(features, grid, batch, SIZE))
+
+
+def test_legacy_changes_the_first_decoder_block_only(random_voxels, make_ptv3):
+    grid, batch = random_voxels()
+    features, net = features_of(grid), make_ptv3().double().eval()
+    plain = net(features, grid, batch, SIZE)
+    net.legacy = True
+    assert not torch.allclose(plain, net(features, grid, batch, SIZE))
+    for stage in net.dec.values():
+        conv = stage["block0"].cpe[0]
+        torch.nn.init.zeros_(conv.weight)
+    net.legacy = False
+    without = net(features, grid, batch, SIZE)
+    net.legacy = True
+    assert torch.equal(without, net(features, grid, batch, SIZE))
+
+
+def test_state_dict_has_the_official_names():
+    with torch.device("meta"):
+        net = PTv3(norm="batch")
+    names = {name: tuple(value.shape) for name, value in net.state_dict().items()}
+    expected = {
+        "embedding.stem.conv.weight": (128, 5, 5, 5, 1024),
+        "embedding.stem.norm.running_mean": (128,),
+        "enc.enc0.block0.cpe.0.weight": (128, 3, 3, 3, 128),
+        "enc.enc0.block0.cpe.0.bias": (128,),
+        "enc.enc0.block1.cpe.1.weight": (128, 128),
+        "enc.enc0.block1.cpe.2.weight": (128,),
+        "enc.enc3.block5.attn.qkv.weight": (768, 256),
+        "enc.enc3.block5.attn.proj.bias": (256,),
+        "enc.enc1.block0.norm1.0.weight": (128,),
+        "enc.enc1.block0.norm2.0.bias": (128,),
+        "enc.enc4.block1.mlp.0.fc1.weight": (2048, 512),
+        "enc.enc4.block1.mlp.0.fc2.weight": (512, 2048),
+        "enc.enc1.down.proj.weight": (128, 128),
+        "enc.enc4.down.norm.0.running_var": (512,),
+        "dec.dec3.up.proj.0.weight": (256, 512),
+        "dec.dec3.up.proj.1.weight": (256,),
+        "dec.dec0.up.proj_skip.0.weight": (1024, 128),
+        "dec.dec0.up.proj_skip.1.bias": (1024,),
+        "dec.dec0.block1.attn.qkv.weight": (3072, 1024),
+    }
+    assert expected.items() <= names.items()
+    assert "enc.enc0.down.proj.weight" not in names
+    assert net.out_channels == 1024
+
+
+@pytest.mark.parametrize("norm", ["layer", "group", "batch"])
+def test_norms(norm, random_voxels, make_ptv3):
+    grid, batch = random_voxels()
+    widths = {"enc_channels": (64, 64, 64), "dec_channels": (64, 64), "enc_heads": (2, 2, 2), "dec_heads": (2, 2)}
+    net = make_ptv3(norm=norm, **widths).double()
+    assert torch.isfinite(net(features_of(grid), grid, batch, SIZE)).all()
+    with pytest.raises(ValueError, match=r"ptv3\.norm"):
+        make_ptv3(norm="instance")
+
+
+def test_widths_that_do_not_match_are_refused():
+    with pytest.raises(ValueError, match="one fewer in the decoder"):
+        PTv3(8, enc_channels=(16, 32))

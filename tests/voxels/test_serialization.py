@@ -1,0 +1,100 @@
+import pytest
+import torch
+
+from vg2gt.voxels.serialization import (
+    ORDERS,
+    hilbert_codes,
+    make_windows,
+    relative_grid,
+    serial_codes,
+    serial_keys,
+    z_codes,
+)
+
+
+def cube(bits):
+    axis = torch.arange(1 << bits)
+    return torch.cartesian_prod(axis, axis, axis)
+
+
+@pytest.mark.parametrize("bits", [1, 2, 3, 4])
+def test_consecutive_hilbert_codes_are_face_neighbours(bits):
+    cells = cube(bits)
+    codes = hilbert_codes(cells, bits)
+    assert torch.equal(codes.sort().values, torch.arange(len(cells)))
+    steps = cells[codes.argsort()].diff(dim=0).abs().sum(1)
+    assert steps.eq(1).all()
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_codes_are_bijections(order):
+    codes = serial_codes(cube(4), 4, order)
+    assert codes.unique().numel() == 16**3
+    assert codes.min() == 0
+
+
+def test_dropping_three_bits_gives_the_parent():
+    cells = cube(4)
+    assert torch.equal(z_codes(cells) >> 3, z_codes(cells >> 1))
+    assert torch.equal(hilbert_codes(cells, 4) >> 3, hilbert_codes(cells >> 1, 3))
+    for order in ORDERS:
+        codes = serial_codes(cells, 4, order) >> 3
+        parents = (cells >> 1) @ torch.tensor([64, 8, 1])
+        assert torch.stack((codes, parents), 1).unique(dim=0).shape[0] == 8**3
+
+
+def test_z_order_interleaves_bits():
+    cells = torch.tensor([[1, 0, 0], [0, 1, 0], [0, 0, 1], [2, 0, 0], [(1 << 21) - 1, 0, 0]])
+    spread = sum(1 << (3 * bit + 2) for bit in range(21))
+    assert z_codes(cells).tolist() == [4, 2, 1, 32, spread]
+
+
+def test_hilbert_with_21_bits_is_local():
+    start = torch.tensor([[1_234_567, 99, 2_000_000]])
+    cells = start + cube(2)
+    assert hilbert_codes(cells, 21).unique().numel() == 64
+    assert hilbert_codes(cells, 21).min() >= 0
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_codes_do_not_depend_on_the_other_scenes_extent(order):
+    cells = cube(3)
+    assert torch.equal(serial_codes(cells, 3, order), serial_codes(cells, 5, order))
+
+
+def test_relative_grid_is_each_scenes_own():
+    grid = torch.tensor([[5, -3, 2], [6, -1, 9], [100, 200, 300]])
+    assert relative_grid(grid, torch.tensor([0, 0, 1])).tolist() == [[0, 0, 0], [1, 2, 7], [0, 0, 0]]
+
+
+def test_keys_sort_by_scene_first(random_voxels):
+    grid, batch = random_voxels((40, 30, 50))
+    for key in serial_keys(relative_grid(grid, batch), batch, torch.ones(3), ORDERS):
+        assert torch.equal(batch[key.argsort()], batch)
+        assert key.unique().numel() == len(key)
+
+
+def test_too_large_a_scene_is_refused_with_its_size_and_extent():
+    grid = torch.tensor([[0, 0, 0], [(1 << 21) - 1, 0, 0]])
+    size = torch.tensor([0.002])
+    assert serial_keys(grid, torch.tensor([0, 0]), size, ("z",))[0].min() >= 0
+    with pytest.raises(ValueError, match=r"2097152 voxels.*0\.002"):
+        serial_keys(grid, torch.tensor([0, 1]), size, ("z",))
+    with pytest.raises(ValueError, match="4194304 voxels"):
+        serial_keys(torch.tensor([[(1 << 22) - 1, 0, 0]]), torch.tensor([0]), size, ("z",))
+
+
+@pytest.mark.parametrize("count", [1, 7, 8, 9, 16, 17, 30])
+@pytest.mark.parametrize("shift", [0, 4])
+def test_every_voxel_is_owned_once_by_a_window_of_its_scene(count, shift):
+    counts = [count, 11, 0, 3]
+    batch = torch.arange(4).repeat_interleave(torch.tensor(counts))
+    order = torch.cat([torch.randperm(n) + sum(counts[:i]) for i, n in enumerate(counts)])
+    windows = make_windows(order, counts, 8, shift)
+    rows = torch.cat([group.rows.flatten() for group in windows.groups])
+    assert torch.equal(rows[windows.owner], torch.arange(len(order)))
+    position = order.argsort()
+    for group in windows.groups:
+        assert torch.equal(batch[group.rows], group.scene[:, None].expand_as(group.rows))
+        assert position[group.rows].diff(dim=1).eq(1).all()
+        assert group.rows.shape[1] == min(8, counts[int(group.scene[0])])

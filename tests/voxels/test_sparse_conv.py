@@ -1,0 +1,51 @@
+import pytest
+import torch
+from torch.nn import functional as F
+
+from vg2gt.voxels.sparse_conv import SubmanifoldConv3d, neighbor_pairs
+
+
+def dense_result(conv, features, grid, batch):
+    low, high = grid.amin(0), grid.amax(0)
+    volume = features.new_zeros(int(batch.max()) + 1, features.shape[1], *(high - low + 1).tolist())
+    x, y, z = (grid - low).unbind(-1)
+    volume[batch, :, x, y, z] = features
+    out = F.conv3d(volume, conv.weight.permute(0, 4, 1, 2, 3), conv.bias, padding=conv.kernel_size // 2)
+    return out[batch, :, x, y, z]
+
+
+@pytest.mark.parametrize("kernel_size", [3, 5])
+def test_equals_dense_convolution_with_gradients(kernel_size, random_voxels):
+    grid, batch = random_voxels((150, 100), extent=7)  # dense enough to touch every border and offset
+    conv = SubmanifoldConv3d(4, 3, kernel_size).double()
+    assert conv.bias is not None
+    features = torch.randn(len(grid), 4, dtype=torch.float64, requires_grad=True)
+    pairs = neighbor_pairs(grid, batch, kernel_size)
+    assert all(len(i) for i, _ in pairs)
+    out, dense = conv(features, pairs), dense_result(conv, features, grid, batch)
+    torch.testing.assert_close(out, dense, atol=1e-12, rtol=1e-12)
+    probe = torch.randn_like(out)
+    inputs = (features, conv.weight, conv.bias)
+    for ours, reference in zip(
+        torch.autograd.grad(out, inputs, probe), torch.autograd.grad(dense, inputs, probe), strict=True
+    ):
+        torch.testing.assert_close(ours, reference, atol=1e-11, rtol=1e-11)
+
+
+def test_a_batch_equals_separate_runs(random_voxels):
+    grid, batch = random_voxels((60, 40), extent=6)
+    conv = SubmanifoldConv3d(4, 4, 3).double()
+    features = torch.randn(len(grid), 4, dtype=torch.float64)
+    together = conv(features, neighbor_pairs(grid, batch, 3))
+    for scene in (0, 1):
+        rows = batch == scene
+        alone = conv(features[rows], neighbor_pairs(grid[rows], torch.zeros_like(batch[rows]), 3))
+        torch.testing.assert_close(together[rows], alone, atol=1e-12, rtol=0)
+
+
+def test_a_single_voxel_sees_its_centre_only():
+    conv = SubmanifoldConv3d(2, 2, 3)
+    assert conv.bias is not None
+    features = torch.randn(1, 2)
+    out = conv(features, neighbor_pairs(torch.zeros(1, 3, dtype=torch.int64), torch.zeros(1, dtype=torch.int64), 3))
+    torch.testing.assert_close(out, features @ conv.weight[:, 1, 1, 1].t() + conv.bias)
