@@ -15,6 +15,7 @@ SMALL = [
     "data.eval_scenes=1",
     "data.min_views=4",
     "data.max_views=4",
+    "data.max_images=4",
     "trainer.accelerator=cpu",
     "trainer.enable_progress_bar=false",
     "trainer.log_every_n_steps=1",
@@ -25,9 +26,14 @@ SMALL = [
 ]
 
 
+def cache_overrides(cache: Path) -> list[str]:
+    """Overrides that keep the rooms in a folder of the test."""
+    return [f"data.{part}.cache_dir={cache}" for part in ("train", "val")]
+
+
 def small_config(folder: Path, cache: Path, *overrides: str) -> DictConfig:
     """Composes the default configuration with :data:`SMALL` and ``overrides``."""
-    fixed = [f"output_dir={folder}", f"data.cache_dir={cache}", "hydra/job_logging=default"]
+    fixed = [f"output_dir={folder}", "hydra/job_logging=default", *cache_overrides(cache)]
     with initialize_config_dir(config_dir(), version_base="1.3"):
         return compose("train", [*fixed, *SMALL, *overrides])
 

@@ -34,7 +34,9 @@ class AtomicCheckpointIO(TorchCheckpointIO):
             os.replace(temporary, target)
         except OSError as error:
             temporary.unlink(missing_ok=True)
-            raise OSError(f"checkpoint {target} could not be written ({error}); earlier checkpoints are intact") from error
+            raise OSError(
+                f"checkpoint {target} could not be written ({error}); earlier checkpoints are intact"
+            ) from error
 
     def load_checkpoint(self, path: Any, map_location: Any = "cpu", weights_only: bool | None = True) -> dict[str, Any]:
         """Loads on the CPU with ``weights_only=True``, whatever is asked for."""

@@ -1,14 +1,14 @@
 """The whole method in one forward pass (paper, Method; data flow in docs/architecture.md).
 
-    images -> frozen backbone -> tokens -> frozen heads -> depth, confidence, cameras
-                                   |                            |
-                                   +<---- coarse voxels <-------+
-                                   |
-                         enhanced tokens -> the same frozen heads -> geometry
-                                   |                                    |
-                                   +------------> fine voxels <---------+
-                                                      |
-                                          self-splitting Gaussian head -> Gaussians
+images -> frozen backbone -> tokens -> frozen heads -> depth, confidence, cameras
+                               |                            |
+                               +<---- coarse voxels <-------+
+                               |
+                     enhanced tokens -> the same frozen heads -> geometry
+                               |                                    |
+                               +------------> fine voxels <---------+
+                                                  |
+                                      self-splitting Gaussian head -> Gaussians
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from torch import Tensor, nn
 from torch.profiler import record_function
 
 from backends.base import Backend
-from vg2gt.geometry.alignment import weighted_median_scale
+from vg2gt.geometry.alignment import fit_depth_scale
 from vg2gt.geometry.cameras import relative_to_first, scale_translations
-from vg2gt.types import Geometry, Gaussians, Hints, Prediction, Voxels
+from vg2gt.types import Gaussians, Geometry, Hints, Prediction, Voxels
 
 ScaleSource = Literal["metric", "focal", "normalize", "groundtruth"]
 CANONICAL_FOCAL = 300.0  # appendix A.1: d_metric = f * d_net / 300
@@ -59,7 +59,7 @@ class SceneScale:
         if self.source == "groundtruth":
             if hints is None or hints.depth is None:
                 raise ValueError("model.scale.source=groundtruth needs the data's depth; use normalize without it")
-            return weighted_median_scale(geometry.depth.detach(), hints.depth)
+            return fit_depth_scale(geometry.depth, hints.depth, hints.depth > 0).nan_to_num(1.0)
         return torch.stack([self._normalize(depth) for depth in geometry.depth.detach()])
 
     def _normalize(self, depth: Tensor) -> Tensor:
@@ -122,9 +122,7 @@ class VG2GT(nn.Module):
             with record_function("vg2gt/decode_again"):
                 again = self.backend.decode(tokens)
             # The camera token is untouched, so the cameras are the backbone's: decoded once, used throughout.
-            geometry = replace(
-                initial, depth=again.depth * unit[:, None, None, None], depth_conf=again.depth_conf
-            )
+            geometry = replace(initial, depth=again.depth * unit[:, None, None, None], depth_conf=again.depth_conf)
         with record_function("vg2gt/fine"):
             voxels: Voxels = self.fine(tokens, geometry, images)
         with record_function("vg2gt/gaussians"):

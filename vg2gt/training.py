@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -41,6 +42,8 @@ class Run:
 def build(config: DictConfig) -> Run:
     """Instantiates everything the configuration names; each part's constructor is its schema."""
     lightning.seed_everything(config.seed, workers=True, verbose=False)
+    # The frozen backbone is in eval mode on purpose.
+    warnings.filterwarnings("ignore", message=r"Found \d+ module\(s\) in eval mode", category=UserWarning)
     datamodule = instantiate(config.data)
     backend = instantiate(config.backend)
     model = instantiate(config.model, backend=backend)

@@ -1,0 +1,54 @@
+"""Numbers for one held-out scene: novel views, rendered depth and normals, decoded depth, primitives."""
+
+from __future__ import annotations
+
+import torch
+
+from vg2gt.geometry.normals import normals_from_depth
+from vg2gt.metrics import cv, depth_metrics, normal_metrics, psnr, ssim
+from vg2gt.model import VG2GT
+from vg2gt.protocols import ground_truth_target_cameras
+from vg2gt.rendering import Renderer
+from vg2gt.types import Batch
+
+
+@torch.no_grad()
+def evaluate_scene(model: VG2GT, renderer: Renderer, batch: Batch) -> dict[str, float]:
+    """Reconstructs a scene from its context views and scores it on its held-out views.
+
+    Args:
+        model: the model, in any mode; it is not changed.
+        renderer: renders the held-out views.
+        batch: one scene (B = 1) with held-out views.
+
+    Returns:
+        ``psnr``, ``ssim``, ``abs_rel``, ``delta_1.05``, ``coverage``, ``normal_mean`` on held-out views at ground-truth
+        poses; ``decoded_abs_rel_before`` and ``decoded_abs_rel`` on the context views; ``gaussians``, ``cv``. Depth is
+        aligned by one median scale a scene.
+
+    Raises:
+        ValueError: if the batch holds several scenes or no held-out view.
+    """
+    if len(batch.scene) != 1 or batch.images.shape[1] == batch.num_context:
+        raise ValueError(f"evaluation takes one scene with held-out views, got scenes {batch.scene} and no target view")
+    prediction = model(batch.context.images, batch.context.hints)
+    target = batch.target
+    rendered = renderer(prediction.gaussians, ground_truth_target_cameras(batch, prediction))
+    true_normals, normals_valid = normals_from_depth(target.depth, target.cameras.intrinsics)
+
+    depth = depth_metrics(rendered.depth[0], target.depth[0], alignment="scene")
+    before = depth_metrics(prediction.initial.depth[0], batch.context.depth[0], alignment="scene")
+    after = depth_metrics(prediction.geometry.depth[0], batch.context.depth[0], alignment="scene")
+    normals = normal_metrics(rendered.normal[0], true_normals[0], normals_valid[0] & (rendered.depth[0] > 0))
+    return {
+        "psnr": float(psnr(rendered.color[0], target.images[0]).mean()),
+        "ssim": float(ssim(rendered.color[0], target.images[0]).mean()),
+        "abs_rel": depth["abs_rel"],
+        "delta_1.05": depth["delta_1.05"],
+        "coverage": depth["coverage"],
+        "normal_mean": normals["mean"],
+        "decoded_abs_rel_before": before["abs_rel"],
+        "decoded_abs_rel": after["abs_rel"],
+        "gaussians": float(len(prediction.gaussians)),
+        "cv": cv(prediction.gaussians.means),
+    }

@@ -1,0 +1,50 @@
+"""Where held-out views are rendered: cameras for training and evaluation that never look at their images' content.
+
+The Gaussians always come from a pass over the context views alone. The cameras of held-out views come either from a
+second, joint pass of the frozen backbone, brought into the first pass's frame by a similarity, or from the data.
+"""
+
+from __future__ import annotations
+
+import torch
+
+from vg2gt.geometry.alignment import align_cameras
+from vg2gt.geometry.cameras import relative_to_first, scale_translations
+from vg2gt.model import VG2GT
+from vg2gt.types import Batch, Cameras, Prediction
+
+
+def training_cameras(model: VG2GT, batch: Batch, prediction: Prediction) -> Cameras:
+    """Cameras of all views of the batch: context views as predicted, held-out views from a joint pass."""
+    if batch.images.shape[1] == batch.num_context:
+        return prediction.geometry.cameras
+    return _append(prediction.geometry.cameras, joint_target_cameras(model, batch, prediction))
+
+
+@torch.no_grad()
+def joint_target_cameras(model: VG2GT, batch: Batch, prediction: Prediction) -> Cameras:
+    """Predicted cameras of the held-out views (protocol ``novel``).
+
+    The backbone sees context and held-out views together; a similarity between its context cameras and those of the
+    context-only pass brings the held-out cameras into the Gaussians' frame.
+    """
+    joint = model.backend.decode(model.backend.encode(batch.images, batch.hints)).cameras
+    joint = scale_translations(relative_to_first(joint), prediction.unit)
+    context = slice(0, batch.num_context)
+    similarity = align_cameras(joint.select(context), prediction.geometry.cameras)
+    return similarity.apply_cameras(joint.select(slice(batch.num_context, None)))
+
+
+def ground_truth_target_cameras(batch: Batch, prediction: Prediction) -> Cameras:
+    """Ground-truth cameras of the held-out views in the Gaussians' frame (protocol ``gt_pose``)."""
+    context = slice(0, batch.num_context)
+    similarity = align_cameras(batch.cameras.select(context), prediction.geometry.cameras)
+    return similarity.apply_cameras(batch.cameras.select(slice(batch.num_context, None)))
+
+
+def _append(first: Cameras, second: Cameras) -> Cameras:
+    return Cameras(
+        torch.cat((first.world_to_camera, second.world_to_camera), 1),
+        torch.cat((first.intrinsics, second.intrinsics), 1),
+        first.size,
+    )
