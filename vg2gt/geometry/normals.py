@@ -27,12 +27,6 @@ def ray_slopes(intrinsics: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tenso
     return (x - cx) / fx, (y - cy) / fy
 
 
-def normal_from_slopes(gx: Tensor, gy: Tensor, u: Tensor, v: Tensor) -> Tensor:
-    """Unit camera-frame normals ``[..., 3, H, W]`` from depth slopes ``[..., H, W]`` (module docstring)."""
-    normal = torch.stack((gx, gy, -1 - u * gx - v * gy), -3)
-    return normal / normal.square().sum(-3, keepdim=True).sqrt()
-
-
 def normals_from_depth(depth: Tensor, intrinsics: Tensor, edge_threshold: float = 0.05) -> tuple[Tensor, Tensor]:
     """Camera-frame normals by central differences of unprojected points.
 
@@ -62,6 +56,7 @@ def normals_from_depth(depth: Tensor, intrinsics: Tensor, edge_threshold: float 
     gx = intrinsics[..., 0, 0, None, None] * (right - left) / (right + left)
     gy = intrinsics[..., 1, 1, None, None] * (down - up) / (down + up)
     gx, gy = torch.where(valid, gx, 0.0), torch.where(valid, gy, 0.0)
-    normals = normal_from_slopes(gx, gy, u[..., 1:-1], v[..., 1:-1, :])
+    normals = torch.stack((gx, gy, -1 - u[..., 1:-1] * gx - v[..., 1:-1, :] * gy), -3)
+    normals = normals / normals.square().sum(-3, keepdim=True).sqrt()
     normals = torch.where(valid[..., None, :, :], normals, 0.0)
     return F.pad(normals, (1, 1, 1, 1)), F.pad(valid, (1, 1, 1, 1))

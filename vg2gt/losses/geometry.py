@@ -7,13 +7,14 @@ distances and angles do not change under a common rotation, and the ground truth
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from vg2gt.geometry.cameras import invert_rigid
-from vg2gt.geometry.normals import normal_from_slopes, ray_slopes
+from vg2gt.geometry.normals import ray_slopes
 from vg2gt.geometry.rotations import matrix_to_quat
 from vg2gt.losses.truth import Truth
 from vg2gt.types import Cameras
@@ -160,13 +161,14 @@ def point_normal_loss(depth: Tensor, cameras: Cameras, truth: Truth, valid: Tens
     for stride in POINT_STRIDES:
         mask = valid[:, ::stride, ::stride]
         predicted = _corner_normals(depth, cameras.intrinsics[0], stride)
-        with torch.no_grad():
-            expected = _corner_normals(truth.depth[0], truth.cameras.intrinsics[0], stride)
+        expected = _corner_normals(truth.depth[0], truth.cameras.intrinsics[0], stride)
         disagreement, count = depth.new_zeros(()), mask.new_zeros((), dtype=torch.long)
-        for corner, p, q in zip(CORNERS, predicted, expected, strict=True):
-            q = (turn @ q.flatten(2)).view_as(q)
+        for corner, (x, y, z), n in zip(CORNERS, predicted, expected, strict=True):
+            n = turn @ torch.stack(n, 1).flatten(2)
+            n = (n / n.square().sum(1, keepdim=True).sqrt()).unflatten(2, x.shape[1:])
+            cosine = (x * n[:, 0] + y * n[:, 1] + z * n[:, 2]) / (x * x + y * y + z * z).sqrt()
             both = _corner_mask(mask, corner)
-            disagreement = disagreement + ((1 - (p * q).sum(1)) * both).sum()
+            disagreement = disagreement + ((1 - cosine) * both).sum()
             count = count + both.sum()
         total = total + disagreement / count.clamp(min=1)
     return total / len(POINT_STRIDES)
@@ -187,11 +189,11 @@ def _corner_mask(valid: Tensor, corner: tuple[int, int]) -> Tensor:
     return _corner(valid, corner) & horizontal & vertical
 
 
-def _corner_normals(depth: Tensor, intrinsics: Tensor, stride: int) -> list[Tensor]:
-    """Camera-frame normals ``[V, 3, h - 1, w - 1]`` for each of the four corners of the strided depth ``[V, H, W]``.
+def _corner_normals(depth: Tensor, intrinsics: Tensor, stride: int) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """Camera-frame normals of the strided depth ``[V, H, W]``, components ``[V, h - 1, w - 1]``, corner by corner.
 
-    The differences to the neighbours, ``(d1 - d) r + h d1 / fx e_x`` and its like, have the cross product derived in
-    :mod:`vg2gt.geometry.normals` with ``gx = fx (d1 - d) / (h d1)``.
+    The differences to the neighbours, ``(d1 - d) r + d1 / fx e_x`` and its like, have the cross product derived in
+    :mod:`vg2gt.geometry.normals` with ``gx = fx (d1 - d) / d1``. Not of unit length.
     """
     u, v = ray_slopes(intrinsics, (depth.shape[-2], depth.shape[-1]))
     u, v = u[..., ::stride], v[..., ::stride, :]
@@ -200,13 +202,11 @@ def _corner_normals(depth: Tensor, intrinsics: Tensor, stride: int) -> list[Tens
     difference_x, difference_y = fx * (depth[..., 1:] - depth[..., :-1]), fy * (depth[:, 1:] - depth[:, :-1])
     slope_x = {1: difference_x / depth[..., 1:], -1: difference_x / depth[..., :-1]}
     slope_y = {1: difference_y / depth[:, 1:], -1: difference_y / depth[:, :-1]}
-    normals = []
     for across, down in CORNERS:
         rows = slice(None, -1) if down > 0 else slice(1, None)
         columns = slice(None, -1) if across > 0 else slice(1, None)
         gx, gy = slope_x[across][:, rows], slope_y[down][..., columns]
-        normals.append(normal_from_slopes(gx, gy, u[..., columns], v[..., rows, :]))
-    return normals
+        yield gx, gy, -1 - u[..., columns] * gx - v[..., rows, :] * gy
 
 
 @torch.no_grad()

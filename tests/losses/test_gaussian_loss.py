@@ -1,0 +1,167 @@
+"""Losses of rendered views, term by term."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from vg2gt.geometry.normals import normals_from_depth
+from vg2gt.losses import GaussianLoss, VG2GTLoss
+from vg2gt.losses.gaussian import RenderTargets
+from vg2gt.types import Cameras, Render
+
+SIZE = (20, 26)
+
+
+@pytest.fixture
+def case() -> tuple[Render, Cameras, RenderTargets, Tensor]:
+    """Two rendered views of one scene with random content, and what they should show."""
+    g = torch.Generator().manual_seed(5)
+    rand = lambda *shape: torch.rand(*shape, generator=g, dtype=torch.float64)  # noqa: E731
+    x = torch.linspace(0, 2, SIZE[1], dtype=torch.float64)
+    surface = 2 + 0.2 * torch.sin(x).expand(2, *SIZE)
+    depth = surface * (1 + 0.02 * rand(2, *SIZE))
+    depth[rand(2, *SIZE) < 0.1] = 0
+    rendered = Render(rand(1, 2, 3, *SIZE), depth[None], rand(1, 2, 3, *SIZE) - 0.7, rand(1, 2, *SIZE))
+    k = torch.tensor([[25.0, 0, 12.5], [0, 25, 9.5], [0, 0, 1]], dtype=torch.float64)
+    cameras = Cameras(torch.eye(4, dtype=torch.float64).expand(1, 2, 4, 4), k.expand(1, 2, 3, 3), SIZE)
+    valid = torch.ones(2, *SIZE, dtype=torch.bool)
+    targets = RenderTargets(
+        rand(2, 3, *SIZE),
+        3 * surface * (1 + 0.02 * rand(2, *SIZE)),
+        rand(2, *SIZE) > 0.2,
+        (k * torch.tensor([1.1, 1.1, 1], dtype=torch.float64)[:, None]).expand(2, 3, 3),
+        3 * surface,
+        1 + rand(2, *SIZE),
+        valid.clone(),
+        torch.ones(1, 1, 1, dtype=torch.bool),
+    )
+    return rendered, cameras, targets, torch.tensor([3.0, 3.1], dtype=torch.float64)
+
+
+def test_colour_and_depth_terms_by_hand(case) -> None:
+    rendered, _, targets, scale = case
+    terms = GaussianLoss()(*case)
+    hits = (rendered.depth[0] > 0) & (rendered.alpha[0] > 0.5)
+    scaled = rendered.depth[0] * scale[:, None, None]
+    torch.testing.assert_close(terms["color_l1"], (rendered.color[0] - targets.images).abs().mean())
+    both = hits & targets.valid
+    torch.testing.assert_close(terms["depth_gt"], (scaled - targets.depth)[both].abs().mean())
+    weighted = (targets.decoded_conf * (scaled - targets.decoded).abs())[hits].sum() / targets.decoded_conf[hits].sum()
+    torch.testing.assert_close(terms["depth_consistency"], weighted)
+    plain = GaussianLoss(confidence_weighted=False)(*case)["depth_consistency"]
+    torch.testing.assert_close(plain, (scaled - targets.decoded)[hits].abs().mean())
+
+
+def test_ssim_by_hand(case) -> None:
+    rendered, _, targets, _ = case
+    offsets = torch.arange(-5, 6, dtype=torch.float64)
+    g = torch.exp(-offsets.square() / (2 * 1.5**2))
+    window = torch.outer(g, g) / g.sum().square()
+    pad = lambda image: torch.nn.functional.pad(image, (5, 5, 5, 5), mode="reflect")  # noqa: E731
+    x, y = (pad(image).unfold(2, 11, 1).unfold(3, 11, 1) for image in (rendered.color[0], targets.images))
+    mean = lambda patches: (patches * window).sum((-2, -1))  # noqa: E731
+    mx, my = mean(x), mean(y)
+    vx, vy, cov = mean(x * x) - mx**2, mean(y * y) - my**2, mean(x * y) - mx * my
+    value = (2 * mx * my + 0.01**2) * (2 * cov + 0.03**2) / ((mx**2 + my**2 + 0.01**2) * (vx + vy + 0.03**2))
+    torch.testing.assert_close(GaussianLoss()(*case)["ssim"], 1 - value.mean(), rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("target", ["render", "decoded", "gt"])
+def test_normals_are_compared_with_the_chosen_depth_map(case, target: str) -> None:
+    rendered, cameras, targets, _ = case
+    hits = (rendered.depth[0] > 0) & (rendered.alpha[0] > 0.5)
+    depth, intrinsics, weights = {
+        "render": (rendered.depth[0] * hits, cameras.intrinsics[0], torch.ones(2, *SIZE)),
+        "decoded": (targets.decoded, cameras.intrinsics[0], targets.decoded_conf),
+        "gt": (targets.depth * targets.valid, targets.intrinsics, torch.ones(2, *SIZE)),
+    }[target]
+    expected, valid = normals_from_depth(depth, intrinsics)
+    mask = hits & valid
+    assert mask.any()
+    cosine = torch.cosine_similarity(rendered.normal[0], expected, dim=1)
+    value = ((1 - cosine) * weights)[mask].sum() / weights[mask].sum()
+    torch.testing.assert_close(GaussianLoss(normal_target=target)(*case)["normal"], value)
+
+
+def test_holes_are_not_surfaces_at_depth_zero(case) -> None:
+    rendered, cameras, targets, scale = case
+    terms = GaussianLoss()(*case)
+    depth = rendered.depth.clone()
+    depth[rendered.alpha <= 0.5] = 100.0  # nearly transparent: whatever depth it has does not count
+    other = GaussianLoss()(replace(rendered, depth=depth), cameras, targets, scale)
+    for name in terms:
+        torch.testing.assert_close(other[name], terms[name])
+
+
+def test_nothing_rendered_gives_zeros_with_graph_and_finite_gradients(case) -> None:
+    rendered, cameras, targets, scale = case
+    depth = torch.zeros_like(rendered.depth).requires_grad_()
+    normal = torch.zeros_like(rendered.normal).requires_grad_()
+    loss = GaussianLoss()
+    terms = loss(replace(rendered, depth=depth, normal=normal), cameras, targets, scale)
+    assert all(float(terms[name].detach()) == 0 for name in ("depth_gt", "depth_consistency", "normal"))
+    loss.total(terms).backward()
+    for leaf in (depth, normal):
+        assert leaf.grad is not None
+        assert (leaf.grad == 0).all()
+
+
+@pytest.mark.parametrize("target", ["render", "decoded", "gt"])
+def test_gradients_are_finite_with_holes_and_zero_normals(case, target: str) -> None:
+    rendered, cameras, targets, scale = case
+    normal = rendered.normal.clone()
+    normal[..., :10] = 0
+    decoded = targets.decoded.clone()
+    decoded[:, 4:8] = torch.inf
+    leaves = {"color": rendered.color.clone(), "depth": rendered.depth.clone(), "normal": normal}
+    for leaf in leaves.values():
+        leaf.requires_grad_()
+    targets = replace(targets, decoded=decoded, decoded_valid=targets.decoded_valid & decoded.isfinite())
+    loss = GaussianLoss(normal_target=target)
+    loss.total(loss(replace(rendered, **leaves), cameras, targets, scale)).backward()
+    for name, leaf in leaves.items():
+        assert leaf.grad is not None, name
+        assert torch.isfinite(leaf.grad).all(), name
+        assert (leaf.grad != 0).any(), name
+
+
+def test_group_and_term_weights(case) -> None:
+    weights = {"color_l1": 0.9, "ssim": 0.1, "depth_consistency": 0.25, "depth_gt": 0.5, "normal": 0.001}
+    loss = replace(GaussianLoss(weight=10), **weights)
+    terms = loss(*case)
+    torch.testing.assert_close(loss.total(terms), 10 * sum(weights[name] * terms[name] for name in weights))
+
+
+def test_decoded_depth_and_confidence_are_constants_of_the_gaussian_losses(sample) -> None:
+    made = sample()
+    depth = (1.02 * made.prediction.geometry.depth).requires_grad_()
+    conf = made.prediction.geometry.depth_conf.clone().requires_grad_()
+    made = made.with_depth(depth, conf).with_render(depth=(1.05 * made.rendered.depth).requires_grad_())
+    everything = VG2GTLoss()(*made.inputs)
+    geometry_only = VG2GTLoss()(made.prediction, made.batch)
+    assert float(everything.terms["depth_consistency"]) > 0.01
+    with_render = torch.autograd.grad(everything.total, (depth, conf))
+    without = torch.autograd.grad(geometry_only.total, (depth, conf))
+    for a, b in zip(with_render, without, strict=True):
+        assert torch.equal(a, b)
+
+
+def test_held_out_views_have_no_decoded_depth_to_agree_with(sample) -> None:
+    made = sample(rendered=(3, 1))  # view 3 is held out, view 1 is context
+    wrong = made.rendered.depth.clone()
+    wrong[:, 0] *= 1.5
+    flipped = made.rendered.normal.clone()
+    flipped[:, 0] *= -1
+    terms = VG2GTLoss()(*made.with_render(depth=wrong, normal=flipped).inputs).terms
+    assert float(terms["depth_consistency"]) < 1e-9
+    assert float(terms["normal"]) < 1e-9
+    assert float(terms["depth_gt"]) > 0.1
+    only_held_out = VG2GTLoss()(*sample(rendered=(3,)).inputs).terms
+    assert float(only_held_out["depth_consistency"]) == float(only_held_out["normal"]) == 0
+
+
+def test_unknown_normal_target_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"loss\.gaussian\.normal_target.*'world'"):
+        GaussianLoss(normal_target="world")

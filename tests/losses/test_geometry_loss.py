@@ -1,0 +1,237 @@
+"""VGGT's terms against straightforward re-derivations on point maps."""
+
+import math
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from vg2gt.geometry.cameras import unproject
+from vg2gt.geometry.rotations import quat_to_matrix
+from vg2gt.losses import GeometryLoss
+from vg2gt.losses.geometry import camera_errors, depth_gradient_loss, point_normal_loss, trusted_pixels
+from vg2gt.losses.truth import Truth, normalize_truth
+from vg2gt.types import Cameras
+
+
+def disturbed(sample, size=(24, 32), seed=3):
+    """A sample's truth, and predicted depth, confidence and cameras that differ from it, in the truth's unit."""
+    made = sample(size=size)
+    generator = torch.Generator().manual_seed(seed)
+    truth = normalize_truth(made.batch).views(slice(0, 3))
+    noise = torch.randn(truth.depth.shape, generator=generator, dtype=torch.float64)
+    depth = truth.depth * (1 + 0.05 * noise)
+    poses = truth.cameras.world_to_camera.clone()
+    turn = torch.tensor([1, 0.02, -0.03, 0.01], dtype=torch.float64)
+    poses[:, 1:, :3, :3] = quat_to_matrix(turn) @ poses[:, 1:, :3, :3]
+    poses[:, 1:, :3, 3] += 0.05
+    intrinsics = truth.cameras.intrinsics.clone()
+    intrinsics[..., 0, 0] *= 1.03
+    cameras = Cameras(poses, intrinsics, size)
+    valid = torch.rand(depth.shape, generator=generator) > 0.15
+    conf = 1 + torch.rand(depth.shape, generator=generator, dtype=torch.float64)
+    return truth, depth, conf, cameras, valid
+
+
+def slow_mean_terms(error: Tensor, conf: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+    e, c = error[valid], conf[valid]
+    if len(e) > 1000:
+        keep = e <= torch.quantile(e, 0.98)
+        e, c = e[keep], c[keep]
+    return (c * e - 0.2 * torch.log(c)).mean(), e.mean()
+
+
+def slow_depth_gradient(error: Tensor, valid: Tensor) -> Tensor:
+    scales = []
+    for stride in (1, 2, 4, 8):
+        e, m = error[:, ::stride, ::stride], valid[:, ::stride, ::stride]
+        total = 0.0
+        for v in range(e.shape[0]):
+            for y in range(e.shape[1]):
+                for x in range(e.shape[2]):
+                    for yy, xx in ((y, x + 1), (y + 1, x)):
+                        if yy < e.shape[1] and xx < e.shape[2] and m[v, y, x] and m[v, yy, xx]:
+                            total += min(abs(float(e[v, yy, xx] - e[v, y, x])), 100.0)
+        scales.append(total / int(m.sum()))
+    return torch.tensor(sum(scales) / 4, dtype=torch.float64)
+
+
+def slow_point_normals(points: Tensor, true_points: Tensor, valid: Tensor) -> Tensor:
+    scales = []
+    for stride in (1, 2, 4):
+        p, q, m = (x[:, ::stride, ::stride] for x in (points, true_points, valid))
+        values = []
+        for v in range(m.shape[0]):
+            for y in range(m.shape[1]):
+                for x in range(m.shape[2]):
+                    for dy, dx in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+                        yy, xx = y + dy, x + dx
+                        if not (0 <= yy < m.shape[1] and 0 <= xx < m.shape[2]):
+                            continue
+                        if not (m[v, y, x] and m[v, y, xx] and m[v, yy, x]):
+                            continue
+                        normals = [
+                            torch.linalg.cross(c[v, y, xx] - c[v, y, x], c[v, yy, x] - c[v, y, x]) for c in (p, q)
+                        ]
+                        values.append(1 - torch.cosine_similarity(*normals, dim=0))
+        scales.append(torch.stack(values).mean())
+    return torch.stack(scales).mean()
+
+
+def test_depth_task_matches_the_definition(sample) -> None:
+    truth, depth, conf, cameras, valid = disturbed(sample)
+    task, _ = GeometryLoss()(depth, conf, cameras, truth, valid)
+    error = depth[0] - truth.depth[0]
+    expected = *slow_mean_terms(error.abs(), conf[0], valid[0]), slow_depth_gradient(error, valid[0])
+    torch.testing.assert_close((task.conf, task.reg, task.grad), expected)
+    torch.testing.assert_close(task.total, sum(expected))
+
+
+def test_point_task_matches_the_definition_on_point_maps(sample) -> None:
+    truth, depth, conf, cameras, valid = disturbed(sample, size=(18, 20))
+    _, task = GeometryLoss()(depth, conf, cameras, truth, valid)
+    points, true_points = unproject(depth, cameras)[0], unproject(truth.depth, truth.cameras)[0]
+    error = (points - true_points).norm(dim=-1)
+    expected = *slow_mean_terms(error, conf[0], valid[0]), slow_point_normals(points, true_points, valid[0])
+    torch.testing.assert_close((task.conf, task.reg, task.grad), expected)
+
+
+def test_one_set_of_pixels_is_kept_below_the_quantile() -> None:
+    error = torch.rand(3, 30, 40, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    valid = torch.rand(error.shape, generator=torch.Generator().manual_seed(1)) > 0.3
+    for quantile in (0.5, 0.98, 1.0):
+        keep = trusted_pixels(error, valid, quantile)
+        assert torch.equal(keep, valid & (error <= torch.quantile(error[valid], quantile)))
+    few = valid & (torch.arange(40) < 10)
+    assert int(few.sum()) <= 1000
+    assert torch.equal(trusted_pixels(error, few, 0.5), few)
+
+
+def test_an_outlier_has_no_gradient_and_errors_stop_at_100(sample) -> None:
+    truth, depth, conf, cameras, _ = disturbed(sample)
+    everywhere = torch.ones_like(depth, dtype=torch.bool)
+    depth = depth.clone()
+    depth[0, 1, 5, 5] = 1e6
+    depth.requires_grad_()
+    task, point = GeometryLoss()(depth, conf, cameras, truth, everywhere)
+    (task.reg + task.conf + point.reg + point.conf).backward()
+    assert depth.grad is not None
+    assert depth.grad[0, 1, 5, 5] == 0
+    assert depth.grad[0, 1, 5, 6] != 0
+    assert float(depth_gradient_loss(depth[0].detach() - truth.depth[0], everywhere[0])) < 2
+    far, _ = GeometryLoss(quantile=1.0)(truth.depth + 500, torch.ones_like(conf), cameras, truth, everywhere)
+    torch.testing.assert_close(far.reg, torch.tensor(100.0, dtype=torch.float64))
+    torch.testing.assert_close(far.conf, torch.tensor(100.0, dtype=torch.float64))
+
+
+def test_a_perfect_prediction_leaves_only_the_confidence_term(sample) -> None:
+    truth, _, conf, _, valid = disturbed(sample)
+    task, point = GeometryLoss()(truth.depth, conf, truth.cameras, truth, valid)
+    for loss in (task, point):
+        assert float(loss.reg) < 1e-9
+        assert float(loss.grad) < 1e-9
+        torch.testing.assert_close(loss.conf, -0.2 * conf[0][valid[0]].log().mean(), atol=1e-2, rtol=0)
+
+
+def test_scaling_a_depth_map_costs_no_normals_but_bending_it_does(sample) -> None:
+    truth, _, _, _, _ = disturbed(sample)
+    valid = torch.ones_like(truth.depth[0], dtype=torch.bool)
+    scaled = point_normal_loss(1.3 * truth.depth[0], truth.cameras, truth, valid)
+    bent = truth.depth[0] * torch.linspace(0.8, 1.2, 32, dtype=torch.float64)
+    assert float(scaled) < 1e-12
+    assert float(point_normal_loss(bent, truth.cameras, truth, valid)) > 1e-3
+
+
+def test_holes_and_infinities_outside_the_mask_leave_gradients_finite(sample) -> None:
+    truth, depth, conf, cameras, valid = disturbed(sample)
+    depth, conf = depth.clone(), conf.clone()
+    depth[~valid] = torch.tensor([0.0, torch.inf, -1.0, torch.nan], dtype=torch.float64).repeat(1000)[
+        : int((~valid).sum())
+    ]
+    conf[~valid] = 0
+    depth.requires_grad_()
+    conf.requires_grad_()
+    task, point = GeometryLoss()(depth, conf, cameras, truth, valid)
+    (task.total + point.total).backward()
+    assert depth.grad is not None
+    assert conf.grad is not None
+    assert torch.isfinite(task.total + point.total)
+    assert torch.isfinite(depth.grad).all()
+    assert torch.isfinite(conf.grad).all()
+    assert (depth.grad[~valid] == 0).all()
+
+
+def test_fewer_than_100_pixels_give_a_zero_with_graph(sample) -> None:
+    made = sample()
+    few = torch.zeros_like(made.batch.depth)
+    few[0, 1, 3, :] = 3.0
+    few[0, 2, :3, :22] = 3.0  # 32 + 66 = 98 pixels in context views
+    few[0, 3] = 3.0  # a held-out view does not count
+    truth = normalize_truth(replace(made.batch, depth=few))
+    assert not truth.known[0]
+    assert truth.unit[0] == 1
+    context = truth.views(slice(0, 3))
+    depth = made.prediction.geometry.depth.clone().requires_grad_()
+    task, point = GeometryLoss()(depth, made.prediction.geometry.depth_conf, context.cameras, context, context.valid)
+    (task.total + point.total).backward()
+    assert float(task.total) == float(point.total) == 0
+    assert depth.grad is not None
+    assert (depth.grad == 0).all()
+
+
+def test_truth_is_divided_by_the_mean_distance_in_the_first_frame(sample) -> None:
+    made = sample(scenes=2)
+    depth = made.batch.depth.clone()
+    depth[:, :, :5] = 0
+    truth = normalize_truth(replace(made.batch, depth=depth))
+    batch = made.batch
+    for scene in range(2):
+        first = batch.cameras.world_to_camera[scene, 0]
+        points = unproject(depth[scene : scene + 1, :3], batch.cameras.scene(scene).select(slice(0, 3)))[0]
+        local = points @ first[:3, :3].T + first[:3, 3]
+        mask = depth[scene, :3] > 0
+        expected = local[mask].norm(dim=-1).sum() / (mask.sum() + 1e-3)
+        torch.testing.assert_close(truth.unit[scene], expected)
+        torch.testing.assert_close(truth.depth[scene, 3][5:], depth[scene, 3][5:] / expected)
+    assert torch.equal(truth.cameras.world_to_camera[:, 0], torch.eye(4, dtype=torch.float64).expand(2, 4, 4))
+    assert not truth.valid[:, :, :5].any()
+    larger = replace(
+        batch,
+        depth=depth * 7,
+        cameras=replace(batch.cameras, world_to_camera=with_scaled_translation(batch.cameras.world_to_camera, 7)),
+    )
+    again = normalize_truth(larger)
+    torch.testing.assert_close(again.depth, truth.depth, rtol=1e-6, atol=1e-6)
+    torch.testing.assert_close(again.cameras.world_to_camera, truth.cameras.world_to_camera, rtol=1e-6, atol=1e-6)
+
+
+def with_scaled_translation(poses: Tensor, factor: float) -> Tensor:
+    scaled = poses.clone()
+    scaled[..., :3, 3] *= factor
+    return scaled
+
+
+def test_camera_errors_by_hand() -> None:
+    identity = torch.eye(4, dtype=torch.float64).repeat(1, 1, 1, 1)
+    turned = identity.clone()
+    angle = 0.2
+    turned[..., :3, :3] = quat_to_matrix(
+        torch.tensor([math.cos(angle / 2), math.sin(angle / 2), 0, 0], dtype=torch.float64)
+    )
+    turned[..., 0, 3] = 0.3
+    intrinsics = torch.tensor([[50.0, 0, 20], [0, 25, 10], [0, 0, 1]], dtype=torch.float64).repeat(1, 1, 1, 1)
+    wider = intrinsics.clone()
+    wider[..., 0, 0] = 25
+    errors = camera_errors(Cameras(turned, wider, (50, 100)), Cameras(identity, intrinsics, (50, 100)))
+    assert math.isclose(float(errors["camera_T"]), 0.1, rel_tol=1e-9)
+    expected = (1 - math.cos(angle / 2) + math.sin(angle / 2)) / 4
+    assert math.isclose(float(errors["camera_R"]), expected, rel_tol=1e-6)
+    assert math.isclose(float(errors["camera_F"]), (math.atan(2) - math.atan(1)), rel_tol=1e-9)
+
+
+def test_truth_selects_views_and_scenes(sample) -> None:
+    truth = normalize_truth(sample(scenes=2).batch)
+    part = truth.scene(1).views(torch.tensor([2, 0]))
+    assert isinstance(part, Truth)
+    assert torch.equal(part.depth[0, 1], truth.depth[1, 0])
+    assert torch.equal(part.cameras.world_to_camera[0, 0], truth.cameras.world_to_camera[1, 2])

@@ -1,0 +1,260 @@
+"""The whole objective: scale, averaging over scenes, missing depth, what is trained and what is only logged."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from hydra.utils import instantiate
+
+from vg2gt.geometry.cameras import scale_translations
+from vg2gt.losses import EnhancementLoss, GaussianLoss, GeometryLoss, ScaleAlignment, VG2GTLoss
+
+CONFIGS = str(Path(__file__).parents[2] / "configs")
+DEPTH_TERMS = ["depth_conf", "depth_reg", "depth_grad", "point_conf", "point_reg", "point_grad"]
+GAUSSIAN_TERMS = ["color_l1", "ssim", "depth_consistency", "depth_gt", "normal"]
+
+
+def noisy(made, seed=0, amount=0.03):
+    generator = torch.Generator().manual_seed(seed)
+    geometry = made.prediction.geometry
+    noise = [torch.randn(geometry.depth.shape, generator=generator).to(geometry.depth.dtype) for _ in range(2)]
+    shade = torch.rand(made.rendered.color.shape, generator=generator).to(geometry.depth.dtype)
+    made = made.with_depth(geometry.depth * (1 + amount * noise[0]))
+    made = made.with_initial(geometry.depth * (1 + amount * noise[1]))
+    return made.with_render(color=0.8 * made.rendered.color + 0.2 * shade, depth=1.01 * made.rendered.depth)
+
+
+def joined(first, second):
+    """Two records of one scene each as one record of two scenes."""
+    rest: list[torch.Tensor] = []
+    second.map(lambda tensor: rest.append(tensor) or tensor)
+    remaining = iter(rest)
+    return first.map(lambda tensor: torch.cat((tensor, next(remaining))))
+
+
+def in_unit(made, factor: float):
+    """The same prediction in another unit."""
+    factors = torch.full_like(made.prediction.unit, factor)
+
+    def change(geometry):
+        return replace(geometry, depth=geometry.depth * factor, cameras=scale_translations(geometry.cameras, factors))
+
+    prediction = replace(
+        made.prediction, initial=change(made.prediction.initial), geometry=change(made.prediction.geometry)
+    )
+    return replace(
+        made.with_render(depth=made.rendered.depth * factor),
+        prediction=prediction,
+        cameras=scale_translations(made.cameras, factors),
+    )
+
+
+def test_an_exact_prediction_in_any_unit_costs_only_confidence(sample) -> None:
+    report = VG2GTLoss()(*sample(unit=2.5).inputs)
+    for name in set(DEPTH_TERMS + GAUSSIAN_TERMS) - {"depth_conf", "point_conf"}:
+        assert float(report.terms[name]) < 1e-5, name
+    assert float(report.terms["rendered"]) == 1
+    assert report.skipped == 0
+
+
+@pytest.mark.parametrize("align", [ScaleAlignment(), ScaleAlignment("rendered"), ScaleAlignment(per_view=True)])
+def test_the_predictions_unit_does_not_matter(sample, align: ScaleAlignment) -> None:
+    made = noisy(sample(scenes=2))
+    loss = VG2GTLoss(align=align)
+    one, other = loss(*made.inputs), loss(*in_unit(made, 0.13).inputs)
+    torch.testing.assert_close(other.total, one.total)
+    torch.testing.assert_close(other.scale * 0.13, one.scale)
+    for name, value in one.terms.items():
+        torch.testing.assert_close(other.terms[name], value, msg=name)
+
+
+def test_the_datas_unit_does_not_matter(sample) -> None:
+    made = noisy(sample())
+    factors = torch.full((1,), 20.0, dtype=torch.float64)
+    batch = replace(made.batch, depth=made.batch.depth * 20, cameras=scale_translations(made.batch.cameras, factors))
+    one, other = VG2GTLoss()(*made.inputs), VG2GTLoss()(*replace(made, batch=batch).inputs)
+    torch.testing.assert_close(other.total, one.total, rtol=1e-5, atol=1e-6)
+
+
+def test_scale_source_on_gaussians_that_are_a_tenth_too_far(sample) -> None:
+    made = sample(rendered=(0, 1, 2))
+    made = made.with_render(depth=1.1 * made.rendered.depth)
+    plain = GaussianLoss(confidence_weighted=False)
+    enhanced = VG2GTLoss(gaussian=plain, align=ScaleAlignment("enhanced"))(*made.inputs)
+    rendered = VG2GTLoss(gaussian=plain, align=ScaleAlignment("rendered"))(*made.inputs)
+    torch.testing.assert_close(rendered.scale * 1.1, enhanced.scale)
+    mean_depth = float(made.batch.depth[:, :3].mean() * enhanced.scale / 2.5)
+    assert float(enhanced.terms["depth_gt"]) == pytest.approx(0.1 * mean_depth, rel=1e-6)
+    assert float(enhanced.terms["depth_reg"]) < 1e-9
+    assert float(rendered.terms["depth_gt"]) < 1e-9
+    assert float(rendered.terms["depth_reg"]) == pytest.approx((1 - 1 / 1.1) * mean_depth, rel=1e-2)
+    for report in (enhanced, rendered):
+        assert float(report.terms["initial_depth"]) < 0  # the backbone's own depth has its own, exact scale
+        assert float(report.terms["depth_consistency"]) == pytest.approx(
+            0.1 * mean_depth * float(report.scale / enhanced.scale), rel=1e-6
+        )
+
+
+def test_rendered_source_without_a_surface_falls_back_to_the_enhanced_depth(sample) -> None:
+    made = sample()
+    made = made.with_render(depth=torch.zeros_like(made.rendered.depth))
+    report = VG2GTLoss(align=ScaleAlignment("rendered"))(*made.inputs)
+    torch.testing.assert_close(report.scale, VG2GTLoss()(*made.inputs).scale)
+
+
+@pytest.mark.parametrize("source", ["enhanced", "rendered"])
+def test_per_view_scales_forgive_what_one_scale_does_not(sample, source: str) -> None:
+    made = sample(rendered=(0, 1, 2))
+    factors = torch.tensor([1.0, 1.2, 0.9], dtype=torch.float64)[:, None, None]
+    made = made.with_depth(made.prediction.geometry.depth * factors)
+    made = made.with_render(depth=made.rendered.depth * factors)
+    one = VG2GTLoss(align=ScaleAlignment(source))(*made.inputs)
+    each = VG2GTLoss(align=ScaleAlignment(source, per_view=True))(*made.inputs)
+    assert float(each.terms["depth_consistency"]) < 1e-9  # decoded and rendered depth share every view's scale
+    for name in ("depth_reg", "depth_gt"):
+        assert float(each.terms[name]) < 1e-9
+        assert float(one.terms[name]) > 0.05
+
+
+def test_held_out_views_keep_the_scenes_scale(sample) -> None:
+    made = sample(rendered=(3,))
+    report = VG2GTLoss(align=ScaleAlignment(per_view=True))(*made.inputs)
+    assert float(report.terms["depth_gt"]) < 1e-9
+
+
+def test_scales_are_constants(sample) -> None:
+    made = noisy(sample())
+    depth = made.prediction.geometry.depth.clone().requires_grad_()
+    report = VG2GTLoss()(*made.with_depth(depth).inputs)
+    assert not report.scale.requires_grad
+    # Were the scale part of the graph, moving along the depth itself (a change of unit) would cost nothing.
+    (gradient,) = torch.autograd.grad(report.total, depth)
+    assert abs(float((gradient * depth).sum())) > 1e-4
+
+
+def test_scenes_count_alike(sample) -> None:
+    first, second = (noisy(sample(seed=seed), seed) for seed in (1, 2))
+    holes = second.batch.depth.clone()
+    holes[:, :, :15] = 0  # fewer pixels must not mean less weight
+    second = second.with_truth(holes)
+    both = replace(
+        first,
+        batch=replace(joined(first.batch, second.batch), scene=("a", "b")),
+        prediction=joined(first.prediction, second.prediction),
+        rendered=joined(first.rendered, second.rendered),
+        cameras=joined(first.cameras, second.cameras),
+    )
+    reports = [VG2GTLoss()(*made.inputs) for made in (first, second)]
+    joint = VG2GTLoss()(*both.inputs)
+    torch.testing.assert_close(joint.total, (reports[0].total + reports[1].total) / 2)
+    for name in joint.terms:
+        torch.testing.assert_close(joint.terms[name], (reports[0].terms[name] + reports[1].terms[name]) / 2)
+    torch.testing.assert_close(joint.scale, torch.cat([r.scale for r in reports]))
+
+
+@pytest.mark.parametrize("align", [ScaleAlignment(), ScaleAlignment("rendered", per_view=True)])
+def test_a_scene_without_depth_still_trains_its_colours(sample, align: ScaleAlignment) -> None:
+    made = noisy(sample(scenes=2))
+    missing = made.batch.depth.clone()
+    missing[1] = 0
+    leaves = {
+        "depth": made.prediction.geometry.depth.clone(),
+        "conf": made.prediction.geometry.depth_conf.clone(),
+        "color": made.rendered.color.clone(),
+        "rendered": made.rendered.depth.clone(),
+        "normal": made.rendered.normal + 0.1,
+    }
+    for leaf in leaves.values():
+        leaf.requires_grad_()
+    made = made.with_truth(missing).with_depth(leaves["depth"], leaves["conf"])
+    made = made.with_render(color=leaves["color"], depth=leaves["rendered"], normal=leaves["normal"])
+    report = VG2GTLoss(align=align)(*made.inputs)
+    assert report.skipped == 1
+    assert float(report.scale[1]) == 1
+    report.total.backward()
+    for name, leaf in leaves.items():
+        assert leaf.grad is not None, name
+        assert torch.isfinite(leaf.grad).all(), name
+        assert (leaf.grad[0] != 0).any(), name
+    for name in ("depth", "conf", "rendered"):
+        assert (leaves[name].grad[1] == 0).all(), name  # type: ignore[index]
+    for name in ("color", "normal"):
+        assert (leaves[name].grad[1] != 0).any(), name  # type: ignore[index]
+
+
+def test_a_batch_without_any_depth_keeps_its_graph(sample) -> None:
+    made = sample()
+    depth = made.prediction.geometry.depth.clone().requires_grad_()
+    made = made.with_truth(torch.zeros_like(made.batch.depth)).with_depth(depth)
+    report = VG2GTLoss()(made.prediction, made.batch)
+    report.total.backward()
+    assert float(report.total.detach()) == 0
+    assert report.skipped == 1
+    assert depth.grad is not None
+    assert all(torch.isfinite(value) for value in report.terms.values())
+
+
+def test_cameras_are_logged_and_not_trained(sample) -> None:
+    made = noisy(sample())
+    base = VG2GTLoss()(*made.inputs)
+    weights = dict.fromkeys([*DEPTH_TERMS, *GAUSSIAN_TERMS], 1.0) | {"enhance_depth": 3.0, "enhance_point": 3.0}
+    torch.testing.assert_close(base.total, sum(weight * base.terms[name] for name, weight in weights.items()))
+    assert not any(value.requires_grad for value in base.terms.values())
+    cameras = made.prediction.geometry.cameras
+    intrinsics = cameras.intrinsics.clone()
+    intrinsics[..., 0, 0] *= 1.1
+    geometry = replace(made.prediction.geometry, cameras=replace(cameras, intrinsics=intrinsics))
+    moved = replace(made, prediction=replace(made.prediction, geometry=geometry))
+    assert float(VG2GTLoss()(*moved.inputs).terms["camera_F"]) > 0.01 > float(base.terms["camera_F"])
+
+
+def test_term_weights_reach_the_total(sample) -> None:
+    made = noisy(sample())
+    loss = VG2GTLoss(
+        GeometryLoss(depth=2, point=0.5, gamma=1.5, alpha=0.1),
+        EnhancementLoss(weight=0),
+        GaussianLoss(weight=0.1, depth_consistency=0, depth_gt=0),
+    )
+    report = loss(*made.inputs)
+    terms = report.terms
+    expected = 2 * sum(terms[n] for n in DEPTH_TERMS[:3]) + 0.5 * sum(terms[n] for n in DEPTH_TERMS[3:])
+    torch.testing.assert_close(report.total, expected + 0.1 * (terms["color_l1"] + terms["ssim"] + terms["normal"]))
+
+
+def test_autocast_and_half_precision_inputs_change_nothing(sample) -> None:
+    made = noisy(sample(dtype=torch.float32))
+    half = made.prediction.geometry.depth.bfloat16()
+    with torch.autocast("cpu", torch.bfloat16):
+        inside = VG2GTLoss()(*made.with_depth(half).inputs)
+    outside = VG2GTLoss()(*made.with_depth(half.float()).inputs)
+    assert inside.total.dtype == torch.float32
+    assert torch.equal(inside.total, outside.total)
+
+
+@pytest.mark.parametrize(
+    ("name", "weights"),
+    [("paper", (1.0, 1.0, 1.0, 1.0, 1.0, 1.0)), ("release", (10.0, 0.9, 0.1, 0.25, 0.25, 0.001))],
+)
+def test_configurations_hold_the_published_weights(name: str, weights: tuple[float, ...]) -> None:
+    with initialize_config_dir(CONFIGS, version_base="1.3"):
+        loss = instantiate(compose(f"loss/{name}", ["loss.enhance.on=reg", "loss.align.source=rendered"]).loss)
+    assert isinstance(loss, VG2GTLoss)
+    g = loss.gaussian
+    assert (g.weight, g.color_l1, g.ssim, g.depth_consistency, g.depth_gt, g.normal) == weights
+    assert loss.geometry == GeometryLoss()
+    assert loss.enhance == EnhancementLoss(weight=3, on="reg")
+    assert loss.align == ScaleAlignment("rendered")
+
+
+def test_wrong_inputs_are_named(sample) -> None:
+    made = sample()
+    with pytest.raises(ValueError, match=r"prediction\.initial\.depth is \(1, 3, 24, 32\).*\(1, 2, 24, 32\)"):
+        VG2GTLoss()(made.prediction, replace(made.batch, num_context=2))
+    with pytest.raises(ValueError, match="render exactly the named views"):
+        VG2GTLoss()(made.prediction, made.batch, made.rendered, torch.tensor([0]), made.cameras)
+    with pytest.raises(ValueError, match="need views="):
+        VG2GTLoss()(made.prediction, made.batch, made.rendered)
+    with pytest.raises(ValueError, match=r"loss\.align\.source.*'scene'"):
+        ScaleAlignment("scene")
