@@ -2,6 +2,7 @@
 
 from vg2gt.data.base import DataError, Frames, SceneSource
 from vg2gt.data.datamodule import SceneDataModule
+from vg2gt.data.rgbd import RGBDFolder
 from vg2gt.data.synthetic import SyntheticRooms
 
-__all__ = ["DataError", "Frames", "SceneDataModule", "SceneSource", "SyntheticRooms"]
+__all__ = ["DataError", "Frames", "RGBDFolder", "SceneDataModule", "SceneSource", "SyntheticRooms"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from lightning.pytorch import LightningDataModule
@@ -58,9 +59,8 @@ class SceneDataModule(LightningDataModule):
     uninterrupted one would have seen, with any number of workers.
 
     Args:
-        train: training scenes, or what makes them (``_partial_: true``); called with ``root=`` if that is given.
+        train: training scenes, or what makes them (``_partial_: true``): then called with ``common``.
         val: evaluation scenes, likewise.
-        root: the dataset's folder (or several), handed to sources that are not made yet; None for datasets without.
         image_size: ``(height, width)`` of every image, best a multiple of the backbone's patch size; frames are resized
             until they cover it and cropped at the centre.
         train_scenes: use at most this many training scenes; None: all.
@@ -77,13 +77,13 @@ class SceneDataModule(LightningDataModule):
         seed: seeds the choice of scenes and views.
         workers: loader processes; 0 decodes in the training process.
         memory_mb: decoded frames kept in memory by each process.
+        common: arguments that ``train`` and ``val`` share, such as the dataset's ``root``.
     """
 
     def __init__(
         self,
         train: SceneSource | SourceMaker,
         val: SceneSource | SourceMaker,
-        root: str | Sequence[str] | None = None,
         image_size: Sequence[int] = (224, 448),
         train_scenes: int | None = None,
         eval_scenes: int | None = None,
@@ -99,12 +99,13 @@ class SceneDataModule(LightningDataModule):
         seed: int = 0,
         workers: int = 0,
         memory_mb: int = 1024,
+        **common: Any,
     ) -> None:
         super().__init__()
         self.sampler = ViewSampler(min_views, max_views, max_images, expand_ratio, target_views, seed)
         self.eval_views = EvaluationViews(eval_context, eval_target, eval_window)
         self.image_size = (int(image_size[0]), int(image_size[1]))
-        self.root = root
+        self.common = common
         self.train_scenes = train_scenes
         self.eval_scenes = eval_scenes
         self.steps_per_epoch = steps_per_epoch
@@ -158,9 +159,7 @@ class SceneDataModule(LightningDataModule):
         return self.val_dataloader()
 
     def _source(self, make: SceneSource | SourceMaker) -> SceneSource:
-        if isinstance(make, SceneSource):
-            return make
-        return make() if self.root is None else make(root=self.root)
+        return make if isinstance(make, SceneSource) else make(**self.common)
 
     def _loader(self, dataset: BatchDataset, sampler: object) -> DataLoader[Batch]:
         return DataLoader(

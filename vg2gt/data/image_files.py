@@ -1,0 +1,81 @@
+"""Decoding of colour and depth image files, with errors that name the file and the scene."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from vg2gt.data.base import DataError
+
+# What Pillow raises for files that are damaged in one way or another.
+_DAMAGED = (OSError, SyntaxError, ValueError, EOFError, zlib.error, struct.error, Image.DecompressionBombError)
+
+
+def image_size(path: Path, scene: str) -> tuple[int, int]:
+    """Returns an image's ``(height, width)`` without decoding it.
+
+    Raises:
+        DataError: if the file is missing or not an image.
+    """
+    try:
+        with Image.open(path) as image:
+            return image.height, image.width
+    except _DAMAGED as error:
+        raise _unreadable(path, scene, error) from error
+
+
+def read_color(path: Path, scene: str, size: tuple[int, int]) -> NDArray[np.uint8]:
+    """Reads a colour image ``[H, W, 3]``.
+
+    Args:
+        path: the file.
+        scene: the scene it belongs to, for messages.
+        size: the ``(height, width)`` it must have.
+
+    Raises:
+        DataError: if the file is missing, damaged or of another size.
+    """
+    try:
+        with Image.open(path) as image:
+            pixels = np.array(image.convert("RGB"))
+    except _DAMAGED as error:
+        raise _unreadable(path, scene, error) from error
+    _check_size(path, scene, pixels.shape[:2], size)
+    return pixels
+
+
+def read_depth(path: Path, scene: str, size: tuple[int, int]) -> NDArray[np.int64]:
+    """Reads a one-channel integer depth image ``[H, W]`` as stored (16-bit PNG, PGM or TIFF).
+
+    Raises:
+        DataError: if the file is missing, damaged, not a one-channel integer image, or of another size than ``size``.
+    """
+    try:
+        with Image.open(path) as image:
+            pixels = np.array(image)
+    except _DAMAGED as error:
+        raise _unreadable(path, scene, error) from error
+    if pixels.ndim != 2 or pixels.dtype.kind not in "iu":
+        raise DataError(
+            f"{path} of scene {scene} is not a depth image: expected one channel of 16-bit integers, found "
+            f"{pixels.dtype} values of shape {pixels.shape}"
+        )
+    _check_size(path, scene, pixels.shape, size)
+    return pixels.astype(np.int64)
+
+
+def _unreadable(path: Path, scene: str, error: Exception) -> DataError:
+    return DataError(f"cannot read {path} of scene {scene}: {error}; restore the file or remove the frame")
+
+
+def _check_size(path: Path, scene: str, found: tuple[int, ...], expected: tuple[int, int]) -> None:
+    if tuple(found) != tuple(expected):
+        raise DataError(
+            f"{path} of scene {scene} is {found[1]}x{found[0]} pixels, but the recording's first one is "
+            f"{expected[1]}x{expected[0]}"
+        )
