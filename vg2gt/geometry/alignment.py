@@ -114,9 +114,9 @@ class Similarity(TensorRecord):
 def align_cameras(predicted: Cameras, reference: Cameras) -> Similarity:
     """The similarity that brings predicted cameras onto reference cameras of the same views.
 
-    The rotation is the orthogonal Procrustes solution for the centres (Umeyama) and the orientations together, both
-    normalised, so that one camera, two cameras or cameras on a line are no special cases. Scale and translation follow
-    from the centres by least squares; cameras that do not move have scale 1.
+    The rotation is the mean of the cameras' relative orientations (orthogonal Procrustes); given it, scale and
+    translation are Umeyama's least-squares solution for the centres. Taking the rotation from the centres as well would
+    leave it undetermined for one camera, two cameras or cameras on a line, and to noise for short baselines.
 
     Args:
         predicted: B scenes, V views.
@@ -124,24 +124,26 @@ def align_cameras(predicted: Cameras, reference: Cameras) -> Similarity:
 
     Returns:
         ``[B]`` similarities from the predicted to the reference frame, computed in float64, in the input's dtype.
+        Scenes whose cameras stand still in either frame have scale 1.
     """
     dtype = predicted.world_to_camera.dtype
-    source, target = (_centers(cameras).double() for cameras in (predicted, reference))
-    source_mean, target_mean = source.mean(1), target.mean(1)
-    source, target = source - source_mean[:, None], target - target_mean[:, None]
-    spread = source.square().sum((1, 2)).sqrt() * target.square().sum((1, 2)).sqrt()
-
-    covariance = target.transpose(-1, -2) @ source
-    from_centers = covariance / spread.clamp(min=torch.finfo(torch.float64).tiny)[:, None, None]
     orientations = [cameras.world_to_camera[..., :3, :3].double() for cameras in (predicted, reference)]
-    from_orientations = (orientations[1].transpose(-1, -2) @ orientations[0]).mean(1)
-    rotation = _nearest_rotation(from_centers + from_orientations)
+    rotation = _nearest_rotation((orientations[1].transpose(-1, -2) @ orientations[0]).sum(1))
 
-    scale = (covariance * rotation).sum((1, 2)) / source.square().sum((1, 2))
-    moves = source.square().sum((1, 2)).sqrt() > 1e-6 * source_mean.norm(dim=-1).clamp(min=1e-6)
-    scale = torch.where(moves & (scale > 0), scale, 1.0)
+    source, target = _centers(predicted).double(), _centers(reference).double()
+    moves = _moves(source) & _moves(target)
+    source_mean, target_mean = source.mean(1), target.mean(1)
+    turned = (source - source_mean[:, None]) @ rotation.transpose(-1, -2)
+    agreement = (turned * (target - target_mean[:, None])).sum((1, 2))
+    scale = torch.where(moves & (agreement > 0), agreement / turned.square().sum((1, 2)), 1.0)
     translation = target_mean - scale[:, None] * (rotation @ source_mean[..., None])[..., 0]
     return Similarity(scale.to(dtype), rotation.to(dtype), translation.to(dtype))
+
+
+def _moves(centers: Tensor) -> Tensor:
+    """Whether the centres ``[B, V, 3]`` of a scene differ by more than float32's rounding."""
+    spread = (centers - centers.mean(1, keepdim=True)).norm(dim=-1).amax(1)
+    return spread > 1e-6 * centers.norm(dim=-1).amax(1)
 
 
 def _centers(cameras: Cameras) -> Tensor:

@@ -1,0 +1,181 @@
+from dataclasses import replace
+
+import pytest
+import torch
+from scipy.optimize import minimize_scalar
+from torch import Tensor
+
+from vg2gt.geometry.alignment import Similarity, align_cameras, fit_depth_scale, weighted_median
+from vg2gt.geometry.cameras import project
+from vg2gt.geometry.rotations import quat_to_matrix
+from vg2gt.types import Cameras
+
+
+def rand(*shape: int, seed: int = 0) -> Tensor:
+    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def randn(*shape: int, seed: int = 0) -> Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def random_cameras(scenes: int, views: int, seed: int = 0) -> Cameras:
+    poses = torch.eye(4, dtype=torch.float64).repeat(scenes, views, 1, 1)
+    poses[..., :3, :3] = quat_to_matrix(randn(scenes, views, 4, seed=seed))
+    poses[..., :3, 3] = randn(scenes, views, 3, seed=seed + 1)
+    intrinsics = torch.tensor([[20.0, 0, 9.5], [0, 20, 7.5], [0, 0, 1]], dtype=torch.float64)
+    return Cameras(poses, intrinsics.repeat(scenes, views, 1, 1), (16, 20))
+
+
+def random_similarity(scenes: int, seed: int = 7) -> Similarity:
+    rotation = quat_to_matrix(randn(scenes, 4, seed=seed))
+    return Similarity(0.3 + rand(scenes, seed=seed), rotation, randn(scenes, 3, seed=seed + 1))
+
+
+def test_weighted_median_minimises_the_weighted_distance() -> None:
+    for seed in range(5):
+        values, weights = rand(41, seed=seed), rand(41, seed=seed + 50)
+        weights[::7] = 0
+        cost = (weights * (values[:, None] - values).abs()).sum(-1)
+        found = weighted_median(values, weights)
+        assert float((weights * (found - values).abs()).sum()) <= float(cost.min()) + 1e-12
+
+
+def test_weighted_median_by_hand() -> None:
+    values = torch.tensor([[3.0, 1.0, 2.0, torch.nan], [5.0, 5.0, 7.0, 1.0]])
+    weights = torch.tensor([[1.0, 1.0, 5.0, 0.0], [0.0, 0.0, 0.0, 0.0]])
+    found = weighted_median(values, weights)
+    assert found[0] == 2
+    assert found[1].isnan()
+
+
+def test_scale_is_the_minimiser_of_the_weighted_l1_error() -> None:
+    predicted, reference = 0.5 + rand(1, 2, 20, 30), 1 + 3 * rand(1, 2, 20, 30, seed=1)
+    reference[0, 0, 0, :5] = 0.002  # below the weights' smallest depth
+    valid = rand(1, 2, 20, 30, seed=2) > 0.3
+    scale = float(fit_depth_scale(predicted, reference, valid)[0])
+
+    def cost(s: float) -> float:
+        p, d = predicted[valid], reference[valid]
+        return float(((s * p - d).abs() / d.clamp(min=0.01)).sum())
+
+    best = minimize_scalar(cost, bounds=(0.01, 10), method="bounded", options={"xatol": 1e-10})
+    assert cost(scale) <= cost(best.x) + 1e-9
+    # The unweighted median of the ratios is another number: the weights matter.
+    assert abs(scale - float((reference / predicted)[valid].median())) > 1e-3
+
+
+def test_scale_of_scenes_and_of_views() -> None:
+    predicted = 1 + rand(2, 3, 12, 10)
+    factors = torch.tensor([[2.0, 2.0, 2.0], [0.5, 3.0, 0.5]], dtype=torch.float64)
+    reference = predicted * factors[..., None, None]
+    everywhere = torch.ones_like(predicted, dtype=torch.bool)
+    torch.testing.assert_close(fit_depth_scale(predicted, reference, everywhere, per_view=True), factors)
+    scale = fit_depth_scale(predicted, reference, everywhere)
+    torch.testing.assert_close(scale, torch.tensor([2.0, 0.5], dtype=torch.float64))
+
+
+def test_scale_ignores_invalid_pixels_and_has_no_graph() -> None:
+    predicted, reference = 1 + rand(1, 1, 8, 8), 2 + rand(1, 1, 8, 8, seed=1)
+    good = torch.ones_like(predicted, dtype=torch.bool)
+    good[0, 0, :3] = False
+    reference_scale = fit_depth_scale(predicted, reference, good)
+    predicted[0, 0, 0], predicted[0, 0, 1], reference[0, 0, 2] = 0, torch.inf, torch.nan
+    everywhere = torch.ones_like(good)
+    scale = fit_depth_scale(predicted.requires_grad_(), reference, everywhere)
+    torch.testing.assert_close(scale, reference_scale)
+    assert not scale.requires_grad
+    assert fit_depth_scale(predicted, reference, torch.zeros_like(good)).isnan().all()
+
+
+@pytest.mark.parametrize("size", [(100, 200), (64, 64), (65, 63), (3, 500)])
+def test_subsampling_finds_the_only_valid_pixel_of_a_cell(size: tuple[int, int]) -> None:
+    predicted = torch.ones(1, 1, *size, dtype=torch.float64)
+    for y, x in ((0, 0), (size[0] - 1, size[1] - 1), (size[0] // 3, size[1] // 2)):
+        valid = torch.zeros(1, 1, *size, dtype=torch.bool)
+        valid[0, 0, y, x] = True
+        reference = torch.full_like(predicted, 9.0)
+        reference[0, 0, y, x] = 2.5
+        assert float(fit_depth_scale(predicted, reference, valid)[0]) == 2.5
+
+
+def test_subsampling_takes_one_pixel_near_the_centre_of_every_cell() -> None:
+    # 128 x 192 pixels: cells of 2 x 3, whose middle column is nearest to the centre.
+    ratio = torch.full((1, 1, 128, 192), 50.0, dtype=torch.float64)
+    ratio[..., 1::3] = 2.0
+    everywhere = torch.ones_like(ratio, dtype=torch.bool)
+    assert float(fit_depth_scale(torch.ones_like(ratio), ratio, everywhere)[0]) == 2
+
+
+@pytest.mark.parametrize("views", [2, 3, 8])
+def test_alignment_recovers_a_similarity(views: int) -> None:
+    predicted, truth = random_cameras(3, views), random_similarity(3)
+    found = align_cameras(predicted, truth.apply_cameras(predicted))
+    for name in ("scale", "rotation", "translation"):
+        torch.testing.assert_close(getattr(found, name), getattr(truth, name), rtol=1e-9, atol=1e-9)
+
+
+def test_alignment_of_one_camera_keeps_the_scale() -> None:
+    predicted, truth = random_cameras(2, 1), random_similarity(2)
+    reference = truth.apply_cameras(predicted)
+    found = align_cameras(predicted, reference)
+    torch.testing.assert_close(found.scale, torch.ones(2, dtype=torch.float64))
+    torch.testing.assert_close(found.rotation, truth.rotation)
+    torch.testing.assert_close(found.apply_cameras(predicted).world_to_camera, reference.world_to_camera)
+
+
+def test_alignment_of_cameras_on_a_line_and_of_cameras_that_only_turn() -> None:
+    predicted, truth = random_cameras(1, 5), random_similarity(1)
+    for direction in (torch.tensor([0.3, 0.1, 0.2], dtype=torch.float64), torch.zeros(3, dtype=torch.float64)):
+        centers = torch.arange(5, dtype=torch.float64)[:, None] * direction + 0.4
+        poses = predicted.world_to_camera.clone()
+        poses[0, :, :3, 3] = -(poses[0, :, :3, :3] @ centers[..., None])[..., 0]
+        cameras = Cameras(poses, predicted.intrinsics, predicted.size)
+        reference = truth.apply_cameras(cameras)
+        found = align_cameras(cameras, reference)
+        torch.testing.assert_close(found.rotation, truth.rotation)
+        if direction.any():
+            torch.testing.assert_close(found.scale, truth.scale)
+            torch.testing.assert_close(found.apply_cameras(cameras).world_to_camera, reference.world_to_camera)
+        else:
+            torch.testing.assert_close(found.scale, torch.ones(1, dtype=torch.float64))
+
+
+def test_scale_and_translation_are_least_squares_in_the_centres() -> None:
+    predicted, truth = random_cameras(1, 6), random_similarity(1)
+    exact = truth.apply_cameras(predicted).world_to_camera
+    moved = exact.clone()
+    moved[..., :3, 3] += 0.1 * randn(1, 6, 3, seed=9)
+    reference = Cameras(moved, predicted.intrinsics, predicted.size)
+    found = align_cameras(predicted, reference)
+    torch.testing.assert_close(found.rotation, truth.rotation)
+
+    def cost(similarity: Similarity) -> float:
+        centers = [torch.linalg.inv(c.world_to_camera)[..., :3, 3] for c in (predicted, reference)]
+        return float((similarity.apply(centers[0]) - centers[1]).square().sum())
+
+    for step in (-1e-4, 1e-4):
+        assert cost(replace(found, scale=found.scale + step)) > cost(found)
+        for axis in torch.eye(3, dtype=torch.float64):
+            assert cost(replace(found, translation=found.translation + step * axis)) > cost(found)
+
+
+def test_alignment_never_mirrors() -> None:
+    predicted, other = random_cameras(4, 3), random_cameras(4, 3, seed=20)  # nothing in common
+    found = align_cameras(predicted, other)
+    torch.testing.assert_close(torch.linalg.det(found.rotation), torch.ones(4, dtype=torch.float64))
+    assert (found.scale > 0).all()
+
+
+def test_a_similarity_moves_points_and_cameras_together() -> None:
+    cameras, similarity = random_cameras(2, 3), random_similarity(2)
+    points = randn(2, 3, 5, 3)
+    pixels, depth = project(points, cameras)
+    moved_pixels, moved_depth = project(similarity.apply(points), similarity.apply_cameras(cameras))
+    torch.testing.assert_close(moved_pixels, pixels)
+    torch.testing.assert_close(moved_depth, depth * similarity.scale[:, None, None])
+
+
+def test_float32_cameras_give_float32_similarities() -> None:
+    cameras = random_cameras(1, 4).map(Tensor.float)
+    assert align_cameras(cameras, cameras).rotation.dtype == torch.float32

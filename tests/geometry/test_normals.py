@@ -1,0 +1,103 @@
+import math
+
+import pytest
+import torch
+
+from vg2gt.geometry.cameras import ray_directions
+from vg2gt.geometry.normals import normals_from_depth
+
+SIZE = (24, 30)
+K = torch.tensor([[33.0, 0, 14.2], [0, 29, 11.9], [0, 0, 1]], dtype=torch.float64)
+
+
+def plane_depth(normal: torch.Tensor, distance: float) -> torch.Tensor:
+    """z-depth of the plane ``normal . x = -distance``."""
+    return -distance / (ray_directions(K, SIZE) @ normal)
+
+
+def wavy_depth() -> torch.Tensor:
+    y, x = torch.meshgrid(torch.linspace(0, 4, SIZE[0]), torch.linspace(0, 5, SIZE[1]), indexing="ij")
+    return (3 + 0.05 * torch.sin(x) + 0.04 * torch.cos(2 * y)).double()
+
+
+@pytest.mark.parametrize("direction", [(0, 0, -1), (0.3, -0.2, -1), (-0.5, 0.6, -1), (0.0, -1.0, -0.4)])
+def test_a_plane_has_its_normal_everywhere_inside(direction) -> None:
+    normal = torch.tensor(direction, dtype=torch.float64)
+    normal = normal / normal.norm()
+    depth = plane_depth(normal, 2.0)
+    depth = torch.where(depth > 0, depth, 0)
+    normals, valid = normals_from_depth(depth, K, edge_threshold=0.5)
+    assert valid.any()
+    expected = normal[:, None].expand(3, int(valid.sum()))
+    torch.testing.assert_close(normals[:, valid], expected)
+    assert not valid[0].any()
+    assert not valid[-1].any()
+    assert not valid[:, 0].any()
+    assert not valid[:, -1].any()
+
+
+def test_equals_the_cross_product_of_central_differences() -> None:
+    depth = wavy_depth()
+    points = ray_directions(K, SIZE) * depth[..., None]
+    dx, dy = points[1:-1, 2:] - points[1:-1, :-2], points[2:, 1:-1] - points[:-2, 1:-1]
+    expected = torch.nn.functional.normalize(torch.linalg.cross(dy, dx), dim=-1).permute(2, 0, 1)
+    normals, valid = normals_from_depth(depth, K)
+    assert valid[1:-1, 1:-1].all()
+    torch.testing.assert_close(normals[:, 1:-1, 1:-1], expected)
+    facing = (normals[:, 1:-1, 1:-1] * points[1:-1, 1:-1].permute(2, 0, 1)).sum(0)
+    assert (facing < 0).all()
+
+
+def test_holes_and_depth_edges_have_no_normal() -> None:
+    depth = torch.full(SIZE, 2.0, dtype=torch.float64)
+    depth[:, 15:] = 2.2  # a step of 10 %
+    depth[5, 5] = 0
+    _, valid = normals_from_depth(depth, K)
+    expected = torch.zeros(SIZE, dtype=torch.bool)
+    expected[1:-1, 1:-1] = True
+    expected[:, 14:16] = False
+    for y, x in ((5, 5), (4, 5), (6, 5), (5, 4), (5, 6)):
+        expected[y, x] = False
+    assert torch.equal(valid, expected)
+    _, wide = normals_from_depth(depth, K, edge_threshold=0.2)
+    assert wide[10, 14]
+
+
+def test_does_not_depend_on_the_unit() -> None:
+    depth = wavy_depth()
+    near, valid_near = normals_from_depth(depth, K)
+    far, valid_far = normals_from_depth(1000 * depth, K)
+    assert torch.equal(valid_near, valid_far)
+    torch.testing.assert_close(near, far)
+
+
+def test_batches_have_their_own_intrinsics() -> None:
+    depth = wavy_depth().expand(2, 3, *SIZE)
+    intrinsics = K.repeat(2, 3, 1, 1)
+    intrinsics[1, 2, 0, 0] = 50
+    normals, valid = normals_from_depth(depth, intrinsics)
+    assert normals.shape == (2, 3, 3, *SIZE)
+    assert valid.shape == (2, 3, *SIZE)
+    for b, v in ((0, 0), (1, 2)):
+        torch.testing.assert_close(normals[b, v], normals_from_depth(depth[b, v], intrinsics[b, v])[0])
+    assert not torch.allclose(normals[0, 0], normals[1, 2])
+
+
+def test_gradients_are_right_and_finite_with_holes() -> None:
+    depth = wavy_depth()[:6, :7].clone()
+    depth[2, 2] = 0
+    depth.requires_grad_()
+
+    def weighted(d: torch.Tensor) -> torch.Tensor:
+        normals, _ = normals_from_depth(d, K, edge_threshold=0.3)
+        return (normals * torch.arange(normals.numel(), dtype=torch.float64).view_as(normals)).sum()
+
+    (gradient,) = torch.autograd.grad(weighted(depth), depth)
+    assert torch.isfinite(gradient).all()
+    assert gradient[2, 2] == 0
+    assert (gradient != 0).any()
+    step = 1e-6
+    moved = depth.detach().clone()
+    moved[4, 4] += step
+    numeric = float(weighted(moved) - weighted(depth).detach()) / step
+    assert math.isclose(numeric, float(gradient[4, 4]), rel_tol=1e-4)

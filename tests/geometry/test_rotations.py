@@ -1,0 +1,41 @@
+import math
+
+import torch
+from scipy.spatial.transform import Rotation
+
+from vg2gt.geometry.rotations import matrix_to_quat, quat_to_matrix
+
+
+def random_quats(count: int) -> torch.Tensor:
+    return torch.randn(count, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+
+
+def test_matches_scipy() -> None:
+    quats = random_quats(50)
+    expected = Rotation.from_quat(quats[:, [1, 2, 3, 0]].numpy()).as_matrix()
+    torch.testing.assert_close(quat_to_matrix(quats), torch.from_numpy(expected))
+
+
+def test_round_trip_up_to_sign() -> None:
+    quats = torch.nn.functional.normalize(random_quats(200), dim=-1)
+    back = matrix_to_quat(quat_to_matrix(quats))
+    assert (back[:, 0] >= 0).all()
+    torch.testing.assert_close(back, quats * torch.where(quats[:, :1] < 0, -1.0, 1.0))
+
+
+def test_half_turns_are_safe() -> None:
+    """Turns by pi have w = 0: the square root of the trace is of no use there."""
+    for axis in ((1, 0, 0), (0, 1, 0), (0, 0, 1), (0.6, 0.0, -0.8), (-0.48, 0.6, 0.64)):
+        for angle in (math.pi, math.pi - 1e-7):
+            expected = torch.tensor(
+                [math.cos(angle / 2), *(math.sin(angle / 2) * a for a in axis)], dtype=torch.float64
+            )
+            matrix = quat_to_matrix(expected)
+            torch.testing.assert_close(quat_to_matrix(matrix_to_quat(matrix)), matrix, rtol=1e-9, atol=1e-9)
+
+
+def test_gradients_are_finite_at_the_identity() -> None:
+    matrix = torch.eye(3, dtype=torch.float64).requires_grad_()
+    matrix_to_quat(matrix).sum().backward()
+    assert matrix.grad is not None
+    assert torch.isfinite(matrix.grad).all()
