@@ -1,4 +1,4 @@
-"""The reference: every pixel against every Gaussian. Slow, any dtype, and the oracle the other implementations are held to."""
+"""The reference: every pixel against every Gaussian; the oracle the other implementations are held to."""
 
 from __future__ import annotations
 

@@ -2,8 +2,8 @@
 
 A Gaussian of opacity alpha whose response peaks at ``t*`` with precision ``lambda`` is the solid of vacancy
 ``v(t) = sqrt(1 - g)``, ``g = alpha exp(-lambda (t - t*)^2 / 2)`` (paper, eqn vacancy). A ray has passed it unhit with
-probability ``sqrt(1 - g)`` up to the peak and ``(1 - alpha) / sqrt(1 - g)`` behind it; transmittance T(t) is the product
-over the ray's Gaussians, whatever their order, and the median depth d solves ``T(d) = 1/2``.
+probability ``sqrt(1 - g)`` up to the peak and ``(1 - alpha) / sqrt(1 - g)`` behind it; transmittance T(t) is the
+product over the ray's Gaussians, whatever their order, and the median depth d solves ``T(d) = 1/2``.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
@@ -77,14 +77,18 @@ class SceneViews:
         """Returns the scene with one view (V = 1)."""
         one = slice(index, index + 1)
         colors = self.colors if self.colors.shape[0] == 1 else self.colors[one]
-        return SceneViews(
-            *self.tensors[:4], colors, self.world_to_camera[one], self.intrinsics[one], self.background, self.size
-        )
+        return replace(self, colors=colors, world_to_camera=self.world_to_camera[one], intrinsics=self.intrinsics[one])
 
     def gather(self, index: Tensor) -> SceneViews:
         """Returns the Gaussians of the given indices, in that order."""
-        means, quats, scales, opacities = (tensor[index] for tensor in self.tensors[:4])
-        return SceneViews(means, quats, scales, opacities, self.colors[:, index], *self.tensors[5:], self.size)
+        return replace(
+            self,
+            means=self.means[index],
+            quats=self.quats[index],
+            scales=self.scales[index],
+            opacities=self.opacities[index],
+            colors=self.colors[:, index],
+        )
 
 
 @dataclass(frozen=True)

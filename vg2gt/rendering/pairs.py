@@ -1,4 +1,4 @@
-"""Sparse (pixel, Gaussian) pairs in plain torch: any device, no further packages, autograd for everything but the median."""
+"""Sparse (pixel, Gaussian) pairs in plain torch: any device, no further packages."""
 
 from __future__ import annotations
 

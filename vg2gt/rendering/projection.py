@@ -7,9 +7,10 @@ curvature ``lambda``, and all three follow from the offset ``delta`` between pix
     E = delta' Q delta      s = q . delta      r = (1 + s)^2 + eps E
     D^2 = E / r             t* = z (1 + s) / r             lambda = a0 r
 
-with ``a0 = m' L m``, ``q = (L m)_xy / (f a0)``, ``eps = 1 / (z^2 a0)`` and ``Q = (J Sigma J' + lowpass I)^-1``. Without
-low-pass this is the exact ray maximum of the paper's eqn gggs_color; the low-pass dilates the Gaussian inside its tangent
-plane only, so depth profiles do not thicken. ``q = 0, eps = 0`` is the classic affine splat of 3DGS with the mean's depth.
+with ``a0 = m' L m``, ``q = (L m)_xy / (f a0)``, ``eps = 1 / (z^2 a0)`` and ``Q = (J Sigma J' + lowpass I)^-1``.
+Without low-pass this is the exact ray maximum of the paper's eqn gggs_color; the low-pass dilates the Gaussian inside its
+tangent plane only, so depth profiles do not thicken. ``q = 0, eps = 0`` is the classic affine splat of 3DGS with the
+mean's depth.
 """
 
 from __future__ import annotations
@@ -102,8 +103,8 @@ def screen_box(splats: Splats) -> tuple[Tensor, Tensor]:
     """Smallest screen box of the pixels with alpha >= 1/255, in closed form.
 
     Returns:
-        Box ``[N, 4]`` as (x0, y0, x1, y1), both ends inside, and ``[N]`` bool: False where there is no such pixel or the
-        region is unbounded, that is where the Gaussian straddles the camera plane.
+        Box ``[N, 4]`` as (x0, y0, x1, y1), both ends inside, and ``[N]`` bool: False where there is no such pixel or
+        the region is unbounded, that is where the Gaussian straddles the camera plane.
     """
     cutoff = 2 * torch.log(splats.opacity / ALPHA_MIN)
     q0, q1 = splats.tilt.unbind(-1)
@@ -147,8 +148,8 @@ def respond(splats: Splats, pixels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         pixels: ``[..., 2]`` as (x, y).
 
     Returns:
-        ``o exp(-D^2 / 2)`` before the alpha cap, the peak's depth ``t*`` and its precision ``lambda``; a response without
-        a peak in front of the camera is 0.
+        ``o exp(-D^2 / 2)`` before the alpha cap, the peak's depth ``t*`` and its precision ``lambda``; a response
+        without a peak in front of the camera is 0.
     """
     dx, dy = (pixels - splats.center).unbind(-1)
     quadratic = splats.conic[..., 0] * dx * dx + 2 * splats.conic[..., 1] * dx * dy + splats.conic[..., 2] * dy * dy

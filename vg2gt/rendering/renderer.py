@@ -13,15 +13,16 @@ from torch.nn import functional as F
 from vg2gt.geometry.cameras import invert_rigid
 from vg2gt.geometry.spherical_harmonics import sh_to_rgb
 from vg2gt.rendering.checks import background_color, check_cameras, check_gaussians
+from vg2gt.rendering.cpu import rasterize_cpu
 from vg2gt.rendering.dense import rasterize_dense
 from vg2gt.rendering.options import DepthKind, Images, Mode, RenderOptions, SceneViews
 from vg2gt.rendering.pairs import rasterize_pairs
 from vg2gt.types import Cameras, Gaussians, Render
 
-Implementation = Literal["auto", "torch", "dense"]
+Implementation = Literal["auto", "torch", "dense", "cpu"]
 Rasterizer = Callable[[SceneViews, RenderOptions], Images]
 
-RASTERIZERS: dict[str, Rasterizer] = {"torch": rasterize_pairs, "dense": rasterize_dense}
+RASTERIZERS: dict[str, Rasterizer] = {"torch": rasterize_pairs, "dense": rasterize_dense, "cpu": rasterize_cpu}
 
 
 def render(
@@ -48,13 +49,13 @@ def render(
     Args:
         gaussians: G Gaussians, packed over the B scenes and sorted by scene.
         cameras: the views ``[B, V]``; skew and distortion are not modelled.
-        mode: ``solid`` treats Gaussians as continuous stochastic solids (paper, Sec. Continuous Stochastic Solids Volume
-            Rendering): exact ray maximum, median depth of the continuous transmittance. ``rasterized`` is classic 3DGS:
-            affine splats, Jacobian clamped off-screen, piecewise constant transmittance.
+        mode: ``solid`` treats Gaussians as continuous stochastic solids (paper, Sec. Continuous Stochastic Solids
+            Volume Rendering): exact ray maximum, median depth of the continuous transmittance. ``rasterized`` is
+            classic 3DGS: affine splats, Jacobian clamped off-screen, piecewise constant transmittance.
         background: one colour ``[3]``; None is black.
         near: Gaussians whose mean is nearer are dropped; solid depth is never in front of it. Scene units.
-        implementation: ``torch`` sparse pairs on any device; ``dense`` the slow
-            reference; ``auto`` chooses ``torch``.
+        implementation: ``cpu`` compiled tile renderer; ``torch`` sparse pairs on any device; ``dense`` the slow
+            reference; ``auto`` chooses ``cpu`` on CPU and ``torch`` elsewhere.
         depth: ``median``: where transmittance falls to one half; rasterized, that is the z of the Gaussian at which it
             happens, with gradient to that Gaussian's mean only. ``expected`` (rasterized only): blended z over alpha.
         lowpass: variance in px^2 added to every screen footprint.
@@ -76,7 +77,7 @@ def render(
     options = RenderOptions(mode, depth, near, lowpass, alpha_max, slope_floor, bisections, newton_steps, geometry)
     _check_options(options, implementation)
     check_cameras(cameras)
-    scenes, views = cameras.world_to_camera.shape[:2]
+    scenes = len(cameras.world_to_camera)
     check_gaussians(gaussians, scenes)
     device = gaussians.means.device
     if cameras.world_to_camera.device != device:
@@ -104,7 +105,7 @@ class Renderer:
     Args:
         mode: ``solid`` or ``rasterized``.
         near: near plane in scene units.
-        implementation: ``auto``, ``torch`` or ``dense``.
+        implementation: ``auto``, ``cpu``, ``torch`` or ``dense``.
         depth: ``median``, or ``expected`` with ``rasterized``.
         lowpass: variance in px^2 added to every screen footprint.
         alpha_max: cap of the opacity at a pixel.
@@ -186,7 +187,9 @@ def _scene_views(gaussians: Gaussians, cameras: Cameras, scene: int, background:
 
 def _resolve(implementation: Implementation, device: torch.device) -> str:
     if implementation == "auto":
-        return "torch"
+        return "cpu" if device.type == "cpu" else "torch"
+    if implementation == "cpu" and device.type != "cpu":
+        raise ValueError(f"implementation 'cpu' needs tensors on the CPU, these are on {device}; use 'auto' or 'torch'")
     return implementation
 
 

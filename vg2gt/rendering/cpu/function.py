@@ -1,0 +1,260 @@
+"""Drives the compiled kernels over views and blocks of work, and joins them to autograd.
+
+Deterministic to the bit for any number of threads: tiles write pixels and gradient rows of their own, blocks of Gaussians
+sum their rows in list order, blocks' camera gradients are summed in block order.
+"""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from vg2gt.rendering.cpu import raster
+from vg2gt.rendering.cpu.binning import count_tiles, fill_tiles, radix_order
+from vg2gt.rendering.cpu.projection import BLOCK, project_backward_block, project_block
+from vg2gt.rendering.cpu.threads import parallel_for
+from vg2gt.rendering.options import MEDIAN_MAX_TRANSMITTANCE, TRANSMITTANCE_STOP, Images, RenderOptions, SceneViews
+
+TILES_PER_ITEM = 8
+HIT_CAPACITY = 48  # hits a pixel keeps for the depth solver before its tile is given more room
+NEGLIGIBLE = {np.dtype(np.float32): 42.0, np.dtype(np.float64): 90.0}  # squared sigmas at which a profile vanishes
+
+_local = threading.local()
+
+
+def rasterize_cpu(scene: SceneViews, options: RenderOptions) -> Images:
+    """Renders every view; differentiable in every tensor of the scene."""
+    color, normal, depth, alpha = _Rasterize.apply(*scene.tensors, scene.size, options)
+    return Images(color, normal, depth, alpha)
+
+
+@dataclass(frozen=True)
+class _Lists:
+    """One view's projected Gaussians and tile lists (numpy; names as in the kernels)."""
+
+    records: np.ndarray
+    boxes: np.ndarray
+    counts: np.ndarray
+    offsets: np.ndarray
+    starts: np.ndarray
+    members: np.ndarray
+    slots: np.ndarray
+
+
+@dataclass(frozen=True)
+class _View:
+    """Inputs of one view (numpy)."""
+
+    means: np.ndarray
+    quats: np.ndarray
+    scales: np.ndarray
+    opacities: np.ndarray
+    colors: np.ndarray
+    pose: np.ndarray
+    intrinsics: np.ndarray
+    background: np.ndarray
+    size: tuple[int, int]
+
+    @property
+    def across(self) -> int:
+        return -(-self.size[1] // raster.TILE)
+
+    @property
+    def tiles(self) -> int:
+        return self.across * -(-self.size[0] // raster.TILE)
+
+    @property
+    def blocks(self) -> int:
+        return -(-len(self.means) // BLOCK)
+
+
+class _Rasterize(torch.autograd.Function):
+    """Forward and backward of all views of a scene."""
+
+    @staticmethod
+    def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        tensors, (size, options) = inputs[:8], inputs[8:]
+        arrays = [_array(tensor) for tensor in tensors]
+        count, (height, width), dtype = len(arrays[5]), size, arrays[0].dtype
+        color = np.empty((count, height, width, 3), dtype)
+        normal, depth = np.zeros_like(color), np.zeros((count, height, width), dtype)
+        slope, transmittance = np.zeros_like(depth), np.empty_like(depth)
+        lists: list[_Lists] = []
+        for index in range(count):
+            view = _select(arrays, index, size)
+            lists.append(_prepare(view, options))
+            _forward(
+                view, lists[-1], options, color[index], normal[index], depth[index], slope[index], transmittance[index]
+            )
+        images = [torch.from_numpy(array) for array in (color, normal, depth, 1 - transmittance)]
+        ctx.save_for_backward(*tensors, *images, torch.from_numpy(slope), torch.from_numpy(transmittance))
+        ctx.lists, ctx.size, ctx.options = lists, size, options
+        ctx.set_materialize_grads(False)
+        return images[0], images[1], images[2], images[3]
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Tensor | None) -> tuple[Tensor | None, ...]:
+        saved = [_array(tensor) for tensor in ctx.saved_tensors]
+        arrays, (color, normal, depth, _alpha, slope, transmittance) = saved[:8], saved[8:]
+        options: RenderOptions = ctx.options
+        grad_color, grad_normal, grad_depth, grad_alpha = (
+            None if grad is None else _array(grad) for grad in grad_outputs
+        )
+        geometry = options.geometry and (grad_normal is not None or grad_depth is not None)
+        grad_color = np.zeros_like(color) if grad_color is None else grad_color
+        grad_alpha = np.zeros_like(depth) if grad_alpha is None else grad_alpha
+        grad_normal = np.zeros_like(color) if grad_normal is None else grad_normal
+        grad_depth = np.zeros_like(depth) if grad_depth is None else grad_depth
+        grads = [np.zeros_like(array) for array in arrays]
+        for index, lists in enumerate(ctx.lists):
+            view = _select(arrays, index, ctx.size)
+            solid, expected, crossing, of_alpha = _depth_factors(
+                grad_depth[index], grad_alpha[index], depth[index], slope[index], transmittance[index], options
+            )
+            rows = np.empty((len(lists.members), raster.ROW), view.means.dtype)
+            images = (color[index], normal[index], depth[index], transmittance[index])
+            incoming = (grad_color[index], grad_normal[index], of_alpha, solid, expected, crossing)
+            _backward(view, lists, options, geometry, images, incoming, rows, grads, index)
+        grads[7] = np.einsum("vhwc,vhw->c", grad_color, transmittance)
+        result = [
+            torch.from_numpy(grad) if needed else None
+            for grad, needed in zip(grads, ctx.needs_input_grad[:8], strict=True)
+        ]
+        return (*result, None, None)
+
+
+def _array(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().contiguous().numpy()
+
+
+def _select(arrays: list[np.ndarray], index: int, size: tuple[int, int]) -> _View:
+    colors = arrays[4]
+    return _View(*arrays[:4], colors[index % len(colors)], arrays[5][index], arrays[6][index], arrays[7], size)
+
+
+def _prepare(view: _View, options: RenderOptions) -> _Lists:
+    """Projects one view's Gaussians, orders them by depth and lists them by tile."""
+    total, dtype = len(view.means), view.means.dtype
+    records = np.empty((total, raster.RECORD), dtype)
+    boxes = np.empty((total, 4), np.int32)
+    height, width = view.size
+    solid = options.mode == "solid"
+
+    def project(block: int) -> None:
+        project_block(
+            block, view.means, view.quats, view.scales, view.opacities, view.pose, view.intrinsics, height, width,
+            options.lowpass, options.near, solid, records, boxes,
+        )  # fmt: skip
+
+    parallel_for(view.blocks, project)
+    visible = np.flatnonzero(boxes[:, 1] > boxes[:, 0]).astype(np.int32)
+    keys = np.ascontiguousarray(records[visible, 7]).view(f"u{dtype.itemsize}")
+    visible = visible[radix_order(keys, 8 * dtype.itemsize)]
+    counts, offsets = np.empty(total, np.int32), np.empty(total, np.int64)
+    starts = np.empty(view.tiles + 1, np.int64)
+    count_tiles(boxes, visible, raster.TILE, view.across, counts, offsets, starts)
+    members, slots = np.empty(starts[-1], np.int32), np.empty(starts[-1], np.int64)
+    fill_tiles(boxes, visible, raster.TILE, view.across, offsets, starts, members, slots)
+    return _Lists(records, boxes, counts, offsets, starts, members, slots)
+
+
+def _parameters(options: RenderOptions, dtype: np.dtype) -> np.ndarray:
+    values = (
+        options.alpha_max, TRANSMITTANCE_STOP, MEDIAN_MAX_TRANSMITTANCE, options.near, NEGLIGIBLE[dtype],
+    )  # fmt: skip
+    return np.array(values, dtype)
+
+
+def _scratch(dtype: np.dtype) -> tuple[np.ndarray, np.ndarray]:
+    """This thread's plane and hit buffers; the hits must start finite."""
+    buffers = _local.__dict__.setdefault("buffers", {})
+    if dtype not in buffers:
+        hits = np.zeros((raster.TILE, HIT_CAPACITY, raster.HIT, raster.TILE), dtype)
+        buffers[dtype] = (np.zeros(raster.SCRATCH, dtype), hits)
+    return buffers[dtype]
+
+
+def _tile_items(tiles: int) -> list[tuple[int, int]]:
+    return [(start, min(start + TILES_PER_ITEM, tiles)) for start in range(0, tiles, TILES_PER_ITEM)]
+
+
+def _forward(view: _View, lists: _Lists, options: RenderOptions, *outputs: np.ndarray) -> None:
+    parameters = _parameters(options, view.means.dtype)
+    items = _tile_items(view.tiles)
+    solid, expected = options.mode == "solid", options.depth == "expected"
+
+    def run(item: int) -> None:
+        state, hits = _scratch(view.means.dtype)
+        raster.forward_tiles(
+            lists.records, lists.boxes, view.colors, lists.members, lists.starts, items[item], solid, expected,
+            options.geometry, options.bisections, options.newton_steps, parameters, view.background, state, hits,
+            *outputs,
+        )  # fmt: skip
+
+    parallel_for(len(items), run)
+
+
+def _depth_factors(
+    grad_depth: np.ndarray,
+    grad_alpha: np.ndarray,
+    depth: np.ndarray,
+    slope: np.ndarray,
+    transmittance: np.ndarray,
+    options: RenderOptions,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Splits the depth's gradient into what the kernel takes: solid / S, expected / alpha, crossing; and alpha's own."""
+    zero = np.zeros_like(depth)
+    valid = depth > 0
+    if options.mode == "solid":
+        safe = np.where(valid, depth, 1)
+        bound = np.maximum(slope, options.slope_floor / safe).clip(min=np.finfo(depth.dtype).tiny)
+        return np.where(valid, grad_depth / bound, 0).astype(depth.dtype), zero, zero, grad_alpha
+    if options.depth == "expected":
+        factor = np.where(valid, grad_depth / np.where(valid, 1 - transmittance, 1), 0).astype(depth.dtype)
+        return zero, factor, zero, grad_alpha - factor * depth
+    return zero, zero, np.where(valid, grad_depth, 0).astype(depth.dtype), grad_alpha
+
+
+def _backward(
+    view: _View,
+    lists: _Lists,
+    options: RenderOptions,
+    geometry: bool,
+    images: tuple[np.ndarray, ...],
+    incoming: tuple[np.ndarray, ...],
+    rows: np.ndarray,
+    grads: list[np.ndarray],
+    index: int,
+) -> None:
+    """Adds one view's gradients to ``grads`` (order of SceneViews.tensors)."""
+    parameters = _parameters(options, view.means.dtype)
+    items = _tile_items(view.tiles)
+    height, width = view.size
+    solid = options.mode == "solid"
+
+    def raster_item(item: int) -> None:
+        state, _ = _scratch(view.means.dtype)
+        raster.backward_tiles(
+            lists.records, lists.boxes, view.colors, lists.members, lists.slots, lists.starts, items[item], geometry,
+            parameters, state, *images, *incoming, rows,
+        )  # fmt: skip
+
+    parallel_for(len(items), raster_item)
+    cameras = np.empty((view.blocks, 16), np.float64)
+
+    def project_item(block: int) -> None:
+        project_backward_block(
+            block, view.means, view.quats, view.scales, view.opacities, view.pose, view.intrinsics, height, width,
+            options.lowpass, solid, lists.boxes, lists.counts, lists.offsets, rows, index % len(grads[4]),
+            *grads[:5], cameras,
+        )  # fmt: skip
+
+    parallel_for(view.blocks, project_item)
+    camera = cameras.sum(0)
+    grads[5][index, :3] = camera[:12].reshape(3, 4)
+    grads[6][index, [0, 1, 0, 1], [0, 1, 2, 2]] = camera[12:]
