@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -9,6 +11,7 @@ from vg2gt.geometry.alignment import MIN_DEPTH, weighted_median
 
 ALIGNMENTS = ("median", "scene", "wmed", "scale_shift", "none")
 DELTAS = (1.25, 1.05, 1.03)
+NAMES = ("abs_rel", "mae", "rmse", *(f"delta_{d}" for d in DELTAS), "coverage", *(f"delta_{d}_holes" for d in DELTAS))
 SMALLEST = 1e-6
 
 
@@ -49,27 +52,16 @@ def depth_metrics(
     predicted, reference = predicted.double(), reference.double()
     usable = (reference > 0) & reference.isfinite() & (reference >= min_depth) & (reference <= max_depth)
     valid = usable & (predicted > 0) & predicted.isfinite()
-    shared = (reference[valid] / predicted[valid]).median() if alignment == "scene" and valid.any() else None
-    images = []
-    for p, r, counts, present in zip(predicted, reference, usable, valid, strict=True):
-        if not counts.any():
-            continue
-        coverage = present.sum() / counts.sum()
-        if shared is not None:
-            aligned = p[present] * shared
-        else:
-            aligned = align_depth(p[present], r[present], "none" if alignment == "scene" else alignment)
-        images.append({**_errors(aligned, r[present], coverage), "coverage": coverage})
-    names = [
-        "abs_rel",
-        "mae",
-        "rmse",
-        *(f"delta_{d}" for d in DELTAS),
-        "coverage",
-        *(f"delta_{d}_holes" for d in DELTAS),
+    if alignment == "scene":
+        alignment = "none"
+        if valid.any():
+            predicted = predicted * (reference[valid] / predicted[valid]).median()
+    images = [
+        _score(align_depth(p[v], r[v], alignment), r[v], v.sum().double() / u.sum())
+        for p, r, u, v in zip(predicted, reference, usable, valid, strict=True)
+        if u.any()
     ]
-    nothing = torch.tensor([torch.nan])
-    return {name: float(torch.stack([i[name] for i in images] or [nothing[0]]).nanmean()) for name in names}
+    return {name: float(torch.stack([i[name] for i in images]).nanmean()) if images else math.nan for name in NAMES}
 
 
 def align_depth(predicted: Tensor, reference: Tensor, alignment: str) -> Tensor:
@@ -86,13 +78,14 @@ def align_depth(predicted: Tensor, reference: Tensor, alignment: str) -> Tensor:
     return (reference.mean() + scale * centered).clamp(min=SMALLEST)
 
 
-def _errors(predicted: Tensor, reference: Tensor, coverage: Tensor) -> dict[str, Tensor]:
+def _score(predicted: Tensor, reference: Tensor, coverage: Tensor) -> dict[str, Tensor]:
     error = (predicted - reference).abs()
     ratio = torch.maximum(predicted / reference, reference / predicted)
     results = {
         "abs_rel": (error / reference).mean(),
         "mae": error.mean(),
         "rmse": error.square().mean().sqrt(),
+        "coverage": coverage,
     }
     for delta in DELTAS:
         share = (ratio < delta).double().mean()

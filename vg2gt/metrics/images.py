@@ -32,6 +32,7 @@ def ssim(predicted: Tensor, reference: Tensor) -> Tensor:
     Returns:
         ``[...]``.
     """
-    first, second = (image.float().clamp(0, 1).flatten(0, -4) for image in (predicted, reference))
+    size = predicted.shape[-3:]
+    first, second = (image.float().clamp(0, 1).reshape(-1, *size) for image in (predicted, reference))
     values = kornia.metrics.ssim(first, second, SSIM_WINDOW, padding="valid")
     return values.mean((-3, -2, -1)).reshape(predicted.shape[:-3])

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
 ACCURACIES = (10, 30)
+NAMES = ("mean", "median", *(f"acc_{a}" for a in ACCURACIES), "cosine")
 
 
 def normal_metrics(predicted: Tensor, reference: Tensor, valid: Tensor) -> dict[str, float]:
@@ -36,9 +39,7 @@ def normal_metrics(predicted: Tensor, reference: Tensor, valid: Tensor) -> dict[
     # atan2 keeps its precision at small angles, where acos has none.
     angle = torch.atan2(torch.linalg.cross(predicted, reference, dim=1).norm(dim=1), dot).rad2deg()
     images = [_image(a[v], c[v]) for a, c, v in zip(angle, cosine, valid, strict=True) if v.any()]
-    names = ["mean", "median", *(f"acc_{a}" for a in ACCURACIES), "cosine"]
-    nothing = angle.new_tensor(torch.nan)
-    return {name: float(torch.stack([image[name] for image in images] or [nothing]).mean()) for name in names}
+    return {name: float(torch.stack([i[name] for i in images]).mean()) if images else math.nan for name in NAMES}
 
 
 def _image(angle: Tensor, cosine: Tensor) -> dict[str, Tensor]:

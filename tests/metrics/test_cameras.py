@@ -1,0 +1,90 @@
+import math
+from itertools import combinations
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from vg2gt.geometry.alignment import Similarity
+from vg2gt.geometry.rotations import quat_to_matrix
+from vg2gt.metrics import camera_metrics, relative_pose_errors
+from vg2gt.metrics.cameras import area_under_curve
+from vg2gt.types import Cameras
+
+
+def random_cameras(scenes: int = 2, views: int = 4, seed: int = 0) -> Cameras:
+    generator = torch.Generator().manual_seed(seed)
+    poses = torch.eye(4, dtype=torch.float64).repeat(scenes, views, 1, 1)
+    poses[..., :3, :3] = quat_to_matrix(torch.randn(scenes, views, 4, generator=generator, dtype=torch.float64))
+    poses[..., :3, 3] = torch.randn(scenes, views, 3, generator=generator, dtype=torch.float64)
+    return Cameras(poses, torch.eye(3, dtype=torch.float64).repeat(scenes, views, 1, 1), (4, 4))
+
+
+def test_errors_of_all_pairs_match_brute_force() -> None:
+    predicted, reference = random_cameras(), random_cameras(seed=1)
+    rotation, translation = relative_pose_errors(predicted, reference)
+    for scene in range(2):
+        for pair, (i, j) in enumerate(combinations(range(4), 2)):
+            relative = []
+            for cameras in (predicted, reference):
+                poses = cameras.world_to_camera[scene].numpy()
+                relative.append(poses[j] @ np.linalg.inv(poses[i]))
+            turn = Rotation.from_matrix(relative[0][:3, :3].T @ relative[1][:3, :3]).magnitude()
+            a, b = relative[0][:3, 3], relative[1][:3, 3]
+            angle = math.acos(abs(a @ b) / np.linalg.norm(a) / np.linalg.norm(b))
+            assert float(rotation[scene, pair]) == pytest.approx(math.degrees(turn), rel=1e-9)
+            assert float(translation[scene, pair]) == pytest.approx(math.degrees(angle), rel=1e-9)
+
+
+def test_frame_and_unit_do_not_matter() -> None:
+    reference = random_cameras()
+    rotation = quat_to_matrix(torch.tensor([[0.3, 1, -2, 0.5], [1, 0, 2, 1]], dtype=torch.float64))
+    similarity = Similarity(
+        torch.tensor([3.0, 0.2], dtype=torch.float64), rotation, torch.ones(2, 3, dtype=torch.float64)
+    )
+    errors = relative_pose_errors(similarity.apply_cameras(reference), reference)
+    assert all(float(error.max()) < 1e-5 for error in errors)
+    assert set(camera_metrics(reference, reference).values()) == {1.0}
+
+
+def test_known_turn_and_known_direction() -> None:
+    poses = torch.eye(4, dtype=torch.float64).repeat(1, 2, 1, 1)
+    poses[0, 1, :3, 3] = torch.tensor([1.0, 0, 0])
+    reference = Cameras(poses, torch.eye(3, dtype=torch.float64).repeat(1, 2, 1, 1), (4, 4))
+    other = poses.clone()
+    other[0, 1, :3, :3] = torch.from_numpy(Rotation.from_euler("y", 4.5, degrees=True).as_matrix())
+    direction = math.radians(10.5)
+    other[0, 1, :3, 3] = -5 * torch.tensor([math.cos(direction), math.sin(direction), 0])  # opposite: counts as equal
+    predicted = Cameras(other, reference.intrinsics, (4, 4))
+    rotation, translation = relative_pose_errors(predicted, reference)
+    assert float(rotation) == pytest.approx(4.5)
+    assert float(translation) == pytest.approx(10.5)
+    found = camera_metrics(predicted, reference)
+    assert (found["rra_5"], found["rta_5"], found["rta_15"]) == (1, 0, 1)
+    assert (found["auc_3"], found["auc_5"]) == (0, 0)
+    assert found["auc_15"] == pytest.approx(5 / 15)  # below 11, 12, 13, 14 and 15 degrees
+    assert found["auc_30"] == pytest.approx(20 / 30)
+
+
+def test_cameras_that_stand_still() -> None:
+    still = random_cameras()
+    poses = still.world_to_camera.clone()
+    poses[..., :3, 3] = 0
+    still = Cameras(poses, still.intrinsics, (4, 4))
+    moving = Cameras(random_cameras().world_to_camera, still.intrinsics, (4, 4))
+    assert (relative_pose_errors(moving, still)[1] == 0).all()
+    assert (relative_pose_errors(still, moving)[1] == 90).all()
+
+
+def test_area_under_curve_matches_the_histogram() -> None:
+    errors = 40 * torch.rand(500, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    for threshold in (3, 5, 15, 30):
+        counts, _ = np.histogram(errors.numpy(), bins=np.arange(threshold + 1))
+        expected = np.mean(np.cumsum(counts / len(errors)))
+        assert area_under_curve(errors, threshold) == pytest.approx(expected)
+
+
+def test_a_single_view_is_refused() -> None:
+    with pytest.raises(ValueError, match="at least 2 views"):
+        camera_metrics(random_cameras(views=1), random_cameras(views=1))

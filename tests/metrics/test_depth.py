@@ -1,0 +1,128 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from vg2gt.metrics import depth_metrics
+
+
+def maps(seed: int = 0, noise: float = 0.08) -> tuple[Tensor, Tensor]:
+    """Three images of 31 x 41 pixels with invalid references and holes."""
+    rng = np.random.default_rng(seed)
+    reference = rng.uniform(1, 6, (3, 31, 41))
+    predicted = reference * 0.4 * np.exp(noise * rng.standard_normal(reference.shape))
+    reference[rng.random(reference.shape) < 0.2] = 0
+    predicted[rng.random(reference.shape) < 0.1] = 0
+    return torch.from_numpy(predicted), torch.from_numpy(reference)
+
+
+def numpy_metrics(predicted: np.ndarray, reference: np.ndarray, scale) -> dict[str, float]:
+    """One image at a time; ``scale`` gets the pixels that count."""
+    rows = []
+    for p, r in zip(predicted, reference, strict=True):
+        usable, valid = r > 0, (r > 0) & (p > 0)
+        d, g = scale(p[valid], r[valid]), r[valid]
+        ratio = np.maximum(d / g, g / d)
+        row = {
+            "abs_rel": np.mean(np.abs(d - g) / g),
+            "mae": np.mean(np.abs(d - g)),
+            "rmse": np.sqrt(np.mean((d - g) ** 2)),
+            "coverage": valid.sum() / usable.sum(),
+        }
+        for n in (1.25, 1.05, 1.03):
+            row[f"delta_{n}"] = np.mean(ratio < n)
+            row[f"delta_{n}_holes"] = np.sum(ratio < n) / usable.sum()
+        rows.append(row)
+    return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
+
+
+def lower_median(x: np.ndarray) -> float:
+    return float(np.sort(x)[(len(x) - 1) // 2])
+
+
+def by_median(p: np.ndarray, r: np.ndarray) -> np.ndarray:
+    return p * lower_median(r / p)
+
+
+def by_weighted_median(p: np.ndarray, r: np.ndarray) -> np.ndarray:
+    scales = r / p
+    costs = [np.sum(np.abs(s * p - r) / r) for s in scales]
+    return p * scales[int(np.argmin(costs))]
+
+
+def by_scale_and_shift(p: np.ndarray, r: np.ndarray) -> np.ndarray:
+    a, b = np.polyfit(p, r, 1)
+    return a * p + b
+
+
+@pytest.mark.parametrize(
+    ("alignment", "scale"),
+    [
+        ("median", by_median),
+        ("wmed", by_weighted_median),
+        ("scale_shift", by_scale_and_shift),
+        ("none", lambda p, r: p),
+    ],
+)
+def test_matches_numpy(alignment: str, scale) -> None:
+    predicted, reference = maps()
+    found = depth_metrics(predicted, reference, alignment)
+    expected = numpy_metrics(predicted.numpy(), reference.numpy(), scale)
+    assert found.keys() == expected.keys()
+    for name, value in expected.items():
+        assert found[name] == pytest.approx(value, rel=1e-9), name
+
+
+def test_one_scale_a_scene() -> None:
+    predicted, reference = maps()
+    predicted[1] *= 1.2
+    valid = (predicted > 0) & (reference > 0)
+    shared = lower_median((reference[valid] / predicted[valid]).numpy())
+    found = depth_metrics(predicted, reference, "scene")
+    expected = numpy_metrics(predicted.numpy(), reference.numpy(), lambda p, r: p * shared)
+    assert found == pytest.approx(expected, rel=1e-9)
+    assert found["abs_rel"] > depth_metrics(predicted, reference, "median")["abs_rel"]
+
+
+def test_default_is_the_median_of_each_image() -> None:
+    predicted, reference = maps()
+    assert depth_metrics(predicted, reference) == depth_metrics(predicted, reference, "median")
+
+
+def test_images_count_alike_whatever_their_valid_pixels() -> None:
+    reference = torch.full((2, 10, 10), 2.0)
+    predicted = reference.clone()
+    predicted[0] = 2.2
+    reference[1, 1:] = 0  # ten pixels against a hundred
+    assert depth_metrics(predicted, reference, "none")["abs_rel"] == pytest.approx(0.05)
+
+
+def test_holes_lower_coverage_and_fail_the_delta_test_with_holes_only() -> None:
+    reference = torch.full((2, 4, 5), 3.0)
+    predicted = reference.clone()
+    predicted[0, :2] = 0
+    predicted[1] = 0  # nothing rendered
+    found = depth_metrics(predicted, reference)
+    assert found["coverage"] == pytest.approx(0.25)
+    assert found["delta_1.05"] == 1
+    assert found["delta_1.05_holes"] == pytest.approx(0.25)
+    assert found["abs_rel"] == 0
+
+
+def test_range_and_unusable_images() -> None:
+    reference = torch.tensor([[[1.0, 2.0, 3.0, 50.0]], [[0.0, 0.0, 0.0, 60.0]]])
+    predicted = torch.tensor([[[1.1, 2.2, 9.0, 9.0]], [[1.0, 1.0, 1.0, 1.0]]])
+    found = depth_metrics(predicted, reference, "none", min_depth=0.5, max_depth=2.5)
+    assert found["abs_rel"] == pytest.approx(0.1)
+    assert found["coverage"] == 1
+    nothing = depth_metrics(predicted, torch.zeros_like(reference))
+    assert all(math.isnan(value) for value in nothing.values())
+
+
+def test_wrong_inputs_are_named() -> None:
+    with pytest.raises(ValueError, match=r"\[V, H, W\].*\(2, 3\)"):
+        depth_metrics(torch.ones(2, 3), torch.ones(2, 3))
+    with pytest.raises(ValueError, match=r"alignment.*'affine'"):
+        depth_metrics(torch.ones(1, 2, 3), torch.ones(1, 2, 3), "affine")

@@ -1,0 +1,45 @@
+import math
+
+import pytest
+import torch
+
+from vg2gt.metrics import cv
+
+
+def cloud(count: int = 200) -> torch.Tensor:
+    return torch.randn(count, 3, generator=torch.Generator().manual_seed(0))
+
+
+@pytest.mark.parametrize("k", [1, 8])
+def test_matches_brute_force(k: int) -> None:
+    points = cloud().double()
+    distances = torch.cdist(points, points).sort(-1).values[:, 1 : k + 1].mean(-1)
+    assert cv(points, k) == pytest.approx(float(distances.std(correction=0) / distances.mean()), rel=1e-6)
+
+
+def test_does_not_depend_on_unit_or_order() -> None:
+    points = cloud()
+    assert cv(points) == pytest.approx(cv(7 * points.flip(0) + 3), rel=1e-4)
+
+
+def test_a_ring_is_uniform() -> None:
+    angle = torch.arange(100) * 2 * math.pi / 100
+    ring = torch.stack((angle.cos(), angle.sin(), 0 * angle), -1)
+    assert cv(ring) < 1e-5
+    assert cv(torch.cat((ring, 0.5 * cloud(20)))) > 0.1
+
+
+def test_a_draw_of_queries_is_seeded_and_searches_the_whole_cloud() -> None:
+    points = cloud(4000)
+    full, drawn = cv(points), cv(points, max_queries=1500, seed=3)
+    assert drawn == cv(points, max_queries=1500, seed=3)
+    assert drawn != cv(points, max_queries=1500, seed=4)
+    # Thinning the cloud itself would lengthen all distances and change the figure's meaning.
+    assert drawn == pytest.approx(full, rel=0.1)
+    assert cv(points, max_queries=4000) == full
+
+
+def test_too_few_or_coinciding_points_have_no_figure() -> None:
+    assert math.isnan(cv(cloud(8)))
+    assert not math.isnan(cv(cloud(9)))
+    assert math.isnan(cv(torch.ones(30, 3)))
