@@ -3,6 +3,7 @@
 from vg2gt.losses.enhancement import EnhancementLoss
 from vg2gt.losses.gaussian import GaussianLoss
 from vg2gt.losses.geometry import GeometryLoss
-from vg2gt.losses.objective import LossReport, ScaleAlignment, VG2GTLoss
+from vg2gt.losses.objective import LossReport, VG2GTLoss
+from vg2gt.losses.scale import ScaleAlignment
 
 __all__ = ["EnhancementLoss", "GaussianLoss", "GeometryLoss", "LossReport", "ScaleAlignment", "VG2GTLoss"]

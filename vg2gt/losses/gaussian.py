@@ -17,7 +17,7 @@ SSIM_WINDOW = 11  # kornia's Gaussian window has a standard deviation of 1.5 pix
 
 @dataclass(frozen=True)
 class RenderTargets(TensorRecord):
-    """What R rendered views of one scene are compared with.
+    """What R rendered views of one scene are compared with; with an axis B in front, of B scenes.
 
     Attributes:
         images: ``[R, 3, H, W]`` in [0, 1].
@@ -27,7 +27,7 @@ class RenderTargets(TensorRecord):
         decoded: ``[R, H, W]`` decoded depth in the losses' unit.
         decoded_conf: ``[R, H, W]`` its confidence.
         decoded_valid: ``[R, H, W]`` bool, False for views without decoded depth (held-out ones).
-        comparable: whether decoded and rendered depth are in a known unit.
+        comparable: ``[1, 1, 1]`` bool, whether decoded and rendered depth are in a known unit.
     """
 
     images: Tensor
@@ -38,6 +38,10 @@ class RenderTargets(TensorRecord):
     decoded_conf: Tensor
     decoded_valid: Tensor
     comparable: Tensor
+
+    def scene(self, index: int) -> RenderTargets:
+        """Returns one scene of B."""
+        return self.map(lambda tensor: tensor[index])
 
 
 @dataclass(frozen=True)
