@@ -125,7 +125,7 @@ def _read(folder: Path, scene: str, given: tuple[float, ...] | None) -> Recordin
     _check_same_frames(folder, scene, "colour", files.color, "depth", files.depth)
     numbers = sorted(files.color)
     poses = _read_poses(files.poses, numbers, folder, scene)
-    finite: NDArray[np.bool_] = np.isfinite(poses).all(axis=2).all(axis=1)
+    finite = np.array([np.isfinite(pose).all() for pose in poses])
     if not finite.any():
         raise DataError(f"no frame of scene {scene} in {folder} has a finite pose")
     if not finite.all():

@@ -1,0 +1,178 @@
+"""Batches for training and evaluation, and the same batches after a resume."""
+
+from functools import partial
+
+import lightning
+import pytest
+import torch
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+
+from vg2gt.data import DataError, SceneDataModule, SyntheticRooms
+from vg2gt.data.evaluation_views import EvaluationViews
+from vg2gt.data.frame_cache import FrameCache
+from vg2gt.paths import config_dir
+
+from .conftest import SIZE
+
+
+def _module(rooms: SyntheticRooms, **options) -> SceneDataModule:
+    val = SyntheticRooms(2, first_seed=100, num_frames=6, size=SIZE, cache_dir=str(rooms.cache_dir))
+    defaults = {
+        "image_size": SIZE, "min_views": 2, "max_views": 3, "max_images": 4, "eval_context": [0, 2, 4],
+        "eval_target": [1, 3], "steps_per_epoch": 4,
+    }  # fmt: skip
+    return SceneDataModule(**{"train": rooms, "val": val, **defaults, **options})
+
+
+def test_training_batches(rooms):
+    module = _module(rooms, target_views=1)
+    batches = list(module.train_dataloader())
+    assert len(batches) == 4
+    for batch in batches:
+        scenes, views = batch.frame_ids.shape
+        assert scenes == len(batch.scene) == 4 // batch.num_context
+        assert views == batch.num_context + 1
+        assert batch.images.shape == (scenes, views, 3, *SIZE)
+        assert batch.depth.shape == (scenes, views, *SIZE)
+        assert batch.cameras.size == SIZE
+        assert batch.is_metric.tolist() == [True] * scenes
+        direct = rooms.load(batch.scene[0], batch.frame_ids[0].tolist())
+        torch.testing.assert_close(batch.images[0], direct.images, atol=1e-6, rtol=0)
+        assert torch.equal(batch.depth[0], direct.depth)
+        assert torch.equal(batch.cameras.world_to_camera[0], direct.world_to_camera)
+        assert torch.equal(batch.cameras.intrinsics[0], direct.intrinsics)
+
+
+def test_evaluation_batches_are_context_then_targets(rooms):
+    batches = list(_module(rooms).val_dataloader())
+    assert [batch.scene for batch in batches] == [("room-000100",), ("room-000101",)]
+    assert batches[0].frame_ids.tolist() == [[0, 2, 4, 1, 3]]
+    assert batches[0].num_context == 3
+    assert batches[0].target.frame_ids.tolist() == [[1, 3]]
+
+
+def test_workers_do_not_change_batches(rooms):
+    alone, helped = (list(_module(rooms, workers=workers).train_dataloader()) for workers in (0, 2))
+    for a, b in zip(alone, helped, strict=True):
+        assert a.scene == b.scene
+        assert torch.equal(a.frame_ids, b.frame_ids)
+        assert torch.equal(a.images, b.images)
+
+
+def test_limits_on_scenes(rooms):
+    module = _module(rooms, train_scenes=1, eval_scenes=1)
+    assert {name for batch in module.train_dataloader() for name in batch.scene} == {"room-000000"}
+    assert len(module.val_dataloader()) == 1
+
+
+def test_training_and_evaluation_on_the_same_scenes_is_refused(rooms):
+    same = SyntheticRooms(2, num_frames=6, size=SIZE, first_seed=3)
+    with pytest.raises(DataError, match="room-000003 is used for training and for evaluation"):
+        _module(rooms, val=same).setup()
+
+
+def test_common_arguments_reach_both_sources(tmp_path):
+    module = SceneDataModule(
+        train=partial(SyntheticRooms, num_scenes=1),
+        val=partial(SyntheticRooms, num_scenes=1, first_seed=9),
+        image_size=SIZE, min_views=1, max_views=1, eval_context=[0], eval_target=[1], steps_per_epoch=1,
+        num_frames=2, size=SIZE, cache_dir=str(tmp_path),
+    )  # fmt: skip
+    assert next(iter(module.train_dataloader())).frame_ids.shape[1] == 1
+    assert next(iter(module.val_dataloader())).frame_ids.tolist() == [[0, 1]]
+
+
+def test_scenes_of_one_frame(tmp_path):
+    one = partial(SyntheticRooms, 1, num_frames=1, size=SIZE, cache_dir=str(tmp_path))
+    module = _module(one(), train=one(), val=one(first_seed=7), min_views=1, max_views=1, eval_context=8, eval_target=3)
+    assert next(iter(module.train_dataloader())).images.shape[1] == 1
+    batch = next(iter(module.val_dataloader()))
+    assert batch.images.shape[1] == batch.num_context == 1
+
+
+class _Recorder(lightning.LightningModule):
+    """Learns a sum that depends on every batch and its order."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.zeros(()))
+        self.seen: list[tuple[str, ...]] = []
+
+    def training_step(self, batch, batch_idx):
+        self.seen.append((*batch.scene, *map(str, batch.frame_ids.flatten().tolist())))
+        return (self.weight - batch.images.mean()) ** 2
+
+    def configure_optimizers(self):
+        return torch.optim.Adam(self.parameters(), lr=0.1)
+
+
+def _trainer(steps: int, **options) -> lightning.Trainer:
+    return lightning.Trainer(
+        max_steps=steps, max_epochs=-1, accelerator="cpu", logger=False, enable_checkpointing=False,
+        enable_progress_bar=False, enable_model_summary=False, use_distributed_sampler=False, **options,
+    )  # fmt: skip
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("stop", [2, 4, 6])
+def test_a_resumed_run_sees_the_batches_of_the_uninterrupted_one(rooms, tmp_path, stop):
+    """Stops within an epoch, at its end and within the next one (4 steps each)."""
+    whole = _Recorder()
+    _trainer(10).fit(whole, datamodule=_module(rooms, workers=0))
+    first = _Recorder()
+    trainer = _trainer(stop)
+    trainer.fit(first, datamodule=_module(rooms))
+    trainer.save_checkpoint(tmp_path / "stop.ckpt")
+    second = _Recorder()
+    _trainer(10).fit(second, datamodule=_module(rooms), ckpt_path=tmp_path / "stop.ckpt")
+    assert first.seen + second.seen == whole.seen
+    assert torch.equal(second.weight, whole.weight)
+
+
+def test_the_memory_cache_forgets_the_oldest_frame(rooms, monkeypatch):
+    loads = []
+    load = rooms.load
+    monkeypatch.setattr(rooms, "load", lambda scene, ids: loads.append(list(ids)) or load(scene, ids))
+    frame_bytes = SIZE[0] * SIZE[1] * 7 + 25 * 4
+    cache = FrameCache(rooms, SIZE, 3 * frame_bytes)
+    first = cache.load("room-000000", [0, 1, 2])
+    cache.load("room-000000", [0, 1])
+    cache.load("room-000000", [3])  # drops frame 2
+    again = cache.load("room-000000", [1, 2])
+    assert loads == [[0, 1, 2], [3], [2]]
+    assert torch.equal(again.depth, first.depth[[1, 2]])
+
+
+def test_evaluation_views_by_number_and_window(rooms):
+    source = SyntheticRooms(1, num_frames=20)
+    source.held_out = lambda scene: range(3, 20, 6)
+    (views,) = EvaluationViews(context=4, target=2).choose(source, "room-000000")
+    assert views.context == (0, 6, 13, 19)
+    assert views.target == (3, 15)
+    windows = EvaluationViews(context=3, target=9, window=10).choose(source, "room-000000")
+    assert [window.target for window in windows] == [(3, 9), (15,)]
+    assert windows[1].context[0] == 10
+    for window in windows:
+        assert not set(window.context) & set(window.target)
+
+
+def test_evaluation_positions_are_checked(rooms):
+    with pytest.raises(DataError, match=r"eval_target names positions \[6\], but scene room-000000 has 6 frames"):
+        EvaluationViews([0, 1], [2, 6]).choose(rooms, "room-000000")
+    with pytest.raises(DataError, match="both context and target"):
+        EvaluationViews([0, 1], [1]).choose(rooms, "room-000000")
+    with pytest.raises(ValueError, match="numbers of views"):
+        EvaluationViews([0, 1], [1], window=4)
+
+
+@pytest.mark.parametrize("name", ["synthetic", "rgbd"])
+def test_the_configuration_makes_a_data_module(name, write_recording, tmp_path, monkeypatch):
+    monkeypatch.setenv("VG2GT_CACHE", str(tmp_path))
+    config = OmegaConf.create({"seed": 0, "data": OmegaConf.load(f"{config_dir()}/data/{name}.yaml")})
+    if name == "rgbd":
+        config.data.update(root=str(write_recording(frames=6)), max_views=2, min_views=2, max_images=2)
+    module = instantiate(config.data)
+    assert isinstance(module, SceneDataModule)
+    module.setup()
+    assert module.sampler.max_views == config.data.max_views

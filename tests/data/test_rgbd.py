@@ -1,0 +1,278 @@
+"""RGB-D folders: round trip, layouts, splits, damage, and real recordings by geometry."""
+
+import logging
+import shutil
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from vg2gt.data import DataError, RGBDFolder, SceneDataModule
+
+from .conftest import SIZE
+from .warping import depth_differences
+
+
+def test_a_room_written_as_a_recording_is_read_back(write_recording, rooms):
+    source = RGBDFolder(str(write_recording()), holdout=None)
+    assert source.scenes == ("office",)
+    assert list(source.frames("office")) == list(range(10, 16))
+    frames, expected = source.load("office", [12, 10]), rooms.load("room-000000", [2, 0])
+    torch.testing.assert_close(frames.images, expected.images, atol=1e-6, rtol=0)
+    torch.testing.assert_close(frames.depth, expected.depth, atol=5.1e-4, rtol=0)
+    torch.testing.assert_close(frames.world_to_camera, expected.world_to_camera, atol=1e-6, rtol=0)
+    torch.testing.assert_close(frames.intrinsics, expected.intrinsics, atol=1e-4, rtol=0)
+
+
+def test_exported_scannet_layout_is_sorted_by_number_and_follows_the_depth_images(write_recording, caplog):
+    folder = write_recording()
+    reference = RGBDFolder(str(folder)).load("office", range(10, 16))
+    exported = folder.parent / "scene0000_00"
+    for sub in ("color", "depth", "pose", "intrinsic"):
+        (exported / sub).mkdir(parents=True)
+    poses = np.loadtxt(folder / "poses.txt").reshape(-1, 4, 4)
+    for i in range(6):
+        number = i + 7  # 7 .. 12: sorted by letters 10 would come before 7
+        with Image.open(folder / "images" / f"{i + 10:05d}.png") as image:
+            image.resize((2 * SIZE[1], 2 * SIZE[0]), Image.Resampling.NEAREST).save(
+                exported / "color" / f"{number}.png"
+            )
+        shutil.copy(folder / "depth" / f"{i + 10:05d}.png", exported / "depth" / f"{number}.png")
+        np.savetxt(exported / "pose" / f"{number}.txt", poses[i])
+    np.savetxt(exported / "pose" / "9.txt", np.full((4, 4), -np.inf))
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.loadtxt(folder / "K.txt")
+    np.savetxt(exported / "intrinsic" / "intrinsic_depth.txt", matrix)
+    np.savetxt(exported / "intrinsic" / "intrinsic_color.txt", 2 * matrix)
+    with caplog.at_level(logging.INFO):
+        source = RGBDFolder(str(exported))
+    assert "1 of 6 frames have no finite pose" in caplog.text
+    assert "exported ScanNet layout, 5 frames" in caplog.text
+    assert list(source.frames("scene0000_00")) == [7, 8, 10, 11, 12]
+    frames = source.load("scene0000_00", [7, 8, 10])
+    errors = (frames.images[:, None] - reference.images[None]).abs().mean((2, 3, 4))
+    assert errors.argmin(1).tolist() == [0, 1, 3]
+    assert errors.amin(1).max() < 0.03  # doubled and reduced again
+    assert torch.equal(frames.depth, reference.depth[[0, 1, 3]])
+    torch.testing.assert_close(frames.world_to_camera, reference.world_to_camera[[0, 1, 3]], atol=1e-5, rtol=0)
+    torch.testing.assert_close(frames.intrinsics, reference.intrinsics[:3])
+
+
+def test_seven_scenes_layout(write_recording, caplog):
+    folder = write_recording()
+    sequence = folder.parent / "chess" / "seq-01"
+    sequence.mkdir(parents=True)
+    poses = np.loadtxt(folder / "poses.txt").reshape(-1, 4, 4)
+    for i in range(6):
+        shutil.copy(folder / "images" / f"{i + 10:05d}.png", sequence / f"frame-{i:06d}.color.png")
+        shutil.copy(folder / "depth" / f"{i + 10:05d}.png", sequence / f"frame-{i:06d}.depth.png")
+        np.savetxt(sequence / f"frame-{i:06d}.pose.txt", poses[i])
+    with pytest.raises(DataError, match=r"no intrinsics.*data.intrinsics=\[fx,fy,cx,cy\]"):
+        RGBDFolder(str(folder.parent / "chess"))
+    given = RGBDFolder(str(folder.parent / "chess"), intrinsics=(30, 31, 15.5, 11.5))
+    assert given.scenes == ("seq-01",)
+    assert given.load("seq-01", [0]).intrinsics[0].tolist() == [[30, 0, 15.5], [0, 31, 11.5], [0, 0, 1]]
+    shutil.copy(folder / "K.txt", folder.parent / "chess" / "camera-intrinsics.txt")
+    frames = RGBDFolder(str(folder.parent / "chess")).load("seq-01", [3, 4])
+    expected = RGBDFolder(str(folder)).load("office", [13, 14])
+    assert torch.equal(frames.depth, expected.depth)
+    assert torch.equal(frames.intrinsics, expected.intrinsics)
+    assert "not registered" in caplog.text
+
+
+def test_shared_intrinsics_follow_the_colour_images_to_the_size_of_the_depth(write_recording):
+    folder = write_recording()
+    expected = RGBDFolder(str(folder)).load("office", [10]).intrinsics
+    for path in (folder / "images").iterdir():
+        with Image.open(path) as image:
+            larger = image.resize((2 * SIZE[1], 2 * SIZE[0]))
+        larger.save(path)
+    matrix = np.loadtxt(folder / "K.txt")
+    matrix[:2, :2] *= 2
+    matrix[:2, 2] = 2 * (matrix[:2, 2] + 0.5) - 0.5
+    np.savetxt(folder / "K.txt", matrix)
+    frames = RGBDFolder(str(folder)).load("office", [10])
+    assert frames.images.shape[-2:] == SIZE
+    torch.testing.assert_close(frames.intrinsics, expected)
+
+
+def test_invalid_values_become_zero(write_recording):
+    folder = write_recording()
+    path = folder / "depth" / "00010.png"
+    stored = np.array(Image.open(path))
+    stored[0, :4] = (0, 65535, 7, 2000)
+    Image.fromarray(stored).save(path)
+    depth = RGBDFolder(str(folder), invalid=(0, 7, 65535), depth_scale=2000).load("office", [10]).depth
+    assert depth[0, 0, :4].tolist() == [0, 0, 0, 1]
+
+
+def test_held_out_frames_are_targets_and_never_trained_on(write_recording):
+    source = RGBDFolder(str(write_recording()), holdout=3)
+    assert list(source.held_out("office")) == [11, 14]
+    module = SceneDataModule(
+        train=source,
+        val=source,
+        image_size=SIZE,
+        min_views=2,
+        max_views=4,
+        eval_context=3,
+        eval_target=5,
+        steps_per_epoch=40,
+    )
+    trained = {frame for batch in module.train_dataloader() for frame in batch.frame_ids.flatten().tolist()}
+    assert trained == {10, 12, 13, 15}
+    (batch,) = module.val_dataloader()
+    assert batch.target.frame_ids.tolist() == [[11, 14]]
+    assert set(batch.context.frame_ids[0].tolist()) <= trained
+    without = RGBDFolder(str(source._recordings["office"].folder), holdout=None)
+    with pytest.raises(DataError, match="office is used for training and for evaluation"):
+        SceneDataModule(train=without, val=without, min_views=2, max_views=2, eval_context=2, eval_target=1).setup()
+
+
+def test_a_folder_of_recordings_splits_by_scene(write_recording):
+    root = write_recording("a").parent
+    write_recording("b", scene=1)
+    assert RGBDFolder(str(root)).scenes == ("a", "b")
+    assert RGBDFolder([str(root / "b"), str(root / "a")]).scenes == ("b", "a")
+    module = SceneDataModule(
+        train=RGBDFolder(str(root), scenes=["a"], holdout=None),
+        val=RGBDFolder(str(root), scenes=["b"]),
+        image_size=SIZE, min_views=2, max_views=2, eval_context=2, eval_target=1,
+    )  # fmt: skip
+    module.setup()
+    assert next(iter(module.val_dataloader())).scene == ("b",)
+    with pytest.raises(DataError, match="no scene c; found are: a, b"):
+        RGBDFolder(str(root), scenes=["c"])
+    with pytest.raises(DataError, match="two recordings are called a"):
+        RGBDFolder([str(root / "a"), str(root / "a")])
+
+
+def test_a_missing_root_names_the_path_and_the_remedy(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"nowhere.*data\.root=FOLDER"):
+        RGBDFolder(str(tmp_path / "nowhere"))
+    with pytest.raises(FileNotFoundError, match=r"data\.root is not set.*data\.root=FOLDER"):
+        RGBDFolder(None)
+    with pytest.raises(DataError, match="no RGB-D recording in"):
+        RGBDFolder(str(tmp_path))
+
+
+def _truncate(path):
+    path.write_bytes(path.read_bytes()[:120])
+
+
+def _save(path, array):
+    Image.fromarray(array).save(path)
+
+
+def _drop_a_pose(folder):
+    path = folder / "poses.txt"
+    path.write_text("\n".join(path.read_text().splitlines()[1:]))
+
+
+def _empty(folder):
+    shutil.rmtree(folder)
+    folder.mkdir()
+
+
+def _widen(folder):
+    for path in folder.iterdir():
+        _save(path, np.ones((24, 40, 3), np.uint8))
+
+
+DAMAGE = {
+    "no images": (lambda f: _empty(f / "images"), "scene office has no colour images"),
+    "image removed": (
+        lambda f: (f / "images/00012.png").unlink(),
+        "5 colour and 6 depth files: frame 12 has a depth file",
+    ),
+    "poses missing": (lambda f: (f / "poses.txt").unlink(), r"poses\.txt of scene office"),
+    "a pose missing": (_drop_a_pose, "each of the 6 images; it has 5 lines of 16"),
+    "words": (lambda f: (f / "poses.txt").write_text("a b\n"), r"cannot read .*poses\.txt of scene office"),
+    "not rigid": (
+        lambda f: np.savetxt(f / "poses.txt", 2 * np.loadtxt(f / "poses.txt")),
+        "frame 10 of scene office .* not a rigid",
+    ),
+    "not finite": (lambda f: np.savetxt(f / "poses.txt", np.full((6, 16), np.nan)), "no frame of scene office"),
+    "no intrinsics": (lambda f: (f / "K.txt").unlink(), r"no intrinsics: add K\.txt"),
+    "no 3x3": (lambda f: np.savetxt(f / "K.txt", np.ones((2, 3))), r"K\.txt .* 3x3 or 4x4 matrix, not 2x3"),
+    "no focal length": (lambda f: np.savetxt(f / "K.txt", np.zeros((3, 3))), "no positive focal lengths"),
+    "truncated image": (lambda f: _truncate(f / "images/00012.png"), r"cannot read .*s/00012\.png of scene office"),
+    "truncated depth": (lambda f: _truncate(f / "depth/00012.png"), r"cannot read .*h/00012\.png of scene office"),
+    "wrong size": (
+        lambda f: _save(f / "depth/00012.png", np.ones((24, 30), np.uint16)),
+        r"00012\.png of scene office is 30x24 .* 32x24",
+    ),
+    "other aspect ratio": (lambda f: _widen(f / "images"), "different aspect ratios"),
+    "colour for depth": (
+        lambda f: _save(f / "depth/00012.png", np.ones((*SIZE, 3), np.uint8)),
+        r"00012\.png of scene office is not a depth image",
+    ),
+    "no valid depth": (
+        lambda f: _save(f / "depth/00012.png", np.full(SIZE, 65535, np.uint16)),
+        r"00012\.png of scene office has no valid depth",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGE)
+def test_damage_is_named_by_file_and_scene(write_recording, name):
+    folder = write_recording()
+    damage, message = DAMAGE[name]
+    damage(folder)
+    with pytest.raises(DataError, match=message):
+        RGBDFolder(str(folder)).load("office", range(10, 16))
+
+
+def test_any_damage_to_an_image_is_a_data_error_or_a_picture(write_recording):
+    folder = write_recording()
+    source = RGBDFolder(str(folder))
+    rng = np.random.default_rng(0)
+    failures = 0
+    for kind in ("images", "depth"):
+        path = folder / kind / "00012.png"
+        whole = path.read_bytes()
+        for _ in range(100):
+            damaged = bytearray(whole[: rng.integers(1, len(whole))] if rng.random() < 0.3 else whole)
+            for place in rng.integers(0, len(damaged), 3):
+                damaged[place] = rng.integers(256)
+            path.write_bytes(bytes(damaged))
+            try:
+                assert source.load("office", [12]).images.shape == (1, 3, *SIZE)
+            except DataError as error:
+                failures += "00012.png" in str(error)
+        path.write_bytes(whole)
+    assert failures > 50
+
+
+def test_a_recording_of_one_frame(write_recording):
+    folder = write_recording(frames=1)
+    source = RGBDFolder(str(folder))
+    assert list(source.frames("office")) == [10]
+    assert list(source.held_out("office")) == []
+    assert source.load("office", [10]).depth.shape == (1, *SIZE)
+
+
+def test_hololens_frames_agree_as_its_description_says(shared):
+    source = RGBDFolder(str(shared / "data/hololens_office_a"))
+    ids = source.frames("hololens_office_a")
+    assert len(ids) == 24
+    frames = source.load("hololens_office_a", ids)
+    assert float((frames.depth > 0).float().mean()) == pytest.approx(0.715, abs=0.001)
+    neighbours = [depth_differences(frames, a, b, stride=2)[0] for a, b in pairwise(range(24))]
+    assert np.median([float(d.median()) for d in neighbours]) == pytest.approx(2.4e-3, rel=0.1)
+    pairs = [depth_differences(frames, a, b, stride=3) for a in range(24) for b in range(24) if abs(a - b) >= 8]
+    far = [float(differences.median()) for differences, overlap in pairs if overlap >= 0.3]
+    assert np.median(far) == pytest.approx(7.2e-3, rel=0.1)
+
+
+def test_registered_seven_scenes_frames_agree_as_their_description_says(shared):
+    source = RGBDFolder(str(shared / "data/seven_scenes_redkitchen_a_registered"))
+    (scene,) = source.scenes
+    ids = source.frames(scene)
+    assert len(ids) == 56
+    frames = source.load(scene, ids)
+    pairs = [depth_differences(frames, a, b, stride=10) for a in range(56) for b in range(a + 1, 56)]
+    medians = [float(differences.median()) for differences, overlap in pairs if overlap >= 0.3]
+    assert np.median(medians) == pytest.approx(12.0e-3, rel=0.1)

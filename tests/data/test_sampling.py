@@ -1,0 +1,96 @@
+"""Draws of views and scenes: pure functions of seed and step."""
+
+import logging
+
+import pytest
+
+from vg2gt.data import DataError, SyntheticRooms
+from vg2gt.data.sampling import StepSampler, ViewSampler, usable_scenes
+
+
+def test_the_number_of_views_stays_in_range_and_takes_every_value():
+    sampler = ViewSampler(3, 18, max_images=40)
+    drawn = [sampler.num_views(step) for step in range(600)]
+    assert set(drawn) == set(range(3, 19))
+    for step in range(50):
+        assert sampler.num_scenes(step) == max(1, 40 // drawn[step])
+
+
+def test_all_ranks_draw_the_same_number_of_views_and_other_scenes():
+    source = SyntheticRooms(40, num_frames=20)
+    views = ViewSampler(2, 6, max_images=12)
+    ranks = [StepSampler(source, source.scenes, views, 100, rank=rank, world_size=2) for rank in range(2)]
+    for step in range(30):
+        a, b = (sampler.step(step) for sampler in ranks)
+        assert {len(view.context) for view in (*a, *b)} == {views.num_views(step)}
+        assert len(a) == len(b)
+    first_pass = 40 // (2 * 6)  # whole steps within the first pass over the scenes
+    seen = [view.scene for step in range(first_pass) for sampler in ranks for view in sampler.step(step)]
+    assert len(seen) == len(set(seen))
+
+
+def test_every_scene_comes_once_in_a_pass():
+    sampler = ViewSampler(8, 8, max_images=8, seed=3)
+    passes = [[sampler.scene_indices(step, 7)[0] for step in range(start, start + 7)] for start in (0, 7, 14)]
+    assert all(sorted(turn) == list(range(7)) for turn in passes)
+    assert passes[0] != passes[1]
+
+
+def test_views_are_distinct_frames_of_a_window_around_the_anchor():
+    sampler = ViewSampler(3, 9, expand_ratio=1.5, target_views=2)
+    frames = list(range(100, 400, 2))
+    starts = set()
+    for step in range(300):
+        views = sampler.views(step, "scene", frames, slot=0)
+        chosen = (*views.context, *views.target)
+        assert len(views.context) == sampler.num_views(step)
+        assert len(views.target) == 2
+        assert len(set(chosen)) == len(chosen)
+        assert set(chosen) <= set(frames)
+        window = max(len(chosen), round(1.5 * len(views.context)))
+        assert max(chosen) - min(chosen) <= 2 * (window - 1)
+        starts.add(views.context[0])
+    assert len(starts) > 100
+
+
+def test_scenes_of_one_step_draw_different_views():
+    sampler = ViewSampler(4, 4)
+    assert sampler.views(0, "a", range(100), 0).context != sampler.views(0, "a", range(100), 1).context
+
+
+def test_a_step_does_not_depend_on_where_the_iteration_began():
+    source = SyntheticRooms(9, num_frames=12)
+    views = ViewSampler(2, 4, max_images=8, target_views=1, seed=5)
+    whole = StepSampler(source, source.scenes, views, steps=10)
+    expected = [whole.step(step) for step in range(20)]
+    assert list(whole) == expected[:10]
+    resumed = StepSampler(source, source.scenes, views, steps=10, start_step=lambda: 7)
+    assert list(resumed) == expected[7:10]  # up to the end of the epoch
+    second_epoch = StepSampler(source, source.scenes, views, steps=10, start_step=lambda: 10)
+    assert list(second_epoch) == expected[10:20]
+    other_seed = StepSampler(source, source.scenes, ViewSampler(2, 4, 8, target_views=1, seed=6), steps=10)
+    assert list(other_seed) != expected[:10]
+
+
+def test_scenes_that_are_too_short_are_counted_and_left_out(caplog):
+    source = SyntheticRooms(3, num_frames=5)
+    lengths = {"room-000000": 3, "room-000001": 5, "room-000002": 4}
+    source.frames = lambda scene: range(lengths[scene])
+    with caplog.at_level(logging.WARNING):
+        assert usable_scenes(source, ViewSampler(2, 4), None) == ["room-000001", "room-000002"]
+    assert "1 of 3 training scenes" in caplog.text
+    with pytest.raises(DataError, match=r"longest has 5 .* at most 3"):
+        usable_scenes(source, ViewSampler(6, 6, target_views=2), None)
+
+
+def test_one_frame_is_enough_for_one_view():
+    source = SyntheticRooms(1, num_frames=1)
+    sampler = ViewSampler(1, 1)
+    assert usable_scenes(source, sampler, None) == ["room-000000"]
+    assert sampler.views(4, "room-000000", [0], 0).context == (0,)
+
+
+@pytest.mark.parametrize("arguments", [(0, 3), (4, 3), (3, 4, 8, 0.5), (3, 4, 8, 2.0, -1)])
+def test_impossible_ranges_are_refused(arguments):
+    with pytest.raises(ValueError, match="need"):
+        ViewSampler(*arguments)
