@@ -10,8 +10,8 @@ from vg2gt.voxels.coarse import _PatchPoints
 def perturb(module, seed=0):
     """Gives the zero-initialised projections weight, as training would."""
     torch.manual_seed(seed)
-    for branch in module.fuse:
-        torch.nn.init.normal_(branch[-1].weight, std=0.1)
+    for branch in module.zero:
+        torch.nn.init.normal_(branch.weight, std=0.1)
     return module
 
 
@@ -40,7 +40,7 @@ def test_last_layer_learns_at_step_one_and_ptv3_from_step_two(make_coarse, make_
     for _ in range(2):
         out = module(tokens, geometry)
         torch.stack([(a - b).square().mean() for a, b in zip(out.patch, target, strict=True)]).sum().backward()
-        last = sum(branch[-1].weight.grad.abs().sum() for branch in module.fuse)
+        last = sum(branch.weight.grad.abs().sum() for branch in module.zero)
         inner = sum(p.grad.abs().sum() for p in module.ptv3.parameters())
         norms.append((float(last), float(inner)))
         optimizer.step()

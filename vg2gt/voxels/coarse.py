@@ -9,7 +9,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from vg2gt.geometry.cameras import crop_intrinsics, unproject
+from vg2gt.geometry.cameras import crop_intrinsics, ray_directions, unproject
+from vg2gt.geometry.normals import normals_from_depth
 from vg2gt.types import Cameras, Geometry, Tokens
 from vg2gt.voxels.grid import in_range, plan_voxels, point_cells, pool_mean, pool_min, scene_voxel_size
 from vg2gt.voxels.knn import interpolate, interpolation_weights
@@ -17,7 +18,11 @@ from vg2gt.voxels.ptv3 import PTv3
 
 Inject = Literal["last", "all"]
 VOXEL_CHANNELS = 4  # centroid in the cell (3), confidence
-RESIDUAL_CHANNELS = 3  # from a point to the weighted mean of the surface around it, in its camera's axes
+RESIDUAL_CHANNELS = 4  # from a point to the surface around it: a vector in its camera's axes, a change of its depth
+DEPTH_CHANGE_UNIT = 0.02  # relative
+MAX_DEPTH_CHANGE = 3.0  # units
+GRAZING = 0.2  # product of normal and ray below which the change of depth says nothing
+NORMAL_EDGE = 0.2  # relative depth step across which no normal is taken
 
 
 class CoarseModule(nn.Module):
@@ -34,7 +39,7 @@ class CoarseModule(nn.Module):
         voxel_size: edge length in scene units.
         min_footprint: smallest edge in pixels at the scene's median depth; 0 switches the guard off.
         hidden: widths of the MLP from tokens to voxel features.
-        fuse_channels: hidden width of the fusing projections.
+        fuse_channels: width of the fusing convolutions on the patch grid.
         neighbors: nearest voxels a point's feature is interpolated from.
         inject: ``all`` changes every tap, ``last`` the last one only.
         upsample: points a patch along each axis.
@@ -73,14 +78,17 @@ class CoarseModule(nn.Module):
         self.embed = nn.Sequential(*layers)
         self.ptv3 = ptv3(in_channels=hidden[-1] + VOXEL_CHANNELS)
         width = self.ptv3.out_channels + hidden[-1] + RESIDUAL_CHANNELS
-        self.fuse = nn.ModuleList(
-            nn.Sequential(nn.Linear(width, fuse_channels), nn.GELU(), nn.Linear(fuse_channels, token_dim))
-            for _ in range(num_taps if inject == "all" else 1)
+        self.fuse = nn.Sequential(
+            nn.Conv2d(width, fuse_channels, 3, padding=1),
+            nn.GELU(),
+            nn.Conv2d(fuse_channels, fuse_channels, 3, padding=1),
+            nn.GELU(),
         )
-        for branch in self.fuse:
-            last: nn.Linear = branch[-1]  # pyright: ignore
-            nn.init.zeros_(last.weight)
-            nn.init.zeros_(last.bias)
+        self.zero = nn.ModuleList(
+            nn.Conv2d(fuse_channels, token_dim, 1) for _ in range(num_taps if inject == "all" else 1)
+        )
+        for parameter in self.zero.parameters():
+            nn.init.zeros_(parameter)
 
     def forward(self, tokens: Tokens, geometry: Geometry, generator: torch.Generator | None = None) -> Tokens:
         """Enhances tokens.
@@ -101,7 +109,8 @@ class CoarseModule(nn.Module):
             points = _PatchPoints(geometry, self.cell, scene_voxel_size(geometry, self.voxel_size, self.min_footprint))
             enhanced = self._enhance(embedded[points.rows], points, generator)
             patches, seen = self._to_patches(torch.cat((enhanced, embedded[points.rows]), -1), points, tokens)
-            updates = [torch.where(seen, branch(patches), 0) for branch in self.fuse]
+            fused = self.fuse(_to_maps(patches, tokens.grid))
+            updates = [torch.where(seen, _to_rows(branch(fused), patches), 0) for branch in self.zero]
         untouched = tokens.patch[: len(tokens.patch) - len(updates)]
         changed = tokens.patch[len(untouched) :]
         return tokens.with_patch(
@@ -115,7 +124,7 @@ class CoarseModule(nn.Module):
         return features.permute(0, 2, 3, 1).flatten(0, 2)
 
     def _enhance(self, embedded: Tensor, points: _PatchPoints, generator: torch.Generator | None) -> Tensor:
-        """PTv3 over the voxels, read back at the points: ``[N, C]`` features and the residual ``[N, 3]``."""
+        """PTv3 over the voxels, read back at the points: ``[N, C]`` features and the residual ``[N, 4]``."""
         everything = torch.ones_like(points.batch, dtype=torch.bool)
         plan = plan_voxels(points.cells, points.batch, everything)
         offset = (points.cells - points.cells.floor() - 0.5).float()
@@ -129,8 +138,7 @@ class CoarseModule(nn.Module):
         centers = (plan.grid - origin).float() + 0.5
         index, weights = interpolation_weights(queries, points.batch, centers, plan.batch, self.neighbors)
         residual = interpolate(centers + centroid, index, weights) - queries
-        local = (points.rotation @ residual[..., None])[..., 0]
-        return torch.cat((interpolate(voxels, index, weights), local), -1)
+        return torch.cat((interpolate(voxels, index, weights), points.in_camera(residual)), -1)
 
     def _to_patches(self, features: Tensor, points: _PatchPoints, tokens: Tokens) -> tuple[Tensor, Tensor]:
         """Averages the valid points of every patch: ``[B, V, P, C]`` and whether there were any ``[B, V, P, 1]``."""
@@ -159,6 +167,9 @@ class _PatchPoints:
         cells: ``[N, 3]`` float64 positions in voxel units.
         confidence: ``[N]`` > 0.
         rotation: ``[N, 3, 3]`` world-to-camera rotation of the point's view.
+        depth: ``[N]`` scene units.
+        ray: ``[N, 3]`` the point's ray in its camera's axes, z = 1.
+        normal: ``[N, 3]`` the surface normal there, facing the camera; where it is unknown, the camera's axis.
         placeholder: whether the only point is the placeholder.
         voxel_size: ``[B]``.
     """
@@ -169,7 +180,8 @@ class _PatchPoints:
         smallest = -F.max_pool2d(-confidence, cell)
         valid = torch.isfinite(sampled) & (sampled > 0) & torch.isfinite(smallest) & (smallest > 0)
         size = (sampled.shape[-2], sampled.shape[-1])
-        points = unproject(torch.where(valid, sampled, 1.0), _sampled_cameras(geometry.cameras, cell, size))
+        cameras = _sampled_cameras(geometry.cameras, cell, size)
+        points = unproject(torch.where(valid, sampled, 1.0), cameras)
         scene = torch.arange(len(depth), device=depth.device).repeat_interleave(depth[0].numel() // cell**2)
         cells = point_cells(points.flatten(0, -2), scene, voxel_size)
         usable = valid.flatten() & in_range(cells)
@@ -181,6 +193,34 @@ class _PatchPoints:
         rotations = geometry.cameras.world_to_camera[..., :3, :3].detach().float().flatten(0, 1)
         self.rotation = rotations[self.rows // (valid[0, 0].numel())]
         self.voxel_size = voxel_size
+        self.depth = torch.where(valid, sampled, 1.0).flatten()[self.rows]
+        self.ray = ray_directions(cameras.intrinsics, size).flatten(0, -2)[self.rows]
+        normals, known = normals_from_depth(torch.where(valid, sampled, 0.0), cameras.intrinsics, NORMAL_EDGE)
+        normals = torch.where(known[:, :, None], normals, normals.new_tensor([0.0, 0.0, -1.0])[:, None, None])
+        self.normal = normals.permute(0, 1, 3, 4, 2).flatten(0, -2)[self.rows]
+
+    def in_camera(self, residual: Tensor) -> Tensor:
+        """A residual ``[N, 3]`` (world axes, voxels) in the cameras' axes and as a relative change of depth: ``[N, 4]``.
+
+        The change of depth takes the point along its ray onto the tangent plane through the residual's end, so that
+        where on the surface the neighbours happen to lie drops out: what remains is how far the views disagree.
+        """
+        local = (self.rotation @ residual[..., None])[..., 0]
+        facing = (self.normal * self.ray).sum(-1)
+        steps = (self.normal * local).sum(-1) / facing.clamp(max=-GRAZING)
+        change = steps * self.voxel_size[self.batch] / (self.depth * DEPTH_CHANGE_UNIT)
+        change = torch.where(facing < -GRAZING, change, 0.0).clamp(-MAX_DEPTH_CHANGE, MAX_DEPTH_CHANGE)
+        return torch.cat((local, change[:, None]), -1)
+
+
+def _to_maps(patches: Tensor, grid: tuple[int, int]) -> Tensor:
+    """Patch rows ``[B, V, P, C]`` as maps ``[B V, C, rows, columns]``."""
+    return patches.flatten(0, 1).transpose(1, 2).unflatten(-1, grid)
+
+
+def _to_rows(maps: Tensor, like: Tensor) -> Tensor:
+    """Maps ``[B V, C, rows, columns]`` as patch rows ``[B, V, P, C]``."""
+    return maps.flatten(2).transpose(1, 2).unflatten(0, like.shape[:2])
 
 
 def _sampled_cameras(cameras: Cameras, cell: int, size: tuple[int, int]) -> Cameras:
