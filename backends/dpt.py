@@ -117,12 +117,11 @@ class DPT(nn.Module):
 
     def fuse(self, tokens: Sequence[Tensor], grid: tuple[int, int]) -> Tensor:
         """Fuses four ``[N, P, D]`` token maps into ``[N, features / 2, H, W]``, before the output layers."""
-        height, width = grid[0] * self.patch_size, grid[1] * self.patch_size
-        aspect = width / height
+        image_size = (grid[0] * self.patch_size, grid[1] * self.patch_size)
         maps = []
         for level, (tap, project, resize) in enumerate(zip(tokens, self.projects, self.resize_layers, strict=True), 1):
             x = project(self.norm(tap).transpose(1, 2).unflatten(-1, grid))
-            x = resize(self._add_position(x, aspect))
+            x = resize(self._add_position(x, image_size))
             maps.append(self.scratch.get_submodule(f"layer{level}_rn")(x))
         fused, finer = maps[3], None
         for level in (4, 3, 2, 1):
@@ -130,17 +129,17 @@ class DPT(nn.Module):
             size = (2 * maps[0].shape[-2], 2 * maps[0].shape[-1]) if finest else maps[level - 2].shape[-2:]
             fused = self.scratch.get_submodule(f"refinenet{level}")(fused, finer, size)
             finer = None if finest else maps[level - 2]
-        fused = upsample(self.scratch.get_submodule("output_conv1")(fused), (height, width))
-        return self._add_position(fused, aspect)
+        fused = upsample(self.scratch.get_submodule("output_conv1")(fused), image_size)
+        return self._add_position(fused, image_size)
 
     def forward(self, tokens: Sequence[Tensor], grid: tuple[int, int]) -> Tensor:
         """Maps four ``[N, P, D]`` token maps to ``[N, out, H, W]`` without activation."""
         return self.scratch.get_submodule("output_conv2")(self.fuse(tokens, grid))
 
-    def _add_position(self, x: Tensor, aspect: float) -> Tensor:
+    def _add_position(self, x: Tensor, image_size: tuple[int, int]) -> Tensor:
         if self.position_weight == 0:
             return x
-        return x + self.position_weight * uv_embedding(x.shape[1], (x.shape[-2], x.shape[-1]), aspect, like=x)
+        return x + self.position_weight * uv_embedding(x.shape[1], (x.shape[-2], x.shape[-1]), image_size, like=x)
 
 
 def in_chunks(head: nn.Module, tokens: Sequence[Tensor], grid: tuple[int, int], chunk: int | None) -> Tensor:

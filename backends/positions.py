@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Literal
 
 import torch
@@ -24,7 +25,7 @@ def resize_position_embedding(embedding: Tensor, grid: tuple[int, int], resampli
     Returns:
         ``[rows * columns, C]``.
     """
-    side = round(embedding.shape[0] ** 0.5)
+    side = math.isqrt(int(embedding.shape[0]))
     rows, columns = (torch.ones(size, device=embedding.device, dtype=embedding.dtype).cumsum(0) - 0.5 for size in grid)
     if resampling == "size":
         weights = [_antialiased_weights(centers, side) for centers in (rows, columns)]
@@ -36,6 +37,11 @@ def resize_position_embedding(embedding: Tensor, grid: tuple[int, int], resampli
     values = embedding.unflatten(0, (side, side))
     with full_precision(embedding):
         return torch.einsum("hy,wx,yxc->hwc", weights[0], weights[1], values).flatten(0, 1)
+
+
+def size_tensor(size: tuple[int, int], like: Tensor) -> Tensor:
+    """``size`` as a tensor ``[2]`` without reading the numbers, which would fix them under export."""
+    return torch.stack([torch.full((), length, dtype=like.dtype, device=like.device) for length in size])
 
 
 def _cubic(distance: Tensor, a: float) -> Tensor:
@@ -64,7 +70,7 @@ def _clamped_weights(centers: Tensor, offset: Tensor, side: int) -> Tensor:
     return torch.cat((first, weights[:, 3:-3], last), 1)
 
 
-def uv_embedding(channels: int, size: tuple[int, int], aspect: float, like: Tensor) -> Tensor:
+def uv_embedding(channels: int, size: tuple[int, int], image_size: tuple[int, int], like: Tensor) -> Tensor:
     """Sine-cosine embedding ``[channels, h, w]`` of normalised image coordinates.
 
     Coordinates are those of pixel centres in an image whose half diagonal is 1; half of the channels encode x, half y,
@@ -73,22 +79,21 @@ def uv_embedding(channels: int, size: tuple[int, int], aspect: float, like: Tens
     Args:
         channels: a multiple of 4.
         size: ``(h, w)`` of the feature map.
-        aspect: image width / height.
+        image_size: ``(height, width)`` of the image; only its proportions matter.
         like: gives dtype and device.
     """
-    height, width = size
-    diagonal = (aspect * aspect + 1) ** 0.5
-    x = _centered(width, like.device) * (aspect / diagonal)
-    y = _centered(height, like.device) * (1 / diagonal)
+    extent = size_tensor(image_size, like).double()
+    y_extent, x_extent = (extent / extent.norm()).unbind()
+    y, x = (_centered(length, like.device) for length in size)
     quarter = channels // 4
     omega = 100.0 ** (-torch.arange(quarter, device=like.device, dtype=torch.float64) / quarter)
     waves = []
-    for coordinate in (x[None, :].expand(height, width), y[:, None].expand(height, width)):
+    for coordinate in ((x * x_extent)[None, :].expand(size), (y * y_extent)[:, None].expand(size)):
         phase = omega[:, None, None] * coordinate
         waves += [phase.sin(), phase.cos()]
     return torch.cat(waves).to(like.dtype)
 
 
-def _centered(size: int, device: torch.device) -> Tensor:
-    """Pixel centres from ``-(size - 1) / size`` to ``(size - 1) / size`` in float64."""
-    return (2 * torch.arange(size, device=device, dtype=torch.float64) + 1) / size - 1
+def _centered(length: int, device: torch.device) -> Tensor:
+    """Pixel centres from ``-(n - 1) / n`` to ``(n - 1) / n`` in float64."""
+    return (2 * torch.arange(length, device=device, dtype=torch.float64) + 1) / length - 1

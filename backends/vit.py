@@ -124,3 +124,8 @@ class PatchEmbed(nn.Module):
     def forward(self, images: Tensor) -> Tensor:
         """Maps ``[N, 3, H, W]`` to ``[N, P, dim]``, row major."""
         return self.proj(images).flatten(2).transpose(1, 2)
+
+
+def first_and_others(tokens: Tensor, views: int) -> Tensor:
+    """Spreads two learned tokens ``[1, 2, ...]``, of the first and of every other view, to ``[1, V, ...]``."""
+    return tokens[:, (torch.arange(views, device=tokens.device) > 0).long()]

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from backends.positions import resize_position_embedding
 from backends.rope import Rotary, grid_positions, rotary_2d
-from backends.vit import Block, FeedForward, PatchEmbed
+from backends.vit import Block, FeedForward, PatchEmbed, first_and_others
 
 ReferenceView = Literal["first", "middle", "saddle_balanced"]
 MIN_VIEWS_TO_CHOOSE = 3
@@ -122,8 +122,7 @@ class Backbone(nn.Module):
         """Camera tokens ``[B, V, 1, C]``."""
         if given is not None:
             return given[:, :, None].to(x.dtype)
-        others = self.camera_token[:, 1:].expand(-1, x.shape[1] - 1, -1)
-        tokens = torch.cat((self.camera_token[:, :1], others), 1)
+        tokens = first_and_others(self.camera_token, x.shape[1])
         return tokens[:, :, None].expand(x.shape[0], -1, -1, -1).to(x.dtype)
 
     def _tap(self, local: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:

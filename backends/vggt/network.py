@@ -15,7 +15,7 @@ from backends.normalization import normalize_images
 from backends.positions import resize_position_embedding
 from backends.rope import grid_positions, rotary_2d
 from backends.vggt.camera_head import CameraHead
-from backends.vit import Block, PatchEmbed
+from backends.vit import Block, PatchEmbed, first_and_others
 
 REGISTERS = 4
 
@@ -71,8 +71,7 @@ class Aggregator(nn.Module):
         batch, views = images.shape[:2]
         grid = (images.shape[-2] // self.patch_size, images.shape[-1] // self.patch_size)
         patches = self.patch_embed(normalize_images(images).flatten(0, 1), grid)
-        special = torch.cat((self.camera_token, self.register_token), 2)
-        special = torch.cat((special[:, :1], special[:, 1:].expand(-1, views - 1, -1, -1)), 1)
+        special = first_and_others(torch.cat((self.camera_token, self.register_token), 2), views)
         special = special.expand(batch, -1, -1, -1).flatten(0, 1).to(patches.dtype)
         x = torch.cat((special, patches), 1)
         count, start = x.shape[1], special.shape[1]

@@ -58,7 +58,7 @@ def test_first_half_turns_with_y() -> None:
 
 
 def test_uv_embedding_encodes_x_then_y() -> None:
-    embedding = uv_embedding(8, (4, 6), 1.5, like=torch.zeros(1))
+    embedding = uv_embedding(8, (4, 6), (56, 84), like=torch.zeros(1))
     assert embedding.shape == (8, 4, 6)
     assert (embedding[:4, 0] == embedding[:4, 3]).all()
     assert (embedding[4:, :, 0] == embedding[4:, :, 5]).all()
