@@ -11,6 +11,7 @@ from omegaconf import OmegaConf
 from vg2gt.data import DataError, SceneDataModule, SyntheticRooms
 from vg2gt.data.evaluation_views import EvaluationViews
 from vg2gt.data.frame_cache import FrameCache
+from vg2gt.data.sampling import StepSampler
 from vg2gt.paths import config_dir
 
 from .conftest import SIZE
@@ -103,6 +104,9 @@ class _Recorder(lightning.LightningModule):
         self.seen.append((*batch.scene, *map(str, batch.frame_ids.flatten().tolist())))
         return (self.weight - batch.images.mean()) ** 2
 
+    def validation_step(self, batch, batch_idx):
+        self.log("targets", float(batch.frame_ids.shape[1] - batch.num_context), batch_size=1)
+
     def configure_optimizers(self):
         return torch.optim.Adam(self.parameters(), lr=0.1)
 
@@ -128,6 +132,21 @@ def test_a_resumed_run_sees_the_batches_of_the_uninterrupted_one(rooms, tmp_path
     _trainer(10).fit(second, datamodule=_module(rooms), ckpt_path=tmp_path / "stop.ckpt")
     assert first.seen + second.seen == whole.seen
     assert torch.equal(second.weight, whole.weight)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_run_sees_the_planned_steps_in_order_whatever_the_workers(rooms):
+    module = _module(rooms, workers=2)
+    recorder = _Recorder()
+    trainer = _trainer(10, val_check_interval=3, check_val_every_n_epoch=None, num_sanity_val_steps=0)
+    (before,) = trainer.validate(recorder, datamodule=module, verbose=False)
+    assert before["targets"] == 2
+    trainer.fit(recorder, datamodule=module)
+    plan = StepSampler(rooms, rooms.scenes, module.sampler, steps=10)
+    planned = [[views.context for views in step] for step in plan]
+    assert [step[-sum(map(len, views)) :] for step, views in zip(recorder.seen, planned, strict=True)] == [
+        tuple(str(frame) for context in views for frame in context) for views in planned
+    ]
 
 
 def test_the_memory_cache_forgets_the_oldest_frame(rooms, monkeypatch):
