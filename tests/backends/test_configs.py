@@ -7,7 +7,8 @@ import pytest
 from hydra.utils import get_class
 from omegaconf import DictConfig
 
-FILES = sorted(path.stem for path in (Path(__file__).resolve().parents[2] / "configs" / "backend").glob("*.yaml"))
+FOLDER = Path(__file__).resolve().parents[2] / "configs" / "backend"
+FILES = sorted(path.stem for path in FOLDER.glob("*.yaml") if path.stem != "custom")
 NON_COMMERCIAL = {"da3_large", "da3_giant"}
 
 
@@ -35,3 +36,9 @@ def test_licence_and_name_are_stated(load_config, name: str) -> None:
 def test_tiny_networks_are_tiny(make_backend) -> None:
     for name in ("vggt_tiny", "da3_tiny"):
         assert 1e5 < sum(parameter.numel() for parameter in make_backend(name).parameters()) < 1e6
+
+
+def test_custom_takes_any_class(make_backend) -> None:
+    assert make_backend("custom", "_target_=backends.oracle.OracleBackend").name == "oracle"
+    with pytest.raises(Exception, match="abstract class Backend"):
+        make_backend("custom")
