@@ -19,6 +19,7 @@ from vg2gt.voxels.ptv3 import PTv3
 Inject = Literal["last", "all"]
 VOXEL_CHANNELS = 4  # centroid in the cell (3), confidence
 RESIDUAL_CHANNELS = 4  # from a point to the surface around it: a vector in its camera's axes, a change of its depth
+SURFACE_WIDTH = 2.0  # voxels, of the Gaussian that weighs the voxels around a point
 DEPTH_CHANGE_UNIT = 0.02  # relative
 MAX_DEPTH_CHANGE = 3.0  # units
 GRAZING = 0.2  # product of normal and ray below which the change of depth says nothing
@@ -137,7 +138,8 @@ class CoarseModule(nn.Module):
         queries = (points.cells - origin).float()
         centers = (plan.grid - origin).float() + 0.5
         index, weights = interpolation_weights(queries, points.batch, centers, plan.batch, self.neighbors)
-        residual = interpolate(centers + centroid, index, weights) - queries
+        evidence = torch.zeros_like(confidence).index_add_(0, plan.voxel_of, points.confidence.square())
+        residual = _to_surface(queries, centers + centroid, torch.where(weights > 0, evidence[index], 0), index)
         return torch.cat((interpolate(voxels, index, weights), points.in_camera(residual)), -1)
 
     def _to_patches(self, features: Tensor, points: _PatchPoints, tokens: Tokens) -> tuple[Tensor, Tensor]:
@@ -200,7 +202,7 @@ class _PatchPoints:
         self.normal = normals.permute(0, 1, 3, 4, 2).flatten(0, -2)[self.rows]
 
     def in_camera(self, residual: Tensor) -> Tensor:
-        """A residual ``[N, 3]`` (world axes, voxels) in the cameras' axes and as a relative change of depth: ``[N, 4]``.
+        """A residual ``[N, 3]`` (world axes, voxels) in the cameras' axes and as a change of depth: ``[N, 4]``.
 
         The change of depth takes the point along its ray onto the tangent plane through the residual's end, so that
         where on the surface the neighbours happen to lie drops out: what remains is how far the views disagree.
@@ -211,6 +213,18 @@ class _PatchPoints:
         change = steps * self.voxel_size[self.batch] / (self.depth * DEPTH_CHANGE_UNIT)
         change = torch.where(facing < -GRAZING, change, 0.0).clamp(-MAX_DEPTH_CHANGE, MAX_DEPTH_CHANGE)
         return torch.cat((local, change[:, None]), -1)
+
+
+def _to_surface(queries: Tensor, centroids: Tensor, evidence: Tensor, index: Tensor) -> Tensor:
+    """From every point to the surface that all views agree on around it, ``[N, 3]`` in voxels.
+
+    The features' inverse-square weights would return the point's own voxel; a Gaussian of the distance keeps several,
+    and confident points, of which the square of the confidence is the evidence, outweigh the others.
+    """
+    offset = centroids[index] - queries[:, None]
+    weights = evidence * torch.exp(offset.square().sum(-1) / (-2 * SURFACE_WIDTH**2))
+    weights = weights / weights.sum(1, keepdim=True).clamp(min=1e-12)
+    return (weights[..., None] * offset).sum(1)
 
 
 def _to_maps(patches: Tensor, grid: tuple[int, int]) -> Tensor:
