@@ -1,0 +1,67 @@
+"""The backbones are graphs: they compile, export with free sizes, and bear half precision."""
+
+import pytest
+import torch
+from torch import Tensor, nn
+from torch.export import Dim
+
+from backends.da3 import DA3Backend
+from backends.normalization import normalize_images
+from backends.vggt import VGGTBackend
+
+SHAPES = [(2, 3, 3, 56, 84), (1, 1, 3, 70, 70), (1, 2, 3, 84, 56), (2, 5, 3, 42, 112)]
+
+
+class Encoder(nn.Module):
+    """The backbone alone, images ``[B, V, 3, H, W]`` to the tapped patch tokens and the camera token."""
+
+    def __init__(self, backend: VGGTBackend | DA3Backend) -> None:
+        super().__init__()
+        self.backend = backend
+
+    def forward(self, images: Tensor) -> tuple[Tensor, ...]:
+        backend = self.backend
+        if isinstance(backend, DA3Backend):
+            patch, camera = backend.network.backbone.pretrained(
+                normalize_images(images), backend.taps, backend.reference_view
+            )
+        else:
+            patch, camera = backend.network.aggregator(images, backend.taps)
+        return (*patch, camera)
+
+
+@pytest.fixture(params=["vggt_tiny", "da3_tiny"])
+def encoder(request: pytest.FixtureRequest, make_backend) -> Encoder:
+    return Encoder(make_backend(request.param))
+
+
+def random_images(shape: tuple[int, ...]) -> Tensor:
+    return torch.rand(shape, generator=torch.Generator().manual_seed(0))
+
+
+def test_half_precision_stays_near(encoder: Encoder) -> None:
+    images = random_images(SHAPES[0])
+    with torch.autocast("cpu", torch.bfloat16), torch.no_grad():
+        half = encoder(images)
+    for a, b in zip(half, encoder(images), strict=True):
+        assert (a.float() - b).norm() < 0.03 * b.norm()
+        assert not torch.equal(a.float(), b)
+
+
+@pytest.mark.slow
+def test_compiles_without_graph_breaks(encoder: Encoder) -> None:
+    compiled = torch.compile(encoder, backend="eager", fullgraph=True)
+    for shape in SHAPES:
+        images = random_images(shape)
+        for a, b in zip(compiled(images), encoder(images), strict=True):
+            torch.testing.assert_close(a, b)
+
+
+@pytest.mark.slow
+def test_exports_with_free_views_and_sizes(encoder: Encoder) -> None:
+    free = ({0: Dim.AUTO, 1: Dim.AUTO, 3: Dim.AUTO, 4: Dim.AUTO},)
+    exported = torch.export.export(encoder, (random_images(SHAPES[0]),), dynamic_shapes=free, strict=False).module()
+    for shape in SHAPES:
+        images = random_images(shape)
+        for a, b in zip(exported(images), encoder(images), strict=True):
+            torch.testing.assert_close(a, b)
