@@ -18,7 +18,7 @@ from vg2gt.voxels.ptv3 import PTv3
 
 Inject = Literal["last", "all"]
 VOXEL_CHANNELS = 4  # centroid in the cell (3), confidence
-RESIDUAL_CHANNELS = 4  # from a point to the surface around it: a vector in its camera's axes, a change of its depth
+POINT_CHANNELS = 5  # from a point to the surface around it: a vector in camera axes (3), a change of depth; confidence
 SURFACE_WIDTH = 2.0  # voxels, of the Gaussian that weighs the voxels around a point
 DEPTH_CHANGE_UNIT = 0.02  # relative
 MAX_DEPTH_CHANGE = 3.0  # units
@@ -78,7 +78,7 @@ class CoarseModule(nn.Module):
             layers += [nn.Linear(width_in, width_out), nn.GELU()]
         self.embed = nn.Sequential(*layers)
         self.ptv3 = ptv3(in_channels=hidden[-1] + VOXEL_CHANNELS)
-        width = self.ptv3.out_channels + hidden[-1] + RESIDUAL_CHANNELS
+        width = self.ptv3.out_channels + hidden[-1] + POINT_CHANNELS
         self.fuse = nn.Sequential(
             nn.Conv2d(width, fuse_channels, 3, padding=1),
             nn.GELU(),
@@ -125,7 +125,7 @@ class CoarseModule(nn.Module):
         return features.permute(0, 2, 3, 1).flatten(0, 2)
 
     def _enhance(self, embedded: Tensor, points: _PatchPoints, generator: torch.Generator | None) -> Tensor:
-        """PTv3 over the voxels, read back at the points: ``[N, C]`` features and the residual ``[N, 4]``."""
+        """PTv3 over the voxels, read back at the points: ``[N, C]`` features, then ``POINT_CHANNELS`` more."""
         everything = torch.ones_like(points.batch, dtype=torch.bool)
         plan = plan_voxels(points.cells, points.batch, everything)
         offset = (points.cells - points.cells.floor() - 0.5).float()
@@ -140,7 +140,8 @@ class CoarseModule(nn.Module):
         index, weights = interpolation_weights(queries, points.batch, centers, plan.batch, self.neighbors)
         evidence = torch.zeros_like(confidence).index_add_(0, plan.voxel_of, points.confidence.square())
         residual = _to_surface(queries, centers + centroid, torch.where(weights > 0, evidence[index], 0), index)
-        return torch.cat((interpolate(voxels, index, weights), points.in_camera(residual)), -1)
+        enhanced = interpolate(voxels, index, weights)
+        return torch.cat((enhanced, points.in_camera(residual), points.confidence.log()[:, None]), -1)
 
     def _to_patches(self, features: Tensor, points: _PatchPoints, tokens: Tokens) -> tuple[Tensor, Tensor]:
         """Averages the valid points of every patch: ``[B, V, P, C]`` and whether there were any ``[B, V, P, 1]``."""
