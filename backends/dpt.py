@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
+from torch.utils.checkpoint import checkpoint
 
 from backends.positions import uv_embedding
 
@@ -143,11 +144,15 @@ class DPT(nn.Module):
 
 
 def in_chunks(head: nn.Module, tokens: Sequence[Tensor], grid: tuple[int, int], chunk: int | None) -> Tensor:
-    """Runs a head over ``[B, V, P, D]`` token maps, at most ``chunk`` views at a time, to ``[B, V, out, H, W]``."""
+    """Runs a head over ``[B, V, P, D]`` token maps, at most ``chunk`` views at a time, to ``[B, V, out, H, W]``.
+
+    For gradients every chunk is computed again on the way back, so that one chunk's activations are held at a time.
+    """
     flat = [tap.flatten(0, 1) for tap in tokens]
     count = flat[0].shape[0]
     if chunk is None or chunk >= count:
         out = head(flat, grid)
     else:
-        out = torch.cat([head([tap[i : i + chunk] for tap in flat], grid) for i in range(0, count, chunk)])
+        chunks = zip(*(tap.split(chunk) for tap in flat), strict=True)
+        out = torch.cat([checkpoint(head, part, grid, use_reentrant=False) for part in chunks])
     return out.unflatten(0, tokens[0].shape[:2])

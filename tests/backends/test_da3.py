@@ -82,10 +82,23 @@ def test_given_poses_are_used_up_to_world_frame_and_scale(make_backend, make_sce
 
 
 def test_chunked_heads_equal_whole_heads(make_backend, make_scene) -> None:
+    """In value and in gradient; a chunked head holds less for the way back."""
     images, _ = make_scene(2, 3, SIZE)
-    whole, chunked = (make_backend("da3_tiny", f"head_chunk={chunk}") for chunk in ("null", "4"))
-    tokens = whole.encode(images)
-    torch.testing.assert_close(chunked.decode(tokens).depth, whole.decode(tokens).depth, rtol=1e-5, atol=1e-6)
+    tokens = make_backend("da3_tiny").encode(images)
+    depths, gradients, held = [], [], []
+    for chunk in ("null", "4", "1"):
+        backend = make_backend("da3_tiny", f"head_chunk={chunk}")
+        patch = tuple(tap.clone().requires_grad_() for tap in tokens.patch)
+        sizes = []
+        with torch.autograd.graph.saved_tensors_hooks(lambda t: sizes.append(t.numel()) or t, lambda t: t):  # noqa: B023
+            depth = backend.decode(tokens.with_patch(patch)).depth
+        depths.append(depth)
+        held.append(sum(sizes))
+        gradients.append(torch.cat(torch.autograd.grad(depth.square().sum(), patch)))
+    for depth, gradient in zip(depths[1:], gradients[1:], strict=True):
+        torch.testing.assert_close(depth, depths[0], rtol=1e-5, atol=1e-6)
+        torch.testing.assert_close(gradient, gradients[0], rtol=1e-3, atol=1e-6)
+    assert max(held[1:]) < 0.2 * held[0]
 
 
 def test_metric_depth_grows_with_the_focal_length(make_backend, make_scene) -> None:
