@@ -56,9 +56,6 @@ def _render_pixels(
     splats: Splats, pixels: Tensor, background: Tensor, options: RenderOptions
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Blends P pixels front to back: paper, eqn gggs_color with ``G(t*) = alpha`` for every Gaussian."""
-    if len(splats.depth) == 0:
-        zero = pixels.new_zeros(len(pixels))
-        return background.expand(len(pixels), 3), zero[:, None].expand(-1, 3), zero, zero
     response, peak, precision = respond(splats, pixels[:, None])
     alpha = response.clamp(max=options.alpha_max)
     alpha = torch.where(response.detach() >= ALPHA_MIN, alpha, torch.zeros_like(alpha))
@@ -68,10 +65,10 @@ def _render_pixels(
     after = torch.cumsum(passed, -1)
     before = torch.exp(after - passed)
     weight = alpha * before
-    final = torch.exp(after[:, -1])
+    final = torch.exp(passed.sum(-1))
     color = weight @ splats.color + final[:, None] * background
     normal, depth = torch.zeros_like(color), torch.zeros_like(final)
-    if options.geometry:
+    if options.geometry and len(splats.depth):
         normal = weight @ splats.normal
         depth = _depth(alpha, weight, before.detach(), final, peak, precision, options)
     return color, normal, depth, 1 - final

@@ -8,9 +8,9 @@ curvature ``lambda``, and all three follow from the offset ``delta`` between pix
     D^2 = E / r             t* = z (1 + s) / r             lambda = a0 r
 
 with ``a0 = m' L m``, ``q = (L m)_xy / (f a0)``, ``eps = 1 / (z^2 a0)`` and ``Q = (J Sigma J' + lowpass I)^-1``.
-Without low-pass this is the exact ray maximum of the paper's eqn gggs_color; the low-pass dilates the Gaussian inside its
-tangent plane only, so depth profiles do not thicken. ``q = 0, eps = 0`` is the classic affine splat of 3DGS with the
-mean's depth.
+Without low-pass this is the exact ray maximum of the paper's eqn gggs_color; the low-pass dilates the Gaussian inside
+its tangent plane only, so depth profiles do not thicken. ``q = 0, eps = 0`` is the classic affine splat of 3DGS with
+the mean's depth.
 """
 
 from __future__ import annotations

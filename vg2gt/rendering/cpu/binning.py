@@ -6,17 +6,20 @@ import numpy as np
 from numba import njit
 
 DIGIT_BITS = 11
+TILE_BITS = 4  # tiles are 16 pixels wide and high
 
 
 @njit(error_model="numpy", nogil=True, cache=True)
 def radix_order(keys, bits):
     """Stable ascending order ``[N]`` of unsigned integers with the given number of bits."""
-    order = np.arange(len(keys)).astype(np.int32)
-    spare = np.empty_like(order)
+    order, spare = np.empty(len(keys), np.int32), np.empty(len(keys), np.int32)
+    for i in range(len(keys)):
+        order[i] = i
     counts = np.empty(1 << DIGIT_BITS, np.int64)
     mask = np.uint64((1 << DIGIT_BITS) - 1)
     for shift in range(0, bits, DIGIT_BITS):
-        counts[:] = 0
+        for digit in range(len(counts)):
+            counts[digit] = 0
         for i in range(len(keys)):
             counts[(np.uint64(keys[i]) >> np.uint64(shift)) & mask] += 1
         total = 0
@@ -34,13 +37,14 @@ def radix_order(keys, bits):
 
 
 @njit(error_model="numpy", nogil=True, cache=True)
-def count_tiles(boxes, visible, tile, across, counts, offsets, starts):
+def count_tiles(boxes, visible, across, counts, offsets, starts):
     """Counts tiles a Gaussian (with offsets, in the given depth order) and Gaussians a tile (as list starts)."""
-    starts[:] = 0
+    for k in range(len(starts)):
+        starts[k] = 0
     total = 0
     for i in visible:
-        x0, x1 = boxes[i, 0] // tile, (boxes[i, 1] - 1) // tile
-        y0, y1 = boxes[i, 2] // tile, (boxes[i, 3] - 1) // tile
+        x0, x1 = boxes[i, 0] >> TILE_BITS, (boxes[i, 1] - 1) >> TILE_BITS
+        y0, y1 = boxes[i, 2] >> TILE_BITS, (boxes[i, 3] - 1) >> TILE_BITS
         for y in range(y0, y1 + 1):
             for x in range(x0, x1 + 1):
                 starts[y * across + x + 1] += 1
@@ -52,13 +56,17 @@ def count_tiles(boxes, visible, tile, across, counts, offsets, starts):
 
 
 @njit(error_model="numpy", nogil=True, cache=True)
-def fill_tiles(boxes, visible, tile, across, offsets, starts, members, slots):
+def fill_tiles(boxes, visible, across, offsets, starts, members, slots):
     """Writes the tiles' lists, front to back: Gaussian, and slot of its gradient row (a Gaussian's slots adjoin)."""
-    ends = starts[:-1].copy()
+    ends = np.empty(len(starts) - 1, np.int64)
+    for k in range(len(ends)):
+        ends[k] = starts[k]
     for i in visible:
         slot = offsets[i]
-        for y in range(boxes[i, 2] // tile, (boxes[i, 3] - 1) // tile + 1):
-            for x in range(boxes[i, 0] // tile, (boxes[i, 1] - 1) // tile + 1):
+        x0, x1 = boxes[i, 0] >> TILE_BITS, (boxes[i, 1] - 1) >> TILE_BITS
+        y0, y1 = boxes[i, 2] >> TILE_BITS, (boxes[i, 3] - 1) >> TILE_BITS
+        for y in range(y0, y1 + 1):
+            for x in range(x0, x1 + 1):
                 position = ends[y * across + x]
                 members[position] = i
                 slots[position] = slot

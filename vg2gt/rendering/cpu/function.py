@@ -1,7 +1,7 @@
 """Drives the compiled kernels over views and blocks of work, and joins them to autograd.
 
-Deterministic to the bit for any number of threads: tiles write pixels and gradient rows of their own, blocks of Gaussians
-sum their rows in list order, blocks' camera gradients are summed in block order.
+Deterministic to the bit for any number of threads: tiles write pixels and gradient rows of their own, blocks of
+Gaussians sum their rows in list order, blocks' camera gradients are summed in block order.
 """
 
 from __future__ import annotations
@@ -14,15 +14,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from vg2gt.rendering.cpu import raster
+from vg2gt.rendering.cpu import tiles
+from vg2gt.rendering.cpu.backward import backward_tiles
 from vg2gt.rendering.cpu.binning import count_tiles, fill_tiles, radix_order
+from vg2gt.rendering.cpu.forward import forward_tiles
 from vg2gt.rendering.cpu.projection import BLOCK, project_backward_block, project_block
 from vg2gt.rendering.cpu.threads import parallel_for
 from vg2gt.rendering.options import MEDIAN_MAX_TRANSMITTANCE, TRANSMITTANCE_STOP, Images, RenderOptions, SceneViews
 
 TILES_PER_ITEM = 8
 HIT_CAPACITY = 48  # hits a pixel keeps for the depth solver before its tile is given more room
-NEGLIGIBLE = {np.dtype(np.float32): 42.0, np.dtype(np.float64): 90.0}  # squared sigmas at which a profile vanishes
+NEGLIGIBLE = {np.dtype(np.float32): 30.0, np.dtype(np.float64): 90.0}  # squared sigmas at which a profile vanishes
 
 _local = threading.local()
 
@@ -62,11 +64,11 @@ class _View:
 
     @property
     def across(self) -> int:
-        return -(-self.size[1] // raster.TILE)
+        return -(-self.size[1] // tiles.TILE)
 
     @property
     def tiles(self) -> int:
-        return self.across * -(-self.size[0] // raster.TILE)
+        return self.across * -(-self.size[0] // tiles.TILE)
 
     @property
     def blocks(self) -> int:
@@ -116,7 +118,7 @@ class _Rasterize(torch.autograd.Function):
             solid, expected, crossing, of_alpha = _depth_factors(
                 grad_depth[index], grad_alpha[index], depth[index], slope[index], transmittance[index], options
             )
-            rows = np.empty((len(lists.members), raster.ROW), view.means.dtype)
+            rows = np.empty((len(lists.members), tiles.ROW), view.means.dtype)
             images = (color[index], normal[index], depth[index], transmittance[index])
             incoming = (grad_color[index], grad_normal[index], of_alpha, solid, expected, crossing)
             _backward(view, lists, options, geometry, images, incoming, rows, grads, index)
@@ -133,14 +135,15 @@ def _array(tensor: Tensor) -> np.ndarray:
 
 
 def _select(arrays: list[np.ndarray], index: int, size: tuple[int, int]) -> _View:
-    colors = arrays[4]
-    return _View(*arrays[:4], colors[index % len(colors)], arrays[5][index], arrays[6][index], arrays[7], size)
+    means, quats, scales, opacities, colors, poses, intrinsics, background = arrays
+    color = colors[index % len(colors)]
+    return _View(means, quats, scales, opacities, color, poses[index], intrinsics[index], background, size)
 
 
 def _prepare(view: _View, options: RenderOptions) -> _Lists:
     """Projects one view's Gaussians, orders them by depth and lists them by tile."""
     total, dtype = len(view.means), view.means.dtype
-    records = np.empty((total, raster.RECORD), dtype)
+    records = np.empty((total, tiles.RECORD), dtype)
     boxes = np.empty((total, 4), np.int32)
     height, width = view.size
     solid = options.mode == "solid"
@@ -157,9 +160,9 @@ def _prepare(view: _View, options: RenderOptions) -> _Lists:
     visible = visible[radix_order(keys, 8 * dtype.itemsize)]
     counts, offsets = np.empty(total, np.int32), np.empty(total, np.int64)
     starts = np.empty(view.tiles + 1, np.int64)
-    count_tiles(boxes, visible, raster.TILE, view.across, counts, offsets, starts)
+    count_tiles(boxes, visible, view.across, counts, offsets, starts)
     members, slots = np.empty(starts[-1], np.int32), np.empty(starts[-1], np.int64)
-    fill_tiles(boxes, visible, raster.TILE, view.across, offsets, starts, members, slots)
+    fill_tiles(boxes, visible, view.across, offsets, starts, members, slots)
     return _Lists(records, boxes, counts, offsets, starts, members, slots)
 
 
@@ -170,12 +173,13 @@ def _parameters(options: RenderOptions, dtype: np.dtype) -> np.ndarray:
     return np.array(values, dtype)
 
 
-def _scratch(dtype: np.dtype) -> tuple[np.ndarray, np.ndarray]:
-    """This thread's plane and hit buffers; the hits must start finite."""
+def _scratch(dtype: np.dtype) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """This thread's planes, sums and hits; the hits must start finite."""
     buffers = _local.__dict__.setdefault("buffers", {})
     if dtype not in buffers:
-        hits = np.zeros((raster.TILE, HIT_CAPACITY, raster.HIT, raster.TILE), dtype)
-        buffers[dtype] = (np.zeros(raster.SCRATCH, dtype), hits)
+        hits = np.zeros(tiles.TILE * HIT_CAPACITY * tiles.HIT_SIZE, dtype)
+        planes, sums = np.zeros(tiles.PLANES * tiles.PLANE, dtype), np.zeros(tiles.LANE_ROWS * tiles.TILE, dtype)
+        buffers[dtype] = (planes, sums, hits)
     return buffers[dtype]
 
 
@@ -189,8 +193,8 @@ def _forward(view: _View, lists: _Lists, options: RenderOptions, *outputs: np.nd
     solid, expected = options.mode == "solid", options.depth == "expected"
 
     def run(item: int) -> None:
-        state, hits = _scratch(view.means.dtype)
-        raster.forward_tiles(
+        state, _, hits = _scratch(view.means.dtype)
+        forward_tiles(
             lists.records, lists.boxes, view.colors, lists.members, lists.starts, items[item], solid, expected,
             options.geometry, options.bisections, options.newton_steps, parameters, view.background, state, hits,
             *outputs,
@@ -207,7 +211,7 @@ def _depth_factors(
     transmittance: np.ndarray,
     options: RenderOptions,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Splits the depth's gradient into what the kernel takes: solid / S, expected / alpha, crossing; and alpha's own."""
+    """Splits the depth's gradient into what the kernel takes: solid / S, expected / alpha, crossing; and alpha."""
     zero = np.zeros_like(depth)
     valid = depth > 0
     if options.mode == "solid":
@@ -225,8 +229,8 @@ def _backward(
     lists: _Lists,
     options: RenderOptions,
     geometry: bool,
-    images: tuple[np.ndarray, ...],
-    incoming: tuple[np.ndarray, ...],
+    images: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+    incoming: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray],
     rows: np.ndarray,
     grads: list[np.ndarray],
     index: int,
@@ -238,20 +242,21 @@ def _backward(
     solid = options.mode == "solid"
 
     def raster_item(item: int) -> None:
-        state, _ = _scratch(view.means.dtype)
-        raster.backward_tiles(
+        state, sums, _ = _scratch(view.means.dtype)
+        backward_tiles(
             lists.records, lists.boxes, view.colors, lists.members, lists.slots, lists.starts, items[item], geometry,
-            parameters, state, *images, *incoming, rows,
+            parameters, state, sums, *images, *incoming, rows,
         )  # fmt: skip
 
     parallel_for(len(items), raster_item)
     cameras = np.empty((view.blocks, 16), np.float64)
+    means, quats, scales, opacities, colors = grads[:5]
 
     def project_item(block: int) -> None:
         project_backward_block(
             block, view.means, view.quats, view.scales, view.opacities, view.pose, view.intrinsics, height, width,
-            options.lowpass, solid, lists.boxes, lists.counts, lists.offsets, rows, index % len(grads[4]),
-            *grads[:5], cameras,
+            options.lowpass, solid, lists.boxes, lists.counts, lists.offsets, rows, index % len(colors),
+            means, quats, scales, opacities, colors, cameras,
         )  # fmt: skip
 
     parallel_for(view.blocks, project_item)

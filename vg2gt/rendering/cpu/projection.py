@@ -31,7 +31,7 @@ def _rotation(w, x, y, z):
 def project_block(
     block, means, quats, scales, opacities, pose, intrinsics, height, width, lowpass, near, solid, records, boxes
 ):
-    """Writes the records and pixel boxes (x0, x1, y0, y1; ends excluded; empty if invisible) of a block of Gaussians."""
+    """Writes the records and pixel boxes (x0, x1, y0, y1; ends excluded; empty if unseen) of a block of Gaussians."""
     w00, w01, w02, t0 = pose[0, 0], pose[0, 1], pose[0, 2], pose[0, 3]
     w10, w11, w12, t1 = pose[1, 0], pose[1, 1], pose[1, 2], pose[1, 3]
     w20, w21, w22, t2 = pose[2, 0], pose[2, 1], pose[2, 2], pose[2, 3]
@@ -95,8 +95,8 @@ def project_block(
         half_x, half_y = math.sqrt(inv_xx * radius2), math.sqrt(inv_yy * radius2)
         left, right = max(uc + dx - half_x, -1.0), min(uc + dx + half_x, width + 0.0)
         top, bottom = max(vc + dy - half_y, -1.0), min(vc + dy + half_y, height + 0.0)
-        x0, x1 = max(int(math.ceil(left)), 0), min(int(math.floor(right)) + 1, width)
-        y0, y1 = max(int(math.ceil(top)), 0), min(int(math.floor(bottom)) + 1, height)
+        x0, x1 = max(np.int64(math.ceil(left)), 0), min(np.int64(math.floor(right)) + 1, width)
+        y0, y1 = max(np.int64(math.ceil(top)), 0), min(np.int64(math.floor(bottom)) + 1, height)
         if not (left <= right and top <= bottom and x0 < x1 and y0 < y1):
             continue
         boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = x0, x1, y0, y1
@@ -109,9 +109,10 @@ def project_block(
 @njit(error_model="numpy", nogil=True, cache=True)
 def project_backward_block(
     block, means, quats, scales, opacities, pose, intrinsics, height, width, lowpass, solid,
-    boxes, counts, offsets, rows, color_view, grad_means, grad_quats, grad_scales, grad_opacities, grad_colors, grad_cameras,
+    boxes, counts, offsets, rows, color_view,
+    grad_means, grad_quats, grad_scales, grad_opacities, grad_colors, grad_cameras,
 ):  # fmt: skip
-    """Sums every Gaussian's gradient rows, in order, and chains them to the 3D parameters and the camera (both added to).
+    """Sums every Gaussian's gradient rows, in order, and chains them to the 3D parameters (added to) and the camera.
 
     ``grad_cameras[block]`` receives the gradient of the pose's upper three rows and of fx, fy, cx, cy.
     """
@@ -129,7 +130,8 @@ def project_backward_block(
     for i in range(block * BLOCK, min((block + 1) * BLOCK, len(means))):
         if boxes[i, 1] <= boxes[i, 0]:
             continue
-        row[:] = 0.0
+        for j in range(16):
+            row[j] = 0.0
         used = False
         for slot in range(offsets[i], offsets[i] + counts[i]):
             for j in range(16):
@@ -273,4 +275,5 @@ def project_backward_block(
         grad_quats[i, 1] += (gqx - qx * radial) * norm
         grad_quats[i, 2] += (gqy - qy * radial) * norm
         grad_quats[i, 3] += (gqz - qz * radial) * norm
-    grad_cameras[block] = camera
+    for j in range(16):
+        grad_cameras[block, j] = camera[j]

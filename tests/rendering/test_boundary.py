@@ -1,0 +1,148 @@
+"""Degenerate scenes, refused input, and the configured renderer."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import hydra
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from tests.rendering.scenes import IMPLEMENTATIONS, images, pinhole, soup, with_gradients
+from vg2gt.rendering import Renderer, render
+from vg2gt.rendering.options import Mode
+from vg2gt.rendering.renderer import Implementation
+from vg2gt.types import Cameras, Gaussians
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "renderer"
+MODES: tuple[Mode, ...] = ("solid", "rasterized")
+
+
+def assert_sound(gaussians: Gaussians, cameras: Cameras, implementation: Implementation, mode: Mode) -> torch.Tensor:
+    """Renders; every image and gradient must be finite; returns alpha."""
+    gaussians = with_gradients(gaussians)
+    out = render(gaussians, cameras, mode, (0.2, 0.4, 0.6), implementation=implementation)
+    assert out.color.shape == (*cameras.world_to_camera.shape[:2], 3, *cameras.size)
+    assert all(torch.isfinite(image).all() for image in images(out))
+    inputs = [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh]
+    total = torch.stack([image.sum() for image in images(out)]).sum()
+    assert all(torch.isfinite(g).all() for g in torch.autograd.grad(total, inputs))
+    return out.alpha
+
+
+def assert_background(gaussians: Gaussians, implementation: Implementation, mode: Mode) -> None:
+    out = render(gaussians, pinhole((5, 7)), mode, (0.2, 0.4, 0.6), implementation=implementation)
+    expected = torch.tensor([0.2, 0.4, 0.6], dtype=out.color.dtype)[None, None, :, None, None].expand_as(out.color)
+    torch.testing.assert_close(out.color, expected, rtol=0, atol=0)
+    assert not out.alpha.any()
+    assert not out.depth.any()
+    assert not out.normal.any()
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+class TestDegenerateScenes:
+    def test_no_gaussians(self, implementation: Implementation, mode: Mode) -> None:
+        assert_background(soup(0), implementation, mode)
+
+    def test_all_behind_the_camera(self, implementation: Implementation, mode: Mode) -> None:
+        gaussians = soup(20)
+        assert_background(replace(gaussians, means=-gaussians.means), implementation, mode)
+
+    def test_none_in_the_image(self, implementation: Implementation, mode: Mode) -> None:
+        gaussians = soup(20, size=0.01)
+        shifted = gaussians.means + torch.tensor([500.0, 0.0, 0.0])
+        assert_background(replace(gaussians, means=shifted), implementation, mode)
+
+    def test_straddling_the_camera(self, implementation: Implementation, mode: Mode) -> None:
+        gaussians = soup(30)
+        near = gaussians.means * torch.tensor([1.0, 1.0, 0.05])
+        assert_sound(replace(gaussians, means=near), pinhole((6, 9)), implementation, mode)
+
+    @pytest.mark.parametrize("scale", [1e-8, 1e8])
+    def test_tiny_and_huge_scales(self, implementation: Implementation, mode: Mode, scale: float) -> None:
+        gaussians = soup(20).map(lambda t: t.float() if t.is_floating_point() else t)
+        gaussians.scales[::2] *= scale
+        assert_sound(gaussians, pinhole((6, 9)).map(torch.Tensor.float), implementation, mode)
+
+    @pytest.mark.parametrize("size", [(1, 1), (3, 50), (17, 33)])
+    def test_any_image_size(self, implementation: Implementation, mode: Mode, size: tuple[int, int]) -> None:
+        gaussians = soup(40, size=0.3)
+        alpha = assert_sound(gaussians, pinhole(size), implementation, mode)
+        reference = render(gaussians, pinhole(size), mode, implementation="dense").alpha
+        torch.testing.assert_close(alpha, reference, rtol=0, atol=1e-12)
+
+    def test_anisotropic_focal_lengths(self, implementation: Implementation, mode: Mode) -> None:
+        cameras = pinhole((12, 15), focal=(8.0, 40.0))
+        alpha = assert_sound(soup(40), cameras, implementation, mode)
+        reference = render(soup(40), cameras, mode, implementation="dense").alpha
+        torch.testing.assert_close(alpha, reference, rtol=0, atol=1e-12)
+
+    def test_transparent(self, implementation: Implementation, mode: Mode) -> None:
+        gaussians = soup(20)
+        assert_background(replace(gaussians, opacities=torch.zeros(20).double()), implementation, mode)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("means", float("nan")),
+        ("quats", float("inf")),
+        ("scales", 0.0),
+        ("scales", -1.0),
+        ("opacities", 1.5),
+        ("sh", float("nan")),
+    ],
+)
+def test_bad_values_are_refused_by_name(name: str, value: float) -> None:
+    gaussians = soup(5)
+    getattr(gaussians, name)[3] = value
+    with pytest.raises(ValueError, match=rf"^{name} .*\[3"):
+        render(gaussians, pinhole((4, 4)))
+
+
+def test_bad_cameras_are_refused_by_name() -> None:
+    cameras = pinhole((4, 4))
+    with pytest.raises(ValueError, match=r"^world_to_camera holds"):
+        render(soup(5), Cameras(cameras.world_to_camera * float("nan"), cameras.intrinsics, (4, 4)))
+    with pytest.raises(ValueError, match=r"^intrinsics must be"):
+        render(soup(5), Cameras(cameras.world_to_camera, -cameras.intrinsics, (4, 4)))
+    with pytest.raises(ValueError, match=r"^world_to_camera must be \[B, V, 4, 4\]"):
+        render(soup(5), Cameras(cameras.world_to_camera[0], cameras.intrinsics, (4, 4)))
+
+
+def test_bad_shapes_and_order_are_refused() -> None:
+    gaussians = soup(5)
+    with pytest.raises(ValueError, match=r"opacities must be \[5\]"):
+        render(replace(gaussians, opacities=gaussians.opacities[:, None]), pinhole((4, 4)))
+    with pytest.raises(ValueError, match=r"sh must be"):
+        render(replace(gaussians, sh=gaussians.sh[:, 0]), pinhole((4, 4)))
+    with pytest.raises(ValueError, match=r"batch must be sorted"):
+        render(replace(gaussians, batch=gaussians.batch + 1), pinhole((4, 4)))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"mode": "gaussian"}, {"depth": "expected"}, {"near": 0.0}, {"alpha_max": 1.0}, {"implementation": "gpu"}],
+)
+def test_bad_options_are_refused(options: dict[str, object]) -> None:
+    with pytest.raises(ValueError, match=r"depth|mode|near|alpha_max|implementation"):
+        Renderer(**options)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("name", MODES)
+def test_configuration_builds_the_renderer(name: Mode) -> None:
+    renderer = hydra.utils.instantiate(OmegaConf.load(CONFIGS / f"{name}.yaml"))
+    assert isinstance(renderer, Renderer)
+    assert renderer.options.mode == name
+    gaussians, cameras = soup(30), pinhole((12, 15))
+    out = renderer(gaussians, cameras, background=(1.0, 0.0, 0.0))
+    torch.testing.assert_close(out.color, render(gaussians, cameras, name, (1.0, 0.0, 0.0)).color)
+    other = renderer(gaussians, cameras, mode="solid")
+    torch.testing.assert_close(other.depth, render(gaussians, cameras, "solid").depth)
+
+
+def test_half_precision_input_renders_in_float32() -> None:
+    gaussians = soup(10).map(lambda t: t.half() if t.is_floating_point() else t)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert render(gaussians, pinhole((8, 8)).map(torch.Tensor.half)).color.dtype == torch.float32

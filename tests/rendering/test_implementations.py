@@ -1,0 +1,210 @@
+"""Every implementation held to the dense float64 reference, in value and in gradient."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from tests.rendering.scenes import (
+    KINDS,
+    PARAMETERS,
+    cameras_around,
+    images,
+    pinhole,
+    random_like,
+    soup,
+    wall,
+    with_gradients,
+)
+from vg2gt.rendering import render
+from vg2gt.rendering.options import DepthKind, Mode
+from vg2gt.rendering.renderer import Implementation
+from vg2gt.types import Cameras, Gaussians, Render
+
+FAST = ("torch", "cpu")
+BACKGROUND = (0.3, 0.1, 0.7)
+
+
+def render_with_gradients(
+    gaussians: Gaussians,
+    cameras: Cameras,
+    implementation: Implementation,
+    mode: Mode,
+    depth: DepthKind,
+    **options: float,
+) -> tuple[Render, dict[str, Tensor]]:
+    """A render and the gradients of a random weighting of all its images in every input."""
+    gaussians = with_gradients(gaussians)
+    poses, intrinsics = cameras.world_to_camera.clone().requires_grad_(), cameras.intrinsics.clone().requires_grad_()
+    background = torch.tensor(BACKGROUND, dtype=poses.dtype).requires_grad_()
+    out = render(
+        gaussians,
+        Cameras(poses, intrinsics, cameras.size),
+        mode,
+        background,
+        implementation=implementation,
+        depth=depth,
+        **options,  # type: ignore[arg-type]
+    )
+    inputs = {name: getattr(gaussians, name) for name in PARAMETERS}
+    inputs |= {"world_to_camera": poses, "intrinsics": intrinsics, "background": background}
+    grads = torch.autograd.grad(images(out), list(inputs.values()), random_like(out))
+    return out, dict(zip(inputs, grads, strict=True))
+
+
+def relative(value: Tensor, reference: Tensor) -> float:
+    return float((value - reference).norm() / reference.norm())
+
+
+@pytest.mark.parametrize("degree", [0, 2])
+@pytest.mark.parametrize(("mode", "depth"), KINDS)
+@pytest.mark.parametrize("implementation", FAST)
+def test_equals_the_reference(implementation: Implementation, mode: Mode, depth: DepthKind, degree: int) -> None:
+    gaussians, cameras = soup(50, seed=degree, degree=degree, scenes=2), cameras_around((20, 24), scenes=2)
+    expected, expected_grads = render_with_gradients(gaussians, cameras, "dense", mode, depth, bisections=40)
+    out, grads = render_with_gradients(gaussians, cameras, implementation, mode, depth, bisections=40)
+    assert (expected.depth > 0).float().mean() > 0.2
+    for value, reference in zip(images(out), images(expected), strict=True):
+        torch.testing.assert_close(value, reference, rtol=0, atol=1e-12)
+    for name, reference in expected_grads.items():
+        assert relative(grads[name], reference) < 1e-10, name
+
+
+@pytest.mark.parametrize("implementation", FAST)
+def test_deep_translucent_rays_equal_the_reference(implementation: Implementation) -> None:
+    gaussians = soup(300, size=0.6)
+    gaussians = replace(gaussians, opacities=gaussians.opacities * 0.05)
+    cameras = pinhole((9, 18))
+    expected, expected_grads = render_with_gradients(gaussians, cameras, "dense", "solid", "median", bisections=40)
+    out, grads = render_with_gradients(gaussians, cameras, implementation, "solid", "median", bisections=40)
+    assert (expected.depth > 0).any()
+    for value, reference in zip(images(out), images(expected), strict=True):
+        torch.testing.assert_close(value, reference, rtol=0, atol=1e-12)
+    for name, reference in expected_grads.items():
+        assert relative(grads[name], reference) < 1e-10, name
+
+
+@pytest.mark.parametrize("implementation", FAST)
+def test_gradient_in_random_directions(implementation: Implementation) -> None:
+    gaussians, cameras = soup(60, seed=2), cameras_around((20, 24))
+    options = {"bisections": 40, "slope_floor": 0.0}
+    out, grads = render_with_gradients(gaussians, cameras, implementation, "solid", "median", **options)
+    weights = random_like(out)
+    generator = torch.Generator().manual_seed(0)
+    errors = []
+    for _ in range(9):
+        step = {n: torch.randn(getattr(gaussians, n).shape, generator=generator).double() for n in PARAMETERS}
+        analytic = sum(float((grads[name] * direction).sum()) for name, direction in step.items())
+        values = []
+        for sign in (1, -1):
+            moved = replace(gaussians, **{n: getattr(gaussians, n) + sign * 1e-7 * d for n, d in step.items()})
+            r = render(moved, cameras, "solid", BACKGROUND, implementation=implementation, bisections=40)
+            values.append(sum(float((w * i).sum()) for w, i in zip(weights, images(r), strict=True)))
+        errors.append(abs((values[0] - values[1]) / 2e-7 - analytic) / abs(analytic))
+    assert sorted(errors)[4] < 1e-7
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 1e-5)])
+@pytest.mark.parametrize("implementation", FAST)
+def test_scaling_the_world_scales_depth_only(
+    implementation: Implementation, dtype: torch.dtype, tolerance: float
+) -> None:
+    gaussians = with_gradients(soup(60).map(lambda t: t.to(dtype) if t.is_floating_point() else t))
+    cameras = pinhole((20, 24)).map(lambda t: t.to(dtype))
+    out = render(gaussians, cameras, implementation=implementation, slope_floor=0.0, bisections=40)
+    weights = random_like(out)
+
+    def euler(outputs: tuple[Tensor, ...], weights: tuple[Tensor, ...]) -> tuple[float, float]:
+        g = torch.autograd.grad(outputs, [gaussians.means, gaussians.scales], weights, retain_graph=True)
+        terms = [(g[0] * gaussians.means).detach().double(), (g[1] * gaussians.scales).detach().double()]
+        return sum(float(t.sum()) for t in terms), sum(float(t.abs().sum()) for t in terms)
+
+    total, magnitude = euler((out.depth,), (weights[1],))
+    assert abs(total - float((weights[1].double() * out.depth.detach().double()).sum())) < tolerance * magnitude
+    total, magnitude = euler((out.color, out.normal, out.alpha), (weights[0], weights[2], weights[3]))
+    assert abs(total) < tolerance * magnitude
+
+
+def test_float32_depth_is_that_of_float64() -> None:
+    gaussians, cameras = wall(6000, (64, 96))
+    exact = render(gaussians, cameras, implementation="cpu", bisections=40)
+
+    def single(t: Tensor) -> Tensor:
+        return t.float() if t.is_floating_point() else t
+
+    rounded = render(gaussians.map(single), cameras.map(single), implementation="cpu")
+    both = (exact.depth > 0) & (rounded.depth > 0)
+    assert both.float().mean() > 0.95
+    error = (exact.depth - rounded.depth)[both].abs()
+    assert error.median() < 1e-6
+    assert error.quantile(0.999) < 1e-5
+    for value, reference in zip(images(rounded), images(exact), strict=True):
+        assert (value - reference).abs().flatten().quantile(0.99) < 1e-4
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_cpu_is_deterministic_for_any_number_of_threads(dtype: torch.dtype) -> None:
+    gaussians, _ = wall(3000, (40, 72))
+    cameras = cameras_around((40, 72), views=3)
+    gaussians = gaussians.map(lambda t: t.to(dtype) if t.is_floating_point() else t)
+    cameras = cameras.map(lambda t: t.to(dtype))
+    threads = torch.get_num_threads()
+    results = []
+    try:
+        for count in (1, 1, 2, 3):
+            torch.set_num_threads(count)
+            out, grads = render_with_gradients(gaussians, cameras, "cpu", "solid", "median")
+            results.append([*images(out), *grads.values()])
+    finally:
+        torch.set_num_threads(threads)
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+
+
+@pytest.mark.parametrize("implementation", ["dense", *FAST])
+def test_color_only_changes_nothing_but_what_it_leaves_out(implementation: Implementation) -> None:
+    gaussians, cameras = with_gradients(soup(40)), cameras_around((20, 24))
+    inputs = [getattr(gaussians, name) for name in PARAMETERS]
+    grads = []
+    for geometry in (True, False):
+        out = render(gaussians, cameras, implementation=implementation, geometry=geometry)
+        grads.append(torch.autograd.grad(out.color.square().sum() + out.alpha.sum(), inputs))
+    assert not out.depth.any()
+    assert not out.normal.any()
+    for complete, reduced in zip(*grads, strict=True):
+        torch.testing.assert_close(complete, reduced, rtol=1e-12, atol=1e-12)
+
+
+def test_cpu_gradients_of_single_outputs_add_up() -> None:
+    gaussians, cameras = with_gradients(soup(40)), cameras_around((20, 24))
+    inputs = [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities]
+    out = render(gaussians, cameras, implementation="cpu")
+    weights = random_like(out)
+    total = torch.autograd.grad(images(out), inputs, weights, retain_graph=True)
+    parts = [
+        torch.autograd.grad(image, inputs, weight, retain_graph=True)
+        for image, weight in zip(images(out), weights, strict=True)
+    ]
+    for index, whole in enumerate(total):
+        torch.testing.assert_close(sum(part[index] for part in parts), whole, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("implementation", ["dense", *FAST])
+def test_no_gradient_passes_the_alpha_cap(implementation: Implementation) -> None:
+    gaussians = soup(1, size=3.0)
+    gaussians.means[0] = torch.tensor([0.0, 0.0, 40.0])
+    gaussians = with_gradients(replace(gaussians, opacities=torch.ones(1, dtype=torch.float64)))
+    out = render(gaussians, pinhole((1, 1), focal=(1000.0, 1000.0)), implementation=implementation)
+    assert float(out.alpha) == pytest.approx(0.99)
+    grads = torch.autograd.grad(out.alpha.sum(), [gaussians.means, gaussians.opacities])
+    assert not any(g.any() for g in grads)
+
+
+def test_rasterized_median_moves_with_one_gaussian_only() -> None:
+    gaussians, cameras = with_gradients(soup(40)), pinhole((20, 24))
+    out = render(gaussians, cameras, "rasterized", implementation="cpu")
+    row, column = torch.nonzero(out.depth[0, 0] > 0)[0].tolist()
+    (grad,) = torch.autograd.grad(out.depth[0, 0, row, column], gaussians.means)
+    assert (grad.abs().sum(-1) > 0).sum() == 1
+    assert float(grad[:, 2].sum()) == pytest.approx(1.0)
