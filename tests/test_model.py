@@ -1,13 +1,12 @@
 """The whole forward pass on a procedural room with the simulated backbone."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
 
 from tests.training_helpers import small_config
-from vg2gt.model import SceneScale, VG2GT
+from vg2gt.model import VG2GT, SceneScale
 from vg2gt.protocols import ground_truth_target_cameras, training_cameras
 from vg2gt.training import Run, build
 from vg2gt.types import Batch
@@ -61,11 +60,13 @@ def test_gradient_reaches_the_last_coarse_layer_first_and_the_transformer_next(r
     transformer = [name for name in names if name.startswith("ptv3.")]
     assert transformer
 
+    coarse = model.coarse
+
     def gradients() -> dict[str, float]:
         model.zero_grad()
         prediction = model(batch.context.images, batch.context.hints, torch.Generator().manual_seed(0))
         prediction.geometry.depth.square().mean().backward()
-        return {n: 0.0 if p.grad is None else float(p.grad.abs().sum()) for n, p in model.coarse.named_parameters()}
+        return {n: 0.0 if p.grad is None else float(p.grad.abs().sum()) for n, p in coarse.named_parameters()}
 
     saved = {name: value.clone() for name, value in model.coarse.state_dict().items()}
     first = gradients()

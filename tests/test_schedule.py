@@ -1,5 +1,7 @@
 """Learning-rate schedule and parameter groups."""
 
+from itertools import pairwise
+
 import pytest
 from torch import nn
 
@@ -18,9 +20,9 @@ def test_warmup_rises_then_falls() -> None:
     factor = cosine_with_warmup(100, 10, 0.0)
     rates = [factor(step) for step in range(101)]
     assert rates[0] > 0
-    assert all(a < b for a, b in zip(rates[:10], rates[1:11], strict=True))
+    assert all(a < b for a, b in pairwise(rates[:11]))
     assert max(rates) == rates[10] == 1
-    assert all(a > b for a, b in zip(rates[10:], rates[11:], strict=False))
+    assert all(a > b for a, b in pairwise(rates[10:]))
 
 
 def test_only_matrices_decay_and_frozen_parameters_are_left_out() -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import torch
 
-from vg2gt.geometry.alignment import align_cameras
+from vg2gt.geometry.alignment import align_cameras, fit_depth_scale
 from vg2gt.geometry.cameras import relative_to_first, scale_translations
 from vg2gt.model import VG2GT
 from vg2gt.types import Batch, Cameras, Prediction
@@ -36,10 +36,14 @@ def joint_target_cameras(model: VG2GT, batch: Batch, prediction: Prediction) -> 
 
 
 def ground_truth_target_cameras(batch: Batch, prediction: Prediction) -> Cameras:
-    """Ground-truth cameras of the held-out views in the Gaussians' frame (protocol ``gt_pose``)."""
-    context = slice(0, batch.num_context)
-    similarity = align_cameras(batch.cameras.select(context), prediction.geometry.cameras)
-    return similarity.apply_cameras(batch.cameras.select(slice(batch.num_context, None)))
+    """Ground-truth cameras of the held-out views in the Gaussians' frame (protocol ``gt_pose``).
+
+    The similarity comes from the context cameras; where they stand still, its scale comes from the depth.
+    """
+    context = batch.context
+    by_depth = fit_depth_scale(context.depth, prediction.geometry.depth, context.depth > 0).nan_to_num(1.0)
+    similarity = align_cameras(context.cameras, prediction.geometry.cameras, by_depth)
+    return similarity.apply_cameras(batch.target.cameras)
 
 
 def _append(first: Cameras, second: Cameras) -> Cameras:

@@ -31,12 +31,14 @@ class Run:
         datamodule: training and evaluation scenes.
         trainer: Lightning's trainer.
         folder: the run's own folder, ``outputs/<name>``.
+        trial: one step of everything (``fast_dev_run``): no reports, no checkpoints.
     """
 
     module: VG2GTModule
     datamodule: LightningDataModule
     trainer: Trainer
     folder: Path
+    trial: bool
 
 
 def build(config: DictConfig) -> Run:
@@ -62,7 +64,7 @@ def build(config: DictConfig) -> Run:
         plugins=[AtomicCheckpointIO()],
         default_root_dir=config.output_dir,
     )
-    return Run(module, datamodule, trainer, Path(config.output_dir))
+    return Run(module, datamodule, trainer, Path(config.output_dir), bool(config.trainer.get("fast_dev_run")))
 
 
 def train(config: DictConfig) -> dict[str, Any]:
@@ -86,7 +88,7 @@ def train(config: DictConfig) -> dict[str, Any]:
 
     untrained = _untrained_metrics(run, resumed=checkpoint is not None)
     run.trainer.fit(run.module, datamodule=run.datamodule, ckpt_path=checkpoint, weights_only=True)
-    if not run.trainer.fast_dev_run and run.trainer.global_step < run.trainer.max_steps:
+    if not run.trial and run.trainer.global_step < run.trainer.max_steps:
         log.warning("training ended at step %d of %d", run.trainer.global_step, run.trainer.max_steps)
         return {}
     trained = _evaluate(run)
@@ -123,7 +125,7 @@ def _untrained_metrics(run: Run, resumed: bool) -> dict[str, float]:
     path = run.folder / "untrained.json"
     if resumed and path.is_file():
         return read_json(path)
-    if resumed or run.trainer.fast_dev_run:
+    if resumed or run.trial:
         return {}
     metrics = _evaluate(run)
     write_json(path, metrics)
@@ -132,7 +134,7 @@ def _untrained_metrics(run: Run, resumed: bool) -> dict[str, float]:
 
 def _report(run: Run, untrained: dict[str, float], trained: dict[str, float]) -> dict[str, Any]:
     report = {"untrained": untrained, "trained": trained, "steps": run.trainer.global_step}
-    if run.trainer.is_global_zero and not run.trainer.fast_dev_run:
+    if run.trainer.is_global_zero and not run.trial:
         write_json(run.folder / "metrics.json", report)
         write_text(run.folder / "metrics.md", comparison_table(untrained, trained))
         print_comparison(untrained, trained)

@@ -111,7 +111,7 @@ class Similarity(TensorRecord):
         return Cameras(pose, cameras.intrinsics, cameras.size)
 
 
-def align_cameras(predicted: Cameras, reference: Cameras) -> Similarity:
+def align_cameras(predicted: Cameras, reference: Cameras, still_scale: Tensor | None = None) -> Similarity:
     """The similarity that brings predicted cameras onto reference cameras of the same views.
 
     The rotation is the mean of the cameras' relative orientations (orthogonal Procrustes); given it, scale and
@@ -121,10 +121,11 @@ def align_cameras(predicted: Cameras, reference: Cameras) -> Similarity:
     Args:
         predicted: B scenes, V views.
         reference: the same views in another frame and unit.
+        still_scale: ``[B]`` scale of scenes whose cameras stand still in either frame, which say nothing of it; None
+            means 1.
 
     Returns:
         ``[B]`` similarities from the predicted to the reference frame, computed in float64, in the input's dtype.
-        Scenes whose cameras stand still in either frame have scale 1.
     """
     dtype = predicted.world_to_camera.dtype
     orientations = [cameras.world_to_camera[..., :3, :3].double() for cameras in (predicted, reference)]
@@ -135,7 +136,8 @@ def align_cameras(predicted: Cameras, reference: Cameras) -> Similarity:
     source_mean, target_mean = source.mean(1), target.mean(1)
     turned = (source - source_mean[:, None]) @ rotation.transpose(-1, -2)
     agreement = (turned * (target - target_mean[:, None])).sum((1, 2))
-    scale = torch.where(moves & (agreement > 0), agreement / turned.square().sum((1, 2)), 1.0)
+    still = torch.ones_like(agreement) if still_scale is None else still_scale.double()
+    scale = torch.where(moves & (agreement > 0), agreement / turned.square().sum((1, 2)), still)
     translation = target_mean - scale[:, None] * (rotation @ source_mean[..., None])[..., 0]
     return Similarity(scale.to(dtype), rotation.to(dtype), translation.to(dtype))
 

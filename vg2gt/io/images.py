@@ -15,7 +15,14 @@ from vg2gt.io.files import write_bytes
 
 # Anchors of a perceptually ordered map, near (bright) to far (dark); interpolated linearly.
 _DEPTH_ANCHORS = torch.tensor(
-    [[0.99, 0.91, 0.55], [0.97, 0.60, 0.32], [0.83, 0.28, 0.40], [0.50, 0.15, 0.50], [0.20, 0.07, 0.38], [0.02, 0.02, 0.10]]
+    [
+        [0.99, 0.91, 0.55],
+        [0.97, 0.60, 0.32],
+        [0.83, 0.28, 0.40],
+        [0.50, 0.15, 0.50],
+        [0.20, 0.07, 0.38],
+        [0.02, 0.02, 0.10],
+    ]
 )
 
 
