@@ -1,0 +1,328 @@
+"""Speed and memory of the renderer's implementations: ``python benchmarks/render.py [--quick] [--device cuda]``.
+
+All implementations are measured in one process, in turns, and compared by ratio; times are the best of several
+passes: core-milliseconds on a CPU (one thread unless the table says otherwise), milliseconds on a GPU. Prints tables
+and writes a dated JSON file to ``benchmarks/results``, and a plot of the scaling beside it if matplotlib is there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+import torch
+from render_scene import room_cameras, room_gaussians
+from rich.console import Console
+from rich.table import Table
+from torch import Tensor
+
+from vg2gt.io.files import write_json
+from vg2gt.rendering import render
+from vg2gt.types import Cameras, Gaussians
+
+PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
+
+
+@dataclass(frozen=True)
+class Case:
+    """One measurement."""
+
+    implementation: str
+    gaussians: int
+    size: tuple[int, int] = (224, 448)
+    views: int = 1
+    mode: str = "solid"
+    geometry: bool = True
+    threads: int = 1
+    sigma: float = 1.0
+
+    @property
+    def scene(self) -> tuple[Any, ...]:
+        """What two cases must share to be compared."""
+        return self.gaussians, self.size, self.views, self.threads
+
+
+@dataclass
+class Timing:
+    """Best times of a case in milliseconds, and the GPU's peak memory in MB."""
+
+    forward: float = float("inf")
+    backward: float = float("inf")
+    memory: float = 0.0
+
+    @property
+    def total(self) -> float:
+        """Forward and backward."""
+        return self.forward + self.backward
+
+
+def build(case: Case, device: torch.device) -> tuple[Gaussians, Cameras]:
+    """The case's scene on the device; parameters require gradients."""
+    gaussians = room_gaussians(case.gaussians, case.size, case.sigma).to(device)
+    gaussians = gaussians.map(lambda t: t.requires_grad_() if t.is_floating_point() else t)
+    return gaussians, room_cameras(case.views, case.size).to(device)
+
+
+def measure_once(case: Case, gaussians: Gaussians, cameras: Cameras) -> Timing:
+    """Times one forward and one backward pass with random incoming gradients."""
+    torch.set_num_threads(case.threads)
+    device = cameras.intrinsics.device
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)
+        before = torch.cuda.memory_allocated(device)
+    start = _now(device)
+    outputs = _run(case, gaussians, cameras)
+    middle = _now(device)
+    weights = [torch.randn_like(output) for output in outputs]
+    resume = _now(device)
+    torch.autograd.grad(outputs, [getattr(gaussians, name) for name in PARAMETERS], weights, allow_unused=True)
+    end = _now(device)
+    memory = (torch.cuda.max_memory_allocated(device) - before) / 1e6 if device.type == "cuda" else 0.0
+    return Timing(1e3 * (middle - start), 1e3 * (end - resume), memory)
+
+
+def _now(device: torch.device) -> float:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+        return time.perf_counter()
+    return time.process_time()
+
+
+def _run(case: Case, gaussians: Gaussians, cameras: Cameras) -> list[Tensor]:
+    if case.implementation == "gsplat":
+        return _run_gsplat(gaussians, cameras)
+    out = render(
+        gaussians,
+        cameras,
+        case.mode,  # type: ignore[arg-type]
+        implementation=case.implementation,  # type: ignore[arg-type]
+        geometry=case.geometry,
+    )
+    return [out.color, out.depth, out.normal, out.alpha] if case.geometry else [out.color]
+
+
+def _run_gsplat(gaussians: Gaussians, cameras: Cameras) -> list[Tensor]:
+    """The field's GPU rasteriser: colour and expected depth."""
+    from gsplat import rasterization  # pyright: ignore[reportMissingImports]
+
+    height, width = cameras.size
+    colors, alphas, _ = rasterization(
+        gaussians.means,
+        gaussians.quats,
+        gaussians.scales,
+        gaussians.opacities,
+        gaussians.sh,
+        cameras.world_to_camera[0],
+        cameras.intrinsics[0],
+        width,
+        height,
+        sh_degree=0,
+        render_mode="RGB+ED",
+    )
+    return [colors, alphas]
+
+
+def compare(cases: list[Case], device: torch.device, passes: int) -> list[Timing]:
+    """Measures the cases in turns; the first pass warms up."""
+    scenes = {}
+    for case in cases:
+        key = (case.gaussians, case.size, case.views, case.sigma)
+        if key not in scenes:
+            scenes[key] = build(case, device)
+    best = [Timing() for _ in cases]
+    for number in range(passes + 1):
+        for case, timing in zip(cases, best, strict=True):
+            slow = case.implementation == "dense"
+            if slow and number > 1:
+                continue
+            once = measure_once(case, *scenes[(case.gaussians, case.size, case.views, case.sigma)])
+            if number > 0:
+                timing.forward = min(timing.forward, once.forward)
+                timing.backward = min(timing.backward, once.backward)
+                timing.memory = max(timing.memory, once.memory)
+    return best
+
+
+def cpu_suites(quick: bool) -> dict[str, list[Case]]:
+    """Cases on a CPU by table."""
+    base = Case("cpu", 100_000)
+    cores = os.cpu_count() or 1
+    suites = {
+        "implementations": [
+            replace(base, gaussians=1_500, size=(40, 80), sigma=1.2, implementation=name)
+            for name in ("cpu", "torch", "dense")
+        ],
+        "outputs": [
+            base,
+            replace(base, geometry=False),
+            replace(base, mode="rasterized"),
+            replace(base, mode="rasterized", geometry=False),
+        ],
+    }
+    if quick:
+        return suites
+    for count in (20_000, 100_000):
+        sigma = 2.0 if count == 20_000 else 1.0
+        suites["implementations"] += [
+            replace(base, gaussians=count, sigma=sigma, implementation=name) for name in ("cpu", "torch")
+        ]
+    suites["Gaussians"] = [replace(base, gaussians=n) for n in (10_000, 30_000, 100_000, 300_000)]
+    suites["views"] = [replace(base, gaussians=30_000, views=v) for v in (1, 2, 4, 8)]
+    suites["threads"] = [replace(base, views=2, threads=t) for t in sorted({1, 2, cores // 2, cores} - {0})]
+    return suites
+
+
+def gpu_suites(quick: bool) -> dict[str, list[Case]]:
+    """Cases on a GPU by table; gsplat takes part where it is installed."""
+    try:
+        import gsplat  # noqa: F401  # pyright: ignore[reportMissingImports]
+
+        names = ("auto", "torch", "gsplat")
+    except ImportError:
+        names = ("auto", "torch")
+    sizes = ((224, 448),) if quick else ((224, 448), (518, 518))
+    counts, views = ((100_000,), (1, 8)) if quick else ((100_000, 1_000_000), (1, 8, 18))
+    base = Case("auto", 100_000)
+    return {
+        f"{height} x {width}": [
+            replace(base, implementation=name, gaussians=count, size=(height, width), views=number)
+            for count in counts
+            for number in views
+            for name in names
+            if not (name == "torch" and count * number > 1_000_000)
+        ]
+        for height, width in sizes
+    }
+
+
+def peak_memory(gaussians: int, views: int) -> float:
+    """Resident memory in MB a forward and backward pass adds to its inputs, measured in a process of its own."""
+    command = [sys.executable, __file__, "--memory-case", str(gaussians), str(views)]
+    return float(subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()[-1])
+
+
+def _memory_case(gaussians: int, views: int) -> None:
+    small = Case("cpu", 200, size=(16, 16))
+    measure_once(small, *build(small, torch.device("cpu")))
+    case = Case("cpu", gaussians, views=views)
+    scene = build(case, torch.device("cpu"))
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    Path("/proc/self/clear_refs").write_text("5")  # restarts the peak, which building the scene has raised
+    measure_once(case, *scene)
+    peak = next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM"))
+    print((int(peak.split()[1]) * 1024 - pages * resource.getpagesize()) / 1e6)
+
+
+def print_table(console: Console, title: str, cases: list[Case], timings: list[Timing], unit: str) -> None:
+    """One table: a row a case, with its ratio to the first case of the same scene."""
+    table = Table(title=f"{title} ({unit})")
+    for heading in ("implementation", "mode", "outputs", "Gaussians", "size", "views", "threads"):
+        table.add_column(heading)
+    for heading in ("forward", "backward", "total", "ratio"):
+        table.add_column(heading, justify="right")
+    if any(timing.memory for timing in timings):
+        table.add_column("peak MB", justify="right")
+    first: dict[tuple[Any, ...], float] = {}
+    for case, timing in zip(cases, timings, strict=True):
+        reference = first.setdefault(case.scene, timing.total)
+        row = [case.implementation, case.mode, "all" if case.geometry else "colour", f"{case.gaussians:,}"]
+        row += [f"{case.size[0]}x{case.size[1]}", str(case.views), str(case.threads)]
+        row += [f"{value:.1f}" for value in (timing.forward, timing.backward, timing.total)]
+        row += [f"{timing.total / reference:.2f}"] + ([f"{timing.memory:.0f}"] if timing.memory else [])
+        table.add_row(*row)
+    console.print(table)
+
+
+def plot_scaling(results: dict[str, tuple[list[Case], list[Timing]]], path: Path) -> Path | None:
+    """Writes the scaling with Gaussians, views and threads as a picture; None without matplotlib."""
+    try:
+        from matplotlib import pyplot  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        return None
+    axes: dict[str, Callable[[Case], int]] = {
+        "Gaussians": lambda case: case.gaussians,
+        "views": lambda case: case.views,
+        "threads": lambda case: case.threads,
+    }
+    chosen = [name for name in axes if name in results]
+    figure, panels = pyplot.subplots(1, len(chosen), figsize=(4 * len(chosen), 3), squeeze=False)
+    for panel, name in zip(panels[0], chosen, strict=True):
+        cases, timings = results[name]
+        for part in ("forward", "backward"):
+            panel.plot([axes[name](case) for case in cases], [getattr(t, part) for t in timings], "o-", label=part)
+        panel.set(xlabel=name, ylabel="core-milliseconds", ylim=(0, None))
+        panel.legend()
+    figure.tight_layout()
+    figure.savefig(path)
+    return path
+
+
+def machine(device: torch.device) -> dict[str, Any]:
+    """What was measured on."""
+    name = platform.processor() or platform.machine()
+    info = Path("/proc/cpuinfo")
+    if info.exists():
+        models = [line.split(":")[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")]
+        name = models[0] if models else name
+    found = {
+        "processor": name,
+        "cores": os.cpu_count(),
+        "torch": torch.__version__,
+        "python": platform.python_version(),
+    }
+    if device.type == "cuda":
+        found["gpu"] = torch.cuda.get_device_name(device)
+    return found
+
+
+def main() -> None:
+    """Measures, prints and writes."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    parser.add_argument("--quick", action="store_true", help="the small tables only")
+    parser.add_argument("--passes", type=int, default=3)
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
+    parser.add_argument("--memory-case", type=int, nargs=2, help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.memory_case:
+        gaussians, views = arguments.memory_case
+        _memory_case(gaussians, views)
+        return
+    device, console = torch.device(arguments.device), Console(width=120)
+    where = machine(device)
+    console.print(json.dumps(where))
+    suites = (gpu_suites if device.type == "cuda" else cpu_suites)(arguments.quick)
+    unit = "milliseconds" if device.type == "cuda" else "core-milliseconds"
+    results: dict[str, tuple[list[Case], list[Timing]]] = {}
+    for title, cases in suites.items():
+        results[title] = cases, compare(cases, device, arguments.passes)
+        print_table(console, title, *results[title], unit)
+    memory = {}
+    if device.type == "cpu" and Path("/proc/self/clear_refs").exists():
+        for gaussians, views in ((100_000, 1),) if arguments.quick else ((100_000, 1), (300_000, 8)):
+            memory[f"{gaussians} Gaussians, {views} views"] = peak_memory(gaussians, views)
+        console.print("peak memory above inputs, MB:", memory)
+    stem = f"{date.today().isoformat()}-render-{device.type}"
+    tables = {
+        title: [asdict(case) | asdict(timing) for case, timing in zip(*result, strict=True)]
+        for title, result in results.items()
+    }
+    content = {"machine": where, "unit": unit, "passes": arguments.passes, "tables": tables, "peak_memory_mb": memory}
+    console.print(str(write_json(arguments.out / f"{stem}.json", content)))
+    if plot := plot_scaling(results, arguments.out / f"{stem}.png"):
+        console.print(str(plot))
+
+
+if __name__ == "__main__":
+    main()
