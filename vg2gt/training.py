@@ -91,6 +91,7 @@ def train(config: DictConfig) -> dict[str, Any]:
     if not run.trial and run.trainer.global_step < run.trainer.max_steps:
         log.warning("training ended at step %d of %d", run.trainer.global_step, run.trainer.max_steps)
         return {}
+    _save_last(run)
     trained = _evaluate(run)
     return _report(run, untrained, trained)
 
@@ -113,6 +114,13 @@ def _checkpoint_to_resume(config: DictConfig) -> Path | None:
         for path in old:
             path.unlink()
     return None
+
+
+def _save_last(run: Run) -> None:
+    """Saves the final weights where the last step was not a checkpoint's turn."""
+    path = run.folder / "checkpoints" / f"step={run.trainer.global_step}.ckpt"
+    if not run.trial and not path.is_file():
+        run.trainer.save_checkpoint(path)
 
 
 def _evaluate(run: Run) -> dict[str, float]:
