@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.training_helpers import SMALL, cache_overrides, small_config, with_crash
+from tests.training_helpers import SMALL, small_config, with_crash
 from vg2gt.checkpoints import newest_valid, read_checkpoint
 from vg2gt.training import build, train
 
@@ -95,14 +95,13 @@ def test_killed_and_resumed_equals_uninterrupted(tmp_path: Path, cache: Path, fu
 
 
 def test_sigterm_saves_and_ends(tmp_path: Path, cache: Path) -> None:
-    overrides = [*SMALL, f"output_dir={tmp_path}", f"hydra.run.dir={tmp_path}", *cache_overrides(cache)]
+    overrides = [*SMALL, f"output_dir={tmp_path}", f"hydra.run.dir={tmp_path}", f"data.cache_dir={cache}"]
     overrides += ["trainer.max_steps=100000", "callbacks.checkpoint.every_n_train_steps=100000"]
     process = subprocess.Popen(
         [sys.executable, "-m", "vg2gt.cli", "train", *overrides], stderr=subprocess.PIPE, text=True
     )
     deadline = time.monotonic() + 240
-    log = tmp_path / "logs" / "metrics.csv"
-    while process.poll() is None and time.monotonic() < deadline and not log.is_file():
+    while process.poll() is None and time.monotonic() < deadline and not list(tmp_path.glob("logs/*/metrics.csv")):
         time.sleep(0.2)
     process.send_signal(signal.SIGTERM)
     _, errors = process.communicate(timeout=120)

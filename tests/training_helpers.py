@@ -26,14 +26,9 @@ SMALL = [
 ]
 
 
-def cache_overrides(cache: Path) -> list[str]:
-    """Overrides that keep the rooms in a folder of the test."""
-    return [f"data.{part}.cache_dir={cache}" for part in ("train", "val")]
-
-
 def small_config(folder: Path, cache: Path, *overrides: str) -> DictConfig:
     """Composes the default configuration with :data:`SMALL` and ``overrides``."""
-    fixed = [f"output_dir={folder}", "hydra/job_logging=default", *cache_overrides(cache)]
+    fixed = [f"output_dir={folder}", "hydra/job_logging=default", f"data.cache_dir={cache}"]
     with initialize_config_dir(config_dir(), version_base="1.3"):
         return compose("train", [*fixed, *SMALL, *overrides])
 

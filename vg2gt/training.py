@@ -21,6 +21,14 @@ from vg2gt.report import comparison_table, print_comparison
 
 log = logging.getLogger(__name__)
 
+EXPECTED_WARNINGS = (
+    r"Found \d+ module\(s\) in eval mode",  # the frozen backbone
+    r"You're resuming from a checkpoint that ended before the epoch",  # batches are a function of the step's number
+    r"Checkpoint directory .* exists and is not empty",  # ckpt=last
+    r"The '\w+_dataloader' does not have many workers",  # rooms come from the memory cache
+    r".*isinstance\(treespec, LeafSpec\)",  # inside Lightning
+)
+
 
 @dataclass(frozen=True)
 class Run:
@@ -44,8 +52,8 @@ class Run:
 def build(config: DictConfig) -> Run:
     """Instantiates everything the configuration names; each part's constructor is its schema."""
     lightning.seed_everything(config.seed, workers=True, verbose=False)
-    # The frozen backbone is in eval mode on purpose.
-    warnings.filterwarnings("ignore", message=r"Found \d+ module\(s\) in eval mode", category=UserWarning)
+    for message in EXPECTED_WARNINGS:
+        warnings.filterwarnings("ignore", message=message)
     datamodule = instantiate(config.data)
     backend = instantiate(config.backend)
     model = instantiate(config.model, backend=backend)
