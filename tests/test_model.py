@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from tests.training_helpers import small_config
+from vg2gt.losses import VG2GTLoss
 from vg2gt.model import VG2GT, SceneScale
 from vg2gt.protocols import ground_truth_target_cameras, training_cameras
 from vg2gt.training import Run, build
@@ -49,7 +50,7 @@ def test_untrained_head_renders_the_room_without_holes(run: Run, model: VG2GT, b
     rendered = run.module.renderer(prediction.gaussians, cameras)
     seen = prediction.geometry.depth > 0
     assert float((rendered.depth[seen] == 0).float().mean()) < 0.005
-    error = (rendered.color - batch.context.images).abs().mean()
+    error = (rendered.color.detach() - batch.context.images).abs().mean()
     assert float(error) < 0.1
 
 
@@ -83,6 +84,36 @@ def test_gradient_reaches_the_last_coarse_layer_first_and_the_transformer_next(r
     assert torch.equal(prediction.geometry.cameras.world_to_camera, prediction.initial.cameras.world_to_camera)
     assert not torch.equal(prediction.geometry.depth, prediction.initial.depth)
     model.coarse.load_state_dict(saved)
+
+
+def test_hinge_answers_harmful_token_changes_only(run: Run, model: VG2GT, batch: Batch) -> None:
+    """The tokens move along the gradient of the decoded depth's error: uphill is punished, downhill left alone."""
+    context, backend = batch.context, model.backend
+    hinge_only = hinge_alone(run.module.loss)
+    tokens = backend.encode(context.images, context.hints)
+    before = model(context.images, context.hints)
+
+    def hinge(change: tuple[torch.Tensor, ...]) -> torch.Tensor:
+        patch = tuple(tap + delta for tap, delta in zip(tokens.patch, change, strict=True))
+        depth = backend.decode(tokens.with_patch(patch)).depth * before.unit[:, None, None, None]
+        return hinge_only(replace(before, geometry=replace(before.geometry, depth=depth)), context).total
+
+    error = [torch.zeros_like(tap).requires_grad_() for tap in tokens.patch]
+    scaled = tuple(tap + delta for tap, delta in zip(tokens.patch, error, strict=True))
+    wrong = (backend.decode(tokens.with_patch(scaled)).depth - context.depth).abs().mean()
+    uphill = torch.autograd.grad(wrong, error)
+    step = 3.0 / float(torch.stack([g.abs().max() for g in uphill]).max())
+    for sign, expected in ((1.0, True), (-0.1, False)):
+        change = [(sign * step * gradient).requires_grad_() for gradient in uphill]
+        loss = hinge(tuple(change))
+        gradients = torch.autograd.grad(loss, change)
+        assert (float(loss.detach()) > 0) is expected
+        assert any(bool((gradient != 0).any()) for gradient in gradients) is expected
+
+
+def hinge_alone(loss: VG2GTLoss) -> VG2GTLoss:
+    """The objective with the enhancement hinge alone."""
+    return VG2GTLoss(geometry=replace(loss.geometry, depth=0.0, point=0.0), enhance=loss.enhance)
 
 
 def test_held_out_images_never_touch_the_gaussians(model: VG2GT, batch: Batch) -> None:
