@@ -64,9 +64,10 @@ def check_cameras(cameras: Cameras) -> None:
 
 def check_finite(name: str, tensor: Tensor) -> None:
     """Raises ValueError if a tensor holds NaN or infinity, naming it and the first bad position."""
-    finite = torch.isfinite(tensor.detach())
-    if not finite.all():
-        where = torch.nonzero(~finite)
+    if torch.isfinite(tensor.detach().sum()):  # the common case in one fast pass
+        return
+    where = torch.nonzero(~torch.isfinite(tensor))
+    if len(where):
         raise ValueError(
             f"{name} holds {len(where)} NaN or infinite values, the first at {where[0].tolist()}; "
             "look for a diverging loss or an invalid input upstream"

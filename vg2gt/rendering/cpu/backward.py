@@ -42,12 +42,14 @@ from vg2gt.rendering.cpu.tiles import (
     ONE,
     REST,
     ROW,
+    STAGED,
     SUMS,
     TILE,
     TWO,
     ZERO,
     any_alive,
     exp,
+    stage,
     start_rays,
 )
 
@@ -126,23 +128,27 @@ def _reduce_geometry(sums, row):
 
 
 @njit(fastmath=FAST, error_model="numpy", nogil=True, cache=True)
-def _backward_tile(records, colors, boxes, members, slots, x_tile, y_tile, geometry, parameters, state, sums, rows):
+def _backward_tile(
+    records, colors, boxes, members, x_tile, y_tile, geometry, parameters, state, sums, staged, spans, rows
+):
     """Visits a tile's Gaussians front to back again and writes one gradient row for each."""
     alpha_max, stop = parameters[0], parameters[1]
     visited = len(members)
     for p in range(len(members)):
-        if p % 8 == 7 and not any_alive(state):
-            visited = p
-            break
-        i = np.uintp(members[p])
-        g = records[i]
+        j = p % STAGED
+        if j == 0:
+            if not any_alive(state):
+                visited = p
+                break
+            stage(records, colors, boxes, members[p : p + STAGED], x_tile, y_tile, staged, spans)
+        g = staged[j]
         uc, vc, qa, qb, qc, q0, q1, z = g[0], g[1], g[2], g[3], g[4], g[5], g[6], g[7]
         a0, eps, opacity, cutoff = g[8], g[9], g[10], g[11]
         n0, n1, n2 = g[12], g[13], g[14]
-        c0, c1, c2 = colors[i, 0], colors[i, 1], colors[i, 2]
+        c0, c1, c2 = g[16], g[17], g[18]
         left = np.float32(x_tile) - uc
         sums[:] = ZERO
-        for y in range(max(boxes[i, 2] - y_tile, 0), min(boxes[i, 3] - y_tile, TILE)):
+        for y in range(spans[j, 2], spans[j, 3]):
             dy = np.float32(y_tile + y) - vc
             s_row, e_row, f_row = ONE + q1 * dy, qc * dy * dy, TWO * qb * dy
             base = np.uintp(y * TILE)
@@ -248,19 +254,19 @@ def _backward_tile(records, colors, boxes, members, slots, x_tile, y_tile, geome
                 sums[M2 + v] += weight * g5
                 sums[GZ + v] += gt * s * inverse
                 sums[GP + v] += gp * r
-        row = rows[slots[p]]
+        row = rows[p]
         _reduce_color(sums, g, left, row)
         if geometry:
             _reduce_geometry(sums, row)
     for p in range(visited, len(members)):
-        row = rows[slots[p]]
+        row = rows[p]
         for j in range(ROW):
             row[j] = ZERO
 
 
 @njit(fastmath=FAST, error_model="numpy", nogil=True, cache=True)
 def backward_tiles(
-    records, boxes, colors, members, slots, starts, tiles, geometry, parameters, state, sums,
+    records, boxes, colors, members, starts, tiles, geometry, parameters, state, sums, staged, spans,
     color, normal, depth, transmittance,
     grad_color, grad_normal, grad_alpha, grad_solid, grad_expected, grad_crossing, rows,
 ):  # fmt: skip
@@ -278,6 +284,6 @@ def backward_tiles(
         )  # fmt: skip
         begin, end = starts[tile], starts[tile + 1]
         _backward_tile(
-            records, colors, boxes, members[begin:end], slots[begin:end], x_tile, y_tile, geometry, parameters,
-            state, sums, rows,
+            records, colors, boxes, members[begin:end], x_tile, y_tile, geometry, parameters,
+            state, sums, staged, spans, rows[begin:end],
         )  # fmt: skip

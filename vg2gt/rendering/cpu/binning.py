@@ -56,8 +56,8 @@ def count_tiles(boxes, visible, across, counts, offsets, starts):
 
 
 @njit(error_model="numpy", nogil=True, cache=True)
-def fill_tiles(boxes, visible, across, offsets, starts, members, slots):
-    """Writes the tiles' lists, front to back: Gaussian, and slot of its gradient row (a Gaussian's slots adjoin)."""
+def fill_tiles(boxes, visible, across, offsets, starts, members, places):
+    """Writes the tiles' lists, front to back, and every Gaussian's places in them (adjoining, from its offset)."""
     ends = np.empty(len(starts) - 1, np.int64)
     for k in range(len(ends)):
         ends[k] = starts[k]
@@ -69,6 +69,6 @@ def fill_tiles(boxes, visible, across, offsets, starts, members, slots):
             for x in range(x0, x1 + 1):
                 position = ends[y * across + x]
                 members[position] = i
-                slots[position] = slot
+                places[slot] = position
                 ends[y * across + x] = position + 1
                 slot += 1

@@ -45,34 +45,38 @@ from vg2gt.rendering.cpu.tiles import (
     PRECISION,
     QUARTER,
     SLOT,
+    STAGED,
     TILE,
     TWO,
     ZERO,
     any_alive,
     exp,
+    stage,
     start_rays,
 )
 
 
 @njit(fastmath=FAST, error_model="numpy", nogil=True, cache=True)
-def _blend_tile(records, colors, boxes, members, x_tile, y_tile, geometry, solid, parameters, state, hits):
+def _blend_tile(
+    records, colors, boxes, members, x_tile, y_tile, geometry, solid, parameters, state, hits, staged, spans
+):
     """Blends one tile front to back; returns the largest number of hits kept for the depth solver."""
     alpha_max, stop, negligible = parameters[0], parameters[1], parameters[4]
     capacity = len(hits) // (TILE * HIT_SIZE)
     last_slot = np.int32(capacity - 1)
     for p in range(len(members)):
-        if p % 8 == 7 and not any_alive(state):
-            break
-        i = np.uintp(members[p])
-        g = records[i]
+        j = p % STAGED
+        if j == 0:
+            if not any_alive(state):
+                break
+            stage(records, colors, boxes, members[p : p + STAGED], x_tile, y_tile, staged, spans)
+        g = staged[j]
         uc, vc, qa, qb, qc, q0, q1, z = g[0], g[1], g[2], g[3], g[4], g[5], g[6], g[7]
         a0, eps, opacity, cutoff = g[8], g[9], g[10], g[11]
         n0, n1, n2 = g[12], g[13], g[14]
-        c0, c1, c2 = colors[i, 0], colors[i, 1], colors[i, 2]
+        c0, c1, c2 = g[16], g[17], g[18]
         left = np.float32(x_tile) - uc
-        first = max(boxes[i, 0] - x_tile, 0)
-        last = min(boxes[i, 1] - x_tile, TILE)
-        top, bottom = max(boxes[i, 2] - y_tile, 0), min(boxes[i, 3] - y_tile, TILE)
+        first, last, top, bottom = spans[j, 0], spans[j, 1], spans[j, 2], spans[j, 3]
         for y in range(top, bottom):
             dy = np.float32(y_tile + y) - vc
             s_row, e_row, f_row = ONE + q1 * dy, qc * dy * dy, TWO * qb * dy
@@ -260,7 +264,7 @@ def _solve_row(state, hits, y, parameters, bisections, newton_steps):
 @njit(fastmath=FAST, error_model="numpy", nogil=True, cache=True)
 def forward_tiles(
     records, boxes, colors, members, starts, tiles, solid, expected, geometry, bisections, newton_steps,
-    parameters, background, state, hits, color, normal, depth, slope, transmittance,
+    parameters, background, state, hits, staged, spans, color, normal, depth, slope, transmittance,
 ):  # fmt: skip
     """Renders the tiles ``tiles[0] .. tiles[1] - 1`` of one view into the images."""
     height, width = depth.shape
@@ -273,7 +277,9 @@ def forward_tiles(
         while True:
             state[:] = ZERO
             start_rays(state, columns, rows)
-            most = _blend_tile(records, colors, boxes, mine, x_tile, y_tile, geometry, solid, parameters, state, room)
+            most = _blend_tile(
+                records, colors, boxes, mine, x_tile, y_tile, geometry, solid, parameters, state, room, staged, spans
+            )
             if most * HIT_SIZE * TILE <= len(room):
                 break
             room = np.zeros(TILE * most * HIT_SIZE, hits.dtype)

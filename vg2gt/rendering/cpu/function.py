@@ -45,7 +45,7 @@ class _Lists:
     offsets: np.ndarray
     starts: np.ndarray
     members: np.ndarray
-    slots: np.ndarray
+    places: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,8 @@ class _Rasterize(torch.autograd.Function):
             images = (color[index], normal[index], depth[index], transmittance[index])
             incoming = (grad_color[index], grad_normal[index], of_alpha, solid, expected, crossing)
             _backward(view, lists, options, geometry, images, incoming, rows, grads, index)
-        grads[7] = np.einsum("vhwc,vhw->c", grad_color, transmittance)
+        if ctx.needs_input_grad[7]:
+            grads[7] = np.einsum("vhwc,vhw->c", grad_color, transmittance)
         result = [
             torch.from_numpy(grad) if needed else None
             for grad, needed in zip(grads, ctx.needs_input_grad[:8], strict=True)
@@ -161,9 +162,9 @@ def _prepare(view: _View, options: RenderOptions) -> _Lists:
     counts, offsets = np.empty(total, np.int32), np.empty(total, np.int64)
     starts = np.empty(view.tiles + 1, np.int64)
     count_tiles(boxes, visible, view.across, counts, offsets, starts)
-    members, slots = np.empty(starts[-1], np.int32), np.empty(starts[-1], np.int64)
-    fill_tiles(boxes, visible, view.across, offsets, starts, members, slots)
-    return _Lists(records, boxes, counts, offsets, starts, members, slots)
+    members, places = np.empty(starts[-1], np.int32), np.empty(starts[-1], np.int64)
+    fill_tiles(boxes, visible, view.across, offsets, starts, members, places)
+    return _Lists(records, boxes, counts, offsets, starts, members, places)
 
 
 def _parameters(options: RenderOptions, dtype: np.dtype) -> np.ndarray:
@@ -173,13 +174,28 @@ def _parameters(options: RenderOptions, dtype: np.dtype) -> np.ndarray:
     return np.array(values, dtype)
 
 
-def _scratch(dtype: np.dtype) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """This thread's planes, sums and hits; the hits must start finite."""
+@dataclass(frozen=True)
+class _Scratch:
+    """One thread's working memory (names as in the kernels); the hits must start finite."""
+
+    state: np.ndarray
+    sums: np.ndarray
+    hits: np.ndarray
+    staged: np.ndarray
+    spans: np.ndarray
+
+
+def _scratch(dtype: np.dtype) -> _Scratch:
+    """This thread's working memory, kept between calls."""
     buffers = _local.__dict__.setdefault("buffers", {})
     if dtype not in buffers:
-        hits = np.zeros(tiles.TILE * HIT_CAPACITY * tiles.HIT_SIZE, dtype)
-        planes, sums = np.zeros(tiles.PLANES * tiles.PLANE, dtype), np.zeros(tiles.LANE_ROWS * tiles.TILE, dtype)
-        buffers[dtype] = (planes, sums, hits)
+        buffers[dtype] = _Scratch(
+            np.zeros(tiles.PLANES * tiles.PLANE, dtype),
+            np.zeros(tiles.LANE_ROWS * tiles.TILE, dtype),
+            np.zeros(tiles.TILE * HIT_CAPACITY * tiles.HIT_SIZE, dtype),
+            np.zeros((tiles.STAGED, tiles.RECORD + 3), dtype),
+            np.zeros((tiles.STAGED, 4), np.int64),
+        )
     return buffers[dtype]
 
 
@@ -193,11 +209,11 @@ def _forward(view: _View, lists: _Lists, options: RenderOptions, *outputs: np.nd
     solid, expected = options.mode == "solid", options.depth == "expected"
 
     def run(item: int) -> None:
-        state, _, hits = _scratch(view.means.dtype)
+        scratch = _scratch(view.means.dtype)
         forward_tiles(
             lists.records, lists.boxes, view.colors, lists.members, lists.starts, items[item], solid, expected,
-            options.geometry, options.bisections, options.newton_steps, parameters, view.background, state, hits,
-            *outputs,
+            options.geometry, options.bisections, options.newton_steps, parameters, view.background,
+            scratch.state, scratch.hits, scratch.staged, scratch.spans, *outputs,
         )  # fmt: skip
 
     parallel_for(len(items), run)
@@ -242,10 +258,10 @@ def _backward(
     solid = options.mode == "solid"
 
     def raster_item(item: int) -> None:
-        state, sums, _ = _scratch(view.means.dtype)
+        scratch = _scratch(view.means.dtype)
         backward_tiles(
-            lists.records, lists.boxes, view.colors, lists.members, lists.slots, lists.starts, items[item], geometry,
-            parameters, state, sums, *images, *incoming, rows,
+            lists.records, lists.boxes, view.colors, lists.members, lists.starts, items[item], geometry,
+            parameters, scratch.state, scratch.sums, scratch.staged, scratch.spans, *images, *incoming, rows,
         )  # fmt: skip
 
     parallel_for(len(items), raster_item)
@@ -255,7 +271,7 @@ def _backward(
     def project_item(block: int) -> None:
         project_backward_block(
             block, view.means, view.quats, view.scales, view.opacities, view.pose, view.intrinsics, height, width,
-            options.lowpass, solid, lists.boxes, lists.counts, lists.offsets, rows, index % len(colors),
+            options.lowpass, solid, lists.boxes, lists.counts, lists.offsets, lists.places, rows, index % len(colors),
             means, quats, scales, opacities, colors, cameras,
         )  # fmt: skip
 

@@ -17,6 +17,7 @@ TILE = 16
 RECORD = 16  # projected Gaussian: centre 2, conic 3, tilt 2, z, a0, eps, opacity, cutoff, normal 3, unused
 ROW = 16  # gradient of one (tile, Gaussian): centre 2, conic 3, tilt 2, z, a0, opacity, colour 3, normal 3
 PLANES = 18  # of TILE * TILE values: the state of a tile
+STAGED = 16  # Gaussians copied at a time, with their colours
 LANE_ROWS = 15  # of TILE values: the sums of one Gaussian
 HIT_SIZE = 3 * TILE  # one hit of 16 rays: alpha, peak, precision
 HIT, HIT_PEAK, HIT_PRECISION = np.uintp(HIT_SIZE), np.uintp(TILE), np.uintp(2 * TILE)
@@ -76,6 +77,23 @@ def any_alive(state):
     for k in range(PLANE):
         most = max(most, state[k])
     return most > ZERO
+
+
+@njit(error_model="numpy", nogil=True, cache=True)
+def stage(records, colors, boxes, members, x_tile, y_tile, staged, spans):
+    """Copies the next Gaussians of a tile side by side, so that their cache misses overlap.
+
+    ``staged`` receives the record and, from column RECORD on, the colour; ``spans`` the box clipped to the tile, in its
+    own pixels: columns first and last, rows first and last (ends excluded).
+    """
+    for j in range(len(members)):
+        i = np.uintp(members[j])
+        for k in range(RECORD):
+            staged[j, k] = records[i, k]
+        for k in range(3):
+            staged[j, RECORD + k] = colors[i, k]
+        spans[j, 0], spans[j, 1] = max(boxes[i, 0] - x_tile, 0), min(boxes[i, 1] - x_tile, TILE)
+        spans[j, 2], spans[j, 3] = max(boxes[i, 2] - y_tile, 0), min(boxes[i, 3] - y_tile, TILE)
 
 
 @njit(fastmath=FAST, error_model="numpy", nogil=True, cache=True)
