@@ -82,7 +82,7 @@ class Backbone(nn.Module):
         grid = (images.shape[-2] // self.patch_size, images.shape[-1] // self.patch_size)
         x = self._embed(images.flatten(0, 1), grid).unflatten(0, (batch, views))
         local_rotary, global_rotary = self._rotary(grid, views, x)
-        choose = camera_tokens is None and reference != "first" and views >= MIN_VIEWS_TO_CHOOSE
+        choose = camera_tokens is None and reference != "first"
         order: Tensor | None = None
         local, tapped, camera = x, [], x[:, :, 0]
         for index, block in enumerate(self.blocks):
@@ -141,7 +141,7 @@ class PretrainedBackbone(nn.Module):
 
 
 def select_reference(tokens: Tensor, strategy: ReferenceView) -> Tensor:
-    """Chooses one view a scene from class tokens ``[B, V, C]``; returns int64 ``[B]``.
+    """Chooses one view a scene from class tokens ``[B, V, C]``; returns int64 ``[B]``, 0 for fewer than three views.
 
     ``saddle_balanced`` takes the view nearest to the middle of three ranges, each scaled to [0, 1] over the views: mean
     cosine similarity to the others, token norm, and variance of the normalised token.
@@ -149,12 +149,18 @@ def select_reference(tokens: Tensor, strategy: ReferenceView) -> Tensor:
     batch, views = tokens.shape[:2]
     if strategy == "first":
         return torch.zeros(batch, dtype=torch.int64, device=tokens.device)
-    if strategy == "middle":
-        return torch.full((batch,), views // 2, dtype=torch.int64, device=tokens.device)
+    middle = torch.full((batch,), views // 2, dtype=torch.int64, device=tokens.device)
+    chosen = _saddle_balanced(tokens) if strategy == "saddle_balanced" else middle
+    # The number of views as a tensor: a Python comparison would fix it under export.
+    enough = torch.full((), views, device=tokens.device) >= MIN_VIEWS_TO_CHOOSE
+    return torch.where(enough, chosen, 0)
+
+
+def _saddle_balanced(tokens: Tensor) -> Tensor:
     tokens = tokens.float()
     length = tokens.norm(dim=-1)
     unit = tokens / length[..., None]
-    similarity = ((unit @ unit.mT).sum(-1) - 1) / (views - 1)
+    similarity = ((unit @ unit.mT).sum(-1) - 1) / (tokens.shape[1] - 1)
     measures = torch.stack((similarity, length, unit.var(-1)))
     low, high = measures.amin(-1, keepdim=True), measures.amax(-1, keepdim=True)
     scaled = (measures - low) / (high - low + 1e-8)

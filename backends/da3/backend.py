@@ -27,20 +27,53 @@ RAY_BRANCH = tuple(
 NESTED_PARTS = ("model.da3.", "model.da3_metric.")  # a nested file holds two networks
 
 
-class DA3Network(nn.Module):
-    """Backbone, depth head, camera decoder and, if wanted, camera encoder; names and shapes as published."""
+class DA3Decoder(nn.Module):
+    """What stands behind the tokens: depth head and camera decoder; names and shapes as published.
+
+    Args:
+        token_dim: channels of the tokens.
+        features: DPT width.
+        out_channels: DPT channels of the four taps.
+        patch_size: in pixels.
+    """
+
+    def __init__(self, token_dim: int, features: int, out_channels: Sequence[int], patch_size: int) -> None:
+        super().__init__()
+        self.arguments = {
+            "token_dim": token_dim,
+            "features": features,
+            "out_channels": list(out_channels),
+            "patch_size": patch_size,
+        }
+        self.head = DPT(token_dim, features, out_channels, 2, patch_size)
+        self.cam_dec = CameraDecoder(token_dim)
+
+    def decode(self, tokens: Tokens, chunk: int | None) -> Geometry:
+        """See :meth:`Backend.decode`; at most ``chunk`` views at a time go through the depth head."""
+        with full_precision(tokens.camera):
+            out = in_chunks(self.head, tokens.patch, tokens.grid, chunk)
+            camera_to_world, intrinsics = decode_pose(self.cam_dec(tokens.camera), tokens.size)
+        depth, confidence = out[:, :, 0].exp(), 1 + out[:, :, 1].exp()
+        cameras = Cameras(invert_rigid(camera_to_world), intrinsics, tokens.size)
+        return Geometry(depth, confidence, cameras, torch.ones_like(depth[:, 0, 0, 0]))
+
+
+class DA3Network(DA3Decoder):
+    """The decoder with its backbone and, if wanted, camera encoder; names and shapes as published.
+
+    Args:
+        backbone: images to tokens.
+        cam_enc: known cameras to camera tokens.
+        features: DPT width.
+        out_channels: DPT channels of the four taps.
+    """
 
     def __init__(
-        self,
-        backbone: Backbone,
-        head: DPT,
-        cam_dec: CameraDecoder,
-        cam_enc: CameraEncoder | None,
+        self, backbone: Backbone, cam_enc: CameraEncoder | None, features: int, out_channels: Sequence[int]
     ) -> None:
-        super().__init__()
+        token_dim = 2 * backbone.cls_token.shape[-1]
+        super().__init__(token_dim, features, out_channels, backbone.patch_size)
         self.backbone = PretrainedBackbone(backbone)
-        self.head = head
-        self.cam_dec = cam_dec
         self.cam_enc = cam_enc
 
 
@@ -116,9 +149,9 @@ class DA3Backend(Backend):
         def make() -> DA3Network:
             network = DA3Network(
                 Backbone(dim, depth, num_heads, ffn, multiview_from, image_size, patch_size),
-                DPT(2 * dim, features, out_channels, 2, patch_size),
-                CameraDecoder(2 * dim),
                 CameraEncoder(dim, camera_depth, camera_heads) if given_poses else None,
+                features,
+                out_channels,
             )
             _face_forward(network.cam_dec)
             return network
@@ -135,13 +168,17 @@ class DA3Backend(Backend):
     def encode(self, images: Tensor, hints: Hints | None = None) -> Tokens:
         """See :meth:`Backend.encode`; ``hints.cameras`` are used if ``given_poses``."""
         self.check_images(images)
-        given = None
         if self.given_poses:
-            cameras = self.require_hints(images, hints, "cameras").cameras
-            assert cameras is not None
-            assert self.network.cam_enc is not None
+            hints = self.require_hints(images, hints, "cameras")
+        return self.encode_checked(images, hints)
+
+    @torch.no_grad()
+    def encode_checked(self, images: Tensor, hints: Hints | None) -> Tokens:
+        """Encodes what :meth:`encode` has checked: tensor operations only, so that it can be exported."""
+        given = None
+        if self.network.cam_enc is not None and hints is not None and hints.cameras is not None:
             with full_precision(images):
-                given = self.network.cam_enc(normalize_cameras(cameras))
+                given = self.network.cam_enc(normalize_cameras(hints.cameras))
         return self.encode_with(images, given)
 
     @torch.no_grad()
@@ -157,12 +194,7 @@ class DA3Backend(Backend):
 
     def decode(self, tokens: Tokens) -> Geometry:
         """See :meth:`Backend.decode`; the principal point is (W/2, H/2)."""
-        with full_precision(tokens.camera):
-            out = in_chunks(self.network.head, tokens.patch, tokens.grid, self.head_chunk)
-            camera_to_world, intrinsics = decode_pose(self.network.cam_dec(tokens.camera), tokens.size)
-        depth, confidence = out[:, :, 0].exp(), 1 + out[:, :, 1].exp()
-        cameras = Cameras(invert_rigid(camera_to_world), intrinsics, tokens.size)
-        return Geometry(depth, confidence, cameras, torch.ones_like(depth[:, 0, 0, 0]))
+        return self.network.decode(tokens, self.head_chunk)
 
 
 @torch.no_grad()

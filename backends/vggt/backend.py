@@ -7,13 +7,11 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from backends.base import Backend, full_precision, half_precision_on_gpu
-from backends.dpt import in_chunks
-from backends.poses import decode_pose
+from backends.base import Backend, half_precision_on_gpu
 from backends.vggt.camera_head import ITERATIONS
-from backends.vggt.network import VGGTNetwork
+from backends.vggt.network import Aggregator, VGGTNetwork
 from backends.weights import Weights
-from vg2gt.types import Cameras, Geometry, Hints, Tokens
+from vg2gt.types import Geometry, Hints, Tokens
 
 IGNORABLE = ("track_head.", "point_head.", "aggregator.patch_embed.mask_token")
 
@@ -72,18 +70,8 @@ class VGGTBackend(Backend):
         self.head_chunk = head_chunk
 
         def make() -> VGGTNetwork:
-            network = VGGTNetwork(
-                dim,
-                depth,
-                encoder_depth,
-                num_heads,
-                features,
-                out_channels,
-                camera_depth,
-                camera_heads,
-                image_size,
-                patch_size,
-            )
+            aggregator = Aggregator(dim, depth, encoder_depth, num_heads, image_size, patch_size)
+            network = VGGTNetwork(aggregator, features, out_channels, camera_depth, camera_heads)
             _face_forward(network.camera_head.pose_branch.fc2)
             return network
 
@@ -97,6 +85,11 @@ class VGGTBackend(Backend):
     def encode(self, images: Tensor, hints: Hints | None = None) -> Tokens:
         """See :meth:`Backend.encode`; hints are not used."""
         self.check_images(images)
+        return self.encode_checked(images, hints)
+
+    @torch.no_grad()
+    def encode_checked(self, images: Tensor, hints: Hints | None) -> Tokens:
+        """Encodes what :meth:`encode` has checked: tensor operations only, so that it can be exported."""
         size = (images.shape[-2], images.shape[-1])
         with half_precision_on_gpu(images):
             patch, camera = self.network.aggregator(images, self.taps)
@@ -105,12 +98,7 @@ class VGGTBackend(Backend):
 
     def decode(self, tokens: Tokens) -> Geometry:
         """See :meth:`Backend.decode`; the principal point is (W/2, H/2)."""
-        with full_precision(tokens.camera):
-            out = in_chunks(self.network.depth_head, tokens.patch, tokens.grid, self.head_chunk)
-            world_to_camera, intrinsics = decode_pose(self.network.camera_head(tokens.camera), tokens.size)
-        depth, confidence = out[:, :, 0].exp(), 1 + out[:, :, 1].exp()
-        cameras = Cameras(world_to_camera, intrinsics, tokens.size)
-        return Geometry(depth, confidence, cameras, torch.ones_like(depth[:, 0, 0, 0]))
+        return self.network.decode(tokens, self.head_chunk)
 
 
 @torch.no_grad()

@@ -10,12 +10,15 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from backends.dpt import DPT
+from backends.base import full_precision
+from backends.dpt import DPT, in_chunks
 from backends.normalization import normalize_images
+from backends.poses import decode_pose
 from backends.positions import resize_position_embedding
 from backends.rope import grid_positions, rotary_2d
 from backends.vggt.camera_head import CameraHead
 from backends.vit import Block, PatchEmbed, first_and_others
+from vg2gt.types import Cameras, Geometry, Tokens
 
 REGISTERS = 4
 
@@ -98,36 +101,63 @@ def _alternating_block(dim: int, num_heads: int) -> Block:
     return Block(dim, num_heads, qk_norm=True, layer_scale=0.01, eps=1e-5)
 
 
-class VGGTNetwork(nn.Module):
-    """Aggregator with camera and depth heads; names and shapes as published.
+class VGGTDecoder(nn.Module):
+    """What stands behind the tokens: camera and depth head; names and shapes as published.
 
     Args:
-        dim: channels C of the encoder; tokens have 2C.
-        depth: pairs of alternating blocks.
-        encoder_depth: encoder blocks.
-        num_heads: attention heads.
+        token_dim: channels of the tokens.
         features: DPT width.
         out_channels: DPT channels of the four taps.
+        patch_size: in pixels.
         camera_depth: blocks of the camera head.
         camera_heads: attention heads of the camera head.
-        image_size: native image edge, which fixes the position embedding.
-        patch_size: in pixels.
     """
 
     def __init__(
         self,
-        dim: int,
-        depth: int,
-        encoder_depth: int,
-        num_heads: int,
+        token_dim: int,
         features: int,
         out_channels: Sequence[int],
+        patch_size: int,
         camera_depth: int,
         camera_heads: int,
-        image_size: int,
-        patch_size: int,
     ) -> None:
         super().__init__()
-        self.aggregator = Aggregator(dim, depth, encoder_depth, num_heads, image_size, patch_size)
-        self.camera_head = CameraHead(2 * dim, camera_depth, camera_heads)
-        self.depth_head = DPT(2 * dim, features, out_channels, 2, patch_size, rectified_skip=True)
+        self.arguments = {
+            "token_dim": token_dim,
+            "features": features,
+            "out_channels": list(out_channels),
+            "patch_size": patch_size,
+            "camera_depth": camera_depth,
+            "camera_heads": camera_heads,
+        }
+        self.camera_head = CameraHead(token_dim, camera_depth, camera_heads)
+        self.depth_head = DPT(token_dim, features, out_channels, 2, patch_size, rectified_skip=True)
+
+    def decode(self, tokens: Tokens, chunk: int | None) -> Geometry:
+        """See :meth:`Backend.decode`; at most ``chunk`` views at a time go through the depth head."""
+        with full_precision(tokens.camera):
+            out = in_chunks(self.depth_head, tokens.patch, tokens.grid, chunk)
+            world_to_camera, intrinsics = decode_pose(self.camera_head(tokens.camera), tokens.size)
+        depth, confidence = out[:, :, 0].exp(), 1 + out[:, :, 1].exp()
+        cameras = Cameras(world_to_camera, intrinsics, tokens.size)
+        return Geometry(depth, confidence, cameras, torch.ones_like(depth[:, 0, 0, 0]))
+
+
+class VGGTNetwork(VGGTDecoder):
+    """The decoder with its aggregator; names and shapes as published.
+
+    Args:
+        aggregator: images to tokens.
+        features: DPT width.
+        out_channels: DPT channels of the four taps.
+        camera_depth: blocks of the camera head.
+        camera_heads: attention heads of the camera head.
+    """
+
+    def __init__(
+        self, aggregator: Aggregator, features: int, out_channels: Sequence[int], camera_depth: int, camera_heads: int
+    ) -> None:
+        token_dim = 2 * aggregator.camera_token.shape[-1]
+        super().__init__(token_dim, features, out_channels, aggregator.patch_size, camera_depth, camera_heads)
+        self.aggregator = aggregator
