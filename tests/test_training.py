@@ -9,9 +9,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
 
 from tests.training_helpers import SMALL, small_config, with_crash
 from vg2gt.checkpoints import newest_valid, read_checkpoint
+from vg2gt.paths import config_dir
 from vg2gt.training import build, train
 
 
@@ -158,6 +161,17 @@ def test_non_finite_steps_are_skipped_and_then_stop_the_run(tmp_path: Path, cach
     assert "step 0 skipped" in caplog.text
 
 
+def test_real_rgbd_recording(tmp_path: Path, shared: Path) -> None:
+    root = shared / "data" / "hololens_office_a"
+    small = [override for override in SMALL if not override.startswith(("data.train_", "data.eval_"))]
+    with initialize_config_dir(config_dir(), version_base="1.3"):
+        overrides = [f"output_dir={tmp_path}", "hydra/job_logging=default", "debug=fast_dev_run", *small]
+        config = compose("train", [*overrides, "data=rgbd", f"data.root={root}", "data.eval_context=4"])
+    report = train(config)
+    assert report["trained"]["psnr"] > 10
+    assert 0 < report["trained"]["abs_rel"] < 0.2
+
+
 def cli(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "vg2gt.cli", "train", *arguments]
     return subprocess.run(command, capture_output=True, text=True, cwd=folder, timeout=300, check=False)
@@ -179,6 +193,15 @@ def test_help_lists_every_group(tmp_path: Path) -> None:
         "trainer",
     ):
         assert f"\n{group}: " in shown.stdout
+
+
+def test_sweep_runs_every_variant_in_its_own_folder(tmp_path: Path, cache: Path) -> None:
+    small = [*SMALL, "debug=fast_dev_run", f"data.cache_dir={cache}"]
+    sweep = cli("-m", *small, "name=sweep", "model.gaussians.splits=1,4", folder=tmp_path)
+    assert sweep.returncode == 0, sweep.stderr[-3000:]
+    written = sorted((tmp_path / "outputs" / "sweep").glob("*/config.yaml"))
+    splits = [OmegaConf.load(path).model.gaussians.splits for path in written]
+    assert sorted(splits) == [1, 4]
 
 
 def test_misspelt_and_missing_are_named(tmp_path: Path) -> None:
