@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib.util
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import fields
 from typing import Literal, get_args
@@ -19,10 +21,27 @@ from vg2gt.rendering.options import DepthKind, Images, Mode, RenderOptions, Scen
 from vg2gt.rendering.pairs import rasterize_pairs
 from vg2gt.types import Cameras, Gaussians, Render
 
-Implementation = Literal["auto", "torch", "dense", "cpu"]
+Implementation = Literal["auto", "torch", "dense", "cpu", "triton"]
 Rasterizer = Callable[[SceneViews, RenderOptions], Images]
 
-RASTERIZERS: dict[str, Rasterizer] = {"torch": rasterize_pairs, "dense": rasterize_dense, "cpu": rasterize_cpu}
+
+def _rasterize_triton(scene: SceneViews, options: RenderOptions) -> Images:
+    """Imports Triton only when it is asked for: torch's CPU builds come without it."""
+    if importlib.util.find_spec("triton") is None:
+        raise ValueError(
+            "implementation 'triton' needs the package triton; install a CUDA build of torch or use 'torch'"
+        )
+    from vg2gt.rendering.gpu import rasterize_triton
+
+    return rasterize_triton(scene, options)
+
+
+RASTERIZERS: dict[str, Rasterizer] = {
+    "torch": rasterize_pairs,
+    "dense": rasterize_dense,
+    "cpu": rasterize_cpu,
+    "triton": _rasterize_triton,
+}
 
 
 def render(
@@ -54,8 +73,8 @@ def render(
             classic 3DGS: affine splats, Jacobian clamped off-screen, piecewise constant transmittance.
         background: one colour ``[3]``; None is black.
         near: Gaussians whose mean is nearer are dropped; solid depth is never in front of it. Scene units.
-        implementation: ``cpu`` compiled tile renderer; ``torch`` sparse pairs on any device; ``dense`` the slow
-            reference; ``auto`` chooses ``cpu`` on CPU and ``torch`` elsewhere.
+        implementation: ``cpu`` compiled tile renderer; ``triton`` the same for CUDA devices; ``torch`` sparse pairs on
+            any device; ``dense`` the slow reference; ``auto`` chooses ``cpu`` on CPU and ``torch`` elsewhere.
         depth: ``median``: where transmittance falls to one half; rasterized, that is the z of the Gaussian at which it
             happens, with gradient to that Gaussian's mean only. ``expected`` (rasterized only): blended z over alpha.
         lowpass: variance in px^2 added to every screen footprint.
@@ -105,7 +124,7 @@ class Renderer:
     Args:
         mode: ``solid`` or ``rasterized``.
         near: near plane in scene units.
-        implementation: ``auto``, ``cpu``, ``torch`` or ``dense``.
+        implementation: ``auto``, ``cpu``, ``triton``, ``torch`` or ``dense``.
         depth: ``median``, or ``expected`` with ``rasterized``.
         lowpass: variance in px^2 added to every screen footprint.
         alpha_max: cap of the opacity at a pixel.
@@ -190,6 +209,8 @@ def _resolve(implementation: Implementation, device: torch.device) -> str:
         return "cpu" if device.type == "cpu" else "torch"
     if implementation == "cpu" and device.type != "cpu":
         raise ValueError(f"implementation 'cpu' needs tensors on the CPU, these are on {device}; use 'auto' or 'torch'")
+    if implementation == "triton" and device.type != "cuda" and os.environ.get("TRITON_INTERPRET") != "1":
+        raise ValueError(f"implementation 'triton' needs tensors on a CUDA device, these are on {device}; use 'auto'")
     return implementation
 
 
