@@ -3,6 +3,13 @@
 from pathlib import Path
 
 import pytest
+from hydra import compose, initialize_config_dir
+from hydra.utils import instantiate
+
+from backends.export import export
+from vg2gt.paths import config_dir
+
+SHALLOW = ["+backend=da3_tiny", "backend.depth=4", "backend.multiview_from=1", "backend.taps=[0,1,2,3]"]
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 
@@ -13,3 +20,18 @@ def shared() -> Path:
     if not SHARED.is_dir():
         pytest.skip(f"needs the reference data folder {SHARED.name}/ beside the checkout")
     return SHARED
+
+
+@pytest.fixture(scope="session")
+def shallow_da3():
+    """The network behind :func:`onnx_bundle`: da3_tiny with half its blocks, to export faster."""
+    with initialize_config_dir(config_dir(), version_base="1.3"):
+        return instantiate(compose(overrides=SHALLOW).backend)
+
+
+@pytest.fixture(scope="session")
+def onnx_bundle(shallow_da3, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An exported network."""
+    folder = tmp_path_factory.mktemp("onnx") / "bundle"
+    export(shallow_da3, folder)
+    return folder

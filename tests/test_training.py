@@ -56,6 +56,16 @@ def test_fast_dev_run(tmp_path: Path, cache: Path, override: str) -> None:
         assert report["trained"]["decoded_abs_rel"] == report["trained"]["decoded_abs_rel_before"]
 
 
+def test_onnx_backend_trains(tmp_path: Path, cache: Path, onnx_bundle: Path) -> None:
+    run = build(small_config(tmp_path, cache, "debug=fast_dev_run", "backend=onnx", f"backend.path={onnx_bundle}"))
+    coarse = run.module.model.coarse
+    assert coarse is not None
+    before = {name: tensor.clone() for name, tensor in coarse.state_dict().items()}
+    run.trainer.fit(run.module, datamodule=run.datamodule)
+    after = coarse.state_dict()
+    assert any(not torch.equal(tensor, before[name]) for name, tensor in after.items())
+
+
 def test_a_run_writes_its_results(full_run: Path) -> None:
     metrics = json.loads((full_run / "metrics.json").read_text())
     assert metrics["steps"] == 4

@@ -176,4 +176,4 @@ def reference_first(reference: Tensor, views: int) -> Tensor:
 
 def _take_views(x: Tensor, order: Tensor) -> Tensor:
     """Reorders the view axis of ``[B, V, ...]`` by ``[B, V]``."""
-    return torch.take_along_dim(x, order.reshape(*order.shape, *(1,) * (x.dim() - 2)), 1)
+    return x[torch.arange(x.shape[0], device=x.device)[:, None], order]

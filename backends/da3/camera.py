@@ -50,7 +50,8 @@ def normalize_cameras(cameras: Cameras) -> Cameras:
     """Moves the world into view 0 and divides translations by the median distance of the cameras (at least 0.1)."""
     relative = relative_to_first(cameras)
     distance = invert_rigid(relative.world_to_camera)[..., :3, 3].norm(dim=-1)
-    unit = distance.median(-1).values.clamp_min(MIN_MEDIAN_DISTANCE)
+    # The lower median by sorting: Tensor.median does not export.
+    unit = distance.sort(-1).values[:, (distance.shape[1] - 1) // 2].clamp_min(MIN_MEDIAN_DISTANCE)
     poses = relative.world_to_camera.clone()
     poses[..., :3, 3] /= unit[:, None, None]
     return Cameras(poses, relative.intrinsics, relative.size)

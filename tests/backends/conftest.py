@@ -15,7 +15,7 @@ from vg2gt.geometry.cameras import invert_rigid, ray_directions
 from vg2gt.geometry.rotations import quat_to_matrix
 from vg2gt.types import Cameras, Hints
 
-BUILT_IN = ("oracle", "vggt_tiny", "da3_tiny")
+BUILT_IN = ("oracle", "vggt_tiny", "da3_tiny", "onnx")
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 
 
@@ -31,6 +31,8 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 @pytest.fixture(scope="session")
 def backend(request: pytest.FixtureRequest):
+    if request.param == "onnx":
+        return make_backend("onnx", f"path={request.getfixturevalue('onnx_bundle')}")
     if request.param in BUILT_IN:
         return make_backend(request.param)
     module, _, name = request.param.rpartition(".")

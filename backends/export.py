@@ -1,0 +1,246 @@
+"""Writes a frozen network as an ONNX bundle with free numbers of scenes, views, rows and columns.
+
+python -m backends.export backend=da3_small out=FOLDER [backend.key=value ...]
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import shutil
+import sys
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from hydra import compose, initialize_config_dir
+from hydra.errors import HydraException
+from hydra.utils import instantiate
+from safetensors.torch import save
+from torch import Tensor, nn
+from torch.export import Dim
+
+from backends.base import Backend
+from backends.bundle import (
+    CONVENTIONS,
+    DECODER,
+    DECODER_WEIGHTS,
+    ENCODER,
+    Description,
+    decoder_class,
+    decoder_weights,
+    sha256,
+)
+from backends.da3 import DA3Backend
+from backends.onnx import open_session, run_session
+from backends.vggt import VGGTBackend
+from vg2gt.paths import config_dir
+from vg2gt.types import Cameras, Hints, Tokens
+
+Exportable = VGGTBackend | DA3Backend
+
+TRACED = (2, 3, 4, 6)  # scenes, views, patch rows, patch columns: all different, none 1
+CHECKED = ((1, 1, 3, 2), (1, 2, 2, 5), (2, 4, 3, 3))
+TOLERANCE = 1e-3  # relative; a wrong graph is off by far more, a right one by about 1e-6
+OUTPUTS = ("depth", "depth_conf", "world_to_camera", "intrinsics")
+
+
+class EncoderGraph(nn.Module):
+    """Images, and cameras where the network takes given poses, to patch tokens ``[B, V, h, w, D]`` and camera token."""
+
+    def __init__(self, backend: Exportable) -> None:
+        super().__init__()
+        self.backend = backend
+
+    def forward(
+        self, images: Tensor, world_to_camera: Tensor | None = None, intrinsics: Tensor | None = None
+    ) -> tuple[Tensor, ...]:
+        """Encodes ``[B, V, 3, H, W]`` images."""
+        hints = None
+        if world_to_camera is not None and intrinsics is not None:
+            hints = Hints(cameras=Cameras(world_to_camera, intrinsics, (images.shape[-2], images.shape[-1])))
+        tokens = self.backend.encode_checked(images, hints)
+        return (*(tap.unflatten(2, tokens.grid) for tap in tokens.patch), tokens.camera)
+
+
+class DecoderGraph(nn.Module):
+    """Patch tokens ``[B, V, h, w, D]`` and camera token to depth, confidence and cameras."""
+
+    def __init__(self, backend: Exportable) -> None:
+        super().__init__()
+        self.backend = backend
+
+    def forward(self, *tokens: Tensor) -> tuple[Tensor, ...]:
+        """Decodes all views at once; the camera token comes last."""
+        *patch, camera = tokens
+        grid = (patch[0].shape[2], patch[0].shape[3])
+        size = (grid[0] * self.backend.patch_size, grid[1] * self.backend.patch_size)
+        flat = tuple(tap.flatten(2, 3) for tap in patch)
+        geometry = self.backend.network.decode(Tokens(flat, camera, grid, size), None)
+        return geometry.depth, geometry.depth_conf, geometry.cameras.world_to_camera, geometry.cameras.intrinsics
+
+
+def export(backend: Backend, out: Path) -> Description:
+    """Writes the bundle into a temporary folder, compares it with torch at other sizes, and renames it to ``out``.
+
+    Args:
+        backend: on the CPU.
+        out: a folder that does not exist yet, or is empty.
+
+    Returns:
+        What stands in the folder's ``backend.json``.
+
+    Raises:
+        TypeError: if the backend has no graph to export.
+        FileExistsError: if ``out`` holds something.
+        RuntimeError: if a size was fixed in the graph, or onnxruntime computes something else than torch.
+        ImportError: if ``onnx`` or ``onnxscript`` is not installed.
+    """
+    if not isinstance(backend, VGGTBackend | DA3Backend):
+        raise TypeError(f"backend {backend.name} cannot be exported: VGGT and the relative DA3 networks can")
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise FileExistsError(f"{out} exists already: remove it or choose another out=FOLDER")
+    _require("onnx", "onnxscript")
+    folder = out.with_name(f".{out.name}.{os.getpid()}.tmp")
+    folder.mkdir(parents=True)
+    try:
+        description = _write(backend, folder)
+        os.replace(folder, out)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+    return description
+
+
+def _write(backend: Exportable, folder: Path) -> Description:
+    encoder, decoder = EncoderGraph(backend).eval(), DecoderGraph(backend).eval()
+    inputs = example_inputs(backend, *TRACED)
+    with torch.no_grad():
+        tokens = encoder(*inputs)
+    names = ["images", "world_to_camera", "intrinsics"][: len(inputs)]
+    token_names = [*(f"patch_{index}" for index in range(len(backend.token_dims))), "camera"]
+    export_graph(encoder, inputs, names, token_names, folder / ENCODER)
+    export_graph(decoder, tokens, token_names, list(OUTPUTS), folder / DECODER)
+    (folder / DECODER_WEIGHTS).write_bytes(save(decoder_weights(backend.network)))
+    description = Description(
+        name=backend.name,
+        licence=backend.licence,
+        weights=backend.identity()["weights"],
+        patch_size=backend.patch_size,
+        token_dims=list(backend.token_dims),
+        taps=[int(tap) for tap in backend.taps],
+        needs_hints=backend.needs_hints,
+        decoder={"class": decoder_class(backend.network).__name__, "arguments": backend.network.arguments},
+        conventions=CONVENTIONS,
+        max_difference=_compare(encoder, decoder, names, token_names, folder),
+        files={file.name: sha256(file) for file in sorted(folder.iterdir())},
+    )
+    description.write(folder)
+    return description
+
+
+def example_inputs(backend: Exportable, scenes: int, views: int, rows: int, columns: int) -> tuple[Tensor, ...]:
+    """Random images of the given number of patches and, if the backend takes them, cameras on a line."""
+    size = (rows * backend.patch_size, columns * backend.patch_size)
+    images = torch.rand(scenes, views, 3, *size, generator=torch.Generator().manual_seed(0))
+    if not backend.needs_hints:
+        return (images,)
+    poses = torch.eye(4).repeat(scenes, views, 1, 1)
+    poses[..., 0, 3] = torch.arange(views)
+    intrinsics = torch.tensor([[size[1], 0, size[1] / 2], [0, size[1], size[0] / 2], [0, 0, 1]])
+    return images, poses, intrinsics.repeat(scenes, views, 1, 1)
+
+
+def export_graph(
+    graph: nn.Module, inputs: tuple[Tensor, ...], names: Sequence[str], results: Sequence[str], file: Path
+) -> None:
+    """Exports with every axis free whose size differs from the weights' own: all but channels, poses, matrices."""
+    free = tuple(_free_axes(name) for name in names)
+    from onnx_ir.passes.common import ClearMetadataAndDocStringPass
+
+    shapes = (free,) if isinstance(graph, DecoderGraph) else free  # the decoder takes *tokens
+    with torch.no_grad(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        exported = torch.export.export(graph, inputs, dynamic_shapes=shapes, strict=False)
+        user_inputs = set(exported.graph_signature.user_inputs)
+        nodes = [node for node in exported.graph.nodes if node.op == "placeholder" and node.name in user_inputs]
+        for name, axes, node in zip(names, free, nodes, strict=True):
+            shape = node.meta["val"].shape
+            fixed = [axis for axis in axes if isinstance(shape[axis], int) or shape[axis].node.expr.is_number]
+            if fixed:
+                raise RuntimeError(
+                    f"export fixed the axes {fixed} of {name}, now {list(shape)}: a Python number in code"
+                )
+        program = torch.onnx.export(
+            exported, input_names=names, output_names=results, dynamo=True, verbose=False, optimize=False
+        )
+    assert program is not None
+    ClearMetadataAndDocStringPass()(program.model)  # stack traces with the paths of this machine
+    program.save(file)
+
+
+def _free_axes(name: str) -> dict[int, object]:
+    axes = {"images": (0, 1, 3, 4), "world_to_camera": (0, 1), "intrinsics": (0, 1), "camera": (0, 1)}
+    return dict.fromkeys(axes.get(name, (0, 1, 2, 3)), Dim.AUTO)
+
+
+def _compare(
+    encoder: EncoderGraph, decoder: DecoderGraph, names: Sequence[str], token_names: Sequence[str], folder: Path
+) -> dict[str, float]:
+    """Largest max|diff| / max|torch| of every output at other sizes than the traced ones."""
+    worst = {}
+    runs = (("encoder", encoder, ENCODER, names), ("decoder", decoder, DECODER, token_names))
+    for part, graph, file, keys in runs:
+        session = open_session(folder / file, "cpu")
+        worst[part] = 0.0
+        for shape in CHECKED:
+            inputs = example_inputs(encoder.backend, *shape)
+            with torch.no_grad():
+                inputs = inputs if graph is encoder else encoder(*inputs)
+                expected = graph(*inputs)
+            found = run_session(session, dict(zip(keys, inputs, strict=True)))
+            worst[part] = max(worst[part], *map(relative_difference, found, expected))
+            if not worst[part] <= TOLERANCE:
+                raise RuntimeError(f"{file} differs from torch by {worst[part]:.1e} at {shape} scenes, views, patches")
+    return worst
+
+
+def relative_difference(found: Tensor, expected: Tensor) -> float:
+    """max|found - expected| / max|expected|; infinite for other shapes."""
+    if found.shape != expected.shape:
+        return float("inf")
+    return float((found - expected).abs().max() / expected.abs().max())
+
+
+def _require(*packages: str) -> None:
+    for package in packages:
+        try:
+            __import__(package)
+        except ImportError as error:
+            raise ImportError(f"export needs {package}: pip install 'vg2gt[export]'") from error
+
+
+def main(arguments: Sequence[str]) -> None:
+    """The command line.
+
+    Raises:
+        SystemExit: with the message, if the arguments are wrong or the backend cannot be built or written.
+    """
+    out = next((argument.removeprefix("out=") for argument in arguments if argument.startswith("out=")), "")
+    overrides = [argument for argument in arguments if not argument.startswith("out=")]
+    if not out or not any(override.startswith("backend=") for override in overrides):
+        sys.exit(__doc__)
+    overrides = [f"+{item}" if item.startswith("backend=") else item for item in overrides]
+    try:
+        with initialize_config_dir(config_dir(), version_base="1.3"):
+            config = compose(overrides=overrides)
+        description = export(instantiate(config.backend), Path(out).expanduser())
+    except (HydraException, ImportError, OSError, TypeError, ValueError) as error:
+        sys.exit(f"export failed: {error}")
+    differences = ", ".join(f"{part} {value:.1e}" for part, value in description.max_difference.items())
+    print(f"{out}: {description.name}, licence: {description.licence}; largest difference to torch: {differences}")
+
+
+if __name__ == "__main__":
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+    main(sys.argv[1:])

@@ -1,0 +1,124 @@
+"""A backend from an ONNX bundle: the encoder runs in onnxruntime, the decoder is a torch module with gradients."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Literal, get_args
+
+import onnxruntime
+import torch
+from torch import Tensor
+
+from backends.base import Backend
+from backends.bundle import DECODER, DECODER_WEIGHTS, ENCODER, REMEDY, load_decoder, read_bundle
+from vg2gt.types import Cameras, Geometry, Hints, Tokens
+
+Provider = Literal["auto", "cpu", "cuda"]
+CUDA, CPU = "CUDAExecutionProvider", "CPUExecutionProvider"
+
+
+class OnnxBackend(Backend):
+    """The network of a folder written by ``python -m backends.export``.
+
+    Name, licence and identity are those of the exported network, so checkpoints fit both. Without
+    ``decoder.safetensors`` in the folder, ``decode`` runs ``decoder.onnx`` and has no gradient.
+
+    Args:
+        path: the folder.
+        provider: where the encoder runs; ``auto`` takes the GPU if onnxruntime has the provider for it.
+        head_chunk: views decoded at a time by the torch decoder; None decodes all at once.
+
+    Raises:
+        FileNotFoundError: if ``path`` is no bundle or lacks a file.
+        ValueError: if a file is damaged, reads data outside the folder, or does not fit; or the provider is unknown.
+        RuntimeError: if the provider is not available.
+    """
+
+    def __init__(self, path: str | None = None, provider: Provider = "auto", head_chunk: int | None = 8) -> None:
+        if path is None:
+            raise ValueError(f"backend=onnx needs backend.path=FOLDER; {REMEDY}")
+        if provider not in get_args(Provider):
+            raise ValueError(f"backend.provider is {provider!r}; choose one of {', '.join(get_args(Provider))}")
+        folder = Path(path).expanduser()
+        description = read_bundle(folder)
+        decoder = load_decoder(folder, description.decoder)
+        super().__init__(
+            description.name,
+            description.patch_size,
+            tuple(description.token_dims),
+            description.licence,
+            supports_gradient=decoder is not None,
+            needs_hints=description.needs_hints,
+        )
+        self._identity = {"name": description.name, "weights": description.weights}
+        self.head_chunk = head_chunk
+        self.decoder = decoder
+        self.encoder_session = open_session(folder / ENCODER, provider)
+        self.decoder_session = open_session(folder / DECODER, provider) if decoder is None else None
+        if decoder is None:
+            warnings.warn(
+                f"{folder} has no {DECODER_WEIGHTS}: backend {self.name} decodes without gradient, so the coarse "
+                "module is not trained through its depth",
+                stacklevel=2,
+            )
+        print(f"{self.name}: ONNX bundle {folder}, licence: {self.licence}")
+        self.freeze()
+
+    @torch.no_grad()
+    def encode(self, images: Tensor, hints: Hints | None = None) -> Tokens:
+        """See :meth:`Backend.encode`; ``hints.cameras`` are used if the exported network takes given poses."""
+        self.check_images(images)
+        inputs = {"images": images}
+        if self.needs_hints:
+            cameras = self.require_hints(images, hints, "cameras").cameras
+            assert cameras is not None
+            inputs |= {"world_to_camera": cameras.world_to_camera, "intrinsics": cameras.intrinsics}
+        *patch, camera = run_session(self.encoder_session, inputs)
+        grid = (patch[0].shape[2], patch[0].shape[3])
+        return Tokens(tuple(tap.flatten(2, 3) for tap in patch), camera, grid, (images.shape[-2], images.shape[-1]))
+
+    def decode(self, tokens: Tokens) -> Geometry:
+        """See :meth:`Backend.decode`."""
+        if self.decoder is not None:
+            return self.decoder.decode(tokens, self.head_chunk)
+        assert self.decoder_session is not None
+        inputs = {f"patch_{index}": tap.unflatten(2, tokens.grid) for index, tap in enumerate(tokens.patch)}
+        out = run_session(self.decoder_session, {**inputs, "camera": tokens.camera})
+        depth, confidence, world_to_camera, intrinsics = out
+        cameras = Cameras(world_to_camera, intrinsics, tokens.size)
+        return Geometry(depth, confidence, cameras, torch.ones_like(depth[:, 0, 0, 0]))
+
+
+def open_session(file: Path, provider: Provider) -> onnxruntime.InferenceSession:
+    """Opens an ONNX file on the GPU of this process or on the CPU, with torch's number of threads.
+
+    Raises:
+        ValueError: if onnxruntime refuses the file.
+        RuntimeError: if ``cuda`` is wanted and not available.
+    """
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = torch.get_num_threads()
+    providers: list[str | tuple[str, dict[str, str]]] = [CPU]
+    if provider != "cpu" and CUDA in onnxruntime.get_available_providers():
+        # Float32 as torch has it, not TF32; under distributed training every process has its own GPU.
+        providers.insert(0, (CUDA, {"device_id": os.environ.get("LOCAL_RANK", "0"), "use_tf32": "0"}))
+    try:
+        session = onnxruntime.InferenceSession(str(file), options, providers=providers)
+    except Exception as error:  # onnxruntime's own classes have no common base
+        raise ValueError(f"onnxruntime {onnxruntime.__version__} cannot open {file} ({error}): {REMEDY}") from error
+    if provider == "cuda" and CUDA not in session.get_providers():
+        raise RuntimeError(
+            f"backend.provider=cuda, but onnxruntime only has {', '.join(session.get_providers())}: install "
+            "onnxruntime-gpu in place of onnxruntime, or use backend.provider=cpu"
+        )
+    return session
+
+
+def run_session(session: onnxruntime.InferenceSession, inputs: Mapping[str, Tensor]) -> list[Tensor]:
+    """Runs a session on float32 tensors; the results lie on the device of the inputs, without gradient."""
+    device = next(iter(inputs.values())).device
+    feeds = {name: value.detach().float().cpu().contiguous().numpy() for name, value in inputs.items()}
+    return [torch.from_numpy(value).to(device) for value in session.run(None, feeds)]

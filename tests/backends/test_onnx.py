@@ -1,0 +1,269 @@
+"""ONNX bundles: equal to torch at sizes never traced, refused when damaged, decoded with and without gradient."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import onnx
+import pytest
+import torch
+from onnx import TensorProto, helper
+
+from backends import export as exporting
+from backends.base import Backend
+from backends.bundle import DESCRIPTION, external_data, sha256
+from backends.export import (
+    TRACED,
+    EncoderGraph,
+    Exportable,
+    example_inputs,
+    export,
+    export_graph,
+    main,
+    relative_difference,
+)
+from backends.onnx import OnnxBackend, open_session, run_session
+from vg2gt.types import Cameras, Geometry, Hints
+
+UNSEEN = [(1, 1, 5, 5), (1, 2, 6, 4), (2, 5, 3, 8), (3, 4, 2, 7), (1, 1, 1, 1)]  # scenes, views, patch rows, columns
+LIMIT = 5e-5
+
+
+def hints_of(inputs: tuple[torch.Tensor, ...]) -> Hints | None:
+    images, *poses = inputs
+    return Hints(cameras=Cameras(poses[0], poses[1], (images.shape[-2], images.shape[-1]))) if poses else None
+
+
+def worst_of(found: Geometry, expected: Geometry) -> float:
+    pairs = [
+        (found.depth, expected.depth),
+        (found.depth_conf, expected.depth_conf),
+        (found.cameras.world_to_camera, expected.cameras.world_to_camera),
+        (found.cameras.intrinsics, expected.cameras.intrinsics),
+    ]
+    return max(relative_difference(a, b) for a, b in pairs)
+
+
+def worst_difference(found: Backend, expected: Exportable) -> float:
+    """Over tokens and geometry at every unseen size; the decoder is compared on equal tokens too."""
+    worst = 0.0
+    for shape in UNSEEN:
+        inputs = example_inputs(expected, *shape)
+        tokens = expected.encode(inputs[0], hints_of(inputs))
+        again = found.encode(inputs[0], hints_of(inputs))
+        assert (again.grid, again.size) == (tokens.grid, tokens.size)
+        pairs = zip((*again.patch, again.camera), (*tokens.patch, tokens.camera), strict=True)
+        worst = max(worst, *(relative_difference(a, b) for a, b in pairs))
+        geometry = expected.decode(tokens)
+        worst = max(worst, worst_of(found.decode(tokens), geometry), worst_of(found.decode(again), geometry))
+    return worst
+
+
+def without_weights(bundle: Path) -> OnnxBackend:
+    (bundle / "decoder.safetensors").unlink()
+    with pytest.warns(UserWarning, match="decodes without gradient"):
+        return OnnxBackend(str(bundle))
+
+
+@pytest.fixture
+def copy(onnx_bundle: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(onnx_bundle, tmp_path / "copy"))
+
+
+def edit(bundle: Path, change: Callable[[dict[str, Any]], Any]) -> None:
+    """Changes the description and makes its hashes fit the files."""
+    description = json.loads((bundle / DESCRIPTION).read_text())
+    description["files"] = {f.name: sha256(f) for f in sorted(bundle.iterdir()) if f.name != DESCRIPTION}
+    change(description)
+    (bundle / DESCRIPTION).write_text(json.dumps(description))
+
+
+def test_da3_equals_torch_at_other_sizes(onnx_bundle: Path, shallow_da3: Exportable) -> None:
+    backend = OnnxBackend(str(onnx_bundle))
+    assert backend.supports_gradient
+    assert worst_difference(backend, shallow_da3) <= LIMIT
+
+
+def test_decoder_graph_equals_torch_at_other_sizes(copy: Path, shallow_da3: Exportable) -> None:
+    backend = without_weights(copy)
+    assert not backend.supports_gradient
+    assert worst_difference(backend, shallow_da3) <= LIMIT
+    tokens = shallow_da3.encode(example_inputs(shallow_da3, 1, 2, 3, 4)[0])
+    changed = tokens.with_patch(tuple(patch.clone().requires_grad_() for patch in tokens.patch))
+    assert not backend.decode(changed).depth.requires_grad
+
+
+def test_vggt_encoder_equals_torch_at_other_sizes(make_backend, tmp_path: Path) -> None:
+    backend = make_backend("vggt_tiny")
+    graph = EncoderGraph(backend)
+    results = [f"result_{index}" for index in range(5)]
+    export_graph(graph, example_inputs(backend, *TRACED), ["images"], results, tmp_path / "encoder.onnx")
+    session = open_session(tmp_path / "encoder.onnx", "cpu")
+    for shape in UNSEEN:
+        (images,) = example_inputs(backend, *shape)
+        for found, expected in zip(run_session(session, {"images": images}), graph(images), strict=True):
+            assert relative_difference(found, expected) <= LIMIT
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "override",
+    ["vggt_tiny", "da3_tiny", "da3_small", "da3_tiny reference_view=saddle_balanced", "da3_tiny given_poses=true"],
+)
+def test_whole_networks_equal_torch(make_backend, tmp_path: Path, override: str) -> None:
+    network = make_backend(*override.split(), "pretrained=false")
+    export(network, tmp_path / "bundle")
+    differences = [worst_difference(OnnxBackend(str(tmp_path / "bundle")), network)]
+    differences.append(worst_difference(without_weights(tmp_path / "bundle"), network))
+    print(f"{override}: torch decoder {differences[0]:.1e}, ONNX decoder {differences[1]:.1e}")
+    assert max(differences) <= LIMIT
+
+
+def test_checkpoints_fit_the_exported_network(onnx_bundle: Path, shallow_da3: Exportable) -> None:
+    assert OnnxBackend(str(onnx_bundle)).identity() == shallow_da3.identity()
+
+
+def test_files_tell_nothing_of_the_machine(onnx_bundle: Path) -> None:
+    root = str(Path(__file__).resolve().parents[2]).encode()
+    assert not any(root in file.read_bytes() for file in onnx_bundle.iterdir())
+
+
+def test_missing_folder_and_files_are_named(copy: Path, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"backend\.path=FOLDER"):
+        OnnxBackend()
+    with pytest.raises(FileNotFoundError, match=r"nowhere is no ONNX bundle.*python -m backends\.export"):
+        OnnxBackend(str(tmp_path / "nowhere"))
+    (copy / "encoder.onnx").unlink()
+    with pytest.raises(FileNotFoundError, match=r"has no encoder\.onnx"):
+        OnnxBackend(str(copy))
+
+
+@pytest.mark.parametrize("name", ["encoder.onnx", "decoder.onnx", "decoder.safetensors"])
+def test_damaged_files_are_refused(copy: Path, name: str) -> None:
+    content = bytearray((copy / name).read_bytes())
+    content[-1] ^= 1
+    (copy / name).write_bytes(content)
+    with pytest.raises(ValueError, match=rf"{name} is damaged.*sha256"):
+        OnnxBackend(str(copy))
+
+
+def test_what_is_not_onnx_is_refused(copy: Path) -> None:
+    for content in (b"no protocol buffer at all", b"\x08\x08", b"\xff" * 64):
+        (copy / "encoder.onnx").write_bytes(content)
+        edit(copy, lambda description: None)
+        with pytest.raises(ValueError, match=r"encoder\.onnx"):
+            OnnxBackend(str(copy))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda d: d.update(format=2), "format 1"),
+        (lambda d: d.pop("licence"), "lacks or adds licence"),
+        (lambda d: d["files"].update({"../encoder.onnx": "0"}), "not a file of the folder"),
+        (lambda d: d["files"].pop("encoder.onnx"), r"encoder\.onnx is damaged or not of this bundle"),
+        (lambda d: d["decoder"].update({"class": "subprocess.Popen"}), "known are VGGTDecoder, DA3Decoder"),
+        (lambda d: d["decoder"].update({"class": "VGGTDecoder"}), "wrong arguments for VGGTDecoder"),
+        (lambda d: d["decoder"]["arguments"].update(features=32), "does not fit DA3Decoder"),
+    ],
+)
+def test_wrong_descriptions_are_refused(copy: Path, change: Callable[[dict[str, Any]], Any], message: str) -> None:
+    edit(copy, change)
+    with pytest.raises(ValueError, match=message):
+        OnnxBackend(str(copy))
+
+
+def test_weights_beside_the_graph_are_read(copy: Path, shallow_da3: Exportable) -> None:
+    """As for networks beyond 2 GB, whose weights do not fit into the ONNX file."""
+    onnx.save(onnx.load(copy / "encoder.onnx"), copy / "encoder.onnx", save_as_external_data=True, location="data.bin")
+    assert external_data(copy / "encoder.onnx") == ["data.bin"]
+    edit(copy, lambda description: None)
+    assert worst_difference(OnnxBackend(str(copy)), shallow_da3) <= LIMIT
+    (copy / "data.bin").unlink()
+    with pytest.raises(FileNotFoundError, match=r"has no data\.bin"):
+        OnnxBackend(str(copy))
+
+
+@pytest.mark.parametrize("place", ["initializer", "constant", "branch"])
+@pytest.mark.parametrize("location", ["../secret.bin", "/etc/hostname", "unlisted.bin"])
+def test_data_outside_the_folder_is_refused(copy: Path, place: str, location: str) -> None:
+    (copy.parent / "secret.bin").write_bytes(bytes(4))
+    tensor = TensorProto(name="w", data_type=TensorProto.FLOAT, dims=[1], data_location=TensorProto.EXTERNAL)
+    tensor.external_data.add(key="location", value=location)
+    constant = helper.make_node("Constant", [], ["w"], value=tensor)
+    out = helper.make_tensor_value_info("w", TensorProto.FLOAT, [1])
+    branch = helper.make_graph([constant], "branch", [], [out])
+    nodes = {
+        "initializer": [],
+        "constant": [constant],
+        "branch": [helper.make_node("If", ["c"], ["w"], then_branch=branch, else_branch=branch)],
+    }
+    graph = helper.make_graph(nodes[place], "g", [], [out], [tensor] if place == "initializer" else [])
+    (copy / "encoder.onnx").write_bytes(helper.make_model(graph).SerializeToString())
+    edit(copy, lambda description: None)
+    with pytest.raises(ValueError, match="reads data outside the bundle"):
+        OnnxBackend(str(copy))
+
+
+def test_providers_are_checked(onnx_bundle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ValueError, match="auto, cpu, cuda"):
+        OnnxBackend(str(onnx_bundle), provider="tpu")  # pyright: ignore[reportArgumentType]
+    monkeypatch.setattr("onnxruntime.get_available_providers", lambda: ["CPUExecutionProvider"])
+    with pytest.raises(RuntimeError, match=r"onnxruntime-gpu.*backend\.provider=cpu"):
+        OnnxBackend(str(onnx_bundle), provider="cuda")
+
+
+@pytest.mark.gpu
+def test_cuda_provider_equals_torch(onnx_bundle: Path, shallow_da3: Exportable) -> None:
+    assert worst_difference(OnnxBackend(str(onnx_bundle), provider="cuda"), shallow_da3) <= LIMIT
+
+
+def test_export_refuses_what_it_cannot_do(make_backend, shallow_da3: Exportable, tmp_path: Path) -> None:
+    with pytest.raises(TypeError, match="oracle cannot be exported"):
+        export(make_backend("oracle"), tmp_path / "out")
+    (tmp_path / "file").touch()
+    with pytest.raises(FileExistsError, match="exists already"):
+        export(shallow_da3, tmp_path)
+
+
+def test_a_failed_export_leaves_nothing(
+    shallow_da3: Exportable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any) -> None:
+        raise RuntimeError("no graph")
+
+    monkeypatch.setattr(exporting, "export_graph", fail)
+    with pytest.raises(RuntimeError, match="no graph"):
+        export(shallow_da3, tmp_path / "out")
+    assert not list(tmp_path.iterdir())
+
+
+def test_fixed_sizes_are_found(shallow_da3: Exportable, tmp_path: Path) -> None:
+    class Fixed(torch.nn.Module):
+        def forward(self, images: torch.Tensor) -> torch.Tensor:
+            return images.sum() * (2.0 if images.shape[1] == 3 else 1.0)
+
+    inputs = example_inputs(shallow_da3, *TRACED)
+    with pytest.raises(RuntimeError, match=r"fixed the axes \[1\] of images"):
+        export_graph(Fixed(), inputs, ["images"], ["out"], tmp_path / "fixed.onnx")
+
+
+def test_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+
+    def fake(backend: Backend, out: Path) -> Any:
+        asked.append((backend.name, backend.token_dims, out))
+        raise SystemExit
+
+    monkeypatch.setattr(exporting, "export", fake)
+    with pytest.raises(SystemExit):
+        main(["backend=da3_tiny", "backend.dim=96", f"out={tmp_path / 'x'}"])
+    assert asked == [("da3_tiny", (192,) * 4, tmp_path / "x")]
+    with pytest.raises(SystemExit, match="out=FOLDER"):
+        main(["backend=da3_tiny"])
+    with pytest.raises(SystemExit, match="da3_tiny"):
+        main(["backend=unknown", f"out={tmp_path / 'x'}"])
+    with pytest.raises(SystemExit, match=r"backend\.pretrained=false"):
+        main(["backend=da3_tiny", "backend.pretrained=true", f"out={tmp_path / 'x'}"])
