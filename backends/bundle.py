@@ -25,7 +25,7 @@ from backends.weights import load_strictly
 DESCRIPTION = "backend.json"
 ENCODER, DECODER, DECODER_WEIGHTS = "encoder.onnx", "decoder.onnx", "decoder.safetensors"
 FORMAT = 1
-REMEDY = "write the folder again: python -m backends.export backend=NAME out=FOLDER"
+REMEDY = "write it with python -m backends.export backend=NAME out=FOLDER"
 
 Decoder = VGGTDecoder | DA3Decoder
 DECODERS: dict[str, type[VGGTDecoder] | type[DA3Decoder]] = {
@@ -123,6 +123,10 @@ def _parse(file: Path) -> Description:
     names = {field.name for field in fields(Description)}
     if set(content) != names:
         raise ValueError(f"{file} lacks or adds {', '.join(sorted(names ^ set(content)))}: {REMEDY}")
+    for field in fields(Description):
+        kind = str(field.type).split("[")[0]
+        if type(content[field.name]).__name__ != kind:
+            raise ValueError(f"{file} has {field.name}={content[field.name]!r}, expected {kind}: {REMEDY}")
     return Description(**content)
 
 
@@ -153,7 +157,7 @@ def load_decoder(folder: Path, decoder: Mapping[str, Any]) -> Decoder | None:
     try:
         with torch.device("meta"):
             module = kind(**decoder.get("arguments", {}))
-    except (TypeError, ValueError) as error:
+    except (RuntimeError, TypeError, ValueError) as error:
         raise ValueError(
             f"{folder / DESCRIPTION} has wrong arguments for {kind.__name__} ({error}): {REMEDY}"
         ) from error

@@ -39,7 +39,7 @@ class OnnxBackend(Backend):
 
     def __init__(self, path: str | None = None, provider: Provider = "auto", head_chunk: int | None = 8) -> None:
         if path is None:
-            raise ValueError(f"backend=onnx needs backend.path=FOLDER; {REMEDY}")
+            raise ValueError(f"backend=onnx needs backend.path=FOLDER: {REMEDY}")
         if provider not in get_args(Provider):
             raise ValueError(f"backend.provider is {provider!r}; choose one of {', '.join(get_args(Provider))}")
         folder = Path(path).expanduser()

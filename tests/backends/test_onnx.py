@@ -162,10 +162,12 @@ def test_what_is_not_onnx_is_refused(copy: Path) -> None:
     [
         (lambda d: d.update(format=2), "format 1"),
         (lambda d: d.pop("licence"), "lacks or adds licence"),
+        (lambda d: d.update(files=[]), r"files=\[\], expected dict"),
         (lambda d: d["files"].update({"../encoder.onnx": "0"}), "not a file of the folder"),
         (lambda d: d["files"].pop("encoder.onnx"), r"encoder\.onnx is damaged or not of this bundle"),
         (lambda d: d["decoder"].update({"class": "subprocess.Popen"}), "known are VGGTDecoder, DA3Decoder"),
         (lambda d: d["decoder"].update({"class": "VGGTDecoder"}), "wrong arguments for VGGTDecoder"),
+        (lambda d: d["decoder"]["arguments"].update(features=-32), "wrong arguments for DA3Decoder"),
         (lambda d: d["decoder"]["arguments"].update(features=32), "does not fit DA3Decoder"),
     ],
 )
