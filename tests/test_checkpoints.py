@@ -12,14 +12,14 @@ from vg2gt.checkpoints import AtomicCheckpointIO, initialize_from, newest_valid,
 
 
 def test_save_is_atomic_and_reads_back(tmp_path: Path) -> None:
-    path = tmp_path / "checkpoints" / "step=3.ckpt"
+    path = tmp_path / "checkpoints" / "step-3.ckpt"
     AtomicCheckpointIO().save_checkpoint({"global_step": 3, "state_dict": {"w": torch.arange(4.0)}}, path)
     assert torch.equal(read_checkpoint(path)["state_dict"]["w"], torch.arange(4.0))
-    assert [p.name for p in path.parent.iterdir()] == ["step=3.ckpt"]
+    assert [p.name for p in path.parent.iterdir()] == ["step-3.ckpt"]
 
 
 def test_failed_write_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / "step=3.ckpt"
+    path = tmp_path / "step-3.ckpt"
     writer = AtomicCheckpointIO()
     writer.save_checkpoint({"global_step": 3}, path)
 
@@ -36,17 +36,17 @@ def test_failed_write_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.Mon
 def test_newest_valid_passes_over_damaged_files(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     writer = AtomicCheckpointIO()
     for step in (9, 10, 100):
-        writer.save_checkpoint({"global_step": step}, tmp_path / f"step={step}.ckpt")
-    assert newest_valid(tmp_path).name == "step=100.ckpt"
-    content = (tmp_path / "step=100.ckpt").read_bytes()
-    (tmp_path / "step=100.ckpt").write_bytes(content[: len(content) // 2])
+        writer.save_checkpoint({"global_step": step}, tmp_path / f"step-{step}.ckpt")
+    assert newest_valid(tmp_path).name == "step-100.ckpt"
+    content = (tmp_path / "step-100.ckpt").read_bytes()
+    (tmp_path / "step-100.ckpt").write_bytes(content[: len(content) // 2])
     with caplog.at_level(logging.WARNING):
-        assert newest_valid(tmp_path).name == "step=10.ckpt"
-    assert "step=100.ckpt" in caplog.text
+        assert newest_valid(tmp_path).name == "step-10.ckpt"
+    assert "step-100.ckpt" in caplog.text
 
 
 def test_no_valid_checkpoint_is_an_error(tmp_path: Path) -> None:
-    (tmp_path / "step=1.ckpt").write_bytes(b"nothing")
+    (tmp_path / "step-1.ckpt").write_bytes(b"nothing")
     with pytest.raises(FileNotFoundError, match="ckpt=last found no valid checkpoint"):
         newest_valid(tmp_path)
 
@@ -58,9 +58,9 @@ class Malicious:
 
 def test_loading_never_executes_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    torch.save({"state_dict": Malicious()}, tmp_path / "step=1.ckpt")
-    (tmp_path / "step=2.ckpt").write_bytes(pickle.dumps(Malicious()))
-    for name in ("step=1.ckpt", "step=2.ckpt"):
+    torch.save({"state_dict": Malicious()}, tmp_path / "step-1.ckpt")
+    (tmp_path / "step-2.ckpt").write_bytes(pickle.dumps(Malicious()))
+    for name in ("step-1.ckpt", "step-2.ckpt"):
         with pytest.raises(ValueError, match="damaged or not a checkpoint"):
             AtomicCheckpointIO().load_checkpoint(tmp_path / name, weights_only=False)
     assert not (tmp_path / "executed").exists()
@@ -70,7 +70,7 @@ def test_initialize_from_names_the_layers_that_start_anew(tmp_path: Path, caplog
     old = nn.ModuleDict({"body": nn.Linear(4, 4), "out": nn.Linear(4, 28)})
     new = nn.ModuleDict({"body": nn.Linear(4, 4), "out": nn.Linear(4, 14)})
     fresh, trained = new.state_dict()["out.weight"].clone(), old.state_dict()["body.weight"]
-    path = tmp_path / "step=5.ckpt"
+    path = tmp_path / "step-5.ckpt"
     AtomicCheckpointIO().save_checkpoint({"state_dict": old.state_dict()}, path)
     with caplog.at_level(logging.INFO):
         initialize_from(new, path)

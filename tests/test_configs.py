@@ -86,7 +86,11 @@ def test_every_ablation_builds_what_it_says(tmp_path: Path, ablation: str) -> No
         "wo_coarse": run.module.model.coarse is None,
         "wo_split": run.module.model.gaussians.splits == 1,
     }
-    assert {name for name, changed in full.items() if changed} == ({ablation} & set(full))
+    full |= {
+        "wo_depth": run.module.loss.gaussian.depth_gt == run.module.loss.gaussian.depth_consistency == 0,
+        "wo_enhance": run.module.loss.enhance.weight == 0,
+    }
+    assert {name for name, changed in full.items() if changed} == {ablation}
 
 
 def test_paper_experiment_holds_the_papers_numbers(tmp_path: Path) -> None:

@@ -126,6 +126,24 @@ def test_held_out_images_never_touch_the_gaussians(model: VG2GT, batch: Batch) -
     assert torch.equal(one.sh, two.sh)
 
 
+def test_autocast_never_touches_geometry(model: VG2GT, batch: Batch) -> None:
+    exact = model(batch.context.images, batch.context.hints)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        prediction = model(batch.context.images, batch.context.hints)
+        cameras = training_cameras(model, batch, prediction)
+        truth = ground_truth_target_cameras(batch, prediction)
+    assert torch.equal(prediction.geometry.cameras.world_to_camera, exact.geometry.cameras.world_to_camera)
+    assert torch.equal(prediction.voxels.grid, exact.voxels.grid)
+    assert torch.equal(cameras.world_to_camera, training_cameras(model, batch, exact).world_to_camera)
+    assert torch.equal(truth.world_to_camera, ground_truth_target_cameras(batch, exact).world_to_camera)
+    assert prediction.gaussians.means.dtype == torch.float32
+
+
+def test_metric_scale_needs_a_metric_backend(model: VG2GT) -> None:
+    with pytest.raises(ValueError, match="oracle does not"):
+        VG2GT(model.backend, SceneScale("metric"), None, lambda **_: model.fine, lambda **_: model.gaussians)
+
+
 def test_target_cameras_of_both_protocols_agree(model: VG2GT, batch: Batch) -> None:
     prediction = model(batch.context.images, batch.context.hints)
     joint = training_cameras(model, batch, prediction)

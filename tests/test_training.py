@@ -1,6 +1,7 @@
 """Whole runs: every ablation, backends, resume, bad input."""
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -72,7 +73,7 @@ def test_a_run_writes_its_results(full_run: Path) -> None:
     assert metrics["untrained"].keys() == metrics["trained"].keys()
     assert "PSNR" in (full_run / "metrics.md").read_text()
     assert (full_run / "preview.png").stat().st_size > 1000
-    assert newest_valid(full_run / "checkpoints").name == "step=4.ckpt"
+    assert newest_valid(full_run / "checkpoints").name == "step-4.ckpt"
 
 
 def test_checkpoint_holds_the_trained_part_only(full_run: Path) -> None:
@@ -96,7 +97,7 @@ def test_only_the_trained_part_changes(tmp_path: Path, cache: Path) -> None:
 def test_killed_and_resumed_equals_uninterrupted(tmp_path: Path, cache: Path, full_run: Path) -> None:
     with pytest.raises(InterruptedError):
         train(with_crash(small_config(tmp_path, cache), step=3))
-    assert newest_valid(tmp_path / "checkpoints").name == "step=2.ckpt"
+    assert newest_valid(tmp_path / "checkpoints").name == "step-2.ckpt"
     report = train(small_config(tmp_path, cache, "ckpt=last"))
     whole = read_checkpoint(newest_valid(full_run / "checkpoints"))
     resumed = read_checkpoint(newest_valid(tmp_path / "checkpoints"))
@@ -110,9 +111,7 @@ def test_killed_and_resumed_equals_uninterrupted(tmp_path: Path, cache: Path, fu
 def test_sigterm_saves_and_ends(tmp_path: Path, cache: Path) -> None:
     overrides = [*SMALL, f"output_dir={tmp_path}", f"hydra.run.dir={tmp_path}", f"data.cache_dir={cache}"]
     overrides += ["trainer.max_steps=100000", "callbacks.checkpoint.every_n_train_steps=100000"]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "vg2gt.cli", "train", *overrides], stderr=subprocess.PIPE, text=True
-    )
+    process = subprocess.Popen([sys.executable, "-m", "vg2gt.cli.train", *overrides], stderr=subprocess.PIPE, text=True)
     deadline = time.monotonic() + 240
     while process.poll() is None and time.monotonic() < deadline and not list(tmp_path.glob("logs/*/metrics.csv")):
         time.sleep(0.2)
@@ -133,21 +132,33 @@ def test_a_run_never_restarts_silently(full_run: Path, cache: Path, tmp_path: Pa
         train(small_config(tmp_path, cache, "ckpt=nowhere.ckpt"))
 
 
+def test_a_resumed_run_names_what_changed(full_run: Path, cache: Path, tmp_path: Path, caplog) -> None:
+    copied = tmp_path / "copy"
+    shutil.copytree(full_run, copied)
+    report = train(small_config(copied, cache, "ckpt=last", "trainer.max_steps=5", "loss.enhance.weight=2"))
+    assert report["steps"] == 5
+    warning = next(r.getMessage() for r in caplog.records if "differs from the interrupted" in r.getMessage())
+    assert "loss.enhance.weight" in warning
+    assert "trainer.max_steps" in warning
+    with pytest.raises(FileExistsError, match="not the newest checkpoint"):
+        train(small_config(copied, cache, f"ckpt={copied / 'checkpoints' / 'step-2.ckpt'}"))
+
+
 def test_another_backbone_is_refused(full_run: Path, cache: Path, tmp_path: Path) -> None:
     checkpoint = newest_valid(full_run / "checkpoints")
     with pytest.raises(ValueError, match="trained on backbone"):
-        train(small_config(tmp_path, cache, f'ckpt="{checkpoint}"', "backend.seed=1"))
+        train(small_config(tmp_path, cache, f"ckpt={checkpoint}", "backend.seed=1"))
 
 
 def test_another_architecture_is_refused(full_run: Path, cache: Path, tmp_path: Path) -> None:
     checkpoint = newest_valid(full_run / "checkpoints")
-    with pytest.raises(RuntimeError):
-        train(small_config(tmp_path, cache, f'ckpt="{checkpoint}"', "model.gaussians.splits=4"))
+    with pytest.raises(ValueError, match=r"first in model\.gaussians\.out"):
+        train(small_config(tmp_path, cache, f"ckpt={checkpoint}", "model.gaussians.splits=4"))
 
 
 def test_wo_split_starts_from_a_full_model(full_run: Path, cache: Path, tmp_path: Path, caplog) -> None:
     checkpoint = newest_valid(full_run / "checkpoints")
-    config = small_config(tmp_path, cache, "ablation=wo_split", f'init_from="{checkpoint}"', "trainer.max_steps=1")
+    config = small_config(tmp_path, cache, "ablation=wo_split", f"init_from={checkpoint}", "trainer.max_steps=1")
     report = train(config)
     assert report["steps"] == 1
     fresh = next(record.getMessage() for record in caplog.records if "re-initialised" in record.getMessage())
@@ -182,8 +193,46 @@ def test_real_rgbd_recording(tmp_path: Path, shared: Path) -> None:
     assert 0 < report["trained"]["abs_rel"] < 0.2
 
 
+def test_non_finite_gaussians_are_a_skipped_step(tmp_path: Path, cache: Path) -> None:
+    run = build(small_config(tmp_path, cache, "trainer.max_steps=2"))
+    head = run.module.model.gaussians
+    with torch.no_grad():
+        head.hidden.bias[0] = float("inf")
+    before = head.out.weight.clone()
+    run.trainer.fit(run.module, datamodule=run.datamodule)
+    assert run.module.skipped_total == 2
+    assert torch.equal(head.out.weight, before)
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [("+trainer.accumulate_grad_batches=2", "accumulate"), ("+trainer.gradient_clip_algorithm=value", "use norm")],
+)
+def test_unsupported_trainer_options_are_refused(tmp_path: Path, cache: Path, override: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        train(small_config(tmp_path, cache, "debug=fast_dev_run", override))
+
+
+def test_clipping_can_be_switched_off(tmp_path: Path, cache: Path) -> None:
+    run = build(small_config(tmp_path, cache, "trainer.max_steps=1", "trainer.gradient_clip_val=0"))
+    before = run.module.model.gaussians.out.weight.clone()
+    run.trainer.fit(run.module, datamodule=run.datamodule)
+    assert not torch.equal(run.module.model.gaussians.out.weight, before)
+
+
+@pytest.mark.slow
+def test_two_processes_from_the_console_script(tmp_path: Path, cache: Path) -> None:
+    overrides = [*SMALL, f"data.cache_dir={cache}", "trainer=ddp", "trainer.max_steps=2", "name=two"]
+    script = "import vg2gt.cli; vg2gt.cli.main()"
+    run = subprocess.run(
+        [sys.executable, "-c", script, "train", *overrides], capture_output=True, text=True, cwd=tmp_path, timeout=500
+    )
+    assert run.returncode == 0, run.stderr[-3000:]
+    assert json.loads((tmp_path / "outputs" / "two" / "metrics.json").read_text())["steps"] == 2
+
+
 def cli(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "vg2gt.cli", "train", *arguments]
+    command = [sys.executable, "-m", "vg2gt.cli.train", *arguments]
     return subprocess.run(command, capture_output=True, text=True, cwd=folder, timeout=300, check=False)
 
 

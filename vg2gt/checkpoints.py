@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 log = logging.getLogger(__name__)
 
-PATTERN = "step=*.ckpt"
+PATTERN = "step-*.ckpt"
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
@@ -32,7 +32,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
                 file.flush()
                 os.fsync(file.fileno())
             os.replace(temporary, target)
-        except OSError as error:
+        except (OSError, RuntimeError) as error:  # a full disk is a RuntimeError of torch's writer
             temporary.unlink(missing_ok=True)
             raise OSError(
                 f"checkpoint {target} could not be written ({error}); earlier checkpoints are intact"
@@ -81,7 +81,7 @@ def newest_valid(folder: str | Path) -> Path:
 
 
 def _step_of(path: Path) -> int:
-    digits = path.stem.removeprefix("step=").split("-")[0]
+    digits = path.stem.removeprefix("step-").split("-")[0]
     return int(digits) if digits.isdigit() else -1
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -19,7 +20,7 @@ from vg2gt.model import VG2GT
 from vg2gt.protocols import training_cameras
 from vg2gt.rendering import Renderer
 from vg2gt.schedule import cosine_with_warmup, weight_decay_groups
-from vg2gt.types import Batch
+from vg2gt.types import Batch, Gaussians
 
 log = logging.getLogger(__name__)
 
@@ -82,6 +83,10 @@ class VG2GTModule(lightning.LightningModule):
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Reconstructs the context views, renders some views and returns the training loss."""
         prediction = self.model(batch.context.images, batch.context.hints, self.generator)
+        self._scenes = batch.scene
+        if not _is_finite(prediction.gaussians):
+            self._loss_is_finite = False
+            return self._lost_step()
         views = self._draw_views(batch)
         cameras = training_cameras(self.model, batch, prediction).select(views.to(self.device))
         with record_function("vg2gt/render"):
@@ -89,9 +94,12 @@ class VG2GTModule(lightning.LightningModule):
         with record_function("vg2gt/loss"):
             report: LossReport = self.loss(prediction, batch, rendered, views, cameras)
         self._loss_is_finite = bool(torch.isfinite(report.total.detach()))
-        self._scenes = batch.scene
         self._log_step(report, batch, prediction.gaussians.means.shape[0], prediction.voxels.grid.shape[0])
         return report.total
+
+    def _lost_step(self) -> Tensor:
+        """A loss that is NaN in every trained parameter: the step is then dropped on all ranks."""
+        return torch.stack([parameter.sum() for parameter in self.model.trained_parameters()]).sum() * torch.nan
 
     def _draw_views(self, batch: Batch) -> Tensor:
         """Indices of the views to render: all held-out views, then a random choice of context views, up to the cap."""
@@ -118,18 +126,21 @@ class VG2GTModule(lightning.LightningModule):
         gradient_clip_algorithm: str | None = None,
     ) -> None:
         """Clips the global gradient norm; drops the step on all ranks if a loss or gradient is not finite on any."""
-        limit = float("inf") if gradient_clip_val is None else float(gradient_clip_val)
+        if gradient_clip_algorithm not in (None, "norm"):
+            raise ValueError(f"trainer.gradient_clip_algorithm={gradient_clip_algorithm} is not supported; use norm")
+        limit = float(gradient_clip_val) if gradient_clip_val and gradient_clip_val > 0 else float("inf")
         norm = nn.utils.clip_grad_norm_(self.model.trained_parameters(), limit)
         self.log("train/grad_norm", norm.detach())
         bad = torch.tensor(float(not (self._loss_is_finite and bool(torch.isfinite(norm)))), device=self.device)
         bad = self.trainer.strategy.reduce(bad, reduce_op="sum")
+        self.skipped_total += int(float(bad) > 0)
+        self.log("train/skipped_steps", float(self.skipped_total))
         if float(bad) == 0:
             self.skipped_in_a_row = 0
             return
         # Without gradients the optimiser leaves parameters and moments as they are: no decay, no NaN.
         optimizer.zero_grad(set_to_none=True)
         self.skipped_in_a_row += 1
-        self.skipped_total += 1
         log.warning("step %d skipped: loss or gradient is not finite (%s)", self.global_step, ", ".join(self._scenes))
         if self.skipped_in_a_row >= self.max_skipped:
             raise FloatingPointError(
@@ -153,7 +164,8 @@ class VG2GTModule(lightning.LightningModule):
         for index in range(len(batch.scene)):
             metrics = evaluate_scene(self.model, self.renderer, batch.single(index))
             for name, value in metrics.items():
-                self.log(f"eval/{name}", value, on_epoch=True, batch_size=1, sync_dist=True)
+                if math.isfinite(value):  # a scene without ground-truth depth has no depth error
+                    self.log(f"eval/{name}", value, on_epoch=True, batch_size=1, sync_dist=True)
 
     # ---------------------------------------------------------------------------------------------- checkpoints
 
@@ -162,6 +174,7 @@ class VG2GTModule(lightning.LightningModule):
         state = checkpoint["state_dict"]
         checkpoint["state_dict"] = {k: v for k, v in state.items() if not k.startswith(BACKBONE_PREFIX)}
         checkpoint["backend"] = dict(self.model.backend.identity())
+        checkpoint["skipped_steps"] = self.skipped_total
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Refuses a checkpoint that was trained on another backbone."""
@@ -171,15 +184,22 @@ class VG2GTModule(lightning.LightningModule):
                 f"the checkpoint was trained on backbone {stored}, this run uses {present}: choose the same backend= "
                 "and the same weights, or start a new run from it with init_from="
             )
+        self.skipped_total = int(checkpoint.get("skipped_steps", 0))
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False):
         """Loads the trained part; only backbone weights may be missing."""
-        result = super().load_state_dict(state_dict, strict=False, assign=assign)
-        missing = [key for key in result.missing_keys if not key.startswith(BACKBONE_PREFIX)]
-        if missing or result.unexpected_keys:
-            raise RuntimeError(
-                f"the checkpoint does not fit this model: missing {missing[:3]}, not expected "
-                f"{result.unexpected_keys[:3]}; use the model options it was trained with, or init_from= to start "
-                "from the weights that fit"
+        present = {k: v.shape for k, v in self.state_dict().items() if not k.startswith(BACKBONE_PREFIX)}
+        stored = {k: v.shape for k, v in state_dict.items() if not k.startswith(BACKBONE_PREFIX)}
+        if stored != present:
+            wrong = sorted(name for name in stored.keys() | present.keys() if stored.get(name) != present.get(name))
+            raise ValueError(
+                f"the checkpoint does not fit this model, first in {wrong[0]} (stored {stored.get(wrong[0])}, here "
+                f"{present.get(wrong[0])}): use the model options it was trained with, or init_from= to start from the "
+                "weights that fit"
             )
-        return result
+        return super().load_state_dict(state_dict, strict=False, assign=assign)
+
+
+def _is_finite(gaussians: Gaussians) -> bool:
+    tensors = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
+    return all(bool(torch.isfinite(tensor).all()) for tensor in tensors)

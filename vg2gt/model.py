@@ -1,4 +1,4 @@
-"""The whole method in one forward pass (paper, Method; data flow in docs/architecture.md).
+"""The whole method in one forward pass (paper, Method).
 
 images -> frozen backbone -> tokens -> frozen heads -> depth, confidence, cameras
                                |                            |
@@ -77,6 +77,9 @@ class VG2GT(nn.Module):
             (ablation w/o Coarse): the geometry is then the backbone's.
         fine: makes the fine-level voxel module from ``token_dims`` and ``patch_size``.
         gaussians: makes the self-splitting Gaussian head from ``in_channels``.
+
+    Raises:
+        ValueError: if the scale is to be metric and the backend is not.
     """
 
     def __init__(
@@ -88,6 +91,11 @@ class VG2GT(nn.Module):
         gaussians: Callable[..., nn.Module],
     ) -> None:
         super().__init__()
+        if scale.source == "metric" and not backend.is_metric:
+            raise ValueError(
+                f"model.scale.source=metric needs a backend that knows metres, {backend.name} does not: "
+                "use model.scale.source=normalize or focal"
+            )
         self.backend = backend
         self.scale = scale
         dims, patch = backend.token_dims, backend.patch_size

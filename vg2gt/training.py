@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import lightning
+import torch
 from hydra.utils import instantiate
 from lightning.pytorch import LightningDataModule, Trainer
 from omegaconf import DictConfig, OmegaConf
@@ -51,6 +52,7 @@ class Run:
 
 def build(config: DictConfig) -> Run:
     """Instantiates everything the configuration names; each part's constructor is its schema."""
+    _check_trainer(config)
     lightning.seed_everything(config.seed, workers=True, verbose=False)
     for message in EXPECTED_WARNINGS:
         warnings.filterwarnings("ignore", message=message)
@@ -67,12 +69,26 @@ def build(config: DictConfig) -> Run:
     )
     trainer = instantiate(
         config.trainer,
+        accelerator=_accelerator(config.trainer.accelerator),
         callbacks=[instantiate(callback) for callback in config.callbacks.values() if callback],
         logger=[instantiate(logger) for logger in config.logger.values() if logger],
         plugins=[AtomicCheckpointIO()],
         default_root_dir=config.output_dir,
     )
     return Run(module, datamodule, trainer, Path(config.output_dir), bool(config.trainer.get("fast_dev_run")))
+
+
+def _accelerator(asked: str) -> str:
+    """``auto`` means CUDA or the CPU: Apple's MPS has no float64, which the geometry needs."""
+    return asked if asked != "auto" else "gpu" if torch.cuda.is_available() else "cpu"
+
+
+def _check_trainer(config: DictConfig) -> None:
+    if config.trainer.get("accumulate_grad_batches", 1) != 1:
+        raise ValueError(
+            "trainer.accumulate_grad_batches is not supported: a batch is a function of the optimiser's step; use "
+            "data.max_images for larger steps"
+        )
 
 
 def train(config: DictConfig) -> dict[str, Any]:
@@ -90,16 +106,18 @@ def train(config: DictConfig) -> dict[str, Any]:
     """
     checkpoint = _checkpoint_to_resume(config)
     run = build(config)
+    if checkpoint is not None:
+        _name_differences(config)
     write_text(run.folder / "config.yaml", OmegaConf.to_yaml(config, resolve=True))
     if config.init_from and checkpoint is None:
         initialize_from(run.module, config.init_from)
 
     untrained = _untrained_metrics(run, resumed=checkpoint is not None)
     run.trainer.fit(run.module, datamodule=run.datamodule, ckpt_path=checkpoint, weights_only=True)
+    _save_last(run)
     if not run.trial and run.trainer.global_step < run.trainer.max_steps:
         log.warning("training ended at step %d of %d", run.trainer.global_step, run.trainer.max_steps)
         return {}
-    _save_last(run)
     trained = _evaluate(run)
     return _report(run, untrained, trained)
 
@@ -109,10 +127,15 @@ def _checkpoint_to_resume(config: DictConfig) -> Path | None:
     folder = Path(config.output_dir) / "checkpoints"
     if config.ckpt == "last":
         return newest_valid(folder)
-    if config.ckpt:
-        read_checkpoint(config.ckpt)
-        return Path(config.ckpt)
     old = sorted(folder.glob("*.ckpt"))
+    if config.ckpt:
+        path, step = Path(config.ckpt), read_checkpoint(config.ckpt)["global_step"]
+        if old and not (path.resolve().parent == folder.resolve() and path.name == newest_valid(folder).name):
+            raise FileExistsError(
+                f"ckpt={path} (step {step}) is not the newest checkpoint of the run in {folder}: go on in a new folder "
+                "with name=, or with ckpt=last"
+            )
+        return path
     if old and not config.trainer.get("fast_dev_run"):
         if not config.overwrite:
             raise FileExistsError(
@@ -124,10 +147,33 @@ def _checkpoint_to_resume(config: DictConfig) -> Path | None:
     return None
 
 
+def _name_differences(config: DictConfig) -> None:
+    """Says in the log what a resumed run does otherwise than the interrupted one."""
+    path = Path(config.output_dir) / "config.yaml"
+    if not path.is_file():
+        return
+    before, now = (_flatten(OmegaConf.to_container(c, resolve=True)) for c in (OmegaConf.load(path), config))
+    different = sorted(key for key in before.keys() | now.keys() if before.get(key) != now.get(key))
+    different = [key for key in different if key not in ("ckpt", "output_dir", "overwrite")]
+    if different:
+        log.warning("the resumed run differs from the interrupted one in %s", ", ".join(different))
+
+
+def _flatten(node: Any, prefix: str = "") -> dict[str, Any]:
+    if not isinstance(node, dict):
+        return {prefix: node}
+    return {
+        key: value
+        for name, child in node.items()
+        for key, value in _flatten(child, f"{prefix}.{name}".strip(".")).items()
+    }
+
+
 def _save_last(run: Run) -> None:
     """Saves the final weights where the last step was not a checkpoint's turn."""
-    path = run.folder / "checkpoints" / f"step={run.trainer.global_step}.ckpt"
-    if not run.trial and not path.is_file():
+    path = run.folder / "checkpoints" / f"step-{run.trainer.global_step}.ckpt"
+    # Rank 0 decides for all: saving is collective, and it makes the file appear.
+    if run.trainer.strategy.broadcast(not run.trial and not path.is_file()):
         run.trainer.save_checkpoint(path)
 
 
@@ -154,6 +200,7 @@ def _report(run: Run, untrained: dict[str, float], trained: dict[str, float]) ->
         write_json(run.folder / "metrics.json", report)
         write_text(run.folder / "metrics.md", comparison_table(untrained, trained))
         print_comparison(untrained, trained)
+        run.module.to(run.trainer.strategy.root_device)  # the strategy's teardown has moved it to the CPU
         preview = write_preview(run.module, run.datamodule, run.folder / "preview.png")
         newest = newest_valid(run.folder / "checkpoints")
         for name, path in (

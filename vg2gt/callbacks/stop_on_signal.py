@@ -35,12 +35,13 @@ class StopOnSignal(lightning.Callback):
     def on_train_batch_end(self, trainer: lightning.Trainer, *args: Any) -> None:
         """Saves and stops at the end of the step in which the signal came (on any rank)."""
         if trainer.strategy.reduce_boolean_decision(self.received, all=False):
-            path = self.folder / f"step={trainer.global_step}.ckpt"
+            path = self.folder / f"step-{trainer.global_step}.ckpt"
             trainer.save_checkpoint(path)
             trainer.should_stop = True
             log.warning("stopping as asked by SIGTERM: saved %s, go on with ckpt=last", path)
 
-    def on_train_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        """Gives SIGTERM back."""
+    def teardown(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, stage: str) -> None:
+        """Gives SIGTERM back, after an error as well."""
         if self._previous is not None:
             signal.signal(signal.SIGTERM, self._previous)
+            self._previous = None

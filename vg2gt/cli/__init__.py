@@ -10,12 +10,12 @@ COMMANDS = {"train": "vg2gt.cli.train"}
 
 def main() -> None:
     """Runs ``vg2gt COMMAND [arguments]``; the arguments are the command's own (Hydra overrides for ``train``)."""
-    if len(sys.argv) < 2 or sys.argv[1] not in COMMANDS:
-        known = ", ".join(COMMANDS)
-        asked = (
-            f"unknown command {sys.argv[1]!r}; " if len(sys.argv) > 1 and sys.argv[1] not in ("-h", "--help") else ""
-        )
-        print(f"{asked}usage: vg2gt COMMAND [arguments], COMMAND is one of: {known}")
-        sys.exit(0 if not asked and len(sys.argv) > 1 else 2)
-    command = sys.argv.pop(1)
-    importlib.import_module(COMMANDS[command]).main()
+    asked = sys.argv[1] if len(sys.argv) > 1 else ""
+    if asked not in COMMANDS:
+        unknown = f"unknown command {asked!r}; " if asked not in ("", "-h", "--help") else ""
+        print(f"{unknown}usage: vg2gt COMMAND [arguments], COMMAND is one of: {', '.join(COMMANDS)}")
+        sys.exit(0 if asked in ("-h", "--help") else 2)
+    command = importlib.import_module(COMMANDS[asked])
+    # Further processes (DDP) are started as argv says: by the command's own file, without the command's name.
+    sys.argv[:2] = [str(command.__file__)]
+    command.main()

@@ -1,4 +1,4 @@
-"""``vg2gt train``: the same as ``python train.py`` in a checkout, from any folder."""
+"""``vg2gt train``, or ``python -m vg2gt.cli.train``: ``python train.py`` of a checkout, from any folder."""
 
 import hydra
 from omegaconf import DictConfig
@@ -11,3 +11,7 @@ from vg2gt.training import train
 def main(config: DictConfig) -> None:
     """Composes the configuration and runs the training."""
     train(config)
+
+
+if __name__ == "__main__":
+    main()

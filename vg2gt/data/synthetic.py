@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import logging
-import os
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -131,4 +130,4 @@ class SyntheticRooms(SceneSource):
 
 def _threads() -> int:
     """Rendering threads: all cores of this process, or one in a loader's worker, which has siblings."""
-    return 1 if torch.utils.data.get_worker_info() is not None else max(1, len(os.sched_getaffinity(0)))
+    return 1 if torch.utils.data.get_worker_info() is not None else torch.get_num_threads()

@@ -14,6 +14,7 @@ from vg2gt.types import Gaussians, Voxels
 
 Anchor = Literal["centroid", "center"]
 MAX_SCALE = 2.0  # voxels: the paper's bound
+MIN_SCALE = 1e-3  # voxels: renderers need a finite inverse
 INITIAL_ALPHA = 0.95  # of a voxel's K Gaussians together, before training
 
 
@@ -83,7 +84,8 @@ class GaussianHead(nn.Module):
         size = voxels.voxel_size[voxels.batch][:, None, None]
         anchor = voxels.centroid if self.anchor == "centroid" else voxels.centers
         means = anchor[:, None] + self.max_offset * size * torch.tanh(offset)
-        scales = MAX_SCALE * size * torch.sigmoid(scale - math.log(3))  # sigmoid(-ln 3) = 1/4: starts at v / 2
+        scale = MAX_SCALE * torch.sigmoid(scale - math.log(3))  # sigmoid(-ln 3) = 1/4: starts at v / 2
+        scales = size * scale.clamp(min=MIN_SCALE)
         quats = F.normalize(rotation + rotation.new_tensor([1.0, 0.0, 0.0, 0.0]), dim=-1)
         opacities = torch.sigmoid(opacity[..., 0] + self.opacity_bias)
         base = F.pad(rgb_to_sh(voxels.colors)[:, None, None], (0, 0, 0, len(self.sh_gain) - 1))

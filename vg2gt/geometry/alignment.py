@@ -8,6 +8,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
+from vg2gt.geometry.cameras import compose
 from vg2gt.types import Cameras, TensorRecord
 
 SUBSAMPLE = 64
@@ -99,13 +100,13 @@ class Similarity(TensorRecord):
 
     def apply(self, points: Tensor) -> Tensor:
         """Maps points ``[B, ..., 3]``."""
-        flat = points.reshape(points.shape[0], -1, 3) @ self.rotation.transpose(-1, -2)
+        flat = compose(points.reshape(points.shape[0], -1, 3), self.rotation.transpose(-1, -2))
         return (self.scale[:, None, None] * flat + self.translation[:, None]).reshape(points.shape)
 
     def apply_cameras(self, cameras: Cameras) -> Cameras:
         """Moves cameras into the target frame: centres like points, orientations turned, intrinsics kept."""
-        rotation = cameras.world_to_camera[..., :3, :3] @ self.rotation[:, None].transpose(-1, -2)
-        translation = -rotation @ self.apply(_centers(cameras))[..., None]
+        rotation = compose(cameras.world_to_camera[..., :3, :3], self.rotation[:, None].transpose(-1, -2))
+        translation = -compose(rotation, self.apply(_centers(cameras))[..., None])
         top = torch.cat((rotation, translation), -1)
         pose = torch.cat((top, cameras.world_to_camera[..., 3:, :]), -2)
         return Cameras(pose, cameras.intrinsics, cameras.size)
@@ -151,7 +152,7 @@ def _moves(centers: Tensor) -> Tensor:
 def _centers(cameras: Cameras) -> Tensor:
     """Camera centres ``[B, V, 3]`` in the world frame."""
     pose = cameras.world_to_camera
-    return -(pose[..., :3, :3].transpose(-1, -2) @ pose[..., :3, 3:])[..., 0]
+    return -compose(pose[..., :3, :3].transpose(-1, -2), pose[..., :3, 3:])[..., 0]
 
 
 def _nearest_rotation(matrix: Tensor) -> Tensor:

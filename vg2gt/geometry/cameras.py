@@ -35,10 +35,15 @@ def ray_directions(intrinsics: Tensor, size: tuple[int, int]) -> Tensor:
     return torch.cat((xy, torch.ones_like(xy[..., :1])), -1)
 
 
+def compose(first: Tensor, second: Tensor) -> Tensor:
+    """Product of small matrices ``[..., I, J]`` and ``[..., J, K]``, elementwise, so that no autocast can round it."""
+    return (first[..., :, :, None] * second[..., None, :, :]).sum(-2)
+
+
 def invert_rigid(transform: Tensor) -> Tensor:
     """Inverts rigid 4x4 transforms ``[..., 4, 4]`` by transposing the rotation."""
     rotation = transform[..., :3, :3].transpose(-1, -2)
-    translation = -rotation @ transform[..., :3, 3:]
+    translation = -compose(rotation, transform[..., :3, 3:])
     return torch.cat((torch.cat((rotation, translation), -1), transform[..., 3:, :]), -2)
 
 
@@ -89,7 +94,7 @@ def project(points: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
 def relative_to_first(cameras: Cameras) -> Cameras:
     """Moves the world frame into view 0 of every scene, whose pose becomes exactly the identity."""
     first = invert_rigid(cameras.world_to_camera[:, :1])
-    poses = cameras.world_to_camera @ first
+    poses = compose(cameras.world_to_camera, first)
     identity = torch.eye(4, dtype=poses.dtype, device=poses.device).expand_as(poses[:, :1])
     return Cameras(torch.cat((identity, poses[:, 1:]), 1), cameras.intrinsics, cameras.size)
 
