@@ -11,6 +11,7 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig, OmegaConf
 
+from vg2gt.losses import VG2GTLoss
 from vg2gt.paths import config_dir
 from vg2gt.training import build
 
@@ -86,9 +87,11 @@ def test_every_ablation_builds_what_it_says(tmp_path: Path, ablation: str) -> No
         "wo_coarse": run.module.model.coarse is None,
         "wo_split": run.module.model.gaussians.splits == 1,
     }
+    loss = run.module.loss
+    assert isinstance(loss, VG2GTLoss)
     full |= {
-        "wo_depth": run.module.loss.gaussian.depth_gt == run.module.loss.gaussian.depth_consistency == 0,
-        "wo_enhance": run.module.loss.enhance.weight == 0,
+        "wo_depth": loss.gaussian.depth_gt == loss.gaussian.depth_consistency == 0,
+        "wo_enhance": loss.enhance.weight == 0,
     }
     assert {name for name, changed in full.items() if changed} == {ablation}
 

@@ -89,6 +89,7 @@ def test_gradient_reaches_the_last_coarse_layer_first_and_the_transformer_next(r
 def test_hinge_answers_harmful_token_changes_only(run: Run, model: VG2GT, batch: Batch) -> None:
     """The tokens move along the gradient of the decoded depth's error: uphill is punished, downhill left alone."""
     context, backend = batch.context, model.backend
+    assert isinstance(run.module.loss, VG2GTLoss)
     hinge_only = hinge_alone(run.module.loss)
     tokens = backend.encode(context.images, context.hints)
     before = model(context.images, context.hints)

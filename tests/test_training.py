@@ -15,6 +15,7 @@ from omegaconf import OmegaConf
 
 from tests.training_helpers import SMALL, small_config, with_crash
 from vg2gt.checkpoints import newest_valid, read_checkpoint
+from vg2gt.gaussians import GaussianHead
 from vg2gt.paths import config_dir
 from vg2gt.training import build, train
 
@@ -196,6 +197,7 @@ def test_real_rgbd_recording(tmp_path: Path, shared: Path) -> None:
 def test_non_finite_gaussians_are_a_skipped_step(tmp_path: Path, cache: Path) -> None:
     run = build(small_config(tmp_path, cache, "trainer.max_steps=2"))
     head = run.module.model.gaussians
+    assert isinstance(head, GaussianHead)
     with torch.no_grad():
         head.hidden.bias[0] = float("inf")
     before = head.out.weight.clone()
@@ -215,9 +217,11 @@ def test_unsupported_trainer_options_are_refused(tmp_path: Path, cache: Path, ov
 
 def test_clipping_can_be_switched_off(tmp_path: Path, cache: Path) -> None:
     run = build(small_config(tmp_path, cache, "trainer.max_steps=1", "trainer.gradient_clip_val=0"))
-    before = run.module.model.gaussians.out.weight.clone()
+    head = run.module.model.gaussians
+    assert isinstance(head, GaussianHead)
+    before = head.out.weight.clone()
     run.trainer.fit(run.module, datamodule=run.datamodule)
-    assert not torch.equal(run.module.model.gaussians.out.weight, before)
+    assert not torch.equal(head.out.weight, before)
 
 
 @pytest.mark.slow
