@@ -23,7 +23,7 @@ def main() -> None:
     """Renders, prints the errors, writes the picture."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--gaussians", type=int, default=20_000)
-    parser.add_argument("--out", type=Path, default=Path("docs/solid-against-rasterized.png"))
+    parser.add_argument("--out", type=Path, default=Path("docs/figures/solid-against-rasterized.png"))
     arguments = parser.parse_args()
     gaussians = room_gaussians(arguments.gaussians, SIZE, sigma=(100_000 / arguments.gaussians) ** 0.5)
     cameras = room_cameras(3, SIZE).select(slice(1, 2))
