@@ -97,7 +97,8 @@ def test_chunked_heads_equal_whole_heads(make_backend, make_scene) -> None:
         gradients.append(torch.cat(torch.autograd.grad(depth.square().sum(), patch)))
     for depth, gradient in zip(depths[1:], gradients[1:], strict=True):
         torch.testing.assert_close(depth, depths[0], rtol=1e-5, atol=1e-6)
-        torch.testing.assert_close(gradient, gradients[0], rtol=1e-3, atol=1e-6)
+        # In norm, not element by element: another chunk rounds differently, and a ReLU at zero may then open or close.
+        assert float((gradient - gradients[0]).norm() / gradients[0].norm()) < 1e-3
     assert max(held[1:]) < 0.2 * held[0]
 
 
