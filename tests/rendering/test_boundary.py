@@ -1,20 +1,18 @@
 """Degenerate scenes, refused input, and the configured renderer."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import hydra
 import pytest
 import torch
-from omegaconf import OmegaConf
 
 from tests.rendering.scenes import IMPLEMENTATIONS, images, pinhole, soup, with_gradients
+from vg2gt.paths import config_dir
 from vg2gt.rendering import Renderer, render
 from vg2gt.rendering.options import Mode
 from vg2gt.rendering.renderer import Implementation
 from vg2gt.types import Cameras, Gaussians
 
-CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "renderer"
 MODES: tuple[Mode, ...] = ("solid", "rasterized")
 
 
@@ -132,7 +130,9 @@ def test_bad_options_are_refused(options: dict[str, object]) -> None:
 
 @pytest.mark.parametrize("name", MODES)
 def test_configuration_builds_the_renderer(name: Mode) -> None:
-    renderer = hydra.utils.instantiate(OmegaConf.load(CONFIGS / f"{name}.yaml"))
+    with hydra.initialize_config_dir(config_dir(), version_base="1.3"):
+        config = hydra.compose(f"renderer/{name}")
+    renderer = hydra.utils.instantiate(config.renderer)
     assert isinstance(renderer, Renderer)
     assert renderer.options.mode == name
     gaussians, cameras = soup(30), pinhole((12, 15))
