@@ -20,7 +20,7 @@ ROWS: dict[str, tuple[str, int, bool | None]] = {
     "gaussians": ("Gaussians", 0, None),
     "cv": ("uniformity CV (k = 8)", 3, False),
 }
-CAPTION = "held-out views of held-out scenes; ground-truth target poses; depth aligned by one median scale a scene"
+CAPTION = "views never trained on, at ground-truth poses; depth aligned by one median scale a scene"
 
 
 def _cells(untrained: dict[str, float], trained: dict[str, float]) -> list[tuple[str, str, str, str]]:

@@ -5,8 +5,8 @@ from functools import partial
 import lightning
 import pytest
 import torch
+from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
-from omegaconf import OmegaConf
 
 from vg2gt.data import DataError, SceneDataModule, SyntheticRooms
 from vg2gt.data.evaluation_views import EvaluationViews
@@ -188,7 +188,8 @@ def test_evaluation_positions_are_checked(rooms):
 @pytest.mark.parametrize("name", ["synthetic", "rgbd"])
 def test_the_configuration_makes_a_data_module(name, write_recording, tmp_path, monkeypatch):
     monkeypatch.setenv("VG2GT_CACHE", str(tmp_path))
-    config = OmegaConf.create({"seed": 0, "data": OmegaConf.load(f"{config_dir()}/data/{name}.yaml")})
+    with initialize_config_dir(config_dir(), version_base="1.3"):
+        config = compose("train", [f"data={name}", f"output_dir={tmp_path}"])
     if name == "rgbd":
         config.data.update(root=str(write_recording(frames=6)), max_views=2, min_views=2, max_images=2)
     module = instantiate(config.data)
