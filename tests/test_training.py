@@ -8,6 +8,7 @@ import sys
 import time
 from pathlib import Path
 
+import lightning
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
@@ -110,18 +111,41 @@ def test_killed_and_resumed_equals_uninterrupted(tmp_path: Path, cache: Path, fu
 
 
 def test_sigterm_saves_and_ends(tmp_path: Path, cache: Path) -> None:
+    """In training the step is finished and saved; in the evaluation before it there is nothing to save."""
     overrides = [*SMALL, f"output_dir={tmp_path}", f"hydra.run.dir={tmp_path}", f"data.cache_dir={cache}"]
     overrides += ["trainer.max_steps=100000", "callbacks.checkpoint.every_n_train_steps=100000"]
-    process = subprocess.Popen([sys.executable, "-m", "vg2gt.cli.train", *overrides], stderr=subprocess.PIPE, text=True)
+    command = [sys.executable, "-m", "vg2gt.cli.train", *overrides]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     deadline = time.monotonic() + 240
-    while process.poll() is None and time.monotonic() < deadline and not list(tmp_path.glob("logs/*/metrics.csv")):
+    while process.poll() is None and time.monotonic() < deadline and not trains(tmp_path):
         time.sleep(0.2)
     process.send_signal(signal.SIGTERM)
-    _, errors = process.communicate(timeout=120)
+    _, errors = process.communicate(timeout=60)
     assert process.returncode == 0, errors[-2000:]
     saved = newest_valid(tmp_path / "checkpoints")
     assert read_checkpoint(saved)["global_step"] >= 1
     assert "go on with ckpt=last" in errors
+
+
+def trains(folder: Path) -> bool:
+    return any("train/" in path.read_text() for path in folder.glob("logs/*/metrics.csv"))
+
+
+class Terminated(lightning.Callback):
+    """Sends SIGTERM to the own process in the first evaluation batch."""
+
+    def on_validation_batch_start(self, *args: object) -> None:
+        signal.raise_signal(signal.SIGTERM)
+
+
+def test_sigterm_in_an_evaluation_ends_the_run(tmp_path: Path, cache: Path) -> None:
+    run = build(small_config(tmp_path, cache))
+    run.trainer.callbacks.append(Terminated())  # pyright: ignore[reportAttributeAccessIssue]
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(SystemExit) as ended:
+        run.trainer.validate(run.module, datamodule=run.datamodule, verbose=False)
+    assert ended.value.code == 143
+    assert signal.getsignal(signal.SIGTERM) == before
 
 
 def test_a_run_never_restarts_silently(full_run: Path, cache: Path, tmp_path: Path) -> None:

@@ -9,12 +9,17 @@ from types import FrameType
 from typing import Any
 
 import lightning
+from lightning.pytorch.trainer.states import TrainerFn
 
 log = logging.getLogger(__name__)
 
+TERMINATED = 128 + signal.SIGTERM
+
 
 class StopOnSignal(lightning.Callback):
-    """On SIGTERM: finishes the step, writes a checkpoint and ends the training normally (``ckpt=last`` goes on).
+    """On SIGTERM: finishes the training step, writes a checkpoint and ends normally (``ckpt=last`` goes on).
+
+    In the evaluations before and after the training there is nothing to save: the process ends with status 143.
 
     Args:
         folder: where checkpoints are written, the same as the checkpoint callback's.
@@ -27,18 +32,34 @@ class StopOnSignal(lightning.Callback):
 
     def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Takes over SIGTERM for the time of the training."""
-        self._previous = signal.signal(signal.SIGTERM, self._note)
+        self._take_over()
+
+    def on_validation_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        """Takes over SIGTERM for the time of an evaluation."""
+        self._take_over()
+
+    def _take_over(self) -> None:
+        if signal.getsignal(signal.SIGTERM) != self._note:
+            self._previous = signal.signal(signal.SIGTERM, self._note)
 
     def _note(self, number: int, frame: FrameType | None) -> None:
         self.received = True
 
     def on_train_batch_end(self, trainer: lightning.Trainer, *args: Any) -> None:
         """Saves and stops at the end of the step in which the signal came (on any rank)."""
-        if trainer.strategy.reduce_boolean_decision(self.received, all=False):
+        # Lightning's own handler is in place until the training starts, and only takes a note.
+        asked = self.received or bool(getattr(trainer, "received_sigterm", False))
+        if trainer.strategy.reduce_boolean_decision(asked, all=False):
             path = self.folder / f"step-{trainer.global_step}.ckpt"
             trainer.save_checkpoint(path)
             trainer.should_stop = True
             log.warning("stopping as asked by SIGTERM: saved %s, go on with ckpt=last", path)
+
+    def on_validation_batch_end(self, trainer: lightning.Trainer, *args: Any) -> None:
+        """Ends the process if the signal came in an evaluation outside the training."""
+        if self.received and trainer.state.fn == TrainerFn.VALIDATING:
+            log.warning("stopping as asked by SIGTERM during an evaluation; a trained run goes on with ckpt=last")
+            raise SystemExit(TERMINATED)
 
     def teardown(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, stage: str) -> None:
         """Gives SIGTERM back, after an error as well."""
