@@ -27,7 +27,7 @@ from vg2gt.rendering.renderer import Implementation
 from vg2gt.types import Cameras, Gaussians, Render
 
 if importlib.util.find_spec("triton") is None:
-    pytest.skip("Triton comes with torch's CUDA builds only", allow_module_level=True)
+    pytest.skip("needs triton, which has wheels for Linux on x86-64 only", allow_module_level=True)
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
 runnable = pytest.mark.skipif(DEVICE == "cpu" and not INTERPRETED, reason="runs in test_in_the_interpreter's process")

@@ -7,6 +7,9 @@ the interpreter cannot iterate over a tensor's range. Hits lie in three planes (
 values, each hit number of all ``pixels`` side by side.
 """
 
+# pyright: reportGeneralTypeIssues=false, reportOperatorIssue=false
+# (inside a kernel the operators and ranges are Triton's language, which its type hints do not describe)
+
 from __future__ import annotations
 
 import triton  # pyright: ignore[reportMissingImports]
