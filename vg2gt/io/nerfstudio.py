@@ -1,0 +1,366 @@
+"""nerfstudio's and instant-ngp's ``transforms.json``: posed frames with intrinsics, shared or one a frame.
+
+In the file poses are camera-to-world with OpenGL axes (x right, y up, z backward) and the centre of the first pixel is
+at (1/2, 1/2). The records hold our conventions; the change happens in ``_world_to_camera`` and ``_camera_to_world``
+and in :meth:`Lens.intrinsics` and :meth:`Lens.from_intrinsics`, and nowhere else.
+
+Example:
+    >>> import numpy as np, tempfile
+    >>> from vg2gt.io import Lens, Transforms, TransformsFrame, read_transforms, write_transforms
+    >>> lens = Lens.from_intrinsics([[500, 0, 319.5], [0, 500, 239.5], [0, 0, 1]], size=(480, 640))
+    >>> frames = (TransformsFrame("images/0001.png", np.eye(4), lens),)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     back = read_transforms(write_transforms(folder + "/transforms.json", Transforms(frames)))
+    >>> back.frames[0].file_path, back.frames[0].lens.cx
+    ('images/0001.png', 320.0)
+    >>> back.frames[0].lens.intrinsics()[0].tolist()
+    [500.0, 0.0, 319.5]
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vg2gt.io.errors import FormatError
+from vg2gt.io.files import read_json, write_json
+
+PIXEL_CENTER = 0.5  # where the file has the centre of the first pixel; ours is at 0
+DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+
+_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenCV camera axes <-> OpenGL camera axes
+_ROTATION_TOLERANCE = 0.02  # recorded poses are orthonormal to about 1e-3
+_MAX_SIZE = 1 << 20
+
+
+@dataclass(frozen=True)
+class Lens:
+    """What a file says about the optics of its frames; None where it is silent.
+
+    Attributes:
+        width: image width in pixels.
+        height: image height in pixels.
+        fl_x: focal length in pixels.
+        fl_y: vertical focal length in pixels.
+        cx: principal point in pixels, the centre of the first pixel at 1/2.
+        cy: the same, vertically.
+        camera_angle_x: full horizontal field of view in radians; ``fl_x`` goes before it.
+        camera_angle_y: full vertical field of view in radians; ``fl_y`` goes before it.
+        camera_model: such as ``OPENCV`` or ``OPENCV_FISHEYE``.
+        distortion: OpenCV coefficients among ``k1 k2 k3 k4 p1 p2``.
+    """
+
+    width: int | None = None
+    height: int | None = None
+    fl_x: float | None = None
+    fl_y: float | None = None
+    cx: float | None = None
+    cy: float | None = None
+    camera_angle_x: float | None = None
+    camera_angle_y: float | None = None
+    camera_model: str | None = None
+    distortion: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def is_distorted(self) -> bool:
+        """Whether the images are not those of a pinhole camera."""
+        return any(value != 0 for value in self.distortion.values()) or "FISHEYE" in (self.camera_model or "")
+
+    @staticmethod
+    def from_intrinsics(
+        intrinsics: ArrayLike, size: tuple[int, int], distortion: Mapping[str, float] | None = None
+    ) -> Lens:
+        """Lens of our intrinsics ``[3, 3]`` (integer pixel centres) and image ``(height, width)``."""
+        k = np.asarray(intrinsics, np.float64)
+        cx, cy = (float(k[axis, 2]) + PIXEL_CENTER for axis in (0, 1))
+        return Lens(
+            int(size[1]),
+            int(size[0]),
+            float(k[0, 0]),
+            float(k[1, 1]),
+            cx,
+            cy,
+            camera_model="OPENCV",
+            distortion=dict(distortion or {}),
+        )
+
+    def intrinsics(self, size: tuple[int, int] | None = None) -> NDArray[np.floating]:
+        """Pinhole part ``[3, 3]`` in pixels of the file's image size, with our integer pixel centres.
+
+        A missing ``fl_x`` follows from ``camera_angle_x``, a missing ``fl_y`` from ``camera_angle_y`` or else equals
+        ``fl_x``, a missing principal point is the middle of the image.
+
+        Args:
+            size: the images' ``(height, width)``, used where the file does not give its own.
+
+        Raises:
+            ValueError: if the size is needed and not known, or there is no focal length.
+        """
+        height = self.height or (size[0] if size else None)
+        width = self.width or (size[1] if size else None)
+        fl_x = _focal(self.fl_x, self.camera_angle_x, width)
+        if fl_x is None:
+            raise ValueError("the focal length needs fl_x, or camera_angle_x and the images' width: pass size")
+        fl_y = _focal(self.fl_y, self.camera_angle_y, height) or fl_x
+        cx, cy = _middle(self.cx, width), _middle(self.cy, height)
+        if cx is None or cy is None:
+            raise ValueError("the principal point needs cx and cy or the images' size: pass size=(height, width)")
+        return np.array([[fl_x, 0, cx - PIXEL_CENTER], [0, fl_y, cy - PIXEL_CENTER], [0, 0, 1]])
+
+
+def _focal(focal: float | None, angle: float | None, extent: int | None) -> float | None:
+    if focal is None and angle is not None and extent is not None:
+        return extent / 2 / math.tan(angle / 2)
+    return focal
+
+
+def _middle(center: float | None, extent: int | None) -> float | None:
+    return extent / 2 if center is None and extent is not None else center
+
+
+@dataclass(frozen=True, eq=False)
+class TransformsFrame:
+    """One frame.
+
+    Attributes:
+        file_path: the image as the file names it, relative to the file's folder; it need not exist.
+        world_to_camera: ``[4, 4]`` float64, OpenCV; all NaN where the file's pose is not finite.
+        lens: the frame's own intrinsics, the file's shared ones filled in.
+        depth_file_path: depth image, or None.
+        mask_path: mask image, or None.
+    """
+
+    file_path: str
+    world_to_camera: NDArray[np.floating]
+    lens: Lens
+    depth_file_path: str | None = None
+    mask_path: str | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Transforms:
+    """A whole file.
+
+    Attributes:
+        frames: the frames in the file's order; images listed but absent are the caller's business.
+        applied_transform: ``[3, 4]`` float64 by which an earlier tool moved its world to the one of the poses, or None.
+        ply_file_path: point cloud of the scene in the world of the poses, or None.
+    """
+
+    frames: tuple[TransformsFrame, ...]
+    applied_transform: NDArray[np.floating] | None = None
+    ply_file_path: str | None = None
+
+    def before_applied_transform(self) -> Transforms:
+        """The same frames in the world before ``applied_transform``; unchanged where there was none.
+
+        The point cloud is left behind, because it belongs to the other world.
+        """
+        if self.applied_transform is None:
+            return self
+        applied = np.vstack((self.applied_transform, [0, 0, 0, 1]))
+        frames = tuple(replace(frame, world_to_camera=frame.world_to_camera @ applied) for frame in self.frames)
+        return Transforms(frames)
+
+
+def read_transforms(path: str | Path) -> Transforms:
+    """Reads a ``transforms.json``.
+
+    Args:
+        path: the file.
+
+    Returns:
+        Its frames in our conventions; fields that are not among the records' are ignored.
+
+    Raises:
+        FormatError: if it is not JSON or of another shape, naming the file and the field.
+    """
+    path = Path(path)
+    try:
+        content = read_json(path)
+    except (ValueError, RecursionError) as error:
+        raise FormatError(f"{path}: not valid JSON ({error}); the file is truncated or damaged") from error
+    top = _Fields(path, "", content)
+    shared = _read_lens(top, Lens())
+    frames = top.get("frames", list, "a list of frames")
+    if frames is None:
+        raise top.wrong("frames", None, "a list of frames")
+    applied = content.get("applied_transform")
+    return Transforms(
+        tuple(_read_frame(_Fields(path, f"frames[{i}].", frame), shared) for i, frame in enumerate(frames)),
+        None if applied is None else _rigid(top, "applied_transform")[:3],
+        top.text("ply_file_path"),
+    )
+
+
+def write_transforms(path: str | Path, transforms: Transforms) -> Path:
+    """Writes a ``transforms.json``, atomically; intrinsics stand at the top if all frames share them.
+
+    Args:
+        path: the file.
+        transforms: what to write; not changed.
+
+    Returns:
+        The path.
+
+    Raises:
+        ValueError: if a pose is not finite.
+    """
+    frames, content = transforms.frames, {}
+    shared = bool(frames) and all(frame.lens == frames[0].lens for frame in frames)
+    if shared:
+        content.update(_lens_fields(frames[0].lens))
+    if transforms.applied_transform is not None:
+        content["applied_transform"] = np.asarray(transforms.applied_transform).tolist()
+    if transforms.ply_file_path is not None:
+        content["ply_file_path"] = transforms.ply_file_path
+    content["frames"] = [_frame_fields(frame, with_lens=not shared) for frame in frames]
+    return write_json(path, content)
+
+
+class _Fields:
+    """The fields of one JSON object; every error names the file and the field."""
+
+    def __init__(self, path: Path, prefix: str, content: Any) -> None:
+        self.path, self.prefix = path, prefix
+        if not isinstance(content, dict):
+            name = prefix.rstrip(".") or "the file's content"
+            raise FormatError(f"{path}: {name} should be an object, got {_short(content)}")
+        self.content = content
+
+    def wrong(self, name: str, value: Any, expected: str) -> FormatError:
+        found = "is missing" if name not in self.content else f"is {_short(value)}"
+        return FormatError(f"{self.path}: {self.prefix}{name} {found}, expected {expected}")
+
+    def get(self, name: str, kind: type, expected: str) -> Any:
+        value = self.content.get(name)
+        if value is not None and not isinstance(value, kind):
+            raise self.wrong(name, value, expected)
+        return value
+
+    def text(self, name: str) -> str | None:
+        return self.get(name, str, "a file name")
+
+    def number(self, name: str, low: float = -math.inf, high: float = math.inf) -> float | None:
+        """A finite number strictly between ``low`` and ``high``."""
+        value = self.content.get(name)
+        if value is None:
+            return None
+        number = _float(value)
+        if number is None or not math.isfinite(number) or not low < number < high:
+            limits = "" if low == -math.inf else f" greater than {low:g}" + (f" and below {high:g}" * (high < math.inf))
+            raise self.wrong(name, value, f"a finite number{limits}")
+        return number
+
+    def pixels(self, name: str) -> int | None:
+        value = self.number(name, 0, _MAX_SIZE)
+        if value is None:
+            return None
+        if value != round(value):
+            raise self.wrong(name, value, "a whole number of pixels")
+        return round(value)
+
+
+def _float(value: Any) -> float | None:
+    """A JSON number as a float, or None; true and false are no numbers."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf
+
+
+def _short(value: Any) -> str:
+    text = type(value).__name__ if isinstance(value, dict | list) else repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _read_lens(fields: _Fields, shared: Lens) -> Lens:
+    """The lens of one object; what it does not say is taken from ``shared``."""
+    own = {
+        "width": fields.pixels("w"),
+        "height": fields.pixels("h"),
+        **{name: fields.number(name, 0) for name in ("fl_x", "fl_y")},
+        **{name: fields.number(name) for name in ("cx", "cy")},
+        **{name: fields.number(name, 0, math.pi) for name in ("camera_angle_x", "camera_angle_y")},
+        "camera_model": fields.get("camera_model", str, "a camera model's name"),
+    }
+    coefficients = {name: fields.number(name) for name in DISTORTION}
+    given = {name: value for name, value in coefficients.items() if value is not None}
+    return replace(
+        shared,
+        **{name: value for name, value in own.items() if value is not None},
+        distortion={**shared.distortion, **given},
+    )
+
+
+def _read_frame(fields: _Fields, shared: Lens) -> TransformsFrame:
+    file_path = fields.text("file_path")
+    if not file_path:
+        raise fields.wrong("file_path", file_path, "the name of an image file")
+    lens = _read_lens(fields, shared)
+    if lens.fl_x is None and lens.camera_angle_x is None:
+        raise fields.wrong("fl_x", None, "fl_x or camera_angle_x, here or at the top of the file")
+    camera_to_world = _rigid(fields, "transform_matrix")
+    return TransformsFrame(
+        file_path, _world_to_camera(camera_to_world), lens, fields.text("depth_file_path"), fields.text("mask_path")
+    )
+
+
+def _rigid(fields: _Fields, name: str) -> NDArray[np.floating]:
+    """A rigid ``[4, 4]`` transform from 3 or 4 rows of 4 numbers; all NaN if one of its numbers is not finite."""
+    rows = fields.content.get(name)
+    expected = "3 or 4 rows of 4 numbers"
+    if not isinstance(rows, list) or len(rows) not in (3, 4):
+        raise fields.wrong(name, rows, expected)
+    matrix = np.eye(4)
+    for i, row in enumerate(rows):
+        values = [_float(value) for value in row] if isinstance(row, list) else []
+        if len(values) != 4 or None in values:
+            raise fields.wrong(f"{name}", rows, f"{expected}; row {i} is {_short(row)}")
+        matrix[i] = values
+    if not np.isfinite(matrix).all():
+        return np.full((4, 4), np.nan)
+    rotation = matrix[:3, :3]
+    error = np.abs(rotation.T @ rotation - np.eye(3)).max() if np.abs(rotation).max() < 2 else math.inf
+    if error > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0 or np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
+        raise FormatError(
+            f"{fields.path}: {fields.prefix}{name} is not a rotation and a translation (R'R differs from the identity "
+            f"by {error:.2g}); remove scale, shear and mirroring from the poses"
+        )
+    return matrix
+
+
+def _world_to_camera(camera_to_world: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Our pose of the file's: inverse, with the camera's y and z axes turned around."""
+    if not np.isfinite(camera_to_world).all():
+        return camera_to_world
+    return np.linalg.inv(camera_to_world @ _OPENGL)
+
+
+def _camera_to_world(world_to_camera: NDArray[np.floating]) -> NDArray[np.floating]:
+    return np.linalg.inv(world_to_camera) @ _OPENGL
+
+
+def _frame_fields(frame: TransformsFrame, with_lens: bool) -> dict[str, Any]:
+    pose = np.asarray(frame.world_to_camera, np.float64)
+    if pose.shape != (4, 4) or not np.isfinite(pose).all():
+        raise ValueError(f"{frame.file_path}: world_to_camera must be finite [4, 4], got {pose.tolist()}")
+    content: dict[str, Any] = {"file_path": frame.file_path, "transform_matrix": _camera_to_world(pose).tolist()}
+    for name in ("depth_file_path", "mask_path"):
+        if getattr(frame, name) is not None:
+            content[name] = getattr(frame, name)
+    return {**content, **_lens_fields(frame.lens)} if with_lens else content
+
+
+def _lens_fields(lens: Lens) -> dict[str, Any]:
+    names = ("fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y", "camera_model")
+    content = {"w": lens.width, "h": lens.height, **{name: getattr(lens, name) for name in names}, **lens.distortion}
+    return {name: value for name, value in content.items() if value is not None}
