@@ -20,12 +20,15 @@ class Frames(TensorRecord):
         depth: ``[V, H, W]`` float32 z-depth in the dataset's unit, 0 = invalid; the same pixels as ``images``.
         world_to_camera: ``[V, 4, 4]`` float32 rigid OpenCV poses.
         intrinsics: ``[V, 3, 3]`` float32 in pixels, integer pixel centres.
+        sparse_depth: depth stands at single pixels (laser, triangulated points): resizing moves the points instead of
+            looking up the nearest pixel.
     """
 
     images: Tensor
     depth: Tensor
     world_to_camera: Tensor
     intrinsics: Tensor
+    sparse_depth: bool = False
 
 
 class SceneSource(ABC):
@@ -37,9 +40,11 @@ class SceneSource(ABC):
 
     Attributes:
         is_metric: whether the unit of depth and poses is the metre.
+        has_depth: whether frames have depth; without it a source serves reconstruction and novel views, not training.
     """
 
     is_metric: bool = True
+    has_depth: bool = True
 
     @property
     @abstractmethod
@@ -53,6 +58,13 @@ class SceneSource(ABC):
     def held_out(self, scene: str) -> Sequence[int]:
         """Ids among ``frames`` that training never sees, kept as evaluation targets; none by default."""
         return ()
+
+    def place(self, scene: str) -> str:
+        """Name of what the scene shows: two recordings of one place must not be split between training and evaluation.
+
+        The scene itself, unless the dataset records places several times.
+        """
+        return scene
 
     @abstractmethod
     def load(self, scene: str, frame_ids: Sequence[int]) -> Frames:

@@ -29,13 +29,13 @@ def image_size(path: Path, scene: str) -> tuple[int, int]:
         raise _unreadable(path, scene, error) from error
 
 
-def read_color(path: Path, scene: str, size: tuple[int, int]) -> NDArray[np.uint8]:
+def read_color(path: Path, scene: str, size: tuple[int, int] | None = None) -> NDArray[np.uint8]:
     """Reads a colour image ``[H, W, 3]``.
 
     Args:
         path: the file.
         scene: the scene it belongs to, for messages.
-        size: the ``(height, width)`` it must have.
+        size: the ``(height, width)`` it must have; None: any.
 
     Raises:
         DataError: if the file is missing, damaged or of another size.
@@ -49,7 +49,7 @@ def read_color(path: Path, scene: str, size: tuple[int, int]) -> NDArray[np.uint
     return pixels
 
 
-def read_depth(path: Path, scene: str, size: tuple[int, int]) -> NDArray[np.int64]:
+def read_depth(path: Path, scene: str, size: tuple[int, int] | None = None) -> NDArray[np.int64]:
     """Reads a one-channel integer depth image ``[H, W]`` as stored (16-bit PNG, PGM or TIFF).
 
     Raises:
@@ -73,8 +73,8 @@ def _unreadable(path: Path, scene: str, error: Exception) -> DataError:
     return DataError(f"cannot read {path} of scene {scene}: {error}; restore the file or remove the frame")
 
 
-def _check_size(path: Path, scene: str, found: tuple[int, ...], expected: tuple[int, int]) -> None:
-    if tuple(found) != tuple(expected):
+def _check_size(path: Path, scene: str, found: tuple[int, ...], expected: tuple[int, int] | None) -> None:
+    if expected is not None and tuple(found) != tuple(expected):
         raise DataError(
             f"{path} of scene {scene} is {found[1]}x{found[0]} pixels, but the recording's first one is "
             f"{expected[1]}x{expected[0]}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -16,15 +17,40 @@ def resize(frames: Frames, size: tuple[int, int]) -> Frames:
     """Resizes frames to exactly ``size`` (height, width).
 
     Colour is antialiased (triangle filter as wide as a target pixel); depth takes the nearest pixel, because a mean
-    across an edge is a point in mid-air.
+    across an edge is a point in mid-air. Sparse depth moves point by point, and the nearest point to the camera wins.
     """
     height, width = frames.depth.shape[-2:]
     if (height, width) == tuple(size):
         return frames
-    images = interpolate(frames.images, size, mode="bilinear", antialias=True, align_corners=False).clamp(0, 1)
-    depth = interpolate(frames.depth[:, None], size, mode="nearest-exact")[:, 0]
-    intrinsics = resize_intrinsics(frames.intrinsics, size[1] / width, size[0] / height)
-    return Frames(images, depth, frames.world_to_camera, intrinsics)
+    return replace(
+        frames,
+        images=resize_images(frames.images, size),
+        depth=resize_depth(frames.depth, size, frames.sparse_depth),
+        intrinsics=resize_intrinsics(frames.intrinsics, size[1] / width, size[0] / height),
+    )
+
+
+def resize_images(images: Tensor, size: tuple[int, int]) -> Tensor:
+    """Resizes images ``[V, 3, H, W]``, antialiased."""
+    if tuple(images.shape[-2:]) == tuple(size):
+        return images
+    return interpolate(images, size, mode="bilinear", antialias=True, align_corners=False).clamp(0, 1)
+
+
+def resize_depth(depth: Tensor, size: tuple[int, int], sparse: bool = False) -> Tensor:
+    """Resizes depth ``[V, H, W]``: the nearest pixel, or, where it is sparse, every point to the pixel it falls in."""
+    views, height, width = depth.shape
+    if (height, width) == tuple(size):
+        return depth
+    if not sparse:
+        return interpolate(depth[:, None], size, mode="nearest-exact")[:, 0]
+    view, y, x = depth.nonzero(as_tuple=True)
+    # A pixel's centre c lies in the new pixel floor((c + 1/2) scale).
+    row = ((y + 0.5) * (size[0] / height)).long().clamp(max=size[0] - 1)
+    column = ((x + 0.5) * (size[1] / width)).long().clamp(max=size[1] - 1)
+    nearest = depth.new_full((views * size[0] * size[1],), torch.inf)
+    nearest.scatter_reduce_(0, (view * size[0] + row) * size[1] + column, depth[view, y, x], "amin")
+    return torch.where(nearest.isinf(), 0, nearest).reshape(views, *size)
 
 
 def crop(frames: Frames, top: int, left: int, size: tuple[int, int]) -> Frames:
@@ -33,11 +59,11 @@ def crop(frames: Frames, top: int, left: int, size: tuple[int, int]) -> Frames:
     def window(image: Tensor) -> Tensor:
         return image[..., top : top + size[0], left : left + size[1]].contiguous()
 
-    return Frames(
-        window(frames.images),
-        window(frames.depth),
-        frames.world_to_camera,
-        crop_intrinsics(frames.intrinsics, left, top),
+    return replace(
+        frames,
+        images=window(frames.images),
+        depth=window(frames.depth),
+        intrinsics=crop_intrinsics(frames.intrinsics, left, top),
     )
 
 

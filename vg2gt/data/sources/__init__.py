@@ -1,0 +1,1 @@
+"""Datasets on disk, one file a layout; all are a ``FileSource``."""

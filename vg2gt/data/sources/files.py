@@ -1,0 +1,231 @@
+"""What the loaders of datasets on disk share: scenes found in folders, an index of each, decoding, splits, caching."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from abc import abstractmethod
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from vg2gt.data.base import DataError, Frames, SceneSource
+from vg2gt.data.image_files import read_color
+from vg2gt.data.sources.index import SceneIndex, Size, folder_state, index_to_bytes, read_index
+from vg2gt.data.transforms import from_bytes, resize_depth, resize_images, resize_to_cover
+from vg2gt.io.files import write_bytes
+
+
+class FileSource(SceneSource):
+    """A dataset on disk. A loader says where scenes are (``find``), what is in one (``index``) and reads a depth file.
+
+    Args:
+        root: the dataset's folder, or several.
+        scenes: names of the scenes to use, or a text file with one a line; None: all.
+        holdout: hold out every this many-th frame as an evaluation target; None: none.
+        every: use every this many-th frame only.
+        index_cache: folder for the indices (file lists, poses, intrinsics), so that they are read from the dataset
+            only once; None: they are read anew by every process. An index is made again when the scene's folder
+            changes; a pose file edited in place inside a folder of pose files is not noticed.
+
+    Raises:
+        FileNotFoundError: if a root does not exist.
+        DataError: if there is no scene, or not one that was named.
+    """
+
+    layout: ClassVar[str]
+    """What is looked for in ``root``, for messages."""
+    index_version: ClassVar[int] = 1
+    """Raise it when ``index`` would give another result for the same files."""
+    sparse_depth: ClassVar[bool] = False
+
+    def __init__(
+        self,
+        root: str | Sequence[str] | None,
+        scenes: Sequence[str] | str | None = None,
+        holdout: int | None = None,
+        every: int = 1,
+        index_cache: str | None = None,
+    ) -> None:
+        if holdout is not None and holdout < 2:
+            raise ValueError(f"holdout must be at least 2 (or null for none), got {holdout}")
+        if every < 1:
+            raise ValueError(f"every must be at least 1 (use every this many-th frame), got {every}")
+        self.holdout = holdout
+        self.every = every
+        self.index_cache = Path(index_cache).expanduser() if index_cache else None
+        self._folders = self._select(self._find_all(_roots(root, self.layout)), scenes)
+        self._indices: dict[str, SceneIndex] = {}
+
+    @abstractmethod
+    def find(self, root: Path) -> Mapping[str, Path]:
+        """Scenes below ``root`` by name, with their folders, without reading them."""
+
+    @abstractmethod
+    def index(self, scene: str, folder: Path) -> SceneIndex:
+        """Reads file lists, poses and intrinsics of a scene.
+
+        Raises:
+            DataError: if the scene is missing something or damaged.
+        """
+
+    def read_color(self, index: SceneIndex, row: int) -> NDArray[np.uint8]:
+        """Decodes the colour image ``[h, w, 3]`` of a row of the index.
+
+        Raises:
+            DataError: if it is missing, damaged, or of another size than the index says.
+        """
+        return read_color(index.color[row], index.name, index.color_size)
+
+    def read_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
+        """Decodes the depth ``[h, w]`` of a row of the index: z-depth in the dataset's unit, 0 = invalid.
+
+        Args:
+            index: the scene.
+            row: which frame.
+            size: the ``(height, width)`` it must have.
+
+        Raises:
+            DataError: if it is missing, damaged, or of another size.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has depth files but no read_depth")
+
+    def options(self) -> Mapping[str, object]:
+        """Arguments that decide an index, beside the folder; part of the cache's key."""
+        return {}
+
+    @property
+    def scenes(self) -> Sequence[str]:
+        """Names of the scenes."""
+        return tuple(self._folders)
+
+    def frames(self, scene: str) -> Sequence[int]:
+        """Numbers of the usable frames, in order."""
+        return self.scene_index(scene).frame_ids[:: self.every]
+
+    def held_out(self, scene: str) -> Sequence[int]:
+        """Every ``holdout``-th frame, from the middle of the first stretch on."""
+        return self.frames(scene)[self.holdout // 2 :: self.holdout] if self.holdout else ()
+
+    def load(self, scene: str, frame_ids: Sequence[int]) -> Frames:
+        """Decodes frames at the scene's size; images of another size are brought to it.
+
+        Raises:
+            DataError: naming the file and the scene, if one is missing or damaged, or depth is valid nowhere.
+        """
+        index = self.scene_index(scene)
+        parts = [self._load_frame(index, index.row(frame)) for frame in frame_ids]
+        return Frames(
+            images=torch.cat([part.images for part in parts]),
+            depth=torch.cat([part.depth for part in parts]),
+            world_to_camera=torch.cat([part.world_to_camera for part in parts]),
+            intrinsics=torch.cat([part.intrinsics for part in parts]),
+            sparse_depth=self.sparse_depth,
+        )
+
+    def scene_index(self, scene: str) -> SceneIndex:
+        """The index of a scene, from memory, from the cache, or read anew."""
+        if scene not in self._folders:
+            raise DataError(f"there is no scene {scene}; found are: {_some(self._folders)}")
+        if scene not in self._indices:
+            self._indices[scene] = self._recall_index(scene, self._folders[scene])
+        return self._indices[scene]
+
+    def _load_frame(self, index: SceneIndex, row: int) -> Frames:
+        pixels = self.read_color(index, row)
+        images = from_bytes(torch.from_numpy(pixels)).permute(2, 0, 1)[None].contiguous()
+        depth = torch.zeros_like(images[:, 0])
+        if index.depth:
+            depth = torch.from_numpy(self._valid_depth(index, row, index.depth_size or pixels.shape[:2]))[None]
+        poses = torch.from_numpy(index.world_to_camera[row : row + 1]).float()
+        intrinsics = torch.from_numpy(index.intrinsics[row : row + 1]).float()
+        if index.color_size is None:
+            return resize_to_cover(Frames(images, depth, poses, intrinsics, self.sparse_depth), index.size)
+        depth = resize_depth(depth, index.size, self.sparse_depth)
+        return Frames(resize_images(images, index.size), depth, poses, intrinsics, self.sparse_depth)
+
+    def _valid_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
+        depth = self.read_depth(index, row, size)
+        if not (depth > 0).any():
+            raise DataError(
+                f"{index.depth[row]} of scene {index.name} has no valid depth in any pixel; remove the frame, or "
+                "correct the depth unit and the values that mean 'invalid'"
+            )
+        return depth
+
+    def _find_all(self, roots: Sequence[Path]) -> dict[str, Path]:
+        found: dict[str, Path] = {}
+        for root in roots:
+            inside = self.find(root)
+            if not inside:
+                raise DataError(f"no scene of this dataset in {root}: expected {self.layout}")
+            for name, folder in inside.items():
+                if name in found:
+                    raise DataError(
+                        f"two scenes are called {name}: {found[name]} and {folder}; rename one, or give data.root "
+                        "their common parent folder"
+                    )
+                found[name] = folder
+        return found
+
+    def _select(self, found: dict[str, Path], scenes: Sequence[str] | str | None) -> dict[str, Path]:
+        if scenes is None:
+            return found
+        names = read_split(scenes) if isinstance(scenes, str) else list(scenes)
+        unknown = [name for name in names if name not in found]
+        if unknown:
+            raise DataError(f"there is no scene {_some(unknown)}; found are: {_some(found)}")
+        return {name: found[name] for name in names}
+
+    def _recall_index(self, scene: str, folder: Path) -> SceneIndex:
+        if self.index_cache is None:
+            return self.index(scene, folder)
+        key = json.dumps([type(self).__qualname__, self.index_version, str(folder.resolve()), scene, self.options()])
+        digest = hashlib.sha256(key.encode()).hexdigest()[:24]
+        path = self.index_cache / "index" / f"{digest}.npz"
+        state = folder_state(folder)
+        index = read_index(path, scene, folder, state)
+        if index is None:
+            index = self.index(scene, folder)
+            write_bytes(path, index_to_bytes(index, state))
+        return index
+
+
+def read_split(path: str) -> list[str]:
+    """Reads scene names from a text file, one a line; ``#`` begins a comment.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        DataError: if it names no scene, or one twice.
+    """
+    file = Path(path).expanduser()
+    if not file.is_file():
+        raise FileNotFoundError(f"the scene list {file} does not exist; give a list of names or a text file of them")
+    names = [line.split("#")[0].strip() for line in file.read_text().splitlines()]
+    names = [name for name in names if name]
+    twice = [name for name, count in Counter(names).items() if count > 1]
+    if not names or twice:
+        raise DataError(f"the scene list {file} " + (f"names {twice[0]} twice" if twice else "names no scene"))
+    return names
+
+
+def _roots(root: str | Sequence[str] | None, layout: str) -> list[Path]:
+    if not root:
+        raise FileNotFoundError(f"data.root is not set: name the dataset's folder ({layout})")
+    roots = [Path(path).expanduser() for path in ([root] if isinstance(root, str) else root)]
+    for path in roots:
+        if not path.is_dir():
+            raise FileNotFoundError(
+                f"the data folder {path} (seen from {Path.cwd()}) does not exist: set data.root=FOLDER to {layout}"
+            )
+    return roots
+
+
+def _some(names: Sequence[str] | Mapping[str, object], most: int = 10) -> str:
+    names = list(names)
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

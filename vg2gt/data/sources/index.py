@@ -1,0 +1,199 @@
+"""The index of a scene: file lists, poses and intrinsics, checked once, and how it is kept on disk."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import logging
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vg2gt.data.base import DataError
+from vg2gt.data.sources.parsing import check_intrinsics, inverse, load_npz, rigid
+
+log = logging.getLogger(__name__)
+
+Size = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class SceneIndex:
+    """All of a scene but its pixels; row i of everything belongs to frame ``frame_ids[i]``.
+
+    Attributes:
+        name: the scene's name.
+        folder: where it is.
+        frame_ids: increasing numbers of the frames.
+        color: colour image files.
+        depth: depth files; empty where the scene has none.
+        world_to_camera: ``[n, 4, 4]`` float64 rigid OpenCV poses.
+        intrinsics: ``[n, 3, 3]`` float64, integer pixel centres; of frames of ``size``, or, where ``color_size`` is
+            None, of each colour image as it is.
+        size: ``(height, width)`` of decoded frames.
+        color_size: of the colour files; None: each has its own, and is resized to cover ``size`` and cropped.
+        depth_size: of the depth files; None: each has its colour image's.
+        dropped: frames left out, by reason.
+    """
+
+    name: str
+    folder: Path
+    frame_ids: tuple[int, ...]
+    color: tuple[Path, ...]
+    depth: tuple[Path, ...]
+    world_to_camera: NDArray[np.float64]
+    intrinsics: NDArray[np.float64]
+    size: Size
+    color_size: Size | None
+    depth_size: Size | None
+    dropped: Mapping[str, int] = field(default_factory=dict)
+
+    def row(self, frame: int) -> int:
+        """Position of a frame.
+
+        Raises:
+            DataError: if the scene has no such frame.
+        """
+        place = int(np.searchsorted(self.frame_ids, frame))
+        if place == len(self.frame_ids) or self.frame_ids[place] != frame:
+            raise DataError(f"scene {self.name} in {self.folder} has no usable frame {frame}")
+        return place
+
+
+def make_index(
+    name: str,
+    folder: Path,
+    color: Mapping[int, Path],
+    depth: Mapping[int, Path] | None,
+    camera_to_world: Mapping[int, NDArray[np.float64]],
+    intrinsics: NDArray[np.float64] | Mapping[int, NDArray[np.float64]],
+    size: Size,
+    color_size: Size | None,
+    depth_size: Size | None = None,
+) -> SceneIndex:
+    """Joins what a layout holds of each frame; frames that lack something are left out and counted.
+
+    Args:
+        name: the scene's name.
+        folder: where it is.
+        color: colour image files by frame number.
+        depth: depth files by frame number; None where the layout has none.
+        camera_to_world: 4x4 OpenCV poses by frame number; a pose that is not finite drops its frame.
+        intrinsics: one ``[3, 3]`` for all frames, or by frame number; of which size is said at ``SceneIndex``.
+        size: ``(height, width)`` of decoded frames.
+        color_size: of the colour files; None: each has its own.
+        depth_size: of the depth files; None: each has its colour image's.
+
+    Raises:
+        DataError: if no frame is left, a pose is not rigid, or intrinsics are not usable.
+    """
+    where = f"{folder} (scene {name})"
+    _check_registered(where, color_size, depth_size)
+    dropped: Counter[str] = Counter()
+    kept = []
+    for number in sorted(color):
+        pose = camera_to_world.get(number)
+        if pose is None:
+            dropped["without a pose"] += 1
+        elif not np.isfinite(pose).all():
+            dropped["whose pose is not finite"] += 1
+        elif depth is not None and number not in depth:
+            dropped["without a depth file"] += 1
+        else:
+            kept.append(number)
+    lone = len(set(depth or ()) - set(color))
+    if lone:
+        dropped["without a colour image"] = lone
+    if not kept:
+        found = f"{len(color)} colour images, {len(camera_to_world)} poses"
+        found += f", {len(depth)} depth files" if depth is not None else ""
+        reasons = "".join(f"; {count} frames {reason}" for reason, count in dropped.items())
+        raise DataError(f"no usable frame in {where}: it has {found}{reasons}")
+    for reason, count in dropped.items():
+        log.warning("scene %s: %d of %d frames %s are left out", name, count, len(color), reason)
+    poses = rigid(np.stack([camera_to_world[number] for number in kept]).astype(np.float64), kept, where)
+    if isinstance(intrinsics, Mapping):
+        matrices = np.stack([intrinsics[number] for number in kept]).astype(np.float64)
+    else:
+        matrices = np.broadcast_to(np.asarray(intrinsics, np.float64), (len(kept), 3, 3)).copy()
+    return SceneIndex(
+        name=name,
+        folder=folder,
+        frame_ids=tuple(kept),
+        color=tuple(color[number] for number in kept),
+        depth=tuple(depth[number] for number in kept) if depth is not None else (),
+        world_to_camera=inverse(poses),
+        intrinsics=check_intrinsics(matrices, where),
+        size=size,
+        color_size=color_size,
+        depth_size=depth_size or color_size,
+        dropped=dict(dropped),
+    )
+
+
+def _check_registered(where: str, color: Size | None, depth: Size | None) -> None:
+    if color and depth and abs(color[0] * depth[1] / (color[1] * depth[0]) - 1) > 0.02:
+        raise DataError(
+            f"colour ({color[1]}x{color[0]}) and depth ({depth[1]}x{depth[0]}) in {where} have different aspect "
+            "ratios: they are not registered"
+        )
+
+
+def folder_state(folder: Path) -> str:
+    """Changes when files are added to or removed from a scene, or one directly in its folder is edited."""
+    if not folder.is_dir():
+        return str(folder.stat().st_mtime_ns)
+    entries = [(path, path.stat()) for path in sorted(folder.iterdir())]
+    inner = [(path, path.stat()) for top, _ in entries if top.is_dir() for path in sorted(top.glob("*/"))]
+    text = json.dumps([[str(path), stat.st_mtime_ns, stat.st_size] for path, stat in entries + inner])
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def index_to_bytes(index: SceneIndex, state: str) -> bytes:
+    """An ``.npz`` file of an index and of the state of the folder it was made from."""
+    buffer = io.BytesIO()
+    np.savez(
+        buffer,
+        state=np.array(state),
+        frame_ids=np.array(index.frame_ids, np.int64),
+        color=np.array([str(path) for path in index.color]),
+        depth=np.array([str(path) for path in index.depth], dtype=str),
+        world_to_camera=index.world_to_camera,
+        intrinsics=index.intrinsics,
+        sizes=np.array([size or (0, 0) for size in (index.size, index.color_size, index.depth_size)], np.int64),
+        dropped=np.array(json.dumps(index.dropped)),
+    )
+    return buffer.getvalue()
+
+
+def read_index(path: Path, scene: str, folder: Path, state: str) -> SceneIndex | None:
+    """Reads an index back; None where there is none, it is damaged, or the folder's state is another."""
+    if not path.is_file():
+        return None
+    names = ("state", "frame_ids", "color", "depth", "world_to_camera", "intrinsics", "sizes", "dropped")
+    try:
+        arrays = load_npz(path, scene, names)
+    except DataError as error:
+        log.warning("the cached index is damaged and is made again: %s", error)
+        return None
+    if str(arrays["state"]) != state:
+        return None
+    size, color_size, depth_size = ((height, width) for height, width in arrays["sizes"].tolist())
+    return SceneIndex(
+        name=scene,
+        folder=folder,
+        frame_ids=tuple(arrays["frame_ids"].tolist()),
+        color=tuple(map(Path, arrays["color"].tolist())),
+        depth=tuple(map(Path, arrays["depth"].tolist())),
+        world_to_camera=arrays["world_to_camera"],
+        intrinsics=arrays["intrinsics"],
+        size=size,
+        color_size=color_size if all(color_size) else None,
+        depth_size=depth_size if all(depth_size) else None,
+        dropped=json.loads(str(arrays["dropped"])),
+    )

@@ -1,0 +1,155 @@
+"""Small readers that all loaders share; every error names the file and the scene."""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vg2gt.data.base import DataError
+
+log = logging.getLogger(__name__)
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".tif", ".tiff", ".webp", ".bmp")
+
+_ROTATION_TOLERANCE = 0.02
+
+
+def read_numbers(path: Path, scene: str, skip_lines: int = 0) -> NDArray[np.float64]:
+    """Reads a table of numbers, at least one row; ``#`` begins a comment.
+
+    Raises:
+        DataError: if the file is missing, empty, or not a table of numbers.
+    """
+    try:
+        text = path.read_text(encoding="utf-8").splitlines()[skip_lines:]
+        rows = [line.split("#")[0].split() for line in text]
+        table = np.array([[float(word) for word in row] for row in rows if row], dtype=np.float64)
+    except (OSError, ValueError) as error:
+        raise DataError(f"cannot read {path} of scene {scene}: {error}") from error
+    if table.size == 0:
+        raise DataError(f"{path} of scene {scene} holds no numbers")
+    return table
+
+
+def read_matrix(path: Path, scene: str, shapes: Sequence[tuple[int, int]]) -> NDArray[np.float64]:
+    """Reads a matrix of one of the given shapes.
+
+    Raises:
+        DataError: if the file is missing, damaged, or holds a matrix of another shape.
+    """
+    matrix = read_numbers(path, scene)
+    if matrix.shape not in tuple(shapes):
+        expected = " or ".join(f"{rows}x{columns}" for rows, columns in shapes)
+        raise DataError(
+            f"{path} of scene {scene} must hold a {expected} matrix, not {matrix.shape[0]}x{matrix.shape[1]}"
+        )
+    return matrix
+
+
+def read_text_lines(path: Path, scene: str) -> list[str]:
+    """Reads the lines of a text file without blank and ``#`` lines.
+
+    Raises:
+        DataError: if the file is missing or not text.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, ValueError) as error:
+        raise DataError(f"cannot read {path} of scene {scene}: {error}") from error
+    return [line.strip() for line in lines if line.strip() and not line.lstrip().startswith("#")]
+
+
+def load_npz(path: Path, scene: str, names: Sequence[str]) -> dict[str, NDArray]:
+    """Reads named arrays of an ``.npz`` file without executing anything in it.
+
+    Raises:
+        DataError: if the file is missing or damaged, or lacks one of the arrays.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            return {name: stored[name] for name in names}
+    except KeyError as error:
+        raise DataError(f"{path} of scene {scene} has no array {error}; expected {', '.join(names)}") from error
+    except Exception as error:  # a damaged archive raises whatever zipfile, zlib and numpy's header parser raise
+        raise DataError(f"cannot read {path} of scene {scene}: {error}") from error
+
+
+def numbered(folder: Path, scene: str, pattern: str = "*", suffixes: Sequence[str] = IMAGE_SUFFIXES) -> dict[int, Path]:
+    """Files of a folder by the last number in their name (before the first dot), in the order of the numbers.
+
+    Hidden files and files with other suffixes are passed over; so is a folder that does not exist.
+
+    Raises:
+        DataError: if a name has no number or two files have the same.
+    """
+    files: dict[int, Path] = {}
+    for path in sorted(folder.glob(pattern)):
+        if path.name.startswith(".") or path.suffix.lower() not in suffixes:
+            continue
+        digits = re.findall(r"\d+", path.name.split(".")[0])
+        if not digits:
+            raise DataError(f"{path} of scene {scene} has no frame number in its name")
+        number = int(digits[-1])
+        if number in files:
+            raise DataError(f"{files[number]} and {path} of scene {scene} have the same frame number {number}")
+        files[number] = path
+    return dict(sorted(files.items()))
+
+
+def rigid(poses: NDArray[np.float64], frames: Sequence[int], where: str) -> NDArray[np.float64]:
+    """Replaces the rotations of 4x4 poses, which recordings give to a few digits, by the nearest exact ones.
+
+    Args:
+        poses: ``[n, 4, 4]`` finite transforms.
+        frames: their frame ids, for the message.
+        where: the file or folder and the scene, for the message.
+
+    Raises:
+        DataError: naming the first pose that is not a rigid transform to within 2 %.
+    """
+    rotations = poses[:, :3, :3]
+    error = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max((1, 2), initial=0)
+    row = np.abs(poses[:, 3] - [0, 0, 0, 1]).max(1, initial=0)
+    bad = (error > _ROTATION_TOLERANCE) | (np.linalg.det(rotations) < 0) | (row > 1e-3)
+    if bad.any():
+        raise DataError(
+            f"the pose of frame {frames[int(bad.argmax())]} in {where} is not a rigid transform (a rotation and a "
+            "translation over a row 0 0 0 1)"
+        )
+    left, _, right = np.linalg.svd(rotations)
+    exact = np.tile(np.eye(4), (len(poses), 1, 1))
+    exact[:, :3, :3] = left @ right
+    exact[:, :3, 3] = poses[:, :3, 3]
+    return exact
+
+
+def inverse(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Inverts rigid 4x4 transforms ``[..., 4, 4]``."""
+    out = np.zeros_like(poses)
+    rotation = poses[..., :3, :3].swapaxes(-1, -2)
+    out[..., :3, :3] = rotation
+    out[..., :3, 3:] = -rotation @ poses[..., :3, 3:]
+    out[..., 3, 3] = 1
+    return out
+
+
+def pinhole(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.float64]:
+    """Intrinsics ``[3, 3]`` from focal lengths and principal point in pixels (integer pixel centres)."""
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
+def check_intrinsics(intrinsics: NDArray[np.float64], where: str) -> NDArray[np.float64]:
+    """Returns ``[..., 3, 3]`` intrinsics as they are.
+
+    Raises:
+        DataError: if a value is not finite or a focal length not positive.
+    """
+    focal = intrinsics[..., [0, 1], [0, 1]]
+    if not (np.isfinite(intrinsics).all() and (focal > 0).all()):
+        raise DataError(f"the intrinsics in {where} have no positive focal lengths: {intrinsics.tolist()}")
+    return intrinsics
