@@ -1,9 +1,11 @@
-"""Depth Anything 3's metric depth network, alone and as the yardstick of the relative one (nested)."""
+"""Depth Anything 3's single-view depth networks: metric and relative (mono), and metric as a yardstick (nested)."""
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -15,7 +17,8 @@ from backends.da3.backend import NESTED_PARTS, DA3Backend
 from backends.dpt import DPT, in_chunks
 from backends.normalization import normalize_images
 from backends.weights import Weights
-from vg2gt.types import Geometry, Hints, Tokens
+from vg2gt.geometry.alignment import fit_depth_scale
+from vg2gt.types import Cameras, Geometry, Hints, Tokens
 
 CANONICAL_FOCAL = 300.0  # pixels at network resolution
 SKY_THRESHOLD = 0.3
@@ -48,10 +51,10 @@ class DepthAndSky(nn.Module):
         return torch.cat(outputs, 1)
 
 
-class DA3MetricBackend(Backend):
-    """DA3's metric network: depth in metres from the data's cameras, which it needs; confidence 1.
+class DA3SingleViewBackend(Backend):
+    """One of DA3's networks that see one view at a time: cameras come from the data, confidence is 1.
 
-    Depth is the network's output times the mean focal length (pixels) / 300; sky gets the far end of the scene.
+    Depth is the network's output times one factor a view, which the subclass knows; sky gets the far end of the scene.
 
     Args:
         name: stands in checkpoints and messages.
@@ -73,6 +76,9 @@ class DA3MetricBackend(Backend):
         head_chunk: views decoded at a time; None decodes all at once.
     """
 
+    metric: ClassVar[bool]
+    hint_names: ClassVar[tuple[str, ...]]
+
     def __init__(
         self,
         name: str,
@@ -93,7 +99,7 @@ class DA3MetricBackend(Backend):
         seed: int = 0,
         head_chunk: int | None = 8,
     ) -> None:
-        super().__init__(name, patch_size, (dim,) * len(taps), licence, is_metric=True, needs_hints=True)
+        super().__init__(name, patch_size, (dim,) * len(taps), licence, is_metric=self.metric, needs_hints=True)
         self.taps = tuple(taps)
         self.head_chunk = head_chunk
 
@@ -109,28 +115,70 @@ class DA3MetricBackend(Backend):
 
     @torch.no_grad()
     def encode(self, images: Tensor, hints: Hints | None = None) -> Tokens:
-        """See :meth:`Backend.encode`; needs ``hints.cameras``, whose translations must be in metres."""
+        """See :meth:`Backend.encode`; fixes the factors once, so that token changes do not move the unit."""
         self.check_images(images)
-        cameras = self.require_hints(images, hints, "cameras").cameras
+        hints = self.require_hints(images, hints, *self.hint_names)
         size = (images.shape[-2], images.shape[-1])
         with half_precision_on_gpu(images):
             patch, camera = self.network.backbone.pretrained(normalize_images(images), self.taps)
         grid = (size[0] // self.patch_size, size[1] // self.patch_size)
-        return Tokens(tuple(tap.float() for tap in patch), camera.float(), grid, size, {"cameras": cameras})
+        tokens = Tokens(tuple(tap.float() for tap in patch), camera.float(), grid, size)
+        return replace(tokens, state={"cameras": hints.cameras, "factor": self.factor(tokens, hints)})
+
+    @abstractmethod
+    def factor(self, tokens: Tokens, hints: Hints) -> Tensor:
+        """Units of the cameras' translations per unit of the network's output, ``[B, V]``."""
 
     def decode_raw(self, tokens: Tokens) -> tuple[Tensor, Tensor]:
-        """Returns depth for a focal length of 300 pixels and the sky score, both ``[B, V, H, W]``."""
+        """Returns the network's depth, sky not filled, and its sky score, both ``[B, V, H, W]``."""
         with full_precision(tokens.camera):
             out = in_chunks(DepthAndSky(self.network.head), tokens.patch, tokens.grid, self.head_chunk)
         return out[:, :, 0].exp(), F.relu(out[:, :, 1])
 
     def decode(self, tokens: Tokens) -> Geometry:
         """See :meth:`Backend.decode`; the cameras are those of the data."""
+        depth = fill_sky(*self.decode_raw(tokens)) * tokens.state["factor"][..., None, None]
+        return Geometry(depth, torch.ones_like(depth), tokens.state["cameras"], torch.ones_like(depth[:, 0, 0, 0]))
+
+
+class DA3MetricBackend(DA3SingleViewBackend):
+    """DA3's metric network: metres, if the translations of the data's cameras are in metres.
+
+    The factor is the mean focal length (pixels at network resolution) / 300. Arguments: see
+    :class:`DA3SingleViewBackend`.
+    """
+
+    metric = True
+    hint_names = ("cameras",)
+
+    def factor(self, tokens: Tokens, hints: Hints) -> Tensor:
+        """See :meth:`DA3SingleViewBackend.factor`."""
+        assert hints.cameras is not None
+        return metres(hints.cameras)
+
+
+class DA3MonoBackend(DA3SingleViewBackend):
+    """DA3's relative network: every view's depth has a unit of its own, which is fitted to the data's depth.
+
+    The fit is the weighted median of all valid pixels of the view that are not sky. A view without any gets the median
+    factor of its scene; a scene without any gets 1. Arguments: see :class:`DA3SingleViewBackend`.
+    """
+
+    metric = False
+    hint_names = ("cameras", "depth")
+
+    def factor(self, tokens: Tokens, hints: Hints) -> Tensor:
+        """See :meth:`DA3SingleViewBackend.factor`."""
+        assert hints.depth is not None
         depth, sky = self.decode_raw(tokens)
-        cameras = tokens.state["cameras"]
-        focal = cameras.intrinsics[..., [0, 1], [0, 1]].mean(-1)
-        depth = fill_sky(depth, sky) * (focal / CANONICAL_FOCAL)[..., None, None]
-        return Geometry(depth, torch.ones_like(depth), cameras, torch.ones_like(depth[:, 0, 0, 0]))
+        factor = fit_depth_scale(depth, hints.depth, sky < SKY_THRESHOLD, per_view=True)
+        scene = factor.nanmedian(1, keepdim=True).values.nan_to_num(1.0)
+        return torch.where(factor.isnan(), scene, factor)
+
+
+def metres(cameras: Cameras) -> Tensor:
+    """Metres per unit of the metric network's output, ``[B, V]``."""
+    return cameras.intrinsics[..., [0, 1], [0, 1]].mean(-1) / CANONICAL_FOCAL
 
 
 def fill_sky(depth: Tensor, sky: Tensor) -> Tensor:
@@ -176,8 +224,7 @@ class DA3NestedBackend(Backend):
         geometry = self.relative.decode(tokens)
         metric_tokens = self.metric.encode(images, Hints(cameras=geometry.cameras))
         depth, sky = self.metric.decode_raw(metric_tokens)
-        focal = geometry.cameras.intrinsics[..., [0, 1], [0, 1]].mean(-1)
-        scale = fit_scale(depth * (focal / CANONICAL_FOCAL)[..., None, None], sky, geometry)
+        scale = fit_scale(depth * metres(geometry.cameras)[..., None, None], sky, geometry)
         return replace(tokens, state={**tokens.state, "scale": scale})
 
     def decode(self, tokens: Tokens) -> Geometry:

@@ -18,6 +18,7 @@ CASES = {
     "da3_large": ("da3-large", ("given_poses=true",)),
     "da3_giant": ("da3-giant", ("given_poses=true",)),
     "da3_metric_large": ("da3metric-large", ()),
+    "da3_mono_large": ("da3mono-large", ()),
     "da3_nested": ("da3nested-giant-large", ("relative.given_poses=true",)),
 }
 
@@ -46,7 +47,7 @@ def test_names_and_shapes(shared: Path, make_backend, name: str) -> None:
     assert ours == published
 
 
-@pytest.mark.parametrize("name", ["vggt_1b", "da3_small", "da3_large", "da3_giant"])
+@pytest.mark.parametrize("name", ["vggt_1b", "da3_small", "da3_large", "da3_giant", "da3_mono_large"])
 def test_a_published_file_would_load(shared: Path, make_backend, load_config, name: str) -> None:
     """Without the camera encoder, exactly as the YAML says: every leftover of the file is known."""
     manifest = json.loads((shared / "manifests" / f"{CASES[name][0]}.json").read_text())
