@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from vg2gt.data.furniture import Builder
-from vg2gt.data.raycast import FAR, groups_in_cone, intersect_part, leave_walls, nearest_hit, surface
-from vg2gt.data.synthetic_rooms import SyntheticRoom
-from vg2gt.data.textures import Pattern, pattern_value, pulse_train, square_wave
+from vg2gt.data.synthetic.furniture import Builder
+from vg2gt.data.synthetic.raycast import FAR, groups_in_cone, intersect_part, leave_walls, nearest_hit, surface
+from vg2gt.data.synthetic.rooms import SyntheticRoom
+from vg2gt.data.synthetic.textures import Pattern, pattern_value, pulse_train, square_wave
 
 
 def _inside(kind: int, local: np.ndarray, half: np.ndarray) -> np.ndarray:
@@ -64,7 +64,7 @@ def test_rays_leave_the_room_on_its_walls():
 
 
 def test_bounding_spheres_and_cones_lose_no_hit():
-    room = SyntheticRoom(6, 1, (16, 16)).room
+    room = SyntheticRoom(6, 1, (16, 16)).world
     origin = np.array([0.1, 0.2, 1.4])
     every = np.arange(len(room.groups))
     plain = room.groups.copy()

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from vg2gt.data import SyntheticRooms
-from vg2gt.data.room_renderer import render_frame
-from vg2gt.data.synthetic_rooms import SyntheticRoom
+from vg2gt.data.synthetic.renderer import render_frame
+from vg2gt.data.synthetic.rooms import SyntheticRoom
 from vg2gt.geometry.cameras import invert_rigid, project, ray_directions, unproject
 from vg2gt.types import Cameras
 
@@ -46,7 +46,7 @@ def test_points_of_one_frame_are_where_another_frame_sees_them():
                 continue
             shifted = room.intrinsics.copy()
             shifted[:2, 2] -= (u, v)  # the position becomes pixel (0, 0)
-            depth = float(render_frame(room.room, room.world_to_camera[1], shifted, (1, 1)).depth[0, 0])
+            depth = float(render_frame(room.world, room.world_to_camera[1], shifted, (1, 1)).depth[0, 0])
             if depth > float(z[0, 0, y, x]) - 0.01:  # else frame 1 sees something in front of it
                 seen = torch.tensor([(u - room.intrinsics[0, 2]), (v - room.intrinsics[1, 2])]) / room.intrinsics[0, 0]
                 world = torch.cat((seen, torch.ones(1))).double() * depth
@@ -163,7 +163,7 @@ def test_a_room_keeps_its_pixels():
     stored = np.load(Path(__file__).parent / "reference" / "room-000003.npz")
     room = SyntheticRoom(3, 8, (56, 112))
     frames = room.render([0, 5], 1)
-    for name, found in (("parts", room.room.parts), ("materials", room.room.materials)):
+    for name, found in (("parts", room.world.parts), ("materials", room.world.materials)):
         np.testing.assert_allclose(found, stored[name], rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(room.world_to_camera, stored["world_to_camera"], rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(np.stack([frame.depth for frame in frames]), stored["depth"], rtol=1e-6)

@@ -3,13 +3,13 @@
 import torch
 
 from vg2gt.data import Frames
-from vg2gt.data.room_renderer import render_frame
-from vg2gt.data.synthetic_rooms import SyntheticRoom
+from vg2gt.data.synthetic.renderer import render_frame
+from vg2gt.data.synthetic.rooms import SyntheticRoom
 from vg2gt.data.transforms import crop, from_bytes, resize, resize_to_cover, to_bytes
 
 
 def _render(room: SyntheticRoom, intrinsics: torch.Tensor, size: tuple[int, int]) -> Frames:
-    frame = render_frame(room.room, room.world_to_camera[0], intrinsics.double().numpy(), size)
+    frame = render_frame(room.world, room.world_to_camera[0], intrinsics.double().numpy(), size)
     images = torch.from_numpy(frame.image).permute(2, 0, 1)[None] / 255
     pose = torch.from_numpy(room.world_to_camera[:1]).float()
     return Frames(images, torch.from_numpy(frame.depth)[None], pose, intrinsics[None].float())

@@ -3,6 +3,8 @@
 from vg2gt.data.base import DataError, Frames, SceneSource
 from vg2gt.data.datamodule import SceneDataModule
 from vg2gt.data.rgbd import RGBDFolder
-from vg2gt.data.synthetic import SyntheticRooms
+from vg2gt.data.synthetic import SyntheticScenes
 
-__all__ = ["DataError", "Frames", "RGBDFolder", "SceneDataModule", "SceneSource", "SyntheticRooms"]
+SyntheticRooms = SyntheticScenes
+
+__all__ = ["DataError", "Frames", "RGBDFolder", "SceneDataModule", "SceneSource", "SyntheticRooms", "SyntheticScenes"]

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from enum import IntEnum
 
-from vg2gt.data.raycast import jit
+from vg2gt.data.synthetic.raycast import jit
 
 
 class Pattern(IntEnum):
@@ -26,9 +26,11 @@ class Pattern(IntEnum):
     MOSAIC = 7
     WEAVE = 8
     PLANKS = 9
+    WINDOWS = 10
 
 
-PLAIN, STRIPES, CHECKS, BRICKS, DOTS, CLOUDS, WOOD, MOSAIC, WEAVE, PLANKS = (int(kind) for kind in Pattern)
+INDOOR = tuple(pattern for pattern in Pattern if pattern is not Pattern.WINDOWS)
+PLAIN, STRIPES, CHECKS, BRICKS, DOTS, CLOUDS, WOOD, MOSAIC, WEAVE, PLANKS, WINDOWS = (int(kind) for kind in Pattern)
 
 _MIN_WIDTH = 1e-4  # filter width below which a pattern counts as unfiltered
 
@@ -177,4 +179,10 @@ def pattern_value(kind, x, y, frequency, footprint, seed):
         tone = hash_cell(int(board), 7, seed) * fade + 0.5 * (1 - fade)
         grain = _grain(x + 10 * tone, y, frequency * 2.0, footprint, seed)
         value = (1 - pulse_train(v, 0.06, width)) * (0.6 * tone + 0.4 * grain)
+    elif kind == WINDOWS:
+        pane = pulse_train(u, 0.5, width) * pulse_train(v, 0.55, width)
+        bars = 1 - 0.5 * pulse_train(2 * u, 0.08, 2 * width)
+        tone = hash_cell(int(math.floor(u + 0.5)), int(math.floor(v + 0.5)), seed)
+        fade = min(max(2.0 - 4.0 * width, 0.0), 1.0)
+        value = pane * bars * (0.75 + fade * 0.5 * (tone - 0.5))
     return min(max(value, 0.0), 1.0)

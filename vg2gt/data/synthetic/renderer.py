@@ -1,8 +1,8 @@
-"""Renders a room of textured parts with point lights and shadows: colour, exact z-depth and normals.
+"""Renders a world of textured parts with point lights and shadows: colour, exact z-depth and normals.
 
 One numba kernel renders a frame and releases the interpreter's lock, so frames are rendered by threads. The image is
 worked on in tiles: all rays of a tile are cast first, then shaded with the groups that can throw a shadow on what the
-tile sees.
+tile sees. Highlights and the sky are compiled in only where a world has them (``None`` is a type to numba).
 """
 
 from __future__ import annotations
@@ -13,8 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vg2gt.data.raycast import FAR, find_occluder, groups_in_cone, jit, nearest_hit, surface
-from vg2gt.data.textures import fractal_noise, pattern_value
+from vg2gt.data.synthetic.raycast import FAR, find_occluder, groups_in_cone, jit, nearest_hit, surface
+from vg2gt.data.synthetic.sky import GROUND, add_sky
+from vg2gt.data.synthetic.textures import fractal_noise, pattern_value
 
 _TILE = 8
 _SAMPLES = 2  # colour samples per axis and pixel
@@ -24,11 +25,12 @@ _GAMMA = 1 / 1.8
 
 
 @dataclass(frozen=True)
-class Room:
-    """Geometry, materials and lights of one room. Metres, z up.
+class World:
+    """Geometry, materials and lights of one scene. Metres, z up.
 
     Attributes:
-        walls: ``[2, 3]`` lower and upper corner of the room's inside.
+        walls: ``[2, 3]`` lower and upper corner of the room that holds everything; under an open sky, of the
+            part of the ground that is seen.
         wall_materials: ``[6]`` materials of the walls x-, x+, y-, y+, floor, ceiling.
         parts: ``[n, PART_COLUMNS]`` boxes, cylinders and ellipsoids (columns: ``raycast.py``).
         part_materials: ``[n]``.
@@ -37,6 +39,8 @@ class Room:
             slow and of a fine tonal variation.
         lights: ``[l, 6]`` position and colour.
         ambient: light from everywhere.
+        highlights: ``[m, 2]`` strength and Blinn-Phong exponent of the materials; None: nothing shines.
+        sky: ``[SKY_COLUMNS]`` (columns: ``sky.py``), in place of the ceiling and the four walls; None: a closed world.
     """
 
     walls: NDArray[np.float64]
@@ -47,16 +51,18 @@ class Room:
     materials: NDArray[np.float64]
     lights: NDArray[np.float64]
     ambient: float
+    highlights: NDArray[np.float64] | None = None
+    sky: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)
-class RoomFrame:
+class RenderedFrame:
     """One rendered frame.
 
     Attributes:
         image: ``[H, W, 3]`` uint8.
-        depth: ``[H, W]`` float32 z-depth in metres at the exact pixel centres.
-        normal: ``[H, W, 3]`` float32 unit camera-frame normals there, facing the camera.
+        depth: ``[H, W]`` float32 z-depth in metres at the exact pixel centres, 0 in the sky.
+        normal: ``[H, W, 3]`` float32 unit camera-frame normals there, facing the camera; 0 in the sky.
     """
 
     image: NDArray[np.uint8]
@@ -65,23 +71,23 @@ class RoomFrame:
 
 
 def render_frame(
-    room: Room, world_to_camera: NDArray[np.float64], intrinsics: NDArray[np.float64], size: tuple[int, int]
-) -> RoomFrame:
+    world: World, world_to_camera: NDArray[np.float64], intrinsics: NDArray[np.float64], size: tuple[int, int]
+) -> RenderedFrame:
     """Renders one camera.
 
     Args:
-        room: what is seen.
-        world_to_camera: ``[4, 4]`` OpenCV; the camera must stand in the room and outside of its parts.
+        world: what is seen.
+        world_to_camera: ``[4, 4]`` OpenCV; the camera must stand inside the walls and outside of its parts.
         intrinsics: ``[3, 3]`` in pixels, integer pixel centres, no skew.
         size: image ``(height, width)``.
     """
-    frame = RoomFrame(np.empty((*size, 3), np.uint8), np.empty(size, np.float32), np.empty((*size, 3), np.float32))
+    frame = RenderedFrame(np.empty((*size, 3), np.uint8), np.empty(size, np.float32), np.empty((*size, 3), np.float32))
     rotation = np.ascontiguousarray(world_to_camera[:3, :3])
     origin = -rotation.T @ world_to_camera[:3, 3]
     camera = (intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2])
-    geometry = (room.parts, room.groups, room.walls)
-    look = (room.part_materials, room.wall_materials, room.materials, room.lights, room.ambient)
-    _render(origin, rotation, camera, geometry, look, frame.image, frame.depth, frame.normal)
+    geometry = (world.parts, world.groups, world.walls)
+    look = (world.part_materials, world.wall_materials, world.materials, world.lights, world.ambient)
+    _render(origin, rotation, camera, geometry, look, world.highlights, world.sky, frame.image, frame.depth, frame.normal)
     return frame
 
 
@@ -129,13 +135,30 @@ def _light_cone(light, points, count, axis):
 
 
 @jit
-def _shade(hit, t, p, d, footprint, parts, groups, look, shadowing, counts, guesses, color):
+def _leave_out_sky(hits, points, count, origin):
+    """Moves points in the sky, on which nothing throws a shadow, onto another point of the tile."""
+    solid = origin
+    for k in range(count):
+        if hits[k] < 0 and hits[k] != GROUND:
+            points[k] = solid
+        else:
+            solid = points[k]
+
+
+@jit
+def _shade(hit, t, p, d, footprint, parts, groups, look, highlights, sky, shadowing, counts, guesses, color):
     """Adds the linear colour of one ray's hit to ``color``; ``shadowing`` lists the groups to ask for every light."""
     part_materials, wall_materials, materials, lights, ambient = look
+    shallow = 0.15
+    if sky is not None:
+        if hit < 0 and hit != GROUND:
+            add_sky(sky, d, footprint, color)
+            return
+        shallow = 0.03  # the far ground would flicker
     nx, ny, nz, u, v = surface(hit, parts, p[0], p[1], p[2])
     m = part_materials[hit] if hit >= 0 else wall_materials[-1 - hit]
     cosine = abs(nx * d[0] + ny * d[1] + nz * d[2])
-    width = footprint * t / max(cosine, 0.15)
+    width = footprint * t / max(cosine, shallow)
     seed = int(materials[m, 2])
     mix = pattern_value(int(materials[m, 0]), u, v, materials[m, 1], width, seed)
     tone = 1.0 + materials[m, 9] * fractal_noise(u, v, materials[m, 10], 2, width, seed + 31)
@@ -156,13 +179,21 @@ def _shade(hit, t, p, d, footprint, parts, groups, look, shadowing, counts, gues
         red += strength * lights[i, 3]
         green += strength * lights[i, 4]
         blue += strength * lights[i, 5]
+        if highlights is not None:
+            if guess < 0:
+                away = nx * d[0] + ny * d[1] + nz * d[2]
+                length = math.sqrt((ex - d[0]) ** 2 + (ey - d[1]) ** 2 + (ez - d[2]) ** 2)
+                glint = highlights[m, 0] * max((facing - away) / length, 0.0) ** highlights[m, 1]
+                glint /= 0.5 + 0.25 * squared
+                for channel in range(3):
+                    color[channel] += glint * lights[i, 3 + channel]
     color[0] += tone * (materials[m, 3] + mix * (materials[m, 6] - materials[m, 3])) * red
     color[1] += tone * (materials[m, 4] + mix * (materials[m, 7] - materials[m, 4])) * green
     color[2] += tone * (materials[m, 5] + mix * (materials[m, 8] - materials[m, 5])) * blue
 
 
 @jit
-def _cast_centers(y0, x0, y1, x1, origin, rotation, camera, geometry, visible, count, depth, normal):
+def _cast_centers(y0, x0, y1, x1, origin, rotation, camera, geometry, sky, visible, count, depth, normal):
     """Depth and normals of a tile at its pixel centres."""
     parts, groups, walls = geometry
     ox, oy, oz = origin
@@ -171,6 +202,11 @@ def _cast_centers(y0, x0, y1, x1, origin, rotation, camera, geometry, visible, c
         for x in range(x0, x1):
             z = _ray(x, y, rotation, camera, d)
             t, hit = nearest_hit(visible, count, parts, groups, walls, ox, oy, oz, d[0], d[1], d[2])
+            if sky is not None:
+                if hit < 0 and hit != GROUND:
+                    depth[y, x] = 0.0
+                    normal[y, x, :] = 0.0
+                    continue
             n = surface(hit, parts, ox + t * d[0], oy + t * d[1], oz + t * d[2])
             depth[y, x] = t * z
             for i in range(3):
@@ -178,7 +214,7 @@ def _cast_centers(y0, x0, y1, x1, origin, rotation, camera, geometry, visible, c
 
 
 @jit
-def _render(origin, rotation, camera, geometry, look, image, depth, normal):
+def _render(origin, rotation, camera, geometry, look, highlights, sky, image, depth, normal):
     parts, groups, walls = geometry
     lights = look[3]
     height, width = depth.shape
@@ -197,7 +233,7 @@ def _render(origin, rotation, camera, geometry, look, image, depth, normal):
             y1, x1 = min(y0 + _TILE, height), min(x0 + _TILE, width)
             spread = _tile_cone(y0, x0, y1, x1, rotation, camera, axis)
             count = groups_in_cone(origin, axis, spread, FAR, groups, visible, near)
-            _cast_centers(y0, x0, y1, x1, (ox, oy, oz), rotation, camera, geometry, visible, count, depth, normal)
+            _cast_centers(y0, x0, y1, x1, (ox, oy, oz), rotation, camera, geometry, sky, visible, count, depth, normal)
             k = 0
             for y in range(y0, y1):
                 for x in range(x0, x1):
@@ -210,6 +246,8 @@ def _render(origin, rotation, camera, geometry, look, image, depth, normal):
                         distances[k] = t
                         points[k, 0], points[k, 1], points[k, 2] = ox + t * d[0], oy + t * d[1], oz + t * d[2]
                         k += 1
+            if sky is not None:
+                _leave_out_sky(hits, points, k, origin)
             for i in range(len(lights)):
                 spread, reach = _light_cone(lights[i], points, k, axis)
                 counts[i] = groups_in_cone(lights[i, :3], axis, spread, reach, groups, shadowing[i], near)
@@ -220,7 +258,7 @@ def _render(origin, rotation, camera, geometry, look, image, depth, normal):
                     for _ in range(per_pixel):
                         _shade(
                             hits[k], distances[k], points[k], directions[k], step / camera[0],
-                            parts, groups, look, shadowing, counts, guesses, color,
+                            parts, groups, look, highlights, sky, shadowing, counts, guesses, color,
                         )  # fmt: skip
                         k += 1
                     for i in range(3):

@@ -2,58 +2,49 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vg2gt.data.furniture import MAKERS, Builder
-from vg2gt.data.raycast import PART_COLUMNS
-from vg2gt.data.room_renderer import Room, RoomFrame, render_frame
-from vg2gt.data.textures import Pattern
-
-GENERATOR_VERSION = 1  # raise it whenever the same seed would give other pixels
+from vg2gt.data.synthetic.builder import Builder
+from vg2gt.data.synthetic.furniture import MAKERS
+from vg2gt.data.synthetic.raycast import PART_COLUMNS
+from vg2gt.data.synthetic.renderer import World
+from vg2gt.data.synthetic.scene import SyntheticScene, draw_highlights, level_poses
+from vg2gt.data.synthetic.textures import INDOOR, Pattern
 
 _FLOOR_PATTERNS = (Pattern.CHECKS, Pattern.BRICKS, Pattern.CLOUDS, Pattern.WOOD, Pattern.MOSAIC, Pattern.PLANKS)
 _CEILING_PATTERNS = (Pattern.PLAIN, Pattern.CLOUDS, Pattern.BRICKS)
-_PICTURE_PATTERNS = tuple(pattern for pattern in Pattern if pattern not in (Pattern.PLAIN, Pattern.BRICKS))
+_PICTURE_PATTERNS = tuple(pattern for pattern in INDOOR if pattern not in (Pattern.PLAIN, Pattern.BRICKS))
 _WALL_GAP = 0.55  # metres from a wall to the middle of the furniture along it
 _TRIES = 200
 
 
-class SyntheticRoom:
-    """One furnished room with a camera path.
-
-    The world frame has its origin at the middle of the floor, z up, metres.
+class SyntheticRoom(SyntheticScene):
+    """One furnished room with a camera path. The world frame has its origin at the middle of the floor.
 
     Args:
         seed: decides everything, together with the number of frames.
         num_frames: cameras on the path, at least 1.
         size: image ``(height, width)``.
+        highlights: whether surfaces shine; nothing but the colour changes.
     """
 
-    def __init__(self, seed: int, num_frames: int, size: tuple[int, int]) -> None:
-        rng = np.random.default_rng((GENERATOR_VERSION, seed))
+    version = 1  # raise it whenever the same seed would give other pixels
+
+    def __init__(self, seed: int, num_frames: int, size: tuple[int, int], highlights: bool = False) -> None:
+        rng = np.random.default_rng((self.version, seed))
         extent = rng.uniform((3.5, 3.5, 2.4), (7.0, 7.0, 3.3))
         builder = Builder(rng)
         shell = _shell_materials(builder)
         _hang_pictures(builder, extent)
         occupied = _furnish(builder, extent)
-        self.room = _finish(builder, extent, shell)
-        self.size = size
-        camera_to_world = _camera_path(rng, extent, occupied, num_frames)
-        self.world_to_camera = np.linalg.inv(camera_to_world)
-        focal = 0.5 * size[1] / np.tan(rng.uniform(1.2, 1.55) / 2)
-        self.intrinsics = np.array([[focal, 0, (size[1] - 1) / 2], [0, focal, (size[0] - 1) / 2], [0, 0, 1]])
-
-    def render(self, frames: Sequence[int], threads: int) -> list[RoomFrame]:
-        """Renders the given frames of the path, ``threads`` at a time."""
-        with ThreadPoolExecutor(threads) as pool:
-            return list(pool.map(self._render_frame, frames))
-
-    def _render_frame(self, frame: int) -> RoomFrame:
-        return render_frame(self.room, self.world_to_camera[frame], self.intrinsics, self.size)
+        world = _finish(builder, extent, shell)
+        if highlights:
+            world = replace(world, highlights=draw_highlights((self.version, seed), len(world.materials)))
+        poses = _camera_path(rng, extent, occupied, num_frames)
+        super().__init__(world, poses, rng.uniform(1.2, 1.55), size)
 
 
 def _shell_materials(builder: Builder) -> NDArray[np.int64]:
@@ -105,14 +96,14 @@ def _candidate_place(rng: np.random.Generator, extent: NDArray[np.float64]) -> t
     return position, rng.uniform(0, 2 * np.pi)
 
 
-def _finish(builder: Builder, extent: NDArray[np.float64], shell: NDArray[np.int64]) -> Room:
+def _finish(builder: Builder, extent: NDArray[np.float64], shell: NDArray[np.int64]) -> World:
     rng = builder.rng
     count = int(rng.integers(1, 4))
     position = rng.uniform(-0.4, 0.4, (count, 3)) * extent
     position[:, 2] = extent[2] - rng.uniform(0.1, 0.5, count)
     color = rng.uniform(0.8, 1.1, (count, 1)) * (1 + rng.uniform(-0.12, 0.12, (count, 3))) / np.sqrt(count)
     half = extent[:2] / 2
-    return Room(
+    return World(
         walls=np.array([[-half[0], -half[1], 0.0], [half[0], half[1], extent[2]]]),
         wall_materials=shell,
         parts=np.array(builder.parts).reshape(-1, PART_COLUMNS),
@@ -134,17 +125,7 @@ def _camera_path(
     height = np.minimum(height, extent[2] - 0.4)
     pan = rng.uniform(0, 2 * np.pi) + rng.choice((-1, 1)) * rng.uniform(1.2, 2.4) * s + 0.1 * np.sin(7 * s)
     nod = -rng.uniform(0, 0.35) + 0.15 * np.sin(s * np.pi * rng.uniform(0.6, 2) + rng.uniform(0, 6))
-
-    forward = np.stack((np.cos(pan) * np.cos(nod), np.sin(pan) * np.cos(nod), np.sin(nod)), 1)
-    right = np.cross(forward, (0.0, 0.0, 1.0))
-    right /= np.linalg.norm(right, axis=1, keepdims=True)
-    poses = np.tile(np.eye(4), (count, 1, 1))
-    poses[:, :3, 0] = right
-    poses[:, :3, 1] = np.cross(forward, right)
-    poses[:, :3, 2] = forward
-    poses[:, :2, 3] = floor
-    poses[:, 2, 3] = height
-    return poses
+    return level_poses(np.column_stack((floor, height)), pan, nod)
 
 
 def _free_arc(

@@ -1,4 +1,4 @@
-"""Procedural rooms as a dataset: made from a seed when first asked for, then read from a cache folder."""
+"""Procedural scenes as a dataset: made from a seed when first asked for, then read from a cache folder."""
 
 from __future__ import annotations
 
@@ -13,25 +13,35 @@ import torch
 from numpy.typing import NDArray
 
 from vg2gt.data.base import Frames, SceneSource
-from vg2gt.data.synthetic_rooms import GENERATOR_VERSION, SyntheticRoom
+from vg2gt.data.synthetic.rooms import SyntheticRoom
+from vg2gt.data.synthetic.scene import SyntheticScene
 from vg2gt.data.transforms import from_bytes
 from vg2gt.io.files import write_bytes
 
 log = logging.getLogger(__name__)
 
+VARIANTS: dict[str, type[SyntheticRoom]] = {
+    "room": SyntheticRoom,
+}
 
-class SyntheticRooms(SceneSource):
-    """Furnished rooms with exact depth and poses.
 
-    Room k of a source has the seed ``first_seed + k`` and the name ``room-<seed>``, so sources whose seed ranges do not
-    overlap share no scene.
+class SyntheticScenes(SceneSource):
+    """Furnished rooms and outdoor scenes with exact depth and poses.
+
+    Scene k of a source has the seed ``first_seed + k`` and the name ``<variant>-<seed>``, so sources whose seed ranges
+    do not overlap share no scene. The sky of outdoor scenes has no depth.
 
     Args:
-        num_scenes: rooms in this source.
-        first_seed: seed of the first room.
-        num_frames: frames on a room's camera path.
+        num_scenes: scenes in this source.
+        first_seed: seed of the first scene.
+        num_frames: frames on a scene's camera path.
         size: image ``(height, width)``; best the size that is trained on.
+        variant: ``room`` or ``outdoor``, or a list: seeds take turns, so ``[room, room, outdoor]`` is one third outdoor.
+        highlights: whether surfaces shine, with colours that depend on the view; geometry and textures stay the same.
         cache_dir: folder for the rendered frames (``~`` is the home folder); None keeps nothing on disk.
+
+    Raises:
+        ValueError: if a number is out of range or a variant unknown.
     """
 
     def __init__(
@@ -40,22 +50,31 @@ class SyntheticRooms(SceneSource):
         first_seed: int = 0,
         num_frames: int = 16,
         size: Sequence[int] = (112, 224),
+        variant: str | Sequence[str] = "room",
+        highlights: bool = False,
         cache_dir: str | None = None,
     ) -> None:
         if num_scenes < 1 or num_frames < 1 or first_seed < 0:
             raise ValueError(
-                "synthetic rooms need num_scenes >= 1, num_frames >= 1 and first_seed >= 0; "
+                "synthetic scenes need num_scenes >= 1, num_frames >= 1 and first_seed >= 0; "
                 f"got {num_scenes}, {num_frames} and {first_seed}"
             )
+        variants = [variant] if isinstance(variant, str) else list(variant)
+        if not variants or not set(variants) <= set(VARIANTS):
+            raise ValueError(f"variant must be one of {', '.join(VARIANTS)}, or a list of them; got {variant!r}")
         self.num_frames = num_frames
         self.size = (int(size[0]), int(size[1]))
+        self.highlights = highlights
         self.cache_dir = Path(cache_dir).expanduser() if cache_dir else None
-        self._seeds = {f"room-{seed:06d}": seed for seed in range(first_seed, first_seed + num_scenes)}
+        self._seeds: dict[str, tuple[str, int]] = {}
+        for seed in range(first_seed, first_seed + num_scenes):
+            kind = variants[seed % len(variants)]
+            self._seeds[f"{kind}-{seed:06d}"] = (kind, seed)
         self._names = tuple(self._seeds)
 
     @property
     def scenes(self) -> Sequence[str]:
-        """Names of the rooms."""
+        """Names of the scenes."""
         return self._names
 
     def frames(self, scene: str) -> Sequence[int]:
@@ -63,7 +82,7 @@ class SyntheticRooms(SceneSource):
         return range(self.num_frames)
 
     def load(self, scene: str, frame_ids: Sequence[int]) -> Frames:
-        """Returns frames of a room, rendering the room if the cache does not hold it."""
+        """Returns frames of a scene, rendering the scene if the cache does not hold it."""
         arrays = self._read_cache(scene)
         if arrays is None:
             arrays = self._render(scene)
@@ -78,32 +97,37 @@ class SyntheticRooms(SceneSource):
         )
 
     def normals(self, scene: str, frame_ids: Sequence[int]) -> torch.Tensor:
-        """Renders the exact camera-frame unit normals ``[V, 3, H, W]`` of frames; they are not cached."""
-        frames = self._room(scene).render(frame_ids, _threads())
+        """Renders the exact camera-frame unit normals ``[V, 3, H, W]`` of frames, 0 in the sky; they are not cached."""
+        frames = self.scene(scene).render(frame_ids, _threads())
         return torch.from_numpy(np.stack([frame.normal for frame in frames])).permute(0, 3, 1, 2).contiguous()
 
-    def _room(self, scene: str) -> SyntheticRoom:
-        return SyntheticRoom(self._seeds[scene], self.num_frames, self.size)
+    def scene(self, scene: str) -> SyntheticScene:
+        """Makes a scene, ready to be rendered."""
+        kind, seed = self._seeds[scene]
+        return VARIANTS[kind](seed, self.num_frames, self.size, self.highlights)
 
     def _render(self, scene: str) -> dict[str, NDArray]:
-        room = self._room(scene)
-        frames = room.render(range(self.num_frames), _threads())
+        made = self.scene(scene)
+        frames = made.render(range(self.num_frames), _threads())
         return {
             "images": np.stack([frame.image for frame in frames]),
             "depth": np.stack([frame.depth for frame in frames]),
-            "world_to_camera": room.world_to_camera,
-            "intrinsics": room.intrinsics,
+            "world_to_camera": made.world_to_camera,
+            "intrinsics": made.intrinsics,
         }
 
     def cache_file(self, scene: str) -> Path | None:
-        """Where a room's frames are kept; the name holds everything that decides the pixels."""
+        """Where a scene's frames are kept; the name holds everything that decides the pixels."""
         if self.cache_dir is None:
             return None
-        folder = f"rooms-v{GENERATOR_VERSION}-{self.size[0]}x{self.size[1]}x{self.num_frames}"
+        kind = self._seeds[scene][0]
+        look = "-highlights" if self.highlights else ""
+        size = f"{self.size[0]}x{self.size[1]}x{self.num_frames}"
+        folder = f"{kind}s{look}-v{VARIANTS[kind].version}-{size}"
         return self.cache_dir / folder / f"{scene}.npz"
 
     def _read_cache(self, scene: str) -> dict[str, NDArray] | None:
-        """Reads a room from the cache; None, with a warning, where the file is damaged (its checksums do not fit)."""
+        """Reads a scene from the cache; None, with a warning, where the file is damaged (its checksums do not fit)."""
         path = self.cache_file(scene)
         if path is None or not path.is_file():
             return None
@@ -111,11 +135,11 @@ class SyntheticRooms(SceneSource):
             with np.load(path, allow_pickle=False) as stored:
                 arrays = {name: stored[name] for name in ("images", "depth", "world_to_camera", "intrinsics")}
         except (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile) as error:
-            log.warning("the cached room %s is damaged (%s) and is made again", path, error)
+            log.warning("the cached scene %s is damaged (%s) and is made again", path, error)
             return None
         shape = (self.num_frames, *self.size)
         if arrays["images"].shape != (*shape, 3) or arrays["depth"].shape != shape:
-            log.warning("the cached room %s has another shape than %s and is made again", path, shape)
+            log.warning("the cached scene %s has another shape than %s and is made again", path, shape)
             return None
         return arrays
 

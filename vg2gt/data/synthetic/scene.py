@@ -1,0 +1,79 @@
+"""What every procedural scene has: a world, a camera path through it and a way to render it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vg2gt.data.synthetic.renderer import RenderedFrame, World, render_frame
+
+_HIGHLIGHTS = 1  # tells the random stream of the highlights from that of the scene
+_MATT_SHARE = 0.3
+
+
+class SyntheticScene:
+    """A world and cameras on a path through it, in metres, z up.
+
+    Args:
+        world: what is seen.
+        camera_to_world: ``[n, 4, 4]`` OpenCV.
+        field_of_view: horizontal, rad.
+        size: image ``(height, width)``.
+
+    Attributes:
+        world_to_camera: ``[n, 4, 4]`` float64.
+        intrinsics: ``[3, 3]`` float64 in pixels, integer pixel centres.
+    """
+
+    def __init__(
+        self, world: World, camera_to_world: NDArray[np.float64], field_of_view: float, size: tuple[int, int]
+    ) -> None:
+        self.world = world
+        self.size = size
+        self.world_to_camera = np.linalg.inv(camera_to_world)
+        focal = 0.5 * size[1] / np.tan(field_of_view / 2)
+        self.intrinsics = np.array([[focal, 0, (size[1] - 1) / 2], [0, focal, (size[0] - 1) / 2], [0, 0, 1]])
+
+    def render(self, frames: Sequence[int], threads: int) -> list[RenderedFrame]:
+        """Renders the given frames of the path, ``threads`` at a time."""
+        with ThreadPoolExecutor(threads) as pool:
+            return list(pool.map(self._render_frame, frames))
+
+    def _render_frame(self, frame: int) -> RenderedFrame:
+        return render_frame(self.world, self.world_to_camera[frame], self.intrinsics, self.size)
+
+
+def level_poses(
+    position: NDArray[np.float64], pan: NDArray[np.float64], nod: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Camera-to-world poses ``[n, 4, 4]`` of cameras that are not rolled.
+
+    Args:
+        position: ``[n, 3]``.
+        pan: ``[n]`` turn about the vertical (rad), 0 looks along x.
+        nod: ``[n]`` upward (rad).
+    """
+    forward = np.stack((np.cos(pan) * np.cos(nod), np.sin(pan) * np.cos(nod), np.sin(nod)), 1)
+    right = np.cross(forward, (0.0, 0.0, 1.0))
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    poses = np.tile(np.eye(4), (len(position), 1, 1))
+    poses[:, :3, 0] = right
+    poses[:, :3, 1] = np.cross(forward, right)
+    poses[:, :3, 2] = forward
+    poses[:, :3, 3] = position
+    return poses
+
+
+def draw_highlights(seed: tuple[int, ...], materials: int) -> NDArray[np.float64]:
+    """Strength and Blinn-Phong exponent ``[m, 2]`` of every material; a third of the materials stays matt.
+
+    Drawn from a random stream of its own, so that nothing else of the scene changes. The exponent is that of a surface
+    whose microfacets have slopes of ``roughness`` standard deviation, ``2 / roughness^2 - 2``.
+    """
+    rng = np.random.default_rng((*seed, _HIGHLIGHTS))
+    strength = rng.uniform(0.15, 0.9, materials) * (rng.random(materials) >= _MATT_SHARE)
+    roughness = np.exp(rng.uniform(*np.log((0.1, 0.6)), materials))
+    return np.stack((strength, 2 / roughness**2 - 2), 1)
