@@ -91,9 +91,18 @@ def find_weights(name: str, repo: str | None, revision: str | None, path: str | 
         return Path(hf_hub_download(repo, WEIGHT_FILES[0], revision=revision))
     except Exception as error:  # the hub raises its own, requests' and httpx's errors
         raise FileNotFoundError(
-            f"cannot get {WEIGHT_FILES[0]} of {repo} (revision {revision or 'newest'}) for backend {name}: {error}. "
-            f"Check the network and the cache, {remedy}"
+            f"cannot get {WEIGHT_FILES[0]} of {repo} (revision {revision or 'newest'}) for backend {name}: "
+            f"{_reason(error)}. Check the network, the revision and the cache, or {remedy}"
         ) from error
+
+
+def _reason(error: BaseException) -> str:
+    """What the hub's client says, in one line; of a file not in the cache, also why it could not be fetched."""
+    root = error
+    while isinstance(error, FileNotFoundError) and root.__cause__ is not None:
+        root = root.__cause__
+    told = [error] if root is error else [error, root]
+    return "; ".join(" ".join(str(one).split()).rstrip(".") for one in told)
 
 
 def read_weights(file: Path) -> dict[str, Tensor]:
