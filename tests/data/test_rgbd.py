@@ -48,8 +48,9 @@ def test_exported_scannet_layout_is_sorted_by_number_and_follows_the_depth_image
     np.savetxt(exported / "intrinsic" / "intrinsic_color.txt", 2 * matrix)
     with caplog.at_level(logging.INFO):
         source = RGBDFolder(str(exported))
-    assert "1 of 6 frames have no finite pose" in caplog.text
-    assert "exported ScanNet layout, 5 frames" in caplog.text
+        source.frames("scene0000_00")
+    assert "1 of 6 frames whose pose is not finite" in caplog.text
+    assert "folders color/ and depth/, 5 frames" in caplog.text
     assert list(source.frames("scene0000_00")) == [7, 8, 10, 11, 12]
     frames = source.load("scene0000_00", [7, 8, 10])
     errors = (frames.images[:, None] - reference.images[None]).abs().mean((2, 3, 4))
@@ -70,7 +71,7 @@ def test_seven_scenes_layout(write_recording, caplog):
         shutil.copy(folder / "depth" / f"{i + 10:05d}.png", sequence / f"frame-{i:06d}.depth.png")
         np.savetxt(sequence / f"frame-{i:06d}.pose.txt", poses[i])
     with pytest.raises(DataError, match=r"no intrinsics.*data.intrinsics=\[fx,fy,cx,cy\]"):
-        RGBDFolder(str(folder.parent / "chess"))
+        RGBDFolder(str(folder.parent / "chess")).frames("seq-01")
     given = RGBDFolder(str(folder.parent / "chess"), intrinsics=(30, 31, 15.5, 11.5))
     assert given.scenes == ("seq-01",)
     assert given.load("seq-01", [0]).intrinsics[0].tolist() == [[30, 0, 15.5], [0, 31, 11.5], [0, 0, 1]]
@@ -126,7 +127,7 @@ def test_held_out_frames_are_targets_and_never_trained_on(write_recording):
     (batch,) = module.val_dataloader()
     assert batch.target.frame_ids.tolist() == [[11, 14]]
     assert set(batch.context.frame_ids[0].tolist()) <= trained
-    without = RGBDFolder(str(source._recordings["office"].folder), holdout=None)
+    without = RGBDFolder(str(source.scene_index("office").folder), holdout=None)
     with pytest.raises(DataError, match="office is used for training and for evaluation"):
         SceneDataModule(train=without, val=without, min_views=2, max_views=2, eval_context=2, eval_target=1).setup()
 
@@ -145,7 +146,7 @@ def test_a_folder_of_recordings_splits_by_scene(write_recording):
     assert next(iter(module.val_dataloader())).scene == ("b",)
     with pytest.raises(DataError, match="no scene c; found are: a, b"):
         RGBDFolder(str(root), scenes=["c"])
-    with pytest.raises(DataError, match="two recordings are called a"):
+    with pytest.raises(DataError, match="two scenes are called a"):
         RGBDFolder([str(root / "a"), str(root / "a")])
 
 
@@ -154,7 +155,7 @@ def test_a_missing_root_names_the_path_and_the_remedy(tmp_path):
         RGBDFolder(str(tmp_path / "nowhere"))
     with pytest.raises(FileNotFoundError, match=r"data\.root is not set.*data\.root=FOLDER"):
         RGBDFolder(None)
-    with pytest.raises(DataError, match="no RGB-D recording in"):
+    with pytest.raises(DataError, match=r"no scene of RGBDFolder in .*expected images"):
         RGBDFolder(str(tmp_path))
 
 
@@ -185,16 +186,19 @@ DAMAGE = {
     "no images": (lambda f: _empty(f / "images"), "scene office has no colour images"),
     "image removed": (
         lambda f: (f / "images/00012.png").unlink(),
-        "5 colour and 6 depth files: frame 12 has a depth file",
+        "one line of 16 numbers .* for each of the 5 images; it has 6",
     ),
     "poses missing": (lambda f: (f / "poses.txt").unlink(), r"poses\.txt of scene office"),
     "a pose missing": (_drop_a_pose, "each of the 6 images; it has 5 lines of 16"),
     "words": (lambda f: (f / "poses.txt").write_text("a b\n"), r"cannot read .*poses\.txt of scene office"),
     "not rigid": (
         lambda f: np.savetxt(f / "poses.txt", 2 * np.loadtxt(f / "poses.txt")),
-        "frame 10 of scene office .* not a rigid",
+        "frame 10 in .*scene office.* not a rigid",
     ),
-    "not finite": (lambda f: np.savetxt(f / "poses.txt", np.full((6, 16), np.nan)), "no frame of scene office"),
+    "not finite": (
+        lambda f: np.savetxt(f / "poses.txt", np.full((6, 16), np.nan)),
+        "no usable frame .*; 6 frames whose pose is not finite",
+    ),
     "no intrinsics": (lambda f: (f / "K.txt").unlink(), r"no intrinsics: add K\.txt"),
     "no 3x3": (lambda f: np.savetxt(f / "K.txt", np.ones((2, 3))), r"K\.txt .* 3x3 or 4x4 matrix, not 2x3"),
     "no focal length": (lambda f: np.savetxt(f / "K.txt", np.zeros((3, 3))), "no positive focal lengths"),
@@ -276,3 +280,17 @@ def test_registered_seven_scenes_frames_agree_as_their_description_says(shared):
     pairs = [depth_differences(frames, a, b, stride=10) for a in range(56) for b in range(a + 1, 56)]
     medians = [float(differences.median()) for differences, overlap in pairs if overlap >= 0.3]
     assert np.median(medians) == pytest.approx(12.0e-3, rel=0.1)
+
+
+def test_raw_seven_scenes_depth_agrees_as_its_description_says(shared):
+    source = RGBDFolder(str(shared / "data/seven_scenes_redkitchen_a"), holdout=None)
+    (scene,) = source.scenes
+    frames = source.load(scene, source.frames(scene))
+    assert float((frames.depth > 0).float().mean()) == pytest.approx(0.883, abs=0.001)
+    count = len(frames.depth)
+    pairs = [depth_differences(frames, a, b, stride=10) for a in range(count) for b in range(count) if a != b]
+    together = torch.cat([differences for differences, overlap in pairs if overlap >= 0.3])
+    assert float(together.median()) == pytest.approx(12.2e-3, rel=0.1)
+    assert float((together < 0.03).float().mean()) == pytest.approx(0.78, abs=0.02)
+    neighbours = [float(depth_differences(frames, a, a + 1, stride=4)[0].median()) for a in range(count - 1)]
+    assert np.median(neighbours) == pytest.approx(6.0e-3, rel=0.1)

@@ -2,7 +2,7 @@
 
 from vg2gt.data.base import DataError, Frames, SceneSource
 from vg2gt.data.datamodule import SceneDataModule
-from vg2gt.data.rgbd import RGBDFolder
+from vg2gt.data.sources.rgbd import RGBDFolder
 from vg2gt.data.synthetic import SyntheticScenes
 
 SyntheticRooms = SyntheticScenes

@@ -163,7 +163,7 @@ class FileSource(SceneSource):
         for root in roots:
             inside = self.find(root)
             if not inside:
-                raise DataError(f"no scene of this dataset in {root}: expected {self.layout}")
+                raise DataError(f"no scene of {type(self).__name__} in {root}: expected {self.layout}")
             for name, folder in inside.items():
                 if name in found:
                     raise DataError(
@@ -216,12 +216,13 @@ def read_split(path: str) -> list[str]:
 
 def _roots(root: str | Sequence[str] | None, layout: str) -> list[Path]:
     if not root:
-        raise FileNotFoundError(f"data.root is not set: name the dataset's folder ({layout})")
+        raise FileNotFoundError(f"data.root is not set: give data.root=FOLDER, which holds {layout}")
     roots = [Path(path).expanduser() for path in ([root] if isinstance(root, str) else root)]
     for path in roots:
         if not path.is_dir():
             raise FileNotFoundError(
-                f"the data folder {path} (seen from {Path.cwd()}) does not exist: set data.root=FOLDER to {layout}"
+                f"the data folder {path} (seen from {Path.cwd()}) does not exist: set data.root=FOLDER to one that "
+                f"holds {layout}"
             )
     return roots
 

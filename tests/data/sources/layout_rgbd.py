@@ -1,0 +1,59 @@
+"""RGB-D folders: one file of poses, one file a pose, 7-Scenes."""
+
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from vg2gt.data import Frames, RGBDFolder
+
+from .layouts import Layout, camera_to_world, pixels
+
+
+def _millimetres(frames: Frames) -> np.ndarray:
+    return (frames.depth.numpy() * 1000 + 0.5).astype(np.uint16)
+
+
+def write_recording(root: Path, frames: Frames, scene: str = "office") -> None:
+    """``images/ depth/ poses.txt K.txt``; frames 10, 11, ..."""
+    for sub in ("images", "depth"):
+        (root / scene / sub).mkdir(parents=True)
+    for i, (image, depth) in enumerate(zip(pixels(frames), _millimetres(frames), strict=True)):
+        Image.fromarray(image).save(root / scene / "images" / f"{i + 10:05d}.png")
+        Image.fromarray(depth).save(root / scene / "depth" / f"{i + 10:05d}.png")
+    np.savetxt(root / scene / "poses.txt", camera_to_world(frames).reshape(-1, 16))
+    np.savetxt(root / scene / "K.txt", frames.intrinsics[0].numpy())
+
+
+def _write_pose_files(root: Path, frames: Frames) -> None:
+    for sub in ("rgb", "depth", "pose", "intrinsic"):
+        (root / "hall" / sub).mkdir(parents=True)
+    for i, pose in enumerate(camera_to_world(frames)):
+        Image.fromarray(pixels(frames)[i]).save(root / "hall" / "rgb" / f"{i + 8}.jpg", quality=95, subsampling=0)
+        Image.fromarray(_millimetres(frames)[i]).save(root / "hall" / "depth" / f"{i + 8}.png")
+        np.savetxt(root / "hall" / "pose" / f"{i + 8}.txt", pose)
+    matrix = np.eye(4)
+    matrix[:3, :3] = frames.intrinsics[0].numpy()
+    np.savetxt(root / "hall" / "intrinsic" / "intrinsic_depth.txt", matrix)
+
+
+def _write_seven_scenes(root: Path, frames: Frames) -> None:
+    folder = root / "chess" / "seq-01"
+    folder.mkdir(parents=True)
+    for i, pose in enumerate(camera_to_world(frames)):
+        Image.fromarray(pixels(frames)[i]).save(folder / f"frame-{i:06d}.color.png")
+        depth = _millimetres(frames)[i]
+        Image.fromarray(np.where(depth == 0, 65535, depth)).save(folder / f"frame-{i:06d}.depth.png")
+        np.savetxt(folder / f"frame-{i:06d}.pose.txt", pose)
+    np.savetxt(root / "chess" / "camera-intrinsics.txt", frames.intrinsics[0].numpy())
+
+
+def _read(root: Path) -> RGBDFolder:
+    return RGBDFolder(str(root), holdout=None)
+
+
+LAYOUTS = {
+    "rgbd": Layout(write_recording, _read, frame_ids=tuple(range(10, 16))),
+    "rgbd_pose_files": Layout(_write_pose_files, _read, image_error=0.012, frame_ids=tuple(range(8, 14))),
+    "seven_scenes": Layout(_write_seven_scenes, _read),
+}

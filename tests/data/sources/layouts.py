@@ -1,0 +1,65 @@
+"""What every loader's tests share: the scene they lay out on disk, and the comparison after it was read back.
+
+A layout says how a dataset is written and how it is read. Modules ``layout_*.py`` beside this one each hold some in a
+dictionary ``LAYOUTS``; every entry goes through the round trip (``test_round_trip.py``) and through damage
+(``test_damage.py``).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from vg2gt.data import Frames, SyntheticRooms
+from vg2gt.data.sources.files import FileSource
+
+SIZE = (30, 40)
+"""Height and width of the scene's images; small, and no multiple of anything else."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """A dataset's layout on disk.
+
+    Attributes:
+        write: lays frames out below an empty folder, as scene number 0 of a dataset would be.
+        read: makes the loader of that folder.
+        image_error: largest mean absolute difference of images (PNG: 0; JPEG: the codec's).
+        depth_quantum: step of stored depth at depth z: ``quantum(z)``; None where the layout has no depth.
+        frame_ids: ids under which frames 0, 1, ... come back; None: unchanged.
+        moved_world: poses come back up to one rigid transform of the world.
+    """
+
+    write: Callable[[Path, Frames], None]
+    read: Callable[[Path], FileSource]
+    image_error: float = 0.0
+    depth_quantum: Callable[[torch.Tensor], torch.Tensor] | None = lambda depth: torch.full_like(depth, 1e-3)
+    frame_ids: tuple[int, ...] | None = None
+    moved_world: bool = False
+
+
+def all_layouts() -> dict[str, Layout]:
+    """Every layout by name."""
+    found: dict[str, Layout] = {}
+    for path in sorted(Path(__file__).parent.glob("layout_*.py")):
+        found |= import_module(f"{__package__}.{path.stem}").LAYOUTS
+    return found
+
+
+def room(frames: int = 6) -> Frames:
+    """Frames of a procedural room; written nowhere."""
+    source = SyntheticRooms(1, num_frames=frames, size=SIZE)
+    return source.load(source.scenes[0], range(frames))
+
+
+def camera_to_world(frames: Frames) -> np.ndarray:
+    """``[V, 4, 4]`` float64 poses of frames."""
+    return np.linalg.inv(frames.world_to_camera.double().numpy())
+
+
+def pixels(frames: Frames) -> np.ndarray:
+    """``[V, H, W, 3]`` uint8 images of frames."""
+    return (frames.images.permute(0, 2, 3, 1).numpy() * 255 + 0.5).astype(np.uint8)

@@ -1,0 +1,74 @@
+"""Synthetic scene -> a dataset's layout on disk -> its loader: the same images, depth, poses and intrinsics."""
+
+import pickle
+
+import pytest
+import torch
+
+from vg2gt.geometry.cameras import relative_to_first
+from vg2gt.types import Cameras
+
+from .layouts import SIZE, Layout, all_layouts, room
+
+LAYOUTS = all_layouts()
+
+
+@pytest.fixture(scope="module")
+def frames():
+    return room()
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_a_scene_comes_back(name, frames, tmp_path):
+    layout: Layout = LAYOUTS[name]
+    layout.write(tmp_path, frames)
+    source = layout.read(tmp_path)
+    (scene,) = source.scenes
+    ids = layout.frame_ids or tuple(range(len(frames.images)))
+    assert tuple(source.frames(scene)) == ids
+    order = [2, 0, 4]
+    loaded = source.load(scene, [ids[i] for i in order])
+    expected = frames.map(lambda tensor: tensor[order])
+
+    assert loaded.images.shape[-2:] == SIZE
+    assert float((loaded.images - expected.images).abs().mean()) <= layout.image_error + 1e-6
+    poses = loaded.world_to_camera
+    if layout.moved_world:
+        poses = _from_first(poses, loaded) @ torch.eye(4)
+        torch.testing.assert_close(poses, _from_first(expected.world_to_camera, expected), atol=1e-6, rtol=0)
+    else:
+        torch.testing.assert_close(poses, expected.world_to_camera, atol=1e-6, rtol=0)
+    torch.testing.assert_close(loaded.intrinsics, expected.intrinsics, atol=1e-4, rtol=0)
+    if layout.depth_quantum is None:
+        assert not source.has_depth
+        assert not loaded.depth.any()
+        return
+    assert source.has_depth
+    valid = loaded.depth > 0
+    assert bool(valid.any())
+    error = (loaded.depth - expected.depth).abs()[valid]
+    assert bool((error <= 0.5 * layout.depth_quantum(expected.depth)[valid] + 1e-6).all())
+    if not loaded.sparse_depth:
+        assert torch.equal(valid, expected.depth > 0)
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_a_loader_travels_to_workers_and_its_index_is_cached(name, frames, tmp_path):
+    layout: Layout = LAYOUTS[name]
+    layout.write(tmp_path / "data", frames)
+    source = layout.read(tmp_path / "data")
+    (scene,) = source.scenes
+    frame = source.frames(scene)[1]
+    direct = pickle.loads(pickle.dumps(source)).load(scene, [frame])
+    for _ in ("written", "read"):
+        cached = layout.read(tmp_path / "data")
+        cached.index_cache = tmp_path / "cache"
+        again = cached.load(scene, [frame])
+        for value, expected in zip(vars(again).values(), vars(direct).values(), strict=True):
+            assert torch.equal(value, expected) if isinstance(value, torch.Tensor) else value == expected
+        assert len(list((tmp_path / "cache").rglob("*.npz"))) == 1
+
+
+def _from_first(poses: torch.Tensor, frames) -> torch.Tensor:
+    size = (frames.depth.shape[-2], frames.depth.shape[-1])
+    return relative_to_first(Cameras(poses[None].double(), frames.intrinsics[None].double(), size)).world_to_camera[0]

@@ -1,0 +1,194 @@
+"""Folders of RGB-D frames with poses: people's own recordings, 7-Scenes sequences.
+
+Layouts, told apart by what is there:
+
+* folders: colour in ``images/``, ``color/`` or ``rgb/``, depth in ``depth/``, poses in ``poses.txt`` (16 numbers a
+  line, in the order of the images) or one text file a frame in ``pose/`` or ``poses/``, intrinsics in ``K.txt`` (3x3)
+  or in ``intrinsic/intrinsic_{color,depth}.txt`` (4x4, as ScanNet is exported);
+* 7-Scenes: ``frame-NNNNNN.{color.png|jpg,depth.png,pose.txt}`` in one folder, intrinsics in ``camera-intrinsics.txt``.
+
+Poses are camera-to-world, OpenCV, metres.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from vg2gt.data.base import DataError
+from vg2gt.data.image_files import image_size, read_depth
+from vg2gt.data.sources.files import FileSource
+from vg2gt.data.sources.index import SceneIndex, Size, make_index
+from vg2gt.data.sources.parsing import numbered, pinhole, read_matrix, read_numbers
+from vg2gt.geometry.cameras import resize_intrinsics
+
+log = logging.getLogger(__name__)
+
+_COLOR_FOLDERS = ("images", "color", "rgb")
+_POSE_FOLDERS = ("pose", "poses")
+_INTRINSICS_FILES = ("K.txt", "camera-intrinsics.txt")
+
+
+@dataclass(frozen=True)
+class _Files:
+    """What a recording consists of."""
+
+    layout: str
+    color: dict[int, Path]
+    depth: dict[int, Path]
+    poses: dict[int, Path] | Path
+    intrinsics: tuple[Path, ...]
+
+
+class RGBDFolder(FileSource):
+    """Recordings with registered colour and depth images and a pose for every frame.
+
+    One recording cannot be split by scenes, so every ``holdout``-th frame is held out: training never sees it and
+    evaluation scores it. Give ``scenes`` to split a folder of many recordings by scenes instead.
+
+    Args:
+        root: a recording, a folder of recordings (one or two levels deep), or a list of such folders.
+        depth_scale: stored depth units a metre: 1000 for millimetres, 5000 for TUM.
+        invalid: stored values that mean "no depth".
+        holdout: hold out every this many-th frame; None: none.
+        scenes: names of the recordings to use, or a text file of them; None: all.
+        intrinsics: (fx, fy, cx, cy) in pixels of the colour images, where the folder has no intrinsics or wrong ones.
+        every: use every this many-th frame only.
+        index_cache: see ``FileSource``.
+
+    Raises:
+        FileNotFoundError: if a root does not exist.
+        DataError: if a folder holds no recording.
+    """
+
+    layout = (
+        "images/, color/ or rgb/ with depth/, poses.txt and K.txt, or frame-*.color.png with frame-*.depth.png, there "
+        "or up to two folders deeper"
+    )
+
+    def __init__(
+        self,
+        root: str | Sequence[str] | None,
+        depth_scale: float = 1000.0,
+        invalid: Sequence[int] = (0, 65535),
+        holdout: int | None = 6,
+        scenes: Sequence[str] | str | None = None,
+        intrinsics: Sequence[float] | None = None,
+        every: int = 1,
+        index_cache: str | None = None,
+    ) -> None:
+        if not depth_scale > 0:
+            raise ValueError(f"depth_scale must be positive (stored units a metre), got {depth_scale}")
+        self.depth_scale = float(depth_scale)
+        self.invalid = tuple(int(value) for value in invalid)
+        self.intrinsics = tuple(float(value) for value in intrinsics) if intrinsics else None
+        super().__init__(root, scenes, holdout, every, index_cache)
+
+    def find(self, root: Path) -> Mapping[str, Path]:
+        """The folder itself, or recordings one or two levels below it."""
+        if _is_recording(root):
+            return {root.resolve().name: root}
+        inner = [folder for pattern in ("*", "*/*") for folder in sorted(root.glob(pattern)) if _is_recording(folder)]
+        return {folder.relative_to(root).as_posix(): folder for folder in inner}
+
+    def options(self) -> Mapping[str, object]:
+        """The intrinsics that replace the files'."""
+        return {"intrinsics": self.intrinsics}
+
+    def index(self, scene: str, folder: Path) -> SceneIndex:
+        """Lists a recording's files and reads its poses and intrinsics."""
+        in_folders = (folder / "depth").is_dir()
+        files = _files_in_folders(folder, scene) if in_folders else _files_of_seven_scenes(folder, scene)
+        if not files.color or not files.depth:
+            kind = "colour" if not files.color else "depth"
+            raise DataError(f"scene {scene} has no {kind} images in {folder}")
+        color_size = image_size(next(iter(files.color.values())), scene)
+        depth_size = image_size(next(iter(files.depth.values())), scene)
+        index = make_index(
+            name=scene,
+            folder=folder,
+            color=files.color,
+            depth=files.depth,
+            camera_to_world=_read_poses(files, scene),
+            intrinsics=self._depth_intrinsics(files.intrinsics, folder, scene, color_size, depth_size),
+            size=depth_size,
+            color_size=color_size,
+            depth_size=depth_size,
+        )
+        size = f"{depth_size[1]}x{depth_size[0]}"
+        log.info("scene %s: %s, %d frames of %s in %s", scene, files.layout, len(index.frame_ids), size, folder)
+        return index
+
+    def read_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
+        """Decodes an integer depth image."""
+        stored = read_depth(index.depth[row], index.name, size)
+        return np.where(np.isin(stored, self.invalid), 0, stored / self.depth_scale).astype(np.float32)
+
+    def _depth_intrinsics(
+        self, files: Sequence[Path], folder: Path, scene: str, color: Size, depth: Size
+    ) -> NDArray[np.float64]:
+        """Intrinsics of the depth images: their own file, or the colour images' brought to their size."""
+        own = [path for path in files if path.name == "intrinsic_depth.txt"]
+        if self.intrinsics is not None:
+            matrix = pinhole(*self.intrinsics)
+        elif files:
+            matrix = read_matrix((own or files)[0], scene, ((3, 3), (4, 4)))[:3, :3].copy()
+        else:
+            raise DataError(
+                f"scene {scene} in {folder} has no intrinsics: add K.txt (3x3) or set data.intrinsics=[fx,fy,cx,cy]"
+            )
+        if own and self.intrinsics is None:
+            return matrix
+        return resize_intrinsics(torch.from_numpy(matrix), depth[1] / color[1], depth[0] / color[0]).numpy()
+
+
+def _is_recording(folder: Path) -> bool:
+    in_folders = (folder / "depth").is_dir() and any((folder / name).is_dir() for name in _COLOR_FOLDERS)
+    return folder.is_dir() and (in_folders or any(folder.glob("frame-*.color.*")))
+
+
+def _files_in_folders(folder: Path, scene: str) -> _Files:
+    color = next(folder / name for name in _COLOR_FOLDERS if (folder / name).is_dir())
+    pose_folder = next((folder / name for name in _POSE_FOLDERS if (folder / name).is_dir()), None)
+    poses = numbered(pose_folder, scene, suffixes=(".txt",)) if pose_folder else folder / "poses.txt"
+    exported = [folder / "intrinsic" / f"intrinsic_{kind}.txt" for kind in ("color", "depth")]
+    single = [folder / name for name in _INTRINSICS_FILES if (folder / name).is_file()][:1]
+    return _Files(
+        layout=f"folders {color.name}/ and depth/",
+        color=numbered(color, scene),
+        depth=numbered(folder / "depth", scene),
+        poses=poses,
+        intrinsics=tuple(path for path in exported if path.is_file()) or tuple(single),
+    )
+
+
+def _files_of_seven_scenes(folder: Path, scene: str) -> _Files:
+    log.warning("scene %s: raw 7-Scenes streams are not registered; colour and depth do not match exactly", scene)
+    # The intrinsics lie beside the frames, or beside the sequences of a scene.
+    candidates = [place / name for place in (folder, folder.parent) for name in _INTRINSICS_FILES]
+    return _Files(
+        layout="7-Scenes layout",
+        color=numbered(folder, scene, "frame-*.color.*"),
+        depth=numbered(folder, scene, "frame-*.depth.*"),
+        poses=numbered(folder, scene, "frame-*.pose.txt", suffixes=(".txt",)),
+        intrinsics=tuple(path for path in candidates if path.is_file())[:1],
+    )
+
+
+def _read_poses(files: _Files, scene: str) -> dict[int, NDArray[np.float64]]:
+    """Camera-to-world poses by frame number."""
+    if isinstance(files.poses, dict):
+        return {number: read_matrix(path, scene, ((4, 4),)) for number, path in files.poses.items()}
+    rows = read_numbers(files.poses, scene)
+    if rows.shape != (len(files.color), 16):
+        raise DataError(
+            f"{files.poses} of scene {scene} must have one line of 16 numbers (4x4 camera-to-world) for each of the "
+            f"{len(files.color)} images; it has {rows.shape[0]} lines of {rows.shape[1]}"
+        )
+    return dict(zip(files.color, rows.reshape(-1, 4, 4), strict=True))
