@@ -7,7 +7,7 @@ import logging
 import pytest
 
 from vg2gt.data import DataError, SyntheticRooms
-from vg2gt.data.sampling import StepSampler, ViewSampler, usable_scenes
+from vg2gt.data.sampling import ScenePool, StepSampler, ViewSampler, shares, usable_scenes
 
 
 def test_the_number_of_views_stays_in_range_and_takes_every_value():
@@ -47,10 +47,38 @@ def test_all_ranks_draw_the_same_number_of_views_and_other_scenes():
 
 
 def test_every_scene_comes_once_in_a_pass():
-    sampler = ViewSampler(8, 8, max_images=8, seed=3)
-    passes = [[sampler.scene_indices(step, 7)[0] for step in range(start, start + 7)] for start in (0, 7, 14)]
-    assert all(sorted(turn) == list(range(7)) for turn in passes)
+    pool = ScenePool((tuple("abcdefg"),), seed=3)
+    passes = [[pool.scene(place) for place in range(start, start + 7)] for start in (0, 7, 14)]
+    assert all(sorted(turn) == list("abcdefg") for turn in passes)
     assert passes[0] != passes[1]
+
+
+def test_parts_are_drawn_exactly_by_weight_and_each_in_passes():
+    parts = tuple(tuple(f"{name}{i}" for i in range(count)) for name, count in (("a", 3), ("b", 40), ("c", 1)))
+    pool = ScenePool(parts, shares({"a": 0.5, "b": 0.3, "c": 0.2}), seed=1)
+    assert pool.shares == (5, 3, 2)
+    row = [pool.scene(place) for place in range(400)]
+    for start in range(0, 400, 10):
+        block = [scene[0] for scene in row[start : start + 10]]
+        assert [block.count(name) for name in "abc"] == [5, 3, 2]
+    assert len({tuple(scene[0] for scene in row[start : start + 10]) for start in range(0, 400, 10)}) > 10
+    for names in parts:
+        drawn = [scene for scene in row if scene in names]
+        for start in range(0, len(drawn) - len(names) + 1, len(names)):
+            assert sorted(drawn[start : start + len(names)]) == sorted(names)
+
+
+@pytest.mark.parametrize(
+    ("weights", "expected"),
+    [([1, 1, 1], (1, 1, 1)), ([4, 2], (2, 1)), ([0.125, 1], (1, 8)), ([0.333, 0.667], (333, 667))],
+)
+def test_shares_are_the_weights_exactly(weights, expected):
+    assert shares(dict(zip("abc", weights, strict=False))) == expected
+
+
+def test_weights_of_many_digits_are_refused():
+    with pytest.raises(ValueError, match="fewer digits"):
+        shares({"a": 0.123456789, "b": 1.0})
 
 
 def test_views_are_distinct_frames_of_a_window_around_the_anchor():
@@ -98,6 +126,23 @@ def test_scenes_that_are_too_short_are_counted_and_left_out(caplog):
     assert "1 of 3 training scenes" in caplog.text
     with pytest.raises(DataError, match=r"longest has 5 .* at most 3"):
         usable_scenes(source, ViewSampler(6, 6, target_views=2), None)
+
+
+def test_scenes_that_cannot_be_indexed_are_named_and_left_out(caplog):
+    source = SyntheticRooms(3, num_frames=5)
+
+    def frames(scene):
+        if scene == "room-000001":
+            raise DataError("cannot read poses.txt of scene room-000001")
+        return range(5)
+
+    source.frames = frames
+    with caplog.at_level(logging.WARNING):
+        assert usable_scenes(source, ViewSampler(2, 4), None) == ["room-000000", "room-000002"]
+    assert "room-000001 is left out: cannot read poses.txt" in caplog.text
+    assert "1 of 3 training scenes cannot be read" in caplog.text
+    with pytest.raises(DataError, match="1 scenes cannot be read"):
+        usable_scenes(source, ViewSampler(6, 6), None)
 
 
 def test_one_frame_is_enough_for_one_view():

@@ -2,9 +2,19 @@
 
 from vg2gt.data.base import DataError, Frames, SceneSource
 from vg2gt.data.datamodule import SceneDataModule
+from vg2gt.data.mixture import Mixture
 from vg2gt.data.sources.rgbd import RGBDFolder
 from vg2gt.data.synthetic import SyntheticScenes
 
 SyntheticRooms = SyntheticScenes
 
-__all__ = ["DataError", "Frames", "RGBDFolder", "SceneDataModule", "SceneSource", "SyntheticRooms", "SyntheticScenes"]
+__all__ = [
+    "DataError",
+    "Frames",
+    "Mixture",
+    "RGBDFolder",
+    "SceneDataModule",
+    "SceneSource",
+    "SyntheticRooms",
+    "SyntheticScenes",
+]

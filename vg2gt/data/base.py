@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from torch import Tensor
@@ -39,12 +39,15 @@ class SceneSource(ABC):
     returns must depend on its arguments only, so that worker processes agree.
 
     Attributes:
-        is_metric: whether the unit of depth and poses is the metre.
+        is_metric: whether the unit of depth and poses is the metre, in all scenes.
         has_depth: whether frames have depth; without it a source serves reconstruction and novel views, not training.
+        has_cameras: whether poses and intrinsics are known; without them they are placeholders, for reconstruction
+            only, which makes its own.
     """
 
     is_metric: bool = True
     has_depth: bool = True
+    has_cameras: bool = True
 
     @property
     @abstractmethod
@@ -66,6 +69,18 @@ class SceneSource(ABC):
         """
         return scene
 
+    def scene_is_metric(self, scene: str) -> bool:
+        """Whether one scene's unit is the metre."""
+        return self.is_metric
+
+    def parts(self) -> Mapping[str, float]:
+        """Groups of scenes (``part``) with the weights by which training draws from them; one group by default."""
+        return {"": 1.0}
+
+    def part(self, scene: str) -> str:
+        """The group among ``parts`` to which a scene belongs."""
+        return ""
+
     @abstractmethod
     def load(self, scene: str, frame_ids: Sequence[int]) -> Frames:
         """Decodes frames, in the order of ``frame_ids``.
@@ -73,6 +88,10 @@ class SceneSource(ABC):
         Raises:
             DataError: if a file is missing or damaged, naming the file and the scene.
         """
+
+
+SourceMaker = Callable[..., SceneSource]
+"""What makes a source from keyword arguments, such as a Hydra partial."""
 
 
 class DataError(ValueError):

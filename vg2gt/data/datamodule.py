@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from lightning.pytorch import LightningDataModule
 from torch.utils.data import DataLoader, Dataset
 
-from vg2gt.data.base import DataError, SceneSource, training_frames
+from vg2gt.data.base import DataError, SceneSource, SourceMaker, training_frames
 from vg2gt.data.evaluation_views import EvaluationViews
 from vg2gt.data.frame_cache import FrameCache
 from vg2gt.data.sampling import SceneViews, StepSampler, ViewSampler, usable_scenes
 from vg2gt.types import Batch, Cameras
 
 log = logging.getLogger(__name__)
-
-SourceMaker = Callable[..., SceneSource]
 
 
 class BatchDataset(Dataset[Batch]):
@@ -45,7 +43,7 @@ class BatchDataset(Dataset[Batch]):
             images=stack("images"),
             depth=depth,
             cameras=Cameras(stack("world_to_camera"), stack("intrinsics"), (depth.shape[-2], depth.shape[-1])),
-            is_metric=torch.full((len(views),), self.source.is_metric),
+            is_metric=torch.tensor([self.source.scene_is_metric(view.scene) for view in views]),
             frame_ids=torch.tensor([(*view.context, *view.target) for view in views], dtype=torch.int64),
             scene=tuple(view.scene for view in views),
             num_context=len(views[0].context),
@@ -133,9 +131,14 @@ class SceneDataModule(LightningDataModule):
         self._val = BatchDataset(val, self.image_size, self.memory_mb)
 
     def train_dataloader(self) -> DataLoader[Batch]:
-        """Batches from the trainer's current step on; one item of the loader is one batch."""
+        """Batches from the trainer's current step on; one item of the loader is one batch.
+
+        Raises:
+            DataError: if the training scenes have no depth or no cameras.
+        """
         self.setup()
         assert self._train is not None
+        refuse_untrainable(self._train.source)
         trainer = self.trainer
         sampler = StepSampler(
             self._train.source,
@@ -168,6 +171,20 @@ class SceneDataModule(LightningDataModule):
             sampler=sampler,  # pyright: ignore[reportArgumentType]
             num_workers=self.workers,
             persistent_workers=self.workers > 0,
+        )
+
+
+def refuse_untrainable(source: SceneSource) -> None:
+    """Refuses to train on scenes without depth or cameras, which the losses compare with.
+
+    Raises:
+        DataError: saying what the source lacks.
+    """
+    lacking = [name for name, there in (("depth", source.has_depth), ("cameras", source.has_cameras)) if not there]
+    if lacking:
+        raise DataError(
+            f"{type(source).__name__} has no {' and no '.join(lacking)}: it serves reconstruction and cannot be "
+            "trained on; choose another dataset for data.train, or the loader's depth option"
         )
 
 

@@ -7,9 +7,11 @@ seen, and the number of loader workers or their prefetching changes nothing.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from functools import lru_cache
+from math import gcd, lcm
 
 import numpy as np
 from torch.utils.data import Sampler
@@ -18,7 +20,8 @@ from vg2gt.data.base import DataError, SceneSource, training_frames
 
 log = logging.getLogger(__name__)
 
-_VIEWS, _SCENES, _FRAMES = 0, 1, 2  # independent random streams
+_VIEWS, _SCENES, _FRAMES, _BLOCKS = 0, 1, 2, 3  # independent random streams
+_LONGEST_BLOCK = 100_000
 
 
 @dataclass(frozen=True)
@@ -77,16 +80,14 @@ class ViewSampler:
         """Scenes of a step on one device."""
         return max(1, self.max_images // self.num_views(step))
 
-    def scene_indices(self, step: int, available: int, rank: int = 0, world_size: int = 1) -> list[int]:
-        """Scenes of a step, as indices below ``available``.
+    def slots(self, step: int, rank: int = 0, world_size: int = 1) -> range:
+        """A step's places in the endless row of scenes (``ScenePool.scene``), one for each of its scenes.
 
-        Every step and device owns a fixed stretch of an endless row of shuffled passes over the scenes, so all scenes
-        come equally often.
+        Every step and device owns a fixed stretch of the row, so all scenes come equally often.
         """
         reserved = max(1, self.max_images // self.min_views)
         first = (step * world_size + rank) * reserved
-        slots = (divmod(slot, available) for slot in range(first, first + self.num_scenes(step)))
-        return [int(_permutation(self.seed, turn, available)[place]) for turn, place in slots]
+        return range(first, first + self.num_scenes(step))
 
     def views(self, step: int, scene: str, frames: Sequence[int], slot: int) -> SceneViews:
         """Draws the views of one scene: an anchor, then distinct frames from a window around it.
@@ -112,13 +113,83 @@ class ViewSampler:
         return np.random.default_rng((self.seed, *key))
 
 
+@dataclass(frozen=True)
+class ScenePool:
+    """An endless row of scenes from one or several parts; what stands at a place is a function of seed and place.
+
+    The row is cut into blocks of ``sum(shares)`` places. Every block holds ``shares[k]`` scenes of part k in an order
+    of its own, so any stretch of whole blocks holds the parts exactly in their shares. The scenes of a part come in
+    shuffled passes, each scene once in a pass.
+
+    Attributes:
+        parts: scene names of every part.
+        shares: places of every part in a block.
+        seed: seeds both orders.
+    """
+
+    parts: tuple[tuple[str, ...], ...]
+    shares: tuple[int, ...] = (1,)
+    seed: int = 0
+
+    def scene(self, place: int) -> str:
+        """The scene at a place of the row."""
+        block, inside = divmod(place, sum(self.shares))
+        order = _block(self.seed, block, self.shares)
+        part = int(order[inside])
+        earlier = block * self.shares[part] + int(np.count_nonzero(order[:inside] == part))
+        turn, rank = divmod(earlier, len(self.parts[part]))
+        return self.parts[part][_permutation(self.seed, turn, len(self.parts[part]), part)[rank]]
+
+
+@lru_cache(maxsize=64)
+def _permutation(seed: int, turn: int, count: int, part: int) -> np.ndarray:
+    key = (seed, _SCENES, turn, part) if part else (seed, _SCENES, turn)
+    return np.random.default_rng(key).permutation(count)
+
+
 @lru_cache(maxsize=4)
-def _permutation(seed: int, turn: int, count: int) -> np.ndarray:
-    return np.random.default_rng((seed, _SCENES, turn)).permutation(count)
+def _block(seed: int, block: int, shares: tuple[int, ...]) -> np.ndarray:
+    parts = np.repeat(np.arange(len(shares)), shares)
+    return np.random.default_rng((seed, _BLOCKS, block)).permutation(parts)
+
+
+def scene_pool(source: SceneSource, scenes: Sequence[str], seed: int = 0) -> ScenePool:
+    """The row from which training draws: one part, or a mixture's parts in proportion to their weights.
+
+    Args:
+        source: the training scenes; says which parts there are and what they weigh.
+        scenes: names of those that are used; parts without any have no place in the row.
+        seed: seeds the row.
+    """
+    grouped: dict[str, list[str]] = {part: [] for part in source.parts()}
+    for scene in scenes:
+        grouped[source.part(scene)].append(scene)
+    weights = {part: weight for part, weight in source.parts().items() if grouped[part]}
+    if len(weights) < len(grouped):
+        absent = ", ".join(part for part in grouped if part not in weights)
+        log.warning("no training scene of %s is used: the other parts are drawn in proportion to their weights", absent)
+    return ScenePool(tuple(tuple(grouped[part]) for part in weights), shares(weights), seed)
+
+
+def shares(weights: Mapping[str, float]) -> tuple[int, ...]:
+    """The smallest whole numbers in exactly the proportions of positive decimal weights.
+
+    Raises:
+        ValueError: if the weights have so many digits that the numbers become huge.
+    """
+    exact = [Fraction(str(weight)) for weight in weights.values()]
+    scale = lcm(*(weight.denominator for weight in exact))
+    counts = [int(weight * scale) for weight in exact]
+    counts = [count // gcd(*counts) for count in counts]
+    if sum(counts) > _LONGEST_BLOCK:
+        raise ValueError(f"give the weights {dict(weights)} with fewer digits, or as small whole numbers")
+    return tuple(counts)
 
 
 def usable_scenes(source: SceneSource, sampler: ViewSampler, limit: int | None) -> list[str]:
     """Training scenes with enough frames for every step; the others are counted in a log line.
+
+    A scene that cannot be indexed is left out with a warning that names it.
 
     Args:
         source: the training scenes.
@@ -126,24 +197,42 @@ def usable_scenes(source: SceneSource, sampler: ViewSampler, limit: int | None) 
         limit: use at most this many of the source's first scenes; None: all.
 
     Raises:
-        DataError: if none is left.
+        DataError: if none is left, or none of a mixture's part.
     """
     scenes = list(source.scenes)[:limit]
-    usable = [scene for scene in scenes if len(training_frames(source, scene)) >= sampler.frames_needed]
-    if not usable:
-        longest = max((len(training_frames(source, scene)) for scene in scenes), default=0)
-        possible = longest - sampler.target_views
-        raise DataError(
-            f"none of {len(scenes)} training scenes has {sampler.frames_needed} frames (max_views + target_views); the "
-            f"longest has {longest} that are not held out: set data.max_views and data.min_views to at most {possible}"
-        )
-    if len(usable) < len(scenes):
-        dropped = len(scenes) - len(usable)
+    lengths: dict[str, int] = {}
+    for scene in scenes:
+        try:
+            lengths[scene] = len(training_frames(source, scene))
+        except DataError as error:
+            log.warning("training scene %s is left out: %s", scene, error)
+    usable = [scene for scene, length in lengths.items() if length >= sampler.frames_needed]
+    short, damaged = len(lengths) - len(usable), len(scenes) - len(lengths)
+    for part in dict.fromkeys(source.part(scene) for scene in scenes):
+        if not any(source.part(scene) == part for scene in usable):
+            raise _nothing_usable(source, part, lengths, sampler, damaged)
+    if short:
         log.warning(
             "%d of %d training scenes have fewer than %d frames and are not used",
-            dropped, len(scenes), sampler.frames_needed,
+            short, len(scenes), sampler.frames_needed,
         )  # fmt: skip
+    if damaged:
+        log.warning("%d of %d training scenes cannot be read and are not used", damaged, len(scenes))
     return usable
+
+
+def _nothing_usable(
+    source: SceneSource, part: str, lengths: Mapping[str, int], sampler: ViewSampler, damaged: int
+) -> DataError:
+    inside = [length for scene, length in lengths.items() if source.part(scene) == part]
+    where = f" of {part}" if part else ""
+    unread = f" ({damaged} scenes cannot be read, see the warnings)" if damaged else ""
+    longest = max(inside, default=0)
+    return DataError(
+        f"none of {len(inside)} training scenes{where} has {sampler.frames_needed} frames (max_views + target_views)"
+        f"{unread}; the longest has {longest} that are not held out: set data.max_views and data.min_views to at most "
+        f"{longest - sampler.target_views}"
+    )
 
 
 class StepSampler(Sampler[tuple[SceneViews, ...]]):
@@ -152,7 +241,7 @@ class StepSampler(Sampler[tuple[SceneViews, ...]]):
     Args:
         source: the training scenes.
         scenes: names of those that are used.
-        views: draws scenes and views.
+        views: draws the views.
         steps: steps in an epoch.
         start_step: returns the number of the first step, asked whenever an iteration begins; the iteration ends with
             the epoch that holds this step.
@@ -171,7 +260,7 @@ class StepSampler(Sampler[tuple[SceneViews, ...]]):
         world_size: int = 1,
     ) -> None:
         self.source = source
-        self.scenes = scenes
+        self.pool = scene_pool(source, scenes, views.seed)
         self.views = views
         self.steps = steps
         self.start_step = start_step
@@ -188,9 +277,10 @@ class StepSampler(Sampler[tuple[SceneViews, ...]]):
 
     def step(self, step: int) -> tuple[SceneViews, ...]:
         """The views of one step, one entry a scene, all with equally many views."""
-        indices = self.views.scene_indices(step, len(self.scenes), self.rank, self.world_size)
-        first_slot = self.rank * len(indices)
+        places = self.views.slots(step, self.rank, self.world_size)
+        scenes = [self.pool.scene(place) for place in places]
+        first = self.rank * len(scenes)
         return tuple(
-            self.views.views(step, scene, training_frames(self.source, scene), first_slot + place)
-            for place, scene in enumerate(self.scenes[index] for index in indices)
+            self.views.views(step, scene, training_frames(self.source, scene), first + number)
+            for number, scene in enumerate(scenes)
         )

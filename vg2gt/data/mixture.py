@@ -1,0 +1,139 @@
+"""Several datasets as one, drawn from in stated proportions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import chain, zip_longest
+from typing import Any
+
+from vg2gt.data.base import DataError, Frames, SceneSource, SourceMaker
+from vg2gt.data.sources.files import read_split
+
+
+class Mixture(SceneSource):
+    """Named datasets with weights (paper, Datasets: Infinigen, KITTI and ScanNet).
+
+    A scene is called ``<part>/<scene>``. Training draws scenes in exactly the proportions of the weights, however many
+    scenes a part has; within a part every scene comes equally often (``ScenePool``).
+
+    Args:
+        parts: the datasets by name, or what makes them (``_partial_: true``).
+        weights: the weight of every part, any positive scale; a part of weight 0 is left out and needs no data.
+        scenes: names of the scenes to use, or a text file with one a line; None: all.
+        common: arguments of the parts' makers: ``<part>_<argument>`` goes to one part, any other to all.
+
+    Raises:
+        ValueError: if parts and weights do not fit together.
+        FileNotFoundError: if a part's root is not given or does not exist.
+        DataError: if a part has no scene, or a named scene does not exist.
+    """
+
+    def __init__(
+        self,
+        parts: Mapping[str, SceneSource | SourceMaker],
+        weights: Mapping[str, float],
+        scenes: Sequence[str] | str | None = None,
+        **common: Any,
+    ) -> None:
+        _check(parts, weights)
+        self.weights = {name: weights[name] for name in parts if weights[name] > 0}
+        self.sources = {name: _make(name, parts[name], list(parts), common) for name in self.weights}
+        self.is_metric = all(source.is_metric for source in self.sources.values())
+        self.has_depth = all(source.has_depth for source in self.sources.values())
+        self.has_cameras = all(source.has_cameras for source in self.sources.values())
+        self._scenes = _select(_interleave(self.sources), scenes)
+
+    @property
+    def scenes(self) -> Sequence[str]:
+        """Names of the scenes, the parts taking turns, so that the first few are of all parts."""
+        return self._scenes
+
+    def frames(self, scene: str) -> Sequence[int]:
+        """Ids of a scene's usable frames."""
+        source, name = self._find(scene)
+        return source.frames(name)
+
+    def held_out(self, scene: str) -> Sequence[int]:
+        """Ids of a scene's held-out frames."""
+        source, name = self._find(scene)
+        return source.held_out(name)
+
+    def place(self, scene: str) -> str:
+        """The part and the place within it."""
+        source, name = self._find(scene)
+        return f"{self.part(scene)}/{source.place(name)}"
+
+    def scene_is_metric(self, scene: str) -> bool:
+        """Whether the scene's part is in metres."""
+        source, name = self._find(scene)
+        return source.scene_is_metric(name)
+
+    def parts(self) -> Mapping[str, float]:
+        """The weights."""
+        return self.weights
+
+    def part(self, scene: str) -> str:
+        """The part a scene belongs to."""
+        return scene.partition("/")[0]
+
+    def load(self, scene: str, frame_ids: Sequence[int]) -> Frames:
+        """Decodes frames of a scene."""
+        source, name = self._find(scene)
+        return source.load(name, frame_ids)
+
+    def _find(self, scene: str) -> tuple[SceneSource, str]:
+        part, _, name = scene.partition("/")
+        if part not in self.sources:
+            raise DataError(f"there is no scene {scene}: the mixture's parts are {', '.join(self.sources)}")
+        return self.sources[part], name
+
+
+def _check(parts: Mapping[str, object], weights: Mapping[str, float]) -> None:
+    bad = [name for name in parts if not name or "/" in name]
+    if set(parts) != set(weights) or bad:
+        raise ValueError(
+            f"a mixture needs one weight for every part, and names without '/': parts {list(parts)}, weights "
+            f"{list(weights)}"
+        )
+    if not all(0 <= weight < float("inf") for weight in weights.values()) or not any(weights.values()):
+        raise ValueError(f"weights must be finite, at least 0, and one of them above 0; got {dict(weights)}")
+
+
+def _make(name: str, part: SceneSource | SourceMaker, names: Sequence[str], common: Mapping[str, Any]) -> SceneSource:
+    """A part from its maker, with the arguments that are meant for it."""
+    if isinstance(part, SceneSource):
+        return part
+    owners = {key: _owner(key, names) for key in common}
+    own = {key.removeprefix(f"{name}_"): common[key] for key, owner in owners.items() if owner == name}
+    shared = {key: common[key] for key, owner in owners.items() if owner is None}
+    if "root" in own and not own["root"]:
+        raise FileNotFoundError(
+            f"data.{name}_root is not set: name the dataset's folder, or leave it out with data.weights.{name}=0"
+        )
+    try:
+        return part(**shared, **own)
+    except (FileNotFoundError, DataError) as error:
+        raise type(error)(f"part {name} of the mixture (data.{name}_root): {error}") from error
+
+
+def _owner(key: str, names: Sequence[str]) -> str | None:
+    """The part that an argument ``<part>_<argument>`` is for; None: for all."""
+    return max((name for name in names if key.startswith(f"{name}_")), key=len, default=None)
+
+
+def _interleave(sources: Mapping[str, SceneSource]) -> list[str]:
+    named = [[f"{part}/{scene}" for scene in source.scenes] for part, source in sources.items()]
+    return [name for name in chain.from_iterable(zip_longest(*named)) if name is not None]
+
+
+def _select(found: list[str], scenes: Sequence[str] | str | None) -> tuple[str, ...]:
+    if scenes is None:
+        return tuple(found)
+    names = read_split(scenes) if isinstance(scenes, str) else list(scenes)
+    unknown = sorted(set(names) - set(found))
+    if unknown:
+        raise DataError(
+            f"the mixture has no scene {unknown[0]} ({len(unknown)} of the {len(names)} named are missing); its "
+            f"scenes are called part/scene, such as {found[0]}"
+        )
+    return tuple(names)
