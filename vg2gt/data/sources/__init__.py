@@ -1,1 +1,5 @@
 """Datasets on disk, one file a layout; all are a ``FileSource``."""
+
+from vg2gt.data.sources.kitti import KITTI
+
+__all__ = ["KITTI"]

@@ -95,6 +95,10 @@ class FileSource(SceneSource):
         """
         raise NotImplementedError(f"{type(self).__name__} has depth files but no read_depth")
 
+    def state(self, scene: str, folder: Path) -> str:
+        """Changes when files of a scene do, so that its cached index is made again; for scenes outside one folder."""
+        return folder_state(folder)
+
     def options(self) -> Mapping[str, object]:
         """Arguments that decide an index, beside the folder; part of the cache's key."""
         return {}
@@ -188,7 +192,7 @@ class FileSource(SceneSource):
         key = json.dumps([type(self).__qualname__, self.index_version, str(folder.resolve()), scene, self.options()])
         digest = hashlib.sha256(key.encode()).hexdigest()[:24]
         path = self.index_cache / "index" / f"{digest}.npz"
-        state = folder_state(folder)
+        state = self.state(scene, folder)
         index = read_index(path, scene, folder, state)
         if index is None:
             index = self.index(scene, folder)

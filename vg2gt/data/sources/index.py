@@ -100,13 +100,13 @@ def make_index(
         pose = camera_to_world.get(number)
         if pose is None:
             dropped["without a pose"] += 1
-        elif not np.isfinite(pose).all():
+        elif not (np.abs(pose) < np.finfo(np.float32).max).all():  # poses are handed on in float32
             dropped["whose pose is not finite"] += 1
         elif depth is not None and number not in depth:
             dropped["without a depth file"] += 1
         else:
             kept.append(number)
-    lone = len(set(depth or ()) - set(color))
+    lone = len((set(depth or ()) | set(camera_to_world)) - set(color))
     if lone:
         dropped["without a colour image"] = lone
     if not kept:

@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vg2gt.data.base import DataError
+from vg2gt.io.errors import FormatError
 
 log = logging.getLogger(__name__)
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".tif", ".tiff", ".webp", ".bmp")
 
 _ROTATION_TOLERANCE = 0.02
+_LARGEST = float(np.finfo(np.float32).max)
 
 
 def read_numbers(path: Path, scene: str, skip_lines: int = 0) -> NDArray[np.float64]:
@@ -77,6 +80,15 @@ def load_npz(path: Path, scene: str, names: Sequence[str]) -> dict[str, NDArray]
         raise DataError(f"{path} of scene {scene} has no array {error}; expected {', '.join(names)}") from error
     except Exception as error:  # a damaged archive raises whatever zipfile, zlib and numpy's header parser raise
         raise DataError(f"cannot read {path} of scene {scene}: {error}") from error
+
+
+@contextmanager
+def errors_name(scene: str) -> Iterator[None]:
+    """Turns the errors of readers in ``vg2gt.io`` into ``DataError`` that also names the scene."""
+    try:
+        yield
+    except (FormatError, OSError) as error:
+        raise DataError(f"scene {scene}: {error}") from error
 
 
 def numbered(folder: Path, scene: str, pattern: str = "*", suffixes: Sequence[str] = IMAGE_SUFFIXES) -> dict[int, Path]:
@@ -147,9 +159,9 @@ def check_intrinsics(intrinsics: NDArray[np.float64], where: str) -> NDArray[np.
     """Returns ``[..., 3, 3]`` intrinsics as they are.
 
     Raises:
-        DataError: if a value is not finite or a focal length not positive.
+        DataError: if a value is not finite (in float32, in which it is handed on) or a focal length not positive.
     """
     focal = intrinsics[..., [0, 1], [0, 1]]
-    if not (np.isfinite(intrinsics).all() and (focal > 0).all()):
+    if not ((np.abs(intrinsics) < _LARGEST).all() and (focal > 0).all()):
         raise DataError(f"the intrinsics in {where} have no positive focal lengths: {intrinsics.tolist()}")
     return intrinsics

@@ -1,0 +1,219 @@
+"""KITTI: raw drives with the annotated depth of the depth benchmark; poses from the GPS/IMU unit (OXTS)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vg2gt.data.base import DataError
+from vg2gt.data.image_files import image_size, read_depth
+from vg2gt.data.sources.files import FileSource
+from vg2gt.data.sources.index import SceneIndex, Size, folder_state, make_index
+from vg2gt.data.sources.parsing import inverse, numbered, read_text_lines, rigid
+
+EARTH_RADIUS = 6378137.0
+"""Metres, at the equator, as KITTI's own tools have it."""
+DEPTH_SCALE = 256.0
+"""Stored depth units a metre."""
+
+_CALIBRATION = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt", "calib_imu_to_velo.txt")
+_SPLITS = ("train", "val")
+
+
+class KITTI(FileSource):
+    """Drives of KITTI raw that have annotated depth; a scene is a drive.
+
+    Images are ``<root>/<date>/<drive>_sync/image_02/data/%010d.png``, calibration lies in ``<root>/<date>``, depth is
+    ``<depth_root>/{train,val}/<drive>_sync/proj_depth/groundtruth/image_02/%010d.png`` (uint16, 256 units a metre,
+    0 = none). The first and the last five frames of a drive have no depth and are no frames of the scene.
+
+    Poses come from OXTS packets in a Mercator projection at the drive's first latitude; the world is the first packet's
+    position with axes east, north, up. ``camera <- imu = [I | K^-1 p] R_rect_00 T_velo_to_cam T_imu_to_velo`` with
+    ``P_rect = [K | p]``, so that ``P_rect`` is met exactly.
+
+    Args:
+        root: KITTI raw, the folder of the dates.
+        depth_root: the annotated depth, the folder of ``train`` and ``val``; None: the same as ``root``.
+        split: the benchmark's drives for ``train`` or for ``val``; None: both.
+        camera: 2 for the left colour camera, 3 for the right one.
+        scenes: names of drives, such as ``2011_09_26_drive_0001_sync``, or a text file of them; None: all of the split.
+        holdout: hold out every this many-th frame as an evaluation target; None: none.
+        every: use every this many-th frame only (the cameras take ten a second).
+        index_cache: see ``FileSource``.
+
+    Raises:
+        FileNotFoundError: if a root does not exist.
+        DataError: if no drive has both images and depth.
+    """
+
+    layout = "KITTI raw: DATE/DRIVE_sync/image_02/data, with depth for it in {train,val}/DRIVE_sync/proj_depth"
+    sparse_depth = True
+
+    def __init__(
+        self,
+        root: str | Sequence[str] | None,
+        depth_root: str | None = None,
+        split: str | None = None,
+        camera: int = 2,
+        scenes: Sequence[str] | str | None = None,
+        holdout: int | None = None,
+        every: int = 1,
+        index_cache: str | None = None,
+    ) -> None:
+        if split not in (None, *_SPLITS):
+            raise ValueError(f"split must be train, val or null (both), got {split!r}")
+        if camera not in (2, 3):
+            raise ValueError(f"camera must be 2 (left) or 3 (right), the colour cameras, got {camera}")
+        self.depth_root = Path(depth_root).expanduser() if depth_root else None
+        if self.depth_root is not None and not self.depth_root.is_dir():
+            raise FileNotFoundError(f"the depth folder {self.depth_root} (seen from {Path.cwd()}) does not exist")
+        self.splits = (split,) if split else _SPLITS
+        self.camera = camera
+        super().__init__(root, scenes, holdout, every, index_cache)
+
+    def find(self, root: Path) -> Mapping[str, Path]:
+        """Drives with images of the camera and a depth folder."""
+        drives = {path.name: path for path in sorted(root.glob("*/*_sync")) if (path / self._images).is_dir()}
+        return {name: folder for name, folder in drives.items() if self._depth_folder(folder) is not None}
+
+    def options(self) -> Mapping[str, object]:
+        """The camera, and where depth is taken from."""
+        return {"camera": self.camera, "splits": self.splits, "depth_root": str(self.depth_root)}
+
+    def state(self, scene: str, folder: Path) -> str:
+        """Also that of the depth folder and of the calibration."""
+        depth = self._depth_folder(folder)
+        places = [folder, *([depth] if depth else []), *(folder.parent / name for name in _CALIBRATION)]
+        return " ".join(folder_state(place) for place in places if place.exists())
+
+    def index(self, scene: str, folder: Path) -> SceneIndex:
+        """Lists a drive's files and computes its poses."""
+        depth_folder = self._depth_folder(folder)
+        depth = numbered(depth_folder, scene) if depth_folder else {}
+        if not depth:
+            raise DataError(f"scene {scene} has no annotated depth in {depth_folder}")
+        numbers = range(min(depth), max(depth) + 1)
+        color = {i: path for i, path in numbered(folder / self._images, scene).items() if i in numbers}
+        if not color:
+            raise DataError(f"scene {scene} has depth of frames {numbers}, but no image of them in {folder}")
+        intrinsics, camera_from_imu = read_calibration(folder.parent, scene, self.camera)
+        size = image_size(next(iter(color.values())), scene)
+        packets = numbered(folder / "oxts" / "data", scene, suffixes=(".txt",))
+        imu = imu_to_world({number: _read_packet(path, scene) for number, path in packets.items()})
+        return make_index(
+            name=scene,
+            folder=folder,
+            color=color,
+            depth=depth,
+            camera_to_world={i: pose @ inverse(camera_from_imu) for i, pose in imu.items() if i in numbers},
+            intrinsics=intrinsics,
+            size=size,
+            color_size=size,
+        )
+
+    def read_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
+        """Decodes annotated depth."""
+        return (read_depth(index.depth[row], index.name, size) / DEPTH_SCALE).astype(np.float32)
+
+    @property
+    def _images(self) -> str:
+        return f"image_0{self.camera}/data"
+
+    def _depth_folder(self, drive: Path) -> Path | None:
+        root = self.depth_root or drive.parents[1]
+        inside = f"{drive.name}/proj_depth/groundtruth/image_0{self.camera}"
+        return next((root / split / inside for split in self.splits if (root / split / inside).is_dir()), None)
+
+
+def imu_to_world(packets: Mapping[int, NDArray[np.float64]]) -> dict[int, NDArray[np.float64]]:
+    """Poses of the IMU from OXTS packets.
+
+    Args:
+        packets: numbers of each packet by frame: latitude and longitude in degrees, altitude in metres, roll, pitch and
+            yaw in radians, and others.
+
+    Returns:
+        4x4 IMU-to-world poses in metres by frame number, the origin at the first packet (as coordinates of the whole
+        Earth, 10^6 m, float32 would hold them to 0.1 m only); not finite where the packet is not usable.
+    """
+    if not packets:
+        return {}
+    values = np.stack([packet[:6] for packet in packets.values()])
+    latitude, longitude, altitude, roll, pitch, yaw = values.T
+    first = int((np.isfinite(values).all(1) & (np.abs(latitude) < 90)).argmax())
+    scale = np.cos(np.deg2rad(latitude[first]))
+    with np.errstate(all="ignore"):  # a broken packet becomes NaN and its frame is dropped
+        east = scale * EARTH_RADIUS * np.deg2rad(longitude)
+        north = scale * EARTH_RADIUS * np.log(np.tan(np.deg2rad(90 + latitude) / 2))
+        position = np.stack((east, north, altitude), -1)
+        poses = np.tile(np.eye(4), (len(values), 1, 1))
+        poses[:, :3, :3] = _about("z", yaw) @ _about("y", pitch) @ _about("x", roll)
+        poses[:, :3, 3] = position - position[first]
+    return dict(zip(packets, poses, strict=True))
+
+
+def read_calibration(folder: Path, scene: str, camera: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Intrinsics ``[3, 3]`` of a rectified camera and its ``[4, 4]`` pose ``camera <- imu``.
+
+    Raises:
+        DataError: if a calibration file of the date is missing, damaged, or not a calibration.
+    """
+    cameras, velodyne, imu = (_read_fields(folder / name, scene) for name in _CALIBRATION)
+    where = f"{folder} (calibration of scene {scene})"
+    projection = _field(cameras, f"P_rect_0{camera}", (3, 4), where)
+    rectify = np.eye(4)
+    rectify[:3, :3] = _field(cameras, "R_rect_00", (3, 3), where)
+    intrinsics = projection[:, :3]
+    if abs(np.linalg.det(intrinsics)) < 1e-6:
+        raise DataError(f"P_rect_0{camera} in {where} is not a projection: {projection.tolist()}")
+    shift = np.eye(4)
+    shift[:3, 3] = np.linalg.solve(intrinsics, projection[:, 3])
+    steps = np.stack((rectify, _transform(velodyne, where), _transform(imu, where)))
+    rectify, camera_from_velodyne, velodyne_from_imu = rigid(steps, range(3), f"the calibration files of {where}")
+    return intrinsics, shift @ rectify @ camera_from_velodyne @ velodyne_from_imu
+
+
+def _about(axis: str, angles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rotations ``[n, 3, 3]`` about an axis, counter-clockwise seen against it."""
+    i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
+    out = np.tile(np.eye(3), (len(angles), 1, 1))
+    out[:, i, i] = out[:, j, j] = np.cos(angles)
+    out[:, j, i] = np.sin(angles)
+    out[:, i, j] = -out[:, j, i]
+    return out
+
+
+def _read_packet(path: Path, scene: str) -> NDArray[np.float64]:
+    words = " ".join(read_text_lines(path, scene)).split()
+    try:
+        packet = np.array([float(word) for word in words[:6]])
+    except ValueError as error:
+        raise DataError(f"{path} of scene {scene} is not an OXTS packet: {error}") from error
+    if len(packet) < 6:
+        raise DataError(f"{path} of scene {scene} is not an OXTS packet: it has {len(packet)} numbers, expected 30")
+    return packet
+
+
+def _read_fields(path: Path, scene: str) -> dict[str, str]:
+    lines = [line.partition(":") for line in read_text_lines(path, scene)]
+    return {name.strip(): value for name, _, value in lines}
+
+
+def _field(fields: Mapping[str, str], name: str, shape: tuple[int, int], where: str) -> NDArray[np.float64]:
+    try:
+        values = np.array([float(word) for word in fields[name].split()]).reshape(shape)
+    except (KeyError, ValueError) as error:
+        raise DataError(f"{name} in {where} should be {shape[0]}x{shape[1]} numbers: {error!r}") from error
+    if not (np.abs(values) < 1e6).all():
+        raise DataError(f"{name} in {where} is not finite and of sensible size: {values.tolist()}")
+    return values
+
+
+def _transform(fields: Mapping[str, str], where: str) -> NDArray[np.float64]:
+    transform = np.eye(4)
+    transform[:3, :3] = _field(fields, "R", (3, 3), where)
+    transform[:3, 3] = _field(fields, "T", (3, 1), where)[:, 0]
+    return transform
