@@ -14,7 +14,11 @@ from vg2gt.io.colmap import (
     write_colmap,
 )
 from vg2gt.io.errors import FormatError
+from vg2gt.io.glb import write_glb
+from vg2gt.io.mesh import Mesh, fuse_depth, write_mesh
 from vg2gt.io.nerfstudio import Lens, Transforms, TransformsFrame, read_transforms, write_transforms
+from vg2gt.io.ply import PointCloud, read_gaussian_ply, read_point_ply, write_gaussian_ply, write_point_ply
+from vg2gt.io.splat import read_splat, write_splat
 
 __all__ = [
     "ColmapCamera",
@@ -23,6 +27,8 @@ __all__ = [
     "ColmapPoints",
     "FormatError",
     "Lens",
+    "Mesh",
+    "PointCloud",
     "Transforms",
     "TransformsFrame",
     "colmap_camera",
@@ -30,8 +36,17 @@ __all__ = [
     "colmap_image",
     "colmap_intrinsics",
     "colmap_pose",
+    "fuse_depth",
     "read_colmap",
+    "read_gaussian_ply",
+    "read_point_ply",
+    "read_splat",
     "read_transforms",
     "write_colmap",
+    "write_gaussian_ply",
+    "write_glb",
+    "write_mesh",
+    "write_point_ply",
+    "write_splat",
     "write_transforms",
 ]

@@ -1,0 +1,136 @@
+"""TSDF fusion and surface nets against surfaces known in closed form."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from vg2gt.geometry.cameras import invert_rigid, ray_directions
+from vg2gt.io import fuse_depth, write_mesh
+from vg2gt.types import Cameras
+
+RADIUS = 0.7
+VOXEL = 0.05
+
+
+def looking_at_origin(views: int, distance: float, size: tuple[int, int]) -> Cameras:
+    """Cameras evenly over the sphere (a golden spiral), all looking at the origin."""
+    i = torch.arange(views) + 0.5
+    z, turn = 1 - 2 * i / views, i * 2.399963
+    center = distance * torch.stack(((1 - z**2).sqrt() * turn.cos(), (1 - z**2).sqrt() * turn.sin(), z), -1)
+    forward = -center / distance
+    right = torch.linalg.cross(forward, torch.tensor([0.3, 0.5, 0.8]).expand_as(forward))
+    right = right / right.norm(dim=-1, keepdim=True)
+    rotation = torch.stack((right, torch.linalg.cross(forward, right), forward), 1)
+    poses = torch.eye(4).repeat(views, 1, 1)
+    poses[:, :3, :3] = rotation
+    poses[:, :3, 3] = -(rotation @ center[:, :, None])[:, :, 0]
+    height, width = size
+    k = torch.tensor([[1.1 * width, 0, (width - 1) / 2], [0, 1.1 * width, (height - 1) / 2], [0, 0, 1]])
+    return Cameras(poses[None], k.repeat(1, views, 1, 1), size)
+
+
+def sphere_depth(cameras: Cameras) -> torch.Tensor:
+    """z-depth of a sphere about the origin, 0 beside it."""
+    rays = ray_directions(cameras.intrinsics, cameras.size)[0]
+    poses = invert_rigid(cameras.world_to_camera)[0]
+    center = -(cameras.world_to_camera[0, :, :3, :3] @ poses[:, :3, 3:])[:, None, None, :, 0]  # camera to origin: -t
+    to_center = -center
+    a, b = (rays**2).sum(-1), (rays * -to_center).sum(-1)
+    root = b**2 - a * ((to_center**2).sum(-1) - RADIUS**2)
+    return torch.where(root > 0, (b - root.clamp(min=0).sqrt()) / a, 0.0)
+
+
+def room_depth(cameras: Cameras, half: float) -> torch.Tensor:
+    """z-depth of a cube's walls seen from inside."""
+    rays = ray_directions(cameras.intrinsics, cameras.size)[0]
+    poses = invert_rigid(cameras.world_to_camera)[0]
+    world = torch.einsum("vij,vhwj->vhwi", poses[:, :3, :3], rays)
+    center = poses[:, None, None, :3, 3]
+    return ((torch.sign(world) * half - center) / world).amin(-1)
+
+
+@pytest.fixture(scope="module")
+def sphere():
+    cameras = looking_at_origin(16, 2.5, (72, 72))
+    depth = sphere_depth(cameras)
+    colors = torch.zeros(16, 3, 72, 72)
+    colors[:, 0] = 1
+    return cameras, depth, colors, fuse_depth(depth, cameras, colors, voxel_size=VOXEL)
+
+
+def test_sphere_lies_within_a_voxel_and_is_closed(sphere) -> None:
+    *_, mesh = sphere
+    error = np.abs(np.linalg.norm(mesh.vertices, axis=-1) - RADIUS)
+    assert error.max() < VOXEL
+    assert error.mean() < 0.05 * VOXEL
+    body = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    _, neighbours = np.unique(body.edges_sorted, axis=0, return_counts=True)
+    assert (neighbours % 2 == 0).all()  # closed
+    assert body.volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.01)  # positive: faces look outwards
+    assert mesh.colors is not None
+    assert (mesh.colors == [255, 0, 0]).all()
+
+
+def test_finer_voxels_are_more_accurate(sphere) -> None:
+    cameras, depth, _, coarse = sphere
+    fine = fuse_depth(depth, cameras, voxel_size=VOXEL / 2)
+    errors = [np.abs(np.linalg.norm(mesh.vertices, axis=-1) - RADIUS).mean() for mesh in (coarse, fine)]
+    assert errors[1] < 0.7 * errors[0]
+    assert fine.colors is None
+
+
+def test_room_from_inside() -> None:
+    inward = looking_at_origin(20, 0.4, (40, 56))
+    mesh = fuse_depth(room_depth(inward, 1.5), inward, voxel_size=0.06)
+    outside = np.abs(mesh.vertices).max(-1) - 1.5
+    assert np.abs(outside).max() < 0.06
+    normals = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).face_normals
+    middle = mesh.vertices[mesh.faces].mean(1)
+    assert ((normals * middle).sum(-1) < 0).mean() > 0.999  # faces look into the room
+
+
+def test_depth_edges_make_no_bridges() -> None:
+    """A near square in front of a far wall: nothing is invented between the two."""
+    depth = torch.full((1, 48, 64), 3.0)
+    depth[:, 16:32, 20:40] = 1.5
+    k = torch.tensor([[50.0, 0, 31.5], [0, 50, 23.5], [0, 0, 1]])
+    mesh = fuse_depth(depth, Cameras(torch.eye(4)[None, None], k[None, None], (48, 64)), voxel_size=0.05)
+    distance = np.minimum(np.abs(mesh.vertices[:, 2] - 3), np.abs(mesh.vertices[:, 2] - 1.5))
+    assert distance.max() < 0.05
+    assert {round(float(z), 1) for z in np.unique(mesh.vertices[:, 2])} == {1.5, 3.0}
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".glb", ".obj", ".stl", ".off"])
+def test_written_meshes_load(tmp_path: Path, sphere, suffix: str) -> None:
+    *_, mesh = sphere
+    path = write_mesh(tmp_path / f"sphere{suffix}", mesh)
+    loaded = trimesh.load_mesh(path)
+    assert len(loaded.faces) == len(mesh.faces)
+    np.testing.assert_allclose(loaded.bounds, [mesh.vertices.min(0), mesh.vertices.max(0)], atol=1e-5)
+
+
+def test_inputs_are_not_changed_and_errors_name_the_knob(tmp_path: Path, sphere) -> None:
+    cameras, depth, colors, _ = sphere
+    before = depth.clone()
+    with pytest.raises(ValueError, match="max_voxels=1000"):
+        fuse_depth(depth, cameras, voxel_size=VOXEL, max_voxels=1000)
+    with pytest.raises(ValueError, match="take larger voxels"):
+        fuse_depth(depth, cameras, voxel_size=1e-7)
+    with pytest.raises(ValueError, match="two voxels at least"):
+        fuse_depth(depth, cameras, voxel_size=VOXEL, truncation=VOXEL)
+    with pytest.raises(ValueError, match=r"depth must be \[V, 72, 72\]"):
+        fuse_depth(depth[:, :50], cameras, voxel_size=VOXEL)
+    with pytest.raises(ValueError, match="colors must be"):
+        fuse_depth(depth, cameras, colors[:1], voxel_size=VOXEL)
+    with pytest.raises(ValueError, match="depth has values that are not finite"):
+        fuse_depth(depth / 0, cameras, voxel_size=VOXEL)
+    assert torch.equal(depth, before)
+    empty = fuse_depth(depth * 0, cameras, voxel_size=VOXEL)
+    assert empty.vertices.shape == (0, 3)
+    with pytest.raises(ValueError, match="the mesh is empty"):
+        write_mesh(tmp_path / "empty.ply", empty)
+    with pytest.raises(ValueError, match=r"written as one of \.ply"):
+        write_mesh(tmp_path / "empty.fbx", empty)

@@ -1,0 +1,115 @@
+"""GLB (binary glTF 2.0): points and camera frusta for any 3D viewer.
+
+glTF has y up and cameras looking along -z, our world is OpenCV's (y down, z forward): the file's root turns the scene
+by half a turn about x, so that it stands upright. Colours are written as they are, in sRGB.
+
+Example:
+    >>> import tempfile, torch
+    >>> from vg2gt.io import write_glb
+    >>> from vg2gt.types import Cameras
+    >>> cameras = Cameras(torch.eye(4)[None, None], torch.diag(torch.tensor([50.0, 50, 1]))[None, None], (48, 64))
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_glb(folder + "/scene.glb", torch.rand(10, 3), cameras=cameras).read_bytes()[:4]
+    b'glTF'
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+
+from vg2gt.geometry.cameras import invert_rigid, transform_points
+from vg2gt.io.files import write_bytes
+from vg2gt.types import Cameras
+
+TO_GLTF = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenCV world to glTF world
+POINTS, FRUSTA = "points", "cameras"  # names of the two objects in the file
+_FRUSTUM_SHARE = 0.05  # of the scene's extent, the depth of a frustum nobody gave a size
+_MIDDLE = 0.9  # share of the points that count for the extent: far outliers must not blow up the frusta
+# apex to the four corners, around the image, and a mark above its upper edge
+_EDGES = ((0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1), (1, 5), (5, 2))
+
+
+def write_glb(
+    path: str | Path,
+    positions: ArrayLike,
+    colors: ArrayLike | None = None,
+    cameras: Cameras | None = None,
+    frustum_depth: float | None = None,
+) -> Path:
+    """Writes points and camera frusta, atomically.
+
+    Args:
+        path: the file.
+        positions: ``[N, 3]`` world positions, stored as float32.
+        colors: ``[N, 3]`` uint8; None is mid grey.
+        cameras: one scene (B = 1), or None for points only.
+        frustum_depth: distance from a camera's centre to its drawn image, in scene units; None is a twentieth of the
+            extent of points and cameras.
+
+    Returns:
+        The path.
+
+    Raises:
+        ValueError: if shapes or types are others, or a value is not finite, or there is nothing to write.
+    """
+    import trimesh  # a second of import time that other formats do without
+
+    xyz = np.asarray(positions, np.float64)
+    rgb = np.full(xyz.shape, 128, np.uint8) if colors is None else np.asarray(colors)
+    if xyz.ndim != 2 or xyz.shape[1] != 3 or not np.isfinite(xyz).all():
+        raise ValueError(f"positions must be finite [N, 3], got {list(xyz.shape)}")
+    if rgb.shape != xyz.shape or rgb.dtype != np.uint8:
+        raise ValueError(f"colors must be uint8 {list(xyz.shape)} like positions, got {rgb.dtype} {list(rgb.shape)}")
+    if not len(xyz) and cameras is None:
+        raise ValueError("there are neither points nor cameras to write")
+    scene = trimesh.Scene()
+    if len(xyz):
+        scene.add_geometry(trimesh.PointCloud(xyz, rgb), geom_name=POINTS, node_name=POINTS)
+    if cameras is not None:
+        corners = frusta(cameras, frustum_depth or _FRUSTUM_SHARE * _extent(xyz, cameras))
+        lines = corners[:, np.array(_EDGES)].reshape(-1, 2, 3)
+        scene.add_geometry(trimesh.load_path(lines), geom_name=FRUSTA, node_name=FRUSTA)
+    scene.apply_transform(TO_GLTF)
+    content = scene.export(file_type="glb")
+    assert isinstance(content, bytes)
+    return write_bytes(path, content)
+
+
+def frusta(cameras: Cameras, depth: float) -> NDArray[np.float64]:
+    """Corners of the cameras' frusta ``[V, 6, 3]`` in the world frame.
+
+    Args:
+        cameras: one scene (B = 1).
+        depth: z-depth of the drawn image.
+
+    Returns:
+        Per view the centre, the outer corners of the image clockwise from the upper left, and a point above its upper
+        edge that shows which way is up.
+
+    Raises:
+        ValueError: if there is more than one scene.
+    """
+    if len(cameras.world_to_camera) != 1:
+        raise ValueError(f"expected cameras of one scene, got {len(cameras.world_to_camera)}; use Cameras.scene")
+    height, width = cameras.size
+    left, top, right, bottom = -0.5, -0.5, width - 0.5, height - 0.5  # the image's edges, not its outer pixel centres
+    above = (left + right) / 2, top - 0.25 * height
+    pixels = torch.tensor([[left, top], [right, top], [right, bottom], [left, bottom], above], dtype=torch.float64)
+    k, poses = (t.detach().cpu().double() for t in (cameras.intrinsics[0], cameras.world_to_camera))
+    xy = (pixels - k[:, None, :2, 2]) / k[:, None, [0, 1], [0, 1]]
+    local = torch.cat((xy, torch.ones_like(xy[..., :1])), -1) * depth
+    local = torch.cat((torch.zeros_like(local[:, :1]), local), 1)
+    return transform_points(invert_rigid(poses), local[None])[0].numpy()
+
+
+def _extent(xyz: NDArray[np.float64], cameras: Cameras) -> float:
+    """Diagonal of the box of the cameras and the middle of the points; 1 for a single camera without points."""
+    centers = invert_rigid(cameras.world_to_camera.detach().cpu().double())[0, :, :3, 3].numpy()
+    tail = (1 - _MIDDLE) / 2
+    middle = np.quantile(xyz, [tail, 1 - tail], axis=0) if len(xyz) else centers[:1]
+    corners = np.concatenate((middle, centers))
+    return float(np.linalg.norm(corners.max(0) - corners.min(0))) or 1.0

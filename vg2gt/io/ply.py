@@ -1,0 +1,204 @@
+"""PLY files: Gaussians in the layout of 3D Gaussian Splatting, and coloured points.
+
+A Gaussian file has one ``vertex`` element of floats, in this order: ``x y z``, ``nx ny nz`` (zeros), ``f_dc_0..2``,
+``f_rest_*`` (none or 45, all of red before green before blue), ``opacity`` (logit), ``scale_0..2`` (logarithms),
+``rot_0..3`` (wxyz).
+
+Example:
+    >>> import tempfile, torch
+    >>> from vg2gt.io import read_gaussian_ply, write_gaussian_ply
+    >>> from vg2gt.types import Gaussians
+    >>> means, quats, scales = torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), 0.02)
+    >>> sh, batch = torch.zeros(1, 1, 3), torch.zeros(1, dtype=torch.int64)
+    >>> one = Gaussians(means, quats, scales, torch.tensor([0.5]), sh, batch)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     back = read_gaussian_ply(write_gaussian_ply(folder + "/scene.ply", one))
+    >>> len(back), back.opacities.item(), round(back.scales[0, 0].item(), 6)
+    (1, 0.5, 0.02)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vg2gt.io.errors import FormatError
+from vg2gt.io.files import write_bytes
+from vg2gt.io.gaussian_arrays import OPACITY_MARGIN, GaussianArrays, to_arrays, to_gaussians
+from vg2gt.io.ply_container import read_vertices, vertices_content
+from vg2gt.types import Gaussians
+
+POSITION = ("x", "y", "z")
+NORMAL = ("nx", "ny", "nz")
+COLOR = ("red", "green", "blue")
+FULL_REST = 45  # spherical harmonics of degree 3 without the constant one
+_DC = tuple(f"f_dc_{i}" for i in range(3))
+_SCALE = tuple(f"scale_{i}" for i in range(3))
+_ROTATION = tuple(f"rot_{i}" for i in range(4))
+
+
+@dataclass(frozen=True, eq=False)
+class PointCloud:
+    """Points of one scene.
+
+    Attributes:
+        positions: ``[N, 3]`` float32 or float64, world frame.
+        colors: ``[N, 3]`` uint8, or None.
+    """
+
+    positions: NDArray[np.floating]
+    colors: NDArray[np.uint8] | None = None
+
+
+def write_gaussian_ply(path: str | Path, gaussians: Gaussians, *, full_sh: bool = False) -> Path:
+    """Writes one scene's Gaussians as a 3DGS file (binary, little endian), atomically.
+
+    Args:
+        path: the file.
+        gaussians: one scene; not changed. Opacities are kept 6e-8 away from 0 and 1, whose logits are infinite.
+        full_sh: True writes 45 ``f_rest`` even for colours that do not depend on the view, which the original 3DGS
+            viewer insists on. Degrees 1 and 2 are always filled up with zeros to 45.
+
+    Returns:
+        The path.
+
+    Raises:
+        ValueError: on more than one scene and on values that cannot be written.
+    """
+    arrays = to_arrays(gaussians)
+    count, coefficients = arrays.sh.shape[:2]
+    rest = np.zeros((count, 3, FULL_REST // 3 if coefficients > 1 or full_sh else 0))
+    rest[:, :, : coefficients - 1] = arrays.sh[:, 1:].transpose(0, 2, 1)
+    rest = rest.reshape(count, rest.shape[1] * rest.shape[2])
+    opacities = arrays.opacities.clip(OPACITY_MARGIN, 1 - OPACITY_MARGIN)
+    logits = np.log(opacities) - np.log1p(-opacities)
+    names = (*POSITION, *NORMAL, *_DC, *(f"f_rest_{i}" for i in range(rest.shape[1])), "opacity", *_SCALE, *_ROTATION)
+    table = np.empty(count, [(name, "<f4") for name in names])
+    columns = (
+        *arrays.means.T,
+        *np.zeros((3, count)),
+        *arrays.sh[:, 0].T,
+        *rest.T,
+        logits,
+        *np.log(arrays.scales).T,
+        *arrays.quats.T,
+    )
+    for name, column in zip(names, columns, strict=True):
+        table[name] = column
+    return write_bytes(path, vertices_content(table))
+
+
+def read_gaussian_ply(path: str | Path) -> Gaussians:
+    """Reads a 3DGS file.
+
+    Args:
+        path: the file. Normals may be missing, there may be 0, 9, 24 or 45 ``f_rest``, and other properties are
+            ignored. Rows with values that are not finite or a zero quaternion are left out with a warning.
+
+    Returns:
+        The Gaussians as scene 0, float32, in our activations: standard deviations, opacities, quaternions as they are.
+
+    Raises:
+        FormatError: if the file is damaged or holds something else.
+    """
+    path = Path(path)
+    table = read_vertices(path)
+    found = table.dtype.names or ()
+    rest = [name for name in found if name.startswith("f_rest_")]
+    if len(rest) not in (0, 9, 24, 45):
+        raise FormatError(
+            f"{path}: {len(rest)} f_rest properties, expected 0, 9, 24 or 45 (degree 0 to 3); write the file again"
+        )
+    sh = np.concatenate(
+        (
+            _columns(path, table, _DC)[:, None],
+            _columns(path, table, tuple(f"f_rest_{i}" for i in range(len(rest))))
+            .reshape(len(table), 3, len(rest) // 3)
+            .transpose(0, 2, 1),
+        ),
+        1,
+    )
+    with np.errstate(over="ignore"):  # an infinite result is found and counted
+        opacities = 1 / (1 + np.exp(-_columns(path, table, ("opacity",))[:, 0]))
+        scales = np.exp(_columns(path, table, _SCALE))
+    means, quats = _columns(path, table, POSITION), _columns(path, table, _ROTATION)
+    return to_gaussians(path, GaussianArrays(means, quats, scales, opacities, sh))
+
+
+def write_point_ply(path: str | Path, positions: ArrayLike, colors: ArrayLike | None = None) -> Path:
+    """Writes points as float32 ``x y z`` and, if given, uchar ``red green blue``, atomically.
+
+    Args:
+        path: the file.
+        positions: ``[N, 3]``.
+        colors: ``[N, 3]`` uint8, or None.
+
+    Returns:
+        The path.
+
+    Raises:
+        ValueError: if the shapes or types are others.
+
+    Example:
+        >>> import numpy as np, tempfile
+        >>> from vg2gt.io import read_point_ply, write_point_ply
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = write_point_ply(folder + "/points.ply", [[1, 2, 3]], np.array([[255, 0, 0]], np.uint8))
+        ...     read_point_ply(path).positions.tolist()
+        [[1.0, 2.0, 3.0]]
+    """
+    xyz = np.asarray(positions, np.float64)
+    if xyz.ndim != 2 or xyz.shape[1] != 3:
+        raise ValueError(f"positions must be [N, 3], got {list(xyz.shape)}")
+    names = [(name, "<f4") for name in POSITION]
+    columns = list(xyz.T)
+    if colors is not None:
+        rgb = np.asarray(colors)
+        if rgb.shape != xyz.shape or rgb.dtype != np.uint8:
+            raise ValueError(
+                f"colors must be uint8 {list(xyz.shape)} like positions, got {rgb.dtype} {list(rgb.shape)}"
+            )
+        names += [(name, "u1") for name in COLOR]
+        columns += list(rgb.T)
+    table = np.empty(len(xyz), names)
+    for (name, _), column in zip(names, columns, strict=True):
+        table[name] = column
+    return write_bytes(path, vertices_content(table))
+
+
+def read_point_ply(path: str | Path) -> PointCloud:
+    """Reads the vertices of a PLY file as points; faces and other properties are ignored.
+
+    Args:
+        path: the file, binary little endian or ASCII.
+
+    Returns:
+        Positions (float64 where the file has doubles), and colours where it has uchar ``red green blue``.
+
+    Raises:
+        FormatError: if the file is damaged or has no ``x y z``.
+    """
+    path = Path(path)
+    table = read_vertices(path)
+    wide = any(table.dtype[name] == np.float64 for name in POSITION if name in (table.dtype.names or ()))
+    positions = _columns(path, table, POSITION).astype(np.float64 if wide else np.float32)
+    colored = all(name in (table.dtype.names or ()) and table.dtype[name] == np.uint8 for name in COLOR)
+    return PointCloud(positions, np.stack([table[name] for name in COLOR], -1) if colored else None)
+
+
+def _columns(path: Path, table: NDArray, names: tuple[str, ...]) -> NDArray[np.float64]:
+    """Some properties side by side ``[N, len(names)]``, float64."""
+    missing = [name for name in names if name not in (table.dtype.names or ())]
+    if missing:
+        raise FormatError(
+            f"{path}: vertices have no {', '.join(missing)}, only {', '.join(table.dtype.names or ())}; "
+            "expected x y z for points and x y z f_dc_* opacity scale_* rot_* for Gaussians (not a compressed PLY)"
+        )
+    values = np.empty((len(table), len(names)))
+    with np.errstate(invalid="ignore"):  # a signalling NaN of a damaged file becomes an ordinary one
+        for i, name in enumerate(names):
+            values[:, i] = table[name]
+    return values

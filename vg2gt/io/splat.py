@@ -1,0 +1,95 @@
+"""The ``.splat`` format of the first web viewers: 32 bytes a Gaussian, no header.
+
+Float32 position, float32 standard deviations, 8-bit red green blue and opacity, 8-bit wxyz. What is lost against a PLY
+file: everything of the colour that depends on the view, colours outside [0, 1], and precision of colour and opacity
+(1/510) and of the rotation (1/256 in each component, about half a degree).
+
+Example:
+    >>> import tempfile, torch
+    >>> from vg2gt.io import read_splat, write_splat
+    >>> from vg2gt.types import Gaussians
+    >>> means, quats, scales = torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), 0.02)
+    >>> sh, batch = torch.zeros(1, 1, 3), torch.zeros(1, dtype=torch.int64)
+    >>> one = Gaussians(means, quats, scales, torch.tensor([0.2]), sh, batch)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = write_splat(folder + "/scene.splat", one)
+    ...     path.stat().st_size, round(read_splat(path).opacities.item(), 6)
+    (32, 0.2)
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from vg2gt.geometry.spherical_harmonics import DC
+from vg2gt.io.errors import FormatError
+from vg2gt.io.files import write_bytes
+from vg2gt.io.gaussian_arrays import GaussianArrays, to_arrays, to_gaussians
+from vg2gt.types import Gaussians
+
+_ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
+
+
+def write_splat(path: str | Path, gaussians: Gaussians) -> Path:
+    """Writes one scene's Gaussians in their order, atomically; the module says what is lost.
+
+    Args:
+        path: the file.
+        gaussians: one scene; not changed.
+
+    Returns:
+        The path.
+
+    Raises:
+        ValueError: on more than one scene and on values that cannot be written.
+    """
+    arrays = to_arrays(gaussians)
+    rgba = np.concatenate((0.5 + DC * arrays.sh[:, 0], arrays.opacities[:, None]), 1)
+    length = np.linalg.norm(arrays.quats, axis=-1, keepdims=True)
+    if (length == 0).any():
+        raise ValueError("quats must not be zero: a rotation has no direction then")
+    table = np.empty(len(rgba), _ROW)
+    table["mean"], table["scale"] = arrays.means, arrays.scales
+    table["rgba"] = np.rint(rgba.clip(0, 1) * 255)
+    table["quat"] = np.rint(arrays.quats / length * 128 + 128).clip(0, 255)
+    return write_bytes(path, table.tobytes())
+
+
+def read_splat(path: str | Path) -> Gaussians:
+    """Reads a ``.splat`` file.
+
+    Args:
+        path: the file. The format has nothing by which damage could be told: rows with values that are not finite or a
+            zero quaternion are left out with a warning.
+
+    Returns:
+        The Gaussians as scene 0, float32, colours of degree 0.
+
+    Raises:
+        FormatError: if the length is not a multiple of 32 bytes or a standard deviation is negative.
+    """
+    path = Path(path)
+    data = path.read_bytes()
+    if len(data) % _ROW.itemsize:
+        raise FormatError(
+            f"{path}: {len(data)} bytes are not a multiple of {_ROW.itemsize}; the file is truncated or not a .splat"
+        )
+    table = np.frombuffer(data, _ROW)
+    scales = table["scale"].astype(np.float64)
+    negative = np.flatnonzero((scales < 0).any(-1))
+    if len(negative):
+        raise FormatError(
+            f"{path}, byte {negative[0] * _ROW.itemsize}: scales {scales[negative[0]].tolist()} are negative; the file "
+            "is damaged or not a .splat"
+        )
+    rgba = table["rgba"] / 255.0
+    arrays = GaussianArrays(
+        table["mean"].astype(np.float64),
+        (table["quat"] - 128.0) / 128,
+        scales,
+        rgba[:, 3],
+        ((rgba[:, :3] - 0.5) / DC)[:, None],
+    )
+    return to_gaussians(path, arrays)
