@@ -1,5 +1,7 @@
 """The backbones are graphs: they compile, export with free sizes, and bear half precision."""
 
+import shutil
+
 import pytest
 import torch
 from torch import Tensor, nn
@@ -55,6 +57,23 @@ def test_compiles_without_graph_breaks(encoder: Encoder) -> None:
         images = random_images(shape)
         for a, b in zip(compiled(images), encoder(images), strict=True):
             torch.testing.assert_close(a, b)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("g++") is None, reason="torch.compile needs a C++ compiler on a CPU")
+@pytest.mark.parametrize("name", ["vggt_tiny", "da3_tiny"])
+def test_compiled_backend_equals_the_eager_one(make_backend, name: str) -> None:
+    """``backend.compile=true`` as in a run, with the compiler torch uses by default."""
+    eager, compiled = make_backend(name), make_backend(name, "compile=true")
+    for views in (2, 5):
+        images = random_images((1, views, 3, 56, 84))
+        expected_tokens, tokens = eager.encode(images), compiled.encode(images)
+        expected, geometry = eager.decode(expected_tokens), compiled.decode(tokens)
+        pairs = [*zip(tokens.patch, expected_tokens.patch, strict=True), (tokens.camera, expected_tokens.camera)]
+        pairs += [(geometry.depth, expected.depth), (geometry.depth_conf, expected.depth_conf)]
+        pairs += [(geometry.cameras.world_to_camera, expected.cameras.world_to_camera)]
+        for value, reference in pairs:
+            assert float((value - reference).abs().max() / reference.abs().max()) < 5e-6
 
 
 @pytest.mark.slow
