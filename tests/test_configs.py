@@ -83,7 +83,7 @@ def test_every_ablation_builds_what_it_says(tmp_path: Path, ablation: str) -> No
         composed(tmp_path, f"ablation={ablation}", "trainer.accelerator=cpu", "data.cache_dir=" + str(tmp_path))
     )
     full = {
-        "rasterized": run.module.renderer.options.mode == "rasterized",
+        "rasterized": run.module.renderer.mode == "rasterized",
         "wo_coarse": run.module.model.coarse is None,
         "wo_split": run.module.model.gaussians.splits == 1,
     }

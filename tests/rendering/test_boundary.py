@@ -134,7 +134,7 @@ def test_configuration_builds_the_renderer(name: Mode) -> None:
         config = hydra.compose(f"renderer/{name}")
     renderer = hydra.utils.instantiate(config.renderer)
     assert isinstance(renderer, Renderer)
-    assert renderer.options.mode == name
+    assert renderer.mode == name
     gaussians, cameras = soup(30), pinhole((12, 15))
     out = renderer(gaussians, cameras, background=(1.0, 0.0, 0.0))
     torch.testing.assert_close(out.color, render(gaussians, cameras, name, (1.0, 0.0, 0.0)).color)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor
@@ -20,7 +20,26 @@ JACOBIAN_CLAMP = 1.3  # half fields of view at which 3DGS clamps the projection'
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """Options common to all implementations; see :func:`vg2gt.rendering.render`."""
+    """Options common to all implementations.
+
+    Attributes:
+        mode: ``solid`` treats Gaussians as continuous stochastic solids (paper, Sec. Continuous Stochastic Solids
+            Volume Rendering): exact ray maximum, median depth of the continuous transmittance. ``rasterized`` is
+            classic 3DGS: affine splats, Jacobian clamped off-screen, piecewise constant transmittance.
+        depth: ``median``: where transmittance falls to one half; rasterized, that is the z of the Gaussian at which it
+            happens, with gradient to that Gaussian's mean only. ``expected`` (rasterized only): blended z over alpha.
+        near: Gaussians whose mean is nearer are dropped; solid depth is never in front of it. Scene units.
+        lowpass: variance in px^2 added to every screen footprint.
+        alpha_max: cap of the opacity at a pixel; no gradient passes where it acts.
+        slope_floor: lower bound of ``-d ln T / dd``, in units of 1 / depth, used in the median depth's gradient so that
+            plateaus of transmittance near one half do not dominate; 0 gives the exact gradient.
+        bisections: bisection steps of the solid median depth.
+        newton_steps: Newton steps after the bisections.
+        geometry: False renders colour and alpha only; depth and normal are zero.
+
+    Raises:
+        ValueError: naming an option that is unknown or out of range.
+    """
 
     mode: Mode = "solid"
     depth: DepthKind = "median"
@@ -31,6 +50,29 @@ class RenderOptions:
     bisections: int = 12
     newton_steps: int = 2
     geometry: bool = True
+
+    def __post_init__(self) -> None:
+        check_choice("mode", self.mode, Mode)
+        check_choice("depth", self.depth, DepthKind)
+        if self.mode == "solid" and self.depth != "median":
+            raise ValueError("solid rendering has median depth only; use depth=median or mode=rasterized")
+        for name, good, expected in (
+            ("near", self.near > 0, "positive"),
+            ("lowpass", self.lowpass >= 0, "at least 0"),
+            ("alpha_max", 0 < self.alpha_max < 1, "between 0 and 1"),
+            ("slope_floor", self.slope_floor >= 0, "at least 0"),
+            ("bisections", self.bisections >= 1, "at least 1"),
+            ("newton_steps", self.newton_steps >= 0, "at least 0"),
+        ):
+            if not good:
+                raise ValueError(f"{name} must be {expected}, got {getattr(self, name)}")
+
+
+def check_choice(name: str, value: object, literal: Any) -> None:
+    """Raises ValueError, naming the choices, unless ``value`` is one of a ``Literal`` type's."""
+    choices = get_args(literal)
+    if value not in choices:
+        raise ValueError(f"{name} must be one of {', '.join(choices)}, got {value!r}")
 
 
 @dataclass(frozen=True)
