@@ -1,0 +1,202 @@
+"""COLMAP models with their undistorted images; depth, if wanted, at the model's own points."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from vg2gt.data.base import DataError
+from vg2gt.data.image_files import image_size
+from vg2gt.data.sources.files import FileSource
+from vg2gt.data.sources.index import SceneIndex, Size, folder_state, make_index
+from vg2gt.data.sources.parsing import errors_name, inverse
+from vg2gt.geometry.cameras import resize_intrinsics
+from vg2gt.io import ColmapImage, ColmapModel, colmap_intrinsics, colmap_pose, read_colmap
+
+_MODELS = ("sparse/0", "sparse")
+_FILES = ("cameras.bin", "cameras.txt")
+MIN_TRACK = 3
+"""Views that must see a point before its depth counts: two are not enough to notice a wrong match."""
+
+
+class COLMAP(FileSource):
+    """Scenes of ``images/`` with a COLMAP model in ``sparse/0`` or ``sparse``, text or binary; the scale is arbitrary.
+
+    Frames are numbered 0, 1, ... in the order of the model's image names, also where an image is absent (left out and
+    counted). Only undistorted cameras (PINHOLE, SIMPLE_PINHOLE) are read. Images of several sizes are resized to cover
+    the median size and cropped.
+
+    Args:
+        root: a scene, a folder of scenes (one or two levels deep), or a list of such folders.
+        images: name of the image folder. Images of another size than the cameras' are taken for resized ones, such as
+            ``images_4``, and the intrinsics are resized with them.
+        depth: ``points``: depth at the model's points, in the views that saw them and in at least three views; null:
+            none.
+        scenes: names of the scenes to use, or a text file of them; None: all.
+        holdout: hold out every this many-th frame as an evaluation target; None: none.
+        every: use every this many-th frame only.
+        index_cache: see ``FileSource``.
+
+    Raises:
+        FileNotFoundError: if a root does not exist.
+        DataError: if a folder holds no model.
+    """
+
+    layout = "a COLMAP model in sparse/0 or sparse and its undistorted images/, there or up to two folders deeper"
+    sparse_depth = True
+    is_metric = False
+
+    def __init__(
+        self,
+        root: str | Sequence[str] | None,
+        images: str = "images",
+        depth: str | None = None,
+        scenes: Sequence[str] | str | None = None,
+        holdout: int | None = None,
+        every: int = 1,
+        index_cache: str | None = None,
+    ) -> None:
+        if depth not in (None, "points"):
+            raise ValueError(f"depth must be points (at the model's points) or null (none), got {depth!r}")
+        self.images = images
+        self.has_depth = depth is not None
+        self._points: dict[str, _Points] = {}
+        super().__init__(root, scenes, holdout, every, index_cache)
+
+    def find(self, root: Path) -> Mapping[str, Path]:
+        """The folder itself, or scenes one or two levels below it."""
+        if _model_folder(root) is not None:
+            return {root.resolve().name: root}
+        inner = [folder for pattern in ("*", "*/*") for folder in sorted(root.glob(pattern)) if _model_folder(folder)]
+        return {folder.relative_to(root).as_posix(): folder for folder in inner}
+
+    def options(self) -> Mapping[str, object]:
+        """The image folder, and whether frames need points."""
+        return {"images": self.images, "depth": self.has_depth}
+
+    def state(self, scene: str, folder: Path) -> str:
+        """Also that of the model's folder."""
+        model = _model_folder(folder)
+        return " ".join(folder_state(place) for place in (folder, *([model] if model else [])))
+
+    def index(self, scene: str, folder: Path) -> SceneIndex:
+        """Reads the model and the sizes of its images."""
+        model, model_folder = self._read_model(scene, folder)
+        _refuse_distorted(model, f"{model_folder} (scene {scene})")
+        records = _in_order(model)
+        named = {i: folder / self.images / record.name for i, record in enumerate(records)}
+        with errors_name(scene):
+            color = {i: path for i, path in named.items() if path.is_file()}
+        if not color:
+            raise DataError(f"scene {scene}: none of the model's {len(records)} images is in {folder / self.images}")
+        sizes = {i: image_size(path, scene) for i, path in color.items()}
+        alike = len(set(sizes.values())) == 1
+        size = (_median(size[0] for size in sizes.values()), _median(size[1] for size in sizes.values()))
+        depth = None
+        if self.has_depth:
+            points = self._scene_points(scene, folder)
+            depth = {i: model_folder for i in color if len(points.depth(i))}
+        return make_index(
+            name=scene,
+            folder=folder,
+            color=color,
+            depth=depth,
+            camera_to_world={i: _camera_to_world(record) for i, record in enumerate(records)},
+            intrinsics={i: _resized_intrinsics(model, records[i], sizes[i], path) for i, path in color.items()},
+            size=size,
+            color_size=size if alike else None,
+        )
+
+    def read_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
+        """Depth of the points a view saw, at the pixels where it saw them; the nearest wins a pixel."""
+        points, frame = self._scene_points(index.name, index.folder), index.frame_ids[row]
+        extent = np.array((size[1], size[0]))
+        pixels = np.floor(points.places(frame) * extent).astype(np.int64).clip(max=extent - 1)
+        depth = np.full(size, np.inf, np.float32)
+        np.minimum.at(depth, (pixels[:, 1], pixels[:, 0]), points.depth(frame))
+        return np.where(np.isfinite(depth), depth, 0)
+
+    def _scene_points(self, scene: str, folder: Path) -> _Points:
+        if scene not in self._points:
+            self._points[scene] = _Points(self._read_model(scene, folder)[0])
+        return self._points[scene]
+
+    def _read_model(self, scene: str, folder: Path) -> tuple[ColmapModel, Path]:
+        model_folder = _model_folder(folder)
+        if model_folder is None:
+            raise DataError(f"scene {scene} has no COLMAP model in {folder}: expected {' or '.join(_MODELS)}")
+        with errors_name(scene):
+            return read_colmap(model_folder), model_folder
+
+
+class _Points:
+    """The points that each view saw, by frame number: where in the image, as a part of its size, and how deep."""
+
+    def __init__(self, model: ColmapModel) -> None:
+        used = (model.points.track_lengths >= MIN_TRACK) & (np.abs(model.points.positions) < 1e30).all(1)
+        order = np.argsort(model.points.ids)
+        self._views: list[tuple[NDArray[np.float64], NDArray[np.float32]]] = []
+        for record in _in_order(model):
+            camera, pose = model.cameras[record.camera_id], colmap_pose(record)
+            row = np.searchsorted(model.points.ids, record.point3d_ids, sorter=order).clip(max=len(order) - 1)
+            known = np.zeros(len(row), bool)
+            if len(order):
+                known = (model.points.ids[order[row]] == record.point3d_ids) & used[order[row]]
+            positions = model.points.positions[order[row[known]]]
+            z = positions @ pose[2, :3] + pose[2, 3]
+            place = record.points2d[known] / (camera.width, camera.height)
+            good = (z > 1e-6) & (z < 1e30) & (place >= 0).all(1) & (place < 1).all(1)
+            self._views.append((place[good], z[good].astype(np.float32)))
+
+    def places(self, frame: int) -> NDArray[np.float64]:
+        """``[n, 2]`` (x, y) in [0, 1)."""
+        return self._views[frame][0]
+
+    def depth(self, frame: int) -> NDArray[np.float32]:
+        """``[n]`` positive z-depth."""
+        return self._views[frame][1]
+
+
+def _model_folder(folder: Path) -> Path | None:
+    inside = [folder / name for name in _MODELS]
+    return next((place for place in inside if any((place / name).is_file() for name in _FILES)), None)
+
+
+def _in_order(model: ColmapModel) -> list[ColmapImage]:
+    return sorted(model.images.values(), key=lambda image: image.name)
+
+
+def _median(values: Iterable[int]) -> int:
+    return int(statistics.median_low(values))
+
+
+def _refuse_distorted(model: ColmapModel, where: str) -> None:
+    distorted = sorted({camera.model for camera in model.cameras.values() if not camera.is_pinhole})
+    if distorted:
+        raise DataError(
+            f"the cameras in {where} are {', '.join(distorted)}; only undistorted ones (PINHOLE, SIMPLE_PINHOLE) are "
+            "read. Undistort: colmap image_undistorter --image_path IMAGES --input_path MODEL --output_path SCENE"
+        )
+
+
+def _camera_to_world(record: ColmapImage) -> NDArray[np.float64]:
+    pose = colmap_pose(record)
+    return inverse(pose) if np.isfinite(pose).all() else pose
+
+
+def _resized_intrinsics(model: ColmapModel, record: ColmapImage, size: Size, path: Path) -> NDArray[np.float64]:
+    """Intrinsics of an image as it is on disk."""
+    camera = model.cameras[record.camera_id]
+    scale = (size[1] / camera.width, size[0] / camera.height)
+    # Sizes are whole pixels, so that both directions of a reduced image may be off by one.
+    if abs(scale[0] / scale[1] - 1) > 2 / min(size):
+        raise DataError(
+            f"{path} is {size[1]}x{size[0]} pixels, but its camera in the model {camera.width}x{camera.height}: it is "
+            "not the image the model was made of, nor a reduced one"
+        )
+    return resize_intrinsics(torch.from_numpy(colmap_intrinsics(camera)), *scale).numpy()
