@@ -28,7 +28,7 @@ def _tilt_rotation(angle: float) -> NDArray[np.float64]:
 
 
 class Builder:
-    """Collects parts, their groups and materials while a room is furnished.
+    """Collects parts, their groups and materials while a scene is filled.
 
     Args:
         rng: source of every random choice.
@@ -72,9 +72,25 @@ class Builder:
         """Adds a box of full edge lengths ``size``, turned about the vertical and tilted about its x axis (rad)."""
         self._add(BOX, center, np.array(size) / 2, material, yaw_rotation(turn) @ _tilt_rotation(tilt))
 
-    def cylinder(self, center: Vector, radius: float, height: float, material: int) -> None:
-        """Adds an upright cylinder."""
-        self._add(CYLINDER, center, np.array([radius, radius, height / 2]), material, np.eye(3))
+    def tinted_material(
+        self,
+        color: Vector,
+        kinds: tuple[Pattern, ...],
+        frequency: tuple[float, float],
+        other: Vector | None = None,
+    ) -> int:
+        """Draws a material about one colour (linear RGB), its second colour about ``other`` or a shade of the first."""
+        material = self.new_material(kinds, frequency)
+        first = np.array(color) * self.rng.uniform(0.75, 1.3) * self.rng.uniform(0.9, 1.1, 3)
+        shade = self.rng.uniform(0.5, 0.8) if self.rng.random() < 0.5 else self.rng.uniform(1.25, 1.6)
+        second = first * shade if other is None else np.array(other) * self.rng.uniform(0.8, 1.2)
+        self.materials[material][3:9] = np.clip([*first, *second], 0.02, 1.0).tolist()
+        return material
+
+    def cylinder(self, center: Vector, radius: float, height: float, material: int, lying: bool = False) -> None:
+        """Adds a cylinder, upright or with its axis along y."""
+        own = _tilt_rotation(np.pi / 2) if lying else np.eye(3)
+        self._add(CYLINDER, center, np.array([radius, radius, height / 2]), material, own)
 
     def ellipsoid(self, center: Vector, radii: Vector, material: int) -> None:
         """Adds an ellipsoid."""

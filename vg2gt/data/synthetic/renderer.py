@@ -87,7 +87,9 @@ def render_frame(
     camera = (intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2])
     geometry = (world.parts, world.groups, world.walls)
     look = (world.part_materials, world.wall_materials, world.materials, world.lights, world.ambient)
-    _render(origin, rotation, camera, geometry, look, world.highlights, world.sky, frame.image, frame.depth, frame.normal)
+    _render(
+        origin, rotation, camera, geometry, look, world.highlights, world.sky, frame.image, frame.depth, frame.normal
+    )
     return frame
 
 
@@ -179,14 +181,13 @@ def _shade(hit, t, p, d, footprint, parts, groups, look, highlights, sky, shadow
         red += strength * lights[i, 3]
         green += strength * lights[i, 4]
         blue += strength * lights[i, 5]
-        if highlights is not None:
-            if guess < 0:
-                away = nx * d[0] + ny * d[1] + nz * d[2]
-                length = math.sqrt((ex - d[0]) ** 2 + (ey - d[1]) ** 2 + (ez - d[2]) ** 2)
-                glint = highlights[m, 0] * max((facing - away) / length, 0.0) ** highlights[m, 1]
-                glint /= 0.5 + 0.25 * squared
-                for channel in range(3):
-                    color[channel] += glint * lights[i, 3 + channel]
+        if highlights is not None and guess < 0:
+            away = nx * d[0] + ny * d[1] + nz * d[2]
+            length = math.sqrt((ex - d[0]) ** 2 + (ey - d[1]) ** 2 + (ez - d[2]) ** 2)
+            glint = highlights[m, 0] * max((facing - away) / length, 0.0) ** highlights[m, 1]
+            glint /= 0.5 + 0.25 * squared
+            for channel in range(3):
+                color[channel] += glint * lights[i, 3 + channel]
     color[0] += tone * (materials[m, 3] + mix * (materials[m, 6] - materials[m, 3])) * red
     color[1] += tone * (materials[m, 4] + mix * (materials[m, 7] - materials[m, 4])) * green
     color[2] += tone * (materials[m, 5] + mix * (materials[m, 8] - materials[m, 5])) * blue
@@ -202,11 +203,10 @@ def _cast_centers(y0, x0, y1, x1, origin, rotation, camera, geometry, sky, visib
         for x in range(x0, x1):
             z = _ray(x, y, rotation, camera, d)
             t, hit = nearest_hit(visible, count, parts, groups, walls, ox, oy, oz, d[0], d[1], d[2])
-            if sky is not None:
-                if hit < 0 and hit != GROUND:
-                    depth[y, x] = 0.0
-                    normal[y, x, :] = 0.0
-                    continue
+            if sky is not None and hit < 0 and hit != GROUND:
+                depth[y, x] = 0.0
+                normal[y, x, :] = 0.0
+                continue
             n = surface(hit, parts, ox + t * d[0], oy + t * d[1], oz + t * d[2])
             depth[y, x] = t * z
             for i in range(3):

@@ -75,5 +75,5 @@ def draw_highlights(seed: tuple[int, ...], materials: int) -> NDArray[np.float64
     """
     rng = np.random.default_rng((*seed, _HIGHLIGHTS))
     strength = rng.uniform(0.15, 0.9, materials) * (rng.random(materials) >= _MATT_SHARE)
-    roughness = np.exp(rng.uniform(*np.log((0.1, 0.6)), materials))
+    roughness = np.exp(rng.uniform(np.log(0.1), np.log(0.6), materials))
     return np.stack((strength, 2 / roughness**2 - 2), 1)

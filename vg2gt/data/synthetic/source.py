@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from vg2gt.data.base import Frames, SceneSource
+from vg2gt.data.synthetic.outdoor import SyntheticOutdoor
 from vg2gt.data.synthetic.rooms import SyntheticRoom
 from vg2gt.data.synthetic.scene import SyntheticScene
 from vg2gt.data.transforms import from_bytes
@@ -20,8 +21,9 @@ from vg2gt.io.files import write_bytes
 
 log = logging.getLogger(__name__)
 
-VARIANTS: dict[str, type[SyntheticRoom]] = {
+VARIANTS: dict[str, type[SyntheticRoom] | type[SyntheticOutdoor]] = {
     "room": SyntheticRoom,
+    "outdoor": SyntheticOutdoor,
 }
 
 
@@ -36,7 +38,7 @@ class SyntheticScenes(SceneSource):
         first_seed: seed of the first scene.
         num_frames: frames on a scene's camera path.
         size: image ``(height, width)``; best the size that is trained on.
-        variant: ``room`` or ``outdoor``, or a list: seeds take turns, so ``[room, room, outdoor]`` is one third outdoor.
+        variant: ``room`` or ``outdoor``, or a list: seeds take turns, ``[room, room, outdoor]`` is one third outdoor.
         highlights: whether surfaces shine, with colours that depend on the view; geometry and textures stay the same.
         cache_dir: folder for the rendered frames (``~`` is the home folder); None keeps nothing on disk.
 

@@ -182,7 +182,7 @@ def pattern_value(kind, x, y, frequency, footprint, seed):
     elif kind == WINDOWS:
         pane = pulse_train(u, 0.5, width) * pulse_train(v, 0.55, width)
         bars = 1 - 0.5 * pulse_train(2 * u, 0.08, 2 * width)
-        tone = hash_cell(int(math.floor(u + 0.5)), int(math.floor(v + 0.5)), seed)
+        tone = hash_cell(math.floor(u + 0.5), math.floor(v + 0.5), seed)
         fade = min(max(2.0 - 4.0 * width, 0.0), 1.0)
         value = pane * bars * (0.75 + fade * 0.5 * (tone - 0.5))
     return min(max(value, 0.0), 1.0)
