@@ -15,7 +15,16 @@ from tests.io.gaussian_scenes import scene, views
 from tests.io.splat_oracle import rotations
 from tests.io.test_colmap import views_model
 from vg2gt.geometry.spherical_harmonics import DC
-from vg2gt.io import read_colmap, read_gaussian_ply, write_colmap, write_gaussian_ply, write_point_ply, write_splat
+from vg2gt.io import (
+    colmap_intrinsics,
+    colmap_pose,
+    read_colmap,
+    read_gaussian_ply,
+    write_colmap,
+    write_gaussian_ply,
+    write_point_ply,
+    write_splat,
+)
 
 pytestmark = pytest.mark.slow
 
@@ -49,6 +58,24 @@ def test_pycolmap_reprojects_our_points(tmp_path: Path, text: bool) -> None:
     again = read_colmap(back)
     assert len(again.points) == 500
     assert {image.name for image in again.images.values()} == {"a.png", "b.png", "c.png"}
+
+
+def test_pycolmap_agrees_on_a_real_model(shared: Path, tmp_path: Path) -> None:
+    pycolmap = needs("pycolmap")
+    source = shared / "data" / "colmap_statue" / "sparse" / "0"
+    ours = read_colmap(source)
+    theirs = pycolmap.Reconstruction(str(source))
+    for number, image in ours.images.items():
+        pose = theirs.images[number].cam_from_world().matrix()
+        np.testing.assert_allclose(colmap_pose(image)[:3], pose, atol=1e-12)
+        matrix = theirs.cameras[image.camera_id].calibration_matrix()
+        np.testing.assert_allclose(colmap_intrinsics(ours.cameras[image.camera_id])[:2, 2], matrix[:2, 2] - 0.5)
+    written = pycolmap.Reconstruction(str(write_colmap(tmp_path / "text", ours, text=True)))
+    for model in (theirs, written):
+        model.update_point_3d_errors()
+    assert written.compute_mean_reprojection_error() == pytest.approx(
+        theirs.compute_mean_reprojection_error(), abs=1e-9
+    )
 
 
 def splat_transform(*arguments: Path | str) -> None:

@@ -185,6 +185,20 @@ def test_wrong_arguments_are_named(tmp_path: Path) -> None:
         write_colmap(tmp_path / "binary", small_model(), text=True)
 
 
+@pytest.mark.parametrize("text", [False, True])
+def test_numpy_numbers_are_written_as_numbers(tmp_path: Path, text: bool) -> None:
+    camera = ColmapCamera(1, "SIMPLE_PINHOLE", 64, 48, tuple(np.array([1 / 3, 32.0, 24.0])))
+    image = ColmapImage(
+        1, tuple(np.array([1.0, 0, 0, 0])), tuple(np.full(3, 1e-7)), 1, "a", np.zeros((0, 2)), np.zeros(0, np.int64)
+    )
+    model = ColmapModel({1: camera}, {1: image}, ColmapPoints.empty())
+    read = read_colmap(write_colmap(tmp_path, model, text=text))
+    assert read.cameras[1].params == (1 / 3, 32.0, 24.0)
+    assert read.images[1].translation == (1e-7, 1e-7, 1e-7)
+    with pytest.raises(ValueError, match="stands under number 2"):
+        write_colmap(tmp_path, ColmapModel({2: camera}, {}, ColmapPoints.empty()), text=text)
+
+
 def test_folder_without_a_model(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match="no COLMAP model here"):
         read_colmap(tmp_path)

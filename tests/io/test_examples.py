@@ -1,16 +1,39 @@
-"""The examples in the docstrings of the formats run as written."""
+"""The examples in the docstrings of the formats and in docs/formats.md run as written."""
 
 import doctest
 import importlib
 import pkgutil
+import re
+from pathlib import Path
 
 import pytest
 
 import vg2gt.io
 
 MODULES = [f"vg2gt.io.{module.name}" for module in pkgutil.iter_modules(vg2gt.io.__path__)]
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "formats.md"
 
 
 @pytest.mark.parametrize("name", MODULES)
 def test_docstring_examples(name: str) -> None:
     assert doctest.testmod(importlib.import_module(name)).failed == 0
+
+
+def test_every_format_has_a_docstring_example() -> None:
+    finder = doctest.DocTestFinder(exclude_empty=True)
+    examples = [example for name in MODULES for example in finder.find(importlib.import_module(name), name)]
+    with_one = {example.name.split(".")[2] for example in examples if example.examples}
+    assert {"colmap", "nerfstudio", "ply", "splat", "glb", "mesh"} <= with_one
+
+
+def test_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+    code, printed = re.findall(r"```(?:python)?\n(.*?)```", PAGE.read_text(), re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    exec(compile(code, str(PAGE), "exec"), {})
+    assert capsys.readouterr().out == printed
+
+
+def test_page_names_every_reader_and_writer() -> None:
+    functions = [name for name in vg2gt.io.__all__ if name.startswith(("read_", "write_", "fuse_"))]
+    text = PAGE.read_text()
+    assert [name for name in functions if f"`{name}`" not in text] == []

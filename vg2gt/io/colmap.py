@@ -238,13 +238,17 @@ def _check_references(model: ColmapModel, images: Path, points: Path) -> None:
 def _check_writable(model: ColmapModel) -> None:
     for number, camera in model.cameras.items():
         check_camera(camera, f"camera {number}")
+    numbered = (*model.cameras.items(), *model.images.items())
+    for number, record in numbered:
+        if record.id != number or not 0 <= number < 1 << 32:
+            raise ValueError(f"{record.id} stands under number {number}; numbers must agree and fit into 32 bits")
     for number, image in model.images.items():
         if image.camera_id not in model.cameras:
             raise ValueError(f"image {number} names camera {image.camera_id}, which the model does not have")
         if not image.name or "\0" in image.name or "\n" in image.name:
             raise ValueError(f"image {number} is called {image.name!r}; a name must not be empty or hold a line break")
-        if len(image.points2d) != len(image.point3d_ids):
-            raise ValueError(f"image {number} has {len(image.points2d)} points2d and {len(image.point3d_ids)} ids")
+        if image.points2d.shape != (len(image.point3d_ids), 2):
+            raise ValueError(f"image {number}: points2d {image.points2d.shape}, expected {len(image.point3d_ids), 2}")
     observations, expected = len(model.points.tracks), model.points.track_lengths.sum()
     if observations != expected:
         raise ValueError(f"track_lengths sum to {expected}, but tracks have {observations} rows; they must agree")

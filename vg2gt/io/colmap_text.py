@@ -168,7 +168,8 @@ def points_content(points: ColmapPoints) -> bytes:
 
 
 def _joined(values: tuple) -> str:
-    return " ".join(repr(value) for value in values)
+    # str() of a NumPy float has all its digits, its repr() has its type's name too
+    return " ".join(str(value) for value in values)
 
 
 def _content(lines: list[str]) -> bytes:

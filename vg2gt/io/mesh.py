@@ -53,13 +53,13 @@ def fuse_depth(
     *,
     voxel_size: float,
     truncation: float | None = None,
-    max_voxels: int = 200_000_000,
+    max_voxels: int = 64_000_000,
 ) -> Mesh:
     """Fuses depth maps of one scene into a mesh.
 
     A truncated signed distance along the optical axis is averaged over the views at the voxels near surfaces; the mesh
-    is its zero set, one vertex in every cell that the surface crosses (surface nets). Memory is 20 bytes a voxel,
-    in proportion to the surface, not to the scene's box.
+    is its zero set, one vertex in every cell that the surface crosses (surface nets). Memory is about 50 bytes a voxel
+    at its peak, in proportion to the surface, not to the scene's box.
 
     Args:
         depth: ``[V, H, W]`` z-depth, 0 = invalid. Set what is too far to 0.
@@ -68,7 +68,7 @@ def fuse_depth(
         voxel_size: edge length of a voxel in scene units; details below it are lost.
         truncation: distance at which free space begins, in scene units; None is four voxels. Less than two voxels
             tears holes; walls thinner than it are lost.
-        max_voxels: bound of the memory, at 20 bytes each.
+        max_voxels: bound of the memory, at 50 bytes each (3 GB).
 
     Returns:
         The mesh, empty where there is no valid depth.

@@ -77,7 +77,8 @@ def read_splat(path: str | Path) -> Gaussians:
             f"{path}: {len(data)} bytes are not a multiple of {_ROW.itemsize}; the file is truncated or not a .splat"
         )
     table = np.frombuffer(data, _ROW)
-    scales = table["scale"].astype(np.float64)
+    with np.errstate(invalid="ignore"):  # a signalling NaN of a damaged file becomes an ordinary one
+        means, scales = table["mean"].astype(np.float64), table["scale"].astype(np.float64)
     negative = np.flatnonzero((scales < 0).any(-1))
     if len(negative):
         raise FormatError(
@@ -86,7 +87,7 @@ def read_splat(path: str | Path) -> Gaussians:
         )
     rgba = table["rgba"] / 255.0
     arrays = GaussianArrays(
-        table["mean"].astype(np.float64),
+        means,
         (table["quat"] - 128.0) / 128,
         scales,
         rgba[:, 3],
