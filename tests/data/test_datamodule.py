@@ -11,6 +11,7 @@ from hydra.utils import instantiate
 from vg2gt.data import DataError, SceneDataModule, SyntheticRooms
 from vg2gt.data.evaluation_views import EvaluationViews
 from vg2gt.data.frame_cache import FrameCache
+from vg2gt.data.framing import Framing
 from vg2gt.data.sampling import StepSampler
 from vg2gt.paths import config_dir
 
@@ -54,11 +55,12 @@ def test_evaluation_batches_are_context_then_targets(rooms):
 
 
 def test_workers_do_not_change_batches(rooms):
-    alone, helped = (list(_module(rooms, workers=workers).train_dataloader()) for workers in (0, 2))
-    for a, b in zip(alone, helped, strict=True):
-        assert a.scene == b.scene
-        assert torch.equal(a.frame_ids, b.frame_ids)
-        assert torch.equal(a.images, b.images)
+    alone, *helped = (list(_module(rooms, workers=workers).train_dataloader()) for workers in (0, 1, 2))
+    for other in helped:
+        for a, b in zip(alone, other, strict=True):
+            assert a.scene == b.scene
+            assert torch.equal(a.frame_ids, b.frame_ids)
+            assert torch.equal(a.images, b.images)
 
 
 def test_limits_on_scenes(rooms):
@@ -119,17 +121,18 @@ def _trainer(steps: int, **options) -> lightning.Trainer:
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("stop", [2, 4, 6])
-def test_a_resumed_run_sees_the_batches_of_the_uninterrupted_one(rooms, tmp_path, stop):
-    """Stops within an epoch, at its end and within the next one (4 steps each)."""
+@pytest.mark.parametrize(("stop", "workers"), [(2, 0), (4, 0), (6, 0), (4, 2), (6, 2), (7, 1)])
+def test_a_resumed_run_sees_the_batches_of_the_uninterrupted_one(rooms, tmp_path, stop, workers):
+    """Stops within an epoch, at its end and within the next one (4 steps each); workers read ahead of the stop."""
+    drawn = {"aspect": [0.5, 1.0], "size_multiple": 2, "crop": "random", "zoom": [1, 1.2]} if stop == 6 else {}
     whole = _Recorder()
-    _trainer(10).fit(whole, datamodule=_module(rooms, workers=0))
+    _trainer(10).fit(whole, datamodule=_module(rooms, workers=0, **drawn))
     first = _Recorder()
     trainer = _trainer(stop)
-    trainer.fit(first, datamodule=_module(rooms))
+    trainer.fit(first, datamodule=_module(rooms, workers=workers, **drawn))
     trainer.save_checkpoint(tmp_path / "stop.ckpt")
     second = _Recorder()
-    _trainer(10).fit(second, datamodule=_module(rooms), ckpt_path=tmp_path / "stop.ckpt")
+    _trainer(10).fit(second, datamodule=_module(rooms, workers=workers, **drawn), ckpt_path=tmp_path / "stop.ckpt")
     assert first.seen + second.seen == whole.seen
     assert torch.equal(second.weight, whole.weight)
 
@@ -154,7 +157,7 @@ def test_the_memory_cache_forgets_the_oldest_frame(rooms, monkeypatch):
     load = rooms.load
     monkeypatch.setattr(rooms, "load", lambda scene, ids: loads.append(list(ids)) or load(scene, ids))
     frame_bytes = SIZE[0] * SIZE[1] * 7 + 25 * 4
-    cache = FrameCache(rooms, SIZE, 3 * frame_bytes)
+    cache = FrameCache(rooms, Framing(SIZE).apply, 3 * frame_bytes)
     first = cache.load("room-000000", [0, 1, 2])
     cache.load("room-000000", [0, 1])
     cache.load("room-000000", [3])  # drops frame 2

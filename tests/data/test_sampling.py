@@ -98,6 +98,13 @@ def test_views_are_distinct_frames_of_a_window_around_the_anchor():
     assert len(starts) > 100
 
 
+def test_devices_own_disjoint_places_of_the_row():
+    views = ViewSampler(2, 6, max_images=12)
+    places = [place for step in range(50) for rank in range(3) for place in views.slots(step, rank, 3)]
+    assert len(places) == len(set(places))
+    assert places == sorted(places)
+
+
 def test_scenes_of_one_step_draw_different_views():
     sampler = ViewSampler(4, 4)
     assert sampler.views(0, "a", range(100), 0).context != sampler.views(0, "a", range(100), 1).context

@@ -2,52 +2,21 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
-import torch
 from lightning.pytorch import LightningDataModule
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import DataLoader
 
-from vg2gt.data.base import DataError, SceneSource, SourceMaker, training_frames
+from vg2gt.data.base import Frames, SceneSource, SourceMaker
+from vg2gt.data.batches import BatchDataset
 from vg2gt.data.evaluation_views import EvaluationViews
-from vg2gt.data.frame_cache import FrameCache
-from vg2gt.data.sampling import SceneViews, StepSampler, ViewSampler, usable_scenes
-from vg2gt.types import Batch, Cameras
-
-log = logging.getLogger(__name__)
-
-
-class BatchDataset(Dataset[Batch]):
-    """Turns the views of a step into a batch; indexed by what ``StepSampler`` yields.
-
-    Args:
-        source: the scenes.
-        image_size: ``(height, width)`` of the batches.
-        memory_mb: decoded frames kept in memory, in each process.
-    """
-
-    def __init__(self, source: SceneSource, image_size: tuple[int, int], memory_mb: int) -> None:
-        self.source = source
-        self.cache = FrameCache(source, image_size, memory_mb * 2**20)
-
-    def __getitem__(self, views: tuple[SceneViews, ...]) -> Batch:
-        scenes = [self.cache.load(view.scene, (*view.context, *view.target)) for view in views]
-
-        def stack(name: str) -> torch.Tensor:
-            return torch.stack([getattr(scene, name) for scene in scenes])
-
-        depth = stack("depth")
-        return Batch(
-            images=stack("images"),
-            depth=depth,
-            cameras=Cameras(stack("world_to_camera"), stack("intrinsics"), (depth.shape[-2], depth.shape[-1])),
-            is_metric=torch.tensor([self.source.scene_is_metric(view.scene) for view in views]),
-            frame_ids=torch.tensor([(*view.context, *view.target) for view in views], dtype=torch.int64),
-            scene=tuple(view.scene for view in views),
-            num_context=len(views[0].context),
-        )
+from vg2gt.data.framing import Crop, Fit, FramingSampler
+from vg2gt.data.overlap import refuse_overlap, refuse_untrainable
+from vg2gt.data.sampling import StepSampler, ViewSampler, usable_scenes
+from vg2gt.data.transforms import reduce_to_cover
+from vg2gt.types import Batch
 
 
 class SceneDataModule(LightningDataModule):
@@ -59,8 +28,7 @@ class SceneDataModule(LightningDataModule):
     Args:
         train: training scenes, or what makes them (``_partial_: true``): then called with ``common``.
         val: evaluation scenes, likewise.
-        image_size: ``(height, width)`` of every image, best a multiple of the backbone's patch size; frames are resized
-            until they cover it and cropped at the centre.
+        image_size: ``(height, width)`` of every image, best a multiple of the backbone's patch size.
         train_scenes: use at most this many training scenes; None: all.
         eval_scenes: use at most this many evaluation scenes; None: all.
         min_views: fewest context views of a training step.
@@ -75,6 +43,13 @@ class SceneDataModule(LightningDataModule):
         seed: seeds the choice of scenes and views.
         workers: loader processes; 0 decodes in the training process.
         memory_mb: decoded frames kept in memory by each process.
+        fit: ``cover``: frames are resized until they cover ``image_size`` and cropped; ``pad``: until they fit into it,
+            with black around them that has no depth.
+        aspect: draw the shape of a training step's images from this range of height / width, at about the area of
+            ``image_size`` (``FramingSampler``); None: all of ``image_size``. Evaluation is never drawn.
+        size_multiple: drawn sizes are multiples of this; the backbone's patch size.
+        crop: training crops at the ``center`` or at ``random``.
+        zoom: range from which a training scene's zoom is drawn.
         common: arguments that ``train`` and ``val`` share, such as the dataset's ``root``.
     """
 
@@ -97,12 +72,18 @@ class SceneDataModule(LightningDataModule):
         seed: int = 0,
         workers: int = 0,
         memory_mb: int = 1024,
+        fit: Fit = "cover",
+        aspect: Sequence[float] | None = None,
+        size_multiple: int = 14,
+        crop: Crop = "center",
+        zoom: Sequence[float] = (1.0, 1.0),
         **common: Any,
     ) -> None:
         super().__init__()
         self.sampler = ViewSampler(min_views, max_views, max_images, expand_ratio, target_views, seed)
         self.eval_views = EvaluationViews(eval_context, eval_target, eval_window)
-        self.image_size = (int(image_size[0]), int(image_size[1]))
+        size = (int(image_size[0]), int(image_size[1]))
+        self.framing = FramingSampler(size, aspect, size_multiple, fit, crop, zoom, seed)
         self.common = common
         self.train_scenes = train_scenes
         self.eval_scenes = eval_scenes
@@ -117,6 +98,9 @@ class SceneDataModule(LightningDataModule):
     def setup(self, stage: str | None = None) -> None:
         """Indexes the scenes and refuses evaluation targets that training would see.
 
+        Training scenes that cannot be read or are too short are left out with a warning; an evaluation scene with
+        either fault is an error, because figures must not change silently.
+
         Raises:
             DataError: if the data is missing, unusable, or shared by training and evaluation.
         """
@@ -126,9 +110,9 @@ class SceneDataModule(LightningDataModule):
         self._train_names = usable_scenes(train, self.sampler, self.train_scenes)
         names = list(val.scenes)[: self.eval_scenes]
         self._val_views = [views for name in names for views in self.eval_views.choose(val, name)]
-        refuse_overlap(train, self._train_names, self._val_views)
-        self._train = BatchDataset(train, self.image_size, self.memory_mb)
-        self._val = BatchDataset(val, self.image_size, self.memory_mb)
+        refuse_overlap(train, self._train_names, val, self._val_views)
+        self._train = BatchDataset(train, self._training_size(), self.memory_mb, replace_damaged=True)
+        self._val = BatchDataset(val, self.framing.still.apply, self.memory_mb)
 
     def train_dataloader(self) -> DataLoader[Batch]:
         """Batches from the trainer's current step on; one item of the loader is one batch.
@@ -148,6 +132,7 @@ class SceneDataModule(LightningDataModule):
             start_step=lambda: trainer.global_step if trainer else 0,
             rank=trainer.global_rank if trainer else 0,
             world_size=trainer.world_size if trainer else 1,
+            framing=self.framing,
         )
         return self._loader(self._train, sampler)
 
@@ -161,6 +146,12 @@ class SceneDataModule(LightningDataModule):
         """The evaluation batches."""
         return self.val_dataloader()
 
+    def _training_size(self) -> Callable[[Frames], Frames]:
+        """What is kept of a training frame: its final size, or as much as any framing can need."""
+        if not self.framing.moves:
+            return self.framing.still.apply
+        return partial(reduce_to_cover, size=self.framing.largest)
+
     def _source(self, make: SceneSource | SourceMaker) -> SceneSource:
         return make if isinstance(make, SceneSource) else make(**self.common)
 
@@ -172,41 +163,3 @@ class SceneDataModule(LightningDataModule):
             num_workers=self.workers,
             persistent_workers=self.workers > 0,
         )
-
-
-def refuse_untrainable(source: SceneSource) -> None:
-    """Refuses to train on scenes without depth or cameras, which the losses compare with.
-
-    Raises:
-        DataError: saying what the source lacks.
-    """
-    lacking = [name for name, there in (("depth", source.has_depth), ("cameras", source.has_cameras)) if not there]
-    if lacking:
-        raise DataError(
-            f"{type(source).__name__} has no {' and no '.join(lacking)}: it serves reconstruction and cannot be "
-            "trained on; choose another dataset for data.train, or the loader's depth option"
-        )
-
-
-def refuse_overlap(train: SceneSource, scenes: Sequence[str], evaluation: Sequence[SceneViews]) -> None:
-    """Refuses evaluation targets that are training frames.
-
-    Scenes should differ altogether. Where one recording serves both ends, its targets must be frames held out of
-    training, which is said in the log.
-
-    Raises:
-        DataError: naming the first scene whose targets, or whole scene without targets, training would see.
-    """
-    names = set(scenes)
-    shared = sorted({views.scene for views in evaluation} & names)
-    for views in evaluation:
-        if views.scene not in names:
-            continue
-        seen = set(training_frames(train, views.scene)) & set(views.target or views.context)
-        if seen:
-            raise DataError(
-                f"scene {views.scene} is used for training and for evaluation: {len(seen)} of its evaluation frames "
-                "are trained on; give disjoint scenes (data.train..., data.val...) or hold frames out of training"
-            )
-    if shared:
-        log.info("%d scenes serve training and evaluation; scored are frames held out of training", len(shared))

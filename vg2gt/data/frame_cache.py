@@ -3,27 +3,27 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
 
 from vg2gt.data.base import Frames, SceneSource
-from vg2gt.data.transforms import from_bytes, resize_to_cover, to_bytes
+from vg2gt.data.transforms import from_bytes, to_bytes
 
 
 class FrameCache:
-    """Loads frames at their final size; colour is kept as uint8, depth and cameras as they are.
+    """Loads prepared frames; colour is kept as uint8, depth and cameras as they are.
 
     Args:
         source: where frames come from.
-        size: image ``(height, width)`` they are resized to.
+        prepare: resizes decoded frames, all of a scene to one size, before they are kept.
         capacity: bytes kept.
     """
 
-    def __init__(self, source: SceneSource, size: tuple[int, int], capacity: int) -> None:
+    def __init__(self, source: SceneSource, prepare: Callable[[Frames], Frames], capacity: int) -> None:
         self.source = source
-        self.size = size
+        self.prepare = prepare
         self.capacity = capacity
         self._frames: OrderedDict[tuple[str, int], Frames] = OrderedDict()
         self._used = 0
@@ -40,10 +40,11 @@ class FrameCache:
             torch.stack([frame.depth for frame in chosen]),
             torch.stack([frame.world_to_camera for frame in chosen]),
             torch.stack([frame.intrinsics for frame in chosen]),
+            chosen[0].sparse_depth,
         )
 
     def _decode(self, scene: str, frame_ids: Sequence[int]) -> dict[int, Frames]:
-        frames = resize_to_cover(self.source.load(scene, frame_ids), self.size)
+        frames = self.prepare(self.source.load(scene, frame_ids))
         frames = replace(frames, images=to_bytes(frames.images))
         return {frame: frames.map(lambda tensor, row=row: tensor[row].clone()) for row, frame in enumerate(frame_ids)}
 

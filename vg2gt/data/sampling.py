@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import lru_cache
 from math import gcd, lcm
@@ -17,6 +17,7 @@ import numpy as np
 from torch.utils.data import Sampler
 
 from vg2gt.data.base import DataError, SceneSource, training_frames
+from vg2gt.data.framing import Framing, FramingSampler
 
 log = logging.getLogger(__name__)
 
@@ -32,11 +33,13 @@ class SceneViews:
         scene: the scene's name.
         context: frame ids of the input views; the first is the anchor, whose camera becomes the world frame.
         target: frame ids of the held-out views, disjoint from ``context``.
+        framing: size, zoom and window drawn for the scene; None: as in evaluation.
     """
 
     scene: str
     context: tuple[int, ...]
     target: tuple[int, ...] = ()
+    framing: Framing | None = None
 
 
 @dataclass(frozen=True)
@@ -236,7 +239,7 @@ def _nothing_usable(
 
 
 class StepSampler(Sampler[tuple[SceneViews, ...]]):
-    """Yields, step after step, the views of one device's batch.
+    """Yields, step after step, the views of one device's batch, and how they are framed.
 
     Args:
         source: the training scenes.
@@ -247,6 +250,7 @@ class StepSampler(Sampler[tuple[SceneViews, ...]]):
             the epoch that holds this step.
         rank: number of this device.
         world_size: devices.
+        framing: draws sizes and crops; None: nothing is drawn.
     """
 
     def __init__(
@@ -258,10 +262,12 @@ class StepSampler(Sampler[tuple[SceneViews, ...]]):
         start_step: Callable[[], int] = lambda: 0,
         rank: int = 0,
         world_size: int = 1,
+        framing: FramingSampler | None = None,
     ) -> None:
         self.source = source
         self.pool = scene_pool(source, scenes, views.seed)
         self.views = views
+        self.framing = framing
         self.steps = steps
         self.start_step = start_step
         self.rank = rank
@@ -280,7 +286,8 @@ class StepSampler(Sampler[tuple[SceneViews, ...]]):
         places = self.views.slots(step, self.rank, self.world_size)
         scenes = [self.pool.scene(place) for place in places]
         first = self.rank * len(scenes)
-        return tuple(
-            self.views.views(step, scene, training_frames(self.source, scene), first + number)
-            for number, scene in enumerate(scenes)
-        )
+        return tuple(self._scene(step, scene, first + number) for number, scene in enumerate(scenes))
+
+    def _scene(self, step: int, scene: str, slot: int) -> SceneViews:
+        views = self.views.views(step, scene, training_frames(self.source, scene), slot)
+        return replace(views, framing=self.framing.draw(step, slot)) if self.framing else views

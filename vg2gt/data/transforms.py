@@ -8,6 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
+from torch.nn.functional import pad as constant_pad
 
 from vg2gt.data.base import Frames
 from vg2gt.geometry.cameras import crop_intrinsics, resize_intrinsics
@@ -67,14 +68,62 @@ def crop(frames: Frames, top: int, left: int, size: tuple[int, int]) -> Frames:
     )
 
 
-def resize_to_cover(frames: Frames, size: tuple[int, int]) -> Frames:
-    """Resizes frames, keeping their shape, until they cover ``size`` (height, width), and crops the centre."""
+def pad(frames: Frames, top: int, left: int, size: tuple[int, int]) -> Frames:
+    """Puts frames into black images of ``size`` (height, width), their first pixel at (``top``, ``left``).
+
+    What is added has no depth.
+    """
+    height, width = frames.depth.shape[-2:]
+    margins = (left, size[1] - left - width, top, size[0] - top - height)
+    return replace(
+        frames,
+        images=constant_pad(frames.images, margins),
+        depth=constant_pad(frames.depth, margins),
+        intrinsics=crop_intrinsics(frames.intrinsics, -left, -top),
+    )
+
+
+def resize_to_cover(
+    frames: Frames, size: tuple[int, int], zoom: float = 1.0, place: tuple[float, float] | None = None
+) -> Frames:
+    """Resizes frames, keeping their shape, until they cover ``size`` (height, width), and crops.
+
+    Args:
+        frames: frames of any size.
+        size: of the result.
+        zoom: resizes by this factor more; at least 1.
+        place: of the window in the room it has, (down, right) in [0, 1); None: the middle.
+    """
+    height, width = frames.depth.shape[-2:]
+    scale = max(size[0] / height, size[1] / width) * zoom
+    # Rounding to whole pixels changes the two scales a little; the intrinsics follow the true ones.
+    covering = tuple(max(least, _whole(side * scale)) for least, side in zip(size, (height, width), strict=True))
+    room = (covering[0] - size[0], covering[1] - size[1])
+    resized = resize(frames, (covering[0], covering[1]))
+    if place is None:
+        return crop(resized, room[0] // 2, room[1] // 2, size)
+    return crop(resized, int(place[0] * (room[0] + 1)), int(place[1] * (room[1] + 1)), size)
+
+
+def resize_to_fit(frames: Frames, size: tuple[int, int]) -> Frames:
+    """Resizes frames, keeping their shape, until they fit into ``size`` (height, width), and pads around them."""
+    height, width = frames.depth.shape[-2:]
+    scale = min(size[0] / height, size[1] / width)
+    inner = (min(size[0], max(1, _whole(height * scale))), min(size[1], max(1, _whole(width * scale))))
+    return pad(resize(frames, inner), (size[0] - inner[0]) // 2, (size[1] - inner[1]) // 2, size)
+
+
+def reduce_to_cover(frames: Frames, size: tuple[int, int]) -> Frames:
+    """Makes frames smaller, keeping their shape, until they just cover ``size``; smaller frames stay as they are."""
     height, width = frames.depth.shape[-2:]
     scale = max(size[0] / height, size[1] / width)
-    # Rounding to whole pixels changes the two scales a little; the intrinsics follow the true ones.
-    covering = (max(size[0], math.floor(height * scale + 0.5)), max(size[1], math.floor(width * scale + 0.5)))
-    resized = resize(frames, covering)
-    return crop(resized, (covering[0] - size[0]) // 2, (covering[1] - size[1]) // 2, size)
+    if scale >= 1:
+        return frames
+    return resize(frames, (max(size[0], _whole(height * scale)), max(size[1], _whole(width * scale))))
+
+
+def _whole(length: float) -> int:
+    return math.floor(length + 0.5)
 
 
 def to_bytes(images: Tensor) -> Tensor:

@@ -1,0 +1,119 @@
+"""Frames that cannot be read: replaced and counted in training, an error in evaluation."""
+
+import logging
+from pathlib import Path
+
+import pytest
+import torch
+
+from vg2gt.data import DataError, RGBDFolder, SceneDataModule, SyntheticScenes
+from vg2gt.data.batches import BatchDataset
+from vg2gt.data.framing import Framing
+from vg2gt.data.sampling import SceneViews
+
+from .conftest import SIZE
+
+
+def _dataset(folder: Path, memory_mb: int = 10, **options) -> BatchDataset:
+    source = RGBDFolder(str(folder), holdout=None)
+    return BatchDataset(source, Framing(SIZE).apply, memory_mb, **options)
+
+
+def _truncate(folder: Path, *names: str) -> None:
+    for name in names:
+        path = folder / name
+        path.write_bytes(path.read_bytes()[:-200])
+
+
+def test_the_nearest_readable_frame_takes_the_place_of_a_damaged_one(write_recording, caplog):
+    folder = write_recording(frames=6)  # frames 10 .. 15
+    _truncate(folder, "images/00012.png", "depth/00013.png")
+    views = (SceneViews("office", (12, 10, 13), (15,)),)
+    dataset = _dataset(folder, replace_damaged=True)
+    with caplog.at_level(logging.WARNING):
+        batch = dataset[views]
+    assert batch.frame_ids.tolist() == [[11, 10, 14, 15]]
+    direct = dataset.source.load("office", [11, 10, 14, 15])
+    assert torch.equal(batch.cameras.world_to_camera[0], direct.world_to_camera)
+    assert torch.equal(batch.depth[0], direct.depth)
+    warnings = [record.getMessage() for record in caplog.records]
+    assert len(warnings) == 2
+    assert "frame 12 of scene office" in warnings[0]
+    assert "00012.png" in warnings[0]
+    assert "number 2" in warnings[1]
+    assert "00013.png" in warnings[1]
+
+    caplog.clear()
+    assert dataset[views].frame_ids.tolist() == [[11, 10, 14, 15]]
+    assert not caplog.records  # warned once
+    others = [_dataset(folder, 0, replace_damaged=True), dataset]
+    others[0][(SceneViews("office", (13, 14)),)]  # another history
+    assert all(other[views].frame_ids.tolist() == [[11, 10, 14, 15]] for other in others)
+
+
+def test_evaluation_never_replaces_frames(write_recording):
+    folder = write_recording(frames=6)
+    _truncate(folder, "images/00012.png")
+    with pytest.raises(DataError, match=r"00012\.png of scene office"):
+        _dataset(folder)[(SceneViews("office", (12, 10)),)]
+
+
+def test_a_scene_that_runs_out_of_frames_is_named(write_recording):
+    folder = write_recording(frames=4)
+    _truncate(folder, "images/00010.png", "images/00012.png")
+    dataset = _dataset(folder, replace_damaged=True)
+    assert dataset[(SceneViews("office", (10, 12)),)].frame_ids.tolist() == [[11, 13]]
+    with pytest.raises(DataError, match="scene office has too few readable frames left for a sample of 3"):
+        dataset[(SceneViews("office", (10, 11, 12)),)]
+
+
+def test_held_out_frames_never_step_in(write_recording):
+    folder = write_recording(frames=6)
+    _truncate(folder, "images/00010.png")
+    source = RGBDFolder(str(folder), holdout=3)  # 11 and 14
+    dataset = BatchDataset(source, Framing(SIZE).apply, 1, replace_damaged=True)
+    assert dataset[(SceneViews("office", (10,)),)].frame_ids.tolist() == [[12]]
+
+
+def test_a_damaged_recording_trains_in_workers_as_without(write_recording):
+    folder = write_recording(frames=6)
+    _truncate(folder, "images/00012.png")
+    options = {
+        "image_size": SIZE, "min_views": 2, "max_views": 3, "max_images": 6, "steps_per_epoch": 8, "root": str(folder),
+        "holdout": 5, "eval_context": 2, "eval_target": 1,
+    }  # fmt: skip
+    runs = [
+        list(SceneDataModule(RGBDFolder, RGBDFolder, workers=workers, **options).train_dataloader())
+        for workers in (0, 1, 2)
+    ]
+    assert all(12 not in batch.frame_ids.flatten() for batch in runs[0])
+    for other in runs[1:]:
+        for a, b in zip(runs[0], other, strict=True):
+            assert torch.equal(a.frame_ids, b.frame_ids)
+            assert torch.equal(a.images, b.images)
+
+
+class Floors(SyntheticScenes):
+    """Every two scenes are recordings of one place."""
+
+    def place(self, scene: str) -> str:
+        return f"floor-{int(scene[-6:]) // 2}"
+
+
+def test_evaluation_of_a_place_that_is_trained_on_is_refused():
+    train, val = Floors(3, num_frames=6, size=SIZE), Floors(1, first_seed=3, num_frames=6, size=SIZE)
+    module = SceneDataModule(train, val, min_views=2, max_views=2, eval_context=[0], eval_target=[1])
+    with pytest.raises(DataError, match=r"room-000003 and training scene room-000002 show the same place \(floor-1\)"):
+        module.setup()
+    SceneDataModule(train, val, train_scenes=2, min_views=2, max_views=2, eval_context=[0], eval_target=[1]).setup()
+
+
+@pytest.mark.parametrize(("lack", "word"), [("has_depth", "no depth"), ("has_cameras", "no cameras")])
+def test_scenes_without_depth_or_cameras_are_not_trained_on(lack, word):
+    train = SyntheticScenes(2, num_frames=6, size=SIZE)
+    setattr(train, lack, False)
+    val = SyntheticScenes(1, first_seed=9, num_frames=6, size=SIZE)
+    module = SceneDataModule(train, val, min_views=2, max_views=2, eval_context=[0], eval_target=[1])
+    with pytest.raises(DataError, match=word):
+        module.train_dataloader()
+    assert len(module.val_dataloader()) == 1

@@ -1,0 +1,158 @@
+"""Framing: sizes, zoom and windows are functions of the step, and intrinsics follow the pixels."""
+
+import pytest
+import torch
+
+from vg2gt.data import Frames, SceneDataModule, SyntheticScenes
+from vg2gt.data.framing import Framing, FramingSampler
+from vg2gt.data.sampling import StepSampler, ViewSampler
+from vg2gt.data.transforms import pad, reduce_to_cover
+from vg2gt.geometry.cameras import ray_directions
+
+from .conftest import SIZE
+
+
+def _rays(height: int = 60, width: int = 80, sparse: bool = False) -> Frames:
+    """Frames whose colours are the rays' directions and whose depth is the ray's x: pixels tell where they are."""
+    intrinsics = torch.tensor([[90.0, 0, 38.2], [0, 85.0, 30.9], [0, 0, 1]])[None]
+    rays = ray_directions(intrinsics, (height, width))[0]
+    images = (
+        rays.permute(2, 0, 1)[None] * torch.tensor([1.0, 1.0, 0.5])[:, None, None]
+        + torch.tensor([0.5, 0.5, 0.0])[:, None, None]
+    )
+    return Frames(images, rays[None, ..., 0] + 1, torch.eye(4)[None], intrinsics, sparse)
+
+
+FRAMINGS = [
+    Framing((28, 56)),
+    Framing((28, 56), zoom=1.3),
+    Framing((42, 28), zoom=1.2, place=(0.0, 0.99)),
+    Framing((42, 28), place=(0.4, 0.2)),
+    Framing((28, 56), fit="pad"),
+    Framing((70, 70), fit="pad"),
+    Framing((98, 126), zoom=1.1, place=(0.9, 0.1)),
+]
+
+
+@pytest.mark.parametrize("framing", FRAMINGS)
+def test_pixels_and_intrinsics_agree(framing):
+    framed = framing.apply(_rays())
+    assert framed.images.shape[-2:] == framed.depth.shape[-2:] == framing.size
+    expected = ray_directions(framed.intrinsics, framing.size)[0]
+    inside = framed.images[0, 2] > 0.499  # black: padded
+    inside[1:-1, 1:-1] &= (inside[:-2, 1:-1] & inside[2:, 1:-1] & inside[1:-1, :-2] & inside[1:-1, 2:]).clone()
+    inside[[0, -1]] = inside[:, [0, -1]] = False
+    assert inside.float().mean() > 0.4
+    colors = framed.images[0, :2].permute(1, 2, 0) - 0.5
+    assert float((colors - expected[..., :2]).abs()[inside].max()) < 0.1 / 85  # 0.1 pixels
+    assert float((framed.depth[0] - 1 - expected[..., 0]).abs()[inside].max()) < 0.51 / 90  # the nearest pixel
+    if framing.fit == "pad":
+        assert not framed.depth[0][framed.images[0, 2] == 0].any()
+
+
+def test_sparse_depth_follows_a_zoom():
+    frames = _rays(sparse=True)
+    frames.depth[:, ::2] = 0
+    framed = Framing((42, 56), zoom=1.5, place=(0.3, 0.6)).apply(frames)
+    expected = ray_directions(framed.intrinsics, (42, 56))[0, ..., 0]
+    valid = framed.depth[0] > 0
+    assert 0 < valid.float().mean() < 0.6
+    assert float((framed.depth[0] - 1 - expected).abs()[valid].max()) < 0.51 / 90
+
+
+def test_padding_moves_the_principal_point():
+    framed = pad(_rays(), 3, 5, (70, 90))
+    assert torch.equal(framed.images[..., 3:63, 5:85], _rays().images)
+    assert float(framed.images.sum()) == pytest.approx(float(_rays().images.sum()), rel=1e-6)
+    assert framed.intrinsics[0, :2, 2].tolist() == pytest.approx([43.2, 33.9])
+
+
+def test_reduced_frames_cover_and_are_never_enlarged():
+    assert reduce_to_cover(_rays(), (20, 56)).depth.shape[-2:] == (42, 56)
+    assert reduce_to_cover(_rays(), (100, 56)).depth.shape[-2:] == (60, 80)
+
+
+def test_nothing_is_drawn_by_default():
+    sampler = FramingSampler((28, 56))
+    assert not sampler.moves
+    assert sampler.draw(3, 1) is None
+    assert sampler.size(5) == sampler.largest == (28, 56)
+
+
+def test_drawn_sizes_keep_the_area_and_stay_in_range():
+    sampler = FramingSampler((224, 448), aspect=(0.33, 1.0), seed=4)
+    sizes = {sampler.size(step) for step in range(300)}
+    assert len(sizes) > 10
+    for height, width in sizes:
+        assert height % 14 == width % 14 == 0
+        assert 0.3 < height / width < 1.05
+        assert abs(height * width / (224 * 448) - 1) < 0.08
+        assert height <= sampler.largest[0]
+        assert width <= sampler.largest[1]
+
+
+def test_a_steps_scenes_share_a_size_on_all_devices_and_differ_in_zoom_and_window():
+    source = SyntheticScenes(40, num_frames=8)
+    framing = FramingSampler((56, 112), aspect=(0.5, 1), crop="random", zoom=(1, 1.3), seed=2)
+    ranks = [
+        StepSampler(source, source.scenes, ViewSampler(2, 3, 6), 9, rank=rank, world_size=2, framing=framing)
+        for rank in range(2)
+    ]
+    for step in range(20):
+        drawn = [views.framing for sampler in ranks for views in sampler.step(step) if views.framing]
+        assert len(drawn) == sum(len(sampler.step(step)) for sampler in ranks)
+        assert {frame.size for frame in drawn} == {framing.size(step)}
+        assert len({(frame.zoom, frame.place) for frame in drawn}) == len(drawn)
+        assert all(1 <= frame.zoom <= 1.3 for frame in drawn)
+    assert ranks[0].step(4) == ranks[0].step(4)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"fit": "squeeze"}, {"crop": "left"}, {"aspect": (2, 1)}, {"aspect": (0.5,)}, {"zoom": (0.5, 1)},
+        {"fit": "pad", "crop": "random"}, {"fit": "pad", "zoom": (1, 1.2)}, {"size_multiple": 0},
+    ],
+)  # fmt: skip
+def test_impossible_framings_are_refused(options):
+    with pytest.raises(ValueError, match=r"data\."):
+        FramingSampler((28, 56), **options)
+
+
+def _module(rooms: SyntheticScenes, **options) -> SceneDataModule:
+    val = SyntheticScenes(1, first_seed=100, num_frames=6, size=SIZE, cache_dir=str(rooms.cache_dir))
+    return SceneDataModule(
+        rooms, val, image_size=(14, 28), min_views=2, max_views=3, max_images=6, eval_context=[0, 2],
+        eval_target=[1], steps_per_epoch=6, **options,
+    )  # fmt: skip
+
+
+DRAWN = {"aspect": [0.4, 1.2], "size_multiple": 2, "crop": "random", "zoom": [1, 1.4]}
+
+
+def test_drawn_batches_are_the_same_with_any_workers_and_memory(rooms):
+    expected = list(_module(rooms, **DRAWN).train_dataloader())
+    assert len({batch.images.shape[-2:] for batch in expected}) > 3
+    assert len({batch.cameras.intrinsics[0, 0, 0, 0].item() for batch in expected}) == 6
+    for options in ({"workers": 1}, {"workers": 2}, {"memory_mb": 0}):
+        again = list(_module(rooms, **DRAWN, **options).train_dataloader())
+        for a, b in zip(expected, again, strict=True):
+            assert (a.scene, a.cameras.size) == (b.scene, b.cameras.size)
+            assert torch.equal(a.frame_ids, b.frame_ids)
+            assert torch.equal(a.images, b.images)
+            assert torch.equal(a.depth, b.depth)
+            assert torch.equal(a.cameras.intrinsics, b.cameras.intrinsics)
+
+
+def test_evaluation_is_never_drawn(rooms):
+    plain, drawn = (next(iter(_module(rooms, **options).val_dataloader())) for options in ({}, DRAWN))
+    assert torch.equal(plain.images, drawn.images)
+    assert torch.equal(plain.cameras.intrinsics, drawn.cameras.intrinsics)
+
+
+def test_padded_batches_hold_whole_frames(rooms):
+    batch = next(iter(_module(rooms, fit="pad").train_dataloader()))
+    assert batch.images.shape[-2:] == (14, 28)
+    assert not batch.depth[..., :, :4].any()
+    assert not batch.depth[..., :, -4:].any()
+    assert batch.depth[..., 8:20].all()

@@ -1,0 +1,107 @@
+"""From the views of a step to a batch, and what happens where a frame cannot be read."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+
+import torch
+from torch.utils.data import Dataset
+
+from vg2gt.data.base import DataError, Frames, SceneSource, training_frames
+from vg2gt.data.frame_cache import FrameCache
+from vg2gt.data.sampling import SceneViews
+from vg2gt.types import Batch, Cameras
+
+log = logging.getLogger(__name__)
+
+
+class BatchDataset(Dataset[Batch]):
+    """Turns the views of a step into a batch; indexed by what ``StepSampler`` yields.
+
+    Args:
+        source: the scenes.
+        prepare: resizes decoded frames before they are kept in memory; to their final size, where views bring no
+            framing of their own.
+        memory_mb: decoded frames kept in memory, in each process.
+        replace_damaged: for training: the nearest readable frame takes the place of one that cannot be read, with a
+            warning; otherwise that is an error.
+    """
+
+    def __init__(
+        self, source: SceneSource, prepare: Callable[[Frames], Frames], memory_mb: int, replace_damaged: bool = False
+    ) -> None:
+        self.source = source
+        self.cache = FrameCache(source, prepare, memory_mb * 2**20)
+        self.replace_damaged = replace_damaged
+        self.damaged: set[tuple[str, int]] = set()
+
+    def __getitem__(self, views: tuple[SceneViews, ...]) -> Batch:
+        ids = [self._readable(view) for view in views]
+        scenes = [self._load(view, frames) for view, frames in zip(views, ids, strict=True)]
+
+        def stack(name: str) -> torch.Tensor:
+            return torch.stack([getattr(scene, name) for scene in scenes])
+
+        depth = stack("depth")
+        return Batch(
+            images=stack("images"),
+            depth=depth,
+            cameras=Cameras(stack("world_to_camera"), stack("intrinsics"), (depth.shape[-2], depth.shape[-1])),
+            is_metric=torch.tensor([self.source.scene_is_metric(view.scene) for view in views]),
+            frame_ids=torch.tensor(ids, dtype=torch.int64),
+            scene=tuple(view.scene for view in views),
+            num_context=len(views[0].context),
+        )
+
+    def _load(self, view: SceneViews, frame_ids: Sequence[int]) -> Frames:
+        frames = self.cache.load(view.scene, frame_ids)
+        return view.framing.apply(frames) if view.framing else frames
+
+    def _readable(self, view: SceneViews) -> tuple[int, ...]:
+        """The frames of a scene, those that cannot be read replaced.
+
+        The result depends on the files alone, not on what was read before. The frames are in memory afterwards.
+        """
+        ids = (*view.context, *view.target)
+        if not self.replace_damaged:
+            return ids
+        if self.damaged.isdisjoint((view.scene, frame) for frame in ids):
+            try:
+                self.cache.load(view.scene, ids)
+                return ids
+            except DataError:
+                pass  # which frame it was is found out one by one
+        return self._replace(view.scene, ids)
+
+    def _replace(self, scene: str, ids: Sequence[int]) -> tuple[int, ...]:
+        frames = training_frames(self.source, scene)
+        chosen = list(ids)
+        for place in [place for place, frame in enumerate(ids) if not self._reads(scene, frame)]:
+            middle = frames.index(ids[place])
+            nearest = sorted(range(len(frames)), key=lambda row, middle=middle: (abs(row - middle), row))
+            taken = {*ids, *chosen}
+            candidates = (frames[row] for row in nearest if frames[row] not in taken)
+            found = next((frame for frame in candidates if self._reads(scene, frame)), None)
+            if found is None:
+                raise DataError(
+                    f"scene {scene} has too few readable frames left for a sample of {len(ids)} views: restore its "
+                    "files (the warnings name them) or remove the scene from the training scenes"
+                )
+            chosen[place] = found
+        return tuple(chosen)
+
+    def _reads(self, scene: str, frame: int) -> bool:
+        if (scene, frame) in self.damaged:
+            return False
+        try:
+            self.cache.load(scene, [frame])
+        except DataError as error:
+            self.damaged.add((scene, frame))
+            log.warning(
+                "frame %d of scene %s is left out of training, number %d to be so in this process; its neighbour takes "
+                "its place: %s",
+                frame, scene, len(self.damaged), error,
+            )  # fmt: skip
+            return False
+        return True

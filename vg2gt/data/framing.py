@@ -1,0 +1,134 @@
+"""How frames are brought to the size of a batch: whole or cut, in the middle or at random, always with intrinsics."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+
+from vg2gt.data.base import Frames
+from vg2gt.data.transforms import resize_to_cover, resize_to_fit
+
+_SIZE, _WINDOW = 4, 5  # random streams, apart from those of the view sampler
+
+Fit = Literal["cover", "pad"]
+Crop = Literal["center", "random"]
+
+
+@dataclass(frozen=True)
+class Framing:
+    """The framing of one scene's frames.
+
+    Attributes:
+        size: ``(height, width)`` of the result.
+        fit: ``cover`` resizes until the size is covered and crops, ``pad`` until the whole frame fits and pads.
+        zoom: at least 1; frames are resized by this factor more before they are cropped.
+        place: the cropped window's place in the room it has, (down, right) in [0, 1); None: the middle.
+    """
+
+    size: tuple[int, int]
+    fit: Fit = "cover"
+    zoom: float = 1.0
+    place: tuple[float, float] | None = None
+
+    def apply(self, frames: Frames) -> Frames:
+        """Returns frames of ``size`` with their intrinsics."""
+        if self.fit == "pad":
+            return resize_to_fit(frames, self.size)
+        return resize_to_cover(frames, self.size, self.zoom, self.place)
+
+
+@dataclass(frozen=True)
+class FramingSampler:
+    """Draws the framing of training scenes: a pure function of seed, step and scene, like all sampling.
+
+    The size is drawn once a step, the same on every device. Zoom and window are drawn once a scene, so that views which
+    shared intrinsics still do and overlap as before. ``crop="random"`` moves the principal point off the middle; only
+    for backbones that are told intrinsics or predict the principal point. Colours are never changed.
+
+    Args:
+        image_size: ``(height, width)``, kept where ``aspect`` is None; otherwise its area is kept about.
+        aspect: range of height / width from which a step's shape is drawn, evenly in its logarithm; None: fixed.
+        size_multiple: drawn sizes are multiples of this (the backbone's patch size).
+        fit: see ``Framing``; ``pad`` keeps the whole frame and allows neither zoom nor random crops.
+        crop: where the window lies: ``center`` or ``random``.
+        zoom: range of the zoom, evenly in its logarithm.
+        seed: seeds every draw.
+
+    Raises:
+        ValueError: if a range or choice is impossible.
+    """
+
+    image_size: tuple[int, int]
+    aspect: Sequence[float] | None = None
+    size_multiple: int = 14
+    fit: Fit = "cover"
+    crop: Crop = "center"
+    zoom: Sequence[float] = (1.0, 1.0)
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name, value, choices in (("fit", self.fit, get_args(Fit)), ("crop", self.crop, get_args(Crop))):
+            if value not in choices:
+                raise ValueError(f"data.{name} must be one of {', '.join(choices)}, got {value!r}")
+        for name, bounds, least in (("aspect", self.aspect, 0.05), ("zoom", self.zoom, 1.0)):
+            if bounds is not None and (len(bounds) != 2 or not least <= bounds[0] <= bounds[1] <= 20):
+                raise ValueError(f"data.{name} must be a range [least, most] within [{least}, 20], got {bounds}")
+        if self.size_multiple < 1 or min(self.image_size) < self.size_multiple:
+            raise ValueError(f"data.size_multiple must be in [1, {min(self.image_size)}], got {self.size_multiple}")
+        if self.fit == "pad" and (self.crop != "center" or tuple(self.zoom) != (1, 1)):
+            raise ValueError("data.fit=pad keeps the whole frame: leave data.crop=center and data.zoom=[1,1]")
+
+    @property
+    def still(self) -> Framing:
+        """The framing of evaluation: never drawn."""
+        return Framing(self.image_size, self.fit)
+
+    @property
+    def moves(self) -> bool:
+        """Whether anything is drawn at all."""
+        return self.aspect is not None or self.crop == "random" or tuple(self.zoom) != (1, 1)
+
+    @property
+    def largest(self) -> tuple[int, int]:
+        """``(height, width)`` that covers every size and zoom that can be drawn."""
+        shapes = self.aspect or (self.image_size[0] / self.image_size[1],)
+        sizes = [self._size(shape) for shape in shapes]
+        zoom = self.zoom[1]
+        return math.ceil(max(size[0] for size in sizes) * zoom), math.ceil(max(size[1] for size in sizes) * zoom)
+
+    def size(self, step: int) -> tuple[int, int]:
+        """``(height, width)`` of a step's images on all devices."""
+        if self.aspect is None:
+            return self.image_size
+        return self._size(_between(self.aspect, np.random.default_rng((self.seed, _SIZE, step)).random()))
+
+    def draw(self, step: int, slot: int) -> Framing | None:
+        """The framing of one scene; None where nothing is drawn.
+
+        Args:
+            step: number of the training step.
+            slot: number of the scene in the step over all devices.
+        """
+        if not self.moves:
+            return None
+        rng = np.random.default_rng((self.seed, _WINDOW, step, slot))
+        zoom, down, right = rng.random(3).tolist()
+        place = (down, right) if self.crop == "random" else None
+        return Framing(self.size(step), self.fit, _between(self.zoom, zoom), place)
+
+    def _size(self, shape: float) -> tuple[int, int]:
+        """About the area of ``image_size`` in another shape (height / width)."""
+        if self.aspect is None:
+            return self.image_size
+        area, unit = self.image_size[0] * self.image_size[1], self.size_multiple
+        height = max(1, round(math.sqrt(area * shape) / unit))
+        width = max(1, round(math.sqrt(area / shape) / unit))
+        return height * unit, width * unit
+
+
+def _between(bounds: Sequence[float], fraction: float) -> float:
+    return float(bounds[0] * (bounds[1] / bounds[0]) ** fraction)
