@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from vg2gt.geometry.alignment import Similarity, align_cameras, fit_depth_scale, weighted_median
+from vg2gt.geometry.alignment import Similarity, align_cameras, align_points, fit_depth_scale, weighted_median
 from vg2gt.geometry.cameras import project
 from vg2gt.geometry.rotations import quat_to_matrix
 from vg2gt.types import Cameras
@@ -186,3 +186,40 @@ def test_a_similarity_moves_points_and_cameras_together() -> None:
 def test_float32_cameras_give_float32_similarities() -> None:
     cameras = random_cameras(1, 4).map(Tensor.float)
     assert align_cameras(cameras, cameras).rotation.dtype == torch.float32
+
+
+def test_points_are_aligned_exactly_whatever_the_similarity() -> None:
+    points, truth = randn(3, 20, 3), random_similarity(3)
+    found = align_points(points, truth.apply(points))
+    for name in ("scale", "rotation", "translation"):
+        torch.testing.assert_close(getattr(found, name), getattr(truth, name))
+
+
+def test_noisy_points_are_aligned_by_least_squares() -> None:
+    """Umeyama's closed form: singular values of the covariance over the variance."""
+    points, truth = randn(1, 60, 3), random_similarity(1)
+    reference = truth.apply(points) + 0.1 * randn(1, 60, 3, seed=4)
+    found = align_points(points, reference)
+    x, y = (p[0] - p[0].mean(0) for p in (points, reference))
+    u, d, vh = torch.linalg.svd(y.T @ x / 60)
+    sign = torch.tensor([1.0, 1.0, float(torch.linalg.det(u @ vh).sign())], dtype=torch.float64)
+    torch.testing.assert_close(found.rotation[0], u @ torch.diag(sign) @ vh)
+    torch.testing.assert_close(found.scale[0], (d * sign).sum() / x.square().sum(1).mean())
+    torch.testing.assert_close(found.apply(points).mean(1), reference.mean(1))
+
+
+def test_alignment_of_points_matches_evo() -> None:
+    evo = pytest.importorskip("evo.core.geometry", reason="needs evo (GPL; pip install evo)")
+    for seed in range(5):
+        points, reference = randn(1, 30, 3, seed=seed), randn(1, 30, 3, seed=seed + 50)  # mirrored ones among them
+        rotation, translation, scale = evo.umeyama_alignment(points[0].T.numpy(), reference[0].T.numpy(), True)
+        found = align_points(points, reference)
+        assert found.rotation[0].numpy() == pytest.approx(rotation, abs=1e-9)
+        assert found.translation[0].numpy() == pytest.approx(translation, abs=1e-9)
+        assert float(found.scale) == pytest.approx(scale, rel=1e-9)
+
+
+def test_points_that_coincide_keep_their_unit() -> None:
+    found = align_points(torch.ones(1, 5, 3), torch.full((1, 5, 3), 4.0))
+    assert float(found.scale) == 1
+    torch.testing.assert_close(found.apply(torch.ones(1, 1, 3)), torch.full((1, 1, 3), 4.0))

@@ -43,3 +43,19 @@ def test_too_few_or_coinciding_points_have_no_figure() -> None:
     assert math.isnan(cv(cloud(8)))
     assert not math.isnan(cv(cloud(9)))
     assert math.isnan(cv(torch.ones(30, 3)))
+
+
+def test_a_periodic_lattice_has_no_variation() -> None:
+    """Two rings in perpendicular planes of four dimensions: a square lattice without edges, bent but not stretched."""
+    angle = torch.arange(40, dtype=torch.float64) * 2 * math.pi / 40
+    u, v = torch.meshgrid(angle, angle, indexing="ij")
+    lattice = torch.stack((u.cos(), u.sin(), v.cos(), v.sin()), -1).reshape(-1, 4)
+    for k in (1, 4, 8):
+        assert cv(lattice, k) < 1e-9
+
+
+def test_a_lattice_with_edges_has_equal_nearest_distances() -> None:
+    """Every point of a cubic lattice, corners too, has three neighbours one step away; its edges show from k = 4 on."""
+    lattice = torch.cartesian_prod(*[torch.arange(5.0)] * 3)
+    assert cv(lattice, 3) < 1e-9
+    assert cv(lattice, 8) > 0.01

@@ -143,8 +143,31 @@ def align_cameras(predicted: Cameras, reference: Cameras, still_scale: Tensor | 
     return Similarity(scale.to(dtype), rotation.to(dtype), translation.to(dtype))
 
 
+def align_points(points: Tensor, reference: Tensor) -> Similarity:
+    """The least-squares similarity between corresponding points (Umeyama 1991).
+
+    Args:
+        points: ``[B, N, 3]``.
+        reference: ``[B, N, 3]``, the same points in another frame and unit.
+
+    Returns:
+        ``[B]`` similarities from the points' frame to the reference's, computed in float64, in the input's dtype. Of
+        points that coincide the scale is 1.
+    """
+    source, target = points.double(), reference.double()
+    source_mean, target_mean = source.mean(1), target.mean(1)
+    centered = source - source_mean[:, None]
+    rotation = _nearest_rotation((target - target_mean[:, None]).transpose(-1, -2) @ centered)
+    turned = centered @ rotation.transpose(-1, -2)
+    spread = turned.square().sum((1, 2))
+    agreement = (turned * (target - target_mean[:, None])).sum((1, 2))
+    scale = torch.where(_moves(source) & (agreement > 0), agreement / spread, 1.0)
+    translation = target_mean - scale[:, None] * (rotation @ source_mean[..., None])[..., 0]
+    return Similarity(*(part.to(points.dtype) for part in (scale, rotation, translation)))
+
+
 def _moves(centers: Tensor) -> Tensor:
-    """Whether the centres ``[B, V, 3]`` of a scene differ by more than float32's rounding."""
+    """Whether the points ``[B, N, 3]`` of a scene differ by more than float32's rounding."""
     spread = (centers - centers.mean(1, keepdim=True)).norm(dim=-1).amax(1)
     return spread > 1e-6 * centers.norm(dim=-1).amax(1)
 

@@ -1,0 +1,138 @@
+"""LPIPS with random weights against the same network written in NumPy."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from numpy.lib.stride_tricks import sliding_window_view
+from safetensors.torch import save_file
+
+from vg2gt.metrics import LPIPS, WeightsNotFoundError, load_lpips
+from vg2gt.metrics.lpips import WEIGHTS_FILE
+
+POSITIONS = {
+    0: 3,
+    2: 64,
+    5: 64,
+    7: 128,
+    10: 128,
+    12: 256,
+    14: 256,
+    17: 256,
+    19: 512,
+    21: 512,
+    24: 512,
+    26: 512,
+    28: 512,
+}
+WIDTHS = dict(zip(POSITIONS, [64, 64, 128, 128, 256, 256, 256, 512, 512, 512, 512, 512, 512], strict=True))
+COMPARED_AFTER = (2, 7, 14, 21, 28)
+
+
+@pytest.fixture(scope="module")
+def features() -> dict[str, torch.Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    state = {"classifier.6.bias": torch.zeros(3)}
+    for position, channels in POSITIONS.items():
+        shape = (WIDTHS[position], channels, 3, 3)
+        state[f"features.{position}.weight"] = torch.randn(shape, generator=generator) / (9 * channels / 2) ** 0.5
+        state[f"features.{position}.bias"] = 0.1 * torch.randn(WIDTHS[position], generator=generator)
+    return state
+
+
+@pytest.fixture(scope="module")
+def channel_weights() -> dict[str, torch.Tensor]:
+    generator = torch.Generator().manual_seed(1)
+    sizes = (64, 128, 256, 512, 512)
+    return {f"lin{k}.model.1.weight": torch.rand(1, size, 1, 1, generator=generator) for k, size in enumerate(sizes)}
+
+
+def numpy_lpips(first: np.ndarray, second: np.ndarray, state: dict[str, torch.Tensor]) -> float:
+    """Float64, written from the publication: convolve, rectify, pool; compare after the last layer of each stage."""
+    shift, scale = (np.array(v)[:, None, None] for v in ((-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)))
+    maps = [(2 * np.clip(image, 0, 1) - 1 - shift) / scale for image in (first, second)]
+    total, stage = 0.0, 0
+    for position in POSITIONS:
+        weight, bias = (state[f"features.{position}.{name}"].double().numpy() for name in ("weight", "bias"))
+        for side in (0, 1):
+            windows = sliding_window_view(np.pad(maps[side], ((0, 0), (1, 1), (1, 1))), (3, 3), axis=(1, 2))
+            maps[side] = np.maximum(
+                np.einsum("chwij,ocij->ohw", windows, weight, optimize=True) + bias[:, None, None], 0
+            )
+        if position in COMPARED_AFTER:
+            unit = [m / np.linalg.norm(m, axis=0, keepdims=True) for m in maps]
+            lin = state[f"lin{stage}.model.1.weight"].double().numpy()[0]
+            total += float((lin * (unit[0] - unit[1]) ** 2).sum(0).mean())
+            stage += 1
+            maps = [m[:, : m.shape[1] // 2 * 2, : m.shape[2] // 2 * 2] for m in maps]
+            maps = [m.reshape(len(m), m.shape[1] // 2, 2, m.shape[2] // 2, 2).max((2, 4)) for m in maps]
+    return total
+
+
+def test_matches_numpy(features, channel_weights) -> None:
+    state = {**features, **channel_weights}
+    generator = torch.Generator().manual_seed(2)
+    first, second = torch.rand(2, 2, 3, 18, 21, generator=generator)
+    first = first + 0.3  # some colours beyond 1
+    found = LPIPS(state)(first, second)
+    assert found.shape == (2,)
+    expected = [numpy_lpips(a.double().numpy(), b.double().numpy(), state) for a, b in zip(first, second, strict=True)]
+    assert found.tolist() == pytest.approx(expected, rel=1e-4)
+
+
+def test_zero_for_the_same_image_and_larger_for_more_noise(features, channel_weights) -> None:
+    metric = LPIPS({**features, **channel_weights})
+    generator = torch.Generator().manual_seed(3)
+    image, noise = torch.rand(2, 3, 32, 32, generator=generator)
+    assert float(metric(image, image)) == 0
+    distances = [float(metric(image + share * (noise - image), image)) for share in (0.1, 0.3, 1.0)]
+    assert 0 < distances[0] < distances[1] < distances[2]
+    with pytest.raises(ValueError, match=r"H, W >= 16.*\(3, 8, 32\)"):
+        metric(image[:, :8], image[:, :8])
+
+
+def test_weights_from_a_file_a_folder_and_the_hubs_cache(
+    features, channel_weights, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    image, other = torch.rand(2, 3, 16, 16, generator=torch.Generator().manual_seed(4))
+    expected = float(LPIPS({**features, **channel_weights})(image, other))
+    torch.save(features, tmp_path / WEIGHTS_FILE)
+    save_file(channel_weights, tmp_path / "vgg.safetensors")
+    assert float(load_lpips(str(tmp_path))(image, other)) == expected
+
+    alone = float(load_lpips(str(tmp_path / WEIGHTS_FILE))(image, other))  # with the published channel weights
+    assert alone > 0
+    assert alone != expected
+
+    hub = tmp_path / "hub"
+    (hub / "checkpoints").mkdir(parents=True)
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(hub))
+    with pytest.raises(WeightsNotFoundError, match=r"evaluation\.lpips=download"):
+        load_lpips()
+    (tmp_path / WEIGHTS_FILE).rename(hub / "checkpoints" / WEIGHTS_FILE)
+    assert float(load_lpips()(image, other)) == alone
+
+
+def test_missing_and_wrong_weights_are_named(features, channel_weights, tmp_path: Path) -> None:
+    with pytest.raises(WeightsNotFoundError, match="weights not found"):
+        load_lpips(str(tmp_path / "nowhere.pth"))
+    with pytest.raises(WeightsNotFoundError, match="weights not found"):
+        load_lpips(str(tmp_path))
+    with pytest.raises(ValueError, match=r"features\.0\.weight.*missing"):
+        LPIPS(channel_weights)
+    wrong = {**features, **channel_weights, "features.5.bias": torch.zeros(3)}
+    with pytest.raises(ValueError, match=r"features\.5\.bias must be \(128,\), it is \(3,\)"):
+        LPIPS(wrong)
+    (tmp_path / "damaged.pth").write_bytes(b"not a checkpoint")
+    with pytest.raises(ValueError, match=r"damaged\.pth is damaged"):
+        load_lpips(str(tmp_path / "damaged.pth"))
+
+
+def test_a_download_that_fails_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    def offline(*args: object, **kwargs: object) -> None:
+        raise OSError("no route to host")
+
+    monkeypatch.setattr(torch.hub, "load_state_dict_from_url", offline)
+    with pytest.raises(WeightsNotFoundError, match=r"cannot be fetched.*no route to host"):
+        load_lpips("download")

@@ -1,0 +1,66 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from vg2gt.metrics import point_metrics
+from vg2gt.metrics.points import thin
+
+
+def cloud(count: int, seed: int) -> torch.Tensor:
+    return torch.rand(count, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+@pytest.mark.parametrize("cap", [None, 0.05])
+def test_matches_brute_force(cap: float | None) -> None:
+    predicted, reference = cloud(300, 0), cloud(400, 1)
+    distances = torch.cdist(predicted, reference)
+    there, back = distances.amin(1), distances.amin(0)
+    found = point_metrics(predicted, reference, threshold=0.06, cap=cap)
+    kept = [d if cap is None else d[d < cap] for d in (there, back)]
+    precision, recall = float((there < 0.06).double().mean()), float((back < 0.06).double().mean())
+    expected = {
+        "accuracy": float(kept[0].mean()),
+        "completeness": float(kept[1].mean()),
+        "chamfer": float(kept[0].mean() + kept[1].mean()) / 2,
+        "precision": precision,
+        "recall": recall,
+        "f_score": 2 * precision * recall / (precision + recall),
+    }
+    assert found == pytest.approx(expected, rel=1e-9)
+
+
+def test_a_shifted_plane_and_a_half_of_it() -> None:
+    x, y = torch.meshgrid(torch.arange(20.0), torch.arange(20.0), indexing="ij")
+    plane = torch.stack((x, y, 0 * x), -1).reshape(-1, 3)
+    half = plane[plane[:, 0] < 10] + torch.tensor([0, 0, 0.3])
+    found = point_metrics(half, plane, threshold=0.5)
+    assert found["accuracy"] == pytest.approx(0.3)
+    assert (found["precision"], found["recall"]) == (1.0, 0.5)
+    assert found["f_score"] == pytest.approx(2 / 3)
+    expected = np.mean([np.hypot(max(column - 9, 0), 0.3) for column in range(20)])
+    assert found["completeness"] == pytest.approx(expected)
+
+
+def test_thinning_keeps_one_point_a_cell() -> None:
+    points = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.6, 0, 0], [0.0, 0.6, 0], [0.05, 0.05, 0.05]])
+    assert thin(points, 0.5).tolist() == points[[0, 2, 3]].tolist()
+    dense = torch.cat((cloud(50, 0), cloud(50, 0) + 1e-6))
+    assert point_metrics(dense, cloud(50, 0), 0.1, downsample=1e-3)["accuracy"] < 1e-6
+
+
+def test_nothing_to_compare_has_no_figure() -> None:
+    empty = torch.empty(0, 3)
+    assert all(math.isnan(value) for value in point_metrics(empty, cloud(5, 0), 0.1).values())
+    assert all(math.isnan(value) for value in point_metrics(cloud(5, 0), empty, 0.1).values())
+    far = point_metrics(cloud(5, 0), cloud(5, 0) + 100, 0.1, cap=20)
+    assert math.isnan(far["chamfer"])
+    assert far["f_score"] == 0
+
+
+def test_wrong_inputs_are_named() -> None:
+    with pytest.raises(ValueError, match=r"predicted points must be \[N, 3\].*\(3, 4\)"):
+        point_metrics(torch.ones(3, 4), torch.ones(3, 3), 0.1)
+    with pytest.raises(ValueError, match=r"threshold must be a positive length, got 0"):
+        point_metrics(torch.ones(3, 3), torch.ones(3, 3), 0)

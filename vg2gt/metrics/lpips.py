@@ -1,0 +1,155 @@
+"""LPIPS, the learned perceptual distance, on VGG-16 features (Zhang et al. 2018, version 0.1)."""
+
+from __future__ import annotations
+
+import importlib.util
+import pickle
+from collections.abc import Mapping
+from pathlib import Path
+
+import torch
+from safetensors.torch import load_file
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+WEIGHTS_URL = "https://download.pytorch.org/models/vgg16-397923af.pth"
+WEIGHTS_FILE = WEIGHTS_URL.rpartition("/")[2]
+HOW_TO_GET = f"evaluation.lpips=download fetches {WEIGHTS_FILE} (528 MB), or evaluation.lpips=PATH of it"
+
+# Convolutions of each stage up to the activation that is compared; max pooling between the stages.
+STAGES = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512))
+# Mean and deviation of ImageNet's colours, for images in [-1, 1].
+SHIFT = (-0.030, -0.088, -0.188)
+SCALE = (0.458, 0.448, 0.450)
+SMALLEST_IMAGE = 2 ** (len(STAGES) - 1)
+EPSILON = 1e-10
+
+
+class WeightsNotFoundError(FileNotFoundError):
+    """LPIPS has no weights here; the message says how to get them."""
+
+
+class LPIPS(nn.Module):
+    """Distance of unit-length VGG-16 features, weighted by channel, averaged over the image, summed over five stages.
+
+    Args:
+        state: ``features.N.weight`` and ``features.N.bias`` of VGG-16 (torchvision's names; others are left alone) and
+            ``linK.model.1.weight``, K = 0 .. 4, the channel weights (the names of LPIPS' own file).
+
+    Raises:
+        ValueError: naming the first tensor that is missing or has another shape.
+    """
+
+    shift: Tensor
+    scale: Tensor
+
+    def __init__(self, state: Mapping[str, Tensor]) -> None:
+        super().__init__()
+        self.stages = nn.ModuleList()
+        self.channel_weights = nn.ParameterList()
+        channels, position = 3, 0
+        for stage, widths in enumerate(STAGES):
+            convolutions = nn.ModuleList()
+            for width in widths:
+                convolution = nn.Conv2d(channels, width, 3, padding=1, device="meta")
+                weight = _tensor(state, f"features.{position}.weight", (width, channels, 3, 3))
+                convolution.weight = nn.Parameter(weight)
+                convolution.bias = nn.Parameter(_tensor(state, f"features.{position}.bias", (width,)))
+                convolutions.append(convolution)
+                channels, position = width, position + 2  # an activation follows every convolution
+            position += 1  # and a pooling every stage
+            self.stages.append(convolutions)
+            self.channel_weights.append(nn.Parameter(_tensor(state, f"lin{stage}.model.1.weight", (1, channels, 1, 1))))
+        self.register_buffer("shift", torch.tensor(SHIFT)[:, None, None])
+        self.register_buffer("scale", torch.tensor(SCALE)[:, None, None])
+        self.requires_grad_(False)
+
+    @torch.no_grad()
+    def forward(self, predicted: Tensor, reference: Tensor) -> Tensor:
+        """Distance of each image, colours clamped to [0, 1].
+
+        Args:
+            predicted: ``[..., 3, H, W]``, at least 16 pixels high and wide.
+            reference: ``[..., 3, H, W]``.
+
+        Returns:
+            ``[...]``, 0 for identical images.
+
+        Raises:
+            ValueError: if the shapes differ or the images are too small.
+        """
+        if predicted.shape != reference.shape or min(predicted.shape[-2:]) < SMALLEST_IMAGE:
+            raise ValueError(
+                f"LPIPS compares images of one shape [..., 3, H, W] with H, W >= {SMALLEST_IMAGE}, got "
+                f"{tuple(predicted.shape)} and {tuple(reference.shape)}"
+            )
+        size = predicted.shape[-3:]
+        pairs = zip(predicted.reshape(-1, *size), reference.reshape(-1, *size), strict=True)
+        return torch.stack([self._distance(*pair) for pair in pairs]).reshape(predicted.shape[:-3])
+
+    def _distance(self, predicted: Tensor, reference: Tensor) -> Tensor:
+        """One pair ``[3, H, W]`` at a time: the first stage holds 128 floats for every pixel of both images."""
+        features = (torch.stack((predicted, reference)).float().clamp(0, 1) * 2 - 1 - self.shift) / self.scale
+        distance = features.new_zeros(())
+        for stage, (convolutions, weights) in enumerate(zip(self.stages, self.channel_weights, strict=True)):
+            features = F.max_pool2d(features, 2) if stage else features
+            assert isinstance(convolutions, nn.ModuleList)
+            for convolution in convolutions:
+                features = F.relu(convolution(features))
+            unit = features / (features.square().sum(1, keepdim=True).sqrt() + EPSILON)
+            distance = distance + ((unit[0] - unit[1]).square() * weights[0]).sum(0).mean()
+        return distance
+
+
+def load_lpips(source: str = "auto") -> LPIPS:
+    """Builds LPIPS from weights on this machine; only tensors are read, never code.
+
+    Args:
+        source: ``auto``: VGG-16 as torch hub has it in its cache; ``download``: fetched into that cache if needed; or
+            the path of a ``.pth`` or ``.safetensors`` file, or of a folder of them. Channel weights that are not there
+            come from torchmetrics' installation.
+
+    Raises:
+        WeightsNotFoundError: if there are no weights, saying how to get them.
+        ValueError: if the files hold something else.
+    """
+    if source == "download":
+        try:
+            features = torch.hub.load_state_dict_from_url(WEIGHTS_URL, map_location="cpu", weights_only=True)
+        except OSError as error:  # urllib's errors are
+            raise WeightsNotFoundError(f"weights not found: {WEIGHTS_URL} cannot be fetched ({error})") from error
+        return LPIPS({**_installed_channel_weights(), **features})
+    path = Path(torch.hub.get_dir()) / "checkpoints" / WEIGHTS_FILE if source == "auto" else Path(source)
+    path = path.expanduser()
+    files = sorted(p for p in path.glob("*") if p.suffix in (".pth", ".safetensors")) if path.is_dir() else [path]
+    if not files or not all(file.is_file() for file in files):
+        raise WeightsNotFoundError(f"weights not found: {HOW_TO_GET}")
+    state = _installed_channel_weights()
+    for file in files:
+        state |= _read(file)
+    return LPIPS(state)
+
+
+def _installed_channel_weights() -> dict[str, Tensor]:
+    """The five small tensors, which torchmetrics (a dependency of Lightning) brings along; empty if it does not."""
+    package = importlib.util.find_spec("torchmetrics")
+    folders = list(package.submodule_search_locations or ()) if package else []
+    files = [Path(folder, "functional", "image", "lpips_models", "vgg.pth") for folder in folders]
+    return next((_read(file) for file in files if file.is_file()), {})
+
+
+def _read(file: Path) -> dict[str, Tensor]:
+    try:
+        if file.suffix == ".safetensors":
+            return load_file(file)
+        state = torch.load(file, map_location="cpu", weights_only=True)
+    except (RuntimeError, EOFError, pickle.UnpicklingError, KeyError, ValueError) as error:
+        raise ValueError(f"{file} is damaged or holds more than tensors: {error}") from error
+    return {name: tensor for name, tensor in state.items() if isinstance(tensor, Tensor)}
+
+
+def _tensor(state: Mapping[str, Tensor], name: str, shape: tuple[int, ...]) -> Tensor:
+    if name not in state or state[name].shape != shape:
+        found = tuple(state[name].shape) if name in state else "missing"
+        raise ValueError(f"LPIPS needs VGG-16's weights: {name} must be {shape}, it is {found}; {HOW_TO_GET}")
+    return state[name].float()

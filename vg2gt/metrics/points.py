@@ -1,0 +1,76 @@
+"""Distances between point clouds."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+from torch import Tensor
+
+NAMES = ("accuracy", "completeness", "chamfer", "precision", "recall", "f_score")
+
+
+def point_metrics(
+    predicted: Tensor,
+    reference: Tensor,
+    threshold: float,
+    downsample: float | None = None,
+    cap: float | None = None,
+) -> dict[str, float]:
+    """Compares two point clouds in one frame and unit.
+
+    DTU's figures take millimetres, ``downsample=0.2`` and ``cap=20``.
+
+    Args:
+        predicted: ``[N, 3]``.
+        reference: ``[M, 3]``.
+        threshold: distance below which a point counts as right.
+        downsample: keep one point in every cell of this edge, in both clouds; None keeps all.
+        cap: distances from here on are left out of the means (they still fail precision and recall); None: none.
+
+    Returns:
+        ``accuracy`` (mean distance from a predicted point to the reference), ``completeness`` (from a reference point
+        to the prediction), ``chamfer`` (the mean of both), ``precision``, ``recall`` (shares of those distances below
+        the threshold) and ``f_score``, their harmonic mean. All are NaN if a cloud is empty; a mean is NaN if the cap
+        leaves it nothing.
+
+    Raises:
+        ValueError: if a cloud is not ``[N, 3]`` or a length is not positive.
+    """
+    for name, cloud in (("predicted", predicted), ("reference", reference)):
+        if cloud.dim() != 2 or cloud.shape[1] != 3:
+            raise ValueError(f"{name} points must be [N, 3], got {tuple(cloud.shape)}")
+    for name, length in (("threshold", threshold), ("downsample", downsample), ("cap", cap)):
+        if length is not None and not length > 0:
+            raise ValueError(f"{name} must be a positive length, got {length}")
+    first, second = (thin(cloud.detach().cpu().double().numpy(), downsample) for cloud in (predicted, reference))
+    if not len(first) or not len(second):
+        return dict.fromkeys(NAMES, math.nan)
+    to_reference, to_predicted = KDTree(second).query(first)[0], KDTree(first).query(second)[0]
+    accuracy, completeness = (_mean_below(distances, cap) for distances in (to_reference, to_predicted))
+    precision, recall = (float((distances < threshold).mean()) for distances in (to_reference, to_predicted))
+    both = precision + recall
+    return {
+        "accuracy": accuracy,
+        "completeness": completeness,
+        "chamfer": (accuracy + completeness) / 2,
+        "precision": precision,
+        "recall": recall,
+        "f_score": 2 * precision * recall / both if both else 0.0,
+    }
+
+
+def thin(points: NDArray[np.float64], edge: float | None) -> NDArray[np.float64]:
+    """Keeps, in every cubic cell of this edge, the first of the points ``[N, 3]``; all of them if ``edge`` is None."""
+    if edge is None or not len(points):
+        return points
+    cells = np.floor((points - points.min(0)) / edge).astype(np.int64)
+    _, first = np.unique(cells, axis=0, return_index=True)
+    return points[np.sort(first)]
+
+
+def _mean_below(distances: NDArray[np.float64], cap: float | None) -> float:
+    kept = distances if cap is None else distances[distances < cap]
+    return float(kept.mean()) if len(kept) else math.nan
