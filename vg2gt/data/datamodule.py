@@ -106,13 +106,17 @@ class SceneDataModule(LightningDataModule):
         """
         if self._train is not None and self._val is not None:
             return
-        train, val = self._source(self._make_train), self._source(self._make_val)
+        train, val = self.train_source(), self._source(self._make_val)
         self._train_names = usable_scenes(train, self.sampler, self.train_scenes)
         names = list(val.scenes)[: self.eval_scenes]
         self._val_views = [views for name in names for views in self.eval_views.choose(val, name)]
         refuse_overlap(train, self._train_names, val, self._val_views)
         self._train = BatchDataset(train, self._training_size(), self.memory_mb, replace_damaged=True)
         self._val = BatchDataset(val, self.framing.still.apply, self.memory_mb)
+
+    def train_source(self) -> SceneSource:
+        """The training scenes as they are on disk."""
+        return self._source(self._make_train)
 
     def train_dataloader(self) -> DataLoader[Batch]:
         """Batches from the trainer's current step on; one item of the loader is one batch.

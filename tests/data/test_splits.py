@@ -1,0 +1,85 @@
+"""Split files: places stay together, parts are divided by themselves, and the data module accepts the lists."""
+
+import shutil
+from functools import partial
+from typing import Any
+
+import pytest
+
+from vg2gt.data import DataError, Mixture, RGBDFolder, SceneDataModule, SyntheticScenes
+from vg2gt.data.sources.files import read_split
+from vg2gt.data.splits import main, split_scenes
+
+
+class Floors(SyntheticScenes):
+    """Every three scenes are recordings of one place."""
+
+    def place(self, scene: str) -> str:
+        return f"floor-{int(scene[-6:]) // 3}"
+
+
+def test_recordings_of_a_place_stay_together():
+    source = Floors(60)
+    train, val = split_scenes(source, 0.25, seed=3)
+    assert sorted(train + val) == list(source.scenes)
+    assert not {source.place(scene) for scene in train} & {source.place(scene) for scene in val}
+    assert len(val) == 15
+    assert split_scenes(source, 0.25, seed=3) == (train, val)
+    assert split_scenes(source, 0.25, seed=4) != (train, val)
+
+
+def test_every_part_of_a_mixture_is_divided():
+    mixture = Mixture({"a": SyntheticScenes(20), "b": Floors(6), "c": SyntheticScenes(1)}, {"a": 1, "b": 5, "c": 1})
+    train, val = split_scenes(mixture, 0.1)
+    assert sum(scene.startswith("a/") for scene in val) == 2
+    assert sum(scene.startswith("b/") for scene in val) == 3
+    assert "c/room-000000" in train
+
+
+def test_one_place_cannot_be_divided():
+    with pytest.raises(DataError, match="single place"):
+        split_scenes(Floors(3), 0.5)
+    with pytest.raises(ValueError, match="fraction"):
+        split_scenes(Floors(30), 1.0)
+
+
+def test_the_command_writes_lists_that_the_data_module_takes(write_recording, tmp_path, capsys):
+    folder = write_recording("home/kitchen")
+    for name in ("hall", "attic", "cellar"):
+        shutil.copytree(folder, tmp_path / "home" / name)
+    arguments = ["data=rgbd", f"data.root={tmp_path / 'home'}", "data.holdout=null", "fraction=0.5"]
+    main([*arguments, f"out={tmp_path / 'lists'}"])
+    assert "val.txt: 2 scenes" in capsys.readouterr().out
+    lists = [str(tmp_path / "lists" / name) for name in ("train.txt", "val.txt")]
+    assert sorted(name for path in lists for name in read_split(path)) == ["attic", "cellar", "hall", "kitchen"]
+
+    makers = [partial(RGBDFolder, scenes=path, holdout=None) for path in lists]
+    options: dict[str, Any] = {
+        "root": str(tmp_path / "home"),
+        "min_views": 2,
+        "max_views": 2,
+        "eval_context": 2,
+        "eval_target": 1,
+    }
+    SceneDataModule(*makers, **options).setup()
+    with pytest.raises(DataError, match="used for training and for evaluation"):
+        SceneDataModule(makers[0], makers[0], **options).setup()
+
+    main([*arguments, f"out={tmp_path / 'lists'}"])  # the same again
+    with pytest.raises(SystemExit, match="holds another split"):
+        main([*arguments, f"out={tmp_path / 'lists'}", "split_seed=1"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["data=rgbd"], "give out="),
+        (["out=x", "data=rgbd", "data.root=not_here"], "not_here"),
+        (["out=x", "fraction=half"], "option fraction takes a value of type float"),
+        (["out=x", "data.rot=y", "data=rgbd"], "rot"),
+        (["out=x", "data=nothing"], "nothing"),
+    ],
+)
+def test_wrong_arguments_are_named(arguments, message):
+    with pytest.raises(SystemExit, match=message):
+        main(arguments)
