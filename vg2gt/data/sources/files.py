@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fnmatch
 import hashlib
 import json
 from abc import abstractmethod
@@ -26,7 +27,8 @@ class FileSource(SceneSource):
 
     Args:
         root: the dataset's folder, or several.
-        scenes: names of the scenes to use, or a text file with one a line; None: all.
+        scenes: names of the scenes to use, patterns of names (``Scene20/*``), or a text file with one a line; None:
+            all.
         holdout: hold out every this many-th frame as an evaluation target; None: none.
         every: use every this many-th frame only.
         index_cache: folder for the indices (file lists, poses, intrinsics), so that they are read from the dataset
@@ -181,10 +183,11 @@ class FileSource(SceneSource):
         if scenes is None:
             return found
         names = read_split(scenes) if isinstance(scenes, str) else list(scenes)
-        unknown = [name for name in names if name not in found]
+        chosen = {name: fnmatch.filter(found, name) if "*" in name else [name] for name in names}
+        unknown = [name for name, scenes in chosen.items() if not scenes or scenes[0] not in found]
         if unknown:
             raise DataError(f"there is no scene {_some(unknown)}; found are: {_some(found)}")
-        return {name: found[name] for name in names}
+        return {scene: found[scene] for scenes in chosen.values() for scene in scenes}
 
     def _recall_index(self, scene: str, folder: Path) -> SceneIndex:
         if self.index_cache is None:
