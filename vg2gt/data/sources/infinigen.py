@@ -1,0 +1,128 @@
+"""Infinigen: procedural scenes as its renderer leaves them, and as InsScene-15K exports them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vg2gt.data.base import DataError
+from vg2gt.data.image_files import image_size
+from vg2gt.data.sources.arrays import load_matrices, load_npy, npy_size
+from vg2gt.data.sources.files import FileSource
+from vg2gt.data.sources.index import SceneIndex, Size, make_index
+from vg2gt.data.sources.scene_folders import scene_folders
+
+_RIG_STEP = 100_000
+_NAME = re.compile(r"_(\d+)_(\d+)_(\d+)_(\d+)$")
+
+_View = tuple[int, int]
+
+
+class Infinigen(FileSource):
+    """Scenes rendered by Infinigen: a scene is a folder with ``frames/{Image,Depth,camview}/camera_0``.
+
+    Files are ``{Image,Depth,camview}_{rig}_{resample}_{frame:04d}_{subcam}.{png,npy,npz}``. A scene with one rig is a
+    video and its frame ids are frame numbers; in the export of InsScene-15K one frame is seen by many rigs and the ids
+    are rig numbers; with several of both the id is ``100000 rig + frame``. Resamples show the same view in other
+    materials: the first is taken.
+
+    The camview files hold ``T``, camera-to-world in OpenCV axes, and ``K``, whose principal point is W/2, H/2 as
+    Blender counts: 1/2 is subtracted. Depth is z-depth in metres, of the images' size or twice that (the OpenGL
+    annotations), then reduced to every second pixel. The centre of an image pixel lies between four depth pixels; of
+    these equally near ones the lower right is taken, 1/4 of an image pixel away, because their mean would be a point
+    in mid-air at edges.
+
+    Args:
+        root: a scene, or a folder of scenes (up to two levels deep).
+        max_depth: farther points (metres), and the sky, which is infinite or huge, have no depth.
+        scenes: names of the scenes to use (paths below ``root``), or a text file with one a line; None: all.
+        holdout: hold out every this many-th frame as an evaluation target; None: none.
+        every: use every this many-th frame only.
+        index_cache: see ``FileSource``.
+
+    Raises:
+        FileNotFoundError: if a root does not exist.
+        DataError: if a root holds no scene.
+    """
+
+    layout = "SCENE/frames/{Image,Depth,camview}/camera_0, there or up to two folders deeper"
+
+    def __init__(
+        self,
+        root: str | Sequence[str] | None,
+        max_depth: float = 30.0,
+        scenes: Sequence[str] | str | None = None,
+        holdout: int | None = None,
+        every: int = 1,
+        index_cache: str | None = None,
+    ) -> None:
+        if not max_depth > 0:
+            raise ValueError(f"max_depth must be positive (metres), got {max_depth}")
+        self.max_depth = float(max_depth)
+        super().__init__(root, scenes, holdout, every, index_cache)
+
+    def find(self, root: Path) -> Mapping[str, Path]:
+        """Folders with ``frames/Image/camera_0``, by their path."""
+        scenes = scene_folders(root, lambda folder: (folder / "frames/Image/camera_0").is_dir(), by_path=True)
+        return {name: folder / "frames" for name, folder in scenes.items()}
+
+    def place(self, scene: str) -> str:
+        """The first folder of the path: InsScene-15K has several parts of one scene below it."""
+        return scene.split("/")[0]
+
+    def index(self, scene: str, folder: Path) -> SceneIndex:
+        """Lists a scene's files and reads its cameras."""
+        color, depth, cameras = (
+            _views(folder / kind / "camera_0", kind, suffix, scene)
+            for kind, suffix in (("Image", ".png"), ("Depth", ".npy"), ("camview", ".npz"))
+        )
+        if not color or not depth:
+            raise DataError(f"scene {scene} has no {'Image' if not color else 'Depth'} files in {folder}")
+        ids = _frame_ids({*color, *depth, *cameras})
+        matrices = {ids[view]: load_matrices(path, scene, {"K": (3, 3), "T": (4, 4)}) for view, path in cameras.items()}
+        centre = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+        color_size = image_size(next(iter(color.values())), scene)
+        return make_index(
+            name=scene,
+            folder=folder,
+            color={ids[view]: path for view, path in color.items()},
+            depth={ids[view]: path for view, path in depth.items()},
+            camera_to_world={frame: matrix["T"] for frame, matrix in matrices.items()},
+            intrinsics={frame: matrix["K"] - centre for frame, matrix in matrices.items()},
+            size=color_size,
+            color_size=color_size,
+            depth_size=npy_size(next(iter(depth.values())), scene),
+        )
+
+    def read_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
+        """Reads depth; what is farther than ``max_depth`` or not a number is none."""
+        depth = load_npy(index.depth[row], index.name, size)
+        return np.where((depth > 0) & (depth <= self.max_depth), depth, np.float32(0))
+
+
+def _views(folder: Path, kind: str, suffix: str, scene: str) -> dict[_View, Path]:
+    """Files of one kind by rig and frame, in this order; the first resample of each."""
+    views: dict[tuple[int, ...], Path] = {}
+    for path in sorted(folder.glob(f"{kind}_*{suffix}")):
+        name = _NAME.search(path.stem)
+        if name is None:
+            raise DataError(f"{path} of scene {scene} is not named {kind}_RIG_RESAMPLE_FRAME_SUBCAM{suffix}")
+        rig, resample, frame, subcam = map(int, name.groups())
+        views[rig, frame, resample, subcam] = path
+    first: dict[_View, Path] = {}
+    for rig, frame, resample, subcam in sorted(views):
+        first.setdefault((rig, frame), views[rig, frame, resample, subcam])
+    return first
+
+
+def _frame_ids(views: set[_View]) -> dict[_View, int]:
+    rigs, frames = ({view[i] for view in views} for i in (0, 1))
+    if len(rigs) == 1:
+        return {view: view[1] for view in views}
+    if len(frames) == 1:
+        return {view: view[0] for view in views}
+    return {view: _RIG_STEP * view[0] + view[1] for view in views}
