@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import io
+import statistics
 import struct
 import zlib
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -29,19 +32,28 @@ def image_size(path: Path, scene: str) -> tuple[int, int]:
         raise _unreadable(path, scene, error) from error
 
 
-def read_color(path: Path, scene: str, size: tuple[int, int] | None = None) -> NDArray[np.uint8]:
+def typical_size(sizes: Iterable[tuple[int, int]]) -> tuple[int, int]:
+    """The common ``(height, width)`` to which images of several sizes are brought: the median of each."""
+    heights, widths = zip(*sizes, strict=True)
+    return statistics.median_low(heights), statistics.median_low(widths)
+
+
+def read_color(
+    path: Path, scene: str, size: tuple[int, int] | None = None, content: bytes | None = None
+) -> NDArray[np.uint8]:
     """Reads a colour image ``[H, W, 3]``.
 
     Args:
         path: the file.
         scene: the scene it belongs to, for messages.
         size: the ``(height, width)`` it must have; None: any.
+        content: the encoded image where it is a part of the file; None: it is the file.
 
     Raises:
         DataError: if the file is missing, damaged or of another size.
     """
     try:
-        with Image.open(path) as image:
+        with Image.open(path if content is None else io.BytesIO(content)) as image:
             pixels = np.array(image.convert("RGB"))
     except _DAMAGED as error:
         raise _unreadable(path, scene, error) from error

@@ -1,0 +1,103 @@
+"""ScanNet, read from its ``.sens`` files without exporting them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vg2gt.data.base import DataError
+from vg2gt.data.image_files import read_color
+from vg2gt.data.sources.files import FileSource
+from vg2gt.data.sources.index import SceneIndex, Size, make_index
+from vg2gt.data.sources.scannet import room_of_scan
+from vg2gt.data.sources.sens import SensStream, decode_depth, read_span, scan_sens
+
+
+class ScanNetSens(FileSource):
+    """Scans in ScanNet's raw ``.sens`` files; a scene is a file, its frames are numbered as in an export.
+
+    Frames, depth and intrinsics are those of ``ScanNet``. Images are decoded where they lie; nothing else of the file,
+    which has gigabytes, is read.
+
+    Args:
+        root: ScanNet's folder, or its ``scans``, or the folder of a scan, or a list of such.
+        scenes: names of scans, or a text file with one a line (the official ``scannetv2_train.txt``); None: all.
+        holdout: hold out every this many-th frame as an evaluation target; None: none.
+        every: use every this many-th frame only (the camera takes 30 a second).
+        index_cache: see ``FileSource``; without it, every process reads the headers of all frames of a scan at first.
+
+    Raises:
+        FileNotFoundError: if a root does not exist.
+        DataError: if a root holds no ``.sens`` file.
+    """
+
+    layout = "sceneNNNN_NN.sens, there or up to two folders deeper"
+
+    def __init__(
+        self,
+        root: str | Sequence[str] | None,
+        scenes: Sequence[str] | str | None = None,
+        holdout: int | None = None,
+        every: int = 1,
+        index_cache: str | None = None,
+    ) -> None:
+        super().__init__(root, scenes, holdout, every, index_cache)
+        self._streams: dict[str, SensStream] = {}
+
+    def find(self, root: Path) -> Mapping[str, Path]:
+        """``.sens`` files by their name."""
+        found: dict[str, Path] = {}
+        for path in sorted(path for pattern in ("*", "*/*", "*/*/*") for path in root.glob(pattern + ".sens")):
+            if path.stem in found:
+                raise DataError(f"two scans are called {path.stem}: {found[path.stem]} and {path}; remove one")
+            found[path.stem] = path
+        return found
+
+    def place(self, scene: str) -> str:
+        """The room: ``scene0000`` of ``scene0000_00`` and ``scene0000_01``."""
+        return room_of_scan(scene)
+
+    def index(self, scene: str, folder: Path) -> SceneIndex:
+        """Reads the headers of all frames."""
+        stream, poses = scan_sens(folder, scene)
+        self._streams[scene] = stream
+        files = dict.fromkeys(range(len(poses)), folder)
+        return make_index(
+            name=scene,
+            folder=folder,
+            color=files,
+            depth=files,
+            camera_to_world=dict(enumerate(poses)),
+            intrinsics=stream.depth_intrinsics,
+            size=stream.depth_size,
+            color_size=stream.color_size,
+            depth_size=stream.depth_size,
+        )
+
+    def read_color(self, index: SceneIndex, row: int) -> NDArray[np.uint8]:
+        """Decodes a colour image of the stream."""
+        path, frame = index.color[row], index.frame_ids[row]
+        content = read_span(path, index.name, self._span(index, frame, "color"))
+        return read_color(path, f"{index.name} (frame {frame})", index.color_size, content)
+
+    def read_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
+        """Decodes a depth image of the stream."""
+        path, frame = index.depth[row], index.frame_ids[row]
+        content = read_span(path, index.name, self._span(index, frame, "depth"))
+        stream = self._stream(index.name, path)
+        where = f"frame {frame} in {path} of scene {index.name}"
+        return (decode_depth(content, stream.depth_compression, size, where) / stream.depth_scale).astype(np.float32)
+
+    def _span(self, index: SceneIndex, frame: int, kind: str) -> NDArray[np.int64]:
+        spans: NDArray[np.int64] = getattr(self._stream(index.name, index.folder), kind)
+        if frame >= len(spans):
+            raise DataError(f"{index.folder} of scene {index.name} has no frame {frame} any more; index it again")
+        return spans[frame]
+
+    def _stream(self, scene: str, path: Path) -> SensStream:
+        if scene not in self._streams:
+            self._streams[scene], _ = scan_sens(path, scene)
+        return self._streams[scene]
