@@ -1,0 +1,93 @@
+"""ScanNet++: the iPhone frames, undistorted and with depth rendered from the laser scan."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vg2gt.data.base import DataError
+from vg2gt.data.image_files import image_size, read_depth
+from vg2gt.data.sources.arrays import load_matrices
+from vg2gt.data.sources.files import FileSource
+from vg2gt.data.sources.index import SceneIndex, Size, make_index
+from vg2gt.data.sources.parsing import load_npz, numbered
+from vg2gt.data.sources.scene_folders import scene_folders
+
+DEPTH_SCALE = 1000.0
+"""Stored depth units a metre."""
+METADATA = "scene_iphone_metadata.npz"
+"""The file of a scene's cameras."""
+
+
+class ScanNetPPiPhone(FileSource):
+    """Preprocessed scenes of ScanNet++, as in InsScene-15K's ``processed_scannetpp_v2``; iPhone frames only.
+
+    A scene has ``images/frame_NNNNNN.jpg``, ``depth/frame_NNNNNN.png`` (of the same size, millimetres, 0 = none) and
+    ``scene_iphone_metadata.npz`` with ``images`` [N] (file names), ``trajectories`` [N, 4, 4] (camera-to-world, OpenCV)
+    and ``intrinsics`` [N, 3, 3], whose principal point counts pixels as COLMAP does: 1/2 is subtracted. The folders
+    hold DSLR frames too, which the file does not name; a frame's number is its id.
+
+    Args:
+        root: the folder of the scenes, or of splits with scenes, or a scene, or a list of such.
+        scenes: names of scenes, or a text file with one a line (the official ``nvs_sem_train.txt``); None: all.
+        holdout: hold out every this many-th frame as an evaluation target; None: none.
+        every: use every this many-th frame only.
+        index_cache: see ``FileSource``.
+
+    Raises:
+        FileNotFoundError: if a root does not exist.
+        DataError: if a root holds no scene.
+    """
+
+    layout = f"SCENE/{{images,depth}} and SCENE/{METADATA}, there or up to two folders deeper"
+
+    def find(self, root: Path) -> Mapping[str, Path]:
+        """Folders with iPhone cameras, by their name."""
+        return scene_folders(root, lambda folder: (folder / METADATA).is_file())
+
+    def index(self, scene: str, folder: Path) -> SceneIndex:
+        """Reads the cameras and finds their images."""
+        path = folder / METADATA
+        names = load_npz(path, scene, ("images",))["images"]
+        if names.ndim != 1 or names.dtype.kind not in "US":
+            raise DataError(f"images in {path} of scene {scene} must be a list of file names, not {names.dtype}")
+        shapes = {"trajectories": (len(names), 4, 4), "intrinsics": (len(names), 3, 3)}
+        matrices = load_matrices(path, scene, shapes)
+        frames = _frame_numbers(names.astype(str), path, scene)
+        images = numbered(folder / "images", scene, "frame_*")
+        depth = numbered(folder / "depth", scene, "frame_*")
+        color = {number: images[number] for number in frames if number in images}
+        if not color or not depth:
+            raise DataError(f"scene {scene} has no {'images' if not color else 'depth'} of iPhone frames in {folder}")
+        centre = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+        size = image_size(next(iter(color.values())), scene)
+        return make_index(
+            name=scene,
+            folder=folder,
+            color=color,
+            depth={number: file for number, file in depth.items() if number in frames},
+            camera_to_world={number: matrices["trajectories"][row] for number, row in frames.items()},
+            intrinsics={number: matrices["intrinsics"][row] - centre for number, row in frames.items()},
+            size=size,
+            color_size=size,
+        )
+
+    def read_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
+        """Decodes a depth image in millimetres."""
+        return (read_depth(index.depth[row], index.name, size) / DEPTH_SCALE).astype(np.float32)
+
+
+def _frame_numbers(names: NDArray[np.str_], path: Path, scene: str) -> dict[int, int]:
+    """Rows of the file by frame number."""
+    rows: dict[int, int] = {}
+    for row, name in enumerate(names):
+        digits = PurePosixPath(str(name)).stem.removeprefix("frame_")
+        if not digits.isascii() or not digits.isdigit():
+            raise DataError(f"{path} of scene {scene} names an image {name!r}; expected frame_NNNNNN.jpg")
+        if int(digits) in rows:
+            raise DataError(f"{path} of scene {scene} names frame {int(digits)} twice")
+        rows[int(digits)] = row
+    return rows
