@@ -1,0 +1,35 @@
+"""Replica as rendered for NICE-SLAM."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+from vg2gt.data import Frames
+from vg2gt.data.sources import Replica
+
+from .layout_scannet import JPEG_ERROR
+from .layouts import Layout, camera_to_world, pixels, room
+
+
+def write(root: Path, frames: Frames, scene: str = "office3") -> None:
+    folder = root / scene / "results"
+    folder.mkdir(parents=True)
+    stored = (frames.depth.numpy() * 6553.5 + 0.5).astype(np.uint16)
+    for i, image in enumerate(pixels(frames)):
+        Image.fromarray(image).save(folder / f"frame{i:06d}.jpg", quality=95, subsampling=0)
+        Image.fromarray(stored[i]).save(folder / f"depth{i:06d}.png")
+    np.savetxt(folder.parent / "traj.txt", camera_to_world(frames).reshape(-1, 16))
+
+
+def _read(root: Path) -> Replica:
+    intrinsics = room(1).intrinsics[0].double()
+    return Replica(str(root), intrinsics=[float(intrinsics[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))])
+
+
+def _quantum(depth: torch.Tensor) -> torch.Tensor:
+    return torch.full_like(depth, 1 / 6553.5)
+
+
+LAYOUTS = {"replica": Layout(write, _read, image_error=JPEG_ERROR, depth_quantum=_quantum)}
