@@ -1,0 +1,193 @@
+"""TUM RGB-D: recordings of a Kinect with poses from motion capture."""
+
+from __future__ import annotations
+
+import os.path
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from vg2gt.data.base import DataError
+from vg2gt.data.image_files import image_size, read_depth
+from vg2gt.data.sources.files import FileSource
+from vg2gt.data.sources.index import SceneIndex, Size, make_index
+from vg2gt.data.sources.parsing import pinhole, read_numbers, read_text_lines
+from vg2gt.data.sources.scene_folders import scene_folders
+
+DEPTH_SCALE = 5000.0
+"""Stored depth units a metre."""
+INTRINSICS = {
+    "freiburg1": (517.3, 516.5, 318.6, 255.3),
+    "freiburg2": (520.9, 521.0, 325.1, 249.7),
+    "freiburg3": (535.4, 539.2, 320.1, 247.6),
+}
+"""Calibrated (fx, fy, cx, cy) of the colour images of the three Kinects, 640x480."""
+
+_CAMERA = re.compile(r"(?:freiburg|fr)([123])(?!\d)")
+_SHORTEST_QUATERNION = 0.5
+
+
+class TUM(FileSource):
+    """Sequences of the TUM RGB-D benchmark, and recordings in its layout; a scene is a sequence.
+
+    ``rgb.txt`` and ``depth.txt`` list ``timestamp path``, ``groundtruth.txt`` ``timestamp tx ty tz qx qy qz qw``
+    (camera-to-world, OpenCV, metres). A colour image makes a frame with the depth image and the pose that differ from
+    it by at most ``max_difference`` in time; nearest pairs first, nothing is used twice. Frame ids are positions in
+    ``rgb.txt``, in order of time. Depth is registered to the colour camera, 5000 units a metre; 0 and 65535 mean none.
+    Listed files that do not exist are counted and left out.
+
+    The intrinsics are those of the Kinect that the folder's name says (``freiburg1``, ``fr1``, ...). The images are
+    taken as a pinhole camera's. Those of freiburg3 are undistorted; those of freiburg1 and freiburg2 are not: by the
+    published coefficients half of their pixels are off by more than 5 pixels, a tenth by more than 8, and the corners
+    by 15 to 37. Undistort them beforehand where that matters.
+
+    Args:
+        root: a sequence, or a folder of sequences, or a list of such.
+        intrinsics: (fx, fy, cx, cy) in pixels of the colour images; None: by the folder's name.
+        max_difference: largest difference of times in a frame, in seconds.
+        scenes: names of sequences, or a text file with one a line; None: all.
+        holdout: hold out every this many-th frame as an evaluation target; None: none.
+        every: use every this many-th frame only (the camera takes 30 a second).
+        index_cache: see ``FileSource``.
+
+    Raises:
+        FileNotFoundError: if a root does not exist.
+        DataError: if a root holds no sequence.
+    """
+
+    layout = "rgb.txt, depth.txt and groundtruth.txt, there or one folder deeper"
+
+    def __init__(
+        self,
+        root: str | Sequence[str] | None,
+        intrinsics: Sequence[float] | None = None,
+        max_difference: float = 0.02,
+        scenes: Sequence[str] | str | None = None,
+        holdout: int | None = 6,
+        every: int = 1,
+        index_cache: str | None = None,
+    ) -> None:
+        if not max_difference > 0:
+            raise ValueError(f"max_difference must be positive (seconds), got {max_difference}")
+        self.intrinsics = tuple(float(value) for value in intrinsics) if intrinsics else None
+        self.max_difference = float(max_difference)
+        super().__init__(root, scenes, holdout, every, index_cache)
+
+    def find(self, root: Path) -> Mapping[str, Path]:
+        """Folders with ``rgb.txt``, by their name."""
+        return scene_folders(root, lambda folder: (folder / "rgb.txt").is_file(), levels=1)
+
+    def options(self) -> Mapping[str, object]:
+        """What decides which frames there are and how they are seen."""
+        return {"intrinsics": self.intrinsics, "max_difference": self.max_difference}
+
+    def index(self, scene: str, folder: Path) -> SceneIndex:
+        """Reads the lists and joins them."""
+        if not (folder / "groundtruth.txt").is_file():
+            raise DataError(
+                f"scene {scene} in {folder} has no groundtruth.txt (lines of 'timestamp tx ty tz qx qy qz qw'), so its "
+                "poses are not known; add the file, or reconstruct the images as a folder without poses"
+            )
+        times, files = _read_list(folder / "rgb.txt", scene)
+        depth_times, depth_files = _read_list(folder / "depth.txt", scene)
+        pose_times, poses = _read_poses(folder / "groundtruth.txt", scene)
+        depth = associate(times, depth_times, self.max_difference)
+        pose = associate(times, pose_times, self.max_difference)
+        color = {i: folder / file for i, file in enumerate(files) if os.path.isfile(folder / file)}
+        depth_paths = {i: folder / depth_files[j] for i, j in depth.items()}
+        depth_paths = {i: path for i, path in depth_paths.items() if os.path.isfile(path)}
+        if not color or not depth_paths:
+            raise DataError(
+                f"scene {scene} in {folder} has no {'colour' if not color else 'depth'} images: none of those listed "
+                f"in {'rgb' if not color else 'depth'}.txt exists or belongs to a frame"
+            )
+        size = image_size(next(iter(color.values())), scene)
+        return make_index(
+            name=scene,
+            folder=folder,
+            color=color,
+            depth=depth_paths,
+            camera_to_world={i: poses[j] for i, j in pose.items()},
+            intrinsics=pinhole(*self._camera(scene, folder)),
+            size=size,
+            color_size=size,
+        )
+
+    def read_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
+        """Decodes a depth image."""
+        stored = read_depth(index.depth[row], index.name, size)
+        return np.where(stored == 65535, 0, stored / DEPTH_SCALE).astype(np.float32)
+
+    def _camera(self, scene: str, folder: Path) -> tuple[float, ...]:
+        named = _CAMERA.search(scene)
+        if self.intrinsics is not None:
+            return self.intrinsics
+        if named is None:
+            raise DataError(
+                f"the intrinsics of scene {scene} in {folder} are not known: its name says neither freiburg1 nor "
+                "freiburg2 nor freiburg3; set data.intrinsics=[fx,fy,cx,cy]"
+            )
+        return INTRINSICS[f"freiburg{named[1]}"]
+
+
+def associate(times: NDArray[np.float64], others: NDArray[np.float64], max_difference: float) -> dict[int, int]:
+    """Pairs two increasing lists of times: the nearest first, each at most once.
+
+    Returns:
+        Positions in ``others`` by positions in ``times``.
+    """
+    first = np.searchsorted(others, times - max_difference, "left")
+    last = np.searchsorted(others, times + max_difference, "right")
+    near = [(i, j) for i in range(len(times)) for j in range(first[i], last[i])]
+    pairs: dict[int, int] = {}
+    used: set[int] = set()
+    for i, j in sorted(near, key=lambda pair: abs(times[pair[0]] - others[pair[1]])):
+        if i not in pairs and j not in used:
+            pairs[i] = j
+            used.add(j)
+    return pairs
+
+
+def _read_list(path: Path, scene: str) -> tuple[NDArray[np.float64], list[str]]:
+    """Increasing times, and the files taken at them."""
+    entries: dict[float, str] = {}
+    for line in read_text_lines(path, scene):
+        words = line.split(maxsplit=1)
+        time = _number(words[0])
+        if len(words) < 2 or not np.isfinite(time):
+            raise DataError(f"{path} of scene {scene} must have lines of 'timestamp path', not {line!r}")
+        if time in entries:
+            raise DataError(f"{path} of scene {scene} lists {words[0]} twice")
+        entries[time] = words[1]
+    if not entries:
+        raise DataError(f"{path} of scene {scene} lists no file")
+    times = sorted(entries)
+    return np.array(times), [entries[time] for time in times]
+
+
+def _read_poses(path: Path, scene: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Increasing times and ``[n, 4, 4]`` camera-to-world poses; one without a unit quaternion is not finite."""
+    rows = read_numbers(path, scene)
+    if rows.shape[1] != 8:
+        raise DataError(
+            f"{path} of scene {scene} must have lines of 'timestamp tx ty tz qx qy qz qw', not {rows.shape[1]} numbers"
+        )
+    rows = rows[np.isfinite(rows[:, 0])]
+    rows = rows[np.argsort(rows[:, 0], kind="stable")]
+    poses = np.full((len(rows), 4, 4), np.nan)
+    good = np.isfinite(rows).all(1) & (np.linalg.norm(rows[:, 4:], axis=1) > _SHORTEST_QUATERNION)
+    poses[good] = np.eye(4)
+    poses[good, :3, :3] = Rotation.from_quat(rows[good, 4:]).as_matrix()
+    poses[good, :3, 3] = rows[good, 1:4]
+    return rows[:, 0], poses
+
+
+def _number(word: str) -> float:
+    try:
+        return float(word)
+    except ValueError:
+        return np.nan
