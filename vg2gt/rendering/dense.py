@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from vg2gt.geometry.cameras import pixel_grid
-from vg2gt.rendering.median import MedianDepth
+from vg2gt.rendering.median import ray_depth
 from vg2gt.rendering.options import ALPHA_MIN, TRANSMITTANCE_STOP, Images, RenderOptions, SceneViews
 from vg2gt.rendering.projection import Splats, respond, visible_splats
 
@@ -70,26 +70,5 @@ def _render_pixels(
     normal, depth = torch.zeros_like(color), torch.zeros_like(final)
     if options.geometry and len(splats.depth):
         normal = weight @ splats.normal
-        depth = _depth(alpha, weight, before.detach(), final, peak, precision, options)
+        depth = ray_depth(alpha, weight, before.detach(), final, peak, precision, DenseRays(), options)
     return color, normal, depth, 1 - final
-
-
-def _depth(
-    alpha: Tensor,
-    weight: Tensor,
-    before: Tensor,
-    final: Tensor,
-    peak: Tensor,
-    precision: Tensor,
-    options: RenderOptions,
-) -> Tensor:
-    if options.mode == "solid":
-        depth = MedianDepth.apply(alpha, peak, precision, before, DenseRays(), options)
-        assert isinstance(depth, Tensor)
-        return depth
-    if options.depth == "expected":
-        covered = 1 - final
-        hit = covered.detach() > 0
-        return torch.where(hit, (weight * peak).sum(-1) / torch.where(hit, covered, 1.0), 0.0)
-    crossing = (before > 0.5) & (before * (1 - alpha.detach()) <= 0.5)
-    return (crossing * peak).sum(-1)

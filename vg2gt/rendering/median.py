@@ -1,4 +1,4 @@
-"""Median depth of a ray through stochastic solids, with its implicit gradient.
+"""Depth of rays; above all the median depth through stochastic solids, with its implicit gradient.
 
 A Gaussian of opacity alpha whose response peaks at ``t*`` with precision ``lambda`` is the solid of vacancy
 ``v(t) = sqrt(1 - g)``, ``g = alpha exp(-lambda (t - t*)^2 / 2)`` (paper, eqn vacancy). A ray has passed it unhit with
@@ -120,3 +120,37 @@ class MedianDepth(torch.autograd.Function):
         grad_peak = half * g * precision * offset.abs()
         grad_precision = torch.where(passed, -0.5, 0.5) * half * g * offset**2
         return factor * grad_alpha, factor * grad_peak, factor * grad_precision, None, None, None
+
+
+def ray_depth(
+    alpha: Tensor,
+    weight: Tensor,
+    before: Tensor,
+    final: Tensor,
+    peak: Tensor,
+    precision: Tensor,
+    rays: Rays,
+    options: RenderOptions,
+) -> Tensor:
+    """Depth of every ray in the mode and of the kind that the options say; 0 where a ray has none.
+
+    Args:
+        alpha: opacity of every hit, 0 where a dense matrix has none.
+        weight: blending weight of every hit.
+        before: transmittance in front of every hit in blending order, without gradient.
+        final: transmittance of every ray.
+        peak: peak depth of every hit.
+        precision: inverse variance of every hit along its ray.
+        rays: how hits belong to rays.
+        options: mode, kind of depth, and the solver's settings.
+    """
+    if options.mode == "solid":
+        depth = MedianDepth.apply(alpha, peak, precision, before, rays, options)
+        assert isinstance(depth, Tensor)
+        return depth
+    if options.depth == "expected":
+        covered = 1 - final
+        hit = covered.detach() > 0
+        return torch.where(hit, rays.sum(weight * peak) / torch.where(hit, covered, 1.0), 0.0)
+    crossing = (before > 0.5) & (before * (1 - alpha.detach()) <= 0.5)
+    return rays.sum(crossing * peak)

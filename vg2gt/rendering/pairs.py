@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from vg2gt.rendering.median import MedianDepth
+from vg2gt.rendering.median import ray_depth
 from vg2gt.rendering.options import ALPHA_MIN, TRANSMITTANCE_STOP, Images, RenderOptions, SceneViews
-from vg2gt.rendering.projection import Splats, respond, visible_splats
+from vg2gt.rendering.projection import Splats, list_cells, pixel_boxes, respond, visible_splats
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,8 @@ def _render_view(scene: SceneViews, options: RenderOptions) -> Images:
     with torch.no_grad():
         index, rays = _hits(splats, box, scene.size, options)
     hits = splats[index]
-    response, peak, precision = respond(hits, _pixels(rays.pixel, width, peak_like=hits.depth))
+    pixels = torch.stack((rays.pixel % width, rays.pixel // width), -1).to(hits.depth.dtype)
+    response, peak, precision = respond(hits, pixels)
     alpha = response.clamp(max=options.alpha_max)
     passed = torch.log1p(-alpha)
     before = torch.exp(rays.running_sum(passed) - passed).to(alpha.dtype)
@@ -69,27 +70,18 @@ def _render_view(scene: SceneViews, options: RenderOptions) -> Images:
     normal, depth = torch.zeros_like(color), torch.zeros_like(final)
     if options.geometry:
         normal = rays.sum(weight[:, None] * hits.normal)
-        depth = _depth(alpha, weight, before.detach(), final, peak, precision, rays, options)
+        depth = ray_depth(alpha, weight, before.detach(), final, peak, precision, rays, options)
     shape = (1, height, width)
     return Images(color.view(*shape, 3), normal.view(*shape, 3), depth.view(shape), (1 - final).view(shape))
-
-
-def _pixels(pixel: Tensor, width: int, peak_like: Tensor) -> Tensor:
-    return torch.stack((pixel % width, pixel // width), -1).to(peak_like.dtype)
 
 
 def _hits(splats: Splats, box: Tensor, size: tuple[int, int], options: RenderOptions) -> tuple[Tensor, PairRays]:
     """Lists all hits, sorted by pixel and front to back within a pixel: splat index ``[N]`` and the rays."""
     height, width = size
-    low = box[:, :2].ceil().clamp(min=0).long()
-    limit = torch.tensor([width - 1, height - 1], device=box.device)
-    extent = (torch.minimum(box[:, 2:].floor().clamp(min=-1).long(), limit) - low + 1).clamp(min=0)
-    area = extent.prod(-1)
-    index = torch.repeat_interleave(area)
-    cell = torch.arange(len(index), device=box.device) - (torch.cumsum(area, 0) - area)[index]
-    columns = extent[index, 0]
-    pixel = (low[index, 1] + cell // columns) * width + low[index, 0] + cell % columns
-    response, _, _ = respond(splats[index], _pixels(pixel, width, peak_like=splats.depth))
+    first, last = pixel_boxes(box, size)
+    index, cells = list_cells(first, (last - first + 1).clamp(min=0))
+    pixel = cells[:, 1] * width + cells[:, 0]
+    response, _, _ = respond(splats[index], cells.to(splats.depth.dtype))
     kept = response >= ALPHA_MIN
     pixel, order = torch.sort(pixel[kept], stable=True)
     index, response = index[kept][order], response[kept][order]
@@ -97,25 +89,3 @@ def _hits(splats: Splats, box: Tensor, size: tuple[int, int], options: RenderOpt
     after = rays.running_sum(torch.log1p(-response.clamp(max=options.alpha_max)))
     kept = after >= math.log(TRANSMITTANCE_STOP)
     return index[kept], PairRays(pixel[kept], height * width)
-
-
-def _depth(
-    alpha: Tensor,
-    weight: Tensor,
-    before: Tensor,
-    final: Tensor,
-    peak: Tensor,
-    precision: Tensor,
-    rays: PairRays,
-    options: RenderOptions,
-) -> Tensor:
-    if options.mode == "solid":
-        depth = MedianDepth.apply(alpha, peak, precision, before, rays, options)
-        assert isinstance(depth, Tensor)
-        return depth
-    if options.depth == "expected":
-        covered = 1 - final
-        hit = covered.detach() > 0
-        return torch.where(hit, rays.sum(weight * peak) / torch.where(hit, covered, 1.0), 0.0)
-    crossing = (before > 0.5) & (before * (1 - alpha.detach()) <= 0.5)
-    return rays.sum(crossing * peak)

@@ -140,6 +140,30 @@ def visible_splats(scene: SceneViews, options: RenderOptions) -> tuple[Splats, T
     return project(scene.gather(index), options), box
 
 
+def pixel_boxes(box: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """First and last pixel ``[N, 2]`` as (x, y) of screen boxes, cut at the image; last < first where it holds none."""
+    height, width = size
+    limit = torch.tensor([width - 1, height - 1], device=box.device)
+    return box[:, :2].ceil().clamp(min=0).long(), torch.minimum(box[:, 2:].floor().clamp(min=-1).long(), limit)
+
+
+def list_cells(first: Tensor, extent: Tensor) -> tuple[Tensor, Tensor]:
+    """Lists the cells of rectangles, row by row, in the rectangles' order.
+
+    Args:
+        first: ``[N, 2]`` least cell as (x, y).
+        extent: ``[N, 2]`` cells in x and in y, at least 0.
+
+    Returns:
+        Rectangle ``[M]`` and cell ``[M, 2]``.
+    """
+    area = extent.prod(-1)
+    index = torch.repeat_interleave(area)
+    number = torch.arange(len(index), device=first.device) - (torch.cumsum(area, 0) - area)[index]
+    columns = extent[index, 0]
+    return index, first[index] + torch.stack((number % columns, number // columns), -1)
+
+
 def respond(splats: Splats, pixels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Closed-form response of splats at pixels (module docstring).
 

@@ -21,7 +21,7 @@ from vg2gt.rendering.options import (
     RenderOptions,
     SceneViews,
 )
-from vg2gt.rendering.projection import Splats, visible_splats
+from vg2gt.rendering.projection import Splats, list_cells, pixel_boxes, visible_splats
 
 kernels: Any = launchable  # Triton makes its functions objects that take a grid: kernel[grid](...)
 
@@ -75,23 +75,17 @@ def _bin(box: Tensor, counts: Tensor, size: tuple[int, int]) -> _Lists:
     """Lists splats by tile, front to back; splats are given view by view, front to back, with their screen boxes."""
     height, width = size
     across, down = -(-width // kernels.TILE), -(-height // kernels.TILE)
-    limit = torch.tensor([width - 1, height - 1], device=box.device)
-    low = box[:, :2].ceil().clamp(min=0).long()
-    high = torch.minimum(box[:, 2:].floor().clamp(min=-1).long(), limit)
-    empty = (high < low).any(-1)
+    low, high = pixel_boxes(box, size)
     first, last = low // kernels.TILE, high // kernels.TILE
-    extent = torch.where(empty[:, None], 0, last - first + 1)
-    areas = extent.prod(-1)
-    splat = torch.repeat_interleave(areas)
-    cell = torch.arange(len(splat), device=box.device) - (torch.cumsum(areas, 0) - areas)[splat]
-    columns = extent[splat, 0]
+    extent = torch.where((high < low).any(-1)[:, None], 0, last - first + 1)
+    splat, cells = list_cells(first, extent)
     view = torch.repeat_interleave(counts)[splat]
-    tile = (first[splat, 1] + cell // columns) * across + first[splat, 0] + cell % columns + view * across * down
+    tile = cells[:, 1] * across + cells[:, 0] + view * across * down
     tile, order = torch.sort(tile, stable=True)
     edges = torch.arange(len(counts) * across * down + 1, device=box.device)
     starts = torch.searchsorted(tile, edges)
     shape = (len(counts), height, width)
-    return _Lists(splat[order].int(), order.int(), starts.int(), areas, across, across * down, shape)
+    return _Lists(splat[order].int(), order.int(), starts.int(), extent.prod(-1), across, across * down, shape)
 
 
 class _Rasterize(torch.autograd.Function):
