@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 
 import torch
@@ -115,6 +115,18 @@ class Backend(nn.Module, ABC):
                 f"images must be finite and in [0, 1], got values from {float(low):.4g} to {float(high):.4g}: "
                 "divide 8-bit images by 255 and clamp after resizing"
             )
+
+    def as_tokens(self, images: Tensor, patch: Sequence[Tensor], camera: Tensor) -> Tokens:
+        """Returns, in float32, the tokens that a backbone made of ``images``.
+
+        Args:
+            images: ``[B, V, 3, H, W]``.
+            patch: ``[B, V, P, D]`` of every tapped layer.
+            camera: ``[B, V, Dc]``.
+        """
+        size = (images.shape[-2], images.shape[-1])
+        grid = (size[0] // self.patch_size, size[1] // self.patch_size)
+        return Tokens(tuple(tap.float() for tap in patch), camera.float(), grid, size)
 
     def require_hints(self, images: Tensor, hints: Hints | None, *names: str) -> Hints:
         """Returns ``hints`` if they hold the named fields for all views of ``images``.

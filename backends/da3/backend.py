@@ -184,13 +184,11 @@ class DA3Backend(Backend):
     @torch.no_grad()
     def encode_with(self, images: Tensor, camera_tokens: Tensor | None) -> Tokens:
         """Encodes checked images, with camera tokens ``[B, V, C]`` from the camera encoder if there are any."""
-        size = (images.shape[-2], images.shape[-1])
         with half_precision_on_gpu(images):
             patch, camera = self.network.backbone.pretrained(
                 normalize_images(images), self.taps, self.reference_view, camera_tokens
             )
-        grid = (size[0] // self.patch_size, size[1] // self.patch_size)
-        return Tokens(tuple(tap.float() for tap in patch), camera.float(), grid, size)
+        return self.as_tokens(images, patch, camera)
 
     def decode(self, tokens: Tokens) -> Geometry:
         """See :meth:`Backend.decode`; the principal point is (W/2, H/2)."""

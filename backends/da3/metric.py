@@ -118,11 +118,9 @@ class DA3SingleViewBackend(Backend):
         """See :meth:`Backend.encode`; fixes the factors once, so that token changes do not move the unit."""
         self.check_images(images)
         hints = self.require_hints(images, hints, *self.hint_names)
-        size = (images.shape[-2], images.shape[-1])
         with half_precision_on_gpu(images):
             patch, camera = self.network.backbone.pretrained(normalize_images(images), self.taps)
-        grid = (size[0] // self.patch_size, size[1] // self.patch_size)
-        tokens = Tokens(tuple(tap.float() for tap in patch), camera.float(), grid, size)
+        tokens = self.as_tokens(images, patch, camera)
         return replace(tokens, state={"cameras": hints.cameras, "factor": self.factor(tokens, hints)})
 
     @abstractmethod

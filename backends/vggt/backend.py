@@ -90,11 +90,9 @@ class VGGTBackend(Backend):
     @torch.no_grad()
     def encode_checked(self, images: Tensor, hints: Hints | None) -> Tokens:
         """Encodes what :meth:`encode` has checked: tensor operations only, so that it can be exported."""
-        size = (images.shape[-2], images.shape[-1])
         with half_precision_on_gpu(images):
             patch, camera = self.network.aggregator(images, self.taps)
-        grid = (size[0] // self.patch_size, size[1] // self.patch_size)
-        return Tokens(tuple(tap.float() for tap in patch), camera.float(), grid, size)
+        return self.as_tokens(images, patch, camera)
 
     def decode(self, tokens: Tokens) -> Geometry:
         """See :meth:`Backend.decode`; the principal point is (W/2, H/2)."""
