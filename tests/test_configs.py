@@ -11,6 +11,7 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig, OmegaConf
 
+from tests.training_helpers import full_model
 from vg2gt.losses import VG2GTLoss
 from vg2gt.paths import config_dir
 from vg2gt.training import build
@@ -84,8 +85,8 @@ def test_every_ablation_builds_what_it_says(tmp_path: Path, ablation: str) -> No
     )
     full = {
         "rasterized": run.module.renderer.mode == "rasterized",
-        "wo_coarse": run.module.model.coarse is None,
-        "wo_split": run.module.model.gaussians.splits == 1,
+        "wo_coarse": full_model(run).coarse is None,
+        "wo_split": full_model(run).gaussians.splits == 1,
     }
     loss = run.module.loss
     assert isinstance(loss, VG2GTLoss)

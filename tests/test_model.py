@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from tests.training_helpers import small_config
+from tests.training_helpers import full_model, small_config
 from vg2gt.losses import VG2GTLoss
 from vg2gt.model import VG2GT, SceneScale
 from vg2gt.protocols import ground_truth_target_cameras, training_cameras
@@ -27,7 +27,7 @@ def batch(run: Run) -> Batch:
 
 @pytest.fixture
 def model(run: Run) -> VG2GT:
-    return run.module.model.eval()
+    return full_model(run).eval()
 
 
 def test_at_initialisation_the_second_decoding_is_the_first(model: VG2GT, batch: Batch) -> None:
@@ -55,7 +55,7 @@ def test_untrained_head_renders_the_room_without_holes(run: Run, model: VG2GT, b
 
 
 def test_gradient_reaches_the_last_coarse_layer_first_and_the_transformer_next(run: Run, batch: Batch) -> None:
-    model = run.module.model.train()
+    model = full_model(run).train()
     assert model.coarse is not None
     names = [name for name, _ in model.coarse.named_parameters()]
     transformer = [name for name in names if name.startswith("ptv3.")]
@@ -134,6 +134,8 @@ def test_autocast_never_touches_geometry(model: VG2GT, batch: Batch) -> None:
         cameras = training_cameras(model, batch, prediction)
         truth = ground_truth_target_cameras(batch, prediction)
     assert torch.equal(prediction.geometry.cameras.world_to_camera, exact.geometry.cameras.world_to_camera)
+    assert prediction.voxels is not None
+    assert exact.voxels is not None
     assert torch.equal(prediction.voxels.grid, exact.voxels.grid)
     assert torch.equal(cameras.world_to_camera, training_cameras(model, batch, exact).world_to_camera)
     assert torch.equal(truth.world_to_camera, ground_truth_target_cameras(batch, exact).world_to_camera)

@@ -14,7 +14,7 @@ import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from tests.training_helpers import SMALL, small_config, with_crash
+from tests.training_helpers import SMALL, full_model, small_config, with_crash
 from vg2gt.checkpoints import newest_valid, read_checkpoint
 from vg2gt.gaussians import GaussianHead
 from vg2gt.paths import config_dir
@@ -61,7 +61,7 @@ def test_fast_dev_run(tmp_path: Path, cache: Path, override: str) -> None:
 
 def test_onnx_backend_trains(tmp_path: Path, cache: Path, onnx_bundle: Path) -> None:
     run = build(small_config(tmp_path, cache, "debug=fast_dev_run", "backend=onnx", f"backend.path={onnx_bundle}"))
-    coarse = run.module.model.coarse
+    coarse = full_model(run).coarse
     assert coarse is not None
     before = {name: tensor.clone() for name, tensor in coarse.state_dict().items()}
     run.trainer.fit(run.module, datamodule=run.datamodule)
@@ -192,7 +192,7 @@ def test_wo_split_starts_from_a_full_model(full_run: Path, cache: Path, tmp_path
 
 def test_non_finite_steps_are_skipped_and_then_stop_the_run(tmp_path: Path, cache: Path, caplog) -> None:
     run = build(small_config(tmp_path, cache, "training.max_skipped=2"))
-    before = {name: tensor.clone() for name, tensor in run.module.model.gaussians.state_dict().items()}
+    before = {name: tensor.clone() for name, tensor in full_model(run).gaussians.state_dict().items()}
     forward = run.module.loss.forward
 
     def poisoned(*args, **kwargs):
@@ -203,7 +203,7 @@ def test_non_finite_steps_are_skipped_and_then_stop_the_run(tmp_path: Path, cach
     run.module.loss.forward = poisoned
     with pytest.raises(FloatingPointError, match="2 steps in a row"):
         run.trainer.fit(run.module, datamodule=run.datamodule)
-    assert all(torch.equal(before[k], v) for k, v in run.module.model.gaussians.state_dict().items())
+    assert all(torch.equal(before[k], v) for k, v in full_model(run).gaussians.state_dict().items())
     assert "step 0 skipped" in caplog.text
 
 
@@ -220,7 +220,7 @@ def test_real_rgbd_recording(tmp_path: Path, shared: Path) -> None:
 
 def test_non_finite_gaussians_are_a_skipped_step(tmp_path: Path, cache: Path) -> None:
     run = build(small_config(tmp_path, cache, "trainer.max_steps=2"))
-    head = run.module.model.gaussians
+    head = full_model(run).gaussians
     assert isinstance(head, GaussianHead)
     with torch.no_grad():
         head.hidden.bias[0] = float("inf")
@@ -241,7 +241,7 @@ def test_unsupported_trainer_options_are_refused(tmp_path: Path, cache: Path, ov
 
 def test_clipping_can_be_switched_off(tmp_path: Path, cache: Path) -> None:
     run = build(small_config(tmp_path, cache, "trainer.max_steps=1", "trainer.gradient_clip_val=0"))
-    head = run.module.model.gaussians
+    head = full_model(run).gaussians
     assert isinstance(head, GaussianHead)
     before = head.out.weight.clone()
     run.trainer.fit(run.module, datamodule=run.datamodule)

@@ -7,7 +7,9 @@ import lightning
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, open_dict
 
+from vg2gt.model import VG2GT
 from vg2gt.paths import config_dir
+from vg2gt.training import Run
 
 SMALL = [
     "data.image_size=[56,112]",
@@ -49,3 +51,9 @@ def with_crash(config: DictConfig, step: int) -> DictConfig:
     with open_dict(config):
         config.callbacks.crash = {"_target_": f"{__name__}.CrashAfter", "step": step}
     return config
+
+
+def full_model(run: Run) -> VG2GT:
+    """The run's model, known to be the paper's."""
+    assert isinstance(run.module.model, VG2GT)
+    return run.module.model

@@ -6,7 +6,7 @@ import torch
 
 from vg2gt.geometry.normals import normals_from_depth
 from vg2gt.metrics import cv, depth_metrics, normal_metrics, psnr, ssim
-from vg2gt.model import VG2GT
+from vg2gt.model import Reconstructor
 from vg2gt.protocols import ground_truth_target_cameras
 from vg2gt.rendering import Renderer
 from vg2gt.types import Batch
@@ -15,7 +15,7 @@ CV_QUERIES = 20_000
 
 
 @torch.no_grad()
-def evaluate_scene(model: VG2GT, renderer: Renderer, batch: Batch) -> dict[str, float]:
+def evaluate_scene(model: Reconstructor, renderer: Renderer, batch: Batch) -> dict[str, float]:
     """Reconstructs a scene from its context views and scores it on its held-out views.
 
     Args:

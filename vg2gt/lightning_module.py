@@ -16,11 +16,11 @@ from torch.profiler import record_function
 
 from vg2gt.evaluation import evaluate_scene
 from vg2gt.losses import LossReport
-from vg2gt.model import VG2GT
+from vg2gt.model import Reconstructor
 from vg2gt.protocols import training_cameras
 from vg2gt.rendering import Renderer
 from vg2gt.schedule import cosine_with_warmup, weight_decay_groups
-from vg2gt.types import Batch, Gaussians
+from vg2gt.types import Batch, Gaussians, Prediction
 
 log = logging.getLogger(__name__)
 
@@ -45,7 +45,7 @@ class VG2GTModule(lightning.LightningModule):
 
     def __init__(
         self,
-        model: VG2GT,
+        model: Reconstructor,
         loss: nn.Module,
         renderer: Renderer,
         optimizer: Callable[..., Optimizer],
@@ -94,7 +94,7 @@ class VG2GTModule(lightning.LightningModule):
         with record_function("vg2gt/loss"):
             report: LossReport = self.loss(prediction, batch, rendered, views, cameras)
         self._loss_is_finite = bool(torch.isfinite(report.total.detach()))
-        self._log_step(report, batch, prediction.gaussians.means.shape[0], prediction.voxels.grid.shape[0])
+        self._log_step(report, batch, prediction)
         return report.total
 
     def _lost_step(self) -> Tensor:
@@ -108,15 +108,17 @@ class VG2GTModule(lightning.LightningModule):
         context = torch.randperm(batch.num_context, generator=self.generator)
         return torch.cat((held_out, context))[: self.render_views]
 
-    def _log_step(self, report: LossReport, batch: Batch, gaussians: int, voxels: int) -> None:
+    def _log_step(self, report: LossReport, batch: Batch, prediction: Prediction) -> None:
         scenes = len(batch.scene)
         pixels = batch.context.depth.numel()
         self.log("loss", report.total.detach(), prog_bar=True, batch_size=scenes)
         for name, value in report.terms.items():
             short = name in ("color_l1", "depth_gt", "depth_reg", "normal")
             self.log(f"train/{name}", value, prog_bar=short, batch_size=scenes)
-        self.log("train/gaussians_per_view", gaussians / (scenes * batch.num_context), batch_size=scenes)
-        self.log("train/voxels_per_pixel", voxels / pixels, batch_size=scenes)
+        per_view = len(prediction.gaussians) / (scenes * batch.num_context)
+        self.log("train/gaussians_per_view", per_view, batch_size=scenes)
+        if prediction.voxels is not None:
+            self.log("train/voxels_per_pixel", len(prediction.voxels.grid) / pixels, batch_size=scenes)
         self.log("train/scenes_without_depth", float(report.skipped), batch_size=scenes)
 
     def configure_gradient_clipping(

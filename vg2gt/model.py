@@ -13,6 +13,7 @@ images -> frozen backbone -> tokens -> frozen heads -> depth, confidence, camera
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Literal, get_args
@@ -24,7 +25,7 @@ from torch.profiler import record_function
 from backends.base import Backend
 from vg2gt.geometry.alignment import fit_depth_scale
 from vg2gt.geometry.cameras import relative_to_first, scale_translations
-from vg2gt.types import Gaussians, Geometry, Hints, Prediction, Voxels
+from vg2gt.types import Gaussians, Geometry, Hints, Prediction, Tokens, Voxels
 
 ScaleSource = Literal["metric", "focal", "normalize", "groundtruth"]
 CANONICAL_FOCAL = 300.0  # appendix A.1: d_metric = f * d_net / 300
@@ -67,7 +68,57 @@ class SceneScale:
         return self.median_depth / valid.median() if valid.numel() else depth.new_ones(())
 
 
-class VG2GT(nn.Module):
+class Reconstructor(nn.Module, ABC):
+    """What training, evaluation and commands know of a model: images in, a Gaussian scene out, on a frozen backbone.
+
+    Args:
+        backend: the frozen visual foundation model.
+        scale: fixes the scene unit.
+
+    Raises:
+        ValueError: if the scale is to be metric and the backend is not.
+    """
+
+    def __init__(self, backend: Backend, scale: SceneScale) -> None:
+        super().__init__()
+        if scale.source == "metric" and not backend.is_metric:
+            raise ValueError(
+                f"model.scale.source=metric needs a backend that knows metres, {backend.name} does not: "
+                "use model.scale.source=normalize or focal"
+            )
+        self.backend = backend
+        self.scale = scale
+
+    @abstractmethod
+    def forward(
+        self, images: Tensor, hints: Hints | None = None, generator: torch.Generator | None = None
+    ) -> Prediction:
+        """Reconstructs B scenes.
+
+        Args:
+            images: ``[B, V, 3, H, W]`` in [0, 1]; H and W multiples of the backend's patch size.
+            hints: what the data knows, for backends that need it.
+            generator: draws whatever is random while training.
+
+        Returns:
+            Geometry and Gaussians in scene units and in the frame of view 0.
+        """
+
+    def read_views(self, images: Tensor, hints: Hints | None) -> tuple[Tokens, Geometry, Tensor]:
+        """Runs the frozen backbone; returns its tokens, its geometry in the scene frame, and the unit ``[B]``."""
+        with record_function("vg2gt/encode"):
+            tokens = self.backend.encode(images, hints)
+        with record_function("vg2gt/decode"), torch.no_grad():
+            raw = self.backend.decode(tokens)
+        unit = self.scale(raw, hints)
+        return tokens, _to_scene_frame(raw, unit), unit
+
+    def trained_parameters(self) -> list[nn.Parameter]:
+        """The parameters that training changes: everything but the backbone."""
+        return [parameter for parameter in self.parameters() if parameter.requires_grad]
+
+
+class VG2GT(Reconstructor):
     """Feed-forward Gaussian reconstruction on a frozen backbone.
 
     Args:
@@ -90,14 +141,7 @@ class VG2GT(nn.Module):
         fine: Callable[..., nn.Module],
         gaussians: Callable[..., nn.Module],
     ) -> None:
-        super().__init__()
-        if scale.source == "metric" and not backend.is_metric:
-            raise ValueError(
-                f"model.scale.source=metric needs a backend that knows metres, {backend.name} does not: "
-                "use model.scale.source=normalize or focal"
-            )
-        self.backend = backend
-        self.scale = scale
+        super().__init__(backend, scale)
         dims, patch = backend.token_dims, backend.patch_size
         self.coarse = coarse(token_dim=dims[-1], num_taps=len(dims), patch_size=patch) if coarse else None
         self.fine = fine(token_dims=dims, patch_size=patch)
@@ -116,13 +160,7 @@ class VG2GT(nn.Module):
         Returns:
             Geometry before and after enhancement, voxels and Gaussians, in scene units and in the frame of view 0.
         """
-        with record_function("vg2gt/encode"):
-            tokens = self.backend.encode(images, hints)
-        with record_function("vg2gt/decode"), torch.no_grad():
-            raw = self.backend.decode(tokens)
-        unit = self.scale(raw, hints)
-        initial = _to_scene_frame(raw, unit)
-
+        tokens, initial, unit = self.read_views(images, hints)
         geometry = initial
         if self.coarse is not None:
             with record_function("vg2gt/coarse"):
@@ -136,10 +174,6 @@ class VG2GT(nn.Module):
         with record_function("vg2gt/gaussians"):
             gaussians: Gaussians = self.gaussians(voxels)
         return Prediction(initial, geometry, voxels, gaussians, unit)
-
-    def trained_parameters(self) -> list[nn.Parameter]:
-        """The parameters that training changes: everything but the backbone."""
-        return [parameter for parameter in self.parameters() if parameter.requires_grad]
 
 
 def _to_scene_frame(geometry: Geometry, unit: Tensor) -> Geometry:

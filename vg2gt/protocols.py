@@ -10,11 +10,11 @@ import torch
 
 from vg2gt.geometry.alignment import align_cameras, fit_depth_scale
 from vg2gt.geometry.cameras import relative_to_first, scale_translations
-from vg2gt.model import VG2GT
+from vg2gt.model import Reconstructor
 from vg2gt.types import Batch, Cameras, Prediction
 
 
-def training_cameras(model: VG2GT, batch: Batch, prediction: Prediction) -> Cameras:
+def training_cameras(model: Reconstructor, batch: Batch, prediction: Prediction) -> Cameras:
     """Cameras of all views of the batch: context views as predicted, held-out views from a joint pass."""
     if batch.images.shape[1] == batch.num_context:
         return prediction.geometry.cameras
@@ -22,7 +22,7 @@ def training_cameras(model: VG2GT, batch: Batch, prediction: Prediction) -> Came
 
 
 @torch.no_grad()
-def joint_target_cameras(model: VG2GT, batch: Batch, prediction: Prediction) -> Cameras:
+def joint_target_cameras(model: Reconstructor, batch: Batch, prediction: Prediction) -> Cameras:
     """Predicted cameras of the held-out views (protocol ``novel``).
 
     The backbone sees context and held-out views together; a similarity between its context cameras and those of the

@@ -103,9 +103,15 @@ def train(config: DictConfig) -> dict[str, Any]:
     Raises:
         FileExistsError: if the folder holds a run and neither ``ckpt`` nor ``overwrite`` says what to do with it.
         FileNotFoundError: if ``ckpt`` names no valid checkpoint.
+        ValueError: if the model has no trained part.
     """
     checkpoint = _checkpoint_to_resume(config)
     run = build(config)
+    if not run.module.model.trained_parameters():
+        raise ValueError(
+            f"{type(run.module.model).__name__} has no trained part: evaluate it as it is (python -m vg2gt.evaluate), "
+            "or choose another model="
+        )
     if checkpoint is not None:
         _name_differences(config)
     write_text(run.folder / "config.yaml", OmegaConf.to_yaml(config, resolve=True))

@@ -277,18 +277,18 @@ class Render(TensorRecord):
 
 @dataclass(frozen=True)
 class Prediction(TensorRecord):
-    """Everything one forward pass of VG²GT yields, in the scene unit and the frame of context view 0.
+    """Everything one forward pass yields, in the scene unit and the frame of context view 0.
 
     Attributes:
         initial: the frozen backbone's geometry, before enhancement.
-        geometry: geometry decoded again from the enhanced tokens.
-        voxels: refined fine voxels.
+        geometry: geometry decoded again from the enhanced tokens; ``initial`` where nothing enhances them.
+        voxels: refined fine voxels; None for models that split no voxels.
         gaussians: the Gaussian scene.
         unit: ``[B]`` scene units per unit of the backend's raw output (1 where nothing was rescaled).
     """
 
     initial: Geometry
     geometry: Geometry
-    voxels: Voxels
+    voxels: Voxels | None
     gaussians: Gaussians
     unit: Tensor

@@ -3,7 +3,7 @@ import math
 import torch
 from scipy.spatial.transform import Rotation
 
-from vg2gt.geometry.rotations import matrix_to_quat, quat_to_matrix
+from vg2gt.geometry.rotations import matrix_to_quat, multiply_quats, quat_to_matrix
 
 
 def random_quats(count: int) -> torch.Tensor:
@@ -39,3 +39,10 @@ def test_gradients_are_finite_at_the_identity() -> None:
     matrix_to_quat(matrix).sum().backward()
     assert matrix.grad is not None
     assert torch.isfinite(matrix.grad).all()
+
+
+def test_product_of_quaternions_is_the_product_of_rotations() -> None:
+    torch.manual_seed(6)
+    one, two = torch.nn.functional.normalize(torch.randn(2, 20, 4, dtype=torch.float64), dim=-1)
+    product = quat_to_matrix(multiply_quats(one, two))
+    assert torch.allclose(product, quat_to_matrix(one) @ quat_to_matrix(two), atol=1e-12)

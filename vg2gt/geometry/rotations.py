@@ -36,3 +36,11 @@ def matrix_to_quat(matrix: Tensor) -> Tensor:
     best = squares.argmax(-1)[..., None, None].expand(*outer.shape[:-2], 1, 4)
     quats = F.normalize(torch.gather(outer, -2, best)[..., 0, :], dim=-1)
     return torch.where(quats[..., :1] < 0, -quats, quats)
+
+
+def multiply_quats(first: Tensor, second: Tensor) -> Tensor:
+    """Hamilton product of quaternions ``[..., 4]`` (wxyz): the rotation ``second`` followed by ``first``."""
+    w, v = first[..., :1], first[..., 1:]
+    other_w, other_v = second[..., :1], second[..., 1:]
+    scalar = w * other_w - (v * other_v).sum(-1, keepdim=True)
+    return torch.cat((scalar, w * other_v + other_w * v + torch.linalg.cross(v, other_v)), -1)

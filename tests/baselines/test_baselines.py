@@ -1,0 +1,295 @@
+"""The models to compare with: counts, order of views, gradients, whole runs."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from hydra.utils import instantiate
+
+from tests.training_helpers import small_config
+from vg2gt.baselines import PixelAligned, VoxelMerged
+from vg2gt.baselines.pixels import usable_pixels
+from vg2gt.baselines.voxel_merged import merge_by_voxel
+from vg2gt.checkpoints import newest_valid, read_checkpoint
+from vg2gt.evaluation import evaluate_scene
+from vg2gt.geometry.cameras import unproject
+from vg2gt.model import Reconstructor
+from vg2gt.rendering import Renderer, render
+from vg2gt.training import build, train
+from vg2gt.types import Batch, Gaussians, Hints, Prediction
+
+TRAINED = ["pixel_aligned", "voxel_merged"]
+ALL = [*TRAINED, "pointcloud"]
+VIEWS = 4
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("rooms")
+
+
+@pytest.fixture(scope="module")
+def batch(cache: Path, tmp_path_factory: pytest.TempPathFactory) -> Batch:
+    data = instantiate(small_config(tmp_path_factory.mktemp("run"), cache, "data.eval_context=[0,4,8,12]").data)
+    data.setup("validate")
+    return next(iter(data.val_dataloader()))
+
+
+@pytest.fixture(scope="module")
+def make(cache: Path, tmp_path_factory: pytest.TempPathFactory):
+    """Models by name, with random numbers in the last layer where one is trained."""
+
+    def make(name: str, *overrides: str, seed: int | None = None) -> Reconstructor:
+        config = small_config(tmp_path_factory.mktemp("run"), cache, f"model={name}", *overrides)
+        torch.manual_seed(0)
+        model = instantiate(config.model, backend=instantiate(config.backend))
+        if seed is not None:
+            torch.manual_seed(seed)
+            torch.nn.init.normal_(model.gaussians.out.weight, std=0.3)
+        return model
+
+    return make
+
+
+def predict(model: Reconstructor, batch: Batch) -> Prediction:
+    return model(batch.context.images, batch.context.hints)
+
+
+@pytest.mark.parametrize("name", TRAINED)
+def test_fast_dev_run(tmp_path: Path, cache: Path, name: str) -> None:
+    report = train(small_config(tmp_path, cache, "debug=fast_dev_run", f"model={name}"))
+    assert {"psnr", "abs_rel", "decoded_abs_rel"} <= set(report["trained"])
+    assert all(value == value for value in report["trained"].values())
+    assert report["trained"]["decoded_abs_rel"] == report["trained"]["decoded_abs_rel_before"]
+
+
+def test_point_cloud_is_evaluated_and_not_trained(tmp_path: Path, cache: Path) -> None:
+    config = small_config(tmp_path, cache, "model=pointcloud")
+    with pytest.raises(ValueError, match="PointCloud has no trained part"):
+        train(config)
+    assert not list(tmp_path.glob("config.yaml"))
+    run = build(config)
+    (metrics,) = run.trainer.validate(run.module, datamodule=run.datamodule, verbose=False)
+    assert metrics["eval/psnr"] > 15
+    assert 0 < metrics["eval/abs_rel"] < 0.1
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_untrained_models_show_the_room(make, batch: Batch, name: str) -> None:
+    model = make(name)
+    prediction = predict(model, batch)
+    shown = render(prediction.gaussians.detach(), prediction.geometry.cameras)
+    seen = prediction.geometry.depth > 0
+    assert float((shown.depth[seen] == 0).float().mean()) < 0.01
+    assert float((shown.color - batch.context.images).abs().mean()) < 0.06
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_one_gaussian_a_valid_pixel(make, batch: Batch, name: str) -> None:
+    """All pixels of the views, less those without depth; merging by voxels only ever makes fewer."""
+    depth = batch.context.depth.clone()
+    depth[:, 1, :10] = 0
+    hints = replace(batch.context.hints, depth=depth)
+    full = make(name)(batch.context.images, batch.context.hints)
+    holey = make(name)(batch.context.images, hints)
+    pixels = int((full.geometry.depth > 0).sum())
+    if name == "voxel_merged":
+        assert 0 < len(holey.gaussians) < len(full.gaussians) < pixels
+    else:
+        assert pixels == VIEWS * 56 * 112
+        assert len(full.gaussians) == pixels
+        assert len(holey.gaussians) == pixels - 10 * 112
+
+
+def test_untrained_gaussians_lie_on_their_pixels(make, batch: Batch) -> None:
+    model = make("pixel_aligned")
+    torch.nn.init.zeros_(model.gaussians.out.weight)
+    prediction = predict(model, batch)
+    points = unproject(prediction.geometry.depth, prediction.geometry.cameras).flatten(0, -2)
+    torch.testing.assert_close(prediction.gaussians.means, points, atol=1e-5, rtol=1e-5)
+    pixels = usable_pixels(prediction.geometry, batch.context.images)
+    footprint = prediction.geometry.depth.flatten() / prediction.geometry.cameras.intrinsics[0, 0, 0, 0]
+    torch.testing.assert_close(pixels.footprint[:, 0], footprint)
+    torch.testing.assert_close(prediction.gaussians.scales[:, 0], 0.5 * footprint)
+
+
+def test_gaussians_stay_near_their_pixels(make, batch: Batch) -> None:
+    model = make("pixel_aligned", seed=1)
+    with torch.no_grad():
+        model.gaussians.out.weight *= 20
+        prediction = predict(model, batch)
+    pixels = usable_pixels(prediction.geometry, batch.context.images)
+    local = (pixels.rotation * (prediction.gaussians.means - pixels.center)[..., None]).sum(-2)
+    relative = local[:, 2] / pixels.depth
+    assert 0.05 < float((relative - 1).abs().max()) < 0.1 + 1e-5
+    sideways = (local[:, :2] - pixels.rays[:, :2] * pixels.depth[:, None] * relative[:, None]) / pixels.footprint
+    assert 0.5 < float(sideways.abs().max()) < 1 + 1e-3
+    widths = prediction.gaussians.scales / pixels.footprint[:, :1]
+    assert 0.009 < float(widths.min()) < float(widths.max()) < 4.001
+
+
+def reordered(batch: Batch, order: list[int]) -> tuple[torch.Tensor, Hints]:
+    context = batch.context
+    hints = context.hints
+    assert hints.depth is not None
+    assert hints.cameras is not None
+    assert hints.frame_ids is not None
+    views = torch.tensor(order)
+    changed = Hints(hints.depth[:, views], hints.cameras.select(views), hints.scene_key, hints.frame_ids[:, views])
+    return context.images[:, views], changed
+
+
+def table(gaussians: Gaussians) -> torch.Tensor:
+    return torch.cat(
+        (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities[:, None], gaussians.sh.flatten(1)), 1
+    )
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_order_of_the_later_views_does_not_matter(make, batch: Batch, name: str) -> None:
+    """View 0 is the world frame; the others may come in any order."""
+    model = make(name, seed=None if name == "pointcloud" else 2)
+    order = [0, 3, 1, 2]
+    images, hints = reordered(batch, order)
+    with torch.no_grad():
+        one = table(predict(model, batch).gaussians)
+        two = table(model(images, hints).gaussians)
+    if name == "voxel_merged":  # sorted by voxel, whatever the order of what is in it
+        assert one.shape == two.shape
+        assert float((one - two).abs().max()) < 1e-4
+    else:
+        moved = one.unflatten(0, (VIEWS, -1))[torch.tensor(order)].flatten(0, 1)
+        torch.testing.assert_close(two, moved, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["pixel_aligned", "pointcloud"])
+def test_another_first_view_turns_the_scene_and_nothing_else(make, batch: Batch, name: str) -> None:
+    """Rotations are predicted in camera axes, so the Gaussians move with the cameras."""
+    model = make(name, "backend.depth_noise=0", seed=None if name == "pointcloud" else 3)
+    images, hints = reordered(batch, [1, 0, 2, 3])
+    with torch.no_grad():
+        one, two = predict(model, batch), model(images, hints)
+    turn = one.geometry.cameras.world_to_camera[0, 1]
+    means = one.gaussians.means @ turn[:3, :3].T + turn[:3, 3]
+    moved = torch.cat([part for index in (1, 0, 2, 3) for part in means.chunk(VIEWS)[index : index + 1]])
+    assert float((two.gaussians.means - moved).abs().max()) < 2e-2  # tokens carry the place in the world, so not exact
+    shown = [render(p.gaussians, p.geometry.cameras).color.mean(0) for p in (one, two)]
+    assert float((shown[0][[1, 0, 2, 3]] - shown[1]).abs().mean()) < 5e-3
+
+
+@pytest.mark.parametrize("name", TRAINED)
+def test_gradient_reaches_every_parameter(make, batch: Batch, name: str) -> None:
+    model = make(name, "model.gaussians.sh_degree=1", seed=4)
+    prediction = predict(model, batch)
+    shown = render(prediction.gaussians, prediction.geometry.cameras.select(slice(0, 2)))
+    ((shown.color - batch.images[:, :2]).square().mean() + 0.1 * shown.depth.mean()).backward()
+    trained = {name: p for name, p in model.named_parameters() if p.requires_grad}
+    assert len(trained) == len(model.trained_parameters())
+    silent = [name for name, p in trained.items() if p.grad is None or not bool(p.grad.any())]
+    assert not silent
+    if isinstance(model, VoxelMerged):  # the confidence as well
+        assert bool(model.gaussians.out.weight.grad[-1].any())  # type: ignore[index]
+    assert all(p.grad is None for p in model.backend.parameters())
+
+
+def test_merging_is_a_weighted_mean() -> None:
+    """Against a loop over voxels."""
+    torch.manual_seed(5)
+    count = 60
+    gaussians = Gaussians(
+        torch.rand(count, 3) - 0.5,
+        torch.nn.functional.normalize(torch.randn(count, 4), dim=-1),
+        torch.rand(count, 3),
+        torch.rand(count),
+        torch.randn(count, 4, 3),
+        torch.arange(count) // 30,
+    )
+    weights, size = torch.rand(count) + 0.1, torch.tensor([0.5, 0.25])
+    merged = merge_by_voxel(gaussians, weights, size)
+    voxels: dict[tuple[int, ...], list[int]] = {}
+    for row in range(count):
+        scene = int(gaussians.batch[row])
+        cell = (gaussians.means[row].double() / size[scene].double()).floor().long().tolist()
+        voxels.setdefault((scene, *cell), []).append(row)
+    assert len(merged) == len(voxels)
+    assert max(map(len, voxels.values())) > 2
+    for index, (key, rows) in enumerate(sorted(voxels.items())):
+        w = weights[rows] / weights[rows].sum()
+        assert int(merged.batch[index]) == key[0]
+        for name in ("means", "scales", "opacities", "sh"):
+            values = getattr(gaussians, name)[rows]
+            expected = (w.reshape(-1, *(1,) * (values.dim() - 1)) * values).sum(0)
+            torch.testing.assert_close(getattr(merged, name)[index], expected, atol=1e-6, rtol=1e-5)
+    turned = replace(gaussians, quats=-gaussians.quats)
+    torch.testing.assert_close(merge_by_voxel(turned, weights, size).quats, merged.quats)
+    assert torch.allclose(merged.quats.norm(dim=-1), torch.ones(len(merged)))
+
+
+def test_larger_voxels_merge_more(make, batch: Batch) -> None:
+    counts = [len(predict(make("voxel_merged", f"model.min_footprint={f}"), batch).gaussians) for f in (1, 2, 4, 8)]
+    assert counts == sorted(counts, reverse=True)
+    assert counts[-1] < counts[0] / 4
+
+
+def test_point_cloud_as_3dgs_starts(make, batch: Batch) -> None:
+    """Spacing to the three nearest points, against all distances."""
+    model = make("pointcloud", "model.spacing=neighbors", "model.width=1", "model.opacity=0.1")
+    gaussians = predict(model, batch).gaussians
+    some = torch.arange(0, len(gaussians), 997)
+    distances = torch.cdist(gaussians.means[some].double(), gaussians.means.double()).sort(1).values[:, 1:4]
+    expected = distances.square().mean(1).sqrt().float()
+    torch.testing.assert_close(gaussians.scales[some, 0], expected, atol=1e-5, rtol=1e-4)
+    assert float(gaussians.opacities.max()) == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("name", TRAINED)
+def test_checkpoint_round_trip(tmp_path: Path, cache: Path, name: str) -> None:
+    def config(folder: str, *overrides: str):
+        return small_config(tmp_path / folder, cache, f"model={name}", "trainer.max_steps=2", *overrides)
+
+    first = train(config("first"))
+    stored = newest_valid(tmp_path / "first" / "checkpoints")
+    assert not [key for key in read_checkpoint(stored)["state_dict"] if ".backend." in key]
+    again = train(config("second", f"init_from={stored}", "trainer.max_steps=1"))
+    assert again["untrained"] == first["trained"]
+    other = "voxel_merged" if name == "pixel_aligned" else "tiny"
+    with pytest.raises(ValueError, match="does not fit this model"):
+        train(
+            small_config(tmp_path / "third", cache, f"model={other}", f"ckpt={stored}", "model.gaussians.sh_degree=1")
+        )
+
+
+def test_unknown_options_are_refused(make) -> None:
+    with pytest.raises(Exception, match=r"model\.spacing is 'metres'"):
+        make("pointcloud", "model.spacing=metres")
+    with pytest.raises(Exception, match=r"gaussians\.sh_degree must be 0 to"):
+        make("pixel_aligned", "model.gaussians.sh_degree=9")
+
+
+def test_no_usable_pixel_gives_an_empty_scene(make, batch: Batch) -> None:
+    hints = replace(batch.context.hints, depth=torch.zeros_like(batch.context.depth))
+    for name in ALL:
+        assert len(make(name)(batch.context.images, hints).gaussians) == 0
+
+
+def test_two_scenes_equal_two_runs(make, batch: Batch) -> None:
+    context = batch.context
+    double = context.map(lambda t: torch.cat((t, t)))
+    double = replace(double, scene=context.scene * 2)
+    for name in ALL:
+        model = make(name)
+        with torch.no_grad():
+            one = predict(model, batch).gaussians
+            two = model(double.images, double.hints).gaussians
+        assert len(two) == 2 * len(one)
+        torch.testing.assert_close(table(two.scene(1)), table(one), atol=1e-5, rtol=1e-5)
+
+
+def test_evaluation_takes_every_model(make, batch: Batch) -> None:
+    scores = {name: evaluate_scene(make(name), Renderer(), batch) for name in ALL}
+    assert (
+        scores["pointcloud"]["gaussians"] == scores["pixel_aligned"]["gaussians"] > scores["voxel_merged"]["gaussians"]
+    )
+    assert scores["voxel_merged"]["cv"] < scores["pixel_aligned"]["cv"]
+    assert isinstance(make("pixel_aligned"), PixelAligned)

@@ -1,0 +1,144 @@
+"""One Gaussian a pixel from a dense head on the frozen tokens, as Depth Anything 3 and others do."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from backends.base import Backend
+from vg2gt.baselines.pixels import Pixels, usable_pixels
+from vg2gt.geometry.rotations import matrix_to_quat, multiply_quats
+from vg2gt.geometry.spherical_harmonics import MAX_DEGREE, rgb_to_sh
+from vg2gt.model import Reconstructor, SceneScale
+from vg2gt.types import Gaussians, Hints, Prediction
+from vg2gt.voxels import DenseHead
+
+MAX_SCALE = 4.0  # footprints
+MIN_SCALE = 1e-2  # footprints: renderers need a finite inverse
+INITIAL_SCALE = 0.5  # footprints
+INITIAL_OPACITY = 0.9
+
+
+class PixelHead(nn.Module):
+    """Two-layer MLP from a pixel's feature to one Gaussian.
+
+    Before training every Gaussian lies on its unprojected pixel, is round, half a pixel wide at its depth (standard
+    deviation), nearly opaque and has the pixel's colour, so that coloured points render without holes.
+
+    Args:
+        in_channels: width of the pixel features.
+        sh_degree: degree L of the spherical harmonics, 0 to 3.
+        max_offset: largest sideways shift of the mean, in pixels.
+        max_depth_residual: largest relative change of the depth.
+        hidden: width of the hidden layer; None takes ``in_channels``.
+
+    Attributes:
+        out: the last layer; its last output a pixel is the logit of a confidence, which ``VoxelMerged`` uses.
+    """
+
+    def __init__(
+        self,
+        in_channels: int,
+        sh_degree: int = 0,
+        max_offset: float = 1.0,
+        max_depth_residual: float = 0.1,
+        hidden: int | None = None,
+    ) -> None:
+        super().__init__()
+        if not 0 <= sh_degree <= MAX_DEGREE:
+            raise ValueError(f"gaussians.sh_degree must be 0 to {MAX_DEGREE}, got {sh_degree}")
+        self.max_offset = max_offset
+        self.max_depth_residual = max_depth_residual
+        bands = (sh_degree + 1) ** 2
+        self.parts = (2, 1, 3, 4, 1, 3 * bands, 1)
+        self.hidden = nn.Linear(in_channels, hidden or in_channels)
+        self.out = nn.Linear(hidden or in_channels, sum(self.parts))
+        nn.init.normal_(self.out.weight, std=0.02)
+        nn.init.zeros_(self.out.bias)
+        self.scale_bias = _logit(INITIAL_SCALE / MAX_SCALE)
+        self.opacity_bias = _logit(INITIAL_OPACITY)
+        degrees = [degree for degree in range(sh_degree + 1) for _ in range(2 * degree + 1)]
+        gains = torch.tensor([0.1 * 0.25**degree if degree else 1.0 for degree in degrees])
+        self.sh_gain: Tensor
+        self.register_buffer("sh_gain", gains[:, None], persistent=False)
+
+    def forward(
+        self, features: Tensor, pixels: Pixels, min_footprint: Tensor | None = None
+    ) -> tuple[Gaussians, Tensor]:
+        """Turns pixels into Gaussians.
+
+        Args:
+            features: ``[N, C]``.
+            pixels: the same N pixels.
+            min_footprint: ``[N]`` in scene units; scales are relative to it where it is larger than the pixel. None: 0.
+
+        Returns:
+            One Gaussian a pixel, in the order of the pixels, and positive confidences ``[N]`` that are those of the
+            depth before training.
+        """
+        raw = self.out(F.gelu(self.hidden(features))).float()
+        shift, residual, scale, rotation, opacity, color, trust = raw.split(self.parts, -1)
+        depth = pixels.depth * (1 + self.max_depth_residual * torch.tanh(residual[:, 0]))
+        sideways = self.max_offset * pixels.footprint * torch.tanh(shift)
+        means = pixels.to_world(pixels.rays * depth[:, None] + F.pad(sideways, (0, 1)))
+        footprint = pixels.footprint.mean(-1)
+        unit = footprint if min_footprint is None else torch.maximum(footprint, min_footprint)
+        scales = unit[:, None] * (MAX_SCALE * torch.sigmoid(scale + self.scale_bias)).clamp(min=MIN_SCALE)
+        # In camera axes: a head that sees images cannot know the world's.
+        quats = F.normalize(rotation + rotation.new_tensor([1.0, 0.0, 0.0, 0.0]), dim=-1)
+        quats = multiply_quats(matrix_to_quat(pixels.rotation), quats)
+        base = F.pad(rgb_to_sh(pixels.colors)[:, None], (0, 0, 0, len(self.sh_gain) - 1))
+        gaussians = Gaussians(
+            means=means,
+            quats=quats,
+            scales=scales,
+            opacities=torch.sigmoid(opacity[:, 0] + self.opacity_bias),
+            sh=base + self.sh_gain * color.unflatten(-1, (-1, 3)),
+            batch=pixels.batch,
+        )
+        # softplus(ln(e - 1)) = 1: the confidence of the depth, until training knows better.
+        return gaussians, pixels.confidence * F.softplus(trust[:, 0] + math.log(math.e - 1)).clamp(min=1e-6)
+
+
+class PixelAligned(Reconstructor):
+    """One Gaussian for every pixel with a depth.
+
+    The geometry is the backbone's own; only the dense head and the Gaussian head are trained.
+
+    Args:
+        backend: the frozen visual foundation model.
+        scale: fixes the scene unit.
+        dense_head: makes the dense head from ``token_dims`` and ``patch_size``.
+        gaussians: makes the pixel head from ``in_channels``.
+    """
+
+    def __init__(
+        self,
+        backend: Backend,
+        scale: SceneScale,
+        dense_head: Callable[..., DenseHead],
+        gaussians: Callable[..., PixelHead],
+    ) -> None:
+        super().__init__(backend, scale)
+        self.dense_head = dense_head(token_dims=backend.token_dims, patch_size=backend.patch_size)
+        self.gaussians = gaussians(in_channels=self.dense_head.out_channels)
+
+    def forward(
+        self, images: Tensor, hints: Hints | None = None, generator: torch.Generator | None = None
+    ) -> Prediction:
+        """Reconstructs B scenes; see :meth:`vg2gt.model.Reconstructor.forward`. Nothing is random here."""
+        tokens, geometry, unit = self.read_views(images, hints)
+        with torch.profiler.record_function("vg2gt/fine"):
+            dense = self.dense_head(tokens, images).permute(0, 2, 3, 1).flatten(0, 2)
+        with torch.profiler.record_function("vg2gt/gaussians"), torch.autocast(images.device.type, enabled=False):
+            pixels = usable_pixels(geometry, images)
+            gaussians, _ = self.gaussians(F.gelu(dense.float()).index_select(0, pixels.rows), pixels)
+        return Prediction(geometry, geometry, None, gaussians, unit)
+
+
+def _logit(probability: float) -> float:
+    return math.log(probability / (1 - probability))

@@ -1,0 +1,78 @@
+"""The backbone's coloured points as Gaussians: nothing is trained (paper, Baselines, "coloured point clouds")."""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+import torch
+from torch import Tensor
+
+from backends.base import Backend
+from vg2gt.baselines.pixels import Pixels, usable_pixels
+from vg2gt.geometry.spherical_harmonics import rgb_to_sh
+from vg2gt.model import Reconstructor, SceneScale
+from vg2gt.types import Gaussians, Hints, Prediction
+from vg2gt.voxels.knn import nearest_neighbors
+
+Spacing = Literal["pixel", "neighbors"]
+NEIGHBORS = 3
+
+
+class PointCloud(Reconstructor):
+    """One round Gaussian a pixel, as wide as the points lie apart.
+
+    Args:
+        backend: the frozen visual foundation model.
+        scale: fixes the scene unit.
+        spacing: ``pixel``: the size of the pixel at its depth; ``neighbors``: the root mean square distance to the
+            three nearest points, which with ``opacity=0.1`` is how 3DGS starts from a point cloud.
+        width: standard deviation over the spacing.
+        opacity: of every Gaussian, in (0, 1).
+
+    Raises:
+        ValueError: if the spacing is unknown.
+    """
+
+    def __init__(
+        self,
+        backend: Backend,
+        scale: SceneScale,
+        spacing: Spacing = "pixel",
+        width: float = 0.5,
+        opacity: float = 0.9,
+    ) -> None:
+        if spacing not in get_args(Spacing):
+            raise ValueError(f"model.spacing is {spacing!r}; choose one of {', '.join(get_args(Spacing))}")
+        super().__init__(backend, scale)
+        self.spacing = spacing
+        self.width = width
+        self.opacity = opacity
+
+    @torch.no_grad()
+    def forward(
+        self, images: Tensor, hints: Hints | None = None, generator: torch.Generator | None = None
+    ) -> Prediction:
+        """Reconstructs B scenes; see :meth:`vg2gt.model.Reconstructor.forward`. Nothing is random here."""
+        _, geometry, unit = self.read_views(images, hints)
+        with torch.profiler.record_function("vg2gt/gaussians"), torch.autocast(images.device.type, enabled=False):
+            pixels = usable_pixels(geometry, images)
+            means = pixels.to_world(pixels.rays * pixels.depth[:, None])
+            spacing = pixels.footprint.mean(-1) if self.spacing == "pixel" else _distance_to_neighbors(means, pixels)
+            gaussians = Gaussians(
+                means=means,
+                quats=means.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(means), 1),
+                scales=(self.width * spacing)[:, None].repeat(1, 3),
+                opacities=torch.full_like(spacing, self.opacity),
+                sh=rgb_to_sh(pixels.colors)[:, None],
+                batch=pixels.batch,
+            )
+        return Prediction(geometry, geometry, None, gaussians, unit)
+
+
+def _distance_to_neighbors(means: Tensor, pixels: Pixels) -> Tensor:
+    """Root mean square distance ``[N]`` of every point to its nearest others in the scene, at least 1 % of a pixel."""
+    parts = []
+    for points in means.split(torch.bincount(pixels.batch).tolist()):
+        index = nearest_neighbors(points, points, NEIGHBORS + 1)[:, 1:]  # the nearest is the point itself
+        parts.append((points[index] - points[:, None]).square().sum(-1).mean(1).sqrt())
+    return torch.maximum(torch.cat(parts), 0.01 * pixels.footprint.mean(-1)) if parts else means[:, 0]
