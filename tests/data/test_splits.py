@@ -53,7 +53,7 @@ def test_the_command_writes_lists_that_the_data_module_takes(write_recording, tm
     lists = [str(tmp_path / "lists" / name) for name in ("train.txt", "val.txt")]
     assert sorted(name for path in lists for name in read_split(path)) == ["attic", "cellar", "hall", "kitchen"]
 
-    makers = [partial(RGBDFolder, scenes=path, holdout=None) for path in lists]
+    train, val = (partial(RGBDFolder, scenes=path, holdout=None) for path in lists)
     options: dict[str, Any] = {
         "root": str(tmp_path / "home"),
         "min_views": 2,
@@ -61,9 +61,9 @@ def test_the_command_writes_lists_that_the_data_module_takes(write_recording, tm
         "eval_context": 2,
         "eval_target": 1,
     }
-    SceneDataModule(*makers, **options).setup()
+    SceneDataModule(train, val, **options).setup()
     with pytest.raises(DataError, match="used for training and for evaluation"):
-        SceneDataModule(makers[0], makers[0], **options).setup()
+        SceneDataModule(train, train, **options).setup()
 
     main([*arguments, f"out={tmp_path / 'lists'}"])  # the same again
     with pytest.raises(SystemExit, match="holds another split"):

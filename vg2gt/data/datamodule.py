@@ -14,6 +14,7 @@ from vg2gt.data.batches import BatchDataset
 from vg2gt.data.evaluation_views import EvaluationViews
 from vg2gt.data.framing import Crop, Fit, FramingSampler
 from vg2gt.data.overlap import refuse_overlap, refuse_untrainable
+from vg2gt.data.resized_cache import ResizedCache
 from vg2gt.data.sampling import StepSampler, ViewSampler, usable_scenes
 from vg2gt.data.transforms import reduce_to_cover
 from vg2gt.types import Batch
@@ -50,6 +51,8 @@ class SceneDataModule(LightningDataModule):
         size_multiple: drawn sizes are multiples of this; the backbone's patch size.
         crop: training crops at the ``center`` or at ``random``.
         zoom: range from which a training scene's zoom is drawn.
+        resized_cache: folder that keeps decoded training frames, reduced to the size that is needed (``ResizedCache``);
+            None: they are decoded from the dataset's files every time.
         common: arguments that ``train`` and ``val`` share, such as the dataset's ``root``.
     """
 
@@ -77,6 +80,7 @@ class SceneDataModule(LightningDataModule):
         size_multiple: int = 14,
         crop: Crop = "center",
         zoom: Sequence[float] = (1.0, 1.0),
+        resized_cache: str | None = None,
         **common: Any,
     ) -> None:
         super().__init__()
@@ -84,6 +88,7 @@ class SceneDataModule(LightningDataModule):
         self.eval_views = EvaluationViews(eval_context, eval_target, eval_window)
         size = (int(image_size[0]), int(image_size[1]))
         self.framing = FramingSampler(size, aspect, size_multiple, fit, crop, zoom, seed)
+        self.resized_cache = resized_cache
         self.common = common
         self.train_scenes = train_scenes
         self.eval_scenes = eval_scenes
@@ -111,6 +116,8 @@ class SceneDataModule(LightningDataModule):
         names = list(val.scenes)[: self.eval_scenes]
         self._val_views = [views for name in names for views in self.eval_views.choose(val, name)]
         refuse_overlap(train, self._train_names, val, self._val_views)
+        if self.resized_cache:
+            train = ResizedCache(train, self.resized_cache, self.framing.largest)
         self._train = BatchDataset(train, self._training_size(), self.memory_mb, replace_damaged=True)
         self._val = BatchDataset(val, self.framing.still.apply, self.memory_mb)
 

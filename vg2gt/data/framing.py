@@ -77,8 +77,8 @@ class FramingSampler:
         for name, bounds, least in (("aspect", self.aspect, 0.05), ("zoom", self.zoom, 1.0)):
             if bounds is not None and (len(bounds) != 2 or not least <= bounds[0] <= bounds[1] <= 20):
                 raise ValueError(f"data.{name} must be a range [least, most] within [{least}, 20], got {bounds}")
-        if self.size_multiple < 1 or min(self.image_size) < self.size_multiple:
-            raise ValueError(f"data.size_multiple must be in [1, {min(self.image_size)}], got {self.size_multiple}")
+        if self.size_multiple < 1:
+            raise ValueError(f"data.size_multiple must be at least 1, got {self.size_multiple}")
         if self.fit == "pad" and (self.crop != "center" or tuple(self.zoom) != (1, 1)):
             raise ValueError("data.fit=pad keeps the whole frame: leave data.crop=center and data.zoom=[1,1]")
 

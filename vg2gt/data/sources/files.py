@@ -134,6 +134,14 @@ class FileSource(SceneSource):
             sparse_depth=self.sparse_depth,
         )
 
+    def identity(self, scene: str) -> str:
+        """Also the version of the loader and the state of the scene's files; not which frames are chosen."""
+        choice = ("holdout", "every", "index_cache")
+        options = {k: repr(v) for k, v in sorted(vars(self).items()) if not k.startswith("_") and k not in choice}
+        folder = self._folders[scene]
+        state = (self.index_version, str(folder.resolve()), self.state(scene, folder))
+        return json.dumps([type(self).__qualname__, scene, options, state])
+
     def scene_index(self, scene: str) -> SceneIndex:
         """The index of a scene, from memory, from the cache, or read anew."""
         if scene not in self._folders:
