@@ -1,6 +1,25 @@
 """Datasets on disk, one file a layout; all are a ``FileSource``."""
 
 from vg2gt.data.sources.colmap_model import COLMAP
+from vg2gt.data.sources.infinigen import Infinigen
 from vg2gt.data.sources.kitti import KITTI
+from vg2gt.data.sources.nerfstudio import Nerfstudio
+from vg2gt.data.sources.replica import Replica
+from vg2gt.data.sources.scannet import ScanNet
+from vg2gt.data.sources.scannet_sens import ScanNetSens
+from vg2gt.data.sources.scannetpp import ScanNetPPiPhone
+from vg2gt.data.sources.tum import TUM
+from vg2gt.data.sources.virtual_kitti import VirtualKITTI2
 
-__all__ = ["COLMAP", "KITTI"]
+__all__ = [
+    "COLMAP",
+    "KITTI",
+    "TUM",
+    "Infinigen",
+    "Nerfstudio",
+    "Replica",
+    "ScanNet",
+    "ScanNetPPiPhone",
+    "ScanNetSens",
+    "VirtualKITTI2",
+]

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import statistics
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +10,11 @@ import torch
 from numpy.typing import NDArray
 
 from vg2gt.data.base import DataError
-from vg2gt.data.image_files import image_size
+from vg2gt.data.image_files import image_size, typical_size
 from vg2gt.data.sources.files import FileSource
 from vg2gt.data.sources.index import SceneIndex, Size, folder_state, make_index
 from vg2gt.data.sources.parsing import errors_name, inverse
+from vg2gt.data.sources.scene_folders import scene_folders
 from vg2gt.geometry.cameras import resize_intrinsics
 from vg2gt.io import ColmapImage, ColmapModel, colmap_intrinsics, colmap_pose, read_colmap
 
@@ -70,10 +70,7 @@ class COLMAP(FileSource):
 
     def find(self, root: Path) -> Mapping[str, Path]:
         """The folder itself, or scenes one or two levels below it."""
-        if _model_folder(root) is not None:
-            return {root.resolve().name: root}
-        inner = [folder for pattern in ("*", "*/*") for folder in sorted(root.glob(pattern)) if _model_folder(folder)]
-        return {folder.relative_to(root).as_posix(): folder for folder in inner}
+        return scene_folders(root, lambda folder: _model_folder(folder) is not None, by_path=True)
 
     def options(self) -> Mapping[str, object]:
         """The image folder, and whether frames need points."""
@@ -95,8 +92,7 @@ class COLMAP(FileSource):
         if not color:
             raise DataError(f"scene {scene}: none of the model's {len(records)} images is in {folder / self.images}")
         sizes = {i: image_size(path, scene) for i, path in color.items()}
-        alike = len(set(sizes.values())) == 1
-        size = (_median(size[0] for size in sizes.values()), _median(size[1] for size in sizes.values()))
+        size = typical_size(sizes.values())
         depth = None
         if self.has_depth:
             points = self._scene_points(scene, folder)
@@ -109,7 +105,7 @@ class COLMAP(FileSource):
             camera_to_world={i: _camera_to_world(record) for i, record in enumerate(records)},
             intrinsics={i: _resized_intrinsics(model, records[i], sizes[i], path) for i, path in color.items()},
             size=size,
-            color_size=size if alike else None,
+            color_size=size if len(set(sizes.values())) == 1 else None,
         )
 
     def read_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
@@ -169,10 +165,6 @@ def _model_folder(folder: Path) -> Path | None:
 
 def _in_order(model: ColmapModel) -> list[ColmapImage]:
     return sorted(model.images.values(), key=lambda image: image.name)
-
-
-def _median(values: Iterable[int]) -> int:
-    return int(statistics.median_low(values))
 
 
 def _refuse_distorted(model: ColmapModel, where: str) -> None:

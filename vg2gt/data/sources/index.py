@@ -106,7 +106,8 @@ def make_index(
             dropped["without a depth file"] += 1
         else:
             kept.append(number)
-    lone = len((set(depth or ()) | set(camera_to_world)) - set(color))
+    listed = set(color) | set(depth or ()) | set(camera_to_world)
+    lone = len(listed) - len(color)
     if lone:
         dropped["without a colour image"] = lone
     if not kept:
@@ -115,7 +116,7 @@ def make_index(
         reasons = "".join(f"; {count} frames {reason}" for reason, count in dropped.items())
         raise DataError(f"no usable frame in {where}: it has {found}{reasons}")
     for reason, count in dropped.items():
-        log.warning("scene %s: %d of %d frames %s are left out", name, count, len(color), reason)
+        log.warning("scene %s: %d of %d frames %s are left out", name, count, len(listed), reason)
     poses = rigid(np.stack([camera_to_world[number] for number in kept]).astype(np.float64), kept, where)
     if isinstance(intrinsics, Mapping):
         matrices = np.stack([intrinsics[number] for number in kept]).astype(np.float64)

@@ -1,0 +1,38 @@
+"""nerfstudio captures: one camera or one a frame, with and without depth."""
+
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from vg2gt.data import Frames
+from vg2gt.data.sources import Nerfstudio
+from vg2gt.io import Lens, Transforms, TransformsFrame, write_transforms
+
+from .layouts import SIZE, Layout, pixels
+
+
+def write(root: Path, frames: Frames, depth: bool = True) -> None:
+    """``transforms.json``, ``images/`` and ``depth/`` in millimetres."""
+    for name in ("images", "depth"):
+        (root / "desk" / name).mkdir(parents=True)
+    records = []
+    for i, image in enumerate(pixels(frames)):
+        Image.fromarray(image).save(root / "desk" / "images" / f"{i:04d}.png")
+        Image.fromarray((frames.depth[i].numpy() * 1000 + 0.5).astype(np.uint16)).save(
+            root / "desk" / "depth" / f"{i:04d}.png"
+        )
+        lens = Lens.from_intrinsics(frames.intrinsics[i].double().numpy(), SIZE)
+        pose = frames.world_to_camera[i].double().numpy()
+        # Some writers leave the suffix out.
+        name = f"images/{i:04d}" + ("" if i % 2 else ".png")
+        records.append(TransformsFrame(name, pose, lens, f"depth/{i:04d}.png" if depth else None))
+    write_transforms(root / "desk" / "transforms.json", Transforms(tuple(records[::-1])))
+
+
+LAYOUTS = {
+    "nerfstudio": Layout(
+        lambda root, frames: write(root, frames, False), lambda root: Nerfstudio(str(root)), depth_quantum=None
+    ),
+    "nerfstudio_depth": Layout(write, lambda root: Nerfstudio(str(root), depth=True)),
+}

@@ -1,0 +1,40 @@
+"""Plane sweep: how well one image explains another at the best of many depths, from poses and intrinsics alone."""
+
+import torch
+from torch.nn.functional import avg_pool2d, grid_sample
+
+from vg2gt.data import Frames
+from vg2gt.geometry.cameras import project, unproject
+from vg2gt.types import Cameras
+
+WINDOW = 9
+
+
+def median_best_ncc(frames: Frames, near: float, far: float, planes: int = 64, window: int = WINDOW) -> float:
+    """Median over pixels of the first frame of the best normalised cross-correlation with the second."""
+    gray = frames.images.mean(1)
+    height, width = gray.shape[-2:]
+    first, second = (
+        Cameras(frames.world_to_camera[None, i : i + 1], frames.intrinsics[None, i : i + 1], (height, width))
+        for i in (0, 1)
+    )
+    best = torch.full((height, width), -1.0)
+    for depth in 1 / torch.linspace(1 / near, 1 / far, planes):
+        pixels, z = project(unproject(torch.full((1, 1, height, width), float(depth)), first), second)
+        grid = (pixels[0] + 0.5) * (2 / torch.tensor([width, height])) - 1
+        warped = grid_sample(gray[1][None, None], grid, padding_mode="border", align_corners=False)[0, 0]
+        inside = (grid[0].abs() < 1).all(-1) & (z[0, 0] > 0)
+        score = torch.where(_mean(inside.float(), window) > 0.999, _ncc(gray[0], warped, window), -1.0)
+        best = torch.maximum(best, score)
+    return float(best[best > -1].median())
+
+
+def _ncc(a: torch.Tensor, b: torch.Tensor, window: int) -> torch.Tensor:
+    mean_a, mean_b = _mean(a, window), _mean(b, window)
+    covariance = _mean(a * b, window) - mean_a * mean_b
+    variances = (_mean(a * a, window) - mean_a**2) * (_mean(b * b, window) - mean_b**2)
+    return covariance / variances.clamp(min=1e-10).sqrt()
+
+
+def _mean(image: torch.Tensor, window: int) -> torch.Tensor:
+    return avg_pool2d(image[None, None], window, 1, window // 2, count_include_pad=False)[0, 0]
