@@ -157,6 +157,10 @@ class SceneDataModule(LightningDataModule):
         """The evaluation batches."""
         return self.val_dataloader()
 
+    def evaluation_data(self) -> BatchDataset:
+        """The evaluation scenes alone, for any views of them: indexed by a tuple of ``SceneViews``."""
+        return BatchDataset(self._source(self._make_val), self.framing.still.apply, self.memory_mb)
+
     def _training_size(self) -> Callable[[Frames], Frames]:
         """What is kept of a training frame: its final size, or as much as any framing can need."""
         if not self.framing.moves:

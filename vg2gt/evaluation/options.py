@@ -1,0 +1,71 @@
+"""What an evaluation compares, and how: every option stands in its configuration and in its report."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from vg2gt.evaluation.views import ViewSelection
+from vg2gt.metrics.depth import ALIGNMENTS
+
+
+@dataclass(frozen=True)
+class PointOptions:
+    """How point clouds are compared; lengths in the data's unit.
+
+    Args:
+        threshold: distance below which a point is right.
+        downsample: one point is kept in every cell of this edge; None keeps all.
+        cap: distances from here on are left out of the means; None: none.
+    """
+
+    threshold: float = 0.05
+    downsample: float | None = 0.02
+    cap: float | None = None
+
+
+@dataclass(frozen=True)
+class EvaluationOptions:
+    """What an evaluation compares.
+
+    Args:
+        selection: which views of a scene.
+        alignment: of depth, see :func:`vg2gt.metrics.depth_metrics`; the paper's is ``median``.
+        depth_range: true depths outside it are left out, ``(nearest, farthest)`` in the data's unit; None: no bound.
+        neighbors: k of the uniformity CV.
+        points: how point clouds are compared.
+        lpips: ``auto`` (weights in torch hub's cache), ``download``, the weights' path, or None: no LPIPS.
+        pictures: number of scenes of which pictures are written, for every number of views.
+        table: name of the data set in the paper's tables, whose rows are printed below ours; None: none of them.
+
+    Raises:
+        ValueError: if the alignment is unknown or a number out of range.
+    """
+
+    selection: ViewSelection = field(default_factory=ViewSelection)
+    alignment: str = "median"
+    depth_range: Sequence[float | None] = (None, None)
+    neighbors: int = 8
+    points: PointOptions = field(default_factory=PointOptions)
+    lpips: str | None = "auto"
+    pictures: int = 0
+    table: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.alignment not in ALIGNMENTS:
+            raise ValueError(f"evaluation.alignment={self.alignment!r}: choose one of {', '.join(ALIGNMENTS)}")
+        if self.neighbors < 1 or self.pictures < 0 or len(self.depth_range) != 2:
+            raise ValueError(
+                "evaluation needs neighbors >= 1, pictures >= 0 and depth_range=[nearest,farthest], got "
+                f"{self.neighbors}, {self.pictures} and {list(self.depth_range)}"
+            )
+
+    @property
+    def nearest(self) -> float:
+        """The nearest true depth that counts."""
+        return self.depth_range[0] or 0.0
+
+    @property
+    def farthest(self) -> float:
+        """The farthest true depth that counts."""
+        return self.depth_range[1] or float("inf")
