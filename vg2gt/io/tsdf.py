@@ -1,8 +1,7 @@
 """Fusion of depth maps into a truncated signed distance, on blocks of voxels near surfaces only.
 
-A view measures the difference in z between a surface and a voxel. The cosine between ray and normal turns it into the
-distance from the surface's tangent plane; without it, views at a slant pull the mean outwards. Its square is the view's
-weight.
+A view measures the difference in z between a surface and a voxel, which overstates the distance where it looks at a
+slant and would pull the mean outwards. The squared cosine between ray and normal, its weight, keeps that small.
 """
 
 from __future__ import annotations
@@ -94,10 +93,9 @@ def _surface_blocks(depth: Tensor, cameras: Cameras, voxel_size: float, truncati
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """One depth map with its camera: z-depth, normal times ray of unit z, and weight, all ``[H, W]``."""
+    """One depth map with its camera: z-depth and weight ``[H, W]``, colour ``[3, H, W]``."""
 
     depth: Tensor
-    facing: Tensor
     weight: Tensor
     color: Tensor | None
     world_to_camera: Tensor
@@ -108,11 +106,9 @@ def _view(depth: Tensor, cameras: Cameras, colors: Tensor | None, index: int) ->
     intrinsics = cameras.intrinsics[0, index]
     rays = ray_directions(intrinsics, cameras.size)
     normals, valid = normals_from_depth(depth[index], intrinsics)
-    facing = (normals.permute(1, 2, 0) * rays).sum(-1).abs()
-    cosine = facing / rays.norm(dim=-1)
+    cosine = (normals.permute(1, 2, 0) * rays).sum(-1) / rays.norm(dim=-1)
     return _View(
         depth[index],
-        torch.where(valid, facing, 1.0),
         torch.where(valid, cosine.square().clamp(min=_MIN_WEIGHT), _EDGE_WEIGHT),
         None if colors is None else colors[index],
         cameras.world_to_camera[0, index],
@@ -136,9 +132,9 @@ def _integrate(
     surface = _sample_depth(view.depth, x, y, truncation)
     keep = (surface > 0) & (surface - z > -truncation)
     pick, column, row = pick[keep], x[keep].round().long(), y[keep].round().long()
-    signed = view.facing[row, column] * (surface - z)[keep] / truncation
+    signed = (surface - z)[keep] / truncation
     share = view.weight[row, column]
-    distance.view(-1)[pick] += share * signed.clamp(-1, 1)
+    distance.view(-1)[pick] += share * signed.clamp(max=1)
     weight.view(-1)[pick] += share
     if shade is not None and view.color is not None:
         shade.view(-1, 3)[pick] += share[:, None] * view.color[:, row, column].T
