@@ -67,8 +67,7 @@ def test_every_option_composes_and_fits_its_constructor(tmp_path: Path, group: s
 def test_every_preset_composes(tmp_path: Path, group: str) -> None:
     assert names(group)
     for name in names(group):
-        extra = ["data.root=somewhere"] if name == "paper" else []
-        config = composed(tmp_path, f"{group}={name}", *extra)
+        config = composed(tmp_path, f"{group}={name}")
         assert assert_signatures_fit(OmegaConf.to_container(config, resolve=True)) >= 8
 
 
@@ -99,7 +98,7 @@ def test_every_ablation_builds_what_it_says(tmp_path: Path, ablation: str) -> No
 
 def test_paper_experiment_holds_the_papers_numbers(tmp_path: Path) -> None:
     """Paper, Implementation Details."""
-    config = composed(tmp_path, "experiment=paper", "data.root=somewhere")
+    config = composed(tmp_path, "experiment=paper")
     assert config.trainer.max_steps == 420_000
     assert config.trainer.devices == 2
     assert config.optimizer._target_ == "torch.optim.AdamW"
@@ -110,4 +109,5 @@ def test_paper_experiment_holds_the_papers_numbers(tmp_path: Path) -> None:
     assert config.model.scale.source == "focal"
     assert list(config.data.image_size) == [224, 448]
     assert (config.data.min_views, config.data.max_views) == (3, 18)
+    assert set(config.data.weights) == {"infinigen", "kitti", "scannet"}
     assert config.training.render_views is None
