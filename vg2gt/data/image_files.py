@@ -18,6 +18,19 @@ from vg2gt.data.base import DataError
 # What Pillow raises for files that are damaged in one way or another.
 _DAMAGED = (OSError, SyntaxError, ValueError, EOFError, zlib.error, struct.error, Image.DecompressionBombError)
 
+_ORIENTATION_TAG = 0x0112
+# What turns an image upright, by its EXIF orientation.
+_TURNS = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_270,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_90,
+}
+_QUARTER_TURNS = (5, 6, 7, 8)
+
 
 def image_size(path: Path, scene: str) -> tuple[int, int]:
     """Returns an image's ``(height, width)`` without decoding it.
@@ -61,6 +74,36 @@ def read_color(
     return pixels
 
 
+def photo_size(path: Path, scene: str) -> tuple[int, int]:
+    """Returns the ``(height, width)`` of a photograph turned upright, without decoding it.
+
+    Raises:
+        DataError: if the file is missing or not an image.
+    """
+    try:
+        with Image.open(path) as image:
+            turned = _orientation(image) in _QUARTER_TURNS
+            return (image.width, image.height) if turned else (image.height, image.width)
+    except _DAMAGED as error:
+        raise _unreadable(path, scene, error) from error
+
+
+def read_photo(path: Path, scene: str, size: tuple[int, int] | None = None) -> NDArray[np.uint8]:
+    """Reads a photograph ``[H, W, 3]``, turned upright as its EXIF data says; otherwise like ``read_color``.
+
+    Raises:
+        DataError: if the file is missing, damaged, or turned upright of another size than ``size``.
+    """
+    try:
+        with Image.open(path) as image:
+            turn = _TURNS.get(_orientation(image))
+            pixels = np.array((image if turn is None else image.transpose(turn)).convert("RGB"))
+    except _DAMAGED as error:
+        raise _unreadable(path, scene, error) from error
+    _check_size(path, scene, pixels.shape[:2], size)
+    return pixels
+
+
 def read_depth(path: Path, scene: str, size: tuple[int, int] | None = None) -> NDArray[np.int64]:
     """Reads a one-channel integer depth image ``[H, W]`` as stored (16-bit PNG, PGM or TIFF).
 
@@ -79,6 +122,14 @@ def read_depth(path: Path, scene: str, size: tuple[int, int] | None = None) -> N
         )
     _check_size(path, scene, pixels.shape, size)
     return pixels.astype(np.int64)
+
+
+def _orientation(image: Image.Image) -> int:
+    """EXIF orientation of an image, 1 (upright) where there is none or the EXIF data are damaged."""
+    try:
+        return int(image.getexif().get(_ORIENTATION_TAG, 1))
+    except Exception:  # the EXIF parser raises whatever the bytes lead it to
+        return 1
 
 
 def _unreadable(path: Path, scene: str, error: Exception) -> DataError:

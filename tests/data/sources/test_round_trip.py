@@ -32,6 +32,9 @@ def test_a_scene_comes_back(name, frames, tmp_path):
 
     assert loaded.images.shape[-2:] == SIZE
     assert float((loaded.images - expected.images).abs().mean()) <= layout.image_error + 1e-6
+    if not source.has_cameras:
+        assert layout.depth_quantum is None
+        return
     poses = loaded.world_to_camera
     if layout.moved_world:
         poses = _from_first(poses, loaded)

@@ -1,6 +1,7 @@
 """Datasets on disk, one file a layout; all are a ``FileSource``."""
 
 from vg2gt.data.sources.colmap_model import COLMAP
+from vg2gt.data.sources.image_folder import ImageFolder
 from vg2gt.data.sources.infinigen import Infinigen
 from vg2gt.data.sources.kitti import KITTI
 from vg2gt.data.sources.nerfstudio import Nerfstudio
@@ -15,6 +16,7 @@ __all__ = [
     "COLMAP",
     "KITTI",
     "TUM",
+    "ImageFolder",
     "Infinigen",
     "Nerfstudio",
     "Replica",

@@ -1,0 +1,94 @@
+"""Folders of photographs without cameras and without depth: for reconstruction, which finds its own cameras."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vg2gt.data.image_files import photo_size, read_photo, typical_size
+from vg2gt.data.sources.files import FileSource
+from vg2gt.data.sources.index import SceneIndex, Size, make_index
+from vg2gt.data.sources.parsing import IMAGE_SUFFIXES, pinhole
+from vg2gt.data.sources.scene_folders import scene_folders
+
+FOCAL = 1.2
+"""Placeholder focal length, in the larger side of the image: the usual first guess of structure from motion."""
+
+
+class ImageFolder(FileSource):
+    """Photographs of a scene in a folder, turned upright as their EXIF data says.
+
+    Frames are numbered 0, 1, ... in the order of their names, with numbers in names in the order of numbers
+    (``IMG_9`` before ``IMG_10``). Images of several sizes are resized to cover the median size and cropped.
+
+    There are no cameras: ``has_cameras`` and ``has_depth`` are False, every pose is the identity, and the intrinsics
+    are a guess (focal length 1.2 times the larger side, principal point in the middle). Training refuses such a source.
+
+    Args:
+        root: a folder of images, a folder of such folders (one or two levels deep), or a list.
+        scenes: names of the folders to use, or a text file of them; None: all.
+        every: use every this many-th image only.
+        index_cache: see ``FileSource``.
+
+    Raises:
+        FileNotFoundError: if a root does not exist.
+        DataError: if a folder holds no images.
+    """
+
+    layout = f"images ({', '.join(suffix[1:] for suffix in IMAGE_SUFFIXES)}), there or up to two folders deeper"
+    is_metric = False
+    has_depth = False
+    has_cameras = False
+
+    def __init__(
+        self,
+        root: str | Sequence[str] | None,
+        scenes: Sequence[str] | str | None = None,
+        every: int = 1,
+        index_cache: str | None = None,
+    ) -> None:
+        super().__init__(root, scenes, None, every, index_cache)
+
+    def find(self, root: Path) -> Mapping[str, Path]:
+        """The folder itself, or folders one or two levels below it."""
+        return scene_folders(root, lambda folder: bool(_images(folder)), by_path=True)
+
+    def index(self, scene: str, folder: Path) -> SceneIndex:
+        """Lists the images and reads their sizes."""
+        color = dict(enumerate(_images(folder)))
+        sizes = {i: photo_size(path, scene) for i, path in color.items()}
+        size = typical_size(sizes.values())
+        return make_index(
+            name=scene,
+            folder=folder,
+            color=color,
+            depth=None,
+            camera_to_world=dict.fromkeys(color, np.eye(4)),
+            intrinsics={i: _guess(size) for i, size in sizes.items()},
+            size=size,
+            color_size=size if len(set(sizes.values())) == 1 else None,
+        )
+
+    def read_color(self, index: SceneIndex, row: int) -> NDArray[np.uint8]:
+        """Decodes an image and turns it upright."""
+        return read_photo(index.color[row], index.name, index.color_size)
+
+
+def _guess(size: Size) -> NDArray[np.float64]:
+    focal = FOCAL * max(size)
+    return pinhole(focal, focal, (size[1] - 1) / 2, (size[0] - 1) / 2)
+
+
+def _images(folder: Path) -> list[Path]:
+    files = [path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()]
+    return sorted((path for path in files if not path.name.startswith(".")), key=_by_number)
+
+
+def _by_number(path: Path) -> tuple[list[str | int], str]:
+    """Sorts runs of digits by their value; they stand at the odd places of the split name."""
+    parts = re.split(r"(\d+)", path.name)
+    return [int(part) if i % 2 else part for i, part in enumerate(parts)], path.name
