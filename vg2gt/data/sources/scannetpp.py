@@ -83,8 +83,8 @@ class ScanNetPPiPhone(FileSource):
 def _frame_numbers(names: NDArray[np.str_], path: Path, scene: str) -> dict[int, int]:
     """Rows of the file by frame number."""
     rows: dict[int, int] = {}
-    for row, name in enumerate(names):
-        digits = PurePosixPath(str(name)).stem.removeprefix("frame_")
+    for row, name in enumerate(names.tolist()):
+        digits = PurePosixPath(name).stem.removeprefix("frame_")
         if not digits.isascii() or not digits.isdigit():
             raise DataError(f"{path} of scene {scene} names an image {name!r}; expected frame_NNNNNN.jpg")
         if int(digits) in rows:

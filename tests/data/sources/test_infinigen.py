@@ -1,0 +1,142 @@
+"""Infinigen's own traps: depth of twice the images' size, the sky, file names, Blender's pixel centres."""
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from vg2gt.data import DataError
+from vg2gt.data.sources import Infinigen
+
+HEIGHT, WIDTH = 4, 6
+
+
+def write_view(folder, name, depth, shift=0.0):
+    """One view with a symmetric camera, as Blender describes it."""
+    for kind in ("Image", "Depth", "camview"):
+        (folder / "frames" / kind / "camera_0").mkdir(parents=True, exist_ok=True)
+    Image.fromarray(np.full((HEIGHT, WIDTH, 3), 90, np.uint8)).save(folder / f"frames/Image/camera_0/Image_{name}.png")
+    np.save(folder / f"frames/Depth/camera_0/Depth_{name}.npy", depth)
+    pose = np.eye(4)
+    pose[0, 3] = shift
+    intrinsics = np.array([[5.0, 0, WIDTH / 2], [0, 5.0, HEIGHT / 2], [0, 0, 1]])
+    np.savez(folder / f"frames/camview/camera_0/camview_{name}.npz", K=intrinsics, T=pose)
+
+
+def plain():
+    return np.full((HEIGHT, WIDTH), 2, np.float32)
+
+
+def test_depth_of_twice_the_size_takes_one_of_the_four_nearest_pixels(tmp_path):
+    """Exactly the lower right one; a mean would be 0.5 off here, another pixel 1 or more."""
+    fine = np.arange(1, 1 + 4 * HEIGHT * WIDTH, dtype=np.float32).reshape(2 * HEIGHT, 2 * WIDTH)
+    write_view(tmp_path / "a", "0_0_0001_0", fine)
+    depth = Infinigen(str(tmp_path), max_depth=1e3).load("a", [1]).depth[0].numpy()
+    assert np.array_equal(depth, fine[1::2, 1::2])
+
+
+def test_depth_of_a_slanted_plane_is_right_to_a_quarter_of_a_pixel(tmp_path):
+    """z = 1 / (a + b x) on the ray through an image pixel; fine pixel u lies at image pixel (u + 1/2) / 2 - 1/2."""
+
+    def plane(u):
+        return (1 / (0.4 + 0.3 * (u - (WIDTH - 1) / 2) / 5)).astype(np.float32)
+
+    fine = np.tile(plane((np.arange(2 * WIDTH) + 0.5) / 2 - 0.5), (2 * HEIGHT, 1))
+    write_view(tmp_path / "a", "0_0_0001_0", fine)
+    frames = Infinigen(str(tmp_path)).load("a", [1])
+    assert float(frames.intrinsics[0, 0, 2]) == (WIDTH - 1) / 2
+    assert float(frames.intrinsics[0, 1, 2]) == (HEIGHT - 1) / 2
+    columns = np.arange(WIDTH)
+    np.testing.assert_allclose(frames.depth[0, 0].numpy(), plane(columns + 0.25), rtol=1e-6)
+    assert np.abs(frames.depth[0, 0].numpy() - plane(columns)).max() > 0.01
+
+
+def test_sky_and_what_is_too_far_have_no_depth(tmp_path):
+    depth = plain()
+    depth[0] = [np.inf, 1e10, 30.5, np.nan, -1, 29.5]
+    write_view(tmp_path / "a", "0_0_0001_0", depth)
+    assert Infinigen(str(tmp_path)).load("a", [1]).depth[0, 0].tolist() == [0, 0, 0, 0, 0, 29.5]
+    assert Infinigen(str(tmp_path), max_depth=20).load("a", [1]).depth[0, 0].tolist() == [0] * 6
+    assert Infinigen(str(tmp_path), max_depth=31).load("a", [1]).depth[0, 0, 2] == 30.5
+    with pytest.raises(ValueError, match="max_depth must be positive"):
+        Infinigen(str(tmp_path), max_depth=0)
+
+
+def test_frames_are_numbered_by_what_varies(tmp_path):
+    for frame in (9, 10, 100):
+        write_view(tmp_path / "video", f"0_0_{frame:04d}_0", plain())
+    for rig in (2, 10, 1):
+        write_view(tmp_path / "rigs", f"{rig}_0_0048_0", plain(), shift=rig)
+    for name in ("0_0_0001_0", "0_0_0002_0", "3_0_0001_0"):
+        write_view(tmp_path / "both", name, plain())
+    source = Infinigen(str(tmp_path))
+    assert source.frames("video") == (9, 10, 100)
+    assert source.frames("rigs") == (1, 2, 10)
+    assert source.frames("both") == (1, 2, 300_001)
+    assert source.load("rigs", [10, 2]).world_to_camera[:, 0, 3].tolist() == [-10, -2]
+
+
+def test_of_two_resamples_the_first_is_taken(tmp_path):
+    write_view(tmp_path / "a", "0_1_0001_0", plain() + 1)
+    write_view(tmp_path / "a", "0_0_0001_0", plain())
+    assert torch.equal(Infinigen(str(tmp_path)).load("a", [1]).depth[0], torch.full((HEIGHT, WIDTH), 2.0))
+
+
+def test_parts_of_an_exported_scene_show_one_place(tmp_path):
+    for part in ("scene_1/x", "scene_1/y", "scene_2/x"):
+        write_view(tmp_path / part, "0_0_0001_0", plain())
+    source = Infinigen(str(tmp_path))
+    assert source.scenes == ("scene_1/x", "scene_1/y", "scene_2/x")
+    assert [source.place(scene) for scene in source.scenes] == ["scene_1", "scene_1", "scene_2"]
+    assert Infinigen(str(tmp_path / "scene_1")).scenes == ("x", "y")
+    assert Infinigen(str(tmp_path / "scene_1" / "x")).scenes == ("x",)
+
+
+def test_a_cached_index_is_made_again_when_a_view_is_added(tmp_path):
+    write_view(tmp_path / "data" / "a", "0_0_0001_0", plain())
+    cache = str(tmp_path / "cache")
+    assert Infinigen(str(tmp_path / "data"), index_cache=cache).frames("a") == (1,)
+    write_view(tmp_path / "data" / "a", "0_0_0002_0", plain())
+    assert Infinigen(str(tmp_path / "data"), index_cache=cache).frames("a") == (1, 2)
+
+
+DAMAGE = {
+    "a name without numbers": (lambda f: np.save(f / "Depth/camera_0/Depth_x.npy", plain()), "is not named Depth_RIG"),
+    "no depth": (lambda f: (f / "Depth/camera_0/Depth_0_0_0001_0.npy").unlink(), "scene a has no Depth files"),
+    "no camera": (lambda f: (f / "camview/camera_0/camview_0_0_0001_0.npz").unlink(), "1 frames without a pose"),
+    "whole numbers": (
+        lambda f: np.save(f / "Depth/camera_0/Depth_0_0_0001_0.npy", np.ones((HEIGHT, WIDTH), int)),
+        r"Depth_0_0_0001_0\.npy of scene a is not a depth image",
+    ),
+    "other shape": (
+        lambda f: np.save(f / "Depth/camera_0/Depth_0_0_0001_0.npy", np.ones((HEIGHT, 2 * WIDTH), np.float32)),
+        "different aspect ratios",
+    ),
+    "a pose of 3x4": (
+        lambda f: np.savez(f / "camview/camera_0/camview_0_0_0001_0.npz", K=np.eye(3), T=np.eye(4)[:3]),
+        r"T in .*camview_0_0_0001_0\.npz of scene a must hold 4x4 numbers",
+    ),
+    "all sky": (
+        lambda f: np.save(f / "Depth/camera_0/Depth_0_0_0001_0.npy", plain() + 1e10),
+        r"Depth_0_0_0001_0\.npy of scene a has no valid depth",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGE)
+def test_damage_is_named(tmp_path, name):
+    write_view(tmp_path / "a", "0_0_0001_0", plain())
+    damage, message = DAMAGE[name]
+    damage(tmp_path / "a" / "frames")
+    with pytest.raises(DataError, match=message):
+        Infinigen(str(tmp_path)).load("a", [1])
+
+
+def test_a_header_that_asks_for_much_memory_is_refused(tmp_path):
+    write_view(tmp_path / "a", "0_0_0001_0", plain())
+    path = tmp_path / "a/frames/Depth/camera_0/Depth_0_0_0001_0.npy"
+    content = path.read_bytes().replace(b"(4, 6), }" + 10 * b" ", b"(400000, 600000), }")
+    assert b"600000" in content
+    path.write_bytes(content)
+    with pytest.raises(DataError, match=r"cannot read .*Depth_0_0_0001_0\.npy of scene a: mmap length"):
+        Infinigen(str(tmp_path)).frames("a")
