@@ -124,7 +124,7 @@ def train(config: DictConfig) -> dict[str, Any]:
     if not run.trial and run.trainer.global_step < run.trainer.max_steps:
         log.warning("training ended at step %d of %d", run.trainer.global_step, run.trainer.max_steps)
         return {}
-    trained = _evaluate(run)
+    trained = evaluate(run)
     return _report(run, untrained, trained)
 
 
@@ -158,20 +158,21 @@ def _name_differences(config: DictConfig) -> None:
     path = Path(config.output_dir) / "config.yaml"
     if not path.is_file():
         return
-    before, now = (_flatten(OmegaConf.to_container(c, resolve=True)) for c in (OmegaConf.load(path), config))
+    before, now = (flatten(OmegaConf.to_container(c, resolve=True)) for c in (OmegaConf.load(path), config))
     different = sorted(key for key in before.keys() | now.keys() if before.get(key) != now.get(key))
     different = [key for key in different if key not in ("ckpt", "output_dir", "overwrite")]
     if different:
         log.warning("the resumed run differs from the interrupted one in %s", ", ".join(different))
 
 
-def _flatten(node: Any, prefix: str = "") -> dict[str, Any]:
+def flatten(node: Any, prefix: str = "") -> dict[str, Any]:
+    """Names the leaves of nested dictionaries by dotted keys."""
     if not isinstance(node, dict):
         return {prefix: node}
     return {
         key: value
         for name, child in node.items()
-        for key, value in _flatten(child, f"{prefix}.{name}".strip(".")).items()
+        for key, value in flatten(child, f"{prefix}.{name}".strip(".")).items()
     }
 
 
@@ -183,7 +184,8 @@ def _save_last(run: Run) -> None:
         run.trainer.save_checkpoint(path)
 
 
-def _evaluate(run: Run) -> dict[str, float]:
+def evaluate(run: Run) -> dict[str, float]:
+    """Evaluates the model as it is on the evaluation scenes; returns means over scenes."""
     results = run.trainer.validate(run.module, datamodule=run.datamodule, verbose=False)
     return {key.removeprefix("eval/"): float(value) for key, value in results[0].items()} if results else {}
 
@@ -195,7 +197,7 @@ def _untrained_metrics(run: Run, resumed: bool) -> dict[str, float]:
         return read_json(path)
     if resumed or run.trial:
         return {}
-    metrics = _evaluate(run)
+    metrics = evaluate(run)
     write_json(path, metrics)
     return metrics
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import importlib
 import sys
 
-COMMANDS = {"train": "vg2gt.cli.train"}
+COMMANDS = {"train": "vg2gt.cli.train", "evaluate": "vg2gt.cli.evaluate", "ablate": "vg2gt.ablate"}
 
 
 def main() -> None:
-    """Runs ``vg2gt COMMAND [arguments]``; the arguments are the command's own (Hydra overrides for ``train``)."""
+    """Runs ``vg2gt COMMAND [arguments]``; the arguments are the command's own (Hydra overrides where it trains)."""
     asked = sys.argv[1] if len(sys.argv) > 1 else ""
     if asked not in COMMANDS:
         unknown = f"unknown command {asked!r}; " if asked not in ("", "-h", "--help") else ""

@@ -41,10 +41,10 @@ def evaluate_scene(model: Reconstructor, renderer: Renderer, batch: Batch) -> di
         batch: one scene (B = 1) with held-out views.
 
     Returns:
-        ``psnr``, ``ssim``, ``abs_rel``, ``delta_1.05``, ``coverage``, ``normal_mean`` on held-out views at ground-truth
-        poses, rendered as solids whatever the training renders; ``abs_rel_rasterized`` with 3DGS rasterisation;
-        ``decoded_abs_rel_before`` and ``decoded_abs_rel`` on the context views; ``gaussians``, ``cv``. Depth is
-        aligned by one median scale a scene.
+        ``psnr``, ``ssim``, ``rmse``, ``abs_rel``, ``delta_1.25``, ``delta_1.05``, ``coverage``, ``normal_mean`` on
+        held-out views at ground-truth poses, rendered as solids whatever the training renders; ``abs_rel_rasterized``
+        with 3DGS rasterisation; ``decoded_abs_rel_before`` and ``decoded_abs_rel`` on the context views; ``gaussians``,
+        ``cv``. Depth is aligned by one median scale a scene.
 
     Raises:
         ValueError: if the batch holds several scenes or no held-out view.
@@ -61,7 +61,9 @@ def evaluate_scene(model: Reconstructor, renderer: Renderer, batch: Batch) -> di
     return {
         "psnr": images["psnr"],
         "ssim": images["ssim"],
+        "rmse": depth["rmse"],
         "abs_rel": depth["abs_rel"],
+        "delta_1.25": depth["delta_1.25"],
         "delta_1.05": depth["delta_1.05"],
         "coverage": depth["coverage"],
         "abs_rel_rasterized": depth_scores(rasterized.depth, target, "scene")["abs_rel"],

@@ -1,0 +1,136 @@
+"""The ablation study at the size of a test: a full model of two steps, continuations of one."""
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import vg2gt.study
+from tests.training_helpers import SMALL
+from vg2gt.ablate import CONTROL, FULL, Ablation, common_overrides, continuations
+from vg2gt.checkpoints import newest_valid, read_checkpoint
+
+ROOT = Path(__file__).resolve().parents[1]
+QUIET = [override for override in SMALL if not override.startswith("trainer.max_steps")]
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("rooms")
+
+
+def study(folder: Path, cache: Path, *overrides: str, steps: int = 1, splits: tuple[int, ...] = (1, 2)) -> Ablation:
+    return Ablation(folder, [*QUIET, f"data.cache_dir={cache}", *overrides], 1, 2, steps, ["wo_split"], splits)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory, cache: Path) -> Path:
+    folder = tmp_path_factory.mktemp("ablation")
+    study(folder, cache).run()
+    return folder
+
+
+def test_every_row_is_run_once() -> None:
+    names = [run.name for run in continuations(["wo_depth", "wo_split"], [1, 2, 3, 4], full_splits=2)]
+    assert names == [FULL, "wo_depth", "wo_split", "splits=3", "splits=4", CONTROL]
+    names = [run.name for run in continuations([], [1, 2], full_splits=4)]
+    assert names == [FULL, "splits=1", "splits=2", CONTROL]
+    assert [run.name for run in continuations(["wo_depth"], [2], full_splits=2)] == [FULL, "wo_depth"]
+
+
+def test_results_and_tables(finished: Path) -> None:
+    metrics = json.loads((finished / "metrics.json").read_text())
+    assert set(metrics["runs"]) == {FULL, "wo_split", CONTROL}
+    assert all(set(runs) == {"0"} for runs in metrics["runs"].values())
+    full, variant = (metrics["runs"][name]["0"] for name in (FULL, "wo_split"))
+    assert variant["gaussians"] < 0.7 * full["gaussians"]
+    difference = metrics["summary"]["wo_split"]["abs_rel"]["difference"]
+    assert difference == pytest.approx(variant["abs_rel"] - full["abs_rel"])
+    report = (finished / "metrics.md").read_text()
+    assert "| w/o Split |" in report
+    assert "| *paper* | *28.19* | *0.865* |" in report
+    assert "| splits=2 |" in report
+    assert "1 of 1 seeds complete" in report
+    assert "n/a" in report  # LPIPS where it was not measured
+
+
+def test_all_continue_from_the_same_full_model(finished: Path) -> None:
+    """The full model goes on as long as every variant does, and only a new last layer starts anew."""
+    home = finished / "seed-0"
+    start = read_checkpoint(newest_valid(home / "start" / "checkpoints"))
+    assert start["global_step"] == 2
+    layer = "model.gaussians.out.weight"
+    untrained = json.loads((home / "full" / "untrained.json").read_text())
+    assert untrained == json.loads((home / "start" / "metrics.json").read_text())["trained"]
+    for name in (FULL, "wo_split", CONTROL):
+        end = read_checkpoint(newest_valid(home / name / "checkpoints"))
+        assert end["global_step"] == 1
+        hidden = "model.gaussians.hidden.weight"
+        moved = (end["state_dict"][hidden] - start["state_dict"][hidden]).abs().max()
+        assert 0 < float(moved) < 5e-3
+        if name == CONTROL:
+            assert float((end["state_dict"][layer] - start["state_dict"][layer]).abs().max()) > 0.02
+
+
+def test_finished_runs_are_not_repeated(finished: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(vg2gt.study, "train", lambda config: pytest.fail(f"trained {config.output_dir}"))
+    again = study(finished, cache)
+    again.run()
+    assert {name: set(runs) for name, runs in again.results.items()} == {name: {0} for name in again.results}
+
+
+def test_interrupted_run_goes_on(finished: Path, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What was saved is used: the result equals the uninterrupted one's."""
+    folder = tmp_path / "copy"
+    shutil.copytree(finished, folder)
+    before = json.loads((folder / "seed-0" / "start" / "metrics.json").read_text())
+    (folder / "seed-0" / "start" / "metrics.json").unlink()
+    trained: list[str] = []
+    train = vg2gt.study.train
+
+    def watched(config):
+        trained.append(f"{Path(config.output_dir).name} ckpt={config.ckpt}")
+        return train(config)
+
+    monkeypatch.setattr(vg2gt.study, "train", watched)
+    study(folder, cache).run()
+    assert trained == ["start ckpt=last"]
+    assert json.loads((folder / "seed-0" / "start" / "metrics.json").read_text()) == before
+
+
+def test_an_interruption_ends_the_study(cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(vg2gt.study, "train", lambda config: {})
+    with pytest.raises(SystemExit) as ended:
+        study(tmp_path, cache).run()
+    assert ended.value.code == 143
+
+
+def test_other_settings_are_refused(finished: Path, cache: Path) -> None:
+    with pytest.raises(ValueError, match=r"trainer\.max_steps.*choose another name="):
+        study(finished, cache, steps=3).run()
+    with pytest.raises(ValueError, match=r"start holds a run with other settings \(loss\.enhance\.weight\)"):
+        study(finished, cache, "loss.enhance.weight=2").run()
+
+
+def test_what_the_study_decides_cannot_be_overridden() -> None:
+    assert common_overrides(["seeds=2", "backend=da3_small", "+data.x=1"]) == ["backend=da3_small", "+data.x=1"]
+    with pytest.raises(ValueError, match=r"trainer\.max_steps is decided by the study"):
+        common_overrides(["trainer.max_steps=7"])
+
+
+def test_the_readmes_line_in_a_shell(tmp_path: Path, cache: Path) -> None:
+    """The line as printed; later overrides make it short."""
+    (line,) = re.findall(
+        r"^(python -m vg2gt\.ablate [^#\n]*?)(?: *#.*)?$", (ROOT / "README.md").read_text(), re.MULTILINE
+    )
+    short = ["name=short", "seeds=1", "full_steps=1", "steps=1", "variants=[]", "splits=[2]", *QUIET]
+    line = line.replace("python", sys.executable, 1)
+    command = " ".join([line, *(f"'{override}'" for override in [*short, f"data.cache_dir={cache}"])])
+    shown = subprocess.run(command, shell=True, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert shown.returncode == 0, shown.stderr[-3000:]
+    assert "| VG²GT (full) |" in shown.stdout
+    assert (tmp_path / "outputs" / "short" / "metrics.md").is_file()
