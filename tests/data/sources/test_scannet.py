@@ -10,7 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
-from vg2gt.data import DataError
+from vg2gt.data import DataError, RGBDFolder
 from vg2gt.data.sources import ScanNet, ScanNetSens
 
 from .layout_scannet import millimetres, sens_frame, sens_header, write_export, write_sens
@@ -160,3 +160,16 @@ def test_a_stream_that_shrinks_after_it_was_indexed_is_an_error(tmp_path, frames
     path.write_bytes(path.read_bytes()[:2000])
     with pytest.raises(DataError, match=r"scene0707_00\.sens of scene scene0707_00 has become shorter"):
         source.load(SCENE, [3])
+
+
+def test_a_real_recording_in_this_layout_reads_as_an_rgbd_folder_does(shared):
+    """The geometry of that folder is checked in the tests of the RGB-D folder."""
+    root = shared / "data" / "seven_scenes_redkitchen_a_registered"
+    ours, theirs = ScanNet(str(root)), RGBDFolder(str(root))
+    (scene,) = ours.scenes
+    ids = ours.frames(scene)
+    assert len(ids) == 56
+    assert ids == tuple(theirs.frames(scene))
+    first, second = ours.load(scene, ids[::20]), theirs.load(scene, ids[::20])
+    for name in ("images", "depth", "world_to_camera", "intrinsics"):
+        assert torch.equal(getattr(first, name), getattr(second, name))
