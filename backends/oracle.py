@@ -53,10 +53,12 @@ class OracleBackend(Backend):
         depth_noise: standard deviation of the relative depth error.
         pose_noise: see above; None means ``0.1 * depth_noise``.
         response: log-depth answer to a unit change of the tokens.
+        background: depth given to pixels without depth, such as the sky, in multiples of their scene's deepest, with
+            the least confidence; None leaves them without.
         seed: of the noise and of the frozen weights.
 
     Raises:
-        ValueError: if ``dim`` is too small or a noise level is negative.
+        ValueError: if ``dim`` is too small, a noise level is negative or the background not behind the scene.
     """
 
     def __init__(
@@ -67,6 +69,7 @@ class OracleBackend(Backend):
         depth_noise: float = 0.02,
         pose_noise: float | None = None,
         response: float = 0.02,
+        background: float | None = None,
         seed: int = 0,
     ) -> None:
         pose_noise = 0.1 * depth_noise if pose_noise is None else pose_noise
@@ -74,10 +77,13 @@ class OracleBackend(Backend):
             raise ValueError(f"backend.dim must be a multiple of 4 and at least {2 * GEOMETRY_CHANNELS}, got {dim}")
         if depth_noise < 0 or pose_noise < 0:
             raise ValueError(f"noise must not be negative: depth_noise {depth_noise}, pose_noise {pose_noise}")
+        if background is not None and background < 1:
+            raise ValueError(f"backend.background must be at least 1 (deepest depths) or null, got {background}")
         super().__init__("oracle", patch_size, (dim,) * taps, licence="Apache-2.0 (no weights)", needs_hints=True)
         self.depth_noise = depth_noise
         self.pose_noise = pose_noise
         self.response = response
+        self.background = background
         self.seed = seed
         image_dim = dim - GEOMETRY_CHANNELS
         with seeded_initialisation(seed):
@@ -105,6 +111,9 @@ class OracleBackend(Backend):
             cameras = self._predict_cameras(hints.cameras, depth, noise)
             predicted = _bleed(depth * (1 + self.depth_noise * noise.relative))
             confidence = self._predict_confidence(predicted, depth, noise)
+            if self.background is not None:
+                far = self.background * depth.amax((1, 2, 3), keepdim=True)
+                predicted = torch.where(depth > 0, predicted, far)
             geometry = _describe_patches(predicted, confidence, cameras, grid)
             patch = self._tokens(images, geometry)
             camera = self.camera_projection(_describe_cameras(cameras, _median_depth(predicted)))

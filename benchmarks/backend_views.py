@@ -24,8 +24,8 @@ from typing import TypeVar
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
+from machine import machine
 from omegaconf import DictConfig
-from render import machine
 from render_scene import room_cameras
 from rich.console import Console
 from rich.table import Table

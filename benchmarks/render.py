@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import platform
 import resource
 import subprocess
 import sys
@@ -22,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from machine import machine
 from render_scene import room_cameras, room_gaussians
 from rich.console import Console
 from rich.table import Table
@@ -270,24 +270,6 @@ def plot_scaling(results: dict[str, tuple[list[Case], list[Timing]]], path: Path
     figure.tight_layout()
     figure.savefig(path)
     return path
-
-
-def machine(device: torch.device) -> dict[str, Any]:
-    """What was measured on."""
-    name = platform.processor() or platform.machine()
-    info = Path("/proc/cpuinfo")
-    if info.exists():
-        models = [line.split(":")[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")]
-        name = models[0] if models else name
-    found = {
-        "processor": name,
-        "cores": os.cpu_count(),
-        "torch": torch.__version__,
-        "python": platform.python_version(),
-    }
-    if device.type == "cuda":
-        found["gpu"] = torch.cuda.get_device_name(device)
-    return found
 
 
 def main() -> None:

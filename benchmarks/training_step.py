@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import platform
 import tempfile
 import time
 from datetime import date
@@ -16,6 +15,7 @@ from pathlib import Path
 
 import torch
 from hydra import compose, initialize_config_dir
+from machine import machine
 from rich.console import Console
 from rich.table import Table
 
@@ -90,17 +90,12 @@ def main() -> None:
     for stage, value in seconds.items():
         table.add_row(stage, f"{value:.3f}", f"{value / seconds['whole step']:.0%}")
     Console().print(table)
-    machine = {
-        "processor": platform.processor() or platform.machine(),
-        "cores": os.cpu_count(),
-        "torch": torch.__version__,
-    }
     result = {
         "seconds": seconds,
         "threads": arguments.threads,
         "overrides": arguments.overrides,
         "steps": arguments.steps,
-        "machine": machine,
+        "machine": machine(),
     }
     path = arguments.out / f"{date.today().isoformat()}-training-step.json"
     print(write_json(path, result))

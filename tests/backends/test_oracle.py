@@ -76,6 +76,21 @@ def test_invalid_depth_stays_invalid(make_scene) -> None:
     assert all(torch.isfinite(patch).all() for patch in tokens.patch)
 
 
+def test_the_background_lies_behind_the_scene(make_scene) -> None:
+    images, hints = make_scene(1, 2, SIZE)
+    depth = hints.depth.clone()
+    depth[..., :20, :] = 0
+    given = Hints(depth, hints.cameras, hints.scene_key, hints.frame_ids)
+    without, backend = OracleBackend(), OracleBackend(background=1.5)
+    geometry = backend.decode(backend.encode(images, given))
+    plain = without.decode(without.encode(images, given))
+    assert torch.equal(geometry.depth[depth > 0], plain.depth[depth > 0])
+    assert torch.equal(geometry.depth_conf, plain.depth_conf)
+    torch.testing.assert_close(geometry.depth[depth == 0], torch.full((2 * 20 * SIZE[1],), 1.5 * float(depth.max())))
+    with pytest.raises(ValueError, match=r"backend\.background must be at least 1"):
+        OracleBackend(background=0.5)
+
+
 def test_depth_bleeds_over_edges_only(make_scene) -> None:
     images, hints = make_scene(1, 1, SIZE)
     depth = torch.full((1, 1, *SIZE), 2.0)
