@@ -109,8 +109,8 @@ class ViewSelection:
         available = [frame for frame in frames if frame not in held_out]
         if len(available) < count:
             raise DataError(
-                f"scene {scene} has {len(available)} frames that are not held out, views={count} needs {count}: ask for "
-                "fewer views, or leave the scene out (data.eval_scenes, data.val.scenes)"
+                f"scene {scene} has {len(available)} frames that are not held out, views={count} needs {count}: ask "
+                "for fewer views, or leave the scene out (data.eval_scenes, data.val.scenes)"
             )
         length = min(len(frames), max(round(self.spread * count), count + (0 if held_out else self.targets)))
         start = int(rng.integers(len(frames) - length + 1))

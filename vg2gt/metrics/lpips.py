@@ -14,7 +14,7 @@ from torch.nn import functional as F
 
 WEIGHTS_URL = "https://download.pytorch.org/models/vgg16-397923af.pth"
 WEIGHTS_FILE = WEIGHTS_URL.rpartition("/")[2]
-HOW_TO_GET = f"evaluation.lpips=download fetches {WEIGHTS_FILE} (528 MB), or evaluation.lpips=PATH of it"
+HOW_TO_GET = "evaluation.lpips=download or evaluation.lpips=PATH"
 
 # Convolutions of each stage up to the activation that is compared; max pooling between the stages.
 STAGES = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512))
@@ -26,7 +26,7 @@ EPSILON = 1e-10
 
 
 class WeightsNotFoundError(FileNotFoundError):
-    """LPIPS has no weights here; the message says how to get them."""
+    """LPIPS has no weights here (``vgg16-397923af.pth``, 528 MB); the message says how to get them."""
 
 
 class LPIPS(nn.Module):

@@ -1,0 +1,231 @@
+"""An evaluation from its configuration to its report."""
+
+from __future__ import annotations
+
+import logging
+import statistics
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+
+from vg2gt.data.base import SceneSource
+from vg2gt.data.batches import BatchDataset
+from vg2gt.data.datamodule import SceneDataModule
+from vg2gt.data.overlap import refuse_overlap
+from vg2gt.data.sampling import SceneViews, usable_scenes
+from vg2gt.evaluation import paper
+from vg2gt.evaluation.options import EvaluationOptions
+from vg2gt.evaluation.pictures import PANELS, scene_picture
+from vg2gt.evaluation.scene import SceneEvaluator, SceneResult
+from vg2gt.evaluation.settings import (
+    Weights,
+    build_model,
+    checkpoint_path,
+    choose_device,
+    load_weights,
+    resolve_parts,
+)
+from vg2gt.evaluation.store import ResultStore
+from vg2gt.evaluation.tables import markdown
+from vg2gt.io.files import write_json, write_text
+from vg2gt.io.images import write_png
+from vg2gt.metrics import LPIPS, WeightsNotFoundError, load_lpips
+from vg2gt.model import Reconstructor
+from vg2gt.training import flatten
+from vg2gt.types import Batch
+
+log = logging.getLogger(__name__)
+
+# Settings that choose which samples are evaluated or shown, or where: others in a folder are other figures.
+FREE = ("views", "name", "output_dir", "overwrite", "ckpt", "device", "evaluation.pictures", "data.eval_scenes")
+FREE += ("data.workers", "data.memory_mb", "data.steps_per_epoch")
+
+
+def evaluate(config: DictConfig) -> dict[str, Any]:
+    """Evaluates a model on the scenes of a data set, for every number of input views asked.
+
+    Writes into the output folder: the resolved configuration, one file a scene as it is done, ``metrics.json``,
+    ``metrics.md`` and pictures. Scenes that the folder holds already are not evaluated again.
+
+    Args:
+        config: ``configs/evaluate.yaml``.
+
+    Returns:
+        The content of ``metrics.json``: ``settings``, and for every number of views ``mean`` and ``scenes``.
+
+    Raises:
+        FileExistsError: if the folder holds another evaluation.
+        FileNotFoundError: if the checkpoint, its configuration or the data is missing.
+        ValueError: if an option is wrong or the checkpoint does not fit.
+    """
+    folder = Path(config.output_dir)
+    counts = _view_counts(config.views)
+    options: EvaluationOptions = instantiate(config.evaluation, _convert_="all")
+    checkpoint = checkpoint_path(config.ckpt)
+    parts = resolve_parts(config, checkpoint)
+    datamodule: SceneDataModule = instantiate(config.data)
+    data = datamodule.evaluation_data()
+    samples = _samples(options, data.source, list(data.source.scenes)[: datamodule.eval_scenes], counts)
+    _refuse_training_views(checkpoint, config, data.source, [view for views in samples.values() for view in views])
+
+    device = choose_device(config.device)
+    model = build_model(parts, config.seed, device)
+    weights = load_weights(model, checkpoint)
+    lpips, lpips_label = _lpips(options.lpips, device)
+    resolved = OmegaConf.merge(OmegaConf.to_container(config, resolve=True), parts)
+    store = ResultStore(folder, _identity(resolved, weights, lpips is not None, model), config.overwrite)
+    write_text(folder / "config.yaml", OmegaConf.to_yaml(resolved, resolve=True))
+
+    evaluator = SceneEvaluator(model, instantiate(parts["renderer"]), options, lpips)
+    results = {count: _evaluate_all(evaluator, data, views, store, device) for count, views in samples.items()}
+    settings = _settings(config, options, model, weights, data.source, samples, lpips_label, device)
+    report = {
+        "settings": settings,
+        "views": {
+            str(count): {"mean": mean_scores(scores), "scenes": dict(sorted(scores.items()))}
+            for count, scores in results.items()
+        },
+    }
+    write_json(folder / "metrics.json", report)
+    text = markdown(report)
+    write_text(folder / "metrics.md", text)
+    print(text)
+    if options.pictures:
+        print(f"pictures ({PANELS}): {folder / 'pictures'}")
+    print(f"metrics: {folder / 'metrics.json'}, {folder / 'metrics.md'}")
+    return report
+
+
+def mean_scores(scenes: Mapping[str, Mapping[str, float | None]]) -> dict[str, float | None]:
+    """Mean over the scenes that have a figure; of times and memory the median, for the first scene also compiles."""
+    names = dict.fromkeys(name for scores in scenes.values() for name in scores)
+    means: dict[str, float | None] = {}
+    for name in names:
+        values = [value for scores in scenes.values() if (value := scores.get(name)) is not None]
+        average = statistics.median if name.endswith(("_seconds", "_mib")) else statistics.fmean
+        means[name] = average(values) if values else None
+    return means
+
+
+def _view_counts(views: Any) -> list[int]:
+    counts = [views] if isinstance(views, int) else list(views)
+    if not counts or not all(isinstance(count, int) and count > 0 for count in counts):
+        raise ValueError(f"views={views}: give numbers of input views, such as 'views=[3,10,20]'")
+    return sorted(set(counts))
+
+
+def _samples(
+    options: EvaluationOptions, source: SceneSource, scenes: Sequence[str], counts: Sequence[int]
+) -> dict[int, list[SceneViews]]:
+    return {count: options.selection.choose(source, scenes, count) for count in counts}
+
+
+def _refuse_training_views(
+    checkpoint: Path | None, config: DictConfig, source: SceneSource, views: Sequence[SceneViews]
+) -> None:
+    """Refuses to score frames that the run was trained on, where it was trained on a data set of the same kind.
+
+    Raises:
+        DataError: naming the first scene.
+    """
+    path = checkpoint.resolve().parent.parent / "config.yaml" if checkpoint else None
+    if path is None or not path.is_file():
+        return
+    run = OmegaConf.load(path)
+    if OmegaConf.select(run, "data.train._target_") != OmegaConf.select(config, "data.val._target_"):
+        return
+    try:
+        trained: SceneDataModule = instantiate(run.data)
+        train = trained.train_source()
+        names = usable_scenes(train, trained.sampler, trained.train_scenes)
+    except (FileNotFoundError, ValueError) as error:
+        log.warning("whether the evaluated scenes were trained on cannot be checked: %s", error)
+        return
+    refuse_overlap(train, names, source, views)
+
+
+def _lpips(source: str | None, device: torch.device) -> tuple[LPIPS | None, str]:
+    """The network and what the report says of it."""
+    if source is None:
+        return None, "n/a (evaluation.lpips=null)"
+    try:
+        return load_lpips(source).to(device), "VGG-16, version 0.1"
+    except WeightsNotFoundError as error:
+        log.warning("LPIPS: %s", error)
+        return None, f"n/a ({error})"
+
+
+def _identity(config: Any, weights: Weights, has_lpips: bool, model: Reconstructor) -> dict[str, Any]:
+    """All that decides the figures of a sample, flat."""
+    settings = flatten(OmegaConf.to_container(config, resolve=True))
+    kept = {key: value for key, value in settings.items() if not key.startswith(FREE)}
+    kept |= {f"weights.{key}": value for key, value in model.backend.identity().items()}
+    return kept | {"checkpoint.sha256": weights.digest, "lpips.found": has_lpips}
+
+
+def _evaluate_all(
+    evaluator: SceneEvaluator,
+    data: BatchDataset,
+    samples: Sequence[SceneViews],
+    store: ResultStore,
+    device: torch.device,
+) -> dict[str, dict[str, float | None]]:
+    """Scores by scene; those in the store are taken from there, unless their picture is wanted and missing."""
+    results = {}
+    for number, views in enumerate(samples):
+        wanted = number < evaluator.options.pictures
+        scores = store.read(views)
+        if scores is None or (wanted and not store.picture(views).is_file()):
+            batch = data[(views,)].to(device)
+            result = evaluator(batch, has_cameras=data.source.has_cameras)
+            if wanted:
+                _write_picture(store.picture(views), batch, result, evaluator.options.alignment)
+            scores = result.scores
+            store.write(views, scores)
+            log.info("%d views, scene %d of %d: %s", len(views.context), number + 1, len(samples), views.scene)
+        results[views.scene] = scores
+    return results
+
+
+def _write_picture(path: Path, batch: Batch, result: SceneResult, alignment: str) -> None:
+    protocol = next(name for name in ("gt_pose", "novel", "context") if name in result.renders)
+    truth = batch.context if protocol == "context" else batch.target
+    write_png(path, scene_picture(batch, result.renders[protocol], truth, alignment))
+
+
+def _settings(
+    config: DictConfig,
+    options: EvaluationOptions,
+    model: Reconstructor,
+    weights: Weights,
+    source: SceneSource,
+    samples: Mapping[int, Sequence[SceneViews]],
+    lpips: str,
+    device: torch.device,
+) -> dict[str, Any]:
+    size = (int(config.data.image_size[0]), int(config.data.image_size[1]))
+    crop = "resized to cover, cropped at the centre" if config.data.get("fit", "cover") == "cover" else "padded"
+    known = paper.is_the_papers(options.table, size, options.alignment)
+    return {
+        "name": Path(config.output_dir).name,
+        "weights": str(weights) if model.trained_parameters() else "none: the model has no trained part",
+        "model": type(model).__name__,
+        "backend": model.backend.identity(),
+        "data": type(source).__name__,
+        "scenes": len(next(iter(samples.values()))),
+        "index": options.selection.index or f"drawn with seed {options.selection.seed}",
+        "size": size,
+        "crop": crop,
+        "alignment": options.alignment,
+        "depth_range": list(options.depth_range),
+        "neighbors": options.neighbors,
+        "lpips": lpips,
+        "points": asdict(options.points),
+        "device": str(device),
+        "paper": options.table if known else None,
+    }

@@ -1,0 +1,78 @@
+"""Results of single scenes on disk: written as they come, so that an interrupted evaluation goes on where it was."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from vg2gt.data.sampling import SceneViews
+from vg2gt.io.files import read_json, write_json
+
+IDENTITY = "identity.json"
+
+
+class ResultStore:
+    """The scenes of one evaluation, one JSON file each.
+
+    Args:
+        folder: the evaluation's folder.
+        identity: flat settings that decide the figures (weights, data, options). Another evaluation in the same folder
+            must have the same.
+        overwrite: throw away what the folder holds of another evaluation, or of this one.
+
+    Raises:
+        FileExistsError: if the folder holds an evaluation with other settings, naming the first that differ.
+    """
+
+    def __init__(self, folder: Path, identity: Mapping[str, Any], overwrite: bool = False) -> None:
+        self.folder = folder
+        if overwrite:
+            shutil.rmtree(folder / "scenes", ignore_errors=True)
+            shutil.rmtree(folder / "pictures", ignore_errors=True)
+        elif (folder / IDENTITY).is_file():
+            before = read_json(folder / IDENTITY)
+            different = sorted(key for key in before.keys() | identity.keys() if before.get(key) != identity.get(key))
+            if different:
+                told = ", ".join(f"{key} ({before.get(key)} -> {identity.get(key)})" for key in different[:3])
+                more = f" and {len(different) - 3} more" if len(different) > 3 else ""
+                raise FileExistsError(
+                    f"{folder} holds an evaluation with other settings: {told}{more}; choose another name=, or replace "
+                    "it with overwrite=true"
+                )
+        write_json(folder / IDENTITY, dict(identity))
+
+    def read(self, views: SceneViews) -> dict[str, float | None] | None:
+        """The scores of a sample that was evaluated before; None if it was not, or with other frames."""
+        path = self._path(views)
+        if not path.is_file():
+            return None
+        try:
+            stored = read_json(path)
+        except ValueError:
+            return None  # measured again
+        same = stored["context"] == list(views.context) and stored["target"] == list(views.target)
+        return stored["scores"] if same else None
+
+    def write(self, views: SceneViews, scores: Mapping[str, float | None]) -> None:
+        """Writes the scores of a sample, atomically."""
+        content = {
+            "scene": views.scene,
+            "context": list(views.context),
+            "target": list(views.target),
+            "scores": dict(scores),
+        }
+        write_json(self._path(views), content)
+
+    def picture(self, views: SceneViews) -> Path:
+        """Where the picture of a sample is."""
+        return self.folder / "pictures" / f"{file_name(views.scene)}-{len(views.context)}.png"
+
+    def _path(self, views: SceneViews) -> Path:
+        return self.folder / "scenes" / str(len(views.context)) / f"{file_name(views.scene)}.json"
+
+
+def file_name(scene: str) -> str:
+    """A scene's name as a file name: one folder deep, and different for different scenes."""
+    return scene.replace("%", "%25").replace("/", "%2F")
