@@ -3,6 +3,7 @@
 from vg2gt.data.base import DataError, Frames, SceneSource
 from vg2gt.data.datamodule import SceneDataModule
 from vg2gt.data.mixture import Mixture
+from vg2gt.data.sharded_scenes import ShardedScenes
 from vg2gt.data.sources.rgbd import RGBDFolder
 from vg2gt.data.synthetic import SyntheticScenes
 
@@ -15,6 +16,7 @@ __all__ = [
     "RGBDFolder",
     "SceneDataModule",
     "SceneSource",
+    "ShardedScenes",
     "SyntheticRooms",
     "SyntheticScenes",
 ]

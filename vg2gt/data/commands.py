@@ -31,7 +31,7 @@ def parse(arguments: Sequence[str], options: dict[str, Any]) -> tuple[dict[str, 
     for argument in own:
         key, _, text = argument.partition("=")
         wanted = type(options[key]) if options[key] is not None else str
-        value = text if wanted is str else OmegaConf.from_dotlist([argument])[key]
+        value = text if wanted is str else _read(text)
         if not isinstance(value, wanted) and not (wanted is float and isinstance(value, int)):
             raise ValueError(f"option {key} takes a value of type {wanted.__name__}, got {text!r}")
         chosen[key] = value
@@ -45,3 +45,9 @@ def parse(arguments: Sequence[str], options: dict[str, Any]) -> tuple[dict[str, 
     except (HydraException, OmegaConfBaseException) as error:
         raise ValueError(str(error)) from error
     return chosen, module
+
+
+def _read(text: str) -> Any:
+    """A value as YAML has it."""
+    value = OmegaConf.from_dotlist([f"value={text}"]).value
+    return OmegaConf.to_object(value) if OmegaConf.is_config(value) else value

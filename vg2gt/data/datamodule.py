@@ -111,7 +111,7 @@ class SceneDataModule(LightningDataModule):
         """
         if self._train is not None and self._val is not None:
             return
-        train, val = self.train_source(), self._source(self._make_val)
+        train, val = self.train_source(), self.val_source()
         self._train_names = usable_scenes(train, self.sampler, self.train_scenes)
         names = list(val.scenes)[: self.eval_scenes]
         self._val_views = [views for name in names for views in self.eval_views.choose(val, name)]
@@ -124,6 +124,10 @@ class SceneDataModule(LightningDataModule):
     def train_source(self) -> SceneSource:
         """The training scenes as they are on disk."""
         return self._source(self._make_train)
+
+    def val_source(self) -> SceneSource:
+        """The evaluation scenes as they are on disk."""
+        return self._source(self._make_val)
 
     def train_dataloader(self) -> DataLoader[Batch]:
         """Batches from the trainer's current step on; one item of the loader is one batch.
