@@ -5,8 +5,9 @@ from __future__ import annotations
 import fnmatch
 import hashlib
 import json
+import logging
 from abc import abstractmethod
-from collections import Counter
+from collections import Counter, OrderedDict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import ClassVar
@@ -21,14 +22,18 @@ from vg2gt.data.sources.index import SceneIndex, Size, folder_state, index_to_by
 from vg2gt.data.transforms import from_bytes, resize_depth, resize_images, resize_to_cover
 from vg2gt.io.files import write_bytes
 
+log = logging.getLogger(__name__)
+
+_INDICES_IN_MEMORY = 64
+
 
 class FileSource(SceneSource):
     """A dataset on disk. A loader says where scenes are (``find``), what is in one (``index``) and reads a depth file.
 
     Args:
         root: the dataset's folder, or several.
-        scenes: names of the scenes to use, patterns of names (``Scene20/*``), or a text file with one a line; None:
-            all.
+        scenes: names of the scenes to use, patterns of names (``Scene20/*``), or a text file with one a line, of
+            which those that are not there are counted and left out; None: all.
         holdout: hold out every this many-th frame as an evaluation target; None: none.
         every: use every this many-th frame only.
         index_cache: folder for the indices (file lists, poses, intrinsics), so that they are read from the dataset
@@ -62,7 +67,8 @@ class FileSource(SceneSource):
         self.every = every
         self.index_cache = Path(index_cache).expanduser() if index_cache else None
         self._folders = self._select(self._find_all(_roots(root, self.layout)), scenes)
-        self._indices: dict[str, SceneIndex] = {}
+        self._indices: OrderedDict[str, SceneIndex] = OrderedDict()
+        self._frame_ids: dict[str, NDArray[np.int64]] = {}
 
     @abstractmethod
     def find(self, root: Path) -> Mapping[str, Path]:
@@ -112,7 +118,9 @@ class FileSource(SceneSource):
 
     def frames(self, scene: str) -> Sequence[int]:
         """Numbers of the usable frames, in order."""
-        return self.scene_index(scene).frame_ids[:: self.every]
+        if scene not in self._frame_ids:
+            self._frame_ids[scene] = np.array(self.scene_index(scene).frame_ids[:: self.every])
+        return self._frame_ids[scene].tolist()
 
     def held_out(self, scene: str) -> Sequence[int]:
         """Every ``holdout``-th frame, from the middle of the first stretch on."""
@@ -148,6 +156,10 @@ class FileSource(SceneSource):
             raise DataError(f"there is no scene {scene}; found are: {_some(self._folders)}")
         if scene not in self._indices:
             self._indices[scene] = self._recall_index(scene, self._folders[scene])
+            # A dataset of a thousand long videos would fill gigabytes; from the cache they are quickly read again.
+            if self.index_cache is not None and len(self._indices) > _INDICES_IN_MEMORY:
+                self._indices.popitem(last=False)
+        self._indices.move_to_end(scene)
         return self._indices[scene]
 
     def _load_frame(self, index: SceneIndex, row: int) -> Frames:
@@ -192,10 +204,14 @@ class FileSource(SceneSource):
             return found
         names = read_split(scenes) if isinstance(scenes, str) else list(scenes)
         chosen = {name: fnmatch.filter(found, name) if "*" in name else [name] for name in names}
-        unknown = [name for name, scenes in chosen.items() if not scenes or scenes[0] not in found]
-        if unknown:
+        unknown = [name for name, fitting in chosen.items() if not fitting or fitting[0] not in found]
+        # A list in a file is of the whole dataset, of which people often have a part.
+        if unknown and (not isinstance(scenes, str) or len(unknown) == len(chosen)):
             raise DataError(f"there is no scene {_some(unknown)}; found are: {_some(found)}")
-        return {scene: found[scene] for scenes in chosen.values() for scene in scenes}
+        if unknown:
+            log.warning("%d of the %d scenes that %s names are not there", len(unknown), len(chosen), scenes)
+            chosen = {name: fitting for name, fitting in chosen.items() if name not in unknown}
+        return {scene: found[scene] for fitting in chosen.values() for scene in fitting}
 
     def _recall_index(self, scene: str, folder: Path) -> SceneIndex:
         if self.index_cache is None:

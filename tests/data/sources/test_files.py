@@ -1,0 +1,65 @@
+"""What all loaders of files share: lists of scenes, and the memory that indices take."""
+
+import logging
+
+import pytest
+
+from vg2gt.data import DataError, RGBDFolder
+from vg2gt.data.sources import files
+
+from .layout_rgbd import write_recording
+from .layouts import room
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    root = tmp_path_factory.mktemp("dataset")
+    for name in ("a", "b", "c"):
+        write_recording(root, room(2), name)
+    return root
+
+
+def test_a_list_in_a_file_may_name_scenes_that_are_not_there(dataset, tmp_path, caplog):
+    path = tmp_path / "train.txt"
+    path.write_text("# of the whole dataset\nc\nnot_copied\na\n")
+    with caplog.at_level(logging.WARNING):
+        assert RGBDFolder(str(dataset), scenes=str(path)).scenes == ("c", "a")
+    assert f"1 of the 3 scenes that {path} names are not there" in caplog.text
+    path.write_text("not_copied\n")
+    with pytest.raises(DataError, match="no scene not_copied; found are: a, b, c"):
+        RGBDFolder(str(dataset), scenes=str(path))
+    with pytest.raises(DataError, match="no scene not_copied"):
+        RGBDFolder(str(dataset), scenes=["a", "not_copied"])
+    with pytest.raises(FileNotFoundError, match=r"the scene list .*absent\.txt does not exist"):
+        RGBDFolder(str(dataset), scenes=str(tmp_path / "absent.txt"))
+    path.write_text("a\nb\na\n")
+    with pytest.raises(DataError, match="names a twice"):
+        RGBDFolder(str(dataset), scenes=str(path))
+
+
+def test_few_indices_stay_in_memory_and_the_rest_come_from_the_cache(dataset, tmp_path, monkeypatch):
+    monkeypatch.setattr(files, "_INDICES_IN_MEMORY", 1)
+    source = RGBDFolder(str(dataset), index_cache=str(tmp_path))
+    ids = {scene: source.frames(scene) for scene in source.scenes}
+    assert len(source._indices) == 1
+    monkeypatch.setattr(RGBDFolder, "index", lambda *_: pytest.fail("the dataset is indexed again"))
+    for scene in source.scenes:
+        assert source.load(scene, ids[scene]).depth.shape[0] == 2
+        assert source.frames(scene) == ids[scene] == [10, 11]
+
+
+def test_a_changed_scene_is_indexed_again(dataset, tmp_path):
+    write_recording(tmp_path, room(3), "d")
+    cache = str(tmp_path / "cache")
+    assert RGBDFolder(str(tmp_path / "d"), holdout=None, index_cache=cache).frames("d") == [10, 11, 12]
+    (tmp_path / "d/depth/00011.png").unlink()
+    assert RGBDFolder(str(tmp_path / "d"), holdout=None, index_cache=cache).frames("d") == [10, 12]
+    assert len(list((tmp_path / "cache").rglob("*.npz"))) == 1
+
+
+def test_every_second_frame(dataset):
+    assert RGBDFolder(str(dataset), every=2).frames("a") == [10]
+    with pytest.raises(ValueError, match="every must be at least 1"):
+        RGBDFolder(str(dataset), every=0)
+    with pytest.raises(ValueError, match="holdout must be at least 2"):
+        RGBDFolder(str(dataset), holdout=1)
