@@ -1,5 +1,6 @@
 """Readers and writers, one file a format."""
 
+from vg2gt.io.cameras_json import NamedCamera, named_cameras, read_cameras_json, write_cameras_json
 from vg2gt.io.colmap import (
     ColmapCamera,
     ColmapImage,
@@ -28,6 +29,7 @@ __all__ = [
     "FormatError",
     "Lens",
     "Mesh",
+    "NamedCamera",
     "PointCloud",
     "Transforms",
     "TransformsFrame",
@@ -37,11 +39,14 @@ __all__ = [
     "colmap_intrinsics",
     "colmap_pose",
     "fuse_depth",
+    "named_cameras",
+    "read_cameras_json",
     "read_colmap",
     "read_gaussian_ply",
     "read_point_ply",
     "read_splat",
     "read_transforms",
+    "write_cameras_json",
     "write_colmap",
     "write_gaussian_ply",
     "write_glb",

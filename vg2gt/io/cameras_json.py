@@ -1,0 +1,167 @@
+"""``cameras.json``: the posed cameras of a scene, each with its own image size, in our conventions.
+
+The file is a list of objects ``name``, ``width``, ``height``, ``intrinsics`` (3 rows of 3, integer pixel centres) and
+``world_to_camera`` (4 rows of 4, OpenCV axes). Other fields are ignored. (3D Gaussian Splatting writes a file of the
+same name with other fields; it is refused, naming the missing one.)
+
+Example:
+    >>> import tempfile, torch
+    >>> from vg2gt.io import named_cameras, read_cameras_json, write_cameras_json
+    >>> from vg2gt.types import Cameras
+    >>> intrinsics = torch.tensor([[50.0, 0, 31.5], [0, 50, 23.5], [0, 0, 1]])
+    >>> cameras = Cameras(torch.eye(4)[None, None], intrinsics[None, None], (48, 64))
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = write_cameras_json(folder + "/cameras.json", named_cameras(cameras, ["left.png"]))
+    ...     back = read_cameras_json(path)
+    >>> back[0].name, back[0].width, back[0].cameras().size
+    ('left.png', 64, (48, 64))
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from vg2gt.io.errors import FormatError
+from vg2gt.io.files import read_json, write_json
+from vg2gt.types import Cameras
+
+_ROTATION_TOLERANCE = 1e-3
+_MAX_SIZE = 1 << 20
+
+
+@dataclass(frozen=True, eq=False)
+class NamedCamera:
+    """One pinhole camera.
+
+    Attributes:
+        name: of the view, usually its image file relative to the folder of the images; not empty.
+        width: of the image in pixels.
+        height: of the image in pixels.
+        intrinsics: ``[3, 3]`` float64 in pixels, integer pixel centres.
+        world_to_camera: ``[4, 4]`` float64, OpenCV axes, scene units.
+    """
+
+    name: str
+    width: int
+    height: int
+    intrinsics: NDArray[np.float64]
+    world_to_camera: NDArray[np.float64]
+
+    def cameras(self) -> Cameras:
+        """This camera as the renderer takes it: one scene, one view, float32."""
+        pose, intrinsics = (torch.from_numpy(m).float()[None, None] for m in (self.world_to_camera, self.intrinsics))
+        return Cameras(pose, intrinsics, (self.height, self.width))
+
+
+def named_cameras(cameras: Cameras, names: Sequence[str]) -> list[NamedCamera]:
+    """The views of one scene with a name each.
+
+    Raises:
+        ValueError: if there is more than one scene, or not one name a view.
+    """
+    scenes, views = cameras.world_to_camera.shape[:2]
+    if scenes != 1 or views != len(names):
+        raise ValueError(
+            f"expected one scene and one name a view, got {scenes} scenes, {views} views, {len(names)} names"
+        )
+    poses, intrinsics = (t[0].detach().cpu().double().numpy() for t in (cameras.world_to_camera, cameras.intrinsics))
+    height, width = cameras.size
+    return [NamedCamera(name, width, height, k, pose) for name, k, pose in zip(names, intrinsics, poses, strict=True)]
+
+
+def write_cameras_json(path: str | Path, cameras: Sequence[NamedCamera]) -> Path:
+    """Writes cameras in their order, atomically; every float64 comes back as it was.
+
+    Args:
+        path: the file.
+        cameras: what to write; not changed.
+
+    Returns:
+        The path.
+
+    Raises:
+        ValueError: if one is no camera: a wrong shape, a value that is not finite, no rotation, no focal length.
+    """
+    content = [
+        {
+            "name": camera.name,
+            "width": int(camera.width),
+            "height": int(camera.height),
+            "intrinsics": np.asarray(camera.intrinsics, np.float64).tolist(),
+            "world_to_camera": np.asarray(camera.world_to_camera, np.float64).tolist(),
+        }
+        for camera in cameras
+    ]
+    for index, entry in enumerate(content):
+        _camera(f"cameras[{index}]", entry)
+    return write_json(path, content)
+
+
+def read_cameras_json(path: str | Path) -> list[NamedCamera]:
+    """Reads the cameras of a file in their order.
+
+    Raises:
+        FormatError: if it is not JSON or of another shape, naming the file, the entry and the field.
+    """
+    path = Path(path)
+    try:
+        content = read_json(path)
+    except (ValueError, RecursionError) as error:
+        raise FormatError(f"{path}: not valid JSON ({error}); the file is truncated or damaged") from error
+    if not isinstance(content, list):
+        raise FormatError(f"{path}: expected a list of cameras, got {type(content).__name__}")
+    return [_camera(f"{path}: [{index}]", entry) for index, entry in enumerate(content)]
+
+
+def _camera(place: str, entry: Any) -> NamedCamera:
+    """Checks one entry; ``place`` is where it stands, for messages."""
+    if not isinstance(entry, dict):
+        raise FormatError(f"{place} is {type(entry).__name__}, expected an object")
+    name = entry.get("name")
+    if not isinstance(name, str) or not name:
+        raise FormatError(f"{place}.name is {_short(name)}, expected the view's name")
+    intrinsics, pose = _matrix(place, entry, "intrinsics", 3), _matrix(place, entry, "world_to_camera", 4)
+    focal = intrinsics[[0, 1], [0, 1]]
+    if (focal <= 0).any() or np.abs(intrinsics[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]] - [0, 0, 0, 0, 1]).max() > 1e-9:
+        raise FormatError(
+            f"{place}.intrinsics is {intrinsics.tolist()}, expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with "
+            "positive focal lengths and no skew; undistort the images"
+        )
+    rotation = pose[:3, :3]
+    error = np.abs(rotation.T @ rotation - np.eye(3)).max() if np.abs(rotation).max() < 2 else np.inf
+    if error > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0 or np.abs(pose[3] - [0, 0, 0, 1]).max() > 1e-6:
+        raise FormatError(
+            f"{place}.world_to_camera is not a rotation and a translation (R'R differs from the identity by "
+            f"{error:.2g}); remove scale, shear and mirroring"
+        )
+    return NamedCamera(name, _pixels(place, entry, "width"), _pixels(place, entry, "height"), intrinsics, pose)
+
+
+def _pixels(place: str, entry: dict[str, Any], field: str) -> int:
+    value = entry.get(field)
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 < value < _MAX_SIZE:
+        raise FormatError(f"{place}.{field} is {_short(value)}, expected a whole number of pixels above 0")
+    return value
+
+
+def _matrix(place: str, entry: dict[str, Any], field: str, size: int) -> NDArray[np.float64]:
+    rows = entry.get(field)
+    try:
+        matrix = np.array(rows, np.float64)
+    except (TypeError, ValueError, OverflowError):
+        matrix = np.empty(0)
+    if matrix.shape != (size, size) or not np.isfinite(matrix).all():
+        raise FormatError(f"{place}.{field} is {_short(rows)}, expected {size} rows of {size} finite numbers")
+    return matrix
+
+
+def _short(value: Any) -> str:
+    text = "missing" if value is None else repr(value)
+    return text if len(text) <= 80 else text[:77] + "..."
