@@ -15,6 +15,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -122,7 +123,7 @@ class RGBDFolder(FileSource):
             depth_size=depth_size,
         )
         size = f"{depth_size[1]}x{depth_size[0]}"
-        log.info("scene %s: %s, %d frames of %s in %s", scene, files.layout, len(index.frame_ids), size, folder)
+        _say(f"scene {scene}: {files.layout}, {len(index.frame_ids)} frames of {size} in {folder}")
         return index
 
     def read_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
@@ -148,6 +149,12 @@ class RGBDFolder(FileSource):
         return resize_intrinsics(torch.from_numpy(matrix), depth[1] / color[1], depth[0] / color[0]).numpy()
 
 
+@lru_cache
+def _say(message: str, level: int = logging.INFO) -> None:
+    """Logs a message once, although training and evaluation both read the recording."""
+    log.log(level, message)
+
+
 def _is_recording(folder: Path) -> bool:
     in_folders = (folder / "depth").is_dir() and any((folder / name).is_dir() for name in _COLOR_FOLDERS)
     return folder.is_dir() and (in_folders or any(folder.glob("frame-*.color.*")))
@@ -169,7 +176,7 @@ def _files_in_folders(folder: Path, scene: str) -> _Files:
 
 
 def _files_of_seven_scenes(folder: Path, scene: str) -> _Files:
-    log.warning("scene %s: raw 7-Scenes streams are not registered; colour and depth do not match exactly", scene)
+    _say(f"scene {scene}: raw 7-Scenes streams are not registered; colour and depth do not match", logging.WARNING)
     # The intrinsics lie beside the frames, or beside the sequences of a scene.
     candidates = [place / name for place in (folder, folder.parent) for name in _INTRINSICS_FILES]
     return _Files(
