@@ -56,6 +56,7 @@ def clocked(model: Reconstructor, device: torch.device) -> Iterator[Clock]:
     parts = [(backend, "encode"), (backend, "decode")]
     if isinstance(coarse, nn.Module):
         parts.append((coarse, "forward"))
+    own = [vars(owner).get(name) for owner, name in parts]
     for owner, name in parts:
         setattr(owner, name, timed(getattr(owner, name)))
     begin = now(device)
@@ -63,8 +64,11 @@ def clocked(model: Reconstructor, device: torch.device) -> Iterator[Clock]:
         yield clock
         clock.total = now(device) - begin
     finally:
-        for owner, name in parts:
-            delattr(owner, name)  # the class's own shows again
+        for (owner, name), before in zip(parts, own, strict=True):
+            if before is None:
+                delattr(owner, name)  # the class's own shows again
+            else:
+                setattr(owner, name, before)
 
 
 def now(device: torch.device) -> float:

@@ -1,0 +1,39 @@
+"""A small scene and a model on it."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.training_helpers import small_config
+from vg2gt.evaluation import EvaluationOptions, SceneEvaluator
+from vg2gt.lightning_module import VG2GTModule
+from vg2gt.training import build
+from vg2gt.types import Batch
+
+
+@pytest.fixture(scope="module")
+def module_and_batch(tmp_path_factory: pytest.TempPathFactory) -> tuple[VG2GTModule, Batch]:
+    """An untrained head on the oracle, and a room of 56x112 with 8 context and 3 target views."""
+    folder = tmp_path_factory.mktemp("scene")
+    run = build(small_config(folder, folder / "cache"))
+    run.module.eval()
+    return run.module, next(iter(run.datamodule.val_dataloader()))
+
+
+@pytest.fixture(scope="module")
+def evaluator(module_and_batch) -> SceneEvaluator:
+    module, _ = module_and_batch
+    return SceneEvaluator(module.model, module.renderer, EvaluationOptions())
+
+
+@pytest.fixture(scope="module")
+def batch(module_and_batch) -> Batch:
+    torch.manual_seed(0)
+    return module_and_batch[1]
+
+
+def evaluate_overrides(folder: Path, cache: Path, *overrides: str) -> list[str]:
+    """Overrides of ``configs/evaluate.yaml`` for an evaluation of two rooms of 56x112."""
+    small = ["data.image_size=[56,112]", "data.eval_scenes=2", "views=[2]", "device=cpu", "name=test"]
+    return [*small, f"output_dir={folder}", "hydra/job_logging=default", f"data.cache_dir={cache}", *overrides]

@@ -1,0 +1,53 @@
+from pathlib import Path
+
+import pytest
+
+from vg2gt.data.sampling import SceneViews
+from vg2gt.evaluation.run import mean_scores
+from vg2gt.evaluation.store import ResultStore, file_name
+
+VIEWS = SceneViews("kitchen/seq-01", (1, 2), (3,))
+
+
+def test_scores_come_back_for_the_same_frames_only(tmp_path: Path) -> None:
+    store = ResultStore(tmp_path, {"a": 1})
+    assert store.read(VIEWS) is None
+    store.write(VIEWS, {"psnr": 20.5, "abs_rel": None})
+    again = ResultStore(tmp_path, {"a": 1})
+    assert again.read(VIEWS) == {"psnr": 20.5, "abs_rel": None}
+    assert again.read(SceneViews(VIEWS.scene, (1, 2), (4,))) is None
+    assert again.read(SceneViews(VIEWS.scene, (1, 2, 5), (3,))) is None
+
+
+def test_a_damaged_file_is_measured_again(tmp_path: Path) -> None:
+    store = ResultStore(tmp_path, {})
+    store.write(VIEWS, {"psnr": 1.0})
+    next((tmp_path / "scenes" / "2").iterdir()).write_text('{"scene": ')
+    assert store.read(VIEWS) is None
+
+
+def test_other_settings_are_refused_and_named(tmp_path: Path) -> None:
+    ResultStore(tmp_path, {"alignment": "median", "k": 8}).write(VIEWS, {"psnr": 1.0})
+    with pytest.raises(FileExistsError, match=r"alignment \(median -> scene\).*overwrite=true"):
+        ResultStore(tmp_path, {"alignment": "scene", "k": 8})
+    replaced = ResultStore(tmp_path, {"alignment": "scene", "k": 8}, overwrite=True)
+    assert replaced.read(VIEWS) is None
+
+
+def test_different_scenes_have_different_files() -> None:
+    names = ["a/b", "a%2Fb", "a_b", "a"]
+    assert len({file_name(name) for name in names}) == len(names)
+    assert "/" not in file_name("a/b")
+
+
+def test_means_leave_out_what_is_missing_and_times_are_medians() -> None:
+    scenes = {
+        "a": {"psnr": 20.0, "abs_rel": None, "scene/head_seconds": 9.0},
+        "b": {"psnr": 30.0, "abs_rel": 0.2, "scene/head_seconds": 1.0},
+        "c": {"psnr": 40.0, "abs_rel": 0.4, "scene/head_seconds": 2.0, "lpips": None},
+    }
+    means = mean_scores(scenes)
+    assert means["psnr"] == 30
+    assert means["abs_rel"] == pytest.approx(0.3)
+    assert means["scene/head_seconds"] == 2
+    assert means["lpips"] is None
