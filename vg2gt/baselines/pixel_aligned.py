@@ -8,6 +8,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
+from torch.profiler import record_function
 
 from backends.base import Backend
 from vg2gt.baselines.pixels import Pixels, usable_pixels
@@ -132,9 +133,9 @@ class PixelAligned(Reconstructor):
     ) -> Prediction:
         """Reconstructs B scenes; see :meth:`vg2gt.model.Reconstructor.forward`. Nothing is random here."""
         tokens, geometry, unit = self.read_views(images, hints)
-        with torch.profiler.record_function("vg2gt/fine"):
+        with record_function("vg2gt/fine"):
             dense = self.dense_head(tokens, images).permute(0, 2, 3, 1).flatten(0, 2)
-        with torch.profiler.record_function("vg2gt/gaussians"), torch.autocast(images.device.type, enabled=False):
+        with record_function("vg2gt/gaussians"), torch.autocast(images.device.type, enabled=False):
             pixels = usable_pixels(geometry, images)
             gaussians, _ = self.gaussians(F.gelu(dense.float()).index_select(0, pixels.rows), pixels)
         return Prediction(geometry, geometry, None, gaussians, unit)

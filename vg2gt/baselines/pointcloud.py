@@ -6,6 +6,7 @@ from typing import Literal, get_args
 
 import torch
 from torch import Tensor
+from torch.profiler import record_function
 
 from backends.base import Backend
 from vg2gt.baselines.pixels import Pixels, usable_pixels
@@ -54,7 +55,7 @@ class PointCloud(Reconstructor):
     ) -> Prediction:
         """Reconstructs B scenes; see :meth:`vg2gt.model.Reconstructor.forward`. Nothing is random here."""
         _, geometry, unit = self.read_views(images, hints)
-        with torch.profiler.record_function("vg2gt/gaussians"), torch.autocast(images.device.type, enabled=False):
+        with record_function("vg2gt/gaussians"), torch.autocast(images.device.type, enabled=False):
             pixels = usable_pixels(geometry, images)
             means = pixels.to_world(pixels.rays * pixels.depth[:, None])
             spacing = pixels.footprint.mean(-1) if self.spacing == "pixel" else _distance_to_neighbors(means, pixels)

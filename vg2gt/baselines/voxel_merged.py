@@ -7,6 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 from torch.nn import functional as F
+from torch.profiler import record_function
 
 from backends.base import Backend
 from vg2gt.baselines.pixel_aligned import PixelHead
@@ -53,9 +54,9 @@ class VoxelMerged(Reconstructor):
     ) -> Prediction:
         """Reconstructs B scenes; see :meth:`vg2gt.model.Reconstructor.forward`. Nothing is random here."""
         tokens, geometry, unit = self.read_views(images, hints)
-        with torch.profiler.record_function("vg2gt/fine"):
+        with record_function("vg2gt/fine"):
             dense = self.dense_head(tokens, images).permute(0, 2, 3, 1).flatten(0, 2)
-        with torch.profiler.record_function("vg2gt/gaussians"), torch.autocast(images.device.type, enabled=False):
+        with record_function("vg2gt/gaussians"), torch.autocast(images.device.type, enabled=False):
             size = scene_voxel_size(geometry, self.voxel_size, self.min_footprint)
             pixels = usable_pixels(geometry, images)
             features = F.gelu(dense.float()).index_select(0, pixels.rows)

@@ -1,0 +1,174 @@
+"""VG²GT against the baselines in one run: ``python benchmarks/baselines.py [steps=N] [seeds=N] [overrides]``.
+
+Every model is trained from scratch for the same number of steps on the same backbone, losses, batches and machine, and
+evaluated on the same held-out scenes: VG²GT, VG²GT without its coarse module (which separates the voxels' part from
+the enhanced geometry's), one Gaussian a pixel, pixel Gaussians merged by voxels, and the coloured points, which need no
+training. Finished trainings are not repeated, interrupted ones go on. Writes runs, ``metrics.json``, ``metrics.md`` and
+``models.png`` into ``outputs/<name>``; name=baselines.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from machine import machine
+from stage_clock import StageClock
+
+from vg2gt.checkpoints import newest_valid, read_checkpoint
+from vg2gt.io.files import write_json, write_text
+from vg2gt.io.images import colorize_depth, grid, write_png
+from vg2gt.protocols import ground_truth_target_cameras
+from vg2gt.study import Metrics, compose_run, markdown, over_seeds, run_once, summarize
+from vg2gt.training import Run, build
+from vg2gt.types import Batch
+
+DEFAULTS = {"name": "baselines", "steps": "400", "seeds": "1"}
+REFERENCE = "VG²GT"
+MAX_ERROR = 0.1  # relative depth error shown as white
+COLUMNS = {
+    "psnr": ("PSNR", 2),
+    "ssim": ("SSIM", 3),
+    "rmse": ("RMSE", 4),
+    "abs_rel": ("abs_rel", 4),
+    "delta_1.05": ("δ1.05", 3),
+    "abs_rel_rasterized": ("abs_rel, rasterised", 4),
+    "decoded_abs_rel": ("abs_rel, decoded", 4),
+    "normal_mean": ("normals, deg", 1),
+    "coverage": ("coverage", 4),
+    "cv": ("CV (k=8)", 3),
+    "gaussians": ("Gaussians", 0),
+    "head_seconds": ("head, core-s", 2),
+    "reconstruction_seconds": ("all, core-s", 2),
+    "render_seconds": ("render a view, core-s", 3),
+}
+
+
+@dataclass(frozen=True)
+class Model:
+    """A row: its folder, its overrides, and whether there is anything to train."""
+
+    folder: str
+    overrides: tuple[str, ...] = ()
+    trained: bool = True
+
+
+MODELS = {
+    REFERENCE: Model("vg2gt"),
+    "VG²GT w/o coarse": Model("wo_coarse", ("ablation=wo_coarse",)),
+    "pixel-aligned": Model("pixel_aligned", ("model=pixel_aligned",)),
+    "voxel-merged": Model("voxel_merged", ("model=voxel_merged",)),
+    "coloured points": Model("pointcloud", ("model=pointcloud",), trained=False),
+}
+
+
+def restore(model: Model, overrides: list[str], folder: Path) -> tuple[Run, Batch]:
+    """The trained module of a finished run, and the first evaluation scene."""
+    run = build(compose_run([*overrides, *model.overrides], folder))
+    if model.trained:
+        run.module.load_state_dict(read_checkpoint(newest_valid(folder / "checkpoints"))["state_dict"])
+    run.datamodule.setup("validate")
+    run.module.eval()
+    return run, next(iter(run.datamodule.val_dataloader())).single(0).to(run.module.device)
+
+
+@torch.no_grad()
+def costs(run: Run, batch: Batch, passes: int = 3) -> Metrics:
+    """Best seconds of a reconstruction and of rendering one view, all cores of a CPU or the GPU's."""
+    clock, context = StageClock(run.module.device), batch.context
+    for _ in range(passes):
+        with clock.listening():
+            prediction = run.module.model(context.images, context.hints)
+        with clock.stage("render"):
+            run.module.renderer(prediction.gaussians, prediction.geometry.cameras.select(slice(0, 1)))
+    best = {name: stage.best for name, stage in clock.stages.items()}
+    head = best.get("fine", 0.0) + best["gaussians"]
+    whole = sum(value for name, value in best.items() if name != "render")
+    return {"head_seconds": head, "reconstruction_seconds": whole, "render_seconds": best["render"]}
+
+
+@torch.no_grad()
+def panels(run: Run, batch: Batch) -> list[torch.Tensor]:
+    """Rendered colour, rendered depth and its relative error (black none, white 10 % and holes) of a held-out view."""
+    prediction = run.module.model(batch.context.images, batch.context.hints)
+    cameras = ground_truth_target_cameras(batch, prediction).select(slice(0, 1))
+    rendered, true = run.module.renderer(prediction.gaussians, cameras, mode="solid"), batch.target.depth[0, 0]
+    depth = rendered.depth[0, 0]
+    both = (depth > 0) & (true > 0)
+    depth = depth * (true[both] / depth[both]).median()
+    error = ((depth / true.clamp_min(1e-6) - 1).abs() / MAX_ERROR).clamp(0, 1)
+    error = torch.where(depth > 0, error, 1.0) * (true > 0)
+    near, far = (float(true[true > 0].quantile(q)) for q in (0.02, 0.98))
+    return [rendered.color[0, 0], colorize_depth(depth, near, far), error.expand(3, -1, -1)]
+
+
+def truth(batch: Batch) -> list[torch.Tensor]:
+    """The held-out view itself, in the columns of :func:`panels`."""
+    true = batch.target.depth[0, 0]
+    near, far = (float(true[true > 0].quantile(q)) for q in (0.02, 0.98))
+    return [batch.target.images[0, 0], colorize_depth(true, near, far), torch.zeros_like(batch.target.images[0, 0])]
+
+
+def report(results: Mapping[str, Mapping[int, Metrics]], options: Mapping[str, str]) -> str:
+    """The table as Markdown."""
+    rows = [
+        [name, *(over_seeds(runs, metric).shown(decimals) for metric, (_, decimals) in COLUMNS.items())]
+        for name, runs in results.items()
+        if runs
+    ]
+    protocol = (
+        f"{options['steps']} training steps each, {options['seeds']} seed(s) (mean ± 95 % confidence interval where "
+        "there are several). Scenes never trained on, held-out views at ground-truth poses, rendered as stochastic "
+        "solids, depth aligned by one median scale a scene. Times: best of three passes on the first scene."
+    )
+    table = markdown(["", *(heading for heading, _ in COLUMNS.values())], rows)
+    return f"# VG²GT and baselines\n\n{protocol}\n\n{table}\n"
+
+
+def main() -> None:
+    """Trains whatever is not trained, measures and writes."""
+    options, overrides = dict(DEFAULTS), []
+    for argument in sys.argv[1:]:
+        key, _, value = argument.partition("=")
+        if key in ("-h", "--help"):
+            print(__doc__)
+            return
+        if key in options:
+            options[key] = value
+        else:
+            overrides.append(argument)
+    home = Path("outputs").resolve() / options["name"]
+    results: dict[str, dict[int, Metrics]] = {name: {} for name in MODELS}
+    rows: list[list[torch.Tensor]] = []
+    for seed in range(int(options["seeds"])):
+        for name, model in MODELS.items():
+            folder = home / f"seed-{seed}" / model.folder
+            steps = options["steps"] if model.trained else "0"
+            mine = [*overrides, f"seed={seed}", f"trainer.max_steps={steps}"]
+            print(f"seed {seed}: {name}", flush=True)
+            metrics = run_once([*mine, *model.overrides], folder)
+            run, batch = restore(model, mine, folder)
+            results[name][seed] = metrics | costs(run, batch)
+            if seed == 0:
+                rows = rows or [truth(batch)]
+                rows.append(panels(run, batch))
+                write_png(home / "models.png", grid(rows))
+            content = {
+                "options": options,
+                "overrides": overrides,
+                "machine": machine(run.module.device),
+                "runs": {key: {str(s): m for s, m in runs.items()} for key, runs in results.items()},
+                "summary": summarize({key: runs for key, runs in results.items() if runs}, REFERENCE),
+            }
+            write_json(home / "metrics.json", content)
+            write_text(home / "metrics.md", report(results, options))
+    print(report(results, options))
+    print(f"rows of models.png: truth, {', '.join(MODELS)}; colour, depth, relative depth error")
+    print(f"metrics: {home / 'metrics.json'}")
+
+
+if __name__ == "__main__":
+    main()

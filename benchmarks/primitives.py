@@ -1,0 +1,237 @@
+"""Primitives and decoding time against the number of views: ``python benchmarks/primitives.py [--views N ...]``.
+
+VG²GT (at several voxel sizes) against one Gaussian a pixel and against pixel Gaussians merged by voxels, on procedural
+rooms or, with ``data=rgbd data.root=FOLDER``, on a recording (paper, figure on the number of primitives and the time of
+the decoding head). Heads are untrained unless overrides name weights, which changes neither counts nor times: counts
+follow from the geometry, here the simulated backbone's, whose noise is printed. Times are the best of several passes:
+core-seconds on a CPU, CUDA events on a GPU. Prints a table, writes a dated JSON file to ``benchmarks/results`` and a
+plot to ``docs/figures``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import json
+import tempfile
+from dataclasses import asdict, dataclass
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+import torch
+from hydra.utils import instantiate
+from machine import machine
+from rich.console import Console
+from rich.table import Table
+from stage_clock import StageClock
+
+from vg2gt.io.files import write_json
+from vg2gt.study import compose_run
+from vg2gt.types import Batch
+from vg2gt.voxels.grid import scene_voxel_size
+
+PIXEL_ALIGNED = "pixel_aligned"
+REPOSITORY = Path(__file__).resolve().parents[1]
+
+
+@dataclass(frozen=True)
+class Method:
+    """A model and the smallest edge of its voxels in pixels; None where there are none."""
+
+    model: str
+    footprint: float | None
+
+    @property
+    def label(self) -> str:
+        """Name in tables and plots; with the voxels' edge."""
+        return self.model if self.footprint is None else f"{self.model}, {self.footprint:g} px"
+
+    @property
+    def overrides(self) -> list[str]:
+        """What the configuration needs."""
+        key = "model.fine.min_footprint" if self.model in ("tiny", "vg2gt") else "model.min_footprint"
+        return [f"model={self.model}", *([] if self.footprint is None else [f"{key}={self.footprint}"])]
+
+
+@dataclass
+class Row:
+    """What one method gives for one number of views, means over scenes.
+
+    Attributes:
+        method: its label.
+        views: input views.
+        primitives: Gaussians a scene.
+        head_seconds: from tokens and geometry to Gaussians (dense head included).
+        seconds: everything but the backbone and its first decoding.
+        voxel_size: edge in scene units (median depth 1); 0 without voxels.
+    """
+
+    method: str
+    views: int
+    primitives: float
+    head_seconds: float
+    seconds: float
+    voxel_size: float
+
+
+def load_scenes(overrides: list[str], views: int, scenes: int) -> list[Batch]:
+    """Evaluation scenes with the given number of input views, spread evenly over each."""
+    chosen = [f"data.eval_context={views}", "data.eval_target=0", f"data.eval_scenes={scenes}"]
+    with tempfile.TemporaryDirectory() as folder:
+        data = instantiate(compose_run([*overrides, *chosen], Path(folder)).data)
+    data.setup("validate")
+    return [batch.context for batch, _ in zip(data.val_dataloader(), range(scenes), strict=False)]
+
+
+@torch.no_grad()
+def measure(method: Method, batches: list[Batch], overrides: list[str], passes: int, device: torch.device) -> Row:
+    """Reconstructs the scenes and takes means."""
+    with tempfile.TemporaryDirectory() as folder:
+        config = compose_run([*overrides, *method.overrides], Path(folder))
+    torch.manual_seed(0)
+    model = instantiate(config.model, backend=instantiate(config.backend)).to(device).eval()
+    counts, heads, totals, sizes = [], [], [], []
+    for batch in batches:
+        batch = batch.to(device)
+        clock = StageClock(device)
+        for _ in range(passes + 1):
+            with clock.listening():
+                prediction = model(batch.images, batch.hints)
+        best = {name: min(stage.seconds[1:]) for name, stage in clock.stages.items()}
+        counts.append(len(prediction.gaussians))
+        heads.append(best.get("fine", 0.0) + best["gaussians"])
+        totals.append(sum(value for name, value in best.items() if name not in ("encode", "decode")))
+        options = model.fine if hasattr(model, "fine") else model
+        if method.footprint is not None:
+            size = scene_voxel_size(prediction.geometry, options.voxel_size, options.min_footprint)
+            sizes.append(float(size[0]))
+
+    def mean(values: list[float]) -> float:
+        return sum(values) / len(values) if values else 0.0
+
+    return Row(method.label, batches[0].num_context, mean(counts), mean(heads), mean(totals), mean(sizes))
+
+
+def print_table(console: Console, title: str, rows: list[Row], pixels: int) -> None:
+    """A row a method and number of views, with ratios to the pixel-aligned one."""
+    table = Table(title=title)
+    headings = (
+        "method",
+        "views",
+        "primitives",
+        "of pixels",
+        "of pixel-aligned",
+        "head, s",
+        "of pixel-aligned",
+        "all, s",
+    )
+    for heading in headings:
+        table.add_column(heading, justify="left" if heading == "method" else "right")
+    reference = {row.views: row for row in rows if row.method == PIXEL_ALIGNED}
+    for row in rows:
+        base = reference[row.views]
+        table.add_row(
+            row.method,
+            str(row.views),
+            f"{row.primitives:,.0f}",
+            f"{row.primitives / (pixels * row.views):.0%}",
+            f"{row.primitives / base.primitives:.1%}",
+            f"{row.head_seconds:.2f}",
+            f"{row.head_seconds / base.head_seconds:.0%}",
+            f"{row.seconds:.2f}",
+        )
+    console.print(table)
+
+
+def plot(rows: list[Row], title: str, unit: str, path: Path) -> Path | None:
+    """Writes primitives and decoding time against views as a picture; None without matplotlib."""
+    try:
+        from matplotlib import pyplot  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        return None
+    figure, panels = pyplot.subplots(1, 2, figsize=(10, 3.6))
+    for label in dict.fromkeys(row.method for row in rows):
+        mine = [row for row in rows if row.method == label]
+        views = [row.views for row in mine]
+        panels[0].plot(views, [row.primitives / 1e3 for row in mine], "o-", label=label)
+        panels[1].plot(views, [row.head_seconds for row in mine], "o-", label=label)
+    panels[0].set(xlabel="views", ylabel="primitives [thousands]", ylim=(0, None))
+    panels[1].set(xlabel="views", ylabel=f"decoding head [{unit}]", ylim=(0, None))
+    panels[0].legend(fontsize=8)
+    figure.suptitle(title, fontsize=9)
+    figure.tight_layout()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110)
+    return path
+
+
+def describe(overrides: list[str], batch: Batch) -> dict[str, Any]:
+    """The data, the backbone and its noise."""
+    with tempfile.TemporaryDirectory() as folder:
+        config = compose_run(overrides, Path(folder))
+    return {
+        "first scene": batch.scene[0],
+        "size": list(batch.images.shape[-2:]),
+        "backend": str(config.backend.get("name", "oracle")),
+        "depth noise": config.backend.get("depth_noise"),
+    }
+
+
+def main() -> None:
+    """Measures, prints, writes and plots."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--views", type=int, nargs="+", default=[4, 10, 20, 50])
+    parser.add_argument("--footprints", type=float, nargs="+", default=[1.0, 2.0, 3.3], help="voxel edges in pixels")
+    parser.add_argument("--model", default="tiny", choices=("tiny", "vg2gt"))
+    parser.add_argument("--scenes", type=int, default=1)
+    parser.add_argument("--passes", type=int, default=1)
+    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    parser.add_argument("--name", default="rooms", help="part of the files' names, and of the plot's title")
+    parser.add_argument("--out", type=Path, default=REPOSITORY / "benchmarks" / "results")
+    parser.add_argument("--figures", type=Path, default=REPOSITORY / "docs" / "figures")
+    parser.add_argument(
+        "overrides", nargs="*", help="Hydra overrides; rooms have data.num_frames=64 unless they say so"
+    )
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    device, console = torch.device(arguments.device), Console(width=120)
+    overrides = list(arguments.overrides)
+    if not any(override.startswith("data=") for override in overrides):
+        overrides = ["data.num_frames=64", *overrides]
+    methods = [Method(PIXEL_ALIGNED, None)]
+    methods += [Method("voxel_merged", arguments.footprints[-1])]
+    methods += [Method(arguments.model, footprint) for footprint in arguments.footprints]
+    rows: list[Row] = []
+    batches: list[Batch] = []
+    for views in arguments.views:
+        batches = load_scenes(overrides, views, arguments.scenes)
+        for method in methods:
+            rows.append(measure(method, batches, overrides, arguments.passes, device))
+            console.print(f"{rows[-1].method}, {views} views: {rows[-1].primitives:,.0f} primitives", highlight=False)
+            gc.collect()
+    about = describe(overrides, batches[0])
+    height, width = about["size"]
+    noise = about["depth noise"]
+    title = f"{arguments.name}, {height}x{width}, voxel edges in pixels at the median depth, backend {about['backend']}"
+    title += "" if noise is None else f" with {noise:.0%} depth noise"
+    rows.sort(key=lambda row: ([method.label for method in methods].index(row.method), row.views))
+    print_table(console, title, rows, height * width)
+    unit = "seconds" if device.type == "cuda" else "core-seconds"
+    content = {
+        "machine": machine(device),
+        "unit": unit,
+        "overrides": overrides,
+        "scenes": arguments.scenes,
+        "passes": arguments.passes,
+        "data": about,
+        "rows": [asdict(row) for row in rows],
+    }
+    stem = f"{date.today().isoformat()}-primitives-{arguments.name}-{device.type}"
+    console.print(str(write_json(arguments.out / f"{stem}.json", json.loads(json.dumps(content)))))
+    if picture := plot(rows, title, unit, arguments.figures / f"primitives-{arguments.name}.png"):
+        console.print(str(picture))
+
+
+if __name__ == "__main__":
+    main()

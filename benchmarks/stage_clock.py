@@ -1,0 +1,78 @@
+"""Time and memory of the stages that a model marks in its forward pass."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from unittest import mock
+
+import torch
+
+MARKED = (
+    "vg2gt.model",
+    "vg2gt.baselines.pixel_aligned",
+    "vg2gt.baselines.voxel_merged",
+    "vg2gt.baselines.pointcloud",
+)
+
+
+@dataclass
+class Passes:
+    """What a stage took, a number a pass.
+
+    Attributes:
+        seconds: of all cores on a CPU (other processes hardly matter), of the device on a GPU.
+        peak_mb: allocated on the GPU above what was there when the stage began; 0 on a CPU.
+    """
+
+    seconds: list[float] = field(default_factory=list)
+    peak_mb: list[float] = field(default_factory=list)
+
+    @property
+    def best(self) -> float:
+        """The fastest pass."""
+        return min(self.seconds)
+
+    @property
+    def memory(self) -> float:
+        """The largest peak."""
+        return max(self.peak_mb)
+
+
+class StageClock:
+    """Collects stages by name; the model's marks report to it inside :meth:`listening`."""
+
+    def __init__(self, device: torch.device) -> None:
+        self.device = device
+        self.stages: dict[str, Passes] = {}
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Measures what happens inside the block; on a GPU with events, after the device has done what came before."""
+        passes = self.stages.setdefault(name.removeprefix("vg2gt/"), Passes())
+        if self.device.type != "cuda":
+            begin = time.process_time()
+            yield
+            passes.seconds.append(time.process_time() - begin)
+            passes.peak_mb.append(0.0)
+            return
+        torch.cuda.synchronize(self.device)
+        torch.cuda.reset_peak_memory_stats(self.device)
+        before = torch.cuda.memory_allocated(self.device)
+        begin, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
+        begin.record()
+        yield
+        end.record()
+        torch.cuda.synchronize(self.device)
+        passes.seconds.append(begin.elapsed_time(end) / 1e3)
+        passes.peak_mb.append((torch.cuda.max_memory_allocated(self.device) - before) / 1e6)
+
+    @contextmanager
+    def listening(self) -> Iterator[None]:
+        """Takes the marks of the models inside the block."""
+        with ExitStack() as stack:
+            for module in MARKED:
+                stack.enter_context(mock.patch(f"{module}.record_function", self.stage))
+            yield

@@ -1,0 +1,199 @@
+"""Inference time by stage: ``python benchmarks/stages.py [--views N] [--size H W] [--device cuda] [overrides]``.
+
+Backbone, first decode, coarse voxels, second decode, fine voxels, Gaussian head and rendering of one view, on a
+procedural room, with whatever model and backend the overrides name (paper, Evaluation of Time Consumption:
+``backend=da3_giant model=vg2gt``, 10 views of 224x448 and 518x518). Times are the best of several passes:
+core-seconds on a CPU, CUDA events on a GPU, where each stage's peak memory stands beside. Weights need not be there
+(``backend.pretrained=false``), but then the depth is noise, and so is the number of voxels, which is printed.
+``--training`` adds a training step and what a whole training would cost, beside the paper's table. Prints tables and
+writes a dated JSON file to ``benchmarks/results``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+from dataclasses import dataclass
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+import torch
+from machine import machine
+from rich.console import Console
+from rich.table import Table
+from stage_clock import StageClock
+
+from vg2gt.io.files import write_json
+from vg2gt.study import compose_run
+from vg2gt.training import Run, build
+from vg2gt.types import Batch
+
+STAGES = {
+    "encode": "backbone",
+    "decode": "first decode",
+    "coarse": "coarse voxels",
+    "decode_again": "second decode",
+    "fine": "fine voxels",
+    "gaussians": "Gaussian head",
+    "render": "render one view",
+}
+RECONSTRUCTION = tuple(name for name in STAGES if name != "render")
+# Paper, Evaluation of Time Consumption: 10 images, DA3-GIANT, RTX PRO 6000; seconds. "whole" of DA3: its own network.
+PAPER = {
+    (224, 448): {"decode_again": 0.0852, "fine + head": 0.293, "whole": 1.122, "DA3 alone": 0.764},
+    (518, 518): {"whole": 2.440, "DA3 alone": 2.180},
+}
+# Paper, Table training_cost: GPU, hours, hours converted to the paper's GPU.
+PAPER_TRAINING = {
+    "VG²GT": ("PRO 6000", 99.0, 99.0),
+    "AnySplat": ("A800", 768.0, 685.824),
+    "DA3": ("H100", 30720.0, 57415.68),
+    "VGGT": ("A100", 13824.0, 12344.832),
+    "MapAnything": ("H200", 9216.0, 24689.664),
+}
+PAPER_STEPS = 420_000
+
+
+@dataclass(frozen=True)
+class Case:
+    """What is measured: a number of views at a size, with Hydra overrides."""
+
+    views: int
+    size: tuple[int, int]
+    overrides: tuple[str, ...]
+
+
+def prepare(case: Case, device: torch.device, folder: str) -> tuple[Run, Batch]:
+    """Builds the run and one scene on the device."""
+    height, width = case.size
+    accelerator = "gpu" if device.type == "cuda" else "cpu"
+    scene = [f"data.image_size=[{height},{width}]", "data.eval_scenes=1", "data.train_scenes=1", "data.eval_target=1"]
+    scene += [f"data.eval_context={case.views}", f"data.num_frames={case.views + 6}"]
+    views = [f"data.min_views={case.views}", f"data.max_views={case.views}", f"data.max_images={case.views}"]
+    config = compose_run([f"trainer.accelerator={accelerator}", *scene, *views, *case.overrides], Path(folder))
+    run = build(config)
+    run.datamodule.setup("validate")
+    run.module.to(device)
+    return run, next(iter(run.datamodule.val_dataloader())).to(device)
+
+
+@torch.no_grad()
+def measure_inference(run: Run, batch: Batch, passes: int, device: torch.device) -> dict[str, Any]:
+    """Best seconds and largest peaks of every stage; the first pass warms up."""
+    model, clock = run.module.model.eval(), StageClock(device)
+    context = batch.context
+    for number in range(passes + 1):
+        if number == 1:
+            clock.stages.clear()
+        with clock.listening():
+            prediction = model(context.images, context.hints)
+        cameras = prediction.geometry.cameras.select(slice(0, 1))
+        with clock.stage("render"):
+            run.module.renderer(prediction.gaussians, cameras)
+    pixels = context.depth.numel()
+    voxels = None if prediction.voxels is None else len(prediction.voxels.grid)
+    return {
+        "seconds": {name: clock.stages[name].best for name in STAGES if name in clock.stages},
+        "peak_mb": {name: clock.stages[name].memory for name in STAGES if name in clock.stages},
+        "gaussians": len(prediction.gaussians),
+        "voxels_per_pixel": None if voxels is None else voxels / pixels,
+    }
+
+
+def measure_training(run: Run, batch: Batch, passes: int, device: torch.device) -> float:
+    """Best seconds of a training step without the optimiser: reconstruction, rendering, losses, backward pass."""
+    module, clock = run.module.train(), StageClock(device)
+    run.trainer.strategy.connect(module)
+    module.log = lambda *args, **kwargs: None  # type: ignore[method-assign]
+    for _ in range(passes + 1):
+        with clock.stage("training step"):
+            module.training_step(batch, 0).backward()
+        module.zero_grad(set_to_none=True)
+    return min(clock.stages["training step"].seconds[1:])
+
+
+def print_stages(console: Console, case: Case, result: dict[str, Any], on_gpu: bool) -> None:
+    """A row a stage, the paper's seconds beside."""
+    height, width = case.size
+    title = f"{case.views} views of {height}x{width}, {result['gaussians']:,} Gaussians"
+    if result["voxels_per_pixel"] is not None:
+        title += f", {result['voxels_per_pixel']:.2f} voxels a pixel"
+    table = Table(title=title)
+    headings = ["stage", "seconds", "share", *(["peak MB"] if on_gpu else []), "paper, s"]
+    for heading in headings:
+        table.add_column(heading, justify="left" if heading == "stage" else "right")
+    seconds, peaks = result["seconds"], result["peak_mb"]
+    paper = PAPER.get(case.size, {}) if case.views == 10 else {}
+    whole = sum(seconds[name] for name in RECONSTRUCTION if name in seconds)
+    backbone = seconds["encode"] + seconds["decode"]
+    rows = [(STAGES[name], seconds[name], peaks[name], paper.get(name)) for name in seconds]
+    rows += [
+        (
+            "fine voxels and Gaussian head",
+            seconds.get("fine", 0.0) + seconds["gaussians"],
+            0.0,
+            paper.get("fine + head"),
+        ),
+        ("backbone and first decode alone", backbone, 0.0, paper.get("DA3 alone")),
+        ("whole reconstruction", whole, max(peaks.values()), paper.get("whole")),
+    ]
+    for name, value, peak, theirs in rows:
+        memory = [f"{peak:.0f}" if peak else ""] if on_gpu else []
+        table.add_row(name, f"{value:.4f}", f"{value / whole:.0%}", *memory, f"{theirs:g}" if theirs else "")
+    console.print(table)
+
+
+def print_training(console: Console, step_seconds: float, where: str) -> None:
+    """Hours of a whole training of the paper's length on this machine, beside the paper's table."""
+    table = Table(title=f"training cost, this configuration: {PAPER_STEPS:,} steps of {step_seconds:.3f} s")
+    for heading in ("method", "device", "device hours", "hours on the paper's GPU"):
+        table.add_column(heading, justify="left" if heading in ("method", "device") else "right")
+    table.add_row("measured here", where, f"{step_seconds * PAPER_STEPS / 3600:,.1f}", "n/a")
+    for name, (gpu, hours, converted) in PAPER_TRAINING.items():
+        table.add_row(f"{name} (paper)", gpu, f"{hours:,.0f}", f"{converted:,.1f}")
+    console.print(table)
+
+
+def main() -> None:
+    """Measures, prints and writes."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--views", type=int, default=10)
+    parser.add_argument("--size", type=int, nargs=2, action="append", metavar=("H", "W"))
+    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    parser.add_argument("--passes", type=int, default=3)
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--training", action="store_true", help="measure a training step as well")
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
+    parser.add_argument("overrides", nargs="*", help="Hydra overrides")
+    arguments = parser.parse_args()
+    torch.set_num_threads(arguments.threads)
+    device, console = torch.device(arguments.device), Console(width=110)
+    where = machine(device)
+    console.print(json.dumps(where))
+    cases = []
+    for size in arguments.size or [[224, 448], [518, 518]]:
+        case = Case(arguments.views, (size[0], size[1]), tuple(arguments.overrides))
+        with tempfile.TemporaryDirectory() as folder:
+            run, batch = prepare(case, device, folder)
+            result = measure_inference(run, batch, arguments.passes, device)
+            print_stages(console, case, result, device.type == "cuda")
+            if arguments.training:
+                result["training_step"] = measure_training(run, batch.context, arguments.passes, device)
+                print_training(console, result["training_step"], str(where.get("gpu", where["processor"])))
+        cases.append({"views": case.views, "size": list(case.size), **result})
+    content = {
+        "machine": where,
+        "unit": "seconds" if device.type == "cuda" else "core-seconds",
+        "threads": arguments.threads,
+        "overrides": arguments.overrides,
+        "passes": arguments.passes,
+        "cases": cases,
+    }
+    stem = f"{date.today().isoformat()}-stages-{device.type}"
+    console.print(str(write_json(arguments.out / f"{stem}.json", content)))
+
+
+if __name__ == "__main__":
+    main()
