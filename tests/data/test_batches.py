@@ -51,6 +51,16 @@ def test_the_nearest_readable_frame_takes_the_place_of_a_damaged_one(write_recor
     assert all(other[views].frame_ids.tolist() == [[11, 10, 14, 15]] for other in others)
 
 
+@pytest.mark.parametrize("replace_damaged", [False, True])
+def test_a_frame_is_decoded_once_a_batch(write_recording, replace_damaged, monkeypatch):
+    dataset = _dataset(write_recording(frames=6), 0, replace_damaged=replace_damaged)
+    decoded = []
+    load = RGBDFolder.load
+    monkeypatch.setattr(RGBDFolder, "load", lambda self, scene, ids: decoded.extend(ids) or load(self, scene, ids))
+    assert dataset[(SceneViews("office", (12, 10), (15,)),)].num_context == 2
+    assert decoded == [12, 10, 15]
+
+
 def test_evaluation_never_replaces_frames(write_recording):
     folder = write_recording(frames=6)
     _truncate(folder, "images/00012.png")

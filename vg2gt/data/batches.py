@@ -37,8 +37,11 @@ class BatchDataset(Dataset[Batch]):
         self.damaged: set[tuple[str, int]] = set()
 
     def __getitem__(self, views: tuple[SceneViews, ...]) -> Batch:
-        ids = [self._readable(view) for view in views]
-        scenes = [self._load(view, frames) for view, frames in zip(views, ids, strict=True)]
+        loaded = [self._load(view) for view in views]
+        scenes = [
+            view.framing.apply(frames) if view.framing else frames
+            for view, (frames, _) in zip(views, loaded, strict=True)
+        ]
 
         def stack(name: str) -> torch.Tensor:
             return torch.stack([getattr(scene, name) for scene in scenes])
@@ -49,30 +52,26 @@ class BatchDataset(Dataset[Batch]):
             depth=depth,
             cameras=Cameras(stack("world_to_camera"), stack("intrinsics"), (depth.shape[-2], depth.shape[-1])),
             is_metric=torch.tensor([self.source.scene_is_metric(view.scene) for view in views]),
-            frame_ids=torch.tensor(ids, dtype=torch.int64),
+            frame_ids=torch.tensor([ids for _, ids in loaded], dtype=torch.int64),
             scene=tuple(view.scene for view in views),
             num_context=len(views[0].context),
         )
 
-    def _load(self, view: SceneViews, frame_ids: Sequence[int]) -> Frames:
-        frames = self.cache.load(view.scene, frame_ids)
-        return view.framing.apply(frames) if view.framing else frames
+    def _load(self, view: SceneViews) -> tuple[Frames, Sequence[int]]:
+        """The frames of a scene and their ids, those that cannot be read replaced.
 
-    def _readable(self, view: SceneViews) -> tuple[int, ...]:
-        """The frames of a scene, those that cannot be read replaced.
-
-        The result depends on the files alone, not on what was read before. The frames are in memory afterwards.
+        The result depends on the files alone, not on what was read before.
         """
         ids = (*view.context, *view.target)
         if not self.replace_damaged:
-            return ids
+            return self.cache.load(view.scene, ids), ids
         if self.damaged.isdisjoint((view.scene, frame) for frame in ids):
             try:
-                self.cache.load(view.scene, ids)
-                return ids
+                return self.cache.load(view.scene, ids), ids
             except DataError:
                 pass  # which frame it was is found out one by one
-        return self._replace(view.scene, ids)
+        ids = self._replace(view.scene, ids)
+        return self.cache.load(view.scene, ids), ids
 
     def _replace(self, scene: str, ids: Sequence[int]) -> tuple[int, ...]:
         frames = training_frames(self.source, scene)
