@@ -74,3 +74,8 @@ def test_the_documented_options_exist() -> None:
     mix = (ROOT / "configs" / "data" / "paper_mix.yaml").read_text()
     for option in set(re.findall(r"(?<!vg2gt\.)data\.([a-z_]+)[=`]", TEXT)) - {"root", "holdout"}:
         assert re.search(rf"^{option}:", shared + mix, re.MULTILINE), option
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "configs" / "data").glob("*.yaml")), ids=lambda path: path.stem)
+def test_every_dataset_has_the_shared_options(path: Path) -> None:
+    assert "  - shared@_here_: reading\n" in path.read_text()
