@@ -8,11 +8,14 @@ from vg2gt.geometry.cameras import project, unproject
 from vg2gt.types import Cameras
 
 WINDOW = 9
+CONTRAST = 0.01
+"""Standard deviation of grey below which noise decides, as in front of a black background."""
 
 
-def median_best_ncc(frames: Frames, near: float, far: float, planes: int = 64, window: int = WINDOW) -> float:
-    """Median over pixels of the first frame of the best normalised cross-correlation with the second."""
+def median_best_ncc(frames: Frames, near: float, far: float, planes: int = 64) -> float:
+    """Median over the textured windows of the first frame of the best normalised cross-correlation with the second."""
     gray = frames.images.mean(1)
+    textured = (_mean(gray[0] ** 2) - _mean(gray[0]) ** 2) > CONTRAST**2
     height, width = gray.shape[-2:]
     first, second = (
         Cameras(frames.world_to_camera[None, i : i + 1], frames.intrinsics[None, i : i + 1], (height, width))
@@ -24,17 +27,17 @@ def median_best_ncc(frames: Frames, near: float, far: float, planes: int = 64, w
         grid = (pixels[0] + 0.5) * (2 / torch.tensor([width, height])) - 1
         warped = grid_sample(gray[1][None, None], grid, padding_mode="border", align_corners=False)[0, 0]
         inside = (grid[0].abs() < 1).all(-1) & (z[0, 0] > 0)
-        score = torch.where(_mean(inside.float(), window) > 0.999, _ncc(gray[0], warped, window), -1.0)
+        score = torch.where(_mean(inside.float()) > 0.999, _ncc(gray[0], warped), -1.0)
         best = torch.maximum(best, score)
-    return float(best[best > -1].median())
+    return float(best[textured & (best > -1)].median())
 
 
-def _ncc(a: torch.Tensor, b: torch.Tensor, window: int) -> torch.Tensor:
-    mean_a, mean_b = _mean(a, window), _mean(b, window)
-    covariance = _mean(a * b, window) - mean_a * mean_b
-    variances = (_mean(a * a, window) - mean_a**2) * (_mean(b * b, window) - mean_b**2)
+def _ncc(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    mean_a, mean_b = _mean(a), _mean(b)
+    covariance = _mean(a * b) - mean_a * mean_b
+    variances = (_mean(a * a) - mean_a**2) * (_mean(b * b) - mean_b**2)
     return covariance / variances.clamp(min=1e-10).sqrt()
 
 
-def _mean(image: torch.Tensor, window: int) -> torch.Tensor:
-    return avg_pool2d(image[None, None], window, 1, window // 2, count_include_pad=False)[0, 0]
+def _mean(image: torch.Tensor) -> torch.Tensor:
+    return avg_pool2d(image[None, None], WINDOW, 1, WINDOW // 2, count_include_pad=False)[0, 0]

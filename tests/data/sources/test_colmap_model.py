@@ -74,7 +74,7 @@ def test_absent_images_are_counted_and_keep_the_numbers(tmp_path):
     write(tmp_path, room(4))
     (tmp_path / "statue" / "images" / "left" / "009.png").unlink()
     source = COLMAP(str(tmp_path / "statue"))
-    assert source.frames("statue") == (0, 2, 3)
+    assert tuple(source.frames("statue")) == (0, 2, 3)
     assert source.scene_index("statue").dropped == {"without a colour image": 1}
 
 
@@ -106,7 +106,7 @@ def test_points_need_three_views_and_the_nearest_wins(tmp_path):
     points = replace(model.points, tracks=model.points.tracks[kept], track_lengths=lengths)
     write_colmap(folder, replace(model, points=points))
     source = COLMAP(str(tmp_path), depth="points")
-    assert source.frames("statue") == (1, 2)
+    assert tuple(source.frames("statue")) == (1, 2)
     assert source.scene_index("statue").dropped == {"without a depth file": 1}
     with pytest.raises(ValueError, match="depth must be points"):
         COLMAP(str(tmp_path), depth="dense")

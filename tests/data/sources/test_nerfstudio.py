@@ -62,9 +62,9 @@ def test_numbers_follow_names_and_absent_files_are_counted(tmp_path):
     (tmp_path / "desk" / "images" / "0001.png").unlink()
     _edit(tmp_path, lambda content: content["frames"][0].pop("depth_file_path"))  # the file lists frame 3 first
     source = Nerfstudio(str(tmp_path / "desk"))
-    assert source.frames("desk") == (0, 2, 3)
+    assert tuple(source.frames("desk")) == (0, 2, 3)
     deep = Nerfstudio(str(tmp_path / "desk"), depth=True)
-    assert deep.frames("desk") == (0, 2)
+    assert tuple(deep.frames("desk")) == (0, 2)
     assert deep.scene_index("desk").dropped == {"without a colour image": 1, "without a depth file": 1}
 
 

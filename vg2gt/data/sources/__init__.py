@@ -1,6 +1,7 @@
 """Datasets on disk, one file a layout; all are a ``FileSource``."""
 
 from vg2gt.data.sources.colmap_model import COLMAP
+from vg2gt.data.sources.dtu import DTU, DTUTraining
 from vg2gt.data.sources.image_folder import ImageFolder
 from vg2gt.data.sources.infinigen import Infinigen
 from vg2gt.data.sources.kitti import KITTI
@@ -9,13 +10,16 @@ from vg2gt.data.sources.replica import Replica
 from vg2gt.data.sources.scannet import ScanNet
 from vg2gt.data.sources.scannet_sens import ScanNetSens
 from vg2gt.data.sources.scannetpp import ScanNetPPiPhone
+from vg2gt.data.sources.tanks_and_temples import TanksAndTemples
 from vg2gt.data.sources.tum import TUM
 from vg2gt.data.sources.virtual_kitti import VirtualKITTI2
 
 __all__ = [
     "COLMAP",
+    "DTU",
     "KITTI",
     "TUM",
+    "DTUTraining",
     "ImageFolder",
     "Infinigen",
     "Nerfstudio",
@@ -23,5 +27,6 @@ __all__ = [
     "ScanNet",
     "ScanNetPPiPhone",
     "ScanNetSens",
+    "TanksAndTemples",
     "VirtualKITTI2",
 ]

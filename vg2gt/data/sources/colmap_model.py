@@ -20,6 +20,7 @@ from vg2gt.io import ColmapImage, ColmapModel, colmap_intrinsics, colmap_pose, r
 
 _MODELS = ("sparse/0", "sparse")
 _FILES = ("cameras.bin", "cameras.txt")
+_SCENES_IN_MEMORY = 16
 MIN_TRACK = 3
 """Views that must see a point before its depth counts: two are not enough to notice a wrong match."""
 
@@ -70,7 +71,7 @@ class COLMAP(FileSource):
 
     def find(self, root: Path) -> Mapping[str, Path]:
         """The folder itself, or scenes one or two levels below it."""
-        return scene_folders(root, lambda folder: _model_folder(folder) is not None, by_path=True)
+        return scene_folders(root, lambda folder: model_folder_of(folder) is not None, by_path=True)
 
     def options(self) -> Mapping[str, object]:
         """The image folder, and whether frames need points."""
@@ -78,13 +79,13 @@ class COLMAP(FileSource):
 
     def state(self, scene: str, folder: Path) -> str:
         """Also that of the model's folder."""
-        model = _model_folder(folder)
+        model = model_folder_of(folder)
         return " ".join(folder_state(place) for place in (folder, *([model] if model else [])))
 
     def index(self, scene: str, folder: Path) -> SceneIndex:
         """Reads the model and the sizes of its images."""
         model, model_folder = self._read_model(scene, folder)
-        _refuse_distorted(model, f"{model_folder} (scene {scene})")
+        refuse_distorted(model, f"{model_folder} (scene {scene})")
         records = _in_order(model)
         named = {i: folder / self.images / record.name for i, record in enumerate(records)}
         with errors_name(scene):
@@ -103,7 +104,7 @@ class COLMAP(FileSource):
             color=color,
             depth=depth,
             camera_to_world={i: _camera_to_world(record) for i, record in enumerate(records)},
-            intrinsics={i: _resized_intrinsics(model, records[i], sizes[i], path) for i, path in color.items()},
+            intrinsics={i: image_intrinsics(model, records[i], sizes[i], path) for i, path in color.items()},
             size=size,
             color_size=size if len(set(sizes.values())) == 1 else None,
         )
@@ -119,11 +120,13 @@ class COLMAP(FileSource):
 
     def _scene_points(self, scene: str, folder: Path) -> _Points:
         if scene not in self._points:
+            if len(self._points) >= _SCENES_IN_MEMORY:
+                self._points.clear()
             self._points[scene] = _Points(self._read_model(scene, folder)[0])
         return self._points[scene]
 
     def _read_model(self, scene: str, folder: Path) -> tuple[ColmapModel, Path]:
-        model_folder = _model_folder(folder)
+        model_folder = model_folder_of(folder)
         if model_folder is None:
             raise DataError(f"scene {scene} has no COLMAP model in {folder}: expected {' or '.join(_MODELS)}")
         with errors_name(scene):
@@ -158,7 +161,8 @@ class _Points:
         return self._views[frame][1]
 
 
-def _model_folder(folder: Path) -> Path | None:
+def model_folder_of(folder: Path) -> Path | None:
+    """The folder of a scene's model, if it has one."""
     inside = [folder / name for name in _MODELS]
     return next((place for place in inside if any((place / name).is_file() for name in _FILES)), None)
 
@@ -167,7 +171,12 @@ def _in_order(model: ColmapModel) -> list[ColmapImage]:
     return sorted(model.images.values(), key=lambda image: image.name)
 
 
-def _refuse_distorted(model: ColmapModel, where: str) -> None:
+def refuse_distorted(model: ColmapModel, where: str) -> None:
+    """Refuses a model of distorted images.
+
+    Raises:
+        DataError: naming the camera models found, and the command that undistorts.
+    """
     distorted = sorted({camera.model for camera in model.cameras.values() if not camera.is_pinhole})
     if distorted:
         raise DataError(
@@ -181,8 +190,18 @@ def _camera_to_world(record: ColmapImage) -> NDArray[np.float64]:
     return inverse(pose) if np.isfinite(pose).all() else pose
 
 
-def _resized_intrinsics(model: ColmapModel, record: ColmapImage, size: Size, path: Path) -> NDArray[np.float64]:
-    """Intrinsics of an image as it is on disk."""
+def image_intrinsics(model: ColmapModel, record: ColmapImage, size: Size, path: Path) -> NDArray[np.float64]:
+    """Intrinsics ``[3, 3]`` of an image as it is on disk, which may be a reduced one.
+
+    Args:
+        model: the model.
+        record: the image's record in it.
+        size: the image's ``(height, width)`` on disk.
+        path: the image, for the message.
+
+    Raises:
+        DataError: if the image has another shape than its camera.
+    """
     camera = model.cameras[record.camera_id]
     scale = (size[1] / camera.width, size[0] / camera.height)
     # Sizes are whole pixels, so that both directions of a reduced image may be off by one.

@@ -18,6 +18,7 @@ from vg2gt.data.sources.undistortion import Undistortion
 from vg2gt.io import Lens, TransformsFrame, read_transforms
 
 _FILE = "transforms.json"
+_SCENES_IN_MEMORY = 64
 _MODELS = (None, "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE")
 
 
@@ -108,6 +109,8 @@ class Nerfstudio(FileSource):
 
     def _records(self, scene: str, folder: Path) -> list[TransformsFrame]:
         if scene not in self._frames:
+            if len(self._frames) >= _SCENES_IN_MEMORY:
+                self._frames.clear()
             with errors_name(scene):
                 frames = read_transforms(folder / _FILE).frames
             self._frames[scene] = sorted(frames, key=lambda frame: frame.file_path)

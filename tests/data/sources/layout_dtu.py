@@ -1,0 +1,80 @@
+"""DTU as MVSNet trains and tests on it."""
+
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from vg2gt.data import Frames
+from vg2gt.data.sources import DTU, DTUTraining
+
+from .layouts import SIZE, Layout, pixels
+
+CROP = (4, 7)
+"""Rows and columns of the halved recorded image that are cut away above and to the left; 44 and 80 in DTU."""
+
+
+def pfm(depth: np.ndarray) -> bytes:
+    """A little-endian portable float map."""
+    height, width = depth.shape
+    return f"Pf\n{width} {height}\n-1.0\n".encode() + depth[::-1].astype("<f4").tobytes()
+
+
+def camera(world_to_camera: np.ndarray, intrinsics: np.ndarray) -> str:
+    """A camera file; the translation is given in metres and written in millimetres."""
+    pose = np.array(world_to_camera, np.float64)
+    pose[:3, 3] *= 1000
+    rows = [" ".join(repr(float(value)) for value in row) for row in (*pose, *intrinsics)]
+    return "extrinsic\n" + "\n".join(rows[:4]) + "\n\nintrinsic\n" + "\n".join(rows[4:]) + "\n\n425.0 2.5\n"
+
+
+def write_depth(folder: Path, frames: Frames, crop: tuple[int, int] | None = None) -> None:
+    """``depth_map`` and ``depth_visual``; with crop: of twice the size, around the images. Masked depth is nonsense."""
+    folder.mkdir(parents=True)
+    for i, depth in enumerate(frames.depth.numpy() * 1000):
+        if crop:
+            depth = np.pad(depth, ((crop[0],) * 2, (crop[1],) * 2), constant_values=700).repeat(2, 0).repeat(2, 1)
+        (folder / f"depth_map_{i:04d}.pfm").write_bytes(pfm(np.where(depth > 0, depth, 777)))
+        Image.fromarray(np.where(depth > 0, 255, 10).astype(np.uint8)).save(folder / f"depth_visual_{i:04d}.png")
+
+
+def write_training(root: Path, frames: Frames) -> None:
+    """Scan 1 in light 3, with cameras of a quarter of the size and depth of the recorded size."""
+    (root / "Rectified" / "scan1_train").mkdir(parents=True)
+    (root / "Cameras" / "train").mkdir(parents=True)
+    for i, image in enumerate(pixels(frames)):
+        Image.fromarray(image).save(root / "Rectified" / "scan1_train" / f"rect_{i + 1:03d}_3_r5000.png")
+        intrinsics = frames.intrinsics[i].double().numpy().copy()
+        intrinsics[:2, 2] += 0.25
+        intrinsics[:2] /= 4
+        text = camera(frames.world_to_camera[i].double().numpy(), intrinsics)
+        (root / "Cameras" / "train" / f"{i:08d}_cam.txt").write_text(text)
+    write_depth(root / "Depths_raw" / "scan1", frames, CROP)
+
+
+def write_test(root: Path, frames: Frames) -> None:
+    """Scan 65 with JPEG images, and depth beside the scans."""
+    for name in ("images", "cams"):
+        (root / "scans" / "scan65" / name).mkdir(parents=True)
+    for i, image in enumerate(pixels(frames)):
+        path = root / "scans" / "scan65" / "images" / f"{i:08d}.jpg"
+        Image.fromarray(image).save(path, quality=95, subsampling=0)
+        text = camera(frames.world_to_camera[i].double().numpy(), frames.intrinsics[i].double().numpy())
+        (root / "scans" / "scan65" / "cams" / f"{i:08d}_cam.txt").write_text(text)
+    (root / "scans" / "scan65" / "pair.txt").write_text("1\n0\n1 1 1.0\n")
+    write_depth(root / "depth" / "scan65", frames)
+
+
+def _read_test(root: Path) -> DTU:
+    return DTU(str(root / "scans"), depth="pfm", depth_root=str(root / "depth"))
+
+
+assert SIZE[0] % 4 != 0, "a quarter of the size must not be mistaken for another"
+
+# Depth is stored in float32 millimetres.
+LAYOUTS = {
+    "dtu_training": Layout(
+        write_training, lambda root: DTUTraining(str(root)), depth_quantum=lambda depth: depth * 1e-6
+    ),
+    "dtu": Layout(write_test, _read_test, image_error=0.012, depth_quantum=lambda depth: depth * 1e-6),
+}

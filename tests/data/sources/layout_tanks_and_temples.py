@@ -1,0 +1,45 @@
+"""Tanks and Temples, without its scan, whose depth is tested by itself (``test_scan_depth.py``)."""
+
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from vg2gt.data import Frames
+from vg2gt.data.sources import TanksAndTemples
+from vg2gt.io import ColmapModel, ColmapPoints, colmap_camera, colmap_image, write_colmap
+
+from .layouts import SIZE, Layout, camera_to_world, pixels
+
+# From the unit and axes of structure from motion to metres in the scan: scale 2.5, half a turn about an axis, a shift.
+TO_SCAN = np.array([[0, 2.5, 0, 1.0], [2.5, 0, 0, -4], [0, 0, -2.5, 2], [0, 0, 0, 1]])
+
+
+def write(root: Path, frames: Frames) -> None:
+    """Images 1, 2, ... of which the last is not registered; intrinsics from a COLMAP model in another world."""
+    folder = root / "Barn"
+    folder.mkdir(parents=True)
+    from_scan = np.linalg.inv(TO_SCAN)
+    poses = from_scan @ camera_to_world(frames)
+    poses[:, :3, :3] *= 2.5
+    blocks = []
+    for i, image in enumerate((*pixels(frames), pixels(frames)[0])):
+        Image.fromarray(image).save(folder / f"{i + 1:06d}.png")
+        registered = i < len(poses)
+        pose = poses[i] if registered else np.eye(4)
+        rows = [" ".join(repr(float(value)) for value in row) for row in pose]
+        blocks.append("\n".join([f"{i} {i if registered else -1} 0", *rows]))
+    (folder / "Barn_COLMAP_SfM.log").write_text("\n".join(blocks) + "\n")
+    np.savetxt(folder / "Barn_trans.txt", TO_SCAN)
+    intrinsics = frames.intrinsics.double().numpy()
+    images = {i + 1: colmap_image(i + 1, np.eye(4), i + 1, f"{i + 1:06d}.png") for i in range(len(poses))}
+    cameras = {i + 1: colmap_camera(i + 1, matrix, SIZE) for i, matrix in enumerate(intrinsics)}
+    write_colmap(folder / "sparse", ColmapModel(cameras, images, ColmapPoints.empty()))
+
+
+def read(root: Path, depth: str | None = None) -> TanksAndTemples:
+    """The loader."""
+    return TanksAndTemples(str(root), depth=depth)
+
+
+LAYOUTS = {"tanks_and_temples": Layout(write, read, depth_quantum=None, frame_ids=tuple(range(1, 7)))}

@@ -1,0 +1,192 @@
+"""Depth from a laser scan: against analytic surfaces, what is hidden, the cache, damaged scans."""
+
+import os
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+
+from vg2gt.data import DataError, Frames, SyntheticRooms
+from vg2gt.data.sources import DTU, TanksAndTemples
+from vg2gt.data.sources.scan_depth import ScanDepth, read_points, render_points
+from vg2gt.geometry.cameras import unproject
+from vg2gt.io.ply_container import vertices_content
+from vg2gt.types import Cameras
+
+from .layout_dtu import write_test
+from .layout_tanks_and_temples import write as write_tanks
+from .layouts import room
+
+K = np.array([[100.0, 0, 49.5], [0, 100.0, 39.5], [0, 0, 1]])
+VIEW = (80, 100)
+
+
+def _grid(step: float, width: float, height: float) -> np.ndarray:
+    x, y = np.meshgrid(np.arange(-width / 2, width / 2, step), np.arange(-height / 2, height / 2, step))
+    return np.stack((x.ravel(), y.ravel()), -1)
+
+
+def _wall(step: float, width: float, height: float, z: float) -> np.ndarray:
+    plane = _grid(step, width, height)
+    return np.concatenate((plane, np.full((len(plane), 1), z)), 1).astype(np.float32)
+
+
+def _pose() -> np.ndarray:
+    """A camera turned by 20 degrees about y, away from the origin."""
+    angle = np.deg2rad(20)
+    pose = np.eye(4)
+    pose[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+    pose[:3, 3] = [0.3, -0.2, 0.5]
+    return pose
+
+
+def _ply(points: np.ndarray) -> bytes:
+    table = np.zeros(len(points), [(axis, "<f4") for axis in "xyz"])
+    for i, axis in enumerate("xyz"):
+        table[axis] = points[:, i]
+    return vertices_content(table)
+
+
+def test_a_slanted_wall_within_the_sampling():
+    """Rays against the plane z = 3 in the world, by a turned camera: every pixel, half a pixel's slope exact."""
+    depth = render_points(_wall(0.01, 16, 10, 3.0), _pose(), K, VIEW, window=3)
+    x, y = np.meshgrid(np.arange(VIEW[1]), np.arange(VIEW[0]))
+    rays = np.stack(((x - 49.5) / 100, (y - 39.5) / 100, np.ones_like(x)), -1)
+    to_world = np.linalg.inv(_pose())
+    expected = (3 - to_world[2, 3]) / (rays @ to_world[2, :3])
+    assert (depth > 0).all()
+    slope = np.maximum(*np.abs(np.gradient(expected)))
+    assert (np.abs(depth - expected) <= 0.51 * slope + 1e-5).all()
+
+
+def test_what_is_behind_a_sparse_surface_is_hidden():
+    """A front wall with a point at every third pixel: what shines through goes, what is beside it stays."""
+    front, back = _wall(0.06, 1.2, 1.0, 2.0), _wall(0.02, 8, 8, 4.0)
+    depth = render_points(np.concatenate((back, front)), np.eye(4), K, VIEW)
+    rows, columns = slice(20, 60), slice(25, 75)  # well inside the front wall's image
+    inside = depth[rows, columns]
+    assert set(np.unique(inside)) == {0.0, 2.0}
+    assert 0.08 < (inside == 2).mean() < 0.15
+    assert (depth[:, :12] == 4).all()
+    shining = render_points(np.concatenate((back, front)), np.eye(4), K, VIEW, window=1)[rows, columns]
+    assert (shining == 4).mean() > 0.5  # without the window, the wall would be full of holes
+
+
+def test_points_behind_and_beside_the_camera_do_not_count():
+    points = np.array([[0, 0, -1], [50, 0, 1], [0, 0, 0], [0, 0, 2]], np.float32)
+    depth = render_points(points, np.eye(4), K, VIEW)
+    assert (depth > 0).sum() == 1
+    assert depth[40, 50] == 2  # the principal point (49.5, 39.5) is the corner of four pixels
+
+
+def test_a_furnished_room_agrees_with_its_ray_caster():
+    """The procedural room's depth in one view against its points from all views."""
+    size = (120, 160)
+    source = SyntheticRooms(1, num_frames=4, size=size)
+    frames = source.load(source.scenes[0], range(4))
+    points = _points(frames)
+    pose, intrinsics = frames.world_to_camera[2].double().numpy(), frames.intrinsics[2].double().numpy()
+    depth = torch.from_numpy(render_points(points, pose, intrinsics, size, window=3))
+    seen = depth > 0
+    error = (depth / frames.depth[2] - 1).abs()[seen]
+    assert float(seen.float().mean()) > 0.8
+    assert float(error.median()) < 0.005
+    # Of the farther of two surfaces that meet in a pixel, nothing is left.
+    assert float((depth / frames.depth[2])[seen].quantile(0.999)) < 1.02
+
+
+def test_images_are_kept_and_made_again_when_the_scan_changes(tmp_path):
+    scan, points = tmp_path / "scan.ply", _wall(0.02, 4, 4, 2.0)
+    scan.write_bytes(_ply(points))
+    cache = tmp_path / "cache"
+
+    def read(**options) -> np.ndarray:
+        return ScanDepth(cache, **options).read(scan, "barn", np.eye(4), K, VIEW)
+
+    first = read()
+    (file,) = (cache / "scan-depth").iterdir()
+    written = file.stat().st_mtime_ns
+    assert np.array_equal(read(), first)
+    assert file.stat().st_mtime_ns == written
+    read(occlusion=1.5)
+    assert len(list((cache / "scan-depth").iterdir())) == 2
+    file.write_bytes(b"damaged")
+    assert np.array_equal(read(), first)
+    assert file.stat().st_size > 100
+    scan.write_bytes(_ply(points * 2))
+    os.utime(scan, ns=(1, 1))
+    assert read()[40, 50] == 4
+    assert ScanDepth().read(scan, "barn", np.eye(4), K, VIEW, unit=0.5)[40, 50] == 2
+
+
+@pytest.mark.parametrize("options", [{"occlusion": 0.9}, {"window": 4}, {"window": 0}])
+def test_senseless_options_are_refused(options):
+    with pytest.raises(ValueError, match="must be"):
+        ScanDepth(**options)
+
+
+def test_damaged_scans_are_named(tmp_path):
+    scan = tmp_path / "scan.ply"
+    with pytest.raises(DataError, match=r"scene barn.*scan\.ply"):
+        read_points(scan, "barn")
+    whole = _ply(_wall(0.5, 4, 4, 2.0))
+    rng = np.random.default_rng(0)
+    messages = []
+    for _ in range(300):
+        content = bytearray(whole)
+        if rng.random() < 0.3:
+            content = content[: rng.integers(len(content))]
+        for place in rng.integers(0, max(1, min(len(content), 200 if rng.random() < 0.7 else 10**6)), 3):
+            content[place : place + 1] = bytes([rng.integers(256)])
+        scan.write_bytes(content)
+        try:
+            points = read_points(scan, "barn")
+        except DataError as error:
+            messages.append(str(error))
+        else:
+            assert np.isfinite(points).all()
+    assert 100 < len(messages) < 300
+    assert all("barn" in message for message in messages)
+    scan.write_bytes(_ply(np.full((4, 3), np.nan)))
+    with pytest.raises(DataError, match="has no points"):
+        read_points(scan, "barn")
+
+
+def _points(frames: Frames) -> np.ndarray:
+    """World points of all pixels of all frames."""
+    _, height, width = frames.depth.shape
+    cameras = Cameras(frames.world_to_camera[None], frames.intrinsics[None], (height, width))
+    return unproject(frames.depth[None], cameras)[0][frames.depth > 0].numpy()
+
+
+@pytest.mark.parametrize("name", ["tanks", "dtu"])
+def test_loaders_read_the_scan(name, tmp_path):
+    """Metres in both: Tanks and Temples in the scan's frame, DTU from millimetres."""
+    frames = room()
+    cache = str(tmp_path / "cache")
+    if name == "tanks":
+        write_tanks(tmp_path, frames)
+        (tmp_path / "Barn" / "Barn.ply").write_bytes(_ply(_points(frames)))
+        make = partial(TanksAndTemples, str(tmp_path), depth_cache=cache)
+    else:
+        write_test(tmp_path, frames)
+        (tmp_path / "stl").mkdir()
+        (tmp_path / "stl" / "stl065_total.ply").write_bytes(_ply(_points(frames) * 1000))
+        options = {"depth": "scan", "depth_root": str(tmp_path / "stl"), "depth_cache": cache}
+        make = partial(DTU, str(tmp_path / "scans"), **options)
+    source = make()
+    (scene,) = source.scenes
+    ids = list(source.frames(scene))
+    loaded = source.load(scene, ids)
+    assert source.has_depth
+    assert source.is_metric
+    seen = loaded.depth > 0
+    assert float(seen.float().mean()) > 0.05  # few: in so small images a window spans half the room
+    error = (loaded.depth / frames.depth - 1).abs()[seen]
+    assert float(error.median()) < 0.01
+    assert len(list((tmp_path / "cache" / "scan-depth").iterdir())) == len(ids)
+    for path in tmp_path.rglob("*.ply"):
+        path.unlink()
+    with pytest.raises(DataError, match=r"has no (scan|depth)"):
+        make().frames(scene)

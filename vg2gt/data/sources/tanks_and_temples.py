@@ -1,0 +1,191 @@
+"""Tanks and Temples: images with the benchmark's reference poses, and depth from its laser scans."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vg2gt.data.base import DataError
+from vg2gt.data.image_files import image_size
+from vg2gt.data.sources.colmap_model import image_intrinsics, model_folder_of, refuse_distorted
+from vg2gt.data.sources.files import FileSource
+from vg2gt.data.sources.index import SceneIndex, Size, folder_state, make_index
+from vg2gt.data.sources.parsing import errors_name, numbered, pinhole, read_matrix, read_text_lines
+from vg2gt.data.sources.scan_depth import VERSION, ScanDepth
+from vg2gt.data.sources.scene_folders import scene_folders
+from vg2gt.io import read_colmap
+
+_LOG = "_COLMAP_SfM.log"
+
+
+class TanksAndTemples(FileSource):
+    """Scenes ``S`` with ``S_COLMAP_SfM.log``, ``S_trans.txt``, ``S.ply`` and images in ``images/`` or beside them.
+
+    The log has a camera-to-world pose for each image in the order of the images' names, in the arbitrary unit of
+    structure from motion; ``S_trans.txt`` takes that world to the scan's, which is in metres. Images that the log marks
+    as not registered (a second number of -1) are left out and counted. The crop volume ``S.json`` is not needed.
+
+    The benchmark gives no calibration. Intrinsics are those of an undistorted COLMAP model of the same images in
+    ``sparse/0`` or ``sparse`` (its poses are not used), or ``intrinsics``. The focal length of 0.7 times the image
+    width that the benchmark recommends is a first guess, to be refined: refined ones are near 0.6.
+
+    Args:
+        root: a scene, a folder of scenes, or a list.
+        intrinsics: (fx, fy, cx, cy) in pixels of the images, integer pixel centres; null: those of the COLMAP model.
+        depth: ``scan``: rendered from ``S.ply`` and kept in ``depth_cache``; null: none.
+        depth_cache: see ``ScanDepth``.
+        scenes: names of scenes, or a text file of them; None: all.
+        holdout: hold out every this many-th frame as an evaluation target; None: none.
+        every: use every this many-th frame only.
+        index_cache: see ``FileSource``.
+
+    Raises:
+        FileNotFoundError: if a root does not exist.
+        DataError: if there is no scene.
+    """
+
+    layout = f"scenes S with S{_LOG}, S_trans.txt and images, there or one folder deeper"
+
+    def __init__(
+        self,
+        root: str | Sequence[str] | None,
+        intrinsics: Sequence[float] | None = None,
+        depth: str | None = "scan",
+        depth_cache: str | None = None,
+        scenes: Sequence[str] | str | None = None,
+        holdout: int | None = None,
+        every: int = 1,
+        index_cache: str | None = None,
+    ) -> None:
+        if depth not in (None, "scan"):
+            raise ValueError(f"depth must be scan or null (none), got {depth!r}")
+        if intrinsics is not None and len(intrinsics) != 4:
+            raise ValueError(f"intrinsics must be [fx, fy, cx, cy], got {list(intrinsics)}")
+        self.intrinsics = tuple(float(value) for value in intrinsics) if intrinsics else None
+        self.has_depth = depth is not None
+        self._scan_depth = ScanDepth(Path(depth_cache).expanduser() if depth_cache else None)
+        super().__init__(root, scenes, holdout, every, index_cache)
+
+    def find(self, root: Path) -> Mapping[str, Path]:
+        """The folder itself, or scenes one level below it."""
+        return scene_folders(root, lambda folder: _log_file(folder) is not None, levels=1)
+
+    def options(self) -> Mapping[str, object]:
+        """The intrinsics that replace the model's, and whether there must be a scan."""
+        return {"intrinsics": self.intrinsics, "depth": self.has_depth}
+
+    def state(self, scene: str, folder: Path) -> str:
+        """Also that of the COLMAP model."""
+        model = model_folder_of(folder)
+        return " ".join([f"scan depth {VERSION}", *(folder_state(place) for place in (folder, model) if place)])
+
+    def index(self, scene: str, folder: Path) -> SceneIndex:
+        """Reads log, transform and intrinsics."""
+        log_file = _log_file(folder)
+        if log_file is None:
+            raise DataError(f"scene {scene} has no file *{_LOG} in {folder}")
+        name = log_file.name[: -len(_LOG)]
+        color = numbered(folder / "images" if (folder / "images").is_dir() else folder, scene)
+        if not color:
+            raise DataError(f"scene {scene} has no images in {folder / 'images'} or {folder}")
+        poses = read_log(log_file, scene)
+        if len(poses) != len(color):
+            raise DataError(
+                f"{log_file} of scene {scene} has {len(poses)} poses for {len(color)} images; they belong together by "
+                "their order, so that all images of the benchmark must be there"
+            )
+        to_scan = _read_similarity(folder / f"{name}_trans.txt", scene)
+        size = image_size(next(iter(color.values())), scene)
+        scan = folder / f"{name}.ply"
+        if self.has_depth and not scan.is_file():
+            raise DataError(f"scene {scene} has no scan {scan}: add it, or set data.depth=null")
+        registered = {i: pose for i, pose in zip(color, poses, strict=True) if pose is not None}
+        intrinsics = self._intrinsics(scene, folder, color, size)
+        return make_index(
+            name=scene,
+            folder=folder,
+            color=color,
+            depth=dict.fromkeys(color, scan) if self.has_depth else None,
+            camera_to_world={i: moved(to_scan, pose) for i, pose in registered.items() if i in intrinsics},
+            intrinsics=intrinsics,
+            size=size,
+            color_size=size,
+        )
+
+    def read_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
+        """Renders the scan."""
+        pose, matrix = index.world_to_camera[row], index.intrinsics[row]
+        return self._scan_depth.read(index.depth[row], index.name, pose, matrix, size)
+
+    def _intrinsics(
+        self, scene: str, folder: Path, color: Mapping[int, Path], size: Size
+    ) -> dict[int, NDArray[np.float64]]:
+        if self.intrinsics is not None:
+            return dict.fromkeys(color, pinhole(*self.intrinsics))
+        model_folder = model_folder_of(folder)
+        if model_folder is None:
+            raise DataError(
+                f"scene {scene} in {folder} has no intrinsics: add an undistorted COLMAP model of the images as "
+                "sparse/, or set data.intrinsics=[fx,fy,cx,cy]"
+            )
+        with errors_name(scene):
+            model = read_colmap(model_folder)
+        refuse_distorted(model, f"{model_folder} (scene {scene})")
+        records = {Path(image.name).name: image for image in model.images.values()}
+        # The benchmark's images that the model lacks were not registered, and have no use.
+        known = {number: (path, records[path.name]) for number, path in color.items() if path.name in records}
+        return {number: image_intrinsics(model, record, size, path) for number, (path, record) in known.items()}
+
+
+def read_log(path: Path, scene: str) -> list[NDArray[np.float64] | None]:
+    """Reads a trajectory: for each image a line of three whole numbers and a 4x4 camera-to-world matrix.
+
+    Returns:
+        The matrices in the order of the file; None for images that were not registered (second number -1).
+
+    Raises:
+        DataError: if the file is missing, truncated or damaged.
+    """
+    rows = [line.split() for line in read_text_lines(path, scene)]
+    if not rows or len(rows) % 5:
+        raise DataError(f"{path} of scene {scene} has {len(rows)} lines; expected five for each image")
+    poses: list[NDArray[np.float64] | None] = []
+    for start in range(0, len(rows), 5):
+        header, matrix = rows[start], rows[start + 1 : start + 5]
+        try:
+            numbers = [int(word) for word in header]
+            values = np.array([[float(word) for word in row] for row in matrix])
+        except ValueError as error:
+            raise DataError(f"{path} of scene {scene}, image {start // 5}: {error}") from error
+        if len(numbers) != 3 or values.shape != (4, 4):
+            raise DataError(f"{path} of scene {scene}, image {start // 5}: expected 3 numbers and a 4x4 matrix")
+        poses.append(None if numbers[1] < 0 else values)
+    return poses
+
+
+def moved(similarity: NDArray[np.float64], pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A camera-to-world pose in a world moved by a 4x4 similarity; its rotation stays one, the scale moves it only."""
+    if not np.isfinite(pose).all():
+        return np.full((4, 4), np.nan)
+    scale = np.cbrt(np.linalg.det(similarity[:3, :3]))
+    out = similarity @ pose
+    out[:3, :3] /= scale
+    return out
+
+
+def _read_similarity(path: Path, scene: str) -> NDArray[np.float64]:
+    matrix = read_matrix(path, scene, ((4, 4),))
+    linear = matrix[:3, :3]
+    with np.errstate(all="ignore"):
+        scale = np.cbrt(np.linalg.det(linear)) if np.isfinite(matrix).all() else np.nan
+        error = np.abs(linear @ linear.T / scale**2 - np.eye(3)).max()
+    if not (1e-6 < scale < 1e6 and error < 0.02 and np.abs(matrix[3] - [0, 0, 0, 1]).max() < 1e-6):
+        raise DataError(f"{path} of scene {scene} is not a rotation, a scale and a translation: {matrix.tolist()}")
+    return matrix
+
+
+def _log_file(folder: Path) -> Path | None:
+    return next(iter(sorted(folder.glob(f"*{_LOG}"))), None) if folder.is_dir() else None
