@@ -7,8 +7,12 @@ caller gives the groups that a bundle of rays can meet at all (``groups_in_cone`
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numba
+from llvmlite.ir import Constant
+from numba import types
+from numba.extending import intrinsic
 
 BOX, CYLINDER, ELLIPSOID = 0, 1, 2
 
@@ -22,6 +26,32 @@ _EPSILON = 1e-9
 _FLAGS = {"reassoc", "contract", "arcp", "nsz"}  # not the flags that forbid infinities
 
 jit = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_FLAGS)
+
+
+def _without_owner(context: Any, builder: Any, kind: Any, value: Any) -> Any:
+    if isinstance(kind, types.Array):
+        array = context.make_array(kind)(context, builder, value)
+        array.meminfo = Constant(array.meminfo.type, None)
+        return array._getvalue()
+    if isinstance(kind, types.BaseTuple):
+        members = enumerate(kind)  # pyright: ignore[reportArgumentType]
+        items = [_without_owner(context, builder, part, builder.extract_value(value, i)) for i, part in members]
+        return context.make_tuple(builder, kind, items)
+    return value
+
+
+def _unowned(context: Any, value: Any) -> Any:
+    """The same array, or tuple of arrays and other things, without owners, who must outlive it.
+
+    Compiled code counts the references to an array's owner with atomic operations wherever it passes the array on: in
+    the inner loops that took as long as the ray casting itself.
+    """
+    return value(value), lambda context, builder, signature, arguments: _without_owner(
+        context, builder, signature.args[0], arguments[0]
+    )
+
+
+unowned: Any = intrinsic(_unowned)
 
 
 @jit

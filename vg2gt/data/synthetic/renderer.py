@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vg2gt.data.synthetic.raycast import FAR, find_occluder, groups_in_cone, jit, nearest_hit, surface
+from vg2gt.data.synthetic.raycast import FAR, find_occluder, groups_in_cone, jit, nearest_hit, surface, unowned
 from vg2gt.data.synthetic.sky import GROUND, add_sky
 from vg2gt.data.synthetic.textures import fractal_noise, pattern_value
 
@@ -87,10 +87,18 @@ def render_frame(
     camera = (intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2])
     geometry = (world.parts, world.groups, world.walls)
     look = (world.part_materials, world.wall_materials, world.materials, world.lights, world.ambient)
-    _render(
-        origin, rotation, camera, geometry, look, world.highlights, world.sky, frame.image, frame.depth, frame.normal
-    )
+    out = (frame.image, frame.depth, frame.normal)
+    _render((origin, rotation), camera, geometry, look, (world.highlights, world.sky), _workspace(world), out)
     return frame
+
+
+def _workspace(world: World) -> tuple[NDArray, ...]:
+    """Memory of the kernel: it works on arrays without owners (``unowned``), so Python has to own them."""
+    rays, lights, groups = _TILE * _TILE * _SAMPLES**2, len(world.lights), len(world.groups)
+    samples = (np.empty((rays, 3)), np.empty((rays, 3)), np.empty(rays), np.empty(rays, np.int64))
+    seen = (np.empty(groups, np.int64), np.empty(groups))
+    shadows = (np.empty((lights, groups), np.int64), np.zeros(lights, np.int64), np.full(lights, -1))
+    return (*samples, *seen, *shadows, np.empty(3), np.empty(3))
 
 
 @jit
@@ -214,20 +222,18 @@ def _cast_centers(y0, x0, y1, x1, origin, rotation, camera, geometry, sky, visib
 
 
 @jit
-def _render(origin, rotation, camera, geometry, look, highlights, sky, image, depth, normal):
+def _render(pose, camera, geometry, look, extras, workspace, out):
+    origin, rotation = unowned(pose)
+    geometry, look = unowned(geometry), unowned(look)
     parts, groups, walls = geometry
     lights = look[3]
+    highlights, sky = unowned(extras)
+    points, directions, distances, hits, visible, near, shadowing, counts, guesses, axis, color = unowned(workspace)
+    image, depth, normal = unowned(out)
     height, width = depth.shape
     ox, oy, oz = origin[0], origin[1], origin[2]
     per_pixel = _SAMPLES * _SAMPLES
     step = 1.0 / _SAMPLES
-    size = _TILE * _TILE * per_pixel
-    points, directions = np.empty((size, 3)), np.empty((size, 3))
-    distances, hits = np.empty(size), np.empty(size, np.int64)
-    visible, near = np.empty(len(groups), np.int64), np.empty(len(groups))
-    shadowing = np.empty((len(lights), len(groups)), np.int64)
-    counts, guesses = np.zeros(len(lights), np.int64), np.full(len(lights), -1)
-    axis, color = np.empty(3), np.empty(3)
     for y0 in range(0, height, _TILE):
         for x0 in range(0, width, _TILE):
             y1, x1 = min(y0 + _TILE, height), min(x0 + _TILE, width)
