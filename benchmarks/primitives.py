@@ -31,7 +31,7 @@ from vg2gt.study import compose_run
 from vg2gt.types import Batch
 from vg2gt.voxels.grid import scene_voxel_size
 
-PIXEL_ALIGNED = "pixel_aligned"
+LABELS = {"pixel_aligned": "pixel-aligned", "voxel_merged": "voxel-merged", "tiny": "VG²GT", "vg2gt": "VG²GT (large)"}
 REPOSITORY = Path(__file__).resolve().parents[1]
 
 
@@ -45,7 +45,8 @@ class Method:
     @property
     def label(self) -> str:
         """Name in tables and plots; with the voxels' edge."""
-        return self.model if self.footprint is None else f"{self.model}, {self.footprint:g} px"
+        name = LABELS[self.model]
+        return name if self.footprint is None else f"{name}, {self.footprint:g} px"
 
     @property
     def overrides(self) -> list[str]:
@@ -128,7 +129,7 @@ def print_table(console: Console, title: str, rows: list[Row], pixels: int) -> N
     )
     for heading in headings:
         table.add_column(heading, justify="left" if heading == "method" else "right")
-    reference = {row.views: row for row in rows if row.method == PIXEL_ALIGNED}
+    reference = {row.views: row for row in rows if row.method == LABELS["pixel_aligned"]}
     for row in rows:
         base = reference[row.views]
         table.add_row(
@@ -199,7 +200,7 @@ def main() -> None:
     overrides = list(arguments.overrides)
     if not any(override.startswith("data=") for override in overrides):
         overrides = ["data.num_frames=64", *overrides]
-    methods = [Method(PIXEL_ALIGNED, None)]
+    methods = [Method("pixel_aligned", None)]
     methods += [Method("voxel_merged", arguments.footprints[-1])]
     methods += [Method(arguments.model, footprint) for footprint in arguments.footprints]
     rows: list[Row] = []

@@ -25,6 +25,7 @@ from rich.console import Console
 from rich.table import Table
 from stage_clock import StageClock
 
+from vg2gt.evaluation.paper import tables
 from vg2gt.io.files import write_json
 from vg2gt.study import compose_run
 from vg2gt.training import Run, build
@@ -44,14 +45,6 @@ RECONSTRUCTION = tuple(name for name in STAGES if name != "render")
 PAPER = {
     (224, 448): {"decode_again": 0.0852, "fine + head": 0.293, "whole": 1.122, "DA3 alone": 0.764},
     (518, 518): {"whole": 2.440, "DA3 alone": 2.180},
-}
-# Paper, Table training_cost: GPU, hours, hours converted to the paper's GPU.
-PAPER_TRAINING = {
-    "VG²GT": ("PRO 6000", 99.0, 99.0),
-    "AnySplat": ("A800", 768.0, 685.824),
-    "DA3": ("H100", 30720.0, 57415.68),
-    "VGGT": ("A100", 13824.0, 12344.832),
-    "MapAnything": ("H200", 9216.0, 24689.664),
 }
 PAPER_STEPS = 420_000
 
@@ -151,8 +144,8 @@ def print_training(console: Console, step_seconds: float, where: str) -> None:
     for heading in ("method", "device", "device hours", "hours on the paper's GPU"):
         table.add_column(heading, justify="left" if heading in ("method", "device") else "right")
     table.add_row("measured here", where, f"{step_seconds * PAPER_STEPS / 3600:,.1f}", "n/a")
-    for name, (gpu, hours, converted) in PAPER_TRAINING.items():
-        table.add_row(f"{name} (paper)", gpu, f"{hours:,.0f}", f"{converted:,.1f}")
+    for name, cost in tables()["tbl_training_cost"].items():
+        table.add_row(f"{name} (paper)", cost["gpu"], f"{cost['hours']:,.0f}", f"{cost['converted_hours']:,.1f}")
     console.print(table)
 
 

@@ -23,6 +23,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from vg2gt.checkpoints import AtomicCheckpointIO, newest_valid, read_checkpoint
+from vg2gt.evaluation.paper import tables
 from vg2gt.io.files import write_json, write_text
 from vg2gt.paths import config_dir
 from vg2gt.study import Metrics, compose_run, markdown, over_seeds, paired_difference, quoted, run_once, summarize
@@ -61,18 +62,9 @@ OUR_COLUMNS: dict[str, tuple[str, int, bool | None]] = {
     "cv": ("CV", 3, False),
     "gaussians": ("Gaussians", 0, None),
 }
-# Paper, Table ablation and Table split, Replica; columns as PAPER_COLUMNS.
-PAPER: dict[str, tuple[float, ...]] = {
-    "rasterized": (29.59, 0.888, 0.211, 1.2296, 0.3005, 0.7088, 0.5940),
-    "wo_depth": (28.83, 0.876, 0.219, 0.1014, 0.0137, 0.9944, 0.9855),
-    "wo_coarse": (29.11, 0.880, 0.209, 0.0990, 0.0130, 0.9946, 0.9863),
-    "wo_enhance": (28.93, 0.878, 0.219, 0.0994, 0.0138, 0.9946, 0.9862),
-    "wo_split": (28.19, 0.865, 0.219, 0.1083, 0.0147, 0.9935, 0.9825),
-    FULL: (30.86, 0.898, 0.192, 0.0786, 0.0109, 0.9968, 0.9904),
-    "splits=1": (28.191, 0.865, 0.219, 0.1083, 0.0147, 0.9935, 0.9825),
-    "splits=2": (30.855, 0.898, 0.192, 0.0786, 0.0109, 0.9968, 0.9904),
-    "splits=4": (30.954, 0.899, 0.183, 0.0803, 0.0111, 0.9966, 0.9906),
-}
+# The rows of the paper's tables of the same meaning (Replica).
+PAPER_ABLATION, PAPER_SPLIT, PAPER_DATA = "tbl_ablation", "tbl_split", "replica"
+PAPER_FULL = "VG2GT (full)"
 
 
 @dataclass(frozen=True)
@@ -166,7 +158,7 @@ class Ablation:
             "overrides": self.overrides,
             "runs": {name: {str(seed): m for seed, m in runs.items()} for name, runs in self.results.items()},
             "summary": summarize({name: runs for name, runs in self.results.items() if runs}, FULL),
-            "paper": {name: dict(zip(PAPER_COLUMNS, row, strict=True)) for name, row in PAPER.items()},
+            "paper": {table: tables()[table][PAPER_DATA] for table in (PAPER_ABLATION, PAPER_SPLIT)},
         }
         write_json(self.folder / "metrics.json", content)
         write_text(self.folder / "metrics.md", self.report())
@@ -220,14 +212,22 @@ def _label(name: str) -> str:
     return LABELS.get(name, name)
 
 
+def _paper_row(name: str) -> Mapping[str, float] | None:
+    """What the paper reports in a row of the same meaning; None where it has none."""
+    if name.startswith("splits="):
+        row = "w/o split" if name == "splits=1" else name.replace("splits", "split")
+        return tables()[PAPER_SPLIT][PAPER_DATA].get(row)
+    return tables()[PAPER_ABLATION][PAPER_DATA].get(PAPER_FULL if name == FULL else _label(name))
+
+
 def _table(results: Mapping[str, Mapping[int, Metrics]], rows: Mapping[str, str]) -> str:
     """Ours and the paper's; ``rows`` maps what the paper calls a row to the run that stands for it."""
     lines = []
     for name, run in rows.items():
         cells = [over_seeds(results[run], metric).shown(column[1]) for metric, column in PAPER_COLUMNS.items()]
         lines.append([_label(name), *cells])
-        if name in PAPER:
-            lines.append(["*paper*", *(f"*{value:g}*" for value in PAPER[name])])
+        if paper := _paper_row(name):
+            lines.append(["*paper*", *(f"*{paper[metric]:g}*" for metric in PAPER_COLUMNS)])
     return markdown(["", *(column[0] for column in PAPER_COLUMNS.values())], lines)
 
 
