@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from tests.training_helpers import small_config
-from vg2gt.evaluation import EvaluationOptions, SceneEvaluator
+from vg2gt.evaluation import EvaluationOptions, SceneEvaluator, SceneResult
 from vg2gt.lightning_module import VG2GTModule
 from vg2gt.training import build
 from vg2gt.types import Batch
@@ -31,6 +31,11 @@ def evaluator(module_and_batch) -> SceneEvaluator:
 def batch(module_and_batch) -> Batch:
     torch.manual_seed(0)
     return module_and_batch[1]
+
+
+@pytest.fixture(scope="module")
+def result(evaluator: SceneEvaluator, batch: Batch) -> SceneResult:
+    return evaluator(batch)
 
 
 def evaluate_overrides(folder: Path, cache: Path, *overrides: str) -> list[str]:

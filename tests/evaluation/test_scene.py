@@ -3,7 +3,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from vg2gt.evaluation import EvaluationOptions, SceneEvaluator, evaluate_scene
+from vg2gt.evaluation import EvaluationOptions, SceneEvaluator, SceneResult, evaluate_scene
 from vg2gt.evaluation.cost import clocked
 from vg2gt.evaluation.scene import MODES, PROTOCOLS
 from vg2gt.geometry.normals import normals_from_depth
@@ -12,8 +12,7 @@ from vg2gt.protocols import ground_truth_target_cameras
 from vg2gt.types import Batch
 
 
-def test_scores_are_the_metrics_of_the_renders(evaluator: SceneEvaluator, batch: Batch) -> None:
-    result = evaluator(batch)
+def test_scores_are_the_metrics_of_the_renders(result: SceneResult, batch: Batch) -> None:
     truth = batch.target
     render = result.renders["gt_pose"]
     expected = {f"rendered/gt_pose/solid/{k}": v for k, v in depth_metrics(render.depth[0], truth.depth[0]).items()}
@@ -31,8 +30,8 @@ def test_scores_are_the_metrics_of_the_renders(evaluator: SceneEvaluator, batch:
     assert {name: result.scores[name] for name in expected} == expected
 
 
-def test_every_protocol_and_mode_has_every_figure(evaluator: SceneEvaluator, batch: Batch) -> None:
-    scores = evaluator(batch).scores
+def test_every_protocol_and_mode_has_every_figure(result: SceneResult) -> None:
+    scores = result.scores
     for protocol in PROTOCOLS:
         for mode in MODES:
             for name in ("psnr", "ssim", "abs_rel", "mae", "rmse", "coverage", "delta_1.05_holes", "normal_acc_30"):
@@ -44,8 +43,7 @@ def test_every_protocol_and_mode_has_every_figure(evaluator: SceneEvaluator, bat
     assert not any(name.endswith("lpips") for name in scores)
 
 
-def test_context_renders_are_of_the_inputs(evaluator: SceneEvaluator, batch: Batch) -> None:
-    result = evaluator(batch)
+def test_context_renders_are_of_the_inputs(result: SceneResult, batch: Batch) -> None:
     assert result.renders["context"].color.shape[1] == batch.num_context
     expected = float(psnr(result.renders["context"].color[0], batch.context.images[0]).mean())
     assert result.scores["rendered/context/solid/psnr"] == expected
@@ -57,7 +55,7 @@ def test_without_true_depth_what_needs_it_is_none_and_not_zero(evaluator: SceneE
     encode = evaluator.model.backend.encode
     evaluator.model.backend.encode = (
         lambda images, hints: encode(  # pyright: ignore[reportAttributeAccessIssue]
-            images, replace(hints, depth=batch.depth[:, : images.shape[1]])
+            images, replace(batch.hints if hints is None else hints, depth=batch.depth[:, : images.shape[1]])
         )
     )
     try:
@@ -81,16 +79,16 @@ def test_without_targets_or_true_cameras(evaluator: SceneEvaluator, batch: Batch
     assert "cameras/auc_5" not in evaluator(one_view).scores
 
 
-def test_options_reach_the_metrics(module_and_batch, evaluator: SceneEvaluator, batch: Batch) -> None:
+def test_options_reach_the_metrics(module_and_batch, result: SceneResult, batch: Batch) -> None:
     module, _ = module_and_batch
     depth = batch.target.depth
     middle = float(depth[depth > 0].median())
     options = EvaluationOptions(alignment="scene", depth_range=(None, middle), neighbors=3)
     scores = SceneEvaluator(module.model, module.renderer, options)(batch).scores
-    render = evaluator(batch).renders["gt_pose"]
+    render = result.renders["gt_pose"]
     expected = depth_metrics(render.depth[0], depth[0], "scene", 0.0, middle)
     assert scores["rendered/gt_pose/solid/abs_rel"] == expected["abs_rel"]
-    assert scores["scene/cv"] != evaluator(batch).scores["scene/cv"]
+    assert scores["scene/cv"] != result.scores["scene/cv"]
     with pytest.raises(ValueError, match=r"alignment='affine'"):
         EvaluationOptions(alignment="affine")
     with pytest.raises(ValueError, match="neighbors >= 1"):

@@ -20,9 +20,9 @@ def report(**settings: Any) -> dict[str, Any]:
         "scene/cv": 0.25,
     }
     known = {
-        "name": "test", "weights": "none", "model": "VG2GT", "backend": "oracle", "data": "Rooms", "scenes": 1,
+        "name": "test", "weights": "none", "model": "VG2GT", "backend": {"name": "oracle", "weights": "0a" * 32}, "data": "Rooms", "scenes": 1,
         "index": "replica", "size": [518, 518], "crop": "cover", "alignment": "median", "depth_range": [None, None],
-        "neighbors": 8, "lpips": "VGG-16, version 0.1", "points": {}, "device": "cpu", "paper": None,
+        "neighbors": 8, "lpips": "VGG-16, version 0.1", "points": {"threshold": 0.05, "cap": None}, "device": "cpu", "paper": None,
     }  # fmt: skip
     views = {str(count): {"mean": scores, "scenes": {"room": scores}} for count in (3, 10)}
     return {"settings": known | settings, "views": views}
@@ -33,10 +33,16 @@ def test_figures_stand_where_they_belong() -> None:
     assert re.search(r"\| 3 +\| gt_pose +\| solid +\| +0\.0123 \|.* 0\.9876 \|", text)
     assert re.search(r"\| 10 +\| gt_pose +\| rasterized \| +24\.00 \| +n/a \| +n/a \|", text)
     assert re.search(r"\| room +\| 3 +\| +25\.50 \|", text)
-    assert "alignment median" in text
+    assert "alignment median, of any true depth" in text
+    assert "threshold 0.05, cap none" in text
     assert "k = 8" in text
     assert "## Cameras of the input views\n\nn/a" in text
     assert "paper" not in text
+
+
+def test_a_range_of_depths_is_said() -> None:
+    assert "of true depths from 0 to 10" in markdown(report(depth_range=[None, 10]))
+    assert "of true depths from 0.5 to any" in markdown(report(depth_range=[0.5, None]))
 
 
 def test_lpips_without_weights_says_how_to_get_them() -> None:

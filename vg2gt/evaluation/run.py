@@ -13,7 +13,7 @@ import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from vg2gt.data.base import SceneSource
+from vg2gt.data.base import DataError, SceneSource
 from vg2gt.data.batches import BatchDataset
 from vg2gt.data.datamodule import SceneDataModule
 from vg2gt.data.overlap import refuse_overlap
@@ -128,7 +128,10 @@ def _samples(
 def _refuse_training_views(
     checkpoint: Path | None, config: DictConfig, source: SceneSource, views: Sequence[SceneViews]
 ) -> None:
-    """Refuses to score frames that the run was trained on, where it was trained on a data set of the same kind.
+    """Refuses to score what the run was trained on, where it was trained on a data set of the same kind.
+
+    Of a scene that was trained on, only frames that the training held out may be scored. Frame numbers alone would not
+    do: the evaluation may read the scene with other options.
 
     Raises:
         DataError: naming the first scene.
@@ -146,6 +149,12 @@ def _refuse_training_views(
     except (FileNotFoundError, ValueError) as error:
         log.warning("whether the evaluated scenes were trained on cannot be checked: %s", error)
         return
+    for view in views:
+        if view.scene in names and not set(view.target or view.context) <= set(train.held_out(view.scene)):
+            raise DataError(
+                f"scene {view.scene} was trained on, and frames the training did not hold out would be scored: choose "
+                "other scenes (data.val...)"
+            )
     refuse_overlap(train, names, source, views)
 
 

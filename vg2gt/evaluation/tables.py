@@ -95,13 +95,13 @@ def _heading(settings: Mapping[str, Any]) -> str:
     shown = {
         "weights": settings["weights"],
         "model": settings["model"],
-        "backbone": settings["backend"],
+        "backbone": f"{settings['backend']['name']}, weights {settings['backend']['weights'][:12]}",
         "data": f"{settings['data']}, {settings['scenes']} scenes, views {settings['index']}",
         "images": f"{settings['size'][0]}x{settings['size'][1]}, {settings['crop']}",
-        "depth": f"alignment {settings['alignment']}; range {settings['depth_range']}",
+        "depth": f"alignment {settings['alignment']}, {_range(settings['depth_range'])}",
         "CV": f"k = {settings['neighbors']}",
         "LPIPS": settings["lpips"],
-        "points": settings["points"],
+        "points": ", ".join(f"{key} {_length(value)}" for key, value in settings["points"].items()),
         "device": settings["device"],
     }
     lines += [f"- {name}: {value}" for name, value in shown.items()]
@@ -116,6 +116,17 @@ def _heading(settings: Mapping[str, Any]) -> str:
             "are others than ours"
         )
     return "\n".join([*lines, ""])
+
+
+def _range(bounds: Sequence[float | None]) -> str:
+    nearest, farthest = bounds
+    if nearest is None and farthest is None:
+        return "of any true depth"
+    return f"of true depths from {nearest or 0} to {'any' if farthest is None else farthest}"
+
+
+def _length(value: float | None) -> str:
+    return "none" if value is None else f"{value:g}"
 
 
 def _section(title: str, keys: Sequence[str], columns: Columns, rows: Rows) -> str:

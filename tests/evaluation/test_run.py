@@ -1,0 +1,215 @@
+"""Whole evaluations of two small rooms."""
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from tests.evaluation.conftest import evaluate_overrides
+from tests.training_helpers import small_config
+from vg2gt.data.base import DataError, Frames
+from vg2gt.data.synthetic import SyntheticScenes
+from vg2gt.evaluation.run import evaluate
+from vg2gt.evaluation.scene import SceneEvaluator
+from vg2gt.evaluation.settings import checkpoint_path, run_name
+from vg2gt.metrics.lpips import STAGES
+from vg2gt.paths import config_dir
+from vg2gt.training import train
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("rooms")
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory, cache: Path) -> Path:
+    folder = tmp_path_factory.mktemp("run") / "outputs" / "tiny"
+    train(small_config(folder, cache, "trainer.max_steps=2"))
+    return folder
+
+
+def run(folder: Path, cache: Path, *overrides: str) -> dict[str, Any]:
+    with initialize_config_dir(config_dir(), version_base="1.3"):
+        config = compose("evaluate", evaluate_overrides(folder, cache, *overrides))
+    return evaluate(config)
+
+
+@pytest.fixture(scope="module")
+def evaluated(tmp_path_factory: pytest.TempPathFactory, trained: Path, cache: Path) -> Path:
+    folder = tmp_path_factory.mktemp("evaluated")
+    run(folder, cache, f"ckpt={trained}")
+    return folder
+
+
+def without_cost(scores: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in scores.items() if not name.endswith(("_seconds", "_mib"))}
+
+
+def test_an_evaluation_writes_its_results(evaluated: Path, trained: Path) -> None:
+    report = json.loads((evaluated / "metrics.json").read_text(), parse_constant=pytest.fail)
+    result = report["views"]["2"]
+    assert set(result["scenes"]) == {"room-1000000", "room-1000001"}
+    values = [scores["rendered/gt_pose/solid/psnr"] for scores in result["scenes"].values()]
+    assert result["mean"]["rendered/gt_pose/solid/psnr"] == pytest.approx(sum(values) / 2)
+    assert report["settings"]["weights"] == f"{trained / 'checkpoints' / 'step-2.ckpt'} (step 2)"
+    assert "## Rendered depth" in (evaluated / "metrics.md").read_text()
+    config = OmegaConf.load(evaluated / "config.yaml")
+    assert config.model._target_ == "vg2gt.model.VG2GT"
+    assert config.backend._target_ == "backends.oracle.OracleBackend"
+
+
+def test_the_untrained_head_says_so_and_scores_otherwise(tmp_path: Path, cache: Path, evaluated: Path, capsys) -> None:
+    report = run(tmp_path, cache)
+    assert report["settings"]["weights"] == "none: the head is untrained"
+    assert "weights: none: the head is untrained" in capsys.readouterr().out
+    other = json.loads((evaluated / "metrics.json").read_text())
+    name = "rendered/gt_pose/solid/psnr"
+    assert report["views"]["2"]["mean"][name] != other["views"]["2"]["mean"][name]
+    assert report["views"]["2"]["mean"]["decoded/before/abs_rel"] == pytest.approx(
+        other["views"]["2"]["mean"]["decoded/before/abs_rel"]
+    )
+
+
+def test_an_interrupted_evaluation_goes_on(
+    tmp_path: Path, cache: Path, trained: Path, evaluated: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    original, seen = SceneEvaluator.__call__, []
+
+    def counted(self, batch, has_cameras=True):
+        if len(seen) == 1:
+            seen.append("crash")
+            raise InterruptedError("simulated crash")
+        seen.append(batch.scene[0])
+        return original(self, batch, has_cameras)
+
+    monkeypatch.setattr(SceneEvaluator, "__call__", counted)
+    with pytest.raises(InterruptedError):
+        run(tmp_path, cache, f"ckpt={trained}")
+    assert not (tmp_path / "metrics.json").exists()
+    report = run(tmp_path, cache, f"ckpt={trained}")
+    assert seen == ["room-1000000", "crash", "room-1000001"]
+    whole = json.loads((evaluated / "metrics.json").read_text())
+    for scene, scores in whole["views"]["2"]["scenes"].items():
+        assert without_cost(report["views"]["2"]["scenes"][scene]) == without_cost(scores)
+
+
+def test_more_scenes_and_views_join_other_settings_do_not(
+    tmp_path: Path, cache: Path, trained: Path, evaluated: Path
+) -> None:
+    folder = tmp_path / "copy"
+    shutil.copytree(evaluated, folder)
+    report = run(folder, cache, f"ckpt={trained}", "views=[1,2]", "data.eval_scenes=1")
+    assert set(report["views"]) == {"1", "2"}
+    assert "cameras/auc_5" not in report["views"]["1"]["mean"]
+    with pytest.raises(FileExistsError, match=r"evaluation\.alignment \(median -> scene\)"):
+        run(folder, cache, f"ckpt={trained}", "evaluation.alignment=scene")
+    with pytest.raises(FileExistsError, match=r"checkpoint\.sha256"):
+        run(folder, cache)
+    run(folder, cache, f"ckpt={trained}", "data.eval_scenes=1", "overwrite=true")
+    assert len(list((folder / "scenes" / "2").iterdir())) == 1
+
+
+def test_pictures_can_be_asked_for_later(tmp_path: Path, cache: Path, trained: Path, evaluated: Path) -> None:
+    folder = tmp_path / "copy"
+    shutil.copytree(evaluated, folder)
+    run(folder, cache, f"ckpt={trained}", "evaluation.pictures=1")
+    assert [path.name for path in (folder / "pictures").iterdir()] == ["room-1000000-2.png"]
+
+
+def test_another_backbone_or_model_is_refused(tmp_path: Path, cache: Path, trained: Path) -> None:
+    with pytest.raises(ValueError, match="trained on backbone"):
+        run(tmp_path, cache, f"ckpt={trained}", "backend=oracle", "backend.seed=1")
+    with pytest.raises(ValueError, match=r"does not fit this model, first in model\.gaussians\.out"):
+        run(tmp_path, cache, f"ckpt={trained}", "+model.gaussians.splits=4")
+
+
+def test_one_key_of_the_runs_model_can_be_changed(tmp_path: Path, cache: Path, trained: Path) -> None:
+    report = run(tmp_path, cache, f"ckpt={trained}", "+model.fine.max_voxels=200", "data.eval_scenes=1")
+    assert report["views"]["2"]["mean"]["scene/gaussians"] == 400
+
+
+def test_scenes_of_the_training_are_refused(tmp_path: Path, cache: Path, trained: Path) -> None:
+    with pytest.raises(DataError, match="scene room-000000 was trained on"):
+        run(tmp_path, cache, f"ckpt={trained}", "data.val.first_seed=0")
+
+
+def test_what_is_missing_or_wrong_is_named(tmp_path: Path, cache: Path, trained: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="ckpt=nowhere: no such checkpoint or run"):
+        run(tmp_path, cache, "ckpt=nowhere")
+    lone = tmp_path / "lone.ckpt"
+    shutil.copy(trained / "checkpoints" / "step-2.ckpt", lone)
+    with pytest.raises(FileNotFoundError, match=r"config\.yaml is missing.*model= and backend="):
+        run(tmp_path, cache, f"ckpt={lone}")
+    with pytest.raises(ValueError, match="give numbers of input views"):
+        run(tmp_path, cache, "views=[]")
+    with pytest.raises(DataError, match=r"has 32 frames .* views=33 needs 33"):
+        run(tmp_path, cache, "views=[33]")
+
+
+class WithoutDepth(SyntheticScenes):
+    """Rooms of which one has no depth."""
+
+    def load(self, scene: str, frame_ids: Any) -> Frames:
+        frames = super().load(scene, frame_ids)
+        if scene == "room-1000000":
+            frames.depth.zero_()
+        return frames
+
+
+def test_a_scene_without_depth_has_no_depth_error(tmp_path: Path, cache: Path) -> None:
+    data = [f"data.val._target_={__name__}.WithoutDepth", "backend=vggt_tiny"]
+    report = run(tmp_path, cache, *data)
+    blind, seeing = (report["views"]["2"]["scenes"][f"room-100000{i}"] for i in (0, 1))
+    name = "rendered/gt_pose/solid/abs_rel"
+    assert blind[name] is None
+    assert seeing[name] is not None
+    assert blind["rendered/novel/solid/psnr"] is not None
+    assert report["views"]["2"]["mean"][name] == seeing[name]
+    assert "n/a" in (tmp_path / "metrics.md").read_text()
+
+
+def test_lpips_from_a_local_file(tmp_path: Path, cache: Path, trained: Path) -> None:
+    generator, state, channels, position = torch.Generator().manual_seed(0), {}, 3, 0
+    for stage, widths in enumerate(STAGES):
+        for width in widths:
+            shape = (width, channels, 3, 3)
+            state[f"features.{position}.weight"] = torch.randn(shape, generator=generator) / (4.5 * channels) ** 0.5
+            state[f"features.{position}.bias"] = torch.zeros(width)
+            channels, position = width, position + 2
+        position += 1
+        state[f"lin{stage}.model.1.weight"] = torch.rand(1, channels, 1, 1, generator=generator)
+    torch.save(state, tmp_path / "weights.pth")
+    out = tmp_path / "out"
+    chosen = ["data.eval_scenes=1", f"evaluation.lpips={tmp_path / 'weights.pth'}"]
+    report = run(out, cache, f"ckpt={trained}", *chosen)
+    assert report["settings"]["lpips"].startswith("VGG-16")
+    assert report["views"]["2"]["mean"]["rendered/novel/solid/lpips"] > 0
+
+
+def test_a_checkpoint_is_a_file_or_the_newest_of_a_run(trained: Path) -> None:
+    newest = trained / "checkpoints" / "step-2.ckpt"
+    assert checkpoint_path(None) is None
+    assert checkpoint_path(str(trained)) == newest
+    assert checkpoint_path(str(trained / "checkpoints")) == newest
+    assert checkpoint_path(str(newest)) == newest
+
+
+@pytest.mark.parametrize(
+    ("ckpt", "name"),
+    [
+        (None, "untrained"),
+        ("outputs/quickstart", "quickstart"),
+        ("outputs/quickstart/checkpoints/step-400.ckpt", "quickstart"),
+        ("/data/outputs/wo_depth/", "wo_depth"),
+        ("../other/mine.ckpt", "other"),
+        ("mine.ckpt", "mine"),
+    ],
+)
+def test_the_folder_is_named_after_the_run(ckpt: str | None, name: str) -> None:
+    assert run_name(ckpt) == name
