@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from vg2gt.data import SyntheticRooms
+from vg2gt.data import SyntheticScenes
 
 SIZE = (24, 32)
 
 
 @pytest.fixture(scope="session")
-def rooms(tmp_path_factory) -> SyntheticRooms:
+def rooms(tmp_path_factory) -> SyntheticScenes:
     """Four rooms of six small frames, cached for the session."""
-    return SyntheticRooms(4, num_frames=6, size=SIZE, cache_dir=str(tmp_path_factory.mktemp("rooms")))
+    return SyntheticScenes(4, num_frames=6, size=SIZE, cache_dir=str(tmp_path_factory.mktemp("rooms")))
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
-from vg2gt.data import DataError, SceneDataModule, SyntheticRooms
+from vg2gt.data import DataError, SceneDataModule, SyntheticScenes
 from vg2gt.data.evaluation_views import EvaluationViews
 from vg2gt.data.frame_cache import FrameCache
 from vg2gt.data.framing import Framing
@@ -18,8 +18,8 @@ from vg2gt.paths import config_dir
 from .conftest import SIZE
 
 
-def _module(rooms: SyntheticRooms, **options) -> SceneDataModule:
-    val = SyntheticRooms(2, first_seed=100, num_frames=6, size=SIZE, cache_dir=str(rooms.cache_dir))
+def _module(rooms: SyntheticScenes, **options) -> SceneDataModule:
+    val = SyntheticScenes(2, first_seed=100, num_frames=6, size=SIZE, cache_dir=str(rooms.cache_dir))
     defaults = {
         "image_size": SIZE, "min_views": 2, "max_views": 3, "max_images": 4, "eval_context": [0, 2, 4],
         "eval_target": [1, 3], "steps_per_epoch": 4,
@@ -70,15 +70,15 @@ def test_limits_on_scenes(rooms):
 
 
 def test_training_and_evaluation_on_the_same_scenes_is_refused(rooms):
-    same = SyntheticRooms(2, num_frames=6, size=SIZE, first_seed=3)
+    same = SyntheticScenes(2, num_frames=6, size=SIZE, first_seed=3)
     with pytest.raises(DataError, match="room-000003 is used for training and for evaluation"):
         _module(rooms, val=same).setup()
 
 
 def test_common_arguments_reach_both_sources(tmp_path):
     module = SceneDataModule(
-        train=partial(SyntheticRooms, num_scenes=1),
-        val=partial(SyntheticRooms, num_scenes=1, first_seed=9),
+        train=partial(SyntheticScenes, num_scenes=1),
+        val=partial(SyntheticScenes, num_scenes=1, first_seed=9),
         image_size=SIZE, min_views=1, max_views=1, eval_context=[0], eval_target=[1], steps_per_epoch=1,
         num_frames=2, size=SIZE, cache_dir=str(tmp_path),
     )  # fmt: skip
@@ -87,7 +87,7 @@ def test_common_arguments_reach_both_sources(tmp_path):
 
 
 def test_scenes_of_one_frame(tmp_path):
-    one = partial(SyntheticRooms, 1, num_frames=1, size=SIZE, cache_dir=str(tmp_path))
+    one = partial(SyntheticScenes, 1, num_frames=1, size=SIZE, cache_dir=str(tmp_path))
     module = _module(one(), train=one(), val=one(first_seed=7), min_views=1, max_views=1, eval_context=8, eval_target=3)
     assert next(iter(module.train_dataloader())).images.shape[1] == 1
     batch = next(iter(module.val_dataloader()))
@@ -167,7 +167,7 @@ def test_the_memory_cache_forgets_the_oldest_frame(rooms, monkeypatch):
 
 
 def test_evaluation_views_by_number_and_window(rooms):
-    source = SyntheticRooms(1, num_frames=20)
+    source = SyntheticScenes(1, num_frames=20)
     source.held_out = lambda scene: range(3, 20, 6)
     (views,) = EvaluationViews(context=4, target=2).choose(source, "room-000000")
     assert views.context == (0, 6, 13, 19)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.training_helpers import small_config
 from vg2gt.data import Frames, SyntheticScenes
 from vg2gt.data.synthetic.builder import Builder
 from vg2gt.data.synthetic.outdoor import SyntheticOutdoor
@@ -14,6 +15,7 @@ from vg2gt.data.synthetic.renderer import World, render_frame
 from vg2gt.data.synthetic.rooms import SyntheticRoom
 from vg2gt.data.synthetic.scene import draw_highlights, level_poses
 from vg2gt.geometry.cameras import ray_directions
+from vg2gt.training import train
 
 from .warping import depth_differences
 
@@ -173,6 +175,13 @@ def test_sources_are_pickled_and_give_normals_without_sky():
     frames, normals = source.load("outdoor-000002", [1]), source.normals("outdoor-000002", [1])
     assert isinstance(frames, Frames)
     assert torch.equal(normals.norm(dim=1) == 0, frames.depth == 0)
+
+
+def test_training_copes_with_the_sky(tmp_path):
+    overrides = ["debug=fast_dev_run", "data.variant=outdoor", "data.highlights=true", "backend.background=1.2"]
+    for with_background in (overrides[:-1], overrides):
+        report = train(small_config(tmp_path / str(len(with_background)), tmp_path / "cache", *with_background))
+        assert np.isfinite(list(report["trained"].values())).all()
 
 
 def test_rays_find_the_ground_or_the_sky(streets):

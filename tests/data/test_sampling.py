@@ -6,7 +6,7 @@ import logging
 
 import pytest
 
-from vg2gt.data import DataError, SyntheticRooms
+from vg2gt.data import DataError, SyntheticScenes
 from vg2gt.data.sampling import ScenePool, StepSampler, ViewSampler, shares, usable_scenes
 
 
@@ -27,14 +27,14 @@ def test_the_number_of_views_stays_in_range_and_takes_every_value():
 )
 def test_the_samples_of_one_dataset_never_change(sampler, digest):
     """Figures were published with them: a run of the same seed must see the same samples in later versions."""
-    source = SyntheticRooms(11, num_frames=16)
+    source = SyntheticScenes(11, num_frames=16)
     ranks = [StepSampler(source, source.scenes, sampler, 60, rank=rank, world_size=2) for rank in range(2)]
     drawn = [[[[v.scene, v.context, v.target] for v in rank.step(step)] for step in range(60)] for rank in ranks]
     assert hashlib.sha256(json.dumps(drawn).encode()).hexdigest() == digest
 
 
 def test_all_ranks_draw_the_same_number_of_views_and_other_scenes():
-    source = SyntheticRooms(40, num_frames=20)
+    source = SyntheticScenes(40, num_frames=20)
     views = ViewSampler(2, 6, max_images=12)
     ranks = [StepSampler(source, source.scenes, views, 100, rank=rank, world_size=2) for rank in range(2)]
     for step in range(30):
@@ -111,7 +111,7 @@ def test_scenes_of_one_step_draw_different_views():
 
 
 def test_a_step_does_not_depend_on_where_the_iteration_began():
-    source = SyntheticRooms(9, num_frames=12)
+    source = SyntheticScenes(9, num_frames=12)
     views = ViewSampler(2, 4, max_images=8, target_views=1, seed=5)
     whole = StepSampler(source, source.scenes, views, steps=10)
     expected = [whole.step(step) for step in range(20)]
@@ -125,7 +125,7 @@ def test_a_step_does_not_depend_on_where_the_iteration_began():
 
 
 def test_scenes_that_are_too_short_are_counted_and_left_out(caplog):
-    source = SyntheticRooms(3, num_frames=5)
+    source = SyntheticScenes(3, num_frames=5)
     lengths = {"room-000000": 3, "room-000001": 5, "room-000002": 4}
     source.frames = lambda scene: range(lengths[scene])
     with caplog.at_level(logging.WARNING):
@@ -136,7 +136,7 @@ def test_scenes_that_are_too_short_are_counted_and_left_out(caplog):
 
 
 def test_scenes_that_cannot_be_indexed_are_named_and_left_out(caplog):
-    source = SyntheticRooms(3, num_frames=5)
+    source = SyntheticScenes(3, num_frames=5)
 
     def frames(scene):
         if scene == "room-000001":
@@ -153,7 +153,7 @@ def test_scenes_that_cannot_be_indexed_are_named_and_left_out(caplog):
 
 
 def test_one_frame_is_enough_for_one_view():
-    source = SyntheticRooms(1, num_frames=1)
+    source = SyntheticScenes(1, num_frames=1)
     sampler = ViewSampler(1, 1)
     assert usable_scenes(source, sampler, None) == ["room-000000"]
     assert sampler.views(4, "room-000000", [0], 0).context == (0,)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from vg2gt.data import SyntheticRooms
+from vg2gt.data import SyntheticScenes
 from vg2gt.data.synthetic.renderer import render_frame
 from vg2gt.data.synthetic.rooms import SyntheticRoom
 from vg2gt.geometry.cameras import invert_rigid, project, ray_directions, unproject
@@ -66,7 +66,7 @@ def test_depth_of_one_frame_predicts_the_next(rooms):
 
 
 def test_normals_are_those_of_the_surface():
-    rooms = SyntheticRooms(1, first_seed=5, num_frames=2, size=(56, 112))
+    rooms = SyntheticScenes(1, first_seed=5, num_frames=2, size=(56, 112))
     frames, normals = rooms.load("room-000005", [1]), rooms.normals("room-000005", [1])
     torch.testing.assert_close(normals.norm(dim=1), torch.ones(1, 56, 112), atol=1e-5, rtol=0)
     rays = ray_directions(frames.intrinsics, (56, 112))
@@ -82,7 +82,7 @@ def test_normals_are_those_of_the_surface():
 
 def test_colour_agrees_between_views():
     """Surfaces look alike from two places: texture sticks to them and light does not depend on the camera."""
-    rooms = SyntheticRooms(1, first_seed=2, num_frames=12, size=(112, 224))
+    rooms = SyntheticScenes(1, first_seed=2, num_frames=12, size=(112, 224))
     frames = rooms.load("room-000002", [5, 6])
     points = unproject(frames.depth[None, :1], camera(frames, 0))
     pixels, z = project(points, camera(frames, 1))
@@ -97,7 +97,7 @@ def test_colour_agrees_between_views():
 
 
 def test_the_same_seed_gives_the_same_room_and_another_seed_another(rooms):
-    again = SyntheticRooms(4, num_frames=6, size=SIZE)
+    again = SyntheticScenes(4, num_frames=6, size=SIZE)
     a, b = again.load("room-000001", [0, 3]), rooms.load("room-000001", [0, 3])
     assert torch.equal(a.images, b.images)
     assert torch.equal(a.depth, b.depth)
@@ -113,7 +113,7 @@ def test_threads_do_not_change_pixels():
 
 
 def test_a_damaged_cache_file_is_made_again(tmp_path, caplog):
-    rooms = SyntheticRooms(1, num_frames=2, size=SIZE, cache_dir=str(tmp_path))
+    rooms = SyntheticScenes(1, num_frames=2, size=SIZE, cache_dir=str(tmp_path))
     whole = rooms.load("room-000000", [0, 1])
     path = rooms.cache_file("room-000000")
     assert path is not None
@@ -133,7 +133,7 @@ def test_a_damaged_cache_file_is_made_again(tmp_path, caplog):
 
 
 def test_the_cache_is_read(tmp_path, monkeypatch):
-    rooms = SyntheticRooms(1, num_frames=2, size=SIZE, cache_dir=str(tmp_path))
+    rooms = SyntheticScenes(1, num_frames=2, size=SIZE, cache_dir=str(tmp_path))
     first = rooms.load("room-000000", [1])
     monkeypatch.setattr(rooms, "_render", lambda scene: pytest.fail("rendered again"))
     assert torch.equal(rooms.load("room-000000", [1]).images, first.images)
@@ -141,21 +141,21 @@ def test_the_cache_is_read(tmp_path, monkeypatch):
 
 def test_size_and_length_are_part_of_the_cache_key(tmp_path):
     names = {
-        SyntheticRooms(1, num_frames=n, size=size, cache_dir=str(tmp_path)).cache_file("room-000000")
+        SyntheticScenes(1, num_frames=n, size=size, cache_dir=str(tmp_path)).cache_file("room-000000")
         for n, size in ((2, SIZE), (3, SIZE), (2, (32, 24)))
     }
     assert len(names) == 3
 
 
 def test_a_room_of_one_frame(tmp_path):
-    frames = SyntheticRooms(1, num_frames=1, size=SIZE, cache_dir=str(tmp_path)).load("room-000000", [0])
+    frames = SyntheticScenes(1, num_frames=1, size=SIZE, cache_dir=str(tmp_path)).load("room-000000", [0])
     assert frames.depth.shape == (1, *SIZE)
 
 
 @pytest.mark.parametrize("arguments", [{"num_scenes": 0}, {"num_frames": 0}, {"first_seed": -1}])
 def test_impossible_arguments_are_refused(arguments):
     with pytest.raises(ValueError, match="num_scenes >= 1"):
-        SyntheticRooms(**arguments)
+        SyntheticScenes(**arguments)
 
 
 def test_a_room_keeps_its_pixels():

@@ -7,8 +7,6 @@ from vg2gt.data.sharded_scenes import ShardedScenes
 from vg2gt.data.sources.rgbd import RGBDFolder
 from vg2gt.data.synthetic import SyntheticScenes
 
-SyntheticRooms = SyntheticScenes
-
 __all__ = [
     "DataError",
     "Frames",
@@ -17,6 +15,5 @@ __all__ = [
     "SceneDataModule",
     "SceneSource",
     "ShardedScenes",
-    "SyntheticRooms",
     "SyntheticScenes",
 ]

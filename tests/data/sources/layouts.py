@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from vg2gt.data import Frames, SyntheticRooms
+from vg2gt.data import Frames, SyntheticScenes
 from vg2gt.data.sources.files import FileSource
 
 SIZE = (30, 40)
@@ -51,7 +51,7 @@ def all_layouts() -> dict[str, Layout]:
 
 def room(frames: int = 6) -> Frames:
     """Frames of a procedural room; written nowhere."""
-    source = SyntheticRooms(1, num_frames=frames, size=SIZE)
+    source = SyntheticScenes(1, num_frames=frames, size=SIZE)
     return source.load(source.scenes[0], range(frames))
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from vg2gt.data import DataError, Frames, SyntheticRooms
+from vg2gt.data import DataError, Frames, SyntheticScenes
 from vg2gt.data.sources import DTU, TanksAndTemples
 from vg2gt.data.sources.scan_depth import ScanDepth, read_points, render_points
 from vg2gt.geometry.cameras import unproject
@@ -83,7 +83,7 @@ def test_points_behind_and_beside_the_camera_do_not_count():
 def test_a_furnished_room_agrees_with_its_ray_caster():
     """The procedural room's depth in one view against its points from all views."""
     size = (120, 160)
-    source = SyntheticRooms(1, num_frames=4, size=size)
+    source = SyntheticScenes(1, num_frames=4, size=size)
     frames = source.load(source.scenes[0], range(4))
     points = _points(frames)
     pose, intrinsics = frames.world_to_camera[2].double().numpy(), frames.intrinsics[2].double().numpy()
