@@ -1,3 +1,22 @@
 """VG²GT: feed-forward Gaussian reconstruction on frozen visual foundation models."""
 
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from vg2gt.model import VG2GT
+    from vg2gt.reconstruction import Scene, reconstruct
+
+__all__ = ["VG2GT", "Scene", "reconstruct"]
 __version__ = "0.1.0"
+
+_HOMES = {"VG2GT": "vg2gt.model", "Scene": "vg2gt.reconstruction", "reconstruct": "vg2gt.reconstruction"}
+
+
+def __getattr__(name: str) -> Any:
+    """Imports what is asked for only then: torch and Hydra take seconds."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(_HOMES[name]), name)

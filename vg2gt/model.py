@@ -16,7 +16,8 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Literal, get_args
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import torch
 from torch import Tensor, nn
@@ -26,6 +27,9 @@ from backends.base import Backend
 from vg2gt.geometry.alignment import fit_depth_scale
 from vg2gt.geometry.cameras import relative_to_first, scale_translations
 from vg2gt.types import Gaussians, Geometry, Hints, Prediction, Tokens, Voxels
+
+if TYPE_CHECKING:
+    from vg2gt.reconstruction import Scene
 
 ScaleSource = Literal["metric", "focal", "normalize", "groundtruth"]
 CANONICAL_FOCAL = 300.0  # appendix A.1: d_metric = f * d_net / 300
@@ -112,6 +116,22 @@ class Reconstructor(nn.Module, ABC):
             raw = self.backend.decode(tokens)
         unit = self.scale(raw, hints)
         return tokens, _to_scene_frame(raw, unit), unit
+
+    @staticmethod
+    def from_pretrained(ckpt: str | Path | None = None, backend: str | None = None, **options: Any) -> Reconstructor:
+        """Builds the model of a run, its trained part loaded; see :func:`vg2gt.reconstruction.load_model`."""
+        from vg2gt.reconstruction import load_model
+
+        return load_model(ckpt, backend, **options).model
+
+    def reconstruct(self, images: Any, **options: Any) -> Scene:
+        """Reconstructs a scene from image files, folders, videos or arrays.
+
+        See :func:`vg2gt.reconstruction.reconstruct_with` for ``images`` and the options.
+        """
+        from vg2gt.reconstruction import reconstruct_with
+
+        return reconstruct_with(self, images, **options)
 
     def trained_parameters(self) -> list[nn.Parameter]:
         """The parameters that training changes: everything but the backbone."""

@@ -5,7 +5,14 @@ from __future__ import annotations
 import importlib
 import sys
 
-COMMANDS = {"train": "vg2gt.cli.train", "evaluate": "vg2gt.cli.evaluate", "ablate": "vg2gt.ablate"}
+COMMANDS = {
+    "train": "vg2gt.cli.train",
+    "evaluate": "vg2gt.cli.evaluate",
+    "ablate": "vg2gt.ablate",
+    "reconstruct": "vg2gt.cli.reconstruct",
+    "render": "vg2gt.cli.render",
+    "view": "vg2gt.cli.view",
+}
 
 
 def main() -> None:

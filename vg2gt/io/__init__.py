@@ -20,6 +20,7 @@ from vg2gt.io.mesh import Mesh, fuse_depth, write_mesh
 from vg2gt.io.nerfstudio import Lens, Transforms, TransformsFrame, read_transforms, write_transforms
 from vg2gt.io.ply import PointCloud, read_gaussian_ply, read_point_ply, write_gaussian_ply, write_point_ply
 from vg2gt.io.splat import read_splat, write_splat
+from vg2gt.io.video import read_video, write_video
 
 __all__ = [
     "ColmapCamera",
@@ -46,6 +47,7 @@ __all__ = [
     "read_point_ply",
     "read_splat",
     "read_transforms",
+    "read_video",
     "write_cameras_json",
     "write_colmap",
     "write_gaussian_ply",
@@ -54,4 +56,5 @@ __all__ = [
     "write_point_ply",
     "write_splat",
     "write_transforms",
+    "write_video",
 ]

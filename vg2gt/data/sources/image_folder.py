@@ -85,10 +85,10 @@ def _guess(size: Size) -> NDArray[np.float64]:
 
 def _images(folder: Path) -> list[Path]:
     files = [path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()]
-    return sorted((path for path in files if not path.name.startswith(".")), key=_by_number)
+    return sorted((path for path in files if not path.name.startswith(".")), key=by_number)
 
 
-def _by_number(path: Path) -> tuple[list[str | int], str]:
-    """Sorts runs of digits by their value; they stand at the odd places of the split name."""
+def by_number(path: Path) -> tuple[list[str | int], str]:
+    """Sorting key of a file by its name, runs of digits by their value; they stand at the odd places of the split."""
     parts = re.split(r"(\d+)", path.name)
     return [int(part) if i % 2 else part for i, part in enumerate(parts)], path.name

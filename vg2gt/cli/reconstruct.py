@@ -1,0 +1,126 @@
+"""``vg2gt reconstruct``: images, a folder of them or a video to a scene."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+from rich.console import Console
+from rich.logging import RichHandler
+
+from vg2gt.evaluation.settings import choose_device
+from vg2gt.io.video import MissingDecoderError, require_ffmpeg
+from vg2gt.reconstruction import OUTPUTS, Monitor, OutOfMemory, Ready, load_model, reconstruct_with, write_outputs
+from vg2gt.reconstruction.outputs import DEFAULT, ORBIT_FRAMES, check_outputs, cost_figures, prepare_folder
+
+EXPECTED_ERRORS = (ValueError, FileNotFoundError, FileExistsError, PermissionError, OutOfMemory, MissingDecoderError)
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command's arguments."""
+    listing = "\n".join(f"  {name:<13} {text}" for name, text in OUTPUTS.items())
+    arguments = argparse.ArgumentParser(
+        "vg2gt reconstruct",
+        description="Reconstructs a scene of 3D Gaussians from images.",
+        epilog=f"outputs of --save:\n{listing}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = arguments.add_argument
+    add("images", nargs="+", help="image files, a folder of them, a video, or a recording with known cameras")
+    add("--out", required=True, metavar="DIR", help="where to write")
+    add("--ckpt", metavar="PATH", help="a checkpoint or a run's folder; without it the head is untrained")
+    add("--backend", metavar="NAME[,KEY=VALUE...]", help="of configs/backend; default: the run's own")
+    add("--model", metavar="NAME[,KEY=VALUE...]", help="of configs/model; default: the run's own")
+    add("--set", action="append", default=[], metavar="KEY=VALUE", help="another option, such as model.fine.max_voxels")
+    add("--save", type=_names, default=list(DEFAULT), metavar="LIST", help=f"default: {','.join(DEFAULT)}")
+    add("--size", type=_size, metavar="N|HxW", help="longer side, or height x width, in pixels; default 518, CPU 280")
+    add("--every", type=int, default=1, metavar="N", help="take every N-th image or frame only")
+    add("--max-images", type=int, metavar="N", help="take at most N, evenly spread; of a video 32 by default")
+    add("--mode", choices=("solid", "rasterized"), default="solid", help="how views are rendered")
+    add("--frames", type=int, default=ORBIT_FRAMES, metavar="N", help=f"length of the orbit, default {ORBIT_FRAMES}")
+    add("--mesh-voxel", type=float, metavar="X", help="edge of the mesh's voxels in scene units")
+    add("--device", default="auto", help="auto, cpu, cuda, cuda:N")
+    add("--overwrite", action="store_true", help="replace outputs that are there")
+    add("--quiet", action="store_true", help="no progress bars")
+    return arguments
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Runs the command; ends with one line on what is wrong where something is."""
+    options = parser().parse_args(argv)
+    logging.basicConfig(
+        level=logging.WARNING,
+        format="%(message)s",
+        handlers=[RichHandler(console=Console(stderr=True), show_time=False, show_path=False)],
+    )
+    try:
+        run(options)
+    except EXPECTED_ERRORS as error:
+        sys.exit(f"{type(error).__name__}: {error}")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Reconstructs and writes."""
+    check_outputs(options.save)
+    prepare_folder(options.out, options.save, options.overwrite)
+    if "orbit.mp4" in options.save:
+        require_ffmpeg("writing orbit.mp4")
+    with Monitor(show=not options.quiet, device=choose_device(options.device)) as monitor:
+        with monitor.stage("load model"):
+            ready = load_model(options.ckpt, options.backend, options.model, options.set, device=options.device)
+        scene = reconstruct_with(
+            ready.model,
+            options.images,
+            every=options.every,
+            max_images=options.max_images,
+            size=options.size,
+            renderer=replace(ready.renderer, mode=options.mode),
+            monitor=monitor,
+        )
+        figures = _figures(ready)
+        folder = write_outputs(
+            scene,
+            options.out,
+            options.save,
+            overwrite=options.overwrite,
+            frames=options.frames,
+            mesh_voxel=options.mesh_voxel,
+            figures=figures,
+            monitor=monitor,
+        )
+    cost = cost_figures(monitor)
+    times = ", ".join(f"{name} {seconds:.1f}" for name, seconds in cost["seconds"].items())
+    height, width = scene.cameras.size
+    print(f"{len(scene.names)} images of {height}x{width}: {len(scene.gaussians)} Gaussians")
+    print(f"weights: {figures['weights']}")
+    print(f"seconds: {times}; peak memory {cost['peak_memory_mib']} MiB")
+    print(f"written: {', '.join(str(folder / name) for name in options.save)}")
+
+
+def _figures(ready: Ready) -> dict[str, Any]:
+    trained = bool(ready.model.trained_parameters())
+    return {
+        "model": type(ready.model).__name__,
+        "backend": ready.model.backend.identity(),
+        "weights": str(ready.weights) if trained else "none: the model has no trained part",
+    }
+
+
+def _names(text: str) -> list[str]:
+    return [name.strip() for name in text.split(",") if name.strip()]
+
+
+def _size(text: str) -> int | tuple[int, int]:
+    sides = text.lower().split("x")
+    if len(sides) > 2 or not all(side.isdigit() and int(side) > 0 for side in sides):
+        raise argparse.ArgumentTypeError(f"{text!r} is neither N nor HxW, such as 518 or 294x518")
+    numbers = [int(side) for side in sides]
+    return numbers[0] if len(numbers) == 1 else (numbers[0], numbers[1])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,102 @@
+"""``vg2gt render``: a scene's file seen from given cameras: colour, depth, normals, an animation."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from vg2gt.cli.reconstruct import EXPECTED_ERRORS
+from vg2gt.evaluation.settings import choose_device
+from vg2gt.io import read_cameras_json, read_gaussian_ply, read_splat
+from vg2gt.reconstruction import Monitor, interpolate, render_views
+from vg2gt.reconstruction.maps import MAPS, Animation, Sink, map_sinks
+from vg2gt.reconstruction.outputs import FPS, check_outputs, cost_figures, prepare_folder
+from vg2gt.rendering import Renderer
+from vg2gt.types import Gaussians
+
+OUTPUTS = {**MAPS, "video.gif": "the colour of all views as an animation", "video.mp4": "the same as H.264"}
+DEFAULT = ("color.png",)
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command's arguments."""
+    listing = "\n".join(f"  {name:<12} {text}" for name, text in OUTPUTS.items())
+    arguments = argparse.ArgumentParser(
+        "vg2gt render",
+        description="Renders a scene of 3D Gaussians into the cameras of a cameras.json.",
+        epilog=f"outputs of --save:\n{listing}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = arguments.add_argument
+    add("scene", help="scene.ply or scene.splat")
+    add("--cameras", required=True, metavar="PATH", help="cameras.json")
+    add("--out", required=True, metavar="DIR", help="where to write")
+    add("--save", default=",".join(DEFAULT), metavar="LIST", help=f"default: {','.join(DEFAULT)}")
+    add("--mode", choices=("solid", "rasterized"), default="solid")
+    add("--depth", choices=("median", "expected"), default="median", help="expected: rasterized only")
+    add("--interpolate", type=int, metavar="N", help="go smoothly through the cameras with N new ones between each two")
+    add("--fps", type=float, default=FPS, help=f"of the animation, default {FPS:g}")
+    add("--near", type=float, default=0.01, help="near plane in scene units")
+    add("--device", default="auto", help="auto, cpu, cuda, cuda:N")
+    add("--overwrite", action="store_true", help="replace outputs that are there")
+    add("--quiet", action="store_true", help="no progress bars")
+    return arguments
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Runs the command; ends with one line on what is wrong where something is."""
+    options = parser().parse_args(argv)
+    try:
+        run(options)
+    except EXPECTED_ERRORS as error:
+        sys.exit(f"{type(error).__name__}: {error}")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Renders and writes."""
+    outputs = [name.strip() for name in options.save.split(",")]
+    check_outputs(outputs, OUTPUTS)
+    cameras = read_cameras_json(options.cameras)
+    if not cameras:
+        raise ValueError(f"{options.cameras} names no camera; there is nothing to render")
+    cameras = cameras if options.interpolate is None else interpolate(cameras, options.interpolate)
+    gaussians = read_gaussians(options.scene).to(choose_device(options.device))
+    renderer = Renderer(mode=options.mode, depth=options.depth, near=options.near)
+    folder = prepare_folder(options.out, outputs, options.overwrite)
+    sinks: list[Sink] = list(map_sinks(folder, outputs))
+    sinks += [Animation(folder / name, options.fps) for name in outputs if name.startswith("video")]
+    with Monitor(show=not options.quiet, device=gaussians.means.device) as monitor:
+        with monitor.stage("render", len(cameras)) as advance:
+            for view in render_views(renderer, gaussians, cameras):
+                for sink in sinks:
+                    sink.add(view)
+                advance()
+        with monitor.stage("write"):
+            for sink in sinks:
+                sink.close()
+    cost = cost_figures(monitor)
+    seconds = sum(cost["seconds"].values())
+    print(f"{len(cameras)} views of {len(gaussians)} Gaussians: {seconds:.1f} s, peak {cost['peak_memory_mib']} MiB")
+    print(f"written: {', '.join(str(folder / name) for name in outputs)}")
+
+
+def read_gaussians(path: str | Path) -> Gaussians:
+    """Reads a scene by its suffix.
+
+    Raises:
+        FileNotFoundError: if there is none.
+        ValueError: if it cannot be read or has another suffix.
+    """
+    path = Path(path)
+    readers = {".ply": read_gaussian_ply, ".splat": read_splat}
+    if path.suffix.lower() not in readers:
+        raise ValueError(f"{path}: expected a scene of Gaussians, {' or '.join(readers)}")
+    if not path.is_file():
+        raise FileNotFoundError(f"no scene at {path}")
+    return readers[path.suffix.lower()](path)
+
+
+if __name__ == "__main__":
+    main()

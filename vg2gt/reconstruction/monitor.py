@@ -1,0 +1,105 @@
+"""What a command is doing, how long each stage took, and how much memory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Any
+
+import torch
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from vg2gt.evaluation.cost import now, peak_memory_mib, reset_peak_memory
+from vg2gt.model import Reconstructor
+
+_PARTS = {"coarse": "enhance tokens", "fine": "fine voxels", "gaussians": "Gaussians"}
+
+
+class Monitor:
+    """Measures stages; shows them as progress bars where asked.
+
+    Args:
+        show: draw progress bars on the standard error stream.
+        device: whose work is waited for and whose memory is measured.
+
+    Attributes:
+        seconds: wall time by stage, in the order in which they began; a stage that comes twice adds up. Time of a
+            stage inside another one counts for the inner one only.
+    """
+
+    def __init__(self, show: bool = False, device: torch.device | str = "cpu") -> None:
+        self.device = torch.device(device)
+        self.seconds: dict[str, float] = {}
+        self._progress = Progress(
+            TextColumn("{task.description:<24}"),
+            BarColumn(24),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            console=Console(stderr=True),
+            disable=not show,
+        )
+        self._running: list[str] = []
+        self._since = 0.0
+
+    def __enter__(self) -> Monitor:
+        reset_peak_memory(self.device)
+        self._progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._progress.stop()
+
+    @property
+    def peak_memory_mib(self) -> float:
+        """Peak memory so far: of the GPU since this monitor began, or of the whole process on a CPU."""
+        return peak_memory_mib(self.device)
+
+    @contextmanager
+    def stage(self, name: str, total: int = 1) -> Iterator[Callable[[], None]]:
+        """Measures the block; yields what to call after each of ``total`` steps (the end of the block completes it)."""
+        self._settle()
+        self._running.append(name)
+        self.seconds.setdefault(name, 0.0)
+        task = self._progress.add_task(name, total=total)
+        try:
+            yield lambda: self._progress.update(task, advance=1)
+            self._progress.update(task, completed=total)
+        finally:
+            self._settle()
+            self._running.pop()
+
+    def _settle(self) -> None:
+        """Gives the time since the last change of stages to the stage that was running."""
+        moment = now(self.device)
+        if self._running:
+            self.seconds[self._running[-1]] += moment - self._since
+        self._since = moment
+
+    @contextmanager
+    def watching(self, model: Reconstructor) -> Iterator[None]:
+        """Inside the block the parts of a model report as stages of their own."""
+        backend: Any = model.backend
+        parts: list[tuple[Any, str, str]] = [(backend, "encode", "backbone"), (backend, "decode", "decode geometry")]
+        parts += [(module, "forward", _PARTS[name]) for name, module in model.named_children() if name in _PARTS]
+        with ExitStack() as stack:
+            for owner, method, name in parts:
+                stack.enter_context(self._reporting(owner, method, name))
+            yield
+
+    @contextmanager
+    def _reporting(self, owner: Any, method: str, name: str) -> Iterator[None]:
+        original, own = getattr(owner, method), vars(owner).get(method)
+
+        def call(*args: Any, **kwargs: Any) -> Any:
+            with self.stage(name):
+                return original(*args, **kwargs)
+
+        setattr(owner, method, call)
+        try:
+            yield
+        finally:
+            if own is None:
+                delattr(owner, method)  # the class's own shows again
+            else:
+                setattr(owner, method, own)

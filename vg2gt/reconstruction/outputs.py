@@ -1,0 +1,282 @@
+"""Everything that can be written of a scene, by the name of its file."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from vg2gt.io import (
+    Lens,
+    Transforms,
+    TransformsFrame,
+    colmap_from_views,
+    fuse_depth,
+    write_cameras_json,
+    write_colmap,
+    write_gaussian_ply,
+    write_glb,
+    write_mesh,
+    write_point_ply,
+    write_splat,
+    write_transforms,
+)
+from vg2gt.io.files import write_bytes, write_json
+from vg2gt.reconstruction.maps import MAPS, Animation, Sink, map_sinks, png, to_pixels, whole_folder
+from vg2gt.reconstruction.monitor import Monitor
+from vg2gt.reconstruction.paths import orbit
+from vg2gt.reconstruction.report import HtmlReport, PngReport
+from vg2gt.reconstruction.scene import RenderedView, Scene
+
+ORBIT_FRAMES, FPS = 72, 24.0
+MESH_PIXELS = 2.0  # edge of a mesh's voxel, in pixels at the median depth
+_MESH_DEPTHS = 10.0  # in median depths: what is farther is left out of the mesh
+
+OUTPUTS = {
+    "scene.ply": "the Gaussians, as 3D Gaussian Splatting writes them",
+    "scene.splat": "the Gaussians, 32 bytes each, for web viewers",
+    "cameras.json": "the cameras of the views",
+    "points.ply": "coloured points of the decoded depth",
+    "points.glb": "the same points and the cameras, for any 3D viewer",
+    "images": "the input images at the working size, PNGs in images/",
+    **MAPS,
+    "mesh.ply": "a mesh fused from rendered depth",
+    "mesh.glb": "the same as GLB",
+    "mesh.obj": "the same as OBJ",
+    "orbit.gif": "an animation about the central view",
+    "orbit.mp4": "the same as H.264",
+    "colmap": "a COLMAP model and its images in colmap/",
+    "nerfstudio": "transforms.json, points and images in nerfstudio/",
+    "report.png": "input, colour, depth and normals of up to 12 views",
+    "report.html": "the same of all views, with the run's figures",
+    "report.json": "the run's figures: backend, weights, sizes, time a stage, peak memory",
+}
+DEFAULT = ("scene.ply", "cameras.json", "report.png", "report.json")
+
+
+def check_outputs(outputs: Sequence[str], known: Mapping[str, str] = OUTPUTS) -> None:
+    """Checks names of outputs.
+
+    Raises:
+        ValueError: if one is unknown, or there is none; lists what there is.
+    """
+    for output in outputs or [""]:
+        if output not in known:
+            raise ValueError(f"unknown output {output!r}; choose from: {', '.join(known)}")
+
+
+def prepare_folder(folder: str | Path, outputs: Sequence[str], overwrite: bool) -> Path:
+    """Makes the output folder and checks that the outputs can be written into it.
+
+    Raises:
+        FileExistsError: if an output is there already and must not be overwritten.
+        PermissionError: if the folder cannot be written to.
+    """
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise PermissionError(
+            f"the output folder {folder} cannot be made ({error.strerror}); choose another"
+        ) from error
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise PermissionError(f"the output folder {folder} is not writable; choose another")
+    there = [target for target in (folder / _target(output) for output in outputs) if target.exists()]
+    if there and not overwrite:
+        raise FileExistsError(f"{there[0]} is there already; choose another folder, or overwrite it (--overwrite)")
+    return folder
+
+
+def write_outputs(
+    scene: Scene,
+    folder: str | Path,
+    outputs: Sequence[str] = DEFAULT,
+    *,
+    overwrite: bool = False,
+    frames: int = ORBIT_FRAMES,
+    mesh_voxel: float | None = None,
+    figures: Mapping[str, Any] | None = None,
+    monitor: Monitor | None = None,
+) -> Path:
+    """Writes outputs of a scene, each file or folder whole or not at all.
+
+    Args:
+        scene: what to write.
+        folder: where; made if it is not there.
+        outputs: among :data:`OUTPUTS`.
+        overwrite: replace what is there.
+        frames: length of the orbit.
+        mesh_voxel: edge of the mesh's voxels in scene units; None: two pixels at the median depth.
+        figures: what ``report.json`` and ``report.html`` say beside the scene's own figures.
+        monitor: told of the stages.
+
+    Returns:
+        The folder.
+
+    Raises:
+        FileExistsError: if an output is there already.
+        PermissionError: if the folder cannot be written to.
+        MissingDecoderError: if an animation needs ffmpeg and there is none.
+        ValueError: if an output is unknown.
+    """
+    check_outputs(outputs)
+    folder = prepare_folder(folder, outputs, overwrite)
+    monitor = monitor or Monitor()
+    animations = [Animation(folder / output, FPS) for output in outputs if output.startswith("orbit")]
+    plain = [output for output in outputs if output in _WRITERS]
+    if plain:
+        with monitor.stage("write files", len(plain)) as advance:
+            for output in plain:
+                _WRITERS[output](scene, folder / _target(output))
+                advance()
+    sinks = map_sinks(folder, outputs)
+    sinks += [Mesh(scene, folder, outputs, mesh_voxel)] if any(o.startswith("mesh") for o in outputs) else []
+    sinks += [PngReport(scene, folder / "report.png")] if "report.png" in outputs else []
+    page = HtmlReport(scene, folder / "report.html") if "report.html" in outputs else None
+    sinks += [page] if page else []
+    if sinks:
+        _feed(scene, sinks, monitor)
+    if animations:
+        _turn(scene, animations, frames, monitor)
+    facts = {**scene_figures(scene), **(figures or {}), **cost_figures(monitor)}
+    if page:
+        page.write(facts, folder / "orbit.gif" if "orbit.gif" in outputs else None)
+    if "report.json" in outputs:
+        write_json(folder / "report.json", facts)
+    return folder
+
+
+def scene_figures(scene: Scene) -> dict[str, Any]:
+    """What a report says of a scene."""
+    height, width = scene.cameras.size
+    return {
+        "views": len(scene.names),
+        "size": [height, width],
+        "gaussians": len(scene.gaussians),
+        "metres_per_unit": scene.metres_per_unit,
+        "mode": scene.renderer.mode,
+    }
+
+
+def cost_figures(monitor: Monitor) -> dict[str, Any]:
+    """Time by stage and peak memory."""
+    seconds = {name: round(value, 3) for name, value in monitor.seconds.items()}
+    return {"seconds": seconds, "peak_memory_mib": round(monitor.peak_memory_mib), "device": str(monitor.device)}
+
+
+class Mesh:
+    """Keeps the rendered depth and colour of the views and fuses them into a mesh."""
+
+    def __init__(self, scene: Scene, folder: Path, outputs: Sequence[str], voxel_size: float | None) -> None:
+        self.scene = scene
+        self.paths = [folder / output for output in outputs if output.startswith("mesh")]
+        self.voxel_size = voxel_size
+        self._depth: list[Tensor] = []
+        self._color: list[Tensor] = []
+
+    def add(self, view: RenderedView) -> None:
+        """Keeps what is needed of a view."""
+        self._depth.append(view.depth)
+        self._color.append(view.color)
+
+    def close(self) -> None:
+        """Fuses and writes."""
+        depth = torch.stack(self._depth)
+        if not (depth > 0).any():
+            raise ValueError("no view has rendered depth, so there is no mesh; leave mesh out of the outputs")
+        median = float(depth[depth > 0].median())
+        depth = torch.where(depth < _MESH_DEPTHS * median, depth, 0)
+        focal = float(self.scene.cameras.intrinsics[..., [0, 1], [0, 1]].mean())
+        voxel_size = self.voxel_size or MESH_PIXELS * median / focal
+        mesh = fuse_depth(depth, self.scene.cameras, torch.stack(self._color), voxel_size=voxel_size)
+        for path in self.paths:
+            write_mesh(path, mesh)
+
+
+def _feed(scene: Scene, sinks: Sequence[Sink], monitor: Monitor) -> None:
+    with monitor.stage("render views", len(scene.names)) as advance:
+        for view in scene.render():
+            for sink in sinks:
+                sink.add(view)
+            advance()
+    with monitor.stage("write maps", len(sinks)) as advance:
+        for sink in sinks:
+            sink.close()
+            advance()
+
+
+def _turn(scene: Scene, animations: Sequence[Animation], frames: int, monitor: Monitor) -> None:
+    path = orbit(scene.named_cameras(), float(scene.depth[scene.depth > 0].median()), frames)
+    with monitor.stage("render orbit", len(path)) as advance:
+        for view in scene.render(path):
+            for animation in animations:
+                animation.add(view)
+            advance()
+        for animation in animations:
+            animation.close()
+
+
+def _write_images(scene: Scene, folder: Path) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, image in zip(scene.names, scene.images, strict=True):
+        write_bytes(folder / f"{name}.png", png(to_pixels(image)))
+
+
+def _images(scene: Scene, target: Path) -> None:
+    with whole_folder(target) as folder:
+        _write_images(scene, folder)
+
+
+def _colmap(scene: Scene, target: Path) -> None:
+    points = scene.points()
+    names = [camera.name for camera in scene.named_cameras()]
+    model = colmap_from_views(scene.cameras, names, points.positions, points.colors, (points.views, points.pixels))
+    with whole_folder(target) as folder:
+        _write_images(scene, folder / "images")
+        write_colmap(folder / "sparse" / "0", model)
+
+
+def _nerfstudio(scene: Scene, target: Path) -> None:
+    frames = [
+        TransformsFrame(
+            f"images/{camera.name}",
+            camera.world_to_camera,
+            Lens.from_intrinsics(camera.intrinsics, (camera.height, camera.width)),
+        )
+        for camera in scene.named_cameras()
+    ]
+    with whole_folder(target) as folder:
+        _write_images(scene, folder / "images")
+        _points_ply(scene, folder / "points.ply")
+        write_transforms(folder / "transforms.json", Transforms(tuple(frames), ply_file_path="points.ply"))
+
+
+def _points_ply(scene: Scene, path: Path) -> None:
+    points = scene.points()
+    write_point_ply(path, points.positions, points.colors)
+
+
+def _points_glb(scene: Scene, path: Path) -> None:
+    points = scene.points()
+    write_glb(path, points.positions, points.colors, scene.cameras)
+
+
+def _target(output: str) -> str:
+    """The file or folder of an output."""
+    return os.path.splitext(output)[0] if output in MAPS else output
+
+
+_WRITERS: dict[str, Callable[[Scene, Path], Any]] = {
+    "scene.ply": lambda scene, path: write_gaussian_ply(path, scene.gaussians),
+    "scene.splat": lambda scene, path: write_splat(path, scene.gaussians),
+    "cameras.json": lambda scene, path: write_cameras_json(path, scene.named_cameras()),
+    "points.ply": _points_ply,
+    "points.glb": _points_glb,
+    "images": _images,
+    "colmap": _colmap,
+    "nerfstudio": _nerfstudio,
+}

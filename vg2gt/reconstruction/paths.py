@@ -1,0 +1,103 @@
+"""Camera paths for videos: an orbit around what the views look at, and smooth ways between given cameras."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, RotationSpline
+
+from vg2gt.io.cameras_json import NamedCamera
+
+WIDTH, HEIGHT = 0.15, 0.06  # half axes of the orbit, in distances to what is looked at
+
+
+def orbit(cameras: Sequence[NamedCamera], distance: float, frames: int = 72) -> list[NamedCamera]:
+    """One round of an ellipse about the most central camera, always facing the point in front of it.
+
+    Where few images were taken from one side, wide orbits would look behind the scene; this one stays in front.
+
+    Args:
+        cameras: the views.
+        distance: to the point that is looked at, along the central camera's axis, in scene units.
+        frames: length of the path.
+
+    Raises:
+        ValueError: if there are no cameras or the numbers are not positive.
+    """
+    if not cameras or not distance > 0 or frames < 1:
+        raise ValueError(f"an orbit needs cameras, a distance and frames, got {len(cameras)}, {distance}, {frames}")
+    centers = np.stack([_inverse(camera.world_to_camera)[:3, 3] for camera in cameras])
+    middle = cameras[int(np.linalg.norm(centers - np.median(centers, 0), axis=1).argmin())]
+    to_world = _inverse(middle.world_to_camera)
+    path = []
+    for angle in 2 * math.pi * np.arange(frames) / frames:
+        place = distance * np.array([WIDTH * math.sin(angle), -HEIGHT * math.cos(angle), 0])
+        local = np.eye(4)
+        local[:3, :3] = _facing(np.array([0, 0, distance]) - place)
+        local[:3, 3] = place
+        path.append(_moved(middle, _inverse(to_world @ local), len(path)))
+    return path
+
+
+def interpolate(cameras: Sequence[NamedCamera], between: int) -> list[NamedCamera]:
+    """A smooth way through given cameras: splines of position and rotation, linear intrinsics.
+
+    Args:
+        cameras: at least two, of one image size; all are on the path.
+        between: new cameras between each two.
+
+    Returns:
+        The path, ``(n - 1) * (between + 1) + 1`` cameras.
+
+    Raises:
+        ValueError: if there are fewer than two cameras, their sizes differ, or ``between`` is negative.
+    """
+    if len(cameras) < 2 or between < 0:
+        raise ValueError(f"a path needs at least two cameras and 0 or more between them, got {len(cameras)}, {between}")
+    sizes = {(camera.width, camera.height) for camera in cameras}
+    if len(sizes) > 1:
+        raise ValueError(f"cameras of one image size are needed, these have {sorted(sizes)}; choose some of one size")
+    times = np.arange(len(cameras), dtype=np.float64)
+    poses = np.stack([_inverse(camera.world_to_camera) for camera in cameras])
+    positions = CubicSpline(times, poses[:, :3, 3], bc_type="natural")
+    rotations = RotationSpline(times, Rotation.from_matrix(poses[:, :3, :3]))
+    intrinsics = np.stack([camera.intrinsics for camera in cameras])
+    path = []
+    for number in range((len(cameras) - 1) * (between + 1) + 1):
+        left, step = divmod(number, between + 1)
+        if step == 0:  # exactly the given one, whatever the splines' rounding
+            path.append(cameras[left])
+            continue
+        time = left + step / (between + 1)
+        pose = np.eye(4)
+        pose[:3, :3] = rotations(time).as_matrix()
+        pose[:3, 3] = positions(time)
+        share = time - left
+        k = (1 - share) * intrinsics[left] + share * intrinsics[left + 1]
+        name = f"{cameras[left].name}-{step:03d}"
+        path.append(NamedCamera(name, cameras[0].width, cameras[0].height, k, _inverse(pose)))
+    return path
+
+
+def _moved(camera: NamedCamera, world_to_camera: NDArray[np.float64], number: int) -> NamedCamera:
+    return NamedCamera(f"orbit-{number:04d}", camera.width, camera.height, camera.intrinsics, world_to_camera)
+
+
+def _facing(direction: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Camera-to-world rotation that looks along a direction with its x axis level (y down)."""
+    forward = direction / np.linalg.norm(direction)
+    right = np.cross([0.0, 1.0, 0.0], forward)
+    right /= np.linalg.norm(right)
+    return np.stack((right, np.cross(forward, right), forward), 1)
+
+
+def _inverse(pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Inverse of a rigid transform, whose rotation stays one to the last digit."""
+    inverse = np.eye(4)
+    inverse[:3, :3] = pose[:3, :3].T
+    inverse[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
+    return inverse

@@ -1,0 +1,119 @@
+"""From images to a scene in one call."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import torch
+
+from vg2gt.model import Reconstructor
+from vg2gt.reconstruction.models import load_model
+from vg2gt.reconstruction.monitor import Monitor
+from vg2gt.reconstruction.pictures import ImagesLike, find_pictures
+from vg2gt.reconstruction.scene import Scene
+from vg2gt.reconstruction.views import Views, load_views, working_size
+from vg2gt.rendering import Renderer
+from vg2gt.types import Prediction
+
+
+class OutOfMemory(MemoryError):
+    """The device's memory is full; the message says what to change."""
+
+
+def reconstruct(
+    images: ImagesLike,
+    ckpt: str | Path | None = None,
+    backend: str | None = None,
+    *,
+    every: int = 1,
+    max_images: int | None = None,
+    size: int | tuple[int, int] | None = None,
+    device: str = "auto",
+) -> Scene:
+    """Builds a model and reconstructs a scene: :func:`load_model`, then :func:`reconstruct_with`."""
+    ready = load_model(ckpt, backend, device=device)
+    return reconstruct_with(ready.model, images, every=every, max_images=max_images, size=size, renderer=ready.renderer)
+
+
+@torch.no_grad()
+def reconstruct_with(
+    model: Reconstructor,
+    images: ImagesLike,
+    *,
+    every: int = 1,
+    max_images: int | None = None,
+    size: int | tuple[int, int] | None = None,
+    renderer: Renderer | None = None,
+    monitor: Monitor | None = None,
+) -> Scene:
+    """Reconstructs a scene from any number of images.
+
+    Args:
+        model: the model; it is put into eval mode.
+        images: see :func:`vg2gt.reconstruction.find_pictures`.
+        every: take every this many-th image only.
+        max_images: take at most so many, evenly spread.
+        size: see :func:`vg2gt.reconstruction.working_size`.
+        renderer: how the scene will be rendered; None: as solids, with the default options.
+        monitor: told of the stages.
+
+    Returns:
+        The scene, in the frame of the first image's camera; its Gaussians stay on the model's device.
+
+    Raises:
+        FileNotFoundError: if a path does not exist.
+        ValueError: if there are no images, one cannot be read, or the backend needs what they do not have.
+        OutOfMemory: if the device's memory is full.
+    """
+    monitor = monitor or Monitor()
+    device = next((parameter.device for parameter in model.parameters()), torch.device("cpu"))
+    pictures = find_pictures(images, every, max_images, posed=model.backend.needs_hints)
+    target = working_size([p.size for p in pictures], model.backend.patch_size, device.type, size)
+    with memory_advice(len(pictures), target):
+        views = load_views(pictures, target, monitor)
+        prediction = _forward(model.eval(), views, device, monitor)
+    return _scene(prediction, views, renderer or Renderer(), model.backend.is_metric)
+
+
+def _forward(model: Reconstructor, views: Views, device: torch.device, monitor: Monitor) -> Prediction:
+    hints = None if views.hints is None else views.hints.to(device)
+    with monitor.stage("reconstruct"), monitor.watching(model):
+        return model(views.images[None].to(device), hints)
+
+
+def _scene(prediction: Prediction, views: Views, renderer: Renderer, is_metric: bool) -> Scene:
+    geometry = prediction.geometry.detach()
+    if not len(prediction.gaussians):
+        raise ValueError("the backend found no depth in any image, so there is nothing to reconstruct")
+    return Scene(
+        gaussians=prediction.gaussians.detach(),
+        cameras=geometry.cameras,
+        images=views.images,
+        depth=geometry.depth[0].cpu(),
+        depth_conf=geometry.depth_conf[0].cpu(),
+        names=views.names,
+        renderer=renderer,
+        metres_per_unit=float(geometry.scale) if is_metric else None,
+    )
+
+
+@contextmanager
+def memory_advice(images: int, size: tuple[int, int]) -> Iterator[None]:
+    """Turns what torch says when memory is full into what to do about it.
+
+    Raises:
+        OutOfMemory: naming the knobs.
+    """
+    try:
+        yield
+    except (RuntimeError, MemoryError) as error:
+        full = isinstance(error, (MemoryError, torch.OutOfMemoryError)) or "allocate memory" in str(error)
+        if not full:
+            raise
+        raise OutOfMemory(
+            f"memory is full with {images} images of {size[0]}x{size[1]} ({str(error).splitlines()[0]}). Take fewer "
+            "images (--max-images, --every), smaller ones (--size), fewer voxels (--set model.fine.max_voxels=500000), "
+            "or smaller chunks (--set backend.head_chunk=2, --set model.fine.dense_head.views_per_chunk=2)"
+        ) from error

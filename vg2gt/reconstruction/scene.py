@@ -1,0 +1,132 @@
+"""A reconstructed scene: Gaussians, the cameras they were seen from, and the images."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from vg2gt.geometry.cameras import unproject
+from vg2gt.io.cameras_json import NamedCamera, named_cameras
+from vg2gt.rendering import Renderer
+from vg2gt.types import Cameras, Gaussians
+
+POINTS = 100_000
+
+
+@dataclass(frozen=True)
+class RenderedView:
+    """One rendered view on the CPU.
+
+    Attributes:
+        camera: where it was rendered.
+        color: ``[3, H, W]`` in [0, 1], black behind the scene.
+        depth: ``[H, W]`` z-depth in scene units, 0 = none.
+        normal: ``[3, H, W]`` in the camera's frame, not unit length.
+        alpha: ``[H, W]`` opacity in [0, 1].
+    """
+
+    camera: NamedCamera
+    color: Tensor
+    depth: Tensor
+    normal: Tensor
+    alpha: Tensor
+
+
+@dataclass(frozen=True)
+class ScenePoints:
+    """Coloured points of a scene, each with the pixel it comes from.
+
+    Attributes:
+        positions: ``[N, 3]`` float64 in the world frame.
+        colors: ``[N, 3]`` uint8.
+        views: ``[N]`` index of the view.
+        pixels: ``[N, 2]`` (x, y), integer pixel centres.
+    """
+
+    positions: NDArray[np.float64]
+    colors: NDArray[np.uint8]
+    views: NDArray[np.int64]
+    pixels: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What :func:`vg2gt.reconstruct` gives.
+
+    The world is the frame of the first image's camera (x right, y down, z forward).
+
+    Attributes:
+        gaussians: the scene, on the device it was made on.
+        cameras: the views' cameras ``[1, V]``, of images of the working size.
+        images: ``[V, 3, H, W]`` in [0, 1]: the input at the working size.
+        depth: ``[V, H, W]`` decoded z-depth in scene units, 0 = none.
+        depth_conf: ``[V, H, W]`` its confidence, larger is better.
+        names: one a view.
+        renderer: how it is rendered.
+        metres_per_unit: metres a scene unit; None where nobody knows.
+    """
+
+    gaussians: Gaussians
+    cameras: Cameras
+    images: Tensor
+    depth: Tensor
+    depth_conf: Tensor
+    names: tuple[str, ...]
+    renderer: Renderer
+    metres_per_unit: float | None = None
+
+    def named_cameras(self) -> list[NamedCamera]:
+        """The views' cameras, named like the image files that :meth:`save` writes."""
+        return named_cameras(self.cameras, [f"{name}.png" for name in self.names])
+
+    def render(self, cameras: Sequence[NamedCamera] | None = None) -> Iterator[RenderedView]:
+        """Renders views one by one, so that memory does not grow with their number; None: the input views."""
+        return render_views(self.renderer, self.gaussians, self.named_cameras() if cameras is None else cameras)
+
+    def points(self, limit: int = POINTS) -> ScenePoints:
+        """Points of the decoded depth on a regular grid of pixels, at most ``limit``."""
+        views, height, width = self.depth.shape
+        step = max(1, int(np.ceil(np.sqrt(views * height * width / limit))))
+        grid = (slice(None), slice(step // 2, None, step), slice(step // 2, None, step))
+        world = unproject(self.depth[None].double(), self.cameras.to("cpu").map(_double))[0]
+        keep = self.depth[grid] > 0
+        view, row, column = (index[grid][keep] for index in _indices(self.depth.shape))
+        colors = (self.images.permute(0, 2, 3, 1)[grid][keep] * 255 + 0.5).to(torch.uint8)
+        pixels = torch.stack((column, row), -1)
+        return ScenePoints(world[grid][keep].numpy(), colors.numpy(), view.numpy(), pixels.numpy())
+
+    def save(self, folder: str | Path, outputs: Sequence[str] = ("scene.ply", "cameras.json", "report.png")) -> None:
+        """Writes files into a folder; :data:`vg2gt.reconstruction.OUTPUTS` lists what there is.
+
+        Raises:
+            FileExistsError: if one is there already.
+            ValueError: if an output is unknown.
+        """
+        from vg2gt.reconstruction.outputs import write_outputs
+
+        write_outputs(self, folder, outputs)
+
+
+@torch.no_grad()
+def render_views(renderer: Renderer, gaussians: Gaussians, cameras: Sequence[NamedCamera]) -> Iterator[RenderedView]:
+    """Renders one scene into cameras of any sizes, one by one."""
+    device = gaussians.means.device
+    for camera in cameras:
+        image = renderer(gaussians, camera.cameras().to(device)).to("cpu")
+        yield RenderedView(
+            camera, image.color[0, 0].clamp(0, 1), image.depth[0, 0], image.normal[0, 0], image.alpha[0, 0]
+        )
+
+
+def _indices(shape: torch.Size) -> tuple[Tensor, ...]:
+    return torch.meshgrid(*(torch.arange(side) for side in shape), indexing="ij")
+
+
+def _double(tensor: Tensor) -> Tensor:
+    return tensor.double()

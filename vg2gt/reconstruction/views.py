@@ -1,0 +1,119 @@
+"""Pictures of any size brought to one working size, with what is known of their cameras."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from vg2gt.data.base import Frames
+from vg2gt.data.transforms import resize_to_cover
+from vg2gt.reconstruction.monitor import Monitor
+from vg2gt.reconstruction.pictures import Picture
+from vg2gt.types import Cameras, Hints
+
+log = logging.getLogger(__name__)
+
+LONGER_SIDE = {"cuda": 518, "cpu": 280}  # pixels, by device; foundation models are trained at about 518
+_MUCH_LOST = 0.25
+
+
+@dataclass(frozen=True)
+class Views:
+    """The input of a reconstruction.
+
+    Attributes:
+        images: ``[V, 3, H, W]`` float32 in [0, 1], on the CPU.
+        names: one a view, unique.
+        kept: share of each picture's area that is in its image; the rest was cropped.
+        hints: what the data know, on the CPU; None where they know nothing.
+    """
+
+    images: Tensor
+    names: tuple[str, ...]
+    kept: tuple[float, ...]
+    hints: Hints | None
+
+
+def working_size(
+    sizes: Sequence[tuple[int, int]], patch: int, device: str, size: int | tuple[int, int] | None = None
+) -> tuple[int, int]:
+    """The ``(height, width)`` to which all pictures are brought, in multiples of the patch size.
+
+    The shape is the geometric mean of the pictures' shapes, which crops mixed ones the least.
+
+    Args:
+        sizes: the pictures' ``(height, width)``.
+        patch: the backend's patch size.
+        device: type of the device that computes; decides the default.
+        size: the longer side in pixels (rounded down to patches), or exactly (height, width); None: 518 on a GPU, 280
+            on a CPU, but not more than the pictures have.
+
+    Raises:
+        ValueError: if the size is smaller than a patch, or given exactly and not a multiple of the patch.
+    """
+    if isinstance(size, tuple):
+        if min(size) < patch or any(side % patch for side in size):
+            near = "x".join(str(max(round(side / patch), 1) * patch) for side in size)
+            raise ValueError(f"size {size[0]}x{size[1]} is not a multiple of the patch size {patch}; try {near}")
+        return size
+    if size is not None and size < patch:
+        raise ValueError(f"size {size} is smaller than one patch of {patch} pixels")
+    shape = math.exp(sum(math.log(height / width) for height, width in sizes) / len(sizes))
+    longest = sorted(max(pair) for pair in sizes)[len(sizes) // 2]
+    longer = max(size or min(LONGER_SIDE.get(device, LONGER_SIDE["cuda"]), longest), patch) // patch
+    shorter = max(1, round(longer * min(shape, 1 / shape)))
+    return (longer * patch, shorter * patch) if shape > 1 else (shorter * patch, longer * patch)
+
+
+def load_views(pictures: Sequence[Picture], size: tuple[int, int], monitor: Monitor) -> Views:
+    """Decodes pictures one by one; each is resized to cover the working size and cropped at its centre.
+
+    Raises:
+        ValueError: if a picture cannot be read, naming it.
+    """
+    frames: list[Frames] = []
+    with monitor.stage("load images", len(pictures)) as advance:
+        for picture in pictures:
+            frames.append(resize_to_cover(picture.read(size), size))
+            advance()
+    kept = tuple(_kept(picture.size, size) for picture in pictures)
+    much = [picture.name for picture, share in zip(pictures, kept, strict=True) if share < 1 - _MUCH_LOST]
+    if much:
+        log.warning(
+            "%d of %d images have another shape than %dx%d and lose more than a quarter at their borders, the first is "
+            "%s; reconstruct images of one shape together, or choose another size",
+            len(much), len(pictures), size[0], size[1], much[0],
+        )  # fmt: skip
+    images = torch.cat([frame.images for frame in frames])
+    return Views(images, tuple(picture.name for picture in pictures), kept, _hints(pictures, frames, size))
+
+
+def _kept(size: tuple[int, int], window: tuple[int, int]) -> float:
+    ratio = (size[0] / size[1]) / (window[0] / window[1])
+    return min(ratio, 1 / ratio)
+
+
+def _hints(pictures: Sequence[Picture], frames: Sequence[Frames], size: tuple[int, int]) -> Hints | None:
+    """What recordings know; None if any picture is not from one.
+
+    Raises:
+        ValueError: if they come from several recordings, whose worlds have nothing to do with each other.
+    """
+    sources = {picture.source for picture in pictures}
+    if "" in sources:
+        return None
+    if len(sources) > 1:
+        raise ValueError(f"cameras of several recordings cannot be mixed: {', '.join(sorted(sources))}; give one")
+    has_depth = all(picture.has_depth for picture in pictures)
+    cameras = Cameras(
+        torch.cat([frame.world_to_camera for frame in frames])[None],
+        torch.cat([frame.intrinsics for frame in frames])[None],
+        size,
+    )
+    depth = torch.cat([frame.depth for frame in frames])[None] if has_depth else None
+    return Hints(depth, cameras, tuple(sources), torch.arange(len(frames))[None])
