@@ -215,14 +215,14 @@ def main() -> None:
     height, width = about["size"]
     noise = about["depth noise"]
     title = f"{arguments.name}, {height}x{width}, voxel edges in pixels at the median depth, backend {about['backend']}"
-    title += "" if noise is None else f" with {noise:.0%} depth noise"
+    title += "" if noise is None else f" with {noise:.1%} depth noise"
     rows.sort(key=lambda row: ([method.label for method in methods].index(row.method), row.views))
     print_table(console, title, rows, height * width)
     unit = "seconds" if device.type == "cuda" else "core-seconds"
     content = {
         "machine": machine(device),
         "unit": unit,
-        "overrides": overrides,
+        "overrides": [override for override in overrides if not override.startswith("data.root=")],
         "scenes": arguments.scenes,
         "passes": arguments.passes,
         "data": about,
