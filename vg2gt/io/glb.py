@@ -70,7 +70,8 @@ def write_glb(
     if len(xyz):
         scene.add_geometry(trimesh.PointCloud(xyz, rgb), geom_name=POINTS, node_name=POINTS)
     if cameras is not None:
-        corners = frusta(cameras, frustum_depth or _FRUSTUM_SHARE * _extent(xyz, cameras))
+        centers = invert_rigid(cameras.world_to_camera.detach().cpu().double())[0, :, :3, 3].numpy()
+        corners = frusta(cameras, frustum_depth or _FRUSTUM_SHARE * scene_extent(xyz, centers))
         lines = corners[:, np.array(_EDGES)].reshape(-1, 2, 3)
         scene.add_geometry(trimesh.load_path(lines), geom_name=FRUSTA, node_name=FRUSTA)
     scene.apply_transform(TO_GLTF)
@@ -106,9 +107,8 @@ def frusta(cameras: Cameras, depth: float) -> NDArray[np.float64]:
     return transform_points(invert_rigid(poses), local[None])[0].numpy()
 
 
-def _extent(xyz: NDArray[np.float64], cameras: Cameras) -> float:
-    """Diagonal of the box of the cameras and the middle of the points; 1 for a single camera without points."""
-    centers = invert_rigid(cameras.world_to_camera.detach().cpu().double())[0, :, :3, 3].numpy()
+def scene_extent(xyz: NDArray[np.float64], centers: NDArray[np.float64]) -> float:
+    """Diagonal of the box of camera centres ``[V, 3]`` and the middle of the points ``[N, 3]``; 1 where that is 0."""
     tail = (1 - _MIDDLE) / 2
     middle = np.quantile(xyz, [tail, 1 - tail], axis=0) if len(xyz) else centers[:1]
     corners = np.concatenate((middle, centers))

@@ -1,0 +1,173 @@
+"""The page in headless Chromium, against our own renderer."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from benchmarks.viewer_scene import voxel_room
+from tests.io.gaussian_scenes import scene, views
+from tests.viewer.chromium import Page, chromium
+from tests.viewer.test_page import HOSTILE, pictured_scene
+from vg2gt.io import named_cameras
+from vg2gt.rendering import render
+from vg2gt.types import Cameras, Gaussians
+from vg2gt.viewer import ViewerScene, write_viewer_html
+
+pytestmark = pytest.mark.slow
+
+CLEAN = "#ui=off"
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    with chromium(tmp_path_factory.mktemp("profile")) as tab:
+        yield tab
+
+
+def show(page: Page, path: Path, scene: ViewerScene, size: tuple[int, int], fragment: str = CLEAN) -> None:
+    """Opens a scene's page in a window of ``(height, width)`` pixels and waits until it is drawn."""
+    address = write_viewer_html(path, scene).as_uri()
+    page.open(address + fragment, size[1], size[0])
+    page.run("vg2gtViewer.ready.then(() => null)")
+
+
+def psnr(image: np.ndarray, truth: torch.Tensor) -> float:
+    """Of a screenshot against an image ``[3, H, W]``, in dB."""
+    error = torch.from_numpy(image).permute(2, 0, 1) / 255 - truth.clamp(0, 1)
+    return -10 * math.log10(float(error.square().mean()))
+
+
+def compare(page: Page, path: Path, gaussians: Gaussians, cameras: Cameras) -> list[float]:
+    """PSNR of every view."""
+    records = named_cameras(cameras, [str(index) for index in range(cameras.intrinsics.shape[1])])
+    show(page, path, ViewerScene(gaussians, records), cameras.size)
+    truth = render(gaussians, cameras, "rasterized", geometry=False).color[0]
+    figures = []
+    for index in range(len(records)):
+        page.run(f"vg2gtViewer.setCamera({index}).then(() => null)")
+        figures.append(psnr(page.screenshot(), truth[index]))
+    return figures
+
+
+def test_screenshot_is_our_rasterized_image_of_a_room(page: Page, tmp_path: Path) -> None:
+    gaussians, cameras, _ = voxel_room(voxel_size=0.03)
+    assert len(gaussians) > 15_000
+    figures = compare(page, tmp_path / "room.html", gaussians, cameras.select(slice(0, 12, 4)))
+    print(f"{len(gaussians)} Gaussians, PSNR {figures}, loaded in {page.run('vg2gtViewer.loadSeconds'):.2f} s")
+    assert min(figures) > 40
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_screenshot_of_gaussians_of_all_shapes_and_colours(page: Page, tmp_path: Path, degree: int) -> None:
+    figures = compare(page, tmp_path / "scene.html", scene(300, degree), views((120, 168)))
+    assert min(figures) > 40
+
+
+def test_equal_depths_keep_the_order_of_the_renderer(page: Page, tmp_path: Path) -> None:
+    before = scene(200)
+    flat = replace(before, means=before.means * torch.tensor([1.0, 1, 0]) + torch.tensor([0.0, 0, 3]))
+    assert min(compare(page, tmp_path / "flat.html", flat, views((120, 168)).select(slice(0, 1)))) > 40
+
+
+def test_cameras_from_script_and_address(page: Page, tmp_path: Path) -> None:
+    gaussians, cameras = scene(300), views((120, 168))
+    records = named_cameras(cameras, ["a", "b", "c"])
+    truth = render(gaussians, cameras, "rasterized", geometry=False).color[0]
+    show(page, tmp_path / "page.html", ViewerScene(gaussians, records), cameras.size, "#camera=2&ui=off")
+    assert psnr(page.screenshot(), truth[2]) > 40
+    rows = records[1].world_to_camera.tolist(), records[1].intrinsics.tolist()
+    record = f"{{width: 168, height: 120, world_to_camera: {rows[0]}, intrinsics: {rows[1]}}}"
+    page.run(f"vg2gtViewer.setCamera({record}).then(() => null)")
+    assert psnr(page.screenshot(), truth[1]) > 40
+    assert psnr(page.screenshot(), truth[2]) < 30
+
+
+def test_controls_move_the_view_and_reset_brings_it_back(page: Page, tmp_path: Path) -> None:
+    show(page, tmp_path / "page.html", pictured_scene(), (400, 700), "")
+    before = page.screenshot()
+
+    def drag(button: str, buttons: int) -> None:
+        common = {"button": button, "buttons": buttons, "clickCount": 1}
+        page.call("Input.dispatchMouseEvent", type="mousePressed", x=500, y=200, **common)
+        page.call("Input.dispatchMouseEvent", type="mouseMoved", x=560, y=230, **common)
+        page.call("Input.dispatchMouseEvent", type="mouseReleased", x=560, y=230, **common)
+
+    def key(name: str) -> None:
+        page.call("Input.dispatchKeyEvent", type="keyDown", key=name)
+        page.run("new Promise((resolve) => setTimeout(resolve, 300))")
+        page.call("Input.dispatchKeyEvent", type="keyUp", key=name)
+
+    actions = {
+        "turn": lambda: drag("left", 1),
+        "move": lambda: drag("right", 2),
+        "wheel": lambda: page.call("Input.dispatchMouseEvent", type="mouseWheel", x=500, y=200, deltaX=0, deltaY=240),
+        "fly": lambda: key("w"),
+        "arrow": lambda: key("ArrowLeft"),
+    }
+    settle = "new Promise((resolve) => setTimeout(resolve, 700))"
+    for name, action in actions.items():
+        action()
+        page.run(settle)
+        assert (page.screenshot() != before).any(-1).mean() > 0.02, name
+        page.run("document.getElementById('reset').click()")
+        page.run(settle)
+        assert (page.screenshot() == before).all(), name
+
+
+def test_cameras_and_images_can_be_shown(page: Page, tmp_path: Path) -> None:
+    shown_scene = pictured_scene()
+    show(page, tmp_path / "page.html", shown_scene, (400, 700), "")
+    pose = np.eye(4)
+    pose[2, 3] = 2.0  # from behind the cameras
+    intrinsics = shown_scene.cameras[0].intrinsics.tolist()
+    record = f"{{width: 56, height: 40, world_to_camera: {pose.tolist()}, intrinsics: {intrinsics}}}"
+    page.run(f"vg2gtViewer.setCamera({record}).then(() => null)")
+    before = page.screenshot()
+    shown = []
+    for box in ("show-frusta", "show-images"):
+        page.run(f"document.getElementById('{box}').click()")
+        page.run("new Promise((resolve) => setTimeout(resolve, 700))")
+        shown.append(page.screenshot())
+    assert count(shown[0], [255, 184, 51]) > 20
+    assert count(shown[1], [90, 90, 90]) > count(before, [90, 90, 90]) + 20
+
+
+def count(image: np.ndarray, color: list[int]) -> int:
+    """Pixels of a colour right of the controls."""
+    return int((np.abs(image[:, 310:].astype(int) - color).max(-1) < 4).sum())
+
+
+def test_page_fetches_nothing_and_hostile_names_do_nothing(page: Page, tmp_path: Path) -> None:
+    show(page, tmp_path / "page.html", pictured_scene(HOSTILE), (400, 700), "")
+    assert [address for address in page.requests if not address.startswith(("file:", "blob:"))] == []
+    assert page.run("document.title") == HOSTILE
+    assert page.run("document.getElementById('cameras').options[1].text.startsWith('</script><script>')")
+    # the policy stops what a hole in the escaping would let in
+    page.run("document.body.insertAdjacentHTML('beforeend', '<img src=x onerror=\"window.hole = 1\">')")
+    page.run(
+        "{const s = document.createElement('script'); s.textContent = 'window.hole = 2'; document.body.append(s);}"
+    )
+    assert page.run("fetch('data:,x').then(() => 'fetched', () => 'refused')") == "refused"
+    assert page.run("window.hole") is None
+
+
+def test_narrow_screen(page: Page, tmp_path: Path) -> None:
+    address = write_viewer_html(tmp_path / "page.html", pictured_scene("a-very-" + "long-" * 30 + "name")).as_uri()
+    page.open(address, 360, 640, mobile=True)
+    page.run("vg2gtViewer.ready.then(() => null)")
+    assert page.run("document.documentElement.scrollWidth") <= 360
+    places = page.run(
+        "[...document.querySelectorAll('#panel button, #panel select, #panel label, #panel summary')]"
+        ".map((e) => e.getBoundingClientRect()).map((r) => [r.left, r.right, r.width, r.height])"
+    )
+    assert all(left >= 0 and right <= 360 and width > 0 and height >= 16 for left, right, width, height in places)
+    unnamed = page.run(
+        "[...document.querySelectorAll('button, select, input, canvas')].filter((e) => "
+        "!(e.getAttribute('aria-label') || e.textContent.trim() || e.closest('label')?.textContent.trim())).length"
+    )
+    assert unnamed == 0

@@ -1,0 +1,93 @@
+"""`vg2gt view`: what it writes, and one clear line for everything that is wrong."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.io.gaussian_scenes import scene, views
+from vg2gt.cli import COMMANDS, view
+from vg2gt.io import named_cameras, write_cameras_json, write_gaussian_ply, write_splat
+from vg2gt.viewer import read_viewer_html, server
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> Path:
+    """A folder with scene.ply, scene.splat, cameras.json and two of its three images."""
+    write_gaussian_ply(tmp_path / "scene.ply", scene(60))
+    write_splat(tmp_path / "scene.splat", scene(60))
+    write_cameras_json(tmp_path / "cameras.json", named_cameras(views(), ["0.png", "1.png", "2.png"]))
+    for index in range(2):
+        Image.fromarray(np.full((40, 56, 3), 100, np.uint8)).save(tmp_path / f"{index}.png")
+    return tmp_path
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *arguments: Path | str) -> None:
+    monkeypatch.setattr(sys, "argv", ["view", *map(str, arguments)])
+    view.main()
+
+
+def test_command_is_registered() -> None:
+    assert COMMANDS["view"] == view.__name__
+
+
+@pytest.mark.parametrize("name", ["scene.ply", "scene.splat"])
+def test_page_of_a_file(files: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, name: str) -> None:
+    run(monkeypatch, files / name, "--cameras", files / "cameras.json", "--html", files / "out" / "page.html")
+    assert len(read_viewer_html(files / "out" / "page.html")) == 60
+    printed = capsys.readouterr().out
+    assert "2 of 3 cameras have their image" in printed
+    assert "60 Gaussians" in printed
+    page = (files / "out" / "page.html").read_text()
+    assert f"<title>{name}</title>" in page
+    assert page.count('"picture": "') == 2
+
+
+def test_script_starts_it(files: Path) -> None:
+    command = [sys.executable, "-c", "import vg2gt.cli; vg2gt.cli.main()", "view"]
+    arguments = [*command, str(files / "scene.ply"), "--html", str(files / "page.html"), "--title", "mine"]
+    done = subprocess.run(arguments, capture_output=True, text=True, check=False, env={**os.environ})
+    assert done.returncode == 0, done.stderr
+    assert "<title>mine</title>" in (files / "page.html").read_text()
+
+
+def test_mistakes_end_with_one_line(
+    files: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    write_gaussian_ply(files / "empty.ply", scene(0))
+    (files / "broken.ply").write_bytes(b"ply\nnonsense")
+    (files / "0.png").write_bytes(b"nonsense")
+    html, ply = ("--html", files / "page.html"), files / "scene.ply"
+    cases: list[tuple[tuple[Path | str, ...], str]] = [
+        ((files / "absent.ply", *html), "absent.ply"),
+        ((files / "cameras.json", *html), "expected one of .ply, .splat"),
+        ((files / "broken.ply", *html), "broken.ply"),
+        ((files / "empty.ply", *html), "empty.ply holds no Gaussians"),
+        ((ply, *html, "--port", "9000"), "leave out --host, --port and --share"),
+        ((ply, *html, "--share"), "leave out --host, --port and --share"),
+        ((ply, *html, "--images", files), "--images needs --cameras"),
+        ((ply, *html, "--cameras", ply), "scene.ply: not valid JSON"),
+        ((ply, *html, "--cameras", files / "cameras.json"), "0.png"),
+        ((ply, "--port", "70000"), "--port"),
+    ]
+    for arguments, message in cases:
+        with pytest.raises(SystemExit) as ended:
+            run(monkeypatch, *arguments)
+        assert ended.value.code == 2
+        last = capsys.readouterr().err.splitlines()[-1]
+        assert last.startswith("vg2gt view: error: ")
+        assert message in last
+    assert not (files / "page.html").exists()
+
+
+def test_without_viser_the_extra_is_named(
+    files: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    monkeypatch.setattr(server.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(SystemExit):
+        run(monkeypatch, files / "scene.ply")
+    assert "pip install 'vg2gt[view]'" in capsys.readouterr().err

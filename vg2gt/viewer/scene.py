@@ -1,0 +1,117 @@
+"""What the viewers show: Gaussians, cameras, small pictures of their images, where to start."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image, ImageOps
+
+from vg2gt.io.cameras_json import NamedCamera
+from vg2gt.io.glb import scene_extent
+from vg2gt.types import Gaussians
+
+FRUSTUM_SHARE = 0.05  # of the scene's extent, the depth of a drawn frustum
+PICTURE_SIDE = 320  # longer side of an image shown in its frustum, in pixels
+_DEFAULT_SIZE = (960, 720)  # of the view of a scene without cameras
+_INSIDE_SHARE = 0.1  # of the Gaussians that the first camera's frame must have in view to start there
+
+
+@dataclass(frozen=True)
+class ViewerScene:
+    """A scene to show.
+
+    Attributes:
+        gaussians: one scene, at least one Gaussian.
+        cameras: the cameras to draw; the first is the initial view.
+        pictures: ``[H, W, 3]`` uint8 or None, one a camera; empty: no pictures.
+        title: of the page.
+
+    Raises:
+        ValueError: if there are no Gaussians, or pictures and cameras disagree in number.
+    """
+
+    gaussians: Gaussians
+    cameras: Sequence[NamedCamera] = ()
+    pictures: Sequence[NDArray[np.uint8] | None] = field(default=())
+    title: str = "scene"
+
+    def __post_init__(self) -> None:
+        if not len(self.gaussians):
+            raise ValueError("there are no Gaussians to show")
+        if self.pictures and len(self.pictures) != len(self.cameras):
+            raise ValueError(f"expected a picture (or None) a camera, got {len(self.pictures)} for {len(self.cameras)}")
+
+    def picture(self, index: int) -> NDArray[np.uint8] | None:
+        """The picture of a camera, None without."""
+        return self.pictures[index] if self.pictures else None
+
+    def initial(self) -> NamedCamera:
+        """Where to start: the first camera, else :func:`default_camera`."""
+        return self.cameras[0] if self.cameras else default_camera(self.gaussians)
+
+    def frustum_depth(self) -> float:
+        """Distance from a camera's centre to its drawn image, scene units."""
+        centers = np.stack([camera_to_world(camera)[:3, 3] for camera in self.cameras or [self.initial()]])
+        return FRUSTUM_SHARE * scene_extent(self.gaussians.means.detach().cpu().double().numpy(), centers)
+
+
+def camera_to_world(camera: NamedCamera) -> NDArray[np.float64]:
+    """Pose ``[4, 4]`` of a camera in the world."""
+    rotation, translation = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation.T, -rotation.T @ translation
+    return pose
+
+
+def default_camera(gaussians: Gaussians) -> NamedCamera:
+    """A view of a scene nobody gave cameras for.
+
+    The world's own frame, which is the first camera's in our scenes, if a tenth of the Gaussians are in view there;
+    otherwise from in front of the scene, far enough to see its middle nine tenths.
+    """
+    width, height = _DEFAULT_SIZE
+    focal = 0.8 * width
+    intrinsics = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
+    means = gaussians.means.detach().cpu().double()
+    reach = torch.tensor([width, height]) / 2 / focal
+    inside = (means[:, 2] > 0) & (means[:, :2].abs() < reach * means[:, 2:]).all(-1)
+    pose = np.eye(4)
+    if inside.double().mean() < _INSIDE_SHARE:
+        xyz = means.numpy()
+        low, high = np.quantile(xyz, [0.05, 0.95], axis=0)
+        radius = max(float(np.linalg.norm(high - low)) / 2, 1e-3)
+        pose[:3, 3] = -(low + high) / 2 + [0, 0, radius / float(reach.min())]
+    return NamedCamera("default", width, height, intrinsics, pose)
+
+
+def load_pictures(cameras: Sequence[NamedCamera], folder: str | Path) -> list[NDArray[np.uint8] | None]:
+    """Small upright pictures of the cameras' images, ``folder / name`` each.
+
+    Returns:
+        One a camera, the longer side ``PICTURE_SIDE`` pixels at most; None where there is no such file inside the
+        folder (names that lead out of it count as absent).
+
+    Raises:
+        ValueError: if a file is there and cannot be read, naming it.
+    """
+    root = Path(folder).resolve()
+    pictures: list[NDArray[np.uint8] | None] = []
+    for camera in cameras:
+        path = None if "\0" in camera.name else (root / camera.name).resolve()
+        inside = path is not None and path.is_relative_to(root) and path.is_file()
+        pictures.append(_small_picture(path) if path is not None and inside else None)
+    return pictures
+
+
+def _small_picture(path: Path) -> NDArray[np.uint8]:
+    try:
+        with Image.open(path) as image:
+            image.thumbnail((PICTURE_SIDE, PICTURE_SIDE))
+            return np.array((ImageOps.exif_transpose(image) or image).convert("RGB"))
+    except Exception as error:  # image libraries raise whatever the bytes lead them to
+        raise ValueError(f"cannot read {path}: {error}; restore or remove the image") from error

@@ -1,0 +1,140 @@
+"""A scene in a browser by a viser server on this machine."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from vg2gt.geometry.rotations import matrix_to_quat, quat_to_matrix
+from vg2gt.geometry.spherical_harmonics import DC
+from vg2gt.io.cameras_json import NamedCamera
+from vg2gt.types import Gaussians
+from vg2gt.viewer.scene import ViewerScene, camera_to_world
+
+if TYPE_CHECKING:
+    import viser  # pyright: ignore[reportMissingImports]  # optional
+
+LOOPBACK = "127.0.0.1"
+PORT = 8080
+_LOOK_DEPTHS = 10.0  # frustum depths ahead of a camera, the point to turn around
+
+
+class MissingViserError(ImportError):
+    """The package viser is not installed."""
+
+
+def start_server(scene: ViewerScene, host: str = LOOPBACK, port: int = PORT, share: bool = False) -> viser.ViserServer:
+    """Serves the scene until ``stop()`` of what it returns.
+
+    Colours are those of degree 0: viser's splats do not depend on the view. Its page has a button that publishes the
+    scene through an outside server; here it does nothing unless ``share`` is true, whoever asks.
+
+    Args:
+        scene: what to show; not changed.
+        host: address to listen on; the default can be reached from this machine only.
+        port: the first port to try; if it is taken, a later free one is used (``get_port()``). 0: any.
+        share: whether the scene may be published; ``request_share_url()`` does it.
+
+    Returns:
+        The running server.
+
+    Raises:
+        MissingViserError: without the package viser, naming the extra that brings it.
+    """
+    if importlib.util.find_spec("viser") is None:
+        raise MissingViserError(
+            "the live viewer needs viser: pip install 'vg2gt[view]', or write a page with --html, which needs nothing"
+        )
+    import viser  # pyright: ignore[reportMissingImports]  # optional
+
+    class Server(viser.ViserServer):
+        """Publishes only what may be published."""
+
+        def request_share_url(self, verbose: bool = True) -> str | None:
+            return super().request_share_url(verbose) if share else None
+
+    server = Server(host=host, port=port, label=scene.title, verbose=False)
+    try:
+        _fill(server, scene)
+    except BaseException:
+        server.stop()
+        raise
+    return server
+
+
+def _fill(server: viser.ViserServer, scene: ViewerScene) -> None:
+    server.scene.set_up_direction("-y")
+    _add_gaussians(server, scene.gaussians)
+    ahead = _LOOK_DEPTHS * scene.frustum_depth()
+    pose = camera_to_world(scene.initial())
+    server.initial_camera.position = pose[:3, 3]
+    server.initial_camera.look_at = pose[:3, 3] + ahead * pose[:3, 2]
+    server.initial_camera.up = -pose[:3, 1]
+    server.initial_camera.fov = _field_of_view(scene.initial())
+    if scene.cameras:
+        _add_cameras(server, scene, ahead)
+
+
+def _add_cameras(server: viser.ViserServer, scene: ViewerScene, ahead: float) -> None:
+    """Frusta with their images, boxes that hide either, and a list of cameras to look through."""
+    frusta = [_add_frustum(server, scene, index) for index in range(len(scene.cameras))]
+    pictured = any(scene.picture(index) is not None for index in range(len(frusta)))
+    names = [f"{index}: {camera.name}" for index, camera in enumerate(scene.cameras)]
+    show_cameras = server.gui.add_checkbox("Cameras", True)
+    show_images = server.gui.add_checkbox("Images", pictured, disabled=not pictured)
+    chosen = server.gui.add_dropdown("Look through", names)
+
+    @show_cameras.on_update
+    def _(_: Any) -> None:
+        for frustum in frusta:
+            frustum.visible = show_cameras.value
+
+    @show_images.on_update
+    def _(_: Any) -> None:
+        for index, frustum in enumerate(frusta):
+            frustum.image = scene.picture(index) if show_images.value else None
+
+    @chosen.on_update
+    def _(event: Any) -> None:
+        if event.client is not None:
+            camera = scene.cameras[names.index(chosen.value)]
+            pose = camera_to_world(camera)
+            with event.client.atomic():
+                event.client.camera.up_direction = -pose[:3, 1]
+                event.client.camera.position = pose[:3, 3]
+                event.client.camera.look_at = pose[:3, 3] + ahead * pose[:3, 2]
+                event.client.camera.fov = _field_of_view(camera)
+
+
+def _add_frustum(server: viser.ViserServer, scene: ViewerScene, index: int) -> viser.CameraFrustumHandle:
+    camera, pose = scene.cameras[index], camera_to_world(scene.cameras[index])
+    return server.scene.add_camera_frustum(
+        f"/cameras/{index}",  # not the name: a slash in it would mean a parent
+        fov=_field_of_view(camera),
+        aspect=camera.width / camera.height,
+        scale=scene.frustum_depth(),
+        image=scene.picture(index),
+        wxyz=matrix_to_quat(torch.from_numpy(pose[:3, :3])).numpy(),
+        position=pose[:3, 3],
+        color=(255, 184, 51),
+    )
+
+
+def _field_of_view(camera: NamedCamera) -> float:
+    """Vertical, in radians; viser puts the principal point into the middle."""
+    return 2 * math.atan(camera.height / 2 / float(camera.intrinsics[1, 1]))
+
+
+def _add_gaussians(server: viser.ViserServer, gaussians: Gaussians) -> None:
+    gaussians = gaussians.map(lambda tensor: tensor.detach().cpu())
+    scaled = quat_to_matrix(gaussians.quats) * gaussians.scales[:, None, :]
+    server.scene.add_gaussian_splats(
+        "/gaussians",
+        centers=gaussians.means.float().numpy(),
+        covariances=(scaled @ scaled.transpose(1, 2)).float().numpy(),
+        rgbs=(0.5 + DC * gaussians.sh[:, 0]).clamp(0, 1).float().numpy(),
+        opacities=gaussians.opacities[:, None].float().numpy(),
+    )

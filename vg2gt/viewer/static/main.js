@@ -1,0 +1,125 @@
+// Wires the page together. window.vg2gtViewer is for scripts: ready (a promise), setCamera(index or camera record), which
+// resolves when that view is drawn completely, and loadSeconds. The address may end in #camera=INDEX&ui=off.
+
+const started = performance.now();
+const element = (id) => document.getElementById(id);
+
+function say(text, isError = false) {
+  element("status").textContent = text;
+  element("status").classList.toggle("error", isError);
+}
+
+function requested() {
+  const parameters = new URLSearchParams(location.hash.slice(1));
+  return { camera: Number.parseInt(parameters.get("camera") ?? "0", 10), panel: parameters.get("ui") !== "off" };
+}
+
+async function start() {
+  const scene = JSON.parse(element("scene").textContent), canvas = element("view");
+  const buffer = await inflate(element("gaussians").textContent);
+  element("gaussians").remove();  // megabytes of text
+  const { means, harmonics, geometry } = decodeGaussians(scene.gaussians, buffer);
+  const renderer = new Renderer(canvas, scene.settings), sorter = new DepthSorter(means);
+  renderer.setGaussians(geometry, harmonics, scene.gaussians.degree);
+  const records = scene.cameras.length ? scene.cameras : [scene.initial];
+  const pictures = await Promise.all(scene.cameras.map(({ picture }) => picture && decodePicture(picture)));
+  renderer.setFrusta(scene.cameras.map(fromRecord), pictures, scene.frustum_depth);
+
+  const up = records.map(fromRecord).reduce((sum, { axes }) => addScaled(sum, axes[1], -1), [0, 0, 0]);
+  const view = new View(Math.hypot(...up) > 0.1 ? unit(up) : [0, -1, 0]);
+  const show = { frusta: false, images: false };
+  let version = 0, drawn = -1, busy = false, waiting = [];
+
+  // Sorts for the newest view and draws; in between frames show the newest view in an older order.
+  async function update() {
+    busy = true;
+    while (drawn < version) {
+      const now = version, axis = [...view.axes[2], view.translation()[2]];
+      const order = await sorter.sort(axis, scene.settings.near);
+      renderer.setOrder(order);
+      await new Promise((resolve) => setTimeout(resolve));
+      paint();
+      drawn = now;
+    }
+    busy = false;
+    for (const resolve of waiting.splice(0)) resolve();
+  }
+
+  function paint() {
+    const density = Math.min(window.devicePixelRatio, 2);
+    renderer.resize(Math.max(1, Math.round(canvas.clientWidth * density)),
+      Math.max(1, Math.round(canvas.clientHeight * density)));
+    renderer.draw(view, show);
+  }
+
+  function changed() {
+    version++;
+    if (busy) requestAnimationFrame(paint);
+    else update();
+  }
+
+  function complete() {
+    return new Promise((resolve) => {
+      waiting.push(resolve);
+      changed();
+    });
+  }
+
+  function setCamera(camera) {
+    const record = typeof camera === "number" ? records[camera] : camera;
+    if (!record) throw new Error(`There is no camera ${camera}; the scene has ${records.length}.`);
+    view.set(fromRecord(record));
+    view.pivot = typicalDepth(view, means, 20 * scene.frustum_depth);
+    if (typeof camera === "number") element("cameras").selectedIndex = camera;
+    return complete();
+  }
+
+  connect({ canvas, view, changed, setCamera, show, records, scene, pictures });
+  const wanted = requested();
+  await setCamera(records[wanted.camera] ? wanted.camera : 0);
+  viewer.loadSeconds = (performance.now() - started) / 1000;
+  say(`${scene.gaussians.count.toLocaleString("en")} Gaussians, ${scene.cameras.length} cameras`);
+  return setCamera;
+}
+
+// Buttons, boxes, keys, window.
+function connect({ canvas, view, changed, setCamera, show, records, scene, pictures }) {
+  const list = element("cameras");
+  for (const { name } of records) list.append(new Option(name));
+  const walk = (step) => setCamera((list.selectedIndex + step + records.length) % records.length);
+  const reset = () => setCamera(Math.max(0, list.selectedIndex));
+  const controls = new Controls(canvas, view, changed, {
+    n: () => walk(1),
+    p: () => walk(-1),
+    r: reset,
+    c: () => element("show-frusta").click(),
+    i: () => element("show-images").click(),
+  });
+  list.addEventListener("change", reset);
+  element("next").addEventListener("click", () => walk(1));
+  element("previous").addEventListener("click", () => walk(-1));
+  element("reset").addEventListener("click", reset);
+  const box = (id, enabled, apply) => {
+    element(id).disabled = !enabled;
+    element(id).addEventListener("change", () => {
+      apply(element(id).checked);
+      changed();
+    });
+  };
+  box("show-frusta", scene.cameras.length > 0, (on) => { show.frusta = on; });
+  box("show-images", pictures.some(Boolean), (on) => { show.images = on; });
+  box("fly", true, (on) => { controls.fly = on; });
+  new ResizeObserver(changed).observe(canvas);
+  window.addEventListener("hashchange", () => {
+    element("panel").hidden = !requested().panel;
+    if (records[requested().camera]) setCamera(requested().camera);
+  });
+  canvas.addEventListener("webglcontextlost", () => say("The graphics device was lost; reload the page.", true));
+}
+
+element("panel").hidden = !requested().panel;
+const viewer = { ready: null, loadSeconds: null };
+viewer.ready = start();
+viewer.setCamera = async (camera) => (await viewer.ready)(camera);
+viewer.ready.catch((error) => say(`${error.message ?? error}`, true));
+window.vg2gtViewer = viewer;
