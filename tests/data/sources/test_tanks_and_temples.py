@@ -41,8 +41,9 @@ def test_a_similarity_moves_the_camera_and_keeps_its_rotation():
 
 def test_unregistered_images_are_counted(tmp_path):
     write(tmp_path, room(3))
-    source = read(tmp_path)
-    assert source.scene_index("Barn").dropped == {"without a pose": 1}
+    for source in (read(tmp_path), TanksAndTemples(str(tmp_path), intrinsics=[30, 30, 19, 14], depth=None)):
+        assert tuple(source.frames("Barn")) == (1, 2, 3)
+        assert source.scene_index("Barn").dropped == {"without a pose": 1}
     (tmp_path / "Barn" / "000002.png").unlink()
     with pytest.raises(DataError, match="4 poses for 3 images; they belong together by their order"):
         read(tmp_path).frames("Barn")
