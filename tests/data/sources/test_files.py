@@ -45,20 +45,20 @@ def test_few_indices_stay_in_memory_and_the_rest_come_from_the_cache(dataset, tm
     monkeypatch.setattr(RGBDFolder, "index", lambda *_: pytest.fail("the dataset is indexed again"))
     for scene in source.scenes:
         assert source.load(scene, ids[scene]).depth.shape[0] == 2
-        assert source.frames(scene) == ids[scene] == [10, 11]
+        assert source.frames(scene) == ids[scene] == (10, 11)
 
 
 def test_a_changed_scene_is_indexed_again(dataset, tmp_path):
     write_recording(tmp_path, room(3), "d")
     cache = str(tmp_path / "cache")
-    assert RGBDFolder(str(tmp_path / "d"), holdout=None, index_cache=cache).frames("d") == [10, 11, 12]
+    assert RGBDFolder(str(tmp_path / "d"), holdout=None, index_cache=cache).frames("d") == (10, 11, 12)
     (tmp_path / "d/depth/00011.png").unlink()
-    assert RGBDFolder(str(tmp_path / "d"), holdout=None, index_cache=cache).frames("d") == [10, 12]
+    assert RGBDFolder(str(tmp_path / "d"), holdout=None, index_cache=cache).frames("d") == (10, 12)
     assert len(list((tmp_path / "cache").rglob("*.npz"))) == 1
 
 
 def test_every_second_frame(dataset):
-    assert RGBDFolder(str(dataset), every=2).frames("a") == [10]
+    assert RGBDFolder(str(dataset), every=2).frames("a") == (10,)
     with pytest.raises(ValueError, match="every must be at least 1"):
         RGBDFolder(str(dataset), every=0)
     with pytest.raises(ValueError, match="holdout must be at least 2"):

@@ -120,7 +120,7 @@ class FileSource(SceneSource):
         """Numbers of the usable frames, in order."""
         if scene not in self._frame_ids:
             self._frame_ids[scene] = np.array(self.scene_index(scene).frame_ids[:: self.every])
-        return self._frame_ids[scene].tolist()
+        return tuple(self._frame_ids[scene].tolist())
 
     def held_out(self, scene: str) -> Sequence[int]:
         """Every ``holdout``-th frame, from the middle of the first stretch on."""
