@@ -23,7 +23,7 @@ def test_the_readmes_line(tmp_path: Path, tmp_path_factory: pytest.TempPathFacto
     path = os.pathsep.join((str(Path(sys.executable).parent), os.environ["PATH"]))
     environment = {**os.environ, "PATH": path, "VG2GT_CACHE": str(cache), "PYTHONPATH": str(ROOT)}
     run = subprocess.run(
-        lines[0], shell=True, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300, check=False
+        lines[0], shell=True, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=600, check=False
     )
     assert run.returncode == 0, run.stderr[-3000:]
     folder = tmp_path / "outputs" / "evaluate" / "quickstart-synthetic"

@@ -134,6 +134,12 @@ def test_one_key_of_the_runs_model_can_be_changed(tmp_path: Path, cache: Path, t
     assert report["views"]["2"]["mean"]["scene/gaussians"] == 400
 
 
+def test_a_model_without_a_trained_part(tmp_path: Path, cache: Path) -> None:
+    report = run(tmp_path, cache, "model=pointcloud", "data.eval_scenes=1")
+    assert report["settings"]["weights"] == "none: the model has no trained part"
+    assert report["views"]["2"]["mean"]["scene/gaussians_per_pixel"] == 1
+
+
 def test_scenes_of_the_training_are_refused(tmp_path: Path, cache: Path, trained: Path) -> None:
     with pytest.raises(DataError, match="scene room-000000 was trained on"):
         run(tmp_path, cache, f"ckpt={trained}", "data.val.first_seed=0")

@@ -20,10 +20,23 @@ def report(**settings: Any) -> dict[str, Any]:
         "scene/cv": 0.25,
     }
     known = {
-        "name": "test", "weights": "none", "model": "VG2GT", "backend": {"name": "oracle", "weights": "0a" * 32}, "data": "Rooms", "scenes": 1,
-        "index": "replica", "size": [518, 518], "crop": "cover", "alignment": "median", "depth_range": [None, None],
-        "neighbors": 8, "lpips": "VGG-16, version 0.1", "points": {"threshold": 0.05, "cap": None}, "device": "cpu", "paper": None,
-    }  # fmt: skip
+        "name": "test",
+        "weights": "none",
+        "model": "VG2GT",
+        "backend": {"name": "oracle", "weights": "0a" * 32},
+        "data": "Rooms",
+        "scenes": 1,
+        "index": "replica",
+        "size": [518, 518],
+        "crop": "cover",
+        "alignment": "median",
+        "depth_range": [None, None],
+        "neighbors": 8,
+        "lpips": "VGG-16, version 0.1",
+        "points": {"threshold": 0.05, "cap": None},
+        "device": "cpu",
+        "paper": None,
+    }
     views = {str(count): {"mean": scores, "scenes": {"room": scores}} for count in (3, 10)}
     return {"settings": known | settings, "views": views}
 
