@@ -11,7 +11,7 @@ import pytest
 
 import vg2gt.study
 from tests.training_helpers import SMALL
-from vg2gt.ablate import CONTROL, FULL, Ablation, common_overrides, continuations
+from vg2gt.ablate import CONTROL, FULL, OUR_COLUMNS, PAPER_COLUMNS, Ablation, _verdict, common_overrides, continuations
 from vg2gt.checkpoints import newest_valid, read_checkpoint
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -116,6 +116,17 @@ def test_other_settings_are_refused(finished: Path, cache: Path) -> None:
         study(finished, cache, "loss.enhance.weight=2").run()
 
 
+def test_verdicts() -> None:
+    full = {seed: {"psnr": 25.0 + seed, "abs_rel": 0.02, "gaussians": 10.0} for seed in range(3)}
+    other = {seed: {"psnr": 24.0 + seed + 0.01 * seed, "abs_rel": 0.02, "gaussians": 5.0 + seed} for seed in range(3)}
+    columns = PAPER_COLUMNS | OUR_COLUMNS
+    verdict = {name: _verdict(other, full, name, columns[name]) for name in ("psnr", "abs_rel", "gaussians")}
+    assert verdict == {"psnr": "-0.99 ± 0.02 (worse)", "abs_rel": "identical", "gaussians": "-4 ± 2"}
+    far = {seed: {"abs_rel": 0.02 + 0.01 * (seed - 1)} for seed in range(3)}
+    assert _verdict(far, full, "abs_rel", columns["abs_rel"]).endswith("(not told apart)")
+    assert _verdict({0: {"psnr": 27.0}}, full, "psnr", columns["psnr"]) == "+2.00"
+
+
 def test_what_the_study_decides_cannot_be_overridden() -> None:
     assert common_overrides(["seeds=2", "backend=da3_small", "+data.x=1"]) == ["backend=da3_small", "+data.x=1"]
     with pytest.raises(ValueError, match=r"trainer\.max_steps is decided by the study"):
@@ -134,3 +145,10 @@ def test_the_readmes_line_in_a_shell(tmp_path: Path, cache: Path) -> None:
     assert shown.returncode == 0, shown.stderr[-3000:]
     assert "| VG²GT (full) |" in shown.stdout
     assert (tmp_path / "outputs" / "short" / "metrics.md").is_file()
+
+
+def test_several_devices_are_refused(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "vg2gt.ablate", "trainer.devices=2"]
+    shown = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert shown.returncode != 0
+    assert "trainer.devices=2: a study runs its trainings one after another on one device" in shown.stderr

@@ -195,8 +195,8 @@ class Ablation:
             "stochastic solids and aligned by one median scale a scene, whatever the training rendered (the 3DGS row "
             "too: its own rasterised depth stands below). Where the number of splits differs from the full model's, "
             "the last layer starts anew; the control shows what that alone costs. The paper's rows are Replica, "
-            "30000 more steps, and LPIPS of VGG; compare orders, not values. LPIPS is n/a where its weights were not "
-            "found."
+            "30000 more steps, and LPIPS of VGG; compare orders, not values. LPIPS is not measured "
+            "while training: python -m vg2gt.evaluate ckpt=RUN has it, if its weights are there."
         )
 
 
@@ -266,6 +266,8 @@ def _verdict(
     shown = change.shown(decimals, sign=True)
     if larger_is_better is None or not math.isfinite(change.margin):
         return shown
+    if change.mean == change.margin == 0:
+        return "identical"
     if abs(change.mean) <= change.margin:
         return f"{shown} (not told apart)"
     return f"{shown} ({'better' if (change.mean > 0) == larger_is_better else 'worse'})"
@@ -292,6 +294,10 @@ def main(config: DictConfig) -> None:
     """Composes the study and runs it."""
     if "gaussians" not in config.model or "splits" not in config.model.gaussians:
         raise ValueError("ablations need a model with splits: model=tiny or model=vg2gt")
+    if config.trainer.devices != 1:
+        raise ValueError(
+            f"trainer.devices={config.trainer.devices}: a study runs its trainings one after another on one device"
+        )
     study = Ablation(
         Path(config.output_dir),
         common_overrides(HydraConfig.get().overrides.task),
