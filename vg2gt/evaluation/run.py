@@ -41,7 +41,7 @@ from vg2gt.types import Batch
 
 log = logging.getLogger(__name__)
 
-# Settings that choose which samples are evaluated or shown, or where: others in a folder are other figures.
+# Settings that choose samples, pictures or places; all others decide figures and must be the same in a folder.
 FREE = ("views", "name", "output_dir", "overwrite", "ckpt", "device", "evaluation.pictures", "data.eval_scenes")
 FREE += ("data.workers", "data.memory_mb", "data.steps_per_epoch")
 
