@@ -176,3 +176,21 @@ def test_footprint_guard(make_fine, make_room):
     voxels = make_fine(voxel_size=1e-4, min_footprint=3)(tokens, geometry, images)
     expected = 3 * geometry.depth.median() / geometry.cameras.intrinsics[0, 0, 0, 0]
     torch.testing.assert_close(voxels.voxel_size, expected[None])
+
+
+def test_without_gradient_views_are_pooled_a_few_at_a_time_to_the_same_voxels(make_fine, make_room):
+    tokens, geometry, images = make_room(scenes=2, views=3)
+    depth = geometry.depth.clone()
+    depth[0, 1, :20] = 0  # pixels that no voxel uses
+    geometry = replace(geometry, depth=depth)
+    module = make_fine()
+    whole = module(tokens, geometry, images)
+    seen = []
+    decode = module.dense_head._decode
+    module.dense_head._decode = lambda *args: seen.append(len(args[2])) or decode(*args)
+    module.dense_head.views_per_chunk = 2
+    with torch.no_grad():
+        chunked = module(tokens, geometry, images)
+    assert seen == [2, 2, 2]
+    assert torch.equal(chunked.grid, whole.grid)
+    torch.testing.assert_close(chunked.features, whole.features, atol=1e-5, rtol=1e-5)

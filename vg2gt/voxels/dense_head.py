@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -115,13 +115,16 @@ class DenseHead(nn.Module):
         Returns:
             ``[B * V, out_channels, H, W]``, laid out channels-last in memory.
         """
+        chunks = list(self.chunks(tokens, images))
+        return chunks[0] if len(chunks) == 1 else torch.cat(chunks)
+
+    def chunks(self, tokens: Tokens, images: Tensor) -> Iterator[Tensor]:
+        """Decodes features ``views_per_chunk`` views at a time; joined they are what the head returns."""
         taps = [tap.flatten(0, 1) for tap in tokens.patch]
         pictures = images.flatten(0, 1)
-        chunks = [
-            self._decode([tap[rows] for tap in taps], tokens.grid, pictures[rows])
-            for rows in (slice(i, i + self.views_per_chunk) for i in range(0, len(pictures), self.views_per_chunk))
-        ]
-        return chunks[0] if len(chunks) == 1 else torch.cat(chunks)
+        for begin in range(0, len(pictures), self.views_per_chunk):
+            rows = slice(begin, begin + self.views_per_chunk)
+            yield self._decode([tap[rows] for tap in taps], tokens.grid, pictures[rows])
 
     def _decode(self, taps: list[Tensor], grid: tuple[int, int], images: Tensor) -> Tensor:
         maps = [layer(tap, grid) for layer, tap in zip(self.reassemble, taps, strict=True)]

@@ -12,7 +12,16 @@ from torch.nn import functional as F
 from vg2gt.geometry.cameras import unproject
 from vg2gt.types import Geometry, Tokens, Voxels
 from vg2gt.voxels.dense_head import DenseHead
-from vg2gt.voxels.grid import VoxelPlan, in_range, plan_voxels, point_cells, pool_mean, pool_min, scene_voxel_size
+from vg2gt.voxels.grid import (
+    VoxelPlan,
+    in_range,
+    plan_voxels,
+    point_cells,
+    pool_mean,
+    pool_mean_of_chunks,
+    pool_min,
+    scene_voxel_size,
+)
 from vg2gt.voxels.pointmlp import PointMLP
 
 log = logging.getLogger(__name__)
@@ -74,13 +83,12 @@ class FineModule(nn.Module):
         Raises:
             ValueError: if a scene spans too many voxels to be numbered.
         """
-        dense = self.dense_head(tokens, images).permute(0, 2, 3, 1).flatten(0, 2)
         with torch.autocast(images.device.type, enabled=False):
             size = scene_voxel_size(geometry, self.voxel_size, self.min_footprint)
             points = _Points(geometry, size)
             plan = self._plan(points)
-            features = F.gelu(torch.addmm(dense.float(), points.offset, self.point_offset.weight.t()))
-            pooled = pool_mean(features, points.confidence, plan)
+        pooled = self._pool_features(tokens, images, points, plan)
+        with torch.autocast(images.device.type, enabled=False):
             colors = pool_mean(images.float().permute(0, 1, 3, 4, 2).reshape(-1, 3), points.confidence, plan)
             offset = pool_mean(points.offset, points.confidence, plan)
             confidence = pool_min(points.confidence, plan)
@@ -91,6 +99,21 @@ class FineModule(nn.Module):
             centroid = (plan.grid + 0.5 + offset.double()) * size.double()[plan.batch, None]
         refined = self.point_mlp(torch.cat((pooled, extra), -1), plan.grid, plan.batch, size)
         return Voxels(refined, colors, plan.grid, plan.batch, confidence, count, centroid.to(pooled.dtype), size)
+
+    def _pool_features(self, tokens: Tokens, images: Tensor, points: _Points, plan: VoxelPlan) -> Tensor:
+        """``[M, C]``; without gradient the features of a few views are there at a time, which bounds the memory."""
+        if torch.is_grad_enabled() or not len(plan):
+            features = self._point_features(self.dense_head(tokens, images), points.offset)
+            return pool_mean(features, points.confidence, plan)
+        pixels = self.dense_head.views_per_chunk * images.shape[-2] * images.shape[-1]
+        chunks = map(self._point_features, self.dense_head.chunks(tokens, images), points.offset.split(pixels))
+        return pool_mean_of_chunks(chunks, points.confidence, plan)
+
+    def _point_features(self, dense: Tensor, offset: Tensor) -> Tensor:
+        """Features ``[N, C]`` of the pixels of some views, their places within the cells ``[N, 3]`` mixed in."""
+        with torch.autocast(dense.device.type, enabled=False):
+            rows = dense.permute(0, 2, 3, 1).flatten(0, 2).float()
+            return F.gelu(torch.addmm(rows, offset, self.point_offset.weight.t()))
 
     def _plan(self, points: _Points) -> VoxelPlan:
         plan = plan_voxels(points.cells, points.batch, points.valid)

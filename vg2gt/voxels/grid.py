@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -175,6 +176,28 @@ def pool_mean(values: Tensor, weights: Tensor, plan: VoxelPlan) -> Tensor:
     if not len(plan):  # nothing to pool; the sum keeps the autograd graph
         return values[:0].to(torch.promote_types(values.dtype, torch.float32)) * weights[:0, None]
     return _WeightedMean.apply(values, weights, plan)  # pyright: ignore[reportReturnType]
+
+
+def pool_mean_of_chunks(chunks: Iterable[Tensor], weights: Tensor, plan: VoxelPlan) -> Tensor:
+    """:func:`pool_mean` of values that come in consecutive chunks of rows, so that nobody holds them all.
+
+    Without gradient; sums of voxels that several chunks meet in are associated otherwise.
+    """
+    dtype = torch.promote_types(weights.dtype, torch.float32)
+    ordered = weights.to(dtype)[plan.order]
+    voxel = plan.voxel_of[plan.order]
+    share = ordered / torch.segment_reduce(ordered, "sum", lengths=plan.counts, unsafe=True)[voxel]
+    means: Tensor | None = None
+    begin = 0
+    for values in chunks:
+        inside = ((plan.order >= begin) & (plan.order < begin + len(values))).nonzero()[:, 0]
+        counts = torch.bincount(voxel[inside], minlength=len(plan))
+        rows, starts = plan.order[inside] - begin, counts.cumsum(0) - counts
+        part = F.embedding_bag(rows, values.to(dtype), starts, mode="sum", per_sample_weights=share[inside])
+        means = part if means is None else means.add_(part)
+        begin += len(values)
+    assert means is not None
+    return means
 
 
 def pool_min(values: Tensor, plan: VoxelPlan) -> Tensor:
