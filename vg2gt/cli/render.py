@@ -11,7 +11,7 @@ from vg2gt.cli.reconstruct import EXPECTED_ERRORS
 from vg2gt.evaluation.settings import choose_device
 from vg2gt.io import read_cameras_json, read_gaussian_ply, read_splat
 from vg2gt.reconstruction import Monitor, interpolate, render_views
-from vg2gt.reconstruction.maps import MAPS, Animation, Sink, map_sinks
+from vg2gt.reconstruction.maps import MAPS, Animation, Sink, feed, map_sinks
 from vg2gt.reconstruction.outputs import FPS, check_outputs, cost_figures, prepare_folder
 from vg2gt.rendering import Renderer
 from vg2gt.types import Gaussians
@@ -67,15 +67,9 @@ def run(options: argparse.Namespace) -> None:
     folder = prepare_folder(options.out, outputs, options.overwrite)
     sinks: list[Sink] = list(map_sinks(folder, outputs))
     sinks += [Animation(folder / name, options.fps) for name in outputs if name.startswith("video")]
-    with Monitor(show=not options.quiet, device=gaussians.means.device) as monitor:
-        with monitor.stage("render", len(cameras)) as advance:
-            for view in render_views(renderer, gaussians, cameras):
-                for sink in sinks:
-                    sink.add(view)
-                advance()
-        with monitor.stage("write"):
-            for sink in sinks:
-                sink.close()
+    monitor = Monitor(show=not options.quiet, device=gaussians.means.device)
+    with monitor, monitor.stage("render views", len(cameras)) as advance:
+        feed(render_views(renderer, gaussians, cameras), sinks, advance)
     cost = cost_figures(monitor)
     seconds = sum(cost["seconds"].values())
     print(f"{len(cameras)} views of {len(gaussians)} Gaussians: {seconds:.1f} s, peak {cost['peak_memory_mib']} MiB")

@@ -6,7 +6,7 @@ import io
 import logging
 import os
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Protocol
@@ -19,6 +19,7 @@ from torch import Tensor
 from vg2gt.io.files import write_bytes
 from vg2gt.io.images import colorize_normals
 from vg2gt.io.video import require_ffmpeg, write_video
+from vg2gt.reconstruction.paths import view_stem
 from vg2gt.reconstruction.scene import RenderedView
 
 log = logging.getLogger(__name__)
@@ -61,11 +62,21 @@ class MapFolder:
         self.suffixes = tuple(suffixes)
         self.target = folder / kind
         self._staged = _staging(self.target)
+        self._written: set[Path] = set()
         self._too_deep = 0
 
     def add(self, view: RenderedView) -> None:
-        """Writes the view's map."""
-        stem = self._staged / Path(view.camera.name).with_suffix("")
+        """Writes the view's map.
+
+        Raises:
+            ValueError: if the view's name leads out of the folder, or another view has it.
+        """
+        stem = self._staged / view_stem(view.camera.name)
+        if not stem.resolve().is_relative_to(self._staged.resolve()):
+            raise ValueError(f"a view is called {view.camera.name!r}, which is outside of the output folder; rename it")
+        if stem in self._written:
+            raise ValueError(f"two views are called {view_stem(view.camera.name)}; rename one of the cameras")
+        self._written.add(stem)
         stem.parent.mkdir(parents=True, exist_ok=True)
         values = {"color": view.color, "depth": view.depth, "normals": view.normal}[self.kind]
         for suffix in self.suffixes:
@@ -80,6 +91,10 @@ class MapFolder:
                 "%d pixels deeper than %g scene units do not fit into a 16-bit PNG and stand as 0; save depth.npy",
                 self._too_deep, _LARGEST / DEPTH_STEPS,
             )  # fmt: skip
+
+    def discard(self) -> None:
+        """Removes what was written and is not at its place."""
+        shutil.rmtree(self._staged, ignore_errors=True)
 
     def _png(self, values: Tensor) -> bytes:
         if self.kind == "depth":
@@ -124,6 +139,21 @@ def map_sinks(folder: Path, outputs: Sequence[str]) -> list[Sink]:
             kind, suffix = os.path.splitext(output)
             kinds.setdefault(kind, []).append(suffix)
     return [MapFolder(folder, kind, suffixes) for kind, suffixes in kinds.items()]
+
+
+def feed(views: Iterable[RenderedView], sinks: Sequence[Sink], advance: Callable[[], None]) -> None:
+    """Gives every view to every sink and closes them; on an error no half-written folder stays."""
+    try:
+        for view in views:
+            for sink in sinks:
+                sink.add(view)
+            advance()
+        for sink in sinks:
+            sink.close()
+    finally:
+        for sink in sinks:
+            if isinstance(sink, MapFolder):
+                sink.discard()
 
 
 @contextmanager

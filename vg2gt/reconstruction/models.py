@@ -76,7 +76,7 @@ def load_model(
         )
     checkpoint = checkpoint_path(None if ckpt is None else str(ckpt))
     given = {"backend": backend, "model": model}
-    config = OmegaConf.create({part: _part(part, spec) for part, spec in given.items() if spec is not None})
+    config = OmegaConf.create({part: compose_part(part, spec) for part, spec in given.items() if spec is not None})
     parts = resolve_parts(config, checkpoint)
     for option in options:
         _set_option(parts, option)
@@ -91,8 +91,12 @@ def load_model(
     return Ready(built, replace(renderer, mode="solid", depth="median"), weights)
 
 
-def _part(part: str, spec: str) -> DictConfig:
-    """Configuration of ``NAME[,key=value...]`` of a group."""
+def compose_part(part: str, spec: str) -> DictConfig:
+    """Configuration of ``NAME[,key=value...]`` of a group: ``backend``, ``model`` or ``renderer``.
+
+    Raises:
+        ValueError: if the name or an option is unknown.
+    """
     name, *changes = split_outside_brackets(spec)
     if name not in _names(part):
         raise ValueError(f"unknown {part} {name!r}; choose one of: {', '.join(_names(part))}")

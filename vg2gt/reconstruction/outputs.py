@@ -26,7 +26,7 @@ from vg2gt.io import (
     write_transforms,
 )
 from vg2gt.io.files import write_bytes, write_json
-from vg2gt.reconstruction.maps import MAPS, Animation, Sink, map_sinks, png, to_pixels, whole_folder
+from vg2gt.reconstruction.maps import MAPS, Animation, feed, map_sinks, png, to_pixels, whole_folder
 from vg2gt.reconstruction.monitor import Monitor
 from vg2gt.reconstruction.paths import orbit
 from vg2gt.reconstruction.report import HtmlReport, PngReport
@@ -139,7 +139,8 @@ def write_outputs(
     page = HtmlReport(scene, folder / "report.html") if "report.html" in outputs else None
     sinks += [page] if page else []
     if sinks:
-        _feed(scene, sinks, monitor)
+        with monitor.stage("render views", len(scene.names)) as advance:
+            feed(scene.render(), sinks, advance)
     if animations:
         _turn(scene, animations, frames, monitor)
     facts = {**scene_figures(scene), **(figures or {}), **cost_figures(monitor)}
@@ -197,27 +198,10 @@ class Mesh:
             write_mesh(path, mesh)
 
 
-def _feed(scene: Scene, sinks: Sequence[Sink], monitor: Monitor) -> None:
-    with monitor.stage("render views", len(scene.names)) as advance:
-        for view in scene.render():
-            for sink in sinks:
-                sink.add(view)
-            advance()
-    with monitor.stage("write maps", len(sinks)) as advance:
-        for sink in sinks:
-            sink.close()
-            advance()
-
-
 def _turn(scene: Scene, animations: Sequence[Animation], frames: int, monitor: Monitor) -> None:
     path = orbit(scene.named_cameras(), float(scene.depth[scene.depth > 0].median()), frames)
     with monitor.stage("render orbit", len(path)) as advance:
-        for view in scene.render(path):
-            for animation in animations:
-                animation.add(view)
-            advance()
-        for animation in animations:
-            animation.close()
+        feed(scene.render(path), animations, advance)
 
 
 def _write_images(scene: Scene, folder: Path) -> None:

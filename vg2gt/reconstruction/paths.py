@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
+from vg2gt.data.sources.parsing import IMAGE_SUFFIXES
 from vg2gt.io.cameras_json import NamedCamera
 
 WIDTH, HEIGHT = 0.15, 0.06  # half axes of the orbit, in distances to what is looked at
@@ -78,9 +80,14 @@ def interpolate(cameras: Sequence[NamedCamera], between: int) -> list[NamedCamer
         pose[:3, 3] = positions(time)
         share = time - left
         k = (1 - share) * intrinsics[left] + share * intrinsics[left + 1]
-        name = f"{cameras[left].name}-{step:03d}"
+        name = f"{view_stem(cameras[left].name)}-{step:03d}"
         path.append(NamedCamera(name, cameras[0].width, cameras[0].height, k, _inverse(pose)))
     return path
+
+
+def view_stem(name: str) -> str:
+    """A view's name without the ending of an image file; other dots are part of the name."""
+    return name[: -len(suffix)] if (suffix := Path(name).suffix).lower() in IMAGE_SUFFIXES else name
 
 
 def _moved(camera: NamedCamera, world_to_camera: NDArray[np.float64], number: int) -> NamedCamera:

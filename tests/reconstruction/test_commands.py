@@ -1,0 +1,189 @@
+"""``vg2gt reconstruct`` and ``vg2gt render`` from the command line."""
+
+import json
+import re
+import shlex
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import vg2gt.cli
+from vg2gt.cli import reconstruct as reconstruct_command
+from vg2gt.cli import render as render_command
+from vg2gt.io import read_cameras_json, read_gaussian_ply, write_cameras_json
+from vg2gt.io.video import count_frames
+from vg2gt.reconstruction import Scene
+
+ORACLE = "oracle,depth_noise=0"
+
+ROOT = Path(__file__).resolve().parents[2]
+TINY = ["--backend", "da3_tiny", "--size", "70", "--quiet", "--device", "cpu"]
+
+
+def _run(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a shell would do with a line of the documentation."""
+    words = shlex.split(command)
+    assert words[0] == "vg2gt"
+    monkeypatch.setattr(sys, "argv", words)
+    vg2gt.cli.main()
+
+
+def test_photographs_of_all_sizes(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    reconstruct_command.main([str(photos), "--out", str(tmp_path / "out"), *TINY])
+    assert {p.name for p in (tmp_path / "out").iterdir()} == {"scene.ply", "cameras.json", "report.png", "report.json"}
+    figures = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert figures["weights"] == "none: the head is untrained"
+    assert figures["backend"]["name"] == "da3_tiny"
+    assert set(figures["seconds"]) >= {"load images", "backbone", "decode geometry", "fine voxels", "render views"}
+    assert len(read_gaussian_ply(tmp_path / "out" / "scene.ply")) == figures["gaussians"]
+    assert len({camera.width for camera in read_cameras_json(tmp_path / "out" / "cameras.json")}) == 1
+    printed = capsys.readouterr().out
+    assert "4 images of 56x70" in printed
+    assert "untrained" in printed
+    assert "peak memory" in printed
+
+
+def test_written_scene_renders_to_the_image_in_memory(scene: Scene, tmp_path: Path) -> None:
+    scene.save(tmp_path, ["scene.ply", "cameras.json"])
+    for mode in ("solid", "rasterized"):
+        out = tmp_path / mode
+        files = [str(tmp_path / "scene.ply"), "--cameras", str(tmp_path / "cameras.json"), "--out", str(out)]
+        save = "color.png,depth.npy,depth.png,normals.npy,normals.png,video.gif"
+        render_command.main([*files, "--mode", mode, "--save", save, "--quiet", "--device", "cpu"])
+        gaussians, cameras = scene.gaussians, scene.cameras
+        expected = scene.renderer(gaussians, cameras, mode=mode)
+        for i, name in enumerate(scene.names):
+            depth = np.load(out / "depth" / f"{name}.npy")
+            difference = np.abs(depth - expected.depth[0, i].numpy())
+            assert np.quantile(difference, 0.99) < 1e-5
+            color = np.array(Image.open(out / "color" / f"{name}.png")) / 255.0
+            in_memory = expected.color[0, i].clamp(0, 1).permute(1, 2, 0).numpy()
+            assert np.quantile(np.abs(color - in_memory), 0.99) < 1 / 500
+            normals = np.load(out / "normals" / f"{name}.npy")
+            assert np.quantile(np.abs(normals - expected.normal[0, i].numpy()), 0.99) < 1e-4
+        assert count_frames(out / "video.gif") == 4
+
+
+def test_path_between_cameras_of_mixed_sizes(scene: Scene, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    scene.save(tmp_path, ["scene.splat", "cameras.json"])
+    arguments = [str(tmp_path / "scene.splat"), "--cameras", str(tmp_path / "cameras.json"), "--quiet"]
+    render_command.main([*arguments, "--out", str(tmp_path / "path"), "--interpolate", "2"])
+    assert len(list((tmp_path / "path" / "color").iterdir())) == 10
+    assert (tmp_path / "path" / "color" / "008-002.png").is_file()
+    cameras = read_cameras_json(tmp_path / "cameras.json")
+    k = cameras[1].intrinsics.copy()
+    small = type(cameras[1])("small.png", 56, 42, k, cameras[1].world_to_camera)
+    write_cameras_json(tmp_path / "cameras.json", [cameras[0], small])
+    render_command.main([*arguments, "--out", str(tmp_path / "mixed")])
+    assert Image.open(tmp_path / "mixed" / "color" / "small.png").size == (56, 42)
+    with pytest.raises(SystemExit, match="one image size"):
+        render_command.main([*arguments, "--out", str(tmp_path / "more"), "--interpolate", "2"])
+
+
+@pytest.mark.parametrize(
+    ("names", "said"), [(["a.png", "a.jpg"], "two views are called a;"), (["../a.png", "b.png"], "outside of")]
+)
+def test_names_of_views_that_cannot_be_files(names, said: str, scene: Scene, tmp_path: Path) -> None:
+    scene.save(tmp_path, ["scene.ply"])
+    cameras = [replace(camera, name=name) for camera, name in zip(scene.named_cameras(), names, strict=False)]
+    write_cameras_json(tmp_path / "cameras.json", cameras)
+    files = [str(tmp_path / "scene.ply"), "--cameras", str(tmp_path / "cameras.json"), "--out", str(tmp_path / "out")]
+    with pytest.raises(SystemExit, match=said):
+        render_command.main([*files, "--quiet"])
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["nowhere.jpg", *TINY], r"FileNotFoundError: nowhere.jpg does not exist"),
+        (["empty", *TINY], "ValueError: no images in empty"),
+        (["broken.png", *TINY], r"DataError: cannot read broken.png"),
+        (["broken.png", "--backend", "dinosaur"], "unknown backend 'dinosaur'"),
+        (["broken.png"], "name a checkpoint, or a backend"),
+        (["broken.png", "--save", "scene.fbx", *TINY], r"unknown output 'scene.fbx'"),
+        (["broken.png", "--backend", "oracle"], "needs known cameras"),
+    ],
+)
+def test_one_line_says_what_is_wrong(arguments, said: str, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "broken.png").write_text("no picture")
+    with pytest.raises(SystemExit) as stopped:
+        reconstruct_command.main([*arguments, "--out", "out", "--quiet"])
+    message = str(stopped.value)
+    assert re.search(said, message)
+    assert "\n" not in message
+    assert not list((tmp_path / "out").glob("*")) if (tmp_path / "out").exists() else True
+
+
+def test_output_folder_that_cannot_be_written(photos: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(SystemExit, match=r"PermissionError: the output folder .*file cannot be made"):
+        reconstruct_command.main([str(photos), "--out", str(tmp_path / "file"), *TINY])
+
+
+def test_sizes() -> None:
+    parse = reconstruct_command.parser().parse_args
+    assert parse(["a", "--out", "b", "--size", "518"]).size == 518
+    assert parse(["a", "--out", "b", "--size", "294x518"]).size == (294, 518)
+    with pytest.raises(SystemExit):
+        parse(["a", "--out", "b", "--size", "large"])
+
+
+def test_commands_of_the_readme(run_folder: Path, recording: Path, photos: Path, tmp_path: Path, monkeypatch) -> None:
+    """The line that needs no weights runs as written, the other ones are at least understood."""
+    lines = re.findall(r"^vg2gt (?:reconstruct|render) [^#\n]*", (ROOT / "README.md").read_text(), re.MULTILINE)
+    assert len(lines) >= 3
+    (tmp_path / "recording").symlink_to(recording)
+    (tmp_path / "photos").symlink_to(photos)
+    (tmp_path / "outputs").mkdir()
+    (tmp_path / "outputs" / "quickstart").symlink_to(run_folder)
+    monkeypatch.chdir(tmp_path)
+    ran = 0
+    for line in lines:
+        command, words = shlex.split(line)[1], shlex.split(line)[2:]
+        (reconstruct_command if command == "reconstruct" else render_command).parser().parse_args(words)
+        if "da3_small" not in line:
+            _run(line, monkeypatch)
+            ran += 1
+    assert ran >= 2
+    assert (tmp_path / "outputs" / "room" / "scene.ply").is_file()
+
+
+def test_help_lists_all_outputs(capsys: pytest.CaptureFixture) -> None:
+    with pytest.raises(SystemExit):
+        reconstruct_command.main(["--help"])
+    text = capsys.readouterr().out
+    assert all(name in text for name in ("scene.splat", "nerfstudio", "report.html", "depth.npy"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["pi3_house", "da3_soh", "vggt_room"])
+def test_real_photographs(name: str, shared: Path, tmp_path: Path) -> None:
+    folder = shared / "data" / "unposed" / name
+    save = "scene.ply,cameras.json,depth.png,normals.png,mesh.ply,colmap,orbit.gif,report.html"
+    reconstruct_command.main([str(folder), "--out", str(tmp_path), "--save", save, "--frames", "8", *TINY])
+    cameras = read_cameras_json(tmp_path / "cameras.json")
+    assert len(cameras) == len([p for p in folder.iterdir() if p.suffix in (".png", ".jpg")])
+    assert len(list((tmp_path / "depth").iterdir())) == len(cameras)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["hololens_office_a", "seven_scenes_redkitchen_a_registered"])
+def test_real_recordings(name: str, shared: Path, tmp_path: Path) -> None:
+    folder = shared / "data" / name
+    arguments = ["--backend", ORACLE, "--size", "168", "--max-images", "8", "--quiet", "--device", "cpu"]
+    save = "scene.ply,cameras.json,color.png,images"
+    reconstruct_command.main([str(folder), "--out", str(tmp_path), "--save", save, *arguments])
+    errors = []
+    for path in sorted((tmp_path / "color").iterdir()):
+        rendered, truth = (np.array(Image.open(p)) / 255 for p in (path, tmp_path / "images" / path.name))
+        seen = rendered.sum(-1) > 0.05  # sensors leave holes
+        assert seen.mean() > 0.5
+        errors.append(-10 * np.log10(np.square(rendered - truth)[seen].mean()))
+    assert np.mean(errors) > 17

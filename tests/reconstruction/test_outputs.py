@@ -1,0 +1,179 @@
+"""Every output is read back by its reader and says the same as the scene in memory."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from PIL import Image
+
+from vg2gt.geometry.cameras import project
+from vg2gt.io import (
+    colmap_intrinsics,
+    colmap_pose,
+    read_cameras_json,
+    read_colmap,
+    read_gaussian_ply,
+    read_point_ply,
+    read_splat,
+    read_transforms,
+    read_video,
+)
+from vg2gt.reconstruction import OUTPUTS, Scene, write_outputs
+from vg2gt.types import Cameras
+
+VIDEOS = ("orbit.mp4",)  # needs ffmpeg
+
+
+@pytest.fixture(scope="module")
+def written(scene: Scene, tmp_path_factory) -> Path:
+    outputs = [name for name in OUTPUTS if name not in VIDEOS]
+    return write_outputs(
+        scene, tmp_path_factory.mktemp("out") / "new", outputs, frames=4, figures={"weights": "<none>"}
+    )
+
+
+def _close(ours: torch.Tensor, expected: torch.Tensor, tolerance: float = 1e-6) -> None:
+    torch.testing.assert_close(ours, expected, atol=tolerance, rtol=tolerance)
+
+
+def test_only_what_was_asked_is_there(written: Path) -> None:
+    folders = {"color", "depth", "normals"}
+    names = {name for name in OUTPUTS if name.split(".")[0] not in folders} - set(VIDEOS)
+    assert {path.name for path in written.iterdir()} == names | folders
+
+
+def test_gaussians(written: Path, scene: Scene) -> None:
+    back = read_gaussian_ply(written / "scene.ply")
+    for field in ("means", "scales", "opacities"):
+        _close(getattr(back, field), getattr(scene.gaussians, field), 1e-5)
+    assert torch.equal(read_splat(written / "scene.splat").means, scene.gaussians.means)
+
+
+def test_cameras(written: Path, scene: Scene) -> None:
+    back = read_cameras_json(written / "cameras.json")
+    assert [camera.name for camera in back] == ["008.png", "009.png", "010.png", "011.png"]
+    poses = torch.cat([camera.cameras().world_to_camera for camera in back], 1)
+    assert torch.equal(poses, scene.cameras.world_to_camera)
+    assert all((camera.height, camera.width) == scene.cameras.size for camera in back)
+    for camera in back:
+        assert (written / "images" / camera.name).is_file()
+
+
+def test_maps(written: Path, scene: Scene) -> None:
+    for camera, view in zip(scene.named_cameras(), scene.render(), strict=True):
+        stem = camera.name.removesuffix(".png")
+        depth = np.load(written / "depth" / f"{stem}.npy")
+        assert np.array_equal(depth, view.depth.numpy())
+        stored = np.array(Image.open(written / "depth" / f"{stem}.png"))
+        assert stored.dtype == np.uint16
+        assert np.abs(stored / 1000 - depth).max() <= 5.1e-4
+        color = np.array(Image.open(written / "color" / f"{stem}.png")) / 255
+        assert np.abs(color - view.color.permute(1, 2, 0).numpy()).max() < 1 / 500
+        assert np.array_equal(np.load(written / "normals" / f"{stem}.npy"), view.normal.numpy())
+        assert Image.open(written / "normals" / f"{stem}.png").size == (112, 84)
+
+
+def test_rendered_views_look_like_the_input(scene: Scene) -> None:
+    """The head's initial state makes coloured voxels where the depth is known."""
+    for image, depth, view in zip(scene.images, scene.depth, scene.render(), strict=True):
+        error = (view.color - image).square().mean()
+        assert -10 * error.log10() > 20
+        both = (depth > 0) & (view.depth > 0)
+        assert both.float().mean() > 0.95
+        assert ((view.depth / depth)[both] - 1).abs().median() < 0.06  # untrained Gaussians are a voxel thick
+
+
+def test_colmap_points_fall_on_the_pixels_they_came_from(written: Path, scene: Scene) -> None:
+    model = read_colmap(written / "colmap" / "sparse" / "0")
+    assert len(model.points) > 5000
+    errors = []
+    for index, image in enumerate(model.images.values()):
+        k, pose = colmap_intrinsics(model.cameras[image.camera_id]), colmap_pose(image)
+        rows = np.searchsorted(model.points.ids, image.point3d_ids)
+        local = model.points.positions[rows] @ pose[:3, :3].T + pose[:3, 3]
+        pixels = local @ k.T
+        pixels = pixels[:, :2] / pixels[:, 2:] + 0.5
+        errors.append(np.linalg.norm(pixels - image.points2d, axis=1))
+        picture = np.array(Image.open(written / "colmap" / "images" / image.name))
+        x, y = (image.points2d - 0.5).round().astype(int).T
+        assert np.array_equal(picture[y, x], model.points.colors[rows])
+        assert np.abs(local[:, 2] - scene.depth[index, y, x].numpy()).max() < 1e-4
+    assert np.concatenate(errors).max() < 0.5
+
+
+def test_nerfstudio(written: Path, scene: Scene) -> None:
+    transforms = read_transforms(written / "nerfstudio" / "transforms.json")
+    for frame, camera in zip(transforms.frames, scene.named_cameras(), strict=True):
+        assert (written / "nerfstudio" / frame.file_path).is_file()
+        assert np.abs(frame.world_to_camera - camera.world_to_camera).max() < 1e-6
+        assert np.abs(frame.lens.intrinsics() - camera.intrinsics).max() < 1e-9
+    assert transforms.ply_file_path is not None
+    assert len(read_point_ply(written / "nerfstudio" / transforms.ply_file_path).positions) > 5000
+
+
+def test_points_and_meshes_lie_on_the_surfaces(written: Path, scene: Scene) -> None:
+    points = read_point_ply(written / "points.ply").positions
+    loaded = trimesh.load(written / "points.glb")
+    assert isinstance(loaded, trimesh.Scene)
+    assert set(loaded.geometry) == {"points", "cameras"}
+    for suffix in ("ply", "glb", "obj"):
+        mesh = trimesh.load_mesh(written / f"mesh.{suffix}")
+        assert len(mesh.faces) > 1000
+    vertices = torch.from_numpy(np.array(trimesh.load_mesh(written / "mesh.ply").vertices)).float()
+    for candidates, tolerance in ((torch.from_numpy(points).float(), 0.01), (vertices, 0.06)):
+        pixels, depth = project(candidates[None, None], scene.cameras.select(slice(0, 1)))
+        x, y = pixels[0, 0].round().long().unbind(-1)
+        seen = (depth[0, 0] > 0) & (x >= 0) & (x < 112) & (y >= 0) & (y < 84)
+        surface = scene.depth[0, y[seen], x[seen]]
+        error = (depth[0, 0][seen] / surface - 1).abs()[surface > 0]
+        assert error.median() < tolerance
+
+
+def test_animation_and_reports(written: Path, scene: Scene) -> None:
+    frames = [frame for _, frame in read_video(written / "orbit.gif")]
+    assert [frame.shape for frame in frames] == [(84, 112, 3)] * 4
+    assert Image.open(written / "report.png").size == (4 * 112 + 12, 4 * 84 + 12)
+    figures = json.loads((written / "report.json").read_text())
+    assert figures["views"] == 4
+    assert figures["gaussians"] == len(scene.gaussians)
+    assert set(figures["seconds"]) >= {"write files", "render views", "render orbit"}
+    assert figures["peak_memory_mib"] > 100
+    page = (written / "report.html").read_text()
+    assert page.count("data:image/jpeg;base64,") == 16
+    assert page.count("data:image/gif;base64,") == 1
+    assert "&lt;none&gt;" in page
+    assert "http" not in page
+
+
+def test_nothing_is_replaced_unasked(written: Path, scene: Scene, tmp_path: Path) -> None:
+    with pytest.raises(FileExistsError, match=r"scene.ply is there already"):
+        write_outputs(scene, written, ["scene.ply"])
+    write_outputs(scene, tmp_path, ["color.png"])
+    (tmp_path / "color" / "stale.png").touch()
+    write_outputs(scene, tmp_path, ["color.png"], overwrite=True)
+    assert not (tmp_path / "color" / "stale.png").exists()
+
+
+def test_unknown_outputs_and_folders_that_cannot_be(scene: Scene, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"unknown output 'scene.obj'; choose from: scene.ply"):
+        scene.save(tmp_path, ["scene.obj"])
+    (tmp_path / "file").touch()
+    with pytest.raises(PermissionError, match="file"):
+        scene.save(tmp_path / "file" / "folder")
+
+
+def test_depth_too_deep_for_a_png_is_said(scene: Scene, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    gaussians = replace(scene.gaussians, means=scene.gaussians.means * 100, scales=scene.gaussians.scales * 100)
+    first = scene.cameras.select(slice(0, 1))
+    cameras = Cameras(first.world_to_camera, first.intrinsics, first.size)
+    parts = {"gaussians": gaussians, "cameras": cameras, "images": scene.images[:1], "depth": scene.depth[:1] * 100}
+    far = replace(scene, **parts, names=scene.names[:1])
+    write_outputs(far, tmp_path, ["depth.png"])
+    assert "save depth.npy" in caplog.text
+    stored = np.array(Image.open(tmp_path / "depth" / "008.png"))
+    assert (stored == 0).any()
+    assert (stored > 50_000).any()

@@ -1,0 +1,58 @@
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from vg2gt.io import NamedCamera
+from vg2gt.reconstruction import interpolate, orbit
+
+K = np.array([[50.0, 0, 31.5], [0, 50, 23.5], [0, 0, 1]])
+
+
+def _camera(x: float, turn: float = 0.0, size: tuple[int, int] = (64, 48), focal: float = 50.0) -> NamedCamera:
+    pose = np.eye(4)
+    pose[:3, :3] = [[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]]
+    pose[:3, 3] = (x, 0, 0)
+    k = K.copy()
+    k[0, 0] = k[1, 1] = focal
+    return NamedCamera(f"c{x:g}", *size, k, np.linalg.inv(pose).astype(np.float64))
+
+
+def test_orbit_faces_one_point_and_closes() -> None:
+    path = orbit([_camera(-1), _camera(0.1), _camera(5)], distance=2.0, frames=16)
+    assert len({camera.name for camera in path}) == 16
+    looked_at = np.array([0.1, 0, 2.0, 1])
+    centers = []
+    for camera in path:
+        local = camera.world_to_camera @ looked_at
+        assert np.abs(local[:2]).max() < 1e-9
+        assert local[2] > 0
+        rotation = camera.world_to_camera[:3, :3]
+        assert np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-12
+        assert abs(rotation[0, 1]) < 1e-12  # level
+        centers.append(np.linalg.inv(camera.world_to_camera)[:3, 3])
+    steps = np.linalg.norm(np.diff([*centers, centers[0]], axis=0), axis=1)
+    assert steps.max() < 0.15
+    assert np.ptp(centers, axis=0)[0] == pytest.approx(2 * 0.15 * 2.0)
+
+
+def test_interpolation_passes_through_the_cameras() -> None:
+    given = [_camera(0), _camera(1, 0.4, focal=60.0), _camera(3, 0.2)]
+    path = interpolate(given, 3)
+    assert len(path) == 9
+    assert path[::4] == given
+    assert len({camera.name for camera in path}) == 9
+    assert path[2].intrinsics[0, 0] == pytest.approx(55)
+    jumps = [np.abs(a.world_to_camera - b.world_to_camera).max() for a, b in pairwise(path)]
+    assert max(jumps) < 0.8
+    (middle,) = interpolate([_camera(0), _camera(2, 0.5)], 1)[1:2]
+    assert np.allclose(np.linalg.inv(middle.world_to_camera), np.linalg.inv(_camera(1, 0.25).world_to_camera))
+
+
+def test_what_no_path_can_be_made_of() -> None:
+    with pytest.raises(ValueError, match="at least two"):
+        interpolate([_camera(0)], 2)
+    with pytest.raises(ValueError, match="one image size"):
+        interpolate([_camera(0), _camera(1, size=(32, 48))], 2)
+    with pytest.raises(ValueError, match="needs cameras"):
+        orbit([], 1.0)

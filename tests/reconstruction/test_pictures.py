@@ -1,0 +1,140 @@
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from vg2gt.io import write_video
+from vg2gt.reconstruction import Monitor, find_pictures, working_size
+from vg2gt.reconstruction.views import load_views
+
+
+def _views(images, size=(84, 112), **options):
+    return load_views(find_pictures(images, **options), size, Monitor())
+
+
+def test_photographs_of_all_sizes_come_upright_in_the_order_of_their_numbers(photos: Path, frames) -> None:
+    views = _views(photos)
+    assert views.names == ("IMG_8", "IMG_9", "IMG_10", "IMG_11")
+    assert torch.equal(views.images[0], frames.images[0])
+    for i in (1, 2):  # JPEG, resized or turned
+        assert (views.images[i] - frames.images[i]).abs().mean() < 0.03
+    assert views.kept == pytest.approx((1, 1, 1, 0.5))
+    assert views.hints is None
+
+
+def test_order_and_mixture_of_arguments_are_kept(photos: Path, frames) -> None:
+    given = [frames.images[3], photos / "IMG_9.jpg", Image.open(photos / "IMG_10.jpg"), frames.images[:2]]
+    views = _views(given)
+    assert views.names == ("image-000", "IMG_9", "image-001", "image-002", "image-003")
+    assert (views.images[2] - frames.images[2]).abs().mean() < 0.03  # the Pillow image's EXIF data count too
+    assert torch.allclose(views.images[[0, 3, 4]], frames.images[[3, 0, 1]], atol=1 / 500)
+
+
+def test_every_and_max_images_spread_evenly(photos: Path) -> None:
+    assert [p.name for p in find_pictures(photos, every=2)] == ["IMG_8", "IMG_10"]
+    assert [p.name for p in find_pictures(photos, max_images=2)] == ["IMG_8", "IMG_11"]
+    assert [p.name for p in find_pictures(photos, max_images=1)] == ["IMG_8"]
+
+
+def test_frames_of_a_video(tmp_path: Path) -> None:
+    frames = [np.zeros((20, 70, 3), np.uint8) for _ in range(70)]
+    for i, frame in enumerate(frames):
+        frame[:, :i] = 255
+    path = write_video(tmp_path / "clip.gif", frames)
+    assert len(find_pictures(path)) == 24  # every third: at most 32
+    chosen = find_pictures(path, every=30)
+    assert [p.name for p in chosen] == ["clip-000000", "clip-000030", "clip-000060"]
+    assert chosen[2].read((14, 14)).images.mean().item() == pytest.approx(60 / 70, abs=0.02)
+    assert len(find_pictures(path, max_images=5)) == 5
+
+
+def test_large_pictures_are_shrunk_while_they_are_read(tmp_path: Path) -> None:
+    Image.new("RGB", (1200, 900), (10, 20, 30)).save(tmp_path / "large.png")
+    (picture,) = find_pictures(tmp_path)
+    assert picture.size == (900, 1200)
+    read = picture.read((84, 112))
+    assert read.images.shape == (1, 3, 180, 240)
+    assert (read.images[0, :, 5, 5] * 255).round().tolist() == [10, 20, 30]
+
+
+def test_a_recording_gives_its_cameras_and_depth(recording: Path, frames) -> None:
+    pictures = find_pictures(recording, posed=True)
+    views = load_views(pictures, (56, 84), Monitor())
+    assert views.names == ("008", "009", "010", "011")
+    assert views.hints is not None
+    assert views.hints.cameras is not None
+    assert views.hints.depth is not None
+    assert views.hints.depth.shape == (1, 4, 56, 84)
+    assert torch.allclose(views.hints.cameras.world_to_camera[0], frames.world_to_camera, atol=1e-5)
+    scale = 84 / 112
+    assert views.hints.cameras.intrinsics[0, 0, 0, 0].item() == pytest.approx(frames.intrinsics[0, 0, 0] * scale)
+    assert [p.name for p in find_pictures(recording)] == ["008", "009", "010", "011"]  # as mere photographs
+
+
+@pytest.mark.parametrize(
+    ("size", "expected"),
+    [(None, (210, 280)), (140, (112, 140)), ((28, 56), (28, 56))],
+)
+def test_working_size(size, expected) -> None:
+    assert working_size([(600, 800)] * 3, 14, "cpu", size) == expected
+
+
+def test_working_size_of_mixed_and_extreme_shapes() -> None:
+    assert working_size([(600, 800), (800, 600)], 14, "cpu") == (280, 280)
+    assert working_size([(800, 600)], 14, "cuda") == (518, 392)
+    assert working_size([(100, 3000)], 14, "cpu") == (14, 280)
+    assert working_size([(60, 50)], 14, "cpu") == (56, 42)  # not more than there is
+    with pytest.raises(ValueError, match="try 28x56"):
+        working_size([(60, 50)], 14, "cpu", (30, 60))
+    with pytest.raises(ValueError, match="smaller than one patch"):
+        working_size([(60, 50)], 14, "cpu", 10)
+
+
+def test_nothing_to_reconstruct(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="no images to reconstruct"):
+        find_pictures([])
+    (tmp_path / "clip.mp4").touch()
+    with pytest.raises(ValueError, match=r"no images in .* name one: .*clip.mp4"):
+        find_pictures(tmp_path)
+    with pytest.raises(FileNotFoundError, match=r"nowhere.jpg"):
+        find_pictures(tmp_path / "nowhere.jpg")
+
+
+def test_what_cannot_be_read_is_named(tmp_path: Path, monkeypatch) -> None:
+    (tmp_path / "note.jpg").write_text("no picture")
+    with pytest.raises(ValueError, match=r"cannot read .*note.jpg"):
+        find_pictures(tmp_path)
+    Image.new("RGB", (40, 30)).save(tmp_path / "whole.png")
+    content = (tmp_path / "whole.png").read_bytes()
+    (tmp_path / "note.jpg").write_bytes(content[: len(content) // 2])
+    os.remove(tmp_path / "whole.png")
+    with pytest.raises(ValueError, match=r"cannot read .*note.jpg"):
+        _views(tmp_path, (14, 14))
+    (tmp_path / "IMG.HEIC").touch()
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(ValueError, match="pip install pillow-heif"):
+        find_pictures(tmp_path / "IMG.HEIC")
+
+
+@pytest.mark.parametrize(
+    ("item", "said"),
+    [
+        (np.zeros((4, 5), np.uint8), r"shape \[4, 5\]"),
+        (np.zeros((4, 5, 3), np.int32), "uint8"),
+        (torch.full((3, 4, 5), 2.0), r"\[0, 1\]"),
+        (7, "int"),
+    ],
+)
+def test_what_is_no_image(item, said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        find_pictures([item])
+
+
+def test_needed_cameras_are_asked_for(photos: Path) -> None:
+    with pytest.raises(ValueError, match=r"needs known cameras.*photos has none"):
+        find_pictures(photos, posed=True)
+    with pytest.raises(ValueError, match="needs known cameras"):
+        find_pictures(np.zeros((4, 5, 3), np.uint8), posed=True)
