@@ -25,7 +25,7 @@ OPACITY = 0.95
 
 
 def voxel_room(
-    seed: int = 3, views: int = 12, size: tuple[int, int] = (240, 320), voxel_size: float = 0.06
+    seed: int = 2, views: int = 12, size: tuple[int, int] = (240, 320), voxel_size: float = 0.06
 ) -> tuple[Gaussians, Cameras, Tensor]:
     """Makes the scene.
 
@@ -67,7 +67,7 @@ def main() -> None:
     """Writes the scene's files."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--voxel-size", type=float, default=0.03)
+    parser.add_argument("--voxel-size", type=float, default=0.02)
     arguments = parser.parse_args()
     gaussians, cameras, images = voxel_room(size=(480, 640), voxel_size=arguments.voxel_size)
     names = [f"{index:02d}.png" for index in range(len(images))]

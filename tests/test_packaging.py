@@ -16,6 +16,7 @@ def test_installed_wheel_trains_from_an_empty_folder(tmp_path: Path) -> None:
     members = zipfile.ZipFile(wheel).namelist()
     assert "vg2gt/configs/train.yaml" in members
     assert "backends/oracle.py" in members
+    assert "vg2gt/viewer/static/page.html" in members
     assert not [name for name in members if name.startswith(("tests/", "benchmarks/", "outputs/"))]
 
     site, empty = tmp_path / "site", tmp_path / "empty"

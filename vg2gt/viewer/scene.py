@@ -15,7 +15,7 @@ from vg2gt.io.cameras_json import NamedCamera
 from vg2gt.io.glb import scene_extent
 from vg2gt.types import Gaussians
 
-FRUSTUM_SHARE = 0.05  # of the scene's extent, the depth of a drawn frustum
+FRUSTUM_SHARE = 0.02  # of the scene's extent, the depth of a drawn frustum
 PICTURE_SIDE = 320  # longer side of an image shown in its frustum, in pixels
 _DEFAULT_SIZE = (960, 720)  # of the view of a scene without cameras
 _INSIDE_SHARE = 0.1  # of the Gaussians that the first camera's frame must have in view to start there

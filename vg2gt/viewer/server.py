@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 LOOPBACK = "127.0.0.1"
 PORT = 8080
-_LOOK_DEPTHS = 10.0  # frustum depths ahead of a camera, the point to turn around
+_LOOK_DEPTHS = 25.0  # frustum depths ahead of a camera, the point to turn around
 
 
 class MissingViserError(ImportError):

@@ -1,5 +1,6 @@
 // Wires the page together. window.vg2gtViewer is for scripts: ready (a promise), setCamera(index or camera record), which
-// resolves when that view is drawn completely, and loadSeconds. The address may end in #camera=INDEX&ui=off.
+// resolves when that view is drawn completely, and loadSeconds. The address may end in
+// #camera=INDEX&show=cameras,images&ui=off.
 
 const started = performance.now();
 const element = (id) => document.getElementById(id);
@@ -11,7 +12,11 @@ function say(text, isError = false) {
 
 function requested() {
   const parameters = new URLSearchParams(location.hash.slice(1));
-  return { camera: Number.parseInt(parameters.get("camera") ?? "0", 10), panel: parameters.get("ui") !== "off" };
+  return {
+    camera: Number.parseInt(parameters.get("camera") ?? "0", 10),
+    show: (parameters.get("show") ?? "").split(","),
+    panel: parameters.get("ui") !== "off",
+  };
 }
 
 async function start() {
@@ -30,14 +35,13 @@ async function start() {
   const show = { frusta: false, images: false };
   let version = 0, drawn = -1, busy = false, waiting = [];
 
-  // Sorts for the newest view and draws; in between frames show the newest view in an older order.
+  // Sorts for the newest view and draws; in between frames show the newest view in an older order. The first one is
+  // sorted here: it is sooner than a worker starts.
   async function update() {
     busy = true;
     while (drawn < version) {
-      const now = version, axis = [...view.axes[2], view.translation()[2]];
-      const order = await sorter.sort(axis, scene.settings.near);
-      renderer.setOrder(order);
-      await new Promise((resolve) => setTimeout(resolve));
+      const now = version, axis = [...view.axes[2], view.translation()[2]], near = scene.settings.near;
+      renderer.setOrder(drawn < 0 ? makeDepthSorter(means)(axis, near) : await sorter.sort(axis, near));
       paint();
       drawn = now;
     }
@@ -45,11 +49,19 @@ async function start() {
     for (const resolve of waiting.splice(0)) resolve();
   }
 
-  function paint() {
+  function wantedSize() {
     const density = Math.min(window.devicePixelRatio, 2);
-    renderer.resize(Math.max(1, Math.round(canvas.clientWidth * density)),
-      Math.max(1, Math.round(canvas.clientHeight * density)));
+    return [canvas.clientWidth, canvas.clientHeight].map((length) => Math.max(1, Math.round(length * density)));
+  }
+
+  function paint() {
+    renderer.resize(...wantedSize());
     renderer.draw(view, show);
+  }
+
+  function resized() {
+    const [width, height] = wantedSize();
+    if (width !== canvas.width || height !== canvas.height) changed();
   }
 
   function changed() {
@@ -69,12 +81,12 @@ async function start() {
     const record = typeof camera === "number" ? records[camera] : camera;
     if (!record) throw new Error(`There is no camera ${camera}; the scene has ${records.length}.`);
     view.set(fromRecord(record));
-    view.pivot = typicalDepth(view, means, 20 * scene.frustum_depth);
+    view.pivot = typicalDepth(view, means, 50 * scene.frustum_depth);
     if (typeof camera === "number") element("cameras").selectedIndex = camera;
     return complete();
   }
 
-  connect({ canvas, view, changed, setCamera, show, records, scene, pictures });
+  connect({ canvas, view, changed, resized, setCamera, show, records, scene, pictures });
   const wanted = requested();
   await setCamera(records[wanted.camera] ? wanted.camera : 0);
   viewer.loadSeconds = (performance.now() - started) / 1000;
@@ -83,7 +95,7 @@ async function start() {
 }
 
 // Buttons, boxes, keys, window.
-function connect({ canvas, view, changed, setCamera, show, records, scene, pictures }) {
+function connect({ canvas, view, changed, resized, setCamera, show, records, scene, pictures }) {
   const list = element("cameras");
   for (const { name } of records) list.append(new Option(name));
   const walk = (step) => setCamera((list.selectedIndex + step + records.length) % records.length);
@@ -92,7 +104,7 @@ function connect({ canvas, view, changed, setCamera, show, records, scene, pictu
     n: () => walk(1),
     p: () => walk(-1),
     r: reset,
-    c: () => element("show-frusta").click(),
+    c: () => element("show-cameras").click(),
     i: () => element("show-images").click(),
   });
   list.addEventListener("change", reset);
@@ -101,15 +113,17 @@ function connect({ canvas, view, changed, setCamera, show, records, scene, pictu
   element("reset").addEventListener("click", reset);
   const box = (id, enabled, apply) => {
     element(id).disabled = !enabled;
+    element(id).checked = enabled && requested().show.includes(id.slice("show-".length));
+    apply(element(id).checked);
     element(id).addEventListener("change", () => {
       apply(element(id).checked);
       changed();
     });
   };
-  box("show-frusta", scene.cameras.length > 0, (on) => { show.frusta = on; });
+  box("show-cameras", scene.cameras.length > 0, (on) => { show.frusta = on; });
   box("show-images", pictures.some(Boolean), (on) => { show.images = on; });
   box("fly", true, (on) => { controls.fly = on; });
-  new ResizeObserver(changed).observe(canvas);
+  new ResizeObserver(resized).observe(canvas);
   window.addEventListener("hashchange", () => {
     element("panel").hidden = !requested().panel;
     if (records[requested().camera]) setCamera(requested().camera);

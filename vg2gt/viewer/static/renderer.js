@@ -170,14 +170,14 @@ class Renderer {
     gl.activeTexture(gl.TEXTURE0);
   }
 
-  // Far frusta first; the one the viewer looks out of is left away.
+  // Far frusta first; those at the eye would hide the scene and are left away.
   drawFrusta(view, frusta, images) {
     const gl = this.gl, { uniforms } = this.overlay;
     this.usePose(this.overlay, view);
     gl.uniform1f(uniforms.near, this.settings.near);
     gl.bindVertexArray(this.frustumArray);
     const distance = ({ center }) => Math.hypot(...addScaled(center, view.center, -1));
-    const shown = this.frusta.filter((frustum) => distance(frustum) > 0.5 * frustum.depth);
+    const shown = this.frusta.filter((frustum) => distance(frustum) > 2 * frustum.depth);
     for (const { start, lines, texture } of shown.sort((a, b) => distance(b) - distance(a))) {
       gl.uniform1i(uniforms.textured, images && texture ? 1 : 0);
       if (images && texture) {
