@@ -2,8 +2,6 @@
 
 import json
 import re
-import shlex
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +9,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-import vg2gt.cli
 from vg2gt.cli import reconstruct as reconstruct_command
 from vg2gt.cli import render as render_command
 from vg2gt.io import read_cameras_json, read_gaussian_ply, write_cameras_json
@@ -20,16 +17,7 @@ from vg2gt.reconstruction import Scene
 
 ORACLE = "oracle,depth_noise=0"
 
-ROOT = Path(__file__).resolve().parents[2]
 TINY = ["--backend", "da3_tiny", "--size", "70", "--quiet", "--device", "cpu"]
-
-
-def _run(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a shell would do with a line of the documentation."""
-    words = shlex.split(command)
-    assert words[0] == "vg2gt"
-    monkeypatch.setattr(sys, "argv", words)
-    vg2gt.cli.main()
 
 
 def test_photographs_of_all_sizes(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
@@ -133,26 +121,6 @@ def test_sizes() -> None:
     assert parse(["a", "--out", "b", "--size", "294x518"]).size == (294, 518)
     with pytest.raises(SystemExit):
         parse(["a", "--out", "b", "--size", "large"])
-
-
-def test_commands_of_the_readme(run_folder: Path, recording: Path, photos: Path, tmp_path: Path, monkeypatch) -> None:
-    """The line that needs no weights runs as written, the other ones are at least understood."""
-    lines = re.findall(r"^vg2gt (?:reconstruct|render) [^#\n]*", (ROOT / "README.md").read_text(), re.MULTILINE)
-    assert len(lines) >= 3
-    (tmp_path / "recording").symlink_to(recording)
-    (tmp_path / "photos").symlink_to(photos)
-    (tmp_path / "outputs").mkdir()
-    (tmp_path / "outputs" / "quickstart").symlink_to(run_folder)
-    monkeypatch.chdir(tmp_path)
-    ran = 0
-    for line in lines:
-        command, words = shlex.split(line)[1], shlex.split(line)[2:]
-        (reconstruct_command if command == "reconstruct" else render_command).parser().parse_args(words)
-        if "da3_small" not in line:
-            _run(line, monkeypatch)
-            ran += 1
-    assert ran >= 2
-    assert (tmp_path / "outputs" / "room" / "scene.ply").is_file()
 
 
 def test_help_lists_all_outputs(capsys: pytest.CaptureFixture) -> None:

@@ -49,6 +49,8 @@ def test_frames_of_a_video(tmp_path: Path) -> None:
     assert [p.name for p in chosen] == ["clip-000000", "clip-000030", "clip-000060"]
     assert chosen[2].read((14, 14)).images.mean().item() == pytest.approx(60 / 70, abs=0.02)
     assert len(find_pictures(path, max_images=5)) == 5
+    mixed = find_pictures([frames[0], path, frames[1], frames[2]], every=30)
+    assert [p.name for p in mixed] == ["image", "clip-000000", "clip-000030", "clip-000060"]
 
 
 def test_large_pictures_are_shrunk_while_they_are_read(tmp_path: Path) -> None:

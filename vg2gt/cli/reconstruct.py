@@ -16,8 +16,9 @@ from vg2gt.evaluation.settings import choose_device
 from vg2gt.io.video import MissingDecoderError, require_ffmpeg
 from vg2gt.reconstruction import OUTPUTS, Monitor, OutOfMemory, Ready, load_model, reconstruct_with, write_outputs
 from vg2gt.reconstruction.outputs import DEFAULT, ORBIT_FRAMES, check_outputs, cost_figures, prepare_folder
+from vg2gt.reconstruction.pipeline import memory_advice
 
-EXPECTED_ERRORS = (ValueError, FileNotFoundError, FileExistsError, PermissionError, OutOfMemory, MissingDecoderError)
+EXPECTED_ERRORS = (ValueError, OSError, ImportError, OutOfMemory, MissingDecoderError)
 
 
 def parser() -> argparse.ArgumentParser:
@@ -82,16 +83,17 @@ def run(options: argparse.Namespace) -> None:
             monitor=monitor,
         )
         figures = _figures(ready)
-        folder = write_outputs(
-            scene,
-            options.out,
-            options.save,
-            overwrite=options.overwrite,
-            frames=options.frames,
-            mesh_voxel=options.mesh_voxel,
-            figures=figures,
-            monitor=monitor,
-        )
+        with memory_advice(len(scene.names), scene.cameras.size):
+            folder = write_outputs(
+                scene,
+                options.out,
+                options.save,
+                overwrite=options.overwrite,
+                frames=options.frames,
+                mesh_voxel=options.mesh_voxel,
+                figures=figures,
+                monitor=monitor,
+            )
     cost = cost_figures(monitor)
     times = ", ".join(f"{name} {seconds:.1f}" for name, seconds in cost["seconds"].items())
     height, width = scene.cameras.size

@@ -79,13 +79,16 @@ def find_pictures(
     if every < 1 or (max_images is not None and max_images < 1):
         raise ValueError(f"every and max_images must be at least 1, got {every} and {max_images}")
     items = list(images) if isinstance(images, (list, tuple)) else [images]
-    found: list[Picture] = []
+    chosen: list[Picture] = []
+    stills = 0
     for item in items:
-        found += _posed_pictures(item) if posed else _pictures(item, every, max_images)
-    if not found:
+        found = _posed_pictures(item) if posed else _pictures(item, every, max_images)
+        if not _is_video(item):  # of a video every so many-th frame was decoded
+            stills += len(found)
+            found = [picture for i, picture in enumerate(found, stills - len(found)) if i % every == 0]
+        chosen += found
+    if not chosen:
         raise ValueError("there are no images to reconstruct; give image files, a folder of them, or a video")
-    # A video's frames are chosen while it is decoded.
-    chosen = found if len(items) == 1 and _is_video(items[0]) else found[::every]
     if max_images is not None and len(chosen) > max_images:
         chosen = [chosen[i] for i in _spread(len(chosen), max_images)]
     return _with_unique_names(chosen)
