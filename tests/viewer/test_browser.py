@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -168,6 +169,7 @@ def count(image: np.ndarray, color: list[int]) -> int:
 
 def test_page_fetches_nothing_and_hostile_names_do_nothing(page: Page, tmp_path: Path) -> None:
     show(page, tmp_path / "page.html", pictured_scene(HOSTILE), (400, 700), "")
+    assert [address for address in page.requests if address.startswith("blob:")]  # the sorting worker is let in
     assert [address for address in page.requests if not address.startswith(("file:", "blob:"))] == []
     assert page.run("document.title") == HOSTILE
     assert page.run("document.getElementById('cameras').options[1].text.startsWith('</script><script>')")
@@ -178,6 +180,34 @@ def test_page_fetches_nothing_and_hostile_names_do_nothing(page: Page, tmp_path:
     )
     assert page.run("fetch('data:,x').then(() => 'fetched', () => 'refused')") == "refused"
     assert page.run("window.hole") is None
+
+
+@contextmanager
+def lacking(page: Page, script: str) -> Iterator[None]:
+    """Runs a script before every page's own."""
+    number = page.call("Page.addScriptToEvaluateOnNewDocument", source=script)["identifier"]
+    yield
+    page.call("Page.removeScriptToEvaluateOnNewDocument", identifier=number)
+
+
+@pytest.mark.parametrize(
+    ("script", "least"),
+    [
+        ("window.Worker = undefined", CLOSE),
+        ("WebGL2RenderingContext.prototype.getExtension = () => null", 40.0),  # rounds to 8 bits at every splat
+    ],
+)
+def test_browsers_that_lack_something(page: Page, tmp_path: Path, script: str, least: float) -> None:
+    with lacking(page, script):
+        assert min(compare(page, tmp_path / "page.html", scene(300), views((120, 168)))) > least
+
+
+def test_browser_without_webgl_says_so(page: Page, tmp_path: Path) -> None:
+    path = write_viewer_html(tmp_path / "page.html", pictured_scene())
+    with lacking(page, "HTMLCanvasElement.prototype.getContext = () => null"):
+        page.open(path.as_uri(), 400, 300)
+        page.run("vg2gtViewer.ready.catch(() => null)")
+        assert "no WebGL 2" in page.run("document.getElementById('status').textContent")
 
 
 def test_narrow_screen(page: Page, tmp_path: Path) -> None:

@@ -47,8 +47,8 @@ def write_viewer_html(path: str | Path, scene: ViewerScene) -> Path:
     script = '(() => {\n"use strict";\n' + "\n".join(_static(name) for name in SCRIPTS) + "})();\n"
     style = _static("style.css")
     policy = (
-        f"default-src 'none'; script-src '{_hash(script)}' blob:; worker-src blob:; style-src '{_hash(style)}'; "
-        "img-src blob:; base-uri 'none'; form-action 'none'"
+        f"default-src 'none'; script-src '{_hash(script)}'; worker-src blob:; style-src '{_hash(style)}'; "
+        "base-uri 'none'; form-action 'none'"
     )
     parts = {
         "policy": policy,
