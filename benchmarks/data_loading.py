@@ -2,8 +2,9 @@
 
 Writes synthetic RGB-D recordings of 640x480 (PNG and JPEG colour, 16-bit PNG depth) to a temporary folder and reads
 them as training batches of 8 images of 224x448: from the files, from the cache of resized frames, from shards, and from
-memory, with 0, 1 and 2 worker processes. Then takes training steps on a CPU and measures how long each waits for its
-batch. Beside that stands what the paper's training took in a second on each of its devices. Prints tables and writes a
+memory, with 0, 1 and 2 worker processes. Then takes steps of the default training (images of 112x224) on a CPU and
+measures how long each waits for its batch. Beside that stands what the paper's training took in a second on each of its
+devices. Prints tables and writes a
 dated JSON file to ``benchmarks/results``.
 """
 
@@ -35,7 +36,7 @@ from vg2gt.paths import config_dir
 from vg2gt.training import build
 from vg2gt.types import Batch
 
-SIZE, STORED, VIEWS = (224, 448), (480, 640), 8
+SIZE, STEP_SIZE, STORED, VIEWS = (224, 448), (112, 224), (480, 640), 8
 PAPER_SECONDS = 49.5 * 3600 / 420_000
 """Of a step (paper, Implementation Details)."""
 
@@ -68,19 +69,19 @@ def write_data(folder: Path, scenes: int) -> dict[str, list[str]]:
     }
 
 
-def configure(overrides: list[str], workers: int, steps: int) -> Any:
+def configure(overrides: list[str], workers: int, steps: int, size: tuple[int, int]) -> Any:
     """The training configuration of one measurement."""
     views = [f"data.{name}_views={VIEWS}" for name in ("min", "max")]
-    fixed = [f"data.image_size=[{SIZE[0]},{SIZE[1]}]", f"data.max_images={VIEWS}", "data.target_views=0"]
+    fixed = [f"data.image_size=[{size[0]},{size[1]}]", f"data.max_images={VIEWS}", "data.target_views=0"]
     fixed += [f"data.workers={workers}", f"data.steps_per_epoch={steps}", "trainer.accelerator=cpu"]
     with tempfile.TemporaryDirectory() as folder, initialize_config_dir(config_dir(), version_base="1.3"):
         return compose("train", [f"output_dir={folder}", "hydra/job_logging=default", *overrides, *views, *fixed])
 
 
-def batches(overrides: list[str], workers: int, steps: int) -> Iterator[Batch]:
+def batches(overrides: list[str], workers: int, steps: int, size: tuple[int, int] = SIZE) -> Iterator[Batch]:
     """Training batches; evaluation, for which the temporary data has no scenes, is left out."""
-    data = configure(overrides, workers, steps).data
-    data.val = {"_target_": "vg2gt.data.SyntheticScenes", "num_scenes": 1, "num_frames": 12, "size": list(SIZE)}
+    data = configure(overrides, workers, steps, size).data
+    data.val = {"_target_": "vg2gt.data.SyntheticScenes", "num_scenes": 1, "num_frames": 12}
     data.eval_scenes = 0
     return iter(instantiate(data).train_dataloader())
 
@@ -102,12 +103,12 @@ def speed(overrides: list[str], workers: int, steps: int) -> dict[str, float]:
 
 def waiting(overrides: list[str], workers: int, steps: int) -> dict[str, float]:
     """Seconds of a training step of the default model on a CPU, and seconds that it waits for its batch before."""
-    run = build(configure(overrides, workers, steps))
+    run = build(configure(overrides, workers, steps, STEP_SIZE))
     module = run.module.train()
     run.trainer.strategy.connect(module)
     module.log = lambda *args, **kwargs: None  # type: ignore[method-assign]
     optimizer = torch.optim.AdamW(module.model.trained_parameters(), lr=1e-4)
-    loader, waits, works = batches(overrides, workers, steps), [], []
+    loader, waits, works = batches(overrides, workers, steps, STEP_SIZE), [], []
     for step in range(steps):
         start = time.perf_counter()
         batch = next(loader)
@@ -137,16 +138,20 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
     arguments = parser.parse_args()
     torch.set_num_threads(1)  # as in a worker process
-    console, steps = Console(width=120), 12 if arguments.quick else 40
+    console, steps = Console(width=120), 12 if arguments.quick else 30
     with tempfile.TemporaryDirectory() as folder:
-        forms = write_data(Path(folder), scenes=2 if arguments.quick else 6)
+        forms = write_data(Path(folder), scenes=2 if arguments.quick else 4)
         list(batches(forms["resized frames"], 0, steps))  # fills the cache
         speeds = {
             form: {str(workers): speed(overrides, workers, steps) for workers in arguments.workers}
             for form, overrides in forms.items()
         }
         torch.set_num_threads(arguments.threads)
-        pairs = [] if arguments.quick else [("PNG files", 0), ("PNG files", 1), ("resized frames", 1)]
+        pairs = (
+            []
+            if arguments.quick
+            else [("PNG files", 0), ("PNG files", 1), ("resized frames", 0), ("resized frames", 1)]
+        )
         waits = {f"{form}, {workers} workers": waiting(forms[form], workers, 8) for form, workers in pairs}
 
     table = Table(title=f"images a second, {STORED[1]}x{STORED[0]} RGB-D to {SIZE[0]}x{SIZE[1]}, by workers")
@@ -168,6 +173,7 @@ def main() -> None:
         "images_per_step": VIEWS,
         "paper_images_per_second": demand,
         "threads": arguments.threads,
+        "load_average": os.getloadavg(),
     }
     console.print(str(write_json(arguments.out / f"{date.today().isoformat()}-data-loading-cpu.json", content)))
 
