@@ -142,8 +142,11 @@ def test_real_photographs(name: str, shared: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["hololens_office_a", "seven_scenes_redkitchen_a_registered"])
-def test_real_recordings(name: str, shared: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "psnr"),
+    [("hololens_office_a", 18.0), ("seven_scenes_redkitchen_a_registered", 15.0)],  # the latter registered by estimate
+)
+def test_real_recordings(name: str, psnr: float, shared: Path, tmp_path: Path) -> None:
     folder = shared / "data" / name
     arguments = ["--backend", ORACLE, "--size", "168", "--max-images", "8", "--quiet", "--device", "cpu"]
     save = "scene.ply,cameras.json,color.png,images"
@@ -154,4 +157,4 @@ def test_real_recordings(name: str, shared: Path, tmp_path: Path) -> None:
         seen = rendered.sum(-1) > 0.05  # sensors leave holes
         assert seen.mean() > 0.5
         errors.append(-10 * np.log10(np.square(rendered - truth)[seen].mean()))
-    assert np.mean(errors) > 17
+    assert np.mean(errors) > psnr
