@@ -147,6 +147,16 @@ def test_size_and_length_are_part_of_the_cache_key(tmp_path):
     assert len(names) == 3
 
 
+def test_another_version_of_the_generator_is_another_scene(monkeypatch):
+    source = SyntheticScenes(2)
+    before = source.identity("room-000000")
+    assert before == SyntheticScenes(1, cache_dir="elsewhere").identity("room-000000")
+    assert before != source.identity("room-000001")
+    assert before != SyntheticScenes(1, highlights=True).identity("room-000000")
+    monkeypatch.setattr(SyntheticRoom, "version", SyntheticRoom.version + 1)
+    assert source.identity("room-000000") != before
+
+
 def test_a_room_of_one_frame(tmp_path):
     frames = SyntheticScenes(1, num_frames=1, size=SIZE, cache_dir=str(tmp_path)).load("room-000000", [0])
     assert frames.depth.shape == (1, *SIZE)

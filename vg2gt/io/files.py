@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 from pathlib import Path
 from typing import Any
+
+log = logging.getLogger(__name__)
+
+_unwritable: set[Path] = set()
 
 
 def write_bytes(path: str | Path, content: bytes) -> Path:
@@ -19,6 +24,26 @@ def write_bytes(path: str | Path, content: bytes) -> Path:
     finally:
         temporary.unlink(missing_ok=True)
     return path
+
+
+def write_cached(path: str | Path, content: bytes, cache: str | Path) -> None:
+    """Writes a file that can be made again: where its folder cannot be written to, the work goes on without it.
+
+    A full or read-only disk is told once a process and folder; nothing more is then written there.
+
+    Args:
+        path: the file.
+        content: what it holds.
+        cache: the folder above it that the user chose, for the message.
+    """
+    cache = Path(cache)
+    if cache in _unwritable:
+        return
+    try:
+        write_bytes(path, content)
+    except OSError as error:
+        _unwritable.add(cache)
+        log.warning("nothing more is kept in the cache folder %s, which cannot be written to: %s", cache, error)
 
 
 def write_text(path: str | Path, content: str) -> Path:

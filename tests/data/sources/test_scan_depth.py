@@ -126,6 +126,14 @@ def test_senseless_options_are_refused(options):
         ScanDepth(**options)
 
 
+def test_a_cache_that_cannot_be_written_is_gone_without(tmp_path, caplog):
+    (tmp_path / "scan.ply").write_bytes(_ply(_wall(0.05, 4, 4, 2.0)))
+    (tmp_path / "cache").write_text("a file where the folder should be")
+    depth = ScanDepth(tmp_path / "cache").read(tmp_path / "scan.ply", "a", np.eye(4), K, VIEW)
+    assert (depth > 0).any()
+    assert "nothing more is kept in the cache folder" in caplog.text
+
+
 def test_damaged_scans_are_named(tmp_path):
     scan = tmp_path / "scan.ply"
     with pytest.raises(DataError, match=r"scene barn.*scan\.ply"):

@@ -16,7 +16,7 @@ from scipy.ndimage import minimum_filter
 from vg2gt.data.base import DataError
 from vg2gt.data.sources.index import Size
 from vg2gt.data.sources.parsing import errors_name, load_npz
-from vg2gt.io.files import write_bytes
+from vg2gt.io.files import write_cached
 from vg2gt.io.ply_container import read_vertices
 
 VERSION = 1
@@ -80,10 +80,10 @@ class ScanDepth:
                 pass  # a damaged copy is made again
         points = self._points(scan, scene, unit)
         depth = render_points(points, world_to_camera, intrinsics, size, self.occlusion, self.window)
-        if stored is not None:
+        if stored is not None and self.cache is not None:
             buffer = io.BytesIO()
             np.savez_compressed(buffer, depth=depth)
-            write_bytes(stored, buffer.getvalue())
+            write_cached(stored, buffer.getvalue(), self.cache)
         return depth
 
     def _points(self, scan: Path, scene: str, unit: float) -> NDArray[np.float32]:

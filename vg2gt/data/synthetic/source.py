@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import logging
 import zipfile
 from collections.abc import Sequence
@@ -17,7 +18,7 @@ from vg2gt.data.synthetic.outdoor import SyntheticOutdoor
 from vg2gt.data.synthetic.rooms import SyntheticRoom
 from vg2gt.data.synthetic.scene import SyntheticScene
 from vg2gt.data.transforms import from_bytes
-from vg2gt.io.files import write_bytes
+from vg2gt.io.files import write_cached
 
 log = logging.getLogger(__name__)
 
@@ -108,6 +109,12 @@ class SyntheticScenes(SceneSource):
         kind, seed = self._seeds[scene]
         return VARIANTS[kind](seed, self.num_frames, self.size, self.highlights)
 
+    def identity(self, scene: str) -> str:
+        """What decides the pixels, with the version of the generator."""
+        kind = self._seeds[scene][0]
+        version = VARIANTS[kind].version
+        return json.dumps([type(self).__qualname__, scene, version, self.size, self.num_frames, self.highlights])
+
     def _render(self, scene: str) -> dict[str, NDArray]:
         made = self.scene(scene)
         frames = made.render(range(self.num_frames), _threads())
@@ -147,11 +154,11 @@ class SyntheticScenes(SceneSource):
 
     def _write_cache(self, scene: str, arrays: dict[str, NDArray]) -> None:
         path = self.cache_file(scene)
-        if path is None:
+        if path is None or self.cache_dir is None:
             return
         buffer = io.BytesIO()
         np.savez(buffer, **arrays)  # pyright: ignore[reportArgumentType]
-        write_bytes(path, buffer.getvalue())
+        write_cached(path, buffer.getvalue(), self.cache_dir)
 
 
 def _threads() -> int:
