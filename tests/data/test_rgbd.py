@@ -2,6 +2,7 @@
 
 import logging
 import shutil
+from collections import Counter
 from itertools import pairwise
 
 import numpy as np
@@ -83,7 +84,33 @@ def test_seven_scenes_layout(write_recording, caplog):
     assert "not registered" in caplog.text
 
 
-def test_shared_intrinsics_follow_the_colour_images_to_the_size_of_the_depth(write_recording):
+def test_intrinsics_beside_the_sequences_are_read_again_when_they_are_edited(write_recording, tmp_path):
+    folder = write_recording()
+    sequence = folder.parent / "chess" / "seq-01"
+    sequence.mkdir(parents=True)
+    for kind, sub in (("color", "images"), ("depth", "depth")):
+        shutil.copy(folder / sub / "00010.png", sequence / f"frame-000000.{kind}.png")
+    np.savetxt(sequence / "frame-000000.pose.txt", np.eye(4))
+    for focal in (30, 60):
+        np.savetxt(sequence.parent / "camera-intrinsics.txt", [[focal, 0, 15], [0, 31, 11], [0, 0, 1]])
+        source = RGBDFolder(str(sequence.parent), index_cache=str(tmp_path / "cache"))
+        assert float(source.load("seq-01", [0]).intrinsics[0, 0, 0]) == focal
+
+
+def test_recordings_of_one_room_show_one_place(write_recording):
+    folder = write_recording()
+    root = folder.parent / "all"
+    names = ("kitchen/seq-01", "kitchen/seq-02", "office/seq-01", "scans/scene0000_00", "scans/scene0000_01", "me/hall")
+    for name in names:
+        shutil.copytree(folder, root / name)
+    source = RGBDFolder(str(root))
+    places = {"kitchen": 2, "office": 1, "scene0000": 2, "me/hall": 1}
+    assert Counter(source.place(name) for name in names) == places
+    alone = RGBDFolder(str(root / "kitchen" / "seq-02"))
+    assert alone.place("seq-02") == "kitchen"
+
+
+def test_shared_intrinsics_follow_the_colour_images_to_the_size_of_the_depth(write_recording, caplog):
     folder = write_recording()
     expected = RGBDFolder(str(folder)).load("office", [10]).intrinsics
     for path in (folder / "images").iterdir():
@@ -96,6 +123,7 @@ def test_shared_intrinsics_follow_the_colour_images_to_the_size_of_the_depth(wri
     np.savetxt(folder / "K.txt", matrix)
     frames = RGBDFolder(str(folder)).load("office", [10])
     assert frames.images.shape[-2:] == SIZE
+    assert "colour of 64x48 is reduced to the depth's 32x24" in caplog.text
     torch.testing.assert_close(frames.intrinsics, expected)
 
 

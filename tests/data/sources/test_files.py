@@ -1,14 +1,25 @@
 """What all loaders of files share: lists of scenes, and the memory that indices take."""
 
 import logging
+import threading
+from dataclasses import replace
+from pathlib import Path
 
+import numpy as np
 import pytest
+import yaml
 
-from vg2gt.data import DataError, RGBDFolder
-from vg2gt.data.sources import files
+from vg2gt.data import DataError, RGBDFolder, SyntheticScenes
+from vg2gt.data.sources import files, parsing
+from vg2gt.data.sources.index import index_to_bytes, make_index, read_index
+from vg2gt.paths import config_dir
 
 from .layout_rgbd import write_recording
 from .layouts import room
+
+OTHERS = ("paper_mix", "shards", "synthetic")
+"""Configurations of data that are no scenes in files."""
+CONFIGURATIONS = [path for path in sorted(Path(config_dir(), "data").glob("*.yaml")) if path.stem not in OTHERS]
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +41,8 @@ def test_a_list_in_a_file_may_name_scenes_that_are_not_there(dataset, tmp_path, 
         RGBDFolder(str(dataset), scenes=str(path))
     with pytest.raises(DataError, match="no scene not_copied"):
         RGBDFolder(str(dataset), scenes=["a", "not_copied"])
-    with pytest.raises(FileNotFoundError, match=r"the scene list .*absent\.txt does not exist"):
+    absent = r"the scene list .*absent\.txt does not exist.*data\.train\.scenes=null data\.val\.scenes=null"
+    with pytest.raises(FileNotFoundError, match=absent):
         RGBDFolder(str(dataset), scenes=str(tmp_path / "absent.txt"))
     path.write_text("a\nb\na\n")
     with pytest.raises(DataError, match="names a twice"):
@@ -55,6 +67,68 @@ def test_a_changed_scene_is_indexed_again(dataset, tmp_path):
     (tmp_path / "d/depth/00011.png").unlink()
     assert RGBDFolder(str(tmp_path / "d"), holdout=None, index_cache=cache).frames("d") == (10, 12)
     assert len(list((tmp_path / "cache").rglob("*.npz"))) == 1
+
+
+def test_an_index_keeps_names_below_the_folder_and_shared_intrinsics_once(tmp_path):
+    folder, beside = tmp_path / "scene", tmp_path / "depth"
+    count = 500
+    index = make_index(
+        name="scene",
+        folder=folder,
+        color={i: folder / "color" / f"{i}.jpg" for i in range(count)},
+        depth={i: beside / f"{i}.png" for i in range(count)},
+        camera_to_world={i: np.eye(4) for i in range(count)},
+        intrinsics=np.diag([30.0, 30.0, 1.0]),
+        size=(30, 40),
+        color_size=(30, 40),
+    )
+    index = replace(index, extra={"spans": np.arange(count)})
+    content = index_to_bytes(index, "state")
+    assert len(content) < count * (8 * 16 + 8 + 8 + 20 + len(str(beside)) + 10) + 6000
+    (tmp_path / "index.npz").write_bytes(content)
+    again = read_index(tmp_path / "index.npz", "scene", folder, "state")
+    assert again is not None
+    for name, value in vars(index).items():
+        if name != "extra":
+            assert (
+                np.array_equal(getattr(again, name), value)
+                if isinstance(value, np.ndarray)
+                else (getattr(again, name) == value)
+            )
+    assert np.array_equal(again.extra["spans"], np.arange(count))
+    (tmp_path / "video").write_bytes(b"")
+    alone = replace(index, folder=tmp_path / "video", color=(tmp_path / "video",) * count, depth=())
+    (tmp_path / "index.npz").write_bytes(index_to_bytes(alone, "state"))
+    again = read_index(tmp_path / "index.npz", "scene", tmp_path / "video", "state")
+    assert again is not None
+    assert (again.color, again.depth) == (alone.color, ())
+
+
+def test_a_cache_that_cannot_be_written_is_told_once(dataset, tmp_path, caplog):
+    (tmp_path / "cache").write_text("a file where the folder should be")
+    with caplog.at_level(logging.WARNING):
+        source = RGBDFolder(str(dataset), index_cache=str(tmp_path / "cache"))
+        assert [source.frames(scene) for scene in source.scenes] == [(10, 11)] * 3
+        rooms = SyntheticScenes(2, num_frames=1, size=(14, 14), cache_dir=str(tmp_path / "cache"))
+        assert rooms.load("room-000000", [0]).depth.shape == (1, 14, 14)
+    assert sum("nothing more is kept" in record.getMessage() for record in caplog.records) == 1
+
+
+def test_poses_are_read_several_at_a_time(tmp_path, monkeypatch):
+    meeting = threading.Barrier(2)
+
+    def read(path, scene, shapes):
+        meeting.wait(timeout=20)
+        return np.eye(4)
+
+    monkeypatch.setattr(parsing, "read_matrix", read)
+    assert list(parsing.read_poses({i: tmp_path / str(i) for i in (3, 1)}, "a")) == [3, 1]
+
+
+@pytest.mark.parametrize("path", CONFIGURATIONS, ids=lambda path: path.stem)
+def test_every_configuration_of_files_names_the_shared_options(path):
+    keys = set(yaml.safe_load(path.read_text()))
+    assert {"every", "index_cache"} <= keys
 
 
 def test_every_second_frame(dataset):

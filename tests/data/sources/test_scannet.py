@@ -88,6 +88,32 @@ def test_a_stream_holds_what_its_export_does(tmp_path, frames):
     assert torch.allclose(ours.intrinsics, theirs.intrinsics, atol=1e-4)
 
 
+def test_a_cached_stream_is_not_scanned_again(tmp_path, frames, monkeypatch):
+    write_sens(tmp_path / "raw", frames, lost=1)
+    root, cache = str(tmp_path / "raw"), str(tmp_path / "cache")
+    first = ScanNetSens(root, index_cache=cache).load(SCENE, [3, 2])
+    monkeypatch.setattr("vg2gt.data.sources.scannet_sens.scan_sens", lambda *_: pytest.fail("scanned again"))
+    again = ScanNetSens(root, index_cache=cache).load(SCENE, [3, 2])
+    assert torch.equal(again.images, first.images)
+    assert torch.equal(again.depth, first.depth)
+
+
+def test_edited_intrinsics_are_read_again(tmp_path, frames):
+    write_export(tmp_path / "data", frames)
+    path = tmp_path / "data" / "scans" / SCENE / "intrinsic" / "intrinsic_depth.txt"
+
+    def focal(loader) -> float:
+        source = loader(str(tmp_path / "data"), index_cache=str(tmp_path / "cache"))
+        return float(source.load(source.scenes[0], [8]).intrinsics[0, 0, 0])
+
+    for loader in (ScanNet, RGBDFolder):
+        before = focal(loader)
+        matrix = np.loadtxt(path)
+        matrix[0, 0] *= 2
+        np.savetxt(path, matrix)
+        assert focal(loader) == pytest.approx(2 * before)
+
+
 def test_a_frame_is_read_without_the_rest_of_the_file(tmp_path, frames):
     """Between two frames lies an image of 2 GiB, as a hole."""
     parts = [

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from vg2gt.data.base import DataError, Frames, SceneSource
 from vg2gt.data.image_files import read_color
-from vg2gt.data.sources.index import SceneIndex, Size, folder_state, index_to_bytes, read_index
+from vg2gt.data.sources.index import FORMAT, SceneIndex, Size, folder_state, index_to_bytes, read_index
 from vg2gt.data.transforms import from_bytes, resize_depth, resize_images, resize_to_cover
-from vg2gt.io.files import write_bytes
+from vg2gt.io.files import write_cached
 
 log = logging.getLogger(__name__)
 
@@ -50,6 +50,8 @@ class FileSource(SceneSource):
     index_version: ClassVar[int] = 1
     """Raise it when ``index`` would give another result for the same files."""
     sparse_depth: ClassVar[bool] = False
+    depth_remedy: ClassVar[str] = "correct the depth unit and the values that mean 'invalid'"
+    """What to do where a frame has no valid depth, for messages."""
 
     def __init__(
         self,
@@ -69,6 +71,7 @@ class FileSource(SceneSource):
         self._folders = self._select(self._find_all(_roots(root, self.layout)), scenes)
         self._indices: OrderedDict[str, SceneIndex] = OrderedDict()
         self._frame_ids: dict[str, NDArray[np.int64]] = {}
+        self._indexes = False
 
     @abstractmethod
     def find(self, root: Path) -> Mapping[str, Path]:
@@ -180,7 +183,7 @@ class FileSource(SceneSource):
         if not (depth > 0).any():
             raise DataError(
                 f"{index.depth[row]} of scene {index.name} has no valid depth in any pixel; remove the frame, or "
-                "correct the depth unit and the values that mean 'invalid'"
+                f"{self.depth_remedy}"
             )
         return depth
 
@@ -216,14 +219,19 @@ class FileSource(SceneSource):
     def _recall_index(self, scene: str, folder: Path) -> SceneIndex:
         if self.index_cache is None:
             return self.index(scene, folder)
-        key = json.dumps([type(self).__qualname__, self.index_version, str(folder.resolve()), scene, self.options()])
+        version = (FORMAT, self.index_version)
+        key = json.dumps([type(self).__qualname__, version, str(folder.resolve()), scene, self.options()])
         digest = hashlib.sha256(key.encode()).hexdigest()[:24]
         path = self.index_cache / "index" / f"{digest}.npz"
         state = self.state(scene, folder)
         index = read_index(path, scene, folder, state)
         if index is None:
+            if not self._indexes:
+                self._indexes = True
+                message = "file lists, poses and intrinsics of up to %d scenes are read once and then kept in %s"
+                log.info(message, len(self._folders), self.index_cache)
             index = self.index(scene, folder)
-            write_bytes(path, index_to_bytes(index, state))
+            write_cached(path, index_to_bytes(index, state), self.index_cache)
         return index
 
 
@@ -236,7 +244,10 @@ def read_split(path: str) -> list[str]:
     """
     file = Path(path).expanduser()
     if not file.is_file():
-        raise FileNotFoundError(f"the scene list {file} does not exist; give a list of names or a text file of them")
+        raise FileNotFoundError(
+            f"the scene list {file} does not exist; give a list of names or a text file of them, or use all scenes of "
+            "data.root: data.train.scenes=null data.val.scenes=null"
+        )
     names = [line.split("#")[0].strip() for line in file.read_text().splitlines()]
     names = [name for name in names if name]
     twice = [name for name, count in Counter(names).items() if count > 1]

@@ -6,8 +6,9 @@ import hashlib
 import io
 import json
 import logging
+import os
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -20,6 +21,9 @@ from vg2gt.data.sources.parsing import check_intrinsics, inverse, load_npz, rigi
 log = logging.getLogger(__name__)
 
 Size = tuple[int, int]
+
+FORMAT = 2
+"""Of the files that keep an index; raise it when they are written otherwise."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +43,7 @@ class SceneIndex:
         color_size: of the colour files; None: each has its own, and is resized to cover ``size`` and cropped.
         depth_size: of the depth files; None: each has its colour image's.
         dropped: frames left out, by reason.
+        extra: what else a loader keeps of a scene, as arrays.
     """
 
     name: str
@@ -52,6 +57,7 @@ class SceneIndex:
     color_size: Size | None
     depth_size: Size | None
     dropped: Mapping[str, int] = field(default_factory=dict)
+    extra: Mapping[str, NDArray] = field(default_factory=dict)
 
     def row(self, frame: int) -> int:
         """Position of a frame.
@@ -150,35 +156,74 @@ def folder_state(folder: Path) -> str:
     if not folder.is_dir():
         return str(folder.stat().st_mtime_ns)
     entries = [(path, path.stat()) for path in sorted(folder.iterdir())]
-    inner = [(path, path.stat()) for top, _ in entries if top.is_dir() for path in sorted(top.glob("*/"))]
+    inner = [(path, path.stat()) for top, _ in entries if top.is_dir() for path in _folders_in(top)]
     text = json.dumps([[str(path), stat.st_mtime_ns, stat.st_size] for path, stat in entries + inner])
     return hashlib.sha256(text.encode()).hexdigest()
 
 
+def files_state(paths: Sequence[Path]) -> str:
+    """Changes when one of some files, which need not exist, is edited, added or removed."""
+    stats = [(str(path), path.stat()) for path in paths if path.is_file()]
+    return json.dumps([[name, stat.st_mtime_ns, stat.st_size] for name, stat in stats])
+
+
+def _folders_in(folder: Path) -> list[Path]:
+    """Folders directly in another, without asking the disk about each of its files."""
+    with os.scandir(folder) as entries:
+        return sorted(Path(entry.path) for entry in entries if entry.is_dir())
+
+
 def index_to_bytes(index: SceneIndex, state: str) -> bytes:
-    """An ``.npz`` file of an index and of the state of the folder it was made from."""
+    """An ``.npz`` file of an index and of the state of the folder it was made from.
+
+    Thousands of scenes are kept: names of files stand in it without the scene's folder, and intrinsics that all frames
+    share only once.
+    """
+    shared = (index.intrinsics == index.intrinsics[:1]).all()
     buffer = io.BytesIO()
     np.savez(
         buffer,
         state=np.array(state),
         frame_ids=np.array(index.frame_ids, np.int64),
-        color=np.array([str(path) for path in index.color]),
-        depth=np.array([str(path) for path in index.depth], dtype=str),
+        color=_names(index.color, index.folder),
+        depth=_names(index.depth, index.folder),
         world_to_camera=index.world_to_camera,
-        intrinsics=index.intrinsics,
+        intrinsics=index.intrinsics[:1] if shared else index.intrinsics,
         sizes=np.array([size or (0, 0) for size in (index.size, index.color_size, index.depth_size)], np.int64),
         dropped=np.array(json.dumps(index.dropped)),
+        extra=np.array(json.dumps(list(index.extra))),
+        **{f"extra_{name}": array for name, array in index.extra.items()},  # pyright: ignore[reportArgumentType]
     )
     return buffer.getvalue()
+
+
+def _names(paths: Sequence[Path], folder: Path) -> NDArray[np.uint8]:
+    """Names of files as bytes, with zeros between them; those outside the folder by their whole path."""
+    inside, start = str(folder) + os.sep, len(str(folder)) + 1
+
+    def name(text: str) -> str:
+        if text == str(folder):
+            return "."
+        return text[start:] if text.startswith(inside) else os.path.abspath(text)
+
+    texts = [name(str(path)) for path in paths]
+    return np.frombuffer("\0".join(texts).encode(errors="surrogateescape"), np.uint8)
+
+
+def _paths(names: NDArray[np.uint8], folder: Path) -> tuple[Path, ...]:
+    content = names.tobytes().decode(errors="surrogateescape")
+    return tuple(folder / text for text in content.split("\0")) if content else ()
 
 
 def read_index(path: Path, scene: str, folder: Path, state: str) -> SceneIndex | None:
     """Reads an index back; None where there is none, it is damaged, or the folder's state is another."""
     if not path.is_file():
         return None
-    names = ("state", "frame_ids", "color", "depth", "world_to_camera", "intrinsics", "sizes", "dropped")
+    names = ("state", "frame_ids", "color", "depth", "world_to_camera", "intrinsics", "sizes", "dropped", "extra")
     try:
         arrays = load_npz(path, scene, names)
+        kept = json.loads(str(arrays["extra"]))
+        extra = load_npz(path, scene, [f"extra_{name}" for name in kept]) if kept else {}
     except DataError as error:
         log.warning("the cached index is damaged and is made again: %s", error)
         return None
@@ -189,12 +234,13 @@ def read_index(path: Path, scene: str, folder: Path, state: str) -> SceneIndex |
         name=scene,
         folder=folder,
         frame_ids=tuple(arrays["frame_ids"].tolist()),
-        color=tuple(map(Path, arrays["color"].tolist())),
-        depth=tuple(map(Path, arrays["depth"].tolist())),
+        color=_paths(arrays["color"], folder),
+        depth=_paths(arrays["depth"], folder),
         world_to_camera=arrays["world_to_camera"],
-        intrinsics=arrays["intrinsics"],
+        intrinsics=np.broadcast_to(arrays["intrinsics"], (len(arrays["frame_ids"]), 3, 3)).copy(),
         size=size,
         color_size=color_size if all(color_size) else None,
         depth_size=depth_size if all(depth_size) else None,
         dropped=json.loads(str(arrays["dropped"])),
+        extra={name: extra[f"extra_{name}"] for name in kept},
     )

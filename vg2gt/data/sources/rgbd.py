@@ -13,6 +13,7 @@ Poses are camera-to-world, OpenCV, metres.
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -25,8 +26,9 @@ from numpy.typing import NDArray
 from vg2gt.data.base import DataError
 from vg2gt.data.image_files import image_size, read_depth
 from vg2gt.data.sources.files import FileSource
-from vg2gt.data.sources.index import SceneIndex, Size, make_index
-from vg2gt.data.sources.parsing import numbered, pinhole, read_matrix, read_numbers
+from vg2gt.data.sources.index import SceneIndex, Size, files_state, folder_state, make_index
+from vg2gt.data.sources.parsing import numbered, pinhole, read_matrix, read_numbers, read_poses
+from vg2gt.data.sources.scannet import room_of_scan
 from vg2gt.geometry.cameras import resize_intrinsics
 
 log = logging.getLogger(__name__)
@@ -98,6 +100,17 @@ class RGBDFolder(FileSource):
         inner = [folder for pattern in ("*", "*/*") for folder in sorted(root.glob(pattern)) if _is_recording(folder)]
         return {folder.relative_to(root).as_posix(): folder for folder in inner}
 
+    def place(self, scene: str) -> str:
+        """What several recordings show: the folder of 7-Scenes' ``seq-NN``, the room of ScanNet's ``sceneNNNN_NN``."""
+        folder = self._folders[scene].resolve()
+        if re.fullmatch(r"seq-\d+", folder.name):
+            return folder.parent.name
+        return room_of_scan(folder.name) if re.fullmatch(r"scene\d{4}_\d\d", folder.name) else scene
+
+    def state(self, scene: str, folder: Path) -> str:
+        """Also that of the intrinsics, which lie deeper or beside the recording."""
+        return folder_state(folder) + files_state([*_exported_intrinsics(folder), *_beside(folder.parent)])
+
     def options(self) -> Mapping[str, object]:
         """The intrinsics that replace the files'."""
         return {"intrinsics": self.intrinsics}
@@ -124,6 +137,9 @@ class RGBDFolder(FileSource):
         )
         size = f"{depth_size[1]}x{depth_size[0]}"
         _say(f"scene {scene}: {files.layout}, {len(index.frame_ids)} frames of {size} in {folder}")
+        if color_size[0] > depth_size[0]:
+            larger = f"{color_size[1]}x{color_size[0]}"
+            _say(f"scene {scene}: colour of {larger} is reduced to the depth's {size}", logging.WARNING)
         return index
 
     def read_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
@@ -164,21 +180,20 @@ def _files_in_folders(folder: Path, scene: str) -> _Files:
     color = next(folder / name for name in _COLOR_FOLDERS if (folder / name).is_dir())
     pose_folder = next((folder / name for name in _POSE_FOLDERS if (folder / name).is_dir()), None)
     poses = numbered(pose_folder, scene, suffixes=(".txt",)) if pose_folder else folder / "poses.txt"
-    exported = [folder / "intrinsic" / f"intrinsic_{kind}.txt" for kind in ("color", "depth")]
-    single = [folder / name for name in _INTRINSICS_FILES if (folder / name).is_file()][:1]
+    single = [path for path in _beside(folder) if path.is_file()][:1]
     return _Files(
         layout=f"folders {color.name}/ and depth/",
         color=numbered(color, scene),
         depth=numbered(folder / "depth", scene),
         poses=poses,
-        intrinsics=tuple(path for path in exported if path.is_file()) or tuple(single),
+        intrinsics=tuple(path for path in _exported_intrinsics(folder) if path.is_file()) or tuple(single),
     )
 
 
 def _files_of_seven_scenes(folder: Path, scene: str) -> _Files:
     _say(f"scene {scene}: raw 7-Scenes streams are not registered; colour and depth do not match", logging.WARNING)
     # The intrinsics lie beside the frames, or beside the sequences of a scene.
-    candidates = [place / name for place in (folder, folder.parent) for name in _INTRINSICS_FILES]
+    candidates = [*_beside(folder), *_beside(folder.parent)]
     return _Files(
         layout="7-Scenes layout",
         color=numbered(folder, scene, "frame-*.color.*"),
@@ -188,10 +203,18 @@ def _files_of_seven_scenes(folder: Path, scene: str) -> _Files:
     )
 
 
+def _exported_intrinsics(folder: Path) -> list[Path]:
+    return [folder / "intrinsic" / f"intrinsic_{kind}.txt" for kind in ("color", "depth")]
+
+
+def _beside(folder: Path) -> list[Path]:
+    return [folder / name for name in _INTRINSICS_FILES]
+
+
 def _read_poses(files: _Files, scene: str) -> dict[int, NDArray[np.float64]]:
     """Camera-to-world poses by frame number."""
     if isinstance(files.poses, dict):
-        return {number: read_matrix(path, scene, ((4, 4),)) for number, path in files.poses.items()}
+        return read_poses(files.poses, scene)
     rows = read_numbers(files.poses, scene)
     if rows.shape != (len(files.color), 16):
         raise DataError(

@@ -11,12 +11,14 @@ from numpy.typing import NDArray
 from vg2gt.data.base import DataError
 from vg2gt.data.image_files import image_size, read_depth
 from vg2gt.data.sources.files import FileSource
-from vg2gt.data.sources.index import SceneIndex, Size, make_index
-from vg2gt.data.sources.parsing import numbered, read_matrix
+from vg2gt.data.sources.index import SceneIndex, Size, files_state, folder_state, make_index
+from vg2gt.data.sources.parsing import numbered, read_matrix, read_poses
 from vg2gt.data.sources.scene_folders import scene_folders
 
 DEPTH_SCALE = 1000.0
 """Stored depth units a metre."""
+INTRINSICS = "intrinsic/intrinsic_depth.txt"
+"""A scan's intrinsics, those of its depth images."""
 
 
 class ScanNet(FileSource):
@@ -49,6 +51,10 @@ class ScanNet(FileSource):
         """The room: ``scene0000`` of ``scene0000_00`` and ``scene0000_01``."""
         return room_of_scan(scene)
 
+    def state(self, scene: str, folder: Path) -> str:
+        """Also that of the intrinsics."""
+        return folder_state(folder) + files_state([folder / INTRINSICS])
+
     def index(self, scene: str, folder: Path) -> SceneIndex:
         """Lists a scan's files and reads its poses and intrinsics."""
         color, depth = numbered(folder / "color", scene), numbered(folder / "depth", scene)
@@ -61,8 +67,8 @@ class ScanNet(FileSource):
             folder=folder,
             color=color,
             depth=depth,
-            camera_to_world={number: read_matrix(path, scene, ((4, 4),)) for number, path in poses.items()},
-            intrinsics=read_matrix(folder / "intrinsic" / "intrinsic_depth.txt", scene, ((4, 4),))[:3, :3],
+            camera_to_world=read_poses(poses, scene),
+            intrinsics=read_matrix(folder / INTRINSICS, scene, ((4, 4),))[:3, :3],
             size=depth_size,
             color_size=image_size(next(iter(color.values())), scene),
             depth_size=depth_size,

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,14 +14,14 @@ from vg2gt.data.image_files import read_color
 from vg2gt.data.sources.files import FileSource
 from vg2gt.data.sources.index import SceneIndex, Size, make_index
 from vg2gt.data.sources.scannet import room_of_scan
-from vg2gt.data.sources.sens import SensStream, decode_depth, read_span, scan_sens
+from vg2gt.data.sources.sens import decode_depth, read_span, scan_sens
 
 
 class ScanNetSens(FileSource):
     """Scans in ScanNet's raw ``.sens`` files; a scene is a file, its frames are numbered as in an export.
 
-    Frames, depth and intrinsics are those of ``ScanNet``. Images are decoded where they lie; nothing else of the file,
-    which has gigabytes, is read.
+    Frames, depth and intrinsics are those of ``ScanNet``. Images are decoded where they lie, which the index says;
+    nothing else of the file, which has gigabytes, is read.
 
     Args:
         root: ScanNet's folder, or its ``scans``, or the folder of a scan, or a list of such.
@@ -35,17 +36,6 @@ class ScanNetSens(FileSource):
     """
 
     layout = "sceneNNNN_NN.sens, there or up to two folders deeper"
-
-    def __init__(
-        self,
-        root: str | Sequence[str] | None,
-        scenes: Sequence[str] | str | None = None,
-        holdout: int | None = None,
-        every: int = 1,
-        index_cache: str | None = None,
-    ) -> None:
-        super().__init__(root, scenes, holdout, every, index_cache)
-        self._streams: dict[str, SensStream] = {}
 
     def find(self, root: Path) -> Mapping[str, Path]:
         """``.sens`` files by their name."""
@@ -63,9 +53,8 @@ class ScanNetSens(FileSource):
     def index(self, scene: str, folder: Path) -> SceneIndex:
         """Reads the headers of all frames."""
         stream, poses = scan_sens(folder, scene)
-        self._streams[scene] = stream
         files = dict.fromkeys(range(len(poses)), folder)
-        return make_index(
+        index = make_index(
             name=scene,
             folder=folder,
             color=files,
@@ -76,28 +65,20 @@ class ScanNetSens(FileSource):
             color_size=stream.color_size,
             depth_size=stream.depth_size,
         )
+        kept = list(index.frame_ids)
+        coding = np.array([stream.depth_compression, stream.depth_scale])
+        return replace(index, extra={"color": stream.color[kept], "depth": stream.depth[kept], "depth_coding": coding})
 
     def read_color(self, index: SceneIndex, row: int) -> NDArray[np.uint8]:
         """Decodes a colour image of the stream."""
         path, frame = index.color[row], index.frame_ids[row]
-        content = read_span(path, index.name, self._span(index, frame, "color"))
+        content = read_span(path, index.name, index.extra["color"][row])
         return read_color(path, f"{index.name} (frame {frame})", index.color_size, content)
 
     def read_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
         """Decodes a depth image of the stream."""
         path, frame = index.depth[row], index.frame_ids[row]
-        content = read_span(path, index.name, self._span(index, frame, "depth"))
-        stream = self._stream(index.name, path)
+        content = read_span(path, index.name, index.extra["depth"][row])
+        compression, scale = index.extra["depth_coding"].tolist()
         where = f"frame {frame} in {path} of scene {index.name}"
-        return (decode_depth(content, stream.depth_compression, size, where) / stream.depth_scale).astype(np.float32)
-
-    def _span(self, index: SceneIndex, frame: int, kind: str) -> NDArray[np.int64]:
-        spans: NDArray[np.int64] = getattr(self._stream(index.name, index.folder), kind)
-        if frame >= len(spans):
-            raise DataError(f"{index.folder} of scene {index.name} has no frame {frame} any more; index it again")
-        return spans[frame]
-
-    def _stream(self, scene: str, path: Path) -> SensStream:
-        if scene not in self._streams:
-            self._streams[scene], _ = scan_sens(path, scene)
-        return self._streams[scene]
+        return (decode_depth(content, int(compression), size, where) / scale).astype(np.float32)
