@@ -55,7 +55,11 @@ def split_scenes(source: SceneSource, fraction: float, seed: int = 0) -> tuple[l
         count = min(max(1, round(fraction * len(places))), len(places) - 1)
         evaluation |= {places[place] for place in order[:count]}
     if not evaluation:
-        raise DataError("the dataset shows a single place: hold frames out of training instead (data.holdout)")
+        place = source.place(source.scenes[0])
+        raise DataError(
+            f"the dataset shows a single place ({place}): hold frames out of training instead (data.holdout); or, if "
+            f"the scenes in a folder {place} are different places, name that folder: data.root=[.../{place}]"
+        )
     in_val = {scene: source.place(scene) in evaluation for scene in source.scenes}
     return [scene for scene in in_val if not in_val[scene]], [scene for scene in in_val if in_val[scene]]
 

@@ -7,6 +7,7 @@ from PIL import Image
 
 from vg2gt.data import DataError
 from vg2gt.data.sources import Infinigen
+from vg2gt.data.splits import split_scenes
 
 HEIGHT, WIDTH = 4, 6
 
@@ -92,6 +93,16 @@ def test_parts_of_an_exported_scene_show_one_place(tmp_path):
     assert Infinigen(str(tmp_path / "scene_1" / "x")).scenes == ("x",)
 
 
+def test_seeds_of_a_job_are_divided_when_the_job_is_named(tmp_path):
+    """``JOB/SEED/frames`` looks like the parts of an exported scene; the error says how to tell them apart."""
+    for seed in ("1a", "2b"):
+        write_view(tmp_path / "indoors" / seed, "0_0_0001_0", plain())
+    with pytest.raises(DataError, match=r"single place \(indoors\).*data\.root=\[\.\.\./indoors\]"):
+        split_scenes(Infinigen(str(tmp_path)), 0.5)
+    train, val = split_scenes(Infinigen([str(tmp_path / "indoors")]), 0.5)
+    assert sorted(train + val) == ["1a", "2b"]
+
+
 def test_a_cached_index_is_made_again_when_a_view_is_added(tmp_path):
     write_view(tmp_path / "data" / "a", "0_0_0001_0", plain())
     cache = str(tmp_path / "cache")
@@ -118,7 +129,7 @@ DAMAGE = {
     ),
     "all sky": (
         lambda f: np.save(f / "Depth/camera_0/Depth_0_0_0001_0.npy", plain() + 1e10),
-        r"Depth_0_0_0001_0\.npy of scene a has no valid depth",
+        r"Depth_0_0_0001_0\.npy of scene a has no valid depth .*data\.max_depth",
     ),
 }
 

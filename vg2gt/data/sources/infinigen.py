@@ -37,8 +37,10 @@ class Infinigen(FileSource):
     in mid-air at edges.
 
     Args:
-        root: a scene, or a folder of scenes (up to two levels deep).
-        max_depth: farther points (metres), and the sky, which is infinite or huge, have no depth.
+        root: a scene, or a folder of scenes (up to two levels deep; those in one folder below it count as one place,
+            see ``place``), or a list of such.
+        max_depth: farther points (metres), and the sky, which is infinite or huge, have no depth. A frame that shows
+            nothing nearer is one without valid depth: training replaces it, evaluation refuses it.
         scenes: names of the scenes to use (paths below ``root``), or a text file with one a line; None: all.
         holdout: hold out every this many-th frame as an evaluation target; None: none.
         every: use every this many-th frame only.
@@ -50,6 +52,7 @@ class Infinigen(FileSource):
     """
 
     layout = "SCENE/frames/{Image,Depth,camview}/camera_0, there or up to two folders deeper"
+    depth_remedy = "raise data.max_depth, beyond which points have no depth (nor has the sky)"
 
     def __init__(
         self,
@@ -71,7 +74,11 @@ class Infinigen(FileSource):
         return {name: folder / "frames" for name, folder in scenes.items()}
 
     def place(self, scene: str) -> str:
-        """The first folder of the path: InsScene-15K has several parts of one scene below it."""
+        """The first folder of the path: InsScene-15K has several parts of one scene below it.
+
+        Infinigen's own renderer leaves ``JOB/SEED/frames``, where every seed is a world of its own: give the folders of
+        the jobs as ``root``.
+        """
         return scene.split("/")[0]
 
     def index(self, scene: str, folder: Path) -> SceneIndex:

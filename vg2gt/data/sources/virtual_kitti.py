@@ -42,6 +42,7 @@ class VirtualKITTI2(FileSource):
     """
 
     layout = "SceneNN/VARIATION/frames/{rgb,depth}/Camera_K and SceneNN/VARIATION/{extrinsic,intrinsic}.txt"
+    depth_remedy = "raise data.max_depth, beyond which points have no depth (nor has the sky)"
 
     def __init__(
         self,
