@@ -31,7 +31,7 @@ class ShardedScenes(SceneSource):
     """Scenes written by ``python -m vg2gt.data.shards``.
 
     A frame is one range of one tar file, so frames are read in any order, and only those that are asked for: a step's
-    views are a function of its number here as with files. Only the index (poses, intrinsics and offsets, about 100
+    views are a function of its number here as with files. Only the index (poses, intrinsics and offsets, about 150
     bytes a frame) is read at the start.
 
     Args:
