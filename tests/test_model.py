@@ -16,7 +16,8 @@ from vg2gt.types import Batch
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     cache = tmp_path_factory.mktemp("rooms")
-    return build(small_config(tmp_path_factory.mktemp("run"), cache, "data.image_size=[112,224]", "data.max_views=8"))
+    views = ["data.image_size=[112,224]", "data.max_views=8", "data.max_images=8"]
+    return build(small_config(tmp_path_factory.mktemp("run"), cache, *views))
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ def test_the_number_of_views_stays_in_range_and_takes_every_value():
     drawn = [sampler.num_views(step) for step in range(600)]
     assert set(drawn) == set(range(3, 19))
     for step in range(50):
-        assert sampler.num_scenes(step) == max(1, 40 // drawn[step])
+        assert sampler.num_scenes(step) == 40 // drawn[step]
 
 
 @pytest.mark.parametrize(
@@ -133,6 +133,11 @@ def test_scenes_that_are_too_short_are_counted_and_left_out(caplog):
     assert "1 of 3 training scenes" in caplog.text
     with pytest.raises(DataError, match=r"longest has 5 .* at most 3"):
         usable_scenes(source, ViewSampler(6, 6, target_views=2), None)
+    with pytest.raises(DataError, match=r"longest has 5 that are not held out: lower data.target_views \(now 8\)"):
+        usable_scenes(source, ViewSampler(2, 2, target_views=8), None)
+    source.frames = lambda scene: ()
+    with pytest.raises(DataError, match="longest has 0 that are not held out: use longer scenes"):
+        usable_scenes(source, ViewSampler(2, 2, target_views=8), None)
 
 
 def test_scenes_that_cannot_be_indexed_are_named_and_left_out(caplog):
@@ -159,7 +164,7 @@ def test_one_frame_is_enough_for_one_view():
     assert sampler.views(4, "room-000000", [0], 0).context == (0,)
 
 
-@pytest.mark.parametrize("arguments", [(0, 3), (4, 3), (3, 4, 8, 0.5), (3, 4, 8, 2.0, -1)])
+@pytest.mark.parametrize("arguments", [(0, 3), (4, 3), (3, 4, 8, 0.5), (3, 4, 8, 2.0, -1), (2, 8, 4)])
 def test_impossible_ranges_are_refused(arguments):
     with pytest.raises(ValueError, match="need"):
         ViewSampler(*arguments)

@@ -13,8 +13,9 @@ from vg2gt.data.sources.files import read_split
 class Mixture(SceneSource):
     """Named datasets with weights (paper, Datasets: Infinigen, KITTI and ScanNet).
 
-    A scene is called ``<part>/<scene>``. Training draws scenes in exactly the proportions of the weights, however many
-    scenes a part has; within a part every scene comes equally often (``ScenePool``).
+    A scene is called ``<part>/<scene>``. Training draws scenes in the proportions of the weights, however many scenes a
+    part has, and the scenes of a part equally often (``ScenePool``): exactly where the number of views is fixed, in
+    expectation where it varies (``ViewSampler.slots``).
 
     Args:
         parts: the datasets by name, or what makes them (``_partial_: true``).

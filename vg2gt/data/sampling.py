@@ -49,7 +49,8 @@ class ViewSampler:
     Args:
         min_views: fewest context views.
         max_views: most context views.
-        max_images: context images in a step and on one device: a step with N views holds ``max_images // N`` scenes.
+        max_images: context images in a step and on one device: a step with N views holds ``max_images // N`` scenes;
+            at least ``max_views``.
         expand_ratio: the views are drawn from a window of ``expand_ratio * N`` consecutive frames.
         target_views: held-out views drawn from the same window, in addition.
         seed: seeds every draw.
@@ -69,6 +70,11 @@ class ViewSampler:
             raise ValueError(
                 f"need target_views >= 0 and expand_ratio >= 1, got {self.target_views} and {self.expand_ratio}"
             )
+        if self.max_images < self.max_views:
+            raise ValueError(
+                f"need max_images >= max_views, got {self.max_images} and {self.max_views}: the {self.max_views} views "
+                "of a scene do not fit into a step; raise data.max_images, or lower data.max_views (and data.min_views)"
+            )
 
     @property
     def frames_needed(self) -> int:
@@ -81,14 +87,16 @@ class ViewSampler:
 
     def num_scenes(self, step: int) -> int:
         """Scenes of a step on one device."""
-        return max(1, self.max_images // self.num_views(step))
+        return self.max_images // self.num_views(step)
 
     def slots(self, step: int, rank: int = 0, world_size: int = 1) -> range:
         """A step's places in the endless row of scenes (``ScenePool.scene``), one for each of its scenes.
 
-        Every step and device owns a fixed stretch of the row, so all scenes come equally often.
+        Every step and device owns a fixed stretch of the row, long enough for a step of ``min_views``; one of more
+        views leaves the rest of its stretch out. So where the number of views is fixed, all scenes come equally often;
+        where it varies, they do in expectation.
         """
-        reserved = max(1, self.max_images // self.min_views)
+        reserved = self.max_images // self.min_views
         first = (step * world_size + rank) * reserved
         return range(first, first + self.num_scenes(step))
 
@@ -231,10 +239,16 @@ def _nothing_usable(
     where = f" of {part}" if part else ""
     unread = f" ({damaged} scenes cannot be read, see the warnings)" if damaged else ""
     longest = max(inside, default=0)
+    views = longest - sampler.target_views
+    if views >= 1:
+        remedy = f"set data.max_views and data.min_views to at most {views}, or lower data.target_views"
+    elif longest > 1 and sampler.target_views:
+        remedy = f"lower data.target_views (now {sampler.target_views}), and data.max_views and data.min_views with it"
+    else:
+        remedy = "use longer scenes, or hold fewer frames out (data.holdout)"
     return DataError(
         f"none of {len(inside)} training scenes{where} has {sampler.frames_needed} frames (max_views + target_views)"
-        f"{unread}; the longest has {longest} that are not held out: set data.max_views and data.min_views to at most "
-        f"{longest - sampler.target_views}"
+        f"{unread}; the longest has {longest} that are not held out: {remedy}"
     )
 
 
