@@ -16,6 +16,7 @@ from omegaconf import OmegaConf
 
 from tests.training_helpers import SMALL, full_model, small_config, with_crash
 from vg2gt.checkpoints import newest_valid, read_checkpoint
+from vg2gt.data import DataError, SyntheticScenes
 from vg2gt.gaussians import GaussianHead
 from vg2gt.paths import config_dir
 from vg2gt.training import build, train
@@ -237,6 +238,18 @@ def test_non_finite_gaussians_are_a_skipped_step(tmp_path: Path, cache: Path) ->
 def test_unsupported_trainer_options_are_refused(tmp_path: Path, cache: Path, override: str, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         train(small_config(tmp_path, cache, "debug=fast_dev_run", override))
+
+
+class WithoutDepth(SyntheticScenes):
+    """Rooms without depth."""
+
+    has_depth = False
+
+
+def test_data_that_cannot_be_trained_on_is_refused_before_anything_is_measured(tmp_path: Path, cache: Path) -> None:
+    with pytest.raises(DataError, match="WithoutDepth has no depth"):
+        train(small_config(tmp_path, cache, f"data.train._target_={__name__}.WithoutDepth"))
+    assert not list(tmp_path.iterdir())
 
 
 def test_clipping_can_be_switched_off(tmp_path: Path, cache: Path) -> None:

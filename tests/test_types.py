@@ -1,5 +1,6 @@
 """Records: mapping over tensors, scene selection, views."""
 
+import pytest
 import torch
 
 from vg2gt.types import Batch, Cameras, Gaussians, Tokens, Voxels
@@ -33,6 +34,13 @@ def test_batch_splits_context_and_target() -> None:
     assert second.scene == ("b",)
     assert second.num_context == 3
     assert second.target.images[0, :, 0, 0, 0].tolist() == [8, 9]
+
+
+def test_pinning_reaches_every_tensor(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.Tensor, "pin_memory", lambda tensor: tensor + 1)  # needs a GPU
+    pinned = cameras(1, 2).pin_memory()
+    assert torch.equal(pinned.world_to_camera, cameras(1, 2).world_to_camera + 1)
+    assert torch.equal(pinned.intrinsics, cameras(1, 2).intrinsics + 1)
 
 
 def test_gaussians_of_a_scene_are_its_rows() -> None:

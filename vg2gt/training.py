@@ -15,6 +15,7 @@ from lightning.pytorch import LightningDataModule, Trainer
 from omegaconf import DictConfig, OmegaConf
 
 from vg2gt.checkpoints import AtomicCheckpointIO, initialize_from, newest_valid, read_checkpoint
+from vg2gt.data.datamodule import SceneDataModule
 from vg2gt.io.files import read_json, write_json, write_text
 from vg2gt.lightning_module import VG2GTModule
 from vg2gt.preview import write_preview
@@ -107,6 +108,8 @@ def train(config: DictConfig) -> dict[str, Any]:
     """
     checkpoint = _checkpoint_to_resume(config)
     run = build(config)
+    if isinstance(run.datamodule, SceneDataModule):
+        run.datamodule.setup("fit")  # before anything is measured: faults of the data are named first
     if not run.module.model.trained_parameters():
         raise ValueError(
             f"{type(run.module.model).__name__} has no trained part: evaluate it as it is (python -m vg2gt.evaluate), "

@@ -30,6 +30,10 @@ class TensorRecord:
         """Returns a copy on ``device``."""
         return self.map(lambda tensor: tensor.to(device))
 
+    def pin_memory(self: Record) -> Record:
+        """Returns a copy in page-locked memory, from where copies to a GPU are faster."""
+        return self.map(Tensor.pin_memory)
+
     def detach(self: Record) -> Record:
         """Returns a copy cut from the autograd graph."""
         return self.map(Tensor.detach)

@@ -9,10 +9,12 @@ import pytest
 import torch
 
 from vg2gt.data import Mixture, RGBDFolder, SceneDataModule, SyntheticScenes
+from vg2gt.data.framing import FramingSampler
 from vg2gt.data.resized_cache import ResizedCache
 from vg2gt.data.transforms import reduce_to_cover
 
 SMALL = (12, 16)
+FRAMING = FramingSampler(SMALL)
 
 
 @pytest.fixture
@@ -25,7 +27,7 @@ def _files(folder: Path) -> list[Path]:
 
 
 def test_frames_are_decoded_once_and_come_back_the_same(recording, tmp_path, monkeypatch):
-    cache = ResizedCache(recording, tmp_path / "cache", SMALL)
+    cache = ResizedCache(recording, tmp_path / "cache", FRAMING)
     first = cache.load("office", [12, 10])
     expected = reduce_to_cover(recording.load("office", [12, 10]), SMALL)
     assert float((first.images - expected.images).abs().max()) <= 0.5 / 255 + 1e-6
@@ -33,19 +35,27 @@ def test_frames_are_decoded_once_and_come_back_the_same(recording, tmp_path, mon
         assert torch.equal(getattr(first, name), getattr(expected, name))
     assert len(_files(tmp_path / "cache")) == 2
     monkeypatch.setattr(RGBDFolder, "load", None)
-    again = ResizedCache(recording, tmp_path / "cache", SMALL).load("office", [12, 10])
+    again = ResizedCache(recording, tmp_path / "cache", FRAMING).load("office", [12, 10])
     assert torch.equal(again.images, first.images)
     assert torch.equal(again.depth, first.depth)
     assert again.sparse_depth == first.sparse_depth
 
 
-@pytest.mark.parametrize("options", [{}, {"aspect": [0.5, 1.0], "zoom": [1, 1.2], "size_multiple": 2}])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"aspect": [0.5, 1.0], "zoom": [1, 1.2], "size_multiple": 2},
+        {"fit": "pad", "image_size": (12, 24)},
+        {"fit": "pad", "aspect": [0.5, 1.5], "size_multiple": 2},
+    ],
+)
 def test_batches_are_those_without_a_cache(recording, tmp_path, options: dict[str, Any]):
     def batches(**more: Any) -> list:
         val = SyntheticScenes(1, num_frames=4, size=SMALL)
         module = SceneDataModule(
-            recording, val, image_size=SMALL, min_views=2, max_views=3, max_images=6, eval_context=[0],
-            eval_target=[1], steps_per_epoch=5, **options, **more,
+            recording, val, min_views=2, max_views=3, max_images=6, eval_context=[0],
+            eval_target=[1], steps_per_epoch=5, **{"image_size": SMALL, **options}, **more,
         )  # fmt: skip
         return list(module.train_dataloader())
 
@@ -59,7 +69,7 @@ def test_batches_are_those_without_a_cache(recording, tmp_path, options: dict[st
 
 
 def test_a_damaged_file_is_made_again(recording, tmp_path, caplog):
-    cache = ResizedCache(recording, tmp_path / "cache", SMALL)
+    cache = ResizedCache(recording, tmp_path / "cache", FRAMING)
     first = cache.load("office", [11])
     (path,) = _files(tmp_path / "cache")
     content = path.read_bytes()
@@ -76,22 +86,22 @@ def test_other_options_sizes_and_files_have_their_own_frames(recording, tmp_path
     sources = [recording, RGBDFolder(str(folder), depth_scale=500, holdout=3)]
     for source in sources:
         for size in (SMALL, (6, 8)):
-            ResizedCache(source, tmp_path / "cache", size).load("office", [11])
+            ResizedCache(source, tmp_path / "cache", FramingSampler(size)).load("office", [11])
     assert len(_files(tmp_path / "cache")) == 4
-    ResizedCache(RGBDFolder(str(folder), holdout=5, every=2), tmp_path / "cache", SMALL).load("office", [10])
+    ResizedCache(RGBDFolder(str(folder), holdout=5, every=2), tmp_path / "cache", FRAMING).load("office", [10])
     assert len({path.parent for path in _files(tmp_path / "cache")}) == 4  # which frames are chosen changes nothing
-    before = ResizedCache(recording, tmp_path / "cache", SMALL)._scene_folder("office")
+    before = ResizedCache(recording, tmp_path / "cache", FRAMING)._scene_folder("office")
     time.sleep(0.01)
     (folder / "K.txt").write_text((folder / "K.txt").read_text().replace("e+01", "e+02"))
-    old = ResizedCache(recording, tmp_path / "cache", SMALL)
+    old = ResizedCache(recording, tmp_path / "cache", FRAMING)
     old._folders["office"] = before
-    changed = ResizedCache(RGBDFolder(str(folder), holdout=None), tmp_path / "cache", SMALL)
+    changed = ResizedCache(RGBDFolder(str(folder), holdout=None), tmp_path / "cache", FRAMING)
     assert changed.load("office", [11]).intrinsics[0, 0, 0] > 5 * old.load("office", [11]).intrinsics[0, 0, 0]
 
 
 def test_everything_else_is_the_sources(recording, tmp_path):
     mixture = Mixture({"a": recording, "b": SyntheticScenes(2)}, {"a": 1, "b": 3})
-    cache = ResizedCache(mixture, tmp_path, SMALL)
+    cache = ResizedCache(mixture, tmp_path, FRAMING)
     assert cache.scenes == mixture.scenes
     assert cache.parts() == {"a": 1, "b": 3}
     for scene in cache.scenes:
@@ -102,7 +112,7 @@ def test_everything_else_is_the_sources(recording, tmp_path):
 
 def test_a_full_disk_ends_the_writing_only(recording, tmp_path, caplog):
     (tmp_path / "cache").write_text("a file where the folder should be")
-    cache = ResizedCache(recording, tmp_path / "cache", SMALL)
+    cache = ResizedCache(recording, tmp_path / "cache", FRAMING)
     with caplog.at_level(logging.WARNING):
         assert cache.load("office", [10, 11]).images.shape == (2, 3, *SMALL)
     assert sum("no longer written" in record.getMessage() for record in caplog.records) == 1

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any
 
 from lightning.pytorch import LightningDataModule
 from torch.utils.data import DataLoader
 
-from vg2gt.data.base import Frames, SceneSource, SourceMaker
+from vg2gt.data.base import DataError, Frames, SceneSource, SourceMaker
 from vg2gt.data.batches import BatchDataset
 from vg2gt.data.evaluation_views import EvaluationViews
 from vg2gt.data.framing import Crop, Fit, FramingSampler
 from vg2gt.data.overlap import refuse_overlap, refuse_untrainable
 from vg2gt.data.resized_cache import ResizedCache
 from vg2gt.data.sampling import StepSampler, ViewSampler, usable_scenes
-from vg2gt.data.transforms import reduce_to_cover
 from vg2gt.types import Batch
 
 
@@ -107,17 +106,21 @@ class SceneDataModule(LightningDataModule):
         either fault is an error, because figures must not change silently.
 
         Raises:
-            DataError: if the data is missing, unusable, or shared by training and evaluation.
+            DataError: if the data is missing, unusable, or shared by training and evaluation; for ``stage="fit"`` also
+                if the training scenes have no depth or no cameras.
         """
         if self._train is not None and self._val is not None:
             return
         train, val = self.train_source(), self.val_source()
-        self._train_names = usable_scenes(train, self.sampler, self.train_scenes)
+        trainable = train.has_depth and train.has_cameras
+        if stage == "fit":
+            refuse_untrainable(train)
+        self._train_names = usable_scenes(train, self.sampler, self.train_scenes) if trainable else []
         names = list(val.scenes)[: self.eval_scenes]
         self._val_views = [views for name in names for views in self.eval_views.choose(val, name)]
         refuse_overlap(train, self._train_names, val, self._val_views)
         if self.resized_cache:
-            train = ResizedCache(train, self.resized_cache, self.framing.largest)
+            train = ResizedCache(train, self.resized_cache, self.framing)
         self._train = BatchDataset(train, self._training_size(), self.memory_mb, replace_damaged=True)
         self._val = BatchDataset(val, self.framing.still.apply, self.memory_mb)
 
@@ -169,16 +172,27 @@ class SceneDataModule(LightningDataModule):
         """What is kept of a training frame: its final size, or as much as any framing can need."""
         if not self.framing.moves:
             return self.framing.still.apply
-        return partial(reduce_to_cover, size=self.framing.largest)
+        return self.framing.reduce
 
     def _source(self, make: SceneSource | SourceMaker) -> SceneSource:
-        return make if isinstance(make, SceneSource) else make(**self.common)
+        if isinstance(make, SceneSource):
+            return make
+        try:
+            inspect.signature(make).bind(**self.common)
+        except TypeError as error:
+            raise DataError(
+                f"the dataset's loader {error} (data.*): leave the option out; if a preset (evaluation=synthetic) sets "
+                "it, choose another preset or remove it with '~data.NAME'"
+            ) from error
+        return make(**self.common)
 
     def _loader(self, dataset: BatchDataset, sampler: object) -> DataLoader[Batch]:
+        trainer = self.trainer
         return DataLoader(
             dataset,
             batch_size=None,  # the sampler's items are whole batches
             sampler=sampler,  # pyright: ignore[reportArgumentType]
             num_workers=self.workers,
             persistent_workers=self.workers > 0,
+            pin_memory=trainer is not None and trainer.strategy.root_device.type == "cuda",
         )

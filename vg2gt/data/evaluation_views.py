@@ -38,25 +38,23 @@ class EvaluationViews:
         Raises:
             DataError: if the scene lacks a frame that was named, or has no frame for the context.
         """
-        frames = list(source.frames(scene))
+        frames, held_out = list(source.frames(scene)), set(source.held_out(scene))
         if self.window is None:
-            return [self._choose(source, scene, frames)]
+            return [self._choose(scene, frames, held_out)]
         count = max(1, round(len(frames) / self.window))
         return [
-            self._choose(source, scene, [frames[i] for i in part])
+            self._choose(scene, [frames[i] for i in part], held_out)
             for part in np.array_split(np.arange(len(frames)), count)
         ]
 
-    def _choose(self, source: SceneSource, scene: str, frames: list[int]) -> SceneViews:
-        held_out = [frame for frame in source.held_out(scene) if frame in set(frames)]
+    def _choose(self, scene: str, frames: list[int], held_out: set[int]) -> SceneViews:
         if isinstance(self.context, int):
-            candidates = [frame for frame in frames if frame not in set(held_out)]
-            context = _spread(candidates, self.context)
+            context = _spread([frame for frame in frames if frame not in held_out], self.context)
         else:
             context = _at(frames, self.context, scene, "eval_context")
         if isinstance(self.target, int):
-            rest = [frame for frame in frames if frame not in set(context)]
-            target = _spread(held_out or rest, self.target)
+            inputs, kept = set(context), [frame for frame in frames if frame in held_out]
+            target = _spread(kept or [frame for frame in frames if frame not in inputs], self.target)
         else:
             target = _at(frames, self.target, scene, "eval_target")
         if not context:
@@ -71,6 +69,8 @@ def _spread(frames: list[int], count: int) -> list[int]:
     """``count`` frames evenly spread over ``frames`` (all of them if there are fewer), both ends included."""
     if count >= len(frames):
         return frames
+    if count == 0:
+        return []
     places = np.linspace(0, len(frames) - 1, count) if count > 1 else np.array([(len(frames) - 1) / 2])
     return [frames[int(place + 0.5)] for place in places]
 

@@ -10,7 +10,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from vg2gt.data.base import Frames
-from vg2gt.data.transforms import resize_to_cover, resize_to_fit
+from vg2gt.data.transforms import reduce_to_cover, reduce_to_fit, resize_to_cover, resize_to_fit
 
 _SIZE, _WINDOW = 4, 5  # random streams, apart from those of the view sampler
 
@@ -94,11 +94,15 @@ class FramingSampler:
 
     @property
     def largest(self) -> tuple[int, int]:
-        """``(height, width)`` that covers every size and zoom that can be drawn."""
+        """``(height, width)`` that covers every size and zoom that can be drawn (no zoom with ``fit="pad"``)."""
         shapes = self.aspect or (self.image_size[0] / self.image_size[1],)
         sizes = [self._size(shape) for shape in shapes]
         zoom = self.zoom[1]
         return math.ceil(max(size[0] for size in sizes) * zoom), math.ceil(max(size[1] for size in sizes) * zoom)
+
+    def reduce(self, frames: Frames) -> Frames:
+        """Makes frames smaller, as far as no framing that can be drawn needs more of them."""
+        return (reduce_to_fit if self.fit == "pad" else reduce_to_cover)(frames, self.largest)
 
     def size(self, step: int) -> tuple[int, int]:
         """``(height, width)`` of a step's images on all devices."""

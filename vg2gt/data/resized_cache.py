@@ -13,8 +13,9 @@ import numpy as np
 import torch
 
 from vg2gt.data.base import DataError, Frames, SceneSource
+from vg2gt.data.framing import FramingSampler
 from vg2gt.data.sources.parsing import load_npz
-from vg2gt.data.transforms import from_bytes, reduce_to_cover, to_bytes
+from vg2gt.data.transforms import from_bytes, to_bytes
 from vg2gt.io.files import write_bytes
 
 log = logging.getLogger(__name__)
@@ -24,23 +25,23 @@ _NAMES = ("image", "depth", "world_to_camera", "intrinsics")
 
 
 class ResizedCache(SceneSource):
-    """A source whose frames are kept on disk, made smaller until they just cover a size.
+    """A source whose frames are kept on disk, made smaller until they just suffice for a framing.
 
     A frame is written when it is first asked for, uncompressed: 7 bytes a pixel, 0.7 MB at 224x448. Its place depends
-    on the scene's identity (the dataset's files and the loader's options) and on the size, so a changed dataset is
-    decoded anew; a damaged file is made again. Loading from it gives what loading from the source and reducing would,
-    colours rounded to 8 bits.
+    on the scene's identity (the dataset's files and the loader's options) and on the size and fit, so a changed
+    dataset is decoded anew; a damaged file is made again. Loading from it gives what loading from the source and
+    reducing would, colours rounded to 8 bits.
 
     Args:
         source: where frames come from.
         folder: where they are kept (``~`` is the home folder); several runs and processes may share it.
-        size: ``(height, width)`` that reduced frames cover; frames that do not are kept as they are.
+        framing: what frames are needed for; they are made as small as all that it draws allows.
     """
 
-    def __init__(self, source: SceneSource, folder: str | Path, size: tuple[int, int]) -> None:
+    def __init__(self, source: SceneSource, folder: str | Path, framing: FramingSampler) -> None:
         self.source = source
         self.folder = Path(folder).expanduser()
-        self.size = size
+        self.framing = framing
         self.is_metric = source.is_metric
         self.has_depth = source.has_depth
         self.has_cameras = source.has_cameras
@@ -77,8 +78,8 @@ class ResizedCache(SceneSource):
         return self.source.part(scene)
 
     def identity(self, scene: str) -> str:
-        """The source's, and the size."""
-        return json.dumps([_VERSION, self.size, self.source.identity(scene)])
+        """The source's, and what decides the size."""
+        return json.dumps([_VERSION, self.framing.largest, self.framing.fit, self.source.identity(scene)])
 
     def load(self, scene: str, frame_ids: Sequence[int]) -> Frames:
         """Reads frames from the folder; those that are not there are decoded and written."""
@@ -99,7 +100,7 @@ class ResizedCache(SceneSource):
                 return _read(path, scene)
             except DataError as error:
                 log.warning("the resized frame %s is damaged and is made again: %s", path, error)
-        frames = reduce_to_cover(self.source.load(scene, [frame]), self.size)
+        frames = self.framing.reduce(self.source.load(scene, [frame]))
         made = Frames(
             from_bytes(to_bytes(frames.images[0])),
             frames.depth[0],

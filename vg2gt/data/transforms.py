@@ -107,9 +107,7 @@ def resize_to_cover(
 
 def resize_to_fit(frames: Frames, size: tuple[int, int]) -> Frames:
     """Resizes frames, keeping their shape, until they fit into ``size`` (height, width), and pads around them."""
-    height, width = frames.depth.shape[-2:]
-    scale = min(size[0] / height, size[1] / width)
-    inner = (min(size[0], max(1, _whole(height * scale))), min(size[1], max(1, _whole(width * scale))))
+    inner = _fitting(frames, size)
     return pad(resize(frames, inner), (size[0] - inner[0]) // 2, (size[1] - inner[1]) // 2, size)
 
 
@@ -120,6 +118,21 @@ def reduce_to_cover(frames: Frames, size: tuple[int, int]) -> Frames:
     if scale >= 1:
         return frames
     return resize(frames, (max(size[0], _whole(height * scale)), max(size[1], _whole(width * scale))))
+
+
+def reduce_to_fit(frames: Frames, size: tuple[int, int]) -> Frames:
+    """Makes frames smaller, keeping their shape, until they just fit into ``size``; smaller frames stay as they are."""
+    height, width = frames.depth.shape[-2:]
+    if height <= size[0] and width <= size[1]:
+        return frames
+    return resize(frames, _fitting(frames, size))
+
+
+def _fitting(frames: Frames, size: tuple[int, int]) -> tuple[int, int]:
+    """``(height, width)`` of the largest frames of this shape that fit into ``size``."""
+    height, width = frames.depth.shape[-2:]
+    scale = min(size[0] / height, size[1] / width)
+    return min(size[0], max(1, _whole(height * scale))), min(size[1], max(1, _whole(width * scale)))
 
 
 def _whole(length: float) -> int:
