@@ -1,6 +1,7 @@
 """Whole evaluations of two small rooms."""
 
 import json
+import logging
 import shutil
 from pathlib import Path
 from typing import Any
@@ -141,8 +142,47 @@ def test_a_model_without_a_trained_part(tmp_path: Path, cache: Path) -> None:
 
 
 def test_scenes_of_the_training_are_refused(tmp_path: Path, cache: Path, trained: Path) -> None:
-    with pytest.raises(DataError, match="scene room-000000 was trained on"):
+    with pytest.raises(DataError, match="scene room-000000 is used for training and for evaluation"):
         run(tmp_path, cache, f"ckpt={trained}", "data.val.first_seed=0")
+
+
+class OtherLoader(SyntheticScenes):
+    """Another loader of the same scenes."""
+
+
+def test_scenes_of_the_training_are_refused_whatever_loads_them(tmp_path: Path, cache: Path, trained: Path) -> None:
+    other = [f"data.val._target_={__name__}.OtherLoader", "data.val.first_seed=0"]
+    with pytest.raises(DataError, match="scene room-000000 is used for training and for evaluation"):
+        run(tmp_path, cache, f"ckpt={trained}", *other)
+
+
+def test_scenes_in_a_mixture_that_was_trained_on_are_refused(tmp_path: Path, cache: Path, trained: Path) -> None:
+    copied = tmp_path / "run"
+    shutil.copytree(trained, copied)
+    config = OmegaConf.load(copied / "config.yaml")
+    part = config.data.train
+    config.data.train = {
+        "_target_": "vg2gt.data.Mixture", "_partial_": True, "parts": {"rooms": part}, "weights": {"rooms": 1}
+    }  # fmt: skip
+    OmegaConf.save(config, copied / "config.yaml")
+    with pytest.raises(DataError, match="scene room-000000 is used for training and for evaluation"):
+        run(tmp_path / "out", cache, f"ckpt={copied}", "data.val.first_seed=0")
+
+
+def test_training_data_that_is_gone_is_told(tmp_path: Path, cache: Path, trained: Path, caplog) -> None:
+    copied = tmp_path / "run"
+    shutil.copytree(trained, copied)
+    config = OmegaConf.load(copied / "config.yaml")
+    for target in ("vg2gt.data.sources.ScanNet", "no_longer_installed.Loader"):
+        config.data.train = {"_target_": target, "_partial_": True}
+        config.data.root = str(tmp_path / "gone")
+        for key in ("num_frames", "size", "cache_dir"):
+            config.data.pop(key, None)
+        OmegaConf.save(config, copied / "config.yaml")
+        caplog.clear()
+        with caplog.at_level(logging.WARNING):
+            run(tmp_path / target, cache, f"ckpt={copied}", "data.eval_scenes=1")
+        assert "whether the evaluated scenes were trained on cannot be checked" in caplog.text
 
 
 def test_what_is_missing_or_wrong_is_named(tmp_path: Path, cache: Path, trained: Path) -> None:
@@ -178,6 +218,20 @@ def test_a_scene_without_depth_has_no_depth_error(tmp_path: Path, cache: Path) -
     assert blind["rendered/novel/solid/psnr"] is not None
     assert report["views"]["2"]["mean"][name] == seeing[name]
     assert "n/a" in (tmp_path / "metrics.md").read_text()
+
+
+class WithoutCameras(SyntheticScenes):
+    """Rooms whose cameras are not known."""
+
+    has_cameras = False
+
+
+def test_a_backend_that_is_told_the_cameras_needs_some(tmp_path: Path, cache: Path) -> None:
+    data = [f"data.val._target_={__name__}.WithoutCameras", "data.eval_scenes=1"]
+    with pytest.raises(DataError, match=r"backend oracle is told .* WithoutCameras has no cameras"):
+        run(tmp_path, cache, *data)
+    report = run(tmp_path, cache, *data, "backend=vggt_tiny")
+    assert "rendered/gt_pose/solid/psnr" not in report["views"]["2"]["mean"]
 
 
 def test_lpips_from_a_local_file(tmp_path: Path, cache: Path, trained: Path) -> None:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 
-from vg2gt.data.base import DataError, SceneSource, training_frames
+from vg2gt.data.base import DataError, SceneSource
 from vg2gt.data.sampling import SceneViews
 
 log = logging.getLogger(__name__)
@@ -28,10 +28,13 @@ def refuse_untrainable(source: SceneSource) -> None:
 def refuse_overlap(
     train: SceneSource, scenes: Sequence[str], val: SceneSource, evaluation: Sequence[SceneViews]
 ) -> None:
-    """Refuses evaluation targets that are training frames, and evaluation of places that are trained on.
+    """Refuses evaluation targets that are not held out of training, and evaluation of places that are trained on.
 
     Scenes should differ altogether. Where one recording serves both ends, its targets must be frames held out of
     training, which is said in the log.
+
+    The two sources may be of any kinds: scenes and places are known by their names. A part of a mixture is compared
+    with the part of that name; where the training data has none, with all of it.
 
     Args:
         train: the training source.
@@ -40,29 +43,53 @@ def refuse_overlap(
         evaluation: the evaluation samples.
 
     Raises:
-        DataError: naming the first scene whose targets (whole scene, without targets) training would see, or whose
-            place is shown by a training scene.
+        DataError: naming the first scene with targets (whole scene, without targets) that training does not hold out,
+            or whose place is shown by a training scene.
     """
-    places = {train.place(scene): scene for scene in scenes}
-    names = set(scenes)
+    targets: dict[str, set[int]] = {}
     for views in evaluation:
-        if views.scene in names:
-            _refuse_seen_targets(train, views)
-        elif (place := val.place(views.scene)) in places:
+        targets.setdefault(views.scene, set()).update(views.target or views.context)
+    by_name, by_place = _named(train, scenes, lambda scene: scene), _named(train, scenes, train.place)
+    parts, shared = train.parts(), 0
+    for scene, frames in targets.items():
+        part = val.part(scene) if val.part(scene) in parts else None
+        same = by_name.get((part, _without_part(val, scene, scene)), ())
+        for trained in same:
+            _refuse_seen_targets(train, trained, scene, frames)
+        shared += bool(same)
+        place = _without_part(val, scene, val.place(scene))
+        if not same and (part, place) in by_place:
             raise DataError(
-                f"evaluation scene {views.scene} and training scene {places[place]} show the same place ({place}): "
-                "give disjoint scenes, such as the lists that `python -m vg2gt.data.splits` writes"
+                f"evaluation scene {scene} and training scene {by_place[part, place][0]} show the same place "
+                f"({place}): give disjoint scenes, such as the lists that `python -m vg2gt.data.splits` writes; if "
+                "they are different places, rename one"
             )
-    shared = {views.scene for views in evaluation} & names
     if shared:
-        log.info("%d scenes serve training and evaluation; scored are frames held out of training", len(shared))
+        log.info("%d scenes serve training and evaluation; scored are frames held out of training", shared)
 
 
-def _refuse_seen_targets(train: SceneSource, views: SceneViews) -> None:
-    seen = set(training_frames(train, views.scene)) & set(views.target or views.context)
+def _named(
+    source: SceneSource, scenes: Sequence[str], name: Callable[[str], str]
+) -> Mapping[tuple[str | None, str], list[str]]:
+    """Scenes by what ``name`` gives for them, within their part and within no part (None)."""
+    found: dict[tuple[str | None, str], list[str]] = {}
+    for scene in scenes:
+        for part in (source.part(scene), None):
+            found.setdefault((part, _without_part(source, scene, name(scene))), []).append(scene)
+    return found
+
+
+def _without_part(source: SceneSource, scene: str, name: str) -> str:
+    """The name of a scene or a place as its own dataset has it, without the part that a mixture puts before it."""
+    part = source.part(scene)
+    return name.removeprefix(f"{part}/") if part else name
+
+
+def _refuse_seen_targets(train: SceneSource, trained: str, scene: str, frames: set[int]) -> None:
+    seen = frames - set(train.held_out(trained))
     if seen:
         raise DataError(
-            f"scene {views.scene} is used for training and for evaluation: {len(seen)} of its evaluation frames are "
-            "trained on; give disjoint scenes, such as the lists that `python -m vg2gt.data.splits` writes, or hold "
-            "frames out of training (data.holdout)"
+            f"scene {scene} is used for training and for evaluation: {len(seen)} of its evaluation frames are not held "
+            "out of training; give disjoint scenes, such as the lists that `python -m vg2gt.data.splits` writes, or "
+            "hold frames out of training (data.holdout); if they are different scenes, rename one"
         )

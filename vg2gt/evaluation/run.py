@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
@@ -17,7 +18,7 @@ from vg2gt.data.base import DataError, SceneSource
 from vg2gt.data.batches import BatchDataset
 from vg2gt.data.datamodule import SceneDataModule
 from vg2gt.data.overlap import refuse_overlap
-from vg2gt.data.sampling import SceneViews, usable_scenes
+from vg2gt.data.sampling import SceneViews
 from vg2gt.evaluation import paper
 from vg2gt.evaluation.options import EvaluationOptions
 from vg2gt.evaluation.pictures import PANELS, scene_picture
@@ -71,10 +72,11 @@ def evaluate(config: DictConfig) -> dict[str, Any]:
     datamodule: SceneDataModule = instantiate(config.data)
     data = datamodule.evaluation_data()
     samples = _samples(options, data.source, list(data.source.scenes)[: datamodule.eval_scenes], counts)
-    _refuse_training_views(checkpoint, config, data.source, [view for views in samples.values() for view in views])
+    _refuse_training_views(checkpoint, data.source, [view for views in samples.values() for view in views])
 
     device = choose_device(config.device)
     model = build_model(parts, config.seed, device)
+    _refuse_without_hints(model, data.source)
     weights = load_weights(model, checkpoint)
     lpips, lpips_label = _lpips(options.lpips, device)
     resolved = OmegaConf.merge(OmegaConf.to_container(config, resolve=True), parts)
@@ -125,13 +127,11 @@ def _samples(
     return {count: options.selection.choose(source, scenes, count) for count in counts}
 
 
-def _refuse_training_views(
-    checkpoint: Path | None, config: DictConfig, source: SceneSource, views: Sequence[SceneViews]
-) -> None:
-    """Refuses to score what the run was trained on, where it was trained on a data set of the same kind.
+def _refuse_training_views(checkpoint: Path | None, source: SceneSource, views: Sequence[SceneViews]) -> None:
+    """Refuses to score what the run was trained on, whatever kinds of source training and evaluation read.
 
-    Of a scene that was trained on, only frames that the training held out may be scored. Frame numbers alone would not
-    do: the evaluation may read the scene with other options.
+    Every scene in the run's training data counts as trained on, also those that it left out as too short: to find
+    these, all scenes would have to be indexed. If the training data is no longer there, that is said in the log.
 
     Raises:
         DataError: naming the first scene.
@@ -139,23 +139,22 @@ def _refuse_training_views(
     path = checkpoint.resolve().parent.parent / "config.yaml" if checkpoint else None
     if path is None or not path.is_file():
         return
-    run = OmegaConf.load(path)
-    if OmegaConf.select(run, "data.train._target_") != OmegaConf.select(config, "data.val._target_"):
-        return
     try:
-        trained: SceneDataModule = instantiate(run.data)
+        trained: SceneDataModule = instantiate(OmegaConf.load(path).data)
         train = trained.train_source()
-        names = usable_scenes(train, trained.sampler, trained.train_scenes)
-    except (FileNotFoundError, ValueError) as error:
+    except (OSError, ValueError, ImportError, InstantiationException) as error:
         log.warning("whether the evaluated scenes were trained on cannot be checked: %s", error)
         return
-    for view in views:
-        if view.scene in names and not set(view.target or view.context) <= set(train.held_out(view.scene)):
-            raise DataError(
-                f"scene {view.scene} was trained on, and frames the training did not hold out would be scored: choose "
-                "other scenes (data.val...)"
-            )
-    refuse_overlap(train, names, source, views)
+    refuse_overlap(train, list(train.scenes)[: trained.train_scenes], source, views)
+
+
+def _refuse_without_hints(model: Reconstructor, source: SceneSource) -> None:
+    lacking = [name for name, there in (("depth", source.has_depth), ("cameras", source.has_cameras)) if not there]
+    if lacking and model.backend.needs_hints:
+        raise DataError(
+            f"backend {model.backend.name} is told the data's depth and cameras, and {type(source).__name__} has no "
+            f"{' and no '.join(lacking)}: choose another backend= or other data"
+        )
 
 
 def _lpips(source: str | None, device: torch.device) -> tuple[LPIPS | None, str]:
