@@ -106,7 +106,13 @@ def test_one_line_says_what_is_wrong(arguments, said: str, tmp_path: Path, monke
     message = str(stopped.value)
     assert re.search(said, message)
     assert "\n" not in message
-    assert not list((tmp_path / "out").glob("*")) if (tmp_path / "out").exists() else True
+    assert not (tmp_path / "out").exists()
+
+
+def test_missing_images_are_told_before_the_weights_are_loaded(tmp_path: Path) -> None:
+    absent = [str(tmp_path / "nowhere"), "--backend", "da3_tiny,pretrained=true,path=weights-that-are-not-there"]
+    with pytest.raises(SystemExit, match="nowhere does not exist"):
+        reconstruct_command.main([*absent, "--out", str(tmp_path / "out"), "--quiet"])
 
 
 def test_output_folder_that_cannot_be_written(photos: Path, tmp_path: Path) -> None:

@@ -47,6 +47,20 @@ def test_page_of_a_file(files: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     assert page.count('"picture": "') == 2
 
 
+def test_images_in_the_folder_that_reconstruct_writes(
+    files: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    (files / "images").mkdir()
+    for index in range(2):
+        (files / f"{index}.png").rename(files / "images" / f"{index}.png")
+    page = ("--html", files / "page.html")
+    run(monkeypatch, files / "scene.ply", "--cameras", files / "cameras.json", *page)
+    assert f"2 of 3 cameras have their image in {files / 'images'}" in capsys.readouterr().out
+    assert (files / "page.html").read_text().count('"picture": "') == 2
+    run(monkeypatch, files / "scene.ply", "--cameras", files / "cameras.json", "--images", files, *page)
+    assert "0 of 3 cameras have their image" in capsys.readouterr().out
+
+
 def test_script_starts_it(files: Path) -> None:
     command = [sys.executable, "-c", "import vg2gt.cli; vg2gt.cli.main()", "view"]
     arguments = [*command, str(files / "scene.ply"), "--html", str(files / "page.html"), "--title", "mine"]

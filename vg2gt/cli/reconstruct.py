@@ -15,7 +15,8 @@ from rich.logging import RichHandler
 from vg2gt.evaluation.settings import choose_device
 from vg2gt.io.video import MissingDecoderError, require_ffmpeg
 from vg2gt.reconstruction import OUTPUTS, Monitor, OutOfMemory, Ready, load_model, reconstruct_with, write_outputs
-from vg2gt.reconstruction.outputs import DEFAULT, ORBIT_FRAMES, check_outputs, cost_figures, prepare_folder
+from vg2gt.reconstruction.outputs import DEFAULT, ORBIT_FRAMES, check_folder, check_outputs, cost_figures
+from vg2gt.reconstruction.pictures import existing_path
 from vg2gt.reconstruction.pipeline import memory_advice
 
 EXPECTED_ERRORS = (ValueError, OSError, ImportError, OutOfMemory, MissingDecoderError)
@@ -67,7 +68,9 @@ def main(argv: Sequence[str] | None = None) -> None:
 def run(options: argparse.Namespace) -> None:
     """Reconstructs and writes."""
     check_outputs(options.save)
-    prepare_folder(options.out, options.save, options.overwrite)
+    check_folder(options.out, options.save, options.overwrite)
+    for item in options.images:  # before weights are downloaded
+        existing_path(item)
     if "orbit.mp4" in options.save:
         require_ffmpeg("writing orbit.mp4")
     with Monitor(show=not options.quiet, device=choose_device(options.device)) as monitor:

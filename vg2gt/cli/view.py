@@ -5,13 +5,19 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from vg2gt.io import read_cameras_json, read_gaussian_ply, read_splat
+from vg2gt.io.cameras_json import NamedCamera
 from vg2gt.types import Gaussians
 from vg2gt.viewer import MissingViserError, ViewerScene, load_pictures, start_server, write_viewer_html
 from vg2gt.viewer.server import LOOPBACK, PORT
 
+IMAGE_FOLDER = "images"  # beside cameras.json, as `vg2gt reconstruct --save images` writes it
 READERS = {".ply": read_gaussian_ply, ".splat": read_splat}
 
 
@@ -38,7 +44,9 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="vg2gt view", description="Shows a scene of Gaussians in the browser.")
     parser.add_argument("scene", type=Path, help=f"Gaussians: {', '.join(READERS)}")
     parser.add_argument("--cameras", type=Path, help="cameras.json of the scene; the first one is the initial view")
-    parser.add_argument("--images", type=Path, help="folder of the cameras' images; default: that of cameras.json")
+    parser.add_argument(
+        "--images", type=Path, help="folder of the cameras' images; default: that of cameras.json, or images/ in it"
+    )
     parser.add_argument("--html", type=Path, help="write one self-contained page to this file instead of serving")
     parser.add_argument("--title", help="of the page; default: the scene's file name")
     parser.add_argument("--host", help=f"address to listen on; default: {LOOPBACK}, this machine only")
@@ -60,10 +68,22 @@ def _scene(arguments: argparse.Namespace) -> ViewerScene:
     if arguments.cameras is None:
         return ViewerScene(gaussians, title=title)
     cameras = read_cameras_json(arguments.cameras)
-    folder = arguments.images or arguments.cameras.parent
-    pictures = load_pictures(cameras, folder)
-    print(f"{sum(picture is not None for picture in pictures)} of {len(cameras)} cameras have their image in {folder}")
-    return ViewerScene(gaussians, cameras, pictures, title)
+    beside = arguments.cameras.parent
+    folders = [arguments.images] if arguments.images is not None else [beside, beside / IMAGE_FOLDER]
+    return ViewerScene(gaussians, cameras, _pictures(cameras, folders), title)
+
+
+def _pictures(cameras: Sequence[NamedCamera], folders: Sequence[Path]) -> list[NDArray[np.uint8] | None]:
+    """The cameras' pictures from the first of the folders that has any; says where they are from."""
+    for folder in folders:
+        pictures = load_pictures(cameras, folder)
+        found = sum(picture is not None for picture in pictures)
+        if found:
+            print(f"{found} of {len(cameras)} cameras have their image in {folder}")
+            return pictures
+    looked = " or ".join(str(folder) for folder in folders)
+    print(f"0 of {len(cameras)} cameras have their image in {looked}; --images names another folder")
+    return []
 
 
 def _read_gaussians(path: Path) -> Gaussians:

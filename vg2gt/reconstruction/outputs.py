@@ -69,25 +69,39 @@ def check_outputs(outputs: Sequence[str], known: Mapping[str, str] = OUTPUTS) ->
             raise ValueError(f"unknown output {output!r}; choose from: {', '.join(known)}")
 
 
-def prepare_folder(folder: str | Path, outputs: Sequence[str], overwrite: bool) -> Path:
-    """Makes the output folder and checks that the outputs can be written into it.
+def check_folder(folder: str | Path, outputs: Sequence[str], overwrite: bool) -> Path:
+    """Checks that the outputs can be written into a folder, which need not be there; makes nothing.
 
     Raises:
         FileExistsError: if an output is there already and must not be overwritten.
-        PermissionError: if the folder cannot be written to.
+        PermissionError: if the folder cannot be made or written to.
     """
     folder = Path(folder)
+    place = next(place for place in (folder, *folder.parents) if place.exists())
+    if not place.is_dir():
+        raise PermissionError(f"the output folder {folder} cannot be made ({place} is a file); choose another")
+    if not os.access(place, os.W_OK | os.X_OK):
+        raise PermissionError(f"the output folder {folder} is not writable; choose another")
+    there = [target for target in (folder / _target(output) for output in outputs) if target.exists()]
+    if there and not overwrite:
+        raise FileExistsError(f"{there[0]} is there already; choose another folder, or overwrite it (--overwrite)")
+    return folder
+
+
+def prepare_folder(folder: str | Path, outputs: Sequence[str], overwrite: bool) -> Path:
+    """Makes the output folder after :func:`check_folder`.
+
+    Raises:
+        FileExistsError: if an output is there already and must not be overwritten.
+        PermissionError: if the folder cannot be made or written to.
+    """
+    folder = check_folder(folder, outputs, overwrite)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise PermissionError(
             f"the output folder {folder} cannot be made ({error.strerror}); choose another"
         ) from error
-    if not os.access(folder, os.W_OK | os.X_OK):
-        raise PermissionError(f"the output folder {folder} is not writable; choose another")
-    there = [target for target in (folder / _target(output) for output in outputs) if target.exists()]
-    if there and not overwrite:
-        raise FileExistsError(f"{there[0]} is there already; choose another folder, or overwrite it (--overwrite)")
     return folder
 
 

@@ -94,6 +94,18 @@ def find_pictures(
     return _with_unique_names(chosen)
 
 
+def existing_path(item: str | Path) -> Path:
+    """The path of a file or folder, its ``~`` expanded.
+
+    Raises:
+        FileNotFoundError: if it does not exist.
+    """
+    path = Path(item).expanduser()
+    if not path.exists():
+        raise FileNotFoundError(f"{path} does not exist (seen from {Path.cwd()})")
+    return path
+
+
 def shrunk(pixels: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
     """Averages blocks of pixels of an image ``[H, W, 3]`` that is more than twice as large as ``size`` both ways."""
     factor = min(pixels.shape[0] // size[0], pixels.shape[1] // size[1]) // 2
@@ -109,11 +121,9 @@ def frame_of(pixels: NDArray[np.uint8]) -> Frames:
 def _pictures(item: Any, every: int, max_images: int | None) -> list[Picture]:
     if not isinstance(item, (str, Path)):
         return _from_memory(item)
-    path = Path(item).expanduser()
+    path = existing_path(item)
     if path.is_dir():
         return [_photo(file) for file in _image_files(path)]
-    if not path.exists():
-        raise FileNotFoundError(f"{path} does not exist (seen from {Path.cwd()})")
     return _video(path, every, max_images) if _is_video(path) else [_photo(path)]
 
 
@@ -189,9 +199,7 @@ def _from_memory(item: Any) -> list[Picture]:
 
 
 def _posed_pictures(item: Any) -> list[Picture]:
-    path = Path(item).expanduser() if isinstance(item, (str, Path)) else None
-    if path is not None and not path.exists():
-        raise FileNotFoundError(f"{path} does not exist (seen from {Path.cwd()})")
+    path = existing_path(item) if isinstance(item, (str, Path)) else None
     source = _source(path) if path is not None and path.is_dir() else None
     if source is None:
         raise ValueError(
