@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 # name in metrics.json -> (label, decimals, larger is better; None: neither)
@@ -41,7 +42,7 @@ def print_comparison(untrained: dict[str, float], trained: dict[str, float]) -> 
     for heading in ("", "untrained", "trained", "change"):
         table.add_column(heading, justify="left" if not heading else "right")
     for row in _cells(untrained, trained):
-        table.add_row(*row)
+        table.add_row(*map(escape, row))
     Console(width=110).print(table)
 
 
