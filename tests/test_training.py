@@ -261,6 +261,11 @@ def test_clipping_can_be_switched_off(tmp_path: Path, cache: Path) -> None:
     assert not torch.equal(head.out.weight, before)
 
 
+def test_progress_bar_can_be_switched_off(tmp_path: Path, cache: Path) -> None:
+    trainer = build(small_config(tmp_path, cache, "trainer.enable_progress_bar=false")).trainer
+    assert trainer.progress_bar_callback is None
+
+
 @pytest.mark.slow
 def test_two_processes_from_the_console_script(tmp_path: Path, cache: Path) -> None:
     overrides = [*SMALL, f"data.cache_dir={cache}", "trainer=ddp", "trainer.max_steps=2", "name=two"]
@@ -314,3 +319,4 @@ def test_misspelt_and_missing_are_named(tmp_path: Path) -> None:
     assert missing.returncode != 0
     assert "not_here" in missing.stderr
     assert "data.root=" in missing.stderr
+    assert "Traceback" not in missing.stderr

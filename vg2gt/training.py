@@ -12,6 +12,7 @@ import lightning
 import torch
 from hydra.utils import instantiate
 from lightning.pytorch import LightningDataModule, Trainer
+from lightning.pytorch.callbacks import ProgressBar
 from omegaconf import DictConfig, OmegaConf
 
 from vg2gt.checkpoints import AtomicCheckpointIO, initialize_from, newest_valid, read_checkpoint
@@ -71,12 +72,18 @@ def build(config: DictConfig) -> Run:
     trainer = instantiate(
         config.trainer,
         accelerator=_accelerator(config.trainer.accelerator),
-        callbacks=[instantiate(callback) for callback in config.callbacks.values() if callback],
+        callbacks=_callbacks(config),
         logger=[instantiate(logger) for logger in config.logger.values() if logger],
         plugins=[AtomicCheckpointIO()],
         default_root_dir=config.output_dir,
     )
     return Run(module, datamodule, trainer, Path(config.output_dir), bool(config.trainer.get("fast_dev_run")))
+
+
+def _callbacks(config: DictConfig) -> list[lightning.Callback]:
+    """The configured callbacks; ``trainer.enable_progress_bar=false`` leaves progress bars out."""
+    callbacks = [instantiate(callback) for callback in config.callbacks.values() if callback]
+    return [c for c in callbacks if config.trainer.get("enable_progress_bar", True) or not isinstance(c, ProgressBar)]
 
 
 def _accelerator(asked: str) -> str:

@@ -3,14 +3,16 @@
 import hydra
 from omegaconf import DictConfig
 
+from vg2gt.cli.errors import said_in_one_line
 from vg2gt.paths import config_dir
 from vg2gt.training import train
 
 
 @hydra.main(version_base="1.3", config_path=config_dir(), config_name="train")
 def main(config: DictConfig) -> None:
-    """Composes the configuration and runs the training."""
-    train(config)
+    """Composes the configuration and runs the training; what the user can mend is said in one line."""
+    with said_in_one_line():
+        train(config)
 
 
 if __name__ == "__main__":
