@@ -227,7 +227,7 @@ def test_non_finite_gaussians_are_a_skipped_step(tmp_path: Path, cache: Path) ->
         head.hidden.bias[0] = float("inf")
     before = head.out.weight.clone()
     run.trainer.fit(run.module, datamodule=run.datamodule)
-    assert run.module.skipped_total == 2
+    assert run.module.skipped.total == 2
     assert torch.equal(head.out.weight, before)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import lightning
@@ -14,13 +15,24 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 from torch.profiler import record_function
 
+from vg2gt.distributed import from_all_ranks, in_turns
 from vg2gt.evaluation import evaluate_scene
+from vg2gt.faults import (
+    Fault,
+    GradientWatch,
+    SkippedSteps,
+    described,
+    fault_of_batch,
+    fault_of_loss,
+    fault_of_prediction,
+    gather,
+)
 from vg2gt.losses import LossReport
 from vg2gt.model import Reconstructor
 from vg2gt.protocols import training_cameras
-from vg2gt.rendering import Renderer
+from vg2gt.rendering import Renderer, UnrenderableError
 from vg2gt.schedule import cosine_with_warmup, weight_decay_groups
-from vg2gt.types import Batch, Gaussians, Prediction
+from vg2gt.types import Batch, Prediction
 
 log = logging.getLogger(__name__)
 
@@ -39,8 +51,8 @@ class VG2GTModule(lightning.LightningModule):
         warmup_steps: steps of linear warm-up.
         render_views: most views rendered in a training step, held-out views first; None renders all.
         max_skipped: stop after this many steps in a row whose loss or gradient was not finite.
-        seed: seeds every random draw of a step, together with the step's number and the rank, so that a resumed run
-            draws what the uninterrupted one would have drawn.
+        seed: seeds every random draw of a step, together with the step's number, so that a resumed run draws what the
+            uninterrupted one would have drawn; the rank enters only where scenes draw apart (drop-path).
     """
 
     def __init__(
@@ -63,39 +75,59 @@ class VG2GTModule(lightning.LightningModule):
         self.final_lr = final_lr
         self.warmup_steps = warmup_steps
         self.render_views = render_views
-        self.max_skipped = max_skipped
         self.seed = seed
         self.generator = torch.Generator()
-        self.skipped_in_a_row = 0
-        self.skipped_total = 0
-        self._loss_is_finite = True
+        self.skipped = SkippedSteps(max_skipped)
+        self._watch = GradientWatch(())
+        self._fault: Fault | None = None
         self._scenes: tuple[str, ...] = ()
+        self._scores: dict[tuple[str | int, ...], dict[str, float]] = {}
         self.strict_loading = False  # backbone weights are never stored; load_state_dict checks everything else
 
     # ------------------------------------------------------------------------------------------------- training
 
     def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
-        """Seeds this step's randomness from (seed, step, rank)."""
-        step_seed = (self.seed * 1_000_003 + self.global_step) * 1009 + self.global_rank
-        torch.manual_seed(step_seed)
-        self.generator.manual_seed(step_seed)
+        """Seeds this step's randomness: what belongs to the step alike on all ranks, what belongs to scenes apart."""
+        step_seed = (self.seed * 1_000_003 + self.global_step) * 1009
+        self.generator.manual_seed(step_seed)  # curve orders, rendered views
+        torch.manual_seed(step_seed + self.global_rank)  # drop-path
+
+    def on_fit_start(self) -> None:
+        """Begins to watch the gradients."""
+        named = self.model.named_parameters()
+        self._watch = GradientWatch((name, parameter) for name, parameter in named if parameter.requires_grad)
+
+    def on_fit_end(self) -> None:
+        """Stops watching them."""
+        self._watch.remove()
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Reconstructs the context views, renders some views and returns the training loss."""
-        prediction = self.model(batch.context.images, batch.context.hints, self.generator)
+        self._watch.clear()
         self._scenes = batch.scene
-        if not _is_finite(prediction.gaussians):
-            self._loss_is_finite = False
-            return self._lost_step()
+        self._fault = fault_of_batch(batch)
+        report = self._losses(batch) if self._fault is None else None
+        return report.total if report is not None and self._fault is None else self._lost_step()
+
+    def _losses(self, batch: Batch) -> LossReport | None:
+        """The training losses; what is not finite is noted, and None returned where it cannot be rendered."""
+        prediction = self.model(batch.context.images, batch.context.hints, self.generator)
+        self._fault = fault_of_prediction(prediction, batch.scene)
+        if self._fault is not None:
+            return None
         views = self._draw_views(batch)
         cameras = training_cameras(self.model, batch, prediction).select(views.to(self.device))
-        with record_function("vg2gt/render"):
-            rendered = self.renderer(prediction.gaussians, cameras)
+        try:
+            with record_function("vg2gt/render"):
+                rendered = self.renderer(prediction.gaussians, cameras)
+        except UnrenderableError as error:
+            self._fault = Fault(batch.scene, f"nothing to render: {error}")
+            return None
         with record_function("vg2gt/loss"):
             report: LossReport = self.loss(prediction, batch, rendered, views, cameras)
-        self._loss_is_finite = bool(torch.isfinite(report.total.detach()))
+        self._fault = fault_of_loss(report, batch.scene)
         self._log_step(report, batch, prediction)
-        return report.total
+        return report
 
     def _lost_step(self) -> Tensor:
         """A loss that is NaN in every trained parameter: the step is then dropped on all ranks."""
@@ -133,22 +165,26 @@ class VG2GTModule(lightning.LightningModule):
         limit = float(gradient_clip_val) if gradient_clip_val and gradient_clip_val > 0 else float("inf")
         norm = nn.utils.clip_grad_norm_(self.model.trained_parameters(), limit)
         self.log("train/grad_norm", norm.detach())
-        bad = torch.tensor(float(not (self._loss_is_finite and bool(torch.isfinite(norm)))), device=self.device)
-        bad = self.trainer.strategy.reduce(bad, reduce_op="sum")
-        self.skipped_total += int(float(bad) > 0)
-        self.log("train/skipped_steps", float(self.skipped_total))
-        if float(bad) == 0:
-            self.skipped_in_a_row = 0
-            return
-        # Without gradients the optimiser leaves parameters and moments as they are: no decay, no NaN.
-        optimizer.zero_grad(set_to_none=True)
-        self.skipped_in_a_row += 1
-        log.warning("step %d skipped: loss or gradient is not finite (%s)", self.global_step, ", ".join(self._scenes))
-        if self.skipped_in_a_row >= self.max_skipped:
-            raise FloatingPointError(
-                f"{self.skipped_in_a_row} steps in a row had a non-finite loss or gradient, the last with scenes "
-                f"{', '.join(self._scenes)}; lower optimizer.lr or look at these scenes"
-            )
+        sound = self._fault is None and bool(torch.isfinite(norm))
+        # Every rank sees the sum, so all of them drop the step or none does.
+        unsound = self.trainer.strategy.reduce(norm.new_tensor(float(not sound)), reduce_op="sum")
+        if float(unsound) > 0:
+            # Without gradients the optimiser leaves parameters and moments as they are: no decay, no NaN.
+            optimizer.zero_grad(set_to_none=True)
+            self._drop_step()
+        else:
+            self.skipped.good()
+        self.log("train/skipped_steps", float(self.skipped.total))
+
+    def _drop_step(self) -> None:
+        """Counts a dropped step and says what every rank found."""
+        fault = self._fault
+        if fault is None and (name := self._watch.first_bad()):
+            fault = Fault(self._scenes, f"gradient of {name}")
+        faults = gather(fault and replace(fault, step=self.global_step, rank=self.global_rank))
+        if self.trainer.is_global_zero:
+            log.warning("step %d skipped: %s", self.global_step, described(faults))
+        self.skipped.add(faults)
 
     def configure_optimizers(self) -> dict[str, Any]:
         """Optimiser over the trained parameters and a per-step cosine schedule over the whole run."""
@@ -161,13 +197,25 @@ class VG2GTModule(lightning.LightningModule):
 
     # ----------------------------------------------------------------------------------------------- evaluation
 
+    def on_validation_epoch_start(self) -> None:
+        """Forgets the scores of the evaluation before."""
+        self._scores = {}
+
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
-        """Evaluates one held-out scene batch; every number is logged as ``eval/<name>``."""
-        for index in range(len(batch.scene)):
-            metrics = evaluate_scene(self.model, self.renderer, batch.single(index))
+        """Evaluates one held-out scene batch."""
+        for index, scene in enumerate(batch.scene):
+            sample = (scene, *batch.frame_ids[index].tolist())
+            self._scores[sample] = evaluate_scene(self.model, self.renderer, batch.single(index))
+
+    def on_validation_epoch_end(self) -> None:
+        """Logs every number as ``eval/<name>``: means over the scenes that have it, each counted once on all ranks.
+
+        The ranks' scenes are joined in the order of one process, so their number does not change a bit of the means.
+        """
+        for metrics in in_turns(from_all_ranks(self._scores)).values():
             for name, value in metrics.items():
                 if math.isfinite(value):  # a scene without ground-truth depth has no depth error
-                    self.log(f"eval/{name}", value, on_epoch=True, batch_size=1, sync_dist=True)
+                    self.log(f"eval/{name}", value, on_epoch=True, batch_size=1)
 
     # ---------------------------------------------------------------------------------------------- checkpoints
 
@@ -176,7 +224,7 @@ class VG2GTModule(lightning.LightningModule):
         state = checkpoint["state_dict"]
         checkpoint["state_dict"] = {k: v for k, v in state.items() if not k.startswith(BACKBONE_PREFIX)}
         checkpoint["backend"] = dict(self.model.backend.identity())
-        checkpoint["skipped_steps"] = self.skipped_total
+        checkpoint["skipped_steps"] = self.skipped.state_dict()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Refuses a checkpoint that was trained on another backbone."""
@@ -186,7 +234,7 @@ class VG2GTModule(lightning.LightningModule):
                 f"the checkpoint was trained on backbone {stored}, this run uses {present}: choose the same backend= "
                 "and the same weights, or start a new run from it with init_from="
             )
-        self.skipped_total = int(checkpoint.get("skipped_steps", 0))
+        self.skipped.load_state_dict(checkpoint.get("skipped_steps", 0))
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False):
         """Loads the trained part; only backbone weights may be missing."""
@@ -200,8 +248,3 @@ class VG2GTModule(lightning.LightningModule):
                 "weights that fit"
             )
         return super().load_state_dict(state_dict, strict=False, assign=assign)
-
-
-def _is_finite(gaussians: Gaussians) -> bool:
-    tensors = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
-    return all(bool(torch.isfinite(tensor).all()) for tensor in tensors)

@@ -213,7 +213,12 @@ def _untrained_metrics(run: Run, resumed: bool) -> dict[str, float]:
 
 
 def _report(run: Run, untrained: dict[str, float], trained: dict[str, float]) -> dict[str, Any]:
-    report = {"untrained": untrained, "trained": trained, "steps": run.trainer.global_step}
+    report = {
+        "untrained": untrained,
+        "trained": trained,
+        "steps": run.trainer.global_step,
+        "skipped_steps": run.module.skipped.summary(),
+    }
     if run.trainer.is_global_zero and not run.trial:
         write_json(run.folder / "metrics.json", report)
         write_text(run.folder / "metrics.md", comparison_table(untrained, trained))

@@ -179,8 +179,9 @@ def _centers(cameras: Cameras) -> Tensor:
 
 
 def _nearest_rotation(matrix: Tensor) -> Tensor:
-    """The rotation R that maximises ``trace(R^T M)`` for each ``[B, 3, 3]``."""
-    u, _, vh = torch.linalg.svd(matrix)
+    """The rotation R that maximises ``trace(R^T M)`` for each ``[B, 3, 3]``; NaN where M is not finite."""
+    finite = matrix.isfinite().all(-1).all(-1)[:, None, None]
+    u, _, vh = torch.linalg.svd(torch.where(finite, matrix, 0.0))  # which would raise an error
     sign = torch.ones_like(matrix[:, 0])
     sign[:, 2] = torch.linalg.det(u @ vh).sign()
-    return (u * sign[:, None]) @ vh
+    return torch.where(finite, (u * sign[:, None]) @ vh, torch.nan)

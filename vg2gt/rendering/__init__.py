@@ -1,5 +1,6 @@
 """Rendering Gaussians as continuous stochastic solids, or by classic rasterisation."""
 
+from vg2gt.rendering.checks import UnrenderableError
 from vg2gt.rendering.renderer import Renderer, render
 
-__all__ = ["Renderer", "render"]
+__all__ = ["Renderer", "UnrenderableError", "render"]

@@ -13,6 +13,10 @@ from vg2gt.types import Cameras, Gaussians
 MIN_SCALE = 1e-10  # smaller ones overflow the inverse covariance in float32
 
 
+class UnrenderableError(ValueError):
+    """Values that cannot be rendered: NaN, infinite or out of range. Shapes that disagree are plain ValueErrors."""
+
+
 def check_gaussians(gaussians: Gaussians, scenes: int) -> None:
     """Raises ValueError unless shapes agree, values are finite and in range, and scenes are sorted."""
     count = gaussians.means.shape[0]
@@ -63,12 +67,12 @@ def check_cameras(cameras: Cameras) -> None:
 
 
 def check_finite(name: str, tensor: Tensor) -> None:
-    """Raises ValueError if a tensor holds NaN or infinity, naming it and the first bad position."""
+    """Raises UnrenderableError if a tensor holds NaN or infinity, naming it and the first bad position."""
     if torch.isfinite(tensor.detach().sum()):  # the common case in one fast pass
         return
     where = torch.nonzero(~torch.isfinite(tensor))
     if len(where):
-        raise ValueError(
+        raise UnrenderableError(
             f"{name} holds {len(where)} NaN or infinite values, the first at {where[0].tolist()}; "
             "look for a diverging loss or an invalid input upstream"
         )
@@ -88,4 +92,4 @@ def background_color(background: Tensor | Sequence[float] | None, like: Tensor) 
 def _require(name: str, good: Tensor, expectation: str) -> None:
     if not good.all():
         where = torch.nonzero(~good)
-        raise ValueError(f"{name} must be {expectation}; {len(where)} are not, the first at {where[0].tolist()}")
+        raise UnrenderableError(f"{name} must be {expectation}; {len(where)} are not, the first at {where[0].tolist()}")
