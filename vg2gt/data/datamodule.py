@@ -155,10 +155,15 @@ class SceneDataModule(LightningDataModule):
         return self._loader(self._train, sampler)
 
     def val_dataloader(self) -> DataLoader[Batch]:
-        """One batch (B = 1) a sample: context views, then held-out target views. The same on every device."""
+        """One batch (B = 1) a sample: context views, then held-out target views. Devices take the samples in turns.
+
+        A device for which none is left repeats the first one, as every device has to take part in an evaluation.
+        """
         self.setup()
         assert self._val is not None
-        return self._loader(self._val, [(views,) for views in self._val_views])
+        trainer = self.trainer
+        own = self._val_views[trainer.global_rank :: trainer.world_size] if trainer else self._val_views
+        return self._loader(self._val, [(views,) for views in own or self._val_views[:1]])
 
     def test_dataloader(self) -> DataLoader[Batch]:
         """The evaluation batches."""

@@ -133,10 +133,11 @@ class CoarseModule(nn.Module):
         confidence = pool_min(points.confidence, plan)
         inputs = (pool_mean(embedded, points.confidence, plan), 2 * centroid, confidence.log()[:, None])
         voxels = self.ptv3(torch.cat(inputs, -1), plan.grid, plan.batch, points.voxel_size, generator=generator)
-        # Cells relative to the first one: differences, and so the weights, keep their precision in float32.
-        origin = plan.grid[0]
-        queries = (points.cells - origin).float()
-        centers = (plan.grid - origin).float() + 0.5
+        # Cells relative to their scene's first one: differences, and so the weights, keep their precision in float32.
+        first = torch.searchsorted(plan.batch, torch.arange(len(points.voxel_size), device=plan.batch.device))
+        origin = plan.grid[first.clamp(max=len(plan) - 1)]
+        queries = (points.cells - origin[points.batch]).float()
+        centers = (plan.grid - origin[plan.batch]).float() + 0.5
         index, weights = interpolation_weights(queries, points.batch, centers, plan.batch, self.neighbors)
         evidence = torch.zeros_like(confidence).index_add_(0, plan.voxel_of, points.confidence.square())
         residual = _to_surface(queries, centers + centroid, torch.where(weights > 0, evidence[index], 0), index)

@@ -1,0 +1,34 @@
+"""What several processes of a run tell each other, beside gradients."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import zip_longest
+from typing import Any, TypeVar
+
+import torch.distributed
+
+Key = TypeVar("Key")
+Value = TypeVar("Value")
+
+
+def from_all_ranks(value: Value) -> list[Value]:
+    """The value of every rank, in their order. Collective: every rank has to call it."""
+    if not torch.distributed.is_available() or not torch.distributed.is_initialized():
+        return [value]
+    found: list[Any] = [None] * torch.distributed.get_world_size()
+    torch.distributed.all_gather_object(found, value)
+    return found
+
+
+def in_turns(parts: Sequence[Mapping[Key, Value]]) -> dict[Key, Value]:
+    """Joins what ranks hold who took turns: the first of every rank, then the second of every rank.
+
+    A key that several ranks hold keeps its first place and value.
+    """
+    joined: dict[Key, Value] = {}
+    for row in zip_longest(*(part.items() for part in parts)):
+        for item in row:
+            if item is not None:
+                joined.setdefault(*item)
+    return joined
