@@ -12,8 +12,7 @@ import torch
 
 MARKED = (
     "vg2gt.model",
-    "vg2gt.baselines.pixel_aligned",
-    "vg2gt.baselines.voxel_merged",
+    "vg2gt.baselines.pixels",
     "vg2gt.baselines.pointcloud",
 )
 

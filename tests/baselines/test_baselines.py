@@ -14,6 +14,8 @@ from vg2gt.baselines.voxel_merged import merge_by_voxel
 from vg2gt.checkpoints import newest_valid, read_checkpoint
 from vg2gt.evaluation import evaluate_scene
 from vg2gt.geometry.cameras import unproject
+from vg2gt.geometry.rotations import quat_to_matrix
+from vg2gt.geometry.spherical_harmonics import sh_to_rgb
 from vg2gt.model import Reconstructor
 from vg2gt.rendering import Renderer, render
 from vg2gt.training import build, train
@@ -178,6 +180,20 @@ def test_another_first_view_turns_the_scene_and_nothing_else(make, batch: Batch,
     assert float((shown[0][[1, 0, 2, 3]] - shown[1]).abs().mean()) < 5e-3
 
 
+def test_view_dependent_colours_turn_with_the_camera(make, batch: Batch) -> None:
+    """Like features show like colours along like rays of every camera: harmonics too are predicted in camera axes."""
+    model = make("pixel_aligned", "model.gaussians.sh_degree=2", seed=6)
+    pixels = usable_pixels(predict(model, batch).geometry, torch.full_like(batch.context.images, 0.5))
+    features = torch.randn(1, model.gaussians.hidden.in_features).expand(len(pixels.rows), -1)
+    with torch.no_grad():
+        gaussians, _ = model.gaussians(features, pixels)
+    ray = torch.nn.functional.normalize(torch.tensor([0.2, -0.3, 0.9]), dim=0)  # in camera axes
+    seen = sh_to_rgb(gaussians.sh, pixels.rotation @ ray)
+    assert float((seen.amax(0) - seen.amin(0)).max()) < 1e-5
+    elsewhere = sh_to_rgb(gaussians.sh, ray.expand(len(seen), -1))  # one direction of the world is many of the cameras
+    assert float((elsewhere.amax(0) - elsewhere.amin(0)).max()) > 5e-3
+
+
 @pytest.mark.parametrize("name", TRAINED)
 def test_gradient_reaches_every_parameter(make, batch: Batch, name: str) -> None:
     model = make(name, "model.gaussians.sh_degree=1", seed=4)
@@ -224,6 +240,19 @@ def test_merging_is_a_weighted_mean() -> None:
     turned = replace(gaussians, quats=-gaussians.quats)
     torch.testing.assert_close(merge_by_voxel(turned, weights, size).quats, merged.quats)
     assert torch.allclose(merged.quats.norm(dim=-1), torch.ones(len(merged)))
+
+
+def test_rotations_near_a_half_turn_do_not_cancel() -> None:
+    """Two cameras a little before and after a half turn from view 0: w changes its sign between them."""
+    axis = torch.nn.functional.normalize(torch.tensor([0.35, 0.9, 0.25]), dim=0)
+    half = torch.deg2rad(torch.tensor([[175.0], [186.0], [180.5]])) / 2
+    before, after, between = torch.cat((half.cos(), half.sin() * axis), 1)
+    pair = torch.stack((before, -after))
+    gaussians = Gaussians(
+        torch.full((2, 3), 0.1), pair, torch.ones(2, 3), torch.ones(2), torch.zeros(2, 1, 3), torch.zeros(2).long()
+    )
+    merged = merge_by_voxel(gaussians, torch.ones(2), torch.ones(1))
+    torch.testing.assert_close(quat_to_matrix(merged.quats[0]), quat_to_matrix(between), atol=1e-4, rtol=1e-4)
 
 
 def test_larger_voxels_merge_more(make, batch: Batch) -> None:

@@ -3,7 +3,8 @@ import math
 import pytest
 import torch
 
-from vg2gt.geometry.spherical_harmonics import basis, rgb_to_sh, sh_to_rgb
+from vg2gt.geometry.rotations import quat_to_matrix
+from vg2gt.geometry.spherical_harmonics import basis, rgb_to_sh, rotation_of_coefficients, sh_to_rgb
 
 
 def sphere(count: int) -> torch.Tensor:
@@ -60,3 +61,15 @@ def test_colours_come_back_and_are_not_negative() -> None:
 def test_degrees_out_of_range_are_refused() -> None:
     with pytest.raises(ValueError, match="0 to 3, got 4"):
         basis(torch.zeros(3), 4)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_turned_coefficients_are_the_turned_function(degree: int) -> None:
+    generator = torch.Generator().manual_seed(0)
+    turns = quat_to_matrix(torch.randn(5, 4, generator=generator, dtype=torch.float64))
+    coefficients = torch.randn((degree + 1) ** 2, 3, generator=generator, dtype=torch.float64)
+    matrices = rotation_of_coefficients(turns, degree)
+    directions = sphere(50)
+    for turn, matrix in zip(turns, matrices, strict=True):
+        turned = basis(directions @ turn.T, degree) @ (matrix @ coefficients)
+        torch.testing.assert_close(turned, basis(directions, degree) @ coefficients, atol=1e-12, rtol=0)

@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
-from torch.profiler import record_function
 
-from backends.base import Backend
-from vg2gt.baselines.pixels import Pixels, usable_pixels
+from vg2gt.baselines.pixels import PixelReconstructor, Pixels
 from vg2gt.geometry.rotations import matrix_to_quat, multiply_quats
-from vg2gt.geometry.spherical_harmonics import MAX_DEGREE, rgb_to_sh
-from vg2gt.model import Reconstructor, SceneScale
-from vg2gt.types import Gaussians, Hints, Prediction
-from vg2gt.voxels import DenseHead
+from vg2gt.geometry.spherical_harmonics import MAX_DEGREE, rgb_to_sh, rotation_of_coefficients
+from vg2gt.types import Gaussians, Geometry
 
 MAX_SCALE = 4.0  # footprints
 MIN_SCALE = 1e-2  # footprints: renderers need a finite inverse
@@ -52,6 +47,7 @@ class PixelHead(nn.Module):
         super().__init__()
         if not 0 <= sh_degree <= MAX_DEGREE:
             raise ValueError(f"gaussians.sh_degree must be 0 to {MAX_DEGREE}, got {sh_degree}")
+        self.sh_degree = sh_degree
         self.max_offset = max_offset
         self.max_depth_residual = max_depth_residual
         bands = (sh_degree + 1) ** 2
@@ -89,56 +85,39 @@ class PixelHead(nn.Module):
         footprint = pixels.footprint.mean(-1)
         unit = footprint if min_footprint is None else torch.maximum(footprint, min_footprint)
         scales = unit[:, None] * (MAX_SCALE * torch.sigmoid(scale + self.scale_bias)).clamp(min=MIN_SCALE)
-        # In camera axes: a head that sees images cannot know the world's.
+        # In camera axes, as the harmonics: a head that sees images cannot know the world's.
         quats = F.normalize(rotation + rotation.new_tensor([1.0, 0.0, 0.0, 0.0]), dim=-1)
         quats = multiply_quats(matrix_to_quat(pixels.rotation), quats)
         base = F.pad(rgb_to_sh(pixels.colors)[:, None], (0, 0, 0, len(self.sh_gain) - 1))
+        change = self._turn_to_world(self.sh_gain * color.unflatten(-1, (-1, 3)), pixels)
         gaussians = Gaussians(
             means=means,
             quats=quats,
             scales=scales,
             opacities=torch.sigmoid(opacity[:, 0] + self.opacity_bias),
-            sh=base + self.sh_gain * color.unflatten(-1, (-1, 3)),
+            sh=base + change,
             batch=pixels.batch,
         )
         # softplus(ln(e - 1)) = 1: the confidence of the depth, until training knows better.
         return gaussians, pixels.confidence * F.softplus(trust[:, 0] + math.log(math.e - 1)).clamp(min=1e-6)
 
+    def _turn_to_world(self, sh: Tensor, pixels: Pixels) -> Tensor:
+        """Coefficients ``[N, (L + 1)^2, 3]`` in camera axes to those of the same colours in world axes."""
+        if self.sh_degree == 0:
+            return sh
+        counts = torch.bincount(pixels.view)
+        last = counts.cumsum(0) - 1  # a view without pixels takes its neighbour's, and turns nothing
+        turns = rotation_of_coefficients(pixels.rotation[last.clamp(min=0)], self.sh_degree)
+        parts = sh.split(counts.tolist())
+        return torch.cat([turn @ part for turn, part in zip(turns, parts, strict=True)]) if parts else sh
 
-class PixelAligned(Reconstructor):
-    """One Gaussian for every pixel with a depth.
 
-    The geometry is the backbone's own; only the dense head and the Gaussian head are trained.
+class PixelAligned(PixelReconstructor):
+    """One Gaussian for every pixel with a depth; only the dense head and the Gaussian head are trained."""
 
-    Args:
-        backend: the frozen visual foundation model.
-        scale: fixes the scene unit.
-        dense_head: makes the dense head from ``token_dims`` and ``patch_size``.
-        gaussians: makes the pixel head from ``in_channels``.
-    """
-
-    def __init__(
-        self,
-        backend: Backend,
-        scale: SceneScale,
-        dense_head: Callable[..., DenseHead],
-        gaussians: Callable[..., PixelHead],
-    ) -> None:
-        super().__init__(backend, scale)
-        self.dense_head = dense_head(token_dims=backend.token_dims, patch_size=backend.patch_size)
-        self.gaussians = gaussians(in_channels=self.dense_head.out_channels)
-
-    def forward(
-        self, images: Tensor, hints: Hints | None = None, generator: torch.Generator | None = None
-    ) -> Prediction:
-        """Reconstructs B scenes; see :meth:`vg2gt.model.Reconstructor.forward`. Nothing is random here."""
-        tokens, geometry, unit = self.read_views(images, hints)
-        with record_function("vg2gt/fine"):
-            dense = self.dense_head(tokens, images).permute(0, 2, 3, 1).flatten(0, 2)
-        with record_function("vg2gt/gaussians"), torch.autocast(images.device.type, enabled=False):
-            pixels = usable_pixels(geometry, images)
-            gaussians, _ = self.gaussians(F.gelu(dense.float()).index_select(0, pixels.rows), pixels)
-        return Prediction(geometry, geometry, None, gaussians, unit)
+    def make_gaussians(self, features: Tensor, pixels: Pixels, geometry: Geometry) -> Gaussians:
+        """One Gaussian a pixel."""
+        return self.gaussians(features, pixels)[0]
 
 
 def _logit(probability: float) -> float:

@@ -1,14 +1,21 @@
-"""The usable pixels of all views as one packed list, and what lies behind them."""
+"""The usable pixels of all views as one packed list, and models that begin with a Gaussian a pixel."""
 
 from __future__ import annotations
 
+from abc import abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torch.nn import functional as F
+from torch.profiler import record_function
 
+from backends.base import Backend
 from vg2gt.geometry.cameras import invert_rigid, ray_directions
-from vg2gt.types import Geometry, TensorRecord
+from vg2gt.model import Reconstructor, SceneScale
+from vg2gt.types import Gaussians, Geometry, Hints, Prediction, TensorRecord
+from vg2gt.voxels import DenseHead
 
 
 @dataclass(frozen=True)
@@ -17,6 +24,7 @@ class Pixels(TensorRecord):
 
     Attributes:
         rows: ``[N]`` int64 index into all pixels, flattened from ``[B, V, H, W]``.
+        view: ``[N]`` int64 index into the ``B * V`` views, sorted.
         batch: ``[N]`` int64 scene index, sorted.
         rays: ``[N, 3]`` camera-frame directions with unit z.
         depth: ``[N]`` z-depth in scene units.
@@ -28,6 +36,7 @@ class Pixels(TensorRecord):
     """
 
     rows: Tensor
+    view: Tensor
     batch: Tensor
     rays: Tensor
     depth: Tensor
@@ -63,6 +72,7 @@ def usable_pixels(geometry: Geometry, images: Tensor) -> Pixels:
     depth = depth.flatten()[rows]
     return Pixels(
         rows=rows,
+        view=view,
         batch=view // views,
         rays=ray_directions(intrinsics, (height, width)).reshape(-1, 3)[rows],
         depth=depth,
@@ -72,3 +82,42 @@ def usable_pixels(geometry: Geometry, images: Tensor) -> Pixels:
         rotation=camera_to_world[view, :3, :3],
         center=camera_to_world[view, :3, 3],
     )
+
+
+class PixelReconstructor(Reconstructor):
+    """Features of a dense head at every pixel, and Gaussians made of them; the geometry is the backbone's own.
+
+    Args:
+        backend: the frozen visual foundation model.
+        scale: fixes the scene unit.
+        dense_head: makes the dense head from ``token_dims`` and ``patch_size``.
+        gaussians: makes the pixel head from ``in_channels``.
+    """
+
+    def __init__(
+        self,
+        backend: Backend,
+        scale: SceneScale,
+        dense_head: Callable[..., DenseHead],
+        gaussians: Callable[..., nn.Module],
+    ) -> None:
+        super().__init__(backend, scale)
+        self.dense_head = dense_head(token_dims=backend.token_dims, patch_size=backend.patch_size)
+        self.gaussians = gaussians(in_channels=self.dense_head.out_channels)
+
+    def forward(
+        self, images: Tensor, hints: Hints | None = None, generator: torch.Generator | None = None
+    ) -> Prediction:
+        """Reconstructs B scenes; see :meth:`vg2gt.model.Reconstructor.forward`. Nothing is random here."""
+        tokens, geometry, unit = self.read_views(images, hints)
+        with record_function("vg2gt/fine"):
+            dense = self.dense_head(tokens, images).permute(0, 2, 3, 1).flatten(0, 2)
+        with record_function("vg2gt/gaussians"), torch.autocast(images.device.type, enabled=False):
+            pixels = usable_pixels(geometry, images)
+            features = F.gelu(dense.float()).index_select(0, pixels.rows)
+            gaussians = self.make_gaussians(features, pixels, geometry)
+        return Prediction(geometry, geometry, None, gaussians, unit)
+
+    @abstractmethod
+    def make_gaussians(self, features: Tensor, pixels: Pixels, geometry: Geometry) -> Gaussians:
+        """Turns the features ``[N, C]`` of the N usable pixels of B scenes into their Gaussians."""

@@ -5,20 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional as F
-from torch.profiler import record_function
 
 from backends.base import Backend
-from vg2gt.baselines.pixel_aligned import PixelHead
-from vg2gt.baselines.pixels import usable_pixels
-from vg2gt.model import Reconstructor, SceneScale
-from vg2gt.types import Gaussians, Hints, Prediction
+from vg2gt.baselines.pixels import PixelReconstructor, Pixels
+from vg2gt.model import SceneScale
+from vg2gt.types import Gaussians, Geometry
 from vg2gt.voxels import DenseHead
-from vg2gt.voxels.grid import in_range, plan_voxels, point_cells, pool_mean, scene_voxel_size
+from vg2gt.voxels.grid import VoxelPlan, in_range, plan_voxels, point_cells, pool_mean, scene_voxel_size
 
 
-class VoxelMerged(Reconstructor):
+class VoxelMerged(PixelReconstructor):
     """One Gaussian a pixel first; then all Gaussians of a voxel become their confidence-weighted mean.
 
     What is merged are finished parameters, not features: nothing looks at a voxel as a whole, and a voxel holds one
@@ -39,30 +37,19 @@ class VoxelMerged(Reconstructor):
         backend: Backend,
         scale: SceneScale,
         dense_head: Callable[..., DenseHead],
-        gaussians: Callable[..., PixelHead],
+        gaussians: Callable[..., nn.Module],
         voxel_size: float = 0.002,
         min_footprint: float = 1.0,
     ) -> None:
-        super().__init__(backend, scale)
+        super().__init__(backend, scale, dense_head, gaussians)
         self.voxel_size = voxel_size
         self.min_footprint = min_footprint
-        self.dense_head = dense_head(token_dims=backend.token_dims, patch_size=backend.patch_size)
-        self.gaussians = gaussians(in_channels=self.dense_head.out_channels)
 
-    def forward(
-        self, images: Tensor, hints: Hints | None = None, generator: torch.Generator | None = None
-    ) -> Prediction:
-        """Reconstructs B scenes; see :meth:`vg2gt.model.Reconstructor.forward`. Nothing is random here."""
-        tokens, geometry, unit = self.read_views(images, hints)
-        with record_function("vg2gt/fine"):
-            dense = self.dense_head(tokens, images).permute(0, 2, 3, 1).flatten(0, 2)
-        with record_function("vg2gt/gaussians"), torch.autocast(images.device.type, enabled=False):
-            size = scene_voxel_size(geometry, self.voxel_size, self.min_footprint)
-            pixels = usable_pixels(geometry, images)
-            features = F.gelu(dense.float()).index_select(0, pixels.rows)
-            single, confidence = self.gaussians(features, pixels, min_footprint=size[pixels.batch])
-            gaussians = merge_by_voxel(single, confidence, size)
-        return Prediction(geometry, geometry, None, gaussians, unit)
+    def make_gaussians(self, features: Tensor, pixels: Pixels, geometry: Geometry) -> Gaussians:
+        """One Gaussian an occupied voxel."""
+        size = scene_voxel_size(geometry, self.voxel_size, self.min_footprint)
+        single, confidence = self.gaussians(features, pixels, min_footprint=size[pixels.batch])
+        return merge_by_voxel(single, confidence, size)
 
 
 def merge_by_voxel(gaussians: Gaussians, confidence: Tensor, voxel_size: Tensor) -> Gaussians:
@@ -80,7 +67,7 @@ def merge_by_voxel(gaussians: Gaussians, confidence: Tensor, voxel_size: Tensor)
     cells = point_cells(gaussians.means, gaussians.batch, voxel_size)
     plan = plan_voxels(cells, gaussians.batch, in_range(cells.detach()))
     offset = (cells - cells.detach().floor() - 0.5).float()
-    quats = torch.where(gaussians.quats[:, :1] < 0, -gaussians.quats, gaussians.quats)  # q and -q turn alike
+    quats = _same_signs(gaussians.quats, confidence, plan)
     parts = (offset, quats, gaussians.scales, gaussians.opacities[:, None], gaussians.sh.flatten(1))
     merged = pool_mean(torch.cat(parts, -1), confidence, plan)
     offset, quats, scales, opacities, sh = merged.split([part.shape[1] for part in parts], -1)
@@ -94,3 +81,13 @@ def merge_by_voxel(gaussians: Gaussians, confidence: Tensor, voxel_size: Tensor)
         sh=sh.unflatten(-1, gaussians.sh.shape[1:]),
         batch=plan.batch,
     )
+
+
+def _same_signs(quats: Tensor, confidence: Tensor, plan: VoxelPlan) -> Tensor:
+    """Quaternions ``[N, 4]`` or their negatives, which turn alike, so that those of a voxel do not cancel.
+
+    The component that is largest in a voxel decides: near a half turn, where w passes through 0, w would not do.
+    """
+    decisive = pool_mean(quats.detach().square(), confidence.detach(), plan).argmax(-1)
+    own = quats.detach().gather(1, decisive[plan.voxel_of.clamp(min=0), None]) if len(plan) else quats[:, :1]
+    return torch.where(own < 0, -quats, quats)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 MAX_DEGREE = 3
 DC = 0.28209479177387814  # 1 / (2 sqrt(pi))
@@ -45,6 +46,28 @@ def basis(directions: Tensor, degree: int) -> Tensor:
             -0.5900435899266435 * x * (xx - 3 * yy),
         ]
     return torch.stack(values, -1)
+
+
+def rotation_of_coefficients(rotation: Tensor, degree: int) -> Tensor:
+    """Matrices that turn a function on the sphere by turning its coefficients.
+
+    Args:
+        rotation: ``[..., 3, 3]``, such as camera to world.
+        degree: highest degree L, 0 to 3.
+
+    Returns:
+        ``[..., (L + 1)^2, (L + 1)^2]``: the coefficients ``M c`` give along ``rotation @ d`` what ``c`` gives along
+        ``d``.
+
+    Raises:
+        ValueError: if the degree is out of range.
+    """
+    # Each degree is closed under rotations, so values along enough directions determine the turned coefficients.
+    axis = torch.arange(-1, 2, dtype=torch.float64, device=rotation.device)
+    directions = torch.cartesian_prod(axis, axis, axis)
+    directions = F.normalize(directions[directions.any(-1)], dim=-1)
+    before = basis(directions @ rotation.double(), degree)
+    return (torch.linalg.pinv(basis(directions, degree)) @ before).to(rotation.dtype)
 
 
 def rgb_to_sh(rgb: Tensor) -> Tensor:
