@@ -15,12 +15,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors.torch import load_file
 from torch import Tensor
 
 from backends.da3.backend import DA3Decoder
 from backends.vggt.network import VGGTDecoder
 from backends.weights import load_strictly
+from vg2gt.io.tensors import read_tensors
 
 DESCRIPTION = "backend.json"
 ENCODER, DECODER, DECODER_WEIGHTS = "encoder.onnx", "decoder.onnx", "decoder.safetensors"
@@ -100,6 +100,10 @@ def read_bundle(folder: Path) -> Description:
             if name == DECODER_WEIGHTS:
                 continue
             raise FileNotFoundError(f"{folder} has no {name}: copy the whole folder, or {REMEDY}")
+        if (folder / name).resolve().parent != folder.resolve():
+            raise ValueError(
+                f"{folder / name} is a link to a file outside the folder: copy the file itself, or {REMEDY}"
+            )
         found = sha256(folder / name)
         if found != expected:
             raise ValueError(
@@ -161,7 +165,7 @@ def load_decoder(folder: Path, decoder: Mapping[str, Any]) -> Decoder | None:
         raise ValueError(
             f"{folder / DESCRIPTION} has wrong arguments for {kind.__name__} ({error}): {REMEDY}"
         ) from error
-    load_strictly(module, load_file(file), "", (), str(file))
+    load_strictly(module, read_tensors(file), "", (), str(file))
     return module
 
 
@@ -201,7 +205,7 @@ def external_data(file: Path) -> list[str]:
     with file.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as content:
         try:
             return sorted(set(_locations(content, 0, len(content), "model")))
-        except (IndexError, UnicodeDecodeError) as error:
+        except (IndexError, UnicodeDecodeError, RecursionError) as error:
             raise ValueError(f"{file} is not an ONNX file: {REMEDY}") from error
 
 

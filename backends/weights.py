@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import TypeVar
 
 import torch
-from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from backends.base import seeded_initialisation
+from vg2gt.io.tensors import read_tensors
 
 WEIGHT_FILES = ("model.safetensors", "model.pt")
 SHOWN = 5
@@ -58,7 +58,7 @@ class Weights:
         file = find_weights(self.name, self.repo, self.revision, self.path)
         with torch.device("meta"):
             network = make()
-        load_strictly(network, read_weights(file), self.prefix, self.ignorable, str(file))
+        load_strictly(network, read_tensors(file), self.prefix, self.ignorable, str(file))
         print(f"{self.name}: weights from {self.path or self.repo}, licence: {self.licence}")
         return network
 
@@ -103,20 +103,6 @@ def _reason(error: BaseException) -> str:
         root = root.__cause__
     told = [error] if root is error else [error, root]
     return "; ".join(" ".join(str(one).split()).rstrip(".") for one in told)
-
-
-def read_weights(file: Path) -> dict[str, Tensor]:
-    """Reads ``.safetensors``, or a PyTorch file that holds nothing but tensors.
-
-    Raises:
-        ValueError: if the file holds something else.
-    """
-    if file.suffix == ".safetensors":
-        return load_file(file)
-    state = torch.load(file, map_location="cpu", weights_only=True)
-    if not isinstance(state, Mapping) or not all(isinstance(value, Tensor) for value in state.values()):
-        raise ValueError(f"{file} is not a mapping of names to tensors: export the bare state dict")
-    return dict(state)
 
 
 def load_strictly(

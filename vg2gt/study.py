@@ -14,10 +14,10 @@ from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig, OmegaConf
 from scipy.stats import t as student
 
-from vg2gt.checkpoints import PATTERN
 from vg2gt.io.files import read_json, write_json, write_text
 from vg2gt.paths import config_dir
 from vg2gt.training import build, evaluate, flatten, train
+from vg2gt.trust import read_run_config
 
 log = logging.getLogger(__name__)
 
@@ -59,8 +59,7 @@ def run_once(overrides: Sequence[str], folder: Path) -> Metrics:
     result = folder / "metrics.json"
     if result.is_file():
         return read_json(result)["trained"]
-    if any((folder / "checkpoints").glob(PATTERN)):
-        config.ckpt = "last"
+    config.ckpt = "auto"
     report = train(config) if config.trainer.max_steps else _only_evaluate(config, folder)
     if not report:
         log.warning("interrupted in %s; the same command goes on from there", folder)
@@ -83,7 +82,7 @@ def _refuse_other_run(config: DictConfig, folder: Path) -> None:
         return
     before, now = (
         flatten(OmegaConf.to_container(c, resolve=True))
-        for c in (OmegaConf.load(path), config)  # what was written is resolved
+        for c in (read_run_config(path), config)
     )
     keys = {
         key

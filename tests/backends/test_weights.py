@@ -7,7 +7,8 @@ import torch
 from safetensors.torch import save_file
 from torch import nn
 
-from backends.weights import find_weights, load_strictly, read_weights
+from backends.weights import find_weights, load_strictly
+from vg2gt.io.tensors import read_tensors
 
 
 def published(backend, prefix: str = "model.") -> dict[str, torch.Tensor]:
@@ -102,4 +103,4 @@ def test_files_that_hold_more_than_tensors_are_refused(tmp_path: Path) -> None:
     file = tmp_path / "model.pt"
     torch.save({"state_dict": {"a": torch.zeros(1)}}, file)
     with pytest.raises(ValueError, match="mapping of names to tensors"):
-        read_weights(file)
+        read_tensors(file)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from vg2gt.data.base import DataError
+from vg2gt.io.images import open_image
 
 # What Pillow raises for files that are damaged in one way or another.
 _DAMAGED = (OSError, SyntaxError, ValueError, EOFError, zlib.error, struct.error, Image.DecompressionBombError)
@@ -39,7 +40,7 @@ def image_size(path: Path, scene: str) -> tuple[int, int]:
         DataError: if the file is missing or not an image.
     """
     try:
-        with Image.open(path) as image:
+        with open_image(path) as image:
             return image.height, image.width
     except _DAMAGED as error:
         raise _unreadable(path, scene, error) from error
@@ -66,7 +67,7 @@ def read_color(
         DataError: if the file is missing, damaged or of another size.
     """
     try:
-        with Image.open(path if content is None else io.BytesIO(content)) as image:
+        with open_image(path if content is None else io.BytesIO(content)) as image:
             pixels = np.array(image.convert("RGB"))
     except _DAMAGED as error:
         raise _unreadable(path, scene, error) from error
@@ -81,7 +82,7 @@ def photo_size(path: Path, scene: str) -> tuple[int, int]:
         DataError: if the file is missing or not an image.
     """
     try:
-        with Image.open(path) as image:
+        with open_image(path) as image:
             turned = _orientation(image) in _QUARTER_TURNS
             return (image.width, image.height) if turned else (image.height, image.width)
     except _DAMAGED as error:
@@ -95,7 +96,7 @@ def read_photo(path: Path, scene: str, size: tuple[int, int] | None = None) -> N
         DataError: if the file is missing, damaged, or turned upright of another size than ``size``.
     """
     try:
-        with Image.open(path) as image:
+        with open_image(path) as image:
             turn = _TURNS.get(_orientation(image))
             pixels = np.array((image if turn is None else image.transpose(turn)).convert("RGB"))
     except _DAMAGED as error:
@@ -111,7 +112,7 @@ def read_depth(path: Path, scene: str, size: tuple[int, int] | None = None) -> N
         DataError: if the file is missing, damaged, not a one-channel integer image, or of another size than ``size``.
     """
     try:
-        with Image.open(path) as image:
+        with open_image(path) as image:
             pixels = np.array(image)
     except _DAMAGED as error:
         raise _unreadable(path, scene, error) from error

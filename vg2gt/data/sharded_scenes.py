@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import struct
-import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -15,16 +14,27 @@ import numpy as np
 import torch
 from fsspec.core import url_to_fs
 from numpy.typing import NDArray
-from PIL import Image
+from PIL.Image import DecompressionBombError
 
 from vg2gt.data.base import DataError, Frames, SceneSource
 from vg2gt.data.sources.files import read_split
 from vg2gt.data.transforms import from_bytes
+from vg2gt.io.errors import FormatError
+from vg2gt.io.images import open_image
+from vg2gt.io.npz import read_npz
 
 INDEX = "index.npz"
 VERSION = 1
 ARRAYS = ("frame_ids", "held_out", "shard", "image", "depth", "world_to_camera", "intrinsics")
-_DAMAGED = (OSError, SyntaxError, ValueError, EOFError, KeyError, zlib.error, struct.error, zipfile.BadZipFile)
+# Where shards are read from: fsspec also knows addresses that lead on to others and run templates of their own.
+SCHEMES = ("file", "local", "memory", "http", "https", "s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "adl", "hf")
+# What Pillow raises for images that are damaged in one way or another; a FormatError is a ValueError.
+_DAMAGED = (OSError, SyntaxError, ValueError, EOFError, KeyError, zlib.error, struct.error, DecompressionBombError)
+_HEADERS = 4096  # bytes of an array's file beside its values, at most
+_LARGEST = 1 << 30  # bytes of an encoded frame
+_SHAPES = {"image": (2,), "depth": (2,), "world_to_camera": (4, 4), "intrinsics": (3, 3)}
+_SCENE = {"rows": list, "place": str, "part": str, "is_metric": bool, "sparse_depth": bool, "identity": str}
+_META = {"has_depth": bool, "has_cameras": bool, "parts": dict, "scenes": dict}
 
 
 class ShardedScenes(SceneSource):
@@ -35,8 +45,8 @@ class ShardedScenes(SceneSource):
     bytes a frame) is read at the start.
 
     Args:
-        root: the folder of the shards, or its URL (``s3://``, ``gs://``, ``https://``, ...: what fsspec can open
-            with the packages that are installed).
+        root: the folder of the shards, or its URL (``s3://``, ``gs://``, ``https://``, ...: those of ``SCHEMES`` that
+            fsspec can open with the packages that are installed).
         subset: folder below ``root`` (``train`` or ``val``); None: ``root`` itself.
         scenes: names of the scenes to use, or a text file with one a line; None: all.
         weights: other weights of the parts than those of the mixture that was written; None: the same.
@@ -44,7 +54,7 @@ class ShardedScenes(SceneSource):
 
     Raises:
         FileNotFoundError: if there is no index.
-        DataError: if the index is damaged, or a named scene or part does not exist.
+        DataError: if the index is damaged, a named scene or part does not exist, or the URL is of another kind.
     """
 
     def __init__(
@@ -59,6 +69,7 @@ class ShardedScenes(SceneSource):
             raise FileNotFoundError("data.root is not set: name the folder, or the URL, of shards")
         self.root = "/".join((str(root).rstrip("/"), *([subset] if subset else [])))
         self.storage_options = dict(storage_options or {})
+        _check_address(self.root, self.storage_options)
         self._arrays, self._meta = self._read_index()
         self.is_metric = all(scene["is_metric"] for scene in self._meta["scenes"].values())
         self.has_depth = self._meta["has_depth"]
@@ -138,13 +149,15 @@ class ShardedScenes(SceneSource):
                 f"there are no shards in {self.root}: {INDEX} is missing; write them with python -m vg2gt.data.shards"
             ) from error
         try:
-            with np.load(io.BytesIO(content), allow_pickle=False) as stored:
-                meta = json.loads(str(stored["meta"]))
-                arrays = {name: stored[name] for name in ARRAYS}
-        except _DAMAGED as error:
+            arrays = read_npz(io.BytesIO(content), ("meta", *ARRAYS))
+            meta = json.loads(str(arrays.pop("meta")))
+        except (FormatError, KeyError, ValueError, RecursionError) as error:
             raise DataError(f"{path} is damaged: {error}; write the shards again") from error
-        if meta.get("version") != VERSION:
-            raise DataError(f"{path} is of version {meta.get('version')}, this program reads {VERSION}: write it again")
+        version = meta.get("version") if isinstance(meta, dict) else None
+        if version != VERSION:
+            raise DataError(f"{path} is of version {version}, this program reads {VERSION}: write it again")
+        if not (_arrays_fit(arrays) and _fits(meta, _META) and _scenes_fit(meta["scenes"], len(arrays["frame_ids"]))):
+            raise DataError(f"{path} is damaged: its arrays and scenes do not fit together; write the shards again")
         return arrays, meta
 
     def _select(self, scenes: Sequence[str] | str | None) -> tuple[str, ...]:
@@ -172,6 +185,45 @@ class ShardedScenes(SceneSource):
         return self._scene(scene)["rows"][0] + int(places[0])
 
 
+def _arrays_fit(arrays: Mapping[str, NDArray]) -> bool:
+    """Whether there is a row a frame of everything, and ranges are such as frames have."""
+    rows = len(arrays["frame_ids"]) if arrays["frame_ids"].ndim else -1
+    kinds = {"held_out": "b", "world_to_camera": "f", "intrinsics": "f"}
+    if not all(
+        array.shape == (rows, *_SHAPES.get(name, ())) and array.dtype.kind in kinds.get(name, "iu")
+        for name, array in arrays.items()
+    ):
+        return False
+    places = np.stack((arrays["image"], arrays["depth"])).astype(np.int64)
+    span = np.abs(places[1, :, 0] - places[0, :, 0])
+    lengths = places[..., 1]
+    return bool(
+        (arrays["shard"] >= 0).all()
+        and (places >= 0).all()
+        and max(lengths.max(initial=0), span.max(initial=0)) < _LARGEST
+    )
+
+
+def _scenes_fit(scenes: Mapping[str, Any], rows: int) -> bool:
+    return all(
+        _fits(scene, _SCENE)
+        and len(scene["rows"]) == 2
+        and all(isinstance(row, int) for row in scene["rows"])
+        and 0 <= scene["rows"][0] < scene["rows"][1] <= rows
+        for scene in scenes.values()
+    )
+
+
+def _fits(content: Any, kinds: Mapping[str, type]) -> bool:
+    return isinstance(content, dict) and all(isinstance(content.get(name), kind) for name, kind in kinds.items())
+
+
+def _check_address(root: str, storage_options: Mapping[str, Any]) -> None:
+    scheme = root.partition("://")[0] if "://" in root else "file"
+    if scheme not in SCHEMES or "::" in root or "protocol" in storage_options:
+        raise DataError(f"shards are not read from {root!r}: give a folder, or a URL of {', '.join(SCHEMES)}")
+
+
 def _weights(written: Mapping[str, float], chosen: Mapping[str, float] | None) -> dict[str, float]:
     if chosen is None:
         return dict(written)
@@ -185,9 +237,9 @@ def _decode(content: bytes, image: NDArray, depth: NDArray, where: str) -> tuple
     start = int(image[0])
     encoded = (content[place - start : place - start + length] for place, length in (image.tolist(), depth.tolist()))
     try:
-        pixels = np.array(Image.open(io.BytesIO(next(encoded))).convert("RGB"))
-        with np.load(io.BytesIO(next(encoded)), allow_pickle=False) as stored:
-            z = stored["depth"]
+        pixels = np.array(open_image(io.BytesIO(next(encoded))).convert("RGB"))
+        limit = 4 * pixels.shape[0] * pixels.shape[1] + _HEADERS
+        z = read_npz(io.BytesIO(next(encoded)), ("depth",), limit)["depth"]
     except _DAMAGED as error:
         raise DataError(f"cannot read {where}: {error}; copy the shard again, or write it again") from error
     if z.dtype != np.float32 or z.shape != pixels.shape[:2]:

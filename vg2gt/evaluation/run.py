@@ -38,6 +38,7 @@ from vg2gt.io.images import write_png
 from vg2gt.metrics import LPIPS, WeightsNotFoundError, load_lpips
 from vg2gt.model import Reconstructor
 from vg2gt.training import flatten
+from vg2gt.trust import UntrustedError, check_targets, read_run_config
 from vg2gt.types import Batch
 
 log = logging.getLogger(__name__)
@@ -140,8 +141,12 @@ def _refuse_training_views(checkpoint: Path | None, source: SceneSource, views: 
     if path is None or not path.is_file():
         return
     try:
-        trained: SceneDataModule = instantiate(OmegaConf.load(path).data)
+        run = read_run_config(path)
+        check_targets(run.data, f"{path}: data")
+        trained: SceneDataModule = instantiate(run.data)
         train = trained.train_source()
+    except UntrustedError:
+        raise
     except (OSError, ValueError, ImportError, InstantiationException) as error:
         log.warning("whether the evaluated scenes were trained on cannot be checked: %s", error)
         return

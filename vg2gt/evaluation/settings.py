@@ -19,6 +19,7 @@ from vg2gt.checkpoints import newest_valid, read_checkpoint
 from vg2gt.lightning_module import VG2GTModule
 from vg2gt.model import Reconstructor
 from vg2gt.paths import config_dir
+from vg2gt.trust import check_targets, read_run_config
 
 PARTS = ("backend", "model", "renderer")
 
@@ -60,24 +61,26 @@ def resolve_parts(config: DictConfig, checkpoint: Path | None) -> dict[str, Dict
 
     Raises:
         FileNotFoundError: if the run's ``config.yaml`` is needed and missing.
+        UntrustedError: if what is needed of it is not data only, or names what is not ours (:mod:`vg2gt.trust`).
     """
     given: dict[str, Any] = {part: config.get(part) for part in PARTS}
     if all(value is not None and "_target_" in value for value in given.values()):
         return given
-    if checkpoint is None:
+    path = None if checkpoint is None else checkpoint.resolve().parent.parent / "config.yaml"
+    if path is None:
         run = _training_defaults()
     else:
-        path = checkpoint.resolve().parent.parent / "config.yaml"
         if not path.is_file():
             raise FileNotFoundError(
                 f"{path} is missing: the run's configuration says which model and backend its checkpoint belongs to; "
                 "put it back, or name both with model= and backend= and renderer="
             )
-        run = OmegaConf.load(path)
-        assert isinstance(run, DictConfig)
+        run = read_run_config(path)
     parts = {}
     for part, value in given.items():
         whole = value is not None and "_target_" in value
+        if path is not None and not whole:
+            check_targets(run[part], f"{path}: {part}")
         parts[part] = value if whole else OmegaConf.merge(run[part], value or {})
     return parts
 

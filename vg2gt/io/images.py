@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Sequence
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 import torch
@@ -24,6 +25,20 @@ _DEPTH_ANCHORS = torch.tensor(
         [0.02, 0.02, 0.10],
     ]
 )
+
+
+# Pillow tries every format it knows, whatever a file is called; some of them run other programs (EPS: Ghostscript).
+_FORMATS = ("PNG", "JPEG", "MPO", "PPM", "TIFF", "WEBP", "BMP", "GIF", "HEIF")
+
+
+def open_image(file: str | Path | IO[bytes]) -> Image.Image:
+    """Opens an image file lazily as Pillow does, if it is in one of the formats of photographs and depth images.
+
+    Raises:
+        OSError: if the file is missing or in no such format.
+    """
+    Image.init()
+    return Image.open(file, formats=[name for name in _FORMATS if name in Image.OPEN])
 
 
 def colorize_depth(depth: Tensor, near: float, far: float) -> Tensor:

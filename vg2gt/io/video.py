@@ -31,6 +31,7 @@ from PIL import Image
 
 from vg2gt.io.errors import FormatError
 from vg2gt.io.files import write_bytes
+from vg2gt.io.images import open_image
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".gif")
 _QUALITY = "18"  # constant rate factor of H.264: 0 is lossless, 23 the program's default
@@ -174,8 +175,8 @@ def _last_line(text: bytes) -> str:
 
 def _open_gif(path: Path) -> Image.Image:
     try:
-        return Image.open(path)
-    except OSError as error:
+        return open_image(path)
+    except (OSError, Image.DecompressionBombError) as error:
         raise FormatError(f"{path}: not a GIF ({error})") from error
 
 

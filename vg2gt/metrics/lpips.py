@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import importlib.util
-import pickle
 from collections.abc import Mapping
 from pathlib import Path
 
 import torch
-from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn import functional as F
+
+from vg2gt.io.tensors import read_tensors
 
 WEIGHTS_URL = "https://download.pytorch.org/models/vgg16-397923af.pth"
 WEIGHTS_FILE = WEIGHTS_URL.rpartition("/")[2]
@@ -115,7 +115,9 @@ def load_lpips(source: str = "auto") -> LPIPS:
     """
     if source == "download":
         try:
-            features = torch.hub.load_state_dict_from_url(WEIGHTS_URL, map_location="cpu", weights_only=True)
+            features = torch.hub.load_state_dict_from_url(
+                WEIGHTS_URL, map_location="cpu", check_hash=True, weights_only=True
+            )
         except OSError as error:  # urllib's errors are
             raise WeightsNotFoundError(f"weights not found: {WEIGHTS_URL} cannot be fetched ({error})") from error
         return LPIPS({**_installed_channel_weights(), **features})
@@ -139,13 +141,7 @@ def _installed_channel_weights() -> dict[str, Tensor]:
 
 
 def _read(file: Path) -> dict[str, Tensor]:
-    try:
-        if file.suffix == ".safetensors":
-            return load_file(file)
-        state = torch.load(file, map_location="cpu", weights_only=True)
-    except (RuntimeError, EOFError, pickle.UnpicklingError, KeyError, ValueError) as error:
-        raise ValueError(f"{file} is damaged or holds more than tensors: {error}") from error
-    return {name: tensor for name, tensor in state.items() if isinstance(tensor, Tensor)}
+    return read_tensors(file)
 
 
 def _tensor(state: Mapping[str, Tensor], name: str, shape: tuple[int, ...]) -> Tensor:

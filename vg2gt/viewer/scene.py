@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from PIL import Image, ImageOps
+from PIL import ImageOps
 
 from vg2gt.io.cameras_json import NamedCamera
 from vg2gt.io.glb import scene_extent
+from vg2gt.io.images import open_image
 from vg2gt.types import Gaussians
 
 FRUSTUM_SHARE = 0.02  # of the scene's extent, the depth of a drawn frustum
@@ -110,7 +111,7 @@ def load_pictures(cameras: Sequence[NamedCamera], folder: str | Path) -> list[ND
 
 def _small_picture(path: Path) -> NDArray[np.uint8]:
     try:
-        with Image.open(path) as image:
+        with open_image(path) as image:
             image.thumbnail((PICTURE_SIDE, PICTURE_SIDE))
             return np.array((ImageOps.exif_transpose(image) or image).convert("RGB"))
     except Exception as error:  # image libraries raise whatever the bytes lead them to

@@ -13,7 +13,7 @@ from vg2gt.data.base import DataError
 from vg2gt.data.image_files import image_size, typical_size
 from vg2gt.data.sources.files import FileSource
 from vg2gt.data.sources.index import SceneIndex, Size, folder_state, make_index
-from vg2gt.data.sources.parsing import errors_name, inverse
+from vg2gt.data.sources.parsing import errors_name, inverse, named_file
 from vg2gt.data.sources.scene_folders import scene_folders
 from vg2gt.geometry.cameras import resize_intrinsics
 from vg2gt.io import ColmapImage, ColmapModel, colmap_intrinsics, colmap_pose, read_colmap
@@ -87,7 +87,8 @@ class COLMAP(FileSource):
         model, model_folder = self._read_model(scene, folder)
         refuse_distorted(model, f"{model_folder} (scene {scene})")
         records = _in_order(model)
-        named = {i: folder / self.images / record.name for i, record in enumerate(records)}
+        where = f"{model_folder} of scene {scene}"
+        named = {i: named_file(folder / self.images, record.name, where) for i, record in enumerate(records)}
         with errors_name(scene):
             color = {i: path for i, path in named.items() if path.is_file()}
         if not color:

@@ -12,7 +12,7 @@ from vg2gt.data.base import DataError
 from vg2gt.data.image_files import image_size, read_color, read_depth, typical_size
 from vg2gt.data.sources.files import FileSource
 from vg2gt.data.sources.index import SceneIndex, Size, make_index
-from vg2gt.data.sources.parsing import check_intrinsics, errors_name, inverse
+from vg2gt.data.sources.parsing import check_intrinsics, errors_name, inverse, named_file
 from vg2gt.data.sources.scene_folders import scene_folders
 from vg2gt.data.sources.undistortion import Undistortion
 from vg2gt.io import Lens, TransformsFrame, read_transforms
@@ -75,10 +75,12 @@ class Nerfstudio(FileSource):
     def index(self, scene: str, folder: Path) -> SceneIndex:
         """Reads the file and the sizes of its images."""
         records = self._records(scene, folder)
+        where = f"{folder / _FILE} of scene {scene}"
         with errors_name(scene):
-            color = {i: _image_path(folder / record.file_path) for i, record in enumerate(records)}
+            color = {i: _image_path(named_file(folder, record.file_path, where)) for i, record in enumerate(records)}
             color = {i: path for i, path in color.items() if path.is_file()}
-            depth = {i: folder / record.depth_file_path for i, record in enumerate(records) if record.depth_file_path}
+            named = {i: record.depth_file_path for i, record in enumerate(records) if record.depth_file_path}
+            depth = {i: named_file(folder, name, where) for i, name in named.items()}
         if not color:
             raise DataError(f"scene {scene}: none of the {len(records)} images of {folder / _FILE} exists")
         sizes = {i: image_size(path, scene) for i, path in color.items()}

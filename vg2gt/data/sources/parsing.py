@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from vg2gt.data.base import DataError
 from vg2gt.io.errors import FormatError
+from vg2gt.io.npz import read_npz
 
 log = logging.getLogger(__name__)
 
@@ -93,12 +95,34 @@ def load_npz(path: Path, scene: str, names: Sequence[str]) -> dict[str, NDArray]
         DataError: if the file is missing or damaged, or lacks one of the arrays.
     """
     try:
-        with np.load(path, allow_pickle=False) as stored:
-            return {name: stored[name] for name in names}
+        return read_npz(path, names)
     except KeyError as error:
         raise DataError(f"{path} of scene {scene} has no array {error}; expected {', '.join(names)}") from error
-    except Exception as error:  # a damaged archive raises whatever zipfile, zlib and numpy's header parser raise
+    except (OSError, FormatError) as error:
         raise DataError(f"cannot read {path} of scene {scene}: {error}") from error
+
+
+def named_file(folder: Path, name: str, where: str) -> Path:
+    """The file that a dataset's own file names, which must lie in the dataset's folder.
+
+    The name alone is looked at: folders that are links to other disks are the user's own doing.
+
+    Args:
+        folder: the scene's folder.
+        name: relative to it, or absolute.
+        where: the file that names it and the scene, for the message.
+
+    Raises:
+        DataError: if the name leads out of the folder.
+    """
+    root = os.path.abspath(folder)
+    path = os.path.normpath(os.path.join(root, name))
+    if "\0" in name or os.path.commonpath((root, path)) != root:
+        raise DataError(
+            f"{where} names the file {name[:200]!r}, which lies outside {folder}; move it, or a link to its folder, "
+            "inside and name it relative to the folder"
+        )
+    return folder / os.path.relpath(path, root)
 
 
 @contextmanager

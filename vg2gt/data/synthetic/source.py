@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import logging
-import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -18,7 +17,9 @@ from vg2gt.data.synthetic.outdoor import SyntheticOutdoor
 from vg2gt.data.synthetic.rooms import SyntheticRoom
 from vg2gt.data.synthetic.scene import SyntheticScene
 from vg2gt.data.transforms import from_bytes
+from vg2gt.io.errors import FormatError
 from vg2gt.io.files import write_cached
+from vg2gt.io.npz import read_npz
 
 log = logging.getLogger(__name__)
 
@@ -141,9 +142,8 @@ class SyntheticScenes(SceneSource):
         if path is None or not path.is_file():
             return None
         try:
-            with np.load(path, allow_pickle=False) as stored:
-                arrays = {name: stored[name] for name in ("images", "depth", "world_to_camera", "intrinsics")}
-        except (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile) as error:
+            arrays = read_npz(path, ("images", "depth", "world_to_camera", "intrinsics"))
+        except (FormatError, KeyError, OSError) as error:
             log.warning("the cached scene %s is damaged (%s) and is made again", path, error)
             return None
         shape = (self.num_frames, *self.size)
