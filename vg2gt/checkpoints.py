@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import logging
 import os
-import pickle
+import zipfile
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
+from zipfile import ZIP_STORED
 
 import torch
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 from torch import Tensor, nn
+
+from vg2gt.io.files import flush_folder, flush_to_disk
 
 log = logging.getLogger(__name__)
 
@@ -22,20 +26,26 @@ class AtomicCheckpointIO(TorchCheckpointIO):
     """Writes a checkpoint whole or not at all, and loads tensors and plain values only (no pickled code)."""
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any | None = None) -> None:
-        """Saves to ``<path>.tmp``, flushes to the disk and renames; the file under ``path`` is never half-written."""
+        """Saves to ``<path>.tmp``, flushes to the disk and renames; the file under ``path`` is never half-written.
+
+        Raises:
+            OSError: if it cannot be written (a full disk); what is under ``path`` stays.
+        """
         target = Path(path)
         target.parent.mkdir(parents=True, exist_ok=True)
         temporary = target.with_name(target.name + ".tmp")
         try:
             with open(temporary, "wb") as file:
                 torch.save(checkpoint, file)
-                file.flush()
-                os.fsync(file.fileno())
+                flush_to_disk(file)
             os.replace(temporary, target)
-        except (OSError, RuntimeError) as error:  # a full disk is a RuntimeError of torch's writer
-            temporary.unlink(missing_ok=True)
+            flush_folder(target.parent)
+        except (OSError, RuntimeError) as error:  # torch's writer may make a RuntimeError of a full disk
+            with suppress(OSError):
+                temporary.unlink(missing_ok=True)
             raise OSError(
-                f"checkpoint {target} could not be written ({error}); earlier checkpoints are intact"
+                f"checkpoint {target} could not be written ({error}); earlier checkpoints are intact: make room and go "
+                "on with ckpt=last"
             ) from error
 
     def load_checkpoint(self, path: Any, map_location: Any = "cpu", weights_only: bool | None = True) -> dict[str, Any]:
@@ -44,7 +54,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
-    """Reads a checkpoint.
+    """Reads a checkpoint and verifies the checksums in it.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -54,9 +64,23 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     if not path.is_file():
         raise FileNotFoundError(f"no checkpoint at {path}")
     try:
-        return torch.load(path, map_location="cpu", weights_only=True)
-    except (RuntimeError, EOFError, pickle.UnpicklingError, KeyError, OSError) as error:
+        _verify_checksums(path)
+        content = torch.load(path, map_location="cpu", weights_only=True)
+        if not isinstance(content, dict):
+            raise ValueError(f"it holds a {type(content).__name__}")
+    except Exception as error:  # there is no end to what readers raise over damaged bytes
         raise ValueError(f"checkpoint {path} is damaged or not a checkpoint of this project: {error}") from error
+    return content
+
+
+def _verify_checksums(path: Path) -> None:
+    """torch.load does not compare the checksums in its files: flipped bits would become weights."""
+    with zipfile.ZipFile(path) as archive:
+        # Packed entries are never written; unpacking one might fill the memory.
+        wrong = next((entry.filename for entry in archive.infolist() if entry.compress_type != ZIP_STORED), None)
+        wrong = wrong or archive.testzip()
+    if wrong is not None:
+        raise ValueError(f"wrong checksum of {wrong}")
 
 
 def newest_valid(folder: str | Path) -> Path:
@@ -66,23 +90,55 @@ def newest_valid(folder: str | Path) -> Path:
         FileNotFoundError: if the folder holds none.
     """
     folder = Path(folder)
-    candidates = sorted(folder.glob(PATTERN), key=_step_of, reverse=True)
+    candidates = by_age(folder)
     for path in candidates:
         try:
             read_checkpoint(path)
-        except ValueError as error:
+        except (ValueError, FileNotFoundError) as error:  # not found: a folder of that name
             log.warning("%s; trying the one before", error)
         else:
             return path
     raise FileNotFoundError(
-        f"ckpt=last found no valid checkpoint in {folder} ({len(candidates)} damaged); "
-        "start the run without ckpt=last, or name a file with ckpt=PATH"
+        f"ckpt=last found no valid checkpoint in {folder} ({len(candidates)} damaged); to start from the beginning "
+        "leave ckpt=last out (ckpt=auto starts or goes on, as needed), or name a file with ckpt=PATH"
     )
+
+
+def by_age(folder: Path) -> list[Path]:
+    """A run's checkpoints, valid or not, the newest first."""
+    return sorted(folder.glob(PATTERN), key=lambda path: (_step_of(path), path.name), reverse=True)
 
 
 def _step_of(path: Path) -> int:
     digits = path.stem.removeprefix("step-").split("-")[0]
-    return int(digits) if digits.isdigit() else -1
+    return int(digits) if digits.isdecimal() else -1
+
+
+def remove_leftovers(folder: Path, newest: Path | None) -> None:
+    """Clears what an interrupted run left behind, before the folder is written to again.
+
+    Half-written files are deleted. Whatever stands in the way of checkpoints still to come, because it is named like a
+    newer one than the run goes on from, is damaged and renamed to ``*.damaged``.
+
+    Args:
+        folder: the run's own.
+        newest: the checkpoint that the run goes on from; None: from the beginning.
+    """
+    for path in [*folder.glob(".*.tmp"), *(folder / "checkpoints").glob("*.tmp")]:
+        if path.is_symlink() or path.is_file():
+            path.unlink()
+    if newest is None:
+        return
+    for path in by_age(folder / "checkpoints"):
+        if path.name == newest.name:
+            break
+        aside = path.with_name(f"{path.name}.damaged")
+        number = 1
+        while aside.exists():
+            number += 1
+            aside = path.with_name(f"{path.name}.damaged-{number}")
+        path.rename(aside)
+        log.warning("%s is damaged and now named %s; the run goes on from %s", path, aside.name, newest.name)
 
 
 def initialize_from(module: nn.Module, path: str | Path) -> None:

@@ -31,9 +31,9 @@ def read_curves(run: str | Path) -> dict[str, dict[int, float]]:
         )
     curves: dict[str, dict[int, float]] = {}
     for path in files:
-        with open(path, newline="") as file:
-            rows = list(csv.DictReader(file))
-        for row in rows:
+        # A row that a killed process did not finish has no line break, and is logged again by the one that goes on.
+        whole = path.read_text().rpartition("\n")[0]
+        for row in csv.DictReader(whole.splitlines()):
             step = int(row["step"])
             for name, text in row.items():
                 if name not in ("step", "epoch") and text:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import logging
 import os
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 log = logging.getLogger(__name__)
 
@@ -14,16 +15,50 @@ _unwritable: set[Path] = set()
 
 
 def write_bytes(path: str | Path, content: bytes) -> Path:
-    """Writes ``content`` atomically, making the folder if needed; returns the path."""
+    """Writes ``content`` atomically, making the folder if needed; returns the path.
+
+    Raises:
+        OSError: if it cannot be written (a full disk), naming the file; what it held before is still there.
+    """
+    return _write(path, content, durable=False)
+
+
+def _write(path: str | Path, content: bytes, durable: bool) -> Path:
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        temporary.write_bytes(content)
+        with open(temporary, "wb") as file:
+            file.write(content)
+            if durable:
+                flush_to_disk(file)
         os.replace(temporary, path)
+        if durable:
+            flush_folder(path.parent)
+    except OSError as error:
+        raise OSError(error.errno, f"{path} could not be written: {error.strerror}") from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):  # of a disk that fails; the error on its way says more
+            temporary.unlink(missing_ok=True)
     return path
+
+
+def flush_to_disk(file: IO[bytes]) -> None:
+    """Returns when the content of an open file would survive a power failure."""
+    file.flush()
+    os.fsync(file.fileno())
+
+
+def flush_folder(folder: Path) -> None:
+    """The same for the names in a folder, after a rename; not every file system can."""
+    if not hasattr(os, "O_DIRECTORY"):
+        return
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        with suppress(OSError):
+            os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def write_cached(path: str | Path, content: bytes, cache: str | Path) -> None:
@@ -47,8 +82,8 @@ def write_cached(path: str | Path, content: bytes, cache: str | Path) -> None:
 
 
 def write_text(path: str | Path, content: str) -> Path:
-    """Writes UTF-8 text atomically; returns the path."""
-    return write_bytes(path, content.encode())
+    """Writes UTF-8 text atomically and to the disk itself; returns the path. Errors as in :func:`write_bytes`."""
+    return _write(path, content.encode(), durable=True)
 
 
 def write_json(path: str | Path, content: Any) -> Path:
