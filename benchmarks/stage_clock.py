@@ -61,9 +61,10 @@ class StageClock:
         torch.cuda.reset_peak_memory_stats(self.device)
         before = torch.cuda.memory_allocated(self.device)
         begin, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
-        begin.record()
+        stream = torch.cuda.current_stream(self.device)
+        begin.record(stream)
         yield
-        end.record()
+        end.record(stream)
         torch.cuda.synchronize(self.device)
         passes.seconds.append(begin.elapsed_time(end) / 1e3)
         passes.peak_mb.append((torch.cuda.max_memory_allocated(self.device) - before) / 1e6)

@@ -3,10 +3,12 @@
 Backbone, first decode, coarse voxels, second decode, fine voxels, Gaussian head and rendering of one view, on a
 procedural room, with whatever model and backend the overrides name (paper, Evaluation of Time Consumption:
 ``backend=da3_giant model=vg2gt``, 10 views of 224x448 and 518x518). Times are the best of several passes:
-core-seconds on a CPU, CUDA events on a GPU, where each stage's peak memory stands beside. Weights need not be there
-(``backend.pretrained=false``), but then the depth is noise, and so is the number of voxels, which is printed.
-``--training`` adds a training step and what a whole training would cost, beside the paper's table. Prints tables and
-writes a dated JSON file to ``benchmarks/results``.
+core-seconds on a CPU, CUDA events on a GPU, where each stage's peak memory stands beside; ``trainer.precision`` holds
+as it does in training. Weights need not be there (``backend.pretrained=false``), but then the depth is noise, and so is
+the number of voxels, which is printed. ``--training`` adds a training step and what a whole training of the paper's
+length would cost; the paper's steps have 15 images in the mean and render them all on each of two devices
+(``--views 15 experiment=paper data=synthetic trainer=gpu backend=... model=...``). Prints tables and writes a dated
+JSON file to ``benchmarks/results``.
 """
 
 from __future__ import annotations
@@ -27,6 +29,7 @@ from stage_clock import StageClock
 
 from vg2gt.evaluation.paper import tables
 from vg2gt.io.files import write_json
+from vg2gt.schedule import weight_decay_groups
 from vg2gt.study import compose_run
 from vg2gt.training import Run, build
 from vg2gt.types import Batch
@@ -46,7 +49,7 @@ PAPER = {
     (224, 448): {"decode_again": 0.0852, "fine + head": 0.293, "whole": 1.122, "DA3 alone": 0.764},
     (518, 518): {"whole": 2.440, "DA3 alone": 2.180},
 }
-PAPER_STEPS = 420_000
+PAPER_STEPS, PAPER_DEVICES = 420_000, 2
 
 
 @dataclass(frozen=True)
@@ -65,7 +68,8 @@ def prepare(case: Case, device: torch.device, folder: str) -> tuple[Run, Batch]:
     scene = [f"data.image_size=[{height},{width}]", "data.eval_scenes=1", "data.train_scenes=1", "data.eval_target=1"]
     scene += [f"data.eval_context={case.views}", f"data.num_frames={case.views + 6}"]
     views = [f"data.min_views={case.views}", f"data.max_views={case.views}", f"data.max_images={case.views}"]
-    config = compose_run([f"trainer.accelerator={accelerator}", *scene, *views, *case.overrides], Path(folder))
+    alone = [f"trainer.accelerator={accelerator}", "trainer.devices=1", "trainer.strategy=auto"]
+    config = compose_run([*alone, *scene, *views, *case.overrides], Path(folder))
     run = build(config)
     run.datamodule.setup("validate")
     run.module.to(device)
@@ -80,7 +84,7 @@ def measure_inference(run: Run, batch: Batch, passes: int, device: torch.device)
     for number in range(passes + 1):
         if number == 1:
             clock.stages.clear()
-        with clock.listening():
+        with clock.listening(), run.trainer.precision_plugin.val_step_context():
             prediction = model(context.images, context.hints)
         cameras = prediction.geometry.cameras.select(slice(0, 1))
         with clock.stage("render"):
@@ -96,14 +100,24 @@ def measure_inference(run: Run, batch: Batch, passes: int, device: torch.device)
 
 
 def measure_training(run: Run, batch: Batch, passes: int, device: torch.device) -> float:
-    """Best seconds of a training step without the optimiser: reconstruction, rendering, losses, backward pass."""
+    """Best seconds of a training step: reconstruction, rendering, losses, backward pass, clipping, optimiser.
+
+    Data loading is not in it.
+    """
     module, clock = run.module.train(), StageClock(device)
     run.trainer.strategy.connect(module)
     module.log = lambda *args, **kwargs: None  # type: ignore[method-assign]
+    optimizer = module.make_optimizer(weight_decay_groups(module.model))
     for _ in range(passes + 1):
         with clock.stage("training step"):
-            module.training_step(batch, 0).backward()
-        module.zero_grad(set_to_none=True)
+            with run.trainer.precision_plugin.train_step_context():
+                loss = module.training_step(batch, 0)
+            if not bool(torch.isfinite(loss)):
+                raise FloatingPointError("the loss is not finite: such a step is dropped, its time says nothing")
+            loss.backward()
+            torch.nn.utils.clip_grad_norm_(module.model.trained_parameters(), 1.0)
+            optimizer.step()
+            optimizer.zero_grad(set_to_none=True)
     return min(clock.stages["training step"].seconds[1:])
 
 
@@ -138,12 +152,21 @@ def print_stages(console: Console, case: Case, result: dict[str, Any], on_gpu: b
     console.print(table)
 
 
-def print_training(console: Console, step_seconds: float, where: str) -> None:
+def paper_training_hours(step_seconds: float) -> float:
+    """Device hours of a training as long and on as many devices as the paper's, every device with a step of its own."""
+    return step_seconds * PAPER_STEPS * PAPER_DEVICES / 3600
+
+
+def print_training(console: Console, run: Run, case: Case, step_seconds: float, where: str) -> None:
     """Hours of a whole training of the paper's length on this machine, beside the paper's table."""
-    table = Table(title=f"training cost, this configuration: {PAPER_STEPS:,} steps of {step_seconds:.3f} s")
+    rendered = min(case.views, run.module.render_views or case.views)
+    table = Table(
+        title=f"training cost: {PAPER_STEPS:,} steps of {step_seconds:.3f} s on {PAPER_DEVICES} devices, each step "
+        f"{case.views} images, {rendered} of them rendered (paper: 15 in the mean, all rendered)"
+    )
     for heading in ("method", "device", "device hours", "hours on the paper's GPU"):
         table.add_column(heading, justify="left" if heading in ("method", "device") else "right")
-    table.add_row("measured here", where, f"{step_seconds * PAPER_STEPS / 3600:,.1f}", "n/a")
+    table.add_row("measured here", where, f"{paper_training_hours(step_seconds):,.1f}", "n/a")
     for name, cost in tables()["tbl_training_cost"].items():
         table.add_row(f"{name} (paper)", cost["gpu"], f"{cost['hours']:,.0f}", f"{cost['converted_hours']:,.1f}")
     console.print(table)
@@ -165,7 +188,8 @@ def main() -> None:
     device, console = torch.device(arguments.device), Console(width=110)
     where = machine(device)
     console.print(json.dumps(where))
-    cases = []
+    model = next((text.removeprefix("model=") for text in arguments.overrides if text.startswith("model=")), "tiny")
+    cases, backend, precision = [], "", ""
     for size in arguments.size or [[224, 448], [518, 518]]:
         case = Case(arguments.views, (size[0], size[1]), tuple(arguments.overrides))
         with tempfile.TemporaryDirectory() as folder:
@@ -174,17 +198,22 @@ def main() -> None:
             print_stages(console, case, result, device.type == "cuda")
             if arguments.training:
                 result["training_step"] = measure_training(run, batch.context, arguments.passes, device)
-                print_training(console, result["training_step"], str(where.get("gpu", where["processor"])))
+                result["rendered_in_training"] = min(case.views, run.module.render_views or case.views)
+                print_training(console, run, case, result["training_step"], str(where.get("gpu", where["processor"])))
         cases.append({"views": case.views, "size": list(case.size), **result})
+        backend, precision = run.module.model.backend.name, str(run.trainer.precision)
     content = {
         "machine": where,
         "unit": "seconds" if device.type == "cuda" else "core-seconds",
         "threads": arguments.threads,
+        "backend": backend,
+        "model": model,
+        "precision": precision,
         "overrides": arguments.overrides,
         "passes": arguments.passes,
         "cases": cases,
     }
-    stem = f"{date.today().isoformat()}-stages-{device.type}"
+    stem = f"{date.today().isoformat()}-stages-{backend}-{model}-{device.type}"
     console.print(str(write_json(arguments.out / f"{stem}.json", content)))
 
 

@@ -1,11 +1,13 @@
 """The benchmark scripts run and write what they say, at sizes that measure nothing."""
 
+import importlib
 import json
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+import torch
 
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 TINY = ["data.image_size=[56,112]", "data.train_scenes=1", "data.eval_scenes=1"]
@@ -22,14 +24,46 @@ def run(name: str, folder: Path, *arguments: str) -> str:
 @pytest.mark.slow
 def test_stages(tmp_path: Path) -> None:
     sizes = ["--views", "3", "--size", "56", "112", "--passes", "1", "--device", "cpu"]
-    shown = run("stages.py", tmp_path, *sizes, "--training", "--out", str(tmp_path), "backend=da3_tiny")
+    overrides = ["backend=da3_tiny", "trainer.precision=bf16-mixed"]
+    shown = run("stages.py", tmp_path, *sizes, "--training", "--out", str(tmp_path), *overrides)
     assert "second decode" in shown
     assert "AnySplat (paper)" in shown
-    (path,) = tmp_path.glob("*-stages-cpu.json")
-    (case,) = json.loads(path.read_text())["cases"]
+    (path,) = tmp_path.glob("*-stages-da3_tiny-tiny-cpu.json")
+    content = json.loads(path.read_text())
+    assert content["precision"] == "bf16-mixed"
+    (case,) = content["cases"]
+    assert case["rendered_in_training"] == 3
     assert set(case["seconds"]) == {"encode", "decode", "coarse", "decode_again", "fine", "gaussians", "render"}
     assert all(seconds > 0 for seconds in case["seconds"].values())
     assert case["training_step"] > sum(case["seconds"].values()) / 2
+
+
+@pytest.mark.slow
+def test_stages_of_the_papers_experiment(tmp_path: Path) -> None:
+    """Its settings ask for two devices and bfloat16; measured is one device's share, networks in bfloat16."""
+    options = ["--views", "3", "--size", "56", "112", "--passes", "1", "--device", "cpu", "--out", str(tmp_path)]
+    small = ["backend=da3_tiny", "data=synthetic", "trainer=gpu", "model=tiny", "training.render_views=null"]
+    run("stages.py", tmp_path, *options, "experiment=paper", *small)
+    (path,) = tmp_path.glob("*-stages-da3_tiny-tiny-cpu.json")
+    assert json.loads(path.read_text())["precision"] == "bf16-mixed"
+
+
+def test_training_hours_count_every_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The paper: 49.5 hours of two devices, 420000 steps, are 99 device hours."""
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    assert importlib.import_module("stages").paper_training_hours(49.5 * 3600 / 420_000) == pytest.approx(99)
+
+
+def test_stages_run_in_the_precision_of_the_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    stages, device = importlib.import_module("stages"), torch.device("cpu")
+    overrides = ("trainer.precision=bf16-mixed", f"data.cache_dir={tmp_path}")
+    run, batch = stages.prepare(stages.Case(2, (28, 56), overrides), device, str(tmp_path / "run"))
+    seen: list[bool] = []
+    run.module.model.fine.register_forward_pre_hook(lambda *_: seen.append(torch.is_autocast_enabled("cpu")))
+    stages.measure_inference(run, batch, 1, device)
+    stages.measure_training(run, batch, 1, device)
+    assert seen == 4 * [True]
 
 
 @pytest.mark.slow
