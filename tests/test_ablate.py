@@ -98,7 +98,7 @@ def test_interrupted_run_goes_on(finished: Path, cache: Path, tmp_path: Path, mo
 
     monkeypatch.setattr(vg2gt.study, "train", watched)
     study(folder, cache).run()
-    assert trained == ["start ckpt=last"]
+    assert trained == ["start ckpt=auto"]
     assert json.loads((folder / "seed-0" / "start" / "metrics.json").read_text()) == before
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shutil
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,23 +12,24 @@ from typing import Any
 import lightning
 import torch
 from hydra.utils import instantiate
+from lightning.fabric.utilities.rank_zero import rank_zero_only
 from lightning.pytorch import LightningDataModule, Trainer
 from lightning.pytorch.callbacks import ProgressBar
 from omegaconf import DictConfig, OmegaConf
 
-from vg2gt.checkpoints import AtomicCheckpointIO, initialize_from, newest_valid, read_checkpoint
+from vg2gt.checkpoints import AtomicCheckpointIO, initialize_from, newest_valid, read_checkpoint, remove_leftovers
 from vg2gt.data.datamodule import SceneDataModule
 from vg2gt.io.files import read_json, write_json, write_text
 from vg2gt.lightning_module import VG2GTModule
 from vg2gt.preview import write_preview
 from vg2gt.report import comparison_table, print_comparison
+from vg2gt.trust import read_run_config
 
 log = logging.getLogger(__name__)
 
 EXPECTED_WARNINGS = (
     r"Found \d+ module\(s\) in eval mode",  # the frozen backbone
     r"You're resuming from a checkpoint that ended before the epoch",  # batches are a function of the step's number
-    r"Checkpoint directory .* exists and is not empty",  # ckpt=last
     r"The '\w+_dataloader' does not have many workers",  # rooms come from the memory cache
     r".*isinstance\(treespec, LeafSpec\)",  # inside Lightning
 )
@@ -124,6 +126,8 @@ def train(config: DictConfig) -> dict[str, Any]:
         )
     if checkpoint is not None:
         _name_differences(config)
+    if rank_zero_only.rank == 0 and not run.trial:
+        remove_leftovers(run.folder, checkpoint)
     write_text(run.folder / "config.yaml", OmegaConf.to_yaml(config, resolve=True))
     if config.init_from and checkpoint is None:
         initialize_from(run.module, config.init_from)
@@ -141,10 +145,12 @@ def train(config: DictConfig) -> dict[str, Any]:
 def _checkpoint_to_resume(config: DictConfig) -> Path | None:
     """Resolves ``ckpt``; never restarts a run silently and never mixes two runs in one folder."""
     folder = Path(config.output_dir) / "checkpoints"
-    if config.ckpt == "last":
-        return newest_valid(folder)
     old = sorted(folder.glob("*.ckpt"))
-    if config.ckpt:
+    if config.ckpt == "last" or (config.ckpt == "auto" and old):
+        return newest_valid(folder)
+    if config.ckpt == "auto":
+        log.info("ckpt=auto: no checkpoint in %s yet, the run starts from the beginning", folder)
+    elif config.ckpt:
         path, step = Path(config.ckpt), read_checkpoint(config.ckpt)["global_step"]
         if old and not (path.resolve().parent == folder.resolve() and path.name == newest_valid(folder).name):
             raise FileExistsError(
@@ -159,7 +165,10 @@ def _checkpoint_to_resume(config: DictConfig) -> Path | None:
                 "or replace it with overwrite=true"
             )
         for path in old:
-            path.unlink()
+            path.unlink(missing_ok=True)
+        # Neither the curve nor the result of the run that was replaced is this run's.
+        shutil.rmtree(folder.parent / "logs", ignore_errors=True)
+        (folder.parent / "metrics.json").unlink(missing_ok=True)
     return None
 
 
@@ -168,7 +177,7 @@ def _name_differences(config: DictConfig) -> None:
     path = Path(config.output_dir) / "config.yaml"
     if not path.is_file():
         return
-    before, now = (flatten(OmegaConf.to_container(c, resolve=True)) for c in (OmegaConf.load(path), config))
+    before, now = (flatten(OmegaConf.to_container(c, resolve=True)) for c in (read_run_config(path), config))
     different = sorted(key for key in before.keys() | now.keys() if before.get(key) != now.get(key))
     different = [key for key in different if key not in ("ckpt", "output_dir", "overwrite")]
     if different:

@@ -1,0 +1,255 @@
+"""Starts real trainings in process groups of their own, kills them at chosen moments and goes on until they finish."""
+
+from __future__ import annotations
+
+import importlib
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from tests.training_helpers import SMALL
+from vg2gt.checkpoints import read_checkpoint
+from vg2gt.curves import read_curves
+from vg2gt.io.files import read_json
+
+ROOT = Path(__file__).resolve().parents[2]
+PATIENCE = 600.0  # seconds until a process that does not end is taken to hang
+STEPS = 6
+# Evaluations inside the training, checkpoints at every second step, a log row a step.
+RUN = [
+    *SMALL,
+    "data.image_size=[28,56]",
+    "data.eval_context=2",
+    "data.eval_target=1",
+    f"trainer.max_steps={STEPS}",
+    "trainer.val_check_interval=3",
+]
+
+# A process forked from this one has the slow imports behind it.
+_SERVER = multiprocessing.get_context("forkserver")
+_SERVER.set_forkserver_preload(["vg2gt.training", "vg2gt.evaluation.run", "vg2gt.ablate"])
+
+Moment = Callable[["Attempt"], bool]
+
+
+def _run_main(module: str, arguments: list[str], output: str, folder: str) -> None:
+    os.setsid()
+    descriptor = os.open(output, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
+    os.dup2(descriptor, 1)
+    os.dup2(descriptor, 2)
+    os.chdir(folder)
+    command = importlib.import_module(module)
+    sys.argv = [str(command.__file__), *arguments]
+    command.main()
+
+
+@dataclass
+class Attempt:
+    """One process of a run.
+
+    Attributes:
+        folder: the run's folder.
+        output: the file that its terminal output goes to.
+        process: of the standard library, of either kind.
+        seen: notes of the moment that is waited for.
+    """
+
+    folder: Path
+    output: Path
+    process: Any
+    seen: dict[str, Any] = field(default_factory=dict)
+    started: float = field(default_factory=time.monotonic)
+
+    def status(self) -> int | None:
+        """Its exit status, None while it runs."""
+        return self.process.poll() if isinstance(self.process, subprocess.Popen) else self.process.exitcode
+
+    def said(self) -> str:
+        """What it has written to the terminal so far."""
+        return self.output.read_text(errors="replace") if self.output.is_file() else ""
+
+    def kill(self) -> None:
+        """SIGKILL to the whole process group."""
+        with suppress(ProcessLookupError):
+            os.killpg(self.process.pid, signal.SIGKILL)
+        self.wait()
+
+    def wait(self) -> int:
+        """Waits for the end; returns the exit status."""
+        if isinstance(self.process, subprocess.Popen):
+            return self.process.wait(PATIENCE)
+        self.process.join(PATIENCE)
+        return self.process.exitcode
+
+    def wait_for(self, moment: Moment) -> bool:
+        """Whether the moment came before the process ended."""
+        while time.monotonic() - self.started < PATIENCE:
+            if moment(self):
+                return True
+            if self.status() is not None:
+                return False
+            time.sleep(0.0002)
+        self.kill()
+        raise TimeoutError(f"{self.folder} waited {PATIENCE:g} s:\n{self.said()[-3000:]}")
+
+
+def start(
+    module: str, arguments: Sequence[str], folder: Path, warm: bool = True, environment: dict[str, str] | None = None
+) -> Attempt:
+    """Starts a command in a new process group.
+
+    Args:
+        module: whose ``main`` is the command.
+        arguments: its command line.
+        folder: the run's; output goes to a file beside it.
+        warm: forks a process that has imported everything; otherwise ``python -m`` as a user starts it.
+        environment: more variables, for cold starts.
+    """
+    output = folder.with_name(f"{folder.name}.out")
+    if warm:
+        process = _SERVER.Process(target=_run_main, args=(module, list(arguments), str(output), str(folder.parent)))
+        process.start()
+        return Attempt(folder, output, process)
+    with open(output, "ab") as file:
+        process = subprocess.Popen(
+            [sys.executable, "-m", module, *arguments],
+            stdout=file,
+            stderr=file,
+            cwd=ROOT,
+            start_new_session=True,
+            env={**os.environ, "OMP_NUM_THREADS": "1", **(environment or {})},
+        )
+    return Attempt(folder, output, process)
+
+
+def training(folder: Path, cache: Path, *overrides: str) -> list[str]:
+    """The command line that starts a run and goes on with it."""
+    fixed = [f"output_dir={folder}", f"hydra.run.dir={folder}", f"data.cache_dir={cache}", "ckpt=auto"]
+    return [*fixed, *RUN, *overrides]
+
+
+def finish(module: str, arguments: Sequence[str], folder: Path, warm: bool = True) -> None:
+    """Lets a command run to its end."""
+    attempt = start(module, arguments, folder, warm)
+    status = attempt.wait()
+    assert status == 0, f"status {status}:\n{attempt.said()[-4000:]}"
+
+
+# ------------------------------------------------------------------------------------------------------- moments
+
+
+def after_seconds(seconds: float) -> Moment:
+    """Some time after the first step was logged: in a step, between steps, while a log is written."""
+
+    def come(attempt: Attempt) -> bool:
+        if "since" not in attempt.seen:
+            if not _newest_log(attempt.folder).count("\n"):
+                return False
+            attempt.seen["since"] = time.monotonic()
+        return time.monotonic() - attempt.seen["since"] >= seconds
+
+    return come
+
+
+def while_a_checkpoint_is_written(attempt: Attempt) -> bool:
+    """A checkpoint has only its temporary name."""
+    return any((attempt.folder / "checkpoints").glob("*.tmp"))
+
+
+def after_a_checkpoint(number: int) -> Moment:
+    """A new checkpoint has its name, the oldest is not yet deleted; the step's row is not yet in the log."""
+
+    def come(attempt: Attempt) -> bool:
+        folder = attempt.folder / "checkpoints"
+        before = attempt.seen.setdefault("before", set(folder.glob("*.ckpt")))
+        return len(set(folder.glob("*.ckpt")) - before) >= number
+
+    return come
+
+
+def in_validation(attempt: Attempt) -> bool:
+    """The row of the step before the evaluation is logged, that of the evaluation is not."""
+    log = _newest_log(attempt.folder)
+    return any(line.split(",")[_column(log, "step")] == "2" for line in log.splitlines()[1:])
+
+
+def in_first_evaluation(attempt: Attempt) -> bool:
+    """The run's configuration is written, the metrics of the untrained head are not."""
+    return (attempt.folder / "config.yaml").is_file() and not (attempt.folder / "untrained.json").is_file()
+
+
+def in_last_evaluation(attempt: Attempt) -> bool:
+    """The last checkpoint is there, the report is not."""
+    return (attempt.folder / "checkpoints" / f"step-{STEPS}.ckpt").is_file()
+
+
+def while_the_report_is_written(attempt: Attempt) -> bool:
+    """The metrics are there, what is written after them may be missing."""
+    return (attempt.folder / "metrics.json").is_file()
+
+
+def _newest_log(folder: Path) -> str:
+    files = sorted(folder.glob("logs/version_*/metrics.csv"), key=lambda path: path.stat().st_mtime)
+    return files[-1].read_text() if files else ""
+
+
+def _column(log: str, name: str) -> int:
+    return log.split("\n", 1)[0].split(",").index(name)
+
+
+# ------------------------------------------------------------------------------------------------------- results
+
+
+def check_files(folder: Path) -> int:
+    """Reads every file that a killed run left under a final name; returns the number of checkpoints."""
+    checkpoints = sorted((folder / "checkpoints").glob("*.ckpt"))
+    for path in checkpoints:
+        read_checkpoint(path)
+    for path in folder.glob("*.json"):
+        read_json(path)
+    return len(checkpoints)
+
+
+def assert_same(whole: Path, resumed: Path) -> None:
+    """Weights, optimiser state, schedule, metrics and curves are equal bit for bit, and nothing is left over."""
+    names = sorted(path.name for path in (whole / "checkpoints").iterdir())
+    assert sorted(path.name for path in (resumed / "checkpoints").iterdir()) == names
+    for name in names:
+        expected, found = (read_checkpoint(folder / "checkpoints" / name) for folder in (whole, resumed))
+        for key in ("state_dict", "optimizer_states", "lr_schedulers", "global_step", "skipped_steps"):
+            assert_equal(expected[key], found[key], f"{name}:{key}")
+        # The other loops count evaluations outside the training, of this process alone.
+        assert_equal(expected["loops"]["fit_loop"], found["loops"]["fit_loop"], f"{name}:fit_loop")
+    for name in ("untrained.json", "metrics.json"):
+        assert read_json(whole / name) == read_json(resumed / name), name
+    for name in ("metrics.md", "preview.png"):
+        assert (whole / name).read_bytes() == (resumed / name).read_bytes(), name
+    assert read_curves(whole) == read_curves(resumed)
+    assert not list(resumed.rglob("*.tmp"))
+
+
+def assert_equal(expected: Any, found: Any, name: str) -> None:
+    """Equality of nested containers with tensors in them."""
+    assert type(expected) is type(found), name
+    if isinstance(expected, torch.Tensor):
+        assert torch.equal(expected, found), name
+    elif isinstance(expected, dict):
+        assert expected.keys() == found.keys(), name
+        for key in expected:
+            assert_equal(expected[key], found[key], f"{name}.{key}")
+    elif isinstance(expected, list | tuple):
+        assert len(expected) == len(found), name
+        for index, pair in enumerate(zip(expected, found, strict=True)):
+            assert_equal(*pair, f"{name}[{index}]")
+    else:
+        assert expected == found, name
