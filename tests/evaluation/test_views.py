@@ -74,6 +74,28 @@ def test_a_window_grows_until_it_holds_the_views() -> None:
     assert set(views.context) | set(views.target) == set(range(24))
 
 
+@pytest.mark.parametrize("count", [1, 3])
+def test_a_window_grows_until_it_holds_a_held_out_frame(count: int) -> None:
+    source = Listed(range(200), held_out=range(0, 200, 8))
+    for scene in map(str, range(40)):
+        views = ViewSelection(spread=2.0).draw(source, scene, count)
+        assert views.target
+        assert max(views.context + views.target) - min(views.context + views.target) <= 8
+        assert not ViewSelection(targets=0).draw(source, scene, count).target
+    elsewhere = Listed(range(20), held_out=[77])  # a held-out frame that the scene lacks
+    assert len(ViewSelection().draw(elsewhere, "a", 3).context) == 3
+
+
+@pytest.mark.parametrize(
+    ("context", "target"), [([3, 9], [3]), ([3, 9], [4, 4]), ([3, 3], [4]), ([3, 9, 12], [4]), ([3], [4])]
+)
+def test_an_index_that_mixes_input_and_target_or_miscounts_is_refused(tmp_path: Path, context, target) -> None:
+    path = tmp_path / "mine.json"
+    path.write_text(json.dumps({"scenes": {"a": {"2": {"context": context, "target": target}}}}))
+    with pytest.raises(DataError, match="views of scene a are not 2 input views and others"):
+        ViewSelection(index=str(path)).choose(Listed(range(40)), ["a"], 2)
+
+
 def test_fixed_views() -> None:
     views = ViewSelection(fixed={3: [23, 24, 33]}).draw(Listed(range(49)), "a", 3)
     assert views.context == (23, 24, 33)

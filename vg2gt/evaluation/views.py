@@ -62,7 +62,8 @@ class ViewSelection:
         """The samples of ``count`` input views, one a scene.
 
         Raises:
-            DataError: if a scene has too few frames, or lacks one that the index or ``fixed`` names.
+            DataError: if a scene has too few frames, lacks one that the index or ``fixed`` names, or if the index names
+                another number of input views, a frame twice or an input view as target.
         """
         stored = read_index(self.index)
         chosen = [_stored_views(stored, scene, count) or self.draw(source, scene, count) for scene in scenes]
@@ -73,7 +74,7 @@ class ViewSelection:
                 index_path(self.index).name, count, len(drawn), len(scenes), drawn[0], self.seed,
             )  # fmt: skip
         for views in chosen:
-            _check_frames(source, views)
+            _check_frames(source, views, count)
         return chosen
 
     def draw(self, source: SceneSource, scene: str, count: int) -> SceneViews:
@@ -86,7 +87,7 @@ class ViewSelection:
             DataError: if the scene has fewer than ``count`` frames that are not held out.
         """
         frames = list(source.frames(scene))
-        held_out = set(source.held_out(scene))
+        held_out = set(source.held_out(scene)) & set(frames)
         rng = np.random.default_rng(
             int.from_bytes(hashlib.sha256(f"{self.seed}/{scene}/{count}".encode()).digest(), "big")
         )
@@ -105,7 +106,7 @@ class ViewSelection:
     def _window(
         self, frames: list[int], held_out: set[int], scene: str, count: int, rng: np.random.Generator
     ) -> list[int]:
-        """Consecutive frames, ``spread * count`` of them or as many more as the views and targets need."""
+        """Consecutive frames, ``spread * count`` of them or as many more as the views and one held-out frame need."""
         available = [frame for frame in frames if frame not in held_out]
         if len(available) < count:
             raise DataError(
@@ -114,7 +115,13 @@ class ViewSelection:
             )
         length = min(len(frames), max(round(self.spread * count), count + (0 if held_out else self.targets)))
         start = int(rng.integers(len(frames) - length + 1))
-        while sum(frame not in held_out for frame in frames[start : start + length]) < count:
+        needs_held_out = bool(held_out) and self.targets > 0
+
+        def suffices(window: list[int]) -> bool:
+            inputs = sum(frame not in held_out for frame in window)
+            return inputs >= count and (inputs < len(window) or not needs_held_out)
+
+        while not suffices(frames[start : start + length]):
             length = min(len(frames), length + 1)
             start = min(start, len(frames) - length)
         return frames[start : start + length]
@@ -174,7 +181,14 @@ def _stored_views(stored: Mapping[str, Mapping[str, Any]], scene: str, count: in
     return SceneViews(scene, tuple(entry["context"]), tuple(entry["target"])) if entry else None
 
 
-def _check_frames(source: SceneSource, views: SceneViews) -> None:
+def _check_frames(source: SceneSource, views: SceneViews, count: int) -> None:
+    named = [*views.context, *views.target]
+    if len(views.context) != count or len(set(named)) != len(named):
+        raise DataError(
+            f"the evaluation's views of scene {views.scene} are not {count} input views and others: input "
+            f"{list(views.context)}, held out {list(views.target)}; correct evaluation.selection (index, fixed), or draw "
+            "views with evaluation.selection.index=null"
+        )
     missing = sorted({*views.context, *views.target} - set(source.frames(views.scene)))
     if missing:
         raise DataError(
