@@ -106,6 +106,7 @@ def measure_training(run: Run, batch: Batch, passes: int, device: torch.device) 
     """
     module, clock = run.module.train(), StageClock(device)
     run.trainer.strategy.connect(module)
+    module.trainer = run.trainer
     module.log = lambda *args, **kwargs: None  # type: ignore[method-assign]
     optimizer = module.make_optimizer(weight_decay_groups(module.model))
     for _ in range(passes + 1):
