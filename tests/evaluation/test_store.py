@@ -51,3 +51,23 @@ def test_means_leave_out_what_is_missing_and_times_are_medians() -> None:
     assert means["abs_rel"] == pytest.approx(0.3)
     assert means["scene/head_seconds"] == 2
     assert means["lpips"] is None
+
+
+@pytest.mark.parametrize("name", ["config.yaml", "metrics.json", "scenes"])
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_what_is_not_an_evaluations_is_never_replaced(tmp_path: Path, name: str, overwrite: bool) -> None:
+    own = tmp_path / "scenes" / "own" if name == "scenes" else tmp_path / name
+    own.parent.mkdir(exist_ok=True)
+    own.write_text("mine")
+    with pytest.raises(FileExistsError, match=f"holds {name} of something that is no evaluation"):
+        ResultStore(tmp_path, {"a": 1}, overwrite)
+    assert own.read_text() == "mine"
+    assert not (tmp_path / "identity.json").exists()
+
+
+def test_an_interrupted_replacement_leaves_no_report_of_before(tmp_path: Path) -> None:
+    ResultStore(tmp_path, {"a": 1})
+    for name in ("metrics.json", "metrics.md"):
+        (tmp_path / name).write_text("of before")
+    ResultStore(tmp_path, {"a": 2}, overwrite=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["identity.json"]

@@ -11,6 +11,9 @@ from vg2gt.data.sampling import SceneViews
 from vg2gt.io.files import read_json, write_json
 
 IDENTITY = "identity.json"
+FOLDERS = ("scenes", "pictures")
+REPORTS = ("metrics.json", "metrics.md")
+WRITTEN = (*FOLDERS, *REPORTS, "config.yaml")
 
 
 class ResultStore:
@@ -23,15 +26,26 @@ class ResultStore:
         overwrite: throw away what the folder holds of another evaluation, or of this one.
 
     Raises:
-        FileExistsError: if the folder holds an evaluation with other settings, naming the first that differ.
+        FileExistsError: if the folder holds an evaluation with other settings, naming the first that differ; or files
+            of something else, such as a training run's, which are never replaced.
     """
 
     def __init__(self, folder: Path, identity: Mapping[str, Any], overwrite: bool = False) -> None:
         self.folder = folder
-        if overwrite:
-            shutil.rmtree(folder / "scenes", ignore_errors=True)
-            shutil.rmtree(folder / "pictures", ignore_errors=True)
-        elif (folder / IDENTITY).is_file():
+        if not (folder / IDENTITY).is_file():
+            foreign = [name for name in WRITTEN if (folder / name).exists()]
+            if foreign:
+                raise FileExistsError(
+                    f"{folder} holds {', '.join(foreign)} of something that is no evaluation (it has no {IDENTITY}): "
+                    "choose another output_dir= or name="
+                )
+        elif overwrite:
+            # The report first: an interruption must not leave it beside other settings.
+            for name in REPORTS:
+                (folder / name).unlink(missing_ok=True)
+            for name in FOLDERS:
+                shutil.rmtree(folder / name, ignore_errors=True)
+        else:
             before = read_json(folder / IDENTITY)
             different = sorted(key for key in before.keys() | identity.keys() if before.get(key) != identity.get(key))
             if different:

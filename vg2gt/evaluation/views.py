@@ -186,8 +186,8 @@ def _check_frames(source: SceneSource, views: SceneViews, count: int) -> None:
     if len(views.context) != count or len(set(named)) != len(named):
         raise DataError(
             f"the evaluation's views of scene {views.scene} are not {count} input views and others: input "
-            f"{list(views.context)}, held out {list(views.target)}; correct evaluation.selection (index, fixed), or draw "
-            "views with evaluation.selection.index=null"
+            f"{list(views.context)}, held out {list(views.target)}; correct evaluation.selection (index, fixed), or "
+            "draw views with evaluation.selection.index=null"
         )
     missing = sorted({*views.context, *views.target} - set(source.frames(views.scene)))
     if missing:
