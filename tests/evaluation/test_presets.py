@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from hydra import compose, initialize_config_dir
-from hydra.utils import instantiate
+from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig
 
 from vg2gt.evaluation import EvaluationOptions, paper
@@ -40,9 +40,16 @@ def test_presets_instantiate(preset: str) -> None:
 def test_the_papers_presets_are_the_papers(preset: str) -> None:
     config = composed(preset)
     options: EvaluationOptions = instantiate(config.evaluation, _convert_="all")
-    size = (config.data.image_size[0], config.data.image_size[1])
     assert options.table == preset
-    assert paper.is_the_papers(options.table, size, options.alignment)
+    read = {
+        "source": get_class(config.data.val._target_).__name__,
+        "size": (config.data.image_size[0], config.data.image_size[1]),
+        "fit": config.data.fit,
+        "alignment": options.alignment,
+        "depth_range": options.depth_range,
+    }
+    assert paper.obstacle(preset, **read, told=False) is None
+    assert paper.obstacle(preset, **read, told=True) is not None
 
 
 def test_dtu_is_compared_with_its_own_options() -> None:

@@ -130,6 +130,15 @@ def test_another_backbone_or_model_is_refused(tmp_path: Path, cache: Path, train
         run(tmp_path, cache, f"ckpt={trained}", "+model.gaussians.splits=4")
 
 
+def test_the_papers_rows_do_not_stand_beside_other_data(tmp_path: Path, cache: Path, trained: Path) -> None:
+    chosen = ["evaluation.table=replica", "data.eval_scenes=1", "views=[3]"]
+    report = run(tmp_path, cache, f"ckpt={trained}", *chosen)
+    assert report["settings"]["paper"] is None
+    text = (tmp_path / "metrics.md").read_text()
+    assert "the paper's rows are left out: the data is read by SyntheticScenes" in text
+    assert "tbl_" not in text
+
+
 def test_one_key_of_the_runs_model_can_be_changed(tmp_path: Path, cache: Path, trained: Path) -> None:
     report = run(tmp_path, cache, f"ckpt={trained}", "+model.fine.max_voxels=200", "data.eval_scenes=1")
     assert report["views"]["2"]["mean"]["scene/gaussians"] == 400

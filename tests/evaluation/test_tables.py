@@ -36,6 +36,7 @@ def report(**settings: Any) -> dict[str, Any]:
         "points": {"threshold": 0.05, "cap": None},
         "device": "cpu",
         "paper": None,
+        "paper_obstacle": None,
     }
     views = {str(count): {"mean": scores, "scenes": {"room": scores}} for count in (3, 10)}
     return {"settings": known | settings, "views": views}
@@ -76,11 +77,32 @@ def test_the_papers_rows_stand_beside_ours() -> None:
     assert "tbl_depth_whole" not in enhanced
 
 
-def test_only_the_papers_protocol_may_stand_beside_the_paper() -> None:
-    assert paper.is_the_papers("replica", (518, 518), "median")
-    assert not paper.is_the_papers("replica", (112, 224), "median")
-    assert not paper.is_the_papers("replica", (518, 518), "none")
-    assert not paper.is_the_papers(None, (518, 518), "median")
+PAPERS = {
+    "source": "Replica",
+    "size": (518, 518),
+    "fit": "cover",
+    "alignment": "median",
+    "depth_range": [None, None],
+    "told": False,
+}
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "told"),
+    [
+        ("source", "SyntheticScenes", "read by SyntheticScenes, which is not the paper's replica"),
+        ("source", "ScanNet", "read by ScanNet"),
+        ("size", (112, 224), "images are 112x224"),
+        ("fit", "pad", "518x518 \\(pad\\)"),
+        ("alignment", "none", "aligned by none"),
+        ("depth_range", [None, 10], r"within \[None, 10\]"),
+        ("told", True, "told true depth"),
+    ],
+)
+def test_only_the_papers_protocol_may_stand_beside_the_paper(key: str, value: Any, told: str) -> None:
+    assert paper.obstacle("replica", **PAPERS) is None
+    assert re.search(told, paper.obstacle("replica", **PAPERS | {key: value}) or "")
+    assert "the paper's rows are left out: because" in markdown(report(paper_obstacle="because"))
 
 
 def figures(node: Any) -> list[float]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,12 @@ OURS = "VG2GT"
 MODES = {OURS: "solid", f"{OURS}(3DGS)": "rasterized"}  # the paper's rows and how they are rendered
 RESOLUTION = (518, 518)
 ALIGNMENT = "median"
+SOURCES = {  # the paper's data sets and what reads them
+    "replica": ("Replica",),
+    "dtu": ("DTU",),
+    "tat": ("TanksAndTemples",),
+    "scannet": ("ScanNet", "ScanNetSens"),
+}
 
 DEPTH, IMAGES, DECODED = "tbl_depth_whole", "tbl_nvs_whole", "tbl_depth_scannet_tat"
 NORMALS, UNIFORMITY = "tbl_camera_orientation", "tbl_point_uniformity"
@@ -25,9 +31,36 @@ def tables() -> Mapping[str, Any]:
     return read_json(TABLES)
 
 
-def is_the_papers(dataset: str | None, size: tuple[int, int], alignment: str) -> bool:
-    """Whether figures may stand beside the paper's: its data set, its resolution, its alignment of depth."""
-    return dataset is not None and tuple(size) == RESOLUTION and alignment == ALIGNMENT
+def obstacle(
+    dataset: str,
+    *,
+    source: str,
+    size: Sequence[int],
+    fit: str,
+    alignment: str,
+    depth_range: Sequence[float | None],
+    told: bool,
+) -> str | None:
+    """What keeps figures from standing beside the paper's rows on a data set; None if nothing does.
+
+    Args:
+        dataset: as in the tables, such as ``replica``.
+        source: class that reads the evaluated data.
+        size: ``(height, width)`` of the images.
+        fit: how they were brought to it, ``cover`` or ``pad``.
+        alignment: of depth.
+        depth_range: true depths that count.
+        told: whether the backbone is told the data's depth or cameras, which the paper's are not.
+    """
+    if source not in SOURCES.get(dataset, ()):
+        return f"the data is read by {source}, which is not the paper's {dataset}"
+    if tuple(size) != RESOLUTION or fit != "cover":
+        return f"images are {size[0]}x{size[1]} ({fit}), the paper's 518x518 (cover)"
+    if alignment != ALIGNMENT or any(bound is not None for bound in depth_range):
+        return f"depth is aligned by {alignment} within {list(depth_range)}, the paper's by {ALIGNMENT} without bounds"
+    if told:
+        return "the backbone is told true depth or cameras"
+    return None
 
 
 def rows_by_views(table: str, dataset: str, views: int) -> Iterator[tuple[str, Mapping[str, float]]]:

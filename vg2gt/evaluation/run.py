@@ -38,7 +38,7 @@ from vg2gt.io.images import write_png
 from vg2gt.metrics import LPIPS, WeightsNotFoundError, load_lpips
 from vg2gt.model import Reconstructor
 from vg2gt.training import flatten
-from vg2gt.trust import UntrustedError, check_targets, read_run_config
+from vg2gt.trust import check_targets, read_run_config
 from vg2gt.types import Batch
 
 log = logging.getLogger(__name__)
@@ -145,8 +145,6 @@ def _refuse_training_views(checkpoint: Path | None, source: SceneSource, views: 
         check_targets(run.data, f"{path}: data")
         trained: SceneDataModule = instantiate(run.data)
         train = trained.train_source()
-    except UntrustedError:
-        raise
     except (OSError, ValueError, ImportError, InstantiationException) as error:
         log.warning("whether the evaluated scenes were trained on cannot be checked: %s", error)
         return
@@ -222,8 +220,16 @@ def _settings(
     device: torch.device,
 ) -> dict[str, Any]:
     size = (int(config.data.image_size[0]), int(config.data.image_size[1]))
-    crop = "resized to cover, cropped at the centre" if config.data.get("fit", "cover") == "cover" else "padded"
-    known = paper.is_the_papers(options.table, size, options.alignment)
+    fit = config.data.get("fit", "cover")
+    obstacle = options.table and paper.obstacle(
+        options.table,
+        source=type(source).__name__,
+        size=size,
+        fit=fit,
+        alignment=options.alignment,
+        depth_range=options.depth_range,
+        told=model.backend.needs_hints,
+    )
     return {
         "name": Path(config.output_dir).name,
         "weights": str(weights) if model.trained_parameters() else "none: the model has no trained part",
@@ -233,12 +239,13 @@ def _settings(
         "scenes": len(next(iter(samples.values()))),
         "index": options.selection.index or f"drawn with seed {options.selection.seed}",
         "size": size,
-        "crop": crop,
+        "crop": "resized to cover, cropped at the centre" if fit == "cover" else "padded",
         "alignment": options.alignment,
         "depth_range": list(options.depth_range),
         "neighbors": options.neighbors,
         "lpips": lpips,
         "points": asdict(options.points),
         "device": str(device),
-        "paper": options.table if known else None,
+        "paper": None if obstacle else options.table,
+        "paper_obstacle": obstacle,
     }

@@ -113,8 +113,10 @@ def _heading(settings: Mapping[str, Any]) -> str:
     if settings["paper"]:
         lines.append(
             f"- rows `paper` are the paper's own results on {settings['paper']}; its views are not published, so they "
-            "are others than ours"
+            "are others than ours, and the k of its CV is unknown"
         )
+    if settings["paper_obstacle"]:
+        lines.append(f"- the paper's rows are left out: {settings['paper_obstacle']}")
     return "\n".join([*lines, ""])
 
 
