@@ -35,9 +35,8 @@ RUN = [
     "trainer.val_check_interval=3",
 ]
 
-# A process forked from this one has the slow imports behind it.
-_SERVER = multiprocessing.get_context("forkserver")
-_SERVER.set_forkserver_preload(["vg2gt.training", "vg2gt.evaluation.run", "vg2gt.ablate"])
+TRAIN, EVALUATE, ABLATE = "vg2gt.cli.train", "vg2gt.cli.evaluate", "vg2gt.ablate"
+PRELOADED = ["vg2gt.training", "vg2gt.evaluation.run", "vg2gt.ablate"]
 
 Moment = Callable[["Attempt"], bool]
 
@@ -61,12 +60,14 @@ class Attempt:
         folder: the run's folder.
         output: the file that its terminal output goes to.
         process: of the standard library, of either kind.
+        before: names and times of all in the folder when it was started.
         seen: notes of the moment that is waited for.
     """
 
     folder: Path
     output: Path
     process: Any
+    before: set[tuple[str, int]]
     seen: dict[str, Any] = field(default_factory=dict)
     started: float = field(default_factory=time.monotonic)
 
@@ -74,14 +75,24 @@ class Attempt:
         """Its exit status, None while it runs."""
         return self.process.poll() if isinstance(self.process, subprocess.Popen) else self.process.exitcode
 
+    def new(self) -> set[str]:
+        """Names, relative to the folder, of all that this process has written."""
+        return {name for name, _ in _contents(self.folder) - self.before}
+
+    def log(self) -> str:
+        """The log that this process writes; empty until it does."""
+        files = [name for name in self.new() if name.endswith("metrics.csv")]
+        return (self.folder / files[0]).read_text() if files else ""
+
     def said(self) -> str:
         """What it has written to the terminal so far."""
         return self.output.read_text(errors="replace") if self.output.is_file() else ""
 
     def kill(self) -> None:
-        """SIGKILL to the whole process group."""
-        with suppress(ProcessLookupError):
-            os.killpg(self.process.pid, signal.SIGKILL)
+        """SIGKILL to the whole process group, or to a process that has not founded it yet."""
+        for send in (os.killpg, os.kill):
+            with suppress(ProcessLookupError):
+                send(self.process.pid, signal.SIGKILL)
         self.wait()
 
     def wait(self) -> int:
@@ -115,11 +126,13 @@ def start(
         warm: forks a process that has imported everything; otherwise ``python -m`` as a user starts it.
         environment: more variables, for cold starts.
     """
-    output = folder.with_name(f"{folder.name}.out")
+    output, before = folder.with_name(f"{folder.name}.out"), _contents(folder)
     if warm:
-        process = _SERVER.Process(target=_run_main, args=(module, list(arguments), str(output), str(folder.parent)))
+        server = multiprocessing.get_context("forkserver")
+        server.set_forkserver_preload(PRELOADED)
+        process = server.Process(target=_run_main, args=(module, list(arguments), str(output), str(folder.parent)))
         process.start()
-        return Attempt(folder, output, process)
+        return Attempt(folder, output, process, before)
     with open(output, "ab") as file:
         process = subprocess.Popen(
             [sys.executable, "-m", module, *arguments],
@@ -129,7 +142,7 @@ def start(
             start_new_session=True,
             env={**os.environ, "OMP_NUM_THREADS": "1", **(environment or {})},
         )
-    return Attempt(folder, output, process)
+    return Attempt(folder, output, process, before)
 
 
 def training(folder: Path, cache: Path, *overrides: str) -> list[str]:
@@ -149,11 +162,11 @@ def finish(module: str, arguments: Sequence[str], folder: Path, warm: bool = Tru
 
 
 def after_seconds(seconds: float) -> Moment:
-    """Some time after the first step was logged: in a step, between steps, while a log is written."""
+    """Some time after the first row was logged: in a step, between steps, in an evaluation, while a file is written."""
 
     def come(attempt: Attempt) -> bool:
         if "since" not in attempt.seen:
-            if not _newest_log(attempt.folder).count("\n"):
+            if not attempt.log():
                 return False
             attempt.seen["since"] = time.monotonic()
         return time.monotonic() - attempt.seen["since"] >= seconds
@@ -163,48 +176,46 @@ def after_seconds(seconds: float) -> Moment:
 
 def while_a_checkpoint_is_written(attempt: Attempt) -> bool:
     """A checkpoint has only its temporary name."""
-    return any((attempt.folder / "checkpoints").glob("*.tmp"))
+    return any(name.endswith(".ckpt.tmp") for name in attempt.new())
 
 
-def after_a_checkpoint(number: int) -> Moment:
-    """A new checkpoint has its name, the oldest is not yet deleted; the step's row is not yet in the log."""
-
-    def come(attempt: Attempt) -> bool:
-        folder = attempt.folder / "checkpoints"
-        before = attempt.seen.setdefault("before", set(folder.glob("*.ckpt")))
-        return len(set(folder.glob("*.ckpt")) - before) >= number
-
-    return come
+def after_a_checkpoint(attempt: Attempt) -> bool:
+    """A checkpoint has its name, the oldest is not yet deleted; the step's row is not yet in the log."""
+    return any(name.endswith(".ckpt") for name in attempt.new())
 
 
 def in_validation(attempt: Attempt) -> bool:
-    """The row of the step before the evaluation is logged, that of the evaluation is not."""
-    log = _newest_log(attempt.folder)
-    return any(line.split(",")[_column(log, "step")] == "2" for line in log.splitlines()[1:])
+    """The row of the step before the first evaluation is logged, that of the evaluation is not."""
+    log = attempt.log()
+    if "train/" not in log:
+        return False
+    column = log.split("\n", 1)[0].split(",").index("step")
+    return any(line.split(",")[column] == "2" for line in log.splitlines()[1:])
 
 
 def in_first_evaluation(attempt: Attempt) -> bool:
     """The run's configuration is written, the metrics of the untrained head are not."""
-    return (attempt.folder / "config.yaml").is_file() and not (attempt.folder / "untrained.json").is_file()
+    return "config.yaml" in attempt.new()
 
 
 def in_last_evaluation(attempt: Attempt) -> bool:
-    """The last checkpoint is there, the report is not."""
-    return (attempt.folder / "checkpoints" / f"step-{STEPS}.ckpt").is_file()
+    """The last checkpoint is there, what trains and evaluates has begun, the report is not there."""
+    last = attempt.folder / "checkpoints" / f"step-{STEPS}.ckpt"
+    return last.is_file() and any(name.startswith("logs/version_") for name in attempt.new())
 
 
 def while_the_report_is_written(attempt: Attempt) -> bool:
     """The metrics are there, what is written after them may be missing."""
-    return (attempt.folder / "metrics.json").is_file()
+    return "metrics.json" in attempt.new()
 
 
-def _newest_log(folder: Path) -> str:
-    files = sorted(folder.glob("logs/version_*/metrics.csv"), key=lambda path: path.stat().st_mtime)
-    return files[-1].read_text() if files else ""
-
-
-def _column(log: str, name: str) -> int:
-    return log.split("\n", 1)[0].split(",").index(name)
+def _contents(folder: Path) -> set[tuple[str, int]]:
+    """Relative names and times of all in a folder."""
+    found = set()
+    for path in folder.rglob("*"):
+        with suppress(FileNotFoundError):  # renamed meanwhile
+            found.add((str(path.relative_to(folder)), path.stat().st_mtime_ns))
+    return found
 
 
 # ------------------------------------------------------------------------------------------------------- results
