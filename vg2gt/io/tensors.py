@@ -23,7 +23,7 @@ def read_torch(path: str | Path) -> Any:
     """
     path = Path(path)
     try:
-        _refuse_compressed(path)
+        _refuse_foreign(path)
         return torch.load(path, map_location="cpu", weights_only=True)
     except (FileNotFoundError, FormatError):
         raise
@@ -51,11 +51,13 @@ def read_tensors(path: str | Path) -> dict[str, Tensor]:
         raise FormatError(f"{path} is damaged or no safetensors file: {error}") from error
 
 
-def _refuse_compressed(path: Path) -> None:
-    """A compressed archive could unpack to a thousand times its size."""
+def _refuse_foreign(path: Path) -> None:
+    """A compressed archive could unpack to a thousand times its size; one of TorchScript holds programs."""
     if not zipfile.is_zipfile(path):
         return
     with zipfile.ZipFile(path) as archive:
         for member in archive.infolist():
             if member.compress_type != zipfile.ZIP_STORED or member.file_size > member.compress_size:
                 raise FormatError(f"{path} is no file of torch.save: {member.filename} in it is compressed")
+            if member.filename.endswith("/constants.pkl"):
+                raise FormatError(f"{path} holds programs besides tensors (TorchScript): export the bare state dict")

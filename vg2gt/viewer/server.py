@@ -3,8 +3,14 @@
 from __future__ import annotations
 
 import importlib.util
+import ipaddress
 import math
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+from http import HTTPStatus
 from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
 
 import torch
 
@@ -30,7 +36,9 @@ def start_server(scene: ViewerScene, host: str = LOOPBACK, port: int = PORT, sha
     """Serves the scene until ``stop()`` of what it returns.
 
     Colours are those of degree 0: viser's splats do not depend on the view. Its page has a button that publishes the
-    scene through an outside server; here it does nothing unless ``share`` is true, whoever asks.
+    scene through an outside server; here it does nothing unless ``share`` is true, whoever asks. Unless it is shared,
+    only the page itself may ask: other pages in the same browser are refused, also under a name of their own that
+    leads to this machine.
 
     Args:
         scene: what to show; not changed.
@@ -56,13 +64,59 @@ def start_server(scene: ViewerScene, host: str = LOOPBACK, port: int = PORT, sha
         def request_share_url(self, verbose: bool = True) -> str | None:
             return super().request_share_url(verbose) if share else None
 
-    server = Server(host=host, port=port, label=scene.title, verbose=False)
+    with _refusing_other_pages(share):
+        server = Server(host=host, port=port, label=scene.title, verbose=False)
     try:
         _fill(server, scene)
     except BaseException:
         server.stop()
         raise
     return server
+
+
+def is_own_request(hosts: list[str], origins: list[str]) -> bool:
+    """Whether a request comes from the served page, or from its user.
+
+    Args:
+        hosts: the request's ``Host`` headers. An attacker's name may lead to this machine (DNS rebinding), so the host
+            must be an address, ``localhost`` or this machine's name.
+        origins: its ``Origin`` headers, which browsers send with a page's requests; the page's own host, or none.
+    """
+    if len(hosts) != 1 or len(origins) > 1:
+        return False
+    try:
+        name = urlsplit(f"//{hosts[0]}").hostname or ""
+    except ValueError:
+        return False
+    if name not in ("localhost", socket.gethostname().lower(), socket.getfqdn().lower()):
+        try:
+            ipaddress.ip_address(name)
+        except ValueError:
+            return False
+    return all(origin in (f"http://{hosts[0]}", f"https://{hosts[0]}") for origin in origins)
+
+
+@contextmanager
+def _refusing_other_pages(share: bool) -> Iterator[None]:
+    """Servers that viser begins inside the block answer :func:`is_own_request` only; viser itself asks nobody."""
+    from websockets.asyncio import server  # pyright: ignore[reportMissingImports]  # viser's
+
+    serve = server.serve
+
+    def guarded(*arguments: Any, process_request: Any = None, **options: Any) -> Any:
+        def check(connection: Any, request: Any) -> Any:
+            headers = request.headers
+            if share or is_own_request(headers.get_all("Host"), headers.get_all("Origin")):
+                return process_request(connection, request)
+            return connection.respond(HTTPStatus.FORBIDDEN, "not from another page\n")
+
+        return serve(*arguments, process_request=check, **options)
+
+    server.serve = guarded
+    try:
+        yield
+    finally:
+        server.serve = serve
 
 
 def _fill(server: viser.ViserServer, scene: ViewerScene) -> None:

@@ -15,7 +15,7 @@ from vg2gt.data.base import DataError
 from vg2gt.data.image_files import image_size, read_depth
 from vg2gt.data.sources.files import FileSource
 from vg2gt.data.sources.index import SceneIndex, Size, make_index
-from vg2gt.data.sources.parsing import pinhole, read_numbers, read_text_lines
+from vg2gt.data.sources.parsing import named_file, pinhole, read_numbers, read_text_lines
 from vg2gt.data.sources.scene_folders import scene_folders
 
 DEPTH_SCALE = 5000.0
@@ -97,8 +97,8 @@ class TUM(FileSource):
         pose_times, poses = _read_poses(folder / "groundtruth.txt", scene)
         depth = associate(times, depth_times, self.max_difference)
         pose = associate(times, pose_times, self.max_difference)
-        color = {i: folder / file for i, file in enumerate(files) if os.path.isfile(folder / file)}
-        depth_paths = {i: folder / depth_files[j] for i, j in depth.items()}
+        color = {i: file for i, file in enumerate(files) if os.path.isfile(file)}
+        depth_paths = {i: depth_files[j] for i, j in depth.items()}
         depth_paths = {i: path for i, path in depth_paths.items() if os.path.isfile(path)}
         if not color or not depth_paths:
             raise DataError(
@@ -152,8 +152,8 @@ def associate(times: NDArray[np.float64], others: NDArray[np.float64], max_diffe
     return pairs
 
 
-def _read_list(path: Path, scene: str) -> tuple[NDArray[np.float64], list[str]]:
-    """Increasing times, and the files taken at them."""
+def _read_list(path: Path, scene: str) -> tuple[NDArray[np.float64], list[Path]]:
+    """Increasing times, and the files taken at them, which lie beside the list."""
     entries: dict[float, str] = {}
     for line in read_text_lines(path, scene):
         words = line.split(maxsplit=1)
@@ -166,7 +166,8 @@ def _read_list(path: Path, scene: str) -> tuple[NDArray[np.float64], list[str]]:
     if not entries:
         raise DataError(f"{path} of scene {scene} lists no file")
     times = sorted(entries)
-    return np.array(times), [entries[time] for time in times]
+    where = f"{path} of scene {scene}"
+    return np.array(times), [named_file(path.parent, entries[time], where) for time in times]
 
 
 def _read_poses(path: Path, scene: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

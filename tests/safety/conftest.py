@@ -1,0 +1,79 @@
+"""Malicious files. Each would make the canary file if anything in it ran; no test may leave one behind."""
+
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from vg2gt.data import SyntheticScenes
+from vg2gt.data.shards import write_shards
+from vg2gt.reconstruction import load_model
+from vg2gt.reconstruction.models import compose_part
+
+SIZE = (24, 32)
+
+
+class Armed:
+    """An object whose unpickling makes a file."""
+
+    def __init__(self, canary: Path) -> None:
+        self.canary = canary
+
+    def __reduce__(self):
+        return os.system, (f"touch {self.canary}",)
+
+
+@pytest.fixture
+def canary(tmp_path: Path) -> Iterator[Path]:
+    path = tmp_path / "canary"
+    yield path
+    assert not path.exists(), "code in a malicious file was executed"
+
+
+@pytest.fixture
+def armed(canary: Path) -> Armed:
+    return Armed(canary)
+
+
+@pytest.fixture
+def pickled_array(armed: Armed) -> np.ndarray:
+    array = np.empty(1, object)
+    array[0] = armed
+    return array
+
+
+@pytest.fixture(scope="session")
+def model():
+    return load_model(backend="oracle,depth_noise=0", device="cpu").model
+
+
+@pytest.fixture
+def run_folder(model, tmp_path: Path) -> Path:
+    """A training run's folder."""
+    folder = tmp_path / "run"
+    (folder / "checkpoints").mkdir(parents=True)
+    parts = {"backend": "oracle", "model": "tiny", "renderer": "solid"}
+    config = {name: compose_part(name, choice) for name, choice in parts.items()}
+    OmegaConf.save(OmegaConf.create(config), folder / "config.yaml")
+    state = {f"model.{key}": value for key, value in model.state_dict().items() if not key.startswith("backend.")}
+    checkpoint = {"state_dict": state, "backend": dict(model.backend.identity()), "global_step": 7}
+    torch.save(checkpoint, folder / "checkpoints" / "step-7.ckpt")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def rooms(tmp_path_factory: pytest.TempPathFactory) -> SyntheticScenes:
+    return SyntheticScenes(1, num_frames=3, size=SIZE, cache_dir=str(tmp_path_factory.mktemp("rooms")))
+
+
+@pytest.fixture
+def write_shards_to(rooms: SyntheticScenes) -> Callable[[Path], Path]:
+    def write(folder: Path) -> Path:
+        write_shards(rooms, folder)
+        return folder
+
+    return write

@@ -1,0 +1,267 @@
+"""Pictures, headers and names that ask for too much, for other programs, or for files that are not theirs."""
+
+import io
+import json
+import os
+import struct
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from vg2gt.data import DataError
+from vg2gt.data.image_files import image_size, photo_size, read_color, read_depth, read_photo
+from vg2gt.data.sources import COLMAP, TUM, Nerfstudio
+from vg2gt.data.sources.sens import scan_sens
+from vg2gt.io import (
+    FormatError,
+    read_cameras_json,
+    read_colmap,
+    read_gaussian_ply,
+    read_splat,
+    read_transforms,
+    read_video,
+)
+from vg2gt.io.cameras_json import NamedCamera
+from vg2gt.io.images import open_image
+from vg2gt.viewer import load_pictures
+
+HUGE = 1 << 60
+
+
+def png_of(width: int, height: int) -> bytes:
+    """A PNG file that claims a size and holds next to nothing."""
+
+    def chunk(kind: bytes, content: bytes) -> bytes:
+        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"")) + chunk(b"IEND", b"")
+
+
+def eps(canary: Path) -> bytes:
+    """PostScript is a program; Pillow would hand it to Ghostscript, whatever the file's name says."""
+    text = f"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 10 10\n({canary}) (w) file closefile\nshowpage\n%%EOF\n"
+    return text.encode()
+
+
+PICTURES: dict[str, Callable[[Path], bytes]] = {
+    "bomb": lambda canary: png_of(100_000, 100_000),
+    "larger bomb": lambda canary: png_of(2**31 - 1, 2**31 - 1),
+    "postscript": eps,
+    "pdf": lambda canary: b"%PDF-1.4\n1 0 obj <</OpenAction <</S /Launch>>>> endobj",
+    "icon": lambda canary: b"\0\0\1\0\1\0\0\0\0\0\1\0\x20\0\xff\xff\xff\x7f\x16\0\0\0",
+    "svg": lambda canary: b'<svg xmlns="http://www.w3.org/2000/svg"><image href="file:///etc/passwd"/></svg>',
+    "netpbm bomb": lambda canary: b"P6 1000000 1000000 255\n" + bytes(9),
+    "text bomb": lambda canary: png_of(1, 1)[:33] + zipped_text() + png_of(1, 1)[33:],
+    "python": lambda canary: f"import os\nopen({str(canary)!r}, 'w')\n".encode(),
+}
+
+
+def zipped_text() -> bytes:
+    content = b"Comment\0\0" + zlib.compress(bytes(256 << 20))
+    return struct.pack(">I", len(content)) + b"zTXt" + content + struct.pack(">I", zlib.crc32(b"zTXt" + content))
+
+
+@pytest.mark.parametrize("name", PICTURES)
+def test_pictures(tmp_path: Path, canary: Path, name: str) -> None:
+    path = tmp_path / "0001.png"
+    path.write_bytes(PICTURES[name](canary))
+    for read in (read_color, read_photo, read_depth):
+        with pytest.raises(DataError, match=r"cannot read .*0001\.png of scene s"):
+            read(path, "s")
+    camera = NamedCamera("0001.png", 9, 9, np.eye(3), np.eye(4))
+    with pytest.raises(ValueError, match=r"cannot read .*0001\.png"):
+        load_pictures([camera], tmp_path)
+    if "bomb" not in name:
+        for size in (image_size, photo_size):
+            with pytest.raises(DataError, match=r"cannot read .*0001\.png of scene s"):
+                size(path, "s")
+    moving = tmp_path / "moving.gif"
+    moving.write_bytes(path.read_bytes())
+    with pytest.raises(FormatError, match=r"moving\.gif"):
+        list(read_video(moving))
+
+
+def test_ordinary_pictures_are_read(tmp_path: Path) -> None:
+    picture = Image.fromarray(np.arange(48, dtype=np.uint8).reshape(4, 4, 3))
+    for kind in ("PNG", "JPEG", "TIFF", "PPM", "WEBP", "BMP", "GIF"):
+        buffer = io.BytesIO()
+        picture.save(buffer, kind)
+        assert open_image(buffer).convert("RGB").size == (4, 4), kind
+
+
+def ply(lines: str, encoding: str = "binary_little_endian") -> bytes:
+    return f"ply\nformat {encoding} 1.0\n{lines}end_header\n".encode() + bytes(64)
+
+
+POSITION = "property float x\nproperty float y\nproperty float z\n"
+PLYS = {
+    "2^60 vertices": ply(f"element vertex {HUGE}\n{POSITION}"),
+    "2^60 lines": ply(f"element vertex {HUGE}\n{POSITION}", "ascii"),
+    "2^60 before": ply(f"element other {HUGE}\nproperty double a\nelement vertex 1\n{POSITION}"),
+    "2^60 lines before": ply(f"element other {HUGE}\nproperty double a\nelement vertex 1\n{POSITION}", "ascii"),
+    "10^30 vertices": ply(f"element vertex 1{'0' * 30}\n{POSITION}"),
+    "2^40 vertices": ply(f"element vertex {1 << 40}\n{POSITION}"),
+    "negative": ply(f"element vertex -1\n{POSITION}"),
+    "endless header": b"ply\nformat ascii 1.0\n" + b"comment x\n" * 100_000,
+    "many properties": ply("element vertex 1\n" + "".join(f"property float p{i}\n" for i in range(9000))),
+}
+
+
+@pytest.mark.parametrize("name", PLYS)
+def test_ply_headers(tmp_path: Path, name: str) -> None:
+    path = tmp_path / "scene.ply"
+    path.write_bytes(PLYS[name])
+    with pytest.raises(FormatError, match=r"scene\.ply"):
+        read_gaussian_ply(path)
+
+
+def test_splats(tmp_path: Path) -> None:
+    path = tmp_path / "scene.splat"
+    path.write_bytes(bytes(33))
+    with pytest.raises(FormatError, match=r"scene\.splat"):
+        read_splat(path)
+
+
+COUNT = struct.pack("<Q", HUGE)
+CAMERA = struct.pack("<QIiQQ4d", 1, 1, 1, 64, 48, 50, 50, 32, 24)
+POSE = struct.pack("<I7dI", 1, 1, 0, 0, 0, 0, 0, 0, 1)
+MODELS = {
+    "2^60 cameras": {"cameras": COUNT + bytes(64)},
+    "2^60 images": {"images": COUNT + bytes(64)},
+    "2^60 points": {"points3D": COUNT + bytes(64)},
+    "2^60 features": {"images": struct.pack("<Q", 1) + POSE + b"a.png\0" + COUNT + bytes(64)},
+    "2^60 observations": {"points3D": struct.pack("<Q", 1) + struct.pack("<Q3d3BdQ", 1, 0, 0, 0, 0, 0, 0, 0, HUGE)},
+    "endless name": {"images": struct.pack("<Q", 1) + POSE + b"a" * 100_000},
+}
+
+
+def colmap_model(folder: Path, name: str = "a.png", **files: bytes) -> Path:
+    folder.mkdir(parents=True)
+    image = struct.pack("<Q", 1) + POSE + name.encode() + b"\0" + bytes(8)
+    for file, content in {"cameras": CAMERA, "images": image, "points3D": bytes(8), **files}.items():
+        (folder / f"{file}.bin").write_bytes(content)
+    return folder
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_colmap_headers(tmp_path: Path, name: str) -> None:
+    assert read_colmap(colmap_model(tmp_path / "good")).images[1].name == "a.png"
+    with pytest.raises(FormatError, match=r"bad"):
+        read_colmap(colmap_model(tmp_path / "bad", **MODELS[name]))
+
+
+def test_sens_headers(tmp_path: Path) -> None:
+    path = tmp_path / "scan.sens"
+    sizes = (640, 480, 640, 480)
+    for name_length, count, sides, frame in (
+        (HUGE, 1, sizes, b""),
+        (0, HUGE, sizes, b""),
+        (0, 1, (1 << 31,) * 4, b""),
+        (0, 1, sizes, bytes(80) + struct.pack("<2Q", HUGE, HUGE)),
+        (0, 1, sizes, bytes(80) + struct.pack("<2Q", (1 << 64) - 1, 1)),
+    ):
+        header = struct.pack("<IQ", 4, name_length) + bytes(256) + struct.pack("<2i4I", 2, 1, *sides)
+        path.write_bytes(header + struct.pack("<fQ", 1000, count) + frame)
+        with pytest.raises(DataError, match=r"cannot read .*scan\.sens of scene s"):
+            scan_sens(path, "s")
+
+
+def test_json_files(tmp_path: Path) -> None:
+    path = tmp_path / "cameras.json"
+    camera = {
+        "name": "a",
+        "width": 8,
+        "height": 8,
+        "intrinsics": np.eye(3).tolist(),
+        "world_to_camera": np.eye(4).tolist(),
+    }
+    for content in (
+        "[" * 100_000,
+        json.dumps([{**camera, "width": HUGE}]),
+        json.dumps([{**camera, "height": -1}]),
+        "[" + json.dumps(camera).replace("8", "1" * 5000) + "]",
+    ):
+        path.write_text(content)
+        with pytest.raises(FormatError, match=r"cameras\.json"):
+            read_cameras_json(path)
+    path = path.rename(tmp_path / "transforms.json")
+    pose = np.eye(4).tolist()
+    for content in ("[" * 100_000, '{"frames": ' + "[" * 100_000, json.dumps({"w": HUGE, "fl_x": 1, "frames": []})):
+        path.write_text(content)
+        with pytest.raises(FormatError, match=r"transforms\.json"):
+            read_transforms(path)
+    path.write_text(json.dumps({"fl_x": 9, "frames": [{"file_path": "a.png", "transform_matrix": pose}]}))
+    assert read_transforms(path).frames[0].file_path == "a.png"
+
+
+NAMES = ["../secret.png", "/etc/passwd", "a/../../secret.png", "images/../../secret.png", "../scene/../secret.png"]
+
+
+@pytest.fixture
+def secret(tmp_path: Path) -> Path:
+    """A picture beside the scene's folder, which no scene may read."""
+    path = tmp_path / "secret.png"
+    Image.new("RGB", (64, 48), "red").save(path)
+    return path
+
+
+@pytest.mark.parametrize("name", [*NAMES, "SECRET"])
+@pytest.mark.parametrize("field", ["file_path", "depth_file_path"])
+def test_transforms_name_files_of_their_folder(tmp_path: Path, secret: Path, name: str, field: str) -> None:
+    folder = tmp_path / "scene"
+    folder.mkdir()
+    Image.new("RGB", (64, 48)).save(folder / "a.png")
+    frame = {"file_path": "a.png", "depth_file_path": "a.png", "transform_matrix": np.eye(4).tolist()}
+    frame[field] = str(secret) if name == "SECRET" else name
+    (folder / "transforms.json").write_text(json.dumps({"fl_x": 50, "frames": [frame]}))
+    source = Nerfstudio(str(folder), depth=True)
+    with pytest.raises(DataError, match=r"transforms\.json of scene scene names the file .* which lies outside"):
+        source.frames("scene")
+
+
+@pytest.mark.parametrize("name", [*NAMES, "SECRET"])
+def test_colmap_models_name_images_of_their_folder(tmp_path: Path, secret: Path, name: str) -> None:
+    colmap_model(tmp_path / "scene" / "sparse" / "0", str(secret) if name == "SECRET" else name)
+    (tmp_path / "scene" / "images").mkdir()
+    with pytest.raises(DataError, match=r"names the file .* which lies outside .*images"):
+        COLMAP(str(tmp_path / "scene")).frames("scene")
+
+
+@pytest.mark.parametrize("name", [*NAMES, "SECRET"])
+@pytest.mark.parametrize("file", ["rgb.txt", "depth.txt"])
+def test_lists_of_recordings_name_files_of_their_folder(tmp_path: Path, secret: Path, name: str, file: str) -> None:
+    folder = tmp_path / "freiburg1_x"
+    folder.mkdir()
+    Image.new("RGB", (640, 480)).save(folder / "a.png")
+    for other in ("rgb.txt", "depth.txt"):
+        (folder / other).write_text("1.0 a.png\n")
+    (folder / file).write_text(f"1.0 {secret if name == 'SECRET' else name}\n")
+    (folder / "groundtruth.txt").write_text("1.0 0 0 0 0 0 0 1\n")
+    source = TUM(str(folder))
+    with pytest.raises(DataError, match=rf"{file} of scene .* names the file .* which lies outside"):
+        source.frames(source.scenes[0])
+
+
+def test_names_inside_and_links_of_the_users_own_are_fine(tmp_path: Path) -> None:
+    folder, elsewhere = tmp_path / "scene", tmp_path / "large_disk"
+    elsewhere.mkdir()
+    folder.mkdir()
+    Image.new("RGB", (64, 48)).save(elsewhere / "a.png")
+    (folder / "images").symlink_to(elsewhere)
+    names = ["images/a.png", "./images/a.png", str(folder / "images" / "a.png"), "x/../images/a.png"]
+    frames = [{"file_path": name, "transform_matrix": np.eye(4).tolist()} for name in names]
+    (folder / "transforms.json").write_text(json.dumps({"fl_x": 50, "frames": frames}))
+    assert len(Nerfstudio(str(folder)).frames("scene")) == 4
+
+
+def test_viewers_show_pictures_of_their_folder_only(tmp_path: Path, secret: Path) -> None:
+    folder = tmp_path / "images"
+    folder.mkdir()
+    os.symlink(secret, folder / "link.png")
+    for name in (*NAMES, str(secret), "link.png", "a\0b"):
+        assert load_pictures([NamedCamera(name, 9, 9, np.eye(3), np.eye(4))], folder) == [None]

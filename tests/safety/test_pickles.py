@@ -1,0 +1,237 @@
+"""Nothing that is loaded is unpickled: checkpoints, weights, arrays, caches, shards."""
+
+import io
+import logging
+import pickle
+import re
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from backends.vggt import VGGTBackend
+from backends.weights import find_weights
+from tests.safety.conftest import SIZE, Armed
+from vg2gt.checkpoints import AtomicCheckpointIO, initialize_from, read_checkpoint
+from vg2gt.data import DataError, RGBDFolder, ShardedScenes, SyntheticScenes
+from vg2gt.data.framing import FramingSampler
+from vg2gt.data.resized_cache import ResizedCache
+from vg2gt.data.sharded_scenes import INDEX
+from vg2gt.data.sources.arrays import load_matrices, load_npy
+from vg2gt.data.sources.parsing import load_npz
+from vg2gt.io.errors import FormatError
+from vg2gt.io.npz import read_npz
+from vg2gt.io.tensors import read_tensors
+from vg2gt.metrics.lpips import load_lpips
+from vg2gt.reconstruction import load_model
+
+
+def zipped(armed: Armed) -> bytes:
+    buffer = io.BytesIO()
+    torch.save({"global_step": 1, "state_dict": {"w": armed}}, buffer)
+    return buffer.getvalue()
+
+
+def legacy(armed: Armed) -> bytes:
+    buffer = io.BytesIO()
+    torch.save({"w": armed}, buffer, _use_new_zipfile_serialization=False)
+    return buffer.getvalue()
+
+
+def script(armed: Armed) -> bytes:
+    """A TorchScript archive holds code: constants.pkl, and code/ to be compiled."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        archive.writestr("m/data.pkl", pickle.dumps(armed))
+        archive.writestr("m/constants.pkl", pickle.dumps(armed))
+        archive.writestr("m/code/__torch__.py", "import os")
+        archive.writestr("m/version", "3\n")
+    return buffer.getvalue()
+
+
+def by_name(armed: Armed) -> bytes:
+    """No class at all: the opcodes themselves."""
+    return b"cos\nsystem\n(S'touch " + str(armed.canary).encode() + b"'\ntR."
+
+
+PICKLES: dict[str, Callable[[Armed], bytes]] = {
+    "zip": zipped,
+    "legacy": legacy,
+    "pickle 0": lambda armed: pickle.dumps(armed, 0),
+    "pickle 5": lambda armed: pickle.dumps({"w": armed}, 5),
+    "opcodes": by_name,
+    "script": script,
+}
+
+
+def test_the_attack_works(tmp_path: Path) -> None:
+    pickle.loads(by_name(Armed(tmp_path / "first")))
+    torch.load(io.BytesIO(zipped(Armed(tmp_path / "second"))), weights_only=False)
+    assert (tmp_path / "first").exists()
+    assert (tmp_path / "second").exists()
+
+
+@pytest.mark.parametrize("kind", PICKLES)
+def test_checkpoints(run_folder: Path, armed: Armed, kind: str) -> None:
+    path = run_folder / "checkpoints" / "step-7.ckpt"
+    path.write_bytes(PICKLES[kind](armed))
+    for read in (
+        lambda: read_checkpoint(path),
+        lambda: AtomicCheckpointIO().load_checkpoint(path, weights_only=False),
+        lambda: initialize_from(torch.nn.Linear(1, 1), path),
+        lambda: load_model(path, device="cpu"),
+    ):
+        with pytest.raises(ValueError, match=r"step-7\.ckpt is damaged or not a checkpoint"):
+            read()
+
+
+@pytest.mark.parametrize("kind", PICKLES)
+@pytest.mark.parametrize("suffix", [".pt", ".bin", ".pth", ".safetensors"])
+def test_weights(tmp_path: Path, armed: Armed, kind: str, suffix: str) -> None:
+    path = tmp_path / f"model{suffix}"
+    path.write_bytes(PICKLES[kind](armed))
+    with pytest.raises(FormatError, match=rf"model\{suffix} (is damaged or|holds programs)"):
+        read_tensors(find_weights("vggt", None, None, str(path)))
+    with pytest.raises(FormatError, match=rf"model\{suffix} (is damaged or|holds programs)"):
+        VGGTBackend(pretrained=True, path=str(path))
+    if suffix in (".pth", ".safetensors"):
+        with pytest.raises(FormatError, match=rf"model\{suffix} (is damaged or|holds programs)"):
+            load_lpips(str(path))
+
+
+HEADERS = {
+    "huge header": (2**60).to_bytes(8, "little") + b"{}",
+    "huge tensor": b'{"w":{"dtype":"F32","shape":[1152921504606846976],"data_offsets":[0,4]}}',
+    "huge offsets": b'{"w":{"dtype":"F32","shape":[1],"data_offsets":[0,1152921504606846976]}}',
+    "overlap": b'{"a":{"dtype":"F32","shape":[1],"data_offsets":[0,4]},"b":{"dtype":"F32","shape":[1],"data_offsets":[0,4]}}',
+    "negative": b'{"w":{"dtype":"F32","shape":[-1],"data_offsets":[0,4]}}',
+    "unknown type": b'{"w":{"dtype":"object","shape":[1],"data_offsets":[0,4]}}',
+    "no JSON": b"__import__('os').system('touch canary')",
+}
+
+
+@pytest.mark.parametrize("name", HEADERS)
+def test_safetensors_headers(tmp_path: Path, name: str) -> None:
+    header = HEADERS[name]
+    path = tmp_path / "model.safetensors"
+    path.write_bytes((b"" if name == "huge header" else len(header).to_bytes(8, "little")) + header + bytes(4))
+    with pytest.raises(FormatError, match="no safetensors file"):
+        read_tensors(path)
+
+
+def test_huge_tensors_of_a_legacy_file(tmp_path: Path) -> None:
+    buffer = io.BytesIO()
+    torch.save({"w": torch.zeros(77)}, buffer, _use_new_zipfile_serialization=False)
+    content = buffer.getvalue().replace(b"KM", b"\x8a\x07\xff\xff\xff\xff\xff\xff\x0f")  # the number 77 of the storage
+    assert content != buffer.getvalue()
+    path = tmp_path / "model.pt"
+    path.write_bytes(content)
+    with pytest.raises(FormatError, match="is damaged or holds more"):
+        read_tensors(path)
+
+
+def saved(name: str, array: np.ndarray) -> bytes:
+    buffer = io.BytesIO()
+    np.savez(buffer, **{name: array})  # pyright: ignore[reportArgumentType]
+    return buffer.getvalue()
+
+
+def test_arrays(tmp_path: Path, pickled_array: np.ndarray, armed: Armed) -> None:
+    path, flat = tmp_path / "scene.npz", tmp_path / "depth.npy"
+    np.save(flat, pickled_array, allow_pickle=True)
+    np.load(io.BytesIO(saved("depth", np.zeros(1))))
+    for content in (saved("depth", pickled_array), pickle.dumps(armed), flat.read_bytes()):
+        path.write_bytes(content)
+        with pytest.raises(FormatError, match="no readable archive|single array"):
+            read_npz(path, ("depth",))
+        with pytest.raises(DataError, match=r"cannot read .*scene\.npz of scene s"):
+            load_npz(path, "s", ("depth",))
+        with pytest.raises(DataError, match=r"cannot read .*scene\.npz of scene s"):
+            load_matrices(path, "s", {"depth": (None,)})
+    for content in (flat.read_bytes(), pickle.dumps(armed), saved("depth", np.zeros(1))):
+        flat.write_bytes(content)
+        with pytest.raises(DataError, match=r"cannot read|is not a depth image"):
+            load_npy(flat, "s", (1, 1))
+
+
+@pytest.fixture
+def recording(rooms: SyntheticScenes, tmp_path: Path) -> Path:
+    from PIL import Image
+
+    folder = tmp_path / "office"
+    frames = rooms.load(rooms.scenes[0], [0, 1])
+    for name in ("images", "depth"):
+        (folder / name).mkdir(parents=True)
+    for i in range(2):
+        colour = (frames.images[i].permute(1, 2, 0).numpy() * 255).astype(np.uint8)
+        Image.fromarray(colour).save(folder / "images" / f"{i}.png")
+        Image.fromarray((frames.depth[i].numpy() * 1000).astype(np.uint16)).save(folder / "depth" / f"{i}.png")
+    np.savetxt(folder / "poses.txt", np.linalg.inv(frames.world_to_camera.double().numpy()).reshape(-1, 16))
+    np.savetxt(folder / "K.txt", frames.intrinsics[0].numpy())
+    return folder
+
+
+def test_index_caches(
+    recording: Path, tmp_path: Path, pickled_array: np.ndarray, armed: Armed, caplog: pytest.LogCaptureFixture
+) -> None:
+    cache = tmp_path / "cache"
+
+    def frames() -> list[int]:
+        source = RGBDFolder(str(recording), holdout=None, index_cache=str(cache))
+        return list(source.frames(source.scenes[0]))
+
+    assert frames() == [0, 1]
+    (path,) = cache.rglob("*.npz")
+    with np.load(path) as stored:
+        good = dict(stored)
+    for name in ("state", "extra", "color", "frame_ids"):
+        caplog.clear()
+        np.savez(path, **{**good, name: pickled_array})  # pyright: ignore[reportArgumentType]
+        assert frames() == [0, 1]
+        assert "the cached index is damaged and is made again" in caplog.text
+    path.write_bytes(pickle.dumps(armed))
+    assert frames() == [0, 1]
+
+
+def test_resized_frames_and_rooms(
+    tmp_path: Path, pickled_array: np.ndarray, armed: Armed, caplog: pytest.LogCaptureFixture
+) -> None:
+    rooms = SyntheticScenes(1, num_frames=1, size=SIZE, cache_dir=str(tmp_path / "rooms"))
+    framing = FramingSampler(SIZE)
+    expected = ResizedCache(rooms, tmp_path / "resized", framing).load(rooms.scenes[0], [0])
+    for folder, said in (("resized", "resized frame .* is damaged"), ("rooms", "cached scene .* is damaged")):
+        (path,) = (tmp_path / folder).rglob("*.npz")
+        with np.load(path) as stored:
+            good = dict(stored)
+        for hostile in ({**good, "depth": pickled_array}, None):
+            caplog.clear()
+            if hostile is None:
+                path.write_bytes(pickle.dumps(armed))
+            else:
+                np.savez(path, **hostile)  # pyright: ignore[reportArgumentType]
+            source: Any = SyntheticScenes(1, num_frames=1, size=SIZE, cache_dir=str(tmp_path / "rooms"))
+            if folder == "resized":
+                source = ResizedCache(rooms, tmp_path / "resized", framing)
+            with caplog.at_level(logging.WARNING):
+                found = source.load(rooms.scenes[0], [0])
+            assert torch.equal(found.depth, expected.depth)
+            assert caplog.records
+            assert re.search(said, caplog.text)
+
+
+def test_shard_indices(write_shards_to, tmp_path: Path, pickled_array: np.ndarray, armed: Armed) -> None:
+    folder = write_shards_to(tmp_path / "shards")
+    with np.load(folder / INDEX) as stored:
+        good = dict(stored)
+    for name in ("meta", "frame_ids", "image", "intrinsics"):
+        np.savez(folder / INDEX, **{**good, name: pickled_array})  # pyright: ignore[reportArgumentType]
+        with pytest.raises(DataError, match=r"index\.npz is damaged"):
+            ShardedScenes(str(folder))
+    for content in (pickle.dumps(armed), by_name(armed), zipped(armed)):
+        (folder / INDEX).write_bytes(content)
+        with pytest.raises(DataError, match=r"index\.npz is damaged"):
+            ShardedScenes(str(folder))

@@ -1,0 +1,214 @@
+"""What a run's config.yaml, a checkpoint's hyper-parameters or a bundle's JSON names is not called."""
+
+import logging
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from vg2gt.evaluation.run import _refuse_training_views
+from vg2gt.paths import config_dir
+from vg2gt.reconstruction import load_model
+from vg2gt.study import _refuse_other_run
+from vg2gt.training import _name_differences
+from vg2gt.trust import ENVIRONMENT, UntrustedError, check_targets, read_run_config
+
+Attack = Callable[[str], dict[str, Any]]
+
+ATTACKS: dict[str, Attack] = {
+    "os.system": lambda c: {"_target_": "os.system", "_args_": [f"touch {c}"]},
+    "posix.system": lambda c: {"_target_": "posix.system", "_args_": [f"touch {c}"]},
+    "builtins.eval": lambda c: {"_target_": "builtins.eval", "_args_": [f"open({c!r}, 'w')"]},
+    "builtins.exec": lambda c: {"_target_": "builtins.exec", "_args_": [f"open({c!r}, 'w')"]},
+    "builtins.open": lambda c: {"_target_": "builtins.open", "file": c, "mode": "w"},
+    "pathlib": lambda c: {"_target_": "pathlib.Path.touch", "_args_": [{"_target_": "pathlib.Path", "_args_": [c]}]},
+    "Popen": lambda c: {"_target_": "subprocess.Popen", "args": ["touch", c]},
+    "pickle": lambda c: {"_target_": "pickle.loads", "_args_": ["cos\nsystem\n(S'touch " + c + "'\ntR."]},
+    "torch.load": lambda c: {"_target_": "torch.load", "f": c, "weights_only": False},
+    "torch.hub": lambda c: {"_target_": "torch.hub.load", "repo_or_dir": c, "model": "m", "source": "local"},
+    "get_method": lambda c: {"_target_": "hydra.utils.get_method", "path": "os.system"},
+    "hydra": lambda c: {"_target_": "hydra.utils.instantiate", "config": {"_target_": "os.mkdir", "path": c}},
+    "import": lambda c: {"_target_": "importlib.import_module", "name": "antigravity"},
+    "partial": lambda c: {"_target_": "os.mkdir", "_partial_": True, "path": c},
+    "nested": lambda c: {"_target_": "vg2gt.model.SceneScale", "source": {"_target_": "os.mkdir", "path": c}},
+    "in args": lambda c: {"_target_": "vg2gt.model.SceneScale", "_args_": [[{"_target_": "os.mkdir", "path": c}]]},
+    "not recursive": lambda c: {
+        "_target_": "vg2gt.model.SceneScale", "_recursive_": False, "x": {"_target_": "os.mkdir", "path": c},
+    },
+    "through a module of ours": lambda c: {"_target_": "vg2gt.io.video.subprocess.run", "args": ["touch", c]},
+    "through torch": lambda c: {"_target_": "vg2gt.model.torch.os.mkdir", "path": c},
+    "a function of ours": lambda c: {"_target_": "vg2gt.io.files.write_text", "path": c, "content": ""},
+    "training": lambda c: {"_target_": "vg2gt.training.train", "config": {"output_dir": c}},
+    "a method of ours": lambda c: {"_target_": "backends.bundle.Description.write", "folder": c},
+    "a class that writes": lambda c: {"_target_": "vg2gt.reconstruction.maps.Animation", "path": c, "fps": 1},
+    "almost ours": lambda c: {"_target_": "vg2gt_evil.Backend", "path": c},
+    "no name": lambda c: {"_target_": ["os", "system"], "path": c},
+    "a list": lambda c: [{"_target_": "os.mkdir", "path": c}],  # pyright: ignore[reportAssignmentType]
+}  # fmt: skip
+
+PLACES = {
+    "backend": lambda config, attack: config.update(backend=attack),
+    "renderer": lambda config, attack: config.update(renderer=attack),
+    "an argument of the model": lambda config, attack: config["model"]["fine"].update(voxel_size=attack),
+}
+
+
+def edit(run_folder: Path, change: Callable[[dict[str, Any]], Any]) -> None:
+    path = run_folder / "config.yaml"
+    config: Any = OmegaConf.to_container(OmegaConf.load(path))
+    change(config)
+    OmegaConf.save(OmegaConf.create(config), path)
+
+
+@pytest.fixture
+def no_network(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: Any) -> None:
+        raise AssertionError("a connection was opened")
+
+    monkeypatch.setattr("socket.socket.connect", refuse)
+
+
+@pytest.mark.parametrize("attack", ATTACKS)
+@pytest.mark.usefixtures("no_network")
+def test_a_runs_configuration_calls_nothing_foreign(run_folder: Path, canary: Path, attack: str) -> None:
+    edit(run_folder, lambda config: config.update(backend=ATTACKS[attack](str(canary))))
+    with pytest.raises(UntrustedError, match=r"config\.yaml: backend.*_target_ is .*VG2GT_TRUST=PACKAGE"):
+        load_model(run_folder, device="cpu")
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_wherever_it_stands(run_folder: Path, canary: Path, place: str) -> None:
+    attack = {"_target_": "os.mkdir", "path": str(canary)}
+    edit(run_folder, lambda config: PLACES[place](config, attack))
+    with pytest.raises(UntrustedError, match=r"_target_ is 'os\.mkdir'"):
+        load_model(run_folder, device="cpu")
+    with pytest.raises(UntrustedError, match=r"_target_ is 'os\.mkdir'"):  # other changes do not hide it
+        load_model(run_folder, device="cpu", options=["renderer.near=0.5", "model.fine.max_voxels=5"])
+
+
+def test_the_runs_data_call_nothing_foreign(run_folder: Path, canary: Path, rooms, caplog) -> None:
+    """An evaluation only asks what was trained on: it says why it cannot know, and goes on."""
+    edit(run_folder, lambda config: config.update(data={"_target_": "os.mkdir", "path": str(canary)}))
+    _refuse_training_views(run_folder / "checkpoints" / "step-7.ckpt", rooms, [])
+    assert "cannot be checked" in caplog.text
+    assert "data._target_ is 'os.mkdir'" in caplog.text
+
+
+def test_what_the_user_names_is_called(run_folder: Path) -> None:
+    """Untrusted is the file, not the command line."""
+    edit(run_folder, lambda config: config.update(renderer={"_target_": "os.mkdir", "path": "nowhere"}))
+    with pytest.raises(UntrustedError):
+        load_model(run_folder, "oracle", "tiny", device="cpu")
+    edit(
+        run_folder,
+        lambda config: config.update(
+            backend={"_target_": "os.mkdir"}, renderer={"_target_": "vg2gt.rendering.Renderer"}
+        ),
+    )
+    assert load_model(run_folder, "oracle,depth_noise=0", device="cpu").weights.step == 7
+
+
+YAMLS = {
+    "object": ("!!python/object/apply:os.system ['touch {canary}']", "the tag"),
+    "new object": ("!!python/object/new:os.system ['touch {canary}']", "the tag"),
+    "name": ("!!python/name:os.system ''", "the tag"),
+    "module": ("!!python/module:antigravity ''", "the tag"),
+    "own tag": ("!evil 1", "the tag"),
+    "environment": ("${{oc.env:SECRET}}", "the interpolation"),
+    "nested interpolation": ("a${{oc.env:${{b}}}}", "the interpolation"),
+    "decode": ("${{oc.decode:'1'}}", "the interpolation"),
+    "bomb": ("[&a [x,x], &b [*a,*a], &c [*b,*b]]", "an alias"),
+    "deep": ("[" * 3000 + "]" * 3000, "nested more than"),
+    "long": ("x" * (2 << 20), "has .* bytes"),
+    "no YAML": ("{{", "is not a run's configuration"),
+    "no text": ("\udcff", "is not a run's configuration"),
+}
+
+
+@pytest.mark.parametrize("name", YAMLS)
+def test_a_runs_configuration_is_plain(
+    run_folder: Path, canary: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SECRET", "hunter2")
+    value, said = YAMLS[name]
+    path = run_folder / "config.yaml"
+    text = path.read_text() + f"extra: {value.format(canary=canary) if '{' in value else value}\n"
+    path.write_bytes(text.encode("utf-8", "surrogateescape"))
+    with pytest.raises(ValueError, match=said) as caught:
+        load_model(run_folder, device="cpu")
+    assert "hunter2" not in str(caught.value)
+    assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize("read", [_name_differences, lambda config: _refuse_other_run(config, Path(config.output_dir))])
+def test_no_command_reads_the_environment_for_a_runs_configuration(
+    read: Callable, run_folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("SECRET", "hunter2")
+    with (run_folder / "config.yaml").open("a") as file:
+        file.write("${oc.env:SECRET}: 1\nx: ${oc.env:SECRET}\n")
+    with caplog.at_level(logging.DEBUG), pytest.raises(UntrustedError, match="the interpolation") as caught:
+        read(OmegaConf.create({"output_dir": str(run_folder)}))
+    assert "hunter2" not in caplog.text + str(caught.value)
+
+
+@pytest.mark.parametrize("attack", ["os.system", "builtins.eval", "Popen", "get_method", "partial"])
+def test_hyper_parameters_of_a_checkpoint_call_nothing(run_folder: Path, canary: Path, attack: str) -> None:
+    path = run_folder / "checkpoints" / "step-7.ckpt"
+    content = torch.load(path, weights_only=True)
+    hostile = ATTACKS[attack](str(canary))
+    content |= {"hyper_parameters": {**hostile, "_instantiator": "os.system"}, "hparams_name": "kwargs"}
+    content |= {
+        "hparams_type": "os.system",
+        "datamodule_hyper_parameters": hostile,
+        "callbacks": {"os.system": hostile},
+    }
+    torch.save(content, path)
+    assert load_model(run_folder, device="cpu").weights.step == 7  # what nobody reads does no harm
+
+
+def test_a_package_is_trusted_by_name(run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, model) -> None:
+    """docs/add-a-backend.md: training with an own backend, then reading the run."""
+    (tmp_path / "my_own_pkg.py").write_text(
+        "import os\nfrom backends.oracle import OracleBackend\nclass Mine(OracleBackend):\n    pass\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    edit(run_folder, lambda config: config["backend"].update(_target_="my_own_pkg.Mine"))
+    with pytest.raises(UntrustedError, match=r"my_own_pkg\.Mine.*VG2GT_TRUST"):
+        load_model(run_folder, device="cpu")
+    assert "my_own_pkg" not in sys.modules  # not even imported
+    monkeypatch.setenv(ENVIRONMENT, "other, my_own_pkg")
+    assert type(load_model(run_folder, device="cpu").model.backend).__name__ == "Mine"
+    edit(run_folder, lambda config: config["backend"].update(_target_="my_own_pkg.os.mkdir"))
+    with pytest.raises(UntrustedError, match="not in my_own_pkg"):
+        load_model(run_folder, device="cpu")
+    monkeypatch.delitem(sys.modules, "my_own_pkg")
+
+
+def test_everything_of_the_projects_configurations_is_trusted() -> None:
+    for group in ("backend", "model", "renderer", "data"):
+        files = sorted(Path(config_dir(), group).glob("*.yaml"))
+        assert files
+        for path in files:
+            check_targets(OmegaConf.load(path), path)
+
+
+def test_a_runs_own_configuration_is_read_back(run_folder: Path) -> None:
+    path = run_folder / "config.yaml"
+    assert read_run_config(path) == OmegaConf.load(path)
+    path.write_text("- 1\n")
+    with pytest.raises(ValueError, match="expected a mapping"):
+        read_run_config(path)
+
+
+def test_the_attacks_are_attacks(tmp_path: Path) -> None:
+    """Without the check Hydra, or Python, would do what they say."""
+    from hydra.utils import instantiate
+
+    path = tmp_path / "folder"
+    instantiate({"_target_": "os.mkdir", "path": str(path)})
+    assert path.is_dir()
