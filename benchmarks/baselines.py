@@ -18,11 +18,11 @@ import torch
 from machine import machine
 from stage_clock import StageClock
 
-from vg2gt.checkpoints import newest_valid, read_checkpoint
+from vg2gt.checkpoints import read_checkpoint
 from vg2gt.io.files import write_json, write_text
 from vg2gt.io.images import colorize_depth, grid, write_png
 from vg2gt.protocols import ground_truth_target_cameras
-from vg2gt.study import Metrics, compose_run, markdown, over_seeds, run_once, summarize
+from vg2gt.study import Metrics, compose_run, final_checkpoint, markdown, over_seeds, run_once, summarize
 from vg2gt.training import Run, build
 from vg2gt.types import Batch
 
@@ -65,11 +65,11 @@ MODELS = {
 }
 
 
-def restore(model: Model, overrides: list[str], folder: Path) -> tuple[Run, Batch]:
+def restore(model: Model, overrides: list[str], steps: int, folder: Path) -> tuple[Run, Batch]:
     """The trained module of a finished run, and the first evaluation scene."""
     run = build(compose_run([*overrides, *model.overrides], folder))
     if model.trained:
-        run.module.load_state_dict(read_checkpoint(newest_valid(folder / "checkpoints"))["state_dict"])
+        run.module.load_state_dict(read_checkpoint(final_checkpoint(folder, steps))["state_dict"])
     run.datamodule.setup("validate")
     run.module.eval()
     return run, next(iter(run.datamodule.val_dataloader())).single(0).to(run.module.device)
@@ -150,7 +150,7 @@ def main() -> None:
             mine = [*overrides, f"seed={seed}", f"trainer.max_steps={steps}"]
             print(f"seed {seed}: {name}", flush=True)
             metrics = run_once([*mine, *model.overrides], folder)
-            run, batch = restore(model, mine, folder)
+            run, batch = restore(model, mine, int(steps), folder)
             results[name][seed] = metrics | costs(run, batch)
             if seed == 0:
                 rows = rows or [truth(batch)]

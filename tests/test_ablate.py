@@ -12,7 +12,7 @@ import pytest
 import vg2gt.study
 from tests.training_helpers import SMALL
 from vg2gt.ablate import CONTROL, FULL, OUR_COLUMNS, PAPER_COLUMNS, Ablation, _verdict, common_overrides, continuations
-from vg2gt.checkpoints import newest_valid, read_checkpoint
+from vg2gt.checkpoints import AtomicCheckpointIO, newest_valid, read_checkpoint
 
 ROOT = Path(__file__).resolve().parents[1]
 QUIET = [override for override in SMALL if not override.startswith("trainer.max_steps")]
@@ -114,6 +114,62 @@ def test_other_settings_are_refused(finished: Path, cache: Path) -> None:
         study(finished, cache, steps=3).run()
     with pytest.raises(ValueError, match=r"start holds a run with other settings \(loss\.enhance\.weight\)"):
         study(finished, cache, "loss.enhance.weight=2").run()
+
+
+def test_results_of_another_full_model_are_not_taken(finished: Path, cache: Path, tmp_path: Path) -> None:
+    """The full model's folder was deleted, as the message says, and trained longer: its continuations are stale."""
+    folder = tmp_path / "copy"
+    shutil.copytree(finished, folder)
+    shutil.rmtree(folder / "seed-0" / "start")
+    longer = Ablation(folder, [*QUIET, f"data.cache_dir={cache}"], 1, 3, 1, ["wo_split"], (1, 2))
+    with pytest.raises(ValueError, match=r"full holds a run that started from other weights"):
+        longer.run()
+    assert longer.results[FULL] == {}
+
+
+def test_a_full_model_whose_end_is_lost_is_refused(finished: Path, cache: Path, tmp_path: Path) -> None:
+    """Its last checkpoint is damaged: variants must not go on from an earlier one."""
+    folder = tmp_path / "copy"
+    shutil.copytree(finished, folder)
+    checkpoints = folder / "seed-0" / "start" / "checkpoints"
+    last = newest_valid(checkpoints)
+    content = read_checkpoint(last)
+    last.write_bytes(b"damaged")
+    AtomicCheckpointIO().save_checkpoint(content | {"global_step": 1}, checkpoints / "step-1.ckpt")
+    with pytest.raises(ValueError, match=r"start ran 2 steps, but its newest valid checkpoint is that of step 1"):
+        study(folder, cache).run()
+
+
+def test_one_that_diverges_does_not_stop_the_others(
+    finished: Path, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "copy"
+    shutil.copytree(finished, folder)
+    shutil.rmtree(folder / "seed-0" / "wo_split")
+
+    def diverge(config):
+        raise FloatingPointError(f"20 steps in a row in {config.output_dir}")
+
+    monkeypatch.setattr(vg2gt.study, "train", diverge)
+    again = study(folder, cache)
+    again.run()
+    assert again.diverged == ["w/o Split, seed 0"]
+    assert {name for name, runs in again.results.items() if runs} == {FULL, CONTROL}
+    report = (folder / "metrics.md").read_text()
+    assert "Diverged: w/o Split, seed 0." in report
+    assert re.search(r"\| w/o Split \| n/a \|", report)
+
+
+def test_splits_are_compared_with_the_control(tmp_path: Path, cache: Path) -> None:
+    """A new last layer costs 1 dB here; two fewer splits cost nothing beyond that."""
+    some = study(tmp_path, cache)
+    for seed in range(3):
+        psnr = {FULL: 27.0 + seed, "wo_split": 26.0 + seed + 0.01 * (seed - 1), CONTROL: 26.0 + seed}
+        some.results |= {name: some.results[name] | {seed: {"psnr": value}} for name, value in psnr.items()}
+    _, against_full, against_control = some.report().rsplit("## Differences", 2)
+    assert "| w/o Split | -1.00 ± 0.02 (worse) |" in against_full
+    assert "| w/o Split | +0.00 ± 0.02 (not told apart) |" in against_control
+    assert "| VG²GT (full) |" not in against_control
 
 
 def test_verdicts() -> None:

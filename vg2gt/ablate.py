@@ -6,8 +6,8 @@ is ahead by training longer. All continuations of a seed see the same batches an
 views, so differences to the full model are taken seed by seed. Only the last layer starts anew where the number of
 splits changes; a control continues the full model with a new last layer as well.
 
-Finished runs are never repeated, interrupted ones go on. Writes ``metrics.json`` and ``metrics.md`` into
-``outputs/<name>``, after every run.
+Finished runs are never repeated, interrupted ones go on; a run that diverges is named and the others are run all the
+same. Writes ``metrics.json`` and ``metrics.md`` into ``outputs/<name>``, after every run.
 """
 
 from __future__ import annotations
@@ -22,11 +22,21 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from vg2gt.checkpoints import AtomicCheckpointIO, newest_valid, read_checkpoint
+from vg2gt.checkpoints import AtomicCheckpointIO, read_checkpoint
 from vg2gt.evaluation.paper import tables
 from vg2gt.io.files import write_json, write_text
 from vg2gt.paths import config_dir
-from vg2gt.study import Metrics, compose_run, markdown, over_seeds, paired_difference, quoted, run_once, summarize
+from vg2gt.study import (
+    Metrics,
+    compose_run,
+    final_checkpoint,
+    markdown,
+    over_seeds,
+    paired_difference,
+    quoted,
+    run_once,
+    summarize,
+)
 
 log = logging.getLogger(__name__)
 
@@ -126,20 +136,29 @@ class Ablation:
         self.full_splits = int(compose_run(self.overrides, folder).model.gaussians.splits)
         self.runs = continuations(self.variants, self.splits, self.full_splits)
         self.results: dict[str, dict[int, Metrics]] = {run.name: {} for run in self.runs}
+        self.diverged: list[str] = []
 
     def run(self) -> None:
-        """Runs whatever is not finished; the tables are rewritten after every run."""
+        """Runs whatever is not finished; the tables are rewritten after every run.
+
+        Raises:
+            FloatingPointError: if a full model diverges; a continuation that does is noted in ``diverged``.
+        """
         total, number = self.seeds * (1 + len(self.runs)), 0
         for seed in range(self.seeds):
             home = self.folder / f"seed-{seed}"
             number += 1
             print(f"[{number}/{total}] seed {seed}: the full model, {self.full_steps} steps", flush=True)
             run_once([*self.overrides, f"seed={seed}", f"trainer.max_steps={self.full_steps}"], home / "start")
-            start = newest_valid(home / "start" / "checkpoints")
+            start = final_checkpoint(home / "start", self.full_steps)
             for run in self.runs:
                 number += 1
                 print(f"[{number}/{total}] seed {seed}: {_label(run.name)}, {self.steps} steps more", flush=True)
-                self.results[run.name][seed] = self._go_on(run, seed, start, home)
+                try:
+                    self.results[run.name][seed] = self._go_on(run, seed, start, home)
+                except FloatingPointError as error:
+                    self.diverged.append(f"{_label(run.name)}, seed {seed}")
+                    log.error("%s diverged: %s", self.diverged[-1], error)
                 self.write()
 
     def _go_on(self, run: Continuation, seed: int, start: Path, home: Path) -> Metrics:
@@ -156,6 +175,7 @@ class Ablation:
             "full_steps": self.full_steps,
             "steps": self.steps,
             "overrides": self.overrides,
+            "diverged": self.diverged,
             "runs": {name: {str(seed): m for seed, m in runs.items()} for name, runs in self.results.items()},
             "summary": summarize({name: runs for name, runs in self.results.items() if runs}, FULL),
             "paper": {table: tables()[table][PAPER_DATA] for table in (PAPER_ABLATION, PAPER_SPLIT)},
@@ -177,9 +197,18 @@ class Ablation:
             "## More figures of the same runs",
             _plain_table(self.results, OUR_COLUMNS),
             "## Differences to the full model, seed by seed",
-            _difference_table(self.results),
+            _difference_table(self.results, FULL),
         ]
+        if CONTROL in self.results:
+            parts += [
+                "## Differences to the full model with a new last layer, seed by seed",
+                _difference_table({name: self.results[name] for name in self._new_layers()}, CONTROL),
+            ]
         return "\n\n".join(parts) + "\n"
+
+    def _new_layers(self) -> list[str]:
+        """The runs that began with a new last layer."""
+        return [CONTROL, *(name for name in self.results if name == "wo_split" or name.startswith("splits="))]
 
     def _row_of(self, count: int) -> str:
         if count == self.full_splits:
@@ -188,14 +217,18 @@ class Ablation:
 
     def _protocol(self) -> str:
         done = min((len(runs) for runs in self.results.values()), default=0)
+        diverged = f" Diverged: {'; '.join(self.diverged)}." if self.diverged else ""
         return (
             f"Full model {self.full_steps} steps, then every row (the full model as well) {self.steps} steps more from "
-            f"it, with the same batches. {done} of {self.seeds} seeds complete; mean ± 95 % confidence interval over "
-            "seeds (Student's t; none for one seed). Views never trained on, at ground-truth poses; depth rendered as "
-            "stochastic solids and aligned by one median scale a scene, whatever the training rendered (the 3DGS row "
-            "too: its own rasterised depth stands below). Where the number of splits differs from the full model's, "
-            "the last layer starts anew; the control shows what that alone costs. The paper's rows are Replica, "
-            "30000 more steps, and LPIPS of VGG; compare orders, not values. LPIPS is not measured "
+            f"it, with the same batches. {done} of {self.seeds} seeds complete;{diverged} mean ± 95 % confidence "
+            "interval over seeds (Student's t; none for one seed). Seeds differ in weights and training batches; all "
+            "see the same held-out scenes, so the intervals say nothing of other scenes. Every difference is judged by "
+            "itself: of twenty true zeros one is called better or worse. Views never trained on, at ground-truth poses; "
+            "depth rendered as stochastic solids and aligned by one median scale a scene, whatever the training "
+            "rendered (the 3DGS row too: its own rasterised depth stands below). Where the number of splits differs "
+            "from the full model's, the last layer starts anew; the control shows what that alone costs, and is what "
+            "these rows are compared with in the last table. The paper's rows are Replica, 30000 more steps, and LPIPS "
+            "of VGG; compare orders, not values. LPIPS is not measured "
             "while training: python -m vg2gt.evaluate ckpt=RUN has it, if its weights are there."
         )
 
@@ -241,14 +274,14 @@ def _plain_table(
     return markdown(["", *(column[0] for column in columns.values())], rows)
 
 
-def _difference_table(results: Mapping[str, Mapping[int, Metrics]]) -> str:
-    """Each run less the full model; says whether the interval leaves out zero."""
+def _difference_table(results: Mapping[str, Mapping[int, Metrics]], reference: str) -> str:
+    """Each run less the reference; says whether the interval leaves out zero."""
     columns = {name: c for name, c in (PAPER_COLUMNS | OUR_COLUMNS).items() if _is_there(results, name)}
     rows = []
     for name, runs in results.items():
-        if name != FULL:
-            rows.append([_label(name), *(_verdict(runs, results[FULL], m, c) for m, c in columns.items())])
-    return markdown(["minus full", *(column[0] for column in columns.values())], rows)
+        if name != reference:
+            rows.append([_label(name), *(_verdict(runs, results[reference], m, c) for m, c in columns.items())])
+    return markdown([f"minus {_label(reference)}", *(column[0] for column in columns.values())], rows)
 
 
 def _is_there(results: Mapping[str, Mapping[int, Metrics]], metric: str) -> bool:
@@ -310,6 +343,8 @@ def main(config: DictConfig) -> None:
     study.run()
     print(study.report())
     print(f"metrics: {study.folder / 'metrics.json'}")
+    if study.diverged:
+        raise SystemExit(f"diverged, not in the tables: {'; '.join(study.diverged)}")
 
 
 if __name__ == "__main__":

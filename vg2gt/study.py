@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import math
 from collections.abc import Mapping, Sequence
@@ -9,11 +10,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig, OmegaConf
 from scipy.stats import t as student
+from torch import Tensor
 
+from vg2gt.checkpoints import newest_valid, read_checkpoint
 from vg2gt.io.files import read_json, write_json, write_text
 from vg2gt.paths import config_dir
 from vg2gt.training import build, evaluate, flatten, train
@@ -23,6 +27,7 @@ log = logging.getLogger(__name__)
 
 Metrics = dict[str, float]
 INTERRUPTED = 143
+START = "start.json"
 # What makes two runs the same; where they live and how they are shown may differ.
 COMPARED = ("backend", "model", "data", "loss", "renderer", "optimizer", "training", "seed")
 COMPARED_KEYS = ("trainer.max_steps", "trainer.precision", "trainer.gradient_clip_val")
@@ -51,11 +56,12 @@ def run_once(overrides: Sequence[str], folder: Path) -> Metrics:
         The metrics after training.
 
     Raises:
-        ValueError: if the folder holds the run of another configuration.
+        ValueError: if the folder holds the run of another configuration, or one that started from other weights.
         SystemExit: if the training was asked to stop (SIGTERM); the same call goes on with it.
     """
     config = compose_run(overrides, folder)
     _refuse_other_run(config, folder)
+    _refuse_other_start(config, folder)
     result = folder / "metrics.json"
     if result.is_file():
         return read_json(result)["trained"]
@@ -80,10 +86,7 @@ def _refuse_other_run(config: DictConfig, folder: Path) -> None:
     path = folder / "config.yaml"
     if not path.is_file():
         return
-    before, now = (
-        flatten(OmegaConf.to_container(c, resolve=True))
-        for c in (read_run_config(path), config)
-    )
+    before, now = (flatten(OmegaConf.to_container(c, resolve=True)) for c in (read_run_config(path), config))
     keys = {
         key
         for key in before.keys() | now.keys()
@@ -95,6 +98,47 @@ def _refuse_other_run(config: DictConfig, folder: Path) -> None:
             f"{folder} holds a run with other settings ({', '.join(different)}): choose another name=, repeat the "
             "settings, or delete the folder"
         )
+
+
+def _refuse_other_start(config: DictConfig, folder: Path) -> None:
+    """Notes the weights a new run starts from; by their content, for a folder may be moved, or filled anew."""
+    if not config.init_from:
+        return
+    path, weights = folder / START, weights_digest(read_checkpoint(config.init_from)["state_dict"])
+    if path.is_file():
+        if read_json(path)["weights"] != weights:
+            raise ValueError(
+                f"{folder} holds a run that started from other weights than those of {config.init_from}: choose "
+                "another name=, or delete the folder"
+            )
+    elif not (folder / "config.yaml").is_file():
+        write_json(path, {"weights": weights})
+
+
+def weights_digest(state: Mapping[str, Tensor]) -> str:
+    """SHA-256 of tensors and their names."""
+    digest = hashlib.sha256()
+    for name, tensor in sorted(state.items()):
+        digest.update(f"{name} {tuple(tensor.shape)} {tensor.dtype}".encode())
+        digest.update(tensor.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().tobytes())
+    return digest.hexdigest()
+
+
+def final_checkpoint(folder: Path, steps: int) -> Path:
+    """The checkpoint that a finished run of ``steps`` steps ended with.
+
+    Raises:
+        FileNotFoundError: if no checkpoint of the run is valid.
+        ValueError: if the newest valid one is of an earlier step.
+    """
+    path = newest_valid(folder / "checkpoints")
+    reached = read_checkpoint(path)["global_step"]
+    if reached != steps:
+        raise ValueError(
+            f"{folder} ran {steps} steps, but its newest valid checkpoint is that of step {reached}: delete the "
+            "folder, and the run is repeated"
+        )
+    return path
 
 
 @dataclass(frozen=True)
