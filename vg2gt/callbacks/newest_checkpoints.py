@@ -42,7 +42,7 @@ class NewestCheckpoints(Checkpoint):
 
     def on_train_batch_end(self, trainer: lightning.Trainer, *args: Any) -> None:
         """Saves when it is the step's turn, unless an evaluation comes first."""
-        if not _evaluation_follows(trainer):
+        if not evaluation_follows(trainer):
             self._save_if_due(trainer)
 
     def on_validation_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
@@ -85,7 +85,7 @@ class NewestCheckpoints(Checkpoint):
             self._row = None
 
 
-def _evaluation_follows(trainer: lightning.Trainer) -> bool:
+def evaluation_follows(trainer: lightning.Trainer) -> bool:
     """Whether the trainer evaluates after this step; with an evaluation every few epochs, unknown and taken as no."""
     every = trainer.val_check_batch
     return (

@@ -11,6 +11,8 @@ from typing import Any
 import lightning
 from lightning.pytorch.trainer.states import TrainerFn
 
+from vg2gt.callbacks.newest_checkpoints import evaluation_follows
+
 log = logging.getLogger(__name__)
 
 TERMINATED = 128 + signal.SIGTERM
@@ -52,6 +54,8 @@ class StopOnSignal(lightning.Callback):
         if trainer.strategy.reduce_boolean_decision(asked, all=False):
             path = self.folder / f"step-{trainer.global_step}.ckpt"
             trainer.save_checkpoint(path)
+            if not evaluation_follows(trainer):
+                trainer.limit_val_batches = 0  # a trainer that is told to stop evaluates once more
             trainer.should_stop = True
             log.warning("stopping as asked by SIGTERM: saved %s, go on with ckpt=last", path)
 

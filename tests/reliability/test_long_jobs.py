@@ -1,0 +1,97 @@
+"""Evaluations, studies and exports that are killed go on with the same command and give the same results."""
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.reliability import crash_harness as harness
+from tests.reliability.crash_harness import ABLATE, EVALUATE, Attempt, Moment
+from tests.training_helpers import SMALL
+from vg2gt.io.files import read_json
+
+SYNTHETIC = "vg2gt.data.synthetic"
+
+
+def kill_and_finish(module: str, arguments: list[str], folder: Path, moments: list[Moment], warm: bool = True) -> int:
+    """Returns how many of the moments came before the end."""
+    kills = 0
+    for moment in moments:
+        attempt = harness.start(module, arguments, folder, warm)
+        if attempt.wait_for(moment):
+            attempt.kill()
+        assert attempt.status() in (0, -9), attempt.said()[-4000:]
+        kills += attempt.status() == -9
+    harness.finish(module, arguments, folder, warm)
+    return kills
+
+
+def after_a_scene(attempt: Attempt) -> bool:
+    """A scene is evaluated."""
+    return any(name.startswith("scenes/2/") for name in attempt.new())
+
+
+def after_a_recording(attempt: Attempt) -> bool:
+    """A scene is written."""
+    return any(name.startswith("room-") for name in attempt.new())
+
+
+def without_cost(node: Any) -> Any:
+    """Without times and memory."""
+    if isinstance(node, dict):
+        return {k: without_cost(v) for k, v in node.items() if not k.endswith(("_seconds", "_mib"))}
+    return node
+
+
+@pytest.mark.slow
+def test_evaluation(tmp_path: Path, rooms: Path, whole: Path) -> None:
+    def arguments(folder: Path) -> list[str]:
+        small = ["data.image_size=[28,56]", "data.eval_scenes=5", "views=[2]", "device=cpu", "name=test"]
+        places = [f"output_dir={folder}", f"hydra.run.dir={folder}", f"data.cache_dir={rooms}", f"ckpt={run}"]
+        return [*small, *places, "evaluation.pictures=2"]
+
+    run, expected, folder = tmp_path / "run", tmp_path / "whole", tmp_path / "killed"
+    shutil.copytree(whole, run)
+    harness.finish(EVALUATE, arguments(expected), expected)
+    kills = kill_and_finish(EVALUATE, arguments(folder), folder, [after_a_scene] * 4)
+    results = [read_json(path / "metrics.json") for path in (expected, folder)]
+    for result in results:
+        del result["settings"]["name"]  # that of the folder
+    assert without_cost(results[0]) == without_cost(results[1])
+    for path in (expected / "pictures").iterdir():
+        assert path.read_bytes() == (folder / "pictures" / path.name).read_bytes()
+    print(f"{kills} kills survived: an evaluation")
+    assert kills >= 3
+
+
+@pytest.mark.slow
+def test_study(tmp_path: Path, rooms: Path) -> None:
+    def arguments(folder: Path) -> list[str]:
+        small = [o for o in SMALL if not o.startswith(("trainer.max_steps", "callbacks.progress_bar"))]
+        study = ["seeds=1", "full_steps=4", "steps=3", "variants=[wo_split]", "splits=[2]", "data.image_size=[28,56]"]
+        return [*small, *study, f"data.cache_dir={rooms}", f"hydra.run.dir={folder}"]
+
+    expected, folder = tmp_path / "whole", tmp_path / "killed"
+    harness.finish(ABLATE, arguments(expected), expected)
+    moments = [harness.after_seconds(seconds) for seconds in np.random.default_rng(0).uniform(0, 5, 5)]
+    kills = kill_and_finish(ABLATE, arguments(folder), folder, moments)
+    for name in ("metrics.json", "metrics.md"):
+        assert (expected / name).read_bytes() == (folder / name).read_bytes(), name
+    print(f"{kills} kills survived: a study")
+    assert kills >= 3
+
+
+@pytest.mark.slow
+def test_export_of_synthetic_scenes(tmp_path: Path) -> None:
+    def arguments(folder: Path) -> list[str]:
+        return [f"out={folder}", "scenes=6", "frames=4", "size=[28,56]", "workers=1"]
+
+    expected, folder = tmp_path / "whole", tmp_path / "killed"
+    harness.finish(SYNTHETIC, arguments(expected), expected, warm=False)
+    kills = kill_and_finish(SYNTHETIC, arguments(folder), folder, [after_a_recording] * 3, warm=False)
+    files = [{p.relative_to(f): p.read_bytes() for p in f.rglob("*") if p.is_file()} for f in (expected, folder)]
+    assert files[0] == files[1]
+    print(f"{kills} kills survived: an export")
+    assert kills >= 2
