@@ -12,11 +12,18 @@ Key = TypeVar("Key")
 Value = TypeVar("Value")
 
 
+def world_size() -> int:
+    """Number of processes that train together."""
+    if not torch.distributed.is_available() or not torch.distributed.is_initialized():
+        return 1
+    return torch.distributed.get_world_size()
+
+
 def from_all_ranks(value: Value) -> list[Value]:
     """The value of every rank, in their order. Collective: every rank has to call it."""
-    if not torch.distributed.is_available() or not torch.distributed.is_initialized():
+    if world_size() == 1:
         return [value]
-    found: list[Any] = [None] * torch.distributed.get_world_size()
+    found: list[Any] = [None] * world_size()
     torch.distributed.all_gather_object(found, value)
     return found
 
@@ -27,8 +34,8 @@ def in_turns(parts: Sequence[Mapping[Key, Value]]) -> dict[Key, Value]:
     A key that several ranks hold keeps its first place and value.
     """
     joined: dict[Key, Value] = {}
-    for row in zip_longest(*(part.items() for part in parts)):
-        for item in row:
-            if item is not None:
-                joined.setdefault(*item)
+    for row in zip_longest(*parts):
+        for key, part in zip(row, parts, strict=True):
+            if key is not None:
+                joined.setdefault(key, part[key])
     return joined

@@ -6,6 +6,7 @@ import logging
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import lightning
@@ -15,7 +16,7 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 from torch.profiler import record_function
 
-from vg2gt.distributed import from_all_ranks, in_turns
+from vg2gt.distributed import from_all_ranks, in_turns, world_size
 from vg2gt.evaluation import evaluate_scene
 from vg2gt.faults import (
     Fault,
@@ -37,6 +38,7 @@ from vg2gt.types import Batch, Prediction
 log = logging.getLogger(__name__)
 
 BACKBONE_PREFIX = "model.backend."
+IN_PROGRESS_BAR = ("loss", "train/color_l1", "train/depth_gt", "train/depth_reg", "train/normal")
 
 
 class VG2GTModule(lightning.LightningModule):
@@ -81,6 +83,7 @@ class VG2GTModule(lightning.LightningModule):
         self._watch = GradientWatch(())
         self._fault: Fault | None = None
         self._scenes: tuple[str, ...] = ()
+        self._figures: dict[str, Tensor] = {}
         self._scores: dict[tuple[str | int, ...], dict[str, float]] = {}
         self.strict_loading = False  # backbone weights are never stored; load_state_dict checks everything else
 
@@ -104,7 +107,7 @@ class VG2GTModule(lightning.LightningModule):
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Reconstructs the context views, renders some views and returns the training loss."""
         self._watch.clear()
-        self._scenes = batch.scene
+        self._scenes, self._figures = batch.scene, {}
         self._fault = fault_of_batch(batch)
         report = self._losses(batch) if self._fault is None else None
         return report.total if report is not None and self._fault is None else self._lost_step()
@@ -126,7 +129,7 @@ class VG2GTModule(lightning.LightningModule):
         with record_function("vg2gt/loss"):
             report: LossReport = self.loss(prediction, batch, rendered, views, cameras)
         self._fault = fault_of_loss(report, batch.scene)
-        self._log_step(report, batch, prediction)
+        self._figures = self._step_figures(report, batch, prediction)
         return report
 
     def _lost_step(self) -> Tensor:
@@ -140,18 +143,26 @@ class VG2GTModule(lightning.LightningModule):
         context = torch.randperm(batch.num_context, generator=self.generator)
         return torch.cat((held_out, context))[: self.render_views]
 
-    def _log_step(self, report: LossReport, batch: Batch, prediction: Prediction) -> None:
-        scenes = len(batch.scene)
-        pixels = batch.context.depth.numel()
-        self.log("loss", report.total.detach(), prog_bar=True, batch_size=scenes)
-        for name, value in report.terms.items():
-            short = name in ("color_l1", "depth_gt", "depth_reg", "normal")
-            self.log(f"train/{name}", value, prog_bar=short, batch_size=scenes)
-        per_view = len(prediction.gaussians) / (scenes * batch.num_context)
-        self.log("train/gaussians_per_view", per_view, batch_size=scenes)
+    def _step_figures(self, report: LossReport, batch: Batch, prediction: Prediction) -> dict[str, Tensor]:
+        """What is logged of a step; the mean over ranks is what one process with all scenes would log."""
+        figures: dict[str, Tensor | float] = {"loss": report.total.detach()}
+        figures |= {f"train/{name}": value for name, value in report.terms.items()}
+        figures["train/gaussians_per_view"] = len(prediction.gaussians) / (len(batch.scene) * batch.num_context)
         if prediction.voxels is not None:
-            self.log("train/voxels_per_pixel", len(prediction.voxels.grid) / pixels, batch_size=scenes)
-        self.log("train/scenes_without_depth", float(report.skipped), batch_size=scenes)
+            figures["train/voxels_per_pixel"] = len(prediction.voxels.grid) / batch.context.depth.numel()
+        figures["train/scenes_without_depth"] = float(report.skipped * world_size())
+        as_tensor = partial(torch.as_tensor, dtype=torch.float32, device=report.total.device)
+        return {name: as_tensor(value) for name, value in figures.items()}
+
+    def _log_step(self, average: bool) -> None:
+        """Logs the step's figures: means over ranks, or this rank's own of a step that was dropped."""
+        if not self._figures:
+            return
+        values = torch.stack(list(self._figures.values()))
+        if average:
+            values = self.trainer.strategy.reduce(values, reduce_op="mean")
+        for name, value in zip(self._figures, values, strict=True):
+            self.log(name, value, prog_bar=name in IN_PROGRESS_BAR)
 
     def configure_gradient_clipping(
         self,
@@ -164,7 +175,6 @@ class VG2GTModule(lightning.LightningModule):
             raise ValueError(f"trainer.gradient_clip_algorithm={gradient_clip_algorithm} is not supported; use norm")
         limit = float(gradient_clip_val) if gradient_clip_val and gradient_clip_val > 0 else float("inf")
         norm = nn.utils.clip_grad_norm_(self.model.trained_parameters(), limit)
-        self.log("train/grad_norm", norm.detach())
         sound = self._fault is None and bool(torch.isfinite(norm))
         # Every rank sees the sum, so all of them drop the step or none does.
         unsound = self.trainer.strategy.reduce(norm.new_tensor(float(not sound)), reduce_op="sum")
@@ -174,6 +184,8 @@ class VG2GTModule(lightning.LightningModule):
             self._drop_step()
         else:
             self.skipped.good()
+        self._log_step(average=float(unsound) == 0)
+        self.log("train/grad_norm", norm.detach())
         self.log("train/skipped_steps", float(self.skipped.total))
 
     def _drop_step(self) -> None:
