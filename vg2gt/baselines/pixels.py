@@ -17,6 +17,8 @@ from vg2gt.model import Reconstructor, SceneScale
 from vg2gt.types import Gaussians, Geometry, Hints, Prediction, TensorRecord
 from vg2gt.voxels import DenseHead
 
+SMALLEST_FOOTPRINT = 1e-7  # scene units; a hundredth of it is still a scale that renders
+
 
 @dataclass(frozen=True)
 class Pixels(TensorRecord):
@@ -78,7 +80,7 @@ def usable_pixels(geometry: Geometry, images: Tensor) -> Pixels:
         depth=depth,
         confidence=confidence.flatten()[rows],
         colors=images.float().permute(0, 1, 3, 4, 2).reshape(-1, 3)[rows],
-        footprint=depth[:, None] / focal[view],
+        footprint=(depth[:, None] / focal[view]).clamp(min=SMALLEST_FOOTPRINT),
         rotation=camera_to_world[view, :3, :3],
         center=camera_to_world[view, :3, 3],
     )

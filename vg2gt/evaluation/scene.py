@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import torch
@@ -21,8 +22,10 @@ from vg2gt.evaluation.scores import (
 from vg2gt.metrics import LPIPS, camera_metrics, cv
 from vg2gt.model import Reconstructor
 from vg2gt.protocols import ground_truth_target_cameras, joint_target_cameras
-from vg2gt.rendering import Renderer
-from vg2gt.types import Batch, Cameras, Prediction, Render
+from vg2gt.rendering import Renderer, UnrenderableError
+from vg2gt.types import Batch, Cameras, Gaussians, Prediction, Render
+
+log = logging.getLogger(__name__)
 
 CV_QUERIES = 20_000
 MODES = ("solid", "rasterized")
@@ -55,8 +58,8 @@ def evaluate_scene(model: Reconstructor, renderer: Renderer, batch: Batch) -> di
     prediction = model(batch.context.images, batch.context.hints)
     target = batch.target
     cameras = ground_truth_target_cameras(batch, prediction)
-    rendered = renderer(prediction.gaussians, cameras, mode="solid")
-    rasterized = renderer(prediction.gaussians, cameras, mode="rasterized")
+    rendered = render_or_nan(renderer, prediction.gaussians, cameras, "solid")
+    rasterized = render_or_nan(renderer, prediction.gaussians, cameras, "rasterized")
     images, depth = image_scores(rendered, target), depth_scores(rendered.depth, target, "scene")
     return {
         "psnr": images["psnr"],
@@ -73,6 +76,21 @@ def evaluate_scene(model: Reconstructor, renderer: Renderer, batch: Batch) -> di
         "gaussians": float(len(prediction.gaussians)),
         "cv": cv(prediction.gaussians.means, max_queries=CV_QUERIES),
     }
+
+
+def render_or_nan(renderer: Renderer, gaussians: Gaussians, cameras: Cameras, mode: Any) -> Render:
+    """Renders; where Gaussians or cameras cannot be rendered, says so in the log and returns views of NaN.
+
+    Figures of such views are NaN, which reports show as n/a: one scene does not end an evaluation.
+    """
+    try:
+        return renderer(gaussians, cameras, mode=mode)
+    except UnrenderableError as error:
+        log.warning("a scene has nothing to render: %s", error)
+    views = cameras.world_to_camera.shape[:2]
+    flat = gaussians.means.new_full((*views, *cameras.size), torch.nan)
+    three = flat[:, :, None].expand(-1, -1, 3, -1, -1)
+    return Render(color=three, depth=flat, normal=three, alpha=flat)
 
 
 @dataclass(frozen=True)
@@ -122,20 +140,21 @@ class SceneEvaluator:
         if len(batch.scene) != 1:
             raise ValueError(f"evaluation takes one scene at a time, got {', '.join(batch.scene)}")
         prediction, cost = self._reconstruct(batch)
+        known = self._known(batch)
         scores: dict[str, float] = {}
         renders: dict[str, Render] = {}
         for protocol, cameras in self._cameras(batch, prediction, has_cameras).items():
-            truth = batch.context if protocol == "context" else batch.target
+            truth = known.context if protocol == "context" else known.target
             for mode in MODES:
                 rendered, seconds = self._render(prediction, cameras, mode)
-                scores |= _under(f"rendered/{protocol}/{mode}", self._view_scores(rendered, truth))
+                scores |= _under(f"rendered/{protocol}/{mode}", self._view_scores(rendered, truth, has_cameras))
                 if mode == "solid":
                     renders[protocol] = rendered
                     cost["render_seconds"] = seconds
-        scores |= _under("decoded/before", self._depth_scores(prediction.initial.depth, batch.context))
-        scores |= _under("decoded/after", self._depth_scores(prediction.geometry.depth, batch.context))
+        scores |= _under("decoded/before", self._depth_scores(prediction.initial.depth, known.context))
+        scores |= _under("decoded/after", self._depth_scores(prediction.geometry.depth, known.context))
         if has_cameras:
-            scores |= self._pose_and_point_scores(batch.context, prediction, renders["context"])
+            scores |= self._pose_and_point_scores(known.context, prediction, renders["context"])
         cost["cv"] = cv(prediction.gaussians.means, self.options.neighbors, CV_QUERIES)
         return SceneResult(present(scores | _under("scene", cost)), prediction, renders)
 
@@ -165,16 +184,20 @@ class SceneEvaluator:
         """Renders views; also seconds a view."""
         device = prediction.gaussians.means.device
         begin = now(device)
-        rendered = self.renderer(prediction.gaussians, cameras, mode=mode)
+        rendered = render_or_nan(self.renderer, prediction.gaussians, cameras, mode)
         return rendered, (now(device) - begin) / cameras.world_to_camera.shape[1]
 
-    def _view_scores(self, rendered: Render, truth: Batch) -> dict[str, float]:
-        images = image_scores(rendered, truth, self.lpips)
-        return images | self._depth_scores(rendered.depth, truth) | normal_scores(rendered, truth)
+    def _known(self, batch: Batch) -> Batch:
+        """The batch whose true depths out of range are unknown."""
+        inside = (batch.depth >= self.options.nearest) & (batch.depth <= self.options.farthest)
+        return replace(batch, depth=torch.where(inside, batch.depth, 0.0))
+
+    def _view_scores(self, rendered: Render, truth: Batch, has_cameras: bool) -> dict[str, float]:
+        scores = image_scores(rendered, truth, self.lpips) | self._depth_scores(rendered.depth, truth)
+        return scores | normal_scores(rendered, truth) if has_cameras else scores
 
     def _depth_scores(self, depth: torch.Tensor, truth: Batch) -> dict[str, float]:
-        options = self.options
-        return depth_scores(depth, truth, options.alignment, options.nearest, options.farthest)
+        return depth_scores(depth, truth, self.options.alignment)
 
     def _pose_and_point_scores(self, truth: Batch, prediction: Prediction, rendered: Render) -> dict[str, float]:
         scores: dict[str, float] = {}

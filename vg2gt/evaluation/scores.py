@@ -34,17 +34,17 @@ def normal_scores(rendered: Render, truth: Batch) -> dict[str, float]:
     return {f"normal_{name}": value for name, value in scores.items()}
 
 
-def depth_scores(
-    depth: Tensor, truth: Batch, alignment: str, nearest: float = 0.0, farthest: float = float("inf")
-) -> dict[str, float]:
+def depth_scores(depth: Tensor, truth: Batch, alignment: str) -> dict[str, float]:
     """Errors of depth maps ``[1, V, H, W]`` of one scene, see :func:`vg2gt.metrics.depth_metrics`."""
-    return depth_metrics(depth[0], truth.depth[0], alignment, nearest, farthest)
+    return depth_metrics(depth[0], truth.depth[0], alignment)
 
 
 def point_scores(
     depth: Tensor, cameras: Cameras, truth: Batch, similarity: Similarity, **options: float | None
 ) -> dict[str, float]:
     """Compares the points of predicted depth maps with those of the true ones.
+
+    Pixels whose true depth is unknown are left out of both clouds: there is nothing to compare their points with.
 
     Args:
         depth: ``[1, V, H, W]``.
@@ -53,8 +53,10 @@ def point_scores(
         similarity: from the predicted to the true world frame.
         options: of :func:`vg2gt.metrics.point_metrics`.
     """
-    predicted = similarity.apply(unproject(depth, cameras))[depth > 0]
-    reference = unproject(truth.depth, truth.cameras)[truth.depth > 0]
+    known = truth.depth > 0
+    predicted = similarity.apply(unproject(depth, cameras))[known & (depth > 0) & depth.isfinite()]
+    predicted = predicted[predicted.isfinite().all(-1)]
+    reference = unproject(truth.depth, truth.cameras)[known]
     return point_metrics(predicted, reference, **options)  # pyright: ignore[reportArgumentType]
 
 
@@ -64,7 +66,7 @@ def align_geometry(geometry: Geometry, truth: Batch) -> Similarity | None:
     Taken from points instead of cameras, because a point cloud is to be judged by its shape: the scale that a short
     baseline gives would move all of it.
     """
-    valid = (geometry.depth > 0) & (truth.depth > 0)
+    valid = (geometry.depth > 0) & geometry.depth.isfinite() & (truth.depth > 0)
     if int(valid.sum()) < 3:
         return None
     predicted, reference = unproject(geometry.depth, geometry.cameras), unproject(truth.depth, truth.cameras)

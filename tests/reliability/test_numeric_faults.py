@@ -1,0 +1,320 @@
+"""NaN and infinity in data, backbone, losses and gradients: the step is dropped everywhere, counted and named."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from tests.reliability.steps import TINY, Poison, first_batches, fit, named, tiny_run
+from tests.training_helpers import SMALL, small_config, with_crash
+from vg2gt.checkpoints import newest_valid, read_checkpoint
+from vg2gt.faults import fault_of_batch
+from vg2gt.losses.objective import VG2GTLoss
+from vg2gt.training import Run, train
+from vg2gt.types import Batch
+
+VALUES = (float("nan"), float("inf"), -float("inf"))
+TERMS = ("depth_conf", "depth_reg", "depth_grad", "point_conf", "point_reg", "point_grad", "enhance_depth")
+TERMS += ("enhance_point", "color_l1", "ssim", "depth_consistency", "depth_gt", "normal")
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("rooms")
+
+
+@pytest.fixture
+def run(tmp_path: Path, cache: Path) -> Run:
+    return tiny_run(tmp_path, cache)
+
+
+def spoiled(batch: Batch, part: str, value: float) -> Batch:
+    """A copy with one bad value in the last view."""
+    batch = batch.map(Tensor.clone)
+    tensors = {"images": batch.images, "depth": batch.depth}
+    tensors |= {"world_to_camera": batch.cameras.world_to_camera, "intrinsics": batch.cameras.intrinsics}
+    tensors[part][-1, -1].view(-1)[0] = value
+    return batch
+
+
+PARTS = [(part, value) for part in ("images", "depth", "world_to_camera", "intrinsics") for value in VALUES]
+PARTS += [("intrinsics", 0.0), ("intrinsics", -40.0)]
+
+
+def test_a_bad_value_in_the_data_drops_the_step(run: Run, caplog: pytest.LogCaptureFixture) -> None:
+    (good,) = first_batches(run, 1)
+    bad = [named(spoiled(good, part, value), f"room-{i}") for i, (part, value) in enumerate(PARTS)]
+    audit = fit(run, [good, *bad, good])
+    audit.assert_sound()
+    assert audit.skipped == [False, *([True] * len(bad)), False]
+    for i, (part, _) in enumerate(PARTS):
+        assert f"step {i + 1} skipped: rank 0, room-{i}: {part} of the batch" in caplog.text
+    assert run.module.skipped.summary()["faults"][0] == {
+        "scenes": ["room-0"],
+        "cause": "images of the batch",
+        "step": 1,
+        "rank": 0,
+    }
+
+
+def test_only_the_scene_at_fault_is_named(run: Run) -> None:
+    good, other = first_batches(run, 2)
+    both = replace(
+        good.map(lambda tensor: torch.cat((tensor, tensor))), scene=("kitchen", "hall"), num_context=good.num_context
+    )
+    fault = fault_of_batch(spoiled(both, "depth", float("nan")))
+    assert fault is not None
+    assert fault.scenes == ("hall",)
+    assert fault_of_batch(both) is None
+    assert fault_of_batch(other) is None
+
+
+Change = Callable[[Any], Any]
+
+
+def _depth(value: float, everywhere: bool) -> Change:
+    def change(geometry: Any) -> Any:
+        depth = geometry.depth.clone()
+        (depth if everywhere else depth[..., 3, 5])[...] = value
+        return replace(geometry, depth=depth)
+
+    return change
+
+
+def _confidence(value: float, everywhere: bool) -> Change:
+    def change(geometry: Any) -> Any:
+        confidence = geometry.depth_conf.clone()
+        (confidence if everywhere else confidence[..., 3, 5])[...] = value
+        return replace(geometry, depth_conf=confidence)
+
+    return change
+
+
+def _cameras(part: str, value: float) -> Change:
+    def change(geometry: Any) -> Any:
+        tensor = getattr(geometry.cameras, part).clone()
+        tensor[:, -1, 0, 0] = value
+        return replace(geometry, cameras=replace(geometry.cameras, **{part: tensor}))
+
+    return change
+
+
+def _tokens(part: str, value: float) -> Change:
+    def change(tokens: Any) -> Any:
+        if part == "camera":
+            return replace(tokens, camera=torch.full_like(tokens.camera, value))
+        patch = tuple(tap.clone() for tap in tokens.patch)
+        patch[-1 if part == "last" else 0][:, 0, 1] = value
+        return tokens.with_patch(patch)
+
+    return change
+
+
+# what is changed, how, whether the step must be dropped (None: either way)
+BACKBONE: list[tuple[str, Change, bool | None]] = []
+BACKBONE += [("decode", _depth(value, everywhere), None) for value in VALUES for everywhere in (False, True)]
+BACKBONE += [("decode", _confidence(value, everywhere), None) for value in VALUES for everywhere in (False, True)]
+BACKBONE += [("decode", _cameras(part, value), True) for part in ("world_to_camera", "intrinsics") for value in VALUES]
+BACKBONE += [("encode", _tokens(part, value), True) for part in ("first", "last") for value in VALUES]
+BACKBONE += [("encode", _tokens("camera", value), None) for value in VALUES]
+
+
+def test_a_bad_value_from_the_backbone_does_no_harm(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pixels without a finite depth or confidence are pixels without depth; bad tokens and cameras drop the step."""
+    backend = run.module.model.backend
+
+    def spoil(name: str, original: Callable[..., Any], *args: Any) -> Any:
+        result, step = original(*args), run.trainer.global_step
+        where, change, _ = BACKBONE[step] if step < len(BACKBONE) else ("", None, None)
+        return change(result) if where == name and change else result
+
+    for name in ("encode", "decode"):
+        monkeypatch.setattr(backend, name, partial(spoil, name, getattr(backend, name)))
+    (good,) = first_batches(run, 1)
+    audit = fit(run, [good] * (len(BACKBONE) + 1))
+    audit.assert_sound()
+    assert not audit.skipped[-1]
+    for (_, _, expected), skipped in zip(BACKBONE, audit.skipped[:-1], strict=True):
+        assert expected is None or skipped is expected
+
+
+@pytest.mark.parametrize("value", VALUES[:2])
+def test_a_bad_loss_term_is_named_with_its_scene(
+    tmp_path: Path, cache: Path, value: float, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    run = tiny_run(tmp_path, cache, "data.max_images=4")
+    loss = run.module.loss
+    assert isinstance(loss, VG2GTLoss)
+    seen = {"_geometry_terms": 0, "_gaussian_terms": 0}
+
+    def spoil(method: str, original: Callable[..., Any], *args: Any) -> Any:
+        scene = original(*args)
+        second = seen[method] % 2 == 1
+        seen[method] += 1
+        term = TERMS[run.trainer.global_step] if run.trainer.global_step < len(TERMS) else ""
+        if not second or term not in scene.terms:
+            return scene
+        return replace(scene, total=scene.total + value, terms=scene.terms | {term: scene.total * value})
+
+    for method in seen:
+        monkeypatch.setattr(loss, method, partial(spoil, method, getattr(loss, method)))
+    (good,) = first_batches(run, 1)
+    assert len(good.scene) == 2
+    audit = fit(run, [good] * (len(TERMS) + 1))
+    audit.assert_sound()
+    assert audit.skipped == [True] * len(TERMS) + [False]
+    for step, term in enumerate(TERMS):
+        assert f"step {step} skipped: rank 0, {good.scene[1]}: loss term {term}" in caplog.text
+
+
+def bad_gradients(run: Run, names: list[str]) -> None:
+    """Spoils the gradient of the n-th parameter in the n-th step."""
+    parameters = dict(run.module.model.named_parameters())
+    for step, name in enumerate(names):
+        value = VALUES[step % len(VALUES)]
+
+        def spoil(gradient: Tensor, step: int = step, value: float = value) -> Tensor:
+            if run.trainer.global_step == step:
+                gradient = gradient.clone(memory_format=torch.contiguous_format)
+                gradient.view(-1)[-1] = value
+            return gradient
+
+        parameters[name].register_hook(spoil)
+
+
+def check_bad_gradients(run: Run, names: list[str], caplog: pytest.LogCaptureFixture) -> None:
+    bad_gradients(run, names)
+    (good,) = first_batches(run, 1)
+    audit = fit(run, [good] * (len(names) + 1))
+    audit.assert_sound()
+    assert audit.skipped == [True] * len(names) + [False]
+    for step, name in enumerate(names):
+        assert f"step {step} skipped: rank 0, {good.scene[0]}: gradient of {name}" in caplog.text
+
+
+def trained_names(run: Run) -> list[str]:
+    return [name for name, parameter in run.module.model.named_parameters() if parameter.requires_grad]
+
+
+def test_a_bad_gradient_of_one_parameter_is_named(run: Run, caplog: pytest.LogCaptureFixture) -> None:
+    check_bad_gradients(run, trained_names(run)[::20], caplog)
+
+
+@pytest.mark.slow
+def test_a_bad_gradient_of_any_parameter_is_named(run: Run, caplog: pytest.LogCaptureFixture) -> None:
+    names = trained_names(run)
+    assert len(names) > 100
+    check_bad_gradients(run, names, caplog)
+
+
+def test_a_norm_that_overflows_drops_the_step(run: Run, caplog: pytest.LogCaptureFixture) -> None:
+    name = trained_names(run)[0]
+    dict(run.module.model.named_parameters())[name].register_hook(lambda gradient: torch.full_like(gradient, 1e30))
+    audit = fit(run, first_batches(run, 1))
+    audit.assert_sound()
+    assert audit.skipped == [True]
+    assert "step 0 skipped: the gradient's norm overflows" in caplog.text
+
+
+def test_too_many_in_a_row_stop_the_run_with_their_causes(tmp_path: Path, cache: Path) -> None:
+    run = tiny_run(tmp_path, cache, "training.max_skipped=3")
+    (good,) = first_batches(run, 1)
+    bad = [named(spoiled(good, "depth", float("nan")), f"room-{i}") for i in range(5)]
+    expected = (
+        "3 steps in a row had a non-finite loss or gradient, the last: rank 0, room-4: depth of the batch. "
+        "Scenes of these steps: room-2, room-3, room-4. "
+    )
+    with pytest.raises(FloatingPointError, match=re.escape(expected) + ".*training.max_skipped"):
+        fit(run, [bad[0], bad[1], good, bad[2], bad[3], bad[4]])
+    assert run.module.skipped.total == 5
+    with pytest.raises(ValueError, match=r"training\.max_skipped must be at least 1"):
+        tiny_run(tmp_path, cache, "training.max_skipped=0")
+
+
+def test_a_dropped_step_counts_for_schedule_and_data(tmp_path: Path, cache: Path) -> None:
+    """Learning rate, random draws and optimiser go on as if only the weights had not been told."""
+    run = tiny_run(tmp_path / "a", cache)
+    one, two, three = first_batches(run, 3)
+    disturbed = fit(run, [one, spoiled(two, "images", float("nan")), three])
+    assert run.trainer.global_step == 3
+    undisturbed = fit(tiny_run(tmp_path / "b", cache), [one, two, three])
+    assert disturbed.rates == undisturbed.rates
+    assert len(set(disturbed.rates)) == 3
+    steps = {int(state["step"]) for state in run.trainer.optimizers[0].state.values()}
+    assert steps == {2}
+
+
+RESUMABLE = [override for override in TINY if not override.startswith(("callbacks.", "logger"))]
+RESUMABLE += [f"+callbacks.poison._target_={Poison.__module__}.Poison", "+callbacks.poison.steps=[1,2]"]
+
+
+def test_resume_across_dropped_steps_equals_the_uninterrupted_run(tmp_path: Path, cache: Path) -> None:
+    """Checkpoints fall between two dropped steps: the second one is the first of the resumed run."""
+    whole = train(small_config(tmp_path / "whole", cache, *RESUMABLE))
+    with pytest.raises(InterruptedError):
+        train(with_crash(small_config(tmp_path / "cut", cache, *RESUMABLE), step=3))
+    resumed = train(small_config(tmp_path / "cut", cache, *RESUMABLE, "ckpt=last"))
+    assert resumed == whole
+    assert whole["skipped_steps"]["total"] == 2
+    assert [fault["step"] for fault in whole["skipped_steps"]["faults"]] == [1, 2]
+    assert json.loads((tmp_path / "cut" / "metrics.json").read_text()) == resumed
+    first, second = (read_checkpoint(newest_valid(tmp_path / name / "checkpoints")) for name in ("whole", "cut"))
+    assert first["skipped_steps"] == second["skipped_steps"]
+    assert all(torch.equal(tensor, second["state_dict"][name]) for name, tensor in first["state_dict"].items())
+    for row, state in first["optimizer_states"][0]["state"].items():
+        assert all(torch.equal(value, second["optimizer_states"][0]["state"][row][key]) for key, value in state.items())
+    counts = [row.split(",") for row in next((tmp_path / "whole").glob("logs/*/metrics.csv")).read_text().splitlines()]
+    column = counts[0].index("train/skipped_steps")
+    assert [row[column] for row in counts[1:] if row[column]] == ["0.0", "1.0", "2.0", "2.0"]
+
+
+def test_checkpoints_with_a_plain_number_still_load(run: Run) -> None:
+    run.module.skipped.load_state_dict(7)
+    assert run.module.skipped.summary() == {"total": 7, "faults": []}
+
+
+def two_processes(folder: Path, cache: Path, *overrides: str) -> subprocess.CompletedProcess[str]:
+    """Trains on two gloo processes; fails if they hang."""
+    small = [o for o in small_overrides(folder, cache) if not o.startswith("data.train_scenes")]
+    command = [sys.executable, "-c", "import vg2gt.cli; vg2gt.cli.main()", "train", *small, *overrides]
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
+    return subprocess.run(command, capture_output=True, text=True, cwd=folder, timeout=300, env=environment)
+
+
+def small_overrides(folder: Path, cache: Path) -> list[str]:
+    poison = [f"+callbacks.poison._target_={Poison.__module__}.Poison", "+callbacks.poison.rank=1"]
+    places = [f"output_dir={folder}", f"hydra.run.dir={folder}", f"data.cache_dir={cache}", "trainer=ddp"]
+    return [*SMALL, *[o for o in RESUMABLE if "poison" not in o], *poison, *places]
+
+
+def test_a_fault_on_one_rank_drops_the_step_on_both(tmp_path: Path, cache: Path) -> None:
+    ended = two_processes(tmp_path, cache, "+callbacks.poison.steps=[1]", "trainer.max_steps=3")
+    assert ended.returncode == 0, ended.stderr[-3000:]
+    skipped = json.loads((tmp_path / "metrics.json").read_text())["skipped_steps"]
+    assert skipped["total"] == 1
+    assert [(fault["step"], fault["rank"], fault["cause"]) for fault in skipped["faults"]] == [
+        (1, 1, "images of the batch")
+    ]
+    ranks = [json.loads((tmp_path / f"rank-{rank}.json").read_text()) for rank in (0, 1)]
+    assert ranks[0] == ranks[1]
+    before, dropped, after = ranks[0]
+    assert before == dropped != after
+
+
+@pytest.mark.slow
+def test_faults_on_one_rank_stop_both(tmp_path: Path, cache: Path) -> None:
+    many = ["+callbacks.poison.steps=[1,2,3]", "training.max_skipped=3", "trainer.max_steps=9"]
+    ended = two_processes(tmp_path, cache, *many)
+    assert ended.returncode != 0
+    assert "3 steps in a row" in ended.stderr
+    assert "the last: rank 1, room-" in ended.stderr
