@@ -52,6 +52,8 @@ class PixelHead(nn.Module):
         self.max_depth_residual = max_depth_residual
         bands = (sh_degree + 1) ** 2
         self.parts = (2, 1, 3, 4, 1, 3 * bands, 1)
+        # An untrained dense head's features hardly differ from pixel to pixel; VG²GT's point network has norms too.
+        self.norm = nn.LayerNorm(in_channels)
         self.hidden = nn.Linear(in_channels, hidden or in_channels)
         self.out = nn.Linear(hidden or in_channels, sum(self.parts))
         nn.init.normal_(self.out.weight, std=0.02)
@@ -77,7 +79,7 @@ class PixelHead(nn.Module):
             One Gaussian a pixel, in the order of the pixels, and positive confidences ``[N]`` that are those of the
             depth before training.
         """
-        raw = self.out(F.gelu(self.hidden(features))).float()
+        raw = self.out(F.gelu(self.hidden(self.norm(features)))).float()
         shift, residual, scale, rotation, opacity, color, trust = raw.split(self.parts, -1)
         depth = pixels.depth * (1 + self.max_depth_residual * torch.tanh(residual[:, 0]))
         sideways = self.max_offset * pixels.footprint * torch.tanh(shift)
