@@ -26,12 +26,15 @@ def joint_target_cameras(model: Reconstructor, batch: Batch, prediction: Predict
     """Predicted cameras of the held-out views (protocol ``novel``).
 
     The backbone sees context and held-out views together; a similarity between its context cameras and those of the
-    context-only pass brings the held-out cameras into the Gaussians' frame.
+    context-only pass brings the held-out cameras into the Gaussians' frame. Where the context cameras stand still, as a
+    single one does, its scale comes from the depth that both passes decode of the context views.
     """
-    joint = model.backend.decode(model.backend.encode(batch.images, batch.hints)).cameras
-    joint = scale_translations(relative_to_first(joint), prediction.unit)
+    geometry = model.backend.decode(model.backend.encode(batch.images, batch.hints))
+    joint = scale_translations(relative_to_first(geometry.cameras), prediction.unit)
     context = slice(0, batch.num_context)
-    similarity = align_cameras(joint.select(context), prediction.geometry.cameras)
+    depth, first_depth = geometry.depth[:, context] * prediction.unit[:, None, None, None], prediction.initial.depth
+    by_depth = fit_depth_scale(depth, first_depth, first_depth > 0).nan_to_num(1.0)
+    similarity = align_cameras(joint.select(context), prediction.geometry.cameras, by_depth)
     return similarity.apply_cameras(joint.select(slice(batch.num_context, None)))
 
 

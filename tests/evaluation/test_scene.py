@@ -1,14 +1,17 @@
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import pytest
 import torch
 
-from vg2gt.evaluation import EvaluationOptions, SceneEvaluator, SceneResult, evaluate_scene
+from vg2gt.evaluation import EvaluationOptions, PointOptions, SceneEvaluator, SceneResult, evaluate_scene
 from vg2gt.evaluation.cost import clocked
 from vg2gt.evaluation.scene import MODES, PROTOCOLS
+from vg2gt.evaluation.scores import align_geometry, point_scores
+from vg2gt.geometry.alignment import Similarity
+from vg2gt.geometry.cameras import scale_translations
 from vg2gt.geometry.normals import normals_from_depth
 from vg2gt.metrics import cv, depth_metrics, normal_metrics, psnr, ssim
-from vg2gt.protocols import ground_truth_target_cameras
+from vg2gt.protocols import ground_truth_target_cameras, joint_target_cameras
 from vg2gt.types import Batch
 
 
@@ -93,6 +96,75 @@ def test_options_reach_the_metrics(module_and_batch, result: SceneResult, batch:
         EvaluationOptions(alignment="affine")
     with pytest.raises(ValueError, match="neighbors >= 1"):
         EvaluationOptions(neighbors=0)
+
+
+def test_true_depth_out_of_range_is_unknown_to_every_figure(module_and_batch, batch: Batch) -> None:
+    module, _ = module_and_batch
+    middle = float(batch.depth[batch.depth > 0].median())
+    near = replace(batch, depth=torch.where(batch.depth <= middle, batch.depth, 0.0))
+    limited = SceneEvaluator(module.model, module.renderer, EvaluationOptions(depth_range=(None, middle)))(batch)
+    target, render = near.target, limited.renders["gt_pose"]
+    normals, valid = normals_from_depth(target.depth[0], target.cameras.intrinsics[0])
+    expected = normal_metrics(render.normal[0], normals, valid & (render.depth[0] > 0))["mean"]
+    assert limited.scores["rendered/gt_pose/solid/normal_mean"] == expected
+    similarity = align_geometry(limited.prediction.geometry, near.context)
+    assert similarity is not None
+    geometry, options = limited.prediction.geometry, asdict(PointOptions())
+    points = point_scores(geometry.depth, geometry.cameras, near.context, similarity, **options)
+    assert limited.scores["points/decoded/f_score"] == points["f_score"]
+
+
+def test_points_of_unknown_pixels_are_not_wrong(batch: Batch) -> None:
+    context = batch.context
+    holes = torch.zeros_like(context.depth, dtype=torch.bool)
+    holes[:, :, :, ::2] = True
+    holes[:, 0] = True  # a view without any depth
+    truth = replace(context, depth=torch.where(holes, 0.0, context.depth))
+    perfect = Similarity(torch.ones(1), torch.eye(3)[None], torch.zeros(1, 3))
+    scores = point_scores(context.depth, context.cameras, truth, perfect, threshold=1e-4)
+    assert scores["precision"] == scores["recall"] == 1
+    assert scores["accuracy"] == 0
+
+
+def test_placeholder_cameras_score_no_normals(evaluator: SceneEvaluator, batch: Batch) -> None:
+    scores = evaluator(batch, has_cameras=False).scores
+    assert "rendered/novel/solid/psnr" in scores
+    assert not any("normal" in name for name in scores)
+
+
+@pytest.mark.parametrize("bounds", [(5, 1), (None, 0), (-1, None), (2, 2)])
+def test_a_range_without_depths_is_refused(bounds) -> None:
+    with pytest.raises(ValueError, match=r"depth_range=.* leaves no depth"):
+        EvaluationOptions(depth_range=bounds)
+
+
+@pytest.mark.parametrize("name", ["threshold", "downsample", "cap"])
+def test_lengths_are_positive(name: str) -> None:
+    with pytest.raises(ValueError, match=rf"evaluation\.points\.{name}=-1"):
+        PointOptions(**{name: -1})
+
+
+@pytest.mark.parametrize("views", [1, 3])
+def test_the_joint_pass_may_have_another_unit(module_and_batch, batch: Batch, views: int) -> None:
+    """As backbones without metric scale have: three times larger as soon as held-out views are seen too."""
+    module, _ = module_and_batch
+    inputs = replace(batch, num_context=views)
+    decode = module.model.backend.decode
+
+    def rescaled(tokens):
+        geometry = decode(tokens)
+        larger = scale_translations(geometry.cameras, torch.full((1,), 3.0))
+        return replace(geometry, depth=geometry.depth * 3, cameras=larger)
+
+    with torch.no_grad():
+        prediction = module.model(inputs.context.images, inputs.context.hints)
+    plain = joint_target_cameras(module.model, inputs, prediction)
+    module.model.backend.decode = rescaled
+    try:
+        found = joint_target_cameras(module.model, inputs, prediction)
+    finally:
+        del module.model.backend.decode
+    torch.testing.assert_close(found.world_to_camera, plain.world_to_camera, rtol=1e-4, atol=1e-5)
 
 
 def test_the_figures_of_training_runs(module_and_batch, batch: Batch) -> None:

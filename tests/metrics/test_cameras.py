@@ -88,3 +88,17 @@ def test_area_under_curve_matches_the_histogram() -> None:
 def test_a_single_view_is_refused() -> None:
     with pytest.raises(ValueError, match="at least 2 views"):
         camera_metrics(random_cameras(views=1), random_cameras(views=1))
+
+
+def test_cameras_that_turn_in_one_place_have_no_direction_wherever_that_is() -> None:
+    turns = Rotation.random(5, random_state=0).as_matrix()
+
+    def cameras(centers: np.ndarray) -> Cameras:
+        poses = np.tile(np.eye(4), (5, 1, 1))
+        poses[:, :3, :3] = turns
+        poses[:, :3, 3] = -np.einsum("nij,nj->ni", turns, centers)
+        return Cameras(torch.tensor(poses[None], dtype=torch.float32), torch.eye(3).repeat(1, 5, 1, 1), (4, 4))
+
+    still, moving = cameras(np.tile([100.0, 50, 3], (5, 1))), cameras(np.random.default_rng(0).normal(size=(5, 3)))
+    assert float(relative_pose_errors(moving, still)[1].max()) == 0
+    assert float(relative_pose_errors(still, moving)[1].min()) == 90

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 
 from vg2gt.evaluation.views import ViewSelection
 from vg2gt.metrics.depth import ALIGNMENTS
@@ -17,11 +17,19 @@ class PointOptions:
         threshold: distance below which a point is right.
         downsample: one point is kept in every cell of this edge; None keeps all.
         cap: distances from here on are left out of the means; None: none.
+
+    Raises:
+        ValueError: if a length is not positive.
     """
 
     threshold: float = 0.05
     downsample: float | None = 0.02
     cap: float | None = None
+
+    def __post_init__(self) -> None:
+        for name, length in asdict(self).items():
+            if not (length is None and name != "threshold") and not length > 0:
+                raise ValueError(f"evaluation.points.{name}={length}: give a positive length in the data's unit")
 
 
 @dataclass(frozen=True)
@@ -31,7 +39,8 @@ class EvaluationOptions:
     Args:
         selection: which views of a scene.
         alignment: of depth, see :func:`vg2gt.metrics.depth_metrics`; the paper's is ``median``.
-        depth_range: true depths outside it are left out, ``(nearest, farthest)`` in the data's unit; None: no bound.
+        depth_range: true depths outside it count as unknown, for depth, normals and points alike, ``(nearest,
+            farthest)`` in the data's unit; None: no bound.
         neighbors: k of the uniformity CV.
         points: how point clouds are compared.
         lpips: ``auto`` (weights in torch hub's cache), ``download``, the weights' path, or None: no LPIPS.
@@ -59,6 +68,11 @@ class EvaluationOptions:
                 "evaluation needs neighbors >= 1, pictures >= 0 and depth_range=[nearest,farthest], got "
                 f"{self.neighbors}, {self.pictures} and {list(self.depth_range)}"
             )
+        if not 0 <= self.nearest < self.farthest:
+            raise ValueError(
+                f"evaluation.depth_range={list(self.depth_range)} leaves no depth: give [nearest,farthest] with "
+                "0 <= nearest < farthest, null for no bound"
+            )
 
     @property
     def nearest(self) -> float:
@@ -68,4 +82,4 @@ class EvaluationOptions:
     @property
     def farthest(self) -> float:
         """The farthest true depth that counts."""
-        return self.depth_range[1] or float("inf")
+        return float("inf") if self.depth_range[1] is None else self.depth_range[1]

@@ -10,6 +10,7 @@ from vg2gt.types import Cameras
 
 ACCURACIES = (5, 15, 30)
 AREAS = (3, 5, 15, 30)
+STILL = 1e-6  # a shorter baseline, in distances from the world's origin, is float32's rounding
 
 
 def relative_pose_errors(predicted: Cameras, reference: Cameras) -> tuple[Tensor, Tensor]:
@@ -22,13 +23,18 @@ def relative_pose_errors(predicted: Cameras, reference: Cameras) -> tuple[Tensor
     Returns:
         Rotation errors ``[B, V (V - 1) / 2]`` and errors of the direction of translation, both in degrees. As in the
         field's evaluations a direction and its opposite count as equal, so the latter are at most 90. A pair whose
-        reference does not move has no direction and translation error 0.
+        reference does not move has no direction and translation error 0; one of which only the prediction does not
+        move has translation error 90.
     """
     first, second = torch.triu_indices(*(predicted.world_to_camera.shape[1],) * 2, offset=1)
-    relative = []
+    relative, still = [], []
     for cameras in (predicted, reference):
         poses = cameras.world_to_camera.double()
-        relative.append(poses[:, second] @ invert_rigid(poses[:, first]))
+        pairs = poses[:, second] @ invert_rigid(poses[:, first])
+        relative.append(pairs)
+        # Equal centres far from the origin leave float32's rounding, which has a direction.
+        distance = torch.maximum(poses[:, first, :3, 3].norm(dim=-1), poses[:, second, :3, 3].norm(dim=-1))
+        still.append(pairs[..., :3, 3].norm(dim=-1) <= STILL * distance)
     difference = relative[0][..., :3, :3].transpose(-1, -2) @ relative[1][..., :3, :3]
     axis = torch.stack([difference[..., i, j] - difference[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0))], -1)
     trace = difference.diagonal(dim1=-2, dim2=-1).sum(-1)
@@ -37,9 +43,8 @@ def relative_pose_errors(predicted: Cameras, reference: Cameras) -> tuple[Tensor
     t, t_ref = (pose[..., :3, 3] for pose in relative)
     sine = torch.linalg.cross(t, t_ref, dim=-1).norm(dim=-1)
     translation = torch.atan2(sine, (t * t_ref).sum(-1).abs()).rad2deg()
-    still = t.norm(dim=-1) == 0
-    translation = torch.where(still, 90.0, translation)
-    return rotation, torch.where(t_ref.norm(dim=-1) < 1e-9, 0.0, translation)
+    translation = torch.where(still[0], 90.0, translation)
+    return rotation, torch.where(still[1], 0.0, translation)
 
 
 def camera_metrics(predicted: Cameras, reference: Cameras) -> dict[str, float]:
