@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import tempfile
 from dataclasses import dataclass
 from datetime import date
@@ -187,7 +188,7 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
     device, console = torch.device(arguments.device), Console(width=110)
-    where = machine(device)
+    where, load = machine(device), round(os.getloadavg()[0], 2)
     console.print(json.dumps(where))
     model = next((text.removeprefix("model=") for text in arguments.overrides if text.startswith("model=")), "tiny")
     cases, backend, precision = [], "", ""
@@ -207,6 +208,7 @@ def main() -> None:
         "machine": where,
         "unit": "seconds" if device.type == "cuda" else "core-seconds",
         "threads": arguments.threads,
+        "load at the beginning": load,
         "backend": backend,
         "model": model,
         "precision": precision,

@@ -77,6 +77,14 @@ def test_primitives(tmp_path: Path) -> None:
     assert rows["VG²GT, 4 px", 6] < rows["VG²GT, 2 px", 6]
 
 
+def test_primitives_take_no_weights(tmp_path: Path) -> None:
+    """They would be passed over."""
+    command = [sys.executable, str(BENCHMARKS / "primitives.py"), "init_from=some.ckpt"]
+    shown = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=200)
+    assert shown.returncode != 0
+    assert "init_from=some.ckpt: only untrained models are measured here" in shown.stderr
+
+
 @pytest.mark.slow
 def test_baselines(tmp_path: Path) -> None:
     arguments = ["steps=1", "name=short", *TINY, *QUIET]

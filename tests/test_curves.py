@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from vg2gt.curves import moving_average, plot_curves, read_curves
+from vg2gt.curves import labels, moving_average, plot_curves, read_curves
 
 
 def write_log(folder: Path, version: int, text: str) -> None:
@@ -37,6 +37,19 @@ def test_picture(run: Path) -> None:
     out = plot_curves([run], run / "curves.png")
     assert out.read_bytes().startswith(b"\x89PNG")
     assert sorted(path.name for path in run.iterdir()) == ["curves.png", "logs"]
+
+
+def test_runs_of_the_same_name_are_told_apart(tmp_path: Path) -> None:
+    """Otherwise one would silently take the other's place."""
+    assert labels([tmp_path / "a" / "full", tmp_path / "b" / "full"]) == ["a/full", "b/full"]
+    assert labels([tmp_path / "a" / "full", tmp_path / "b" / "start"]) == ["full", "start"]
+
+
+def test_a_log_without_training_is_named(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib", reason="matplotlib is in the extra eval")
+    write_log(tmp_path, 0, "epoch,step,eval/psnr\n0,0,20.0\n")
+    with pytest.raises(ValueError, match="no training was logged"):
+        plot_curves([tmp_path], tmp_path / "curves.png")
 
 
 def test_missing_and_empty_logs_are_named(tmp_path: Path) -> None:

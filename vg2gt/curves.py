@@ -52,18 +52,30 @@ def moving_average(values: list[float], window: int) -> list[float]:
     return averages
 
 
+def labels(runs: list[Path]) -> list[str]:
+    """Shortest ends of the paths that tell the runs apart, such as ``seed-0/full`` and ``seed-1/full``."""
+    parts = [run.resolve().parts for run in dict.fromkeys(runs)]
+    length = 1
+    while len({part[-length:] for part in parts}) < len({*parts}):
+        length += 1
+    return ["/".join(run.resolve().parts[-length:]) for run in runs]
+
+
 def plot_curves(runs: list[Path], out: Path) -> Path:
     """Writes one panel a quantity and one line a run: every logged value pale, the moving average strong.
 
     Raises:
         ImportError: if matplotlib is not installed.
+        ValueError: if no run has logged a training step.
     """
     try:
         from matplotlib import pyplot  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise ImportError("curves need matplotlib: pip install 'vg2gt[eval]'") from error
-    curves = {run.name: read_curves(run) for run in runs}
+    curves = {label: read_curves(run) for label, run in zip(labels(runs), runs, strict=True)}
     shown = [name for name in PANELS if any(name in logged for logged in curves.values())]
+    if not shown:
+        raise ValueError(f"no training was logged in {', '.join(map(str, runs))}: none of {', '.join(PANELS)}")
     columns = min(3, len(shown))
     rows = math.ceil(len(shown) / columns)
     figure, panels = pyplot.subplots(rows, columns, figsize=(4 * columns, 2.8 * rows), squeeze=False)
