@@ -67,7 +67,8 @@ def test_senseless_numbers_are_refused(every: int, kept: int) -> None:
 
 def test_a_checkpoint_carries_the_row_of_its_step(tmp_path: Path, cache: Path) -> None:
     """A process that goes on from it, without the log of the one before, writes it."""
-    run = build(small_config(tmp_path, cache, *RUN, "callbacks.checkpoint.every_n_train_steps=4"))
+    overrides = ["callbacks.checkpoint.every_n_train_steps=4", "trainer.val_check_interval=1000"]
+    run = build(small_config(tmp_path, cache, *RUN, *overrides))
     run.trainer.fit(run.module, datamodule=run.datamodule)
     logged = {name: curve[3] for name, curve in read_curves(tmp_path).items() if 3 in curve}
     saved = read_checkpoint(tmp_path / "checkpoints" / "step-4.ckpt")["last_row"]
@@ -81,9 +82,9 @@ def test_a_checkpoint_carries_the_row_of_its_step(tmp_path: Path, cache: Path) -
 
 
 def test_sigterm_saves_without_another_evaluation(tmp_path: Path, cache: Path) -> None:
-    stopped = TerminatedAt(4)
+    stopped = TerminatedAt(3)
     run = build(small_config(tmp_path, cache, *RUN))
     run.trainer.callbacks.append(stopped)  # pyright: ignore[reportAttributeAccessIssue]
     run.trainer.fit(run.module, datamodule=run.datamodule)
-    assert newest_valid(tmp_path / "checkpoints").name == "step-4.ckpt"
-    assert stopped.evaluations == 1  # that of step 3
+    assert newest_valid(tmp_path / "checkpoints").name == "step-3.ckpt"
+    assert stopped.evaluations == 0

@@ -85,7 +85,7 @@ def test_newest_valid_passes_over_damaged_files(tmp_path: Path, caplog: pytest.L
 
 def test_no_valid_checkpoint_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "step-1.ckpt").write_bytes(b"nothing")
-    with pytest.raises(FileNotFoundError, match="ckpt=last found no valid checkpoint"):
+    with pytest.raises(FileNotFoundError, match=r"no valid checkpoint in .* \(1 damaged\).* overwrite=true"):
         newest_valid(tmp_path)
 
 

@@ -99,8 +99,8 @@ def newest_valid(folder: str | Path) -> Path:
         else:
             return path
     raise FileNotFoundError(
-        f"ckpt=last found no valid checkpoint in {folder} ({len(candidates)} damaged); to start from the beginning "
-        "leave ckpt=last out (ckpt=auto starts or goes on, as needed), or name a file with ckpt=PATH"
+        f"no valid checkpoint in {folder} ({len(candidates)} damaged): name a file with ckpt=PATH, or start from the "
+        "beginning with ckpt=null overwrite=true (ckpt=auto starts by itself only where there are none)"
     )
 
 

@@ -32,7 +32,7 @@ RUN = [
     "data.eval_context=2",
     "data.eval_target=1",
     f"trainer.max_steps={STEPS}",
-    "trainer.val_check_interval=3",
+    "trainer.val_check_interval=4",
 ]
 
 TRAIN, EVALUATE, ABLATE = "vg2gt.cli.train", "vg2gt.cli.evaluate", "vg2gt.ablate"
@@ -185,12 +185,12 @@ def after_a_checkpoint(attempt: Attempt) -> bool:
 
 
 def in_validation(attempt: Attempt) -> bool:
-    """The row of the step before the first evaluation is logged, that of the evaluation is not."""
+    """The row of the step before the evaluation is logged; that of the evaluation, and the checkpoint, come later."""
     log = attempt.log()
     if "train/" not in log:
         return False
     column = log.split("\n", 1)[0].split(",").index("step")
-    return any(line.split(",")[column] == "2" for line in log.splitlines()[1:])
+    return any(line.split(",")[column] == "3" for line in log.splitlines()[1:])
 
 
 def in_first_evaluation(attempt: Attempt) -> bool:

@@ -70,6 +70,35 @@ def test_killed_run_equals_uninterrupted(tmp_path: Path, rooms: Path, whole: Pat
     harness.assert_same(whole, tmp_path / "run")
 
 
+def test_a_damaged_last_checkpoint_is_set_aside(tmp_path: Path, rooms: Path, whole: Path) -> None:
+    """The run goes on from the one before, says so, and ends the same."""
+    folder = tmp_path / "run"
+    shutil.copytree(whole, folder)
+    newest = folder / "checkpoints" / f"step-{harness.STEPS}.ckpt"
+    content = bytearray(newest.read_bytes())
+    content[len(content) // 2] ^= 1
+    newest.write_bytes(content)
+    (folder / "metrics.json").unlink()
+    harness.finish(TRAIN, harness.training(folder, rooms), folder)
+    aside = newest.with_name(f"{newest.name}.damaged")
+    assert aside.read_bytes() == bytes(content)
+    aside.unlink()
+    harness.assert_same(whole, folder)
+    said = folder.with_name("run.out").read_text()
+    assert "trying the one before" in said
+    assert "goes on from step-4.ckpt" in said
+
+
+def test_auto_does_not_start_over_where_all_checkpoints_are_damaged(tmp_path: Path, rooms: Path) -> None:
+    folder = tmp_path / "run"
+    (folder / "checkpoints").mkdir(parents=True)
+    (folder / "checkpoints" / "step-2.ckpt").write_bytes(b"damaged")
+    attempt = harness.start(TRAIN, harness.training(folder, rooms), folder)
+    assert attempt.wait() == 1
+    assert "FileNotFoundError: no valid checkpoint in" in attempt.said()
+    assert (folder / "checkpoints" / "step-2.ckpt").is_file()
+
+
 @pytest.mark.slow
 def test_twenty_kills(tmp_path: Path, rooms: Path, whole: Path) -> None:
     kills: dict[str, int] = {}

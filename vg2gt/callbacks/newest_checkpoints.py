@@ -75,8 +75,13 @@ class NewestCheckpoints(Checkpoint):
     ) -> None:
         """Takes these values out again."""
         self._row = checkpoint.get(LAST_ROW)
+        # Lightning counts the step after its checkpoint, and not at all where nothing is left to train: the last
+        # evaluation would be logged a step early.
+        loop = checkpoint.get("loops", {}).get("fit_loop", {}).get("epoch_loop.state_dict")
+        if loop is not None and checkpoint["global_step"] == trainer.max_steps:
+            loop["_batches_that_stepped"] = checkpoint["global_step"]
 
-    def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+    def on_fit_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Writes them to the log of the process that goes on."""
         if self._row is not None:
             for logger in trainer.loggers:
