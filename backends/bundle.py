@@ -120,7 +120,7 @@ def read_bundle(folder: Path) -> Description:
 def _parse(file: Path) -> Description:
     try:
         content = json.loads(file.read_text())
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{file} is not valid JSON ({error}): {REMEDY}") from error
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise ValueError(f"{file} is not a description of format {FORMAT}: {REMEDY}")
@@ -202,11 +202,11 @@ def external_data(file: Path) -> list[str]:
     Raises:
         ValueError: if it is not an ONNX file.
     """
-    with file.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as content:
-        try:
+    try:
+        with file.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as content:
             return sorted(set(_locations(content, 0, len(content), "model")))
-        except (IndexError, UnicodeDecodeError, RecursionError) as error:
-            raise ValueError(f"{file} is not an ONNX file: {REMEDY}") from error
+    except (IndexError, ValueError, RecursionError) as error:  # ValueError: an empty file, or names that are no text
+        raise ValueError(f"{file} is not an ONNX file: {REMEDY}") from error
 
 
 def _locations(content: mmap.mmap, start: int, end: int, message: str) -> Iterator[str]:

@@ -1,6 +1,7 @@
 """Malicious files. Each would make the canary file if anything in it ran; no test may leave one behind."""
 
 import os
+import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -51,10 +52,9 @@ def model():
     return load_model(backend="oracle,depth_noise=0", device="cpu").model
 
 
-@pytest.fixture
-def run_folder(model, tmp_path: Path) -> Path:
-    """A training run's folder."""
-    folder = tmp_path / "run"
+@pytest.fixture(scope="session")
+def harmless_run(model, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("harmless") / "run"
     (folder / "checkpoints").mkdir(parents=True)
     parts = {"backend": "oracle", "model": "tiny", "renderer": "solid"}
     config = {name: compose_part(name, choice) for name, choice in parts.items()}
@@ -65,15 +65,23 @@ def run_folder(model, tmp_path: Path) -> Path:
     return folder
 
 
+@pytest.fixture
+def run_folder(harmless_run: Path, tmp_path: Path) -> Path:
+    """A training run's folder, to be made malicious."""
+    return Path(shutil.copytree(harmless_run, tmp_path / "run"))
+
+
 @pytest.fixture(scope="session")
 def rooms(tmp_path_factory: pytest.TempPathFactory) -> SyntheticScenes:
     return SyntheticScenes(1, num_frames=3, size=SIZE, cache_dir=str(tmp_path_factory.mktemp("rooms")))
 
 
-@pytest.fixture
-def write_shards_to(rooms: SyntheticScenes) -> Callable[[Path], Path]:
+@pytest.fixture(scope="session")
+def write_shards_to(rooms: SyntheticScenes, tmp_path_factory: pytest.TempPathFactory) -> Callable[[Path], Path]:
+    whole = tmp_path_factory.mktemp("shards") / "whole"
+    write_shards(rooms, whole)
+
     def write(folder: Path) -> Path:
-        write_shards(rooms, folder)
-        return folder
+        return Path(shutil.copytree(whole, folder))
 
     return write

@@ -14,8 +14,9 @@ import pytest
 import torch
 from PIL import Image
 
+from tests.safety.conftest import SIZE
 from vg2gt.checkpoints import read_checkpoint
-from vg2gt.data import DataError, ShardedScenes
+from vg2gt.data import DataError, ShardedScenes, SyntheticScenes
 from vg2gt.data.sharded_scenes import INDEX
 from vg2gt.data.sources.arrays import load_npy
 from vg2gt.data.sources.parsing import load_npz
@@ -46,14 +47,14 @@ def npy_header(shape: tuple[int, ...], kind: str = "<f4") -> bytes:
 
 @pytest.fixture(scope="module")
 def bomb() -> bytes:
-    return deflated_zeros("depth.npy", 512 << 20, npy_header((1 << 27,)))
+    return deflated_zeros("depth.npy", 300 << 20, npy_header((75 << 20,)))
 
 
 def test_array_bombs(tmp_path: Path, bomb: bytes) -> None:
     assert len(bomb) < 1 << 20
     path = tmp_path / "bomb.npz"
     path.write_bytes(bomb)
-    with pytest.raises(FormatError, match=r"unpack to 5368\d+ bytes, at most 268435456"):
+    with pytest.raises(FormatError, match=r"unpack to 3145\d+ bytes, at most 268435456"):
         read_npz(path, ("depth",))
     with pytest.raises(DataError, match=r"bomb\.npz of scene s: .*unpack to"):
         load_npz(path, "s", ("depth",))
@@ -86,9 +87,7 @@ def test_members_of_an_archive_are_never_written_to_disk(tmp_path: Path) -> None
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["a.npz", "inner"]
 
 
-def rezipped(
-    content: bytes, change: Callable[[str, bytes], tuple[str, bytes]], kind: int = zipfile.ZIP_STORED
-) -> bytes:
+def rezipped(content: bytes, change: Callable[[str, bytes], tuple[str, bytes]], kind: int = 0) -> bytes:
     buffer = io.BytesIO()
     with zipfile.ZipFile(io.BytesIO(content)) as old, zipfile.ZipFile(buffer, "w", kind) as new:
         for member in old.infolist():
@@ -98,7 +97,7 @@ def rezipped(
 
 ZIPS: dict[str, Callable[[bytes], bytes]] = {
     "compressed": lambda content: rezipped(content, lambda n, c: (n, c), zipfile.ZIP_DEFLATED),
-    "bomb": lambda content: rezipped(content, lambda n, c: (n, bytes(64 << 20) if "data/0" in n else c), zipfile.ZIP_DEFLATED),
+    "bomb": lambda content: rezipped(content, lambda n, c: (n, bytes(8 << 20) if "data/0" in n else c), 8),
     "parent folder": lambda content: rezipped(content, lambda n, c: ("../" + n, c)),
     "absolute": lambda content: rezipped(content, lambda n, c: ("/" + n, c)),
     "no pickle": lambda content: rezipped(content, lambda n, c: (n.replace("data.pkl", "data.txt"), c)),
@@ -116,13 +115,11 @@ def test_zip_files_of_torch(tmp_path: Path, name: str) -> None:
         (tmp_path / "inner" / file).write_bytes(ZIPS[name](buffer.getvalue()))
     read = {"model.pt": read_tensors, "step-1.ckpt": read_checkpoint}
     for file, reader in read.items():
-        try:
-            content = reader(tmp_path / "inner" / file)
-        except ValueError as error:
-            assert file in str(error)
-        else:  # names of members are labels, nothing is extracted
-            assert name in ("parent folder", "absolute")
-            assert torch.equal(content["w"], torch.arange(99.0))
+        if name in ("parent folder", "absolute"):  # names of members are labels, nothing is extracted
+            assert torch.equal(reader(tmp_path / "inner" / file)["w"], torch.arange(99.0))
+            continue
+        with pytest.raises(ValueError, match=file):
+            reader(tmp_path / "inner" / file)
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["inner", "model.pt", "step-1.ckpt"]
 
 
@@ -255,17 +252,12 @@ def test_addresses_that_lead_on_are_refused(root: str, options: dict[str, Any]) 
         ShardedScenes(root, storage_options=options)
 
 
-def test_caches_are_refused_without_a_word_too_many(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, bomb: bytes
-) -> None:
-    """A bomb in the cache of rooms: one warning, and the room is made again."""
-    from tests.safety.conftest import SIZE
-    from vg2gt.data import SyntheticScenes
-
+def test_a_bomb_in_the_cache_of_rooms(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """One warning, and the room is made again."""
     source = SyntheticScenes(1, num_frames=1, size=SIZE, cache_dir=str(tmp_path))
     expected = source.load(source.scenes[0], [0])
     (path,) = tmp_path.rglob("*.npz")
-    path.write_bytes(deflated_zeros("images.npy", 512 << 20, npy_header((1 << 29,), "|u1")))
+    path.write_bytes(deflated_zeros("images.npy", 300 << 20, npy_header((300 << 20,), "|u1")))
     again = SyntheticScenes(1, num_frames=1, size=SIZE, cache_dir=str(tmp_path))
     with caplog.at_level(logging.WARNING):
         assert torch.equal(again.load(again.scenes[0], [0]).depth, expected.depth)

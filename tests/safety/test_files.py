@@ -5,7 +5,7 @@ import json
 import os
 import struct
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -62,7 +62,7 @@ PICTURES: dict[str, Callable[[Path], bytes]] = {
 
 
 def zipped_text() -> bytes:
-    content = b"Comment\0\0" + zlib.compress(bytes(256 << 20))
+    content = b"Comment\0\0" + zlib.compress(bytes(80 << 20))
     return struct.pack(">I", len(content)) + b"zTXt" + content + struct.pack(">I", zlib.crc32(b"zTXt" + content))
 
 
@@ -140,10 +140,10 @@ MODELS = {
 }
 
 
-def colmap_model(folder: Path, name: str = "a.png", **files: bytes) -> Path:
+def colmap_model(folder: Path, name: str = "a.png", files: Mapping[str, bytes] | None = None) -> Path:
     folder.mkdir(parents=True)
     image = struct.pack("<Q", 1) + POSE + name.encode() + b"\0" + bytes(8)
-    for file, content in {"cameras": CAMERA, "images": image, "points3D": bytes(8), **files}.items():
+    for file, content in {"cameras": CAMERA, "images": image, "points3D": bytes(8), **(files or {})}.items():
         (folder / f"{file}.bin").write_bytes(content)
     return folder
 
@@ -152,7 +152,7 @@ def colmap_model(folder: Path, name: str = "a.png", **files: bytes) -> Path:
 def test_colmap_headers(tmp_path: Path, name: str) -> None:
     assert read_colmap(colmap_model(tmp_path / "good")).images[1].name == "a.png"
     with pytest.raises(FormatError, match=r"bad"):
-        read_colmap(colmap_model(tmp_path / "bad", **MODELS[name]))
+        read_colmap(colmap_model(tmp_path / "bad", files=MODELS[name]))
 
 
 def test_sens_headers(tmp_path: Path) -> None:

@@ -1,0 +1,224 @@
+"""ONNX bundles: no data from outside the folder, no code of their own, no class but our decoders."""
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from safetensors.numpy import save_file
+
+from backends.bundle import (
+    CONVENTIONS,
+    DECODER,
+    DECODER_WEIGHTS,
+    DESCRIPTION,
+    ENCODER,
+    Description,
+    read_bundle,
+    sha256,
+)
+from backends.onnx import OnnxBackend, open_session
+
+onnx = pytest.importorskip("onnx", reason="needs onnx: pip install 'vg2gt[export]'")
+from onnx import TensorProto, helper  # noqa: E402
+
+
+def graph(*nodes: Any, initializers: tuple[Any, ...] = ()) -> Any:
+    shape = helper.make_tensor_value_info
+    inputs, outputs = [shape("x", TensorProto.FLOAT, [1])], [shape("y", TensorProto.FLOAT, [1])]
+    return helper.make_graph(list(nodes), "g", inputs, outputs, list(initializers))
+
+
+def network(*nodes: Any, initializers: tuple[Any, ...] = (), domain: str = "") -> bytes:
+    opsets = [helper.make_opsetid("", 17), *([helper.make_opsetid(domain, 1)] if domain else [])]
+    made = graph(*nodes, initializers=initializers)
+    return helper.make_model(made, opset_imports=opsets, ir_version=9).SerializeToString()
+
+
+HARMLESS = network(helper.make_node("Identity", ["x"], ["y"]))
+
+
+def outside(location: str) -> bytes:
+    """A network whose weight lies in another file."""
+    tensor = TensorProto(name="w", data_type=TensorProto.FLOAT, dims=[1], data_location=TensorProto.EXTERNAL)
+    tensor.external_data.add(key="location", value=location)
+    return network(helper.make_node("Add", ["x", "w"], ["y"]), initializers=(tensor,))
+
+
+def describe(folder: Path, change: Callable[[dict[str, Any]], Any] = lambda content: None) -> None:
+    """Writes a description that fits the folder's files, then changed."""
+    description = Description(
+        name="da3_tiny",
+        licence="mine",
+        weights="0" * 64,
+        patch_size=14,
+        token_dims=[4],
+        taps=[0],
+        needs_hints=False,
+        decoder={"class": "DA3Decoder", "arguments": {}},
+        conventions=CONVENTIONS,
+        max_difference={},
+        files={file.name: sha256(file) for file in sorted(folder.iterdir()) if file.name != DESCRIPTION},
+    )
+    description.write(folder)
+    content = json.loads((folder / DESCRIPTION).read_text())
+    change(content)
+    (folder / DESCRIPTION).write_text(json.dumps(content))
+
+
+@pytest.fixture
+def bundle(tmp_path: Path) -> Path:
+    folder = tmp_path / "bundle"
+    folder.mkdir()
+    for name in (ENCODER, DECODER):
+        (folder / name).write_bytes(HARMLESS)
+    describe(folder)
+    return folder
+
+
+@pytest.mark.filterwarnings("ignore:.*decodes without gradient")
+def test_a_harmless_bundle_is_read(bundle: Path) -> None:
+    assert OnnxBackend(str(bundle)).name == "da3_tiny"
+
+
+@pytest.mark.parametrize(
+    "location",
+    [
+        "../secret.bin",
+        "SECRET",
+        "/etc/passwd",
+        "sub/../../secret.bin",
+        "./../secret.bin",
+        "unlisted.bin",
+        "",
+        "..",
+        "*/_ORT_MEM_ADDR_/*",  # onnxruntime's own mark of an address in memory
+        "file:///etc/passwd",
+        "http://127.0.0.1/weights.bin",
+    ],
+)
+@pytest.mark.parametrize("listed", [False, True])
+def test_data_outside_the_folder(bundle: Path, location: str, listed: bool) -> None:
+    secret = bundle.parent / "secret.bin"
+    secret.write_bytes(bytes(4))
+    location = str(secret) if location == "SECRET" else location
+    (bundle / ENCODER).write_bytes(outside(location))
+    describe(bundle, lambda content: content["files"].update({location: sha256(secret)} if listed else {}))
+    with pytest.raises((ValueError, FileNotFoundError), match=r"outside the bundle|not a file of the folder|has no"):
+        OnnxBackend(str(bundle))
+
+
+@pytest.mark.parametrize("name", ["data.bin", ENCODER])
+def test_links_out_of_the_folder(bundle: Path, name: str) -> None:
+    secret = bundle.parent / "secret.bin"
+    secret.write_bytes(HARMLESS if name == ENCODER else bytes(4))
+    if name == "data.bin":
+        (bundle / ENCODER).write_bytes(outside("data.bin"))
+    (bundle / name).unlink(missing_ok=True)
+    os.symlink(secret, bundle / name)
+    describe(bundle)
+    with pytest.raises(ValueError, match="is a link to a file outside the folder"):
+        read_bundle(bundle)
+
+
+def field(number: int, content: bytes) -> bytes:
+    """One field of a protocol buffer."""
+    length, digits = len(content), []
+    while length > 127:
+        digits.append(length & 127 | 128)
+        length >>= 7
+    return bytes([number << 3 | 2, *digits, length]) + content
+
+
+def nested_graphs(depth: int) -> bytes:
+    """A graph in an attribute of a node of a graph in ..."""
+    graph = b""
+    for _ in range(depth):
+        graph = field(1, field(5, field(6, graph)))
+    return field(7, graph)
+
+
+def test_what_is_no_network(bundle: Path) -> None:
+    for content in (b"", b"\x08\x08", b"\x7fELF" + bytes(64), b"ORTM" * 9, bytes(range(256)), nested_graphs(2000)):
+        (bundle / ENCODER).write_bytes(content)
+        describe(bundle)
+        with pytest.raises(ValueError, match=r"encoder\.onnx"):
+            OnnxBackend(str(bundle))
+
+
+@pytest.mark.parametrize(
+    ("domain", "operator", "attributes"),
+    [
+        ("com.evil", "Run", {"command": "touch canary"}),
+        ("ai.onnx.contrib", "PyOp", {"code": "open('canary', 'w')"}),
+        ("pyop", "PyOp", {"module": "os", "class_name": "system"}),
+        ("com.microsoft", "EPContext", {"ep_cache_context": "../engine.bin", "embed_mode": 0}),
+        ("org.pytorch.aten", "ATen", {"operator": "system"}),
+        ("", "NoSuchOperator", {}),
+    ],
+)
+def test_operators_of_their_own(bundle: Path, canary: Path, domain: str, operator: str, attributes: dict) -> None:
+    node = helper.make_node(operator, ["x"], ["y"], domain=domain, **attributes)
+    (bundle / ENCODER).write_bytes(network(node, domain=domain))
+    describe(bundle)
+    with pytest.raises(ValueError, match=r"onnxruntime .* cannot open .*encoder\.onnx"):
+        OnnxBackend(str(bundle))
+
+
+@pytest.mark.filterwarnings("ignore:.*decodes without gradient")
+def test_libraries_in_the_folder_are_never_opened(bundle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (bundle / "custom_ops.so").write_bytes(b"\x7fELF")
+    opened = []
+    monkeypatch.setattr("onnxruntime.SessionOptions.register_custom_ops_library", lambda *a: opened.append(a))
+    model = onnx.load_from_string(HARMLESS)
+    config = {"session_options": {"custom_ops_library": "custom_ops.so"}}
+    model.metadata_props.add(key="ort_config", value=json.dumps(config))
+    (bundle / ENCODER).write_bytes(model.SerializeToString())
+    describe(bundle)
+    OnnxBackend(str(bundle))
+    assert not opened
+    assert open_session(bundle / ENCODER, "cpu").get_providers() == ["CPUExecutionProvider"]
+
+
+CALL = {"_target_": "os.system", "_args_": ["touch canary"]}
+DESCRIPTIONS: dict[str, Callable[[dict[str, Any]], Any]] = {
+    "a target": lambda content: content.update(_target_="os.system"),
+    "decoder a target": lambda content: content.update(decoder=CALL),
+    "class os.system": lambda content: content["decoder"].update({"class": "os.system"}),
+    "class builtins.eval": lambda content: content["decoder"].update({"class": "builtins.eval"}),
+    "class Popen": lambda content: content["decoder"].update({"class": "subprocess.Popen"}),
+    "class a path": lambda content: content["decoder"].update({"class": "../decoder.py:Decoder"}),
+    "class __init__": lambda content: content["decoder"].update({"class": "__init__"}),
+    "class a list": lambda content: content["decoder"].update({"class": ["DA3Decoder"]}),
+    "arguments a target": lambda content: content["decoder"].update(arguments=CALL),
+    "an argument a target": lambda content: content["decoder"].update(arguments={"features": CALL}),
+    "arguments a list": lambda content: content["decoder"].update(arguments=[CALL]),
+    "file above": lambda content: content["files"].update({"../encoder.onnx": "0"}),
+    "file elsewhere": lambda content: content["files"].update({"/etc/passwd": "0"}),
+    "file of no name": lambda content: content["files"].update({"": "0"}),
+    "a folder": lambda content: content["files"].update({".": "0"}),
+    "zero byte": lambda content: content["files"].update({"a\0b": "0"}),
+    "hash of another": lambda content: content["files"].update({ENCODER: "0" * 64}),
+    "hash a mapping": lambda content: content["files"].update({ENCODER: CALL}),
+}
+
+
+@pytest.mark.parametrize("name", DESCRIPTIONS)
+def test_descriptions(bundle: Path, canary: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(bundle.parent)
+    save_file({"w": np.zeros(1)}, bundle / DECODER_WEIGHTS)
+    describe(bundle, DESCRIPTIONS[name])
+    with pytest.raises((ValueError, FileNotFoundError), match=r"bundle"):
+        OnnxBackend(str(bundle))
+
+
+@pytest.mark.parametrize(
+    "content", ["[" * 100_000, "{" * 9, "", "\0", '{"format": ' + "1" * 9999 + "}", "!!python/object:os"]
+)
+def test_descriptions_that_are_none(bundle: Path, content: str) -> None:
+    (bundle / DESCRIPTION).write_text(content)
+    with pytest.raises(ValueError, match=r"backend\.json is not"):
+        read_bundle(bundle)
