@@ -129,7 +129,7 @@ def print_stages(console: Console, case: Case, result: dict[str, Any], on_gpu: b
     title = f"{case.views} views of {height}x{width}, {result['gaussians']:,} Gaussians"
     if result["voxels_per_pixel"] is not None:
         title += f", {result['voxels_per_pixel']:.2f} voxels a pixel"
-    table = Table(title=title)
+    table = Table(title=title, caption="paper: DA3-GIANT with model=vg2gt's widths on an RTX PRO 6000")
     headings = ["stage", "seconds", "share", *(["peak MB"] if on_gpu else []), "paper, s"]
     for heading in headings:
         table.add_column(heading, justify="left" if heading == "stage" else "right")
