@@ -34,6 +34,8 @@ EXPECTED_WARNINGS = (
     r".*isinstance\(treespec, LeafSpec\)",  # inside Lightning
 )
 
+PRECISIONS = ("32-true", "bf16-mixed", "32", "bf16")  # the last two are Lightning's short names
+
 
 @dataclass(frozen=True)
 class Run:
@@ -94,6 +96,12 @@ def _accelerator(asked: str) -> str:
 
 
 def _check_trainer(config: DictConfig) -> None:
+    if str(config.trainer.get("precision", "32-true")) not in PRECISIONS:
+        raise ValueError(
+            f"trainer.precision={config.trainer.precision} is not supported: geometry, voxels, rendering and losses "
+            "are float32, which half precision cannot hold and float64 does not improve; use bf16-mixed (networks in "
+            "bfloat16) or 32-true"
+        )
     if config.trainer.get("accumulate_grad_batches", 1) != 1:
         raise ValueError(
             "trainer.accumulate_grad_batches is not supported: a batch is a function of the optimiser's step; use "

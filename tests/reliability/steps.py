@@ -17,6 +17,7 @@ from vg2gt.training import Run, build
 from vg2gt.types import Batch
 
 TINY = [
+    "data.steps_per_epoch=100",
     "data.image_size=[28,56]",
     "data.min_views=2",
     "data.max_views=2",

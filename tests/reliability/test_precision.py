@@ -1,0 +1,277 @@
+"""Precision: bfloat16 networks agree with float32 ones, and geometry is never below float32."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import lightning
+import pytest
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+import vg2gt.baselines.pixels
+import vg2gt.baselines.voxel_merged
+import vg2gt.lightning_module
+import vg2gt.losses.objective
+import vg2gt.rendering.renderer
+import vg2gt.voxels.coarse
+import vg2gt.voxels.fine
+from tests.reliability.steps import first_batches, fit, tiny_run
+from tests.training_helpers import full_model
+from vg2gt.evaluation import evaluate_scene
+from vg2gt.losses.gaussian import GaussianLoss
+from vg2gt.losses.geometry import GeometryLoss
+from vg2gt.model import SceneScale
+from vg2gt.rendering import Renderer
+from vg2gt.training import Run
+from vg2gt.types import Voxels
+
+STEPS = 6
+LOSS_TOLERANCE = 5e-3  # relative, of every step's loss
+COSINE = 0.998  # of every step's gradient before clipping
+METRIC_TOLERANCE = {"psnr": 0.1, "ssim": 0.01, "abs_rel": 0.005, "decoded_abs_rel": 0.001, "coverage": 0.01}
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("rooms")
+
+
+class Steps(lightning.Callback):
+    """Notes loss and gradient of every step."""
+
+    def __init__(self) -> None:
+        self.losses: list[float] = []
+        self.gradients: list[Tensor] = []
+
+    def on_before_optimizer_step(self, trainer: Any, pl_module: Any, optimizer: Any) -> None:
+        gradients = [p.grad for p in pl_module.parameters() if p.grad is not None]
+        assert {gradient.dtype for gradient in gradients} == {torch.float32}
+        self.gradients.append(torch.cat([gradient.flatten().double() for gradient in gradients]))
+
+    def on_train_batch_end(self, trainer: Any, pl_module: Any, outputs: Any, *args: Any) -> None:
+        self.losses.append(float(outputs["loss"]))
+
+
+def trained(precision: str, overrides: tuple[str, ...], steps: int, folder: Path, cache: Path) -> tuple[Run, Steps]:
+    run = tiny_run(folder, cache, f"trainer.precision={precision}", *overrides)
+    noted = Steps()
+    run.trainer.callbacks.append(noted)  # pyright: ignore[reportAttributeAccessIssue]
+    fit(run, first_batches(run, steps)).assert_sound()
+    return run, noted
+
+
+def check_agreement(overrides: tuple[str, ...], steps: int, folder: Path, cache: Path) -> None:
+    exact, mixed = (trained(p, overrides, steps, folder, cache) for p in ("32-true", "bf16-mixed"))
+    for one, other in zip(exact[1].losses, mixed[1].losses, strict=True):
+        assert other == pytest.approx(one, rel=LOSS_TOLERANCE)
+    cosines = [
+        float(F.cosine_similarity(*pair, dim=0)) for pair in zip(exact[1].gradients, mixed[1].gradients, strict=True)
+    ]
+    assert min(cosines) > COSINE
+    assert mixed[1].losses != exact[1].losses  # autocast was on
+    exact[0].datamodule.setup("validate")
+    batch = next(iter(exact[0].datamodule.val_dataloader()))
+    scores = []
+    for run, _ in (exact, mixed):
+        with run.trainer.precision_plugin.forward_context():
+            scores.append(evaluate_scene(run.module.model.eval(), run.module.renderer, batch))
+    for name, tolerance in METRIC_TOLERANCE.items():
+        assert scores[1][name] == pytest.approx(scores[0][name], abs=tolerance), name
+    largest = max(abs(other / one - 1) for one, other in zip(exact[1].losses, mixed[1].losses, strict=True))
+    print(f"{overrides}: loss differs by {largest:.1e}, gradients' cosine {min(cosines):.5f}, ", end="")
+    print({name: round(scores[1][name] - scores[0][name], 5) for name in METRIC_TOLERANCE})
+
+
+def test_bfloat16_networks_agree_with_float32(tmp_path: Path, cache: Path) -> None:
+    check_agreement((), STEPS, tmp_path, cache)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ("data.image_size=[112,224]", "data.max_views=4", "data.min_views=4", "data.max_images=4"),
+        ("backend=da3_tiny",),
+        ("backend=vggt_tiny",),
+        ("ablation=wo_coarse",),
+        ("model=pixel_aligned",),
+        ("model=voxel_merged",),
+        ("model.gaussians.sh_degree=2",),
+    ],
+    ids=" ".join,
+)
+def test_bfloat16_networks_agree_for_longer_and_in_every_model(
+    overrides: tuple[str, ...], tmp_path: Path, cache: Path
+) -> None:
+    check_agreement(overrides, 40, tmp_path, cache)
+
+
+def dtypes(value: Any, skip: tuple[str, ...] = ()) -> Iterator[tuple[str, torch.dtype]]:
+    """Names and dtypes of all floating-point tensors in records, tuples and mappings."""
+    if isinstance(value, Tensor):
+        if value.is_floating_point():
+            yield "", value.dtype
+    elif is_dataclass(value) and not isinstance(value, type):
+        for field in fields(value):
+            if field.name not in skip:
+                yield from ((f".{field.name}{n}", d) for n, d in dtypes(getattr(value, field.name), skip))
+    elif isinstance(value, (tuple, list)):
+        for i, item in enumerate(value):
+            yield from ((f"[{i}]{n}", d) for n, d in dtypes(item, skip))
+    elif isinstance(value, dict):
+        for key, item in value.items():
+            yield from ((f"[{key}]{n}", d) for n, d in dtypes(item, skip))
+
+
+# what networks may say in bfloat16: it becomes geometry in float32
+NETWORKS = ("patch", "camera", "features")
+
+PLACES: list[tuple[Any, str]] = [
+    (vg2gt.voxels.coarse, "unproject"),
+    (vg2gt.voxels.coarse, "scene_voxel_size"),
+    (vg2gt.voxels.coarse, "point_cells"),
+    (vg2gt.voxels.coarse, "pool_mean"),
+    (vg2gt.voxels.coarse, "pool_min"),
+    (vg2gt.voxels.coarse, "interpolation_weights"),
+    (vg2gt.voxels.coarse, "normals_from_depth"),
+    (vg2gt.voxels.fine, "unproject"),
+    (vg2gt.voxels.fine, "scene_voxel_size"),
+    (vg2gt.voxels.fine, "point_cells"),
+    (vg2gt.voxels.fine, "pool_mean"),
+    (vg2gt.voxels.fine, "pool_min"),
+    (vg2gt.lightning_module, "training_cameras"),
+    (vg2gt.rendering.renderer, "_scene_views"),
+    (Renderer, "__call__"),
+    (SceneScale, "__call__"),
+    (GeometryLoss, "__call__"),
+    (GaussianLoss, "__call__"),
+    (vg2gt.losses.objective.VG2GTLoss, "forward"),
+    (vg2gt.losses.objective, "normalize_truth"),
+    (vg2gt.losses.objective, "camera_errors"),
+]
+BASELINE_PLACES: list[tuple[Any, str]] = [
+    (vg2gt.baselines.pixels, "ray_directions"),
+    (vg2gt.baselines.voxel_merged, "point_cells"),
+    (vg2gt.baselines.voxel_merged, "pool_mean"),
+    (Renderer, "__call__"),
+]
+
+
+class Probe:
+    """Notes the dtypes that go into functions and come out of them.
+
+    Attributes:
+        seen: names of the functions that were called.
+        low: tensors below float32.
+    """
+
+    def __init__(self) -> None:
+        self.seen: set[str] = set()
+        self.low: set[str] = set()
+
+    def watch(self, owner: Any, name: str, patch: pytest.MonkeyPatch) -> None:
+        label, original = f"{getattr(owner, '__name__', owner)}.{name}", getattr(owner, name)
+
+        def probed(*args: Any, **kwargs: Any) -> Any:
+            result = original(*args, **kwargs)
+            self.note(label, {"in": args, "in_named": kwargs, "out": result})
+            return result
+
+        patch.setattr(owner, name, probed)
+
+    def note(self, label: str, values: Any) -> None:
+        self.seen.add(label)
+        for name, dtype in dtypes(values, NETWORKS):
+            if torch.finfo(dtype).bits < 32:
+                self.low.add(f"{label}{name} is {dtype}")
+
+
+@pytest.mark.parametrize(
+    ("overrides", "places"),
+    [((), PLACES), (("backend=da3_tiny",), PLACES), (("model=voxel_merged",), BASELINE_PLACES)],
+    ids=["full", "da3_tiny", "voxel_merged"],
+)
+def test_geometry_is_never_below_float32(
+    overrides: tuple[str, ...],
+    places: list[tuple[Any, str]],
+    tmp_path: Path,
+    cache: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    run = tiny_run(tmp_path, cache, "trainer.precision=bf16-mixed", *overrides)
+    probe = Probe()
+    for owner, name in places:
+        probe.watch(owner, name, monkeypatch)
+    backend = run.module.model.backend
+    for name in ("decode", "encode"):
+        probe.watch(backend, name, monkeypatch)
+    networks: set[torch.dtype] = set()
+    for name, module in run.module.model.named_modules():
+        if name in ("", "fine", "gaussians", "coarse"):
+            module.register_forward_hook(lambda module, args, out, name=name: probe.note(f"model.{name}", (args, out)))
+        if name.endswith("dense_head"):
+            module.register_forward_hook(lambda module, args, out: networks.add(out.dtype))
+    (batch,) = first_batches(run, 1)
+    fit(run, [batch, batch]).assert_sound()
+    expected = {f"{getattr(owner, '__name__', owner)}.{name}" for owner, name in places}
+    assert expected <= probe.seen
+    assert not probe.low
+    assert networks == {torch.bfloat16}  # autocast was on, where it may be
+    assert {parameter.dtype for parameter in run.module.parameters()} == {torch.float32}
+
+
+@contextmanager
+def autocast(enabled: bool) -> Iterator[None]:
+    with torch.autocast("cpu", torch.bfloat16, enabled=enabled):
+        yield
+
+
+def test_voxel_grids_do_not_depend_on_the_precision(tmp_path: Path, cache: Path) -> None:
+    """From equal tokens: the same cells, counts, colours and centroids to the bit."""
+    run = tiny_run(tmp_path, cache)
+    model = full_model(run).eval()
+    (batch,) = first_batches(run, 1)
+    context = batch.context
+    with torch.no_grad():
+        tokens, geometry, _ = model.read_views(context.images, context.hints)
+        found: list[Voxels] = []
+        for enabled in (False, True):
+            with autocast(enabled):
+                found.append(model.fine(tokens, geometry, context.images))
+    exact, mixed = found
+    for name in ("grid", "batch", "count", "colors", "confidence", "centroid", "voxel_size"):
+        assert torch.equal(getattr(exact, name), getattr(mixed, name)), name
+    assert not torch.equal(exact.features.float(), mixed.features.float())
+
+
+@pytest.mark.parametrize("backend", ["oracle", "da3_tiny", "vggt_tiny"])
+def test_decoding_does_not_depend_on_the_precision(tmp_path: Path, cache: Path, backend: str) -> None:
+    run = tiny_run(tmp_path, cache, f"backend={backend}")
+    (batch,) = first_batches(run, 1)
+    frozen = run.module.model.backend
+    with torch.no_grad():
+        tokens = frozen.encode(batch.context.images, batch.context.hints)
+        exact = frozen.decode(tokens)
+        with autocast(True):
+            mixed = frozen.decode(tokens)
+            again = frozen.encode(batch.context.images, batch.context.hints)
+    assert torch.equal(exact.depth, mixed.depth)
+    assert torch.equal(exact.cameras.world_to_camera, mixed.cameras.world_to_camera)
+    assert torch.equal(exact.cameras.intrinsics, mixed.cameras.intrinsics)
+    assert torch.equal(again.patch[-1], tokens.patch[-1])
+
+
+@pytest.mark.parametrize("precision", ["16-mixed", "bf16-true", "16-true", "64-true", "16", "64"])
+def test_other_precisions_are_refused(tmp_path: Path, cache: Path, precision: str) -> None:
+    with pytest.raises(ValueError, match=rf"trainer\.precision={precision} .* use bf16-mixed .* or 32-true"):
+        tiny_run(tmp_path, cache, f"trainer.precision={precision}")
+
+
+@pytest.mark.parametrize("precision", ["32", "bf16"])
+def test_short_names_of_supported_precisions(tmp_path: Path, cache: Path, precision: str) -> None:
+    run = tiny_run(tmp_path, cache, f"trainer.precision={precision}")
+    assert run.trainer.precision in ("32-true", "bf16-mixed")
