@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import signal
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from itertools import zip_longest
 from typing import Any, TypeVar
 
+import lightning
 import torch.distributed
 
 Key = TypeVar("Key")
@@ -39,3 +42,17 @@ def in_turns(parts: Sequence[Mapping[Key, Value]]) -> dict[Key, Value]:
             if key is not None:
                 joined.setdefault(key, part[key])
     return joined
+
+
+@contextmanager
+def ending_together(trainer: lightning.Trainer) -> Iterator[None]:
+    """Ends the ranks that this process started if it fails itself: they would wait for it in vain.
+
+    The other way round Lightning watches them, and whoever starts ranks on several machines watches all.
+    """
+    try:
+        yield
+    except BaseException:
+        if trainer.strategy.launcher is not None:
+            trainer.strategy.launcher.kill(signal.SIGKILL)
+        raise

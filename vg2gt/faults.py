@@ -11,10 +11,10 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import torch
-import torch.distributed
 from torch import Tensor, nn
 from torch.utils.hooks import RemovableHandle
 
+from vg2gt.distributed import from_all_ranks
 from vg2gt.losses import LossReport
 from vg2gt.types import Batch, Prediction, TensorRecord
 
@@ -183,11 +183,7 @@ class SkippedSteps:
 
 def gather(fault: Fault | None) -> list[Fault]:
     """The faults of all ranks, in their order. Collective: every rank has to call it."""
-    if not torch.distributed.is_available() or not torch.distributed.is_initialized():
-        return [fault] if fault else []
-    found: list[Fault | None] = [None] * torch.distributed.get_world_size()
-    torch.distributed.all_gather_object(found, fault)
-    return [each for each in found if each]
+    return [each for each in from_all_ranks(fault) if each]
 
 
 def described(faults: list[Fault]) -> str:

@@ -19,6 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from vg2gt.checkpoints import AtomicCheckpointIO, initialize_from, newest_valid, read_checkpoint, remove_leftovers
 from vg2gt.data.datamodule import SceneDataModule
+from vg2gt.distributed import ending_together
 from vg2gt.io.files import read_json, write_json, write_text
 from vg2gt.lightning_module import VG2GTModule
 from vg2gt.preview import write_preview
@@ -31,6 +32,7 @@ EXPECTED_WARNINGS = (
     r"Found \d+ module\(s\) in eval mode",  # the frozen backbone
     r"You're resuming from a checkpoint that ended before the epoch",  # batches are a function of the step's number
     r"The '\w+_dataloader' does not have many workers",  # rooms come from the memory cache
+    r"It is recommended to use `self.log\('eval/",  # all ranks log the same
     r".*isinstance\(treespec, LeafSpec\)",  # inside Lightning
 )
 
@@ -140,14 +142,15 @@ def train(config: DictConfig) -> dict[str, Any]:
     if config.init_from and checkpoint is None:
         initialize_from(run.module, config.init_from)
 
-    untrained = _untrained_metrics(run, resumed=checkpoint is not None)
-    run.trainer.fit(run.module, datamodule=run.datamodule, ckpt_path=checkpoint, weights_only=True)
-    _save_last(run)
-    if not run.trial and run.trainer.global_step < run.trainer.max_steps:
-        log.warning("training ended at step %d of %d", run.trainer.global_step, run.trainer.max_steps)
-        return {}
-    trained = evaluate(run)
-    return _report(run, untrained, trained)
+    with ending_together(run.trainer):
+        untrained = _untrained_metrics(run, resumed=checkpoint is not None)
+        run.trainer.fit(run.module, datamodule=run.datamodule, ckpt_path=checkpoint, weights_only=True)
+        _save_last(run)
+        if not run.trial and run.trainer.global_step < run.trainer.max_steps:
+            log.warning("training ended at step %d of %d", run.trainer.global_step, run.trainer.max_steps)
+            return {}
+        trained = evaluate(run)
+        return _report(run, untrained, trained)
 
 
 def _checkpoint_to_resume(config: DictConfig) -> Path | None:

@@ -24,7 +24,7 @@ def said_in_one_line() -> Iterator[None]:
     try:
         yield
     except (InstantiationException, *USER_ERRORS) as error:
-        if os.environ.get(TRACEBACK) or _in_a_sweep():
+        if os.environ.get(TRACEBACK) or in_a_sweep():
             raise
         # A constructor's own error is the cause of Hydra's.
         cause = error.__cause__ or error if isinstance(error, InstantiationException) else error
@@ -32,5 +32,6 @@ def said_in_one_line() -> Iterator[None]:
         sys.exit(f"\n{type(cause).__name__}: {cause}\n({TRACEBACK}=1 shows where)")
 
 
-def _in_a_sweep() -> bool:
+def in_a_sweep() -> bool:
+    """Whether this is a job of a sweep (``-m``)."""
     return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN

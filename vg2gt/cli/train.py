@@ -4,6 +4,7 @@ import hydra
 from omegaconf import DictConfig
 
 from vg2gt.cli.errors import said_in_one_line
+from vg2gt.cli.sweeps import needs_own_process, run_in_own_process
 from vg2gt.paths import config_dir
 from vg2gt.training import train
 
@@ -12,7 +13,10 @@ from vg2gt.training import train
 def main(config: DictConfig) -> None:
     """Composes the configuration and runs the training; what the user can mend is said in one line."""
     with said_in_one_line():
-        train(config)
+        if needs_own_process(config):
+            run_in_own_process(config)
+        else:
+            train(config)
 
 
 if __name__ == "__main__":

@@ -113,7 +113,8 @@ class PointMLP(nn.Module):
         """
         features = self.embed(features)
         if not len(features):
-            return features
+            # The stages have nothing to do, but every rank's parameters must be in the graph: the others would wait.
+            return features + 0 * sum(parameter.sum() for parameter in self.stages.parameters())
         local = relative_grid(grid, batch)
         positions = local.float()
         for stage, windows in zip(self.stages, self._windows(local, batch, voxel_size), strict=True):
