@@ -21,6 +21,7 @@ from vg2gt.evaluation.settings import checkpoint_path, run_name
 from vg2gt.metrics.lpips import STAGES
 from vg2gt.paths import config_dir
 from vg2gt.training import train
+from vg2gt.trust import read_run_config
 
 
 @pytest.fixture(scope="module")
@@ -178,6 +179,37 @@ def test_scenes_in_a_mixture_that_was_trained_on_are_refused(tmp_path: Path, cac
         run(tmp_path / "out", cache, f"ckpt={copied}", "data.val.first_seed=0")
 
 
+def test_what_the_weights_before_were_trained_on_is_refused(tmp_path: Path, cache: Path, trained: Path, caplog) -> None:
+    """A run on other rooms that began with ``init_from``, or went on in a new folder with ``ckpt``."""
+    later = tmp_path / "later"
+    shutil.copytree(trained, later)
+    for key, start in (("init_from", trained / "checkpoints" / "step-2.ckpt"), ("ckpt", trained)):
+        config = OmegaConf.load(trained / "config.yaml")
+        config.data.train.first_seed = 500
+        config[key] = str(start)
+        OmegaConf.save(config, later / "config.yaml")
+        with pytest.raises(DataError, match="scene room-000000 is used for training and for evaluation"):
+            run(tmp_path / "out", cache, f"ckpt={later}", "data.val.first_seed=0")
+    config.ckpt = str(tmp_path / "gone.ckpt")
+    OmegaConf.save(config, later / "config.yaml")
+    run(tmp_path / "out", cache, f"ckpt={later}", "data.eval_scenes=1")
+    assert "cannot be checked" in caplog.text
+    assert "gone.ckpt, which is not there" in caplog.text
+
+
+def test_a_lone_checkpoint_is_not_checked_and_that_is_told(tmp_path: Path, cache: Path, trained: Path, caplog) -> None:
+    shutil.copy(trained / "checkpoints" / "step-2.ckpt", tmp_path / "lone.ckpt")
+    parts = read_run_config(trained / "config.yaml")
+    with initialize_config_dir(config_dir(), version_base="1.3"):
+        config = compose("evaluate", evaluate_overrides(tmp_path / "out", cache, "data.eval_scenes=1"))
+    OmegaConf.set_struct(config, False)
+    config.ckpt = str(tmp_path / "lone.ckpt")
+    for part in ("model", "backend", "renderer"):
+        config[part] = parts[part]
+    evaluate(config)
+    assert "whether the evaluated scenes were trained on cannot be checked" in caplog.text
+
+
 def test_training_data_that_is_gone_is_told(tmp_path: Path, cache: Path, trained: Path, caplog) -> None:
     copied = tmp_path / "run"
     shutil.copytree(trained, copied)
@@ -201,10 +233,51 @@ def test_what_is_missing_or_wrong_is_named(tmp_path: Path, cache: Path, trained:
     shutil.copy(trained / "checkpoints" / "step-2.ckpt", lone)
     with pytest.raises(FileNotFoundError, match=r"config\.yaml is missing.*model= and backend="):
         run(tmp_path, cache, f"ckpt={lone}")
-    with pytest.raises(ValueError, match="give numbers of input views"):
-        run(tmp_path, cache, "views=[]")
+    for views in ("[]", "null", "2.5", "three", "[0]", "[true]"):
+        with pytest.raises(ValueError, match="give numbers of input views"):
+            run(tmp_path, cache, f"views={views}")
+    (tmp_path / "empty" / "checkpoints").mkdir(parents=True)
+    with pytest.raises(FileNotFoundError, match=r"ckpt=.*empty: no valid checkpoint in .*ckpt=null for the untrained"):
+        run(tmp_path, cache, f"ckpt={tmp_path / 'empty'}")
+    with pytest.raises(DataError, match=r"no scene to evaluate.*data\.eval_scenes=null"):
+        run(tmp_path, cache, "data.eval_scenes=0")
+    for device in ("banana", "cuda:99"):
+        with pytest.raises(ValueError, match=f"device={device}: torch sees"):
+            run(tmp_path, cache, f"device={device}")
+    with pytest.raises(FileNotFoundError, match=r"no \.pth or \.safetensors at /nowhere/vgg\.pth"):
+        run(tmp_path, cache, "evaluation.lpips=/nowhere/vgg.pth")
     with pytest.raises(DataError, match=r"has 32 frames .* views=33 needs 33"):
         run(tmp_path, cache, "views=[33]")
+
+
+@pytest.mark.parametrize("content", ["", "foo: 1", "model: null"])
+def test_a_configuration_without_the_runs_parts_is_named(
+    tmp_path: Path, cache: Path, trained: Path, content: str
+) -> None:
+    copied = tmp_path / "run"
+    shutil.copytree(trained, copied)
+    (copied / "config.yaml").write_text(content)
+    with pytest.raises(ValueError, match=r"config\.yaml names no (data|backend)"):
+        run(tmp_path / "out", cache, f"ckpt={copied}")
+
+
+def test_a_training_runs_folder_is_left_as_it_is(tmp_path: Path, cache: Path, trained: Path) -> None:
+    copied = tmp_path / "run"
+    shutil.copytree(trained, copied)
+    for more in ([], ["overwrite=true"]):
+        with pytest.raises(FileExistsError, match=r"holds metrics\.json, .*config\.yaml of something"):
+            run(copied, cache, f"ckpt={copied}", "data.eval_scenes=1", *more)
+    for name in ("config.yaml", "metrics.json", "metrics.md"):
+        assert (copied / name).read_bytes() == (trained / name).read_bytes()
+
+
+def test_times_of_another_device_do_not_join(tmp_path: Path, cache: Path, trained: Path) -> None:
+    run(tmp_path, cache, f"ckpt={trained}", "data.eval_scenes=1")
+    identity = json.loads((tmp_path / "identity.json").read_text())
+    assert identity["device"] == "cpu"
+    (tmp_path / "identity.json").write_text(json.dumps(identity | {"device": "Some GPU"}))
+    with pytest.raises(FileExistsError, match=r"device \(Some GPU -> cpu\)"):
+        run(tmp_path, cache, f"ckpt={trained}", "data.eval_scenes=1")
 
 
 class WithoutDepth(SyntheticScenes):

@@ -51,6 +51,8 @@ def test_means_leave_out_what_is_missing_and_times_are_medians() -> None:
     assert means["abs_rel"] == pytest.approx(0.3)
     assert means["scene/head_seconds"] == 2
     assert means["lpips"] is None
+    two = {name: scenes[name] for name in ("a", "b")}  # the first of two compiled: it says nothing of the rest
+    assert mean_scores(two)["scene/head_seconds"] == 1
 
 
 @pytest.mark.parametrize("name", ["config.yaml", "metrics.json", "scenes"])

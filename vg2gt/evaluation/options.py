@@ -28,7 +28,8 @@ class PointOptions:
 
     def __post_init__(self) -> None:
         for name, length in asdict(self).items():
-            if not (length is None and name != "threshold") and not length > 0:
+            optional = length is None and name != "threshold"
+            if not optional and (length is None or not length > 0):
                 raise ValueError(f"evaluation.points.{name}={length}: give a positive length in the data's unit")
 
 

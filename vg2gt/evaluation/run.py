@@ -10,16 +10,15 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from vg2gt.data.base import DataError, SceneSource
 from vg2gt.data.batches import BatchDataset
 from vg2gt.data.datamodule import SceneDataModule
-from vg2gt.data.overlap import refuse_overlap
 from vg2gt.data.sampling import SceneViews
 from vg2gt.evaluation import paper
+from vg2gt.evaluation.checks import refuse_training_views, refuse_without_hints
 from vg2gt.evaluation.options import EvaluationOptions
 from vg2gt.evaluation.pictures import PANELS, scene_picture
 from vg2gt.evaluation.scene import SceneEvaluator, SceneResult
@@ -35,10 +34,10 @@ from vg2gt.evaluation.store import ResultStore
 from vg2gt.evaluation.tables import markdown
 from vg2gt.io.files import write_json, write_text
 from vg2gt.io.images import write_png
+from vg2gt.memory import EVALUATION, memory_advice
 from vg2gt.metrics import LPIPS, WeightsNotFoundError, load_lpips
 from vg2gt.model import Reconstructor
 from vg2gt.training import flatten
-from vg2gt.trust import check_targets, read_run_config
 from vg2gt.types import Batch
 
 log = logging.getLogger(__name__)
@@ -48,6 +47,7 @@ FREE = ("views", "name", "output_dir", "overwrite", "ckpt", "device", "evaluatio
 FREE += ("data.workers", "data.memory_mb", "data.steps_per_epoch")
 
 
+@memory_advice(EVALUATION)
 def evaluate(config: DictConfig) -> dict[str, Any]:
     """Evaluates a model on the scenes of a data set, for every number of input views asked.
 
@@ -73,15 +73,15 @@ def evaluate(config: DictConfig) -> dict[str, Any]:
     datamodule: SceneDataModule = instantiate(config.data)
     data = datamodule.evaluation_data()
     samples = _samples(options, data.source, list(data.source.scenes)[: datamodule.eval_scenes], counts)
-    _refuse_training_views(checkpoint, data.source, [view for views in samples.values() for view in views])
+    refuse_training_views(checkpoint, data.source, [view for views in samples.values() for view in views])
 
     device = choose_device(config.device)
     model = build_model(parts, config.seed, device)
-    _refuse_without_hints(model, data.source)
+    refuse_without_hints(model, data.source)
     weights = load_weights(model, checkpoint)
     lpips, lpips_label = _lpips(options.lpips, device)
     resolved = OmegaConf.merge(OmegaConf.to_container(config, resolve=True), parts)
-    store = ResultStore(folder, _identity(resolved, weights, lpips is not None, model), config.overwrite)
+    store = ResultStore(folder, _identity(resolved, weights, lpips is not None, model, device), config.overwrite)
     write_text(folder / "config.yaml", OmegaConf.to_yaml(resolved, resolve=True))
 
     evaluator = SceneEvaluator(model, instantiate(parts["renderer"]), options, lpips)
@@ -105,19 +105,19 @@ def evaluate(config: DictConfig) -> dict[str, Any]:
 
 
 def mean_scores(scenes: Mapping[str, Mapping[str, float | None]]) -> dict[str, float | None]:
-    """Mean over the scenes that have a figure; of times and memory the median, for the first scene also compiles."""
+    """Mean over the scenes that have a figure; of times and memory the lower median: the first scene also compiles."""
     names = dict.fromkeys(name for scores in scenes.values() for name in scores)
     means: dict[str, float | None] = {}
     for name in names:
         values = [value for scores in scenes.values() if (value := scores.get(name)) is not None]
-        average = statistics.median if name.endswith(("_seconds", "_mib")) else statistics.fmean
+        average = statistics.median_low if name.endswith(("_seconds", "_mib")) else statistics.fmean
         means[name] = average(values) if values else None
     return means
 
 
 def _view_counts(views: Any) -> list[int]:
-    counts = [views] if isinstance(views, int) else list(views)
-    if not counts or not all(isinstance(count, int) and count > 0 for count in counts):
+    counts = list(views) if isinstance(views, Sequence) else [views]
+    if not counts or not all(type(count) is int and count > 0 for count in counts):
         raise ValueError(f"views={views}: give numbers of input views, such as 'views=[3,10,20]'")
     return sorted(set(counts))
 
@@ -125,58 +125,36 @@ def _view_counts(views: Any) -> list[int]:
 def _samples(
     options: EvaluationOptions, source: SceneSource, scenes: Sequence[str], counts: Sequence[int]
 ) -> dict[int, list[SceneViews]]:
+    if not scenes:
+        raise DataError(
+            f"there is no scene to evaluate: {type(source).__name__} offers {len(source.scenes)}, data.eval_scenes "
+            "takes none of them; data.eval_scenes=null takes all"
+        )
     return {count: options.selection.choose(source, scenes, count) for count in counts}
 
 
-def _refuse_training_views(checkpoint: Path | None, source: SceneSource, views: Sequence[SceneViews]) -> None:
-    """Refuses to score what the run was trained on, whatever kinds of source training and evaluation read.
-
-    Every scene in the run's training data counts as trained on, also those that it left out as too short: to find
-    these, all scenes would have to be indexed. If the training data is no longer there, that is said in the log.
-
-    Raises:
-        DataError: naming the first scene.
-    """
-    path = checkpoint.resolve().parent.parent / "config.yaml" if checkpoint else None
-    if path is None or not path.is_file():
-        return
-    try:
-        run = read_run_config(path)
-        check_targets(run.data, f"{path}: data")
-        trained: SceneDataModule = instantiate(run.data)
-        train = trained.train_source()
-    except (OSError, ValueError, ImportError, InstantiationException) as error:
-        log.warning("whether the evaluated scenes were trained on cannot be checked: %s", error)
-        return
-    refuse_overlap(train, list(train.scenes)[: trained.train_scenes], source, views)
-
-
-def _refuse_without_hints(model: Reconstructor, source: SceneSource) -> None:
-    lacking = [name for name, there in (("depth", source.has_depth), ("cameras", source.has_cameras)) if not there]
-    if lacking and model.backend.needs_hints:
-        raise DataError(
-            f"backend {model.backend.name} is told the data's depth and cameras, and {type(source).__name__} has no "
-            f"{' and no '.join(lacking)}: choose another backend= or other data"
-        )
-
-
 def _lpips(source: str | None, device: torch.device) -> tuple[LPIPS | None, str]:
-    """The network and what the report says of it."""
+    """The network and what the report says of it; weights that were named must be there."""
     if source is None:
         return None, "n/a (evaluation.lpips=null)"
     try:
         return load_lpips(source).to(device), "VGG-16, version 0.1"
     except WeightsNotFoundError as error:
+        if source not in ("auto", "download"):
+            raise
         log.warning("LPIPS: %s", error)
         return None, f"n/a ({error})"
 
 
-def _identity(config: Any, weights: Weights, has_lpips: bool, model: Reconstructor) -> dict[str, Any]:
-    """All that decides the figures of a sample, flat."""
+def _identity(
+    config: Any, weights: Weights, has_lpips: bool, model: Reconstructor, device: torch.device
+) -> dict[str, Any]:
+    """All that decides the figures of a sample, flat; the machine's kind decides the times."""
     settings = flatten(OmegaConf.to_container(config, resolve=True))
     kept = {key: value for key, value in settings.items() if not key.startswith(FREE)}
     kept |= {f"weights.{key}": value for key, value in model.backend.identity().items()}
-    return kept | {"checkpoint.sha256": weights.digest, "lpips.found": has_lpips}
+    where = torch.cuda.get_device_name(device) if device.type == "cuda" else device.type
+    return kept | {"checkpoint.sha256": weights.digest, "lpips.found": has_lpips, "device": where}
 
 
 def _evaluate_all(

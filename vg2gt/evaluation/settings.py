@@ -35,13 +35,24 @@ def checkpoint_path(ckpt: str | None) -> Path | None:
     path = Path(ckpt)
     if path.is_dir():
         folder = path / "checkpoints" if (path / "checkpoints").is_dir() else path
-        return newest_valid(folder)
+        try:
+            return newest_valid(folder)
+        except FileNotFoundError as error:
+            raise FileNotFoundError(
+                f"ckpt={ckpt}: no valid checkpoint in {folder}; give a run's folder such as outputs/quickstart, a "
+                "checkpoint's file, or ckpt=null for the untrained head"
+            ) from error
     if not path.is_file():
         raise FileNotFoundError(
             f"ckpt={ckpt}: no such checkpoint or run; give a file, a run's folder such as outputs/quickstart, or "
             "ckpt=null for the untrained head"
         )
     return path
+
+
+def run_config_path(checkpoint: Path) -> Path:
+    """Where the configuration of a checkpoint's run is."""
+    return checkpoint.resolve().parent.parent / "config.yaml"
 
 
 def run_name(ckpt: str | None) -> str:
@@ -61,12 +72,13 @@ def resolve_parts(config: DictConfig, checkpoint: Path | None) -> dict[str, Dict
 
     Raises:
         FileNotFoundError: if the run's ``config.yaml`` is needed and missing.
+        ValueError: if it lacks a part.
         UntrustedError: if what is needed of it is not data only, or names what is not ours (:mod:`vg2gt.trust`).
     """
     given: dict[str, Any] = {part: config.get(part) for part in PARTS}
     if all(value is not None and "_target_" in value for value in given.values()):
         return given
-    path = None if checkpoint is None else checkpoint.resolve().parent.parent / "config.yaml"
+    path = None if checkpoint is None else run_config_path(checkpoint)
     if path is None:
         run = _training_defaults()
     else:
@@ -80,6 +92,8 @@ def resolve_parts(config: DictConfig, checkpoint: Path | None) -> dict[str, Dict
     for part, value in given.items():
         whole = value is not None and "_target_" in value
         if path is not None and not whole:
+            if run.get(part) is None:
+                raise ValueError(f"{path} names no {part}: it is not the configuration of a run; name one with {part}=")
             check_targets(run[part], f"{path}: {part}")
         parts[part] = value if whole else OmegaConf.merge(run[part], value or {})
     return parts
@@ -134,5 +148,18 @@ def build_model(parts: dict[str, DictConfig], seed: int, device: torch.device) -
 
 
 def choose_device(asked: str) -> torch.device:
-    """``auto`` is the GPU where there is one."""
-    return torch.device(("cuda" if torch.cuda.is_available() else "cpu") if asked == "auto" else asked)
+    """``auto`` is the GPU where there is one.
+
+    Raises:
+        ValueError: if there is no such device.
+    """
+    there = torch.cuda.is_available()
+    try:
+        device = torch.device(("cuda" if there else "cpu") if asked == "auto" else asked)
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        known = "a GPU (cuda) and a CPU" if there else "a CPU only"
+        raise ValueError(
+            f"device={asked}: torch sees {known} here; device=auto takes the GPU if there is one"
+        ) from error
+    return device

@@ -125,7 +125,8 @@ def load_lpips(source: str = "auto") -> LPIPS:
     path = path.expanduser()
     files = sorted(p for p in path.glob("*") if p.suffix in (".pth", ".safetensors")) if path.is_dir() else [path]
     if not files or not all(file.is_file() for file in files):
-        raise WeightsNotFoundError(f"weights not found: {HOW_TO_GET}")
+        looked = "" if source == "auto" else f"no .pth or .safetensors at {path}; "
+        raise WeightsNotFoundError(f"weights not found: {looked}{HOW_TO_GET}")
     state = _installed_channel_weights()
     for file in files:
         state |= _read(file)

@@ -1,0 +1,81 @@
+"""What an evaluation refuses before it begins: scenes that the weights have seen, data that lacks what is needed."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from hydra.errors import InstantiationException
+from hydra.utils import instantiate
+from omegaconf import DictConfig
+
+from vg2gt.data.base import DataError, SceneSource
+from vg2gt.data.datamodule import SceneDataModule
+from vg2gt.data.overlap import refuse_overlap
+from vg2gt.data.sampling import SceneViews
+from vg2gt.evaluation.settings import checkpoint_path, run_config_path
+from vg2gt.model import Reconstructor
+from vg2gt.trust import check_targets, read_run_config
+
+log = logging.getLogger(__name__)
+
+UNCHECKED = "whether the evaluated scenes were trained on cannot be checked: %s"
+RESUMED_IN_PLACE = (None, "last", "auto")
+
+
+def refuse_training_views(checkpoint: Path | None, source: SceneSource, views: Sequence[SceneViews]) -> None:
+    """Refuses to score what the run was trained on, whatever kinds of source training and evaluation read.
+
+    So it does for the runs from whose weights the run was started. Every scene in a run's training data counts as
+    trained on, also those that it left out as too short: to find these, all scenes would have to be indexed. If the
+    training data, or a run's configuration, is no longer there, that is said in the log.
+
+    Raises:
+        DataError: naming the first scene.
+    """
+    for path, run in _ancestry(checkpoint):
+        try:
+            if run.get("data") is None:
+                raise ValueError(f"{path} names no data")
+            check_targets(run.data, f"{path}: data")
+            trained: SceneDataModule = instantiate(run.data)
+            train = trained.train_source()
+        except (OSError, ValueError, ImportError, InstantiationException) as error:
+            log.warning(UNCHECKED, error)
+            continue
+        refuse_overlap(train, list(train.scenes)[: trained.train_scenes], source, views)
+
+
+def _ancestry(checkpoint: Path | None) -> Iterator[tuple[Path, DictConfig]]:
+    """Configurations of the run of a checkpoint and of the runs that its weights come from, the newest first."""
+    seen = set()
+    while checkpoint is not None and (path := run_config_path(checkpoint)) not in seen:
+        seen.add(path)
+        try:
+            run = read_run_config(path)
+        except (OSError, ValueError) as error:
+            log.warning(UNCHECKED, error)
+            return
+        yield path, run
+        given = (run.get("init_from"), run.get("ckpt"))
+        before = next((str(weights) for weights in given if weights not in RESUMED_IN_PLACE), None)
+        try:
+            checkpoint = checkpoint_path(before)
+        except FileNotFoundError:
+            log.warning(UNCHECKED, f"{path}: the run started from {before}, which is not there")
+            return
+
+
+def refuse_without_hints(model: Reconstructor, source: SceneSource) -> None:
+    """Refuses data without depth or cameras for a backbone that is told them.
+
+    Raises:
+        DataError: saying what is lacking.
+    """
+    lacking = [name for name, there in (("depth", source.has_depth), ("cameras", source.has_cameras)) if not there]
+    if lacking and model.backend.needs_hints:
+        raise DataError(
+            f"backend {model.backend.name} is told the data's depth and cameras, and {type(source).__name__} has no "
+            f"{' and no '.join(lacking)}: choose another backend= or other data"
+        )
