@@ -71,4 +71,4 @@ def _append(path: Path, text: str) -> None:
                 content = content[file.write(content) :]
         except OSError as error:
             file.truncate(end)
-            raise OSError(error.errno, f"{path} could not be written: {error.strerror}") from error
+            raise OSError(error.errno, f"{path} could not be written: {error.strerror or error}") from error

@@ -36,7 +36,7 @@ def _write(path: str | Path, content: bytes, durable: bool) -> Path:
         if durable:
             flush_folder(path.parent)
     except OSError as error:
-        raise OSError(error.errno, f"{path} could not be written: {error.strerror}") from error
+        raise OSError(error.errno, f"{path} could not be written: {error.strerror or error}") from error
     finally:
         with suppress(OSError):  # of a disk that fails; the error on its way says more
             temporary.unlink(missing_ok=True)
