@@ -29,6 +29,7 @@ from vg2gt.faults import (
     gather,
 )
 from vg2gt.losses import LossReport
+from vg2gt.memory import dropped_by
 from vg2gt.model import Reconstructor
 from vg2gt.protocols import training_cameras
 from vg2gt.rendering import Renderer, UnrenderableError
@@ -150,6 +151,7 @@ class VG2GTModule(lightning.LightningModule):
         figures["train/gaussians_per_view"] = len(prediction.gaussians) / (len(batch.scene) * batch.num_context)
         if prediction.voxels is not None:
             figures["train/voxels_per_pixel"] = len(prediction.voxels.grid) / batch.context.depth.numel()
+        figures |= {f"train/{what}_dropped": float(count) for what, count in dropped_by(self.model).items()}
         figures["train/scenes_without_depth"] = float(report.skipped * world_size())
         as_tensor = partial(torch.as_tensor, dtype=torch.float32, device=report.total.device)
         return {name: as_tensor(value) for name, value in figures.items()}

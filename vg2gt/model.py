@@ -26,6 +26,7 @@ from torch.profiler import record_function
 from backends.base import Backend
 from vg2gt.geometry.alignment import fit_depth_scale
 from vg2gt.geometry.cameras import relative_to_first, scale_translations
+from vg2gt.memory import note_sizes
 from vg2gt.types import Gaussians, Geometry, Hints, Prediction, Tokens, Voxels
 
 if TYPE_CHECKING:
@@ -110,6 +111,8 @@ class Reconstructor(nn.Module, ABC):
 
     def read_views(self, images: Tensor, hints: Hints | None) -> tuple[Tokens, Geometry, Tensor]:
         """Runs the frozen backbone; returns its tokens, its geometry in the scene frame, and the unit ``[B]``."""
+        scenes, views, _, height, width = images.shape
+        note_sizes({f"images of {height}x{width} in {scenes} scene{'s' * (scenes > 1)}": scenes * views}, anew=True)
         with record_function("vg2gt/encode"):
             tokens = self.backend.encode(images, hints)
         with record_function("vg2gt/decode"), torch.no_grad():

@@ -22,6 +22,7 @@ from vg2gt.data.datamodule import SceneDataModule
 from vg2gt.distributed import ending_together
 from vg2gt.io.files import read_json, write_json, write_text
 from vg2gt.lightning_module import VG2GTModule
+from vg2gt.memory import TRAINING, memory_advice
 from vg2gt.preview import write_preview
 from vg2gt.report import comparison_table, print_comparison
 from vg2gt.trust import read_run_config
@@ -111,6 +112,7 @@ def _check_trainer(config: DictConfig) -> None:
         )
 
 
+@memory_advice(TRAINING)
 def train(config: DictConfig) -> dict[str, Any]:
     """Runs the configuration from beginning to end.
 
@@ -124,6 +126,7 @@ def train(config: DictConfig) -> dict[str, Any]:
         FileExistsError: if the folder holds a run and neither ``ckpt`` nor ``overwrite`` says what to do with it.
         FileNotFoundError: if ``ckpt`` names no valid checkpoint.
         ValueError: if the model has no trained part.
+        OutOfMemory: if a device's memory is full, naming the sizes and the options that reduce them.
     """
     checkpoint = _checkpoint_to_resume(config)
     run = build(config)

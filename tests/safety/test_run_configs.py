@@ -10,7 +10,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from vg2gt.evaluation.run import _refuse_training_views
+from vg2gt.evaluation.checks import refuse_training_views
 from vg2gt.paths import config_dir
 from vg2gt.reconstruction import load_model
 from vg2gt.study import _refuse_other_run
@@ -93,7 +93,7 @@ def test_wherever_it_stands(run_folder: Path, canary: Path, place: str) -> None:
 def test_the_runs_data_call_nothing_foreign(run_folder: Path, canary: Path, rooms, caplog) -> None:
     """An evaluation only asks what was trained on: it says why it cannot know, and goes on."""
     edit(run_folder, lambda config: config.update(data={"_target_": "os.mkdir", "path": str(canary)}))
-    _refuse_training_views(run_folder / "checkpoints" / "step-7.ckpt", rooms, [])
+    refuse_training_views(run_folder / "checkpoints" / "step-7.ckpt", rooms, [])
     assert "cannot be checked" in caplog.text
     assert "data._target_ is 'os.mkdir'" in caplog.text
 

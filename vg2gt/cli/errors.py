@@ -11,7 +11,9 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.errors import InstantiationException
 from hydra.types import RunMode
 
-USER_ERRORS = (ValueError, OSError, ImportError, ArithmeticError)
+from vg2gt.memory import OutOfMemory
+
+USER_ERRORS = (ValueError, OSError, ImportError, ArithmeticError, OutOfMemory)
 TRACEBACK = "HYDRA_FULL_ERROR"
 
 

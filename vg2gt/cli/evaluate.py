@@ -8,6 +8,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from vg2gt.evaluation.run import evaluate
 from vg2gt.evaluation.settings import run_name
+from vg2gt.memory import OutOfMemory
 from vg2gt.paths import config_dir
 
 OmegaConf.register_new_resolver("run_name", run_name, replace=True)
@@ -21,7 +22,7 @@ def main(config: DictConfig) -> None:
     except InstantiationException as error:  # what a constructor said
         cause = error.__cause__ or error
         sys.exit(f"{type(cause).__name__}: {cause}")
-    except (ValueError, OSError, ImportError) as error:
+    except (ValueError, OSError, ImportError, OutOfMemory) as error:
         sys.exit(f"{type(error).__name__}: {error}")
 
 

@@ -14,10 +14,10 @@ from rich.logging import RichHandler
 
 from vg2gt.evaluation.settings import choose_device
 from vg2gt.io.video import MissingDecoderError, require_ffmpeg
+from vg2gt.memory import RECONSTRUCTION, memory_advice
 from vg2gt.reconstruction import OUTPUTS, Monitor, OutOfMemory, Ready, load_model, reconstruct_with, write_outputs
 from vg2gt.reconstruction.outputs import DEFAULT, ORBIT_FRAMES, check_folder, check_outputs, cost_figures
 from vg2gt.reconstruction.pictures import existing_path
-from vg2gt.reconstruction.pipeline import memory_advice
 
 EXPECTED_ERRORS = (ValueError, OSError, ImportError, OutOfMemory, MissingDecoderError)
 
@@ -86,7 +86,7 @@ def run(options: argparse.Namespace) -> None:
             monitor=monitor,
         )
         figures = _figures(ready)
-        with memory_advice(len(scene.names), scene.cameras.size):
+        with memory_advice(RECONSTRUCTION):
             folder = write_outputs(
                 scene,
                 options.out,

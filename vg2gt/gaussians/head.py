@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from vg2gt.geometry.spherical_harmonics import MAX_DEGREE, rgb_to_sh
+from vg2gt.memory import Cap, check_limit, note_sizes
 from vg2gt.types import Gaussians, Voxels
 
 Anchor = Literal["centroid", "center"]
@@ -31,9 +32,12 @@ class GaussianHead(nn.Module):
         anchor: means are offsets from the voxel's ``centroid`` or, as in the paper, from its ``center``.
         max_offset: rho, largest offset along an axis in voxels.
         hidden: width of the hidden layer; None takes ``in_channels``.
+        max_gaussians: most Gaussians a scene; beyond it the least opaque are dropped, with a warning in the log and the
+            metric ``train/gaussians_dropped``. None keeps all.
 
     Attributes:
         out: the last layer, whose width depends on ``splits`` and ``sh_degree``.
+        cap: counts what ``max_gaussians`` drops.
     """
 
     def __init__(
@@ -44,6 +48,7 @@ class GaussianHead(nn.Module):
         anchor: Anchor = "centroid",
         max_offset: float = 1.0,
         hidden: int | None = None,
+        max_gaussians: int | None = None,
     ) -> None:
         super().__init__()
         if splits < 1:
@@ -56,6 +61,8 @@ class GaussianHead(nn.Module):
         self.sh_degree = sh_degree
         self.anchor = anchor
         self.max_offset = max_offset
+        self.max_gaussians = check_limit("model.gaussians.max_gaussians", max_gaussians)
+        self.cap = Cap("model.gaussians.max_gaussians", "Gaussians", "least opaque")
         bands = (sh_degree + 1) ** 2
         self.parts = (3, 3, 4, 1, 3 * bands)
         self.hidden = nn.Linear(in_channels, hidden or in_channels)
@@ -76,8 +83,8 @@ class GaussianHead(nn.Module):
             voxels: refined voxels of B scenes.
 
         Returns:
-            ``M * splits`` Gaussians, those of a voxel adjacent: scales in (0, 2 v), means within ``max_offset`` v of
-            the anchor along each axis, unit quaternions.
+            ``M * splits`` Gaussians (fewer beyond ``max_gaussians``), those of a voxel adjacent: scales in (0, 2 v),
+            means within ``max_offset`` v of the anchor along each axis, unit quaternions.
         """
         raw = self.out(F.gelu(self.hidden(voxels.features))).float().unflatten(-1, (self.splits, -1))
         offset, scale, rotation, opacity, color = raw.split(self.parts, -1)
@@ -91,7 +98,10 @@ class GaussianHead(nn.Module):
         base = F.pad(rgb_to_sh(voxels.colors)[:, None, None], (0, 0, 0, len(self.sh_gain) - 1))
         sh = base + self.sh_gain * color.unflatten(-1, (-1, 3))
         batch = voxels.batch.repeat_interleave(self.splits)
-        return Gaussians(*(part.flatten(0, 1) for part in (means, quats, scales, opacities, sh)), batch=batch)
+        note_sizes({"Gaussians": len(batch)})
+        parts = Gaussians(*(part.flatten(0, 1) for part in (means, quats, scales, opacities, sh)), batch=batch)
+        keep = self.cap(self.max_gaussians, parts.opacities, batch)
+        return parts if keep is None else parts.map(lambda tensor: tensor[keep])
 
 
 def _logit(probability: float) -> float:

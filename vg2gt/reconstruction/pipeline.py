@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import torch
 
+from vg2gt.memory import RECONSTRUCTION, memory_advice, note_sizes
 from vg2gt.model import Reconstructor
 from vg2gt.reconstruction.models import load_model
 from vg2gt.reconstruction.monitor import Monitor
@@ -16,10 +15,6 @@ from vg2gt.reconstruction.scene import Scene
 from vg2gt.reconstruction.views import Views, load_views, working_size
 from vg2gt.rendering import Renderer
 from vg2gt.types import Prediction
-
-
-class OutOfMemory(MemoryError):
-    """The device's memory is full; the message says what to change."""
 
 
 def reconstruct(
@@ -71,7 +66,8 @@ def reconstruct_with(
     device = next((parameter.device for parameter in model.parameters()), torch.device("cpu"))
     pictures = find_pictures(images, every, max_images, posed=model.backend.needs_hints)
     target = working_size([p.size for p in pictures], model.backend.patch_size, device.type, size)
-    with memory_advice(len(pictures), target):
+    with memory_advice(RECONSTRUCTION):
+        note_sizes({f"images of {target[0]}x{target[1]}": len(pictures)})
         views = load_views(pictures, target, monitor)
         prediction = _forward(model.eval(), views, device, monitor)
     return _scene(prediction, views, renderer or Renderer(), model.backend.is_metric)
@@ -97,23 +93,3 @@ def _scene(prediction: Prediction, views: Views, renderer: Renderer, is_metric: 
         renderer=renderer,
         metres_per_unit=float(geometry.scale) if is_metric else None,
     )
-
-
-@contextmanager
-def memory_advice(images: int, size: tuple[int, int]) -> Iterator[None]:
-    """Turns what torch says when memory is full into what to do about it.
-
-    Raises:
-        OutOfMemory: naming the knobs.
-    """
-    try:
-        yield
-    except (RuntimeError, MemoryError) as error:
-        full = isinstance(error, (MemoryError, torch.OutOfMemoryError)) or "allocate memory" in str(error)
-        if not full:
-            raise
-        raise OutOfMemory(
-            f"memory is full with {images} images of {size[0]}x{size[1]} ({str(error).splitlines()[0]}). Take fewer "
-            "images (--max-images, --every), smaller ones (--size), fewer voxels (--set model.fine.max_voxels=500000), "
-            "or smaller chunks (--set backend.head_chunk=2, --set model.fine.dense_head.views_per_chunk=2)"
-        ) from error

@@ -14,6 +14,7 @@ from torch.nn import functional as F
 
 from vg2gt.geometry.cameras import invert_rigid
 from vg2gt.geometry.spherical_harmonics import sh_to_rgb
+from vg2gt.memory import note_sizes
 from vg2gt.rendering.checks import background_color, check_cameras, check_gaussians
 from vg2gt.rendering.cpu import rasterize_cpu
 from vg2gt.rendering.dense import rasterize_dense
@@ -81,6 +82,9 @@ class Renderer(RenderOptions):
             raise ValueError(
                 f"cameras are on {cameras.world_to_camera.device}, the Gaussians on {device}; move one of them"
             )
+        height, width = cameras.size
+        views = cameras.world_to_camera.shape[:2].numel()
+        note_sizes({"Gaussians": len(gaussians), f"views of {height}x{width} to render": views})
         rasterize = RASTERIZERS[_resolve(self.implementation, device)]
         dtype = torch.promote_types(gaussians.means.dtype, torch.float32)
         with torch.autocast(device.type, enabled=False):

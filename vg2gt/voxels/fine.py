@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from vg2gt.geometry.cameras import unproject
+from vg2gt.memory import Cap, check_limit, note_sizes
 from vg2gt.types import Geometry, Tokens, Voxels
 from vg2gt.voxels.dense_head import DenseHead
 from vg2gt.voxels.grid import (
@@ -42,11 +43,15 @@ class FineModule(nn.Module):
         point_mlp: makes the voxel network from ``in_channels``.
         voxel_size: edge length in scene units.
         min_footprint: smallest edge in pixels at the scene's median depth; 0 switches the guard off.
-        max_voxels: most voxels a scene; beyond it the least confident are dropped, with a warning in the log. None
-            keeps all.
+        max_voxels: most voxels a scene; beyond it the least confident are dropped, with a warning in the log and
+            the metric ``train/voxels_dropped``. None keeps all.
 
     Attributes:
         out_channels: width of the refined features.
+        cap: counts what ``max_voxels`` drops.
+
+    Raises:
+        ValueError: if ``max_voxels`` is below 1.
     """
 
     def __init__(
@@ -62,7 +67,8 @@ class FineModule(nn.Module):
         super().__init__()
         self.voxel_size = voxel_size
         self.min_footprint = min_footprint
-        self.max_voxels = max_voxels
+        self.max_voxels = check_limit("model.fine.max_voxels", max_voxels)
+        self.cap = Cap("model.fine.max_voxels", "voxels", "least confident")
         self.dense_head = dense_head(token_dims=token_dims, patch_size=patch_size)
         width = self.dense_head.out_channels
         self.point_offset = nn.Linear(3, width, bias=False)
@@ -117,18 +123,11 @@ class FineModule(nn.Module):
 
     def _plan(self, points: _Points) -> VoxelPlan:
         plan = plan_voxels(points.cells, points.batch, points.valid)
+        note_sizes({"voxels": len(plan)})
         if self.max_voxels is None:
             return plan
-        keep = _most_confident(pool_min(points.confidence.detach(), plan), plan.batch, self.max_voxels)
-        dropped = int((~keep).sum())
-        if not dropped:
-            return plan
-        lost = int(plan.counts[~keep].sum())
-        log.warning(
-            "fine.max_voxels=%d a scene: dropped the %d least confident of %d voxels (%d of %d points)",
-            self.max_voxels, dropped, len(plan), lost, len(plan.order),
-        )  # fmt: skip
-        return plan.select(keep)
+        keep = self.cap(self.max_voxels, pool_min(points.confidence.detach(), plan), plan.batch)
+        return plan if keep is None else plan.select(keep)
 
 
 class _Points:
@@ -156,18 +155,6 @@ class _Points:
         far = int((usable.flatten() & ~near).sum())
         if far:
             log.warning("left out %d of %d points too far away to be numbered", far, usable.numel())
-
-
-def _most_confident(confidence: Tensor, batch: Tensor, limit: int) -> Tensor:
-    """``[M]`` bool: the ``limit`` most confident voxels of every scene."""
-    keep = torch.ones_like(batch, dtype=torch.bool)
-    begin = 0
-    for count in torch.bincount(batch).tolist():
-        if count > limit:
-            least = confidence[begin : begin + count].argsort(stable=True)[: count - limit]
-            keep[begin + least] = False
-        begin += count
-    return keep
 
 
 def _scene_medians(values: Tensor, batch: Tensor) -> Tensor:

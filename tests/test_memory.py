@@ -1,0 +1,249 @@
+"""Caps drop the lowest of each scene and say so; full memory is one error that names sizes and options."""
+
+import logging
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from hydra.utils import instantiate
+
+from vg2gt.gaussians import GaussianHead
+from vg2gt.memory import (
+    EVALUATION,
+    RECONSTRUCTION,
+    TRAINING,
+    Cap,
+    OutOfMemory,
+    dropped_by,
+    memory_advice,
+    note_sizes,
+)
+from vg2gt.paths import config_dir
+from vg2gt.study import compose_run
+from vg2gt.training import train
+from vg2gt.types import Voxels
+
+ROOT = Path(__file__).resolve().parents[1]
+SMALL = [
+    "data.image_size=[28,28]",
+    "data.num_frames=6",
+    "data.train_scenes=1",
+    "data.eval_scenes=1",
+    "data.max_images=3",
+    "data.min_views=2",
+    "data.max_views=2",
+    "data.eval_context=2",
+    "data.eval_target=1",
+    "trainer.enable_progress_bar=false",
+]
+
+
+def some_voxels(counts: tuple[int, ...] = (40, 60), seed: int = 0) -> Voxels:
+    generator = torch.Generator().manual_seed(seed)
+    batch = torch.repeat_interleave(torch.arange(len(counts)), torch.tensor(counts))
+    total = len(batch)
+    grid = torch.stack((torch.arange(total), torch.zeros(total), torch.zeros(total)), -1).long()
+    features, colors = torch.randn(total, 8, generator=generator), torch.rand(total, 3, generator=generator)
+    confidence = torch.rand(total, generator=generator) + 0.1
+    return Voxels(
+        features, colors, grid, batch, confidence, torch.ones(total), grid + 0.5, torch.full((len(counts),), 0.1)
+    )
+
+
+def head(max_gaussians: int | None = None) -> GaussianHead:
+    torch.manual_seed(0)
+    made = GaussianHead(8, splits=2, max_gaussians=max_gaussians)
+    torch.nn.init.normal_(made.out.weight)
+    return made
+
+
+def test_the_least_opaque_gaussians_of_each_scene_go(caplog: pytest.LogCaptureFixture) -> None:
+    voxels = some_voxels()
+    whole = head()(voxels)
+    capped = head(70)
+    with caplog.at_level(logging.WARNING):
+        kept = capped(voxels)
+    assert torch.bincount(kept.batch).tolist() == [70, 70]
+    for scene, count in ((0, 80), (1, 120)):
+        before, after = whole.scene(scene), kept.scene(scene)
+        assert torch.equal(after.opacities.sort().values, before.opacities.sort().values[count - 70 :])
+        rows = (before.opacities >= after.opacities.min()).nonzero()[:, 0]
+        assert torch.equal(after.means, before.means[rows])  # in their order
+    assert "model.gaussians.max_gaussians=70 a scene: dropped the 60 least opaque of 200 Gaussians" in caplog.text
+    assert dropped_by(capped) == {"gaussians": 60}
+    assert torch.equal(capped(voxels).means, kept.means)
+
+
+def test_a_scene_is_capped_as_if_it_were_alone() -> None:
+    both = head(50)(some_voxels())
+    first = some_voxels()
+    rows = first.batch == 0
+    names = ("features", "colors", "grid", "batch", "confidence", "count", "centroid")
+    alone = Voxels(*(getattr(first, name)[rows] for name in names), first.voxel_size[:1])  # pyright: ignore[reportCallIssue]
+    torch.testing.assert_close(head(50)(alone).means, both.scene(0).means)
+
+
+def test_which_are_dropped_does_not_depend_on_their_order() -> None:
+    generator = torch.Generator().manual_seed(0)
+    ranks, batch = torch.rand(500, generator=generator), torch.arange(2).repeat_interleave(250)
+    order = torch.cat((torch.randperm(250, generator=generator), 250 + torch.randperm(250, generator=generator)))
+    keep = Cap("o", "things", "least")(100, ranks, batch)
+    shuffled = Cap("o", "things", "least")(100, ranks[order], batch)
+    assert keep is not None and shuffled is not None  # noqa: PT018
+    assert torch.equal(keep[order], shuffled)
+    assert torch.bincount(batch[keep]).tolist() == [100, 100]
+    ties = Cap("o", "things", "least")(100, torch.ones(500), batch)
+    assert ties is not None
+    assert torch.equal(ties, Cap("o", "things", "least")(100, torch.ones(500), batch))
+
+
+def test_below_the_limit_nothing_changes(caplog: pytest.LogCaptureFixture) -> None:
+    voxels = some_voxels()
+    for limit in (120, 10**6):
+        made, expected = head(limit)(voxels), head()(voxels)
+        for name in ("means", "quats", "scales", "opacities", "sh", "batch"):
+            assert torch.equal(getattr(made, name), getattr(expected, name))
+    assert not caplog.records
+    assert dropped_by(head()) == {}
+
+
+def test_the_kept_ones_have_their_gradients() -> None:
+    voxels, capped = some_voxels(), head(50)
+    capped(voxels).means.sum().backward()
+    assert torch.isfinite(capped.out.weight.grad).all()  # pyright: ignore[reportArgumentType]
+    assert float(capped.out.weight.grad.abs().sum()) > 0  # pyright: ignore[reportOptionalMemberAccess]
+
+
+def test_what_is_dropped_is_not_told_in_every_pass(caplog: pytest.LogCaptureFixture) -> None:
+    cap, batch = Cap("model.x", "things", "least"), torch.zeros(10, dtype=torch.int64)
+    for _ in range(1000):
+        cap(4, torch.arange(10.0), batch)
+        assert cap.dropped == 6
+    assert len(caplog.records) == 10  # 1, 2, 4, ..., 512
+    cap(20, torch.arange(10.0), batch)
+    assert cap.dropped == 0
+
+
+@pytest.mark.parametrize("option", ["model.fine.max_voxels", "model.gaussians.max_gaussians"])
+def test_a_limit_of_nothing_is_refused(option: str) -> None:
+    with initialize_config_dir(config_dir(), version_base="1.3"):
+        config = compose(overrides=["+backend=oracle", "+model=tiny", f"{option}=0"])
+    with pytest.raises(Exception, match=f"{option} must be at least 1, or null"):
+        instantiate(config.model, backend=instantiate(config.backend))
+
+
+def test_training_logs_what_was_dropped(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    overrides = ["model.fine.max_voxels=200", "model.gaussians.max_gaussians=300", "trainer.max_steps=1"]
+    config = compose_run([*SMALL, *overrides, "trainer.log_every_n_steps=1", f"name={tmp_path.name}"], tmp_path)
+    with caplog.at_level(logging.WARNING):
+        train(config)
+    (metrics,) = tmp_path.rglob("metrics.csv")
+    header = metrics.read_text().splitlines()[0].split(",")
+    assert {"train/voxels_dropped", "train/gaussians_dropped"} <= set(header)
+    assert "model.fine.max_voxels=200 a scene: dropped" in caplog.text
+    assert "model.gaussians.max_gaussians=300 a scene: dropped" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB"),
+        MemoryError(),
+        MemoryError("Unable to allocate 8.00 EiB for an array"),
+        RuntimeError("[enforce fail at alloc_cpu.cpp:114] err == 0. DefaultCPUAllocator: can't allocate memory: 12"),
+        RuntimeError("DefaultCPUAllocator: not enough memory: you tried to allocate 1024 bytes."),
+        RuntimeError("CUDA error: out of memory"),
+        RuntimeError("std::bad_alloc"),
+        RuntimeError("CUDA error: CUBLAS_STATUS_ALLOC_FAILED when calling `cublasCreate(handle)`"),
+    ],
+)
+def test_full_memory_is_one_error(error: Exception) -> None:
+    @memory_advice(TRAINING)
+    def fail() -> None:
+        note_sizes({"images of 1x1": 1, "Gaussians": 5}, anew=True)
+        note_sizes({"images of 28x28": 4}, anew=True)
+        note_sizes({"voxels": 7})
+        raise error
+
+    said = r"memory is full with 4 images of 28x28, 7 voxels \(.+\)\. Take fewer"
+    with pytest.raises(OutOfMemory, match=said) as caught:
+        fail()
+    assert caught.value.__cause__ is error
+    note_sizes({"voxels": 1})  # outside: nobody listens
+
+
+def test_other_errors_pass() -> None:
+    for error in (RuntimeError("shapes cannot be multiplied"), ValueError("memory"), OutOfMemory("said already")):
+        with pytest.raises(type(error), match=str(error)), memory_advice(TRAINING):
+            raise error
+
+
+@pytest.mark.parametrize("stage", ["model.fine.point_mlp", "renderer"])
+def test_training_names_sizes_and_options(stage: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB")
+
+    place = "vg2gt.rendering.renderer.Renderer.__call__" if stage == "renderer" else "vg2gt.voxels.PointMLP.forward"
+    monkeypatch.setattr(place, fail)
+    config = compose_run([*SMALL, "trainer.max_steps=1", f"name={tmp_path.name}"], tmp_path)
+    sizes = r"memory is full with 2 images of 28x28 in 1 scene, \d+ voxels"
+    sizes += r", \d+ Gaussians" if stage == "renderer" else r" \("
+    with pytest.raises(OutOfMemory, match=rf"{sizes}.*data\.max_images.*data\.image_size.*model\.fine\.max_voxels"):
+        train(config)
+
+
+def options_in(advice: str) -> list[str]:
+    words = advice.replace("(", " ").replace(")", " ").replace(",", " ").split()
+    return [word.split("=")[0].lstrip("+") for word in words if "." in word and not word.startswith("--")]
+
+
+@pytest.mark.parametrize("advice", [TRAINING, EVALUATION, RECONSTRUCTION])
+def test_the_options_exist(advice: str) -> None:
+    with initialize_config_dir(config_dir(), version_base="1.3"):
+        config = compose("train", ["model=vg2gt", "backend=da3_small", "output_dir=.", "hydra/job_logging=default"])
+    named = options_in(advice)
+    assert len(named) >= 4
+    for name in named:
+        node = config
+        for key in name.split("."):
+            assert key in node, name
+            node = node[key]
+
+
+SCRIPT = """
+import resource, sys
+import torch
+from pathlib import Path
+from vg2gt.study import compose_run
+from vg2gt.training import train
+torch.set_num_threads(1)
+config = compose_run(sys.argv[2:], Path(sys.argv[1]))
+import vg2gt.lightning_module as module
+
+def limited(self, batch, *_):
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    limit = pages * resource.getpagesize() + (64 << 20)
+    resource.setrlimit(resource.RLIMIT_AS, (limit, resource.RLIM_INFINITY))
+    return step(self, batch, *_)
+
+step = module.VG2GTModule.training_step
+module.VG2GTModule.training_step = limited
+try:
+    train(config)
+except MemoryError as error:
+    resource.setrlimit(resource.RLIMIT_AS, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+    print("CAUGHT", type(error).__name__, error)
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="RLIMIT_AS is enforced on Linux")
+def test_a_real_failure_to_allocate(tmp_path: Path) -> None:
+    overrides = [*SMALL, "data.image_size=[224,448]", "trainer.max_steps=1", "trainer.limit_val_batches=0"]
+    command = [sys.executable, "-c", SCRIPT, str(tmp_path), *overrides, "name=run"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300, check=False)
+    assert "CAUGHT OutOfMemory memory is full with" in done.stdout, done.stdout[-2000:] + done.stderr[-2000:]
+    assert "images of 224x448" in done.stdout
+    assert "data.max_images" in done.stdout
