@@ -117,6 +117,13 @@ def _back_to_back(batch: Batch) -> Batch:
     return _with_cameras(batch, poses)
 
 
+def _outliers(batch: Batch) -> Batch:
+    """Most points near, the others almost too far to be numbered, on both sides."""
+    depth = torch.ones_like(batch.depth)
+    depth[..., :10, :] = 1900.0
+    return _back_to_back(replace(batch, depth=depth))
+
+
 def _far_from_origin(batch: Batch) -> Batch:
     """A world whose origin lies 1000 km away."""
     shift = torch.eye(4)
@@ -151,7 +158,30 @@ SCENES: dict[str, Mutation] = {
     "held-out view far away": _target_far_away,
     "views back to back": _back_to_back,
     "far from the origin": _far_from_origin,
+    "outliers on both sides": _outliers,
 }
+
+
+def beside(good: Batch, other: Batch) -> Batch:
+    """Two scenes in one batch; the other alone where its views differ in number."""
+    if good.images.shape != other.images.shape or good.num_context != other.num_context:
+        return other
+    cameras = (
+        torch.cat(pair)
+        for pair in (
+            (good.cameras.world_to_camera, other.cameras.world_to_camera),
+            (good.cameras.intrinsics, other.cameras.intrinsics),
+        )
+    )
+    return Batch(
+        images=torch.cat((good.images, other.images)),
+        depth=torch.cat((good.depth, other.depth)),
+        cameras=Cameras(*cameras, good.cameras.size),
+        is_metric=torch.cat((good.is_metric, other.is_metric)),
+        frame_ids=torch.cat((good.frame_ids, other.frame_ids)),
+        scene=(*good.scene, *other.scene),
+        num_context=good.num_context,
+    )
 
 
 def obey_names(backend: Backend, monkeypatch: Any) -> None:

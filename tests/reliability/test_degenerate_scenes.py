@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from tests.reliability.degenerate import SCENES, obey_names, random_mutation
+from tests.reliability.degenerate import SCENES, beside, obey_names, random_mutation
 from tests.reliability.steps import first_batches, fit, tiny_run
 from vg2gt.evaluation.options import EvaluationOptions
 from vg2gt.evaluation.scene import SceneEvaluator, evaluate_scene
@@ -138,13 +138,25 @@ def check_random_scenes(first_seed: int, count: int, folder: Path, cache: Path, 
     batches, labels = [], []
     for seed in range(first_seed, first_seed + count):
         label, mutate = random_mutation(np.random.default_rng(seed))
-        batches.append(mutate(good))
+        batches.append(beside(good, mutate(good)) if seed % 2 else mutate(good))
         labels.append(f"{seed}: {label}")
     audit = fit(run, batches)
     harmed = [label for label, finite in zip(labels, audit.finite, strict=True) if not finite]
     assert not harmed
     audit.assert_sound()
     print(f"{count} mutated scenes: {sum(audit.skipped)} dropped, none harmful")
+
+
+@pytest.mark.parametrize("overrides", [(), ("model=voxel_merged",)], ids=" ".join)
+def test_far_points_of_two_scenes_can_be_numbered(overrides: tuple[str, ...], tmp_path: Path, cache: Path) -> None:
+    small_voxels = ["fine", "coarse"] if not overrides else []
+    guards = [f"model.{part}.min_footprint=0" for part in small_voxels] or ["model.min_footprint=0"]
+    run = tiny_run(tmp_path, cache, *overrides, *guards)
+    (good,) = first_batches(run, 1)
+    far = SCENES["outliers on both sides"](good)
+    audit = fit(run, [beside(far, far), beside(good, far), far])
+    audit.assert_sound()
+    assert audit.skipped == [False] * 3
 
 
 def test_mutated_scenes_do_no_harm(tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,7 +12,7 @@ from torch.nn import functional as F
 
 from vg2gt.types import Geometry
 
-MAX_CELLS = 1 << 20  # cells either side of the origin; serialisation codes hold 21 bits an axis
+MAX_CELLS = 1 << 18  # cells either side of the origin: 19 bits an axis leave 6 of a code's 63 for the scene
 
 
 @dataclass(frozen=True)
