@@ -98,3 +98,19 @@ def test_baselines(tmp_path: Path) -> None:
     before = (home / "seed-0" / "vg2gt" / "metrics.json").stat().st_mtime_ns
     run("baselines.py", tmp_path, *arguments)
     assert (home / "seed-0" / "vg2gt" / "metrics.json").stat().st_mtime_ns == before
+
+
+@pytest.mark.slow
+def test_memory(tmp_path: Path) -> None:
+    run("memory.py", tmp_path, "--models", "tiny", "--out", str(tmp_path))
+    (written,) = tmp_path.glob("*-memory-cpu.json")
+    points = json.loads(written.read_text())["points"]
+    views = [point for point in points if point["varied"] == "views"]
+    for mode in ("forward", "training"):
+        passes = [point[mode]["pass_mib"] for point in views]
+        assert passes == sorted(passes)
+    assert views[-1]["training"]["pass_mib"] > views[-1]["forward"]["pass_mib"] > 0
+    capped = next(point for point in points if point["overrides"] == ["model.fine.max_voxels=1000"])
+    assert capped["forward"]["voxels"] == 1000
+    assert capped["training"]["pass_mib"] < views[-1]["training"]["pass_mib"]
+    assert written.with_suffix(".md").read_text().count("| views |") == 4
