@@ -1,0 +1,293 @@
+"""Two processes train like one with twice the scenes, and end together; a batch of two scenes is the mean of two."""
+
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import lightning
+import pytest
+import torch
+from omegaconf import OmegaConf
+from torch import Tensor
+
+from tests.losses.conftest import Sample, make_sample
+from tests.reliability import two_ranks
+from tests.reliability.degenerate import SCENES
+from tests.reliability.steps import TINY, first_batches, tiny_run
+from tests.training_helpers import SMALL
+from vg2gt.callbacks import StopOnSignal
+from vg2gt.distributed import in_turns
+from vg2gt.losses import EnhancementLoss, GaussianLoss, ScaleAlignment, VG2GTLoss
+from vg2gt.training import Run
+from vg2gt.types import Batch
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("rooms")
+
+
+# --------------------------------------------------------------------------------------------- scenes count alike
+
+OBJECTIVES = {
+    "default": VG2GTLoss(),
+    "decoded normals, trusted alike": VG2GTLoss(gaussian=GaussianLoss(confidence_weighted=False)),
+    "rendered normals": VG2GTLoss(gaussian=GaussianLoss(normal_target="render")),
+    "true normals": VG2GTLoss(gaussian=GaussianLoss(normal_target="gt")),
+    "hinge on the error": VG2GTLoss(enhance=EnhancementLoss(margin=0.01, on="reg")),
+    "hinge as printed": VG2GTLoss(enhance=EnhancementLoss(form="paper_literal")),
+    "scale of the renders": VG2GTLoss(align=ScaleAlignment(source="rendered")),
+    "scale per view": VG2GTLoss(align=ScaleAlignment(per_view=True)),
+}
+
+
+def two_scenes() -> Sample:
+    """A good scene and a worse one of another size: batch-wide quantiles, scales or hinges would mix them."""
+    sample = make_sample(scenes=2, size=(24, 48))
+    noise = torch.Generator().manual_seed(3)
+    shape = sample.prediction.geometry.depth.shape
+    worse = torch.tensor([0.02, 0.5], dtype=torch.float64)[:, None, None, None]
+    depth = sample.prediction.geometry.depth * (1 + worse * torch.randn(shape, generator=noise, dtype=torch.float64))
+    start = sample.prediction.initial.depth * (1 + 0.1 * torch.randn(shape, generator=noise, dtype=torch.float64))
+    truth = sample.batch.depth * torch.tensor([1.0, 7.0], dtype=torch.float64)[:, None, None, None]
+    return sample.with_depth(depth).with_initial(start).with_truth(truth)
+
+
+def scene_of(sample: Sample, index: int) -> Sample:
+    rows = slice(index, index + 1)
+    prediction = sample.prediction
+    return replace(
+        sample,
+        batch=sample.batch.single(index),
+        prediction=replace(
+            prediction,
+            initial=prediction.initial.map(lambda tensor: tensor[rows]),
+            geometry=prediction.geometry.map(lambda tensor: tensor[rows]),
+            unit=prediction.unit[rows],
+        ),
+        rendered=sample.rendered.map(lambda tensor: tensor[rows]),
+        cameras=sample.cameras.scene(index),
+    )
+
+
+def leaves(sample: Sample) -> tuple[Sample, list[Tensor]]:
+    """The same sample, and the tensors of the prediction to which gradients flow."""
+    geometry = sample.prediction.geometry
+    depth, conf = (t.clone().requires_grad_() for t in (geometry.depth, geometry.depth_conf))
+    render = {
+        name: getattr(sample.rendered, name).clone().requires_grad_() for name in ("color", "depth", "normal", "alpha")
+    }
+    return sample.with_depth(depth, conf).with_render(**render), [depth, conf, *render.values()]
+
+
+def value_and_gradients(loss: VG2GTLoss, sample: Sample) -> tuple[Tensor, dict[str, Tensor], list[Tensor]]:
+    sample, inputs = leaves(sample)
+    report = loss(*sample.inputs)
+    gradients = torch.autograd.grad(report.total, inputs, allow_unused=True, materialize_grads=True)
+    return report.total.detach(), report.terms, list(gradients)
+
+
+@pytest.mark.parametrize("name", OBJECTIVES)
+def test_the_loss_of_two_scenes_is_the_mean_of_theirs(name: str) -> None:
+    loss, sample = OBJECTIVES[name], two_scenes()
+    total, terms, gradients = value_and_gradients(loss, sample)
+    alone = [value_and_gradients(loss, scene_of(sample, index)) for index in range(2)]
+    torch.testing.assert_close(total, (alone[0][0] + alone[1][0]) / 2, rtol=1e-12, atol=0)
+    assert alone[0][0] != alone[1][0]
+    for term, value in terms.items():
+        torch.testing.assert_close(value, (alone[0][1][term] + alone[1][1][term]) / 2, rtol=1e-12, atol=1e-14)
+    for together, first, second in zip(gradients, alone[0][2], alone[1][2], strict=True):
+        torch.testing.assert_close(together, torch.cat((first, second)) / 2, rtol=1e-9, atol=1e-14)
+
+
+def step(run: Run, batch: Batch) -> tuple[Tensor, Tensor]:
+    """Loss and gradient of one training step."""
+    module = run.module
+    module.train()
+    module.model.backend.eval()
+    module.zero_grad()
+    module.generator.manual_seed(5)
+    loss = module.training_step(batch, 0)
+    loss.backward()
+    return loss.detach(), torch.cat([p.grad.flatten() for p in module.model.trained_parameters() if p.grad is not None])
+
+
+def test_the_step_of_two_scenes_is_the_mean_of_theirs(tmp_path: Path, cache: Path) -> None:
+    """From images to gradients, through backbone, voxels, Gaussians and renders."""
+    run = tiny_run(tmp_path, cache, "data.max_images=4")
+    batch = first_batches(run, 1)[0]
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():  # away from the zero convolutions
+        for parameter in run.module.model.trained_parameters():
+            parameter += 0.02 * torch.randn(parameter.shape, generator=generator)
+    loss, gradient = step(run, batch)
+    first, second = (step(run, batch.single(index)) for index in range(2))
+    assert first[0] != second[0]
+    torch.testing.assert_close(loss, (first[0] + second[0]) / 2, rtol=1e-6, atol=0)
+    mean = (first[1] + second[1]) / 2
+    assert (gradient - mean).norm() < 2e-6 * mean.norm()
+
+
+# ------------------------------------------------------------------------------------------------ nobody is waited for
+
+
+@pytest.mark.parametrize("model", ["vg2gt", "pixel_aligned", "voxel_merged"])
+def test_every_parameter_has_a_gradient_whatever_the_scene(tmp_path: Path, cache: Path, model: str) -> None:
+    """DDP waits for the gradient of every parameter of every rank."""
+    run = tiny_run(tmp_path, cache, f"model={'tiny' if model == 'vg2gt' else model}")
+    batch = first_batches(run, 1)[0]
+    parameters = run.module.model.trained_parameters()
+    for scene in ("unchanged", "no depth", "one pixel with depth", "held-out view looks away"):
+        _, gradient = step(run, SCENES[scene](batch))
+        assert len(gradient) == sum(parameter.numel() for parameter in parameters), scene
+
+
+@pytest.mark.parametrize("override", ["model.coarse=null", "model.gaussians.splits=1", "loss.gaussian.weight=0"])
+def test_no_variant_has_unused_parameters(tmp_path: Path, cache: Path, override: str) -> None:
+    run = tiny_run(tmp_path, cache, override)
+    _, gradient = step(run, first_batches(run, 1)[0])
+    assert len(gradient) == sum(parameter.numel() for parameter in run.module.model.trained_parameters())
+
+
+@pytest.fixture(scope="module")
+def two(tmp_path_factory: pytest.TempPathFactory, cache: Path) -> tuple[Path, list[subprocess.CompletedProcess]]:
+    """All short scenarios, the one that fails last."""
+    folder = tmp_path_factory.mktemp("two")
+    names = ("sgd", "empty_rank", "three_scenes", "one_scene", "broken_loader")
+    return folder, two_ranks.run_on_two_ranks(folder, cache, *names)
+
+
+def results(two: tuple[Path, list[subprocess.CompletedProcess]], name: str) -> list[dict]:
+    folder, ended = two
+    files = [folder / f"{name}-{rank}.pt" for rank in range(2)]
+    assert all(path.is_file() for path in files), [rank.stderr[-3000:] for rank in ended]
+    return [torch.load(path, weights_only=True) for path in files]
+
+
+def assert_trained_alike(one: dict, ranks: list[dict], loss: float, weights: float) -> None:
+    assert torch.equal(ranks[0]["weights"], ranks[1]["weights"])
+    assert ranks[0]["losses"] == ranks[1]["losses"]
+    differences = [abs(a - b) for a, b in zip(one["losses"], ranks[0]["losses"], strict=True)]
+    assert max(differences) < loss
+    assert (one["weights"] - ranks[0]["weights"]).abs().max() < weights
+
+
+def test_two_processes_train_like_one_with_twice_the_scenes(two, tmp_path: Path, cache: Path) -> None:
+    run = tiny_run(tmp_path, cache, *two_ranks.step_overrides(two_ranks.SGD, 4, scenes=2))
+    before = two_ranks.weights(run)
+    one = two_ranks.trained(run)
+    assert (one["weights"] - before).abs().max() > 1e-3
+    assert_trained_alike(one, results(two, "sgd"), loss=2e-6, weights=2e-6)
+
+
+def test_only_the_trained_part_is_averaged(two, tmp_path: Path, cache: Path) -> None:
+    run = tiny_run(tmp_path, cache)
+    trained = sum(parameter.numel() for parameter in run.module.model.trained_parameters())
+    assert trained < sum(parameter.numel() for parameter in run.module.parameters())
+    assert [rank["averaged"] for rank in results(two, "sgd")] == [trained, trained]
+
+
+def test_an_empty_rank_holds_nobody_up(two) -> None:
+    first, second = results(two, "empty_rank")
+    assert first["steps"] == second["steps"] == len(two_ranks.EMPTY)
+    assert first["dropped"] == second["dropped"]
+    assert torch.equal(first["weights"], second["weights"])
+    assert bool(first["weights"].isfinite().all())
+
+
+def test_evaluation_on_two_ranks_is_that_of_one(two, tmp_path: Path, cache: Path) -> None:
+    """Three scenes, one of them without the metrics of depth: every bit is the same."""
+    one = two_ranks.three_scenes(tmp_path, cache)
+    assert {"psnr", "abs_rel"} <= one.keys()
+    assert results(two, "three_scenes") == [one, one]
+
+
+def test_fewer_scenes_than_ranks_can_be_evaluated_while_training(two) -> None:
+    first, second = results(two, "one_scene")
+    assert first == second
+    assert first["eval/psnr"] > 5
+
+
+def test_an_error_of_one_rank_ends_both(two) -> None:
+    folder, ended = two
+    assert not list(folder.glob("broken_loader-*.pt"))
+    assert all(rank.returncode != 0 for rank in ended)
+    assert "this batch cannot be read" in ended[1].stderr
+
+
+def test_ranks_join_what_they_took_in_turns() -> None:
+    parts = [{"a": 1, "c": 3, "e": 5}, {"b": 2, "d": 4}, {"a": 9}]
+    joined = in_turns(parts)
+    assert list(joined.items()) == [("a", 1), ("b", 2), ("c", 3), ("d", 4), ("e", 5)]
+
+
+# ---------------------------------------------------------------------------------------------------------- clusters
+
+
+class Announced(lightning.Callback):
+    """Sends the signal of SLURM's ``--signal=USR1`` in the second step."""
+
+    def on_train_batch_start(self, trainer: lightning.Trainer, *args: object) -> None:
+        if trainer.global_step == 1:
+            signal.raise_signal(signal.SIGUSR1)
+
+
+def test_the_announced_end_of_a_job_saves_after_the_step(tmp_path: Path, cache: Path) -> None:
+    run = tiny_run(tmp_path, cache, "trainer.max_steps=5")
+    run.trainer.callbacks += [StopOnSignal(str(tmp_path)), Announced()]  # pyright: ignore[reportAttributeAccessIssue]
+    before = signal.getsignal(signal.SIGUSR1)
+    run.trainer.fit(run.module, datamodule=run.datamodule)
+    assert [path.name for path in tmp_path.glob("*.ckpt")] == ["step-2.ckpt"]
+    assert signal.getsignal(signal.SIGUSR1) == before
+
+
+# ------------------------------------------------------------------------------------------------------------- slow
+
+
+@pytest.mark.slow
+def test_tasks_of_a_slurm_job_find_each_other(tmp_path: Path, cache: Path) -> None:
+    """The environment that srun gives two tasks of one node."""
+    job = {"SLURM_JOB_ID": "4242", "SLURM_JOB_NAME": "train", "SLURM_NODELIST": "127.0.0.1", "SLURM_NODEID": "0"}
+    job |= {"SLURM_NTASKS": "2", "SLURM_NTASKS_PER_NODE": "2", "SLURM_JOB_NUM_NODES": "1"}
+    job |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(two_ranks.free_port())}
+    small = [*SMALL, *TINY[:7], f"data.cache_dir={cache}", "trainer=slurm", "trainer.precision=32-true", "name=job"]
+    command = [sys.executable, "-m", "vg2gt.cli.train", *small]
+    tasks = [
+        subprocess.Popen(
+            command, cwd=tmp_path, env={**os.environ, **job, "SLURM_PROCID": str(task), "SLURM_LOCALID": str(task)}
+        )
+        for task in range(2)
+    ]
+    try:
+        assert [task.wait(1200) for task in tasks] == [0, 0]
+    finally:
+        for task in tasks:
+            task.kill()
+    assert (tmp_path / "outputs" / "job" / "metrics.json").is_file()
+
+
+@pytest.mark.slow
+def test_forty_steps_on_two_processes(tmp_path: Path, cache: Path) -> None:
+    """With SGD rounding stays rounding; Adam divides by the gradient's size and makes it grow."""
+    names = ("sgd_long", "adamw_long")
+    ended = two_ranks.run_on_two_ranks(tmp_path, cache, *names, timeout=1500)
+    for name, optimizer, loss, weights in zip(names, (two_ranks.SGD, ()), (5e-6, 5e-2), (5e-6, 2e-2), strict=True):
+        one = two_ranks.trained(tiny_run(tmp_path, cache, *two_ranks.step_overrides(optimizer, 40, scenes=2)))
+        ranks = results((tmp_path, ended), name)
+        differences = [abs(a - b) for a, b in zip(one["losses"], ranks[0]["losses"], strict=True)]
+        print(name, "loss", max(differences), "weights", float((one["weights"] - ranks[0]["weights"]).abs().max()))
+        assert_trained_alike(one, ranks, loss, weights)
+
+
+@pytest.mark.slow
+def test_a_sweep_over_numbers_of_devices(tmp_path: Path, cache: Path) -> None:
+    small = [*SMALL, *TINY[:7], f"data.cache_dir={cache}", "trainer.max_steps=1", "name=sweep"]
+    command = [sys.executable, "-m", "vg2gt.cli.train", "-m", *small, "trainer=default,ddp"]
+    sweep = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=1200, check=False)
+    assert sweep.returncode == 0, sweep.stderr[-3000:]
+    folders = [tmp_path / "outputs" / "sweep" / job for job in "01"]
+    assert [OmegaConf.load(folder / "config.yaml").trainer.devices for folder in folders] == [1, 2]
+    assert all((folder / "metrics.json").is_file() for folder in folders)

@@ -1,0 +1,175 @@
+"""Scenarios on two processes: ``python -m tests.reliability.two_ranks FOLDER CACHE NAME ...`` is one of them.
+
+Several scenarios share the processes, whose start takes longer than any of them.
+"""
+
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import lightning
+import torch
+from torch import Tensor
+from torch.nn.parallel import DistributedDataParallel
+
+from tests.reliability.degenerate import SCENES
+from tests.reliability.steps import first_batches, fit, tiny_run
+from vg2gt.data import DataError
+from vg2gt.data.batches import BatchDataset
+from vg2gt.distributed import ending_together
+from vg2gt.training import Run, evaluate
+
+RANKS = ["trainer=ddp"]
+SGD = ["optimizer._target_=torch.optim.SGD", "~optimizer.betas", "optimizer.lr=0.05"]
+EMPTY = [
+    "no depth",
+    "one pixel with depth",
+    "held-out view looks away",
+    "black images",
+    "one view",
+    "10 km, depth alone",
+]
+
+
+class Curve(lightning.Callback):
+    """Keeps the logged loss of every step, and what DDP averages."""
+
+    def __init__(self) -> None:
+        self.losses: list[float] = []
+        self.averaged = 0
+
+    def on_train_batch_end(self, trainer: lightning.Trainer, *args: Any) -> None:
+        self.losses.append(float(trainer.callback_metrics["loss"]))
+        if isinstance(trainer.strategy.model, DistributedDataParallel):
+            reducer = trainer.strategy.model.reducer
+            self.averaged = sum(bucket.buffer().numel() for bucket in reducer._get_zeros_like_grad_buckets())
+
+
+def trained(run: Run) -> dict[str, Any]:
+    """Trains a run to its end; its loss curve, final weights and number of averaged elements."""
+    curve = Curve()
+    run.trainer.callbacks.append(curve)  # pyright: ignore[reportAttributeAccessIssue]
+    run.trainer.fit(run.module, datamodule=run.datamodule)
+    return {"losses": curve.losses, "weights": weights(run), "averaged": curve.averaged}
+
+
+def weights(run: Run) -> Tensor:
+    return torch.cat([parameter.detach().flatten() for parameter in run.module.model.trained_parameters()])
+
+
+def step_overrides(optimizer: Sequence[str], steps: int, scenes: int) -> list[str]:
+    """A run of ``scenes`` scenes a step and device."""
+    return [*optimizer, f"trainer.max_steps={steps}", f"data.max_images={2 * scenes}", "data.train_scenes=6"]
+
+
+def equal_steps(folder: Path, cache: Path, optimizer: Sequence[str], steps: int) -> dict[str, Any]:
+    return trained(tiny_run(folder, cache, *RANKS, *step_overrides(optimizer, steps, scenes=1)))
+
+
+def empty_rank(folder: Path, cache: Path) -> dict[str, Any]:
+    """Rank 1 gets scenes without depth, views or anything to see, rank 0 good ones; views and voxels differ."""
+    run = tiny_run(folder, cache, *RANKS, "data.train_scenes=3")
+    batches = first_batches(run, 1) * len(EMPTY)
+    if run.trainer.global_rank == 1:
+        batches = [SCENES[name](batch) for name, batch in zip(EMPTY, batches, strict=True)]
+    audit = fit(run, batches)
+    audit.assert_sound()
+    return {"weights": weights(run), "steps": run.trainer.global_step, "dropped": audit.skipped}
+
+
+def three_scenes(folder: Path, cache: Path, *overrides: str) -> dict[str, Any]:
+    """Evaluates three scenes, the second of them without depth."""
+    run = tiny_run(folder, cache, "data.eval_scenes=3", *overrides)
+    load = BatchDataset.__getitem__
+
+    def without_depth(dataset: BatchDataset, views: Any) -> Any:
+        batch = load(dataset, views)
+        return SCENES["no depth"](batch) if views[0].scene.endswith("1") else batch
+
+    with patch.object(BatchDataset, "__getitem__", without_depth):
+        return evaluate(run)
+
+
+def one_scene(folder: Path, cache: Path, *overrides: str) -> dict[str, Any]:
+    """Evaluates fewer scenes than there are ranks, in the middle of a training."""
+    run = tiny_run(folder, cache, *overrides, "trainer.max_steps=2", "trainer.val_check_interval=1")
+    run.trainer.fit(run.module, datamodule=run.datamodule)
+    return {name: float(value) for name, value in run.trainer.callback_metrics.items() if name.startswith("eval/")}
+
+
+def broken_loader(folder: Path, cache: Path) -> dict[str, Any]:
+    """The second batch of rank 1 cannot be read."""
+    run = tiny_run(folder, cache, *RANKS, "trainer.max_steps=4")
+    load, calls = BatchDataset.__getitem__, []
+
+    def fails(dataset: BatchDataset, views: Any) -> Any:
+        calls.append(views)
+        if run.trainer.global_rank == 1 and len(calls) == 2:
+            raise DataError("this batch cannot be read")
+        return load(dataset, views)
+
+    with patch.object(BatchDataset, "__getitem__", fails), ending_together(run.trainer):
+        run.trainer.fit(run.module, datamodule=run.datamodule)
+    return {}
+
+
+SCENARIOS: dict[str, Callable[[Path, Path], dict[str, Any]]] = {
+    "sgd": lambda folder, cache: equal_steps(folder, cache, SGD, 4),
+    "sgd_long": lambda folder, cache: equal_steps(folder, cache, SGD, 40),
+    "adamw_long": lambda folder, cache: equal_steps(folder, cache, (), 40),
+    "empty_rank": empty_rank,
+    "three_scenes": lambda folder, cache: three_scenes(folder, cache, *RANKS),
+    "one_scene": lambda folder, cache: one_scene(folder, cache, *RANKS),
+    "broken_loader": broken_loader,
+}
+
+
+def run_on_two_ranks(folder: Path, cache: Path, *names: str, timeout: float = 300) -> list[subprocess.CompletedProcess]:
+    """Runs scenarios after one another; their results are ``FOLDER/<name>-<rank>.pt``.
+
+    Raises:
+        subprocess.TimeoutExpired: if they hang; nothing is left running.
+    """
+    address = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free_port()), "NODE_RANK": "0", "WORLD_SIZE": "2"}
+    command = [sys.executable, "-m", __name__, str(folder), str(cache), *names]
+    errors = [folder / f"errors-{rank}.txt" for rank in range(2)]
+    ranks = [
+        subprocess.Popen(
+            command,
+            env={**os.environ, **address, "LOCAL_RANK": str(rank), "OMP_NUM_THREADS": "1"},
+            cwd=Path(__file__).parents[2],
+            stderr=path.open("w"),
+        )
+        for rank, path in enumerate(errors)
+    ]
+    try:
+        codes = [rank.wait(timeout) for rank in ranks]
+    finally:
+        for rank in ranks:
+            rank.kill()
+    return [
+        subprocess.CompletedProcess(command, code, stderr=path.read_text())
+        for code, path in zip(codes, errors, strict=True)
+    ]
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def main() -> None:
+    folder, cache, *names = sys.argv[1:]
+    for name in names:
+        result = SCENARIOS[name](Path(folder) / name, Path(cache))
+        torch.save(result, Path(folder) / f"{name}-{os.environ['LOCAL_RANK']}.pt")
+
+
+if __name__ == "__main__":
+    main()
