@@ -129,7 +129,7 @@ SCENARIOS: dict[str, Callable[[Path, Path], dict[str, Any]]] = {
 }
 
 
-def run_on_two_ranks(folder: Path, cache: Path, *names: str, timeout: float = 300) -> list[subprocess.CompletedProcess]:
+def run_on_two_ranks(folder: Path, cache: Path, *names: str, timeout: float = 900) -> list[subprocess.CompletedProcess]:
     """Runs scenarios after one another; their results are ``FOLDER/<name>-<rank>.pt``.
 
     Raises:
