@@ -20,6 +20,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from vg2gt.data.datamodule import SceneDataModule
 from vg2gt.evaluation.options import EvaluationOptions
+from vg2gt.evaluation.run import view_counts
 from vg2gt.evaluation.views import make_index
 from vg2gt.io.files import write_text
 from vg2gt.paths import config_dir
@@ -47,7 +48,7 @@ def write_views(arguments: Sequence[str]) -> Path:
         raise ValueError(str(error)) from error
     source = datamodule.evaluation_data().source
     scenes = list(source.scenes)[: datamodule.eval_scenes]
-    index = make_index(options.selection, source, scenes, list(config.views))
+    index = make_index(options.selection, source, scenes, view_counts(config.views))
     # One line a list of frames: readable, and a change of one draw is a change of one line.
     text = re.sub(r"\[[^\[\]{}]*\]", lambda found: re.sub(r"\s+", " ", found[0]), json.dumps(index, indent=1))
     return write_text(out[0], text.replace("[ ", "[").replace(" ]", "]") + "\n")

@@ -184,12 +184,13 @@ def test_what_the_weights_before_were_trained_on_is_refused(tmp_path: Path, cach
     later = tmp_path / "later"
     shutil.copytree(trained, later)
     for key, start in (("init_from", trained / "checkpoints" / "step-2.ckpt"), ("ckpt", trained)):
-        config = OmegaConf.load(trained / "config.yaml")
+        config = read_run_config(trained / "config.yaml")
         config.data.train.first_seed = 500
         config[key] = str(start)
         OmegaConf.save(config, later / "config.yaml")
         with pytest.raises(DataError, match="scene room-000000 is used for training and for evaluation"):
             run(tmp_path / "out", cache, f"ckpt={later}", "data.val.first_seed=0")
+    config = read_run_config(trained / "config.yaml")
     config.ckpt = str(tmp_path / "gone.ckpt")
     OmegaConf.save(config, later / "config.yaml")
     run(tmp_path / "out", cache, f"ckpt={later}", "data.eval_scenes=1")

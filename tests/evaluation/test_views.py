@@ -155,6 +155,10 @@ def test_dtus_index_is_what_its_49_frames_give() -> None:
 def test_the_commands_errors(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"out=FILE\.json"):
         write_views(["evaluation=synthetic"])
+    with pytest.raises(ValueError, match="give numbers of input views"):
+        write_views([f"out={tmp_path / 'x.json'}", "views=null"])
+    one = write_views([f"out={tmp_path / 'one.json'}", "views=3", "data.eval_scenes=1"])
+    assert list(read_index(str(one))["room-1000000"]) == ["3"]
     with pytest.raises(ValueError, match="nonsense"):
         write_views([f"out={tmp_path / 'x.json'}", "evaluation=nonsense"])
 

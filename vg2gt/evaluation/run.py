@@ -66,7 +66,7 @@ def evaluate(config: DictConfig) -> dict[str, Any]:
         ValueError: if an option is wrong or the checkpoint does not fit.
     """
     folder = Path(config.output_dir)
-    counts = _view_counts(config.views)
+    counts = view_counts(config.views)
     options: EvaluationOptions = instantiate(config.evaluation, _convert_="all")
     checkpoint = checkpoint_path(config.ckpt)
     parts = resolve_parts(config, checkpoint)
@@ -115,7 +115,12 @@ def mean_scores(scenes: Mapping[str, Mapping[str, float | None]]) -> dict[str, f
     return means
 
 
-def _view_counts(views: Any) -> list[int]:
+def view_counts(views: Any) -> list[int]:
+    """The numbers of input views that ``views`` asks for, in order.
+
+    Raises:
+        ValueError: if it is no number or list of numbers.
+    """
     counts = list(views) if isinstance(views, Sequence) else [views]
     if not counts or not all(type(count) is int and count > 0 for count in counts):
         raise ValueError(f"views={views}: give numbers of input views, such as 'views=[3,10,20]'")
