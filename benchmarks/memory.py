@@ -75,7 +75,7 @@ class Point:
 MODELS = {
     "tiny": Model((112, 112), (), (2, 4, 8, 16), (1_000, 10_000, 50_000), (1, 4, 8)),
     "paper": Model(
-        (112, 224), ("backend=da3_small", "backend.pretrained=false", "model=vg2gt"), (2, 4, 8), (1_000, 10_000), (1, 4)
+        (112, 224), ("backend=da3_small", "backend.pretrained=false", "model=vg2gt"), (2, 4), (1_000,), (1, 4)
     ),
 }
 
@@ -194,7 +194,8 @@ def main() -> None:
     if device.type == "cpu":  # what is imported and compiled once is no part of any point
         for mode in arguments.modes:
             measure(MODELS["tiny"], Point("views", 2), mode, device)
-    rows: list[dict[str, Any]] = []
+    where, rows = machine(device), []
+    stem = arguments.out / f"{date.today().isoformat()}-memory-{device.type}"
     for name in arguments.models:
         for point in MODELS[name].points():
             row: dict[str, Any] = {"model": name, "varied": point.varied, "views": point.views}
@@ -203,12 +204,10 @@ def main() -> None:
                 row[mode] = run(MODELS[name], point, mode, device)
             rows.append(row)
             print(row, flush=True)
-    where = machine(device)
-    stem = arguments.out / f"{date.today().isoformat()}-memory-{device.type}"
-    write_json(f"{stem}.json", {"machine": where, "unit": "MiB", "threads": 1, "points": rows})
-    text = markdown(rows, where)
-    print(text)
-    print(write_text(f"{stem}.md", text))
+            write_json(f"{stem}.json", {"machine": where, "unit": "MiB", "threads": 1, "points": rows})
+            write_text(f"{stem}.md", markdown(rows, where))
+    print(markdown(rows, where))
+    print(f"{stem}.json, {stem}.md")
 
 
 if __name__ == "__main__":
