@@ -166,17 +166,15 @@ def beside(good: Batch, other: Batch) -> Batch:
     """Two scenes in one batch; the other alone where its views differ in number."""
     if good.images.shape != other.images.shape or good.num_context != other.num_context:
         return other
-    cameras = (
-        torch.cat(pair)
-        for pair in (
-            (good.cameras.world_to_camera, other.cameras.world_to_camera),
-            (good.cameras.intrinsics, other.cameras.intrinsics),
-        )
+    cameras = Cameras(
+        torch.cat((good.cameras.world_to_camera, other.cameras.world_to_camera)),
+        torch.cat((good.cameras.intrinsics, other.cameras.intrinsics)),
+        good.cameras.size,
     )
     return Batch(
         images=torch.cat((good.images, other.images)),
         depth=torch.cat((good.depth, other.depth)),
-        cameras=Cameras(*cameras, good.cameras.size),
+        cameras=cameras,
         is_metric=torch.cat((good.is_metric, other.is_metric)),
         frame_ids=torch.cat((good.frame_ids, other.frame_ids)),
         scene=(*good.scene, *other.scene),

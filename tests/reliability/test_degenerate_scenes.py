@@ -57,7 +57,7 @@ def check_training(
     assert not audit.skipped[-1]
 
 
-@pytest.mark.parametrize("overrides", [FULL, ABLATIONS[0], *BASELINES], ids=" ".join)
+@pytest.mark.parametrize("overrides", [FULL, BASELINES[1]], ids=" ".join)
 def test_degenerate_scenes_do_no_harm(
     overrides: tuple[str, ...], tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -87,16 +87,15 @@ def check_evaluation(overrides: tuple[str, ...], folder: Path, cache: Path, patc
         evaluated(run.module.model, run.module.renderer, mutate(good.map(Tensor.clone)))
 
 
-@pytest.mark.parametrize("overrides", [FULL, ("model=pointcloud",)], ids=" ".join)
-def test_degenerate_scenes_can_be_evaluated(
-    overrides: tuple[str, ...], tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    check_evaluation(overrides, tmp_path, cache, monkeypatch)
+def test_degenerate_scenes_can_be_evaluated(tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    check_evaluation(FULL, tmp_path, cache, monkeypatch)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "overrides", [*ABLATIONS, *BASELINES, *OPTIONS, ("model=pointcloud", "model.spacing=neighbors")], ids=" ".join
+    "overrides",
+    [*ABLATIONS, *BASELINES, *OPTIONS, ("model=pointcloud",), ("model=pointcloud", "model.spacing=neighbors")],
+    ids=" ".join,
 )
 def test_degenerate_scenes_can_be_evaluated_by_every_model(
     overrides: tuple[str, ...], tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
@@ -160,7 +159,7 @@ def test_far_points_of_two_scenes_can_be_numbered(overrides: tuple[str, ...], tm
 
 
 def test_mutated_scenes_do_no_harm(tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    check_random_scenes(0, 40, tmp_path, cache, monkeypatch)
+    check_random_scenes(0, 30, tmp_path, cache, monkeypatch)
 
 
 @pytest.mark.slow
