@@ -1,5 +1,6 @@
 """The ablation study at the size of a test: a full model of two steps, continuations of one."""
 
+import gc
 import json
 import re
 import shutil
@@ -13,6 +14,8 @@ import vg2gt.study
 from tests.training_helpers import SMALL
 from vg2gt.ablate import CONTROL, FULL, OUR_COLUMNS, PAPER_COLUMNS, Ablation, _verdict, common_overrides, continuations
 from vg2gt.checkpoints import AtomicCheckpointIO, newest_valid, read_checkpoint
+from vg2gt.lightning_module import VG2GTModule
+from vg2gt.study import run_once
 
 ROOT = Path(__file__).resolve().parents[1]
 QUIET = [override for override in SMALL if not override.startswith("trainer.max_steps")]
@@ -170,6 +173,16 @@ def test_splits_are_compared_with_the_control(tmp_path: Path, cache: Path) -> No
     assert "| w/o Split | -1.00 ± 0.02 (worse) |" in against_full
     assert "| w/o Split | +0.00 ± 0.02 (not told apart) |" in against_control
     assert "| VG²GT (full) |" not in against_control
+
+
+def test_a_finished_run_leaves_the_memory(tmp_path: Path, cache: Path) -> None:
+    def alive() -> int:
+        return sum(isinstance(thing, VG2GTModule) for thing in gc.get_objects())
+
+    gc.collect()
+    before = alive()
+    run_once([*SMALL, "trainer.max_steps=1", f"data.cache_dir={cache}"], tmp_path)
+    assert alive() == before
 
 
 def test_verdicts() -> None:

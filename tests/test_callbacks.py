@@ -88,3 +88,9 @@ def test_sigterm_saves_without_another_evaluation(tmp_path: Path, cache: Path) -
     run.trainer.fit(run.module, datamodule=run.datamodule)
     assert newest_valid(tmp_path / "checkpoints").name == "step-3.ckpt"
     assert stopped.evaluations == 0
+
+
+def test_signals_are_as_before_the_run(tmp_path: Path, cache: Path) -> None:
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGUSR1)}
+    train(small_config(tmp_path, cache, *RUN, "trainer.max_steps=1"))
+    assert {number: signal.getsignal(number) for number in before} == before

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import hashlib
 import logging
 import math
@@ -67,6 +68,7 @@ def run_once(overrides: Sequence[str], folder: Path) -> Metrics:
         return read_json(result)["trained"]
     config.ckpt = "auto"
     report = train(config) if config.trainer.max_steps else _only_evaluate(config, folder)
+    gc.collect()  # trainer, module and data refer to each other: without it every run's frames stay until much later
     if not report:
         log.warning("interrupted in %s; the same command goes on from there", folder)
         raise SystemExit(INTERRUPTED)
