@@ -23,6 +23,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from vg2gt.checkpoints import AtomicCheckpointIO, read_checkpoint
+from vg2gt.cli.errors import said_in_one_line
 from vg2gt.evaluation.paper import tables
 from vg2gt.io.files import write_json, write_text
 from vg2gt.paths import config_dir
@@ -324,14 +325,24 @@ def common_overrides(overrides: Sequence[str]) -> list[str]:
 
 @hydra.main(version_base="1.3", config_path=config_dir(), config_name="ablate")
 def main(config: DictConfig) -> None:
-    """Composes the study and runs it."""
+    """Composes the study and runs it; what the user can mend is said in one line."""
+    with said_in_one_line():
+        study = _study(config)
+        study.run()
+    print(study.report())
+    print(f"metrics: {study.folder / 'metrics.json'}")
+    if study.diverged:
+        raise SystemExit(f"diverged, not in the tables: {'; '.join(study.diverged)}")
+
+
+def _study(config: DictConfig) -> Ablation:
     if "gaussians" not in config.model or "splits" not in config.model.gaussians:
         raise ValueError("ablations need a model with splits: model=tiny or model=vg2gt")
     if config.trainer.devices != 1:
         raise ValueError(
             f"trainer.devices={config.trainer.devices}: a study runs its trainings one after another on one device"
         )
-    study = Ablation(
+    return Ablation(
         Path(config.output_dir),
         common_overrides(HydraConfig.get().overrides.task),
         config.seeds,
@@ -340,11 +351,6 @@ def main(config: DictConfig) -> None:
         list(config.variants),
         list(config.splits),
     )
-    study.run()
-    print(study.report())
-    print(f"metrics: {study.folder / 'metrics.json'}")
-    if study.diverged:
-        raise SystemExit(f"diverged, not in the tables: {'; '.join(study.diverged)}")
 
 
 if __name__ == "__main__":
