@@ -27,7 +27,7 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def study(folder: Path, cache: Path, *overrides: str, steps: int = 1, splits: tuple[int, ...] = (1, 2)) -> Ablation:
-    return Ablation(folder, [*QUIET, f"data.cache_dir={cache}", *overrides], 1, 2, steps, ["wo_split"], splits)
+    return Ablation(folder, [*QUIET, f"data.cache_dir={cache}", *overrides], 1, 2, steps, 1e-4, ["wo_split"], splits)
 
 
 @pytest.fixture(scope="module")

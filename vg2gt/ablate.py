@@ -41,7 +41,7 @@ from vg2gt.study import (
 
 log = logging.getLogger(__name__)
 
-OWN_KEYS = ("name", "seeds", "full_steps", "steps", "variants", "splits")
+OWN_KEYS = ("name", "seeds", "full_steps", "steps", "lr", "variants", "splits")
 SETTLED_KEYS = ("seed", "ckpt", "init_from", "overwrite", "output_dir", "ablation", "trainer.max_steps")
 CONTINUATION_SEED = 1000  # the continuation's batches are not the first ones of the full model's training
 FULL, CONTROL = "full", "new_last_layer"
@@ -113,6 +113,7 @@ class Ablation:
         seeds: repetitions.
         full_steps: training of the full model.
         steps: of every continuation.
+        lr: initial learning rate of every continuation.
         variants: options of the group ``ablation``.
         splits: numbers of Gaussians a voxel.
     """
@@ -124,6 +125,7 @@ class Ablation:
         seeds: int,
         full_steps: int,
         steps: int,
+        lr: float,
         variants: Sequence[str],
         splits: Sequence[int],
     ) -> None:
@@ -132,6 +134,7 @@ class Ablation:
         self.seeds = seeds
         self.full_steps = full_steps
         self.steps = steps
+        self.lr = lr
         self.variants = list(variants)
         self.splits = list(splits)
         self.full_splits = int(compose_run(self.overrides, folder).model.gaussians.splits)
@@ -166,7 +169,7 @@ class Ablation:
         if run.new_last_layer:
             start = _without_last_layer(start, home / "start" / "without_last_layer.ckpt")
         overrides = [*self.overrides, *run.overrides, f"seed={CONTINUATION_SEED + seed}"]
-        overrides += [f"trainer.max_steps={self.steps}", f"init_from={quoted(start)}"]
+        overrides += [f"trainer.max_steps={self.steps}", f"optimizer.lr={self.lr}", f"init_from={quoted(start)}"]
         return run_once(overrides, home / run.name.replace("=", "-"))
 
     def write(self) -> None:
@@ -175,6 +178,7 @@ class Ablation:
             "seeds": self.seeds,
             "full_steps": self.full_steps,
             "steps": self.steps,
+            "lr": self.lr,
             "overrides": self.overrides,
             "diverged": self.diverged,
             "runs": {name: {str(seed): m for seed, m in runs.items()} for name, runs in self.results.items()},
@@ -221,7 +225,7 @@ class Ablation:
         diverged = f" Diverged: {'; '.join(self.diverged)}." if self.diverged else ""
         return (
             f"Full model {self.full_steps} steps, then every row (the full model as well) {self.steps} steps more from "
-            f"it, with the same batches. {done} of {self.seeds} seeds complete;{diverged} mean ± 95 % confidence "
+            f"it, at a learning rate of {self.lr:g}, with the same batches. {done} of {self.seeds} seeds complete;{diverged} mean ± 95 % confidence "
             "interval over seeds (Student's t; none for one seed). Seeds differ in weights and training batches; all "
             "see the same held-out scenes, so the intervals say nothing of other scenes. Every difference is judged by "
             "itself: of twenty true zeros one is called better or worse. Views never trained on, at ground-truth "
@@ -348,6 +352,7 @@ def _study(config: DictConfig) -> Ablation:
         config.seeds,
         config.full_steps,
         config.steps,
+        config.lr,
         list(config.variants),
         list(config.splits),
     )
