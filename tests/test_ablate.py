@@ -124,7 +124,7 @@ def test_results_of_another_full_model_are_not_taken(finished: Path, cache: Path
     folder = tmp_path / "copy"
     shutil.copytree(finished, folder)
     shutil.rmtree(folder / "seed-0" / "start")
-    longer = Ablation(folder, [*QUIET, f"data.cache_dir={cache}"], 1, 3, 1, ["wo_split"], (1, 2))
+    longer = Ablation(folder, [*QUIET, f"data.cache_dir={cache}"], 1, 3, 1, 1e-4, ["wo_split"], (1, 2))
     with pytest.raises(ValueError, match=r"full holds a run that started from other weights"):
         longer.run()
     assert longer.results[FULL] == {}
