@@ -9,13 +9,13 @@ from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
-from zipfile import ZIP_STORED
 
 import torch
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 from torch import Tensor, nn
 
 from vg2gt.io.files import flush_folder, flush_to_disk
+from vg2gt.io.tensors import refuse_foreign
 
 log = logging.getLogger(__name__)
 
@@ -64,6 +64,7 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     if not path.is_file():
         raise FileNotFoundError(f"no checkpoint at {path}")
     try:
+        refuse_foreign(path)
         _verify_checksums(path)
         content = torch.load(path, map_location="cpu", weights_only=True)
         if not isinstance(content, dict):
@@ -76,9 +77,7 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
 def _verify_checksums(path: Path) -> None:
     """torch.load does not compare the checksums in its files: flipped bits would become weights."""
     with zipfile.ZipFile(path) as archive:
-        # Packed entries are never written; unpacking one might fill the memory.
-        wrong = next((entry.filename for entry in archive.infolist() if entry.compress_type != ZIP_STORED), None)
-        wrong = wrong or archive.testzip()
+        wrong = archive.testzip()
     if wrong is not None:
         raise ValueError(f"wrong checksum of {wrong}")
 

@@ -62,6 +62,7 @@ def test_a_wrong_option_is_one_line(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "vg2gt.evaluate", "evaluation.alignment=affine"]
     run = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=120, check=False)
     assert run.returncode != 0
-    assert run.stderr.strip() == (
-        "ValueError: evaluation.alignment='affine': choose one of median, scene, wmed, scale_shift, none"
-    )
+    assert run.stderr.strip().splitlines() == [
+        "ValueError: evaluation.alignment='affine': choose one of median, scene, wmed, scale_shift, none",
+        "(HYDRA_FULL_ERROR=1 shows where)",
+    ]

@@ -115,9 +115,6 @@ def test_zip_files_of_torch(tmp_path: Path, name: str) -> None:
         (tmp_path / "inner" / file).write_bytes(ZIPS[name](buffer.getvalue()))
     read = {"model.pt": read_tensors, "step-1.ckpt": read_checkpoint}
     for file, reader in read.items():
-        if name in ("parent folder", "absolute"):  # names of members are labels, nothing is extracted
-            assert torch.equal(reader(tmp_path / "inner" / file)["w"], torch.arange(99.0))
-            continue
         with pytest.raises(ValueError, match=file):
             reader(tmp_path / "inner" / file)
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["inner", "model.pt", "step-1.ckpt"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zipfile
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import torch
@@ -23,7 +23,7 @@ def read_torch(path: str | Path) -> Any:
     """
     path = Path(path)
     try:
-        _refuse_foreign(path)
+        refuse_foreign(path)
         return torch.load(path, map_location="cpu", weights_only=True)
     except (FileNotFoundError, FormatError):
         raise
@@ -51,13 +51,22 @@ def read_tensors(path: str | Path) -> dict[str, Tensor]:
         raise FormatError(f"{path} is damaged or no safetensors file: {error}") from error
 
 
-def _refuse_foreign(path: Path) -> None:
-    """A compressed archive could unpack to a thousand times its size; one of TorchScript holds programs."""
+def refuse_foreign(path: Path) -> None:
+    """Refuses archives that ``torch.save`` never writes.
+
+    A compressed one could unpack to a thousand times its size, names that lead out of the archive have no use in it,
+    and one of TorchScript holds programs.
+
+    Raises:
+        FormatError: naming what is in it.
+    """
     if not zipfile.is_zipfile(path):
         return
     with zipfile.ZipFile(path) as archive:
         for member in archive.infolist():
             if member.compress_type != zipfile.ZIP_STORED or member.file_size > member.compress_size:
                 raise FormatError(f"{path} is no file of torch.save: {member.filename} in it is compressed")
+            if member.filename.startswith("/") or ".." in PurePosixPath(member.filename).parts:
+                raise FormatError(f"{path} is no file of torch.save: {member.filename} in it leads out of the file")
             if member.filename.endswith("/constants.pkl"):
                 raise FormatError(f"{path} holds programs besides tensors (TorchScript): export the bare state dict")
