@@ -95,6 +95,9 @@ class OracleBackend(Backend):
         self.mixing = nn.Parameter(mixing)
         self.readout = nn.Parameter(readout)
         self.freeze()
+        # Not the weights' own digest: the last bits of a QR decomposition depend on the machine and its threads.
+        made_of = f"oracle {patch_size} {dim} {taps} {seed}"
+        self._identity = {"name": self.name, "weights": hashlib.sha256(made_of.encode()).hexdigest()}
 
     @torch.no_grad()
     def encode(self, images: Tensor, hints: Hints | None = None) -> Tokens:

@@ -176,6 +176,19 @@ def test_construction_leaves_the_global_generator_alone() -> None:
     assert first.identity() != OracleBackend(seed=1).identity()
 
 
+def test_identity_does_not_depend_on_threads() -> None:
+    """A checkpoint trained with two threads is read with one, though the last bits of the weights may differ."""
+    threads = torch.get_num_threads()
+    try:
+        identities = []
+        for count in (1, 2):
+            torch.set_num_threads(count)
+            identities.append(OracleBackend().identity())
+    finally:
+        torch.set_num_threads(threads)
+    assert identities[0] == identities[1]
+
+
 @pytest.mark.parametrize("name", ["depth", "cameras", "frame_ids"])
 def test_each_missing_hint_is_named(make_scene, name: str) -> None:
     images, hints = make_scene(1, 2, SIZE)
