@@ -35,7 +35,7 @@ from backends.bundle import (
 from backends.da3 import DA3Backend
 from backends.onnx import open_session, run_session
 from backends.vggt import VGGTBackend
-from vg2gt.paths import config_dir
+from vg2gt.config import config_dir
 from vg2gt.types import Cameras, Hints, Tokens
 
 Exportable = VGGTBackend | DA3Backend

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from backends.base import Backend, full_precision, seeded_initialisation
-from backends.vit import Block, PatchEmbed
+from backends.vit import PatchEmbed, ViTBlock
 from vg2gt.geometry.cameras import invert_rigid, relative_to_first, unproject
 from vg2gt.geometry.rotations import quat_to_matrix
 from vg2gt.types import Cameras, Geometry, Hints, Tokens
@@ -88,7 +88,7 @@ class OracleBackend(Backend):
         image_dim = dim - GEOMETRY_CHANNELS
         with seeded_initialisation(seed):
             self.patch_embed = PatchEmbed(patch_size, image_dim)
-            self.blocks = nn.ModuleList(Block(image_dim, 4) for _ in range(taps))
+            self.blocks = nn.ModuleList(ViTBlock(image_dim, 4) for _ in range(taps))
             self.camera_projection = nn.Linear(16 + 4, dim)
             mixing = torch.stack([torch.linalg.qr(torch.randn(dim, dim))[0] for _ in range(taps)])
             readout = torch.randn(taps, dim, CELLS * CELLS) / math.sqrt(dim / taps)

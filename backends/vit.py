@@ -79,7 +79,7 @@ class LayerScale(nn.Module):
         return x * self.gamma
 
 
-class Block(nn.Module):
+class ViTBlock(nn.Module):
     """Pre-norm transformer block: attention, then feed-forward, each scaled and added.
 
     Args:

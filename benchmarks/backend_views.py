@@ -32,8 +32,8 @@ from rich.table import Table
 
 from backends.base import Backend
 from vg2gt import __version__
+from vg2gt.config import config_dir
 from vg2gt.io.files import write_json
-from vg2gt.paths import config_dir
 from vg2gt.types import Hints, Tokens
 
 MEGABYTE = 1e6

@@ -18,12 +18,12 @@ import torch
 from machine import machine
 from stage_clock import StageClock
 
-from vg2gt.checkpoints import read_checkpoint
+from vg2gt.evaluation.protocols import ground_truth_target_cameras
 from vg2gt.io.files import write_json, write_text
 from vg2gt.io.images import colorize_depth, grid, write_png
-from vg2gt.protocols import ground_truth_target_cameras
-from vg2gt.study import Metrics, compose_run, final_checkpoint, markdown, over_seeds, run_once, summarize
-from vg2gt.training import Run, build
+from vg2gt.runs.checkpoints import read_checkpoint
+from vg2gt.studies.study import Metrics, compose_run, final_checkpoint, markdown, over_seeds, run_once, summarize
+from vg2gt.training.loop import Run, build
 from vg2gt.types import Batch
 
 DEFAULTS = {"name": "baselines", "steps": "400", "seeds": "1"}

@@ -27,13 +27,13 @@ from PIL import Image
 from rich.console import Console
 from rich.table import Table
 
+from vg2gt.config import config_dir
 from vg2gt.data import RGBDFolder
-from vg2gt.data.sampling import ViewSampler
 from vg2gt.data.shards import Encoding, write_shards
 from vg2gt.data.synthetic.export import SceneSettings, missing_scenes, write_scenes
+from vg2gt.data.views.sampling import ViewSampler
 from vg2gt.io.files import write_json
-from vg2gt.paths import config_dir
-from vg2gt.training import build
+from vg2gt.training.loop import build
 from vg2gt.types import Batch
 
 SIZE, STEP_SIZE, STORED, VIEWS = (224, 448), (112, 224), (480, 640), 8

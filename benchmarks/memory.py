@@ -30,7 +30,7 @@ from machine import machine
 from stages import Case, prepare
 
 from vg2gt.io.files import write_json, write_text
-from vg2gt.training import Run
+from vg2gt.training.loop import Run
 from vg2gt.types import Batch
 
 MIB = 2**20

@@ -27,7 +27,7 @@ from rich.table import Table
 from stage_clock import StageClock
 
 from vg2gt.io.files import write_json
-from vg2gt.study import compose_run
+from vg2gt.studies.study import compose_run
 from vg2gt.types import Batch
 from vg2gt.voxels.grid import scene_voxel_size
 

@@ -4,17 +4,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
-from unittest import mock
 
 import torch
 
-MARKED = (
-    "vg2gt.model",
-    "vg2gt.baselines.pixels",
-    "vg2gt.baselines.pointcloud",
-)
+from vg2gt.profiling import listening
 
 
 @dataclass
@@ -50,7 +45,7 @@ class StageClock:
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
         """Measures what happens inside the block; on a GPU with events, after the device has done what came before."""
-        passes = self.stages.setdefault(name.removeprefix("vg2gt/"), Passes())
+        passes = self.stages.setdefault(name, Passes())
         if self.device.type != "cuda":
             begin = time.process_time()
             yield
@@ -69,10 +64,6 @@ class StageClock:
         passes.seconds.append(begin.elapsed_time(end) / 1e3)
         passes.peak_mb.append((torch.cuda.max_memory_allocated(self.device) - before) / 1e6)
 
-    @contextmanager
-    def listening(self) -> Iterator[None]:
+    def listening(self) -> AbstractContextManager[None]:
         """Takes the marks of the models inside the block."""
-        with ExitStack() as stack:
-            for module in MARKED:
-                stack.enter_context(mock.patch(f"{module}.record_function", self.stage))
-            yield
+        return listening(self.stage)

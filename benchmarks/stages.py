@@ -30,9 +30,9 @@ from stage_clock import StageClock
 
 from vg2gt.evaluation.paper import tables
 from vg2gt.io.files import write_json
-from vg2gt.schedule import weight_decay_groups
-from vg2gt.study import compose_run
-from vg2gt.training import Run, build
+from vg2gt.studies.study import compose_run
+from vg2gt.training.loop import Run, build
+from vg2gt.training.schedule import weight_decay_groups
 from vg2gt.types import Batch
 
 STAGES = {

@@ -19,9 +19,9 @@ from machine import machine
 from rich.console import Console
 from rich.table import Table
 
+from vg2gt.config import config_dir
 from vg2gt.io.files import write_json
-from vg2gt.paths import config_dir
-from vg2gt.training import build
+from vg2gt.training.loop import build
 
 STAGES = {
     "backbone (encode)": "vg2gt/encode",

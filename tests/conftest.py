@@ -7,7 +7,7 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
 from backends.export import export
-from vg2gt.paths import config_dir
+from vg2gt.config import config_dir
 
 SHALLOW = ["+backend=da3_tiny", "backend.depth=4", "backend.multiview_from=1", "backend.taps=[0,1,2,3]"]
 

@@ -12,9 +12,9 @@ from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from tests.training_helpers import full_model
+from vg2gt.config import config_dir
 from vg2gt.losses import VG2GTLoss
-from vg2gt.paths import config_dir
-from vg2gt.training import build
+from vg2gt.training.loop import build
 
 CONFIGS = Path(config_dir())
 OPTIONAL_PACKAGES = {"wandb": "wandb", "tensorboard": "tensorboard"}

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from vg2gt.paths import config_dir
+from vg2gt.config import config_dir
 
 ROOT = Path(__file__).resolve().parents[1]
 TEXT = (ROOT / "docs" / "reproduce.md").read_text()
@@ -16,7 +16,7 @@ TEXT = (ROOT / "docs" / "reproduce.md").read_text()
 def test_modules_and_scripts_exist() -> None:
     modules = set(re.findall(r"python -m ([\w.]+)", TEXT))
     scripts = set(re.findall(r"python ([\w/]+\.py)", TEXT))
-    assert {"vg2gt.evaluate", "vg2gt.ablate", "vg2gt.curves"} <= modules
+    assert {"vg2gt.evaluate", "vg2gt.studies.ablation", "vg2gt.studies.curves"} <= modules
     assert {"benchmarks/baselines.py", "benchmarks/primitives.py", "benchmarks/stages.py"} <= scripts
     for module in modules:
         path = ROOT / module.replace(".", "/")
@@ -35,7 +35,7 @@ def test_presets_and_files_exist() -> None:
         assert (ROOT / path).exists(), path
 
 
-@pytest.mark.parametrize("module", ["vg2gt.curves", "vg2gt.ablate"])
+@pytest.mark.parametrize("module", ["vg2gt.studies.curves", "vg2gt.studies.ablation"])
 def test_commands_explain_themselves(module: str, tmp_path: Path) -> None:
     command = [sys.executable, "-m", module, "--help"]
     shown = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)

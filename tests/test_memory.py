@@ -10,6 +10,7 @@ import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
+from vg2gt.config import config_dir
 from vg2gt.gaussians import GaussianHead
 from vg2gt.memory import (
     EVALUATION,
@@ -21,9 +22,8 @@ from vg2gt.memory import (
     memory_advice,
     note_sizes,
 )
-from vg2gt.paths import config_dir
-from vg2gt.study import compose_run
-from vg2gt.training import train
+from vg2gt.studies.study import compose_run
+from vg2gt.training.loop import train
 from vg2gt.types import Voxels
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -217,11 +217,11 @@ SCRIPT = """
 import resource, sys
 import torch
 from pathlib import Path
-from vg2gt.study import compose_run
-from vg2gt.training import train
+from vg2gt.studies.study import compose_run
+from vg2gt.training.loop import train
 torch.set_num_threads(1)
 config = compose_run(sys.argv[2:], Path(sys.argv[1]))
-import vg2gt.lightning_module as module
+import vg2gt.training.module as module
 
 def limited(self, batch, *_):
     pages = int(Path("/proc/self/statm").read_text().split()[0])

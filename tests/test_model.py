@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from tests.training_helpers import full_model, small_config
+from vg2gt.evaluation.protocols import ground_truth_target_cameras, training_cameras
 from vg2gt.losses import VG2GTLoss
 from vg2gt.model import VG2GT, SceneScale
-from vg2gt.protocols import ground_truth_target_cameras, training_cameras
-from vg2gt.training import Run, build
+from vg2gt.training.loop import Run, build
 from vg2gt.types import Batch
 
 

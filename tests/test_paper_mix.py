@@ -11,8 +11,8 @@ from tests.data.sources import layout_kitti
 from tests.data.sources.layout_infinigen import LAYOUTS as INFINIGEN
 from tests.data.sources.layout_scannet import write_export
 from tests.data.sources.layouts import room
-from vg2gt.paths import config_dir
-from vg2gt.training import build, train
+from vg2gt.config import config_dir
+from vg2gt.training.loop import build, train
 
 TINY = [
     "backend=oracle",

@@ -7,9 +7,9 @@ import lightning
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, open_dict
 
+from vg2gt.config import config_dir
 from vg2gt.model import VG2GT
-from vg2gt.paths import config_dir
-from vg2gt.training import Run
+from vg2gt.training.loop import Run
 
 SMALL = [
     "data.image_size=[56,112]",

@@ -7,12 +7,19 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from vg2gt.model import VG2GT
-    from vg2gt.reconstruction import Scene, reconstruct
+    from vg2gt.reconstruction import Scene, reconstruct, reconstruct_with
+    from vg2gt.runs.models import load_model
 
-__all__ = ["VG2GT", "Scene", "reconstruct"]
+__all__ = ["VG2GT", "Scene", "load_model", "reconstruct", "reconstruct_with"]
 __version__ = "0.1.0"
 
-_HOMES = {"VG2GT": "vg2gt.model", "Scene": "vg2gt.reconstruction", "reconstruct": "vg2gt.reconstruction"}
+_HOMES = {
+    "VG2GT": "vg2gt.model",
+    "load_model": "vg2gt.runs.models",
+    "Scene": "vg2gt.reconstruction",
+    "reconstruct": "vg2gt.reconstruction",
+    "reconstruct_with": "vg2gt.reconstruction",
+}
 
 
 def __getattr__(name: str) -> Any:

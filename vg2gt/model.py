@@ -14,25 +14,22 @@ images -> frozen backbone -> tokens -> frozen heads -> depth, confidence, camera
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor, nn
-from torch.profiler import record_function
 
 from backends.base import Backend
 from vg2gt.geometry.alignment import fit_depth_scale
 from vg2gt.geometry.cameras import relative_to_first, scale_translations
 from vg2gt.memory import note_sizes
+from vg2gt.profiling import stage
 from vg2gt.types import Gaussians, Geometry, Hints, Prediction, Tokens, Voxels
 
-if TYPE_CHECKING:
-    from vg2gt.reconstruction import Scene
-
 ScaleSource = Literal["metric", "focal", "normalize", "groundtruth"]
+BACKBONE_PREFIX = "backend."
 CANONICAL_FOCAL = 300.0  # appendix A.1: d_metric = f * d_net / 300
 
 
@@ -113,32 +110,55 @@ class Reconstructor(nn.Module, ABC):
         """Runs the frozen backbone; returns its tokens, its geometry in the scene frame, and the unit ``[B]``."""
         scenes, views, _, height, width = images.shape
         note_sizes({f"images of {height}x{width} in {scenes} scene{'s' * (scenes > 1)}": scenes * views}, anew=True)
-        with record_function("vg2gt/encode"):
+        with stage("encode"):
             tokens = self.backend.encode(images, hints)
-        with record_function("vg2gt/decode"), torch.no_grad():
+        with stage("decode"), torch.no_grad():
             raw = self.backend.decode(tokens)
         unit = self.scale(raw, hints)
         return tokens, _to_scene_frame(raw, unit), unit
 
-    @staticmethod
-    def from_pretrained(ckpt: str | Path | None = None, backend: str | None = None, **options: Any) -> Reconstructor:
-        """Builds the model of a run, its trained part loaded; see :func:`vg2gt.reconstruction.load_model`."""
-        from vg2gt.reconstruction import load_model
-
-        return load_model(ckpt, backend, **options).model
-
-    def reconstruct(self, images: Any, **options: Any) -> Scene:
-        """Reconstructs a scene from image files, folders, videos or arrays.
-
-        See :func:`vg2gt.reconstruction.reconstruct_with` for ``images`` and the options.
-        """
-        from vg2gt.reconstruction import reconstruct_with
-
-        return reconstruct_with(self, images, **options)
-
     def trained_parameters(self) -> list[nn.Parameter]:
         """The parameters that training changes: everything but the backbone."""
         return [parameter for parameter in self.parameters() if parameter.requires_grad]
+
+    def trained_state(self) -> dict[str, Tensor]:
+        """What a checkpoint holds of the model: the state of everything but the backbone."""
+        return {name: value for name, value in self.state_dict().items() if not name.startswith(BACKBONE_PREFIX)}
+
+    def load_trained(self, state: Mapping[str, Tensor], backend: Mapping[str, Any] | None) -> None:
+        """Loads the trained part, which must be whole; the backbone is never stored.
+
+        Args:
+            state: as :meth:`trained_state` gave it.
+            backend: identity of the backbone it was trained on.
+
+        Raises:
+            ValueError: if it was trained on another backbone, or does not fit this model; nothing is loaded then.
+        """
+        self.check_backend(backend)
+        present = {name: value.shape for name, value in self.trained_state().items()}
+        stored = {name: value.shape for name, value in state.items() if not name.startswith(BACKBONE_PREFIX)}
+        if stored != present:
+            wrong = sorted(name for name in stored.keys() | present.keys() if stored.get(name) != present.get(name))
+            raise ValueError(
+                f"the checkpoint does not fit this model, first in {wrong[0]} (stored {stored.get(wrong[0])}, here "
+                f"{present.get(wrong[0])}): use the model options it was trained with, or init_from= to start from the "
+                "weights that fit"
+            )
+        self.load_state_dict(state, strict=False)
+
+    def check_backend(self, stored: Mapping[str, Any] | None) -> None:
+        """Refuses weights that were trained on another backbone.
+
+        Raises:
+            ValueError: naming both.
+        """
+        present = dict(self.backend.identity())
+        if stored != present:
+            raise ValueError(
+                f"the checkpoint was trained on backbone {stored}, this run uses {present}: choose the same backend= "
+                "and the same weights, or start a new run from it with init_from="
+            )
 
 
 class VG2GT(Reconstructor):
@@ -186,15 +206,15 @@ class VG2GT(Reconstructor):
         tokens, initial, unit = self.read_views(images, hints)
         geometry = initial
         if self.coarse is not None:
-            with record_function("vg2gt/coarse"):
+            with stage("coarse"):
                 tokens = self.coarse(tokens, initial, generator=generator)
-            with record_function("vg2gt/decode_again"):
+            with stage("decode_again"):
                 again = self.backend.decode(tokens)
             # The camera token is untouched, so the cameras are the backbone's: decoded once, used throughout.
             geometry = replace(initial, depth=again.depth * unit[:, None, None, None], depth_conf=again.depth_conf)
-        with record_function("vg2gt/fine"):
+        with stage("fine"):
             voxels: Voxels = self.fine(tokens, geometry, images)
-        with record_function("vg2gt/gaussians"):
+        with stage("gaussians"):
             gaussians: Gaussians = self.gaussians(voxels)
         return Prediction(initial, geometry, voxels, gaussians, unit)
 

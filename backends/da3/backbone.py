@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from backends.positions import resize_position_embedding
 from backends.rope import Rotary, grid_positions, rotary_2d
-from backends.vit import Block, FeedForward, PatchEmbed, first_and_others
+from backends.vit import FeedForward, PatchEmbed, ViTBlock, first_and_others
 
 ReferenceView = Literal["first", "middle", "saddle_balanced"]
 MIN_VIEWS_TO_CHOOSE = 3
@@ -53,7 +53,7 @@ class Backbone(nn.Module):
         self.pos_embed = nn.Parameter(torch.zeros(1, (image_size // patch_size) ** 2 + 1, dim).normal_(std=0.02))
         self.patch_embed = PatchEmbed(patch_size, dim)
         self.blocks = nn.ModuleList(
-            Block(dim, num_heads, qk_norm=index >= self.multiview_from, ffn=ffn) for index in range(depth)
+            ViTBlock(dim, num_heads, qk_norm=index >= self.multiview_from, ffn=ffn) for index in range(depth)
         )
         self.norm = nn.LayerNorm(dim, eps=1e-5)
 

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from backends.poses import encode_pose
-from backends.vit import MLP, Block
+from backends.vit import MLP, ViTBlock
 from vg2gt.geometry.cameras import invert_rigid, relative_to_first
 from vg2gt.types import Cameras
 
@@ -35,7 +35,7 @@ class CameraEncoder(nn.Module):
 
     def __init__(self, dim: int, depth: int, num_heads: int) -> None:
         super().__init__()
-        self.trunk = nn.Sequential(*(Block(dim, num_heads, layer_scale=0.01, eps=1e-5) for _ in range(depth)))
+        self.trunk = nn.Sequential(*(ViTBlock(dim, num_heads, layer_scale=0.01, eps=1e-5) for _ in range(depth)))
         self.token_norm = nn.LayerNorm(dim, eps=1e-5)
         self.trunk_norm = nn.LayerNorm(dim, eps=1e-5)
         self.pose_branch = MLP(POSE_DIM, dim // 2, dim)

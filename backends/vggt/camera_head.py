@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from backends.vit import MLP, Block
+from backends.vit import MLP, ViTBlock
 
 ITERATIONS = 4
 POSE_DIM = 9
@@ -24,7 +24,7 @@ class CameraHead(nn.Module):
     def __init__(self, dim: int, depth: int, num_heads: int) -> None:
         super().__init__()
         self.empty_pose_tokens = nn.Parameter(torch.zeros(1, 1, POSE_DIM))
-        self.trunk = nn.ModuleList(Block(dim, num_heads, layer_scale=0.01, eps=1e-5) for _ in range(depth))
+        self.trunk = nn.ModuleList(ViTBlock(dim, num_heads, layer_scale=0.01, eps=1e-5) for _ in range(depth))
         self.token_norm = nn.LayerNorm(dim, eps=1e-5)
         self.trunk_norm = nn.LayerNorm(dim, eps=1e-5)
         self.embed_pose = nn.Linear(POSE_DIM, dim)

@@ -17,7 +17,7 @@ from backends.poses import decode_pose
 from backends.positions import resize_position_embedding
 from backends.rope import grid_positions, rotary_2d
 from backends.vggt.camera_head import CameraHead
-from backends.vit import Block, PatchEmbed, first_and_others
+from backends.vit import PatchEmbed, ViTBlock, first_and_others
 from vg2gt.types import Cameras, Geometry, Tokens
 
 REGISTERS = 4
@@ -32,7 +32,7 @@ class Encoder(nn.Module):
         self.pos_embed = nn.Parameter(torch.zeros(1, (image_size // patch_size) ** 2 + 1, dim).normal_(std=0.02))
         self.register_tokens = nn.Parameter(torch.zeros(1, REGISTERS, dim).normal_(std=0.02))
         self.patch_embed = PatchEmbed(patch_size, dim)
-        self.blocks = nn.ModuleList(Block(dim, num_heads) for _ in range(depth))
+        self.blocks = nn.ModuleList(ViTBlock(dim, num_heads) for _ in range(depth))
         self.norm = nn.LayerNorm(dim, eps=1e-6)
 
     def forward(self, images: Tensor, grid: tuple[int, int]) -> Tensor:
@@ -97,8 +97,8 @@ class Aggregator(nn.Module):
         return tapped, camera
 
 
-def _alternating_block(dim: int, num_heads: int) -> Block:
-    return Block(dim, num_heads, qk_norm=True, layer_scale=0.01, eps=1e-5)
+def _alternating_block(dim: int, num_heads: int) -> ViTBlock:
+    return ViTBlock(dim, num_heads, qk_norm=True, layer_scale=0.01, eps=1e-5)
 
 
 class VGGTDecoder(nn.Module):

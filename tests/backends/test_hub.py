@@ -28,7 +28,7 @@ LOAD = """
 import json, sys, time
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
-from vg2gt.paths import config_dir
+from vg2gt.config import config_dir
 
 time.sleep = lambda seconds: None  # the client's pauses between its attempts to reach the hub
 results = []

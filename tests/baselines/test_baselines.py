@@ -11,14 +11,14 @@ from tests.training_helpers import small_config
 from vg2gt.baselines import PixelAligned, VoxelMerged
 from vg2gt.baselines.pixels import usable_pixels
 from vg2gt.baselines.voxel_merged import merge_by_voxel
-from vg2gt.checkpoints import newest_valid, read_checkpoint
 from vg2gt.evaluation import evaluate_scene
 from vg2gt.geometry.cameras import unproject
 from vg2gt.geometry.rotations import quat_to_matrix
 from vg2gt.geometry.spherical_harmonics import sh_to_rgb
 from vg2gt.model import Reconstructor
 from vg2gt.rendering import Renderer, render
-from vg2gt.training import build, train
+from vg2gt.runs.checkpoints import newest_valid, read_checkpoint
+from vg2gt.training.loop import build, train
 from vg2gt.types import Batch, Gaussians, Hints, Prediction
 
 TRAINED = ["pixel_aligned", "voxel_merged"]

@@ -9,7 +9,7 @@ import torch
 from vg2gt.data import DataError, RGBDFolder, SceneDataModule, SyntheticScenes
 from vg2gt.data.batches import BatchDataset
 from vg2gt.data.framing import Framing
-from vg2gt.data.sampling import SceneViews
+from vg2gt.data.views.sampling import SceneSample
 
 from .conftest import SIZE
 
@@ -28,7 +28,7 @@ def _truncate(folder: Path, *names: str) -> None:
 def test_the_nearest_readable_frame_takes_the_place_of_a_damaged_one(write_recording, caplog):
     folder = write_recording(frames=6)  # frames 10 .. 15
     _truncate(folder, "images/00012.png", "depth/00013.png")
-    views = (SceneViews("office", (12, 10, 13), (15,)),)
+    views = (SceneSample("office", (12, 10, 13), (15,)),)
     dataset = _dataset(folder, replace_damaged=True)
     with caplog.at_level(logging.WARNING):
         batch = dataset[views]
@@ -47,7 +47,7 @@ def test_the_nearest_readable_frame_takes_the_place_of_a_damaged_one(write_recor
     assert dataset[views].frame_ids.tolist() == [[11, 10, 14, 15]]
     assert not caplog.records  # warned once
     others = [_dataset(folder, 0, replace_damaged=True), dataset]
-    others[0][(SceneViews("office", (13, 14)),)]  # another history
+    others[0][(SceneSample("office", (13, 14)),)]  # another history
     assert all(other[views].frame_ids.tolist() == [[11, 10, 14, 15]] for other in others)
 
 
@@ -57,7 +57,7 @@ def test_a_frame_is_decoded_once_a_batch(write_recording, replace_damaged, monke
     decoded = []
     load = RGBDFolder.load
     monkeypatch.setattr(RGBDFolder, "load", lambda self, scene, ids: decoded.extend(ids) or load(self, scene, ids))
-    assert dataset[(SceneViews("office", (12, 10), (15,)),)].num_context == 2
+    assert dataset[(SceneSample("office", (12, 10), (15,)),)].num_context == 2
     assert decoded == [12, 10, 15]
 
 
@@ -65,16 +65,16 @@ def test_evaluation_never_replaces_frames(write_recording):
     folder = write_recording(frames=6)
     _truncate(folder, "images/00012.png")
     with pytest.raises(DataError, match=r"00012\.png of scene office"):
-        _dataset(folder)[(SceneViews("office", (12, 10)),)]
+        _dataset(folder)[(SceneSample("office", (12, 10)),)]
 
 
 def test_a_scene_that_runs_out_of_frames_is_named(write_recording):
     folder = write_recording(frames=4)
     _truncate(folder, "images/00010.png", "images/00012.png")
     dataset = _dataset(folder, replace_damaged=True)
-    assert dataset[(SceneViews("office", (10, 12)),)].frame_ids.tolist() == [[11, 13]]
+    assert dataset[(SceneSample("office", (10, 12)),)].frame_ids.tolist() == [[11, 13]]
     with pytest.raises(DataError, match="scene office has too few readable frames left for a sample of 3"):
-        dataset[(SceneViews("office", (10, 11, 12)),)]
+        dataset[(SceneSample("office", (10, 11, 12)),)]
 
 
 def test_held_out_frames_never_step_in(write_recording):
@@ -82,7 +82,7 @@ def test_held_out_frames_never_step_in(write_recording):
     _truncate(folder, "images/00010.png")
     source = RGBDFolder(str(folder), holdout=3)  # 11 and 14
     dataset = BatchDataset(source, Framing(SIZE).apply, 1, replace_damaged=True)
-    assert dataset[(SceneViews("office", (10,)),)].frame_ids.tolist() == [[12]]
+    assert dataset[(SceneSample("office", (10,)),)].frame_ids.tolist() == [[12]]
 
 
 def test_a_damaged_recording_trains_in_workers_as_without(write_recording):

@@ -9,12 +9,12 @@ import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
+from vg2gt.config import config_dir
 from vg2gt.data import DataError, SceneDataModule, SyntheticScenes
-from vg2gt.data.evaluation_views import EvaluationViews
 from vg2gt.data.frame_cache import FrameCache
 from vg2gt.data.framing import Framing
-from vg2gt.data.sampling import StepSampler
-from vg2gt.paths import config_dir
+from vg2gt.data.views.even import EvaluationViews
+from vg2gt.data.views.sampling import StepSampler
 
 from .conftest import SIZE
 

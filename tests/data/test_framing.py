@@ -5,8 +5,8 @@ import torch
 
 from vg2gt.data import Frames, SceneDataModule, SyntheticScenes
 from vg2gt.data.framing import Framing, FramingSampler
-from vg2gt.data.sampling import StepSampler, ViewSampler
 from vg2gt.data.transforms import pad, reduce_to_cover
+from vg2gt.data.views.sampling import StepSampler, ViewSampler
 from vg2gt.geometry.cameras import ray_directions
 
 from .conftest import SIZE

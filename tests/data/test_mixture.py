@@ -6,7 +6,7 @@ from functools import partial
 import pytest
 
 from vg2gt.data import DataError, Mixture, RGBDFolder, SceneDataModule, SyntheticScenes
-from vg2gt.data.sampling import StepSampler, ViewSampler, usable_scenes
+from vg2gt.data.views.sampling import StepSampler, ViewSampler, usable_scenes
 
 from .conftest import SIZE
 

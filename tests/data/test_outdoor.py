@@ -13,9 +13,9 @@ from vg2gt.data.synthetic.outdoor import SyntheticOutdoor
 from vg2gt.data.synthetic.raycast import FAR, PART_COLUMNS, nearest_hit
 from vg2gt.data.synthetic.renderer import World, render_frame
 from vg2gt.data.synthetic.rooms import SyntheticRoom
-from vg2gt.data.synthetic.scene import draw_highlights, level_poses
+from vg2gt.data.synthetic.synthetic_scene import draw_highlights, level_poses
 from vg2gt.geometry.cameras import ray_directions
-from vg2gt.training import train
+from vg2gt.training.loop import train
 
 from .warping import depth_differences
 

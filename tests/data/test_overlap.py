@@ -8,7 +8,7 @@ from vg2gt.data import DataError, Mixture, SceneSource, SyntheticScenes
 from vg2gt.data.framing import FramingSampler
 from vg2gt.data.overlap import refuse_overlap
 from vg2gt.data.resized_cache import ResizedCache
-from vg2gt.data.sampling import SceneViews
+from vg2gt.data.views.sampling import SceneSample
 
 
 class Scans(SyntheticScenes):
@@ -36,7 +36,7 @@ class OtherReader(Scans):
 
 
 def _check(train: SceneSource, trained: Sequence[str], val: SceneSource, scene: str, target: tuple[int, ...]) -> None:
-    refuse_overlap(train, trained, val, [SceneViews(scene, (0, 1), target)])
+    refuse_overlap(train, trained, val, [SceneSample(scene, (0, 1), target)])
 
 
 def _mixture(**parts: SceneSource) -> Mixture:
@@ -81,6 +81,6 @@ def test_parts_of_one_mixture_are_different_datasets():
 
 def test_held_out_frames_are_listed_once_a_scene():
     train = Scans(1)
-    windows = [SceneViews("scene0000_00", (0,), (frame,)) for frame in (2, 5, 8) * 20]
+    windows = [SceneSample("scene0000_00", (0,), (frame,)) for frame in (2, 5, 8) * 20]
     refuse_overlap(train, train.scenes, OtherReader(1), windows)
     assert train.asked == ["scene0000_00"]

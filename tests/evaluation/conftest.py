@@ -7,8 +7,8 @@ import torch
 
 from tests.training_helpers import small_config
 from vg2gt.evaluation import EvaluationOptions, SceneEvaluator, SceneResult
-from vg2gt.lightning_module import VG2GTModule
-from vg2gt.training import build
+from vg2gt.training.loop import build
+from vg2gt.training.module import VG2GTModule
 from vg2gt.types import Batch
 
 

@@ -9,9 +9,9 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig
 
+from vg2gt.config import config_dir
+from vg2gt.data.views.drawn import index_path
 from vg2gt.evaluation import EvaluationOptions, paper
-from vg2gt.evaluation.views import index_path
-from vg2gt.paths import config_dir
 
 PRESETS = sorted(path.stem for path in (Path(config_dir()) / "evaluation").glob("*.yaml"))
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.training_helpers import small_config
-from vg2gt.training import train
+from vg2gt.training.loop import train
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -13,15 +13,15 @@ from omegaconf import OmegaConf
 
 from tests.evaluation.conftest import evaluate_overrides
 from tests.training_helpers import small_config
+from vg2gt.config import config_dir
 from vg2gt.data.base import DataError, Frames
 from vg2gt.data.synthetic import SyntheticScenes
+from vg2gt.evaluation.evaluator import SceneEvaluator
 from vg2gt.evaluation.run import evaluate
-from vg2gt.evaluation.scene import SceneEvaluator
-from vg2gt.evaluation.settings import checkpoint_path, run_name
 from vg2gt.metrics.lpips import STAGES
-from vg2gt.paths import config_dir
-from vg2gt.training import train
-from vg2gt.trust import read_run_config
+from vg2gt.runs.load import checkpoint_path, run_name
+from vg2gt.runs.trust import read_run_config
+from vg2gt.training.loop import train
 
 
 @pytest.fixture(scope="module")

@@ -2,11 +2,11 @@ from pathlib import Path
 
 import pytest
 
-from vg2gt.data.sampling import SceneViews
+from vg2gt.data.views.sampling import SceneSample
 from vg2gt.evaluation.run import mean_scores
 from vg2gt.evaluation.store import ResultStore, file_name
 
-VIEWS = SceneViews("kitchen/seq-01", (1, 2), (3,))
+VIEWS = SceneSample("kitchen/seq-01", (1, 2), (3,))
 
 
 def test_scores_come_back_for_the_same_frames_only(tmp_path: Path) -> None:
@@ -15,8 +15,8 @@ def test_scores_come_back_for_the_same_frames_only(tmp_path: Path) -> None:
     store.write(VIEWS, {"psnr": 20.5, "abs_rel": None})
     again = ResultStore(tmp_path, {"a": 1})
     assert again.read(VIEWS) == {"psnr": 20.5, "abs_rel": None}
-    assert again.read(SceneViews(VIEWS.scene, (1, 2), (4,))) is None
-    assert again.read(SceneViews(VIEWS.scene, (1, 2, 5), (3,))) is None
+    assert again.read(SceneSample(VIEWS.scene, (1, 2), (4,))) is None
+    assert again.read(SceneSample(VIEWS.scene, (1, 2, 5), (3,))) is None
 
 
 def test_a_damaged_file_is_measured_again(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from PIL import Image
 
 from vg2gt.data import SyntheticScenes
 from vg2gt.reconstruction import Scene, load_model, reconstruct_with
-from vg2gt.reconstruction.models import Ready, compose_part
+from vg2gt.runs.models import LoadedModel, compose_part
 
 SIZE = (84, 112)
 ORACLE = "oracle,depth_noise=0"
@@ -55,7 +55,7 @@ def photos(frames, tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def ready() -> Ready:
+def ready() -> LoadedModel:
     return load_model(backend=ORACLE, device="cpu")
 
 

@@ -18,9 +18,9 @@ from typing import Any
 import torch
 
 from tests.training_helpers import SMALL
-from vg2gt.checkpoints import read_checkpoint
-from vg2gt.curves import read_curves
 from vg2gt.io.files import read_json
+from vg2gt.runs.checkpoints import read_checkpoint
+from vg2gt.studies.curves import read_curves
 
 ROOT = Path(__file__).resolve().parents[2]
 PATIENCE = 600.0  # seconds until a process that does not end is taken to hang
@@ -35,8 +35,8 @@ RUN = [
     "trainer.val_check_interval=4",
 ]
 
-TRAIN, EVALUATE, ABLATE = "vg2gt.cli.train", "vg2gt.cli.evaluate", "vg2gt.ablate"
-PRELOADED = ["vg2gt.training", "vg2gt.evaluation.run", "vg2gt.ablate"]
+TRAIN, EVALUATE, ABLATE = "vg2gt.cli.train", "vg2gt.cli.evaluate", "vg2gt.studies.ablation"
+PRELOADED = ["vg2gt.training.loop", "vg2gt.evaluation.run", "vg2gt.studies.ablation"]
 
 Moment = Callable[["Attempt"], bool]
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from tests.training_helpers import small_config
-from vg2gt.training import Run, build
+from vg2gt.training.loop import Run, build
 from vg2gt.types import Batch
 
 TINY = [

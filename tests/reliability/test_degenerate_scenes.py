@@ -10,11 +10,11 @@ from torch import Tensor, nn
 
 from tests.reliability.degenerate import SCENES, beside, obey_names, random_mutation
 from tests.reliability.steps import first_batches, fit, tiny_run
+from vg2gt.evaluation.evaluator import SceneEvaluator, evaluate_scene
 from vg2gt.evaluation.options import EvaluationOptions
-from vg2gt.evaluation.scene import SceneEvaluator, evaluate_scene
 from vg2gt.model import VG2GT, Reconstructor
 from vg2gt.rendering import Renderer
-from vg2gt.training import Run
+from vg2gt.training.loop import Run
 from vg2gt.types import Batch
 
 FULL = ("",)

@@ -12,10 +12,10 @@ import pytest
 
 from tests.reliability import crash_harness as harness
 from tests.reliability.crash_harness import TRAIN, Attempt
-from vg2gt.checkpoints import newest_valid
-from vg2gt.csv_log import WholeRowsLogger
-from vg2gt.curves import read_curves
 from vg2gt.io.files import read_json, write_json
+from vg2gt.runs.checkpoints import newest_valid
+from vg2gt.studies.curves import read_curves
+from vg2gt.training.log import WholeRowsLogger
 
 
 @contextmanager

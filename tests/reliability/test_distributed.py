@@ -18,10 +18,10 @@ from tests.reliability import two_ranks
 from tests.reliability.degenerate import SCENES
 from tests.reliability.steps import TINY, first_batches, tiny_run
 from tests.training_helpers import SMALL
-from vg2gt.callbacks import StopOnSignal
-from vg2gt.distributed import in_turns
 from vg2gt.losses import EnhancementLoss, GaussianLoss, ScaleAlignment, VG2GTLoss
-from vg2gt.training import Run
+from vg2gt.training.callbacks import StopOnSignal
+from vg2gt.training.distributed import in_turns
+from vg2gt.training.loop import Run
 from vg2gt.types import Batch
 
 

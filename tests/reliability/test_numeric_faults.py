@@ -17,10 +17,10 @@ from torch import Tensor
 
 from tests.reliability.steps import TINY, Poison, first_batches, fit, named, tiny_run
 from tests.training_helpers import SMALL, small_config, with_crash
-from vg2gt.checkpoints import newest_valid, read_checkpoint
-from vg2gt.faults import fault_of_batch
 from vg2gt.losses.objective import VG2GTLoss
-from vg2gt.training import Run, train
+from vg2gt.runs.checkpoints import newest_valid, read_checkpoint
+from vg2gt.training.faults import fault_of_batch
+from vg2gt.training.loop import Run, train
 from vg2gt.types import Batch
 
 VALUES = (float("nan"), float("inf"), -float("inf"))

@@ -14,9 +14,9 @@ from torch.nn import functional as F
 
 import vg2gt.baselines.pixels
 import vg2gt.baselines.voxel_merged
-import vg2gt.lightning_module
 import vg2gt.losses.objective
 import vg2gt.rendering.renderer
+import vg2gt.training.module
 import vg2gt.voxels.coarse
 import vg2gt.voxels.fine
 from tests.reliability.steps import first_batches, fit, tiny_run
@@ -26,7 +26,7 @@ from vg2gt.losses.gaussian import GaussianLoss
 from vg2gt.losses.geometry import GeometryLoss
 from vg2gt.model import SceneScale
 from vg2gt.rendering import Renderer
-from vg2gt.training import Run
+from vg2gt.training.loop import Run
 from vg2gt.types import Voxels
 
 STEPS = 6
@@ -143,7 +143,7 @@ PLACES: list[tuple[Any, str]] = [
     (vg2gt.voxels.fine, "point_cells"),
     (vg2gt.voxels.fine, "pool_mean"),
     (vg2gt.voxels.fine, "pool_min"),
-    (vg2gt.lightning_module, "training_cameras"),
+    (vg2gt.training.module, "training_cameras"),
     (vg2gt.rendering.renderer, "_scene_views"),
     (Renderer, "__call__"),
     (SceneScale, "__call__"),

@@ -21,8 +21,8 @@ from tests.reliability.degenerate import SCENES
 from tests.reliability.steps import first_batches, fit, tiny_run
 from vg2gt.data import DataError
 from vg2gt.data.batches import BatchDataset
-from vg2gt.distributed import ending_together
-from vg2gt.training import Run, evaluate
+from vg2gt.training.distributed import ending_together
+from vg2gt.training.loop import Run, evaluate
 
 RANKS = ["trainer=ddp"]
 SGD = ["optimizer._target_=torch.optim.SGD", "~optimizer.betas", "optimizer.lr=0.05"]

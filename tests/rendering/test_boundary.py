@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from tests.rendering.scenes import IMPLEMENTATIONS, images, pinhole, soup, with_gradients
-from vg2gt.paths import config_dir
+from vg2gt.config import config_dir
 from vg2gt.rendering import Renderer, render
 from vg2gt.rendering.options import Mode
 from vg2gt.rendering.renderer import Implementation

@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 from vg2gt.data import SyntheticScenes
 from vg2gt.data.shards import write_shards
 from vg2gt.reconstruction import load_model
-from vg2gt.reconstruction.models import compose_part
+from vg2gt.runs.models import compose_part
 
 SIZE = (24, 32)
 

@@ -15,14 +15,13 @@ import torch
 from PIL import Image
 
 from tests.safety.conftest import SIZE
-from vg2gt.checkpoints import read_checkpoint
 from vg2gt.data import DataError, ShardedScenes, SyntheticScenes
 from vg2gt.data.sharded_scenes import INDEX
-from vg2gt.data.sources.arrays import load_npy
-from vg2gt.data.sources.parsing import load_npz
+from vg2gt.io.arrays import load_npy
 from vg2gt.io.errors import FormatError
-from vg2gt.io.npz import read_npz
+from vg2gt.io.npz import load_npz, read_npz
 from vg2gt.io.tensors import read_tensors
+from vg2gt.runs.checkpoints import read_checkpoint
 
 
 def deflated_zeros(name: str, size: int, header: bytes = b"") -> bytes:

@@ -13,9 +13,7 @@ import pytest
 from PIL import Image
 
 from vg2gt.data import DataError
-from vg2gt.data.image_files import image_size, photo_size, read_color, read_depth, read_photo
 from vg2gt.data.sources import COLMAP, TUM, Nerfstudio
-from vg2gt.data.sources.sens import scan_sens
 from vg2gt.io import (
     FormatError,
     read_cameras_json,
@@ -26,7 +24,9 @@ from vg2gt.io import (
     read_video,
 )
 from vg2gt.io.cameras_json import NamedCamera
+from vg2gt.io.image_files import image_size, photo_size, read_color, read_depth, read_photo
 from vg2gt.io.images import open_image
+from vg2gt.io.sens import scan_sens
 from vg2gt.viewer import load_pictures
 
 HUGE = 1 << 60

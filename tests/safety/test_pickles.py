@@ -16,18 +16,17 @@ import torch
 from backends.vggt import VGGTBackend
 from backends.weights import find_weights
 from tests.safety.conftest import SIZE, Armed
-from vg2gt.checkpoints import AtomicCheckpointIO, initialize_from, read_checkpoint
 from vg2gt.data import DataError, RGBDFolder, ShardedScenes, SyntheticScenes
 from vg2gt.data.framing import FramingSampler
 from vg2gt.data.resized_cache import ResizedCache
 from vg2gt.data.sharded_scenes import INDEX
-from vg2gt.data.sources.arrays import load_matrices, load_npy
-from vg2gt.data.sources.parsing import load_npz
+from vg2gt.io.arrays import load_matrices, load_npy
 from vg2gt.io.errors import FormatError
-from vg2gt.io.npz import read_npz
+from vg2gt.io.npz import load_npz, read_npz
 from vg2gt.io.tensors import read_tensors
 from vg2gt.metrics.lpips import load_lpips
 from vg2gt.reconstruction import load_model
+from vg2gt.runs.checkpoints import AtomicCheckpointIO, initialize_from, read_checkpoint
 
 
 def zipped(armed: Armed) -> bytes:

@@ -10,12 +10,12 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
+from vg2gt.config import config_dir
 from vg2gt.evaluation.checks import refuse_training_views
-from vg2gt.paths import config_dir
 from vg2gt.reconstruction import load_model
-from vg2gt.study import _refuse_other_run
-from vg2gt.training import _name_differences
-from vg2gt.trust import ENVIRONMENT, UntrustedError, check_targets, read_run_config
+from vg2gt.runs.trust import ENVIRONMENT, UntrustedError, check_targets, read_run_config
+from vg2gt.studies.study import _refuse_other_run
+from vg2gt.training.loop import _name_differences
 
 Attack = Callable[[str], dict[str, Any]]
 
@@ -42,7 +42,7 @@ ATTACKS: dict[str, Attack] = {
     "through a module of ours": lambda c: {"_target_": "vg2gt.io.video.subprocess.run", "args": ["touch", c]},
     "through torch": lambda c: {"_target_": "vg2gt.model.torch.os.mkdir", "path": c},
     "a function of ours": lambda c: {"_target_": "vg2gt.io.files.write_text", "path": c, "content": ""},
-    "training": lambda c: {"_target_": "vg2gt.training.train", "config": {"output_dir": c}},
+    "training": lambda c: {"_target_": "vg2gt.training.loop.train", "config": {"output_dir": c}},
     "a method of ours": lambda c: {"_target_": "backends.bundle.Description.write", "folder": c},
     "a class that writes": lambda c: {"_target_": "vg2gt.reconstruction.maps.Animation", "path": c, "fps": 1},
     "almost ours": lambda c: {"_target_": "vg2gt_evil.Backend", "path": c},

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
-from torch.profiler import record_function
 
 from backends.base import Backend
 from vg2gt.geometry.cameras import invert_rigid, ray_directions
 from vg2gt.model import Reconstructor, SceneScale
+from vg2gt.profiling import stage
 from vg2gt.types import Gaussians, Geometry, Hints, Prediction, TensorRecord
 from vg2gt.voxels import DenseHead
 
@@ -112,9 +112,9 @@ class PixelReconstructor(Reconstructor):
     ) -> Prediction:
         """Reconstructs B scenes; see :meth:`vg2gt.model.Reconstructor.forward`. Nothing is random here."""
         tokens, geometry, unit = self.read_views(images, hints)
-        with record_function("vg2gt/fine"):
+        with stage("fine"):
             dense = self.dense_head(tokens, images).permute(0, 2, 3, 1).flatten(0, 2)
-        with record_function("vg2gt/gaussians"), torch.autocast(images.device.type, enabled=False):
+        with stage("gaussians"), torch.autocast(images.device.type, enabled=False):
             pixels = usable_pixels(geometry, images)
             features = F.gelu(dense.float()).index_select(0, pixels.rows)
             gaussians = self.make_gaussians(features, pixels, geometry)

@@ -6,12 +6,12 @@ from typing import Literal, get_args
 
 import torch
 from torch import Tensor
-from torch.profiler import record_function
 
 from backends.base import Backend
 from vg2gt.baselines.pixels import Pixels, usable_pixels
 from vg2gt.geometry.spherical_harmonics import rgb_to_sh
 from vg2gt.model import Reconstructor, SceneScale
+from vg2gt.profiling import stage
 from vg2gt.types import Gaussians, Hints, Prediction
 from vg2gt.voxels.knn import nearest_neighbors
 
@@ -55,7 +55,7 @@ class PointCloud(Reconstructor):
     ) -> Prediction:
         """Reconstructs B scenes; see :meth:`vg2gt.model.Reconstructor.forward`. Nothing is random here."""
         _, geometry, unit = self.read_views(images, hints)
-        with record_function("vg2gt/gaussians"), torch.autocast(images.device.type, enabled=False):
+        with stage("gaussians"), torch.autocast(images.device.type, enabled=False):
             pixels = usable_pixels(geometry, images)
             means = pixels.to_world(pixels.rays * pixels.depth[:, None])
             spacing = pixels.footprint.mean(-1) if self.spacing == "pixel" else _distance_to_neighbors(means, pixels)

@@ -8,7 +8,7 @@ import sys
 COMMANDS = {
     "train": "vg2gt.cli.train",
     "evaluate": "vg2gt.cli.evaluate",
-    "ablate": "vg2gt.ablate",
+    "ablate": "vg2gt.studies.ablation",
     "reconstruct": "vg2gt.cli.reconstruct",
     "render": "vg2gt.cli.render",
     "view": "vg2gt.cli.view",

@@ -4,9 +4,9 @@ import hydra
 from omegaconf import DictConfig, OmegaConf
 
 from vg2gt.cli.errors import said_in_one_line
+from vg2gt.config import config_dir
 from vg2gt.evaluation.run import evaluate
-from vg2gt.evaluation.settings import run_name
-from vg2gt.paths import config_dir
+from vg2gt.runs.load import run_name
 
 OmegaConf.register_new_resolver("run_name", run_name, replace=True)
 

@@ -12,12 +12,12 @@ from typing import Any
 from rich.console import Console
 from rich.logging import RichHandler
 
-from vg2gt.evaluation.settings import choose_device
 from vg2gt.io.video import MissingDecoderError, require_ffmpeg
 from vg2gt.memory import RECONSTRUCTION, memory_advice
-from vg2gt.reconstruction import OUTPUTS, Monitor, OutOfMemory, Ready, load_model, reconstruct_with, write_outputs
+from vg2gt.reconstruction import OUTPUTS, LoadedModel, Monitor, OutOfMemory, load_model, reconstruct_with, write_outputs
 from vg2gt.reconstruction.outputs import DEFAULT, ORBIT_FRAMES, check_folder, check_outputs, cost_figures
 from vg2gt.reconstruction.pictures import existing_path
+from vg2gt.runs.load import choose_device
 
 EXPECTED_ERRORS = (ValueError, OSError, ImportError, OutOfMemory, MissingDecoderError)
 
@@ -106,7 +106,7 @@ def run(options: argparse.Namespace) -> None:
     print(f"written: {', '.join(str(folder / name) for name in options.save)}")
 
 
-def _figures(ready: Ready) -> dict[str, Any]:
+def _figures(ready: LoadedModel) -> dict[str, Any]:
     trained = bool(ready.model.trained_parameters())
     return {
         "model": type(ready.model).__name__,

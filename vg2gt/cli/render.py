@@ -8,12 +8,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from vg2gt.cli.reconstruct import EXPECTED_ERRORS
-from vg2gt.evaluation.settings import choose_device
 from vg2gt.io import read_cameras_json, read_gaussian_ply, read_splat
 from vg2gt.reconstruction import Monitor, interpolate, render_views
 from vg2gt.reconstruction.maps import MAPS, Animation, Sink, feed, map_sinks
 from vg2gt.reconstruction.outputs import FPS, check_outputs, cost_figures, prepare_folder
 from vg2gt.rendering import Renderer
+from vg2gt.runs.load import choose_device
 from vg2gt.types import Gaussians
 
 OUTPUTS = {**MAPS, "video.gif": "the colour of all views as an animation", "video.mp4": "the same as H.264"}

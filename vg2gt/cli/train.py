@@ -5,8 +5,8 @@ from omegaconf import DictConfig
 
 from vg2gt.cli.errors import said_in_one_line
 from vg2gt.cli.sweeps import needs_own_process, run_in_own_process
-from vg2gt.paths import config_dir
-from vg2gt.training import train
+from vg2gt.config import config_dir
+from vg2gt.training.loop import train
 
 
 @hydra.main(version_base="1.3", config_path=config_dir(), config_name="train")

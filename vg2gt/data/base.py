@@ -9,7 +9,10 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
+from vg2gt.io.errors import DataError
 from vg2gt.types import TensorRecord
+
+__all__ = ["DataError", "Frames", "SceneSource", "SourceMaker", "training_frames"]
 
 
 @dataclass(frozen=True)
@@ -101,10 +104,6 @@ class SceneSource(ABC):
 
 SourceMaker = Callable[..., SceneSource]
 """What makes a source from keyword arguments, such as a Hydra partial."""
-
-
-class DataError(ValueError):
-    """A dataset is not what it should be; the message names the file, the scene and the remedy."""
 
 
 def training_frames(source: SceneSource, scene: str) -> list[int]:

@@ -10,7 +10,7 @@ from torch.utils.data import Dataset
 
 from vg2gt.data.base import DataError, Frames, SceneSource, training_frames
 from vg2gt.data.frame_cache import FrameCache
-from vg2gt.data.sampling import SceneViews
+from vg2gt.data.views.sampling import SceneSample
 from vg2gt.types import Batch, Cameras
 
 log = logging.getLogger(__name__)
@@ -36,7 +36,7 @@ class BatchDataset(Dataset[Batch]):
         self.replace_damaged = replace_damaged
         self.damaged: set[tuple[str, int]] = set()
 
-    def __getitem__(self, views: tuple[SceneViews, ...]) -> Batch:
+    def __getitem__(self, views: tuple[SceneSample, ...]) -> Batch:
         loaded = [self._load(view) for view in views]
         scenes = [
             view.framing.apply(frames) if view.framing else frames
@@ -57,7 +57,7 @@ class BatchDataset(Dataset[Batch]):
             num_context=len(views[0].context),
         )
 
-    def _load(self, view: SceneViews) -> tuple[Frames, Sequence[int]]:
+    def _load(self, view: SceneSample) -> tuple[Frames, Sequence[int]]:
         """The frames of a scene and their ids, those that cannot be read replaced.
 
         The result depends on the files alone, not on what was read before.

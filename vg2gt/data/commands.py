@@ -11,8 +11,8 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from vg2gt.config import config_dir
 from vg2gt.data.datamodule import SceneDataModule
-from vg2gt.paths import config_dir
 
 
 def parse(arguments: Sequence[str], options: dict[str, Any]) -> tuple[dict[str, Any], SceneDataModule]:

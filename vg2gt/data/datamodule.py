@@ -11,11 +11,11 @@ from torch.utils.data import DataLoader
 
 from vg2gt.data.base import DataError, Frames, SceneSource, SourceMaker
 from vg2gt.data.batches import BatchDataset
-from vg2gt.data.evaluation_views import EvaluationViews
 from vg2gt.data.framing import Crop, Fit, FramingSampler
 from vg2gt.data.overlap import refuse_overlap, refuse_untrainable
 from vg2gt.data.resized_cache import ResizedCache
-from vg2gt.data.sampling import StepSampler, ViewSampler, usable_scenes
+from vg2gt.data.views.even import EvaluationViews
+from vg2gt.data.views.sampling import StepSampler, ViewSampler, usable_scenes
 from vg2gt.types import Batch
 
 
@@ -170,7 +170,7 @@ class SceneDataModule(LightningDataModule):
         return self.val_dataloader()
 
     def evaluation_data(self) -> BatchDataset:
-        """The evaluation scenes alone, for any views of them: indexed by a tuple of ``SceneViews``."""
+        """The evaluation scenes alone, for any views of them: indexed by a tuple of ``SceneSample``."""
         return BatchDataset(self._source(self._make_val), self.framing.still.apply, self.memory_mb)
 
     def _training_size(self) -> Callable[[Frames], Frames]:

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 
 from vg2gt.data.base import DataError, SceneSource
-from vg2gt.data.sampling import SceneViews
+from vg2gt.data.views.sampling import SceneSample
 
 log = logging.getLogger(__name__)
 
@@ -26,7 +26,7 @@ def refuse_untrainable(source: SceneSource) -> None:
 
 
 def refuse_overlap(
-    train: SceneSource, scenes: Sequence[str], val: SceneSource, evaluation: Sequence[SceneViews]
+    train: SceneSource, scenes: Sequence[str], val: SceneSource, evaluation: Sequence[SceneSample]
 ) -> None:
     """Refuses evaluation targets that are not held out of training, and evaluation of places that are trained on.
 

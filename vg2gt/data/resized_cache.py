@@ -14,9 +14,9 @@ import torch
 
 from vg2gt.data.base import DataError, Frames, SceneSource
 from vg2gt.data.framing import FramingSampler
-from vg2gt.data.sources.parsing import load_npz
 from vg2gt.data.transforms import from_bytes, to_bytes
 from vg2gt.io.files import write_bytes
+from vg2gt.io.npz import load_npz
 
 log = logging.getLogger(__name__)
 

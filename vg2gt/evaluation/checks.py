@@ -13,10 +13,10 @@ from omegaconf import DictConfig
 from vg2gt.data.base import DataError, SceneSource
 from vg2gt.data.datamodule import SceneDataModule
 from vg2gt.data.overlap import refuse_overlap
-from vg2gt.data.sampling import SceneViews
-from vg2gt.evaluation.settings import checkpoint_path, run_config_path
+from vg2gt.data.views.sampling import SceneSample
 from vg2gt.model import Reconstructor
-from vg2gt.trust import check_targets, read_run_config
+from vg2gt.runs.load import checkpoint_path, run_config_path
+from vg2gt.runs.trust import check_targets, read_run_config
 
 log = logging.getLogger(__name__)
 
@@ -24,7 +24,7 @@ UNCHECKED = "whether the evaluated scenes were trained on cannot be checked: %s"
 RESUMED_IN_PLACE = (None, "last", "auto")
 
 
-def refuse_training_views(checkpoint: Path | None, source: SceneSource, views: Sequence[SceneViews]) -> None:
+def refuse_training_views(checkpoint: Path | None, source: SceneSource, views: Sequence[SceneSample]) -> None:
     """Refuses to score what the run was trained on, whatever kinds of source training and evaluation read.
 
     So it does for the runs from whose weights the run was started. Every scene in a run's training data counts as

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 
-from vg2gt.evaluation.views import ViewSelection
+from vg2gt.data.views.drawn import ViewSelection
 from vg2gt.metrics.depth import ALIGNMENTS
 
 

@@ -16,20 +16,12 @@ from omegaconf import DictConfig, OmegaConf
 from vg2gt.data.base import DataError, SceneSource
 from vg2gt.data.batches import BatchDataset
 from vg2gt.data.datamodule import SceneDataModule
-from vg2gt.data.sampling import SceneViews
+from vg2gt.data.views.sampling import SceneSample
 from vg2gt.evaluation import paper
 from vg2gt.evaluation.checks import refuse_training_views, refuse_without_hints
+from vg2gt.evaluation.evaluator import SceneEvaluator, SceneResult
 from vg2gt.evaluation.options import EvaluationOptions
 from vg2gt.evaluation.pictures import PANELS, scene_picture
-from vg2gt.evaluation.scene import SceneEvaluator, SceneResult
-from vg2gt.evaluation.settings import (
-    Weights,
-    build_model,
-    checkpoint_path,
-    choose_device,
-    load_weights,
-    resolve_parts,
-)
 from vg2gt.evaluation.store import ResultStore
 from vg2gt.evaluation.tables import markdown
 from vg2gt.io.files import write_json, write_text
@@ -37,7 +29,15 @@ from vg2gt.io.images import write_png
 from vg2gt.memory import EVALUATION, memory_advice
 from vg2gt.metrics import LPIPS, WeightsNotFoundError, load_lpips
 from vg2gt.model import Reconstructor
-from vg2gt.training import flatten
+from vg2gt.runs.load import (
+    TrainedWeights,
+    build_model,
+    checkpoint_path,
+    choose_device,
+    load_weights,
+    resolve_parts,
+)
+from vg2gt.training.loop import flatten
 from vg2gt.types import Batch
 
 log = logging.getLogger(__name__)
@@ -129,7 +129,7 @@ def view_counts(views: Any) -> list[int]:
 
 def _samples(
     options: EvaluationOptions, source: SceneSource, scenes: Sequence[str], counts: Sequence[int]
-) -> dict[int, list[SceneViews]]:
+) -> dict[int, list[SceneSample]]:
     if not scenes:
         raise DataError(
             f"there is no scene to evaluate: {type(source).__name__} offers {len(source.scenes)}, data.eval_scenes "
@@ -152,7 +152,7 @@ def _lpips(source: str | None, device: torch.device) -> tuple[LPIPS | None, str]
 
 
 def _identity(
-    config: Any, weights: Weights, has_lpips: bool, model: Reconstructor, device: torch.device
+    config: Any, weights: TrainedWeights, has_lpips: bool, model: Reconstructor, device: torch.device
 ) -> dict[str, Any]:
     """All that decides the figures of a sample, flat; the machine's kind decides the times."""
     settings = flatten(OmegaConf.to_container(config, resolve=True))
@@ -165,7 +165,7 @@ def _identity(
 def _evaluate_all(
     evaluator: SceneEvaluator,
     data: BatchDataset,
-    samples: Sequence[SceneViews],
+    samples: Sequence[SceneSample],
     store: ResultStore,
     device: torch.device,
 ) -> dict[str, dict[str, float | None]]:
@@ -196,9 +196,9 @@ def _settings(
     config: DictConfig,
     options: EvaluationOptions,
     model: Reconstructor,
-    weights: Weights,
+    weights: TrainedWeights,
     source: SceneSource,
-    samples: Mapping[int, Sequence[SceneViews]],
+    samples: Mapping[int, Sequence[SceneSample]],
     lpips: str,
     device: torch.device,
 ) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from vg2gt.data.sampling import SceneViews
+from vg2gt.data.views.sampling import SceneSample
 from vg2gt.io.files import read_json, write_json
 
 IDENTITY = "identity.json"
@@ -57,7 +57,7 @@ class ResultStore:
                 )
         write_json(folder / IDENTITY, dict(identity))
 
-    def read(self, views: SceneViews) -> dict[str, float | None] | None:
+    def read(self, views: SceneSample) -> dict[str, float | None] | None:
         """The scores of a sample that was evaluated before; None if it was not, or with other frames."""
         path = self._path(views)
         if not path.is_file():
@@ -69,7 +69,7 @@ class ResultStore:
         same = stored["context"] == list(views.context) and stored["target"] == list(views.target)
         return stored["scores"] if same else None
 
-    def write(self, views: SceneViews, scores: Mapping[str, float | None]) -> None:
+    def write(self, views: SceneSample, scores: Mapping[str, float | None]) -> None:
         """Writes the scores of a sample, atomically."""
         content = {
             "scene": views.scene,
@@ -79,11 +79,11 @@ class ResultStore:
         }
         write_json(self._path(views), content)
 
-    def picture(self, views: SceneViews) -> Path:
+    def picture(self, views: SceneSample) -> Path:
         """Where the picture of a sample is."""
         return self.folder / "pictures" / f"{file_name(views.scene)}-{len(views.context)}.png"
 
-    def _path(self, views: SceneViews) -> Path:
+    def _path(self, views: SceneSample) -> Path:
         return self.folder / "scenes" / str(len(views.context)) / f"{file_name(views.scene)}.json"
 
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 from vg2gt.evaluation import paper
-from vg2gt.evaluation.scene import MODES, PROTOCOLS
+from vg2gt.evaluation.evaluator import MODES, PROTOCOLS
 
 # figure -> (heading, decimals, share: printed as it is)
 DEPTH = {

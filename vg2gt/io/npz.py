@@ -10,7 +10,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from vg2gt.io.errors import FormatError
+from vg2gt.io.errors import DataError, FormatError
 
 _ALWAYS = 256 << 20  # bytes that an archive may unpack to, however small it is
 _RATIO = 100  # more bytes than this for each byte of the archive are no data of ours (zeros reach 1000)
@@ -39,6 +39,20 @@ def read_npz(file: str | Path | BinaryIO, names: Sequence[str], limit: int | Non
         raise
     except Exception as error:  # damage raises whatever zipfile, zlib and the header's parser raise; sizes MemoryError
         raise FormatError(f"no readable archive of plain arrays: {error or type(error).__name__}") from error
+
+
+def load_npz(path: Path, scene: str, names: Sequence[str]) -> dict[str, NDArray]:
+    """Reads named arrays of an ``.npz`` file without executing anything in it.
+
+    Raises:
+        DataError: if the file is missing or damaged, or lacks one of the arrays.
+    """
+    try:
+        return read_npz(path, names)
+    except KeyError as error:
+        raise DataError(f"{path} of scene {scene} has no array {error}; expected {', '.join(names)}") from error
+    except (OSError, FormatError) as error:
+        raise DataError(f"cannot read {path} of scene {scene}: {error}") from error
 
 
 def _check_sizes(stored: np.lib.npyio.NpzFile, names: Sequence[str], limit: int | None) -> None:

@@ -19,7 +19,7 @@ from torch import Tensor
 from vg2gt.io.files import write_bytes
 from vg2gt.io.images import colorize_normals
 from vg2gt.io.video import require_ffmpeg, write_video
-from vg2gt.reconstruction.paths import view_stem
+from vg2gt.reconstruction.camera_paths import view_stem
 from vg2gt.reconstruction.scene import RenderedView
 
 log = logging.getLogger(__name__)

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
-from typing import Any
+from contextlib import contextmanager
 
 import torch
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from vg2gt.evaluation.cost import now, peak_memory_mib, reset_peak_memory
-from vg2gt.model import Reconstructor
+from vg2gt.profiling import listening, now, peak_memory_mib, reset_peak_memory
 
-_PARTS = {"coarse": "enhance tokens", "fine": "fine voxels", "gaussians": "Gaussians"}
+_LABELS = {
+    "encode": "backbone",
+    "decode": "decode geometry",
+    "coarse": "enhance tokens",
+    "decode_again": "decode geometry",
+    "fine": "fine voxels",
+    "gaussians": "Gaussians",
+}
 
 
 class Monitor:
@@ -77,29 +82,12 @@ class Monitor:
         self._since = moment
 
     @contextmanager
-    def watching(self, model: Reconstructor) -> Iterator[None]:
-        """Inside the block the parts of a model report as stages of their own."""
-        backend: Any = model.backend
-        parts: list[tuple[Any, str, str]] = [(backend, "encode", "backbone"), (backend, "decode", "decode geometry")]
-        parts += [(module, "forward", _PARTS[name]) for name, module in model.named_children() if name in _PARTS]
-        with ExitStack() as stack:
-            for owner, method, name in parts:
-                stack.enter_context(self._reporting(owner, method, name))
+    def watching(self) -> Iterator[None]:
+        """Inside the block the stages that a model marks report as stages of their own."""
+        with listening(lambda name: self._labelled(_LABELS.get(name, name))):
             yield
 
     @contextmanager
-    def _reporting(self, owner: Any, method: str, name: str) -> Iterator[None]:
-        original, own = getattr(owner, method), vars(owner).get(method)
-
-        def call(*args: Any, **kwargs: Any) -> Any:
-            with self.stage(name):
-                return original(*args, **kwargs)
-
-        setattr(owner, method, call)
-        try:
+    def _labelled(self, label: str) -> Iterator[None]:
+        with self.stage(label):
             yield
-        finally:
-            if own is None:
-                delattr(owner, method)  # the class's own shows again
-            else:
-                setattr(owner, method, own)

@@ -26,9 +26,9 @@ from vg2gt.io import (
     write_transforms,
 )
 from vg2gt.io.files import write_bytes, write_json
+from vg2gt.reconstruction.camera_paths import orbit
 from vg2gt.reconstruction.maps import MAPS, Animation, feed, map_sinks, png, to_pixels, whole_folder
 from vg2gt.reconstruction.monitor import Monitor
-from vg2gt.reconstruction.paths import orbit
 from vg2gt.reconstruction.report import HtmlReport, PngReport
 from vg2gt.reconstruction.scene import RenderedView, Scene
 
@@ -148,7 +148,7 @@ def write_outputs(
                 _WRITERS[output](scene, folder / _target(output))
                 advance()
     sinks = map_sinks(folder, outputs)
-    sinks += [Mesh(scene, folder, outputs, mesh_voxel)] if any(o.startswith("mesh") for o in outputs) else []
+    sinks += [MeshOutput(scene, folder, outputs, mesh_voxel)] if any(o.startswith("mesh") for o in outputs) else []
     sinks += [PngReport(scene, folder / "report.png")] if "report.png" in outputs else []
     page = HtmlReport(scene, folder / "report.html") if "report.html" in outputs else None
     sinks += [page] if page else []
@@ -183,7 +183,7 @@ def cost_figures(monitor: Monitor) -> dict[str, Any]:
     return {"seconds": seconds, "peak_memory_mib": round(monitor.peak_memory_mib), "device": str(monitor.device)}
 
 
-class Mesh:
+class MeshOutput:
     """Keeps the rendered depth and colour of the views and fuses them into a mesh."""
 
     def __init__(self, scene: Scene, folder: Path, outputs: Sequence[str], voxel_size: float | None) -> None:

@@ -17,7 +17,6 @@ from PIL import Image, ImageOps
 from torch import Tensor
 
 from vg2gt.data.base import Frames
-from vg2gt.data.image_files import photo_size, read_photo
 from vg2gt.data.sources.colmap_model import COLMAP, model_folder_of
 from vg2gt.data.sources.files import FileSource
 from vg2gt.data.sources.image_folder import by_number
@@ -25,6 +24,7 @@ from vg2gt.data.sources.nerfstudio import Nerfstudio
 from vg2gt.data.sources.parsing import IMAGE_SUFFIXES
 from vg2gt.data.sources.rgbd import RGBDFolder
 from vg2gt.data.transforms import from_bytes
+from vg2gt.io.image_files import photo_size, read_photo
 from vg2gt.io.nerfstudio import read_transforms
 from vg2gt.io.video import VIDEO_SUFFIXES, count_frames, read_video
 

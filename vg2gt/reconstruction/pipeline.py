@@ -8,12 +8,12 @@ import torch
 
 from vg2gt.memory import RECONSTRUCTION, memory_advice, note_sizes
 from vg2gt.model import Reconstructor
-from vg2gt.reconstruction.models import load_model
+from vg2gt.reconstruction.inputs import Views, load_views, working_size
 from vg2gt.reconstruction.monitor import Monitor
 from vg2gt.reconstruction.pictures import ImagesLike, find_pictures
 from vg2gt.reconstruction.scene import Scene
-from vg2gt.reconstruction.views import Views, load_views, working_size
 from vg2gt.rendering import Renderer
+from vg2gt.runs.models import load_model
 from vg2gt.types import Prediction
 
 
@@ -75,7 +75,7 @@ def reconstruct_with(
 
 def _forward(model: Reconstructor, views: Views, device: torch.device, monitor: Monitor) -> Prediction:
     hints = None if views.hints is None else views.hints.to(device)
-    with monitor.stage("reconstruct"), monitor.watching(model):
+    with monitor.stage("reconstruct"), monitor.watching():
         return model(views.images[None].to(device), hints)
 
 

@@ -22,8 +22,8 @@ from vg2gt.io.errors import FormatError
 from vg2gt.io.files import write_text
 from vg2gt.rendering.options import ALPHA_MIN, JACOBIAN_CLAMP, RenderOptions
 from vg2gt.types import Gaussians
+from vg2gt.viewer.content import ViewerScene
 from vg2gt.viewer.packing import PackedGaussians, pack, unpack
-from vg2gt.viewer.scene import ViewerScene
 
 STATIC = Path(__file__).with_name("static")
 SCRIPTS = ("shaders.js", "decode.js", "sorting.js", "camera.js", "controls.js", "renderer.js", "main.js")

@@ -18,7 +18,7 @@ from vg2gt.geometry.rotations import matrix_to_quat, quat_to_matrix
 from vg2gt.geometry.spherical_harmonics import DC
 from vg2gt.io.cameras_json import NamedCamera
 from vg2gt.types import Gaussians
-from vg2gt.viewer.scene import ViewerScene, camera_to_world
+from vg2gt.viewer.content import ViewerScene, camera_to_world
 
 if TYPE_CHECKING:
     import viser  # pyright: ignore[reportMissingImports]  # optional

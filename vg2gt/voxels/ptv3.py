@@ -99,7 +99,7 @@ class MLP(nn.Module):
         return self.fc2(F.gelu(self.fc1(x)))
 
 
-class Block(nn.Module):
+class PTv3Block(nn.Module):
     """Conditional positional encoding by sparse convolution (xCPE), attention and MLP, each residual.
 
     Args:
@@ -242,7 +242,7 @@ class PTv3(nn.Module):
 
         def blocks(channels: int, heads: int, rates: list[float]) -> dict[str, nn.Module]:
             return {
-                f"block{i}": Block(channels, heads, window, i % len(self.orders), mlp_ratio, rate)
+                f"block{i}": PTv3Block(channels, heads, window, i % len(self.orders), mlp_ratio, rate)
                 for i, rate in enumerate(rates)
             }
 

@@ -6,8 +6,8 @@ import pytest
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
+from vg2gt.config import config_dir
 from vg2gt.data import SceneDataModule
-from vg2gt.paths import config_dir
 
 from . import layout_infinigen, layout_replica, layout_scannet, layout_scannetpp, layout_tum, layout_virtual_kitti
 from .layouts import room

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import yaml
 
+from vg2gt.config import config_dir
 from vg2gt.data import DataError, RGBDFolder, SyntheticScenes
 from vg2gt.data.sources import files, parsing
 from vg2gt.data.sources.index import index_to_bytes, make_index, read_index
-from vg2gt.paths import config_dir
 
 from .layout_rgbd import write_recording
 from .layouts import room

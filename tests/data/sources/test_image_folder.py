@@ -10,9 +10,9 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from PIL import Image
 
+from vg2gt.config import config_dir
 from vg2gt.data import DataError
 from vg2gt.data.sources import ImageFolder
-from vg2gt.paths import config_dir
 
 # Rows of an upright image with its top in red and its left in dark, for every EXIF orientation (standard table).
 _STORED = {

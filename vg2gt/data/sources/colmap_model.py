@@ -10,13 +10,13 @@ import torch
 from numpy.typing import NDArray
 
 from vg2gt.data.base import DataError
-from vg2gt.data.image_files import image_size, typical_size
 from vg2gt.data.sources.files import FileSource
-from vg2gt.data.sources.index import SceneIndex, Size, folder_state, make_index
+from vg2gt.data.sources.index import SceneIndex, folder_state, make_index
 from vg2gt.data.sources.parsing import errors_name, inverse, named_file
 from vg2gt.data.sources.scene_folders import scene_folders
 from vg2gt.geometry.cameras import resize_intrinsics
 from vg2gt.io import ColmapImage, ColmapModel, colmap_intrinsics, colmap_pose, read_colmap
+from vg2gt.io.image_files import Size, image_size, typical_size
 
 _MODELS = ("sparse/0", "sparse")
 _FILES = ("cameras.bin", "cameras.txt")

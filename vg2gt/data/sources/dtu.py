@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vg2gt.data.base import DataError
-from vg2gt.data.image_files import image_size, read_depth
-from vg2gt.data.pfm import read_pfm
 from vg2gt.data.sources.files import FileSource
-from vg2gt.data.sources.index import SceneIndex, Size, folder_state, make_index
+from vg2gt.data.sources.index import SceneIndex, folder_state, make_index
 from vg2gt.data.sources.parsing import check_intrinsics, inverse, numbered, read_text_lines, rigid
 from vg2gt.data.sources.scan_depth import VERSION, ScanDepth
 from vg2gt.data.sources.scene_folders import scene_folders
+from vg2gt.io.image_files import Size, image_size, read_depth
+from vg2gt.io.pfm import read_pfm
 
 EVALUATION_SCANS = (24, 37, 40, 55, 63, 65, 69, 83, 97, 105, 106, 110, 114, 118, 122)
 """The fifteen scans on which surface reconstruction is compared."""

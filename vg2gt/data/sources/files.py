@@ -17,10 +17,10 @@ import torch
 from numpy.typing import NDArray
 
 from vg2gt.data.base import DataError, Frames, SceneSource
-from vg2gt.data.image_files import read_color
-from vg2gt.data.sources.index import FORMAT, SceneIndex, Size, folder_state, index_to_bytes, read_index
+from vg2gt.data.sources.index import FORMAT, SceneIndex, folder_state, index_to_bytes, read_index
 from vg2gt.data.transforms import from_bytes, resize_depth, resize_images, resize_to_cover
 from vg2gt.io.files import write_cached
+from vg2gt.io.image_files import Size, read_color
 
 log = logging.getLogger(__name__)
 

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vg2gt.data.image_files import photo_size, read_photo, typical_size
 from vg2gt.data.sources.files import FileSource
-from vg2gt.data.sources.index import SceneIndex, Size, make_index
+from vg2gt.data.sources.index import SceneIndex, make_index
 from vg2gt.data.sources.parsing import IMAGE_SUFFIXES, pinhole
 from vg2gt.data.sources.scene_folders import scene_folders
+from vg2gt.io.image_files import Size, photo_size, read_photo, typical_size
 
 FOCAL = 1.2
 """Placeholder focal length, in the larger side of the image: the usual first guess of structure from motion."""

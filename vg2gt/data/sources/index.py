@@ -16,11 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vg2gt.data.base import DataError
-from vg2gt.data.sources.parsing import check_intrinsics, inverse, load_npz, rigid
+from vg2gt.data.sources.parsing import check_intrinsics, inverse, rigid
+from vg2gt.io.image_files import Size
+from vg2gt.io.npz import load_npz
 
 log = logging.getLogger(__name__)
 
-Size = tuple[int, int]
 
 FORMAT = 2
 """Of the files that keep an index; raise it when they are written otherwise."""

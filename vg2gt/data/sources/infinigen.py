@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vg2gt.data.base import DataError
-from vg2gt.data.image_files import image_size
-from vg2gt.data.sources.arrays import load_matrices, load_npy, npy_size
 from vg2gt.data.sources.files import FileSource
-from vg2gt.data.sources.index import SceneIndex, Size, make_index
+from vg2gt.data.sources.index import SceneIndex, make_index
 from vg2gt.data.sources.scene_folders import scene_folders
+from vg2gt.io.arrays import load_matrices, load_npy, npy_size
+from vg2gt.io.image_files import Size, image_size
 
 _RIG_STEP = 100_000
 _NAME = re.compile(r"_(\d+)_(\d+)_(\d+)_(\d+)$")

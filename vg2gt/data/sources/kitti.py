@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vg2gt.data.base import DataError
-from vg2gt.data.image_files import image_size, read_depth
 from vg2gt.data.sources.files import FileSource
-from vg2gt.data.sources.index import SceneIndex, Size, folder_state, make_index
+from vg2gt.data.sources.index import SceneIndex, folder_state, make_index
 from vg2gt.data.sources.parsing import inverse, numbered, read_text_lines, rigid
+from vg2gt.io.image_files import Size, image_size, read_depth
 
 EARTH_RADIUS = 6378137.0
 """Metres, at the equator, as KITTI's own tools have it."""

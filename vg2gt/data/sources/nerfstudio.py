@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vg2gt.data.base import DataError
-from vg2gt.data.image_files import image_size, read_color, read_depth, typical_size
 from vg2gt.data.sources.files import FileSource
-from vg2gt.data.sources.index import SceneIndex, Size, make_index
+from vg2gt.data.sources.index import SceneIndex, make_index
 from vg2gt.data.sources.parsing import check_intrinsics, errors_name, inverse, named_file
 from vg2gt.data.sources.scene_folders import scene_folders
 from vg2gt.data.sources.undistortion import Undistortion
 from vg2gt.io import Lens, TransformsFrame, read_transforms
+from vg2gt.io.image_files import Size, image_size, read_color, read_depth, typical_size
 
 _FILE = "transforms.json"
 _SCENES_IN_MEMORY = 64

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from vg2gt.data.base import DataError
 from vg2gt.io.errors import FormatError
-from vg2gt.io.npz import read_npz
 
 log = logging.getLogger(__name__)
 
@@ -86,20 +85,6 @@ def read_text_lines(path: Path, scene: str) -> list[str]:
     except (OSError, ValueError) as error:
         raise DataError(f"cannot read {path} of scene {scene}: {error}") from error
     return [line.strip() for line in lines if line.strip() and not line.lstrip().startswith("#")]
-
-
-def load_npz(path: Path, scene: str, names: Sequence[str]) -> dict[str, NDArray]:
-    """Reads named arrays of an ``.npz`` file without executing anything in it.
-
-    Raises:
-        DataError: if the file is missing or damaged, or lacks one of the arrays.
-    """
-    try:
-        return read_npz(path, names)
-    except KeyError as error:
-        raise DataError(f"{path} of scene {scene} has no array {error}; expected {', '.join(names)}") from error
-    except (OSError, FormatError) as error:
-        raise DataError(f"cannot read {path} of scene {scene}: {error}") from error
 
 
 def named_file(folder: Path, name: str, where: str) -> Path:

@@ -10,12 +10,12 @@ import torch
 from numpy.typing import NDArray
 
 from vg2gt.data.base import DataError
-from vg2gt.data.image_files import image_size, read_depth
 from vg2gt.data.sources.files import FileSource
-from vg2gt.data.sources.index import SceneIndex, Size, make_index
+from vg2gt.data.sources.index import SceneIndex, make_index
 from vg2gt.data.sources.parsing import numbered, pinhole, read_numbers
 from vg2gt.data.sources.scene_folders import scene_folders
 from vg2gt.geometry.cameras import resize_intrinsics
+from vg2gt.io.image_files import Size, image_size, read_depth
 
 DEPTH_SCALE = 6553.5
 """Stored depth units a metre."""

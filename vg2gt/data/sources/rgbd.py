@@ -24,12 +24,12 @@ import torch
 from numpy.typing import NDArray
 
 from vg2gt.data.base import DataError
-from vg2gt.data.image_files import image_size, read_depth
 from vg2gt.data.sources.files import FileSource
-from vg2gt.data.sources.index import SceneIndex, Size, files_state, folder_state, make_index
+from vg2gt.data.sources.index import SceneIndex, files_state, folder_state, make_index
 from vg2gt.data.sources.parsing import numbered, pinhole, read_matrix, read_numbers, read_poses
 from vg2gt.data.sources.scannet import room_of_scan
 from vg2gt.geometry.cameras import resize_intrinsics
+from vg2gt.io.image_files import Size, image_size, read_depth
 
 log = logging.getLogger(__name__)
 

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vg2gt.data.base import DataError
-from vg2gt.data.image_files import image_size, read_depth
 from vg2gt.data.sources.files import FileSource
-from vg2gt.data.sources.index import SceneIndex, Size, files_state, folder_state, make_index
+from vg2gt.data.sources.index import SceneIndex, files_state, folder_state, make_index
 from vg2gt.data.sources.parsing import numbered, read_matrix, read_poses
 from vg2gt.data.sources.scene_folders import scene_folders
+from vg2gt.io.image_files import Size, image_size, read_depth
 
 DEPTH_SCALE = 1000.0
 """Stored depth units a metre."""

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vg2gt.data.base import DataError
-from vg2gt.data.image_files import read_color
 from vg2gt.data.sources.files import FileSource
-from vg2gt.data.sources.index import SceneIndex, Size, make_index
+from vg2gt.data.sources.index import SceneIndex, make_index
 from vg2gt.data.sources.scannet import room_of_scan
-from vg2gt.data.sources.sens import decode_depth, read_span, scan_sens
+from vg2gt.io.image_files import Size, read_color
+from vg2gt.io.sens import decode_depth, read_span, scan_sens
 
 
 class ScanNetSens(FileSource):

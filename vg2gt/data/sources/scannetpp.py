@@ -9,12 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vg2gt.data.base import DataError
-from vg2gt.data.image_files import image_size, read_depth
-from vg2gt.data.sources.arrays import load_matrices
 from vg2gt.data.sources.files import FileSource
-from vg2gt.data.sources.index import SceneIndex, Size, make_index
-from vg2gt.data.sources.parsing import load_npz, numbered
+from vg2gt.data.sources.index import SceneIndex, make_index
+from vg2gt.data.sources.parsing import numbered
 from vg2gt.data.sources.scene_folders import scene_folders
+from vg2gt.io.arrays import load_matrices
+from vg2gt.io.image_files import Size, image_size, read_depth
+from vg2gt.io.npz import load_npz
 
 DEPTH_SCALE = 1000.0
 """Stored depth units a metre."""

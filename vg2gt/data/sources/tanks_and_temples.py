@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vg2gt.data.base import DataError
-from vg2gt.data.image_files import image_size
 from vg2gt.data.sources.colmap_model import image_intrinsics, model_folder_of, refuse_distorted
 from vg2gt.data.sources.files import FileSource
-from vg2gt.data.sources.index import SceneIndex, Size, folder_state, make_index
+from vg2gt.data.sources.index import SceneIndex, folder_state, make_index
 from vg2gt.data.sources.parsing import errors_name, numbered, pinhole, read_matrix, read_text_lines
 from vg2gt.data.sources.scan_depth import VERSION, ScanDepth
 from vg2gt.data.sources.scene_folders import scene_folders
 from vg2gt.io import read_colmap
+from vg2gt.io.image_files import Size, image_size
 
 _LOG = "_COLMAP_SfM.log"
 

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from vg2gt.data.base import DataError
-from vg2gt.data.image_files import image_size, read_depth
 from vg2gt.data.sources.files import FileSource
-from vg2gt.data.sources.index import SceneIndex, Size, make_index
+from vg2gt.data.sources.index import SceneIndex, make_index
 from vg2gt.data.sources.parsing import named_file, pinhole, read_numbers, read_text_lines
 from vg2gt.data.sources.scene_folders import scene_folders
+from vg2gt.io.image_files import Size, image_size, read_depth
 
 DEPTH_SCALE = 5000.0
 """Stored depth units a metre."""

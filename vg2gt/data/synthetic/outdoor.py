@@ -11,8 +11,8 @@ from vg2gt.data.synthetic import street
 from vg2gt.data.synthetic.builder import Builder
 from vg2gt.data.synthetic.raycast import PART_COLUMNS
 from vg2gt.data.synthetic.renderer import World
-from vg2gt.data.synthetic.scene import SyntheticScene, draw_highlights, level_poses
 from vg2gt.data.synthetic.sky import draw_sky
+from vg2gt.data.synthetic.synthetic_scene import SyntheticScene, draw_highlights, level_poses
 from vg2gt.data.synthetic.textures import Pattern
 
 _STREAM = 2  # tells the random stream of outdoor scenes from that of rooms with the same seed

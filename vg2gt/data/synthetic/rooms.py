@@ -11,7 +11,7 @@ from vg2gt.data.synthetic.builder import Builder
 from vg2gt.data.synthetic.furniture import MAKERS
 from vg2gt.data.synthetic.raycast import PART_COLUMNS
 from vg2gt.data.synthetic.renderer import World
-from vg2gt.data.synthetic.scene import SyntheticScene, draw_highlights, level_poses
+from vg2gt.data.synthetic.synthetic_scene import SyntheticScene, draw_highlights, level_poses
 from vg2gt.data.synthetic.textures import INDOOR, Pattern
 
 _FLOOR_PATTERNS = (Pattern.CHECKS, Pattern.BRICKS, Pattern.CLOUDS, Pattern.WOOD, Pattern.MOSAIC, Pattern.PLANKS)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from vg2gt.data.base import Frames, SceneSource
 from vg2gt.data.synthetic.outdoor import SyntheticOutdoor
 from vg2gt.data.synthetic.rooms import SyntheticRoom
-from vg2gt.data.synthetic.scene import SyntheticScene
+from vg2gt.data.synthetic.synthetic_scene import SyntheticScene
 from vg2gt.data.transforms import from_bytes
 from vg2gt.io.errors import FormatError
 from vg2gt.io.files import write_cached

@@ -1,0 +1,171 @@
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from vg2gt.cli.views import write_views
+from vg2gt.data.base import DataError, Frames, SceneSource
+from vg2gt.data.views.drawn import INDICES, index_path, make_index, read_index
+from vg2gt.data.views.sampling import SceneSample
+from vg2gt.evaluation import ViewSelection
+
+
+class Listed(SceneSource):
+    """Scenes that are nothing but lists of frames."""
+
+    def __init__(self, frames: Sequence[int], scenes: Sequence[str] = ("a", "b"), held_out: Sequence[int] = ()) -> None:
+        self._frames, self._scenes, self._held_out = list(frames), list(scenes), list(held_out)
+
+    @property
+    def scenes(self) -> Sequence[str]:
+        return self._scenes
+
+    def frames(self, scene: str) -> Sequence[int]:
+        return self._frames
+
+    def held_out(self, scene: str) -> Sequence[int]:
+        return self._held_out
+
+    def load(self, scene: str, frame_ids: Sequence[int]) -> Frames:
+        raise NotImplementedError
+
+
+@pytest.mark.parametrize("count", [1, 3, 10, 20])
+def test_views_lie_in_a_limited_range_and_targets_between_them(count: int) -> None:
+    source, selection = Listed(range(0, 600, 3)), ViewSelection(spread=3.0, targets=4)
+    starts = set()
+    for scene in map(str, range(30)):
+        views = selection.draw(source, scene, count)
+        assert len(views.context) == count
+        assert len(views.target) == min(4, len(views.target))
+        assert not set(views.context) & set(views.target)
+        assert list(views.context) == sorted(views.context)
+        chosen = [*views.context, *views.target]
+        assert max(chosen) - min(chosen) <= 3 * max(3 * count, count + 4)
+        inside = [frame for frame in views.target if views.context[0] < frame < views.context[-1]]
+        free = [f for f in range(views.context[0], views.context[-1], 3) if f not in views.context]
+        assert len(inside) == min(4, len(free)) or not free
+        starts.add(views.context[0])
+    assert len(starts) > 20  # anywhere in the scene
+
+
+def test_a_draw_depends_on_seed_scene_and_number_alone() -> None:
+    source = Listed(range(100))
+    first = ViewSelection(seed=1).draw(source, "a", 5)
+    assert ViewSelection(seed=1).draw(Listed(range(100), ["a"]), "a", 5) == first
+    assert ViewSelection(seed=2).draw(source, "a", 5).context != first.context
+    assert ViewSelection(seed=1).draw(source, "b", 5).context != first.context
+
+
+def test_targets_are_held_out_frames_and_inputs_never() -> None:
+    held_out = range(0, 60, 6)
+    source = Listed(range(60), held_out=held_out)
+    for scene in map(str, range(20)):
+        views = ViewSelection(spread=3.0).draw(source, scene, 8)
+        assert not set(views.context) & set(held_out)
+        assert views.target
+        assert set(views.target) <= set(held_out)
+
+
+def test_a_window_grows_until_it_holds_the_views() -> None:
+    source = Listed(range(24), held_out=range(2, 24, 6))
+    views = ViewSelection(spread=1.0).draw(source, "a", 20)
+    assert set(views.context) | set(views.target) == set(range(24))
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_a_window_grows_until_it_holds_a_held_out_frame(count: int) -> None:
+    source = Listed(range(200), held_out=range(0, 200, 8))
+    for scene in map(str, range(40)):
+        views = ViewSelection(spread=2.0).draw(source, scene, count)
+        assert views.target
+        assert max(views.context + views.target) - min(views.context + views.target) <= 8
+        assert not ViewSelection(targets=0).draw(source, scene, count).target
+    elsewhere = Listed(range(20), held_out=[77])  # a held-out frame that the scene lacks
+    assert len(ViewSelection().draw(elsewhere, "a", 3).context) == 3
+
+
+@pytest.mark.parametrize(
+    ("context", "target"), [([3, 9], [3]), ([3, 9], [4, 4]), ([3, 3], [4]), ([3, 9, 12], [4]), ([3], [4])]
+)
+def test_an_index_that_mixes_input_and_target_or_miscounts_is_refused(tmp_path: Path, context, target) -> None:
+    path = tmp_path / "mine.json"
+    path.write_text(json.dumps({"scenes": {"a": {"2": {"context": context, "target": target}}}}))
+    with pytest.raises(DataError, match="views of scene a are not 2 input views and others"):
+        ViewSelection(index=str(path)).choose(Listed(range(40)), ["a"], 2)
+
+
+def test_fixed_views() -> None:
+    views = ViewSelection(fixed={3: [23, 24, 33]}).draw(Listed(range(49)), "a", 3)
+    assert views.context == (23, 24, 33)
+    assert all(24 < frame < 33 for frame in views.target)
+    with pytest.raises(ValueError, match=r"fixed names \[1, 2\] for 3"):
+        ViewSelection(fixed={3: [1, 2]})
+
+
+def test_an_index_overrides_the_draw_and_gaps_are_drawn_with_a_warning(tmp_path: Path, caplog) -> None:
+    path = tmp_path / "mine.json"
+    entry = {"context": [7, 5], "target": [6]}
+    path.write_text(json.dumps({"scenes": {"a": {"2": entry}}}))
+    selection = ViewSelection(index=str(path))
+    source = Listed(range(40))
+    first, second = selection.choose(source, ["a", "b"], 2)
+    assert first == SceneSample("a", (7, 5), (6,))
+    assert second == selection.draw(source, "b", 2)
+    assert "mine.json holds no 2 views of 1 of 2 scenes (the first is b)" in caplog.text
+
+
+def test_wrong_indices_and_too_few_frames_are_named(tmp_path: Path) -> None:
+    source = Listed(range(10))
+    with pytest.raises(FileNotFoundError, match=r"Committed are .*synthetic"):
+        read_index("nowhere")
+    (tmp_path / "bad.json").write_text('{"scenes": {"a": {"2": [1, 2]}}}')
+    with pytest.raises(ValueError, match="not an index"):
+        read_index(str(tmp_path / "bad.json"))
+    (tmp_path / "other.json").write_text('{"scenes": {"a": {"1": {"context": [77], "target": []}}}}')
+    with pytest.raises(DataError, match=r"frames \[77\] of scene a"):
+        ViewSelection(index=str(tmp_path / "other.json")).choose(source, ["a"], 1)
+    with pytest.raises(DataError, match=r"scene a has 10 frames .* views=11"):
+        ViewSelection().draw(source, "a", 11)
+    with pytest.raises(ValueError, match=r"spread=0\.5"):
+        ViewSelection(spread=0.5)
+
+
+def test_the_command_writes_what_is_committed(tmp_path: Path) -> None:
+    path = write_views(["evaluation=synthetic", f"out={tmp_path / 'again.json'}"])
+    assert path.read_text() == index_path("synthetic").read_text()
+    assert set(read_index("synthetic")["room-1000000"]) == {"3", "10", "20"}
+
+
+def test_the_command_repeats_the_index_of_real_recordings(tmp_path: Path, shared: Path) -> None:
+    roots = ",".join(str(shared / "data" / scene) for scene in sorted(read_index("rgbd")))
+    path = write_views(["evaluation=rgbd", f"data.root=[{roots}]", f"out={tmp_path / 'again.json'}"])
+    assert path.read_text() == index_path("rgbd").read_text()
+
+
+def test_dtus_index_is_what_its_49_frames_give() -> None:
+    stored = read_index("dtu")
+    assert len(stored) == 15
+    fixed = ViewSelection(fixed={3: [23, 24, 33]})
+    assert make_index(fixed, Listed(range(49)), list(stored), [3, 10, 20])["scenes"] == stored
+    assert all(views["3"]["context"] == [23, 24, 33] for views in stored.values())
+
+
+def test_the_commands_errors(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"out=FILE\.json"):
+        write_views(["evaluation=synthetic"])
+    with pytest.raises(ValueError, match="give numbers of input views"):
+        write_views([f"out={tmp_path / 'x.json'}", "views=null"])
+    one = write_views([f"out={tmp_path / 'one.json'}", "views=3", "data.eval_scenes=1"])
+    assert list(read_index(str(one))["room-1000000"]) == ["3"]
+    with pytest.raises(ValueError, match="nonsense"):
+        write_views([f"out={tmp_path / 'x.json'}", "evaluation=nonsense"])
+
+
+@pytest.mark.parametrize("path", sorted(INDICES.glob("*.json")), ids=lambda path: path.stem)
+def test_committed_indices_are_sound(path: Path) -> None:
+    for views in read_index(str(path)).values():
+        for count, entry in views.items():
+            assert len(set(entry["context"])) == int(count)
+            assert not set(entry["context"]) & set(entry["target"])

@@ -1,0 +1,170 @@
+"""Draws of views and scenes: pure functions of seed and step."""
+
+import hashlib
+import json
+import logging
+
+import pytest
+
+from vg2gt.data import DataError, SyntheticScenes
+from vg2gt.data.views.sampling import ScenePool, StepSampler, ViewSampler, shares, usable_scenes
+
+
+def test_the_number_of_views_stays_in_range_and_takes_every_value():
+    sampler = ViewSampler(3, 18, max_images=40)
+    drawn = [sampler.num_views(step) for step in range(600)]
+    assert set(drawn) == set(range(3, 19))
+    for step in range(50):
+        assert sampler.num_scenes(step) == 40 // drawn[step]
+
+
+@pytest.mark.parametrize(
+    ("sampler", "digest"),
+    [
+        (ViewSampler(8, 8, 8, 2.0, 3, 0), "149f62fda21c93face42790568336d4312d6ea6485c86e32160ff85e0c924ae9"),
+        (ViewSampler(3, 6, 18, 2.0, 0, 7), "95bc3d2b832cb289bb26dd727f87274821d2dcd7d5c5047dac2e1fe5b6cfae85"),
+    ],
+)
+def test_the_samples_of_one_dataset_never_change(sampler, digest):
+    """Figures were published with them: a run of the same seed must see the same samples in later versions."""
+    source = SyntheticScenes(11, num_frames=16)
+    ranks = [StepSampler(source, source.scenes, sampler, 60, rank=rank, world_size=2) for rank in range(2)]
+    drawn = [[[[v.scene, v.context, v.target] for v in rank.step(step)] for step in range(60)] for rank in ranks]
+    assert hashlib.sha256(json.dumps(drawn).encode()).hexdigest() == digest
+
+
+def test_all_ranks_draw_the_same_number_of_views_and_other_scenes():
+    source = SyntheticScenes(40, num_frames=20)
+    views = ViewSampler(2, 6, max_images=12)
+    ranks = [StepSampler(source, source.scenes, views, 100, rank=rank, world_size=2) for rank in range(2)]
+    for step in range(30):
+        a, b = (sampler.step(step) for sampler in ranks)
+        assert {len(view.context) for view in (*a, *b)} == {views.num_views(step)}
+        assert len(a) == len(b)
+    first_pass = 40 // (2 * 6)  # whole steps within the first pass over the scenes
+    seen = [view.scene for step in range(first_pass) for sampler in ranks for view in sampler.step(step)]
+    assert len(seen) == len(set(seen))
+
+
+def test_every_scene_comes_once_in_a_pass():
+    pool = ScenePool((tuple("abcdefg"),), seed=3)
+    passes = [[pool.scene(place) for place in range(start, start + 7)] for start in (0, 7, 14)]
+    assert all(sorted(turn) == list("abcdefg") for turn in passes)
+    assert passes[0] != passes[1]
+
+
+def test_parts_are_drawn_exactly_by_weight_and_each_in_passes():
+    parts = tuple(tuple(f"{name}{i}" for i in range(count)) for name, count in (("a", 3), ("b", 40), ("c", 1)))
+    pool = ScenePool(parts, shares({"a": 0.5, "b": 0.3, "c": 0.2}), seed=1)
+    assert pool.shares == (5, 3, 2)
+    row = [pool.scene(place) for place in range(400)]
+    for start in range(0, 400, 10):
+        block = [scene[0] for scene in row[start : start + 10]]
+        assert [block.count(name) for name in "abc"] == [5, 3, 2]
+    assert len({tuple(scene[0] for scene in row[start : start + 10]) for start in range(0, 400, 10)}) > 10
+    for names in parts:
+        drawn = [scene for scene in row if scene in names]
+        for start in range(0, len(drawn) - len(names) + 1, len(names)):
+            assert sorted(drawn[start : start + len(names)]) == sorted(names)
+
+
+@pytest.mark.parametrize(
+    ("weights", "expected"),
+    [([1, 1, 1], (1, 1, 1)), ([4, 2], (2, 1)), ([0.125, 1], (1, 8)), ([0.333, 0.667], (333, 667))],
+)
+def test_shares_are_the_weights_exactly(weights, expected):
+    assert shares(dict(zip("abc", weights, strict=False))) == expected
+
+
+def test_weights_of_many_digits_are_refused():
+    with pytest.raises(ValueError, match="fewer digits"):
+        shares({"a": 0.123456789, "b": 1.0})
+
+
+def test_views_are_distinct_frames_of_a_window_around_the_anchor():
+    sampler = ViewSampler(3, 9, expand_ratio=1.5, target_views=2)
+    frames = list(range(100, 400, 2))
+    starts = set()
+    for step in range(300):
+        views = sampler.views(step, "scene", frames, slot=0)
+        chosen = (*views.context, *views.target)
+        assert len(views.context) == sampler.num_views(step)
+        assert len(views.target) == 2
+        assert len(set(chosen)) == len(chosen)
+        assert set(chosen) <= set(frames)
+        window = max(len(chosen), round(1.5 * len(views.context)))
+        assert max(chosen) - min(chosen) <= 2 * (window - 1)
+        starts.add(views.context[0])
+    assert len(starts) > 100
+
+
+def test_devices_own_disjoint_places_of_the_row():
+    views = ViewSampler(2, 6, max_images=12)
+    places = [place for step in range(50) for rank in range(3) for place in views.slots(step, rank, 3)]
+    assert len(places) == len(set(places))
+    assert places == sorted(places)
+
+
+def test_scenes_of_one_step_draw_different_views():
+    sampler = ViewSampler(4, 4)
+    assert sampler.views(0, "a", range(100), 0).context != sampler.views(0, "a", range(100), 1).context
+
+
+def test_a_step_does_not_depend_on_where_the_iteration_began():
+    source = SyntheticScenes(9, num_frames=12)
+    views = ViewSampler(2, 4, max_images=8, target_views=1, seed=5)
+    whole = StepSampler(source, source.scenes, views, steps=10)
+    expected = [whole.step(step) for step in range(20)]
+    assert list(whole) == expected[:10]
+    resumed = StepSampler(source, source.scenes, views, steps=10, start_step=lambda: 7)
+    assert list(resumed) == expected[7:10]  # up to the end of the epoch
+    second_epoch = StepSampler(source, source.scenes, views, steps=10, start_step=lambda: 10)
+    assert list(second_epoch) == expected[10:20]
+    other_seed = StepSampler(source, source.scenes, ViewSampler(2, 4, 8, target_views=1, seed=6), steps=10)
+    assert list(other_seed) != expected[:10]
+
+
+def test_scenes_that_are_too_short_are_counted_and_left_out(caplog):
+    source = SyntheticScenes(3, num_frames=5)
+    lengths = {"room-000000": 3, "room-000001": 5, "room-000002": 4}
+    source.frames = lambda scene: range(lengths[scene])
+    with caplog.at_level(logging.WARNING):
+        assert usable_scenes(source, ViewSampler(2, 4), None) == ["room-000001", "room-000002"]
+    assert "1 of 3 training scenes" in caplog.text
+    with pytest.raises(DataError, match=r"longest has 5 .* at most 3"):
+        usable_scenes(source, ViewSampler(6, 6, target_views=2), None)
+    with pytest.raises(DataError, match=r"longest has 5 that are not held out: lower data.target_views \(now 8\)"):
+        usable_scenes(source, ViewSampler(2, 2, target_views=8), None)
+    source.frames = lambda scene: ()
+    with pytest.raises(DataError, match="longest has 0 that are not held out: use longer scenes"):
+        usable_scenes(source, ViewSampler(2, 2, target_views=8), None)
+
+
+def test_scenes_that_cannot_be_indexed_are_named_and_left_out(caplog):
+    source = SyntheticScenes(3, num_frames=5)
+
+    def frames(scene):
+        if scene == "room-000001":
+            raise DataError("cannot read poses.txt of scene room-000001")
+        return range(5)
+
+    source.frames = frames
+    with caplog.at_level(logging.WARNING):
+        assert usable_scenes(source, ViewSampler(2, 4), None) == ["room-000000", "room-000002"]
+    assert "room-000001 is left out: cannot read poses.txt" in caplog.text
+    assert "1 of 3 training scenes cannot be read" in caplog.text
+    with pytest.raises(DataError, match="1 scenes cannot be read"):
+        usable_scenes(source, ViewSampler(6, 6), None)
+
+
+def test_one_frame_is_enough_for_one_view():
+    source = SyntheticScenes(1, num_frames=1)
+    sampler = ViewSampler(1, 1)
+    assert usable_scenes(source, sampler, None) == ["room-000000"]
+    assert sampler.views(4, "room-000000", [0], 0).context == (0,)
+
+
+@pytest.mark.parametrize("arguments", [(0, 3), (4, 3), (3, 4, 8, 0.5), (3, 4, 8, 2.0, -1), (2, 8, 4)])
+def test_impossible_ranges_are_refused(arguments):
+    with pytest.raises(ValueError, match="need"):
+        ViewSampler(*arguments)

@@ -1,0 +1,198 @@
+from dataclasses import asdict, replace
+
+import pytest
+import torch
+
+from vg2gt.evaluation import EvaluationOptions, PointOptions, SceneEvaluator, SceneResult, evaluate_scene
+from vg2gt.evaluation.evaluator import MODES, PROTOCOLS
+from vg2gt.evaluation.protocols import ground_truth_target_cameras, joint_target_cameras
+from vg2gt.evaluation.scores import align_geometry, point_scores
+from vg2gt.geometry.alignment import Similarity
+from vg2gt.geometry.cameras import scale_translations
+from vg2gt.geometry.normals import normals_from_depth
+from vg2gt.metrics import cv, depth_metrics, normal_metrics, psnr, ssim
+from vg2gt.profiling import clocked
+from vg2gt.types import Batch
+
+
+def test_scores_are_the_metrics_of_the_renders(result: SceneResult, batch: Batch) -> None:
+    truth = batch.target
+    render = result.renders["gt_pose"]
+    expected = {f"rendered/gt_pose/solid/{k}": v for k, v in depth_metrics(render.depth[0], truth.depth[0]).items()}
+    expected["rendered/gt_pose/solid/psnr"] = float(psnr(render.color[0], truth.images[0]).mean())
+    expected["rendered/gt_pose/solid/ssim"] = float(ssim(render.color[0], truth.images[0]).mean())
+    normals, valid = normals_from_depth(truth.depth[0], truth.cameras.intrinsics[0])
+    found = normal_metrics(render.normal[0], normals, valid & (render.depth[0] > 0))
+    expected |= {f"rendered/gt_pose/solid/normal_{k}": v for k, v in found.items()}
+    prediction = result.prediction
+    for when, geometry in (("before", prediction.initial), ("after", prediction.geometry)):
+        scores = depth_metrics(geometry.depth[0], batch.context.depth[0])
+        expected |= {f"decoded/{when}/{k}": v for k, v in scores.items()}
+    expected["scene/cv"] = cv(prediction.gaussians.means)
+    expected["scene/gaussians"] = len(prediction.gaussians)
+    assert {name: result.scores[name] for name in expected} == expected
+
+
+def test_every_protocol_and_mode_has_every_figure(result: SceneResult) -> None:
+    scores = result.scores
+    for protocol in PROTOCOLS:
+        for mode in MODES:
+            for name in ("psnr", "ssim", "abs_rel", "mae", "rmse", "coverage", "delta_1.05_holes", "normal_acc_30"):
+                assert scores[f"rendered/{protocol}/{mode}/{name}"] is not None
+    assert scores["cameras/auc_30"] is not None
+    for cloud in ("rendered", "decoded"):
+        assert 0 < (scores[f"points/{cloud}/f_score"] or 0) <= 1
+    assert (scores["scene/reconstruct_seconds"] or 0) > (scores["scene/head_seconds"] or 0) > 0
+    assert not any(name.endswith("lpips") for name in scores)
+
+
+def test_context_renders_are_of_the_inputs(result: SceneResult, batch: Batch) -> None:
+    assert result.renders["context"].color.shape[1] == batch.num_context
+    expected = float(psnr(result.renders["context"].color[0], batch.context.images[0]).mean())
+    assert result.scores["rendered/context/solid/psnr"] == expected
+
+
+def test_without_true_depth_what_needs_it_is_none_and_not_zero(evaluator: SceneEvaluator, batch: Batch) -> None:
+    blind = replace(batch, depth=torch.zeros_like(batch.depth))
+    # The backbone is told the depth all the same: the oracle has nothing else.
+    encode = evaluator.model.backend.encode
+    evaluator.model.backend.encode = (
+        lambda images, hints: encode(  # pyright: ignore[reportAttributeAccessIssue]
+            images, replace(batch.hints if hints is None else hints, depth=batch.depth[:, : images.shape[1]])
+        )
+    )
+    try:
+        scores = evaluator(blind).scores
+    finally:
+        del evaluator.model.backend.encode
+    for name in ("abs_rel", "coverage", "delta_1.05_holes", "normal_mean"):
+        assert scores[f"rendered/gt_pose/solid/{name}"] is None
+    assert scores["decoded/after/abs_rel"] is None
+    assert scores["rendered/gt_pose/solid/psnr"] is not None
+    assert "points/decoded/chamfer" not in scores
+
+
+def test_without_targets_or_true_cameras(evaluator: SceneEvaluator, batch: Batch) -> None:
+    inputs_only = evaluator(batch.context)
+    assert set(inputs_only.renders) == {"context"}
+    unposed = evaluator(batch, has_cameras=False)
+    assert set(unposed.renders) == {"context", "novel"}
+    assert not any(name.startswith(("cameras", "points", "rendered/gt_pose")) for name in unposed.scores)
+    one_view = replace(batch, num_context=1)
+    assert "cameras/auc_5" not in evaluator(one_view).scores
+
+
+def test_options_reach_the_metrics(module_and_batch, result: SceneResult, batch: Batch) -> None:
+    module, _ = module_and_batch
+    depth = batch.target.depth
+    middle = float(depth[depth > 0].median())
+    options = EvaluationOptions(alignment="scene", depth_range=(None, middle), neighbors=3)
+    scores = SceneEvaluator(module.model, module.renderer, options)(batch).scores
+    render = result.renders["gt_pose"]
+    expected = depth_metrics(render.depth[0], depth[0], "scene", 0.0, middle)
+    assert scores["rendered/gt_pose/solid/abs_rel"] == expected["abs_rel"]
+    assert scores["scene/cv"] != result.scores["scene/cv"]
+    with pytest.raises(ValueError, match=r"alignment='affine'"):
+        EvaluationOptions(alignment="affine")
+    with pytest.raises(ValueError, match="neighbors >= 1"):
+        EvaluationOptions(neighbors=0)
+
+
+def test_true_depth_out_of_range_is_unknown_to_every_figure(module_and_batch, batch: Batch) -> None:
+    module, _ = module_and_batch
+    middle = float(batch.depth[batch.depth > 0].median())
+    near = replace(batch, depth=torch.where(batch.depth <= middle, batch.depth, 0.0))
+    limited = SceneEvaluator(module.model, module.renderer, EvaluationOptions(depth_range=(None, middle)))(batch)
+    target, render = near.target, limited.renders["gt_pose"]
+    normals, valid = normals_from_depth(target.depth[0], target.cameras.intrinsics[0])
+    expected = normal_metrics(render.normal[0], normals, valid & (render.depth[0] > 0))["mean"]
+    assert limited.scores["rendered/gt_pose/solid/normal_mean"] == expected
+    similarity = align_geometry(limited.prediction.geometry, near.context)
+    assert similarity is not None
+    geometry, options = limited.prediction.geometry, asdict(PointOptions())
+    points = point_scores(geometry.depth, geometry.cameras, near.context, similarity, **options)
+    assert limited.scores["points/decoded/f_score"] == points["f_score"]
+
+
+def test_points_of_unknown_pixels_are_not_wrong(batch: Batch) -> None:
+    context = batch.context
+    holes = torch.zeros_like(context.depth, dtype=torch.bool)
+    holes[:, :, :, ::2] = True
+    holes[:, 0] = True  # a view without any depth
+    truth = replace(context, depth=torch.where(holes, 0.0, context.depth))
+    perfect = Similarity(torch.ones(1), torch.eye(3)[None], torch.zeros(1, 3))
+    scores = point_scores(context.depth, context.cameras, truth, perfect, threshold=1e-4)
+    assert scores["precision"] == scores["recall"] == 1
+    assert scores["accuracy"] == 0
+
+
+def test_placeholder_cameras_score_no_normals(evaluator: SceneEvaluator, batch: Batch) -> None:
+    scores = evaluator(batch, has_cameras=False).scores
+    assert "rendered/novel/solid/psnr" in scores
+    assert not any("normal" in name for name in scores)
+
+
+@pytest.mark.parametrize("bounds", [(5, 1), (None, 0), (-1, None), (2, 2)])
+def test_a_range_without_depths_is_refused(bounds) -> None:
+    with pytest.raises(ValueError, match=r"depth_range=.* leaves no depth"):
+        EvaluationOptions(depth_range=bounds)
+
+
+@pytest.mark.parametrize("name", ["threshold", "downsample", "cap"])
+def test_lengths_are_positive(name: str) -> None:
+    with pytest.raises(ValueError, match=rf"evaluation\.points\.{name}=-1"):
+        PointOptions(**{name: -1})
+
+
+@pytest.mark.parametrize("views", [1, 3])
+def test_the_joint_pass_may_have_another_unit(module_and_batch, batch: Batch, views: int) -> None:
+    """As backbones without metric scale have: three times larger as soon as held-out views are seen too."""
+    module, _ = module_and_batch
+    inputs = replace(batch, num_context=views)
+    decode = module.model.backend.decode
+
+    def rescaled(tokens):
+        geometry = decode(tokens)
+        larger = scale_translations(geometry.cameras, torch.full((1,), 3.0))
+        return replace(geometry, depth=geometry.depth * 3, cameras=larger)
+
+    with torch.no_grad():
+        prediction = module.model(inputs.context.images, inputs.context.hints)
+    plain = joint_target_cameras(module.model, inputs, prediction)
+    module.model.backend.decode = rescaled
+    try:
+        found = joint_target_cameras(module.model, inputs, prediction)
+    finally:
+        del module.model.backend.decode
+    torch.testing.assert_close(found.world_to_camera, plain.world_to_camera, rtol=1e-4, atol=1e-5)
+
+
+def test_the_figures_of_training_runs(module_and_batch, batch: Batch) -> None:
+    """What ``train.py`` reports, spelt out once more."""
+    module, _ = module_and_batch
+    found = evaluate_scene(module.model, module.renderer, batch)
+    with torch.no_grad():
+        prediction = module.model(batch.context.images, batch.context.hints)
+        cameras = ground_truth_target_cameras(batch, prediction)
+        solid = module.renderer(prediction.gaussians, cameras, mode="solid")
+        flat = module.renderer(prediction.gaussians, cameras, mode="rasterized")
+    depth = depth_metrics(solid.depth[0], batch.target.depth[0], "scene")
+    for name in ("abs_rel", "delta_1.05", "coverage"):
+        assert found[name] == depth[name]
+    assert found["psnr"] == float(psnr(solid.color[0], batch.target.images[0]).mean())
+    assert found["abs_rel_rasterized"] == depth_metrics(flat.depth[0], batch.target.depth[0], "scene")["abs_rel"]
+    decoded = depth_metrics(prediction.geometry.depth[0], batch.context.depth[0], "scene")
+    assert found["decoded_abs_rel"] == decoded["abs_rel"]
+    with pytest.raises(ValueError, match="held-out views"):
+        evaluate_scene(module.model, module.renderer, batch.context)
+
+
+def test_the_clock_leaves_the_model_as_it_was(module_and_batch, batch: Batch) -> None:
+    module, _ = module_and_batch
+    model = module.model
+    with clocked(torch.device("cpu")) as clock:
+        model(batch.context.images, batch.context.hints)
+    assert 0 < clock.before_head < clock.total
+    assert clock.head == clock.total - clock.before_head
+    assert "encode" not in vars(model.backend)
+    assert "forward" not in vars(model.coarse)

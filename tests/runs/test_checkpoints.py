@@ -1,0 +1,238 @@
+"""Checkpoints: atomic, newest valid, no code execution, initialisation from weights."""
+
+import io
+import logging
+import os
+import pickle
+import zipfile
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from tests.reliability.crash_harness import assert_equal
+from vg2gt.runs.checkpoints import AtomicCheckpointIO, initialize_from, newest_valid, read_checkpoint, remove_leftovers
+
+
+def test_save_is_atomic_and_reads_back(tmp_path: Path) -> None:
+    path = tmp_path / "checkpoints" / "step-3.ckpt"
+    AtomicCheckpointIO().save_checkpoint({"global_step": 3, "state_dict": {"w": torch.arange(4.0)}}, path)
+    assert torch.equal(read_checkpoint(path)["state_dict"]["w"], torch.arange(4.0))
+    assert [p.name for p in path.parent.iterdir()] == ["step-3.ckpt"]
+
+
+def test_failed_write_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "step-3.ckpt"
+    writer = AtomicCheckpointIO()
+    writer.save_checkpoint({"global_step": 3}, path)
+
+    def full(*args: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("torch.save", full)
+    with pytest.raises(OSError, match=r"earlier checkpoints are intact"):
+        writer.save_checkpoint({"global_step": 4}, path)
+    assert read_checkpoint(path)["global_step"] == 3
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+@pytest.mark.parametrize("values", [10, 1_000_000])
+def test_full_disk_is_one_error_that_names_the_file(tmp_path: Path, values: int) -> None:
+    writer = AtomicCheckpointIO()
+    writer.save_checkpoint({"global_step": 3}, tmp_path / "step-3.ckpt")
+    (tmp_path / "step-4.ckpt.tmp").symlink_to("/dev/full")
+    with pytest.raises(OSError, match=r"step-4\.ckpt could not be written \(.*No space left.*go on with ckpt=last"):
+        writer.save_checkpoint({"global_step": 4, "w": torch.zeros(values)}, tmp_path / "step-4.ckpt")
+    assert [path.name for path in tmp_path.iterdir()] == ["step-3.ckpt"]
+    assert newest_valid(tmp_path).name == "step-3.ckpt"
+
+
+def test_file_and_folder_reach_the_disk_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    done: list[str] = []
+    fsync, replace = os.fsync, os.replace
+
+    def noted_fsync(descriptor: int) -> None:
+        done.append(Path(os.readlink(f"/proc/self/fd/{descriptor}")).name)
+        fsync(descriptor)
+
+    def noted_replace(source: Path, target: Path) -> None:
+        done.append("rename")
+        replace(source, target)
+
+    monkeypatch.setattr("os.fsync", noted_fsync)
+    monkeypatch.setattr("os.replace", noted_replace)
+    AtomicCheckpointIO().save_checkpoint({"global_step": 3}, tmp_path / "step-3.ckpt")
+    assert done == ["step-3.ckpt.tmp", "rename", tmp_path.name]
+
+
+def test_newest_valid_passes_over_damaged_files(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    writer = AtomicCheckpointIO()
+    for step in (9, 10, 100):
+        writer.save_checkpoint({"global_step": step}, tmp_path / f"step-{step}.ckpt")
+    assert newest_valid(tmp_path).name == "step-100.ckpt"
+    content = (tmp_path / "step-100.ckpt").read_bytes()
+    (tmp_path / "step-100.ckpt").write_bytes(content[: len(content) // 2])
+    with caplog.at_level(logging.WARNING):
+        assert newest_valid(tmp_path).name == "step-10.ckpt"
+    assert "step-100.ckpt" in caplog.text
+
+
+def test_no_valid_checkpoint_is_an_error(tmp_path: Path) -> None:
+    (tmp_path / "step-1.ckpt").write_bytes(b"nothing")
+    with pytest.raises(FileNotFoundError, match=r"no valid checkpoint in .* \(1 damaged\).* overwrite=true"):
+        newest_valid(tmp_path)
+
+
+def test_whatever_bears_the_name_is_passed_over(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    AtomicCheckpointIO().save_checkpoint({"global_step": 1}, tmp_path / "step-1.ckpt")
+    (tmp_path / "step-2.ckpt").touch()
+    (tmp_path / "step-3.ckpt").mkdir()
+    (tmp_path / "step-4.ckpt").symlink_to("nowhere")
+    torch.save([1, 2], tmp_path / "step-5.ckpt")
+    torch.save({"global_step": 6}, tmp_path / "step-6.ckpt", _use_new_zipfile_serialization=False)
+    with zipfile.ZipFile(tmp_path / "step-1.ckpt") as stored, zipfile.ZipFile(tmp_path / "step-7.ckpt", "w") as packed:
+        for name in stored.namelist():
+            packed.writestr(name, stored.read(name), zipfile.ZIP_DEFLATED)
+    with caplog.at_level(logging.WARNING):
+        assert newest_valid(tmp_path).name == "step-1.ckpt"
+    assert [f"step-{step}.ckpt" in caplog.text for step in range(1, 8)] == [False, *[True] * 6]
+
+
+def test_flipped_bits_in_weights_are_found(tmp_path: Path) -> None:
+    """torch.load alone takes them."""
+    path, weights = tmp_path / "step-1.ckpt", torch.arange(1000.0)
+    AtomicCheckpointIO().save_checkpoint({"w": weights}, path)
+    content = bytearray(path.read_bytes())
+    content[content.find(weights.numpy().tobytes()) + 2001] ^= 4
+    path.write_bytes(content)
+    assert not torch.equal(torch.load(path, weights_only=True)["w"], weights)
+    with pytest.raises(ValueError, match="wrong checksum of"):
+        read_checkpoint(path)
+
+
+def state(seed: int) -> dict[str, Any]:
+    """What a training saves, small."""
+    module = nn.Linear(16, 16)
+    generator = torch.Generator().manual_seed(seed)
+    nn.init.normal_(module.weight, generator=generator)
+    optimizer = torch.optim.AdamW(module.parameters())
+    module(torch.ones(1, 16)).sum().backward()
+    optimizer.step()
+    return {
+        "state_dict": module.state_dict(),
+        "optimizer_states": [optimizer.state_dict()],
+        "global_step": seed,
+        "loops": {"fit_loop": {"total": {"ready": seed}}},
+        "backend": {"name": "oracle"},
+    }
+
+
+def mutations(content: bytes, other: bytes, count: int, seed: int) -> Iterator[tuple[str, bytes]]:
+    """Damaged versions of a file: ``count`` of every kind."""
+    generator = np.random.default_rng(seed)
+    size = len(content)
+    for _ in range(count):
+        start, end = sorted(int(n) for n in generator.integers(0, size, 2))
+        yield "truncated", content[:start]
+        flipped = bytearray(content)
+        flipped[start] ^= 1 << int(generator.integers(8))
+        yield "one bit", bytes(flipped)
+        for place in generator.integers(0, size, 20):
+            flipped[place] ^= 1 << int(generator.integers(8))
+        yield "21 bits", bytes(flipped)
+        yield "stretch of zeros", content[:start] + bytes(end - start) + content[end:]
+        yield "stretch lost", content[:start] + content[end:]
+        yield "stretch twice", content[:end] + content[start:]
+        yield "stretch of noise", content[:start] + generator.bytes(end - start) + content[end:]
+        yield "begins as another", other[:start] + content[start:]
+        yield "ends as another", content[:start] + other[start:]
+        yield "appended", content + other[start:]
+
+
+def test_damaged_checkpoints_are_never_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Either refused or, where only padding was hit, exactly what was saved; nothing is executed."""
+    monkeypatch.chdir(tmp_path)
+    first, second = state(1), state(2)
+    writer = AtomicCheckpointIO()
+    writer.save_checkpoint(first, tmp_path / "step-1.ckpt")
+    writer.save_checkpoint(second, tmp_path / "step-2.ckpt")
+    malicious = io.BytesIO()
+    torch.save({"state_dict": Malicious(), "padding": torch.zeros(2000)}, malicious)
+    content, tried, refused = (tmp_path / "step-2.ckpt").read_bytes(), Counter(), Counter()
+    others = ((tmp_path / "step-1.ckpt").read_bytes(), malicious.getvalue())
+    for seed, other in enumerate(others):
+        for kind, damaged in mutations(content, other, count=30, seed=seed):
+            if damaged == content:
+                continue
+            (tmp_path / "step-2.ckpt").write_bytes(damaged)
+            taken = newest_valid(tmp_path)
+            tried[kind] += 1
+            refused[kind] += taken.name == "step-1.ckpt"
+            if taken.name == "step-2.ckpt":
+                found = read_checkpoint(taken)
+                # Appended files may be another whole checkpoint, which is as valid as the one before it.
+                whole = [saved for saved in (first, second) if saved["global_step"] == found["global_step"]]
+                assert_equal(whole[0], found, kind)
+    assert not (tmp_path / "executed").exists()
+    print(f"{sum(tried.values())} mutations, {sum(refused.values())} refused: {dict(tried - refused)} were harmless")
+    assert sum(tried.values()) >= 500
+    assert all(refused[kind] > 0.8 * tried[kind] for kind in tried if kind != "appended")
+
+
+def test_leftovers_are_cleared(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    folder = tmp_path / "checkpoints"
+    writer = AtomicCheckpointIO()
+    for step in (1, 2, 3):
+        writer.save_checkpoint({"global_step": step}, folder / f"step-{step}.ckpt")
+    (folder / "step-3.ckpt").write_bytes(b"damaged")
+    (folder / "step-3.ckpt.damaged").write_bytes(b"damaged before")
+    (folder / "step-4.ckpt").mkdir()
+    (folder / "step-5.ckpt.tmp").write_bytes(b"half")
+    (tmp_path / ".metrics.json.123.tmp").write_bytes(b"half")
+    (tmp_path / "notes.tmp").write_bytes(b"the user's")
+    remove_leftovers(tmp_path, newest_valid(folder))
+    assert sorted(path.name for path in folder.iterdir()) == [
+        "step-1.ckpt",
+        "step-2.ckpt",
+        "step-3.ckpt.damaged",
+        "step-3.ckpt.damaged-2",
+        "step-4.ckpt.damaged",
+    ]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["checkpoints", "notes.tmp"]
+    assert "goes on from step-2.ckpt" in caplog.text
+
+
+class Malicious:
+    def __reduce__(self):
+        return (Path.touch, (Path("executed"),))
+
+
+def test_loading_never_executes_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    torch.save({"state_dict": Malicious()}, tmp_path / "step-1.ckpt")
+    (tmp_path / "step-2.ckpt").write_bytes(pickle.dumps(Malicious()))
+    for name in ("step-1.ckpt", "step-2.ckpt"):
+        with pytest.raises(ValueError, match="damaged or not a checkpoint"):
+            AtomicCheckpointIO().load_checkpoint(tmp_path / name, weights_only=False)
+    assert not (tmp_path / "executed").exists()
+
+
+def test_initialize_from_names_the_layers_that_start_anew(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    old = nn.ModuleDict({"body": nn.Linear(4, 4), "out": nn.Linear(4, 28)})
+    new = nn.ModuleDict({"body": nn.Linear(4, 4), "out": nn.Linear(4, 14)})
+    fresh, trained = new.state_dict()["out.weight"].clone(), old.state_dict()["body.weight"]
+    path = tmp_path / "step-5.ckpt"
+    AtomicCheckpointIO().save_checkpoint({"state_dict": old.state_dict()}, path)
+    with caplog.at_level(logging.INFO):
+        initialize_from(new, path)
+    assert torch.equal(new.state_dict()["body.weight"], trained)
+    assert torch.equal(new.state_dict()["out.weight"], fresh)
+    assert "re-initialised layers: out" in caplog.text
+    with pytest.raises(ValueError, match="none of its"):
+        initialize_from(nn.ModuleDict({"other": nn.Linear(2, 2)}), path)

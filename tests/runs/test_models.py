@@ -1,0 +1,87 @@
+from pathlib import Path
+
+import pytest
+import torch
+
+import vg2gt
+from vg2gt.reconstruction import OutOfMemory, load_model
+from vg2gt.runs.models import split_outside_brackets
+
+
+def test_a_run_is_rebuilt_with_its_weights(run_folder: Path, ready) -> None:
+    loaded = load_model(run_folder, device="cpu")
+    marked = loaded.model.get_parameter("gaussians.out.bias") - ready.model.get_parameter("gaussians.out.bias")
+    assert torch.allclose(marked, torch.full_like(marked, 0.25))
+    assert str(loaded.weights).endswith("step-7.ckpt (step 7)")
+    assert not loaded.model.training
+
+
+def test_options_change_parts(run_folder: Path) -> None:
+    options = ["model.fine.max_voxels=50", "renderer.near=0.5"]
+    loaded = load_model(run_folder, "oracle,depth_noise=0.5,taps=4", options=options, device="cpu")
+    assert loaded.model.backend.depth_noise == 0.5
+    assert loaded.model.get_submodule("fine").max_voxels == 50
+    assert loaded.renderer.near == 0.5
+
+
+def test_lists_are_values() -> None:
+    assert split_outside_brackets("da3_tiny, taps=[0,1],path={a: 1,b: 2}") == [
+        "da3_tiny",
+        "taps=[0,1]",
+        "path={a: 1,b: 2}",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ({}, "name a checkpoint, or a backend .*oracle"),
+        ({"backend": "dinosaur"}, "unknown backend 'dinosaur'; choose one of: .*da3_tiny"),
+        ({"backend": "oracle,noise=1"}, "oracle has no option 'noise'; it has .*depth_noise"),
+        ({"backend": "oracle,taps"}, "must be key=value"),
+        ({"backend": "oracle", "model": "huge"}, "unknown model 'huge'"),
+        ({"backend": "oracle", "options": ["loss.x=1"]}, "must begin with one of"),
+        ({"backend": "oracle,depth_noise=-1"}, "noise must not be negative"),
+    ],
+)
+def test_what_is_unknown_is_named(arguments, said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        load_model(**arguments)
+
+
+def test_another_backbone_is_refused(run_folder: Path) -> None:
+    with pytest.raises(ValueError, match=r"trained on backbone .*oracle.*this run uses .*da3_tiny"):
+        load_model(run_folder, "da3_tiny", device="cpu")
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        load_model("nowhere")
+
+
+def test_python_interface(run_folder: Path, recording: Path, tmp_path: Path) -> None:
+    loaded = vg2gt.load_model(run_folder, device="cpu")
+    scene = vg2gt.reconstruct_with(loaded.model, recording, size=56, max_images=2)
+    assert isinstance(scene, vg2gt.Scene)
+    assert scene.images.shape == (2, 3, 42, 56)
+    assert scene.names == ("008", "011")
+    again = vg2gt.reconstruct(recording, run_folder, size=56, max_images=2, device="cpu")
+    assert torch.equal(again.gaussians.means, scene.gaussians.means)
+    scene.save(tmp_path / "out", ["scene.ply"])
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["scene.ply"]
+
+
+@pytest.mark.parametrize("error", [torch.OutOfMemoryError("CUDA out of memory"), MemoryError("no more")])
+def test_full_memory_names_the_knobs(error: Exception, ready, recording: Path, monkeypatch) -> None:
+    def fail(*args, **kwargs):
+        raise error
+
+    monkeypatch.setattr(ready.model.fine, "forward", fail)
+    with pytest.raises(OutOfMemory, match=r"4 images of 84x112.*--max-images.*--size.*head_chunk"):
+        vg2gt.reconstruct_with(ready.model, recording)
+
+
+def test_other_errors_stay_what_they_are(ready, recording: Path, monkeypatch) -> None:
+    def fail(*args, **kwargs):
+        raise RuntimeError("shapes cannot be multiplied")
+
+    monkeypatch.setattr(ready.model.fine, "forward", fail)
+    with pytest.raises(RuntimeError, match="shapes"):
+        vg2gt.reconstruct_with(ready.model, recording)

@@ -1,0 +1,232 @@
+"""The ablation study at the size of a test: a full model of two steps, continuations of one."""
+
+import gc
+import json
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import vg2gt.studies.study
+from tests.training_helpers import SMALL
+from vg2gt.runs.checkpoints import AtomicCheckpointIO, newest_valid, read_checkpoint
+from vg2gt.studies.ablation import (
+    CONTROL,
+    FULL,
+    OUR_COLUMNS,
+    PAPER_COLUMNS,
+    Ablation,
+    _verdict,
+    common_overrides,
+    continuations,
+)
+from vg2gt.studies.study import run_once
+from vg2gt.training.module import VG2GTModule
+
+ROOT = Path(__file__).resolve().parents[2]
+QUIET = [override for override in SMALL if not override.startswith("trainer.max_steps")]
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("rooms")
+
+
+def study(folder: Path, cache: Path, *overrides: str, steps: int = 1, splits: tuple[int, ...] = (1, 2)) -> Ablation:
+    return Ablation(folder, [*QUIET, f"data.cache_dir={cache}", *overrides], 1, 2, steps, 1e-4, ["wo_split"], splits)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory, cache: Path) -> Path:
+    folder = tmp_path_factory.mktemp("ablation")
+    study(folder, cache).run()
+    return folder
+
+
+def test_every_row_is_run_once() -> None:
+    names = [run.name for run in continuations(["wo_depth", "wo_split"], [1, 2, 3, 4], full_splits=2)]
+    assert names == [FULL, "wo_depth", "wo_split", "splits=3", "splits=4", CONTROL]
+    names = [run.name for run in continuations([], [1, 2], full_splits=4)]
+    assert names == [FULL, "splits=1", "splits=2", CONTROL]
+    assert [run.name for run in continuations(["wo_depth"], [2], full_splits=2)] == [FULL, "wo_depth"]
+
+
+def test_results_and_tables(finished: Path) -> None:
+    metrics = json.loads((finished / "metrics.json").read_text())
+    assert set(metrics["runs"]) == {FULL, "wo_split", CONTROL}
+    assert all(set(runs) == {"0"} for runs in metrics["runs"].values())
+    full, variant = (metrics["runs"][name]["0"] for name in (FULL, "wo_split"))
+    assert variant["gaussians"] < 0.7 * full["gaussians"]
+    difference = metrics["summary"]["wo_split"]["abs_rel"]["difference"]
+    assert difference == pytest.approx(variant["abs_rel"] - full["abs_rel"])
+    report = (finished / "metrics.md").read_text()
+    assert "| w/o Split |" in report
+    assert "| *paper* | *28.19* | *0.865* |" in report
+    assert "| splits=2 |" in report
+    assert "1 of 1 seeds complete" in report
+    assert "n/a" in report  # LPIPS where it was not measured
+
+
+def test_all_continue_from_the_same_full_model(finished: Path) -> None:
+    """The full model goes on as long as every variant does, and only a new last layer starts anew."""
+    home = finished / "seed-0"
+    start = read_checkpoint(newest_valid(home / "start" / "checkpoints"))
+    assert start["global_step"] == 2
+    layer = "model.gaussians.out.weight"
+    untrained = json.loads((home / "full" / "untrained.json").read_text())
+    assert untrained == json.loads((home / "start" / "metrics.json").read_text())["trained"]
+    for name in (FULL, "wo_split", CONTROL):
+        end = read_checkpoint(newest_valid(home / name / "checkpoints"))
+        assert end["global_step"] == 1
+        hidden = "model.gaussians.hidden.weight"
+        moved = (end["state_dict"][hidden] - start["state_dict"][hidden]).abs().max()
+        assert 0 < float(moved) < 5e-3
+        if name == CONTROL:
+            assert float((end["state_dict"][layer] - start["state_dict"][layer]).abs().max()) > 0.02
+
+
+def test_finished_runs_are_not_repeated(finished: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(vg2gt.studies.study, "train", lambda config: pytest.fail(f"trained {config.output_dir}"))
+    again = study(finished, cache)
+    again.run()
+    assert {name: set(runs) for name, runs in again.results.items()} == {name: {0} for name in again.results}
+
+
+def test_interrupted_run_goes_on(finished: Path, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What was saved is used: the result equals the uninterrupted one's."""
+    folder = tmp_path / "copy"
+    shutil.copytree(finished, folder)
+    before = json.loads((folder / "seed-0" / "start" / "metrics.json").read_text())
+    (folder / "seed-0" / "start" / "metrics.json").unlink()
+    trained: list[str] = []
+    train = vg2gt.studies.study.train
+
+    def watched(config):
+        trained.append(f"{Path(config.output_dir).name} ckpt={config.ckpt}")
+        return train(config)
+
+    monkeypatch.setattr(vg2gt.studies.study, "train", watched)
+    study(folder, cache).run()
+    assert trained == ["start ckpt=auto"]
+    assert json.loads((folder / "seed-0" / "start" / "metrics.json").read_text()) == before
+
+
+def test_an_interruption_ends_the_study(cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(vg2gt.studies.study, "train", lambda config: {})
+    with pytest.raises(SystemExit) as ended:
+        study(tmp_path, cache).run()
+    assert ended.value.code == 143
+
+
+def test_other_settings_are_refused(finished: Path, cache: Path) -> None:
+    with pytest.raises(ValueError, match=r"trainer\.max_steps.*choose another name="):
+        study(finished, cache, steps=3).run()
+    with pytest.raises(ValueError, match=r"start holds a run with other settings \(loss\.enhance\.weight\)"):
+        study(finished, cache, "loss.enhance.weight=2").run()
+
+
+def test_results_of_another_full_model_are_not_taken(finished: Path, cache: Path, tmp_path: Path) -> None:
+    """The full model's folder was deleted, as the message says, and trained longer: its continuations are stale."""
+    folder = tmp_path / "copy"
+    shutil.copytree(finished, folder)
+    shutil.rmtree(folder / "seed-0" / "start")
+    longer = Ablation(folder, [*QUIET, f"data.cache_dir={cache}"], 1, 3, 1, 1e-4, ["wo_split"], (1, 2))
+    with pytest.raises(ValueError, match=r"full holds a run that started from other weights"):
+        longer.run()
+    assert longer.results[FULL] == {}
+
+
+def test_a_full_model_whose_end_is_lost_is_refused(finished: Path, cache: Path, tmp_path: Path) -> None:
+    """Its last checkpoint is damaged: variants must not go on from an earlier one."""
+    folder = tmp_path / "copy"
+    shutil.copytree(finished, folder)
+    checkpoints = folder / "seed-0" / "start" / "checkpoints"
+    last = newest_valid(checkpoints)
+    content = read_checkpoint(last)
+    last.write_bytes(b"damaged")
+    AtomicCheckpointIO().save_checkpoint(content | {"global_step": 1}, checkpoints / "step-1.ckpt")
+    with pytest.raises(ValueError, match=r"start ran 2 steps, but its newest valid checkpoint is that of step 1"):
+        study(folder, cache).run()
+
+
+def test_one_that_diverges_does_not_stop_the_others(
+    finished: Path, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "copy"
+    shutil.copytree(finished, folder)
+    shutil.rmtree(folder / "seed-0" / "wo_split")
+
+    def diverge(config):
+        raise FloatingPointError(f"20 steps in a row in {config.output_dir}")
+
+    monkeypatch.setattr(vg2gt.studies.study, "train", diverge)
+    again = study(folder, cache)
+    again.run()
+    assert again.diverged == ["w/o Split, seed 0"]
+    assert {name for name, runs in again.results.items() if runs} == {FULL, CONTROL}
+    report = (folder / "metrics.md").read_text()
+    assert "Diverged: w/o Split, seed 0." in report
+    assert re.search(r"\| w/o Split \| n/a \|", report)
+
+
+def test_splits_are_compared_with_the_control(tmp_path: Path, cache: Path) -> None:
+    """A new last layer costs 1 dB here; two fewer splits cost nothing beyond that."""
+    some = study(tmp_path, cache)
+    for seed in range(3):
+        psnr = {FULL: 27.0 + seed, "wo_split": 26.0 + seed + 0.01 * (seed - 1), CONTROL: 26.0 + seed}
+        some.results |= {name: some.results[name] | {seed: {"psnr": value}} for name, value in psnr.items()}
+    _, against_full, against_control = some.report().rsplit("## Differences", 2)
+    assert "| w/o Split | -1.00 ± 0.02 (worse) |" in against_full
+    assert "| w/o Split | +0.00 ± 0.02 (not told apart) |" in against_control
+    assert "| VG²GT (full) |" not in against_control
+
+
+def test_a_finished_run_leaves_the_memory(tmp_path: Path, cache: Path) -> None:
+    def alive() -> int:
+        return sum(isinstance(thing, VG2GTModule) for thing in gc.get_objects())
+
+    gc.collect()
+    before = alive()
+    run_once([*SMALL, "trainer.max_steps=1", f"data.cache_dir={cache}"], tmp_path)
+    assert alive() == before
+
+
+def test_verdicts() -> None:
+    full = {seed: {"psnr": 25.0 + seed, "abs_rel": 0.02, "gaussians": 10.0} for seed in range(3)}
+    other = {seed: {"psnr": 24.0 + seed + 0.01 * seed, "abs_rel": 0.02, "gaussians": 5.0 + seed} for seed in range(3)}
+    columns = PAPER_COLUMNS | OUR_COLUMNS
+    verdict = {name: _verdict(other, full, name, columns[name]) for name in ("psnr", "abs_rel", "gaussians")}
+    assert verdict == {"psnr": "-0.99 ± 0.02 (worse)", "abs_rel": "identical", "gaussians": "-4 ± 2"}
+    far = {seed: {"abs_rel": 0.02 + 0.01 * (seed - 1)} for seed in range(3)}
+    assert _verdict(far, full, "abs_rel", columns["abs_rel"]).endswith("(not told apart)")
+    assert _verdict({0: {"psnr": 27.0}}, full, "psnr", columns["psnr"]) == "+2.00"
+
+
+def test_what_the_study_decides_cannot_be_overridden() -> None:
+    assert common_overrides(["seeds=2", "backend=da3_small", "+data.x=1"]) == ["backend=da3_small", "+data.x=1"]
+    with pytest.raises(ValueError, match=r"trainer\.max_steps is decided by the study"):
+        common_overrides(["trainer.max_steps=7"])
+
+
+def test_the_readmes_line_in_a_shell(tmp_path: Path, cache: Path) -> None:
+    """The line as printed; later overrides make it short."""
+    (line,) = re.findall(
+        r"^(python -m vg2gt\.ablate [^#\n]*?)(?: *#.*)?$", (ROOT / "README.md").read_text(), re.MULTILINE
+    )
+    short = ["name=short", "seeds=1", "full_steps=1", "steps=1", "variants=[]", "splits=[2]", *QUIET]
+    line = line.replace("python", sys.executable, 1)
+    command = " ".join([line, *(f"'{override}'" for override in [*short, f"data.cache_dir={cache}"])])
+    shown = subprocess.run(command, shell=True, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert shown.returncode == 0, shown.stderr[-3000:]
+    assert "| VG²GT (full) |" in shown.stdout
+    assert (tmp_path / "outputs" / "short" / "metrics.md").is_file()
+
+
+def test_several_devices_are_refused(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "vg2gt.studies.ablation", "trainer.devices=2"]
+    shown = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert shown.returncode != 0
+    assert "trainer.devices=2: a study runs its trainings one after another on one device" in shown.stderr

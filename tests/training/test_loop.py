@@ -1,0 +1,322 @@
+"""Whole runs: every ablation, backends, resume, bad input."""
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import lightning
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from tests.training_helpers import SMALL, full_model, small_config, with_crash
+from vg2gt.config import config_dir
+from vg2gt.data import DataError, SyntheticScenes
+from vg2gt.gaussians import GaussianHead
+from vg2gt.runs.checkpoints import newest_valid, read_checkpoint
+from vg2gt.training.loop import build, train
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("rooms")
+
+
+@pytest.fixture(scope="module")
+def full_run(tmp_path_factory: pytest.TempPathFactory, cache: Path) -> Path:
+    folder = tmp_path_factory.mktemp("full")
+    train(small_config(folder, cache))
+    return folder
+
+
+VARIANTS = [
+    "ablation=rasterized",
+    "ablation=wo_depth",
+    "ablation=wo_coarse",
+    "ablation=wo_enhance",
+    "ablation=wo_split",
+    "model.gaussians.splits=1",
+    "model.gaussians.splits=2",
+    "model.gaussians.splits=4",
+    "loss=release",
+    "backend=vggt_tiny",
+    "backend=da3_tiny",
+    "data.target_views=1",
+    "data.max_images=8",
+]
+
+
+@pytest.mark.parametrize("override", VARIANTS)
+def test_fast_dev_run(tmp_path: Path, cache: Path, override: str) -> None:
+    report = train(small_config(tmp_path, cache, "debug=fast_dev_run", override))
+    assert {"psnr", "abs_rel", "decoded_abs_rel"} <= set(report["trained"])
+    assert all(value == value for value in report["trained"].values())
+    if override == "ablation=wo_coarse":
+        assert report["trained"]["decoded_abs_rel"] == report["trained"]["decoded_abs_rel_before"]
+
+
+def test_onnx_backend_trains(tmp_path: Path, cache: Path, onnx_bundle: Path) -> None:
+    run = build(small_config(tmp_path, cache, "debug=fast_dev_run", "backend=onnx", f"backend.path={onnx_bundle}"))
+    coarse = full_model(run).coarse
+    assert coarse is not None
+    before = {name: tensor.clone() for name, tensor in coarse.state_dict().items()}
+    run.trainer.fit(run.module, datamodule=run.datamodule)
+    after = coarse.state_dict()
+    assert any(not torch.equal(tensor, before[name]) for name, tensor in after.items())
+
+
+def test_a_run_writes_its_results(full_run: Path) -> None:
+    metrics = json.loads((full_run / "metrics.json").read_text())
+    assert metrics["steps"] == 4
+    assert metrics["untrained"].keys() == metrics["trained"].keys()
+    assert "PSNR" in (full_run / "metrics.md").read_text()
+    assert (full_run / "preview.png").stat().st_size > 1000
+    assert newest_valid(full_run / "checkpoints").name == "step-4.ckpt"
+
+
+def test_checkpoint_holds_the_trained_part_only(full_run: Path) -> None:
+    checkpoint = read_checkpoint(newest_valid(full_run / "checkpoints"))
+    assert checkpoint["backend"]["name"] == "oracle"
+    assert checkpoint["state_dict"]
+    assert not [key for key in checkpoint["state_dict"] if ".backend." in key]
+
+
+def test_only_the_trained_part_changes(tmp_path: Path, cache: Path) -> None:
+    run = build(small_config(tmp_path, cache, "trainer.max_steps=2"))
+    before = {name: tensor.clone() for name, tensor in run.module.state_dict().items()}
+    run.trainer.fit(run.module, datamodule=run.datamodule)
+    changed = {name for name, tensor in run.module.state_dict().items() if not torch.equal(tensor, before[name])}
+    assert any(name.startswith("model.gaussians") for name in changed)
+    assert any(name.startswith("model.coarse") for name in changed)
+    assert not any(name.startswith("model.backend") for name in changed)
+    assert not run.module.model.backend.training
+
+
+def test_killed_and_resumed_equals_uninterrupted(tmp_path: Path, cache: Path, full_run: Path) -> None:
+    with pytest.raises(InterruptedError):
+        train(with_crash(small_config(tmp_path, cache), step=3))
+    assert newest_valid(tmp_path / "checkpoints").name == "step-2.ckpt"
+    report = train(small_config(tmp_path, cache, "ckpt=last"))
+    whole = read_checkpoint(newest_valid(full_run / "checkpoints"))
+    resumed = read_checkpoint(newest_valid(tmp_path / "checkpoints"))
+    assert resumed["global_step"] == whole["global_step"] == 4
+    for name, tensor in whole["state_dict"].items():
+        assert torch.equal(tensor, resumed["state_dict"][name]), name
+    assert report["trained"] == json.loads((full_run / "metrics.json").read_text())["trained"]
+    assert report["untrained"] == json.loads((full_run / "metrics.json").read_text())["untrained"]
+
+
+def test_sigterm_saves_and_ends(tmp_path: Path, cache: Path) -> None:
+    """In training the step is finished and saved; in the evaluation before it there is nothing to save."""
+    overrides = [*SMALL, f"output_dir={tmp_path}", f"hydra.run.dir={tmp_path}", f"data.cache_dir={cache}"]
+    overrides += ["trainer.max_steps=100000", "callbacks.checkpoint.every_n_train_steps=100000"]
+    command = [sys.executable, "-m", "vg2gt.cli.train", *overrides]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 240
+    while process.poll() is None and time.monotonic() < deadline and not trains(tmp_path):
+        time.sleep(0.2)
+    process.send_signal(signal.SIGTERM)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 0, errors[-2000:]
+    saved = newest_valid(tmp_path / "checkpoints")
+    assert read_checkpoint(saved)["global_step"] >= 1
+    assert "go on with ckpt=last" in errors
+
+
+def trains(folder: Path) -> bool:
+    return any("train/" in path.read_text() for path in folder.glob("logs/*/metrics.csv"))
+
+
+class Terminated(lightning.Callback):
+    """Sends SIGTERM to the own process in the first evaluation batch."""
+
+    def on_validation_batch_start(self, *args: object) -> None:
+        signal.raise_signal(signal.SIGTERM)
+
+
+def test_sigterm_in_an_evaluation_ends_the_run(tmp_path: Path, cache: Path) -> None:
+    run = build(small_config(tmp_path, cache))
+    run.trainer.callbacks.append(Terminated())  # pyright: ignore[reportAttributeAccessIssue]
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(SystemExit) as ended:
+        run.trainer.validate(run.module, datamodule=run.datamodule, verbose=False)
+    assert ended.value.code == 143
+    assert signal.getsignal(signal.SIGTERM) == before
+
+
+def test_a_run_never_restarts_silently(full_run: Path, cache: Path, tmp_path: Path) -> None:
+    with pytest.raises(FileExistsError, match="ckpt=last"):
+        train(small_config(full_run, cache))
+    with pytest.raises(FileNotFoundError, match="no valid checkpoint"):
+        train(small_config(tmp_path, cache, "ckpt=last"))
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        train(small_config(tmp_path, cache, "ckpt=nowhere.ckpt"))
+
+
+def test_a_resumed_run_names_what_changed(full_run: Path, cache: Path, tmp_path: Path, caplog) -> None:
+    copied = tmp_path / "copy"
+    shutil.copytree(full_run, copied)
+    report = train(small_config(copied, cache, "ckpt=last", "trainer.max_steps=5", "loss.enhance.weight=2"))
+    assert report["steps"] == 5
+    warning = next(r.getMessage() for r in caplog.records if "differs from the interrupted" in r.getMessage())
+    assert "loss.enhance.weight" in warning
+    assert "trainer.max_steps" in warning
+    with pytest.raises(FileExistsError, match="not the newest checkpoint"):
+        train(small_config(copied, cache, f"ckpt={copied / 'checkpoints' / 'step-2.ckpt'}"))
+
+
+def test_another_backbone_is_refused(full_run: Path, cache: Path, tmp_path: Path) -> None:
+    checkpoint = newest_valid(full_run / "checkpoints")
+    with pytest.raises(ValueError, match="trained on backbone"):
+        train(small_config(tmp_path, cache, f"ckpt={checkpoint}", "backend.seed=1"))
+
+
+def test_another_architecture_is_refused(full_run: Path, cache: Path, tmp_path: Path) -> None:
+    checkpoint = newest_valid(full_run / "checkpoints")
+    with pytest.raises(ValueError, match=r"first in model\.gaussians\.out"):
+        train(small_config(tmp_path, cache, f"ckpt={checkpoint}", "model.gaussians.splits=4"))
+
+
+def test_wo_split_starts_from_a_full_model(full_run: Path, cache: Path, tmp_path: Path, caplog) -> None:
+    checkpoint = newest_valid(full_run / "checkpoints")
+    config = small_config(tmp_path, cache, "ablation=wo_split", f"init_from={checkpoint}", "trainer.max_steps=1")
+    report = train(config)
+    assert report["steps"] == 1
+    fresh = next(record.getMessage() for record in caplog.records if "re-initialised" in record.getMessage())
+    assert fresh == "re-initialised layers: model.gaussians.out"
+
+
+def test_non_finite_steps_are_skipped_and_then_stop_the_run(tmp_path: Path, cache: Path, caplog) -> None:
+    run = build(small_config(tmp_path, cache, "training.max_skipped=2"))
+    before = {name: tensor.clone() for name, tensor in full_model(run).gaussians.state_dict().items()}
+    forward = run.module.loss.forward
+
+    def poisoned(*args, **kwargs):
+        report = forward(*args, **kwargs)
+        object.__setattr__(report, "total", report.total + float("nan"))
+        return report
+
+    run.module.loss.forward = poisoned
+    with pytest.raises(FloatingPointError, match="2 steps in a row"):
+        run.trainer.fit(run.module, datamodule=run.datamodule)
+    assert all(torch.equal(before[k], v) for k, v in full_model(run).gaussians.state_dict().items())
+    assert "step 0 skipped" in caplog.text
+
+
+def test_real_rgbd_recording(tmp_path: Path, shared: Path) -> None:
+    root = shared / "data" / "hololens_office_a"
+    small = [override for override in SMALL if not override.startswith(("data.train_", "data.eval_"))]
+    with initialize_config_dir(config_dir(), version_base="1.3"):
+        overrides = [f"output_dir={tmp_path}", "hydra/job_logging=default", "debug=fast_dev_run", *small]
+        config = compose("train", [*overrides, "data=rgbd", f"data.root={root}", "data.eval_context=4"])
+    report = train(config)
+    assert report["trained"]["psnr"] > 10
+    assert 0 < report["trained"]["abs_rel"] < 0.2
+
+
+def test_non_finite_gaussians_are_a_skipped_step(tmp_path: Path, cache: Path) -> None:
+    run = build(small_config(tmp_path, cache, "trainer.max_steps=2"))
+    head = full_model(run).gaussians
+    assert isinstance(head, GaussianHead)
+    with torch.no_grad():
+        head.hidden.bias[0] = float("inf")
+    before = head.out.weight.clone()
+    run.trainer.fit(run.module, datamodule=run.datamodule)
+    assert run.module.skipped.total == 2
+    assert torch.equal(head.out.weight, before)
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [("+trainer.accumulate_grad_batches=2", "accumulate"), ("+trainer.gradient_clip_algorithm=value", "use norm")],
+)
+def test_unsupported_trainer_options_are_refused(tmp_path: Path, cache: Path, override: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        train(small_config(tmp_path, cache, "debug=fast_dev_run", override))
+
+
+class WithoutDepth(SyntheticScenes):
+    """Rooms without depth."""
+
+    has_depth = False
+
+
+def test_data_that_cannot_be_trained_on_is_refused_before_anything_is_measured(tmp_path: Path, cache: Path) -> None:
+    with pytest.raises(DataError, match="WithoutDepth has no depth"):
+        train(small_config(tmp_path, cache, f"data.train._target_={__name__}.WithoutDepth"))
+    assert not list(tmp_path.iterdir())
+
+
+def test_clipping_can_be_switched_off(tmp_path: Path, cache: Path) -> None:
+    run = build(small_config(tmp_path, cache, "trainer.max_steps=1", "trainer.gradient_clip_val=0"))
+    head = full_model(run).gaussians
+    assert isinstance(head, GaussianHead)
+    before = head.out.weight.clone()
+    run.trainer.fit(run.module, datamodule=run.datamodule)
+    assert not torch.equal(head.out.weight, before)
+
+
+def test_progress_bar_can_be_switched_off(tmp_path: Path, cache: Path) -> None:
+    trainer = build(small_config(tmp_path, cache, "trainer.enable_progress_bar=false")).trainer
+    assert trainer.progress_bar_callback is None
+
+
+@pytest.mark.slow
+def test_two_processes_from_the_console_script(tmp_path: Path, cache: Path) -> None:
+    overrides = [*SMALL, f"data.cache_dir={cache}", "trainer=ddp", "trainer.max_steps=2", "name=two"]
+    script = "import vg2gt.cli; vg2gt.cli.main()"
+    run = subprocess.run(
+        [sys.executable, "-c", script, "train", *overrides], capture_output=True, text=True, cwd=tmp_path, timeout=500
+    )
+    assert run.returncode == 0, run.stderr[-3000:]
+    assert json.loads((tmp_path / "outputs" / "two" / "metrics.json").read_text())["steps"] == 2
+
+
+def cli(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "vg2gt.cli.train", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, cwd=folder, timeout=300, check=False)
+
+
+def test_help_lists_every_group(tmp_path: Path) -> None:
+    shown = cli("-h", folder=tmp_path)
+    assert shown.returncode == 0
+    for group in (
+        "ablation",
+        "backend",
+        "data",
+        "debug",
+        "experiment",
+        "logger",
+        "loss",
+        "model",
+        "renderer",
+        "trainer",
+    ):
+        assert f"\n{group}: " in shown.stdout
+
+
+def test_sweep_runs_every_variant_in_its_own_folder(tmp_path: Path, cache: Path) -> None:
+    small = [*SMALL, "debug=fast_dev_run", f"data.cache_dir={cache}"]
+    sweep = cli("-m", *small, "name=sweep", "model.gaussians.splits=1,4", folder=tmp_path)
+    assert sweep.returncode == 0, sweep.stderr[-3000:]
+    written = sorted((tmp_path / "outputs" / "sweep").glob("*/config.yaml"))
+    splits = [OmegaConf.load(path).model.gaussians.splits for path in written]
+    assert sorted(splits) == [1, 4]
+
+
+def test_misspelt_and_missing_are_named(tmp_path: Path) -> None:
+    misspelt = cli("model.gausians.splits=4", folder=tmp_path)
+    assert misspelt.returncode != 0
+    assert "gausians" in misspelt.stderr
+    unknown = cli("backend=dav3", folder=tmp_path)
+    assert "oracle" in unknown.stderr
+    missing = cli("data=rgbd", "data.root=not_here", folder=tmp_path)
+    assert missing.returncode != 0
+    assert "not_here" in missing.stderr
+    assert "data.root=" in missing.stderr
+    assert "Traceback" not in missing.stderr

@@ -1,0 +1,197 @@
+"""Which views of a scene an evaluation takes: drawn from a seed, or read from a committed index.
+
+All data sets of the paper are sequences, so views are drawn from a limited range of consecutive frames (paper, appendix
+A.2); DTU's three views are fixed. What is drawn depends on the seed, the scene's name, its frames and the number of
+views alone. An index is a JSON file with the frame ids that a draw gave, so that figures can be reproduced whatever
+becomes of the draw.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vg2gt.data.base import DataError, SceneSource
+from vg2gt.data.views.sampling import SceneSample
+from vg2gt.io.files import read_json
+
+log = logging.getLogger(__name__)
+
+INDICES = Path(__file__).resolve().parent / "indices"
+
+
+@dataclass(frozen=True)
+class ViewSelection:
+    """Chooses the input and the held-out views of evaluation scenes.
+
+    Args:
+        index: name of a committed index, or a JSON file; scenes and numbers of views that it lacks are drawn. None:
+            all are drawn.
+        targets: held-out views of a sample, as many as there are at most.
+        spread: N input views and their targets are drawn from ``spread * N`` consecutive frames.
+        seed: of the draw.
+        fixed: frame ids of the input views for some numbers of views, such as ``{3: [23, 24, 33]}``.
+
+    Raises:
+        ValueError: if a number is out of range or a fixed choice has another number of frames than it says.
+    """
+
+    index: str | None = None
+    targets: int = 4
+    spread: float = 2.0
+    seed: int = 0
+    fixed: Mapping[int, Sequence[int]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.targets < 0 or self.spread < 1:
+            raise ValueError(
+                "evaluation.selection needs targets >= 0 and spread >= 1, "
+                f"got targets={self.targets}, spread={self.spread}"
+            )
+        for count, frames in self.fixed.items():
+            if len(set(frames)) != count:
+                raise ValueError(f"evaluation.selection.fixed names {list(frames)} for {count} views")
+
+    def choose(self, source: SceneSource, scenes: Sequence[str], count: int) -> list[SceneSample]:
+        """The samples of ``count`` input views, one a scene.
+
+        Raises:
+            DataError: if a scene has too few frames, lacks one that the index or ``fixed`` names, or if the index names
+                another number of input views, a frame twice or an input view as target.
+        """
+        stored = read_index(self.index)
+        chosen = [_stored_views(stored, scene, count) or self.draw(source, scene, count) for scene in scenes]
+        drawn = [scene for scene in scenes if _stored_views(stored, scene, count) is None]
+        if drawn and self.index is not None:
+            log.warning(
+                "%s holds no %d views of %d of %d scenes (the first is %s): they are drawn with seed %d",
+                index_path(self.index).name, count, len(drawn), len(scenes), drawn[0], self.seed,
+            )  # fmt: skip
+        for views in chosen:
+            _check_frames(source, views, count)
+        return chosen
+
+    def draw(self, source: SceneSource, scene: str, count: int) -> SceneSample:
+        """Draws the views of a scene, in the order in which they were taken.
+
+        The range begins anywhere in the scene. Targets are frames that the source holds out, or, if it holds none out,
+        any that are left; both between the first and the last input view where there are some.
+
+        Raises:
+            DataError: if the scene has fewer than ``count`` frames that are not held out.
+        """
+        frames = list(source.frames(scene))
+        held_out = set(source.held_out(scene)) & set(frames)
+        rng = np.random.default_rng(
+            int.from_bytes(hashlib.sha256(f"{self.seed}/{scene}/{count}".encode()).digest(), "big")
+        )
+        if count in self.fixed:
+            context = list(self.fixed[count])
+            window = frames
+        else:
+            window = self._window(frames, held_out, scene, count, rng)
+            inputs = [frame for frame in window if frame not in held_out]
+            context = sorted(rng.choice(inputs, count, replace=False).tolist())
+        rest = [frame for frame in window if frame not in context and (frame in held_out or not held_out)]
+        rest = [frame for frame in rest if context[0] < frame < context[-1]] or rest
+        target = sorted(rng.choice(rest, min(self.targets, len(rest)), replace=False).tolist()) if rest else []
+        return SceneSample(scene, tuple(context), tuple(target))
+
+    def _window(
+        self, frames: list[int], held_out: set[int], scene: str, count: int, rng: np.random.Generator
+    ) -> list[int]:
+        """Consecutive frames, ``spread * count`` of them or as many more as the views and one held-out frame need."""
+        available = [frame for frame in frames if frame not in held_out]
+        if len(available) < count:
+            raise DataError(
+                f"scene {scene} has {len(available)} frames that are not held out, views={count} needs {count}: ask "
+                "for fewer views, or leave the scene out (data.eval_scenes, data.val.scenes)"
+            )
+        length = min(len(frames), max(round(self.spread * count), count + (0 if held_out else self.targets)))
+        start = int(rng.integers(len(frames) - length + 1))
+        needs_held_out = bool(held_out) and self.targets > 0
+
+        def suffices(window: list[int]) -> bool:
+            inputs = sum(frame not in held_out for frame in window)
+            return inputs >= count and (inputs < len(window) or not needs_held_out)
+
+        while not suffices(frames[start : start + length]):
+            length = min(len(frames), length + 1)
+            start = min(start, len(frames) - length)
+        return frames[start : start + length]
+
+
+def index_path(name: str) -> Path:
+    """The file of an index: one of the package's by name, or any by its path."""
+    return Path(name).expanduser() if name.endswith(".json") else INDICES / f"{name}.json"
+
+
+def read_index(name: str | None) -> Mapping[str, Mapping[str, Any]]:
+    """The scenes of an index: scene -> number of views -> ``context`` and ``target`` frame ids; empty for None.
+
+    Raises:
+        FileNotFoundError: if there is no such index, naming those there are.
+        ValueError: if the file is not an index.
+    """
+    if name is None:
+        return {}
+    path = index_path(name)
+    if not path.is_file():
+        known = ", ".join(sorted(p.stem for p in INDICES.glob("*.json")))
+        raise FileNotFoundError(
+            f"evaluation.selection.index={name}: no file {path}. Committed are {known}; make others with "
+            "`vg2gt data views`, or draw the views with evaluation.selection.index=null"
+        )
+    content = read_json(path)
+    scenes = content.get("scenes") if isinstance(content, dict) else None
+    if not isinstance(scenes, dict) or not all(_is_entry(v) for views in scenes.values() for v in views.values()):
+        raise ValueError(f"{path} is not an index of evaluation views (scenes -> number -> context, target)")
+    return scenes
+
+
+def make_index(selection: ViewSelection, source: SceneSource, scenes: Sequence[str], counts: Sequence[int]) -> dict:
+    """The content of an index file: what ``selection`` draws for some scenes and numbers of views."""
+    drawn = {scene: {count: selection.draw(source, scene, count) for count in sorted(counts)} for scene in scenes}
+    return {
+        "seed": selection.seed,
+        "spread": selection.spread,
+        "targets": selection.targets,
+        "scenes": {
+            scene: {
+                str(count): {"context": list(chosen.context), "target": list(chosen.target)}
+                for count, chosen in views.items()
+            }
+            for scene, views in drawn.items()
+        },
+    }
+
+
+def _is_entry(value: Any) -> bool:
+    return isinstance(value, dict) and all(isinstance(value.get(key), list) for key in ("context", "target"))
+
+
+def _stored_views(stored: Mapping[str, Mapping[str, Any]], scene: str, count: int) -> SceneSample | None:
+    entry = stored.get(scene, {}).get(str(count))
+    return SceneSample(scene, tuple(entry["context"]), tuple(entry["target"])) if entry else None
+
+
+def _check_frames(source: SceneSource, views: SceneSample, count: int) -> None:
+    named = [*views.context, *views.target]
+    if len(views.context) != count or len(set(named)) != len(named):
+        raise DataError(
+            f"the evaluation's views of scene {views.scene} are not {count} input views and others: input "
+            f"{list(views.context)}, held out {list(views.target)}; correct evaluation.selection (index, fixed), or "
+            "draw views with evaluation.selection.index=null"
+        )
+    missing = sorted({*views.context, *views.target} - set(source.frames(views.scene)))
+    if missing:
+        raise DataError(
+            f"the evaluation asks for frames {missing} of scene {views.scene}, which the data does not have: read it "
+            "with the options the index was made with (data.every), or draw views with evaluation.selection.index=null"
+        )

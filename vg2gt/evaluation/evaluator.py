@@ -1,0 +1,216 @@
+"""One scene reconstructed and scored: briefly while training, completely by the evaluate command."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import torch
+
+from vg2gt.evaluation.options import EvaluationOptions
+from vg2gt.evaluation.protocols import ground_truth_target_cameras, joint_target_cameras
+from vg2gt.evaluation.scores import (
+    align_geometry,
+    depth_scores,
+    image_scores,
+    normal_scores,
+    point_scores,
+    present,
+)
+from vg2gt.metrics import LPIPS, camera_metrics, cv
+from vg2gt.model import Reconstructor
+from vg2gt.profiling import clocked, now, peak_memory_mib, reset_peak_memory
+from vg2gt.rendering import Renderer, UnrenderableError
+from vg2gt.types import Batch, Cameras, Gaussians, Prediction, Render
+
+log = logging.getLogger(__name__)
+
+CV_QUERIES = 20_000
+MODES = ("solid", "rasterized")
+PROTOCOLS = ("novel", "gt_pose", "context")
+
+Scores = dict[str, float | None]
+
+
+@torch.no_grad()
+def evaluate_scene(model: Reconstructor, renderer: Renderer, batch: Batch) -> dict[str, float]:
+    """Reconstructs a scene from its context views and scores it on its held-out views, as training runs do.
+
+    Args:
+        model: the model, in any mode; it is not changed.
+        renderer: its options are used in both modes.
+        batch: one scene (B = 1) with held-out views.
+
+    Returns:
+        ``psnr``, ``ssim``, ``rmse``, ``abs_rel``, ``delta_1.25``, ``delta_1.05``, ``coverage``, ``normal_mean`` on
+        held-out views at ground-truth poses, rendered as solids whatever the training renders; ``abs_rel_rasterized``
+        with 3DGS rasterisation; ``decoded_abs_rel_before`` and ``decoded_abs_rel`` on the context views; ``gaussians``,
+        ``cv``. Depth is aligned by one median scale a scene.
+
+    Raises:
+        ValueError: if the batch holds several scenes or no held-out view.
+    """
+    held_out = batch.images.shape[1] - batch.num_context
+    if len(batch.scene) != 1 or not held_out:
+        raise ValueError(f"evaluation takes one scene with held-out views, got {batch.scene} with {held_out} of them")
+    prediction = model(batch.context.images, batch.context.hints)
+    target = batch.target
+    cameras = ground_truth_target_cameras(batch, prediction)
+    rendered = render_or_nan(renderer, prediction.gaussians, cameras, "solid")
+    rasterized = render_or_nan(renderer, prediction.gaussians, cameras, "rasterized")
+    images, depth = image_scores(rendered, target), depth_scores(rendered.depth, target, "scene")
+    return {
+        "psnr": images["psnr"],
+        "ssim": images["ssim"],
+        "rmse": depth["rmse"],
+        "abs_rel": depth["abs_rel"],
+        "delta_1.25": depth["delta_1.25"],
+        "delta_1.05": depth["delta_1.05"],
+        "coverage": depth["coverage"],
+        "abs_rel_rasterized": depth_scores(rasterized.depth, target, "scene")["abs_rel"],
+        "normal_mean": normal_scores(rendered, target)["normal_mean"],
+        "decoded_abs_rel_before": depth_scores(prediction.initial.depth, batch.context, "scene")["abs_rel"],
+        "decoded_abs_rel": depth_scores(prediction.geometry.depth, batch.context, "scene")["abs_rel"],
+        "gaussians": float(len(prediction.gaussians)),
+        "cv": cv(prediction.gaussians.means, max_queries=CV_QUERIES),
+    }
+
+
+def render_or_nan(renderer: Renderer, gaussians: Gaussians, cameras: Cameras, mode: Any) -> Render:
+    """Renders; where Gaussians or cameras cannot be rendered, says so in the log and returns views of NaN.
+
+    Figures of such views are NaN, which reports show as n/a: one scene does not end an evaluation.
+    """
+    try:
+        return renderer(gaussians, cameras, mode=mode)
+    except UnrenderableError as error:
+        log.warning("a scene has nothing to render: %s", error)
+    views = cameras.world_to_camera.shape[:2]
+    flat = gaussians.means.new_full((*views, *cameras.size), torch.nan)
+    three = flat[:, :, None].expand(-1, -1, 3, -1, -1)
+    return Render(color=three, depth=flat, normal=three, alpha=flat)
+
+
+@dataclass(frozen=True)
+class SceneResult:
+    """What the complete evaluation of a scene gives.
+
+    Attributes:
+        scores: figures by their path, such as ``rendered/gt_pose/solid/psnr``; None where there is none.
+        prediction: the reconstruction.
+        renders: solid renders by protocol.
+    """
+
+    scores: Scores
+    prediction: Prediction
+    renders: Mapping[str, Render]
+
+
+class SceneEvaluator:
+    """Scores scenes completely: rendered in every protocol and mode, decoded, cameras, points, uniformity, cost.
+
+    Args:
+        model: the model, in eval mode, on its device.
+        renderer: its options are used in both modes.
+        options: what is compared and how.
+        lpips: the network, on the model's device; None where there is none.
+    """
+
+    def __init__(
+        self, model: Reconstructor, renderer: Renderer, options: EvaluationOptions, lpips: LPIPS | None = None
+    ) -> None:
+        self.model = model
+        self.renderer = renderer
+        self.options = options
+        self.lpips = lpips
+
+    @torch.no_grad()
+    def __call__(self, batch: Batch, has_cameras: bool = True) -> SceneResult:
+        """Evaluates one scene.
+
+        Args:
+            batch: one scene (B = 1) on the model's device, with or without held-out views.
+            has_cameras: whether the batch's cameras are true; otherwise all that needs them is left out.
+
+        Raises:
+            ValueError: if the batch holds several scenes.
+        """
+        if len(batch.scene) != 1:
+            raise ValueError(f"evaluation takes one scene at a time, got {', '.join(batch.scene)}")
+        prediction, cost = self._reconstruct(batch)
+        known = self._known(batch)
+        scores: dict[str, float] = {}
+        renders: dict[str, Render] = {}
+        for protocol, cameras in self._cameras(batch, prediction, has_cameras).items():
+            truth = known.context if protocol == "context" else known.target
+            for mode in MODES:
+                rendered, seconds = self._render(prediction, cameras, mode)
+                scores |= _under(f"rendered/{protocol}/{mode}", self._view_scores(rendered, truth, has_cameras))
+                if mode == "solid":
+                    renders[protocol] = rendered
+                    cost["render_seconds"] = seconds
+        scores |= _under("decoded/before", self._depth_scores(prediction.initial.depth, known.context))
+        scores |= _under("decoded/after", self._depth_scores(prediction.geometry.depth, known.context))
+        if has_cameras:
+            scores |= self._pose_and_point_scores(known.context, prediction, renders["context"])
+        cost["cv"] = cv(prediction.gaussians.means, self.options.neighbors, CV_QUERIES)
+        return SceneResult(present(scores | _under("scene", cost)), prediction, renders)
+
+    def _reconstruct(self, batch: Batch) -> tuple[Prediction, dict[str, float]]:
+        device = batch.images.device
+        reset_peak_memory(device)
+        with clocked(device) as clock:
+            prediction = self.model(batch.context.images, batch.context.hints)
+        gaussians = len(prediction.gaussians)
+        return prediction, {
+            "gaussians": float(gaussians),
+            "gaussians_per_pixel": gaussians / batch.context.depth.numel(),
+            "reconstruct_seconds": clock.total,
+            "head_seconds": clock.head,
+            "peak_memory_mib": peak_memory_mib(device),
+        }
+
+    def _cameras(self, batch: Batch, prediction: Prediction, has_cameras: bool) -> dict[str, Cameras]:
+        cameras = {"context": prediction.geometry.cameras}
+        if batch.images.shape[1] > batch.num_context:
+            cameras["novel"] = joint_target_cameras(self.model, batch, prediction)
+            if has_cameras:
+                cameras["gt_pose"] = ground_truth_target_cameras(batch, prediction)
+        return cameras
+
+    def _render(self, prediction: Prediction, cameras: Cameras, mode: Any) -> tuple[Render, float]:
+        """Renders views; also seconds a view."""
+        device = prediction.gaussians.means.device
+        begin = now(device)
+        rendered = render_or_nan(self.renderer, prediction.gaussians, cameras, mode)
+        return rendered, (now(device) - begin) / cameras.world_to_camera.shape[1]
+
+    def _known(self, batch: Batch) -> Batch:
+        """The batch whose true depths out of range are unknown."""
+        inside = (batch.depth >= self.options.nearest) & (batch.depth <= self.options.farthest)
+        return replace(batch, depth=torch.where(inside, batch.depth, 0.0))
+
+    def _view_scores(self, rendered: Render, truth: Batch, has_cameras: bool) -> dict[str, float]:
+        scores = image_scores(rendered, truth, self.lpips) | self._depth_scores(rendered.depth, truth)
+        return scores | normal_scores(rendered, truth) if has_cameras else scores
+
+    def _depth_scores(self, depth: torch.Tensor, truth: Batch) -> dict[str, float]:
+        return depth_scores(depth, truth, self.options.alignment)
+
+    def _pose_and_point_scores(self, truth: Batch, prediction: Prediction, rendered: Render) -> dict[str, float]:
+        scores: dict[str, float] = {}
+        geometry = prediction.geometry
+        if truth.num_context > 1:
+            scores |= _under("cameras", camera_metrics(geometry.cameras, truth.cameras))
+        similarity = align_geometry(geometry, truth)
+        if similarity is not None:
+            for name, depth in (("decoded", geometry.depth), ("rendered", rendered.depth)):
+                found = point_scores(depth, geometry.cameras, truth, similarity, **asdict(self.options.points))
+                scores |= _under(f"points/{name}", found)
+        return scores
+
+
+def _under(path: str, scores: Mapping[str, float]) -> dict[str, float]:
+    return {f"{path}/{name}": value for name, value in scores.items()}

@@ -1,0 +1,148 @@
+"""Decoding of colour and depth image files, with errors that name the file and the scene."""
+
+from __future__ import annotations
+
+import io
+import statistics
+import struct
+import zlib
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from vg2gt.io.errors import DataError
+from vg2gt.io.images import open_image
+
+# What Pillow raises for files that are damaged in one way or another.
+_DAMAGED = (OSError, SyntaxError, ValueError, EOFError, zlib.error, struct.error, Image.DecompressionBombError)
+
+Size = tuple[int, int]
+"""Height and width in pixels."""
+
+_ORIENTATION_TAG = 0x0112
+# What turns an image upright, by its EXIF orientation.
+_TURNS = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_270,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_90,
+}
+_QUARTER_TURNS = (5, 6, 7, 8)
+
+
+def image_size(path: Path, scene: str) -> tuple[int, int]:
+    """Returns an image's ``(height, width)`` without decoding it.
+
+    Raises:
+        DataError: if the file is missing or not an image.
+    """
+    try:
+        with open_image(path) as image:
+            return image.height, image.width
+    except _DAMAGED as error:
+        raise _unreadable(path, scene, error) from error
+
+
+def typical_size(sizes: Iterable[tuple[int, int]]) -> tuple[int, int]:
+    """The common ``(height, width)`` to which images of several sizes are brought: the median of each."""
+    heights, widths = zip(*sizes, strict=True)
+    return statistics.median_low(heights), statistics.median_low(widths)
+
+
+def read_color(
+    path: Path, scene: str, size: tuple[int, int] | None = None, content: bytes | None = None
+) -> NDArray[np.uint8]:
+    """Reads a colour image ``[H, W, 3]``.
+
+    Args:
+        path: the file.
+        scene: the scene it belongs to, for messages.
+        size: the ``(height, width)`` it must have; None: any.
+        content: the encoded image where it is a part of the file; None: it is the file.
+
+    Raises:
+        DataError: if the file is missing, damaged or of another size.
+    """
+    try:
+        with open_image(path if content is None else io.BytesIO(content)) as image:
+            pixels = np.array(image.convert("RGB"))
+    except _DAMAGED as error:
+        raise _unreadable(path, scene, error) from error
+    _check_size(path, scene, pixels.shape[:2], size)
+    return pixels
+
+
+def photo_size(path: Path, scene: str) -> tuple[int, int]:
+    """Returns the ``(height, width)`` of a photograph turned upright, without decoding it.
+
+    Raises:
+        DataError: if the file is missing or not an image.
+    """
+    try:
+        with open_image(path) as image:
+            turned = _orientation(image) in _QUARTER_TURNS
+            return (image.width, image.height) if turned else (image.height, image.width)
+    except _DAMAGED as error:
+        raise _unreadable(path, scene, error) from error
+
+
+def read_photo(path: Path, scene: str, size: tuple[int, int] | None = None) -> NDArray[np.uint8]:
+    """Reads a photograph ``[H, W, 3]``, turned upright as its EXIF data says; otherwise like ``read_color``.
+
+    Raises:
+        DataError: if the file is missing, damaged, or turned upright of another size than ``size``.
+    """
+    try:
+        with open_image(path) as image:
+            turn = _TURNS.get(_orientation(image))
+            pixels = np.array((image if turn is None else image.transpose(turn)).convert("RGB"))
+    except _DAMAGED as error:
+        raise _unreadable(path, scene, error) from error
+    _check_size(path, scene, pixels.shape[:2], size)
+    return pixels
+
+
+def read_depth(path: Path, scene: str, size: tuple[int, int] | None = None) -> NDArray[np.int64]:
+    """Reads a one-channel integer depth image ``[H, W]`` as stored (16-bit PNG, PGM or TIFF).
+
+    Raises:
+        DataError: if the file is missing, damaged, not a one-channel integer image, or of another size than ``size``.
+    """
+    try:
+        with open_image(path) as image:
+            pixels = np.array(image)
+    except _DAMAGED as error:
+        raise _unreadable(path, scene, error) from error
+    if pixels.ndim != 2 or pixels.dtype.kind not in "iu":
+        raise DataError(
+            f"{path} of scene {scene} is not a depth image: expected one channel of 16-bit integers, found "
+            f"{pixels.dtype} values of shape {pixels.shape}"
+        )
+    _check_size(path, scene, pixels.shape, size)
+    return pixels.astype(np.int64)
+
+
+def _orientation(image: Image.Image) -> int:
+    """EXIF orientation of an image, 1 (upright) where there is none or the EXIF data are damaged."""
+    try:
+        return int(image.getexif().get(_ORIENTATION_TAG, 1))
+    except Exception:  # the EXIF parser raises whatever the bytes lead it to
+        return 1
+
+
+def _unreadable(path: Path, scene: str, error: Exception) -> DataError:
+    return DataError(f"cannot read {path} of scene {scene}: {error}; restore the file or remove the frame")
+
+
+def _check_size(path: Path, scene: str, found: tuple[int, ...], expected: tuple[int, int] | None) -> None:
+    if expected is not None and tuple(found) != tuple(expected):
+        raise DataError(
+            f"{path} of scene {scene} is {found[1]}x{found[0]} pixels, but the recording's first one is "
+            f"{expected[1]}x{expected[0]}"
+        )

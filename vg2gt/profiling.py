@@ -1,0 +1,97 @@
+"""Marks of a model's stages, for torch's profiler and for whoever listens; wall time and peak memory."""
+
+from __future__ import annotations
+
+import resource
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
+
+import torch
+from torch.profiler import record_function
+
+MIB = 2**20
+BEFORE_HEAD = ("encode", "decode", "coarse", "decode_again")
+
+Listener = Callable[[str], AbstractContextManager[None]]
+_listeners: ContextVar[tuple[Listener, ...]] = ContextVar("listeners", default=())
+
+
+@contextmanager
+def stage(name: str) -> Iterator[None]:
+    """Marks a stage: torch's profiler shows it as ``vg2gt/<name>``, listeners run around it."""
+    with ExitStack() as stack:
+        stack.enter_context(record_function(f"vg2gt/{name}"))
+        for listener in _listeners.get():
+            stack.enter_context(listener(name))
+        yield
+
+
+@contextmanager
+def listening(listener: Listener) -> Iterator[None]:
+    """Inside the block every stage runs inside ``listener(name)``."""
+    token = _listeners.set((*_listeners.get(), listener))
+    try:
+        yield
+    finally:
+        _listeners.reset(token)
+
+
+@dataclass
+class Clock:
+    """Wall time of parts of a reconstruction, in seconds.
+
+    Attributes:
+        total: the whole pass.
+        before_head: the backbone, its decoding and the coarse enhancement.
+    """
+
+    total: float = 0.0
+    before_head: float = 0.0
+
+    @property
+    def head(self) -> float:
+        """What makes Gaussians of tokens and geometry: the paper's decoding-head time."""
+        return self.total - self.before_head
+
+
+@contextmanager
+def clocked(device: torch.device) -> Iterator[Clock]:
+    """Measures one pass of a model inside the block, waiting for the device at the ends of every stage."""
+    clock = Clock()
+
+    @contextmanager
+    def listener(name: str) -> Iterator[None]:
+        begin = now(device)
+        yield
+        if name in BEFORE_HEAD:
+            clock.before_head += now(device) - begin
+
+    begin = now(device)
+    with listening(listener):
+        yield clock
+    clock.total = now(device) - begin
+
+
+def now(device: torch.device) -> float:
+    """Seconds on a steady clock, once the device has done what it was given."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter()
+
+
+def reset_peak_memory(device: torch.device) -> None:
+    """Begins a new measurement on a GPU; a process's own peak cannot be reset."""
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)
+
+
+def peak_memory_mib(device: torch.device) -> float:
+    """Peak memory in MiB: allocated on the GPU since the last reset, or resident in the process since its start."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device) / MIB
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / MIB if sys.platform == "darwin" else peak / 1024

@@ -1,0 +1,171 @@
+"""Checkpoints on disk: written to a temporary name and renamed, read without executing anything."""
+
+from __future__ import annotations
+
+import logging
+import os
+import zipfile
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning.pytorch.plugins.io import TorchCheckpointIO
+from torch import Tensor, nn
+
+from vg2gt.io.files import flush_folder, flush_to_disk
+from vg2gt.io.tensors import refuse_foreign
+
+log = logging.getLogger(__name__)
+
+PATTERN = "step-*.ckpt"
+MODEL_PREFIX = "model."  # of the model's names in a checkpoint's state_dict, as the Lightning module names it
+
+
+class AtomicCheckpointIO(TorchCheckpointIO):
+    """Writes a checkpoint whole or not at all, and loads tensors and plain values only (no pickled code)."""
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any | None = None) -> None:
+        """Saves to ``<path>.tmp``, flushes to the disk and renames; the file under ``path`` is never half-written.
+
+        Raises:
+            OSError: if it cannot be written (a full disk); what is under ``path`` stays.
+        """
+        target = Path(path)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        temporary = target.with_name(target.name + ".tmp")
+        try:
+            with open(temporary, "wb") as file:
+                torch.save(checkpoint, file)
+                flush_to_disk(file)
+            os.replace(temporary, target)
+            flush_folder(target.parent)
+        except (OSError, RuntimeError) as error:  # torch's writer may make a RuntimeError of a full disk
+            with suppress(OSError):
+                temporary.unlink(missing_ok=True)
+            raise OSError(
+                f"checkpoint {target} could not be written ({error}); earlier checkpoints are intact: make room and go "
+                "on with ckpt=last"
+            ) from error
+
+    def load_checkpoint(self, path: Any, map_location: Any = "cpu", weights_only: bool | None = True) -> dict[str, Any]:
+        """Loads on the CPU with ``weights_only=True``, whatever is asked for."""
+        return read_checkpoint(path)
+
+
+def read_checkpoint(path: str | Path) -> dict[str, Any]:
+    """Reads a checkpoint and verifies the checksums in it.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if the file is damaged or holds anything but tensors and plain values.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"no checkpoint at {path}")
+    try:
+        refuse_foreign(path)
+        _verify_checksums(path)
+        content = torch.load(path, map_location="cpu", weights_only=True)
+        if not isinstance(content, dict):
+            raise ValueError(f"it holds a {type(content).__name__}")
+    except Exception as error:  # there is no end to what readers raise over damaged bytes
+        raise ValueError(f"checkpoint {path} is damaged or not a checkpoint of this project: {error}") from error
+    return content
+
+
+def model_state(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The model's part of a checkpoint's ``state_dict``, by the model's own names."""
+    return {name.removeprefix(MODEL_PREFIX): tensor for name, tensor in state.items()}
+
+
+def _verify_checksums(path: Path) -> None:
+    """torch.load does not compare the checksums in its files: flipped bits would become weights."""
+    with zipfile.ZipFile(path) as archive:
+        wrong = archive.testzip()
+    if wrong is not None:
+        raise ValueError(f"wrong checksum of {wrong}")
+
+
+def newest_valid(folder: str | Path) -> Path:
+    """Returns the newest readable checkpoint of a run, passing over damaged ones with a warning.
+
+    Raises:
+        FileNotFoundError: if the folder holds none.
+    """
+    folder = Path(folder)
+    candidates = by_age(folder)
+    for path in candidates:
+        try:
+            read_checkpoint(path)
+        except (ValueError, FileNotFoundError) as error:  # not found: a folder of that name
+            log.warning("%s; trying the one before", error)
+        else:
+            return path
+    raise FileNotFoundError(
+        f"no valid checkpoint in {folder} ({len(candidates)} damaged): name a file with ckpt=PATH, or start from the "
+        "beginning with ckpt=null overwrite=true (ckpt=auto starts by itself only where there are none)"
+    )
+
+
+def by_age(folder: Path) -> list[Path]:
+    """A run's checkpoints, valid or not, the newest first."""
+    return sorted(folder.glob(PATTERN), key=lambda path: (_step_of(path), path.name), reverse=True)
+
+
+def _step_of(path: Path) -> int:
+    digits = path.stem.removeprefix("step-").split("-")[0]
+    return int(digits) if digits.isdecimal() else -1
+
+
+def remove_leftovers(folder: Path, newest: Path | None) -> None:
+    """Clears what an interrupted run left behind, before the folder is written to again.
+
+    Half-written files are deleted. Whatever stands in the way of checkpoints still to come, because it is named like a
+    newer one than the run goes on from, is damaged and renamed to ``*.damaged``.
+
+    Args:
+        folder: the run's own.
+        newest: the checkpoint that the run goes on from; None: from the beginning.
+    """
+    for path in [*folder.glob(".*.tmp"), *(folder / "checkpoints").glob("*.tmp")]:
+        if path.is_symlink() or path.is_file():
+            path.unlink()
+    if newest is None:
+        return
+    for path in by_age(folder / "checkpoints"):
+        if path.name == newest.name:
+            break
+        aside = path.with_name(f"{path.name}.damaged")
+        number = 1
+        while aside.exists():
+            number += 1
+            aside = path.with_name(f"{path.name}.damaged-{number}")
+        path.rename(aside)
+        log.warning("%s is damaged and now named %s; the run goes on from %s", path, aside.name, newest.name)
+
+
+def initialize_from(module: nn.Module, path: str | Path) -> None:
+    """Starts a new run from trained weights; layers that don't fit keep their fresh initialisation and are logged.
+
+    Args:
+        module: the Lightning module.
+        path: checkpoint whose ``state_dict`` is used; optimiser state and step are not.
+
+    Raises:
+        ValueError: if nothing in the checkpoint fits the module.
+    """
+    stored: Mapping[str, Tensor] = read_checkpoint(path).get("state_dict", {})
+    present = {k: v for k, v in module.state_dict().items() if not k.startswith("model.backend.")}
+    fitting = {k: v for k, v in stored.items() if k in present and present[k].shape == v.shape}
+    if not fitting:
+        raise ValueError(f"init_from={path}: none of its {len(stored)} tensors fits this model")
+    nn.Module.load_state_dict(module, fitting, strict=False)
+    fresh = sorted({key.rpartition(".")[0] for key in present.keys() - fitting.keys()})
+    unused = sorted({key.rpartition(".")[0] for key in stored.keys() - present.keys()})
+    log.info("initialised %d of %d tensors from %s", len(fitting), len(present), path)
+    if fresh:
+        log.warning("re-initialised layers: %s", ", ".join(fresh))
+    if unused:
+        log.warning("layers of the checkpoint this model does not have: %s", ", ".join(unused))

@@ -1,0 +1,363 @@
+"""The paper's ablations on our data: ``vg2gt ablate [seeds=N] [steps=N] [any override of train.yaml ...]``.
+
+As in the paper (appendix, Model Evaluation) no variant is trained from scratch. For every seed one full model is
+trained; each variant starts from it and goes on for ``steps`` steps, and so does the full model itself, so that nobody
+is ahead by training longer. All continuations of a seed see the same batches and are evaluated on the same held-out
+views, so differences to the full model are taken seed by seed. Only the last layer starts anew where the number of
+splits changes; a control continues the full model with a new last layer as well.
+
+Finished runs are never repeated, interrupted ones go on; a run that diverges is named and the others are run all the
+same. Writes ``metrics.json`` and ``metrics.md`` into ``outputs/<name>``, after every run.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+
+from vg2gt.cli.errors import said_in_one_line
+from vg2gt.config import config_dir
+from vg2gt.evaluation.paper import tables
+from vg2gt.io.files import write_json, write_text
+from vg2gt.runs.checkpoints import AtomicCheckpointIO, read_checkpoint
+from vg2gt.studies.study import (
+    Metrics,
+    compose_run,
+    final_checkpoint,
+    markdown,
+    over_seeds,
+    paired_difference,
+    quoted,
+    run_once,
+    summarize,
+)
+
+log = logging.getLogger(__name__)
+
+OWN_KEYS = ("name", "seeds", "full_steps", "steps", "lr", "variants", "splits")
+SETTLED_KEYS = ("seed", "ckpt", "init_from", "overwrite", "output_dir", "ablation", "trainer.max_steps")
+CONTINUATION_SEED = 1000  # the continuation's batches are not the first ones of the full model's training
+FULL, CONTROL = "full", "new_last_layer"
+LAST_LAYER = "model.gaussians.out."
+
+LABELS = {
+    "rasterized": "3DGS",
+    "wo_depth": "w/o Depth",
+    "wo_coarse": "w/o Coarse",
+    "wo_enhance": "w/o Enhance",
+    "wo_split": "w/o Split",
+    FULL: "VG²GT (full)",
+    CONTROL: "full, last layer anew",
+}
+# metric -> (heading, decimals, larger is better; None: neither)
+PAPER_COLUMNS: dict[str, tuple[str, int, bool | None]] = {
+    "psnr": ("PSNR", 2, True),
+    "ssim": ("SSIM", 3, True),
+    "lpips": ("LPIPS", 3, False),
+    "rmse": ("RMSE", 4, False),
+    "abs_rel": ("ABS", 4, False),
+    "delta_1.25": ("δ1.25", 4, True),
+    "delta_1.05": ("δ1.05", 4, True),
+}
+OUR_COLUMNS: dict[str, tuple[str, int, bool | None]] = {
+    "abs_rel_rasterized": ("ABS, rasterised", 4, False),
+    "decoded_abs_rel": ("ABS, decoded", 4, False),
+    "normal_mean": ("normals [deg]", 1, False),
+    "cv": ("CV", 3, False),
+    "gaussians": ("Gaussians", 0, None),
+}
+# The rows of the paper's tables of the same meaning (Replica).
+PAPER_ABLATION, PAPER_SPLIT, PAPER_DATA = "tbl_ablation", "tbl_split", "replica"
+PAPER_FULL = "VG2GT (full)"
+
+
+@dataclass(frozen=True)
+class Continuation:
+    """One run that starts from the full model.
+
+    Attributes:
+        name: of its folder and of its row.
+        overrides: what it changes.
+        new_last_layer: the Gaussian head's last layer starts anew although it would fit.
+    """
+
+    name: str
+    overrides: tuple[str, ...] = ()
+    new_last_layer: bool = False
+
+
+def continuations(variants: Sequence[str], splits: Sequence[int], full_splits: int) -> list[Continuation]:
+    """The runs of both tables, each once: splits=1 is w/o Split, and the full model's own number is the full model."""
+    runs = [Continuation(FULL), *(Continuation(name, (f"ablation={name}",)) for name in variants)]
+    for count in splits:
+        if count != full_splits and not (count == 1 and "wo_split" in variants):
+            runs.append(Continuation(f"splits={count}", (f"model.gaussians.splits={count}",)))
+    if any(run.name == "wo_split" or run.name.startswith("splits=") for run in runs):
+        runs.append(Continuation(CONTROL, new_last_layer=True))
+    return runs
+
+
+class Ablation:
+    """Runs the study and writes its tables.
+
+    Args:
+        folder: holds everything.
+        overrides: of ``train.yaml``, common to all runs.
+        seeds: repetitions.
+        full_steps: training of the full model.
+        steps: of every continuation.
+        lr: initial learning rate of every continuation.
+        variants: options of the group ``ablation``.
+        splits: numbers of Gaussians a voxel.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        overrides: Sequence[str],
+        seeds: int,
+        full_steps: int,
+        steps: int,
+        lr: float,
+        variants: Sequence[str],
+        splits: Sequence[int],
+    ) -> None:
+        self.folder = folder
+        self.overrides = list(overrides)
+        self.seeds = seeds
+        self.full_steps = full_steps
+        self.steps = steps
+        self.lr = lr
+        self.variants = list(variants)
+        self.splits = list(splits)
+        self.full_splits = int(compose_run(self.overrides, folder).model.gaussians.splits)
+        self.runs = continuations(self.variants, self.splits, self.full_splits)
+        self.results: dict[str, dict[int, Metrics]] = {run.name: {} for run in self.runs}
+        self.diverged: list[str] = []
+
+    def run(self) -> None:
+        """Runs whatever is not finished; the tables are rewritten after every run.
+
+        Raises:
+            FloatingPointError: if a full model diverges; a continuation that does is noted in ``diverged``.
+        """
+        total, number = self.seeds * (1 + len(self.runs)), 0
+        for seed in range(self.seeds):
+            home = self.folder / f"seed-{seed}"
+            number += 1
+            print(f"[{number}/{total}] seed {seed}: the full model, {self.full_steps} steps", flush=True)
+            run_once([*self.overrides, f"seed={seed}", f"trainer.max_steps={self.full_steps}"], home / "start")
+            start = final_checkpoint(home / "start", self.full_steps)
+            for run in self.runs:
+                number += 1
+                print(f"[{number}/{total}] seed {seed}: {_label(run.name)}, {self.steps} steps more", flush=True)
+                try:
+                    self.results[run.name][seed] = self._go_on(run, seed, start, home)
+                except FloatingPointError as error:
+                    self.diverged.append(f"{_label(run.name)}, seed {seed}")
+                    log.error("%s diverged: %s", self.diverged[-1], error)
+                self.write()
+
+    def _go_on(self, run: Continuation, seed: int, start: Path, home: Path) -> Metrics:
+        if run.new_last_layer:
+            start = _without_last_layer(start, home / "start" / "without_last_layer.ckpt")
+        overrides = [*self.overrides, *run.overrides, f"seed={CONTINUATION_SEED + seed}"]
+        overrides += [f"trainer.max_steps={self.steps}", f"optimizer.lr={self.lr}", f"init_from={quoted(start)}"]
+        return run_once(overrides, home / run.name.replace("=", "-"))
+
+    def write(self) -> None:
+        """Writes ``metrics.json`` and ``metrics.md``."""
+        content = {
+            "seeds": self.seeds,
+            "full_steps": self.full_steps,
+            "steps": self.steps,
+            "lr": self.lr,
+            "overrides": self.overrides,
+            "diverged": self.diverged,
+            "runs": {name: {str(seed): m for seed, m in runs.items()} for name, runs in self.results.items()},
+            "summary": summarize({name: runs for name, runs in self.results.items() if runs}, FULL),
+            "paper": {table: tables()[table][PAPER_DATA] for table in (PAPER_ABLATION, PAPER_SPLIT)},
+        }
+        write_json(self.folder / "metrics.json", content)
+        write_text(self.folder / "metrics.md", self.report())
+
+    def report(self) -> str:
+        """Both tables as Markdown, the paper's rows beside ours, and the differences to the full model."""
+        ablations = [*self.variants, FULL]
+        splits = {f"splits={count}": self._row_of(count) for count in self.splits}
+        parts = [
+            "# Ablations",
+            self._protocol(),
+            "## Components",
+            _table(self.results, {name: name for name in ablations}),
+            "## Splits",
+            _table(self.results, splits | ({CONTROL: CONTROL} if CONTROL in self.results else {})),
+            "## More figures of the same runs",
+            _plain_table(self.results, OUR_COLUMNS),
+            "## Differences to the full model, seed by seed",
+            _difference_table(self.results, FULL),
+        ]
+        if CONTROL in self.results:
+            parts += [
+                "## Differences to the full model with a new last layer, seed by seed",
+                _difference_table({name: self.results[name] for name in self._new_layers()}, CONTROL),
+            ]
+        return "\n\n".join(parts) + "\n"
+
+    def _new_layers(self) -> list[str]:
+        """The runs that began with a new last layer."""
+        return [CONTROL, *(name for name in self.results if name == "wo_split" or name.startswith("splits="))]
+
+    def _row_of(self, count: int) -> str:
+        if count == self.full_splits:
+            return FULL
+        return "wo_split" if count == 1 and "wo_split" in self.variants else f"splits={count}"
+
+    def _protocol(self) -> str:
+        done = min((len(runs) for runs in self.results.values()), default=0)
+        diverged = f" Diverged: {'; '.join(self.diverged)}." if self.diverged else ""
+        return (
+            f"Full model {self.full_steps} steps, then every row (the full model as well) {self.steps} steps more from "
+            f"it, at a learning rate of {self.lr:g}, with the same batches. "
+            f"{done} of {self.seeds} seeds complete;{diverged} mean ± 95 % confidence interval over "
+            "seeds (Student's t; none for one seed). Seeds differ in weights and training batches; all see the same "
+            "held-out scenes, so the intervals say nothing of other scenes. Every difference is judged by itself: "
+            "of twenty true zeros one is called better or worse. Views never trained on, at ground-truth "
+            "poses; depth rendered as stochastic solids and aligned by one median scale a scene, whatever the training "
+            "rendered (the 3DGS row too: its own rasterised depth stands below). Where the number of splits differs "
+            "from the full model's, the last layer starts anew; the control shows what that alone costs, and is what "
+            "these rows are compared with in the last table. The paper's rows are Replica, 30000 more steps, and LPIPS "
+            "of VGG; compare orders, not values. LPIPS is not measured "
+            "while training: python -m vg2gt.evaluate ckpt=RUN has it, if its weights are there."
+        )
+
+
+def _without_last_layer(start: Path, path: Path) -> Path:
+    """A checkpoint whose Gaussian head lacks its last layer, so that ``init_from`` starts that one anew."""
+    state = read_checkpoint(start)["state_dict"]
+    kept = {name: tensor for name, tensor in state.items() if not name.startswith(LAST_LAYER)}
+    AtomicCheckpointIO().save_checkpoint({"state_dict": kept}, path)
+    return path
+
+
+def _label(name: str) -> str:
+    return LABELS.get(name, name)
+
+
+def _paper_row(name: str) -> Mapping[str, float] | None:
+    """What the paper reports in a row of the same meaning; None where it has none."""
+    if name.startswith("splits="):
+        row = "w/o split" if name == "splits=1" else name.replace("splits", "split")
+        return tables()[PAPER_SPLIT][PAPER_DATA].get(row)
+    return tables()[PAPER_ABLATION][PAPER_DATA].get(PAPER_FULL if name == FULL else _label(name))
+
+
+def _table(results: Mapping[str, Mapping[int, Metrics]], rows: Mapping[str, str]) -> str:
+    """Ours and the paper's; ``rows`` maps what the paper calls a row to the run that stands for it."""
+    lines = []
+    for name, run in rows.items():
+        cells = [over_seeds(results[run], metric).shown(column[1]) for metric, column in PAPER_COLUMNS.items()]
+        lines.append([_label(name), *cells])
+        if paper := _paper_row(name):
+            lines.append(["*paper*", *(f"*{paper[metric]:g}*" for metric in PAPER_COLUMNS)])
+    return markdown(["", *(column[0] for column in PAPER_COLUMNS.values())], lines)
+
+
+def _plain_table(
+    results: Mapping[str, Mapping[int, Metrics]], columns: Mapping[str, tuple[str, int, bool | None]]
+) -> str:
+    rows = [
+        [_label(name), *(over_seeds(runs, metric).shown(column[1]) for metric, column in columns.items())]
+        for name, runs in results.items()
+    ]
+    return markdown(["", *(column[0] for column in columns.values())], rows)
+
+
+def _difference_table(results: Mapping[str, Mapping[int, Metrics]], reference: str) -> str:
+    """Each run less the reference; says whether the interval leaves out zero."""
+    columns = {name: c for name, c in (PAPER_COLUMNS | OUR_COLUMNS).items() if _is_there(results, name)}
+    rows = []
+    for name, runs in results.items():
+        if name != reference:
+            rows.append([_label(name), *(_verdict(runs, results[reference], m, c) for m, c in columns.items())])
+    return markdown([f"minus {_label(reference)}", *(column[0] for column in columns.values())], rows)
+
+
+def _is_there(results: Mapping[str, Mapping[int, Metrics]], metric: str) -> bool:
+    return all(metric in metrics for runs in results.values() for metrics in runs.values())
+
+
+def _verdict(
+    runs: Mapping[int, Metrics],
+    reference: Mapping[int, Metrics],
+    metric: str,
+    column: tuple[str, int, bool | None],
+) -> str:
+    _, decimals, larger_is_better = column
+    change = paired_difference(runs, reference, metric)
+    shown = change.shown(decimals, sign=True)
+    if larger_is_better is None or not math.isfinite(change.margin):
+        return shown
+    if change.mean == change.margin == 0:
+        return "identical"
+    if abs(change.mean) <= change.margin:
+        return f"{shown} (not told apart)"
+    return f"{shown} ({'better' if (change.mean > 0) == larger_is_better else 'worse'})"
+
+
+def common_overrides(overrides: Sequence[str]) -> list[str]:
+    """The command line's overrides that go to every training.
+
+    Raises:
+        ValueError: if one sets what the study itself decides.
+    """
+    kept = []
+    for override in overrides:
+        key = override.split("=")[0].lstrip("+~")
+        if key in SETTLED_KEYS:
+            raise ValueError(f"{key} is decided by the study; its own keys are {', '.join(OWN_KEYS)}")
+        if key not in OWN_KEYS:
+            kept.append(override)
+    return kept
+
+
+@hydra.main(version_base="1.3", config_path=config_dir(), config_name="ablate")
+def main(config: DictConfig) -> None:
+    """Composes the study and runs it; what the user can mend is said in one line."""
+    with said_in_one_line():
+        study = _study(config)
+        study.run()
+    print(study.report())
+    print(f"metrics: {study.folder / 'metrics.json'}")
+    if study.diverged:
+        raise SystemExit(f"diverged, not in the tables: {'; '.join(study.diverged)}")
+
+
+def _study(config: DictConfig) -> Ablation:
+    if "gaussians" not in config.model or "splits" not in config.model.gaussians:
+        raise ValueError("ablations need a model with splits: model=tiny or model=vg2gt")
+    if config.trainer.devices != 1:
+        raise ValueError(
+            f"trainer.devices={config.trainer.devices}: a study runs its trainings one after another on one device"
+        )
+    return Ablation(
+        Path(config.output_dir),
+        common_overrides(HydraConfig.get().overrides.task),
+        config.seeds,
+        config.full_steps,
+        config.steps,
+        config.lr,
+        list(config.variants),
+        list(config.splits),
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,217 @@
+"""Several trainings that belong together: each run once, resumed where it was interrupted, compared over seeds."""
+
+from __future__ import annotations
+
+import gc
+import hashlib
+import logging
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from omegaconf import DictConfig, OmegaConf
+from scipy.stats import t as student
+from torch import Tensor
+
+from vg2gt.config import config_dir
+from vg2gt.io.files import read_json, write_json, write_text
+from vg2gt.runs.checkpoints import newest_valid, read_checkpoint
+from vg2gt.runs.trust import read_run_config
+from vg2gt.training.loop import build, evaluate, flatten, train
+
+log = logging.getLogger(__name__)
+
+Metrics = dict[str, float]
+INTERRUPTED = 143
+START = "start.json"
+# What makes two runs the same; where they live and how they are shown may differ.
+COMPARED = ("backend", "model", "data", "loss", "renderer", "optimizer", "training", "seed")
+COMPARED_KEYS = ("trainer.max_steps", "trainer.precision", "trainer.gradient_clip_val")
+NOT_COMPARED = ("data.workers", "data.memory_mb", "data.cache_dir")
+
+
+def compose_run(overrides: Sequence[str], folder: Path) -> DictConfig:
+    """Composes the configuration of one training whose folder is ``folder``."""
+    overrides = [*overrides, f"output_dir={quoted(folder)}", "hydra/job_logging=default"]
+    if GlobalHydra.instance().is_initialized():
+        return compose("train", overrides)
+    with initialize_config_dir(config_dir(), version_base="1.3"):
+        return compose("train", overrides)
+
+
+def run_once(overrides: Sequence[str], folder: Path) -> Metrics:
+    """Trains and evaluates one run unless ``folder`` already holds its result.
+
+    A run that was interrupted goes on from its newest checkpoint; a model without a trained part is only evaluated.
+
+    Args:
+        overrides: of ``train.yaml``.
+        folder: the run's own.
+
+    Returns:
+        The metrics after training.
+
+    Raises:
+        ValueError: if the folder holds the run of another configuration, or one that started from other weights.
+        SystemExit: if the training was asked to stop (SIGTERM); the same call goes on with it.
+    """
+    config = compose_run(overrides, folder)
+    _refuse_other_run(config, folder)
+    _refuse_other_start(config, folder)
+    result = folder / "metrics.json"
+    if result.is_file():
+        return read_json(result)["trained"]
+    config.ckpt = "auto"
+    report = train(config) if config.trainer.max_steps else _only_evaluate(config, folder)
+    gc.collect()  # trainer, module and data refer to each other: without it every run's frames stay until much later
+    if not report:
+        log.warning("interrupted in %s; the same command goes on from there", folder)
+        raise SystemExit(INTERRUPTED)
+    return report["trained"]
+
+
+def _only_evaluate(config: DictConfig, folder: Path) -> dict[str, Any]:
+    """The result of a run of no steps."""
+    write_text(folder / "config.yaml", OmegaConf.to_yaml(config, resolve=True))
+    metrics = evaluate(build(config))
+    report = {"untrained": metrics, "trained": metrics, "steps": 0}
+    write_json(folder / "metrics.json", report)
+    return report
+
+
+def _refuse_other_run(config: DictConfig, folder: Path) -> None:
+    path = folder / "config.yaml"
+    if not path.is_file():
+        return
+    before, now = (flatten(OmegaConf.to_container(c, resolve=True)) for c in (read_run_config(path), config))
+    keys = {
+        key
+        for key in before.keys() | now.keys()
+        if (key.split(".")[0] in COMPARED or key in COMPARED_KEYS) and key not in NOT_COMPARED
+    }
+    different = sorted(key for key in keys if before.get(key) != now.get(key))
+    if different:
+        raise ValueError(
+            f"{folder} holds a run with other settings ({', '.join(different)}): choose another name=, repeat the "
+            "settings, or delete the folder"
+        )
+
+
+def _refuse_other_start(config: DictConfig, folder: Path) -> None:
+    """Notes the weights a new run starts from; by their content, for a folder may be moved, or filled anew."""
+    if not config.init_from:
+        return
+    path, weights = folder / START, weights_digest(read_checkpoint(config.init_from)["state_dict"])
+    if path.is_file():
+        if read_json(path)["weights"] != weights:
+            raise ValueError(
+                f"{folder} holds a run that started from other weights than those of {config.init_from}: choose "
+                "another name=, or delete the folder"
+            )
+    elif not (folder / "config.yaml").is_file():
+        write_json(path, {"weights": weights})
+
+
+def weights_digest(state: Mapping[str, Tensor]) -> str:
+    """SHA-256 of tensors and their names."""
+    digest = hashlib.sha256()
+    for name, tensor in sorted(state.items()):
+        digest.update(f"{name} {tuple(tensor.shape)} {tensor.dtype}".encode())
+        digest.update(tensor.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().tobytes())
+    return digest.hexdigest()
+
+
+def final_checkpoint(folder: Path, steps: int) -> Path:
+    """The checkpoint that a finished run of ``steps`` steps ended with.
+
+    Raises:
+        FileNotFoundError: if no checkpoint of the run is valid.
+        ValueError: if the newest valid one is of an earlier step.
+    """
+    path = newest_valid(folder / "checkpoints")
+    reached = read_checkpoint(path)["global_step"]
+    if reached != steps:
+        raise ValueError(
+            f"{folder} ran {steps} steps, but its newest valid checkpoint is that of step {reached}: delete the "
+            "folder, and the run is repeated"
+        )
+    return path
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A mean over seeds.
+
+    Attributes:
+        mean: the mean.
+        margin: half the width of its 95 % confidence interval (Student's t); NaN for a single value.
+    """
+
+    mean: float
+    margin: float
+
+    def shown(self, decimals: int, sign: bool = False) -> str:
+        """``mean ± margin``; the margin is left out where there is none."""
+        if not math.isfinite(self.mean):
+            return "n/a"
+        text = f"{self.mean:{'+' if sign else ''}.{decimals}f}"
+        return f"{text} ± {self.margin:.{decimals}f}" if math.isfinite(self.margin) else text
+
+
+def estimate(values: Sequence[float]) -> Estimate:
+    """Mean and 95 % confidence interval of independent values; NaN for none."""
+    count = len(values)
+    if not count:
+        return Estimate(math.nan, math.nan)
+    mean = sum(values) / count
+    if count == 1:
+        return Estimate(mean, math.nan)
+    deviation = math.sqrt(sum((value - mean) ** 2 for value in values) / (count - 1))
+    return Estimate(mean, float(student.ppf(0.975, count - 1)) * deviation / math.sqrt(count))
+
+
+def over_seeds(runs: Mapping[int, Metrics], metric: str) -> Estimate:
+    """One metric over the seeds; not available if any of the runs lacks it."""
+    complete = all(metric in run for run in runs.values())
+    return estimate([run[metric] for run in runs.values()] if complete else [])
+
+
+def paired_difference(runs: Mapping[int, Metrics], reference: Mapping[int, Metrics], metric: str) -> Estimate:
+    """``runs - reference`` of one metric, seed by seed: what the seeds share cancels."""
+    seeds = [s for s in runs if s in reference and metric in runs[s] and metric in reference[s]]
+    return estimate([runs[s][metric] - reference[s][metric] for s in seeds])
+
+
+def summarize(results: Mapping[str, Mapping[int, Metrics]], reference: str) -> dict[str, dict[str, dict[str, float]]]:
+    """Everything the tables show, as plain numbers: ``{run: {metric: {mean, ci95, difference, difference_ci95}}}``."""
+    summary: dict[str, dict[str, dict[str, float]]] = {}
+    for name, runs in results.items():
+        metrics = sorted(set.intersection(*(set(run) for run in runs.values()))) if runs else []
+        summary[name] = {}
+        for metric in metrics:
+            value = over_seeds(runs, metric)
+            change = paired_difference(runs, results.get(reference, {}), metric)
+            figures = {
+                "mean": value.mean,
+                "ci95": value.margin,
+                "difference": change.mean,
+                "difference_ci95": change.margin,
+            }
+            summary[name][metric] = {key: figure for key, figure in figures.items() if math.isfinite(figure)}
+    return summary
+
+
+def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table; the first column is left-aligned."""
+    lines = ["| " + " | ".join(header) + " |", "|---" + "|---:" * (len(header) - 1) + "|"]
+    return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)])
+
+
+def quoted(path: Path) -> str:
+    """The path as a value in an override, whatever signs of Hydra's grammar are in it."""
+    return "'" + str(path).replace("'", "\\'") + "'"

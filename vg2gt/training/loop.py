@@ -1,0 +1,258 @@
+"""A training run: build from the configuration, evaluate the untrained head, train, evaluate again, report."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import lightning
+import torch
+from hydra.utils import instantiate
+from lightning.fabric.utilities.rank_zero import rank_zero_only
+from lightning.pytorch import LightningDataModule, Trainer
+from lightning.pytorch.callbacks import ProgressBar
+from omegaconf import DictConfig, OmegaConf
+
+from vg2gt.data.datamodule import SceneDataModule
+from vg2gt.io.files import read_json, write_json, write_text
+from vg2gt.memory import TRAINING, memory_advice
+from vg2gt.runs.checkpoints import AtomicCheckpointIO, initialize_from, newest_valid, read_checkpoint, remove_leftovers
+from vg2gt.runs.trust import read_run_config
+from vg2gt.training.distributed import ending_together
+from vg2gt.training.module import VG2GTModule
+from vg2gt.training.preview import write_preview
+from vg2gt.training.report import comparison_table, print_comparison
+
+log = logging.getLogger(__name__)
+
+EXPECTED_WARNINGS = (
+    r"Found \d+ module\(s\) in eval mode",  # the frozen backbone
+    r"You're resuming from a checkpoint that ended before the epoch",  # batches are a function of the step's number
+    r"The '\w+_dataloader' does not have many workers",  # rooms come from the memory cache
+    r"It is recommended to use `self.log\('eval/",  # all ranks log the same
+    r".*isinstance\(treespec, LeafSpec\)",  # inside Lightning
+)
+
+PRECISIONS = ("32-true", "bf16-mixed", "32", "bf16")  # the last two are Lightning's short names
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a configuration stands for.
+
+    Attributes:
+        module: model, loss, renderer and optimiser.
+        datamodule: training and evaluation scenes.
+        trainer: Lightning's trainer.
+        folder: the run's own folder, ``outputs/<name>``.
+        trial: one step of everything (``fast_dev_run``): no reports, no checkpoints.
+    """
+
+    module: VG2GTModule
+    datamodule: LightningDataModule
+    trainer: Trainer
+    folder: Path
+    trial: bool
+
+
+def build(config: DictConfig) -> Run:
+    """Instantiates everything the configuration names; each part's constructor is its schema."""
+    _check_trainer(config)
+    lightning.seed_everything(config.seed, workers=True, verbose=False)
+    for message in EXPECTED_WARNINGS:
+        warnings.filterwarnings("ignore", message=message)
+    datamodule = instantiate(config.data)
+    backend = instantiate(config.backend)
+    model = instantiate(config.model, backend=backend)
+    module = VG2GTModule(
+        model=model,
+        loss=instantiate(config.loss),
+        renderer=instantiate(config.renderer),
+        optimizer=instantiate(config.optimizer),
+        **config.training,
+        seed=config.seed,
+    )
+    trainer = instantiate(
+        config.trainer,
+        accelerator=_accelerator(config.trainer.accelerator),
+        callbacks=_callbacks(config),
+        logger=[instantiate(logger) for logger in config.logger.values() if logger],
+        plugins=[AtomicCheckpointIO()],
+        default_root_dir=config.output_dir,
+    )
+    return Run(module, datamodule, trainer, Path(config.output_dir), bool(config.trainer.get("fast_dev_run")))
+
+
+def _callbacks(config: DictConfig) -> list[lightning.Callback]:
+    """The configured callbacks; ``trainer.enable_progress_bar=false`` leaves progress bars out."""
+    callbacks = [instantiate(callback) for callback in config.callbacks.values() if callback]
+    return [c for c in callbacks if config.trainer.get("enable_progress_bar", True) or not isinstance(c, ProgressBar)]
+
+
+def _accelerator(asked: str) -> str:
+    """``auto`` means CUDA or the CPU: Apple's MPS has no float64, which the geometry needs."""
+    return asked if asked != "auto" else "gpu" if torch.cuda.is_available() else "cpu"
+
+
+def _check_trainer(config: DictConfig) -> None:
+    if str(config.trainer.get("precision", "32-true")) not in PRECISIONS:
+        raise ValueError(
+            f"trainer.precision={config.trainer.precision} is not supported: geometry, voxels, rendering and losses "
+            "are float32, which half precision cannot hold and float64 does not improve; use bf16-mixed (networks in "
+            "bfloat16) or 32-true"
+        )
+    if config.trainer.get("accumulate_grad_batches", 1) != 1:
+        raise ValueError(
+            "trainer.accumulate_grad_batches is not supported: a batch is a function of the optimiser's step; use "
+            "data.max_images for larger steps"
+        )
+
+
+@memory_advice(TRAINING)
+def train(config: DictConfig) -> dict[str, Any]:
+    """Runs the configuration from beginning to end.
+
+    Writes into ``outputs/<name>``: the resolved configuration, checkpoints, ``metrics.json``, ``metrics.md`` and
+    ``preview.png``.
+
+    Returns:
+        The content of ``metrics.json``.
+
+    Raises:
+        FileExistsError: if the folder holds a run and neither ``ckpt`` nor ``overwrite`` says what to do with it.
+        FileNotFoundError: if ``ckpt`` names no valid checkpoint.
+        ValueError: if the model has no trained part.
+        OutOfMemory: if a device's memory is full, naming the sizes and the options that reduce them.
+    """
+    checkpoint = _checkpoint_to_resume(config)
+    run = build(config)
+    if isinstance(run.datamodule, SceneDataModule):
+        run.datamodule.setup("fit")  # before anything is measured: faults of the data are named first
+    if not run.module.model.trained_parameters():
+        raise ValueError(
+            f"{type(run.module.model).__name__} has no trained part: evaluate it as it is (python -m vg2gt.evaluate), "
+            "or choose another model="
+        )
+    if checkpoint is not None:
+        _name_differences(config)
+    if rank_zero_only.rank == 0 and not run.trial:
+        remove_leftovers(run.folder, checkpoint)
+    write_text(run.folder / "config.yaml", OmegaConf.to_yaml(config, resolve=True))
+    if config.init_from and checkpoint is None:
+        initialize_from(run.module, config.init_from)
+
+    with ending_together(run.trainer):
+        untrained = _untrained_metrics(run, resumed=checkpoint is not None)
+        run.trainer.fit(run.module, datamodule=run.datamodule, ckpt_path=checkpoint, weights_only=True)
+        _save_last(run)
+        if not run.trial and run.trainer.global_step < run.trainer.max_steps:
+            log.warning("training ended at step %d of %d", run.trainer.global_step, run.trainer.max_steps)
+            return {}
+        trained = evaluate(run)
+        return _report(run, untrained, trained)
+
+
+def _checkpoint_to_resume(config: DictConfig) -> Path | None:
+    """Resolves ``ckpt``; never restarts a run silently and never mixes two runs in one folder."""
+    folder = Path(config.output_dir) / "checkpoints"
+    old = sorted(folder.glob("*.ckpt"))
+    if config.ckpt == "last" or (config.ckpt == "auto" and old):
+        return newest_valid(folder)
+    if config.ckpt == "auto":
+        log.info("ckpt=auto: no checkpoint in %s yet, the run starts from the beginning", folder)
+    elif config.ckpt:
+        path, step = Path(config.ckpt), read_checkpoint(config.ckpt)["global_step"]
+        if old and not (path.resolve().parent == folder.resolve() and path.name == newest_valid(folder).name):
+            raise FileExistsError(
+                f"ckpt={path} (step {step}) is not the newest checkpoint of the run in {folder}: go on in a new folder "
+                "with name=, or with ckpt=last"
+            )
+        return path
+    if old and not config.trainer.get("fast_dev_run"):
+        if not config.overwrite:
+            raise FileExistsError(
+                f"{folder} already holds a run ({len(old)} checkpoints): go on with ckpt=last, choose another name=, "
+                "or replace it with overwrite=true"
+            )
+        for path in old:
+            path.unlink(missing_ok=True)
+        # Neither the curve nor the result of the run that was replaced is this run's.
+        shutil.rmtree(folder.parent / "logs", ignore_errors=True)
+        (folder.parent / "metrics.json").unlink(missing_ok=True)
+    return None
+
+
+def _name_differences(config: DictConfig) -> None:
+    """Says in the log what a resumed run does otherwise than the interrupted one."""
+    path = Path(config.output_dir) / "config.yaml"
+    if not path.is_file():
+        return
+    before, now = (flatten(OmegaConf.to_container(c, resolve=True)) for c in (read_run_config(path), config))
+    different = sorted(key for key in before.keys() | now.keys() if before.get(key) != now.get(key))
+    different = [key for key in different if key not in ("ckpt", "output_dir", "overwrite")]
+    if different:
+        log.warning("the resumed run differs from the interrupted one in %s", ", ".join(different))
+
+
+def flatten(node: Any, prefix: str = "") -> dict[str, Any]:
+    """Names the leaves of nested dictionaries by dotted keys."""
+    if not isinstance(node, dict):
+        return {prefix: node}
+    return {
+        key: value
+        for name, child in node.items()
+        for key, value in flatten(child, f"{prefix}.{name}".strip(".")).items()
+    }
+
+
+def _save_last(run: Run) -> None:
+    """Saves the final weights where the last step was not a checkpoint's turn."""
+    path = run.folder / "checkpoints" / f"step-{run.trainer.global_step}.ckpt"
+    # Rank 0 decides for all: saving is collective, and it makes the file appear.
+    if run.trainer.strategy.broadcast(not run.trial and not path.is_file()):
+        run.trainer.save_checkpoint(path)
+
+
+def evaluate(run: Run) -> dict[str, float]:
+    """Evaluates the model as it is on the evaluation scenes; returns means over scenes."""
+    results = run.trainer.validate(run.module, datamodule=run.datamodule, verbose=False)
+    return {key.removeprefix("eval/"): float(value) for key, value in results[0].items()} if results else {}
+
+
+def _untrained_metrics(run: Run, resumed: bool) -> dict[str, float]:
+    """Metrics of the head as initialised: measured once a run and kept beside it for resumed runs."""
+    path = run.folder / "untrained.json"
+    if resumed and path.is_file():
+        return read_json(path)
+    if resumed or run.trial:
+        return {}
+    metrics = evaluate(run)
+    write_json(path, metrics)
+    return metrics
+
+
+def _report(run: Run, untrained: dict[str, float], trained: dict[str, float]) -> dict[str, Any]:
+    report = {
+        "untrained": untrained,
+        "trained": trained,
+        "steps": run.trainer.global_step,
+        "skipped_steps": run.module.skipped.summary(),
+    }
+    if run.trainer.is_global_zero and not run.trial:
+        write_json(run.folder / "metrics.json", report)
+        write_text(run.folder / "metrics.md", comparison_table(untrained, trained))
+        print_comparison(untrained, trained)
+        run.module.to(run.trainer.strategy.root_device)  # the strategy's teardown has moved it to the CPU
+        preview = write_preview(run.module, run.datamodule, run.folder / "preview.png")
+        newest = newest_valid(run.folder / "checkpoints")
+        for name, path in (
+            ("preview (input | rendered colour | depth | normals | ground truth)", preview),
+            ("checkpoint", newest),
+            ("metrics", run.folder / "metrics.json"),
+        ):
+            print(f"{name}: {path}")
+    return report

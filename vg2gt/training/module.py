@@ -1,0 +1,249 @@
+"""The training loop's view of VG²GT: steps, optimiser, logging, checkpoints of the trained part. No maths."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import lightning
+import torch
+from torch import Tensor, nn
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LambdaLR
+
+from vg2gt.evaluation import evaluate_scene
+from vg2gt.evaluation.protocols import training_cameras
+from vg2gt.losses import LossReport
+from vg2gt.memory import dropped_by
+from vg2gt.model import Reconstructor
+from vg2gt.profiling import stage
+from vg2gt.rendering import Renderer, UnrenderableError
+from vg2gt.runs.checkpoints import MODEL_PREFIX, model_state
+from vg2gt.training.distributed import from_all_ranks, in_turns, world_size
+from vg2gt.training.faults import (
+    Fault,
+    GradientWatch,
+    SkippedSteps,
+    described,
+    fault_of_batch,
+    fault_of_loss,
+    fault_of_prediction,
+    gather,
+)
+from vg2gt.training.schedule import cosine_with_warmup, weight_decay_groups
+from vg2gt.types import Batch, Prediction
+
+log = logging.getLogger(__name__)
+
+IN_PROGRESS_BAR = ("loss", "train/color_l1", "train/depth_gt", "train/depth_reg", "train/normal")
+
+
+class VG2GTModule(lightning.LightningModule):
+    """Trains everything but the backbone (paper, Training).
+
+    Args:
+        model: the reconstruction model.
+        loss: the training objective.
+        renderer: renders the training and evaluation views.
+        optimizer: makes the optimiser from parameter groups (Hydra partial); its ``lr`` is the initial rate.
+        final_lr: learning rate at the end of the cosine schedule.
+        warmup_steps: steps of linear warm-up.
+        render_views: most views rendered in a training step, held-out views first; None renders all.
+        max_skipped: stop after this many steps in a row whose loss or gradient was not finite.
+        seed: seeds every random draw of a step, together with the step's number, so that a resumed run draws what the
+            uninterrupted one would have drawn; the rank enters only where scenes draw apart (drop-path).
+    """
+
+    def __init__(
+        self,
+        model: Reconstructor,
+        loss: nn.Module,
+        renderer: Renderer,
+        optimizer: Callable[..., Optimizer],
+        final_lr: float = 1e-8,
+        warmup_steps: int = 0,
+        render_views: int | None = None,
+        max_skipped: int = 20,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        self.model = model
+        self.loss = loss
+        self.renderer = renderer
+        self.make_optimizer = optimizer
+        self.final_lr = final_lr
+        self.warmup_steps = warmup_steps
+        self.render_views = render_views
+        self.seed = seed
+        self.generator = torch.Generator()
+        self.skipped = SkippedSteps(max_skipped)
+        self._watch = GradientWatch(())
+        self._fault: Fault | None = None
+        self._scenes: tuple[str, ...] = ()
+        self._figures: dict[str, Tensor] = {}
+        self._scores: dict[tuple[str | int, ...], dict[str, float]] = {}
+        self.strict_loading = False  # backbone weights are never stored; load_state_dict checks everything else
+
+    # ------------------------------------------------------------------------------------------------- training
+
+    def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
+        """Seeds this step's randomness: what belongs to the step alike on all ranks, what belongs to scenes apart."""
+        step_seed = (self.seed * 1_000_003 + self.global_step) * 1009
+        self.generator.manual_seed(step_seed)  # curve orders, rendered views
+        torch.manual_seed(step_seed + self.global_rank)  # drop-path
+
+    def on_fit_start(self) -> None:
+        """Begins to watch the gradients."""
+        named = self.model.named_parameters()
+        self._watch = GradientWatch((name, parameter) for name, parameter in named if parameter.requires_grad)
+
+    def on_fit_end(self) -> None:
+        """Stops watching them."""
+        self._watch.remove()
+
+    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        """Reconstructs the context views, renders some views and returns the training loss."""
+        self._watch.clear()
+        self._scenes, self._figures = batch.scene, {}
+        self._fault = fault_of_batch(batch)
+        report = self._losses(batch) if self._fault is None else None
+        return report.total if report is not None and self._fault is None else self._lost_step()
+
+    def _losses(self, batch: Batch) -> LossReport | None:
+        """The training losses; what is not finite is noted, and None returned where it cannot be rendered."""
+        prediction = self.model(batch.context.images, batch.context.hints, self.generator)
+        self._fault = fault_of_prediction(prediction, batch.scene)
+        if self._fault is not None:
+            return None
+        views = self._draw_views(batch)
+        cameras = training_cameras(self.model, batch, prediction).select(views.to(self.device))
+        try:
+            with stage("render"):
+                rendered = self.renderer(prediction.gaussians, cameras)
+        except UnrenderableError as error:
+            self._fault = Fault(batch.scene, f"nothing to render: {error}")
+            return None
+        with stage("loss"):
+            report: LossReport = self.loss(prediction, batch, rendered, views, cameras)
+        self._fault = fault_of_loss(report, batch.scene)
+        self._figures = self._step_figures(report, batch, prediction)
+        return report
+
+    def _lost_step(self) -> Tensor:
+        """A loss that is NaN in every trained parameter: the step is then dropped on all ranks."""
+        return torch.stack([parameter.sum() for parameter in self.model.trained_parameters()]).sum() * torch.nan
+
+    def _draw_views(self, batch: Batch) -> Tensor:
+        """Indices of the views to render: all held-out views, then a random choice of context views, up to the cap."""
+        total = batch.images.shape[1]
+        held_out = torch.arange(batch.num_context, total)
+        context = torch.randperm(batch.num_context, generator=self.generator)
+        return torch.cat((held_out, context))[: self.render_views]
+
+    def _step_figures(self, report: LossReport, batch: Batch, prediction: Prediction) -> dict[str, Tensor]:
+        """What is logged of a step; the mean over ranks is what one process with all scenes would log."""
+        figures: dict[str, Tensor | float] = {"loss": report.total.detach()}
+        figures |= {f"train/{name}": value for name, value in report.terms.items()}
+        figures["train/gaussians_per_view"] = len(prediction.gaussians) / (len(batch.scene) * batch.num_context)
+        if prediction.voxels is not None:
+            figures["train/voxels_per_pixel"] = len(prediction.voxels.grid) / batch.context.depth.numel()
+        figures |= {f"train/{what}_dropped": float(count) for what, count in dropped_by(self.model).items()}
+        figures["train/scenes_without_depth"] = float(report.skipped * world_size())
+        as_tensor = partial(torch.as_tensor, dtype=torch.float32, device=report.total.device)
+        return {name: as_tensor(value) for name, value in figures.items()}
+
+    def _log_step(self, average: bool) -> None:
+        """Logs the step's figures: means over ranks, or this rank's own of a step that was dropped."""
+        if not self._figures:
+            return
+        values = torch.stack(list(self._figures.values()))
+        if average:
+            values = self.trainer.strategy.reduce(values, reduce_op="mean")
+        for name, value in zip(self._figures, values, strict=True):
+            self.log(name, value, prog_bar=name in IN_PROGRESS_BAR)
+
+    def configure_gradient_clipping(
+        self,
+        optimizer: Optimizer,
+        gradient_clip_val: int | float | None = None,
+        gradient_clip_algorithm: str | None = None,
+    ) -> None:
+        """Clips the global gradient norm; drops the step on all ranks if a loss or gradient is not finite on any."""
+        if gradient_clip_algorithm not in (None, "norm"):
+            raise ValueError(f"trainer.gradient_clip_algorithm={gradient_clip_algorithm} is not supported; use norm")
+        limit = float(gradient_clip_val) if gradient_clip_val and gradient_clip_val > 0 else float("inf")
+        norm = nn.utils.clip_grad_norm_(self.model.trained_parameters(), limit)
+        sound = self._fault is None and bool(torch.isfinite(norm))
+        # Every rank sees the sum, so all of them drop the step or none does.
+        unsound = self.trainer.strategy.reduce(norm.new_tensor(float(not sound)), reduce_op="sum")
+        if float(unsound) > 0:
+            # Without gradients the optimiser leaves parameters and moments as they are: no decay, no NaN.
+            optimizer.zero_grad(set_to_none=True)
+            self._drop_step()
+        else:
+            self.skipped.good()
+        self._log_step(average=float(unsound) == 0)
+        self.log("train/grad_norm", norm.detach())
+        self.log("train/skipped_steps", float(self.skipped.total))
+
+    def _drop_step(self) -> None:
+        """Counts a dropped step and says what every rank found."""
+        fault = self._fault
+        if fault is None and (name := self._watch.first_bad()):
+            fault = Fault(self._scenes, f"gradient of {name}")
+        faults = gather(fault and replace(fault, step=self.global_step, rank=self.global_rank))
+        if self.trainer.is_global_zero:
+            log.warning("step %d skipped: %s", self.global_step, described(faults))
+        self.skipped.add(faults)
+
+    def configure_optimizers(self) -> dict[str, Any]:
+        """Optimiser over the trained parameters and a per-step cosine schedule over the whole run."""
+        optimizer = self.make_optimizer(weight_decay_groups(self.model))
+        initial_lr = optimizer.param_groups[0]["lr"]
+        steps = int(self.trainer.estimated_stepping_batches)
+        factor = cosine_with_warmup(steps, self.warmup_steps, self.final_lr / initial_lr)
+        scheduler = LambdaLR(optimizer, factor)
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
+
+    # ----------------------------------------------------------------------------------------------- evaluation
+
+    def on_validation_epoch_start(self) -> None:
+        """Forgets the scores of the evaluation before."""
+        self._scores = {}
+
+    def validation_step(self, batch: Batch, batch_idx: int) -> None:
+        """Evaluates one held-out scene batch."""
+        for index, scene in enumerate(batch.scene):
+            sample = (scene, *batch.frame_ids[index].tolist())
+            self._scores[sample] = evaluate_scene(self.model, self.renderer, batch.single(index))
+
+    def on_validation_epoch_end(self) -> None:
+        """Logs every number as ``eval/<name>``: means over the scenes that have it, each counted once on all ranks.
+
+        The ranks' scenes are joined in the order of one process, so their number does not change a bit of the means.
+        """
+        for metrics in in_turns(from_all_ranks(self._scores)).values():
+            for name, value in metrics.items():
+                if math.isfinite(value):  # a scene without ground-truth depth has no depth error
+                    self.log(f"eval/{name}", value, on_epoch=True, batch_size=1)
+
+    # ---------------------------------------------------------------------------------------------- checkpoints
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Keeps the trained part only, and the identity of the backbone it belongs to."""
+        checkpoint["state_dict"] = {MODEL_PREFIX + name: value for name, value in self.model.trained_state().items()}
+        checkpoint["backend"] = dict(self.model.backend.identity())
+        checkpoint["skipped_steps"] = self.skipped.state_dict()
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Refuses a checkpoint that was trained on another backbone."""
+        self.model.check_backend(checkpoint.get("backend"))
+        self.skipped.load_state_dict(checkpoint.get("skipped_steps", 0))
+
+    def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False):
+        """Loads the trained part; only backbone weights may be missing."""
+        self.model.load_trained(model_state(state_dict), self.model.backend.identity())
