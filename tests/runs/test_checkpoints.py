@@ -16,27 +16,33 @@ import torch
 from torch import nn
 
 from tests.reliability.crash_harness import assert_equal
-from vg2gt.runs.checkpoints import AtomicCheckpointIO, initialize_from, newest_valid, read_checkpoint, remove_leftovers
+from vg2gt.runs.checkpoints import (
+    initialize_from,
+    newest_valid,
+    read_checkpoint,
+    remove_leftovers,
+    write_checkpoint,
+)
+from vg2gt.training.checkpoint_io import AtomicCheckpointIO
 
 
 def test_save_is_atomic_and_reads_back(tmp_path: Path) -> None:
     path = tmp_path / "checkpoints" / "step-3.ckpt"
-    AtomicCheckpointIO().save_checkpoint({"global_step": 3, "state_dict": {"w": torch.arange(4.0)}}, path)
+    write_checkpoint({"global_step": 3, "state_dict": {"w": torch.arange(4.0)}}, path)
     assert torch.equal(read_checkpoint(path)["state_dict"]["w"], torch.arange(4.0))
     assert [p.name for p in path.parent.iterdir()] == ["step-3.ckpt"]
 
 
 def test_failed_write_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "step-3.ckpt"
-    writer = AtomicCheckpointIO()
-    writer.save_checkpoint({"global_step": 3}, path)
+    write_checkpoint({"global_step": 3}, path)
 
     def full(*args: object) -> None:
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("torch.save", full)
     with pytest.raises(OSError, match=r"earlier checkpoints are intact"):
-        writer.save_checkpoint({"global_step": 4}, path)
+        write_checkpoint({"global_step": 4}, path)
     assert read_checkpoint(path)["global_step"] == 3
     assert len(list(tmp_path.iterdir())) == 1
 
@@ -44,11 +50,10 @@ def test_failed_write_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.Mon
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
 @pytest.mark.parametrize("values", [10, 1_000_000])
 def test_full_disk_is_one_error_that_names_the_file(tmp_path: Path, values: int) -> None:
-    writer = AtomicCheckpointIO()
-    writer.save_checkpoint({"global_step": 3}, tmp_path / "step-3.ckpt")
+    write_checkpoint({"global_step": 3}, tmp_path / "step-3.ckpt")
     (tmp_path / "step-4.ckpt.tmp").symlink_to("/dev/full")
     with pytest.raises(OSError, match=r"step-4\.ckpt could not be written \(.*No space left.*go on with ckpt=last"):
-        writer.save_checkpoint({"global_step": 4, "w": torch.zeros(values)}, tmp_path / "step-4.ckpt")
+        write_checkpoint({"global_step": 4, "w": torch.zeros(values)}, tmp_path / "step-4.ckpt")
     assert [path.name for path in tmp_path.iterdir()] == ["step-3.ckpt"]
     assert newest_valid(tmp_path).name == "step-3.ckpt"
 
@@ -67,14 +72,13 @@ def test_file_and_folder_reach_the_disk_in_order(tmp_path: Path, monkeypatch: py
 
     monkeypatch.setattr("os.fsync", noted_fsync)
     monkeypatch.setattr("os.replace", noted_replace)
-    AtomicCheckpointIO().save_checkpoint({"global_step": 3}, tmp_path / "step-3.ckpt")
+    write_checkpoint({"global_step": 3}, tmp_path / "step-3.ckpt")
     assert done == ["step-3.ckpt.tmp", "rename", tmp_path.name]
 
 
 def test_newest_valid_passes_over_damaged_files(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    writer = AtomicCheckpointIO()
     for step in (9, 10, 100):
-        writer.save_checkpoint({"global_step": step}, tmp_path / f"step-{step}.ckpt")
+        write_checkpoint({"global_step": step}, tmp_path / f"step-{step}.ckpt")
     assert newest_valid(tmp_path).name == "step-100.ckpt"
     content = (tmp_path / "step-100.ckpt").read_bytes()
     (tmp_path / "step-100.ckpt").write_bytes(content[: len(content) // 2])
@@ -90,7 +94,7 @@ def test_no_valid_checkpoint_is_an_error(tmp_path: Path) -> None:
 
 
 def test_whatever_bears_the_name_is_passed_over(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    AtomicCheckpointIO().save_checkpoint({"global_step": 1}, tmp_path / "step-1.ckpt")
+    write_checkpoint({"global_step": 1}, tmp_path / "step-1.ckpt")
     (tmp_path / "step-2.ckpt").touch()
     (tmp_path / "step-3.ckpt").mkdir()
     (tmp_path / "step-4.ckpt").symlink_to("nowhere")
@@ -107,7 +111,7 @@ def test_whatever_bears_the_name_is_passed_over(tmp_path: Path, caplog: pytest.L
 def test_flipped_bits_in_weights_are_found(tmp_path: Path) -> None:
     """torch.load alone takes them."""
     path, weights = tmp_path / "step-1.ckpt", torch.arange(1000.0)
-    AtomicCheckpointIO().save_checkpoint({"w": weights}, path)
+    write_checkpoint({"w": weights}, path)
     content = bytearray(path.read_bytes())
     content[content.find(weights.numpy().tobytes()) + 2001] ^= 4
     path.write_bytes(content)
@@ -159,9 +163,8 @@ def test_damaged_checkpoints_are_never_taken(tmp_path: Path, monkeypatch: pytest
     """Either refused or, where only padding was hit, exactly what was saved; nothing is executed."""
     monkeypatch.chdir(tmp_path)
     first, second = state(1), state(2)
-    writer = AtomicCheckpointIO()
-    writer.save_checkpoint(first, tmp_path / "step-1.ckpt")
-    writer.save_checkpoint(second, tmp_path / "step-2.ckpt")
+    write_checkpoint(first, tmp_path / "step-1.ckpt")
+    write_checkpoint(second, tmp_path / "step-2.ckpt")
     malicious = io.BytesIO()
     torch.save({"state_dict": Malicious(), "padding": torch.zeros(2000)}, malicious)
     content, tried, refused = (tmp_path / "step-2.ckpt").read_bytes(), Counter(), Counter()
@@ -187,9 +190,8 @@ def test_damaged_checkpoints_are_never_taken(tmp_path: Path, monkeypatch: pytest
 
 def test_leftovers_are_cleared(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     folder = tmp_path / "checkpoints"
-    writer = AtomicCheckpointIO()
     for step in (1, 2, 3):
-        writer.save_checkpoint({"global_step": step}, folder / f"step-{step}.ckpt")
+        write_checkpoint({"global_step": step}, folder / f"step-{step}.ckpt")
     (folder / "step-3.ckpt").write_bytes(b"damaged")
     (folder / "step-3.ckpt.damaged").write_bytes(b"damaged before")
     (folder / "step-4.ckpt").mkdir()
@@ -228,7 +230,7 @@ def test_initialize_from_names_the_layers_that_start_anew(tmp_path: Path, caplog
     new = nn.ModuleDict({"body": nn.Linear(4, 4), "out": nn.Linear(4, 14)})
     fresh, trained = new.state_dict()["out.weight"].clone(), old.state_dict()["body.weight"]
     path = tmp_path / "step-5.ckpt"
-    AtomicCheckpointIO().save_checkpoint({"state_dict": old.state_dict()}, path)
+    write_checkpoint({"state_dict": old.state_dict()}, path)
     with caplog.at_level(logging.INFO):
         initialize_from(new, path)
     assert torch.equal(new.state_dict()["body.weight"], trained)

@@ -26,7 +26,8 @@ from vg2gt.io.npz import load_npz, read_npz
 from vg2gt.io.tensors import read_tensors
 from vg2gt.metrics.lpips import load_lpips
 from vg2gt.reconstruction import load_model
-from vg2gt.runs.checkpoints import AtomicCheckpointIO, initialize_from, read_checkpoint
+from vg2gt.runs.checkpoints import initialize_from, read_checkpoint
+from vg2gt.training.checkpoint_io import AtomicCheckpointIO
 
 
 def zipped(armed: Armed) -> bytes:

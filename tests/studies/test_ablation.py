@@ -12,7 +12,7 @@ import pytest
 
 import vg2gt.studies.study
 from tests.training_helpers import SMALL
-from vg2gt.runs.checkpoints import AtomicCheckpointIO, newest_valid, read_checkpoint
+from vg2gt.runs.checkpoints import newest_valid, read_checkpoint, write_checkpoint
 from vg2gt.studies.ablation import (
     CONTROL,
     FULL,
@@ -147,7 +147,7 @@ def test_a_full_model_whose_end_is_lost_is_refused(finished: Path, cache: Path, 
     last = newest_valid(checkpoints)
     content = read_checkpoint(last)
     last.write_bytes(b"damaged")
-    AtomicCheckpointIO().save_checkpoint(content | {"global_step": 1}, checkpoints / "step-1.ckpt")
+    write_checkpoint(content | {"global_step": 1}, checkpoints / "step-1.ckpt")
     with pytest.raises(ValueError, match=r"start ran 2 steps, but its newest valid checkpoint is that of step 1"):
         study(folder, cache).run()
 

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from lightning.pytorch.plugins.io import TorchCheckpointIO
 from torch import Tensor, nn
 
 from vg2gt.io.files import flush_folder, flush_to_disk
@@ -23,35 +22,28 @@ PATTERN = "step-*.ckpt"
 MODEL_PREFIX = "model."  # of the model's names in a checkpoint's state_dict, as the Lightning module names it
 
 
-class AtomicCheckpointIO(TorchCheckpointIO):
-    """Writes a checkpoint whole or not at all, and loads tensors and plain values only (no pickled code)."""
+def write_checkpoint(checkpoint: Mapping[str, Any], path: str | Path) -> None:
+    """Saves to ``<path>.tmp``, flushes to the disk and renames; the file under ``path`` is never half-written.
 
-    def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any | None = None) -> None:
-        """Saves to ``<path>.tmp``, flushes to the disk and renames; the file under ``path`` is never half-written.
-
-        Raises:
-            OSError: if it cannot be written (a full disk); what is under ``path`` stays.
-        """
-        target = Path(path)
-        target.parent.mkdir(parents=True, exist_ok=True)
-        temporary = target.with_name(target.name + ".tmp")
-        try:
-            with open(temporary, "wb") as file:
-                torch.save(checkpoint, file)
-                flush_to_disk(file)
-            os.replace(temporary, target)
-            flush_folder(target.parent)
-        except (OSError, RuntimeError) as error:  # torch's writer may make a RuntimeError of a full disk
-            with suppress(OSError):
-                temporary.unlink(missing_ok=True)
-            raise OSError(
-                f"checkpoint {target} could not be written ({error}); earlier checkpoints are intact: make room and go "
-                "on with ckpt=last"
-            ) from error
-
-    def load_checkpoint(self, path: Any, map_location: Any = "cpu", weights_only: bool | None = True) -> dict[str, Any]:
-        """Loads on the CPU with ``weights_only=True``, whatever is asked for."""
-        return read_checkpoint(path)
+    Raises:
+        OSError: if it cannot be written (a full disk); what is under ``path`` stays.
+    """
+    target = Path(path)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    temporary = target.with_name(target.name + ".tmp")
+    try:
+        with open(temporary, "wb") as file:
+            torch.save(checkpoint, file)
+            flush_to_disk(file)
+        os.replace(temporary, target)
+        flush_folder(target.parent)
+    except (OSError, RuntimeError) as error:  # torch's writer may make a RuntimeError of a full disk
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        raise OSError(
+            f"checkpoint {target} could not be written ({error}); earlier checkpoints are intact: make room and go "
+            "on with ckpt=last"
+        ) from error
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:

@@ -26,7 +26,7 @@ from vg2gt.cli.errors import said_in_one_line
 from vg2gt.config import config_dir
 from vg2gt.evaluation.paper import tables
 from vg2gt.io.files import write_json, write_text
-from vg2gt.runs.checkpoints import AtomicCheckpointIO, read_checkpoint
+from vg2gt.runs.checkpoints import read_checkpoint, write_checkpoint
 from vg2gt.studies.study import (
     Metrics,
     compose_run,
@@ -243,7 +243,7 @@ def _without_last_layer(start: Path, path: Path) -> Path:
     """A checkpoint whose Gaussian head lacks its last layer, so that ``init_from`` starts that one anew."""
     state = read_checkpoint(start)["state_dict"]
     kept = {name: tensor for name, tensor in state.items() if not name.startswith(LAST_LAYER)}
-    AtomicCheckpointIO().save_checkpoint({"state_dict": kept}, path)
+    write_checkpoint({"state_dict": kept}, path)
     return path
 
 

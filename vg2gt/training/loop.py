@@ -20,8 +20,9 @@ from omegaconf import DictConfig, OmegaConf
 from vg2gt.data.datamodule import SceneDataModule
 from vg2gt.io.files import read_json, write_json, write_text
 from vg2gt.memory import TRAINING, memory_advice
-from vg2gt.runs.checkpoints import AtomicCheckpointIO, initialize_from, newest_valid, read_checkpoint, remove_leftovers
+from vg2gt.runs.checkpoints import initialize_from, newest_valid, read_checkpoint, remove_leftovers
 from vg2gt.runs.trust import read_run_config
+from vg2gt.training.checkpoint_io import AtomicCheckpointIO
 from vg2gt.training.distributed import ending_together
 from vg2gt.training.module import VG2GTModule
 from vg2gt.training.preview import write_preview
