@@ -11,7 +11,7 @@ import vg2gt.cli
 from vg2gt.cli import reconstruct as reconstruct_command
 from vg2gt.cli import render as render_command
 from vg2gt.io import read_cameras_json
-from vg2gt.io.video import has_ffmpeg
+from vg2gt.io.video import has_pyav
 from vg2gt.reconstruction import OUTPUTS
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -38,7 +38,7 @@ def _run(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     """Runs what needs no download; the rest is at least understood."""
     command = {"reconstruct": reconstruct_command, "render": render_command}[words[1]]
     command.parser().parse_args(words[2:])
-    if "da3_small" in words or ("video.mp4" in words[-3:] and not has_ffmpeg()):
+    if "da3_small" in words or ("video.mp4" in words[-3:] and not has_pyav()):
         return
     monkeypatch.setattr(sys, "argv", words)
     vg2gt.cli.main()

@@ -25,7 +25,7 @@ from vg2gt.io import (
 from vg2gt.reconstruction import OUTPUTS, Scene, write_outputs
 from vg2gt.types import Cameras
 
-VIDEOS = ("orbit.mp4",)  # needs ffmpeg
+VIDEOS = ("orbit.mp4",)  # needs PyAV
 
 
 @pytest.fixture(scope="module")

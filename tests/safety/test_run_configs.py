@@ -39,7 +39,7 @@ ATTACKS: dict[str, Attack] = {
     "not recursive": lambda c: {
         "_target_": "vg2gt.model.SceneScale", "_recursive_": False, "x": {"_target_": "os.mkdir", "path": c},
     },
-    "through a module of ours": lambda c: {"_target_": "vg2gt.io.video.subprocess.run", "args": ["touch", c]},
+    "through a module of ours": lambda c: {"_target_": "vg2gt.cli.sweeps.subprocess.run", "args": ["touch", c]},
     "through torch": lambda c: {"_target_": "vg2gt.model.torch.os.mkdir", "path": c},
     "a function of ours": lambda c: {"_target_": "vg2gt.io.files.write_text", "path": c, "content": ""},
     "training": lambda c: {"_target_": "vg2gt.training.loop.train", "config": {"output_dir": c}},

@@ -12,7 +12,7 @@ from typing import Any
 from rich.console import Console
 from rich.logging import RichHandler
 
-from vg2gt.io.video import MissingDecoderError, require_ffmpeg
+from vg2gt.io.video import MissingDecoderError, require_pyav
 from vg2gt.memory import RECONSTRUCTION, memory_advice
 from vg2gt.reconstruction import OUTPUTS, LoadedModel, Monitor, OutOfMemory, load_model, reconstruct_with, write_outputs
 from vg2gt.reconstruction.outputs import DEFAULT, ORBIT_FRAMES, check_folder, check_outputs, cost_figures
@@ -72,7 +72,7 @@ def run(options: argparse.Namespace) -> None:
     for item in options.images:  # before weights are downloaded
         existing_path(item)
     if "orbit.mp4" in options.save:
-        require_ffmpeg("writing orbit.mp4")
+        require_pyav("writing orbit.mp4")
     with Monitor(show=not options.quiet, device=choose_device(options.device)) as monitor:
         with monitor.stage("load model"):
             ready = load_model(options.ckpt, options.backend, options.model, options.set, device=options.device)

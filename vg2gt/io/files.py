@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import logging
 import os
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
@@ -14,23 +15,24 @@ log = logging.getLogger(__name__)
 _unwritable: set[Path] = set()
 
 
-def write_bytes(path: str | Path, content: bytes) -> Path:
-    """Writes ``content`` atomically, making the folder if needed; returns the path.
+@contextmanager
+def replacing(path: str | Path, durable: bool = False) -> Iterator[Path]:
+    """A temporary name to write to, which takes the place of ``path`` at the end of the block or vanishes on an error.
+
+    Args:
+        path: the file; its folder is made if needed.
+        durable: return only when the content would survive a power failure.
 
     Raises:
         OSError: if it cannot be written (a full disk), naming the file; what it held before is still there.
     """
-    return _write(path, content, durable=False)
-
-
-def _write(path: str | Path, content: bytes, durable: bool) -> Path:
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        with open(temporary, "wb") as file:
-            file.write(content)
-            if durable:
+        yield temporary
+        if durable:
+            with open(temporary, "rb+") as file:
                 flush_to_disk(file)
         os.replace(temporary, path)
         if durable:
@@ -40,7 +42,13 @@ def _write(path: str | Path, content: bytes, durable: bool) -> Path:
     finally:
         with suppress(OSError):  # of a disk that fails; the error on its way says more
             temporary.unlink(missing_ok=True)
-    return path
+
+
+def write_bytes(path: str | Path, content: bytes, durable: bool = False) -> Path:
+    """Writes ``content`` atomically; returns the path. Arguments and errors as in :func:`replacing`."""
+    with replacing(path, durable) as temporary:
+        temporary.write_bytes(content)
+    return Path(path)
 
 
 def flush_to_disk(file: IO[bytes]) -> None:
@@ -83,7 +91,7 @@ def write_cached(path: str | Path, content: bytes, cache: str | Path) -> None:
 
 def write_text(path: str | Path, content: str) -> Path:
     """Writes UTF-8 text atomically and to the disk itself; returns the path. Errors as in :func:`write_bytes`."""
-    return _write(path, content.encode(), durable=True)
+    return write_bytes(path, content.encode(), durable=True)
 
 
 def write_json(path: str | Path, content: Any) -> Path:

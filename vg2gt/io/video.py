@@ -1,7 +1,7 @@
 """Moving pictures: frames of videos, and animations of rendered views.
 
-GIF goes through Pillow and always works. Everything else goes through the program ``ffmpeg``: the system's, or the one
-that the extra ``video`` brings (``pip install vg2gt[video]``).
+GIF goes through Pillow and always works. Everything else goes through PyAV, FFmpeg's libraries, which the extra
+``video`` brings (``pip install vg2gt[video]``).
 
 Example:
     >>> import numpy as np, tempfile
@@ -17,29 +17,34 @@ from __future__ import annotations
 
 import importlib.util
 import io
-import os
-import re
-import shutil
-import subprocess
-import tempfile
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from fractions import Fraction
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
 from vg2gt.io.errors import FormatError
-from vg2gt.io.files import write_bytes
+from vg2gt.io.files import replacing, write_bytes
 from vg2gt.io.images import open_image
+
+if TYPE_CHECKING:
+    from av import VideoFrame  # optional
+    from av.container import InputContainer
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".gif")
 _QUALITY = "18"  # constant rate factor of H.264: 0 is lossless, 23 the program's default
 _PALETTE = 255
+# Files that hold all their frames. FFmpeg goes by a file's content, and lists and playlists under any name would make
+# it open other files of this machine.
+_CONTAINERS = "mov,matroska,avi,mpegts,mpeg,flv,asf,ogg"
 
 
 class MissingDecoderError(RuntimeError):
-    """There is no ffmpeg; the message says how to get one."""
+    """There is no PyAV; the message says how to get it."""
 
 
 def count_frames(path: str | Path) -> int:
@@ -47,17 +52,14 @@ def count_frames(path: str | Path) -> int:
 
     Raises:
         FormatError: if the file cannot be read.
-        MissingDecoderError: if it is no GIF and there is no ffmpeg.
+        MissingDecoderError: if it is no GIF and there is no PyAV.
     """
     path = _existing(path)
     if path.suffix.lower() == ".gif":
         with _open_gif(path) as image:
             return getattr(image, "n_frames", 1)
-    done = _run(["-i", str(path), "-map", "0:v:0", "-c", "copy", "-f", "null", "-"])
-    counts = re.findall(rb"frame=\s*(\d+)", done.stderr)
-    if done.returncode or not counts:
-        raise FormatError(f"{path}: ffmpeg cannot read it ({_last_line(done.stderr)})")
-    return int(counts[-1])
+    with _opened(path) as container:
+        return sum(packet.size > 0 for packet in container.demux(video=0))  # the last one is empty
 
 
 def read_video(path: str | Path, every: int = 1) -> Iterator[tuple[int, NDArray[np.uint8]]]:
@@ -72,35 +74,19 @@ def read_video(path: str | Path, every: int = 1) -> Iterator[tuple[int, NDArray[
 
     Raises:
         FormatError: if the file cannot be read.
-        MissingDecoderError: if it is no GIF and there is no ffmpeg.
+        MissingDecoderError: if it is no GIF and there is no PyAV.
     """
     path = _existing(path)
     if path.suffix.lower() == ".gif":
         yield from _read_gif(path, every)
         return
-    # Frames are numbered anew, or the chosen ones would be repeated to fill the time between them.
-    choose = f"select=not(mod(n\\,{every})),setpts=N/FRAME_RATE/TB"
-    command = [_ffmpeg(), "-v", "error", "-i", str(path), "-map", "0:v:0", "-vf", choose]
-    with tempfile.TemporaryFile() as complaints:
-        process = subprocess.Popen(
-            [*command, "-f", "image2pipe", "-c:v", "ppm", "-"],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=complaints,
-        )
-        assert process.stdout is not None
-        number = 0
-        try:
-            while (frame := _read_ppm(process.stdout)) is not None:
-                yield number, frame
-                number += every
-        finally:
-            process.stdout.close()
-            process.kill() if process.poll() is None and number else None
-            process.wait()
-        if not number:
-            complaints.seek(0)
-            raise FormatError(f"{path}: ffmpeg decodes no frame ({_last_line(complaints.read())})")
+    number = -1
+    with _opened(path) as container:
+        for number, frame in enumerate(_decoded(container)):
+            if number % every == 0:
+                yield number, _upright(frame)
+        if number < 0:
+            raise FormatError(f"{path}: no frame of it can be decoded; it is truncated or damaged")
 
 
 def write_video(path: str | Path, frames: Sequence[NDArray[np.uint8]], fps: float = 24.0) -> Path:
@@ -116,7 +102,7 @@ def write_video(path: str | Path, frames: Sequence[NDArray[np.uint8]], fps: floa
 
     Raises:
         ValueError: if there are no frames, sizes differ, or the suffix is another.
-        MissingDecoderError: if it is an MP4 and there is no ffmpeg.
+        MissingDecoderError: if it is an MP4 and there is no PyAV.
     """
     path = Path(path)
     if not len(frames) or any(f.shape != frames[0].shape or f.dtype != np.uint8 for f in frames):
@@ -130,35 +116,19 @@ def write_video(path: str | Path, frames: Sequence[NDArray[np.uint8]], fps: floa
     return _write_mp4(path, frames, fps)
 
 
-def has_ffmpeg() -> bool:
+def has_pyav() -> bool:
     """Whether anything but GIF can be read and written."""
-    return shutil.which("ffmpeg") is not None or importlib.util.find_spec("imageio_ffmpeg") is not None
+    return importlib.util.find_spec("av") is not None
 
 
-def require_ffmpeg(purpose: str) -> None:
-    """Checks early that there is an ffmpeg.
+def require_pyav(purpose: str) -> None:
+    """Checks early that there is PyAV.
 
     Raises:
         MissingDecoderError: if there is none, naming the purpose and the remedy.
     """
-    if not has_ffmpeg():
-        raise MissingDecoderError(
-            f"{purpose} needs ffmpeg: pip install 'vg2gt[video]', or install the system's ffmpeg (GIF works without)"
-        )
-
-
-def _ffmpeg() -> str:
-    require_ffmpeg("a video other than GIF")
-    found = shutil.which("ffmpeg")
-    if found is None:
-        import imageio_ffmpeg  # pyright: ignore[reportMissingImports]
-
-        found = imageio_ffmpeg.get_ffmpeg_exe()
-    return str(found)
-
-
-def _run(arguments: list[str]) -> subprocess.CompletedProcess[bytes]:
-    return subprocess.run([_ffmpeg(), *arguments], stdin=subprocess.DEVNULL, capture_output=True, check=False)
+    if not has_pyav():
+        raise MissingDecoderError(f"{purpose} needs PyAV: pip install 'vg2gt[video]' (GIF works without)")
 
 
 def _existing(path: str | Path) -> Path:
@@ -168,9 +138,46 @@ def _existing(path: str | Path) -> Path:
     return path
 
 
-def _last_line(text: bytes) -> str:
-    lines = text.decode(errors="replace").strip().splitlines()
-    return lines[-1] if lines else "it says nothing"
+@contextmanager
+def _opened(path: Path) -> Iterator[InputContainer]:
+    """A video file, and nothing that it names."""
+    require_pyav("a video other than GIF")
+    import av
+    from av.error import FFmpegError
+
+    try:
+        with open(path, "rb") as file, av.open(file, container_options={"format_whitelist": _CONTAINERS}) as container:
+            if not container.streams.video:
+                raise FormatError(f"{path}: there is no video in it; give a video's file")
+            yield container
+    except (FFmpegError, OSError) as error:
+        raise FormatError(f"{path}: no video that can be read ({error.strerror}); it is damaged or a list") from error
+
+
+def _decoded(container: InputContainer) -> Iterator[VideoFrame]:
+    """The frames of a file's first video; what is damaged is left out."""
+    from av.error import InvalidDataError
+
+    container.streams.video[0].thread_type = "AUTO"
+    for packet in container.demux(video=0):
+        try:
+            frames = packet.decode()
+        except InvalidDataError:
+            continue
+        yield from frames
+
+
+def _upright(frame: VideoFrame) -> NDArray[np.uint8]:
+    """Pixels ``[H, W, 3]`` of a frame of any depth and colour space, turned and mirrored as its display matrix says."""
+    pixels = frame.reformat(format="rgb24", interpolation="BICUBIC").to_ndarray().astype(np.uint8, copy=False)
+    matrix = frame.side_data.get("DISPLAYMATRIX")
+    if matrix is None:
+        return pixels
+    # x right, y down: shown at (a x + c y, b x + d y)
+    a, b, _, c, d = np.frombuffer(matrix, np.int32)[:5].tolist()
+    if abs(b) > abs(a):
+        pixels, a, d = pixels.swapaxes(0, 1), c, b
+    return np.ascontiguousarray(pixels[:: -1 if d < 0 else 1, :: -1 if a < 0 else 1])
 
 
 def _open_gif(path: Path) -> Image.Image:
@@ -190,28 +197,6 @@ def _read_gif(path: Path, every: int) -> Iterator[tuple[int, NDArray[np.uint8]]]
                 raise FormatError(f"{path}: frame {number} is damaged ({error})") from error
 
 
-def _read_ppm(stream: io.BufferedIOBase | io.RawIOBase | object) -> NDArray[np.uint8] | None:
-    """The next image of a stream of binary PPM files; None at its end."""
-    read = stream.read  # pyright: ignore[reportAttributeAccessIssue]
-    if read(2) != b"P6":
-        return None
-    numbers: list[int] = []
-    digits = b""
-    read(1)
-    while len(numbers) < 3:  # width, height, largest value, each followed by one blank
-        byte = read(1)
-        if byte.isdigit():
-            digits += byte
-        else:
-            numbers.append(int(digits))
-            digits = b""
-    width, height, _ = numbers
-    content = read(width * height * 3)
-    if len(content) < width * height * 3:
-        return None
-    return np.frombuffer(content, np.uint8).reshape(height, width, 3)
-
-
 def _gif(frames: Sequence[NDArray[np.uint8]], fps: float) -> bytes:
     """One palette for all frames, from the whole animation, so that colours do not flicker."""
     step = max(1, len(frames) // 8)
@@ -225,22 +210,20 @@ def _gif(frames: Sequence[NDArray[np.uint8]], fps: float) -> bytes:
 
 
 def _write_mp4(path: Path, frames: Sequence[NDArray[np.uint8]], fps: float) -> Path:
+    require_pyav(f"writing {path.name}")
+    import av
+    from av.error import FFmpegError
+
     height, width = frames[0].shape[0] // 2 * 2, frames[0].shape[1] // 2 * 2
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp.mp4")
-    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{fps:g}", "-i", "-"]
-    codec = ["-an", "-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", _QUALITY, "-movflags", "+faststart"]
-    pixels = b"".join(np.ascontiguousarray(frame[:height, :width]).tobytes() for frame in frames)
-    try:
-        done = subprocess.run(
-            [_ffmpeg(), "-v", "error", "-y", *source, *codec, str(temporary)],
-            input=pixels,
-            capture_output=True,
-            check=False,
-        )
-        if done.returncode:
-            raise OSError(f"{path}: ffmpeg could not write it ({_last_line(done.stderr)})")
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with replacing(path) as temporary:
+        try:
+            with av.open(f"file:{temporary}", "w", format="mp4", options={"movflags": "+faststart"}) as container:
+                stream = container.add_stream("libx264", Fraction(f"{fps:g}"), {"crf": _QUALITY})
+                stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+                for pixels in frames:
+                    even = np.ascontiguousarray(pixels[:height, :width])
+                    container.mux(stream.encode(av.VideoFrame.from_ndarray(even, "rgb24")))
+                container.mux(stream.encode(None))
+        except FFmpegError as error:
+            raise OSError(error.errno, error.strerror) from error
     return path

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from vg2gt.io.files import write_bytes
 from vg2gt.io.images import colorize_normals
-from vg2gt.io.video import require_ffmpeg, write_video
+from vg2gt.io.video import require_pyav, write_video
 from vg2gt.reconstruction.camera_paths import view_stem
 from vg2gt.reconstruction.scene import RenderedView
 
@@ -112,12 +112,12 @@ class Animation:
         fps: frames a second.
 
     Raises:
-        MissingDecoderError: if it is no GIF and there is no ffmpeg.
+        MissingDecoderError: if it is no GIF and there is no PyAV.
     """
 
     def __init__(self, path: Path, fps: float) -> None:
         if path.suffix != ".gif":
-            require_ffmpeg(f"writing {path.name}")
+            require_pyav(f"writing {path.name}")
         self.path = path
         self.fps = fps
         self._frames: list[NDArray[np.uint8]] = []

@@ -134,7 +134,7 @@ def write_outputs(
     Raises:
         FileExistsError: if an output is there already.
         PermissionError: if the folder cannot be written to.
-        MissingDecoderError: if an animation needs ffmpeg and there is none.
+        MissingDecoderError: if an animation needs PyAV and there is none.
         ValueError: if an output is unknown.
     """
     check_outputs(outputs)

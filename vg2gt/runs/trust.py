@@ -116,7 +116,7 @@ def _check(target: Any, said: str) -> None:
         found = get_object(target)
     except Exception as error:  # Hydra's, or whatever importing a trusted package raises
         raise UntrustedError(f"{said}, which cannot be imported ({' '.join(str(error).split())[:200]})") from error
-    # A name may lead through a module to what it has imported itself: vg2gt.io.video.subprocess.run
+    # A name may lead through a module to what it has imported itself: vg2gt.cli.sweeps.subprocess.run
     home = getattr(found, "__module__", None)
     if not isinstance(home, str) or not f"{home}.".startswith(f"{package}."):
         raise UntrustedError(f"{said}, which is defined in {home}, not in {package}; {advice}")
