@@ -19,31 +19,24 @@ from machine import machine
 from stage_clock import StageClock
 
 from vg2gt.evaluation.protocols import ground_truth_target_cameras
+from vg2gt.evaluation.tables import Metric, columns
 from vg2gt.io.files import write_json, write_text
 from vg2gt.io.images import colorize_depth, grid, write_png
 from vg2gt.runs.checkpoints import read_checkpoint
-from vg2gt.studies.study import Metrics, compose_run, final_checkpoint, markdown, over_seeds, run_once, summarize
+from vg2gt.studies.study import Metrics, compose_run, final_checkpoint, run_once, seeds_table, summarize
 from vg2gt.training.loop import Run, build
 from vg2gt.types import Batch
 
 DEFAULTS = {"name": "baselines", "steps": "400", "seeds": "1"}
 REFERENCE = "VG²GT"
 MAX_ERROR = 0.1  # relative depth error shown as white
-COLUMNS = {
-    "psnr": ("PSNR", 2),
-    "ssim": ("SSIM", 3),
-    "rmse": ("RMSE", 4),
-    "abs_rel": ("abs_rel", 4),
-    "delta_1.05": ("δ1.05", 3),
-    "abs_rel_rasterized": ("abs_rel, rasterised", 4),
-    "decoded_abs_rel": ("abs_rel, decoded", 4),
-    "normal_mean": ("normals, deg", 1),
-    "coverage": ("coverage", 4),
-    "cv": ("CV (k=8)", 3),
-    "gaussians": ("Gaussians", 0),
-    "head_seconds": ("head, core-s", 2),
-    "reconstruction_seconds": ("all, core-s", 2),
-    "render_seconds": ("render a view, core-s", 3),
+COLUMNS = columns(
+    *("psnr", "ssim", "rmse", "abs_rel", "delta_1.05", "abs_rel_rasterized", "decoded_abs_rel", "normal_mean"),
+    *("coverage", "cv", "gaussians"),
+) | {
+    "head_seconds": Metric("head, core-s", 2, False),
+    "reconstruction_seconds": Metric("all, core-s", 2, False),
+    "render_seconds": Metric("render a view, core-s", 3, False),
 }
 
 
@@ -114,17 +107,12 @@ def truth(batch: Batch) -> list[torch.Tensor]:
 
 def report(results: Mapping[str, Mapping[int, Metrics]], options: Mapping[str, str]) -> str:
     """The table as Markdown."""
-    rows = [
-        [name, *(over_seeds(runs, metric).shown(decimals) for metric, (_, decimals) in COLUMNS.items())]
-        for name, runs in results.items()
-        if runs
-    ]
     protocol = (
         f"{options['steps']} training steps each, {options['seeds']} seed(s) (mean ± 95 % confidence interval where "
         "there are several). Scenes never trained on, held-out views at ground-truth poses, rendered as stochastic "
-        "solids, depth aligned by one median scale a scene. Times: best of three passes on the first scene."
+        "solids, depth aligned by one median scale per scene. Times: best of three passes on the first scene."
     )
-    table = markdown(["", *(heading for heading, _ in COLUMNS.values())], rows)
+    table = seeds_table({name: runs for name, runs in results.items() if runs}, COLUMNS)
     return f"# VG²GT and baselines\n\n{protocol}\n\n{table}\n"
 
 
@@ -161,7 +149,7 @@ def main() -> None:
                 "overrides": overrides,
                 "machine": machine(run.module.device),
                 "runs": {key: {str(s): m for s, m in runs.items()} for key, runs in results.items()},
-                "summary": summarize({key: runs for key, runs in results.items() if runs}, REFERENCE),
+                "summary": summarize(results, REFERENCE),
             }
             write_json(home / "metrics.json", content)
             write_text(home / "metrics.md", report(results, options))

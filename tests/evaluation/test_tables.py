@@ -1,11 +1,14 @@
+import math
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from vg2gt.evaluation import paper
-from vg2gt.evaluation.tables import markdown
+from vg2gt.evaluation.sections import report_markdown
+from vg2gt.evaluation.tables import METRICS, columns, markdown_table, number
 
 
 def report(**settings: Any) -> dict[str, Any]:
@@ -43,7 +46,7 @@ def report(**settings: Any) -> dict[str, Any]:
 
 
 def test_figures_stand_where_they_belong() -> None:
-    text = markdown(report())
+    text = report_markdown(report())
     assert re.search(r"\| 3 +\| gt_pose +\| solid +\| +0\.0123 \|.* 0\.9876 \|", text)
     assert re.search(r"\| 10 +\| gt_pose +\| rasterized \| +24\.00 \| +n/a \| +n/a \|", text)
     assert re.search(r"\| room +\| 3 +\| +25\.50 \|", text)
@@ -54,24 +57,43 @@ def test_figures_stand_where_they_belong() -> None:
     assert "paper" not in text
 
 
+def test_a_table_is_aligned_and_says_what_is_missing() -> None:
+    cells = [number(1.25, 1), number(None, 1), number(math.inf, 1), number(0.5, 2, sign=True)]
+    assert cells == ["1.2", "n/a", "n/a", "+0.50"]
+    table = markdown_table(["", "value"], [["a", cells[0]], ["longer", cells[1]]])
+    assert table.splitlines() == [
+        "|        | value |",
+        "| ------ | ----: |",
+        "| a      |   1.2 |",
+        "| longer |   n/a |",
+    ]
+
+
+def test_columns_are_the_specifications_but_for_what_a_table_says() -> None:
+    path = "rendered/gt_pose/solid/abs_rel"
+    chosen = columns("psnr", path, labels={path: "error"}, decimals={"psnr": 1})
+    assert chosen["psnr"] == replace(METRICS["psnr"], decimals=1)
+    assert chosen[path] == replace(METRICS["abs_rel"], label="error")
+
+
 def test_a_range_of_depths_is_said() -> None:
-    assert "of true depths from 0 to 10" in markdown(report(depth_range=[None, 10]))
-    assert "of true depths from 0.5 to any" in markdown(report(depth_range=[0.5, None]))
+    assert "of true depths from 0 to 10" in report_markdown(report(depth_range=[None, 10]))
+    assert "of true depths from 0.5 to any" in report_markdown(report(depth_range=[0.5, None]))
 
 
 def test_lpips_without_weights_says_how_to_get_them() -> None:
-    text = markdown(report(lpips="n/a (weights not found: evaluation.lpips=download or PATH)"))
+    text = report_markdown(report(lpips="n/a (weights not found: evaluation.lpips=download or PATH)"))
     assert "LPIPS n/a (weights not found: evaluation.lpips=download or PATH)" in text
 
 
 def test_the_papers_rows_stand_beside_ours() -> None:
-    text = markdown(report(paper="replica"))
+    text = report_markdown(report(paper="replica"))
     assert re.search(r"\| 3 +\| paper, tbl_depth_whole +\| solid +\| +0\.0070 \| +n/a \| +0\.0690 \|", text)
     assert re.search(r"\| 10 +\| paper, tbl_depth_whole +\| rasterized \| +0\.0140 \|", text)
     assert re.search(r"\| 3 +\| paper, tbl_nvs_whole +\| solid +\| +31\.03 \| +0\.898 \| +0\.169 \|", text)
     assert re.search(r"paper, tbl_camera_orientation +\| solid +\| +7\.34 \| +3\.64 \|", text)
     assert re.search(r"paper, tbl_point_uniformity +\| +0\.353 \|", text)
-    enhanced = markdown(report(paper="scannet"))
+    enhanced = report_markdown(report(paper="scannet"))
     assert re.search(r"after: paper, tbl_depth_scannet_tat +\| +0\.0320 \|", enhanced)
     assert re.search(r"before \(DA3\): paper, tbl_depth_scannet_tat +\| +0\.0360 \|", enhanced)
     assert "tbl_depth_whole" not in enhanced
@@ -102,7 +124,7 @@ PAPERS = {
 def test_only_the_papers_protocol_may_stand_beside_the_paper(key: str, value: Any, told: str) -> None:
     assert paper.obstacle("replica", **PAPERS) is None
     assert re.search(told, paper.obstacle("replica", **PAPERS | {key: value}) or "")
-    assert "the paper's rows are left out: because" in markdown(report(paper_obstacle="because"))
+    assert "the paper's rows are left out: because" in report_markdown(report(paper_obstacle="because"))
 
 
 def figures(node: Any) -> list[float]:

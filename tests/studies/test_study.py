@@ -7,14 +7,15 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from vg2gt.evaluation.tables import columns
 from vg2gt.studies.study import (
     Estimate,
     compose_run,
     estimate,
-    markdown,
     over_seeds,
     paired_difference,
     quoted,
+    seeds_table,
     summarize,
 )
 
@@ -62,8 +63,14 @@ def test_summary_has_no_numbers_that_do_not_exist() -> None:
     assert summary["full"]["psnr"] == {"mean": 20.0, "difference": 0.0}
 
 
-def test_markdown_table() -> None:
-    assert markdown(["", "a"], [["x", "1"]]) == "|  | a |\n|---|---:|\n| x | 1 |"
+def test_one_row_per_run() -> None:
+    runs = {"full": {0: {"psnr": 20.0}, 1: {"psnr": 30.0}}, "other": {0: {"psnr": 19.0}, 1: {}}}
+    table = seeds_table(runs, columns("psnr", decimals={"psnr": 1}))
+    assert table.splitlines()[1:] == [
+        "| ----- | ----------: |",
+        "| full  | 25.0 ± 63.5 |",
+        "| other |         n/a |",
+    ]
 
 
 def test_paths_survive_the_override_grammar(tmp_path: Path) -> None:

@@ -63,14 +63,14 @@ def obstacle(
     return None
 
 
-def rows_by_views(table: str, dataset: str, views: int) -> Iterator[tuple[str, Mapping[str, float]]]:
-    """The paper's own rows for a number of views: rendering mode and figures."""
+def rows_by_views(table: str, dataset: str | None, views: int) -> Iterator[tuple[str, Mapping[str, float]]]:
+    """The paper's own rows for a number of views: rendering mode and figures; none without a data set."""
     methods = tables()[table].get(dataset, {})
     for method, mode in MODES.items():
         if str(views) in methods.get(method, {}):
             yield mode, methods[method][str(views)]
 
 
-def row(table: str, dataset: str, method: str = OURS) -> Mapping[str, float] | None:
-    """A method's row of a table without numbers of views; None if the data set is not in it."""
+def row(table: str, dataset: str | None, method: str = OURS) -> Mapping[str, float] | None:
+    """A method's row of a table without numbers of views; None if there is no data set or it is not in the table."""
     return tables()[table].get(dataset, {}).get(method)

@@ -22,8 +22,8 @@ from vg2gt.evaluation.checks import refuse_training_views, refuse_without_hints
 from vg2gt.evaluation.evaluator import SceneEvaluator, SceneResult
 from vg2gt.evaluation.options import EvaluationOptions
 from vg2gt.evaluation.pictures import PANELS, scene_picture
+from vg2gt.evaluation.sections import report_markdown
 from vg2gt.evaluation.store import ResultStore
-from vg2gt.evaluation.tables import markdown
 from vg2gt.io.files import write_json, write_text
 from vg2gt.io.images import write_png
 from vg2gt.memory import EVALUATION, memory_advice
@@ -95,7 +95,7 @@ def evaluate(config: DictConfig) -> dict[str, Any]:
         },
     }
     write_json(folder / "metrics.json", report)
-    text = markdown(report)
+    text = report_markdown(report)
     write_text(folder / "metrics.md", text)
     print(text)
     if options.pictures:

@@ -15,7 +15,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import hydra
@@ -25,17 +25,19 @@ from omegaconf import DictConfig
 from vg2gt.cli.errors import said_in_one_line
 from vg2gt.config import config_dir
 from vg2gt.evaluation.paper import tables
+from vg2gt.evaluation.tables import Metric, columns, markdown_table
 from vg2gt.io.files import write_json, write_text
 from vg2gt.runs.checkpoints import read_checkpoint, write_checkpoint
 from vg2gt.studies.study import (
+    Estimate,
     Metrics,
     compose_run,
     final_checkpoint,
-    markdown,
-    over_seeds,
     paired_difference,
     quoted,
     run_once,
+    seeds_row,
+    seeds_table,
     summarize,
 )
 
@@ -56,23 +58,11 @@ LABELS = {
     FULL: "VG²GT (full)",
     CONTROL: "full, last layer anew",
 }
-# metric -> (heading, decimals, larger is better; None: neither)
-PAPER_COLUMNS: dict[str, tuple[str, int, bool | None]] = {
-    "psnr": ("PSNR", 2, True),
-    "ssim": ("SSIM", 3, True),
-    "lpips": ("LPIPS", 3, False),
-    "rmse": ("RMSE", 4, False),
-    "abs_rel": ("ABS", 4, False),
-    "delta_1.25": ("δ1.25", 4, True),
-    "delta_1.05": ("δ1.05", 4, True),
-}
-OUR_COLUMNS: dict[str, tuple[str, int, bool | None]] = {
-    "abs_rel_rasterized": ("ABS, rasterised", 4, False),
-    "decoded_abs_rel": ("ABS, decoded", 4, False),
-    "normal_mean": ("normals [deg]", 1, False),
-    "cv": ("CV", 3, False),
-    "gaussians": ("Gaussians", 0, None),
-}
+PAPER_COLUMNS = columns(
+    *("psnr", "ssim", "lpips", "rmse", "abs_rel", "delta_1.25", "delta_1.05"),
+    decimals={"delta_1.25": 4, "delta_1.05": 4},
+)
+OUR_COLUMNS = columns("abs_rel_rasterized", "decoded_abs_rel", "normal_mean", "cv", "gaussians")
 # The rows of the paper's tables of the same meaning (Replica).
 PAPER_ABLATION, PAPER_SPLIT, PAPER_DATA = "tbl_ablation", "tbl_split", "replica"
 PAPER_FULL = "VG2GT (full)"
@@ -104,10 +94,11 @@ def continuations(variants: Sequence[str], splits: Sequence[int], full_splits: i
     return runs
 
 
+@dataclass
 class Ablation:
     """Runs the study and writes its tables.
 
-    Args:
+    Attributes:
         folder: holds everything.
         overrides: of ``train.yaml``, common to all runs.
         seeds: repetitions.
@@ -115,32 +106,25 @@ class Ablation:
         steps: of every continuation.
         lr: initial learning rate of every continuation.
         variants: options of the group ``ablation``.
-        splits: numbers of Gaussians a voxel.
+        splits: numbers of Gaussians per voxel.
+        results: metrics by run and seed.
+        diverged: the continuations without a result.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        overrides: Sequence[str],
-        seeds: int,
-        full_steps: int,
-        steps: int,
-        lr: float,
-        variants: Sequence[str],
-        splits: Sequence[int],
-    ) -> None:
-        self.folder = folder
-        self.overrides = list(overrides)
-        self.seeds = seeds
-        self.full_steps = full_steps
-        self.steps = steps
-        self.lr = lr
-        self.variants = list(variants)
-        self.splits = list(splits)
-        self.full_splits = int(compose_run(self.overrides, folder).model.gaussians.splits)
+    folder: Path
+    overrides: Sequence[str]
+    seeds: int
+    full_steps: int
+    steps: int
+    lr: float
+    variants: Sequence[str]
+    splits: Sequence[int]
+    diverged: list[str] = field(default_factory=list, init=False)
+
+    def __post_init__(self) -> None:
+        self.full_splits = int(compose_run(self.overrides, self.folder).model.gaussians.splits)
         self.runs = continuations(self.variants, self.splits, self.full_splits)
         self.results: dict[str, dict[int, Metrics]] = {run.name: {} for run in self.runs}
-        self.diverged: list[str] = []
 
     def run(self) -> None:
         """Runs whatever is not finished; the tables are rewritten after every run.
@@ -179,10 +163,10 @@ class Ablation:
             "full_steps": self.full_steps,
             "steps": self.steps,
             "lr": self.lr,
-            "overrides": self.overrides,
+            "overrides": list(self.overrides),
             "diverged": self.diverged,
             "runs": {name: {str(seed): m for seed, m in runs.items()} for name, runs in self.results.items()},
-            "summary": summarize({name: runs for name, runs in self.results.items() if runs}, FULL),
+            "summary": summarize(self.results, FULL),
             "paper": {table: tables()[table][PAPER_DATA] for table in (PAPER_ABLATION, PAPER_SPLIT)},
         }
         write_json(self.folder / "metrics.json", content)
@@ -190,24 +174,23 @@ class Ablation:
 
     def report(self) -> str:
         """Both tables as Markdown, the paper's rows beside ours, and the differences to the full model."""
-        ablations = [*self.variants, FULL]
         splits = {f"splits={count}": self._row_of(count) for count in self.splits}
         parts = [
             "# Ablations",
             self._protocol(),
             "## Components",
-            _table(self.results, {name: name for name in ablations}),
+            _beside_paper(self.results, {name: name for name in (*self.variants, FULL)}),
             "## Splits",
-            _table(self.results, splits | ({CONTROL: CONTROL} if CONTROL in self.results else {})),
+            _beside_paper(self.results, splits | ({CONTROL: CONTROL} if CONTROL in self.results else {})),
             "## More figures of the same runs",
-            _plain_table(self.results, OUR_COLUMNS),
+            seeds_table({_label(name): runs for name, runs in self.results.items()}, OUR_COLUMNS),
             "## Differences to the full model, seed by seed",
-            _difference_table(self.results, FULL),
+            _differences(self.results, FULL),
         ]
         if CONTROL in self.results:
             parts += [
                 "## Differences to the full model with a new last layer, seed by seed",
-                _difference_table({name: self.results[name] for name in self._new_layers()}, CONTROL),
+                _differences({name: self.results[name] for name in self._new_layers()}, CONTROL),
             ]
         return "\n\n".join(parts) + "\n"
 
@@ -230,9 +213,9 @@ class Ablation:
             "seeds (Student's t; none for one seed). Seeds differ in weights and training batches; all see the same "
             "held-out scenes, so the intervals say nothing of other scenes. Every difference is judged by itself: "
             "of twenty true zeros one is called better or worse. Views never trained on, at ground-truth "
-            "poses; depth rendered as stochastic solids and aligned by one median scale a scene, whatever the training "
-            "rendered (the 3DGS row too: its own rasterised depth stands below). Where the number of splits differs "
-            "from the full model's, the last layer starts anew; the control shows what that alone costs, and is what "
+            "poses; depth rendered as stochastic solids and aligned by one median scale per scene, whatever the "
+            "training rendered (the 3DGS row too: its own rasterised depth stands below). Where the number of splits "
+            "differs from the full model's, the last layer starts anew; the control shows what that alone costs, and is what "
             "these rows are compared with in the last table. The paper's rows are Replica, 30000 more steps, and LPIPS "
             "of VGG; compare orders, not values. LPIPS is not measured "
             "while training: python -m vg2gt.evaluate ckpt=RUN has it, if its weights are there."
@@ -259,57 +242,37 @@ def _paper_row(name: str) -> Mapping[str, float] | None:
     return tables()[PAPER_ABLATION][PAPER_DATA].get(PAPER_FULL if name == FULL else _label(name))
 
 
-def _table(results: Mapping[str, Mapping[int, Metrics]], rows: Mapping[str, str]) -> str:
+def _beside_paper(results: Mapping[str, Mapping[int, Metrics]], rows: Mapping[str, str]) -> str:
     """Ours and the paper's; ``rows`` maps what the paper calls a row to the run that stands for it."""
     lines = []
     for name, run in rows.items():
-        cells = [over_seeds(results[run], metric).shown(column[1]) for metric, column in PAPER_COLUMNS.items()]
-        lines.append([_label(name), *cells])
+        lines.append([_label(name), *seeds_row(results[run], PAPER_COLUMNS)])
         if paper := _paper_row(name):
             lines.append(["*paper*", *(f"*{paper[metric]:g}*" for metric in PAPER_COLUMNS)])
-    return markdown(["", *(column[0] for column in PAPER_COLUMNS.values())], lines)
+    return markdown_table(["", *(metric.label for metric in PAPER_COLUMNS.values())], lines)
 
 
-def _plain_table(
-    results: Mapping[str, Mapping[int, Metrics]], columns: Mapping[str, tuple[str, int, bool | None]]
-) -> str:
+def _differences(results: Mapping[str, Mapping[int, Metrics]], reference: str) -> str:
+    """Each run less the reference, of the metrics that all have; says whether the interval leaves out zero."""
+    every = [metrics for runs in results.values() for metrics in runs.values()]
+    shown = {name: m for name, m in (PAPER_COLUMNS | OUR_COLUMNS).items() if all(name in metrics for metrics in every)}
     rows = [
-        [_label(name), *(over_seeds(runs, metric).shown(column[1]) for metric, column in columns.items())]
+        [_label(name), *(_verdict(paired_difference(runs, results[reference], key), m) for key, m in shown.items())]
         for name, runs in results.items()
+        if name != reference
     ]
-    return markdown(["", *(column[0] for column in columns.values())], rows)
+    return markdown_table([f"minus {_label(reference)}", *(metric.label for metric in shown.values())], rows)
 
 
-def _difference_table(results: Mapping[str, Mapping[int, Metrics]], reference: str) -> str:
-    """Each run less the reference; says whether the interval leaves out zero."""
-    columns = {name: c for name, c in (PAPER_COLUMNS | OUR_COLUMNS).items() if _is_there(results, name)}
-    rows = []
-    for name, runs in results.items():
-        if name != reference:
-            rows.append([_label(name), *(_verdict(runs, results[reference], m, c) for m, c in columns.items())])
-    return markdown([f"minus {_label(reference)}", *(column[0] for column in columns.values())], rows)
-
-
-def _is_there(results: Mapping[str, Mapping[int, Metrics]], metric: str) -> bool:
-    return all(metric in metrics for runs in results.values() for metrics in runs.values())
-
-
-def _verdict(
-    runs: Mapping[int, Metrics],
-    reference: Mapping[int, Metrics],
-    metric: str,
-    column: tuple[str, int, bool | None],
-) -> str:
-    _, decimals, larger_is_better = column
-    change = paired_difference(runs, reference, metric)
-    shown = change.shown(decimals, sign=True)
-    if larger_is_better is None or not math.isfinite(change.margin):
+def _verdict(change: Estimate, metric: Metric) -> str:
+    shown = change.shown(metric.decimals, sign=True)
+    if metric.larger_is_better is None or not math.isfinite(change.margin):
         return shown
     if change.mean == change.margin == 0:
         return "identical"
     if abs(change.mean) <= change.margin:
         return f"{shown} (not told apart)"
-    return f"{shown} ({'better' if (change.mean > 0) == larger_is_better else 'worse'})"
+    return f"{shown} ({'better' if (change.mean > 0) == metric.larger_is_better else 'worse'})"
 
 
 def common_overrides(overrides: Sequence[str]) -> list[str]:

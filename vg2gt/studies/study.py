@@ -19,6 +19,7 @@ from scipy.stats import t as student
 from torch import Tensor
 
 from vg2gt.config import config_dir
+from vg2gt.evaluation.tables import Metric, markdown_table, number
 from vg2gt.io.files import read_json, write_json, write_text
 from vg2gt.runs.checkpoints import newest_valid, read_checkpoint
 from vg2gt.runs.trust import read_run_config
@@ -157,19 +158,15 @@ class Estimate:
 
     def shown(self, decimals: int, sign: bool = False) -> str:
         """``mean ± margin``; the margin is left out where there is none."""
-        if not math.isfinite(self.mean):
-            return "n/a"
-        text = f"{self.mean:{'+' if sign else ''}.{decimals}f}"
+        text = number(self.mean, decimals, sign)
         return f"{text} ± {self.margin:.{decimals}f}" if math.isfinite(self.margin) else text
 
 
 def estimate(values: Sequence[float]) -> Estimate:
     """Mean and 95 % confidence interval of independent values; NaN for none."""
     count = len(values)
-    if not count:
-        return Estimate(math.nan, math.nan)
-    mean = sum(values) / count
-    if count == 1:
+    mean = sum(values) / count if count else math.nan
+    if count < 2:
         return Estimate(mean, math.nan)
     deviation = math.sqrt(sum((value - mean) ** 2 for value in values) / (count - 1))
     return Estimate(mean, float(student.ppf(0.975, count - 1)) * deviation / math.sqrt(count))
@@ -177,8 +174,7 @@ def estimate(values: Sequence[float]) -> Estimate:
 
 def over_seeds(runs: Mapping[int, Metrics], metric: str) -> Estimate:
     """One metric over the seeds; not available if any of the runs lacks it."""
-    complete = all(metric in run for run in runs.values())
-    return estimate([run[metric] for run in runs.values()] if complete else [])
+    return estimate([run[metric] for run in runs.values()] if all(metric in run for run in runs.values()) else [])
 
 
 def paired_difference(runs: Mapping[int, Metrics], reference: Mapping[int, Metrics], metric: str) -> Estimate:
@@ -188,28 +184,32 @@ def paired_difference(runs: Mapping[int, Metrics], reference: Mapping[int, Metri
 
 
 def summarize(results: Mapping[str, Mapping[int, Metrics]], reference: str) -> dict[str, dict[str, dict[str, float]]]:
-    """Everything the tables show, as plain numbers: ``{run: {metric: {mean, ci95, difference, difference_ci95}}}``."""
+    """Everything the tables show, as plain numbers: ``{run: {metric: {mean, ci95, difference, difference_ci95}}}``.
+
+    Runs without a result are left out, and so is what is not finite.
+    """
     summary: dict[str, dict[str, dict[str, float]]] = {}
     for name, runs in results.items():
-        metrics = sorted(set.intersection(*(set(run) for run in runs.values()))) if runs else []
-        summary[name] = {}
-        for metric in metrics:
-            value = over_seeds(runs, metric)
-            change = paired_difference(runs, results.get(reference, {}), metric)
-            figures = {
-                "mean": value.mean,
-                "ci95": value.margin,
-                "difference": change.mean,
-                "difference_ci95": change.margin,
-            }
-            summary[name][metric] = {key: figure for key, figure in figures.items() if math.isfinite(figure)}
+        for metric in sorted(set.intersection(*map(set, runs.values()))) if runs else ():
+            value, change = over_seeds(runs, metric), paired_difference(runs, results.get(reference, {}), metric)
+            figures = {"mean": value.mean, "ci95": value.margin}
+            figures |= {"difference": change.mean, "difference_ci95": change.margin}
+            finite = {key: figure for key, figure in figures.items() if math.isfinite(figure)}
+            summary.setdefault(name, {})[metric] = finite
     return summary
 
 
-def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table; the first column is left-aligned."""
-    lines = ["| " + " | ".join(header) + " |", "|---" + "|---:" * (len(header) - 1) + "|"]
-    return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)])
+def seeds_table(results: Mapping[str, Mapping[int, Metrics]], shown: Mapping[str, Metric]) -> str:
+    """One row per run, its means over the seeds, as Markdown."""
+    return markdown_table(
+        ["", *(metric.label for metric in shown.values())],
+        [[name, *seeds_row(runs, shown)] for name, runs in results.items()],
+    )
+
+
+def seeds_row(runs: Mapping[int, Metrics], shown: Mapping[str, Metric]) -> list[str]:
+    """Means of one run over its seeds, as cells of a table."""
+    return [over_seeds(runs, name).shown(metric.decimals) for name, metric in shown.items()]
 
 
 def quoted(path: Path) -> str:
