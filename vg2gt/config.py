@@ -1,6 +1,7 @@
 """Where the configuration groups are: inside the installed package, or beside it in a checkout."""
 
 from pathlib import Path
+from typing import Any
 
 _PACKAGE = Path(__file__).resolve().parent
 
@@ -15,3 +16,14 @@ def config_dir() -> str:
         if (folder / "train.yaml").is_file():
             return str(folder)
     raise FileNotFoundError(f"no configuration folder with train.yaml in or beside {_PACKAGE}; reinstall vg2gt")
+
+
+def flatten(node: Any, prefix: str = "") -> dict[str, Any]:
+    """Names the leaves of nested dictionaries by dotted keys."""
+    if not isinstance(node, dict):
+        return {prefix: node}
+    return {
+        key: value
+        for name, child in node.items()
+        for key, value in flatten(child, f"{prefix}.{name}".strip(".")).items()
+    }

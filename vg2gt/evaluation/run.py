@@ -13,6 +13,7 @@ import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
+from vg2gt.config import flatten
 from vg2gt.data.base import DataError, SceneSource
 from vg2gt.data.batches import BatchDataset
 from vg2gt.data.datamodule import SceneDataModule
@@ -37,7 +38,6 @@ from vg2gt.runs.load import (
     load_weights,
     resolve_parts,
 )
-from vg2gt.training.loop import flatten
 from vg2gt.types import Batch
 
 log = logging.getLogger(__name__)

@@ -18,12 +18,12 @@ from omegaconf import DictConfig, OmegaConf
 from scipy.stats import t as student
 from torch import Tensor
 
-from vg2gt.config import config_dir
+from vg2gt.config import config_dir, flatten
 from vg2gt.evaluation.tables import Metric, markdown_table, number
 from vg2gt.io.files import read_json, write_json, write_text
 from vg2gt.runs.checkpoints import newest_valid, read_checkpoint
 from vg2gt.runs.trust import read_run_config
-from vg2gt.training.loop import build, evaluate, flatten, train
+from vg2gt.training.loop import build, evaluate, train
 
 log = logging.getLogger(__name__)
 

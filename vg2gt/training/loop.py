@@ -17,6 +17,7 @@ from lightning.pytorch import LightningDataModule, Trainer
 from lightning.pytorch.callbacks import ProgressBar
 from omegaconf import DictConfig, OmegaConf
 
+from vg2gt.config import flatten
 from vg2gt.data.datamodule import SceneDataModule
 from vg2gt.io.files import read_json, write_json, write_text
 from vg2gt.memory import TRAINING, memory_advice
@@ -197,17 +198,6 @@ def _name_differences(config: DictConfig) -> None:
     different = [key for key in different if key not in ("ckpt", "output_dir", "overwrite")]
     if different:
         log.warning("the resumed run differs from the interrupted one in %s", ", ".join(different))
-
-
-def flatten(node: Any, prefix: str = "") -> dict[str, Any]:
-    """Names the leaves of nested dictionaries by dotted keys."""
-    if not isinstance(node, dict):
-        return {prefix: node}
-    return {
-        key: value
-        for name, child in node.items()
-        for key, value in flatten(child, f"{prefix}.{name}".strip(".")).items()
-    }
 
 
 def _save_last(run: Run) -> None:
