@@ -1,8 +1,5 @@
 """Full-size networks have exactly the tensors of the published files, but for those named as not needed."""
 
-import json
-from pathlib import Path
-
 import pytest
 import torch
 from torch import nn
@@ -10,6 +7,7 @@ from torch import nn
 from backends.da3 import DA3NestedBackend
 from backends.da3.backend import RAY_BRANCH
 from backends.weights import load_strictly
+from tests.references import read_json
 
 CASES = {
     "vggt_1b": ("vggt-1b", ()),
@@ -28,9 +26,9 @@ def tensors(network: nn.Module, prefix: str) -> dict[str, list[int]]:
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_names_and_shapes(shared: Path, make_backend, name: str) -> None:
+def test_names_and_shapes(make_backend, name: str) -> None:
     file, overrides = CASES[name]
-    manifest = json.loads((shared / "manifests" / f"{file}.json").read_text())
+    manifest = read_json("manifests")[file]
     nested = name == "da3_nested"
     random = ["relative.pretrained=false", "metric.pretrained=false"] if nested else ["pretrained=false"]
     with torch.device("meta"):
@@ -40,19 +38,19 @@ def test_names_and_shapes(shared: Path, make_backend, name: str) -> None:
     else:
         ours = tensors(backend.network, manifest["hub_prefix"])
     # Camera encoder and sky are named as not needed, but are part of our networks; the ray branch is not.
-    unused = [key for key in manifest["ignorable_prefixes_for_depth_and_camera"] if "cam_enc" not in key]
+    unused = [key for key in manifest["ignorable_prefixes"] if "cam_enc" not in key]
     unused = [key for key in unused if "sky" not in key]
     unused += ["model.da3." + key for key in RAY_BRANCH] if nested else []
-    published = {key: entry["shape"] for key, entry in manifest["tensors"].items() if not key.startswith(tuple(unused))}
+    published = {key: shape for key, shape in manifest["tensors"].items() if not key.startswith(tuple(unused))}
     assert ours == published
 
 
 @pytest.mark.parametrize("name", ["vggt_1b", "da3_small", "da3_large", "da3_giant", "da3_mono_large"])
-def test_a_published_file_would_load(shared: Path, make_backend, load_config, name: str) -> None:
+def test_a_published_file_would_load(make_backend, load_config, name: str) -> None:
     """Without the camera encoder, exactly as the YAML says: every leftover of the file is known."""
-    manifest = json.loads((shared / "manifests" / f"{CASES[name][0]}.json").read_text())
+    manifest = read_json("manifests")[CASES[name][0]]
     assert load_config(name).repo in manifest["hub_repos"]
     with torch.device("meta"):
         backend = make_backend(name, "pretrained=false")
-        state = {key: torch.empty(entry["shape"]) for key, entry in manifest["tensors"].items()}
+        state = {key: torch.empty(shape) for key, shape in manifest["tensors"].items()}
     load_strictly(backend.network, state, backend.weights.prefix, backend.weights.ignorable, "file")

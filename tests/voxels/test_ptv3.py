@@ -1,6 +1,7 @@
 import pytest
 import torch
 
+from tests.references import draw_weights, read_cases, read_json
 from vg2gt.voxels import PTv3
 
 SIZE = torch.full((2,), 0.125)
@@ -95,6 +96,18 @@ def test_legacy_changes_the_first_decoder_block_only(random_voxels, make_ptv3):
     without = net(features, grid, batch, SIZE)
     net.legacy = True
     assert torch.equal(without, net(features, grid, batch, SIZE))
+
+
+@pytest.mark.parametrize("case", [0, 1])
+def test_equals_the_official_code(case):
+    net = PTv3(**read_json("networks")["ptv3_tiny"]["config"], norm="batch", legacy=True).eval()
+    counters = {name: value for name, value in net.state_dict().items() if name.endswith("num_batches_tracked")}
+    net.load_state_dict(draw_weights("ptv3_tiny") | counters)
+    features, grid, batch, expected = (
+        read_cases("ptv3_tiny")[f"{case}.{name}"] for name in ("features", "grid", "batch", "output")
+    )
+    out = net(features, grid, batch, torch.ones(case + 1))
+    assert (out - expected).abs().max() <= 2e-5 * expected.abs().max()
 
 
 def test_state_dict_has_the_official_names():
