@@ -11,32 +11,26 @@ from __future__ import annotations
 
 import argparse
 import json
-import resource
 import subprocess
 import sys
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from datetime import date
-from pathlib import Path
 from typing import TypeVar
 
 import torch
+from common import PeakMemory, machine, parser, used_seconds, write_results
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
-from machine import machine
 from omegaconf import DictConfig
 from render_scene import room_cameras
-from rich.console import Console
-from rich.table import Table
 
 from backends.base import Backend
 from vg2gt import __version__
 from vg2gt.config import config_dir
-from vg2gt.io.files import write_json
+from vg2gt.evaluation.tables import print_table
 from vg2gt.types import Hints, Tokens
 
-MEGABYTE = 1e6
 Result = TypeVar("Result")
 
 
@@ -47,33 +41,6 @@ class Stage:
     seconds: float = float("inf")
     wall: float = float("inf")
     peak_mb: float = 0.0
-
-
-class PeakMemory:
-    """The most memory in use since ``restart``, above what was in use when this was made."""
-
-    def __init__(self, device: torch.device) -> None:
-        self.device = device
-        self.start = torch.cuda.memory_allocated(device) if device.type == "cuda" else _resident()
-
-    def restart(self) -> None:
-        """Forgets the peak so far."""
-        if self.device.type == "cuda":
-            torch.cuda.reset_peak_memory_stats(self.device)
-        else:
-            Path("/proc/self/clear_refs").write_text("5")
-
-    def megabytes(self) -> float:
-        """The peak above the start."""
-        if self.device.type == "cuda":
-            return (torch.cuda.max_memory_allocated(self.device) - self.start) / MEGABYTE
-        status = Path("/proc/self/status").read_text().splitlines()
-        kilobytes = next(line.split()[1] for line in status if line.startswith("VmHWM"))
-        return (int(kilobytes) * 1024 - self.start) / MEGABYTE
-
-
-def _resident() -> int:
-    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
 
 
 def build(name: str, device: torch.device) -> Backend:
@@ -114,21 +81,14 @@ def measure(backend: Backend, views: int, size: tuple[int, int], passes: int, de
 
 def _run(stage: Stage, function: Callable[[], Result], number: int, memory: PeakMemory) -> Result:
     memory.restart()
-    used, clock = _now(memory.device), time.perf_counter()
+    used, clock = used_seconds(memory.device), time.perf_counter()
     result = function()
-    used, clock = _now(memory.device) - used, time.perf_counter() - clock
+    used, clock = used_seconds(memory.device) - used, time.perf_counter() - clock
     if number == 0:
-        stage.peak_mb = memory.megabytes()
+        stage.peak_mb = memory.megabytes
     else:
         stage.seconds, stage.wall = min(stage.seconds, used), min(stage.wall, clock)
     return result
-
-
-def _now(device: torch.device) -> float:
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
-        return time.perf_counter()
-    return time.process_time()
 
 
 @torch.no_grad()
@@ -151,45 +111,35 @@ def measure_apart(arguments: argparse.Namespace, views: int) -> dict[str, Stage]
     return {name: Stage(**stage) for name, stage in json.loads(printed.splitlines()[-1]).items()}
 
 
-def print_tables(console: Console, title: str, results: dict[int, dict[str, Stage]]) -> None:
-    """A table a stage: a row a view count, with the ratios to the smallest."""
-    smallest = results[min(results)]
-    for name, first in smallest.items():
-        table = Table(title=f"{name}, {title}")
-        for heading in ("views", "seconds", "ratio", "seconds a view", "peak MB", "ratio"):
-            table.add_column(heading, justify="right")
+def print_tables(title: str, results: dict[int, dict[str, Stage]]) -> None:
+    """One table per stage: one row per view count, with the ratios to the smallest."""
+    head = ("views", "seconds", "ratio", "seconds per view", "peak MB", "ratio")
+    for name, first in results[min(results)].items():
+        rows = []
         for views, stages in sorted(results.items()):
             stage = stages[name]
             row = [str(views), f"{stage.seconds:.3f}", f"{stage.seconds / first.seconds:.2f}"]
             row += [f"{stage.seconds / views:.3f}", f"{stage.peak_mb:.0f}", f"{stage.peak_mb / first.peak_mb:.2f}"]
-            table.add_row(*row)
-        console.print(table)
+            rows.append(row)
+        print_table(head, rows, title=f"{name}, {title}", text_columns=0)
 
 
 def main() -> None:
     """Measures, prints and writes."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--backend", default="da3_small", help="a name in configs/backend")
-    parser.add_argument("--views", type=int, nargs="+", default=[1, 2, 4, 8, 16])
-    parser.add_argument("--size", type=int, nargs=2, default=[112, 224], metavar=("HEIGHT", "WIDTH"))
-    parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
-    parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--passes", type=int, default=3)
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
-    parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)
-    arguments = parser.parse_args()
-    if arguments.device == "auto":
-        arguments.device = "cuda" if torch.cuda.is_available() else "cpu"
+    options = parser(__doc__, device=True, threads=1, passes=3)
+    options.add_argument("--backend", default="da3_small", help="a name in configs/backend")
+    options.add_argument("--views", type=int, nargs="+", default=[1, 2, 4, 8, 16])
+    options.add_argument("--size", type=int, nargs=2, default=[112, 224], metavar=("HEIGHT", "WIDTH"))
+    options.add_argument("--child", action="store_true", help=argparse.SUPPRESS)
+    arguments = options.parse_args()
     device, size = torch.device(arguments.device), (arguments.size[0], arguments.size[1])
     torch.set_num_threads(arguments.threads)
     if arguments.child:
         stages = measure(build(arguments.backend, device), arguments.views[0], size, arguments.passes, device)
         print(json.dumps({name: asdict(stage) for name, stage in stages.items()}))
         return
-    console = Console(width=120)
     results = {views: measure_apart(arguments, views) for views in sorted(set(arguments.views))}
-    title = f"{arguments.backend}, {size[0]}x{size[1]}, {device.type}, {arguments.threads} threads"
-    print_tables(console, title, results)
+    print_tables(f"{arguments.backend}, {size[0]}x{size[1]}, {device.type}, {arguments.threads} threads", results)
     content = {
         "machine": machine(device) | {"vg2gt": __version__},
         "backend": arguments.backend,
@@ -199,8 +149,7 @@ def main() -> None:
         "passes": arguments.passes,
         "views": {views: {name: asdict(stage) for name, stage in stages.items()} for views, stages in results.items()},
     }
-    path = arguments.out / f"{date.today().isoformat()}-backends-{arguments.backend}-{device.type}.json"
-    console.print(str(write_json(path, content)))
+    write_results(arguments.out, f"backends-{arguments.backend}-{device.type}", content)
 
 
 if __name__ == "__main__":

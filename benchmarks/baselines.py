@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from machine import machine
+from common import machine
 from stage_clock import StageClock
 
 from vg2gt.evaluation.protocols import ground_truth_target_cameras

@@ -10,29 +10,25 @@ dated JSON file to ``benchmarks/results``.
 
 from __future__ import annotations
 
-import argparse
 import os
 import tempfile
 import time
 from collections.abc import Iterator
-from datetime import date
 from pathlib import Path
 from typing import Any
 
 import torch
+from common import machine, parser, training_step, write_results
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
-from machine import machine
 from PIL import Image
-from rich.console import Console
-from rich.table import Table
 
 from vg2gt.config import config_dir
 from vg2gt.data import RGBDFolder
 from vg2gt.data.shards import Encoding, write_shards
 from vg2gt.data.synthetic.export import SceneSettings, missing_scenes, write_scenes
 from vg2gt.data.views.sampling import ViewSampler
-from vg2gt.io.files import write_json
+from vg2gt.evaluation.tables import print_table
 from vg2gt.training.loop import build
 from vg2gt.types import Batch
 
@@ -104,16 +100,14 @@ def speed(overrides: list[str], workers: int, steps: int) -> dict[str, float]:
 def waiting(overrides: list[str], workers: int, steps: int) -> dict[str, float]:
     """Seconds of a training step of the default model on a CPU, and seconds that it waits for its batch before."""
     run = build(configure(overrides, workers, steps, STEP_SIZE))
-    module = run.module.train()
-    run.trainer.strategy.connect(module)
-    module.log = lambda *args, **kwargs: None  # type: ignore[method-assign]
-    optimizer = torch.optim.AdamW(module.model.trained_parameters(), lr=1e-4)
+    step_loss = training_step(run)
+    optimizer = torch.optim.AdamW(run.module.model.trained_parameters(), lr=1e-4)
     loader, waits, works = batches(overrides, workers, steps, STEP_SIZE), [], []
-    for step in range(steps):
+    for _ in range(steps):
         start = time.perf_counter()
         batch = next(loader)
         ready = time.perf_counter()
-        module.training_step(batch, step).backward()
+        step_loss(batch).backward()
         optimizer.step()
         optimizer.zero_grad()
         waits.append(ready - start)
@@ -131,14 +125,13 @@ def paper_demand() -> float:
 
 def main() -> None:
     """Measures, prints and writes."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="few batches, no training steps")
-    parser.add_argument("--workers", type=int, nargs="*", default=[0, 1, 2])
-    parser.add_argument("--threads", type=int, default=os.cpu_count() or 1, help="of the training step")
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
-    arguments = parser.parse_args()
+    options = parser(__doc__)
+    options.add_argument("--quick", action="store_true", help="few batches, no training steps")
+    options.add_argument("--workers", type=int, nargs="*", default=[0, 1, 2])
+    options.add_argument("--threads", type=int, default=os.cpu_count() or 1, help="of the training step")
+    arguments = options.parse_args()
     torch.set_num_threads(1)  # as in a worker process
-    console, steps = Console(width=120), 12 if arguments.quick else 30
+    steps = 12 if arguments.quick else 30
     with tempfile.TemporaryDirectory() as folder:
         forms = write_data(Path(folder), scenes=2 if arguments.quick else 4)
         list(batches(forms["resized frames"], 0, steps))  # fills the cache
@@ -154,18 +147,16 @@ def main() -> None:
         )
         waits = {f"{form}, {workers} workers": waiting(forms[form], workers, 8) for form, workers in pairs}
 
-    table = Table(title=f"images a second, {STORED[1]}x{STORED[0]} RGB-D to {SIZE[0]}x{SIZE[1]}, by workers")
-    for heading in ("read from", *map(str, arguments.workers), "per core second"):
-        table.add_column(heading)
+    rows = []
     for form, found in speeds.items():
         row = [f"{values['images_per_second']:.0f}" for values in found.values()]
-        row += [f"{found['0']['images_per_core_second']:.0f}" if "0" in found else ""]
-        table.add_row(form, *row)
-    console.print(table)
+        rows.append([form, *row, f"{found['0']['images_per_core_second']:.0f}" if "0" in found else ""])
+    title = f"images per second, {STORED[1]}x{STORED[0]} RGB-D to {SIZE[0]}x{SIZE[1]}, by workers"
+    print_table(["read from", *map(str, arguments.workers), "per core second"], rows, title=title)
     demand = paper_demand()
-    console.print(f"the paper's training takes about {demand:.0f} images a second on each of two devices")
+    print(f"the paper's training takes about {demand:.0f} images a second on each of two devices")
     for name, value in waits.items():
-        console.print(f"{name}: a step of {VIEWS} images takes {value['step']:.2f} s and waits {value['wait']:.3f} s")
+        print(f"{name}: a step of {VIEWS} images takes {value['step']:.2f} s and waits {value['wait']:.3f} s")
     content = {
         "machine": machine(),
         "speeds": speeds,
@@ -175,7 +166,7 @@ def main() -> None:
         "threads": arguments.threads,
         "load_average": os.getloadavg(),
     }
-    console.print(str(write_json(arguments.out / f"{date.today().isoformat()}-data-loading-cpu.json", content)))
+    write_results(arguments.out, "data-loading-cpu", content)
 
 
 if __name__ == "__main__":

@@ -6,10 +6,10 @@ The colours agree; the rasterised depth jumps from Gaussian to Gaussian, the sol
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 
 import torch
+from common import parser
 from render_scene import room_cameras, room_gaussians, true_depth
 
 from vg2gt.io.images import colorize_depth, grid, write_png
@@ -21,10 +21,9 @@ ERROR_SHOWN = 0.03  # metres at full brightness
 
 def main() -> None:
     """Renders, prints the errors, writes the picture."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--gaussians", type=int, default=20_000)
-    parser.add_argument("--out", type=Path, default=Path("docs/figures/solid-against-rasterized.png"))
-    arguments = parser.parse_args()
+    options = parser(__doc__, out=Path("docs/figures/solid-against-rasterized.png"))
+    options.add_argument("--gaussians", type=int, default=20_000)
+    arguments = options.parse_args()
     gaussians = room_gaussians(arguments.gaussians, SIZE, sigma=(100_000 / arguments.gaussians) ** 0.5)
     cameras = room_cameras(3, SIZE).select(slice(1, 2))
     truth = true_depth(cameras)[0, 0]

@@ -7,19 +7,15 @@ out. Prints a table and writes a dated JSON file to ``benchmarks/results``.
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 import time
 from collections.abc import Callable
-from datetime import date
 from pathlib import Path
 
-from machine import machine
-from rich.console import Console
-from rich.table import Table
+from common import machine, parser, write_results
 
 from vg2gt.data.synthetic.export import SceneSettings, missing_scenes, write_scenes
-from vg2gt.io.files import write_json
+from vg2gt.evaluation.tables import print_table
 
 CASES = {
     "rooms": ("room", False),
@@ -58,29 +54,26 @@ def measure(work: Callable[[SceneSettings, int], int], settings: SceneSettings, 
 
 def main() -> None:
     """Measures, prints and writes."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenes", type=int, default=12)
-    parser.add_argument("--frames", type=int, default=8)
-    parser.add_argument("--size", type=int, nargs=2, default=(224, 448))
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
-    arguments = parser.parse_args()
+    options = parser(__doc__)
+    options.add_argument("--scenes", type=int, default=12)
+    options.add_argument("--frames", type=int, default=8)
+    options.add_argument("--size", type=int, nargs=2, default=(224, 448))
+    arguments = options.parse_args()
     height, width = arguments.size
-    table = Table(title=f"frames a second of one core, {height}x{width}")
-    for heading in ("scenes", "rendered", "rendered and written", "kB a frame"):
-        table.add_column(heading, justify="left" if heading == "scenes" else "right")
-    results = {}
+    results, rows = {}, []
     for name, (variant, highlights) in CASES.items():
         settings = SceneSettings(arguments.frames, (height, width), variant, highlights)
-        rendered = measure(render_all, settings, arguments.scenes)
+        rendered = measure(render_all, settings, arguments.scenes)["frames_per_second"]
         written = measure(write_all, settings, arguments.scenes)
         results[name] = {
-            "rendered_frames_per_second": rendered["frames_per_second"],
+            "rendered_frames_per_second": rendered,
             "written_frames_per_second": written["frames_per_second"],
             "bytes_per_frame": written["bytes_per_frame"],
         }
-        speeds = (rendered["frames_per_second"], written["frames_per_second"])
-        table.add_row(name, *(f"{speed:.2f}" for speed in speeds), f"{written['bytes_per_frame'] / 1e3:.0f}")
-    Console().print(table)
+        speeds = [f"{rendered:.2f}", f"{written['frames_per_second']:.2f}"]
+        rows.append([name, *speeds, f"{written['bytes_per_frame'] / 1e3:.0f}"])
+    head = ("scenes", "rendered", "rendered and written", "kB per frame")
+    print_table(head, rows, title=f"frames per second of one core, {height}x{width}")
     content = {
         "machine": machine(),
         "size": [height, width],
@@ -88,7 +81,7 @@ def main() -> None:
         "frames": arguments.frames,
         "results": results,
     }
-    print(write_json(arguments.out / f"{date.today().isoformat()}-generator.json", content))
+    write_results(arguments.out, "generator", content)
 
 
 if __name__ == "__main__":

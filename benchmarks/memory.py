@@ -12,26 +12,23 @@ a Markdown table to ``benchmarks/results``.
 
 from __future__ import annotations
 
-import argparse
-import ctypes
 import gc
 import logging
 import multiprocessing
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from datetime import date
 from multiprocessing.connection import Connection
-from pathlib import Path
 from typing import Any
 
 import torch
-from machine import machine
+from common import PeakMemory, machine, parser, training_step, write_results
 from stages import Case, prepare
 
-from vg2gt.io.files import write_json, write_text
+from vg2gt.evaluation.tables import markdown_table
+from vg2gt.io.files import write_text
 from vg2gt.training.loop import Run
-from vg2gt.types import Batch
+from vg2gt.types import Batch, Prediction
 
 MIB = 2**20
 MODES = ("forward", "training")
@@ -87,9 +84,9 @@ def measure(model: Model, point: Point, mode: str, device: torch.device) -> dict
         run, batch = prepare(Case(point.views, model.size, overrides), device, folder)
         step = _training_step if mode == "training" else _forward
         gc.collect()
-        before = _begin(device)
+        memory = PeakMemory(device)
         sizes = step(run, batch)
-        peak = _peak(device)
+        before, peak = memory.start / MIB, memory.peak / MIB
     return {"before_mib": before, "peak_mib": peak, "pass_mib": peak - before, **sizes}
 
 
@@ -98,43 +95,20 @@ def _forward(run: Run, batch: Batch) -> dict[str, int]:
     with torch.no_grad():
         prediction = model(context.images, context.hints)
         run.module.renderer(prediction.gaussians, prediction.geometry.cameras.select(slice(0, 1)))
-    voxels = 0 if prediction.voxels is None else len(prediction.voxels.grid)
-    return {"voxels": voxels, "gaussians": len(prediction.gaussians)}
+    return _sizes(prediction)
 
 
 def _training_step(run: Run, batch: Batch) -> dict[str, int]:
-    module, sizes = run.module.train(), {}
-    run.trainer.strategy.connect(module)
-    module.log = lambda *args, **kwargs: None  # type: ignore[method-assign]
-
-    def note(_: Any, __: Any, prediction: Any) -> None:
-        sizes["voxels"] = 0 if prediction.voxels is None else len(prediction.voxels.grid)
-        sizes["gaussians"] = len(prediction.gaussians)
-
-    module.model.register_forward_hook(note)
-    module.training_step(batch.context, 0).backward()
+    module, step_loss, sizes = run.module, training_step(run), {}
+    module.model.register_forward_hook(lambda _, __, prediction: sizes.update(_sizes(prediction)))
+    step_loss(batch.context).backward()
     module.make_optimizer(module.model.trained_parameters()).step()
     return sizes
 
 
-def _begin(device: torch.device) -> float:
-    if device.type == "cuda":
-        torch.cuda.empty_cache()
-        torch.cuda.reset_peak_memory_stats(device)
-        return torch.cuda.memory_allocated(device) / MIB
-    # What building and loading have freed goes back to the system, or the pass would be served from it unseen.
-    ctypes.CDLL(None).malloc_trim(0)
-    Path("/proc/self/clear_refs").write_text("5")  # sets the high-water mark to what is resident now
-    return _status("VmRSS")
-
-
-def _peak(device: torch.device) -> float:
-    return torch.cuda.max_memory_allocated(device) / MIB if device.type == "cuda" else _status("VmHWM")
-
-
-def _status(name: str) -> float:
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(int(line.split()[1]) / 1024 for line in lines if line.startswith(f"{name}:"))
+def _sizes(prediction: Prediction) -> dict[str, int]:
+    voxels = 0 if prediction.voxels is None else len(prediction.voxels.grid)
+    return {"voxels": voxels, "gaussians": len(prediction.gaussians)}
 
 
 def in_a_child(model: Model, point: Point, mode: str, device: torch.device) -> dict[str, Any]:
@@ -158,35 +132,31 @@ def in_a_child(model: Model, point: Point, mode: str, device: torch.device) -> d
 
 
 def markdown(rows: Sequence[dict[str, Any]], where: dict[str, Any]) -> str:
-    """A table a configuration."""
+    """One table per configuration."""
+    head = ["varied", "views", "voxels", "Gaussians"]
+    head += ["forward: peak", "of it the pass", "training: peak", "of it the step"]
     lines = [f"Peak memory in MiB; {where.get('gpu', where['processor'])}, torch {where['torch']}.", ""]
     for name in dict.fromkeys(row["model"] for row in rows):
         height, width = MODELS[name].size
         lines += [f"`{name}`, {height}x{width}: {' '.join(MODELS[name].overrides) or 'defaults'}", ""]
-        lines += [
-            "| varied | views | voxels | Gaussians | forward: peak | of it the pass | training: peak | of it the step |"
-        ]
-        lines += ["|---|---:|---:|---:|---:|---:|---:|---:|"]
-        for row in (row for row in rows if row["model"] == name):
-            figures = []
-            for mode in MODES:
-                found = row.get(mode, {})
-                figures += [f"{found[key]:,.0f}" if key in found else "n/a" for key in ("peak_mib", "pass_mib")]
-            sizes = row.get("forward") or row.get("training") or {}
-            counts = [f"{sizes[key]:,}" if key in sizes else "n/a" for key in ("voxels", "gaussians")]
-            lines.append(f"| {' | '.join((row['varied'], str(row['views']), *counts, *figures))} |")
-        lines.append("")
+        lines += [markdown_table(head, [_cells(row) for row in rows if row["model"] == name]), ""]
     return "\n".join(lines)
+
+
+def _cells(row: dict[str, Any]) -> list[str]:
+    sizes = row.get("forward") or row.get("training") or {}
+    counts = [f"{sizes[key]:,}" if key in sizes else "n/a" for key in ("voxels", "gaussians")]
+    found = [(row.get(mode, {}), key) for mode in MODES for key in ("peak_mib", "pass_mib")]
+    return [row["varied"], str(row["views"]), *counts, *(f"{f[key]:,.0f}" if key in f else "n/a" for f, key in found)]
 
 
 def main() -> None:
     """Measures, prints and writes."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--models", nargs="+", choices=MODELS, default=list(MODELS))
-    parser.add_argument("--modes", nargs="+", choices=MODES, default=list(MODES))
-    parser.add_argument("--device", default="cpu")
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
-    arguments = parser.parse_args()
+    options = parser(__doc__)
+    options.add_argument("--models", nargs="+", choices=MODELS, default=list(MODELS))
+    options.add_argument("--modes", nargs="+", choices=MODES, default=list(MODES))
+    options.add_argument("--device", default="cpu")
+    arguments = options.parse_args()
     torch.set_num_threads(1)
     logging.disable(logging.WARNING)  # the limits say what they drop
     device = torch.device(arguments.device)
@@ -195,7 +165,6 @@ def main() -> None:
         for mode in arguments.modes:
             measure(MODELS["tiny"], Point("views", 2), mode, device)
     where, rows = machine(device), []
-    stem = arguments.out / f"{date.today().isoformat()}-memory-{device.type}"
     for name in arguments.models:
         for point in MODELS[name].points():
             row: dict[str, Any] = {"model": name, "varied": point.varied, "views": point.views}
@@ -204,10 +173,10 @@ def main() -> None:
                 row[mode] = run(MODELS[name], point, mode, device)
             rows.append(row)
             print(row, flush=True)
-            write_json(f"{stem}.json", {"machine": where, "unit": "MiB", "threads": 1, "points": rows})
-            write_text(f"{stem}.md", markdown(rows, where))
+            content = {"machine": where, "unit": "MiB", "threads": 1, "points": rows}
+            path = write_results(arguments.out, f"memory-{device.type}", content)
+            write_text(path.with_suffix(".md"), markdown(rows, where))
     print(markdown(rows, where))
-    print(f"{stem}.json, {stem}.md")
 
 
 if __name__ == "__main__":

@@ -10,29 +10,24 @@ the best of several passes: core-seconds on a CPU, CUDA events on a GPU. Prints 
 
 from __future__ import annotations
 
-import argparse
 import gc
-import json
 import tempfile
 from dataclasses import asdict, dataclass
-from datetime import date
 from pathlib import Path
 from typing import Any
 
 import torch
+from common import RESULTS, machine, parser, write_results
 from hydra.utils import instantiate
-from machine import machine
-from rich.console import Console
-from rich.table import Table
 from stage_clock import StageClock
 
-from vg2gt.io.files import write_json
+from vg2gt.evaluation.tables import print_table
 from vg2gt.studies.study import compose_run
 from vg2gt.types import Batch
 from vg2gt.voxels.grid import scene_voxel_size
 
 LABELS = {"pixel_aligned": "pixel-aligned", "voxel_merged": "voxel-merged", "tiny": "VG²GT", "vg2gt": "VG²GT (large)"}
-REPOSITORY = Path(__file__).resolve().parents[1]
+FIGURES = RESULTS.parents[1] / "docs" / "figures"
 
 
 @dataclass(frozen=True)
@@ -114,35 +109,24 @@ def measure(method: Method, batches: list[Batch], overrides: list[str], passes: 
     return Row(method.label, batches[0].num_context, mean(counts), mean(heads), mean(totals), mean(sizes))
 
 
-def print_table(console: Console, title: str, rows: list[Row], pixels: int) -> None:
-    """A row a method and number of views, with ratios to the pixel-aligned one."""
-    table = Table(title=title)
-    headings = (
-        "method",
-        "views",
-        "primitives",
-        "of pixels",
-        "of pixel-aligned",
-        "head, s",
-        "of pixel-aligned",
-        "all, s",
-    )
-    for heading in headings:
-        table.add_column(heading, justify="left" if heading == "method" else "right")
+def print_rows(title: str, rows: list[Row], pixels: int) -> None:
+    """One row per method and number of views, with ratios to the pixel-aligned one."""
+    head = ("method", "views", "primitives", "of pixels", "of pixel-aligned", "head, s", "of pixel-aligned", "all, s")
     reference = {row.views: row for row in rows if row.method == LABELS["pixel_aligned"]}
-    for row in rows:
-        base = reference[row.views]
-        table.add_row(
+    cells = [
+        [
             row.method,
             str(row.views),
             f"{row.primitives:,.0f}",
             f"{row.primitives / (pixels * row.views):.0%}",
-            f"{row.primitives / base.primitives:.1%}",
+            f"{row.primitives / reference[row.views].primitives:.1%}",
             f"{row.head_seconds:.2f}",
-            f"{row.head_seconds / base.head_seconds:.0%}",
+            f"{row.head_seconds / reference[row.views].head_seconds:.0%}",
             f"{row.seconds:.2f}",
-        )
-    console.print(table)
+        ]
+        for row in rows
+    ]
+    print_table(head, cells, title=title, width=120)
 
 
 def plot(rows: list[Row], title: str, unit: str, path: Path) -> Path | None:
@@ -181,25 +165,21 @@ def describe(overrides: list[str], batch: Batch) -> dict[str, Any]:
 
 def main() -> None:
     """Measures, prints, writes and plots."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--views", type=int, nargs="+", default=[4, 10, 20, 50])
-    parser.add_argument("--footprints", type=float, nargs="+", default=[1.0, 2.0, 3.3], help="voxel edges in pixels")
-    parser.add_argument("--model", default="tiny", choices=("tiny", "vg2gt"))
-    parser.add_argument("--scenes", type=int, default=1)
-    parser.add_argument("--passes", type=int, default=1)
-    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
-    parser.add_argument("--name", default="rooms", help="part of the files' names, and of the plot's title")
-    parser.add_argument("--out", type=Path, default=REPOSITORY / "benchmarks" / "results")
-    parser.add_argument("--figures", type=Path, default=REPOSITORY / "docs" / "figures")
-    parser.add_argument(
-        "overrides", nargs="*", help="Hydra overrides; rooms have data.num_frames=64 unless they say so"
+    options = parser(
+        __doc__, device=True, passes=1, overrides="Hydra overrides; rooms have data.num_frames=64 unless they say so"
     )
-    arguments = parser.parse_args()
+    options.add_argument("--views", type=int, nargs="+", default=[4, 10, 20, 50])
+    options.add_argument("--footprints", type=float, nargs="+", default=[1.0, 2.0, 3.3], help="voxel edges in pixels")
+    options.add_argument("--model", default="tiny", choices=("tiny", "vg2gt"))
+    options.add_argument("--scenes", type=int, default=1)
+    options.add_argument("--name", default="rooms", help="part of the files' names, and of the plot's title")
+    options.add_argument("--figures", type=Path, default=FIGURES)
+    arguments = options.parse_args()
     torch.set_num_threads(1)
-    device, console = torch.device(arguments.device), Console(width=120)
+    device = torch.device(arguments.device)
     overrides = list(arguments.overrides)
     if weights := [override for override in overrides if override.startswith(("ckpt=", "init_from="))]:
-        parser.error(
+        options.error(
             f"{weights[0]}: only untrained models are measured here; python -m vg2gt.evaluate counts trained ones"
         )
     if not any(override.startswith("data=") for override in overrides):
@@ -213,7 +193,7 @@ def main() -> None:
         batches = load_scenes(overrides, views, arguments.scenes)
         for method in methods:
             rows.append(measure(method, batches, overrides, arguments.passes, device))
-            console.print(f"{rows[-1].method}, {views} views: {rows[-1].primitives:,.0f} primitives", highlight=False)
+            print(f"{rows[-1].method}, {views} views: {rows[-1].primitives:,.0f} primitives")
             gc.collect()
     about = describe(overrides, batches[0])
     height, width = about["size"]
@@ -221,7 +201,7 @@ def main() -> None:
     title = f"{arguments.name}, {height}x{width}, voxel edges in pixels at the median depth, backend {about['backend']}"
     title += "" if noise is None else f" with {noise:.1%} depth noise"
     rows.sort(key=lambda row: ([method.label for method in methods].index(row.method), row.views))
-    print_table(console, title, rows, height * width)
+    print_rows(title, rows, height * width)
     unit = "seconds" if device.type == "cuda" else "core-seconds"
     content = {
         "machine": machine(device),
@@ -232,10 +212,9 @@ def main() -> None:
         "data": about,
         "rows": [asdict(row) for row in rows],
     }
-    stem = f"{date.today().isoformat()}-primitives-{arguments.name}-{device.type}"
-    console.print(str(write_json(arguments.out / f"{stem}.json", json.loads(json.dumps(content)))))
+    write_results(arguments.out, f"primitives-{arguments.name}-{device.type}", content)
     if picture := plot(rows, title, unit, arguments.figures / f"primitives-{arguments.name}.png"):
-        console.print(str(picture))
+        print(picture)
 
 
 if __name__ == "__main__":

@@ -10,24 +10,20 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import resource
 import subprocess
 import sys
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
-from datetime import date
 from pathlib import Path
 from typing import Any
 
 import torch
-from machine import machine
+from common import MEGABYTE, PeakMemory, machine, parser, used_seconds, write_results
 from render_scene import room_cameras, room_gaussians
-from rich.console import Console
-from rich.table import Table
 from torch import Tensor
 
-from vg2gt.io.files import write_json
+from vg2gt.evaluation.tables import print_table
 from vg2gt.rendering import render
 from vg2gt.types import Cameras, Gaussians
 
@@ -82,23 +78,16 @@ def measure_once(case: Case, gaussians: Gaussians, cameras: Cameras) -> Timing:
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
         before = torch.cuda.memory_allocated(device)
-    start, clock = _now(device), time.perf_counter()
+    start, clock = used_seconds(device), time.perf_counter()
     outputs = _run(case, gaussians, cameras)
-    middle, forward_wall = _now(device), time.perf_counter() - clock
+    middle, forward_wall = used_seconds(device), time.perf_counter() - clock
     weights = [torch.randn_like(output) for output in outputs]
-    resume, clock = _now(device), time.perf_counter()
+    resume, clock = used_seconds(device), time.perf_counter()
     torch.autograd.grad(outputs, [getattr(gaussians, name) for name in PARAMETERS], weights, allow_unused=True)
-    end = _now(device)
+    end = used_seconds(device)
     wall = 1e3 * (forward_wall + time.perf_counter() - clock)
-    memory = (torch.cuda.max_memory_allocated(device) - before) / 1e6 if device.type == "cuda" else 0.0
+    memory = (torch.cuda.max_memory_allocated(device) - before) / MEGABYTE if device.type == "cuda" else 0.0
     return Timing(1e3 * (middle - start), 1e3 * (end - resume), wall, memory)
-
-
-def _now(device: torch.device) -> float:
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
-        return time.perf_counter()
-    return time.process_time()
 
 
 def _run(case: Case, gaussians: Gaussians, cameras: Cameras) -> list[Tensor]:
@@ -220,32 +209,27 @@ def _memory_case(gaussians: int, views: int) -> None:
     measure_once(small, *build(small, torch.device("cpu")))
     case = Case("cpu", gaussians, views=views)
     scene = build(case, torch.device("cpu"))
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    Path("/proc/self/clear_refs").write_text("5")  # restarts the peak, which building the scene has raised
+    memory = PeakMemory(torch.device("cpu"))
     measure_once(case, *scene)
-    peak = next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM"))
-    print((int(peak.split()[1]) * 1024 - pages * resource.getpagesize()) / 1e6)
+    print(memory.megabytes)
 
 
-def print_table(console: Console, title: str, cases: list[Case], timings: list[Timing], unit: str) -> None:
-    """One table: a row a case, with its ratio to the first case of the same scene."""
-    table = Table(title=f"{title} ({unit})")
-    for heading in ("implementation", "mode", "outputs", "Gaussians", "size", "views", "threads"):
-        table.add_column(heading)
-    for heading in ("forward", "backward", "total", "ratio", "wall"):
-        table.add_column(heading, justify="right")
-    if any(timing.memory for timing in timings):
-        table.add_column("peak MB", justify="right")
+def print_case_table(title: str, cases: list[Case], timings: list[Timing], unit: str) -> None:
+    """One row per case, with its ratio to the first case of the same scene."""
+    head = ["implementation", "mode", "outputs", "Gaussians", "size", "views", "threads"]
+    head += ["forward", "backward", "total", "ratio", "wall"]
+    if with_memory := any(timing.memory for timing in timings):
+        head.append("peak MB")
     first: dict[tuple[Any, ...], float] = {}
+    rows = []
     for case, timing in zip(cases, timings, strict=True):
         reference = first.setdefault(case.scene, timing.total)
         row = [case.implementation, case.mode, "all" if case.geometry else "colour", f"{case.gaussians:,}"]
         row += [f"{case.size[0]}x{case.size[1]}", str(case.views), str(case.threads)]
         row += [f"{value:.1f}" for value in (timing.forward, timing.backward, timing.total)]
         row += [f"{timing.total / reference:.2f}", f"{timing.wall:.1f}"]
-        row += [f"{timing.memory:.0f}"] if timing.memory else []
-        table.add_row(*row)
-    console.print(table)
+        rows.append(row + ([f"{timing.memory:.0f}"] if with_memory else []))
+    print_table(head, rows, title=f"{title} ({unit})", text_columns=7, width=120)
 
 
 def plot_scaling(results: dict[str, tuple[list[Case], list[Timing]]], path: Path) -> Path | None:
@@ -274,40 +258,36 @@ def plot_scaling(results: dict[str, tuple[list[Case], list[Timing]]], path: Path
 
 def main() -> None:
     """Measures, prints and writes."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
-    parser.add_argument("--quick", action="store_true", help="the small tables only")
-    parser.add_argument("--passes", type=int, default=3)
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
-    parser.add_argument("--memory-case", type=int, nargs=2, help=argparse.SUPPRESS)
-    arguments = parser.parse_args()
+    options = parser(__doc__, device=True, passes=3)
+    options.add_argument("--quick", action="store_true", help="the small tables only")
+    options.add_argument("--memory-case", type=int, nargs=2, help=argparse.SUPPRESS)
+    arguments = options.parse_args()
     if arguments.memory_case:
         gaussians, views = arguments.memory_case
         _memory_case(gaussians, views)
         return
-    device, console = torch.device(arguments.device), Console(width=120)
+    device = torch.device(arguments.device)
     where = machine(device)
-    console.print(json.dumps(where))
+    print(json.dumps(where))
     suites = (gpu_suites if device.type == "cuda" else cpu_suites)(arguments.quick)
     unit = "milliseconds" if device.type == "cuda" else "core-milliseconds"
     results: dict[str, tuple[list[Case], list[Timing]]] = {}
     for title, cases in suites.items():
         results[title] = cases, compare(cases, device, arguments.passes)
-        print_table(console, title, *results[title], unit)
+        print_case_table(title, *results[title], unit)
     memory = {}
     if device.type == "cpu" and Path("/proc/self/clear_refs").exists():
         for gaussians, views in ((100_000, 1),) if arguments.quick else ((100_000, 1), (300_000, 8)):
             memory[f"{gaussians} Gaussians, {views} views"] = peak_memory(gaussians, views)
-        console.print("peak memory above inputs, MB:", memory)
-    stem = f"{date.today().isoformat()}-render-{device.type}"
+        print("peak memory above inputs, MB:", memory)
     tables = {
         title: [asdict(case) | asdict(timing) for case, timing in zip(*result, strict=True)]
         for title, result in results.items()
     }
     content = {"machine": where, "unit": unit, "passes": arguments.passes, "tables": tables, "peak_memory_mb": memory}
-    console.print(str(write_json(arguments.out / f"{stem}.json", content)))
-    if plot := plot_scaling(results, arguments.out / f"{stem}.png"):
-        console.print(str(plot))
+    path = write_results(arguments.out, f"render-{device.type}", content)
+    if plot := plot_scaling(results, path.with_suffix(".png")):
+        print(plot)
 
 
 if __name__ == "__main__":

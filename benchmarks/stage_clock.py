@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 
@@ -14,7 +14,7 @@ from vg2gt.profiling import listening
 
 @dataclass
 class Passes:
-    """What a stage took, a number a pass.
+    """What a stage took, one number per pass.
 
     Attributes:
         seconds: of all cores on a CPU (other processes hardly matter), of the device on a GPU.
@@ -38,8 +38,9 @@ class Passes:
 class StageClock:
     """Collects stages by name; the model's marks report to it inside :meth:`listening`."""
 
-    def __init__(self, device: torch.device) -> None:
+    def __init__(self, device: torch.device, now: Callable[[], float] = time.process_time) -> None:
         self.device = device
+        self.now = now  # on a CPU
         self.stages: dict[str, Passes] = {}
 
     @contextmanager
@@ -47,9 +48,9 @@ class StageClock:
         """Measures what happens inside the block; on a GPU with events, after the device has done what came before."""
         passes = self.stages.setdefault(name, Passes())
         if self.device.type != "cuda":
-            begin = time.process_time()
+            begin = self.now()
             yield
-            passes.seconds.append(time.process_time() - begin)
+            passes.seconds.append(self.now() - begin)
             passes.peak_mb.append(0.0)
             return
         torch.cuda.synchronize(self.device)

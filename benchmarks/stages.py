@@ -13,23 +13,19 @@ JSON file to ``benchmarks/results``.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import tempfile
 from dataclasses import dataclass
-from datetime import date
 from pathlib import Path
 from typing import Any
 
 import torch
-from machine import machine
-from rich.console import Console
-from rich.table import Table
+from common import machine, parser, training_step, write_results
 from stage_clock import StageClock
 
 from vg2gt.evaluation.paper import tables
-from vg2gt.io.files import write_json
+from vg2gt.evaluation.tables import print_table
 from vg2gt.studies.study import compose_run
 from vg2gt.training.loop import Run, build
 from vg2gt.training.schedule import weight_decay_groups
@@ -105,15 +101,12 @@ def measure_training(run: Run, batch: Batch, passes: int, device: torch.device) 
 
     Data loading is not in it.
     """
-    module, clock = run.module.train(), StageClock(device)
-    run.trainer.strategy.connect(module)
-    module.trainer = run.trainer
-    module.log = lambda *args, **kwargs: None  # type: ignore[method-assign]
+    module, step_loss, clock = run.module, training_step(run), StageClock(device)
     optimizer = module.make_optimizer(weight_decay_groups(module.model))
     for _ in range(passes + 1):
         with clock.stage("training step"):
             with run.trainer.precision_plugin.train_step_context():
-                loss = module.training_step(batch, 0)
+                loss = step_loss(batch)
             if not bool(torch.isfinite(loss)):
                 raise FloatingPointError("the loss is not finite: such a step is dropped, its time says nothing")
             loss.backward()
@@ -123,35 +116,28 @@ def measure_training(run: Run, batch: Batch, passes: int, device: torch.device) 
     return min(clock.stages["training step"].seconds[1:])
 
 
-def print_stages(console: Console, case: Case, result: dict[str, Any], on_gpu: bool) -> None:
-    """A row a stage, the paper's seconds beside."""
-    height, width = case.size
-    title = f"{case.views} views of {height}x{width}, {result['gaussians']:,} Gaussians"
+def print_stages(case: Case, result: dict[str, Any], on_gpu: bool) -> None:
+    """One row per stage, the paper's seconds beside."""
+    title = f"{case.views} views of {case.size[0]}x{case.size[1]}, {result['gaussians']:,} Gaussians"
     if result["voxels_per_pixel"] is not None:
-        title += f", {result['voxels_per_pixel']:.2f} voxels a pixel"
-    table = Table(title=title, caption="paper: DA3-GIANT with model=vg2gt's widths on an RTX PRO 6000")
-    headings = ["stage", "seconds", "share", *(["peak MB"] if on_gpu else []), "paper, s"]
-    for heading in headings:
-        table.add_column(heading, justify="left" if heading == "stage" else "right")
+        title += f", {result['voxels_per_pixel']:.2f} voxels per pixel"
     seconds, peaks = result["seconds"], result["peak_mb"]
     paper = PAPER.get(case.size, {}) if case.views == 10 else {}
     whole = sum(seconds[name] for name in RECONSTRUCTION if name in seconds)
-    backbone = seconds["encode"] + seconds["decode"]
-    rows = [(STAGES[name], seconds[name], peaks[name], paper.get(name)) for name in seconds]
-    rows += [
-        (
-            "fine voxels and Gaussian head",
-            seconds.get("fine", 0.0) + seconds["gaussians"],
-            0.0,
-            paper.get("fine + head"),
-        ),
+    head, backbone = seconds.get("fine", 0.0) + seconds["gaussians"], seconds["encode"] + seconds["decode"]
+    shown = [(STAGES[name], seconds[name], peaks[name], paper.get(name)) for name in seconds]
+    shown += [
+        ("fine voxels and Gaussian head", head, 0.0, paper.get("fine + head")),
         ("backbone and first decode alone", backbone, 0.0, paper.get("DA3 alone")),
         ("whole reconstruction", whole, max(peaks.values()), paper.get("whole")),
     ]
-    for name, value, peak, theirs in rows:
+    rows = []
+    for name, value, peak, theirs in shown:
         memory = [f"{peak:.0f}" if peak else ""] if on_gpu else []
-        table.add_row(name, f"{value:.4f}", f"{value / whole:.0%}", *memory, f"{theirs:g}" if theirs else "")
-    console.print(table)
+        rows.append([name, f"{value:.4f}", f"{value / whole:.0%}", *memory, f"{theirs:g}" if theirs else ""])
+    headings = ["stage", "seconds", "share", *(["peak MB"] if on_gpu else []), "paper, s"]
+    caption = "paper: DA3-GIANT with model=vg2gt's widths on an RTX PRO 6000"
+    print_table(headings, rows, title=title, caption=caption)
 
 
 def paper_training_hours(step_seconds: float) -> float:
@@ -159,37 +145,30 @@ def paper_training_hours(step_seconds: float) -> float:
     return step_seconds * PAPER_STEPS * PAPER_DEVICES / 3600
 
 
-def print_training(console: Console, run: Run, case: Case, step_seconds: float, where: str) -> None:
+def print_training(run: Run, case: Case, step_seconds: float, where: str) -> None:
     """Hours of a whole training of the paper's length on this machine, beside the paper's table."""
     rendered = min(case.views, run.module.render_views or case.views)
-    table = Table(
-        title=f"training cost: {PAPER_STEPS:,} steps of {step_seconds:.3f} s on {PAPER_DEVICES} devices, each step "
+    title = (
+        f"training cost: {PAPER_STEPS:,} steps of {step_seconds:.3f} s on {PAPER_DEVICES} devices, each step "
         f"{case.views} images, {rendered} of them rendered (paper: 15 in the mean, all rendered)"
     )
-    for heading in ("method", "device", "device hours", "hours on the paper's GPU"):
-        table.add_column(heading, justify="left" if heading in ("method", "device") else "right")
-    table.add_row("measured here", where, f"{paper_training_hours(step_seconds):,.1f}", "n/a")
+    rows = [["measured here", where, f"{paper_training_hours(step_seconds):,.1f}", "n/a"]]
     for name, cost in tables()["tbl_training_cost"].items():
-        table.add_row(f"{name} (paper)", cost["gpu"], f"{cost['hours']:,.0f}", f"{cost['converted_hours']:,.1f}")
-    console.print(table)
+        rows.append([f"{name} (paper)", cost["gpu"], f"{cost['hours']:,.0f}", f"{cost['converted_hours']:,.1f}"])
+    print_table(("method", "device", "device hours", "hours on the paper's GPU"), rows, title=title, text_columns=2)
 
 
 def main() -> None:
     """Measures, prints and writes."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--views", type=int, default=10)
-    parser.add_argument("--size", type=int, nargs=2, action="append", metavar=("H", "W"))
-    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
-    parser.add_argument("--passes", type=int, default=3)
-    parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--training", action="store_true", help="measure a training step as well")
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
-    parser.add_argument("overrides", nargs="*", help="Hydra overrides")
-    arguments = parser.parse_args()
+    options = parser(__doc__, device=True, threads=1, passes=3, overrides="Hydra overrides")
+    options.add_argument("--views", type=int, default=10)
+    options.add_argument("--size", type=int, nargs=2, action="append", metavar=("H", "W"))
+    options.add_argument("--training", action="store_true", help="measure a training step as well")
+    arguments = options.parse_args()
     torch.set_num_threads(arguments.threads)
-    device, console = torch.device(arguments.device), Console(width=110)
+    device = torch.device(arguments.device)
     where, load = machine(device), round(os.getloadavg()[0], 2)
-    console.print(json.dumps(where))
+    print(json.dumps(where))
     model = next((text.removeprefix("model=") for text in arguments.overrides if text.startswith("model=")), "tiny")
     cases, backend, precision = [], "", ""
     for size in arguments.size or [[224, 448], [518, 518]]:
@@ -197,11 +176,11 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as folder:
             run, batch = prepare(case, device, folder)
             result = measure_inference(run, batch, arguments.passes, device)
-            print_stages(console, case, result, device.type == "cuda")
+            print_stages(case, result, device.type == "cuda")
             if arguments.training:
                 result["training_step"] = measure_training(run, batch.context, arguments.passes, device)
                 result["rendered_in_training"] = min(case.views, run.module.render_views or case.views)
-                print_training(console, run, case, result["training_step"], str(where.get("gpu", where["processor"])))
+                print_training(run, case, result["training_step"], str(where.get("gpu", where["processor"])))
         cases.append({"views": case.views, "size": list(case.size), **result})
         backend, precision = run.module.model.backend.name, str(run.trainer.precision)
     content = {
@@ -216,8 +195,7 @@ def main() -> None:
         "passes": arguments.passes,
         "cases": cases,
     }
-    stem = f"{date.today().isoformat()}-stages-{backend}-{model}-{device.type}"
-    console.print(str(write_json(arguments.out / f"{stem}.json", content)))
+    write_results(arguments.out, f"stages-{backend}-{model}-{device.type}", content)
 
 
 if __name__ == "__main__":

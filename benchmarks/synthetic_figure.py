@@ -6,10 +6,10 @@ A room, the same room with highlights, and two outdoor scenes: two frames of the
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 
 import torch
+from common import parser
 from torch import Tensor
 
 from vg2gt.data.synthetic import SyntheticScenes
@@ -33,10 +33,9 @@ def panels(variant: str, seed: int, highlights: bool, size: tuple[int, int]) -> 
 
 def main() -> None:
     """Renders and writes the picture."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--size", type=int, nargs=2, default=(140, 280))
-    parser.add_argument("--out", type=Path, default=Path("docs/figures/synthetic.png"))
-    arguments = parser.parse_args()
+    options = parser(__doc__, out=Path("docs/figures/synthetic.png"))
+    options.add_argument("--size", type=int, nargs=2, default=(140, 280))
+    arguments = options.parse_args()
     rows = [panels(*row, size=tuple(arguments.size)) for row in ROWS]
     print(write_png(arguments.out, grid(rows)))
 

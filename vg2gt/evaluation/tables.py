@@ -113,12 +113,12 @@ def print_table(
     title: str | None = None,
     caption: str | None = None,
     text_columns: int = 1,
-    console: Console | None = None,
+    width: int = 110,
 ) -> None:
-    """Prints a table to the terminal; ``head``, ``rows`` and ``text_columns`` as in :func:`markdown_table`."""
+    """Prints a table ``width`` characters wide at most; the other arguments are those of :func:`markdown_table`."""
     table = Table(title=title, caption=caption)
     for index, heading in enumerate(head):
         table.add_column(heading, justify="left" if index < text_columns else "right")
     for row in rows:
         table.add_row(*map(escape, row))
-    (console or Console(width=110)).print(table)
+    Console(width=width).print(table)

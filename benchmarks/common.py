@@ -1,0 +1,137 @@
+"""What the benchmarks share: options, the machine, clocks and peak memory, a training step, result files."""
+
+from __future__ import annotations
+
+import argparse
+import ctypes
+import os
+import platform
+import time
+from collections.abc import Callable, Mapping
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from vg2gt.io.files import write_json
+from vg2gt.training.loop import Run
+from vg2gt.types import Batch
+
+RESULTS = Path(__file__).resolve().parent / "results"
+MEGABYTE = 1e6
+
+
+def parser(
+    doc: str | None,
+    *,
+    out: Path = RESULTS,
+    device: bool = False,
+    threads: int | None = None,
+    passes: int | None = None,
+    overrides: str | None = None,
+) -> argparse.ArgumentParser:
+    """A parser of the options that the benchmarks have in common.
+
+    Args:
+        doc: the script's docstring.
+        out: default of ``--out``, where results are written.
+        device: whether there is ``--device``; its default is a GPU if there is one.
+        threads: default of ``--threads``; None: no such option.
+        passes: default of ``--passes``; None: no such option.
+        overrides: help of the Hydra overrides after all options; None: there are none.
+    """
+    made = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    made.add_argument("--out", type=Path, default=out)
+    if device:
+        made.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    for name, default in (("--threads", threads), ("--passes", passes)):
+        if default is not None:
+            made.add_argument(name, type=int, default=default)
+    if overrides is not None:
+        made.add_argument("overrides", nargs="*", help=overrides)
+    return made
+
+
+def write_results(folder: Path, name: str, content: Mapping[str, Any]) -> Path:
+    """Writes ``<date>-<name>.json`` and prints where; returns the path."""
+    path = write_json(folder / f"{date.today().isoformat()}-{name}.json", dict(content))
+    print(path)
+    return path
+
+
+def machine(device: torch.device | str = "cpu") -> dict[str, Any]:
+    """Processor, cores and versions, and the GPU's name if ``device`` is one."""
+    name = platform.processor() or platform.machine()
+    info = Path("/proc/cpuinfo")
+    if info.exists():
+        models = [line.split(":")[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")]
+        name = models[0] if models else name
+    found = {
+        "processor": name,
+        "cores": os.cpu_count(),
+        "torch": torch.__version__,
+        "python": platform.python_version(),
+    }
+    if torch.device(device).type == "cuda":
+        found["gpu"] = torch.cuda.get_device_name(device)
+    return found
+
+
+def used_seconds(device: torch.device) -> float:
+    """Seconds of all cores on a CPU, which other processes hardly change; by the clock on a GPU that is done."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+        return time.perf_counter()
+    return time.process_time()
+
+
+class PeakMemory:
+    """The most memory in use since ``restart``: allocated on a GPU, resident (VmHWM) in the process on a CPU.
+
+    Attributes:
+        start: bytes in use when this was made.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self.device = device
+        if device.type == "cuda":
+            torch.cuda.empty_cache()
+            self.start = torch.cuda.memory_allocated(device)
+        else:
+            # What was freed goes back to the system, or what follows would be served from it unseen.
+            ctypes.CDLL(None).malloc_trim(0)
+            self.start = _status("VmRSS")
+        self.restart()
+
+    def restart(self) -> None:
+        """Forgets the peak so far."""
+        if self.device.type == "cuda":
+            torch.cuda.reset_peak_memory_stats(self.device)
+        else:
+            Path("/proc/self/clear_refs").write_text("5")  # sets the high-water mark to what is resident now
+
+    @property
+    def peak(self) -> int:
+        """Bytes in use at the peak."""
+        return torch.cuda.max_memory_allocated(self.device) if self.device.type == "cuda" else _status("VmHWM")
+
+    @property
+    def megabytes(self) -> float:
+        """The peak above the start."""
+        return (self.peak - self.start) / MEGABYTE
+
+
+def _status(name: str) -> int:
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) * 1024 for line in lines if line.startswith(f"{name}:"))
+
+
+def training_step(run: Run) -> Callable[[Batch], Tensor]:
+    """The run's training step without its loop: a function from a batch to the loss; nothing is logged."""
+    module = run.module.train()
+    run.trainer.strategy.connect(module)
+    module.trainer = run.trainer
+    module.log = lambda *args, **kwargs: None  # type: ignore[method-assign]
+    return lambda batch: module.training_step(batch, 0)
