@@ -4,7 +4,8 @@ import pytest
 import torch
 
 from vg2gt.types import Cameras
-from vg2gt.voxels.coarse import _PatchPoints
+from vg2gt.voxels import grid
+from vg2gt.voxels.coarse import PatchPoints
 
 
 def perturb(module, seed=0):
@@ -62,7 +63,7 @@ def test_geometry_is_detached(make_coarse, make_room):
 
 def test_points_are_nearest_pixels_with_the_least_confidence(make_room):
     _, geometry, _ = make_room()
-    points = _PatchPoints(geometry, 7, torch.tensor([0.125]))
+    points = PatchPoints(geometry, 7, torch.tensor([0.125]))
     depth = geometry.depth[0, :, 3::7, 3::7].flatten()
     assert len(points.rows) == len(depth)
     confidence = geometry.depth_conf[0].unfold(1, 7, 7).unfold(2, 7, 7).amin((-1, -2))
@@ -151,3 +152,17 @@ def test_bad_options_are_refused(make_coarse):
         make_coarse(inject="first")
     with pytest.raises(ValueError, match="does not divide"):
         make_coarse(upsample=3)
+    with pytest.raises(ValueError, match=r"coarse\.fuse_kernel"):
+        make_coarse(fuse_kernel=2)
+
+
+@pytest.mark.parametrize(("views", "voxel_size", "warned"), [(3, 1e-3, True), (1, 1e-3, False), (3, 0.5, False)])
+def test_sparse_voxels_are_named_once(views, voxel_size, warned, make_coarse, make_room, monkeypatch, caplog):
+    monkeypatch.setattr(grid, "_warned_of_sparse", set())
+    tokens, geometry, _ = make_room(scenes=2, views=views)
+    module = make_coarse(voxel_size=voxel_size)
+    for _ in range(2):
+        module(tokens, geometry)
+    messages = [record.getMessage() for record in caplog.records]
+    assert len(messages) == warned
+    assert all("1.00 points each" in m and "model.coarse.min_footprint" in m for m in messages)

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from vg2gt.types import Cameras, Geometry
+from vg2gt.voxels import grid
 from vg2gt.voxels.grid import (
     in_range,
     mixed_radix_keys,
@@ -12,6 +13,7 @@ from vg2gt.voxels.grid import (
     pool_mean,
     pool_min,
     scene_voxel_size,
+    warn_if_sparse,
 )
 
 SIZE = torch.tensor([0.125, 0.25])
@@ -181,3 +183,17 @@ def test_voxel_size_guard():
     torch.testing.assert_close(scene_voxel_size(geometry, 0.002, 1.5), torch.tensor([0.06, 0.002]))
     torch.testing.assert_close(scene_voxel_size(geometry, 0.1, 1.5), torch.tensor([0.1, 0.1]))
     torch.testing.assert_close(scene_voxel_size(geometry, 0.002, 0), torch.tensor([0.002, 0.002]))
+
+
+@pytest.mark.parametrize(("shared", "module", "warned"), [(1, "fine", True), (2, "fine", False), (1, "coarse", False)])
+def test_the_sparsest_scene_decides_whether_voxels_are_sparse(shared, module, warned, monkeypatch, caplog):
+    """Scene 0 has ten points in one voxel, scene 1 seven voxels of one point each and ``shared`` points more in one."""
+    monkeypatch.setattr(grid, "_warned_of_sparse", set())
+    cells = torch.zeros(17 + shared, 3, dtype=torch.float64)
+    cells[10:17, 0] = torch.arange(7)
+    cells[17:, 0] = 6
+    batch = (torch.arange(len(cells)) >= 10).long()
+    plan = plan_voxels(cells, batch, torch.ones_like(batch, dtype=torch.bool))
+    for _ in range(2):
+        warn_if_sparse(plan, module)
+    assert [record.args for record in caplog.records] == [("fine", pytest.approx(8 / 7), "fine", "fine")] * warned

@@ -1,4 +1,8 @@
-"""Coarse-level feature enhancement: patch tokens gain what voxels shared by all views know (paper, Coarse-level)."""
+"""Coarse-level feature enhancement: patch tokens gain what voxels shared by all views know (paper, Coarse-level).
+
+With ``surface_evidence=False embedding_skip=False fuse_kernel=1`` (``model=vg2gt``) it is the paper's; what the three
+switches add is ours, and the first one's additions have a file of their own (:mod:`vg2gt.voxels.surface`).
+"""
 
 from __future__ import annotations
 
@@ -9,21 +13,21 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from vg2gt.geometry.cameras import crop_intrinsics, ray_directions, unproject
-from vg2gt.geometry.normals import normals_from_depth
+from vg2gt.geometry.cameras import crop_intrinsics, unproject
 from vg2gt.types import Cameras, Geometry, Tokens
-from vg2gt.voxels.grid import in_range, plan_voxels, point_cells, pool_mean, pool_min, scene_voxel_size
+from vg2gt.voxels.grid import in_range, plan_voxels, point_cells, pool_mean, pool_min, scene_voxel_size, warn_if_sparse
 from vg2gt.voxels.knn import interpolate, interpolation_weights
 from vg2gt.voxels.ptv3 import PTv3
+from vg2gt.voxels.surface import (
+    CENTROID_CHANNELS,
+    SURFACE_CHANNELS,
+    PointFrames,
+    cell_centroids,
+    vectors_to_surface,
+    voxel_evidence,
+)
 
 Inject = Literal["last", "all"]
-VOXEL_CHANNELS = 4  # centroid in the cell (3), confidence
-POINT_CHANNELS = 5  # from a point to the surface around it: a vector in camera axes (3), a change of depth; confidence
-SURFACE_WIDTH = 2.0  # voxels, of the Gaussian that weighs the voxels around a point
-DEPTH_CHANGE_UNIT = 0.02  # relative
-MAX_DEPTH_CHANGE = 3.0  # units
-GRAZING = 0.2  # product of normal and ray below which the change of depth says nothing
-NORMAL_EDGE = 0.2  # relative depth step across which no normal is taken
 
 
 class CoarseModule(nn.Module):
@@ -35,7 +39,7 @@ class CoarseModule(nn.Module):
     Args:
         token_dim: width of the tapped patch tokens.
         num_taps: number of tapped layers.
-        patch_size: pixels a patch, a multiple of ``upsample``.
+        patch_size: pixels per patch side, a multiple of ``upsample``.
         ptv3: makes the voxel network from ``in_channels``.
         voxel_size: edge length in scene units.
         min_footprint: smallest edge in pixels at the scene's median depth; 0 switches the guard off.
@@ -43,10 +47,15 @@ class CoarseModule(nn.Module):
         fuse_channels: width of the fusing convolutions on the patch grid.
         neighbors: nearest voxels a point's feature is interpolated from.
         inject: ``all`` changes every tap, ``last`` the last one only.
-        upsample: points a patch along each axis.
+        upsample: points per patch along each axis.
+        surface_evidence: not in the paper: the voxels' centroids enter PTv3, and how far every point is from the
+            surface that the views agree on enters the fusion.
+        embedding_skip: not in the paper: the patches' own embedding enters the fusion beside the voxels' features.
+        fuse_kernel: edge length of the fusing convolutions: 1 fuses every patch by itself (paper), 3 reads its
+            neighbours.
 
     Raises:
-        ValueError: if ``inject`` is unknown or ``upsample`` does not divide the patch.
+        ValueError: if ``inject`` or ``fuse_kernel`` is not one of these or ``upsample`` does not divide the patch.
     """
 
     def __init__(
@@ -62,10 +71,15 @@ class CoarseModule(nn.Module):
         neighbors: int = 16,
         inject: Inject = "all",
         upsample: int = 2,
+        surface_evidence: bool = True,
+        embedding_skip: bool = True,
+        fuse_kernel: int = 3,
     ) -> None:
         super().__init__()
         if inject not in get_args(Inject):
             raise ValueError(f"coarse.inject is {inject!r}; choose one of {', '.join(get_args(Inject))}")
+        if fuse_kernel not in (1, 3):
+            raise ValueError(f"coarse.fuse_kernel is {fuse_kernel!r}; choose 1 or 3")
         if patch_size % upsample:
             raise ValueError(f"coarse.upsample={upsample} does not divide the backend's patch of {patch_size} pixels")
         self.cell = patch_size // upsample
@@ -73,16 +87,18 @@ class CoarseModule(nn.Module):
         self.voxel_size = voxel_size
         self.min_footprint = min_footprint
         self.neighbors = neighbors
+        self.surface_evidence = surface_evidence
+        self.embedding_skip = embedding_skip
         layers: list[nn.Module] = [nn.LayerNorm(token_dim)]
         for width_in, width_out in zip((token_dim, *hidden), hidden, strict=False):
             layers += [nn.Linear(width_in, width_out), nn.GELU()]
         self.embed = nn.Sequential(*layers)
-        self.ptv3 = ptv3(in_channels=hidden[-1] + VOXEL_CHANNELS)
-        width = self.ptv3.out_channels + hidden[-1] + POINT_CHANNELS
+        self.ptv3 = ptv3(in_channels=hidden[-1] + CENTROID_CHANNELS * surface_evidence + 1)
+        width = self.ptv3.out_channels + SURFACE_CHANNELS * surface_evidence + hidden[-1] * embedding_skip
         self.fuse = nn.Sequential(
-            nn.Conv2d(width, fuse_channels, 3, padding=1),
+            nn.Conv2d(width, fuse_channels, fuse_kernel, padding=fuse_kernel // 2),
             nn.GELU(),
-            nn.Conv2d(fuse_channels, fuse_channels, 3, padding=1),
+            nn.Conv2d(fuse_channels, fuse_channels, fuse_kernel, padding=fuse_kernel // 2),
             nn.GELU(),
         )
         self.zero = nn.ModuleList(
@@ -106,12 +122,16 @@ class CoarseModule(nn.Module):
             ValueError: if a scene spans too many voxels to be numbered.
         """
         with torch.autocast(geometry.depth.device.type, enabled=False):
-            embedded = self._embed(tokens)
-            points = _PatchPoints(geometry, self.cell, scene_voxel_size(geometry, self.voxel_size, self.min_footprint))
-            enhanced = self._enhance(embedded[points.rows], points, generator)
-            patches, seen = self._to_patches(torch.cat((enhanced, embedded[points.rows]), -1), points, tokens)
-            fused = self.fuse(_to_maps(patches, tokens.grid))
-            updates = [torch.where(seen, _to_rows(branch(fused), patches), 0) for branch in self.zero]
+            points = PatchPoints(geometry, self.cell, scene_voxel_size(geometry, self.voxel_size, self.min_footprint))
+            embedded = self._embed(tokens)[points.rows]  # f(p): [N, C]
+            enhanced = self._enhance(embedded, points, generator)
+            if self.embedding_skip:
+                enhanced = torch.cat((enhanced, embedded), -1)
+            patches, seen = self._to_patches(enhanced, points, tokens)
+            maps = patches.flatten(0, 1).transpose(1, 2).unflatten(-1, tokens.grid)  # [B V, C, rows, columns]
+            fused = self.fuse(maps)
+            # Zero convolution: what it adds to each of the taps' tokens, nothing before training.
+            updates = [_to_patch_rows(branch(fused), seen) for branch in self.zero]  # [B, V, P, D] each
         untouched = tokens.patch[: len(tokens.patch) - len(updates)]
         changed = tokens.patch[len(untouched) :]
         return tokens.with_patch(
@@ -120,123 +140,103 @@ class CoarseModule(nn.Module):
 
     def _embed(self, tokens: Tokens) -> Tensor:
         """Features of the last tap on the upsampled grid, ``[B V h w, C]``."""
-        features = self.embed(tokens.patch[-1].float()).flatten(0, 1).unflatten(1, tokens.grid).permute(0, 3, 1, 2)
+        features = self.embed(tokens.patch[-1].float())  # [B, V, P, C]
+        features = features.flatten(0, 1).unflatten(1, tokens.grid).permute(0, 3, 1, 2)  # [B V, C, rows, columns]
         features = F.interpolate(features, scale_factor=self.upsample, mode="bilinear", align_corners=False)
-        return features.permute(0, 2, 3, 1).flatten(0, 2)
+        return features.permute(0, 2, 3, 1).flatten(0, 2)  # [B V h w, C]
 
-    def _enhance(self, embedded: Tensor, points: _PatchPoints, generator: torch.Generator | None) -> Tensor:
-        """PTv3 over the voxels, read back at the points: ``[N, C]`` features, then ``POINT_CHANNELS`` more."""
-        everything = torch.ones_like(points.batch, dtype=torch.bool)
-        plan = plan_voxels(points.cells, points.batch, everything)
-        offset = (points.cells - points.cells.floor() - 0.5).float()
-        centroid = pool_mean(offset, points.confidence, plan)
-        confidence = pool_min(points.confidence, plan)
-        inputs = (pool_mean(embedded, points.confidence, plan), 2 * centroid, confidence.log()[:, None])
+    def _enhance(self, embedded: Tensor, points: PatchPoints, generator: torch.Generator | None) -> Tensor:
+        """PTv3 over the voxels, read back at the points: ``[N, C]``; surface evidence adds ``SURFACE_CHANNELS``."""
+        plan = plan_voxels(points.cells, points.batch, torch.ones_like(points.batch, dtype=torch.bool))
+        if points.views > 1:
+            warn_if_sparse(plan, "coarse")
+        pooled = pool_mean(embedded, points.confidence, plan)  # f_m^v, eqn voxelfeature: [M, C]
+        least = pool_min(points.confidence, plan)  # n_m^v, eqn voxelfeature: [M]
+        inputs = (pooled, least.log()[:, None])
+        if self.surface_evidence:
+            centroid = cell_centroids(points.cells, points.confidence, plan)
+            inputs = (pooled, 2 * centroid, least.log()[:, None])
+        # S, T and S^-1 of eqn ptvzengqiang: PTv3 serialises, enhances and returns the voxels in the order given.
         voxels = self.ptv3(torch.cat(inputs, -1), plan.grid, plan.batch, points.voxel_size, generator=generator)
         # Cells relative to their scene's first one: differences, and so the weights, keep their precision in float32.
         first = torch.searchsorted(plan.batch, torch.arange(len(points.voxel_size), device=plan.batch.device))
         origin = plan.grid[first.clamp(max=len(plan) - 1)]
         queries = (points.cells - origin[points.batch]).float()
         centers = (plan.grid - origin[plan.batch]).float() + 0.5
-        index, weights = interpolation_weights(queries, points.batch, centers, plan.batch, self.neighbors)
-        evidence = torch.zeros_like(confidence).index_add_(0, plan.voxel_of, points.confidence.square())
-        residual = _to_surface(queries, centers + centroid, torch.where(weights > 0, evidence[index], 0), index)
-        enhanced = interpolate(voxels, index, weights)
-        return torch.cat((enhanced, points.in_camera(residual), points.confidence.log()[:, None]), -1)
+        # Paper, after eqn ptvzengqiang: distance-weighted over the 16 nearest voxel centres.
+        index, weights = interpolation_weights(queries, points.batch, centers, plan.batch, self.neighbors)  # [N, k]
+        enhanced = interpolate(voxels, index, weights)  # [N, C]
+        if not self.surface_evidence:
+            return enhanced
+        evidence = torch.where(weights > 0, voxel_evidence(points.confidence, plan)[index], 0)
+        to_surface = vectors_to_surface(queries, centers + centroid, evidence, index)
+        frames = PointFrames(points.depth, points.cameras, points.rows)
+        seen = frames.in_camera(to_surface, points.voxel_size[points.batch])
+        return torch.cat((enhanced, seen, points.confidence.log()[:, None]), -1)
 
-    def _to_patches(self, features: Tensor, points: _PatchPoints, tokens: Tokens) -> tuple[Tensor, Tensor]:
+    def _to_patches(self, features: Tensor, points: PatchPoints, tokens: Tokens) -> tuple[Tensor, Tensor]:
         """Averages the valid points of every patch: ``[B, V, P, C]`` and whether there were any ``[B, V, P, 1]``."""
         views = tokens.patch[-1].shape[:2]
         rows, columns = tokens.grid
-        total = views[0] * views[1] * rows * columns * self.upsample**2
-        weighted = torch.cat((features, torch.ones_like(features[:, :1])), -1)
+        total = views.numel() * rows * columns * self.upsample**2
+        weighted = torch.cat((features, torch.ones_like(features[:, :1])), -1)  # [N, C + 1]
         if points.placeholder:
             weighted = weighted * 0
-        dense = weighted.new_zeros(total, weighted.shape[1]).index_copy(0, points.rows, weighted)
-        dense = dense.view(*views, rows, self.upsample, columns, self.upsample, -1).sum((3, 5)).flatten(2, 3)
+        dense = weighted.new_zeros(total, weighted.shape[1]).index_copy(0, points.rows, weighted)  # [B V h w, C + 1]
+        dense = dense.view(*views, rows, self.upsample, columns, self.upsample, -1).sum((3, 5))
+        dense = dense.flatten(2, 3)  # [B, V, P, C + 1]
         count = dense[..., -1:]
         return dense[..., :-1] / count.clamp(min=1), count > 0
 
 
-class _PatchPoints:
+class PatchPoints:
     """The points of the upsampled patch grid that have a valid depth, packed.
 
     Depth is taken at the central pixel of every cell, never averaged across an edge; confidence is the smallest of
     the cell. Where nothing at all is valid one placeholder point stands in, so that the network's parameters stay in
     the autograd graph; its features are discarded.
 
+    Args:
+        geometry: B scenes of V views, in scene units.
+        cell: pixels per cell side.
+        voxel_size: ``[B]``.
+
     Attributes:
         rows: ``[N]`` place in the flattened ``[B, V, h, w]`` grid.
         batch: ``[N]`` scene index, sorted.
         cells: ``[N, 3]`` float64 positions in voxel units.
         confidence: ``[N]`` > 0.
-        rotation: ``[N, 3, 3]`` world-to-camera rotation of the point's view.
-        depth: ``[N]`` scene units.
-        ray: ``[N, 3]`` the point's ray in its camera's axes, z = 1.
-        normal: ``[N, 3]`` the surface normal there, facing the camera; where it is unknown, the camera's axis.
         placeholder: whether the only point is the placeholder.
         voxel_size: ``[B]``.
+        views: V.
+        depth: ``[B, V, h, w]`` of the grid, scene units, 0 = invalid.
+        cameras: whose pixels are the grid's.
     """
 
     def __init__(self, geometry: Geometry, cell: int, voxel_size: Tensor) -> None:
         depth, confidence = geometry.depth.detach().float(), geometry.depth_conf.detach().float()
-        sampled = depth[..., cell // 2 :: cell, cell // 2 :: cell]
-        smallest = -F.max_pool2d(-confidence, cell)
+        sampled = depth[..., cell // 2 :: cell, cell // 2 :: cell]  # [B, V, h, w]
+        smallest = -F.max_pool2d(-confidence, cell)  # [B, V, h, w]
         valid = torch.isfinite(sampled) & (sampled > 0) & torch.isfinite(smallest) & (smallest > 0)
-        size = (sampled.shape[-2], sampled.shape[-1])
-        cameras = _sampled_cameras(geometry.cameras, cell, size)
-        points = unproject(torch.where(valid, sampled, 1.0), cameras)
-        scene = torch.arange(len(depth), device=depth.device).repeat_interleave(depth[0].numel() // cell**2)
-        cells = point_cells(points.flatten(0, -2), scene, voxel_size)
+        self.voxel_size = voxel_size
+        self.views = sampled.shape[1]
+        self.depth = torch.where(valid, sampled, 0.0)
+        self.cameras = _sampled_cameras(geometry.cameras, cell, (sampled.shape[-2], sampled.shape[-1]))
+        points = unproject(torch.where(valid, sampled, 1.0), self.cameras)  # [B, V, h, w, 3]
+        scene = torch.arange(len(depth), device=depth.device).repeat_interleave(sampled[0].numel())  # [B V h w]
+        cells = point_cells(points.flatten(0, -2), scene, voxel_size)  # [B V h w, 3]
         usable = valid.flatten() & in_range(cells)
         self.placeholder = not bool(usable.any())
         self.rows = usable.nonzero()[:, 0] if not self.placeholder else scene.new_zeros(1)
         self.batch = scene[self.rows]
         self.cells = cells[self.rows] if not self.placeholder else cells.new_zeros(1, 3)
         self.confidence = torch.where(valid, smallest, 1.0).flatten()[self.rows]
-        rotations = geometry.cameras.world_to_camera[..., :3, :3].detach().float().flatten(0, 1)
-        self.rotation = rotations[self.rows // (valid[0, 0].numel())]
-        self.voxel_size = voxel_size
-        self.depth = torch.where(valid, sampled, 1.0).flatten()[self.rows]
-        self.ray = ray_directions(cameras.intrinsics, size).flatten(0, -2)[self.rows]
-        normals, known = normals_from_depth(torch.where(valid, sampled, 0.0), cameras.intrinsics, NORMAL_EDGE)
-        normals = torch.where(known[:, :, None], normals, normals.new_tensor([0.0, 0.0, -1.0])[:, None, None])
-        self.normal = normals.permute(0, 1, 3, 4, 2).flatten(0, -2)[self.rows]
-
-    def in_camera(self, residual: Tensor) -> Tensor:
-        """A residual ``[N, 3]`` (world axes, voxels) in the cameras' axes and as a change of depth: ``[N, 4]``.
-
-        The change of depth takes the point along its ray onto the tangent plane through the residual's end, so that
-        where on the surface the neighbours happen to lie drops out: what remains is how far the views disagree.
-        """
-        local = (self.rotation @ residual[..., None])[..., 0]
-        facing = (self.normal * self.ray).sum(-1)
-        steps = (self.normal * local).sum(-1) / facing.clamp(max=-GRAZING)
-        change = steps * self.voxel_size[self.batch] / (self.depth * DEPTH_CHANGE_UNIT)
-        change = torch.where(facing < -GRAZING, change, 0.0).clamp(-MAX_DEPTH_CHANGE, MAX_DEPTH_CHANGE)
-        return torch.cat((local, change[:, None]), -1)
 
 
-def _to_surface(queries: Tensor, centroids: Tensor, evidence: Tensor, index: Tensor) -> Tensor:
-    """From every point to the surface that all views agree on around it, ``[N, 3]`` in voxels.
-
-    The features' inverse-square weights would return the point's own voxel; a Gaussian of the distance keeps several,
-    and confident points, of which the square of the confidence is the evidence, outweigh the others.
-    """
-    offset = centroids[index] - queries[:, None]
-    weights = evidence * torch.exp(offset.square().sum(-1) / (-2 * SURFACE_WIDTH**2))
-    weights = weights / weights.sum(1, keepdim=True).clamp(min=1e-12)
-    return (weights[..., None] * offset).sum(1)
-
-
-def _to_maps(patches: Tensor, grid: tuple[int, int]) -> Tensor:
-    """Patch rows ``[B, V, P, C]`` as maps ``[B V, C, rows, columns]``."""
-    return patches.flatten(0, 1).transpose(1, 2).unflatten(-1, grid)
-
-
-def _to_rows(maps: Tensor, like: Tensor) -> Tensor:
-    """Maps ``[B V, C, rows, columns]`` as patch rows ``[B, V, P, C]``."""
-    return maps.flatten(2).transpose(1, 2).unflatten(0, like.shape[:2])
+def _to_patch_rows(maps: Tensor, seen: Tensor) -> Tensor:
+    """Maps ``[B V, C, rows, columns]`` as patch rows ``[B, V, P, C]``, 0 where not ``seen`` ``[B, V, P, 1]``."""
+    rows = maps.flatten(2).transpose(1, 2).unflatten(0, seen.shape[:2])  # [B, V, P, C]
+    return torch.where(seen, rows, 0)
 
 
 def _sampled_cameras(cameras: Cameras, cell: int, size: tuple[int, int]) -> Cameras:

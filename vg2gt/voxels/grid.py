@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
@@ -12,7 +13,14 @@ from torch.nn import functional as F
 
 from vg2gt.types import Geometry
 
+log = logging.getLogger(__name__)
+
 MAX_CELLS = 1 << 18  # cells either side of the origin: 19 bits an axis leave 6 of a code's 63 for the scene
+# Below, hardly any voxel fuses what several views see. Coarse points are a patch's few, and their voxels share features
+# through PTv3 and 16 neighbours besides.
+MIN_POINTS_PER_VOXEL = {"coarse": 1.1, "fine": 1.2}
+
+_warned_of_sparse: set[str] = set()
 
 
 @dataclass(frozen=True)
@@ -128,6 +136,26 @@ def plan_voxels(cells: Tensor, batch: Tensor, valid: Tensor) -> VoxelPlan:
     voxel_of = torch.full_like(batch, -1)
     voxel_of[point_rows] = inverse
     return VoxelPlan(floors[first], scenes[first], point_rows, starts, counts, voxel_of)
+
+
+def warn_if_sparse(plan: VoxelPlan, module: str) -> None:
+    """Says in the log, once per module and process, that a scene's voxels hold hardly more than one point each.
+
+    Args:
+        plan: the voxels of B scenes.
+        module: whose options to name, ``coarse`` or ``fine``.
+    """
+    if module in _warned_of_sparse or not len(plan):
+        return
+    voxels, points = torch.bincount(plan.batch), torch.bincount(plan.batch, plan.counts)
+    fewest = float((points / voxels)[voxels > 0].min())
+    if fewest < MIN_POINTS_PER_VOXEL[module]:
+        _warned_of_sparse.add(module)
+        log.warning(
+            "the %s voxels of a scene hold %.2f points each: nearly nothing is fused across views. Raise "
+            "model.%s.voxel_size, or set model.%s.min_footprint (pixels per voxel edge at the median depth)",
+            *(module, fewest, module, module),
+        )
 
 
 class _WeightedMean(torch.autograd.Function):
