@@ -96,6 +96,38 @@ def test_every_ablation_builds_what_it_says(tmp_path: Path, ablation: str) -> No
     assert {name for name, changed in full.items() if changed} == {ablation}
 
 
+ADDITIONS = {"surface_evidence": True, "embedding_skip": True, "fuse_kernel": 3}  # what the paper does not have
+PAPER = {"surface_evidence": False, "embedding_skip": False, "fuse_kernel": 1}
+
+
+@pytest.mark.parametrize(
+    ("overrides", "coarse", "anchor"),
+    [
+        ([], ADDITIONS, "centroid"),
+        (["model=vg2gt"], PAPER, "center"),
+        (["model=vg2gt_plus"], ADDITIONS, "centroid"),
+        (["experiment=paper"], PAPER, "center"),
+        (["experiment=paper_counts"], PAPER, "center"),
+        (["experiment=finetune"], ADDITIONS, "centroid"),
+    ],
+)
+def test_the_papers_presets_have_none_of_our_additions(
+    tmp_path: Path, overrides: list[str], coarse: dict[str, Any], anchor: str
+) -> None:
+    model = composed(tmp_path, *overrides).model
+    assert {key: model.coarse[key] for key in coarse} == coarse
+    assert model.gaussians.anchor == anchor
+
+
+def test_paper_counts_differs_from_the_paper_in_its_voxels_only(tmp_path: Path) -> None:
+    paper, counts = (composed(tmp_path, f"experiment={name}") for name in ("paper", "paper_counts"))
+    assert counts.model.scale == {"_target_": "vg2gt.model.SceneScale", "source": "normalize", "median_depth": 1.0}
+    assert (counts.model.coarse.min_footprint, counts.model.fine.min_footprint) == (7, 1)
+    counts.name, counts.model.scale.source = paper.name, paper.model.scale.source
+    counts.model.coarse.min_footprint = counts.model.fine.min_footprint = 0
+    assert {key: counts[key] for key in counts} == {key: paper[key] for key in paper}
+
+
 def test_paper_experiment_holds_the_papers_numbers(tmp_path: Path) -> None:
     """Paper, Implementation Details."""
     config = composed(tmp_path, "experiment=paper")
@@ -103,8 +135,8 @@ def test_paper_experiment_holds_the_papers_numbers(tmp_path: Path) -> None:
     assert config.trainer.devices == 2
     assert config.optimizer._target_ == "torch.optim.AdamW"
     assert (config.optimizer.lr, config.training.final_lr) == (3e-6, 1e-8)
-    assert config.model.fine.voxel_size == 0.002
-    assert config.model.fine.min_footprint == 0
+    assert (config.model.coarse.voxel_size, config.model.fine.voxel_size) == (0.01, 0.002)
+    assert config.model.coarse.min_footprint == config.model.fine.min_footprint == 0
     assert config.model.gaussians.splits == 2
     assert config.model.scale.source == "focal"
     assert list(config.data.image_size) == [224, 448]

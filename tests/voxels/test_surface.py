@@ -41,8 +41,15 @@ def test_frames_of_a_frontal_plane() -> None:
     frames = frame(row=13)
     torch.testing.assert_close(frames.ray, torch.tensor([[0.1, 0, 1]]))
     torch.testing.assert_close(frames.normal, torch.tensor([[0.0, 0, -1]]))
-    assert torch.equal(frames.rotation[0], TURN)
     assert frames.depth.tolist() == [2]
+
+
+def test_every_point_has_its_own_views_rotation() -> None:
+    depth, camera = plane()
+    poses = torch.cat((camera.world_to_camera, torch.eye(4)[None, None]), 1)
+    both = Cameras(poses, camera.intrinsics.expand(1, 2, 3, 3), camera.size)
+    frames = PointFrames(depth.expand(1, 2, 5, 5), both, torch.tensor([24, 25]))
+    assert torch.equal(frames.rotation, torch.stack((TURN, torch.eye(3))))
 
 
 def test_where_no_normal_is_known_it_is_the_cameras_axis() -> None:
@@ -149,6 +156,21 @@ def test_each_view_is_told_how_far_it_is_from_the_surface_both_agree_on(
     assert float(voxels[0][:, 14].mean()) == pytest.approx(2 * ((surface - 1.95) / 0.15 - 0.5), abs=0.1)
     assert voxels[0][:, 12:15].abs().amax() <= 1
     assert torch.equal(voxels[0][:, 15], torch.zeros(len(voxels[0])))
+
+
+def test_a_scene_of_few_voxels_is_told_of_its_own_only(make_room, make_coarse) -> None:
+    """Fewer than 16: what stands in for the missing neighbours is another scene's voxel."""
+    tokens, geometry, _ = make_room(scenes=2)
+    module = make_coarse(voxel_size=2.0).eval()
+    told = inputs_of(module.fuse[0])
+    module(tokens, geometry)
+    cameras = geometry.cameras
+    pose, intrinsics = cameras.world_to_camera[1:], cameras.intrinsics[1:]
+    alone = Geometry(
+        geometry.depth[1:], geometry.depth_conf[1:], Cameras(pose, intrinsics, cameras.size), geometry.scale[1:]
+    )
+    module(tokens.map(lambda tensor: tensor[1:]), alone)
+    torch.testing.assert_close(told[0][3:, 24:29], told[1][:, 24:29])
 
 
 # ------------------------------------------------------------------------------------------- without the additions

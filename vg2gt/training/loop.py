@@ -26,6 +26,7 @@ from vg2gt.runs.trust import read_run_config
 from vg2gt.training.checkpoint_io import AtomicCheckpointIO
 from vg2gt.training.distributed import ending_together
 from vg2gt.training.module import VG2GTModule
+from vg2gt.training.notices import notices
 from vg2gt.training.preview import write_preview
 from vg2gt.training.report import comparison_table, print_comparison
 
@@ -131,6 +132,8 @@ def train(config: DictConfig) -> dict[str, Any]:
         OutOfMemory: if a device's memory is full, naming the sizes and the options that reduce them.
     """
     checkpoint = _checkpoint_to_resume(config)
+    for notice in notices(config) if rank_zero_only.rank == 0 else ():
+        log.warning(notice)
     run = build(config)
     if isinstance(run.datamodule, SceneDataModule):
         run.datamodule.setup("fit")  # before anything is measured: faults of the data are named first

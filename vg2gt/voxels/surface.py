@@ -65,7 +65,7 @@ class PointFrames:
         """
         local = (self.rotation @ to_surface[..., None])[..., 0]
         facing = (self.normal * self.ray).sum(-1)
-        steps = (self.normal * local).sum(-1) / facing.clamp(max=-GRAZING)
+        steps = (self.normal * local).sum(-1) / facing
         change = steps * voxel_size / (self.depth * DEPTH_CHANGE_UNIT)
         change = torch.where(facing < -GRAZING, change, 0.0).clamp(-MAX_DEPTH_CHANGE, MAX_DEPTH_CHANGE)
         return torch.cat((local, change[:, None]), -1)
