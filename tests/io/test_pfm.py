@@ -18,7 +18,7 @@ def test_both_byte_orders_bottom_row_first(tmp_path: Path, order: str, scale: st
     depth = read_pfm(path, "scan1", (3, 4))
     assert depth.dtype == np.float32
     assert np.array_equal(depth, DEPTH)
-    with pytest.raises(DataError, match="is 4x3 pixels, expected 3x4"):
+    with pytest.raises(DataError, match="is 4x3 pixels, but the recording's first one is 3x4"):
         read_pfm(path, "scan1", (4, 3))
 
 

@@ -6,6 +6,7 @@ import os
 import struct
 import zlib
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,7 @@ from vg2gt.io import (
     read_video,
 )
 from vg2gt.io.cameras_json import NamedCamera
-from vg2gt.io.image_files import image_size, photo_size, read_color, read_depth, read_photo
+from vg2gt.io.image_files import image_size, read_color, read_depth
 from vg2gt.io.images import open_image
 from vg2gt.io.sens import scan_sens
 from vg2gt.viewer import load_pictures
@@ -70,16 +71,16 @@ def zipped_text() -> bytes:
 def test_pictures(tmp_path: Path, canary: Path, name: str) -> None:
     path = tmp_path / "0001.png"
     path.write_bytes(PICTURES[name](canary))
-    for read in (read_color, read_photo, read_depth):
+    for read in (read_color, partial(read_color, upright=True), read_depth):
         with pytest.raises(DataError, match=r"cannot read .*0001\.png of scene s"):
             read(path, "s")
     camera = NamedCamera("0001.png", 9, 9, np.eye(3), np.eye(4))
     with pytest.raises(ValueError, match=r"cannot read .*0001\.png"):
         load_pictures([camera], tmp_path)
     if "bomb" not in name:
-        for size in (image_size, photo_size):
+        for upright in (False, True):
             with pytest.raises(DataError, match=r"cannot read .*0001\.png of scene s"):
-                size(path, "s")
+                image_size(path, "s", upright)
     moving = tmp_path / "moving.gif"
     moving.write_bytes(path.read_bytes())
     with pytest.raises(FormatError, match=r"moving\.gif"):

@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import torch
 from torch import Tensor
 
 from vg2gt.io.errors import DataError
@@ -33,6 +34,12 @@ class Frames(TensorRecord):
     world_to_camera: Tensor
     intrinsics: Tensor
     sparse_depth: bool = False
+
+    @staticmethod
+    def concatenate(parts: Sequence[Frames]) -> Frames:
+        """Joins frames of one scene and size along the views."""
+        names = ("images", "depth", "world_to_camera", "intrinsics")
+        return replace(parts[0], **{name: torch.cat([getattr(part, name) for part in parts]) for name in names})
 
 
 class SceneSource(ABC):

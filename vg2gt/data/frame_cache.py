@@ -6,8 +6,6 @@ from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-import torch
-
 from vg2gt.data.base import Frames, SceneSource
 from vg2gt.data.transforms import from_bytes, to_bytes
 
@@ -35,18 +33,16 @@ class FrameCache:
         chosen = [fresh[frame] if frame in fresh else self._recall(scene, frame) for frame in frame_ids]
         for frame, value in fresh.items():
             self._keep((scene, frame), value)
-        return Frames(
-            from_bytes(torch.stack([frame.images for frame in chosen])),
-            torch.stack([frame.depth for frame in chosen]),
-            torch.stack([frame.world_to_camera for frame in chosen]),
-            torch.stack([frame.intrinsics for frame in chosen]),
-            chosen[0].sparse_depth,
-        )
+        frames = Frames.concatenate(chosen)
+        return replace(frames, images=from_bytes(frames.images))
 
     def _decode(self, scene: str, frame_ids: Sequence[int]) -> dict[int, Frames]:
         frames = self.prepare(self.source.load(scene, frame_ids))
         frames = replace(frames, images=to_bytes(frames.images))
-        return {frame: frames.map(lambda tensor, row=row: tensor[row].clone()) for row, frame in enumerate(frame_ids)}
+        return {
+            frame: frames.map(lambda tensor, row=row: tensor[row : row + 1].clone())  # [1, ...]
+            for row, frame in enumerate(frame_ids)
+        }
 
     def _recall(self, scene: str, frame: int) -> Frames:
         self._frames.move_to_end((scene, frame))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vg2gt.io.errors import DataError
-from vg2gt.io.image_files import Size
+from vg2gt.io.image_files import Size, check_size
 from vg2gt.io.npz import load_npz
 
 
@@ -57,11 +57,7 @@ def load_npy(path: Path, scene: str, size: Size) -> NDArray[np.float32]:
         DataError: if the file is missing or damaged, no image of floats, or of another size.
     """
     mapped = _map_npy(path, scene)
-    if mapped.shape != tuple(size):
-        raise DataError(
-            f"{path} of scene {scene} is {mapped.shape[1]}x{mapped.shape[0]} pixels, but the scene's first one is "
-            f"{size[1]}x{size[0]}"
-        )
+    check_size(path, scene, mapped.shape, size)
     return np.asarray(mapped, dtype=np.float32)
 
 

@@ -6,7 +6,8 @@ import io
 import statistics
 import struct
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -36,27 +37,30 @@ _TURNS = {
 _QUARTER_TURNS = (5, 6, 7, 8)
 
 
-def image_size(path: Path, scene: str) -> tuple[int, int]:
+def image_size(path: Path, scene: str, upright: bool = False) -> Size:
     """Returns an image's ``(height, width)`` without decoding it.
+
+    Args:
+        path: the file.
+        scene: the scene it belongs to, for messages.
+        upright: of a photograph turned upright as its EXIF data says.
 
     Raises:
         DataError: if the file is missing or not an image.
     """
-    try:
-        with open_image(path) as image:
-            return image.height, image.width
-    except _DAMAGED as error:
-        raise _unreadable(path, scene, error) from error
+    with _opened(path, path, scene) as image:
+        turned = upright and _orientation(image) in _QUARTER_TURNS
+        return (image.width, image.height) if turned else (image.height, image.width)
 
 
-def typical_size(sizes: Iterable[tuple[int, int]]) -> tuple[int, int]:
+def typical_size(sizes: Iterable[Size]) -> Size:
     """The common ``(height, width)`` to which images of several sizes are brought: the median of each."""
     heights, widths = zip(*sizes, strict=True)
     return statistics.median_low(heights), statistics.median_low(widths)
 
 
 def read_color(
-    path: Path, scene: str, size: tuple[int, int] | None = None, content: bytes | None = None
+    path: Path, scene: str, size: Size | None = None, content: bytes | None = None, upright: bool = False
 ) -> NDArray[np.uint8]:
     """Reads a colour image ``[H, W, 3]``.
 
@@ -65,67 +69,58 @@ def read_color(
         scene: the scene it belongs to, for messages.
         size: the ``(height, width)`` it must have; None: any.
         content: the encoded image where it is a part of the file; None: it is the file.
+        upright: turn a photograph upright as its EXIF data says.
 
     Raises:
         DataError: if the file is missing, damaged or of another size.
     """
-    try:
-        with open_image(path if content is None else io.BytesIO(content)) as image:
-            pixels = np.array(image.convert("RGB"))
-    except _DAMAGED as error:
-        raise _unreadable(path, scene, error) from error
-    _check_size(path, scene, pixels.shape[:2], size)
+    with _opened(path if content is None else io.BytesIO(content), path, scene) as image:
+        turn = _TURNS.get(_orientation(image)) if upright else None
+        pixels = np.array((image if turn is None else image.transpose(turn)).convert("RGB"))
+    check_size(path, scene, pixels.shape[:2], size)
     return pixels
 
 
-def photo_size(path: Path, scene: str) -> tuple[int, int]:
-    """Returns the ``(height, width)`` of a photograph turned upright, without decoding it.
-
-    Raises:
-        DataError: if the file is missing or not an image.
-    """
-    try:
-        with open_image(path) as image:
-            turned = _orientation(image) in _QUARTER_TURNS
-            return (image.width, image.height) if turned else (image.height, image.width)
-    except _DAMAGED as error:
-        raise _unreadable(path, scene, error) from error
-
-
-def read_photo(path: Path, scene: str, size: tuple[int, int] | None = None) -> NDArray[np.uint8]:
-    """Reads a photograph ``[H, W, 3]``, turned upright as its EXIF data says; otherwise like ``read_color``.
-
-    Raises:
-        DataError: if the file is missing, damaged, or turned upright of another size than ``size``.
-    """
-    try:
-        with open_image(path) as image:
-            turn = _TURNS.get(_orientation(image))
-            pixels = np.array((image if turn is None else image.transpose(turn)).convert("RGB"))
-    except _DAMAGED as error:
-        raise _unreadable(path, scene, error) from error
-    _check_size(path, scene, pixels.shape[:2], size)
-    return pixels
-
-
-def read_depth(path: Path, scene: str, size: tuple[int, int] | None = None) -> NDArray[np.int64]:
+def read_depth(path: Path, scene: str, size: Size | None = None) -> NDArray[np.int64]:
     """Reads a one-channel integer depth image ``[H, W]`` as stored (16-bit PNG, PGM or TIFF).
 
     Raises:
         DataError: if the file is missing, damaged, not a one-channel integer image, or of another size than ``size``.
     """
-    try:
-        with open_image(path) as image:
-            pixels = np.array(image)
-    except _DAMAGED as error:
-        raise _unreadable(path, scene, error) from error
+    with _opened(path, path, scene) as image:
+        pixels = np.array(image)
     if pixels.ndim != 2 or pixels.dtype.kind not in "iu":
         raise DataError(
             f"{path} of scene {scene} is not a depth image: expected one channel of 16-bit integers, found "
             f"{pixels.dtype} values of shape {pixels.shape}"
         )
-    _check_size(path, scene, pixels.shape, size)
+    check_size(path, scene, pixels.shape, size)
     return pixels.astype(np.int64)
+
+
+def check_size(path: Path, scene: str, found: tuple[int, ...], expected: Size | None) -> None:
+    """Refuses an image of another ``(height, width)`` than expected; None: any will do.
+
+    Raises:
+        DataError: naming both sizes.
+    """
+    if expected is not None and tuple(found) != tuple(expected):
+        raise DataError(
+            f"{path} of scene {scene} is {found[1]}x{found[0]} pixels, but the recording's first one is "
+            f"{expected[1]}x{expected[0]}"
+        )
+
+
+@contextmanager
+def _opened(file: Path | io.BytesIO, path: Path, scene: str) -> Iterator[Image.Image]:
+    """An open image; what is raised while it is read names the file, the scene and the remedy."""
+    try:
+        with open_image(file) as image:
+            yield image
+    except _DAMAGED as error:
+        raise DataError(
+            f"cannot read {path} of scene {scene}: {error}; restore the file or remove the frame"
+        ) from error
 
 
 def _orientation(image: Image.Image) -> int:
@@ -134,15 +129,3 @@ def _orientation(image: Image.Image) -> int:
         return int(image.getexif().get(_ORIENTATION_TAG, 1))
     except Exception:  # the EXIF parser raises whatever the bytes lead it to
         return 1
-
-
-def _unreadable(path: Path, scene: str, error: Exception) -> DataError:
-    return DataError(f"cannot read {path} of scene {scene}: {error}; restore the file or remove the frame")
-
-
-def _check_size(path: Path, scene: str, found: tuple[int, ...], expected: tuple[int, int] | None) -> None:
-    if expected is not None and tuple(found) != tuple(expected):
-        raise DataError(
-            f"{path} of scene {scene} is {found[1]}x{found[0]} pixels, but the recording's first one is "
-            f"{expected[1]}x{expected[0]}"
-        )

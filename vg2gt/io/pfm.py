@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vg2gt.io.errors import DataError
+from vg2gt.io.image_files import Size, check_size
 
 _HEADER = re.compile(rb"(P[fF])\s+(\d{1,6})\s+(\d{1,6})\s+([-+0-9.eE]{1,20})\s")
 
 
-def read_pfm(path: Path, scene: str, size: tuple[int, int] | None = None) -> NDArray[np.float32]:
+def read_pfm(path: Path, scene: str, size: Size | None = None) -> NDArray[np.float32]:
     """Reads a one-channel float image ``[H, W]``, its first row at the top (the file has the bottom row first).
 
     Args:
@@ -39,8 +40,7 @@ def read_pfm(path: Path, scene: str, size: tuple[int, int] | None = None) -> NDA
             f"{path} of scene {scene} is damaged: {width}x{height} pixels take {4 * width * height} bytes, it has "
             f"{len(values)}"
         )
-    if size is not None and (height, width) != tuple(size):
-        raise DataError(f"{path} of scene {scene} is {width}x{height} pixels, expected {size[1]}x{size[0]}")
+    check_size(path, scene, (height, width), size)
     # The sign of the scale is the byte order: negative is little-endian.
     pixels = np.frombuffer(values, "<f4" if scale < 0 else ">f4").reshape(height, width)
     return pixels[::-1].astype(np.float32)

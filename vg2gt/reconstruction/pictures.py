@@ -24,7 +24,7 @@ from vg2gt.data.sources.nerfstudio import Nerfstudio
 from vg2gt.data.sources.parsing import IMAGE_SUFFIXES
 from vg2gt.data.sources.rgbd import RGBDFolder
 from vg2gt.data.transforms import from_bytes
-from vg2gt.io.image_files import photo_size, read_photo
+from vg2gt.io.image_files import image_size, read_color
 from vg2gt.io.nerfstudio import read_transforms
 from vg2gt.io.video import VIDEO_SUFFIXES, count_frames, read_video
 
@@ -146,9 +146,9 @@ def _photo(path: Path) -> Picture:
     place = path.parent.name or "."
 
     def read(size: tuple[int, int]) -> Frames:
-        return frame_of(shrunk(read_photo(path, place), size))
+        return frame_of(shrunk(read_color(path, place, upright=True), size))
 
-    return Picture(path.stem, photo_size(path, place), read)
+    return Picture(path.stem, image_size(path, place, upright=True), read)
 
 
 def _open_heic(path: Path) -> None:

@@ -92,7 +92,7 @@ def test_a_cached_stream_is_not_scanned_again(tmp_path, frames, monkeypatch):
     write_sens(tmp_path / "raw", frames, lost=1)
     root, cache = str(tmp_path / "raw"), str(tmp_path / "cache")
     first = ScanNetSens(root, index_cache=cache).load(SCENE, [3, 2])
-    monkeypatch.setattr("vg2gt.data.sources.scannet_sens.scan_sens", lambda *_: pytest.fail("scanned again"))
+    monkeypatch.setattr("vg2gt.data.sources.scannet.scan_sens", lambda *_: pytest.fail("scanned again"))
     again = ScanNetSens(root, index_cache=cache).load(SCENE, [3, 2])
     assert torch.equal(again.images, first.images)
     assert torch.equal(again.depth, first.depth)

@@ -7,8 +7,7 @@ from vg2gt.data.sources.infinigen import Infinigen
 from vg2gt.data.sources.kitti import KITTI
 from vg2gt.data.sources.nerfstudio import Nerfstudio
 from vg2gt.data.sources.replica import Replica
-from vg2gt.data.sources.scannet import ScanNet
-from vg2gt.data.sources.scannet_sens import ScanNetSens
+from vg2gt.data.sources.scannet import ScanNet, ScanNetSens
 from vg2gt.data.sources.scannetpp import ScanNetPPiPhone
 from vg2gt.data.sources.tanks_and_temples import TanksAndTemples
 from vg2gt.data.sources.tum import TUM

@@ -8,15 +8,16 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from typing_extensions import Unpack
 
 from vg2gt.data.base import DataError
-from vg2gt.data.sources.files import FileSource
-from vg2gt.data.sources.index import SceneIndex, folder_state, make_index
-from vg2gt.data.sources.parsing import errors_name, inverse, named_file
+from vg2gt.data.sources.files import FileSource, HoldoutOptions
+from vg2gt.data.sources.index import SceneIndex, make_index
+from vg2gt.data.sources.parsing import errors_name, named_file, to_world
 from vg2gt.data.sources.scene_folders import scene_folders
 from vg2gt.geometry.cameras import resize_intrinsics
 from vg2gt.io import ColmapImage, ColmapModel, colmap_intrinsics, colmap_pose, read_colmap
-from vg2gt.io.image_files import Size, image_size, typical_size
+from vg2gt.io.image_files import Size, image_size
 
 _MODELS = ("sparse/0", "sparse")
 _FILES = ("cameras.bin", "cameras.txt")
@@ -38,17 +39,11 @@ class COLMAP(FileSource):
             ``images_4``, and the intrinsics are resized with them.
         depth: ``points``: depth at the model's points, in the views that saw them and in at least three views; null:
             none.
-        scenes: names of the scenes to use, or a text file of them; None: all.
-        holdout: hold out every this many-th frame as an evaluation target; None: none.
-        every: use every this many-th frame only.
-        index_cache: see ``FileSource``.
-
-    Raises:
-        FileNotFoundError: if a root does not exist.
-        DataError: if a folder holds no model.
+        shared: see ``FileSource``.
     """
 
     layout = "a COLMAP model in sparse/0 or sparse and its undistorted images/, there or up to two folders deeper"
+    index_options = ("images", "has_depth")
     sparse_depth = True
     is_metric = False
 
@@ -57,30 +52,22 @@ class COLMAP(FileSource):
         root: str | Sequence[str] | None,
         images: str = "images",
         depth: str | None = None,
-        scenes: Sequence[str] | str | None = None,
-        holdout: int | None = None,
-        every: int = 1,
-        index_cache: str | None = None,
+        **shared: Unpack[HoldoutOptions],
     ) -> None:
         if depth not in (None, "points"):
             raise ValueError(f"depth must be points (at the model's points) or null (none), got {depth!r}")
         self.images = images
         self.has_depth = depth is not None
         self._points: dict[str, _Points] = {}
-        super().__init__(root, scenes, holdout, every, index_cache)
+        super().__init__(root, **shared)
 
     def find(self, root: Path) -> Mapping[str, Path]:
         """The folder itself, or scenes one or two levels below it."""
         return scene_folders(root, lambda folder: model_folder_of(folder) is not None, by_path=True)
 
-    def options(self) -> Mapping[str, object]:
-        """The image folder, and whether frames need points."""
-        return {"images": self.images, "depth": self.has_depth}
-
-    def state(self, scene: str, folder: Path) -> str:
-        """Also that of the model's folder."""
-        model = model_folder_of(folder)
-        return " ".join(folder_state(place) for place in (folder, *([model] if model else [])))
+    def watched(self, scene: str, folder: Path) -> Sequence[Path | None]:
+        """Also the model's folder."""
+        return folder, model_folder_of(folder)
 
     def index(self, scene: str, folder: Path) -> SceneIndex:
         """Reads the model and the sizes of its images."""
@@ -94,21 +81,13 @@ class COLMAP(FileSource):
         if not color:
             raise DataError(f"scene {scene}: none of the model's {len(records)} images is in {folder / self.images}")
         sizes = {i: image_size(path, scene) for i, path in color.items()}
-        size = typical_size(sizes.values())
+        poses = {i: to_world(colmap_pose(record)) for i, record in enumerate(records)}
+        intrinsics = {i: image_intrinsics(model, records[i], sizes[i], path) for i, path in color.items()}
         depth = None
         if self.has_depth:
             points = self._scene_points(scene, folder)
             depth = {i: model_folder for i in color if len(points.depth(i))}
-        return make_index(
-            name=scene,
-            folder=folder,
-            color=color,
-            depth=depth,
-            camera_to_world={i: _camera_to_world(record) for i, record in enumerate(records)},
-            intrinsics={i: image_intrinsics(model, records[i], sizes[i], path) for i, path in color.items()},
-            size=size,
-            color_size=size if len(set(sizes.values())) == 1 else None,
-        )
+        return make_index(scene, folder, color, depth, poses, intrinsics, color_size=sizes)
 
     def read_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
         """Depth of the points a view saw, at the pixels where it saw them; the nearest wins a pixel."""
@@ -184,11 +163,6 @@ def refuse_distorted(model: ColmapModel, where: str) -> None:
             f"the cameras in {where} are {', '.join(distorted)}; only undistorted ones (PINHOLE, SIMPLE_PINHOLE) are "
             "read. Undistort: colmap image_undistorter --image_path IMAGES --input_path MODEL --output_path SCENE"
         )
-
-
-def _camera_to_world(record: ColmapImage) -> NDArray[np.float64]:
-    pose = colmap_pose(record)
-    return inverse(pose) if np.isfinite(pose).all() else pose
 
 
 def image_intrinsics(model: ColmapModel, record: ColmapImage, size: Size, path: Path) -> NDArray[np.float64]:

@@ -6,19 +6,27 @@ Files are in millimetres; everything read is in metres.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import Unpack
 
 from vg2gt.data.base import DataError
-from vg2gt.data.sources.files import FileSource
-from vg2gt.data.sources.index import SceneIndex, folder_state, make_index
-from vg2gt.data.sources.parsing import check_intrinsics, inverse, numbered, read_text_lines, rigid
+from vg2gt.data.sources.files import FileSource, HoldoutOptions
+from vg2gt.data.sources.index import SceneIndex, check_found, first_size, make_index
+from vg2gt.data.sources.parsing import (
+    check_intrinsics,
+    existing_depth_root,
+    expanded,
+    numbered,
+    read_text_lines,
+    to_world,
+)
 from vg2gt.data.sources.scan_depth import VERSION, ScanDepth
 from vg2gt.data.sources.scene_folders import scene_folders
-from vg2gt.io.image_files import Size, image_size, read_depth
+from vg2gt.io.image_files import Size, read_depth
 from vg2gt.io.pfm import read_pfm
 
 EVALUATION_SCANS = (24, 37, 40, 55, 63, 65, 69, 83, 97, 105, 106, 110, 114, 118, 122)
@@ -47,33 +55,24 @@ class DTUTraining(FileSource):
         root: the folder of ``Rectified``, ``Cameras`` and ``Depths``.
         light: which of the seven lights, 0 to 6.
         keep_evaluation_scans: also offer the scans of ``EVALUATION_SCANS``, which are left out otherwise.
-        scenes: names such as ``scan1``, or a text file of them; None: all.
-        holdout: hold out every this many-th frame as an evaluation target; None: none.
-        every: use every this many-th frame only.
-        index_cache: see ``FileSource``.
-
-    Raises:
-        FileNotFoundError: if a root does not exist.
-        DataError: if there is no scan.
+        shared: see ``FileSource``; a scene is called ``scan1``, ``scan2``, ...
     """
 
     layout = "MVSNet's DTU training set: Rectified/scanN_train, Cameras and Depths_raw or Depths"
+    index_options = ("light",)
 
     def __init__(
         self,
         root: str | Sequence[str] | None,
         light: int = 3,
         keep_evaluation_scans: bool = False,
-        scenes: Sequence[str] | str | None = None,
-        holdout: int | None = None,
-        every: int = 1,
-        index_cache: str | None = None,
+        **shared: Unpack[HoldoutOptions],
     ) -> None:
         if light not in range(7):
             raise ValueError(f"light must be 0 to 6, got {light}")
         self.light = light
         self.keep_evaluation_scans = keep_evaluation_scans
-        super().__init__(root, scenes, holdout, every, index_cache)
+        super().__init__(root, **shared)
 
     def find(self, root: Path) -> Mapping[str, Path]:
         """Folders ``Rectified/scanN_train`` in the order of N."""
@@ -85,15 +84,10 @@ class DTUTraining(FileSource):
         kept = [n for n in sorted(found) if self.keep_evaluation_scans or n not in EVALUATION_SCANS]
         return {f"scan{number}": found[number] for number in kept}
 
-    def options(self) -> Mapping[str, object]:
-        """The light."""
-        return {"light": self.light}
-
-    def state(self, scene: str, folder: Path) -> str:
-        """Also that of the depth and the cameras."""
+    def watched(self, scene: str, folder: Path) -> Sequence[Path | None]:
+        """Also the depth and the cameras."""
         root = folder.parents[1]
-        places = (folder, root / "Cameras", *_training_depth(root, scene))
-        return " ".join(folder_state(place) for place in places if place.exists())
+        return folder, root / "Cameras", *_training_depth(root, scene)
 
     def index(self, scene: str, folder: Path) -> SceneIndex:
         """Lists the images of one light and reads their cameras."""
@@ -107,23 +101,14 @@ class DTUTraining(FileSource):
             match = re.fullmatch(r"rect_(\d{1,9})_\d_r5000\.png", path.name)
             if match:
                 color[int(match[1]) - 1] = path
-        if not color:
-            raise DataError(f"scene {scene} has no images rect_*_{self.light}_r5000.png in {folder}")
-        size = image_size(next(iter(color.values())), scene)
+        check_found(scene, folder, {f"images rect_*_{self.light}_r5000.png": color})
+        depth = numbered(depth_folder, scene, suffixes=(".pfm",))
+        size = first_size(color, scene)
         reduced = (root / "Cameras" / "train").is_dir()
-        files = numbered(root / "Cameras" / ("train" if reduced else "."), scene, "*_cam.txt", (".txt",))
-        cameras = {number: read_camera(path, scene) for number, path in files.items() if number in color}
+        poses, intrinsics = _read_cameras(root / "Cameras" / ("train" if reduced else "."), scene, color)
         bring = _from_quarter if reduced else _from_full
-        return make_index(
-            name=scene,
-            folder=folder,
-            color=color,
-            depth=numbered(depth_folder, scene, suffixes=(".pfm",)),
-            camera_to_world={number: pose for number, (pose, _) in cameras.items()},
-            intrinsics={number: bring(matrix, size) for number, (_, matrix) in cameras.items()},
-            size=size,
-            color_size=size,
-        )
+        intrinsics = {number: bring(matrix, size) for number, matrix in intrinsics.items()}
+        return make_index(scene, folder, color, depth, poses, intrinsics)
 
     def read_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
         """Decodes masked depth and registers it with the image."""
@@ -142,17 +127,11 @@ class DTU(FileSource):
             DTU) and kept in ``depth_cache``; null: none.
         depth_root: the folder of that depth.
         depth_cache: see ``ScanDepth``.
-        scenes: names of scans, or a text file of them; None: all.
-        holdout: hold out every this many-th frame as an evaluation target; None: none.
-        every: use every this many-th frame only.
-        index_cache: see ``FileSource``.
-
-    Raises:
-        FileNotFoundError: if a root does not exist.
-        DataError: if there is no scan.
+        shared: see ``FileSource``.
     """
 
     layout = "scans with images/ and cams/NNNNNNNN_cam.txt, there or one folder deeper"
+    index_options = ("depth", "depth_root")
 
     def __init__(
         self,
@@ -160,10 +139,7 @@ class DTU(FileSource):
         depth: str | None = None,
         depth_root: str | None = None,
         depth_cache: str | None = None,
-        scenes: Sequence[str] | str | None = None,
-        holdout: int | None = None,
-        every: int = 1,
-        index_cache: str | None = None,
+        **shared: Unpack[HoldoutOptions],
     ) -> None:
         if depth not in (None, "pfm", "scan"):
             raise ValueError(f"depth must be pfm, scan or null (none), got {depth!r}")
@@ -171,11 +147,9 @@ class DTU(FileSource):
             raise ValueError(f"depth={depth} needs depth_root, the folder of the {depth} files")
         self.depth = depth
         self.has_depth = depth is not None
-        self.depth_root = Path(depth_root).expanduser() if depth_root else None
-        if self.depth_root is not None and not self.depth_root.is_dir():
-            raise FileNotFoundError(f"the depth folder {self.depth_root} (seen from {Path.cwd()}) does not exist")
-        self._scan_depth = ScanDepth(Path(depth_cache).expanduser() if depth_cache else None)
-        super().__init__(root, scenes, holdout, every, index_cache)
+        self.depth_root = existing_depth_root(depth_root)
+        self._scan_depth = ScanDepth(expanded(depth_cache))
+        super().__init__(root, **shared)
 
     def find(self, root: Path) -> Mapping[str, Path]:
         """The folder itself, or scans one level below it."""
@@ -186,28 +160,26 @@ class DTU(FileSource):
         number = _scan_number(scene)
         return scene if number is None else f"scan{number}"
 
-    def options(self) -> Mapping[str, object]:
-        """Where depth comes from."""
-        return {"depth": self.depth, "depth_root": str(self.depth_root)}
+    def watched(self, scene: str, folder: Path) -> Sequence[Path | None]:
+        """Also the depth."""
+        return folder, self._depth_place(scene) if self.depth else None
 
     def state(self, scene: str, folder: Path) -> str:
-        """Also that of the depth."""
-        places = [folder, *([self._depth_place(scene)] if self.depth else [])]
-        return " ".join([f"scan depth {VERSION}", *(folder_state(place) for place in places if place.exists())])
+        """Also the version of the rendered depth."""
+        return f"scan depth {VERSION} {super().state(scene, folder)}"
 
     def index(self, scene: str, folder: Path) -> SceneIndex:
         """Lists the images and reads their cameras."""
         color = numbered(folder / "images", scene)
-        if not color:
-            raise DataError(f"scene {scene} has no images in {folder / 'images'}")
-        size = image_size(next(iter(color.values())), scene)
-        files = numbered(folder / "cams", scene, "*_cam.txt", (".txt",))
-        cameras = {number: read_camera(path, scene) for number, path in files.items()}
-        for number, (_, matrix) in cameras.items():
+        check_found(scene, folder / "images", {"images": color})
+        size = first_size(color, scene)
+        poses, intrinsics = _read_cameras(folder / "cams", scene)
+        for number, matrix in intrinsics.items():
             if not (abs(matrix[0, 2] / size[1] - 0.5) < 0.25 and abs(matrix[1, 2] / size[0] - 0.5) < 0.25):
                 raise DataError(
-                    f"{files[number]} of scene {scene} has its principal point at ({matrix[0, 2]:.6g}, "
-                    f"{matrix[1, 2]:.6g}), but the images are {size[1]}x{size[0]}: the camera is one of another size"
+                    f"camera {number} in {folder / 'cams'} of scene {scene} has its principal point at "
+                    f"({matrix[0, 2]:.6g}, {matrix[1, 2]:.6g}), but the images are {size[1]}x{size[0]}: the camera is "
+                    "one of another size"
                 )
         depth = None
         if self.depth is not None:
@@ -216,16 +188,7 @@ class DTU(FileSource):
                 raise DataError(f"scene {scene} has no depth: {place} does not exist; set data.depth=null, or add it")
             scan = self.depth == "scan"
             depth = dict.fromkeys(color, place) if scan else numbered(place, scene, suffixes=(".pfm",))
-        return make_index(
-            name=scene,
-            folder=folder,
-            color=color,
-            depth=depth,
-            camera_to_world={number: pose for number, (pose, _) in cameras.items()},
-            intrinsics={number: matrix for number, (_, matrix) in cameras.items()},
-            size=size,
-            color_size=size,
-        )
+        return make_index(scene, folder, color, depth, poses, intrinsics)
 
     def read_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
         """Decodes masked depth, or renders the scan."""
@@ -262,10 +225,17 @@ def read_camera(path: Path, scene: str) -> tuple[NDArray[np.float64], NDArray[np
     except (ValueError, IndexError) as error:
         raise DataError(f"{path} of scene {scene} is not a camera of MVSNet: {error}") from error
     check_intrinsics(intrinsics, f"{path} of scene {scene}")
-    if not (np.abs(pose) < 1e30).all():
-        return np.full((4, 4), np.nan), intrinsics
     pose[:3, 3] *= MILLIMETRE
-    return inverse(rigid(pose[None], [0], f"{path} of scene {scene}"))[0], intrinsics
+    return to_world(pose, f"{path} of scene {scene}"), intrinsics
+
+
+def _read_cameras(
+    folder: Path, scene: str, wanted: Container[int] | None = None
+) -> tuple[dict[int, NDArray[np.float64]], dict[int, NDArray[np.float64]]]:
+    """Camera-to-world poses and intrinsics by frame number, of the wanted frames or of all."""
+    files = numbered(folder, scene, "*_cam.txt", (".txt",))
+    cameras = {i: read_camera(path, scene) for i, path in files.items() if wanted is None or i in wanted}
+    return {i: pose for i, (pose, _) in cameras.items()}, {i: matrix for i, (_, matrix) in cameras.items()}
 
 
 def _from_quarter(intrinsics: NDArray[np.float64], size: Size) -> NDArray[np.float64]:

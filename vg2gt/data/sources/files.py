@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import fnmatch
 import hashlib
+import inspect
 import json
 import logging
 from abc import abstractmethod
 from collections import Counter, OrderedDict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar, TypedDict
 
 import numpy as np
 import torch
@@ -18,21 +19,38 @@ from numpy.typing import NDArray
 
 from vg2gt.data.base import DataError, Frames, SceneSource
 from vg2gt.data.sources.index import FORMAT, SceneIndex, folder_state, index_to_bytes, read_index
+from vg2gt.data.sources.parsing import expanded
 from vg2gt.data.transforms import from_bytes, resize_depth, resize_images, resize_to_cover
 from vg2gt.io.files import write_cached
-from vg2gt.io.image_files import Size, read_color
+from vg2gt.io.image_files import Size, read_color, read_depth
 
 log = logging.getLogger(__name__)
 
 _INDICES_IN_MEMORY = 64
 
 
+class FileOptions(TypedDict, total=False):
+    """Arguments of every ``FileSource``, which a loader with some of its own takes as ``**shared`` and hands on."""
+
+    scenes: Sequence[str] | str | None
+    every: int
+    index_cache: str | None
+
+
+class HoldoutOptions(FileOptions, total=False):
+    """The same with ``holdout``, for loaders that hold nothing out unless told to."""
+
+    holdout: int | None
+
+
 class FileSource(SceneSource):
-    """A dataset on disk. A loader says where scenes are (``find``), what is in one (``index``) and reads a depth file.
+    """A dataset on disk. A loader says where scenes are (``find``), what is in one (``index``) and how depth is stored.
+
+    The arguments, and what they raise, are those of every loader.
 
     Args:
         root: the dataset's folder, or several.
-        scenes: names of the scenes to use, patterns of names (``Scene20/*``), or a text file with one a line, of
+        scenes: names of the scenes to use, patterns of names (``Scene20/*``), or a text file with one per line, of
             which those that are not there are counted and left out; None: all.
         holdout: hold out every this many-th frame as an evaluation target; None: none.
         every: use every this many-th frame only.
@@ -49,9 +67,30 @@ class FileSource(SceneSource):
     """What is looked for in ``root``, for messages."""
     index_version: ClassVar[int] = 1
     """Raise it when ``index`` would give another result for the same files."""
+    index_options: ClassVar[tuple[str, ...]] = ()
+    """Attributes that decide an index, beside the folder; part of the cache's key."""
     sparse_depth: ClassVar[bool] = False
+    depth_scale: float = 1000.0
+    """Stored depth units for one unit of the poses."""
+    invalid: tuple[int, ...] = ()
+    """Stored depth that means none, beside 0."""
     depth_remedy: ClassVar[str] = "correct the depth unit and the values that mean 'invalid'"
     """What to do where a frame has no valid depth, for messages."""
+
+    __signature__: ClassVar[inspect.Signature]
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Names the shared arguments in the signature of a constructor that hands them on: it is the YAML's schema."""
+        super().__init_subclass__(**options)
+        parameters = list(inspect.signature(cls.__init__).parameters.values())[1:]
+        own = [parameter for parameter in parameters if parameter.kind is not parameter.VAR_KEYWORD]
+        if len(own) < len(parameters):
+            shared = list(inspect.signature(FileSource.__init__).parameters.values())[1:]
+            names = {parameter.name for parameter in own}
+            more = [
+                parameter.replace(kind=parameter.KEYWORD_ONLY) for parameter in shared if parameter.name not in names
+            ]
+            cls.__signature__ = inspect.Signature([*own, *more])
 
     def __init__(
         self,
@@ -67,7 +106,7 @@ class FileSource(SceneSource):
             raise ValueError(f"every must be at least 1 (use every this many-th frame), got {every}")
         self.holdout = holdout
         self.every = every
-        self.index_cache = Path(index_cache).expanduser() if index_cache else None
+        self.index_cache = expanded(index_cache)
         self._folders = self._select(self._find_all(_roots(root, self.layout)), scenes)
         self._indices: OrderedDict[str, SceneIndex] = OrderedDict()
         self._frame_ids: dict[str, NDArray[np.int64]] = {}
@@ -96,6 +135,8 @@ class FileSource(SceneSource):
     def read_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
         """Decodes the depth ``[h, w]`` of a row of the index: z-depth in the dataset's unit, 0 = invalid.
 
+        By default from an image of whole numbers, in units of ``depth_scale`` and with ``invalid`` ones.
+
         Args:
             index: the scene.
             row: which frame.
@@ -104,15 +145,23 @@ class FileSource(SceneSource):
         Raises:
             DataError: if it is missing, damaged, or of another size.
         """
-        raise NotImplementedError(f"{type(self).__name__} has depth files but no read_depth")
+        stored = read_depth(index.depth[row], index.name, size)
+        depth = stored / self.depth_scale
+        if self.invalid:
+            depth = np.where(np.isin(stored, self.invalid), 0, depth)
+        return depth.astype(np.float32)
+
+    def watched(self, scene: str, folder: Path) -> Sequence[Path | None]:
+        """Folders and files that decide a scene's index, as far as they exist; by default the scene's folder."""
+        return (folder,)
 
     def state(self, scene: str, folder: Path) -> str:
-        """Changes when files of a scene do, so that its cached index is made again; for scenes outside one folder."""
-        return folder_state(folder)
+        """Changes when files of a scene do (``watched``), so that its cached index is made again."""
+        return " ".join(folder_state(place) for place in self.watched(scene, folder) if place and place.exists())
 
     def options(self) -> Mapping[str, object]:
-        """Arguments that decide an index, beside the folder; part of the cache's key."""
-        return {}
+        """What decides an index, beside the folder; part of the cache's key. By default the ``index_options``."""
+        return {name: getattr(self, name) for name in self.index_options}
 
     @property
     def scenes(self) -> Sequence[str]:
@@ -136,14 +185,7 @@ class FileSource(SceneSource):
             DataError: naming the file and the scene, if one is missing or damaged, or depth is valid nowhere.
         """
         index = self.scene_index(scene)
-        parts = [self._load_frame(index, index.row(frame)) for frame in frame_ids]
-        return Frames(
-            images=torch.cat([part.images for part in parts]),
-            depth=torch.cat([part.depth for part in parts]),
-            world_to_camera=torch.cat([part.world_to_camera for part in parts]),
-            intrinsics=torch.cat([part.intrinsics for part in parts]),
-            sparse_depth=self.sparse_depth,
-        )
+        return Frames.concatenate([self._load_frame(index, index.row(frame)) for frame in frame_ids])
 
     def identity(self, scene: str) -> str:
         """Also the version of the loader and the state of the scene's files; not which frames are chosen."""
@@ -220,7 +262,7 @@ class FileSource(SceneSource):
         if self.index_cache is None:
             return self.index(scene, folder)
         version = (FORMAT, self.index_version)
-        key = json.dumps([type(self).__qualname__, version, str(folder.resolve()), scene, self.options()])
+        key = json.dumps([type(self).__qualname__, version, str(folder.resolve()), scene, self.options()], default=str)
         digest = hashlib.sha256(key.encode()).hexdigest()[:24]
         path = self.index_cache / "index" / f"{digest}.npz"
         state = self.state(scene, folder)
@@ -236,7 +278,7 @@ class FileSource(SceneSource):
 
 
 def read_split(path: str) -> list[str]:
-    """Reads scene names from a text file, one a line; ``#`` begins a comment.
+    """Reads scene names from a text file, one per line; ``#`` begins a comment.
 
     Raises:
         FileNotFoundError: if there is no such file.

@@ -13,7 +13,7 @@ from vg2gt.data.sources.files import FileSource
 from vg2gt.data.sources.index import SceneIndex, make_index
 from vg2gt.data.sources.parsing import IMAGE_SUFFIXES, pinhole
 from vg2gt.data.sources.scene_folders import scene_folders
-from vg2gt.io.image_files import Size, photo_size, read_photo, typical_size
+from vg2gt.io.image_files import Size, image_size, read_color
 
 FOCAL = 1.2
 """Placeholder focal length, in the larger side of the image: the usual first guess of structure from motion."""
@@ -30,13 +30,9 @@ class ImageFolder(FileSource):
 
     Args:
         root: a folder of images, a folder of such folders (one or two levels deep), or a list.
-        scenes: names of the folders to use, or a text file of them; None: all.
+        scenes: see ``FileSource``.
         every: use every this many-th image only.
         index_cache: see ``FileSource``.
-
-    Raises:
-        FileNotFoundError: if a root does not exist.
-        DataError: if a folder holds no images.
     """
 
     layout = f"images ({', '.join(suffix[1:] for suffix in IMAGE_SUFFIXES)}), there or up to two folders deeper"
@@ -60,22 +56,13 @@ class ImageFolder(FileSource):
     def index(self, scene: str, folder: Path) -> SceneIndex:
         """Lists the images and reads their sizes."""
         color = dict(enumerate(_images(folder)))
-        sizes = {i: photo_size(path, scene) for i, path in color.items()}
-        size = typical_size(sizes.values())
-        return make_index(
-            name=scene,
-            folder=folder,
-            color=color,
-            depth=None,
-            camera_to_world=dict.fromkeys(color, np.eye(4)),
-            intrinsics={i: _guess(size) for i, size in sizes.items()},
-            size=size,
-            color_size=size if len(set(sizes.values())) == 1 else None,
-        )
+        sizes = {i: image_size(path, scene, upright=True) for i, path in color.items()}
+        intrinsics = {i: _guess(size) for i, size in sizes.items()}
+        return make_index(scene, folder, color, None, dict.fromkeys(color, np.eye(4)), intrinsics, color_size=sizes)
 
     def read_color(self, index: SceneIndex, row: int) -> NDArray[np.uint8]:
         """Decodes an image and turns it upright."""
-        return read_photo(index.color[row], index.name, index.color_size)
+        return read_color(index.color[row], index.name, index.color_size, upright=True)
 
 
 def _guess(size: Size) -> NDArray[np.float64]:

@@ -8,7 +8,7 @@ import json
 import logging
 import os
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Sized
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from vg2gt.data.base import DataError
 from vg2gt.data.sources.parsing import check_intrinsics, inverse, rigid
-from vg2gt.io.image_files import Size
+from vg2gt.io.image_files import Size, image_size, typical_size
 from vg2gt.io.npz import load_npz
 
 log = logging.getLogger(__name__)
@@ -72,6 +72,22 @@ class SceneIndex:
         return place
 
 
+def first_size(files: Mapping[int, Path], scene: str) -> Size:
+    """``(height, width)`` of the first of some images."""
+    return image_size(next(iter(files.values())), scene)
+
+
+def check_found(scene: str, folder: Path, found: Mapping[str, Sized]) -> None:
+    """Refuses a scene that lacks a kind of files altogether.
+
+    Raises:
+        DataError: naming the first of the kinds (the keys of ``found``) that has none.
+    """
+    for kind, files in found.items():
+        if not files:
+            raise DataError(f"scene {scene} has no {kind} in {folder}")
+
+
 def make_index(
     name: str,
     folder: Path,
@@ -79,8 +95,8 @@ def make_index(
     depth: Mapping[int, Path] | None,
     camera_to_world: Mapping[int, NDArray[np.float64]],
     intrinsics: NDArray[np.float64] | Mapping[int, NDArray[np.float64]],
-    size: Size,
-    color_size: Size | None,
+    color_size: Size | Mapping[int, Size] | None = None,
+    size: Size | None = None,
     depth_size: Size | None = None,
 ) -> SceneIndex:
     """Joins what a layout holds of each frame; frames that lack something are left out and counted.
@@ -92,13 +108,19 @@ def make_index(
         depth: depth files by frame number; None where the layout has none.
         camera_to_world: 4x4 OpenCV poses by frame number; a pose that is not finite drops its frame.
         intrinsics: one ``[3, 3]`` for all frames, or by frame number; of which size is said at ``SceneIndex``.
-        size: ``(height, width)`` of decoded frames.
-        color_size: of the colour files; None: each has its own.
+        color_size: ``(height, width)`` of the colour files, or of each by frame number; None: the first one's.
+        size: of decoded frames; None: that of the colour files, or the median where they differ.
         depth_size: of the depth files; None: each has its colour image's.
 
     Raises:
         DataError: if no frame is left, a pose is not rigid, or intrinsics are not usable.
     """
+    if isinstance(color_size, Mapping):
+        size = size or typical_size(color_size.values())
+        color_size = size if set(color_size.values()) == {size} else None
+    else:
+        color_size = color_size or first_size(color, name)
+        size = size or color_size
     where = f"{folder} (scene {name})"
     _check_registered(where, color_size, depth_size)
     dropped: Counter[str] = Counter()
@@ -153,19 +175,14 @@ def _check_registered(where: str, color: Size | None, depth: Size | None) -> Non
 
 
 def folder_state(folder: Path) -> str:
-    """Changes when files are added to or removed from a scene, or one directly in its folder is edited."""
+    """Changes when files are added to or removed from a folder, or one directly in it is edited; or when a file is."""
     if not folder.is_dir():
-        return str(folder.stat().st_mtime_ns)
+        stat = folder.stat()
+        return json.dumps([str(folder), stat.st_mtime_ns, stat.st_size])
     entries = [(path, path.stat()) for path in sorted(folder.iterdir())]
     inner = [(path, path.stat()) for top, _ in entries if top.is_dir() for path in _folders_in(top)]
     text = json.dumps([[str(path), stat.st_mtime_ns, stat.st_size] for path, stat in entries + inner])
     return hashlib.sha256(text.encode()).hexdigest()
-
-
-def files_state(paths: Sequence[Path]) -> str:
-    """Changes when one of some files, which need not exist, is edited, added or removed."""
-    stats = [(str(path), path.stat()) for path in paths if path.is_file()]
-    return json.dumps([[name, stat.st_mtime_ns, stat.st_size] for name, stat in stats])
 
 
 def _folders_in(folder: Path) -> list[Path]:

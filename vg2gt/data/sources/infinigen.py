@@ -8,13 +8,15 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import Unpack
 
 from vg2gt.data.base import DataError
-from vg2gt.data.sources.files import FileSource
-from vg2gt.data.sources.index import SceneIndex, make_index
+from vg2gt.data.sources.files import FileSource, HoldoutOptions
+from vg2gt.data.sources.index import SceneIndex, check_found, make_index
+from vg2gt.data.sources.parsing import CORNER_TO_CENTER, positive
 from vg2gt.data.sources.scene_folders import scene_folders
 from vg2gt.io.arrays import load_matrices, load_npy, npy_size
-from vg2gt.io.image_files import Size, image_size
+from vg2gt.io.image_files import Size
 
 _RIG_STEP = 100_000
 _NAME = re.compile(r"_(\d+)_(\d+)_(\d+)_(\d+)$")
@@ -41,14 +43,7 @@ class Infinigen(FileSource):
             see ``place``), or a list of such.
         max_depth: farther points (metres), and the sky, which is infinite or huge, have no depth. A frame that shows
             nothing nearer is one without valid depth: training replaces it, evaluation refuses it.
-        scenes: names of the scenes to use (paths below ``root``), or a text file with one a line; None: all.
-        holdout: hold out every this many-th frame as an evaluation target; None: none.
-        every: use every this many-th frame only.
-        index_cache: see ``FileSource``.
-
-    Raises:
-        FileNotFoundError: if a root does not exist.
-        DataError: if a root holds no scene.
+        shared: see ``FileSource``.
     """
 
     layout = "SCENE/frames/{Image,Depth,camview}/camera_0, there or up to two folders deeper"
@@ -58,15 +53,10 @@ class Infinigen(FileSource):
         self,
         root: str | Sequence[str] | None,
         max_depth: float = 30.0,
-        scenes: Sequence[str] | str | None = None,
-        holdout: int | None = None,
-        every: int = 1,
-        index_cache: str | None = None,
+        **shared: Unpack[HoldoutOptions],
     ) -> None:
-        if not max_depth > 0:
-            raise ValueError(f"max_depth must be positive (metres), got {max_depth}")
-        self.max_depth = float(max_depth)
-        super().__init__(root, scenes, holdout, every, index_cache)
+        self.max_depth = positive("max_depth", max_depth, "metres")
+        super().__init__(root, **shared)
 
     def find(self, root: Path) -> Mapping[str, Path]:
         """Folders with ``frames/Image/camera_0``, by their path."""
@@ -87,21 +77,16 @@ class Infinigen(FileSource):
             _views(folder / kind / "camera_0", kind, suffix, scene)
             for kind, suffix in (("Image", ".png"), ("Depth", ".npy"), ("camview", ".npz"))
         )
-        if not color or not depth:
-            raise DataError(f"scene {scene} has no {'Image' if not color else 'Depth'} files in {folder}")
+        check_found(scene, folder, {"Image files": color, "Depth files": depth})
         ids = _frame_ids({*color, *depth, *cameras})
         matrices = {ids[view]: load_matrices(path, scene, {"K": (3, 3), "T": (4, 4)}) for view, path in cameras.items()}
-        centre = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
-        color_size = image_size(next(iter(color.values())), scene)
         return make_index(
-            name=scene,
-            folder=folder,
+            scene,
+            folder,
             color={ids[view]: path for view, path in color.items()},
             depth={ids[view]: path for view, path in depth.items()},
             camera_to_world={frame: matrix["T"] for frame, matrix in matrices.items()},
-            intrinsics={frame: matrix["K"] - centre for frame, matrix in matrices.items()},
-            size=color_size,
-            color_size=color_size,
+            intrinsics={frame: matrix["K"] - CORNER_TO_CENTER for frame, matrix in matrices.items()},
             depth_size=npy_size(next(iter(depth.values())), scene),
         )
 

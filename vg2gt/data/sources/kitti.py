@@ -7,17 +7,15 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import Unpack
 
 from vg2gt.data.base import DataError
-from vg2gt.data.sources.files import FileSource
-from vg2gt.data.sources.index import SceneIndex, folder_state, make_index
-from vg2gt.data.sources.parsing import inverse, numbered, read_text_lines, rigid
-from vg2gt.io.image_files import Size, image_size, read_depth
+from vg2gt.data.sources.files import FileSource, HoldoutOptions
+from vg2gt.data.sources.index import SceneIndex, make_index
+from vg2gt.data.sources.parsing import existing_depth_root, inverse, numbered, read_numbers, read_text_lines, rigid
 
 EARTH_RADIUS = 6378137.0
 """Metres, at the equator, as KITTI's own tools have it."""
-DEPTH_SCALE = 256.0
-"""Stored depth units a metre."""
 
 _CALIBRATION = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt", "calib_imu_to_velo.txt")
 _SPLITS = ("train", "val")
@@ -39,18 +37,13 @@ class KITTI(FileSource):
         depth_root: the annotated depth, the folder of ``train`` and ``val``; None: the same as ``root``.
         split: the benchmark's drives for ``train`` or for ``val``; None: both.
         camera: 2 for the left colour camera, 3 for the right one.
-        scenes: names of drives, such as ``2011_09_26_drive_0001_sync``, or a text file of them; None: all of the split.
-        holdout: hold out every this many-th frame as an evaluation target; None: none.
-        every: use every this many-th frame only (the cameras take ten a second).
-        index_cache: see ``FileSource``.
-
-    Raises:
-        FileNotFoundError: if a root does not exist.
-        DataError: if no drive has both images and depth.
+        shared: see ``FileSource``; the cameras take ten frames per second.
     """
 
     layout = "KITTI raw: DATE/DRIVE_sync/image_02/data, with depth for it in {train,val}/DRIVE_sync/proj_depth"
+    index_options = ("camera", "splits", "depth_root")
     sparse_depth = True
+    depth_scale = 256.0
 
     def __init__(
         self,
@@ -58,36 +51,25 @@ class KITTI(FileSource):
         depth_root: str | None = None,
         split: str | None = None,
         camera: int = 2,
-        scenes: Sequence[str] | str | None = None,
-        holdout: int | None = None,
-        every: int = 1,
-        index_cache: str | None = None,
+        **shared: Unpack[HoldoutOptions],
     ) -> None:
         if split not in (None, *_SPLITS):
             raise ValueError(f"split must be train, val or null (both), got {split!r}")
         if camera not in (2, 3):
             raise ValueError(f"camera must be 2 (left) or 3 (right), the colour cameras, got {camera}")
-        self.depth_root = Path(depth_root).expanduser() if depth_root else None
-        if self.depth_root is not None and not self.depth_root.is_dir():
-            raise FileNotFoundError(f"the depth folder {self.depth_root} (seen from {Path.cwd()}) does not exist")
+        self.depth_root = existing_depth_root(depth_root)
         self.splits = (split,) if split else _SPLITS
         self.camera = camera
-        super().__init__(root, scenes, holdout, every, index_cache)
+        super().__init__(root, **shared)
 
     def find(self, root: Path) -> Mapping[str, Path]:
         """Drives with images of the camera and a depth folder."""
         drives = {path.name: path for path in sorted(root.glob("*/*_sync")) if (path / self._images).is_dir()}
         return {name: folder for name, folder in drives.items() if self._depth_folder(folder) is not None}
 
-    def options(self) -> Mapping[str, object]:
-        """The camera, and where depth is taken from."""
-        return {"camera": self.camera, "splits": self.splits, "depth_root": str(self.depth_root)}
-
-    def state(self, scene: str, folder: Path) -> str:
-        """Also that of the depth folder and of the calibration."""
-        depth = self._depth_folder(folder)
-        places = [folder, *([depth] if depth else []), *(folder.parent / name for name in _CALIBRATION)]
-        return " ".join(folder_state(place) for place in places if place.exists())
+    def watched(self, scene: str, folder: Path) -> Sequence[Path | None]:
+        """Also the depth folder and the calibration."""
+        return folder, self._depth_folder(folder), *(folder.parent / name for name in _CALIBRATION)
 
     def index(self, scene: str, folder: Path) -> SceneIndex:
         """Lists a drive's files and computes its poses."""
@@ -100,23 +82,10 @@ class KITTI(FileSource):
         if not color:
             raise DataError(f"scene {scene} has depth of frames {numbers}, but no image of them in {folder}")
         intrinsics, camera_from_imu = read_calibration(folder.parent, scene, self.camera)
-        size = image_size(next(iter(color.values())), scene)
         packets = numbered(folder / "oxts" / "data", scene, suffixes=(".txt",))
         imu = imu_to_world({number: _read_packet(path, scene) for number, path in packets.items()})
-        return make_index(
-            name=scene,
-            folder=folder,
-            color=color,
-            depth=depth,
-            camera_to_world={i: pose @ inverse(camera_from_imu) for i, pose in imu.items() if i in numbers},
-            intrinsics=intrinsics,
-            size=size,
-            color_size=size,
-        )
-
-    def read_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
-        """Decodes annotated depth."""
-        return (read_depth(index.depth[row], index.name, size) / DEPTH_SCALE).astype(np.float32)
+        poses = {i: pose @ inverse(camera_from_imu) for i, pose in imu.items() if i in numbers}
+        return make_index(scene, folder, color, depth, poses, intrinsics)
 
     @property
     def _images(self) -> str:
@@ -187,14 +156,10 @@ def _about(axis: str, angles: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _read_packet(path: Path, scene: str) -> NDArray[np.float64]:
-    words = " ".join(read_text_lines(path, scene)).split()
-    try:
-        packet = np.array([float(word) for word in words[:6]])
-    except ValueError as error:
-        raise DataError(f"{path} of scene {scene} is not an OXTS packet: {error}") from error
+    packet = read_numbers(path, scene)[0]
     if len(packet) < 6:
         raise DataError(f"{path} of scene {scene} is not an OXTS packet: it has {len(packet)} numbers, expected 30")
-    return packet
+    return packet[:6]
 
 
 def _read_fields(path: Path, scene: str) -> dict[str, str]:

@@ -7,15 +7,16 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import Unpack
 
 from vg2gt.data.base import DataError
-from vg2gt.data.sources.files import FileSource
+from vg2gt.data.sources.files import FileSource, HoldoutOptions
 from vg2gt.data.sources.index import SceneIndex, make_index
-from vg2gt.data.sources.parsing import check_intrinsics, errors_name, inverse, named_file
+from vg2gt.data.sources.parsing import check_intrinsics, errors_name, named_file, positive, to_world
 from vg2gt.data.sources.scene_folders import scene_folders
 from vg2gt.data.sources.undistortion import Undistortion
 from vg2gt.io import Lens, TransformsFrame, read_transforms
-from vg2gt.io.image_files import Size, image_size, read_color, read_depth, typical_size
+from vg2gt.io.image_files import Size, image_size
 
 _FILE = "transforms.json"
 _SCENES_IN_MEMORY = 64
@@ -33,17 +34,11 @@ class Nerfstudio(FileSource):
         root: a scene, a folder of scenes (one or two levels deep), or a list of such folders.
         depth: read the depth images that frames name as ``depth_file_path``; frames without are left out.
         depth_scale: stored depth units for one unit of the poses: 1000 for millimetres and metres.
-        scenes: names of the scenes to use, or a text file of them; None: all.
-        holdout: hold out every this many-th frame as an evaluation target; None: none.
-        every: use every this many-th frame only.
-        index_cache: see ``FileSource``.
-
-    Raises:
-        FileNotFoundError: if a root does not exist.
-        DataError: if a folder holds no such file.
+        shared: see ``FileSource``.
     """
 
     layout = f"{_FILE}, there or up to two folders deeper"
+    index_options = ("has_depth",)
     is_metric = False
 
     def __init__(
@@ -51,26 +46,17 @@ class Nerfstudio(FileSource):
         root: str | Sequence[str] | None,
         depth: bool = False,
         depth_scale: float = 1000.0,
-        scenes: Sequence[str] | str | None = None,
-        holdout: int | None = None,
-        every: int = 1,
-        index_cache: str | None = None,
+        **shared: Unpack[HoldoutOptions],
     ) -> None:
-        if not depth_scale > 0:
-            raise ValueError(f"depth_scale must be positive (stored units for one of the poses), got {depth_scale}")
         self.has_depth = depth
-        self.depth_scale = float(depth_scale)
+        self.depth_scale = positive("depth_scale", depth_scale, "stored units for one of the poses")
         self._frames: dict[str, list[TransformsFrame]] = {}
         self._last: tuple[Lens, Undistortion] | None = None
-        super().__init__(root, scenes, holdout, every, index_cache)
+        super().__init__(root, **shared)
 
     def find(self, root: Path) -> Mapping[str, Path]:
         """The folder itself, or scenes one or two levels below it."""
         return scene_folders(root, lambda folder: (folder / _FILE).is_file(), by_path=True)
-
-    def options(self) -> Mapping[str, object]:
-        """Whether frames need depth."""
-        return {"depth": self.has_depth}
 
     def index(self, scene: str, folder: Path) -> SceneIndex:
         """Reads the file and the sizes of its images."""
@@ -84,28 +70,20 @@ class Nerfstudio(FileSource):
         if not color:
             raise DataError(f"scene {scene}: none of the {len(records)} images of {folder / _FILE} exists")
         sizes = {i: image_size(path, scene) for i, path in color.items()}
-        size = typical_size(sizes.values())
-        return make_index(
-            name=scene,
-            folder=folder,
-            color=color,
-            depth=depth if self.has_depth else None,
-            camera_to_world={i: _camera_to_world(record) for i, record in enumerate(records)},
-            intrinsics={i: self._intrinsics(scene, records[i], sizes[i], path) for i, path in color.items()},
-            size=size,
-            color_size=size if len(set(sizes.values())) == 1 else None,
-        )
+        poses = {i: to_world(np.asarray(record.world_to_camera, np.float64)) for i, record in enumerate(records)}
+        intrinsics = {i: self._intrinsics(scene, records[i], sizes[i], path) for i, path in color.items()}
+        return make_index(scene, folder, color, depth if self.has_depth else None, poses, intrinsics, color_size=sizes)
 
     def read_color(self, index: SceneIndex, row: int) -> NDArray[np.uint8]:
         """Decodes a colour image and undistorts it."""
-        pixels = read_color(index.color[row], index.name, index.color_size)
+        pixels = super().read_color(index, row)
         size = (pixels.shape[0], pixels.shape[1])
         undistortion = self._undistortion(index.name, self._record(index, row).lens, size, index.color[row])
         return undistortion.color(pixels) if undistortion else pixels
 
     def read_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
         """Decodes an integer depth image and undistorts it like its colour image."""
-        depth = (read_depth(index.depth[row], index.name, size) / self.depth_scale).astype(np.float32)
+        depth = super().read_depth(index, row, size)
         undistortion = self._undistortion(index.name, self._record(index, row).lens, size, index.color[row])
         return undistortion.depth(depth) if undistortion else depth
 
@@ -149,8 +127,3 @@ class Nerfstudio(FileSource):
 def _image_path(path: Path) -> Path:
     """The file, which some writers name without its suffix."""
     return path if path.is_file() or path.suffix else Path(f"{path}.png")
-
-
-def _camera_to_world(record: TransformsFrame) -> NDArray[np.float64]:
-    pose = np.asarray(record.world_to_camera, np.float64)
-    return inverse(pose) if np.isfinite(pose).all() else pose

@@ -20,6 +20,9 @@ log = logging.getLogger(__name__)
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".tif", ".tiff", ".webp", ".bmp")
 
+CORNER_TO_CENTER = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+"""Subtracted from intrinsics whose principal point counts from the corner of the first pixel, not from its centre."""
+
 _THREADS = 8
 _ROTATION_TOLERANCE = 0.02
 _LARGEST = float(np.finfo(np.float32).max)
@@ -31,11 +34,10 @@ def read_numbers(path: Path, scene: str, skip_lines: int = 0) -> NDArray[np.floa
     Raises:
         DataError: if the file is missing, empty, or not a table of numbers.
     """
+    rows = [line.split("#")[0].split() for line in _read_lines(path, scene)[skip_lines:]]
     try:
-        text = path.read_text(encoding="utf-8").splitlines()[skip_lines:]
-        rows = [line.split("#")[0].split() for line in text]
         table = np.array([[float(word) for word in row] for row in rows if row], dtype=np.float64)
-    except (OSError, ValueError) as error:
+    except ValueError as error:
         raise DataError(f"cannot read {path} of scene {scene}: {error}") from error
     if table.size == 0:
         raise DataError(f"{path} of scene {scene} holds no numbers")
@@ -58,7 +60,7 @@ def read_matrix(path: Path, scene: str, shapes: Sequence[tuple[int, int]]) -> ND
 
 
 def read_poses(files: Mapping[int, Path], scene: str) -> dict[int, NDArray[np.float64]]:
-    """Reads 4x4 matrices, one a file, several files at a time: on a network's disk a file takes milliseconds to open.
+    """Reads 4x4 matrices, one per file, several files at a time: on a network's disk a file takes milliseconds to open.
 
     Raises:
         DataError: as ``read_matrix``.
@@ -80,11 +82,15 @@ def read_text_lines(path: Path, scene: str) -> list[str]:
     Raises:
         DataError: if the file is missing or not text.
     """
+    lines = [line.strip() for line in _read_lines(path, scene)]
+    return [line for line in lines if line and not line.startswith("#")]
+
+
+def _read_lines(path: Path, scene: str) -> list[str]:
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        return path.read_text(encoding="utf-8").splitlines()
     except (OSError, ValueError) as error:
         raise DataError(f"cannot read {path} of scene {scene}: {error}") from error
-    return [line.strip() for line in lines if line.strip() and not line.lstrip().startswith("#")]
 
 
 def named_file(folder: Path, name: str, where: str) -> Path:
@@ -178,6 +184,22 @@ def inverse(poses: NDArray[np.float64]) -> NDArray[np.float64]:
     return out
 
 
+def to_world(world_to_camera: NDArray[np.float64], where: str | None = None, frame: int = 0) -> NDArray[np.float64]:
+    """Inverts a pose ``[4, 4]``; one that is not finite stays so, and drops its frame.
+
+    Args:
+        world_to_camera: the pose.
+        where: the file or folder and the scene: the pose is made exactly rigid first (``rigid``); None: it is rigid.
+        frame: its frame id, for the message.
+
+    Raises:
+        DataError: if it is to be made rigid and is far from it.
+    """
+    if not (np.abs(world_to_camera) < 1e30).all():
+        return np.full((4, 4), np.nan)
+    return inverse(rigid(world_to_camera[None], [frame], where)[0] if where else world_to_camera)
+
+
 def pinhole(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.float64]:
     """Intrinsics ``[3, 3]`` from focal lengths and principal point in pixels (integer pixel centres)."""
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
@@ -193,3 +215,42 @@ def check_intrinsics(intrinsics: NDArray[np.float64], where: str) -> NDArray[np.
     if not ((np.abs(intrinsics) < _LARGEST).all() and (focal > 0).all()):
         raise DataError(f"the intrinsics in {where} have no positive focal lengths: {intrinsics.tolist()}")
     return intrinsics
+
+
+def four_intrinsics(intrinsics: Sequence[float] | None) -> tuple[float, ...] | None:
+    """Checks the argument (fx, fy, cx, cy) of a loader; None stays None.
+
+    Raises:
+        ValueError: if it has another number of values.
+    """
+    if intrinsics is not None and len(intrinsics) != 4:
+        raise ValueError(f"intrinsics must be [fx, fy, cx, cy], got {list(intrinsics)}")
+    return tuple(float(value) for value in intrinsics) if intrinsics else None
+
+
+def positive(name: str, value: float, unit: str) -> float:
+    """Checks an argument of a loader that must be above 0.
+
+    Raises:
+        ValueError: if it is not, naming it and its unit.
+    """
+    if not value > 0:
+        raise ValueError(f"{name} must be positive ({unit}), got {value}")
+    return float(value)
+
+
+def expanded(path: str | None) -> Path | None:
+    """A folder that the user names, where ``~`` is the home folder."""
+    return Path(path).expanduser() if path else None
+
+
+def existing_depth_root(path: str | None) -> Path | None:
+    """The folder of depth beside a dataset.
+
+    Raises:
+        FileNotFoundError: if it is named but does not exist.
+    """
+    folder = expanded(path)
+    if folder is not None and not folder.is_dir():
+        raise FileNotFoundError(f"the depth folder {folder} (seen from {Path.cwd()}) does not exist")
+    return folder

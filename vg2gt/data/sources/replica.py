@@ -8,17 +8,15 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from typing_extensions import Unpack
 
 from vg2gt.data.base import DataError
-from vg2gt.data.sources.files import FileSource
-from vg2gt.data.sources.index import SceneIndex, make_index
-from vg2gt.data.sources.parsing import numbered, pinhole, read_numbers
+from vg2gt.data.sources.files import FileSource, HoldoutOptions
+from vg2gt.data.sources.index import SceneIndex, check_found, first_size, make_index
+from vg2gt.data.sources.parsing import four_intrinsics, numbered, pinhole, read_numbers
 from vg2gt.data.sources.scene_folders import scene_folders
 from vg2gt.geometry.cameras import resize_intrinsics
-from vg2gt.io.image_files import Size, image_size, read_depth
-
-DEPTH_SCALE = 6553.5
-"""Stored depth units a metre."""
+from vg2gt.io.image_files import Size
 
 _SIZE = (680, 1200)
 _INTRINSICS = pinhole(600.0, 600.0, 599.5, 339.5)
@@ -35,58 +33,33 @@ class Replica(FileSource):
     Args:
         root: the folder of the scenes, or a scene, or a list of such.
         intrinsics: (fx, fy, cx, cy) in pixels of the images, if another camera rendered them; None: Replica's.
-        scenes: names of scenes, or a text file with one a line; None: all.
-        holdout: hold out every this many-th frame as an evaluation target; None: none.
-        every: use every this many-th frame only (a video has 2000 close ones).
-        index_cache: see ``FileSource``.
-
-    Raises:
-        FileNotFoundError: if a root does not exist.
-        DataError: if a root holds no scene.
+        shared: see ``FileSource``; a video has 2000 close frames.
     """
 
     layout = "SCENE/traj.txt and SCENE/results/{frame,depth}*, there or one folder deeper"
+    index_options = ("intrinsics",)
+    depth_scale = 6553.5
 
     def __init__(
         self,
         root: str | Sequence[str] | None,
         intrinsics: Sequence[float] | None = None,
-        scenes: Sequence[str] | str | None = None,
-        holdout: int | None = None,
-        every: int = 1,
-        index_cache: str | None = None,
+        **shared: Unpack[HoldoutOptions],
     ) -> None:
-        self.intrinsics = tuple(float(value) for value in intrinsics) if intrinsics else None
-        super().__init__(root, scenes, holdout, every, index_cache)
+        self.intrinsics = four_intrinsics(intrinsics)
+        super().__init__(root, **shared)
 
     def find(self, root: Path) -> Mapping[str, Path]:
         """Folders with ``results``, by their name."""
         return scene_folders(root, lambda folder: (folder / "results").is_dir(), levels=1)
 
-    def options(self) -> Mapping[str, object]:
-        """The intrinsics that replace Replica's."""
-        return {"intrinsics": self.intrinsics}
-
     def index(self, scene: str, folder: Path) -> SceneIndex:
         """Lists a scene's files and reads its poses."""
         color, depth = (numbered(folder / "results", scene, f"{kind}*") for kind in ("frame", "depth"))
-        if not color or not depth:
-            raise DataError(f"scene {scene} has no {'frame' if not color else 'depth'} images in {folder / 'results'}")
-        size = image_size(next(iter(color.values())), scene)
-        return make_index(
-            name=scene,
-            folder=folder,
-            color=color,
-            depth=depth,
-            camera_to_world=_read_trajectory(folder / "traj.txt", scene, max(color)),
-            intrinsics=self._intrinsics(folder, scene, size),
-            size=size,
-            color_size=size,
-        )
-
-    def read_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
-        """Decodes a depth image."""
-        return (read_depth(index.depth[row], index.name, size) / DEPTH_SCALE).astype(np.float32)
+        check_found(scene, folder / "results", {"frame images": color, "depth images": depth})
+        poses = _read_trajectory(folder / "traj.txt", scene, max(color))
+        intrinsics = self._intrinsics(folder, scene, first_size(color, scene))
+        return make_index(scene, folder, color, depth, poses, intrinsics)
 
     def _intrinsics(self, folder: Path, scene: str, size: Size) -> NDArray[np.float64]:
         if self.intrinsics is not None:

@@ -2,8 +2,8 @@
 
 Layouts, told apart by what is there:
 
-* folders: colour in ``images/``, ``color/`` or ``rgb/``, depth in ``depth/``, poses in ``poses.txt`` (16 numbers a
-  line, in the order of the images) or one text file a frame in ``pose/`` or ``poses/``, intrinsics in ``K.txt`` (3x3)
+* folders: colour in ``images/``, ``color/`` or ``rgb/``, depth in ``depth/``, poses in ``poses.txt`` (16 numbers per
+  line, in the order of the images) or one text file per frame in ``pose/`` or ``poses/``, intrinsics in ``K.txt`` (3x3)
   or in ``intrinsic/intrinsic_{color,depth}.txt`` (4x4, as ScanNet is exported);
 * 7-Scenes: ``frame-NNNNNN.{color.png|jpg,depth.png,pose.txt}`` in one folder, intrinsics in ``camera-intrinsics.txt``.
 
@@ -22,14 +22,24 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from typing_extensions import Unpack
 
 from vg2gt.data.base import DataError
-from vg2gt.data.sources.files import FileSource
-from vg2gt.data.sources.index import SceneIndex, files_state, folder_state, make_index
-from vg2gt.data.sources.parsing import numbered, pinhole, read_matrix, read_numbers, read_poses
+from vg2gt.data.sources.files import FileOptions, FileSource
+from vg2gt.data.sources.index import SceneIndex, check_found, first_size, make_index
+from vg2gt.data.sources.parsing import (
+    four_intrinsics,
+    numbered,
+    pinhole,
+    positive,
+    read_matrix,
+    read_numbers,
+    read_poses,
+)
 from vg2gt.data.sources.scannet import room_of_scan
+from vg2gt.data.sources.scene_folders import scene_folders
 from vg2gt.geometry.cameras import resize_intrinsics
-from vg2gt.io.image_files import Size, image_size, read_depth
+from vg2gt.io.image_files import Size
 
 log = logging.getLogger(__name__)
 
@@ -57,23 +67,18 @@ class RGBDFolder(FileSource):
 
     Args:
         root: a recording, a folder of recordings (one or two levels deep), or a list of such folders.
-        depth_scale: stored depth units a metre: 1000 for millimetres, 5000 for TUM.
+        depth_scale: stored depth units per metre: 1000 for millimetres, 5000 for TUM.
         invalid: stored values that mean "no depth".
         holdout: hold out every this many-th frame; None: none.
-        scenes: names of the recordings to use, or a text file of them; None: all.
         intrinsics: (fx, fy, cx, cy) in pixels of the colour images, where the folder has no intrinsics or wrong ones.
-        every: use every this many-th frame only.
-        index_cache: see ``FileSource``.
-
-    Raises:
-        FileNotFoundError: if a root does not exist.
-        DataError: if a folder holds no recording.
+        shared: see ``FileSource``.
     """
 
     layout = (
         "images/, color/ or rgb/ with depth/, poses.txt and K.txt, or frame-*.color.png with frame-*.depth.png, there "
         "or up to two folders deeper"
     )
+    index_options = ("intrinsics",)
 
     def __init__(
         self,
@@ -81,24 +86,17 @@ class RGBDFolder(FileSource):
         depth_scale: float = 1000.0,
         invalid: Sequence[int] = (0, 65535),
         holdout: int | None = 6,
-        scenes: Sequence[str] | str | None = None,
         intrinsics: Sequence[float] | None = None,
-        every: int = 1,
-        index_cache: str | None = None,
+        **shared: Unpack[FileOptions],
     ) -> None:
-        if not depth_scale > 0:
-            raise ValueError(f"depth_scale must be positive (stored units a metre), got {depth_scale}")
-        self.depth_scale = float(depth_scale)
+        self.depth_scale = positive("depth_scale", depth_scale, "stored units per metre")
         self.invalid = tuple(int(value) for value in invalid)
-        self.intrinsics = tuple(float(value) for value in intrinsics) if intrinsics else None
-        super().__init__(root, scenes, holdout, every, index_cache)
+        self.intrinsics = four_intrinsics(intrinsics)
+        super().__init__(root, holdout=holdout, **shared)
 
     def find(self, root: Path) -> Mapping[str, Path]:
         """The folder itself, or recordings one or two levels below it."""
-        if _is_recording(root):
-            return {root.resolve().name: root}
-        inner = [folder for pattern in ("*", "*/*") for folder in sorted(root.glob(pattern)) if _is_recording(folder)]
-        return {folder.relative_to(root).as_posix(): folder for folder in inner}
+        return scene_folders(root, _is_recording, by_path=True)
 
     def place(self, scene: str) -> str:
         """What several recordings show: the folder of 7-Scenes' ``seq-NN``, the room of ScanNet's ``sceneNNNN_NN``."""
@@ -107,32 +105,27 @@ class RGBDFolder(FileSource):
             return folder.parent.name
         return room_of_scan(folder.name) if re.fullmatch(r"scene\d{4}_\d\d", folder.name) else scene
 
-    def state(self, scene: str, folder: Path) -> str:
-        """Also that of the intrinsics, which lie deeper or beside the recording."""
-        return folder_state(folder) + files_state([*_exported_intrinsics(folder), *_beside(folder.parent)])
-
-    def options(self) -> Mapping[str, object]:
-        """The intrinsics that replace the files'."""
-        return {"intrinsics": self.intrinsics}
+    def watched(self, scene: str, folder: Path) -> Sequence[Path | None]:
+        """Also the intrinsics, which lie deeper or beside the recording."""
+        return folder, *_exported_intrinsics(folder), *_beside(folder.parent)
 
     def index(self, scene: str, folder: Path) -> SceneIndex:
         """Lists a recording's files and reads its poses and intrinsics."""
         in_folders = (folder / "depth").is_dir()
         files = _files_in_folders(folder, scene) if in_folders else _files_of_seven_scenes(folder, scene)
-        if not files.color or not files.depth:
-            kind = "colour" if not files.color else "depth"
-            raise DataError(f"scene {scene} has no {kind} images in {folder}")
-        color_size = image_size(next(iter(files.color.values())), scene)
-        depth_size = image_size(next(iter(files.depth.values())), scene)
+        check_found(scene, folder, {"colour images": files.color, "depth images": files.depth})
+        color_size, depth_size = first_size(files.color, scene), first_size(files.depth, scene)
+        poses = _read_poses(files, scene)
+        intrinsics = self._depth_intrinsics(files.intrinsics, folder, scene, color_size, depth_size)
         index = make_index(
-            name=scene,
-            folder=folder,
-            color=files.color,
-            depth=files.depth,
-            camera_to_world=_read_poses(files, scene),
-            intrinsics=self._depth_intrinsics(files.intrinsics, folder, scene, color_size, depth_size),
+            scene,
+            folder,
+            files.color,
+            files.depth,
+            poses,
+            intrinsics,
+            color_size,
             size=depth_size,
-            color_size=color_size,
             depth_size=depth_size,
         )
         size = f"{depth_size[1]}x{depth_size[0]}"
@@ -141,11 +134,6 @@ class RGBDFolder(FileSource):
             larger = f"{color_size[1]}x{color_size[0]}"
             _say(f"scene {scene}: colour of {larger} is reduced to the depth's {size}", logging.WARNING)
         return index
-
-    def read_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
-        """Decodes an integer depth image."""
-        stored = read_depth(index.depth[row], index.name, size)
-        return np.where(np.isin(stored, self.invalid), 0, stored / self.depth_scale).astype(np.float32)
 
     def _depth_intrinsics(
         self, files: Sequence[Path], folder: Path, scene: str, color: Size, depth: Size

@@ -10,15 +10,12 @@ from numpy.typing import NDArray
 
 from vg2gt.data.base import DataError
 from vg2gt.data.sources.files import FileSource
-from vg2gt.data.sources.index import SceneIndex, make_index
-from vg2gt.data.sources.parsing import numbered
+from vg2gt.data.sources.index import SceneIndex, check_found, make_index
+from vg2gt.data.sources.parsing import CORNER_TO_CENTER, numbered
 from vg2gt.data.sources.scene_folders import scene_folders
 from vg2gt.io.arrays import load_matrices
-from vg2gt.io.image_files import Size, image_size, read_depth
 from vg2gt.io.npz import load_npz
 
-DEPTH_SCALE = 1000.0
-"""Stored depth units a metre."""
 METADATA = "scene_iphone_metadata.npz"
 """The file of a scene's cameras."""
 
@@ -31,16 +28,8 @@ class ScanNetPPiPhone(FileSource):
     and ``intrinsics`` [N, 3, 3], whose principal point counts pixels as COLMAP does: 1/2 is subtracted. The folders
     hold DSLR frames too, which the file does not name; a frame's number is its id.
 
-    Args:
-        root: the folder of the scenes, or of splits with scenes, or a scene, or a list of such.
-        scenes: names of scenes, or a text file with one a line (the official ``nvs_sem_train.txt``); None: all.
-        holdout: hold out every this many-th frame as an evaluation target; None: none.
-        every: use every this many-th frame only.
-        index_cache: see ``FileSource``.
-
-    Raises:
-        FileNotFoundError: if a root does not exist.
-        DataError: if a root holds no scene.
+    The arguments are those of ``FileSource``. ``root`` is the folder of the scenes, or of splits with scenes, or a
+    scene, or a list of such; a list of scenes may be the official ``nvs_sem_train.txt``.
     """
 
     layout = f"SCENE/{{images,depth}} and SCENE/{METADATA}, there or up to two folders deeper"
@@ -61,24 +50,15 @@ class ScanNetPPiPhone(FileSource):
         images = numbered(folder / "images", scene, "frame_*")
         depth = numbered(folder / "depth", scene, "frame_*")
         color = {number: images[number] for number in frames if number in images}
-        if not color or not depth:
-            raise DataError(f"scene {scene} has no {'images' if not color else 'depth'} of iPhone frames in {folder}")
-        centre = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
-        size = image_size(next(iter(color.values())), scene)
+        check_found(scene, folder, {"images of iPhone frames": color, "depth of iPhone frames": depth})
         return make_index(
-            name=scene,
-            folder=folder,
-            color=color,
+            scene,
+            folder,
+            color,
             depth={number: file for number, file in depth.items() if number in frames},
             camera_to_world={number: matrices["trajectories"][row] for number, row in frames.items()},
-            intrinsics={number: matrices["intrinsics"][row] - centre for number, row in frames.items()},
-            size=size,
-            color_size=size,
+            intrinsics={number: matrices["intrinsics"][row] - CORNER_TO_CENTER for number, row in frames.items()},
         )
-
-    def read_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
-        """Decodes a depth image in millimetres."""
-        return (read_depth(index.depth[row], index.name, size) / DEPTH_SCALE).astype(np.float32)
 
 
 def _frame_numbers(names: NDArray[np.str_], path: Path, scene: str) -> dict[int, int]:

@@ -7,16 +7,25 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import Unpack
 
 from vg2gt.data.base import DataError
 from vg2gt.data.sources.colmap_model import image_intrinsics, model_folder_of, refuse_distorted
-from vg2gt.data.sources.files import FileSource
-from vg2gt.data.sources.index import SceneIndex, folder_state, make_index
-from vg2gt.data.sources.parsing import errors_name, numbered, pinhole, read_matrix, read_text_lines
+from vg2gt.data.sources.files import FileSource, HoldoutOptions
+from vg2gt.data.sources.index import SceneIndex, first_size, make_index
+from vg2gt.data.sources.parsing import (
+    errors_name,
+    expanded,
+    four_intrinsics,
+    numbered,
+    pinhole,
+    read_matrix,
+    read_text_lines,
+)
 from vg2gt.data.sources.scan_depth import VERSION, ScanDepth
 from vg2gt.data.sources.scene_folders import scene_folders
 from vg2gt.io import read_colmap
-from vg2gt.io.image_files import Size, image_size
+from vg2gt.io.image_files import Size
 
 _LOG = "_COLMAP_SfM.log"
 
@@ -37,17 +46,11 @@ class TanksAndTemples(FileSource):
         intrinsics: (fx, fy, cx, cy) in pixels of the images, integer pixel centres; null: those of the COLMAP model.
         depth: ``scan``: rendered from ``S.ply`` and kept in ``depth_cache``; null: none.
         depth_cache: see ``ScanDepth``.
-        scenes: names of scenes, or a text file of them; None: all.
-        holdout: hold out every this many-th frame as an evaluation target; None: none.
-        every: use every this many-th frame only.
-        index_cache: see ``FileSource``.
-
-    Raises:
-        FileNotFoundError: if a root does not exist.
-        DataError: if there is no scene.
+        shared: see ``FileSource``.
     """
 
     layout = f"scenes S with S{_LOG}, S_trans.txt and images, there or one folder deeper"
+    index_options = ("intrinsics", "has_depth")
 
     def __init__(
         self,
@@ -55,32 +58,26 @@ class TanksAndTemples(FileSource):
         intrinsics: Sequence[float] | None = None,
         depth: str | None = "scan",
         depth_cache: str | None = None,
-        scenes: Sequence[str] | str | None = None,
-        holdout: int | None = None,
-        every: int = 1,
-        index_cache: str | None = None,
+        **shared: Unpack[HoldoutOptions],
     ) -> None:
         if depth not in (None, "scan"):
             raise ValueError(f"depth must be scan or null (none), got {depth!r}")
-        if intrinsics is not None and len(intrinsics) != 4:
-            raise ValueError(f"intrinsics must be [fx, fy, cx, cy], got {list(intrinsics)}")
-        self.intrinsics = tuple(float(value) for value in intrinsics) if intrinsics else None
+        self.intrinsics = four_intrinsics(intrinsics)
         self.has_depth = depth is not None
-        self._scan_depth = ScanDepth(Path(depth_cache).expanduser() if depth_cache else None)
-        super().__init__(root, scenes, holdout, every, index_cache)
+        self._scan_depth = ScanDepth(expanded(depth_cache))
+        super().__init__(root, **shared)
 
     def find(self, root: Path) -> Mapping[str, Path]:
         """The folder itself, or scenes one level below it."""
         return scene_folders(root, lambda folder: _log_file(folder) is not None, levels=1)
 
-    def options(self) -> Mapping[str, object]:
-        """The intrinsics that replace the model's, and whether there must be a scan."""
-        return {"intrinsics": self.intrinsics, "depth": self.has_depth}
+    def watched(self, scene: str, folder: Path) -> Sequence[Path | None]:
+        """Also the COLMAP model."""
+        return folder, model_folder_of(folder)
 
     def state(self, scene: str, folder: Path) -> str:
-        """Also that of the COLMAP model."""
-        model = model_folder_of(folder)
-        return " ".join([f"scan depth {VERSION}", *(folder_state(place) for place in (folder, model) if place)])
+        """Also the version of the rendered depth."""
+        return f"scan depth {VERSION} {super().state(scene, folder)}"
 
     def index(self, scene: str, folder: Path) -> SceneIndex:
         """Reads log, transform and intrinsics."""
@@ -98,22 +95,14 @@ class TanksAndTemples(FileSource):
                 "their order, so that all images of the benchmark must be there"
             )
         to_scan = _read_similarity(folder / f"{name}_trans.txt", scene)
-        size = image_size(next(iter(color.values())), scene)
         scan = folder / f"{name}.ply"
         if self.has_depth and not scan.is_file():
             raise DataError(f"scene {scene} has no scan {scan}: add it, or set data.depth=null")
         registered = {i: pose for i, pose in zip(color, poses, strict=True) if pose is not None}
-        intrinsics = self._intrinsics(scene, folder, color, size)
-        return make_index(
-            name=scene,
-            folder=folder,
-            color=color,
-            depth=dict.fromkeys(color, scan) if self.has_depth else None,
-            camera_to_world={i: moved(to_scan, pose) for i, pose in registered.items() if i in intrinsics},
-            intrinsics=intrinsics,
-            size=size,
-            color_size=size,
-        )
+        intrinsics = self._intrinsics(scene, folder, color, first_size(color, scene))
+        to_world = {i: moved(to_scan, pose) for i, pose in registered.items() if i in intrinsics}
+        depth = dict.fromkeys(color, scan) if self.has_depth else None
+        return make_index(scene, folder, color, depth, to_world, intrinsics)
 
     def read_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
         """Renders the scan."""

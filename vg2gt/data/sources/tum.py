@@ -10,16 +10,21 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from typing_extensions import Unpack
 
 from vg2gt.data.base import DataError
-from vg2gt.data.sources.files import FileSource
+from vg2gt.data.sources.files import FileOptions, FileSource
 from vg2gt.data.sources.index import SceneIndex, make_index
-from vg2gt.data.sources.parsing import named_file, pinhole, read_numbers, read_text_lines
+from vg2gt.data.sources.parsing import (
+    four_intrinsics,
+    named_file,
+    pinhole,
+    positive,
+    read_numbers,
+    read_text_lines,
+)
 from vg2gt.data.sources.scene_folders import scene_folders
-from vg2gt.io.image_files import Size, image_size, read_depth
 
-DEPTH_SCALE = 5000.0
-"""Stored depth units a metre."""
 INTRINSICS = {
     "freiburg1": (517.3, 516.5, 318.6, 255.3),
     "freiburg2": (520.9, 521.0, 325.1, 249.7),
@@ -37,8 +42,8 @@ class TUM(FileSource):
     ``rgb.txt`` and ``depth.txt`` list ``timestamp path``, ``groundtruth.txt`` ``timestamp tx ty tz qx qy qz qw``
     (camera-to-world, OpenCV, metres). A colour image makes a frame with the depth image and the pose that differ from
     it by at most ``max_difference`` in time; nearest pairs first, nothing is used twice. Frame ids are positions in
-    ``rgb.txt``, in order of time. Depth is registered to the colour camera, 5000 units a metre; 0 and 65535 mean none.
-    Listed files that do not exist are counted and left out.
+    ``rgb.txt``, in order of time. Depth is registered to the colour camera, 5000 units per metre; 0 and 65535 mean
+    none. Listed files that do not exist are counted and left out.
 
     The intrinsics are those of the Kinect that the folder's name says (``freiburg1``, ``fr1``, ...). The images are
     taken as a pinhole camera's. Those of freiburg3 are undistorted; those of freiburg1 and freiburg2 are not: by the
@@ -49,41 +54,30 @@ class TUM(FileSource):
         root: a sequence, or a folder of sequences, or a list of such.
         intrinsics: (fx, fy, cx, cy) in pixels of the colour images; None: by the folder's name.
         max_difference: largest difference of times in a frame, in seconds.
-        scenes: names of sequences, or a text file with one a line; None: all.
         holdout: hold out every this many-th frame as an evaluation target; None: none.
-        every: use every this many-th frame only (the camera takes 30 a second).
-        index_cache: see ``FileSource``.
-
-    Raises:
-        FileNotFoundError: if a root does not exist.
-        DataError: if a root holds no sequence.
+        shared: see ``FileSource``; the camera takes 30 frames per second.
     """
 
     layout = "rgb.txt, depth.txt and groundtruth.txt, there or one folder deeper"
+    index_options = ("intrinsics", "max_difference")
+    depth_scale = 5000.0
+    invalid = (65535,)
 
     def __init__(
         self,
         root: str | Sequence[str] | None,
         intrinsics: Sequence[float] | None = None,
         max_difference: float = 0.02,
-        scenes: Sequence[str] | str | None = None,
         holdout: int | None = 6,
-        every: int = 1,
-        index_cache: str | None = None,
+        **shared: Unpack[FileOptions],
     ) -> None:
-        if not max_difference > 0:
-            raise ValueError(f"max_difference must be positive (seconds), got {max_difference}")
-        self.intrinsics = tuple(float(value) for value in intrinsics) if intrinsics else None
-        self.max_difference = float(max_difference)
-        super().__init__(root, scenes, holdout, every, index_cache)
+        self.intrinsics = four_intrinsics(intrinsics)
+        self.max_difference = positive("max_difference", max_difference, "seconds")
+        super().__init__(root, holdout=holdout, **shared)
 
     def find(self, root: Path) -> Mapping[str, Path]:
         """Folders with ``rgb.txt``, by their name."""
         return scene_folders(root, lambda folder: (folder / "rgb.txt").is_file(), levels=1)
-
-    def options(self) -> Mapping[str, object]:
-        """What decides which frames there are and how they are seen."""
-        return {"intrinsics": self.intrinsics, "max_difference": self.max_difference}
 
     def index(self, scene: str, folder: Path) -> SceneIndex:
         """Reads the lists and joins them."""
@@ -105,22 +99,8 @@ class TUM(FileSource):
                 f"scene {scene} in {folder} has no {'colour' if not color else 'depth'} images: none of those listed "
                 f"in {'rgb' if not color else 'depth'}.txt exists or belongs to a frame"
             )
-        size = image_size(next(iter(color.values())), scene)
-        return make_index(
-            name=scene,
-            folder=folder,
-            color=color,
-            depth=depth_paths,
-            camera_to_world={i: poses[j] for i, j in pose.items()},
-            intrinsics=pinhole(*self._camera(scene, folder)),
-            size=size,
-            color_size=size,
-        )
-
-    def read_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
-        """Decodes a depth image."""
-        stored = read_depth(index.depth[row], index.name, size)
-        return np.where(stored == 65535, 0, stored / DEPTH_SCALE).astype(np.float32)
+        intrinsics = pinhole(*self._camera(scene, folder))
+        return make_index(scene, folder, color, depth_paths, {i: poses[j] for i, j in pose.items()}, intrinsics)
 
     def _camera(self, scene: str, folder: Path) -> tuple[float, ...]:
         named = _CAMERA.search(scene)

@@ -7,15 +7,13 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import Unpack
 
 from vg2gt.data.base import DataError
-from vg2gt.data.sources.files import FileSource
-from vg2gt.data.sources.index import SceneIndex, folder_state, make_index
-from vg2gt.data.sources.parsing import inverse, numbered, pinhole, read_numbers, rigid
-from vg2gt.io.image_files import Size, image_size, read_depth
-
-DEPTH_SCALE = 100.0
-"""Stored depth units a metre."""
+from vg2gt.data.sources.files import FileSource, HoldoutOptions
+from vg2gt.data.sources.index import SceneIndex, check_found, make_index
+from vg2gt.data.sources.parsing import numbered, pinhole, positive, read_numbers, to_world
+from vg2gt.io.image_files import Size
 
 _LARGEST_NUMBER = 1 << 31
 
@@ -31,32 +29,21 @@ class VirtualKITTI2(FileSource):
     Args:
         root: the folder of ``Scene01``, ``Scene02``, ...
         max_depth: farther points (metres) have no depth.
-        scenes: names of scenes, patterns such as ``Scene20/*/Camera_0``, or a text file of them; None: all.
-        holdout: hold out every this many-th frame as an evaluation target; None: none.
-        every: use every this many-th frame only (the cameras take ten a second).
-        index_cache: see ``FileSource``.
-
-    Raises:
-        FileNotFoundError: if a root does not exist.
-        DataError: if a root holds no scene.
+        shared: see ``FileSource``; the cameras take ten frames per second.
     """
 
     layout = "SceneNN/VARIATION/frames/{rgb,depth}/Camera_K and SceneNN/VARIATION/{extrinsic,intrinsic}.txt"
     depth_remedy = "raise data.max_depth, beyond which points have no depth (nor has the sky)"
+    depth_scale = 100.0
 
     def __init__(
         self,
         root: str | Sequence[str] | None,
         max_depth: float = 80.0,
-        scenes: Sequence[str] | str | None = None,
-        holdout: int | None = None,
-        every: int = 1,
-        index_cache: str | None = None,
+        **shared: Unpack[HoldoutOptions],
     ) -> None:
-        if not max_depth > 0:
-            raise ValueError(f"max_depth must be positive (metres), got {max_depth}")
-        self.max_depth = float(max_depth)
-        super().__init__(root, scenes, holdout, every, index_cache)
+        self.max_depth = positive("max_depth", max_depth, "metres")
+        super().__init__(root, **shared)
 
     def find(self, root: Path) -> Mapping[str, Path]:
         """Cameras with colour images; the folder of a scene is that of the variation."""
@@ -71,40 +58,30 @@ class VirtualKITTI2(FileSource):
         """The drive: variations and cameras show the same streets."""
         return scene.split("/")[0]
 
-    def state(self, scene: str, folder: Path) -> str:
-        """Also that of the camera's images."""
-        cameras = [folder / "frames" / kind / _camera_folder(scene) for kind in ("rgb", "depth")]
-        return " ".join(folder_state(path) for path in (folder, *cameras) if path.exists())
+    def watched(self, scene: str, folder: Path) -> Sequence[Path | None]:
+        """Also the camera's images."""
+        return folder, *(folder / "frames" / kind / _camera_folder(scene) for kind in ("rgb", "depth"))
 
     def index(self, scene: str, folder: Path) -> SceneIndex:
         """Lists a camera's files and reads its poses and intrinsics."""
         camera = _camera_folder(scene)
         color, depth = (numbered(folder / "frames" / kind / camera, scene) for kind in ("rgb", "depth"))
-        if not color or not depth:
-            raise DataError(f"scene {scene} has no {'colour' if not color else 'depth'} images in {folder / 'frames'}")
+        check_found(scene, folder / "frames", {"colour images": color, "depth images": depth})
         number = int(camera.removeprefix("Camera_"))
         extrinsics = _read_rows(folder / "extrinsic.txt", scene, number, 16)
         intrinsics = _read_rows(folder / "intrinsic.txt", scene, number, 4)
-        size = image_size(next(iter(color.values())), scene)
-        return make_index(
-            name=scene,
-            folder=folder,
-            color=color,
-            depth=depth,
-            # A frame that lacks intrinsics is one without a camera.
-            camera_to_world={
-                frame: _to_world(row.reshape(4, 4), frame, f"{folder} (scene {scene})")
-                for frame, row in extrinsics.items()
-                if frame in intrinsics
-            },
-            intrinsics={frame: pinhole(*row) for frame, row in intrinsics.items()},
-            size=size,
-            color_size=size,
-        )
+        # A frame that lacks intrinsics is one without a camera.
+        poses = {
+            frame: to_world(row.reshape(4, 4), f"{folder} (scene {scene})", frame)
+            for frame, row in extrinsics.items()
+            if frame in intrinsics
+        }
+        matrices = {frame: pinhole(*row) for frame, row in intrinsics.items()}
+        return make_index(scene, folder, color, depth, poses, matrices)
 
     def read_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
         """Decodes a depth image in centimetres; what is farther than ``max_depth`` has none."""
-        depth = (read_depth(index.depth[row], index.name, size) / DEPTH_SCALE).astype(np.float32)
+        depth = super().read_depth(index, row, size)
         return np.where(depth <= self.max_depth, depth, np.float32(0))
 
 
@@ -128,10 +105,3 @@ def _read_rows(path: Path, scene: str, camera: int, count: int) -> dict[int, NDA
     if (counts > 1).any():
         raise DataError(f"{path} of scene {scene} has frame {frames[counts.argmax()]} of camera {camera} twice")
     return {int(row[0]): row[2:] for row in rows}
-
-
-def _to_world(world_to_camera: NDArray[np.float64], frame: int, where: str) -> NDArray[np.float64]:
-    """Inverts a pose; one that is not finite stays so, and drops its frame."""
-    if not np.isfinite(world_to_camera).all():
-        return np.full((4, 4), np.nan)
-    return inverse(rigid(world_to_camera[None], [frame], where))[0]
