@@ -58,7 +58,6 @@ def write_data(folder: Path, scenes: int) -> dict[str, list[str]]:
     return {
         "PNG files": [*files, f"data.root={folder / 'png'}"],
         "JPEG files": [*files, f"data.root={folder / 'jpeg'}"],
-        "resized frames": [*files, f"data.root={folder / 'png'}", f"data.resized_cache={folder / 'resized'}"],
         "shards, PNG": [*shards, f"data.root={folder / 'shards'}"],
         "shards, JPEG": [*shards, f"data.root={folder / 'jpeg_shards'}"],
         "memory": [*files, f"data.root={folder / 'png'}", "data.memory_mb=4096"],

@@ -43,13 +43,24 @@ def targets(node: Any, where: str = "") -> Iterator[tuple[str, dict[str, Any]]]:
 def assert_signatures_fit(node: Any) -> int:
     count = 0
     for where, target in targets(node):
-        signature = inspect.signature(get_class(target["_target_"]))
-        takes_any = any(p.kind is inspect.Parameter.VAR_KEYWORD for p in signature.parameters.values())
-        given = {key for key in target if not (key.startswith("_") and key.endswith("_"))}
-        unknown = given - set(signature.parameters)
-        assert takes_any or not unknown, f"{where}: {target['_target_']} has no argument {sorted(unknown)}"
+        given = [key for key in target if not (key.startswith("_") and key.endswith("_"))]
+        unknown = [key for key in given if not accepts(target, key)]
+        assert not unknown, f"{where}: {target['_target_']} has no argument {unknown}"
         count += 1
     return count
+
+
+def accepts(target: dict[str, Any], key: str) -> bool:
+    """Whether a constructor has an argument, or hands it on to parts of its own that all have it."""
+    parameters = inspect.signature(get_class(target["_target_"])).parameters
+    if key in parameters or not any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters.values()):
+        return key in parameters
+    if target["_target_"] == "vg2gt.data.SceneDataModule":
+        return accepts(target["train"], key) and accepts(target["val"], key)
+    if target["_target_"] == "vg2gt.data.Mixture":
+        owners = [name for name in target["parts"] if key.startswith(f"{name}_")] or list(target["parts"])
+        return all(accepts(target["parts"][name], key.removeprefix(f"{name}_")) for name in owners)
+    return True
 
 
 GROUPS = ["backend", "model", "data", "loss", "renderer", "optimizer", "trainer", "callbacks", "logger"]
@@ -61,6 +72,16 @@ def test_every_option_composes_and_fits_its_constructor(tmp_path: Path, group: s
         pytest.skip(f"{name} is not installed (extra: log)")
     config = composed(tmp_path, f"{group}={name}", *(["data.root=somewhere"] if name == "rgbd" else []))
     assert assert_signatures_fit(OmegaConf.to_container(config[group], resolve=True)) >= 1
+
+
+@pytest.mark.parametrize("name", names("data"))
+def test_misspelt_options_of_data_are_found(tmp_path: Path, name: str) -> None:
+    config = OmegaConf.to_container(composed(tmp_path, f"data={name}").data, resolve=True)
+    assert isinstance(config, dict)
+    with pytest.raises(AssertionError, match="eval_windw"):
+        assert_signatures_fit({**config, "eval_windw": 30})
+    with pytest.raises(AssertionError, match="scnes"):
+        assert_signatures_fit({**config, "train": {**config["train"], "scnes": None}})
 
 
 @pytest.mark.parametrize("group", ["experiment", "ablation", "debug"])

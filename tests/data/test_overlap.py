@@ -5,9 +5,7 @@ from collections.abc import Sequence
 import pytest
 
 from vg2gt.data import DataError, Mixture, SceneSource, SyntheticScenes
-from vg2gt.data.framing import FramingSampler
 from vg2gt.data.overlap import refuse_overlap
-from vg2gt.data.resized_cache import ResizedCache
 from vg2gt.data.views.sampling import SceneSample
 
 
@@ -50,12 +48,6 @@ def _mixture(**parts: SceneSource) -> Mixture:
         (_mixture(scans=Scans(1), rooms=SyntheticScenes(2)), "scans/scene0001_00", OtherReader(1), "scene0001_01"),
         (OtherReader(1), "scene0001_00", _mixture(scans=Scans(1)), "scans/scene0001_01"),
         (_mixture(scans=Scans(1)), "scans/scene0001_00", _mixture(mine=OtherReader(1)), "mine/scene0001_01"),
-        (
-            ResizedCache(_mixture(a=Scans(1)), "unused", FramingSampler((4, 4))),
-            "a/scene0001_00",
-            Scans(1),
-            "scene0001_01",
-        ),
     ],
 )
 def test_a_place_is_known_in_every_reader_and_mixture(train, trained, val, scene):

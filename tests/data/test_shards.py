@@ -15,6 +15,7 @@ from omegaconf import OmegaConf
 
 from vg2gt.data import DataError, Mixture, RGBDFolder, SceneDataModule, ShardedScenes, SyntheticScenes
 from vg2gt.data.commands import parse
+from vg2gt.data.framing import FramingSampler
 from vg2gt.data.sharded_scenes import INDEX
 from vg2gt.data.shards import Encoding, main, write_shards
 from vg2gt.data.transforms import reduce_to_cover
@@ -59,12 +60,15 @@ def test_frames_are_reduced_and_compressed(rooms, tmp_path):
     assert torch.equal(loaded.depth, expected.depth)
 
 
-def test_training_reads_shards_in_workers_as_the_source_itself(mixture, tmp_path):
-    write_shards(mixture, tmp_path / "out", Encoding(SIZE))
+@pytest.mark.parametrize(
+    "drawn", [{}, {"aspect": [0.5, 1.0], "zoom": [1, 1.2], "size_multiple": 2}, {"fit": "pad", "image_size": (24, 48)}]
+)
+def test_training_reads_shards_in_workers_as_the_source_itself(mixture, tmp_path, drawn):
+    write_shards(mixture, tmp_path / "out", Encoding(FramingSampler(**{"image_size": SIZE, **drawn}).largest))
     val = SyntheticScenes(1, first_seed=70, num_frames=4, size=SIZE)
     options: dict[str, Any] = {
         "image_size": SIZE, "min_views": 2, "max_views": 3, "max_images": 6, "steps_per_epoch": 6, "eval_context": [0],
-        "eval_target": [1],
+        "eval_target": [1], **drawn,
     }  # fmt: skip
     direct = list(SceneDataModule(mixture, val, **options).train_dataloader())
     for workers in (0, 2):

@@ -7,7 +7,6 @@ import re
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,8 +16,6 @@ from backends.vggt import VGGTBackend
 from backends.weights import find_weights
 from tests.safety.conftest import SIZE, Armed
 from vg2gt.data import DataError, RGBDFolder, ShardedScenes, SyntheticScenes
-from vg2gt.data.framing import FramingSampler
-from vg2gt.data.resized_cache import ResizedCache
 from vg2gt.data.sharded_scenes import INDEX
 from vg2gt.io.arrays import load_matrices, load_npy
 from vg2gt.io.errors import FormatError
@@ -200,30 +197,24 @@ def test_index_caches(
     assert frames() == [0, 1]
 
 
-def test_resized_frames_and_rooms(
-    tmp_path: Path, pickled_array: np.ndarray, armed: Armed, caplog: pytest.LogCaptureFixture
-) -> None:
-    rooms = SyntheticScenes(1, num_frames=1, size=SIZE, cache_dir=str(tmp_path / "rooms"))
-    framing = FramingSampler(SIZE)
-    expected = ResizedCache(rooms, tmp_path / "resized", framing).load(rooms.scenes[0], [0])
-    for folder, said in (("resized", "resized frame .* is damaged"), ("rooms", "cached scene .* is damaged")):
-        (path,) = (tmp_path / folder).rglob("*.npz")
-        with np.load(path) as stored:
-            good = dict(stored)
-        for hostile in ({**good, "depth": pickled_array}, None):
-            caplog.clear()
-            if hostile is None:
-                path.write_bytes(pickle.dumps(armed))
-            else:
-                np.savez(path, **hostile)  # pyright: ignore[reportArgumentType]
-            source: Any = SyntheticScenes(1, num_frames=1, size=SIZE, cache_dir=str(tmp_path / "rooms"))
-            if folder == "resized":
-                source = ResizedCache(rooms, tmp_path / "resized", framing)
-            with caplog.at_level(logging.WARNING):
-                found = source.load(rooms.scenes[0], [0])
-            assert torch.equal(found.depth, expected.depth)
-            assert caplog.records
-            assert re.search(said, caplog.text)
+def test_rooms(tmp_path: Path, pickled_array: np.ndarray, armed: Armed, caplog: pytest.LogCaptureFixture) -> None:
+    def depth() -> torch.Tensor:
+        rooms = SyntheticScenes(1, num_frames=1, size=SIZE, cache_dir=str(tmp_path / "rooms"))
+        return rooms.load(rooms.scenes[0], [0]).depth
+
+    expected = depth()
+    (path,) = (tmp_path / "rooms").rglob("*.npz")
+    with np.load(path) as stored:
+        good = dict(stored)
+    for hostile in ({**good, "depth": pickled_array}, None):
+        caplog.clear()
+        if hostile is None:
+            path.write_bytes(pickle.dumps(armed))
+        else:
+            np.savez(path, **hostile)  # pyright: ignore[reportArgumentType]
+        with caplog.at_level(logging.WARNING):
+            assert torch.equal(depth(), expected)
+        assert re.search("cached scene .* is damaged", caplog.text)
 
 
 def test_shard_indices(write_shards_to, tmp_path: Path, pickled_array: np.ndarray, armed: Armed) -> None:

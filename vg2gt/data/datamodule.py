@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from lightning.pytorch import LightningDataModule
 from torch.utils.data import DataLoader
 
-from vg2gt.data.base import DataError, Frames, SceneSource, SourceMaker
+from vg2gt.data.base import DataError, SceneSource, SourceMaker
 from vg2gt.data.batches import BatchDataset
 from vg2gt.data.framing import Crop, Fit, FramingSampler
 from vg2gt.data.overlap import refuse_overlap, refuse_untrainable
-from vg2gt.data.resized_cache import ResizedCache
 from vg2gt.data.views.even import EvaluationViews
 from vg2gt.data.views.sampling import StepSampler, ViewSampler, usable_scenes
 from vg2gt.types import Batch
@@ -50,9 +49,11 @@ class SceneDataModule(LightningDataModule):
         size_multiple: drawn sizes are multiples of this; the backbone's patch size.
         crop: training crops at the ``center`` or at ``random``.
         zoom: range from which a training scene's zoom is drawn.
-        resized_cache: folder that keeps decoded training frames, reduced to the size that is needed (``ResizedCache``);
-            None: they are decoded from the dataset's files every time.
+        resized_cache: no longer an option, refused unless None: shards keep reduced frames.
         common: arguments that ``train`` and ``val`` share, such as the dataset's ``root``.
+
+    Raises:
+        ValueError: if an option is out of range.
     """
 
     def __init__(
@@ -87,7 +88,13 @@ class SceneDataModule(LightningDataModule):
         self.eval_views = EvaluationViews(eval_context, eval_target, eval_window)
         size = (int(image_size[0]), int(image_size[1]))
         self.framing = FramingSampler(size, aspect, size_multiple, fit, crop, zoom, seed)
-        self.resized_cache = resized_cache
+        if resized_cache is not None:
+            largest = ",".join(map(str, self.framing.largest))
+            raise ValueError(
+                "data.resized_cache is replaced by shards: write the reduced frames once with `python -m "
+                f"vg2gt.data.shards out=FOLDER/train size=[{largest}] data=...` (and out=FOLDER/val subset=val), then "
+                "train with data=shards data.root=FOLDER"
+            )
         self.common = common
         self.train_scenes = train_scenes
         self.eval_scenes = eval_scenes
@@ -119,9 +126,9 @@ class SceneDataModule(LightningDataModule):
         names = list(val.scenes)[: self.eval_scenes]
         self._val_views = [views for name in names for views in self.eval_views.choose(val, name)]
         refuse_overlap(train, self._train_names, val, self._val_views)
-        if self.resized_cache:
-            train = ResizedCache(train, self.resized_cache, self.framing)
-        self._train = BatchDataset(train, self._training_size(), self.memory_mb, replace_damaged=True)
+        # Of a training frame is kept its final size, or as much as any framing can need.
+        prepare = self.framing.reduce if self.framing.moves else self.framing.still.apply
+        self._train = BatchDataset(train, prepare, self.memory_mb, replace_damaged=True)
         self._val = BatchDataset(val, self.framing.still.apply, self.memory_mb)
 
     def train_source(self) -> SceneSource:
@@ -155,7 +162,7 @@ class SceneDataModule(LightningDataModule):
         return self._loader(self._train, sampler)
 
     def val_dataloader(self) -> DataLoader[Batch]:
-        """One batch (B = 1) a sample: context views, then held-out target views. Devices take the samples in turns.
+        """One batch (B = 1) per sample: context views, then held-out target views. Devices take the samples in turns.
 
         A device for which none is left repeats the first one, as every device has to take part in an evaluation.
         """
@@ -172,12 +179,6 @@ class SceneDataModule(LightningDataModule):
     def evaluation_data(self) -> BatchDataset:
         """The evaluation scenes alone, for any views of them: indexed by a tuple of ``SceneSample``."""
         return BatchDataset(self._source(self._make_val), self.framing.still.apply, self.memory_mb)
-
-    def _training_size(self) -> Callable[[Frames], Frames]:
-        """What is kept of a training frame: its final size, or as much as any framing can need."""
-        if not self.framing.moves:
-            return self.framing.still.apply
-        return self.framing.reduce
 
     def _source(self, make: SceneSource | SourceMaker) -> SceneSource:
         if isinstance(make, SceneSource):

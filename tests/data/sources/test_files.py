@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
+from hydra import compose, initialize_config_dir
 
 from vg2gt.config import config_dir
 from vg2gt.data import DataError, RGBDFolder, SyntheticScenes
@@ -19,7 +19,7 @@ from .layouts import room
 
 OTHERS = ("paper_mix", "shards", "synthetic")
 """Configurations of data that are no scenes in files."""
-CONFIGURATIONS = [path for path in sorted(Path(config_dir(), "data").glob("*.yaml")) if path.stem not in OTHERS]
+CONFIGURATIONS = sorted({path.stem for path in Path(config_dir(), "data").glob("*.yaml")} - set(OTHERS))
 
 
 @pytest.fixture(scope="module")
@@ -125,10 +125,10 @@ def test_poses_are_read_several_at_a_time(tmp_path, monkeypatch):
     assert list(parsing.read_poses({i: tmp_path / str(i) for i in (3, 1)}, "a")) == [3, 1]
 
 
-@pytest.mark.parametrize("path", CONFIGURATIONS, ids=lambda path: path.stem)
-def test_every_configuration_of_files_names_the_shared_options(path):
-    keys = set(yaml.safe_load(path.read_text()))
-    assert {"every", "index_cache"} <= keys
+@pytest.mark.parametrize("name", CONFIGURATIONS)
+def test_every_configuration_of_files_has_the_shared_options(name):
+    with initialize_config_dir(config_dir(), version_base="1.3"):
+        assert {"every", "index_cache", "fit", "max_views"} <= set(compose("train", [f"data={name}"]).data)
 
 
 def test_every_second_frame(dataset):

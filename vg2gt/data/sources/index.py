@@ -119,6 +119,7 @@ def make_index(
         size = size or typical_size(color_size.values())
         color_size = size if set(color_size.values()) == {size} else None
     else:
+        check_found(name, folder, {"colour images": color})
         color_size = color_size or first_size(color, name)
         size = size or color_size
     where = f"{folder} (scene {name})"
