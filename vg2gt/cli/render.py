@@ -10,7 +10,7 @@ from pathlib import Path
 from vg2gt.cli.reconstruct import EXPECTED_ERRORS
 from vg2gt.io import read_cameras_json, read_gaussian_ply, read_splat
 from vg2gt.reconstruction import Monitor, interpolate, render_views
-from vg2gt.reconstruction.maps import MAPS, Animation, Sink, feed, map_sinks
+from vg2gt.reconstruction.maps import MAPS, animation, feed, map_sinks
 from vg2gt.reconstruction.outputs import FPS, check_outputs, cost_figures, prepare_folder
 from vg2gt.rendering import Renderer
 from vg2gt.runs.load import choose_device
@@ -65,8 +65,8 @@ def run(options: argparse.Namespace) -> None:
     gaussians = read_gaussians(options.scene).to(choose_device(options.device))
     renderer = Renderer(mode=options.mode, depth=options.depth, near=options.near)
     folder = prepare_folder(options.out, outputs, options.overwrite)
-    sinks: list[Sink] = list(map_sinks(folder, outputs))
-    sinks += [Animation(folder / name, options.fps) for name in outputs if name.startswith("video")]
+    sinks = map_sinks(folder, outputs)
+    sinks += [animation(folder / name, options.fps) for name in outputs if name.startswith("video")]
     monitor = Monitor(show=not options.quiet, device=gaussians.means.device)
     with monitor, monitor.stage("render views", len(cameras)) as advance:
         feed(render_views(renderer, gaussians, cameras), sinks, advance)

@@ -5,10 +5,11 @@ from __future__ import annotations
 import io
 from collections.abc import Sequence
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
@@ -67,9 +68,18 @@ def grid(rows: Sequence[Sequence[Tensor]], gap: int = 4) -> Tensor:
     return torch.cat(lines, -2)[..., :-gap, :-gap]
 
 
+def to_pixels(image: Tensor) -> NDArray[np.uint8]:
+    """An image ``[3, H, W]`` in [0, 1] as ``[H, W, 3]`` uint8."""
+    return (image.detach().cpu().clamp(0, 1).permute(1, 2, 0).numpy() * 255 + 0.5).astype(np.uint8)
+
+
+def encode_image(pixels: NDArray[np.generic], kind: str = "PNG", **options: Any) -> bytes:
+    """An 8-bit colour ``[H, W, 3]`` or 16-bit grey ``[H, W]`` image as a file's content; Pillow's options."""
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, kind, **options)
+    return buffer.getvalue()
+
+
 def write_png(path: str | Path, image: Tensor) -> Path:
     """Writes an image ``[3, H, W]`` in [0, 1] as an 8-bit PNG, atomically; returns the path."""
-    pixels = (image.detach().cpu().clamp(0, 1).permute(1, 2, 0).numpy() * 255 + 0.5).astype(np.uint8)
-    buffer = io.BytesIO()
-    Image.fromarray(pixels).save(buffer, format="PNG")
-    return write_bytes(path, buffer.getvalue())
+    return write_bytes(path, encode_image(to_pixels(image)))

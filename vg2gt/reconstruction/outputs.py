@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -25,12 +26,14 @@ from vg2gt.io import (
     write_splat,
     write_transforms,
 )
-from vg2gt.io.files import write_bytes, write_json
+from vg2gt.io.files import write_json
+from vg2gt.io.images import write_png
+from vg2gt.io.video import require_pyav
 from vg2gt.reconstruction.camera_paths import orbit
-from vg2gt.reconstruction.maps import MAPS, Animation, feed, map_sinks, png, to_pixels, whole_folder
+from vg2gt.reconstruction.maps import MAPS, AddView, animation, feed, map_sinks, whole_folder
 from vg2gt.reconstruction.monitor import Monitor
-from vg2gt.reconstruction.report import HtmlReport, PngReport
-from vg2gt.reconstruction.scene import RenderedView, Scene
+from vg2gt.reconstruction.report import html_rows, png_report, write_html_report
+from vg2gt.reconstruction.scene import Scene
 
 ORBIT_FRAMES, FPS = 72, 24.0
 MESH_PIXELS = 2.0  # edge of a mesh's voxel, in pixels at the median depth
@@ -53,7 +56,7 @@ OUTPUTS = {
     "nerfstudio": "transforms.json, points and images in nerfstudio/",
     "report.png": "input, colour, depth and normals of up to 12 views",
     "report.html": "the same of all views, with the run's figures",
-    "report.json": "the run's figures: backend, weights, sizes, time a stage, peak memory",
+    "report.json": "the run's figures: backend, weights, sizes, time per stage, peak memory",
 }
 DEFAULT = ("scene.ply", "cameras.json", "report.png", "report.json")
 
@@ -140,7 +143,8 @@ def write_outputs(
     check_outputs(outputs)
     folder = prepare_folder(folder, outputs, overwrite)
     monitor = monitor or Monitor()
-    animations = [Animation(folder / output, FPS) for output in outputs if output.startswith("orbit")]
+    if "orbit.mp4" in outputs:
+        require_pyav("writing orbit.mp4")
     plain = [output for output in outputs if output in _WRITERS]
     if plain:
         with monitor.stage("write files", len(plain)) as advance:
@@ -148,18 +152,24 @@ def write_outputs(
                 _WRITERS[output](scene, folder / _target(output))
                 advance()
     sinks = map_sinks(folder, outputs)
-    sinks += [MeshOutput(scene, folder, outputs, mesh_voxel)] if any(o.startswith("mesh") for o in outputs) else []
-    sinks += [PngReport(scene, folder / "report.png")] if "report.png" in outputs else []
-    page = HtmlReport(scene, folder / "report.html") if "report.html" in outputs else None
-    sinks += [page] if page else []
+    if meshes := [folder / output for output in outputs if output.startswith("mesh")]:
+        sinks.append(mesh_fusion(scene, meshes, mesh_voxel))
+    if "report.png" in outputs:
+        sinks.append(png_report(scene, folder / "report.png"))
+    rows: list[str] = []
+    if "report.html" in outputs:
+        sinks.append(html_rows(scene, rows))
     if sinks:
         with monitor.stage("render views", len(scene.names)) as advance:
             feed(scene.render(), sinks, advance)
-    if animations:
-        _turn(scene, animations, frames, monitor)
+    if orbits := [folder / output for output in outputs if output.startswith("orbit")]:
+        path = orbit(scene.named_cameras(), float(scene.depth[scene.depth > 0].median()), frames)
+        with monitor.stage("render orbit", len(path)) as advance:
+            feed(scene.render(path), [animation(file, FPS) for file in orbits], advance)
     facts = {**scene_figures(scene), **(figures or {}), **cost_figures(monitor)}
-    if page:
-        page.write(facts, folder / "orbit.gif" if "orbit.gif" in outputs else None)
+    if "report.html" in outputs:
+        gif = folder / "orbit.gif" if "orbit.gif" in outputs else None
+        write_html_report(folder / "report.html", rows, facts, gif)
     if "report.json" in outputs:
         write_json(folder / "report.json", facts)
     return folder
@@ -183,45 +193,29 @@ def cost_figures(monitor: Monitor) -> dict[str, Any]:
     return {"seconds": seconds, "peak_memory_mib": round(monitor.peak_memory_mib), "device": str(monitor.device)}
 
 
-class MeshOutput:
-    """Keeps the rendered depth and colour of the views and fuses them into a mesh."""
+@contextmanager
+def mesh_fusion(scene: Scene, paths: Sequence[Path], voxel_size: float | None) -> Iterator[AddView]:
+    """Keeps the rendered depth and colour of the views, fuses them into a mesh and writes it to the paths.
 
-    def __init__(self, scene: Scene, folder: Path, outputs: Sequence[str], voxel_size: float | None) -> None:
-        self.scene = scene
-        self.paths = [folder / output for output in outputs if output.startswith("mesh")]
-        self.voxel_size = voxel_size
-        self._depth: list[Tensor] = []
-        self._color: list[Tensor] = []
-
-    def add(self, view: RenderedView) -> None:
-        """Keeps what is needed of a view."""
-        self._depth.append(view.depth)
-        self._color.append(view.color)
-
-    def close(self) -> None:
-        """Fuses and writes."""
-        depth = torch.stack(self._depth)
-        if not (depth > 0).any():
-            raise ValueError("no view has rendered depth, so there is no mesh; leave mesh out of the outputs")
-        median = float(depth[depth > 0].median())
-        depth = torch.where(depth < _MESH_DEPTHS * median, depth, 0)
-        focal = float(self.scene.cameras.intrinsics[..., [0, 1], [0, 1]].mean())
-        voxel_size = self.voxel_size or MESH_PIXELS * median / focal
-        mesh = fuse_depth(depth, self.scene.cameras, torch.stack(self._color), voxel_size=voxel_size)
-        for path in self.paths:
-            write_mesh(path, mesh)
-
-
-def _turn(scene: Scene, animations: Sequence[Animation], frames: int, monitor: Monitor) -> None:
-    path = orbit(scene.named_cameras(), float(scene.depth[scene.depth > 0].median()), frames)
-    with monitor.stage("render orbit", len(path)) as advance:
-        feed(scene.render(path), animations, advance)
+    Raises:
+        ValueError: if no view has rendered depth.
+    """
+    kept: list[tuple[Tensor, Tensor]] = []
+    yield lambda view: kept.append((view.depth, view.color))
+    depth, colors = (torch.stack(maps) for maps in zip(*kept, strict=True))
+    if not (depth > 0).any():
+        raise ValueError("no view has rendered depth, so there is no mesh; leave mesh out of the outputs")
+    median = float(depth[depth > 0].median())
+    depth = torch.where(depth < _MESH_DEPTHS * median, depth, 0)
+    focal = float(scene.cameras.intrinsics[..., [0, 1], [0, 1]].mean())
+    mesh = fuse_depth(depth, scene.cameras, colors, voxel_size=voxel_size or MESH_PIXELS * median / focal)
+    for path in paths:
+        write_mesh(path, mesh)
 
 
 def _write_images(scene: Scene, folder: Path) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
     for name, image in zip(scene.names, scene.images, strict=True):
-        write_bytes(folder / f"{name}.png", png(to_pixels(image)))
+        write_png(folder / f"{name}.png", image)
 
 
 def _images(scene: Scene, target: Path) -> None:

@@ -90,7 +90,7 @@ def find_pictures(
     if not chosen:
         raise ValueError("there are no images to reconstruct; give image files, a folder of them, or a video")
     if max_images is not None and len(chosen) > max_images:
-        chosen = [chosen[i] for i in _spread(len(chosen), max_images)]
+        chosen = [chosen[i] for i in spread(len(chosen), max_images)]
     return _with_unique_names(chosen)
 
 
@@ -235,7 +235,7 @@ def _source(folder: Path) -> FileSource | None:
     return None
 
 
-def _spread(count: int, limit: int) -> Iterable[int]:
+def spread(count: int, limit: int) -> Iterable[int]:
     """``limit`` of ``count`` positions, evenly spread, the first and the last among them."""
     return [round(i * (count - 1) / max(limit - 1, 1)) for i in range(limit)]
 

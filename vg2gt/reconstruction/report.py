@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import base64
 import html
-import io
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import torch
-from PIL import Image
 from torch import Tensor
 
 from vg2gt.io.files import write_text
-from vg2gt.io.images import colorize_depth, colorize_normals, grid, write_png
-from vg2gt.reconstruction.maps import to_pixels
+from vg2gt.io.images import colorize_depth, colorize_normals, encode_image, grid, to_pixels, write_png
+from vg2gt.reconstruction.maps import AddView
+from vg2gt.reconstruction.pictures import spread
 from vg2gt.reconstruction.scene import RenderedView, Scene
 
 PANELS = ("input", "rendered colour", "rendered depth", "rendered normals")
@@ -29,68 +29,58 @@ table { border-collapse: collapse } td, th { padding: 2px 12px 2px 0; text-align
 """
 
 
-class PngReport:
-    """One picture with a row a view, of at most 12 views, evenly spread."""
+@contextmanager
+def png_report(scene: Scene, path: Path) -> Iterator[AddView]:
+    """Writes one picture with a row per view, of at most 12 views, evenly spread."""
+    count, depth_range = len(scene.names), _depth_range(scene)
+    numbers, wanted = iter(range(count)), spread(count, min(count, ROWS))
+    rows: list[list[Tensor]] = []
 
-    def __init__(self, scene: Scene, path: Path) -> None:
-        self.scene = scene
-        self.path = path
-        self._range = _depth_range(scene)
-        count = len(scene.names)
-        self._wanted = {round(i * (count - 1) / max(min(count, ROWS) - 1, 1)) for i in range(min(count, ROWS))}
-        self._rows: list[list[Tensor]] = []
-        self._next = 0
+    def add(view: RenderedView) -> None:
+        number = next(numbers)
+        if number in wanted:
+            rows.append(_panels(scene.images[number], view, depth_range))
 
-    def add(self, view: RenderedView) -> None:
-        """Draws the next view, if it is among those shown."""
-        if self._next in self._wanted:
-            self._rows.append(_panels(self.scene.images[self._next], view, self._range))
-        self._next += 1
-
-    def close(self) -> None:
-        """Writes the picture."""
-        write_png(self.path, grid(self._rows))
+    yield add
+    write_png(path, grid(rows))
 
 
-class HtmlReport:
-    """A page that holds all its pictures: figures of the run and a row a view."""
+@contextmanager
+def html_rows(scene: Scene, rows: list[str]) -> Iterator[AddView]:
+    """Appends a row per view, with all its pictures, for :func:`write_html_report`."""
+    depth_range = _depth_range(scene)
 
-    def __init__(self, scene: Scene, path: Path) -> None:
-        self.scene = scene
-        self.path = path
-        self._range = _depth_range(scene)
-        self._rows: list[str] = []
-
-    def add(self, view: RenderedView) -> None:
-        """Draws the next view."""
-        number = len(self._rows)
-        panels = _panels(self.scene.images[number], view, self._range)
+    def add(view: RenderedView) -> None:
+        panels = _panels(scene.images[len(rows)], view, depth_range)
         images = "".join(
-            f'<img src="{_jpeg(panel)}" alt="{name}" title="{name}">'
+            f'<img src="{_data("image/jpeg", encode_image(to_pixels(panel), "JPEG", quality=88))}" '
+            f'alt="{name}" title="{name}">'
             for name, panel in zip(PANELS, panels, strict=True)
         )
-        self._rows.append(f'<div class="view"><h3>{html.escape(self.scene.names[number])}</h3>{images}</div>')
+        rows.append(f'<div class="view"><h3>{html.escape(scene.names[len(rows)])}</h3>{images}</div>')
 
-    def close(self) -> None:
-        """Nothing yet: the figures are known at the very end."""
+    yield add
 
-    def write(self, figures: Mapping[str, Any], orbit: Path | None) -> None:
-        """Writes the page.
 
-        Args:
-            figures: the table at the top.
-            orbit: a GIF to show, or None.
-        """
-        rows = "".join(f"<tr><th>{html.escape(key)}</th><td>{_cell(value)}</td></tr>" for key, value in figures.items())
-        moving = ""
-        if orbit is not None:
-            moving = f'<p><img src="{_data("image/gif", orbit.read_bytes())}" alt="orbit"></p>'
-        title = f"Reconstruction of {len(self.scene.names)} views"
-        write_text(
-            self.path,
-            f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title><style>{_STYLE}</style>'
-            f"<h1>{title}</h1><table>{rows}</table>{moving}<p>{' | '.join(PANELS)}</p>{''.join(self._rows)}</html>\n",
-        )
+def write_html_report(path: Path, rows: Sequence[str], figures: Mapping[str, Any], orbit: Path | None) -> None:
+    """Writes a page that holds all its pictures.
+
+    Args:
+        path: the file.
+        rows: one per view, from :func:`html_rows`.
+        figures: the table at the top.
+        orbit: a GIF to show, or None.
+    """
+    table = "".join(f"<tr><th>{html.escape(key)}</th><td>{_cell(value)}</td></tr>" for key, value in figures.items())
+    moving = ""
+    if orbit is not None:
+        moving = f'<p><img src="{_data("image/gif", orbit.read_bytes())}" alt="orbit"></p>'
+    title = f"Reconstruction of {len(rows)} views"
+    write_text(
+        path,
+        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title><style>{_STYLE}</style>'
+        f"<h1>{title}</h1><table>{table}</table>{moving}<p>{' | '.join(PANELS)}</p>{''.join(rows)}</html>\n",
+    )
 
 
 def _panels(image: Tensor, view: RenderedView, depth_range: tuple[float, float]) -> list[Tensor]:
@@ -113,12 +103,6 @@ def _cell(value: Any) -> str:
 
 def _text(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value)
-
-
-def _jpeg(panel: Tensor) -> str:
-    buffer = io.BytesIO()
-    Image.fromarray(to_pixels(panel)).save(buffer, "JPEG", quality=88)
-    return _data("image/jpeg", buffer.getvalue())
 
 
 def _data(kind: str, content: bytes) -> str:

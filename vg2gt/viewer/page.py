@@ -9,17 +9,15 @@ from __future__ import annotations
 import base64
 import hashlib
 import html
-import io
 import json
 import re
 from pathlib import Path
 from typing import Any
 
-from PIL import Image
-
 from vg2gt.io.cameras_json import NamedCamera
 from vg2gt.io.errors import FormatError
 from vg2gt.io.files import write_text
+from vg2gt.io.images import encode_image
 from vg2gt.rendering.options import ALPHA_MIN, JACOBIAN_CLAMP, RenderOptions
 from vg2gt.types import Gaussians
 from vg2gt.viewer.content import ViewerScene
@@ -114,9 +112,7 @@ def _jpeg(scene: ViewerScene, index: int) -> str | None:
     picture = scene.picture(index)
     if picture is None:
         return None
-    buffer = io.BytesIO()
-    Image.fromarray(picture).save(buffer, format="JPEG", quality=_JPEG_QUALITY)
-    return base64.b64encode(buffer.getvalue()).decode()
+    return base64.b64encode(encode_image(picture, "JPEG", quality=_JPEG_QUALITY)).decode()
 
 
 def _json_in_html(content: Any) -> str:
