@@ -107,7 +107,10 @@ class Reconstructor(nn.Module, ABC):
         """
 
     def read_views(self, images: Tensor, hints: Hints | None) -> tuple[Tokens, Geometry, Tensor]:
-        """Runs the frozen backbone; returns its tokens, its geometry in the scene frame, and the unit ``[B]``."""
+        """Runs the frozen backbone (paper, eqn preliminary_vggt).
+
+        Returns its tokens, its geometry in the scene frame, and the unit ``[B]``.
+        """
         scenes, views, _, height, width = images.shape
         note_sizes({f"images of {height}x{width} in {scenes} scene{'s' * (scenes > 1)}": scenes * views}, anew=True)
         with stage("encode"):
@@ -162,7 +165,7 @@ class Reconstructor(nn.Module, ABC):
 
 
 class VG2GT(Reconstructor):
-    """Feed-forward Gaussian reconstruction on a frozen backbone.
+    """Feed-forward Gaussian reconstruction on a frozen backbone (paper, eqn propose).
 
     Args:
         backend: the frozen visual foundation model.

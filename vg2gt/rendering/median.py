@@ -38,13 +38,13 @@ class Rays(Protocol):
 
 
 def log_transmittance(t: Tensor, alpha: Tensor, peak: Tensor, precision: Tensor) -> Tensor:
-    """Every hit's share of ``ln T(t)``; all arguments have one value a hit."""
+    """Every hit's share of ``ln T(t)`` (paper, eqns volume_render and vacancy); all arguments have one value a hit."""
     occupied = torch.log1p(-alpha * torch.exp(-0.5 * precision * (t - peak) ** 2))
     return torch.where(t <= peak, 0.5 * occupied, torch.log1p(-alpha) - 0.5 * occupied)
 
 
 def slope(t: Tensor, alpha: Tensor, peak: Tensor, precision: Tensor) -> Tensor:
-    """Every hit's share of ``S = -d ln T / dt >= 0``."""
+    """Every hit's share of ``S = -d ln T / dt >= 0`` (paper, eqn sup_attenuation_coefficient)."""
     g = alpha * torch.exp(-0.5 * precision * (t - peak) ** 2)
     return 0.5 * g * precision * (t - peak).abs() / (1 - g)
 

@@ -58,7 +58,7 @@ def _voxels_of_metres(config: DictConfig) -> str | None:
     return (
         f"model.fine.voxel_size={fine.voxel_size:g} with model.scale.source=normalize, model.fine.min_footprint=0: the "
         f"median depth is {unit:g}, so that voxels may be smaller than pixels and fuse nothing; "
-        "experiment=paper_counts has one pixel"
+        "experiment=paper_counts has voxels of one pixel"
     )
 
 

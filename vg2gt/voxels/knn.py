@@ -37,7 +37,7 @@ def nearest_neighbors(queries: Tensor, points: Tensor, neighbors: int) -> Tensor
 def interpolation_weights(
     queries: Tensor, query_batch: Tensor, points: Tensor, point_batch: Tensor, neighbors: int
 ) -> tuple[Tensor, Tensor]:
-    """Neighbours within each scene and their weights ``1 / (d^2 + 1e-6)``, normalised to sum 1.
+    """Neighbours within each scene and their weights ``1 / (d^2 + 1e-6)``, normalised to sum 1 (paper: 16 nearest).
 
     Args:
         queries: ``[N, 3]`` in voxel units, the unit of d.
