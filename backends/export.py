@@ -1,22 +1,15 @@
-"""Writes a frozen network as an ONNX bundle with free numbers of scenes, views, rows and columns.
-
-python -m backends.export backend=da3_small out=FOLDER [backend.key=value ...]
-"""
+"""Writes a frozen network as an ONNX bundle with free numbers of scenes, views, rows and columns."""
 
 from __future__ import annotations
 
-import logging
 import os
+import runpy
 import shutil
-import sys
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
 import torch
-from hydra import compose, initialize_config_dir
-from hydra.errors import HydraException
-from hydra.utils import instantiate
 from safetensors.torch import save
 from torch import Tensor, nn
 from torch.export import Dim
@@ -35,7 +28,6 @@ from backends.bundle import (
 from backends.da3 import DA3Backend
 from backends.onnx import open_session, run_session
 from backends.vggt import VGGTBackend
-from vg2gt.config import config_dir
 from vg2gt.types import Cameras, Hints, Tokens
 
 Exportable = VGGTBackend | DA3Backend
@@ -92,13 +84,13 @@ def export(backend: Backend, out: Path) -> Description:
         What stands in the folder's ``backend.json``.
 
     Raises:
-        TypeError: if the backend has no graph to export.
+        ValueError: if the backend has no graph to export.
         FileExistsError: if ``out`` holds something.
         RuntimeError: if a size was fixed in the graph, or onnxruntime computes something else than torch.
         ImportError: if ``onnx`` or ``onnxscript`` is not installed.
     """
     if not isinstance(backend, VGGTBackend | DA3Backend):
-        raise TypeError(f"backend {backend.name} cannot be exported: VGGT and the relative DA3 networks can")
+        raise ValueError(f"backend {backend.name} cannot be exported: VGGT and the relative DA3 networks can")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise FileExistsError(f"{out} exists already: remove it or choose another out=FOLDER")
     _require("onnx", "onnxscript")
@@ -220,27 +212,5 @@ def _require(*packages: str) -> None:
             raise ImportError(f"export needs {package}: pip install 'vg2gt[export]'") from error
 
 
-def main(arguments: Sequence[str]) -> None:
-    """The command line.
-
-    Raises:
-        SystemExit: with the message, if the arguments are wrong or the backend cannot be built or written.
-    """
-    out = next((argument.removeprefix("out=") for argument in arguments if argument.startswith("out=")), "")
-    overrides = [argument for argument in arguments if not argument.startswith("out=")]
-    if not out or not any(override.startswith("backend=") for override in overrides):
-        sys.exit(__doc__)
-    overrides = [f"+{item}" if item.startswith("backend=") else item for item in overrides]
-    try:
-        with initialize_config_dir(config_dir(), version_base="1.3"):
-            config = compose(overrides=overrides)
-        description = export(instantiate(config.backend), Path(out).expanduser())
-    except (HydraException, ImportError, OSError, TypeError, ValueError) as error:
-        sys.exit(f"export failed: {error}")
-    differences = ", ".join(f"{part} {value:.1e}" for part, value in description.max_difference.items())
-    print(f"{out}: {description.name}, licence: {description.licence}; largest difference to torch: {differences}")
-
-
-if __name__ == "__main__":
-    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
-    main(sys.argv[1:])
+if __name__ == "__main__":  # python -m backends.export, the same as vg2gt export
+    runpy.run_module("vg2gt.cli.export", run_name="__main__")

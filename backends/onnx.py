@@ -21,7 +21,7 @@ CUDA, CPU = "CUDAExecutionProvider", "CPUExecutionProvider"
 
 
 class OnnxBackend(Backend):
-    """The network of a folder written by ``python -m backends.export``.
+    """The network of a folder written by ``vg2gt export``.
 
     Name, licence and identity are those of the exported network, so checkpoints fit both. Without
     ``decoder.safetensors`` in the folder, ``decode`` runs ``decoder.onnx`` and has no gradient.

@@ -1,7 +1,7 @@
 """Speed of the synthetic generator: ``python benchmarks/generator.py [--scenes N] [--size H W]``.
 
 Frames a second of one core, by the time that the process computed, so that other processes hardly matter: scenes made
-and rendered, and made, rendered and written to disk as ``python -m vg2gt.data.synthetic`` does. Compilation is left
+and rendered, and made, rendered and written to disk as ``vg2gt data synthetic`` does. Compilation is left
 out. Prints a table and writes a dated JSON file to ``benchmarks/results``.
 """
 

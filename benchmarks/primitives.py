@@ -179,9 +179,7 @@ def main() -> None:
     device = torch.device(arguments.device)
     overrides = list(arguments.overrides)
     if weights := [override for override in overrides if override.startswith(("ckpt=", "init_from="))]:
-        options.error(
-            f"{weights[0]}: only untrained models are measured here; python -m vg2gt.evaluate counts trained ones"
-        )
+        options.error(f"{weights[0]}: only untrained models are measured here; vg2gt evaluate counts trained ones")
     if not any(override.startswith("data=") for override in overrides):
         overrides = ["data.num_frames=64", *overrides]
     methods = [Method("pixel_aligned", None)]

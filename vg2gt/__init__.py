@@ -7,18 +7,19 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from vg2gt.model import VG2GT
-    from vg2gt.reconstruction import Scene, reconstruct, reconstruct_with
-    from vg2gt.runs.models import load_model
+    from vg2gt.reconstruction.pipeline import reconstruct, reconstruct_with
+    from vg2gt.reconstruction.scene import Scene
+    from vg2gt.runs.load import load_model
 
 __all__ = ["VG2GT", "Scene", "load_model", "reconstruct", "reconstruct_with"]
 __version__ = "0.1.0"
 
 _HOMES = {
     "VG2GT": "vg2gt.model",
-    "load_model": "vg2gt.runs.models",
-    "Scene": "vg2gt.reconstruction",
-    "reconstruct": "vg2gt.reconstruction",
-    "reconstruct_with": "vg2gt.reconstruction",
+    "load_model": "vg2gt.runs.load",
+    "Scene": "vg2gt.reconstruction.scene",
+    "reconstruct": "vg2gt.reconstruction.pipeline",
+    "reconstruct_with": "vg2gt.reconstruction.pipeline",
 }
 
 

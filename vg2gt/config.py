@@ -1,13 +1,22 @@
-"""Where the configuration groups are: inside the installed package, or beside it in a checkout."""
+"""Configurations: where the groups are, and how all commands, studies and tests compose them."""
 
+from __future__ import annotations
+
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
+
+import hydra
+from hydra.core.global_hydra import GlobalHydra
+from hydra.errors import HydraException
+from omegaconf import DictConfig
+from omegaconf.errors import OmegaConfBaseException
 
 _PACKAGE = Path(__file__).resolve().parent
 
 
 def config_dir() -> str:
-    """Returns the absolute path of the configuration folder.
+    """Returns the absolute path of the configuration folder: inside the installed package, or beside it in a checkout.
 
     Raises:
         FileNotFoundError: if neither the package nor the checkout holds it.
@@ -16,6 +25,39 @@ def config_dir() -> str:
         if (folder / "train.yaml").is_file():
             return str(folder)
     raise FileNotFoundError(f"no configuration folder with train.yaml in or beside {_PACKAGE}; reinstall vg2gt")
+
+
+def group_options(group: str) -> list[str]:
+    """The names that ``group=`` takes, sorted."""
+    return sorted(path.stem for path in Path(config_dir(), group).glob("*.yaml"))
+
+
+def compose(name: str | None, *overrides: str) -> DictConfig:
+    """Composes a configuration as the commands do, inside a command as well.
+
+    Args:
+        name: ``train``, ``evaluate``, ``ablate``, or one option such as ``loss/quickstart``; None: nothing but what
+            ``+group=option`` adds.
+        overrides: as on the command line.
+
+    Raises:
+        ValueError: if an override is wrong, with Hydra's reason in one line.
+    """
+    # Inside a command Hydra is initialised already, with the same folder.
+    inside = GlobalHydra.instance().is_initialized()
+    try:
+        with nullcontext() if inside else hydra.initialize_config_dir(config_dir(), version_base="1.3"):
+            return hydra.compose(name, list(overrides))
+    except (HydraException, OmegaConfBaseException) as error:
+        raise ValueError(hydra_message(error)) from error
+
+
+def hydra_message(error: Exception) -> str:
+    """What Hydra or OmegaConf say, in one line; where they have looked is left out."""
+    said = str(error).partition("Config search path")[0].removeprefix("In '_dummy_empty_config_': ")
+    if isinstance(error.__cause__, OmegaConfBaseException):
+        said += f" ({str(error.__cause__).splitlines()[0]})"
+    return " ".join(said.partition("    full_key")[0].split())
 
 
 def flatten(node: Any, prefix: str = "") -> dict[str, Any]:

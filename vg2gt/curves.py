@@ -1,6 +1,6 @@
 """``python -m vg2gt.curves RUN ...``: the same as ``vg2gt curves``."""
 
-from vg2gt.studies.curves import main
+from vg2gt.cli.curves import main
 
 if __name__ == "__main__":
     main()

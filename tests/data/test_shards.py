@@ -14,7 +14,6 @@ import torch
 from omegaconf import OmegaConf
 
 from vg2gt.data import DataError, Mixture, RGBDFolder, SceneDataModule, ShardedScenes, SyntheticScenes
-from vg2gt.data.commands import parse
 from vg2gt.data.framing import FramingSampler
 from vg2gt.data.sharded_scenes import INDEX
 from vg2gt.data.shards import Encoding, main, write_shards

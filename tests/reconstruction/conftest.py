@@ -9,8 +9,9 @@ from omegaconf import OmegaConf
 from PIL import Image
 
 from vg2gt.data import SyntheticScenes
-from vg2gt.reconstruction import Scene, load_model, reconstruct_with
-from vg2gt.runs.models import LoadedModel, compose_part
+from vg2gt.reconstruction.pipeline import reconstruct_with
+from vg2gt.reconstruction.scene import Scene
+from vg2gt.runs.load import LoadedModel, compose_part, load_model
 
 SIZE = (84, 112)
 ORACLE = "oracle,depth_noise=0"

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from vg2gt.io import NamedCamera
-from vg2gt.reconstruction import interpolate, orbit
+from vg2gt.reconstruction.camera_paths import interpolate, orbit
 
 K = np.array([[50.0, 0, 31.5], [0, 50, 23.5], [0, 0, 1]])
 

@@ -13,7 +13,7 @@ from vg2gt.cli import reconstruct as reconstruct_command
 from vg2gt.cli import render as render_command
 from vg2gt.io import read_cameras_json, read_gaussian_ply, write_cameras_json
 from vg2gt.io.video import count_frames
-from vg2gt.reconstruction import Scene
+from vg2gt.reconstruction.scene import Scene
 
 ORACLE = "oracle,depth_noise=0"
 

@@ -12,7 +12,7 @@ from vg2gt.cli import reconstruct as reconstruct_command
 from vg2gt.cli import render as render_command
 from vg2gt.io import read_cameras_json
 from vg2gt.io.video import has_pyav
-from vg2gt.reconstruction import OUTPUTS
+from vg2gt.reconstruction.output_names import OUTPUTS
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "reconstruct.md"

@@ -22,7 +22,9 @@ from vg2gt.io import (
     read_transforms,
     read_video,
 )
-from vg2gt.reconstruction import OUTPUTS, Scene, write_outputs
+from vg2gt.reconstruction.output_names import OUTPUTS
+from vg2gt.reconstruction.outputs import write_outputs
+from vg2gt.reconstruction.scene import Scene
 from vg2gt.types import Cameras
 
 VIDEOS = ("orbit.mp4",)  # needs PyAV

@@ -7,8 +7,9 @@ import torch
 from PIL import Image
 
 from vg2gt.io import write_video
-from vg2gt.reconstruction import Monitor, find_pictures, working_size
-from vg2gt.reconstruction.inputs import load_views
+from vg2gt.reconstruction.inputs import load_views, working_size
+from vg2gt.reconstruction.monitor import Monitor
+from vg2gt.reconstruction.pictures import find_pictures
 
 
 def _views(images, size=(84, 112), **options):

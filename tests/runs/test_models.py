@@ -4,8 +4,8 @@ import pytest
 import torch
 
 import vg2gt
-from vg2gt.reconstruction import OutOfMemory, load_model
-from vg2gt.runs.models import split_outside_brackets
+from vg2gt.memory import OutOfMemory
+from vg2gt.runs.load import load_model, split_outside_brackets
 
 
 def test_a_run_is_rebuilt_with_its_weights(run_folder: Path, ready) -> None:

@@ -12,8 +12,7 @@ from omegaconf import OmegaConf
 
 from vg2gt.data import SyntheticScenes
 from vg2gt.data.shards import write_shards
-from vg2gt.reconstruction import load_model
-from vg2gt.runs.models import compose_part
+from vg2gt.runs.load import compose_part, load_model
 
 SIZE = (24, 32)
 

@@ -22,8 +22,8 @@ from vg2gt.io.errors import FormatError
 from vg2gt.io.npz import load_npz, read_npz
 from vg2gt.io.tensors import read_tensors
 from vg2gt.metrics.lpips import load_lpips
-from vg2gt.reconstruction import load_model
 from vg2gt.runs.checkpoints import initialize_from, read_checkpoint
+from vg2gt.runs.load import load_model
 from vg2gt.training.checkpoint_io import AtomicCheckpointIO
 
 

@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 
 from vg2gt.config import config_dir
 from vg2gt.evaluation.checks import refuse_training_views
-from vg2gt.reconstruction import load_model
+from vg2gt.runs.load import load_model
 from vg2gt.runs.trust import ENVIRONMENT, UntrustedError, check_targets, read_run_config
 from vg2gt.studies.study import _refuse_other_run
 from vg2gt.training.loop import _name_differences

@@ -1,4 +1,4 @@
-"""How a command ends when the user can mend what went wrong."""
+"""How a command ends when the user can mend what went wrong: with one line, the same way for all commands."""
 
 from __future__ import annotations
 
@@ -8,30 +8,44 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import InstantiationException
+from hydra.errors import HydraException, InstantiationException
 from hydra.types import RunMode
+from omegaconf.errors import OmegaConfBaseException
 
-from vg2gt.memory import OutOfMemory
+from vg2gt.config import hydra_message
 
-USER_ERRORS = (ValueError, OSError, ImportError, ArithmeticError, OutOfMemory)
+USER_ERRORS = (
+    ValueError,
+    OSError,
+    ImportError,
+    ArithmeticError,
+    MemoryError,
+    HydraException,
+    OmegaConfBaseException,
+)
 TRACEBACK = "HYDRA_FULL_ERROR"
 
 
 @contextmanager
-def said_in_one_line() -> Iterator[None]:
+def errors_in_one_line() -> Iterator[None]:
     """Ends the process with the message of an error instead of its traceback.
 
     ``HYDRA_FULL_ERROR=1`` shows the traceback. In a sweep errors are left to Hydra, which runs the other jobs first.
     """
     try:
         yield
-    except (InstantiationException, *USER_ERRORS) as error:
-        if os.environ.get(TRACEBACK) or in_a_sweep():
+    except Exception as error:
+        if os.environ.get(TRACEBACK) or in_a_sweep() or not isinstance(error, USER_ERRORS):
             raise
         # A constructor's own error is the cause of Hydra's.
         cause = error.__cause__ or error if isinstance(error, InstantiationException) else error
-        # The line break ends a progress bar that was interrupted.
-        sys.exit(f"\n{type(cause).__name__}: {cause}\n({TRACEBACK}=1 shows where)")
+        if sys.stderr.isatty():
+            print(file=sys.stderr)  # ends a progress bar that was interrupted
+        if isinstance(cause, (HydraException, OmegaConfBaseException)):
+            said = hydra_message(cause)
+        else:
+            said = f"{type(cause).__name__}: {' '.join(str(cause).splitlines())}"
+        sys.exit(f"{said} ({TRACEBACK}=1 shows where)")
 
 
 def in_a_sweep() -> bool:

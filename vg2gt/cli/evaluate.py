@@ -1,21 +1,33 @@
 """``vg2gt evaluate``, or ``python -m vg2gt.evaluate``: a checkpoint's figures on a data set."""
 
-import hydra
+from __future__ import annotations
+
+from pathlib import Path
+
 from omegaconf import DictConfig, OmegaConf
 
-from vg2gt.cli.errors import said_in_one_line
-from vg2gt.config import config_dir
-from vg2gt.evaluation.run import evaluate
-from vg2gt.runs.load import run_name
+from vg2gt.cli.arguments import hydra_command
+from vg2gt.cli.commands import COMMANDS
+
+
+def run_name(ckpt: str | None) -> str:
+    """Name of the run to which a checkpoint belongs, for the evaluation's folder; ``untrained`` without one."""
+    if not ckpt:
+        return "untrained"
+    parts = [part for part in Path(ckpt).parts if part not in ("outputs", "checkpoints", "/", "..", ".")]
+    folders = parts[:-1] if parts[-1:] and parts[-1].endswith(".ckpt") else parts
+    return (folders or [Path(ckpt).stem])[-1]
+
 
 OmegaConf.register_new_resolver("run_name", run_name, replace=True)
 
 
-@hydra.main(version_base="1.3", config_path=config_dir(), config_name="evaluate")
+@hydra_command(COMMANDS["evaluate"], "evaluate")
 def main(config: DictConfig) -> None:
-    """Composes the configuration and runs the evaluation; what the user can mend is said in one line."""
-    with said_in_one_line():
-        evaluate(config)
+    """Runs the evaluation that the configuration describes."""
+    from vg2gt.evaluation.run import evaluate
+
+    evaluate(config)
 
 
 if __name__ == "__main__":

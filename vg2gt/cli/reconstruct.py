@@ -4,33 +4,22 @@ from __future__ import annotations
 
 import argparse
 import logging
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
-from rich.logging import RichHandler
+from vg2gt.cli.arguments import flag_parser, list_of_names, listing
+from vg2gt.cli.commands import COMMANDS
+from vg2gt.cli.errors import errors_in_one_line
+from vg2gt.reconstruction.output_names import DEFAULT, ORBIT_FRAMES, OUTPUTS
 
-from vg2gt.io.video import MissingDecoderError, require_pyav
-from vg2gt.memory import RECONSTRUCTION, memory_advice
-from vg2gt.reconstruction import OUTPUTS, LoadedModel, Monitor, OutOfMemory, load_model, reconstruct_with, write_outputs
-from vg2gt.reconstruction.outputs import DEFAULT, ORBIT_FRAMES, check_folder, check_outputs, cost_figures
-from vg2gt.reconstruction.pictures import existing_path
-from vg2gt.runs.load import choose_device
-
-EXPECTED_ERRORS = (ValueError, OSError, ImportError, OutOfMemory, MissingDecoderError)
+if TYPE_CHECKING:
+    from vg2gt.runs.load import LoadedModel
 
 
 def parser() -> argparse.ArgumentParser:
     """The command's arguments."""
-    listing = "\n".join(f"  {name:<13} {text}" for name, text in OUTPUTS.items())
-    arguments = argparse.ArgumentParser(
-        "vg2gt reconstruct",
-        description="Reconstructs a scene of 3D Gaussians from images.",
-        epilog=f"outputs of --save:\n{listing}",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    arguments = flag_parser("reconstruct", COMMANDS["reconstruct"], listing(OUTPUTS))
     add = arguments.add_argument
     add("images", nargs="+", help="image files, a folder of them, a video, or a recording with known cameras")
     add("--out", required=True, metavar="DIR", help="where to write")
@@ -38,7 +27,7 @@ def parser() -> argparse.ArgumentParser:
     add("--backend", metavar="NAME[,KEY=VALUE...]", help="of configs/backend; default: the run's own")
     add("--model", metavar="NAME[,KEY=VALUE...]", help="of configs/model; default: the run's own")
     add("--set", action="append", default=[], metavar="KEY=VALUE", help="another option, such as model.fine.max_voxels")
-    add("--save", type=_names, default=list(DEFAULT), metavar="LIST", help=f"default: {','.join(DEFAULT)}")
+    add("--save", type=list_of_names, default=list(DEFAULT), metavar="LIST", help=f"default: {','.join(DEFAULT)}")
     add("--size", type=_size, metavar="N|HxW", help="longer side, or height x width, in pixels; default 518, CPU 280")
     add("--every", type=int, default=1, metavar="N", help="take every N-th image or frame only")
     add("--max-images", type=int, metavar="N", help="take at most N, evenly spread; of a video 32 by default")
@@ -53,20 +42,29 @@ def parser() -> argparse.ArgumentParser:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Runs the command; ends with one line on what is wrong where something is."""
+    from rich.console import Console
+    from rich.logging import RichHandler
+
     options = parser().parse_args(argv)
     logging.basicConfig(
         level=logging.WARNING,
         format="%(message)s",
         handlers=[RichHandler(console=Console(stderr=True), show_time=False, show_path=False)],
     )
-    try:
+    with errors_in_one_line():
         run(options)
-    except EXPECTED_ERRORS as error:
-        sys.exit(f"{type(error).__name__}: {error}")
 
 
 def run(options: argparse.Namespace) -> None:
     """Reconstructs and writes."""
+    from vg2gt.io.video import require_pyav
+    from vg2gt.memory import RECONSTRUCTION, memory_advice
+    from vg2gt.reconstruction.monitor import Monitor
+    from vg2gt.reconstruction.outputs import check_folder, check_outputs, cost_figures, write_outputs
+    from vg2gt.reconstruction.pictures import existing_path
+    from vg2gt.reconstruction.pipeline import reconstruct_with
+    from vg2gt.runs.load import choose_device, load_model
+
     check_outputs(options.save)
     check_folder(options.out, options.save, options.overwrite)
     for item in options.images:  # before weights are downloaded
@@ -115,17 +113,9 @@ def _figures(ready: LoadedModel) -> dict[str, Any]:
     }
 
 
-def _names(text: str) -> list[str]:
-    return [name.strip() for name in text.split(",") if name.strip()]
-
-
 def _size(text: str) -> int | tuple[int, int]:
     sides = text.lower().split("x")
     if len(sides) > 2 or not all(side.isdigit() and int(side) > 0 for side in sides):
         raise argparse.ArgumentTypeError(f"{text!r} is neither N nor HxW, such as 518 or 294x518")
     numbers = [int(side) for side in sides]
     return numbers[0] if len(numbers) == 1 else (numbers[0], numbers[1])
-
-
-if __name__ == "__main__":
-    main()

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from vg2gt.cli.reconstruct import EXPECTED_ERRORS
-from vg2gt.io import read_cameras_json, read_gaussian_ply, read_splat
-from vg2gt.reconstruction import Monitor, interpolate, render_views
-from vg2gt.reconstruction.maps import MAPS, animation, feed, map_sinks
-from vg2gt.reconstruction.outputs import FPS, check_outputs, cost_figures, prepare_folder
-from vg2gt.rendering import Renderer
-from vg2gt.runs.load import choose_device
-from vg2gt.types import Gaussians
+from vg2gt.cli.arguments import flag_parser, list_of_names, listing
+from vg2gt.cli.commands import COMMANDS
+from vg2gt.cli.errors import errors_in_one_line
+from vg2gt.reconstruction.output_names import FPS, MAPS
+
+if TYPE_CHECKING:
+    from vg2gt.types import Gaussians
 
 OUTPUTS = {**MAPS, "video.gif": "the colour of all views as an animation", "video.mp4": "the same as H.264"}
 DEFAULT = ("color.png",)
@@ -22,18 +21,12 @@ DEFAULT = ("color.png",)
 
 def parser() -> argparse.ArgumentParser:
     """The command's arguments."""
-    listing = "\n".join(f"  {name:<12} {text}" for name, text in OUTPUTS.items())
-    arguments = argparse.ArgumentParser(
-        "vg2gt render",
-        description="Renders a scene of 3D Gaussians into the cameras of a cameras.json.",
-        epilog=f"outputs of --save:\n{listing}",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    arguments = flag_parser("render", COMMANDS["render"], listing(OUTPUTS))
     add = arguments.add_argument
     add("scene", help="scene.ply or scene.splat")
     add("--cameras", required=True, metavar="PATH", help="cameras.json")
     add("--out", required=True, metavar="DIR", help="where to write")
-    add("--save", default=",".join(DEFAULT), metavar="LIST", help=f"default: {','.join(DEFAULT)}")
+    add("--save", type=list_of_names, default=list(DEFAULT), metavar="LIST", help=f"default: {','.join(DEFAULT)}")
     add("--mode", choices=("solid", "rasterized"), default="solid")
     add("--depth", choices=("median", "expected"), default="median", help="expected: rasterized only")
     add("--interpolate", type=int, metavar="N", help="go smoothly through the cameras with N new ones between each two")
@@ -48,15 +41,22 @@ def parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> None:
     """Runs the command; ends with one line on what is wrong where something is."""
     options = parser().parse_args(argv)
-    try:
+    with errors_in_one_line():
         run(options)
-    except EXPECTED_ERRORS as error:
-        sys.exit(f"{type(error).__name__}: {error}")
 
 
 def run(options: argparse.Namespace) -> None:
     """Renders and writes."""
-    outputs = [name.strip() for name in options.save.split(",")]
+    from vg2gt.io import read_cameras_json
+    from vg2gt.reconstruction.camera_paths import interpolate
+    from vg2gt.reconstruction.maps import animation, feed, map_sinks
+    from vg2gt.reconstruction.monitor import Monitor
+    from vg2gt.reconstruction.outputs import check_outputs, cost_figures, prepare_folder
+    from vg2gt.reconstruction.scene import render_views
+    from vg2gt.rendering import Renderer
+    from vg2gt.runs.load import choose_device
+
+    outputs = options.save
     check_outputs(outputs, OUTPUTS)
     cameras = read_cameras_json(options.cameras)
     if not cameras:
@@ -83,6 +83,8 @@ def read_gaussians(path: str | Path) -> Gaussians:
         FileNotFoundError: if there is none.
         ValueError: if it cannot be read or has another suffix.
     """
+    from vg2gt.io import read_gaussian_ply, read_splat
+
     path = Path(path)
     readers = {".ply": read_gaussian_ply, ".splat": read_splat}
     if path.suffix.lower() not in readers:
@@ -90,7 +92,3 @@ def read_gaussians(path: str | Path) -> Gaussians:
     if not path.is_file():
         raise FileNotFoundError(f"no scene at {path}")
     return readers[path.suffix.lower()](path)
-
-
-if __name__ == "__main__":
-    main()

@@ -7,51 +7,53 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.typing import NDArray
+from vg2gt.cli.arguments import flag_parser
+from vg2gt.cli.commands import COMMANDS
+from vg2gt.cli.errors import errors_in_one_line
+from vg2gt.cli.render import read_gaussians
 
-from vg2gt.io import read_cameras_json, read_gaussian_ply, read_splat
-from vg2gt.io.cameras_json import NamedCamera
-from vg2gt.types import Gaussians
-from vg2gt.viewer import MissingViserError, ViewerScene, load_pictures, start_server, write_viewer_html
-from vg2gt.viewer.server import LOOPBACK, PORT
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from vg2gt.io.cameras_json import NamedCamera
+    from vg2gt.viewer import ViewerScene
 
 IMAGE_FOLDER = "images"  # beside cameras.json, as `vg2gt reconstruct --save images` writes it
-READERS = {".ply": read_gaussian_ply, ".splat": read_splat}
 
 
-def main() -> None:
+def main(argv: Sequence[str] | None = None) -> None:
     """Reads the arguments and shows the scene; what is wrong with them or the files ends it with one line."""
     parser = _parser()
-    arguments = parser.parse_args()
+    arguments = parser.parse_args(argv)
     if arguments.html is not None and (arguments.host, arguments.port, arguments.share) != (None, None, False):
         parser.error("--html writes a file and serves nothing; leave out --host, --port and --share")
     if arguments.images is not None and arguments.cameras is None:
         parser.error("--images needs --cameras, which names them")
-    try:
+    with errors_in_one_line():
         scene = _scene(arguments)
         if arguments.html is None:
             _serve(scene, arguments)
         else:
+            from vg2gt.viewer import write_viewer_html
+
             path = write_viewer_html(arguments.html, scene)
             print(f"{path}: {len(scene.gaussians)} Gaussians, {path.stat().st_size / 1e6:.1f} MB; open it in a browser")
-    except (ValueError, OSError, MissingViserError) as error:
-        parser.error(str(error))
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="vg2gt view", description="Shows a scene of Gaussians in the browser.")
-    parser.add_argument("scene", type=Path, help=f"Gaussians: {', '.join(READERS)}")
-    parser.add_argument("--cameras", type=Path, help="cameras.json of the scene; the first one is the initial view")
-    parser.add_argument(
-        "--images", type=Path, help="folder of the cameras' images; default: that of cameras.json, or images/ in it"
-    )
-    parser.add_argument("--html", type=Path, help="write one self-contained page to this file instead of serving")
-    parser.add_argument("--title", help="of the page; default: the scene's file name")
-    parser.add_argument("--host", help=f"address to listen on; default: {LOOPBACK}, this machine only")
-    parser.add_argument("--port", type=_port, help=f"first port to try; default: {PORT}")
-    parser.add_argument("--share", action="store_true", help="also publish the page through viser's public server")
+    parser = flag_parser("view", COMMANDS["view"])
+    add = parser.add_argument
+    add("scene", type=Path, help="scene.ply or scene.splat")
+    add("--cameras", type=Path, help="cameras.json of the scene; the first one is the initial view")
+    add("--images", type=Path, help="folder of the cameras' images; default: that of cameras.json, or images/ in it")
+    add("--html", type=Path, help="write one self-contained page to this file instead of serving")
+    add("--title", help="of the page; default: the scene's file name")
+    add("--host", help="address to listen on; default: 127.0.0.1, this machine only")
+    add("--port", type=_port, help="first port to try; default: 8080")
+    add("--share", action="store_true", help="also publish the page through viser's public server")
     return parser
 
 
@@ -63,7 +65,12 @@ def _port(text: str) -> int:
 
 
 def _scene(arguments: argparse.Namespace) -> ViewerScene:
-    gaussians = _read_gaussians(arguments.scene)
+    from vg2gt.io import read_cameras_json
+    from vg2gt.viewer import ViewerScene
+
+    gaussians = read_gaussians(arguments.scene)
+    if not len(gaussians):
+        raise ValueError(f"{arguments.scene} holds no Gaussians")
     title = arguments.title or arguments.scene.name
     if arguments.cameras is None:
         return ViewerScene(gaussians, title=title)
@@ -75,6 +82,8 @@ def _scene(arguments: argparse.Namespace) -> ViewerScene:
 
 def _pictures(cameras: Sequence[NamedCamera], folders: Sequence[Path]) -> list[NDArray[np.uint8] | None]:
     """The cameras' pictures from the first of the folders that has any; says where they are from."""
+    from vg2gt.viewer import load_pictures
+
     for folder in folders:
         pictures = load_pictures(cameras, folder)
         found = sum(picture is not None for picture in pictures)
@@ -86,17 +95,9 @@ def _pictures(cameras: Sequence[NamedCamera], folders: Sequence[Path]) -> list[N
     return []
 
 
-def _read_gaussians(path: Path) -> Gaussians:
-    read = READERS.get(path.suffix.lower())
-    if read is None:
-        raise ValueError(f"{path}: expected one of {', '.join(READERS)} by its name")
-    gaussians = read(path)
-    if not len(gaussians):
-        raise ValueError(f"{path} holds no Gaussians")
-    return gaussians
-
-
 def _serve(scene: ViewerScene, arguments: argparse.Namespace) -> None:
+    from vg2gt.viewer.server import LOOPBACK, PORT, start_server
+
     server = start_server(
         scene,
         LOOPBACK if arguments.host is None else arguments.host,
@@ -114,7 +115,3 @@ def _serve(scene: ViewerScene, arguments: argparse.Namespace) -> None:
         pass
     finally:
         server.stop()
-
-
-if __name__ == "__main__":
-    main()

@@ -61,7 +61,7 @@ def refuse_overlap(
         if not same and (part, place) in by_place:
             raise DataError(
                 f"evaluation scene {scene} and training scene {by_place[part, place][0]} show the same place "
-                f"({place}): give disjoint scenes, such as the lists that `python -m vg2gt.data.splits` writes; if "
+                f"({place}): give disjoint scenes, such as the lists that `vg2gt data splits` writes; if "
                 "they are different places, rename one"
             )
     if shared:
@@ -90,6 +90,6 @@ def _refuse_seen_targets(train: SceneSource, trained: str, scene: str, frames: s
     if seen:
         raise DataError(
             f"scene {scene} is used for training and for evaluation: {len(seen)} of its evaluation frames are not held "
-            "out of training; give disjoint scenes, such as the lists that `python -m vg2gt.data.splits` writes, or "
+            "out of training; give disjoint scenes, such as the lists that `vg2gt data splits` writes, or "
             "hold frames out of training (data.holdout); if they are different scenes, rename one"
         )

@@ -38,7 +38,7 @@ _META = {"has_depth": bool, "has_cameras": bool, "parts": dict, "scenes": dict}
 
 
 class ShardedScenes(SceneSource):
-    """Scenes written by ``python -m vg2gt.data.shards``.
+    """Scenes written by ``vg2gt data shards``.
 
     A frame is one range of one tar file, so frames are read in any order, and only those that are asked for: a step's
     views are a function of its number here as with files. Only the index (poses, intrinsics and offsets, about 150
@@ -146,7 +146,7 @@ class ShardedScenes(SceneSource):
                 content = file.read()  # pyright: ignore[reportAttributeAccessIssue]
         except FileNotFoundError as error:
             raise FileNotFoundError(
-                f"there are no shards in {self.root}: {INDEX} is missing; write them with python -m vg2gt.data.shards"
+                f"there are no shards in {self.root}: {INDEX} is missing; write them with vg2gt data shards"
             ) from error
         try:
             arrays = read_npz(io.BytesIO(content), ("meta", *ARRAYS))

@@ -1,18 +1,4 @@
-"""Writes a dataset as a few large tar files, to be read by range from a disk or straight from an object store.
-
-python -m vg2gt.data.shards out=FOLDER/train data=rgbd data.root=RECORDINGS [key=value ...]
-
-  out=FOLDER/train    a new folder; data=shards reads FOLDER/train, and FOLDER/val written with subset=val
-  subset=train        train or val: which scenes of the dataset
-  size=[224,448]      frames are made smaller until they just cover this size; []: they stay as they are
-  quality=0           1 to 100: colour as JPEG of this quality; 0: lossless (PNG)
-  shard_mb=256        a new tar file is begun after so many megabytes
-  workers=0           processes that decode and encode
-
-All other arguments choose the dataset as in `python train.py`. Frames that cannot be read are left out and counted. The
-tar files are in WebDataset's format. Copy the folder to where it is to be read from and train with
-data=shards data.root=FOLDER, which may be a URL (s3://, gs://, https://).
-"""
+"""Writes a dataset as a few large tar files, to be read by range from a disk or straight from an object store."""
 
 from __future__ import annotations
 
@@ -21,6 +7,7 @@ import io
 import json
 import logging
 import os
+import runpy
 import sys
 import tarfile
 from collections import Counter
@@ -36,7 +23,6 @@ from rich.progress import track
 from torch.utils.data import DataLoader, Dataset
 
 from vg2gt.data.base import DataError, SceneSource
-from vg2gt.data.commands import parse
 from vg2gt.data.sharded_scenes import ARRAYS, INDEX, VERSION
 from vg2gt.data.transforms import reduce_to_cover, to_bytes
 from vg2gt.io.files import write_bytes
@@ -238,29 +224,6 @@ def _index(columns: dict[str, list], meta: dict[str, Any]) -> bytes:
     return buffer.getvalue()
 
 
-def main(arguments: Sequence[str]) -> None:
-    """The command line.
-
-    Raises:
-        SystemExit: with the message, if the arguments are wrong or nothing can be written.
-    """
-    if not arguments or {"-h", "--help"} & set(arguments):
-        print(__doc__)
-        sys.exit(0 if arguments else 2)
-    defaults = {"out": None, "subset": "train", "size": [224, 448], "quality": 0, "shard_mb": 256.0, "workers": 0}
-    try:
-        options, module = parse(arguments, defaults)
-        if options["subset"] not in ("train", "val"):
-            raise ValueError(f"option subset must be train or val, got {options['subset']}")
-        source = module.train_source() if options["subset"] == "train" else module.val_source()
-        size = tuple(options["size"]) or None
-        out = Path(options["out"]).expanduser()
-        encoding = Encoding(size, options["quality"])
-        counts = write_shards(source, out, encoding, options["shard_mb"], options["workers"], progress=True)
-    except (OSError, ValueError) as error:
-        sys.exit(f"shards: {error}")
-    print(f"{out}: " + ", ".join(f"{count} {what}" for what, count in counts.items()))
-
-
-if __name__ == "__main__":
-    main(sys.argv[1:])
+if __name__ == "__main__":  # python -m vg2gt.data.shards, the same as vg2gt data shards
+    sys.argv[1:1] = ["shards"]
+    runpy.run_module("vg2gt.cli.data", run_name="__main__")

@@ -1,27 +1,16 @@
-"""Divides the scenes of a dataset into training and evaluation lists; recordings of one place stay together.
-
-python -m vg2gt.data.splits out=FOLDER data=rgbd data.root=RECORDINGS [key=value ...]
-
-  out=FOLDER        where train.txt and val.txt are written
-  fraction=0.1      share of the places that goes to val.txt, of every part of a mixture
-  split_seed=0      another seed, another division
-
-All other arguments choose the dataset as in `python train.py`; the scenes of data.train are divided. Use the lists with
-data.train.scenes=FOLDER/train.txt data.val.scenes=FOLDER/val.txt
-"""
+"""Divides the scenes of a dataset into training and evaluation lists; recordings of one place stay together."""
 
 from __future__ import annotations
 
 import logging
+import runpy
 import sys
 import zlib
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from vg2gt.data.base import DataError, SceneSource
-from vg2gt.data.commands import parse
 from vg2gt.io.files import write_text
 
 log = logging.getLogger(__name__)
@@ -85,24 +74,6 @@ def write_splits(out: Path, source: SceneSource, fraction: float, seed: int) -> 
     return paths
 
 
-def main(arguments: Sequence[str]) -> None:
-    """The command line.
-
-    Raises:
-        SystemExit: with the message, if the arguments are wrong or the scenes cannot be divided.
-    """
-    if not arguments or {"-h", "--help"} & set(arguments):
-        print(__doc__)
-        sys.exit(0 if arguments else 2)
-    try:
-        options, module = parse(arguments, {"out": None, "fraction": 0.1, "split_seed": 0})
-        out = Path(options["out"]).expanduser()
-        paths = write_splits(out, module.train_source(), options["fraction"], options["split_seed"])
-    except (OSError, ValueError) as error:
-        sys.exit(f"splits: {error}")
-    for path in paths:
-        print(f"{path}: {len(path.read_text().splitlines()) - 1} scenes")
-
-
-if __name__ == "__main__":
-    main(sys.argv[1:])
+if __name__ == "__main__":  # python -m vg2gt.data.splits, the same as vg2gt data splits
+    sys.argv[1:1] = ["splits"]
+    runpy.run_module("vg2gt.cli.data", run_name="__main__")

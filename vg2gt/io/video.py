@@ -43,7 +43,7 @@ _PALETTE = 255
 _CONTAINERS = "mov,matroska,avi,mpegts,mpeg,flv,asf,ogg"
 
 
-class MissingDecoderError(RuntimeError):
+class MissingDecoderError(ImportError):
     """There is no PyAV; the message says how to get it."""
 
 

@@ -19,20 +19,13 @@ from vg2gt.io.files import write_bytes
 from vg2gt.io.images import colorize_normals, encode_image, to_pixels
 from vg2gt.io.video import write_video
 from vg2gt.reconstruction.camera_paths import view_stem
+from vg2gt.reconstruction.output_names import MAPS
 from vg2gt.reconstruction.scene import RenderedView
 
 log = logging.getLogger(__name__)
 
 DEPTH_STEPS = 1000  # stored depth units per scene unit in a 16-bit PNG
 _LARGEST = 65535
-
-MAPS = {
-    "color.png": "rendered colour, a PNG per view in color/",
-    "depth.png": "rendered depth, a 16-bit PNG per view in depth/: thousandths of the scene unit, 0 = none",
-    "depth.npy": "rendered depth, a float32 array per view in depth/, scene units, 0 = none",
-    "normals.png": "rendered normals, a coloured PNG per view in normals/",
-    "normals.npy": "rendered normals, a float32 array [3, H, W] per view in normals/, the camera's frame",
-}
 
 AddView: TypeAlias = Callable[[RenderedView], None]
 Sink: TypeAlias = AbstractContextManager[AddView]

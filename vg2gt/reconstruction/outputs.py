@@ -30,35 +30,14 @@ from vg2gt.io.files import write_json
 from vg2gt.io.images import write_png
 from vg2gt.io.video import require_pyav
 from vg2gt.reconstruction.camera_paths import orbit
-from vg2gt.reconstruction.maps import MAPS, AddView, animation, feed, map_sinks, whole_folder
+from vg2gt.reconstruction.maps import AddView, animation, feed, map_sinks, whole_folder
 from vg2gt.reconstruction.monitor import Monitor
+from vg2gt.reconstruction.output_names import DEFAULT, FPS, MAPS, ORBIT_FRAMES, OUTPUTS
 from vg2gt.reconstruction.report import html_rows, png_report, write_html_report
 from vg2gt.reconstruction.scene import Scene
 
-ORBIT_FRAMES, FPS = 72, 24.0
 MESH_PIXELS = 2.0  # edge of a mesh's voxel, in pixels at the median depth
 _MESH_DEPTHS = 10.0  # in median depths: what is farther is left out of the mesh
-
-OUTPUTS = {
-    "scene.ply": "the Gaussians, as 3D Gaussian Splatting writes them",
-    "scene.splat": "the Gaussians, 32 bytes each, for web viewers",
-    "cameras.json": "the cameras of the views",
-    "points.ply": "coloured points of the decoded depth",
-    "points.glb": "the same points and the cameras, for any 3D viewer",
-    "images": "the input images at the working size, PNGs in images/",
-    **MAPS,
-    "mesh.ply": "a mesh fused from rendered depth",
-    "mesh.glb": "the same as GLB",
-    "mesh.obj": "the same as OBJ",
-    "orbit.gif": "an animation about the central view",
-    "orbit.mp4": "the same as H.264",
-    "colmap": "a COLMAP model and its images in colmap/",
-    "nerfstudio": "transforms.json, points and images in nerfstudio/",
-    "report.png": "input, colour, depth and normals of up to 12 views",
-    "report.html": "the same of all views, with the run's figures",
-    "report.json": "the run's figures: backend, weights, sizes, time per stage, peak memory",
-}
-DEFAULT = ("scene.ply", "cameras.json", "report.png", "report.json")
 
 
 def check_outputs(outputs: Sequence[str], known: Mapping[str, str] = OUTPUTS) -> None:

@@ -13,7 +13,7 @@ from vg2gt.reconstruction.monitor import Monitor
 from vg2gt.reconstruction.pictures import ImagesLike, find_pictures
 from vg2gt.reconstruction.scene import Scene
 from vg2gt.rendering import Renderer
-from vg2gt.runs.models import load_model
+from vg2gt.runs.load import load_model
 from vg2gt.types import Prediction
 
 

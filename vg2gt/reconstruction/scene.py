@@ -102,7 +102,7 @@ class Scene:
         return ScenePoints(world[grid][keep].numpy(), colors.numpy(), view.numpy(), pixels.numpy())
 
     def save(self, folder: str | Path, outputs: Sequence[str] = ("scene.ply", "cameras.json", "report.png")) -> None:
-        """Writes files into a folder; :data:`vg2gt.reconstruction.OUTPUTS` lists what there is.
+        """Writes files into a folder; :data:`vg2gt.reconstruction.output_names.OUTPUTS` lists what there is.
 
         Raises:
             FileExistsError: if one is there already.

@@ -18,12 +18,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from vg2gt.cli.errors import said_in_one_line
-from vg2gt.config import config_dir
 from vg2gt.evaluation.paper import tables
 from vg2gt.evaluation.tables import Metric, columns, markdown_table
 from vg2gt.io.files import write_json, write_text
@@ -218,7 +215,7 @@ class Ablation:
             "differs from the full model's, the last layer starts anew; the control shows what that alone costs, and "
             "is what these rows are compared with in the last table. The paper's rows are Replica, 30000 more steps, "
             "and LPIPS of VGG; compare orders, not values. LPIPS is not measured "
-            "while training: python -m vg2gt.evaluate ckpt=RUN has it, if its weights are there."
+            "while training: vg2gt evaluate ckpt=RUN has it, if its weights are there."
         )
 
 
@@ -291,12 +288,14 @@ def common_overrides(overrides: Sequence[str]) -> list[str]:
     return kept
 
 
-@hydra.main(version_base="1.3", config_path=config_dir(), config_name="ablate")
-def main(config: DictConfig) -> None:
-    """Composes the study and runs it; what the user can mend is said in one line."""
-    with said_in_one_line():
-        study = _study(config)
-        study.run()
+def run_study(config: DictConfig) -> None:
+    """Runs the study of ``ablate.yaml`` inside a command and prints its tables.
+
+    Raises:
+        SystemExit: if a continuation diverged.
+    """
+    study = _study(config)
+    study.run()
     print(study.report())
     print(f"metrics: {study.folder / 'metrics.json'}")
     if study.diverged:
@@ -320,7 +319,3 @@ def _study(config: DictConfig) -> Ablation:
         list(config.variants),
         list(config.splits),
     )
-
-
-if __name__ == "__main__":
-    main()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import csv
 import math
 from pathlib import Path
@@ -97,16 +96,3 @@ def plot_curves(runs: list[Path], out: Path) -> Path:
     pyplot.close(figure)
     temporary.replace(out)
     return out
-
-
-def main() -> None:
-    """Reads the runs and writes the picture."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("runs", type=Path, nargs="+", help="folders of runs")
-    parser.add_argument("--out", type=Path, help="the PNG file; default: curves.png in the first run's folder")
-    arguments = parser.parse_args()
-    print(plot_curves(arguments.runs, arguments.out or arguments.runs[0] / "curves.png"))
-
-
-if __name__ == "__main__":
-    main()

@@ -12,13 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from hydra import compose, initialize_config_dir
-from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig, OmegaConf
 from scipy.stats import t as student
 from torch import Tensor
 
-from vg2gt.config import config_dir, flatten
+from vg2gt.config import compose, flatten
 from vg2gt.evaluation.tables import Metric, markdown_table, number
 from vg2gt.io.files import read_json, write_json, write_text
 from vg2gt.runs.checkpoints import newest_valid, read_checkpoint
@@ -38,11 +36,7 @@ NOT_COMPARED = ("data.workers", "data.memory_mb", "data.cache_dir")
 
 def compose_run(overrides: Sequence[str], folder: Path) -> DictConfig:
     """Composes the configuration of one training whose folder is ``folder``."""
-    overrides = [*overrides, f"output_dir={quoted(folder)}", "hydra/job_logging=default"]
-    if GlobalHydra.instance().is_initialized():
-        return compose("train", overrides)
-    with initialize_config_dir(config_dir(), version_base="1.3"):
-        return compose("train", overrides)
+    return compose("train", *overrides, f"output_dir={quoted(folder)}")
 
 
 def run_once(overrides: Sequence[str], folder: Path) -> Metrics:

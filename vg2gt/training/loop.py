@@ -139,7 +139,7 @@ def train(config: DictConfig) -> dict[str, Any]:
         run.datamodule.setup("fit")  # before anything is measured: faults of the data are named first
     if not run.module.model.trained_parameters():
         raise ValueError(
-            f"{type(run.module.model).__name__} has no trained part: evaluate it as it is (python -m vg2gt.evaluate), "
+            f"{type(run.module.model).__name__} has no trained part: evaluate it as it is (vg2gt evaluate), "
             "or choose another model="
         )
     if checkpoint is not None:

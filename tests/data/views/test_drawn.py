@@ -3,8 +3,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
-
 from vg2gt.cli.views import write_views
+
 from vg2gt.data.base import DataError, Frames, SceneSource
 from vg2gt.data.views.drawn import INDICES, index_path, make_index, read_index
 from vg2gt.data.views.sampling import SceneSample

@@ -1,0 +1,18 @@
+"""``vg2gt ablate``, or ``python -m vg2gt.ablate``: the paper's ablations on our data."""
+
+from omegaconf import DictConfig
+
+from vg2gt.cli.arguments import hydra_command
+from vg2gt.cli.commands import COMMANDS
+
+
+@hydra_command(COMMANDS["ablate"], "ablate")
+def main(config: DictConfig) -> None:
+    """Runs the study that the configuration describes."""
+    from vg2gt.studies.ablation import run_study
+
+    run_study(config)
+
+
+if __name__ == "__main__":
+    main()

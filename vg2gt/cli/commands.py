@@ -1,0 +1,131 @@
+"""All commands of ``vg2gt``: what each does, an example, where it is. Imports none of them: help comes at once."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from difflib import get_close_matches
+
+import vg2gt
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command of the command line.
+
+    Attributes:
+        entry: ``module:function``; the function takes its arguments from ``sys.argv``.
+        does: one line of what it does.
+        example: a command line.
+    """
+
+    entry: str
+    does: str
+    example: str
+
+
+COMMANDS = {
+    "train": Command(
+        "vg2gt.cli.train:main",
+        "trains a model and shows what it gave; the same as python train.py",
+        "vg2gt train name=first trainer.max_steps=200",
+    ),
+    "evaluate": Command(
+        "vg2gt.cli.evaluate:main",
+        "measures a checkpoint on a data set",
+        "vg2gt evaluate ckpt=outputs/quickstart data=synthetic 'views=[3,10,20]'",
+    ),
+    "ablate": Command(
+        "vg2gt.cli.ablate:main",
+        "trains and compares the paper's ablations over seeds",
+        "vg2gt ablate seeds=3 steps=100",
+    ),
+    "reconstruct": Command(
+        "vg2gt.cli.reconstruct:main",
+        "makes a scene of Gaussians from images, a folder of them or a video",
+        "vg2gt reconstruct photos/ --backend da3_small --out outputs/photos",
+    ),
+    "render": Command(
+        "vg2gt.cli.render:main",
+        "renders a scene into the cameras of a cameras.json",
+        "vg2gt render scene.ply --cameras cameras.json --save color.png --out views",
+    ),
+    "view": Command(
+        "vg2gt.cli.view:main",
+        "shows a scene in the browser, live or as one page",
+        "vg2gt view scene.ply --cameras cameras.json --html scene.html",
+    ),
+    "export": Command(
+        "vg2gt.cli.export:main",
+        "writes a frozen network as an ONNX bundle",
+        "vg2gt export backend=da3_small out=bundles/da3_small",
+    ),
+    "data": Command(
+        "vg2gt.cli.data:main",
+        "makes scenes, shards, splits and lists of views",
+        "vg2gt data synthetic out=rooms scenes=100",
+    ),
+    "curves": Command(
+        "vg2gt.cli.curves:main",
+        "draws training curves of one or several runs",
+        "vg2gt curves outputs/quickstart",
+    ),
+}
+
+DATA_COMMANDS = {
+    "synthetic": Command(
+        "vg2gt.cli.data:synthetic",
+        "writes procedural rooms and streets as RGB-D recordings",
+        "vg2gt data synthetic out=rooms scenes=100",
+    ),
+    "shards": Command(
+        "vg2gt.cli.data:shards",
+        "writes a dataset as a few large tar files",
+        "vg2gt data shards out=shards/train data=rgbd data.root=RECORDINGS",
+    ),
+    "splits": Command(
+        "vg2gt.cli.data:splits",
+        "divides a dataset's scenes into training and evaluation lists",
+        "vg2gt data splits out=lists data=rgbd data.root=RECORDINGS",
+    ),
+    "views": Command(
+        "vg2gt.cli.data:views",
+        "draws the views of an evaluation and writes them down",
+        "vg2gt data views evaluation=rgbd data.root=RECORDINGS out=views.json",
+    ),
+}
+
+
+def dispatch(program: str, commands: Mapping[str, Command]) -> None:
+    """Runs ``program COMMAND [arguments]``; lists the commands if none is named.
+
+    Raises:
+        SystemExit: if there is no such command, naming the nearest.
+    """
+    asked = sys.argv[1] if len(sys.argv) > 1 else ""
+    if asked in ("", "-h", "--help"):
+        print(listing(program, commands))
+        sys.exit(0 if asked else 2)
+    if asked == "--version":
+        print(f"vg2gt {vg2gt.__version__}")
+        return
+    if asked not in commands:
+        near = get_close_matches(asked, commands, 1)
+        advice = f", did you mean {near[0]}?" if near else ""
+        print(f"{program}: unknown command {asked!r}{advice} ({program} --help lists all)", file=sys.stderr)
+        sys.exit(2)
+    module, _, function = commands[asked].entry.partition(":")
+    command = importlib.import_module(module)
+    # Further processes (DDP) are started as argv says: by the command's own file, without the command's name.
+    sys.argv[:2] = [str(command.__file__)]
+    getattr(command, function)()
+
+
+def listing(program: str, commands: Mapping[str, Command]) -> str:
+    """One line and an example for each command."""
+    lines = [f"usage: {program} COMMAND [arguments]", ""]
+    for name, command in commands.items():
+        lines += [f"  {name:<12} {command.does}", f"  {'':<12}   {command.example}"]
+    return "\n".join([*lines, "", f"{program} COMMAND --help explains one of them."])

@@ -1,0 +1,32 @@
+"""What can be written of a scene. Imports nothing, so that a command's help lists it at once."""
+
+ORBIT_FRAMES, FPS = 72, 24.0
+
+MAPS = {
+    "color.png": "rendered colour, a PNG per view in color/",
+    "depth.png": "rendered depth, a 16-bit PNG per view in depth/: thousandths of the scene unit, 0 = none",
+    "depth.npy": "rendered depth, a float32 array per view in depth/, scene units, 0 = none",
+    "normals.png": "rendered normals, a coloured PNG per view in normals/",
+    "normals.npy": "rendered normals, a float32 array [3, H, W] per view in normals/, the camera's frame",
+}
+
+OUTPUTS = {
+    "scene.ply": "the Gaussians, as 3D Gaussian Splatting writes them",
+    "scene.splat": "the Gaussians, 32 bytes each, for web viewers",
+    "cameras.json": "the cameras of the views",
+    "points.ply": "coloured points of the decoded depth",
+    "points.glb": "the same points and the cameras, for any 3D viewer",
+    "images": "the input images at the working size, PNGs in images/",
+    **MAPS,
+    "mesh.ply": "a mesh fused from rendered depth",
+    "mesh.glb": "the same as GLB",
+    "mesh.obj": "the same as OBJ",
+    "orbit.gif": "an animation about the central view",
+    "orbit.mp4": "the same as H.264",
+    "colmap": "a COLMAP model and its images in colmap/",
+    "nerfstudio": "transforms.json, points and images in nerfstudio/",
+    "report.png": "input, colour, depth and normals of up to 12 views",
+    "report.html": "the same of all views, with the run's figures",
+    "report.json": "the run's figures: backend, weights, sizes, time per stage, peak memory",
+}
+DEFAULT = ("scene.ply", "cameras.json", "report.png", "report.json")
