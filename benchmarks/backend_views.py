@@ -20,14 +20,13 @@ from typing import TypeVar
 
 import torch
 from common import PeakMemory, machine, parser, used_seconds, write_results
-from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 from render_scene import room_cameras
 
 from backends.base import Backend
 from vg2gt import __version__
-from vg2gt.config import config_dir
+from vg2gt.config import compose
 from vg2gt.evaluation.tables import print_table
 from vg2gt.types import Hints, Tokens
 
@@ -49,8 +48,7 @@ def build(name: str, device: torch.device) -> Backend:
     Raises:
         ValueError: if it has no weights that could be random.
     """
-    with initialize_config_dir(config_dir(), version_base="1.3"):
-        config = compose("train", [f"backend={name}"]).backend
+    config = compose("train", f"backend={name}").backend
     parts = [config, *(part for part in config.values() if isinstance(part, DictConfig))]  # nested: two networks
     parts = [part for part in parts if "pretrained" in part]
     if not parts:

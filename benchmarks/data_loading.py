@@ -19,11 +19,10 @@ from typing import Any
 
 import torch
 from common import machine, parser, training_step, write_results
-from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from PIL import Image
 
-from vg2gt.config import config_dir
+from vg2gt.config import compose
 from vg2gt.data import RGBDFolder
 from vg2gt.data.shards import Encoding, write_shards
 from vg2gt.data.synthetic.export import SceneSettings, missing_scenes, write_scenes
@@ -69,8 +68,7 @@ def configure(overrides: list[str], workers: int, steps: int, size: tuple[int, i
     views = [f"data.{name}_views={VIEWS}" for name in ("min", "max")]
     fixed = [f"data.image_size=[{size[0]},{size[1]}]", f"data.max_images={VIEWS}", "data.target_views=0"]
     fixed += [f"data.workers={workers}", f"data.steps_per_epoch={steps}", "trainer.accelerator=cpu"]
-    with tempfile.TemporaryDirectory() as folder, initialize_config_dir(config_dir(), version_base="1.3"):
-        return compose("train", [f"output_dir={folder}", "hydra/job_logging=default", *overrides, *views, *fixed])
+    return compose("train", "output_dir=.", *overrides, *views, *fixed)
 
 
 def batches(overrides: list[str], workers: int, steps: int, size: tuple[int, int] = SIZE) -> Iterator[Batch]:

@@ -3,11 +3,10 @@
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
 from backends.export import export
-from vg2gt.config import config_dir
+from vg2gt.config import compose
 
 SHALLOW = ["+backend=da3_tiny", "backend.depth=4", "backend.multiview_from=1", "backend.taps=[0,1,2,3]"]
 
@@ -25,8 +24,7 @@ def shared() -> Path:
 @pytest.fixture(scope="session")
 def shallow_da3():
     """The network behind :func:`onnx_bundle`: da3_tiny with half its blocks, to export faster."""
-    with initialize_config_dir(config_dir(), version_base="1.3"):
-        return instantiate(compose(overrides=SHALLOW).backend)
+    return instantiate(compose(None, *SHALLOW).backend)
 
 
 @pytest.fixture(scope="session")

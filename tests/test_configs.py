@@ -7,26 +7,19 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hydra import compose, initialize_config_dir
 from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from tests.training_helpers import full_model
-from vg2gt.config import config_dir
+from vg2gt.config import compose, group_options
 from vg2gt.losses import VG2GTLoss
 from vg2gt.training.loop import build
 
-CONFIGS = Path(config_dir())
 OPTIONAL_PACKAGES = {"wandb": "wandb", "tensorboard": "tensorboard"}
 
 
-def names(group: str) -> list[str]:
-    return sorted(path.stem for path in (CONFIGS / group).glob("*.yaml"))
-
-
 def composed(tmp_path: Path, *overrides: str) -> DictConfig:
-    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
-        return compose("train", [f"output_dir={tmp_path}", "hydra/job_logging=default", *overrides])
+    return compose("train", f"output_dir={tmp_path}", *overrides)
 
 
 def targets(node: Any, where: str = "") -> Iterator[tuple[str, dict[str, Any]]]:
@@ -66,7 +59,7 @@ def accepts(target: dict[str, Any], key: str) -> bool:
 GROUPS = ["backend", "model", "data", "loss", "renderer", "optimizer", "trainer", "callbacks", "logger"]
 
 
-@pytest.mark.parametrize(("group", "name"), [(group, name) for group in GROUPS for name in names(group)])
+@pytest.mark.parametrize(("group", "name"), [(group, name) for group in GROUPS for name in group_options(group)])
 def test_every_option_composes_and_fits_its_constructor(tmp_path: Path, group: str, name: str) -> None:
     if name in OPTIONAL_PACKAGES and importlib.util.find_spec(OPTIONAL_PACKAGES[name]) is None:
         pytest.skip(f"{name} is not installed (extra: log)")
@@ -86,19 +79,19 @@ def test_misspelt_options_of_data_are_found(tmp_path: Path, name: str) -> None:
 
 @pytest.mark.parametrize("group", ["experiment", "ablation", "debug"])
 def test_every_preset_composes(tmp_path: Path, group: str) -> None:
-    assert names(group)
-    for name in names(group):
+    assert group_options(group)
+    for name in group_options(group):
         config = composed(tmp_path, f"{group}={name}")
         assert assert_signatures_fit(OmegaConf.to_container(config, resolve=True)) >= 8
 
 
 @pytest.mark.parametrize("group", ["loss", "renderer", "optimizer"])
 def test_parts_instantiate(tmp_path: Path, group: str) -> None:
-    for name in names(group):
+    for name in group_options(group):
         assert callable(instantiate(composed(tmp_path, f"{group}={name}")[group]))
 
 
-@pytest.mark.parametrize("ablation", names("ablation"))
+@pytest.mark.parametrize("ablation", group_options("ablation"))
 def test_every_ablation_builds_what_it_says(tmp_path: Path, ablation: str) -> None:
     run = build(
         composed(tmp_path, f"ablation={ablation}", "trainer.accelerator=cpu", "data.cache_dir=" + str(tmp_path))

@@ -4,14 +4,13 @@ import shutil
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
 from tests.data.sources import layout_kitti
 from tests.data.sources.layout_infinigen import LAYOUTS as INFINIGEN
 from tests.data.sources.layout_scannet import write_export
 from tests.data.sources.layouts import room
-from vg2gt.config import config_dir
+from vg2gt.config import compose
 from vg2gt.training.loop import build, train
 
 TINY = [
@@ -53,9 +52,8 @@ def miniature(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def _config(out: Path, miniature: Path, *overrides: str) -> DictConfig:
     roots = [f"data.{part}_root={miniature / part}" for part in ("infinigen", "kitti", "scannet")]
-    fixed = ["experiment=paper", f"output_dir={out}", "hydra/job_logging=default", f"data.index_cache={out / 'cache'}"]
-    with initialize_config_dir(config_dir(), version_base="1.3"):
-        return compose("train", [*fixed, *TINY, *roots, *overrides])
+    fixed = ["experiment=paper", f"output_dir={out}", f"data.index_cache={out / 'cache'}"]
+    return compose("train", *fixed, *TINY, *roots, *overrides)
 
 
 def test_two_steps_on_the_three_layouts(tmp_path: Path, miniature: Path) -> None:

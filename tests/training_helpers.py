@@ -4,10 +4,9 @@ from pathlib import Path
 from typing import Any
 
 import lightning
-from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, open_dict
 
-from vg2gt.config import config_dir
+from vg2gt.config import compose
 from vg2gt.model import VG2GT
 from vg2gt.training.loop import Run
 
@@ -30,9 +29,7 @@ SMALL = [
 
 def small_config(folder: Path, cache: Path, *overrides: str) -> DictConfig:
     """Composes the default configuration with :data:`SMALL` and ``overrides``."""
-    fixed = [f"output_dir={folder}", "hydra/job_logging=default", f"data.cache_dir={cache}"]
-    with initialize_config_dir(config_dir(), version_base="1.3"):
-        return compose("train", [*fixed, *SMALL, *overrides])
+    return compose("train", f"output_dir={folder}", f"data.cache_dir={cache}", *SMALL, *overrides)
 
 
 class CrashAfter(lightning.Callback):

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 from torch import Tensor
 
 from backends.base import Backend
+from vg2gt.config import compose
 from vg2gt.geometry.cameras import invert_rigid, ray_directions
 from vg2gt.geometry.rotations import quat_to_matrix
 from vg2gt.types import Cameras, Hints
@@ -41,8 +41,7 @@ def backend(request: pytest.FixtureRequest):
 
 def load_config(name: str, *overrides: str) -> DictConfig:
     """One file of configs/backend with overrides such as ``pretrained=false``."""
-    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
-        return compose(overrides=[f"+backend={name}", *(f"backend.{override}" for override in overrides)]).backend
+    return compose(None, f"+backend={name}", *(f"backend.{override}" for override in overrides)).backend
 
 
 def make_backend(name: str, *overrides: str) -> Backend:

@@ -26,15 +26,13 @@ ADDRESS = re.compile(r"/(?P<repo>[^/]+/[^/]+)/resolve/(?P<revision>[^/]+)/(?P<fi
 # Loads backends given as [[name, override, ...], ...]; prints for each the weights' hash, or what was raised.
 LOAD = """
 import json, sys, time
-from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
-from vg2gt.config import config_dir
+from vg2gt.config import compose
 
 time.sleep = lambda seconds: None  # the client's pauses between its attempts to reach the hub
 results = []
 for name, *overrides in json.loads(sys.argv[1]):
-    with initialize_config_dir(config_dir(), version_base="1.3"):
-        config = compose(overrides=[f"+backend={name}", *(f"backend.{override}" for override in overrides)]).backend
+    config = compose(None, f"+backend={name}", *(f"backend.{override}" for override in overrides)).backend
     try:
         results.append(instantiate(config).identity()["weights"])
     except Exception as error:

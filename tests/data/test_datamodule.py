@@ -8,10 +8,9 @@ from types import SimpleNamespace
 import lightning
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
-from vg2gt.config import config_dir
+from vg2gt.config import compose
 from vg2gt.data import DataError, SceneDataModule, SyntheticScenes
 from vg2gt.data.frame_cache import FrameCache
 from vg2gt.data.framing import Framing
@@ -257,8 +256,7 @@ def test_evaluation_positions_are_checked(rooms):
 @pytest.mark.parametrize("name", ["synthetic", "rgbd"])
 def test_the_configuration_makes_a_data_module(name, write_recording, tmp_path, monkeypatch):
     monkeypatch.setenv("VG2GT_CACHE", str(tmp_path))
-    with initialize_config_dir(config_dir(), version_base="1.3"):
-        config = compose("train", [f"data={name}", f"output_dir={tmp_path}"])
+    config = compose("train", f"data={name}", f"output_dir={tmp_path}")
     if name == "rgbd":
         config.data.update(root=str(write_recording(frames=6)), max_views=2, min_views=2, max_images=2)
     module = instantiate(config.data)

@@ -13,10 +13,12 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
+from vg2gt.cli.data import data_module
+from vg2gt.cli.data import shards as main
 from vg2gt.data import DataError, Mixture, RGBDFolder, SceneDataModule, ShardedScenes, SyntheticScenes
 from vg2gt.data.framing import FramingSampler
 from vg2gt.data.sharded_scenes import INDEX
-from vg2gt.data.shards import Encoding, main, write_shards
+from vg2gt.data.shards import Encoding, write_shards
 from vg2gt.data.transforms import reduce_to_cover
 
 from .conftest import SIZE
@@ -158,7 +160,7 @@ def test_scenes_and_weights_can_be_chosen(mixture, tmp_path):
         ShardedScenes(str(tmp_path / "out"), weights={"rooms": 1})
     with pytest.raises(DataError, match="no usable frame 99"):
         chosen.load("office/office", [99])
-    with pytest.raises(FileNotFoundError, match=r"vg2gt\.data\.shards"):
+    with pytest.raises(FileNotFoundError, match="vg2gt data shards"):
         ShardedScenes(str(tmp_path / "nowhere"))
     with pytest.raises(FileNotFoundError, match=r"data\.root"):
         ShardedScenes(None)
@@ -176,7 +178,7 @@ def test_the_command_writes_what_data_shards_reads(write_recording, tmp_path, ca
         with pytest.raises(SystemExit, match="not empty"):
             main([*own, *data])
     small = ["data.image_size=[14,20]", "data.min_views=2", "data.max_views=2", "data.eval_context=2"]
-    _, module = parse(["data=shards", f"data.root={tmp_path / 'shards'}", *small], {})
+    module = data_module(["data=shards", f"data.root={tmp_path / 'shards'}", *small])
     module.setup()
     assert Counter(name for batch in [next(iter(module.train_dataloader()))] for name in batch.scene) == {"one": 4}
     assert next(iter(module.val_dataloader())).scene == ("two",)

@@ -6,9 +6,10 @@ from typing import Any
 
 import pytest
 
+from vg2gt.cli.data import splits as main
 from vg2gt.data import DataError, Mixture, RGBDFolder, SceneDataModule, SyntheticScenes
 from vg2gt.data.sources.files import read_split
-from vg2gt.data.splits import main, split_scenes
+from vg2gt.data.splits import split_scenes
 
 
 class Floors(SyntheticScenes):
@@ -75,7 +76,7 @@ def test_the_command_writes_lists_that_the_data_module_takes(write_recording, tm
     [
         (["data=rgbd"], "give out="),
         (["out=x", "data=rgbd", "data.root=not_here"], "not_here"),
-        (["out=x", "fraction=half"], "option fraction takes a value of type float"),
+        (["out=x", "fraction=half"], "option fraction: Value 'half'"),
         (["out=x", "data.rot=y", "data=rgbd"], "rot"),
         (["out=x", "data=nothing"], "nothing"),
     ],

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 import torch
 
+from vg2gt.cli.arguments import read_options
+from vg2gt.cli.data import SyntheticOptions
+from vg2gt.cli.data import synthetic as main
 from vg2gt.data import DataError, RGBDFolder
-from vg2gt.data.synthetic.__main__ import main, parse
 from vg2gt.data.synthetic.export import SceneSettings, missing_scenes, store_depth, write_scenes
 
 SETTINGS = SceneSettings(frames=2, size=(24, 32), variant=["room", "outdoor"], normals=True)
@@ -105,14 +107,15 @@ def test_the_command_writes_and_continues(tmp_path, capsys):
     ],
 )
 def test_wrong_arguments_are_one_clear_error(tmp_path, argument, message):
-    with pytest.raises(SystemExit, match="synthetic: ") as error:
+    with pytest.raises(SystemExit, match="ValueError: ") as error:
         main([f"out={tmp_path / 'out'}", argument])
     assert message in str(error.value)
     assert os.listdir(tmp_path) == []
 
 
 def test_out_is_needed_and_options_are_typed():
-    with pytest.raises(ValueError, match="out=FOLDER"):
-        parse(["scenes=3"])
-    options = parse(["out=x", "variant=[room,outdoor]", "size=[56,112]", "normals=true", "depth_scale=500"])
+    with pytest.raises(ValueError, match="give out="):
+        read_options(SyntheticOptions, ["scenes=3"])
+    given = ["out=x", "variant=[room,outdoor]", "size=[56,112]", "normals=true", "depth_scale=500"]
+    options, _ = read_options(SyntheticOptions, given)
     assert options.settings == SceneSettings(16, (56, 112), ["room", "outdoor"], False, True, 500.0)

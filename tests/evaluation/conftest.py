@@ -41,4 +41,4 @@ def result(evaluator: SceneEvaluator, batch: Batch) -> SceneResult:
 def evaluate_overrides(folder: Path, cache: Path, *overrides: str) -> list[str]:
     """Overrides of ``configs/evaluate.yaml`` for an evaluation of two rooms of 56x112."""
     small = ["data.image_size=[56,112]", "data.eval_scenes=2", "views=[2]", "device=cpu", "name=test"]
-    return [*small, f"output_dir={folder}", "hydra/job_logging=default", f"data.cache_dir={cache}", *overrides]
+    return [*small, f"output_dir={folder}", f"data.cache_dir={cache}", *overrides]

@@ -1,27 +1,22 @@
 """Every preset composes, fits its constructors and holds what the paper says."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
 from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig
 
-from vg2gt.config import config_dir
+from tests.commands import vg2gt
+from vg2gt.config import compose, group_options
 from vg2gt.data.views.drawn import index_path
 from vg2gt.evaluation import EvaluationOptions, paper
 
-PRESETS = sorted(path.stem for path in (Path(config_dir()) / "evaluation").glob("*.yaml"))
+PRESETS = group_options("evaluation")
 
 
 def composed(preset: str) -> DictConfig:
     root = {"synthetic": [], "dtu": ["data.val.root=somewhere"]}.get(preset, ["data.root=somewhere"])
-    with initialize_config_dir(config_dir(), version_base="1.3"):
-        return compose(
-            "evaluate", [f"evaluation={preset}", "name=x", "output_dir=x", "hydra/job_logging=default", *root]
-        )
+    return compose("evaluate", f"evaluation={preset}", "name=x", "output_dir=x", *root)
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -59,10 +54,7 @@ def test_dtu_is_compared_with_its_own_options() -> None:
 
 
 def test_a_wrong_option_is_one_line(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "vg2gt.evaluate", "evaluation.alignment=affine"]
-    run = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=120, check=False)
+    run = vg2gt("evaluate", "evaluation.alignment=affine", folder=tmp_path)
     assert run.returncode != 0
-    assert run.stderr.strip().splitlines() == [
-        "ValueError: evaluation.alignment='affine': choose one of median, scene, wmed, scale_shift, none",
-        "(HYDRA_FULL_ERROR=1 shows where)",
-    ]
+    said = "ValueError: evaluation.alignment='affine': choose one of median, scene, wmed, scale_shift, none"
+    assert run.stderr.strip() == f"{said} (HYDRA_FULL_ERROR=1 shows where)"

@@ -8,18 +8,18 @@ from typing import Any
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from tests.evaluation.conftest import evaluate_overrides
 from tests.training_helpers import small_config
-from vg2gt.config import config_dir
+from vg2gt.cli.evaluate import run_name
+from vg2gt.config import compose
 from vg2gt.data.base import DataError, Frames
 from vg2gt.data.synthetic import SyntheticScenes
 from vg2gt.evaluation.evaluator import SceneEvaluator
 from vg2gt.evaluation.run import evaluate
 from vg2gt.metrics.lpips import STAGES
-from vg2gt.runs.load import checkpoint_path, run_name
+from vg2gt.runs.find import checkpoint_path
 from vg2gt.runs.trust import read_run_config
 from vg2gt.training.loop import train
 
@@ -37,9 +37,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory, cache: Path) -> Path:
 
 
 def run(folder: Path, cache: Path, *overrides: str) -> dict[str, Any]:
-    with initialize_config_dir(config_dir(), version_base="1.3"):
-        config = compose("evaluate", evaluate_overrides(folder, cache, *overrides))
-    return evaluate(config)
+    return evaluate(compose("evaluate", *evaluate_overrides(folder, cache, *overrides)))
 
 
 @pytest.fixture(scope="module")
@@ -201,8 +199,7 @@ def test_what_the_weights_before_were_trained_on_is_refused(tmp_path: Path, cach
 def test_a_lone_checkpoint_is_not_checked_and_that_is_told(tmp_path: Path, cache: Path, trained: Path, caplog) -> None:
     shutil.copy(trained / "checkpoints" / "step-2.ckpt", tmp_path / "lone.ckpt")
     parts = read_run_config(trained / "config.yaml")
-    with initialize_config_dir(config_dir(), version_base="1.3"):
-        config = compose("evaluate", evaluate_overrides(tmp_path / "out", cache, "data.eval_scenes=1"))
+    config = compose("evaluate", *evaluate_overrides(tmp_path / "out", cache, "data.eval_scenes=1"))
     OmegaConf.set_struct(config, False)
     config.ckpt = str(tmp_path / "lone.ckpt")
     for part in ("model", "backend", "renderer"):

@@ -1,17 +1,15 @@
 """The whole objective: scale, averaging over scenes, missing depth, what is trained and what is only logged."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
+from vg2gt.config import compose
 from vg2gt.geometry.cameras import scale_translations
 from vg2gt.losses import EnhancementLoss, GaussianLoss, GeometryLoss, ScaleAlignment, VG2GTLoss
 
-CONFIGS = str(Path(__file__).parents[2] / "configs")
 DEPTH_TERMS = ["depth_conf", "depth_reg", "depth_grad", "point_conf", "point_reg", "point_grad"]
 GAUSSIAN_TERMS = ["color_l1", "ssim", "depth_consistency", "depth_gt", "normal"]
 
@@ -241,8 +239,7 @@ def test_autocast_and_half_precision_inputs_change_nothing(sample) -> None:
     [("paper", (1.0, 1.0, 1.0, 1.0, 1.0, 1.0)), ("release", (10.0, 0.9, 0.1, 0.25, 0.25, 0.001))],
 )
 def test_configurations_hold_the_published_weights(name: str, weights: tuple[float, ...]) -> None:
-    with initialize_config_dir(CONFIGS, version_base="1.3"):
-        loss = instantiate(compose(f"loss/{name}", ["loss.enhance.on=reg", "loss.align.source=rendered"]).loss)
+    loss = instantiate(compose(f"loss/{name}", "loss.enhance.on=reg", "loss.align.source=rendered").loss)
     assert isinstance(loss, VG2GTLoss)
     g = loss.gaussian
     assert (g.weight, g.color_l1, g.ssim, g.depth_consistency, g.depth_gt, g.normal) == weights

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from tests.rendering.scenes import IMPLEMENTATIONS, images, pinhole, soup, with_gradients
-from vg2gt.config import config_dir
+from vg2gt.config import compose
 from vg2gt.rendering import Renderer, render
 from vg2gt.rendering.options import Mode
 from vg2gt.rendering.renderer import Implementation
@@ -130,9 +130,7 @@ def test_bad_options_are_refused(options: dict[str, object]) -> None:
 
 @pytest.mark.parametrize("name", MODES)
 def test_configuration_builds_the_renderer(name: Mode) -> None:
-    with hydra.initialize_config_dir(config_dir(), version_base="1.3"):
-        config = hydra.compose(f"renderer/{name}")
-    renderer = hydra.utils.instantiate(config.renderer)
+    renderer = hydra.utils.instantiate(compose(f"renderer/{name}").renderer)
     assert isinstance(renderer, Renderer)
     assert renderer.mode == name
     gaussians, cameras = soup(30), pinhole((12, 15))

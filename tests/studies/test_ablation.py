@@ -4,13 +4,12 @@ import gc
 import json
 import re
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 import vg2gt.studies.study
+from tests.commands import ROOT, shell, vg2gt
 from tests.training_helpers import SMALL
 from vg2gt.evaluation.tables import METRICS
 from vg2gt.runs.checkpoints import newest_valid, read_checkpoint, write_checkpoint
@@ -25,7 +24,6 @@ from vg2gt.studies.ablation import (
 from vg2gt.studies.study import paired_difference, run_once
 from vg2gt.training.module import VG2GTModule
 
-ROOT = Path(__file__).resolve().parents[2]
 QUIET = [override for override in SMALL if not override.startswith("trainer.max_steps")]
 
 
@@ -221,20 +219,15 @@ def test_what_the_study_decides_cannot_be_overridden() -> None:
 
 def test_the_readmes_line_in_a_shell(tmp_path: Path, cache: Path) -> None:
     """The line as printed; later overrides make it short."""
-    (line,) = re.findall(
-        r"^(python -m vg2gt\.ablate [^#\n]*?)(?: *#.*)?$", (ROOT / "README.md").read_text(), re.MULTILINE
-    )
+    (line,) = re.findall(r"^(vg2gt ablate [^#\n]*?)(?: *#.*)?$", (ROOT / "README.md").read_text(), re.MULTILINE)
     short = ["name=short", "seeds=1", "full_steps=1", "steps=1", "variants=[]", "splits=[2]", *QUIET]
-    line = line.replace("python", sys.executable, 1)
-    command = " ".join([line, *(f"'{override}'" for override in [*short, f"data.cache_dir={cache}"])])
-    shown = subprocess.run(command, shell=True, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert shown.returncode == 0, shown.stderr[-3000:]
-    assert "| VG²GT (full) |" in unpadded(shown.stdout)
+    short.append(f"data.cache_dir={cache}")
+    printed = shell(" ".join([line, *(f"'{override}'" for override in short)]), tmp_path)
+    assert "| VG²GT (full) |" in unpadded(printed)
     assert (tmp_path / "outputs" / "short" / "metrics.md").is_file()
 
 
 def test_several_devices_are_refused(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "vg2gt.studies.ablation", "trainer.devices=2"]
-    shown = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    shown = vg2gt("ablate", "trainer.devices=2", folder=tmp_path)
     assert shown.returncode != 0
     assert "trainer.devices=2: a study runs its trainings one after another on one device" in shown.stderr

@@ -11,11 +11,11 @@ from pathlib import Path
 import lightning
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
+from tests.commands import vg2gt
 from tests.training_helpers import SMALL, full_model, small_config, with_crash
-from vg2gt.config import config_dir
+from vg2gt.config import compose
 from vg2gt.data import DataError, SyntheticScenes
 from vg2gt.gaussians import GaussianHead
 from vg2gt.runs.checkpoints import newest_valid, read_checkpoint
@@ -211,10 +211,8 @@ def test_non_finite_steps_are_skipped_and_then_stop_the_run(tmp_path: Path, cach
 def test_real_rgbd_recording(tmp_path: Path, shared: Path) -> None:
     root = shared / "data" / "hololens_office_a"
     small = [override for override in SMALL if not override.startswith(("data.train_", "data.eval_"))]
-    with initialize_config_dir(config_dir(), version_base="1.3"):
-        overrides = [f"output_dir={tmp_path}", "hydra/job_logging=default", "debug=fast_dev_run", *small]
-        config = compose("train", [*overrides, "data=rgbd", f"data.root={root}", "data.eval_context=4"])
-    report = train(config)
+    data = ["data=rgbd", f"data.root={root}", "data.eval_context=4"]
+    report = train(compose("train", f"output_dir={tmp_path}", "debug=fast_dev_run", *small, *data))
     assert report["trained"]["psnr"] > 10
     assert 0 < report["trained"]["abs_rel"] < 0.2
 
@@ -269,54 +267,15 @@ def test_progress_bar_can_be_switched_off(tmp_path: Path, cache: Path) -> None:
 @pytest.mark.slow
 def test_two_processes_from_the_console_script(tmp_path: Path, cache: Path) -> None:
     overrides = [*SMALL, f"data.cache_dir={cache}", "trainer=ddp", "trainer.max_steps=2", "name=two"]
-    script = "import vg2gt.cli; vg2gt.cli.main()"
-    run = subprocess.run(
-        [sys.executable, "-c", script, "train", *overrides], capture_output=True, text=True, cwd=tmp_path, timeout=500
-    )
+    run = vg2gt("train", *overrides, folder=tmp_path)
     assert run.returncode == 0, run.stderr[-3000:]
     assert json.loads((tmp_path / "outputs" / "two" / "metrics.json").read_text())["steps"] == 2
 
 
-def cli(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "vg2gt.cli.train", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, cwd=folder, timeout=300, check=False)
-
-
-def test_help_lists_every_group(tmp_path: Path) -> None:
-    shown = cli("-h", folder=tmp_path)
-    assert shown.returncode == 0
-    for group in (
-        "ablation",
-        "backend",
-        "data",
-        "debug",
-        "experiment",
-        "logger",
-        "loss",
-        "model",
-        "renderer",
-        "trainer",
-    ):
-        assert f"\n{group}: " in shown.stdout
-
-
 def test_sweep_runs_every_variant_in_its_own_folder(tmp_path: Path, cache: Path) -> None:
     small = [*SMALL, "debug=fast_dev_run", f"data.cache_dir={cache}"]
-    sweep = cli("-m", *small, "name=sweep", "model.gaussians.splits=1,4", folder=tmp_path)
+    sweep = vg2gt("train", "-m", *small, "name=sweep", "model.gaussians.splits=1,4", folder=tmp_path)
     assert sweep.returncode == 0, sweep.stderr[-3000:]
     written = sorted((tmp_path / "outputs" / "sweep").glob("*/config.yaml"))
     splits = [OmegaConf.load(path).model.gaussians.splits for path in written]
     assert sorted(splits) == [1, 4]
-
-
-def test_misspelt_and_missing_are_named(tmp_path: Path) -> None:
-    misspelt = cli("model.gausians.splits=4", folder=tmp_path)
-    assert misspelt.returncode != 0
-    assert "gausians" in misspelt.stderr
-    unknown = cli("backend=dav3", folder=tmp_path)
-    assert "oracle" in unknown.stderr
-    missing = cli("data=rgbd", "data.root=not_here", folder=tmp_path)
-    assert missing.returncode != 0
-    assert "not_here" in missing.stderr
-    assert "data.root=" in missing.stderr
-    assert "Traceback" not in missing.stderr

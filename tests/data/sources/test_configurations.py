@@ -3,10 +3,9 @@
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
-from vg2gt.config import config_dir
+from vg2gt.config import compose
 from vg2gt.data import SceneDataModule
 
 from . import layout_infinigen, layout_replica, layout_scannet, layout_scannetpp, layout_tum, layout_virtual_kitti
@@ -92,8 +91,7 @@ def test_scenes_are_split_and_batched(tmp_path, frames, name):
     write(tmp_path / "data", frames)
     small = ["image_size=[28,42]", "min_views=2", "max_views=2", "max_images=2", "target_views=0", "eval_context=2"]
     overrides = [f"data={name}", f"data.root={tmp_path / 'data'}", f"data.index_cache={tmp_path / 'cache'}", *changes]
-    with initialize_config_dir(config_dir(), version_base="1.3"):
-        config = compose("train", [*overrides, *(f"data.{change}" for change in small), "data.eval_target=1"])
+    config = compose("train", *overrides, *(f"data.{change}" for change in small), "data.eval_target=1")
     module = instantiate(config.data)
     assert isinstance(module, SceneDataModule)
     assert set(module.train_source().scenes) == train

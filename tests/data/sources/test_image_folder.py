@@ -6,11 +6,10 @@ from shutil import copytree
 import numpy as np
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from PIL import Image
 
-from vg2gt.config import config_dir
+from vg2gt.config import compose
 from vg2gt.data import DataError
 from vg2gt.data.sources import ImageFolder
 
@@ -84,9 +83,8 @@ def test_training_is_refused(tmp_path):
     for i in range(12):
         _save(tmp_path / "train" / f"{i}.png", _photo(i))
     copytree(tmp_path / "train", tmp_path / "val")
-    with initialize_config_dir(config_dir(), version_base="1.3"):
-        overrides = ["data=image_folder", f"data.root={tmp_path}", "data.train.scenes=[train]", "data.val.scenes=[val]"]
-        module = instantiate(compose("train", [*overrides, "data.index_cache=null"]).data)
+    overrides = ["data=image_folder", f"data.root={tmp_path}", "data.train.scenes=[train]", "data.val.scenes=[val]"]
+    module = instantiate(compose("train", *overrides, "data.index_cache=null").data)
     with pytest.raises(DataError, match="ImageFolder has no depth and no cameras"):
         module.train_dataloader()
 

@@ -3,8 +3,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
-from vg2gt.cli.views import write_views
 
+from vg2gt.cli.data import write_views
 from vg2gt.data.base import DataError, Frames, SceneSource
 from vg2gt.data.views.drawn import INDICES, index_path, make_index, read_index
 from vg2gt.data.views.sampling import SceneSample
@@ -153,8 +153,10 @@ def test_dtus_index_is_what_its_49_frames_give() -> None:
 
 
 def test_the_commands_errors(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"out=FILE\.json"):
+    with pytest.raises(ValueError, match=r"out="):
         write_views(["evaluation=synthetic"])
+    with pytest.raises(ValueError, match=r"out=FILE\.json"):
+        write_views(["evaluation=synthetic", "out=index.txt"])
     with pytest.raises(ValueError, match="give numbers of input views"):
         write_views([f"out={tmp_path / 'x.json'}", "views=null"])
     one = write_views([f"out={tmp_path / 'one.json'}", "views=3", "data.eval_scenes=1"])

@@ -1,0 +1,112 @@
+"""The front door: every command explains itself at once, and says in one line what is wrong."""
+
+import re
+import subprocess
+import sys
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from tests.commands import ROOT, vg2gt
+from vg2gt import __version__
+from vg2gt.cli.commands import COMMANDS, DATA_COMMANDS, dispatch
+
+ALL = {(name,): command for name, command in COMMANDS.items()}
+ALL |= {("data", name): command for name, command in DATA_COMMANDS.items()}
+
+# Runs in one process all helps; torch and Lightning must not be imported for any.
+HELPS = """
+import sys
+from vg2gt.cli import main
+for words in {words}:
+    sys.argv = ["vg2gt", *words, "--help"]
+    print("HELP OF", *words)
+    try:
+        main()
+    except SystemExit as ended:
+        assert not ended.code, words
+    assert not {{"torch", "lightning"}} & set(sys.modules), words
+"""
+
+
+@pytest.fixture(scope="module")
+def helps(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    script = HELPS.format(words=list(ALL))
+    folder = tmp_path_factory.mktemp("empty")
+    shown = subprocess.run([sys.executable, "-c", script], cwd=folder, capture_output=True, text=True, check=False)
+    assert shown.returncode == 0, shown.stderr[-3000:]
+    assert not list(folder.iterdir())
+    texts = shown.stdout.split("HELP OF ")[1:]
+    return {text.partition("\n")[0]: text for text in texts}
+
+
+@pytest.mark.parametrize("words", ALL, ids=" ".join)
+def test_help_shows_an_example_and_imports_little(words: tuple[str, ...], helps: dict[str, str]) -> None:
+    assert ALL[words].example in helps[" ".join(words)]
+    assert ALL[words].example.startswith(f"vg2gt {' '.join(words)} ")
+
+
+@pytest.mark.parametrize("name", ["train", "ablate"])
+def test_help_of_a_training_lists_every_group(name: str, helps: dict[str, str]) -> None:
+    for group in ("ablation", "backend", "data", "debug", "experiment", "logger", "loss", "model", "renderer"):
+        assert f"\n{group}: " in helps[name]
+
+
+def test_the_front_door(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def said(program: str, *words: str) -> str:
+        monkeypatch.setattr(sys, "argv", [program, *words])
+        with suppress(SystemExit):
+            dispatch(program, COMMANDS if program == "vg2gt" else DATA_COMMANDS)
+        return "".join(capsys.readouterr())
+
+    assert said("vg2gt") == said("vg2gt", "--help")
+    for command in COMMANDS.values():
+        assert command.does in said("vg2gt")
+        assert command.example in said("vg2gt")
+    assert said("vg2gt", "--version") == f"vg2gt {__version__}\n"
+    assert said("vg2gt", "trian") == "vg2gt: unknown command 'trian', did you mean train? (vg2gt --help lists all)\n"
+    assert "did you mean shards?" in said("vg2gt data", "shard")
+    assert said("vg2gt", "zzz") == "vg2gt: unknown command 'zzz' (vg2gt --help lists all)\n"
+
+
+@pytest.mark.parametrize(
+    "module", ["vg2gt.data.synthetic", "vg2gt.data.splits", "vg2gt.data.shards", "backends.export"]
+)
+def test_modules_are_commands_too(module: str, tmp_path: Path) -> None:
+    shown = subprocess.run(
+        [sys.executable, "-m", module, "--help"], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert "example: vg2gt " in shown.stdout, shown.stderr[-2000:]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["train", "model.gausians.splits=4"], r"model.gausians.splits=4 \(Key 'gausians' is not in struct\)"),
+        (["train", "backend=dav3"], "Available options in 'backend': custom da3_base"),
+        (["train", "data=rgbd", "data.root=not_here"], "the data folder not_here .* does not exist: set data.root="),
+        (["curves", "nowhere"], "nowhere|matplotlib"),
+        (["export", "backend=oracle", "out=bundle"], "backend oracle cannot be exported"),
+        (["data", "views", "out=views.json", "evaluation=nonsense"], "Could not find 'evaluation/nonsense'"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_mistakes_are_one_line(words: list[str], said: str, tmp_path: Path) -> None:
+    shown = vg2gt(*words, folder=tmp_path)
+    assert shown.returncode == 1
+    *logged, line = shown.stderr.strip().splitlines()
+    assert not logged or words[0] == "train"
+    assert "Traceback" not in shown.stderr
+    assert re.search(said, line), line
+    assert line.endswith("(HYDRA_FULL_ERROR=1 shows where)")
+
+
+def test_tracebacks_are_there_for_who_asks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+    for words in (["train", "backend=dav3"], ["render", "x.ply", "--cameras", "no.json", "--out", "x"]):
+        assert "Traceback" in vg2gt(*words, folder=tmp_path).stderr
+
+
+def test_train_py_is_the_same_command() -> None:
+    assert "from vg2gt.cli.train import main" in (ROOT / "train.py").read_text()
