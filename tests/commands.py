@@ -8,7 +8,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def vg2gt(*arguments: str, folder: Path, timeout: float = 500) -> subprocess.CompletedProcess[str]:
+def run_vg2gt(*arguments: str, folder: Path, timeout: float = 500) -> subprocess.CompletedProcess[str]:
     """Runs ``vg2gt ARGUMENTS`` in a folder, whatever its outcome."""
     command = [sys.executable, "-c", "import vg2gt.cli; vg2gt.cli.main()", *arguments]
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=timeout, check=False)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.commands import ROOT, vg2gt
+from tests.commands import ROOT, run_vg2gt
 from vg2gt import __version__
 from vg2gt.cli.commands import COMMANDS, DATA_COMMANDS, dispatch
 
@@ -93,7 +93,7 @@ def test_modules_are_commands_too(module: str, tmp_path: Path) -> None:
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
 def test_mistakes_are_one_line(words: list[str], said: str, tmp_path: Path) -> None:
-    shown = vg2gt(*words, folder=tmp_path)
+    shown = run_vg2gt(*words, folder=tmp_path)
     assert shown.returncode == 1
     *logged, line = shown.stderr.strip().splitlines()
     assert not logged or words[0] == "train"
@@ -105,7 +105,7 @@ def test_mistakes_are_one_line(words: list[str], said: str, tmp_path: Path) -> N
 def test_tracebacks_are_there_for_who_asks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
     for words in (["train", "backend=dav3"], ["render", "x.ply", "--cameras", "no.json", "--out", "x"]):
-        assert "Traceback" in vg2gt(*words, folder=tmp_path).stderr
+        assert "Traceback" in run_vg2gt(*words, folder=tmp_path).stderr
 
 
 def test_train_py_is_the_same_command() -> None:

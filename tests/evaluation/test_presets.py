@@ -6,7 +6,7 @@ import pytest
 from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig
 
-from tests.commands import vg2gt
+from tests.commands import run_vg2gt
 from vg2gt.config import compose, group_options
 from vg2gt.data.views.drawn import index_path
 from vg2gt.evaluation import EvaluationOptions, paper
@@ -54,7 +54,7 @@ def test_dtu_is_compared_with_its_own_options() -> None:
 
 
 def test_a_wrong_option_is_one_line(tmp_path: Path) -> None:
-    run = vg2gt("evaluate", "evaluation.alignment=affine", folder=tmp_path)
+    run = run_vg2gt("evaluate", "evaluation.alignment=affine", folder=tmp_path)
     assert run.returncode != 0
     said = "ValueError: evaluation.alignment='affine': choose one of median, scene, wmed, scale_shift, none"
     assert run.stderr.strip() == f"{said} (HYDRA_FULL_ERROR=1 shows where)"

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import vg2gt.studies.study
-from tests.commands import ROOT, shell, vg2gt
+from tests.commands import ROOT, run_vg2gt, shell
 from tests.training_helpers import SMALL
 from vg2gt.evaluation.tables import METRICS
 from vg2gt.runs.checkpoints import newest_valid, read_checkpoint, write_checkpoint
@@ -228,6 +228,6 @@ def test_the_readmes_line_in_a_shell(tmp_path: Path, cache: Path) -> None:
 
 
 def test_several_devices_are_refused(tmp_path: Path) -> None:
-    shown = vg2gt("ablate", "trainer.devices=2", folder=tmp_path)
+    shown = run_vg2gt("ablate", "trainer.devices=2", folder=tmp_path)
     assert shown.returncode != 0
     assert "trainer.devices=2: a study runs its trainings one after another on one device" in shown.stderr

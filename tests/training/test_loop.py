@@ -13,7 +13,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from tests.commands import vg2gt
+from tests.commands import run_vg2gt
 from tests.training_helpers import SMALL, full_model, small_config, with_crash
 from vg2gt.config import compose
 from vg2gt.data import DataError, SyntheticScenes
@@ -267,14 +267,14 @@ def test_progress_bar_can_be_switched_off(tmp_path: Path, cache: Path) -> None:
 @pytest.mark.slow
 def test_two_processes_from_the_console_script(tmp_path: Path, cache: Path) -> None:
     overrides = [*SMALL, f"data.cache_dir={cache}", "trainer=ddp", "trainer.max_steps=2", "name=two"]
-    run = vg2gt("train", *overrides, folder=tmp_path)
+    run = run_vg2gt("train", *overrides, folder=tmp_path)
     assert run.returncode == 0, run.stderr[-3000:]
     assert json.loads((tmp_path / "outputs" / "two" / "metrics.json").read_text())["steps"] == 2
 
 
 def test_sweep_runs_every_variant_in_its_own_folder(tmp_path: Path, cache: Path) -> None:
     small = [*SMALL, "debug=fast_dev_run", f"data.cache_dir={cache}"]
-    sweep = vg2gt("train", "-m", *small, "name=sweep", "model.gaussians.splits=1,4", folder=tmp_path)
+    sweep = run_vg2gt("train", "-m", *small, "name=sweep", "model.gaussians.splits=1,4", folder=tmp_path)
     assert sweep.returncode == 0, sweep.stderr[-3000:]
     written = sorted((tmp_path / "outputs" / "sweep").glob("*/config.yaml"))
     splits = [OmegaConf.load(path).model.gaussians.splits for path in written]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.commands import vg2gt
+from tests.commands import run_vg2gt
 from tests.io.gaussian_scenes import scene, views
 from vg2gt.cli import view
 from vg2gt.io import named_cameras, write_cameras_json, write_gaussian_ply, write_splat
@@ -53,7 +53,7 @@ def test_images_in_the_folder_that_reconstruct_writes(files: Path, capsys: pytes
 
 
 def test_script_starts_it(files: Path) -> None:
-    done = vg2gt("view", "scene.ply", "--html", "page.html", "--title", "mine", folder=files)
+    done = run_vg2gt("view", "scene.ply", "--html", "page.html", "--title", "mine", folder=files)
     assert done.returncode == 0, done.stderr
     assert "<title>mine</title>" in (files / "page.html").read_text()
 

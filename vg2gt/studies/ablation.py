@@ -213,9 +213,9 @@ class Ablation:
             "poses; depth rendered as stochastic solids and aligned by one median scale per scene, whatever the "
             "training rendered (the 3DGS row too: its own rasterised depth stands below). Where the number of splits "
             "differs from the full model's, the last layer starts anew; the control shows what that alone costs, and "
-            "is what these rows are compared with in the last table. The paper's rows are Replica, 30000 more steps, and "
-            "LPIPS of VGG; compare orders, not values. LPIPS is not measured "
-            "while training: vg2gt evaluate ckpt=RUN has it, if its weights are there."
+            "is what these rows are compared with in the last table. The paper's rows are Replica, 30000 more steps, "
+            "and LPIPS of VGG; compare orders, not values. LPIPS is not measured while training: vg2gt "
+            "evaluate ckpt=RUN has it, if its weights are there."
         )
 
 
