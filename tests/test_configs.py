@@ -67,7 +67,7 @@ def test_every_option_composes_and_fits_its_constructor(tmp_path: Path, group: s
     assert assert_signatures_fit(OmegaConf.to_container(config[group], resolve=True)) >= 1
 
 
-@pytest.mark.parametrize("name", names("data"))
+@pytest.mark.parametrize("name", group_options("data"))
 def test_misspelt_options_of_data_are_found(tmp_path: Path, name: str) -> None:
     config = OmegaConf.to_container(composed(tmp_path, f"data={name}").data, resolve=True)
     assert isinstance(config, dict)

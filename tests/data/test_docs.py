@@ -10,10 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from PIL import Image
 
-from vg2gt.config import config_dir
+from vg2gt.config import compose
 
 ROOT = Path(__file__).resolve().parents[2]
 TEXT = (ROOT / "docs" / "add-a-dataset.md").read_text()
@@ -73,7 +72,6 @@ def test_the_example_trains(example: Path) -> None:
 
 
 def test_the_documented_options_exist() -> None:
-    with initialize_config_dir(config_dir(), version_base="1.3"):
-        config = compose("train", ["data=paper_mix"]).data
+    config = compose("train", "data=paper_mix").data
     for option in set(re.findall(r"(?<!vg2gt\.)data\.([a-z_]+)[=`]", TEXT)) - {"root", "holdout"}:
         assert option in config, option

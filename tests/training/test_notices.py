@@ -3,16 +3,13 @@
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
 
-from vg2gt.config import config_dir
+from vg2gt.config import compose
 from vg2gt.training.notices import notices
 
 
 def said(tmp_path: Path, *overrides: str) -> list[str]:
-    fixed = [f"output_dir={tmp_path}", "hydra/job_logging=default"]
-    with initialize_config_dir(config_dir(), version_base="1.3"):
-        return notices(compose("train", [*fixed, *overrides]))
+    return notices(compose("train", f"output_dir={tmp_path}", *overrides))
 
 
 @pytest.mark.parametrize(
