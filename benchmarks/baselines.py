@@ -2,9 +2,9 @@
 
 Every model is trained from scratch for the same number of steps on the same backbone, losses, batches and machine, and
 evaluated on the same held-out scenes: VG²GT, VG²GT without its coarse module (which separates the voxels' part from
-the enhanced geometry's), one Gaussian a pixel, pixel Gaussians merged by voxels, and the coloured points, which need no
-training. Finished trainings are not repeated, interrupted ones go on. Writes runs, ``metrics.json``, ``metrics.md`` and
-``models.png`` into ``outputs/<name>``; name=baselines.
+the enhanced geometry's), one Gaussian per pixel, pixel Gaussians merged by voxels, and the coloured points, which need
+no training. Finished trainings are not repeated, interrupted ones go on. Writes runs, ``metrics.json``, ``metrics.md``
+and ``models.png`` into ``outputs/<name>``; name=baselines.
 """
 
 from __future__ import annotations

@@ -80,7 +80,7 @@ def batches(overrides: list[str], workers: int, steps: int, size: tuple[int, int
 
 
 def speed(overrides: list[str], workers: int, steps: int) -> dict[str, float]:
-    """Images a second by the clock, and per second of processor time where the process itself decodes."""
+    """Images per second by the clock, and per second of processor time where the process itself decodes."""
     list(batches(overrides, 0, 3))  # warms the disk's cache
     loader = batches(overrides, workers, steps)
     warm = 2 + 2 * workers  # workers begin by reading ahead
@@ -114,7 +114,7 @@ def waiting(overrides: list[str], workers: int, steps: int) -> dict[str, float]:
 
 
 def paper_demand() -> float:
-    """Images a second that a device of the paper took, with our sampler's filling of a step (18 images at most)."""
+    """Images per second that a device of the paper took, with our sampler's filling of a step (18 images at most)."""
     sampler = ViewSampler(3, 18, 18)
     drawn = [sampler.num_views(step) * sampler.num_scenes(step) for step in range(5000)]
     return sum(drawn) / len(drawn) / PAPER_SECONDS
@@ -151,7 +151,7 @@ def main() -> None:
     title = f"images per second, {STORED[1]}x{STORED[0]} RGB-D to {SIZE[0]}x{SIZE[1]}, by workers"
     print_table(["read from", *map(str, arguments.workers), "per core second"], rows, title=title)
     demand = paper_demand()
-    print(f"the paper's training takes about {demand:.0f} images a second on each of two devices")
+    print(f"the paper's training takes about {demand:.0f} images per second on each of two devices")
     for name, value in waits.items():
         print(f"{name}: a step of {VIEWS} images takes {value['step']:.2f} s and waits {value['wait']:.3f} s")
     content = {

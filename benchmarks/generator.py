@@ -1,7 +1,7 @@
 """Speed of the synthetic generator: ``python benchmarks/generator.py [--scenes N] [--size H W]``.
 
-Frames a second of one core, by the time that the process computed, so that other processes hardly matter: scenes made
-and rendered, and made, rendered and written to disk as ``vg2gt data synthetic`` does. Compilation is left
+Frames per second of one core, by the time that the process computed, so that other processes hardly matter: scenes
+made and rendered, and made, rendered and written to disk as ``vg2gt data synthetic`` does. Compilation is left
 out. Prints a table and writes a dated JSON file to ``benchmarks/results``.
 """
 
@@ -43,7 +43,7 @@ def write_all(settings: SceneSettings, scenes: int) -> int:
 
 
 def measure(work: Callable[[SceneSettings, int], int], settings: SceneSettings, scenes: int) -> dict[str, float]:
-    """Frames a second of one core, and bytes a frame."""
+    """Frames per second of one core, and bytes per frame."""
     work(settings, 1)  # compiles
     started = time.process_time()
     written = work(settings, scenes)

@@ -1,7 +1,7 @@
 """A scene to look at: a procedural room as coloured voxels, ``python benchmarks/viewer_scene.py FOLDER``.
 
-Writes ``scene.ply``, ``cameras.json`` and the images it was made of, as `vg2gt view` takes them: one Gaussian a voxel,
-a little larger than its cell, in the mean colour of the pixels that fall into it.
+Writes ``scene.ply``, ``cameras.json`` and the images it was made of, as `vg2gt view` takes them: one Gaussian per
+voxel, a little larger than its cell, in the mean colour of the pixels that fall into it.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ import torch
 from vg2gt.evaluation import EvaluationOptions, PointOptions, SceneEvaluator, SceneResult, evaluate_scene
 from vg2gt.evaluation.evaluator import MODES, PROTOCOLS
 from vg2gt.evaluation.protocols import ground_truth_target_cameras, joint_target_cameras
-from vg2gt.evaluation.scores import align_geometry, point_scores
+from vg2gt.evaluation.scene_metrics import align_geometry, point_cloud_metrics
 from vg2gt.geometry.alignment import Similarity
 from vg2gt.geometry.cameras import scale_translations
 from vg2gt.geometry.normals import normals_from_depth
@@ -30,11 +30,11 @@ def test_scores_are_the_metrics_of_the_renders(result: SceneResult, batch: Batch
         expected |= {f"decoded/{when}/{k}": v for k, v in scores.items()}
     expected["scene/cv"] = cv(prediction.gaussians.means)
     expected["scene/gaussians"] = len(prediction.gaussians)
-    assert {name: result.scores[name] for name in expected} == expected
+    assert {name: result.metrics[name] for name in expected} == expected
 
 
 def test_every_protocol_and_mode_has_every_figure(result: SceneResult) -> None:
-    scores = result.scores
+    scores = result.metrics
     for protocol in PROTOCOLS:
         for mode in MODES:
             for name in ("psnr", "ssim", "abs_rel", "mae", "rmse", "coverage", "delta_1.05_holes", "normal_acc_30"):
@@ -49,7 +49,7 @@ def test_every_protocol_and_mode_has_every_figure(result: SceneResult) -> None:
 def test_context_renders_are_of_the_inputs(result: SceneResult, batch: Batch) -> None:
     assert result.renders["context"].color.shape[1] == batch.num_context
     expected = float(psnr(result.renders["context"].color[0], batch.context.images[0]).mean())
-    assert result.scores["rendered/context/solid/psnr"] == expected
+    assert result.metrics["rendered/context/solid/psnr"] == expected
 
 
 def test_without_true_depth_what_needs_it_is_none_and_not_zero(evaluator: SceneEvaluator, batch: Batch) -> None:
@@ -62,7 +62,7 @@ def test_without_true_depth_what_needs_it_is_none_and_not_zero(evaluator: SceneE
         )
     )
     try:
-        scores = evaluator(blind).scores
+        scores = evaluator(blind).metrics
     finally:
         del evaluator.model.backend.encode
     for name in ("abs_rel", "coverage", "delta_1.05_holes", "normal_mean"):
@@ -77,9 +77,9 @@ def test_without_targets_or_true_cameras(evaluator: SceneEvaluator, batch: Batch
     assert set(inputs_only.renders) == {"context"}
     unposed = evaluator(batch, has_cameras=False)
     assert set(unposed.renders) == {"context", "novel"}
-    assert not any(name.startswith(("cameras", "points", "rendered/gt_pose")) for name in unposed.scores)
+    assert not any(name.startswith(("cameras", "points", "rendered/gt_pose")) for name in unposed.metrics)
     one_view = replace(batch, num_context=1)
-    assert "cameras/auc_5" not in evaluator(one_view).scores
+    assert "cameras/auc_5" not in evaluator(one_view).metrics
 
 
 def test_options_reach_the_metrics(module_and_batch, result: SceneResult, batch: Batch) -> None:
@@ -87,11 +87,11 @@ def test_options_reach_the_metrics(module_and_batch, result: SceneResult, batch:
     depth = batch.target.depth
     middle = float(depth[depth > 0].median())
     options = EvaluationOptions(alignment="scene", depth_range=(None, middle), neighbors=3)
-    scores = SceneEvaluator(module.model, module.renderer, options)(batch).scores
+    scores = SceneEvaluator(module.model, module.renderer, options)(batch).metrics
     render = result.renders["gt_pose"]
-    expected = depth_metrics(render.depth[0], depth[0], "scene", 0.0, middle)
+    expected = depth_metrics(render.depth[0], torch.where(depth[0] <= middle, depth[0], 0.0), "scene")
     assert scores["rendered/gt_pose/solid/abs_rel"] == expected["abs_rel"]
-    assert scores["scene/cv"] != result.scores["scene/cv"]
+    assert scores["scene/cv"] != result.metrics["scene/cv"]
     with pytest.raises(ValueError, match=r"alignment='affine'"):
         EvaluationOptions(alignment="affine")
     with pytest.raises(ValueError, match="neighbors >= 1"):
@@ -106,12 +106,12 @@ def test_true_depth_out_of_range_is_unknown_to_every_figure(module_and_batch, ba
     target, render = near.target, limited.renders["gt_pose"]
     normals, valid = normals_from_depth(target.depth[0], target.cameras.intrinsics[0])
     expected = normal_metrics(render.normal[0], normals, valid & (render.depth[0] > 0))["mean"]
-    assert limited.scores["rendered/gt_pose/solid/normal_mean"] == expected
+    assert limited.metrics["rendered/gt_pose/solid/normal_mean"] == expected
     similarity = align_geometry(limited.prediction.geometry, near.context)
     assert similarity is not None
     geometry, options = limited.prediction.geometry, asdict(PointOptions())
-    points = point_scores(geometry.depth, geometry.cameras, near.context, similarity, **options)
-    assert limited.scores["points/decoded/f_score"] == points["f_score"]
+    points = point_cloud_metrics(geometry.depth, geometry.cameras, near.context, similarity, **options)
+    assert limited.metrics["points/decoded/f_score"] == points["f_score"]
 
 
 def test_points_of_unknown_pixels_are_not_wrong(batch: Batch) -> None:
@@ -121,13 +121,13 @@ def test_points_of_unknown_pixels_are_not_wrong(batch: Batch) -> None:
     holes[:, 0] = True  # a view without any depth
     truth = replace(context, depth=torch.where(holes, 0.0, context.depth))
     perfect = Similarity(torch.ones(1), torch.eye(3)[None], torch.zeros(1, 3))
-    scores = point_scores(context.depth, context.cameras, truth, perfect, threshold=1e-4)
+    scores = point_cloud_metrics(context.depth, context.cameras, truth, perfect, threshold=1e-4)
     assert scores["precision"] == scores["recall"] == 1
     assert scores["accuracy"] == 0
 
 
 def test_placeholder_cameras_score_no_normals(evaluator: SceneEvaluator, batch: Batch) -> None:
-    scores = evaluator(batch, has_cameras=False).scores
+    scores = evaluator(batch, has_cameras=False).metrics
     assert "rendered/novel/solid/psnr" in scores
     assert not any("normal" in name for name in scores)
 

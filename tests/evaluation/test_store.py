@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from vg2gt.data.views.sampling import SceneSample
-from vg2gt.evaluation.run import mean_scores
+from vg2gt.evaluation.run import mean_metrics
 from vg2gt.evaluation.store import ResultStore, file_name
 
 VIEWS = SceneSample("kitchen/seq-01", (1, 2), (3,))
@@ -46,13 +46,13 @@ def test_means_leave_out_what_is_missing_and_times_are_medians() -> None:
         "b": {"psnr": 30.0, "abs_rel": 0.2, "scene/head_seconds": 1.0},
         "c": {"psnr": 40.0, "abs_rel": 0.4, "scene/head_seconds": 2.0, "lpips": None},
     }
-    means = mean_scores(scenes)
+    means = mean_metrics(scenes)
     assert means["psnr"] == 30
     assert means["abs_rel"] == pytest.approx(0.3)
     assert means["scene/head_seconds"] == 2
     assert means["lpips"] is None
     two = {name: scenes[name] for name in ("a", "b")}  # the first of two compiled: it says nothing of the rest
-    assert mean_scores(two)["scene/head_seconds"] == 1
+    assert mean_metrics(two)["scene/head_seconds"] == 1
 
 
 @pytest.mark.parametrize("name", ["config.yaml", "metrics.json", "scenes"])

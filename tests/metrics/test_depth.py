@@ -111,10 +111,10 @@ def test_holes_lower_coverage_and_fail_the_delta_test_with_holes_only() -> None:
     assert found["abs_rel"] == 0
 
 
-def test_range_and_unusable_images() -> None:
-    reference = torch.tensor([[[1.0, 2.0, 3.0, 50.0]], [[0.0, 0.0, 0.0, 60.0]]])
+def test_unusable_pixels_and_images_are_left_out() -> None:
+    reference = torch.tensor([[[1.0, 2.0, 0.0, torch.inf]], [[0.0, 0.0, 0.0, torch.nan]]])
     predicted = torch.tensor([[[1.1, 2.2, 9.0, 9.0]], [[1.0, 1.0, 1.0, 1.0]]])
-    found = depth_metrics(predicted, reference, "none", min_depth=0.5, max_depth=2.5)
+    found = depth_metrics(predicted, reference, "none")
     assert found["abs_rel"] == pytest.approx(0.1)
     assert found["coverage"] == 1
     nothing = depth_metrics(predicted, torch.zeros_like(reference))

@@ -43,7 +43,7 @@ def test_a_shifted_plane_and_a_half_of_it() -> None:
     assert found["completeness"] == pytest.approx(expected)
 
 
-def test_thinning_keeps_one_point_a_cell() -> None:
+def test_thinning_keeps_one_point_per_cell() -> None:
     points = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.6, 0, 0], [0.0, 0.6, 0], [0.05, 0.05, 0.05]])
     assert thin(points, 0.5).tolist() == points[[0, 2, 3]].tolist()
     dense = torch.cat((cloud(50, 0), cloud(50, 0) + 1e-6))

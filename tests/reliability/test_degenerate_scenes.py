@@ -74,7 +74,7 @@ def test_degenerate_scenes_do_no_harm_in_several_steps(
 
 def evaluated(model: Reconstructor, renderer: Renderer, batch: Batch) -> dict[str, float | None]:
     """All figures of both evaluations; fails if one is infinite where a report would show it."""
-    scores = SceneEvaluator(model.eval(), renderer, EvaluationOptions())(batch).scores
+    scores = SceneEvaluator(model.eval(), renderer, EvaluationOptions())(batch).metrics
     assert all(value is None or math.isfinite(value) for value in scores.values())
     if batch.images.shape[1] > batch.num_context:
         scores = scores | evaluate_scene(model, renderer, batch)

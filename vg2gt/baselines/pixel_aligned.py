@@ -1,4 +1,4 @@
-"""One Gaussian a pixel from a dense head on the frozen tokens, as Depth Anything 3 and others do."""
+"""One Gaussian per pixel from a dense head on the frozen tokens, as Depth Anything 3 and others do."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class PixelHead(nn.Module):
         hidden: width of the hidden layer; None takes ``in_channels``.
 
     Attributes:
-        out: the last layer; its last output a pixel is the logit of a confidence, which ``VoxelMerged`` uses.
+        out: the last layer; its last output per pixel is the logit of a confidence, which ``VoxelMerged`` uses.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class PixelHead(nn.Module):
             min_footprint: ``[N]`` in scene units; scales are relative to it where it is larger than the pixel. None: 0.
 
         Returns:
-            One Gaussian a pixel, in the order of the pixels, and positive confidences ``[N]`` that are those of the
+            One Gaussian per pixel, in the order of the pixels, and positive confidences ``[N]`` that are those of the
             depth before training.
         """
         raw = self.out(F.gelu(self.hidden(self.norm(features)))).float()
@@ -118,7 +118,7 @@ class PixelAligned(PixelReconstructor):
     """One Gaussian for every pixel with a depth; only the dense head and the Gaussian head are trained."""
 
     def make_gaussians(self, features: Tensor, pixels: Pixels, geometry: Geometry) -> Gaussians:
-        """One Gaussian a pixel."""
+        """One Gaussian per pixel."""
         return self.gaussians(features, pixels)[0]
 
 

@@ -1,4 +1,4 @@
-"""The usable pixels of all views as one packed list, and models that begin with a Gaussian a pixel."""
+"""The usable pixels of all views as one packed list, and models that begin with a Gaussian per pixel."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Pixels(TensorRecord):
     center: Tensor
 
     def to_world(self, local: Tensor) -> Tensor:
-        """Moves camera-frame points ``[N, 3]``, one a pixel, into the world; elementwise, so no autocast rounds it."""
+        """Moves camera-frame points ``[N, 3]``, one per pixel, into the world; elementwise: no autocast rounds it."""
         return (self.rotation * local[:, None, :]).sum(-1) + self.center
 
 

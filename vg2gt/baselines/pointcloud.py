@@ -20,7 +20,7 @@ NEIGHBORS = 3
 
 
 class PointCloud(Reconstructor):
-    """One round Gaussian a pixel, as wide as the points lie apart.
+    """One round Gaussian per pixel, as wide as the points lie apart.
 
     Args:
         backend: the frozen visual foundation model.

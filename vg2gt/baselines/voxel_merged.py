@@ -17,7 +17,7 @@ from vg2gt.voxels.grid import VoxelPlan, in_range, plan_voxels, point_cells, poo
 
 
 class VoxelMerged(PixelReconstructor):
-    """One Gaussian a pixel first; then all Gaussians of a voxel become their confidence-weighted mean.
+    """One Gaussian per pixel first; then all Gaussians of a voxel become their confidence-weighted mean.
 
     What is merged are finished parameters, not features: nothing looks at a voxel as a whole, and a voxel holds one
     Gaussian. Scales are relative to the voxel, where that is larger than the pixel, so that the merged Gaussians leave
@@ -46,7 +46,7 @@ class VoxelMerged(PixelReconstructor):
         self.min_footprint = min_footprint
 
     def make_gaussians(self, features: Tensor, pixels: Pixels, geometry: Geometry) -> Gaussians:
-        """One Gaussian an occupied voxel."""
+        """One Gaussian per occupied voxel."""
         size = scene_voxel_size(geometry, self.voxel_size, self.min_footprint)
         single, confidence = self.gaussians(features, pixels, min_footprint=size[pixels.batch])
         return merge_by_voxel(single, confidence, size)
@@ -61,7 +61,7 @@ def merge_by_voxel(gaussians: Gaussians, confidence: Tensor, voxel_size: Tensor)
         voxel_size: ``[B]`` edge length in scene units.
 
     Returns:
-        One Gaussian an occupied voxel; those too far away to be numbered are left out. Differentiable in parameters
+        One Gaussian per occupied voxel; those too far away to be numbered are left out. Differentiable in parameters
         and confidence, not in which Gaussian lies where.
     """
     cells = point_cells(gaussians.means, gaussians.batch, voxel_size)

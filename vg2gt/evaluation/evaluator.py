@@ -11,15 +11,14 @@ import torch
 
 from vg2gt.evaluation.options import EvaluationOptions
 from vg2gt.evaluation.protocols import ground_truth_target_cameras, joint_target_cameras
-from vg2gt.evaluation.scores import (
+from vg2gt.evaluation.scene_metrics import (
     align_geometry,
-    depth_scores,
-    image_scores,
-    normal_scores,
-    point_scores,
+    image_metrics,
+    point_cloud_metrics,
     present,
+    rendered_normal_metrics,
 )
-from vg2gt.metrics import LPIPS, camera_metrics, cv
+from vg2gt.metrics import LPIPS, camera_metrics, cv, depth_metrics
 from vg2gt.model import Reconstructor
 from vg2gt.profiling import clocked, now, peak_memory_mib, reset_peak_memory
 from vg2gt.rendering import Renderer, UnrenderableError
@@ -31,12 +30,12 @@ CV_QUERIES = 20_000
 MODES = ("solid", "rasterized")
 PROTOCOLS = ("novel", "gt_pose", "context")
 
-Scores = dict[str, float | None]
+Metrics = dict[str, float | None]
 
 
 @torch.no_grad()
 def evaluate_scene(model: Reconstructor, renderer: Renderer, batch: Batch) -> dict[str, float]:
-    """Reconstructs a scene from its context views and scores it on its held-out views, as training runs do.
+    """Reconstructs a scene from its context views and metrics it on its held-out views, as training runs do.
 
     Args:
         model: the model, in any mode; it is not changed.
@@ -47,7 +46,7 @@ def evaluate_scene(model: Reconstructor, renderer: Renderer, batch: Batch) -> di
         ``psnr``, ``ssim``, ``rmse``, ``abs_rel``, ``delta_1.25``, ``delta_1.05``, ``coverage``, ``normal_mean`` on
         held-out views at ground-truth poses, rendered as solids whatever the training renders; ``abs_rel_rasterized``
         with 3DGS rasterisation; ``decoded_abs_rel_before`` and ``decoded_abs_rel`` on the context views; ``gaussians``,
-        ``cv``. Depth is aligned by one median scale a scene.
+        ``cv``. Depth is aligned by one median scale per scene.
 
     Raises:
         ValueError: if the batch holds several scenes or no held-out view.
@@ -58,21 +57,19 @@ def evaluate_scene(model: Reconstructor, renderer: Renderer, batch: Batch) -> di
     prediction = model(batch.context.images, batch.context.hints)
     target = batch.target
     cameras = ground_truth_target_cameras(batch, prediction)
-    rendered = render_or_nan(renderer, prediction.gaussians, cameras, "solid")
-    rasterized = render_or_nan(renderer, prediction.gaussians, cameras, "rasterized")
-    images, depth = image_scores(rendered, target), depth_scores(rendered.depth, target, "scene")
+    rendered, rasterized = (render_or_nan(renderer, prediction.gaussians, cameras, mode) for mode in MODES)
+    depth = depth_metrics(rendered.depth[0], target.depth[0], "scene")
+
+    def abs_rel(found: torch.Tensor, truth: Batch) -> float:
+        return depth_metrics(found[0], truth.depth[0], "scene")["abs_rel"]
+
     return {
-        "psnr": images["psnr"],
-        "ssim": images["ssim"],
-        "rmse": depth["rmse"],
-        "abs_rel": depth["abs_rel"],
-        "delta_1.25": depth["delta_1.25"],
-        "delta_1.05": depth["delta_1.05"],
-        "coverage": depth["coverage"],
-        "abs_rel_rasterized": depth_scores(rasterized.depth, target, "scene")["abs_rel"],
-        "normal_mean": normal_scores(rendered, target)["normal_mean"],
-        "decoded_abs_rel_before": depth_scores(prediction.initial.depth, batch.context, "scene")["abs_rel"],
-        "decoded_abs_rel": depth_scores(prediction.geometry.depth, batch.context, "scene")["abs_rel"],
+        **image_metrics(rendered, target),
+        **{name: depth[name] for name in ("rmse", "abs_rel", "delta_1.25", "delta_1.05", "coverage")},
+        "abs_rel_rasterized": abs_rel(rasterized.depth, target),
+        "normal_mean": rendered_normal_metrics(rendered, target)["normal_mean"],
+        "decoded_abs_rel_before": abs_rel(prediction.initial.depth, batch.context),
+        "decoded_abs_rel": abs_rel(prediction.geometry.depth, batch.context),
         "gaussians": float(len(prediction.gaussians)),
         "cv": cv(prediction.gaussians.means, max_queries=CV_QUERIES),
     }
@@ -98,33 +95,31 @@ class SceneResult:
     """What the complete evaluation of a scene gives.
 
     Attributes:
-        scores: figures by their path, such as ``rendered/gt_pose/solid/psnr``; None where there is none.
+        metrics: figures by their path, such as ``rendered/gt_pose/solid/psnr``; None where there is none.
         prediction: the reconstruction.
         renders: solid renders by protocol.
     """
 
-    scores: Scores
+    metrics: Metrics
     prediction: Prediction
     renders: Mapping[str, Render]
 
 
+@dataclass(frozen=True)
 class SceneEvaluator:
     """Scores scenes completely: rendered in every protocol and mode, decoded, cameras, points, uniformity, cost.
 
-    Args:
+    Attributes:
         model: the model, in eval mode, on its device.
         renderer: its options are used in both modes.
         options: what is compared and how.
         lpips: the network, on the model's device; None where there is none.
     """
 
-    def __init__(
-        self, model: Reconstructor, renderer: Renderer, options: EvaluationOptions, lpips: LPIPS | None = None
-    ) -> None:
-        self.model = model
-        self.renderer = renderer
-        self.options = options
-        self.lpips = lpips
+    model: Reconstructor
+    renderer: Renderer
+    options: EvaluationOptions
+    lpips: LPIPS | None = None
 
     @torch.no_grad()
     def __call__(self, batch: Batch, has_cameras: bool = True) -> SceneResult:
@@ -141,22 +136,22 @@ class SceneEvaluator:
             raise ValueError(f"evaluation takes one scene at a time, got {', '.join(batch.scene)}")
         prediction, cost = self._reconstruct(batch)
         known = self._known(batch)
-        scores: dict[str, float] = {}
+        metrics: dict[str, float] = {}
         renders: dict[str, Render] = {}
         for protocol, cameras in self._cameras(batch, prediction, has_cameras).items():
             truth = known.context if protocol == "context" else known.target
             for mode in MODES:
                 rendered, seconds = self._render(prediction, cameras, mode)
-                scores |= _under(f"rendered/{protocol}/{mode}", self._view_scores(rendered, truth, has_cameras))
+                metrics |= _under(f"rendered/{protocol}/{mode}", self._view_metrics(rendered, truth, has_cameras))
                 if mode == "solid":
                     renders[protocol] = rendered
                     cost["render_seconds"] = seconds
-        scores |= _under("decoded/before", self._depth_scores(prediction.initial.depth, known.context))
-        scores |= _under("decoded/after", self._depth_scores(prediction.geometry.depth, known.context))
+        metrics |= _under("decoded/before", self._depth_metrics(prediction.initial.depth, known.context))
+        metrics |= _under("decoded/after", self._depth_metrics(prediction.geometry.depth, known.context))
         if has_cameras:
-            scores |= self._pose_and_point_scores(known.context, prediction, renders["context"])
+            metrics |= self._pose_and_point_cloud_metrics(known.context, prediction, renders["context"])
         cost["cv"] = cv(prediction.gaussians.means, self.options.neighbors, CV_QUERIES)
-        return SceneResult(present(scores | _under("scene", cost)), prediction, renders)
+        return SceneResult(present(metrics | _under("scene", cost)), prediction, renders)
 
     def _reconstruct(self, batch: Batch) -> tuple[Prediction, dict[str, float]]:
         device = batch.images.device
@@ -181,7 +176,7 @@ class SceneEvaluator:
         return cameras
 
     def _render(self, prediction: Prediction, cameras: Cameras, mode: Any) -> tuple[Render, float]:
-        """Renders views; also seconds a view."""
+        """Renders views; also seconds per view."""
         device = prediction.gaussians.means.device
         begin = now(device)
         rendered = render_or_nan(self.renderer, prediction.gaussians, cameras, mode)
@@ -192,25 +187,25 @@ class SceneEvaluator:
         inside = (batch.depth >= self.options.nearest) & (batch.depth <= self.options.farthest)
         return replace(batch, depth=torch.where(inside, batch.depth, 0.0))
 
-    def _view_scores(self, rendered: Render, truth: Batch, has_cameras: bool) -> dict[str, float]:
-        scores = image_scores(rendered, truth, self.lpips) | self._depth_scores(rendered.depth, truth)
-        return scores | normal_scores(rendered, truth) if has_cameras else scores
+    def _view_metrics(self, rendered: Render, truth: Batch, has_cameras: bool) -> dict[str, float]:
+        metrics = image_metrics(rendered, truth, self.lpips) | self._depth_metrics(rendered.depth, truth)
+        return metrics | rendered_normal_metrics(rendered, truth) if has_cameras else metrics
 
-    def _depth_scores(self, depth: torch.Tensor, truth: Batch) -> dict[str, float]:
-        return depth_scores(depth, truth, self.options.alignment)
+    def _depth_metrics(self, depth: torch.Tensor, truth: Batch) -> dict[str, float]:
+        return depth_metrics(depth[0], truth.depth[0], self.options.alignment)
 
-    def _pose_and_point_scores(self, truth: Batch, prediction: Prediction, rendered: Render) -> dict[str, float]:
-        scores: dict[str, float] = {}
+    def _pose_and_point_cloud_metrics(self, truth: Batch, prediction: Prediction, rendered: Render) -> dict[str, float]:
+        metrics: dict[str, float] = {}
         geometry = prediction.geometry
         if truth.num_context > 1:
-            scores |= _under("cameras", camera_metrics(geometry.cameras, truth.cameras))
+            metrics |= _under("cameras", camera_metrics(geometry.cameras, truth.cameras))
         similarity = align_geometry(geometry, truth)
         if similarity is not None:
             for name, depth in (("decoded", geometry.depth), ("rendered", rendered.depth)):
-                found = point_scores(depth, geometry.cameras, truth, similarity, **asdict(self.options.points))
-                scores |= _under(f"points/{name}", found)
-        return scores
+                found = point_cloud_metrics(depth, geometry.cameras, truth, similarity, **asdict(self.options.points))
+                metrics |= _under(f"points/{name}", found)
+        return metrics
 
 
-def _under(path: str, scores: Mapping[str, float]) -> dict[str, float]:
-    return {f"{path}/{name}": value for name, value in scores.items()}
+def _under(path: str, metrics: Mapping[str, float]) -> dict[str, float]:
+    return {f"{path}/{name}": value for name, value in metrics.items()}

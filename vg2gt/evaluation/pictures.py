@@ -16,7 +16,7 @@ PANELS = "input | rendered | truth | rendered depth | true depth | depth error |
 
 
 def scene_picture(batch: Batch, rendered: Render, truth: Batch, alignment: str) -> Tensor:
-    """One row a view, evenly spread, at most three: the panels of :data:`PANELS`.
+    """One row per view, evenly spread, at most three: the panels of :data:`PANELS`.
 
     Args:
         batch: the scene; the input view shown is the one taken nearest to the rendered view.

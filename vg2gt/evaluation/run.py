@@ -20,7 +20,7 @@ from vg2gt.data.datamodule import SceneDataModule
 from vg2gt.data.views.sampling import SceneSample
 from vg2gt.evaluation import paper
 from vg2gt.evaluation.checks import refuse_training_views, refuse_without_hints
-from vg2gt.evaluation.evaluator import SceneEvaluator, SceneResult
+from vg2gt.evaluation.evaluator import SceneEvaluator
 from vg2gt.evaluation.options import EvaluationOptions
 from vg2gt.evaluation.pictures import PANELS, scene_picture
 from vg2gt.evaluation.sections import report_markdown
@@ -32,7 +32,6 @@ from vg2gt.metrics import LPIPS, WeightsNotFoundError, load_lpips
 from vg2gt.model import Reconstructor
 from vg2gt.runs.find import checkpoint_path
 from vg2gt.runs.load import TrainedWeights, build_model, choose_device, load_weights, resolve_parts
-from vg2gt.types import Batch
 
 log = logging.getLogger(__name__)
 
@@ -45,7 +44,7 @@ FREE += ("data.workers", "data.memory_mb", "data.steps_per_epoch")
 def evaluate(config: DictConfig) -> dict[str, Any]:
     """Evaluates a model on the scenes of a data set, for every number of input views asked.
 
-    Writes into the output folder: the resolved configuration, one file a scene as it is done, ``metrics.json``,
+    Writes into the output folder: the resolved configuration, one file per scene as it is done, ``metrics.json``,
     ``metrics.md`` and pictures. Scenes that the folder holds already are not evaluated again.
 
     Args:
@@ -84,8 +83,8 @@ def evaluate(config: DictConfig) -> dict[str, Any]:
     report = {
         "settings": settings,
         "views": {
-            str(count): {"mean": mean_scores(scores), "scenes": dict(sorted(scores.items()))}
-            for count, scores in results.items()
+            str(count): {"mean": mean_metrics(metrics), "scenes": dict(sorted(metrics.items()))}
+            for count, metrics in results.items()
         },
     }
     write_json(folder / "metrics.json", report)
@@ -98,12 +97,12 @@ def evaluate(config: DictConfig) -> dict[str, Any]:
     return report
 
 
-def mean_scores(scenes: Mapping[str, Mapping[str, float | None]]) -> dict[str, float | None]:
+def mean_metrics(scenes: Mapping[str, Mapping[str, float | None]]) -> dict[str, float | None]:
     """Mean over the scenes that have a figure; of times and memory the lower median: the first scene also compiles."""
-    names = dict.fromkeys(name for scores in scenes.values() for name in scores)
+    names = dict.fromkeys(name for metrics in scenes.values() for name in metrics)
     means: dict[str, float | None] = {}
     for name in names:
-        values = [value for scores in scenes.values() if (value := scores.get(name)) is not None]
+        values = [value for metrics in scenes.values() if (value := metrics.get(name)) is not None]
         average = statistics.median_low if name.endswith(("_seconds", "_mib")) else statistics.fmean
         means[name] = average(values) if values else None
     return means
@@ -163,27 +162,24 @@ def _evaluate_all(
     store: ResultStore,
     device: torch.device,
 ) -> dict[str, dict[str, float | None]]:
-    """Scores by scene; those in the store are taken from there, unless their picture is wanted and missing."""
+    """Metrics per scene; those in the store are taken from there, unless their picture is wanted and missing."""
     results = {}
     for number, views in enumerate(samples):
         wanted = number < evaluator.options.pictures
-        scores = store.read(views)
-        if scores is None or (wanted and not store.picture(views).is_file()):
+        metrics = store.read(views)
+        if metrics is None or (wanted and not store.picture(views).is_file()):
             batch = data[(views,)].to(device)
             result = evaluator(batch, has_cameras=data.source.has_cameras)
             if wanted:
-                _write_picture(store.picture(views), batch, result, evaluator.options.alignment)
-            scores = result.scores
-            store.write(views, scores)
+                protocol = next(name for name in ("gt_pose", "novel", "context") if name in result.renders)
+                truth = batch.context if protocol == "context" else batch.target
+                shown = scene_picture(batch, result.renders[protocol], truth, evaluator.options.alignment)
+                write_png(store.picture(views), shown)
+            metrics = result.metrics
+            store.write(views, metrics)
             log.info("%d views, scene %d of %d: %s", len(views.context), number + 1, len(samples), views.scene)
-        results[views.scene] = scores
+        results[views.scene] = metrics
     return results
-
-
-def _write_picture(path: Path, batch: Batch, result: SceneResult, alignment: str) -> None:
-    protocol = next(name for name in ("gt_pose", "novel", "context") if name in result.renders)
-    truth = batch.context if protocol == "context" else batch.target
-    write_png(path, scene_picture(batch, result.renders[protocol], truth, alignment))
 
 
 def _settings(

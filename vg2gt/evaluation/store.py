@@ -58,7 +58,7 @@ class ResultStore:
         write_json(folder / IDENTITY, dict(identity))
 
     def read(self, views: SceneSample) -> dict[str, float | None] | None:
-        """The scores of a sample that was evaluated before; None if it was not, or with other frames."""
+        """The metrics of a sample that was evaluated before; None if it was not, or with other frames."""
         path = self._path(views)
         if not path.is_file():
             return None
@@ -69,13 +69,13 @@ class ResultStore:
         same = stored["context"] == list(views.context) and stored["target"] == list(views.target)
         return stored["scores"] if same else None
 
-    def write(self, views: SceneSample, scores: Mapping[str, float | None]) -> None:
-        """Writes the scores of a sample, atomically."""
+    def write(self, views: SceneSample, metrics: Mapping[str, float | None]) -> None:
+        """Writes the metrics of a sample, atomically."""
         content = {
             "scene": views.scene,
             "context": list(views.context),
             "target": list(views.target),
-            "scores": dict(scores),
+            "scores": dict(metrics),
         }
         write_json(self._path(views), content)
 

@@ -133,14 +133,8 @@ def align_cameras(predicted: Cameras, reference: Cameras, still_scale: Tensor | 
     rotation = _nearest_rotation((orientations[1].transpose(-1, -2) @ orientations[0]).sum(1))
 
     source, target = _centers(predicted).double(), _centers(reference).double()
-    moves = _moves(source) & _moves(target)
-    source_mean, target_mean = source.mean(1), target.mean(1)
-    turned = (source - source_mean[:, None]) @ rotation.transpose(-1, -2)
-    agreement = (turned * (target - target_mean[:, None])).sum((1, 2))
-    still = torch.ones_like(agreement) if still_scale is None else still_scale.double()
-    scale = torch.where(moves & (agreement > 0), agreement / turned.square().sum((1, 2)), still)
-    translation = target_mean - scale[:, None] * (rotation @ source_mean[..., None])[..., 0]
-    return Similarity(scale.to(dtype), rotation.to(dtype), translation.to(dtype))
+    still = 1.0 if still_scale is None else still_scale.double()
+    return _umeyama(rotation, source, target, _moves(source) & _moves(target), still, dtype)
 
 
 def align_points(points: Tensor, reference: Tensor) -> Similarity:
@@ -155,15 +149,24 @@ def align_points(points: Tensor, reference: Tensor) -> Similarity:
         points that coincide the scale is 1.
     """
     source, target = points.double(), reference.double()
+    centered, centered_target = source - source.mean(1)[:, None], target - target.mean(1)[:, None]
+    rotation = _nearest_rotation(centered_target.transpose(-1, -2) @ centered)
+    return _umeyama(rotation, source, target, _moves(source), 1.0, points.dtype)
+
+
+def _umeyama(
+    rotation: Tensor, source: Tensor, target: Tensor, moves: Tensor, still: Tensor | float, dtype: torch.dtype
+) -> Similarity:
+    """Least-squares scale and translation of points ``[B, N, 3]`` once turned (Umeyama 1991, eqn 41 and 42).
+
+    Scenes that do not move ``[B]``, or move against their target, take the scale ``still``.
+    """
     source_mean, target_mean = source.mean(1), target.mean(1)
-    centered = source - source_mean[:, None]
-    rotation = _nearest_rotation((target - target_mean[:, None]).transpose(-1, -2) @ centered)
-    turned = centered @ rotation.transpose(-1, -2)
-    spread = turned.square().sum((1, 2))
+    turned = (source - source_mean[:, None]) @ rotation.transpose(-1, -2)
     agreement = (turned * (target - target_mean[:, None])).sum((1, 2))
-    scale = torch.where(_moves(source) & (agreement > 0), agreement / spread, 1.0)
+    scale = torch.where(moves & (agreement > 0), agreement / turned.square().sum((1, 2)), still)
     translation = target_mean - scale[:, None] * (rotation @ source_mean[..., None])[..., 0]
-    return Similarity(*(part.to(points.dtype) for part in (scale, rotation, translation)))
+    return Similarity(scale.to(dtype), rotation.to(dtype), translation.to(dtype))
 
 
 def _moves(centers: Tensor) -> Tensor:

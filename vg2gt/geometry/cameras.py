@@ -77,7 +77,7 @@ def project(points: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
     """Projects world points into every view.
 
     Args:
-        points: ``[B, V, ..., 3]`` world points, one set a view.
+        points: ``[B, V, ..., 3]`` world points, one set per view.
         cameras: the views.
 
     Returns:
@@ -100,7 +100,7 @@ def relative_to_first(cameras: Cameras) -> Cameras:
 
 
 def scale_translations(cameras: Cameras, scale: Tensor) -> Cameras:
-    """Multiplies the cameras' translations by one factor ``[B]`` a scene."""
+    """Multiplies the cameras' translations by one factor ``[B]`` per scene."""
     poses = cameras.world_to_camera
     translation = poses[..., :3, 3:] * scale[:, None, None, None]
     top = torch.cat((poses[..., :3, :3], translation), -1)

@@ -1,4 +1,8 @@
-"""Quaternions (wxyz) and rotation matrices."""
+"""Quaternions (wxyz) and rotation matrices.
+
+Not kornia's: its gradients of :func:`quat_to_matrix` and values of :func:`matrix_to_quat` differ in the last bits, and
+training must stay equal to the bit; times are alike.
+"""
 
 from __future__ import annotations
 

@@ -63,7 +63,7 @@ def camera_metrics(predicted: Cameras, reference: Cameras) -> dict[str, float]:
         ValueError: if there is no pair.
     """
     if predicted.world_to_camera.shape[1] < 2:
-        raise ValueError("camera metrics need at least 2 views a scene, got 1")
+        raise ValueError("camera metrics need at least 2 views per scene, got 1")
     rotation, translation = relative_pose_errors(predicted, reference)
     results = {f"rra_{t}": float((rotation < t).double().mean()) for t in ACCURACIES}
     results |= {f"rta_{t}": float((translation < t).double().mean()) for t in ACCURACIES}

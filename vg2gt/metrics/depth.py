@@ -15,24 +15,16 @@ NAMES = ("abs_rel", "mae", "rmse", *(f"delta_{d}" for d in DELTAS), "coverage", 
 SMALLEST = 1e-6
 
 
-def depth_metrics(
-    predicted: Tensor,
-    reference: Tensor,
-    alignment: str = "median",
-    min_depth: float = 0.0,
-    max_depth: float = float("inf"),
-) -> dict[str, float]:
+def depth_metrics(predicted: Tensor, reference: Tensor, alignment: str = "median") -> dict[str, float]:
     """Scores the depth maps of one scene: pixels are averaged per image, images per scene.
 
-    A pixel counts where the reference is valid and in range and the prediction has a depth.
+    A pixel counts where the reference is valid and the prediction has a depth.
 
     Args:
         predicted: ``[V, H, W]`` z-depth, 0 = hole.
         reference: ``[V, H, W]`` true z-depth, 0 = invalid.
-        alignment: ``median``: one median ratio an image; ``scene``: one median ratio a scene; ``wmed``: an image's
-            ratio that minimises the relative L1 error; ``scale_shift``: least squares an image; ``none``.
-        min_depth: reference depths below it are left out.
-        max_depth: reference depths above it are left out.
+        alignment: ``median``: one median ratio per image; ``scene``: one median ratio per scene; ``wmed``: the ratio
+            per image that minimises the relative L1 error; ``scale_shift``: least squares per image; ``none``.
 
     Returns:
         ``abs_rel``, ``mae``, ``rmse`` (in the reference's unit), ``delta_1.25``, ``delta_1.05``, ``delta_1.03`` over
@@ -50,7 +42,7 @@ def depth_metrics(
     if alignment not in ALIGNMENTS:
         raise ValueError(f"alignment must be one of {ALIGNMENTS}, got {alignment!r}")
     predicted, reference = predicted.double(), reference.double()
-    usable = (reference > 0) & reference.isfinite() & (reference >= min_depth) & (reference <= max_depth)
+    usable = (reference > 0) & reference.isfinite()
     valid = usable & (predicted > 0) & predicted.isfinite()
     if alignment == "scene":
         alignment = "none"

@@ -129,7 +129,7 @@ def load_lpips(source: str = "auto") -> LPIPS:
         raise WeightsNotFoundError(f"weights not found: {looked}{HOW_TO_GET}")
     state = _installed_channel_weights()
     for file in files:
-        state |= _read(file)
+        state |= read_tensors(file)
     return LPIPS(state)
 
 
@@ -138,11 +138,7 @@ def _installed_channel_weights() -> dict[str, Tensor]:
     package = importlib.util.find_spec("torchmetrics")
     folders = list(package.submodule_search_locations or ()) if package else []
     files = [Path(folder, "functional", "image", "lpips_models", "vgg.pth") for folder in folders]
-    return next((_read(file) for file in files if file.is_file()), {})
-
-
-def _read(file: Path) -> dict[str, Tensor]:
-    return read_tensors(file)
+    return next((read_tensors(file) for file in files if file.is_file()), {})
 
 
 def _tensor(state: Mapping[str, Tensor], name: str, shape: tuple[int, ...]) -> Tensor:

@@ -61,7 +61,7 @@ def labels(runs: list[Path]) -> list[str]:
 
 
 def plot_curves(runs: list[Path], out: Path) -> Path:
-    """Writes one panel a quantity and one line a run: every logged value pale, the moving average strong.
+    """Writes one panel per quantity and one line per run: every logged value pale, the moving average strong.
 
     Raises:
         ImportError: if matplotlib is not installed.

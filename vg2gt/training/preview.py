@@ -15,7 +15,7 @@ from vg2gt.types import Batch
 
 @torch.no_grad()
 def write_preview(module: VG2GTModule, datamodule: LightningDataModule, path: str | Path, scenes: int = 3) -> Path:
-    """Writes one row a scene: input | rendered colour | rendered depth | rendered normals | ground truth.
+    """Writes one row per scene: input | rendered colour | rendered depth | rendered normals | ground truth.
 
     Args:
         module: the trained module.

@@ -2,44 +2,40 @@
 
 from __future__ import annotations
 
-import torch
+import math
+
 from torch import Tensor
 
 from vg2gt.geometry.alignment import Similarity, align_points
 from vg2gt.geometry.cameras import unproject
 from vg2gt.geometry.normals import normals_from_depth
-from vg2gt.metrics import LPIPS, depth_metrics, normal_metrics, point_metrics, psnr, ssim
+from vg2gt.metrics import LPIPS, normal_metrics, point_metrics, psnr, ssim
 from vg2gt.types import Batch, Cameras, Geometry, Render
 
 
-def image_scores(rendered: Render, truth: Batch, lpips: LPIPS | None = None) -> dict[str, float]:
+def image_metrics(rendered: Render, truth: Batch, lpips: LPIPS | None = None) -> dict[str, float]:
     """``psnr``, ``ssim`` and, with a network, ``lpips`` of one scene's views, averaged over images."""
-    scores = {
+    found = {
         "psnr": float(psnr(rendered.color[0], truth.images[0]).mean()),
         "ssim": float(ssim(rendered.color[0], truth.images[0]).mean()),
     }
     if lpips is not None:
-        scores["lpips"] = float(lpips(rendered.color[0], truth.images[0]).mean())
-    return scores
+        found["lpips"] = float(lpips(rendered.color[0], truth.images[0]).mean())
+    return found
 
 
-def normal_scores(rendered: Render, truth: Batch) -> dict[str, float]:
+def rendered_normal_metrics(rendered: Render, truth: Batch) -> dict[str, float]:
     """Errors of the rendered normals of one scene, names with ``normal_`` in front.
 
     Pixels count where the true depth has a normal, which takes a valid pixel, four valid neighbours and no depth edge
     between them, and where a depth was rendered.
     """
     normals, valid = normals_from_depth(truth.depth, truth.cameras.intrinsics)
-    scores = normal_metrics(rendered.normal[0], normals[0], valid[0] & (rendered.depth[0] > 0))
-    return {f"normal_{name}": value for name, value in scores.items()}
+    found = normal_metrics(rendered.normal[0], normals[0], valid[0] & (rendered.depth[0] > 0))
+    return {f"normal_{name}": value for name, value in found.items()}
 
 
-def depth_scores(depth: Tensor, truth: Batch, alignment: str) -> dict[str, float]:
-    """Errors of depth maps ``[1, V, H, W]`` of one scene, see :func:`vg2gt.metrics.depth_metrics`."""
-    return depth_metrics(depth[0], truth.depth[0], alignment)
-
-
-def point_scores(
+def point_cloud_metrics(
     depth: Tensor, cameras: Cameras, truth: Batch, similarity: Similarity, **options: float | None
 ) -> dict[str, float]:
     """Compares the points of predicted depth maps with those of the true ones.
@@ -75,4 +71,4 @@ def align_geometry(geometry: Geometry, truth: Batch) -> Similarity | None:
 
 def present(values: dict[str, float]) -> dict[str, float | None]:
     """The same figures with None where there is none, as JSON has no NaN; infinity is none either."""
-    return {name: value if bool(torch.isfinite(torch.tensor(float(value)))) else None for name, value in values.items()}
+    return {name: value if math.isfinite(value) else None for name, value in values.items()}
