@@ -9,7 +9,7 @@ import torch
 from vg2gt.data import DataError, RGBDFolder, SceneDataModule, SyntheticScenes
 from vg2gt.data.batches import BatchDataset
 from vg2gt.data.framing import Framing
-from vg2gt.data.views.sampling import SceneSample
+from vg2gt.data.views import SceneSample
 
 from .conftest import SIZE
 

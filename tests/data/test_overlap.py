@@ -6,7 +6,7 @@ import pytest
 
 from vg2gt.data import DataError, Mixture, SceneSource, SyntheticScenes
 from vg2gt.data.overlap import refuse_overlap
-from vg2gt.data.views.sampling import SceneSample
+from vg2gt.data.views import SceneSample
 
 
 class Scans(SyntheticScenes):

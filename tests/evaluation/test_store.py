@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from vg2gt.data.views.sampling import SceneSample
+from vg2gt.data.views import SceneSample
 from vg2gt.evaluation.run import mean_metrics
 from vg2gt.evaluation.store import ResultStore, file_name
 

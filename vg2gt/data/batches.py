@@ -10,7 +10,7 @@ from torch.utils.data import Dataset
 
 from vg2gt.data.base import DataError, Frames, SceneSource, training_frames
 from vg2gt.data.frame_cache import FrameCache
-from vg2gt.data.views.sampling import SceneSample
+from vg2gt.data.views import SceneSample
 from vg2gt.types import Batch, Cameras
 
 log = logging.getLogger(__name__)
@@ -62,7 +62,7 @@ class BatchDataset(Dataset[Batch]):
 
         The result depends on the files alone, not on what was read before.
         """
-        ids = (*view.context, *view.target)
+        ids = view.frames
         if not self.replace_damaged:
             return self.cache.load(view.scene, ids), ids
         if self.damaged.isdisjoint((view.scene, frame) for frame in ids):

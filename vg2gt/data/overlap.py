@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 
 from vg2gt.data.base import DataError, SceneSource
-from vg2gt.data.views.sampling import SceneSample
+from vg2gt.data.views import SceneSample
 
 log = logging.getLogger(__name__)
 

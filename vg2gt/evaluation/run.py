@@ -17,7 +17,7 @@ from vg2gt.config import flatten
 from vg2gt.data.base import DataError, SceneSource
 from vg2gt.data.batches import BatchDataset
 from vg2gt.data.datamodule import SceneDataModule
-from vg2gt.data.views.sampling import SceneSample
+from vg2gt.data.views import SceneSample
 from vg2gt.evaluation import paper
 from vg2gt.evaluation.checks import refuse_training_views, refuse_without_hints
 from vg2gt.evaluation.evaluator import SceneEvaluator

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from vg2gt.data.views.sampling import SceneSample
+from vg2gt.data.views import SceneSample
 from vg2gt.io.files import read_json, write_json
 
 IDENTITY = "identity.json"

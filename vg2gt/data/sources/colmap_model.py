@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,6 @@ from vg2gt.data.base import DataError
 from vg2gt.data.sources.files import FileSource, HoldoutOptions
 from vg2gt.data.sources.index import SceneIndex, make_index
 from vg2gt.data.sources.parsing import errors_name, named_file, to_world
-from vg2gt.data.sources.scene_folders import scene_folders
 from vg2gt.geometry.cameras import resize_intrinsics
 from vg2gt.io import ColmapImage, ColmapModel, colmap_intrinsics, colmap_pose, read_colmap
 from vg2gt.io.image_files import Size, image_size
@@ -43,6 +42,7 @@ class COLMAP(FileSource):
     """
 
     layout = "a COLMAP model in sparse/0 or sparse and its undistorted images/, there or up to two folders deeper"
+    names_are_paths = True
     index_options = ("images", "has_depth")
     sparse_depth = True
     is_metric = False
@@ -61,9 +61,9 @@ class COLMAP(FileSource):
         self._points: dict[str, _Points] = {}
         super().__init__(root, **shared)
 
-    def find(self, root: Path) -> Mapping[str, Path]:
-        """The folder itself, or scenes one or two levels below it."""
-        return scene_folders(root, lambda folder: model_folder_of(folder) is not None, by_path=True)
+    def is_scene(self, folder: Path) -> bool:
+        """Whether it holds a model."""
+        return model_folder_of(folder) is not None
 
     def watched(self, scene: str, folder: Path) -> Sequence[Path | None]:
         """Also the model's folder."""

@@ -25,7 +25,6 @@ from vg2gt.data.sources.parsing import (
     to_world,
 )
 from vg2gt.data.sources.scan_depth import VERSION, ScanDepth
-from vg2gt.data.sources.scene_folders import scene_folders
 from vg2gt.io.image_files import Size, read_depth
 from vg2gt.io.pfm import read_pfm
 
@@ -131,6 +130,8 @@ class DTU(FileSource):
     """
 
     layout = "scans with images/ and cams/NNNNNNNN_cam.txt, there or one folder deeper"
+    scene_marks = ("images", "cams")
+    levels = 1
     index_options = ("depth", "depth_root")
 
     def __init__(
@@ -150,10 +151,6 @@ class DTU(FileSource):
         self.depth_root = existing_depth_root(depth_root)
         self._scan_depth = ScanDepth(expanded(depth_cache))
         super().__init__(root, **shared)
-
-    def find(self, root: Path) -> Mapping[str, Path]:
-        """The folder itself, or scans one level below it."""
-        return scene_folders(root, lambda folder: (folder / "images").is_dir() and (folder / "cams").is_dir(), levels=1)
 
     def place(self, scene: str) -> str:
         """``scanN``, as in the training set, so that a scan cannot serve both."""

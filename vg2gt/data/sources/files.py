@@ -65,6 +65,12 @@ class FileSource(SceneSource):
 
     layout: ClassVar[str]
     """What is looked for in ``root``, for messages."""
+    scene_marks: ClassVar[tuple[str, ...]] = ()
+    """Files and folders that a folder must hold to be a scene."""
+    levels: ClassVar[int] = 2
+    """How deep below ``root`` scenes lie, at most."""
+    names_are_paths: ClassVar[bool] = False
+    """Scenes are called by their path below ``root``, not by their folder's name."""
     index_version: ClassVar[int] = 1
     """Raise it when ``index`` would give another result for the same files."""
     index_options: ClassVar[tuple[str, ...]] = ()
@@ -112,9 +118,26 @@ class FileSource(SceneSource):
         self._frame_ids: dict[str, NDArray[np.int64]] = {}
         self._indexes = False
 
-    @abstractmethod
+    def is_scene(self, folder: Path) -> bool:
+        """Whether a folder is a scene: it holds the ``scene_marks``, unless a loader knows better."""
+        return all((folder / mark).exists() for mark in self.scene_marks)
+
     def find(self, root: Path) -> Mapping[str, Path]:
-        """Scenes below ``root`` by name, with their folders, without reading them."""
+        """Scenes by name, with their folders, without reading them: ``root`` itself, or those up to ``levels`` below.
+
+        Raises:
+            DataError: if two scenes get one name.
+        """
+        if self.is_scene(root):
+            return {root.resolve().name: root}
+        found: dict[str, Path] = {}
+        for depth in range(1, self.levels + 1):
+            for folder in sorted(path for path in root.glob("/".join("*" * depth)) if path.is_dir()):
+                if self.is_scene(folder):
+                    _add_scene(
+                        found, folder.relative_to(root).as_posix() if self.names_are_paths else folder.name, folder
+                    )
+        return found
 
     @abstractmethod
     def index(self, scene: str, folder: Path) -> SceneIndex:
@@ -236,12 +259,7 @@ class FileSource(SceneSource):
             if not inside:
                 raise DataError(f"no scene of {type(self).__name__} in {root}: expected {self.layout}")
             for name, folder in inside.items():
-                if name in found:
-                    raise DataError(
-                        f"two scenes are called {name}: {found[name]} and {folder}; rename one, or give data.root "
-                        "their common parent folder"
-                    )
-                found[name] = folder
+                _add_scene(found, name, folder)
         return found
 
     def _select(self, found: dict[str, Path], scenes: Sequence[str] | str | None) -> dict[str, Path]:
@@ -309,6 +327,15 @@ def _roots(root: str | Sequence[str] | None, layout: str) -> list[Path]:
                 f"holds {layout}"
             )
     return roots
+
+
+def _add_scene(found: dict[str, Path], name: str, folder: Path) -> None:
+    if name in found:
+        raise DataError(
+            f"two scenes are called {name}: {found[name]} and {folder}; rename one, or give data.root one of them or "
+            "their common parent folder"
+        )
+    found[name] = folder
 
 
 def _some(names: Sequence[str] | Mapping[str, object], most: int = 10) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from vg2gt.data.sources.files import FileSource
 from vg2gt.data.sources.index import SceneIndex, make_index
 from vg2gt.data.sources.parsing import IMAGE_SUFFIXES, pinhole
-from vg2gt.data.sources.scene_folders import scene_folders
 from vg2gt.io.image_files import Size, image_size, read_color
 
 FOCAL = 1.2
@@ -36,6 +35,7 @@ class ImageFolder(FileSource):
     """
 
     layout = f"images ({', '.join(suffix[1:] for suffix in IMAGE_SUFFIXES)}), there or up to two folders deeper"
+    names_are_paths = True
     is_metric = False
     has_depth = False
     has_cameras = False
@@ -49,9 +49,9 @@ class ImageFolder(FileSource):
     ) -> None:
         super().__init__(root, scenes, None, every, index_cache)
 
-    def find(self, root: Path) -> Mapping[str, Path]:
-        """The folder itself, or folders one or two levels below it."""
-        return scene_folders(root, lambda folder: bool(_images(folder)), by_path=True)
+    def is_scene(self, folder: Path) -> bool:
+        """Whether it holds images."""
+        return bool(_images(folder))
 
     def index(self, scene: str, folder: Path) -> SceneIndex:
         """Lists the images and reads their sizes."""

@@ -14,7 +14,6 @@ from vg2gt.data.base import DataError
 from vg2gt.data.sources.files import FileSource, HoldoutOptions
 from vg2gt.data.sources.index import SceneIndex, check_found, make_index
 from vg2gt.data.sources.parsing import CORNER_TO_CENTER, positive
-from vg2gt.data.sources.scene_folders import scene_folders
 from vg2gt.io.arrays import load_matrices, load_npy, npy_size
 from vg2gt.io.image_files import Size
 
@@ -47,6 +46,8 @@ class Infinigen(FileSource):
     """
 
     layout = "SCENE/frames/{Image,Depth,camview}/camera_0, there or up to two folders deeper"
+    scene_marks = ("frames/Image/camera_0",)
+    names_are_paths = True
     depth_remedy = "raise data.max_depth, beyond which points have no depth (nor has the sky)"
 
     def __init__(
@@ -59,9 +60,8 @@ class Infinigen(FileSource):
         super().__init__(root, **shared)
 
     def find(self, root: Path) -> Mapping[str, Path]:
-        """Folders with ``frames/Image/camera_0``, by their path."""
-        scenes = scene_folders(root, lambda folder: (folder / "frames/Image/camera_0").is_dir(), by_path=True)
-        return {name: folder / "frames" for name, folder in scenes.items()}
+        """The ``frames`` of scenes, by the scenes' paths."""
+        return {name: folder / "frames" for name, folder in super().find(root).items()}
 
     def place(self, scene: str) -> str:
         """The first folder of the path: InsScene-15K has several parts of one scene below it.

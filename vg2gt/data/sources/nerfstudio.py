@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,6 @@ from vg2gt.data.base import DataError
 from vg2gt.data.sources.files import FileSource, HoldoutOptions
 from vg2gt.data.sources.index import SceneIndex, make_index
 from vg2gt.data.sources.parsing import check_intrinsics, errors_name, named_file, positive, to_world
-from vg2gt.data.sources.scene_folders import scene_folders
 from vg2gt.data.sources.undistortion import Undistortion
 from vg2gt.io import Lens, TransformsFrame, read_transforms
 from vg2gt.io.image_files import Size, image_size
@@ -38,6 +37,8 @@ class Nerfstudio(FileSource):
     """
 
     layout = f"{_FILE}, there or up to two folders deeper"
+    scene_marks = (_FILE,)
+    names_are_paths = True
     index_options = ("has_depth",)
     is_metric = False
 
@@ -53,10 +54,6 @@ class Nerfstudio(FileSource):
         self._frames: dict[str, list[TransformsFrame]] = {}
         self._last: tuple[Lens, Undistortion] | None = None
         super().__init__(root, **shared)
-
-    def find(self, root: Path) -> Mapping[str, Path]:
-        """The folder itself, or scenes one or two levels below it."""
-        return scene_folders(root, lambda folder: (folder / _FILE).is_file(), by_path=True)
 
     def index(self, scene: str, folder: Path) -> SceneIndex:
         """Reads the file and the sizes of its images."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,6 @@ from vg2gt.data.base import DataError
 from vg2gt.data.sources.files import FileSource, HoldoutOptions
 from vg2gt.data.sources.index import SceneIndex, check_found, first_size, make_index
 from vg2gt.data.sources.parsing import four_intrinsics, numbered, pinhole, read_numbers
-from vg2gt.data.sources.scene_folders import scene_folders
 from vg2gt.geometry.cameras import resize_intrinsics
 from vg2gt.io.image_files import Size
 
@@ -37,6 +36,8 @@ class Replica(FileSource):
     """
 
     layout = "SCENE/traj.txt and SCENE/results/{frame,depth}*, there or one folder deeper"
+    scene_marks = ("results",)
+    levels = 1
     index_options = ("intrinsics",)
     depth_scale = 6553.5
 
@@ -48,10 +49,6 @@ class Replica(FileSource):
     ) -> None:
         self.intrinsics = four_intrinsics(intrinsics)
         super().__init__(root, **shared)
-
-    def find(self, root: Path) -> Mapping[str, Path]:
-        """Folders with ``results``, by their name."""
-        return scene_folders(root, lambda folder: (folder / "results").is_dir(), levels=1)
 
     def index(self, scene: str, folder: Path) -> SceneIndex:
         """Lists a scene's files and reads its poses."""

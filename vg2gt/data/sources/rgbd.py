@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -37,7 +37,6 @@ from vg2gt.data.sources.parsing import (
     read_poses,
 )
 from vg2gt.data.sources.scannet import room_of_scan
-from vg2gt.data.sources.scene_folders import scene_folders
 from vg2gt.geometry.cameras import resize_intrinsics
 from vg2gt.io.image_files import Size
 
@@ -78,6 +77,7 @@ class RGBDFolder(FileSource):
         "images/, color/ or rgb/ with depth/, poses.txt and K.txt, or frame-*.color.png with frame-*.depth.png, there "
         "or up to two folders deeper"
     )
+    names_are_paths = True
     index_options = ("intrinsics",)
 
     def __init__(
@@ -94,9 +94,10 @@ class RGBDFolder(FileSource):
         self.intrinsics = four_intrinsics(intrinsics)
         super().__init__(root, holdout=holdout, **shared)
 
-    def find(self, root: Path) -> Mapping[str, Path]:
-        """The folder itself, or recordings one or two levels below it."""
-        return scene_folders(root, _is_recording, by_path=True)
+    def is_scene(self, folder: Path) -> bool:
+        """Whether it has colour and depth in one of the layouts."""
+        in_folders = (folder / "depth").is_dir() and any((folder / name).is_dir() for name in _COLOR_FOLDERS)
+        return in_folders or any(folder.glob("frame-*.color.*"))
 
     def place(self, scene: str) -> str:
         """What several recordings show: the folder of 7-Scenes' ``seq-NN``, the room of ScanNet's ``sceneNNNN_NN``."""
@@ -157,11 +158,6 @@ class RGBDFolder(FileSource):
 def _say(message: str, level: int = logging.INFO) -> None:
     """Logs a message once, although training and evaluation both read the recording."""
     log.log(level, message)
-
-
-def _is_recording(folder: Path) -> bool:
-    in_folders = (folder / "depth").is_dir() and any((folder / name).is_dir() for name in _COLOR_FOLDERS)
-    return folder.is_dir() and (in_folders or any(folder.glob("frame-*.color.*")))
 
 
 def _files_in_folders(folder: Path, scene: str) -> _Files:

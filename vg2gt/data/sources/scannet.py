@@ -13,7 +13,6 @@ from vg2gt.data.base import DataError
 from vg2gt.data.sources.files import FileSource
 from vg2gt.data.sources.index import SceneIndex, check_found, first_size, make_index
 from vg2gt.data.sources.parsing import numbered, read_matrix, read_poses
-from vg2gt.data.sources.scene_folders import scene_folders
 from vg2gt.io.image_files import Size, read_color
 from vg2gt.io.sens import decode_depth, read_span, scan_sens
 
@@ -33,11 +32,8 @@ class ScanNet(FileSource):
     such; a list of scenes may be the official ``scannetv2_train.txt``; the camera takes 30 frames per second.
     """
 
+    scene_marks = ("color", "depth", "pose")
     layout = "sceneNNNN_NN/{color,depth,pose,intrinsic}, there or up to two folders deeper"
-
-    def find(self, root: Path) -> Mapping[str, Path]:
-        """Folders with ``color``, ``depth`` and ``pose``, by their name."""
-        return scene_folders(root, lambda folder: all((folder / kind).is_dir() for kind in ("color", "depth", "pose")))
 
     def place(self, scene: str) -> str:
         """The room: ``scene0000`` of ``scene0000_00`` and ``scene0000_01``."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -12,7 +11,6 @@ from vg2gt.data.base import DataError
 from vg2gt.data.sources.files import FileSource
 from vg2gt.data.sources.index import SceneIndex, check_found, make_index
 from vg2gt.data.sources.parsing import CORNER_TO_CENTER, numbered
-from vg2gt.data.sources.scene_folders import scene_folders
 from vg2gt.io.arrays import load_matrices
 from vg2gt.io.npz import load_npz
 
@@ -32,11 +30,8 @@ class ScanNetPPiPhone(FileSource):
     scene, or a list of such; a list of scenes may be the official ``nvs_sem_train.txt``.
     """
 
+    scene_marks = (METADATA,)
     layout = f"SCENE/{{images,depth}} and SCENE/{METADATA}, there or up to two folders deeper"
-
-    def find(self, root: Path) -> Mapping[str, Path]:
-        """Folders with iPhone cameras, by their name."""
-        return scene_folders(root, lambda folder: (folder / METADATA).is_file())
 
     def index(self, scene: str, folder: Path) -> SceneIndex:
         """Reads the cameras and finds their images."""

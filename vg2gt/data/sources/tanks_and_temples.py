@@ -23,7 +23,6 @@ from vg2gt.data.sources.parsing import (
     read_text_lines,
 )
 from vg2gt.data.sources.scan_depth import VERSION, ScanDepth
-from vg2gt.data.sources.scene_folders import scene_folders
 from vg2gt.io import read_colmap
 from vg2gt.io.image_files import Size
 
@@ -50,6 +49,7 @@ class TanksAndTemples(FileSource):
     """
 
     layout = f"scenes S with S{_LOG}, S_trans.txt and images, there or one folder deeper"
+    levels = 1
     index_options = ("intrinsics", "has_depth")
 
     def __init__(
@@ -67,9 +67,9 @@ class TanksAndTemples(FileSource):
         self._scan_depth = ScanDepth(expanded(depth_cache))
         super().__init__(root, **shared)
 
-    def find(self, root: Path) -> Mapping[str, Path]:
-        """The folder itself, or scenes one level below it."""
-        return scene_folders(root, lambda folder: _log_file(folder) is not None, levels=1)
+    def is_scene(self, folder: Path) -> bool:
+        """Whether it holds a trajectory."""
+        return _log_file(folder) is not None
 
     def watched(self, scene: str, folder: Path) -> Sequence[Path | None]:
         """Also the COLMAP model."""

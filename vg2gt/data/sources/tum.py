@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os.path
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +23,6 @@ from vg2gt.data.sources.parsing import (
     read_numbers,
     read_text_lines,
 )
-from vg2gt.data.sources.scene_folders import scene_folders
 
 INTRINSICS = {
     "freiburg1": (517.3, 516.5, 318.6, 255.3),
@@ -59,6 +58,8 @@ class TUM(FileSource):
     """
 
     layout = "rgb.txt, depth.txt and groundtruth.txt, there or one folder deeper"
+    scene_marks = ("rgb.txt",)
+    levels = 1
     index_options = ("intrinsics", "max_difference")
     depth_scale = 5000.0
     invalid = (65535,)
@@ -74,10 +75,6 @@ class TUM(FileSource):
         self.intrinsics = four_intrinsics(intrinsics)
         self.max_difference = positive("max_difference", max_difference, "seconds")
         super().__init__(root, holdout=holdout, **shared)
-
-    def find(self, root: Path) -> Mapping[str, Path]:
-        """Folders with ``rgb.txt``, by their name."""
-        return scene_folders(root, lambda folder: (folder / "rgb.txt").is_file(), levels=1)
 
     def index(self, scene: str, folder: Path) -> SceneIndex:
         """Reads the lists and joins them."""

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from vg2gt.data.base import DataError, SceneSource
-from vg2gt.data.views.sampling import SceneSample
+from vg2gt.data.views.sample import SceneSample
 from vg2gt.io.files import read_json
 
 log = logging.getLogger(__name__)
@@ -59,7 +59,7 @@ class ViewSelection:
                 raise ValueError(f"evaluation.selection.fixed names {list(frames)} for {count} views")
 
     def choose(self, source: SceneSource, scenes: Sequence[str], count: int) -> list[SceneSample]:
-        """The samples of ``count`` input views, one a scene.
+        """The samples of ``count`` input views, one per scene.
 
         Raises:
             DataError: if a scene has too few frames, lacks one that the index or ``fixed`` names, or if the index names
@@ -182,14 +182,13 @@ def _stored_views(stored: Mapping[str, Mapping[str, Any]], scene: str, count: in
 
 
 def _check_frames(source: SceneSource, views: SceneSample, count: int) -> None:
-    named = [*views.context, *views.target]
-    if len(views.context) != count or len(set(named)) != len(named):
+    if len(views.context) != count or len(set(views.frames)) != len(views.frames):
         raise DataError(
             f"the evaluation's views of scene {views.scene} are not {count} input views and others: input "
             f"{list(views.context)}, held out {list(views.target)}; correct evaluation.selection (index, fixed), or "
             "draw views with evaluation.selection.index=null"
         )
-    missing = sorted({*views.context, *views.target} - set(source.frames(views.scene)))
+    missing = sorted(set(views.frames) - set(source.frames(views.scene)))
     if missing:
         raise DataError(
             f"the evaluation asks for frames {missing} of scene {views.scene}, which the data does not have: read it "

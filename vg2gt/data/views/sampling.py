@@ -17,29 +17,13 @@ import numpy as np
 from torch.utils.data import Sampler
 
 from vg2gt.data.base import DataError, SceneSource, training_frames
-from vg2gt.data.framing import Framing, FramingSampler
+from vg2gt.data.framing import FramingSampler
+from vg2gt.data.views.sample import SceneSample
 
 log = logging.getLogger(__name__)
 
 _VIEWS, _SCENES, _FRAMES, _BLOCKS = 0, 1, 2, 3  # independent random streams
 _LONGEST_BLOCK = 100_000
-
-
-@dataclass(frozen=True)
-class SceneSample:
-    """Frames of one scene: the context views first, then the held-out target views.
-
-    Attributes:
-        scene: the scene's name.
-        context: frame ids of the input views; the first is the anchor, whose camera becomes the world frame.
-        target: frame ids of the held-out views, disjoint from ``context``.
-        framing: size, zoom and window drawn for the scene; None: as in evaluation.
-    """
-
-    scene: str
-    context: tuple[int, ...]
-    target: tuple[int, ...] = ()
-    framing: Framing | None = None
 
 
 @dataclass(frozen=True)
@@ -296,7 +280,7 @@ class StepSampler(Sampler[tuple[SceneSample, ...]]):
             yield self.step(step)
 
     def step(self, step: int) -> tuple[SceneSample, ...]:
-        """The views of one step, one entry a scene, all with equally many views."""
+        """The views of one step, one entry per scene, all with equally many views."""
         places = self.views.slots(step, self.rank, self.world_size)
         scenes = [self.pool.scene(place) for place in places]
         first = self.rank * len(scenes)
