@@ -91,9 +91,9 @@ class SceneDataModule(LightningDataModule):
         if resized_cache is not None:
             largest = ",".join(map(str, self.framing.largest))
             raise ValueError(
-                "data.resized_cache is replaced by shards: write the reduced frames once with `python -m "
-                f"vg2gt.data.shards out=FOLDER/train size=[{largest}] data=...` (and out=FOLDER/val subset=val), then "
-                "train with data=shards data.root=FOLDER"
+                "data.resized_cache is replaced by shards: write the reduced frames once with `vg2gt data "
+                f"shards out=FOLDER/train size=[{largest}] data=...` (and out=FOLDER/val subset=val), then train with "
+                "data=shards data.root=FOLDER"
             )
         self.common = common
         self.train_scenes = train_scenes
