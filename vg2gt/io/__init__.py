@@ -1,4 +1,4 @@
-"""Readers and writers, one file a format."""
+"""Readers and writers, one file per format."""
 
 from vg2gt.io.cameras_json import NamedCamera, named_cameras, read_cameras_json, write_cameras_json
 from vg2gt.io.colmap import (
@@ -18,7 +18,7 @@ from vg2gt.io.errors import FormatError
 from vg2gt.io.glb import write_glb
 from vg2gt.io.mesh import Mesh, fuse_depth, write_mesh
 from vg2gt.io.nerfstudio import Lens, Transforms, TransformsFrame, read_transforms, write_transforms
-from vg2gt.io.ply import PointCloud, read_gaussian_ply, read_point_ply, write_gaussian_ply, write_point_ply
+from vg2gt.io.ply import ColoredPoints, read_gaussian_ply, read_point_ply, write_gaussian_ply, write_point_ply
 from vg2gt.io.splat import read_splat, write_splat
 from vg2gt.io.video import read_video, write_video
 
@@ -27,11 +27,11 @@ __all__ = [
     "ColmapImage",
     "ColmapModel",
     "ColmapPoints",
+    "ColoredPoints",
     "FormatError",
     "Lens",
     "Mesh",
     "NamedCamera",
-    "PointCloud",
     "Transforms",
     "TransformsFrame",
     "colmap_camera",

@@ -29,11 +29,11 @@ import torch
 from numpy.typing import NDArray
 
 from vg2gt.io.errors import FormatError
-from vg2gt.io.files import read_json, write_json
+from vg2gt.io.files import write_json
+from vg2gt.io.json_checks import MAX_SIZE, check_rigid, load_json, short
 from vg2gt.types import Cameras
 
 _ROTATION_TOLERANCE = 1e-3
-_MAX_SIZE = 1 << 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,17 +59,35 @@ class NamedCamera:
         pose, intrinsics = (torch.from_numpy(m).float()[None, None] for m in (self.world_to_camera, self.intrinsics))
         return Cameras(pose, intrinsics, (self.height, self.width))
 
+    def fields(self) -> dict[str, Any]:
+        """This camera as plain values, as it stands in a file."""
+        return {
+            "name": self.name,
+            "width": int(self.width),
+            "height": int(self.height),
+            "intrinsics": np.asarray(self.intrinsics, np.float64).tolist(),
+            "world_to_camera": np.asarray(self.world_to_camera, np.float64).tolist(),
+        }
+
+
+def invert_pose(pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Inverse of a rigid transform ``[4, 4]``, whose rotation stays one to the last digit."""
+    inverse = np.eye(4)
+    inverse[:3, :3] = pose[:3, :3].T
+    inverse[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
+    return inverse
+
 
 def named_cameras(cameras: Cameras, names: Sequence[str]) -> list[NamedCamera]:
     """The views of one scene with a name each.
 
     Raises:
-        ValueError: if there is more than one scene, or not one name a view.
+        ValueError: if there is more than one scene, or not one name per view.
     """
     scenes, views = cameras.world_to_camera.shape[:2]
     if scenes != 1 or views != len(names):
         raise ValueError(
-            f"expected one scene and one name a view, got {scenes} scenes, {views} views, {len(names)} names"
+            f"expected one scene and one name per view, got {scenes} scenes, {views} views, {len(names)} names"
         )
     poses, intrinsics = (t[0].detach().cpu().double().numpy() for t in (cameras.world_to_camera, cameras.intrinsics))
     height, width = cameras.size
@@ -89,16 +107,7 @@ def write_cameras_json(path: str | Path, cameras: Sequence[NamedCamera]) -> Path
     Raises:
         ValueError: if one is no camera: a wrong shape, a value that is not finite, no rotation, no focal length.
     """
-    content = [
-        {
-            "name": camera.name,
-            "width": int(camera.width),
-            "height": int(camera.height),
-            "intrinsics": np.asarray(camera.intrinsics, np.float64).tolist(),
-            "world_to_camera": np.asarray(camera.world_to_camera, np.float64).tolist(),
-        }
-        for camera in cameras
-    ]
+    content = [camera.fields() for camera in cameras]
     for index, entry in enumerate(content):
         _camera(f"cameras[{index}]", entry)
     return write_json(path, content)
@@ -111,10 +120,7 @@ def read_cameras_json(path: str | Path) -> list[NamedCamera]:
         FormatError: if it is not JSON or of another shape, naming the file, the entry and the field.
     """
     path = Path(path)
-    try:
-        content = read_json(path)
-    except (ValueError, RecursionError) as error:
-        raise FormatError(f"{path}: not valid JSON ({error}); the file is truncated or damaged") from error
+    content = load_json(path)
     if not isinstance(content, list):
         raise FormatError(f"{path}: expected a list of cameras, got {type(content).__name__}")
     return [_camera(f"{path}: [{index}]", entry) for index, entry in enumerate(content)]
@@ -126,7 +132,7 @@ def _camera(place: str, entry: Any) -> NamedCamera:
         raise FormatError(f"{place} is {type(entry).__name__}, expected an object")
     name = entry.get("name")
     if not isinstance(name, str) or not name:
-        raise FormatError(f"{place}.name is {_short(name)}, expected the view's name")
+        raise FormatError(f"{place}.name is {short(name)}, expected the view's name")
     intrinsics, pose = _matrix(place, entry, "intrinsics", 3), _matrix(place, entry, "world_to_camera", 4)
     focal = intrinsics[[0, 1], [0, 1]]
     if (focal <= 0).any() or np.abs(intrinsics[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]] - [0, 0, 0, 0, 1]).max() > 1e-9:
@@ -134,20 +140,14 @@ def _camera(place: str, entry: Any) -> NamedCamera:
             f"{place}.intrinsics is {intrinsics.tolist()}, expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with "
             "positive focal lengths and no skew; undistort the images"
         )
-    rotation = pose[:3, :3]
-    error = np.abs(rotation.T @ rotation - np.eye(3)).max() if np.abs(rotation).max() < 2 else np.inf
-    if error > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0 or np.abs(pose[3] - [0, 0, 0, 1]).max() > 1e-6:
-        raise FormatError(
-            f"{place}.world_to_camera is not a rotation and a translation (R'R differs from the identity by "
-            f"{error:.2g}); remove scale, shear and mirroring"
-        )
+    check_rigid(f"{place}.world_to_camera", pose, _ROTATION_TOLERANCE)
     return NamedCamera(name, _pixels(place, entry, "width"), _pixels(place, entry, "height"), intrinsics, pose)
 
 
 def _pixels(place: str, entry: dict[str, Any], field: str) -> int:
     value = entry.get(field)
-    if isinstance(value, bool) or not isinstance(value, int) or not 0 < value < _MAX_SIZE:
-        raise FormatError(f"{place}.{field} is {_short(value)}, expected a whole number of pixels above 0")
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 < value < MAX_SIZE:
+        raise FormatError(f"{place}.{field} is {short(value)}, expected a whole number of pixels above 0")
     return value
 
 
@@ -158,10 +158,5 @@ def _matrix(place: str, entry: dict[str, Any], field: str, size: int) -> NDArray
     except (TypeError, ValueError, OverflowError):
         matrix = np.empty(0)
     if matrix.shape != (size, size) or not np.isfinite(matrix).all():
-        raise FormatError(f"{place}.{field} is {_short(rows)}, expected {size} rows of {size} finite numbers")
+        raise FormatError(f"{place}.{field} is {short(rows)}, expected {size} rows of {size} finite numbers")
     return matrix
-
-
-def _short(value: Any) -> str:
-    text = "missing" if value is None else repr(value)
-    return text if len(text) <= 80 else text[:77] + "..."

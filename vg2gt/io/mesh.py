@@ -58,8 +58,8 @@ def fuse_depth(
     """Fuses depth maps of one scene into a mesh.
 
     A truncated signed distance along the optical axis is averaged over the views at the voxels near surfaces; the mesh
-    is its zero set, one vertex in every cell that the surface crosses (surface nets). Memory is about 50 bytes a voxel
-    at its peak, in proportion to the surface, not to the scene's box.
+    is its zero set, one vertex in every cell that the surface crosses (surface nets). Memory is about 50 bytes per
+    voxel at its peak, in proportion to the surface, not to the scene's box.
 
     Args:
         depth: ``[V, H, W]`` z-depth, 0 = invalid. Set what is too far to 0.
@@ -178,7 +178,7 @@ def _check(depth: Tensor, cameras: Cameras, colors: Tensor | None, voxel_size: f
     views = depth.shape[0] if depth.dim() == 3 else -1
     if cameras.world_to_camera.shape[:2] != (1, views) or tuple(depth.shape[1:]) != tuple(cameras.size):
         raise ValueError(
-            f"depth must be [V, {cameras.size[0]}, {cameras.size[1]}] with one camera a map of one scene, got depth "
+            f"depth must be [V, {cameras.size[0]}, {cameras.size[1]}] with one camera per map of one scene, got depth "
             f"{list(depth.shape)} and cameras {list(cameras.world_to_camera.shape[:2])}; use Cameras.scene"
         )
     if min(depth.shape[1:]) < 2:

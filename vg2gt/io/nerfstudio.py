@@ -1,4 +1,4 @@
-"""nerfstudio's and instant-ngp's ``transforms.json``: posed frames with intrinsics, shared or one a frame.
+"""nerfstudio's and instant-ngp's ``transforms.json``: posed frames with intrinsics, shared or per frame.
 
 In the file poses are camera-to-world with OpenGL axes (x right, y up, z backward) and the centre of the first pixel is
 at (1/2, 1/2). The records hold our conventions; the change happens in ``_world_to_camera`` and ``_camera_to_world``
@@ -29,14 +29,20 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vg2gt.io.errors import FormatError
-from vg2gt.io.files import read_json, write_json
+from vg2gt.io.files import write_json
+from vg2gt.io.json_checks import MAX_SIZE, check_rigid, load_json, short
 
 PIXEL_CENTER = 0.5  # where the file has the centre of the first pixel; ours is at 0
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 
+_ANY, _POSITIVE, _ANGLE = (-math.inf, math.inf), (0, math.inf), (0, math.pi)
+_LIMITS = {
+    **dict.fromkeys(("fl_x", "fl_y"), _POSITIVE),
+    **dict.fromkeys(("cx", "cy"), _ANY),
+    **dict.fromkeys(("camera_angle_x", "camera_angle_y"), _ANGLE),
+}
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenCV camera axes <-> OpenGL camera axes
 _ROTATION_TOLERANCE = 0.02  # recorded poses are orthonormal to about 1e-3
-_MAX_SIZE = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -79,16 +85,8 @@ class Lens:
         """Lens of our intrinsics ``[3, 3]`` (integer pixel centres) and image ``(height, width)``."""
         k = np.asarray(intrinsics, np.float64)
         cx, cy = (float(k[axis, 2]) + PIXEL_CENTER for axis in (0, 1))
-        return Lens(
-            int(size[1]),
-            int(size[0]),
-            float(k[0, 0]),
-            float(k[1, 1]),
-            cx,
-            cy,
-            camera_model="OPENCV",
-            distortion=dict(distortion or {}),
-        )
+        width, height, distortion = int(size[1]), int(size[0]), dict(distortion or {})
+        return Lens(width, height, float(k[0, 0]), float(k[1, 1]), cx, cy, camera_model="OPENCV", distortion=distortion)
 
     def intrinsics(self, size: tuple[int, int] | None = None) -> NDArray[np.floating]:
         """Pinhole part ``[3, 3]`` in pixels of the file's image size, with our integer pixel centres.
@@ -182,10 +180,7 @@ def read_transforms(path: str | Path) -> Transforms:
         FormatError: if it is not JSON or of another shape, naming the file and the field.
     """
     path = Path(path)
-    try:
-        content = read_json(path)
-    except (ValueError, RecursionError) as error:
-        raise FormatError(f"{path}: not valid JSON ({error}); the file is truncated or damaged") from error
+    content = load_json(path)
     top = _Fields(path, "", content)
     shared = _read_lens(top, Lens())
     frames = top.get("frames", list, "a list of frames")
@@ -231,11 +226,11 @@ class _Fields:
         self.path, self.prefix = path, prefix
         if not isinstance(content, dict):
             name = prefix.rstrip(".") or "the file's content"
-            raise FormatError(f"{path}: {name} should be an object, got {_short(content)}")
+            raise FormatError(f"{path}: {name} should be an object, got {short(content)}")
         self.content = content
 
     def wrong(self, name: str, value: Any, expected: str) -> FormatError:
-        found = "is missing" if name not in self.content else f"is {_short(value)}"
+        found = "is missing" if name not in self.content else f"is {short(value)}"
         return FormatError(f"{self.path}: {self.prefix}{name} {found}, expected {expected}")
 
     def get(self, name: str, kind: type, expected: str) -> Any:
@@ -259,7 +254,7 @@ class _Fields:
         return number
 
     def pixels(self, name: str) -> int | None:
-        value = self.number(name, 0, _MAX_SIZE)
+        value = self.number(name, 0, MAX_SIZE)
         if value is None:
             return None
         if value != round(value):
@@ -277,19 +272,12 @@ def _float(value: Any) -> float | None:
         return math.inf
 
 
-def _short(value: Any) -> str:
-    text = type(value).__name__ if isinstance(value, dict | list) else repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."
-
-
 def _read_lens(fields: _Fields, shared: Lens) -> Lens:
     """The lens of one object; what it does not say is taken from ``shared``."""
     own = {
         "width": fields.pixels("w"),
         "height": fields.pixels("h"),
-        **{name: fields.number(name, 0) for name in ("fl_x", "fl_y")},
-        **{name: fields.number(name) for name in ("cx", "cy")},
-        **{name: fields.number(name, 0, math.pi) for name in ("camera_angle_x", "camera_angle_y")},
+        **{name: fields.number(name, *limits) for name, limits in _LIMITS.items()},
         "camera_model": fields.get("camera_model", str, "a camera model's name"),
     }
     coefficients = {name: fields.number(name) for name in DISTORTION}
@@ -324,17 +312,11 @@ def _rigid(fields: _Fields, name: str) -> NDArray[np.floating]:
     for i, row in enumerate(rows):
         values = [_float(value) for value in row] if isinstance(row, list) else []
         if len(values) != 4 or None in values:
-            raise fields.wrong(f"{name}", rows, f"{expected}; row {i} is {_short(row)}")
+            raise fields.wrong(f"{name}", rows, f"{expected}; row {i} is {short(row)}")
         matrix[i] = values
     if not np.isfinite(matrix).all():
         return np.full((4, 4), np.nan)
-    rotation = matrix[:3, :3]
-    error = np.abs(rotation.T @ rotation - np.eye(3)).max() if np.abs(rotation).max() < 2 else math.inf
-    if error > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0 or np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
-        raise FormatError(
-            f"{fields.path}: {fields.prefix}{name} is not a rotation and a translation (R'R differs from the identity "
-            f"by {error:.2g}); remove scale, shear and mirroring from the poses"
-        )
+    check_rigid(f"{fields.path}: {fields.prefix}{name}", matrix, _ROTATION_TOLERANCE)
     return matrix
 
 
@@ -361,6 +343,6 @@ def _frame_fields(frame: TransformsFrame, with_lens: bool) -> dict[str, Any]:
 
 
 def _lens_fields(lens: Lens) -> dict[str, Any]:
-    names = ("fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y", "camera_model")
-    content = {"w": lens.width, "h": lens.height, **{name: getattr(lens, name) for name in names}, **lens.distortion}
+    own = {name: getattr(lens, name) for name in (*_LIMITS, "camera_model")}
+    content = {"w": lens.width, "h": lens.height, **own, **lens.distortion}
     return {name: value for name, value in content.items() if value is not None}

@@ -41,7 +41,7 @@ _ROTATION = tuple(f"rot_{i}" for i in range(4))
 
 
 @dataclass(frozen=True, eq=False)
-class PointCloud:
+class ColoredPoints:
     """Points of one scene.
 
     Attributes:
@@ -76,18 +76,16 @@ def write_gaussian_ply(path: str | Path, gaussians: Gaussians, *, full_sh: bool 
     opacities = arrays.opacities.clip(OPACITY_MARGIN, 1 - OPACITY_MARGIN)
     logits = np.log(opacities) - np.log1p(-opacities)
     names = (*POSITION, *NORMAL, *_DC, *(f"f_rest_{i}" for i in range(rest.shape[1])), "opacity", *_SCALE, *_ROTATION)
-    table = np.empty(count, [(name, "<f4") for name in names])
     columns = (
-        *arrays.means.T,
-        *np.zeros((3, count)),
-        *arrays.sh[:, 0].T,
-        *rest.T,
-        logits,
-        *np.log(arrays.scales).T,
-        *arrays.quats.T,
+        arrays.means,
+        np.zeros((count, 3)),
+        arrays.sh[:, 0],
+        rest,
+        logits[:, None],
+        np.log(arrays.scales),
+        arrays.quats,
     )
-    for name, column in zip(names, columns, strict=True):
-        table[name] = column
+    table = np.concatenate(columns, 1).astype("<f4").view([(name, "<f4") for name in names])[:, 0]
     return write_bytes(path, vertices_content(table))
 
 
@@ -169,7 +167,7 @@ def write_point_ply(path: str | Path, positions: ArrayLike, colors: ArrayLike | 
     return write_bytes(path, vertices_content(table))
 
 
-def read_point_ply(path: str | Path) -> PointCloud:
+def read_point_ply(path: str | Path) -> ColoredPoints:
     """Reads the vertices of a PLY file as points; faces and other properties are ignored.
 
     Args:
@@ -186,7 +184,7 @@ def read_point_ply(path: str | Path) -> PointCloud:
     wide = any(table.dtype[name] == np.float64 for name in POSITION if name in (table.dtype.names or ()))
     positions = _columns(path, table, POSITION).astype(np.float64 if wide else np.float32)
     colored = all(name in (table.dtype.names or ()) and table.dtype[name] == np.uint8 for name in COLOR)
-    return PointCloud(positions, np.stack([table[name] for name in COLOR], -1) if colored else None)
+    return ColoredPoints(positions, np.stack([table[name] for name in COLOR], -1) if colored else None)
 
 
 def _columns(path: Path, table: NDArray, names: tuple[str, ...]) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""The ``.splat`` format of the first web viewers: 32 bytes a Gaussian, no header.
+"""The ``.splat`` format of the first web viewers: 32 bytes per Gaussian, no header.
 
 Float32 position, float32 standard deviations, 8-bit red green blue and opacity, 8-bit wxyz. What is lost against a PLY
 file: everything of the colour that depends on the view, colours outside [0, 1], and precision of colour and opacity

@@ -95,7 +95,7 @@ def write_video(path: str | Path, frames: Sequence[NDArray[np.uint8]], fps: floa
     Args:
         path: the file, ``.gif`` or ``.mp4``.
         frames: ``[H, W, 3]`` each, all of one size; not changed. MP4 needs even sizes: an odd row or column is cut.
-        fps: frames a second; GIF knows hundredths of a second only.
+        fps: frames per second; GIF knows hundredths of a second only.
 
     Returns:
         The path.

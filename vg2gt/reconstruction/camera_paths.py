@@ -12,7 +12,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from vg2gt.data.sources.parsing import IMAGE_SUFFIXES
-from vg2gt.io.cameras_json import NamedCamera
+from vg2gt.io.cameras_json import NamedCamera, invert_pose
 
 WIDTH, HEIGHT = 0.15, 0.06  # half axes of the orbit, in distances to what is looked at
 
@@ -32,16 +32,16 @@ def orbit(cameras: Sequence[NamedCamera], distance: float, frames: int = 72) -> 
     """
     if not cameras or not distance > 0 or frames < 1:
         raise ValueError(f"an orbit needs cameras, a distance and frames, got {len(cameras)}, {distance}, {frames}")
-    centers = np.stack([_inverse(camera.world_to_camera)[:3, 3] for camera in cameras])
+    centers = np.stack([invert_pose(camera.world_to_camera)[:3, 3] for camera in cameras])
     middle = cameras[int(np.linalg.norm(centers - np.median(centers, 0), axis=1).argmin())]
-    to_world = _inverse(middle.world_to_camera)
+    to_world = invert_pose(middle.world_to_camera)
     path = []
     for angle in 2 * math.pi * np.arange(frames) / frames:
         place = distance * np.array([WIDTH * math.sin(angle), -HEIGHT * math.cos(angle), 0])
         local = np.eye(4)
         local[:3, :3] = _facing(np.array([0, 0, distance]) - place)
         local[:3, 3] = place
-        path.append(_moved(middle, _inverse(to_world @ local), len(path)))
+        path.append(_moved(middle, invert_pose(to_world @ local), len(path)))
     return path
 
 
@@ -64,7 +64,7 @@ def interpolate(cameras: Sequence[NamedCamera], between: int) -> list[NamedCamer
     if len(sizes) > 1:
         raise ValueError(f"cameras of one image size are needed, these have {sorted(sizes)}; choose some of one size")
     times = np.arange(len(cameras), dtype=np.float64)
-    poses = np.stack([_inverse(camera.world_to_camera) for camera in cameras])
+    poses = np.stack([invert_pose(camera.world_to_camera) for camera in cameras])
     positions = CubicSpline(times, poses[:, :3, 3], bc_type="natural")
     rotations = RotationSpline(times, Rotation.from_matrix(poses[:, :3, :3]))
     intrinsics = np.stack([camera.intrinsics for camera in cameras])
@@ -81,7 +81,7 @@ def interpolate(cameras: Sequence[NamedCamera], between: int) -> list[NamedCamer
         share = time - left
         k = (1 - share) * intrinsics[left] + share * intrinsics[left + 1]
         name = f"{view_stem(cameras[left].name)}-{step:03d}"
-        path.append(NamedCamera(name, cameras[0].width, cameras[0].height, k, _inverse(pose)))
+        path.append(NamedCamera(name, cameras[0].width, cameras[0].height, k, invert_pose(pose)))
     return path
 
 
@@ -100,11 +100,3 @@ def _facing(direction: NDArray[np.float64]) -> NDArray[np.float64]:
     right = np.cross([0.0, 1.0, 0.0], forward)
     right /= np.linalg.norm(right)
     return np.stack((right, np.cross(forward, right), forward), 1)
-
-
-def _inverse(pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Inverse of a rigid transform, whose rotation stays one to the last digit."""
-    inverse = np.eye(4)
-    inverse[:3, :3] = pose[:3, :3].T
-    inverse[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
-    return inverse

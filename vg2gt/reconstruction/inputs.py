@@ -28,7 +28,7 @@ class Views:
 
     Attributes:
         images: ``[V, 3, H, W]`` float32 in [0, 1], on the CPU.
-        names: one a view, unique.
+        names: one per view, unique.
         kept: share of each picture's area that is in its image; the rest was cropped.
         hints: what the data know, on the CPU; None where they know nothing.
     """

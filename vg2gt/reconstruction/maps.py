@@ -90,7 +90,7 @@ def _npy(values: Tensor) -> bytes:
 
 @contextmanager
 def animation(path: Path, fps: float) -> Iterator[AddView]:
-    """Collects the colour of the views and writes them as an animation, ``.gif`` or ``.mp4``, ``fps`` frames a second.
+    """Collects the colour of the views and writes them as an animation, ``.gif`` or ``.mp4``, ``fps`` per second.
 
     Raises:
         MissingDecoderError: if it is no GIF and there is no PyAV.

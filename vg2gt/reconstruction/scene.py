@@ -67,9 +67,9 @@ class Scene:
         images: ``[V, 3, H, W]`` in [0, 1]: the input at the working size.
         depth: ``[V, H, W]`` decoded z-depth in scene units, 0 = none.
         depth_conf: ``[V, H, W]`` its confidence, larger is better.
-        names: one a view.
+        names: one per view.
         renderer: how it is rendered.
-        metres_per_unit: metres a scene unit; None where nobody knows.
+        metres_per_unit: metres per scene unit; None where nobody knows.
     """
 
     gaussians: Gaussians

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from PIL import ImageOps
 
-from vg2gt.io.cameras_json import NamedCamera
+from vg2gt.io.cameras_json import NamedCamera, invert_pose
 from vg2gt.io.glb import scene_extent
 from vg2gt.io.images import open_image
 from vg2gt.types import Gaussians
@@ -29,7 +29,7 @@ class ViewerScene:
     Attributes:
         gaussians: one scene, at least one Gaussian.
         cameras: the cameras to draw; the first is the initial view.
-        pictures: ``[H, W, 3]`` uint8 or None, one a camera; empty: no pictures.
+        pictures: ``[H, W, 3]`` uint8 or None, one per camera; empty: no pictures.
         title: of the page.
 
     Raises:
@@ -45,7 +45,9 @@ class ViewerScene:
         if not len(self.gaussians):
             raise ValueError("there are no Gaussians to show")
         if self.pictures and len(self.pictures) != len(self.cameras):
-            raise ValueError(f"expected a picture (or None) a camera, got {len(self.pictures)} for {len(self.cameras)}")
+            raise ValueError(
+                f"expected a picture (or None) per camera, got {len(self.pictures)} for {len(self.cameras)}"
+            )
 
     def picture(self, index: int) -> NDArray[np.uint8] | None:
         """The picture of a camera, None without."""
@@ -63,10 +65,7 @@ class ViewerScene:
 
 def camera_to_world(camera: NamedCamera) -> NDArray[np.float64]:
     """Pose ``[4, 4]`` of a camera in the world."""
-    rotation, translation = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation.T, -rotation.T @ translation
-    return pose
+    return invert_pose(camera.world_to_camera)
 
 
 def default_camera(gaussians: Gaussians) -> NamedCamera:
@@ -94,7 +93,7 @@ def load_pictures(cameras: Sequence[NamedCamera], folder: str | Path) -> list[ND
     """Small upright pictures of the cameras' images, ``folder / name`` each.
 
     Returns:
-        One a camera, the longer side ``PICTURE_SIDE`` pixels at most; None where there is no such file inside the
+        One per camera, the longer side ``PICTURE_SIDE`` pixels at most; None where there is no such file inside the
         folder (names that lead out of it count as absent).
 
     Raises:

@@ -1,8 +1,8 @@
 """Gaussians as the compact bytes inside a viewer page, and back.
 
-One block a column, little endian, in the order of ``_columns``: float32 means, float16 colour coefficients, 16-bit
+One block per column, little endian, in the order of ``_columns``: float32 means, float16 colour coefficients, 16-bit
 logarithms of the standard deviations between the scene's smallest and largest, 16-bit components of unit quaternions,
-16-bit opacities. 34 bytes a Gaussian with colours of degree 0, 124 of degree 3, before gzip.
+16-bit opacities. 34 bytes per Gaussian with colours of degree 0, 124 of degree 3, before gzip.
 """
 
 from __future__ import annotations

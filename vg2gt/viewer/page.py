@@ -14,7 +14,6 @@ import re
 from pathlib import Path
 from typing import Any
 
-from vg2gt.io.cameras_json import NamedCamera
 from vg2gt.io.errors import FormatError
 from vg2gt.io.files import write_text
 from vg2gt.io.images import encode_image
@@ -82,11 +81,11 @@ def read_viewer_html(path: str | Path) -> Gaussians:
 def _content(scene: ViewerScene, packed: PackedGaussians) -> dict[str, Any]:
     """What the script finds in the page besides the Gaussians."""
     options = RenderOptions(mode="rasterized")
-    cameras = [{**_camera_fields(camera), "picture": _jpeg(scene, index)} for index, camera in enumerate(scene.cameras)]
+    cameras = [{**camera.fields(), "picture": _jpeg(scene, index)} for index, camera in enumerate(scene.cameras)]
     return {
         "gaussians": packed.header(),
         "cameras": cameras,
-        "initial": _camera_fields(scene.initial()),
+        "initial": scene.initial().fields(),
         "frustum_depth": scene.frustum_depth(),
         "settings": {
             "near": options.near,
@@ -95,16 +94,6 @@ def _content(scene: ViewerScene, packed: PackedGaussians) -> dict[str, Any]:
             "alpha_min": ALPHA_MIN,
             "jacobian_clamp": JACOBIAN_CLAMP,
         },
-    }
-
-
-def _camera_fields(camera: NamedCamera) -> dict[str, Any]:
-    return {
-        "name": camera.name,
-        "width": camera.width,
-        "height": camera.height,
-        "intrinsics": camera.intrinsics.tolist(),
-        "world_to_camera": camera.world_to_camera.tolist(),
     }
 
 
