@@ -1,15 +1,26 @@
 """A small dataset on disk and small sources."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
-import numpy as np
 import pytest
-from PIL import Image
+import torch
 
 from vg2gt.data import SyntheticScenes
+from vg2gt.types import Batch
+
+from .sources import layout_rgbd
 
 SIZE = (24, 32)
+
+
+def assert_same_batches(found: Iterable[Batch], expected: Iterable[Batch]) -> None:
+    """Equal to the last bit, one after another."""
+    for a, b in zip(found, expected, strict=True):
+        assert (a.scene, a.cameras.size) == (b.scene, b.cameras.size)
+        for name in ("frame_ids", "images", "depth"):
+            assert torch.equal(getattr(a, name), getattr(b, name))
+        assert torch.equal(a.cameras.intrinsics, b.cameras.intrinsics)
 
 
 @pytest.fixture(scope="session")
@@ -23,18 +34,7 @@ def write_recording(tmp_path, rooms) -> Callable[..., Path]:
     """Returns a function that writes a room as an RGB-D recording with ``images/ depth/ poses.txt K.txt``."""
 
     def write(name: str = "office", scene: int = 0, frames: int = 6) -> Path:
-        folder = tmp_path / name
-        source = rooms.load(rooms.scenes[scene], range(frames))
-        for sub in ("images", "depth"):
-            (folder / sub).mkdir(parents=True)
-        for i in range(frames):
-            pixels = (source.images[i].permute(1, 2, 0).numpy() * 255 + 0.5).astype(np.uint8)
-            Image.fromarray(pixels).save(folder / "images" / f"{i + 10:05d}.png")
-            millimetres = (source.depth[i].numpy() * 1000 + 0.5).astype(np.uint16)
-            Image.fromarray(millimetres).save(folder / "depth" / f"{i + 10:05d}.png")
-        poses = np.linalg.inv(source.world_to_camera.double().numpy())
-        np.savetxt(folder / "poses.txt", poses.reshape(-1, 16))
-        np.savetxt(folder / "K.txt", source.intrinsics[0].numpy())
-        return folder
+        layout_rgbd.write_recording(tmp_path, rooms.load(rooms.scenes[scene], range(frames)), name)
+        return tmp_path / name
 
     return write

@@ -17,7 +17,7 @@ from vg2gt.data.framing import Framing
 from vg2gt.data.views.even import EvaluationViews
 from vg2gt.data.views.sampling import StepSampler
 
-from .conftest import SIZE
+from .conftest import SIZE, assert_same_batches
 
 
 def _module(rooms: SyntheticScenes, **options) -> SceneDataModule:
@@ -59,10 +59,7 @@ def test_evaluation_batches_are_context_then_targets(rooms):
 def test_workers_do_not_change_batches(rooms):
     alone, *helped = (list(_module(rooms, workers=workers).train_dataloader()) for workers in (0, 1, 2))
     for other in helped:
-        for a, b in zip(alone, other, strict=True):
-            assert a.scene == b.scene
-            assert torch.equal(a.frame_ids, b.frame_ids)
-            assert torch.equal(a.images, b.images)
+        assert_same_batches(other, alone)
 
 
 def test_limits_on_scenes(rooms):

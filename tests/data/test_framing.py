@@ -9,7 +9,7 @@ from vg2gt.data.transforms import pad, reduce_to_cover
 from vg2gt.data.views.sampling import StepSampler, ViewSampler
 from vg2gt.geometry.cameras import ray_directions
 
-from .conftest import SIZE
+from .conftest import SIZE, assert_same_batches
 
 
 def _rays(height: int = 60, width: int = 80, sparse: bool = False) -> Frames:
@@ -135,13 +135,7 @@ def test_drawn_batches_are_the_same_with_any_workers_and_memory(rooms):
     assert len({batch.images.shape[-2:] for batch in expected}) > 3
     assert len({batch.cameras.intrinsics[0, 0, 0, 0].item() for batch in expected}) == 6
     for options in ({"workers": 1}, {"workers": 2}, {"memory_mb": 0}):
-        again = list(_module(rooms, **DRAWN, **options).train_dataloader())
-        for a, b in zip(expected, again, strict=True):
-            assert (a.scene, a.cameras.size) == (b.scene, b.cameras.size)
-            assert torch.equal(a.frame_ids, b.frame_ids)
-            assert torch.equal(a.images, b.images)
-            assert torch.equal(a.depth, b.depth)
-            assert torch.equal(a.cameras.intrinsics, b.cameras.intrinsics)
+        assert_same_batches(_module(rooms, **DRAWN, **options).train_dataloader(), expected)
 
 
 def test_evaluation_is_never_drawn(rooms):

@@ -1,6 +1,5 @@
 """RGB-D folders: round trip, layouts, splits, damage, and real recordings by geometry."""
 
-import logging
 import shutil
 from collections import Counter
 from itertools import pairwise
@@ -13,88 +12,25 @@ from PIL import Image
 from vg2gt.data import DataError, RGBDFolder, SceneDataModule
 
 from .conftest import SIZE
+from .sources.layout_rgbd import write_seven_scenes
+from .sources.layouts import room
 from .warping import depth_differences
 
 
-def test_a_room_written_as_a_recording_is_read_back(write_recording, rooms):
-    source = RGBDFolder(str(write_recording()), holdout=None)
-    assert source.scenes == ("office",)
-    assert list(source.frames("office")) == list(range(10, 16))
-    frames, expected = source.load("office", [12, 10]), rooms.load("room-000000", [2, 0])
-    torch.testing.assert_close(frames.images, expected.images, atol=1e-6, rtol=0)
-    torch.testing.assert_close(frames.depth, expected.depth, atol=5.1e-4, rtol=0)
-    torch.testing.assert_close(frames.world_to_camera, expected.world_to_camera, atol=1e-6, rtol=0)
-    torch.testing.assert_close(frames.intrinsics, expected.intrinsics, atol=1e-4, rtol=0)
-
-
-def test_exported_scannet_layout_is_sorted_by_number_and_follows_the_depth_images(write_recording, caplog):
-    folder = write_recording()
-    reference = RGBDFolder(str(folder)).load("office", range(10, 16))
-    exported = folder.parent / "scene0000_00"
-    for sub in ("color", "depth", "pose", "intrinsic"):
-        (exported / sub).mkdir(parents=True)
-    poses = np.loadtxt(folder / "poses.txt").reshape(-1, 4, 4)
-    for i in range(6):
-        number = i + 7  # 7 .. 12: sorted by letters 10 would come before 7
-        with Image.open(folder / "images" / f"{i + 10:05d}.png") as image:
-            image.resize((2 * SIZE[1], 2 * SIZE[0]), Image.Resampling.NEAREST).save(
-                exported / "color" / f"{number}.png"
-            )
-        shutil.copy(folder / "depth" / f"{i + 10:05d}.png", exported / "depth" / f"{number}.png")
-        np.savetxt(exported / "pose" / f"{number}.txt", poses[i])
-    np.savetxt(exported / "pose" / "9.txt", np.full((4, 4), -np.inf))
-    matrix = np.eye(4)
-    matrix[:3, :3] = np.loadtxt(folder / "K.txt")
-    np.savetxt(exported / "intrinsic" / "intrinsic_depth.txt", matrix)
-    np.savetxt(exported / "intrinsic" / "intrinsic_color.txt", 2 * matrix)
-    with caplog.at_level(logging.INFO):
-        source = RGBDFolder(str(exported))
-        source.frames("scene0000_00")
-    assert "1 of 6 frames whose pose is not finite" in caplog.text
-    assert "folders color/ and depth/, 5 frames" in caplog.text
-    assert list(source.frames("scene0000_00")) == [7, 8, 10, 11, 12]
-    frames = source.load("scene0000_00", [7, 8, 10])
-    errors = (frames.images[:, None] - reference.images[None]).abs().mean((2, 3, 4))
-    assert errors.argmin(1).tolist() == [0, 1, 3]
-    assert errors.amin(1).max() < 0.03  # doubled and reduced again
-    assert torch.equal(frames.depth, reference.depth[[0, 1, 3]])
-    torch.testing.assert_close(frames.world_to_camera, reference.world_to_camera[[0, 1, 3]], atol=1e-5, rtol=0)
-    torch.testing.assert_close(frames.intrinsics, reference.intrinsics[:3])
-
-
-def test_seven_scenes_layout(write_recording, caplog):
-    folder = write_recording()
-    sequence = folder.parent / "chess" / "seq-01"
-    sequence.mkdir(parents=True)
-    poses = np.loadtxt(folder / "poses.txt").reshape(-1, 4, 4)
-    for i in range(6):
-        shutil.copy(folder / "images" / f"{i + 10:05d}.png", sequence / f"frame-{i:06d}.color.png")
-        shutil.copy(folder / "depth" / f"{i + 10:05d}.png", sequence / f"frame-{i:06d}.depth.png")
-        np.savetxt(sequence / f"frame-{i:06d}.pose.txt", poses[i])
+def test_intrinsics_beside_the_sequences_of_seven_scenes(tmp_path, caplog):
+    write_seven_scenes(tmp_path / "data", room(2))
+    root, path = tmp_path / "data" / "chess", tmp_path / "data" / "chess" / "camera-intrinsics.txt"
+    for focal in (30, 60):  # read again when they are edited
+        np.savetxt(path, [[focal, 0, 15], [0, 31, 11], [0, 0, 1]])
+        source = RGBDFolder(str(root), index_cache=str(tmp_path / "cache"))
+        assert float(source.load("seq-01", [0]).intrinsics[0, 0, 0]) == focal
+    assert "not registered" in caplog.text
+    path.unlink()
     with pytest.raises(DataError, match=r"no intrinsics.*data.intrinsics=\[fx,fy,cx,cy\]"):
-        RGBDFolder(str(folder.parent / "chess")).frames("seq-01")
-    given = RGBDFolder(str(folder.parent / "chess"), intrinsics=(30, 31, 15.5, 11.5))
+        RGBDFolder(str(root)).frames("seq-01")
+    given = RGBDFolder(str(root), intrinsics=(30, 31, 15.5, 11.5))
     assert given.scenes == ("seq-01",)
     assert given.load("seq-01", [0]).intrinsics[0].tolist() == [[30, 0, 15.5], [0, 31, 11.5], [0, 0, 1]]
-    shutil.copy(folder / "K.txt", folder.parent / "chess" / "camera-intrinsics.txt")
-    frames = RGBDFolder(str(folder.parent / "chess")).load("seq-01", [3, 4])
-    expected = RGBDFolder(str(folder)).load("office", [13, 14])
-    assert torch.equal(frames.depth, expected.depth)
-    assert torch.equal(frames.intrinsics, expected.intrinsics)
-    assert "not registered" in caplog.text
-
-
-def test_intrinsics_beside_the_sequences_are_read_again_when_they_are_edited(write_recording, tmp_path):
-    folder = write_recording()
-    sequence = folder.parent / "chess" / "seq-01"
-    sequence.mkdir(parents=True)
-    for kind, sub in (("color", "images"), ("depth", "depth")):
-        shutil.copy(folder / sub / "00010.png", sequence / f"frame-000000.{kind}.png")
-    np.savetxt(sequence / "frame-000000.pose.txt", np.eye(4))
-    for focal in (30, 60):
-        np.savetxt(sequence.parent / "camera-intrinsics.txt", [[focal, 0, 15], [0, 31, 11], [0, 0, 1]])
-        source = RGBDFolder(str(sequence.parent), index_cache=str(tmp_path / "cache"))
-        assert float(source.load("seq-01", [0]).intrinsics[0, 0, 0]) == focal
 
 
 def test_recordings_of_one_room_show_one_place(write_recording):

@@ -21,7 +21,7 @@ from vg2gt.data.sharded_scenes import INDEX
 from vg2gt.data.shards import Encoding, write_shards
 from vg2gt.data.transforms import reduce_to_cover
 
-from .conftest import SIZE
+from .conftest import SIZE, assert_same_batches
 
 
 @pytest.fixture
@@ -74,12 +74,7 @@ def test_training_reads_shards_in_workers_as_the_source_itself(mixture, tmp_path
     direct = list(SceneDataModule(mixture, val, **options).train_dataloader())
     for workers in (0, 2):
         shards = ShardedScenes(str(tmp_path / "out"))
-        batches = list(SceneDataModule(shards, val, workers=workers, **options).train_dataloader())
-        for a, b in zip(direct, batches, strict=True):
-            assert a.scene == b.scene
-            assert torch.equal(a.frame_ids, b.frame_ids)
-            assert torch.equal(a.images, b.images)
-            assert torch.equal(a.depth, b.depth)
+        assert_same_batches(SceneDataModule(shards, val, workers=workers, **options).train_dataloader(), direct)
 
 
 def test_shards_are_read_from_other_file_systems(rooms, tmp_path):

@@ -41,11 +41,7 @@ def _read(root: Path) -> Infinigen:
     return Infinigen(str(root))
 
 
-def _exact(depth):
-    return 0 * depth
-
-
 LAYOUTS = {
-    "infinigen": Layout(_write_video, _read, depth_quantum=_exact, frame_ids=tuple(range(48, 54))),
-    "infinigen_insscene": Layout(_write_rigs, _read, depth_quantum=_exact, frame_ids=tuple(range(8, 14))),
+    "infinigen": Layout(_write_video, _read, depth_quantum=0.0, frame_ids=tuple(range(48, 54))),
+    "infinigen_insscene": Layout(_write_rigs, _read, depth_quantum=0.0, frame_ids=tuple(range(8, 14))),
 }

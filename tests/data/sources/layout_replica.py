@@ -3,14 +3,13 @@
 from pathlib import Path
 
 import numpy as np
-import torch
 from PIL import Image
 
 from vg2gt.data import Frames
 from vg2gt.data.sources import Replica
 
 from .layout_scannet import JPEG_ERROR
-from .layouts import Layout, camera_to_world, pixels, room
+from .layouts import Layout, camera_of, camera_to_world, pixels, room
 
 
 def write(root: Path, frames: Frames, scene: str = "office3") -> None:
@@ -24,12 +23,7 @@ def write(root: Path, frames: Frames, scene: str = "office3") -> None:
 
 
 def _read(root: Path) -> Replica:
-    intrinsics = room(1).intrinsics[0].double()
-    return Replica(str(root), intrinsics=[float(intrinsics[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))])
+    return Replica(str(root), intrinsics=camera_of(room(1)))
 
 
-def _quantum(depth: torch.Tensor) -> torch.Tensor:
-    return torch.full_like(depth, 1 / 6553.5)
-
-
-LAYOUTS = {"replica": Layout(write, _read, image_error=JPEG_ERROR, depth_quantum=_quantum)}
+LAYOUTS = {"replica": Layout(write, _read, image_error=JPEG_ERROR, depth_quantum=1 / 6553.5)}

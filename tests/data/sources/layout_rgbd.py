@@ -37,7 +37,8 @@ def _write_pose_files(root: Path, frames: Frames) -> None:
     np.savetxt(root / "hall" / "intrinsic" / "intrinsic_depth.txt", matrix)
 
 
-def _write_seven_scenes(root: Path, frames: Frames) -> None:
+def write_seven_scenes(root: Path, frames: Frames) -> None:
+    """One sequence, and the intrinsics beside it."""
     folder = root / "chess" / "seq-01"
     folder.mkdir(parents=True)
     for i, pose in enumerate(camera_to_world(frames)):
@@ -55,5 +56,5 @@ def _read(root: Path) -> RGBDFolder:
 LAYOUTS = {
     "rgbd": Layout(write_recording, _read, frame_ids=tuple(range(10, 16))),
     "rgbd_pose_files": Layout(_write_pose_files, _read, image_error=0.012, frame_ids=tuple(range(8, 14))),
-    "seven_scenes": Layout(_write_seven_scenes, _read),
+    "seven_scenes": Layout(write_seven_scenes, _read),
 }

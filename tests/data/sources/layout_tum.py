@@ -3,14 +3,13 @@
 from pathlib import Path
 
 import numpy as np
-import torch
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from vg2gt.data import Frames
 from vg2gt.data.sources import TUM
 
-from .layouts import Layout, camera_to_world, pixels, room
+from .layouts import Layout, camera_of, camera_to_world, pixels, room
 
 START = 1305031102.0
 
@@ -48,13 +47,7 @@ def write_poses(folder: Path, times: np.ndarray, poses: np.ndarray) -> None:
 
 
 def _read(root: Path) -> TUM:
-    intrinsics = room(1).intrinsics[0].double()
-    camera = [float(intrinsics[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))]
-    return TUM(str(root), intrinsics=camera, holdout=None)
+    return TUM(str(root), intrinsics=camera_of(room(1)), holdout=None)
 
 
-def _quantum(depth: torch.Tensor) -> torch.Tensor:
-    return torch.full_like(depth, 1 / 5000)
-
-
-LAYOUTS = {"tum": Layout(write, _read, depth_quantum=_quantum)}
+LAYOUTS = {"tum": Layout(write, _read, depth_quantum=1 / 5000)}

@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import numpy as np
-import torch
 from PIL import Image
 
 from vg2gt.data import Frames
@@ -36,12 +35,6 @@ def write(root: Path, frames: Frames, variation: str = "Scene06/fog", camera: in
     np.savetxt(folder / "intrinsic.txt", cameras, "%.9g", header=CAMERA_HEADING, comments="")
 
 
-def _quantum(depth: torch.Tensor) -> torch.Tensor:
-    return torch.full_like(depth, 0.01)
-
-
 LAYOUTS = {
-    "virtual_kitti": Layout(
-        write, lambda root: VirtualKITTI2(str(root)), image_error=JPEG_ERROR, depth_quantum=_quantum
-    )
+    "virtual_kitti": Layout(write, lambda root: VirtualKITTI2(str(root)), image_error=JPEG_ERROR, depth_quantum=0.01)
 }

@@ -28,7 +28,7 @@ class Layout:
         write: lays frames out below an empty folder, as scene number 0 of a dataset would be.
         read: makes the loader of that folder.
         image_error: largest mean absolute difference of images (PNG: 0; JPEG: the codec's).
-        depth_quantum: step of stored depth at depth z: ``quantum(z)``; None where the layout has no depth.
+        depth_quantum: step of stored depth, or the step at depth z, ``quantum(z)``; None where the layout has no depth.
         frame_ids: ids under which frames 0, 1, ... come back; None: unchanged.
         moved_world: poses come back up to one rigid transform of the world.
     """
@@ -36,7 +36,7 @@ class Layout:
     write: Callable[[Path, Frames], None]
     read: Callable[[Path], FileSource]
     image_error: float = 0.0
-    depth_quantum: Callable[[torch.Tensor], torch.Tensor] | None = lambda depth: torch.full_like(depth, 1e-3)
+    depth_quantum: Callable[[torch.Tensor], torch.Tensor] | float | None = 1e-3
     frame_ids: tuple[int, ...] | None = None
     moved_world: bool = False
 
@@ -58,6 +58,12 @@ def room(frames: int = 6) -> Frames:
 def camera_to_world(frames: Frames) -> np.ndarray:
     """``[V, 4, 4]`` float64 poses of frames."""
     return np.linalg.inv(frames.world_to_camera.double().numpy())
+
+
+def camera_of(frames: Frames) -> list[float]:
+    """(fx, fy, cx, cy) of the first frame."""
+    matrix = frames.intrinsics[0].double()
+    return [float(matrix[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))]
 
 
 def pixels(frames: Frames) -> np.ndarray:

@@ -26,24 +26,27 @@ def frames():
     return room(4)
 
 
-def test_frames_are_sorted_by_number_and_lost_ones_left_out(tmp_path, frames, caplog):
+@pytest.mark.parametrize("loader", [ScanNet, RGBDFolder])
+def test_frames_are_sorted_by_number_and_lost_ones_left_out(tmp_path, frames, caplog, loader):
     write_export(tmp_path, frames)
     np.savetxt(tmp_path / "scans" / SCENE / "pose" / "9.txt", np.full((4, 4), -np.inf))
-    with caplog.at_level(logging.WARNING):
-        source = ScanNet(str(tmp_path))
+    with caplog.at_level(logging.INFO):
+        source = loader(str(tmp_path / "scans"))
         assert source.frames(SCENE) == (8, 10, 11)
     assert "1 of 4 frames whose pose is not finite are left out" in caplog.text
+    assert loader is ScanNet or "folders color/ and depth/, 3 frames" in caplog.text
     assert torch.allclose(source.load(SCENE, [10]).world_to_camera[0], frames.world_to_camera[2], atol=1e-6)
 
 
-def test_colour_is_resized_to_the_depth_images_whose_intrinsics_count(tmp_path, frames):
+@pytest.mark.parametrize("loader", [ScanNet, RGBDFolder])
+def test_colour_is_resized_to_the_depth_images_whose_intrinsics_count(tmp_path, frames, loader):
     """The layout's colour intrinsics are those of images twice as large."""
     write_export(tmp_path, frames)
     for path in (tmp_path / "scans" / SCENE / "color").iterdir():
         with Image.open(path) as image:
             larger = image.resize((2 * image.width, 2 * image.height), Image.Resampling.NEAREST)
         larger.save(path, quality=95, subsampling=0)
-    loaded = ScanNet(str(tmp_path)).load(SCENE, [8, 9, 10, 11])
+    loaded = loader(str(tmp_path / "scans")).load(SCENE, [8, 9, 10, 11])
     assert loaded.images.shape == frames.images.shape
     assert float((loaded.images - frames.images).abs().mean()) < 0.03
     assert torch.allclose(loaded.intrinsics, frames.intrinsics, atol=1e-4)
