@@ -13,7 +13,7 @@ from torch import Tensor, nn
 log = logging.getLogger(__name__)
 
 TRAINING = (
-    "fewer images a step (data.max_images, training.render_views), smaller ones (data.image_size), fewer voxels "
+    "fewer images per step (data.max_images, training.render_views), smaller ones (data.image_size), fewer voxels "
     "(model.fine.max_voxels, or a larger model.fine.voxel_size) or fewer Gaussians (model.gaussians.max_gaussians)"
 )
 EVALUATION = (
@@ -106,7 +106,7 @@ class Cap:
         """Chooses what to keep.
 
         Args:
-            limit: the most a scene; None: no limit.
+            limit: the most per scene; None: no limit.
             ranks: ``[M]``; of equal ones the later are kept.
             batch: ``[M]`` scene index, sorted.
 

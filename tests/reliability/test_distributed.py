@@ -20,7 +20,7 @@ from tests.reliability.steps import TINY, first_batches, tiny_run
 from tests.training_helpers import SMALL
 from vg2gt.losses import EnhancementLoss, GaussianLoss, ScaleAlignment, VG2GTLoss
 from vg2gt.training.callbacks import StopOnSignal
-from vg2gt.training.distributed import in_turns
+from vg2gt.training.distributed import interleave
 from vg2gt.training.loop import Run
 from vg2gt.types import Batch
 
@@ -218,9 +218,9 @@ def test_an_error_of_one_rank_ends_both(two) -> None:
     assert "this batch cannot be read" in ended[1].stderr
 
 
-def test_ranks_join_what_they_took_in_turns() -> None:
+def test_what_ranks_hold_is_interleaved() -> None:
     parts = [{"a": 1, "c": 3, "e": 5}, {"b": 2, "d": 4}, {"a": 9}]
-    joined = in_turns(parts)
+    joined = interleave(parts)
     assert list(joined.items()) == [("a", 1), ("b", 2), ("c", 3), ("d", 4), ("e", 5)]
 
 

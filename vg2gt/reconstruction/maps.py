@@ -9,7 +9,7 @@ import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,14 +20,16 @@ from vg2gt.io.images import colorize_normals, encode_image, to_pixels
 from vg2gt.io.video import write_video
 from vg2gt.reconstruction.camera_paths import view_stem
 from vg2gt.reconstruction.output_names import MAPS
-from vg2gt.reconstruction.scene import RenderedView
+
+if TYPE_CHECKING:
+    from vg2gt.reconstruction.scene import RenderedView
 
 log = logging.getLogger(__name__)
 
 DEPTH_STEPS = 1000  # stored depth units per scene unit in a 16-bit PNG
 _LARGEST = 65535
 
-AddView: TypeAlias = Callable[[RenderedView], None]
+AddView: TypeAlias = "Callable[[RenderedView], None]"
 Sink: TypeAlias = AbstractContextManager[AddView]
 """Gives what takes rendered views one by one; at the end of its block it writes what needs all of them."""
 

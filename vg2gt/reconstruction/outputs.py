@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -34,7 +34,9 @@ from vg2gt.reconstruction.maps import AddView, animation, feed, map_sinks, whole
 from vg2gt.reconstruction.monitor import Monitor
 from vg2gt.reconstruction.output_names import DEFAULT, FPS, MAPS, ORBIT_FRAMES, OUTPUTS
 from vg2gt.reconstruction.report import html_rows, png_report, write_html_report
-from vg2gt.reconstruction.scene import Scene
+
+if TYPE_CHECKING:
+    from vg2gt.reconstruction.scene import Scene
 
 MESH_PIXELS = 2.0  # edge of a mesh's voxel, in pixels at the median depth
 _MESH_DEPTHS = 10.0  # in median depths: what is farther is left out of the mesh

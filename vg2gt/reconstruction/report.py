@@ -8,7 +8,7 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -17,7 +17,9 @@ from vg2gt.io.files import write_text
 from vg2gt.io.images import colorize_depth, colorize_normals, encode_image, grid, to_pixels, write_png
 from vg2gt.reconstruction.maps import AddView
 from vg2gt.reconstruction.pictures import spread
-from vg2gt.reconstruction.scene import RenderedView, Scene
+
+if TYPE_CHECKING:
+    from vg2gt.reconstruction.scene import RenderedView, Scene
 
 PANELS = ("input", "rendered colour", "rendered depth", "rendered normals")
 ROWS = 12

@@ -22,7 +22,7 @@ def world_size() -> int:
     return torch.distributed.get_world_size()
 
 
-def from_all_ranks(value: Value) -> list[Value]:
+def all_gather_object(value: Value) -> list[Value]:
     """The value of every rank, in their order. Collective: every rank has to call it."""
     if world_size() == 1:
         return [value]
@@ -31,8 +31,8 @@ def from_all_ranks(value: Value) -> list[Value]:
     return found
 
 
-def in_turns(parts: Sequence[Mapping[Key, Value]]) -> dict[Key, Value]:
-    """Joins what ranks hold who took turns: the first of every rank, then the second of every rank.
+def interleave(parts: Sequence[Mapping[Key, Value]]) -> dict[Key, Value]:
+    """Joins the parts of ranks that took turns: the first of every rank, then the second of every rank.
 
     A key that several ranks hold keeps its first place and value.
     """

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.utils.hooks import RemovableHandle
 
 from vg2gt.losses import LossReport
-from vg2gt.training.distributed import from_all_ranks
+from vg2gt.training.distributed import all_gather_object
 from vg2gt.types import Batch, Prediction, TensorRecord
 
 KEPT = 20  # faults named in the report of a run
@@ -181,9 +181,9 @@ class SkippedSteps:
         self._scenes = dict.fromkeys(state["scenes"])
 
 
-def gather(fault: Fault | None) -> list[Fault]:
+def gather_faults(fault: Fault | None) -> list[Fault]:
     """The faults of all ranks, in their order. Collective: every rank has to call it."""
-    return [each for each in from_all_ranks(fault) if each]
+    return [each for each in all_gather_object(fault) if each]
 
 
 def described(faults: list[Fault]) -> str:

@@ -23,7 +23,7 @@ from vg2gt.model import Reconstructor
 from vg2gt.profiling import stage
 from vg2gt.rendering import Renderer, UnrenderableError
 from vg2gt.runs.checkpoints import MODEL_PREFIX, model_state
-from vg2gt.training.distributed import from_all_ranks, in_turns, world_size
+from vg2gt.training.distributed import all_gather_object, interleave, world_size
 from vg2gt.training.faults import (
     Fault,
     GradientWatch,
@@ -32,7 +32,7 @@ from vg2gt.training.faults import (
     fault_of_batch,
     fault_of_loss,
     fault_of_prediction,
-    gather,
+    gather_faults,
 )
 from vg2gt.training.schedule import cosine_with_warmup, weight_decay_groups
 from vg2gt.types import Batch, Prediction
@@ -85,7 +85,7 @@ class VG2GTModule(lightning.LightningModule):
         self._fault: Fault | None = None
         self._scenes: tuple[str, ...] = ()
         self._figures: dict[str, Tensor] = {}
-        self._scores: dict[tuple[str | int, ...], dict[str, float]] = {}
+        self._metrics: dict[tuple[str | int, ...], dict[str, float]] = {}
         self.strict_loading = False  # backbone weights are never stored; load_state_dict checks everything else
 
     # ------------------------------------------------------------------------------------------------- training
@@ -195,7 +195,7 @@ class VG2GTModule(lightning.LightningModule):
         fault = self._fault
         if fault is None and (name := self._watch.first_bad()):
             fault = Fault(self._scenes, f"gradient of {name}")
-        faults = gather(fault and replace(fault, step=self.global_step, rank=self.global_rank))
+        faults = gather_faults(fault and replace(fault, step=self.global_step, rank=self.global_rank))
         if self.trainer.is_global_zero:
             log.warning("step %d skipped: %s", self.global_step, described(faults))
         self.skipped.add(faults)
@@ -212,21 +212,21 @@ class VG2GTModule(lightning.LightningModule):
     # ----------------------------------------------------------------------------------------------- evaluation
 
     def on_validation_epoch_start(self) -> None:
-        """Forgets the scores of the evaluation before."""
-        self._scores = {}
+        """Forgets the metrics of the evaluation before."""
+        self._metrics = {}
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         """Evaluates one held-out scene batch."""
         for index, scene in enumerate(batch.scene):
             sample = (scene, *batch.frame_ids[index].tolist())
-            self._scores[sample] = evaluate_scene(self.model, self.renderer, batch.single(index))
+            self._metrics[sample] = evaluate_scene(self.model, self.renderer, batch.single(index))
 
     def on_validation_epoch_end(self) -> None:
         """Logs every number as ``eval/<name>``: means over the scenes that have it, each counted once on all ranks.
 
         The ranks' scenes are joined in the order of one process, so their number does not change a bit of the means.
         """
-        for metrics in in_turns(from_all_ranks(self._scores)).values():
+        for metrics in interleave(all_gather_object(self._metrics)).values():
             for name, value in metrics.items():
                 if math.isfinite(value):  # a scene without ground-truth depth has no depth error
                     self.log(f"eval/{name}", value, on_epoch=True, batch_size=1)

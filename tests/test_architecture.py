@@ -1,0 +1,104 @@
+"""Who imports whom, read from the source: imports inside functions count as well."""
+
+import ast
+from graphlib import TopologicalSorter
+from pathlib import Path
+
+from tests.commands import ROOT
+
+# What a room of vg2gt may import beside itself and the leaves, which import no other room.
+LEAVES = {"types", "config", "memory", "profiling"}
+BASICS = {"geometry", "io"}
+MAY_IMPORT: dict[str, set[str]] = {
+    "geometry": set(),
+    "io": {"geometry"},
+    "data": BASICS,
+    **dict.fromkeys(("rendering", "voxels", "gaussians", "losses", "metrics"), BASICS),
+    "model": {"voxels", "gaussians", "backends"} | BASICS,
+    "baselines": {"model", "voxels", "gaussians", "backends"} | BASICS,
+    "runs": {"baselines", "model", "rendering", "data"} | BASICS,
+    "evaluation": {"runs", "model", "rendering", "metrics", "data"} | BASICS,
+    "reconstruction": {"runs", "model", "rendering", "data"} | BASICS,
+    "training": {"evaluation", "runs", "model", "losses", "rendering", "data"} | BASICS,
+    "studies": {"training", "evaluation", "runs"} | BASICS,
+    "viewer": {"rendering"} | BASICS,
+    "cli": set("studies training evaluation reconstruction viewer runs rendering data io backends".split()),
+    **{command: {"cli"} for command in ("evaluate", "ablate", "curves")},
+}
+OF_BACKENDS = ("vg2gt.types", "vg2gt.geometry", "vg2gt.io.tensors")
+
+
+def modules() -> dict[str, Path]:
+    found = {}
+    for path in [*ROOT.glob("vg2gt/**/*.py"), *ROOT.glob("backends/**/*.py")]:
+        name = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+        found[name.removesuffix(".__init__")] = path
+    return found
+
+
+MODULES = modules()
+
+
+class WithoutTypeChecking(ast.NodeTransformer):
+    """Takes away what is imported for type checkers only: it runs never."""
+
+    def visit_If(self, node: ast.If) -> ast.AST | None:
+        return None if ast.unparse(node.test) == "TYPE_CHECKING" else self.generic_visit(node)
+
+
+def imports(module: str, when_run: bool) -> set[str]:
+    """The modules of this project that one imports; a name of a package that is no module is its ``__init__``'s."""
+    names: set[str] = set()
+    tree = ast.parse(MODULES[module].read_text())
+    for node in ast.walk(WithoutTypeChecking().visit(tree) if when_run else tree):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{module}: relative import"
+            names |= {f"{node.module}.{alias.name}" for alias in node.names}
+    found = {name if name in MODULES else name.rpartition(".")[0] for name in names}
+    return {name for name in found if name in MODULES and name != module}
+
+
+def room(module: str) -> str:
+    """``geometry`` of ``vg2gt.geometry.cameras``; ``backends`` of all in there."""
+    first, _, rest = module.partition(".")
+    return rest.partition(".")[0] if first == "vg2gt" else first
+
+
+GRAPH = {module: imports(module, when_run=False) for module in MODULES}
+
+
+def test_there_is_no_circle() -> None:
+    TopologicalSorter({module: imports(module, when_run=True) for module in MODULES}).prepare()
+
+
+def test_imports_go_one_way() -> None:
+    wrong = []
+    for module, imported in GRAPH.items():
+        here = room(module)
+        if here in ("", "backends"):  # vg2gt itself imports on demand what it offers
+            continue
+        allowed = set() if here in LEAVES else {here, *LEAVES, *MAY_IMPORT[here]}
+        wrong += [f"{module} -> {other}" for other in imported if room(other) not in allowed and other != "vg2gt"]
+    assert not wrong
+
+
+def test_rooms_go_one_way() -> None:
+    TopologicalSorter(MAY_IMPORT).prepare()  # a circle in the table itself would let everything through
+
+
+def test_backends_need_little_of_the_project() -> None:
+    wrong = [
+        f"{module} -> {other}"
+        for module, imported in GRAPH.items()
+        if room(module) == "backends"
+        for other in imported
+        if room(other) != "backends" and not other.startswith(OF_BACKENDS)
+    ]
+    assert not wrong
+
+
+def test_few_modules_stand_loose() -> None:
+    loose = [path.name for path in (ROOT / "vg2gt").glob("*.py") if path.name != "__init__.py"]
+    assert len(loose) <= 8, loose
