@@ -22,7 +22,9 @@ MAY_IMPORT: dict[str, set[str]] = {
     "training": {"evaluation", "runs", "model", "losses", "rendering", "data"} | BASICS,
     "studies": {"training", "evaluation", "runs"} | BASICS,
     "viewer": {"rendering"} | BASICS,
-    "cli": set("studies training evaluation reconstruction viewer runs rendering data io backends".split()),
+    "cli": set(
+        ["studies", "training", "evaluation", "reconstruction", "viewer", "runs", "rendering", "data", "io", "backends"]
+    ),
     **{command: {"cli"} for command in ("evaluate", "ablate", "curves")},
 }
 OF_BACKENDS = ("vg2gt.types", "vg2gt.geometry", "vg2gt.io.tensors")

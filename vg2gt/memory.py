@@ -123,7 +123,7 @@ class Cap:
         self._passes += 1
         if self._passes & (self._passes - 1) == 0:
             log.warning(
-                "%s=%d a scene: dropped the %d %s of %d %s (pass %d with losses; next said in pass %d)",
+                "%s=%d per scene: dropped the %d %s of %d %s (pass %d with losses; next said in pass %d)",
                 self.option, limit, self.dropped, self.rank, len(batch), self.what, self._passes, 2 * self._passes,
             )  # fmt: skip
         return keep
