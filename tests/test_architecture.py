@@ -22,7 +22,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "training": {"evaluation", "runs", "model", "losses", "rendering", "data"} | BASICS,
     "studies": {"training", "evaluation", "runs"} | BASICS,
     "viewer": {"rendering"} | BASICS,
-    "cli": set(
+    "cli": {"studies", "training", "evaluation", "reconstruction", "viewer", "runs", "data", "backends", "rendering", "io"},
         ["studies", "training", "evaluation", "reconstruction", "viewer", "runs", "rendering", "data", "io", "backends"]
     ),
     **{command: {"cli"} for command in ("evaluate", "ablate", "curves")},

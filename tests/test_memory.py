@@ -71,7 +71,7 @@ def test_the_least_opaque_gaussians_of_each_scene_go(caplog: pytest.LogCaptureFi
         assert torch.equal(after.opacities.sort().values, before.opacities.sort().values[count - 70 :])
         rows = (before.opacities >= after.opacities.min()).nonzero()[:, 0]
         assert torch.equal(after.means, before.means[rows])  # in their order
-    assert "model.gaussians.max_gaussians=70 a scene: dropped the 60 least opaque of 200 Gaussians" in caplog.text
+    assert "model.gaussians.max_gaussians=70 per scene: dropped the 60 least opaque of 200 Gaussians" in caplog.text
     assert dropped_by(capped) == {"gaussians": 60}
     assert torch.equal(capped(voxels).means, kept.means)
 
@@ -141,8 +141,8 @@ def test_training_logs_what_was_dropped(tmp_path: Path, caplog: pytest.LogCaptur
     (metrics,) = tmp_path.rglob("metrics.csv")
     header = metrics.read_text().splitlines()[0].split(",")
     assert {"train/voxels_dropped", "train/gaussians_dropped"} <= set(header)
-    assert "model.fine.max_voxels=200 a scene: dropped" in caplog.text
-    assert "model.gaussians.max_gaussians=300 a scene: dropped" in caplog.text
+    assert "model.fine.max_voxels=200 per scene: dropped" in caplog.text
+    assert "model.gaussians.max_gaussians=300 per scene: dropped" in caplog.text
 
 
 @pytest.mark.parametrize(
