@@ -17,14 +17,13 @@ MAY_IMPORT: dict[str, set[str]] = {
     "model": {"voxels", "gaussians", "backends"} | BASICS,
     "baselines": {"model", "voxels", "gaussians", "backends"} | BASICS,
     "runs": {"baselines", "model", "rendering", "data"} | BASICS,
+    "viewer": {"rendering"} | BASICS,
     "evaluation": {"runs", "model", "rendering", "metrics", "data"} | BASICS,
     "reconstruction": {"runs", "model", "rendering", "data"} | BASICS,
     "training": {"evaluation", "runs", "model", "losses", "rendering", "data"} | BASICS,
     "studies": {"training", "evaluation", "runs"} | BASICS,
-    "viewer": {"rendering"} | BASICS,
-    "cli": {"studies", "training", "evaluation", "reconstruction", "viewer", "runs", "data", "backends", "rendering", "io"},
-        ["studies", "training", "evaluation", "reconstruction", "viewer", "runs", "rendering", "data", "io", "backends"]
-    ),
+    "cli": {"studies", "training", "evaluation", "reconstruction", "viewer", "runs", "rendering", "data", "backends"}
+    | BASICS,
     **{command: {"cli"} for command in ("evaluate", "ablate", "curves")},
 }
 OF_BACKENDS = ("vg2gt.types", "vg2gt.geometry", "vg2gt.io.tensors")
