@@ -10,7 +10,7 @@ from vg2gt.data.views import SceneSample
 
 
 class Scans(SyntheticScenes):
-    """Two scans a room, every third frame held out."""
+    """Two scans per room, every third frame held out."""
 
     first = 0
 

@@ -45,9 +45,9 @@ class Framing:
 class FramingSampler:
     """Draws the framing of training scenes: a pure function of seed, step and scene, like all sampling.
 
-    The size is drawn once a step, the same on every device. Zoom and window are drawn once a scene, so that views which
-    shared intrinsics still do and overlap as before. ``crop="random"`` moves the principal point off the middle; only
-    for backbones that are told intrinsics or predict the principal point. Colours are never changed.
+    The size is drawn once per step, the same on every device. Zoom and window are drawn once per scene, so that views
+    which shared intrinsics still do and overlap as before. ``crop="random"`` moves the principal point off the middle;
+    only for backbones that are told intrinsics or predict the principal point. Colours are never changed.
 
     Args:
         image_size: ``(height, width)``, kept where ``aspect`` is None; otherwise its area is kept about.

@@ -20,7 +20,7 @@ class Mixture(SceneSource):
     Args:
         parts: the datasets by name, or what makes them (``_partial_: true``).
         weights: the weight of every part, any positive scale; a part of weight 0 is left out and needs no data.
-        scenes: names of the scenes to use, or a text file with one a line; None: all.
+        scenes: names of the scenes to use, or a text file with one per line; None: all.
         common: arguments of the parts' makers: ``<part>_<argument>`` goes to one part, any other to all.
 
     Raises:

@@ -42,13 +42,13 @@ class ShardedScenes(SceneSource):
 
     A frame is one range of one tar file, so frames are read in any order, and only those that are asked for: a step's
     views are a function of its number here as with files. Only the index (poses, intrinsics and offsets, about 150
-    bytes a frame) is read at the start.
+    bytes per frame) is read at the start.
 
     Args:
         root: the folder of the shards, or its URL (``s3://``, ``gs://``, ``https://``, ...: those of ``SCHEMES`` that
             fsspec can open with the packages that are installed).
         subset: folder below ``root`` (``train`` or ``val``); None: ``root`` itself.
-        scenes: names of the scenes to use, or a text file with one a line; None: all.
+        scenes: names of the scenes to use, or a text file with one per line; None: all.
         weights: other weights of the parts than those of the mixture that was written; None: the same.
         storage_options: arguments of the file system, such as credentials.
 
@@ -186,7 +186,7 @@ class ShardedScenes(SceneSource):
 
 
 def _arrays_fit(arrays: Mapping[str, NDArray]) -> bool:
-    """Whether there is a row a frame of everything, and ranges are such as frames have."""
+    """Whether there is a row per frame of everything, and ranges are such as frames have."""
     rows = len(arrays["frame_ids"]) if arrays["frame_ids"].ndim else -1
     kinds = {"held_out": "b", "world_to_camera": "f", "intrinsics": "f"}
     if not all(

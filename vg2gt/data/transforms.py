@@ -44,12 +44,12 @@ def resize_depth(depth: Tensor, size: tuple[int, int], sparse: bool = False) -> 
     if (height, width) == tuple(size):
         return depth
     if not sparse:
-        return interpolate(depth[:, None], size, mode="nearest-exact")[:, 0]
-    view, y, x = depth.nonzero(as_tuple=True)
+        return interpolate(depth[:, None], size, mode="nearest-exact")[:, 0]  # [V, H', W']
+    view, y, x = depth.nonzero(as_tuple=True)  # [P] each
     # A pixel's centre c lies in the new pixel floor((c + 1/2) scale).
     row = ((y + 0.5) * (size[0] / height)).long().clamp(max=size[0] - 1)
     column = ((x + 0.5) * (size[1] / width)).long().clamp(max=size[1] - 1)
-    nearest = depth.new_full((views * size[0] * size[1],), torch.inf)
+    nearest = depth.new_full((views * size[0] * size[1],), torch.inf)  # [V H' W']
     nearest.scatter_reduce_(0, (view * size[0] + row) * size[1] + column, depth[view, y, x], "amin")
     return torch.where(nearest.isinf(), 0, nearest).reshape(views, *size)
 

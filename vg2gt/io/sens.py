@@ -2,7 +2,7 @@
 
 All numbers are little endian: version (uint32, 4), sensor name (uint64 length, bytes), 4x4 float32 intrinsics and
 extrinsics of colour and then of depth, compression types (2 x int32), widths and heights of colour and of depth
-(4 x uint32), depth units a metre (float32), number of frames (uint64). A frame is its 4x4 float32 pose
+(4 x uint32), depth units per metre (float32), number of frames (uint64). A frame is its 4x4 float32 pose
 (camera-to-world), timestamps of colour and depth (2 x uint64), lengths of the two images (2 x uint64), and their bytes.
 """
 
@@ -39,7 +39,7 @@ class SensStream:
         depth_size: of the depth images.
         depth_intrinsics: ``[3, 3]`` of the depth images.
         depth_compression: 0: raw uint16, 1: zlib.
-        depth_scale: stored units a metre.
+        depth_scale: stored units per metre.
         color: ``[n, 2]`` first byte and length of each colour image.
         depth: ``[n, 2]`` of each depth image.
     """
@@ -124,7 +124,7 @@ def _scan(file: BinaryIO, length: int) -> tuple[SensStream, NDArray[np.float64]]
         raise ValueError(f"images of {sides[0]}x{sides[1]} and {sides[2]}x{sides[3]} pixels")
     depth_scale, count = _unpack(file, "<fQ")
     if not 1 <= depth_scale <= _FINEST_DEPTH:
-        raise ValueError(f"{depth_scale} depth units a metre")
+        raise ValueError(f"{depth_scale} depth units per metre")
     poses, color, depth = _scan_frames(file, length, count)
     stream = SensStream(
         color_size=(sides[1], sides[0]),

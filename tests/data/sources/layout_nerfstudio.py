@@ -1,4 +1,4 @@
-"""nerfstudio captures: one camera or one a frame, with and without depth."""
+"""nerfstudio captures: one camera or one per frame, with and without depth."""
 
 from pathlib import Path
 

@@ -15,7 +15,7 @@ START = 1305031102.0
 
 
 def write(root: Path, frames: Frames, scene: str = "rgbd_dataset_freiburg1_desk") -> None:
-    """Colour 30 times a second, depth 11 ms later, poses 100 times a second; the lists' last files are absent."""
+    """Colour 30 times per second, depth 11 ms later, poses 100 times per second; the lists' last files are absent."""
     folder = root / scene
     for kind in ("rgb", "depth"):
         (folder / kind).mkdir(parents=True)

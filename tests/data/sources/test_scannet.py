@@ -152,7 +152,7 @@ DAMAGE = {
     "a long name": (lambda c: _overwrite(c, 4, HUGE), "sensor's name of 2305843009213693952 bytes"),
     "an unknown compression": (lambda c: _overwrite(c, COUNT_AT - 24, b"\2"), "colour of type 2 and depth of type 2"),
     "wide images": (lambda c: _overwrite(c, COUNT_AT - 20, b"\xff\xff\xff\xff"), "images of 4294967295x30"),
-    "no unit": (lambda c: _overwrite(c, COUNT_AT - 4, bytes(4)), "0.0 depth units a metre"),
+    "no unit": (lambda c: _overwrite(c, COUNT_AT - 4, bytes(4)), "0.0 depth units per metre"),
     "many frames": (lambda c: _overwrite(c, COUNT_AT, HUGE), "it ends .*within"),
     "no frame": (lambda c: _overwrite(c, COUNT_AT, bytes(8)), "it holds no frame"),
     "a long image": (lambda c: _overwrite(c, COUNT_AT + 8 + 64 + 16, HUGE), "it ends within frame 0 of 4"),

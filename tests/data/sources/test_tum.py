@@ -129,7 +129,7 @@ def test_a_real_recording_without_poses_and_with_made_up_ones(shared, tmp_path, 
 
 
 def test_real_ground_truth_is_a_smooth_path(shared, tmp_path):
-    """Motion capture took 100 poses a second, but none for 0.11 s, which costs two frames."""
+    """Motion capture took 100 poses per second, but none for 0.11 s, which costs two frames."""
     folder = tmp_path / "rgbd_dataset_freiburg1_xyz"
     folder.mkdir()
     shutil.copy(shared / "data/trajectories/tum_freiburg1_xyz_groundtruth.txt", folder / "groundtruth.txt")

@@ -232,8 +232,8 @@ class FileSource(SceneSource):
 
     def _load_frame(self, index: SceneIndex, row: int) -> Frames:
         pixels = self.read_color(index, row)
-        images = from_bytes(torch.from_numpy(pixels)).permute(2, 0, 1)[None].contiguous()
-        depth = torch.zeros_like(images[:, 0])
+        images = from_bytes(torch.from_numpy(pixels)).permute(2, 0, 1)[None].contiguous()  # [1, 3, H, W]
+        depth = torch.zeros_like(images[:, 0])  # [1, H, W]
         if index.depth:
             depth = torch.from_numpy(self._valid_depth(index, row, index.depth_size or pixels.shape[:2]))[None]
         poses = torch.from_numpy(index.world_to_camera[row : row + 1]).float()

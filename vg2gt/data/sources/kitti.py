@@ -25,7 +25,7 @@ class KITTI(FileSource):
     """Drives of KITTI raw that have annotated depth; a scene is a drive.
 
     Images are ``<root>/<date>/<drive>_sync/image_02/data/%010d.png``, calibration lies in ``<root>/<date>``, depth is
-    ``<depth_root>/{train,val}/<drive>_sync/proj_depth/groundtruth/image_02/%010d.png`` (uint16, 256 units a metre,
+    ``<depth_root>/{train,val}/<drive>_sync/proj_depth/groundtruth/image_02/%010d.png`` (uint16, 256 units per metre,
     0 = none). The first and the last five frames of a drive have no depth and are no frames of the scene.
 
     Poses come from OXTS packets in a Mercator projection at the drive's first latitude; the world is the first packet's

@@ -25,7 +25,7 @@ _LARGEST_STRETCH = 0.01
 class Replica(FileSource):
     """The eight rooms and offices of Replica with a video in each; a scene is a folder such as ``office0``.
 
-    ``results/frameNNNNNN.jpg`` and ``results/depthNNNNNN.png`` (6553.5 units a metre, 0 = none); line N of ``traj.txt``
+    ``results/frameNNNNNN.jpg`` and ``results/depthNNNNNN.png`` (6553.5 per metre, 0 = none); line N of ``traj.txt``
     holds the 16 numbers of frame N's camera-to-world matrix (OpenCV, metres). Images are 1200x680 with a focal length
     of 600 and the principal point in the middle, (599.5, 339.5); reduced copies have the same camera in larger pixels.
 

@@ -70,7 +70,7 @@ class Undistortion:
 
     def color(self, pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Undistorts an image ``[h, w, 3]``, bilinearly."""
-        sampled = self._sample(torch.from_numpy(pixels).permute(2, 0, 1).float(), "bilinear")
+        sampled = self._sample(torch.from_numpy(pixels).permute(2, 0, 1).float(), "bilinear")  # [3, h, w]
         return (sampled + 0.5).clamp(0, 255).byte().permute(1, 2, 0).contiguous().numpy()
 
     def depth(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -79,7 +79,7 @@ class Undistortion:
 
     def _sample(self, image: torch.Tensor, mode: str) -> torch.Tensor:
         grid = (self.places + 0.5) * (2 / np.array(self.size[::-1])) - 1
-        grid = torch.from_numpy(grid).float()[None]
+        grid = torch.from_numpy(grid).float()[None]  # [1, h, w, 2]
         return grid_sample(image[None], grid, mode, padding_mode="border", align_corners=False)[0]
 
     def _zoomed(self, zoom: float) -> NDArray[np.float64]:

@@ -55,7 +55,7 @@ class Builder:
             self._group_start.append(len(self.parts))
 
     def new_material(self, kinds: tuple[Pattern, ...] = INDOOR, frequency: tuple[float, float] = (1, 8)) -> int:
-        """Draws a material: one of ``kinds`` with a log-uniform pattern ``frequency`` (periods a metre)."""
+        """Draws a material: one of ``kinds`` with a log-uniform pattern ``frequency`` (periods per metre)."""
         rng = self.rng
         first = rng.uniform(0.15, 0.95, 3)
         if rng.random() < 0.4:

@@ -1,7 +1,7 @@
 """Writes synthetic scenes as RGB-D recordings, which ``data=rgbd data.root=FOLDER`` reads.
 
-A scene is a folder with ``images/NNNNN.png``, ``depth/NNNNN.png`` (uint16, ``depth_scale`` units a metre, 0 = none),
-``poses.txt`` (camera-to-world, 16 numbers a line), ``K.txt`` and, if asked for, ``normals/NNNNN.npz`` (``normals``,
+A scene is a folder with ``images/NNNNN.png``, ``depth/NNNNN.png`` (uint16, ``depth_scale`` units per metre, 0 = none),
+``poses.txt`` (camera-to-world, 16 numbers per line), ``K.txt`` and, if asked for, ``normals/NNNNN.npz`` (``normals``,
 float16 ``[H, W, 3]`` in the camera frame, 0 in the sky). Depth that 16 bits cannot hold, beyond 65.534 m at the default
 scale, is written as none.
 """
@@ -39,12 +39,12 @@ class SceneSettings:
     """What decides the content of a written scene besides its seed.
 
     Args:
-        frames: frames a scene.
+        frames: frames per scene.
         size: image ``(height, width)``.
         variant: as in :class:`SyntheticScenes`.
         highlights: whether surfaces shine.
         normals: write normals too.
-        depth_scale: stored depth units a metre.
+        depth_scale: stored depth units per metre.
     """
 
     frames: int = 16
