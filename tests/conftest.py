@@ -22,6 +22,12 @@ def shared() -> Path:
 
 
 @pytest.fixture(scope="session")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of rendered rooms, so that each is rendered once."""
+    return tmp_path_factory.mktemp("rooms")
+
+
+@pytest.fixture(scope="session")
 def shallow_da3():
     """The network behind :func:`onnx_bundle`: da3_tiny with half its blocks, to export faster."""
     return instantiate(compose(None, *SHALLOW).backend)

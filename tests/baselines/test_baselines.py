@@ -27,11 +27,6 @@ VIEWS = 4
 
 
 @pytest.fixture(scope="module")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("rooms")
-
-
-@pytest.fixture(scope="module")
 def batch(cache: Path, tmp_path_factory: pytest.TempPathFactory) -> Batch:
     data = instantiate(small_config(tmp_path_factory.mktemp("run"), cache, "data.eval_context=[0,4,8,12]").data)
     data.setup("validate")

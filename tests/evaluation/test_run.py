@@ -25,11 +25,6 @@ from vg2gt.training.loop import train
 
 
 @pytest.fixture(scope="module")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("rooms")
-
-
-@pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory, cache: Path) -> Path:
     folder = tmp_path_factory.mktemp("run") / "outputs" / "tiny"
     train(small_config(folder, cache, "trainer.max_steps=2"))
@@ -45,6 +40,18 @@ def evaluated(tmp_path_factory: pytest.TempPathFactory, trained: Path, cache: Pa
     folder = tmp_path_factory.mktemp("evaluated")
     run(folder, cache, f"ckpt={trained}")
     return folder
+
+
+@pytest.fixture
+def copied(tmp_path: Path, trained: Path) -> Path:
+    """A copy of the trained run that a test may change."""
+    return shutil.copytree(trained, tmp_path / "run")
+
+
+@pytest.fixture
+def joined(tmp_path: Path, evaluated: Path) -> Path:
+    """A copy of the evaluation that a test may add to."""
+    return shutil.copytree(evaluated, tmp_path / "copy")
 
 
 def without_cost(scores: dict[str, Any]) -> dict[str, Any]:
@@ -99,27 +106,21 @@ def test_an_interrupted_evaluation_goes_on(
         assert without_cost(report["views"]["2"]["scenes"][scene]) == without_cost(scores)
 
 
-def test_more_scenes_and_views_join_other_settings_do_not(
-    tmp_path: Path, cache: Path, trained: Path, evaluated: Path
-) -> None:
-    folder = tmp_path / "copy"
-    shutil.copytree(evaluated, folder)
-    report = run(folder, cache, f"ckpt={trained}", "views=[1,2]", "data.eval_scenes=1")
+def test_more_scenes_and_views_join_other_settings_do_not(cache: Path, trained: Path, joined: Path) -> None:
+    report = run(joined, cache, f"ckpt={trained}", "views=[1,2]", "data.eval_scenes=1")
     assert set(report["views"]) == {"1", "2"}
     assert "cameras/auc_5" not in report["views"]["1"]["mean"]
     with pytest.raises(FileExistsError, match=r"evaluation\.alignment \(median -> scene\)"):
-        run(folder, cache, f"ckpt={trained}", "evaluation.alignment=scene")
+        run(joined, cache, f"ckpt={trained}", "evaluation.alignment=scene")
     with pytest.raises(FileExistsError, match=r"checkpoint\.sha256"):
-        run(folder, cache)
-    run(folder, cache, f"ckpt={trained}", "data.eval_scenes=1", "overwrite=true")
-    assert len(list((folder / "scenes" / "2").iterdir())) == 1
+        run(joined, cache)
+    run(joined, cache, f"ckpt={trained}", "data.eval_scenes=1", "overwrite=true")
+    assert len(list((joined / "scenes" / "2").iterdir())) == 1
 
 
-def test_pictures_can_be_asked_for_later(tmp_path: Path, cache: Path, trained: Path, evaluated: Path) -> None:
-    folder = tmp_path / "copy"
-    shutil.copytree(evaluated, folder)
-    run(folder, cache, f"ckpt={trained}", "evaluation.pictures=1")
-    assert [path.name for path in (folder / "pictures").iterdir()] == ["room-1000000-2.png"]
+def test_pictures_can_be_asked_for_later(cache: Path, trained: Path, joined: Path) -> None:
+    run(joined, cache, f"ckpt={trained}", "evaluation.pictures=1")
+    assert [path.name for path in (joined / "pictures").iterdir()] == ["room-1000000-2.png"]
 
 
 def test_another_backbone_or_model_is_refused(tmp_path: Path, cache: Path, trained: Path) -> None:
@@ -164,9 +165,7 @@ def test_scenes_of_the_training_are_refused_whatever_loads_them(tmp_path: Path, 
         run(tmp_path, cache, f"ckpt={trained}", *other)
 
 
-def test_scenes_in_a_mixture_that_was_trained_on_are_refused(tmp_path: Path, cache: Path, trained: Path) -> None:
-    copied = tmp_path / "run"
-    shutil.copytree(trained, copied)
+def test_scenes_in_a_mixture_that_was_trained_on_are_refused(tmp_path: Path, cache: Path, copied: Path) -> None:
     config = OmegaConf.load(copied / "config.yaml")
     part = config.data.train
     config.data.train = {
@@ -177,21 +176,21 @@ def test_scenes_in_a_mixture_that_was_trained_on_are_refused(tmp_path: Path, cac
         run(tmp_path / "out", cache, f"ckpt={copied}", "data.val.first_seed=0")
 
 
-def test_what_the_weights_before_were_trained_on_is_refused(tmp_path: Path, cache: Path, trained: Path, caplog) -> None:
+def test_what_the_weights_before_were_trained_on_is_refused(
+    tmp_path: Path, cache: Path, trained: Path, copied: Path, caplog
+) -> None:
     """A run on other rooms that began with ``init_from``, or went on in a new folder with ``ckpt``."""
-    later = tmp_path / "later"
-    shutil.copytree(trained, later)
     for key, start in (("init_from", trained / "checkpoints" / "step-2.ckpt"), ("ckpt", trained)):
         config = read_run_config(trained / "config.yaml")
         config.data.train.first_seed = 500
         config[key] = str(start)
-        OmegaConf.save(config, later / "config.yaml")
+        OmegaConf.save(config, copied / "config.yaml")
         with pytest.raises(DataError, match="scene room-000000 is used for training and for evaluation"):
-            run(tmp_path / "out", cache, f"ckpt={later}", "data.val.first_seed=0")
+            run(tmp_path / "out", cache, f"ckpt={copied}", "data.val.first_seed=0")
     config = read_run_config(trained / "config.yaml")
     config.ckpt = str(tmp_path / "gone.ckpt")
-    OmegaConf.save(config, later / "config.yaml")
-    run(tmp_path / "out", cache, f"ckpt={later}", "data.eval_scenes=1")
+    OmegaConf.save(config, copied / "config.yaml")
+    run(tmp_path / "out", cache, f"ckpt={copied}", "data.eval_scenes=1")
     assert "cannot be checked" in caplog.text
     assert "gone.ckpt, which is not there" in caplog.text
 
@@ -208,9 +207,7 @@ def test_a_lone_checkpoint_is_not_checked_and_that_is_told(tmp_path: Path, cache
     assert "whether the evaluated scenes were trained on cannot be checked" in caplog.text
 
 
-def test_training_data_that_is_gone_is_told(tmp_path: Path, cache: Path, trained: Path, caplog) -> None:
-    copied = tmp_path / "run"
-    shutil.copytree(trained, copied)
+def test_training_data_that_is_gone_is_told(tmp_path: Path, cache: Path, trained: Path, copied: Path, caplog) -> None:
     config = OmegaConf.load(copied / "config.yaml")
     for target in ("vg2gt.data.sources.ScanNet", "no_longer_installed.Loader"):
         config.data.train = {"_target_": target, "_partial_": True}
@@ -250,18 +247,14 @@ def test_what_is_missing_or_wrong_is_named(tmp_path: Path, cache: Path, trained:
 
 @pytest.mark.parametrize("content", ["", "foo: 1", "model: null"])
 def test_a_configuration_without_the_runs_parts_is_named(
-    tmp_path: Path, cache: Path, trained: Path, content: str
+    tmp_path: Path, cache: Path, copied: Path, content: str
 ) -> None:
-    copied = tmp_path / "run"
-    shutil.copytree(trained, copied)
     (copied / "config.yaml").write_text(content)
     with pytest.raises(ValueError, match=r"config\.yaml names no (data|backend)"):
         run(tmp_path / "out", cache, f"ckpt={copied}")
 
 
-def test_a_training_runs_folder_is_left_as_it_is(tmp_path: Path, cache: Path, trained: Path) -> None:
-    copied = tmp_path / "run"
-    shutil.copytree(trained, copied)
+def test_a_training_runs_folder_is_left_as_it_is(cache: Path, trained: Path, copied: Path) -> None:
     for more in ([], ["overwrite=true"]):
         with pytest.raises(FileExistsError, match=r"holds metrics\.json, .*config\.yaml of something"):
             run(copied, cache, f"ckpt={copied}", "data.eval_scenes=1", *more)

@@ -4,6 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.geometry.test_cameras import random_cameras
 from vg2gt.geometry.alignment import Similarity, align_cameras, align_points, fit_depth_scale, weighted_median
 from vg2gt.geometry.cameras import project
 from vg2gt.geometry.rotations import quat_to_matrix
@@ -16,14 +17,6 @@ def rand(*shape: int, seed: int = 0) -> Tensor:
 
 def randn(*shape: int, seed: int = 0) -> Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-
-
-def random_cameras(scenes: int, views: int, seed: int = 0) -> Cameras:
-    poses = torch.eye(4, dtype=torch.float64).repeat(scenes, views, 1, 1)
-    poses[..., :3, :3] = quat_to_matrix(randn(scenes, views, 4, seed=seed))
-    poses[..., :3, 3] = randn(scenes, views, 3, seed=seed + 1)
-    intrinsics = torch.tensor([[20.0, 0, 9.5], [0, 20, 7.5], [0, 0, 1]], dtype=torch.float64)
-    return Cameras(poses, intrinsics.repeat(scenes, views, 1, 1), (16, 20))
 
 
 def random_similarity(scenes: int, seed: int = 7) -> Similarity:

@@ -21,8 +21,8 @@ from vg2gt.types import Cameras
 SIZE = (6, 8)
 
 
-def random_cameras(scenes: int = 2, views: int = 3) -> Cameras:
-    generator = torch.Generator().manual_seed(0)
+def random_cameras(scenes: int = 2, views: int = 3, seed: int = 0) -> Cameras:
+    generator = torch.Generator().manual_seed(seed)
     poses = torch.eye(4, dtype=torch.float64).repeat(scenes, views, 1, 1)
     poses[..., :3, :3] = quat_to_matrix(torch.randn(scenes, views, 4, generator=generator, dtype=torch.float64))
     poses[..., :3, 3] = torch.randn(scenes, views, 3, generator=generator, dtype=torch.float64)

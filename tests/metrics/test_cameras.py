@@ -6,6 +6,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from tests.geometry.test_cameras import random_cameras
 from vg2gt.geometry.alignment import Similarity
 from vg2gt.geometry.rotations import quat_to_matrix
 from vg2gt.metrics import camera_metrics, relative_pose_errors
@@ -13,16 +14,8 @@ from vg2gt.metrics.cameras import area_under_curve
 from vg2gt.types import Cameras
 
 
-def random_cameras(scenes: int = 2, views: int = 4, seed: int = 0) -> Cameras:
-    generator = torch.Generator().manual_seed(seed)
-    poses = torch.eye(4, dtype=torch.float64).repeat(scenes, views, 1, 1)
-    poses[..., :3, :3] = quat_to_matrix(torch.randn(scenes, views, 4, generator=generator, dtype=torch.float64))
-    poses[..., :3, 3] = torch.randn(scenes, views, 3, generator=generator, dtype=torch.float64)
-    return Cameras(poses, torch.eye(3, dtype=torch.float64).repeat(scenes, views, 1, 1), (4, 4))
-
-
 def test_errors_of_all_pairs_match_brute_force() -> None:
-    predicted, reference = random_cameras(), random_cameras(seed=1)
+    predicted, reference = random_cameras(views=4), random_cameras(views=4, seed=1)
     rotation, translation = relative_pose_errors(predicted, reference)
     for scene in range(2):
         for pair, (i, j) in enumerate(combinations(range(4), 2)):
@@ -38,7 +31,7 @@ def test_errors_of_all_pairs_match_brute_force() -> None:
 
 
 def test_frame_and_unit_do_not_matter() -> None:
-    reference = random_cameras()
+    reference = random_cameras(views=4)
     rotation = quat_to_matrix(torch.tensor([[0.3, 1, -2, 0.5], [1, 0, 2, 1]], dtype=torch.float64))
     similarity = Similarity(
         torch.tensor([3.0, 0.2], dtype=torch.float64), rotation, torch.ones(2, 3, dtype=torch.float64)
@@ -68,11 +61,11 @@ def test_known_turn_and_known_direction() -> None:
 
 
 def test_cameras_that_stand_still() -> None:
-    still = random_cameras()
+    still = random_cameras(views=4)
     poses = still.world_to_camera.clone()
     poses[..., :3, 3] = 0
     still = Cameras(poses, still.intrinsics, (4, 4))
-    moving = Cameras(random_cameras().world_to_camera, still.intrinsics, (4, 4))
+    moving = Cameras(random_cameras(views=4).world_to_camera, still.intrinsics, (4, 4))
     assert (relative_pose_errors(moving, still)[1] == 0).all()
     assert (relative_pose_errors(still, moving)[1] == 90).all()
 

@@ -11,22 +11,10 @@ from safetensors.torch import save_file
 from vg2gt.metrics import LPIPS, WeightsNotFoundError, load_lpips
 from vg2gt.metrics.lpips import WEIGHTS_FILE
 
-POSITIONS = {
-    0: 3,
-    2: 64,
-    5: 64,
-    7: 128,
-    10: 128,
-    12: 256,
-    14: 256,
-    17: 256,
-    19: 512,
-    21: 512,
-    24: 512,
-    26: 512,
-    28: 512,
-}
-WIDTHS = dict(zip(POSITIONS, [64, 64, 128, 128, 256, 256, 256, 512, 512, 512, 512, 512, 512], strict=True))
+WIDTHS = dict(
+    zip((0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28), (64,) * 2 + (128,) * 2 + (256,) * 3 + (512,) * 6, strict=True)
+)
+POSITIONS = dict(zip(WIDTHS, (3, *WIDTHS.values()), strict=False))  # and the channels that go in
 COMPARED_AFTER = (2, 7, 14, 21, 28)
 
 

@@ -27,11 +27,6 @@ from vg2gt.training.module import VG2GTModule
 QUIET = [override for override in SMALL if not override.startswith("trainer.max_steps")]
 
 
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("rooms")
-
-
 def study(folder: Path, cache: Path, *overrides: str, steps: int = 1, splits: tuple[int, ...] = (1, 2)) -> Ablation:
     return Ablation(folder, [*QUIET, f"data.cache_dir={cache}", *overrides], 1, 2, steps, 1e-4, ["wo_split"], splits)
 
@@ -46,6 +41,12 @@ def finished(tmp_path_factory: pytest.TempPathFactory, cache: Path) -> Path:
     folder = tmp_path_factory.mktemp("ablation")
     study(folder, cache).run()
     return folder
+
+
+@pytest.fixture
+def folder(tmp_path: Path, finished: Path) -> Path:
+    """A copy of the finished study that a test may change."""
+    return shutil.copytree(finished, tmp_path / "copy")
 
 
 def test_every_row_is_run_once() -> None:
@@ -97,10 +98,8 @@ def test_finished_runs_are_not_repeated(finished: Path, cache: Path, monkeypatch
     assert {name: set(runs) for name, runs in again.results.items()} == {name: {0} for name in again.results}
 
 
-def test_interrupted_run_goes_on(finished: Path, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interrupted_run_goes_on(folder: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What was saved is used: the result equals the uninterrupted one's."""
-    folder = tmp_path / "copy"
-    shutil.copytree(finished, folder)
     before = json.loads((folder / "seed-0" / "start" / "metrics.json").read_text())
     (folder / "seed-0" / "start" / "metrics.json").unlink()
     trained: list[str] = []
@@ -130,10 +129,8 @@ def test_other_settings_are_refused(finished: Path, cache: Path) -> None:
         study(finished, cache, "loss.enhance.weight=2").run()
 
 
-def test_results_of_another_full_model_are_not_taken(finished: Path, cache: Path, tmp_path: Path) -> None:
+def test_results_of_another_full_model_are_not_taken(folder: Path, cache: Path) -> None:
     """The full model's folder was deleted, as the message says, and trained longer: its continuations are stale."""
-    folder = tmp_path / "copy"
-    shutil.copytree(finished, folder)
     shutil.rmtree(folder / "seed-0" / "start")
     longer = Ablation(folder, [*QUIET, f"data.cache_dir={cache}"], 1, 3, 1, 1e-4, ["wo_split"], (1, 2))
     with pytest.raises(ValueError, match=r"full holds a run that started from other weights"):
@@ -141,10 +138,8 @@ def test_results_of_another_full_model_are_not_taken(finished: Path, cache: Path
     assert longer.results[FULL] == {}
 
 
-def test_a_full_model_whose_end_is_lost_is_refused(finished: Path, cache: Path, tmp_path: Path) -> None:
+def test_a_full_model_whose_end_is_lost_is_refused(folder: Path, cache: Path) -> None:
     """Its last checkpoint is damaged: variants must not go on from an earlier one."""
-    folder = tmp_path / "copy"
-    shutil.copytree(finished, folder)
     checkpoints = folder / "seed-0" / "start" / "checkpoints"
     last = newest_valid(checkpoints)
     content = read_checkpoint(last)
@@ -154,11 +149,7 @@ def test_a_full_model_whose_end_is_lost_is_refused(finished: Path, cache: Path, 
         study(folder, cache).run()
 
 
-def test_one_that_diverges_does_not_stop_the_others(
-    finished: Path, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = tmp_path / "copy"
-    shutil.copytree(finished, folder)
+def test_one_that_diverges_does_not_stop_the_others(folder: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shutil.rmtree(folder / "seed-0" / "wo_split")
 
     def diverge(config):
