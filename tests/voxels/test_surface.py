@@ -217,9 +217,8 @@ def test_confidence_enters_only_where_the_paper_says(options: dict, same: bool, 
     """Voxels of one point each do not weigh, so confidence can matter as the voxels' own only, an input of PTv3."""
     tokens, geometry, _ = make_room()
     module = make_coarse(voxel_size=1e-3, **options)
-    last = module.ptv3.embedding["stem"]["conv"].weight
     with torch.no_grad():
-        last[..., -1] = 0
+        module.ptv3.get_parameter("embedding.stem.conv.weight")[..., -1] = 0
     other = replace(geometry, depth_conf=geometry.depth_conf.flip(-1) + 1)
     assert torch.equal(result(module, tokens, geometry), result(module, tokens, other)) == same
 

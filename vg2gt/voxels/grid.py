@@ -15,7 +15,7 @@ from vg2gt.types import Geometry
 
 log = logging.getLogger(__name__)
 
-MAX_CELLS = 1 << 18  # cells either side of the origin: 19 bits an axis leave 6 of a code's 63 for the scene
+MAX_CELLS = 1 << 18  # cells either side of the origin: 19 bits per axis leave 6 of a code's 63 for the scene
 # Below, hardly any voxel fuses what several views see. Coarse points are a patch's few, and their voxels share features
 # through PTv3 and 16 neighbours besides.
 MIN_POINTS_PER_VOXEL = {"coarse": 1.1, "fine": 1.2}
@@ -62,7 +62,7 @@ class VoxelPlan:
 
 
 def mixed_radix_keys(grid: Tensor, batch: Tensor, margin: int = 0) -> tuple[Tensor, tuple[int, int, int]]:
-    """One collision-free int64 key a cell, ordered like (scene, x, y, z).
+    """One collision-free int64 key per cell, ordered like (scene, x, y, z).
 
     Args:
         grid: ``[M, 3]`` int64 cells, any sign.

@@ -44,7 +44,7 @@ def interpolation_weights(
         query_batch: ``[N]`` scene index, sorted.
         points: ``[M, 3]`` in voxel units.
         point_batch: ``[M]`` scene index, sorted; every scene with queries has at least one point.
-        neighbors: how many a query; a scene with fewer points uses them all.
+        neighbors: how many per query; a scene with fewer points uses them all.
 
     Returns:
         Rows of ``points`` ``[N, neighbors]`` (row 0 with weight 0 where there is none) and weights ``[N, neighbors]``,
@@ -58,7 +58,7 @@ def interpolation_weights(
         nearest = nearest_neighbors(queries[rows], points[first:last], neighbors)
         index[rows, : nearest.shape[1]] = nearest + first
         found[rows, : nearest.shape[1]] = True
-    squared = (queries[:, None] - points[index]).square().sum(-1)
+    squared = (queries[:, None] - points[index]).square().sum(-1)  # [N, neighbors]
     weights = torch.where(found, 1 / (squared + 1e-6), 0)
     return index, weights / weights.sum(1, keepdim=True)
 

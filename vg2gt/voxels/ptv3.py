@@ -60,7 +60,7 @@ class SerializedAttention(nn.Module):
     Args:
         channels: width.
         heads: number of heads.
-        window: voxels a window.
+        window: voxels per window.
         order: number of the curve in the level's sequence.
     """
 
@@ -75,13 +75,14 @@ class SerializedAttention(nn.Module):
     def forward(self, features: Tensor, level: Level) -> Tensor:
         """Maps ``[M, C]`` to ``[M, C]``."""
         windows = level.windows(self.order, self.window)
-        qkv = self.qkv(features)
+        qkv = self.qkv(features)  # [M, 3 C]
         parts = []
         for group in windows.groups:
-            rows = qkv.index_select(0, group.rows.flatten())
-            query, key, value = rows.view(*group.rows.shape, 3, self.heads, -1).permute(2, 0, 3, 1, 4)
+            rows = qkv.index_select(0, group.rows.flatten())  # [W K, 3 C]
+            rows = rows.view(*group.rows.shape, 3, self.heads, -1)  # [W, K, 3, heads, C / heads]
+            query, key, value = rows.permute(2, 0, 3, 1, 4)  # [W, heads, K, C / heads] each
             attended = F.scaled_dot_product_attention(query, key, value)
-            parts.append(attended.transpose(1, 2).flatten(2).flatten(0, 1))
+            parts.append(attended.transpose(1, 2).flatten(2).flatten(0, 1))  # [W K, C]
         attended = parts[0] if len(parts) == 1 else torch.cat(parts)
         return self.proj(attended.index_select(0, windows.owner))
 
@@ -105,7 +106,7 @@ class PTv3Block(nn.Module):
     Args:
         channels: width.
         heads: attention heads.
-        window: voxels an attention window.
+        window: voxels per attention window.
         order: number of the curve.
         mlp_ratio: hidden width of the MLP over ``channels``.
         drop_path: probability that a voxel skips a residual branch while training.
@@ -149,13 +150,13 @@ class GridPool(nn.Module):
         self, features: Tensor, level: Level, generator: torch.Generator | None
     ) -> tuple[Tensor, Level, Tensor]:
         """Returns pooled features ``[M', C']``, their level and every voxel's parent ``[M]``."""
-        parents, order = torch.sort(level.keys[0] >> 3, stable=True)
+        parents, order = torch.sort(level.keys[0] >> 3, stable=True)  # [M]
         _, inverse, counts = torch.unique_consecutive(parents, return_inverse=True, return_counts=True)
         parent_of = torch.empty_like(inverse)
         parent_of[order] = inverse
         first = order[counts.cumsum(0) - counts]
-        projected = self.proj(features).index_select(0, order)
-        pooled = torch.segment_reduce(projected, "max", lengths=counts, unsafe=True)
+        projected = self.proj(features).index_select(0, order)  # [M, C']
+        pooled = torch.segment_reduce(projected, "max", lengths=counts, unsafe=True)  # [M', C']
         coarse = Level(level.grid[first] >> 1, level.batch[first], [key[first] >> 3 for key in level.keys], generator)
         return F.gelu(self.norm[0](pooled)), coarse, parent_of
 
@@ -188,7 +189,7 @@ class PTv3(nn.Module):
         dec_channels: widths of the decoder's stages, finest first, one fewer than the encoder's.
         dec_depths: blocks of the decoder's stages.
         dec_heads: attention heads of the decoder's stages.
-        window: voxels an attention window.
+        window: voxels per attention window.
         stem_kernel: edge length of the first convolution.
         mlp_ratio: hidden width of the MLPs over their width.
         drop_path: largest probability of skipping a residual branch; it grows linearly with depth.
@@ -282,6 +283,7 @@ class PTv3(nn.Module):
             ValueError: if a scene spans too many voxels to be serialised.
         """
         generator = generator if self.training else None
+        # S of eqn ptvzengqiang; S^-1 is Windows.owner, with which attention returns to the voxels' own order.
         local = relative_grid(grid, batch)
         # One bit of the keys goes at every pooling.
         keys = serial_keys(local, batch, voxel_size, self.orders, min_bits=max(1, len(self.enc) - 1))

@@ -41,7 +41,7 @@ def hilbert_codes(grid: Tensor, bits: int) -> Tensor:
 
     Args:
         grid: ``[M, 3]`` int64 with 0 <= coordinate < 2^bits.
-        bits: bits an axis, 1 to 21.
+        bits: bits per axis, 1 to 21.
 
     Returns:
         ``[M]`` int64 < 2^(3 bits); cells with consecutive codes share a face, and dropping the last three bits
@@ -89,14 +89,14 @@ def relative_grid(grid: Tensor, batch: Tensor) -> Tensor:
 def serial_keys(
     grid: Tensor, batch: Tensor, voxel_size: Tensor, orders: Sequence[Order], min_bits: int = 1
 ) -> list[Tensor]:
-    """Sort keys ``scene << 3 bits | code``, one ``[M]`` tensor an order.
+    """Sort keys ``scene << 3 bits | code``, one ``[M]`` tensor per order.
 
     Args:
         grid: ``[M, 3]`` cells relative to their scene's smallest.
         batch: ``[M]`` scene index.
         voxel_size: ``[B]`` edge lengths, for the error's message only.
         orders: the wanted orders.
-        min_bits: bits an axis at least, so that keys can be shifted to parents this many times.
+        min_bits: bits per axis at least, so that keys can be shifted to parents this many times.
 
     Raises:
         ValueError: if code and scene index do not fit into 63 bits, or an axis not into 21.
@@ -148,7 +148,7 @@ def make_windows(order: Tensor, counts: list[int], length: int, shift: int = 0) 
     Args:
         order: ``[M]`` voxels along the curve, scene after scene.
         counts: voxels of each scene.
-        length: voxels a window; a scene with fewer makes one window of what it has.
+        length: voxels per window; a scene with fewer makes one window of what it has.
         shift: the first window starts this many voxels before the scene does, 0 <= shift < length.
     """
     by_length: dict[int, list[tuple[Tensor, Tensor, int]]] = {}
@@ -158,9 +158,9 @@ def make_windows(order: Tensor, counts: list[int], length: int, shift: int = 0) 
             continue
         size = min(length, count)
         first = -shift if count > length else 0
-        starts = torch.arange(first, count, size, device=order.device)
+        starts = torch.arange(first, count, size, device=order.device)  # [W]
         inside = starts.clamp(0, count - size)
-        places = inside[:, None] + torch.arange(size, device=order.device)
+        places = inside[:, None] + torch.arange(size, device=order.device)  # [W, K]
         owned = (places >= starts[:, None]) & (places < starts[:, None] + size)
         by_length.setdefault(size, []).append((order[begin + places], owned, scene))
         begin += count
@@ -169,8 +169,8 @@ def make_windows(order: Tensor, counts: list[int], length: int, shift: int = 0) 
         scenes = torch.cat([torch.full((len(rows),), scene, device=order.device) for rows, _, scene in parts])
         groups.append(WindowGroup(torch.cat([rows for rows, _, _ in parts]), scenes))
         owned_rows += [owned.flatten() for _, owned, _ in parts]
-    rows = torch.cat([group.rows.flatten() for group in groups])
-    places = torch.cat(owned_rows).nonzero()[:, 0]
+    rows = torch.cat([group.rows.flatten() for group in groups])  # [sum of W K]
+    places = torch.cat(owned_rows).nonzero()[:, 0]  # [M]
     owner = torch.empty_like(order)
     owner[rows[places]] = places
     return Windows(tuple(groups), owner)

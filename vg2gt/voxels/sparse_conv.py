@@ -43,7 +43,7 @@ class _SubmanifoldConvolution(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, features: Tensor, weight: Tensor, pairs: Pairs) -> Tensor:
-        taps = weight.flatten(1, 3).unbind(1)
+        taps = weight.flatten(1, 3).unbind(1)  # k^3 times [out, in]
         out = features @ taps[len(pairs)].t()
         for t, (i, j) in enumerate(pairs):
             out.index_add_(0, i, features.index_select(0, j) @ taps[t].t())
@@ -57,7 +57,7 @@ class _SubmanifoldConvolution(torch.autograd.Function):
         (grad,) = grad_outputs
         features, weight = ctx.saved_tensors
         pairs: Pairs = ctx.pairs
-        taps = weight.flatten(1, 3).unbind(1)
+        taps = weight.flatten(1, 3).unbind(1)  # k^3 times [out, in]
         grad_weight = torch.empty_like(weight)
         grad_taps = grad_weight.flatten(1, 3).unbind(1)
         grad_features = grad @ taps[len(pairs)]
