@@ -1,6 +1,7 @@
 import logging
 from dataclasses import replace
 
+import pytest
 import torch
 
 from vg2gt.geometry.cameras import unproject
@@ -194,3 +195,13 @@ def test_without_gradient_views_are_pooled_a_few_at_a_time_to_the_same_voxels(ma
     assert seen == [2, 2, 2]
     assert torch.equal(chunked.grid, whole.grid)
     torch.testing.assert_close(chunked.features, whole.features, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize(("views", "voxel_size", "warned"), [(2, 1e-4, True), (1, 1e-4, False), (2, 0.125, False)])
+def test_sparse_voxels_are_named_once(views, voxel_size, warned, make_fine, make_room, monkeypatch, caplog):
+    monkeypatch.setattr("vg2gt.voxels.grid._warned_of_sparse", set())
+    module = make_fine(voxel_size=voxel_size).eval()
+    with torch.no_grad():
+        for _ in range(2):
+            module(*make_room(views=views))
+    assert ["model.fine.min_footprint" in record.getMessage() for record in caplog.records] == [True] * warned

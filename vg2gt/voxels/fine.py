@@ -22,6 +22,7 @@ from vg2gt.voxels.grid import (
     pool_mean_of_chunks,
     pool_min,
     scene_voxel_size,
+    warn_if_sparse,
 )
 from vg2gt.voxels.pointmlp import PointMLP
 
@@ -93,6 +94,8 @@ class FineModule(nn.Module):
             size = scene_voxel_size(geometry, self.voxel_size, self.min_footprint)
             points = _Points(geometry, size)
             plan = self._plan(points)
+            if images.shape[1] > 1:
+                warn_if_sparse(plan, "fine")
         pooled = self._pool_features(tokens, images, points, plan)
         with torch.autocast(images.device.type, enabled=False):
             colors = pool_mean(images.float().permute(0, 1, 3, 4, 2).reshape(-1, 3), points.confidence, plan)
