@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from tests.io.gaussian_scenes import views
-from tests.io.mutations import survives
 from tests.io.test_nerfstudio import random_pose
 from vg2gt.io import FormatError, NamedCamera, named_cameras, read_cameras_json, write_cameras_json
 
@@ -81,8 +80,3 @@ def test_cameras_that_are_none_are_not_written(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"cameras\[0\]\.world_to_camera"):
         write_cameras_json(tmp_path / "cameras.json", [bad])
     assert not list(tmp_path.iterdir())
-
-
-def test_mutations_survive(tmp_path: Path) -> None:
-    path = write_cameras_json(tmp_path / "cameras.json", mixed())
-    survives(lambda: read_cameras_json(path), path, 300)

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from tests.io.mutations import survives
 from vg2gt.geometry.cameras import project
 from vg2gt.io import (
     ColmapCamera,
@@ -238,12 +237,3 @@ def test_dangling_track(tmp_path: Path) -> None:
     write_colmap(tmp_path, model)
     with pytest.raises(FormatError, match="names feature 99 of image 2"):
         read_colmap(tmp_path)
-
-
-@pytest.mark.parametrize("text", [False, True])
-@pytest.mark.parametrize("count", [60, pytest.param(600, marks=pytest.mark.slow)])
-def test_damaged_files_are_refused_or_read(tmp_path: Path, text: bool, count: int) -> None:
-    write_colmap(tmp_path, small_model(points=20), text=text)
-    for name in FILES:
-        refused, _ = survives(lambda: read_colmap(tmp_path), tmp_path / f"{name}{'.txt' if text else '.bin'}", count)
-        assert refused > count / 4

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 
-from tests.io.mutations import survives
 from vg2gt.geometry.rotations import quat_to_matrix
 from vg2gt.io import FormatError, Lens, Transforms, TransformsFrame, read_transforms, write_transforms
 
@@ -161,10 +160,3 @@ def test_pose_that_is_not_finite_is_kept_as_nan_and_not_written(tmp_path: Path) 
     with pytest.raises(ValueError, match="finite"):
         write_transforms(tmp_path / "out.json", transforms)
     assert not (tmp_path / "out.json").exists()
-
-
-@pytest.mark.parametrize("count", [60, pytest.param(600, marks=pytest.mark.slow)])
-def test_damaged_files_are_refused_or_read(tmp_path: Path, count: int) -> None:
-    path = write_transforms(tmp_path / "transforms.json", random_transforms(False, 3))
-    refused, _ = survives(lambda: read_transforms(path), path, count)
-    assert refused > count / 4

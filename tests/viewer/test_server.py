@@ -46,14 +46,9 @@ def listening() -> set[tuple[str, int]]:
     found = set()
     for table in ("tcp", "tcp6"):
         for line in Path(f"/proc/self/net/{table}").read_text().splitlines()[1:]:
-            (
-                _,
-                local,
-                _,
-                state,
-                *_,
-            ) = fields = line.split()
-            if state == "0A" and fields[9] in inodes:
+            fields = line.split()
+            local, state, inode = fields[1], fields[3], fields[9]
+            if state == "0A" and inode in inodes:
                 address, port = local.split(":")
                 packed = bytes.fromhex(address)
                 words = b"".join(packed[i : i + 4][::-1] for i in range(0, len(packed), 4))
@@ -97,7 +92,7 @@ def test_nothing_is_published_unless_asked(server, monkeypatch: pytest.MonkeyPat
 
 def test_command_serves_until_interrupted(tmp_path: Path) -> None:
     path = write_gaussian_ply(tmp_path / "scene.ply", scene(20))
-    command = [sys.executable, "-m", "vg2gt.cli.view", str(path), "--port", "0"]
+    command = [sys.executable, "-c", "import vg2gt.cli; vg2gt.cli.main()", "view", str(path), "--port", "0"]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
     assert process.stdout is not None
