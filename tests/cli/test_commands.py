@@ -10,9 +10,9 @@ import pytest
 
 from tests.commands import ROOT, run_vg2gt
 from vg2gt import __version__
-from vg2gt.cli.commands import COMMANDS, DATA_COMMANDS, dispatch
+from vg2gt.cli.commands import COMMANDS, DATA_COMMANDS, Command, dispatch
 
-ALL = {(name,): command for name, command in COMMANDS.items()}
+ALL: dict[tuple[str, ...], Command] = {(name,): command for name, command in COMMANDS.items()}
 ALL |= {("data", name): command for name, command in DATA_COMMANDS.items()}
 
 # Runs in one process all helps; torch and Lightning must not be imported for any.

@@ -35,7 +35,7 @@ RUN = [
     "trainer.val_check_interval=4",
 ]
 
-TRAIN, EVALUATE, ABLATE = "vg2gt.cli.train", "vg2gt.cli.evaluate", "vg2gt.studies.ablation"
+TRAIN, EVALUATE, ABLATE = "vg2gt.cli.train", "vg2gt.cli.evaluate", "vg2gt.cli.ablate"
 PRELOADED = ["vg2gt.training.loop", "vg2gt.evaluation.run", "vg2gt.studies.ablation"]
 
 Moment = Callable[["Attempt"], bool]
