@@ -141,17 +141,12 @@ class Backend(nn.Module, ABC):
                 f"backend {self.name} needs hints from the data, missing: {', '.join(missing)}. Pass batch.hints, "
                 "or choose a backend that works from images alone (backend=vggt_1b, backend=da3_small, ...)"
             )
-        shapes = {
-            "depth": ((batch, views, height, width), hints.depth),
-            "cameras": ((batch, views, 4, 4), hints.cameras.world_to_camera if hints.cameras else None),
-            "frame_ids": ((batch, views), hints.frame_ids),
-        }
+        shapes = {"depth": (batch, views, height, width), "cameras": (batch, views, 4, 4), "frame_ids": (batch, views)}
         for name in names:
-            expected, value = shapes.get(name, (None, None))
-            if value is not None and value.shape != expected:
-                raise ValueError(
-                    f"hints.{name} must be {list(expected or ())} for these images, got {list(value.shape)}"
-                )
+            value = getattr(hints, name)
+            found = value.world_to_camera.shape if name == "cameras" else getattr(value, "shape", ())
+            if name in shapes and found != shapes[name]:
+                raise ValueError(f"hints.{name} must be {list(shapes[name])} for these images, got {list(found)}")
         if "scene_key" in names and len(hints.scene_key) != batch:
             raise ValueError(f"hints.scene_key must name {batch} scenes, got {len(hints.scene_key)}")
         return hints

@@ -113,6 +113,7 @@ class DPT(nn.Module):
             self.scratch.add_module(f"refinenet{level}", Fusion(features, rectified_skip, has_finer=level < 4))
         self.scratch.output_conv1 = nn.Conv2d(features, features // 2, 3, padding=1)
         self.scratch.output_conv2 = output_layers(features // 2, out)
+        self.outputs = ("output_conv2", "sky_output_conv2") if sky else ("output_conv2",)
         if sky:
             self.scratch.sky_output_conv2 = output_layers(features // 2, 1)
 
@@ -134,8 +135,9 @@ class DPT(nn.Module):
         return self._add_position(fused, image_size)
 
     def forward(self, tokens: Sequence[Tensor], grid: tuple[int, int]) -> Tensor:
-        """Maps four ``[N, P, D]`` token maps to ``[N, out, H, W]`` without activation."""
-        return self.scratch.get_submodule("output_conv2")(self.fuse(tokens, grid))
+        """Maps four ``[N, P, D]`` token maps to ``[N, out, H, W]`` (sky as one channel more) without activation."""
+        fused = self.fuse(tokens, grid)
+        return torch.cat([self.scratch.get_submodule(name)(fused) for name in self.outputs], 1)
 
     def _add_position(self, x: Tensor, image_size: tuple[int, int]) -> Tensor:
         if self.position_weight == 0:

@@ -8,10 +8,11 @@ from typing import get_args
 import torch
 from torch import Tensor, nn
 
-from backends.base import Backend, full_precision, half_precision_on_gpu
+from backends.base import full_precision, half_precision_on_gpu
 from backends.da3.backbone import Backbone, PretrainedBackbone, ReferenceView
 from backends.da3.camera import CameraDecoder, CameraEncoder, normalize_cameras
 from backends.dpt import DPT, in_chunks
+from backends.network import NetworkBackend, predict
 from backends.normalization import normalize_images
 from backends.poses import decode_pose
 from backends.vit import FeedForward
@@ -77,38 +78,24 @@ class DA3Network(DA3Decoder):
         self.cam_enc = cam_enc
 
 
-class DA3Backend(Backend):
+class DA3Backend(NetworkBackend):
     """Depth Anything 3 (Lin et al., 2025): relative geometry in the frame of a reference view.
 
-    Args:
-        name: stands in checkpoints and messages.
-        licence: of the weights.
-        dim: channels C; tokens have 2C.
+    Args (the others: see :class:`NetworkBackend`; tokens have 2C channels):
         depth: blocks.
-        num_heads: attention heads.
-        ffn: feed-forward layer.
         multiview_from: first block of the alternating part.
-        taps: four blocks whose tokens feed the heads.
-        features: DPT width.
-        out_channels: DPT channels of the four taps.
+        ffn: feed-forward layer.
         camera_depth: blocks of the camera encoder.
         camera_heads: attention heads of the camera encoder.
-        image_size: native image edge.
-        patch_size: in pixels.
         reference_view: which view defines the predicted world frame.
         given_poses: whether ``hints.cameras`` go through the camera encoder (then they are needed).
-        pretrained: whether to load weights; random ones (by ``seed``) otherwise.
-        repo: Hugging Face repository of the weights.
-        revision: its branch, tag or commit.
-        path: local weight file or folder instead.
-        prefix: of the names in the file.
-        seed: of random weights.
-        head_chunk: views decoded at a time; None decodes all at once.
-        compile: whether to ``torch.compile`` the backbone.
 
     Raises:
         ValueError: if the reference-view strategy is unknown.
     """
+
+    backbone_name = "backbone.pretrained"
+    network: DA3Network
 
     def __init__(
         self,
@@ -141,10 +128,8 @@ class DA3Backend(Backend):
             known = ", ".join(get_args(ReferenceView))
             raise ValueError(f"backend.reference_view is {reference_view!r}; choose one of {known}")
         super().__init__(name, patch_size, (2 * dim,) * len(taps), licence, needs_hints=given_poses)
-        self.taps = tuple(taps)
-        self.reference_view = reference_view
+        self.reference_view: ReferenceView = reference_view
         self.given_poses = given_poses
-        self.head_chunk = head_chunk
 
         def make() -> DA3Network:
             network = DA3Network(
@@ -153,28 +138,23 @@ class DA3Backend(Backend):
                 features,
                 out_channels,
             )
-            _face_forward(network.cam_dec)
+            decoder = network.cam_dec  # about the identity pose and fields of view of 1 rad
+            for layer, bias in (
+                (decoder.fc_t, (0, 0, 0)),
+                (decoder.fc_qvec, (0, 0, 0, 1)),
+                (decoder.fc_fov[0], (1, 1)),
+            ):
+                predict(layer, bias)
             return network
 
         unused = (*RAY_BRANCH, "gs_head.", *(() if given_poses else ("cam_enc.",)))
         ignorable = (*(prefix + part for part in unused), *(part for part in NESTED_PARTS if part != prefix))
-        self.weights = Weights(name, licence, pretrained, repo, revision, path, seed, prefix, ignorable)
-        self.network = self.weights.build(make)
-        if compile:
-            self.network.backbone.pretrained.compile()
-        self.freeze()
-
-    @torch.no_grad()
-    def encode(self, images: Tensor, hints: Hints | None = None) -> Tokens:
-        """See :meth:`Backend.encode`; ``hints.cameras`` are used if ``given_poses``."""
-        self.check_images(images)
-        if self.given_poses:
-            hints = self.require_hints(images, hints, "cameras")
-        return self.encode_checked(images, hints)
+        weights = Weights(name, licence, pretrained, repo, revision, path, seed, prefix, ignorable)
+        self._build(make, weights, taps, head_chunk, compile)
 
     @torch.no_grad()
     def encode_checked(self, images: Tensor, hints: Hints | None) -> Tokens:
-        """Encodes what :meth:`encode` has checked: tensor operations only, so that it can be exported."""
+        """See :meth:`NetworkBackend.encode_checked`."""
         given = None
         if self.network.cam_enc is not None and hints is not None and hints.cameras is not None:
             with full_precision(images):
@@ -189,17 +169,3 @@ class DA3Backend(Backend):
                 normalize_images(images), self.taps, self.reference_view, camera_tokens
             )
         return self.as_tokens(images, patch, camera)
-
-    def decode(self, tokens: Tokens) -> Geometry:
-        """See :meth:`Backend.decode`; the principal point is (W/2, H/2)."""
-        return self.network.decode(tokens, self.head_chunk)
-
-
-@torch.no_grad()
-def _face_forward(decoder: CameraDecoder) -> None:
-    """Makes random weights predict about the identity pose and a field of view of 1 rad."""
-    field_of_view = decoder.fc_fov[0]
-    assert isinstance(field_of_view, nn.Linear)
-    for layer, bias in ((decoder.fc_t, (0, 0, 0)), (decoder.fc_qvec, (0, 0, 0, 1)), (field_of_view, (1, 1))):
-        layer.weight.mul_(0.1)
-        layer.bias.copy_(layer.bias.new_tensor(bias))

@@ -15,6 +15,7 @@ from backends.base import Backend, full_precision, half_precision_on_gpu
 from backends.da3.backbone import Backbone, PretrainedBackbone
 from backends.da3.backend import NESTED_PARTS, DA3Backend
 from backends.dpt import DPT, in_chunks
+from backends.network import NetworkBackend
 from backends.normalization import normalize_images
 from backends.weights import Weights
 from vg2gt.geometry.alignment import fit_depth_scale
@@ -36,46 +37,14 @@ class DA3MetricNetwork(nn.Module):
         self.head = head
 
 
-class DepthAndSky(nn.Module):
-    """The two outputs of one DPT as channels: depth (raw) and sky (raw)."""
-
-    def __init__(self, head: DPT) -> None:
-        super().__init__()
-        self.head = head
-
-    def forward(self, tokens: Sequence[Tensor], grid: tuple[int, int]) -> Tensor:
-        """Maps four ``[N, P, D]`` token maps to ``[N, 2, H, W]`` without activation."""
-        fused = self.head.fuse(tokens, grid)
-        layers = self.head.scratch
-        outputs = [layers.get_submodule(name)(fused) for name in ("output_conv2", "sky_output_conv2")]
-        return torch.cat(outputs, 1)
-
-
-class DA3SingleViewBackend(Backend):
+class DA3SingleViewBackend(NetworkBackend):
     """One of DA3's networks that see one view at a time: cameras come from the data, confidence is 1.
 
     Depth is the network's output times one factor a view, which the subclass knows; sky gets the far end of the scene.
-
-    Args:
-        name: stands in checkpoints and messages.
-        licence: of the weights.
-        dim: channels C of the tokens.
-        depth: blocks.
-        num_heads: attention heads.
-        taps: four blocks whose tokens feed the head.
-        features: DPT width.
-        out_channels: DPT channels of the four taps.
-        image_size: native image edge.
-        patch_size: in pixels.
-        pretrained: whether to load weights; random ones (by ``seed``) otherwise.
-        repo: Hugging Face repository of the weights.
-        revision: its branch, tag or commit.
-        path: local weight file or folder instead.
-        prefix: of the names in the file.
-        seed: of random weights.
-        head_chunk: views decoded at a time; None decodes all at once.
+    Arguments: see :class:`NetworkBackend`; ``depth`` is the number of blocks.
     """
 
+    network: DA3MetricNetwork
     metric: ClassVar[bool]
     hint_names: ClassVar[tuple[str, ...]]
 
@@ -100,8 +69,6 @@ class DA3SingleViewBackend(Backend):
         head_chunk: int | None = 8,
     ) -> None:
         super().__init__(name, patch_size, (dim,) * len(taps), licence, is_metric=self.metric, needs_hints=True)
-        self.taps = tuple(taps)
-        self.head_chunk = head_chunk
 
         def make() -> DA3MetricNetwork:
             backbone = Backbone(dim, depth, num_heads, "mlp", None, image_size, patch_size)
@@ -109,9 +76,8 @@ class DA3SingleViewBackend(Backend):
             return DA3MetricNetwork(backbone, head)
 
         ignorable = tuple(part for part in NESTED_PARTS if part != prefix)
-        self.weights = Weights(name, licence, pretrained, repo, revision, path, seed, prefix, ignorable)
-        self.network = self.weights.build(make)
-        self.freeze()
+        weights = Weights(name, licence, pretrained, repo, revision, path, seed, prefix, ignorable)
+        self._build(make, weights, taps, head_chunk)
 
     @torch.no_grad()
     def encode(self, images: Tensor, hints: Hints | None = None) -> Tokens:
@@ -130,7 +96,7 @@ class DA3SingleViewBackend(Backend):
     def decode_raw(self, tokens: Tokens) -> tuple[Tensor, Tensor]:
         """Returns the network's depth, sky not filled, and its sky score, both ``[B, V, H, W]``."""
         with full_precision(tokens.camera):
-            out = in_chunks(DepthAndSky(self.network.head), tokens.patch, tokens.grid, self.head_chunk)
+            out = in_chunks(self.network.head, tokens.patch, tokens.grid, self.head_chunk)
         return out[:, :, 0].exp(), F.relu(out[:, :, 1])
 
     def decode(self, tokens: Tokens) -> Geometry:

@@ -5,42 +5,30 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from backends.base import Backend, half_precision_on_gpu
+from backends.base import half_precision_on_gpu
+from backends.network import NetworkBackend, predict
 from backends.vggt.camera_head import ITERATIONS
 from backends.vggt.network import Aggregator, VGGTNetwork
 from backends.weights import Weights
-from vg2gt.types import Geometry, Hints, Tokens
+from vg2gt.types import Hints, Tokens
 
 IGNORABLE = ("track_head.", "point_head.", "aggregator.patch_embed.mask_token")
 
 
-class VGGTBackend(Backend):
-    """VGGT (Wang et al., 2025): relative geometry in the frame of the first view.
+class VGGTBackend(NetworkBackend):
+    """VGGT (Wang et al., 2025): relative geometry in the frame of the first view. Hints are not used.
 
-    Args:
-        name: stands in checkpoints and messages.
-        licence: of the weights.
-        dim: channels C; tokens have 2C.
+    Args (the others: see :class:`NetworkBackend`; tokens have 2C channels):
         depth: pairs of alternating blocks.
         encoder_depth: blocks of the per-view encoder.
-        num_heads: attention heads.
-        taps: four block pairs whose tokens feed the heads.
-        features: DPT width.
-        out_channels: DPT channels of the four taps.
         camera_depth: blocks of the camera head.
         camera_heads: attention heads of the camera head.
-        image_size: native image edge.
-        patch_size: in pixels.
-        pretrained: whether to load weights; random ones (by ``seed``) otherwise.
-        repo: Hugging Face repository of the weights.
-        revision: its branch, tag or commit.
-        path: local weight file or folder instead.
-        seed: of random weights.
-        head_chunk: views decoded at a time; None decodes all at once.
-        compile: whether to ``torch.compile`` the backbone.
     """
+
+    backbone_name = "aggregator"
+    network: VGGTNetwork
 
     def __init__(
         self,
@@ -66,41 +54,20 @@ class VGGTBackend(Backend):
         compile: bool = False,
     ) -> None:
         super().__init__(name, patch_size, (2 * dim,) * len(taps), licence)
-        self.taps = tuple(taps)
-        self.head_chunk = head_chunk
 
         def make() -> VGGTNetwork:
             aggregator = Aggregator(dim, depth, encoder_depth, num_heads, image_size, patch_size)
             network = VGGTNetwork(aggregator, features, out_channels, camera_depth, camera_heads)
-            _face_forward(network.camera_head.pose_branch.fc2)
+            # in every round a share of the identity pose and of fields of view of 1 rad
+            predict(network.camera_head.pose_branch.fc2, [value / ITERATIONS for value in (0, 0, 0, 0, 0, 0, 1, 1, 1)])
             return network
 
-        self.weights = Weights(name, licence, pretrained, repo, revision, path, seed, ignorable=IGNORABLE)
-        self.network = self.weights.build(make)
-        if compile:
-            self.network.aggregator.compile()
-        self.freeze()
-
-    @torch.no_grad()
-    def encode(self, images: Tensor, hints: Hints | None = None) -> Tokens:
-        """See :meth:`Backend.encode`; hints are not used."""
-        self.check_images(images)
-        return self.encode_checked(images, hints)
+        weights = Weights(name, licence, pretrained, repo, revision, path, seed, ignorable=IGNORABLE)
+        self._build(make, weights, taps, head_chunk, compile)
 
     @torch.no_grad()
     def encode_checked(self, images: Tensor, hints: Hints | None) -> Tokens:
-        """Encodes what :meth:`encode` has checked: tensor operations only, so that it can be exported."""
+        """See :meth:`NetworkBackend.encode_checked`."""
         with half_precision_on_gpu(images):
             patch, camera = self.network.aggregator(images, self.taps)
         return self.as_tokens(images, patch, camera)
-
-    def decode(self, tokens: Tokens) -> Geometry:
-        """See :meth:`Backend.decode`; the principal point is (W/2, H/2)."""
-        return self.network.decode(tokens, self.head_chunk)
-
-
-@torch.no_grad()
-def _face_forward(layer: nn.Linear) -> None:
-    """Makes random weights predict about the identity pose and a field of view of 1 rad, summed over the rounds."""
-    layer.weight.mul_(0.1)
-    layer.bias.copy_(layer.bias.new_tensor([0, 0, 0, 0, 0, 0, 1, 1, 1]) / ITERATIONS)

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from backends.base import Backend
 from vg2gt.geometry.cameras import relative_to_first
-from vg2gt.types import Cameras, Geometry, Hints, Tokens
+from vg2gt.types import Geometry, Hints, Tokens
 
 
 @pytest.fixture(scope="module")
@@ -29,20 +29,9 @@ def geometry(backend: Backend, tokens: Tokens) -> Geometry:
 def pick(scene: tuple[Tensor, Hints], scenes: list[int], views: list[int]) -> tuple[Tensor, Hints]:
     """The same data with some scenes and views, in that order."""
     images, hints = scene
-    cameras = hints.cameras
-    assert hints.depth is not None
-    assert hints.frame_ids is not None
-    assert cameras is not None
-
-    def rows(tensor: Tensor) -> Tensor:
-        return tensor[scenes][:, views]
-
-    return rows(images), Hints(
-        rows(hints.depth),
-        Cameras(rows(cameras.world_to_camera), rows(cameras.intrinsics), cameras.size),
-        tuple(hints.scene_key[index] for index in scenes),
-        rows(hints.frame_ids),
-    )
+    keys = tuple(hints.scene_key[index] for index in scenes)
+    picked = hints.map(lambda tensor: tensor[scenes][:, views])
+    return images[scenes][:, views], dataclasses.replace(picked, scene_key=keys)
 
 
 def assert_same(result: Geometry, expected: Geometry, views: list[int] | None = None) -> None:
@@ -164,12 +153,7 @@ def test_view_order(backend: Backend, scene, geometry: Geometry) -> None:
 def test_batch_of_two_equals_two_singles(backend: Backend, scene, geometry: Geometry) -> None:
     for index in (0, 1):
         single = backend.decode(backend.encode(*pick(scene, [index], [0, 1, 2])))
-        expected = Geometry(
-            geometry.depth[index : index + 1],
-            geometry.depth_conf[index : index + 1],
-            geometry.cameras.scene(index),
-            geometry.scale[index : index + 1],
-        )
+        expected = geometry.map(lambda tensor, index=index: tensor[index : index + 1])
         assert_same(single, expected)
 
 

@@ -1,11 +1,18 @@
+from dataclasses import replace
+
 import pytest
 import torch
 
 from backends.oracle import OracleBackend
 from vg2gt.geometry.cameras import relative_to_first
-from vg2gt.types import Cameras, Hints
+from vg2gt.types import Geometry, Hints
 
 SIZE = (56, 112)
+
+
+def simulate(images: torch.Tensor, hints: Hints, **settings) -> Geometry:
+    backend = OracleBackend(**settings)
+    return backend.decode(backend.encode(images, hints))
 
 
 def relative_error(geometry, hints: Hints) -> torch.Tensor:
@@ -14,8 +21,7 @@ def relative_error(geometry, hints: Hints) -> torch.Tensor:
 
 def test_without_noise_it_is_the_data(make_scene) -> None:
     images, hints = make_scene(2, 3, SIZE)
-    backend = OracleBackend(depth_noise=0)
-    geometry = backend.decode(backend.encode(images, hints))
+    geometry = simulate(images, hints, depth_noise=0)
     torch.testing.assert_close(geometry.depth, hints.depth)
     expected = relative_to_first(hints.cameras)
     torch.testing.assert_close(geometry.cameras.world_to_camera, expected.world_to_camera, rtol=0, atol=1e-6)
@@ -24,8 +30,7 @@ def test_without_noise_it_is_the_data(make_scene) -> None:
 
 def test_noise_has_the_stated_size_and_is_smooth(make_scene) -> None:
     images, hints = make_scene(4, 12, SIZE)
-    backend = OracleBackend(depth_noise=0.02)
-    error = relative_error(backend.decode(backend.encode(images, hints)), hints)
+    error = relative_error(simulate(images, hints, depth_noise=0.02), hints)
     assert 0.017 < error.square().mean().sqrt() < 0.023
     assert 0.006 < error.mean((-2, -1)).std() < 0.02  # a constant of every view is part of it
     assert error.diff(dim=-1).abs().mean() < 0.1 * error.abs().mean()
@@ -33,18 +38,12 @@ def test_noise_has_the_stated_size_and_is_smooth(make_scene) -> None:
 
 def test_noise_depends_on_seed_scene_and_frame_only(make_scene) -> None:
     images, hints = make_scene(2, 4, SIZE)
-    backend = OracleBackend()
-    error = relative_error(backend.decode(backend.encode(images, hints)), hints)
+    error = relative_error(simulate(images, hints), hints)
     order = torch.tensor([2, 0, 3, 1])  # another first view too
-    flipped = Hints(
-        hints.depth[:, order].flip(0),
-        Cameras(hints.cameras.world_to_camera[:, order].flip(0), hints.cameras.intrinsics[:, order].flip(0), SIZE),
-        hints.scene_key[::-1],
-        hints.frame_ids[:, order].flip(0),
-    )
-    again = relative_error(backend.decode(backend.encode(images[:, order].flip(0), flipped)), flipped)
+    flipped = replace(hints.map(lambda tensor: tensor[:, order].flip(0)), scene_key=hints.scene_key[::-1])
+    again = relative_error(simulate(images[:, order].flip(0), flipped), flipped)
     torch.testing.assert_close(again, error[:, order].flip(0), rtol=0, atol=1e-6)
-    other = relative_error(backend.decode(OracleBackend(seed=1).encode(images, hints)), hints)
+    other = relative_error(simulate(images, hints, seed=1), hints)
     assert (other - error).abs().mean() > 0.005
     assert (error[0, 0] - error[1, 0]).abs().mean() > 0.002
     assert (error[0, 0] - error[0, 1]).abs().mean() > 0.002
@@ -52,7 +51,7 @@ def test_noise_depends_on_seed_scene_and_frame_only(make_scene) -> None:
 
 def test_first_pose_is_exact_and_the_others_err_a_little(make_scene) -> None:
     images, hints = make_scene(4, 12, SIZE)
-    geometry = OracleBackend().decode(OracleBackend(pose_noise=0.01).encode(images, hints))
+    geometry = simulate(images, hints, pose_noise=0.01)
     poses = geometry.cameras.world_to_camera
     assert torch.equal(poses[:, 0], torch.eye(4).expand(4, 4, 4))
     exact = relative_to_first(hints.cameras).world_to_camera
@@ -68,7 +67,7 @@ def test_invalid_depth_stays_invalid(make_scene) -> None:
     depth[..., 20:40, 30:60] = 0
     depth[0, 1] = 0
     backend = OracleBackend()
-    tokens = backend.encode(images, Hints(depth, hints.cameras, hints.scene_key, hints.frame_ids))
+    tokens = backend.encode(images, replace(hints, depth=depth))
     geometry = backend.decode(tokens.with_patch(tuple(patch + 1 for patch in tokens.patch)))
     assert torch.equal(geometry.depth == 0, depth == 0)
     assert geometry.depth_conf[depth == 0].max() < 0.01
@@ -80,10 +79,8 @@ def test_the_background_lies_behind_the_scene(make_scene) -> None:
     images, hints = make_scene(1, 2, SIZE)
     depth = hints.depth.clone()
     depth[..., :20, :] = 0
-    given = Hints(depth, hints.cameras, hints.scene_key, hints.frame_ids)
-    without, backend = OracleBackend(), OracleBackend(background=1.5)
-    geometry = backend.decode(backend.encode(images, given))
-    plain = without.decode(without.encode(images, given))
+    given = replace(hints, depth=depth)
+    geometry, plain = simulate(images, given, background=1.5), simulate(images, given)
     assert torch.equal(geometry.depth[depth > 0], plain.depth[depth > 0])
     assert torch.equal(geometry.depth_conf, plain.depth_conf)
     torch.testing.assert_close(geometry.depth[depth == 0], torch.full((2 * 20 * SIZE[1],), 1.5 * float(depth.max())))
@@ -95,8 +92,7 @@ def test_depth_bleeds_over_edges_only(make_scene) -> None:
     images, hints = make_scene(1, 1, SIZE)
     depth = torch.full((1, 1, *SIZE), 2.0)
     depth[..., 50:] = 3.0
-    backend = OracleBackend(depth_noise=0)
-    geometry = backend.decode(backend.encode(images, Hints(depth, hints.cameras, hints.scene_key, hints.frame_ids)))
+    geometry = simulate(images, replace(hints, depth=depth), depth_noise=0)
     changed = (geometry.depth != depth).any(-2)[0, 0].nonzero()[:, 0].tolist()
     assert changed == [49, 50]
     assert 2 < geometry.depth[0, 0, 20, 49] < geometry.depth[0, 0, 20, 50] < 3
@@ -104,7 +100,7 @@ def test_depth_bleeds_over_edges_only(make_scene) -> None:
 
 def test_confidence_knows_the_error(make_scene) -> None:
     images, hints = make_scene(2, 4, SIZE)
-    geometry = OracleBackend().decode(OracleBackend().encode(images, hints))
+    geometry = simulate(images, hints)
     error = relative_error(geometry, hints).abs()
     sure = geometry.depth_conf > geometry.depth_conf.median()
     assert error[sure].mean() < 0.7 * error[~sure].mean()
@@ -116,7 +112,7 @@ def test_tokens_do_not_know_the_truth(make_scene) -> None:
     noisy = OracleBackend(depth_noise=0.05, pose_noise=0.0)
     exact = OracleBackend(depth_noise=0.0)
     predicted = noisy.decode(noisy.encode(images, hints))
-    truth = Hints(predicted.depth, hints.cameras, hints.scene_key, hints.frame_ids)
+    truth = replace(hints, depth=predicted.depth)
     first, second = noisy.encode(images, hints), exact.encode(images, truth)
     torch.testing.assert_close(second.state["depth"], first.state["depth"])
     confidence_only = [(a - b).abs() for a, b in zip(first.patch, second.patch, strict=True)]
@@ -192,9 +188,8 @@ def test_identity_does_not_depend_on_threads() -> None:
 @pytest.mark.parametrize("name", ["depth", "cameras", "frame_ids"])
 def test_each_missing_hint_is_named(make_scene, name: str) -> None:
     images, hints = make_scene(1, 2, SIZE)
-    fields = {"depth": hints.depth, "cameras": hints.cameras, "frame_ids": hints.frame_ids, name: None}
     with pytest.raises(ValueError, match=f"missing: {name}\\."):
-        OracleBackend().encode(images, Hints(scene_key=hints.scene_key, **fields))
+        OracleBackend().encode(images, replace(hints, **{name: None}))
 
 
 def test_bad_settings_are_refused() -> None:

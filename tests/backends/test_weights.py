@@ -1,5 +1,4 @@
 import sys
-import types
 from pathlib import Path
 
 import pytest
@@ -75,27 +74,6 @@ def test_missing_files_are_named(tmp_path: Path) -> None:
 def test_missing_hub_library_is_explained(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
     with pytest.raises(ImportError, match="pip install huggingface_hub"):
-        find_weights("name", "some/repo", None, None)
-
-
-def test_hub_is_asked_for_the_revision(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    asked = {}
-
-    def download(repo: str, file: str, revision: str | None) -> str:
-        asked.update(repo=repo, file=file, revision=revision)
-        return str(tmp_path / file)
-
-    monkeypatch.setitem(sys.modules, "huggingface_hub", types.SimpleNamespace(hf_hub_download=download))
-    assert find_weights("name", "some/repo", "v1", None) == tmp_path / "model.safetensors"
-    assert asked == {"repo": "some/repo", "file": "model.safetensors", "revision": "v1"}
-
-
-def test_an_unreachable_hub_names_repository_and_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
-    def download(*_, **__) -> str:
-        raise OSError("no route to host")
-
-    monkeypatch.setitem(sys.modules, "huggingface_hub", types.SimpleNamespace(hf_hub_download=download))
-    with pytest.raises(FileNotFoundError, match=r"some/repo.*no route to host.*backend\.pretrained=false"):
         find_weights("name", "some/repo", None, None)
 
 

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
+from vg2gt.rendering import render
 from vg2gt.types import Cameras, Gaussians, Render
 
 IMPLEMENTATIONS = ("dense", "torch", "cpu")
 KINDS = (("solid", "median"), ("rasterized", "median"), ("rasterized", "expected"))
+BACKGROUND = (0.3, 0.1, 0.7)
 PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
 
 
@@ -90,6 +94,11 @@ def with_gradients(gaussians: Gaussians) -> Gaussians:
     return gaussians.map(lambda t: t.clone().requires_grad_() if t.is_floating_point() else t)
 
 
+def floats_to(value: Any, dtype: torch.dtype) -> Any:
+    """A record of tensors whose floating-point ones have another dtype."""
+    return value.map(lambda t: t.to(dtype) if t.is_floating_point() else t)
+
+
 def images(render: Render) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Colour, depth, normal, alpha."""
     return render.color, render.depth, render.normal, render.alpha
@@ -99,3 +108,29 @@ def random_like(render: Render, seed: int = 0) -> tuple[Tensor, ...]:
     """One random weight image for each image of a render."""
     generator = torch.Generator().manual_seed(seed)
     return tuple(torch.randn(i.shape, generator=generator, dtype=torch.float64).to(i.dtype) for i in images(render))
+
+
+def render_with_gradients(
+    gaussians: Gaussians, cameras: Cameras, device: str = "cpu", **options: Any
+) -> tuple[Render, dict[str, Tensor]]:
+    """A render on a device and the gradients of a random weighting of all its images in every input, on the CPU."""
+    gaussians, cameras = with_gradients(gaussians.to(device)), cameras.to(device)
+    poses, intrinsics = cameras.world_to_camera.clone().requires_grad_(), cameras.intrinsics.clone().requires_grad_()
+    background = torch.tensor(BACKGROUND, dtype=poses.dtype, device=device).requires_grad_()
+    out = render(gaussians, Cameras(poses, intrinsics, cameras.size), background=background, **options)
+    inputs = {name: getattr(gaussians, name) for name in PARAMETERS}
+    inputs |= {"world_to_camera": poses, "intrinsics": intrinsics, "background": background}
+    weights = [weight.to(device) for weight in random_like(out)]
+    grads = torch.autograd.grad(images(out), list(inputs.values()), weights)
+    return out.to("cpu"), {name: grad.cpu() for name, grad in zip(inputs, grads, strict=True)}
+
+
+def assert_same_render(
+    found: tuple[Render, dict[str, Tensor]], expected: tuple[Render, dict[str, Tensor]], atol: float = 1e-12
+) -> None:
+    """Images equal to ``atol``, gradients to 1e-10 of their norm; the reference has depth somewhere."""
+    assert (expected[0].depth > 0).any()
+    for value, reference in zip(images(found[0]), images(expected[0]), strict=True):
+        torch.testing.assert_close(value, reference, rtol=0, atol=atol)
+    for name, reference in expected[1].items():
+        assert (found[1][name] - reference).norm() < 1e-10 * reference.norm(), name

@@ -6,7 +6,7 @@ import hydra
 import pytest
 import torch
 
-from tests.rendering.scenes import IMPLEMENTATIONS, images, pinhole, soup, with_gradients
+from tests.rendering.scenes import IMPLEMENTATIONS, floats_to, images, pinhole, soup, with_gradients
 from vg2gt.config import compose
 from vg2gt.rendering import Renderer, render
 from vg2gt.rendering.options import Mode
@@ -59,7 +59,7 @@ class TestDegenerateScenes:
 
     @pytest.mark.parametrize("scale", [1e-8, 1e8])
     def test_tiny_and_huge_scales(self, implementation: Implementation, mode: Mode, scale: float) -> None:
-        gaussians = soup(20).map(lambda t: t.float() if t.is_floating_point() else t)
+        gaussians = floats_to(soup(20), torch.float32)
         gaussians.scales[::2] *= scale
         assert_sound(gaussians, pinhole((6, 9)).map(torch.Tensor.float), implementation, mode)
 
@@ -141,6 +141,6 @@ def test_configuration_builds_the_renderer(name: Mode) -> None:
 
 
 def test_half_precision_input_renders_in_float32() -> None:
-    gaussians = soup(10).map(lambda t: t.half() if t.is_floating_point() else t)
+    gaussians = floats_to(soup(10), torch.float16)
     with torch.autocast("cpu", dtype=torch.bfloat16):
         assert render(gaussians, pinhole((8, 8)).map(torch.Tensor.half)).color.dtype == torch.float32

@@ -7,12 +7,16 @@ import torch
 from torch import Tensor
 
 from tests.rendering.scenes import (
+    BACKGROUND,
     KINDS,
     PARAMETERS,
+    assert_same_render,
     cameras_around,
+    floats_to,
     images,
     pinhole,
     random_like,
+    render_with_gradients,
     soup,
     wall,
     with_gradients,
@@ -20,41 +24,8 @@ from tests.rendering.scenes import (
 from vg2gt.rendering import render
 from vg2gt.rendering.options import DepthKind, Mode
 from vg2gt.rendering.renderer import Implementation
-from vg2gt.types import Cameras, Gaussians, Render
 
 FAST = ("torch", "cpu")
-BACKGROUND = (0.3, 0.1, 0.7)
-
-
-def render_with_gradients(
-    gaussians: Gaussians,
-    cameras: Cameras,
-    implementation: Implementation,
-    mode: Mode,
-    depth: DepthKind,
-    **options: float,
-) -> tuple[Render, dict[str, Tensor]]:
-    """A render and the gradients of a random weighting of all its images in every input."""
-    gaussians = with_gradients(gaussians)
-    poses, intrinsics = cameras.world_to_camera.clone().requires_grad_(), cameras.intrinsics.clone().requires_grad_()
-    background = torch.tensor(BACKGROUND, dtype=poses.dtype).requires_grad_()
-    out = render(
-        gaussians,
-        Cameras(poses, intrinsics, cameras.size),
-        mode,
-        background,
-        implementation=implementation,
-        depth=depth,
-        **options,  # type: ignore[arg-type]
-    )
-    inputs = {name: getattr(gaussians, name) for name in PARAMETERS}
-    inputs |= {"world_to_camera": poses, "intrinsics": intrinsics, "background": background}
-    grads = torch.autograd.grad(images(out), list(inputs.values()), random_like(out))
-    return out, dict(zip(inputs, grads, strict=True))
-
-
-def relative(value: Tensor, reference: Tensor) -> float:
-    return float((value - reference).norm() / reference.norm())
 
 
 @pytest.mark.parametrize("degree", [0, 2])
@@ -62,34 +33,28 @@ def relative(value: Tensor, reference: Tensor) -> float:
 @pytest.mark.parametrize("implementation", FAST)
 def test_equals_the_reference(implementation: Implementation, mode: Mode, depth: DepthKind, degree: int) -> None:
     gaussians, cameras = soup(50, seed=degree, degree=degree, scenes=2), cameras_around((20, 24), scenes=2)
-    expected, expected_grads = render_with_gradients(gaussians, cameras, "dense", mode, depth, bisections=40)
-    out, grads = render_with_gradients(gaussians, cameras, implementation, mode, depth, bisections=40)
-    assert (expected.depth > 0).float().mean() > 0.2
-    for value, reference in zip(images(out), images(expected), strict=True):
-        torch.testing.assert_close(value, reference, rtol=0, atol=1e-12)
-    for name, reference in expected_grads.items():
-        assert relative(grads[name], reference) < 1e-10, name
+    options = {"mode": mode, "depth": depth, "bisections": 40}
+    expected = render_with_gradients(gaussians, cameras, implementation="dense", **options)
+    assert (expected[0].depth > 0).float().mean() > 0.2
+    assert_same_render(render_with_gradients(gaussians, cameras, implementation=implementation, **options), expected)
 
 
 @pytest.mark.parametrize("implementation", FAST)
 def test_deep_translucent_rays_equal_the_reference(implementation: Implementation) -> None:
     gaussians = soup(300, size=0.6)
     gaussians = replace(gaussians, opacities=gaussians.opacities * 0.05)
-    cameras = pinhole((9, 18))
-    expected, expected_grads = render_with_gradients(gaussians, cameras, "dense", "solid", "median", bisections=40)
-    out, grads = render_with_gradients(gaussians, cameras, implementation, "solid", "median", bisections=40)
-    assert (expected.depth > 0).any()
-    for value, reference in zip(images(out), images(expected), strict=True):
-        torch.testing.assert_close(value, reference, rtol=0, atol=1e-12)
-    for name, reference in expected_grads.items():
-        assert relative(grads[name], reference) < 1e-10, name
+    expected, found = (
+        render_with_gradients(gaussians, pinhole((9, 18)), implementation=name, bisections=40)
+        for name in ("dense", implementation)
+    )
+    assert_same_render(found, expected)
 
 
 @pytest.mark.parametrize("implementation", FAST)
 def test_gradient_in_random_directions(implementation: Implementation) -> None:
     gaussians, cameras = soup(60, seed=2), cameras_around((20, 24))
     options = {"bisections": 40, "slope_floor": 0.0}
-    out, grads = render_with_gradients(gaussians, cameras, implementation, "solid", "median", **options)
+    out, grads = render_with_gradients(gaussians, cameras, implementation=implementation, **options)
     weights = random_like(out)
     generator = torch.Generator().manual_seed(0)
     errors = []
@@ -99,7 +64,7 @@ def test_gradient_in_random_directions(implementation: Implementation) -> None:
         values = []
         for sign in (1, -1):
             moved = replace(gaussians, **{n: getattr(gaussians, n) + sign * 1e-7 * d for n, d in step.items()})
-            r = render(moved, cameras, "solid", BACKGROUND, implementation=implementation, bisections=40)
+            r = render(moved, cameras, background=BACKGROUND, implementation=implementation, bisections=40)
             values.append(sum(float((w * i).sum()) for w, i in zip(weights, images(r), strict=True)))
         errors.append(abs((values[0] - values[1]) / 2e-7 - analytic) / abs(analytic))
     assert sorted(errors)[4] < 1e-7
@@ -110,8 +75,8 @@ def test_gradient_in_random_directions(implementation: Implementation) -> None:
 def test_scaling_the_world_scales_depth_only(
     implementation: Implementation, dtype: torch.dtype, tolerance: float
 ) -> None:
-    gaussians = with_gradients(soup(60).map(lambda t: t.to(dtype) if t.is_floating_point() else t))
-    cameras = pinhole((20, 24)).map(lambda t: t.to(dtype))
+    gaussians = with_gradients(floats_to(soup(60), dtype))
+    cameras = floats_to(pinhole((20, 24)), dtype)
     out = render(gaussians, cameras, implementation=implementation, slope_floor=0.0, bisections=40)
     weights = random_like(out)
 
@@ -129,11 +94,7 @@ def test_scaling_the_world_scales_depth_only(
 def test_float32_depth_is_that_of_float64() -> None:
     gaussians, cameras = wall(6000, (64, 96))
     exact = render(gaussians, cameras, implementation="cpu", bisections=40)
-
-    def single(t: Tensor) -> Tensor:
-        return t.float() if t.is_floating_point() else t
-
-    rounded = render(gaussians.map(single), cameras.map(single), implementation="cpu")
+    rounded = render(floats_to(gaussians, torch.float32), floats_to(cameras, torch.float32), implementation="cpu")
     both = (exact.depth > 0) & (rounded.depth > 0)
     assert both.float().mean() > 0.95
     error = (exact.depth - rounded.depth)[both].abs()
@@ -145,16 +106,14 @@ def test_float32_depth_is_that_of_float64() -> None:
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_cpu_is_deterministic_for_any_number_of_threads(dtype: torch.dtype) -> None:
-    gaussians, _ = wall(3000, (40, 72))
-    cameras = cameras_around((40, 72), views=3)
-    gaussians = gaussians.map(lambda t: t.to(dtype) if t.is_floating_point() else t)
-    cameras = cameras.map(lambda t: t.to(dtype))
+    gaussians = floats_to(wall(3000, (40, 72))[0], dtype)
+    cameras = floats_to(cameras_around((40, 72), views=3), dtype)
     threads = torch.get_num_threads()
     results = []
     try:
         for count in (1, 1, 2, 3):
             torch.set_num_threads(count)
-            out, grads = render_with_gradients(gaussians, cameras, "cpu", "solid", "median")
+            out, grads = render_with_gradients(gaussians, cameras, implementation="cpu")
             results.append([*images(out), *grads.values()])
     finally:
         torch.set_num_threads(threads)

@@ -2,38 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor
 
 from vg2gt.geometry.cameras import pixel_grid
-from vg2gt.rendering.median import ray_depth
+from vg2gt.rendering.median import Rays, ray_depth
 from vg2gt.rendering.options import ALPHA_MIN, TRANSMITTANCE_STOP, Images, RenderOptions, SceneViews
 from vg2gt.rendering.projection import Splats, respond, visible_splats
 
 CELLS_PER_CHUNK = 1 << 21  # pixels times Gaussians held at once
-
-
-@dataclass(frozen=True)
-class DenseRays:
-    """Rows are rays, columns Gaussians."""
-
-    def sum(self, hits: Tensor) -> Tensor:
-        """Sum over columns."""
-        return hits.sum(-1)
-
-    def amin(self, hits: Tensor) -> Tensor:
-        """Minimum over columns."""
-        return hits.amin(-1)
-
-    def amax(self, hits: Tensor) -> Tensor:
-        """Maximum over columns."""
-        return hits.amax(-1)
-
-    def spread(self, rays: Tensor) -> Tensor:
-        """Repeats along columns by broadcasting."""
-        return rays[:, None]
 
 
 def rasterize_dense(scene: SceneViews, options: RenderOptions) -> Images:
@@ -44,7 +21,7 @@ def rasterize_dense(scene: SceneViews, options: RenderOptions) -> Images:
 def _render_view(scene: SceneViews, options: RenderOptions) -> Images:
     height, width = scene.size
     splats, _ = visible_splats(scene, options)
-    pixels = pixel_grid(height, width, like=scene.means).reshape(-1, 2)
+    pixels = pixel_grid(height, width, like=scene.means).reshape(-1, 2)  # [H * W, 2]
     chunks = pixels.split(max(1, CELLS_PER_CHUNK // max(1, len(splats.depth))))
     parts = [_render_pixels(splats, chunk, scene.background, options) for chunk in chunks]
     color, normal, depth, alpha = (torch.cat(part) for part in zip(*parts, strict=True))
@@ -59,7 +36,7 @@ def _render_pixels(
 
     Eqn gggs_color with ``G(t*) = alpha`` for every Gaussian.
     """
-    response, peak, precision = respond(splats, pixels[:, None])
+    response, peak, precision = respond(splats, pixels[:, None])  # [P, N]
     alpha = response.clamp(max=options.alpha_max)
     alpha = torch.where(response.detach() >= ALPHA_MIN, alpha, torch.zeros_like(alpha))
     kept = torch.cumprod(1 - alpha.detach(), -1) >= TRANSMITTANCE_STOP
@@ -67,11 +44,11 @@ def _render_pixels(
     passed = torch.log1p(-alpha)
     after = torch.cumsum(passed, -1)
     before = torch.exp(after - passed)
-    weight = alpha * before
+    weight = alpha * before  # [P, N], paper, eqn 3dgs_render_preliminary
     final = torch.exp(passed.sum(-1))
-    color = weight @ splats.color + final[:, None] * background
+    color = weight @ splats.color + final[:, None] * background  # [P, 3]
     normal, depth = torch.zeros_like(color), torch.zeros_like(final)
     if options.geometry and len(splats.depth):
         normal = weight @ splats.normal
-        depth = ray_depth(alpha, weight, before.detach(), final, peak, precision, DenseRays(), options)
+        depth = ray_depth(alpha, weight, before.detach(), final, peak, precision, Rays(), options)
     return color, normal, depth, 1 - final

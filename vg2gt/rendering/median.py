@@ -8,37 +8,42 @@ product over the ray's Gaussians, whatever their order, and the median depth d s
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+import math
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from vg2gt.rendering.options import BRACKET_SIGMAS, MEDIAN_MAX_TRANSMITTANCE, RenderOptions
-from vg2gt.rendering.projection import LOG_HALF
+
+LOG_HALF = math.log(0.5)
 
 
-class Rays(Protocol):
-    """How hits belong to rays, so that one solver serves a dense matrix and a sparse list of hits."""
+class Rays:
+    """How hits belong to rays, so that one solver serves a dense matrix and a sparse list of hits.
+
+    This is the dense matrix ``[P, N]``: rows are rays, columns their hits.
+    """
 
     def sum(self, hits: Tensor) -> Tensor:
         """Sum over every ray's hits."""
-        ...
+        return hits.sum(-1)
 
     def amin(self, hits: Tensor) -> Tensor:
         """Minimum over every ray's hits, inf without any."""
-        ...
+        return hits.amin(-1)
 
     def amax(self, hits: Tensor) -> Tensor:
         """Maximum over every ray's hits, -inf without any."""
-        ...
+        return hits.amax(-1)
 
-    def spread(self, rays: Tensor) -> Tensor:
-        """One value a ray, repeated for every hit."""
-        ...
+    def expand(self, rays: Tensor) -> Tensor:
+        """One value per ray, repeated for every hit."""
+        return rays[:, None]
 
 
 def log_transmittance(t: Tensor, alpha: Tensor, peak: Tensor, precision: Tensor) -> Tensor:
-    """Every hit's share of ``ln T(t)`` (paper, eqns volume_render and vacancy); all arguments have one value a hit."""
+    """Every hit's share of ``ln T(t)`` (paper, eqns volume_render and vacancy); all of one value per hit."""
     occupied = torch.log1p(-alpha * torch.exp(-0.5 * precision * (t - peak) ** 2))
     return torch.where(t <= peak, 0.5 * occupied, torch.log1p(-alpha) - 0.5 * occupied)
 
@@ -72,7 +77,7 @@ class MedianDepth(torch.autograd.Function):
         """
 
         def residual(t: Tensor) -> Tensor:
-            return rays.sum(log_transmittance(rays.spread(t), alpha, peak, precision)) - LOG_HALF
+            return rays.sum(log_transmittance(rays.expand(t), alpha, peak, precision)) - LOG_HALF
 
         reach = BRACKET_SIGMAS / precision.sqrt()
         hit = alpha > 0
@@ -94,7 +99,7 @@ class MedianDepth(torch.autograd.Function):
         depth = 0.5 * (lo + hi)
         tiny = torch.finfo(depth.dtype).tiny
         for _ in range(options.newton_steps):
-            step = residual(depth) / rays.sum(slope(rays.spread(depth), alpha, peak, precision)).clamp(min=tiny)
+            step = residual(depth) / rays.sum(slope(rays.expand(depth), alpha, peak, precision)).clamp(min=tiny)
             depth = torch.minimum(torch.maximum(depth + step, lo), hi)
         depth = torch.where(solvable, depth, torch.zeros_like(depth))
         ctx.save_for_backward(alpha, peak, precision, depth)
@@ -107,14 +112,14 @@ class MedianDepth(torch.autograd.Function):
         alpha, peak, precision, depth = ctx.saved_tensors
         rays: Rays = ctx.rays
         valid = depth > 0
-        offset = rays.spread(depth) - peak
+        offset = rays.expand(depth) - peak
         bell = torch.exp(-0.5 * precision * offset**2)
         g = alpha * bell
         half = 0.5 / (1 - g)
         total = rays.sum(half * g * precision * offset.abs())
         floor = ctx.slope_floor / torch.where(valid, depth, torch.ones_like(depth))
         total = torch.maximum(total, floor).clamp(min=torch.finfo(total.dtype).tiny)
-        factor = rays.spread(torch.where(valid, grad_outputs[0] / total, torch.zeros_like(depth)))
+        factor = rays.expand(torch.where(valid, grad_outputs[0] / total, torch.zeros_like(depth)))
         passed = offset > 0
         grad_alpha = torch.where(passed, half * bell - 1 / (1 - alpha), -half * bell)
         grad_peak = half * g * precision * offset.abs()
@@ -154,3 +159,23 @@ def ray_depth(
         return torch.where(hit, rays.sum(weight * peak) / torch.where(hit, covered, 1.0), 0.0)
     crossing = (before > 0.5) & (before * (1 - alpha.detach()) <= 0.5)
     return rays.sum(crossing * peak)
+
+
+def depth_factors(
+    grad_depth: Tensor, grad_alpha: Tensor, depth: Tensor, slope: Tensor, transmittance: Tensor, options: RenderOptions
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Splits the gradient of the images ``[V, H, W]`` of depth into what the compiled backward kernels take.
+
+    Returns:
+        Incoming gradient over S (solid, paper, eqn tmed_grad), over alpha (expected), at the crossing (rasterized
+        median), each 0 in the other cases; and the gradient of alpha.
+    """
+    zero, valid = torch.zeros_like(depth), depth > 0
+    if options.mode == "solid":
+        floor = torch.full_like(depth, options.slope_floor) / torch.where(valid, depth, 1.0)
+        bound = torch.maximum(slope, floor).clamp(min=torch.finfo(depth.dtype).tiny)
+        return torch.where(valid, grad_depth / bound, 0.0), zero, zero, grad_alpha
+    if options.depth == "expected":
+        factor = torch.where(valid, grad_depth / torch.where(valid, 1 - transmittance, 1.0), 0.0)
+        return zero, factor, zero, grad_alpha - factor * depth
+    return zero, zero, torch.where(valid, grad_depth, 0.0), grad_alpha

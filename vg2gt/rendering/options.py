@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, Literal, get_args
 
 import torch
@@ -104,16 +104,7 @@ class SceneViews:
     @property
     def tensors(self) -> tuple[Tensor, ...]:
         """The differentiable inputs in declaration order."""
-        return (
-            self.means,
-            self.quats,
-            self.scales,
-            self.opacities,
-            self.colors,
-            self.world_to_camera,
-            self.intrinsics,
-            self.background,
-        )
+        return tuple(getattr(self, field.name) for field in fields(self) if field.name != "size")
 
     def view(self, index: int) -> SceneViews:
         """Returns the scene with one view (V = 1)."""
@@ -152,9 +143,4 @@ class Images:
     @staticmethod
     def stack(views: list[Images]) -> Images:
         """Joins renders of single views along V."""
-        return Images(
-            torch.cat([view.color for view in views]),
-            torch.cat([view.normal for view in views]),
-            torch.cat([view.depth for view in views]),
-            torch.cat([view.alpha for view in views]),
-        )
+        return Images(*(torch.cat([getattr(view, field.name) for view in views]) for field in fields(Images)))

@@ -8,14 +8,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from vg2gt.rendering.median import ray_depth
+from vg2gt.rendering.median import Rays, ray_depth
 from vg2gt.rendering.options import ALPHA_MIN, TRANSMITTANCE_STOP, Images, RenderOptions, SceneViews
 from vg2gt.rendering.projection import Splats, list_cells, pixel_boxes, respond, visible_splats
 
 
 @dataclass(frozen=True)
-class PairRays:
-    """Hits in one list; ``pixel`` names the ray of each.
+class PairRays(Rays):
+    """Hits in one list ``[N]``; ``pixel`` names the ray of each.
 
     Attributes:
         pixel: ``[N]`` int64, sorted.
@@ -26,19 +26,19 @@ class PairRays:
     count: int
 
     def sum(self, hits: Tensor) -> Tensor:
-        """Sum over every ray's hits."""
+        """See :class:`Rays`."""
         return hits.new_zeros(self.count, *hits.shape[1:]).index_add(0, self.pixel, hits)
 
     def amin(self, hits: Tensor) -> Tensor:
-        """Minimum over every ray's hits."""
+        """See :class:`Rays`."""
         return hits.new_full((self.count,), torch.inf).scatter_reduce(0, self.pixel, hits, "amin")
 
     def amax(self, hits: Tensor) -> Tensor:
-        """Maximum over every ray's hits."""
+        """See :class:`Rays`."""
         return hits.new_full((self.count,), -torch.inf).scatter_reduce(0, self.pixel, hits, "amax")
 
-    def spread(self, rays: Tensor) -> Tensor:
-        """One value a ray, repeated for every hit."""
+    def expand(self, rays: Tensor) -> Tensor:
+        """See :class:`Rays`."""
         return rays[self.pixel]
 
     def running_sum(self, hits: Tensor) -> Tensor:
@@ -59,14 +59,14 @@ def _render_view(scene: SceneViews, options: RenderOptions) -> Images:
     with torch.no_grad():
         index, rays = _hits(splats, box, scene.size, options)
     hits = splats[index]
-    pixels = torch.stack((rays.pixel % width, rays.pixel // width), -1).to(hits.depth.dtype)
+    pixels = torch.stack((rays.pixel % width, rays.pixel // width), -1).to(hits.depth.dtype)  # [N, 2]
     response, peak, precision = respond(hits, pixels)
     alpha = response.clamp(max=options.alpha_max)
     passed = torch.log1p(-alpha)
     before = torch.exp(rays.running_sum(passed) - passed).to(alpha.dtype)
-    weight = alpha * before
+    weight = alpha * before  # [N], paper, eqn 3dgs_render_preliminary
     final = torch.exp(rays.sum(passed.double())).to(alpha.dtype)
-    color = rays.sum(weight[:, None] * hits.color) + final[:, None] * scene.background
+    color = rays.sum(weight[:, None] * hits.color) + final[:, None] * scene.background  # [H * W, 3]
     normal, depth = torch.zeros_like(color), torch.zeros_like(final)
     if options.geometry:
         normal = rays.sum(weight[:, None] * hits.normal)

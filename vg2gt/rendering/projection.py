@@ -15,7 +15,6 @@ the mean's depth.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, fields
 
 import torch
@@ -182,6 +181,3 @@ def respond(splats: Splats, pixels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     response = splats.opacity * torch.exp(-0.5 * quadratic / r)
     response = torch.where(forward > 0, response, torch.zeros_like(response))
     return response, splats.depth * forward / r, splats.precision * r
-
-
-LOG_HALF = math.log(0.5)

@@ -6,7 +6,7 @@ import importlib.util
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -18,7 +18,7 @@ from vg2gt.memory import note_sizes
 from vg2gt.rendering.checks import background_color, check_cameras, check_gaussians
 from vg2gt.rendering.cpu import rasterize_cpu
 from vg2gt.rendering.dense import rasterize_dense
-from vg2gt.rendering.options import DepthKind, Images, Mode, RenderOptions, SceneViews, check_choice
+from vg2gt.rendering.options import Images, Mode, RenderOptions, SceneViews, check_choice
 from vg2gt.rendering.pairs import rasterize_pairs
 from vg2gt.types import Cameras, Gaussians, Render
 
@@ -95,9 +95,9 @@ class Renderer(RenderOptions):
             field.name: torch.stack([getattr(image, field.name) for image in images]) for field in fields(Images)
         }
         return Render(
-            color=stacked["color"].permute(0, 1, 4, 2, 3),
+            color=stacked["color"].permute(0, 1, 4, 2, 3),  # [B, V, 3, H, W]
             depth=stacked["depth"],
-            normal=stacked["normal"].permute(0, 1, 4, 2, 3),
+            normal=stacked["normal"].permute(0, 1, 4, 2, 3),  # [B, V, 3, H, W]
             alpha=stacked["alpha"],
         )
 
@@ -108,15 +108,7 @@ def render(
     mode: Mode = "solid",
     background: Tensor | Sequence[float] | None = None,
     near: float = 0.01,
-    *,
-    implementation: Implementation = "auto",
-    depth: DepthKind = "median",
-    lowpass: float = 0.3,
-    alpha_max: float = 0.99,
-    slope_floor: float = 30.0,
-    bisections: int = 12,
-    newton_steps: int = 2,
-    geometry: bool = True,
+    **options: Any,
 ) -> Render:
     """Renders the Gaussians of B scenes into V views each.
 
@@ -126,17 +118,10 @@ def render(
     Args:
         gaussians: G Gaussians, packed over the B scenes and sorted by scene.
         cameras: the views ``[B, V]``; skew and distortion are not modelled.
-        mode: ``solid`` or ``rasterized``; this and all other options are described in :class:`RenderOptions`.
+        mode: ``solid`` or ``rasterized``.
         background: one colour ``[3]``; None is black.
         near: near plane.
-        implementation: which code renders, see :class:`Renderer`.
-        depth: ``median`` or ``expected``.
-        lowpass: added to every footprint.
-        alpha_max: cap of the opacity at a pixel.
-        slope_floor: bounds the median depth's gradient.
-        bisections: of the median depth.
-        newton_steps: of the median depth.
-        geometry: whether to render depth and normals.
+        **options: ``implementation`` (:class:`Renderer`) and the others of :class:`RenderOptions`.
 
     Returns:
         Views ``[B, V, ...]`` in the Gaussians' dtype (float32 at least). Solid depth is 0 where a ray's final
@@ -146,10 +131,7 @@ def render(
     Raises:
         ValueError: on shapes that disagree, NaN or infinite values, scales that are not positive, unknown options.
     """
-    renderer = Renderer(
-        mode, depth, near, lowpass, alpha_max, slope_floor, bisections, newton_steps, geometry, implementation
-    )
-    return renderer(gaussians, cameras, background)
+    return Renderer(mode=mode, near=near, **options)(gaussians, cameras, background)
 
 
 def _scene_views(gaussians: Gaussians, cameras: Cameras, scene: int, background: Tensor) -> SceneViews:

@@ -20,6 +20,7 @@ from vg2gt.rendering.cpu.binning import count_tiles, fill_tiles, radix_order
 from vg2gt.rendering.cpu.forward import forward_tiles
 from vg2gt.rendering.cpu.projection import BLOCK, project_backward_block, project_block
 from vg2gt.rendering.cpu.threads import parallel_for
+from vg2gt.rendering.median import depth_factors
 from vg2gt.rendering.options import MEDIAN_MAX_TRANSMITTANCE, TRANSMITTANCE_STOP, Images, RenderOptions, SceneViews
 
 TILES_PER_ITEM = 8
@@ -71,8 +72,13 @@ class _View:
         return self.across * -(-self.size[0] // tiles.TILE)
 
     @property
-    def blocks(self) -> int:
-        return -(-len(self.means) // BLOCK)
+    def tile_ranges(self) -> list[tuple[int, int]]:
+        starts = range(0, self.tiles, TILES_PER_ITEM)
+        return [(start, min(start + TILES_PER_ITEM, self.tiles)) for start in starts]
+
+    @property
+    def blocks(self) -> range:
+        return range(-(-len(self.means) // BLOCK))
 
 
 class _Rasterize(torch.autograd.Function):
@@ -90,9 +96,8 @@ class _Rasterize(torch.autograd.Function):
         for index in range(count):
             view = _select(arrays, index, size)
             lists.append(_prepare(view, options))
-            _forward(
-                view, lists[-1], options, color[index], normal[index], depth[index], slope[index], transmittance[index]
-            )
+            outputs = (array[index] for array in (color, normal, depth, slope, transmittance))
+            _forward(view, lists[-1], options, *outputs)
         images = [torch.from_numpy(array) for array in (color, normal, depth, 1 - transmittance)]
         ctx.save_for_backward(*tensors, *images, torch.from_numpy(slope), torch.from_numpy(transmittance))
         ctx.lists, ctx.size, ctx.options = lists, size, options
@@ -101,29 +106,26 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor | None) -> tuple[Tensor | None, ...]:
-        saved = [_array(tensor) for tensor in ctx.saved_tensors]
-        arrays, (color, normal, depth, _alpha, slope, transmittance) = saved[:8], saved[8:]
+        color, normal, depth, _, slope, transmittance = ctx.saved_tensors[8:]
         options: RenderOptions = ctx.options
+        geometry = options.geometry and (grad_outputs[1] is not None or grad_outputs[2] is not None)
         grad_color, grad_normal, grad_depth, grad_alpha = (
-            None if grad is None else _array(grad) for grad in grad_outputs
+            torch.zeros_like(image) if grad is None else grad
+            for grad, image in zip(grad_outputs, (color, normal, depth, depth), strict=True)
         )
-        geometry = options.geometry and (grad_normal is not None or grad_depth is not None)
-        grad_color = np.zeros_like(color) if grad_color is None else grad_color
-        grad_alpha = np.zeros_like(depth) if grad_alpha is None else grad_alpha
-        grad_normal = np.zeros_like(color) if grad_normal is None else grad_normal
-        grad_depth = np.zeros_like(depth) if grad_depth is None else grad_depth
+        factors = depth_factors(grad_depth, grad_alpha, depth, slope, transmittance, options)
+        solid, expected, crossing, grad_alpha = factors
+        images = [_array(image) for image in (color, normal, depth, transmittance)]
+        incoming = [_array(grad) for grad in (grad_color, grad_normal, grad_alpha, solid, expected, crossing)]
+        arrays = [_array(tensor) for tensor in ctx.saved_tensors[:8]]
         grads = [np.zeros_like(array) for array in arrays]
         for index, lists in enumerate(ctx.lists):
             view = _select(arrays, index, ctx.size)
-            solid, expected, crossing, of_alpha = _depth_factors(
-                grad_depth[index], grad_alpha[index], depth[index], slope[index], transmittance[index], options
-            )
             rows = np.empty((len(lists.members), tiles.ROW), view.means.dtype)
-            images = (color[index], normal[index], depth[index], transmittance[index])
-            incoming = (grad_color[index], grad_normal[index], of_alpha, solid, expected, crossing)
-            _backward(view, lists, options, geometry, images, incoming, rows, grads, index)
+            planes = [array[index] for array in (*images, *incoming)]
+            _backward(view, lists, options, geometry, planes, rows, grads, index)
         if ctx.needs_input_grad[7]:
-            grads[7] = np.einsum("vhwc,vhw->c", grad_color, transmittance)
+            grads[7] = np.einsum("vhwc,vhw->c", incoming[0], images[3])
         result = [
             torch.from_numpy(grad) if needed else None
             for grad, needed in zip(grads, ctx.needs_input_grad[:8], strict=True)
@@ -199,45 +201,19 @@ def _scratch(dtype: np.dtype) -> _Scratch:
     return buffers[dtype]
 
 
-def _tile_items(tiles: int) -> list[tuple[int, int]]:
-    return [(start, min(start + TILES_PER_ITEM, tiles)) for start in range(0, tiles, TILES_PER_ITEM)]
-
-
 def _forward(view: _View, lists: _Lists, options: RenderOptions, *outputs: np.ndarray) -> None:
     parameters = _parameters(options, view.means.dtype)
-    items = _tile_items(view.tiles)
     solid, expected = options.mode == "solid", options.depth == "expected"
 
-    def run(item: int) -> None:
+    def run(tile_range: tuple[int, int]) -> None:
         scratch = _scratch(view.means.dtype)
         forward_tiles(
-            lists.records, lists.boxes, view.colors, lists.members, lists.starts, items[item], solid, expected,
+            lists.records, lists.boxes, view.colors, lists.members, lists.starts, tile_range, solid, expected,
             options.geometry, options.bisections, options.newton_steps, parameters, view.background,
             scratch.state, scratch.hits, scratch.staged, scratch.spans, *outputs,
         )  # fmt: skip
 
-    parallel_for(len(items), run)
-
-
-def _depth_factors(
-    grad_depth: np.ndarray,
-    grad_alpha: np.ndarray,
-    depth: np.ndarray,
-    slope: np.ndarray,
-    transmittance: np.ndarray,
-    options: RenderOptions,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Splits the depth's gradient into what the kernel takes: solid / S, expected / alpha, crossing; and alpha."""
-    zero = np.zeros_like(depth)
-    valid = depth > 0
-    if options.mode == "solid":
-        safe = np.where(valid, depth, 1)
-        bound = np.maximum(slope, options.slope_floor / safe).clip(min=np.finfo(depth.dtype).tiny)
-        return np.where(valid, grad_depth / bound, 0).astype(depth.dtype), zero, zero, grad_alpha
-    if options.depth == "expected":
-        factor = np.where(valid, grad_depth / np.where(valid, 1 - transmittance, 1), 0).astype(depth.dtype)
-        return zero, factor, zero, grad_alpha - factor * depth
-    return zero, zero, np.where(valid, grad_depth, 0).astype(depth.dtype), grad_alpha
+    parallel_for(view.tile_ranges, run)
 
 
 def _backward(
@@ -245,37 +221,35 @@ def _backward(
     lists: _Lists,
     options: RenderOptions,
     geometry: bool,
-    images: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
-    incoming: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+    planes: list[np.ndarray],
     rows: np.ndarray,
     grads: list[np.ndarray],
     index: int,
 ) -> None:
-    """Adds one view's gradients to ``grads`` (order of SceneViews.tensors)."""
+    """Adds one view's gradients to ``grads`` (order of SceneViews.tensors); ``planes``: images and their gradients."""
     parameters = _parameters(options, view.means.dtype)
-    items = _tile_items(view.tiles)
     height, width = view.size
     solid = options.mode == "solid"
 
-    def raster_item(item: int) -> None:
+    def rasterize(tile_range: tuple[int, int]) -> None:
         scratch = _scratch(view.means.dtype)
         backward_tiles(
-            lists.records, lists.boxes, view.colors, lists.members, lists.starts, items[item], geometry,
-            parameters, scratch.state, scratch.sums, scratch.staged, scratch.spans, *images, *incoming, rows,
+            lists.records, lists.boxes, view.colors, lists.members, lists.starts, tile_range, geometry,
+            parameters, scratch.state, scratch.sums, scratch.staged, scratch.spans, *planes, rows,
         )  # fmt: skip
 
-    parallel_for(len(items), raster_item)
-    cameras = np.empty((view.blocks, 16), np.float64)
+    parallel_for(view.tile_ranges, rasterize)
+    cameras = np.empty((len(view.blocks), 16), np.float64)
     means, quats, scales, opacities, colors = grads[:5]
 
-    def project_item(block: int) -> None:
+    def project(block: int) -> None:
         project_backward_block(
             block, view.means, view.quats, view.scales, view.opacities, view.pose, view.intrinsics, height, width,
             options.lowpass, solid, lists.boxes, lists.counts, lists.offsets, lists.places, rows, index % len(colors),
             means, quats, scales, opacities, colors, cameras,
         )  # fmt: skip
 
-    parallel_for(view.blocks, project_item)
+    parallel_for(view.blocks, project)
     camera = cameras.sum(0)
     grads[5][index, :3] = camera[:12].reshape(3, 4)
     grads[6][index, [0, 1, 0, 1], [0, 1, 2, 2]] = camera[12:]

@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
+from typing import TypeVar
 
 import torch
 
+Item = TypeVar("Item")
 
-def parallel_for(count: int, function: Callable[[int], None]) -> None:
-    """Calls ``function(index)`` for every index below ``count``; which thread takes which is left open."""
-    threads = min(torch.get_num_threads(), count)
+
+def parallel_for(items: Sequence[Item], function: Callable[[Item], None]) -> None:
+    """Calls ``function(item)`` for every item; which thread takes which is left open."""
+    threads = min(torch.get_num_threads(), len(items))
     if threads <= 1:
-        for index in range(count):
-            function(index)
+        for item in items:
+            function(item)
         return
-    list(_pool(threads, os.getpid()).map(function, range(count)))
+    list(_pool(threads, os.getpid()).map(function, items))
 
 
 @lru_cache(maxsize=4)

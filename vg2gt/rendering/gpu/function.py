@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from vg2gt.rendering.gpu import kernels as launchable
+from vg2gt.rendering.median import depth_factors
 from vg2gt.rendering.options import (
     ALPHA_MIN,
     BRACKET_SIGMAS,
@@ -143,18 +144,9 @@ class _Rasterize(torch.autograd.Function):
             torch.zeros_like(image) if grad is None else grad.contiguous()
             for grad, image in zip(grad_outputs, like, strict=True)
         )
-        zero = torch.zeros_like(depth)
-        grad_solid, grad_expected, grad_crossing = zero, zero, zero
-        valid = depth > 0
-        safe = torch.where(valid, depth, 1.0)
-        if options.mode == "solid":
-            bound = torch.maximum(slope, options.slope_floor / safe).clamp(min=torch.finfo(depth.dtype).tiny)
-            grad_solid = torch.where(valid, grad_depth / bound, 0.0)
-        elif options.depth == "expected":
-            grad_expected = torch.where(valid, grad_depth / torch.where(valid, 1 - transmittance, 1.0), 0.0)
-            grad_alpha = grad_alpha - grad_expected * depth
-        else:
-            grad_crossing = torch.where(valid, grad_depth, 0.0)
+        grad_solid, grad_expected, grad_crossing, grad_alpha = depth_factors(
+            grad_depth, grad_alpha, depth, slope, transmittance, options
+        )
         rows = records.new_zeros(len(lists.members), kernels.RECORD)
         views, height, width = lists.shape
         kernels.backward_kernel[(views * lists.tiles,)](

@@ -1,0 +1,81 @@
+"""A backend around one published network: its weights, its taps, and decoding a few views at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from backends.base import Backend
+from backends.weights import Weights
+from vg2gt.types import Geometry, Hints, Tokens
+
+
+class NetworkBackend(Backend):
+    """What the networks of VGGT and DA3 share; their constructors take these arguments besides their own.
+
+    Args:
+        name: stands in checkpoints and messages.
+        licence: of the weights.
+        dim: channels C of the blocks.
+        num_heads: attention heads.
+        taps: four blocks (VGGT: pairs of blocks) whose tokens feed the heads.
+        features: DPT width.
+        out_channels: DPT channels of the four taps.
+        image_size: native image edge.
+        patch_size: in pixels.
+        pretrained: whether to load weights; random ones (by ``seed``) otherwise.
+        repo: Hugging Face repository of the weights.
+        revision: its branch, tag or commit.
+        path: local weight file or folder instead.
+        prefix: of the names in the file.
+        seed: of random weights.
+        head_chunk: views decoded at a time; None decodes all at once.
+        compile: whether to ``torch.compile`` the backbone.
+    """
+
+    network: Any
+    backbone_name: str  # of the module that makes tokens
+
+    def _build(
+        self,
+        make: Callable[[], nn.Module],
+        weights: Weights,
+        taps: Sequence[int],
+        head_chunk: int | None,
+        compile: bool = False,
+    ) -> None:
+        """Ends the constructor: makes the network with its weights and freezes it."""
+        self.taps = tuple(taps)
+        self.head_chunk = head_chunk
+        self.weights = weights
+        self.network = weights.build(make)
+        if compile:
+            self.network.get_submodule(self.backbone_name).compile()
+        self.freeze()
+
+    @torch.no_grad()
+    def encode(self, images: Tensor, hints: Hints | None = None) -> Tokens:
+        """See :meth:`Backend.encode`; ``hints.cameras`` are needed, and used, where the network takes given poses."""
+        self.check_images(images)
+        if self.needs_hints:
+            hints = self.require_hints(images, hints, "cameras")
+        return self.encode_checked(images, hints)
+
+    def encode_checked(self, images: Tensor, hints: Hints | None) -> Tokens:
+        """Encodes what :meth:`encode` has checked: tensor operations only, so that it can be exported."""
+        raise NotImplementedError
+
+    def decode(self, tokens: Tokens) -> Geometry:
+        """See :meth:`Backend.decode`; the principal point is (W/2, H/2)."""
+        return self.network.decode(tokens, self.head_chunk)
+
+
+@torch.no_grad()
+def predict(layer: nn.Module, bias: Sequence[float]) -> None:
+    """Makes a last layer with random weights predict about ``bias``: so cameras look forward, with sensible fields."""
+    assert isinstance(layer, nn.Linear)
+    layer.weight.mul_(0.1)
+    layer.bias.copy_(layer.bias.new_tensor(bias))
