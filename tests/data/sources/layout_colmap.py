@@ -5,7 +5,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
 from vg2gt.data import Frames
 from vg2gt.data.sources import COLMAP
@@ -13,7 +12,7 @@ from vg2gt.geometry.cameras import unproject
 from vg2gt.io import ColmapModel, ColmapPoints, colmap_from_views, write_colmap
 from vg2gt.types import Cameras
 
-from .layouts import SIZE, Layout, pixels
+from .layouts import SIZE, Layout, pixels, save
 
 POINTS_A_VIEW = 60
 
@@ -22,9 +21,8 @@ def write(root: Path, frames: Frames, text: bool = False) -> None:
     """``images/left/`` and ``sparse/0``, with points at pixels of every view."""
     cameras = Cameras(frames.world_to_camera[None].double(), frames.intrinsics[None].double(), SIZE)
     names = [f"left/{9 * i:03d}.png" for i in range(len(frames.images))]
-    (root / "statue" / "images" / "left").mkdir(parents=True)
     for name, image in zip(names, pixels(frames), strict=True):
-        Image.fromarray(image).save(root / "statue" / "images" / name)
+        save(root / "statue" / "images" / name, image)
     world = unproject(frames.depth[None].double(), cameras)[0].numpy()
     write_colmap(root / "statue" / "sparse" / "0", _with_points(colmap_from_views(cameras, names), world), text=text)
 

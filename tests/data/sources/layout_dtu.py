@@ -3,12 +3,11 @@
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
 from vg2gt.data import Frames
 from vg2gt.data.sources import DTU, DTUTraining
 
-from .layouts import SIZE, Layout, pixels
+from .layouts import SIZE, Layout, pixels, save
 
 CROP = (4, 7)
 """Rows and columns of the halved recorded image that are cut away above and to the left; 44 and 80 in DTU."""
@@ -35,15 +34,14 @@ def write_depth(folder: Path, frames: Frames, crop: tuple[int, int] | None = Non
         if crop:
             depth = np.pad(depth, ((crop[0],) * 2, (crop[1],) * 2), constant_values=700).repeat(2, 0).repeat(2, 1)
         (folder / f"depth_map_{i:04d}.pfm").write_bytes(pfm(np.where(depth > 0, depth, 777)))
-        Image.fromarray(np.where(depth > 0, 255, 10).astype(np.uint8)).save(folder / f"depth_visual_{i:04d}.png")
+        save(folder / f"depth_visual_{i:04d}.png", np.where(depth > 0, 255, 10).astype(np.uint8))
 
 
 def write_training(root: Path, frames: Frames) -> None:
     """Scan 1 in light 3, with cameras of a quarter of the size and depth of the recorded size."""
-    (root / "Rectified" / "scan1_train").mkdir(parents=True)
     (root / "Cameras" / "train").mkdir(parents=True)
     for i, image in enumerate(pixels(frames)):
-        Image.fromarray(image).save(root / "Rectified" / "scan1_train" / f"rect_{i + 1:03d}_3_r5000.png")
+        save(root / "Rectified" / "scan1_train" / f"rect_{i + 1:03d}_3_r5000.png", image)
         intrinsics = frames.intrinsics[i].double().numpy().copy()
         intrinsics[:2, 2] += 0.25
         intrinsics[:2] /= 4
@@ -58,7 +56,7 @@ def write_test(root: Path, frames: Frames) -> None:
         (root / "scans" / "scan65" / name).mkdir(parents=True)
     for i, image in enumerate(pixels(frames)):
         path = root / "scans" / "scan65" / "images" / f"{i:08d}.jpg"
-        Image.fromarray(image).save(path, quality=95, subsampling=0)
+        save(path, image)
         text = camera(frames.world_to_camera[i].double().numpy(), frames.intrinsics[i].double().numpy())
         (root / "scans" / "scan65" / "cams" / f"{i:08d}_cam.txt").write_text(text)
     (root / "scans" / "scan65" / "pair.txt").write_text("1\n0\n1 1 1.0\n")

@@ -3,12 +3,11 @@
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
 from vg2gt.data import Frames
 from vg2gt.data.sources import Infinigen
 
-from .layouts import Layout, camera_to_world, pixels
+from .layouts import Layout, camera_to_world, pixels, save
 
 SKY = (1e10, np.inf)
 
@@ -24,7 +23,7 @@ def write(root: Path, frames: Frames, names: list[str], enlarge: int) -> None:
         depth = np.where(depth > 0, depth, SKY[i % 2]).astype(np.float32)
         intrinsics = frames.intrinsics[i].double().numpy()
         intrinsics[:2, 2] += 0.5
-        Image.fromarray(pixels(frames)[i]).save(folder / "Image/camera_0" / f"Image_{name}.png")
+        save(folder / "Image/camera_0" / f"Image_{name}.png", pixels(frames)[i])
         np.save(folder / "Depth/camera_0" / f"Depth_{name}.npy", depth.repeat(enlarge, 0).repeat(enlarge, 1))
         np.savez(folder / "camview/camera_0" / f"camview_{name}.npz", K=intrinsics, T=poses[i])
 

@@ -3,12 +3,11 @@
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
 from vg2gt.data import Frames
 from vg2gt.data.sources import KITTI
 
-from .layouts import Layout, camera_to_world, pixels
+from .layouts import Layout, camera_to_world, pixels, save
 
 DATE, DRIVE = "2011_09_26", "2011_09_26_drive_0001_sync"
 RADIUS = 6378137.0
@@ -45,11 +44,11 @@ def write(root: Path, frames: Frames) -> None:
     count = len(imu)
     for number in range(count + 10):
         i = min(max(number - 5, 0), count - 1)
-        Image.fromarray(pixels(frames)[i]).save(drive / "image_02" / "data" / f"{number:010d}.png")
+        save(drive / "image_02" / "data" / f"{number:010d}.png", pixels(frames)[i])
         (drive / "oxts" / "data" / f"{number:010d}.txt").write_text(packet(imu[i]))
         if number == i + 5:
             stored = (frames.depth[i].numpy() * 256 + 0.5).astype(np.uint16)
-            Image.fromarray(stored).save(depth_folder / f"{number:010d}.png")
+            save(depth_folder / f"{number:010d}.png", stored)
 
 
 def packet(imu_to_world: np.ndarray, latitude: float = 49.0, longitude: float = 8.4) -> str:

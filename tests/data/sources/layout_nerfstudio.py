@@ -3,25 +3,20 @@
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
 from vg2gt.data import Frames
 from vg2gt.data.sources import Nerfstudio
 from vg2gt.io import Lens, Transforms, TransformsFrame, write_transforms
 
-from .layouts import SIZE, Layout, pixels
+from .layouts import SIZE, Layout, pixels, save
 
 
 def write(root: Path, frames: Frames, depth: bool = True) -> None:
     """``transforms.json``, ``images/`` and ``depth/`` in millimetres."""
-    for name in ("images", "depth"):
-        (root / "desk" / name).mkdir(parents=True)
     records = []
     for i, image in enumerate(pixels(frames)):
-        Image.fromarray(image).save(root / "desk" / "images" / f"{i:04d}.png")
-        Image.fromarray((frames.depth[i].numpy() * 1000 + 0.5).astype(np.uint16)).save(
-            root / "desk" / "depth" / f"{i:04d}.png"
-        )
+        save(root / "desk" / "images" / f"{i:04d}.png", image)
+        save(root / "desk" / "depth" / f"{i:04d}.png", (frames.depth[i].numpy() * 1000 + 0.5).astype(np.uint16))
         lens = Lens.from_intrinsics(frames.intrinsics[i].double().numpy(), SIZE)
         pose = frames.world_to_camera[i].double().numpy()
         # Some writers leave the suffix out.

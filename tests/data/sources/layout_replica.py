@@ -3,22 +3,20 @@
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
 from vg2gt.data import Frames
 from vg2gt.data.sources import Replica
 
 from .layout_scannet import JPEG_ERROR
-from .layouts import Layout, camera_of, camera_to_world, pixels, room
+from .layouts import Layout, camera_of, camera_to_world, pixels, room, save
 
 
 def write(root: Path, frames: Frames, scene: str = "office3") -> None:
     folder = root / scene / "results"
-    folder.mkdir(parents=True)
     stored = (frames.depth.numpy() * 6553.5 + 0.5).astype(np.uint16)
     for i, image in enumerate(pixels(frames)):
-        Image.fromarray(image).save(folder / f"frame{i:06d}.jpg", quality=95, subsampling=0)
-        Image.fromarray(stored[i]).save(folder / f"depth{i:06d}.png")
+        save(folder / f"frame{i:06d}.jpg", image)
+        save(folder / f"depth{i:06d}.png", stored[i])
     np.savetxt(folder.parent / "traj.txt", camera_to_world(frames).reshape(-1, 16))
 
 

@@ -3,11 +3,10 @@
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
 from vg2gt.data import Frames, RGBDFolder
 
-from .layouts import Layout, camera_to_world, pixels
+from .layouts import Layout, camera_to_world, pixels, save
 
 
 def _millimetres(frames: Frames) -> np.ndarray:
@@ -16,11 +15,9 @@ def _millimetres(frames: Frames) -> np.ndarray:
 
 def write_recording(root: Path, frames: Frames, scene: str = "office") -> None:
     """``images/ depth/ poses.txt K.txt``; frames 10, 11, ..."""
-    for sub in ("images", "depth"):
-        (root / scene / sub).mkdir(parents=True)
     for i, (image, depth) in enumerate(zip(pixels(frames), _millimetres(frames), strict=True)):
-        Image.fromarray(image).save(root / scene / "images" / f"{i + 10:05d}.png")
-        Image.fromarray(depth).save(root / scene / "depth" / f"{i + 10:05d}.png")
+        save(root / scene / "images" / f"{i + 10:05d}.png", image)
+        save(root / scene / "depth" / f"{i + 10:05d}.png", depth)
     np.savetxt(root / scene / "poses.txt", camera_to_world(frames).reshape(-1, 16))
     np.savetxt(root / scene / "K.txt", frames.intrinsics[0].numpy())
 
@@ -29,8 +26,8 @@ def _write_pose_files(root: Path, frames: Frames) -> None:
     for sub in ("rgb", "depth", "pose", "intrinsic"):
         (root / "hall" / sub).mkdir(parents=True)
     for i, pose in enumerate(camera_to_world(frames)):
-        Image.fromarray(pixels(frames)[i]).save(root / "hall" / "rgb" / f"{i + 8}.jpg", quality=95, subsampling=0)
-        Image.fromarray(_millimetres(frames)[i]).save(root / "hall" / "depth" / f"{i + 8}.png")
+        save(root / "hall" / "rgb" / f"{i + 8}.jpg", pixels(frames)[i])
+        save(root / "hall" / "depth" / f"{i + 8}.png", _millimetres(frames)[i])
         np.savetxt(root / "hall" / "pose" / f"{i + 8}.txt", pose)
     matrix = np.eye(4)
     matrix[:3, :3] = frames.intrinsics[0].numpy()
@@ -42,9 +39,9 @@ def write_seven_scenes(root: Path, frames: Frames) -> None:
     folder = root / "chess" / "seq-01"
     folder.mkdir(parents=True)
     for i, pose in enumerate(camera_to_world(frames)):
-        Image.fromarray(pixels(frames)[i]).save(folder / f"frame-{i:06d}.color.png")
+        save(folder / f"frame-{i:06d}.color.png", pixels(frames)[i])
         depth = _millimetres(frames)[i]
-        Image.fromarray(np.where(depth == 0, 65535, depth)).save(folder / f"frame-{i:06d}.depth.png")
+        save(folder / f"frame-{i:06d}.depth.png", np.where(depth == 0, 65535, depth))
         np.savetxt(folder / f"frame-{i:06d}.pose.txt", pose)
     np.savetxt(root / "chess" / "camera-intrinsics.txt", frames.intrinsics[0].numpy())
 

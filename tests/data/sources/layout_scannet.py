@@ -11,7 +11,7 @@ from PIL import Image
 from vg2gt.data import Frames
 from vg2gt.data.sources import ScanNet, ScanNetSens
 
-from .layouts import Layout, camera_to_world, pixels
+from .layouts import Layout, camera_to_world, pixels, save
 
 JPEG_ERROR = 0.009
 """Mean absolute error of images of the test's room as JPEG of quality 95 (measured: 0.0060 to 0.0077)."""
@@ -27,8 +27,8 @@ def write_export(root: Path, frames: Frames, scene: str = "scene0707_00") -> Non
     for kind in ("color", "depth", "pose", "intrinsic"):
         (folder / kind).mkdir(parents=True)
     for i, pose in enumerate(camera_to_world(frames)):
-        Image.fromarray(pixels(frames)[i]).save(folder / "color" / f"{i + 8}.jpg", quality=95, subsampling=0)
-        Image.fromarray(millimetres(frames)[i]).save(folder / "depth" / f"{i + 8}.png")
+        save(folder / "color" / f"{i + 8}.jpg", pixels(frames)[i])
+        save(folder / "depth" / f"{i + 8}.png", millimetres(frames)[i])
         np.savetxt(folder / "pose" / f"{i + 8}.txt", pose)
     intrinsics = np.eye(4)
     intrinsics[:3, :3] = frames.intrinsics[0].numpy()

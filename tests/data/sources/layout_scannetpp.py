@@ -3,26 +3,23 @@
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
 from vg2gt.data import Frames
 from vg2gt.data.sources import ScanNetPPiPhone
 
 from .layout_scannet import JPEG_ERROR, millimetres
-from .layouts import Layout, camera_to_world, pixels
+from .layouts import Layout, camera_to_world, pixels, save
 
 
 def write(root: Path, frames: Frames) -> None:
     """Frames 0, 10, 20, ...; the cameras' file names them from the last to the first, and one more."""
     folder = root / "processed" / "0a5c013435"
-    (folder / "images").mkdir(parents=True)
-    (folder / "depth").mkdir()
     names = [f"frame_{10 * i:06d}" for i in range(len(frames.images))]
     for name, image, depth in zip(names, pixels(frames), millimetres(frames), strict=True):
-        Image.fromarray(image).save(folder / "images" / f"{name}.jpg", quality=95, subsampling=0)
-        Image.fromarray(depth).save(folder / "depth" / f"{name}.png")
-    Image.fromarray(np.zeros((20, 30, 3), np.uint8)).save(folder / "images" / "DSC00010.jpg")
-    Image.fromarray(np.zeros((20, 30), np.uint16)).save(folder / "depth" / "DSC00010.png")
+        save(folder / "images" / f"{name}.jpg", image)
+        save(folder / "depth" / f"{name}.png", depth)
+    save(folder / "images" / "DSC00010.jpg", np.zeros((20, 30, 3), np.uint8))
+    save(folder / "depth" / "DSC00010.png", np.zeros((20, 30), np.uint16))
     intrinsics = frames.intrinsics.double().numpy()
     intrinsics[:, :2, 2] += 0.5
     poses = camera_to_world(frames)

@@ -3,13 +3,12 @@
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
 from vg2gt.data import Frames
 from vg2gt.data.sources import TanksAndTemples
 from vg2gt.io import ColmapModel, ColmapPoints, colmap_camera, colmap_image, write_colmap
 
-from .layouts import SIZE, Layout, camera_to_world, pixels
+from .layouts import SIZE, Layout, camera_to_world, pixels, save
 
 # From the unit and axes of structure from motion to metres in the scan: scale 2.5, half a turn about an axis, a shift.
 TO_SCAN = np.array([[0, 2.5, 0, 1.0], [2.5, 0, 0, -4], [0, 0, -2.5, 2], [0, 0, 0, 1]])
@@ -18,13 +17,12 @@ TO_SCAN = np.array([[0, 2.5, 0, 1.0], [2.5, 0, 0, -4], [0, 0, -2.5, 2], [0, 0, 0
 def write(root: Path, frames: Frames) -> None:
     """Images 1, 2, ... of which the last is not registered; intrinsics from a COLMAP model in another world."""
     folder = root / "Barn"
-    folder.mkdir(parents=True)
     from_scan = np.linalg.inv(TO_SCAN)
     poses = from_scan @ camera_to_world(frames)
     poses[:, :3, :3] *= 2.5
     blocks = []
     for i, image in enumerate((*pixels(frames), pixels(frames)[0])):
-        Image.fromarray(image).save(folder / f"{i + 1:06d}.png")
+        save(folder / f"{i + 1:06d}.png", image)
         registered = i < len(poses)
         pose = poses[i] if registered else np.eye(4)
         rows = [" ".join(repr(float(value)) for value in row) for row in pose]

@@ -3,13 +3,12 @@
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from vg2gt.data import Frames
 from vg2gt.data.sources import TUM
 
-from .layouts import Layout, camera_of, camera_to_world, pixels, room
+from .layouts import Layout, camera_of, camera_to_world, pixels, room, save
 
 START = 1305031102.0
 
@@ -17,8 +16,6 @@ START = 1305031102.0
 def write(root: Path, frames: Frames, scene: str = "rgbd_dataset_freiburg1_desk") -> None:
     """Colour 30 times per second, depth 11 ms later, poses 100 times per second; the lists' last files are absent."""
     folder = root / scene
-    for kind in ("rgb", "depth"):
-        (folder / kind).mkdir(parents=True)
     stored = (frames.depth.numpy() * 5000 + 0.5).astype(np.uint16)
     stored[stored == 0] = 65535
     count = len(stored)
@@ -28,8 +25,8 @@ def write(root: Path, frames: Frames, scene: str = "rgbd_dataset_freiburg1_desk"
         for kind, stamp in (("rgb", time), ("depth", time + 0.011)):
             lists[kind].append(f"{stamp:.6f} {kind}/{stamp:.6f}.png")
         if i < count:
-            Image.fromarray(pixels(frames)[i]).save(folder / lists["rgb"][-1].split()[1])
-            Image.fromarray(stored[i]).save(folder / lists["depth"][-1].split()[1])
+            save(folder / lists["rgb"][-1].split()[1], pixels(frames)[i])
+            save(folder / lists["depth"][-1].split()[1], stored[i])
     for kind, lines in lists.items():
         (folder / f"{kind}.txt").write_text("\n".join(lines) + "\n")
     write_poses(folder, times, camera_to_world(frames))

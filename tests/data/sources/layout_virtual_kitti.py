@@ -3,13 +3,12 @@
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
 from vg2gt.data import Frames
 from vg2gt.data.sources import VirtualKITTI2
 
 from .layout_scannet import JPEG_ERROR
-from .layouts import Layout, pixels
+from .layouts import Layout, pixels, save
 
 POSE_HEADING = "frame cameraID r1,1 r1,2 r1,3 t1 r2,1 r2,2 r2,3 t2 r3,1 r3,2 r3,3 t3 0 0 0 1"
 CAMERA_HEADING = "frame cameraID K[0,0] K[1,1] K[0,2] K[1,2]"
@@ -19,13 +18,11 @@ def write(root: Path, frames: Frames, variation: str = "Scene06/fog", camera: in
     """Frames 0, 1, ... of a camera; the text files hold a second, displaced camera too. No depth is sky."""
     folder = root / variation
     centimetres = np.where(frames.depth.numpy() > 0, frames.depth.numpy() * 100 + 0.5, 65535).astype(np.uint16)
-    for kind in ("rgb", "depth"):
-        (folder / "frames" / kind / f"Camera_{camera}").mkdir(parents=True)
     poses, cameras = [], []
     for i, image in enumerate(pixels(frames)):
         colour = folder / "frames/rgb" / f"Camera_{camera}" / f"rgb_{i:05d}.jpg"
-        Image.fromarray(image).save(colour, quality=95, subsampling=0)
-        Image.fromarray(centimetres[i]).save(folder / "frames/depth" / f"Camera_{camera}" / f"depth_{i:05d}.png")
+        save(colour, image)
+        save(folder / "frames/depth" / f"Camera_{camera}" / f"depth_{i:05d}.png", centimetres[i])
         matrix, pose = frames.intrinsics[i].numpy(), frames.world_to_camera[i].double().numpy()
         for number in (0, 1):
             displaced = pose + np.eye(4)[:, :1] @ np.eye(4)[3:] * (number - camera)

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from PIL import Image
 
 from vg2gt.data import Frames, SyntheticScenes
 from vg2gt.data.sources.files import FileSource
@@ -69,3 +70,10 @@ def camera_of(frames: Frames) -> list[float]:
 def pixels(frames: Frames) -> np.ndarray:
     """``[V, H, W, 3]`` uint8 images of frames."""
     return (frames.images.permute(0, 2, 3, 1).numpy() * 255 + 0.5).astype(np.uint8)
+
+
+def save(path: Path, image: np.ndarray) -> None:
+    """Writes an image, as JPEG of quality 95 or without loss, and makes its folder."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    options = {"quality": 95, "subsampling": 0} if path.suffix == ".jpg" else {}
+    Image.fromarray(image).save(path, **options)
