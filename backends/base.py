@@ -22,7 +22,7 @@ class Backend(nn.Module, ABC):
     Args:
         name: stands in checkpoints and messages.
         patch_size: edge of a patch in pixels; image sizes must be multiples of it.
-        token_dims: channels of the patch tokens, one entry a tapped layer, in tap order.
+        token_dims: channels of the patch tokens, one entry per tapped layer, in tap order.
         licence: licence of the weights, printed when they are loaded.
         is_metric: True if ``Geometry.scale`` turns the decoded depth into metres.
         supports_gradient: True if ``decode`` is differentiable in ``tokens.patch``.

@@ -74,7 +74,7 @@ class DPT(nn.Module):
         features: width of the fusion stages.
         out_channels: channels of the four projected maps.
         out: channels of the result.
-        patch_size: pixels a token.
+        patch_size: pixels per token.
         rectified_skip: see :class:`ResidualUnit`.
         normalize: whether one LayerNorm, shared by the taps, comes first.
         position_weight: weight of the sine-cosine coordinates added to the maps; 0 adds none.
@@ -122,7 +122,7 @@ class DPT(nn.Module):
         image_size = (grid[0] * self.patch_size, grid[1] * self.patch_size)
         maps = []
         for level, (tap, project, resize) in enumerate(zip(tokens, self.projects, self.resize_layers, strict=True), 1):
-            x = project(self.norm(tap).transpose(1, 2).unflatten(-1, grid))
+            x = project(self.norm(tap).transpose(1, 2).unflatten(-1, grid))  # [N, C, h, w]
             x = resize(self._add_position(x, image_size))
             maps.append(self.scratch.get_submodule(f"layer{level}_rn")(x))
         fused, finer = maps[3], None

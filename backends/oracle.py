@@ -27,7 +27,7 @@ NOISE_GRID = (4, 8)
 SMOOTH_SHARE, VIEW_SHARE = 0.8, 0.6  # 0.8^2 + 0.6^2 = 1
 BLEED_THRESHOLD = 0.02
 INVALID_CONFIDENCE = 1e-3
-CELLS = 2  # the depth residual has CELLS x CELLS values a patch
+CELLS = 2  # the depth residual has CELLS x CELLS values per patch
 WAVELENGTHS = (1.0, 0.5, 0.25)  # of the encoded place of a patch, in median depths
 GEOMETRY_CHANNELS = CELLS * CELLS + 1 + 3 + 3 + 3 + 6 * len(WAVELENGTHS)
 
@@ -36,7 +36,7 @@ class OracleBackend(Backend):
     """Simulated VFM (needs hints).
 
     Depth is ``gt * (1 + depth_noise * (0.8 s + 0.6 c))`` with a smooth field s (bicubic from 4x8 normal values, unit
-    deviation) and one normal value c a view, then bleeds over depth edges as decoded depth does. Confidence is
+    deviation) and one normal value c per view, then bleeds over depth edges as decoded depth does. Confidence is
     ``1 + 4 exp(-|relative error| / max(depth_noise, 0.01))`` times log-normal noise. Camera rotations err by
     ``0.5 * pose_noise`` rad and positions by ``pose_noise`` median depths of their view, per axis; view 0 is exact.
     All noise is seeded by (seed, scene, frame), whatever the order or number of views.

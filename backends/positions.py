@@ -14,7 +14,7 @@ Resampling = Literal["size", "scale"]
 
 
 def resize_position_embedding(embedding: Tensor, grid: tuple[int, int], resampling: Resampling) -> Tensor:
-    """Bicubic resize of a square position embedding to another patch grid, as one matrix product an axis.
+    """Bicubic resize of a square position embedding to another patch grid, as one matrix product per axis.
 
     Args:
         embedding: ``[side * side, C]``, row major.

@@ -68,7 +68,7 @@ class SwiGLU(nn.Module):
 
 
 class LayerScale(nn.Module):
-    """One factor a channel."""
+    """One factor per channel."""
 
     def __init__(self, dim: int, value: float) -> None:
         super().__init__()

@@ -141,7 +141,7 @@ class PretrainedBackbone(nn.Module):
 
 
 def select_reference(tokens: Tensor, strategy: ReferenceView) -> Tensor:
-    """Chooses one view a scene from class tokens ``[B, V, C]``; returns int64 ``[B]``, 0 for fewer than three views.
+    """Chooses one view per scene from class tokens ``[B, V, C]``; returns int64 ``[B]``, 0 for fewer than three.
 
     ``saddle_balanced`` takes the view nearest to the middle of three ranges, each scaled to [0, 1] over the views: mean
     cosine similarity to the others, token norm, and variance of the normalised token.

@@ -52,7 +52,7 @@ class DA3Decoder(nn.Module):
     def decode(self, tokens: Tokens, chunk: int | None) -> Geometry:
         """See :meth:`Backend.decode`; at most ``chunk`` views at a time go through the depth head."""
         with full_precision(tokens.camera):
-            out = in_chunks(self.head, tokens.patch, tokens.grid, chunk)
+            out = in_chunks(self.head, tokens.patch, tokens.grid, chunk)  # [B, V, 2, H, W]
             camera_to_world, intrinsics = decode_pose(self.cam_dec(tokens.camera), tokens.size)
         depth, confidence = out[:, :, 0].exp(), 1 + out[:, :, 1].exp()
         cameras = Cameras(invert_rigid(camera_to_world), intrinsics, tokens.size)

@@ -40,7 +40,7 @@ class DA3MetricNetwork(nn.Module):
 class DA3SingleViewBackend(NetworkBackend):
     """One of DA3's networks that see one view at a time: cameras come from the data, confidence is 1.
 
-    Depth is the network's output times one factor a view, which the subclass knows; sky gets the far end of the scene.
+    Depth is the network's output times one factor per view, which the subclass knows; sky gets the scene's far end.
     Arguments: see :class:`NetworkBackend`; ``depth`` is the number of blocks.
     """
 
@@ -163,7 +163,7 @@ def quantile(values: Tensor, q: float) -> Tensor:
 
 
 class DA3NestedBackend(Backend):
-    """DA3's relative network with a metric scale: one factor a scene, fitted to the metric network's depth.
+    """DA3's relative network with a metric scale: one factor per scene, fitted to the metric network's depth.
 
     Geometry stays the relative network's; ``Geometry.scale`` turns it into metres.
 

@@ -1,4 +1,4 @@
-"""VGGT: a DINOv2 encoder a view, then alternating attention within and across views.
+"""VGGT: a DINOv2 encoder per view, then alternating attention within and across views.
 
 Module names follow the published weight file (``facebook/VGGT-1B``).
 """
@@ -90,7 +90,7 @@ class Aggregator(nn.Module):
             across = global_block(within.reshape(batch, views * count, -1), (global_rotary[0], global_rotary[1]))
             x = across.reshape(batch * views, count, -1)
             if index in taps or index == last:
-                both = torch.cat((within, x), -1).unflatten(0, (batch, views))
+                both = torch.cat((within, x), -1).unflatten(0, (batch, views))  # [B, V, N, 2C]
                 camera = both[:, :, 0]
                 if index in taps:
                     tapped.append(both[:, :, start:])
@@ -137,7 +137,7 @@ class VGGTDecoder(nn.Module):
     def decode(self, tokens: Tokens, chunk: int | None) -> Geometry:
         """See :meth:`Backend.decode`; at most ``chunk`` views at a time go through the depth head."""
         with full_precision(tokens.camera):
-            out = in_chunks(self.depth_head, tokens.patch, tokens.grid, chunk)
+            out = in_chunks(self.depth_head, tokens.patch, tokens.grid, chunk)  # [B, V, 2, H, W]
             world_to_camera, intrinsics = decode_pose(self.camera_head(tokens.camera), tokens.size)
         depth, confidence = out[:, :, 0].exp(), 1 + out[:, :, 1].exp()
         cameras = Cameras(world_to_camera, intrinsics, tokens.size)

@@ -38,7 +38,7 @@ def radix_order(keys, bits):
 
 @njit(error_model="numpy", nogil=True, cache=True)
 def count_tiles(boxes, visible, across, counts, offsets, starts):
-    """Counts tiles a Gaussian (with offsets, in the given depth order) and Gaussians a tile (as list starts)."""
+    """Counts tiles per Gaussian (offsets in the given depth order) and Gaussians per tile (as list starts)."""
     for k in range(len(starts)):
         starts[k] = 0
     total = 0

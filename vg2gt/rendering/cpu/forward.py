@@ -112,7 +112,7 @@ _blend_all, _blend_color = _make_blend_tile(True), _make_blend_tile(False)
 
 @njit(fastmath=FAST, error_model="numpy", nogil=True, cache=True)
 def _transmit(state, hits, most, y):
-    """Squared transmittance of a row's rays at the depths in plane MEDIAN, as NUM / DEN: one exponential a hit."""
+    """Squared transmittance of a row's rays at the depths in plane MEDIAN, as NUM / DEN: one exponential per hit."""
     base, capacity = np.uintp(y * TILE), len(hits) // (TILE * HIT_SIZE)
     for lane in range(TILE):
         k = base + np.uintp(lane)

@@ -24,7 +24,7 @@ from vg2gt.rendering.median import depth_factors
 from vg2gt.rendering.options import MEDIAN_MAX_TRANSMITTANCE, TRANSMITTANCE_STOP, Images, RenderOptions, SceneViews
 
 TILES_PER_ITEM = 8
-HIT_CAPACITY = 48  # hits a pixel keeps for the depth solver before its tile is given more room
+HIT_CAPACITY = 48  # hits that a pixel keeps for the depth solver before its tile is given more room
 NEGLIGIBLE = {np.dtype(np.float32): 30.0, np.dtype(np.float64): 90.0}  # squared sigmas at which a profile vanishes
 
 _local = threading.local()

@@ -26,7 +26,7 @@ from vg2gt.rendering.projection import Splats, list_cells, pixel_boxes, visible_
 
 kernels: Any = launchable  # Triton makes its functions objects that take a grid: kernel[grid](...)
 
-HIT_CAPACITY = 48  # hits a ray keeps for the depth solver before the views are blended again with more room
+HIT_CAPACITY = 48  # hits that a ray keeps for the depth solver before the views are blended again with more room
 NEGLIGIBLE = {torch.float32: 30.0, torch.float64: 90.0}  # squared sigmas at which a profile vanishes
 
 

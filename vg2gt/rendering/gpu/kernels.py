@@ -116,7 +116,7 @@ def blend_kernel(
 
 @triton.jit
 def _transmit(slot, plane, pixels, count, most, t):
-    """Squared transmittance at depths ``t`` as a quotient, and ``-2 d ln T / dt``: one exponential a hit."""
+    """Squared transmittance at depths ``t`` as a quotient, and ``-2 d ln T / dt``: one exponential per hit."""
     numerator, denominator, slope = t * 0 + 1.0, t * 0 + 1.0, t * 0
     c = 0
     while c < most:
