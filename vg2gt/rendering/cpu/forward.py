@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -23,7 +24,7 @@ from vg2gt.rendering.cpu.response import attenuate, exp, respond
 from vg2gt.rendering.cpu.tiles import HIT_SIZE, PLANE, STAGED, TILE, any_alive, stage, start_rays
 
 
-def _make_blend_tile(geometry: bool) -> Callable[..., int]:
+def _make_blend_tile(geometry: bool) -> Callable[..., Any]:
     """Compiles the blending of a tile with or without depth and normals: within it that is a constant."""
 
     @njit(fastmath=FAST, error_model="numpy", nogil=True, cache=True)

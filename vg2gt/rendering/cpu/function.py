@@ -235,7 +235,7 @@ def _backward(
         scratch = _scratch(view.means.dtype)
         backward_tiles(
             lists.records, lists.boxes, view.colors, lists.members, lists.starts, tile_range, geometry,
-            parameters, scratch.state, scratch.sums, scratch.staged, scratch.spans, *planes, rows,
+            parameters, scratch.state, scratch.sums, scratch.staged, scratch.spans, *[*planes, rows],
         )  # fmt: skip
 
     parallel_for(view.tile_ranges, rasterize)
