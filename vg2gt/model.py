@@ -174,6 +174,7 @@ class VG2GT(Reconstructor):
             (ablation w/o Coarse): the geometry is then the backbone's.
         fine: makes the fine-level voxel module from ``token_dims`` and ``patch_size``.
         gaussians: makes the self-splitting Gaussian head from ``in_channels``.
+        keep_scale: the enhanced depth keeps the scale of the backbone's, see :func:`with_scale_of`.
 
     Raises:
         ValueError: if the scale is to be metric and the backend is not.
@@ -186,9 +187,11 @@ class VG2GT(Reconstructor):
         coarse: Callable[..., nn.Module] | None,
         fine: Callable[..., nn.Module],
         gaussians: Callable[..., nn.Module],
+        keep_scale: bool = True,
     ) -> None:
         super().__init__(backend, scale)
         dims, patch = backend.token_dims, backend.patch_size
+        self.keep_scale = keep_scale
         self.coarse = coarse(token_dim=dims[-1], num_taps=len(dims), patch_size=patch) if coarse else None
         self.fine = fine(token_dims=dims, patch_size=patch)
         self.gaussians = gaussians(in_channels=self.fine.out_channels)
@@ -214,12 +217,33 @@ class VG2GT(Reconstructor):
             with stage("decode_again"):
                 again = self.backend.decode(tokens)
             # The camera token is untouched, so the cameras are the backbone's: decoded once, used throughout.
-            geometry = replace(initial, depth=again.depth * unit[:, None, None, None], depth_conf=again.depth_conf)
+            depth = again.depth * unit[:, None, None, None]
+            depth = depth if not self.keep_scale else with_scale_of(initial, depth)
+            geometry = replace(initial, depth=depth, depth_conf=again.depth_conf)
         with stage("fine"):
             voxels: Voxels = self.fine(tokens, geometry, images)
         with stage("gaussians"):
             gaussians: Gaussians = self.gaussians(voxels)
         return Prediction(initial, geometry, voxels, gaussians, unit)
+
+
+def with_scale_of(initial: Geometry, depth: Tensor) -> Tensor:
+    """Takes the one factor per scene between enhanced and initial depth out of the enhanced depth, differentiably.
+
+    The cameras stay the backbone's, so the scale of all views' depth against their translations must as well: losses
+    that align depth by a free factor do not see it drift, but every view would unproject to another place. The factor
+    is the exponential of the mean log-ratio, weighted by the backbone's confidence.
+
+    Args:
+        initial: the backbone's geometry.
+        depth: ``[B, V, H, W]`` enhanced depth of the same pixels.
+    """
+    reference = initial.depth.detach()
+    valid = (reference > 0) & (depth > 0)
+    weight = torch.where(valid, initial.depth_conf.detach(), 0.0)  # [B, V, H, W]
+    ratio = torch.where(valid, reference, 1.0).log() - torch.where(valid, depth, 1.0).log()
+    mean = (weight * ratio).sum((1, 2, 3)) / weight.sum((1, 2, 3)).clamp(min=torch.finfo(weight.dtype).tiny)  # [B]
+    return depth * mean.exp()[:, None, None, None]
 
 
 def _to_scene_frame(geometry: Geometry, unit: Tensor) -> Geometry:

@@ -196,6 +196,23 @@ class Geometry(TensorRecord):
 
 
 @dataclass(frozen=True)
+class VoxelMoments(TensorRecord):
+    """How the points of M voxels lie and how colour changes among them; constants, lengths in cells.
+
+    Attributes:
+        spread: ``[M, 3, 3]`` covariance of the points' positions.
+        cross: ``[M, 3 (position), 3 (colour)]`` covariance of position and colour.
+        facing: ``[M, 3]`` unit vectors towards the cameras that saw the points.
+        pixel: ``[M]`` side of a pixel at the points' depth.
+    """
+
+    spread: Tensor
+    cross: Tensor
+    facing: Tensor
+    pixel: Tensor
+
+
+@dataclass(frozen=True)
 class Voxels(TensorRecord):
     """Occupied voxels of B scenes, packed and sorted by scene.
 
@@ -208,6 +225,7 @@ class Voxels(TensorRecord):
         count: ``[M]`` points inside, as a float.
         centroid: ``[M, 3]`` confidence-weighted mean position.
         voxel_size: ``[B]`` edge length in scene units.
+        moments: how the points lie in their cells; None where nobody asked.
     """
 
     features: Tensor
@@ -218,6 +236,7 @@ class Voxels(TensorRecord):
     count: Tensor
     centroid: Tensor
     voxel_size: Tensor
+    moments: VoxelMoments | None = None
 
     @property
     def centers(self) -> Tensor:

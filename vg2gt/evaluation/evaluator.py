@@ -13,6 +13,8 @@ from vg2gt.evaluation.options import EvaluationOptions
 from vg2gt.evaluation.protocols import ground_truth_target_cameras, joint_target_cameras
 from vg2gt.evaluation.scene_metrics import (
     align_geometry,
+    depth_to_camera_scale,
+    edge_metrics,
     image_metrics,
     point_cloud_metrics,
     present,
@@ -70,6 +72,9 @@ def evaluate_scene(model: Reconstructor, renderer: Renderer, batch: Batch) -> di
         "normal_mean": rendered_normal_metrics(rendered, target)["normal_mean"],
         "decoded_abs_rel_before": abs_rel(prediction.initial.depth, batch.context),
         "decoded_abs_rel": abs_rel(prediction.geometry.depth, batch.context),
+        **edge_metrics(rendered, target, "scene"),
+        "depth_to_camera_scale_before": depth_to_camera_scale(prediction.initial, batch.context),
+        "depth_to_camera_scale": depth_to_camera_scale(prediction.geometry, batch.context),
         "gaussians": float(len(prediction.gaussians)),
         "cv": cv(prediction.gaussians.means, max_queries=CV_QUERIES),
     }

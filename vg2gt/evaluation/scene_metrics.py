@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 
+import torch
 from torch import Tensor
 
-from vg2gt.geometry.alignment import Similarity, align_points
+from vg2gt.geometry.alignment import Similarity, align_cameras, align_points, fit_depth_scale
 from vg2gt.geometry.cameras import unproject
 from vg2gt.geometry.normals import normals_from_depth
-from vg2gt.metrics import LPIPS, normal_metrics, point_metrics, psnr, ssim
+from vg2gt.metrics import LPIPS, depth_metrics, near_depth_edges, normal_metrics, point_metrics, psnr, ssim
 from vg2gt.types import Batch, Cameras, Geometry, Render
 
 
@@ -33,6 +34,30 @@ def rendered_normal_metrics(rendered: Render, truth: Batch) -> dict[str, float]:
     normals, valid = normals_from_depth(truth.depth, truth.cameras.intrinsics)
     found = normal_metrics(rendered.normal[0], normals[0], valid[0] & (rendered.depth[0] > 0))
     return {f"normal_{name}": value for name, value in found.items()}
+
+
+def edge_metrics(rendered: Render, truth: Batch, alignment: str) -> dict[str, float]:
+    """``edge_psnr`` and ``edge_abs_rel`` of one scene: only pixels within 3 pixels of an edge of the true depth.
+
+    NaN where there is no such pixel. Depth is aligned by all pixels.
+    """
+    region = near_depth_edges(truth.depth)
+    depth = depth_metrics(rendered.depth[0], truth.depth[0], alignment, region=region[0])
+    error = (rendered.color.clamp(0, 1) - truth.images.clamp(0, 1)).double().square().mean(2)[0]  # [V, H, W]
+    per_view = [e[r].mean() for e, r in zip(error, region[0], strict=True) if r.any()]
+    psnr = -10 * torch.stack(per_view).log10().mean() if per_view else torch.nan
+    return {"edge_psnr": float(psnr), "edge_abs_rel": depth["abs_rel"]}
+
+
+def depth_to_camera_scale(geometry: Geometry, truth: Batch) -> float:
+    """Size of decoded depth over that of the cameras' translations, 1 where both fit together; one scene.
+
+    Either is measured against the truth: depth by the factor of least relative L1 error, cameras by the similarity onto
+    the true ones. NaN without depth or with cameras that stand still.
+    """
+    depth = fit_depth_scale(geometry.depth, truth.depth, truth.depth > 0)
+    unknown = torch.full_like(depth, torch.nan)
+    return float(align_cameras(geometry.cameras, truth.cameras, unknown).scale / depth)
 
 
 def point_cloud_metrics(

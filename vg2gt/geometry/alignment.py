@@ -8,7 +8,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from vg2gt.geometry.cameras import compose
+from vg2gt.geometry.cameras import camera_centers, compose
 from vg2gt.types import Cameras, TensorRecord
 
 SUBSAMPLE = 64
@@ -106,7 +106,7 @@ class Similarity(TensorRecord):
     def apply_cameras(self, cameras: Cameras) -> Cameras:
         """Moves cameras into the target frame: centres like points, orientations turned, intrinsics kept."""
         rotation = compose(cameras.world_to_camera[..., :3, :3], self.rotation[:, None].transpose(-1, -2))
-        translation = -compose(rotation, self.apply(_centers(cameras))[..., None])
+        translation = -compose(rotation, self.apply(camera_centers(cameras))[..., None])
         top = torch.cat((rotation, translation), -1)
         pose = torch.cat((top, cameras.world_to_camera[..., 3:, :]), -2)
         return Cameras(pose, cameras.intrinsics, cameras.size)
@@ -132,7 +132,7 @@ def align_cameras(predicted: Cameras, reference: Cameras, still_scale: Tensor | 
     orientations = [cameras.world_to_camera[..., :3, :3].double() for cameras in (predicted, reference)]
     rotation = _nearest_rotation((orientations[1].transpose(-1, -2) @ orientations[0]).sum(1))
 
-    source, target = _centers(predicted).double(), _centers(reference).double()
+    source, target = camera_centers(predicted).double(), camera_centers(reference).double()
     still = 1.0 if still_scale is None else still_scale.double()
     return _umeyama(rotation, source, target, _moves(source) & _moves(target), still, dtype)
 
@@ -173,12 +173,6 @@ def _moves(centers: Tensor) -> Tensor:
     """Whether the points ``[B, N, 3]`` of a scene differ by more than float32's rounding."""
     spread = (centers - centers.mean(1, keepdim=True)).norm(dim=-1).amax(1)
     return spread > 1e-6 * centers.norm(dim=-1).amax(1)
-
-
-def _centers(cameras: Cameras) -> Tensor:
-    """Camera centres ``[B, V, 3]`` in the world frame."""
-    pose = cameras.world_to_camera
-    return -compose(pose[..., :3, :3].transpose(-1, -2), pose[..., :3, 3:])[..., 0]
 
 
 def _nearest_rotation(matrix: Tensor) -> Tensor:

@@ -125,3 +125,9 @@ def crop_intrinsics(intrinsics: Tensor, left: int, top: int) -> Tensor:
     out[..., 0, 2] -= left
     out[..., 1, 2] -= top
     return out
+
+
+def camera_centers(cameras: Cameras) -> Tensor:
+    """Camera centres ``[B, V, 3]`` in the world frame."""
+    pose = cameras.world_to_camera
+    return -compose(pose[..., :3, :3].transpose(-1, -2), pose[..., :3, 3:])[..., 0]

@@ -119,13 +119,14 @@ class VG2GTLoss(nn.Module):
         with torch.autocast(batch.images.device.type, enabled=False):
             truth = normalize_truth(batch.map(_full_precision))
             initial, enhanced = (g.map(_full_precision) for g in (prediction.initial, prediction.geometry))
-            scales = self.align.fit(enhanced, truth)
+            initial_scales = self.align.fit(initial, truth)
+            scales = initial_scales if self.align.source == "initial" else self.align.fit(enhanced, truth)
             if shown is not None:
                 hits = self.gaussian.hits(shown.render)
                 scales = self.align.fit_rendered(shown.render.depth, hits, shown.views, truth, scales)
             context = truth.views(slice(0, batch.num_context))
             valid = context.valid & (initial.depth > 0) & (enhanced.depth > 0)
-            before, after = self.align.fit(initial, truth).apply(initial), scales.apply(enhanced)
+            before, after = initial_scales.apply(initial), scales.apply(enhanced)
             scenes = [
                 self._geometry_terms(_one(before, i), _one(after, i), context.scene(i), valid[i : i + 1])
                 for i in range(len(batch.scene))

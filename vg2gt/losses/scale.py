@@ -12,7 +12,7 @@ from vg2gt.geometry.cameras import scale_translations
 from vg2gt.losses.truth import Truth
 from vg2gt.types import Geometry, TensorRecord
 
-SCALE_SOURCES = ("enhanced", "rendered")
+SCALE_SOURCES = ("initial", "enhanced", "rendered")
 
 
 @dataclass(frozen=True)
@@ -43,8 +43,9 @@ class ScaleAlignment:
     """How the prediction is brought into the ground truth's unit before the losses compare them.
 
     Args:
-        source: ``enhanced`` fits the scale on the enhanced depth; ``rendered`` on the rendered depth, as the paper's
-            appendix says, which holes and early training make unstable.
+        source: ``initial`` fits the scale on the backbone's own depth, so that no loss is blind to a change of the
+            enhanced depth's scale; ``enhanced`` on the enhanced depth; ``rendered`` on the rendered depth, as the
+            paper's appendix says, which holes and early training make unstable.
         per_view: fit every context view's depth on its own; translations and held-out views keep the scene's scale.
 
     Raises:
@@ -75,7 +76,7 @@ class ScaleAlignment:
             truth: ground truth of all views.
             decoded: the decoded depth's scales, kept for scenes where nothing was rendered.
         """
-        if self.source == "enhanced":
+        if self.source != "rendered":
             return decoded
         shown = truth.views(views)
         return self._fit(depth, shown, views, shown.valid & hits, decoded)

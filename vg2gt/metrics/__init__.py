@@ -2,6 +2,7 @@
 
 from vg2gt.metrics.cameras import camera_metrics, relative_pose_errors
 from vg2gt.metrics.depth import depth_metrics
+from vg2gt.metrics.edges import near_depth_edges
 from vg2gt.metrics.images import psnr, ssim
 from vg2gt.metrics.lpips import LPIPS, WeightsNotFoundError, load_lpips
 from vg2gt.metrics.normals import normal_metrics
@@ -15,6 +16,7 @@ __all__ = [
     "cv",
     "depth_metrics",
     "load_lpips",
+    "near_depth_edges",
     "normal_metrics",
     "point_metrics",
     "psnr",

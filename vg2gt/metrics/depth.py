@@ -15,7 +15,9 @@ NAMES = ("abs_rel", "mae", "rmse", *(f"delta_{d}" for d in DELTAS), "coverage", 
 SMALLEST = 1e-6
 
 
-def depth_metrics(predicted: Tensor, reference: Tensor, alignment: str = "median") -> dict[str, float]:
+def depth_metrics(
+    predicted: Tensor, reference: Tensor, alignment: str = "median", region: Tensor | None = None
+) -> dict[str, float]:
     """Scores the depth maps of one scene: pixels are averaged per image, images per scene.
 
     A pixel counts where the reference is valid and the prediction has a depth.
@@ -25,6 +27,7 @@ def depth_metrics(predicted: Tensor, reference: Tensor, alignment: str = "median
         reference: ``[V, H, W]`` true z-depth, 0 = invalid.
         alignment: ``median``: one median ratio per image; ``scene``: one median ratio per scene; ``wmed``: the ratio
             per image that minimises the relative L1 error; ``scale_shift``: least squares per image; ``none``.
+        region: ``[V, H, W]`` bool, the pixels that are scored; all of them decide the alignment. None scores all.
 
     Returns:
         ``abs_rel``, ``mae``, ``rmse`` (in the reference's unit), ``delta_1.25``, ``delta_1.05``, ``delta_1.03`` over
@@ -48,10 +51,11 @@ def depth_metrics(predicted: Tensor, reference: Tensor, alignment: str = "median
         alignment = "none"
         if valid.any():
             predicted = predicted * (reference[valid] / predicted[valid]).median()
+    region = torch.ones_like(usable) if region is None else region
     images = [
-        _score(align_depth(p[v], r[v], alignment), r[v], v.sum().double() / u.sum())
-        for p, r, u, v in zip(predicted, reference, usable, valid, strict=True)
-        if u.any()
+        _score(align_depth(p[v], r[v], alignment)[s[v]], r[v & s], (v & s).sum().double() / (u & s).sum())
+        for p, r, u, v, s in zip(predicted, reference, usable, valid, region, strict=True)
+        if (u & s).any()
     ]
     return {name: float(torch.stack([i[name] for i in images]).nanmean()) if images else math.nan for name in NAMES}
 

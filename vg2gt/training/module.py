@@ -138,10 +138,15 @@ class VG2GTModule(lightning.LightningModule):
         return torch.stack([parameter.sum() for parameter in self.model.trained_parameters()]).sum() * torch.nan
 
     def _draw_views(self, batch: Batch) -> Tensor:
-        """Indices of the views to render: all held-out views, then a random choice of context views, up to the cap."""
+        """Indices of the views to render: held-out views first, but at least one context view, drawn at random.
+
+        Only context views have a decoded depth that the rendered depth can be compared with.
+        """
         total = batch.images.shape[1]
-        held_out = torch.arange(batch.num_context, total)
         context = torch.randperm(batch.num_context, generator=self.generator)
+        held_out = batch.num_context + torch.randperm(total - batch.num_context, generator=self.generator)
+        if self.render_views is not None:
+            held_out = held_out[: max(self.render_views - 1, 0)]
         return torch.cat((held_out, context))[: self.render_views]
 
     def _step_figures(self, report: LossReport, batch: Batch, prediction: Prediction) -> dict[str, Tensor]:

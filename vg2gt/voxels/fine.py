@@ -9,9 +9,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from vg2gt.geometry.cameras import unproject
+from vg2gt.geometry.cameras import camera_centers, unproject
 from vg2gt.memory import Cap, check_limit, note_sizes
-from vg2gt.types import Geometry, Tokens, Voxels
+from vg2gt.types import Geometry, Tokens, VoxelMoments, Voxels
 from vg2gt.voxels.dense_head import DenseHead
 from vg2gt.voxels.grid import (
     VoxelPlan,
@@ -25,10 +25,14 @@ from vg2gt.voxels.grid import (
     warn_if_sparse,
 )
 from vg2gt.voxels.pointmlp import PointMLP
+from vg2gt.voxels.silhouette import on_surface
 
 log = logging.getLogger(__name__)
 
 EXTRA_CHANNELS = 8  # colour (3), position of the centroid in the cell (3), number of points, confidence
+MOMENT_CHANNELS = 15  # spread (6), covariance with colour (9)
+UPPER = ((0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2))  # rows and columns of a symmetric 3x3 matrix's upper triangle
+FULL = (0, 1, 2, 1, 3, 4, 2, 4, 5)  # where its nine entries are among those six
 
 
 class FineModule(nn.Module):
@@ -46,6 +50,9 @@ class FineModule(nn.Module):
         min_footprint: smallest edge in pixels at the scene's median depth; 0 switches the guard off.
         max_voxels: most voxels a scene; beyond it the least confident are dropped, with a warning in the log and
             the metric ``train/voxels_dropped``. None keeps all.
+        moments: second moments of the points are pooled too: further inputs of the voxel network, and what the
+            Gaussian head's surfel start is made of.
+        drop_fringes: pixels between foreground and background (:mod:`vg2gt.voxels.silhouette`) are left out.
 
     Attributes:
         out_channels: width of the refined features.
@@ -64,6 +71,8 @@ class FineModule(nn.Module):
         voxel_size: float = 0.002,
         min_footprint: float = 1.0,
         max_voxels: int | None = None,
+        moments: bool = False,
+        drop_fringes: bool = False,
     ) -> None:
         super().__init__()
         self.voxel_size = voxel_size
@@ -73,7 +82,9 @@ class FineModule(nn.Module):
         self.dense_head = dense_head(token_dims=token_dims, patch_size=patch_size)
         width = self.dense_head.out_channels
         self.point_offset = nn.Linear(3, width, bias=False)
-        self.point_mlp = point_mlp(in_channels=width + EXTRA_CHANNELS)
+        self.moments = moments
+        self.drop_fringes = drop_fringes
+        self.point_mlp = point_mlp(in_channels=width + EXTRA_CHANNELS + MOMENT_CHANNELS * moments)
         self.out_channels = self.point_mlp.out_channels
 
     def forward(self, tokens: Tokens, geometry: Geometry, images: Tensor) -> Voxels:
@@ -92,22 +103,64 @@ class FineModule(nn.Module):
         """
         with torch.autocast(images.device.type, enabled=False):
             size = scene_voxel_size(geometry, self.voxel_size, self.min_footprint)
-            points = _Points(geometry, size)
+            points = _Points(geometry, size, self.drop_fringes)
             plan = self._plan(points)
             if images.shape[1] > 1:
                 warn_if_sparse(plan, "fine")
         pooled = self._pool_features(tokens, images, points, plan)
         with torch.autocast(images.device.type, enabled=False):
-            colors = pool_mean(images.float().permute(0, 1, 3, 4, 2).reshape(-1, 3), points.confidence, plan)
-            offset = pool_mean(points.offset, points.confidence, plan)
+            pixels = images.float().permute(0, 1, 3, 4, 2).reshape(-1, 3)  # [B V H W, 3]
+            means = pool_mean(torch.cat((points.offset, pixels), -1), points.confidence, plan)
+            offset, colors = means.split(3, -1)
             confidence = pool_min(points.confidence, plan)
             count = plan.counts.to(pooled.dtype)
             density = torch.log(count / _scene_medians(count, plan.batch))
-            extra = torch.cat((2 * colors - 1, 2 * offset, density[:, None], confidence.log()[:, None]), -1)
+            extra = [2 * colors - 1, 2 * offset, density[:, None], confidence.log()[:, None]]
             # Not grid * size + ...: centre plus offset keeps the centroid inside its cell in float32.
             centroid = (plan.grid + 0.5 + offset.double()) * size.double()[plan.batch, None]
-        refined = self.point_mlp(torch.cat((pooled, extra), -1), plan.grid, plan.batch, size)
-        return Voxels(refined, colors, plan.grid, plan.batch, confidence, count, centroid.to(pooled.dtype), size)
+            centroid = centroid.to(pooled.dtype)
+            moments = (
+                self._pool_moments(geometry, size, points, pixels, means, centroid, plan) if self.moments else None
+            )
+            if moments is not None:
+                extra += [12 * moments.spread[:, UPPER[0], UPPER[1]], 20 * moments.cross.flatten(1)]
+        refined = self.point_mlp(torch.cat((pooled, *extra), -1), plan.grid, plan.batch, size)
+        return Voxels(refined, colors, plan.grid, plan.batch, confidence, count, centroid, size, moments)
+
+    @torch.no_grad()
+    def _pool_moments(
+        self,
+        geometry: Geometry,
+        size: Tensor,
+        points: _Points,
+        pixels: Tensor,
+        means: Tensor,
+        centroid: Tensor,
+        plan: VoxelPlan,
+    ) -> VoxelMoments:
+        """Covariances about the pooled means ``[M, 6]``; a few views at a time, which bounds the memory."""
+        centers = camera_centers(geometry.cameras).flatten(0, 1).float()  # [B V, 3]
+        per_view = geometry.depth[0, 0].numel()
+        views = self.dense_head.views_per_chunk
+        focal = geometry.cameras.intrinsics[..., [0, 1], [0, 1]].mean(-1)  # [B, V]
+        cell = (focal * size[:, None])[..., None, None]
+        pixel = (torch.where(geometry.depth > 0, geometry.depth, 1.0) / cell).float().flatten()  # [B V H W]
+
+        def products(first: int) -> Tensor:
+            rows = slice(first * per_view, (first + views) * per_view)
+            offset, color = points.offset[rows], pixels[rows]
+            squares = offset[:, UPPER[0]] * offset[:, UPPER[1]]  # [n, 6]
+            mixed = (offset[:, :, None] * color[:, None]).flatten(1)  # [n, 9]
+            eye = centers[first : first + views].repeat_interleave(per_view, 0)  # [n, 3]
+            return torch.cat((squares, mixed, eye, pixel[rows, None]), -1)
+
+        chunks = (products(first) for first in range(0, len(centers), views))
+        squares, mixed, eye, pixel = pool_mean_of_chunks(chunks, points.confidence, plan).split((6, 9, 3, 1), -1)
+        offset, color = means[:, :3], means[:, 3:]
+        spread = squares - offset[:, UPPER[0]] * offset[:, UPPER[1]]
+        cross = mixed.unflatten(-1, (3, 3)) - offset[:, :, None] * color[:, None]
+        facing = F.normalize(eye - centroid, dim=-1)
+        return VoxelMoments(spread[:, FULL].unflatten(-1, (3, 3)), cross, facing, pixel[:, 0])
 
     def _pool_features(self, tokens: Tokens, images: Tensor, points: _Points, plan: VoxelPlan) -> Tensor:
         """``[M, C]``; without gradient the features of a few views are there at a time, which bounds the memory."""
@@ -144,9 +197,11 @@ class _Points:
         offset: ``[N, 3]`` positions within the cell, from its centre, in [-1/2, 1/2]; differentiable.
     """
 
-    def __init__(self, geometry: Geometry, voxel_size: Tensor) -> None:
+    def __init__(self, geometry: Geometry, voxel_size: Tensor, drop_fringes: bool) -> None:
         depth, confidence = geometry.depth.float(), geometry.depth_conf.float()
         usable = torch.isfinite(depth) & (depth > 0) & torch.isfinite(confidence) & (confidence > 0)
+        if drop_fringes:
+            usable = usable & on_surface(torch.where(usable, depth.detach(), 0.0))
         points = unproject(torch.where(usable, depth, 1.0), geometry.cameras).flatten(0, -2)
         scenes, per_scene = len(depth), depth[0].numel()
         self.batch = torch.arange(scenes, device=depth.device).repeat_interleave(per_scene)

@@ -1,0 +1,120 @@
+"""The surfel start against surfaces whose normal, colour gradient and extent are known."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from vg2gt.gaussians.surfel import ALONE, COLOR_GAIN, MIN_REACH, SHARED, THICKNESS, layout, surface_frame, surfel_start
+from vg2gt.geometry.rotations import quat_to_matrix
+from vg2gt.types import VoxelMoments
+
+
+def moments_of(points: Tensor, colors: Tensor, facing: Tensor) -> VoxelMoments:
+    """Moments of one voxel from its points ``[N, 3]`` (cells), colours ``[N, 3]`` and direction to the camera."""
+    centered, tint = points - points.mean(0), colors - colors.mean(0)
+    spread, cross = centered.T @ centered / len(points), centered.T @ tint / len(points)
+    return VoxelMoments(spread[None], cross[None], F.normalize(facing, dim=-1)[None])
+
+
+def square(frame: Tensor, gradient: Tensor, extent: tuple[float, float] = (1.0, 1.0)) -> tuple[Tensor, Tensor]:
+    """Points all over a square spanned by the frame's first two axes, and colours that change linearly along them."""
+    steps = (torch.arange(20, dtype=torch.float64) + 0.5) / 20 - 0.5
+    u, v = torch.meshgrid(extent[0] * steps, extent[1] * steps, indexing="ij")
+    place = torch.stack((u.flatten(), v.flatten()), -1)
+    return place @ frame[:, :2].T, 0.5 + place @ gradient
+
+
+FRAMES = quat_to_matrix(torch.randn(8, 4, generator=torch.Generator().manual_seed(1), dtype=torch.float64))
+GRADIENT = torch.tensor([[0.3, 0.4, 0.2], [0.0, 0.0, 0.0]], dtype=torch.float64)
+
+
+@pytest.mark.parametrize("frame", FRAMES)
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_normal_direction_and_gradient_of_a_coloured_square(frame: Tensor, side: float) -> None:
+    facing = side * frame[:, 2] + 0.3 * frame[:, 0]
+    found, gradient, reach = surface_frame(moments_of(*square(frame, GRADIENT), facing))
+    expected = torch.stack((frame[:, 0], side * frame[:, 1], side * frame[:, 2]), -1)
+    torch.testing.assert_close(found[0], expected, atol=2e-3, rtol=0)
+    assert torch.linalg.det(found[0]) > 0
+    torch.testing.assert_close(gradient[0], frame[:, :2] @ GRADIENT, atol=0.01, rtol=0)  # the ridge takes 1 %
+    torch.testing.assert_close(reach[0], torch.ones(2, dtype=torch.float64), atol=0.01, rtol=0)
+
+
+def test_the_first_axis_leads_to_the_brighter_side() -> None:
+    frame = FRAMES[0]
+    found, _, _ = surface_frame(moments_of(*square(frame, -GRADIENT), frame[:, 2]))
+    torch.testing.assert_close(found[0, :, 0], -frame[:, 0], atol=1e-3, rtol=0)
+
+
+def test_without_a_gradient_the_longest_axis_is_the_first() -> None:
+    frame = FRAMES[1]
+    found, _, reach = surface_frame(moments_of(*square(frame, 0 * GRADIENT, (0.3, 0.9)), frame[:, 2]))
+    torch.testing.assert_close((found[0, :, 0] * frame[:, 1]).sum().abs(), torch.ones((), dtype=torch.float64))
+    torch.testing.assert_close(reach[0], torch.tensor([0.9, 0.3], dtype=torch.float64), atol=0.01, rtol=0)
+
+
+def test_two_gaussians_lie_along_the_gradient_and_share_its_colours() -> None:
+    frame = FRAMES[2]
+    start = surfel_start(moments_of(*square(frame, GRADIENT), frame[:, 2]), 2)
+    torch.testing.assert_close(
+        start.offsets[0], torch.stack((-0.3 * frame[:, 0], 0.3 * frame[:, 0])), atol=5e-3, rtol=0
+    )
+    expected = COLOR_GAIN * 0.3 * GRADIENT[0]
+    torch.testing.assert_close(start.colors[0], torch.stack((-expected, expected)), atol=5e-3, rtol=0)
+    sizes = torch.tensor([SHARED / 2, ALONE, THICKNESS], dtype=torch.float64)
+    torch.testing.assert_close(start.scales[0], sizes.expand(2, 3), atol=5e-3, rtol=0)
+
+
+def test_where_the_surface_only_touches_the_cell_gaussians_are_smaller() -> None:
+    frame = FRAMES[3]
+    half = surfel_start(moments_of(*square(frame, GRADIENT, (1.0, 0.5)), frame[:, 2]), 1)
+    torch.testing.assert_close(half.scales[0, 0, 1] / half.scales[0, 0, 0], torch.tensor(0.5, dtype=torch.float64))
+    tiny = surfel_start(moments_of(*square(frame, GRADIENT, (1e-3, 1e-3)), frame[:, 2]), 1)
+    torch.testing.assert_close(tiny.scales[0, 0, 0], torch.tensor(MIN_REACH * ALONE, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("splits", range(1, 10))
+def test_any_number_of_gaussians_is_laid_out_evenly(splits: int) -> None:
+    places, scales = layout(splits, torch.zeros((), dtype=torch.float64))
+    assert places.shape == (splits, 2)
+    assert scales.shape == (splits, 3)
+    assert places.abs().max() < 0.61
+    assert len({tuple(place) for place in places.tolist()}) == splits
+    torch.testing.assert_close(places[:, 0].mean(), torch.zeros((), dtype=torch.float64))
+
+
+def test_four_lie_in_a_square() -> None:
+    places, _ = layout(4, torch.zeros(()))
+    torch.testing.assert_close(places.abs(), torch.full((4, 2), 0.3))
+
+
+@pytest.mark.parametrize("points", ["one", "line", "same place"])
+def test_degenerate_voxels_face_their_cameras(points: str) -> None:
+    facing = F.normalize(torch.tensor([0.2, -0.3, 0.9], dtype=torch.float64), dim=-1)
+    along = F.normalize(torch.linalg.cross(facing, torch.tensor([1.0, 0, 0], dtype=torch.float64)), dim=-1)
+    count = {"one": 1, "line": 30, "same place": 30}[points]
+    places = torch.linspace(-0.5, 0.5, count, dtype=torch.float64)[:, None] * along * (points == "line")
+    colors = torch.rand(count, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    for splits in (1, 2, 4, 5):
+        start = surfel_start(moments_of(places, colors, facing).map(Tensor.float), splits)
+        for part in (start.frame, start.offsets, start.scales, start.colors):
+            assert part.isfinite().all()
+        torch.testing.assert_close(start.frame[0, :, 2], facing.float(), atol=1e-3, rtol=0)
+        torch.testing.assert_close(start.frame[0].T @ start.frame[0], torch.eye(3), atol=1e-5, rtol=0)
+        assert (start.scales > 0).all()
+
+
+def test_the_start_turns_with_the_scene() -> None:
+    generator = torch.Generator().manual_seed(3)
+    points = torch.rand(100, 3, generator=generator, dtype=torch.float64) * torch.tensor([0.9, 0.8, 0.1])
+    colors = torch.rand(100, 3, generator=generator, dtype=torch.float64)
+    facing, turn = torch.tensor([0.1, 0.2, 1.0], dtype=torch.float64), FRAMES[5]
+    start = surfel_start(moments_of(points, colors, facing), 4)
+    turned = surfel_start(moments_of(points @ turn.T, colors, turn @ facing), 4)
+    torch.testing.assert_close(turned.offsets, start.offsets @ turn.T)
+    torch.testing.assert_close(turned.frame, turn @ start.frame)
+    torch.testing.assert_close(turned.scales, start.scales)
+    torch.testing.assert_close(turned.colors, start.colors)

@@ -1,0 +1,47 @@
+import pytest
+import torch
+
+from vg2gt.voxels.silhouette import on_surface
+
+
+def _blurred_step(near: float, far: float) -> torch.Tensor:
+    """A foreground and a background with two pixels between them, ``[1, 12, 16]``."""
+    row = torch.tensor([near] * 7 + [0.8 * near + 0.2 * far, 0.2 * near + 0.8 * far] + [far] * 7)
+    return row.expand(1, 12, 16).clone()
+
+
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
+def test_pixels_between_foreground_and_background_are_told_apart(turned: bool, unit: float) -> None:
+    depth = unit * _blurred_step(1.0, 2.0)
+    depth = depth.transpose(-1, -2) if turned else depth
+    found = on_surface(depth)
+    found = found.transpose(-1, -2) if turned else found
+    expected = torch.ones(1, 12, 16, dtype=torch.bool)
+    expected[..., 7:9] = False
+    assert torch.equal(found, expected)
+
+
+def test_a_sharp_silhouette_loses_no_pixel() -> None:
+    depth = torch.full((2, 3, 12, 16), 2.0)
+    depth[..., 3:9, 5:11] = 1.0
+    assert on_surface(depth).all()
+
+
+def test_planes_are_surfaces_however_they_lean() -> None:
+    v, u = torch.meshgrid(torch.linspace(-0.5, 0.5, 40), torch.linspace(-1, 1, 80), indexing="ij")
+    for lean in (0.0, 0.5, 0.8):
+        depth = 1 / (1 - lean * u * 0.9 + 0.2 * v)
+        assert on_surface(depth[None]).all(), lean
+
+
+def test_noise_without_a_silhouette_is_left_alone() -> None:
+    generator = torch.Generator().manual_seed(0)
+    depth = 2 * (1 + 0.015 * torch.rand(1, 30, 40, generator=generator))
+    assert on_surface(depth).all()
+
+
+def test_unknown_depth_is_no_silhouette() -> None:
+    depth = torch.full((1, 20, 20), 1.5)
+    depth[:, :, 10:] = 0
+    assert on_surface(depth)[depth > 0].all()

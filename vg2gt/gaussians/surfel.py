@@ -1,0 +1,134 @@
+"""The surfel start: a voxel's Gaussians laid along its surface, in closed form (our addition to the paper's head).
+
+A mean colour and a mean position say nothing of how the surface runs through a cell and how colour changes across it.
+The second moments of its points do: their spread has the normal as the direction of least variance, and their
+covariance with colour over that spread is the colour's gradient along the surface, as in linear regression.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from vg2gt.geometry.symmetric import principal_direction, smallest_eigenvector
+from vg2gt.types import TensorRecord, VoxelMoments
+
+UNIFORM_VARIANCE = 1 / 12  # of points spread evenly over a cell, in cells^2
+FACING_PRIOR = 1e-4  # cells^2: without evidence a surface faces its cameras
+GRADIENT_RIDGE = 0.01 / 12  # cells^2: a colour gradient needs points that far apart
+MIN_GRADIENT = 1e-4  # squared colour per squared cell; below it the longest axis is the direction
+SPACING = 1.2  # cells, of n Gaussians side by side: SPACING / n
+ALONE = 0.48  # cells, standard deviation of a Gaussian that is alone in its row
+SHARED = 0.68  # cells, n in a row have SHARED / n each
+GRAZING = 0.2  # cosine of the steepest angle at which a pixel covers a surface
+LARGEST_REACH = 1.2  # of a full cell
+MIN_REACH = 0.3  # of a full cell: where a surface only touches a cell, its Gaussians are smaller, but not points
+THICKNESS = 0.06  # cells, standard deviation along the normal
+COLOR_GAIN = 1.2  # Gaussians overlap, which blurs their colours: their difference starts that much larger
+
+
+@dataclass(frozen=True)
+class SurfelStart(TensorRecord):
+    """What K Gaussians of M voxels start with; lengths in cells, constants of the autograd graph.
+
+    Attributes:
+        frame: ``[M, 3, 3]`` rotations, columns (direction of the colour gradient, normal x direction, normal).
+        offsets: ``[M, K, 3]`` from the points' mean position, world axes.
+        scales: ``[M, K, 3]`` standard deviations along the frame's axes.
+        colors: ``[M, K, 3]`` change of the mean colour.
+    """
+
+    frame: Tensor
+    offsets: Tensor
+    scales: Tensor
+    colors: Tensor
+
+
+@torch.no_grad()
+def surfel_start(moments: VoxelMoments, splits: int) -> SurfelStart:
+    """Lays K Gaussians out on every voxel's surface.
+
+    Defined for every input: one point, points in a line or in one place leave a disc that faces the cameras.
+
+    Args:
+        moments: second moments of M voxels.
+        splits: K >= 1.
+    """
+    frame, gradient, reach = surface_frame(moments)
+    grid, scales = layout(splits, moments.spread.new_zeros(()))
+    plane = frame[..., :2]  # [M, 3, 2]
+    offsets = torch.einsum("mij,mj,kj->mki", plane, reach, grid)
+    extent = F.pad(reach.clamp(min=MIN_REACH), (0, 1), value=1.0)  # [M, 3]: not along the normal
+    scales = scales * extent[:, None]
+    colors = COLOR_GAIN * torch.einsum("mki,mic->mkc", offsets, gradient)
+    return SurfelStart(frame, offsets, scales, colors)  # [M, 3, 3], [M, K, 3], [M, K, 3], [M, K, 3]
+
+
+def surface_frame(moments: VoxelMoments) -> tuple[Tensor, Tensor, Tensor]:
+    """How the surface and the colour on it run through every voxel.
+
+    Returns:
+        The frame ``[M, 3, 3]`` as in :class:`SurfelStart`, turned so that its first axis leads to the brighter side and
+        its third to the cameras; the colour gradient ``[M, 3 (place), 3 (colour)]`` in the tangent plane, per cell;
+        and the points' extent ``[M, 2]`` along the first two axes, 1 for a full cell, at most 1.2.
+    """
+    spread, cross, facing = moments.spread, moments.cross, moments.facing
+    eye = torch.eye(3, dtype=spread.dtype, device=spread.device)
+    # A little variance everywhere but along the line of sight: with nothing else known, that line is the normal.
+    prior = FACING_PRIOR * (eye - facing[:, :, None] * facing[:, None])
+    normal = smallest_eigenvector(spread + prior, facing)
+    normal = torch.where((normal * facing).sum(-1, keepdim=True) < 0, -normal, normal)
+    tangent = _orthogonal(normal)
+    plane = torch.stack((tangent, torch.linalg.cross(normal, tangent)), -1)  # [M, 3, 2]
+    inside = plane.transpose(1, 2) @ spread @ plane  # [M, 2, 2]
+    ridge = inside + GRADIENT_RIDGE * eye[:2, :2]
+    determinant = ridge[:, 0, 0] * ridge[:, 1, 1] - ridge[:, 0, 1].square()
+    adjugate = torch.stack((ridge[:, 1, 1], -ridge[:, 0, 1], -ridge[:, 0, 1], ridge[:, 0, 0]), -1).unflatten(-1, (2, 2))
+    slope = adjugate @ (plane.transpose(1, 2) @ cross) / determinant[:, None, None]  # [M, 2, 3]: least squares
+    change = slope @ slope.transpose(1, 2)
+    along, strength = principal_direction(change[:, 0, 0], change[:, 0, 1], change[:, 1, 1])
+    longest, _ = principal_direction(inside[:, 0, 0], inside[:, 0, 1], inside[:, 1, 1])
+    along = torch.where((strength > MIN_GRADIENT)[:, None], along, longest)
+    darker = (slope.sum(-1) * along).sum(-1, keepdim=True) < 0
+    along = torch.where(darker, -along, along)
+    across = torch.stack((-along[:, 1], along[:, 0]), -1)
+    axes = torch.stack((along, across), -1)  # [M, 2, 2], columns in the tangent plane
+    frame = torch.cat((plane @ axes, normal[:, :, None]), -1)
+    # A point stands for its pixel, which covers more of a surface the more it leans away from the line of sight.
+    sight = (frame.transpose(1, 2) @ facing[:, :, None])[..., 0]  # [M, 3], of unit length
+    lean = sight[:, :2].square() / sight[:, 2:].clamp(min=GRAZING).square()
+    variance = (axes * (inside @ axes)).sum(1) + (1 + lean) * moments.pixel[:, None].square() * UNIFORM_VARIANCE
+    reach = (variance / UNIFORM_VARIANCE).clamp(0, LARGEST_REACH**2).sqrt()  # [M, 2]
+    return frame, plane @ slope, reach
+
+
+def layout(splits: int, like: Tensor) -> tuple[Tensor, Tensor]:
+    """Places ``[K, 2]`` of K Gaussians in a cell of unit extent, and their scales ``[K, 3]``.
+
+    Rows across the direction of the colour gradient's axis, as square as K allows: 2 lie in a line along it, 4 in a
+    square, 3 as two and one.
+    """
+    rows = max(1, round(math.sqrt(splits)))
+    places, scales = [], []
+    for row in range(rows):
+        count = splits // rows + (row < splits % rows)
+        across = (row - (rows - 1) / 2) * SPACING / rows
+        for number in range(count):
+            places.append(((number - (count - 1) / 2) * SPACING / count, across))
+            scales.append((_width(count), _width(rows), THICKNESS))
+    return like.new_tensor(places), like.new_tensor(scales)
+
+
+def _width(count: int) -> float:
+    return ALONE if count == 1 else SHARED / count
+
+
+def _orthogonal(normal: Tensor) -> Tensor:
+    """A unit vector ``[M, 3]`` orthogonal to each unit vector."""
+    smallest = normal.abs().argmin(-1, keepdim=True)
+    axis = torch.zeros_like(normal).scatter(-1, smallest, 1.0)
+    return F.normalize(torch.linalg.cross(normal, axis), dim=-1)
