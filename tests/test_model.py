@@ -8,7 +8,7 @@ import torch
 from tests.training_helpers import full_model, small_config
 from vg2gt.evaluation.protocols import ground_truth_target_cameras, training_cameras
 from vg2gt.losses import VG2GTLoss
-from vg2gt.model import VG2GT, SceneScale
+from vg2gt.model import VG2GT, SceneScale, with_scale_of
 from vg2gt.training.loop import Run, build
 from vg2gt.types import Batch
 
@@ -177,3 +177,46 @@ def test_scale_sources(run: Run, batch: Batch, source: str) -> None:
         "groundtruth": 1.0,
     }
     assert float(unit) == pytest.approx(expected[source], rel=0.02)
+
+
+@pytest.mark.parametrize("drift", [0.9, 1.08, 3.0])
+def test_a_common_factor_is_taken_out_of_the_enhanced_depth(run: Run, batch: Batch, drift: float) -> None:
+    """The scale of depth against the cameras is the backbone's, whatever the enhancement does to it."""
+    initial = run.module.model(batch.context.images, batch.context.hints).initial
+    shape = (1 + 0.05 * torch.randn(initial.depth.shape, generator=torch.Generator().manual_seed(0))).requires_grad_()
+    kept, drifted = (with_scale_of(initial, initial.depth * shape * factor) for factor in (1.0, drift))
+    torch.testing.assert_close(drifted, kept)
+    weight = initial.depth_conf * (initial.depth > 0)
+    mean = (weight * (kept / initial.depth.clamp(min=1e-9)).clamp(min=1e-9).log()).sum() / weight.sum()
+    assert abs(mean.item()) < 1e-5
+    # No loss of it says anything of the common factor: its gradient along the depth's logarithm sums to zero.
+    (gradient,) = torch.autograd.grad((kept.square() * torch.linspace(0, 1, kept.shape[-1])).sum(), shape)
+    total = (gradient * shape).sum()
+    assert abs(float(total)) < 1e-4 * float((gradient * shape).abs().sum())
+
+
+def test_without_the_switch_the_scale_may_drift(run: Run, batch: Batch) -> None:
+    model = full_model(run).eval()
+    model.keep_scale = False
+    assert model.coarse is not None
+    torch.nn.init.constant_(model.coarse.zero[-1].bias, 0.3)
+    drifted = model(batch.context.images, batch.context.hints)
+    model.keep_scale = True
+    kept = model(batch.context.images, batch.context.hints)
+    change = (drifted.geometry.depth / kept.geometry.depth.clamp(min=1e-9))[kept.geometry.depth > 0]
+    torch.testing.assert_close(change, change[0].expand_as(change))
+    assert abs(float(change[0]) - 1) > 1e-4
+    torch.nn.init.zeros_(model.coarse.zero[-1].bias)
+
+
+@pytest.mark.parametrize(("most", "held_out", "context"), [(1, 0, 1), (2, 1, 1), (3, 2, 1), (5, 3, 2), (None, 3, 8)])
+def test_every_step_renders_a_context_view(
+    run: Run, batch: Batch, monkeypatch: pytest.MonkeyPatch, most: int | None, held_out: int, context: int
+) -> None:
+    assert (batch.num_context, batch.images.shape[1]) == (8, 11)
+    monkeypatch.setattr(run.module, "render_views", most)
+    drawn = [run.module._draw_views(batch).tolist() for _ in range(20)]
+    for views in drawn:
+        assert len(set(views)) == len(views) == held_out + context
+        assert sum(view >= 8 for view in views) == held_out
+    assert len({tuple(sorted(views)) for views in drawn}) > 1 or most is None

@@ -1,3 +1,4 @@
+import math
 from dataclasses import asdict, replace
 
 import pytest
@@ -6,13 +7,13 @@ import torch
 from vg2gt.evaluation import EvaluationOptions, PointOptions, SceneEvaluator, SceneResult, evaluate_scene
 from vg2gt.evaluation.evaluator import MODES, PROTOCOLS
 from vg2gt.evaluation.protocols import ground_truth_target_cameras, joint_target_cameras
-from vg2gt.evaluation.scene_metrics import align_geometry, point_cloud_metrics
+from vg2gt.evaluation.scene_metrics import align_geometry, depth_to_camera_scale, point_cloud_metrics
 from vg2gt.geometry.alignment import Similarity
-from vg2gt.geometry.cameras import scale_translations
+from vg2gt.geometry.cameras import relative_to_first, scale_translations
 from vg2gt.geometry.normals import normals_from_depth
-from vg2gt.metrics import cv, depth_metrics, normal_metrics, psnr, ssim
+from vg2gt.metrics import cv, depth_metrics, near_depth_edges, normal_metrics, psnr, ssim
 from vg2gt.profiling import clocked
-from vg2gt.types import Batch
+from vg2gt.types import Batch, Geometry
 
 
 def test_scores_are_the_metrics_of_the_renders(result: SceneResult, batch: Batch) -> None:
@@ -185,8 +186,24 @@ def test_the_figures_of_training_runs(module_and_batch, batch: Batch) -> None:
     assert found["abs_rel_rasterized"] == depth_metrics(flat.depth[0], batch.target.depth[0], "scene")["abs_rel"]
     decoded = depth_metrics(prediction.geometry.depth[0], batch.context.depth[0], "scene")
     assert found["decoded_abs_rel"] == decoded["abs_rel"]
+    region = near_depth_edges(batch.target.depth)[0]
+    edges = depth_metrics(solid.depth[0], batch.target.depth[0], "scene", region=region)
+    assert found["edge_abs_rel"] == edges["abs_rel"]
+    assert found["edge_abs_rel"] > found["abs_rel"]
+    assert found["edge_psnr"] < found["psnr"]
     with pytest.raises(ValueError, match="held-out views"):
         evaluate_scene(module.model, module.renderer, batch.context)
+
+
+@pytest.mark.parametrize("factor", [0.9, 1.0, 1.08])
+def test_scale_of_depth_against_the_cameras(batch: Batch, factor: float) -> None:
+    context = batch.context
+    unit = torch.tensor([7.0])
+    cameras = scale_translations(relative_to_first(context.cameras), unit)
+    geometry = Geometry(7 * factor * context.depth, torch.ones_like(context.depth), cameras, unit)
+    assert depth_to_camera_scale(geometry, context) == pytest.approx(factor, rel=1e-4)
+    still = replace(cameras, world_to_camera=cameras.world_to_camera[:, :1].expand_as(cameras.world_to_camera))
+    assert math.isnan(depth_to_camera_scale(replace(geometry, cameras=still), context))
 
 
 def test_the_clock_leaves_the_model_as_it_was(module_and_batch, batch: Batch) -> None:

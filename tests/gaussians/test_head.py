@@ -1,11 +1,14 @@
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 from torch import nn
 
 from vg2gt.gaussians import GaussianHead
-from vg2gt.types import Voxels
+from vg2gt.gaussians.surfel import surfel_start
+from vg2gt.geometry.rotations import quat_to_matrix
+from vg2gt.types import VoxelMoments, Voxels
 
 
 def wall(rows=8, columns=8, channels=16, size=0.5, scenes=1, seed=0):
@@ -151,3 +154,50 @@ def test_gradients_reach_every_parameter_and_the_anchor():
 def test_bad_options_are_refused_by_name(options):
     with pytest.raises(ValueError, match=rf"gaussians\.{next(iter(options))}"):
         head(**options)
+
+
+def surfel_wall(**options):
+    """The wall's voxels with points all over their cells in its plane, seen from in front."""
+    voxels = wall(**options)
+    count = len(voxels.grid)
+    spread = torch.diag(torch.tensor([1.0, 1.0, 0.0]) / 12).expand(count, 3, 3)
+    cross = torch.zeros(count, 3, 3)
+    cross[:, 1] = 0.02 * torch.arange(1, 4)
+    facing = torch.tensor([0.0, 0.0, -1.0]).expand(count, 3)
+    return replace(voxels, moments=VoxelMoments(spread, cross, facing, torch.full((count,), 0.1)))
+
+
+@pytest.mark.parametrize("splits", [1, 2, 3, 4])
+@pytest.mark.parametrize("anchor", ["centroid", "center"])
+@pytest.mark.parametrize("degree", [0, 3])
+def test_a_head_that_says_nothing_gives_the_surfels(splits, anchor, degree):
+    voxels = surfel_wall()
+    module = head(splits=splits, anchor=anchor, sh_degree=degree, start="surfel")
+    nn.init.zeros_(module.out.weight)
+    g, start = module(voxels), surfel_start(voxels.moments, splits)
+    torch.testing.assert_close(g.means, (voxels.centroid[:, None] + 0.5 * start.offsets).flatten(0, 1))
+    torch.testing.assert_close(g.scales, (0.5 * start.scales).flatten(0, 1))
+    frames = quat_to_matrix(g.quats).unflatten(0, (-1, splits))
+    torch.testing.assert_close(frames, start.frame[:, None].expand_as(frames), atol=1e-5, rtol=1e-5)
+    colors = (voxels.colors[:, None] + start.colors).clamp(0, 1).flatten(0, 1)
+    torch.testing.assert_close(0.5 + 0.28209479177387814 * g.sh[:, 0], colors)
+    torch.testing.assert_close(g.opacities, torch.full((len(g),), 0.88))
+
+
+def test_what_the_head_says_is_a_residual_in_the_surface_frame():
+    voxels = surfel_wall()
+    module = head(splits=1, start="surfel", max_offset=0.5)
+    nn.init.zeros_(module.out.weight)
+    before = module(voxels)
+    with torch.no_grad():
+        module.out.bias[2] = 0.3  # along the third axis: the normal
+    shift = (module(voxels).means - before.means) / 0.5
+    normal = surfel_start(voxels.moments, 1).frame[:, :, 2]
+    torch.testing.assert_close(shift, 0.5 * torch.tanh(torch.tensor(0.3)) * normal, atol=1e-6, rtol=1e-5)
+
+
+def test_the_surfel_start_needs_moments():
+    with pytest.raises(ValueError, match=r"start=surfel needs .* model\.fine\.moments=true"):
+        head(start="surfel")(wall())
+    with pytest.raises(ValueError, match=r"gaussians\.start is 'surfels'; choose one of plain, surfel"):
+        head(start="surfels")

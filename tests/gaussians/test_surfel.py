@@ -12,11 +12,11 @@ from vg2gt.geometry.rotations import quat_to_matrix
 from vg2gt.types import VoxelMoments
 
 
-def moments_of(points: Tensor, colors: Tensor, facing: Tensor) -> VoxelMoments:
-    """Moments of one voxel from its points ``[N, 3]`` (cells), colours ``[N, 3]`` and direction to the camera."""
+def moments_of(points: Tensor, colors: Tensor, facing: Tensor, pixel: float = 0.0) -> VoxelMoments:
+    """Moments of one voxel from its points ``[N, 3]`` (cells), colours ``[N, 3]`` and how the camera sees it."""
     centered, tint = points - points.mean(0), colors - colors.mean(0)
     spread, cross = centered.T @ centered / len(points), centered.T @ tint / len(points)
-    return VoxelMoments(spread[None], cross[None], F.normalize(facing, dim=-1)[None])
+    return VoxelMoments(spread[None], cross[None], F.normalize(facing, dim=-1)[None], spread.new_tensor([pixel]))
 
 
 def square(frame: Tensor, gradient: Tensor, extent: tuple[float, float] = (1.0, 1.0)) -> tuple[Tensor, Tensor]:
@@ -74,6 +74,17 @@ def test_where_the_surface_only_touches_the_cell_gaussians_are_smaller() -> None
     torch.testing.assert_close(half.scales[0, 0, 1] / half.scales[0, 0, 0], torch.tensor(0.5, dtype=torch.float64))
     tiny = surfel_start(moments_of(*square(frame, GRADIENT, (1e-3, 1e-3)), frame[:, 2]), 1)
     torch.testing.assert_close(tiny.scales[0, 0, 0], torch.tensor(MIN_REACH * ALONE, dtype=torch.float64))
+
+
+def test_few_points_stand_for_their_pixels() -> None:
+    """One pixel that looks at a surface straight on covers its own side, and twice that at 60 degrees."""
+    frame, point = FRAMES[4], torch.zeros(1, 3, dtype=torch.float64)
+    straight = surface_frame(moments_of(point, point, frame[:, 2], pixel=0.5))[2]
+    torch.testing.assert_close(straight[0], torch.full((2,), 0.5, dtype=torch.float64))
+    leaning = 0.5 * frame[:, 2] + 0.75**0.5 * frame[:, 0]
+    _, _, reach = surface_frame(moments_of(*square(frame, 0 * GRADIENT, (0.8, 0.4)), leaning, pixel=0.3))
+    expected = torch.tensor([(0.8**2 + 0.6**2) ** 0.5, (0.4**2 + 0.3**2) ** 0.5], dtype=torch.float64)
+    torch.testing.assert_close(reach[0], expected, atol=5e-3, rtol=0)
 
 
 @pytest.mark.parametrize("splits", range(1, 10))

@@ -4,7 +4,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from vg2gt.geometry.cameras import unproject
+from vg2gt.geometry.cameras import camera_centers, scale_translations, unproject
 from vg2gt.types import Cameras
 
 
@@ -205,3 +205,57 @@ def test_sparse_voxels_are_named_once(views, voxel_size, warned, make_fine, make
         for _ in range(2):
             module(*make_room(views=views))
     assert ["model.fine.min_footprint" in record.getMessage() for record in caplog.records] == [True] * warned
+
+
+def test_moments_are_the_covariances_of_the_pixels(make_fine, make_room):
+    tokens, geometry, images = make_room(scenes=2)
+    voxels = make_fine(moments=True)(tokens, geometry, images)
+    assert voxels.moments is not None
+    points = unproject(geometry.depth, geometry.cameras)
+    focal = geometry.cameras.intrinsics[0, 0, 0, 0]
+    for scene in (0, 1):
+        rows = (voxels.batch == scene).nonzero()[:, 0]
+        cells = torch.floor(points[scene].double().reshape(-1, 3) / 0.125).long()
+        for row in rows[:: len(rows) // 20].tolist():
+            inside = (cells == voxels.grid[row]).all(-1)
+            weight = geometry.depth_conf[scene].flatten()[inside].double()
+            place = points[scene].reshape(-1, 3)[inside].double() / 0.125
+            color = images[scene].permute(0, 2, 3, 1).reshape(-1, 3)[inside].double()
+            share = (weight / weight.sum())[:, None]
+            place, color = place - (share * place).sum(0), color - (share * color).sum(0)
+            spread, cross = (share * place).T @ place, (share * place).T @ color
+            torch.testing.assert_close(voxels.moments.spread[row].double(), spread, atol=2e-6, rtol=1e-4)
+            torch.testing.assert_close(voxels.moments.cross[row].double(), cross, atol=2e-6, rtol=1e-4)
+            depth = geometry.depth[scene].flatten()[inside].double()
+            torch.testing.assert_close(voxels.moments.pixel[row].double(), (share[:, 0] * depth).sum() / focal / 0.125)
+            sight = voxels.centroid[row] - camera_centers(geometry.cameras)[scene].mean(0)
+            assert (voxels.moments.facing[row] * sight).sum() < 0
+
+
+def test_moments_of_a_scaled_scene_are_the_same(make_fine, make_room):
+    tokens, geometry, images = make_room()
+    small = make_fine(moments=True)(tokens, geometry, images).moments
+    cameras = scale_translations(geometry.cameras, torch.tensor([1024.0]))
+    large = make_fine(moments=True, voxel_size=128.0)(
+        tokens, replace(geometry, depth=1024 * geometry.depth, cameras=cameras), images
+    ).moments
+    for name in ("spread", "cross", "facing", "pixel"):
+        torch.testing.assert_close(getattr(small, name), getattr(large, name), atol=1e-6, rtol=1e-5)
+
+
+def test_fringes_of_silhouettes_make_no_voxels(make_fine, make_room):
+    tokens, geometry, images = make_room(views=1)
+    depth = torch.full_like(geometry.depth, 1.0)
+    depth[..., 40:] = 2.0
+    depth[..., 40:42] = torch.tensor([1.3, 1.7])
+    geometry = replace(geometry, depth=depth)
+    kept = make_fine()(tokens, geometry, images)
+    clean = make_fine(drop_fringes=True)(tokens, geometry, images)
+    assert int(kept.count.sum()) - int(clean.count.sum()) == 2 * depth.shape[-2]
+
+    def between(voxels):
+        z = (voxels.centroid @ geometry.cameras.world_to_camera[0, 0, :3, :3].T)[:, 2]
+        return int(((z > 1.2) & (z < 1.8)).sum())
+
+    assert between(kept) > 0
+    assert between(clean) == 0

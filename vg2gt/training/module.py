@@ -34,6 +34,7 @@ from vg2gt.training.faults import (
     fault_of_prediction,
     gather_faults,
 )
+from vg2gt.training.idle_terms import IdleTerms
 from vg2gt.training.schedule import cosine_with_warmup, weight_decay_groups
 from vg2gt.types import Batch, Prediction
 
@@ -81,6 +82,7 @@ class VG2GTModule(lightning.LightningModule):
         self.seed = seed
         self.generator = torch.Generator()
         self.skipped = SkippedSteps(max_skipped)
+        self._idle = IdleTerms(getattr(loss, "weighted", ()))
         self._watch = GradientWatch(())
         self._fault: Fault | None = None
         self._scenes: tuple[str, ...] = ()
@@ -131,6 +133,7 @@ class VG2GTModule(lightning.LightningModule):
             report: LossReport = self.loss(prediction, batch, rendered, views, cameras)
         self._fault = fault_of_loss(report, batch.scene)
         self._figures = self._step_figures(report, batch, prediction)
+        self._idle.see(report.terms)
         return report
 
     def _lost_step(self) -> Tensor:
