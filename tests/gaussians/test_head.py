@@ -132,10 +132,11 @@ def test_higher_bands_learn_slower():
 
 
 def test_no_voxels_give_no_gaussians():
-    voxels = wall().map(lambda t: t[:0] if len(t) > 1 else t)
-    g = head()(voxels)
-    assert len(g) == 0
-    g.means.sum().backward()
+    voxels = surfel_wall().map(lambda t: t[:0] if len(t) > 1 else t)
+    for start in ("plain", "surfel"):
+        g = head(start=start)(voxels)
+        assert len(g) == 0
+        g.means.sum().backward()
 
 
 def test_gradients_reach_every_parameter_and_the_anchor():

@@ -83,11 +83,12 @@ def test_sky_and_non_finite_pixels_are_left_out(make_fine, make_room):
     assert all(torch.isfinite(p.grad).all() for p in module.parameters() if p.grad is not None)
 
 
-def test_a_scene_without_points_has_no_voxels(make_fine, make_room):
+@pytest.mark.parametrize("moments", [False, True])
+def test_a_scene_without_points_has_no_voxels(make_fine, make_room, moments):
     tokens, geometry, images = make_room(scenes=2)
     depth = geometry.depth.clone()
     depth[0] = 0
-    module = make_fine()
+    module = make_fine(moments=moments)
     voxels = module(tokens, replace(geometry, depth=depth), images)
     assert voxels.batch.unique().tolist() == [1]
     nothing = module(tokens, replace(geometry, depth=depth * 0), images)
