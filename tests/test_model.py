@@ -192,21 +192,21 @@ def test_a_common_factor_is_taken_out_of_the_enhanced_depth(run: Run, batch: Bat
     # No loss of it says anything of the common factor: its gradient along the depth's logarithm sums to zero.
     (gradient,) = torch.autograd.grad((kept.square() * torch.linspace(0, 1, kept.shape[-1])).sum(), shape)
     total = (gradient * shape).sum()
-    assert abs(float(total)) < 1e-4 * float((gradient * shape).abs().sum())
+    assert abs(total.item()) < 1e-4 * (gradient * shape).abs().sum().item()
 
 
 def test_without_the_switch_the_scale_may_drift(run: Run, batch: Batch) -> None:
     model = full_model(run).eval()
     model.keep_scale = False
-    assert model.coarse is not None
-    torch.nn.init.constant_(model.coarse.zero[-1].bias, 0.3)
+    bias = model.get_parameter("coarse.zero.3.bias")
+    torch.nn.init.constant_(bias, 0.3)
     drifted = model(batch.context.images, batch.context.hints)
     model.keep_scale = True
     kept = model(batch.context.images, batch.context.hints)
     change = (drifted.geometry.depth / kept.geometry.depth.clamp(min=1e-9))[kept.geometry.depth > 0]
     torch.testing.assert_close(change, change[0].expand_as(change))
     assert abs(float(change[0]) - 1) > 1e-4
-    torch.nn.init.zeros_(model.coarse.zero[-1].bias)
+    torch.nn.init.zeros_(bias)
 
 
 @pytest.mark.parametrize(("most", "held_out", "context"), [(1, 0, 1), (2, 1, 1), (3, 2, 1), (5, 3, 2), (None, 3, 8)])

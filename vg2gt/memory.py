@@ -28,7 +28,15 @@ RECONSTRUCTION = (
 )
 
 # Parts of the messages of torch's allocators and of CUDA's, where the error has no class of its own.
-_SAID = ("allocate memory", "not enough memory", "out of memory", "bad_alloc", "ALLOC_FAILED")
+# The last is what oneDNN says on some processors when it finds no memory for a convolution's scratch.
+_SAID = (
+    "allocate memory",
+    "not enough memory",
+    "out of memory",
+    "bad_alloc",
+    "ALLOC_FAILED",
+    "could not create a primitive",
+)
 
 _sizes: ContextVar[dict[str, int] | None] = ContextVar("sizes", default=None)
 

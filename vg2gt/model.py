@@ -144,9 +144,9 @@ class Reconstructor(nn.Module, ABC):
         if stored != present:
             wrong = sorted(name for name in stored.keys() | present.keys() if stored.get(name) != present.get(name))
             raise ValueError(
-                f"the checkpoint does not fit this model, first in {wrong[0]} (stored {stored.get(wrong[0])}, here "
-                f"{present.get(wrong[0])}): use the model options it was trained with, or init_from= to start from the "
-                "weights that fit"
+                f"the checkpoint does not fit this model, first in model.{wrong[0]} (stored {stored.get(wrong[0])}, "
+                f"here {present.get(wrong[0])}): use the model options it was trained with, or init_from= to start "
+                "from the weights that fit"
             )
         self.load_state_dict(state, strict=False)
 

@@ -19,6 +19,7 @@ import vg2gt.rendering.renderer
 import vg2gt.training.module
 import vg2gt.voxels.coarse
 import vg2gt.voxels.fine
+import vg2gt.voxels.surface
 from tests.reliability.steps import first_batches, fit, tiny_run
 from tests.training_helpers import full_model
 from vg2gt.evaluation import evaluate_scene
@@ -137,7 +138,7 @@ PLACES: list[tuple[Any, str]] = [
     (vg2gt.voxels.coarse, "pool_mean"),
     (vg2gt.voxels.coarse, "pool_min"),
     (vg2gt.voxels.coarse, "interpolation_weights"),
-    (vg2gt.voxels.coarse, "normals_from_depth"),
+    (vg2gt.voxels.surface, "normals_from_depth"),
     (vg2gt.voxels.fine, "unproject"),
     (vg2gt.voxels.fine, "scene_voxel_size"),
     (vg2gt.voxels.fine, "point_cells"),

@@ -206,9 +206,11 @@ def test_the_papers_module_sees_the_papers_inputs(make_room, make_coarse) -> Non
     assert [tuple(layer.weight.shape[2:]) for layer in (module.fuse[0], module.fuse[2])] == [(1, 1), (1, 1)]
 
 
-def result(module: torch.nn.Module, tokens, geometry: Geometry) -> Tensor:
+def result(module: coarse.CoarseModule, tokens, geometry: Geometry) -> Tensor:
     torch.manual_seed(0)
-    torch.nn.init.normal_(module.zero[-1].weight, std=0.1)
+    for branch in module.zero:
+        assert isinstance(branch, torch.nn.Conv2d)
+        torch.nn.init.normal_(branch.weight, std=0.1)
     return module.eval()(tokens, geometry).patch[-1]
 
 
