@@ -33,6 +33,9 @@ from vg2gt.types import Voxels
 STEPS = 6
 LOSS_TOLERANCE = 5e-3  # relative, of every step's loss
 COSINE = 0.998  # of every step's gradient before clipping
+# Surfels are a twentieth of a voxel thick: what rounding moves by as much shows in depth, normals and colour.
+SURFEL_LOSS_TOLERANCE, SURFEL_COSINE = 2e-2, 0.99
+PLAIN = ("model.gaussians.start=plain", "model.fine.moments=false", "model.fine.drop_fringes=false")
 METRIC_TOLERANCE = {"psnr": 0.1, "ssim": 0.01, "abs_rel": 0.005, "decoded_abs_rel": 0.001, "coverage": 0.01}
 
 
@@ -67,12 +70,13 @@ def trained(precision: str, overrides: tuple[str, ...], steps: int, folder: Path
 
 def check_agreement(overrides: tuple[str, ...], steps: int, folder: Path, cache: Path) -> None:
     exact, mixed = (trained(p, overrides, steps, folder, cache) for p in ("32-true", "bf16-mixed"))
+    surfels = getattr(getattr(exact[0].module.model, "gaussians", None), "start", "plain") == "surfel"
     for one, other in zip(exact[1].losses, mixed[1].losses, strict=True):
-        assert other == pytest.approx(one, rel=LOSS_TOLERANCE)
+        assert other == pytest.approx(one, rel=SURFEL_LOSS_TOLERANCE if surfels else LOSS_TOLERANCE)
     cosines = [
         float(F.cosine_similarity(*pair, dim=0)) for pair in zip(exact[1].gradients, mixed[1].gradients, strict=True)
     ]
-    assert min(cosines) > COSINE
+    assert min(cosines) > (SURFEL_COSINE if surfels else COSINE)
     assert mixed[1].losses != exact[1].losses  # autocast was on
     exact[0].datamodule.setup("validate")
     batch = next(iter(exact[0].datamodule.val_dataloader()))
@@ -87,8 +91,9 @@ def check_agreement(overrides: tuple[str, ...], steps: int, folder: Path, cache:
     print({name: round(scores[1][name] - scores[0][name], 5) for name in METRIC_TOLERANCE})
 
 
-def test_bfloat16_networks_agree_with_float32(tmp_path: Path, cache: Path) -> None:
-    check_agreement((), STEPS, tmp_path, cache)
+@pytest.mark.parametrize("overrides", [PLAIN, ()], ids=["plain", "surfels"])
+def test_bfloat16_networks_agree_with_float32(overrides: tuple[str, ...], tmp_path: Path, cache: Path) -> None:
+    check_agreement(overrides, STEPS, tmp_path, cache)
 
 
 @pytest.mark.slow

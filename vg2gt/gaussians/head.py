@@ -100,8 +100,7 @@ class GaussianHead(nn.Module):
             ``M * splits`` Gaussians (fewer beyond ``max_gaussians``), those of a voxel adjacent: scales in (0, 2 v),
             means within ``max_offset`` v of the anchor along each axis, unit quaternions.
         """
-        with torch.autocast(voxels.features.device.type, enabled=False):  # thin surfels feel half precision
-            raw = self.out(F.gelu(self.hidden(voxels.features.float()))).unflatten(-1, (self.splits, -1))
+        raw = self.out(F.gelu(self.hidden(voxels.features))).float().unflatten(-1, (self.splits, -1))
         offset, scale, rotation, opacity, color = raw.split(self.parts, -1)
         size = voxels.voxel_size[voxels.batch][:, None, None]
         anchor = voxels.centroid if self.anchor == "centroid" else voxels.centers

@@ -111,8 +111,7 @@ class PointMLP(nn.Module):
         Raises:
             ValueError: if a scene spans too many voxels to be serialised.
         """
-        with torch.autocast(features.device.type, enabled=False):  # measured quantities, which bfloat16 would round
-            features = self.embed(features.float())
+        features = self.embed(features)
         if not len(features):
             # The stages have nothing to do, but every rank's parameters must be in the graph: the others would wait.
             return features + 0 * sum(parameter.sum() for parameter in self.stages.parameters())
