@@ -126,7 +126,7 @@ def test_pictures_can_be_asked_for_later(cache: Path, trained: Path, joined: Pat
 def test_another_backbone_or_model_is_refused(tmp_path: Path, cache: Path, trained: Path) -> None:
     with pytest.raises(ValueError, match="trained on backbone"):
         run(tmp_path, cache, f"ckpt={trained}", "backend=oracle", "backend.seed=1")
-    with pytest.raises(ValueError, match=r"does not fit this model, first in gaussians\.out"):
+    with pytest.raises(ValueError, match=r"does not fit this model, first in model\.gaussians\.out"):
         run(tmp_path, cache, f"ckpt={trained}", "+model.gaussians.splits=4")
 
 
