@@ -27,6 +27,7 @@ class Backend(nn.Module, ABC):
         is_metric: True if ``Geometry.scale`` turns the decoded depth into metres.
         supports_gradient: True if ``decode`` is differentiable in ``tokens.patch``.
         needs_hints: True if ``encode`` cannot work without what the data knows.
+        min_views: fewest views that ``encode`` takes; it raises ValueError for fewer.
     """
 
     def __init__(
@@ -38,6 +39,7 @@ class Backend(nn.Module, ABC):
         is_metric: bool = False,
         supports_gradient: bool = True,
         needs_hints: bool = False,
+        min_views: int = 1,
     ) -> None:
         super().__init__()
         self.name = name
@@ -47,6 +49,7 @@ class Backend(nn.Module, ABC):
         self.is_metric = is_metric
         self.supports_gradient = supports_gradient
         self.needs_hints = needs_hints
+        self.min_views = min_views
         self._identity: dict[str, str] | None = None
 
     @abstractmethod

@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from numpy.typing import NDArray
 
-from vg2gt.data.synthetic.renderer import RenderedFrame, World, render_frame
+from vg2gt.data.synthetic.renderer import SAMPLES, RenderedFrame, World, render_frame
 
 _HIGHLIGHTS = 1  # tells the random stream of the highlights from that of the scene
 _MATT_SHARE = 0.3
@@ -37,13 +37,14 @@ class SyntheticScene:
         focal = 0.5 * size[1] / np.tan(field_of_view / 2)
         self.intrinsics = np.array([[focal, 0, (size[1] - 1) / 2], [0, focal, (size[0] - 1) / 2], [0, 0, 1]])
 
-    def render(self, frames: Sequence[int], threads: int) -> list[RenderedFrame]:
-        """Renders the given frames of the path, ``threads`` at a time."""
-        with ThreadPoolExecutor(threads) as pool:
-            return list(pool.map(self._render_frame, frames))
+    def render(self, frames: Sequence[int], threads: int, samples: int = SAMPLES) -> list[RenderedFrame]:
+        """Renders the given frames of the path, ``threads`` at a time, with ``samples`` ** 2 colour samples a pixel."""
 
-    def _render_frame(self, frame: int) -> RenderedFrame:
-        return render_frame(self.world, self.world_to_camera[frame], self.intrinsics, self.size)
+        def render(frame: int) -> RenderedFrame:
+            return render_frame(self.world, self.world_to_camera[frame], self.intrinsics, self.size, samples)
+
+        with ThreadPoolExecutor(threads) as pool:
+            return list(pool.map(render, frames))
 
 
 def level_poses(

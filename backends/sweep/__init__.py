@@ -1,0 +1,5 @@
+"""Learned plane-sweep multi-view stereo: a small frozen backbone whose weights are in the package."""
+
+from backends.sweep.backend import SweepBackend
+
+__all__ = ["SweepBackend"]

@@ -1,0 +1,109 @@
+"""Learned plane-sweep multi-view stereo as a backend: small, trained by us, in the package."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from backends.base import Backend, full_precision
+from backends.sweep.network import SweepNet, Views
+from backends.sweep.tokens import DIM, PATCH, TAPS
+from backends.sweep.views import camera_extent, choose_sources
+from backends.weights import Weights
+from vg2gt.geometry.cameras import relative_to_first
+from vg2gt.types import Geometry, Hints, Tokens
+
+SHIPPED = Path(__file__).parent / "weights" / "sweep.safetensors"
+LICENCE = "Apache-2.0"
+_CONFIDENCE = (0.37, 400.0)  # bounds of 1 / expected relative error
+_NO_PARALLAX = (
+    "backend {name} measures depth by parallax and {why}: take photos from different places, or choose a backend that "
+    "knows scenes from single images (backend=vggt_1b, backend=da3_small, ...)"
+)
+
+
+class SweepBackend(Backend):
+    """Plane-sweep multi-view stereo (needs cameras).
+
+    Every view is compared with the views that overlap it best, on planes between a near and a far depth: those that
+    the hints give, or those that a first, wide sweep finds from the cameras alone. Depth is metric as far as the
+    cameras are. ``depth_conf`` is one over the expected relative error of depth.
+
+    Args:
+        pretrained: whether to load weights, the shipped ones unless ``path`` names others; otherwise random ones.
+        path: a safetensors file of other weights, for example one's own training.
+        planes: of the first of the two sweeps.
+        sources: views that each view is compared with.
+        seed: of random weights.
+
+    Raises:
+        FileNotFoundError: if the weights cannot be found.
+        ValueError: if they do not fit, or a number is out of range.
+    """
+
+    def __init__(
+        self, pretrained: bool = True, path: str | None = None, planes: int = 48, sources: int = 3, seed: int = 0
+    ) -> None:
+        if planes < 8 or sources < 1:
+            raise ValueError(f"backend.planes must be >= 8 and backend.sources >= 1, got {planes} and {sources}")
+        super().__init__("sweep", PATCH, (DIM,) * TAPS, licence=LICENCE, needs_hints=True, min_views=2)
+        weights = Weights(self.name, LICENCE, pretrained, None, None, path or str(SHIPPED), seed)
+        self.network = weights.build(SweepNet)
+        self.planes, self.sources = planes, sources
+        self.freeze()
+
+    @torch.no_grad()
+    def encode(self, images: Tensor, hints: Hints | None = None) -> Tokens:
+        """Sweeps; see :meth:`Backend.encode`. The world frame is view 0's, the unit that of the cameras.
+
+        Raises:
+            ValueError: also if the views have no parallax (one view, or all from one place).
+        """
+        self.check_images(images)
+        hints = self.require_hints(images, hints, "cameras")
+        assert hints.cameras is not None
+        cameras = relative_to_first(hints.cameras.map(Tensor.double)).map(Tensor.float)
+        encoded = []
+        with full_precision(images):
+            for scene, pictures in enumerate(images.float()):
+                views = Views(pictures, cameras.world_to_camera[scene], cameras.intrinsics[scene])
+                self._check_parallax(views)
+                features = self.network.features(pictures)
+                depth_range = self._range(hints, scene)
+                if depth_range is None:
+                    depth_range = self.network.find_range(features, views, self.sources)
+                sources = choose_sources(views.world_to_camera, views.intrinsics, views.size, depth_range, self.sources)
+                encoded.append(self.network.encode(features, views, depth_range, sources, self.planes))
+        taps = [torch.stack([each.taps[tap] for each in encoded]) for tap in range(TAPS)]
+        state = {
+            name: torch.stack([getattr(each, name) for each in encoded])
+            for name in ("context", "context_fine", "swept")
+        }
+        camera = taps[-1].mean(2)  # this network predicts no cameras: a summary of each view stands in for their token
+        return replace(self.as_tokens(images, taps, camera), state=state | {"cameras": cameras})
+
+    def decode(self, tokens: Tokens) -> Geometry:
+        """Reads depth and its expected error; see :meth:`Backend.decode`."""
+        state = tokens.state
+        scenes, views = tokens.camera.shape[:2]
+        with full_precision(tokens.camera):
+            taps = tuple(tap.float().flatten(0, 1) for tap in tokens.patch)
+            depth, log_scale = self.network.decode(
+                taps, *(state[name].flatten(0, 1) for name in ("context", "context_fine", "swept"))
+            )
+            confidence = torch.exp(-log_scale).clamp(*_CONFIDENCE)
+        depth, confidence = (each.unflatten(0, (scenes, views)) for each in (depth, confidence))
+        return Geometry(depth, confidence, state["cameras"], torch.ones_like(depth[:, 0, 0, 0]))
+
+    def _range(self, hints: Hints, scene: int) -> Tensor | None:
+        depth_range = getattr(hints, "depth_range", None)
+        return None if depth_range is None else depth_range[scene].float()
+
+    def _check_parallax(self, views: Views) -> None:
+        if len(views.images) < self.min_views:
+            raise ValueError(_NO_PARALLAX.format(name=self.name, why="was given one view"))
+        if not camera_extent(views.world_to_camera) > 0:
+            raise ValueError(_NO_PARALLAX.format(name=self.name, why="all cameras stand in one place"))

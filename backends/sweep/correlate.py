@@ -1,0 +1,192 @@
+"""Similarity of views with their sources at hypothetical depths: a plain torch reference and compiled CPU kernels.
+
+The reference warps every channel of a source onto every plane and multiplies afterwards; the kernels project, sample
+and multiply point by point, so nothing of the size of planes x channels is ever in memory. Depths and cameras get no
+gradient: planes are hypotheses.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numba import njit
+from torch import Tensor
+from torch.nn import functional as F
+
+from backends.sweep.views import rays, relative_poses
+
+GROUPS = 8  # similarities per point: dot products over the channels c with equal c % GROUPS
+BEHIND = 1e-3  # depth in a source, per depth here, below which a point does not count as seen
+
+
+class SourceWarp:
+    """Where points of every view fall in its sources.
+
+    Args:
+        world_to_camera: ``[V, 4, 4]``.
+        intrinsics: ``[V, 3, 3]`` of the feature maps.
+        sources: ``[V, n]`` indices.
+        size: ``(h, w)`` of the feature maps.
+    """
+
+    def __init__(self, world_to_camera: Tensor, intrinsics: Tensor, sources: Tensor, size: tuple[int, int]) -> None:
+        poses = relative_poses(world_to_camera, sources)
+        camera = intrinsics[sources]
+        self.at_infinity = camera @ poses[..., :3, :3] @ rays(intrinsics, size)[:, None]  # [V, n, 3, h w]
+        self.parallax = camera @ poses[..., :3, 3:]  # [V, n, 3, 1]
+        self.sources = sources
+        self.size = size
+
+    def __call__(self, source: int, inverse: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Projects inverse depths ``[V, D, h w]`` into source number ``source``.
+
+        Returns:
+            Sampling grid ``[V, D, h w, 2]`` in [-1, 1], whether it is inside the image ``[V, D, h w]``, and the depth
+            there times the inverse depth here ``[V, D, h w]``.
+        """
+        height, width = self.size
+        u, v, z = (
+            self.at_infinity[:, source, None, axis] + self.parallax[:, source, None, axis] * inverse
+            for axis in range(3)
+        )
+        safe = z.clamp_min(BEHIND)
+        u, v = u / safe, v / safe
+        inside = (z > BEHIND) & (u > -0.5) & (u < width - 0.5) & (v > -0.5) & (v < height - 0.5)
+        grid = torch.stack(((2 * u + 1) / width - 1, (2 * v + 1) / height - 1), -1).clamp(-3, 3)
+        return grid, inside, z
+
+
+def correlate(features: Tensor, inverse: Tensor, warp: SourceWarp) -> tuple[Tensor, Tensor]:
+    """Compares every view with its sources.
+
+    Args:
+        features: ``[V, C, h, w]``, C a multiple of ``GROUPS``.
+        inverse: ``[V, D, h w]`` inverse depths.
+        warp: of these views.
+
+    Returns:
+        Similarity ``[V, n, D, h w, GROUPS]``, 0 outside of the source, and whether it is inside ``[V, n, D, h w]``.
+    """
+    compiled = features.device.type == "cpu" and features.dtype == torch.float32 and not torch.jit.is_tracing()
+    if not compiled or torch.compiler.is_compiling():
+        return correlate_reference(features, inverse, warp)
+    return _Correlate.apply(features, inverse, warp)  # type: ignore[return-value]
+
+
+def correlate_reference(features: Tensor, inverse: Tensor, warp: SourceWarp) -> tuple[Tensor, Tensor]:
+    """:func:`correlate` in plain torch, for every device and dtype."""
+    here = features.unflatten(1, (-1, GROUPS)).flatten(-2).unsqueeze(3)  # [V, c, G, 1, h w]
+    similarities, insides = [], []
+    for source in range(warp.sources.shape[1]):
+        grid, inside, _ = warp(source, inverse)
+        there = features[warp.sources[:, source]]
+        sampled = F.grid_sample(there, grid.to(there), padding_mode="border", align_corners=False)  # [V, C, D, h w]
+        product = (sampled.unflatten(1, (-1, GROUPS)) * here).sum(1)  # [V, G, D, h w]
+        similarities.append(product.permute(0, 2, 3, 1) * inside[..., None])
+        insides.append(inside)
+    return torch.stack(similarities, 1), torch.stack(insides, 1)
+
+
+class _Correlate(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, features: Tensor, inverse: Tensor, warp: SourceWarp) -> tuple[Tensor, Tensor]:
+        maps = features.permute(0, 2, 3, 1).contiguous()  # [V, h, w, C]
+        views, sources = warp.sources.shape
+        shape = (views, sources, *inverse.shape[1:])
+        similarity = torch.empty(*shape, GROUPS)
+        inside = torch.empty(shape, dtype=torch.bool)
+        geometry = _arrays(maps, warp.sources, warp.at_infinity, warp.parallax, inverse)
+        _forward(*geometry, similarity.numpy(), inside.numpy())
+        ctx.geometry = geometry
+        ctx.mark_non_differentiable(inside)
+        return similarity, inside
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None]:  # type: ignore[override]
+        maps = ctx.geometry[0]
+        gradient = np.zeros_like(maps)
+        _backward(*ctx.geometry, gradients[0].contiguous().numpy(), gradient)
+        return torch.from_numpy(gradient).permute(0, 3, 1, 2), None, None
+
+
+def _arrays(*tensors: Tensor) -> tuple[np.ndarray, ...]:
+    return tuple(tensor.detach().contiguous().numpy() for tensor in tensors)
+
+
+@njit(fastmath=True, error_model="numpy", nogil=True, cache=True, inline="always")
+def _sample(at_infinity, parallax, p, inverse, height, width):
+    """Corner and weights of the four pixels around a point's place in the source, and whether it is inside."""
+    z = at_infinity[2, p] + parallax[2, 0] * inverse
+    safe = max(z, np.float32(BEHIND))
+    u = (at_infinity[0, p] + parallax[0, 0] * inverse) / safe
+    v = (at_infinity[1, p] + parallax[1, 0] * inverse) / safe
+    inside = z > BEHIND and u > -0.5 and u < width - 0.5 and v > -0.5 and v < height - 0.5
+    u = min(max(u, np.float32(0.0)), np.float32(width - 1))
+    v = min(max(v, np.float32(0.0)), np.float32(height - 1))
+    x, y = int(u), int(v)
+    x, y = min(x, max(width - 2, 0)), min(y, max(height - 2, 0))
+    return x, y, u - np.float32(x), v - np.float32(y), inside
+
+
+@njit(fastmath=True, error_model="numpy", nogil=True, cache=True)
+def _forward(maps, sources, at_infinity, parallax, inverse, similarity, inside):
+    views, height, width, channels = maps.shape
+    one = np.float32(1.0)
+    for view in range(views):
+        for n in range(sources.shape[1]):
+            other = sources[view, n]
+            for d in range(inverse.shape[1]):
+                for p in range(height * width):
+                    x, y, a, b, within = _sample(
+                        at_infinity[view, n], parallax[view, n], p, inverse[view, d, p], height, width
+                    )
+                    inside[view, n, d, p] = within
+                    out = similarity[view, n, d, p]
+                    out[:] = 0.0
+                    if not within:
+                        continue
+                    here = maps[view, p // width, p % width]
+                    x1, y1 = min(x + 1, width - 1), min(y + 1, height - 1)
+                    f00, f01 = maps[other, y, x], maps[other, y, x1]
+                    f10, f11 = maps[other, y1, x], maps[other, y1, x1]
+                    w00, w01, w10, w11 = (one - a) * (one - b), a * (one - b), (one - a) * b, a * b
+                    for c in range(0, channels, GROUPS):
+                        for g in range(GROUPS):
+                            k = c + g
+                            out[g] += here[k] * (w00 * f00[k] + w01 * f01[k] + w10 * f10[k] + w11 * f11[k])
+
+
+@njit(fastmath=True, error_model="numpy", nogil=True, cache=True)
+def _backward(maps, sources, at_infinity, parallax, inverse, gradient, out):
+    views, height, width, channels = maps.shape
+    one = np.float32(1.0)
+    for view in range(views):
+        for n in range(sources.shape[1]):
+            other = sources[view, n]
+            for d in range(inverse.shape[1]):
+                for p in range(height * width):
+                    x, y, a, b, within = _sample(
+                        at_infinity[view, n], parallax[view, n], p, inverse[view, d, p], height, width
+                    )
+                    if not within:
+                        continue
+                    given = gradient[view, n, d, p]
+                    row, column = p // width, p % width
+                    here, to_here = maps[view, row, column], out[view, row, column]
+                    x1, y1 = min(x + 1, width - 1), min(y + 1, height - 1)
+                    f00, f01 = maps[other, y, x], maps[other, y, x1]
+                    f10, f11 = maps[other, y1, x], maps[other, y1, x1]
+                    t00, t01 = out[other, y, x], out[other, y, x1]
+                    t10, t11 = out[other, y1, x], out[other, y1, x1]
+                    w00, w01, w10, w11 = (one - a) * (one - b), a * (one - b), (one - a) * b, a * b
+                    for c in range(0, channels, GROUPS):
+                        for g in range(GROUPS):
+                            k = c + g
+                            to_here[k] += given[g] * (w00 * f00[k] + w01 * f01[k] + w10 * f10[k] + w11 * f11[k])
+                            back = given[g] * here[k]
+                            t00[k] += w00 * back
+                            t01[k] += w01 * back
+                            t10[k] += w10 * back
+                            t11[k] += w11 * back

@@ -1,0 +1,109 @@
+"""Image features of the plane sweep: for matching (unit length per group) and for context, at two resolutions."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from backends.sweep.correlate import GROUPS
+
+MATCH_COARSE, MATCH_FINE = 32, 32  # matching channels at 1/4 and 1/2 of the image
+CONTEXT_COARSE, CONTEXT_FINE = 48, 16
+
+
+class Features(NamedTuple):
+    """Features of N images; ``h, w`` is a quarter of the image.
+
+    Attributes:
+        coarse: ``[N, MATCH_COARSE, h, w]``, every group of channels of unit length.
+        fine: ``[N, MATCH_FINE, 2 h, 2 w]``, likewise.
+        context: ``[N, CONTEXT_COARSE, h, w]``.
+        context_fine: ``[N, CONTEXT_FINE, 2 h, 2 w]``.
+    """
+
+    coarse: Tensor
+    fine: Tensor
+    context: Tensor
+    context_fine: Tensor
+
+
+class InstanceNorm(nn.Module):
+    """Instance normalisation by elementary operations: torch's own is slow on channels-last CPU tensors."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(channels))
+        self.bias = nn.Parameter(torch.zeros(channels))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Normalises ``[N, C, h, w]`` over h and w."""
+        centered = x - x.mean((2, 3), keepdim=True)
+        variance = centered.square().mean((2, 3), keepdim=True)
+        scale = torch.rsqrt(variance.float() + 1e-5) * self.weight[:, None, None]
+        return centered * scale.to(x.dtype) + self.bias.to(x.dtype)[:, None, None]
+
+
+def conv_norm(inputs: int, outputs: int, stride: int = 1, kernel: int = 3) -> nn.Sequential:
+    """Convolution, instance normalisation, ReLU."""
+    conv = nn.Conv2d(inputs, outputs, kernel, stride, kernel // 2, bias=False)
+    return nn.Sequential(conv, InstanceNorm(outputs), nn.ReLU(inplace=True))
+
+
+class ResidualBlock(nn.Module):
+    """Two 3x3 convolutions around which the input is added."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.first = conv_norm(channels, channels)
+        self.second = nn.Sequential(nn.Conv2d(channels, channels, 3, 1, 1, bias=False), InstanceNorm(channels))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Maps ``[N, C, h, w]`` to the same shape."""
+        return F.relu(x + self.second(self.first(x)))
+
+
+class FeaturePyramid(nn.Module):
+    """A small feature pyramid network over 1/2 to 1/16 of the image."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.to_half = nn.Sequential(conv_norm(3, 32, 2, 5), conv_norm(32, 32))
+        self.to_quarter = nn.Sequential(conv_norm(32, 48, 2), ResidualBlock(48), ResidualBlock(48))
+        self.to_eighth = nn.Sequential(conv_norm(48, 64, 2), ResidualBlock(64), ResidualBlock(64))
+        self.to_sixteenth = nn.Sequential(conv_norm(64, 96, 2), ResidualBlock(96))
+        self.from_sixteenth = nn.Conv2d(96, 64, 1)
+        self.from_eighth = nn.Conv2d(64, 48, 1)
+        self.from_quarter = nn.Conv2d(48, 32, 1)
+        self.merge = conv_norm(48, 48)
+        self.merge_half = conv_norm(32, 32)
+        self.coarse = nn.Conv2d(48, MATCH_COARSE, 3, 1, 1)
+        self.fine = nn.Conv2d(32, MATCH_FINE, 3, 1, 1)
+        self.context = nn.Conv2d(48, CONTEXT_COARSE, 3, 1, 1)
+        self.context_fine = nn.Conv2d(32, CONTEXT_FINE, 3, 1, 1)
+
+    def forward(self, images: Tensor) -> Features:
+        """Maps images ``[N, 3, H, W]`` in [0, 1], H and W multiples of 8, to their features."""
+        half = self.to_half((images - 0.5) * 3)
+        quarter = self.to_quarter(half)
+        eighth = self.to_eighth(quarter)
+        eighth = F.relu(eighth + _upsample(self.from_sixteenth(self.to_sixteenth(eighth)), eighth))
+        quarter = self.merge(quarter + _upsample(self.from_eighth(eighth), quarter))
+        half = self.merge_half(half + _upsample(self.from_quarter(quarter), half))
+        return Features(
+            _unit_groups(self.coarse(quarter)),
+            _unit_groups(self.fine(half)),
+            F.relu(self.context(quarter)),
+            F.relu(self.context_fine(half)),
+        )
+
+
+def _upsample(x: Tensor, like: Tensor) -> Tensor:
+    return F.interpolate(x, size=like.shape[-2:], mode="bilinear", align_corners=False)
+
+
+def _unit_groups(x: Tensor) -> Tensor:
+    """Makes every group of channels (those of equal c % GROUPS) of ``[N, C, h, w]`` a unit vector, in float32."""
+    return F.normalize(x.float().unflatten(1, (-1, GROUPS)), dim=1, eps=1e-3).flatten(1, 2)

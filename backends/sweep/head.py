@@ -1,0 +1,75 @@
+"""The frozen head: tokens and the sweep's own depth to depth and its uncertainty, differentiable in the tokens."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from backends.sweep.features import CONTEXT_COARSE, CONTEXT_FINE
+from backends.sweep.refine import PlainBlock
+from backends.sweep.tokens import DIM, TAPS
+
+RESPONSE = 0.02  # log-depth per unit of the tokens' correction channels
+CELLS = 2  # the correction channels hold CELLS x CELLS values per patch
+_SPREAD = 48  # channels of a cell after the tokens are spread over it
+_UNSURE = -2.5  # log of the scale of relative errors before training
+
+
+class DepthHead(nn.Module):
+    """Reads log-depth as that of the sweep plus a correction.
+
+    The first four channels of the last tap are the correction of 2x2 cells of the patch, in units of ``RESPONSE``: they
+    pass through linearly, so a change of the tokens changes depth smoothly. Convolutions add what both taps say.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.norms = nn.ModuleList(nn.LayerNorm(DIM) for _ in range(TAPS))
+        self.spread = nn.Linear(TAPS * DIM, CELLS**2 * _SPREAD)
+        self.coarse = nn.Sequential(nn.Conv2d(_SPREAD + CONTEXT_COARSE, 64, 3, 1, 1), PlainBlock(64), PlainBlock(64))
+        self.lift = nn.Conv2d(64, 48, 1)
+        self.fine = nn.Sequential(nn.Conv2d(48 + CONTEXT_FINE + 2, 48, 3, 1, 1), PlainBlock(48))
+        self.out = nn.Conv2d(48, 2, 3, 1, 1)
+        self.mask = nn.Sequential(nn.Conv2d(48, 64, 1), nn.ReLU(), nn.Conv2d(64, 9 * 4, 1))
+        nn.init.zeros_(self.out.weight)
+        nn.init.zeros_(self.out.bias)  # type: ignore[arg-type]
+
+    def forward(
+        self, taps: tuple[Tensor, ...], grid: tuple[int, int], context: Tensor, context_fine: Tensor, swept: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Decodes.
+
+        Args:
+            taps: ``[V, P, DIM]`` each.
+            grid: patches per axis.
+            context: ``[V, CONTEXT_COARSE, h, w]``, a quarter of the image.
+            context_fine: ``[V, CONTEXT_FINE, 2 h, 2 w]``.
+            swept: ``[V, 2, 2 h, 2 w]`` log-depth of the sweep and its probability.
+
+        Returns:
+            Log-depth and log-scale of its error, each ``[V, 4 h, 4 w]``.
+        """
+        said = torch.cat([norm(tap) for norm, tap in zip(self.norms, taps, strict=True)], -1)
+        said = F.pixel_shuffle(self.spread(said).mT.unflatten(-1, grid), CELLS)  # [V, C, h, w]
+        correction = F.pixel_shuffle(taps[-1][..., : CELLS**2].mT.unflatten(-1, grid), CELLS)
+        x = self.lift(F.relu(self.coarse(torch.cat((said, context), 1))))
+        size = swept.shape[-2:]
+        x, correction = (
+            F.interpolate(each, size=size, mode="bilinear", align_corners=False) for each in (x, correction)
+        )
+        center = swept[:, :1].mean((-1, -2), keepdim=True)
+        x = F.relu(self.fine(torch.cat((x, context_fine, swept[:, :1] - center, swept[:, 1:]), 1)))
+        log_depth, log_scale = self.out(x).float().chunk(2, 1)
+        log_depth = swept[:, :1] + RESPONSE * correction.float() + 0.25 * log_depth
+        both = torch.cat((log_depth, log_scale + _UNSURE), 1)
+        full = _convex_upsample(both, self.mask(x).float())
+        return full[:, 0], full[:, 1]
+
+
+def _convex_upsample(x: Tensor, mask: Tensor) -> Tensor:
+    """Doubles ``[V, C, h, w]``: every new pixel is a convex mixture of its 3x3 neighbours, ``mask [V, 36, h, w]``."""
+    views, channels, height, width = x.shape
+    weights = mask.unflatten(1, (9, 4)).softmax(1)  # [V, 9, 4, h, w]
+    around = F.unfold(F.pad(x, (1, 1, 1, 1), mode="replicate"), 3).view(views, channels, 9, 1, height, width)
+    return F.pixel_shuffle((around * weights[:, None]).sum(2).flatten(1, 2), 2)

@@ -1,0 +1,181 @@
+"""The plane-sweep multi-view stereo network: images and cameras to tokens, tokens to depth."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from backends.base import full_precision
+from backends.sweep.correlate import SourceWarp
+from backends.sweep.features import CONTEXT_COARSE, FeaturePyramid, Features
+from backends.sweep.head import DepthHead
+from backends.sweep.refine import RefineNet, slices
+from backends.sweep.tokens import PATCH, TokenNet, patch_places
+from backends.sweep.views import agreed_range, choose_sources, wide_range
+from backends.sweep.volume import (
+    PlaneSweep,
+    VolumeNet,
+    agreement,
+    expectation,
+    to_inverse,
+)
+from vg2gt.geometry.cameras import resize_intrinsics
+
+_BINS = 16  # channels that the planes' probability is summed into
+_FINE_PLANES = 12
+_FINE_REACH = 1.5  # of the second sweep on either side, in spacings of the first
+_FARTHEST = 4.0  # decoded depth at most, in multiples of the farthest plane
+WIDE_PLANES = 64  # of the sweep that finds the range
+
+
+class Views(NamedTuple):
+    """V views of one scene.
+
+    Attributes:
+        images: ``[V, 3, H, W]`` in [0, 1], H and W multiples of 8.
+        world_to_camera: ``[V, 4, 4]``.
+        intrinsics: ``[V, 3, 3]`` in pixels, integer pixel centres.
+    """
+
+    images: Tensor
+    world_to_camera: Tensor
+    intrinsics: Tensor
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Image ``(height, width)``."""
+        return (self.images.shape[-2], self.images.shape[-1])
+
+
+class Sweep(NamedTuple):
+    """What one sweep found.
+
+    Attributes:
+        logits: ``[V, D, h, w]``.
+        position: ``[V, D, h, w]`` or broadcastable: places of the planes, 0 at far and 1 at near.
+        t: ``[V, 1, h, w]`` expected position.
+        mass: ``[V, 1, h, w]`` probability around it.
+    """
+
+    logits: Tensor
+    position: Tensor
+    t: Tensor
+    mass: Tensor
+
+
+class Encoding(NamedTuple):
+    """Everything between images and depth.
+
+    Attributes:
+        taps: patch tokens ``[V, P, DIM]`` of the last blocks.
+        context: ``[V, C, h, w]``, a quarter of the image.
+        context_fine: ``[V, C, 2 h, 2 w]``.
+        swept: ``[V, 2, 2 h, 2 w]`` log-depth of the second sweep and its probability.
+        first: the first sweep.
+        refined: ``[V, 1, h, w]`` position after the U-Net.
+        second: the second sweep.
+    """
+
+    taps: tuple[Tensor, ...]
+    context: Tensor
+    context_fine: Tensor
+    swept: Tensor
+    first: Sweep
+    refined: Tensor
+    second: Sweep
+
+
+class SweepNet(nn.Module):
+    """Learned plane sweep: a wide sweep at 1/4, a U-Net, a narrow sweep at 1/2, tokens of 8x8 patches, a depth head."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.features = FeaturePyramid()
+        self.sweep = PlaneSweep()
+        self.volume = VolumeNet()
+        self.refine = RefineNet(CONTEXT_COARSE + 1 + 1 + 3 + _BINS, 1)
+        self.sweep_fine = PlaneSweep()
+        self.volume_fine = VolumeNet()
+        per_cell = CONTEXT_COARSE + 2 + 3  # context, refined position and first probability, agreement
+        self.tokens = TokenNet(4 * per_cell + 16 * 2 + _BINS)
+        self.head = DepthHead()
+
+    def coarse(
+        self, features: Features, views: Views, depth_range: Tensor, sources: Tensor, planes: int
+    ) -> tuple[Sweep, Tensor]:
+        """The first sweep over ``[near, far]`` and the agreement of its depths ``[V, 3, h, w]``."""
+        warp = _warp(features.coarse, views, sources, 4)
+        position = torch.linspace(0, 1, planes, device=depth_range.device).view(1, -1, 1, 1)
+        inverse = to_inverse(position, depth_range)[..., 0].expand(len(views.images), -1, -1)  # [V, D, 1]
+        logits = self.volume(self.sweep(features.coarse, inverse, warp), planes)
+        t, mass = expectation(logits, position)
+        agreeing = agreement(to_inverse(t.detach(), depth_range), warp)
+        return Sweep(logits, position, t, mass), agreeing
+
+    def find_range(self, features: Features, views: Views, sources: int) -> Tensor:
+        """Near and far ``[2]`` from the cameras alone: a wide sweep, then the depths on which views agree."""
+        wide = wide_range(views.world_to_camera)
+        chosen = choose_sources(views.world_to_camera, views.intrinsics, views.size, wide, sources)
+        sweep, agreeing = self.coarse(features, views, wide, chosen, WIDE_PLANES)
+        depth = 1 / to_inverse(sweep.t, wide)
+        return agreed_range(depth, agreeing[:, 1:2] * (sweep.mass > 0.4), wide)
+
+    def encode(self, features: Features, views: Views, depth_range: Tensor, sources: Tensor, planes: int) -> Encoding:
+        """Images to tokens.
+
+        Args:
+            features: of ``views.images``.
+            views: of one scene.
+            depth_range: ``[2]`` near and far of the planes.
+            sources: ``[V, n]`` indices of the views that each is compared with.
+            planes: of the first sweep.
+        """
+        first, agreeing = self.coarse(features, views, depth_range, sources, planes)
+        bins = slices(first.logits.softmax(1), _BINS)
+        known = torch.cat((features.context, 4 * first.t, first.mass, agreeing, bins), 1)
+        refined = first.t + 0.25 * self.refine(known)
+        second = self._narrow(features.fine, refined, views, depth_range, sources, planes)
+        inverse = to_inverse(second.t, depth_range).clamp_min(1 / (_FARTHEST * depth_range[1]))
+        swept = torch.cat((-inverse.log(), second.mass), 1)
+        grid = (views.size[0] // PATCH, views.size[1] // PATCH)
+        cells = torch.cat((features.context, 4 * refined, first.mass, agreeing), 1)
+        parts = (F.pixel_unshuffle(cells, 2), F.pixel_unshuffle(torch.cat((4 * second.t, second.mass), 1), 4))
+        patches = torch.cat((*parts, F.avg_pool2d(bins, 2)), 1).flatten(2).mT  # [V, P, .]
+        depth = F.avg_pool2d(-swept[:, :1], 4).exp().flatten(1).reciprocal()
+        with full_precision(depth):
+            place = patch_places(depth.detach(), views.world_to_camera, views.intrinsics, depth_range, grid)
+        taps = self.tokens(patches, place, grid)
+        return Encoding(taps, features.context, features.context_fine, swept, first, refined, second)
+
+    def _narrow(
+        self, fine: Tensor, refined: Tensor, views: Views, depth_range: Tensor, sources: Tensor, planes: int
+    ) -> Sweep:
+        """The second sweep, at half of the image, around the refined positions ``[V, 1, h, w]``."""
+        size = (fine.shape[-2], fine.shape[-1])
+        warp = _warp(fine, views, sources, 2)
+        reach = _FINE_REACH / (planes - 1)
+        center = F.interpolate(refined.detach(), size=size, mode="bilinear", align_corners=False)
+        offsets = torch.linspace(-reach, reach, _FINE_PLANES, device=fine.device).view(1, -1, 1, 1)
+        position = center + offsets  # [V, D, 2 h, 2 w]
+        inverse = to_inverse(position, depth_range).clamp_min(1 / (_FARTHEST * depth_range[1])).flatten(2)
+        logits = self.volume_fine(self.sweep_fine(fine, inverse, warp), _FINE_PLANES)
+        t, mass = expectation(logits, position)
+        return Sweep(logits, position, t, mass)
+
+    def decode(
+        self, taps: tuple[Tensor, ...], context: Tensor, context_fine: Tensor, swept: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Tokens to depth and log-scale of its relative error, each ``[V, H, W]``; see :class:`DepthHead`."""
+        grid = (context.shape[-2] // 2, context.shape[-1] // 2)
+        log_depth, log_scale = self.head(taps, grid, context, context_fine, swept)
+        return log_depth.exp(), log_scale
+
+
+def _warp(maps: Tensor, views: Views, sources: Tensor, stride: int) -> SourceWarp:
+    """Correspondences of feature maps at ``1 / stride`` of the images; half precision would move them by pixels."""
+    with full_precision(maps):
+        intrinsics = resize_intrinsics(views.intrinsics, 1 / stride, 1 / stride)
+        return SourceWarp(views.world_to_camera, intrinsics, sources, (maps.shape[-2], maps.shape[-1]))

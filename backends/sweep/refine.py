@@ -1,0 +1,67 @@
+"""A small U-Net over the first sweep: fills what matching cannot see (bare walls, occlusions) from context."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+
+class PlainBlock(nn.Module):
+    """Two 3x3 convolutions around which the input is added, without normalisation: absolute values matter here."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.first = nn.Conv2d(channels, channels, 3, 1, 1)
+        self.second = nn.Conv2d(channels, channels, 3, 1, 1)
+        nn.init.zeros_(self.second.weight)
+        nn.init.zeros_(self.second.bias)  # type: ignore[arg-type]
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Maps ``[N, C, h, w]`` to the same shape."""
+        return x + self.second(F.relu(self.first(F.relu(x))))
+
+
+class RefineNet(nn.Module):
+    """U-Net on 1/4, 1/8 and 1/16 of the image.
+
+    Args:
+        inputs: channels of what is known of every cell.
+        outputs: channels of what is said; zero before training.
+        channels: at the three resolutions.
+    """
+
+    def __init__(self, inputs: int, outputs: int, channels: tuple[int, int, int] = (64, 96, 128)) -> None:
+        super().__init__()
+        fine, middle, coarse = channels
+        self.begin = nn.Sequential(nn.Conv2d(inputs, fine, 3, 1, 1), PlainBlock(fine))
+        self.down = nn.Sequential(nn.ReLU(), nn.Conv2d(fine, middle, 3, 2, 1), PlainBlock(middle))
+        self.bottom = nn.Sequential(
+            nn.ReLU(), nn.Conv2d(middle, coarse, 3, 2, 1), PlainBlock(coarse), PlainBlock(coarse)
+        )
+        self.up = nn.Conv2d(coarse, middle, 1)
+        self.merge = PlainBlock(middle)
+        self.up_fine = nn.Conv2d(middle, fine, 1)
+        self.merge_fine = PlainBlock(fine)
+        self.end = nn.Conv2d(fine, outputs, 3, 1, 1)
+        nn.init.zeros_(self.end.weight)
+        nn.init.zeros_(self.end.bias)  # type: ignore[arg-type]
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Maps ``[N, inputs, h, w]`` to ``[N, outputs, h, w]`` in float32."""
+        fine = self.begin(x)
+        middle = self.down(fine)
+        middle = self.merge(middle + _upsample(self.up(self.bottom(middle)), middle))
+        fine = self.merge_fine(fine + _upsample(self.up_fine(middle), fine))
+        return self.end(F.relu(fine)).float()
+
+
+def _upsample(x: Tensor, like: Tensor) -> Tensor:
+    return F.interpolate(x, size=like.shape[-2:], mode="bilinear", align_corners=False)
+
+
+def slices(probability: Tensor, bins: int) -> Tensor:
+    """Probability ``[V, D, h, w]`` of the planes summed into ``bins`` channels, whatever their number."""
+    flat = probability.flatten(2).transpose(1, 2)  # [V, h w, D]
+    pooled = F.adaptive_avg_pool1d(flat, bins) * (probability.shape[1] / bins)
+    return torch.unflatten(pooled.transpose(1, 2), 2, probability.shape[-2:])

@@ -1,0 +1,102 @@
+"""Patch tokens: what is known of an 8x8 patch, thought over within its view and across views."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from backends.sweep.views import rays
+from vg2gt.geometry.cameras import resize_intrinsics
+
+PATCH = 8
+DIM = 128
+TAPS = 2  # the last two blocks' outputs
+_WAVENUMBERS = (1.5, 4.0, 10.0)  # of a patch's place, per geometric-mean depth
+_IMAGE_WAVES = 8
+POSITION_CHANNELS = 3 + 3 + 6 * len(_WAVENUMBERS) + 4 * _IMAGE_WAVES
+
+
+class TokenBlock(nn.Module):
+    """Pre-norm transformer block whose keys are 2x2-pooled tokens, of the own view or of all views.
+
+    Args:
+        dim: channels.
+        heads: of the attention.
+        across: whether it attends to all views.
+    """
+
+    def __init__(self, dim: int, heads: int, across: bool) -> None:
+        super().__init__()
+        self.heads, self.across = heads, across
+        self.norm, self.norm_mlp = nn.LayerNorm(dim), nn.LayerNorm(dim)
+        self.query, self.key_value, self.out = nn.Linear(dim, dim), nn.Linear(dim, 2 * dim), nn.Linear(dim, dim)
+        self.mlp = nn.Sequential(nn.Linear(dim, 3 * dim), nn.GELU(), nn.Linear(3 * dim, dim))
+
+    def forward(self, x: Tensor, position: Tensor, grid: tuple[int, int]) -> Tensor:
+        """Maps tokens ``[V, P, dim]`` to the same shape; ``position`` likewise, ``grid`` the patches per axis."""
+        views, patches, dim = x.shape
+        placed = self.norm(x) + position
+        query = self.query(placed)
+        keys = F.avg_pool2d(placed.mT.unflatten(-1, grid), 2, ceil_mode=True).flatten(2).mT  # [V, P/4, dim]
+        if self.across:
+            query, keys = query.reshape(1, views * patches, dim), keys.reshape(1, -1, dim)
+        parts = (query, *self.key_value(keys).chunk(2, -1))
+        split = [part.unflatten(-1, (self.heads, -1)).transpose(1, 2) for part in parts]  # [., heads, P, dim/heads]
+        q, k, v = split
+        weights = (q @ k.mT / math.sqrt(q.shape[-1])).softmax(-1)  # the fused kernel is slower on a CPU at these sizes
+        attended = (weights.to(v.dtype) @ v).transpose(1, 2).flatten(2).reshape(views, patches, dim)
+        x = x + self.out(attended)
+        return x + self.mlp(self.norm_mlp(x))
+
+
+class TokenNet(nn.Module):
+    """Embeds patches and runs the blocks, views and all views in turns.
+
+    Args:
+        inputs: channels of what is known of a patch.
+        blocks: number of transformer blocks.
+    """
+
+    def __init__(self, inputs: int, blocks: int = 4) -> None:
+        super().__init__()
+        self.embed = nn.Sequential(nn.Linear(inputs, 2 * DIM), nn.GELU(), nn.Linear(2 * DIM, DIM))
+        self.position = nn.Linear(POSITION_CHANNELS, DIM)
+        self.blocks = nn.ModuleList(TokenBlock(DIM, 4, across=i % 2 == 1) for i in range(blocks))
+
+    def forward(self, patches: Tensor, place: Tensor, grid: tuple[int, int]) -> tuple[Tensor, ...]:
+        """Maps ``patches [V, P, inputs]`` at ``place [V, P, POSITION_CHANNELS]`` to the taps ``[V, P, DIM]``."""
+        tokens, position = self.embed(patches), self.position(place)
+        taps = []
+        for block in self.blocks:
+            tokens = block(tokens, position, grid)
+            taps.append(tokens)
+        return tuple(tap.float() for tap in taps[-TAPS:])
+
+
+def patch_places(
+    depth: Tensor, world_to_camera: Tensor, intrinsics: Tensor, depth_range: Tensor, size: tuple[int, int]
+) -> Tensor:
+    """Where patches are, ``[V, P, POSITION_CHANNELS]``: point and ray in view 0's frame, and place in the image.
+
+    Args:
+        depth: ``[V, P]`` of the patches.
+        world_to_camera: ``[V, 4, 4]``.
+        intrinsics: ``[V, 3, 3]`` of the images.
+        depth_range: ``[2]`` near and far; their geometric mean is the unit.
+        size: patches per axis.
+    """
+    pose = world_to_camera[:1] @ torch.linalg.inv(world_to_camera)
+    ray = rays(resize_intrinsics(intrinsics, 1 / PATCH, 1 / PATCH), size)  # [V, 3, P]
+    unit = depth_range.prod().sqrt()
+    point = (pose[:, :3, :3] @ (ray * depth[:, None]) + pose[:, :3, 3:]) / unit
+    direction = F.normalize(pose[:, :3, :3] @ ray, dim=1)
+    waves = [wave(point * number) for number in _WAVENUMBERS for wave in (torch.sin, torch.cos)]
+    rows, columns = (torch.linspace(0, 1, steps, device=depth.device) for steps in size)
+    axes = torch.stack(torch.meshgrid(rows, columns, indexing="ij")).flatten(1)  # [2, P]
+    numbers = math.pi * 2 ** (torch.arange(_IMAGE_WAVES, device=depth.device) / 2)
+    phases = (axes[:, None] * numbers[:, None]).flatten(0, 1)  # [2 * waves, P]
+    image = torch.cat((phases.sin(), phases.cos())).expand(len(depth), -1, -1)
+    return torch.cat((point.clamp(-5, 5), direction, *waves, image), 1).mT

@@ -1,0 +1,101 @@
+"""What the cameras alone decide: which views are compared, and how near and far the planes stand."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from vg2gt.geometry.cameras import pixel_grid, resize_intrinsics
+
+_GRID = (5, 9)  # rays of a view by which overlap is measured
+_DEPTHS = 5  # planes between near and far at which it is measured
+_LEAST_PARALLAX, _MOST_PARALLAX = (
+    0.08,
+    0.5,
+)  # baseline over depth: below it little is gained, above it views look unlike
+_WIDE = (0.2, 40.0)  # the first sweep's range in units of the cameras' largest distance
+
+
+def rays(intrinsics: Tensor, size: tuple[int, int]) -> Tensor:
+    """Unit-z rays ``[V, 3, h * w]`` through the pixel centres of cameras ``[V, 3, 3]`` of that size."""
+    u, v = pixel_grid(*size, intrinsics).unbind(-1)
+    pixels = torch.stack((u.flatten(), v.flatten(), torch.ones_like(u).flatten()))
+    return torch.linalg.inv(intrinsics) @ pixels
+
+
+def relative_poses(world_to_camera: Tensor, sources: Tensor) -> Tensor:
+    """Transforms ``[V, n, 4, 4]`` from every view to its sources (``[V, n]`` indices)."""
+    return world_to_camera[sources] @ torch.linalg.inv(world_to_camera)[:, None]
+
+
+def choose_sources(
+    world_to_camera: Tensor,
+    intrinsics: Tensor,
+    size: tuple[int, int],
+    depth_range: Tensor,
+    count: int,
+    jitter: float = 0.0,
+) -> Tensor:
+    """Indices ``[V, n]`` of the views that every view is compared with, the best first.
+
+    A source is good if it sees what the view sees, at depths between near and far, from a little aside: the score is
+    the overlap times a reward for parallax that falls again for wide baselines.
+
+    Args:
+        world_to_camera: ``[V, 4, 4]``.
+        intrinsics: ``[V, 3, 3]`` in pixels.
+        size: image ``(height, width)``.
+        depth_range: ``[2]`` near and far.
+        count: sources per view, at most V - 1 are returned.
+        jitter: deviation of log-normal noise on the scores (training).
+    """
+    views = len(world_to_camera)
+    scaled = resize_intrinsics(intrinsics, _GRID[1] / size[1], _GRID[0] / size[0])
+    near, far = depth_range.unbind()
+    steps = torch.linspace(0, 1, _DEPTHS + 2, device=near.device)[1:-1]
+    depths = 1 / (1 / far + steps * (1 / near - 1 / far))
+    points = rays(scaled, _GRID)[:, None] * depths[None, :, None, None]  # [V, z, 3, p]
+    everyone = torch.arange(views, device=near.device).expand(views, views)
+    poses = relative_poses(world_to_camera, everyone)  # [V, s, 4, 4]
+    seen = torch.einsum("vsij,vzjp->vszip", poses[..., :3, :3], points) + poses[:, :, None, :3, 3:]
+    pixels = torch.einsum("sij,vszjp->vszip", scaled, seen)
+    z = pixels[..., 2, :]
+    u, v = (pixels[..., axis, :] / z.clamp_min(1e-6) for axis in (0, 1))
+    inside = (z > 0) & (u > -0.5) & (u < _GRID[1] - 0.5) & (v > -0.5) & (v < _GRID[0] - 0.5)
+    parallax = poses[..., :3, 3].norm(dim=-1) / depths[_DEPTHS // 2]
+    reward = parallax / (parallax + _LEAST_PARALLAX) / (1 + (parallax / _MOST_PARALLAX) ** 2)
+    score = inside.float().mean((-1, -2)) * reward
+    if jitter:
+        score = score * torch.exp(jitter * torch.randn_like(score))
+    score = score.masked_fill(torch.eye(views, dtype=torch.bool, device=score.device), -1.0)
+    return score.topk(min(count, views - 1), dim=1).indices
+
+
+def camera_extent(world_to_camera: Tensor) -> Tensor:
+    """Largest distance between two camera centres of ``[V, 4, 4]``."""
+    centers = torch.linalg.inv(world_to_camera)[:, :3, 3]
+    return torch.cdist(centers, centers).max()
+
+
+def wide_range(world_to_camera: Tensor) -> Tensor:
+    """Near and far ``[2]`` of a first sweep, from the cameras alone."""
+    extent = camera_extent(world_to_camera)
+    return torch.stack((_WIDE[0] * extent, _WIDE[1] * extent))
+
+
+def agreed_range(depth: Tensor, agreement: Tensor, fallback: Tensor, share: float = 0.5) -> Tensor:
+    """Near and far ``[2]`` around the depths on which views agree.
+
+    Agreement, not confidence, chooses the pixels: a network is sure of itself on near, well textured things.
+
+    Args:
+        depth: any shape.
+        agreement: of the same shape, in [0, 1]; see ``volume.agreement``.
+        fallback: the range to keep where almost nothing agrees.
+        share: agreement from which on a pixel counts.
+    """
+    agreed = depth[agreement > share].sort().values
+    if len(agreed) < 0.01 * depth.numel():
+        return fallback
+    low, high = agreed[int(0.02 * len(agreed))], agreed[min(int(0.98 * len(agreed)), len(agreed) - 1)]
+    return torch.stack((low * 0.8, high * 1.4))

@@ -1,0 +1,170 @@
+"""Depth of the learned plane sweep against a classical one and a constant: ``python benchmarks/plane_sweep.py``.
+
+Cameras are given, nothing else: both sweeps get the same depth range, found by the network from the cameras alone (and,
+for the record, the classical one also the true range). Rooms that neither the backbone nor anything else was trained
+on, and, with ``--shared FOLDER``, real recordings. Depth is compared after one median scale per set of views, because
+that is how reconstructions are used; ``raw`` has none. Prints a table and writes a dated JSON file.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import torch
+from common import machine, parser, write_results
+from hydra.utils import instantiate
+from torch import Tensor
+from torch.nn import functional as F
+
+from backends.sweep import SweepBackend
+from backends.sweep.correlate import SourceWarp
+from backends.sweep.network import Views
+from backends.sweep.views import choose_sources
+from backends.sweep.volume import to_inverse
+from vg2gt import __version__
+from vg2gt.config import compose
+from vg2gt.geometry.cameras import resize_intrinsics
+from vg2gt.types import Batch, Hints
+
+SETS = {
+    "rooms": "data=synthetic data.eval_scenes={scenes} data.val.first_seed={seed} data.image_size=[112,224]",
+    "outdoors": "data=synthetic data.eval_scenes={scenes} data.val.first_seed={seed} data.image_size=[112,224]"
+    " data.variant=outdoor",
+    "HoloLens office": "data=rgbd data.root={shared}/hololens_office_a data.image_size=[112,224]",
+    "7-Scenes kitchen": "data=rgbd data.root={shared}/seven_scenes_redkitchen_a_registered data.image_size=[112,224]"
+    " data.eval_window=14",
+}
+_WINDOW = 7  # pixels of the classical matching cost, at half resolution
+_PLANES = 64
+
+
+def batches(overrides: str) -> Iterator[Batch]:
+    """The input views of the evaluation of a data configuration: 8 per scene or window."""
+    config = compose("train", *overrides.split(), "data.eval_target=1", "data.eval_context=8")
+    data = instantiate(config.data)
+    data.setup("validate")
+    for batch in data.val_dataloader():
+        yield batch.context
+
+
+def scores(depth: Tensor, truth: Tensor, confidence: Tensor | None) -> dict[str, float]:
+    """Errors of the depth of some views ``[V, H, W]`` where the truth is known.
+
+    Returns:
+        ``raw`` and ``abs_rel`` (after one median scale), the share within 5 % (``d1.05``), the abs_rel of the more
+        confident half over all (``half``), and the area under the sparsification error over abs_rel (``ause``).
+    """
+    valid = (truth > 0) & torch.isfinite(depth) & (depth > 0)
+    depth, truth = depth[valid], truth[valid]
+    scale = (truth / depth).median()
+    error = (scale * depth / truth - 1).abs()
+    ratio = torch.maximum(scale * depth / truth, truth / (scale * depth))
+    result = {
+        "raw": float((depth / truth - 1).abs().mean()),
+        "abs_rel": float(error.mean()),
+        "d1.05": float((ratio < 1.05).float().mean()),
+        "median": float(error.median()),
+    }
+    if confidence is not None:
+        order = confidence[valid].argsort(descending=True)
+        result["half"] = float(error[order[: len(order) // 2]].mean() / error.mean())
+        kept = [max(1, int(len(error) * (1 - k / 20))) for k in range(19)]
+        found, best = error[order], error.sort().values
+        gaps = [found[:n].mean() - best[:n].mean() for n in kept]
+        result["ause"] = float(torch.stack(gaps).mean() / error.mean())
+    return result
+
+
+def classical(views: Views, depth_range: Tensor) -> Tensor:
+    """Winner-take-all plane sweep ``[V, H, W]``: mean normalised cross-correlation over three sources, 7x7 windows."""
+    sources = choose_sources(views.world_to_camera, views.intrinsics, views.size, depth_range, 3)
+    grey = F.avg_pool2d(views.images.mean(1, keepdim=True), 2)
+    size = (grey.shape[-2], grey.shape[-1])
+    warp = SourceWarp(views.world_to_camera, resize_intrinsics(views.intrinsics, 0.5, 0.5), sources, size)
+    mean, deviation = _moments(grey)
+    best = torch.full_like(grey, -torch.inf)
+    inverse = torch.zeros_like(grey)
+    for t in torch.linspace(0, 1, _PLANES):
+        plane = to_inverse(t, depth_range)
+        total, seen = torch.zeros_like(grey), torch.zeros_like(grey)
+        for source in range(sources.shape[1]):
+            grid, inside, _ = warp(source, plane.expand(len(grey), 1, size[0] * size[1]))
+            grid = grid.view(len(grey), *size, 2)
+            other = F.grid_sample(grey[sources[:, source]], grid, padding_mode="border", align_corners=False)
+            other_mean, other_deviation = _moments(other)
+            covariance = _box(grey * other) - mean * other_mean
+            inside = inside.view_as(grey)
+            total += covariance / (deviation * other_deviation) * inside
+            seen += inside
+        score = torch.where(seen > 0, total / seen.clamp_min(1), -5.0)
+        inverse = torch.where(score > best, plane, inverse)
+        best = torch.maximum(best, score)
+    return F.interpolate(1 / inverse, scale_factor=2)[:, 0]
+
+
+def _box(x: Tensor) -> Tensor:
+    return F.avg_pool2d(x, _WINDOW, 1, _WINDOW // 2, count_include_pad=False)
+
+
+def _moments(x: Tensor) -> tuple[Tensor, Tensor]:
+    mean = _box(x)
+    return mean, ((_box(x.square()) - mean.square()).clamp_min(0) + 1e-4).sqrt()
+
+
+@torch.no_grad()
+def measure(backend: SweepBackend, batch: Batch, old: bool) -> dict[str, dict[str, float]]:
+    """Scores of every method on one batch of one scene; without ``old``, of the network alone."""
+    truth = batch.depth[0]
+    cameras = batch.cameras
+    start = time.process_time()
+    geometry = backend.decode(backend.encode(batch.images, Hints(cameras=cameras)))
+    spent = time.process_time() - start
+    results = {"network": scores(geometry.depth[0], truth, geometry.depth_conf[0])}
+    results["network"]["cpu_s_per_view"] = spent / len(truth)
+    if old:
+        views = Views(batch.images[0], cameras.world_to_camera[0].float(), cameras.intrinsics[0].float())
+        found = backend.network.find_range(backend.network.features(views.images), views, backend.sources)
+        known = truth[truth > 0]
+        true = torch.stack((known.quantile(0.01) * 0.75, known.quantile(0.99) * 1.5)) if len(known) < 2**24 else found
+        results["NCC, same range"] = scores(classical(views, found), truth, None)
+        results["NCC, true range"] = scores(classical(views, true), truth, None)
+        results["constant"] = scores(torch.full_like(truth, float(known.median())), truth, None)
+    return results
+
+
+def average(rows: list[Mapping[str, float]]) -> dict[str, float]:
+    """The mean of every figure."""
+    return {name: math.fsum(row[name] for row in rows) / len(rows) for name in rows[0]}
+
+
+def main() -> None:
+    """Measures all sets."""
+    arguments = parser(__doc__, threads=1)
+    arguments.add_argument("--shared", type=Path, help="folder with the real recordings")
+    arguments.add_argument("--weights", help="safetensors file instead of the shipped weights")
+    arguments.add_argument("--scenes", type=int, default=16, help="rooms")
+    arguments.add_argument("--seed", type=int, default=1_000_000, help="of the first room")
+    arguments.add_argument("--only-network", action="store_true")
+    options = arguments.parse_args()
+    torch.set_num_threads(options.threads)
+    backend = SweepBackend(path=options.weights)
+    table: dict[str, dict[str, dict[str, float]]] = {}
+    for name, overrides in SETS.items():
+        if "{shared}" in overrides and options.shared is None:
+            continue
+        place = overrides.format(shared=options.shared, seed=options.seed, scenes=options.scenes)
+        rows = [measure(backend, batch, not options.only_network) for batch in batches(place)]
+        table[name] = {method: average([row[method] for row in rows]) for method in rows[0]}
+        for method, figures in table[name].items():
+            print(
+                f"{name:18} {method:16}", " ".join(f"{key} {value:.4f}" for key, value in figures.items()), flush=True
+            )
+    content = {"machine": machine(), "version": __version__, "weights": backend.identity()["weights"], "sets": table}
+    write_results(options.out, "plane_sweep", content)
+
+
+if __name__ == "__main__":
+    main()

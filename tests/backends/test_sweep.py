@@ -1,0 +1,202 @@
+"""The plane sweep: its geometry, its kernels against their reference, its limits."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from backends.sweep.backend import SweepBackend
+from backends.sweep.correlate import GROUPS, SourceWarp, correlate, correlate_reference
+from backends.sweep.head import RESPONSE, DepthHead, _convex_upsample
+from backends.sweep.network import SweepNet
+from backends.sweep.tokens import DIM
+from backends.sweep.views import agreed_range, choose_sources, wide_range
+from backends.sweep.volume import agreement, expectation, from_inverse, to_inverse, to_planes
+from vg2gt.geometry.cameras import resize_intrinsics
+from vg2gt.types import Hints
+
+SIZE = (13, 22)
+
+
+def row_of_cameras(views: int, step: float = 0.2) -> tuple[Tensor, Tensor]:
+    """Cameras side by side that look the same way: ``[V, 4, 4]``, ``[V, 3, 3]``."""
+    poses = torch.eye(4).repeat(views, 1, 1)
+    poses[:, 0, 3] = -step * torch.arange(views)
+    intrinsics = torch.tensor([[20.0, 0, 10.5], [0, 20.0, 6], [0, 0, 1]]).repeat(views, 1, 1)
+    return poses, intrinsics
+
+
+@pytest.fixture
+def problem(make_scene) -> tuple[Tensor, Tensor, SourceWarp]:
+    """Features, inverse depths (some of them behind the sources or outside) and correspondences of three views."""
+    hints = make_scene(1, 3, SIZE)[1]
+    generator = torch.Generator().manual_seed(1)
+    features = torch.randn(3, 2 * GROUPS, *SIZE, generator=generator)
+    inverse = torch.rand(3, 5, SIZE[0] * SIZE[1], generator=generator) * 8
+    sources = torch.tensor([[1, 2], [0, 2], [1, 0]])
+    return features, inverse, SourceWarp(hints.cameras.world_to_camera[0], hints.cameras.intrinsics[0], sources, SIZE)
+
+
+def test_kernels_equal_the_reference(problem) -> None:
+    features, inverse, warp = problem
+    results = []
+    for function in (correlate, correlate_reference):
+        given = features.clone().requires_grad_()
+        similarity, inside = function(given, inverse, warp)
+        weight = torch.cos(torch.arange(similarity.numel()).float()).view_as(similarity)
+        (gradient,) = torch.autograd.grad((similarity * weight).sum(), given)
+        results.append((similarity.detach(), inside, gradient))
+    assert 0.2 < results[0][1].float().mean() < 0.95  # some points fall outside
+    for kernel, reference in zip(*results, strict=True):
+        torch.testing.assert_close(kernel, reference, rtol=1e-4, atol=1e-4)
+
+
+def test_reference_gradient(problem) -> None:
+    features, inverse, warp = problem
+    small = SourceWarp.__new__(SourceWarp)
+    small.size, small.sources = warp.size, warp.sources
+    small.at_infinity, small.parallax = warp.at_infinity.double(), warp.parallax.double()
+
+    def similarity(given: Tensor) -> Tensor:
+        return correlate_reference(given, inverse.double()[:, :2], small)[0]
+
+    assert torch.autograd.gradcheck(similarity, features.double().requires_grad_(), fast_mode=True)
+
+
+def test_similarity_is_highest_on_the_true_plane() -> None:
+    """A textured wall at depth 4, seen from three places: features of the same point match where the plane is right."""
+    poses, intrinsics = row_of_cameras(3)
+    generator = torch.Generator().manual_seed(0)
+    texture = torch.nn.functional.normalize(torch.randn(1, GROUPS, SIZE[0], 64, generator=generator), dim=1)
+    disparity = 20 * 0.2 / 4  # one pixel per view: exact shifts
+    features = torch.cat([texture[..., int(k * disparity) :][..., : SIZE[1]] for k in range(3)])
+    planes = 1 / torch.tensor([2.0, 3.0, 4.0, 6.0, 12.0])
+    warp = SourceWarp(poses, intrinsics, torch.tensor([[1], [2], [1]]), SIZE)
+    inverse = planes[None, :, None].expand(3, -1, SIZE[0] * SIZE[1])
+    similarity, inside = correlate(features, inverse, warp)
+    mean = (similarity.sum(-1) * inside).sum((1, 3)) / inside.sum((1, 3))
+    assert mean.argmax(1).tolist() == [2, 2, 2]
+    torch.testing.assert_close(mean[:, 2], torch.ones(3), rtol=0, atol=1e-4)
+
+
+def test_agreement_is_one_for_true_depth_and_signed_otherwise(make_scene) -> None:
+    hints = make_scene(1, 3, SIZE)[1]
+    sources = torch.tensor([[1, 2], [0, 2], [0, 1]])
+    warp = SourceWarp(hints.cameras.world_to_camera[0], hints.cameras.intrinsics[0], sources, SIZE)
+    inverse = 1 / hints.depth[0][:, None]
+    inner = (..., slice(3, -3), slice(5, -5))
+    assert (agreement(inverse, warp)[:, 1][inner] > 0.99).float().mean() > 0.7  # the rest is outside of the sources
+    nearer = inverse.clone()
+    nearer[0] *= 1.1  # view 0 believes everything to be nearer than the others do
+    difference = agreement(nearer, warp)[:, 2][inner]
+    assert (difference[0] <= 0).all()
+    assert (difference[1:] >= 0).float().mean() > 0.9
+    assert difference[0].mean() < -0.05
+
+
+def test_sources_overlap_and_have_parallax() -> None:
+    poses, intrinsics = row_of_cameras(5)
+    turned = poses.clone()
+    turned[4, :3, :3] = torch.diag(torch.tensor([-1.0, 1, -1]))  # looks the other way
+    size, depth_range = (14, 22), torch.tensor([1.0, 10.0])
+    sources = choose_sources(turned, intrinsics, size, depth_range, 3)
+    assert sources.shape == (5, 3)
+    assert all(view not in sources[view] for view in range(5))
+    assert 4 not in sources[:4]
+    still = poses.clone()
+    still[1, 0, 3] = 0  # where view 0 stands: no parallax with it
+    assert choose_sources(still, intrinsics, size, depth_range, 1)[0, 0] != 1
+
+
+def test_ranges() -> None:
+    poses, _ = row_of_cameras(4)
+    torch.testing.assert_close(wide_range(poses), torch.tensor([0.12, 24.0]), rtol=1e-4, atol=0)
+    depth = torch.cat((torch.linspace(2, 4, 1000), torch.full((1000,), 90.0)))
+    agreeing = torch.cat((torch.ones(1000), torch.zeros(1000)))
+    found = agreed_range(depth, agreeing, wide_range(poses))
+    torch.testing.assert_close(found, torch.tensor([2.04 * 0.8, 3.96 * 1.4]), rtol=1e-2, atol=0)
+    assert torch.equal(agreed_range(depth, 0 * agreeing, wide_range(poses)), wide_range(poses))
+
+
+def test_positions_are_inverse_depth() -> None:
+    depth_range = torch.tensor([0.5, 8.0])
+    t = torch.linspace(0, 1, 5)
+    inverse = to_inverse(t, depth_range)
+    torch.testing.assert_close(inverse[[0, -1]], torch.tensor([1 / 8, 2.0]))
+    torch.testing.assert_close(from_inverse(inverse, depth_range), t)
+
+
+def test_expectation_ignores_far_planes() -> None:
+    logits = torch.full((1, 9, 1, 1), -20.0)
+    logits[0, [2, 3]] = 5.0
+    logits[0, 8] = 4.0
+    t, mass = expectation(logits, torch.arange(9.0).view(1, -1, 1, 1))
+    torch.testing.assert_close(t, torch.full((1, 1, 1, 1), 2.5), rtol=1e-4, atol=0)
+    assert 0.5 < float(mass) < 0.9
+
+
+def test_planes_are_images_in_channels_last_memory() -> None:
+    volume = torch.randn(2, 3, 4, 5 * 6).to(memory_format=torch.channels_last)
+    images = to_planes(volume, (5, 6))
+    assert images.is_contiguous(memory_format=torch.channels_last)
+    assert images.data_ptr() == volume.data_ptr()  # no copy
+    assert torch.equal(images[4 + 1, 2], volume[1, 2, 1].view(5, 6))
+
+
+def test_head_answers_the_correction_channels_linearly() -> None:
+    torch.manual_seed(0)
+    head = DepthHead()  # its convolutions say nothing before training
+    taps = (torch.randn(1, 2 * 3, DIM), torch.randn(1, 2 * 3, DIM))
+    taps[1][..., :4] = 0
+    context, fine = torch.randn(1, 48, 4, 6), torch.randn(1, 16, 8, 12)
+    swept = torch.cat((torch.full((1, 1, 8, 12), 0.7), torch.ones(1, 1, 8, 12)), 1)
+    before = head(taps, (2, 3), context, fine, swept)[0]
+    torch.testing.assert_close(before, torch.full_like(before, 0.7), rtol=1e-5, atol=0)
+    taps[1][..., :4] = 3
+    after = head(taps, (2, 3), context, fine, swept)[0]
+    torch.testing.assert_close(after - before, torch.full_like(before, 3 * RESPONSE), rtol=1e-4, atol=1e-6)
+
+
+def test_upsampling_is_a_convex_mixture() -> None:
+    generator = torch.Generator().manual_seed(0)
+    x = torch.rand(1, 2, 4, 5, generator=generator)
+    up = _convex_upsample(x, 5 * torch.randn(1, 36, 4, 5, generator=generator))
+    assert up.shape == (1, 2, 8, 10)
+    around = torch.nn.functional.max_pool2d(torch.nn.functional.pad(x, (1, 1, 1, 1), mode="replicate"), 3, 1)
+    assert (up <= torch.nn.functional.interpolate(around, scale_factor=2.0) + 1e-6).all()
+
+
+def test_cameras_in_one_place_are_refused(make_scene) -> None:
+    backend = SweepBackend(pretrained=False)
+    images, hints = make_scene(1, 3, (32, 48))
+    hints.cameras.world_to_camera[..., :3, 3] = 0
+    with pytest.raises(ValueError, match="parallax and all cameras stand in one place"):
+        backend.encode(images, Hints(cameras=hints.cameras))
+
+
+def test_depth_is_in_the_unit_of_the_cameras(make_scene) -> None:
+    """Metres or millimetres: the same network, the same depth in its unit."""
+    backend = SweepBackend(pretrained=False)
+    images, hints = make_scene(1, 3, (32, 48))
+    depth = backend.decode(backend.encode(images, Hints(cameras=hints.cameras))).depth
+    hints.cameras.world_to_camera[..., :3, 3] *= 1000
+    large = backend.decode(backend.encode(images, Hints(cameras=hints.cameras))).depth
+    torch.testing.assert_close(large / 1000, depth, rtol=2e-2, atol=0)
+
+
+def test_bad_options_are_refused() -> None:
+    for options in ({"planes": 4}, {"sources": 0}):
+        with pytest.raises(ValueError, match=f"backend.{next(iter(options))}"):
+            SweepBackend(pretrained=False, **options)
+
+
+def test_size_is_what_the_card_says() -> None:
+    parameters = sum(parameter.numel() for parameter in SweepNet().parameters())
+    assert 2 * parameters < 8e6  # bytes of the shipped file
+
+
+def test_intrinsics_of_feature_maps() -> None:
+    """A quarter of the image: the middle of the first cell lies between the pixels 1 and 2."""
+    _, intrinsics = row_of_cameras(1)
+    quarter = resize_intrinsics(intrinsics, 1 / 4, 1 / 4)
+    x = (1.5 - intrinsics[0, 0, 2]) / intrinsics[0, 0, 0]
+    torch.testing.assert_close(x * quarter[0, 0, 0] + quarter[0, 0, 2], torch.tensor(0.0), rtol=0, atol=1e-5)

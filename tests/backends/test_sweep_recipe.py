@@ -1,0 +1,105 @@
+"""The recipe of the plane sweep's weights."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch.nn import functional as F
+
+from backends.sweep.backend import SweepBackend
+from backends.sweep.recipe.objective import cell_inverse
+from backends.sweep.recipe.samples import Sample, TrainingSamples, recolour
+from backends.sweep.recipe.scenes import make_scenes
+from backends.sweep.recipe.weights import newest_checkpoint
+from tests.commands import ROOT
+from vg2gt.geometry.cameras import project, unproject
+from vg2gt.types import Cameras
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    return list(make_scenes(tmp_path_factory.mktemp("scenes"), 2))
+
+
+def test_scenes_are_made_once(scenes: list[Path]) -> None:
+    before = [path.stat().st_mtime_ns for path in scenes]
+    assert list(make_scenes(scenes[0].parent, 2)) == scenes
+    assert [path.stat().st_mtime_ns for path in scenes] == before
+
+
+@pytest.mark.parametrize("index", [0, 1, 2, 3])
+def test_views_of_a_sample_see_the_same_points(scenes: list[Path], index: int) -> None:
+    """Crop, zoom, mirror and unit change images, depth, poses and intrinsics together."""
+    sample: Sample = TrainingSamples(scenes, 10, seed=3)[index]
+    views = len(sample.depth)
+    size = (sample.depth.shape[-2], sample.depth.shape[-1])
+    cameras = Cameras(sample.world_to_camera[None], sample.intrinsics[None], size)
+    points = unproject(sample.depth[None], cameras)[0]  # [V, H, W, 3]
+    agreed = []
+    for other in range(1, views):
+        pixels, depth = project(points[0].reshape(1, 1, -1, 3), cameras.select(slice(other, other + 1)))
+        u, v, z = pixels[0, 0, :, 0], pixels[0, 0, :, 1], depth[0, 0]
+        inside = (z > 0) & (u > 0) & (v > 0) & (u < size[1] - 1) & (v < size[0] - 1) & (sample.depth[0].flatten() > 0)
+        grid = torch.stack(((2 * u + 1) / size[1] - 1, (2 * v + 1) / size[0] - 1), -1)[None, None]
+        there = F.grid_sample(sample.depth[other][None, None], grid, mode="nearest", align_corners=False)[0, 0, 0]
+        if inside.sum() > 200:
+            agreed.append(float((((there / z) - 1).abs() < 0.03)[inside].float().mean()))
+    assert agreed
+    assert np.median(agreed) > 0.6  # the rest is hidden there
+
+
+def test_samples_depend_on_their_number_alone(scenes: list[Path]) -> None:
+    first, again = TrainingSamples(scenes, 10, seed=0), TrainingSamples(scenes, 99, seed=0)
+    a, b, other = first[7], again[7], first[8]
+    assert all(torch.equal(x, y) for x, y in zip(a[:5], b[:5], strict=True))
+    assert a.images.shape != other.images.shape or not torch.equal(a.images, other.images)
+    assert 0 < float(a.depth_range[0]) < float(a.depth_range[1])
+
+
+def test_recolouring_keeps_range_and_shape() -> None:
+    images = torch.rand(4, 3, 16, 24, generator=torch.Generator().manual_seed(0))
+    for seed in range(8):
+        changed = recolour(images, np.random.default_rng(seed))
+        assert changed.shape == images.shape
+        assert 0 <= float(changed.min()) <= float(changed.max()) <= 1
+        assert not torch.equal(changed, images)
+
+
+def test_cells_know_their_middle() -> None:
+    """On a slanted plane inverse depth is linear in the image, so the middle of a cell is known exactly."""
+    inverse = 0.2 + 0.01 * torch.arange(16.0).view(1, 1, 16) + 0.02 * torch.arange(8.0).view(1, 8, 1)
+    found, known = cell_inverse(1 / inverse, 4)
+    expected = (
+        0.2
+        + 0.01 * (4 * torch.arange(4.0) + 1.5).view(1, 1, 1, 4)
+        + 0.02 * (4 * torch.arange(2.0) + 1.5).view(1, 1, 2, 1)
+    )
+    torch.testing.assert_close(found, expected)
+    assert known.all()
+    hole = (1 / inverse).clone()
+    hole[0, 1, 1] = 0
+    assert cell_inverse(hole, 4)[1].flatten().tolist() == [0, 1, 1, 1, 1, 1, 1, 1]
+
+
+@pytest.mark.slow
+def test_training_resumes_and_writes_weights(scenes: list[Path], tmp_path: Path) -> None:
+    """Two steps at once are two steps one after the other, and the file loads as a backend."""
+
+    def train(out: Path, *options: str) -> str:
+        common = [f"scenes.folder={scenes[0].parent}", "scenes.count=2", "save_every=1", f"out={out}"]
+        command = [sys.executable, "-m", "backends.sweep.recipe", *common, *options]
+        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr[-3000:]
+        return done.stdout
+
+    train(tmp_path / "whole", "training.steps=2", "training.cooldown=0")
+    train(tmp_path / "parts", "training.steps=1", "training.cooldown=0")
+    newest = newest_checkpoint(tmp_path / "parts")
+    assert newest is not None
+    assert "at step 1 of 2" in train(tmp_path / "parts", "training.steps=2", "training.cooldown=0")
+    nets = [SweepBackend(path=str(tmp_path / part / "sweep.safetensors")).network for part in ("whole", "parts")]
+    for a, b in zip(nets[0].parameters(), nets[1].parameters(), strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-2, atol=1e-3)
