@@ -132,9 +132,14 @@ class GaussianLoss:
         else:
             expected, valid = normals_from_depth(torch.where(targets.valid, targets.depth, 0.0), targets.intrinsics)
         weights = trust if self.normal_target == "decoded" else torch.ones_like(trust)
-        length = (rendered.normal[0].square().sum(1) + 1e-12).sqrt()
-        cosine = (rendered.normal[0] * expected).sum(1) / length
-        return weighted_mean(1 - cosine, weights, hits & valid)
+        return normal_error(rendered.normal[0], expected, weights, hits & valid)
+
+
+def normal_error(normals: Tensor, expected: Tensor, weights: Tensor, mask: Tensor) -> Tensor:
+    """Mean of ``1 - cos`` between normals ``[R, 3, H, W]`` of any length and unit ones, weighted, where the mask is."""
+    length = (normals.square().sum(1) + 1e-12).sqrt()
+    cosine = (normals * expected).sum(1) / length
+    return weighted_mean(1 - cosine, weights, mask)
 
 
 def weighted_mean(values: Tensor, weights: Tensor, mask: Tensor) -> Tensor:

@@ -1,0 +1,53 @@
+"""Fewer Gaussians where they are not seen, more where one is not enough."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from vg2gt.gaussians.surfel import ALONE, layout
+from vg2gt.geometry.rotations import quat_to_matrix
+from vg2gt.refinement.parameters import Parameters
+
+
+def prune(parameters: Parameters, min_opacity: float) -> int:
+    """Removes Gaussians that have become transparent; returns how many. The last one stays."""
+    opacities = torch.sigmoid(parameters.values["opacities"].detach())
+    keep = opacities >= min_opacity
+    if keep.all() or not keep.any():
+        return 0
+    parameters.take(keep.nonzero()[:, 0])
+    return int((~keep).sum())
+
+
+@torch.no_grad()
+def split(parameters: Parameters, count: int) -> int:
+    """Splits the ``count`` Gaussians whose positions are pulled the most in two; returns how many were.
+
+    Each is laid out along its longest axis as a voxel's Gaussians are along its surface (self-split, K = 2): half a
+    cell to either side and half as long, a cell being what one Gaussian that is alone covers.
+    """
+    pull = parameters.pull()
+    chosen = pull.topk(min(count, len(pull))).indices
+    chosen = chosen[pull[chosen] > 0].sort().values
+    if not len(chosen):
+        return 0
+    longest, shift = _along_longest(parameters, chosen)
+    places, scales = layout(2, parameters.unit)
+    rest = torch.ones_like(pull, dtype=torch.bool)
+    rest[chosen] = False
+    parameters.take(torch.cat((rest.nonzero()[:, 0], chosen, chosen)))
+    halves = parameters.values["means"].detach()[-2 * len(chosen) :].unflatten(0, (2, -1))
+    halves += places[:, :1, None] * shift
+    logs = parameters.values["scales"].detach()[-2 * len(chosen) :].unflatten(0, (2, -1))
+    logs += (scales[0, 0] / ALONE).log() * longest
+    return len(chosen)
+
+
+def _along_longest(parameters: Parameters, rows: Tensor) -> tuple[Tensor, Tensor]:
+    """Which axis is the longest, ``[N, 3]`` one-hot, and its cell, ``[N, 3]`` in the units of the positions."""
+    scales = parameters.values["scales"].detach()[rows].exp()
+    length, axis = scales.max(-1)
+    longest = torch.nn.functional.one_hot(axis, 3).to(scales.dtype)
+    direction = (quat_to_matrix(parameters.values["quats"].detach()[rows]) * longest[:, None]).sum(-1)
+    return longest, direction * (length / ALONE / parameters.unit[rows])[:, None]

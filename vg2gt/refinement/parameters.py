@@ -1,0 +1,150 @@
+"""What refinement changes: one scene's Gaussians, its views' cameras and exposures, as Adam sees them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from vg2gt.geometry.cameras import compose
+from vg2gt.geometry.rotations import quat_to_matrix
+from vg2gt.refinement.options import RefineRates
+from vg2gt.types import Cameras, Gaussians, TensorRecord
+
+BETAS = (0.9, 0.99)
+HIGHER_BANDS = 0.05  # rate of the higher spherical harmonics over that of the constant one
+LOGIT_MARGIN = 1e-4
+OF_GAUSSIANS = ("means", "quats", "scales", "opacities", "sh", "sh_rest")
+
+
+@dataclass(frozen=True)
+class RefinedScene(TensorRecord):
+    """A state of a refinement.
+
+    Attributes:
+        gaussians: the scene (B = 1).
+        cameras: of its V views (B = 1).
+        gain: ``[V, 3]`` factors that turn rendered colours into those of the view's image.
+        bias: ``[V, 3]`` what is then added.
+    """
+
+    gaussians: Gaussians
+    cameras: Cameras
+    gain: Tensor
+    bias: Tensor
+
+    def exposed(self, color: Tensor, views: Tensor) -> Tensor:
+        """Rendered colours ``[1, R, 3, H, W]`` with the exposure of their views ``[R]``."""
+        return color * self.gain[views, :, None, None] + self.bias[views, :, None, None]
+
+
+class Parameters:
+    """The scene as free numbers with an optimiser of their own.
+
+    Positions are offsets in units of each Gaussian's middle standard deviation, so that one rate fits small and large
+    ones and every scene's unit. Cameras are turned and shifted in their own frames, view 0 stays where it is.
+
+    Args:
+        start: where to begin.
+        rates: learning rates.
+        pixel: size of a pixel at the scene's median depth over that depth: the unit of turns, and of shifts times
+            ``depth``.
+        depth: median depth in scene units.
+    """
+
+    def __init__(self, start: RefinedScene, rates: RefineRates, pixel: float, depth: float) -> None:
+        gaussians = start.gaussians
+        self.start = start
+        self.pixel, self.depth = pixel, depth
+        self.origin = gaussians.means
+        self.unit = gaussians.scales.median(-1).values
+        self.size = gaussians.scales.max(-1).values
+        views = len(start.gain)
+        self.values = {
+            "means": torch.zeros_like(gaussians.means),
+            "quats": F.normalize(gaussians.quats, dim=-1),
+            "scales": gaussians.scales.log(),
+            "opacities": torch.logit(gaussians.opacities.clamp(LOGIT_MARGIN, 1 - LOGIT_MARGIN)),
+            "sh": gaussians.sh[:, :1].clone(),
+            "sh_rest": gaussians.sh[:, 1:].clone(),
+            "cameras": gaussians.means.new_zeros(views, 6),
+            "focal": gaussians.means.new_zeros(1),
+            "gain": start.gain.log(),
+            "bias": start.bias.clone(),
+        }
+        self.rates = {
+            **{name: getattr(rates, name) for name in ("means", "quats", "scales", "opacities", "sh")},
+            **{"sh_rest": HIGHER_BANDS * rates.sh, "cameras": rates.cameras, "focal": rates.focal},
+            **{"gain": rates.exposure, "bias": rates.exposure},
+        }
+        groups = []
+        for name, value in self.values.items():
+            if self.rates[name] and value.numel():
+                groups.append({"params": [value.requires_grad_(True)], "lr": self.rates[name], "name": name})
+        self.optimizer = torch.optim.Adam(groups, betas=BETAS)
+
+    def scene(self) -> RefinedScene:
+        """The scene with graph."""
+        values, start = self.values, self.start
+        gaussians = Gaussians(
+            self.origin + self.unit[:, None] * values["means"],
+            F.normalize(values["quats"], dim=-1),
+            values["scales"].exp(),
+            torch.sigmoid(values["opacities"]),
+            torch.cat((values["sh"], values["sh_rest"]), 1),
+            torch.zeros(len(self.origin), dtype=torch.int64, device=self.origin.device),
+        )
+        # One exposure for all views would be the scene's own colours.
+        gain, bias = values["gain"], values["bias"]
+        return RefinedScene(gaussians, self._cameras(start.cameras), (gain - gain.mean(0)).exp(), bias - bias.mean(0))
+
+    def _cameras(self, cameras: Cameras) -> Cameras:
+        if not self.rates["cameras"] and not self.rates["focal"]:
+            return cameras
+        moves = self.pixel * torch.cat((torch.zeros_like(self.values["cameras"][:1]), self.values["cameras"][1:]))
+        turn = quat_to_matrix(F.pad(moves[:, :3] / 2, (1, 0), value=1.0))
+        top = torch.cat((turn, self.depth * moves[:, 3:, None]), -1)
+        increment = torch.cat((top, cameras.world_to_camera[0, :, 3:]), -2)
+        poses = compose(increment, cameras.world_to_camera[0])[None]
+        factor = self.values["focal"].exp()
+        focal = torch.cat((factor, factor, torch.ones_like(factor)))[:, None]
+        intrinsics = torch.cat((cameras.intrinsics[..., :2] * focal, cameras.intrinsics[..., 2:]), -1)
+        return Cameras(poses, intrinsics, cameras.size)
+
+    def step(self, loss: Tensor, share: float) -> bool:
+        """One step of Adam with rates at ``share`` of theirs; False, without a step, if a gradient is not finite."""
+        self.optimizer.zero_grad()
+        loss.backward()
+        for group in self.optimizer.param_groups:
+            group["lr"] = share * self.rates[group["name"]]
+        grads = [group["params"][0].grad for group in self.optimizer.param_groups]
+        if not torch.stack([grad.sum() for grad in grads if grad is not None]).isfinite().all():
+            return False
+        self.optimizer.step()
+        return True
+
+    def pull(self) -> Tensor:
+        """``[G]`` how strongly positions are pulled: root mean square gradient in units of each Gaussian's size."""
+        state = self.optimizer.state.get(self.values["means"], {})
+        if "exp_avg_sq" not in state:
+            return torch.zeros_like(self.unit)
+        return state["exp_avg_sq"].sum(-1).sqrt()
+
+    @torch.no_grad()
+    def take(self, rows: Tensor) -> None:
+        """Keeps the Gaussians ``rows`` in that order, which may name one several times, and what Adam knows of them."""
+        self.origin, self.unit, self.size = self.origin[rows], self.unit[rows], self.size[rows]
+        groups = {group["name"]: group for group in self.optimizer.param_groups}
+        for name in OF_GAUSSIANS:
+            before = self.values[name]
+            after = before[rows].detach()
+            self.values[name] = after
+            if name not in groups:
+                continue
+            groups[name]["params"][0] = after.requires_grad_(True)
+            state = self.optimizer.state.pop(before, None)
+            if state is not None:
+                moments = {key: state[key][rows] for key in ("exp_avg", "exp_avg_sq")}
+                self.optimizer.state[after] = {"step": state["step"], **moments}

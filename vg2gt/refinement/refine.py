@@ -1,0 +1,300 @@
+"""Refinement of one scene on its own images."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import torch
+from torch import Tensor
+
+from vg2gt.metrics import psnr
+from vg2gt.refinement.density import prune, split
+from vg2gt.refinement.loss import Observations
+from vg2gt.refinement.options import RefineOptions
+from vg2gt.refinement.parameters import Parameters, RefinedScene
+from vg2gt.refinement.views import ViewOrder
+from vg2gt.rendering import Renderer
+from vg2gt.types import Cameras, Gaussians
+
+log = logging.getLogger(__name__)
+
+WORSE = 2.0  # a left-out view whose loss has grown that much since the best state shows a divergence
+RETREATS = 4  # with each the rates are halved
+SMOOTH = 3  # checks whose scores are averaged: each is of other views
+
+
+@dataclass(frozen=True)
+class Check:
+    """One look at how a refinement goes.
+
+    Attributes:
+        step: steps so far.
+        seconds: by the refinement's clock.
+        score: loss of views that were left out before, over theirs at the start; the mean of the last checks.
+        psnr: of the views rendered since the last check, before each was trained on, in dB.
+        gaussians: how many there are.
+    """
+
+    step: int
+    seconds: float
+    score: float
+    psnr: float
+    gaussians: int
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What an observer is told after every step.
+
+    Attributes:
+        step: steps so far.
+        done: share of the refinement that is done.
+        psnr: mean of the last steps, in dB.
+        gaussians: how many there are.
+        scene: makes the present state.
+    """
+
+    step: int
+    done: float
+    psnr: float
+    gaussians: int
+    scene: Callable[[], RefinedScene]
+
+
+@dataclass(frozen=True)
+class Refined:
+    """What a refinement gives.
+
+    Attributes:
+        scene: the best state.
+        step: the step at which it was reached.
+        steps: steps that were made.
+        seconds: by the refinement's clock.
+        ended: ``steps``, ``seconds``, ``interrupted`` or ``diverged``.
+        psnr: of every view before and after, ``[2, V]`` in dB.
+        trained: ``[N]`` the views that were trained on.
+        held_out: ``[V - N]`` the others.
+        checks: how it went.
+        retreats: how often it fell back to the best state.
+    """
+
+    scene: RefinedScene
+    step: int
+    steps: int
+    seconds: float
+    ended: str
+    psnr: Tensor
+    trained: Tensor
+    held_out: Tensor
+    checks: Sequence[Check] = field(default_factory=tuple)
+    retreats: int = 0
+
+
+def refine(
+    gaussians: Gaussians,
+    cameras: Cameras,
+    seen: Observations,
+    renderer: Renderer,
+    options: RefineOptions | None = None,
+    observe: Callable[[Progress], None] | None = None,
+    clock: Callable[[], float] = time.monotonic,
+) -> Refined:
+    """Optimises one scene on the images of its views.
+
+    Ctrl-C ends it; the best state so far is returned. If the loss is not finite or grows, it goes on from the best
+    state with half the rates, which the log says.
+
+    Args:
+        gaussians: the scene (B = 1).
+        cameras: of its V views (B = 1).
+        seen: what they show, on the same device.
+        renderer: how the scene is rendered, here and later.
+        options: how long and how; default :class:`RefineOptions`.
+        observe: called after every step.
+        clock: what seconds are.
+
+    Raises:
+        ValueError: if there are no Gaussians, or images and cameras do not go together.
+    """
+    options = options or RefineOptions()
+    _check(gaussians, cameras, seen)
+    with torch.enable_grad():
+        return _Refinement(gaussians, cameras, seen, renderer, options, clock).run(observe)
+
+
+class _Refinement:
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        cameras: Cameras,
+        seen: Observations,
+        renderer: Renderer,
+        options: RefineOptions,
+        clock: Callable[[], float],
+    ) -> None:
+        self.seen, self.renderer, self.options, self.clock = seen, renderer, options, clock
+        self.began = clock()
+        self.trainer = renderer if options.loss.needs_geometry else replace(renderer, geometry=False)
+        self.order = ViewOrder(len(seen.images), options.holdout, options.seed)
+        self.limit = int(options.max_growth * len(gaussians))
+        self.depth = _median_depth(gaussians, cameras, seen)
+        self.pixel = 1 / float(cameras.intrinsics[..., [0, 1], [0, 1]].mean())
+        ones = torch.ones_like(seen.images[:, :, 0, 0])
+        self.best = RefinedScene(_with_degree(gaussians, options.sh_degree), cameras, ones, torch.zeros_like(ones))
+        self.best = self.best.detach()
+        self.best_score, self.best_step = math.inf, 0
+        self.start_loss, self.start_psnr = self._score(self.best, torch.arange(len(ones)))
+        self.scores: list[float] = []
+        self.checks: list[Check] = []
+        self.recent: list[float] = []
+        self.factor, self.retreats, self.steps = 1.0, 0, 0
+        self.parameters = self._parameters()
+
+    def run(self, observe: Callable[[Progress], None] | None) -> Refined:
+        """Steps and checks until it is done."""
+        ended = ""
+        try:
+            while not ended:
+                ended = self._step()
+                if observe is not None:
+                    observe(self._progress())
+        except KeyboardInterrupt:
+            ended = "interrupted"
+        _, after = self._score(self.best, torch.arange(len(self.seen.images)))
+        return Refined(
+            scene=self.best,
+            step=self.best_step,
+            steps=self.steps,
+            seconds=self.clock() - self.began,
+            ended=ended,
+            psnr=torch.stack((self.start_psnr, after)),
+            trained=self.order.trained,
+            held_out=self.order.held_out,
+            checks=tuple(self.checks),
+            retreats=self.retreats,
+        )
+
+    def _parameters(self) -> Parameters:
+        return Parameters(self.best, self.options.rates, self.pixel, self.depth)
+
+    def _done(self) -> float:
+        return self.options.done(self.steps, self.clock() - self.began)
+
+    def _progress(self) -> Progress:
+        recent = self.recent[-20:]
+        return Progress(
+            self.steps,
+            self._done(),
+            sum(recent) / max(len(recent), 1),
+            len(self.parameters.origin),
+            lambda: self.parameters.scene().detach(),
+        )
+
+    def _step(self) -> str:
+        """One step, with a check where one is due; says how it ended if it did."""
+        views = self.order.deal(self.options.views_per_step).to(self.seen.images.device)
+        scene = self.parameters.scene()
+        loss, images = self._loss(scene, views)
+        self.recent.append(float(images.mean()))
+        self.steps += 1
+        rate = self.factor * self.options.final_rate ** self._done()
+        if not self.parameters.step(loss, rate):
+            return self._retreat("the loss or its gradient is not finite")
+        done = self._done()
+        if done < 1 and self.steps % self.options.check_every:
+            return ""
+        if trouble := self._check():
+            return self._retreat(trouble)
+        if done < 1:
+            self._change_density(done)
+            self.order.next_round()
+            return ""
+        return "steps" if self.steps == self.options.steps else "seconds"
+
+    def _loss(self, scene: RefinedScene, views: Tensor) -> tuple[Tensor, Tensor]:
+        """The loss of some views, and their PSNR ``[R]``."""
+        loss, cameras, seen = self.options.loss, scene.cameras.select(views), self.seen.views(views)
+        rendered = self.trainer(scene.gaussians, cameras)
+        rendered = replace(rendered, color=scene.exposed(rendered.color, views))
+        terms = loss.of_views(rendered, cameras, seen, self.depth)
+        terms |= loss.of_gaussians(scene.gaussians, self.parameters.size) if torch.is_grad_enabled() else {}
+        return loss.total(terms), psnr(rendered.color[0].detach(), seen.images)
+
+    @torch.no_grad()
+    def _score(self, scene: RefinedScene, views: Tensor) -> tuple[Tensor, Tensor]:
+        """Loss and PSNR ``[R]`` of views, each on its own."""
+        found = [self._loss(scene, view) for view in views.to(self.seen.images.device).split(1)]
+        return torch.stack([loss for loss, _ in found]).cpu(), torch.cat([image for _, image in found]).cpu()
+
+    def _check(self) -> str:
+        """Scores the present state, keeps it if it is the best; says what is wrong if it diverges."""
+        scene = self.parameters.scene().detach()
+        views = self.order.left_out if len(self.order.left_out) else self.order.trained
+        loss, _ = self._score(scene, views)
+        score = float((loss / self.start_loss[views]).mean())
+        if not math.isfinite(score):
+            return "the loss is not finite"
+        if score > WORSE * min(1.0, self.best_score):
+            return f"views that were left out have {score:.1f} times the loss of the start"
+        self.scores = [*self.scores, score][-SMOOTH:]
+        smooth = sum(self.scores) / len(self.scores)
+        since = self.recent[-self.options.check_every :]
+        seconds = self.clock() - self.began
+        self.checks.append(Check(self.steps, seconds, smooth, sum(since) / len(since), len(scene.gaussians)))
+        if smooth <= self.best_score:
+            self.best, self.best_score, self.best_step = scene, smooth, self.steps
+        return ""
+
+    def _change_density(self, done: float) -> None:
+        options = self.options
+        prune(self.parameters, options.prune_opacity)
+        room = self.limit - len(self.parameters.origin)
+        count = min(room, int(options.split_share * len(self.parameters.origin)))
+        if count > 0 and done < 0.5:
+            split(self.parameters, count)
+
+    def _retreat(self, trouble: str) -> str:
+        """Back to the best state with half the rates, unless that was tried often."""
+        self.retreats += 1
+        if self.retreats > RETREATS or self._done() >= 1:
+            return "diverged"
+        self.factor /= 2
+        log.warning(
+            "refinement, step %d: %s; it goes on from step %d with rates times %g",
+            self.steps, trouble, self.best_step, self.factor,
+        )  # fmt: skip
+        self.parameters = self._parameters()
+        self.scores = []
+        return ""
+
+
+def _check(gaussians: Gaussians, cameras: Cameras, seen: Observations) -> None:
+    views, height, width = seen.depth.shape
+    found = (tuple(cameras.world_to_camera.shape[:2]), tuple(cameras.size), tuple(seen.images.shape))
+    if found != ((1, views), (height, width), (views, 3, height, width)) or seen.depth_conf.shape != seen.depth.shape:
+        raise ValueError(
+            f"refinement takes one scene whose views have images, depth and cameras alike, got cameras {found[0]} of "
+            f"{found[1]}, images {found[2]}, depth {tuple(seen.depth.shape)}, {tuple(seen.depth_conf.shape)}"
+        )
+    if not len(gaussians):
+        raise ValueError("there are no Gaussians to refine")
+
+
+def _median_depth(gaussians: Gaussians, cameras: Cameras, seen: Observations) -> float:
+    visible = seen.depth[seen.depth > 0]
+    if len(visible):
+        return float(visible.median())
+    pose = cameras.world_to_camera[0]
+    depth = torch.einsum("vj,gj->vg", pose[:, 2, :3], gaussians.means) + pose[:, 2, 3:]
+    return float(depth[depth > 0].median()) if (depth > 0).any() else 1.0
+
+
+def _with_degree(gaussians: Gaussians, degree: int | None) -> Gaussians:
+    missing = 0 if degree is None else (degree + 1) ** 2 - gaussians.sh.shape[1]
+    if missing <= 0:
+        return gaussians
+    return replace(gaussians, sh=torch.nn.functional.pad(gaussians.sh, (0, 0, 0, missing)))
