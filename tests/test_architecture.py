@@ -18,8 +18,9 @@ MAY_IMPORT: dict[str, set[str]] = {
     "baselines": {"model", "voxels", "gaussians", "backends"} | BASICS,
     "runs": {"baselines", "model", "rendering", "data"} | BASICS,
     "viewer": {"rendering"} | BASICS,
-    "evaluation": {"runs", "model", "rendering", "metrics", "data"} | BASICS,
-    "reconstruction": {"runs", "model", "rendering", "data"} | BASICS,
+    "refinement": {"losses", "metrics", "rendering", "gaussians"} | BASICS,
+    "evaluation": {"refinement", "runs", "model", "rendering", "metrics", "data"} | BASICS,
+    "reconstruction": {"refinement", "runs", "model", "rendering", "data"} | BASICS,
     "training": {"evaluation", "runs", "model", "losses", "rendering", "data"} | BASICS,
     "studies": {"training", "evaluation", "runs"} | BASICS,
     "cli": {"studies", "training", "evaluation", "reconstruction", "viewer", "runs", "rendering", "data", "backends"}

@@ -47,6 +47,11 @@ COMMANDS = {
         "makes a scene of Gaussians from images, a folder of them or a video",
         "vg2gt reconstruct photos/ --backend da3_small --out outputs/photos",
     ),
+    "refine": Command(
+        "vg2gt.cli.refine:main",
+        "optimises a reconstructed scene on its own images",
+        "vg2gt refine outputs/photos --seconds 60 --holdout 8",
+    ),
     "render": Command(
         "vg2gt.cli.render:main",
         "renders a scene into the cameras of a cameras.json",

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 from vg2gt.cli.arguments import flag_parser, list_of_names, listing
 from vg2gt.cli.commands import COMMANDS
 from vg2gt.cli.errors import errors_in_one_line
-from vg2gt.reconstruction.output_names import DEFAULT, ORBIT_FRAMES, OUTPUTS
+from vg2gt.cli.refine import print_refinement, refine_options
+from vg2gt.reconstruction.output_names import DEFAULT, ORBIT_FRAMES, OUTPUTS, REFINED
 
 if TYPE_CHECKING:
     from vg2gt.runs.load import LoadedModel
@@ -32,6 +33,7 @@ def parser() -> argparse.ArgumentParser:
     add("--every", type=int, default=1, metavar="N", help="take every N-th image or frame only")
     add("--max-images", type=int, metavar="N", help="take at most N, evenly spread; of a video 32 by default")
     add("--mode", choices=("solid", "rasterized"), default="solid", help="how views are rendered")
+    add("--refine", nargs="?", type=_steps, const=0, metavar="N", help="optimise the scene on its images, N steps")
     add("--frames", type=int, default=ORBIT_FRAMES, metavar="N", help=f"length of the orbit, default {ORBIT_FRAMES}")
     add("--mesh-voxel", type=float, metavar="X", help="edge of the mesh's voxels in scene units")
     add("--device", default="auto", help="auto, cpu, cuda, cuda:N")
@@ -63,10 +65,13 @@ def run(options: argparse.Namespace) -> None:
     from vg2gt.reconstruction.outputs import check_folder, check_outputs, cost_figures, write_outputs
     from vg2gt.reconstruction.pictures import existing_path
     from vg2gt.reconstruction.pipeline import reconstruct_with
+    from vg2gt.reconstruction.refined import refine_scene
     from vg2gt.runs.load import choose_device, load_model
 
     check_outputs(options.save)
-    check_folder(options.out, options.save, options.overwrite)
+    more = [] if options.refine is None else [REFINED]
+    check_folder(options.out, [*options.save, *more], options.overwrite)
+    how = None if options.refine is None else refine_options(steps=options.refine or None)
     for item in options.images:  # before weights are downloaded
         existing_path(item)
     if "orbit.mp4" in options.save:
@@ -83,6 +88,8 @@ def run(options: argparse.Namespace) -> None:
             renderer=replace(ready.renderer, mode=options.mode),
             monitor=monitor,
         )
+        if how is not None:
+            scene = refine_scene(scene, how, monitor)
         figures = _figures(ready)
         with memory_advice(RECONSTRUCTION):
             folder = write_outputs(
@@ -99,9 +106,11 @@ def run(options: argparse.Namespace) -> None:
     times = ", ".join(f"{name} {seconds:.1f}" for name, seconds in cost["seconds"].items())
     height, width = scene.cameras.size
     print(f"{len(scene.names)} images of {height}x{width}: {len(scene.gaussians)} Gaussians")
+    if scene.refined is not None:
+        print_refinement(scene)
     print(f"weights: {figures['weights']}")
     print(f"seconds: {times}; peak memory {cost['peak_memory_mib']} MiB")
-    print(f"written: {', '.join(str(folder / name) for name in options.save)}")
+    print(f"written: {', '.join(str(folder / name) for name in (*options.save, *more))}")
 
 
 def _figures(ready: LoadedModel) -> dict[str, Any]:
@@ -111,6 +120,12 @@ def _figures(ready: LoadedModel) -> dict[str, Any]:
         "backend": ready.model.backend.identity(),
         "weights": str(ready.weights) if trained else "none: the model has no trained part",
     }
+
+
+def _steps(text: str) -> int:
+    if not text.isdigit() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is no number of steps; write --refine=N, or --refine at the end")
+    return int(text)
 
 
 def _size(text: str) -> int | tuple[int, int]:

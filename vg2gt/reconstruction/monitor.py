@@ -74,6 +74,25 @@ class Monitor:
             self._settle()
             self._running.pop()
 
+    @contextmanager
+    def measure(self, name: str) -> Iterator[Callable[[float, str], None]]:
+        """Measures the block; yields what takes the share that is done and a note, shown with the time that is left."""
+        self._settle()
+        self._running.append(name)
+        self.seconds.setdefault(name, 0.0)
+        task, began = self._progress.add_task(name, total=100), now(self.device)
+
+        def show(done: float, note: str) -> None:
+            left = (now(self.device) - began) * (1 - done) / done if done > 0 else 0.0
+            self._progress.update(task, completed=round(100 * done), description=f"{name} {note}, {left:.0f} s left")
+
+        try:
+            yield show
+            self._progress.update(task, completed=100, description=name)
+        finally:
+            self._settle()
+            self._running.pop()
+
     def _settle(self) -> None:
         """Gives the time since the last change of stages to the stage that was running."""
         moment = now(self.device)

@@ -16,6 +16,7 @@ OUTPUTS = {
     "cameras.json": "the cameras of the views",
     "points.ply": "coloured points of the decoded depth",
     "points.glb": "the same points and the cameras, for any 3D viewer",
+    "views.npz": "input images at the working size, decoded depth and its confidence: what vg2gt refine needs",
     "images": "the input images at the working size, PNGs in images/",
     **MAPS,
     "mesh.ply": "a mesh fused from rendered depth",
@@ -29,4 +30,5 @@ OUTPUTS = {
     "report.html": "the same of all views, with the run's figures",
     "report.json": "the run's figures: backend, weights, sizes, time per stage, peak memory",
 }
-DEFAULT = ("scene.ply", "cameras.json", "report.png", "report.json")
+DEFAULT = ("scene.ply", "cameras.json", "views.npz", "report.png", "report.json")
+REFINED = "refine.png"  # written of every refined scene: views before and after

@@ -32,8 +32,10 @@ from vg2gt.io.video import require_pyav
 from vg2gt.reconstruction.camera_paths import orbit
 from vg2gt.reconstruction.maps import AddView, animation, feed, map_sinks, whole_folder
 from vg2gt.reconstruction.monitor import Monitor
-from vg2gt.reconstruction.output_names import DEFAULT, FPS, MAPS, ORBIT_FRAMES, OUTPUTS
+from vg2gt.reconstruction.output_names import DEFAULT, FPS, MAPS, ORBIT_FRAMES, OUTPUTS, REFINED
+from vg2gt.reconstruction.refined import before_and_after, refinement_figures
 from vg2gt.reconstruction.report import html_rows, png_report, write_html_report
+from vg2gt.reconstruction.saved import write_views
 
 if TYPE_CHECKING:
     from vg2gt.reconstruction.scene import Scene
@@ -122,7 +124,8 @@ def write_outputs(
         ValueError: if an output is unknown.
     """
     check_outputs(outputs)
-    folder = prepare_folder(folder, outputs, overwrite)
+    pictures = [REFINED] if scene.refined is not None else []
+    folder = prepare_folder(folder, [*outputs, *pictures], overwrite)
     monitor = monitor or Monitor()
     if "orbit.mp4" in outputs:
         require_pyav("writing orbit.mp4")
@@ -137,6 +140,8 @@ def write_outputs(
         sinks.append(mesh_fusion(scene, meshes, mesh_voxel))
     if "report.png" in outputs:
         sinks.append(png_report(scene, folder / "report.png"))
+    for name in pictures:
+        write_png(folder / name, before_and_after(scene))
     rows: list[str] = []
     if "report.html" in outputs:
         sinks.append(html_rows(scene, rows))
@@ -165,6 +170,7 @@ def scene_figures(scene: Scene) -> dict[str, Any]:
         "gaussians": len(scene.gaussians),
         "metres_per_unit": scene.metres_per_unit,
         "mode": scene.renderer.mode,
+        **refinement_figures(scene),
     }
 
 
@@ -248,6 +254,7 @@ _WRITERS: dict[str, Callable[[Scene, Path], Any]] = {
     "scene.splat": lambda scene, path: write_splat(path, scene.gaussians),
     "cameras.json": lambda scene, path: write_cameras_json(path, scene.named_cameras()),
     "points.ply": _points_ply,
+    "views.npz": lambda scene, path: write_views(path, scene),
     "points.glb": _points_glb,
     "images": _images,
     "colmap": _colmap,

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,6 +14,7 @@ from torch import Tensor
 
 from vg2gt.geometry.cameras import unproject
 from vg2gt.io.cameras_json import NamedCamera, named_cameras
+from vg2gt.refinement import Refined, RefineOptions
 from vg2gt.rendering import Renderer
 from vg2gt.types import Cameras, Gaussians
 
@@ -70,6 +72,7 @@ class Scene:
         names: one per view.
         renderer: how it is rendered.
         metres_per_unit: metres per scene unit; None where nobody knows.
+        refined: how it was refined; None where it was not.
     """
 
     gaussians: Gaussians
@@ -80,6 +83,7 @@ class Scene:
     names: tuple[str, ...]
     renderer: Renderer
     metres_per_unit: float | None = None
+    refined: Refined | None = None
 
     def named_cameras(self) -> list[NamedCamera]:
         """The views' cameras, named like the image files that :meth:`save` writes."""
@@ -100,6 +104,20 @@ class Scene:
         colors = (self.images.permute(0, 2, 3, 1)[grid][keep] * 255 + 0.5).to(torch.uint8)
         pixels = torch.stack((column, row), -1)
         return ScenePoints(world[grid][keep].numpy(), colors.numpy(), view.numpy(), pixels.numpy())
+
+    def refine(self, options: RefineOptions | None = None, **changes: Any) -> Scene:
+        """Optimises Gaussians and cameras on the scene's own images (:func:`vg2gt.refinement.refine`).
+
+        Args:
+            options: how; default :class:`vg2gt.refinement.RefineOptions`.
+            **changes: options that differ, such as ``steps=50`` or ``holdout=8``.
+
+        Returns:
+            The refined scene; this one is not changed.
+        """
+        from vg2gt.reconstruction.refined import refine_scene
+
+        return refine_scene(self, replace(options or RefineOptions(), **changes))
 
     def save(self, folder: str | Path, outputs: Sequence[str] = ("scene.ply", "cameras.json", "report.png")) -> None:
         """Writes files into a folder; :data:`vg2gt.reconstruction.output_names.OUTPUTS` lists what there is.

@@ -68,7 +68,7 @@ class RefineOptions:
 
     steps: int | None = 100
     seconds: float | None = None
-    views_per_step: int = 2
+    views_per_step: int = 1
     final_rate: float = 0.1
     check_every: int = 20
     holdout: int | None = None

@@ -52,12 +52,13 @@ class Parameters:
         pixel: size of a pixel at the scene's median depth over that depth: the unit of turns, and of shifts times
             ``depth``.
         depth: median depth in scene units.
+        trained: ``[N]`` the views that are trained on; exposures of the others stay as they are.
     """
 
-    def __init__(self, start: RefinedScene, rates: RefineRates, pixel: float, depth: float) -> None:
+    def __init__(self, start: RefinedScene, rates: RefineRates, pixel: float, depth: float, trained: Tensor) -> None:
         gaussians = start.gaussians
         self.start = start
-        self.pixel, self.depth = pixel, depth
+        self.pixel, self.depth, self.trained = pixel, depth, trained
         self.origin = gaussians.means
         self.unit = gaussians.scales.median(-1).values
         self.size = gaussians.scales.max(-1).values
@@ -76,8 +77,11 @@ class Parameters:
         }
         self.rates = {
             **{name: getattr(rates, name) for name in ("means", "quats", "scales", "opacities", "sh")},
-            **{"sh_rest": HIGHER_BANDS * rates.sh, "cameras": rates.cameras, "focal": rates.focal},
-            **{"gain": rates.exposure, "bias": rates.exposure},
+            "sh_rest": HIGHER_BANDS * rates.sh,
+            "cameras": rates.cameras,
+            "focal": rates.focal,
+            "gain": rates.exposure,
+            "bias": rates.exposure,
         }
         groups = []
         for name, value in self.values.items():
@@ -96,9 +100,13 @@ class Parameters:
             torch.cat((values["sh"], values["sh_rest"]), 1),
             torch.zeros(len(self.origin), dtype=torch.int64, device=self.origin.device),
         )
-        # One exposure for all views would be the scene's own colours.
-        gain, bias = values["gain"], values["bias"]
-        return RefinedScene(gaussians, self._cameras(start.cameras), (gain - gain.mean(0)).exp(), bias - bias.mean(0))
+        gain, bias = self._centred(values["gain"]).exp(), self._centred(values["bias"])
+        return RefinedScene(gaussians, self._cameras(start.cameras), gain, bias)
+
+    def _centred(self, exposure: Tensor) -> Tensor:
+        """Exposures ``[V, 3]`` without what all trained views share: that is in the scene's colours."""
+        trained = exposure[self.trained]
+        return exposure.index_copy(0, self.trained, trained - trained.mean(0))
 
     def _cameras(self, cameras: Cameras) -> Cameras:
         if not self.rates["cameras"] and not self.rates["focal"]:

@@ -70,6 +70,7 @@ class Refined:
     """What a refinement gives.
 
     Attributes:
+        start: the state before.
         scene: the best state.
         step: the step at which it was reached.
         steps: steps that were made.
@@ -82,6 +83,7 @@ class Refined:
         retreats: how often it fell back to the best state.
     """
 
+    start: RefinedScene
     scene: RefinedScene
     step: int
     steps: int
@@ -145,7 +147,7 @@ class _Refinement:
         self.pixel = 1 / float(cameras.intrinsics[..., [0, 1], [0, 1]].mean())
         ones = torch.ones_like(seen.images[:, :, 0, 0])
         self.best = RefinedScene(_with_degree(gaussians, options.sh_degree), cameras, ones, torch.zeros_like(ones))
-        self.best = self.best.detach()
+        self.best = self.start = self.best.detach()
         self.best_score, self.best_step = math.inf, 0
         self.start_loss, self.start_psnr = self._score(self.best, torch.arange(len(ones)))
         self.scores: list[float] = []
@@ -166,6 +168,7 @@ class _Refinement:
             ended = "interrupted"
         _, after = self._score(self.best, torch.arange(len(self.seen.images)))
         return Refined(
+            start=self.start,
             scene=self.best,
             step=self.best_step,
             steps=self.steps,
@@ -179,7 +182,8 @@ class _Refinement:
         )
 
     def _parameters(self) -> Parameters:
-        return Parameters(self.best, self.options.rates, self.pixel, self.depth)
+        trained = self.order.trained.to(self.seen.images.device)
+        return Parameters(self.best, self.options.rates, self.pixel, self.depth, trained)
 
     def _done(self) -> float:
         return self.options.done(self.steps, self.clock() - self.began)

@@ -1,0 +1,105 @@
+"""``vg2gt refine``: a reconstructed scene optimised on its own images."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vg2gt.cli.arguments import flag_parser, list_of_names, listing
+from vg2gt.cli.commands import COMMANDS
+from vg2gt.cli.errors import errors_in_one_line
+from vg2gt.reconstruction.output_names import DEFAULT, OUTPUTS, REFINED
+
+if TYPE_CHECKING:
+    from vg2gt.reconstruction.scene import Scene
+    from vg2gt.refinement import RefineOptions
+
+ADVICE = "fewer or smaller images (vg2gt reconstruct --max-images, --size) or fewer Gaussians"
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command's arguments."""
+    arguments = flag_parser("refine", COMMANDS["refine"], listing(OUTPUTS))
+    add = arguments.add_argument
+    add("scene", metavar="DIR", help="a folder that vg2gt reconstruct has written")
+    add("--out", metavar="DIR", help="where to write; default: refined/ in the scene's folder")
+    add("--steps", type=int, metavar="N", help="default: that of the options")
+    add("--seconds", type=float, metavar="S", help="end after so many seconds; alone: without a number of steps")
+    add("--holdout", type=int, metavar="N", help="leave every N-th view out and say its PSNR before and after")
+    add("--options", default="default", metavar="NAME[,KEY=VALUE...]", help="of configs/refine; default: default")
+    add("--save", type=list_of_names, default=list(DEFAULT), metavar="LIST", help=f"default: {','.join(DEFAULT)}")
+    add("--mode", choices=("solid", "rasterized"), default="solid", help="how views are rendered")
+    add("--device", default="auto", help="auto, cpu, cuda, cuda:N")
+    add("--overwrite", action="store_true", help="replace outputs that are there")
+    add("--quiet", action="store_true", help="no progress bars")
+    return arguments
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Runs the command; ends with one line on what is wrong where something is."""
+    options = parser().parse_args(argv)
+    logging.basicConfig(level=logging.WARNING, format="%(message)s")
+    with errors_in_one_line():
+        run(options)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Refines and writes."""
+    from vg2gt.memory import memory_advice
+    from vg2gt.reconstruction.monitor import Monitor
+    from vg2gt.reconstruction.outputs import check_folder, check_outputs, write_outputs
+    from vg2gt.reconstruction.refined import refine_scene
+    from vg2gt.reconstruction.saved import read_scene
+    from vg2gt.rendering import Renderer
+    from vg2gt.runs.load import choose_device
+
+    check_outputs(options.save)
+    out = Path(options.out or Path(options.scene) / "refined")
+    check_folder(out, [*options.save, REFINED], options.overwrite)
+    how = refine_options(options.options, options.steps, options.seconds, options.holdout)
+    device = choose_device(options.device)
+    with Monitor(show=not options.quiet, device=device) as monitor, memory_advice(ADVICE):
+        with monitor.stage("read scene"):
+            scene = read_scene(options.scene, Renderer(mode=options.mode), device)
+        scene = refine_scene(scene, how, monitor)
+        folder = write_outputs(scene, out, options.save, overwrite=options.overwrite, monitor=monitor)
+    print_refinement(scene)
+    print(f"written: {', '.join(str(folder / name) for name in (*options.save, REFINED))}")
+
+
+def print_refinement(scene: Scene) -> None:
+    """Prints what refining a scene gave."""
+    from vg2gt.reconstruction.refined import refinement_lines
+
+    assert scene.refined is not None
+    print("\n".join(refinement_lines(scene.refined)))
+
+
+def refine_options(
+    spec: str = "default", steps: int | None = None, seconds: float | None = None, holdout: int | None = None
+) -> RefineOptions:
+    """Options of ``NAME[,KEY=VALUE...]`` of ``configs/refine``; the other arguments stand above it where given.
+
+    Raises:
+        ValueError: if a name is unknown or a value out of range.
+    """
+    from hydra.errors import InstantiationException
+    from hydra.utils import instantiate
+
+    from vg2gt.runs.load import compose_part
+
+    try:
+        found = instantiate(compose_part("refine", spec))
+    except InstantiationException as error:
+        if not isinstance(error.__cause__, ValueError):
+            raise
+        raise error.__cause__ from error
+    if seconds is not None:
+        found = replace(found, seconds=seconds, steps=steps)
+    elif steps is not None:
+        found = replace(found, steps=steps)
+    return found if holdout is None else replace(found, holdout=holdout)

@@ -1,0 +1,97 @@
+"""A scene refined on its own images, and what there is to tell of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from vg2gt.io.images import colorize_normals, grid
+from vg2gt.reconstruction.monitor import Monitor
+from vg2gt.reconstruction.pictures import spread
+from vg2gt.refinement import Observations, Progress, Refined, RefinedScene, RefineOptions, refine
+
+if TYPE_CHECKING:
+    from vg2gt.reconstruction.scene import Scene
+
+ROWS = 4
+
+
+def refine_scene(scene: Scene, options: RefineOptions, monitor: Monitor | None = None) -> Scene:
+    """Optimises a scene's Gaussians and cameras on its images (:func:`vg2gt.refinement.refine`).
+
+    Args:
+        scene: the start; it is not changed.
+        options: how long and how.
+        monitor: shows PSNR and the time that is left.
+
+    Returns:
+        The refined scene; its images, decoded depth and names are the old ones.
+    """
+    device = scene.gaussians.means.device
+    seen = Observations(scene.images, scene.depth, scene.depth_conf).to(device)
+    with (monitor or Monitor()).measure("refine") as show:
+
+        def observe(progress: Progress) -> None:
+            show(progress.done, f"{progress.psnr:.2f} dB")
+
+        refined = refine(scene.gaussians, scene.cameras, seen, scene.renderer, options, observe)
+    return replace(scene, gaussians=refined.scene.gaussians, cameras=refined.scene.cameras, refined=refined)
+
+
+def refinement_figures(scene: Scene) -> dict[str, Any]:
+    """What a report says of a scene's refinement; nothing where there was none."""
+    refined = scene.refined
+    if refined is None:
+        return {}
+    figures: dict[str, Any] = {
+        "steps": refined.steps,
+        "best_step": refined.step,
+        "seconds": round(refined.seconds, 2),
+        "ended": refined.ended,
+        "retreats": refined.retreats,
+        "gaussians_before": len(refined.start.gaussians),
+        "gaussians_after": len(refined.scene.gaussians),
+    }
+    for name, views in (("trained", refined.trained), ("held_out", refined.held_out)):
+        if len(views):
+            before, after = (round(float(psnr), 3) for psnr in refined.psnr[:, views].mean(1))
+            figures |= {f"psnr_{name}_before": before, f"psnr_{name}_after": after}
+    return {"refinement": figures}
+
+
+def refinement_lines(refined: Refined) -> list[str]:
+    """A short table: views, PSNR before and after, Gaussians."""
+    lines = []
+    for name, views in (("trained on", refined.trained), ("held out", refined.held_out)):
+        if len(views):
+            before, after = refined.psnr[:, views].mean(1).tolist()
+            lines.append(f"{name:<11} {len(views):>4} views: {before:6.2f} -> {after:6.2f} dB")
+    before, after = len(refined.start.gaussians), len(refined.scene.gaussians)
+    ended = {"interrupted": ", interrupted", "diverged": ", stopped because it diverged"}.get(refined.ended, "")
+    lines.append(f"best state: step {refined.step} of {refined.steps}{ended}; Gaussians: {before} -> {after}")
+    return lines
+
+
+@torch.no_grad()
+def before_and_after(scene: Scene) -> Tensor:
+    """A picture ``[3, H', W']`` of up to 4 views, held-out ones first.
+
+    Columns: image, rendered colour before and after, normals before and after.
+    """
+    refined = scene.refined
+    assert refined is not None
+    trained = refined.trained[torch.tensor(sorted(spread(len(refined.trained), min(ROWS, len(refined.trained)))))]
+    views = torch.cat((refined.held_out, trained))[:ROWS]
+
+    def panels(state: RefinedScene, view: Tensor) -> tuple[Tensor, Tensor]:
+        shown = scene.renderer(state.gaussians, state.cameras.select(view)).to("cpu")
+        return shown.color[0, 0].clamp(0, 1), colorize_normals(shown.normal[0, 0])
+
+    rows = []
+    for view in views.split(1):
+        before, after = (panels(state, view.to(state.gain.device)) for state in (refined.start, refined.scene))
+        rows.append([scene.images[int(view)], before[0], after[0], before[1], after[1]])
+    return grid(rows)

@@ -1,0 +1,130 @@
+"""A reconstruction's folder, and the scene back from it."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from vg2gt.io import read_cameras_json, read_gaussian_ply
+from vg2gt.io.cameras_json import NamedCamera
+from vg2gt.io.errors import FormatError
+from vg2gt.io.files import read_json, write_bytes
+from vg2gt.io.images import open_image, to_pixels
+from vg2gt.io.npz import read_npz
+from vg2gt.reconstruction.camera_paths import view_stem
+from vg2gt.rendering import Renderer
+from vg2gt.types import Cameras, Gaussians
+
+if TYPE_CHECKING:
+    from vg2gt.reconstruction.scene import Scene
+
+ARRAYS = ("images", "depth", "depth_conf")
+
+
+def write_views(path: Path, scene: Scene) -> Path:
+    """Writes what the views show: ``images [V, H, W, 3]`` uint8, ``depth`` and ``depth_conf [V, H, W]`` float32."""
+    images = np.stack([to_pixels(image) for image in scene.images])
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, images=images, depth=scene.depth.numpy(), depth_conf=scene.depth_conf.numpy())
+    return write_bytes(path, buffer.getvalue())
+
+
+def read_scene(folder: str | Path, renderer: Renderer, device: torch.device | str = "cpu") -> Scene:
+    """Reads a scene that was saved with its cameras and views.
+
+    Args:
+        folder: holds ``scene.ply``, ``cameras.json`` and ``views.npz``. Without ``views.npz``, images are read from
+            ``images/``, where cameras.json names them, and the scene's own rendered depth stands for the decoded one.
+        renderer: how the scene is rendered.
+        device: where the Gaussians go.
+
+    Raises:
+        FileNotFoundError: naming the file that is missing, and how to get it.
+        ValueError: if the files do not go together.
+    """
+    from vg2gt.reconstruction.scene import Scene
+
+    folder = Path(folder)
+    for name in ("scene.ply", "cameras.json"):
+        if not (folder / name).is_file():
+            raise FileNotFoundError(f"{folder} has no {name}: give a folder that vg2gt reconstruct has written")
+    gaussians = read_gaussian_ply(folder / "scene.ply").to(device)
+    named = read_cameras_json(folder / "cameras.json")
+    cameras = _cameras(folder, named).to(device)
+    if (folder / "views.npz").is_file():
+        images, depth, conf = _read_views(folder / "views.npz", len(named), cameras.size)
+    else:
+        images = _read_images(folder / "images", named)
+        depth = _rendered_depth(renderer, gaussians, cameras)
+        conf = torch.ones_like(depth)
+    report = folder / "report.json"
+    return Scene(
+        gaussians=gaussians,
+        cameras=cameras,
+        images=images,
+        depth=depth,
+        depth_conf=conf,
+        names=tuple(view_stem(camera.name) for camera in named),
+        renderer=renderer,
+        metres_per_unit=read_json(report).get("metres_per_unit") if report.is_file() else None,
+    )
+
+
+def _cameras(folder: Path, named: list[NamedCamera]) -> Cameras:
+    sizes = sorted({(camera.height, camera.width) for camera in named})
+    if len(sizes) != 1:
+        raise ValueError(
+            f"{folder / 'cameras.json'} has cameras of {len(sizes)} sizes {sizes[:3]}; one size is expected"
+        )
+    poses, intrinsics = (
+        torch.from_numpy(np.stack([getattr(camera, name) for camera in named])).float()[None]
+        for name in ("world_to_camera", "intrinsics")
+    )
+    return Cameras(poses, intrinsics, sizes[0])
+
+
+def _read_views(path: Path, views: int, size: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
+    try:
+        arrays = read_npz(path, ARRAYS)
+    except (KeyError, FormatError) as error:
+        raise FormatError(f"{path}: {error}; write it again with vg2gt reconstruct --save views.npz") from error
+    shapes = {name: (views, *size, *([3] if name == "images" else [])) for name in ARRAYS}
+    wrong = [f"{name} {array.shape}" for name, array in arrays.items() if array.shape != shapes[name]]
+    if wrong or arrays["images"].dtype != np.uint8:
+        raise FormatError(
+            f"{path} does not belong to the {views} cameras of {size[0]}x{size[1]} beside it: "
+            f"{', '.join(wrong) or 'its images are not uint8'}"
+        )
+    images = torch.from_numpy(arrays["images"]).permute(0, 3, 1, 2).float() / 255
+    depth, conf = (torch.from_numpy(arrays[name].astype(np.float32)) for name in ("depth", "depth_conf"))
+    return images, depth.nan_to_num(0.0, 0.0, 0.0).clamp(min=0), conf.nan_to_num(0.0, 0.0, 0.0).clamp(min=0)
+
+
+def _read_images(folder: Path, named: list[NamedCamera]) -> Tensor:
+    images = []
+    for camera in named:
+        path = folder / camera.name
+        if not path.is_file():
+            raise FileNotFoundError(
+                f"{folder.parent} has no views.npz and no images/{camera.name}, so there is nothing to refine on: "
+                "reconstruct with --save scene.ply,cameras.json,views.npz"
+            )
+        picture = open_image(path).convert("RGB")
+        if (picture.height, picture.width) != (camera.height, camera.width):
+            raise ValueError(
+                f"{path} has {picture.height}x{picture.width} pixels, its camera {camera.height}x{camera.width}; "
+                "resize one of them"
+            )
+        images.append(torch.from_numpy(np.asarray(picture).copy()).permute(2, 0, 1).float() / 255)
+    return torch.stack(images)
+
+
+@torch.no_grad()
+def _rendered_depth(renderer: Renderer, gaussians: Gaussians, cameras: Cameras) -> Tensor:
+    views = torch.arange(cameras.world_to_camera.shape[1], device=gaussians.means.device)
+    return torch.cat([renderer(gaussians, cameras.select(view)).depth[0].cpu() for view in views.split(1)])
