@@ -23,7 +23,18 @@ MAY_IMPORT: dict[str, set[str]] = {
     "reconstruction": {"refinement", "runs", "model", "rendering", "data"} | BASICS,
     "training": {"evaluation", "runs", "model", "losses", "rendering", "data"} | BASICS,
     "studies": {"training", "evaluation", "runs"} | BASICS,
-    "cli": {"studies", "training", "evaluation", "reconstruction", "viewer", "runs", "rendering", "data", "backends"}
+    "cli": {
+        "studies",
+        "training",
+        "evaluation",
+        "reconstruction",
+        "refinement",
+        "viewer",
+        "runs",
+        "rendering",
+        "data",
+        "backends",
+    }
     | BASICS,
     **{command: {"cli"} for command in ("evaluate", "ablate", "curves")},
 }

@@ -29,7 +29,8 @@ def test_reconstruction_needs_no_lightning() -> None:
 
 def test_photographs_of_all_sizes(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     reconstruct_command.main([str(photos), "--out", str(tmp_path / "out"), *TINY])
-    assert {p.name for p in (tmp_path / "out").iterdir()} == {"scene.ply", "cameras.json", "report.png", "report.json"}
+    names = {"scene.ply", "cameras.json", "views.npz", "report.png", "report.json"}
+    assert {p.name for p in (tmp_path / "out").iterdir()} == names
     figures = json.loads((tmp_path / "out" / "report.json").read_text())
     assert figures["weights"] == "none: the head is untrained"
     assert figures["backend"]["name"] == "da3_tiny"

@@ -50,7 +50,7 @@ def test_readme(workplace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for words in commands:
         _run(words, monkeypatch)
     names = {path.name for path in (workplace / "outputs" / "room").iterdir()}
-    assert names == {"scene.ply", "cameras.json", "report.png", "report.json", "video.gif"}
+    assert names == {"scene.ply", "cameras.json", "views.npz", "report.png", "report.json", "video.gif"}
 
 
 def test_page(workplace: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:

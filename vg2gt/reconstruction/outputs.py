@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -26,8 +28,8 @@ from vg2gt.io import (
     write_splat,
     write_transforms,
 )
-from vg2gt.io.files import write_json
-from vg2gt.io.images import write_png
+from vg2gt.io.files import write_bytes, write_json
+from vg2gt.io.images import to_pixels, write_png
 from vg2gt.io.video import require_pyav
 from vg2gt.reconstruction.camera_paths import orbit
 from vg2gt.reconstruction.maps import AddView, animation, feed, map_sinks, whole_folder
@@ -35,7 +37,6 @@ from vg2gt.reconstruction.monitor import Monitor
 from vg2gt.reconstruction.output_names import DEFAULT, FPS, MAPS, ORBIT_FRAMES, OUTPUTS, REFINED
 from vg2gt.reconstruction.refined import before_and_after, refinement_figures
 from vg2gt.reconstruction.report import html_rows, png_report, write_html_report
-from vg2gt.reconstruction.saved import write_views
 
 if TYPE_CHECKING:
     from vg2gt.reconstruction.scene import Scene
@@ -210,6 +211,14 @@ def _images(scene: Scene, target: Path) -> None:
         _write_images(scene, folder)
 
 
+def _views(scene: Scene, path: Path) -> None:
+    """``images [V, H, W, 3]`` uint8, ``depth`` and ``depth_conf [V, H, W]`` float32."""
+    buffer = io.BytesIO()
+    images = np.stack([to_pixels(image) for image in scene.images])
+    np.savez_compressed(buffer, images=images, depth=scene.depth.numpy(), depth_conf=scene.depth_conf.numpy())
+    write_bytes(path, buffer.getvalue())
+
+
 def _colmap(scene: Scene, target: Path) -> None:
     points = scene.points()
     names = [camera.name for camera in scene.named_cameras()]
@@ -254,7 +263,7 @@ _WRITERS: dict[str, Callable[[Scene, Path], Any]] = {
     "scene.splat": lambda scene, path: write_splat(path, scene.gaussians),
     "cameras.json": lambda scene, path: write_cameras_json(path, scene.named_cameras()),
     "points.ply": _points_ply,
-    "views.npz": lambda scene, path: write_views(path, scene),
+    "views.npz": _views,
     "points.glb": _points_glb,
     "images": _images,
     "colmap": _colmap,

@@ -1,10 +1,8 @@
-"""A reconstruction's folder, and the scene back from it."""
+"""The scene back from a reconstruction's folder."""
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -13,25 +11,15 @@ from torch import Tensor
 from vg2gt.io import read_cameras_json, read_gaussian_ply
 from vg2gt.io.cameras_json import NamedCamera
 from vg2gt.io.errors import FormatError
-from vg2gt.io.files import read_json, write_bytes
-from vg2gt.io.images import open_image, to_pixels
+from vg2gt.io.files import read_json
+from vg2gt.io.images import open_image
 from vg2gt.io.npz import read_npz
 from vg2gt.reconstruction.camera_paths import view_stem
+from vg2gt.reconstruction.scene import Scene
 from vg2gt.rendering import Renderer
 from vg2gt.types import Cameras, Gaussians
 
-if TYPE_CHECKING:
-    from vg2gt.reconstruction.scene import Scene
-
 ARRAYS = ("images", "depth", "depth_conf")
-
-
-def write_views(path: Path, scene: Scene) -> Path:
-    """Writes what the views show: ``images [V, H, W, 3]`` uint8, ``depth`` and ``depth_conf [V, H, W]`` float32."""
-    images = np.stack([to_pixels(image) for image in scene.images])
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, images=images, depth=scene.depth.numpy(), depth_conf=scene.depth_conf.numpy())
-    return write_bytes(path, buffer.getvalue())
 
 
 def read_scene(folder: str | Path, renderer: Renderer, device: torch.device | str = "cpu") -> Scene:
@@ -47,8 +35,6 @@ def read_scene(folder: str | Path, renderer: Renderer, device: torch.device | st
         FileNotFoundError: naming the file that is missing, and how to get it.
         ValueError: if the files do not go together.
     """
-    from vg2gt.reconstruction.scene import Scene
-
     folder = Path(folder)
     for name in ("scene.ply", "cameras.json"):
         if not (folder / name).is_file():

@@ -31,7 +31,7 @@ class RefineRates:
     scales: float = 0.02
     opacities: float = 0.05
     sh: float = 0.02
-    cameras: float = 0.0
+    cameras: float = 0.03
     focal: float = 0.0
     exposure: float = 0.0
 

@@ -148,7 +148,7 @@ class _Refinement:
         ones = torch.ones_like(seen.images[:, :, 0, 0])
         self.best = RefinedScene(_with_degree(gaussians, options.sh_degree), cameras, ones, torch.zeros_like(ones))
         self.best = self.start = self.best.detach()
-        self.best_score, self.best_step = math.inf, 0
+        self.best_score, self.best_step = 1.0, 0
         self.start_loss, self.start_psnr = self._score(self.best, torch.arange(len(ones)))
         self.scores: list[float] = []
         self.checks: list[Check] = []
@@ -166,7 +166,10 @@ class _Refinement:
                     observe(self._progress())
         except KeyboardInterrupt:
             ended = "interrupted"
-        _, after = self._score(self.best, torch.arange(len(self.seen.images)))
+        loss, after = self._score(self.best, torch.arange(len(self.seen.images)))
+        trained = self.order.trained
+        if not loss[trained].mean() <= self.start_loss[trained].mean():  # few views can be better by chance
+            self.best, self.best_step, after = self.start, 0, self.start_psnr
         return Refined(
             start=self.start,
             scene=self.best,

@@ -1,0 +1,134 @@
+"""Refined scenes: in Python, by both commands, in their reports, and what the commands say of unfit folders."""
+
+import json
+import shutil
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from vg2gt.cli import main
+from vg2gt.io import read_cameras_json, read_gaussian_ply
+from vg2gt.reconstruction.outputs import write_outputs
+from vg2gt.reconstruction.saved import read_scene
+from vg2gt.reconstruction.scene import Scene
+
+ORACLE = ["--backend", "oracle,depth_noise=0.02", "--quiet", "--device", "cpu"]
+
+
+def vg2gt(monkeypatch: pytest.MonkeyPatch, *words: str) -> None:
+    monkeypatch.setattr(sys, "argv", ["vg2gt", *words])
+    main()
+
+
+@pytest.fixture(scope="module")
+def saved(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("saved") / "room"
+    scene.save(folder, ["scene.ply", "cameras.json", "views.npz", "images"])
+    return folder
+
+
+def test_a_saved_scene_comes_back(saved: Path, scene: Scene) -> None:
+    back = read_scene(saved, scene.renderer)
+    assert back.names == scene.names
+    assert torch.equal(back.depth, scene.depth)
+    assert torch.equal(back.depth_conf, scene.depth_conf)
+    assert (back.images - scene.images).abs().max() <= 0.5 / 255 + 1e-6
+    torch.testing.assert_close(back.cameras.world_to_camera, scene.cameras.world_to_camera)
+    torch.testing.assert_close(back.gaussians.means, scene.gaussians.means)
+
+
+def test_without_views_its_images_and_own_depth_serve(saved: Path, scene: Scene, tmp_path: Path) -> None:
+    folder = shutil.copytree(saved, tmp_path / "copy")
+    (folder / "views.npz").unlink()
+    back = read_scene(folder, scene.renderer)
+    assert (back.images - scene.images).abs().max() <= 0.5 / 255 + 1e-6
+    both = (back.depth > 0) & (scene.depth > 0)
+    assert ((back.depth / scene.depth)[both] - 1).abs().median() < 0.02
+
+
+def test_in_python(scene: Scene, tmp_path: Path) -> None:
+    refined = scene.refine(steps=6, check_every=3)
+    assert refined.refined is not None
+    assert refined.refined.psnr[1].mean() > refined.refined.psnr[0].mean()
+    assert not torch.equal(refined.gaussians.sh, scene.gaussians.sh)
+    assert scene.refined is None
+    write_outputs(refined, tmp_path, ["report.html"])
+    assert "psnr_trained_after" in (tmp_path / "report.html").read_text()
+
+
+def test_the_command(saved: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+    options = ["--steps", "8", "--holdout", "4", "--options", "default,check_every=4"]
+    vg2gt(monkeypatch, "refine", str(saved), *options, "--quiet", "--device", "cpu")
+    printed = capsys.readouterr().out
+    assert "trained on     3 views:" in printed
+    assert "held out       1 views:" in printed
+    out = saved / "refined"
+    figures = json.loads((out / "report.json").read_text())["refinement"]
+    assert figures["psnr_trained_after"] > figures["psnr_trained_before"]
+    assert (figures["steps"], figures["ended"]) == (8, "steps")
+    assert len(read_gaussian_ply(out / "scene.ply")) == figures["gaussians_after"]
+    first, second = (read_cameras_json(folder / "cameras.json") for folder in (saved, out))
+    assert np.allclose(first[0].world_to_camera, second[0].world_to_camera)
+    assert not np.allclose(first[1].world_to_camera, second[1].world_to_camera, atol=1e-7)
+    assert Image.open(out / "refine.png").size == (5 * 112 + 4 * 4, 4 * 84 + 3 * 4)
+    again = ["refine", str(out), "--seconds", "0.1", "--quiet", "--device", "cpu"]
+    vg2gt(monkeypatch, *again)  # a refined folder is one too
+    with pytest.raises(SystemExit, match="is there already"):
+        vg2gt(monkeypatch, *again)
+
+
+def test_reconstruct_refines_at_once(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    vg2gt(monkeypatch, "reconstruct", str(recording), *ORACLE, "--refine=5", "--out", str(tmp_path / "out"))
+    assert "trained on     4 views:" in capsys.readouterr().out
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["refinement"]["steps"] == 5
+    assert report["seconds"]["refine"] > 0
+    assert (tmp_path / "out" / "refine.png").is_file()
+    with pytest.raises(SystemExit):
+        vg2gt(monkeypatch, "reconstruct", "--refine", str(recording), *ORACLE, "--out", str(tmp_path / "x"))
+    assert "write --refine=N" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        ("scene.ply", "has no scene.ply: give a folder that vg2gt reconstruct has written"),
+        ("views.npz", "has no views.npz and no images/008.png"),
+        ("shape", r"does not belong to the 4 cameras of 84x112 .*depth \(3, 84, 112\)"),
+        ("picture", "has 10x10 pixels, its camera 84x112"),
+        ("option", "default has no option 'rats.sh'"),
+        ("value", "refine.holdout must be at least 2"),
+    ],
+)
+def test_mistakes_are_one_line(
+    saved: Path, damage: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = shutil.copytree(saved, tmp_path / "copy", ignore=shutil.ignore_patterns("refined"))
+    if damage == "scene.ply":
+        (folder / "scene.ply").unlink()
+    elif damage == "views.npz":
+        (folder / "views.npz").unlink()
+        shutil.rmtree(folder / "images")
+    elif damage == "shape":
+        arrays = dict(np.load(folder / "views.npz"))
+        np.savez(folder / "views.npz", **arrays | {"depth": arrays["depth"][:3]})
+    elif damage == "picture":
+        (folder / "views.npz").unlink()
+        Image.new("RGB", (10, 10)).save(folder / "images" / "008.png")
+    words = {"option": ["--options", "default,rats.sh=1"], "value": ["--holdout", "1"]}.get(damage, [])
+    with pytest.raises(SystemExit, match=said):
+        vg2gt(monkeypatch, "refine", str(folder), "--steps", "1", "--quiet", "--device", "cpu", *words)
+
+
+def test_a_scene_without_decoded_depth_still_refines(scene: Scene) -> None:
+    blind = replace(scene, depth=torch.zeros_like(scene.depth))
+    refined = blind.refine(steps=3).refined
+    assert refined is not None
+    assert refined.ended == "steps"

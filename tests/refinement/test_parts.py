@@ -1,0 +1,137 @@
+"""Parameters, density, the order of views and the loss, each on its own."""
+
+import math
+from collections import Counter
+from dataclasses import replace
+
+import pytest
+import torch
+
+from tests.refinement.conftest import VIEWS, Start
+from vg2gt.geometry.cameras import invert_rigid
+from vg2gt.refinement import RefinedScene, RefineLoss, RefineRates
+from vg2gt.refinement.density import prune, split
+from vg2gt.refinement.parameters import Parameters
+from vg2gt.refinement.views import ViewOrder
+
+PIXEL, DEPTH = 0.01, 2.0
+
+
+@pytest.fixture
+def parameters(start: Start) -> Parameters:
+    ones = torch.ones(VIEWS, 3)
+    state = RefinedScene(start.gaussians, start.cameras, ones, torch.zeros_like(ones))
+    return Parameters(state, RefineRates(focal=0.01), PIXEL, DEPTH, torch.arange(VIEWS))
+
+
+def test_parameters_begin_with_the_scene(parameters: Parameters, start: Start) -> None:
+    scene = parameters.scene()
+    for name in ("means", "scales", "opacities", "sh"):
+        torch.testing.assert_close(getattr(scene.gaussians, name), getattr(start.gaussians, name))
+    torch.testing.assert_close(scene.cameras.world_to_camera, start.cameras.world_to_camera)
+    torch.testing.assert_close(scene.cameras.intrinsics, start.cameras.intrinsics)
+
+
+def test_cameras_move_by_pixels(parameters: Parameters, start: Start) -> None:
+    """A turn about the own centre by one pixel's angle; a shift by one pixel at the median depth."""
+    moves = parameters.values["cameras"].detach()
+    moves[1, 1], moves[2, 3] = 1.0, 1.0
+    found, before = parameters.scene().detach().cameras.world_to_camera[0], start.cameras.world_to_camera[0]
+    turn = found[1] @ invert_rigid(before[1])
+    assert math.acos((float(turn[:3, :3].trace()) - 1) / 2) == pytest.approx(PIXEL, rel=0.01)
+    torch.testing.assert_close(invert_rigid(found[1])[:3, 3], invert_rigid(before[1])[:3, 3])
+    torch.testing.assert_close((found[2] - before[2])[:3, 3], torch.tensor([PIXEL * DEPTH, 0, 0]), atol=1e-6, rtol=0)
+
+
+def test_steps_are_in_units_of_each_gaussian(parameters: Parameters) -> None:
+    before = parameters.scene().gaussians.means.detach()
+    scene = parameters.scene().gaussians
+    assert parameters.step((scene.means * torch.randn_like(scene.means)).sum(), share=0.5)
+    moved = (parameters.scene().gaussians.means.detach() - before).abs() / parameters.unit[:, None]
+    torch.testing.assert_close(moved, torch.full_like(moved, 0.5 * 0.05), rtol=0.05, atol=1e-3)
+
+
+def test_a_gradient_that_is_not_finite_changes_nothing(parameters: Parameters) -> None:
+    before = parameters.scene().gaussians
+    assert not parameters.step(parameters.scene().gaussians.means.sum() * torch.nan, share=1.0)
+    assert torch.equal(parameters.scene().gaussians.means, before.means)
+
+
+def test_rows_keep_what_adam_knows(parameters: Parameters) -> None:
+    scene = parameters.scene().gaussians
+    parameters.step(scene.means.square().sum() + scene.opacities.square().sum(), share=1.0)
+    pull, opacities = parameters.pull(), parameters.scene().gaussians.opacities.detach()
+    assert (pull > 0).any()
+    rows = torch.tensor([5, 3, 3])
+    parameters.take(rows)
+    assert torch.equal(parameters.pull(), pull[rows])
+    assert torch.equal(parameters.scene().gaussians.opacities, opacities[rows])
+    assert parameters.step(parameters.scene().gaussians.means.sum(), share=1.0)
+
+
+def test_prune_removes_what_is_transparent(parameters: Parameters) -> None:
+    logits = parameters.values["opacities"].detach()
+    logits[:10] = -6.0
+    before = len(logits)
+    assert prune(parameters, 0.02) == 10
+    assert len(parameters.scene().gaussians) == before - 10
+    parameters.values["opacities"].detach().fill_(-6.0)
+    assert prune(parameters, 0.02) == 0
+
+
+def test_a_split_covers_what_one_covered(parameters: Parameters) -> None:
+    """Both halves about the old place, along its longest axis, none larger."""
+    scene = parameters.scene().gaussians
+    weights = torch.zeros(len(scene.means))
+    weights[[4, 7]] = torch.tensor([1.0, 2.0])
+    parameters.step((scene.means * weights[:, None]).sum(), share=1e-6)
+    before = parameters.scene().gaussians.detach()
+    assert split(parameters, 2) == 2
+    after = parameters.scene().gaussians.detach()
+    assert len(after.means) == len(before.means) + 2
+    halves = after.means[-4:].unflatten(0, (2, 2))  # [half, Gaussian, 3]
+    torch.testing.assert_close(halves.mean(0), before.means[[4, 7]])
+    longest = before.scales[[4, 7]].max(-1).values
+    apart = (halves[0] - halves[1]).norm(dim=-1)
+    torch.testing.assert_close(apart, 0.6 / 0.48 * longest)
+    assert (after.scales[-4:].amax(-1) <= longest.repeat(2)).all()
+
+
+@pytest.mark.parametrize(("views", "holdout"), [(12, 4), (20, None), (2, None)])
+def test_views_are_dealt_alike_and_left_out_in_turns(views: int, holdout: int | None) -> None:
+    order = ViewOrder(views, holdout, seed=0)
+    dealt: Counter[int] = Counter()
+    left_out: Counter[int] = Counter()
+    for _ in range(40):
+        for _ in range(20):
+            hand = order.deal(3).tolist()
+            assert len(set(hand)) == len(hand) == min(3, len(order.trained))
+            assert not set(hand) & set(order.left_out.tolist())
+            dealt.update(hand)
+        left_out.update(order.left_out.tolist())
+        order.next_round()
+    assert set(dealt) == set(order.trained.tolist())
+    assert max(dealt.values()) < 1.2 * min(dealt.values())
+    assert set(left_out) == (set() if views < 4 else set(order.trained.tolist()))
+
+
+def test_a_perfect_view_has_no_loss(start: Start) -> None:
+    rendered = start.renderer(start.gaussians, start.cameras)
+    seen = replace(start.seen, images=rendered.color[0], depth=rendered.depth[0])
+    terms = RefineLoss(normal_render=0, normal_decoded=0).of_views(rendered, start.cameras, seen, 1.0)
+    assert set(terms) == {"color_l1", "ssim", "depth_consistency"}
+    assert all(abs(float(term)) < 1e-4 for term in terms.values())
+    off = replace(rendered, depth=1.1 * rendered.depth)
+    moved = RefineLoss().of_views(off, start.cameras, seen, 2.0)["depth_consistency"]
+    hits = (rendered.depth > 0) & (rendered.alpha > 0.5)
+    trust = torch.where(hits[0], seen.depth_conf, 0)
+    assert float(moved) == pytest.approx(float((0.05 * rendered.depth[0] * trust).sum() / trust.sum()), rel=1e-3)
+
+
+def test_weights_decide_which_terms_there_are(start: Start) -> None:
+    size = start.gaussians.scales.max(-1).values
+    assert RefineLoss().of_gaussians(start.gaussians, size) == {}
+    terms = RefineLoss(opacity=0.1, scale=2.0).of_gaussians(start.gaussians, size / 2)
+    assert float(terms["scale"]) == pytest.approx(1.0)
+    assert float(RefineLoss(opacity=0.1, scale=2.0).total(terms)) == pytest.approx(2 + 0.1 * float(terms["opacity"]))
+    assert not RefineLoss(depth_consistency=0, normal_render=0, normal_decoded=0).needs_geometry

@@ -1,0 +1,136 @@
+"""Whole refinements: they sharpen, repeat to the bit, survive Ctrl-C and bad numbers, and never see held-out views."""
+
+import logging
+from dataclasses import fields, replace
+
+import pytest
+import torch
+
+from tests.refinement.conftest import VIEWS, Start
+from vg2gt.refinement import Progress, Refined, RefinedScene, RefineLoss, RefineOptions, RefineRates, refine
+
+COLOUR = RefineLoss(depth_consistency=0, normal_render=0, normal_decoded=0)
+
+
+def run(start: Start, options: RefineOptions, **changes) -> Refined:
+    return refine(start.gaussians, start.cameras, start.seen, start.renderer, options, **changes)
+
+
+def same(first: RefinedScene, second: RefinedScene) -> bool:
+    pairs = [(getattr(first.gaussians, f.name), getattr(second.gaussians, f.name)) for f in fields(first.gaussians)]
+    pairs += [(first.cameras.world_to_camera, second.cameras.world_to_camera), (first.gain, second.gain)]
+    return all(torch.equal(a, b) for a, b in pairs)
+
+
+@pytest.fixture(scope="module")
+def refined(start: Start) -> Refined:
+    rates = RefineRates(exposure=0.002)
+    return run(start, RefineOptions(steps=24, check_every=8, holdout=3, split_share=0.05, rates=rates))
+
+
+def test_held_out_views_become_sharper(refined: Refined) -> None:
+    assert refined.held_out.tolist() == [2, 5]
+    before, after = refined.psnr
+    assert (after[refined.trained] > before[refined.trained] + 1.5).all()
+    assert (after - before)[refined.held_out].mean() > 1
+    assert refined.ended == "steps"
+    assert [check.step for check in refined.checks] == [8, 16, 24]
+    assert refined.checks[-1].score < 0.9
+
+
+def test_the_first_camera_stays_and_the_others_move(refined: Refined, start: Start) -> None:
+    found, before = refined.scene.cameras, start.cameras
+    moved = (found.world_to_camera - before.world_to_camera).abs().amax((0, 2, 3))
+    assert moved[0] == 0
+    assert (moved[refined.trained[1:]] > 0).all()
+    assert (moved[refined.held_out] == 0).all()
+    rotation = found.world_to_camera[0, :, :3, :3]
+    torch.testing.assert_close(rotation @ rotation.mT, torch.eye(3).expand(VIEWS, 3, 3), atol=1e-5, rtol=0)
+
+
+def test_it_repeats_to_the_bit_and_never_looks_at_held_out_views(refined: Refined, start: Start) -> None:
+    images = start.seen.images.clone()
+    images[refined.held_out] = 1 - images[refined.held_out]
+    other = replace(start, seen=replace(start.seen, images=images))
+    rates = RefineRates(exposure=0.002)
+    again = run(other, RefineOptions(steps=24, check_every=8, holdout=3, split_share=0.05, rates=rates))
+    assert same(again.scene, refined.scene)
+    assert not torch.equal(again.psnr[1, refined.held_out], refined.psnr[1, refined.held_out])
+
+
+def test_it_splits_within_the_limit(refined: Refined, start: Start) -> None:
+    assert len(start.gaussians) < len(refined.scene.gaussians) <= 1.5 * len(start.gaussians)
+    capped = run(start, RefineOptions(steps=4, check_every=2, split_share=0.5, max_growth=1.1, loss=COLOUR))
+    assert len(capped.scene.gaussians) <= 1.1 * len(start.gaussians)
+
+
+def test_an_interruption_keeps_the_best_state(start: Start) -> None:
+    def interrupt(progress: Progress) -> None:
+        if progress.step == 7:
+            raise KeyboardInterrupt
+
+    stopped = run(start, RefineOptions(steps=100, check_every=5, loss=COLOUR), observe=interrupt)
+    assert (stopped.ended, stopped.steps, stopped.step) == ("interrupted", 7, 5)
+    assert stopped.psnr[1].mean() > stopped.psnr[0].mean()
+
+
+@pytest.mark.parametrize("trouble", ["means", "nan"])
+def test_a_divergence_goes_back_and_says_so(start: Start, trouble: str, caplog: pytest.LogCaptureFixture) -> None:
+    """Rates a thousand times too large, or images that are no numbers."""
+    options = RefineOptions(steps=12, check_every=3, loss=COLOUR)
+    if trouble == "means":
+        options = replace(options, rates=RefineRates(means=50.0))
+    else:
+        images = start.seen.images.clone()
+        images[1] = torch.nan
+        start = replace(start, seen=replace(start.seen, images=images))
+    with caplog.at_level(logging.WARNING):
+        found = run(start, options)
+    assert found.retreats >= 1
+    assert "rates times 0.5" in caplog.messages[0]
+    assert all(getattr(found.scene.gaussians, f.name).isfinite().all() for f in fields(found.scene.gaussians))
+    if trouble == "means":
+        assert found.psnr[1].mean() >= found.psnr[0].mean()
+
+
+def test_seconds_end_it(start: Start) -> None:
+    ticks = iter(range(1000))
+    found = run(start, RefineOptions(steps=None, seconds=30, loss=COLOUR), clock=lambda: float(next(ticks)))
+    assert found.ended == "seconds"
+    assert 3 < found.steps < 30
+
+
+def test_colours_may_learn_to_depend_on_the_view(start: Start) -> None:
+    found = run(start, RefineOptions(steps=3, sh_degree=1, loss=COLOUR))
+    assert found.scene.gaussians.sh.shape[1] == 4
+    assert found.scene.gaussians.sh[:, 1:].abs().max() > 0
+
+
+def test_exposures_share_nothing(refined: Refined) -> None:
+    assert refined.scene.gain[refined.trained].log().mean(0).abs().max() < 1e-6
+    assert (refined.scene.gain[refined.trained] != 1).any()
+    assert (refined.scene.gain[refined.held_out] == 1).all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"steps": None}, "both null"),
+        ({"holdout": 1}, "refine.holdout must be at least 2"),
+        ({"max_growth": 0.5}, "refine.max_growth"),
+    ],
+)
+def test_options_out_of_range(changes: dict, said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        RefineOptions(**changes)
+    with pytest.raises(ValueError, match=r"refine.rates.sh"):
+        RefineRates(sh=-1)
+    with pytest.raises(ValueError, match=r"refine.loss.ssim"):
+        RefineLoss(ssim=float("nan"))
+
+
+def test_what_does_not_go_together_is_named(start: Start) -> None:
+    with pytest.raises(ValueError, match="images, depth and cameras alike"):
+        run(replace(start, cameras=start.cameras.select(slice(0, 3))), RefineOptions())
+    with pytest.raises(ValueError, match="no Gaussians"):
+        run(replace(start, gaussians=start.gaussians.map(lambda tensor: tensor[:0])), RefineOptions())
