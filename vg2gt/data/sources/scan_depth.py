@@ -9,12 +9,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter
 
 from vg2gt.data.base import DataError
 from vg2gt.data.sources.parsing import errors_name
+from vg2gt.io.compiled import kernel
 from vg2gt.io.files import write_cached
 from vg2gt.io.image_files import Size
 from vg2gt.io.npz import load_npz
@@ -142,7 +142,7 @@ def render_points(
     return np.where(seen, nearest, np.float32(0))
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def _splat(points, pose, intrinsics, height, width):
     depth = np.full((height, width), np.inf, np.float32)
     fx, fy, cx, cy = intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2] + 0.5, intrinsics[1, 2] + 0.5

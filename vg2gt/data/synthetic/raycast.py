@@ -9,10 +9,11 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numba
 from llvmlite.ir import Constant
 from numba import types
 from numba.extending import intrinsic
+
+from vg2gt.io.compiled import kernel
 
 BOX, CYLINDER, ELLIPSOID = 0, 1, 2
 
@@ -25,7 +26,7 @@ FAR = 1e9
 _EPSILON = 1e-9
 _FLAGS = {"reassoc", "contract", "arcp", "nsz"}  # not the flags that forbid infinities
 
-jit = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_FLAGS)
+jit = kernel(nogil=True, error_model="numpy", fastmath=_FLAGS)
 
 
 def _without_owner(context: Any, builder: Any, kind: Any, value: Any) -> Any:

@@ -11,15 +11,15 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numba import njit
 
+from vg2gt.io.compiled import kernel
 from vg2gt.rendering.cpu import planes
 from vg2gt.rendering.cpu.constants import FAST, HALF, ONE, SUMS, TWO, ZERO
 from vg2gt.rendering.cpu.response import attenuate, exp, respond
 from vg2gt.rendering.cpu.tiles import ROW, STAGED, TILE, any_alive, stage, start_rays
 
 
-@njit(fastmath=FAST, error_model="numpy", nogil=True, cache=True)
+@kernel(fastmath=FAST, error_model="numpy", nogil=True)
 def _load_gradients(
     state, x_tile, y_tile, columns, rows, geometry, color, normal, depth, transmittance,
     grad_color, grad_normal, grad_alpha, grad_solid, grad_expected, grad_crossing,
@@ -46,7 +46,7 @@ def _load_gradients(
             state[k + planes.REST] = rest
 
 
-@njit(fastmath=SUMS, error_model="numpy", nogil=True, cache=True)
+@kernel(fastmath=SUMS, error_model="numpy", nogil=True)
 def _reduce_color(sums, g, left, row):
     """Sums the lanes of one (tile, Gaussian) into its gradient row, the part that colour and alpha need."""
     gx = gxx = gxy = gy = gyy = gs = gsx = gsy = gr = go = k0 = k1 = k2 = ZERO * left
@@ -76,7 +76,7 @@ def _reduce_color(sums, g, left, row):
     row[13], row[14], row[15] = ZERO, ZERO, ZERO
 
 
-@njit(fastmath=SUMS, error_model="numpy", nogil=True, cache=True)
+@kernel(fastmath=SUMS, error_model="numpy", nogil=True)
 def _reduce_geometry(sums, row):
     """Adds what depth and normal need to a gradient row."""
     gz = gp = m0 = m1 = m2 = ZERO * row[0]
@@ -95,7 +95,7 @@ def _reduce_geometry(sums, row):
 def _make_backward_tile(geometry: bool) -> Callable[..., None]:
     """Compiles the visit of a tile with or without what depth and normals need: within it that is a constant."""
 
-    @njit(fastmath=FAST, error_model="numpy", nogil=True, cache=True)
+    @kernel(fastmath=FAST, error_model="numpy", nogil=True)
     def backward_tile(records, colors, boxes, members, x_tile, y_tile, parameters, state, sums, staged, spans, rows):
         """Visits a tile's Gaussians front to back again and writes one gradient row for each."""
         alpha_max, stop = parameters[0], parameters[1]
@@ -198,7 +198,7 @@ def _make_backward_tile(geometry: bool) -> Callable[..., None]:
 _backward_all, _backward_color = _make_backward_tile(True), _make_backward_tile(False)
 
 
-@njit(fastmath=FAST, error_model="numpy", nogil=True, cache=True)
+@kernel(fastmath=FAST, error_model="numpy", nogil=True)
 def backward_tiles(
     records, boxes, colors, members, starts, tiles, geometry, parameters, state, sums, staged, spans,
     color, normal, depth, transmittance,

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from vg2gt.io.compiled import kernel
 
 DIGIT_BITS = 11
 TILE_BITS = 4  # tiles are 16 pixels wide and high
 
 
-@njit(error_model="numpy", nogil=True, cache=True)
+@kernel(error_model="numpy", nogil=True)
 def radix_order(keys, bits):
     """Stable ascending order ``[N]`` of unsigned integers with the given number of bits."""
     order, spare = np.empty(len(keys), np.int32), np.empty(len(keys), np.int32)
@@ -36,7 +37,7 @@ def radix_order(keys, bits):
     return order
 
 
-@njit(error_model="numpy", nogil=True, cache=True)
+@kernel(error_model="numpy", nogil=True)
 def count_tiles(boxes, visible, across, counts, offsets, starts):
     """Counts tiles per Gaussian (offsets in the given depth order) and Gaussians per tile (as list starts)."""
     for k in range(len(starts)):
@@ -55,7 +56,7 @@ def count_tiles(boxes, visible, across, counts, offsets, starts):
         starts[k + 1] += starts[k]
 
 
-@njit(error_model="numpy", nogil=True, cache=True)
+@kernel(error_model="numpy", nogil=True)
 def fill_tiles(boxes, visible, across, offsets, starts, members, places):
     """Writes the tiles' lists, front to back, and every Gaussian's places in them (adjoining, from its offset)."""
     ends = np.empty(len(starts) - 1, np.int64)

@@ -1,8 +1,4 @@
-"""Constants of the compiled kernels: exact in float32, so that they do not change the type they meet.
-
-The compiler's cache follows the file that defines a kernel only: after a change here, in tiles.py, planes.py or
-response.py, touch forward.py and backward.py.
-"""
+"""Constants of the compiled kernels: exact in float32, so that they do not change the type they meet."""
 
 from typing import Any
 

@@ -16,8 +16,8 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numba import njit
 
+from vg2gt.io.compiled import kernel
 from vg2gt.rendering.cpu import planes
 from vg2gt.rendering.cpu.constants import BIG, FAST, FOUR, HALF, ONE, QUARTER, TWO, ZERO
 from vg2gt.rendering.cpu.response import attenuate, exp, respond
@@ -27,7 +27,7 @@ from vg2gt.rendering.cpu.tiles import HIT_SIZE, PLANE, STAGED, TILE, any_alive, 
 def _make_blend_tile(geometry: bool) -> Callable[..., Any]:
     """Compiles the blending of a tile with or without depth and normals: within it that is a constant."""
 
-    @njit(fastmath=FAST, error_model="numpy", nogil=True, cache=True)
+    @kernel(fastmath=FAST, error_model="numpy", nogil=True)
     def blend_tile(records, colors, boxes, members, x_tile, y_tile, solid, parameters, state, hits, staged, spans):
         """Blends one tile front to back; returns the largest number of hits kept for the depth solver."""
         alpha_max, stop, negligible = parameters[0], parameters[1], parameters[4]
@@ -111,7 +111,7 @@ def _make_blend_tile(geometry: bool) -> Callable[..., Any]:
 _blend_all, _blend_color = _make_blend_tile(True), _make_blend_tile(False)
 
 
-@njit(fastmath=FAST, error_model="numpy", nogil=True, cache=True)
+@kernel(fastmath=FAST, error_model="numpy", nogil=True)
 def _transmit(state, hits, most, y):
     """Squared transmittance of a row's rays at the depths in plane MEDIAN, as NUM / DEN: one exponential per hit."""
     base, capacity = np.uintp(y * TILE), len(hits) // (TILE * HIT_SIZE)
@@ -132,7 +132,7 @@ def _transmit(state, hits, most, y):
             state[k + planes.DEN] *= ONE if front else free
 
 
-@njit(fastmath=FAST, error_model="numpy", nogil=True, cache=True)
+@kernel(fastmath=FAST, error_model="numpy", nogil=True)
 def _slopes(state, hits, most, y):
     """``-2 d ln T / dt`` of a row's rays at the depths in plane MEDIAN, into plane MEAN."""
     base, capacity = np.uintp(y * TILE), len(hits) // (TILE * HIT_SIZE)
@@ -149,7 +149,7 @@ def _slopes(state, hits, most, y):
             state[k + planes.MEAN] += g * hit[np.uintp(lane) + planes.HIT_PRECISION] * abs(d) / (ONE - g)
 
 
-@njit(fastmath=FAST, error_model="numpy", nogil=True, cache=True)
+@kernel(fastmath=FAST, error_model="numpy", nogil=True)
 def _solve_row(state, hits, y, parameters, bisections, newton_steps):
     """Median depth of a row's rays into plane MEDIAN (0: none), its slope S into plane MEAN."""
     median_max, near = parameters[2], parameters[3]
@@ -217,7 +217,7 @@ def _solve_row(state, hits, y, parameters, bisections, newton_steps):
             state[k + planes.MEDIAN] = ZERO
 
 
-@njit(fastmath=FAST, error_model="numpy", nogil=True, cache=True)
+@kernel(fastmath=FAST, error_model="numpy", nogil=True)
 def forward_tiles(
     records, boxes, colors, members, starts, tiles, solid, expected, geometry, bisections, newton_steps,
     parameters, background, state, hits, staged, spans, color, normal, depth, slope, transmittance,

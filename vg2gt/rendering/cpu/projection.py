@@ -11,8 +11,8 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
 
+from vg2gt.io.compiled import kernel
 from vg2gt.rendering.options import ALPHA_MIN, JACOBIAN_CLAMP
 
 FAST: Any = {"contract", "nsz", "arcp"}  # nothing that assumes finite values
@@ -20,7 +20,7 @@ SUMMED = 128  # Gaussians whose gradient rows are summed before they are chained
 BLOCK = 2048  # Gaussians a work item; fixed, because camera gradients are summed block by block
 
 
-@njit(error_model="numpy", nogil=True, cache=True, inline="always")
+@kernel(error_model="numpy", nogil=True, inline="always")
 def _rotation(w, x, y, z):
     """Rotation matrix of a unit quaternion, row by row."""
     return (
@@ -30,7 +30,7 @@ def _rotation(w, x, y, z):
     )  # fmt: skip
 
 
-@njit(fastmath=FAST, error_model="numpy", nogil=True, cache=True)
+@kernel(fastmath=FAST, error_model="numpy", nogil=True)
 def project_block(
     block, means, quats, scales, opacities, pose, intrinsics, height, width, lowpass, near, solid, records, boxes
 ):
@@ -109,13 +109,13 @@ def project_block(
         g[8], g[9], g[10], g[11], g[12], g[13], g[14] = a0, eps, opacity, cutoff, l0 * length, l1 * length, l2 * length
 
 
-@njit(fastmath=FAST, error_model="numpy", nogil=True, cache=True, inline="always")
+@kernel(fastmath=FAST, error_model="numpy", nogil=True, inline="always")
 def _whiten(b0, b1, b2, scale, fx, fy, u, v, us, vs, iz):
     """One axis of a Gaussian: its Jacobian row pair, and its component of the ray in units of the axis's length."""
     return scale * fx * (b0 - us * b2) * iz, scale * fy * (b1 - vs * b2) * iz, (b0 * u + b1 * v + b2) / scale
 
 
-@njit(fastmath=FAST, error_model="numpy", nogil=True, cache=True, inline="always")
+@kernel(fastmath=FAST, error_model="numpy", nogil=True, inline="always")
 def _axis_gradient(b0, b1, b2, scale, fx, fy, u, v, us, vs, iz, jx, jy, h, s_xx, s_xy, s_yy, gl0, gl1, gl2, ga0):
     """Gradients through one axis: camera-frame axis (3), scale, the Jacobian's products (2) and slopes (2), u, v."""
     inverse = 1 / scale
@@ -130,7 +130,7 @@ def _axis_gradient(b0, b1, b2, scale, fx, fy, u, v, us, vs, iz, jx, jy, h, s_xx,
     return g0, g1, g2, (gjx + gjy - gw * w) * inverse - gh * h, gjx, gjy, -px * b2, -py * b2, gh * b0, gh * b1
 
 
-@njit(error_model="numpy", nogil=True, cache=True)
+@kernel(error_model="numpy", nogil=True)
 def _sum_rows(begin, end, boxes, counts, offsets, places, rows, totals):
     """Sums the gradient rows of some Gaussians, ahead of their use so that the cache misses overlap."""
     for i in range(begin, end):
@@ -145,7 +145,7 @@ def _sum_rows(begin, end, boxes, counts, offsets, places, rows, totals):
                 total[j] += row[j]
 
 
-@njit(fastmath=FAST, error_model="numpy", nogil=True, cache=True)
+@kernel(fastmath=FAST, error_model="numpy", nogil=True)
 def project_backward_block(
     block, means, quats, scales, opacities, pose, intrinsics, height, width, lowpass, solid,
     boxes, counts, offsets, places, rows, color_view,

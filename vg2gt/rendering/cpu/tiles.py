@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from vg2gt.io.compiled import kernel
 from vg2gt.rendering.cpu.constants import FAST, ONE, SUMS, ZERO
 
 TILE = 16
@@ -17,7 +17,7 @@ RECORD = 16  # projected Gaussian: centre 2, conic 3, tilt 2, z, a0, eps, opacit
 ROW = 16  # gradient of one (tile, Gaussian): centre 2, conic 3, tilt 2, z, a0, opacity, colour 3, normal 3
 
 
-@njit(fastmath=SUMS, error_model="numpy", nogil=True, cache=True)
+@kernel(fastmath=SUMS, error_model="numpy", nogil=True)
 def any_alive(state):
     """Whether any ray of the tile still meets Gaussians."""
     most = state[0]
@@ -26,7 +26,7 @@ def any_alive(state):
     return most > ZERO
 
 
-@njit(error_model="numpy", nogil=True, cache=True)
+@kernel(error_model="numpy", nogil=True)
 def stage(records, colors, boxes, members, x_tile, y_tile, staged, spans):
     """Copies the next Gaussians of a tile side by side, so that their cache misses overlap.
 
@@ -43,7 +43,7 @@ def stage(records, colors, boxes, members, x_tile, y_tile, staged, spans):
         spans[j, 2], spans[j, 3] = max(boxes[i, 2] - y_tile, 0), min(boxes[i, 3] - y_tile, TILE)
 
 
-@njit(fastmath=FAST, error_model="numpy", nogil=True, cache=True)
+@kernel(fastmath=FAST, error_model="numpy", nogil=True)
 def start_rays(state, columns, rows):
     """Transmittance 1 in the image's pixels, stopped rays beyond its border."""
     for y in range(TILE):

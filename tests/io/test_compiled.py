@@ -1,0 +1,123 @@
+"""Compiled kernels are never older than the sources they are made of, and need no folder to be kept in."""
+
+import ast
+import importlib.util
+import os
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.commands import ROOT
+from vg2gt.io import compiled
+
+CONSTANTS = "LIMIT = {}\n"
+KERNEL = """
+from vg2gt.io.compiled import kernel
+from made.constants import LIMIT
+
+@kernel()
+def limit():
+    return LIMIT
+"""
+
+
+@pytest.fixture
+def room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A package with a kernel, whose constant stands in another file."""
+    folder = tmp_path / "made"
+    folder.mkdir()
+    (folder / "kernels.py").write_text(KERNEL)
+    monkeypatch.setattr(compiled, "PACKAGE", tmp_path)
+    monkeypatch.setattr(compiled, "ROOMS", ("made",))
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    return folder
+
+
+def value_with(constant: int, room: Path) -> int:
+    """What the kernel returns in a process that starts after the constant was set: all is imported anew."""
+    (room / "constants.py").write_text(CONSTANTS.format(constant))
+    compiled._folder.cache_clear()
+    for name in [name for name in sys.modules if name.split(".")[0] == "made"]:
+        del sys.modules[name]
+    importlib.invalidate_caches()
+    return importlib.import_module("made.kernels").limit()
+
+
+def test_a_changed_constant_of_another_file_is_used(room: Path, tmp_path: Path) -> None:
+    cache = tmp_path / "cache" / "vg2gt"
+    assert value_with(1, room) == 1
+    assert value_with(22, room) == 22
+    assert len(list(cache.iterdir())) == 2
+    before = {path: path.stat().st_mtime_ns for path in cache.rglob("*.nbc")}
+    assert value_with(1, room) == 1
+    assert {path: path.stat().st_mtime_ns for path in cache.rglob("*.nbc")} == before, "it was compiled again"
+
+
+def test_kernels_of_forgotten_versions_are_deleted(room: Path, tmp_path: Path) -> None:
+    cache = tmp_path / "cache" / "vg2gt"
+    old, foreign = cache / f"made-{'0' * 16}", cache / "mine"
+    for folder in (old, foreign):
+        folder.mkdir(parents=True)
+        os.utime(folder, (time.time() - 40 * 86400,) * 2)
+    value_with(1, room)
+    assert not old.exists()
+    assert foreign.exists()
+
+
+@pytest.mark.parametrize("place", ["nowhere", "own", "of_others"])
+def test_without_a_home_kernels_run(
+    place: str, room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A read-only container: what others could write to is not used, for what is kept there is executed."""
+    missing = tmp_path / "file" / "folder"
+    missing.parent.write_text("")
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    monkeypatch.delenv("NUMBA_CACHE_DIR")
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setenv("HOME", str(missing))
+    monkeypatch.setattr(tempfile, "tempdir", str(missing if place == "nowhere" else temporary))
+    if place == "of_others":
+        (temporary / f"vg2gt-kernels-{os.getuid()}").mkdir()
+        (temporary / f"vg2gt-kernels-{os.getuid()}").chmod(0o777)
+    assert value_with(3, room) == 3
+    assert any(temporary.rglob("*.nbc")) == (place == "own")
+    assert ("NUMBA_CACHE_DIR" in caplog.text) == (place != "own")
+
+
+def test_kernels_take_what_they_need_from_their_own_room() -> None:
+    """Else the hash would not know of it. Functions of ``numba.njit`` are inlined into kernels and not kept."""
+    wrong, kernels = [], 0
+    for path in (ROOT / "vg2gt").rglob("*.py"):
+        tree = ast.parse(path.read_text())
+        imported = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
+        source = path.read_text()
+        if path.name != "compiled.py" and "cache=True" in source and "numba" in source:
+            wrong.append(f"{path}: njit(cache=True)")
+        if not any(name.name in ("kernel", "jit") for node in imported for name in node.names):
+            continue
+        kernels += 1
+        room = ".".join(compiled._room(path).relative_to(ROOT).parts)
+        compiled_names = {
+            name.id
+            for function in ast.walk(tree)
+            if isinstance(function, ast.FunctionDef)
+            and any("kernel" in (d := ast.unparse(x)) or d == "jit" for x in function.decorator_list)
+            for name in ast.walk(function)
+            if isinstance(name, ast.Name)
+        }
+        wrong += [
+            f"{path}: {name.name} of {node.module}"
+            for node in imported
+            for name in node.names
+            if (name.asname or name.name) in compiled_names - {"kernel"}
+            and (node.module or "").startswith("vg2gt.")
+            and not f"{node.module}.".startswith(f"{room}.")
+        ]
+    assert kernels >= 9
+    assert not wrong

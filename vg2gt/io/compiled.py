@@ -1,0 +1,127 @@
+"""Compiled kernels and where they are kept.
+
+numba looks at the file that defines a kernel only: a constant or a function that a kernel takes from another file could
+change, and yesterday's machine code would go on to run. Kernels are therefore kept in a folder named by a hash of all
+the source they can be made of.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import platform
+import shutil
+import stat
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import llvmlite
+import numba
+
+log = logging.getLogger(__name__)
+
+PACKAGE = Path(__file__).resolve().parents[1]
+ROOMS = ("rendering", "data/synthetic", "data/sources")
+"""Folders whose kernels take constants and functions from files of the same folder only (a test holds it)."""
+UNUSED_DAYS = 30
+VARIABLE = "NUMBA_CACHE_DIR"
+
+
+def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """``numba.njit(**options)`` that is compiled once per machine and version of the sources.
+
+    Compiled kernels are kept in the folder that the variable ``NUMBA_CACHE_DIR`` names, else in the user's cache
+    folder, else in one of the user's own among temporary files; where none can be written to, every process compiles
+    anew.
+    """
+
+    def compile_later(function: Callable[..., Any]) -> Any:
+        folder = _folder(_room(Path(function.__code__.co_filename)))
+        if folder is None:
+            return numba.njit(**options)(function)
+        chosen, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(folder)  # numba reads it while it decorates
+        try:
+            return numba.njit(cache=True, **options)(function)
+        finally:
+            numba.config.CACHE_DIR = chosen
+
+    return compile_later
+
+
+def _room(source: Path) -> Path:
+    """The folder that a kernel of this file is made of."""
+    rooms = [PACKAGE / room for room in ROOMS if source.resolve().is_relative_to(PACKAGE / room)]
+    if not rooms:
+        raise ValueError(f"{source}: kernels belong into {', '.join(ROOMS)}, whose files are hashed for the cache")
+    return rooms[0]
+
+
+@lru_cache
+def _folder(room: Path) -> Path | None:
+    """Where kernels of a room are kept; None where nothing can be written."""
+    base = _writable_base()
+    folder = base and _tried(base / f"{room.name}-{_digest(room)}")
+    if base is None or folder is None:
+        log.warning("compiled kernels cannot be kept, every start compiles them anew: name a folder by %s", VARIABLE)
+        return None
+    with suppress(OSError):
+        os.utime(folder)
+    _remove_unused(base)
+    return folder
+
+
+def _digest(room: Path) -> str:
+    versions = f"{numba.__version__} {llvmlite.__version__} {platform.python_version()}"
+    content = hashlib.sha256(versions.encode())
+    for path in [Path(__file__), *sorted(room.rglob("*.py"))]:
+        content.update(path.name.encode() + b"\0" + path.read_bytes())
+    return content.hexdigest()[:16]
+
+
+def _writable_base() -> Path | None:
+    given = os.environ.get(VARIABLE)
+    if given:
+        return _tried(Path(given) / "vg2gt")
+    with suppress(RuntimeError):  # a user without a home
+        found = _tried(Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "vg2gt" / "kernels")
+        if found is not None:
+            return found
+    return _own_temporary_folder()
+
+
+def _tried(folder: Path) -> Path | None:
+    """The folder if files can be written to it."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return folder
+    except OSError:
+        return None
+
+
+def _own_temporary_folder() -> Path | None:
+    """A folder that nobody else can write to: what lies in it is executed."""
+    if not hasattr(os, "getuid"):
+        return None
+    try:
+        folder = Path(tempfile.gettempdir()) / f"vg2gt-kernels-{os.getuid()}"
+        folder.mkdir(mode=0o700, exist_ok=True)
+        found = folder.lstat()
+    except OSError:
+        return None
+    own = stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o077
+    return _tried(folder) if own else None
+
+
+def _remove_unused(base: Path) -> None:
+    """Deletes kernels of versions that were not used for a month."""
+    for folder in base.glob("*-" + "[0-9a-f]" * 16):
+        with suppress(OSError):
+            if time.time() - folder.stat().st_mtime > UNUSED_DAYS * 86400:
+                shutil.rmtree(folder)
