@@ -9,8 +9,10 @@ from typing import Any
 import hydra
 from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+
+OmegaConf.register_new_resolver("last_part", lambda path: Path(str(path)).name, replace=True)
 
 _PACKAGE = Path(__file__).resolve().parent
 
@@ -55,6 +57,7 @@ def compose(name: str | None, *overrides: str) -> DictConfig:
 def hydra_message(error: Exception) -> str:
     """What Hydra or OmegaConf say, in one line; where they have looked is left out."""
     said = str(error).partition("Config search path")[0].removeprefix("In '_dummy_empty_config_': ")
+    said = said.partition("Error raised while resolving interpolation: ")[2] or said
     if isinstance(error.__cause__, OmegaConfBaseException):
         said += f" ({str(error.__cause__).splitlines()[0]})"
     return " ".join(said.partition("    full_key")[0].split())

@@ -19,6 +19,7 @@ from vg2gt.data.synthetic import SyntheticScenes
 from vg2gt.evaluation.evaluator import SceneEvaluator
 from vg2gt.evaluation.run import evaluate
 from vg2gt.metrics.lpips import STAGES
+from vg2gt.runs.checkpoints import read_checkpoint, write_checkpoint
 from vg2gt.runs.find import checkpoint_path
 from vg2gt.runs.trust import read_run_config
 from vg2gt.training.loop import train
@@ -225,7 +226,9 @@ def test_what_is_missing_or_wrong_is_named(tmp_path: Path, cache: Path, trained:
     with pytest.raises(FileNotFoundError, match="ckpt=nowhere: no such checkpoint or run"):
         run(tmp_path, cache, "ckpt=nowhere")
     lone = tmp_path / "lone.ckpt"
-    shutil.copy(trained / "checkpoints" / "step-2.ckpt", lone)
+    old = read_checkpoint(trained / "checkpoints" / "step-2.ckpt")
+    del old["config"]  # checkpoints of old did not know how their model was made
+    write_checkpoint(old, lone)
     with pytest.raises(FileNotFoundError, match=r"config\.yaml is missing.*model= and backend="):
         run(tmp_path, cache, f"ckpt={lone}")
     for views in ("[]", "null", "2.5", "three", "[0]", "[true]"):
@@ -243,6 +246,22 @@ def test_what_is_missing_or_wrong_is_named(tmp_path: Path, cache: Path, trained:
         run(tmp_path, cache, "evaluation.lpips=/nowhere/vgg.pth")
     with pytest.raises(DataError, match=r"has 32 frames .* views=33 needs 33"):
         run(tmp_path, cache, "views=[33]")
+
+
+def test_a_checkpoint_knows_what_it_was_trained_with(tmp_path: Path, cache: Path, trained: Path, copied: Path) -> None:
+    """A file that says otherwise is refused; paths may differ, and without the file the checkpoint suffices."""
+    config = OmegaConf.load(copied / "config.yaml")
+    config.model.scale.median_depth = 3.0
+    config.backend.path = "elsewhere"
+    OmegaConf.save(config, copied / "config.yaml")
+    said = r"does not describe .*step-2\.ckpt: model\.scale\.median_depth is 3\.0 there, 1\.0 in the checkpoint\."
+    with pytest.raises(ValueError, match=said):
+        run(tmp_path / "out", cache, f"ckpt={copied}", "data.eval_scenes=1")
+    (copied / "config.yaml").unlink()
+    lone = run(tmp_path / "lone", cache, f"ckpt={copied}", "data.eval_scenes=1")
+    whole = run(tmp_path / "whole", cache, f"ckpt={trained}", "data.eval_scenes=1")
+    name = "rendered/gt_pose/solid/psnr"
+    assert lone["views"]["2"]["mean"][name] == whole["views"]["2"]["mean"][name]
 
 
 @pytest.mark.parametrize("content", ["", "foo: 1", "model: null"])

@@ -15,7 +15,7 @@ from vg2gt.evaluation.checks import refuse_training_views
 from vg2gt.runs.load import load_model
 from vg2gt.runs.trust import ENVIRONMENT, UntrustedError, check_targets, read_run_config
 from vg2gt.studies.study import _refuse_other_run
-from vg2gt.training.loop import _name_differences
+from vg2gt.training.start import name_differences
 
 Attack = Callable[[str], dict[str, Any]]
 
@@ -144,7 +144,7 @@ def test_a_runs_configuration_is_plain(
     assert str(path) in str(caught.value)
 
 
-@pytest.mark.parametrize("read", [_name_differences, lambda config: _refuse_other_run(config, Path(config.output_dir))])
+@pytest.mark.parametrize("read", [name_differences, lambda config: _refuse_other_run(config, Path(config.output_dir))])
 def test_no_command_reads_the_environment_for_a_runs_configuration(
     read: Callable, run_folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -154,6 +154,20 @@ def test_no_command_reads_the_environment_for_a_runs_configuration(
     with caplog.at_level(logging.DEBUG), pytest.raises(UntrustedError, match="the interpolation") as caught:
         read(OmegaConf.create({"output_dir": str(run_folder)}))
     assert "hunter2" not in caplog.text + str(caught.value)
+
+
+def test_the_configuration_in_a_checkpoint_calls_nothing_either(run_folder: Path, canary: Path) -> None:
+    path = run_folder / "checkpoints" / "step-7.ckpt"
+    content, text = torch.load(path, weights_only=True), (run_folder / "config.yaml").read_text()
+    (run_folder / "config.yaml").unlink()
+    for hostile in (text + "extra: ${oc.env:SECRET}\n", text.replace("backends.oracle.OracleBackend", "os.mkdir")):
+        torch.save(content | {"config": hostile}, path)
+        with pytest.raises(
+            UntrustedError, match=r"step-7\.ckpt: (config, line .*interpolation|backend\._target_ is 'os)"
+        ):
+            load_model(run_folder, device="cpu")
+    torch.save(content | {"config": text}, path)
+    assert load_model(run_folder, device="cpu").weights.step == 7
 
 
 @pytest.mark.parametrize("attack", ["os.system", "builtins.eval", "Popen", "get_method", "partial"])

@@ -19,6 +19,7 @@ from vg2gt.config import compose
 from vg2gt.data import DataError, SyntheticScenes
 from vg2gt.gaussians import GaussianHead
 from vg2gt.runs.checkpoints import newest_valid, read_checkpoint
+from vg2gt.runs.lock import only_process_in
 from vg2gt.training.loop import build, train
 
 
@@ -158,9 +159,66 @@ def test_a_run_never_restarts_silently(full_run: Path, cache: Path, tmp_path: Pa
         train(small_config(tmp_path, cache, "ckpt=nowhere.ckpt"))
 
 
-def test_a_resumed_run_names_what_changed(full_run: Path, cache: Path, tmp_path: Path, caplog) -> None:
-    copied = tmp_path / "copy"
-    shutil.copytree(full_run, copied)
+@pytest.fixture
+def copied(full_run: Path, tmp_path: Path) -> Path:
+    """A finished run of four steps, to be spoilt."""
+    return shutil.copytree(full_run, tmp_path / "copied")
+
+
+def everything_in(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+REFUSED: list[tuple[list[str], str | None]] = [
+    (["debug=fast_dev_run", "model.gaussians.max_offset=3"], None),
+    (["debug=fast_dev_run", "ckpt=last", "backend.seed=1"], "trained on backbone"),
+    (["ckpt=last", "backend.seed=1"], "trained on backbone"),
+    (["ckpt=last", "model.gaussians.splits=4"], r"first in model\.gaussians\.out"),
+    (
+        ["ckpt=last", "optimizer._target_=torch.optim.Adagrad", "~optimizer.betas", "trainer.max_steps=6"],
+        r"trained with torch\.optim\.AdamW and cannot go on with torch\.optim\.Adagrad",
+    ),
+    (["ckpt=auto", "trainer.max_steps=3"], r"step-4\.ckpt is at step 4, further than trainer\.max_steps=3 asks"),
+    (["overwrite=true", "data.train_scenes=0"], r"data\.train_scenes=0 must be at least 1"),
+    (["overwrite=true", "init_from=nowhere.ckpt"], "no checkpoint at nowhere"),
+]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"), REFUSED, ids=lambda value: " ".join(value) if isinstance(value, list) else ""
+)
+def test_trials_and_refused_starts_change_nothing(
+    copied: Path, cache: Path, overrides: list[str], message: str | None
+) -> None:
+    before = everything_in(copied)
+    config = small_config(copied, cache, *overrides)
+    if message is None:
+        train(config)
+    else:
+        with pytest.raises(Exception, match=message):
+            train(config)
+    assert everything_in(copied) == before
+
+
+def test_a_folder_is_one_processs_at_a_time(copied: Path, cache: Path) -> None:
+    code = (
+        "import sys; from vg2gt.runs.lock import *\nwith only_process_in(sys.argv[1]): print('held', flush=1); input()"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code, str(copied)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as other:
+        assert other.stdout
+        assert other.stdout.readline() == b"held\n"
+        with pytest.raises(BlockingIOError, match=rf"copied is in use by another process \(process {other.pid} on"):
+            train(small_config(copied, cache, "ckpt=auto"))
+        other.kill()
+    assert (copied / ".lock").exists()  # of a process that was killed: it holds nothing
+    with only_process_in(copied):
+        pass
+    assert not (copied / ".lock").exists()
+
+
+def test_a_resumed_run_names_what_changed(copied: Path, cache: Path, caplog) -> None:
     report = train(small_config(copied, cache, "ckpt=last", "trainer.max_steps=5", "loss.enhance.weight=2"))
     assert report["steps"] == 5
     warning = next(r.getMessage() for r in caplog.records if "differs from the interrupted" in r.getMessage())
@@ -168,18 +226,6 @@ def test_a_resumed_run_names_what_changed(full_run: Path, cache: Path, tmp_path:
     assert "trainer.max_steps" in warning
     with pytest.raises(FileExistsError, match="not the newest checkpoint"):
         train(small_config(copied, cache, f"ckpt={copied / 'checkpoints' / 'step-2.ckpt'}"))
-
-
-def test_another_backbone_is_refused(full_run: Path, cache: Path, tmp_path: Path) -> None:
-    checkpoint = newest_valid(full_run / "checkpoints")
-    with pytest.raises(ValueError, match="trained on backbone"):
-        train(small_config(tmp_path, cache, f"ckpt={checkpoint}", "backend.seed=1"))
-
-
-def test_another_architecture_is_refused(full_run: Path, cache: Path, tmp_path: Path) -> None:
-    checkpoint = newest_valid(full_run / "checkpoints")
-    with pytest.raises(ValueError, match=r"first in model\.gaussians\.out"):
-        train(small_config(tmp_path, cache, f"ckpt={checkpoint}", "model.gaussians.splits=4"))
 
 
 def test_wo_split_starts_from_a_full_model(full_run: Path, cache: Path, tmp_path: Path, caplog) -> None:
@@ -273,7 +319,7 @@ def test_two_processes_from_the_console_script(tmp_path: Path, cache: Path) -> N
 
 
 def test_sweep_runs_every_variant_in_its_own_folder(tmp_path: Path, cache: Path) -> None:
-    small = [*SMALL, "debug=fast_dev_run", f"data.cache_dir={cache}"]
+    small = [*SMALL, "trainer.max_steps=1", f"data.cache_dir={cache}"]
     sweep = run_vg2gt("train", "-m", *small, "name=sweep", "model.gaussians.splits=1,4", folder=tmp_path)
     assert sweep.returncode == 0, sweep.stderr[-3000:]
     written = sorted((tmp_path / "outputs" / "sweep").glob("*/config.yaml"))

@@ -15,9 +15,12 @@ import hydra
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from vg2gt.cli import folders
 from vg2gt.cli.commands import Command
 from vg2gt.cli.errors import TRACEBACK, errors_in_one_line
 from vg2gt.config import config_dir
+
+folders.register()
 
 Options = TypeVar("Options")
 HELP = {"-h", "--help"}

@@ -84,6 +84,8 @@ class SceneDataModule(LightningDataModule):
         **common: Any,
     ) -> None:
         super().__init__()
+        if train_scenes is not None and train_scenes < 1:
+            raise ValueError(f"data.train_scenes={train_scenes} must be at least 1, or null for all")
         self.sampler = ViewSampler(min_views, max_views, max_images, expand_ratio, target_views, seed)
         self.eval_views = EvaluationViews(eval_context, eval_target, eval_window)
         size = (int(image_size[0]), int(image_size[1]))

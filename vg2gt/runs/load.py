@@ -15,16 +15,19 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from vg2gt.config import compose, group_options
+from vg2gt.config import compose, flatten, group_options
 from vg2gt.model import Reconstructor
 from vg2gt.rendering import Renderer
 from vg2gt.runs.checkpoints import model_state, read_checkpoint
 from vg2gt.runs.find import checkpoint_path, run_config_path
-from vg2gt.runs.trust import check_targets, read_run_config
+from vg2gt.runs.trust import check_targets, parse_run_config, read_run_config
 
 log = logging.getLogger(__name__)
 
 PARTS = ("backend", "model", "renderer")
+MADE_OF = "config"  # where a checkpoint keeps the configuration of these parts, as YAML
+FREE = ("path", "pretrained", "revision", "head_chunk", "views_per_chunk")
+"""Keys that change nothing of what a network computes, or whose effect a checkpoint knows by the weights' hash."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +120,7 @@ def resolve_parts(config: DictConfig, checkpoint: Path | None) -> dict[str, Dict
 
     Raises:
         FileNotFoundError: if the run's ``config.yaml`` is needed and missing.
-        ValueError: if it lacks a part.
+        ValueError: if it lacks a part, or is not what the checkpoint was trained with.
         UntrustedError: if what is needed of it is not data only, or names what is not ours (:mod:`vg2gt.runs.trust`).
     """
     given: dict[str, Any] = {part: config.get(part) for part in PARTS}
@@ -125,21 +128,52 @@ def resolve_parts(config: DictConfig, checkpoint: Path | None) -> dict[str, Dict
     missing = [part for part in PARTS if part not in parts]
     if not missing:
         return parts
-    if checkpoint is None:
-        run = compose("train", "output_dir=.")
-    else:
-        path = run_config_path(checkpoint)
-        if not path.is_file():
-            raise FileNotFoundError(
-                f"{path} is missing: the run's configuration says which model and backend its checkpoint belongs to; "
-                "put it back, or name both with model= and backend= and renderer="
-            )
-        run = read_run_config(path)
-        for part in missing:
-            if run.get(part) is None:
-                raise ValueError(f"{path} names no {part}: it is not the configuration of a run; name one with {part}=")
-            check_targets(run[part], f"{path}: {part}")
+    run = compose("train", "output_dir=.") if checkpoint is None else _config_of(checkpoint, missing)
     return parts | {part: OmegaConf.merge(run[part], given[part] or {}) for part in missing}  # pyright: ignore
+
+
+def made_of(config: DictConfig) -> str:
+    """What a run's checkpoints keep of its configuration: the parts that a model is built of, as YAML."""
+    return OmegaConf.to_yaml({part: OmegaConf.to_container(config[part], resolve=True) for part in PARTS})
+
+
+def _config_of(checkpoint: Path, parts: Sequence[str]) -> DictConfig:
+    """Configuration of a checkpoint's run: its file, which must agree with what the checkpoint knows, or the latter."""
+    path = run_config_path(checkpoint)
+    text = read_checkpoint(checkpoint).get(MADE_OF)  # missing in checkpoints of old
+    known = parse_run_config(text, f"{checkpoint}: {MADE_OF}") if isinstance(text, str) else None
+    if path.is_file():
+        run, source = read_run_config(path), path
+    elif known is not None:
+        run, source = known, checkpoint
+    else:
+        raise FileNotFoundError(
+            f"{path} is missing: the run's configuration says which model and backend its checkpoint belongs to; "
+            "put it back, or name both with model= and backend= and renderer="
+        )
+    for part in parts:
+        if run.get(part) is None:
+            raise ValueError(f"{source} names no {part}: it is not the configuration of a run; name one with {part}=")
+        check_targets(run[part], f"{source}: {part}")
+    if known is not None:
+        _refuse_differences(run, known, parts, path, checkpoint)
+    return run
+
+
+def _refuse_differences(run: DictConfig, known: DictConfig, parts: Sequence[str], path: Path, checkpoint: Path) -> None:
+    """Refuses a run's file that would build another model than its checkpoint was trained with."""
+    plain = (OmegaConf.to_container(config) for config in (run, known))
+    here, there = (flatten({part: config.get(part) for part in parts}) for config in plain)  # pyright: ignore
+    different = [
+        f"{key} is {here.get(key)} there, {there.get(key)} in the checkpoint"
+        for key in sorted(here.keys() | there.keys())
+        if here.get(key) != there.get(key) and key.rpartition(".")[2] not in FREE
+    ]
+    if different:
+        raise ValueError(
+            f"{path} does not describe {checkpoint}: {'; '.join(different[:5])}. Put it right, or remove it: the "
+            "checkpoint knows what it was trained with"
+        )
 
 
 def compose_part(part: str, spec: str) -> DictConfig:

@@ -49,13 +49,20 @@ def read_run_config(path: str | Path) -> DictConfig:
         raise UntrustedError(f"{path} has {path.stat().st_size} bytes; a run's configuration has at most {_LARGEST}")
     try:
         text = path.read_text(encoding="utf-8")
-        _refuse_what_is_not_plain(path, text)
+    except (UnicodeDecodeError, OSError) as error:
+        raise ValueError(f"{path} is not a run's configuration: {' '.join(str(error).split())}") from error
+    return parse_run_config(text, path)
+
+
+def parse_run_config(text: str, source: str | Path) -> DictConfig:
+    """The configuration that a text from elsewhere holds; ``source`` names it in errors, which are the same."""
+    try:
+        _refuse_what_is_not_plain(source, text)
         config = OmegaConf.load(io.StringIO(text))
-    except (yaml.YAMLError, UnicodeDecodeError, OSError) as error:  # OmegaConf's own error for a lone value is OSError
-        reason = " ".join(str(error).split())
-        raise ValueError(f"{path} is not a run's configuration: {reason}") from error
+    except (yaml.YAMLError, OSError) as error:  # OmegaConf's own error for a lone value is OSError
+        raise ValueError(f"{source} is not a run's configuration: {' '.join(str(error).split())}") from error
     if not isinstance(config, DictConfig):
-        raise ValueError(f"{path} is not a run's configuration: expected a mapping, got a list")
+        raise ValueError(f"{source} is not a run's configuration: expected a mapping, got a list")
     return config
 
 
@@ -74,10 +81,10 @@ def check_targets(config: Any, source: str | Path) -> None:
         _check(target, f"{source}.{key}_target_ is {str(target)[:100]!r}")
 
 
-def _refuse_what_is_not_plain(path: Path, text: str) -> None:
+def _refuse_what_is_not_plain(source: str | Path, text: str) -> None:
     depth = 0
     for event in yaml.parse(text, Loader=yaml.SafeLoader):
-        place = f"{path}, line {event.start_mark.line + 1}"
+        place = f"{source}, line {event.start_mark.line + 1}"
         if isinstance(event, yaml.AliasEvent):
             raise UntrustedError(f"{place}: an alias (*{event.anchor}); a run's configuration has none")
         if getattr(event, "tag", None) is not None:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-import shutil
 import warnings
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,18 +17,19 @@ from lightning.pytorch import LightningDataModule, Trainer
 from lightning.pytorch.callbacks import ProgressBar
 from omegaconf import DictConfig, OmegaConf
 
-from vg2gt.config import flatten
 from vg2gt.data.datamodule import SceneDataModule
 from vg2gt.io.files import read_json, write_json, write_text
 from vg2gt.memory import TRAINING, memory_advice
-from vg2gt.runs.checkpoints import initialize_from, newest_valid, read_checkpoint, remove_leftovers
-from vg2gt.runs.trust import read_run_config
+from vg2gt.runs.checkpoints import initialize_from, model_state, newest_valid, read_checkpoint, remove_leftovers
+from vg2gt.runs.load import made_of
+from vg2gt.runs.lock import only_process_in
 from vg2gt.training.checkpoint_io import AtomicCheckpointIO
 from vg2gt.training.distributed import ending_together
 from vg2gt.training.module import VG2GTModule
 from vg2gt.training.notices import notices
 from vg2gt.training.preview import write_preview
 from vg2gt.training.report import comparison_table, print_comparison
+from vg2gt.training.start import WriteConfig, checkpoint_to_resume, clear, name_differences
 
 log = logging.getLogger(__name__)
 
@@ -79,6 +80,7 @@ def build(config: DictConfig) -> Run:
         **config.training,
         seed=config.seed,
     )
+    module.made_of = made_of(config)
     trainer = instantiate(
         config.trainer,
         accelerator=_accelerator(config.trainer.accelerator),
@@ -119,6 +121,8 @@ def _check_trainer(config: DictConfig) -> None:
 def train(config: DictConfig) -> dict[str, Any]:
     """Runs the configuration from beginning to end.
 
+    A refused start changes nothing of a run that the folder holds, and a trial (``fast_dev_run``) writes nothing.
+
     Writes into ``outputs/<name>``: the resolved configuration, checkpoints, ``metrics.json``, ``metrics.md`` and
     ``preview.png``.
 
@@ -126,12 +130,20 @@ def train(config: DictConfig) -> dict[str, Any]:
         The content of ``metrics.json``.
 
     Raises:
+        BlockingIOError: if another process works in the folder.
         FileExistsError: if the folder holds a run and neither ``ckpt`` nor ``overwrite`` says what to do with it.
         FileNotFoundError: if ``ckpt`` names no valid checkpoint.
-        ValueError: if the model has no trained part.
+        ValueError: if the model has no trained part, or the run to go on with is further than ``trainer.max_steps``.
         OutOfMemory: if a device's memory is full, naming the sizes and the options that reduce them.
     """
-    checkpoint = _checkpoint_to_resume(config)
+    writes = rank_zero_only.rank == 0 and not config.trainer.get("fast_dev_run")
+    with only_process_in(config.output_dir) if writes else nullcontext():
+        return _train(config, writes)
+
+
+def _train(config: DictConfig, writes: bool) -> dict[str, Any]:
+    """:func:`train` in a folder that is this process's own; ``writes``: by this process, and not a trial."""
+    checkpoint = checkpoint_to_resume(config)
     for notice in notices(config) if rank_zero_only.rank == 0 else ():
         log.warning(notice)
     run = build(config)
@@ -143,12 +155,22 @@ def train(config: DictConfig) -> dict[str, Any]:
             "or choose another model="
         )
     if checkpoint is not None:
-        _name_differences(config)
-    if rank_zero_only.rank == 0 and not run.trial:
-        remove_leftovers(run.folder, checkpoint)
-    write_text(run.folder / "config.yaml", OmegaConf.to_yaml(config, resolve=True))
-    if config.init_from and checkpoint is None:
+        content = read_checkpoint(checkpoint)  # refused before anything is written
+        run.module.model.load_trained(model_state(content["state_dict"]), content.get("backend"))
+        name_differences(config)
+    elif config.init_from:
         initialize_from(run.module, config.init_from)
+    if writes:
+        if checkpoint is None:
+            clear(run.folder)
+        remove_leftovers(run.folder, checkpoint)
+        describe = WriteConfig(run.folder / "config.yaml", OmegaConf.to_yaml(config, resolve=True))
+        if checkpoint is None or not describe.path.is_file():
+            describe.write()
+        else:
+            run.trainer.callbacks.append(describe)  # pyright: ignore[reportAttributeAccessIssue]
+
+        log.info("the run's folder is %s", run.folder)
 
     with ending_together(run.trainer):
         untrained = _untrained_metrics(run, resumed=checkpoint is not None)
@@ -159,48 +181,6 @@ def train(config: DictConfig) -> dict[str, Any]:
             return {}
         trained = evaluate(run)
         return _report(run, untrained, trained)
-
-
-def _checkpoint_to_resume(config: DictConfig) -> Path | None:
-    """Resolves ``ckpt``; never restarts a run silently and never mixes two runs in one folder."""
-    folder = Path(config.output_dir) / "checkpoints"
-    old = sorted(folder.glob("*.ckpt"))
-    if config.ckpt == "last" or (config.ckpt == "auto" and old):
-        return newest_valid(folder)
-    if config.ckpt == "auto":
-        log.info("ckpt=auto: no checkpoint in %s yet, the run starts from the beginning", folder)
-    elif config.ckpt:
-        path, step = Path(config.ckpt), read_checkpoint(config.ckpt)["global_step"]
-        if old and not (path.resolve().parent == folder.resolve() and path.name == newest_valid(folder).name):
-            raise FileExistsError(
-                f"ckpt={path} (step {step}) is not the newest checkpoint of the run in {folder}: go on in a new folder "
-                "with name=, or with ckpt=last"
-            )
-        return path
-    if old and not config.trainer.get("fast_dev_run"):
-        if not config.overwrite:
-            raise FileExistsError(
-                f"{folder} already holds a run ({len(old)} checkpoints): go on with ckpt=last, choose another name=, "
-                "or replace it with overwrite=true"
-            )
-        for path in old:
-            path.unlink(missing_ok=True)
-        # Neither the curve nor the result of the run that was replaced is this run's.
-        shutil.rmtree(folder.parent / "logs", ignore_errors=True)
-        (folder.parent / "metrics.json").unlink(missing_ok=True)
-    return None
-
-
-def _name_differences(config: DictConfig) -> None:
-    """Says in the log what a resumed run does otherwise than the interrupted one."""
-    path = Path(config.output_dir) / "config.yaml"
-    if not path.is_file():
-        return
-    before, now = (flatten(OmegaConf.to_container(c, resolve=True)) for c in (read_run_config(path), config))
-    different = sorted(key for key in before.keys() | now.keys() if before.get(key) != now.get(key))
-    different = [key for key in different if key not in ("ckpt", "output_dir", "overwrite")]
-    if different:
-        log.warning("the resumed run differs from the interrupted one in %s", ", ".join(different))
 
 
 def _save_last(run: Run) -> None:

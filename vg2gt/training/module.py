@@ -23,6 +23,7 @@ from vg2gt.model import Reconstructor
 from vg2gt.profiling import stage
 from vg2gt.rendering import Renderer, UnrenderableError
 from vg2gt.runs.checkpoints import MODEL_PREFIX, model_state
+from vg2gt.runs.load import MADE_OF
 from vg2gt.training.distributed import all_gather_object, interleave, world_size
 from vg2gt.training.faults import (
     Fault,
@@ -88,6 +89,7 @@ class VG2GTModule(lightning.LightningModule):
         self._scenes: tuple[str, ...] = ()
         self._figures: dict[str, Tensor] = {}
         self._metrics: dict[tuple[str | int, ...], dict[str, float]] = {}
+        self.made_of: str | None = None  # the configuration of the model's parts, for checkpoints
         self.strict_loading = False  # backbone weights are never stored; load_state_dict checks everything else
 
     # ------------------------------------------------------------------------------------------------- training
@@ -242,10 +244,12 @@ class VG2GTModule(lightning.LightningModule):
     # ---------------------------------------------------------------------------------------------- checkpoints
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Keeps the trained part only, and the identity of the backbone it belongs to."""
+        """Keeps the trained part only, the backbone's identity, and how the model was configured."""
         checkpoint["state_dict"] = {MODEL_PREFIX + name: value for name, value in self.model.trained_state().items()}
         checkpoint["backend"] = dict(self.model.backend.identity())
         checkpoint["skipped_steps"] = self.skipped.state_dict()
+        if self.made_of is not None:
+            checkpoint[MADE_OF] = self.made_of
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Refuses a checkpoint that was trained on another backbone."""

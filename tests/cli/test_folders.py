@@ -1,0 +1,76 @@
+"""Where a run's files go: named by what was chosen, never over another run, never outside ``outputs``."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from vg2gt.cli import folders
+from vg2gt.config import hydra_message
+
+DEFAULT = {"data": "synthetic", "backend": "oracle", "model": "tiny", "experiment": None, "ablation": None}
+
+
+@pytest.fixture(autouse=True)
+def empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.chdir(tmp_path)
+    folders.register()
+    for variable in folders.STARTED_BY_OTHERS:
+        monkeypatch.delenv(variable, raising=False)
+    yield
+    folders.free.cache_clear()
+
+
+def folder(choices: dict[str, Any] | None = None, mode: str = "RUN", trial: bool = False, **keys: Any) -> str:
+    """The folder that a new process gives to a run."""
+    folders.free.cache_clear()
+    content = {
+        "name": None, "ckpt": None, "overwrite": False, "trainer": {"fast_dev_run": trial}, "at": "${run_folder:}",
+        "hydra": {"mode": mode, "runtime": {"choices": DEFAULT | (choices or {})}},
+    }  # fmt: skip
+    return OmegaConf.create(content | keys).at
+
+
+def ran(name: str) -> None:
+    Path("outputs", name).mkdir(parents=True)
+    Path("outputs", name, "config.yaml").touch()
+
+
+def test_runs_are_named_by_what_was_chosen() -> None:
+    assert folder() == "quickstart"
+    assert folder({"data": "rgbd"}) == "rgbd-oracle-tiny"
+    assert folder({"experiment": "paper", "data": "paper_mix"}) == "paper_mix-oracle-tiny-paper"
+    assert folder({"data": "rgbd"}, name="mine") == "mine"
+    assert folder(trial=True) == "trials/quickstart"
+    assert folder(mode="MULTIRUN") == "sweep"
+
+
+def test_a_taken_name_gets_a_number_unless_it_is_meant(monkeypatch: pytest.MonkeyPatch) -> None:
+    Path("outputs/quickstart").mkdir(parents=True)  # a start that was refused left no run
+    assert folder() == "quickstart"
+    ran("mine")
+    ran("sweep/0")
+    ran("rgbd-oracle-tiny")
+    ran("rgbd-oracle-tiny-2")
+    assert folder({"data": "rgbd"}) == "rgbd-oracle-tiny-3"
+    assert folder(mode="MULTIRUN") == "sweep-2"
+    for keys in ({"ckpt": "auto"}, {"ckpt": "last"}, {"overwrite": True}):
+        assert folder({"data": "rgbd"}, **keys) == "rgbd-oracle-tiny"
+    assert folder(name="mine") == "mine"
+    monkeypatch.setenv("RANK", "1")  # every process of a job must find the same name
+    assert folder({"data": "rgbd"}) == "rgbd-oracle-tiny"
+
+
+@pytest.mark.parametrize("name", ["../x", "a/../../x", "/x", "\\x", "C:\\x", "..", ""])
+def test_names_do_not_lead_out(name: str) -> None:
+    with pytest.raises(OmegaConfBaseException) as caught:
+        folder(name=name)
+    assert hydra_message(caught.value).startswith(f"name={name}: a name inside outputs")
+
+
+@pytest.mark.parametrize("name", ["mine", "paper/first", "ein Name", "名前", "..x", "12:30"])
+def test_other_names_are_taken_as_they_are(name: str) -> None:
+    assert folder(name=name) == name
