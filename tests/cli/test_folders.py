@@ -57,8 +57,9 @@ def test_a_taken_name_gets_a_number_unless_it_is_meant(monkeypatch: pytest.Monke
     ran("rgbd-oracle-tiny-2")
     assert folder({"data": "rgbd"}) == "rgbd-oracle-tiny-3"
     assert folder(mode="MULTIRUN") == "sweep-2"
-    for keys in ({"ckpt": "auto"}, {"ckpt": "last"}, {"overwrite": True}):
-        assert folder({"data": "rgbd"}, **keys) == "rgbd-oracle-tiny"
+    assert folder({"data": "rgbd"}, overwrite=True) == "rgbd-oracle-tiny"
+    for ckpt in ("auto", "last"):
+        assert folder({"data": "rgbd"}, ckpt=ckpt) == "rgbd-oracle-tiny"
     assert folder(name="mine") == "mine"
     monkeypatch.setenv("RANK", "1")  # every process of a job must find the same name
     assert folder({"data": "rgbd"}) == "rgbd-oracle-tiny"

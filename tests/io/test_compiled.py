@@ -63,7 +63,8 @@ def test_kernels_of_forgotten_versions_are_deleted(room: Path, tmp_path: Path) -
     old, foreign = cache / f"made-{'0' * 16}", cache / "mine"
     for folder in (old, foreign):
         folder.mkdir(parents=True)
-        os.utime(folder, (time.time() - 40 * 86400,) * 2)
+        long_ago = time.time() - 40 * 86400
+        os.utime(folder, (long_ago, long_ago))
     value_with(1, room)
     assert not old.exists()
     assert foreign.exists()

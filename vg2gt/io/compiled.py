@@ -45,11 +45,12 @@ def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
         folder = _folder(_room(Path(function.__code__.co_filename)))
         if folder is None:
             return numba.njit(**options)(function)
-        chosen, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(folder)  # numba reads it while it decorates
+        config: Any = numba.config  # pyright: ignore[reportPrivateImportUsage]
+        chosen, config.CACHE_DIR = config.CACHE_DIR, str(folder)  # numba reads it while it decorates
         try:
             return numba.njit(cache=True, **options)(function)
         finally:
-            numba.config.CACHE_DIR = chosen
+            config.CACHE_DIR = chosen
 
     return compile_later
 
