@@ -3,6 +3,7 @@
 import shutil
 from collections import Counter
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -146,6 +147,20 @@ def _widen(folder):
         _save(path, np.ones((24, 40, 3), np.uint8))
 
 
+def _matrix(folder: Path, place: tuple[int, int], value: float) -> None:
+    matrix = np.loadtxt(folder / "K.txt")
+    matrix[place] = value
+    np.savetxt(folder / "K.txt", matrix)
+
+
+def _transposed(folder: Path) -> None:
+    np.savetxt(folder / "K.txt", np.loadtxt(folder / "K.txt").T)
+
+
+def _resized(folder: Path, factor: float) -> None:
+    np.savetxt(folder / "K.txt", np.diag([factor, factor, 1]) @ np.loadtxt(folder / "K.txt"))
+
+
 DAMAGE = {
     "no images": (lambda f: _empty(f / "images"), "scene office has no colour images"),
     "image removed": (
@@ -165,6 +180,14 @@ DAMAGE = {
     ),
     "no intrinsics": (lambda f: (f / "K.txt").unlink(), r"no intrinsics: add K\.txt"),
     "no 3x3": (lambda f: np.savetxt(f / "K.txt", np.ones((2, 3))), r"K\.txt .* 3x3 or 4x4 matrix, not 2x3"),
+    "a transposed matrix": (_transposed, r"are not fx 0 cx, 0 fy cy, 0 0 1 \(transposed"),
+    "skew": (lambda f: _matrix(f, (0, 1), 3.0), "have skew, which is not modelled"),
+    "a distant principal point": (lambda f: _matrix(f, (0, 2), 1e5), "is far outside"),
+    "the matrix of larger images": (
+        lambda f: _resized(f, 2),
+        r"K\.txt of scene .* another resolution \(about 62x46\)\? Scale it",
+    ),
+    "the matrix of smaller images": (lambda f: _resized(f, 0.25), r"another resolution \(about 8x6\)"),
     "no focal length": (lambda f: np.savetxt(f / "K.txt", np.zeros((3, 3))), "no positive focal lengths"),
     "truncated image": (lambda f: _truncate(f / "images/00012.png"), r"cannot read .*s/00012\.png of scene office"),
     "truncated depth": (lambda f: _truncate(f / "depth/00012.png"), r"cannot read .*h/00012\.png of scene office"),

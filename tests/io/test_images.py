@@ -3,9 +3,12 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 from PIL import Image
 
+from vg2gt.io.errors import DataError
+from vg2gt.io.image_files import read_color
 from vg2gt.io.images import colorize_depth, colorize_normals, grid, write_png
 
 
@@ -34,3 +37,21 @@ def test_grid_places_panels(tmp_path: Path) -> None:
     written = np.asarray(Image.open(write_png(tmp_path / "grid.png", picture)))
     assert written.shape == (10, 14, 3)
     assert written[0, 8, 0] == 51
+
+
+RAMP = np.linspace(0, 65535, 24 * 32).reshape(24, 32)
+
+
+@pytest.mark.parametrize("suffix", ["png", "tif", "pgm"])
+def test_16_bit_grey_photographs_keep_their_greys(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"photo.{suffix}"
+    Image.fromarray(RAMP.astype(np.uint16)).save(path)
+    pixels = read_color(path, "scene")
+    assert np.abs(pixels - RAMP[..., None] / 257).max() <= 0.51
+
+
+@pytest.mark.parametrize(("dtype", "kind"), [(np.int32, "32-bit integers"), (np.float32, "floating-point numbers")])
+def test_photographs_without_a_known_white_are_refused(tmp_path: Path, dtype: type, kind: str) -> None:
+    Image.fromarray(RAMP.astype(dtype)).save(tmp_path / "photo.tif")
+    with pytest.raises(DataError, match=rf"photo\.tif of scene room: a photograph of {kind} has no known white"):
+        read_color(tmp_path / "photo.tif", "room")

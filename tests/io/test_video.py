@@ -60,17 +60,26 @@ def test_frames_come_upright_and_mirrored_as_the_file_says(tmp_path: Path) -> No
         assert [np.array_equal(frame, expected) for _, frame in read_video(path)] == [True]
 
 
-def test_ten_bits_are_read_as_eight(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("codec", "pixels"),
+    [("libx264", "yuv420p10le"), ("libx264", "gray10le"), ("ffv1", "rgb48le")],
+)
+def test_ten_bits_and_more_are_read_as_eight(tmp_path: Path, codec: str, pixels: str) -> None:
     av = pytest.importorskip("av")
     with av.open(str(tmp_path / "deep.mkv"), "w") as container:
-        stream = container.add_stream("libx264", 10, {"crf": "10"})
-        stream.width, stream.height, stream.pix_fmt = 48, 32, "yuv420p10le"
+        stream = container.add_stream(codec, 10, {"crf": "10"} if codec == "libx264" else {})
+        stream.width, stream.height, stream.pix_fmt = 48, 32, pixels
         for frame in _frames():
             container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, "rgb24")))
         container.mux(stream.encode(None))
-    for number, frame in read_video(tmp_path / "deep.mkv"):
+    read = list(read_video(tmp_path / "deep.mkv"))
+    assert len(read) == 6
+    for number, frame in read:
+        expected = _frames()[number].astype(float)
+        if pixels.startswith("gray"):
+            expected = (expected @ [0.299, 0.587, 0.114])[..., None]
         assert frame.dtype == np.uint8
-        assert np.abs(frame.astype(int) - _frames()[number]).mean() < 12
+        assert np.abs(frame - expected).mean() < 12
 
 
 @pytest.mark.parametrize(

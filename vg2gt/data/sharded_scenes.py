@@ -20,7 +20,7 @@ from vg2gt.data.base import DataError, Frames, SceneSource
 from vg2gt.data.sources.files import read_split
 from vg2gt.data.transforms import from_bytes
 from vg2gt.io.errors import FormatError
-from vg2gt.io.images import open_image
+from vg2gt.io.images import color_image, open_image
 from vg2gt.io.npz import read_npz
 
 INDEX = "index.npz"
@@ -237,7 +237,7 @@ def _decode(content: bytes, image: NDArray, depth: NDArray, where: str) -> tuple
     start = int(image[0])
     encoded = (content[place - start : place - start + length] for place, length in (image.tolist(), depth.tolist()))
     try:
-        pixels = np.array(open_image(io.BytesIO(next(encoded))).convert("RGB"))
+        pixels = np.array(color_image(open_image(io.BytesIO(next(encoded)))))
         limit = 4 * pixels.shape[0] * pixels.shape[1] + _HEADERS
         z = read_npz(io.BytesIO(next(encoded)), ("depth",), limit)["depth"]
     except _DAMAGED as error:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from vg2gt.io.errors import DataError
-from vg2gt.io.images import open_image
+from vg2gt.io.images import color_image, open_image
 
 # What Pillow raises for files that are damaged in one way or another.
 _DAMAGED = (OSError, SyntaxError, ValueError, EOFError, zlib.error, struct.error, Image.DecompressionBombError)
@@ -76,7 +76,9 @@ def read_color(
     """
     with _opened(path if content is None else io.BytesIO(content), path, scene) as image:
         turn = _TURNS.get(_orientation(image)) if upright else None
-        pixels = np.array((image if turn is None else image.transpose(turn)).convert("RGB"))
+        pixels = np.array(color_image(image))
+        if turn is not None:
+            pixels = np.array(Image.fromarray(pixels).transpose(turn))
     check_size(path, scene, pixels.shape[:2], size)
     return pixels
 

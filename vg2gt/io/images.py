@@ -42,6 +42,21 @@ def open_image(file: str | Path | IO[bytes]) -> Image.Image:
     return Image.open(file, formats=[name for name in _FORMATS if name in Image.OPEN])
 
 
+def color_image(image: Image.Image) -> Image.Image:
+    """A photograph in 8-bit colour; 16-bit grey is scaled, where Pillow's own conversion would cut it off at 255.
+
+    Raises:
+        OSError: if its values have no known range: 32-bit integers and floats.
+    """
+    grey = image.mode.startswith("I;16") or (image.mode == "I" and image.format in ("PNG", "PPM"))
+    if grey:
+        image = Image.fromarray((np.asarray(image, np.float32) / 257 + 0.5).astype(np.uint8))
+    elif image.mode in ("I", "F"):
+        kind = "32-bit integers" if image.mode == "I" else "floating-point numbers"
+        raise OSError(f"a photograph of {kind} has no known white: save it with 8 or 16 bits a channel")
+    return image.convert("RGB")
+
+
 def colorize_depth(depth: Tensor, near: float, far: float) -> Tensor:
     """Colours z-depth ``[H, W]`` between ``near`` (bright) and ``far`` (dark); holes (0) are grey. ``[3, H, W]``."""
     position = ((depth - near) / max(far - near, 1e-9)).clamp(0, 1) * (len(_DEPTH_ANCHORS) - 1)

@@ -25,6 +25,7 @@ from vg2gt.data.sources.parsing import IMAGE_SUFFIXES
 from vg2gt.data.sources.rgbd import RGBDFolder
 from vg2gt.data.transforms import from_bytes
 from vg2gt.io.image_files import image_size, read_color
+from vg2gt.io.images import color_image
 from vg2gt.io.nerfstudio import read_transforms
 from vg2gt.io.video import VIDEO_SUFFIXES, count_frames, read_video
 
@@ -182,7 +183,7 @@ def _in_memory(name: str, pixels: NDArray[np.uint8]) -> Picture:
 
 def _from_memory(item: Any) -> list[Picture]:
     if isinstance(item, Image.Image):
-        return [_in_memory("image", np.array(ImageOps.exif_transpose(item).convert("RGB")))]
+        return [_in_memory("image", np.array(color_image(ImageOps.exif_transpose(item))))]
     pixels = item.detach().cpu().movedim(-3, -1).numpy() if isinstance(item, Tensor) else np.asarray(item)
     if pixels.ndim not in (3, 4) or pixels.shape[-1] != 3 or 0 in pixels.shape:
         raise ValueError(

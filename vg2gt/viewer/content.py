@@ -13,7 +13,7 @@ from PIL import ImageOps
 
 from vg2gt.io.cameras_json import NamedCamera, invert_pose
 from vg2gt.io.glb import scene_extent
-from vg2gt.io.images import open_image
+from vg2gt.io.images import color_image, open_image
 from vg2gt.types import Gaussians
 
 FRUSTUM_SHARE = 0.02  # of the scene's extent, the depth of a drawn frustum
@@ -111,7 +111,8 @@ def load_pictures(cameras: Sequence[NamedCamera], folder: str | Path) -> list[ND
 def _small_picture(path: Path) -> NDArray[np.uint8]:
     try:
         with open_image(path) as image:
-            image.thumbnail((PICTURE_SIDE, PICTURE_SIDE))
-            return np.array((ImageOps.exif_transpose(image) or image).convert("RGB"))
+            picture = color_image(image) if image.mode.startswith(("I", "F")) else image
+            picture.thumbnail((PICTURE_SIDE, PICTURE_SIDE))
+            return np.array((ImageOps.exif_transpose(picture) or picture).convert("RGB"))
     except Exception as error:  # image libraries raise whatever the bytes lead them to
         raise ValueError(f"cannot read {path}: {error}; restore or remove the image") from error

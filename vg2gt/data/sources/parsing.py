@@ -25,6 +25,8 @@ CORNER_TO_CENTER = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
 
 _THREADS = 8
 _ROTATION_TOLERANCE = 0.02
+_FAR_OFF = 50.0  # focal lengths
+_NO_SKEW = 1e-3  # of the focal length: half a pixel at the border of an image
 _LARGEST = float(np.finfo(np.float32).max)
 
 
@@ -208,13 +210,32 @@ def pinhole(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.float64]:
 def check_intrinsics(intrinsics: NDArray[np.float64], where: str) -> NDArray[np.float64]:
     """Returns ``[..., 3, 3]`` intrinsics as they are.
 
+    Args:
+        intrinsics: the matrices.
+        where: the file or folder and the scene, for the message.
+
     Raises:
-        DataError: if a value is not finite (in float32, in which it is handed on) or a focal length not positive.
+        DataError: if a value is not finite (in float32, in which it is handed on), a focal length not positive, a
+            matrix not that of a pinhole camera without skew, or a principal point far outside any image.
     """
-    focal = intrinsics[..., [0, 1], [0, 1]]
+    focal, lower = intrinsics[..., [0, 1], [0, 1]], intrinsics[..., [1, 2, 2], [0, 0, 1]]
     if not ((np.abs(intrinsics) < _LARGEST).all() and (focal > 0).all()):
         raise DataError(f"the intrinsics in {where} have no positive focal lengths: {intrinsics.tolist()}")
+    small = _NO_SKEW * focal[..., 0]
+    if not ((np.abs(lower) <= small[..., None]).all() and (np.abs(intrinsics[..., 2, 2] - 1) < 1e-6).all()):
+        raise DataError(
+            f"the intrinsics in {where} are not fx 0 cx, 0 fy cy, 0 0 1 (transposed, or another matrix?): "
+            f"{_first(intrinsics)}"
+        )
+    if not (np.abs(intrinsics[..., 0, 1]) <= small).all():
+        raise DataError(f"the intrinsics in {where} have skew, which is not modelled: {_first(intrinsics)}")
+    if not (np.abs(intrinsics[..., :2, 2]) <= _FAR_OFF * focal).all():
+        raise DataError(f"the principal point of the intrinsics in {where} is far outside: {_first(intrinsics)}")
     return intrinsics
+
+
+def _first(matrices: NDArray[np.float64]) -> list[list[float]]:
+    return matrices.reshape(-1, 3, 3)[0].tolist()
 
 
 def four_intrinsics(intrinsics: Sequence[float] | None) -> tuple[float, ...] | None:

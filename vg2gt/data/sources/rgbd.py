@@ -28,6 +28,7 @@ from vg2gt.data.base import DataError
 from vg2gt.data.sources.files import FileOptions, FileSource
 from vg2gt.data.sources.index import SceneIndex, check_found, first_size, make_index
 from vg2gt.data.sources.parsing import (
+    check_intrinsics,
     four_intrinsics,
     numbered,
     pinhole,
@@ -44,6 +45,7 @@ log = logging.getLogger(__name__)
 
 _COLOR_FOLDERS = ("images", "color", "rgb")
 _POSE_FOLDERS = ("pose", "poses")
+_OFF_CENTRE = 0.15  # most of an image's width or height that a principal point may lie from its middle
 _INTRINSICS_FILES = ("K.txt", "camera-intrinsics.txt")
 
 
@@ -144,7 +146,9 @@ class RGBDFolder(FileSource):
         if self.intrinsics is not None:
             matrix = pinhole(*self.intrinsics)
         elif files:
-            matrix = read_matrix((own or files)[0], scene, ((3, 3), (4, 4)))[:3, :3].copy()
+            path = (own or files)[0]
+            matrix = read_matrix(path, scene, ((3, 3), (4, 4)))[:3, :3].copy()
+            _check_resolution(matrix, f"{path} of scene {scene}", depth if own else color)
         else:
             raise DataError(
                 f"scene {scene} in {folder} has no intrinsics: add K.txt (3x3) or set data.intrinsics=[fx,fy,cx,cy]"
@@ -152,6 +156,18 @@ class RGBDFolder(FileSource):
         if own and self.intrinsics is None:
             return matrix
         return resize_intrinsics(torch.from_numpy(matrix), depth[1] / color[1], depth[0] / color[0]).numpy()
+
+
+def _check_resolution(matrix: NDArray[np.float64], where: str, size: Size) -> None:
+    """Refuses intrinsics of other images: those of another resolution have their principal point off the middle."""
+    check_intrinsics(matrix, where)
+    x, y = matrix[0, 2], matrix[1, 2]
+    if abs(x / size[1] - 0.5) > _OFF_CENTRE or abs(y / size[0] - 0.5) > _OFF_CENTRE:
+        raise DataError(
+            f"{where} has its principal point at ({x:g}, {y:g}), far from the middle of the images of "
+            f"{size[1]}x{size[0]}: is it of another resolution (about {2 * x:.0f}x{2 * y:.0f})? Scale it to these "
+            "images, or set data.intrinsics=[fx,fy,cx,cy], which is taken as it is"
+        )
 
 
 @lru_cache
