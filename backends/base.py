@@ -144,7 +144,12 @@ class Backend(nn.Module, ABC):
                 f"backend {self.name} needs hints from the data, missing: {', '.join(missing)}. Pass batch.hints, "
                 "or choose a backend that works from images alone (backend=vggt_1b, backend=da3_small, ...)"
             )
-        shapes = {"depth": (batch, views, height, width), "cameras": (batch, views, 4, 4), "frame_ids": (batch, views)}
+        shapes = {
+            "depth": (batch, views, height, width),
+            "cameras": (batch, views, 4, 4),
+            "frame_ids": (batch, views),
+            "depth_range": (batch, 2),
+        }
         for name in names:
             value = getattr(hints, name)
             found = value.world_to_camera.shape if name == "cameras" else getattr(value, "shape", ())

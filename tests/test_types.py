@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from vg2gt.types import Batch, Cameras, Gaussians, Tokens, Voxels
+from vg2gt.types import Batch, Cameras, Gaussians, Hints, Tokens, Voxels
 
 
 def cameras(scenes: int, views: int) -> Cameras:
@@ -16,6 +16,13 @@ def test_map_reaches_nested_records_tuples_and_mappings() -> None:
     mapped = tokens.map(lambda tensor: tensor + 1)
     assert all(bool((tensor == 1).all()) for tensor in (*mapped.patch, mapped.camera, mapped.state["depth"]))
     assert mapped.grid == (1, 1)
+
+
+def test_hints_map_their_depth_range_and_keep_what_is_unknown() -> None:
+    doubled = Hints(depth_range=torch.tensor([[0.5, 4.0]])).map(lambda tensor: 2 * tensor)
+    assert doubled.depth_range is not None
+    assert doubled.depth_range.tolist() == [[1, 8]]
+    assert doubled.depth is None
 
 
 def test_batch_splits_context_and_target() -> None:

@@ -83,12 +83,15 @@ class Hints(TensorRecord):
         cameras: cameras in any world frame; None if unknown.
         scene_key: one name a scene; seeds simulated noise.
         frame_ids: ``[B, V]`` int64 frame numbers; seed simulated noise.
+        depth_range: ``[B, 2]`` z-depth (near, far) between which nearly all of what the views see lies, such as sparse
+            points of structure from motion tell, in the unit of the cameras' translations; None if unknown.
     """
 
     depth: Tensor | None = None
     cameras: Cameras | None = None
     scene_key: tuple[str, ...] = ()
     frame_ids: Tensor | None = None
+    depth_range: Tensor | None = None
 
 
 @dataclass(frozen=True)
