@@ -28,6 +28,7 @@ class Backend(nn.Module, ABC):
         supports_gradient: True if ``decode`` is differentiable in ``tokens.patch``.
         needs_hints: True if ``encode`` cannot work without what the data knows.
         min_views: fewest views that ``encode`` takes; it raises ValueError for fewer.
+        predicts_cameras: False if its cameras are those of the hints.
     """
 
     def __init__(
@@ -40,6 +41,7 @@ class Backend(nn.Module, ABC):
         supports_gradient: bool = True,
         needs_hints: bool = False,
         min_views: int = 1,
+        predicts_cameras: bool = True,
     ) -> None:
         super().__init__()
         self.name = name
@@ -50,6 +52,7 @@ class Backend(nn.Module, ABC):
         self.supports_gradient = supports_gradient
         self.needs_hints = needs_hints
         self.min_views = min_views
+        self.predicts_cameras = predicts_cameras
         self._identity: dict[str, str] | None = None
 
     @abstractmethod

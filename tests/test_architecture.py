@@ -21,7 +21,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "refinement": {"losses", "metrics", "rendering", "gaussians"} | BASICS,
     "evaluation": {"refinement", "runs", "model", "rendering", "metrics", "data"} | BASICS,
     "reconstruction": {"refinement", "runs", "model", "rendering", "data"} | BASICS,
-    "training": {"evaluation", "runs", "model", "losses", "rendering", "data"} | BASICS,
+    "training": {"evaluation", "runs", "model", "losses", "rendering", "data", "backends"} | BASICS,
     "studies": {"training", "evaluation", "runs"} | BASICS,
     "cli": {
         "studies",
@@ -38,9 +38,9 @@ MAY_IMPORT: dict[str, set[str]] = {
     | BASICS,
     **{command: {"cli"} for command in ("evaluate", "ablate", "curves")},
 }
-OF_BACKENDS = ("vg2gt.types", "vg2gt.geometry", "vg2gt.io.tensors")
+OF_BACKENDS = ("vg2gt.types", "vg2gt.geometry", "vg2gt.io.tensors", "vg2gt.io.files")
 RECIPE = "backends.sweep.recipe"  # makes weights from procedural scenes; a command, which nothing else imports
-OF_RECIPE = (*OF_BACKENDS, "vg2gt.data.synthetic", "vg2gt.io.files")
+OF_RECIPE = (*OF_BACKENDS, "vg2gt.data.synthetic")
 
 
 def modules() -> dict[str, Path]:

@@ -22,6 +22,7 @@ import torch
 from torch import Tensor, nn
 
 from backends.base import Backend
+from backends.cache import TokenCache
 from vg2gt.geometry.alignment import fit_depth_scale
 from vg2gt.geometry.cameras import relative_to_first, scale_translations
 from vg2gt.memory import note_sizes
@@ -90,6 +91,7 @@ class Reconstructor(nn.Module, ABC):
             )
         self.backend = backend
         self.scale = scale
+        self.token_cache: TokenCache | None = None  # set where view sets come again
 
     @abstractmethod
     def forward(
@@ -113,10 +115,14 @@ class Reconstructor(nn.Module, ABC):
         """
         scenes, views, _, height, width = images.shape
         note_sizes({f"images of {height}x{width} in {scenes} scene{'s' * (scenes > 1)}": scenes * views}, anew=True)
-        with stage("encode"):
-            tokens = self.backend.encode(images, hints)
-        with stage("decode"), torch.no_grad():
-            raw = self.backend.decode(tokens)
+        if self.token_cache is not None:
+            with stage("encode"):
+                tokens, raw = self.token_cache.read(self.backend, images, hints)
+        else:
+            with stage("encode"):
+                tokens = self.backend.encode(images, hints)
+            with stage("decode"), torch.no_grad():
+                raw = self.backend.decode(tokens)
         unit = self.scale(raw, hints)
         return tokens, _to_scene_frame(raw, unit), unit
 

@@ -49,7 +49,7 @@ class SweepBackend(Backend):
     ) -> None:
         if planes < 8 or sources < 1:
             raise ValueError(f"backend.planes must be >= 8 and backend.sources >= 1, got {planes} and {sources}")
-        super().__init__("sweep", PATCH, (DIM,) * TAPS, licence=LICENCE, needs_hints=True, min_views=2)
+        super().__init__("sweep", PATCH, (DIM,) * TAPS, LICENCE, needs_hints=True, min_views=2, predicts_cameras=False)
         weights = Weights(self.name, LICENCE, pretrained, None, None, path or str(SHIPPED), seed)
         self.network = weights.build(SweepNet)
         self.planes, self.sources = planes, sources

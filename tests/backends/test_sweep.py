@@ -185,7 +185,7 @@ def test_depth_is_in_the_unit_of_the_cameras(make_scene) -> None:
 
 def test_bad_options_are_refused() -> None:
     for options in ({"planes": 4}, {"sources": 0}):
-        with pytest.raises(ValueError, match=f"backend.{next(iter(options))}"):
+        with pytest.raises(ValueError, match=rf"backend\.{next(iter(options))}"):
             SweepBackend(pretrained=False, **options)
 
 

@@ -147,6 +147,21 @@ def test_lengths_are_positive(name: str) -> None:
         PointOptions(**{name: -1})
 
 
+def test_given_cameras_need_no_joint_pass(module_and_batch, batch: Batch, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A backend whose cameras are the data's is not asked for those of held-out views."""
+    module, _ = module_and_batch
+    inputs = replace(batch, num_context=3)
+    model = module.model
+    with torch.no_grad():
+        prediction = model(inputs.context.images, inputs.context.hints)
+    monkeypatch.setattr(model.backend, "predicts_cameras", False)
+    monkeypatch.setattr(model.backend, "encode", None)
+    found = joint_target_cameras(model, inputs, prediction)
+    data = relative_to_first(batch.cameras).world_to_camera[:, 3:]
+    torch.testing.assert_close(found.world_to_camera[..., :3, :3], data[..., :3, :3])
+    torch.testing.assert_close(found.world_to_camera[..., :3, 3], data[..., :3, 3] * prediction.unit[:, None, None])
+
+
 @pytest.mark.parametrize("views", [1, 3])
 def test_the_joint_pass_may_have_another_unit(module_and_batch, batch: Batch, views: int) -> None:
     """As backbones without metric scale have: three times larger as soon as held-out views are seen too."""

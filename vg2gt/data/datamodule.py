@@ -35,6 +35,7 @@ class SceneDataModule(LightningDataModule):
         max_images: context images of a step on one device; a step with N views holds ``max_images // N`` scenes.
         expand_ratio: the N views are drawn from a window of ``expand_ratio * N`` frames.
         target_views: held-out views added to every training scene.
+        view_sets: every scene has this many fixed draws of views instead of new ones at every step; None: new ones.
         eval_context: positions, or number, of the evaluation's input views (``EvaluationViews``).
         eval_target: positions, or number, of the evaluation's held-out views.
         eval_window: evaluate long scenes in stretches of this many frames; None: whole.
@@ -68,6 +69,7 @@ class SceneDataModule(LightningDataModule):
         max_images: int = 18,
         expand_ratio: float = 2.0,
         target_views: int = 0,
+        view_sets: int | None = None,
         eval_context: int | Sequence[int] = 8,
         eval_target: int | Sequence[int] = 3,
         eval_window: int | None = None,
@@ -86,7 +88,7 @@ class SceneDataModule(LightningDataModule):
         super().__init__()
         if train_scenes is not None and train_scenes < 1:
             raise ValueError(f"data.train_scenes={train_scenes} must be at least 1, or null for all")
-        self.sampler = ViewSampler(min_views, max_views, max_images, expand_ratio, target_views, seed)
+        self.sampler = ViewSampler(min_views, max_views, max_images, expand_ratio, target_views, seed, view_sets)
         self.eval_views = EvaluationViews(eval_context, eval_target, eval_window)
         size = (int(image_size[0]), int(image_size[1]))
         self.framing = FramingSampler(size, aspect, size_multiple, fit, crop, zoom, seed)

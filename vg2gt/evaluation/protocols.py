@@ -29,6 +29,9 @@ def joint_target_cameras(model: Reconstructor, batch: Batch, prediction: Predict
     context-only pass brings the held-out cameras into the Gaussians' frame. Where the context cameras stand still, as a
     single one does, its scale comes from the depth that both passes decode of the context views.
     """
+    if not model.backend.predicts_cameras:  # they are the data's: no pass is needed to know them
+        cameras = scale_translations(relative_to_first(batch.cameras), prediction.unit)
+        return cameras.select(slice(batch.num_context, None))
     geometry = model.backend.decode(model.backend.encode(batch.images, batch.hints))
     joint = scale_translations(relative_to_first(geometry.cameras), prediction.unit)
     context = slice(0, batch.num_context)

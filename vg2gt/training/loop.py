@@ -17,6 +17,7 @@ from lightning.pytorch import LightningDataModule, Trainer
 from lightning.pytorch.callbacks import ProgressBar
 from omegaconf import DictConfig, OmegaConf
 
+from backends.cache import TokenCache
 from vg2gt.data.datamodule import SceneDataModule
 from vg2gt.io.files import read_json, write_json, write_text
 from vg2gt.memory import TRAINING, memory_advice
@@ -72,6 +73,8 @@ def build(config: DictConfig) -> Run:
     datamodule = instantiate(config.data)
     backend = instantiate(config.backend)
     model = instantiate(config.model, backend=backend)
+    if config.token_cache.max_gb:
+        model.token_cache = TokenCache(**config.token_cache)
     module = VG2GTModule(
         model=model,
         loss=instantiate(config.loss),

@@ -98,6 +98,19 @@ def test_views_are_distinct_frames_of_a_window_around_the_anchor():
     assert len(starts) > 100
 
 
+def test_view_sets_are_fixed_draws_per_scene():
+    """Two sets per scene: over many steps every scene shows exactly two, other scenes others."""
+    sampler = ViewSampler(4, 4, 4, 2.0, 2, seed=0, view_sets=2)
+    drawn = {
+        scene: {(v.context, v.target) for v in (sampler.views(step, scene, range(16), step) for step in range(40))}
+        for scene in ("a", "b")
+    }
+    assert [len(sets) for sets in drawn.values()] == [2, 2]
+    assert drawn["a"].isdisjoint(drawn["b"])
+    with pytest.raises(ValueError, match=r"data\.view_sets"):
+        ViewSampler(view_sets=0)
+
+
 def test_devices_own_disjoint_places_of_the_row():
     views = ViewSampler(2, 6, max_images=12)
     places = [place for step in range(50) for rank in range(3) for place in views.slots(step, rank, 3)]

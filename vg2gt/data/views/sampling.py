@@ -7,6 +7,7 @@ seen, and the number of loader workers or their prefetching changes nothing.
 from __future__ import annotations
 
 import logging
+import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -38,6 +39,8 @@ class ViewSampler:
         expand_ratio: the views are drawn from a window of ``expand_ratio * N`` consecutive frames.
         target_views: held-out views drawn from the same window, in addition.
         seed: seeds every draw.
+        view_sets: every scene's views come from this many fixed draws, so that what a frozen backbone makes of them
+            can be kept (``backends.cache``); None draws anew at every step.
     """
 
     min_views: int = 3
@@ -46,6 +49,7 @@ class ViewSampler:
     expand_ratio: float = 2.0
     target_views: int = 0
     seed: int = 0
+    view_sets: int | None = None
 
     def __post_init__(self) -> None:
         if not 1 <= self.min_views <= self.max_views:
@@ -54,6 +58,8 @@ class ViewSampler:
             raise ValueError(
                 f"need target_views >= 0 and expand_ratio >= 1, got {self.target_views} and {self.expand_ratio}"
             )
+        if self.view_sets is not None and self.view_sets < 1:
+            raise ValueError(f"data.view_sets must be at least 1, or null for new draws, got {self.view_sets}")
         if self.max_images < self.max_views:
             raise ValueError(
                 f"need max_images >= max_views, got {self.max_images} and {self.max_views}: the {self.max_views} views "
@@ -94,6 +100,8 @@ class ViewSampler:
             slot: number of the scene in the step over all devices.
         """
         rng = self._rng(_FRAMES, step, slot)
+        if self.view_sets is not None:
+            rng = self._rng(_FRAMES, zlib.crc32(scene.encode()), int(rng.integers(self.view_sets)))
         context = self.num_views(step)
         needed = context + self.target_views
         window = min(len(frames), max(needed, round(self.expand_ratio * context)))

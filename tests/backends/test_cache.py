@@ -1,0 +1,72 @@
+"""Tokens that are kept on disk are those that the backbone would make again."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from backends.cache import TokenCache
+from backends.oracle import OracleBackend
+
+
+class Counting(OracleBackend):
+    """Counts how often it runs."""
+
+    def encode(self, images, hints=None):
+        self.runs = [*getattr(self, "runs", []), len(images)]
+        return super().encode(images, hints)
+
+
+@pytest.fixture
+def scene(make_scene):
+    return make_scene(1, 2, (28, 42))
+
+
+def test_a_second_look_is_bit_equal_and_costs_nothing(tmp_path: Path, scene) -> None:
+    backend = Counting()
+    first = TokenCache(tmp_path).read(backend, *scene)
+    tokens, geometry = TokenCache(tmp_path).read(backend, *scene)  # as another process would
+    assert backend.runs == [1]
+    assert all(torch.equal(a, b) for a, b in zip(tokens.patch, first[0].patch, strict=True))
+    assert torch.equal(geometry.depth, first[1].depth)
+    assert torch.equal(backend.decode(tokens).depth, geometry.depth)
+    assert torch.equal(geometry.cameras.world_to_camera, backend.decode(first[0]).cameras.world_to_camera)
+
+
+def test_whatever_decides_the_result_decides_the_key(tmp_path: Path, scene, make_scene) -> None:
+    images, hints = scene
+    cache, backend = TokenCache(tmp_path), Counting()
+    cache.read(backend, images, hints)
+    cache.read(backend, images.flip(1), hints)
+    cache.read(backend, images, make_scene(1, 2, (28, 42), 5)[1])
+    backend.depth_noise = 0.05
+    cache.read(backend, images, hints)
+    assert backend.runs == [1, 1, 1, 1]
+    other = Counting(seed=3)
+    cache.read(other, images, hints)
+    assert other.runs == [1]
+
+
+def test_a_damaged_file_is_made_again(tmp_path: Path, scene, caplog: pytest.LogCaptureFixture) -> None:
+    backend, cache = Counting(), TokenCache(tmp_path)
+    first, _ = cache.read(backend, *scene)
+    (file,) = tmp_path.glob("*.pt")
+    file.write_bytes(file.read_bytes()[:1000])
+    again, _ = cache.read(backend, *scene)
+    assert "made again" in caplog.text
+    assert torch.equal(again.patch[0], first.patch[0])
+    cache.read(backend, *scene)
+    assert backend.runs == [1, 1]
+
+
+def test_the_oldest_go_when_the_folder_is_full(tmp_path: Path, make_scene) -> None:
+    backend = Counting()
+    TokenCache(tmp_path).read(backend, *make_scene(1, 2, (28, 42), 0))
+    (first,) = tmp_path.glob("*.pt")
+    cache = TokenCache(tmp_path, max_gb=2.5 * first.stat().st_size / 1e9)
+    for seed in (1, 2, 3):
+        cache.read(backend, *make_scene(1, 2, (28, 42), seed))
+    assert len(list(tmp_path.glob("*.pt"))) == 2
+    assert not first.exists()
+    with pytest.raises(ValueError, match="token_cache.max_gb"):
+        TokenCache(tmp_path, 0)
