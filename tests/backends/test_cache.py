@@ -68,5 +68,5 @@ def test_the_oldest_go_when_the_folder_is_full(tmp_path: Path, make_scene) -> No
         cache.read(backend, *make_scene(1, 2, (28, 42), seed))
     assert len(list(tmp_path.glob("*.pt"))) == 2
     assert not first.exists()
-    with pytest.raises(ValueError, match="token_cache.max_gb"):
+    with pytest.raises(ValueError, match=r"token_cache\.max_gb"):
         TokenCache(tmp_path, 0)
