@@ -114,3 +114,15 @@ def test_memory(tmp_path: Path) -> None:
     assert capped["forward"]["voxels"] == 1000
     assert capped["training"]["pass_mib"] < views[-1]["training"]["pass_mib"]
     assert written.with_suffix(".md").read_text().count("| views |") == 4
+
+
+@pytest.mark.slow
+def test_refine(tmp_path: Path) -> None:
+    where = ["--out", str(tmp_path), "--figures", str(tmp_path), "--device", "cpu", "--scenes", "1", "--seconds", "1"]
+    run("refine.py", tmp_path, *where, TINY[0], "data.train_scenes=1", f"data.cache_dir={tmp_path}")
+    (path,) = tmp_path.glob("*-refine-rooms-cpu.json")
+    curves = json.loads(path.read_text())["curves"]
+    assert set(curves) == {"VG²GT, untrained", "pixel-aligned, untrained", "voxel-merged, untrained", "point cloud"}
+    for points in curves.values():
+        assert points[0]["step"] == 0 < points[-1]["step"]
+        assert points[-1]["psnr"] > points[0]["psnr"]

@@ -13,6 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 from tests.training_helpers import full_model
 from vg2gt.config import compose, group_options
 from vg2gt.losses import VG2GTLoss
+from vg2gt.refinement import RefineOptions
 from vg2gt.training.loop import build
 
 OPTIONAL_PACKAGES = {"wandb": "wandb", "tensorboard": "tensorboard"}
@@ -65,6 +66,13 @@ def test_every_option_composes_and_fits_its_constructor(tmp_path: Path, group: s
         pytest.skip(f"{name} is not installed (extra: log)")
     config = composed(tmp_path, f"{group}={name}", *(["data.root=somewhere"] if name == "rgbd" else []))
     assert assert_signatures_fit(OmegaConf.to_container(config[group], resolve=True)) >= 1
+
+
+@pytest.mark.parametrize("name", group_options("refine"))
+def test_refinements_instantiate_and_the_default_is_the_codes(name: str) -> None:
+    config = compose(None, f"+refine={name}").refine
+    assert assert_signatures_fit(OmegaConf.to_container(config)) == 3
+    assert (instantiate(config) == RefineOptions()) == (name == "default")
 
 
 @pytest.mark.parametrize("name", group_options("data"))

@@ -13,6 +13,7 @@ from vg2gt.geometry.cameras import relative_to_first, scale_translations
 from vg2gt.geometry.normals import normals_from_depth
 from vg2gt.metrics import cv, depth_metrics, near_depth_edges, normal_metrics, psnr, ssim
 from vg2gt.profiling import clocked
+from vg2gt.refinement import RefineOptions
 from vg2gt.types import Batch, Geometry
 
 
@@ -45,6 +46,20 @@ def test_every_protocol_and_mode_has_every_figure(result: SceneResult) -> None:
         assert 0 < (scores[f"points/{cloud}/f_score"] or 0) <= 1
     assert (scores["scene/reconstruct_seconds"] or 0) > (scores["scene/head_seconds"] or 0) > 0
     assert not any(name.endswith("lpips") for name in scores)
+
+
+def test_refined_scenes_have_figures_of_their_own(evaluator: SceneEvaluator, result: SceneResult, batch: Batch) -> None:
+    found = replace(evaluator, refinement=RefineOptions(steps=12, check_every=6))(batch).metrics
+    again = {name: value for name, value in found.items() if not name.startswith("refined/")}
+    costs = ("_seconds", "_mib")
+    assert {n: v for n, v in again.items() if not n.endswith(costs)} == {
+        n: v for n, v in result.metrics.items() if not n.endswith(costs)
+    }
+    path = "rendered/gt_pose/solid/psnr"
+    assert (found[f"refined/{path}"] or 0) > (found[path] or 0) + 0.5
+    assert (found["refined/scene/refine_seconds"] or 0) > 0
+    assert found["refined/cameras/auc_3"] is not None
+    assert not any(name.startswith("refined/decoded") for name in found)
 
 
 def test_context_renders_are_of_the_inputs(result: SceneResult, batch: Batch) -> None:

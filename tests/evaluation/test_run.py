@@ -124,6 +124,21 @@ def test_pictures_can_be_asked_for_later(cache: Path, trained: Path, joined: Pat
     assert [path.name for path in (joined / "pictures").iterdir()] == ["room-1000000-2.png"]
 
 
+def test_refined_rows_stand_apart(tmp_path: Path, cache: Path, trained: Path, joined: Path) -> None:
+    few = [f"ckpt={trained}", "data.eval_scenes=1", "views=[3]"]
+    report = run(tmp_path, cache, *few, "evaluation.refine=2")
+    mean = report["views"]["3"]["mean"]
+    assert mean["refined/rendered/gt_pose/solid/psnr"] != mean["rendered/gt_pose/solid/psnr"]
+    text = (tmp_path / "metrics.md").read_text()
+    assert "optimised on the input views, 2 steps; not feed-forward" in text
+    assert "| solid, refined " in text
+    with pytest.raises(FileExistsError, match=r"evaluation\.refine \(2 -> "):
+        run(tmp_path, cache, *few, "evaluation.refine=3")
+    # Where nothing is refined, options of refinement decide nothing.
+    run(joined, cache, f"ckpt={trained}", "refine.rates.sh=1")
+    assert "refined" not in (joined / "metrics.md").read_text()
+
+
 def test_another_backbone_or_model_is_refused(tmp_path: Path, cache: Path, trained: Path) -> None:
     with pytest.raises(ValueError, match="trained on backbone"):
         run(tmp_path, cache, f"ckpt={trained}", "backend=oracle", "backend.seed=1")

@@ -23,6 +23,7 @@ from vg2gt.evaluation.scene_metrics import (
 from vg2gt.metrics import LPIPS, camera_metrics, cv, depth_metrics
 from vg2gt.model import Reconstructor
 from vg2gt.profiling import clocked, now, peak_memory_mib, reset_peak_memory
+from vg2gt.refinement import Observations, RefineOptions, refine
 from vg2gt.rendering import Renderer, UnrenderableError
 from vg2gt.types import Batch, Cameras, Gaussians, Prediction, Render
 
@@ -119,12 +120,14 @@ class SceneEvaluator:
         renderer: its options are used in both modes.
         options: what is compared and how.
         lpips: the network, on the model's device; None where there is none.
+        refinement: how scenes are refined and scored once more, under ``refined/``; None: not at all.
     """
 
     model: Reconstructor
     renderer: Renderer
     options: EvaluationOptions
     lpips: LPIPS | None = None
+    refinement: RefineOptions | None = None
 
     @torch.no_grad()
     def __call__(self, batch: Batch, has_cameras: bool = True) -> SceneResult:
@@ -140,6 +143,18 @@ class SceneEvaluator:
         if len(batch.scene) != 1:
             raise ValueError(f"evaluation takes one scene at a time, got {', '.join(batch.scene)}")
         prediction, cost = self._reconstruct(batch)
+        metrics, renders = self._score(batch, prediction, cost, has_cameras)
+        if self.refinement is not None:
+            refined, cost = self._refine(batch, prediction, self.refinement)
+            scores, _ = self._score(batch, refined, cost, has_cameras)
+            # What was decoded is not refined.
+            metrics |= {f"refined/{name}": value for name, value in scores.items() if not name.startswith("decoded")}
+        return SceneResult(present(metrics), prediction, renders)
+
+    def _score(
+        self, batch: Batch, prediction: Prediction, cost: dict[str, float], has_cameras: bool
+    ) -> tuple[dict[str, float], dict[str, Render]]:
+        """All figures of one prediction, and its solid renders by protocol."""
         known = self._known(batch)
         metrics: dict[str, float] = {}
         renders: dict[str, Render] = {}
@@ -156,7 +171,22 @@ class SceneEvaluator:
         if has_cameras:
             metrics |= self._pose_and_point_cloud_metrics(known.context, prediction, renders["context"])
         cost["cv"] = cv(prediction.gaussians.means, self.options.neighbors, CV_QUERIES)
-        return SceneResult(present(metrics | _under("scene", cost)), prediction, renders)
+        return metrics | _under("scene", cost), renders
+
+    def _refine(
+        self, batch: Batch, prediction: Prediction, options: RefineOptions
+    ) -> tuple[Prediction, dict[str, float]]:
+        """The prediction with Gaussians and cameras optimised on the input views."""
+        device, geometry = batch.images.device, prediction.geometry
+        reset_peak_memory(device)
+        began = now(device)
+        seen = Observations(batch.context.images[0], geometry.depth[0], geometry.depth_conf[0])
+        found = refine(prediction.gaussians, geometry.cameras, seen, self.renderer, options)
+        cost = {"refine_seconds": now(device) - began, "peak_memory_mib": peak_memory_mib(device)}
+        gaussians = found.scene.gaussians
+        cost["gaussians"] = float(len(gaussians))
+        geometry = replace(geometry, cameras=found.scene.cameras)
+        return replace(prediction, gaussians=gaussians, geometry=geometry), cost
 
     def _reconstruct(self, batch: Batch) -> tuple[Prediction, dict[str, float]]:
         device = batch.images.device

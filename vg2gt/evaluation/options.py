@@ -46,6 +46,7 @@ class EvaluationOptions:
         points: how point clouds are compared.
         lpips: ``auto`` (weights in torch hub's cache), ``download``, the weights' path, or None: no LPIPS.
         pictures: number of scenes of which pictures are written, for every number of views.
+        refine: steps of refinement whose result is scored as well, in rows of its own; 0: none.
         table: name of the data set in the paper's tables, whose rows are printed below ours; None: none of them.
 
     Raises:
@@ -59,15 +60,16 @@ class EvaluationOptions:
     points: PointOptions = field(default_factory=PointOptions)
     lpips: str | None = "auto"
     pictures: int = 0
+    refine: int = 0
     table: str | None = None
 
     def __post_init__(self) -> None:
         if self.alignment not in ALIGNMENTS:
             raise ValueError(f"evaluation.alignment={self.alignment!r}: choose one of {', '.join(ALIGNMENTS)}")
-        if self.neighbors < 1 or self.pictures < 0 or len(self.depth_range) != 2:
+        if self.neighbors < 1 or self.pictures < 0 or self.refine < 0 or len(self.depth_range) != 2:
             raise ValueError(
-                "evaluation needs neighbors >= 1, pictures >= 0 and depth_range=[nearest,farthest], got "
-                f"{self.neighbors}, {self.pictures} and {list(self.depth_range)}"
+                "evaluation needs neighbors >= 1, pictures >= 0, refine >= 0 and depth_range=[nearest,farthest], got "
+                f"{self.neighbors}, {self.pictures}, {self.refine} and {list(self.depth_range)}"
             )
         if not 0 <= self.nearest < self.farthest:
             raise ValueError(

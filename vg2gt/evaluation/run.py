@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import statistics
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +38,7 @@ log = logging.getLogger(__name__)
 # Settings that choose samples, pictures or places; all others decide figures and must be the same in a folder.
 FREE = ("views", "name", "output_dir", "overwrite", "ckpt", "device", "evaluation.pictures", "data.eval_scenes")
 FREE += ("data.workers", "data.memory_mb", "data.steps_per_epoch")
+REFINEMENT = ("refine.", "evaluation.refine")  # decide nothing where nothing is refined
 
 
 @memory_advice(EVALUATION)
@@ -77,7 +78,8 @@ def evaluate(config: DictConfig) -> dict[str, Any]:
     store = ResultStore(folder, _identity(resolved, weights, lpips is not None, model, device), config.overwrite)
     write_text(folder / "config.yaml", OmegaConf.to_yaml(resolved, resolve=True))
 
-    evaluator = SceneEvaluator(model, instantiate(parts["renderer"]), options, lpips)
+    refinement = replace(instantiate(config.refine), steps=options.refine, seconds=None) if options.refine else None
+    evaluator = SceneEvaluator(model, instantiate(parts["renderer"]), options, lpips, refinement)
     results = {count: _evaluate_all(evaluator, data, views, store, device) for count, views in samples.items()}
     settings = _settings(config, options, model, weights, data.source, samples, lpips_label, device)
     report = {
@@ -149,7 +151,8 @@ def _identity(
 ) -> dict[str, Any]:
     """All that decides the figures of a sample, flat; the machine's kind decides the times."""
     settings = flatten(OmegaConf.to_container(config, resolve=True))
-    kept = {key: value for key, value in settings.items() if not key.startswith(FREE)}
+    free = FREE if config.evaluation.refine else (*FREE, *REFINEMENT)
+    kept = {key: value for key, value in settings.items() if not key.startswith(free)}
     kept |= {f"weights.{key}": value for key, value in model.backend.identity().items()}
     where = torch.cuda.get_device_name(device) if device.type == "cuda" else device.type
     return kept | {"checkpoint.sha256": weights.digest, "lpips.found": has_lpips, "device": where}
@@ -219,6 +222,7 @@ def _settings(
         "lpips": lpips,
         "points": asdict(options.points),
         "device": str(device),
+        "refinement": options.refine,
         "paper": None if obstacle else options.table,
         "paper_obstacle": obstacle,
     }

@@ -23,6 +23,7 @@ COST = columns(
     *("cv", "gaussians", "gaussians_per_pixel", "reconstruct_seconds", "head_seconds", "render_seconds"),
     "peak_memory_mib",
 )
+REFINED_COST = columns("cv", "gaussians", "refine_seconds", "render_seconds", "peak_memory_mib")
 _HELD_OUT, _INPUTS = "rendered/gt_pose/solid", "rendered/context/solid"
 SCENE = columns(
     *(f"{_HELD_OUT}/{name}" for name in ("psnr", "ssim", "abs_rel", "delta_1.05", "coverage", "normal_mean")),
@@ -38,6 +39,7 @@ SCENE = columns(
 # Where the figures of a section are, and what its rows are called after the number of views.
 Paths = Mapping[str, Sequence[str]]
 RENDERED = {f"rendered/{protocol}/{mode}": (protocol, mode) for protocol in PROTOCOLS for mode in MODES}
+REFINED = {f"refined/{path}": (protocol, f"{mode}, refined") for path, (protocol, mode) in RENDERED.items()}
 DECODED = {"decoded/before": ("before",), "decoded/after": ("after",)}
 POINT_CLOUDS = {"points/rendered": ("rendered",), "points/decoded": ("decoded",)}
 
@@ -74,10 +76,13 @@ def report_markdown(report: Mapping[str, Any]) -> str:
     rendered = ("views", "protocol", "rendering")
     scenes = [([scene, views], figures) for views, result in by_views for scene, figures in result["scenes"].items()]
     sections = [
-        _section("Rendered depth", rendered, DEPTH, rows(RENDERED, paper.DEPTH)),
-        _section("Images", rendered, images, rows(RENDERED, paper.IMAGES)),
+        _section("Rendered depth", rendered, DEPTH, rows(RENDERED | REFINED, paper.DEPTH)),
+        _section("Images", rendered, images, rows(RENDERED | REFINED, paper.IMAGES)),
         _section(
-            "Rendered normals", rendered, NORMALS, rows(RENDERED) + papers_row(paper.NORMALS, "-", normals, "solid")
+            "Rendered normals",
+            rendered,
+            NORMALS,
+            rows(RENDERED | REFINED) + papers_row(paper.NORMALS, "-", normals, "solid"),
         ),
         _section(
             "Decoded depth of the input views",
@@ -92,6 +97,17 @@ def report_markdown(report: Mapping[str, Any]) -> str:
         _section("Uniformity and cost", ("views",), COST, rows({"scene": ()}) + papers_row(paper.UNIFORMITY, cost)),
         _section("Scenes (solid; held-out views at true poses)", ("scene", "views"), SCENE, scenes),
     ]
+    if settings.get("refinement"):
+        sections[-1:-1] = [
+            _section("Cameras of the input views, refined", ("views",), CAMERAS, rows({"refined/cameras": ()})),
+            _section(
+                "Points of the input views, refined",
+                ("views", "depth"),
+                POINTS,
+                rows({"refined/points/rendered": ("rendered",)}),
+            ),
+            _section("Uniformity and cost, refined", ("views",), REFINED_COST, rows({"refined/scene": ()})),
+        ]
     return "\n".join([_heading(settings), *sections])
 
 
@@ -116,6 +132,11 @@ def _heading(settings: Mapping[str, Any]) -> str:
         "cameras; `context`: the input views again",
         "- depth and normals are of rendered pixels only; coverage is the share of true pixels that were rendered",
     ]
+    if settings.get("refinement"):
+        lines.append(
+            f"- rows `refined`: Gaussians and cameras optimised on the input views, {settings['refinement']} steps; "
+            "not feed-forward"
+        )
     if settings["paper"]:
         lines.append(
             f"- rows `paper` are the paper's own results on {settings['paper']}; its views are not published, so they "
