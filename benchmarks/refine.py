@@ -4,8 +4,8 @@ The same refinement (``configs/refine/default.yaml``) from VG²GT's scene, from 
 Gaussians merged by voxels, and from a point cloud as 3DGS starts (``model=pointcloud`` with neighbours' spacing,
 opacity 0.1), on the same backbone, scenes and seconds: core-seconds on a CPU, the clock's on a GPU, evaluation not
 counted. Held-out views at true poses, brought into the scene's frame by its present cameras; depth aligned by one scale
-a scene. ``--ckpt LABEL=PATH`` gives a model its trained part; all others are untrained, which the labels say.
-Procedural rooms or, with ``data=rgbd data.root=FOLDER``, a recording. Writes a dated JSON file to
+a scene. Untrained heads, which the labels say; ``--ckpt LABEL=PATH`` adds a start with its trained part. Procedural
+rooms or, with ``data=rgbd data.root=FOLDER``, a recording. Writes a dated JSON file to
 ``benchmarks/results`` and curves to ``docs/figures``.
 """
 
@@ -137,7 +137,9 @@ def main() -> None:
     options.add_argument("--scenes", type=int, default=4)
     options.add_argument("--seconds", type=float, default=20.0)
     options.add_argument("--starts", nargs="+", choices=STARTS, default=list(STARTS), metavar="LABEL")
-    options.add_argument("--ckpt", nargs="+", default=[], metavar="LABEL=PATH", help="a trained part of a start")
+    options.add_argument(
+        "--ckpt", nargs="+", default=[], metavar="LABEL=PATH", help="adds a start with its trained part"
+    )
     options.add_argument("--name", default="rooms", help="part of the files' names")
     options.add_argument("--figures", type=Path, default=FIGURES)
     arguments = options.parse_args()
@@ -154,10 +156,10 @@ def main() -> None:
     marks = [arguments.seconds * share for share in (1 / 16, 1 / 8, 1 / 4, 1 / 2)]
     backend = [f"backend.{key}={config.backend[key]}" for key in ("depth_noise", "pose_noise") if key in config.backend]
     curves: dict[str, Curve] = {}
-    for label in arguments.starts:
-        ckpt = trained.get(label)
+    names = {label if label == "point cloud" else f"{label}, untrained": (label, None) for label in arguments.starts}
+    names |= {f"{label}, trained": (label, ckpt) for label, ckpt in trained.items()}
+    for name, (label, ckpt) in names.items():
         loaded = load_model(ckpt, None if ckpt else "oracle", None if ckpt else STARTS[label], backend, str(device))
-        name = label if ckpt or label == "point cloud" else f"{label}, untrained"
         curve(loaded, batches[0], replace(how, steps=1), [])  # compiles
         curves[name] = mean_curve([curve(loaded, batch, how, marks) for batch in batches])
         last = curves[name][-1]

@@ -58,7 +58,9 @@ def test_in_python(scene: Scene, tmp_path: Path) -> None:
     assert not torch.equal(refined.gaussians.sh, scene.gaussians.sh)
     assert scene.refined is None
     write_outputs(refined, tmp_path, ["report.html"])
-    assert "psnr_trained_after" in (tmp_path / "report.html").read_text()
+    page = (tmp_path / "report.html").read_text()
+    assert "psnr_trained_after" in page
+    assert page.count("data:image/png;base64,") == 1
 
 
 def test_the_command(saved: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:

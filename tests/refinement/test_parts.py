@@ -43,6 +43,20 @@ def test_cameras_move_by_pixels(parameters: Parameters, start: Start) -> None:
     torch.testing.assert_close((found[2] - before[2])[:3, 3], torch.tensor([PIXEL * DEPTH, 0, 0]), atol=1e-6, rtol=0)
 
 
+def test_another_frame_is_the_same_scene(parameters: Parameters, start: Start) -> None:
+    state = parameters.scene().detach()
+    colours = torch.randn(len(state.gaussians.sh), 4, 3, generator=torch.Generator().manual_seed(0))
+    state = replace(state, gaussians=replace(state.gaussians, sh=colours))
+    pose = start.cameras.world_to_camera[0, 3]
+    moved = state.seen_from(pose)
+    assert torch.equal(moved.cameras.world_to_camera[0, 0], pose)
+    assert (moved.gaussians.means - state.gaussians.means).abs().max() > 0.1
+    first, second = (start.renderer(s.gaussians, s.cameras.select(slice(1, 2))) for s in (state, moved))
+    for name in ("color", "depth", "normal"):
+        difference = (getattr(first, name) - getattr(second, name)).abs()
+        assert difference.mean() < 1e-4, name
+
+
 def test_steps_are_in_units_of_each_gaussian(parameters: Parameters) -> None:
     before = parameters.scene().gaussians.means.detach()
     scene = parameters.scene().gaussians

@@ -43,7 +43,6 @@ def test_the_first_camera_stays_and_the_others_move(refined: Refined, start: Sta
     moved = (found.world_to_camera - before.world_to_camera).abs().amax((0, 2, 3))
     assert moved[0] == 0
     assert (moved[refined.trained[1:]] > 0).all()
-    assert (moved[refined.held_out] == 0).all()
     rotation = found.world_to_camera[0, :, :3, :3]
     torch.testing.assert_close(rotation @ rotation.mT, torch.eye(3).expand(VIEWS, 3, 3), atol=1e-5, rtol=0)
 

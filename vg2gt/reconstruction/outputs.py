@@ -156,7 +156,8 @@ def write_outputs(
     facts = {**scene_figures(scene), **(figures or {}), **cost_figures(monitor)}
     if "report.html" in outputs:
         gif = folder / "orbit.gif" if "orbit.gif" in outputs else None
-        write_html_report(folder / "report.html", rows, facts, gif)
+        picture = folder / REFINED if pictures else None
+        write_html_report(folder / "report.html", rows, facts, gif, picture)
     if "report.json" in outputs:
         write_json(folder / "report.json", facts)
     return folder

@@ -64,7 +64,9 @@ def html_rows(scene: Scene, rows: list[str]) -> Iterator[AddView]:
     yield add
 
 
-def write_html_report(path: Path, rows: Sequence[str], figures: Mapping[str, Any], orbit: Path | None) -> None:
+def write_html_report(
+    path: Path, rows: Sequence[str], figures: Mapping[str, Any], orbit: Path | None, refined: Path | None = None
+) -> None:
     """Writes a page that holds all its pictures.
 
     Args:
@@ -72,11 +74,15 @@ def write_html_report(path: Path, rows: Sequence[str], figures: Mapping[str, Any
         rows: one per view, from :func:`html_rows`.
         figures: the table at the top.
         orbit: a GIF to show, or None.
+        refined: a PNG of views before and after refinement, or None.
     """
     table = "".join(f"<tr><th>{html.escape(key)}</th><td>{_cell(value)}</td></tr>" for key, value in figures.items())
     moving = ""
     if orbit is not None:
         moving = f'<p><img src="{_data("image/gif", orbit.read_bytes())}" alt="orbit"></p>'
+    if refined is not None:
+        shown = _data("image/png", refined.read_bytes())
+        moving += f'<h2>Refined: image | before | after | normals before | after</h2><p><img src="{shown}"></p>'
     title = f"Reconstruction of {len(rows)} views"
     write_text(
         path,

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from vg2gt.geometry.cameras import compose
-from vg2gt.geometry.rotations import quat_to_matrix
+from vg2gt.geometry.cameras import compose, invert_rigid, transform_points
+from vg2gt.geometry.rotations import matrix_to_quat, multiply_quats, quat_to_matrix
+from vg2gt.geometry.spherical_harmonics import rotation_of_coefficients
 from vg2gt.refinement.options import RefineRates
 from vg2gt.types import Cameras, Gaussians, TensorRecord
 
@@ -35,6 +36,22 @@ class RefinedScene(TensorRecord):
     gain: Tensor
     bias: Tensor
 
+    def seen_from(self, first: Tensor) -> RefinedScene:
+        """The same scene and pictures in the world frame in which view 0 has the pose ``first [4, 4]``."""
+        found, gaussians = self.cameras.world_to_camera[0], self.gaussians
+        back = compose(invert_rigid(found[0]), first)  # from the new world to the old one
+        move = invert_rigid(back)
+        turn = move[:3, :3]
+        degree = round(gaussians.sh.shape[1] ** 0.5) - 1
+        moved = replace(
+            gaussians,
+            means=transform_points(move[None, None], gaussians.means[None, None])[0, 0],
+            quats=multiply_quats(matrix_to_quat(turn), gaussians.quats),
+            sh=rotation_of_coefficients(turn, degree) @ gaussians.sh,
+        )
+        poses = torch.cat((first[None], compose(found[1:], back)))
+        return replace(self, gaussians=moved, cameras=replace(self.cameras, world_to_camera=poses[None]))
+
     def exposed(self, color: Tensor, views: Tensor) -> Tensor:
         """Rendered colours ``[1, R, 3, H, W]`` with the exposure of their views ``[R]``."""
         return color * self.gain[views, :, None, None] + self.bias[views, :, None, None]
@@ -44,7 +61,9 @@ class Parameters:
     """The scene as free numbers with an optimiser of their own.
 
     Positions are offsets in units of each Gaussian's middle standard deviation, so that one rate fits small and large
-    ones and every scene's unit. Cameras are turned and shifted in their own frames, view 0 stays where it is.
+    ones and every scene's unit. Cameras are turned and shifted in their own frames; the one of view 0 too, because what
+    is wrong about it alone would otherwise have to be mended by all others and every Gaussian
+    (:meth:`RefinedScene.seen_from` brings it back).
 
     Args:
         start: where to begin.
@@ -111,7 +130,7 @@ class Parameters:
     def _cameras(self, cameras: Cameras) -> Cameras:
         if not self.rates["cameras"] and not self.rates["focal"]:
             return cameras
-        moves = self.pixel * torch.cat((torch.zeros_like(self.values["cameras"][:1]), self.values["cameras"][1:]))
+        moves = self.pixel * self.values["cameras"]
         turn = quat_to_matrix(F.pad(moves[:, :3] / 2, (1, 0), value=1.0))
         top = torch.cat((turn, self.depth * moves[:, 3:, None]), -1)
         increment = torch.cat((top, cameras.world_to_camera[0, :, 3:]), -2)

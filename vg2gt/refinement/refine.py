@@ -71,7 +71,7 @@ class Refined:
 
     Attributes:
         start: the state before.
-        scene: the best state.
+        scene: the best state, in the frame in which the camera of view 0 is where it was.
         step: the step at which it was reached.
         steps: steps that were made.
         seconds: by the refinement's clock.
@@ -170,6 +170,8 @@ class _Refinement:
         trained = self.order.trained
         if not loss[trained].mean() <= self.start_loss[trained].mean():  # few views can be better by chance
             self.best, self.best_step, after = self.start, 0, self.start_psnr
+        elif self.options.rates.cameras:
+            self.best = self.best.seen_from(self.start.cameras.world_to_camera[0, 0])
         return Refined(
             start=self.start,
             scene=self.best,
