@@ -99,6 +99,12 @@ def test_seconds_end_it(start: Start) -> None:
     assert 3 < found.steps < 30
 
 
+def test_without_an_end_every_view_is_rendered_twelve_times() -> None:
+    assert RefineOptions().of(10).steps == 120
+    assert RefineOptions(views_per_step=4).of(10).steps == 30
+    assert RefineOptions(seconds=3).of(10).steps is None
+
+
 def test_colours_may_learn_to_depend_on_the_view(start: Start) -> None:
     found = run(start, RefineOptions(steps=3, sh_degree=1, loss=COLOUR))
     assert found.scene.gaussians.sh.shape[1] == 4
@@ -114,7 +120,7 @@ def test_exposures_share_nothing(refined: Refined) -> None:
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"steps": None}, "both null"),
+        ({"steps": 0}, "refine.steps must be at least 1, or null"),
         ({"holdout": 1}, "refine.holdout must be at least 2"),
         ({"max_growth": 0.5}, "refine.max_growth"),
     ],

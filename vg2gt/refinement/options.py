@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 
 from vg2gt.geometry.spherical_harmonics import MAX_DEGREE
 from vg2gt.refinement.loss import RefineLoss
+
+RENDERINGS = 12  # of each view, where nobody says how long
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,7 @@ class RefineOptions:
     """How long and how a scene is refined.
 
     Args:
-        steps: most steps; None: only ``seconds`` ends it.
+        steps: most steps; None: only ``seconds`` ends it, or, without these, 12 renderings of each view.
         seconds: most seconds by the clock; None: only ``steps`` ends it. The same number of steps gives the same scene
             on a CPU, the same number of seconds does not.
         views_per_step: views rendered in a step.
@@ -66,7 +68,7 @@ class RefineOptions:
         ValueError: naming an option that is out of range.
     """
 
-    steps: int | None = 100
+    steps: int | None = None
     seconds: float | None = None
     views_per_step: int = 1
     final_rate: float = 0.1
@@ -95,8 +97,12 @@ class RefineOptions:
         ):
             if not good:
                 raise ValueError(f"refine.{name} must be {expected}, got {getattr(self, name)}")
-        if self.steps is None and self.seconds is None:
-            raise ValueError("refine.steps and refine.seconds are both null: give one of them, or it would never end")
+
+    def of(self, views: int) -> RefineOptions:
+        """The same options for so many trained views, with an end."""
+        if self.steps is not None or self.seconds is not None:
+            return self
+        return replace(self, steps=-(-RENDERINGS * views // self.views_per_step))
 
     def done(self, step: int, seconds: float) -> float:
         """Share of the refinement that is done after so many steps and seconds, at most 1."""

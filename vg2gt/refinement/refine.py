@@ -138,10 +138,11 @@ class _Refinement:
         options: RefineOptions,
         clock: Callable[[], float],
     ) -> None:
-        self.seen, self.renderer, self.options, self.clock = seen, renderer, options, clock
+        self.seen, self.renderer, self.clock = seen, renderer, clock
         self.began = clock()
         self.trainer = renderer if options.loss.needs_geometry else replace(renderer, geometry=False)
         self.order = ViewOrder(len(seen.images), options.holdout, options.seed)
+        self.options = options.of(len(self.order.trained))
         self.limit = int(options.max_growth * len(gaussians))
         self.depth = _median_depth(gaussians, cameras, seen)
         self.pixel = 1 / float(cameras.intrinsics[..., [0, 1], [0, 1]].mean())
