@@ -42,8 +42,8 @@ def test_page(recording: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
     assert (recording.parent / "outputs" / "start" / "refined" / "refine.png").is_file()
     assert (recording.parent / "outputs" / "sharp" / "refine.png").is_file()
     capsys.readouterr()
-    (example,) = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
-    exec(compile(example, str(PAGE), "exec"), {})
-    assert capsys.readouterr().out == "True 1\n"
+    for example in re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL):
+        exec(compile(example, str(PAGE), "exec"), {})
+    assert capsys.readouterr().out == "True 1\nTrue\n"
     pictures = re.findall(r"!\[.*?\]\((.*?)\)", PAGE.read_text())
     assert all((PAGE.parent / picture).stat().st_size < 400_000 for picture in pictures)

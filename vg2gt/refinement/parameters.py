@@ -46,7 +46,7 @@ class RefinedScene(TensorRecord):
         moved = replace(
             gaussians,
             means=transform_points(move[None, None], gaussians.means[None, None])[0, 0],
-            quats=multiply_quats(matrix_to_quat(turn), gaussians.quats),
+            quats=multiply_quats(matrix_to_quat(turn)[None], gaussians.quats),
             sh=rotation_of_coefficients(turn, degree) @ gaussians.sh,
         )
         poses = torch.cat((first[None], compose(found[1:], back)))
