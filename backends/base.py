@@ -6,6 +6,7 @@ import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -26,10 +27,16 @@ class Backend(nn.Module, ABC):
         licence: licence of the weights, printed when they are loaded.
         is_metric: True if ``Geometry.scale`` turns the decoded depth into metres.
         supports_gradient: True if ``decode`` is differentiable in ``tokens.patch``.
-        needs_hints: True if ``encode`` cannot work without what the data knows.
+        needs_hints: True if ``encode`` cannot work without what the data knows, the cameras at least.
         min_views: fewest views that ``encode`` takes; it raises ValueError for fewer.
         predicts_cameras: False if its cameras are those of the hints.
+
+    Attributes:
+        needs_depth: of a class whose ``encode`` also needs the data's depth: it can do nothing with photographs, which
+            commands say before they build it.
     """
+
+    needs_depth: ClassVar[bool] = False
 
     def __init__(
         self,

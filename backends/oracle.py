@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -60,6 +60,8 @@ class OracleBackend(Backend):
     Raises:
         ValueError: if ``dim`` is too small, a noise level is negative or the background not behind the scene.
     """
+
+    needs_depth: ClassVar[bool] = True
 
     def __init__(
         self,

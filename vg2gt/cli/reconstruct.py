@@ -6,13 +6,19 @@ import argparse
 import logging
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vg2gt.cli.arguments import flag_parser, list_of_names, listing
 from vg2gt.cli.commands import COMMANDS
 from vg2gt.cli.errors import errors_in_one_line
 from vg2gt.cli.refine import print_refinement, refine_options
-from vg2gt.reconstruction.output_names import DEFAULT, ORBIT_FRAMES, OUTPUTS, REFINED
+from vg2gt.reconstruction.output_names import DEFAULT, ORBIT_FRAMES, OUTPUTS, REFINED, SFM
+
+POSES = (
+    "cameras from files beside the images, from structure from motion (kept in DIR/sfm), or the backbone's own; auto: "
+    "the first of these that the backbone needs and that is there"
+)
 
 if TYPE_CHECKING:
     from vg2gt.runs.load import LoadedModel
@@ -28,6 +34,7 @@ def parser() -> argparse.ArgumentParser:
     add("--backend", metavar="NAME[,KEY=VALUE...]", help="of configs/backend; default: the run's own")
     add("--model", metavar="NAME[,KEY=VALUE...]", help="of configs/model; default: the run's own")
     add("--set", action="append", default=[], metavar="KEY=VALUE", help="another option, such as model.fine.max_voxels")
+    add("--poses", choices=("auto", "given", "sfm", "backbone"), default="auto", help=POSES)
     add("--save", type=list_of_names, default=list(DEFAULT), metavar="LIST", help=f"default: {','.join(DEFAULT)}")
     add("--size", type=_size, metavar="N|HxW", help="longer side, or height x width, in pixels; default 518, CPU 280")
     add("--every", type=int, default=1, metavar="N", help="take every N-th image or frame only")
@@ -61,12 +68,14 @@ def run(options: argparse.Namespace) -> None:
     """Reconstructs and writes."""
     from vg2gt.io.video import require_pyav
     from vg2gt.memory import RECONSTRUCTION, memory_advice
+    from vg2gt.reconstruction.cameras import check_depth
     from vg2gt.reconstruction.monitor import Monitor
     from vg2gt.reconstruction.outputs import check_folder, check_outputs, cost_figures, write_outputs
     from vg2gt.reconstruction.pictures import existing_path
     from vg2gt.reconstruction.pipeline import reconstruct_with
     from vg2gt.reconstruction.refined import refine_scene
-    from vg2gt.runs.load import choose_device, load_model
+    from vg2gt.reconstruction.sfm import require_pycolmap
+    from vg2gt.runs.load import backend_class, choose_device, load_model
 
     check_outputs(options.save)
     more = [] if options.refine is None else [REFINED]
@@ -74,6 +83,10 @@ def run(options: argparse.Namespace) -> None:
     how = None if options.refine is None else refine_options(steps=options.refine or None)
     for item in options.images:  # before weights are downloaded
         existing_path(item)
+    if getattr(backend_class(options.ckpt, options.backend), "needs_depth", False):
+        check_depth((options.backend or "of the checkpoint").partition(",")[0], options.images)
+    if options.poses == "sfm" and not (Path(options.out) / SFM).exists():
+        require_pycolmap()
     if "orbit.mp4" in options.save:
         require_pyav("writing orbit.mp4")
     with Monitor(show=not options.quiet, device=choose_device(options.device)) as monitor:
@@ -87,6 +100,8 @@ def run(options: argparse.Namespace) -> None:
             size=options.size,
             renderer=replace(ready.renderer, mode=options.mode),
             monitor=monitor,
+            poses=options.poses,
+            sfm_folder=Path(options.out) / SFM,
         )
         if how is not None:
             scene = refine_scene(scene, how, monitor)
@@ -108,7 +123,7 @@ def run(options: argparse.Namespace) -> None:
     print(f"{len(scene.names)} images of {height}x{width}: {len(scene.gaussians)} Gaussians")
     if scene.refined is not None:
         print_refinement(scene)
-    print(f"weights: {figures['weights']}")
+    print(f"weights: {figures['weights']}; cameras: {scene.cameras_from or 'predicted by the backbone'}")
     print(f"seconds: {times}; peak memory {cost['peak_memory_mib']} MiB")
     print(f"written: {', '.join(str(folder / name) for name in (*options.save, *more))}")
 

@@ -68,14 +68,17 @@ def _ancestry(checkpoint: Path | None) -> Iterator[tuple[Path, DictConfig]]:
 
 
 def refuse_without_hints(model: Reconstructor, source: SceneSource) -> None:
-    """Refuses data without depth or cameras for a backbone that is told them.
+    """Refuses data without depth or cameras for a backbone that needs them.
 
     Raises:
         DataError: saying what is lacking.
     """
-    lacking = [name for name, there in (("depth", source.has_depth), ("cameras", source.has_cameras)) if not there]
-    if lacking and model.backend.needs_hints:
+    backend = model.backend
+    needed = {"depth": backend.needs_depth, "cameras": backend.needs_hints}
+    there = {"depth": source.has_depth, "cameras": source.has_cameras}
+    lacking = [name for name, needs in needed.items() if needs and not there[name]]
+    if lacking:
         raise DataError(
-            f"backend {model.backend.name} is told the data's depth and cameras, and {type(source).__name__} has no "
+            f"backend {backend.name} needs the data's {' and '.join(name for name in needed if needed[name])}, and {type(source).__name__} has no "
             f"{' and no '.join(lacking)}: choose another backend= or other data"
         )

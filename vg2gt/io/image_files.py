@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import statistics
 import struct
 import zlib
@@ -12,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import ExifTags, Image
 
 from vg2gt.io.errors import DataError
 from vg2gt.io.images import color_image, open_image
@@ -35,6 +36,7 @@ _TURNS = {
     8: Image.Transpose.ROTATE_90,
 }
 _QUARTER_TURNS = (5, 6, 7, 8)
+_FILM_DIAGONAL = math.hypot(36, 24)  # millimetres
 
 
 def image_size(path: Path, scene: str, upright: bool = False) -> Size:
@@ -51,6 +53,24 @@ def image_size(path: Path, scene: str, upright: bool = False) -> Size:
     with _opened(path, path, scene) as image:
         turned = upright and _orientation(image) in _QUARTER_TURNS
         return (image.width, image.height) if turned else (image.height, image.width)
+
+
+def focal_length(path: Path, size: Size) -> float | None:
+    """Focal length of a photograph in pixels, from what its EXIF data give in the terms of 35 mm film.
+
+    Args:
+        path: the file.
+        size: the image's ``(height, width)``; it is taken for the whole of what the camera saw.
+
+    Returns:
+        None where the data say nothing, or nothing sensible.
+    """
+    try:
+        with open_image(path) as image:
+            film = float(image.getexif().get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.FocalLengthIn35mmFilm, 0))
+    except Exception:  # the EXIF parser raises whatever the bytes lead it to
+        return None
+    return film * math.hypot(*size) / _FILM_DIAGONAL if 4 <= film <= 2000 else None
 
 
 def typical_size(sizes: Iterable[Size]) -> Size:

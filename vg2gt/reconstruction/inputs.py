@@ -7,6 +7,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -20,6 +21,8 @@ log = logging.getLogger(__name__)
 
 LONGER_SIDE = {"cuda": 518, "cpu": 280}  # pixels, by device; foundation models are trained at about 518
 _MUCH_LOST = 0.25
+_FEWEST_POINTS = 20  # observations of sparse points from which a range is told
+_OUTLIERS, _NEARER, _FARTHER = 1, 0.8, 1.4  # percent left out at either end, widening
 
 
 @dataclass(frozen=True)
@@ -116,4 +119,18 @@ def _hints(pictures: Sequence[Picture], frames: Sequence[Frames], size: tuple[in
         size,
     )
     depth = torch.cat([frame.depth for frame in frames])[None] if has_depth else None
-    return Hints(depth, cameras, tuple(sources), torch.arange(len(frames))[None])
+    return Hints(depth, cameras, tuple(sources), torch.arange(len(frames))[None], depth_range(pictures))
+
+
+def depth_range(pictures: Sequence[Picture]) -> Tensor | None:
+    """Near and far ``[1, 2]`` of what the pictures see, from their sparse points; None where there are too few.
+
+    The range of all but 1 % of the observed points at either end, widened: points lie where there is texture, so that
+    floors before the camera and bare walls behind are missed (``docs/reconstruct.md`` has the measurement).
+    """
+    known = [picture.point_depths for picture in pictures if picture.point_depths is not None]
+    depths = np.concatenate(known) if known else np.zeros(0)
+    if len(depths) < _FEWEST_POINTS:
+        return None
+    near, far = np.percentile(depths, (_OUTLIERS, 100 - _OUTLIERS))
+    return torch.tensor([[near * _NEARER, far * _FARTHER]], dtype=torch.float32)

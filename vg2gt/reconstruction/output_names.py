@@ -1,6 +1,7 @@
 """What can be written of a scene. Imports nothing, so that a command's help lists it at once."""
 
 ORBIT_FRAMES, FPS = 72, 24.0
+SFM = "sfm"  # folder of the cameras that structure from motion found, in the output folder
 
 MAPS = {
     "color.png": "rendered colour, a PNG per view in color/",

@@ -173,6 +173,7 @@ def scene_figures(scene: Scene) -> dict[str, Any]:
         "metres_per_unit": scene.metres_per_unit,
         "mode": scene.renderer.mode,
         **refinement_figures(scene),
+        "cameras": scene.cameras_from or "predicted by the backbone",
     }
 
 

@@ -1,4 +1,4 @@
-"""What may be reconstructed: photographs, folders, videos, posed recordings, arrays; one list of pictures of it all."""
+"""What may be reconstructed: photographs, folders, videos, arrays; one list of pictures of it all."""
 
 from __future__ import annotations
 
@@ -17,24 +17,18 @@ from PIL import Image, ImageOps
 from torch import Tensor
 
 from vg2gt.data.base import Frames
-from vg2gt.data.sources.colmap_model import COLMAP, model_folder_of
-from vg2gt.data.sources.files import FileSource
 from vg2gt.data.sources.image_folder import by_number
-from vg2gt.data.sources.nerfstudio import Nerfstudio
 from vg2gt.data.sources.parsing import IMAGE_SUFFIXES
-from vg2gt.data.sources.rgbd import RGBDFolder
 from vg2gt.data.transforms import from_bytes
-from vg2gt.io.image_files import image_size, read_color
+from vg2gt.io.image_files import focal_length, image_size, read_color
 from vg2gt.io.images import color_image
-from vg2gt.io.nerfstudio import read_transforms
 from vg2gt.io.video import VIDEO_SUFFIXES, count_frames, read_video
 
 ImagesLike: TypeAlias = "str | Path | Image.Image | NDArray[Any] | Tensor | Sequence[Any]"
 
 HEIC_SUFFIXES = (".heic", ".heif")
 VIDEO_FRAMES = 32  # taken from a video when nobody says how many
-_IMAGE_FOLDERS = ("images", "color", "rgb")
-_TRANSFORMS = "transforms.json"
+IMAGE_FOLDERS = ("images", "color", "rgb")
 
 
 @dataclass(frozen=True)
@@ -48,6 +42,9 @@ class Picture:
             cameras have the identity and a guessed focal length.
         source: where its camera (and depth, where ``has_depth``) comes from; empty where there is none.
         has_depth: whether its frame has depth.
+        point_depths: ``[n]`` z-depth of the sparse points that it sees; None where there are none.
+        focal: focal length in pixels that a photograph's EXIF data tell; None where they do not.
+        path: its file; None if it has none of its own.
     """
 
     name: str
@@ -55,20 +52,19 @@ class Picture:
     read: Callable[[tuple[int, int]], Frames]
     source: str = ""
     has_depth: bool = False
+    point_depths: NDArray[np.float32] | None = None
+    focal: float | None = None
+    path: Path | None = None
 
 
-def find_pictures(
-    images: ImagesLike, every: int = 1, max_images: int | None = None, posed: bool = False
-) -> list[Picture]:
-    """Lists the pictures of whatever somebody wants reconstructed.
+def find_pictures(images: ImagesLike, every: int = 1, max_images: int | None = None) -> list[Picture]:
+    """Lists the pictures of whatever somebody wants reconstructed, without their cameras.
 
     Args:
         images: a file, folder or video, a Pillow image, an array ``[H, W, 3]`` or ``[V, H, W, 3]`` (uint8), a tensor
             ``[3, H, W]`` or ``[V, 3, H, W]`` in [0, 1], or a sequence of these, in any mixture.
         every: take every this many-th picture (of videos: frame) only.
         max_images: take at most so many, evenly spread; None: all, of a video 32 frames unless ``every`` is given.
-        posed: cameras are needed: folders are read as recordings with known cameras (RGB-D folders,
-            ``transforms.json``, COLMAP models), depth too where they have it.
 
     Returns:
         The pictures in order, their names unique.
@@ -77,22 +73,38 @@ def find_pictures(
         FileNotFoundError: if a path does not exist.
         ValueError: if there is no picture, naming what was looked at, or a file cannot be read.
     """
-    if every < 1 or (max_images is not None and max_images < 1):
-        raise ValueError(f"every and max_images must be at least 1, got {every} and {max_images}")
-    items = list(images) if isinstance(images, (list, tuple)) else [images]
+    check_choice(every, max_images)
     chosen: list[Picture] = []
     stills = 0
-    for item in items:
-        found = _posed_pictures(item) if posed else _pictures(item, every, max_images)
+    for item in as_items(images):
+        found = _pictures(item, every, max_images)
         if not _is_video(item):  # of a video every so many-th frame was decoded
             stills += len(found)
             found = [picture for i, picture in enumerate(found, stills - len(found)) if i % every == 0]
         chosen += found
     if not chosen:
         raise ValueError("there are no images to reconstruct; give image files, a folder of them, or a video")
-    if max_images is not None and len(chosen) > max_images:
-        chosen = [chosen[i] for i in spread(len(chosen), max_images)]
-    return _with_unique_names(chosen)
+    return with_unique_names(evenly(chosen, max_images))
+
+
+def as_items(images: ImagesLike) -> list[Any]:
+    """What was given as a list."""
+    return list(images) if isinstance(images, (list, tuple)) else [images]
+
+
+def check_choice(every: int, max_images: int | None) -> None:
+    """Checks which images are asked for.
+
+    Raises:
+        ValueError: if a number is below 1.
+    """
+    if every < 1 or (max_images is not None and max_images < 1):
+        raise ValueError(f"every and max_images must be at least 1, got {every} and {max_images}")
+
+
+def evenly(pictures: list[Picture], limit: int | None) -> list[Picture]:
+    """At most ``limit`` of the pictures, evenly spread; None: all."""
+    return pictures if limit is None or len(pictures) <= limit else [pictures[i] for i in spread(len(pictures), limit)]
 
 
 def existing_path(item: str | Path) -> Path:
@@ -124,14 +136,18 @@ def _pictures(item: Any, every: int, max_images: int | None) -> list[Picture]:
         return _from_memory(item)
     path = existing_path(item)
     if path.is_dir():
-        return [_photo(file) for file in _image_files(path)]
+        return [_photo(file) for file in image_files(path)]
     return _video(path, every, max_images) if _is_video(path) else [_photo(path)]
 
 
-def _image_files(folder: Path) -> list[Path]:
-    """Images of a folder or, where it has none, of its folder of images; in the order of the numbers in their names."""
+def image_files(folder: Path) -> list[Path]:
+    """Images of a folder or, where it has none, of its folder of images; in the order of the numbers in their names.
+
+    Raises:
+        ValueError: if there are none.
+    """
     suffixes = (*IMAGE_SUFFIXES, *HEIC_SUFFIXES)
-    for place in (folder, *(folder / name for name in _IMAGE_FOLDERS)):
+    for place in (folder, *(folder / name for name in IMAGE_FOLDERS)):
         inside = sorted(place.iterdir(), key=by_number) if place.is_dir() else []
         files = [file for file in inside if file.suffix.lower() in suffixes and not file.name.startswith(".")]
         if files:
@@ -149,7 +165,8 @@ def _photo(path: Path) -> Picture:
     def read(size: tuple[int, int]) -> Frames:
         return frame_of(shrunk(read_color(path, place, upright=True), size))
 
-    return Picture(path.stem, image_size(path, place, upright=True), read)
+    size = image_size(path, place, upright=True)
+    return Picture(path.stem, size, read, focal=focal_length(path, size), path=path)
 
 
 def _open_heic(path: Path) -> None:
@@ -199,49 +216,12 @@ def _from_memory(item: Any) -> list[Picture]:
     return [_in_memory("image", image) for image in (pixels[None] if pixels.ndim == 3 else pixels)]
 
 
-def _posed_pictures(item: Any) -> list[Picture]:
-    path = existing_path(item) if isinstance(item, (str, Path)) else None
-    source = _source(path) if path is not None and path.is_dir() else None
-    if source is None:
-        raise ValueError(
-            f"this backend needs known cameras, and {path or type(item).__name__} has none. Give a recording's folder "
-            f"(depth images with poses, {_TRANSFORMS}, or a COLMAP model), or take a backend that works from images "
-            "alone, such as da3_small or vggt_1b"
-        )
-    if len(source.scenes) > 1:
-        raise ValueError(f"{path} holds {len(source.scenes)} recordings; give one of them: {', '.join(source.scenes)}")
-    scene = source.scenes[0]
-    index = source.scene_index(scene)
-    frames = source.frames(scene)
-    kind = f"{type(source).__name__} {index.folder}"
-
-    def reader(frame: int) -> Callable[[tuple[int, int]], Frames]:
-        return lambda _: source.load(scene, [frame])
-
-    return [
-        Picture(index.color[index.row(frame)].stem, index.size, reader(frame), kind, source.has_depth)
-        for frame in frames
-    ]
-
-
-def _source(folder: Path) -> FileSource | None:
-    """The recording that a folder holds, with depth where it has any; None for mere photographs."""
-    if (folder / _TRANSFORMS).is_file():
-        with_depth = any(frame.depth_file_path for frame in read_transforms(folder / _TRANSFORMS).frames)
-        return Nerfstudio(str(folder), depth=with_depth)
-    if model_folder_of(folder) is not None:
-        return COLMAP(str(folder))
-    if (folder / "depth").is_dir() or any(folder.glob("frame-*.color.*")):
-        return RGBDFolder(str(folder), holdout=None)
-    return None
-
-
 def spread(count: int, limit: int) -> Iterable[int]:
     """``limit`` of ``count`` positions, evenly spread, the first and the last among them."""
     return [round(i * (count - 1) / max(limit - 1, 1)) for i in range(limit)]
 
 
-def _with_unique_names(pictures: Sequence[Picture]) -> list[Picture]:
+def with_unique_names(pictures: Sequence[Picture]) -> list[Picture]:
     """Numbers pictures of equal names."""
     counts = Counter(picture.name for picture in pictures)
     taken, result = {name for name, count in counts.items() if count == 1}, []

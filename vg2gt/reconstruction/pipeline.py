@@ -8,9 +8,10 @@ import torch
 
 from vg2gt.memory import RECONSTRUCTION, memory_advice, note_sizes
 from vg2gt.model import Reconstructor
+from vg2gt.reconstruction.cameras import Poses, pictures_for
 from vg2gt.reconstruction.inputs import Views, load_views, working_size
 from vg2gt.reconstruction.monitor import Monitor
-from vg2gt.reconstruction.pictures import ImagesLike, find_pictures
+from vg2gt.reconstruction.pictures import ImagesLike
 from vg2gt.reconstruction.scene import Scene
 from vg2gt.rendering import Renderer
 from vg2gt.runs.load import load_model
@@ -42,31 +43,44 @@ def reconstruct_with(
     size: int | tuple[int, int] | None = None,
     renderer: Renderer | None = None,
     monitor: Monitor | None = None,
+    poses: Poses = "auto",
+    sfm_folder: str | Path | None = None,
 ) -> Scene:
     """Reconstructs a scene from any number of images.
 
     Args:
         model: the model; it is put into eval mode.
-        images: see :func:`vg2gt.reconstruction.find_pictures`.
+        images: see :func:`vg2gt.reconstruction.pictures.find_pictures`.
         every: take every this many-th image only.
         max_images: take at most so many, evenly spread.
         size: see :func:`vg2gt.reconstruction.working_size`.
         renderer: how the scene will be rendered; None: as solids, with the default options.
         monitor: told of the stages.
+        poses: where cameras come from, see :func:`vg2gt.reconstruction.cameras.pictures_for`.
+        sfm_folder: where cameras that structure from motion finds are kept, and found again; None: they are not.
 
     Returns:
         The scene, in the frame of the first image's camera; its Gaussians stay on the model's device.
 
     Raises:
         FileNotFoundError: if a path does not exist.
+        ImportError: if cameras must be found and there is no pycolmap.
         ValueError: if there are no images, one cannot be read, or the backend needs what they do not have.
         OutOfMemory: if the device's memory is full.
     """
     monitor = monitor or Monitor()
     device = next((parameter.device for parameter in model.parameters()), torch.device("cpu"))
-    pictures = find_pictures(images, every, max_images, posed=model.backend.needs_hints)
-    target = working_size([p.size for p in pictures], model.backend.patch_size, device.type, size)
-    with memory_advice(RECONSTRUCTION):
+    chosen = pictures_for(
+        model,
+        images,
+        poses,
+        every=every,
+        max_images=max_images,
+        sfm_folder=None if sfm_folder is None else Path(sfm_folder),
+        monitor=monitor,
+    )
+    with memory_advice(RECONSTRUCTION), chosen as pictures:
+        target = working_size([p.size for p in pictures], model.backend.patch_size, device.type, size)
         note_sizes({f"images of {target[0]}x{target[1]}": len(pictures)})
         views = load_views(pictures, target, monitor)
         prediction = _forward(model.eval(), views, device, monitor)
@@ -92,4 +106,5 @@ def _scene(prediction: Prediction, views: Views, renderer: Renderer, is_metric: 
         names=views.names,
         renderer=renderer,
         metres_per_unit=float(geometry.scale) if is_metric else None,
+        cameras_from="" if views.hints is None else views.hints.scene_key[0],
     )

@@ -73,6 +73,7 @@ class Scene:
         renderer: how it is rendered.
         metres_per_unit: metres per scene unit; None where nobody knows.
         refined: how it was refined; None where it was not.
+        cameras_from: where the backbone was given cameras from; empty if it predicted them.
     """
 
     gaussians: Gaussians
@@ -83,6 +84,7 @@ class Scene:
     names: tuple[str, ...]
     renderer: Renderer
     metres_per_unit: float | None = None
+    cameras_from: str = ""
     refined: Refined | None = None
 
     def named_cameras(self) -> list[NamedCamera]:

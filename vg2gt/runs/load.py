@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 from hydra.errors import HydraException
-from hydra.utils import instantiate
+from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -86,13 +86,8 @@ def load_model(
         ValueError: if neither a checkpoint nor a backend is given, a name or an option is unknown, or the checkpoint
             belongs to another backbone.
     """
-    if ckpt is None and backend is None:
-        choices = ", ".join(group_options("backend"))
-        raise ValueError(f"name a checkpoint, or a backend for the untrained head, one of: {choices}")
     checkpoint = checkpoint_path(ckpt)
-    given = {"backend": backend, "model": model}
-    config = OmegaConf.create({part: compose_part(part, spec) for part, spec in given.items() if spec is not None})
-    parts = resolve_parts(config, checkpoint)
+    parts = _named_parts(checkpoint, backend, model)
     for option in options:
         part, _, change = option.partition(".")
         if part not in PARTS:
@@ -110,6 +105,25 @@ def load_model(
     if checkpoint is None and built.trained_parameters():
         log.warning("no checkpoint: the head is untrained and makes coloured voxels (give ckpt for a trained one)")
     return LoadedModel(built, replace(renderer, mode="solid", depth="median"), weights)
+
+
+def backend_class(ckpt: str | Path | None = None, backend: str | None = None) -> type:
+    """Class of the backend that :func:`load_model` would build, which is asked before that takes its time.
+
+    Raises:
+        FileNotFoundError: if there is no such checkpoint, or its run's ``config.yaml`` is missing.
+        ValueError: if neither a checkpoint nor a backend is given, or a name is unknown.
+    """
+    return get_class(_named_parts(checkpoint_path(ckpt), backend, None)["backend"]["_target_"])
+
+
+def _named_parts(checkpoint: Path | None, backend: str | None, model: str | None) -> dict[str, DictConfig]:
+    if checkpoint is None and backend is None:
+        choices = ", ".join(group_options("backend"))
+        raise ValueError(f"name a checkpoint, or a backend for the untrained head, one of: {choices}")
+    given = {"backend": backend, "model": model}
+    config = OmegaConf.create({part: compose_part(part, spec) for part, spec in given.items() if spec is not None})
+    return resolve_parts(config, checkpoint)
 
 
 def resolve_parts(config: DictConfig, checkpoint: Path | None) -> dict[str, DictConfig]:

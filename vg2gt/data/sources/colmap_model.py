@@ -59,6 +59,7 @@ class COLMAP(FileSource):
         self.images = images
         self.has_depth = depth is not None
         self._points: dict[str, _Points] = {}
+        self._all_points: dict[str, _Points] = {}
         super().__init__(root, **shared)
 
     def is_scene(self, folder: Path) -> bool:
@@ -98,6 +99,12 @@ class COLMAP(FileSource):
         np.minimum.at(depth, (pixels[:, 1], pixels[:, 0]), points.depth(frame))
         return np.where(np.isfinite(depth), depth, 0)
 
+    def point_depths(self, scene: str, frame: int) -> NDArray[np.float32]:
+        """``[n]`` positive z-depth of all points that a frame's image saw, however many others did."""
+        if scene not in self._all_points:
+            self._all_points = {scene: _Points(self._read_model(scene, self._folders[scene])[0], min_track=1)}
+        return self._all_points[scene].depth(frame)
+
     def _scene_points(self, scene: str, folder: Path) -> _Points:
         if scene not in self._points:
             if len(self._points) >= _SCENES_IN_MEMORY:
@@ -116,8 +123,8 @@ class COLMAP(FileSource):
 class _Points:
     """The points that each view saw, by frame number: where in the image, as a part of its size, and how deep."""
 
-    def __init__(self, model: ColmapModel) -> None:
-        used = (model.points.track_lengths >= MIN_TRACK) & (np.abs(model.points.positions) < 1e30).all(1)
+    def __init__(self, model: ColmapModel, min_track: int = MIN_TRACK) -> None:
+        used = (model.points.track_lengths >= min_track) & (np.abs(model.points.positions) < 1e30).all(1)
         order = np.argsort(model.points.ids)
         self._views: list[tuple[NDArray[np.float64], NDArray[np.float32]]] = []
         for record in _in_order(model):

@@ -7,7 +7,7 @@ Layouts, told apart by what is there:
   or in ``intrinsic/intrinsic_{color,depth}.txt`` (4x4, as ScanNet is exported);
 * 7-Scenes: ``frame-NNNNNN.{color.png|jpg,depth.png,pose.txt}`` in one folder, intrinsics in ``camera-intrinsics.txt``.
 
-Poses are camera-to-world, OpenCV, metres.
+Poses are camera-to-world, OpenCV, metres. Without depth the unit may be any.
 """
 
 from __future__ import annotations
@@ -72,6 +72,7 @@ class RGBDFolder(FileSource):
         invalid: stored values that mean "no depth".
         holdout: hold out every this many-th frame; None: none.
         intrinsics: (fx, fy, cx, cy) in pixels of the colour images, where the folder has no intrinsics or wrong ones.
+        depth: read depth; False: posed images alone, which may also lie beside ``poses.txt`` and ``K.txt``.
         shared: see ``FileSource``.
     """
 
@@ -80,7 +81,7 @@ class RGBDFolder(FileSource):
         "or up to two folders deeper"
     )
     names_are_paths = True
-    index_options = ("intrinsics",)
+    index_options = ("intrinsics", "has_depth")
 
     def __init__(
         self,
@@ -89,15 +90,20 @@ class RGBDFolder(FileSource):
         invalid: Sequence[int] = (0, 65535),
         holdout: int | None = 6,
         intrinsics: Sequence[float] | None = None,
+        depth: bool = True,
         **shared: Unpack[FileOptions],
     ) -> None:
+        self.has_depth = depth
+        self.is_metric = depth
         self.depth_scale = positive("depth_scale", depth_scale, "stored units per metre")
         self.invalid = tuple(int(value) for value in invalid)
         self.intrinsics = four_intrinsics(intrinsics)
         super().__init__(root, holdout=holdout, **shared)
 
     def is_scene(self, folder: Path) -> bool:
-        """Whether it has colour and depth in one of the layouts."""
+        """Whether it has colour and depth in one of the layouts, or, where depth is not asked for, poses."""
+        if not self.has_depth:
+            return (folder / "poses.txt").is_file() or any((folder / name).is_dir() for name in _POSE_FOLDERS)
         in_folders = (folder / "depth").is_dir() and any((folder / name).is_dir() for name in _COLOR_FOLDERS)
         return in_folders or any(folder.glob("frame-*.color.*"))
 
@@ -114,17 +120,21 @@ class RGBDFolder(FileSource):
 
     def index(self, scene: str, folder: Path) -> SceneIndex:
         """Lists a recording's files and reads its poses and intrinsics."""
-        in_folders = (folder / "depth").is_dir()
+        in_folders = (folder / "depth").is_dir() or not self.has_depth
         files = _files_in_folders(folder, scene) if in_folders else _files_of_seven_scenes(folder, scene)
-        check_found(scene, folder, {"colour images": files.color, "depth images": files.depth})
-        color_size, depth_size = first_size(files.color, scene), first_size(files.depth, scene)
+        check_found(scene, folder, {"colour images": files.color})
+        depth = files.depth if self.has_depth else None
+        if depth is not None:
+            check_found(scene, folder, {"depth images": depth})
+        color_size = first_size(files.color, scene)
+        depth_size = color_size if depth is None else first_size(depth, scene)
         poses = _read_poses(files, scene)
         intrinsics = self._depth_intrinsics(files.intrinsics, folder, scene, color_size, depth_size)
         index = make_index(
             scene,
             folder,
             files.color,
-            files.depth,
+            depth,
             poses,
             intrinsics,
             color_size,
@@ -177,12 +187,12 @@ def _say(message: str, level: int = logging.INFO) -> None:
 
 
 def _files_in_folders(folder: Path, scene: str) -> _Files:
-    color = next(folder / name for name in _COLOR_FOLDERS if (folder / name).is_dir())
+    color = next((folder / name for name in _COLOR_FOLDERS if (folder / name).is_dir()), folder)
     pose_folder = next((folder / name for name in _POSE_FOLDERS if (folder / name).is_dir()), None)
     poses = numbered(pose_folder, scene, suffixes=(".txt",)) if pose_folder else folder / "poses.txt"
     single = [path for path in _beside(folder) if path.is_file()][:1]
     return _Files(
-        layout=f"folders {color.name}/ and depth/",
+        layout=f"folders {color.name}/ and depth/" if (folder / "depth").is_dir() else f"images in {color.name}/",
         color=numbered(color, scene),
         depth=numbered(folder / "depth", scene),
         poses=poses,

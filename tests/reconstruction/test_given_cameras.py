@@ -1,0 +1,247 @@
+"""Cameras that lie beside the images, in which order they are taken, and who gets them."""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from tests.reconstruction.stand_in import PlaneAhead
+from vg2gt.cli import reconstruct as reconstruct_command
+from vg2gt.geometry.cameras import resize_intrinsics, unproject
+from vg2gt.io import (
+    Lens,
+    NamedCamera,
+    Transforms,
+    TransformsFrame,
+    colmap_from_views,
+    write_cameras_json,
+    write_colmap,
+    write_transforms,
+)
+from vg2gt.reconstruction import sfm
+from vg2gt.reconstruction.cameras import pictures_for
+from vg2gt.reconstruction.given_cameras import given_pictures
+from vg2gt.reconstruction.inputs import Views, depth_range, load_views
+from vg2gt.reconstruction.monitor import Monitor
+from vg2gt.reconstruction.pictures import Picture
+from vg2gt.reconstruction.pipeline import reconstruct_with
+from vg2gt.runs.load import load_model
+from vg2gt.types import Cameras
+
+STAND_IN = f"custom,_target_={PlaneAhead.__module__}.{PlaneAhead.__name__}"
+SIZE = (84, 112)
+NAMES = [f"{8 + i:03d}.png" for i in range(4)]
+
+
+@pytest.fixture(scope="module")
+def model():
+    return load_model(backend=STAND_IN, device="cpu").model
+
+
+@pytest.fixture
+def folder(recording: Path, tmp_path: Path) -> Path:
+    """The recording's images alone."""
+    shutil.copytree(recording / "images", tmp_path / "room" / "images")
+    return tmp_path / "room"
+
+
+def put_poses(folder: Path, recording: Path) -> None:
+    for name in ("poses.txt", "K.txt"):
+        shutil.copy(recording / name, folder / name)
+
+
+def put_colmap(folder: Path, frames) -> None:
+    cameras = Cameras(frames.world_to_camera[None].double(), frames.intrinsics[None].double(), SIZE)
+    world = unproject(frames.depth[None].double(), cameras)[0]  # [V, H, W, 3]
+    pixels = np.stack(np.meshgrid(np.arange(3, 112, 9), np.arange(3, 84, 9)), -1).reshape(-1, 2)
+    points = torch.cat([view[pixels[:, 1], pixels[:, 0]] for view in world]).numpy()
+    views = np.repeat(np.arange(4), len(pixels))
+    sources = (views, np.tile(pixels, (4, 1)))
+    write_colmap(folder / "sparse" / "0", colmap_from_views(cameras, NAMES, points, sources=sources))
+
+
+def put_transforms(folder: Path, frames) -> None:
+    lens = Lens.from_intrinsics(frames.intrinsics[0].double().numpy(), SIZE)
+    poses = frames.world_to_camera.double().numpy()
+    records = [TransformsFrame(f"images/{name}", pose, lens) for name, pose in zip(NAMES, poses, strict=True)]
+    write_transforms(folder / "transforms.json", Transforms(tuple(records)))
+
+
+def put_cameras(folder: Path, frames, names=NAMES, size=SIZE, intrinsics=None) -> None:
+    k = frames.intrinsics[0].double().numpy() if intrinsics is None else intrinsics
+    poses = frames.world_to_camera.double().numpy()
+    cameras = [NamedCamera(name, size[1], size[0], k, pose) for name, pose in zip(names, poses, strict=False)]
+    write_cameras_json(folder / "cameras.json", cameras)
+
+
+def views_of(pictures: list[Picture] | None) -> Views:
+    assert pictures is not None
+    return load_views(pictures, SIZE, Monitor())
+
+
+def check_cameras(pictures: list[Picture] | None, frames, kind: str) -> None:
+    assert pictures is not None
+    assert {picture.source.split(" ")[0] for picture in pictures} == {kind}
+    views = views_of(pictures)
+    assert views.names == ("008", "009", "010", "011")
+    assert views.hints is not None
+    assert views.hints.cameras is not None
+    assert torch.allclose(views.hints.cameras.world_to_camera[0], frames.world_to_camera, atol=1e-4)
+    assert torch.allclose(views.hints.cameras.intrinsics[0], frames.intrinsics, atol=1e-3)
+    assert torch.allclose(views.images, frames.images, atol=1 / 400)
+
+
+@pytest.mark.parametrize("inside", [False, True])
+def test_cameras_are_looked_for_in_their_order(inside: bool, folder: Path, recording: Path, frames) -> None:
+    """Each kind goes before those that were put there earlier; also seen from the folder of images."""
+    place = folder / "images" if inside else folder
+    assert given_pictures(place) is None
+    put_poses(folder, recording)
+    check_cameras(given_pictures(place), frames, "RGBDFolder")
+    put_colmap(folder, frames)
+    check_cameras(given_pictures(place), frames, "COLMAP")
+    put_transforms(folder, frames)
+    check_cameras(given_pictures(place), frames, "Nerfstudio")
+    put_cameras(folder, frames)
+    check_cameras(given_pictures(place), frames, "cameras.json")
+
+
+def test_cameras_among_the_images(folder: Path, recording: Path, frames) -> None:
+    put_poses(folder / "images", recording)
+    check_cameras(given_pictures(folder / "images"), frames, "RGBDFolder")
+    put_colmap(folder / "images", frames)
+    check_cameras(given_pictures(folder / "images"), frames, "COLMAP")
+    put_cameras(folder / "images", frames)
+    check_cameras(given_pictures(folder / "images"), frames, "cameras.json")
+
+
+def test_depth_is_read_where_a_recording_has_it(recording: Path, tmp_path: Path, frames) -> None:
+    shutil.copytree(recording, tmp_path / "room")
+    put_cameras(tmp_path / "room", frames)  # goes before the recording for whoever needs no depth
+    with_depth = given_pictures(tmp_path / "room", depth=True)
+    check_cameras(with_depth, frames, "RGBDFolder")
+    assert all(picture.has_depth for picture in with_depth or [])
+    check_cameras(given_pictures(tmp_path / "room"), frames, "cameras.json")
+
+
+def test_every_and_max_images(folder: Path, recording: Path) -> None:
+    put_poses(folder, recording)
+    assert [p.name for p in given_pictures(folder, every=2) or []] == ["008", "010"]
+    assert [p.name for p in given_pictures(folder, max_images=2) or []] == ["008", "011"]
+    assert given_pictures([folder, folder / "images" / "008.png"]) is None
+
+
+def test_cameras_json_of_larger_images_and_without_some(folder: Path, frames, caplog) -> None:
+    double = resize_intrinsics(frames.intrinsics[0].double(), 2, 2).numpy()
+    put_cameras(folder, frames, ["images/008.jpg", "009", "010.png"], (168, 224), double)
+    pictures = given_pictures(folder)
+    assert [p.name for p in pictures or []] == ["008", "009", "010"]
+    assert "left out: 011.png" in caplog.text
+    hints = views_of(pictures).hints
+    assert hints is not None
+    assert hints.cameras is not None
+    assert torch.allclose(hints.cameras.intrinsics[0], frames.intrinsics[:3], atol=1e-3)
+    put_cameras(folder, frames, size=(84, 84))
+    with pytest.raises(ValueError, match=r"008.png is 112x84 pixels, but .*cameras.json was made for 84x84"):
+        given_pictures(folder)
+    put_cameras(folder, frames, ["a", "b"])
+    with pytest.raises(ValueError, match=r"names none of the 4 images"):
+        given_pictures(folder)
+
+
+def test_range_of_depth_is_that_of_the_points_widened(folder: Path, frames) -> None:
+    put_colmap(folder, frames)
+    hints = views_of(given_pictures(folder)).hints
+    assert hints is not None
+    assert hints.depth_range is not None
+    near, far = hints.depth_range[0].tolist()
+    seen = frames.depth[frames.depth > 0]
+    assert near < seen.quantile(0.01)
+    assert far > seen.quantile(0.99)
+    assert far / near < 2.5 * float(seen.quantile(0.99) / seen.quantile(0.01))
+
+
+def test_range_of_depth_ignores_a_few_wild_points_and_needs_some() -> None:
+    def picture(depths) -> Picture:
+        return Picture("a", SIZE, lambda size: None, point_depths=np.asarray(depths, np.float32))  # pyright: ignore
+
+    rows = np.linspace(2, 4, 500)
+    told = depth_range([picture(rows), picture([*rows, 1e6, 1e-6])])
+    assert told is not None
+    assert told.tolist()[0] == pytest.approx([0.8 * 2.02, 1.4 * 3.98], rel=0.01)
+    assert depth_range([picture(rows[:5])]) is None
+    assert depth_range([replace(picture(rows), point_depths=None)]) is None
+
+
+def test_a_backend_that_needs_cameras_gets_them_with_the_range(model, folder: Path, frames) -> None:
+    put_colmap(folder, frames)
+    scene = reconstruct_with(model, folder)
+    assert scene.cameras_from == f"COLMAP {folder}"
+    relative = frames.world_to_camera @ torch.linalg.inv(frames.world_to_camera[:1])
+    assert torch.allclose(scene.cameras.world_to_camera[0, :, :3, :3], relative[:, :3, :3], atol=1e-4)
+
+
+def choose(model, images, poses="auto", **options):
+    with pictures_for(model, images, poses, **options) as pictures:
+        return pictures
+
+
+def test_who_gets_which_cameras(model, folder: Path, recording: Path, ready, monkeypatch) -> None:
+    asked: list[int] = []
+
+    def find(pictures, place, monitor):
+        asked.append(len(pictures))
+        return [replace(picture, source="sfm") for picture in pictures]
+
+    monkeypatch.setattr("vg2gt.reconstruction.cameras.find_cameras", find)
+    images_alone = load_model(backend="da3_tiny", device="cpu").model
+    assert {p.source for p in choose(model, folder)} == {"sfm"}
+    assert asked == [4]
+    with pytest.raises(ValueError, match=r"no cameras lie beside .*room: expected cameras.json.*--poses sfm finds"):
+        choose(model, folder, "given")
+    put_poses(folder, recording)
+    assert {p.source for p in choose(model, folder)} == {p.source for p in choose(model, folder, "given")} != {"sfm"}
+    assert asked == [4]
+    assert {p.source for p in choose(model, folder, "sfm", max_images=3)} == {"sfm"}
+    assert asked == [4, 3]
+    with pytest.raises(ValueError, match="plane_ahead predicts no cameras"):
+        choose(model, folder, "backbone")
+    for poses in ("auto", "backbone"):
+        assert {p.source for p in choose(images_alone, folder, poses)} == {""}
+    for poses in ("given", "sfm"):
+        with pytest.raises(ValueError, match="da3_tiny takes no cameras, it predicts its own"):
+            choose(images_alone, folder, poses)
+    with pytest.raises(ValueError, match="works from the depth and poses of a recording"):
+        choose(ready.model, recording, "sfm")
+    with pytest.raises(ValueError, match="choose one of auto, given, sfm, backbone"):
+        choose(model, folder, "mine")  # pyright: ignore[reportArgumentType]
+    assert asked == [4, 3]
+
+
+@pytest.mark.parametrize("trained", [False, True])
+def test_photographs_for_the_oracle_are_refused_before_any_work(
+    trained: bool, photos: Path, run_folder: Path, tmp_path: Path, monkeypatch
+) -> None:
+    monkeypatch.setattr("vg2gt.runs.load.build_model", lambda *_: pytest.fail("built a model"))
+    chosen = ["--ckpt", str(run_folder)] if trained else ["--backend", "oracle"]
+    with pytest.raises(SystemExit) as stopped:
+        reconstruct_command.main([str(photos), *chosen, "--out", str(tmp_path / "out"), "--quiet"])
+    said = str(stopped.value)
+    assert "works from measured depth, and there is none with" in said
+    assert "--backend da3_small" in said
+    assert "hints" not in said
+    assert not (tmp_path / "out").exists()
+
+
+def test_without_pycolmap_one_line_names_the_extra(model, photos: Path, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(sfm.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(ImportError, match=r"pip install 'vg2gt\[sfm\]'"):
+        reconstruct_with(model, photos)
+    monkeypatch.setattr("vg2gt.runs.load.build_model", lambda *_: pytest.fail("built a model"))
+    with pytest.raises(SystemExit, match=r"pip install 'vg2gt\[sfm\]'"):
+        reconstruct_command.main(
+            [str(photos), "--backend", STAND_IN, "--poses", "sfm", "--out", str(tmp_path / "out"), "--quiet"]
+        )

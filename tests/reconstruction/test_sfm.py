@@ -1,0 +1,199 @@
+"""Cameras by structure from motion: on real photographs, and what happens around it."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch import Tensor
+
+from tests.reconstruction.test_given_cameras import STAND_IN
+from vg2gt.cli import reconstruct as reconstruct_command
+from vg2gt.geometry.alignment import align_points
+from vg2gt.geometry.cameras import camera_centers
+from vg2gt.io import read_colmap
+from vg2gt.io.image_files import focal_length
+from vg2gt.metrics.cameras import relative_pose_errors
+from vg2gt.reconstruction import sfm
+from vg2gt.reconstruction.inputs import depth_range, load_views
+from vg2gt.reconstruction.monitor import Monitor
+from vg2gt.reconstruction.pictures import Picture, find_pictures
+from vg2gt.types import Cameras
+
+COUNT = 8
+
+
+@pytest.fixture(scope="module")
+def office(shared: Path) -> Path:
+    return shared / "data" / "hololens_office_a"
+
+
+@pytest.fixture(scope="module")
+def given(office: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Eight photographs that overlap, and one of nothing that they show."""
+    folder = tmp_path_factory.mktemp("holiday") / "photos"
+    folder.mkdir()
+    for path in sorted((office / "images").iterdir())[:COUNT]:
+        shutil.copy(path, folder / path.name)
+    noise = np.random.default_rng(0).integers(0, 255, (360, 540, 3), np.uint8)
+    Image.fromarray(noise).save(folder / "99999 of something else.png")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def solved(given: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where the result is kept."""
+    pytest.importorskip("pycolmap")
+    folder = tmp_path_factory.mktemp("outputs") / "room" / "sfm"
+    monitor = Monitor()
+    sfm.find_cameras(find_pictures(given), folder, monitor)
+    assert list(monitor.seconds) == ["read photographs", "find features", "match features", "place cameras"]
+    return folder
+
+
+def again(given: Path, folder: Path) -> list[Picture]:
+    return sfm.find_cameras(find_pictures(given), folder, Monitor())
+
+
+@pytest.fixture
+def unsolvable(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sfm, "_solve", lambda *_: pytest.fail("computed again"))
+
+
+@pytest.mark.usefixtures("unsolvable")
+def test_same_images_are_not_computed_again_and_the_unplaced_is_named(given: Path, solved: Path, caplog) -> None:
+    pictures = again(given, solved)
+    assert [picture.name for picture in pictures] == [picture.name for picture in find_pictures(given)[:COUNT]]
+    assert "1 of 9 images show too little" in caplog.text
+    assert "left out: 99999 of something else" in caplog.text
+    assert {picture.source for picture in pictures} == {"structure from motion, 8 of 9 images"}
+
+
+def test_other_images_are_computed_anew(given: Path, solved: Path, tmp_path: Path, monkeypatch) -> None:
+    folder = shutil.copytree(solved, tmp_path / "sfm")
+    photos = shutil.copytree(given, tmp_path / "photos")
+    counts: list[int] = []
+    state = json.loads((folder / "sfm.json").read_text())
+    monkeypatch.setattr(sfm, "_solve", lambda pictures, *_: counts.append(len(pictures)) or state)
+    first = min(photos.iterdir())
+    again(photos, folder)
+    assert counts == []
+    first.write_bytes(first.read_bytes() + b"\0")  # one byte of one file
+    again(photos, folder)
+    assert counts == [9]
+    (photos / "99999 of something else.png").unlink()
+    again(photos, folder)
+    assert counts == [9, 8]
+    (folder / "sfm.json").write_text('{"key": ')
+    again(given, folder)
+    assert counts == [9, 8, 9]
+
+
+def test_cameras_are_those_of_the_recording(given: Path, solved: Path, office: Path) -> None:
+    views = load_views(again(given, solved), (320, 480), Monitor())
+    assert views.hints is not None
+    found = views.hints.cameras
+    assert found is not None
+    poses = np.linalg.inv(np.loadtxt(office / "poses.txt").reshape(-1, 4, 4)[:COUNT])
+    true = Cameras(torch.from_numpy(poses)[None].float(), found.intrinsics, found.size)
+    rotation, _ = relative_pose_errors(found, true)
+    assert rotation.median() < 1
+    # By the centres: the principal point, which is taken to be in the middle, is 11 pixels off in this recording, which
+    # turns all cameras by the same 1.3 degrees.
+    centers = [camera_centers(cameras) for cameras in (found, true)]
+    similarity = align_points(*centers)
+    extent = torch.cdist(centers[1], centers[1]).max()
+    assert (similarity.apply(centers[0]) - centers[1]).norm(dim=-1).median() < 0.03 * extent
+    # Of images resized from 540 to 480 pixels, apart from what undistortion cut off at their borders.
+    focal = np.loadtxt(office / "K.txt")[0, 0] * 480 / 540
+    assert found.intrinsics[0, :, 0, 0].numpy() == pytest.approx(focal, rel=0.08)
+
+    names = sorted((office / "depth").iterdir())[:COUNT]
+    depth = torch.from_numpy(np.stack([np.array(Image.open(name), np.float32) for name in names])) / 1000
+    seen = depth[depth > 0][::50] / similarity.scale
+    near_far = views.hints.depth_range
+    assert near_far is not None
+    assert ((seen > near_far[0, 0]) & (seen < near_far[0, 1])).float().mean() > 0.95
+    assert near_far[0, 1] / near_far[0, 0] < 6
+
+
+def test_points_project_to_where_they_were_seen(given: Path, solved: Path) -> None:
+    """In our pixels, whose centres are whole numbers: half a pixel's mistake would show."""
+    pictures = again(given, solved)
+    model = read_colmap(solved / "sparse")
+    places = dict(zip(model.points.ids.tolist(), model.points.positions, strict=True))
+    errors, depths = [], []
+    for picture, image in zip(pictures, sorted(model.images.values(), key=lambda image: image.name), strict=True):
+        frames = picture.read(picture.size)
+        camera, k = frames.world_to_camera[0].double(), frames.intrinsics[0].double()
+        seen = image.point3d_ids >= 0
+        world = torch.from_numpy(np.stack([places[number] for number in image.point3d_ids[seen].tolist()]))
+        local = world @ camera[:3, :3].mT + camera[:3, 3]
+        pixels = (local @ k.mT)[:, :2] / local[:, 2:]
+        errors.append(pixels - torch.from_numpy(image.points2d[seen] - 0.5))
+        depths.append(local[:, 2])
+    error: Tensor = torch.cat(errors)
+    assert len(error) > 300
+    assert error.norm(dim=-1).median() < 0.8
+    assert error.mean(0).abs().max() < 0.1
+    assert torch.cat(depths).median() == pytest.approx(1, abs=1e-3)
+    assert depth_range(pictures) is not None
+
+
+@pytest.mark.usefixtures("unsolvable")
+def test_command_keeps_the_cameras_beside_its_output(given: Path, solved: Path, tmp_path: Path, capsys) -> None:
+    shutil.copytree(solved, tmp_path / "out" / "sfm")
+    arguments = ["--backend", STAND_IN, "--size", "70", "--quiet", "--device", "cpu", "--save", "scene.ply,report.json"]
+    reconstruct_command.main([str(given), "--out", str(tmp_path / "out"), *arguments])
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["views"] == COUNT
+    assert report["cameras"] == "structure from motion, 8 of 9 images"
+    assert report["cameras"] in capsys.readouterr().out
+
+
+def test_images_without_a_model_are_refused_with_what_to_try(tmp_path: Path) -> None:
+    pytest.importorskip("pycolmap")
+    images = [np.full((60, 80, 3), 40 * i, np.uint8) for i in range(3)]
+    with pytest.raises(ValueError, match=r"cameras of these 3 images cannot be found.*20 or more.*da3_small"):
+        sfm.find_cameras(find_pictures(images), tmp_path / "sfm", Monitor())
+    with pytest.raises(ValueError, match=r"one image alone"):
+        sfm.find_cameras(find_pictures(images[:1]), tmp_path / "sfm", Monitor())
+    assert not (tmp_path / "sfm").exists()
+
+
+def test_a_folder_of_somebody_elses_is_not_replaced(tmp_path: Path, photos: Path) -> None:
+    pytest.importorskip("pycolmap")
+    (tmp_path / "sfm").mkdir()
+    (tmp_path / "sfm" / "thesis.txt").write_text("three years")
+    with pytest.raises(FileExistsError, match="holds other things"):
+        again(photos, tmp_path / "sfm")
+    assert (tmp_path / "sfm" / "thesis.txt").read_text() == "three years"
+
+
+def test_images_of_one_size_and_focal_length_share_a_lens(photos: Path, tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0xA405] = 26  # millimetres of 35 mm film
+    for name in ("IMG_20.jpg", "IMG_21.jpg"):
+        Image.new("RGB", (2000, 1500)).save(tmp_path / name, exif=exif)
+    pictures = find_pictures([photos, tmp_path])
+    expected = 26 * 2500 / np.hypot(36, 24)
+    assert [picture.focal for picture in pictures] == [None] * 4 + [pytest.approx(expected)] * 2
+    assert focal_length(tmp_path / "nowhere.jpg", (2, 2)) is None
+    (tmp_path / "work").mkdir()
+    lenses = sfm._stage(pictures, tmp_path / "work", lambda: None)
+    assert {key: len(names) for key, names in lenses.items()} == {
+        (84, 112, 0): 2,
+        (336, 448, 0): 1,
+        (84, 56, 0): 1,
+        (1200, 1600, round(expected * 0.8, 1)): 2,
+    }
+
+
+@pytest.mark.slow
+def test_the_same_images_give_the_same_cameras(given: Path, solved: Path, tmp_path: Path) -> None:
+    again(given, tmp_path / "sfm")
+    for name in ("cameras.bin", "images.bin", "points3D.bin"):
+        assert (tmp_path / "sfm" / "sparse" / name).read_bytes() == (solved / "sparse" / name).read_bytes()

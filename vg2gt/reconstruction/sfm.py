@@ -1,0 +1,305 @@
+"""Cameras of photographs by structure from motion: COLMAP's incremental mapper, from pycolmap (``vg2gt[sfm]``).
+
+What is found is kept as a folder that every command reads as a COLMAP recording: undistorted ``images/``, a model of
+PINHOLE cameras in ``sparse/``, and ``sfm.json``, which says of which pictures it was made. COLMAP's own lens model with
+one radial coefficient is fitted and the images are undistorted with it: a pinhole fitted to a distorted lens errs in
+its focal length.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import json
+import logging
+import shutil
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from PIL import Image
+
+from vg2gt.data.sources.colmap_model import COLMAP
+from vg2gt.data.transforms import reduce_to_fit, to_bytes
+from vg2gt.io.errors import FormatError
+from vg2gt.io.files import write_json
+from vg2gt.io.json_checks import load_json
+from vg2gt.reconstruction.given_cameras import LAYOUTS, recording_pictures
+from vg2gt.reconstruction.maps import whole_folder
+from vg2gt.reconstruction.monitor import Monitor
+from vg2gt.reconstruction.pictures import Picture
+
+if TYPE_CHECKING:
+    from pycolmap import IncrementalPipelineOptions, Reconstruction  # pyright: ignore[reportMissingImports]
+
+log = logging.getLogger(__name__)
+
+FORMAT = 1
+"""Of the folder; raise it when it is written otherwise."""
+IMAGE_SIDE = 1600  # pixels of the kept images' longer side, at most
+FEATURE_SIDE, FEATURES = 1280, 4096  # features are looked for in images of this longer side, so many at most
+SEED = 0
+_MODEL = "SIMPLE_RADIAL"
+_QUALITY = 95  # of the kept JPEGs
+_AT_ONCE = 4  # images whose features are looked for at the same time, which bounds the memory
+_STATE = "sfm.json"
+
+ADVICE = (
+    "take more photographs, 20 or more, walking around the scene rather than turning on the spot, each showing two "
+    f"thirds of what the one before shows; or put their cameras beside them ({LAYOUTS}); or take a backend that works "
+    "from images alone, such as da3_small"
+)
+
+
+def require_pycolmap() -> None:
+    """Checks early that there is pycolmap.
+
+    Raises:
+        ImportError: if there is none, naming the remedies.
+    """
+    if importlib.util.find_spec("pycolmap") is None:
+        raise ImportError(
+            f"finding the cameras of photographs needs pycolmap: pip install 'vg2gt[sfm]'; or put their cameras beside "
+            f"them ({LAYOUTS}), or take a backend that works from images alone, such as da3_small"
+        )
+
+
+def find_cameras(pictures: Sequence[Picture], folder: Path, monitor: Monitor) -> list[Picture]:
+    """The pictures for which structure from motion finds a camera, undistorted, with the depths of its sparse points.
+
+    Pictures of one size and EXIF focal length share one lens. The world is one of COLMAP's making; the unit is such
+    that the points' median depth over all views is 1. The same pictures give the same cameras.
+
+    Args:
+        pictures: in order; their cameras, if any, are not used.
+        folder: where the result is kept; if it holds that of the very same pictures, nothing is computed.
+        monitor: told of the stages.
+
+    Returns:
+        The placed pictures in the same order and of the same names; the others are named in a warning.
+
+    Raises:
+        ImportError: if pycolmap is needed and missing.
+        FileExistsError: if the folder holds something else.
+        ValueError: if no model of the scene is found, with what to try.
+    """
+    key = _key(pictures)
+    state = _read_state(folder)
+    if state is None or state["key"] != key:
+        require_pycolmap()
+        _check_ours(folder)
+        if len(pictures) < 2:
+            raise ValueError(f"one image alone tells nothing about depth or cameras: {ADVICE}")
+        state = _solve(pictures, folder, key, monitor)
+    else:
+        log.info("the cameras of these very images are taken from %s", folder)
+    if state["left_out"]:
+        names, count = ", ".join(state["left_out"]), len(state["left_out"])
+        log.warning(
+            "%d of %d images show too little of what the others show; they have no cameras and are left out: %s",
+            count, len(pictures), names,
+        )  # fmt: skip
+    names = state["images"]
+    source = f"structure from motion, {len(names)} of {len(pictures)} images"
+    return [replace(p, name=names[f"{p.name}.jpg"], source=source) for p in recording_pictures(COLMAP(str(folder)))]
+
+
+def _key(pictures: Sequence[Picture]) -> str:
+    """Changes with the content, the names or the order of the pictures, and with how they are worked on."""
+    settings = [FORMAT, IMAGE_SIDE, FEATURE_SIDE, FEATURES, SEED, _MODEL, _QUALITY]
+    contents = [[picture.name, picture.size, _digest(picture)] for picture in pictures]
+    return hashlib.sha256(json.dumps([settings, contents]).encode()).hexdigest()
+
+
+def _digest(picture: Picture) -> str:
+    if picture.path is not None:
+        return hashlib.sha256(picture.path.read_bytes()).hexdigest()
+    return hashlib.sha256(to_bytes(picture.read(picture.size).images).numpy().tobytes()).hexdigest()
+
+
+def _read_state(folder: Path) -> dict[str, Any] | None:
+    """What a folder says of its content; None where there is none, or it is damaged."""
+    try:
+        state = load_json(folder / _STATE)
+        kinds = {"key": str, "images": dict, "left_out": list}
+        return state if all(isinstance(state.get(name), kind) for name, kind in kinds.items()) else None
+    except (FormatError, OSError, AttributeError):
+        return None
+
+
+def _check_ours(folder: Path) -> None:
+    """Refuses to replace a folder that is not of our making."""
+    empty = not folder.exists() or (folder.is_dir() and not any(folder.iterdir()))
+    if not empty and not (folder / _STATE).is_file():
+        raise FileExistsError(f"{folder} is there already and holds other things; move it, or choose another --out")
+
+
+def _solve(pictures: Sequence[Picture], folder: Path, key: str, monitor: Monitor) -> dict[str, Any]:
+    with tempfile.TemporaryDirectory(prefix="vg2gt-sfm-") as temporary, _silent():
+        work = Path(temporary)
+        with monitor.stage("read photographs", len(pictures)) as advance:
+            lenses = _stage(pictures, work, advance)
+        names = sorted(name for members in lenses.values() for name in members)
+        _find_features(work, lenses, names, monitor)
+        _match(work, names, monitor)
+        model = _map(work, len(names), monitor)
+        if model is None:
+            raise ValueError(
+                f"the cameras of these {len(pictures)} images cannot be found: too few of them show the same things "
+                f"from places that are near, but not equal; {ADVICE}"
+            )
+        placed = {image.name for image in model.images.values() if image.has_pose}
+        _write(model, work, folder)
+        titles = {name: picture.name for name, picture in zip(names, pictures, strict=True)}
+        state = {
+            "key": key,
+            "images": {name: title for name, title in titles.items() if name in placed},
+            "left_out": [title for name, title in titles.items() if name not in placed],
+            "points": model.num_points3D(),
+            "reprojection_error": round(model.compute_mean_reprojection_error(), 3),
+        }
+        with whole_folder(folder) as staged:
+            for part in ("images", "sparse"):
+                shutil.move(work / "undistorted" / part, staged / part)
+            write_json(staged / _STATE, state)
+    return state
+
+
+def _stage(pictures: Sequence[Picture], work: Path, advance: Any) -> dict[tuple[int, int, float], list[str]]:
+    """Writes the pictures as numbered upright JPEGs; their names by (height, width, focal length or 0)."""
+    lenses: dict[tuple[int, int, float], list[str]] = {}
+    (work / "images").mkdir()
+    for number, picture in enumerate(pictures):
+        shrink = min(1.0, IMAGE_SIDE / max(picture.size))
+        target = (round(picture.size[0] * shrink), round(picture.size[1] * shrink))
+        frames = reduce_to_fit(picture.read(target), (IMAGE_SIDE, IMAGE_SIDE))
+        pixels = to_bytes(frames.images[0]).permute(1, 2, 0).numpy()
+        name = f"{number:06d}.jpg"
+        Image.fromarray(pixels).save(work / "images" / name, quality=_QUALITY, subsampling=0)
+        height, width = pixels.shape[:2]
+        focal = 0.0 if picture.focal is None else round(picture.focal * width / picture.size[1], 1)
+        lenses.setdefault((height, width, focal), []).append(name)
+        advance()
+    return lenses
+
+
+def _find_features(
+    work: Path, lenses: dict[tuple[int, int, float], list[str]], names: Sequence[str], monitor: Monitor
+) -> None:
+    import pycolmap  # pyright: ignore[reportMissingImports]
+
+    database, images = work / "database.db", work / "images"
+    pycolmap.Database.open(database).close()
+    for (height, width, focal), members in lenses.items():
+        reader = pycolmap.ImageReaderOptions()
+        reader.camera_model = _MODEL
+        if focal:
+            reader.camera_params = f"{focal},{width / 2},{height / 2},0"
+        pycolmap.import_images(
+            database, images, camera_mode=pycolmap.CameraMode.SINGLE, image_names=members, options=reader
+        )
+    options = pycolmap.FeatureExtractionOptions()
+    options.use_gpu = False
+    options.num_threads = _threads()
+    options.max_image_size = FEATURE_SIDE
+    options.sift.max_num_features = FEATURES
+    with monitor.stage("find features", len(names)) as advance:
+        for start in range(0, len(names), _AT_ONCE):
+            some = list(names[start : start + _AT_ONCE])
+            pycolmap.extract_features(
+                database, images, image_names=some, extraction_options=options, device=pycolmap.Device.cpu
+            )
+            for _ in some:
+                advance()
+
+
+def _match(work: Path, names: Sequence[str], monitor: Monitor) -> None:
+    """Matches every image with all before it."""
+    import pycolmap  # pyright: ignore[reportMissingImports]
+
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.use_gpu = False
+    matching.num_threads = _threads()
+    checking = pycolmap.TwoViewGeometryOptions()
+    checking.ransac.random_seed = SEED
+    pairs = pycolmap.ImportedPairingOptions()
+    pairs.match_list_path = work / "pairs.txt"
+    with monitor.stage("match features", len(names) - 1) as advance:
+        for number in range(1, len(names)):
+            lines = [f"{before} {names[number]}\n" for before in names[:number]]
+            (work / "pairs.txt").write_text("".join(lines))
+            pycolmap.match_image_pairs(
+                work / "database.db",
+                matching_options=matching,
+                pairing_options=pairs,
+                verification_options=checking,
+                device=pycolmap.Device.cpu,
+            )
+            advance()
+
+
+def _map(work: Path, count: int, monitor: Monitor) -> Reconstruction | None:
+    """The largest model, or None."""
+    import pycolmap  # pyright: ignore[reportMissingImports]
+
+    pycolmap.set_random_seed(SEED)
+    (work / "models").mkdir()
+    with monitor.stage("place cameras", count) as advance:
+        models = pycolmap.incremental_mapping(
+            work / "database.db",
+            work / "images",
+            work / "models",
+            options=_mapping_options(),
+            next_image_callback=advance,
+        )
+    return max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
+
+
+def _mapping_options() -> IncrementalPipelineOptions:
+    import pycolmap  # pyright: ignore[reportMissingImports]
+
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = options.mapper.num_threads = 1  # sums in a fixed order: the same images, the same cameras
+    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = SEED
+    return options
+
+
+def _write(model: Reconstruction, work: Path, folder: Path) -> None:
+    """Brings the points' median depth to 1 and writes undistorted images and their model to ``work/undistorted``."""
+    import pycolmap  # pyright: ignore[reportMissingImports]
+
+    depths = []
+    for image in model.images.values():
+        if image.has_pose:
+            pose = image.cam_from_world().matrix()
+            ids = [point.point3D_id for point in image.points2D if point.has_point3D()]
+            depths += [float(pose[2, :3] @ model.points3D[number].xyz + pose[2, 3]) for number in ids]
+    model.transform(pycolmap.Sim3d(1 / float(np.median(depths)), pycolmap.Rotation3d(), np.zeros(3)))
+    (work / "model").mkdir()
+    model.write(work / "model")
+    pycolmap.undistort_images(
+        work / "undistorted", work / "model", work / "images", jpeg_quality=_QUALITY, num_threads=_threads()
+    )
+
+
+def _threads() -> int:
+    """More than are images at once are of no use to features; matching goes the same way."""
+    return min(_AT_ONCE, torch.get_num_threads())
+
+
+@contextmanager
+def _silent() -> Iterator[None]:
+    """Keeps COLMAP from telling its whole story on the console."""
+    import pycolmap  # pyright: ignore[reportMissingImports]
+
+    before = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = before
