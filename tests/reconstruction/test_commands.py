@@ -102,7 +102,7 @@ def test_names_of_views_that_cannot_be_files(names, said: str, scene: Scene, tmp
         (["broken.png", "--backend", "dinosaur"], "unknown backend 'dinosaur'"),
         (["broken.png"], "name a checkpoint, or a backend"),
         (["broken.png", "--save", "scene.fbx", *TINY], r"unknown output 'scene.fbx'"),
-        (["broken.png", "--backend", "oracle"], "needs known cameras"),
+        (["broken.png", "--backend", "oracle"], "measured depth, and there is none with broken.png"),
     ],
 )
 def test_one_line_says_what_is_wrong(arguments, said: str, tmp_path: Path, monkeypatch) -> None:

@@ -7,6 +7,7 @@ import torch
 from PIL import Image
 
 from vg2gt.io import write_video
+from vg2gt.reconstruction.given_cameras import given_pictures
 from vg2gt.reconstruction.inputs import load_views, working_size
 from vg2gt.reconstruction.monitor import Monitor
 from vg2gt.reconstruction.pictures import find_pictures
@@ -64,7 +65,8 @@ def test_large_pictures_are_shrunk_while_they_are_read(tmp_path: Path) -> None:
 
 
 def test_a_recording_gives_its_cameras_and_depth(recording: Path, frames) -> None:
-    pictures = find_pictures(recording, posed=True)
+    pictures = given_pictures(recording, depth=True)
+    assert pictures is not None
     views = load_views(pictures, (56, 84), Monitor())
     assert views.names == ("008", "009", "010", "011")
     assert views.hints is not None
@@ -134,10 +136,3 @@ def test_what_cannot_be_read_is_named(tmp_path: Path, monkeypatch) -> None:
 def test_what_is_no_image(item, said: str) -> None:
     with pytest.raises(ValueError, match=said):
         find_pictures([item])
-
-
-def test_needed_cameras_are_asked_for(photos: Path) -> None:
-    with pytest.raises(ValueError, match=r"needs known cameras.*photos has none"):
-        find_pictures(photos, posed=True)
-    with pytest.raises(ValueError, match="needs known cameras"):
-        find_pictures(np.zeros((4, 5, 3), np.uint8), posed=True)

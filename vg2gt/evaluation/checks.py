@@ -79,6 +79,6 @@ def refuse_without_hints(model: Reconstructor, source: SceneSource) -> None:
     lacking = [name for name, needs in needed.items() if needs and not there[name]]
     if lacking:
         raise DataError(
-            f"backend {backend.name} needs the data's {' and '.join(name for name in needed if needed[name])}, and {type(source).__name__} has no "
-            f"{' and no '.join(lacking)}: choose another backend= or other data"
+            f"backend {backend.name} needs the data's {' and '.join(lacking)}, and {type(source).__name__} has none: "
+            "choose another backend= or other data"
         )
