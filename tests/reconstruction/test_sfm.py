@@ -90,6 +90,10 @@ def test_other_images_are_computed_anew(given: Path, solved: Path, tmp_path: Pat
     (folder / "sfm.json").write_text('{"key": ')
     again(given, folder)
     assert counts == [9, 8, 9]
+    shutil.copy(solved / "sfm.json", folder)
+    (folder / "images" / "000003.jpg").unlink()
+    again(given, folder)
+    assert counts == [9, 8, 9, 9]
 
 
 def test_cameras_are_those_of_the_recording(given: Path, solved: Path, office: Path) -> None:

@@ -24,7 +24,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from vg2gt.data.sources.colmap_model import COLMAP
+from vg2gt.data.sources.colmap_model import COLMAP, model_folder_of
 from vg2gt.data.transforms import reduce_to_fit, to_bytes
 from vg2gt.io.errors import FormatError
 from vg2gt.io.files import write_json
@@ -123,13 +123,15 @@ def _digest(picture: Picture) -> str:
 
 
 def _read_state(folder: Path) -> dict[str, Any] | None:
-    """What a folder says of its content; None where there is none, or it is damaged."""
+    """What a folder says of its content; None where there is none, or a part is missing or damaged."""
     try:
         state = load_json(folder / _STATE)
-        kinds = {"key": str, "images": dict, "left_out": list}
-        return state if all(isinstance(state.get(name), kind) for name, kind in kinds.items()) else None
-    except (FormatError, OSError, AttributeError):
+    except (FormatError, OSError):
         return None
+    kinds = {"key": str, "images": dict, "left_out": list}
+    known = isinstance(state, dict) and all(isinstance(state.get(name), kind) for name, kind in kinds.items())
+    whole = known and all((folder / "images" / name).is_file() for name in state["images"])
+    return state if whole and model_folder_of(folder) is not None else None
 
 
 def _check_ours(folder: Path) -> None:
@@ -249,13 +251,14 @@ def _map(work: Path, count: int, monitor: Monitor) -> Reconstruction | None:
 
     pycolmap.set_random_seed(SEED)
     (work / "models").mkdir()
+    expected = iter(range(count))
     with monitor.stage("place cameras", count) as advance:
         models = pycolmap.incremental_mapping(
             work / "database.db",
             work / "images",
             work / "models",
             options=_mapping_options(),
-            next_image_callback=advance,
+            next_image_callback=lambda: advance() if next(expected, None) is not None else None,
         )
     return max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
 

@@ -108,13 +108,19 @@ def load_model(
 
 
 def backend_class(ckpt: str | Path | None = None, backend: str | None = None) -> type:
-    """Class of the backend that :func:`load_model` would build, which is asked before that takes its time.
+    """Class of the backend that :func:`load_model` would build, which can be asked before that takes its time.
+
+    What no class can be found for is left to :func:`load_model`, and ``object`` returned.
 
     Raises:
         FileNotFoundError: if there is no such checkpoint, or its run's ``config.yaml`` is missing.
         ValueError: if neither a checkpoint nor a backend is given, or a name is unknown.
     """
-    return get_class(_named_parts(checkpoint_path(ckpt), backend, None)["backend"]["_target_"])
+    target = _named_parts(checkpoint_path(ckpt), backend, None)["backend"]["_target_"]
+    try:
+        return get_class(target)
+    except (ValueError, ImportError):
+        return object
 
 
 def _named_parts(checkpoint: Path | None, backend: str | None, model: str | None) -> dict[str, DictConfig]:
