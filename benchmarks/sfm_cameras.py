@@ -72,7 +72,7 @@ def measure(folder: Path, limit: int | None) -> dict[str, Any]:
         "recording": folder.name,
         "images": len(photos),
         "placed": len(found),
-        "position_median": float(errors.median() / torch.cdist(*[centers[1]] * 2).max()),
+        "position_median": float(errors.median() / torch.cdist(centers[1], centers[1]).max()),
         "position_unit_median": float(errors.median()),
         "rotation_median_deg": float(rotation.median()),
         "rotation_max_deg": float(rotation.max()),
