@@ -2,10 +2,13 @@ from pathlib import Path
 
 import pytest
 import torch
+from omegaconf import OmegaConf
 
 import vg2gt
 from vg2gt.memory import OutOfMemory
-from vg2gt.runs.load import load_model, split_outside_brackets
+from vg2gt.runs.checkpoints import write_slim
+from vg2gt.runs.find import checkpoint_path
+from vg2gt.runs.load import load_model, made_of, split_outside_brackets
 
 
 def test_a_run_is_rebuilt_with_its_weights(run_folder: Path, ready) -> None:
@@ -35,7 +38,6 @@ def test_lists_are_values() -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        ({}, "name a checkpoint, or a backend .*oracle"),
         ({"backend": "dinosaur"}, "unknown backend 'dinosaur'; choose one of: .*da3_tiny"),
         ({"backend": "oracle,noise=1"}, "oracle has no option 'noise'; it has .*depth_noise"),
         ({"backend": "oracle,taps"}, "must be key=value"),
@@ -47,6 +49,25 @@ def test_lists_are_values() -> None:
 def test_what_is_unknown_is_named(arguments, said: str) -> None:
     with pytest.raises(ValueError, match=said):
         load_model(**arguments)
+
+
+def test_a_slim_checkpoint_is_the_same_model(run_folder: Path, tmp_path: Path) -> None:
+    """Weights without the optimiser, with all that names them: no run's folder is needed beside them."""
+    known = torch.load(checkpoint_path(run_folder), weights_only=True)
+    known["config"] = made_of(OmegaConf.load(run_folder / "config.yaml"))
+    torch.save(known, tmp_path / "whole.ckpt")
+    slim = write_slim(tmp_path / "whole.ckpt", tmp_path / "weights.safetensors")
+    whole, loaded = load_model(run_folder, device="cpu"), load_model(slim, device="cpu")
+    for name, value in whole.model.trained_state().items():
+        assert torch.equal(loaded.model.trained_state()[name], value), name
+    assert loaded.weights.step == whole.weights.step
+    with pytest.raises(ValueError, match="trained on backbone"):
+        load_model(slim, "da3_tiny", device="cpu")
+    slim.write_bytes(slim.read_bytes()[:-100])
+    with pytest.raises(ValueError, match=r"weights\.safetensors is damaged"):
+        load_model(slim, device="cpu")
+    with pytest.raises(ValueError, match="must end with"):
+        write_slim(tmp_path / "whole.ckpt", tmp_path / "weights.ckpt")
 
 
 def test_another_backbone_is_refused(run_folder: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import zipfile
@@ -11,14 +12,17 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
 from torch import Tensor, nn
 
-from vg2gt.io.files import flush_folder, flush_to_disk
+from vg2gt.io.files import flush_folder, flush_to_disk, write_bytes
 from vg2gt.io.tensors import refuse_foreign
 
 log = logging.getLogger(__name__)
 
 PATTERN = "step-*.ckpt"
+SLIM = ".safetensors"  # a checkpoint without what only training needs
 MODEL_PREFIX = "model."  # of the model's names in a checkpoint's state_dict, as the Lightning module names it
 
 
@@ -56,6 +60,8 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"no checkpoint at {path}")
+    if path.suffix == SLIM:
+        return _read_slim(path)
     try:
         refuse_foreign(path)
         _verify_checksums(path)
@@ -65,6 +71,44 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     except Exception as error:  # there is no end to what readers raise over damaged bytes
         raise ValueError(f"checkpoint {path} is damaged or not a checkpoint of this project: {error}") from error
     return content
+
+
+def write_slim(checkpoint: str | Path, path: str | Path) -> Path:
+    """Writes what others need of a checkpoint as safetensors: the trained part, and in the header all that names it.
+
+    Args:
+        checkpoint: of a run; optimiser and loop are left out, so training cannot go on from the result.
+        path: ends with ``.safetensors``; every command takes it as a checkpoint.
+
+    Raises:
+        ValueError: if ``path`` has another ending, or the checkpoint is of a version that knew no configuration.
+    """
+    content = read_checkpoint(checkpoint)
+    if Path(path).suffix != SLIM or "config" not in content:
+        raise ValueError(f"{path} must end with {SLIM}, and {checkpoint} must hold the configuration it was made with")
+    header = {
+        "backend": json.dumps(content["backend"]),
+        "step": str(content["global_step"]),
+        "config": content["config"],
+    }
+    state = {name: tensor.contiguous() for name, tensor in sorted(content["state_dict"].items())}
+    return write_bytes(path, save(state, metadata=header))
+
+
+def _read_slim(path: Path) -> dict[str, Any]:
+    try:
+        with safe_open(path, "pt") as file:
+            header = file.metadata() or {}
+            names = list(file.keys())
+            state = {name: file.get_tensor(name) for name in names}
+        facts = {
+            "backend": json.loads(header["backend"]),
+            "global_step": int(header["step"]),
+            "config": header["config"],
+        }
+    except (SafetensorError, OSError, KeyError, ValueError) as error:
+        raise ValueError(f"checkpoint {path} is damaged or not a checkpoint of this project: {error}") from error
+    return {"state_dict": state, **facts}
 
 
 def model_state(state: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -24,6 +24,8 @@ from vg2gt.runs.trust import check_targets, parse_run_config, read_run_config
 
 log = logging.getLogger(__name__)
 
+SHIPPED = Path(__file__).resolve().parents[1] / "weights" / "sweep-tiny.safetensors"
+"""A head trained on ``backend=sweep``, whose weights are in the package too: real photographs without a download."""
 PARTS = ("backend", "model", "renderer")
 MADE_OF = "config"  # where a checkpoint keeps the configuration of these parts, as YAML
 FREE = ("path", "pretrained", "revision", "head_chunk", "views_per_chunk")
@@ -74,7 +76,8 @@ def load_model(
     """Builds a model as its run was configured, and loads its trained part.
 
     Args:
-        ckpt: a checkpoint or a run's folder; None: the untrained head, which makes coloured voxels.
+        ckpt: a checkpoint or a run's folder; None: what ships with the package (:data:`SHIPPED`), or with
+            another backend than ``sweep`` the untrained head, which makes coloured voxels.
         backend: ``NAME[,key=value...]`` of ``configs/backend``; None: the run's own.
         model: ``NAME[,key=value...]`` of ``configs/model``; None: the run's own, ``tiny`` without a checkpoint.
         options: further ``part.key=value``, part being ``backend``, ``model`` or ``renderer``.
@@ -83,10 +86,9 @@ def load_model(
 
     Raises:
         FileNotFoundError: if there is no such checkpoint, or its run's ``config.yaml`` or a weight file is missing.
-        ValueError: if neither a checkpoint nor a backend is given, a name or an option is unknown, or the checkpoint
-            belongs to another backbone.
+        ValueError: if a name or an option is unknown, or the checkpoint belongs to another backbone.
     """
-    checkpoint = checkpoint_path(ckpt)
+    checkpoint = _weights_of(ckpt, backend)
     parts = _named_parts(checkpoint, backend, model)
     for option in options:
         part, _, change = option.partition(".")
@@ -114,19 +116,21 @@ def backend_class(ckpt: str | Path | None = None, backend: str | None = None) ->
 
     Raises:
         FileNotFoundError: if there is no such checkpoint, or its run's ``config.yaml`` is missing.
-        ValueError: if neither a checkpoint nor a backend is given, or a name is unknown.
+        ValueError: if a name is unknown.
     """
-    target = _named_parts(checkpoint_path(ckpt), backend, None)["backend"]["_target_"]
+    target = _named_parts(_weights_of(ckpt, backend), backend, None)["backend"]["_target_"]
     try:
         return get_class(target)
     except (ValueError, ImportError):
         return object
 
 
+def _weights_of(ckpt: str | Path | None, backend: str | None) -> Path | None:
+    """The checkpoint that is meant: the one that ships, where none is named and no backend that it does not fit."""
+    return checkpoint_path(SHIPPED if ckpt is None and backend in (None, "sweep") else ckpt)
+
+
 def _named_parts(checkpoint: Path | None, backend: str | None, model: str | None) -> dict[str, DictConfig]:
-    if checkpoint is None and backend is None:
-        choices = ", ".join(group_options("backend"))
-        raise ValueError(f"name a checkpoint, or a backend for the untrained head, one of: {choices}")
     given = {"backend": backend, "model": model}
     config = OmegaConf.create({part: compose_part(part, spec) for part, spec in given.items() if spec is not None})
     return resolve_parts(config, checkpoint)
