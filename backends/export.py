@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import runpy
+import secrets
 import shutil
 import warnings
 from collections.abc import Sequence
@@ -94,7 +95,7 @@ def export(backend: Backend, out: Path) -> Description:
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise FileExistsError(f"{out} exists already: remove it or choose another out=FOLDER")
     _require("onnx", "onnxscript")
-    folder = out.with_name(f".{out.name}.{os.getpid()}.tmp")
+    folder = out.with_name(f".{out.name}.{secrets.token_hex(8)}.tmp")
     folder.mkdir(parents=True)
     try:
         description = _write(backend, folder)

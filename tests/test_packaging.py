@@ -38,4 +38,4 @@ def test_installed_wheel_trains_from_an_empty_folder(tmp_path: Path) -> None:
     )
     assert run.returncode == 0, run.stderr[-3000:]
     assert str(site) in run.stdout
-    assert (empty / "outputs" / "quickstart" / "config.yaml").is_file()
+    assert (empty / "outputs" / "trials" / "quickstart").is_dir()

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
 from contextlib import nullcontext
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -58,9 +61,38 @@ def hydra_message(error: Exception) -> str:
     """What Hydra or OmegaConf say, in one line; where they have looked is left out."""
     said = str(error).partition("Config search path")[0].removeprefix("In '_dummy_empty_config_': ")
     said = said.partition("Error raised while resolving interpolation: ")[2] or said
+    if missing := re.match(r".*Could not find '([^']+)/([^'/]+)'", said):
+        near = get_close_matches(missing[2], group_options(missing[1]), 1)
+        near_by = f", did you mean {near[0]}?" if near else ";"
+        said = f"there is no {missing[1]}={missing[2]}{near_by} {said[missing.end() :].strip()}"
     if isinstance(error.__cause__, OmegaConfBaseException):
         said += f" ({str(error.__cause__).splitlines()[0]})"
     return " ".join(said.partition("    full_key")[0].split())
+
+
+def near_keys(name: str, overrides: Sequence[str], error: Exception) -> str:
+    """What an unknown key of a command line may have meant: keys of the same last part, or alike.
+
+    Args:
+        name: of the configuration that was composed.
+        overrides: the command line's.
+        error: that composing them raised.
+
+    Returns:
+        The message; empty if the error is another one, or nothing is alike.
+    """
+    unknown = re.match(r"Could not override '([^']+)'", str(error))
+    if unknown is None:
+        return ""
+    try:
+        config = compose(name, *(each for each in overrides if "." not in each.partition("=")[0]), "output_dir=.")
+    except ValueError:
+        return ""
+    keys = [key for key in flatten(OmegaConf.to_container(config, resolve=False)) if "_target_" not in key]
+    room, _, last = unknown[1].rpartition(".")
+    inner = [key for key in keys if key.startswith(f"{room}.") and key.endswith(f".{last}")]
+    found = (inner or get_close_matches(unknown[1], keys, 3, 0.75))[:3]
+    return f"there is no option {unknown[1]}, did you mean {' or '.join(found)}?" if found else ""
 
 
 def flatten(node: Any, prefix: str = "") -> dict[str, Any]:

@@ -1,8 +1,10 @@
 """The front door: every command explains itself at once, and says in one line what is wrong."""
 
+import logging
 import re
 import subprocess
 import sys
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 
@@ -10,7 +12,10 @@ import pytest
 
 from tests.commands import ROOT, run_vg2gt
 from vg2gt import __version__
+from vg2gt.cli import main
 from vg2gt.cli.commands import COMMANDS, DATA_COMMANDS, Command, dispatch
+
+Said = Callable[..., tuple[object, str]]
 
 ALL: dict[tuple[str, ...], Command] = {(name,): command for name, command in COMMANDS.items()}
 ALL |= {("data", name): command for name, command in DATA_COMMANDS.items()}
@@ -80,26 +85,53 @@ def test_modules_are_commands_too(module: str, tmp_path: Path) -> None:
     assert "example: vg2gt " in shown.stdout, shown.stderr[-2000:]
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["train", "model.gausians.splits=4"], r"model.gausians.splits=4 \(Key 'gausians' is not in struct\)"),
-        (["train", "backend=dav3"], "Available options in 'backend': custom da3_base"),
-        (["train", "data=rgbd", "data.root=not_here"], "the data folder not_here .* does not exist: set data.root="),
-        (["curves", "nowhere"], "nowhere|matplotlib"),
-        (["export", "backend=oracle", "out=bundle"], "backend oracle cannot be exported"),
-        (["data", "views", "out=views.json", "evaluation=nonsense"], "Could not find 'evaluation/nonsense'"),
-    ],
-    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
-)
-def test_mistakes_are_one_line(words: list[str], said: str, tmp_path: Path) -> None:
-    shown = run_vg2gt(*words, folder=tmp_path)
-    assert shown.returncode == 1
-    *logged, line = shown.stderr.strip().splitlines()
-    assert not logged or words[0] == "train"
-    assert "Traceback" not in shown.stderr
-    assert re.search(said, line), line
+@pytest.fixture
+def said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Iterator[Said]:
+    """Runs ``vg2gt WORDS`` in an empty folder of this process; what it ends with, and what it has written to stderr."""
+    root = logging.getLogger()
+    before = root.handlers[:], root.level
+
+    def run(*words: str) -> tuple[object, str]:
+        monkeypatch.setattr(sys, "argv", ["vg2gt", *words])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        return ended.value.code, capsys.readouterr().err
+
+    monkeypatch.chdir(tmp_path)
+    yield run
+    root.handlers, root.level = before  # Hydra's are for its process
+
+
+MISTAKES = {
+    "train model.gausians.splits=4": "there is no option model.gausians.splits, did you mean model.gaussians.splits",
+    "train +model.gausians=4 foo.x=1": r"Could not override 'foo.x'",
+    "evaluate evaluation=dtu data.root=FOLDER": "no option data.root, did you mean data.train.root or data.val.root?",
+    "train backend=da3_smal": "there is no backend=da3_smal, did you mean da3_small? Available options",
+    "train data=rgbd data.root=not_here": "the data folder not_here .* does not exist: set data.root=",
+    "train name=../x": "^name=../x: a name inside outputs",
+    "reconstruct . --out x --backend da3_smal": "unknown backend 'da3_smal'; did you mean da3_small",
+    "curves nowhere": "nowhere|matplotlib",
+    "export backend=oracle out=bundle": "backend oracle cannot be exported",
+    "data views out=views.json evaluation=nonsense": "there is no evaluation=nonsense; Available options",
+}
+
+
+@pytest.mark.parametrize("words", MISTAKES)
+def test_mistakes_are_one_line(words: str, said: Said, tmp_path: Path) -> None:
+    line, logged = said(*words.split())
+    assert isinstance(line, str)
+    assert re.search(MISTAKES[words], line), line
     assert line.endswith("(HYDRA_FULL_ERROR=1 shows where)")
+    assert "\n" not in line
+    assert "Traceback" not in logged
+    assert not list(tmp_path.rglob("config.yaml"))
+
+
+def test_arguments_of_train_are_translated_for_reconstruct(said: Said) -> None:
+    words = "reconstruct photos --backend da3_small backend.pretrained=false --out x model.fine.y=2"
+    status, line = said(*words.split())
+    assert status == 2
+    assert "(write --backend NAME,pretrained=false --model NAME,fine.y=2)" in line
 
 
 def test_tracebacks_are_there_for_who_asks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,7 +17,8 @@ from vg2gt.types import Cameras
 
 def load(path: Path) -> tuple[dict[str, np.ndarray], trimesh.Scene]:
     """World positions of every object of the file, in glTF's axes."""
-    scene = trimesh.load_scene(path)
+    scene = trimesh.load(path)
+    assert isinstance(scene, trimesh.Scene)
     placed = {}
     for name in scene.graph.nodes_geometry:
         transform, geometry = scene.graph[name]

@@ -1,3 +1,4 @@
+import shutil
 from pathlib import Path
 
 import pytest
@@ -6,7 +7,7 @@ from omegaconf import OmegaConf
 
 import vg2gt
 from vg2gt.memory import OutOfMemory
-from vg2gt.runs.checkpoints import write_slim
+from vg2gt.runs.checkpoints import read_checkpoint, write_checkpoint, write_slim
 from vg2gt.runs.find import checkpoint_path
 from vg2gt.runs.load import load_model, made_of, split_outside_brackets
 
@@ -75,6 +76,16 @@ def test_another_backbone_is_refused(run_folder: Path) -> None:
         load_model(run_folder, "da3_tiny", device="cpu")
     with pytest.raises(FileNotFoundError, match="nowhere"):
         load_model("nowhere")
+
+
+def test_weights_of_a_diverged_training_are_refused(run_folder: Path, tmp_path: Path) -> None:
+    copied = shutil.copytree(run_folder, tmp_path / "run")
+    path = copied / "checkpoints" / "step-7.ckpt"
+    content = read_checkpoint(path)
+    content["state_dict"]["model.gaussians.out.bias"][3] = torch.nan
+    write_checkpoint(content, path)
+    with pytest.raises(ValueError, match=r"step-7\.ckpt holds weights .* not finite \(model\.gaussians\.out\.bias"):
+        load_model(copied, device="cpu")
 
 
 def test_python_interface(run_folder: Path, recording: Path, tmp_path: Path) -> None:

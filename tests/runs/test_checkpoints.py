@@ -7,6 +7,7 @@ import pickle
 import zipfile
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +57,21 @@ def test_full_disk_is_one_error_that_names_the_file(tmp_path: Path, values: int)
         write_checkpoint({"global_step": 4, "w": torch.zeros(values)}, tmp_path / "step-4.ckpt")
     assert [path.name for path in tmp_path.iterdir()] == ["step-3.ckpt"]
     assert newest_valid(tmp_path).name == "step-3.ckpt"
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_the_disks_own_error_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a write that fails in the middle torch says where it stopped, not why."""
+
+    def save(content: object, file: Any) -> None:
+        with suppress(OSError):
+            file.write(bytes(1 << 20))
+        raise RuntimeError("unexpected pos 64 vs 0")
+
+    monkeypatch.setattr(torch, "save", save)
+    (tmp_path / "step-4.ckpt.tmp").symlink_to("/dev/full")
+    with pytest.raises(OSError, match=r"step-4\.ckpt could not be written \(.*No space left"):
+        write_checkpoint({}, tmp_path / "step-4.ckpt")
 
 
 def test_file_and_folder_reach_the_disk_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

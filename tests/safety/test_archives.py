@@ -20,7 +20,7 @@ from vg2gt.data.sharded_scenes import INDEX
 from vg2gt.io.arrays import load_npy
 from vg2gt.io.errors import FormatError
 from vg2gt.io.npz import load_npz, read_npz
-from vg2gt.io.tensors import read_tensors
+from vg2gt.io.tensors import read_tensors, read_torch
 from vg2gt.runs.checkpoints import read_checkpoint
 
 
@@ -117,6 +117,20 @@ def test_zip_files_of_torch(tmp_path: Path, name: str) -> None:
         with pytest.raises(ValueError, match=file):
             reader(tmp_path / "inner" / file)
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["inner", "model.pt", "step-1.ckpt"]
+
+
+def test_a_tensor_longer_than_its_record_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """torch 2.6 makes such a tensor, with foreign memory at its end; later ones refuse."""
+    buffer = io.BytesIO()
+    shared = torch.arange(99.0)
+    torch.save({"w": shared, "again": shared[3:], "deep": [(torch.zeros(5),)], "none": torch.zeros(0)}, buffer)
+    (tmp_path / "good.pt").write_bytes(buffer.getvalue())
+    whole = read_torch(tmp_path / "good.pt")
+    assert torch.equal(whole["again"], shared[3:])
+    (tmp_path / "short.pt").write_bytes(ZIPS["short storage"](buffer.getvalue()))
+    monkeypatch.setattr(torch, "load", lambda *_, **__: whole)
+    with pytest.raises(ValueError, match=r"short\.pt is damaged: a tensor of 396 bytes has a record of another length"):
+        read_torch(tmp_path / "short.pt")
 
 
 def edited_index(folder: Path, change: Callable[[dict[str, Any], dict[str, Any]], None]) -> None:

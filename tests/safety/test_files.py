@@ -3,9 +3,10 @@
 import io
 import json
 import os
+import signal
 import struct
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from PIL import Image
 
 from vg2gt.data import DataError
 from vg2gt.data.sources import COLMAP, TUM, Nerfstudio
+from vg2gt.data.sources.parsing import read_numbers
 from vg2gt.io import (
     FormatError,
     read_cameras_json,
@@ -27,7 +29,12 @@ from vg2gt.io import (
 from vg2gt.io.cameras_json import NamedCamera
 from vg2gt.io.image_files import image_size, read_color, read_depth
 from vg2gt.io.images import open_image
+from vg2gt.io.npz import load_npz
+from vg2gt.io.pfm import read_pfm
 from vg2gt.io.sens import scan_sens
+from vg2gt.io.tensors import read_tensors
+from vg2gt.runs.checkpoints import read_checkpoint
+from vg2gt.runs.trust import read_run_config
 from vg2gt.viewer import load_pictures
 
 HUGE = 1 << 60
@@ -266,3 +273,58 @@ def test_viewers_show_pictures_of_their_folder_only(tmp_path: Path, secret: Path
     os.symlink(secret, folder / "link.png")
     for name in (*NAMES, str(secret), "link.png", "a\0b"):
         assert load_pictures([NamedCamera(name, 9, 9, np.eye(3), np.eye(4))], folder) == [None]
+
+
+@pytest.fixture
+def patience() -> Iterator[None]:
+    """A reader that waits is a failure, not a hanging test."""
+
+    def give_up(*_: object) -> None:
+        raise AssertionError("the reader waits for a pipe")
+
+    before = signal.signal(signal.SIGALRM, give_up)
+    signal.setitimer(signal.ITIMER_REAL, 5)
+    yield
+    signal.setitimer(signal.ITIMER_REAL, 0)
+    signal.signal(signal.SIGALRM, before)
+
+
+PIPES: dict[str, Callable[[Path], object]] = {
+    "photo.png": lambda path: read_color(path, "room"),
+    "depth.png": lambda path: read_depth(path, "room"),
+    "size.png": lambda path: image_size(path, "room"),
+    "depth.pfm": lambda path: read_pfm(path, "room"),
+    "poses.txt": lambda path: read_numbers(path, "room"),
+    "depth.npz": lambda path: load_npz(path, "room", ["depth"]),
+    "scan.sens": lambda path: scan_sens(path, "room"),
+    "scene.ply": read_gaussian_ply,
+    "scene.splat": read_splat,
+    "clip.mp4": lambda path: list(read_video(path)),
+    "clip.gif": lambda path: list(read_video(path)),
+    "cameras.json": read_cameras_json,
+    "transforms.json": read_transforms,
+    "cameras.txt": lambda path: read_colmap(path.parent),
+    "cameras.bin": lambda path: read_colmap(path.parent),
+    "model.pt": read_tensors,
+    "model.safetensors": read_tensors,
+    "step-1.ckpt": read_checkpoint,
+    "config.yaml": read_run_config,
+}
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
+@pytest.mark.parametrize("name", PIPES)
+@pytest.mark.usefixtures("patience")
+def test_named_pipes_are_not_waited_for(tmp_path: Path, name: str) -> None:
+    os.mkfifo(tmp_path / name)
+    with pytest.raises((ValueError, OSError)):
+        PIPES[name](tmp_path / name)
+
+
+def test_pictures_of_another_size_are_refused_before_they_are_decoded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "large.png").write_bytes(png_of(13_000, 13_000))
+    monkeypatch.setattr("PIL.ImageFile.ImageFile.load", lambda *_: pytest.fail("it was decoded"))
+    with pytest.raises(DataError, match=r"large\.png of scene room is 13000x13000 pixels"):
+        read_color(tmp_path / "large.png", "room", (480, 640))

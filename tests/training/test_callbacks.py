@@ -1,8 +1,11 @@
 """What a run keeps: the newest checkpoints, the row of a checkpoint's step, the state at SIGTERM."""
 
+import multiprocessing
 import shutil
 import signal
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import lightning
@@ -13,6 +16,7 @@ from tests.training_helpers import small_config
 from vg2gt.runs.checkpoints import newest_valid, read_checkpoint
 from vg2gt.studies.curves import read_curves
 from vg2gt.training.callbacks import NewestCheckpoints
+from vg2gt.training.distributed import ending_together
 from vg2gt.training.loop import build, train
 
 
@@ -21,16 +25,17 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("rooms")
 
 
-class TerminatedAt(lightning.Callback):
-    """Sends SIGTERM to the own process in a training step, and counts evaluations while training."""
+class HappensAt(lightning.Callback):
+    """Does something in a training step, and counts evaluations while training."""
 
-    def __init__(self, step: int) -> None:
+    def __init__(self, step: int, action: Callable[[], object]) -> None:
         self.step = step
+        self.action = action
         self.evaluations = 0
 
     def on_train_batch_start(self, trainer: lightning.Trainer, *args: Any) -> None:
         if trainer.global_step == self.step - 1:
-            signal.raise_signal(signal.SIGTERM)
+            self.action()
 
     def on_validation_start(self, *args: Any) -> None:
         self.evaluations += 1
@@ -81,8 +86,9 @@ def test_a_checkpoint_carries_the_row_of_its_step(tmp_path: Path, cache: Path) -
     assert list(curves["loss"]) == [3, 4, 5]
 
 
-def test_sigterm_saves_without_another_evaluation(tmp_path: Path, cache: Path) -> None:
-    stopped = TerminatedAt(3)
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_saves_without_another_evaluation(tmp_path: Path, cache: Path, number: signal.Signals) -> None:
+    stopped = HappensAt(3, lambda: signal.raise_signal(number))
     run = build(small_config(tmp_path, cache, *RUN))
     run.trainer.callbacks.append(stopped)  # pyright: ignore[reportAttributeAccessIssue]
     run.trainer.fit(run.module, datamodule=run.datamodule)
@@ -90,7 +96,43 @@ def test_sigterm_saves_without_another_evaluation(tmp_path: Path, cache: Path) -
     assert stopped.evaluations == 0
 
 
+def test_a_run_whose_folder_vanishes_is_kept_beside_it(tmp_path: Path, cache: Path) -> None:
+    folder, renamed = tmp_path / "run", tmp_path / "renamed"
+    run = build(small_config(folder, cache, *RUN))
+    run.trainer.callbacks.append(HappensAt(3, lambda: folder.rename(renamed)))  # pyright: ignore
+    with pytest.raises(FileNotFoundError, match=r"run was deleted or renamed .* saved .*run-kept.*step-3\.ckpt; go on"):
+        run.trainer.fit(run.module, datamodule=run.datamodule)
+    assert read_checkpoint(tmp_path / "run-kept" / "checkpoints" / "step-3.ckpt")["global_step"] == 3
+    assert "step-2.ckpt" in [path.name for path in (renamed / "checkpoints").iterdir()]
+
+
+def test_a_killed_process_that_loads_data_is_one_error(tmp_path: Path, cache: Path) -> None:
+    def kill() -> None:
+        for process in multiprocessing.active_children():
+            process.kill()
+
+    overrides = ["data.workers=1", "callbacks.checkpoint=null", "logger.csv=null", "trainer.max_steps=50"]
+    run = build(small_config(tmp_path, cache, *RUN, *overrides))
+    run.trainer.callbacks.append(HappensAt(2, kill))  # pyright: ignore[reportAttributeAccessIssue]
+    with pytest.raises(ChildProcessError, match="loads data was killed"), ending_together(run.trainer):
+        run.trainer.fit(run.module, datamodule=run.datamodule)
+
+
+@pytest.mark.parametrize("said", ["[..] Connection closed by peer [127.0.0.1]:9", "Gloo connectFullMesh failed"])
+def test_a_rank_that_has_ended_is_named(said: str) -> None:
+    started = SimpleNamespace(procs=[SimpleNamespace(poll=lambda: None), SimpleNamespace(poll=lambda: -9)])
+    started.kill = lambda number: None
+    trainer: Any = SimpleNamespace(strategy=SimpleNamespace(launcher=started), world_size=3)
+    with (
+        pytest.raises(ChildProcessError, match=r"^rank 2 has ended with status -9; .* ckpt=last"),
+        ending_together(trainer),
+    ):
+        raise RuntimeError(said)
+    with pytest.raises(RuntimeError, match="shapes"), ending_together(trainer):
+        raise RuntimeError("shapes differ")
+
+
 def test_signals_are_as_before_the_run(tmp_path: Path, cache: Path) -> None:
-    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGUSR1)}
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)}
     train(small_config(tmp_path, cache, *RUN, "trainer.max_steps=1"))
     assert {number: signal.getsignal(number) for number in before} == before

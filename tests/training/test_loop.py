@@ -133,21 +133,27 @@ def trains(folder: Path) -> bool:
     return any("train/" in path.read_text() for path in folder.glob("logs/*/metrics.csv"))
 
 
-class Terminated(lightning.Callback):
-    """Sends SIGTERM to the own process in the first evaluation batch."""
+class Signalled(lightning.Callback):
+    """Sends a signal to the own process in the first evaluation batch."""
+
+    def __init__(self, number: signal.Signals) -> None:
+        self.number = number
 
     def on_validation_batch_start(self, *args: object) -> None:
-        signal.raise_signal(signal.SIGTERM)
+        signal.raise_signal(self.number)
 
 
-def test_sigterm_in_an_evaluation_ends_the_run(tmp_path: Path, cache: Path) -> None:
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_a_signal_in_an_evaluation_ends_the_run(
+    tmp_path: Path, cache: Path, number: signal.Signals, status: int
+) -> None:
     run = build(small_config(tmp_path, cache))
-    run.trainer.callbacks.append(Terminated())  # pyright: ignore[reportAttributeAccessIssue]
-    before = signal.getsignal(signal.SIGTERM)
+    run.trainer.callbacks.append(Signalled(number))  # pyright: ignore[reportAttributeAccessIssue]
+    before = signal.getsignal(number)
     with pytest.raises(SystemExit) as ended:
         run.trainer.validate(run.module, datamodule=run.datamodule, verbose=False)
-    assert ended.value.code == 143
-    assert signal.getsignal(signal.SIGTERM) == before
+    assert ended.value.code == status
+    assert signal.getsignal(number) == before
 
 
 def test_a_run_never_restarts_silently(full_run: Path, cache: Path, tmp_path: Path) -> None:

@@ -12,13 +12,14 @@ from inspect import cleandoc
 from typing import Any, TypeVar
 
 import hydra
+from hydra.errors import ConfigCompositionException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from vg2gt.cli import folders
 from vg2gt.cli.commands import Command
 from vg2gt.cli.errors import TRACEBACK, errors_in_one_line
-from vg2gt.config import config_dir
+from vg2gt.config import config_dir, near_keys
 
 folders.register()
 
@@ -51,6 +52,10 @@ def hydra_command(command: Command, config_name: str) -> Callable[[Callable[[Dic
                 try:
                     _show_tracebacks("1")  # else Hydra itself ends the process, with many lines about an argument
                     hydra.main(version_base="1.3", config_path=config_dir(), config_name=config_name)(job)()
+                except ConfigCompositionException as error:
+                    if advice := near_keys(config_name, sys.argv[1:], error):
+                        raise ValueError(advice) from error
+                    raise
                 finally:
                     _show_tracebacks(asked)
 
@@ -115,6 +120,25 @@ def flag_parser(name: str, command: Command, details: str = "") -> argparse.Argu
         epilog=f"example: {command.example}\n{details}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+
+
+def refuse_unknown(parser: argparse.ArgumentParser, unknown: Sequence[str]) -> None:
+    """Ends the command where arguments are left; ``backend.key=value``, as ``vg2gt train`` takes it, gets a hint.
+
+    Args:
+        parser: of a command with ``--backend``, ``--model`` and ``--set``.
+        unknown: the arguments that are none of its.
+    """
+    if not unknown:
+        return
+    hints = []
+    for part, dot, change in (argument.partition(".") for argument in unknown if "=" in argument):
+        if part in ("backend", "model") and dot:
+            hints.append(f"--{part} NAME,{change}")
+        else:
+            hints.append(f"--set {part}{dot}{change}")
+    advice = f" (write {' '.join(hints)})" if hints else ""
+    parser.error(f"unrecognized arguments: {' '.join(unknown)}{advice}")
 
 
 def list_of_names(text: str) -> list[str]:

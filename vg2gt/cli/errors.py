@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -24,6 +25,7 @@ USER_ERRORS = (
     OmegaConfBaseException,
 )
 TRACEBACK = "HYDRA_FULL_ERROR"
+INTERRUPTED = 128 + signal.SIGINT
 
 
 @contextmanager
@@ -34,6 +36,11 @@ def errors_in_one_line() -> Iterator[None]:
     """
     try:
         yield
+    except KeyboardInterrupt:
+        if os.environ.get(TRACEBACK):
+            raise
+        print("interrupted", file=sys.stderr)
+        sys.exit(INTERRUPTED)
     except Exception as error:
         if os.environ.get(TRACEBACK) or in_a_sweep() or not isinstance(error, USER_ERRORS):
             raise

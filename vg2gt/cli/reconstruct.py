@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vg2gt.cli.arguments import flag_parser, list_of_names, listing
+from vg2gt.cli.arguments import flag_parser, list_of_names, listing, refuse_unknown
 from vg2gt.cli.commands import COMMANDS
 from vg2gt.cli.errors import errors_in_one_line
 from vg2gt.cli.refine import print_refinement, refine_options
@@ -54,7 +54,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     from rich.console import Console
     from rich.logging import RichHandler
 
-    options = parser().parse_args(argv)
+    arguments = parser()
+    options, unknown = arguments.parse_known_args(argv)
+    refuse_unknown(arguments, unknown)
     logging.basicConfig(
         level=logging.WARNING,
         format="%(message)s",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import signal
 from collections.abc import Sequence
 from typing import Any
 
@@ -204,5 +205,11 @@ class SceneDataModule(LightningDataModule):
             sampler=sampler,  # pyright: ignore[reportArgumentType]
             num_workers=self.workers,
             persistent_workers=self.workers > 0,
+            worker_init_fn=_leave_interrupts_to_the_trainer,
             pin_memory=trainer is not None and trainer.strategy.root_device.type == "cuda",
         )
+
+
+def _leave_interrupts_to_the_trainer(worker: int) -> None:
+    """Ctrl-C reaches all processes of a terminal: the trainer ends its step with these still loading."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -20,6 +20,7 @@ from vg2gt.io.colmap_records import (
     check_camera,
 )
 from vg2gt.io.errors import FormatError
+from vg2gt.io.files import regular
 
 _COUNT = struct.Struct("<Q")
 _CAMERA = struct.Struct("<IiQQ")  # id, model, width, height
@@ -34,7 +35,7 @@ class _Cursor:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.data = path.read_bytes()
+        self.data = regular(path).read_bytes()
         self.position = 0
 
     @property

@@ -10,6 +10,7 @@ import numpy as np
 
 from vg2gt.io.colmap_records import ColmapCamera, ColmapImage, ColmapPoints, check_camera
 from vg2gt.io.errors import FormatError
+from vg2gt.io.files import regular
 
 _CAMERA = "CAMERA_ID MODEL WIDTH HEIGHT PARAMS..."
 _IMAGE = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
@@ -22,7 +23,7 @@ Record = TypeVar("Record")
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
     """Line numbers from 1 and lines, comments left out."""
     try:
-        text = path.read_text(encoding="utf-8")
+        text = regular(path).read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
         raise FormatError(f"{path}: not UTF-8 text ({error}); the file is damaged or not a text model") from error
     for number, line in enumerate(text.split("\n"), 1):

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import logging
 import os
+import secrets
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -28,7 +31,7 @@ def replacing(path: str | Path, durable: bool = False) -> Iterator[Path]:
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary = temporary_name(path)
     try:
         yield temporary
         if durable:
@@ -42,6 +45,11 @@ def replacing(path: str | Path, durable: bool = False) -> Iterator[Path]:
     finally:
         with suppress(OSError):  # of a disk that fails; the error on its way says more
             temporary.unlink(missing_ok=True)
+
+
+def temporary_name(path: Path) -> Path:
+    """A name beside ``path`` that no other process takes: containers that share a folder may have equal process ids."""
+    return path.with_name(f".{path.name}.{secrets.token_hex(8)}.tmp")
 
 
 def write_bytes(path: str | Path, content: bytes, durable: bool = False) -> Path:
@@ -99,6 +107,20 @@ def write_json(path: str | Path, content: Any) -> Path:
     return write_text(path, json.dumps(content, indent=2, sort_keys=True) + "\n")
 
 
+def regular(path: str | Path) -> Path:
+    """The path of a file that may be opened: a named pipe would keep its reader waiting, a device may have no end.
+
+    Raises:
+        FileNotFoundError: if there is none.
+        OSError: if it is a pipe, a socket or a device; a folder is left to the reader's own message.
+    """
+    path = Path(path)
+    mode = path.stat().st_mode
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+        raise OSError(errno.EINVAL, f"{path} is no regular file but a pipe, a socket or a device")
+    return path
+
+
 def read_json(path: str | Path) -> Any:
     """Reads a JSON file.
 
@@ -106,6 +128,6 @@ def read_json(path: str | Path) -> Any:
         ValueError: if it is not valid JSON, naming the file.
     """
     try:
-        return json.loads(Path(path).read_text())
+        return json.loads(regular(path).read_text())
     except json.JSONDecodeError as error:
         raise ValueError(f"{path} is not valid JSON: {error}") from error

@@ -95,11 +95,12 @@ def read_color(
         DataError: if the file is missing, damaged or of another size.
     """
     with _opened(path if content is None else io.BytesIO(content), path, scene) as image:
+        turned = upright and _orientation(image) in _QUARTER_TURNS
+        check_size(path, scene, image.size if turned else image.size[::-1], size)  # before anything is decoded
         turn = _TURNS.get(_orientation(image)) if upright else None
         pixels = np.array(color_image(image))
         if turn is not None:
             pixels = np.array(Image.fromarray(pixels).transpose(turn))
-    check_size(path, scene, pixels.shape[:2], size)
     return pixels
 
 
@@ -110,13 +111,15 @@ def read_depth(path: Path, scene: str, size: Size | None = None) -> NDArray[np.i
         DataError: if the file is missing, damaged, not a one-channel integer image, or of another size than ``size``.
     """
     with _opened(path, path, scene) as image:
+        channels = len(image.getbands())
+        if channels == 1:
+            check_size(path, scene, image.size[::-1], size)
         pixels = np.array(image)
     if pixels.ndim != 2 or pixels.dtype.kind not in "iu":
         raise DataError(
             f"{path} of scene {scene} is not a depth image: expected one channel of 16-bit integers, found "
             f"{pixels.dtype} values of shape {pixels.shape}"
         )
-    check_size(path, scene, pixels.shape, size)
     return pixels.astype(np.int64)
 
 
@@ -139,6 +142,8 @@ def _opened(file: Path | io.BytesIO, path: Path, scene: str) -> Iterator[Image.I
     try:
         with open_image(file) as image:
             yield image
+    except DataError:
+        raise
     except _DAMAGED as error:
         raise DataError(
             f"cannot read {path} of scene {scene}: {error}; restore the file or remove the frame"

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from vg2gt.io.files import write_bytes
+from vg2gt.io.files import regular, write_bytes
 
 # Anchors of a perceptually ordered map, near (bright) to far (dark); interpolated linearly.
 _DEPTH_ANCHORS = torch.tensor(
@@ -36,8 +36,10 @@ def open_image(file: str | Path | IO[bytes]) -> Image.Image:
     """Opens an image file lazily as Pillow does, if it is in one of the formats of photographs and depth images.
 
     Raises:
-        OSError: if the file is missing or in no such format.
+        OSError: if the file is missing, no regular one, or in no such format.
     """
+    if isinstance(file, (str, Path)):
+        regular(file)
     Image.init()
     return Image.open(file, formats=[name for name in _FORMATS if name in Image.OPEN])
 

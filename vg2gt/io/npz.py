@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vg2gt.io.errors import DataError, FormatError
+from vg2gt.io.files import regular
 
 _ALWAYS = 256 << 20  # bytes that an archive may unpack to, however small it is
 _RATIO = 100  # more bytes than this for each byte of the archive are no data of ours (zeros reach 1000)
@@ -30,6 +31,8 @@ def read_npz(file: str | Path | BinaryIO, names: Sequence[str], limit: int | Non
         OSError: if it cannot be opened.
     """
     try:
+        if isinstance(file, (str, Path)):
+            regular(file)
         with np.load(file, allow_pickle=False) as stored:
             if not isinstance(stored, np.lib.npyio.NpzFile):
                 raise FormatError("it is a single array, not an archive")

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vg2gt.io.errors import DataError
+from vg2gt.io.files import regular
 from vg2gt.io.image_files import Size, check_size
 
 _HEADER = re.compile(rb"(P[fF])\s+(\d{1,6})\s+(\d{1,6})\s+([-+0-9.eE]{1,20})\s")
@@ -26,7 +27,7 @@ def read_pfm(path: Path, scene: str, size: Size | None = None) -> NDArray[np.flo
         DataError: if the file is missing, truncated or too long, not such an image, or of another size.
     """
     try:
-        content = path.read_bytes()
+        content = regular(path).read_bytes()
     except OSError as error:
         raise DataError(f"cannot read {path} of scene {scene}: {error}") from error
     header = _HEADER.match(content[:64])

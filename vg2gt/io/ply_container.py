@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vg2gt.io.errors import FormatError
+from vg2gt.io.files import regular
 
 _TYPES = {
     **dict.fromkeys(("char", "int8"), "<i1"),
@@ -48,7 +49,7 @@ def read_vertices(path: Path) -> NDArray:
     Raises:
         FormatError: if the file is damaged, has no vertices or is big endian.
     """
-    data = path.read_bytes()
+    data = regular(path).read_bytes()
     encoding, elements, start = _header(path, data)
     names = [element.name for element in elements]
     if "vertex" not in names:

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vg2gt.io.errors import DataError
+from vg2gt.io.files import regular
 from vg2gt.io.image_files import Size
 
 _VERSION = 4
@@ -64,7 +65,7 @@ def scan_sens(path: Path, scene: str) -> tuple[SensStream, NDArray[np.float64]]:
     """
     try:
         length = path.stat().st_size
-        with path.open("rb") as file:
+        with regular(path).open("rb") as file:
             return _scan(file, length)
     except (OSError, ValueError) as error:
         raise DataError(f"cannot read {path} of scene {scene}: {error}; export the scan again") from error
@@ -77,7 +78,7 @@ def read_span(path: Path, scene: str, span: NDArray[np.int64]) -> bytes:
         DataError: if the file is missing or has become shorter.
     """
     try:
-        with path.open("rb") as file:
+        with regular(path).open("rb") as file:
             file.seek(int(span[0]))
             content = file.read(int(span[1]))
     except OSError as error:

@@ -25,7 +25,7 @@ import numpy as np
 
 from vg2gt.geometry.spherical_harmonics import DC
 from vg2gt.io.errors import FormatError
-from vg2gt.io.files import write_bytes
+from vg2gt.io.files import regular, write_bytes
 from vg2gt.io.gaussian_arrays import GaussianArrays, to_arrays, to_gaussians
 from vg2gt.types import Gaussians
 
@@ -71,7 +71,7 @@ def read_splat(path: str | Path) -> Gaussians:
         FormatError: if the length is not a multiple of 32 bytes or a standard deviation is negative.
     """
     path = Path(path)
-    data = path.read_bytes()
+    data = regular(path).read_bytes()
     if len(data) % _ROW.itemsize:
         raise FormatError(
             f"{path}: {len(data)} bytes are not a multiple of {_ROW.itemsize}; the file is truncated or not a .splat"

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import zipfile
+from collections import Counter
+from collections.abc import Iterator, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -12,6 +14,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from vg2gt.io.errors import FormatError
+from vg2gt.io.files import regular
 
 
 def read_torch(path: str | Path) -> Any:
@@ -23,8 +26,7 @@ def read_torch(path: str | Path) -> Any:
     """
     path = Path(path)
     try:
-        refuse_foreign(path)
-        return torch.load(path, map_location="cpu", weights_only=True)
+        return load_plain(regular(path))
     except (FileNotFoundError, FormatError):
         raise
     except Exception as error:  # damage raises whatever the unpickler, zip reader and allocator raise
@@ -46,9 +48,55 @@ def read_tensors(path: str | Path) -> dict[str, Tensor]:
             raise FormatError(f"{path} is not a mapping of names to tensors: export the bare state dict")
         return dict(state)
     try:
-        return load_file(path)
+        return load_file(regular(path))
     except SafetensorError as error:
         raise FormatError(f"{path} is damaged or no safetensors file: {error}") from error
+
+
+def load_plain(path: Path) -> Any:
+    """What ``torch.load`` makes of a file in which nothing is executed, compressed or shorter than it says.
+
+    Raises:
+        FormatError: if the file is no archive that ``torch.save`` writes, or a tensor's record is too short.
+        Exception: whatever ``torch.load`` raises over damaged bytes.
+    """
+    refuse_foreign(path)
+    content = torch.load(path, map_location="cpu", weights_only=True)
+    refuse_short_records(path, content)
+    return content
+
+
+def refuse_short_records(path: Path, content: Any) -> None:
+    """Refuses tensors that are longer than their records in the archive: torch 2.6 fills them with foreign memory.
+
+    Args:
+        path: the archive; files of old that are none have lengths torch knows.
+        content: what was read from it.
+
+    Raises:
+        FormatError: if a tensor has no record of its length.
+    """
+    if not zipfile.is_zipfile(path):
+        return
+    with zipfile.ZipFile(path) as archive:
+        records = Counter(member.file_size for member in archive.infolist() if "/data/" in member.filename)
+    storages = {
+        (tensor.untyped_storage().data_ptr(), tensor.untyped_storage().nbytes()) for tensor in _tensors(content)
+    }
+    missing = Counter(length for _, length in storages if length) - records
+    if missing:
+        raise FormatError(f"{path} is damaged: a tensor of {next(iter(missing))} bytes has a record of another length")
+
+
+def _tensors(content: Any) -> Iterator[Tensor]:
+    if isinstance(content, Tensor):
+        yield content
+    elif isinstance(content, Mapping):
+        for value in content.values():
+            yield from _tensors(value)
+    elif isinstance(content, (list, tuple, set)):
+        for value in content:
+            yield from _tensors(value)
 
 
 def refuse_foreign(path: Path) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from vg2gt.io.files import write_bytes
+from vg2gt.io.files import temporary_name, write_bytes
 from vg2gt.io.images import colorize_normals, encode_image, to_pixels
 from vg2gt.io.video import write_video
 from vg2gt.reconstruction.camera_paths import view_stem
@@ -125,7 +125,7 @@ def feed(views: Iterable[RenderedView], sinks: Sequence[Sink], advance: Callable
 @contextmanager
 def whole_folder(target: Path) -> Iterator[Path]:
     """A folder to write into that takes the place of ``target`` at the end of the block, or vanishes on an error."""
-    staged = target.with_name(f".{target.name}.{os.getpid()}.tmp")
+    staged = temporary_name(target)
     shutil.rmtree(staged, ignore_errors=True)
     staged.mkdir(parents=True)
     try:

@@ -9,7 +9,7 @@ import zipfile
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -17,7 +17,7 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from vg2gt.io.files import flush_folder, flush_to_disk, write_bytes
-from vg2gt.io.tensors import refuse_foreign
+from vg2gt.io.tensors import load_plain, refuse_foreign
 
 log = logging.getLogger(__name__)
 
@@ -35,19 +35,38 @@ def write_checkpoint(checkpoint: Mapping[str, Any], path: str | Path) -> None:
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
     temporary = target.with_name(target.name + ".tmp")
+    noting = None
     try:
         with open(temporary, "wb") as file:
-            torch.save(checkpoint, file)
+            noting = _NotingFile(file)
+            torch.save(checkpoint, noting)
             flush_to_disk(file)
         os.replace(temporary, target)
         flush_folder(target.parent)
     except (OSError, RuntimeError) as error:  # torch's writer may make a RuntimeError of a full disk
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
+        reason = error if noting is None or noting.error is None else noting.error
         raise OSError(
-            f"checkpoint {target} could not be written ({error}); earlier checkpoints are intact: make room and go "
+            f"checkpoint {target} could not be written ({reason}); earlier checkpoints are intact: make room and go "
             "on with ckpt=last"
         ) from error
+
+
+class _NotingFile:
+    """A file that remembers the disk's own error, of which torch's writer says "unexpected pos"."""
+
+    def __init__(self, file: IO[bytes]) -> None:
+        self.error: OSError | None = None
+        self.flush = file.flush
+        self._write = file.write
+
+    def write(self, content: Any) -> int:
+        try:
+            return self._write(content)
+        except OSError as error:
+            self.error = error
+            raise
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
@@ -65,7 +84,7 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     try:
         refuse_foreign(path)
         _verify_checksums(path)
-        content = torch.load(path, map_location="cpu", weights_only=True)
+        content = load_plain(path)
         if not isinstance(content, dict):
             raise ValueError(f"it holds a {type(content).__name__}")
     except Exception as error:  # there is no end to what readers raise over damaged bytes
@@ -114,6 +133,17 @@ def _read_slim(path: Path) -> dict[str, Any]:
 def model_state(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """The model's part of a checkpoint's ``state_dict``, by the model's own names."""
     return {name.removeprefix(MODEL_PREFIX): tensor for name, tensor in state.items()}
+
+
+def refuse_not_finite(state: Mapping[str, Tensor], path: str | Path) -> None:
+    """Refuses the weights of a training that has diverged.
+
+    Raises:
+        ValueError: naming the file and the first tensor with NaN or infinity.
+    """
+    bad = next((name for name, value in state.items() if not bool(torch.isfinite(value).all())), None)
+    if bad is not None:
+        raise ValueError(f"checkpoint {path} holds weights that are not finite ({bad}): take an earlier one of its run")
 
 
 def _verify_checksums(path: Path) -> None:
@@ -190,9 +220,10 @@ def initialize_from(module: nn.Module, path: str | Path) -> None:
         path: checkpoint whose ``state_dict`` is used; optimiser state and step are not.
 
     Raises:
-        ValueError: if nothing in the checkpoint fits the module.
+        ValueError: if nothing in the checkpoint fits the module, or something in it is not finite.
     """
     stored: Mapping[str, Tensor] = read_checkpoint(path).get("state_dict", {})
+    refuse_not_finite(stored, path)
     present = {k: v for k, v in module.state_dict().items() if not k.startswith("model.backend.")}
     fitting = {k: v for k, v in stored.items() if k in present and present[k].shape == v.shape}
     if not fitting:

@@ -6,6 +6,7 @@ import hashlib
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from omegaconf.errors import OmegaConfBaseException
 from vg2gt.config import compose, flatten, group_options
 from vg2gt.model import Reconstructor
 from vg2gt.rendering import Renderer
-from vg2gt.runs.checkpoints import model_state, read_checkpoint
+from vg2gt.runs.checkpoints import model_state, read_checkpoint, refuse_not_finite
 from vg2gt.runs.find import checkpoint_path, run_config_path
 from vg2gt.runs.trust import check_targets, parse_run_config, read_run_config
 
@@ -208,7 +209,9 @@ def compose_part(part: str, spec: str) -> DictConfig:
     """
     name, *changes = split_outside_brackets(spec)
     if name not in group_options(part):
-        raise ValueError(f"unknown {part} {name!r}; choose one of: {', '.join(group_options(part))}")
+        near = get_close_matches(name, group_options(part), 1)
+        advice = f"did you mean {near[0]}? All: " if near else "choose one of: "
+        raise ValueError(f"unknown {part} {name!r}; {advice}{', '.join(group_options(part))}")
     config = compose(None, f"+{part}={name}")[part]
     for change in changes:
         _update(config, change, f"{part} {name}", anything=name == "custom")
@@ -252,11 +255,12 @@ def load_weights(model: Reconstructor, path: Path | None) -> TrainedWeights:
     """Loads the trained part into a model; nothing without a path.
 
     Raises:
-        ValueError: if it was trained on another backbone, or does not fit the model.
+        ValueError: if it was trained on another backbone, does not fit the model, or is not finite.
     """
     if path is None:
         return TrainedWeights(None, 0, None)
     checkpoint = read_checkpoint(path)
+    refuse_not_finite(checkpoint["state_dict"], path)
     model.load_trained(model_state(checkpoint["state_dict"]), checkpoint.get("backend"))
     return TrainedWeights(path, int(checkpoint["global_step"]), hashlib.sha256(path.read_bytes()).hexdigest())
 

@@ -20,6 +20,7 @@ from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
 from vg2gt.data.base import SceneSource
+from vg2gt.io.files import regular
 from vg2gt.model import SceneScale
 from vg2gt.rendering import Renderer
 
@@ -48,7 +49,7 @@ def read_run_config(path: str | Path) -> DictConfig:
     if path.stat().st_size > _LARGEST:
         raise UntrustedError(f"{path} has {path.stat().st_size} bytes; a run's configuration has at most {_LARGEST}")
     try:
-        text = path.read_text(encoding="utf-8")
+        text = regular(path).read_text(encoding="utf-8")
     except (UnicodeDecodeError, OSError) as error:
         raise ValueError(f"{path} is not a run's configuration: {' '.join(str(error).split())}") from error
     return parse_run_config(text, path)

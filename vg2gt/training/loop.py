@@ -21,7 +21,14 @@ from backends.cache import TokenCache
 from vg2gt.data.datamodule import SceneDataModule
 from vg2gt.io.files import read_json, write_json, write_text
 from vg2gt.memory import TRAINING, memory_advice
-from vg2gt.runs.checkpoints import initialize_from, model_state, newest_valid, read_checkpoint, remove_leftovers
+from vg2gt.runs.checkpoints import (
+    initialize_from,
+    model_state,
+    newest_valid,
+    read_checkpoint,
+    refuse_not_finite,
+    remove_leftovers,
+)
 from vg2gt.runs.load import made_of
 from vg2gt.runs.lock import only_process_in
 from vg2gt.training.checkpoint_io import AtomicCheckpointIO
@@ -159,6 +166,7 @@ def _train(config: DictConfig, writes: bool) -> dict[str, Any]:
         )
     if checkpoint is not None:
         content = read_checkpoint(checkpoint)  # refused before anything is written
+        refuse_not_finite(content["state_dict"], checkpoint)
         run.module.model.load_trained(model_state(content["state_dict"]), content.get("backend"))
         name_differences(config)
     elif config.init_from:

@@ -80,7 +80,11 @@ class COLMAP(FileSource):
         with errors_name(scene):
             color = {i: path for i, path in named.items() if path.is_file()}
         if not color:
-            raise DataError(f"scene {scene}: none of the model's {len(records)} images is in {folder / self.images}")
+            names = f"the first is {records[0].name}, expected at {named[0]}" if records else "it names none"
+            raise DataError(
+                f"scene {scene}: none of the model's {len(records)} images is in {folder / self.images}; {names}. Copy "
+                "them there, or name their folder by data.images="
+            )
         sizes = {i: image_size(path, scene) for i, path in color.items()}
         poses = {i: to_world(colmap_pose(record)) for i, record in enumerate(records)}
         intrinsics = {i: image_intrinsics(model, records[i], sizes[i], path) for i, path in color.items()}

@@ -71,7 +71,7 @@ class FileSource(SceneSource):
     """How deep below ``root`` scenes lie, at most."""
     names_are_paths: ClassVar[bool] = False
     """Scenes are called by their path below ``root``, not by their folder's name."""
-    index_version: ClassVar[int] = 1
+    index_version: ClassVar[int] = 2
     """Raise it when ``index`` would give another result for the same files."""
     index_options: ClassVar[tuple[str, ...]] = ()
     """Attributes that decide an index, beside the folder; part of the cache's key."""

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from vg2gt.data.base import DataError
 from vg2gt.io.errors import FormatError
+from vg2gt.io.files import regular
 
 log = logging.getLogger(__name__)
 
@@ -90,7 +91,7 @@ def read_text_lines(path: Path, scene: str) -> list[str]:
 
 def _read_lines(path: Path, scene: str) -> list[str]:
     try:
-        return path.read_text(encoding="utf-8").splitlines()
+        return regular(path).read_text(encoding="utf-8").splitlines()
     except (OSError, ValueError) as error:
         raise DataError(f"cannot read {path} of scene {scene}: {error}") from error
 
