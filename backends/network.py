@@ -48,6 +48,8 @@ class NetworkBackend(Backend):
         compile: bool = False,
     ) -> None:
         """Ends the constructor: makes the network with its weights and freezes it."""
+        if list(taps) != sorted(set(taps)):
+            raise ValueError(f"backend.taps={list(taps)} must ascend: the heads take shallow layers first")
         self.taps = tuple(taps)
         self.head_chunk = head_chunk
         self.weights = weights

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -17,6 +17,7 @@ from backends.bundle import DECODER, DECODER_WEIGHTS, ENCODER, REMEDY, load_deco
 from vg2gt.types import Cameras, Geometry, Hints, Tokens
 
 Provider = Literal["auto", "cpu", "cuda"]
+DECODED = ("depth", "depth_conf", "world_to_camera", "intrinsics")
 CUDA, CPU = "CUDAExecutionProvider", "CPUExecutionProvider"
 
 
@@ -33,7 +34,8 @@ class OnnxBackend(Backend):
 
     Raises:
         FileNotFoundError: if ``path`` is no bundle or lacks a file.
-        ValueError: if a file is damaged, reads data outside the folder, or does not fit; or the provider is unknown.
+        ValueError: if a file is damaged, reads data outside the folder, does not fit, or gives other outputs; or the
+            provider is unknown.
         RuntimeError: if the provider is not available.
     """
 
@@ -58,6 +60,10 @@ class OnnxBackend(Backend):
         self.decoder = decoder
         self.encoder_session = open_session(folder / ENCODER, provider)
         self.decoder_session = open_session(folder / DECODER, provider) if decoder is None else None
+        names = [*(f"patch_{index}" for index in range(len(self.token_dims))), "camera"]
+        check_outputs(self.encoder_session, folder / ENCODER, names, dict(zip(names, self.token_dims, strict=False)))
+        if self.decoder_session is not None:
+            check_outputs(self.decoder_session, folder / DECODER, DECODED, {"world_to_camera": 4, "intrinsics": 3})
         if decoder is None:
             warnings.warn(
                 f"{folder} has no {DECODER_WEIGHTS}: backend {self.name} decodes without gradient, so the coarse "
@@ -115,6 +121,29 @@ def open_session(file: Path, provider: Provider) -> onnxruntime.InferenceSession
             "onnxruntime-gpu in place of onnxruntime, or use backend.provider=cpu"
         )
     return session
+
+
+def check_outputs(
+    session: onnxruntime.InferenceSession, file: Path, names: Sequence[str], last: Mapping[str, int]
+) -> None:
+    """Compares a graph's outputs, which are taken by position, with what they should be.
+
+    Args:
+        session: the graph.
+        file: it was read from, for the message.
+        names: of its outputs in order.
+        last: size of an output's last dimension, where it is known.
+
+    Raises:
+        ValueError: if names, their order or sizes are others.
+    """
+    found = [output.name for output in session.get_outputs()]
+    if found != list(names):
+        raise ValueError(f"{file} gives {', '.join(found)}, expected {', '.join(names)} in this order: {REMEDY}")
+    for output in session.get_outputs():
+        size = output.shape[-1] if output.shape else None
+        if isinstance(size, int) and size != last.get(output.name, size):
+            raise ValueError(f"{file}: {output.name} has {size} channels, expected {last[output.name]}: {REMEDY}")
 
 
 def run_session(session: onnxruntime.InferenceSession, inputs: Mapping[str, Tensor]) -> list[Tensor]:

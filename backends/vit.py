@@ -5,7 +5,7 @@ Module names follow the published weight files.
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor, nn
@@ -105,6 +105,8 @@ class ViTBlock(nn.Module):
         self.attn = Attention(dim, num_heads, qk_norm)
         self.ls1 = LayerScale(dim, layer_scale)
         self.norm2 = nn.LayerNorm(dim, eps=eps)
+        if ffn not in get_args(FeedForward):
+            raise ValueError(f"backend.ffn is {ffn!r}; choose one of {', '.join(get_args(FeedForward))}")
         self.mlp = SwiGLU(dim, 4 * dim) if ffn == "swiglu" else MLP(dim, 4 * dim)
         self.ls2 = LayerScale(dim, layer_scale)
 

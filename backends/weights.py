@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import logging
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -53,6 +56,11 @@ class Weights:
             ValueError: if they do not fit.
         """
         if not self.pretrained:
+            if self.path is not None:
+                raise ValueError(
+                    f"backend {self.name}: pretrained=false means random weights, path={self.path} names others: leave "
+                    "one of them out"
+                )
             with seeded_initialisation(self.seed):
                 return make()
         file = find_weights(self.name, self.repo, self.revision, self.path)
@@ -73,7 +81,7 @@ def find_weights(name: str, repo: str | None, revision: str | None, path: str | 
     remedy = f"give backend.path=FILE_OR_FOLDER, or backend.pretrained=false for random weights (repository: {repo})"
     if path is not None:
         given = Path(path).expanduser()
-        candidates = [given] if given.suffix else [given / file for file in WEIGHT_FILES]
+        candidates = [given / file for file in WEIGHT_FILES] if given.is_dir() else [given]
         for candidate in candidates:
             if candidate.is_file():
                 return candidate
@@ -85,15 +93,29 @@ def find_weights(name: str, repo: str | None, revision: str | None, path: str | 
     except ImportError as error:
         raise ImportError(
             f"backend {name} loads {WEIGHT_FILES[0]} from {repo} with huggingface_hub, which is not installed: "
-            f"pip install huggingface_hub, or {remedy}"
+            f"pip install 'vg2gt[hub]', or {remedy}"
         ) from error
+    print(f"{name}: looking for {repo} on the hub or in its cache", file=sys.stderr)
     try:
-        return Path(hf_hub_download(repo, WEIGHT_FILES[0], revision=revision))
+        with _quiet("huggingface_hub"):  # every attempt would be told in several lines
+            return Path(hf_hub_download(repo, WEIGHT_FILES[0], revision=revision))
     except Exception as error:  # the hub raises its own, requests' and httpx's errors
         raise FileNotFoundError(
             f"cannot get {WEIGHT_FILES[0]} of {repo} (revision {revision or 'newest'}) for backend {name}: "
             f"{_reason(error)}. Check the network, the revision and the cache, or {remedy}"
         ) from error
+
+
+@contextmanager
+def _quiet(name: str) -> Iterator[None]:
+    """Leaves out a package's warnings: what is wrong stands in the error."""
+    logger = logging.getLogger(name)
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
 
 
 def _reason(error: BaseException) -> str:
@@ -118,7 +140,7 @@ def load_strictly(
         source: for messages.
 
     Raises:
-        ValueError: naming the first missing, misshapen or unexpected tensors.
+        ValueError: naming the first tensors that are missing, misshapen, unexpected or not finite.
     """
     wanted = {prefix + key: value for key, value in network.state_dict().items()}
     complaints = [f"missing {key} {list(value.shape)}" for key, value in wanted.items() if key not in state]
@@ -128,6 +150,9 @@ def load_strictly(
         if key in state and state[key].shape != value.shape
     ]
     complaints += [f"unexpected {key}" for key in state if key not in wanted and not key.startswith(tuple(ignorable))]
+    bad = next((key for key in wanted if key in state and not bool(torch.isfinite(state[key]).all())), None)
+    if bad is not None:
+        complaints.insert(0, f"{bad} is not finite")
     if complaints:
         more = f"; and {len(complaints) - SHOWN} more" if len(complaints) > SHOWN else ""
         raise ValueError(f"{source} does not fit {type(network).__name__}: {'; '.join(complaints[:SHOWN])}{more}")

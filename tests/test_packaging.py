@@ -1,10 +1,13 @@
 """The wheel works without the checkout."""
 
 import os
+import re
 import subprocess
 import sys
 import zipfile
 from pathlib import Path
+
+import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -39,3 +42,23 @@ def test_installed_wheel_trains_from_an_empty_folder(tmp_path: Path) -> None:
     assert run.returncode == 0, run.stderr[-3000:]
     assert str(site) in run.stdout
     assert (empty / "outputs" / "trials" / "quickstart").is_dir()
+
+
+# Of what torch, numpy, scipy, numba and their like are built against, versions cannot be mixed in one environment.
+LIGHT = ("hydra-core", "omegaconf", "trimesh", "safetensors", "fsspec", "pillow", "rich", "typing-extensions")
+
+
+@pytest.mark.slow
+def test_the_lowest_versions_of_light_packages_do(tmp_path: Path) -> None:
+    """Installs them beside the environment's others (needs a package index) and runs what uses them."""
+    text = (ROOT / "pyproject.toml").read_text()
+    bounds = dict(re.findall(r'"([a-z-]+)>=([0-9.]+)', text))
+    lowest = [f"{name}=={bounds[name]}" for name in LIGHT]
+    install = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--only-binary", ":all:", "--target"]
+    subprocess.run([*install, str(tmp_path), *lowest], check=True, capture_output=True)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join((str(tmp_path), str(ROOT)))}
+    tests = ["tests/io", "tests/safety", "tests/cli", "tests/runs", "tests/test_configs.py"]
+    ran = subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", *tests], cwd=ROOT, env=environment, capture_output=True, text=True, check=False
+    )
+    assert ran.returncode == 0, ran.stdout[-5000:]

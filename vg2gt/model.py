@@ -89,6 +89,7 @@ class Reconstructor(nn.Module, ABC):
                 f"model.scale.source=metric needs a backend that knows metres, {backend.name} does not: "
                 "use model.scale.source=normalize or focal"
             )
+        backend.freeze()  # a subclass may have added layers after its parent's constructor froze those before
         self.backend = backend
         self.scale = scale
         self.token_cache: TokenCache | None = None  # set where view sets come again

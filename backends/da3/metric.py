@@ -25,6 +25,7 @@ CANONICAL_FOCAL = 300.0  # pixels at network resolution
 SKY_THRESHOLD = 0.3
 FAR_QUANTILE = 0.99
 MIN_PIXELS = 10
+NEAREST, NEAREST_METRIC = 1e-3, 1e-2  # depth, metric depth: nearer pixels do not fit the scale
 MAX_SAMPLES = 100_000  # for quantiles
 
 
@@ -146,7 +147,11 @@ def metres(cameras: Cameras) -> Tensor:
 
 
 def fill_sky(depth: Tensor, sky: Tensor) -> Tensor:
-    """Gives sky pixels the far end of their scene: the 0.99 quantile of the other pixels' depth ``[B, V, H, W]``."""
+    """Gives sky pixels the far end of their scene: the 0.99 quantile of the other pixels' depth ``[B, V, H, W]``.
+
+    The published code takes the quantile over the whole batch, so that a scene's sky would depend on its neighbours;
+    of one scene at a time both are the same.
+    """
     is_sky = sky >= SKY_THRESHOLD
     filled = []
     for scene, mask in zip(depth, is_sky, strict=True):
@@ -165,7 +170,9 @@ def quantile(values: Tensor, q: float) -> Tensor:
 class DA3NestedBackend(Backend):
     """DA3's relative network with a metric scale: one factor per scene, fitted to the metric network's depth.
 
-    Geometry stays the relative network's; ``Geometry.scale`` turns it into metres.
+    Geometry stays the relative network's; ``Geometry.scale`` turns it into metres. The published code also gives the
+    relative depth's sky the far end of the scene and full confidence; here it keeps what the network decodes, which
+    stays differentiable.
 
     Args:
         relative: predicts geometry.
@@ -199,6 +206,7 @@ class DA3NestedBackend(Backend):
 def fit_scale(metric_depth: Tensor, sky: Tensor, geometry: Geometry) -> Tensor:
     """Least-squares factor ``[B]`` from relative to metric depth over confident pixels that are not sky.
 
+    As in the published code pixels next to the camera do not count (depth up to 1e-3, metric depth up to 1e-2).
     Confident means at least the median confidence of the scene's pixels that are not sky. A scene with no more than ten
     such pixels gets 1.
     """
@@ -211,5 +219,9 @@ def fit_scale(metric_depth: Tensor, sky: Tensor, geometry: Geometry) -> Tensor:
             factors.append(torch.ones_like(depth[0, 0, 0]))
             continue
         sure = usable & (confidence >= quantile(confidence[usable], 0.5))
+        sure &= (depth > NEAREST) & (target > NEAREST_METRIC)
+        if not sure.any():
+            factors.append(torch.ones_like(depth[0, 0, 0]))
+            continue
         factors.append((target[sure] * depth[sure]).sum() / depth[sure].square().sum())
     return torch.stack(factors)

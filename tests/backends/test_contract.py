@@ -69,6 +69,25 @@ def test_values_are_usable(geometry: Geometry) -> None:
     assert (geometry.cameras.intrinsics[..., [0, 1], [0, 1]] > 0).all()
 
 
+def test_intrinsics_are_in_pixels(geometry: Geometry) -> None:
+    width, height = geometry.cameras.size[::-1]
+    centre = geometry.cameras.intrinsics[..., :2, 2]
+    assert ((centre - torch.tensor([width / 2, height / 2])).abs() < torch.tensor([width / 4, height / 4])).all()
+
+
+def test_given_poses_keep_their_direction(backend: Backend, scene, geometry: Geometry) -> None:
+    """World to camera: the inverse of what is given is not nearer than what is given."""
+    if not backend.needs_hints:
+        pytest.skip("this backend finds its poses itself")
+    found = relative_to_first(geometry.cameras).world_to_camera[..., :3, :3]
+    given = relative_to_first(scene[1].cameras).world_to_camera[..., :3, :3]
+    assert (found - given).abs().mean() < 0.5 * (found - given.mT).abs().mean()
+
+
+def test_tokens_are_float32(tokens: Tokens) -> None:
+    assert {tensor.dtype for tensor in (*tokens.patch, tokens.camera)} == {torch.float32}
+
+
 def test_is_described(backend: Backend) -> None:
     assert backend.name
     assert backend.licence

@@ -147,6 +147,16 @@ def test_sky_is_far() -> None:
     assert torch.equal(fill_sky(depth, torch.ones_like(depth)), depth)  # nothing but sky: nothing to go by
 
 
+def test_sky_is_that_of_its_scene_whatever_else_is_in_the_batch() -> None:
+    """The published code would take one quantile of both scenes."""
+    depth = torch.stack((torch.linspace(1, 2, 400), torch.linspace(50, 90, 400))).reshape(2, 1, 20, 20)
+    sky = torch.zeros_like(depth)
+    sky[:, :, :5] = 0.5
+    alone = torch.cat([fill_sky(depth[i : i + 1], sky[i : i + 1]) for i in range(2)])
+    assert torch.equal(fill_sky(depth, sky), alone)
+    assert alone[0, 0, :5].max() < 2 < 50 < alone[1, 0, :5].min()
+
+
 def test_nested_scale_ignores_sky_and_doubt() -> None:
     generator = torch.Generator().manual_seed(0)
     depth = 1 + torch.rand(2, 2, 20, 20, generator=generator)
@@ -161,6 +171,9 @@ def test_nested_scale_ignores_sky_and_doubt() -> None:
     geometry = Geometry(depth, confidence, cameras, torch.ones(2))
     torch.testing.assert_close(fit_scale(metric, sky, geometry), factor)
     assert torch.equal(fit_scale(metric, torch.ones_like(sky), geometry), torch.ones(2))
+    metric[:, :, 5] = 1e-3  # at the camera's lens
+    torch.testing.assert_close(fit_scale(metric, sky, geometry), factor)
+    assert torch.equal(fit_scale(torch.zeros_like(metric), sky, geometry), torch.ones(2))
 
 
 def test_nested_keeps_the_relative_geometry(make_backend, make_scene) -> None:

@@ -1,8 +1,10 @@
+import re
 import sys
 from pathlib import Path
 
 import pytest
 import torch
+from hydra.errors import InstantiationException
 from safetensors.torch import save_file
 from torch import nn
 
@@ -64,6 +66,40 @@ def test_a_file_of_another_model_is_refused_briefly() -> None:
         load_strictly(network, {"other": torch.zeros(1)}, "", (), "x")
 
 
+def test_a_folder_may_have_a_dot_and_weights_are_copies(tmp_path: Path) -> None:
+    folder = tmp_path / "DA3-LARGE-1.1"
+    folder.mkdir()
+    save_file({"a": torch.ones(3)}, folder / "model.safetensors")
+    file = find_weights("name", None, None, str(folder))
+    state = read_tensors(file)
+    file.write_bytes(bytes(file.stat().st_size))  # while the network runs
+    assert state["a"].tolist() == [1, 1, 1]
+
+
+def test_weights_that_are_not_finite_are_refused() -> None:
+    network = nn.Linear(2, 2)
+    state = {name: value.clone() for name, value in network.state_dict().items()}
+    state["bias"][1] = torch.nan
+    with pytest.raises(ValueError, match=r"x does not fit Linear: bias is not finite"):
+        load_strictly(network, state, "", (), "x")
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"path": "here"}, "pretrained=false means random weights, path=here names others"),
+        ({"taps": [3, 1, 0, 2]}, r"backend\.taps=\[3, 1, 0, 2\] must ascend"),
+        ({"ffn": "swiglue"}, "backend.ffn is 'swiglue'; choose one of mlp, swiglu"),
+    ],
+)
+def test_options_that_mean_nothing_are_refused(make_backend, options: dict[str, object], said: str) -> None:
+    options = {"depth": 4, "multiview_from": 1, "taps": [0, 1, 2, 3], **options}
+    changes = [f"{name}={value}" for name, value in options.items()]
+    with pytest.raises(InstantiationException) as caught:
+        make_backend("da3_tiny", *changes)
+    assert re.search(said, str(caught.value.__cause__))
+
+
 def test_missing_files_are_named(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"model\.safetensors.*backend\.pretrained=false.*some/repo"):
         find_weights("name", "some/repo", None, str(tmp_path))
@@ -73,7 +109,7 @@ def test_missing_files_are_named(tmp_path: Path) -> None:
 
 def test_missing_hub_library_is_explained(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
-    with pytest.raises(ImportError, match="pip install huggingface_hub"):
+    with pytest.raises(ImportError, match=r"pip install 'vg2gt\[hub\]'"):
         find_weights("name", "some/repo", None, None)
 
 

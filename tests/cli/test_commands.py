@@ -9,8 +9,9 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
+from hydra.errors import HydraException
 
-from tests.commands import ROOT, run_vg2gt
+from tests.commands import ROOT
 from vg2gt import __version__
 from vg2gt.cli import main
 from vg2gt.cli.commands import COMMANDS, DATA_COMMANDS, Command, dispatch
@@ -75,14 +76,23 @@ def test_the_front_door(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureF
     assert said("vg2gt", "zzz") == "vg2gt: unknown command 'zzz' (vg2gt --help lists all)\n"
 
 
-@pytest.mark.parametrize(
-    "module", ["vg2gt.data.synthetic", "vg2gt.data.splits", "vg2gt.data.shards", "backends.export"]
-)
-def test_modules_are_commands_too(module: str, tmp_path: Path) -> None:
-    shown = subprocess.run(
-        [sys.executable, "-m", module, "--help"], cwd=tmp_path, capture_output=True, text=True, check=False
-    )
-    assert "example: vg2gt " in shown.stdout, shown.stderr[-2000:]
+MODULES = """
+import runpy, sys
+for module in {modules}:
+    sys.argv = [module, "--help"]
+    try:
+        runpy.run_module(module, run_name="__main__")
+    except SystemExit as ended:
+        assert not ended.code, module
+"""
+
+
+def test_modules_are_commands_too(tmp_path: Path) -> None:
+    modules = ["vg2gt.data.synthetic", "vg2gt.data.splits", "vg2gt.data.shards", "backends.export"]
+    script = MODULES.format(modules=modules)
+    shown = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert shown.returncode == 0, shown.stderr[-2000:]
+    assert shown.stdout.count("example: vg2gt ") == len(modules)
 
 
 @pytest.fixture
@@ -106,7 +116,7 @@ MISTAKES = {
     "train model.gausians.splits=4": "there is no option model.gausians.splits, did you mean model.gaussians.splits",
     "train +model.gausians=4 foo.x=1": r"Could not override 'foo.x'",
     "evaluate evaluation=dtu data.root=FOLDER": "no option data.root, did you mean data.train.root or data.val.root?",
-    "train backend=da3_smal": "there is no backend=da3_smal, did you mean da3_small? Available options",
+    "train backend=da3_smal": r"there is no backend=da3_smal, did you mean da3_small\? Available options",
     "train data=rgbd data.root=not_here": "the data folder not_here .* does not exist: set data.root=",
     "train name=../x": "^name=../x: a name inside outputs",
     "reconstruct . --out x --backend da3_smal": "unknown backend 'da3_smal'; did you mean da3_small",
@@ -127,6 +137,40 @@ def test_mistakes_are_one_line(words: str, said: Said, tmp_path: Path) -> None:
     assert not list(tmp_path.rglob("config.yaml"))
 
 
+WITHOUT_EXTRAS = {
+    "view scene.ply": "view",
+    "curves run": "eval",
+    "train logger=tensorboard": "log",
+    "train logger=wandb": "log",
+    "train backend=da3_small": "hub",
+    "reconstruct clip.mp4 --backend da3_tiny --out x": "video",
+    "render scene.ply --cameras cameras.json --save video.mp4 --out x": "video",
+    "export backend=da3_tiny out=x": "export",
+}
+
+
+@pytest.mark.parametrize("words", WITHOUT_EXTRAS)
+def test_a_missing_optional_package_is_one_line_before_any_work(
+    words: str, said: Said, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for package in ("viser", "matplotlib", "tensorboard", "wandb", "huggingface_hub", "av", "onnx", "onnxscript"):
+        monkeypatch.setitem(sys.modules, package, None)
+    (tmp_path / "clip.mp4").touch()  # neither it nor scene.ply, which is not there, is looked at
+    line, _ = said(*words.split())
+    assert isinstance(line, str)
+    assert f"'vg2gt[{WITHOUT_EXTRAS[words]}]'" in line, line
+    assert [path.name for path in tmp_path.iterdir() if path.is_file()] == ["clip.mp4"]
+
+
+def test_an_interrupted_command_says_so(said: Said, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("vg2gt.cli.render.read_gaussians", interrupted)
+    monkeypatch.setattr("vg2gt.io.read_cameras_json", lambda path: [path])
+    assert said("render", "scene.ply", "--cameras", "c.json", "--out", "x") == (130, "interrupted\n")
+
+
 def test_arguments_of_train_are_translated_for_reconstruct(said: Said) -> None:
     words = "reconstruct photos --backend da3_small backend.pretrained=false --out x model.fine.y=2"
     status, line = said(*words.split())
@@ -134,10 +178,18 @@ def test_arguments_of_train_are_translated_for_reconstruct(said: Said) -> None:
     assert "(write --backend NAME,pretrained=false --model NAME,fine.y=2)" in line
 
 
-def test_tracebacks_are_there_for_who_asks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("words", "error"),
+    [("train backend=dav3", HydraException), ("render x.ply --cameras no.json --out x", FileNotFoundError)],
+)
+def test_tracebacks_are_there_for_who_asks(
+    words: str, error: type[Exception], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
-    for words in (["train", "backend=dav3"], ["render", "x.ply", "--cameras", "no.json", "--out", "x"]):
-        assert "Traceback" in run_vg2gt(*words, folder=tmp_path).stderr
+    monkeypatch.setattr(sys, "argv", ["vg2gt", *words.split()])
+    with pytest.raises(error):
+        main()
 
 
 def test_train_py_is_the_same_command() -> None:

@@ -47,6 +47,7 @@ def test_views_become_records_and_back() -> None:
     [
         ("name", "", "name is '', expected"),
         ("width", 0, "width is 0, expected"),
+        ("width", 1 << 20, "has 1048576x48 pixels, more than 268435456"),
         ("height", 2.5, "height is 2.5, expected"),
         ("intrinsics", None, "intrinsics is missing, expected 3 rows"),
         ("intrinsics", [[1, 2], [3]], "expected 3 rows"),

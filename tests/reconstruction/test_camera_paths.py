@@ -54,5 +54,7 @@ def test_what_no_path_can_be_made_of() -> None:
         interpolate([_camera(0)], 2)
     with pytest.raises(ValueError, match="one image size"):
         interpolate([_camera(0), _camera(1, size=(32, 48))], 2)
+    with pytest.raises(ValueError, match="a path of 1000000002 cameras is longer than 100000"):
+        interpolate([_camera(0), _camera(1)], 1_000_000_000)
     with pytest.raises(ValueError, match="needs cameras"):
         orbit([], 1.0)

@@ -4,6 +4,7 @@ import re
 import shlex
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -51,6 +52,11 @@ def test_readme(workplace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         _run(words, monkeypatch)
     names = {path.name for path in (workplace / "outputs" / "room").iterdir()}
     assert names == {"scene.ply", "cameras.json", "views.npz", "report.png", "report.json", "video.gif"}
+    (example,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    found: dict[str, Any] = {}
+    exec(compile(example, "README.md", "exec"), found)
+    assert len(found["pictures"]) == len(read_cameras_json(workplace / "outputs" / "python" / "cameras.json"))
+    assert all(picture.shape[0] == 3 and 0 <= picture.min() <= picture.max() <= 1 for picture in found["pictures"])
 
 
 def test_page(workplace: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:

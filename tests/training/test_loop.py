@@ -316,6 +316,21 @@ def test_progress_bar_can_be_switched_off(tmp_path: Path, cache: Path) -> None:
     assert trainer.progress_bar_callback is None
 
 
+@pytest.mark.parametrize(("name", "curves"), [("tensorboard", "tensorboard --logdir"), ("wandb", "wandb sync")])
+def test_other_loggers_get_curves_and_the_picture(
+    name: str, curves: str, tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    pytest.importorskip(name)
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    monkeypatch.setenv("WANDB_SILENT", "true")
+    train(small_config(tmp_path, cache, f"logger={name}", "trainer.max_steps=1"))
+    assert curves in capsys.readouterr().out
+    written = [path for pattern in ("*.tfevents.*", "run-*.wandb") for path in tmp_path.rglob(pattern)]
+    content = b"".join(path.read_bytes() for path in written if not path.is_symlink())
+    assert b"train/grad_norm" in content
+    assert b"preview" in content
+
+
 @pytest.mark.slow
 def test_two_processes_from_the_console_script(tmp_path: Path, cache: Path) -> None:
     overrides = [*SMALL, f"data.cache_dir={cache}", "trainer=ddp", "trainer.max_steps=2", "name=two"]

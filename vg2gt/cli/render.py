@@ -48,6 +48,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 def run(options: argparse.Namespace) -> None:
     """Renders and writes."""
     from vg2gt.io import read_cameras_json
+    from vg2gt.io.video import require_pyav
     from vg2gt.reconstruction.camera_paths import interpolate
     from vg2gt.reconstruction.maps import animation, feed, map_sinks
     from vg2gt.reconstruction.monitor import Monitor
@@ -58,6 +59,8 @@ def run(options: argparse.Namespace) -> None:
 
     outputs = options.save
     check_outputs(outputs, OUTPUTS)
+    if "video.mp4" in outputs:
+        require_pyav("writing video.mp4")
     cameras = read_cameras_json(options.cameras)
     if not cameras:
         raise ValueError(f"{options.cameras} names no camera; there is nothing to render")

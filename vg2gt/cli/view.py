@@ -33,6 +33,10 @@ def main(argv: Sequence[str] | None = None) -> None:
     if arguments.images is not None and arguments.cameras is None:
         parser.error("--images needs --cameras, which names them")
     with errors_in_one_line():
+        if arguments.html is None:
+            from vg2gt.viewer.server import require_viser
+
+            require_viser()  # before a scene is read
         scene = _scene(arguments)
         if arguments.html is None:
             _serve(scene, arguments)

@@ -33,6 +33,7 @@ from vg2gt.io.files import write_json
 from vg2gt.io.json_checks import MAX_SIZE, check_rigid, load_json, short
 from vg2gt.types import Cameras
 
+MOST_PIXELS = 1 << 28  # of an image to be rendered: the largest photographs have fewer
 _ROTATION_TOLERANCE = 1e-3
 
 
@@ -141,7 +142,10 @@ def _camera(place: str, entry: Any) -> NamedCamera:
             "positive focal lengths and no skew; undistort the images"
         )
     check_rigid(f"{place}.world_to_camera", pose, _ROTATION_TOLERANCE)
-    return NamedCamera(name, _pixels(place, entry, "width"), _pixels(place, entry, "height"), intrinsics, pose)
+    width, height = _pixels(place, entry, "width"), _pixels(place, entry, "height")
+    if width * height > MOST_PIXELS:
+        raise FormatError(f"{place} has {width}x{height} pixels, more than {MOST_PIXELS} in all")
+    return NamedCamera(name, width, height, intrinsics, pose)
 
 
 def _pixels(place: str, entry: dict[str, Any], field: str) -> int:

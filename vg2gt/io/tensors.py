@@ -48,7 +48,8 @@ def read_tensors(path: str | Path) -> dict[str, Tensor]:
             raise FormatError(f"{path} is not a mapping of names to tensors: export the bare state dict")
         return dict(state)
     try:
-        return load_file(regular(path))
+        # Copies: the file itself would stay mapped, and whoever writes to it would change a network that runs.
+        return {name: tensor.clone() for name, tensor in load_file(regular(path)).items()}
     except SafetensorError as error:
         raise FormatError(f"{path} is damaged or no safetensors file: {error}") from error
 

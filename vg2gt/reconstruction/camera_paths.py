@@ -45,6 +45,9 @@ def orbit(cameras: Sequence[NamedCamera], distance: float, frames: int = 72) -> 
     return path
 
 
+LONGEST = 100_000  # cameras on a path: an hour of film
+
+
 def interpolate(cameras: Sequence[NamedCamera], between: int) -> list[NamedCamera]:
     """A smooth way through given cameras: splines of position and rotation, linear intrinsics.
 
@@ -56,10 +59,13 @@ def interpolate(cameras: Sequence[NamedCamera], between: int) -> list[NamedCamer
         The path, ``(n - 1) * (between + 1) + 1`` cameras.
 
     Raises:
-        ValueError: if there are fewer than two cameras, their sizes differ, or ``between`` is negative.
+        ValueError: if there are fewer than two cameras, their sizes differ, ``between`` is negative, or the path longer
+            than :data:`LONGEST`.
     """
     if len(cameras) < 2 or between < 0:
         raise ValueError(f"a path needs at least two cameras and 0 or more between them, got {len(cameras)}, {between}")
+    if (len(cameras) - 1) * (between + 1) >= LONGEST:
+        raise ValueError(f"a path of {(len(cameras) - 1) * (between + 1) + 1} cameras is longer than {LONGEST}")
     sizes = {(camera.width, camera.height) for camera in cameras}
     if len(sizes) > 1:
         raise ValueError(f"cameras of one image size are needed, these have {sorted(sizes)}; choose some of one size")

@@ -6,6 +6,8 @@ random draws and the learning rate go on as if it had been one, so that a resume
 
 from __future__ import annotations
 
+import logging
+import statistics
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, fields
 from typing import Any
@@ -18,6 +20,10 @@ from vg2gt.losses import LossReport
 from vg2gt.training.distributed import all_gather_object
 from vg2gt.types import Batch, Prediction, TensorRecord
 
+log = logging.getLogger(__name__)
+
+MEDIAN_OF = 50  # steps
+GROWTH = 10.0
 KEPT = 20  # faults named in the report of a run
 
 
@@ -114,6 +120,36 @@ class GradientWatch:
         """Stops watching."""
         for handle in self._handles:
             handle.remove()
+
+
+class GradientGrowth:
+    """Warns when gradients are tenfold of what they were: a training that diverges shows it there first.
+
+    Medians of :data:`MEDIAN_OF` steps are compared with that of the first ones, so that single steps are no alarm. It
+    is said again when they have grown tenfold once more.
+    """
+
+    def __init__(self) -> None:
+        self._norms: list[float] = []
+        self._usual: float | None = None
+
+    def see(self, norm: float, step: int, warn: bool = True) -> None:
+        """Notes the gradient norm of a step that was taken."""
+        self._norms.append(norm)
+        if len(self._norms) < MEDIAN_OF:
+            return
+        recent = statistics.median(self._norms)
+        self._norms.clear()
+        if self._usual is None:
+            self._usual = recent
+        elif recent > GROWTH * self._usual:
+            if warn:
+                log.warning(
+                    "step %d: gradient norms have grown from %.3g to %.3g (medians of %d steps): the training may "
+                    "diverge. Lower optimizer.lr, or look at train/* in the log for the term that grows",
+                    step, self._usual, recent, MEDIAN_OF,
+                )  # fmt: skip
+            self._usual = recent
 
 
 class SkippedSteps:

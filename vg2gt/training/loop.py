@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import logging
 import warnings
 from contextlib import nullcontext
@@ -15,11 +16,13 @@ from hydra.utils import instantiate
 from lightning.fabric.utilities.rank_zero import rank_zero_only
 from lightning.pytorch import LightningDataModule, Trainer
 from lightning.pytorch.callbacks import ProgressBar
+from lightning.pytorch.loggers import TensorBoardLogger, WandbLogger
 from omegaconf import DictConfig, OmegaConf
 
 from backends.cache import TokenCache
 from vg2gt.data.datamodule import SceneDataModule
 from vg2gt.io.files import read_json, write_json, write_text
+from vg2gt.io.image_files import read_color
 from vg2gt.memory import TRAINING, memory_advice
 from vg2gt.runs.checkpoints import (
     initialize_from,
@@ -49,6 +52,7 @@ EXPECTED_WARNINGS = (
     r".*isinstance\(treespec, LeafSpec\)",  # inside Lightning
 )
 
+LOGGER_PACKAGES = {"TensorBoardLogger": "tensorboard", "WandbLogger": "wandb"}
 PRECISIONS = ("32-true", "bf16-mixed", "32", "bf16")  # the last two are Lightning's short names
 
 
@@ -74,6 +78,7 @@ class Run:
 def build(config: DictConfig) -> Run:
     """Instantiates everything the configuration names; each part's constructor is its schema."""
     _check_trainer(config)
+    _check_loggers(config)
     lightning.seed_everything(config.seed, workers=True, verbose=False)
     for message in EXPECTED_WARNINGS:
         warnings.filterwarnings("ignore", message=message)
@@ -234,10 +239,44 @@ def _report(run: Run, untrained: dict[str, float], trained: dict[str, float]) ->
         run.module.to(run.trainer.strategy.root_device)  # the strategy's teardown has moved it to the CPU
         preview = write_preview(run.module, run.datamodule, run.folder / "preview.png")
         newest = newest_valid(run.folder / "checkpoints")
+        _log_picture(run, preview)
         for name, path in (
             ("preview (input | rendered colour | depth | normals | ground truth)", preview),
             ("checkpoint", newest),
             ("metrics", run.folder / "metrics.json"),
         ):
             print(f"{name}: {path}")
+        print(f"curves: {_where_curves_are(run)}")
     return report
+
+
+def _log_picture(run: Run, picture: Path) -> None:
+    """Gives the preview to the loggers that show pictures: TensorBoard and Weights & Biases."""
+    for logger in run.trainer.loggers:
+        if isinstance(logger, TensorBoardLogger):
+            pixels = torch.from_numpy(read_color(picture, run.folder.name))
+            logger.experiment.add_image("preview", pixels, run.trainer.global_step, dataformats="HWC")
+        elif isinstance(logger, WandbLogger):
+            logger.log_image("preview", [str(picture)], run.trainer.global_step)
+
+
+def _where_curves_are(run: Run) -> str:
+    """How to look at the training curves, with the logger the run had."""
+    if any(isinstance(logger, TensorBoardLogger) for logger in run.trainer.loggers):
+        return f"tensorboard --logdir {run.folder}"
+    if any(isinstance(logger, WandbLogger) for logger in run.trainer.loggers):
+        return f"{run.folder / 'wandb'} (offline runs: wandb sync)"
+    return f"vg2gt curves {run.folder} (or logger=tensorboard, logger=wandb for a run)"
+
+
+def _check_loggers(config: DictConfig) -> None:
+    """Refuses a logger whose package is not there, before anything is built.
+
+    Raises:
+        ImportError: naming the extra that brings it.
+    """
+    for logger in config.logger.values():
+        target = str(logger.get("_target_", "")) if logger else ""
+        for ending, package in LOGGER_PACKAGES.items():
+            if target.endswith(ending) and importlib.util.find_spec(package) is None:
+                raise ImportError(f"logger={package} needs {package}: pip install 'vg2gt[log]'")

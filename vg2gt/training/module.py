@@ -27,6 +27,7 @@ from vg2gt.runs.load import MADE_OF
 from vg2gt.training.distributed import all_gather_object, interleave, world_size
 from vg2gt.training.faults import (
     Fault,
+    GradientGrowth,
     GradientWatch,
     SkippedSteps,
     described,
@@ -85,6 +86,7 @@ class VG2GTModule(lightning.LightningModule):
         self.skipped = SkippedSteps(max_skipped)
         self._idle = IdleTerms(getattr(loss, "weighted", ()))
         self._watch = GradientWatch(())
+        self._growth = GradientGrowth()
         self._fault: Fault | None = None
         self._scenes: tuple[str, ...] = ()
         self._figures: dict[str, Tensor] = {}
@@ -196,6 +198,7 @@ class VG2GTModule(lightning.LightningModule):
             self._drop_step()
         else:
             self.skipped.good()
+            self._growth.see(float(norm.detach()), self.global_step, warn=self.trainer.is_global_zero)
         self._log_step(average=float(unsound) == 0)
         self.log("train/grad_norm", norm.detach())
         self.log("train/skipped_steps", float(self.skipped.total))

@@ -32,6 +32,18 @@ class MissingViserError(ImportError):
     """The package viser is not installed."""
 
 
+def require_viser() -> None:
+    """Checks early that there is viser.
+
+    Raises:
+        MissingViserError: if there is none, naming the remedy.
+    """
+    if importlib.util.find_spec("viser") is None:
+        raise MissingViserError(
+            "the live viewer needs viser: pip install 'vg2gt[view]', or write a page with --html, which needs nothing"
+        )
+
+
 def start_server(scene: ViewerScene, host: str = LOOPBACK, port: int = PORT, share: bool = False) -> viser.ViserServer:
     """Serves the scene until ``stop()`` of what it returns.
 
@@ -52,10 +64,7 @@ def start_server(scene: ViewerScene, host: str = LOOPBACK, port: int = PORT, sha
     Raises:
         MissingViserError: without the package viser, naming the extra that brings it.
     """
-    if importlib.util.find_spec("viser") is None:
-        raise MissingViserError(
-            "the live viewer needs viser: pip install 'vg2gt[view]', or write a page with --html, which needs nothing"
-        )
+    require_viser()
     import viser  # pyright: ignore[reportMissingImports]  # optional
 
     class Server(viser.ViserServer):
