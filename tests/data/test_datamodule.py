@@ -206,9 +206,9 @@ def test_the_work_of_choosing_evaluation_views_grows_with_the_frames(window):
 
 def test_data_that_cannot_be_trained_on_is_named_before_overlap_and_lengths(rooms, tmp_path):
     blind = SyntheticScenes(2, num_frames=1, size=SIZE, cache_dir=str(tmp_path))
-    blind.has_depth = False
+    blind.has_cameras = False
     module = _module(rooms, train=blind, val=blind, eval_context=1, eval_target=0)
-    with pytest.raises(DataError, match="has no depth"):
+    with pytest.raises(DataError, match="has no cameras"):
         module.setup("fit")
     module.setup("validate")
     assert len(module.val_dataloader()) == 2

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import lightning
 import pytest
@@ -16,11 +17,11 @@ from omegaconf import OmegaConf
 from tests.commands import run_vg2gt
 from tests.training_helpers import SMALL, full_model, small_config, with_crash
 from vg2gt.config import compose
-from vg2gt.data import DataError, SyntheticScenes
+from vg2gt.data import DataError, Frames, SyntheticScenes
 from vg2gt.gaussians import GaussianHead
 from vg2gt.runs.checkpoints import newest_valid, read_checkpoint
 from vg2gt.runs.lock import only_process_in
-from vg2gt.training.loop import build, train
+from vg2gt.training.loop import build, evaluate, train
 
 
 @pytest.fixture(scope="module")
@@ -291,15 +292,51 @@ def test_unsupported_trainer_options_are_refused(tmp_path: Path, cache: Path, ov
 
 
 class WithoutDepth(SyntheticScenes):
-    """Rooms without depth."""
+    """Posed photographs: rooms whose depth nobody knows."""
 
     has_depth = False
 
+    def load(self, scene: str, frame_ids: Any) -> Frames:
+        frames = super().load(scene, frame_ids)
+        frames.depth.zero_()
+        return frames
 
-def test_data_that_cannot_be_trained_on_is_refused_before_anything_is_measured(tmp_path: Path, cache: Path) -> None:
-    with pytest.raises(DataError, match="WithoutDepth has no depth"):
-        train(small_config(tmp_path, cache, f"data.train._target_={__name__}.WithoutDepth"))
+
+class WithoutCameras(SyntheticScenes):
+    """Photographs of rooms."""
+
+    has_cameras = False
+
+
+@pytest.mark.parametrize(
+    ("source", "said"),
+    [
+        ("WithoutDepth", "oracle needs the data's depth, and WithoutDepth has none"),
+        ("WithoutCameras", "WithoutCameras has no cameras"),
+    ],
+)
+def test_data_that_cannot_be_trained_on_is_refused_before_anything_is_measured(
+    tmp_path: Path, cache: Path, source: str, said: str
+) -> None:
+    with pytest.raises(DataError, match=said):
+        train(small_config(tmp_path, cache, f"data.train._target_={__name__}.{source}"))
     assert not list(tmp_path.iterdir())
+
+
+def test_posed_photographs_without_depth_are_trained_on(tmp_path: Path, cache: Path) -> None:
+    both = [f"data.{part}._target_={__name__}.WithoutDepth" for part in ("train", "val")]
+    run = build(small_config(tmp_path, cache, "backend=da3_tiny", "trainer.max_steps=2", *both))
+    before = {name: tensor.clone() for name, tensor in run.module.model.trained_state().items()}
+    run.trainer.fit(run.module, datamodule=run.datamodule)
+    after = run.module.model.trained_state()
+    assert any(not torch.equal(after[name], before[name]) for name in after if name.startswith("gaussians"))
+    logged = {name: float(value) for name, value in run.trainer.callback_metrics.items()}
+    assert logged["train/scenes_without_depth"] == 1
+    assert logged["train/skipped_steps"] == logged["train/depth_gt"] == logged["train/enhance_depth"] == 0
+    assert logged["train/color_l1"] > 0
+    metrics = evaluate(run)
+    assert metrics["psnr"] > 5
+    assert "abs_rel" not in metrics
 
 
 def test_clipping_can_be_switched_off(tmp_path: Path, cache: Path) -> None:

@@ -119,12 +119,12 @@ class SceneDataModule(LightningDataModule):
 
         Raises:
             DataError: if the data is missing, unusable, or shared by training and evaluation; for ``stage="fit"`` also
-                if the training scenes have no depth or no cameras.
+                if the training scenes have no cameras.
         """
         if self._train is not None and self._val is not None:
             return
         train, val = self.train_source(), self.val_source()
-        trainable = train.has_depth and train.has_cameras
+        trainable = train.has_cameras
         if stage == "fit":
             refuse_untrainable(train)
         self._train_names = usable_scenes(train, self.sampler, self.train_scenes) if trainable else []
@@ -135,6 +135,14 @@ class SceneDataModule(LightningDataModule):
         prepare = self.framing.reduce if self.framing.moves else self.framing.still.apply
         self._train = BatchDataset(train, prepare, self.memory_mb, replace_damaged=True)
         self._val = BatchDataset(val, self.framing.still.apply, self.memory_mb)
+
+    @property
+    def sources(self) -> tuple[SceneSource, SceneSource]:
+        """The training and the evaluation scenes, indexed."""
+        self.setup()
+        assert self._train is not None
+        assert self._val is not None
+        return self._train.source, self._val.source
 
     def train_source(self) -> SceneSource:
         """The training scenes as they are on disk."""
@@ -148,11 +156,12 @@ class SceneDataModule(LightningDataModule):
         """Batches from the trainer's current step on; one item of the loader is one batch.
 
         Raises:
-            DataError: if the training scenes have no depth or no cameras.
+            DataError: if the training scenes have no cameras.
         """
         self.setup()
         assert self._train is not None
-        refuse_untrainable(self._train.source)
+        if not self._train.source.has_cameras:
+            refuse_untrainable(self._train.source)
         trainer = self.trainer
         sampler = StepSampler(
             self._train.source,

@@ -12,16 +12,22 @@ log = logging.getLogger(__name__)
 
 
 def refuse_untrainable(source: SceneSource) -> None:
-    """Refuses to train on scenes without depth or cameras, which the losses compare with.
+    """Refuses to train on scenes without cameras; those without depth are trained on by their colours.
 
     Raises:
         DataError: saying what the source lacks.
     """
-    lacking = [name for name, there in (("depth", source.has_depth), ("cameras", source.has_cameras)) if not there]
-    if lacking:
+    if not source.has_cameras:
+        lacking = "cameras" if source.has_depth else "depth and no cameras"
         raise DataError(
-            f"{type(source).__name__} has no {' and no '.join(lacking)}: it serves reconstruction and cannot be "
-            "trained on; choose another dataset for data.train, or the loader's depth option"
+            f"{type(source).__name__} has no {lacking}: it serves reconstruction and cannot be trained on; choose "
+            "another dataset for data.train, such as a COLMAP model of the same photographs (data=colmap)"
+        )
+    if not source.has_depth:
+        log.info(
+            "%s has no depth: colours of held-out views are trained on, and rendered depth against decoded depth; the "
+            "terms that compare with true depth are zero",
+            type(source).__name__,
         )
 
 

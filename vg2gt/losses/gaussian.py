@@ -27,7 +27,7 @@ class RenderTargets(TensorRecord):
         decoded: ``[R, H, W]`` decoded depth in the losses' unit.
         decoded_conf: ``[R, H, W]`` its confidence.
         decoded_valid: ``[R, H, W]`` bool, False for views without decoded depth (held-out ones).
-        comparable: ``[1, 1, 1]`` bool, whether decoded and rendered depth are in a known unit.
+        comparable: ``[1, 1, 1]`` bool, whether decoded and rendered depth are in one unit.
     """
 
     images: Tensor

@@ -21,6 +21,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from backends.cache import TokenCache
 from vg2gt.data.datamodule import SceneDataModule
+from vg2gt.evaluation.checks import refuse_without_hints
 from vg2gt.io.files import read_json, write_json, write_text
 from vg2gt.io.image_files import read_color
 from vg2gt.memory import TRAINING, memory_advice
@@ -164,6 +165,8 @@ def _train(config: DictConfig, writes: bool) -> dict[str, Any]:
     run = build(config)
     if isinstance(run.datamodule, SceneDataModule):
         run.datamodule.setup("fit")  # before anything is measured: faults of the data are named first
+        for source in run.datamodule.sources:
+            refuse_without_hints(run.module.model, source)
     if not run.module.model.trained_parameters():
         raise ValueError(
             f"{type(run.module.model).__name__} has no trained part: evaluate it as it is (vg2gt evaluate), "
