@@ -58,7 +58,6 @@ def test_the_lowest_versions_of_light_packages_do(tmp_path: Path) -> None:
     subprocess.run([*install, str(tmp_path), *lowest], check=True, capture_output=True)
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join((str(tmp_path), str(ROOT)))}
     tests = ["tests/io", "tests/safety", "tests/cli", "tests/runs", "tests/test_configs.py"]
-    ran = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", *tests], cwd=ROOT, env=environment, capture_output=True, text=True, check=False
-    )
+    command = [sys.executable, "-m", "pytest", "-q", *tests]
+    ran = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
     assert ran.returncode == 0, ran.stdout[-5000:]

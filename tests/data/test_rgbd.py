@@ -153,6 +153,16 @@ def _matrix(folder: Path, place: tuple[int, int], value: float) -> None:
     np.savetxt(folder / "K.txt", matrix)
 
 
+def _short_log(folder: Path) -> None:
+    (folder / "poses.txt").unlink()
+    (folder / "trajectory.log").write_text("0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
+
+
+def _odd_json(folder: Path) -> None:
+    (folder / "K.txt").unlink()
+    (folder / "camera_intrinsic.json").write_text('{"intrinsic_matrix": [1, 2]}')
+
+
 def _transposed(folder: Path) -> None:
     np.savetxt(folder / "K.txt", np.loadtxt(folder / "K.txt").T)
 
@@ -167,7 +177,12 @@ DAMAGE = {
         lambda f: (f / "images/00012.png").unlink(),
         "one line of 16 numbers .* for each of the 5 images; it has 6",
     ),
-    "poses missing": (lambda f: (f / "poses.txt").unlink(), r"poses\.txt of scene office"),
+    "poses missing": (
+        lambda f: (f / "poses.txt").unlink(),
+        r"scene office in .* has 6 colour and 6 depth images but no poses: add poses\.txt",
+    ),
+    "an odd log": (_short_log, r"trajectory\.log of scene office has 1 poses for 6 images"),
+    "another json": (_odd_json, r"camera_intrinsic\.json: expected Open3D's intrinsic_matrix"),
     "a pose missing": (_drop_a_pose, "each of the 6 images; it has 5 lines of 16"),
     "words": (lambda f: (f / "poses.txt").write_text("a b\n"), r"cannot read .*poses\.txt of scene office"),
     "not rigid": (
@@ -281,3 +296,13 @@ def test_raw_seven_scenes_depth_agrees_as_its_description_says(shared):
     assert float((together < 0.03).float().mean()) == pytest.approx(0.78, abs=0.02)
     neighbours = [float(depth_differences(frames, a, a + 1, stride=4)[0].median()) for a in range(count - 1)]
     assert np.median(neighbours) == pytest.approx(6.0e-3, rel=0.1)
+
+
+def test_a_real_recording_with_quaternions(shared):
+    """Its description says: poses are rough, depth of two frames differs by 76 mm in the median."""
+    source = RGBDFolder(str(shared / "data" / "slambook_rgbd"), intrinsics=(518, 519, 325.5, 253.5), holdout=None)
+    (scene,) = source.scenes
+    frames = source.load(scene, source.frames(scene))
+    assert len(frames.images) == 5
+    found = [depth_differences(frames, a, b, stride=4)[0] for a in range(5) for b in range(5) if a != b]
+    assert 0.05 < float(torch.cat(found).median()) < 0.12

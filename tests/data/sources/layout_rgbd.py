@@ -1,12 +1,14 @@
 """RGB-D folders: one file of poses, one file a pose, 7-Scenes."""
 
+import json
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from vg2gt.data import Frames, RGBDFolder
 
-from .layouts import Layout, camera_to_world, pixels, save
+from .layouts import Layout, camera_of, camera_to_world, pixels, save
 
 
 def _millimetres(frames: Frames) -> np.ndarray:
@@ -46,6 +48,33 @@ def write_seven_scenes(root: Path, frames: Frames) -> None:
     np.savetxt(root / "chess" / "camera-intrinsics.txt", frames.intrinsics[0].numpy())
 
 
+def _write_open3d(root: Path, frames: Frames) -> None:
+    """As Redwood's recordings, and Open3D's after a reconstruction."""
+    lines = []
+    for i, pose in enumerate(camera_to_world(frames)):
+        save(root / "den" / "image" / f"{i + 1:06d}.png", pixels(frames)[i])
+        save(root / "den" / "depth" / f"{i + 1:06d}.png", _millimetres(frames)[i])
+        lines += [f"{i} {i} {i + 1}", *(" ".join(map(repr, row)) for row in pose.tolist())]
+    (root / "den" / "trajectory.log").write_text("\n".join(lines))
+    height, width = frames.depth.shape[-2:]
+    matrix = frames.intrinsics[0].T.flatten().tolist()
+    camera = {"width": width, "height": height, "intrinsic_matrix": matrix}
+    (root / "den" / "camera_intrinsic.json").write_text(json.dumps(camera))
+
+
+def _write_icl_nuim(root: Path, frames: Frames) -> None:
+    """y points up in the cameras and in the world; a line is a time, a position and a quaternion."""
+    mirror = np.diag([1.0, -1, 1, 1])
+    rows = []
+    for i, pose in enumerate(mirror @ camera_to_world(frames) @ mirror):
+        save(root / "living" / "rgb" / f"{i}.png", pixels(frames)[i])
+        save(root / "living" / "depth" / f"{i}.png", (frames.depth[i].numpy() * 5000 + 0.5).astype(np.uint16))
+        rows.append([i, *pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat()])
+    np.savetxt(root / "living" / "trajectory.txt", np.array(rows), "%.17g")
+    fx, fy, cx, cy = camera_of(frames)
+    (root / "living" / "K.txt").write_text(f"{fx!r} {-fy!r} {cx!r} {cy!r}\n")
+
+
 def _read(root: Path) -> RGBDFolder:
     return RGBDFolder(str(root), holdout=None)
 
@@ -53,5 +82,9 @@ def _read(root: Path) -> RGBDFolder:
 LAYOUTS = {
     "rgbd": Layout(write_recording, _read, frame_ids=tuple(range(10, 16))),
     "rgbd_pose_files": Layout(_write_pose_files, _read, image_error=0.012, frame_ids=tuple(range(8, 14))),
+    "rgbd_open3d": Layout(_write_open3d, _read, frame_ids=tuple(range(1, 7))),
+    "rgbd_icl_nuim": Layout(
+        _write_icl_nuim, lambda root: RGBDFolder(str(root), depth_scale=5000, holdout=None), depth_quantum=2e-4
+    ),
     "seven_scenes": Layout(write_seven_scenes, _read),
 }

@@ -2,9 +2,10 @@
 
 Layouts, told apart by what is there:
 
-* folders: colour in ``images/``, ``color/`` or ``rgb/``, depth in ``depth/``, poses in ``poses.txt`` (16 numbers per
-  line, in the order of the images) or one text file per frame in ``pose/`` or ``poses/``, intrinsics in ``K.txt`` (3x3)
-  or in ``intrinsic/intrinsic_{color,depth}.txt`` (4x4, as ScanNet is exported);
+* folders: colour in ``images/``, ``color/``, ``rgb/`` or ``image/``, depth in ``depth/``, poses in ``poses.txt`` (16
+  numbers per line, in the order of the images; others: ``rgbd_cameras``) or one text file per frame in ``pose/`` or
+  ``poses/``, intrinsics in ``K.txt`` (3x3) or in ``intrinsic/intrinsic_{color,depth}.txt`` (4x4, as ScanNet is
+  exported); so also recordings of Open3D and Redwood (``trajectory.log``, ``camera_intrinsic.json``) and ICL-NUIM;
 * 7-Scenes: ``frame-NNNNNN.{color.png|jpg,depth.png,pose.txt}`` in one folder, intrinsics in ``camera-intrinsics.txt``.
 
 Poses are camera-to-world, OpenCV, metres. Without depth the unit may be any.
@@ -33,9 +34,15 @@ from vg2gt.data.sources.parsing import (
     numbered,
     pinhole,
     positive,
-    read_matrix,
-    read_numbers,
     read_poses,
+)
+from vg2gt.data.sources.rgbd_cameras import (
+    INTRINSICS_FILES,
+    POSE_FILES,
+    mirrored,
+    pose_file_of,
+    read_camera,
+    read_pose_list,
 )
 from vg2gt.data.sources.scannet import room_of_scan
 from vg2gt.geometry.cameras import resize_intrinsics
@@ -43,10 +50,9 @@ from vg2gt.io.image_files import Size
 
 log = logging.getLogger(__name__)
 
-_COLOR_FOLDERS = ("images", "color", "rgb")
+_COLOR_FOLDERS = ("images", "color", "rgb", "image")
 _POSE_FOLDERS = ("pose", "poses")
 _OFF_CENTRE = 0.15  # most of an image's width or height that a principal point may lie from its middle
-_INTRINSICS_FILES = ("K.txt", "camera-intrinsics.txt")
 
 
 @dataclass(frozen=True)
@@ -56,7 +62,7 @@ class _Files:
     layout: str
     color: dict[int, Path]
     depth: dict[int, Path]
-    poses: dict[int, Path] | Path
+    poses: dict[int, Path] | Path | None
     intrinsics: tuple[Path, ...]
 
 
@@ -77,8 +83,8 @@ class RGBDFolder(FileSource):
     """
 
     layout = (
-        "images/, color/ or rgb/ with depth/, poses.txt and K.txt, or frame-*.color.png with frame-*.depth.png, there "
-        "or up to two folders deeper"
+        "images/, color/, rgb/ or image/ with depth/, poses.txt and K.txt, or frame-*.color.png with "
+        "frame-*.depth.png, there or up to two folders deeper"
     )
     names_are_paths = True
     index_options = ("intrinsics", "has_depth")
@@ -128,8 +134,9 @@ class RGBDFolder(FileSource):
             check_found(scene, folder, {"depth images": depth})
         color_size = first_size(files.color, scene)
         depth_size = color_size if depth is None else first_size(depth, scene)
-        poses = _read_poses(files, scene)
-        intrinsics = self._depth_intrinsics(files.intrinsics, folder, scene, color_size, depth_size)
+        poses = _read_poses(files, folder, scene)
+        intrinsics, upwards = self._depth_intrinsics(files.intrinsics, folder, scene, color_size, depth_size)
+        poses = mirrored(poses) if upwards else poses
         index = make_index(
             scene,
             folder,
@@ -150,22 +157,23 @@ class RGBDFolder(FileSource):
 
     def _depth_intrinsics(
         self, files: Sequence[Path], folder: Path, scene: str, color: Size, depth: Size
-    ) -> NDArray[np.float64]:
-        """Intrinsics of the depth images: their own file, or the colour images' brought to their size."""
+    ) -> tuple[NDArray[np.float64], bool]:
+        """Intrinsics of the depth images, and whether y points up: their own file, or the colour images' resized."""
         own = [path for path in files if path.name == "intrinsic_depth.txt"]
+        upwards = False
         if self.intrinsics is not None:
             matrix = pinhole(*self.intrinsics)
         elif files:
             path = (own or files)[0]
-            matrix = read_matrix(path, scene, ((3, 3), (4, 4)))[:3, :3].copy()
+            matrix, upwards = read_camera(path, scene)
             _check_resolution(matrix, f"{path} of scene {scene}", depth if own else color)
         else:
             raise DataError(
-                f"scene {scene} in {folder} has no intrinsics: add K.txt (3x3) or set data.intrinsics=[fx,fy,cx,cy]"
+                f"scene {scene} in {folder} has no intrinsics: add K.txt (3x3), or set data.intrinsics=[fx,fy,cx,cy]"
             )
         if own and self.intrinsics is None:
-            return matrix
-        return resize_intrinsics(torch.from_numpy(matrix), depth[1] / color[1], depth[0] / color[0]).numpy()
+            return matrix, upwards
+        return resize_intrinsics(torch.from_numpy(matrix), depth[1] / color[1], depth[0] / color[0]).numpy(), upwards
 
 
 def _check_resolution(matrix: NDArray[np.float64], where: str, size: Size) -> None:
@@ -189,7 +197,7 @@ def _say(message: str, level: int = logging.INFO) -> None:
 def _files_in_folders(folder: Path, scene: str) -> _Files:
     color = next((folder / name for name in _COLOR_FOLDERS if (folder / name).is_dir()), folder)
     pose_folder = next((folder / name for name in _POSE_FOLDERS if (folder / name).is_dir()), None)
-    poses = numbered(pose_folder, scene, suffixes=(".txt",)) if pose_folder else folder / "poses.txt"
+    poses = numbered(pose_folder, scene, suffixes=(".txt",)) if pose_folder else pose_file_of(folder)
     single = [path for path in _beside(folder) if path.is_file()][:1]
     return _Files(
         layout=f"folders {color.name}/ and depth/" if (folder / "depth").is_dir() else f"images in {color.name}/",
@@ -218,17 +226,17 @@ def _exported_intrinsics(folder: Path) -> list[Path]:
 
 
 def _beside(folder: Path) -> list[Path]:
-    return [folder / name for name in _INTRINSICS_FILES]
+    return [folder / name for name in INTRINSICS_FILES]
 
 
-def _read_poses(files: _Files, scene: str) -> dict[int, NDArray[np.float64]]:
+def _read_poses(files: _Files, folder: Path, scene: str) -> dict[int, NDArray[np.float64]]:
     """Camera-to-world poses by frame number."""
+    if files.poses is None:
+        raise DataError(
+            f"scene {scene} in {folder} has {len(files.color)} colour and {len(files.depth)} depth images but no "
+            f"poses: add poses.txt (a line of 16 numbers, 4x4 camera-to-world, for each image), or one of "
+            f"{', '.join(POSE_FILES[1:])}"
+        )
     if isinstance(files.poses, dict):
         return read_poses(files.poses, scene)
-    rows = read_numbers(files.poses, scene)
-    if rows.shape != (len(files.color), 16):
-        raise DataError(
-            f"{files.poses} of scene {scene} must have one line of 16 numbers (4x4 camera-to-world) for each of the "
-            f"{len(files.color)} images; it has {rows.shape[0]} lines of {rows.shape[1]}"
-        )
-    return dict(zip(files.color, rows.reshape(-1, 4, 4), strict=True))
+    return read_pose_list(files.poses, scene, list(files.color))

@@ -23,6 +23,7 @@ from vg2gt.data.sources.parsing import (
     read_numbers,
     read_text_lines,
 )
+from vg2gt.data.sources.rgbd_cameras import INTRINSICS_FILES, read_camera
 
 INTRINSICS = {
     "freiburg1": (517.3, 516.5, 318.6, 255.3),
@@ -51,7 +52,8 @@ class TUM(FileSource):
 
     Args:
         root: a sequence, or a folder of sequences, or a list of such.
-        intrinsics: (fx, fy, cx, cy) in pixels of the colour images; None: by the folder's name.
+        intrinsics: (fx, fy, cx, cy) in pixels of the colour images; None: those of ``K.txt`` beside the
+            lists, else by the folder's name.
         max_difference: largest difference of times in a frame, in seconds.
         holdout: hold out every this many-th frame as an evaluation target; None: none.
         shared: see ``FileSource``; the camera takes 30 frames per second.
@@ -103,10 +105,16 @@ class TUM(FileSource):
         named = _CAMERA.search(scene)
         if self.intrinsics is not None:
             return self.intrinsics
+        beside = [folder / name for name in INTRINSICS_FILES if (folder / name).is_file()]
+        if beside:
+            matrix, upwards = read_camera(beside[0], scene)
+            if upwards:
+                raise DataError(f"{beside[0]} of scene {scene} has a negative fy: poses of this layout are OpenCV's")
+            return matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
         if named is None:
             raise DataError(
                 f"the intrinsics of scene {scene} in {folder} are not known: its name says neither freiburg1 nor "
-                "freiburg2 nor freiburg3; set data.intrinsics=[fx,fy,cx,cy]"
+                "freiburg2 nor freiburg3; add K.txt (3x3), or set data.intrinsics=[fx,fy,cx,cy]"
             )
         return INTRINSICS[f"freiburg{named[1]}"]
 

@@ -1,0 +1,105 @@
+"""Cameras of people's own recordings: lists of poses and files of intrinsics in the forms that are about."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from vg2gt.data.base import DataError
+from vg2gt.data.sources.parsing import errors_name, pinhole, read_matrix, read_numbers
+from vg2gt.data.sources.tanks_and_temples import read_log
+from vg2gt.io.errors import FormatError
+from vg2gt.io.json_checks import load_json
+
+POSE_FILES = ("poses.txt", "pose.txt", "trajectory.txt", "trajectory.log", "odometry.log", "poses.log")
+INTRINSICS_FILES = (
+    "K.txt",
+    "camera-intrinsics.txt",
+    "camera_intrinsic.json",
+    "camera_intrinsics.json",
+    "intrinsic.json",
+)
+_COLUMNS = {16: "4x4 matrix", 12: "3x4 matrix", 7: "x y z qx qy qz qw", 8: "time and x y z qx qy qz qw"}
+_MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
+
+
+def pose_file_of(folder: Path) -> Path | None:
+    """The list of poses in a recording's folder, if there is one."""
+    return next((folder / name for name in POSE_FILES if (folder / name).is_file()), None)
+
+
+def read_pose_list(path: Path, scene: str, frames: Sequence[int]) -> dict[int, NDArray[np.float64]]:
+    """Camera-to-world poses ``[4, 4]`` by frame number, from a file with one for each image in their order.
+
+    A line has a 4x4 or 3x4 matrix, or a position and a quaternion (x y z w), with or without a time before; a ``.log``
+    has five lines for each image, as Open3D, Redwood and Tanks and Temples write them.
+
+    Raises:
+        DataError: if the file is damaged or does not go with the images.
+    """
+    if path.suffix == ".log":
+        found = [np.full((4, 4), np.nan) if pose is None else pose for pose in read_log(path, scene)]
+        if len(found) != len(frames):
+            raise DataError(f"{path} of scene {scene} has {len(found)} poses for {len(frames)} images")
+        return dict(zip(frames, found, strict=True))
+    rows = read_numbers(path, scene)
+    if rows.shape[1] not in _COLUMNS or len(rows) != len(frames):
+        raise DataError(
+            f"{path} of scene {scene} must have one line of 16 numbers (4x4 camera-to-world; or "
+            f"{', '.join(f'{count}: {text}' for count, text in list(_COLUMNS.items())[1:])}) for each of the "
+            f"{len(frames)} images; it has {len(rows)} lines of {rows.shape[1]}"
+        )
+    return dict(zip(frames, _matrices(rows), strict=True))
+
+
+def read_camera(path: Path, scene: str) -> tuple[NDArray[np.float64], bool]:
+    """Intrinsics ``[3, 3]`` and whether their y axis points up, as a negative fy says (ICL-NUIM).
+
+    The file holds a 3x3 or 4x4 matrix, one line ``fx fy cx cy``, or is Open3D's ``camera_intrinsic.json``.
+
+    Raises:
+        DataError: if it holds something else.
+    """
+    if path.suffix == ".json":
+        with errors_name(scene):
+            matrix = _open3d_matrix(path)
+    else:
+        matrix = read_matrix(path, scene, ((3, 3), (4, 4), (1, 4)))
+        matrix = pinhole(*matrix[0]) if matrix.shape == (1, 4) else matrix[:3, :3].copy()
+    upwards = bool(matrix[1, 1] < 0)
+    matrix[1, 1] = abs(matrix[1, 1])
+    return matrix, upwards
+
+
+def mirrored(poses: dict[int, NDArray[np.float64]]) -> dict[int, NDArray[np.float64]]:
+    """Poses of cameras and of a world whose y axes are turned round; rotations stay rotations."""
+    return {frame: _MIRROR @ pose @ _MIRROR for frame, pose in poses.items()}
+
+
+def _matrices(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    count = rows.shape[1]
+    if count == 16:
+        return rows.reshape(-1, 4, 4)
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    if count == 12:
+        poses[:, :3] = rows.reshape(-1, 3, 4)
+        return poses
+    numbers = rows[:, -7:]
+    good = np.isfinite(numbers).all(1) & (np.linalg.norm(numbers[:, 3:], axis=1) > 0.5)
+    poses[~good] = np.nan
+    poses[good, :3, :3] = Rotation.from_quat(numbers[good, 3:]).as_matrix()
+    poses[good, :3, 3] = numbers[good, :3]
+    return poses
+
+
+def _open3d_matrix(path: Path) -> NDArray[np.float64]:
+    """``intrinsic_matrix``: nine numbers, column by column."""
+    content = load_json(path)
+    numbers = content.get("intrinsic_matrix") if isinstance(content, dict) else None
+    if not isinstance(numbers, list) or len(numbers) != 9 or not all(type(n) in (int, float) for n in numbers):
+        raise FormatError(f"{path}: expected Open3D's intrinsic_matrix of nine numbers, column by column")
+    return np.array(numbers, np.float64).reshape(3, 3).T.copy()
