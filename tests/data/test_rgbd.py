@@ -194,7 +194,7 @@ DAMAGE = {
         "no usable frame .*; 6 frames whose pose is not finite",
     ),
     "no intrinsics": (lambda f: (f / "K.txt").unlink(), r"no intrinsics: add K\.txt"),
-    "no 3x3": (lambda f: np.savetxt(f / "K.txt", np.ones((2, 3))), r"K\.txt .* 3x3 or 4x4 matrix, not 2x3"),
+    "no 3x3": (lambda f: np.savetxt(f / "K.txt", np.ones((2, 3))), r"K\.txt .* 3x3 or 4x4 or 1x4 matrix, not 2x3"),
     "a transposed matrix": (_transposed, r"are not fx 0 cx, 0 fy cy, 0 0 1 \(transposed"),
     "skew": (lambda f: _matrix(f, (0, 1), 3.0), "have skew, which is not modelled"),
     "a distant principal point": (lambda f: _matrix(f, (0, 2), 1e5), "is far outside"),
