@@ -20,6 +20,10 @@ def test_installed_wheel_trains_from_an_empty_folder(tmp_path: Path) -> None:
     assert "vg2gt/configs/train.yaml" in members
     assert "backends/oracle.py" in members
     assert "vg2gt/viewer/static/page.html" in members
+    weights = [info for info in zipfile.ZipFile(wheel).infolist() if info.filename.endswith(".safetensors")]
+    shipped = {"backends/sweep/weights/sweep.safetensors", "vg2gt/weights/sweep-tiny.safetensors"}
+    assert {info.filename for info in weights} == shipped
+    assert sum(info.file_size for info in weights) < 12e6
     assert not [name for name in members if name.startswith(("tests/", "benchmarks/", "outputs/"))]
 
     site, empty = tmp_path / "site", tmp_path / "empty"

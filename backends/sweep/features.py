@@ -81,8 +81,8 @@ class FeaturePyramid(nn.Module):
         self.merge_half = conv_norm(32, 32)
         self.coarse = nn.Conv2d(48, MATCH_COARSE, 3, 1, 1)
         self.fine = nn.Conv2d(32, MATCH_FINE, 3, 1, 1)
-        self.context = nn.Conv2d(48, CONTEXT_COARSE, 3, 1, 1)
-        self.context_fine = nn.Conv2d(32, CONTEXT_FINE, 3, 1, 1)
+        self.context = _conv_and_norm(48, CONTEXT_COARSE)
+        self.context_fine = _conv_and_norm(32, CONTEXT_FINE)
 
     def forward(self, images: Tensor) -> Features:
         """Maps images ``[N, 3, H, W]`` in [0, 1], H and W multiples of 8, to their features."""
@@ -95,9 +95,14 @@ class FeaturePyramid(nn.Module):
         return Features(
             _unit_groups(self.coarse(quarter)),
             _unit_groups(self.fine(half)),
-            F.relu(self.context(quarter)),
-            F.relu(self.context_fine(half)),
+            self.context(quarter),
+            self.context_fine(half),
         )
+
+
+def _conv_and_norm(inputs: int, outputs: int) -> nn.Sequential:
+    """Without activation: a ReLU here can die in the first steps, and with it all that context would tell."""
+    return nn.Sequential(nn.Conv2d(inputs, outputs, 3, 1, 1, bias=False), InstanceNorm(outputs))
 
 
 def _upsample(x: Tensor, like: Tensor) -> Tensor:

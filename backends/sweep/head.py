@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from backends.sweep.features import CONTEXT_COARSE, CONTEXT_FINE
-from backends.sweep.refine import PlainBlock
+from backends.sweep.refine import PlainBlock, activate
 from backends.sweep.tokens import DIM, TAPS
 
 RESPONSE = 0.02  # log-depth per unit of the tokens' correction channels
@@ -53,13 +53,13 @@ class DepthHead(nn.Module):
         said = torch.cat([norm(tap) for norm, tap in zip(self.norms, taps, strict=True)], -1)
         said = F.pixel_shuffle(self.spread(said).mT.unflatten(-1, grid), CELLS)  # [V, C, h, w]
         correction = F.pixel_shuffle(taps[-1][..., : CELLS**2].mT.unflatten(-1, grid), CELLS)
-        x = self.lift(F.relu(self.coarse(torch.cat((said, context), 1))))
+        x = self.lift(activate(self.coarse(torch.cat((said, context), 1))))
         size = swept.shape[-2:]
         x, correction = (
             F.interpolate(each, size=size, mode="bilinear", align_corners=False) for each in (x, correction)
         )
         center = swept[:, :1].mean((-1, -2), keepdim=True)
-        x = F.relu(self.fine(torch.cat((x, context_fine, swept[:, :1] - center, swept[:, 1:]), 1)))
+        x = activate(self.fine(torch.cat((x, context_fine, swept[:, :1] - center, swept[:, 1:]), 1)))
         log_depth, log_scale = self.out(x).float().chunk(2, 1)
         log_depth = swept[:, :1] + RESPONSE * correction.float() + 0.25 * log_depth
         both = torch.cat((log_depth, log_scale + _UNSURE), 1)

@@ -7,6 +7,11 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 
+def activate(x: Tensor) -> Tensor:
+    """Leaky ReLU: sums of residuals without normalisation drift, and below zero a plain one never comes back."""
+    return F.leaky_relu(x, 0.1)
+
+
 class PlainBlock(nn.Module):
     """Two 3x3 convolutions around which the input is added, without normalisation: absolute values matter here."""
 
@@ -19,7 +24,7 @@ class PlainBlock(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Maps ``[N, C, h, w]`` to the same shape."""
-        return x + self.second(F.relu(self.first(F.relu(x))))
+        return x + self.second(activate(self.first(activate(x))))
 
 
 class RefineNet(nn.Module):
@@ -35,10 +40,8 @@ class RefineNet(nn.Module):
         super().__init__()
         fine, middle, coarse = channels
         self.begin = nn.Sequential(nn.Conv2d(inputs, fine, 3, 1, 1), PlainBlock(fine))
-        self.down = nn.Sequential(nn.ReLU(), nn.Conv2d(fine, middle, 3, 2, 1), PlainBlock(middle))
-        self.bottom = nn.Sequential(
-            nn.ReLU(), nn.Conv2d(middle, coarse, 3, 2, 1), PlainBlock(coarse), PlainBlock(coarse)
-        )
+        self.down = nn.Sequential(nn.Conv2d(fine, middle, 3, 2, 1), PlainBlock(middle))
+        self.bottom = nn.Sequential(nn.Conv2d(middle, coarse, 3, 2, 1), PlainBlock(coarse), PlainBlock(coarse))
         self.up = nn.Conv2d(coarse, middle, 1)
         self.merge = PlainBlock(middle)
         self.up_fine = nn.Conv2d(middle, fine, 1)
@@ -50,10 +53,10 @@ class RefineNet(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """Maps ``[N, inputs, h, w]`` to ``[N, outputs, h, w]`` in float32."""
         fine = self.begin(x)
-        middle = self.down(fine)
-        middle = self.merge(middle + _upsample(self.up(self.bottom(middle)), middle))
+        middle = self.down(activate(fine))
+        middle = self.merge(middle + _upsample(self.up(self.bottom(activate(middle))), middle))
         fine = self.merge_fine(fine + _upsample(self.up_fine(middle), fine))
-        return self.end(F.relu(fine)).float()
+        return self.end(activate(fine)).float()
 
 
 def _upsample(x: Tensor, like: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ from vg2gt.geometry.cameras import invert_rigid, ray_directions
 from vg2gt.geometry.rotations import quat_to_matrix
 from vg2gt.types import Cameras, Hints
 
-BUILT_IN = ("oracle", "vggt_tiny", "da3_tiny", "onnx")
+BUILT_IN = ("oracle", "sweep", "vggt_tiny", "da3_tiny", "onnx")
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 
 

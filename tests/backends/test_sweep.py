@@ -11,8 +11,9 @@ from backends.sweep.network import SweepNet
 from backends.sweep.tokens import DIM
 from backends.sweep.views import agreed_range, choose_sources, wide_range
 from backends.sweep.volume import agreement, expectation, from_inverse, to_inverse, to_planes
+from vg2gt.data import SyntheticScenes
 from vg2gt.geometry.cameras import resize_intrinsics
-from vg2gt.types import Hints
+from vg2gt.types import Batch, Cameras, Hints
 
 SIZE = (13, 22)
 
@@ -200,3 +201,32 @@ def test_intrinsics_of_feature_maps() -> None:
     quarter = resize_intrinsics(intrinsics, 1 / 4, 1 / 4)
     x = (1.5 - intrinsics[0, 0, 2]) / intrinsics[0, 0, 0]
     torch.testing.assert_close(x * quarter[0, 0, 0] + quarter[0, 0, 2], torch.tensor(0.0), rtol=0, atol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def unseen_room() -> Batch:
+    """Eight views of a room that neither the backbone nor anything else was trained on."""
+    frames = SyntheticScenes(1, 1_500_000, num_frames=16).load("room-1500000", range(0, 16, 2))
+    cameras = Cameras(frames.world_to_camera[None], frames.intrinsics[None], (112, 224))
+    metric, ids = torch.ones(1, dtype=torch.bool), torch.arange(8)[None]
+    return Batch(frames.images[None], frames.depth[None], cameras, metric, ids, ("room-1500000",), 8)
+
+
+def test_shipped_weights_measure_depth(unseen_room: Batch) -> None:
+    """From images and cameras alone, metric, with a confidence that knows where it errs."""
+    backend = SweepBackend()
+    geometry = backend.decode(backend.encode(unseen_room.images, Hints(cameras=unseen_room.cameras)))
+    error = (geometry.depth / unseen_room.depth - 1).abs().flatten()
+    assert error.mean() < 0.12
+    assert error.median() < 0.04
+    order = geometry.depth_conf.flatten().argsort(descending=True)
+    assert error[order[: len(order) // 2]].mean() < 0.6 * error.mean()
+
+
+def test_a_given_range_is_used(unseen_room: Batch) -> None:
+    """Structure from motion knows how near and far things are: nothing is searched beyond."""
+    backend = SweepBackend()
+    near_far = torch.tensor([[0.2, 1.0]])
+    hints = Hints(cameras=unseen_room.cameras.select(slice(0, 3)), depth_range=near_far)
+    tokens = backend.encode(unseen_room.images[:, :3], hints)
+    assert float(tokens.state["swept"][:, :, 0].exp().median()) < 1.5

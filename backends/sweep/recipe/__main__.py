@@ -40,7 +40,9 @@ def main(config: DictConfig) -> None:
     samples = Subset(TrainingSamples(files, training.steps, config.seed), range(first, training.steps))
     if checkpoint:
         print(f"going on with {checkpoint} at step {first} of {training.steps}", flush=True)
-    keep = ModelCheckpoint(out, "{step:06d}", every_n_train_steps=config.save_every, save_top_k=-1, save_last=True)
+    keep = ModelCheckpoint(
+        out, "step-{step:06d}", every_n_train_steps=config.save_every, save_top_k=-1, auto_insert_metric_name=False
+    )
     trainer = lightning.Trainer(
         accelerator="cpu",
         precision="bf16-mixed",

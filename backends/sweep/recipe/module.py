@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from typing import Any
 
 import lightning
@@ -53,6 +54,7 @@ class SweepTraining(lightning.LightningModule):
         self.net = SweepNet().to(memory_format=torch.channels_last)
         self.averaged = AveragedModel(self.net, multi_avg_fn=get_ema_multi_avg_fn(average))
         self.averaged.requires_grad_(False)
+        self._core_seconds = 0.0  # of earlier processes, less what this one had used when it began
 
     def training_step(self, sample: Sample, index: int) -> Tensor:
         """The objective of one sample."""
@@ -94,6 +96,23 @@ class SweepTraining(lightning.LightningModule):
         optimizer = torch.optim.AdamW(groups, lr=self.rate, betas=(0.9, 0.98), fused=True)
         scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, self._relative_rate)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
+
+    @property
+    def core_seconds(self) -> float:
+        """Processor time of the whole training, over all processes that it went on in."""
+        return self._core_seconds + time.process_time()
+
+    def on_train_start(self) -> None:
+        """Starts the clock."""
+        self._core_seconds -= time.process_time()
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Keeps the processor time."""
+        checkpoint["core_seconds"] = self.core_seconds
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Goes on counting."""
+        self._core_seconds = float(checkpoint.get("core_seconds", 0.0))
 
     def _relative_rate(self, step: int) -> float:
         begin = (1 - self.cooldown) * self.steps
