@@ -100,7 +100,6 @@ def test_names_of_views_that_cannot_be_files(names, said: str, scene: Scene, tmp
         (["empty", *TINY], "ValueError: no images in empty"),
         (["broken.png", *TINY], r"DataError: cannot read broken.png"),
         (["broken.png", "--backend", "dinosaur"], "unknown backend 'dinosaur'"),
-        (["broken.png"], "name a checkpoint, or a backend"),
         (["broken.png", "--save", "scene.fbx", *TINY], r"unknown output 'scene.fbx'"),
         (["broken.png", "--backend", "oracle"], "measured depth, and there is none with broken.png"),
     ],
