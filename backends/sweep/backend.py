@@ -50,7 +50,9 @@ class SweepBackend(Backend):
         if planes < 8 or sources < 1:
             raise ValueError(f"backend.planes must be >= 8 and backend.sources >= 1, got {planes} and {sources}")
         super().__init__("sweep", PATCH, (DIM,) * TAPS, LICENCE, needs_hints=True, min_views=2, predicts_cameras=False)
-        weights = Weights(self.name, LICENCE, pretrained, None, None, path or str(SHIPPED), seed)
+        weights = Weights(
+            self.name, LICENCE, pretrained, None, None, path or (str(SHIPPED) if pretrained else None), seed
+        )
         self.network = weights.build(SweepNet)
         self.planes, self.sources = planes, sources
         self.freeze()

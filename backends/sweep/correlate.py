@@ -7,6 +7,7 @@ gradient: planes are hypotheses.
 
 from __future__ import annotations
 
+from copy import copy
 from typing import Any
 
 import numpy as np
@@ -38,6 +39,15 @@ class SourceWarp:
         self.parallax = camera @ poses[..., :3, 3:]  # [V, n, 3, 1]
         self.sources = sources
         self.size = size
+        self.first = 0
+
+    def select(self, views: slice) -> SourceWarp:
+        """The same for some consecutive views, compared with sources among all."""
+        part = copy(self)
+        part.first = views.start
+        part.at_infinity, part.parallax = self.at_infinity[views], self.parallax[views]
+        part.sources = self.sources[views]
+        return part
 
     def __call__(self, source: int, inverse: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Projects inverse depths ``[V, D, h w]`` into source number ``source``.
@@ -62,9 +72,9 @@ def correlate(features: Tensor, inverse: Tensor, warp: SourceWarp) -> tuple[Tens
     """Compares every view with its sources.
 
     Args:
-        features: ``[V, C, h, w]``, C a multiple of ``GROUPS``.
-        inverse: ``[V, D, h w]`` inverse depths.
-        warp: of these views.
+        features: ``[N, C, h, w]`` of all views, C a multiple of ``GROUPS``.
+        inverse: ``[V, D, h w]`` inverse depths of the views of ``warp``.
+        warp: of all views or some.
 
     Returns:
         Similarity ``[V, n, D, h w, GROUPS]``, 0 outside of the source, and whether it is inside ``[V, n, D, h w]``.
@@ -77,7 +87,8 @@ def correlate(features: Tensor, inverse: Tensor, warp: SourceWarp) -> tuple[Tens
 
 def correlate_reference(features: Tensor, inverse: Tensor, warp: SourceWarp) -> tuple[Tensor, Tensor]:
     """:func:`correlate` in plain torch, for every device and dtype."""
-    here = features.unflatten(1, (-1, GROUPS)).flatten(-2).unsqueeze(3)  # [V, c, G, 1, h w]
+    own = features[warp.first : warp.first + len(warp.sources)]
+    here = own.unflatten(1, (-1, GROUPS)).flatten(-2).unsqueeze(3)  # [V, c, G, 1, h w]
     similarities, insides = [], []
     for source in range(warp.sources.shape[1]):
         grid, inside, _ = warp(source, inverse)
@@ -98,8 +109,8 @@ class _Correlate(torch.autograd.Function):
         similarity = torch.empty(*shape, GROUPS)
         inside = torch.empty(shape, dtype=torch.bool)
         geometry = _arrays(maps, warp.sources, warp.at_infinity, warp.parallax, inverse)
-        _forward(*geometry, similarity.numpy(), inside.numpy())
-        ctx.geometry = geometry
+        _forward(*geometry, warp.first, similarity.numpy(), inside.numpy())
+        ctx.geometry, ctx.first = geometry, warp.first
         ctx.mark_non_differentiable(inside)
         return similarity, inside
 
@@ -107,7 +118,7 @@ class _Correlate(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None]:  # type: ignore[override]
         maps = ctx.geometry[0]
         gradient = np.zeros_like(maps)
-        _backward(*ctx.geometry, gradients[0].contiguous().numpy(), gradient)
+        _backward(*ctx.geometry, ctx.first, gradients[0].contiguous().numpy(), gradient)
         return torch.from_numpy(gradient).permute(0, 3, 1, 2), None, None
 
 
@@ -131,10 +142,10 @@ def _sample(at_infinity, parallax, p, inverse, height, width):
 
 
 @njit(fastmath=True, error_model="numpy", nogil=True, cache=True)
-def _forward(maps, sources, at_infinity, parallax, inverse, similarity, inside):
-    views, height, width, channels = maps.shape
+def _forward(maps, sources, at_infinity, parallax, inverse, first, similarity, inside):
+    _, height, width, channels = maps.shape
     one = np.float32(1.0)
-    for view in range(views):
+    for view in range(sources.shape[0]):
         for n in range(sources.shape[1]):
             other = sources[view, n]
             for d in range(inverse.shape[1]):
@@ -147,7 +158,7 @@ def _forward(maps, sources, at_infinity, parallax, inverse, similarity, inside):
                     out[:] = 0.0
                     if not within:
                         continue
-                    here = maps[view, p // width, p % width]
+                    here = maps[first + view, p // width, p % width]
                     x1, y1 = min(x + 1, width - 1), min(y + 1, height - 1)
                     f00, f01 = maps[other, y, x], maps[other, y, x1]
                     f10, f11 = maps[other, y1, x], maps[other, y1, x1]
@@ -159,10 +170,10 @@ def _forward(maps, sources, at_infinity, parallax, inverse, similarity, inside):
 
 
 @njit(fastmath=True, error_model="numpy", nogil=True, cache=True)
-def _backward(maps, sources, at_infinity, parallax, inverse, gradient, out):
-    views, height, width, channels = maps.shape
+def _backward(maps, sources, at_infinity, parallax, inverse, first, gradient, out):
+    _, height, width, channels = maps.shape
     one = np.float32(1.0)
-    for view in range(views):
+    for view in range(sources.shape[0]):
         for n in range(sources.shape[1]):
             other = sources[view, n]
             for d in range(inverse.shape[1]):
@@ -174,7 +185,7 @@ def _backward(maps, sources, at_infinity, parallax, inverse, gradient, out):
                         continue
                     given = gradient[view, n, d, p]
                     row, column = p // width, p % width
-                    here, to_here = maps[view, row, column], out[view, row, column]
+                    here, to_here = maps[first + view, row, column], out[first + view, row, column]
                     x1, y1 = min(x + 1, width - 1), min(y + 1, height - 1)
                     f00, f01 = maps[other, y, x], maps[other, y, x1]
                     f10, f11 = maps[other, y1, x], maps[other, y1, x1]

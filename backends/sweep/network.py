@@ -27,6 +27,7 @@ from vg2gt.geometry.cameras import resize_intrinsics
 _BINS = 16  # channels that the planes' probability is summed into
 _FINE_PLANES = 12
 _FINE_REACH = 1.5  # of the second sweep on either side, in spacings of the first
+_VIEWS_AT_A_TIME = 4
 _FARTHEST = 4.0  # decoded depth at most, in multiples of the farthest plane
 WIDE_PLANES = 64  # of the sweep that finds the range
 
@@ -110,7 +111,7 @@ class SweepNet(nn.Module):
         warp = _warp(features.coarse, views, sources, 4)
         position = torch.linspace(0, 1, planes, device=depth_range.device).view(1, -1, 1, 1)
         inverse = to_inverse(position, depth_range)[..., 0].expand(len(views.images), -1, -1)  # [V, D, 1]
-        logits = self.volume(self.sweep(features.coarse, inverse, warp), planes)
+        logits = _match(self.sweep, self.volume, features.coarse, inverse, warp)
         t, mass = expectation(logits, position)
         agreeing = agreement(to_inverse(t.detach(), depth_range), warp)
         return Sweep(logits, position, t, mass), agreeing
@@ -161,7 +162,7 @@ class SweepNet(nn.Module):
         offsets = torch.linspace(-reach, reach, _FINE_PLANES, device=fine.device).view(1, -1, 1, 1)
         position = center + offsets  # [V, D, 2 h, 2 w]
         inverse = to_inverse(position, depth_range).clamp_min(1 / (_FARTHEST * depth_range[1])).flatten(2)
-        logits = self.volume_fine(self.sweep_fine(fine, inverse, warp), _FINE_PLANES)
+        logits = _match(self.sweep_fine, self.volume_fine, fine, inverse, warp)
         t, mass = expectation(logits, position)
         return Sweep(logits, position, t, mass)
 
@@ -172,6 +173,14 @@ class SweepNet(nn.Module):
         grid = (context.shape[-2] // 2, context.shape[-1] // 2)
         log_depth, log_scale = self.head(taps, grid, context, context_fine, swept)
         return log_depth.exp(), log_scale
+
+
+def _match(sweep: PlaneSweep, volume: VolumeNet, features: Tensor, inverse: Tensor, warp: SourceWarp) -> Tensor:
+    """Logits of planes ``[V, D, h, w]``; without gradient a few views at a time, because volumes are large."""
+    views, planes = inverse.shape[:2]
+    step = views if torch.is_grad_enabled() else _VIEWS_AT_A_TIME
+    parts = [slice(first, min(first + step, views)) for first in range(0, views, step)]
+    return torch.cat([volume(sweep(features, inverse[part], warp.select(part)), planes) for part in parts])
 
 
 def _warp(maps: Tensor, views: Views, sources: Tensor, stride: int) -> SourceWarp:

@@ -45,9 +45,7 @@ class TokenBlock(nn.Module):
             query, keys = query.reshape(1, views * patches, dim), keys.reshape(1, -1, dim)
         parts = (query, *self.key_value(keys).chunk(2, -1))
         split = [part.unflatten(-1, (self.heads, -1)).transpose(1, 2) for part in parts]  # [., heads, P, dim/heads]
-        q, k, v = split
-        weights = (q @ k.mT / math.sqrt(q.shape[-1])).softmax(-1)  # the fused kernel is slower on a CPU at these sizes
-        attended = (weights.to(v.dtype) @ v).transpose(1, 2).flatten(2).reshape(views, patches, dim)
+        attended = F.scaled_dot_product_attention(*split).transpose(1, 2).flatten(2).reshape(views, patches, dim)
         x = x + self.out(attended)
         return x + self.mlp(self.norm_mlp(x))
 

@@ -35,9 +35,9 @@ class PlaneSweep(nn.Module):
         """Compares views.
 
         Args:
-            features: ``[V, C, h, w]`` of unit length per group.
+            features: ``[N, C, h, w]`` of unit length per group, of all views.
             inverse: ``[V, D, h w]`` inverse depths of the planes, or ``[V, D, 1]``.
-            warp: of these views.
+            warp: of all views or some.
 
         Returns:
             ``[V D, GROUPS + 1, h, w]``, channels-last: mean similarity per group and the sources' weight.

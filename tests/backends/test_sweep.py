@@ -51,10 +51,21 @@ def test_kernels_equal_the_reference(problem) -> None:
         torch.testing.assert_close(kernel, reference, rtol=1e-4, atol=1e-4)
 
 
+def test_some_views_are_those_of_all(problem) -> None:
+    features, inverse, warp = problem
+    for function in (correlate, correlate_reference):
+        every, some = function(features, inverse, warp), function(features, inverse[1:], warp.select(slice(1, 3)))
+        assert all(torch.equal(a[1:], b) for a, b in zip(every, some, strict=True))
+    similarity = correlate(given := features.clone().requires_grad_(), inverse[1:], warp.select(slice(1, 3)))[0]
+    (kernel,) = torch.autograd.grad(similarity.sum(), given)
+    similarity = correlate_reference(given, inverse[1:], warp.select(slice(1, 3)))[0]
+    torch.testing.assert_close(kernel, torch.autograd.grad(similarity.sum(), given)[0], rtol=1e-4, atol=1e-4)
+
+
 def test_reference_gradient(problem) -> None:
     features, inverse, warp = problem
     small = SourceWarp.__new__(SourceWarp)
-    small.size, small.sources = warp.size, warp.sources
+    small.size, small.sources, small.first = warp.size, warp.sources, 0
     small.at_infinity, small.parallax = warp.at_infinity.double(), warp.parallax.double()
 
     def similarity(given: Tensor) -> Tensor:
