@@ -35,7 +35,7 @@ SETS = {
     " data.variant=outdoor",
     "HoloLens office": "data=rgbd data.root={shared}/hololens_office_a data.image_size=[112,224]",
     "7-Scenes kitchen": "data=rgbd data.root={shared}/seven_scenes_redkitchen_a_registered data.image_size=[112,224]"
-    " data.eval_window=14",
+    " data.eval_window=10",
 }
 _WINDOW = 7  # pixels of the classical matching cost, at half resolution
 _PLANES = 64
