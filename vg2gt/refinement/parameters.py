@@ -61,10 +61,9 @@ class Parameters:
     """The scene as free numbers with an optimiser of their own.
 
     Positions are offsets in units of each Gaussian's middle standard deviation, so that one rate fits small and large
-    ones and every scene's unit. Cameras are shifted in their own frames and turned about the point at the median depth
-    in front of them: a turn about its own centre moves a picture as a shift does, and one could be told from the other
-    but slowly. The camera of view 0 moves too: what is wrong about it alone would otherwise have to be mended by all
-    others and every Gaussian (:meth:`RefinedScene.seen_from` brings it back).
+    ones and every scene's unit. Cameras are turned and shifted in their own frames; the one of view 0 too, because what
+    is wrong about it alone would otherwise have to be mended by all others and every Gaussian
+    (:meth:`RefinedScene.seen_from` brings it back).
 
     Args:
         start: where to begin.
@@ -133,8 +132,7 @@ class Parameters:
             return cameras
         moves = self.pixel * self.values["cameras"]
         turn = quat_to_matrix(F.pad(moves[:, :3] / 2, (1, 0), value=1.0))
-        pivot = moves.new_tensor([0.0, 0.0, self.depth])
-        top = torch.cat((turn, (pivot - turn @ pivot + self.depth * moves[:, 3:])[..., None]), -1)
+        top = torch.cat((turn, self.depth * moves[:, 3:, None]), -1)
         increment = torch.cat((top, cameras.world_to_camera[0, :, 3:]), -2)
         poses = compose(increment, cameras.world_to_camera[0])[None]
         factor = self.values["focal"].exp()
