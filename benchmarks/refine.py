@@ -154,7 +154,8 @@ def main() -> None:
     batches = [batch.to(device) for batch, _ in zip(data.val_dataloader(), range(arguments.scenes), strict=False)]
     how = replace(instantiate(compose(None, "+refine=default").refine), steps=None, seconds=arguments.seconds)
     marks = [arguments.seconds * share for share in (1 / 16, 1 / 8, 1 / 4, 1 / 2)]
-    backend = [f"backend.{key}={config.backend[key]}" for key in ("depth_noise", "pose_noise") if key in config.backend]
+    noise = {key: config.backend.get(key) for key in ("depth_noise", "pose_noise")}
+    backend = [f"backend.{key}={value}" for key, value in noise.items() if value is not None]
     curves: dict[str, Curve] = {}
     names = {label if label == "point cloud" else f"{label}, untrained": (label, None) for label in arguments.starts}
     names |= {f"{label}, trained": (label, ckpt) for label, ckpt in trained.items()}
