@@ -31,8 +31,8 @@ def test_gif_round_trip(tmp_path: Path) -> None:
 
 def test_mp4_round_trip(tmp_path: Path) -> None:
     pytest.importorskip("av")
-    path = write_video(tmp_path / "bar.mp4", _frames(size=(33, 48)), fps=12)
-    assert [p.name for p in tmp_path.iterdir()] == ["bar.mp4"]
+    path = write_video(tmp_path / "12:30.mp4", _frames(size=(33, 48)), fps=12)  # no protocol called 12
+    assert [p.name for p in tmp_path.iterdir()] == ["12:30.mp4"]
     assert count_frames(path) == 6
     back = dict(read_video(path, every=2))
     assert list(back) == [0, 2, 4]
@@ -87,6 +87,9 @@ def test_ten_bits_and_more_are_read_as_eight(tmp_path: Path, codec: str, pixels:
     [
         "ffconcat version 1.0\nfile bar.mp4\n",
         "#EXTM3U\n#EXT-X-TARGETDURATION:2\n#EXTINF:2,\nbar.mp4\n#EXT-X-ENDLIST\n",
+        '<?xml version="1.0"?><MPD xmlns="urn:mpeg:dash:schema:mpd:2011" profiles="urn:mpeg:dash:profile:full:2011">'
+        '<Period><AdaptationSet mimeType="video/mp4"><Representation id="1" bandwidth="1"><BaseURL>bar.mp4</BaseURL>'
+        "<SegmentBase/></Representation></AdaptationSet></Period></MPD>",
         "v=0\no=- 0 0 IN IP4 127.0.0.1\ns=x\nc=IN IP4 127.0.0.1\nt=0 0\nm=video 4321 RTP/AVP 96\n",
         "",
         None,  # the beginning of a video
