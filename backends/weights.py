@@ -127,6 +127,10 @@ def _reason(error: BaseException) -> str:
     return "; ".join(" ".join(str(one).split()).rstrip(".") for one in told)
 
 
+def _has_bad_numbers(tensor: Tensor) -> bool:
+    return not tensor.is_meta and not bool(torch.isfinite(tensor).all())
+
+
 def load_strictly(
     network: nn.Module, state: Mapping[str, Tensor], prefix: str, ignorable: Sequence[str], source: str
 ) -> None:
@@ -150,7 +154,7 @@ def load_strictly(
         if key in state and state[key].shape != value.shape
     ]
     complaints += [f"unexpected {key}" for key in state if key not in wanted and not key.startswith(tuple(ignorable))]
-    bad = next((key for key in wanted if key in state and not bool(torch.isfinite(state[key]).all())), None)
+    bad = next((key for key in wanted if key in state and _has_bad_numbers(state[key])), None)
     if bad is not None:
         complaints.insert(0, f"{bad} is not finite")
     if complaints:

@@ -40,7 +40,7 @@ MAY_IMPORT: dict[str, set[str]] = {
 }
 OF_BACKENDS = ("vg2gt.types", "vg2gt.geometry", "vg2gt.io.tensors", "vg2gt.io.files")
 RECIPE = "backends.sweep.recipe"  # makes weights from procedural scenes; a command, which nothing else imports
-OF_RECIPE = (*OF_BACKENDS, "vg2gt.data.synthetic")
+OF_RECIPE = (*OF_BACKENDS, "vg2gt.data.synthetic", "vg2gt.io.npz")
 
 
 def modules() -> dict[str, Path]:

@@ -52,7 +52,7 @@ def main(config: DictConfig) -> None:
         log_every_n_steps=50,
         enable_model_summary=False,
     )
-    trainer.fit(training, DataLoader(samples, batch_size=None), ckpt_path=checkpoint, weights_only=False)
+    trainer.fit(training, DataLoader(samples, batch_size=None), ckpt_path=checkpoint, weights_only=True)
     print(write_weights(training, out / "sweep.safetensors", config))
 
 

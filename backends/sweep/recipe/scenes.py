@@ -17,6 +17,7 @@ from vg2gt.data.synthetic.outdoor import SyntheticOutdoor
 from vg2gt.data.synthetic.rooms import SyntheticRoom
 from vg2gt.data.synthetic.synthetic_scene import SyntheticScene
 from vg2gt.io.files import write_cached
+from vg2gt.io.npz import read_npz
 
 FIRST_SEED = 5_000_000  # far from the seeds that VG²GT is trained (0 ...) and evaluated (1,000,000 ...) on
 SIZE = (144, 288)
@@ -48,8 +49,8 @@ def scene_file(folder: Path, seed: int) -> Path:
 
 def read_scene(path: Path) -> SceneFrames:
     """Reads a cached scene."""
-    with np.load(path) as arrays:
-        return SceneFrames(*(torch.from_numpy(arrays[name]) for name in SceneFrames._fields))
+    arrays = read_npz(path, SceneFrames._fields)
+    return SceneFrames(*(torch.from_numpy(arrays[name]) for name in SceneFrames._fields))
 
 
 def render_scene(seed: int, threads: int = 1) -> dict[str, NDArray]:

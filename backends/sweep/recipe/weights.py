@@ -19,7 +19,7 @@ def newest_checkpoint(folder: Path) -> Path | None:
 
 def start_step(checkpoint: str | Path) -> int:
     """The step that a checkpoint of our own making goes on with."""
-    return int(torch.load(checkpoint, map_location="cpu", weights_only=False, mmap=True)["global_step"])
+    return int(torch.load(checkpoint, map_location="cpu", weights_only=True, mmap=True)["global_step"])
 
 
 def write_weights(training: SweepTraining, path: Path, config: DictConfig) -> Path:
