@@ -9,7 +9,7 @@ import vg2gt
 from vg2gt.memory import OutOfMemory
 from vg2gt.runs.checkpoints import read_checkpoint, write_checkpoint, write_slim
 from vg2gt.runs.find import checkpoint_path
-from vg2gt.runs.load import load_model, made_of, split_outside_brackets
+from vg2gt.runs.load import SHIPPED, load_model, made_of, split_outside_brackets
 
 
 def test_a_run_is_rebuilt_with_its_weights(run_folder: Path, ready) -> None:
@@ -69,6 +69,15 @@ def test_a_slim_checkpoint_is_the_same_model(run_folder: Path, tmp_path: Path) -
         load_model(slim, device="cpu")
     with pytest.raises(ValueError, match="must end with"):
         write_slim(tmp_path / "whole.ckpt", tmp_path / "weights.ckpt")
+
+
+def test_what_ships_needs_no_name() -> None:
+    """Nothing named: the plane sweep and the head that was trained on it, both from the package."""
+    loaded = load_model(device="cpu")
+    assert loaded.model.backend.name == "sweep"
+    assert loaded.weights.path == SHIPPED
+    assert load_model(backend="sweep", device="cpu").weights.path == SHIPPED
+    assert load_model(backend="sweep,planes=32", device="cpu").weights.path is None
 
 
 def test_another_backbone_is_refused(run_folder: Path) -> None:
