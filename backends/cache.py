@@ -86,7 +86,7 @@ def cache_key(backend: Backend, images: Tensor, hints: Hints | None) -> str:
 
     def add(tensor: Tensor) -> Tensor:
         digest.update(f"{tuple(tensor.shape)} {tensor.dtype}".encode())
-        digest.update(tensor.detach().cpu().contiguous().flatten().view(torch.uint8).numpy())
+        digest.update(tensor.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().tobytes())
         return tensor
 
     add(images)

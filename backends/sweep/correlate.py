@@ -79,7 +79,7 @@ def correlate(features: Tensor, inverse: Tensor, warp: SourceWarp) -> tuple[Tens
     Returns:
         Similarity ``[V, n, D, h w, GROUPS]``, 0 outside of the source, and whether it is inside ``[V, n, D, h w]``.
     """
-    compiled = features.device.type == "cpu" and features.dtype == torch.float32 and not torch.jit.is_tracing()
+    compiled = features.device.type == "cpu" and features.dtype == torch.float32
     if not compiled or torch.compiler.is_compiling():
         return correlate_reference(features, inverse, warp)
     return _Correlate.apply(features, inverse, warp)  # type: ignore[return-value]
@@ -109,7 +109,7 @@ class _Correlate(torch.autograd.Function):
         similarity = torch.empty(*shape, GROUPS)
         inside = torch.empty(shape, dtype=torch.bool)
         geometry = _arrays(maps, warp.sources, warp.at_infinity, warp.parallax, inverse)
-        _forward(*geometry, warp.first, similarity.numpy(), inside.numpy())
+        _forward(geometry, warp.first, similarity.numpy(), inside.numpy())
         ctx.geometry, ctx.first = geometry, warp.first
         ctx.mark_non_differentiable(inside)
         return similarity, inside
@@ -118,7 +118,7 @@ class _Correlate(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None]:  # type: ignore[override]
         maps = ctx.geometry[0]
         gradient = np.zeros_like(maps)
-        _backward(*ctx.geometry, ctx.first, gradients[0].contiguous().numpy(), gradient)
+        _backward(ctx.geometry, ctx.first, gradients[0].contiguous().numpy(), gradient)
         return torch.from_numpy(gradient).permute(0, 3, 1, 2), None, None
 
 
@@ -142,7 +142,8 @@ def _sample(at_infinity, parallax, p, inverse, height, width):
 
 
 @njit(fastmath=True, error_model="numpy", nogil=True, cache=True)
-def _forward(maps, sources, at_infinity, parallax, inverse, first, similarity, inside):
+def _forward(geometry, first, similarity, inside):
+    maps, sources, at_infinity, parallax, inverse = geometry
     _, height, width, channels = maps.shape
     one = np.float32(1.0)
     for view in range(sources.shape[0]):
@@ -170,7 +171,8 @@ def _forward(maps, sources, at_infinity, parallax, inverse, first, similarity, i
 
 
 @njit(fastmath=True, error_model="numpy", nogil=True, cache=True)
-def _backward(maps, sources, at_infinity, parallax, inverse, first, gradient, out):
+def _backward(geometry, first, gradient, out):
+    maps, sources, at_infinity, parallax, inverse = geometry
     _, height, width, channels = maps.shape
     one = np.float32(1.0)
     for view in range(sources.shape[0]):

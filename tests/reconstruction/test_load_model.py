@@ -3,13 +3,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from omegaconf import OmegaConf
 
 import vg2gt
 from vg2gt.memory import OutOfMemory
 from vg2gt.runs.checkpoints import read_checkpoint, write_checkpoint, write_slim
-from vg2gt.runs.find import checkpoint_path
 from vg2gt.runs.load import SHIPPED, load_model, made_of, split_outside_brackets
+from vg2gt.runs.trust import read_run_config
 
 
 def test_a_run_is_rebuilt_with_its_weights(run_folder: Path, ready) -> None:
@@ -54,8 +53,8 @@ def test_what_is_unknown_is_named(arguments, said: str) -> None:
 
 def test_a_slim_checkpoint_is_the_same_model(run_folder: Path, tmp_path: Path) -> None:
     """Weights without the optimiser, with all that names them: no run's folder is needed beside them."""
-    known = torch.load(checkpoint_path(run_folder), weights_only=True)
-    known["config"] = made_of(OmegaConf.load(run_folder / "config.yaml"))
+    known = torch.load(run_folder / "checkpoints" / "step-7.ckpt", weights_only=True)
+    known["config"] = made_of(read_run_config(run_folder / "config.yaml"))
     torch.save(known, tmp_path / "whole.ckpt")
     slim = write_slim(tmp_path / "whole.ckpt", tmp_path / "weights.safetensors")
     whole, loaded = load_model(run_folder, device="cpu"), load_model(slim, device="cpu")

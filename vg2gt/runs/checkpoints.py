@@ -39,7 +39,7 @@ def write_checkpoint(checkpoint: Mapping[str, Any], path: str | Path) -> None:
     try:
         with open(temporary, "wb") as file:
             noting = _NotingFile(file)
-            torch.save(checkpoint, noting)
+            torch.save(checkpoint, noting)  # pyright: ignore[reportArgumentType]: it has what is asked of a file
             flush_to_disk(file)
         os.replace(temporary, target)
         flush_folder(target.parent)

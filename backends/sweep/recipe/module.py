@@ -51,7 +51,8 @@ class SweepTraining(lightning.LightningModule):
         super().__init__()
         self.steps, self.rate, self.weight_decay = steps, rate, weight_decay
         self.warmup, self.cooldown, self.token_noise = warmup, cooldown, token_noise
-        self.net = SweepNet().to(memory_format=torch.channels_last)
+        self.net = SweepNet()
+        self.net.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
         self.averaged = AveragedModel(self.net, multi_avg_fn=get_ema_multi_avg_fn(average))
         self.averaged.requires_grad_(False)
         self._core_seconds = 0.0  # of earlier processes, less what this one had used when it began
