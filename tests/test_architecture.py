@@ -38,7 +38,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     | BASICS,
     **{command: {"cli"} for command in ("evaluate", "ablate", "curves")},
 }
-OF_BACKENDS = ("vg2gt.types", "vg2gt.geometry", "vg2gt.io.tensors", "vg2gt.io.files")
+OF_BACKENDS = ("vg2gt.types", "vg2gt.geometry", "vg2gt.io.tensors", "vg2gt.io.files", "vg2gt.io.compiled")
 RECIPE = "backends.sweep.recipe"  # makes weights from procedural scenes; a command, which nothing else imports
 OF_RECIPE = (*OF_BACKENDS, "vg2gt.data.synthetic", "vg2gt.io.npz")
 

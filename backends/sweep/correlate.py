@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import njit
 from torch import Tensor
 from torch.nn import functional as F
 
 from backends.sweep.views import rays, relative_poses
+from vg2gt.io.compiled import kernel
 
 GROUPS = 8  # similarities per point: dot products over the channels c with equal c % GROUPS
 BEHIND = 1e-3  # depth in a source, per depth here, below which a point does not count as seen
@@ -126,7 +126,7 @@ def _arrays(*tensors: Tensor) -> tuple[np.ndarray, ...]:
     return tuple(tensor.detach().contiguous().numpy() for tensor in tensors)
 
 
-@njit(fastmath=True, error_model="numpy", nogil=True, cache=True, inline="always")
+@kernel(fastmath=True, error_model="numpy", nogil=True, inline="always")
 def _sample(at_infinity, parallax, p, inverse, height, width):
     """Corner and weights of the four pixels around a point's place in the source, and whether it is inside."""
     z = at_infinity[2, p] + parallax[2, 0] * inverse
@@ -141,7 +141,7 @@ def _sample(at_infinity, parallax, p, inverse, height, width):
     return x, y, u - np.float32(x), v - np.float32(y), inside
 
 
-@njit(fastmath=True, error_model="numpy", nogil=True, cache=True)
+@kernel(fastmath=True, error_model="numpy", nogil=True)
 def _forward(geometry, first, similarity, inside):
     maps, sources, at_infinity, parallax, inverse = geometry
     _, height, width, channels = maps.shape
@@ -170,7 +170,7 @@ def _forward(geometry, first, similarity, inside):
                             out[g] += here[k] * (w00 * f00[k] + w01 * f01[k] + w10 * f10[k] + w11 * f11[k])
 
 
-@njit(fastmath=True, error_model="numpy", nogil=True, cache=True)
+@kernel(fastmath=True, error_model="numpy", nogil=True)
 def _backward(geometry, first, gradient, out):
     maps, sources, at_infinity, parallax, inverse = geometry
     _, height, width, channels = maps.shape

@@ -26,8 +26,8 @@ import numba
 
 log = logging.getLogger(__name__)
 
-PACKAGE = Path(__file__).resolve().parents[1]
-ROOMS = ("rendering", "data/synthetic", "data/sources")
+PACKAGES = Path(__file__).resolve().parents[2]
+ROOMS = ("vg2gt/rendering", "vg2gt/data/synthetic", "vg2gt/data/sources", "backends/sweep")
 """Folders whose kernels take constants and functions from files of the same folder only (a test holds it)."""
 UNUSED_DAYS = 30
 VARIABLE = "NUMBA_CACHE_DIR"
@@ -57,7 +57,7 @@ def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
 def _room(source: Path) -> Path:
     """The folder that a kernel of this file is made of."""
-    rooms = [PACKAGE / room for room in ROOMS if source.resolve().is_relative_to(PACKAGE / room)]
+    rooms = [PACKAGES / room for room in ROOMS if source.resolve().is_relative_to(PACKAGES / room)]
     if not rooms:
         raise ValueError(f"{source}: kernels belong into {', '.join(ROOMS)}, whose files are hashed for the cache")
     return rooms[0]
