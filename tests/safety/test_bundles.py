@@ -25,20 +25,32 @@ from backends.onnx import OnnxBackend, open_session
 onnx = pytest.importorskip("onnx", reason="needs onnx: pip install 'vg2gt[export]'")
 from onnx import TensorProto, helper  # noqa: E402
 
+OF_ENCODER = {"patch_0": 4, "camera": 1}  # outputs and their sizes, as the description promises them
+OF_DECODER = {"depth": 1, "depth_conf": 1, "world_to_camera": 4, "intrinsics": 3}
 
-def graph(*nodes: Any, initializers: tuple[Any, ...] = ()) -> Any:
+
+def graph(*nodes: Any, initializers: tuple[Any, ...] = (), outputs: dict[str, int] = OF_ENCODER) -> Any:
+    """A graph whose nodes make ``y`` of ``x``, and the outputs of ``y``."""
     shape = helper.make_tensor_value_info
-    inputs, outputs = [shape("x", TensorProto.FLOAT, [1])], [shape("y", TensorProto.FLOAT, [1])]
-    return helper.make_graph(list(nodes), "g", inputs, outputs, list(initializers))
+    ends = []
+    for name, size in outputs.items():
+        ends.append(helper.make_node("Constant", [], [f"size of {name}"], value_ints=[size]))
+        ends.append(helper.make_node("Expand", ["y", f"size of {name}"], [name]))
+    given = [shape("x", TensorProto.FLOAT, [1])]
+    made = [shape(name, TensorProto.FLOAT, [size]) for name, size in outputs.items()]
+    return helper.make_graph([*nodes, *ends], "g", given, made, list(initializers))
 
 
-def network(*nodes: Any, initializers: tuple[Any, ...] = (), domain: str = "") -> bytes:
+def network(
+    *nodes: Any, initializers: tuple[Any, ...] = (), domain: str = "", outputs: dict[str, int] = OF_ENCODER
+) -> bytes:
     opsets = [helper.make_opsetid("", 17), *([helper.make_opsetid(domain, 1)] if domain else [])]
-    made = graph(*nodes, initializers=initializers)
+    made = graph(*nodes, initializers=initializers, outputs=outputs)
     return helper.make_model(made, opset_imports=opsets, ir_version=9).SerializeToString()
 
 
 HARMLESS = network(helper.make_node("Identity", ["x"], ["y"]))
+HARMLESS_DECODER = network(helper.make_node("Identity", ["x"], ["y"]), outputs=OF_DECODER)
 
 
 def outside(location: str) -> bytes:
@@ -73,8 +85,8 @@ def describe(folder: Path, change: Callable[[dict[str, Any]], Any] = lambda cont
 def bundle(tmp_path: Path) -> Path:
     folder = tmp_path / "bundle"
     folder.mkdir()
-    for name in (ENCODER, DECODER):
-        (folder / name).write_bytes(HARMLESS)
+    (folder / ENCODER).write_bytes(HARMLESS)
+    (folder / DECODER).write_bytes(HARMLESS_DECODER)
     describe(folder)
     return folder
 

@@ -9,7 +9,10 @@ RUN = """
 import logging, sys
 import hydra
 import vg2gt.training.loop
+from vg2gt.cli.folders import register
 from vg2gt.config import config_dir
+
+register()
 
 @hydra.main(version_base="1.3", config_path=config_dir(), config_name="train")
 def main(config):
