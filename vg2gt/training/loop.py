@@ -259,6 +259,7 @@ def _log_picture(run: Run, picture: Path) -> None:
         if isinstance(logger, TensorBoardLogger):
             pixels = torch.from_numpy(read_color(picture, run.folder.name))
             logger.experiment.add_image("preview", pixels, run.trainer.global_step, dataformats="HWC")
+            logger.experiment.flush()  # training has ended and nothing else would write it out
         elif isinstance(logger, WandbLogger):
             logger.log_image("preview", [str(picture)], run.trainer.global_step)
 
