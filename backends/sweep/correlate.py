@@ -101,8 +101,11 @@ def correlate_reference(features: Tensor, inverse: Tensor, warp: SourceWarp) -> 
 
 
 class _Correlate(torch.autograd.Function):
+    """The kernels as one operation; see :func:`correlate` for shapes."""
+
     @staticmethod
     def forward(ctx: Any, features: Tensor, inverse: Tensor, warp: SourceWarp) -> tuple[Tensor, Tensor]:
+        """Similarity and whether points are inside."""
         maps = features.permute(0, 2, 3, 1).contiguous()  # [V, h, w, C]
         views, sources = warp.sources.shape
         shape = (views, sources, *inverse.shape[1:])
@@ -116,6 +119,7 @@ class _Correlate(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None]:  # type: ignore[override]
+        """Gradient of the features; hypotheses and cameras get none."""
         maps = ctx.geometry[0]
         gradient = np.zeros_like(maps)
         _backward(ctx.geometry, ctx.first, gradients[0].contiguous().numpy(), gradient)
@@ -128,7 +132,7 @@ def _arrays(*tensors: Tensor) -> tuple[np.ndarray, ...]:
 
 @kernel(fastmath=True, error_model="numpy", nogil=True, inline="always")
 def _sample(at_infinity, parallax, p, inverse, height, width):
-    """Corner and weights of the four pixels around a point's place in the source, and whether it is inside."""
+    """Rows, columns and bilinear weights of the four pixels around a point in the source; whether it is inside."""
     z = at_infinity[2, p] + parallax[2, 0] * inverse
     safe = max(z, np.float32(BEHIND))
     u = (at_infinity[0, p] + parallax[0, 0] * inverse) / safe
@@ -138,20 +142,21 @@ def _sample(at_infinity, parallax, p, inverse, height, width):
     v = min(max(v, np.float32(0.0)), np.float32(height - 1))
     x, y = int(u), int(v)
     x, y = min(x, max(width - 2, 0)), min(y, max(height - 2, 0))
-    return x, y, u - np.float32(x), v - np.float32(y), inside
+    a, b, one = u - np.float32(x), v - np.float32(y), np.float32(1.0)
+    weights = ((one - a) * (one - b), a * (one - b), (one - a) * b, a * b)
+    return (y, min(y + 1, height - 1)), (x, min(x + 1, width - 1)), weights, inside
 
 
 @kernel(fastmath=True, error_model="numpy", nogil=True)
 def _forward(geometry, first, similarity, inside):
     maps, sources, at_infinity, parallax, inverse = geometry
     _, height, width, channels = maps.shape
-    one = np.float32(1.0)
     for view in range(sources.shape[0]):
         for n in range(sources.shape[1]):
             other = sources[view, n]
             for d in range(inverse.shape[1]):
                 for p in range(height * width):
-                    x, y, a, b, within = _sample(
+                    (y, y1), (x, x1), (w00, w01, w10, w11), within = _sample(
                         at_infinity[view, n], parallax[view, n], p, inverse[view, d, p], height, width
                     )
                     inside[view, n, d, p] = within
@@ -160,10 +165,8 @@ def _forward(geometry, first, similarity, inside):
                     if not within:
                         continue
                     here = maps[first + view, p // width, p % width]
-                    x1, y1 = min(x + 1, width - 1), min(y + 1, height - 1)
                     f00, f01 = maps[other, y, x], maps[other, y, x1]
                     f10, f11 = maps[other, y1, x], maps[other, y1, x1]
-                    w00, w01, w10, w11 = (one - a) * (one - b), a * (one - b), (one - a) * b, a * b
                     for c in range(0, channels, GROUPS):
                         for g in range(GROUPS):
                             k = c + g
@@ -174,13 +177,12 @@ def _forward(geometry, first, similarity, inside):
 def _backward(geometry, first, gradient, out):
     maps, sources, at_infinity, parallax, inverse = geometry
     _, height, width, channels = maps.shape
-    one = np.float32(1.0)
     for view in range(sources.shape[0]):
         for n in range(sources.shape[1]):
             other = sources[view, n]
             for d in range(inverse.shape[1]):
                 for p in range(height * width):
-                    x, y, a, b, within = _sample(
+                    (y, y1), (x, x1), (w00, w01, w10, w11), within = _sample(
                         at_infinity[view, n], parallax[view, n], p, inverse[view, d, p], height, width
                     )
                     if not within:
@@ -188,12 +190,10 @@ def _backward(geometry, first, gradient, out):
                     given = gradient[view, n, d, p]
                     row, column = p // width, p % width
                     here, to_here = maps[first + view, row, column], out[first + view, row, column]
-                    x1, y1 = min(x + 1, width - 1), min(y + 1, height - 1)
                     f00, f01 = maps[other, y, x], maps[other, y, x1]
                     f10, f11 = maps[other, y1, x], maps[other, y1, x1]
                     t00, t01 = out[other, y, x], out[other, y, x1]
                     t10, t11 = out[other, y1, x], out[other, y1, x1]
-                    w00, w01, w10, w11 = (one - a) * (one - b), a * (one - b), (one - a) * b, a * b
                     for c in range(0, channels, GROUPS):
                         for g in range(GROUPS):
                             k = c + g
