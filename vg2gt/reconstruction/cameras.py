@@ -88,8 +88,9 @@ def check_depth(backend: str, images: ImagesLike) -> None:
 def _no_depth(backend: str, images: ImagesLike) -> str:
     return (
         f"backend {backend} works from measured depth, and there is none with {describe(images)}: it reconstructs "
-        "recordings only (depth/ beside images/, with poses.txt and K.txt). For photographs take a backend that works "
-        "from images alone, such as --backend da3_small or vggt_1b; a checkpoint fits the backend it was trained on"
+        "recordings only (depth/ beside images/, with poses.txt and K.txt). For photographs leave --backend and --ckpt "
+        "out (the plane sweep in the package is taken), or take --backend da3_small; a checkpoint fits the backend it "
+        "was trained on"
     )
 
 

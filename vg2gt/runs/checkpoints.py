@@ -23,6 +23,7 @@ log = logging.getLogger(__name__)
 
 PATTERN = "step-*.ckpt"
 SLIM = ".safetensors"  # a checkpoint without what only training needs
+MADE_OF = "config"  # where a checkpoint keeps the configuration of backend, model and renderer, as YAML
 MODEL_PREFIX = "model."  # of the model's names in a checkpoint's state_dict, as the Lightning module names it
 
 
@@ -103,12 +104,12 @@ def write_slim(checkpoint: str | Path, path: str | Path) -> Path:
         ValueError: if ``path`` has another ending, or the checkpoint is of a version that knew no configuration.
     """
     content = read_checkpoint(checkpoint)
-    if Path(path).suffix != SLIM or "config" not in content:
+    if Path(path).suffix != SLIM or MADE_OF not in content:
         raise ValueError(f"{path} must end with {SLIM}, and {checkpoint} must hold the configuration it was made with")
     header = {
         "backend": json.dumps(content["backend"]),
         "step": str(content["global_step"]),
-        "config": content["config"],
+        MADE_OF: content[MADE_OF],
     }
     state = {name: tensor.contiguous() for name, tensor in sorted(content["state_dict"].items())}
     return write_bytes(path, save(state, metadata=header))
@@ -123,7 +124,7 @@ def _read_slim(path: Path) -> dict[str, Any]:
         facts = {
             "backend": json.loads(header["backend"]),
             "global_step": int(header["step"]),
-            "config": header["config"],
+            MADE_OF: header[MADE_OF],
         }
     except (SafetensorError, OSError, KeyError, ValueError) as error:
         raise ValueError(f"checkpoint {path} is damaged or not a checkpoint of this project: {error}") from error

@@ -19,7 +19,7 @@ from omegaconf.errors import OmegaConfBaseException
 from vg2gt.config import compose, flatten, group_options
 from vg2gt.model import Reconstructor
 from vg2gt.rendering import Renderer
-from vg2gt.runs.checkpoints import model_state, read_checkpoint, refuse_not_finite
+from vg2gt.runs.checkpoints import MADE_OF, model_state, read_checkpoint, refuse_not_finite
 from vg2gt.runs.find import checkpoint_path, run_config_path
 from vg2gt.runs.trust import check_targets, parse_run_config, read_run_config
 
@@ -28,7 +28,6 @@ log = logging.getLogger(__name__)
 SHIPPED = Path(__file__).resolve().parents[1] / "weights" / "sweep-tiny.safetensors"
 """A head trained on ``backend=sweep``, whose weights are in the package too: real photographs without a download."""
 PARTS = ("backend", "model", "renderer")
-MADE_OF = "config"  # where a checkpoint keeps the configuration of these parts, as YAML
 FREE = ("path", "pretrained", "revision", "head_chunk", "views_per_chunk")
 """Keys that change nothing of what a network computes, or whose effect a checkpoint knows by the weights' hash."""
 

@@ -22,8 +22,7 @@ from vg2gt.memory import dropped_by
 from vg2gt.model import Reconstructor
 from vg2gt.profiling import stage
 from vg2gt.rendering import Renderer, UnrenderableError
-from vg2gt.runs.checkpoints import MODEL_PREFIX, model_state
-from vg2gt.runs.load import MADE_OF
+from vg2gt.runs.checkpoints import MADE_OF, MODEL_PREFIX, model_state
 from vg2gt.training.distributed import all_gather_object, interleave, world_size
 from vg2gt.training.faults import (
     Fault,
