@@ -11,7 +11,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
-from vg2gt.types import Geometry, Hints, Tokens
+from vg2gt.types import Cameras, Geometry, Hints, Tokens
 
 
 class Backend(nn.Module, ABC):
@@ -165,9 +165,22 @@ class Backend(nn.Module, ABC):
             found = value.world_to_camera.shape if name == "cameras" else getattr(value, "shape", ())
             if name in shapes and found != shapes[name]:
                 raise ValueError(f"hints.{name} must be {list(shapes[name])} for these images, got {list(found)}")
+        if "cameras" in names and hints.cameras is not None:
+            self._check_cameras(hints.cameras)
         if "scene_key" in names and len(hints.scene_key) != batch:
             raise ValueError(f"hints.scene_key must name {batch} scenes, got {len(hints.scene_key)}")
         return hints
+
+    def _check_cameras(self, cameras: Cameras) -> None:
+        """Refuses given cameras that would make everything NaN, or have no field of view."""
+        values = torch.cat((cameras.world_to_camera[..., :3, :].flatten(-2), cameras.intrinsics.flatten(-2)), -1)
+        bad = ~torch.isfinite(values).all(-1) | (cameras.intrinsics[..., [0, 1], [0, 1]] <= 0).any(-1)  # [B, V]
+        if bad.any():
+            scene, view = bad.nonzero()[0].tolist()
+            raise ValueError(
+                f"hints.cameras of scene {scene}, view {view} are not finite or have no positive focal length: leave "
+                "the view out, or correct its pose and intrinsics"
+            )
 
 
 def _is_missing(value: object) -> bool:

@@ -199,7 +199,7 @@ class VG2GT(Reconstructor):
         super().__init__(backend, scale)
         dims, patch = backend.token_dims, backend.patch_size
         self.keep_scale = keep_scale
-        self.coarse = coarse(token_dim=dims[-1], num_taps=len(dims), patch_size=patch) if coarse else None
+        self.coarse = coarse(token_dims=dims, patch_size=patch) if coarse else None
         self.fine = fine(token_dims=dims, patch_size=patch)
         self.gaussians = gaussians(in_channels=self.fine.out_channels)
 

@@ -27,6 +27,8 @@ FAR_QUANTILE = 0.99
 MIN_PIXELS = 10
 NEAREST, NEAREST_METRIC = 1e-3, 1e-2  # depth, metric depth: nearer pixels do not fit the scale
 MAX_SAMPLES = 100_000  # for quantiles
+FARTHEST_SKY = 200.0  # metres
+SKY_CONFIDENCE = 1.0  # the least that DA3 gives: 1 + exp
 
 
 class DA3MetricNetwork(nn.Module):
@@ -170,9 +172,9 @@ def quantile(values: Tensor, q: float) -> Tensor:
 class DA3NestedBackend(Backend):
     """DA3's relative network with a metric scale: one factor per scene, fitted to the metric network's depth.
 
-    Geometry stays the relative network's; ``Geometry.scale`` turns it into metres. The published code also gives the
-    relative depth's sky the far end of the scene and full confidence; here it keeps what the network decodes, which
-    stays differentiable.
+    Geometry stays the relative network's; ``Geometry.scale`` turns it into metres. As in the published code sky, which
+    the metric network knows, gets the far end of its scene, at most 200 m away, and confidence 1. Both are fixed when
+    images are encoded: changed tokens move neither, and no gradient comes from the sky.
 
     Args:
         relative: predicts geometry.
@@ -196,11 +198,39 @@ class DA3NestedBackend(Backend):
         metric_tokens = self.metric.encode(images, Hints(cameras=geometry.cameras))
         depth, sky = self.metric.decode_raw(metric_tokens)
         scale = fit_scale(depth * metres(geometry.cameras)[..., None, None], sky, geometry)
-        return replace(tokens, state={**tokens.state, "scale": scale})
+        state = {"scale": scale, "sky": sky >= SKY_THRESHOLD, "far": far_ends(geometry.depth, sky, scale)}
+        return replace(tokens, state={**tokens.state, **state})
 
     def decode(self, tokens: Tokens) -> Geometry:
         """See :meth:`Backend.decode`."""
-        return replace(self.relative.decode(tokens), scale=tokens.state["scale"])
+        geometry = self.relative.decode(tokens)
+        far = tokens.state["far"][:, None, None, None]
+        filled = tokens.state["sky"] & far.isfinite()
+        return replace(
+            geometry,
+            depth=torch.where(filled, far, geometry.depth),
+            depth_conf=torch.where(filled, SKY_CONFIDENCE, geometry.depth_conf),
+            scale=tokens.state["scale"],
+        )
+
+
+def far_ends(depth: Tensor, sky: Tensor, scale: Tensor) -> Tensor:
+    """Where every scene's sky goes, ``[B]`` in the unit of ``depth``: its other pixels' 0.99 quantile, or 200 m.
+
+    A scene with no more than ten pixels that are not sky has no far end: infinity.
+
+    Args:
+        depth: ``[B, V, H, W]``.
+        sky: ``[B, V, H, W]`` score of the metric network.
+        scale: ``[B]`` metres per unit.
+    """
+    ends = []
+    for scene, score, metres_per_unit in zip(depth, sky, scale, strict=True):
+        ground = scene[score < SKY_THRESHOLD]
+        enough = ground.numel() > MIN_PIXELS
+        far = quantile(ground, FAR_QUANTILE) if enough else torch.full_like(metres_per_unit, torch.inf)
+        ends.append(torch.minimum(far, FARTHEST_SKY / metres_per_unit) if enough else far)
+    return torch.stack(ends)
 
 
 def fit_scale(metric_depth: Tensor, sky: Tensor, geometry: Geometry) -> Tensor:

@@ -124,6 +124,18 @@ def test_missing_hints_are_named(backend: Backend, scene) -> None:
         backend.encode(scene[0])
 
 
+def test_cameras_that_are_no_cameras_are_refused(backend: Backend, scene) -> None:
+    if not backend.needs_hints:
+        pytest.skip("this backend finds its cameras itself")
+    images, hints = scene
+    for part, value in (("world_to_camera", torch.nan), ("intrinsics", torch.inf), ("intrinsics", -1.0)):
+        bad = getattr(hints.cameras, part).clone()
+        bad[1, 2, 0, 0] = value
+        cameras = dataclasses.replace(hints.cameras, **{part: bad})
+        with pytest.raises(ValueError, match="scene 1, view 2"):
+            backend.encode(images, dataclasses.replace(hints, cameras=cameras))
+
+
 def test_decoding_again_is_bit_equal(backend: Backend, tokens: Tokens, geometry: Geometry) -> None:
     unchanged = tokens.with_patch(tuple(patch + torch.zeros_like(patch) for patch in tokens.patch))
     for again in (backend.decode(tokens), backend.decode(unchanged)):

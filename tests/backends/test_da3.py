@@ -3,7 +3,7 @@ import torch
 
 from backends.da3.backbone import reference_first, select_reference
 from backends.da3.camera import normalize_cameras
-from backends.da3.metric import fill_sky, fit_scale
+from backends.da3.metric import far_ends, fill_sky, fit_scale
 from vg2gt.geometry.cameras import invert_rigid, relative_to_first
 from vg2gt.types import Cameras, Geometry, Hints
 
@@ -176,17 +176,62 @@ def test_nested_scale_ignores_sky_and_doubt() -> None:
     assert torch.equal(fit_scale(torch.zeros_like(metric), sky, geometry), torch.ones(2))
 
 
-def test_nested_keeps_the_relative_geometry(make_backend, make_scene) -> None:
-    images, _ = make_scene(2, 2, SIZE)
+@pytest.fixture
+def make_nested(make_backend):
     shared = [f"relative.{o}" for o in ("ffn=mlp", "multiview_from=2", "taps=[1,3,5,7]", "depth=8")]
     shared += [f"relative.{o}" for o in TINY_METRIC if not o.startswith(("taps", "depth"))]
-    backend = make_backend("da3_nested", *shared, *(f"metric.{option}" for option in TINY_METRIC))
+    return lambda: make_backend("da3_nested", *shared, *(f"metric.{option}" for option in TINY_METRIC))
+
+
+def test_nested_keeps_the_relative_geometry(make_nested, make_scene) -> None:
+    images, _ = make_scene(2, 2, SIZE)
+    backend = make_nested()
     tokens = backend.encode(images)
     geometry = backend.decode(tokens)
     expected = backend.relative.decode(backend.relative.encode(images))
-    assert torch.equal(geometry.depth, expected.depth)
+    ground = ~tokens.state["sky"]
+    assert torch.equal(geometry.depth[ground], expected.depth[ground])
+    assert torch.equal(geometry.depth_conf[ground], expected.depth_conf[ground])
     assert backend.is_metric
     assert (geometry.scale > 0).all()
     assert not torch.equal(geometry.scale, torch.ones(2))
     changed = backend.decode(tokens.with_patch(tuple(patch + 0.1 for patch in tokens.patch)))
     assert torch.equal(changed.scale, geometry.scale)
+
+
+def test_nested_sky_is_far_and_stays_there(make_nested, make_scene) -> None:
+    """The metric network says what is sky; the far end is the relative network's, whatever the tokens become."""
+    images, _ = make_scene(2, 2, SIZE)
+    backend = make_nested()
+    decode_raw = backend.metric.decode_raw
+    top = slice(0, SIZE[0] // 3)
+
+    def with_sky(tokens):
+        depth, sky = decode_raw(tokens)
+        sky = torch.zeros_like(sky)
+        sky[0, :, top] = 0.5
+        return depth, sky
+
+    backend.metric.decode_raw = with_sky
+    tokens = backend.encode(images)
+    geometry = backend.decode(tokens)
+    plain = backend.relative.decode(tokens)
+    far = plain.depth[0, :, top.stop :].quantile(0.99)
+    torch.testing.assert_close(geometry.depth[0, :, top], far.expand_as(geometry.depth[0, :, top]))
+    assert (geometry.depth_conf[0, :, top] == 1).all()
+    assert torch.equal(geometry.depth[0, :, top.stop :], plain.depth[0, :, top.stop :])
+    assert torch.equal(geometry.depth[1], plain.depth[1])
+    patch = tuple((tap + 0.1).requires_grad_() for tap in tokens.patch)
+    changed = backend.decode(tokens.with_patch(patch))
+    assert torch.equal(changed.depth[0, :, top], geometry.depth[0, :, top])
+    changed.depth[0, :, top].sum().backward()
+    assert all(not tap.grad.any() for tap in patch)
+
+
+def test_far_ends_are_at_most_200_metres_away() -> None:
+    depth = torch.linspace(1, 100, 400).reshape(1, 1, 20, 20).repeat(3, 1, 1, 1)
+    sky = torch.zeros_like(depth)
+    sky[2] = 1
+    far = far_ends(depth, sky, torch.tensor([1.0, 50.0, 1.0]))
+    torch.testing.assert_close(far[:2], torch.tensor([float(depth[0].quantile(0.99)), 4.0]))
+    assert far[2] == torch.inf  # nothing but sky: left as it is

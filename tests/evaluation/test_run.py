@@ -3,6 +3,8 @@
 import json
 import logging
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +23,7 @@ from vg2gt.evaluation.run import evaluate
 from vg2gt.metrics.lpips import STAGES
 from vg2gt.runs.checkpoints import read_checkpoint, write_checkpoint
 from vg2gt.runs.find import checkpoint_path
+from vg2gt.runs.lock import only_process_in
 from vg2gt.runs.trust import read_run_config
 from vg2gt.training.loop import train
 
@@ -294,6 +297,24 @@ def test_a_training_runs_folder_is_left_as_it_is(cache: Path, trained: Path, cop
             run(copied, cache, f"ckpt={copied}", "data.eval_scenes=1", *more)
     for name in ("config.yaml", "metrics.json", "metrics.md"):
         assert (copied / name).read_bytes() == (trained / name).read_bytes()
+
+
+def test_a_folder_is_one_processs_at_a_time(cache: Path, joined: Path) -> None:
+    code = (
+        "import sys; from vg2gt.runs.lock import *\nwith only_process_in(sys.argv[1]): print('held', flush=1); input()"
+    )
+    before = (joined / "metrics.json").read_bytes()
+    with subprocess.Popen(
+        [sys.executable, "-c", code, str(joined)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as other:
+        assert other.stdout
+        assert other.stdout.readline() == b"held\n"
+        with pytest.raises(BlockingIOError, match=rf"copy is in use by another process \(process {other.pid} on"):
+            run(joined, cache, "overwrite=true")
+        other.kill()
+    assert (joined / "metrics.json").read_bytes() == before
+    with only_process_in(joined):  # the other was killed: it holds nothing
+        pass
 
 
 def test_times_of_another_device_do_not_join(tmp_path: Path, cache: Path, trained: Path) -> None:

@@ -3,11 +3,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from omegaconf import OmegaConf
 
 import vg2gt
 from vg2gt.memory import OutOfMemory
 from vg2gt.runs.checkpoints import read_checkpoint, write_checkpoint, write_slim
-from vg2gt.runs.load import SHIPPED, load_model, made_of, split_outside_brackets
+from vg2gt.runs.load import SHIPPED, compose_part, load_model, made_of, split_outside_brackets
 from vg2gt.runs.trust import read_run_config
 
 
@@ -84,6 +85,29 @@ def test_another_backbone_is_refused(run_folder: Path) -> None:
         load_model(run_folder, "da3_tiny", device="cpu")
     with pytest.raises(FileNotFoundError, match="nowhere"):
         load_model("nowhere")
+
+
+@pytest.mark.parametrize(
+    ("option", "said"),
+    [
+        ("taps=[0,1,2,3]", r"backend\.taps=\[1, 3, 5, 7\], here it is \[0, 1, 2, 3\]"),
+        ("reference_view=saddle_balanced", "backend.reference_view=first, here it is saddle_balanced"),
+    ],
+)
+def test_the_same_weights_with_other_tokens_are_refused(option: str, said: str, tmp_path: Path) -> None:
+    """Neither changes a shape or the weights' hash."""
+    built = load_model(backend="da3_tiny", device="cpu")
+    parts = {"backend": "da3_tiny", "model": "tiny", "renderer": "solid"}
+    checkpoint = {
+        "state_dict": {f"model.{name}": value for name, value in built.model.trained_state().items()},
+        "backend": dict(built.model.backend.identity()),
+        "global_step": 1,
+        "config": made_of(OmegaConf.create({part: compose_part(part, name) for part, name in parts.items()})),
+    }
+    write_checkpoint(checkpoint, tmp_path / "step-1.ckpt")
+    assert load_model(tmp_path / "step-1.ckpt", "da3_tiny,head_chunk=2", device="cpu").weights.step == 1
+    with pytest.raises(ValueError, match=said):
+        load_model(tmp_path / "step-1.ckpt", f"da3_tiny,{option}", device="cpu")
 
 
 def test_weights_of_a_diverged_training_are_refused(run_folder: Path, tmp_path: Path) -> None:

@@ -180,6 +180,7 @@ REFUSED: list[tuple[list[str], str | None]] = [
     (["debug=fast_dev_run", "model.gaussians.max_offset=3"], None),
     (["debug=fast_dev_run", "ckpt=last", "backend.seed=1"], "trained on backbone"),
     (["ckpt=last", "backend.seed=1"], "trained on backbone"),
+    (["ckpt=last", "backend.taps=1"], r"step-4\.ckpt was trained with backend\.taps=4, here it is 1"),
     (["ckpt=last", "model.gaussians.splits=4"], r"first in model\.gaussians\.out"),
     (
         ["ckpt=last", "optimizer._target_=torch.optim.Adagrad", "~optimizer.betas", "trainer.max_steps=6"],

@@ -67,7 +67,8 @@ def make_coarse() -> Callable[..., CoarseModule]:
     def make(**options) -> CoarseModule:
         torch.manual_seed(0)
         defaults = {"ptv3": small_ptv3, "voxel_size": 0.125, "hidden": (16, 12), "fuse_channels": 16}
-        return CoarseModule(TOKEN_DIM, TAPS, PATCH, **{**defaults, **options})
+        defaults |= {"token_dims": [TOKEN_DIM] * TAPS, "patch_size": PATCH}
+        return CoarseModule(**{**defaults, **options})
 
     return make
 

@@ -32,6 +32,17 @@ def test_injection_changes_the_chosen_taps_and_never_the_camera(make_coarse, mak
         assert out.camera is tokens.camera
 
 
+@pytest.mark.parametrize("inject", ["all", "last"])
+def test_taps_may_differ_in_width(inject, make_coarse, make_room):
+    tokens, geometry, _ = make_room()
+    narrow = tokens.patch[0][..., :5]
+    tokens = tokens.with_patch((narrow, *tokens.patch[1:]))
+    out = perturb(make_coarse(token_dims=[tap.shape[-1] for tap in tokens.patch], inject=inject))(tokens, geometry)
+    assert [tap.shape for tap in out.patch] == [tap.shape for tap in tokens.patch]
+    assert torch.equal(out.patch[0], narrow) == (inject == "last")
+    assert not torch.equal(out.patch[-1], tokens.patch[-1])
+
+
 def test_last_layer_learns_at_step_one_and_ptv3_from_step_two(make_coarse, make_room):
     tokens, geometry, _ = make_room()
     module = make_coarse()

@@ -32,6 +32,7 @@ from vg2gt.metrics import LPIPS, WeightsNotFoundError, load_lpips
 from vg2gt.model import Reconstructor
 from vg2gt.runs.find import checkpoint_path
 from vg2gt.runs.load import TrainedWeights, build_model, choose_device, load_weights, resolve_parts
+from vg2gt.runs.lock import only_process_in
 
 log = logging.getLogger(__name__)
 
@@ -55,11 +56,17 @@ def evaluate(config: DictConfig) -> dict[str, Any]:
         The content of ``metrics.json``: ``settings``, and for every number of views ``mean`` and ``scenes``.
 
     Raises:
+        BlockingIOError: if another process works in the folder.
         FileExistsError: if the folder holds another evaluation.
         FileNotFoundError: if the checkpoint, its configuration or the data is missing.
         ValueError: if an option is wrong or the checkpoint does not fit.
     """
-    folder = Path(config.output_dir)
+    with only_process_in(config.output_dir):
+        return _evaluate(config, Path(config.output_dir))
+
+
+def _evaluate(config: DictConfig, folder: Path) -> dict[str, Any]:
+    """:func:`evaluate` in a folder that is this process's own."""
     counts = view_counts(config.views)
     options: EvaluationOptions = instantiate(config.evaluation, _convert_="all")
     checkpoint = checkpoint_path(config.ckpt)

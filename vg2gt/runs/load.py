@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
@@ -30,6 +30,8 @@ SHIPPED = Path(__file__).resolve().parents[1] / "weights" / "sweep-tiny.safetens
 PARTS = ("backend", "model", "renderer")
 FREE = ("path", "pretrained", "revision", "head_chunk", "views_per_chunk")
 """Keys that change nothing of what a network computes, or whose effect a checkpoint knows by the weights' hash."""
+TOKENS = ("taps", "reference_view", "given_poses")
+"""Keys of a backend that decide what the same weights make of images: a trained part fits one choice only."""
 
 
 @dataclass(frozen=True)
@@ -149,11 +151,41 @@ def resolve_parts(config: DictConfig, checkpoint: Path | None) -> dict[str, Dict
     """
     given: dict[str, Any] = {part: config.get(part) for part in PARTS}
     parts = {part: value for part, value in given.items() if value is not None and "_target_" in value}
+    if checkpoint is not None and "backend" in parts:
+        refuse_other_tokens(parts["backend"], read_checkpoint(checkpoint), checkpoint)
     missing = [part for part in PARTS if part not in parts]
     if not missing:
         return parts
     run = compose("train", "output_dir=.") if checkpoint is None else _config_of(checkpoint, missing)
     return parts | {part: OmegaConf.merge(run[part], given[part] or {}) for part in missing}  # pyright: ignore
+
+
+def refuse_other_tokens(backend: Any, checkpoint: Mapping[str, Any], path: Path) -> None:
+    """Refuses a backend that makes other tokens of images than the one a checkpoint was trained with.
+
+    Its weights' hash says nothing of :data:`TOKENS`. Checkpoints of old, which keep no configuration, pass.
+
+    Args:
+        backend: the backend's configuration.
+        checkpoint: the checkpoint's content.
+        path: the checkpoint's file, for the message.
+
+    Raises:
+        ValueError: naming the first key that differs.
+    """
+    text = checkpoint.get(MADE_OF)
+    if not isinstance(text, str):
+        return
+    stored = parse_run_config(text, f"{path}: {MADE_OF}").get("backend")
+    here, there = (flatten(OmegaConf.to_container(OmegaConf.create(part or {}))) for part in (backend, stored))
+    if here.get("_target_") != there.get("_target_"):
+        return  # another network, which the weights' hash tells; or the same one as an ONNX bundle
+    for key in sorted(here.keys() & there.keys()):
+        if key.rpartition(".")[2] in TOKENS and here[key] != there[key]:
+            raise ValueError(
+                f"{path} was trained with backend.{key}={there[key]}, here it is {here[key]}: choose the same, or "
+                "train anew from these weights with init_from="
+            )
 
 
 def made_of(config: DictConfig) -> str:

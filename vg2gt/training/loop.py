@@ -33,7 +33,7 @@ from vg2gt.runs.checkpoints import (
     refuse_not_finite,
     remove_leftovers,
 )
-from vg2gt.runs.load import made_of
+from vg2gt.runs.load import made_of, refuse_other_tokens
 from vg2gt.runs.lock import only_process_in
 from vg2gt.training.checkpoint_io import AtomicCheckpointIO
 from vg2gt.training.distributed import ending_together
@@ -175,6 +175,7 @@ def _train(config: DictConfig, writes: bool) -> dict[str, Any]:
     if checkpoint is not None:
         content = read_checkpoint(checkpoint)  # refused before anything is written
         refuse_not_finite(content["state_dict"], checkpoint)
+        refuse_other_tokens(config.backend, content, checkpoint)
         run.module.model.load_trained(model_state(content["state_dict"]), content.get("backend"))
         name_differences(config)
     elif config.init_from:

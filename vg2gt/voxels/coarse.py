@@ -37,8 +37,7 @@ class CoarseModule(nn.Module):
     valid point keeps its tokens.
 
     Args:
-        token_dim: width of the tapped patch tokens.
-        num_taps: number of tapped layers.
+        token_dims: width of each tapped layer, shallow to deep.
         patch_size: pixels per patch side, a multiple of ``upsample``.
         ptv3: makes the voxel network from ``in_channels``.
         voxel_size: edge length in scene units.
@@ -60,8 +59,7 @@ class CoarseModule(nn.Module):
 
     def __init__(
         self,
-        token_dim: int,
-        num_taps: int,
+        token_dims: Sequence[int],
         patch_size: int,
         ptv3: Callable[..., PTv3],
         voxel_size: float = 0.01,
@@ -89,8 +87,8 @@ class CoarseModule(nn.Module):
         self.neighbors = neighbors
         self.surface_evidence = surface_evidence
         self.embedding_skip = embedding_skip
-        layers: list[nn.Module] = [nn.LayerNorm(token_dim)]
-        for width_in, width_out in zip((token_dim, *hidden), hidden, strict=False):
+        layers: list[nn.Module] = [nn.LayerNorm(token_dims[-1])]
+        for width_in, width_out in zip((token_dims[-1], *hidden), hidden, strict=False):
             layers += [nn.Linear(width_in, width_out), nn.GELU()]
         self.embed = nn.Sequential(*layers)
         self.ptv3 = ptv3(in_channels=hidden[-1] + CENTROID_CHANNELS * surface_evidence + 1)
@@ -102,7 +100,7 @@ class CoarseModule(nn.Module):
             nn.GELU(),
         )
         self.zero = nn.ModuleList(
-            nn.Conv2d(fuse_channels, token_dim, 1) for _ in range(num_taps if inject == "all" else 1)
+            nn.Conv2d(fuse_channels, dim, 1) for dim in (token_dims if inject == "all" else token_dims[-1:])
         )
         for parameter in self.zero.parameters():
             nn.init.zeros_(parameter)
