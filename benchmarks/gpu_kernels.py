@@ -1,0 +1,229 @@
+"""Compiles every Triton kernel of the renderer for GPUs that need not be there: ``python benchmarks/gpu_kernels.py``.
+
+Renders small scenes with the kernels replaced by recorders, takes each launch's types and compile-time options from
+what was recorded, compiles it to machine code for the targets, and prints registers, shared memory, spills and the
+number of instructions. Triton's wheel carries the assembler; no GPU and no driver are needed. Writes a dated JSON file.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import tempfile
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import torch
+import triton  # pyright: ignore[reportMissingImports]
+from common import machine, parser, write_results
+from render_scene import room_cameras, room_gaussians
+from torch import Tensor
+from triton.backends.compiler import GPUTarget  # pyright: ignore[reportMissingImports]
+
+from vg2gt.evaluation.tables import print_table
+from vg2gt.rendering import Renderer
+from vg2gt.rendering.gpu import kernels
+
+TARGETS = {
+    "sm_80": GPUTarget("cuda", 80, 32),
+    "sm_90": GPUTarget("cuda", 90, 32),
+    "sm_100": GPUTarget("cuda", 100, 32),
+    "gfx942": GPUTarget("hip", "gfx942", 64),
+}
+NVIDIA = ("sm_80", "sm_90", "sm_100")
+TYPES = {
+    torch.float32: "*fp32",
+    torch.int32: "*i32",
+    torch.int64: "*i64",
+    torch.int16: "*i16",
+    torch.bool: "*i1",
+}
+Stub = Callable[..., None]
+
+
+@dataclass(frozen=True)
+class Launch:
+    """A launch as it was asked for.
+
+    Attributes:
+        kernel: name.
+        grid: programs.
+        arguments: by name, compile-time ones included.
+        options: such as ``num_warps``.
+    """
+
+    kernel: str
+    grid: tuple[int, ...]
+    arguments: dict[str, Any]
+    options: dict[str, Any]
+
+    @property
+    def signature(self) -> dict[str, str]:
+        """Types of the arguments as Triton takes them."""
+        return {name: _type(name, value, self.constants) for name, value in self.arguments.items()}
+
+    @property
+    def constants(self) -> dict[str, Any]:
+        """Compile-time arguments."""
+        names = {parameter.name for parameter in getattr(kernels, self.kernel).params if parameter.is_constexpr}
+        return {name: value for name, value in self.arguments.items() if name in names}
+
+    @property
+    def variant(self) -> str:
+        """The kernel and those compile-time options that make another kernel of it."""
+        chosen = [f"{name}={value}" for name, value in self.constants.items() if isinstance(value, bool | int)]
+        return " ".join([self.kernel.removesuffix("_kernel"), *chosen])
+
+
+@dataclass(frozen=True)
+class Compiled:
+    """What a kernel became.
+
+    Attributes:
+        variant: kernel and options.
+        target: such as ``sm_90``.
+        warps: per program.
+        registers: per thread.
+        shared: bytes per program.
+        spills: bytes of stores and loads of registers that did not fit, per thread.
+        instructions: of machine code, all paths.
+    """
+
+    variant: str
+    target: str
+    warps: int
+    registers: int
+    shared: int
+    spills: int
+    instructions: int
+
+
+def _type(name: str, value: Any, constants: dict[str, Any]) -> str:
+    if name in constants:
+        return "constexpr"
+    if isinstance(value, Tensor):
+        return TYPES[value.dtype]
+    return "i64" if isinstance(value, int) and abs(value) >= 1 << 31 else "i32"
+
+
+@contextmanager
+def recorded(stubs: dict[str, Stub] | None = None) -> Iterator[list[Launch]]:
+    """Inside the block kernels are not run but listed, and the renderer takes tensors on the CPU for them.
+
+    Args:
+        stubs: by kernel, what happens in its stead: called with the launch's arguments by name.
+    """
+    launches: list[Launch] = []
+
+    class Recorder:
+        def __init__(self, name: str) -> None:
+            self.name, self.names = name, getattr(kernels, name).arg_names
+
+        def __getitem__(self, grid: Sequence[int]) -> Callable[..., None]:
+            def launch(*arguments: Any, **options: Any) -> None:
+                named = dict(zip(self.names, arguments, strict=False))
+                named |= {name: options.pop(name) for name in self.names if name in options}
+                launches.append(Launch(self.name, tuple(grid), named, options))
+                if stubs and self.name in stubs:
+                    stubs[self.name](**named)
+
+            return launch
+
+    names = [name for name in vars(kernels) if name.endswith("_kernel")]
+    recorders = {name: Recorder(name) for name in names}
+    with mock.patch.multiple(kernels, **recorders), mock.patch.dict(os.environ, TRITON_INTERPRET="1"):
+        yield launches
+
+
+def variants() -> dict[str, Launch]:
+    """Every kernel in every form that rendering and its backward pass ask for, by its name and options."""
+    found: dict[str, Launch] = {}
+    for mode, geometry, degree in product(("solid", "rasterized"), (True, False), (0, 1, 2, 3)):
+        gaussians = room_gaussians(40, (16, 24))
+        sh = torch.zeros(len(gaussians), (degree + 1) ** 2, 3)
+        gaussians = replace(gaussians, sh=sh).map(lambda t: t.requires_grad_() if t.is_floating_point() else t)
+        cameras = room_cameras(2, (16, 24))
+        renderer = Renderer(mode=mode, geometry=geometry, implementation="triton")  # type: ignore[arg-type]
+        with recorded() as launches:
+            out = renderer(gaussians, cameras)
+            outputs = [out.color, out.depth, out.normal] if geometry else [out.color]
+            torch.autograd.backward(outputs, [torch.ones_like(image) for image in outputs])
+        found |= {launch.variant: launch for launch in launches}
+    return found
+
+
+def compile_for(launch: Launch, target: str) -> Compiled:
+    """Compiles a recorded launch to machine code and reads what it needs."""
+    source = _source(launch)
+    options = {"num_warps": 4, **launch.options}
+    warps = options["num_warps"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # on defaults that will change with a later Triton
+        made = triton.compile(source, target=TARGETS[target], options=options)
+    if TARGETS[target].backend == "hip":
+        return _amd(launch, target, warps, made)
+    registers, spills = _resources(made.asm["cubin"])
+    return Compiled(launch.variant, target, warps, registers, made.metadata.shared, spills, _count(made.asm["cubin"]))
+
+
+def _source(launch: Launch) -> Any:
+    signature = launch.signature
+    aligned = {
+        (index,): [["tt.divisibility", 16]] for index, kind in enumerate(signature.values()) if kind.startswith("*")
+    }
+    return triton.compiler.ASTSource(getattr(kernels, launch.kernel), signature, launch.constants, aligned)
+
+
+def _resources(cubin: bytes) -> tuple[int, int]:
+    """Registers and bytes of stack (which Triton's kernels have for spills only) of a program for Nvidia GPUs."""
+    said = _tool("cuobjdump", cubin, "-res-usage")
+    (registers,), (stack,), (local,) = (re.findall(rf"{word}:(\d+)", said) for word in ("REG", "STACK", "LOCAL"))
+    return int(registers), int(stack) + int(local)
+
+
+def _count(cubin: bytes) -> int:
+    return len(
+        re.findall(r"^\s+/\*[0-9a-f]{4,}\*/\s+(?!NOP|BRA `\(\.L_x_\d+\);\s*$)\S", _tool("nvdisasm", cubin), re.M)
+    )
+
+
+def _tool(name: str, cubin: bytes, *options: str) -> str:
+    program = getattr(triton.knobs.nvidia, name).path
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "kernel.cubin"
+        path.write_bytes(cubin)
+        return subprocess.run([program, *options, str(path)], check=True, capture_output=True, text=True).stdout
+
+
+def _amd(launch: Launch, target: str, warps: int, made: Any) -> Compiled:
+    text = made.asm["amdgcn"]
+
+    def value(name: str) -> int:
+        return int(re.findall(rf"\.{name}:\s+(\d+)", text)[0])
+
+    spills = 4 * value("vgpr_spill_count") + 4 * value("sgpr_spill_count")
+    instructions = len(re.findall(r"^\t[sv]_|^\t(?:ds|global|buffer|flat)_", text, re.M))
+    return Compiled(launch.variant, target, warps, value("vgpr_count"), made.metadata.shared, spills, instructions)
+
+
+def main() -> None:
+    """Compiles, prints and writes."""
+    options = parser(__doc__)
+    options.add_argument("--targets", nargs="+", choices=TARGETS, default=list(TARGETS))
+    arguments = options.parse_args()
+    found = [compile_for(launch, target) for launch in variants().values() for target in arguments.targets]
+    head = ["kernel", "target", "warps", "registers", "shared", "spilled bytes", "instructions"]
+    print_table(head, [[str(value) for value in asdict(row).values()] for row in found], text_columns=2, width=120)
+    rows = [asdict(row) for row in found]
+    write_results(arguments.out, "gpu-kernels", {"machine": machine(), "triton": triton.__version__, "kernels": rows})
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,61 @@
+"""The Triton kernels compile to machine code for GPUs of three generations, within registers and without spills."""
+
+import importlib
+import importlib.util
+import os
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+if importlib.util.find_spec("triton") is None:
+    pytest.skip("needs triton, which has wheels for Linux on x86-64 only", allow_module_level=True)
+if os.environ.get("TRITON_INTERPRET") == "1":
+    pytest.skip("the interpreter's kernels cannot be compiled", allow_module_level=True)
+
+BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
+NVIDIA = ("sm_80", "sm_90", "sm_100")
+# The most registers a thread may take, over all targets; none may spill. 1-warp programs of up to 64 registers fill all
+# 32 places of a multiprocessor, of up to 128 registers half of them.
+REGISTERS = {"blend": 80, "solve": 80, "backward": 96}
+SHORT = ("blend geometry=True solid=True", "backward geometry=True")
+
+
+@pytest.fixture
+def bench(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    return importlib.import_module("gpu_kernels")
+
+
+def hold(found: list) -> None:
+    for row in found:
+        print(row)
+        assert 16 <= row.registers <= REGISTERS[row.variant.split()[0]], row
+        assert row.spills == 0, row
+        assert row.shared <= 1024, row
+        assert row.instructions > 50, row
+
+
+def test_the_main_kernels_compile_for_a_gpu_that_is_not_there(bench: ModuleType) -> None:
+    launches = bench.variants()
+    hold([bench.compile_for(launches[name], "sm_90") for name in SHORT])
+
+
+@pytest.mark.slow
+def test_all_variants_compile_for_three_generations(bench: ModuleType) -> None:
+    launches = bench.variants()
+    assert {name.split()[0] for name in launches} == set(REGISTERS)
+    hold([bench.compile_for(launch, target) for launch in launches.values() for target in NVIDIA])
+
+
+@pytest.mark.slow
+def test_all_variants_compile_for_amd(bench: ModuleType) -> None:
+    rows = [bench.compile_for(launch, "gfx942") for launch in bench.variants().values()]
+    assert all(row.spills == 0 and 0 < row.registers <= 256 for row in rows), rows
+
+
+def test_a_kernel_that_needs_too_many_registers_is_noticed(bench: ModuleType) -> None:
+    """What the table is held against is read from the machine code: fewer registers allowed, and it spills."""
+    launch = bench.variants()[SHORT[1]]
+    tight = bench.replace(launch, options={**launch.options, "maxnreg": 32})
+    assert bench.compile_for(tight, "sm_90").spills > 0
