@@ -77,6 +77,11 @@ COMMANDS = {
         "draws training curves of one or several runs",
         "vg2gt curves outputs/quickstart",
     ),
+    "doctor": Command(
+        "vg2gt.cli.doctor:main",
+        "shows what this machine has, which renderer it gets, whether its kernels are right and how fast",
+        "vg2gt doctor --no-speed",
+    ),
 }
 
 DATA_COMMANDS = {

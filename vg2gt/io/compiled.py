@@ -55,6 +55,11 @@ def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     return compile_later
 
 
+def cache_folder() -> Path | None:
+    """Where this project keeps what it computed about a machine, compiled kernels above all; None if nowhere."""
+    return _writable_base()
+
+
 def _room(source: Path) -> Path:
     """The folder that a kernel of this file is made of."""
     rooms = [PACKAGES / room for room in ROOMS if source.resolve().is_relative_to(PACKAGES / room)]

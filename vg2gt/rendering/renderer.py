@@ -20,6 +20,7 @@ from vg2gt.rendering.cpu import rasterize_cpu
 from vg2gt.rendering.dense import rasterize_dense
 from vg2gt.rendering.options import Images, Mode, RenderOptions, SceneViews, check_choice
 from vg2gt.rendering.pairs import rasterize_pairs
+from vg2gt.rendering.selfcheck import trusted
 from vg2gt.types import Cameras, Gaussians, Render
 
 Implementation = Literal["auto", "torch", "dense", "cpu", "triton"]
@@ -51,7 +52,8 @@ class Renderer(RenderOptions):
 
     Attributes:
         implementation: ``cpu`` compiled tile renderer; ``triton`` the same for CUDA devices; ``torch`` sparse pairs on
-            any device; ``dense`` the slow reference; ``auto`` chooses ``cpu`` on CPU and ``torch`` elsewhere.
+            any device; ``dense`` the slow reference; ``auto`` chooses ``cpu`` on CPU, ``triton`` on CUDA devices on
+            which it was found to agree with the reference (:mod:`vg2gt.rendering.selfcheck`), ``torch`` elsewhere.
     """
 
     implementation: Implementation = "auto"
@@ -157,12 +159,20 @@ def _scene_views(gaussians: Gaussians, cameras: Cameras, scene: int, background:
 
 def _resolve(implementation: Implementation, device: torch.device) -> str:
     if implementation == "auto":
-        return "cpu" if device.type == "cpu" else "torch"
+        return automatic(device)
     if implementation == "cpu" and device.type != "cpu":
         raise ValueError(f"implementation 'cpu' needs tensors on the CPU, these are on {device}; use 'auto' or 'torch'")
     if implementation == "triton" and device.type != "cuda" and os.environ.get("TRITON_INTERPRET") != "1":
         raise ValueError(f"implementation 'triton' needs tensors on a CUDA device, these are on {device}; use 'auto'")
     return implementation
+
+
+def automatic(device: torch.device) -> str:
+    """The implementation that ``auto`` stands for on a device; on a CUDA device the kernels are checked once."""
+    if device.type == "cpu":
+        return "cpu"
+    can = device.type == "cuda" and importlib.util.find_spec("triton") is not None
+    return "triton" if can and trusted(render, device) else "torch"
 
 
 def _floats_to(dtype: torch.dtype) -> Callable[[Tensor], Tensor]:

@@ -1,0 +1,176 @@
+"""Whether a device's compiled kernels compute what the reference does: found out once, before they are relied on.
+
+A small fixed scene is rendered by the kernels on the device and by the dense reference in float64 on the CPU, values
+and gradients. What was found is kept for the same device, driver, versions and kernels.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import logging
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from vg2gt.geometry.rotations import quat_to_matrix
+from vg2gt.io.compiled import cache_folder
+from vg2gt.io.files import read_json, write_json
+from vg2gt.rendering.options import Mode
+from vg2gt.types import Cameras, Gaussians, Render
+
+log = logging.getLogger(__name__)
+
+RenderFunction = Callable[..., Render]
+
+VALUES = 5e-5  # the largest error that an image may have; float32 makes errors of about 2e-6
+GRADIENTS = 5e-4  # the largest error of a gradient as a share of its norm; float32: about 1e-6
+MODES: tuple[Mode, ...] = ("solid", "rasterized")
+COUNT, SIZE, VIEWS, DEGREE = 14, (9, 11), 2, 1
+KERNELS = Path(__file__).resolve().parent / "gpu"
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How far kernels are from the reference.
+
+    Attributes:
+        values: the largest absolute error of an image (depth in scene units, about 3 deep).
+        gradients: the largest error of an input's gradient over the gradient's norm.
+    """
+
+    values: float
+    gradients: float
+
+    @property
+    def good(self) -> bool:
+        """Whether the kernels can be relied on; NaN cannot."""
+        return self.values <= VALUES and self.gradients <= GRADIENTS
+
+    def __str__(self) -> str:
+        return f"values off by {self.values:.1e} (bound {VALUES:g}), gradients by {self.gradients:.1e} ({GRADIENTS:g})"
+
+
+def trusted(render: RenderFunction, device: torch.device) -> bool:
+    """Whether the Triton kernels may render on a device; says in one line why where they may not.
+
+    Args:
+        render: :func:`vg2gt.rendering.render`.
+        device: a CUDA or ROCm device.
+    """
+    return _trusted(render, identity(device), str(device))
+
+
+@lru_cache
+def _trusted(render: RenderFunction, found_on: str, device: str) -> bool:
+    agreement = known(found_on)
+    if agreement is None:
+        try:
+            agreement = compare(render, torch.device(device))
+        except Exception as error:  # whatever keeps the kernels from running, there is a renderer that does without
+            reason = " ".join(str(error).split()) or type(error).__name__
+            _refuse(f"do not run ({type(error).__name__}: {reason[:300]})", found_on)
+            return False
+        remember(found_on, agreement)
+    if not agreement.good:
+        _refuse(f"disagree with the reference: {agreement}", found_on)
+    return agreement.good
+
+
+def _refuse(why: str, found_on: str) -> None:
+    log.warning("the Triton kernels %s; rendering with 'torch', slower. Please report this line: %s", why, found_on)
+
+
+def identity(device: torch.device) -> str:
+    """What an agreement holds for: device, driver, versions of torch and Triton, and the kernels' sources."""
+    name, driver = device.type, ""
+    if device.type == "cuda":
+        name = torch.cuda.get_device_name(device)
+        version = getattr(torch._C, "_cuda_getDriverVersion", None)
+        driver = f"driver {version() if version else 'unknown'}, CUDA {torch.version.cuda or torch.version.hip}, "
+    with suppress(importlib.metadata.PackageNotFoundError):
+        driver += f"triton {importlib.metadata.version('triton')}, "
+    source = hashlib.sha256(b"".join(path.read_bytes() for path in sorted(KERNELS.glob("*.py"))))
+    return f"{name}, {driver}torch {torch.__version__}, kernels {source.hexdigest()[:12]}"
+
+
+def known(found_on: str) -> Agreement | None:
+    """What was found before; None if nothing was."""
+    with suppress(OSError, ValueError, TypeError, KeyError):
+        return Agreement(**read_json(_file())[found_on])
+    return None
+
+
+def remember(found_on: str, agreement: Agreement) -> None:
+    """Keeps what was found, where a folder can be written to."""
+    with suppress(OSError, TypeError):
+        before = {}
+        with suppress(OSError, ValueError):
+            before = read_json(_file())
+        write_json(_file(), {**before, found_on: asdict(agreement)})
+
+
+def _file() -> Path:
+    folder = cache_folder()
+    if folder is None:
+        raise OSError("no folder to keep it in")
+    return folder / "gpu_agreement.json"
+
+
+def compare(render: RenderFunction, device: torch.device, modes: tuple[Mode, ...] = MODES) -> Agreement:
+    """Renders the fixed scene with the kernels on ``device`` and with the reference; how far they are apart."""
+    worst = torch.zeros(2, dtype=torch.float64)
+    for mode in modes:
+        expected, expected_grads = _run(render, mode, torch.device("cpu"), torch.float64, "dense")
+        found, grads = _run(render, mode, device, torch.float32, "triton")
+        values = [(a - b).abs().max() for a, b in zip(found, expected, strict=True)]
+        relative = [(a - b).norm() / b.norm() for a, b in zip(grads, expected_grads, strict=True)]
+        worst = torch.maximum(worst, torch.stack((torch.stack(values).max(), torch.stack(relative).max())))
+    return Agreement(*worst.tolist())
+
+
+def _run(
+    render: RenderFunction, mode: Mode, device: torch.device, dtype: torch.dtype, implementation: str
+) -> tuple[list[Tensor], list[Tensor]]:
+    """All images and the gradients of a weighted sum of them in every input, in float64 on the CPU."""
+    inputs = [tensor.to(device, dtype).requires_grad_() for tensor in _scene()]
+    means, quats, scales, opacities, sh, poses, intrinsics, background = inputs
+    batch = torch.zeros(COUNT, dtype=torch.int64, device=device)
+    gaussians, cameras = Gaussians(means, quats, scales, opacities, sh, batch), Cameras(poses, intrinsics, SIZE)
+    out = render(gaussians, cameras, mode, background, implementation=implementation)
+    images = [out.color, out.depth, out.normal, out.alpha]
+    weights = [_numbers(image.numel(), 20 + index).view(image.shape) for index, image in enumerate(images)]
+    grads = torch.autograd.grad(images, inputs, [weight.to(device, dtype) for weight in weights])
+    return [image.detach().cpu().double() for image in images], [grad.cpu().double() for grad in grads]
+
+
+def _scene() -> tuple[Tensor, ...]:
+    """Means, quats, scales, opacities, sh, poses, intrinsics, background in float64: Gaussians of all kinds."""
+    height, width = SIZE
+    depth = 2.5 + 1.2 * _numbers(COUNT, 0)
+    sides = torch.stack((0.45 * _numbers(COUNT, 1), 0.3 * _numbers(COUNT, 2)), -1) * depth[:, None]
+    poses = torch.eye(4, dtype=torch.float64).repeat(VIEWS, 1, 1)
+    poses[1, :3, :3] = quat_to_matrix(torch.tensor([1.0, 0.04, -0.05, 0.03], dtype=torch.float64))
+    poses[1, :3, 3] = torch.tensor([0.25, -0.15, 0.2])
+    focal = torch.tensor([[20.0, 0, width / 2], [0, 19.0, height / 2], [0, 0, 1]], dtype=torch.float64)
+    return (
+        torch.cat((sides, depth[:, None]), -1),
+        _numbers(4 * COUNT, 3).view(COUNT, 4) + torch.tensor([0.2, 0, 0, 0], dtype=torch.float64),
+        0.35 * torch.exp(0.7 * _numbers(3 * COUNT, 4)).view(COUNT, 3),
+        (0.8 + 0.6 * _numbers(COUNT, 5)).clamp(max=1.0),
+        0.6 * _numbers(COUNT * (DEGREE + 1) ** 2 * 3, 6).view(COUNT, -1, 3),
+        poses[None],
+        focal.expand(1, VIEWS, 3, 3).clone(),
+        torch.tensor([0.3, 0.1, 0.7], dtype=torch.float64),
+    )
+
+
+def _numbers(count: int, stream: int) -> Tensor:
+    """Numbers in [-1, 1) that look random and are the same everywhere, whatever torch's generators do."""
+    steps = torch.arange(1, count + 1, dtype=torch.float64) + 1000 * stream
+    return 2 * torch.frac(steps * 0.6180339887498949 + torch.frac(steps * steps * 0.4142135623730951)) - 1
