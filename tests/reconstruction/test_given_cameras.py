@@ -8,7 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
+from tests.data.sources.layout_phone import write_polycam
+from tests.data.sources.layouts import room
 from tests.reconstruction.stand_in import PlaneAhead
 from vg2gt.cli import reconstruct as reconstruct_command
 from vg2gt.geometry.cameras import resize_intrinsics, unproject
@@ -246,3 +249,20 @@ def test_without_pycolmap_one_line_names_the_extra(model, photos: Path, tmp_path
         reconstruct_command.main(
             [str(photos), "--backend", STAND_IN, "--poses", "sfm", "--out", str(tmp_path / "out"), "--quiet"]
         )
+
+
+@pytest.mark.parametrize("needed", [False, True])
+def test_a_phones_export_is_read_at_the_size_of_its_photographs(needed: bool, tmp_path: Path) -> None:
+    """Its depth is coarser, and brings the photographs down where a backend needs it."""
+    frames = room(2)
+    write_polycam(tmp_path, frames)
+    for path in (tmp_path / "kitchen" / "keyframes" / "depth").iterdir():
+        with Image.open(path) as image:
+            coarse = np.array(image)[::2, ::2]
+        Image.fromarray(coarse).save(path)
+    pictures = given_pictures([tmp_path / "kitchen"], depth=needed)
+    assert pictures is not None
+    assert [picture.size for picture in pictures] == [(15, 20) if needed else (30, 40)] * 2
+    loaded = pictures[1].read((30, 40))
+    assert bool(loaded.depth.any()) == needed
+    torch.testing.assert_close(loaded.world_to_camera[0], frames.world_to_camera[1], atol=1e-6, rtol=0)

@@ -20,6 +20,7 @@ import io
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from fractions import Fraction
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -87,6 +88,43 @@ def read_video(path: str | Path, every: int = 1) -> Iterator[tuple[int, NDArray[
                 yield number, _upright(frame)
         if number < 0:
             raise FormatError(f"{path}: no frame of it can be decoded; it is truncated or damaged")
+
+
+def read_frame(path: str | Path, number: int) -> NDArray[np.uint8]:
+    """Decodes one frame ``[H, W, 3]`` of a video, from the last frame before it that stands for itself.
+
+    Raises:
+        FormatError: if the file cannot be read or has no such frame.
+        MissingDecoderError: if there is no PyAV.
+    """
+    path = _existing(path)
+    times = _frame_times(path, path.stat().st_mtime_ns)
+    if not 0 <= number < len(times):
+        raise FormatError(f"{path} has {len(times)} frames, none of number {number}")
+    with _opened(path) as container:
+        container.seek(times[number], stream=container.streams.video[0])
+        for frame in _decoded(container):
+            if frame.pts == times[number]:
+                return _upright(frame)
+    raise FormatError(f"{path}: frame {number} cannot be decoded; the file is damaged")
+
+
+def video_size(path: str | Path) -> tuple[int, int]:
+    """``(height, width)`` of a video's first frame, turned upright as the file says.
+
+    Raises:
+        FormatError: if the file cannot be read.
+        MissingDecoderError: if there is no PyAV.
+    """
+    height, width = read_frame(path, 0).shape[:2]
+    return height, width
+
+
+@lru_cache(maxsize=8)
+def _frame_times(path: Path, state: int) -> list[int]:
+    """Presentation times of all frames in their order; ``state`` changes when the file does."""
+    with _opened(path) as container:
+        return sorted(packet.pts for packet in container.demux(video=0) if packet.size and packet.pts is not None)
 
 
 def write_video(path: str | Path, frames: Sequence[NDArray[np.uint8]], fps: float = 24.0) -> Path:

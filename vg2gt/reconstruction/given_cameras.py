@@ -14,6 +14,7 @@ from vg2gt.data.base import DataError, Frames
 from vg2gt.data.sources.colmap_model import COLMAP, model_folder_of
 from vg2gt.data.sources.files import FileSource
 from vg2gt.data.sources.nerfstudio import Nerfstudio
+from vg2gt.data.sources.phone import app_of
 from vg2gt.data.sources.rgbd import RGBDFolder
 from vg2gt.geometry.cameras import resize_intrinsics
 from vg2gt.io.cameras_json import NamedCamera, read_cameras_json
@@ -119,6 +120,8 @@ def _source(folder: Path, images: str, depth: bool) -> FileSource | None:
             return Nerfstudio(str(folder), depth=with_depth)
     if not depth and model_folder_of(folder) is not None:
         return COLMAP(str(folder), images=images)
+    if app_of(folder) is not None:  # colour at its full size where depth is not needed: a phone's is coarse
+        return RGBDFolder(str(folder), holdout=None, depth=depth)
     if (folder / "depth").is_dir() or any(folder.glob("frame-*.color.*")):
         return RGBDFolder(str(folder), holdout=None)
     if not depth and ((folder / "poses.txt").is_file() or (folder / "pose").is_dir() or (folder / "poses").is_dir()):

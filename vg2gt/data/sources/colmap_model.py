@@ -14,6 +14,7 @@ from vg2gt.data.base import DataError
 from vg2gt.data.sources.files import FileSource, HoldoutOptions
 from vg2gt.data.sources.index import SceneIndex, make_index
 from vg2gt.data.sources.parsing import errors_name, named_file, to_world
+from vg2gt.data.sources.sparse_points import SparsePoints, in_order
 from vg2gt.geometry.cameras import resize_intrinsics
 from vg2gt.io import ColmapImage, ColmapModel, colmap_intrinsics, colmap_pose, read_colmap
 from vg2gt.io.image_files import Size, image_size
@@ -21,8 +22,6 @@ from vg2gt.io.image_files import Size, image_size
 _MODELS = ("sparse/0", "sparse")
 _FILES = ("cameras.bin", "cameras.txt")
 _SCENES_IN_MEMORY = 16
-MIN_TRACK = 3
-"""Views that must see a point before its depth counts: two are not enough to notice a wrong match."""
 
 
 class COLMAP(FileSource):
@@ -36,13 +35,14 @@ class COLMAP(FileSource):
         root: a scene, a folder of scenes (one or two levels deep), or a list of such folders.
         images: name of the image folder. Images of another size than the cameras' are taken for resized ones, such as
             ``images_4``, and the intrinsics are resized with them.
-        depth: ``points``: depth at the model's points, in the views that saw them and in at least three views; null:
-            none.
+        depth: ``points``: depth at the model's points in the views that saw them, without likely outliers
+            (``SparsePoints``); null: none.
         shared: see ``FileSource``.
     """
 
     layout = "a COLMAP model in sparse/0 or sparse and its undistorted images/, there or up to two folders deeper"
     names_are_paths = True
+    index_version = 3
     index_options = ("images", "has_depth")
     sparse_depth = True
     is_metric = False
@@ -58,8 +58,8 @@ class COLMAP(FileSource):
             raise ValueError(f"depth must be points (at the model's points) or null (none), got {depth!r}")
         self.images = images
         self.has_depth = depth is not None
-        self._points: dict[str, _Points] = {}
-        self._all_points: dict[str, _Points] = {}
+        self._points: dict[str, SparsePoints] = {}
+        self._all_points: dict[str, SparsePoints] = {}
         super().__init__(root, **shared)
 
     def is_scene(self, folder: Path) -> bool:
@@ -74,7 +74,7 @@ class COLMAP(FileSource):
         """Reads the model and the sizes of its images."""
         model, model_folder = self._read_model(scene, folder)
         refuse_distorted(model, f"{model_folder} (scene {scene})")
-        records = _in_order(model)
+        records = in_order(model)
         where = f"{model_folder} of scene {scene}"
         named = {i: named_file(folder / self.images, record.name, where) for i, record in enumerate(records)}
         with errors_name(scene):
@@ -106,14 +106,14 @@ class COLMAP(FileSource):
     def point_depths(self, scene: str, frame: int) -> NDArray[np.float32]:
         """``[n]`` positive z-depth of all points that a frame's image saw, however many others did."""
         if scene not in self._all_points:
-            self._all_points = {scene: _Points(self._read_model(scene, self._folders[scene])[0], min_track=1)}
+            self._all_points = {scene: SparsePoints(self._read_model(scene, self._folders[scene])[0], sound=False)}
         return self._all_points[scene].depth(frame)
 
-    def _scene_points(self, scene: str, folder: Path) -> _Points:
+    def _scene_points(self, scene: str, folder: Path) -> SparsePoints:
         if scene not in self._points:
             if len(self._points) >= _SCENES_IN_MEMORY:
                 self._points.clear()
-            self._points[scene] = _Points(self._read_model(scene, folder)[0])
+            self._points[scene] = SparsePoints(self._read_model(scene, folder)[0])
         return self._points[scene]
 
     def _read_model(self, scene: str, folder: Path) -> tuple[ColmapModel, Path]:
@@ -124,42 +124,10 @@ class COLMAP(FileSource):
             return read_colmap(model_folder), model_folder
 
 
-class _Points:
-    """The points that each view saw, by frame number: where in the image, as a part of its size, and how deep."""
-
-    def __init__(self, model: ColmapModel, min_track: int = MIN_TRACK) -> None:
-        used = (model.points.track_lengths >= min_track) & (np.abs(model.points.positions) < 1e30).all(1)
-        order = np.argsort(model.points.ids)
-        self._views: list[tuple[NDArray[np.float64], NDArray[np.float32]]] = []
-        for record in _in_order(model):
-            camera, pose = model.cameras[record.camera_id], colmap_pose(record)
-            row = np.searchsorted(model.points.ids, record.point3d_ids, sorter=order).clip(max=len(order) - 1)
-            known = np.zeros(len(row), bool)
-            if len(order):
-                known = (model.points.ids[order[row]] == record.point3d_ids) & used[order[row]]
-            positions = model.points.positions[order[row[known]]]
-            z = positions @ pose[2, :3] + pose[2, 3]
-            place = record.points2d[known] / (camera.width, camera.height)
-            good = (z > 1e-6) & (z < 1e30) & (place >= 0).all(1) & (place < 1).all(1)
-            self._views.append((place[good], z[good].astype(np.float32)))
-
-    def places(self, frame: int) -> NDArray[np.float64]:
-        """``[n, 2]`` (x, y) in [0, 1)."""
-        return self._views[frame][0]
-
-    def depth(self, frame: int) -> NDArray[np.float32]:
-        """``[n]`` positive z-depth."""
-        return self._views[frame][1]
-
-
 def model_folder_of(folder: Path) -> Path | None:
     """The folder of a scene's model, if it has one."""
     inside = [folder / name for name in _MODELS]
     return next((place for place in inside if any((place / name).is_file() for name in _FILES)), None)
-
-
-def _in_order(model: ColmapModel) -> list[ColmapImage]:
-    return sorted(model.images.values(), key=lambda image: image.name)
 
 
 def refuse_distorted(model: ColmapModel, where: str) -> None:

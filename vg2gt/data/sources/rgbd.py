@@ -6,6 +6,7 @@ Layouts, told apart by what is there:
   numbers per line, in the order of the images; others: ``rgbd_cameras``) or one text file per frame in ``pose/`` or
   ``poses/``, intrinsics in ``K.txt`` (3x3) or in ``intrinsic/intrinsic_{color,depth}.txt`` (4x4, as ScanNet is
   exported); so also recordings of Open3D and Redwood (``trajectory.log``, ``camera_intrinsic.json``) and ICL-NUIM;
+* exports of Record3D, Polycam and Stray Scanner: see ``phone``;
 * 7-Scenes: ``frame-NNNNNN.{color.png|jpg,depth.png,pose.txt}`` in one folder, intrinsics in ``camera-intrinsics.txt``.
 
 Poses are camera-to-world, OpenCV, metres. Without depth the unit may be any.
@@ -30,12 +31,14 @@ from vg2gt.data.sources.files import FileOptions, FileSource
 from vg2gt.data.sources.index import SceneIndex, check_found, first_size, make_index
 from vg2gt.data.sources.parsing import (
     check_intrinsics,
+    errors_name,
     four_intrinsics,
     numbered,
     pinhole,
     positive,
     read_poses,
 )
+from vg2gt.data.sources.phone import EXR, VIDEO, PhoneExport, app_of, confidence_of, read_export
 from vg2gt.data.sources.rgbd_cameras import (
     INTRINSICS_FILES,
     POSE_FILES,
@@ -46,7 +49,9 @@ from vg2gt.data.sources.rgbd_cameras import (
 )
 from vg2gt.data.sources.scannet import room_of_scan
 from vg2gt.geometry.cameras import resize_intrinsics
-from vg2gt.io.image_files import Size
+from vg2gt.io.exr import read_exr
+from vg2gt.io.image_files import Size, check_size, read_depth
+from vg2gt.io.video import read_frame
 
 log = logging.getLogger(__name__)
 
@@ -84,7 +89,8 @@ class RGBDFolder(FileSource):
 
     layout = (
         "images/, color/, rgb/ or image/ with depth/, poses.txt and K.txt, or frame-*.color.png with "
-        "frame-*.depth.png, there or up to two folders deeper"
+        "frame-*.depth.png, or an export of Record3D (EXR + JPG), Polycam (raw data) or Stray Scanner, there or up to "
+        "two folders deeper"
     )
     names_are_paths = True
     index_options = ("intrinsics", "has_depth")
@@ -108,6 +114,8 @@ class RGBDFolder(FileSource):
 
     def is_scene(self, folder: Path) -> bool:
         """Whether it has colour and depth in one of the layouts, or, where depth is not asked for, poses."""
+        if app_of(folder) is not None:
+            return True
         if not self.has_depth:
             return (folder / "poses.txt").is_file() or any((folder / name).is_dir() for name in _POSE_FOLDERS)
         in_folders = (folder / "depth").is_dir() and any((folder / name).is_dir() for name in _COLOR_FOLDERS)
@@ -122,10 +130,13 @@ class RGBDFolder(FileSource):
 
     def watched(self, scene: str, folder: Path) -> Sequence[Path | None]:
         """Also the intrinsics, which lie deeper or beside the recording."""
-        return folder, *_exported_intrinsics(folder), *_beside(folder.parent)
+        return folder, *_exported_intrinsics(folder), *_beside(folder.parent), folder / "keyframes"
 
     def index(self, scene: str, folder: Path) -> SceneIndex:
         """Lists a recording's files and reads its poses and intrinsics."""
+        export = read_export(folder, scene)
+        if export is not None:
+            return self._index_of_export(export, folder, scene)
         in_folders = (folder / "depth").is_dir() or not self.has_depth
         files = _files_in_folders(folder, scene) if in_folders else _files_of_seven_scenes(folder, scene)
         check_found(scene, folder, {"colour images": files.color})
@@ -154,6 +165,45 @@ class RGBDFolder(FileSource):
             larger = f"{color_size[1]}x{color_size[0]}"
             _say(f"scene {scene}: colour of {larger} is reduced to the depth's {size}", logging.WARNING)
         return index
+
+    def read_color(self, index: SceneIndex, row: int) -> NDArray[np.uint8]:
+        """Decodes a colour image, or a frame of a video."""
+        path = index.color[row]
+        if path.name != VIDEO:
+            return super().read_color(index, row)
+        with errors_name(index.name):
+            pixels = read_frame(path, index.frame_ids[row])
+        check_size(path, index.name, pixels.shape[:2], index.color_size)
+        return pixels
+
+    def read_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
+        """Decodes depth; of EXR in metres, of whole numbers in ``depth_scale``, without what has no confidence."""
+        path = index.depth[row]
+        if path.suffix.lower() == EXR:
+            with errors_name(index.name):
+                depth = read_exr(path)
+            check_size(path, index.name, depth.shape, size)
+            return np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
+        depth = super().read_depth(index, row, size)
+        confidence = confidence_of(path)
+        return depth if confidence is None else depth * (read_depth(confidence, index.name, size) > 0)
+
+    def _index_of_export(self, export: PhoneExport, folder: Path, scene: str) -> SceneIndex:
+        """The index of what an app has exported; frames have the depth's size."""
+        check_found(scene, folder, {"colour images": export.color})
+        depth = export.depth if self.has_depth else None
+        if depth is not None:
+            check_found(scene, folder, {"depth images": depth})
+        size = export.color_size if depth is None else export.depth_size(scene)
+        scale = (size[1] / export.color_size[1], size[0] / export.color_size[0])
+        intrinsics = export.intrinsics
+        if self.intrinsics is not None:
+            intrinsics = dict.fromkeys(export.color, pinhole(*self.intrinsics))
+        resized = {i: resize_intrinsics(torch.from_numpy(m), *scale).numpy() for i, m in intrinsics.items()}
+        _say(f"scene {scene}: export of {export.app} in {folder}, {len(export.color)} frames of {size[1]}x{size[0]}")
+        return make_index(
+            scene, folder, export.color, depth, export.poses, resized, export.color_size, size=size, depth_size=size
+        )
 
     def _depth_intrinsics(
         self, files: Sequence[Path], folder: Path, scene: str, color: Size, depth: Size

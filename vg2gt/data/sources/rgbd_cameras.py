@@ -53,7 +53,7 @@ def read_pose_list(path: Path, scene: str, frames: Sequence[int]) -> dict[int, N
             f"{', '.join(f'{count}: {text}' for count, text in list(_COLUMNS.items())[1:])}) for each of the "
             f"{len(frames)} images; it has {len(rows)} lines of {rows.shape[1]}"
         )
-    return dict(zip(frames, _matrices(rows), strict=True))
+    return dict(zip(frames, pose_matrices(rows), strict=True))
 
 
 def read_camera(path: Path, scene: str) -> tuple[NDArray[np.float64], bool]:
@@ -80,7 +80,11 @@ def mirrored(poses: dict[int, NDArray[np.float64]]) -> dict[int, NDArray[np.floa
     return {frame: _MIRROR @ pose @ _MIRROR for frame, pose in poses.items()}
 
 
-def _matrices(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+def pose_matrices(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Poses ``[n, 4, 4]`` of rows: a 4x4 or 3x4 matrix, or x y z qx qy qz qw, perhaps after a time.
+
+    A quaternion that is none gives a pose that is not finite.
+    """
     count = rows.shape[1]
     if count == 16:
         return rows.reshape(-1, 4, 4)

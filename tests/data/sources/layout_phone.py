@@ -1,0 +1,88 @@
+"""Exports of capture apps: Record3D, Polycam, Stray Scanner."""
+
+import csv
+import importlib.util
+import json
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from vg2gt.data import Frames, RGBDFolder
+from vg2gt.io import write_video
+
+from .layouts import SIZE, Layout, camera_of, camera_to_world, pixels, save
+
+OPENGL = np.diag([1.0, -1, -1, 1])
+CORNER = np.array([0, 0, 0.5, 0.5])  # from the middle of the first pixel to its corner
+
+
+def _millimetres(frames: Frames) -> np.ndarray:
+    return (frames.depth.numpy() * 1000 + 0.5).astype(np.uint16)
+
+
+def write_record3d(root: Path, frames: Frames, per_frame: bool = False) -> None:
+    """``EXR + JPG``; one channel of float32, named as the first renderer at hand would name it."""
+    import OpenEXR
+
+    folder = root / "sofa" / "EXR_RGBD"
+    for sub in ("rgb", "depth"):
+        (folder / sub).mkdir(parents=True)
+    poses = []
+    header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
+    for i, pose in enumerate(camera_to_world(frames) @ OPENGL):
+        save(folder / "rgb" / f"{i}.jpg", pixels(frames)[i])
+        depth = np.ascontiguousarray(frames.depth[i].numpy())
+        OpenEXR.File(header, {"R": depth}).write(str(folder / "depth" / f"{i}.exr"))
+        poses.append([*Rotation.from_matrix(pose[:3, :3]).as_quat(), *pose[:3, 3]])
+    fx, fy, cx, cy = camera_of(frames) + CORNER
+    content = {"w": SIZE[1], "h": SIZE[0], "poses": poses, "K": [fx, 0, 0, 0, fy, 0, cx, cy, 1], "fps": 60}
+    if per_frame:
+        content |= {"K": [1.0, 0, 0, 0, 1, 0, 0, 0, 1], "perFrameIntrinsicCoeffs": [[fx, fy, cx, cy]] * len(poses)}
+    (folder / "metadata.json").write_text(json.dumps(content))
+
+
+def write_polycam(root: Path, frames: Frames, corrected: bool = True) -> None:
+    """Raw data; what is there before the app's own optimisation is another camera."""
+    folder = root / "kitchen" / "keyframes"
+    for i, pose in enumerate(camera_to_world(frames) @ OPENGL):
+        name = str(1667263848031 + 33 * i)
+        fx, fy, cx, cy = camera_of(frames) + CORNER
+        camera = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "width": SIZE[1], "height": SIZE[0], "blur_score": 80.5}
+        camera |= {f"t_{row}{column}": pose[row, column] for row in range(3) for column in range(4)}
+        before = "corrected_" if corrected else ""
+        save(folder / f"{before}images" / f"{name}.jpg", pixels(frames)[i])
+        save(folder / "depth" / f"{name}.png", _millimetres(frames)[i])
+        for kind in {"cameras", f"{before}cameras"}:
+            (folder / kind).mkdir(exist_ok=True)
+            other = {"t_03": 0.0} if corrected and kind == "cameras" else {}
+            (folder / kind / f"{name}.json").write_text(json.dumps(camera | other))
+
+
+def write_stray(root: Path, frames: Frames) -> None:
+    """A video, and depth beside it."""
+    folder = root / "71de12f9"
+    folder.mkdir(parents=True)
+    write_video(folder / "rgb.mp4", list(pixels(frames)), fps=30)
+    rows = [["timestamp", " frame", " x", " y", " z", " qx", " qy", " qz", " qw"]]
+    for i, pose in enumerate(camera_to_world(frames)):
+        save(folder / "depth" / f"{i:06d}.png", _millimetres(frames)[i])
+        quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat()
+        rows.append([f"{i / 30:.4f}", f" {i:06d}", *map(repr, [*pose[:3, 3].tolist(), *quaternion.tolist()])])
+    with open(folder / "odometry.csv", "w", newline="") as file:
+        csv.writer(file).writerows(rows)
+    fx, fy, cx, cy = camera_of(frames) + CORNER
+    np.savetxt(folder / "camera_matrix.csv", [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], delimiter=",", fmt="%.17g")
+
+
+def _read(root: Path) -> RGBDFolder:
+    return RGBDFolder(str(root), holdout=None)
+
+
+POLYCAM_IDS = tuple(1667263848031 + 33 * i for i in range(6))
+LAYOUTS = {
+    "polycam": Layout(write_polycam, _read, image_error=0.012, frame_ids=POLYCAM_IDS),
+    "stray_scanner": Layout(write_stray, _read, image_error=0.03),
+}
+if importlib.util.find_spec("OpenEXR"):
+    LAYOUTS["record3d"] = Layout(write_record3d, _read, image_error=0.012, depth_quantum=1e-6)

@@ -1,0 +1,212 @@
+"""What capture apps of iPhones and iPads export: Record3D, Polycam, Stray Scanner.
+
+Told apart by what is there:
+
+* Record3D, exported as *EXR + JPG*: ``metadata.json``, ``rgb/N.jpg``, ``depth/N.exr`` (metres);
+* Polycam, *raw data*: ``keyframes/images/N.jpg``, ``keyframes/cameras/N.json``, ``keyframes/depth/N.png`` (mm); where
+  it has optimised its cameras, ``corrected_images/`` and ``corrected_cameras/``;
+* Stray Scanner: ``rgb.mp4``, ``depth/N.png`` (mm), ``odometry.csv``, ``camera_matrix.csv``.
+
+All are metric. Depth is coarser than colour; ``confidence/N.png`` says where it is not to be trusted (0). Principal
+points count from the images' corner, as ARKit's do.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vg2gt.data.sources.parsing import CORNER_TO_CENTER, errors_name, numbered, pinhole
+from vg2gt.data.sources.rgbd_cameras import pose_file_of, pose_matrices
+from vg2gt.io.errors import FormatError
+from vg2gt.io.exr import read_exr
+from vg2gt.io.files import regular
+from vg2gt.io.image_files import Size, image_size
+from vg2gt.io.json_checks import load_json
+from vg2gt.io.video import video_size
+
+EXR = ".exr"
+VIDEO = "rgb.mp4"
+RECORD3D, POLYCAM, STRAY = "Record3D", "Polycam", "Stray Scanner"
+_LARGEST = 1e9  # of what is a number of pixels, metres or frames
+_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # camera axes of ARKit to OpenCV's
+
+
+@dataclass(frozen=True)
+class PhoneExport:
+    """What an export consists of, by frame number.
+
+    Attributes:
+        app: that wrote it.
+        color: colour image files; of Stray Scanner always the video.
+        depth: depth files.
+        poses: ``[4, 4]`` camera-to-world, OpenCV, metres.
+        intrinsics: ``[3, 3]`` of the colour images, integer pixel centres.
+        color_size: ``(height, width)``.
+    """
+
+    app: str
+    color: Mapping[int, Path]
+    depth: Mapping[int, Path]
+    poses: Mapping[int, NDArray[np.float64]]
+    intrinsics: Mapping[int, NDArray[np.float64]]
+    color_size: Size
+
+    def depth_size(self, scene: str) -> Size:
+        """``(height, width)`` of the first depth file.
+
+        Raises:
+            DataError: if it cannot be read.
+            ImportError: if it takes a package that is not installed.
+        """
+        path = next(iter(self.depth.values()))
+        if path.suffix.lower() != EXR:
+            return image_size(path, scene)
+        with errors_name(scene):
+            height, width = read_exr(path).shape
+        return height, width
+
+
+def app_of(folder: Path) -> str | None:
+    """The app whose export a folder is; None if of none."""
+    own_poses = pose_file_of(folder) is not None or (folder / "pose").is_dir() or (folder / "poses").is_dir()
+    if (folder / "metadata.json").is_file() and (folder / "rgb").is_dir() and not own_poses:
+        return RECORD3D
+    if (folder / "keyframes" / "cameras").is_dir():
+        return POLYCAM
+    return STRAY if (folder / "odometry.csv").is_file() and (folder / VIDEO).is_file() else None
+
+
+def read_export(folder: Path, scene: str) -> PhoneExport | None:
+    """Lists an export's files and reads its cameras; None if the folder is no export of an app.
+
+    Raises:
+        DataError: if it is damaged.
+        ImportError: if a video is read and PyAV is not installed.
+    """
+    readers = {RECORD3D: _read_record3d, POLYCAM: _read_polycam, STRAY: _read_stray}
+    app = app_of(folder)
+    with errors_name(scene):
+        return readers[app](folder, scene) if app is not None else None
+
+
+def confidence_of(depth: Path) -> Path | None:
+    """The confidence beside a depth image, if there is any."""
+    path = depth.parent.parent / "confidence" / depth.name
+    return path if path.is_file() else None
+
+
+def _read_record3d(folder: Path, scene: str) -> PhoneExport:
+    """``poses`` are lists of qx qy qz qw x y z; ``K`` goes column by column; newer files have one for every frame."""
+    path = folder / "metadata.json"
+    content = load_json(path)
+    rows = _numbers(path, content, "poses", 7)
+    if isinstance(content.get("perFrameIntrinsicCoeffs"), list) and content["perFrameIntrinsicCoeffs"]:
+        cameras = [pinhole(*row) for row in _numbers(path, content, "perFrameIntrinsicCoeffs", 4)]
+    else:
+        cameras = [_numbers(path, {"K": [content.get("K")]}, "K", 9)[0].reshape(3, 3).T] * len(rows)
+    if len(cameras) != len(rows):
+        raise FormatError(f"{path} has {len(rows)} poses, but intrinsics of {len(cameras)} frames")
+    color, depth = numbered(folder / "rgb", scene), numbered(folder / "depth", scene, suffixes=(EXR,))
+    size = image_size(next(iter(color.values())), scene) if color else (0, 0)
+    said = _numbers(path, {"size": [[content.get("h"), content.get("w")]]}, "size", 2)[0]
+    if not ((said > 0) & (said < _LARGEST)).all():
+        raise FormatError(f"{path}: h and w must be the images' size, got {said[0]:g} and {said[1]:g}")
+    if color and not np.isclose(said[0] * size[1], said[1] * size[0], rtol=0.02):
+        raise FormatError(f"{path} says {said[1]:g}x{said[0]:g} pixels, but the images are {size[1]}x{size[0]}")
+    scale = np.diag([size[1] / said[1], size[0] / said[0], 1.0])
+    return PhoneExport(
+        RECORD3D,
+        color,
+        depth,
+        poses={i: pose @ _OPENGL for i, pose in enumerate(pose_matrices(rows[:, [4, 5, 6, 0, 1, 2, 3]]))},
+        intrinsics={i: scale @ camera - CORNER_TO_CENTER for i, camera in enumerate(cameras)},
+        color_size=size,
+    )
+
+
+def _read_polycam(folder: Path, scene: str) -> PhoneExport:
+    """A file for every camera: ``fx fy cx cy width height`` and the rows of its pose, ``t_00`` to ``t_23``."""
+    inside = folder / "keyframes"
+    corrected = (inside / "corrected_cameras").is_dir() and (inside / "corrected_images").is_dir()
+    before = "corrected_" if corrected else ""
+    color = numbered(inside / f"{before}images", scene)
+    depth = numbered(inside / "depth", scene)
+    poses, intrinsics = {}, {}
+    for frame, path in numbered(inside / f"{before}cameras", scene, suffixes=(".json",)).items():
+        content = load_json(path)
+        names = [f"t_{row}{column}" for row in range(3) for column in range(4)]
+        pose = np.eye(4)
+        pose = np.eye(4)
+        pose[:3] = _fields(path, content, names).reshape(3, 4)
+        poses[frame] = pose @ _OPENGL
+        intrinsics[frame] = pinhole(*_fields(path, content, ["fx", "fy", "cx", "cy"])) - CORNER_TO_CENTER
+    size = image_size(next(iter(color.values())), scene) if color else (0, 0)
+    return PhoneExport(POLYCAM, color, depth, poses, intrinsics, size)
+
+
+def _read_stray(folder: Path, scene: str) -> PhoneExport:
+    """``odometry.csv``: a header, then timestamp, frame, x, y, z, qx, qy, qz, qw of cameras with OpenCV's axes."""
+    path = folder / "odometry.csv"
+    rows = _table(path)
+    header = [name.strip() for name in rows[0]]
+    wanted = ["frame", "x", "y", "z", "qx", "qy", "qz", "qw"]
+    if not set(wanted) <= set(header):
+        raise FormatError(f"{path}: expected columns {', '.join(wanted)}, found {', '.join(header)}")
+    columns = [header.index(name) for name in wanted]
+    try:
+        numbers = np.array([[float(row[column]) for column in columns] for row in rows[1:]])
+        matrix = np.array([[float(word) for word in row] for row in _table(folder / "camera_matrix.csv")])
+    except (ValueError, IndexError) as error:
+        raise FormatError(f"{path} or camera_matrix.csv beside it is damaged: {error}") from error
+    if matrix.shape != (3, 3) or not len(numbers):
+        raise FormatError(f"{folder}: camera_matrix.csv must hold 3x3 numbers and odometry.csv a pose at least")
+    if not (np.abs(numbers[:, 0]) < _LARGEST).all():
+        raise FormatError(f"{path}: a frame's number is none")
+    frames = numbers[:, 0].astype(int).tolist()
+    depth = numbered(folder / "depth", scene)
+    return PhoneExport(
+        STRAY,
+        dict.fromkeys(frames, folder / VIDEO),
+        depth,
+        dict(zip(frames, pose_matrices(numbers[:, 1:]), strict=True)),
+        dict.fromkeys(frames, matrix - CORNER_TO_CENTER),
+        video_size(folder / VIDEO),
+    )
+
+
+def _table(path: Path) -> list[list[str]]:
+    """Rows of a CSV file, without empty ones; at least one."""
+    try:
+        text = regular(path).read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise FormatError(f"{path}: not text ({error})") from error
+    rows = [row for row in csv.reader(text.splitlines()) if row]
+    if not rows:
+        raise FormatError(f"{path} is empty")
+    return rows
+
+
+def _numbers(path: Path, content: Any, key: str, columns: int) -> NDArray[np.float64]:
+    """``[n, columns]`` of a key of a JSON object, n at least 1."""
+    try:
+        values = np.array(content[key], np.float64)
+    except (KeyError, TypeError, ValueError, OverflowError):
+        values = np.empty(0)
+    if values.ndim != 2 or values.shape[1] != columns or not len(values):
+        raise FormatError(f"{path}: expected {key} with {columns} numbers each, as Record3D writes it")
+    return values
+
+
+def _fields(path: Path, content: Any, names: list[str]) -> NDArray[np.float64]:
+    """The numbers that a JSON object has under some names."""
+    found = [content.get(name) if isinstance(content, dict) else None for name in names]
+    if not all(type(value) in (int, float) and abs(value) < _LARGEST for value in found):
+        raise FormatError(f"{path}: expected numbers {names[0]} to {names[-1]}, as Polycam writes them")
+    return np.array(found, np.float64)
