@@ -1,4 +1,4 @@
-"""README's way from an equation to the code leads there; the keys of the deviations from the paper exist."""
+"""docs/paper.md's way from an equation to the code leads there; the keys of the deviations from the paper exist."""
 
 import ast
 import re
@@ -11,7 +11,9 @@ from omegaconf import DictConfig, OmegaConf
 from vg2gt.config import config_dir
 
 ROOT = Path(__file__).resolve().parents[1]
-ROWS = re.findall(r"^\| ((?:eqn?_|\()\S.*?) \| .+? \| (`vg2gt/.+?) \|$", (ROOT / "README.md").read_text(), re.MULTILINE)
+ROWS = re.findall(
+    r"^\| ((?:eqn?_|\()\S.*?) \| .+? \| (`vg2gt/.+?) \|$", (ROOT / "docs" / "paper.md").read_text(), re.MULTILINE
+)
 
 
 def definitions(path: Path) -> set[str]:
