@@ -23,7 +23,7 @@ def _millimetres(frames: Frames) -> np.ndarray:
 
 def write_record3d(root: Path, frames: Frames, per_frame: bool = False) -> None:
     """``EXR + JPG``; one channel of float32, named as the first renderer at hand would name it."""
-    import OpenEXR
+    import OpenEXR  # pyright: ignore[reportMissingImports]: optional
 
     folder = root / "sofa" / "EXR_RGBD"
     for sub in ("rgb", "depth"):

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -195,10 +196,9 @@ def _table(path: Path) -> list[list[str]]:
 
 def _numbers(path: Path, content: Any, key: str, columns: int) -> NDArray[np.float64]:
     """``[n, columns]`` of a key of a JSON object, n at least 1."""
-    try:
-        values = np.array(content[key], np.float64)
-    except (KeyError, TypeError, ValueError, OverflowError):
-        values = np.empty(0)
+    values: NDArray[np.float64] = np.zeros((0, 0))
+    with suppress(KeyError, TypeError, ValueError, OverflowError):
+        values = np.asarray(content[key], np.float64)
     if values.ndim != 2 or values.shape[1] != columns or not len(values):
         raise FormatError(f"{path}: expected {key} with {columns} numbers each, as Record3D writes it")
     return values
@@ -207,6 +207,7 @@ def _numbers(path: Path, content: Any, key: str, columns: int) -> NDArray[np.flo
 def _fields(path: Path, content: Any, names: list[str]) -> NDArray[np.float64]:
     """The numbers that a JSON object has under some names."""
     found = [content.get(name) if isinstance(content, dict) else None for name in names]
-    if not all(type(value) in (int, float) and abs(value) < _LARGEST for value in found):
+    numbers = [value for value in found if isinstance(value, (int, float)) and abs(value) < _LARGEST]
+    if len(numbers) < len(names):
         raise FormatError(f"{path}: expected numbers {names[0]} to {names[-1]}, as Polycam writes them")
-    return np.array(found, np.float64)
+    return np.array(numbers, np.float64)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from vg2gt.io import ColmapCamera, ColmapImage, ColmapModel, colmap_intrinsics, colmap_pose
 
@@ -30,13 +30,14 @@ class SparsePoints:
     """
 
     def __init__(self, model: ColmapModel, sound: bool = True) -> None:
-        used = (np.abs(model.points.positions) < _FAR).all(1)
+        used: NDArray[np.bool_] = np.asarray((np.abs(model.points.positions) < _FAR).all(1))
         if sound:
             used &= (model.points.track_lengths >= MIN_TRACK) & (model.points.track_lengths > 0)
             used = used & (_ray_angles(model) >= MIN_ANGLE)
             used[used] = _near_others(model, used)
         order = np.argsort(model.points.ids)
-        observed = np.zeros((2, len(model.points)), np.int64)  # in images, and where the point projects to
+        observed = np.zeros(len(model.points), np.int64)  # in images
+        agreeing = np.zeros(len(model.points), np.int64)  # and where the point projects to
         views = []
         for record in in_order(model):
             camera, pose = model.cameras[record.camera_id], colmap_pose(record)
@@ -51,10 +52,10 @@ class SparsePoints:
             good = inside & (seen[:, 2] > 1e-6) & (seen[:, 2] < _FAR)
             if sound:
                 good &= _reprojection(seen, camera, record.points2d[known]) <= MAX_REPROJECTION
-                np.add.at(observed, (0, rows[inside]), 1)
-                np.add.at(observed, (1, rows[good]), 1)
+                np.add.at(observed, rows[inside], 1)
+                np.add.at(agreeing, rows[good], 1)
             views.append((rows[good], place[good], seen[good, 2].astype(np.float32)))
-        agreed = 2 * observed[1] >= observed[0]
+        agreed = 2 * agreeing >= observed
         self._views = [(place[agreed[rows]], depth[agreed[rows]]) for rows, place, depth in views]
 
     def places(self, frame: int) -> NDArray[np.float64]:
@@ -116,5 +117,5 @@ def _near_others(model: ColmapModel, used: NDArray[np.bool_]) -> NDArray[np.bool
     rays, owner = _rays(model)
     distance = np.full(len(model.points), np.inf)
     np.fmin.at(distance, owner, np.linalg.norm(rays, axis=1))
-    gap = cKDTree(positions).query(positions, [_NEIGHBOURS + 1])[0][:, 0]
+    gap = np.asarray(KDTree(positions).query(positions, _NEIGHBOURS + 1)[0])[:, -1]
     return gap <= MAX_GAP * distance[used]
