@@ -9,6 +9,7 @@ import shutil
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors.torch import save
@@ -165,11 +166,48 @@ def export_graph(
                     f"export fixed the axes {fixed} of {name}, now {list(shape)}: a Python number in code"
                 )
         program = torch.onnx.export(
-            exported, input_names=names, output_names=results, dynamo=True, verbose=False, optimize=False
+            exported,
+            input_names=names,
+            output_names=results,
+            dynamo=True,
+            verbose=False,
+            optimize=False,
+            custom_translation_table={torch.ops.aten.scaled_dot_product_attention.default: _attention},
         )
     assert program is not None
     ClearMetadataAndDocStringPass()(program.model)  # stack traces with the paths of this machine
     program.save(file)
+
+
+def _attention(query: Any, key: Any, value: Any, *_: Any, **__: Any) -> Any:
+    """Attention ``[B, heads, N, head_dim]`` as onnxruntime's own operator, which never holds the ``N x N`` weights.
+
+    The standard's ``Attention`` holds them, and the products and softmax that torch exports by itself as well.
+    """
+    from onnx.defs import OpSchema
+    from onnxscript import opset18 as op
+    from onnxscript.values import Op, Opset
+
+    parameter, attribute = OpSchema.FormalParameter, OpSchema.Attribute
+    schema = OpSchema(  # what onnxruntime documents of it, as far as it is used
+        "MultiHeadAttention",
+        "com.microsoft",
+        1,
+        inputs=[parameter(name, "T") for name in ("query", "key", "value")],
+        outputs=[parameter("output", "T")],
+        type_constraints=[("T", ["tensor(float)"], "")],
+        attributes=[attribute("num_heads", OpSchema.AttrType.INT, "")],
+    )
+    attend = Op(Opset("com.microsoft", 1), schema.name, schema)
+
+    def joined(heads: Any) -> Any:  # [B, N, heads * head_dim]
+        return op.Reshape(op.Transpose(heads, perm=[0, 2, 1, 3]), op.Constant(value_ints=[0, 0, -1]))
+
+    heads = int(query.shape[1])
+    out = op.Reshape(
+        attend(joined(query), joined(key), joined(value), num_heads=heads), op.Constant(value_ints=[0, 0, heads, -1])
+    )
+    return op.Transpose(out, perm=[0, 2, 1, 3])
 
 
 def _free_axes(name: str) -> dict[int, object]:

@@ -125,6 +125,14 @@ def test_checkpoints_fit_the_exported_network(onnx_bundle: Path, shallow_da3: Ex
     assert OnnxBackend(str(onnx_bundle)).identity() == shallow_da3.identity()
 
 
+@pytest.mark.parametrize("name", ["encoder.onnx", "decoder.onnx"])
+def test_attention_never_holds_the_weights_of_all_pairs(onnx_bundle: Path, name: str) -> None:
+    model = onnx.load(onnx_bundle / name, load_external_data=False)
+    kinds = {(node.domain, node.op_type) for node in model.graph.node}
+    assert ("", "Softmax") not in kinds
+    assert (("com.microsoft", "MultiHeadAttention") in kinds) == (name == "encoder.onnx")
+
+
 def test_files_tell_nothing_of_the_machine(onnx_bundle: Path) -> None:
     root = str(Path(__file__).resolve().parents[2]).encode()
     assert not any(root in file.read_bytes() for file in onnx_bundle.iterdir())
