@@ -179,15 +179,16 @@ def export_graph(
     program.save(file)
 
 
-def _attention(query: Any, key: Any, value: Any, *_: Any, **__: Any) -> Any:
+def _attention(query: Any, key: Any, value: Any) -> Any:
     """Attention ``[B, heads, N, head_dim]`` as onnxruntime's own operator, which never holds the ``N x N`` weights.
 
     The standard's ``Attention`` holds them, and the products and softmax that torch exports by itself as well.
     """
     from onnx.defs import OpSchema
-    from onnxscript import opset18 as op
+    from onnxscript import opset18
     from onnxscript.values import Op, Opset
 
+    op: Any = opset18  # its types know constants of every kind only
     parameter, attribute = OpSchema.FormalParameter, OpSchema.Attribute
     schema = OpSchema(  # what onnxruntime documents of it, as far as it is used
         "MultiHeadAttention",
