@@ -45,7 +45,10 @@ RAMP = np.linspace(0, 65535, 24 * 32).reshape(24, 32)
 @pytest.mark.parametrize("suffix", ["png", "tif", "pgm"])
 def test_16_bit_grey_photographs_keep_their_greys(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"photo.{suffix}"
-    Image.fromarray(RAMP.astype(np.uint16)).save(path)
+    if suffix == "pgm":  # which Pillow writes of 16 bits since version 11 only
+        path.write_bytes(b"P5 32 24 65535\n" + RAMP.astype(">u2").tobytes())
+    else:
+        Image.fromarray(RAMP.astype(np.uint16)).save(path)
     pixels = read_color(path, "scene")
     assert np.abs(pixels - RAMP[..., None] / 257).max() <= 0.51
 
