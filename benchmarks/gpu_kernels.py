@@ -46,7 +46,7 @@ TYPES = {
     torch.int16: "*i16",
     torch.bool: "*i1",
 }
-Stub = Callable[..., None]
+Stub = Callable[..., Any]
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Launch:
     Attributes:
         kernel: name.
         grid: programs.
-        arguments: by name, compile-time ones included.
+        arguments: by name, compile-time ones included; of tensors their types.
         options: such as ``num_warps``.
     """
 
@@ -79,7 +79,9 @@ class Launch:
     @property
     def variant(self) -> str:
         """The kernel and those compile-time options that make another kernel of it."""
-        chosen = [f"{name}={value}" for name, value in self.constants.items() if isinstance(value, bool | int)]
+        chosen = [
+            f"{name}={value}" for name, value in self.constants.items() if isinstance(value, bool) or name == "degree"
+        ]
         return " ".join([self.kernel.removesuffix("_kernel"), *chosen])
 
 
@@ -109,8 +111,8 @@ class Compiled:
 def _type(name: str, value: Any, constants: dict[str, Any]) -> str:
     if name in constants:
         return "constexpr"
-    if isinstance(value, Tensor):
-        return TYPES[value.dtype]
+    if isinstance(value, torch.dtype):
+        return TYPES[value]
     return "i64" if isinstance(value, int) and abs(value) >= 1 << 31 else "i32"
 
 
@@ -119,8 +121,10 @@ def recorded(stubs: dict[str, Stub] | None = None) -> Iterator[list[Launch]]:
     """Inside the block kernels are not run but listed, and the renderer takes tensors on the CPU for them.
 
     Args:
-        stubs: by kernel, what happens in its stead: called with the launch's arguments by name.
+        stubs: by kernel, what happens in its stead: called with the launch's arguments by name. Every Gaussian lies
+            in one tile unless a stub of ``project_kernel`` says otherwise.
     """
+    stubs = {"project_kernel": lambda counts, **_: counts.fill_(1), **(stubs or {})}
     launches: list[Launch] = []
 
     class Recorder:
@@ -131,8 +135,10 @@ def recorded(stubs: dict[str, Stub] | None = None) -> Iterator[list[Launch]]:
             def launch(*arguments: Any, **options: Any) -> None:
                 named = dict(zip(self.names, arguments, strict=False))
                 named |= {name: options.pop(name) for name in self.names if name in options}
-                launches.append(Launch(self.name, tuple(grid), named, options))
-                if stubs and self.name in stubs:
+                # what is kept of a tensor is its type: memory is counted as if nobody looked
+                kept = {name: value.dtype if isinstance(value, Tensor) else value for name, value in named.items()}
+                launches.append(Launch(self.name, tuple(grid), kept, options))
+                if self.name in stubs:
                     stubs[self.name](**named)
 
             return launch
@@ -147,12 +153,15 @@ def recorded(stubs: dict[str, Stub] | None = None) -> Iterator[list[Launch]]:
 def variants() -> dict[str, Launch]:
     """Every kernel in every form that rendering and its backward pass ask for, by its name and options."""
     found: dict[str, Launch] = {}
-    for mode, geometry, degree in product(("solid", "rasterized"), (True, False), (0, 1, 2, 3)):
+    kinds = [("solid", "median", True), ("rasterized", "median", True), ("rasterized", "expected", True)]
+    kinds += [(mode, "median", False) for mode in ("solid", "rasterized")]
+    for (mode, depth, geometry), degree in product(kinds, (0, 1, 2, 3)):
         gaussians = room_gaussians(40, (16, 24))
         sh = torch.zeros(len(gaussians), (degree + 1) ** 2, 3)
         gaussians = replace(gaussians, sh=sh).map(lambda t: t.requires_grad_() if t.is_floating_point() else t)
         cameras = room_cameras(2, (16, 24))
-        renderer = Renderer(mode=mode, geometry=geometry, implementation="triton")  # type: ignore[arg-type]
+        cameras = replace(cameras, world_to_camera=cameras.world_to_camera.requires_grad_(degree == 0))
+        renderer = Renderer(mode=mode, depth=depth, geometry=geometry, implementation="triton")  # type: ignore[arg-type]
         with recorded() as launches:
             out = renderer(gaussians, cameras)
             outputs = [out.color, out.depth, out.normal] if geometry else [out.color]

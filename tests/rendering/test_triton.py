@@ -43,28 +43,68 @@ def test_in_the_interpreter() -> None:
 
 
 @runnable
-@pytest.mark.parametrize(("mode", "depth"), KINDS)
-def test_equals_the_reference(mode: Mode, depth: DepthKind) -> None:
-    gaussians, cameras = soup(25, size=0.25), cameras_around((10, 13))
-    options = {"mode": mode, "depth": depth}
+@pytest.mark.parametrize(("kind", "degree"), [*zip(KINDS, (1, 3, 0), strict=True), (KINDS[0], 2)])
+def test_equals_the_reference(kind: tuple[Mode, DepthKind], degree: int) -> None:
+    """Images of 9 x 11 pixels of two scenes, two views each, in one sequence of launches."""
+    gaussians, cameras = soup(7, seed=degree, size=0.25, degree=degree, scenes=2), cameras_around((9, 11), scenes=2)
+    options = {"mode": kind[0], "depth": kind[1]}
     expected = render_with_gradients(gaussians, cameras, implementation="dense", **options)
     found = render_with_gradients(gaussians, cameras, DEVICE, implementation="triton", **options)
     assert_same_render(found, expected, atol=1e-11)
 
 
 @runnable
-def test_color_only_and_more_hits_than_expected(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vg2gt.rendering.gpu.function.HIT_CAPACITY", 8)
+def test_color_only_and_rays_with_many_hits() -> None:
     gaussians, cameras = soup(60, size=0.6), pinhole((3, 4))
     gaussians = replace(gaussians, opacities=gaussians.opacities * 0.2)
     expected = render_with_gradients(gaussians, cameras, implementation="dense", bisections=6)
     out, grads = render_with_gradients(gaussians, cameras, DEVICE, implementation="triton", bisections=6)
     assert_same_render((out, grads), expected, atol=1e-11)
-    color = render(
-        gaussians.to(DEVICE), cameras.to(DEVICE), "solid", BACKGROUND, implementation="triton", geometry=False
-    )
-    torch.testing.assert_close(color.color.cpu(), out.color, rtol=0, atol=1e-12)
+    leaves = with_gradients(gaussians.to(DEVICE))
+    color = render(leaves, cameras.to(DEVICE), "solid", BACKGROUND, implementation="triton", geometry=False)
+    torch.testing.assert_close(color.color.detach().cpu(), out.color.detach(), rtol=0, atol=1e-12)
     assert not color.depth.any()
+    assert not color.normal.any()
+    (grad,) = torch.autograd.grad(color.color.sum(), leaves.sh)
+    assert grad.any()
+
+
+@runnable
+def test_gradients_are_the_same_however_many_views_are_held_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    from vg2gt.rendering.gpu import function
+
+    assert function._chunks([4, 4, 9, 10]) == ((0, 4, 0, 10),)
+    gaussians, cameras = soup(7, size=0.25), cameras_around((5, 11), views=3)
+    options = {"mode": "rasterized", "implementation": "triton"}
+    _, expected = render_with_gradients(gaussians, cameras, DEVICE, **options)
+    monkeypatch.setattr(function, "ROWS", 5)
+    assert function._chunks([4, 4, 9, 10]) == ((0, 2, 0, 4), (2, 1, 4, 9), (3, 1, 9, 10))
+    assert function._chunks([9, 18]) == ((0, 1, 0, 9), (1, 1, 9, 18))
+    _, grads = render_with_gradients(gaussians, cameras, DEVICE, **options)
+    for name, grad in expected.items():
+        torch.testing.assert_close(grads[name], grad, rtol=1e-12, atol=1e-12)  # summed in another order
+
+
+@runnable
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("means", float("nan")), ("quats", 0.0), ("scales", 0.0), ("opacities", 1.5), ("sh", float("inf")), ("batch", 1)],
+)
+def test_bad_values_are_refused_by_name_though_the_host_looks_at_none(name: str, value: float) -> None:
+    gaussians = soup(5, degree=1)
+    getattr(gaussians, name)[3] = value
+    with pytest.raises(ValueError, match=rf"^{name} "):
+        render(gaussians.to(DEVICE), pinhole((4, 4)).to(DEVICE), implementation="triton")
+
+
+@runnable
+def test_bad_cameras_and_backgrounds_are_refused_by_name() -> None:
+    gaussians, cameras = soup(5).to(DEVICE), pinhole((4, 4)).to(DEVICE)
+    for name, sign in (("world_to_camera", float("nan")), ("intrinsics", -1.0)):
+        with pytest.raises(ValueError, match=rf"^{name} "):
+            render(gaussians, replace(cameras, **{name: getattr(cameras, name) * sign}), implementation="triton")
+    with pytest.raises(ValueError, match=r"^background holds"):
+        render(gaussians, cameras, background=(0.0, float("nan"), 0.0), implementation="triton")
 
 
 @runnable

@@ -17,8 +17,17 @@ class UnrenderableError(ValueError):
     """Values that cannot be rendered: NaN, infinite or out of range. Shapes that disagree are plain ValueErrors."""
 
 
-def check_gaussians(gaussians: Gaussians, scenes: int) -> None:
-    """Raises ValueError unless shapes agree, values are finite and in range, and scenes are sorted."""
+def check_shapes(gaussians: Gaussians, cameras: Cameras) -> None:
+    """Raises ValueError, naming the argument, unless shapes and devices agree and the size is not empty."""
+    poses, intrinsics = cameras.world_to_camera, cameras.intrinsics
+    if poses.dim() != 4 or poses.shape[-2:] != (4, 4):
+        raise ValueError(f"world_to_camera must be [B, V, 4, 4], got {list(poses.shape)}")
+    if intrinsics.shape != (*poses.shape[:2], 3, 3):
+        raise ValueError(
+            f"intrinsics must be {[*poses.shape[:2], 3, 3]} like world_to_camera, got {list(intrinsics.shape)}"
+        )
+    if min(cameras.size) < 1:
+        raise ValueError(f"the cameras' size must be at least 1 x 1 pixels, got {cameras.size}")
     count = gaussians.means.shape[0]
     coefficients = gaussians.sh.shape[1] if gaussians.sh.dim() == 3 else 0
     if coefficients not in {(degree + 1) ** 2 for degree in range(MAX_DEGREE + 1)}:
@@ -35,35 +44,29 @@ def check_gaussians(gaussians: Gaussians, scenes: int) -> None:
         tensor: Tensor = getattr(gaussians, name)
         if tuple(tensor.shape) != shape:
             raise ValueError(f"{name} must be {list(shape)} for {count} Gaussians, got {list(tensor.shape)}")
-        if name != "batch":
-            check_finite(name, tensor)
-    if count == 0:
+    if poses.device != gaussians.means.device:
+        raise ValueError(f"cameras are on {poses.device}, the Gaussians on {gaussians.means.device}; move one of them")
+
+
+def check_values(gaussians: Gaussians, cameras: Cameras) -> None:
+    """Raises ValueError unless values are finite and in range, and the Gaussians sorted by scene."""
+    check_finite("world_to_camera", cameras.world_to_camera)
+    check_finite("intrinsics", cameras.intrinsics)
+    focal = cameras.intrinsics[..., [0, 1], [0, 1]]
+    _require("intrinsics", focal > 0, "pinhole matrices with positive focal lengths")
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        check_finite(name, getattr(gaussians, name))
+    if len(gaussians) == 0:
         return
     _require("scales", gaussians.scales >= MIN_SCALE, f"at least {MIN_SCALE} (standard deviations in scene units)")
     _require("opacities", (gaussians.opacities >= 0) & (gaussians.opacities <= 1), "in [0, 1]")
     _require("quats", gaussians.quats.detach().abs().sum(-1) > 0, "rotations: a quaternion must not be zero")
-    batch = gaussians.batch
+    batch, scenes = gaussians.batch, len(cameras.world_to_camera)
     if batch[0] < 0 or batch[-1] >= scenes or (batch[1:] < batch[:-1]).any():
         raise ValueError(
             f"batch must be sorted scene indices from 0 to {scenes - 1} (the cameras hold {scenes} scenes); "
             "sort the Gaussians by scene"
         )
-
-
-def check_cameras(cameras: Cameras) -> None:
-    """Raises ValueError unless shapes agree, values are finite, focal lengths positive and the size is not empty."""
-    poses, intrinsics = cameras.world_to_camera, cameras.intrinsics
-    if poses.dim() != 4 or poses.shape[-2:] != (4, 4):
-        raise ValueError(f"world_to_camera must be [B, V, 4, 4], got {list(poses.shape)}")
-    if intrinsics.shape != (*poses.shape[:2], 3, 3):
-        raise ValueError(
-            f"intrinsics must be {[*poses.shape[:2], 3, 3]} like world_to_camera, got {list(intrinsics.shape)}"
-        )
-    check_finite("world_to_camera", poses)
-    check_finite("intrinsics", intrinsics)
-    _require("intrinsics", intrinsics[..., [0, 1], [0, 1]] > 0, "pinhole matrices with positive focal lengths")
-    if min(cameras.size) < 1:
-        raise ValueError(f"the cameras' size must be at least 1 x 1 pixels, got {cameras.size}")
 
 
 def check_finite(name: str, tensor: Tensor) -> None:
@@ -85,7 +88,6 @@ def background_color(background: Tensor | Sequence[float] | None, like: Tensor) 
     color = torch.as_tensor(background, dtype=like.dtype, device=like.device)
     if color.shape != (3,):
         raise ValueError(f"background must be one colour [3], got {list(color.shape)}")
-    check_finite("background", color)
     return color
 
 

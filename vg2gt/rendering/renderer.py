@@ -15,7 +15,7 @@ from torch.nn import functional as F
 from vg2gt.geometry.cameras import invert_rigid
 from vg2gt.geometry.spherical_harmonics import sh_to_rgb
 from vg2gt.memory import note_sizes
-from vg2gt.rendering.checks import background_color, check_cameras, check_gaussians
+from vg2gt.rendering.checks import background_color, check_finite, check_shapes, check_values
 from vg2gt.rendering.cpu import rasterize_cpu
 from vg2gt.rendering.dense import rasterize_dense
 from vg2gt.rendering.options import Images, Mode, RenderOptions, SceneViews, check_choice
@@ -27,23 +27,12 @@ Implementation = Literal["auto", "torch", "dense", "cpu", "triton"]
 Rasterizer = Callable[[SceneViews, RenderOptions], Images]
 
 
-def _rasterize_triton(scene: SceneViews, options: RenderOptions) -> Images:
-    """Imports Triton only when it is asked for: torch's CPU builds come without it."""
-    if importlib.util.find_spec("triton") is None:
-        raise ValueError(
-            "implementation 'triton' needs the package triton; install a CUDA build of torch or use 'torch'"
-        )
-    from vg2gt.rendering.gpu import rasterize_triton
-
-    return rasterize_triton(scene, options)
-
-
 RASTERIZERS: dict[str, Rasterizer] = {
     "torch": rasterize_pairs,
     "dense": rasterize_dense,
     "cpu": rasterize_cpu,
-    "triton": _rasterize_triton,
 }
+"""Those that render one scene at a time; Triton's renders all of them."""
 
 
 @dataclass(frozen=True)
@@ -76,22 +65,21 @@ class Renderer(RenderOptions):
         options = self
         if mode is not None:
             options = replace(self, mode=mode, depth="median" if mode == "solid" else self.depth)
-        check_cameras(cameras)
-        scenes = len(cameras.world_to_camera)
-        check_gaussians(gaussians, scenes)
+        check_shapes(gaussians, cameras)
         device = gaussians.means.device
-        if cameras.world_to_camera.device != device:
-            raise ValueError(
-                f"cameras are on {cameras.world_to_camera.device}, the Gaussians on {device}; move one of them"
-            )
         height, width = cameras.size
-        views = cameras.world_to_camera.shape[:2].numel()
-        note_sizes({"Gaussians": len(gaussians), f"views of {height}x{width} to render": views})
-        rasterize = RASTERIZERS[_resolve(self.implementation, device)]
+        scenes, views = cameras.world_to_camera.shape[:2]
+        note_sizes({"Gaussians": len(gaussians), f"views of {height}x{width} to render": scenes * views})
+        implementation = _resolve(self.implementation, device)
         dtype = torch.promote_types(gaussians.means.dtype, torch.float32)
         with torch.autocast(device.type, enabled=False):
+            color = background_color(background, like=gaussians.means.new_empty(0, dtype=dtype))
+            if implementation == "triton":
+                return _render_triton(gaussians.map(_floats_to(dtype)), cameras.map(_floats_to(dtype)), color, options)
+            check_values(gaussians, cameras)
+            check_finite("background", color)
             gaussians, cameras = gaussians.map(_floats_to(dtype)), cameras.map(_floats_to(dtype))
-            color = background_color(background, like=gaussians.means)
+            rasterize = RASTERIZERS[implementation]
             images = [rasterize(_scene_views(gaussians.scene(b), cameras, b, color), options) for b in range(scenes)]
         stacked = {
             field.name: torch.stack([getattr(image, field.name) for image in images]) for field in fields(Images)
@@ -134,6 +122,25 @@ def render(
         ValueError: on shapes that disagree, NaN or infinite values, scales that are not positive, unknown options.
     """
     return Renderer(mode=mode, near=near, **options)(gaussians, cameras, background)
+
+
+def _render_triton(gaussians: Gaussians, cameras: Cameras, background: Tensor, options: RenderOptions) -> Render:
+    """Imports Triton only when it is asked for: torch's CPU builds come without it.
+
+    Its kernels notice values that cannot be rendered; only then is it found out which.
+    """
+    if importlib.util.find_spec("triton") is None:
+        raise ValueError(
+            "implementation 'triton' needs the package triton; install a CUDA build of torch or use 'torch'"
+        )
+    from vg2gt.rendering.gpu import RefusedError, render_triton
+
+    try:
+        return render_triton(gaussians, cameras, background, options)
+    except RefusedError:
+        check_values(gaussians, cameras)
+        check_finite("background", background)
+        raise
 
 
 def _scene_views(gaussians: Gaussians, cameras: Cameras, scene: int, background: Tensor) -> SceneViews:

@@ -1,8 +1,8 @@
-"""The renderer for CUDA devices: tiles of 8 x 8 pixels, one warp each, no atomics; deterministic.
+"""The renderer for CUDA devices: all views of all scenes in one sequence of six kernels, no atomics; deterministic.
 
 Needs the package ``triton``, which comes with torch's CUDA builds.
 """
 
-from vg2gt.rendering.gpu.function import rasterize_triton
+from vg2gt.rendering.gpu.function import RefusedError, render_triton
 
-__all__ = ["rasterize_triton"]
+__all__ = ["RefusedError", "render_triton"]

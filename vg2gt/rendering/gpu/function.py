@@ -1,6 +1,9 @@
-"""Projects, bins and drives the Triton kernels for all views of a scene at once, and joins them to autograd.
+"""Drives the Triton kernels for all views of all scenes at once, and joins them to autograd.
 
-Deterministic: tiles write pixels and gradient rows of their own; a splat's rows adjoin and are summed in order.
+Forward: project every Gaussian into every view of its scene, count its tiles, read the counts (the only time that the
+host waits), write one entry a (tile, Gaussian), sort the entries by view, tile and depth, blend the tiles. Backward:
+visit the tiles again, write one gradient row an entry, sum and chain the rows of every Gaussian. Deterministic: tiles
+write pixels and rows of their own; a Gaussian's rows adjoin and are summed in order by its own lane.
 """
 
 from __future__ import annotations
@@ -12,148 +15,203 @@ import torch
 from torch import Tensor
 
 from vg2gt.rendering.gpu import kernels as launchable
-from vg2gt.rendering.median import depth_factors
+from vg2gt.rendering.gpu.binning import ENTRIES
+from vg2gt.rendering.gpu.projection import BLOCK, CAMERA, REFUSED
+from vg2gt.rendering.gpu.tiles import RECORD, TILE
 from vg2gt.rendering.options import (
-    ALPHA_MIN,
     BRACKET_SIGMAS,
     MEDIAN_MAX_TRANSMITTANCE,
     TRANSMITTANCE_STOP,
-    Images,
     RenderOptions,
-    SceneViews,
 )
-from vg2gt.rendering.projection import Splats, list_cells, pixel_boxes, visible_splats
+from vg2gt.types import Cameras, Gaussians, Render
 
 kernels: Any = launchable  # Triton makes its functions objects that take a grid: kernel[grid](...)
 
-HIT_CAPACITY = 48  # hits that a ray keeps for the depth solver before the views are blended again with more room
 NEGLIGIBLE = {torch.float32: 30.0, torch.float64: 90.0}  # squared sigmas at which a profile vanishes
+BISECTIONS = 3  # that one visit of a tile's Gaussians amounts to
+ROWS = 3_000_000  # gradient rows (64 bytes each) held at once: as many views as have no more, one at least
 
 
-def rasterize_triton(scene: SceneViews, options: RenderOptions) -> Images:
-    """Renders every view; differentiable in every tensor of the scene."""
-    views = [visible_splats(scene.view(index), options) for index in range(len(scene.world_to_camera))]
-    counts = torch.tensor([len(box) for _, box in views], device=scene.means.device)
-    records = torch.cat([_pack(splats) for splats, _ in views])
-    lists = _bin(torch.cat([box for _, box in views]), counts, scene.size)
-    color, normal, depth, alpha = _Rasterize.apply(records, scene.background, lists, options)
-    return Images(color, normal, depth, alpha)
+class RefusedError(ValueError):
+    """The kernels met a value that cannot be rendered; which one is for the caller to say."""
+
+
+def render_triton(gaussians: Gaussians, cameras: Cameras, background: Tensor, options: RenderOptions) -> Render:
+    """Renders every view of every scene; differentiable in every floating-point tensor.
+
+    Args:
+        gaussians: of all scenes, sorted by scene; shapes were checked.
+        cameras: the views.
+        background: ``[3]``.
+        options: the number of bisections is rounded up to a multiple of 3.
+
+    Raises:
+        RefusedError: if a value is not finite or out of range (as :mod:`vg2gt.rendering.checks` has it).
+    """
+    tensors = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
+    tensors = (*tensors, cameras.world_to_camera, cameras.intrinsics, background)
+    with torch.cuda.device_of(gaussians.means):  # Triton launches on the current device
+        color, normal, depth, alpha = _Render.apply(*tensors, gaussians.batch, cameras.size, options)
+    return Render(color, depth, normal, alpha)
 
 
 @dataclass(frozen=True)
 class _Lists:
-    """Tile lists of all views.
+    """Entries of all tiles.
 
     Attributes:
-        members: splat of every list entry.
-        places: the entry's gradient row; a splat's rows adjoin.
-        starts: first entry of every tile of every view, and the end.
-        areas: tiles of every splat.
-        across: tiles in an image row.
-        tiles: tiles of a view.
-        shape: views, height, width.
+        records: ``[V, G, 16]``, see ``tiles.RECORD``; only those of visible Gaussians are written.
+        ends: ``[V * G]`` entries up to and with a slot's own.
+        members: slot of every sorted entry.
+        places: the sorted entry's place among those in slots' order, which is that of its gradient row.
+        starts: first sorted entry of every tile of every view, and the end.
+        chunks: views whose gradient rows are held at once: first view, number of views, first entry, end.
     """
 
+    records: Tensor
+    ends: Tensor
     members: Tensor
     places: Tensor
     starts: Tensor
-    areas: Tensor
-    across: int
-    tiles: int
-    shape: tuple[int, int, int]
+    chunks: tuple[tuple[int, int, int, int], ...]
 
 
-def _pack(splats: Splats) -> Tensor:
-    """Records ``[N, 18]`` in the kernels' order."""
-    cutoff = 2 * torch.log(splats.opacity.detach() / ALPHA_MIN)
-    scalars = (splats.depth, splats.precision, splats.curvature, splats.opacity, cutoff)
-    return torch.cat(
-        (splats.center, splats.conic, splats.tilt, torch.stack(scalars, -1), splats.normal, splats.color), -1
-    )
-
-
-def _bin(box: Tensor, counts: Tensor, size: tuple[int, int]) -> _Lists:
-    """Lists splats by tile, front to back; splats are given view by view, front to back, with their screen boxes."""
-    height, width = size
-    across, down = -(-width // kernels.TILE), -(-height // kernels.TILE)
-    low, high = pixel_boxes(box, size)
-    first, last = low // kernels.TILE, high // kernels.TILE
-    extent = torch.where((high < low).any(-1)[:, None], 0, last - first + 1)
-    splat, cells = list_cells(first, extent)
-    view = torch.repeat_interleave(counts)[splat]
-    tile = cells[:, 1] * across + cells[:, 0] + view * across * down
-    tile, order = torch.sort(tile, stable=True)
-    edges = torch.arange(len(counts) * across * down + 1, device=box.device)
-    starts = torch.searchsorted(tile, edges)
-    shape = (len(counts), height, width)
-    return _Lists(splat[order].int(), order.int(), starts.int(), extent.prod(-1), across, across * down, shape)
-
-
-class _Rasterize(torch.autograd.Function):
-    """Forward and backward of all views; differentiable in the records and the background."""
+class _Render(torch.autograd.Function):
+    """Forward and backward of all views."""
 
     @staticmethod
-    def forward(
-        ctx: Any, records: Tensor, background: Tensor, lists: _Lists, options: RenderOptions
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        views, height, width = lists.shape
-        pixels = views * height * width
+    def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        tensors = tuple(tensor.contiguous() for tensor in inputs[:9])
+        (height, width), options = inputs[9:]
+        poses, background = tensors[5], tensors[7]
+        scenes, views = poses.shape[:2]
+        lists = _list(tensors, (height, width), options)
         solid = options.mode == "solid"
-
-        def image(*channels: int) -> Tensor:
-            return records.new_zeros(*lists.shape, *channels)
-
-        color, normal, transmittance, depth, slope = image(3), image(3), image(), image(), image()
-        mean, median, high = image(), image(), image()
-        counts = torch.zeros(lists.shape, dtype=torch.int32, device=records.device)
-        grid, capacity = (views * lists.tiles,), HIT_CAPACITY if solid and options.geometry else 1
-        while True:
-            hits = records.new_empty(3, capacity, pixels)
-            kernels.blend_kernel[grid](
-                records, lists.members, lists.starts, background, color, normal, transmittance, mean, median, high,
-                counts, hits, height, width, lists.across, lists.tiles, pixels, capacity, capacity * pixels,
-                options.alpha_max, TRANSMITTANCE_STOP, NEGLIGIBLE[records.dtype], options.geometry, solid, num_warps=1,
-            )  # fmt: skip
-            most = int(counts.max()) if counts.numel() else 0
-            if most <= capacity:
-                break
-            capacity = most
-        if options.geometry and solid:
-            kernels.solve_kernel[grid](
-                hits, counts, high, transmittance, depth, slope, height, width, lists.across, lists.tiles, pixels,
-                capacity * pixels, options.near, MEDIAN_MAX_TRANSMITTANCE, BRACKET_SIGMAS, options.bisections,
-                options.newton_steps, num_warps=1,
-            )  # fmt: skip
-        elif options.geometry:
-            covered = 1 - transmittance
-            expected = torch.where(covered > 0, mean / covered, 0.0)
-            depth = expected if options.depth == "expected" else median
-        ctx.save_for_backward(records, color, normal, depth, slope, transmittance)
-        ctx.lists, ctx.options = lists, options
+        across, tiles = _tiles(height, width)
+        make = torch.empty if options.geometry else torch.zeros
+        shape, like = (scenes, views, height, width), {"dtype": poses.dtype, "device": poses.device}
+        color = torch.empty((scenes, views, 3, height, width), **like)
+        normal, depth = make((scenes, views, 3, height, width), **like), make(shape, **like)
+        alpha, transmittance, slopes = (torch.empty(shape, **like) for _ in range(3))
+        kernels.blend_kernel[(scenes * views * tiles,)](
+            lists.records, lists.members, lists.starts, background, color, normal, depth, alpha, transmittance, slopes,
+            height, width, across, tiles,
+            near=options.near, alpha_max=options.alpha_max, stop=TRANSMITTANCE_STOP,
+            negligible=NEGLIGIBLE[poses.dtype], median_max=MEDIAN_MAX_TRANSMITTANCE, sigmas=BRACKET_SIGMAS,
+            sections=-(-options.bisections // BISECTIONS), newton_steps=options.newton_steps,
+            solid=solid, geometry=options.geometry, mean=options.depth == "expected", num_warps=1,
+        )  # fmt: skip
+        listed = (lists.records, lists.ends, lists.members, lists.places, lists.starts)
+        ctx.save_for_backward(*tensors, *listed, color, normal, depth, transmittance, slopes)
+        ctx.chunks, ctx.size, ctx.options = lists.chunks, (height, width), options
         ctx.set_materialize_grads(False)
-        return color, normal, depth, 1 - transmittance
+        return color, normal, depth, alpha
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor | None) -> tuple[Tensor | None, ...]:
-        records, color, normal, depth, slope, transmittance = ctx.saved_tensors
-        lists: _Lists = ctx.lists
+        saved = ctx.saved_tensors
+        means, quats, scales, opacities, sh, poses, intrinsics, _, batch = saved[:9]
+        lists = _Lists(*saved[9:14], ctx.chunks)
+        images = saved[14:]
+        color, _, depth, transmittance, _ = images
         options: RenderOptions = ctx.options
-        like = (color, normal, depth, depth)
-        geometry = options.geometry and (grad_outputs[1] is not None or grad_outputs[2] is not None)
-        grad_color, grad_normal, grad_depth, grad_alpha = (
+        solid, geometry = options.mode == "solid", options.geometry and any(g is not None for g in grad_outputs[1:3])
+        incoming = [
             torch.zeros_like(image) if grad is None else grad.contiguous()
-            for grad, image in zip(grad_outputs, like, strict=True)
-        )
-        grad_solid, grad_expected, grad_crossing, grad_alpha = depth_factors(
-            grad_depth, grad_alpha, depth, slope, transmittance, options
-        )
-        rows = records.new_zeros(len(lists.members), kernels.RECORD)
-        views, height, width = lists.shape
-        kernels.backward_kernel[(views * lists.tiles,)](
-            records, lists.members, lists.places, lists.starts, color, normal, depth, transmittance,
-            grad_color, grad_normal, grad_alpha, grad_solid, grad_expected, grad_crossing, rows,
-            height, width, lists.across, lists.tiles, options.alpha_max, TRANSMITTANCE_STOP, geometry, num_warps=1,
+            for grad, image in zip(grad_outputs, (color, images[1], depth, depth), strict=True)
+        ]
+        scenes, views = poses.shape[:2]
+        height, width = ctx.size
+        across, tiles = _tiles(height, width)
+        total = len(means)
+        blocks = -(-total // BLOCK)
+        grads = [torch.zeros_like(tensor) for tensor in (means, quats, scales, opacities, sh)]
+        of_cameras = ctx.needs_input_grad[5] or ctx.needs_input_grad[6]
+        grad_cameras = poses.new_zeros(blocks if of_cameras else 1, scenes * views, CAMERA)
+        degree = _degree(sh)
+        for first, some, begin, end in lists.chunks:
+            if begin == end:
+                continue
+            rows = means.new_zeros(end - begin, RECORD)
+            kernels.backward_kernel[(scenes * some * tiles,)](
+                lists.records, lists.members, lists.places, lists.starts, *images, *incoming, rows,
+                height, width, across, tiles, views, first, some, begin,
+                alpha_max=options.alpha_max, stop=TRANSMITTANCE_STOP, slope_floor=options.slope_floor,
+                tiny=torch.finfo(means.dtype).tiny,
+                solid=solid, geometry=geometry, mean=options.depth == "expected", num_warps=1,
+            )  # fmt: skip
+            kernels.project_backward_kernel[(blocks,)](
+                means, quats, scales, opacities, sh, batch, poses, intrinsics, lists.records, lists.ends, rows,
+                *grads, grad_cameras, total, views, scenes, height, width, first, some, begin,
+                lowpass=options.lowpass, solid=solid, degree=degree, cameras=of_cameras, num_warps=BLOCK // 32,
+            )  # fmt: skip
+            del rows  # before those of the next views are made
+        grad_poses = grad_intrinsics = grad_background = None
+        if of_cameras:
+            summed = grad_cameras.sum(0)
+            grad_poses = summed[:, :16].view(poses.shape)
+            grad_intrinsics = summed[:, 16:].view(intrinsics.shape)
+        if ctx.needs_input_grad[7]:
+            grad_background = (incoming[0] * transmittance[:, :, None]).sum((0, 1, 3, 4))
+        return (*grads, grad_poses, grad_intrinsics, grad_background, None, None, None)
+
+
+def _tiles(height: int, width: int) -> tuple[int, int]:
+    """Tiles in an image row, and of a view."""
+    across = -(-width // TILE)
+    return across, across * -(-height // TILE)
+
+
+def _degree(sh: Tensor) -> int:
+    return round(sh.shape[1] ** 0.5) - 1
+
+
+def _list(tensors: tuple[Tensor, ...], size: tuple[int, int], options: RenderOptions) -> _Lists:
+    """Projects and lists all Gaussians."""
+    means, quats, scales, opacities, sh, poses, intrinsics, background, batch = tensors
+    (scenes, views), (height, width), total = poses.shape[:2], size, len(means)
+    across, tiles = _tiles(height, width)
+    records = means.new_empty(views, total, RECORD)
+    rects = batch.new_empty(views, total, 2, dtype=torch.int32)
+    ends = batch.new_empty(views * total)
+    per_view = [0] * views
+    if total:
+        kernels.project_kernel[(-(-total // BLOCK), views)](
+            means, quats, scales, opacities, sh, batch, poses, intrinsics, background, records, rects, ends,
+            total, views, scenes, height, width, across,
+            near=options.near, lowpass=options.lowpass, solid=options.mode == "solid", degree=_degree(sh),
+            num_warps=BLOCK // 32,
         )  # fmt: skip
-        grad_records = torch.segment_reduce(rows, "sum", lengths=lists.areas) if len(records) else records * 0
-        grad_background = (grad_color * transmittance[..., None]).sum((0, 1, 2))
-        return grad_records, grad_background, None, None
+        ends = torch.cumsum(ends, 0)
+        per_view = ends[total - 1 :: total].tolist()  # the host waits here, and nowhere else
+    entries = per_view[-1]
+    if entries >= REFUSED:
+        raise RefusedError("a Gaussian, a camera or the background cannot be rendered")
+    keys, owners = batch.new_empty(entries), batch.new_empty(entries, dtype=torch.int32)
+    if entries:
+        kernels.emit_kernel[(-(-entries // ENTRIES),)](
+            records, rects, ends, batch, keys, owners,
+            total, views, tiles, across, entries, (views * total).bit_length(), num_warps=4,
+        )  # fmt: skip
+        keys, order = torch.sort(keys, stable=True)
+    else:
+        order = keys
+    members, places = torch.empty_like(owners), torch.empty_like(owners)
+    starts = batch.new_empty(scenes * views * tiles + 1, dtype=torch.int32)
+    kernels.list_kernel[(-(-max(entries, len(starts)) // ENTRIES),)](
+        keys, order, owners, members, places, starts, entries, scenes * views * tiles, entries.bit_length(),
+        num_warps=4,
+    )  # fmt: skip
+    return _Lists(records, ends, members, places, starts, _chunks(per_view))
+
+
+def _chunks(ends: list[int]) -> tuple[tuple[int, int, int, int], ...]:
+    """Parts views so that each part has at most ``ROWS`` entries or one view: first view, views, first entry, end."""
+    chunks: list[tuple[int, int, int, int]] = []
+    first, begin = 0, 0
+    for view in range(1, len(ends) + 1):
+        if view == len(ends) or ends[view] - begin > ROWS:
+            chunks.append((first, view - first, begin, ends[view - 1]))
+            first, begin = view, ends[view - 1]
+    return tuple(chunks)

@@ -1,0 +1,386 @@
+"""Triton kernels that visit tiles: blend with median depth, and the backward visit.
+
+One program is one warp and one tile of 8 x 8 pixels of one view, a vector of 64 rays. Gaussians are read one at a time,
+front to back, as scalars; one that no ray of the tile hits costs a comparison. Rays are stopped by the sign of their
+transmittance. Nothing is kept per hit: the solver visits the tile's Gaussians anew, eight depths at a time, as far as
+they can matter to the median. Formulas: vg2gt/rendering/projection.py, vg2gt/rendering/median.py.
+
+Options are compile-time constants, so that float64 (for tests) keeps their digits. Loops are ``while`` loops because
+the interpreter cannot iterate over a tensor's range.
+"""
+
+# pyright: reportGeneralTypeIssues=false, reportOperatorIssue=false
+# (inside a kernel the operators and ranges are Triton's language, which its type hints do not describe)
+
+from __future__ import annotations
+
+import triton  # pyright: ignore[reportMissingImports]
+import triton.language as tl  # pyright: ignore[reportMissingImports]
+
+TILE = 8
+RECORD = 16
+"""Values of a Gaussian in a view: centre 2, conic 3, tilt 2, z, a0, cutoff, normal 3, colour 3.
+
+Its gradient row has the same places; that of the cutoff is the gradient of the opacity's logarithm.
+"""
+
+_TILE = tl.constexpr(TILE)
+_RAYS = tl.constexpr(TILE * TILE)
+_RECORD = tl.constexpr(RECORD)
+_ALPHA_MIN = tl.constexpr(1.0 / 255.0)
+_LOG2E = tl.constexpr(1.4426950408889634)
+SIZES = ("height", "width", "across", "tiles")
+
+
+@triton.jit
+def _rays(tile, across, height, width):
+    """Pixel coordinates of a tile's rays, and whether they lie in the image."""
+    lane = tl.arange(0, _RAYS)
+    x = (tile % across) * _TILE + lane % _TILE
+    y = (tile // across) * _TILE + lane // _TILE
+    return x, y, (x < width) & (y < height)
+
+
+@triton.jit
+def _respond(g, x, y, alpha_max: tl.constexpr, solid: tl.constexpr):
+    """A Gaussian's response along rays: offsets, E, 1 + s, r, its inverse, eps, whether it counts, and alpha."""
+    dx, dy = x - tl.load(g), y - tl.load(g + 1)
+    e = (tl.load(g + 2) * dx + 2 * tl.load(g + 3) * dy) * dx + tl.load(g + 4) * dy * dy
+    s, r, inverse, eps = dx * 0 + 1.0, dx * 0 + 1.0, dx * 0 + 1.0, tl.load(g + 9) * 0
+    cutoff = tl.load(g + 9)
+    if solid:
+        z = tl.load(g + 7)
+        eps = 1.0 / (z * z * tl.load(g + 8))
+        s = 1.0 + tl.load(g + 5) * dx + tl.load(g + 6) * dy
+        r = s * s + eps * e
+    on = (e <= cutoff * r) & (s > 0)
+    if solid:
+        r = tl.where(on, r, 1.0)
+        inverse = 1.0 / r
+    # the opacity is exp(cutoff / 2) / 255
+    alpha = tl.exp(0.5 * (cutoff - tl.where(on, e, 0.0) * inverse)) * _ALPHA_MIN
+    return dx, dy, e, s, r, inverse, eps, on, tl.minimum(alpha, alpha_max)
+
+
+@triton.jit(do_not_specialize=SIZES)
+def blend_kernel(
+    records, members, starts, background, color, normal, depth, alphas, transmittance, slopes,
+    height, width, across, tiles,
+    near: tl.constexpr, alpha_max: tl.constexpr, stop: tl.constexpr, negligible: tl.constexpr,
+    median_max: tl.constexpr, sigmas: tl.constexpr, sections: tl.constexpr, newton_steps: tl.constexpr,
+    solid: tl.constexpr, geometry: tl.constexpr, mean: tl.constexpr,
+):  # fmt: skip
+    """Blends a tile front to back and finds its rays' depth: median, or the mean where ``mean`` (not solid) says so."""
+    dtype = records.dtype.element_ty
+    view = (tl.program_id(0) // tiles).to(tl.int64)
+    x, y, inside = _rays(tl.program_id(0) % tiles, across, height, width)
+    px, py = x.to(dtype), y.to(dtype)
+    before = tl.where(inside, 1.0, -1.0).to(dtype)
+    zero = px * 0
+    c0, c1, c2, n0, n1, n2, expected, crossing, hi, far = zero, zero, zero, zero, zero, zero, zero, zero, zero, zero
+    lo = zero + 1e30
+    begin, end = tl.load(starts + tl.program_id(0)), tl.load(starts + tl.program_id(0) + 1)
+    place, last = begin, begin
+    live = place < end
+    while live:
+        g = records + tl.load(members + place).to(tl.int64) * _RECORD
+        _, _, _, s, r, inverse, _, on, alpha = _respond(g, px, py, alpha_max, solid)
+        on = on & (before > 0)
+        if tl.max(on.to(tl.int32), 0) > 0:
+            after = before * (1.0 - alpha)
+            kept = on & (after >= stop)
+            weight = tl.where(kept, alpha * before, 0.0)
+            c0 += weight * tl.load(g + 13)
+            c1 += weight * tl.load(g + 14)
+            c2 += weight * tl.load(g + 15)
+            if geometry:
+                n0 += weight * tl.load(g + 10)
+                n1 += weight * tl.load(g + 11)
+                n2 += weight * tl.load(g + 12)
+                peak = tl.load(g + 7) * s * inverse
+                if solid:
+                    precision = tl.load(g + 8) * r
+                    reach = sigmas / tl.sqrt(precision)
+                    early = before > 0.25
+                    lo = tl.where(kept, tl.minimum(lo, peak - reach), lo)
+                    far = tl.where(kept, tl.maximum(far, peak + reach), far)
+                    hi = tl.where(kept & early, tl.maximum(hi, peak), hi)
+                    beyond = tl.maximum(peak - hi, 0.0)
+                    matters = kept & (early | (precision * beyond * beyond <= negligible))
+                    last = tl.where(tl.max(matters.to(tl.int32), 0) > 0, place + 1, last)
+                else:
+                    expected += weight * peak
+                    crossing = tl.where(kept & (before > 0.5) & (after <= 0.5), peak, crossing)
+            before = tl.where(kept, after, tl.where(on, -before, before))
+        place += 1
+        live = (place < end) & (tl.max(before, 0) > 0)
+    final = tl.abs(before)
+    plane = height * width
+    pixel = view * plane + y * width + x
+    channel = pixel + 2 * view * plane
+    tl.store(color + channel, c0 + final * tl.load(background), mask=inside)
+    tl.store(color + channel + plane, c1 + final * tl.load(background + 1), mask=inside)
+    tl.store(color + channel + 2 * plane, c2 + final * tl.load(background + 2), mask=inside)
+    tl.store(alphas + pixel, 1.0 - final, mask=inside)
+    tl.store(transmittance + pixel, final, mask=inside)
+    if geometry:
+        tl.store(normal + channel, n0, mask=inside)
+        tl.store(normal + channel + plane, n1, mask=inside)
+        tl.store(normal + channel + 2 * plane, n2, mask=inside)
+        if solid:
+            solvable = inside & (final < median_max)
+            lo = tl.maximum(lo, near)
+            hi = tl.where(final > 0.25, far, hi)
+            d, steep = _median(
+                records, members, begin, last, px, py, solvable, lo, hi,
+                alpha_max, stop, sections, newton_steps,
+            )  # fmt: skip
+            tl.store(depth + pixel, d, mask=inside)
+            tl.store(slopes + pixel, 0.5 * steep, mask=inside)
+        elif mean:
+            covered = 1.0 - final
+            hit = covered > 0
+            tl.store(depth + pixel, tl.where(hit, expected / tl.where(hit, covered, 1.0), 0.0), mask=inside)
+        else:
+            tl.store(depth + pixel, crossing, mask=inside)
+
+
+@triton.jit
+def _median(
+    records, members, begin, last, px, py, solvable, lo, hi,
+    alpha_max: tl.constexpr, stop: tl.constexpr, sections: tl.constexpr, newton_steps: tl.constexpr,
+):  # fmt: skip
+    """Median depth between ``lo`` and ``hi`` by sections and Newton steps (0: none), and ``-2 d ln T / dt`` there.
+
+    A section evaluates the transmittance at the seven depths that part the bracket into eight: three bisections.
+    """
+    lo, hi = tl.where(solvable, lo, 1.0), tl.where(solvable, hi, 1.0)
+    section = 0
+    live = tl.max(solvable.to(tl.int32), 0) > 0
+    while live & (section < sections):
+        step = 0.125 * (hi - lo)
+        parts, opened = _part(records, members, begin, last, px, py, solvable, lo, step, alpha_max, stop)
+        solvable = solvable & (opened | (section > 0))  # the median must not lie in front of the bracket
+        lo += parts * step
+        hi = lo + step
+        section += 1
+    d, steep = 0.5 * (lo + hi), lo * 0
+    newton = 0
+    while live & (newton <= newton_steps):
+        ratio, steep = _transmit(records, members, begin, last, px, py, solvable, d, alpha_max, stop)
+        step = tl.log(4.0 * ratio) / tl.where(steep > 0, steep, 1.0)
+        moved = tl.minimum(tl.maximum(d + tl.where(steep > 0, step, 0.0), lo), hi)
+        d = tl.where(newton < newton_steps, moved, d)
+        newton += 1
+    return tl.where(solvable, d, 0.0), steep
+
+
+@triton.jit
+def _part(records, members, place, last, px, py, solvable, lo, step, alpha_max: tl.constexpr, stop: tl.constexpr):
+    """How many of the seven depths ``lo + k step`` lie in front of the median, and whether ``lo`` does.
+
+    The squared transmittance at each depth is a quotient, ``n / d``.
+    """
+    before = tl.where(solvable, 1.0, -1.0).to(px.dtype)
+    one = px * 0 + 1.0
+    n0, n1, n2, n3, n4, n5, n6, n7 = one, one, one, one, one, one, one, one
+    d0, d1, d2, d3, d4, d5, d6, d7 = one, one, one, one, one, one, one, one
+    live = place < last
+    while live:
+        g = records + tl.load(members + place).to(tl.int64) * _RECORD
+        _, _, _, s, r, inverse, _, on, alpha = _respond(g, px, py, alpha_max, True)
+        on = on & (before > 0)
+        if tl.max(on.to(tl.int32), 0) > 0:
+            after = before * (1.0 - alpha)
+            kept = on & (after >= stop)
+            alpha = tl.where(kept, alpha, 0.0)
+            before = tl.where(kept, after, tl.where(on, -before, before))
+            passed = (1.0 - alpha) * (1.0 - alpha)
+            sharp = (-0.5 * _LOG2E) * tl.load(g + 8) * r
+            t = lo - tl.load(g + 7) * s * inverse
+            free = 1.0 - alpha * tl.exp2(sharp * t * t)
+            n0 *= tl.where(t <= 0, free, passed)
+            d0 *= tl.where(t <= 0, 1.0, free)
+            t += step
+            free = 1.0 - alpha * tl.exp2(sharp * t * t)
+            n1 *= tl.where(t <= 0, free, passed)
+            d1 *= tl.where(t <= 0, 1.0, free)
+            t += step
+            free = 1.0 - alpha * tl.exp2(sharp * t * t)
+            n2 *= tl.where(t <= 0, free, passed)
+            d2 *= tl.where(t <= 0, 1.0, free)
+            t += step
+            free = 1.0 - alpha * tl.exp2(sharp * t * t)
+            n3 *= tl.where(t <= 0, free, passed)
+            d3 *= tl.where(t <= 0, 1.0, free)
+            t += step
+            free = 1.0 - alpha * tl.exp2(sharp * t * t)
+            n4 *= tl.where(t <= 0, free, passed)
+            d4 *= tl.where(t <= 0, 1.0, free)
+            t += step
+            free = 1.0 - alpha * tl.exp2(sharp * t * t)
+            n5 *= tl.where(t <= 0, free, passed)
+            d5 *= tl.where(t <= 0, 1.0, free)
+            t += step
+            free = 1.0 - alpha * tl.exp2(sharp * t * t)
+            n6 *= tl.where(t <= 0, free, passed)
+            d6 *= tl.where(t <= 0, 1.0, free)
+            t += step
+            free = 1.0 - alpha * tl.exp2(sharp * t * t)
+            n7 *= tl.where(t <= 0, free, passed)
+            d7 *= tl.where(t <= 0, 1.0, free)
+        place += 1
+        live = (place < last) & (tl.max(before, 0) > 0)
+    parts = (n1 > 0.25 * d1).to(tl.int32) + (n2 > 0.25 * d2).to(tl.int32) + (n3 > 0.25 * d3).to(tl.int32)
+    parts += (n4 > 0.25 * d4).to(tl.int32) + (n5 > 0.25 * d5).to(tl.int32) + (n6 > 0.25 * d6).to(tl.int32)
+    parts += (n7 > 0.25 * d7).to(tl.int32)
+    return parts.to(px.dtype), n0 > 0.25 * d0
+
+
+@triton.jit
+def _transmit(records, members, place, last, px, py, solvable, t, alpha_max: tl.constexpr, stop: tl.constexpr):
+    """Squared transmittance at depths ``t``, and ``-2 d ln T / dt``."""
+    before = tl.where(solvable, 1.0, -1.0).to(px.dtype)
+    numerator, denominator, steep = px * 0 + 1.0, px * 0 + 1.0, px * 0
+    live = place < last
+    while live:
+        g = records + tl.load(members + place).to(tl.int64) * _RECORD
+        _, _, _, s, r, inverse, _, on, alpha = _respond(g, px, py, alpha_max, True)
+        on = on & (before > 0)
+        if tl.max(on.to(tl.int32), 0) > 0:
+            after = before * (1.0 - alpha)
+            kept = on & (after >= stop)
+            alpha = tl.where(kept, alpha, 0.0)
+            before = tl.where(kept, after, tl.where(on, -before, before))
+            precision = tl.load(g + 8) * r
+            offset = t - tl.load(g + 7) * s * inverse
+            bell = alpha * tl.exp(-0.5 * precision * offset * offset)
+            free = 1.0 - bell
+            numerator *= tl.where(offset <= 0, free, (1.0 - alpha) * (1.0 - alpha))
+            denominator *= tl.where(offset <= 0, 1.0, free)
+            steep += bell * precision * tl.abs(offset) / free
+        place += 1
+        live = (place < last) & (tl.max(before, 0) > 0)
+    return numerator / denominator, steep
+
+
+@triton.jit(do_not_specialize=(*SIZES, "views", "first_view", "some_views", "base"))
+def backward_kernel(
+    records, members, places, starts, color, normal, depth, transmittance, slopes,
+    grad_color, grad_normal, grad_depth, grad_alpha, rows,
+    height, width, across, tiles, views, first_view, some_views, base,
+    alpha_max: tl.constexpr, stop: tl.constexpr, slope_floor: tl.constexpr, tiny: tl.constexpr,
+    solid: tl.constexpr, geometry: tl.constexpr, mean: tl.constexpr,
+):  # fmt: skip
+    """Visits a tile's Gaussians front to back again and writes one gradient row for each (rows start at zero).
+
+    The views are ``first_view`` and the next, ``some_views`` of each scene's ``views``; their rows begin at ``base``.
+    """
+    dtype = records.dtype.element_ty
+    number = tl.program_id(0) // tiles
+    view = number // some_views * views + first_view + number % some_views
+    tile = tl.program_id(0) % tiles
+    x, y, inside = _rays(tile, across, height, width)
+    px, py = x.to(dtype), y.to(dtype)
+    before = tl.where(inside, 1.0, -1.0).to(dtype)
+    plane = height * width
+    pixel = view.to(tl.int64) * plane + y * width + x
+    channel = pixel + 2 * view.to(tl.int64) * plane
+    final = tl.load(transmittance + pixel, mask=inside, other=0.0)
+    g0 = tl.load(grad_color + channel, mask=inside, other=0.0)
+    g1 = tl.load(grad_color + channel + plane, mask=inside, other=0.0)
+    g2 = tl.load(grad_color + channel + 2 * plane, mask=inside, other=0.0)
+    # what lies behind weighs on the gradient of alpha: all at first, less and less on the way
+    rest = g0 * tl.load(color + channel, mask=inside, other=0.0)
+    rest += g1 * tl.load(color + channel + plane, mask=inside, other=0.0)
+    rest += g2 * tl.load(color + channel + 2 * plane, mask=inside, other=0.0)
+    rest -= final * tl.load(grad_alpha + pixel, mask=inside, other=0.0)
+    zero = px * 0
+    g3, g4, g5, median, kd, toward, to_crossing = zero, zero, zero, zero, zero, zero, zero
+    if geometry:
+        g3 = tl.load(grad_normal + channel, mask=inside, other=0.0)
+        g4 = tl.load(grad_normal + channel + plane, mask=inside, other=0.0)
+        g5 = tl.load(grad_normal + channel + 2 * plane, mask=inside, other=0.0)
+        rest += g3 * tl.load(normal + channel, mask=inside, other=0.0)
+        rest += g4 * tl.load(normal + channel + plane, mask=inside, other=0.0)
+        rest += g5 * tl.load(normal + channel + 2 * plane, mask=inside, other=0.0)
+        median = tl.load(depth + pixel, mask=inside, other=0.0)
+        incoming = tl.where(median > 0, tl.load(grad_depth + pixel, mask=inside, other=0.0), 0.0)
+        if solid:
+            steep = tl.load(slopes + pixel, mask=inside, other=1.0)
+            steep = tl.maximum(steep, slope_floor / tl.where(median > 0, median, 1.0))
+            kd = incoming / tl.maximum(steep, tiny)
+        elif mean:
+            toward = incoming / tl.where(median > 0, 1.0 - final, 1.0)
+            rest += toward * median  # of the quotient's numerator and of its denominator, (1 - T) + T
+        else:
+            to_crossing = incoming
+    place, end = tl.load(starts + view * tiles + tile), tl.load(starts + view * tiles + tile + 1)
+    live = place < end
+    while live:
+        g = records + tl.load(members + place).to(tl.int64) * _RECORD
+        dx, dy, e, s, r, inverse, eps, on, alpha = _respond(g, px, py, alpha_max, solid)
+        on = on & (before > 0)
+        if tl.max(on.to(tl.int32), 0) > 0:
+            row = rows + (tl.load(places + place) - base).to(tl.int64) * _RECORD
+            z, a0 = tl.load(g + 7), tl.load(g + 8)
+            after = before * (1.0 - alpha)
+            kept = on & (after >= stop)
+            alpha = tl.where(kept, alpha, 0.0)
+            weight = alpha * before
+            peak = z * s * inverse
+            value = g0 * tl.load(g + 13) + g1 * tl.load(g + 14) + g2 * tl.load(g + 15)
+            tl.store(row + 13, tl.sum(weight * g0, 0))
+            tl.store(row + 14, tl.sum(weight * g1, 0))
+            tl.store(row + 15, tl.sum(weight * g2, 0))
+            if geometry:
+                value += g3 * tl.load(g + 10) + g4 * tl.load(g + 11) + g5 * tl.load(g + 12) + toward * peak
+                tl.store(row + 10, tl.sum(weight * g3, 0))
+                tl.store(row + 11, tl.sum(weight * g4, 0))
+                tl.store(row + 12, tl.sum(weight * g5, 0))
+            rest -= weight * value
+            free = 1.0 / (1.0 - alpha)
+            slack = before * value - rest * free
+            gt, gp = zero, zero
+            if geometry:
+                if solid:
+                    # implicit gradient of the median (paper, eqn tmed_grad), scaled by kd = incoming / S
+                    d = median - peak
+                    bell = tl.exp(-0.5 * a0 * r * d * d)
+                    gauss = alpha * bell
+                    half = 0.5 * kd / (1.0 - gauss)
+                    slack += tl.where(d > 0, half * bell - kd * free, -half * bell)
+                    pull = half * gauss * tl.abs(d)
+                    gt = tl.where(kept, pull * a0 * r, 0.0)
+                    gp = tl.where(kept, -0.5 * pull * d, 0.0)
+                else:
+                    gt = weight * toward + tl.where(kept & (before > 0.5) & (after <= 0.5), to_crossing, 0.0)
+            ga = tl.where(kept & (alpha < alpha_max), slack * alpha, 0.0)
+            ge = -0.5 * ga * inverse
+            z_gradient = tl.sum(gt * s * inverse, 0)
+            qb = tl.load(g + 3)
+            if solid:
+                gr = tl.where(kept, -ge * e * inverse - gt * peak * inverse + gp * a0, 0.0)
+                ge += gr * eps
+                gs = gt * z * inverse + 2.0 * gr * s
+                tilted = tl.sum(gs, 0)
+                curved = tl.sum(gr * e, 0) * eps  # eps = 1 / (z^2 a0) is no input of its own
+                sx, sy = tl.sum(ge * dx, 0), tl.sum(ge * dy, 0)
+                tl.store(row, -2.0 * (tl.load(g + 2) * sx + qb * sy) - tilted * tl.load(g + 5))
+                tl.store(row + 1, -2.0 * (qb * sx + tl.load(g + 4) * sy) - tilted * tl.load(g + 6))
+                tl.store(row + 5, tl.sum(gs * dx, 0))
+                tl.store(row + 6, tl.sum(gs * dy, 0))
+                tl.store(row + 7, z_gradient - 2.0 * curved / z)
+                tl.store(row + 8, tl.sum(gp * r, 0) - curved / a0)
+            else:
+                sx, sy = tl.sum(ge * dx, 0), tl.sum(ge * dy, 0)
+                tl.store(row, -2.0 * (tl.load(g + 2) * sx + qb * sy))
+                tl.store(row + 1, -2.0 * (qb * sx + tl.load(g + 4) * sy))
+                tl.store(row + 7, z_gradient)
+            tl.store(row + 2, tl.sum(ge * dx * dx, 0))
+            tl.store(row + 3, 2.0 * tl.sum(ge * dx * dy, 0))
+            tl.store(row + 4, tl.sum(ge * dy * dy, 0))
+            tl.store(row + 9, tl.sum(ga, 0))
+            before = tl.where(kept, after, tl.where(on, -before, before))
+        place += 1
+        live = (place < end) & (tl.max(before, 0) > 0)
