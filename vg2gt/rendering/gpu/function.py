@@ -112,7 +112,8 @@ class _Render(torch.autograd.Function):
     def backward(ctx: Any, *grad_outputs: Tensor | None) -> tuple[Tensor | None, ...]:
         saved = ctx.saved_tensors
         means, quats, scales, opacities, sh, poses, intrinsics, _, batch = saved[:9]
-        lists = _Lists(*saved[9:14], ctx.chunks)
+        records, ends, members, places, starts = saved[9:14]
+        lists = _Lists(records, ends, members, places, starts, ctx.chunks)
         images = saved[14:]
         color, _, depth, transmittance, _ = images
         options: RenderOptions = ctx.options

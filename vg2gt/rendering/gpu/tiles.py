@@ -9,7 +9,7 @@ Options are compile-time constants, so that float64 (for tests) keeps their digi
 the interpreter cannot iterate over a tensor's range.
 """
 
-# pyright: reportGeneralTypeIssues=false, reportOperatorIssue=false
+# pyright: reportGeneralTypeIssues=false, reportOperatorIssue=false, reportArgumentType=false
 # (inside a kernel the operators and ranges are Triton's language, which its type hints do not describe)
 
 from __future__ import annotations
