@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from backends.sweep.features import CONTEXT_COARSE, CONTEXT_FINE
-from backends.sweep.refine import PlainBlock, activate
+from backends.sweep.refine import PlainBlock, activate, convex_upsample
 from backends.sweep.tokens import DIM, TAPS
 
 RESPONSE = 0.02  # log-depth per unit of the tokens' correction channels
@@ -63,13 +63,5 @@ class DepthHead(nn.Module):
         log_depth, log_scale = self.out(x).float().chunk(2, 1)
         log_depth = swept[:, :1] + RESPONSE * correction.float() + 0.25 * log_depth
         both = torch.cat((log_depth, log_scale + _UNSURE), 1)
-        full = _convex_upsample(both, self.mask(x).float())
+        full = convex_upsample(both, self.mask(x).float())
         return full[:, 0], full[:, 1]
-
-
-def _convex_upsample(x: Tensor, mask: Tensor) -> Tensor:
-    """Doubles ``[V, C, h, w]``: every new pixel is a convex mixture of its 3x3 neighbours, ``mask [V, 36, h, w]``."""
-    views, channels, height, width = x.shape
-    weights = mask.unflatten(1, (9, 4)).softmax(1)  # [V, 9, 4, h, w]
-    around = F.unfold(F.pad(x, (1, 1, 1, 1), mode="replicate"), 3).view(views, channels, 9, 1, height, width)
-    return F.pixel_shuffle((around * weights[:, None]).sum(2).flatten(1, 2), 2)

@@ -12,7 +12,7 @@ from backends.base import full_precision
 from backends.sweep.correlate import SourceWarp
 from backends.sweep.features import CONTEXT_COARSE, FeaturePyramid, Features
 from backends.sweep.head import DepthHead
-from backends.sweep.refine import RefineNet, slices
+from backends.sweep.refine import RefineNet, convex_upsample, slices
 from backends.sweep.tokens import PATCH, TokenNet, patch_places
 from backends.sweep.views import agreed_range, choose_sources, wide_range
 from backends.sweep.volume import (
@@ -77,6 +77,7 @@ class Encoding(NamedTuple):
         swept: ``[V, 2, 2 h, 2 w]`` log-depth of the second sweep and its probability.
         first: the first sweep.
         refined: ``[V, 1, h, w]`` position after the U-Net.
+        center: ``[V, 1, 2 h, 2 w]`` the same at the second sweep's resolution: it searches around it.
         second: the second sweep.
     """
 
@@ -86,6 +87,7 @@ class Encoding(NamedTuple):
     swept: Tensor
     first: Sweep
     refined: Tensor
+    center: Tensor
     second: Sweep
 
 
@@ -97,7 +99,7 @@ class SweepNet(nn.Module):
         self.features = FeaturePyramid()
         self.sweep = PlaneSweep()
         self.volume = VolumeNet()
-        self.refine = RefineNet(CONTEXT_COARSE + 1 + 1 + 3 + _BINS, 1)
+        self.refine = RefineNet(CONTEXT_COARSE + 1 + 1 + 3 + _BINS, 1 + 36)  # position, and how it is upsampled
         self.sweep_fine = PlaneSweep()
         self.volume_fine = VolumeNet()
         per_cell = CONTEXT_COARSE + 2 + 3  # context, refined position and first probability, agreement
@@ -137,8 +139,10 @@ class SweepNet(nn.Module):
         first, agreeing = self.coarse(features, views, depth_range, sources, planes)
         bins = slices(first.logits.softmax(1), _BINS)
         known = torch.cat((features.context, 4 * first.t, first.mass, agreeing, bins), 1)
-        refined = first.t + 0.25 * self.refine(known)
-        second = self._narrow(features.fine, refined, views, depth_range, sources, planes)
+        found = self.refine(known)
+        refined = first.t + 0.25 * found[:, :1]
+        center = convex_upsample(refined, found[:, 1:])  # a bilinear one would search between the two sides of an edge
+        second = self._narrow(features.fine, center.detach(), views, depth_range, sources, planes)
         inverse = to_inverse(second.t, depth_range).clamp_min(1 / (_FARTHEST * depth_range[1]))
         swept = torch.cat((-inverse.log(), second.mass), 1)
         grid = (views.size[0] // PATCH, views.size[1] // PATCH)
@@ -149,16 +153,15 @@ class SweepNet(nn.Module):
         with full_precision(depth):
             place = patch_places(depth.detach(), views.world_to_camera, views.intrinsics, depth_range, grid)
         taps = self.tokens(patches, place, grid)
-        return Encoding(taps, features.context, features.context_fine, swept, first, refined, second)
+        return Encoding(taps, features.context, features.context_fine, swept, first, refined, center, second)
 
     def _narrow(
-        self, fine: Tensor, refined: Tensor, views: Views, depth_range: Tensor, sources: Tensor, planes: int
+        self, fine: Tensor, center: Tensor, views: Views, depth_range: Tensor, sources: Tensor, planes: int
     ) -> Sweep:
-        """The second sweep, at half of the image, around the refined positions ``[V, 1, h, w]``."""
+        """The second sweep, at half of the image, around the positions ``center [V, 1, 2 h, 2 w]``."""
         size = (fine.shape[-2], fine.shape[-1])
         warp = _warp(fine, views, sources, 2)
         reach = _FINE_REACH / (planes - 1)
-        center = F.interpolate(refined.detach(), size=size, mode="bilinear", align_corners=False)
         offsets = torch.linspace(-reach, reach, _FINE_PLANES, device=fine.device).view(1, -1, 1, 1)
         position = center + offsets  # [V, D, 2 h, 2 w]
         inverse = to_inverse(position, depth_range).clamp_min(1 / (_FARTHEST * depth_range[1])).flatten(2)

@@ -63,6 +63,14 @@ def _upsample(x: Tensor, like: Tensor) -> Tensor:
     return F.interpolate(x, size=like.shape[-2:], mode="bilinear", align_corners=False)
 
 
+def convex_upsample(x: Tensor, mask: Tensor) -> Tensor:
+    """Doubles ``[V, C, h, w]``: every new pixel is a convex mixture of its 3x3 neighbours, ``mask [V, 36, h, w]``."""
+    views, channels, height, width = x.shape
+    weights = mask.unflatten(1, (9, 4)).softmax(1)  # [V, 9, 4, h, w]
+    around = F.unfold(F.pad(x, (1, 1, 1, 1), mode="replicate"), 3).view(views, channels, 9, 1, height, width)
+    return F.pixel_shuffle((around * weights[:, None]).sum(2).flatten(1, 2), 2)
+
+
 def slices(probability: Tensor, bins: int) -> Tensor:
     """Probability ``[V, D, h, w]`` of the planes summed into ``bins`` channels, whatever their number."""
     flat = probability.flatten(2).transpose(1, 2)  # [V, h w, D]

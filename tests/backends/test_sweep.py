@@ -6,8 +6,9 @@ from torch import Tensor
 
 from backends.sweep.backend import SweepBackend
 from backends.sweep.correlate import GROUPS, SourceWarp, correlate, correlate_reference
-from backends.sweep.head import RESPONSE, DepthHead, _convex_upsample
+from backends.sweep.head import RESPONSE, DepthHead
 from backends.sweep.network import SweepNet
+from backends.sweep.refine import convex_upsample
 from backends.sweep.tokens import DIM
 from backends.sweep.views import agreed_range, choose_sources, wide_range
 from backends.sweep.volume import agreement, expectation, from_inverse, to_inverse, to_planes
@@ -171,7 +172,7 @@ def test_head_answers_the_correction_channels_linearly() -> None:
 def test_upsampling_is_a_convex_mixture() -> None:
     generator = torch.Generator().manual_seed(0)
     x = torch.rand(1, 2, 4, 5, generator=generator)
-    up = _convex_upsample(x, 5 * torch.randn(1, 36, 4, 5, generator=generator))
+    up = convex_upsample(x, 5 * torch.randn(1, 36, 4, 5, generator=generator))
     assert up.shape == (1, 2, 8, 10)
     around = torch.nn.functional.max_pool2d(torch.nn.functional.pad(x, (1, 1, 1, 1), mode="replicate"), 3, 1)
     assert (up <= torch.nn.functional.interpolate(around, scale_factor=2.0) + 1e-6).all()

@@ -13,6 +13,7 @@ import lightning
 import torch
 from lightning.pytorch.callbacks import ModelCheckpoint, RichProgressBar
 from lightning.pytorch.loggers import CSVLogger
+from lightning.pytorch.strategies import DDPStrategy
 from omegaconf import DictConfig
 from torch.utils.data import DataLoader, Subset
 
@@ -37,7 +38,9 @@ def main(config: DictConfig) -> None:
     checkpoint = newest_checkpoint(out) if config.resume == "auto" else config.resume
     training: SweepTraining = hydra.utils.instantiate(config.training)
     first = start_step(checkpoint) if checkpoint else 0
-    samples = Subset(TrainingSamples(files, training.steps, config.seed), range(first, training.steps))
+    per_step = config.processes
+    every = TrainingSamples(files, training.steps * per_step, config.seed)
+    samples = Subset(every, range(first * per_step, len(every)))
     if checkpoint:
         print(f"going on with {checkpoint} at step {first} of {training.steps}", flush=True)
     keep = ModelCheckpoint(
@@ -45,6 +48,8 @@ def main(config: DictConfig) -> None:
     )
     trainer = lightning.Trainer(
         accelerator="cpu",
+        devices=config.processes,
+        strategy="auto" if config.processes == 1 else DDPStrategy(gradient_as_bucket_view=True),
         precision="bf16-mixed",
         max_steps=training.steps,
         callbacks=[keep, RichProgressBar()],
@@ -53,7 +58,8 @@ def main(config: DictConfig) -> None:
         enable_model_summary=False,
     )
     trainer.fit(training, DataLoader(samples, batch_size=None), ckpt_path=checkpoint, weights_only=True)
-    print(write_weights(training, out / "sweep.safetensors", config))
+    if trainer.is_global_zero:
+        print(write_weights(training, out / "sweep.safetensors", config))
 
 
 if __name__ == "__main__":

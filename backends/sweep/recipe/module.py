@@ -55,7 +55,8 @@ class SweepTraining(lightning.LightningModule):
         self.net.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
         self.averaged = AveragedModel(self.net, multi_avg_fn=get_ema_multi_avg_fn(average))
         self.averaged.requires_grad_(False)
-        self._core_seconds = 0.0  # of earlier processes, less what this one had used when it began
+        self._core_seconds = 0.0  # of earlier processes, less what these had used when they began
+        self._processes = 1
 
     def training_step(self, sample: Sample, index: int) -> Tensor:
         """The objective of one sample."""
@@ -100,12 +101,13 @@ class SweepTraining(lightning.LightningModule):
 
     @property
     def core_seconds(self) -> float:
-        """Processor time of the whole training, over all processes that it went on in."""
-        return self._core_seconds + time.process_time()
+        """Processor time of the whole training, over all processes that it ran or went on in."""
+        return self._core_seconds + self._processes * time.process_time()
 
     def on_train_start(self) -> None:
         """Starts the clock."""
-        self._core_seconds -= time.process_time()
+        self._processes = self.trainer.world_size
+        self._core_seconds -= self._processes * time.process_time()
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Keeps the processor time."""

@@ -42,6 +42,7 @@ def objective(encoding: Encoding, depth: Tensor, log_scale: Tensor, sample: Samp
         if cell == 4:
             positions.append(_mean((encoding.refined - t).abs().clamp_max(0.3), known))
         else:
+            positions.append(_mean((encoding.center - t).abs().clamp_max(0.3), known))
             terms["swept"] = _mean((encoding.swept[:, :1] + inverse.log()).abs().clamp_max(_CLAMP), known)
     terms["planes"] = torch.stack(planes).sum()
     terms["position"] = torch.stack(positions).sum()
