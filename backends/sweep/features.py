@@ -111,4 +111,6 @@ def _upsample(x: Tensor, like: Tensor) -> Tensor:
 
 def _unit_groups(x: Tensor) -> Tensor:
     """Makes every group of channels (those of equal c % GROUPS) of ``[N, C, h, w]`` a unit vector, in float32."""
-    return F.normalize(x.float().unflatten(1, (-1, GROUPS)), dim=1, eps=1e-3).flatten(1, 2)
+    grouped = x.float().permute(0, 2, 3, 1).unflatten(-1, (-1, GROUPS))  # [N, h, w, C / GROUPS, GROUPS]
+    length = grouped.square().sum(-2, keepdim=True).clamp_min(1e-6).sqrt()
+    return (grouped / length).flatten(-2).permute(0, 3, 1, 2)

@@ -74,7 +74,7 @@ class PlaneBlock(nn.Module):
         size = x.shape[-2:]
         y = F.relu(self.image(x), inplace=True).permute(0, 2, 3, 1)  # [V D, h, w, C]
         y = y.reshape(-1, planes, size[0] * size[1], y.shape[-1]).permute(0, 3, 1, 2)  # [V, C, D, h w]
-        return to_planes(self.planes(y), (size[0], size[1])).add_(x)
+        return x + to_planes(self.planes(y), (size[0], size[1]))  # in place on a view, gradients would lose channels-last
 
 
 class VolumeNet(nn.Module):
@@ -103,7 +103,8 @@ class VolumeNet(nn.Module):
             y = F.relu(block(y, planes), inplace=True)
         up = F.interpolate(self.up(y), size=x.shape[-2:], mode="bilinear", align_corners=False)
         x = F.relu(up.add_(x), inplace=True)
-        logits = 4 * self.end(self.last(x, planes)).float() + self.sharpness * volume[:, :GROUPS].mean(1, keepdim=True)
+        similarity = volume.permute(0, 2, 3, 1)[..., :GROUPS].mean(-1)  # [V D, h, w]
+        logits = 4 * self.end(self.last(x, planes)).float() + self.sharpness * similarity[:, None]
         return logits.view(-1, planes, *volume.shape[-2:])
 
 

@@ -20,7 +20,7 @@ from torch.utils.data import DataLoader, Subset
 from backends.sweep.recipe.module import SweepTraining
 from backends.sweep.recipe.samples import TrainingSamples
 from backends.sweep.recipe.scenes import make_scenes
-from backends.sweep.recipe.weights import newest_checkpoint, start_step, write_weights
+from backends.sweep.recipe.weights import begin_with, newest_checkpoint, start_step, write_weights
 
 
 @hydra.main(config_path=".", config_name="train", version_base="1.3")
@@ -41,6 +41,8 @@ def main(config: DictConfig) -> None:
     per_step = config.processes
     every = TrainingSamples(files, training.steps * per_step, config.seed)
     samples = Subset(every, range(first * per_step, len(every)))
+    if config.begin and not checkpoint:
+        begin_with(training, Path(config.begin))
     if checkpoint:
         print(f"going on with {checkpoint} at step {first} of {training.steps}", flush=True)
     keep = ModelCheckpoint(

@@ -104,6 +104,10 @@ class SweepTraining(lightning.LightningModule):
         """Processor time of the whole training, over all processes that it ran or went on in."""
         return self._core_seconds + self._processes * time.process_time()
 
+    def count_from(self, core_seconds: float) -> None:
+        """Counts what weights that the training begins with have cost."""
+        self._core_seconds = core_seconds
+
     def on_train_start(self) -> None:
         """Starts the clock."""
         self._processes = self.trainer.world_size

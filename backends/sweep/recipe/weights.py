@@ -6,6 +6,7 @@ from pathlib import Path
 
 import torch
 from omegaconf import DictConfig
+from safetensors import safe_open
 from safetensors.torch import save
 
 from backends.sweep.recipe.module import SweepTraining
@@ -20,6 +21,16 @@ def newest_checkpoint(folder: Path) -> Path | None:
 def start_step(checkpoint: str | Path) -> int:
     """The step that a checkpoint of our own making goes on with."""
     return int(torch.load(checkpoint, map_location="cpu", weights_only=True, mmap=True)["global_step"])
+
+
+def begin_with(training: SweepTraining, path: Path) -> None:
+    """Loads weights into the network and its average; the core-hours that made them count."""
+    with safe_open(path, "pt") as file:
+        state = {name: file.get_tensor(name) for name in file.keys()}
+        hours = float((file.metadata() or {}).get("core_hours", 0))
+    for net in (training.net, training.averaged.module):
+        net.load_state_dict(state)
+    training.count_from(3600 * hours)
 
 
 def write_weights(training: SweepTraining, path: Path, config: DictConfig) -> Path:
