@@ -11,8 +11,8 @@ from torch.nn import functional as F
 
 from backends.sweep.backend import SweepBackend
 from backends.sweep.recipe.objective import cell_inverse
-from backends.sweep.recipe.samples import Sample, TrainingSamples, recolour
-from backends.sweep.recipe.scenes import make_scenes
+from backends.sweep.recipe.samples import Sample, TrainingSamples, _choose_views, _crop, recolour
+from backends.sweep.recipe.scenes import make_scenes, read_scene
 from backends.sweep.recipe.weights import newest_checkpoint
 from tests.commands import ROOT
 from vg2gt.geometry.cameras import project, unproject
@@ -49,6 +49,28 @@ def test_views_of_a_sample_see_the_same_points(scenes: list[Path], index: int) -
             agreed.append(float((((there / z) - 1).abs() < 0.03)[inside].float().mean()))
     assert agreed
     assert np.median(agreed) > 0.6  # the rest is hidden there
+
+
+class _Draws:
+    """Stands in for a random generator: the same window every time, mirrored or not."""
+
+    def __init__(self, mirrored: bool) -> None:
+        self.random = lambda: 0.1 if mirrored else 0.9
+        self.choice = lambda count, p: 0
+        self.uniform = lambda low, high: low
+        self.integers = lambda low, high: low
+
+
+def test_mirrored_windows_show_the_mirrored_world(scenes: list[Path]) -> None:
+    views = _choose_views(read_scene(scenes[0]), np.random.default_rng(0))
+    points = []
+    for mirrored in (False, True):
+        crop = _crop(views, _Draws(mirrored))  # pyright: ignore[reportArgumentType]
+        size = (crop.depth.shape[-2], crop.depth.shape[-1])
+        cameras = Cameras(crop.world_to_camera[None], crop.intrinsics[None], size)
+        points.append(unproject(crop.depth[None], cameras)[0])  # [V, H, W, 3]
+    mirror = torch.tensor([-1.0, 1, 1])
+    torch.testing.assert_close(points[1].flip(2), points[0] * mirror, rtol=1e-4, atol=1e-3)
 
 
 def test_samples_depend_on_their_number_alone(scenes: list[Path]) -> None:
