@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from safetensors import safe_open
 from torch.nn import functional as F
 
-from backends.sweep.backend import SweepBackend
+from backends.sweep.backend import SHIPPED, SweepBackend
 from backends.sweep.recipe.objective import cell_inverse
 from backends.sweep.recipe.samples import Sample, TrainingSamples, _choose_views, _crop, recolour
 from backends.sweep.recipe.scenes import make_scenes, read_scene
@@ -125,3 +126,16 @@ def test_training_resumes_and_writes_weights(scenes: list[Path], tmp_path: Path)
     nets = [SweepBackend(path=str(tmp_path / part / "sweep.safetensors")).network for part in ("whole", "parts")]
     for a, b in zip(nets[0].parameters(), nets[1].parameters(), strict=True):
         torch.testing.assert_close(a, b, rtol=1e-2, atol=1e-3)
+
+
+@pytest.mark.slow
+def test_two_processes_and_given_weights(scenes: list[Path], tmp_path: Path) -> None:
+    """Both processes end on the same weights, which are near those that the training began with."""
+    common = [f"scenes.folder={scenes[0].parent}", "scenes.count=2", f"out={tmp_path}", "training.steps=1"]
+    command = [sys.executable, "-m", "backends.sweep.recipe", *common, "processes=2", f"begin={SHIPPED}"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-3000:]
+    with safe_open(tmp_path / "sweep.safetensors", "pt") as made, safe_open(SHIPPED, "pt") as given:
+        assert float(made.metadata()["core_hours"]) >= float(given.metadata()["core_hours"])
+        for name in given.keys():
+            torch.testing.assert_close(made.get_tensor(name), given.get_tensor(name), rtol=0.05, atol=1e-3)
