@@ -159,7 +159,6 @@ class SweepNet(nn.Module):
         self, fine: Tensor, center: Tensor, views: Views, depth_range: Tensor, sources: Tensor, planes: int
     ) -> Sweep:
         """The second sweep, at half of the image, around the positions ``center [V, 1, 2 h, 2 w]``."""
-        size = (fine.shape[-2], fine.shape[-1])
         warp = _warp(fine, views, sources, 2)
         reach = _FINE_REACH / (planes - 1)
         offsets = torch.linspace(-reach, reach, _FINE_PLANES, device=fine.device).view(1, -1, 1, 1)

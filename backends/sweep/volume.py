@@ -74,7 +74,9 @@ class PlaneBlock(nn.Module):
         size = x.shape[-2:]
         y = F.relu(self.image(x), inplace=True).permute(0, 2, 3, 1)  # [V D, h, w, C]
         y = y.reshape(-1, planes, size[0] * size[1], y.shape[-1]).permute(0, 3, 1, 2)  # [V, C, D, h w]
-        return x + to_planes(self.planes(y), (size[0], size[1]))  # in place on a view, gradients would lose channels-last
+        return x + to_planes(
+            self.planes(y), (size[0], size[1])
+        )  # in place on a view, gradients would lose channels-last
 
 
 class VolumeNet(nn.Module):

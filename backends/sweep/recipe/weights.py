@@ -26,7 +26,7 @@ def start_step(checkpoint: str | Path) -> int:
 def begin_with(training: SweepTraining, path: Path) -> None:
     """Loads weights into the network and its average; the core-hours that made them count."""
     with safe_open(path, "pt") as file:
-        state = {name: file.get_tensor(name) for name in file.keys()}
+        state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
         hours = float((file.metadata() or {}).get("core_hours", 0))
     for net in (training.net, training.averaged.module):
         net.load_state_dict(state)
