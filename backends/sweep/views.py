@@ -13,6 +13,7 @@ _LEAST_PARALLAX, _MOST_PARALLAX = (
     0.08,
     0.5,
 )  # baseline over depth: below it little is gained, above it views look unlike
+_SEEN_AGAIN = 0.4  # worth of a point in one more source, relative to one source fewer
 _WIDE = (0.2, 40.0)  # the first sweep's range in units of the cameras' largest distance
 
 
@@ -39,7 +40,8 @@ def choose_sources(
     """Indices ``[V, n]`` of the views that every view is compared with, the best first.
 
     A source is good if it sees what the view sees, at depths between near and far, from a little aside: the score is
-    the overlap times a reward for parallax that falls again for wide baselines.
+    the overlap times a reward for parallax that falls again for wide baselines. What the sources chosen before see
+    already counts less, so that together they cover the view.
 
     Args:
         world_to_camera: ``[V, 4, 4]``.
@@ -64,11 +66,19 @@ def choose_sources(
     inside = (z > 0) & (u > -0.5) & (u < _GRID[1] - 0.5) & (v > -0.5) & (v < _GRID[0] - 0.5)
     parallax = poses[..., :3, 3].norm(dim=-1) / depths[_DEPTHS // 2]
     reward = parallax / (parallax + _LEAST_PARALLAX) / (1 + (parallax / _MOST_PARALLAX) ** 2)
-    score = inside.float().mean((-1, -2)) * reward
     if jitter:
-        score = score * torch.exp(jitter * torch.randn_like(score))
-    score = score.masked_fill(torch.eye(views, dtype=torch.bool, device=score.device), -1.0)
-    return score.topk(min(count, views - 1), dim=1).indices
+        reward = reward * torch.exp(jitter * torch.randn_like(reward))
+    seen = inside.flatten(2).float()  # [V, s, z p]
+    left = torch.ones_like(seen[:, 0])  # [V, z p] what another look at a point is worth
+    reward = reward.masked_fill(torch.eye(views, dtype=torch.bool, device=reward.device), -torch.inf)
+    chosen = []
+    for _ in range(min(count, views - 1)):
+        score = (seen * left[:, None]).mean(-1).clamp_min(1e-6) * reward  # [V, s]
+        best = score.argmax(1)
+        chosen.append(best)
+        left = left * torch.where(seen[everyone[0], best] > 0, _SEEN_AGAIN, 1.0)
+        reward = reward.scatter(1, best[:, None], -torch.inf)
+    return torch.stack(chosen, 1)
 
 
 def camera_extent(world_to_camera: Tensor) -> Tensor:

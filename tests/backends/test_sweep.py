@@ -120,6 +120,17 @@ def test_sources_overlap_and_have_parallax() -> None:
     assert choose_sources(still, intrinsics, size, depth_range, 1)[0, 0] != 1
 
 
+def test_sources_together_cover_the_view() -> None:
+    """View 0 looks at what 1 and 2 see on the left and 3 on the right: the two best see the same half."""
+    poses, intrinsics = row_of_cameras(4)
+    turns = torch.tensor([0.0, 0.5, 0.5, -0.5])
+    poses[:, 0, 0], poses[:, 0, 2] = turns.cos(), turns.sin()
+    poses[:, 2, 0], poses[:, 2, 2] = -turns.sin(), turns.cos()
+    poses[:, 0, 3] = torch.tensor([0.0, 0.5, 0.6, -0.2])
+    size, depth_range = (14, 22), torch.tensor([2.0, 6.0])
+    assert choose_sources(poses, intrinsics, size, depth_range, 3)[0].tolist() == [1, 3, 2]
+
+
 def test_ranges() -> None:
     poses, _ = row_of_cameras(4)
     torch.testing.assert_close(wide_range(poses), torch.tensor([0.12, 24.0]), rtol=1e-4, atol=0)
