@@ -120,6 +120,16 @@ def test_sources_overlap_and_have_parallax() -> None:
     assert choose_sources(still, intrinsics, size, depth_range, 1)[0, 0] != 1
 
 
+def test_sources_are_not_too_far_aside() -> None:
+    """All look at a point 4 in front of view 0, from 0, 60 and 10 degrees."""
+    angles = torch.deg2rad(torch.tensor([0.0, 60, 10]))
+    poses, intrinsics = row_of_cameras(3)
+    poses[:, 0, 0], poses[:, 0, 2] = angles.cos(), angles.sin()
+    poses[:, 2, 0], poses[:, 2, 2] = -angles.sin(), angles.cos()
+    poses[:, :3, 3] = torch.tensor([0.0, 0, 4]) - poses[:, :3, :3] @ torch.tensor([0.0, 0, 4])
+    assert choose_sources(poses, intrinsics, (14, 22), torch.tensor([3.0, 6.0]), 1)[0].tolist() == [2]
+
+
 def test_sources_together_cover_the_view() -> None:
     """View 0 looks at what 1 and 2 see on the left and 3 on the right: the two best see the same half."""
     poses, intrinsics = row_of_cameras(4)

@@ -11,10 +11,12 @@ from safetensors import safe_open
 from torch.nn import functional as F
 
 from backends.sweep.backend import SHIPPED, SweepBackend
-from backends.sweep.recipe.objective import cell_inverse
+from backends.sweep.network import Encoding, Sweep
+from backends.sweep.recipe.objective import cell_inverse, objective
 from backends.sweep.recipe.samples import Sample, TrainingSamples, _choose_views, _crop, recolour
 from backends.sweep.recipe.scenes import make_scenes, read_scene
 from backends.sweep.recipe.weights import newest_checkpoint
+from backends.sweep.volume import from_inverse
 from tests.commands import ROOT
 from vg2gt.geometry.cameras import project, unproject
 from vg2gt.types import Cameras
@@ -105,6 +107,58 @@ def test_cells_know_their_middle() -> None:
     hole = (1 / inverse).clone()
     hole[0, 1, 1] = 0
     assert cell_inverse(hole, 4)[1].flatten().tolist() == [0, 1, 1, 1, 1, 1, 1, 1]
+
+
+@pytest.fixture
+def slope() -> tuple[Sample, Encoding, torch.Tensor]:
+    """A slanted plane, the sweeps that find it exactly, and its depth."""
+    inverse = (0.2 + 0.01 * torch.arange(16.0).view(1, 1, 16) + 0.02 * torch.arange(16.0).view(1, 16, 1)).expand(
+        2, -1, -1
+    )
+    depth_range = torch.tensor([1.0, 10.0])
+    sample = Sample(torch.zeros(2, 3, 16, 16), 1 / inverse, torch.eye(4), torch.eye(3), depth_range, 16, 1)
+    sweeps = []
+    for cell, planes in ((4, 16), (2, 12)):
+        t = from_inverse(cell_inverse(sample.depth, cell)[0], depth_range)
+        position = torch.linspace(0, 1, planes).view(1, -1, 1, 1)
+        if cell == 2:  # the second sweep's planes stand around the first one's depth
+            position = t + 0.02 * torch.linspace(-1, 1, planes).view(1, -1, 1, 1)
+        share = (1 - (position - t).abs() / (position[:, 1:2] - position[:, :1])).clamp_min(1e-6)
+        sweeps.append(Sweep(share.log(), position, t, torch.ones_like(t)))
+    first, second = sweeps
+    swept = torch.cat((-cell_inverse(sample.depth, 2)[0].log(), second.mass), 1)
+    nothing = torch.zeros(())
+    found = Encoding((), nothing, nothing, swept, first, first.t, second.t, second)
+    return sample, found, sample.depth
+
+
+def test_the_objective_is_lowest_at_the_truth(slope) -> None:
+    sample, found, depth = slope
+    unsure = torch.full_like(depth, -3.0)
+    best = objective(found, depth, unsure, sample)[1]
+    assert all(float(best[name]) < 1e-5 for name in ("depth", "gradient", "position", "swept"))
+
+    def worse(term: str, encoding: Encoding = found, decoded: torch.Tensor = depth) -> bool:
+        return float(objective(encoding, decoded, unsure, sample)[1][term]) > float(best[term]) + 1e-3
+
+    assert worse("depth", decoded=1.1 * depth)
+    assert not worse("gradient", decoded=1.1 * depth)  # the shape is right
+    assert worse("gradient", decoded=depth * (1 + 0.1 * torch.rand(depth.shape, generator=torch.Generator())))
+    assert worse("swept", found._replace(swept=found.swept + 0.1))
+    for name in ("first", "second"):
+        sweep = getattr(found, name)
+        for step in (1, -1):
+            assert worse("planes", found._replace(**{name: sweep._replace(logits=sweep.logits.roll(step, 1))}))
+        assert worse("position", found._replace(**{name: sweep._replace(t=sweep.t + 0.01)}))
+    for name in ("refined", "center"):
+        assert worse("position", found._replace(**{name: getattr(found, name) + 0.01}))
+
+
+def test_uncertainty_is_lowest_where_it_says_the_error(slope) -> None:
+    sample, found, depth = slope
+    scales = torch.linspace(-4, 0, 41)
+    terms = [objective(found, 1.1 * depth, torch.full_like(depth, float(s)), sample)[1]["uncertainty"] for s in scales]
+    assert abs(float(scales[torch.stack(terms).argmin()].exp()) - np.log(1.1)) < 0.01
 
 
 @pytest.mark.slow
