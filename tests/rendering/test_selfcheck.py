@@ -69,7 +69,8 @@ def test_wrong_kernels_are_refused(name: str, tmp_path: Path, monkeypatch: pytes
             monkeypatch.setattr(kernels, kernel, getattr(wrong, kernel))
     found = selfcheck.compare(render, torch.device("cpu"), ("rasterized",))
     assert not found.good
-    assert max(found.values / VALUES, found.gradients / GRADIENTS) > 10
+    # Far outside the bounds, or not a number: a tile that is left out keeps whatever was in memory.
+    assert not max(found.values / VALUES, found.gradients / GRADIENTS) <= 10
 
 
 @pytest.fixture
