@@ -24,7 +24,7 @@ MUTANTS = {
     "sign flipped": ("tiles", "ge = -0.5 * ga * inverse", "ge = 0.5 * ga * inverse"),
     "off by one tile": ("tiles", "x = (tile % across) * _TILE", "x = (tile % across + 1) * _TILE"),
     "rows not summed": (
-        "projection",
+        "projection_backward",
         "most = tl.max(count, 0)",
         "count = tl.minimum(count, 1); most = tl.max(count, 0)",
     ),

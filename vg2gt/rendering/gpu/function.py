@@ -16,7 +16,8 @@ from torch import Tensor
 
 from vg2gt.rendering.gpu import kernels as launchable
 from vg2gt.rendering.gpu.binning import ENTRIES
-from vg2gt.rendering.gpu.projection import BLOCK, CAMERA, REFUSED
+from vg2gt.rendering.gpu.projection import BLOCK, REFUSED
+from vg2gt.rendering.gpu.projection_backward import CAMERA
 from vg2gt.rendering.gpu.tiles import RECORD, TILE
 from vg2gt.rendering.options import (
     BRACKET_SIGMAS,

@@ -198,43 +198,34 @@ def _part(records, members, place, last, px, py, solvable, lo, step, alpha_max: 
             passed = (1.0 - alpha) * (1.0 - alpha)
             sharp = (-0.5 * _LOG2E) * tl.load(g + 8) * r
             t = lo - tl.load(g + 7) * s * inverse
-            free = 1.0 - alpha * tl.exp2(sharp * t * t)
-            n0 *= tl.where(t <= 0, free, passed)
-            d0 *= tl.where(t <= 0, 1.0, free)
+            n0, d0 = _behind(n0, d0, t, alpha, sharp, passed)
             t += step
-            free = 1.0 - alpha * tl.exp2(sharp * t * t)
-            n1 *= tl.where(t <= 0, free, passed)
-            d1 *= tl.where(t <= 0, 1.0, free)
+            n1, d1 = _behind(n1, d1, t, alpha, sharp, passed)
             t += step
-            free = 1.0 - alpha * tl.exp2(sharp * t * t)
-            n2 *= tl.where(t <= 0, free, passed)
-            d2 *= tl.where(t <= 0, 1.0, free)
+            n2, d2 = _behind(n2, d2, t, alpha, sharp, passed)
             t += step
-            free = 1.0 - alpha * tl.exp2(sharp * t * t)
-            n3 *= tl.where(t <= 0, free, passed)
-            d3 *= tl.where(t <= 0, 1.0, free)
+            n3, d3 = _behind(n3, d3, t, alpha, sharp, passed)
             t += step
-            free = 1.0 - alpha * tl.exp2(sharp * t * t)
-            n4 *= tl.where(t <= 0, free, passed)
-            d4 *= tl.where(t <= 0, 1.0, free)
+            n4, d4 = _behind(n4, d4, t, alpha, sharp, passed)
             t += step
-            free = 1.0 - alpha * tl.exp2(sharp * t * t)
-            n5 *= tl.where(t <= 0, free, passed)
-            d5 *= tl.where(t <= 0, 1.0, free)
+            n5, d5 = _behind(n5, d5, t, alpha, sharp, passed)
             t += step
-            free = 1.0 - alpha * tl.exp2(sharp * t * t)
-            n6 *= tl.where(t <= 0, free, passed)
-            d6 *= tl.where(t <= 0, 1.0, free)
+            n6, d6 = _behind(n6, d6, t, alpha, sharp, passed)
             t += step
-            free = 1.0 - alpha * tl.exp2(sharp * t * t)
-            n7 *= tl.where(t <= 0, free, passed)
-            d7 *= tl.where(t <= 0, 1.0, free)
+            n7, d7 = _behind(n7, d7, t, alpha, sharp, passed)
         place += 1
         live = (place < last) & (tl.max(before, 0) > 0)
     parts = (n1 > 0.25 * d1).to(tl.int32) + (n2 > 0.25 * d2).to(tl.int32) + (n3 > 0.25 * d3).to(tl.int32)
     parts += (n4 > 0.25 * d4).to(tl.int32) + (n5 > 0.25 * d5).to(tl.int32) + (n6 > 0.25 * d6).to(tl.int32)
     parts += (n7 > 0.25 * d7).to(tl.int32)
     return parts.to(px.dtype), n0 > 0.25 * d0
+
+
+@triton.jit
+def _behind(numerator, denominator, t, alpha, sharp, passed):
+    """Multiplies the squared transmittance, a quotient, by that of a Gaussian at an offset ``t`` from its peak."""
+    free = 1.0 - alpha * tl.exp2(sharp * t * t)
+    return numerator * tl.where(t <= 0, free, passed), denominator * tl.where(t <= 0, 1.0, free)
 
 
 @triton.jit
