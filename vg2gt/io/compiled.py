@@ -55,11 +55,6 @@ def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     return compile_later
 
 
-def cache_folder() -> Path | None:
-    """Where this project keeps what it computed about a machine, compiled kernels above all; None if nowhere."""
-    return _writable_base()
-
-
 def _room(source: Path) -> Path:
     """The folder that a kernel of this file is made of."""
     rooms = [PACKAGES / room for room in ROOMS if source.resolve().is_relative_to(PACKAGES / room)]
@@ -71,7 +66,7 @@ def _room(source: Path) -> Path:
 @lru_cache
 def _folder(room: Path) -> Path | None:
     """Where kernels of a room are kept; None where nothing can be written."""
-    base = _writable_base()
+    base = cache_folder()
     folder = base and _tried(base / f"{room.name}-{_digest(room)}")
     if base is None or folder is None:
         log.warning("compiled kernels cannot be kept, every start compiles them anew: name a folder by %s", VARIABLE)
@@ -90,7 +85,8 @@ def _digest(room: Path) -> str:
     return content.hexdigest()[:16]
 
 
-def _writable_base() -> Path | None:
+def cache_folder() -> Path | None:
+    """Where this project keeps what it computed about a machine, compiled kernels above all; None if nowhere."""
     given = os.environ.get(VARIABLE)
     if given:
         return _tried(Path(given) / "vg2gt")

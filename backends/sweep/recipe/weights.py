@@ -41,6 +41,7 @@ def write_weights(training: SweepTraining, path: Path, config: DictConfig) -> Pa
         "steps": str(training.global_step),
         "scenes": f"{config.scenes.count} from seed {config.scenes.first_seed}",
         "seed": str(config.seed),
+        "begun_with": Path(config.begin).name if config.begin else "random weights",
         "core_hours": f"{training.core_seconds / 3600:.2f}",
     }
     write_bytes(path, save(tensors, metadata=made_of))
