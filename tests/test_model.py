@@ -55,6 +55,25 @@ def test_untrained_head_renders_the_room_without_holes(run: Run, model: VG2GT, b
     assert float(error) < 0.1
 
 
+def test_rays_that_meet_nothing_show_the_scenes_mean_colour(run: Run, model: VG2GT, batch: Batch) -> None:
+    prediction = model(batch.context.images, batch.context.hints)
+    background = prediction.gaussians.background
+    assert background is not None
+    torch.testing.assert_close(background, batch.context.images.mean((1, 3, 4)))
+    cameras = prediction.geometry.cameras
+    away = replace(cameras, world_to_camera=cameras.world_to_camera.clone())
+    away.world_to_camera[..., 2, 3] -= 1000.0
+    seen = run.module.renderer(prediction.gaussians, away).color[0, 0]
+    torch.testing.assert_close(seen, background[0, :, None, None].expand_as(seen))
+    model.background = "black"
+    try:
+        assert model(batch.context.images, batch.context.hints).gaussians.background is None
+    finally:
+        model.background = "mean"
+    with pytest.raises(ValueError, match=r"model\.background is 'white'; choose one of mean, black"):
+        VG2GT(model.backend, SceneScale(), None, lambda **_: model.fine, lambda **_: model.gaussians, True, "white")
+
+
 def test_gradient_reaches_the_last_coarse_layer_first_and_the_transformer_next(run: Run, batch: Batch) -> None:
     model = full_model(run).train()
     assert model.coarse is not None

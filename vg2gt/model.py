@@ -29,6 +29,7 @@ from vg2gt.memory import note_sizes
 from vg2gt.profiling import stage
 from vg2gt.types import Gaussians, Geometry, Hints, Prediction, Tokens, Voxels
 
+Background = Literal["mean", "black"]
 ScaleSource = Literal["metric", "focal", "normalize", "groundtruth"]
 BACKBONE_PREFIX = "backend."
 CANONICAL_FOCAL = 300.0  # appendix A.1: d_metric = f * d_net / 300
@@ -77,13 +78,16 @@ class Reconstructor(nn.Module, ABC):
     Args:
         backend: the frozen visual foundation model.
         scale: fixes the scene unit.
+        background: what rays see that meet no Gaussian: the ``mean`` colour of the scene's images, or ``black``.
 
     Raises:
-        ValueError: if the scale is to be metric and the backend is not.
+        ValueError: if the scale is to be metric and the backend is not, or the background is unknown.
     """
 
-    def __init__(self, backend: Backend, scale: SceneScale) -> None:
+    def __init__(self, backend: Backend, scale: SceneScale, background: Background = "black") -> None:
         super().__init__()
+        if background not in get_args(Background):
+            raise ValueError(f"model.background is {background!r}; choose one of {', '.join(get_args(Background))}")
         if scale.source == "metric" and not backend.is_metric:
             raise ValueError(
                 f"model.scale.source=metric needs a backend that knows metres, {backend.name} does not: "
@@ -92,6 +96,7 @@ class Reconstructor(nn.Module, ABC):
         backend.freeze()  # a subclass may have added layers after its parent's constructor froze those before
         self.backend = backend
         self.scale = scale
+        self.background: Background = background
         self.token_cache: TokenCache | None = None  # set where view sets come again
 
     @abstractmethod
@@ -126,6 +131,15 @@ class Reconstructor(nn.Module, ABC):
                 raw = self.backend.decode(tokens)
         unit = self.scale(raw, hints)
         return tokens, _to_scene_frame(raw, unit), unit
+
+    def before_background(self, gaussians: Gaussians, images: Tensor) -> Gaussians:
+        """Sets what rays see that meet none of the Gaussians made of ``images`` ``[B, V, 3, H, W]``.
+
+        No input view saw what lies there; its most likely colour, if nothing else is known, is the scene's mean.
+        """
+        if self.background == "black":
+            return gaussians
+        return replace(gaussians, background=images.detach().float().mean((1, 3, 4)))
 
     def trained_parameters(self) -> list[nn.Parameter]:
         """The parameters that training changes: everything but the backbone."""
@@ -182,9 +196,10 @@ class VG2GT(Reconstructor):
         fine: makes the fine-level voxel module from ``token_dims`` and ``patch_size``.
         gaussians: makes the self-splitting Gaussian head from ``in_channels``.
         keep_scale: the enhanced depth keeps the scale of the backbone's, see :func:`with_scale_of`.
+        background: see :class:`Reconstructor`.
 
     Raises:
-        ValueError: if the scale is to be metric and the backend is not.
+        ValueError: if the scale is to be metric and the backend is not, or the background is unknown.
     """
 
     def __init__(
@@ -195,8 +210,9 @@ class VG2GT(Reconstructor):
         fine: Callable[..., nn.Module],
         gaussians: Callable[..., nn.Module],
         keep_scale: bool = True,
+        background: Background = "black",
     ) -> None:
-        super().__init__(backend, scale)
+        super().__init__(backend, scale, background)
         dims, patch = backend.token_dims, backend.patch_size
         self.keep_scale = keep_scale
         self.coarse = coarse(token_dims=dims, patch_size=patch) if coarse else None
@@ -230,7 +246,7 @@ class VG2GT(Reconstructor):
         with stage("fine"):
             voxels: Voxels = self.fine(tokens, geometry, images)
         with stage("gaussians"):
-            gaussians: Gaussians = self.gaussians(voxels)
+            gaussians: Gaussians = self.before_background(self.gaussians(voxels), images)
         return Prediction(initial, geometry, voxels, gaussians, unit)
 
 

@@ -258,6 +258,7 @@ class Gaussians(TensorRecord):
         opacities: ``[G]`` in (0, 1).
         sh: ``[G, (L + 1)^2, 3]`` real spherical-harmonic colour coefficients, world frame; colour = 1/2 + sum.
         batch: ``[G]`` int64 scene index, sorted.
+        background: ``[B, 3]`` colour in [0, 1] of rays that meet no Gaussian; None is black.
     """
 
     means: Tensor
@@ -266,6 +267,7 @@ class Gaussians(TensorRecord):
     opacities: Tensor
     sh: Tensor
     batch: Tensor
+    background: Tensor | None = None
 
     def __len__(self) -> int:
         return self.means.shape[0]
@@ -281,6 +283,7 @@ class Gaussians(TensorRecord):
             self.opacities[rows],
             self.sh[rows],
             torch.zeros_like(self.batch[rows]),
+            None if self.background is None else self.background[index : index + 1],
         )
 
 

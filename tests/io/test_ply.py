@@ -33,6 +33,27 @@ def assert_same(read: Gaussians, written: Gaussians) -> None:
     assert torch.equal(read.batch, written.batch)
 
 
+@pytest.mark.parametrize(
+    ("comment", "background"),
+    [
+        ("background 0.25 0.5 1", [[0.25, 0.5, 1.0]]),
+        ("background 0.25 0.5", None),
+        ("background 0.25 0.5 1.5", None),
+        ("background grey", None),
+        ("made by somebody 0.25 0.5 1", None),
+    ],
+)
+def test_the_colour_behind_a_scene(tmp_path: Path, comment: str, background: list[list[float]] | None) -> None:
+    behind = torch.tensor([[0.25, 0.5, 1.0]])
+    path = write_gaussian_ply(tmp_path / "scene.ply", replace(scene(3, 0), background=behind))
+    content = path.read_bytes()
+    assert b"\ncomment background 0.25 0.5 1\n" in content
+    path.write_bytes(content.replace(b"background 0.25 0.5 1", comment.encode()))
+    found = read_gaussian_ply(path)
+    assert len(found) == 3
+    assert (found.background if found.background is None else found.background.tolist()) == background
+
+
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("count", [0, 1, 300])
 def test_round_trip(tmp_path: Path, degree: int, count: int) -> None:

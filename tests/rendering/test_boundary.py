@@ -6,12 +6,12 @@ import hydra
 import pytest
 import torch
 
-from tests.rendering.scenes import IMPLEMENTATIONS, floats_to, images, pinhole, soup, with_gradients
+from tests.rendering.scenes import IMPLEMENTATIONS, cameras_around, floats_to, images, pinhole, soup, with_gradients
 from vg2gt.config import compose
 from vg2gt.rendering import Renderer, render
-from vg2gt.rendering.options import Mode
+from vg2gt.rendering.options import Mode, RenderOptions
 from vg2gt.rendering.renderer import Implementation
-from vg2gt.types import Cameras, Gaussians
+from vg2gt.types import Cameras, Gaussians, Render
 
 MODES: tuple[Mode, ...] = ("solid", "rasterized")
 
@@ -138,6 +138,48 @@ def test_configuration_builds_the_renderer(name: Mode) -> None:
     torch.testing.assert_close(out.color, render(gaussians, cameras, name, (1.0, 0.0, 0.0)).color)
     other = renderer(gaussians, cameras, mode="solid")
     torch.testing.assert_close(other.depth, render(gaussians, cameras, "solid").depth)
+
+
+def two_scenes() -> tuple[Gaussians, Cameras]:
+    """Two scenes of 20 Gaussians in two views each, each with a background of its own."""
+    colors = torch.tensor([[1.0, 0.5, 0.0], [0.1, 0.2, 0.9]], dtype=torch.float64)
+    return replace(soup(20, scenes=2), background=colors), cameras_around((9, 12), scenes=2)
+
+
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+def test_every_scene_has_its_own_background_unless_one_is_given(implementation: Implementation) -> None:
+    gaussians, cameras = two_scenes()
+    assert gaussians.background is not None
+    out = render(gaussians, cameras, implementation=implementation)
+    for scene, color in enumerate(gaussians.background):
+        alone = render(gaussians.scene(scene), cameras.scene(scene), implementation=implementation)
+        given = render(gaussians, cameras, background=color, implementation=implementation)
+        torch.testing.assert_close(out.color[scene], alone.color[0])
+        torch.testing.assert_close(out.color[scene], given.color[scene])
+    assert (out.color - render(replace(gaussians, background=None), cameras).color).abs().max() > 0.1
+
+
+def test_the_kernels_that_know_one_background_get_each_scenes_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    gpu = pytest.importorskip("vg2gt.rendering.gpu", exc_type=ImportError)
+    gaussians, cameras = two_scenes()
+    monkeypatch.setattr("vg2gt.rendering.renderer._resolve", lambda *_: "triton")
+
+    def stand_in(gaussians: Gaussians, cameras: Cameras, background: torch.Tensor, options: RenderOptions) -> Render:
+        assert background.shape == (3,)
+        with monkeypatch.context() as patch:
+            patch.setattr("vg2gt.rendering.renderer._resolve", lambda *_: "dense")
+            return render(gaussians, cameras, background=background)
+
+    monkeypatch.setattr(gpu, "render_triton", stand_in)
+    found = render(gaussians, cameras).color
+    monkeypatch.undo()
+    torch.testing.assert_close(found, render(gaussians, cameras, implementation="dense").color)
+
+
+def test_a_background_of_another_number_of_scenes_is_refused() -> None:
+    gaussians = replace(soup(5), background=torch.zeros(2, 3))
+    with pytest.raises(ValueError, match=r"one colour per scene \[1, 3\], got \[2, 3\]"):
+        render(gaussians, pinhole((4, 4)))
 
 
 def test_half_precision_input_renders_in_float32() -> None:

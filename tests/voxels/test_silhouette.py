@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from vg2gt.voxels.silhouette import on_surface
+from vg2gt.voxels.silhouette import beside_silhouettes, on_surface
 
 
 def _blurred_step(near: float, far: float) -> torch.Tensor:
@@ -45,3 +45,25 @@ def test_unknown_depth_is_no_silhouette() -> None:
     depth = torch.full((1, 20, 20), 1.5)
     depth[:, :, 10:] = 0
     assert on_surface(depth)[depth > 0].all()
+
+
+@pytest.mark.parametrize(("step", "beside"), [(1.14, False), (1.16, True)])
+def test_three_pixels_on_either_side_of_a_step_are_beside_it(step: float, beside: bool) -> None:
+    depth = torch.full((2, 12, 16), 2.0)
+    depth[..., 8:] *= step
+    expected = torch.zeros(2, 12, 16, dtype=torch.bool)
+    expected[..., 5:11] = beside
+    assert torch.equal(beside_silhouettes(depth), expected)
+
+
+def test_what_lies_between_foreground_and_background_is_beside_a_silhouette() -> None:
+    depth = _blurred_step(1.0, 1.12)  # too small a step for a surface to break off
+    assert beside_silhouettes(depth).flatten().nonzero().flatten().tolist() == [
+        16 * row + column for row in range(12) for column in (7, 8)
+    ]
+
+
+def test_a_hole_is_no_silhouette_and_not_beside_one() -> None:
+    depth = torch.full((1, 20, 20), 1.5)
+    depth[:, :, 10:] = 0
+    assert not beside_silhouettes(depth).any()

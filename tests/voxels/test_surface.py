@@ -10,7 +10,7 @@ from torch import Tensor
 from vg2gt.types import Cameras, Geometry
 from vg2gt.voxels import coarse
 from vg2gt.voxels.grid import plan_voxels
-from vg2gt.voxels.surface import PointFrames, cell_centroids, vectors_to_surface, voxel_evidence
+from vg2gt.voxels.surface import PointFrames, cell_centroids, disagreement, gate, vectors_to_surface, voxel_evidence
 
 TURN = torch.tensor([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]])  # world z becomes the camera's -x, world x its z
 
@@ -171,6 +171,61 @@ def test_a_scene_of_few_voxels_is_told_of_its_own_only(make_room, make_coarse) -
     )
     module(tokens.map(lambda tensor: tensor[1:]), alone)
     torch.testing.assert_close(told[0][3:, 24:29], told[1][:, 24:29])
+
+
+# ------------------------------------------------------------------------------------------------- the gate
+
+
+def test_disagreement_is_the_median_of_a_scenes_usable_points() -> None:
+    change = torch.tensor([0.1, -0.5, 0.3, 9.0, -2.0, 1.0])
+    usable = torch.tensor([True, True, True, False, True, False])
+    found = disagreement(change, usable, torch.tensor([0, 0, 0, 0, 1, 2]), 4)
+    torch.testing.assert_close(found, torch.tensor([0.3, 2.0, 0.0, 0.0]))
+
+
+def test_the_gate_closes_with_the_third_power_and_opens_no_wider_than_one_and_a_half() -> None:
+    torch.testing.assert_close(gate(torch.tensor([0.0, 0.2, 0.4, 3.0])), torch.tensor([0.0, 0.125, 1.0, 1.5]))
+
+
+def updates(module: coarse.CoarseModule, geometry: Geometry, make_room) -> Tensor:
+    """What a module with non-zero weights in its zero projections adds to the last tap, ``[1, 2, P, D]``."""
+    tokens = make_room(views=2)[0]
+    for parameter in module.zero.parameters():
+        torch.nn.init.constant_(parameter, 0.1)
+    with torch.no_grad():
+        return module.eval()(tokens, geometry).patch[-1] - tokens.patch[-1]
+
+
+@pytest.mark.parametrize(("apart", "factor"), [(1.0, 0.0), (1.008, 0.125), (1.016, 1.0), (1.04, 1.5)])
+def test_what_is_changed_follows_the_views_disagreement(apart: float, factor: float, make_room, make_coarse) -> None:
+    """Two planes x % apart: each view is x / 2 % from their mean, in units of 2 %."""
+    geometry = two_views_of_a_plane(apart, 1.0)
+    free = updates(make_coarse(voxel_size=0.15), geometry, make_room)
+    gated = updates(make_coarse(voxel_size=0.15, gate=True), geometry, make_room)
+    share = (gated * free).sum() / free.square().sum()
+    assert float(share) == pytest.approx(factor, rel=0.35, abs=1e-4)
+    torch.testing.assert_close(gated, share * free, atol=1e-4, rtol=1e-3)
+
+
+def test_beside_a_silhouette_there_is_no_evidence(make_room, make_coarse) -> None:
+    """Views that disagree by 4 %; the right half of what they see is twice as far."""
+    tokens, geometry = make_room(views=2)[0], two_views_of_a_plane(1.04, 1.0)
+    geometry.depth[..., 42:] *= 2
+    module = make_coarse(voxel_size=0.15, gate=True)
+    told = inputs_of(module.fuse[0])
+    module(tokens, geometry)
+    evidence = told[0][:, 24:28].abs().amax((0, 1))  # [3, 6 patches of 14 pixels]: the step is between 2 and 3
+    assert (evidence[:, 4:] > 0).any() or (evidence[:, :2] > 0).any()
+    # of a patch's four points the two next to the step (7 pixels wide, the step's reach is 3) are left out
+    points = coarse.PatchPoints(geometry, 7, torch.tensor([0.15]), away_from_silhouettes=True)
+    assert points.clear is not None
+    columns = points.rows % 12
+    assert set(columns[~points.clear].tolist()) == {5, 6}
+
+
+def test_a_gate_needs_evidence(make_coarse) -> None:
+    with pytest.raises(ValueError, match=r"coarse\.gate=true.*coarse\.surface_evidence=true"):
+        make_coarse(gate=True, surface_evidence=False)
 
 
 # ------------------------------------------------------------------------------------------- without the additions

@@ -12,7 +12,7 @@ from torch.nn import functional as F
 
 from backends.base import Backend
 from vg2gt.geometry.cameras import invert_rigid, ray_directions
-from vg2gt.model import Reconstructor, SceneScale
+from vg2gt.model import Background, Reconstructor, SceneScale
 from vg2gt.profiling import stage
 from vg2gt.types import Gaussians, Geometry, Hints, Prediction, TensorRecord
 from vg2gt.voxels import DenseHead
@@ -94,6 +94,7 @@ class PixelReconstructor(Reconstructor):
         scale: fixes the scene unit.
         dense_head: makes the dense head from ``token_dims`` and ``patch_size``.
         gaussians: makes the pixel head from ``in_channels``.
+        background: see :class:`vg2gt.model.Reconstructor`.
     """
 
     def __init__(
@@ -102,8 +103,9 @@ class PixelReconstructor(Reconstructor):
         scale: SceneScale,
         dense_head: Callable[..., DenseHead],
         gaussians: Callable[..., nn.Module],
+        background: Background = "black",
     ) -> None:
-        super().__init__(backend, scale)
+        super().__init__(backend, scale, background)
         self.dense_head = dense_head(token_dims=backend.token_dims, patch_size=backend.patch_size)
         self.gaussians = gaussians(in_channels=self.dense_head.out_channels)
 
@@ -117,7 +119,7 @@ class PixelReconstructor(Reconstructor):
         with stage("gaussians"), torch.autocast(images.device.type, enabled=False):
             pixels = usable_pixels(geometry, images)
             features = F.gelu(dense.float()).index_select(0, pixels.rows)
-            gaussians = self.make_gaussians(features, pixels, geometry)
+            gaussians = self.before_background(self.make_gaussians(features, pixels, geometry), images)
         return Prediction(geometry, geometry, None, gaussians, unit)
 
     @abstractmethod

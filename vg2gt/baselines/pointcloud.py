@@ -10,7 +10,7 @@ from torch import Tensor
 from backends.base import Backend
 from vg2gt.baselines.pixels import Pixels, usable_pixels
 from vg2gt.geometry.spherical_harmonics import rgb_to_sh
-from vg2gt.model import Reconstructor, SceneScale
+from vg2gt.model import Background, Reconstructor, SceneScale
 from vg2gt.profiling import stage
 from vg2gt.types import Gaussians, Hints, Prediction
 from vg2gt.voxels.knn import nearest_neighbors
@@ -29,6 +29,7 @@ class PointCloud(Reconstructor):
             three nearest points, which with ``opacity=0.1`` is how 3DGS starts from a point cloud.
         width: standard deviation over the spacing.
         opacity: of every Gaussian, in (0, 1).
+        background: see :class:`vg2gt.model.Reconstructor`.
 
     Raises:
         ValueError: if the spacing is unknown.
@@ -41,10 +42,11 @@ class PointCloud(Reconstructor):
         spacing: Spacing = "pixel",
         width: float = 0.5,
         opacity: float = 0.9,
+        background: Background = "black",
     ) -> None:
         if spacing not in get_args(Spacing):
             raise ValueError(f"model.spacing is {spacing!r}; choose one of {', '.join(get_args(Spacing))}")
-        super().__init__(backend, scale)
+        super().__init__(backend, scale, background)
         self.spacing = spacing
         self.width = width
         self.opacity = opacity
@@ -67,7 +69,7 @@ class PointCloud(Reconstructor):
                 sh=rgb_to_sh(pixels.colors)[:, None],
                 batch=pixels.batch,
             )
-        return Prediction(geometry, geometry, None, gaussians, unit)
+        return Prediction(geometry, geometry, None, self.before_background(gaussians, images), unit)
 
 
 def _distance_to_neighbors(means: Tensor, pixels: Pixels) -> Tensor:

@@ -10,7 +10,7 @@ from torch.nn import functional as F
 
 from backends.base import Backend
 from vg2gt.baselines.pixels import PixelReconstructor, Pixels
-from vg2gt.model import SceneScale
+from vg2gt.model import Background, SceneScale
 from vg2gt.types import Gaussians, Geometry
 from vg2gt.voxels import DenseHead
 from vg2gt.voxels.grid import VoxelPlan, in_range, plan_voxels, point_cells, pool_mean, scene_voxel_size
@@ -30,6 +30,7 @@ class VoxelMerged(PixelReconstructor):
         gaussians: makes the pixel head from ``in_channels``.
         voxel_size: edge length in scene units.
         min_footprint: smallest edge in pixels at the scene's median depth; 0 switches the guard off.
+        background: see :class:`vg2gt.model.Reconstructor`.
     """
 
     def __init__(
@@ -40,8 +41,9 @@ class VoxelMerged(PixelReconstructor):
         gaussians: Callable[..., nn.Module],
         voxel_size: float = 0.002,
         min_footprint: float = 1.0,
+        background: Background = "black",
     ) -> None:
-        super().__init__(backend, scale, dense_head, gaussians)
+        super().__init__(backend, scale, dense_head, gaussians, background)
         self.voxel_size = voxel_size
         self.min_footprint = min_footprint
 

@@ -2,7 +2,8 @@
 
 A Gaussian file has one ``vertex`` element of floats, in this order: ``x y z``, ``nx ny nz`` (zeros), ``f_dc_0..2``,
 ``f_rest_*`` (none or 45, all of red before green before blue), ``opacity`` (logit), ``scale_0..2`` (logarithms),
-``rot_0..3`` (wxyz).
+``rot_0..3`` (wxyz). The colour behind a scene stands in a comment, ``background R G B`` in [0, 1], which other programs
+ignore.
 
 Example:
     >>> import tempfile, torch
@@ -19,16 +20,17 @@ Example:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import ArrayLike, NDArray
 
 from vg2gt.io.errors import FormatError
 from vg2gt.io.files import write_bytes
 from vg2gt.io.gaussian_arrays import OPACITY_MARGIN, GaussianArrays, to_arrays, to_gaussians
-from vg2gt.io.ply_container import read_vertices, vertices_content
+from vg2gt.io.ply_container import read_comments, read_vertices, vertices_content
 from vg2gt.types import Gaussians
 
 POSITION = ("x", "y", "z")
@@ -86,7 +88,10 @@ def write_gaussian_ply(path: str | Path, gaussians: Gaussians, *, full_sh: bool 
         arrays.quats,
     )
     table = np.concatenate(columns, 1).astype("<f4").view([(name, "<f4") for name in names])[:, 0]
-    return write_bytes(path, vertices_content(table))
+    comments = []
+    if gaussians.background is not None:
+        comments = ["background " + " ".join(f"{value:.6g}" for value in gaussians.background[0].tolist())]
+    return write_bytes(path, vertices_content(table, comments))
 
 
 def read_gaussian_ply(path: str | Path) -> Gaussians:
@@ -123,7 +128,8 @@ def read_gaussian_ply(path: str | Path) -> Gaussians:
         opacities = 1 / (1 + np.exp(-_columns(path, table, ("opacity",))[:, 0]))
         scales = np.exp(_columns(path, table, _SCALE))
     means, quats = _columns(path, table, POSITION), _columns(path, table, _ROTATION)
-    return to_gaussians(path, GaussianArrays(means, quats, scales, opacities, sh))
+    gaussians = to_gaussians(path, GaussianArrays(means, quats, scales, opacities, sh))
+    return replace(gaussians, background=_background(path))
 
 
 def write_point_ply(path: str | Path, positions: ArrayLike, colors: ArrayLike | None = None) -> Path:
@@ -185,6 +191,19 @@ def read_point_ply(path: str | Path) -> ColoredPoints:
     positions = _columns(path, table, POSITION).astype(np.float64 if wide else np.float32)
     colored = all(name in (table.dtype.names or ()) and table.dtype[name] == np.uint8 for name in COLOR)
     return ColoredPoints(positions, np.stack([table[name] for name in COLOR], -1) if colored else None)
+
+
+def _background(path: Path) -> torch.Tensor | None:
+    """The colour behind the scene ``[1, 3]`` that a comment names; None without one, or where it is none."""
+    for comment in read_comments(path):
+        word, _, values = comment.partition(" ")
+        try:
+            color = torch.tensor([float(value) for value in values.split()])
+        except ValueError:
+            continue
+        if word == "background" and len(color) == 3 and bool(((color >= 0) & (color <= 1)).all()):
+            return color[None]
+    return None
 
 
 def _columns(path: Path, table: NDArray, names: tuple[str, ...]) -> NDArray[np.float64]:

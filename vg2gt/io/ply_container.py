@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -35,10 +36,11 @@ class _Element:
     has_list: bool
 
 
-def vertices_content(table: NDArray) -> bytes:
+def vertices_content(table: NDArray, comments: Sequence[str] = ()) -> bytes:
     """A binary little-endian file with one ``vertex`` element: a structured array, its fields in their order."""
     names = table.dtype.names or ()
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
+    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]
+    lines += [f"element vertex {len(table)}"]
     lines += [f"property {_NAMES[table.dtype[name]]} {name}" for name in names]
     return "\n".join([*lines, "end_header", ""]).encode() + table.tobytes()
 
@@ -70,6 +72,14 @@ def read_vertices(path: Path) -> NDArray:
             "left; the file is truncated or damaged"
         )
     return np.frombuffer(data, dtype, vertex.count, offset)
+
+
+def read_comments(path: Path) -> list[str]:
+    """The header's comments, without the word."""
+    with regular(path).open("rb") as file:
+        head = file.read(_HEADER_LIMIT)
+    lines = head[: max(0, head.find(_END))].decode("latin-1").splitlines()
+    return [line.removeprefix("comment").strip() for line in lines if line.startswith("comment ")]
 
 
 def _ascii_table(path: Path, body: bytes, before: list[_Element], vertex: _Element) -> NDArray:

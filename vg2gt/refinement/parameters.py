@@ -118,6 +118,7 @@ class Parameters:
             torch.sigmoid(values["opacities"]),
             torch.cat((values["sh"], values["sh_rest"]), 1),
             torch.zeros(len(self.origin), dtype=torch.int64, device=self.origin.device),
+            start.gaussians.background,
         )
         gain, bias = self._centred(values["gain"]).exp(), self._centred(values["bias"])
         return RefinedScene(gaussians, self._cameras(start.cameras), gain, bias)

@@ -81,14 +81,24 @@ def check_finite(name: str, tensor: Tensor) -> None:
         )
 
 
-def background_color(background: Tensor | Sequence[float] | None, like: Tensor) -> Tensor:
-    """Background as a ``[3]`` tensor like another one; None is black."""
-    if background is None:
-        return like.new_zeros(3)
-    color = torch.as_tensor(background, dtype=like.dtype, device=like.device)
-    if color.shape != (3,):
-        raise ValueError(f"background must be one colour [3], got {list(color.shape)}")
-    return color
+def background_colors(
+    background: Tensor | Sequence[float] | None, gaussians: Gaussians, scenes: int, dtype: torch.dtype
+) -> Tensor:
+    """The background of every scene ``[B, 3]``: one colour ``[3]`` for all, else the Gaussians' own, else black."""
+    device = gaussians.means.device
+    if background is not None:
+        color = torch.as_tensor(background, dtype=dtype, device=device)
+        if color.shape != (3,):
+            raise ValueError(f"background must be one colour [3], got {list(color.shape)}")
+        return color.expand(scenes, 3)
+    if gaussians.background is None:
+        return gaussians.means.new_zeros(scenes, 3, dtype=dtype)
+    if gaussians.background.shape != (scenes, 3):
+        raise ValueError(
+            f"the Gaussians' background must be one colour per scene [{scenes}, 3], "
+            f"got {list(gaussians.background.shape)}"
+        )
+    return gaussians.background.to(dtype)
 
 
 def _require(name: str, good: Tensor, expectation: str) -> None:

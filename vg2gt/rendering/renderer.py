@@ -15,7 +15,7 @@ from torch.nn import functional as F
 from vg2gt.geometry.cameras import invert_rigid
 from vg2gt.geometry.spherical_harmonics import sh_to_rgb
 from vg2gt.memory import note_sizes
-from vg2gt.rendering.checks import background_color, check_finite, check_shapes, check_values
+from vg2gt.rendering.checks import background_colors, check_finite, check_shapes, check_values
 from vg2gt.rendering.cpu import rasterize_cpu
 from vg2gt.rendering.dense import rasterize_dense
 from vg2gt.rendering.options import Images, Mode, RenderOptions, SceneViews, check_choice
@@ -73,14 +73,16 @@ class Renderer(RenderOptions):
         implementation = _resolve(self.implementation, device)
         dtype = torch.promote_types(gaussians.means.dtype, torch.float32)
         with torch.autocast(device.type, enabled=False):
-            color = background_color(background, like=gaussians.means.new_empty(0, dtype=dtype))
+            color = background_colors(background, gaussians, scenes, dtype)  # [B, 3]
             if implementation == "triton":
-                return _render_triton(gaussians.map(_floats_to(dtype)), cameras.map(_floats_to(dtype)), color, options)
+                one = scenes == 1 or background is not None or gaussians.background is None
+                gaussians, cameras = gaussians.map(_floats_to(dtype)), cameras.map(_floats_to(dtype))
+                return _render_triton(gaussians, cameras, color[:1] if one else color, options)
             check_values(gaussians, cameras)
             check_finite("background", color)
             gaussians, cameras = gaussians.map(_floats_to(dtype)), cameras.map(_floats_to(dtype))
             rasterize = RASTERIZERS[implementation]
-            images = [rasterize(_scene_views(gaussians.scene(b), cameras, b, color), options) for b in range(scenes)]
+            images = [rasterize(_scene_views(gaussians.scene(b), cameras, b, color[b]), options) for b in range(scenes)]
         stacked = {
             field.name: torch.stack([getattr(image, field.name) for image in images]) for field in fields(Images)
         }
@@ -109,7 +111,7 @@ def render(
         gaussians: G Gaussians, packed over the B scenes and sorted by scene.
         cameras: the views ``[B, V]``; skew and distortion are not modelled.
         mode: ``solid`` or ``rasterized``.
-        background: one colour ``[3]``; None is black.
+        background: one colour ``[3]``; None is the Gaussians' own, or black.
         near: near plane.
         **options: ``implementation`` (:class:`Renderer`) and the others of :class:`RenderOptions`.
 
@@ -127,7 +129,8 @@ def render(
 def _render_triton(gaussians: Gaussians, cameras: Cameras, background: Tensor, options: RenderOptions) -> Render:
     """Imports Triton only when it is asked for: torch's CPU builds come without it.
 
-    Its kernels notice values that cannot be rendered; only then is it found out which.
+    Its kernels notice values that cannot be rendered; only then is it found out which. ``background`` is ``[1, 3]``, of
+    all scenes, or ``[B, 3]``.
     """
     if importlib.util.find_spec("triton") is None:
         raise ValueError(
@@ -135,12 +138,18 @@ def _render_triton(gaussians: Gaussians, cameras: Cameras, background: Tensor, o
         )
     from vg2gt.rendering.gpu import RefusedError, render_triton
 
+    black = background.new_zeros(3)
     try:
-        return render_triton(gaussians, cameras, background, options)
+        if len(background) == 1:
+            return render_triton(gaussians, cameras, background[0], options)
+        render = render_triton(gaussians, cameras, black, options)
     except RefusedError:
         check_values(gaussians, cameras)
         check_finite("background", background)
         raise
+    # The kernels know one background for all scenes.
+    behind = (1 - render.alpha)[:, :, None] * background[:, None, :, None, None]
+    return replace(render, color=render.color + behind)
 
 
 def _scene_views(gaussians: Gaussians, cameras: Cameras, scene: int, background: Tensor) -> SceneViews:

@@ -1,7 +1,7 @@
 """Coarse-level feature enhancement: patch tokens gain what voxels shared by all views know (paper, Coarse-level).
 
-With ``surface_evidence=False embedding_skip=False fuse_kernel=1`` (``model=vg2gt``) it is the paper's; what the three
-switches add is ours, and the first one's additions have a file of their own (:mod:`vg2gt.voxels.surface`).
+With ``surface_evidence=False embedding_skip=False fuse_kernel=1 gate=False`` (``model=vg2gt``) it is the paper's; what
+the four switches add is ours, and the first and the last have a file of their own (:mod:`vg2gt.voxels.surface`).
 """
 
 from __future__ import annotations
@@ -18,11 +18,14 @@ from vg2gt.types import Cameras, Geometry, Tokens
 from vg2gt.voxels.grid import in_range, plan_voxels, point_cells, pool_mean, pool_min, scene_voxel_size, warn_if_sparse
 from vg2gt.voxels.knn import interpolate, interpolation_weights
 from vg2gt.voxels.ptv3 import PTv3
+from vg2gt.voxels.silhouette import beside_silhouettes
 from vg2gt.voxels.surface import (
     CENTROID_CHANNELS,
     SURFACE_CHANNELS,
     PointFrames,
     cell_centroids,
+    disagreement,
+    gate,
     vectors_to_surface,
     voxel_evidence,
 )
@@ -52,9 +55,12 @@ class CoarseModule(nn.Module):
         embedding_skip: not in the paper: the patches' own embedding enters the fusion beside the voxels' features.
         fuse_kernel: edge length of the fusing convolutions: 1 fuses every patch by itself (paper), 3 reads its
             neighbours.
+        gate: not in the paper: evidence counts away from silhouettes only, and all changes are scaled by how much the
+            views disagree, so that depth on which they agree stays as it is. Needs ``surface_evidence``.
 
     Raises:
-        ValueError: if ``inject`` or ``fuse_kernel`` is not one of these or ``upsample`` does not divide the patch.
+        ValueError: if ``inject`` or ``fuse_kernel`` is not one of these, ``upsample`` does not divide the patch, or
+            ``gate`` has no evidence.
     """
 
     def __init__(
@@ -72,12 +78,15 @@ class CoarseModule(nn.Module):
         surface_evidence: bool = True,
         embedding_skip: bool = True,
         fuse_kernel: int = 3,
+        gate: bool = False,
     ) -> None:
         super().__init__()
         if inject not in get_args(Inject):
             raise ValueError(f"coarse.inject is {inject!r}; choose one of {', '.join(get_args(Inject))}")
         if fuse_kernel not in (1, 3):
             raise ValueError(f"coarse.fuse_kernel is {fuse_kernel!r}; choose 1 or 3")
+        if gate and not surface_evidence:
+            raise ValueError("coarse.gate=true measures the views' disagreement by coarse.surface_evidence=true")
         if patch_size % upsample:
             raise ValueError(f"coarse.upsample={upsample} does not divide the backend's patch of {patch_size} pixels")
         self.cell = patch_size // upsample
@@ -87,6 +96,7 @@ class CoarseModule(nn.Module):
         self.neighbors = neighbors
         self.surface_evidence = surface_evidence
         self.embedding_skip = embedding_skip
+        self.gate = gate
         layers: list[nn.Module] = [nn.LayerNorm(token_dims[-1])]
         for width_in, width_out in zip((token_dims[-1], *hidden), hidden, strict=False):
             layers += [nn.Linear(width_in, width_out), nn.GELU()]
@@ -120,16 +130,17 @@ class CoarseModule(nn.Module):
             ValueError: if a scene spans too many voxels to be numbered.
         """
         with torch.autocast(geometry.depth.device.type, enabled=False):
-            points = PatchPoints(geometry, self.cell, scene_voxel_size(geometry, self.voxel_size, self.min_footprint))
+            size = scene_voxel_size(geometry, self.voxel_size, self.min_footprint)
+            points = PatchPoints(geometry, self.cell, size, away_from_silhouettes=self.gate)
             embedded = self._embed(tokens)[points.rows]  # f(p): [N, C]
-            enhanced = self._enhance(embedded, points, generator)
+            enhanced, gain = self._enhance(embedded, points, generator)
             if self.embedding_skip:
                 enhanced = torch.cat((enhanced, embedded), -1)
             patches, seen = self._to_patches(enhanced, points, tokens)
             maps = patches.flatten(0, 1).transpose(1, 2).unflatten(-1, tokens.grid)  # [B V, C, rows, columns]
             fused = self.fuse(maps)
             # Zero convolution: what it adds to each of the taps' tokens, nothing before training.
-            updates = [_to_patch_rows(branch(fused), seen) for branch in self.zero]  # [B, V, P, D] each
+            updates = [gain * _to_patch_rows(branch(fused), seen) for branch in self.zero]  # [B, V, P, D] each
         untouched = tokens.patch[: len(tokens.patch) - len(updates)]
         changed = tokens.patch[len(untouched) :]
         return tokens.with_patch(
@@ -143,8 +154,13 @@ class CoarseModule(nn.Module):
         features = F.interpolate(features, scale_factor=self.upsample, mode="bilinear", align_corners=False)
         return features.permute(0, 2, 3, 1).flatten(0, 2)  # [B V h w, C]
 
-    def _enhance(self, embedded: Tensor, points: PatchPoints, generator: torch.Generator | None) -> Tensor:
-        """PTv3 over the voxels, read back at the points: ``[N, C]``; surface evidence adds ``SURFACE_CHANNELS``."""
+    def _enhance(
+        self, embedded: Tensor, points: PatchPoints, generator: torch.Generator | None
+    ) -> tuple[Tensor, Tensor]:
+        """PTv3 over the voxels, read back at the points: ``[N, C]``; surface evidence adds ``SURFACE_CHANNELS``.
+
+        Also the gate on changes, ``[B, 1, 1, 1]``; 1 without one.
+        """
         plan = plan_voxels(points.cells, points.batch, torch.ones_like(points.batch, dtype=torch.bool))
         if points.views > 1:
             warn_if_sparse(plan, "coarse")
@@ -164,13 +180,17 @@ class CoarseModule(nn.Module):
         # Paper, after eqn ptvzengqiang: distance-weighted over the 16 nearest voxel centres.
         index, weights = interpolation_weights(queries, points.batch, centers, plan.batch, self.neighbors)  # [N, k]
         enhanced = interpolate(voxels, index, weights)  # [N, C]
+        gain = torch.ones_like(points.voxel_size)
         if not self.surface_evidence:
-            return enhanced
+            return enhanced, gain[:, None, None, None]
         evidence = torch.where(weights > 0, voxel_evidence(points.confidence, plan)[index], 0)
         to_surface = vectors_to_surface(queries, centers + centroid, evidence, index)
         frames = PointFrames(points.depth, points.cameras, points.rows)
         seen = frames.in_camera(to_surface, points.voxel_size[points.batch])
-        return torch.cat((enhanced, seen, points.confidence.log()[:, None]), -1)
+        if points.clear is not None:
+            seen = torch.where(points.clear[:, None], seen, 0)
+            gain = gate(disagreement(seen[:, -1], points.clear, points.batch, len(gain)))
+        return torch.cat((enhanced, seen, points.confidence.log()[:, None]), -1), gain[:, None, None, None]
 
     def _to_patches(self, features: Tensor, points: PatchPoints, tokens: Tokens) -> tuple[Tensor, Tensor]:
         """Averages the valid points of every patch: ``[B, V, P, C]`` and whether there were any ``[B, V, P, 1]``."""
@@ -198,6 +218,7 @@ class PatchPoints:
         geometry: B scenes of V views, in scene units.
         cell: pixels per cell side.
         voxel_size: ``[B]``.
+        away_from_silhouettes: find out which points are.
 
     Attributes:
         rows: ``[N]`` place in the flattened ``[B, V, h, w]`` grid.
@@ -209,9 +230,10 @@ class PatchPoints:
         views: V.
         depth: ``[B, V, h, w]`` of the grid, scene units, 0 = invalid.
         cameras: whose pixels are the grid's.
+        clear: ``[N]`` bool, whether no pixel of the cell is beside a silhouette; None where nobody asked.
     """
 
-    def __init__(self, geometry: Geometry, cell: int, voxel_size: Tensor) -> None:
+    def __init__(self, geometry: Geometry, cell: int, voxel_size: Tensor, away_from_silhouettes: bool = False) -> None:
         depth, confidence = geometry.depth.detach().float(), geometry.depth_conf.detach().float()
         sampled = depth[..., cell // 2 :: cell, cell // 2 :: cell]  # [B, V, h, w]
         smallest = -F.max_pool2d(-confidence, cell)  # [B, V, h, w]
@@ -229,6 +251,10 @@ class PatchPoints:
         self.batch = scene[self.rows]
         self.cells = cells[self.rows] if not self.placeholder else cells.new_zeros(1, 3)
         self.confidence = torch.where(valid, smallest, 1.0).flatten()[self.rows]
+        self.clear: Tensor | None = None
+        if away_from_silhouettes:
+            beside = beside_silhouettes(torch.where(torch.isfinite(depth), depth, 0.0)).to(depth.dtype)
+            self.clear = (F.max_pool2d(beside, cell) == 0).flatten()[self.rows]
 
 
 def _to_patch_rows(maps: Tensor, seen: Tensor) -> Tensor:

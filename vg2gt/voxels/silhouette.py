@@ -1,7 +1,8 @@
-"""Points between foreground and background, which lie on no surface (our addition to the paper's fine level).
+"""Points between foreground and background, which lie on no surface (our addition to both levels of the paper).
 
 Decoded depth does not break off at a silhouette, it runs from the foreground to the background within a few pixels.
-Unprojected and put into voxels those pixels become the fringe of splinters that surrounds every object.
+Unprojected and put into voxels those pixels become the fringe of splinters that surrounds every object. Beside them the
+coarse level cannot tell a view's error from the step of the silhouette itself.
 """
 
 from __future__ import annotations
@@ -14,7 +15,9 @@ TOLERANCE = 0.015  # relative, of a pixel's depth to the plane through two neigh
 STEEPEST = 0.12  # relative change of depth from pixel to pixel beyond which even a plane says nothing
 CONTRAST = 0.08  # relative range of depth in a window without which there is no silhouette
 INSIDE = 0.05  # share of that range by which a pixel lies behind the front and before the back
-WINDOW = 5  # pixels
+REACH = 2  # pixels to every side in which the range of depth is taken
+STEP = 0.15  # relative range of depth around a pixel from which on it is beside a silhouette
+STEP_REACH = 3  # pixels to every side
 
 
 def on_surface(depth: Tensor) -> Tensor:
@@ -39,12 +42,31 @@ def on_surface(depth: Tensor) -> Tensor:
         off_plane = torch.minimum((inverse - 2 * before + before2).abs(), (inverse - 2 * after + after2).abs())
         step = torch.minimum((inverse - before).abs(), (inverse - after).abs())
         broken |= (off_plane > TOLERANCE * inverse) | (step > STEEPEST * inverse)
-    maps = depth.flatten(0, -3)[:, None]  # [N, 1, H, W]
-    far = F.max_pool2d(maps, WINDOW, 1, WINDOW // 2).reshape(depth.shape)
-    near = -F.max_pool2d(-torch.where(maps > 0, maps, torch.inf), WINDOW, 1, WINDOW // 2).reshape(depth.shape)
+    near, far = _depth_range(depth, REACH)
     margin = INSIDE * (far - near)
     between = (far > (1 + CONTRAST) * near) & (depth > near + margin) & (depth < far - margin)
     return ~(broken & between)
+
+
+def beside_silhouettes(depth: Tensor) -> Tensor:
+    """Tells the pixels on no surface, and those on a surface that breaks off within a few pixels.
+
+    Args:
+        depth: ``[..., H, W]`` z-depth in any unit, 0 = invalid.
+
+    Returns:
+        ``[..., H, W]`` bool; false where the depth is invalid.
+    """
+    near, far = _depth_range(depth, STEP_REACH)
+    return (depth > 0) & ((far >= (1 + STEP) * near) | ~on_surface(depth))
+
+
+def _depth_range(depth: Tensor, reach: int) -> tuple[Tensor, Tensor]:
+    """Least and largest valid depth within ``reach`` pixels to every side, as ``depth``."""
+    maps, window = depth.flatten(0, -3)[:, None], 2 * reach + 1  # [N, 1, H, W]
+    far = F.max_pool2d(maps, window, 1, reach)
+    near = -F.max_pool2d(-torch.where(maps > 0, maps, torch.inf), window, 1, reach)
+    return near.reshape(depth.shape), far.reshape(depth.shape)
 
 
 def _shifted(values: Tensor, axis: int, by: int) -> Tensor:
