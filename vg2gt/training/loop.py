@@ -199,6 +199,7 @@ def _train(config: DictConfig, writes: bool) -> dict[str, Any]:
         if not run.trial and run.trainer.global_step < run.trainer.max_steps:
             log.warning("training ended at step %d of %d", run.trainer.global_step, run.trainer.max_steps)
             return {}
+        log.info("evaluating the trained model")
         trained = evaluate(run)
         return _report(run, untrained, trained)
 
@@ -224,6 +225,7 @@ def _untrained_metrics(run: Run, resumed: bool) -> dict[str, float]:
         return read_json(path)
     if resumed or run.trial:
         return {}
+    log.info("evaluating the untrained model first (the bar says Validation), to compare the trained one with")
     metrics = evaluate(run)
     write_json(path, metrics)
     return metrics

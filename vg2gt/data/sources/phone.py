@@ -144,7 +144,6 @@ def _read_polycam(folder: Path, scene: str) -> PhoneExport:
         content = load_json(path)
         names = [f"t_{row}{column}" for row in range(3) for column in range(4)]
         pose = np.eye(4)
-        pose = np.eye(4)
         pose[:3] = _fields(path, content, names).reshape(3, 4)
         poses[frame] = pose @ _OPENGL
         intrinsics[frame] = pinhole(*_fields(path, content, ["fx", "fy", "cx", "cy"])) - CORNER_TO_CENTER
