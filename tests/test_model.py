@@ -65,6 +65,17 @@ def test_rays_that_meet_nothing_show_the_scenes_mean_colour(run: Run, model: VG2
     away.world_to_camera[..., 2, 3] -= 1000.0
     seen = run.module.renderer(prediction.gaussians, away).color[0, 0]
     torch.testing.assert_close(seen, background[0, :, None, None].expand_as(seen))
+    unseen = batch.context.hints.depth
+    assert unseen is not None
+    unseen = unseen.clone()
+    unseen[:, :, :40] = 0  # a sky
+    hints = replace(batch.context.hints, depth=unseen)
+    background = model(batch.context.images, hints).gaussians.background
+    sky = batch.context.images[..., :40, :].mean((1, 3, 4))
+    assert background is not None
+    assert (
+        float((background - sky).abs().max()) < 0.02 < float((sky - batch.context.images.mean((1, 3, 4))).abs().max())
+    )
     model.background = "black"
     try:
         assert model(batch.context.images, batch.context.hints).gaussians.background is None

@@ -32,6 +32,7 @@ from vg2gt.types import Gaussians, Geometry, Hints, Prediction, Tokens, Voxels
 Background = Literal["mean", "black"]
 ScaleSource = Literal["metric", "focal", "normalize", "groundtruth"]
 BACKBONE_PREFIX = "backend."
+SEEN_WEIGHT = 0.01  # in the background's colour, of a pixel with a depth against one without
 CANONICAL_FOCAL = 300.0  # appendix A.1: d_metric = f * d_net / 300
 
 
@@ -78,7 +79,8 @@ class Reconstructor(nn.Module, ABC):
     Args:
         backend: the frozen visual foundation model.
         scale: fixes the scene unit.
-        background: what rays see that meet no Gaussian: the ``mean`` colour of the scene's images, or ``black``.
+        background: what rays see that meet no Gaussian: the ``mean`` colour of the pixels without a depth, or of all
+            where there are none, or ``black``.
 
     Raises:
         ValueError: if the scale is to be metric and the backend is not, or the background is unknown.
@@ -132,14 +134,22 @@ class Reconstructor(nn.Module, ABC):
         unit = self.scale(raw, hints)
         return tokens, _to_scene_frame(raw, unit), unit
 
-    def before_background(self, gaussians: Gaussians, images: Tensor) -> Gaussians:
-        """Sets what rays see that meet none of the Gaussians made of ``images`` ``[B, V, 3, H, W]``.
+    def before_background(self, gaussians: Gaussians, images: Tensor, depth: Tensor) -> Gaussians:
+        """Sets what rays see that meet none of the Gaussians.
 
-        No input view saw what lies there; its most likely colour, if nothing else is known, is the scene's mean.
+        Its most likely colour is that of the pixels for which the backbone found no depth, such as the sky; where there
+        are none, that of the whole scene.
+
+        Args:
+            gaussians: of B scenes.
+            images: ``[B, V, 3, H, W]`` that they were made of.
+            depth: ``[B, V, H, W]`` the backbone's, 0 = invalid.
         """
         if self.background == "black":
             return gaussians
-        return replace(gaussians, background=images.detach().float().mean((1, 3, 4)))
+        weight = torch.where(depth > 0, SEEN_WEIGHT, 1.0)[:, :, None]  # [B, V, 1, H, W]
+        total = (weight * images.detach().float()).sum((1, 3, 4))  # [B, 3]
+        return replace(gaussians, background=total / weight.sum((1, 3, 4)))
 
     def trained_parameters(self) -> list[nn.Parameter]:
         """The parameters that training changes: everything but the backbone."""
@@ -246,7 +256,7 @@ class VG2GT(Reconstructor):
         with stage("fine"):
             voxels: Voxels = self.fine(tokens, geometry, images)
         with stage("gaussians"):
-            gaussians: Gaussians = self.before_background(self.gaussians(voxels), images)
+            gaussians: Gaussians = self.before_background(self.gaussians(voxels), images, initial.depth)
         return Prediction(initial, geometry, voxels, gaussians, unit)
 
 
