@@ -4,8 +4,10 @@ The same refinement (``configs/refine/default.yaml``) from VG²GT's scene, from 
 Gaussians merged by voxels, and from a point cloud as 3DGS starts (``model=pointcloud`` with neighbours' spacing,
 opacity 0.1), on the same backbone, scenes and seconds: core-seconds on a CPU, the clock's on a GPU, evaluation not
 counted. Held-out views at true poses, brought into the scene's frame by its present cameras; depth aligned by one scale
-a scene. Untrained heads, which the labels say; ``--ckpt LABEL=PATH`` adds a start with its trained part. Procedural
-rooms or, with ``data=rgbd data.root=FOLDER``, a recording. Writes a dated JSON file to
+a scene; cameras: root mean square distance of the input views' centres to the true ones after one similarity, in per
+cent of the median depth. Heads are untrained, which the labels say, but for those of ``--ckpt LABEL=PATH``. Procedural
+rooms or, with ``data=rgbd data.root=FOLDER``, a recording; ``backend.pose_noise=0.01`` starts from wrong cameras and
+``--rates cameras=0.1`` says how they move. Writes a dated JSON file to
 ``benchmarks/results`` and curves to ``docs/figures``.
 """
 
@@ -24,11 +26,13 @@ from vg2gt.config import compose
 from vg2gt.evaluation.protocols import ground_truth_target_cameras
 from vg2gt.evaluation.scene_metrics import image_metrics, rendered_normal_metrics
 from vg2gt.evaluation.tables import print_table
+from vg2gt.geometry.alignment import align_cameras
+from vg2gt.geometry.cameras import camera_centers
 from vg2gt.metrics import depth_metrics
 from vg2gt.refinement import Observations, Progress, RefinedScene, RefineOptions, refine
 from vg2gt.rendering import Renderer
 from vg2gt.runs.load import LoadedModel, load_model
-from vg2gt.types import Batch, Prediction
+from vg2gt.types import Batch, Cameras, Prediction
 
 FIGURES = RESULTS.parents[1] / "docs" / "figures"
 STARTS = {
@@ -37,6 +41,7 @@ STARTS = {
     "voxel-merged": "voxel_merged",
     "point cloud": "pointcloud,spacing=neighbors,width=1,opacity=0.1",
 }
+COLUMNS = ("cameras", "gaussians")
 FIGURE = {"psnr": "PSNR [dB]", "ssim": "SSIM", "abs_rel": "abs_rel", "normal_mean": "normals [deg]"}
 Curve = list[dict[str, float]]
 
@@ -70,7 +75,16 @@ def score(batch: Batch, prediction: Prediction, state: RefinedScene, renderer: R
     depth = depth_metrics(rendered.depth[0], truth.depth[0], "scene")
     found = image_metrics(rendered, truth) | {name: depth[name] for name in ("abs_rel", "coverage")}
     found["normal_mean"] = rendered_normal_metrics(rendered, truth)["normal_mean"]
+    found["cameras"] = camera_error(batch.context, state.cameras)
     return found | {"gaussians": float(len(state.gaussians))}
+
+
+def camera_error(truth: Batch, found: Cameras) -> float:
+    """Root mean square distance of the cameras' centres to the true ones, per cent of the median depth."""
+    similarity = align_cameras(found, truth.cameras)
+    centers = similarity.apply(camera_centers(found))
+    apart = (centers - camera_centers(truth.cameras)).square().sum(-1).mean().sqrt()
+    return float(100 * apart / truth.depth[truth.depth > 0].median())
 
 
 def curve(loaded: LoadedModel, batch: Batch, options: RefineOptions, marks: list[float]) -> Curve:
@@ -137,9 +151,8 @@ def main() -> None:
     options.add_argument("--scenes", type=int, default=4)
     options.add_argument("--seconds", type=float, default=20.0)
     options.add_argument("--starts", nargs="+", choices=STARTS, default=list(STARTS), metavar="LABEL")
-    options.add_argument(
-        "--ckpt", nargs="+", default=[], metavar="LABEL=PATH", help="adds a start with its trained part"
-    )
+    options.add_argument("--ckpt", nargs="+", default=[], metavar="LABEL=PATH", help="a start's trained part")
+    options.add_argument("--rates", nargs="+", default=[], metavar="KEY=VALUE", help="of configs/refine, rates.*")
     options.add_argument("--name", default="rooms", help="part of the files' names")
     options.add_argument("--figures", type=Path, default=FIGURES)
     arguments = options.parse_args()
@@ -152,13 +165,16 @@ def main() -> None:
     data = instantiate(config.data)
     data.setup("validate")
     batches = [batch.to(device) for batch, _ in zip(data.val_dataloader(), range(arguments.scenes), strict=False)]
-    how = replace(instantiate(compose(None, "+refine=default").refine), steps=None, seconds=arguments.seconds)
+    rates = [f"refine.rates.{item}" for item in arguments.rates]
+    how = replace(instantiate(compose(None, "+refine=default", *rates).refine), steps=None, seconds=arguments.seconds)
     marks = [arguments.seconds * share for share in (1 / 16, 1 / 8, 1 / 4, 1 / 2)]
     noise = {key: config.backend.get(key) for key in ("depth_noise", "pose_noise")}
     backend = [f"backend.{key}={value}" for key, value in noise.items() if value is not None]
     curves: dict[str, Curve] = {}
-    names = {label if label == "point cloud" else f"{label}, untrained": (label, None) for label in arguments.starts}
-    names |= {f"{label}, trained": (label, ckpt) for label, ckpt in trained.items()}
+    names = {}
+    for label in arguments.starts:
+        kind = "" if label == "point cloud" else ", trained" if label in trained else ", untrained"
+        names[label + kind] = (label, trained.get(label))
     for name, (label, ckpt) in names.items():
         loaded = load_model(ckpt, None if ckpt else "oracle", None if ckpt else STARTS[label], backend, str(device))
         curve(loaded, batches[0], replace(how, steps=1), [])  # compiles
@@ -166,9 +182,9 @@ def main() -> None:
         last = curves[name][-1]
         print(f"{name}: {curves[name][0]['psnr']:.2f} -> {last['psnr']:.2f} dB", flush=True)
     unit = "seconds" if device.type == "cuda" else "core-seconds"
-    head = ("start", unit, "steps", *FIGURE.values(), "Gaussians")
+    head = ("start", unit, "steps", *FIGURE.values(), "cameras [%]", "Gaussians")
     cells = [
-        [name, f"{p['seconds']:.1f}", f"{p['step']:.0f}", *(f"{p[key]:.4g}" for key in (*FIGURE, "gaussians"))]
+        [name, f"{p['seconds']:.1f}", f"{p['step']:.0f}", *(f"{p[key]:.4g}" for key in (*FIGURE, *COLUMNS))]
         for name, points in curves.items()
         for p in points
     ]
@@ -182,6 +198,7 @@ def main() -> None:
         "scenes": [batch.scene[0] for batch in batches],
         "trained": sorted(trained),
         "seconds": arguments.seconds,
+        "rates": arguments.rates,
         "curves": curves,
     }
     write_results(arguments.out, f"refine-{arguments.name}-{device.type}", content)
