@@ -111,7 +111,7 @@ def main() -> None:
             mean = {variant: sum(row[variant] for row in rows) / len(rows) for variant in VARIANTS}
             table[name][f"{noise:g}"] = mean
             print(f"{name:18} noise {noise:<6g}", " | ".join(f"{k} {v:.4f}" for k, v in mean.items()), flush=True)
-    content = {"machine": machine(), "ckpt": str(options.ckpt), "scenes": options.scenes, "sets": table}
+    content = {"machine": machine(), "ckpt": Path(options.ckpt).name, "scenes": options.scenes, "sets": table}
     write_results(options.out, "enhancement", content)
 
 

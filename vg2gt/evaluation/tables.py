@@ -36,6 +36,8 @@ METRICS = {
     **{f"delta_{t}": Metric(f"d<{t}", 3, True) for t in ("1.25", "1.05", "1.03")},
     "delta_1.05_holes": Metric("d<1.05, holes fail", 3, True),
     "coverage": Metric("coverage", 4, True),
+    "edge_abs_rel": Metric("abs_rel at edges", 4, False),
+    "edge_psnr": Metric("PSNR at edges [dB]", 2, True),
     "abs_rel_rasterized": Metric("abs_rel, rasterised", 4, False),
     "decoded_abs_rel_before": Metric("abs_rel, backbone", 4),
     "decoded_abs_rel": Metric("abs_rel, decoded", 4, False),
