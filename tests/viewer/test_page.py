@@ -2,6 +2,7 @@
 
 import base64
 import hashlib
+import json
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -73,6 +74,18 @@ def test_colour_bands_of_zeros_take_no_room() -> None:
 def test_gaussians_of_one_size_are_packed() -> None:
     after = pack(replace(scene(5), scales=torch.full((5, 3), 0.02)))
     assert (after.log_scale_min, after.log_scale_max) == pytest.approx((np.log(0.02), np.log(0.02)))
+
+
+@pytest.mark.parametrize(("behind", "shown"), [(None, [0, 0, 0]), (torch.tensor([[0.25, 0.5, 1.0]]), [0.25, 0.5, 1])])
+def test_page_knows_the_colour_behind_the_scene(
+    tmp_path: Path, behind: torch.Tensor | None, shown: list[float]
+) -> None:
+    gaussians = replace(scene(20, 0), background=behind)
+    page = write_viewer_html(tmp_path / "page.html", ViewerScene(gaussians)).read_text()
+    content = re.search(r'id="scene">([^<]*)<', page)
+    assert content is not None
+    assert json.loads(content[1])["settings"]["background"] == shown
+    assert "clearColor(...this.settings.background, 1)" in page
 
 
 def test_page_needs_nothing_else(tmp_path: Path) -> None:

@@ -82,6 +82,7 @@ def _content(scene: ViewerScene, packed: PackedGaussians) -> dict[str, Any]:
     """What the script finds in the page besides the Gaussians."""
     options = RenderOptions(mode="rasterized")
     cameras = [{**camera.fields(), "picture": _jpeg(scene, index)} for index, camera in enumerate(scene.cameras)]
+    behind = scene.gaussians.background
     return {
         "gaussians": packed.header(),
         "cameras": cameras,
@@ -89,6 +90,7 @@ def _content(scene: ViewerScene, packed: PackedGaussians) -> dict[str, Any]:
         "frustum_depth": scene.frustum_depth(),
         "settings": {
             "near": options.near,
+            "background": [0.0, 0.0, 0.0] if behind is None else behind[0].tolist(),
             "lowpass": options.lowpass,
             "alpha_max": options.alpha_max,
             "alpha_min": ALPHA_MIN,

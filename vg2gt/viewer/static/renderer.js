@@ -133,7 +133,7 @@ class Renderer {
     const gl = this.gl, { width, height } = this.canvas;
     gl.viewport(0, 0, width, height);
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.frame);
-    gl.clearColor(0, 0, 0, 1);
+    gl.clearColor(...this.settings.background, 1);
     gl.clear(gl.COLOR_BUFFER_BIT);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
