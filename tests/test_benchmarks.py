@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from tests.commands import run_python
+
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 TINY = ["data.image_size=[56,112]", "data.train_scenes=1", "data.eval_scenes=1"]
 QUIET = ["trainer.enable_progress_bar=false", "callbacks.progress_bar=null"]
@@ -79,8 +81,8 @@ def test_primitives(tmp_path: Path) -> None:
 
 def test_primitives_take_no_weights(tmp_path: Path) -> None:
     """They would be passed over."""
-    command = [sys.executable, str(BENCHMARKS / "primitives.py"), "init_from=some.ckpt"]
-    shown = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=200)
+    script = f"import sys; sys.path.insert(0, {str(BENCHMARKS)!r}); import primitives; primitives.main()"
+    shown = run_python(script, "init_from=some.ckpt", folder=tmp_path)
     assert shown.returncode != 0
     assert "init_from=some.ckpt: only untrained models are measured here" in shown.stderr
 

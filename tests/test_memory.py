@@ -1,7 +1,6 @@
 """Caps drop the lowest of each scene and say so; full memory is one error that names sizes and options."""
 
 import logging
-import subprocess
 import sys
 from pathlib import Path
 
@@ -9,6 +8,7 @@ import pytest
 import torch
 from hydra.utils import instantiate
 
+from tests.commands import ROOT, run_python
 from vg2gt.config import compose
 from vg2gt.gaussians import GaussianHead
 from vg2gt.memory import (
@@ -25,7 +25,6 @@ from vg2gt.studies.study import compose_run
 from vg2gt.training.loop import train
 from vg2gt.types import Voxels
 
-ROOT = Path(__file__).resolve().parents[1]
 SMALL = [
     "data.image_size=[28,28]",
     "data.num_frames=6",
@@ -239,8 +238,7 @@ except MemoryError as error:
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="RLIMIT_AS is enforced on Linux")
 def test_a_real_failure_to_allocate(tmp_path: Path) -> None:
     overrides = [*SMALL, "data.image_size=[224,448]", "trainer.max_steps=1", "trainer.limit_val_batches=0"]
-    command = [sys.executable, "-c", SCRIPT, str(tmp_path), *overrides, "name=run"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300, check=False)
+    done = run_python(SCRIPT, str(tmp_path), *overrides, "name=run", folder=ROOT)
     assert "CAUGHT OutOfMemory memory is full with" in done.stdout, done.stdout[-2000:] + done.stderr[-2000:]
     assert "images of 224x448" in done.stdout
     assert "data.max_images" in done.stdout

@@ -7,8 +7,6 @@ import hashlib
 import json
 import os
 import re
-import subprocess
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -18,14 +16,16 @@ from threading import Thread
 import pytest
 from safetensors.torch import save
 
+from tests.commands import ROOT, run_python
+
 pytest.importorskip("huggingface_hub")
 
-ROOT = Path(__file__).resolve().parents[2]
 ADDRESS = re.compile(r"/(?P<repo>[^/]+/[^/]+)/resolve/(?P<revision>[^/]+)/(?P<file>.+)")
 
 # Loads backends given as [[name, override, ...], ...]; prints for each the weights' hash, or what was raised.
 LOAD = """
 import json, sys, time
+assert "huggingface_hub" not in sys.modules
 from hydra.utils import instantiate
 from vg2gt.config import compose
 
@@ -123,11 +123,9 @@ def hub(make_backend) -> Iterator[Hub]:
 
 def load(cache: Path, settings: dict[str, str], *backends: tuple[str, ...]) -> list[str]:
     """Loads backends in a process that knows no other cache, token or address, and waits for nothing."""
-    environment = {key: value for key, value in os.environ.items() if not key.startswith(("HF_", "HUGGING"))}
+    environment: dict[str, str | None] = {key: None for key in os.environ if key.startswith(("HF_", "HUGGING"))}
     environment |= {"HF_HOME": str(cache), "NO_PROXY": "127.0.0.1", "HF_HUB_DISABLE_TELEMETRY": "1", **settings}
-    result = subprocess.run(
-        [sys.executable, "-c", LOAD, json.dumps(backends)], env=environment, cwd=ROOT, capture_output=True, text=True
-    )
+    result = run_python(LOAD, json.dumps(backends), folder=ROOT, environment=environment)
     assert result.returncode == 0, result.stderr[-3000:]
     return json.loads(result.stdout.splitlines()[-1])
 

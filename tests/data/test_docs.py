@@ -1,10 +1,7 @@
 """The example of docs/add-a-dataset.md: its loader reads what it says, and training takes it with its configuration."""
 
 import json
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +9,7 @@ import pytest
 import torch
 from PIL import Image
 
+from tests.commands import run_python
 from vg2gt.config import compose
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -58,16 +56,11 @@ def test_the_example_reads_its_layout(example: Path, rooms, monkeypatch) -> None
 
 
 def test_the_example_trains(example: Path) -> None:
-    path = os.pathsep.join((str(example), str(ROOT), os.environ.get("PYTHONPATH", "")))
     small = ["data.image_size=[28,42]", "data.max_images=4", "trainer.accelerator=cpu", "callbacks.progress_bar=null"]
     small += ["debug=fast_dev_run", "trainer.enable_progress_bar=false"]
-    result = subprocess.run(
-        [sys.executable, "-m", "vg2gt.cli.train", "--config-dir", "my_configs", "data=mine", "data.root=data", *small],
-        cwd=example,
-        env={**os.environ, "PYTHONPATH": path},
-        capture_output=True,
-        text=True,
-    )
+    code = "import sys; sys.path.insert(0, ''); import vg2gt.cli; vg2gt.cli.main()"
+    arguments = ["train", "--config-dir", "my_configs", "data=mine", "data.root=data", *small]
+    result = run_python(code, *arguments, folder=example)
     assert result.returncode == 0, result.stderr[-3000:]
 
 

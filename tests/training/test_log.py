@@ -1,8 +1,8 @@
 """What a run's terminal and log file show."""
 
-import subprocess
-import sys
 from pathlib import Path
+
+from tests.commands import run_python
 
 # Imports, configures and logs in the order of a run; loggers are global, hence in a process of its own.
 RUN = """
@@ -27,10 +27,7 @@ main()
 
 
 def test_every_message_comes_once_to_the_terminal_and_to_the_file(tmp_path: Path) -> None:
-    root = Path(__file__).resolve().parents[2]
-    script = tmp_path / "run.py"
-    script.write_text(f"import sys; sys.path.insert(0, {str(root)!r})\n{RUN}")
-    result = subprocess.run([sys.executable, script], cwd=tmp_path, capture_output=True, text=True)
+    result = run_python(RUN, folder=tmp_path)
     assert result.returncode == 0, result.stderr
     (file,) = tmp_path.glob("outputs/**/run.log")
     for text in (result.stdout + result.stderr, file.read_text()):
