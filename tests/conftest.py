@@ -1,16 +1,26 @@
 """Fixtures used by every test folder."""
 
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is imported: there is a test process a core
+
 from pathlib import Path
 
 import pytest
 from hydra.utils import instantiate
 
 from backends.export import export
+from tests.sharing import made_once, shared_folder
 from vg2gt.config import compose
 
 SHALLOW = ["+backend=da3_tiny", "backend.depth=4", "backend.multiview_from=1", "backend.taps=[0,1,2,3]"]
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
+
+
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int | None:
+    """One process for the tests of a GPU, which others would take the memory of; otherwise one a core."""
+    return 0 if config.option.markexpr == "gpu" else None
 
 
 @pytest.fixture(scope="session")
@@ -24,7 +34,7 @@ def shared() -> Path:
 @pytest.fixture(scope="session")
 def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of rendered rooms, so that each is rendered once."""
-    return tmp_path_factory.mktemp("rooms")
+    return shared_folder(tmp_path_factory, "rooms")
 
 
 @pytest.fixture(scope="session")
@@ -36,6 +46,4 @@ def shallow_da3():
 @pytest.fixture(scope="session")
 def onnx_bundle(shallow_da3, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An exported network."""
-    folder = tmp_path_factory.mktemp("onnx") / "bundle"
-    export(shallow_da3, folder)
-    return folder
+    return made_once(tmp_path_factory, "onnx", lambda folder: export(shallow_da3, folder / "bundle")) / "bundle"

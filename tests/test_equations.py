@@ -2,6 +2,7 @@
 
 import ast
 import re
+from functools import lru_cache
 from pathlib import Path
 
 import pytest
@@ -50,6 +51,7 @@ GROUPS = "model|loss|renderer|data|trainer|optimizer"
 KEYS = re.findall(rf"`((?:{GROUPS})\.[\w.]+)`(\*?)(?: \(`(\w+)`\))?", DEVIATIONS)
 
 
+@lru_cache
 def composed(*overrides: str) -> DictConfig:
     with initialize_config_dir(config_dir(), version_base="1.3"):
         return compose("train", ["output_dir=.", "hydra/job_logging=default", *overrides])

@@ -57,7 +57,7 @@ def test_the_lowest_versions_do(tmp_path: Path) -> None:
     assert len(lowest) == 15
     venv.create(tmp_path / "lowest", with_pip=True)
     python = tmp_path / "lowest" / "bin" / "python"
-    install = [str(python), "-m", "pip", "install", "-q", *lowest, "pytest==8.0.0", "av==14.1.0"]
+    install = [str(python), "-m", "pip", "install", "-q", *lowest, "pytest==8.0.0", "pytest-xdist==3.6.0", "av==14.1.0"]
     installed = subprocess.run(install, capture_output=True, text=True, check=False)
     if "No matching distribution" in installed.stderr:
         pytest.skip(f"a lowest version is not to be had for this Python: {installed.stderr.strip().splitlines()[-1]}")

@@ -17,7 +17,7 @@ def test_example_passes_the_contract(tmp_path: Path) -> None:
     assert len(code.splitlines()) <= 40
     (tmp_path / "my_pkg.py").write_text(code)
     path = os.pathsep.join((str(tmp_path), str(ROOT), os.environ.get("PYTHONPATH", "")))
-    command = [sys.executable, "-m", "pytest", "tests/backends/test_contract.py", "-p", "no:cacheprovider"]
+    command = [sys.executable, "-m", "pytest", "tests/backends/test_contract.py", "-n", "0", "-p", "no:cacheprovider"]
     result = subprocess.run(
         [*command, "--backend", "my_pkg.LocalDepthBackend"],
         cwd=ROOT,

@@ -5,17 +5,14 @@ from pathlib import Path
 import pytest
 
 from tests.reliability import crash_harness as harness
+from tests.sharing import made_once
 
 
 @pytest.fixture(scope="session")
-def rooms(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Cache of the rooms that all runs train on."""
-    return tmp_path_factory.mktemp("rooms")
-
-
-@pytest.fixture(scope="session")
-def whole(tmp_path_factory: pytest.TempPathFactory, rooms: Path) -> Path:
+def whole(tmp_path_factory: pytest.TempPathFactory, cache: Path) -> Path:
     """The uninterrupted run."""
-    folder = tmp_path_factory.mktemp("whole") / "run"
-    harness.finish(harness.TRAIN, harness.training(folder, rooms), folder)
-    return folder
+
+    def run(folder: Path) -> None:
+        harness.finish(harness.TRAIN, harness.training(folder / "run", cache), folder / "run")
+
+    return made_once(tmp_path_factory, "whole", run) / "run"

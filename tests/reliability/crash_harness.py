@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import multiprocessing
 import os
 import signal
 import subprocess
@@ -17,12 +16,12 @@ from typing import Any
 
 import torch
 
+from tests.commands import ROOT, become, warm_process
 from tests.training_helpers import SMALL
 from vg2gt.io.files import read_json
 from vg2gt.runs.checkpoints import read_checkpoint
 from vg2gt.studies.curves import read_curves
 
-ROOT = Path(__file__).resolve().parents[2]
 PATIENCE = 600.0  # seconds until a process that does not end is taken to hang
 STEPS = 6
 # Evaluations inside the training, checkpoints at every second step, a log row a step.
@@ -36,17 +35,13 @@ RUN = [
 ]
 
 TRAIN, EVALUATE, ABLATE = "vg2gt.cli.train", "vg2gt.cli.evaluate", "vg2gt.cli.ablate"
-PRELOADED = ["vg2gt.training.loop", "vg2gt.evaluation.run", "vg2gt.studies.ablation"]
 
 Moment = Callable[["Attempt"], bool]
 
 
 def _run_main(module: str, arguments: list[str], output: str, folder: str) -> None:
     os.setsid()
-    descriptor = os.open(output, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
-    os.dup2(descriptor, 1)
-    os.dup2(descriptor, 2)
-    os.chdir(folder)
+    become(folder, [output])
     command = importlib.import_module(module)
     sys.argv = [str(command.__file__), *arguments]
     command.main()
@@ -128,10 +123,7 @@ def start(
     """
     output, before = folder.with_name(f"{folder.name}.out"), _contents(folder)
     if warm:
-        server = multiprocessing.get_context("forkserver")
-        server.set_forkserver_preload(PRELOADED)
-        process = server.Process(target=_run_main, args=(module, list(arguments), str(output), str(folder.parent)))
-        process.start()
+        process = warm_process(_run_main, module, list(arguments), str(output), str(folder.parent))
         return Attempt(folder, output, process, before)
     with open(output, "ab") as file:
         process = subprocess.Popen(

@@ -43,9 +43,9 @@ CASES = [
 ]
 
 
-def survive(case: Case, folder: Path, rooms: Path) -> int:
+def survive(case: Case, folder: Path, cache: Path) -> int:
     """Kills the run at every moment, then lets it finish; returns the kills that came before its end."""
-    arguments, kills = harness.training(folder, rooms, *case.overrides), 0
+    arguments, kills = harness.training(folder, cache, *case.overrides), 0
     for moment in case.moments:
         attempt = harness.start(TRAIN, arguments, folder, case.warm)
         if attempt.wait_for(moment):
@@ -57,20 +57,20 @@ def survive(case: Case, folder: Path, rooms: Path) -> int:
     return kills
 
 
-def test_a_finished_run_stays_as_it_is(tmp_path: Path, rooms: Path, whole: Path) -> None:
+def test_a_finished_run_stays_as_it_is(tmp_path: Path, cache: Path, whole: Path) -> None:
     """``ckpt=auto`` once more, as a queue may do: evaluates again, changes nothing."""
     folder = tmp_path / "run"
     shutil.copytree(whole, folder)
-    harness.finish(TRAIN, harness.training(folder, rooms), folder)
+    harness.finish(TRAIN, harness.training(folder, cache), folder)
     harness.assert_same(whole, folder)
 
 
-def test_killed_run_equals_uninterrupted(tmp_path: Path, rooms: Path, whole: Path) -> None:
-    assert survive(QUICK, tmp_path / "run", rooms) == len(QUICK.moments)
+def test_killed_run_equals_uninterrupted(tmp_path: Path, cache: Path, whole: Path) -> None:
+    assert survive(QUICK, tmp_path / "run", cache) == len(QUICK.moments)
     harness.assert_same(whole, tmp_path / "run")
 
 
-def test_a_damaged_last_checkpoint_is_set_aside(tmp_path: Path, rooms: Path, whole: Path) -> None:
+def test_a_damaged_last_checkpoint_is_set_aside(tmp_path: Path, cache: Path, whole: Path) -> None:
     """The run goes on from the one before, says so, and ends the same."""
     folder = tmp_path / "run"
     shutil.copytree(whole, folder)
@@ -79,7 +79,7 @@ def test_a_damaged_last_checkpoint_is_set_aside(tmp_path: Path, rooms: Path, who
     content[len(content) // 2] ^= 1
     newest.write_bytes(content)
     (folder / "metrics.json").unlink()
-    harness.finish(TRAIN, harness.training(folder, rooms), folder)
+    harness.finish(TRAIN, harness.training(folder, cache), folder)
     aside = newest.with_name(f"{newest.name}.damaged")
     assert aside.read_bytes() == bytes(content)
     aside.unlink()
@@ -89,22 +89,22 @@ def test_a_damaged_last_checkpoint_is_set_aside(tmp_path: Path, rooms: Path, who
     assert "goes on from step-4.ckpt" in said
 
 
-def test_auto_does_not_start_over_where_all_checkpoints_are_damaged(tmp_path: Path, rooms: Path) -> None:
+def test_auto_does_not_start_over_where_all_checkpoints_are_damaged(tmp_path: Path, cache: Path) -> None:
     folder = tmp_path / "run"
     (folder / "checkpoints").mkdir(parents=True)
     (folder / "checkpoints" / "step-2.ckpt").write_bytes(b"damaged")
-    attempt = harness.start(TRAIN, harness.training(folder, rooms), folder)
+    attempt = harness.start(TRAIN, harness.training(folder, cache), folder)
     assert attempt.wait() == 1
     assert "FileNotFoundError: no valid checkpoint in" in attempt.said()
     assert (folder / "checkpoints" / "step-2.ckpt").is_file()
 
 
 @pytest.mark.slow
-def test_twenty_kills(tmp_path: Path, rooms: Path, whole: Path) -> None:
+def test_twenty_kills(tmp_path: Path, cache: Path, whole: Path) -> None:
     kills: dict[str, int] = {}
     for number, case in enumerate(CASES):
         folder = tmp_path / f"run-{number}"
-        kills[case.kind] = survive(case, folder, rooms)
+        kills[case.kind] = survive(case, folder, cache)
         harness.assert_same(whole, folder)
         print(f"{kills[case.kind]} kills survived: {case.kind}", flush=True)
     print(f"{sum(kills.values())} kills survived, every result equal bit for bit")

@@ -31,11 +31,6 @@ OPTIONS = [
 ]
 
 
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("rooms")
-
-
 def make(overrides: tuple[str, ...], folder: Path, cache: Path, patch: pytest.MonkeyPatch) -> tuple[Run, Batch]:
     run = tiny_run(folder, cache, *(override for override in overrides if override))
     (good,) = first_batches(run, 1)

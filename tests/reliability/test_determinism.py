@@ -13,11 +13,6 @@ from tests.reliability.two_ranks import weights
 DROP = "model.coarse.ptv3.drop_path=0.3"  # makes the global generator part of the weights
 
 
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("rooms")
-
-
 @pytest.fixture(autouse=True)
 def _settings() -> Iterator[None]:
     """Leaves torch as it was: the trainer sets these for the whole process."""

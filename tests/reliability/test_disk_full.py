@@ -33,8 +33,8 @@ def checkpoints(folder: Path) -> list[Path]:
     return sorted((folder / "checkpoints").glob("*.ckpt"))
 
 
-def assert_goes_on(whole: Path, folder: Path, rooms: Path) -> None:
-    harness.finish(TRAIN, harness.training(folder, rooms), folder)
+def assert_goes_on(whole: Path, folder: Path, cache: Path) -> None:
+    harness.finish(TRAIN, harness.training(folder, cache), folder)
     harness.assert_same(whole, folder)
 
 
@@ -68,10 +68,10 @@ def test_a_log_that_does_not_fit_keeps_whole_rows(tmp_path: Path) -> None:
         assert next(csv.reader(file)) == ["eval/psnr", "loss", "step"]
 
 
-def test_training_ends_and_goes_on(tmp_path: Path, rooms: Path, whole: Path) -> None:
+def test_training_ends_and_goes_on(tmp_path: Path, cache: Path, whole: Path) -> None:
     """The second checkpoint does not fit: the limit is set on the running process after the first."""
     folder = tmp_path / "run"
-    attempt = harness.start(TRAIN, harness.training(folder, rooms), folder)
+    attempt = harness.start(TRAIN, harness.training(folder, cache), folder)
     assert attempt.wait_for(harness.after_a_checkpoint)
     limit = checkpoints(folder)[0].stat().st_size // 2
     resource.prlimit(attempt.process.pid, resource.RLIMIT_FSIZE, (limit, limit))
@@ -85,7 +85,7 @@ def test_training_ends_and_goes_on(tmp_path: Path, rooms: Path, whole: Path) -> 
     assert "Traceback" not in attempt.said()
     assert not list(folder.rglob("*.tmp"))
     assert newest_valid(folder / "checkpoints") == checkpoints(folder)[-1]
-    assert_goes_on(whole, folder, rooms)
+    assert_goes_on(whole, folder, cache)
 
 
 # ----------------------------------------------------------------------------------------- a file system of our own
@@ -129,9 +129,9 @@ def in_the_first_step(attempt: Attempt) -> bool:
         (harness.in_last_evaluation, r"(metrics\.csv|metrics\.json|metrics\.md|preview\.png)"),
     ],
 )
-def test_full_file_system(small_disk: Path, rooms: Path, whole: Path, moment: harness.Moment, named: str) -> None:
+def test_full_file_system(small_disk: Path, cache: Path, whole: Path, moment: harness.Moment, named: str) -> None:
     folder = small_disk / "run"
-    attempt = harness.start(TRAIN, harness.training(folder, rooms), folder)
+    attempt = harness.start(TRAIN, harness.training(folder, cache), folder)
     assert attempt.wait_for(moment)
     filler = fill(small_disk)
     status = attempt.wait()
@@ -139,5 +139,5 @@ def test_full_file_system(small_disk: Path, rooms: Path, whole: Path, moment: ha
     filler.unlink()
     print(f"{moment}: status {status}, checkpoints {kept}: {attempt.said()[-300:]}")
     assert status == 1
-    assert_goes_on(whole, folder, rooms)
+    assert_goes_on(whole, folder, cache)
     assert re.search(named, attempt.said())

@@ -24,12 +24,6 @@ from vg2gt.training.distributed import interleave
 from vg2gt.training.loop import Run
 from vg2gt.types import Batch
 
-
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("rooms")
-
-
 # --------------------------------------------------------------------------------------------- scenes count alike
 
 OBJECTIVES = {

@@ -46,10 +46,10 @@ def without_cost(node: Any) -> Any:
 
 
 @pytest.mark.slow
-def test_evaluation(tmp_path: Path, rooms: Path, whole: Path) -> None:
+def test_evaluation(tmp_path: Path, cache: Path, whole: Path) -> None:
     def arguments(folder: Path) -> list[str]:
         small = ["data.image_size=[28,56]", "data.eval_scenes=5", "views=[2]", "device=cpu", "name=test"]
-        places = [f"output_dir={folder}", f"hydra.run.dir={folder}", f"data.cache_dir={rooms}", f"ckpt={run}"]
+        places = [f"output_dir={folder}", f"hydra.run.dir={folder}", f"data.cache_dir={cache}", f"ckpt={run}"]
         return [*small, *places, "evaluation.pictures=2"]
 
     run, expected, folder = tmp_path / "run", tmp_path / "whole", tmp_path / "killed"
@@ -67,11 +67,11 @@ def test_evaluation(tmp_path: Path, rooms: Path, whole: Path) -> None:
 
 
 @pytest.mark.slow
-def test_study(tmp_path: Path, rooms: Path) -> None:
+def test_study(tmp_path: Path, cache: Path) -> None:
     def arguments(folder: Path) -> list[str]:
         small = [o for o in SMALL if not o.startswith(("trainer.max_steps", "callbacks.progress_bar"))]
         study = ["seeds=1", "full_steps=4", "steps=3", "variants=[wo_split]", "splits=[2]", "data.image_size=[28,56]"]
-        return [*small, *study, f"data.cache_dir={rooms}", f"hydra.run.dir={folder}"]
+        return [*small, *study, f"data.cache_dir={cache}", f"hydra.run.dir={folder}"]
 
     expected, folder = tmp_path / "whole", tmp_path / "killed"
     harness.finish(ABLATE, arguments(expected), expected)

@@ -1,11 +1,10 @@
-"""Training keeps nothing of its steps: as many live tensors after a step as twenty steps before."""
+"""Training keeps nothing of its steps: as many live tensors after a step as eight steps before."""
 
 import gc
 from pathlib import Path
 from typing import Any
 
 import lightning
-import pytest
 import torch
 
 from tests.training_helpers import small_config
@@ -30,15 +29,10 @@ class CountTensors(lightning.Callback):
             self.found[trainer.global_step] = live_tensors()
 
 
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("cache")
-
-
 def test_steps_leave_no_tensors_behind(tmp_path: Path, cache: Path) -> None:
-    counts = CountTensors((6, 26))
+    counts = CountTensors((4, 12))
     size = ["data.image_size=[28,56]", "data.min_views=3", "data.max_views=3", "data.max_images=3"]
-    run = build(small_config(tmp_path, cache, *size, "trainer.max_steps=26"))
+    run = build(small_config(tmp_path, cache, *size, "trainer.max_steps=12"))
     run.trainer.callbacks.append(counts)  # pyright: ignore[reportAttributeAccessIssue]
     run.trainer.fit(run.module, datamodule=run.datamodule)
     (before, bytes_before), (after, bytes_after) = counts.found.values()

@@ -28,11 +28,6 @@ TERMS = ("depth_conf", "depth_reg", "depth_grad", "point_conf", "point_reg", "po
 TERMS += ("enhance_point", "color_l1", "ssim", "depth_consistency", "depth_gt", "normal")
 
 
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("rooms")
-
-
 @pytest.fixture
 def run(tmp_path: Path, cache: Path) -> Run:
     return tiny_run(tmp_path, cache)

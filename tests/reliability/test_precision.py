@@ -39,11 +39,6 @@ PLAIN = ("model.gaussians.start=plain", "model.fine.moments=false", "model.fine.
 METRIC_TOLERANCE = {"psnr": 0.1, "ssim": 0.01, "abs_rel": 0.005, "decoded_abs_rel": 0.001, "coverage": 0.01}
 
 
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("rooms")
-
-
 class Steps(lightning.Callback):
     """Notes loss and gradient of every step."""
 

@@ -34,7 +34,7 @@ MUTANTS = {
 @pytest.mark.skipif(INTERPRETED or importlib.util.find_spec("triton") is None, reason="the test that starts the others")
 def test_in_the_interpreter() -> None:
     """Runs this file once more, because Triton must be told of its interpreter before it is first imported."""
-    command = [sys.executable, "-m", "pytest", "-q", "-x", __file__]
+    command = [sys.executable, "-m", "pytest", "-n", "0", "-q", "-x", __file__]
     environment = {**os.environ, "TRITON_INTERPRET": "1"}
     result = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stdout[-5000:]

@@ -37,7 +37,7 @@ runnable = pytest.mark.skipif(DEVICE == "cpu" and not INTERPRETED, reason="runs 
 def test_in_the_interpreter() -> None:
     """Runs this file once more, because Triton must be told of its interpreter before it is first imported."""
     environment = {**os.environ, "TRITON_INTERPRET": "1"}
-    command = [sys.executable, "-m", "pytest", "-q", __file__]
+    command = [sys.executable, "-m", "pytest", "-n", "0", "-q", __file__]
     result = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert result.returncode == 0, result.stdout[-5000:]
 

@@ -20,11 +20,6 @@ from vg2gt.training.distributed import ending_together
 from vg2gt.training.loop import build, train
 
 
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("rooms")
-
-
 class HappensAt(lightning.Callback):
     """Does something in a training step, and counts evaluations while training."""
 

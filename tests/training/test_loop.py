@@ -1,11 +1,12 @@
 """Whole runs: every ablation, backends, resume, bad input."""
 
 import json
+import os
+import shlex
 import shutil
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,8 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from tests.commands import run_vg2gt
+from tests.commands import run_vg2gt, shell
+from tests.reliability.crash_harness import start
 from tests.training_helpers import SMALL, full_model, small_config, with_crash
 from vg2gt.config import compose
 from vg2gt.data import DataError, Frames, SyntheticScenes
@@ -22,11 +24,6 @@ from vg2gt.gaussians import GaussianHead
 from vg2gt.runs.checkpoints import newest_valid, read_checkpoint
 from vg2gt.runs.lock import only_process_in
 from vg2gt.training.loop import build, evaluate, train
-
-
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("rooms")
 
 
 @pytest.fixture(scope="module")
@@ -117,21 +114,16 @@ def test_sigterm_saves_and_ends(tmp_path: Path, cache: Path) -> None:
     """In training the step is finished and saved; in the evaluation before it there is nothing to save."""
     overrides = [*SMALL, f"output_dir={tmp_path}", f"hydra.run.dir={tmp_path}", f"data.cache_dir={cache}"]
     overrides += ["trainer.max_steps=100000", "callbacks.checkpoint.every_n_train_steps=100000"]
-    command = [sys.executable, "-m", "vg2gt.cli.train", *overrides]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-    deadline = time.monotonic() + 240
-    while process.poll() is None and time.monotonic() < deadline and not trains(tmp_path):
-        time.sleep(0.2)
-    process.send_signal(signal.SIGTERM)
-    _, errors = process.communicate(timeout=60)
-    assert process.returncode == 0, errors[-2000:]
+    attempt = start("vg2gt.cli.train", overrides, tmp_path)
+    try:
+        assert attempt.wait_for(lambda running: "train/" in running.log()), attempt.said()
+        os.kill(attempt.process.pid, signal.SIGTERM)
+        assert attempt.wait() == 0, attempt.said()[-2000:]
+    finally:
+        attempt.kill()
     saved = newest_valid(tmp_path / "checkpoints")
     assert read_checkpoint(saved)["global_step"] >= 1
-    assert "go on with ckpt=last" in errors
-
-
-def trains(folder: Path) -> bool:
-    return any("train/" in path.read_text() for path in folder.glob("logs/*/metrics.csv"))
+    assert "go on with ckpt=last" in attempt.said()
 
 
 class Signalled(lightning.Callback):
@@ -372,8 +364,7 @@ def test_other_loggers_get_curves_and_the_picture(
 @pytest.mark.slow
 def test_two_processes_from_the_console_script(tmp_path: Path, cache: Path) -> None:
     overrides = [*SMALL, f"data.cache_dir={cache}", "trainer=ddp", "trainer.max_steps=2", "name=two"]
-    run = run_vg2gt("train", *overrides, folder=tmp_path)
-    assert run.returncode == 0, run.stderr[-3000:]
+    shell(shlex.join(["vg2gt", "train", *overrides]), tmp_path)
     assert json.loads((tmp_path / "outputs" / "two" / "metrics.json").read_text())["steps"] == 2
 
 

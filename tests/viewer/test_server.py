@@ -92,7 +92,9 @@ def test_nothing_is_published_unless_asked(server, monkeypatch: pytest.MonkeyPat
 
 def test_command_serves_until_interrupted(tmp_path: Path) -> None:
     path = write_gaussian_ply(tmp_path / "scene.ply", scene(20))
-    command = [sys.executable, "-c", "import vg2gt.cli; vg2gt.cli.main()", "view", str(path), "--port", "0"]
+    # What a shell starts in the background ignores SIGINT, and so does what it starts.
+    code = "import signal, vg2gt.cli; signal.signal(signal.SIGINT, signal.default_int_handler); vg2gt.cli.main()"
+    command = [sys.executable, "-c", code, "view", str(path), "--port", "0"]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
     assert process.stdout is not None
