@@ -24,7 +24,6 @@ SHORT = (
     "list",
     "blend solid=True geometry=True mean=False",
     "backward solid=True geometry=True mean=False",
-    "project_backward solid=True degree=1 cameras=False",
 )
 
 

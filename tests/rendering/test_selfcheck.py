@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from vg2gt.rendering import render, renderer, selfcheck
+from vg2gt.rendering.options import Mode
 from vg2gt.rendering.selfcheck import GRADIENTS, VALUES, Agreement
 
 INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
@@ -32,25 +33,28 @@ MUTANTS = {
 
 
 @pytest.mark.skipif(INTERPRETED or importlib.util.find_spec("triton") is None, reason="the test that starts the others")
-def test_in_the_interpreter() -> None:
+@pytest.mark.parametrize("chosen", ["not slow", pytest.param("slow", marks=pytest.mark.slow)])
+def test_in_the_interpreter(chosen: str) -> None:
     """Runs this file once more, because Triton must be told of its interpreter before it is first imported."""
-    command = [sys.executable, "-m", "pytest", "-n", "0", "-q", "-x", __file__]
+    command = [sys.executable, "-m", "pytest", "-n", "0", "-x", "-m", chosen, __file__]
     environment = {**os.environ, "TRITON_INTERPRET": "1"}
     result = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stdout[-5000:]
 
 
 @interpreted
-def test_right_kernels_agree_far_within_the_bounds() -> None:
-    for mode in selfcheck.MODES:
-        found = selfcheck.compare(render, torch.device("cpu"), (mode,))
-        assert found.good
-        assert found.values < VALUES / 10
-        assert found.gradients < GRADIENTS / 10
+@pytest.mark.parametrize("mode", ["rasterized", pytest.param("solid", marks=pytest.mark.slow)])
+def test_right_kernels_agree_far_within_the_bounds(mode: Mode) -> None:
+    found = selfcheck.compare(render, torch.device("cpu"), (mode,))
+    assert found.good
+    assert found.values < VALUES / 10
+    assert found.gradients < GRADIENTS / 10
 
 
 @interpreted
-@pytest.mark.parametrize("name", MUTANTS)
+@pytest.mark.parametrize(
+    "name", [name if name == "rows not summed" else pytest.param(name, marks=pytest.mark.slow) for name in MUTANTS]
+)
 def test_wrong_kernels_are_refused(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from vg2gt.rendering.gpu import kernels
 

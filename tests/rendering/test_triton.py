@@ -34,19 +34,30 @@ runnable = pytest.mark.skipif(DEVICE == "cpu" and not INTERPRETED, reason="runs 
 
 
 @pytest.mark.skipif(DEVICE == "cuda" or INTERPRETED, reason="only where the kernels cannot run themselves")
-def test_in_the_interpreter() -> None:
+@pytest.mark.parametrize("chosen", ["not slow and not gpu", pytest.param("slow", marks=pytest.mark.slow)])
+def test_in_the_interpreter(chosen: str) -> None:
     """Runs this file once more, because Triton must be told of its interpreter before it is first imported."""
     environment = {**os.environ, "TRITON_INTERPRET": "1"}
-    command = [sys.executable, "-m", "pytest", "-n", "0", "-q", __file__]
+    command = [sys.executable, "-m", "pytest", "-n", "0", "-m", chosen, __file__]
     result = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert result.returncode == 0, result.stdout[-5000:]
 
 
 @runnable
-@pytest.mark.parametrize(("kind", "degree"), [*zip(KINDS, (1, 3, 0), strict=True), (KINDS[0], 2)])
-def test_equals_the_reference(kind: tuple[Mode, DepthKind], degree: int) -> None:
-    """Images of 9 x 11 pixels of two scenes, two views each, in one sequence of launches."""
-    gaussians, cameras = soup(7, seed=degree, size=0.25, degree=degree, scenes=2), cameras_around((9, 11), scenes=2)
+@pytest.mark.parametrize(
+    ("kind", "degree", "scenes", "views"),
+    [
+        (KINDS[0], 1, 2, 1),
+        (KINDS[1], 3, 1, 2),
+        (KINDS[2], 0, 1, 1),
+        *(pytest.param(*case, 2, 2, marks=pytest.mark.slow) for case in zip(KINDS, (1, 3, 0), strict=True)),
+        pytest.param(KINDS[0], 2, 2, 2, marks=pytest.mark.slow),
+    ],
+)
+def test_equals_the_reference(kind: tuple[Mode, DepthKind], degree: int, scenes: int, views: int) -> None:
+    """Images of 9 x 11 pixels, all scenes and views in one sequence of launches."""
+    gaussians = soup(7, seed=degree, size=0.25, degree=degree, scenes=scenes)
+    cameras = cameras_around((9, 11), scenes=scenes, views=views)
     options = {"mode": kind[0], "depth": kind[1]}
     expected = render_with_gradients(gaussians, cameras, implementation="dense", **options)
     found = render_with_gradients(gaussians, cameras, DEVICE, implementation="triton", **options)
