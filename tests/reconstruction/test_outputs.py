@@ -1,6 +1,7 @@
 """Every output is read back by its reader and says the same as the scene in memory."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -148,7 +149,7 @@ def test_animation_and_reports(written: Path, scene: Scene) -> None:
     assert page.count("data:image/jpeg;base64,") == 16
     assert page.count("data:image/gif;base64,") == 1
     assert "&lt;none&gt;" in page
-    assert "http" not in page
+    assert "http" not in re.sub(r"base64,[\w+/=]*", "", page)
 
 
 def test_nothing_is_replaced_unasked(written: Path, scene: Scene, tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import statistics
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 import torch
@@ -65,7 +65,7 @@ def fault_of_batch(batch: Batch) -> Fault | None:
 
 def fault_of_prediction(prediction: Prediction, scenes: tuple[str, ...]) -> Fault | None:
     """Finds NaN or infinity in the Gaussians; names the part of the prediction where it begins."""
-    gaussians = _tensors(prediction.gaussians, "Gaussians'")
+    gaussians = _tensors(replace(prediction.gaussians, background=None), "Gaussians'")  # that is the images' mean
     if all(_all_finite(tensor) for tensor in gaussians.values()):
         return None
     stages = _tensors(prediction.initial.cameras, "backbone's") | {"unit of the scene": prediction.unit}
