@@ -23,6 +23,7 @@ from vg2gt.config import compose
 from vg2gt.metrics import depth_metrics
 from vg2gt.model import VG2GT
 from vg2gt.types import Batch
+from vg2gt.voxels import CoarseModule, PTv3
 from vg2gt.voxels.surface import SURFACE_CHANNELS
 
 SETS = {
@@ -43,7 +44,8 @@ def batches(overrides: str) -> list[Batch]:
 
 def fused_inputs(model: VG2GT, variant: str) -> tuple[slice, bool]:
     """Which channels of the fusion's input a variant changes, and whether their mean replaces them, else zero."""
-    assert model.coarse is not None
+    assert isinstance(model.coarse, CoarseModule)
+    assert isinstance(model.coarse.ptv3, PTv3)
     width = model.coarse.ptv3.out_channels
     if variant == "PTv3's features averaged":
         return slice(0, width), True
@@ -55,7 +57,7 @@ def fused_inputs(model: VG2GT, variant: str) -> tuple[slice, bool]:
 @contextmanager
 def changed(model: VG2GT, variant: str) -> Iterator[None]:
     """Within it the fusion of the coarse module is told what the variant says."""
-    assert model.coarse is not None
+    assert isinstance(model.coarse, CoarseModule)
     if variant == "after":
         yield
         return

@@ -1,6 +1,7 @@
 """The whole forward pass on a procedural room with the simulated backbone."""
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -81,8 +82,9 @@ def test_rays_that_meet_nothing_show_the_scenes_mean_colour(run: Run, model: VG2
         assert model(batch.context.images, batch.context.hints).gaussians.background is None
     finally:
         model.background = "mean"
+    other: Any = "white"
     with pytest.raises(ValueError, match=r"model\.background is 'white'; choose one of mean, black"):
-        VG2GT(model.backend, SceneScale(), None, lambda **_: model.fine, lambda **_: model.gaussians, True, "white")
+        VG2GT(model.backend, SceneScale(), None, lambda **_: model.fine, lambda **_: model.gaussians, background=other)
 
 
 def test_gradient_reaches_the_last_coarse_layer_first_and_the_transformer_next(run: Run, batch: Batch) -> None:
