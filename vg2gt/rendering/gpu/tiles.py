@@ -176,6 +176,22 @@ def _median(
 
 
 @triton.jit
+def _meet(records, members, place, before, px, py, alpha_max: tl.constexpr, stop: tl.constexpr):
+    """The next Gaussian on the rays: its record and response, its alpha where it counts, what is transmitted behind it.
+
+    ``before`` is the transmittance in front of it, negative where the ray has ended; the last value says whether any
+    ray meets it.
+    """
+    g = records + tl.load(members + place).to(tl.int64) * _RECORD
+    _, _, _, s, r, inverse, _, on, alpha = _respond(g, px, py, alpha_max, True)
+    on = on & (before > 0)
+    after = before * (1.0 - alpha)
+    kept = on & (after >= stop)
+    behind = tl.where(kept, after, tl.where(on, -before, before))
+    return g, s, r, inverse, tl.where(kept, alpha, 0.0), behind, tl.max(on.to(tl.int32), 0) > 0
+
+
+@triton.jit
 def _part(records, members, place, last, px, py, solvable, lo, step, alpha_max: tl.constexpr, stop: tl.constexpr):
     """How many of the seven depths ``lo + k step`` lie in front of the median, and whether ``lo`` does.
 
@@ -187,14 +203,8 @@ def _part(records, members, place, last, px, py, solvable, lo, step, alpha_max: 
     d0, d1, d2, d3, d4, d5, d6, d7 = one, one, one, one, one, one, one, one
     live = place < last
     while live:
-        g = records + tl.load(members + place).to(tl.int64) * _RECORD
-        _, _, _, s, r, inverse, _, on, alpha = _respond(g, px, py, alpha_max, True)
-        on = on & (before > 0)
-        if tl.max(on.to(tl.int32), 0) > 0:
-            after = before * (1.0 - alpha)
-            kept = on & (after >= stop)
-            alpha = tl.where(kept, alpha, 0.0)
-            before = tl.where(kept, after, tl.where(on, -before, before))
+        g, s, r, inverse, alpha, before, met = _meet(records, members, place, before, px, py, alpha_max, stop)
+        if met:
             passed = (1.0 - alpha) * (1.0 - alpha)
             sharp = (-0.5 * _LOG2E) * tl.load(g + 8) * r
             t = lo - tl.load(g + 7) * s * inverse
@@ -235,14 +245,8 @@ def _transmit(records, members, place, last, px, py, solvable, t, alpha_max: tl.
     numerator, denominator, steep = px * 0 + 1.0, px * 0 + 1.0, px * 0
     live = place < last
     while live:
-        g = records + tl.load(members + place).to(tl.int64) * _RECORD
-        _, _, _, s, r, inverse, _, on, alpha = _respond(g, px, py, alpha_max, True)
-        on = on & (before > 0)
-        if tl.max(on.to(tl.int32), 0) > 0:
-            after = before * (1.0 - alpha)
-            kept = on & (after >= stop)
-            alpha = tl.where(kept, alpha, 0.0)
-            before = tl.where(kept, after, tl.where(on, -before, before))
+        g, s, r, inverse, alpha, before, met = _meet(records, members, place, before, px, py, alpha_max, stop)
+        if met:
             precision = tl.load(g + 8) * r
             offset = t - tl.load(g + 7) * s * inverse
             bell = alpha * tl.exp(-0.5 * precision * offset * offset)
