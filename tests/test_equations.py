@@ -70,7 +70,7 @@ def test_a_deviations_key_exists_and_the_presets_are_on_the_stated_sides(key: st
 def test_every_switchable_addition_is_in_the_table() -> None:
     starred = {key for key, star, _ in KEYS if star}
     coarse = {f"model.coarse.{name}" for name in ("surface_evidence", "embedding_skip", "fuse_kernel", "gate")}
-    fine = {"model.fine.moments", "model.fine.drop_fringes"}
+    fine = {"model.fine.moments", "model.fine.normal_kernel", "model.fine.drop_fringes"}
     head = {"model.gaussians.anchor", "model.gaussians.start"}
     assert starred == coarse | fine | head | {"model.keep_scale", "model.background"}
     assert {line.count("|") for line in DEVIATIONS.splitlines() if line.startswith("|")} == {5}

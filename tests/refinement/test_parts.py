@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from tests.refinement.conftest import VIEWS, Start
+from vg2gt.gaussians.surfel import ALONE, SPACING
 from vg2gt.geometry.cameras import invert_rigid
 from vg2gt.refinement import RefinedScene, RefineLoss, RefineRates
 from vg2gt.refinement.density import prune, split
@@ -107,7 +108,7 @@ def test_a_split_covers_what_one_covered(parameters: Parameters) -> None:
     torch.testing.assert_close(halves.mean(0), before.means[[4, 7]])
     longest = before.scales[[4, 7]].max(-1).values
     apart = (halves[0] - halves[1]).norm(dim=-1)
-    torch.testing.assert_close(apart, 0.6 / 0.48 * longest)
+    torch.testing.assert_close(apart, SPACING / 2 / ALONE * longest)
     assert (after.scales[-4:].amax(-1) <= longest.repeat(2)).all()
 
 

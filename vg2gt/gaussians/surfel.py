@@ -1,8 +1,9 @@
 """The surfel start: a voxel's Gaussians laid along its surface, in closed form (our addition to the paper's head).
 
 A mean colour and a mean position say nothing of how the surface runs through a cell and how colour changes across it.
-The second moments of its points do: their spread has the normal as the direction of least variance, and their
-covariance with colour over that spread is the colour's gradient along the surface, as in linear regression.
+The second moments of its points do: their spread, and that of the cells around, has the normal as the direction of
+least variance, and their covariance with colour over that spread is the colour's gradient along the surface, as in
+linear regression.
 """
 
 from __future__ import annotations
@@ -14,21 +15,20 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from vg2gt.geometry.symmetric import principal_direction, smallest_eigenvector
+from vg2gt.geometry.symmetric import facing_normals, principal_direction
 from vg2gt.types import TensorRecord, VoxelMoments
 
 UNIFORM_VARIANCE = 1 / 12  # of points spread evenly over a cell, in cells^2
-FACING_PRIOR = 1e-4  # cells^2: without evidence a surface faces its cameras
 GRADIENT_RIDGE = 0.01 / 12  # cells^2: a colour gradient needs points that far apart
 MIN_GRADIENT = 1e-4  # squared colour per squared cell; below it the longest axis is the direction
 SPACING = 1.2  # cells, of n Gaussians side by side: SPACING / n
-ALONE = 0.48  # cells, standard deviation of a Gaussian that is alone in its row
-SHARED = 0.68  # cells, n in a row have SHARED / n each
+ALONE = 0.41  # cells, standard deviation of a Gaussian that is alone in its row
+SHARED = 0.58  # cells, n in a row have SHARED / n each
 GRAZING = 0.2  # cosine of the steepest angle at which a pixel covers a surface
 LARGEST_REACH = 1.2  # of a full cell
 MIN_REACH = 0.3  # of a full cell: where a surface only touches a cell, its Gaussians are smaller, but not points
 THICKNESS = 0.06  # cells, standard deviation along the normal
-COLOR_GAIN = 1.2  # Gaussians overlap, which blurs their colours: their difference starts that much larger
+COLOR_GAIN = 1.4  # Gaussians overlap, which blurs their colours: their difference starts that much larger
 
 
 @dataclass(frozen=True)
@@ -77,15 +77,11 @@ def surface_frame(moments: VoxelMoments) -> tuple[Tensor, Tensor, Tensor]:
         and the points' extent ``[M, 2]`` along the first two axes, 1 for a full cell, at most 1.2.
     """
     spread, cross, facing = moments.spread, moments.cross, moments.facing
-    eye = torch.eye(3, dtype=spread.dtype, device=spread.device)
-    # A little variance everywhere but along the line of sight: with nothing else known, that line is the normal.
-    prior = FACING_PRIOR * (eye - facing[:, :, None] * facing[:, None])
-    normal = smallest_eigenvector(spread + prior, facing)
-    normal = torch.where((normal * facing).sum(-1, keepdim=True) < 0, -normal, normal)
+    normal = facing_normals(spread, facing) if moments.normal is None else moments.normal
     tangent = _orthogonal(normal)
     plane = torch.stack((tangent, torch.linalg.cross(normal, tangent)), -1)  # [M, 3, 2]
     inside = plane.transpose(1, 2) @ spread @ plane  # [M, 2, 2]
-    ridge = inside + GRADIENT_RIDGE * eye[:2, :2]
+    ridge = inside + GRADIENT_RIDGE * torch.eye(2, dtype=spread.dtype, device=spread.device)
     determinant = ridge[:, 0, 0] * ridge[:, 1, 1] - ridge[:, 0, 1].square()
     adjugate = torch.stack((ridge[:, 1, 1], -ridge[:, 0, 1], -ridge[:, 0, 1], ridge[:, 0, 0]), -1).unflatten(-1, (2, 2))
     slope = adjugate @ (plane.transpose(1, 2) @ cross) / determinant[:, None, None]  # [M, 2, 3]: least squares

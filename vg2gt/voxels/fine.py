@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from vg2gt.geometry.cameras import camera_centers, unproject
+from vg2gt.geometry.symmetric import FULL, UPPER
 from vg2gt.memory import Cap, check_limit, note_sizes
 from vg2gt.types import Geometry, Tokens, VoxelMoments, Voxels
 from vg2gt.voxels.dense_head import DenseHead
@@ -24,6 +25,7 @@ from vg2gt.voxels.grid import (
     scene_voxel_size,
     warn_if_sparse,
 )
+from vg2gt.voxels.normals import with_normals
 from vg2gt.voxels.pointmlp import PointMLP
 from vg2gt.voxels.silhouette import on_surface
 
@@ -31,8 +33,6 @@ log = logging.getLogger(__name__)
 
 EXTRA_CHANNELS = 8  # colour (3), position of the centroid in the cell (3), number of points, confidence
 MOMENT_CHANNELS = 15  # spread (6), covariance with colour (9)
-UPPER = ((0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2))  # rows and columns of a symmetric 3x3 matrix's upper triangle
-FULL = (0, 1, 2, 1, 3, 4, 2, 4, 5)  # where its nine entries are among those six
 
 
 class FineModule(nn.Module):
@@ -52,6 +52,8 @@ class FineModule(nn.Module):
             the metric ``train/voxels_dropped``. None keeps all.
         moments: second moments of the points are pooled too: further inputs of the voxel network, and what the
             Gaussian head's surfel start is made of.
+        normal_kernel: cells a side, 1 or 3, whose points say how the surface runs through a voxel
+            (:mod:`vg2gt.voxels.normals`).
         drop_fringes: pixels between foreground and background (:mod:`vg2gt.voxels.silhouette`) are left out.
 
     Attributes:
@@ -59,7 +61,7 @@ class FineModule(nn.Module):
         cap: counts what ``max_voxels`` drops.
 
     Raises:
-        ValueError: if ``max_voxels`` is below 1.
+        ValueError: if ``max_voxels`` is below 1, or ``normal_kernel`` neither 1 nor 3.
     """
 
     def __init__(
@@ -72,9 +74,12 @@ class FineModule(nn.Module):
         min_footprint: float = 1.0,
         max_voxels: int | None = None,
         moments: bool = False,
+        normal_kernel: int = 1,
         drop_fringes: bool = False,
     ) -> None:
         super().__init__()
+        if normal_kernel not in (1, 3):
+            raise ValueError(f"model.fine.normal_kernel must be 1 or 3, got {normal_kernel}")
         self.voxel_size = voxel_size
         self.min_footprint = min_footprint
         self.max_voxels = check_limit("model.fine.max_voxels", max_voxels)
@@ -83,6 +88,7 @@ class FineModule(nn.Module):
         width = self.dense_head.out_channels
         self.point_offset = nn.Linear(3, width, bias=False)
         self.moments = moments
+        self.normal_kernel = normal_kernel
         self.drop_fringes = drop_fringes
         self.point_mlp = point_mlp(in_channels=width + EXTRA_CHANNELS + MOMENT_CHANNELS * moments)
         self.out_channels = self.point_mlp.out_channels
@@ -160,7 +166,8 @@ class FineModule(nn.Module):
         spread = squares - offset[:, UPPER[0]] * offset[:, UPPER[1]]
         cross = mixed.unflatten(-1, (3, 3)) - offset[:, :, None] * color[:, None]
         facing = F.normalize(eye - centroid, dim=-1)
-        return VoxelMoments(spread[:, FULL].unflatten(-1, (3, 3)), cross, facing, pixel[:, 0])
+        moments = VoxelMoments(spread[:, FULL].unflatten(-1, (3, 3)), cross, facing, pixel[:, 0])
+        return with_normals(moments, offset, plan, self.normal_kernel)
 
     def _pool_features(self, tokens: Tokens, images: Tensor, points: _Points, plan: VoxelPlan) -> Tensor:
         """``[M, C]``; without gradient the features of a few views are there at a time, which bounds the memory."""
