@@ -7,7 +7,7 @@ counted. Held-out views at true poses, brought into the scene's frame by its pre
 a scene; cameras: root mean square distance of the input views' centres to the true ones after one similarity, in per
 cent of the median depth. Heads are untrained, which the labels say, but for those of ``--ckpt LABEL=PATH``. Procedural
 rooms or, with ``data=rgbd data.root=FOLDER``, a recording; ``backend.pose_noise=0.01`` starts from wrong cameras and
-``--rates cameras=0.1`` says how they move. Writes a dated JSON file to
+``--options rates.cameras=0.1`` says how they move. Writes a dated JSON file to
 ``benchmarks/results`` and curves to ``docs/figures``.
 """
 
@@ -152,7 +152,7 @@ def main() -> None:
     options.add_argument("--seconds", type=float, default=20.0)
     options.add_argument("--starts", nargs="+", choices=STARTS, default=list(STARTS), metavar="LABEL")
     options.add_argument("--ckpt", nargs="+", default=[], metavar="LABEL=PATH", help="a start's trained part")
-    options.add_argument("--rates", nargs="+", default=[], metavar="KEY=VALUE", help="of configs/refine, rates.*")
+    options.add_argument("--options", nargs="+", default=[], metavar="KEY=VALUE", help="of configs/refine")
     options.add_argument("--name", default="rooms", help="part of the files' names")
     options.add_argument("--figures", type=Path, default=FIGURES)
     arguments = options.parse_args()
@@ -165,8 +165,8 @@ def main() -> None:
     data = instantiate(config.data)
     data.setup("validate")
     batches = [batch.to(device) for batch, _ in zip(data.val_dataloader(), range(arguments.scenes), strict=False)]
-    rates = [f"refine.rates.{item}" for item in arguments.rates]
-    how = replace(instantiate(compose(None, "+refine=default", *rates).refine), steps=None, seconds=arguments.seconds)
+    changes = [f"refine.{item}" for item in arguments.options]
+    how = replace(instantiate(compose(None, "+refine=default", *changes).refine), steps=None, seconds=arguments.seconds)
     marks = [arguments.seconds * share for share in (1 / 16, 1 / 8, 1 / 4, 1 / 2)]
     noise = {key: config.backend.get(key) for key in ("depth_noise", "pose_noise")}
     backend = [f"backend.{key}={value}" for key, value in noise.items() if value is not None]
@@ -198,7 +198,7 @@ def main() -> None:
         "scenes": [batch.scene[0] for batch in batches],
         "trained": sorted(trained),
         "seconds": arguments.seconds,
-        "rates": arguments.rates,
+        "options": arguments.options,
         "curves": curves,
     }
     write_results(arguments.out, f"refine-{arguments.name}-{device.type}", content)

@@ -57,6 +57,7 @@ class RefineOptions:
             check they are scored, what has become transparent is pruned and what is wrong is split.
         holdout: every this many-th view is never trained on, but scored before and after; None: none.
         sh_degree: of the colours, if it is higher than the scene's; None: the scene's.
+        fill: side in pixels of the blocks that get a Gaussian where the scene has none; 0: they stay empty.
         prune_opacity: Gaussians less opaque are removed.
         split_share: share of the Gaussians that a check splits, those whose positions are pulled the most.
         max_growth: the scene has at most this many times its Gaussians.
@@ -75,6 +76,7 @@ class RefineOptions:
     check_every: int = 20
     holdout: int | None = None
     sh_degree: int | None = None
+    fill: float = 4.0
     prune_opacity: float = 0.02
     split_share: float = 0.0
     max_growth: float = 1.5
@@ -91,6 +93,7 @@ class RefineOptions:
             ("check_every", self.check_every >= 1, "at least 1"),
             ("holdout", self.holdout is None or self.holdout >= 2, "at least 2, or null"),
             ("sh_degree", self.sh_degree is None or 0 <= self.sh_degree <= MAX_DEGREE, f"0 to {MAX_DEGREE}, or null"),
+            ("fill", self.fill == 0 or self.fill >= 1, "at least 1, or 0"),
             ("prune_opacity", 0 <= self.prune_opacity < 1, "at least 0 and below 1"),
             ("split_share", 0 <= self.split_share <= 1, "between 0 and 1"),
             ("max_growth", self.max_growth >= 1, "at least 1"),

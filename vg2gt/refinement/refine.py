@@ -13,6 +13,7 @@ from torch import Tensor
 
 from vg2gt.metrics import psnr
 from vg2gt.refinement.density import prune, split
+from vg2gt.refinement.fill import fill_holes
 from vg2gt.refinement.loss import Observations
 from vg2gt.refinement.options import RefineOptions
 from vg2gt.refinement.parameters import Parameters, RefinedScene
@@ -155,7 +156,7 @@ class _Refinement:
         self.checks: list[Check] = []
         self.recent: list[float] = []
         self.factor, self.retreats, self.steps = 1.0, 0, 0
-        self.parameters = self._parameters()
+        self.parameters = self._parameters(self._filled())
 
     def run(self, observe: Callable[[Progress], None] | None) -> Refined:
         """Steps and checks until it is done."""
@@ -187,9 +188,18 @@ class _Refinement:
             retreats=self.retreats,
         )
 
-    def _parameters(self) -> Parameters:
+    def _filled(self) -> RefinedScene:
+        """The start with Gaussians in its holes."""
+        if not self.options.fill:
+            return self.start
+        gaussians, trained = self.start.gaussians, self.order.trained.to(self.seen.images.device)
+        room = self.limit - len(gaussians)
+        filled = fill_holes(gaussians, self.start.cameras, self.seen, self.renderer, trained, self.options.fill, room)
+        return replace(self.start, gaussians=filled)
+
+    def _parameters(self, scene: RefinedScene) -> Parameters:
         trained = self.order.trained.to(self.seen.images.device)
-        return Parameters(self.best, self.options.rates, self.pixel, self.depth, trained)
+        return Parameters(scene, self.options.rates, self.pixel, self.depth, trained)
 
     def _done(self) -> float:
         return self.options.done(self.steps, self.clock() - self.began)
@@ -277,7 +287,7 @@ class _Refinement:
             "refinement, step %d: %s; it goes on from step %d with rates times %g",
             self.steps, trouble, self.best_step, self.factor,
         )  # fmt: skip
-        self.parameters = self._parameters()
+        self.parameters = self._parameters(self.best)
         self.scores = []
         return ""
 

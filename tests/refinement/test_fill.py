@@ -1,0 +1,104 @@
+"""Holes of a scene are filled with Gaussians that refinement can go on from."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import pytest
+import torch
+
+from tests.refinement.conftest import VIEWS, Start
+from vg2gt.refinement import RefineOptions, refine
+from vg2gt.refinement.fill import COVERED, fill_holes, spread
+from vg2gt.types import Gaussians
+
+ROOM = 10_000
+
+
+@pytest.fixture(scope="module")
+def holed(start: Start) -> Start:
+    """The scene as a backbone leaves it that has no depth of the left third of view 0, whatever view sees it."""
+    camera = start.cameras.world_to_camera[0, 0]
+    place = start.gaussians.means @ camera[:3, :3].T + camera[:3, 3]
+    fx, cx = start.cameras.intrinsics[0, 0, 0, [0, 2]]
+    left = (place[:, 2] > 0) & (fx * place[:, 0] / place[:, 2] + cx < start.cameras.size[1] / 3)
+    names = [field.name for field in fields(start.gaussians) if field.name != "background"]
+    kept = replace(start.gaussians, **{name: getattr(start.gaussians, name)[~left] for name in names})
+    uncovered = start.renderer(kept, start.cameras).alpha[0] < COVERED
+    return replace(start, gaussians=kept, seen=replace(start.seen, depth=start.seen.depth * ~uncovered))
+
+
+def holes(start: Start, gaussians: Gaussians) -> torch.Tensor:
+    """Share of each view that no Gaussian covers."""
+    return (start.renderer(gaussians, start.cameras).alpha[0] < COVERED).float().mean((1, 2))
+
+
+def fill(start: Start, room: int = ROOM) -> Gaussians:
+    views = torch.arange(VIEWS)
+    return fill_holes(start.gaussians, start.cameras, start.seen, start.renderer, views, side=4.0, room=room)
+
+
+def test_holes_are_covered_in_the_images_colours(holed: Start) -> None:
+    assert holes(holed, holed.gaussians)[0] > 0.2
+    filled = fill(holed)
+    assert (holes(holed, filled) < 0.03).all()
+    before, after = (
+        (holed.renderer(g, holed.cameras.select(torch.tensor([0]))).color[0, 0] - holed.seen.images[0]).abs().mean()
+        for g in (holed.gaussians, filled)
+    )
+    assert after < 0.6 * before
+    old = len(holed.gaussians)
+    assert torch.equal(filled.means[:old], holed.gaussians.means)
+    assert torch.equal(filled.background, holed.gaussians.background)  # pyright: ignore
+
+
+def test_what_one_view_filled_is_not_filled_again(holed: Start) -> None:
+    once = len(fill(holed)) - len(holed.gaussians)
+    covered = (holes(holed, holed.gaussians).sum() * holed.seen.depth[0].numel() / 16).round()
+    assert 0 < once < 0.7 * float(covered)  # a Gaussian for each block of each view
+
+
+def test_blocks_grow_to_the_room_there_is(holed: Start) -> None:
+    few = len(fill(holed, room=40)) - len(holed.gaussians)
+    assert 0 < few <= 40
+    assert fill(holed, room=0) is holed.gaussians
+
+
+def test_a_filled_scene_is_left_alone(holed: Start) -> None:
+    once = fill(holed)
+    twice = fill(replace(holed, gaussians=once))
+    assert len(twice) - len(once) < 0.05 * (len(once) - len(holed.gaussians))
+
+
+def test_depth_spreads_from_around_a_hole() -> None:
+    depth = torch.full((1, 16, 24), 2.0)
+    depth[:, :, 12:] = 4.0
+    known = depth.clone()
+    known[:, 4:12, 8:16] = 0
+    filled = spread(known)
+    assert torch.equal(filled[known > 0], known[known > 0])
+    inside = filled[0, 4:12, 8:16]
+    assert ((inside >= 2) & (inside <= 4)).all()
+    assert (inside.diff(dim=1) > -0.2).all()
+    assert (inside[:, 0] < inside[:, -1]).all()
+    assert float(spread(torch.zeros(1, 5, 7)).max()) < 1.001  # nothing known: no number is wrong
+
+
+def test_refinement_fills_unless_told_not_to(holed: Start) -> None:
+    with_fill, without = (
+        refine(
+            holed.gaussians,
+            holed.cameras,
+            holed.seen,
+            holed.renderer,
+            RefineOptions(steps=12, check_every=6, holdout=3, fill=side),
+        )
+        for side in (4.0, 0.0)
+    )
+    assert with_fill.psnr[1, with_fill.held_out].mean() > without.psnr[1, without.held_out].mean() + 1
+    assert len(without.scene.gaussians) <= len(holed.gaussians)
+
+
+def test_a_side_below_a_pixel_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"refine\.fill must be at least 1, or 0, got 0\.5"):
+        RefineOptions(fill=0.5)

@@ -1,0 +1,110 @@
+"""Gaussians where the images show something and the scene has nothing."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import fields, replace
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from vg2gt.gaussians.surfel import ALONE
+from vg2gt.geometry.cameras import unproject
+from vg2gt.geometry.spherical_harmonics import rgb_to_sh
+from vg2gt.refinement.loss import Observations
+from vg2gt.rendering import Renderer
+from vg2gt.types import Cameras, Gaussians
+
+COVERED = 0.5  # accumulated opacity of a pixel that shows the scene
+OPACITY = 0.9  # of a new Gaussian: high enough to cover its block, low enough to go where it is wrong
+
+
+@torch.no_grad()
+def fill_holes(
+    gaussians: Gaussians,
+    cameras: Cameras,
+    seen: Observations,
+    renderer: Renderer,
+    views: Tensor,
+    side: float,
+    room: int,
+) -> Gaussians:
+    """Adds round Gaussians along rays that meet none, at depths spread from around each hole.
+
+    A backbone has no depth of glass, of what is beyond a sensor's range, or of the sky, so a feed-forward scene shows
+    its background there. View by view the blocks of pixels that are mostly uncovered get a Gaussian each; what one view
+    has filled is covered for the next. Their depth is a guess for refinement to mend.
+
+    Args:
+        gaussians: the scene (B = 1).
+        cameras: of its V views (B = 1).
+        seen: what they show.
+        renderer: that tells what is covered.
+        views: ``[N]`` those that are filled.
+        side: of a block, in pixels.
+        room: most Gaussians that may be added; blocks grow where there would be more.
+
+    Returns:
+        The scene with the new Gaussians behind its own.
+    """
+    found = renderer(gaussians, cameras.select(views))
+    holes = int((found.alpha < COVERED).sum())
+    if not holes or room < 1:
+        return gaussians
+    pixels = max(round(side), math.ceil(math.sqrt(holes / room)))
+    for view in views.split(1):
+        camera, shown = cameras.select(view), seen.views(view)
+        rendered = renderer(gaussians, camera)
+        hole = (rendered.alpha[0] < COVERED)[:, None].to(shown.images.dtype)  # [1, 1, H, W]
+        depth = torch.where(shown.depth > 0, shown.depth, torch.where(hole[:, 0] > 0, 0.0, rendered.depth[0]))
+        if not (depth > 0).any():
+            continue
+        gaussians = _with(gaussians, _blocks(shown.images, hole, spread(depth), camera, pixels))
+    return gaussians
+
+
+def spread(depth: Tensor) -> Tensor:
+    """``[V, H, W]`` depth with what is 0 filled from around it: means of the logarithm over ever larger blocks."""
+    known = (depth > 0).to(depth.dtype)[:, None]
+    return _pushed(torch.where(known > 0, depth[:, None].clamp(min=1e-12).log(), 0.0), known)[:, 0].exp()
+
+
+def _pushed(values: Tensor, known: Tensor) -> Tensor:
+    """``values [V, 1, H, W]`` where they are ``known``, elsewhere smoothly what is known nearby."""
+    if known.bool().all() or max(values.shape[-2:]) == 1:
+        return values
+    share = F.avg_pool2d(known, 2, ceil_mode=True)
+    mean = F.avg_pool2d(values * known, 2, ceil_mode=True) / share.clamp(min=1e-6)
+    coarse = _pushed(mean, (share > 0).to(values.dtype))
+    return torch.where(known > 0, values, F.interpolate(coarse, values.shape[-2:], mode="bilinear"))
+
+
+def _blocks(images: Tensor, hole: Tensor, depth: Tensor, camera: Cameras, pixels: int) -> Gaussians:
+    """A Gaussian for each block of one view that is mostly ``hole [1, 1, H, W]``."""
+
+    def mean(values: Tensor) -> Tensor:  # over the block's pixels of the hole; [N, C]
+        pooled = F.avg_pool2d(values * hole, pixels, ceil_mode=True) / share.clamp(min=1e-6)
+        return pooled[0].flatten(1).T[chosen]
+
+    share = F.avg_pool2d(hole, pixels, ceil_mode=True)
+    chosen = (share > 0.5).flatten()
+    means = mean(unproject(depth[None], camera)[0].movedim(-1, 1))
+    focal = camera.intrinsics[0, 0, [0, 1], [0, 1]].mean()
+    size = ALONE * pixels * mean(depth[:, None]) / focal  # [N, 1]
+    turn = F.pad(torch.ones_like(size), (0, 3))
+    return Gaussians(
+        means,
+        turn,
+        size.expand(-1, 3),
+        torch.full_like(size[:, 0], OPACITY),
+        rgb_to_sh(mean(images))[:, None],
+        torch.zeros_like(size[:, 0], dtype=torch.int64),
+    )
+
+
+def _with(gaussians: Gaussians, more: Gaussians) -> Gaussians:
+    """One scene of the Gaussians of two, with the background and the degree of the first."""
+    more = replace(more, sh=F.pad(more.sh, (0, 0, 0, gaussians.sh.shape[1] - more.sh.shape[1])))
+    names = [field.name for field in fields(Gaussians) if field.name != "background"]
+    return replace(gaussians, **{name: torch.cat((getattr(gaussians, name), getattr(more, name))) for name in names})
