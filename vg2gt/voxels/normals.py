@@ -35,24 +35,34 @@ def with_normals(moments: VoxelMoments, offset: Tensor, plan: VoxelPlan, kernel:
     own = facing_normals(moments.spread, moments.facing)
     if kernel == 1 or not len(plan):
         return replace(moments, normal=own)
-    spread = _spread_around(moments.spread, own, offset, plan, kernel)
+    spread = _spread_around(moments.spread, own, offset, plan)
     return replace(moments, normal=facing_normals(spread, moments.facing))
 
 
-def _spread_around(spread: Tensor, normal: Tensor, offset: Tensor, plan: VoxelPlan, kernel: int) -> Tensor:
+def _spread_around(spread: Tensor, normal: Tensor, offset: Tensor, plan: VoxelPlan) -> Tensor:
     """``[M, 3, 3]`` covariance of the points of a voxel and its neighbours."""
-    radius = kernel // 2
-    keys, steps = mixed_radix_keys(plan.grid, plan.batch, margin=radius)  # ascending, as the plan's voxels are
-    count, inner = plan.counts.to(spread.dtype), spread[:, UPPER[0], UPPER[1]]
-    sums = spread.new_zeros(len(plan), 10)  # weight, place (3), products of places (6)
-    for step in itertools.product(range(-radius, radius + 1), repeat=3):
-        wanted = keys + sum(s * k for s, k in zip(step, steps, strict=True))
-        row = torch.searchsorted(keys, wanted).clamp_(max=len(keys) - 1)
-        place = offset.index_select(0, row) - offset + spread.new_tensor(step)  # [M, 3]
-        height = (place * normal).sum(-1) / SAME_SURFACE
-        weight = count.index_select(0, row) * (keys.index_select(0, row) == wanted) * torch.exp(-height.square() / 2)
-        products = inner.index_select(0, row) + place[:, UPPER[0]] * place[:, UPPER[1]]
-        sums += weight[:, None] * torch.cat((torch.ones_like(place[:, :1]), place, products), -1)
+    voxel, other, shift = _pairs(plan)
+    x, y, z = (offset.index_select(0, other) - offset.index_select(0, voxel) + shift.to(offset.dtype)).unbind(-1)  # [P]
+    height = (torch.stack((x, y, z), -1) * normal.index_select(0, voxel)).sum(-1) / SAME_SURFACE
+    weight = plan.counts.to(offset.dtype).index_select(0, other) * torch.exp(-height.square() / 2)
+    inner = spread[:, UPPER[0], UPPER[1]].index_select(0, other)  # [P, 6]
+    products = inner + torch.stack((x * x, x * y, x * z, y * y, y * z, z * z), -1)
+    weighted = torch.cat((torch.ones_like(x)[:, None], torch.stack((x, y, z), -1), products), -1) * weight[:, None]
+    sums = torch.segment_reduce(weighted, "sum", lengths=torch.bincount(voxel, minlength=len(plan)))
     mean, products = (sums[:, 1:] / sums[:, :1]).split((3, 6), -1)
     around = products - mean[:, UPPER[0]] * mean[:, UPPER[1]]
     return around[:, FULL].unflatten(-1, (3, 3))
+
+
+def _pairs(plan: VoxelPlan) -> tuple[Tensor, Tensor, Tensor]:
+    """Rows ``[P]`` of voxels, sorted, those of a cell of their 3x3x3 each, and its shift ``[P, 3]``."""
+    keys, (step_x, step_y, _) = mixed_radix_keys(plan.grid, plan.batch, margin=1)  # ascending, as the plan's voxels are
+    columns = keys.new_tensor(list(itertools.product((-1, 0, 1), repeat=2)))  # [9, 2]
+    lowest = keys[:, None] + columns @ keys.new_tensor([step_x, step_y]) - 1  # [M, 9]: the column's first cell
+    # The cells of a column have keys in a row, so its voxels do.
+    row = torch.searchsorted(keys, lowest)[..., None] + torch.arange(3, device=keys.device)  # [M, 9, 3]
+    row = row.clamp_(max=len(keys) - 1)
+    above = keys[row] - lowest[..., None]
+    found = (above >= 0) & (above < 3) & (row.diff(dim=-1, prepend=row[..., :1] - 1) > 0)
+    voxel, column, _ = found.nonzero(as_tuple=True)
+    return voxel, row[found], torch.cat((columns[column], above[found][:, None] - 1), -1)
