@@ -54,9 +54,14 @@ def parser(
     return made
 
 
+def dated(folder: Path, name: str) -> Path:
+    """Where today's results of a name go."""
+    return folder / f"{date.today().isoformat()}-{name}.json"
+
+
 def write_results(folder: Path, name: str, content: Mapping[str, Any]) -> Path:
     """Writes ``<date>-<name>.json`` and prints where; returns the path."""
-    path = write_json(folder / f"{date.today().isoformat()}-{name}.json", dict(content))
+    path = write_json(dated(folder, name), dict(content))
     print(path)
     return path
 
@@ -102,7 +107,7 @@ class PeakMemory:
         else:
             # What was freed goes back to the system, or what follows would be served from it unseen.
             ctypes.CDLL(None).malloc_trim(0)
-            self.start = _status("VmRSS")
+            self.start = status("VmRSS")
         self.restart()
 
     def restart(self) -> None:
@@ -115,7 +120,7 @@ class PeakMemory:
     @property
     def peak(self) -> int:
         """Bytes in use at the peak."""
-        return torch.cuda.max_memory_allocated(self.device) if self.device.type == "cuda" else _status("VmHWM")
+        return torch.cuda.max_memory_allocated(self.device) if self.device.type == "cuda" else status("VmHWM")
 
     @property
     def megabytes(self) -> float:
@@ -123,7 +128,8 @@ class PeakMemory:
         return (self.peak - self.start) / MEGABYTE
 
 
-def _status(name: str) -> int:
+def status(name: str) -> int:
+    """A figure of this process in bytes, by its name in ``/proc/self/status``."""
     lines = Path("/proc/self/status").read_text().splitlines()
     return next(int(line.split()[1]) * 1024 for line in lines if line.startswith(f"{name}:"))
 

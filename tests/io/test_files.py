@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from vg2gt.io.files import read_json, write_bytes, write_json
+from vg2gt.io.files import read_json, replacing, write_bytes, write_json
 
 
 def test_round_trip_makes_folders_and_leaves_no_temporary_file(tmp_path: Path) -> None:
@@ -24,6 +24,19 @@ def test_failure_keeps_the_old_content(tmp_path: Path, monkeypatch: pytest.Monke
         write_bytes(path, b"new")
     assert path.read_bytes() == b"old"
     assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_writers_with_one_process_number_have_their_own_temporary_names(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two containers on one folder."""
+    monkeypatch.setattr("os.getpid", lambda: 7)
+    with replacing(tmp_path / "x") as one, replacing(tmp_path / "x") as other:
+        assert one != other
+        one.write_bytes(b"one")
+        other.write_bytes(b"other")
+    assert (tmp_path / "x").read_bytes() == b"one"  # whoever ends last
+    assert [path.name for path in tmp_path.iterdir()] == ["x"]
 
 
 def test_broken_json_names_the_file(tmp_path: Path) -> None:

@@ -39,18 +39,19 @@ _QUARTER_TURNS = (5, 6, 7, 8)
 _FILM_DIAGONAL = math.hypot(36, 24)  # millimetres
 
 
-def image_size(path: Path, scene: str, upright: bool = False) -> Size:
+def image_size(path: Path, scene: str, upright: bool = False, content: bytes | None = None) -> Size:
     """Returns an image's ``(height, width)`` without decoding it.
 
     Args:
         path: the file.
         scene: the scene it belongs to, for messages.
         upright: of a photograph turned upright as its EXIF data says.
+        content: the encoded image where it is a part of the file; None: it is the file.
 
     Raises:
         DataError: if the file is missing or not an image.
     """
-    with _opened(path, path, scene) as image:
+    with _opened(path if content is None else io.BytesIO(content), path, scene) as image:
         turned = upright and _orientation(image) in _QUARTER_TURNS
         return (image.width, image.height) if turned else (image.height, image.width)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 from typing import Any
@@ -15,14 +16,14 @@ from vg2gt.io.files import read_json
 MAX_SIZE = 1 << 20  # pixels along an image's side
 
 
-def load_json(path: Path) -> Any:
-    """Reads a file.
+def load_json(path: Path, content: bytes | None = None) -> Any:
+    """Reads a file, or what was read of it.
 
     Raises:
         FormatError: if it is not JSON, naming the file.
     """
     try:
-        return read_json(path)
+        return read_json(path) if content is None else json.loads(content)
     except (ValueError, RecursionError) as error:
         raise FormatError(f"{path}: not valid JSON ({error}); the file is truncated or damaged") from error
 

@@ -20,6 +20,7 @@ from vg2gt.geometry.cameras import resize_intrinsics
 from vg2gt.io.cameras_json import NamedCamera, read_cameras_json
 from vg2gt.io.image_files import image_size, read_color
 from vg2gt.io.nerfstudio import read_transforms
+from vg2gt.io.record3d import R3D
 from vg2gt.reconstruction.pictures import (
     IMAGE_FOLDERS,
     ImagesLike,
@@ -49,7 +50,7 @@ def given_pictures(
     this order: ``cameras.json``, ``transforms.json``, a COLMAP model, a recording with poses (with depth or without).
 
     Args:
-        images: a folder, or a sequence of folders.
+        images: a folder or an ``.r3d`` file, or a sequence of such.
         every: take every this many-th picture only.
         max_images: take at most so many, evenly spread; None: all.
         depth: depth is needed as well: what has none is passed over.
@@ -65,7 +66,7 @@ def given_pictures(
     found: list[Picture] = []
     for item in as_items(images):
         path = existing_path(item) if isinstance(item, (str, Path)) else None
-        own = _given(path, depth) if path is not None and path.is_dir() else None
+        own = _given(path, depth) if path is not None and (path.is_dir() or app_of(path)) else None
         if own is None:
             return None
         found += own
@@ -120,7 +121,8 @@ def _source(folder: Path, images: str, depth: bool) -> FileSource | None:
             return Nerfstudio(str(folder), depth=with_depth)
     if not depth and model_folder_of(folder) is not None:
         return COLMAP(str(folder), images=images)
-    if app_of(folder) is not None:  # colour at its full size where depth is not needed: a phone's is coarse
+    if app_of(folder) is not None or any(folder.glob(f"*{R3D}")):
+        # Colour at its full size where depth is not needed: a phone's is coarse.
         return RGBDFolder(str(folder), holdout=None, depth=depth)
     if (folder / "depth").is_dir() or any(folder.glob("frame-*.color.*")):
         return RGBDFolder(str(folder), holdout=None)

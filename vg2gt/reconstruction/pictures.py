@@ -22,6 +22,7 @@ from vg2gt.data.sources.parsing import IMAGE_SUFFIXES
 from vg2gt.data.transforms import from_bytes
 from vg2gt.io.image_files import focal_length, image_size, read_color
 from vg2gt.io.images import color_image
+from vg2gt.io.record3d import is_archive, read_recorded, recorded_files
 from vg2gt.io.video import VIDEO_SUFFIXES, count_frames, read_video
 
 ImagesLike: TypeAlias = "str | Path | Image.Image | NDArray[Any] | Tensor | Sequence[Any]"
@@ -137,6 +138,8 @@ def _pictures(item: Any, every: int, max_images: int | None) -> list[Picture]:
     path = existing_path(item)
     if path.is_dir():
         return [_photo(file) for file in image_files(path)]
+    if is_archive(path):
+        return [_photo(file, read_recorded) for file in recorded_files(path, ".jpg").values()]
     return _video(path, every, max_images) if _is_video(path) else [_photo(path)]
 
 
@@ -157,15 +160,19 @@ def image_files(folder: Path) -> list[Path]:
     raise ValueError(f"no images in {folder} (looked for {', '.join(suffixes)}, there and in images/){hint}")
 
 
-def _photo(path: Path) -> Picture:
+def _photo(path: Path, content_of: Callable[[Path], bytes | None] = lambda _: None) -> Picture:
+    """A photograph; ``content_of`` reads what lies in an archive."""
     if path.suffix.lower() in HEIC_SUFFIXES:
         _open_heic(path)
     place = path.parent.name or "."
 
     def read(size: tuple[int, int]) -> Frames:
-        return frame_of(shrunk(read_color(path, place, upright=True), size))
+        return frame_of(shrunk(read_color(path, place, content=content_of(path), upright=True), size))
 
-    size = image_size(path, place, upright=True)
+    content = content_of(path)
+    size = image_size(path, place, upright=True, content=content)
+    if content is not None:
+        return Picture(path.stem, size, read)
     return Picture(path.stem, size, read, focal=focal_length(path, size), path=path)
 
 

@@ -2,10 +2,13 @@
 
 import csv
 import importlib.util
+import io
 import json
+import zipfile
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from vg2gt.data import Frames, RGBDFolder
@@ -40,6 +43,36 @@ def write_record3d(root: Path, frames: Frames, per_frame: bool = False) -> None:
     if per_frame:
         content |= {"K": [1.0, 0, 0, 0, 1, 0, 0, 0, 1], "perFrameIntrinsicCoeffs": [[fx, fy, cx, cy]] * len(poses)}
     (folder / "metadata.json").write_text(json.dumps(content))
+
+
+def write_r3d(root: Path, frames: Frames, packed: bool = True, told: bool = True) -> None:
+    """Record3D's own: a ZIP of JSON without an ending, and depth and confidence in LZFSE."""
+    import lzfse  # pyright: ignore[reportMissingImports]: optional
+
+    fx, fy, cx, cy = camera_of(frames) + CORNER
+    poses = [[*Rotation.from_matrix(pose[:3, :3]).as_quat(), *pose[:3, 3]] for pose in camera_to_world(frames) @ OPENGL]
+    content = {"w": SIZE[1], "h": SIZE[0], "poses": poses, "K": [fx, 0, 0, 0, fy, 0, cx, cy, 1], "fps": 60}
+    content |= {"dw": SIZE[1], "dh": SIZE[0], "initPose": [0, 0, 0, 1, 0, 0, 0]} if told else {}
+    files = {"metadata": json.dumps(content).encode(), "icon": b"a picture", "sound.m4a": b"a sound"}
+    for i in range(len(poses)):
+        picture = io.BytesIO()
+        Image.fromarray(pixels(frames)[i]).save(picture, "JPEG", quality=95, subsampling=0)
+        files[f"rgbd/{i}.jpg"] = picture.getvalue()
+        files[f"rgbd/{i}.depth"] = lzfse.compress(frames.depth[i].numpy().astype("<f4").tobytes())
+        files[f"rgbd/{i}.conf"] = lzfse.compress(np.full(SIZE, 2, np.uint8).tobytes())
+    root.mkdir(parents=True, exist_ok=True)
+    if packed:
+        with zipfile.ZipFile(root / "sofa.r3d", "w") as archive:
+            for name, part in files.items():
+                archive.writestr(name, part)
+        return
+    for name, part in files.items():
+        (root / "sofa" / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / "sofa" / name).write_bytes(part)
+
+
+def _write_unpacked_r3d(root: Path, frames: Frames) -> None:
+    write_r3d(root, frames, packed=False, told=False)
 
 
 def write_polycam(root: Path, frames: Frames, corrected: bool = True) -> None:
@@ -86,3 +119,6 @@ LAYOUTS = {
 }
 if importlib.util.find_spec("OpenEXR"):
     LAYOUTS["record3d"] = Layout(write_record3d, _read, image_error=0.012, depth_quantum=1e-6)
+if importlib.util.find_spec("lzfse"):
+    LAYOUTS["r3d"] = Layout(write_r3d, _read, image_error=0.012, depth_quantum=1e-6)
+    LAYOUTS["r3d_unpacked"] = Layout(_write_unpacked_r3d, _read, image_error=0.012, depth_quantum=1e-6)

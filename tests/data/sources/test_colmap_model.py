@@ -78,6 +78,15 @@ def test_absent_images_are_counted_and_keep_the_numbers(tmp_path):
     assert source.scene_index("statue").dropped == {"without a colour image": 1}
 
 
+def test_a_model_without_its_images_says_what_it_expects_where(tmp_path):
+    write(tmp_path, room(2))
+    (tmp_path / "statue" / "images").rename(tmp_path / "statue" / "photos")
+    expected = r"none of the model's 2 images is in .*statue/images; the first is left/\S+, expected at .*data\.images="
+    with pytest.raises(DataError, match=expected):
+        COLMAP(str(tmp_path / "statue")).frames("statue")
+    assert COLMAP(str(tmp_path / "statue"), images="photos").frames("statue") == (0, 1)
+
+
 def test_images_of_several_sizes_are_cropped_to_one(tmp_path):
     """One camera of another shape: its frame is cut to the common size and points still project into its pixels."""
     frames = room(3)

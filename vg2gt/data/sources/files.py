@@ -67,6 +67,8 @@ class FileSource(SceneSource):
     """What is looked for in ``root``, for messages."""
     scene_marks: ClassVar[tuple[str, ...]] = ()
     """Files and folders that a folder must hold to be a scene."""
+    scene_files: ClassVar[tuple[str, ...]] = ()
+    """Endings of files that are scenes by themselves."""
     levels: ClassVar[int] = 2
     """How deep below ``root`` scenes lie, at most."""
     names_are_paths: ClassVar[bool] = False
@@ -113,7 +115,7 @@ class FileSource(SceneSource):
         self.holdout = holdout
         self.every = every
         self.index_cache = expanded(index_cache)
-        self._folders = self._select(self._find_all(_roots(root, self.layout)), scenes)
+        self._folders = self._select(self._find_all(_roots(root, self.layout, self.scene_files)), scenes)
         self._indices: OrderedDict[str, SceneIndex] = OrderedDict()
         self._frame_ids: dict[str, NDArray[np.int64]] = {}
         self._indexes = False
@@ -123,7 +125,7 @@ class FileSource(SceneSource):
         return all((folder / mark).exists() for mark in self.scene_marks)
 
     def find(self, root: Path) -> Mapping[str, Path]:
-        """Scenes by name, with their folders, without reading them: ``root`` itself, or those up to ``levels`` below.
+        """Scenes by name, with their folders (or ``scene_files``), unread: ``root`` itself, or up to ``levels`` below.
 
         Raises:
             DataError: if two scenes get one name.
@@ -132,8 +134,8 @@ class FileSource(SceneSource):
             return {root.resolve().name: root}
         found: dict[str, Path] = {}
         for depth in range(1, self.levels + 1):
-            for folder in sorted(path for path in root.glob("/".join("*" * depth)) if path.is_dir()):
-                if self.is_scene(folder):
+            for folder in sorted(root.glob("/".join("*" * depth))):
+                if (folder.is_dir() or folder.suffix.lower() in self.scene_files) and self.is_scene(folder):
                     _add_scene(
                         found, folder.relative_to(root).as_posix() if self.names_are_paths else folder.name, folder
                     )
@@ -316,12 +318,12 @@ def read_split(path: str) -> list[str]:
     return names
 
 
-def _roots(root: str | Sequence[str] | None, layout: str) -> list[Path]:
+def _roots(root: str | Sequence[str] | None, layout: str, files: tuple[str, ...]) -> list[Path]:
     if not root:
         raise FileNotFoundError(f"data.root is not set: give data.root=FOLDER, which holds {layout}")
     roots = [Path(path).expanduser() for path in ([root] if isinstance(root, str) else root)]
     for path in roots:
-        if not path.is_dir():
+        if not (path.is_dir() or (path.is_file() and path.suffix.lower() in files)):
             raise FileNotFoundError(
                 f"the data folder {path} (seen from {Path.cwd()}) does not exist: set data.root=FOLDER to one that "
                 f"holds {layout}"

@@ -3,12 +3,13 @@
 Told apart by what is there:
 
 * Record3D, exported as *EXR + JPG*: ``metadata.json``, ``rgb/N.jpg``, ``depth/N.exr`` (metres);
+* Record3D's own ``.r3d``, packed or unpacked: ``metadata``, ``rgbd/N.jpg``, ``rgbd/N.depth`` (metres), ``rgbd/N.conf``;
 * Polycam, *raw data*: ``keyframes/images/N.jpg``, ``keyframes/cameras/N.json``, ``keyframes/depth/N.png`` (mm); where
   it has optimised its cameras, ``corrected_images/`` and ``corrected_cameras/``;
 * Stray Scanner: ``rgb.mp4``, ``depth/N.png`` (mm), ``odometry.csv``, ``camera_matrix.csv``.
 
-All are metric. Depth is coarser than colour; ``confidence/N.png`` says where it is not to be trusted (0). Principal
-points count from the images' corner, as ARKit's do.
+All are metric. Depth is coarser than colour; ``confidence/N.png`` or ``N.conf`` says where it is not to be trusted (0).
+Principal points count from the images' corner, as ARKit's do.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,13 +29,15 @@ from vg2gt.data.sources.rgbd_cameras import pose_file_of, pose_matrices
 from vg2gt.io.errors import FormatError
 from vg2gt.io.exr import read_exr
 from vg2gt.io.files import regular
-from vg2gt.io.image_files import Size, image_size
+from vg2gt.io.image_files import Size, image_size, read_color
 from vg2gt.io.json_checks import load_json
+from vg2gt.io.record3d import is_archive, is_recorded, read_recorded, recorded_files, unpack_lzfse, unpacked_size
 from vg2gt.io.video import video_size
 
 EXR = ".exr"
+PACKED = ".depth"
 VIDEO = "rgb.mp4"
-RECORD3D, POLYCAM, STRAY = "Record3D", "Polycam", "Stray Scanner"
+RECORD3D, R3D, POLYCAM, STRAY = "Record3D", "Record3D (.r3d)", "Polycam", "Stray Scanner"
 _LARGEST = 1e9  # of what is a number of pixels, metres or frames
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # camera axes of ARKit to OpenCV's
 
@@ -50,6 +53,7 @@ class PhoneExport:
         poses: ``[4, 4]`` camera-to-world, OpenCV, metres.
         intrinsics: ``[3, 3]`` of the colour images, integer pixel centres.
         color_size: ``(height, width)``.
+        recorded: ``(height, width)`` of the depth where the app tells it.
     """
 
     app: str
@@ -58,14 +62,17 @@ class PhoneExport:
     poses: Mapping[int, NDArray[np.float64]]
     intrinsics: Mapping[int, NDArray[np.float64]]
     color_size: Size
+    recorded: Size | None = None
 
     def depth_size(self, scene: str) -> Size:
-        """``(height, width)`` of the first depth file.
+        """``(height, width)`` of the depth, by default of the first file.
 
         Raises:
             DataError: if it cannot be read.
             ImportError: if it takes a package that is not installed.
         """
+        if self.recorded is not None:
+            return self.recorded
         path = next(iter(self.depth.values()))
         if path.suffix.lower() != EXR:
             return image_size(path, scene)
@@ -75,10 +82,12 @@ class PhoneExport:
 
 
 def app_of(folder: Path) -> str | None:
-    """The app whose export a folder is; None if of none."""
+    """The app whose export a folder or an archive is; None if of none."""
     own_poses = pose_file_of(folder) is not None or (folder / "pose").is_dir() or (folder / "poses").is_dir()
     if (folder / "metadata.json").is_file() and (folder / "rgb").is_dir() and not own_poses:
         return RECORD3D
+    if is_archive(folder) or ((folder / "metadata").is_file() and (folder / "rgbd").is_dir()):
+        return R3D
     if (folder / "keyframes" / "cameras").is_dir():
         return POLYCAM
     return STRAY if (folder / "odometry.csv").is_file() and (folder / VIDEO).is_file() else None
@@ -91,7 +100,7 @@ def read_export(folder: Path, scene: str) -> PhoneExport | None:
         DataError: if it is damaged.
         ImportError: if a video is read and PyAV is not installed.
     """
-    readers = {RECORD3D: _read_record3d, POLYCAM: _read_polycam, STRAY: _read_stray}
+    readers = {RECORD3D: _read_record3d, R3D: _read_r3d, POLYCAM: _read_polycam, STRAY: _read_stray}
     app = app_of(folder)
     with errors_name(scene):
         return readers[app](folder, scene) if app is not None else None
@@ -103,10 +112,66 @@ def confidence_of(depth: Path) -> Path | None:
     return path if path.is_file() else None
 
 
+def read_color_file(path: Path, scene: str, size: Size | None) -> NDArray[np.uint8]:
+    """Decodes a colour image ``[H, W, 3]``, which may lie in an archive.
+
+    Raises:
+        DataError: if it is missing, damaged or of another size.
+    """
+    with errors_name(scene):
+        content = read_recorded(path) if is_archive(path.parent.parent) else None
+    return read_color(path, scene, size, content)
+
+
+def read_packed_depth(path: Path, size: Size) -> NDArray[np.float32]:
+    """Reads a ``.depth`` file ``[H, W]`` in metres, 0 where the ``.conf`` beside it, if there is one, has none (0).
+
+    Raises:
+        FormatError: if it is damaged or not of this size.
+        ImportError: if the package ``lzfse`` is not installed.
+    """
+    pixels = size[0] * size[1]
+    depth = np.frombuffer(unpack_lzfse(read_recorded(path), 4 * pixels, path), "<f4").reshape(size)
+    beside = path.with_suffix(".conf")
+    if not is_recorded(beside):
+        return depth
+    confidence = np.frombuffer(unpack_lzfse(read_recorded(beside), pixels, beside), np.uint8).reshape(size)
+    return np.where(confidence > 0, depth, 0)
+
+
 def _read_record3d(folder: Path, scene: str) -> PhoneExport:
-    """``poses`` are lists of qx qy qz qw x y z; ``K`` goes column by column; newer files have one for every frame."""
+    """Files beside each other."""
     path = folder / "metadata.json"
-    content = load_json(path)
+    color, depth = numbered(folder / "rgb", scene), numbered(folder / "depth", scene, suffixes=(EXR,))
+    size = image_size(next(iter(color.values())), scene) if color else (0, 0)
+    return _of_metadata(RECORD3D, path, load_json(path), color, depth, size)
+
+
+def _read_r3d(recording: Path, scene: str) -> PhoneExport:
+    """The size of the depth is in newer files; in others what it unpacks to tells, the shape being the images'."""
+    path = recording / "metadata"
+    content = load_json(path, read_recorded(path))
+    color, depth = recorded_files(recording, ".jpg"), recorded_files(recording, PACKED)
+    first = next(iter(color.values()), None)
+    size = image_size(first, scene, content=read_recorded(first)) if first else (0, 0)
+    export = _of_metadata(R3D, path, content, color, depth, size)
+    if not (color and depth):
+        return export
+    if "dh" in content and "dw" in content:
+        height, width = _size(path, content, "dh", "dw")
+    else:
+        packed = next(iter(depth.values()))
+        pixels = unpacked_size(read_recorded(packed), packed) / 4
+        height, width = (round((pixels * size[i] / size[1 - i]) ** 0.5) for i in (0, 1))
+    if not 0 < height * width <= size[0] * size[1]:
+        raise FormatError(f"{path}: depth of {width}x{height} pixels with images of {size[1]}x{size[0]}")
+    return replace(export, recorded=(height, width))
+
+
+def _of_metadata(
+    app: str, path: Path, content: Any, color: dict[int, Path], depth: dict[int, Path], size: Size
+) -> PhoneExport:
+    """``poses`` are lists of qx qy qz qw x y z; ``K`` goes column by column; newer files have one for every frame."""
     rows = _numbers(path, content, "poses", 7)
     if isinstance(content.get("perFrameIntrinsicCoeffs"), list) and content["perFrameIntrinsicCoeffs"]:
         cameras = [pinhole(*row) for row in _numbers(path, content, "perFrameIntrinsicCoeffs", 4)]
@@ -114,16 +179,12 @@ def _read_record3d(folder: Path, scene: str) -> PhoneExport:
         cameras = [_numbers(path, {"K": [content.get("K")]}, "K", 9)[0].reshape(3, 3).T] * len(rows)
     if len(cameras) != len(rows):
         raise FormatError(f"{path} has {len(rows)} poses, but intrinsics of {len(cameras)} frames")
-    color, depth = numbered(folder / "rgb", scene), numbered(folder / "depth", scene, suffixes=(EXR,))
-    size = image_size(next(iter(color.values())), scene) if color else (0, 0)
-    said = _numbers(path, {"size": [[content.get("h"), content.get("w")]]}, "size", 2)[0]
-    if not ((said > 0) & (said < _LARGEST)).all():
-        raise FormatError(f"{path}: h and w must be the images' size, got {said[0]:g} and {said[1]:g}")
+    said = _size(path, content, "h", "w")
     if color and not np.isclose(said[0] * size[1], said[1] * size[0], rtol=0.02):
         raise FormatError(f"{path} says {said[1]:g}x{said[0]:g} pixels, but the images are {size[1]}x{size[0]}")
     scale = np.diag([size[1] / said[1], size[0] / said[0], 1.0])
     return PhoneExport(
-        RECORD3D,
+        app,
         color,
         depth,
         poses={i: pose @ _OPENGL for i, pose in enumerate(pose_matrices(rows[:, [4, 5, 6, 0, 1, 2, 3]]))},
@@ -191,6 +252,14 @@ def _table(path: Path) -> list[list[str]]:
     if not rows:
         raise FormatError(f"{path} is empty")
     return rows
+
+
+def _size(path: Path, content: Any, *names: str) -> Size:
+    """Height and width in pixels, by their keys."""
+    height, width = _numbers(path, {"size": [[content.get(name) for name in names]]}, "size", 2)[0]
+    if not (0 < height < _LARGEST and 0 < width < _LARGEST):
+        raise FormatError(f"{path}: {' and '.join(names)} must be a size in pixels, got {height:g} and {width:g}")
+    return int(height), int(width)
 
 
 def _numbers(path: Path, content: Any, key: str, columns: int) -> NDArray[np.float64]:

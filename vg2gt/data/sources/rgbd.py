@@ -38,7 +38,17 @@ from vg2gt.data.sources.parsing import (
     positive,
     read_poses,
 )
-from vg2gt.data.sources.phone import EXR, VIDEO, PhoneExport, app_of, confidence_of, read_export
+from vg2gt.data.sources.phone import (
+    EXR,
+    PACKED,
+    VIDEO,
+    PhoneExport,
+    app_of,
+    confidence_of,
+    read_color_file,
+    read_export,
+    read_packed_depth,
+)
 from vg2gt.data.sources.rgbd_cameras import (
     INTRINSICS_FILES,
     POSE_FILES,
@@ -51,6 +61,7 @@ from vg2gt.data.sources.scannet import room_of_scan
 from vg2gt.geometry.cameras import resize_intrinsics
 from vg2gt.io.exr import read_exr
 from vg2gt.io.image_files import Size, check_size, read_depth
+from vg2gt.io.record3d import R3D
 from vg2gt.io.video import read_frame
 
 log = logging.getLogger(__name__)
@@ -89,9 +100,10 @@ class RGBDFolder(FileSource):
 
     layout = (
         "images/, color/, rgb/ or image/ with depth/, poses.txt and K.txt, or frame-*.color.png with "
-        "frame-*.depth.png, or an export of Record3D (EXR + JPG), Polycam (raw data) or Stray Scanner, there or up to "
-        "two folders deeper"
+        "frame-*.depth.png, or an export of Record3D (.r3d, EXR + JPG), Polycam (raw data) or Stray Scanner, there or "
+        "up to two folders deeper"
     )
+    scene_files = (R3D,)
     names_are_paths = True
     index_options = ("intrinsics", "has_depth")
 
@@ -170,18 +182,18 @@ class RGBDFolder(FileSource):
         """Decodes a colour image, or a frame of a video."""
         path = index.color[row]
         if path.name != VIDEO:
-            return super().read_color(index, row)
+            return read_color_file(path, index.name, index.color_size)
         with errors_name(index.name):
             pixels = read_frame(path, index.frame_ids[row])
         check_size(path, index.name, pixels.shape[:2], index.color_size)
         return pixels
 
     def read_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
-        """Decodes depth; of EXR in metres, of whole numbers in ``depth_scale``, without what has no confidence."""
+        """Decodes depth; of floats in metres, of whole numbers in ``depth_scale``, without what has no confidence."""
         path = index.depth[row]
-        if path.suffix.lower() == EXR:
+        if path.suffix.lower() in (EXR, PACKED):
             with errors_name(index.name):
-                depth = read_exr(path)
+                depth = read_exr(path) if path.suffix.lower() == EXR else read_packed_depth(path, size)
             check_size(path, index.name, depth.shape, size)
             return np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
         depth = super().read_depth(index, row, size)

@@ -1,0 +1,147 @@
+"""What the round trips of ``.r3d`` files do not show: confidence, missing packages, damage, other ways in."""
+
+import json
+import struct
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vg2gt.data import DataError, RGBDFolder
+from vg2gt.io import FormatError
+from vg2gt.io.record3d import unpack_lzfse, unpacked_size
+from vg2gt.reconstruction.given_cameras import given_pictures
+from vg2gt.reconstruction.pictures import find_pictures
+
+from .layout_phone import write_r3d
+from .layouts import SIZE, room
+
+PIXELS = SIZE[0] * SIZE[1]
+
+
+def as_it_is(content: bytes) -> bytes:
+    """An LZFSE stream of one block that is not compressed."""
+    return b"bvx-" + struct.pack("<I", len(content)) + content + b"bvx$"
+
+
+def changed(path: Path, **files: bytes) -> None:
+    """Exchanges files of an archive; ``__`` in a keyword stands for the folder and the dot."""
+    with zipfile.ZipFile(path) as archive:
+        content = {name: archive.read(name) for name in archive.namelist()}
+    content |= {"rgbd/" + name[1:].replace("_", ".") if name[0] == "_" else name: part for name, part in files.items()}
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, part in content.items():
+            archive.writestr(name, part)
+
+
+def test_depth_without_confidence_is_left_out(tmp_path: Path) -> None:
+    pytest.importorskip("lzfse")
+    write_r3d(tmp_path, room(2))
+    confidence = np.full(SIZE, 1, np.uint8)
+    confidence[:4] = 0
+    changed(tmp_path / "sofa.r3d", _0_conf=as_it_is(confidence.tobytes()))
+    source = RGBDFolder(str(tmp_path / "sofa.r3d"), holdout=None)  # the file itself
+    depth = source.load("sofa.r3d", [0, 1]).depth
+    assert not depth[0, :4].any()
+    assert (depth[0, 4:] > 0).all()
+    assert (depth[1] > 0).all()
+
+
+def test_without_lzfse_colour_and_cameras_are_read_and_the_remedy_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "lzfse", FakeLzfse)
+    write_r3d(tmp_path, room(2))
+    monkeypatch.setitem(__import__("sys").modules, "lzfse", None)
+    source = RGBDFolder(str(tmp_path), holdout=None, depth=False)
+    assert source.load("sofa.r3d", [1]).images.shape[-2:] == SIZE
+    with pytest.raises(ImportError, match=r"0\.depth is read with lzfse: pip install 'vg2gt\[phone\]'"):
+        RGBDFolder(str(tmp_path), holdout=None).load("sofa.r3d", [0])
+    for way in (tmp_path / "sofa.r3d", tmp_path):
+        given = given_pictures(way)
+        assert given is not None
+        assert [(picture.name, picture.size, picture.has_depth) for picture in given] == [
+            ("0", SIZE, False),
+            ("1", SIZE, False),
+        ]
+    photographs = find_pictures(tmp_path / "sofa.r3d")  # for a backbone that takes no cameras
+    assert [picture.read(picture.size).images.shape[-2:] for picture in photographs] == [SIZE, SIZE]
+
+
+class FakeLzfse:
+    """Streams that are not compressed, where the package is not installed."""
+
+    compress = staticmethod(as_it_is)
+
+
+@pytest.mark.parametrize(
+    ("files", "said"),
+    [
+        ({"metadata": b"{"}, r"sofa\.r3d/metadata: not valid JSON"),
+        ({"metadata": b"[]"}, r"sofa\.r3d/metadata: expected poses with 7 numbers each"),
+        ({"_0_jpg": b""}, r"cannot read .*sofa\.r3d/rgbd/0\.jpg of scene sofa\.r3d"),
+        ({"_0_depth": b"bvx2"}, r"0\.depth: no LZFSE data"),
+        ({"_0_depth": as_it_is(b"1234")}, r"0\.depth unpacks to 4 bytes, expected 4800"),
+        ({"_0_conf": as_it_is(b"1")}, r"0\.conf unpacks to 1 bytes, expected 1200"),
+    ],
+)
+def test_what_is_wrong_is_named(tmp_path: Path, files: dict[str, bytes], said: str) -> None:
+    pytest.importorskip("lzfse")
+    write_r3d(tmp_path, room(2))
+    changed(tmp_path / "sofa.r3d", **files)
+    with pytest.raises(DataError, match=said):
+        RGBDFolder(str(tmp_path), holdout=None).load("sofa.r3d", [0])
+
+
+def test_a_cut_archive_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "lzfse", FakeLzfse)
+    write_r3d(tmp_path, room(1))
+    path = tmp_path / "sofa.r3d"
+    path.write_bytes(path.read_bytes()[:-200])
+    with pytest.raises(DataError, match=r"sofa\.r3d: no readable archive"):
+        RGBDFolder(str(tmp_path)).frames("sofa.r3d")
+
+
+def test_depth_is_not_larger_than_the_image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "lzfse", FakeLzfse)
+    write_r3d(tmp_path, room(1))
+    with zipfile.ZipFile(tmp_path / "sofa.r3d") as archive:
+        content = json.loads(archive.read("metadata"))
+    changed(tmp_path / "sofa.r3d", metadata=json.dumps(content | {"dh": 1 << 20, "dw": 1 << 20}).encode())
+    with pytest.raises(DataError, match=r"depth of 1048576x1048576 pixels with images of 40x30"):
+        RGBDFolder(str(tmp_path)).frames("sofa.r3d")
+
+
+def test_names_in_an_archive_do_not_lead_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "lzfse", FakeLzfse)
+    write_r3d(tmp_path, room(1))
+    (tmp_path / "1.jpg").write_bytes(b"")
+    with zipfile.ZipFile(tmp_path / "sofa.r3d", "a") as archive:
+        archive.writestr("rgbd/../../1.jpg", b"")
+        archive.writestr("/rgbd/2.jpg", b"")
+    assert RGBDFolder(str(tmp_path), holdout=None, depth=False).frames("sofa.r3d") == (0,)
+
+
+def block(raw: int, matches: int, header: int = 32) -> bytes:
+    """A block of LZFSE with nothing in it, and the end."""
+    return b"bvx2" + struct.pack("<IQQI", raw, matches << 40, 0, header) + bytes(max(header, 32) - 28) + b"bvx$"
+
+
+@pytest.mark.parametrize(
+    "stream",
+    [b"", b"bvx$"[:3], b"bvx-\xff\xff\xff\xff", b"zzzz", block(4000, 2000), block(10, 1, header=0), block(10, 1)[:-4]],
+)
+def test_streams_that_lie_are_refused_unread(stream: bytes) -> None:
+    with pytest.raises(FormatError, match=r"0\.depth"):
+        unpacked_size(stream, Path("0.depth"))
+
+
+def test_the_sizes_of_streams_are_told(tmp_path: Path) -> None:
+    lzfse = pytest.importorskip("lzfse")
+    rng = np.random.default_rng(0)
+    smooth = np.add.outer(np.arange(192.0), np.arange(256.0)).astype("<f4")
+    for content in (bytes(4 * PIXELS), smooth.tobytes(), smooth.repeat(20, 0).tobytes(), rng.bytes(5000), b"a" * 70):
+        packed = lzfse.compress(content)
+        assert unpacked_size(packed, tmp_path) == len(content)
+        assert unpack_lzfse(packed, len(content), tmp_path) == content
