@@ -7,8 +7,8 @@ counted. Held-out views at true poses, brought into the scene's frame by its pre
 a scene; cameras: root mean square distance of the input views' centres to the true ones after one similarity, in per
 cent of the median depth. Heads are untrained, which the labels say, but for those of ``--ckpt LABEL=PATH``. Procedural
 rooms or, with ``data=rgbd data.root=FOLDER``, a recording; ``backend.pose_noise=0.01`` starts from wrong cameras and
-``--options rates.cameras=0.1`` says how they move. Writes a dated JSON file to
-``benchmarks/results`` and curves to ``docs/figures``.
+``--options rates.cameras=0.1`` says how they move; ``--exposure 0.2`` brightens and darkens the input views by up to a
+fifth. Writes a dated JSON file to ``benchmarks/results`` and curves to ``docs/figures``.
 """
 
 from __future__ import annotations
@@ -115,6 +115,14 @@ def curve(loaded: LoadedModel, batch: Batch, options: RefineOptions, marks: list
     return [point | {"reconstruct_seconds": reconstruct_seconds} for point in found]
 
 
+def exposed(batch: Batch, spread: float) -> Batch:
+    """Input views with gains spread evenly over ``1 - spread`` to ``1 + spread``, neighbours unlike each other."""
+    gains = torch.ones(batch.images.shape[1], device=batch.images.device)
+    steps = torch.linspace(-spread, spread, batch.num_context, device=batch.images.device)
+    gains[: batch.num_context] += torch.cat((steps[::2], steps[1::2]))
+    return replace(batch, images=(batch.images * gains[:, None, None, None]).clamp(0, 1))
+
+
 def mean_curve(curves: list[Curve]) -> Curve:
     """Means over scenes at every mark that all scenes have."""
     marks = list(dict.fromkeys(p["mark"] for c in curves for p in c))
@@ -153,6 +161,7 @@ def main() -> None:
     options.add_argument("--starts", nargs="+", choices=STARTS, default=list(STARTS), metavar="LABEL")
     options.add_argument("--ckpt", nargs="+", default=[], metavar="LABEL=PATH", help="a start's trained part")
     options.add_argument("--options", nargs="+", default=[], metavar="KEY=VALUE", help="of configs/refine")
+    options.add_argument("--exposure", type=float, default=0.0, help="spread of the input views' gains")
     options.add_argument("--name", default="rooms", help="part of the files' names")
     options.add_argument("--figures", type=Path, default=FIGURES)
     arguments = options.parse_args()
@@ -164,7 +173,8 @@ def main() -> None:
     config = compose("train", "output_dir=.", *arguments.overrides)
     data = instantiate(config.data)
     data.setup("validate")
-    batches = [batch.to(device) for batch, _ in zip(data.val_dataloader(), range(arguments.scenes), strict=False)]
+    loader = zip(data.val_dataloader(), range(arguments.scenes), strict=False)
+    batches = [exposed(batch.to(device), arguments.exposure) for batch, _ in loader]
     changes = [f"refine.{item}" for item in arguments.options]
     how = replace(instantiate(compose(None, "+refine=default", *changes).refine), steps=None, seconds=arguments.seconds)
     marks = [arguments.seconds * share for share in (1 / 16, 1 / 8, 1 / 4, 1 / 2)]
@@ -199,6 +209,7 @@ def main() -> None:
         "trained": sorted(trained),
         "seconds": arguments.seconds,
         "options": arguments.options,
+        "exposure": arguments.exposure,
         "curves": curves,
     }
     write_results(arguments.out, f"refine-{arguments.name}-{device.type}", content)
