@@ -134,7 +134,7 @@ class Reconstructor(nn.Module, ABC):
         unit = self.scale(raw, hints)
         return tokens, _to_scene_frame(raw, unit), unit
 
-    def before_background(self, gaussians: Gaussians, images: Tensor, depth: Tensor) -> Gaussians:
+    def with_background(self, gaussians: Gaussians, images: Tensor, depth: Tensor) -> Gaussians:
         """Sets what rays see that meet none of the Gaussians.
 
         Its most likely colour is that of the pixels for which the backbone found no depth, such as the sky; where there
@@ -256,7 +256,7 @@ class VG2GT(Reconstructor):
         with stage("fine"):
             voxels: Voxels = self.fine(tokens, geometry, images)
         with stage("gaussians"):
-            gaussians: Gaussians = self.before_background(self.gaussians(voxels), images, initial.depth)
+            gaussians: Gaussians = self.with_background(self.gaussians(voxels), images, initial.depth)
         return Prediction(initial, geometry, voxels, gaussians, unit)
 
 

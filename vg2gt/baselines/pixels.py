@@ -119,7 +119,7 @@ class PixelReconstructor(Reconstructor):
         with stage("gaussians"), torch.autocast(images.device.type, enabled=False):
             pixels = usable_pixels(geometry, images)
             features = F.gelu(dense.float()).index_select(0, pixels.rows)
-            gaussians = self.before_background(self.make_gaussians(features, pixels, geometry), images, geometry.depth)
+            gaussians = self.with_background(self.make_gaussians(features, pixels, geometry), images, geometry.depth)
         return Prediction(geometry, geometry, None, gaussians, unit)
 
     @abstractmethod
