@@ -12,11 +12,11 @@ import weakref
 from collections import Counter
 from dataclasses import asdict, dataclass, replace
 from typing import Any
-from unittest import mock
 
 import torch
 from common import MEGABYTE, parser, write_results
 from gpu_kernels import recorded
+from gpu_waits import Waits
 from render_scene import room_cameras, room_gaussians
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -25,12 +25,11 @@ from vg2gt.evaluation.tables import print_table
 from vg2gt.rendering import Renderer
 from vg2gt.rendering.gpu.tiles import TILE
 from vg2gt.rendering.options import RenderOptions, SceneViews
-from vg2gt.rendering.projection import pixel_boxes, project, screen_box
+from vg2gt.rendering.projection import Splats, pixel_boxes, project, screen_box
 from vg2gt.types import Cameras, Gaussians
 
 SIZE = (224, 448)
 ALLOCATIONS = ("empty", "new_empty", "empty_like")
-WAITS = ("_local_scalar_dense", "nonzero", "masked_select", "repeat_interleave", "unique")
 SORT_SCRATCH = 24  # bytes an entry that CUB's pair sort takes beside keys and order: indices, and a copy of both
 
 
@@ -99,20 +98,26 @@ class Watch(TorchDispatchMode):
         self.held -= size
 
 
-def tile_counts(gaussians: Gaussians, cameras: Cameras) -> Tensor:
-    """Tiles ``[V, G]`` that each Gaussian covers in each view, by the reference projection."""
-    options, rows = RenderOptions(), []
+def seen_by(gaussians: Gaussians, cameras: Cameras, view: int) -> tuple[Splats, Tensor, Tensor, Tensor]:
+    """One view's splats, first and last pixel ``[G, 2]`` of each, and ``[G]`` whether it has any pixel."""
+    options, one = RenderOptions(), slice(view, view + 1)
+    scene = SceneViews(
+        gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh[None, :, 0],
+        cameras.world_to_camera[0, one], cameras.intrinsics[0, one], torch.zeros(3), cameras.size,
+    )  # fmt: skip
+    pose, splats = cameras.world_to_camera[0, view], project(scene, options)
+    box, bounded = screen_box(splats)
+    first, last = pixel_boxes(torch.nan_to_num(box), cameras.size)
+    in_front = gaussians.means @ pose[2, :3] + pose[2, 3] > options.near
+    return splats, first, last, bounded & in_front & (last >= first).all(-1)
+
+
+def tile_counts(gaussians: Gaussians, cameras: Cameras, side: int = TILE) -> Tensor:
+    """Tiles ``[V, G]`` of ``side`` pixels that each Gaussian covers in each view, by the reference projection."""
+    rows = []
     for view in range(cameras.world_to_camera.shape[1]):
-        scene = SceneViews(
-            gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh[None, :, 0],
-            cameras.world_to_camera[0, view : view + 1], cameras.intrinsics[0, view : view + 1],
-            torch.zeros(3), cameras.size,
-        )  # fmt: skip
-        pose = cameras.world_to_camera[0, view]
-        box, bounded = screen_box(project(scene, options))
-        first, last = pixel_boxes(torch.nan_to_num(box), cameras.size)
-        seen = bounded & (gaussians.means @ pose[2, :3] + pose[2, 3] > options.near) & (last >= first).all(-1)
-        rows.append(torch.where(seen, (last // TILE - first // TILE + 1).prod(-1), 0))
+        _, first, last, seen = seen_by(gaussians, cameras, view)
+        rows.append(torch.where(seen, (last // side - first // side + 1).prod(-1), 0))
     return torch.stack(rows)
 
 
@@ -122,21 +127,14 @@ def count_step(implementation: str, count: int, views: int) -> Count:
     tiles = tile_counts(gaussians, cameras) if implementation == "triton" else torch.zeros(1)
     gaussians = gaussians.map(lambda t: t.requires_grad_() if t.is_floating_point() else t)
     renderer = Renderer(implementation=implementation)  # type: ignore[arg-type]
-    lists: list[int] = []
-    watch = Watch()
-    read = Tensor.tolist
-
-    def tolist(tensor: Tensor) -> Any:
-        lists.append(1)
-        return read(tensor)
-
+    watch, waits = Watch(), Waits()
     stubs = {"project_kernel": lambda counts, **_: counts.view(-1).copy_(tiles.view(-1))}
-    with recorded(stubs) as launches, mock.patch.object(Tensor, "tolist", tolist):
-        with watch:
+    with recorded(stubs) as launches:
+        with waits, watch:
             out = renderer(gaussians, cameras)
             outputs = [out.color, out.depth, out.normal]
         weights = [torch.ones_like(image) for image in outputs]
-        with watch:
+        with waits, watch:
             torch.autograd.backward(outputs, weights)
     inside = len(launches) and 1  # the recorder's own copy of the counts
     return Count(
@@ -146,7 +144,7 @@ def count_step(implementation: str, count: int, views: int) -> Count:
         int(tiles.sum()),
         sum(watch.names.values()) - inside,
         len(launches),
-        len(lists) + sum(watch.names[name] for name in WAITS),
+        waits.total,
         watch.most / MEGABYTE,
     )
 

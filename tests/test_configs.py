@@ -7,8 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig, OmegaConf
+from torch import nn
 
 from tests.training_helpers import full_model
 from vg2gt.config import compose, group_options
@@ -149,6 +151,24 @@ def test_paper_counts_differs_from_the_paper_in_its_voxels_only(tmp_path: Path) 
     counts.name, counts.model.scale.source = paper.name, paper.model.scale.source
     counts.model.coarse.min_footprint = counts.model.fine.min_footprint = 0
     assert {key: counts[key] for key in counts} == {key: paper[key] for key in paper}
+
+
+@pytest.mark.parametrize("trainer", ["gpu", "slurm"])
+def test_gpus_train_in_mixed_precision_with_a_fused_optimizer(trainer: str, tmp_path: Path) -> None:
+    config = composed(tmp_path, "experiment=paper", f"trainer={trainer}")
+    assert (config.trainer.accelerator, config.trainer.precision) == ("gpu", "bf16-mixed")
+    assert config.trainer.max_steps == 420_000
+    assert (config.optimizer.fused, config.optimizer.lr) == (True, 3e-6)
+    assert "fused" not in composed(tmp_path).optimizer  # bit for bit as ever
+    steps = []
+    for options in (config.optimizer, composed(tmp_path, "optimizer.lr=3e-6").optimizer):
+        weight = nn.Parameter(torch.linspace(-1, 1, 9))
+        optimizer = instantiate(options)([weight])
+        for _ in range(3):
+            weight.grad = torch.cos(weight.detach())
+            optimizer.step()
+        steps.append(weight.detach())
+    torch.testing.assert_close(*steps, rtol=1e-6, atol=0)
 
 
 def test_paper_experiment_holds_the_papers_numbers(tmp_path: Path) -> None:

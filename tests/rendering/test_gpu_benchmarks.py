@@ -43,6 +43,71 @@ def test_memory_of_eighteen_views(step: ModuleType) -> None:
 
 
 @pytest.fixture
+def estimate(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    return importlib.import_module("gpu_estimate")
+
+
+def march(response: list[list[float]]) -> tuple[int, int]:
+    """Entries that a tile's rays visit and meet, one after the other as a program goes."""
+    before, met = [1.0] * len(response), 0
+    for place in range(len(response[0])):
+        if max(before) <= 0:
+            return place, met
+        hits = [ray for ray, row in enumerate(response) if before[ray] > 0 and row[place] >= 1 / 255]
+        met += bool(hits)
+        for ray in hits:
+            after = before[ray] * (1 - response[ray][place])
+            before[ray] = after if after >= 1e-4 else -before[ray]
+    return len(response[0]), met
+
+
+def test_visits_are_those_of_the_kernels(estimate: ModuleType) -> None:
+    generator = torch.Generator().manual_seed(0)
+    response = torch.rand(4, 30, generator=generator) * 0.98 * (torch.rand(4, 30, generator=generator) < 0.4)
+    depths = torch.arange(30.0).expand(4, 30)
+    count, blended, met, solved, solved_met = estimate._visits(response, depths, torch.full((4, 30), 1e4))
+    assert (count, blended, met) == (30, *march(response.tolist()))
+    assert 0 < blended < 30
+    # narrow profiles: what lies behind the quarter of every ray does not matter to its median
+    quarter = (torch.cumprod(1 - response, 1) <= 0.25).int().argmax(1)
+    assert solved == int(quarter.max()) + 1
+    assert solved_met == int((response[:, :solved] > 0).any(0).sum())
+    assert estimate._visits(response, depths, torch.full((4, 30), 1e-9))[3] == blended  # wide ones: all matter
+    assert estimate._visits(response[:, :0], depths[:, :0], depths[:, :0]) == (0, 0, 0, 0, 0)
+
+
+def test_instructions_of_loops_are_read_from_machine_code(estimate: ModuleType) -> None:
+    def lines(count: int) -> list[str]:
+        return ["        /*0010*/                   FADD R1, R1, R2 ;"] * count
+
+    def jump(to: int) -> list[str]:
+        return [f"        /*0010*/              @P0  BRA `(.L_x_{to}) ;"]
+
+    outer = [
+        ".L_x_0:",
+        *lines(5),
+        ".L_x_1:",
+        *lines(10),
+        *jump(2),
+        *lines(60),
+        ".L_x_2:",
+        *lines(4),
+        *jump(1),
+        *jump(0),
+    ]
+    assert estimate.loops("\n".join([*outer, ".L_x_3:", *jump(3)])) == [estimate.Loop(76, 16)]
+
+
+def test_time_follows_visits(estimate: ModuleType) -> None:
+    found = {name: estimate.Loop(300, 100) for name in ("blend", "section", "newton", "backward")}
+    times = estimate.milliseconds(estimate.Visits(50, 20, 10, 8, 4), 1000, found)
+    assert times["blend"] == times["backward"] == pytest.approx(1e6 * (10 * 300 + 10 * 100) / estimate.ISSUED)
+    assert times["section"] == pytest.approx(4e6 * (4 * 300 + 4 * 100) / estimate.ISSUED)
+    assert times["newton"] == pytest.approx(0.75 * times["section"])
+
+
+@pytest.fixture
 def gpu(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     return importlib.import_module("gpu")

@@ -36,10 +36,8 @@ def bench(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 def hold(found: list) -> None:
     for row in found:
         print(row)
-        assert 16 <= row.registers <= REGISTERS[row.variant.split()[0]], row
-        assert row.spills == 0, row
-        assert row.shared <= 1024, row
-        assert row.instructions > 50, row
+    assert not [row for row in found if row.spills or not 16 <= row.registers <= REGISTERS[row.variant.split()[0]]]
+    assert not [row for row in found if row.shared > 1024 or row.instructions <= 50]
 
 
 def test_the_main_kernels_compile_for_a_gpu_that_is_not_there(bench: ModuleType) -> None:
@@ -48,10 +46,11 @@ def test_the_main_kernels_compile_for_a_gpu_that_is_not_there(bench: ModuleType)
 
 
 @pytest.mark.slow
-def test_all_variants_compile_for_three_generations(bench: ModuleType) -> None:
+@pytest.mark.parametrize("target", NVIDIA)
+def test_all_variants_compile_for_three_generations(target: str, bench: ModuleType) -> None:
     launches = bench.variants()
     assert {name.split()[0] for name in launches} == set(REGISTERS)
-    hold([bench.compile_for(launch, target) for launch in launches.values() for target in NVIDIA])
+    hold([bench.compile_for(launch, target) for launch in launches.values()])
 
 
 @pytest.mark.slow

@@ -195,5 +195,5 @@ def test_the_sparsest_scene_decides_whether_voxels_are_sparse(shared, module, wa
     batch = (torch.arange(len(cells)) >= 10).long()
     plan = plan_voxels(cells, batch, torch.ones_like(batch, dtype=torch.bool))
     for _ in range(2):
-        warn_if_sparse(plan, module)
+        warn_if_sparse(plan, 2, module)
     assert [record.args for record in caplog.records] == [("fine", pytest.approx(8 / 7), "fine", "fine")] * warned

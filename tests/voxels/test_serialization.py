@@ -64,12 +64,12 @@ def test_codes_do_not_depend_on_the_other_scenes_extent(order):
 
 def test_relative_grid_is_each_scenes_own():
     grid = torch.tensor([[5, -3, 2], [6, -1, 9], [100, 200, 300]])
-    assert relative_grid(grid, torch.tensor([0, 0, 1])).tolist() == [[0, 0, 0], [1, 2, 7], [0, 0, 0]]
+    assert relative_grid(grid, torch.tensor([0, 0, 1]), 2).tolist() == [[0, 0, 0], [1, 2, 7], [0, 0, 0]]
 
 
 def test_keys_sort_by_scene_first(random_voxels):
     grid, batch = random_voxels((40, 30, 50))
-    for key in serial_keys(relative_grid(grid, batch), batch, torch.ones(3), ORDERS):
+    for key in serial_keys(relative_grid(grid, batch, 3), batch, torch.ones(3), ORDERS):
         assert torch.equal(batch[key.argsort()], batch)
         assert key.unique().numel() == len(key)
 
@@ -79,7 +79,7 @@ def test_too_large_a_scene_is_refused_with_its_size_and_extent():
     size = torch.tensor([0.002])
     assert serial_keys(grid, torch.tensor([0, 0]), size, ("z",))[0].min() >= 0
     with pytest.raises(ValueError, match=r"2097152 voxels.*0\.002"):
-        serial_keys(grid, torch.tensor([0, 1]), size, ("z",))
+        serial_keys(grid, torch.tensor([0, 1]), size.repeat(2), ("z",))
     with pytest.raises(ValueError, match="4194304 voxels"):
         serial_keys(torch.tensor([[(1 << 22) - 1, 0, 0]]), torch.tensor([0]), size, ("z",))
 
@@ -98,3 +98,4 @@ def test_every_voxel_is_owned_once_by_a_window_of_its_scene(count, shift):
         assert torch.equal(batch[group.rows], group.scene[:, None].expand_as(group.rows))
         assert position[group.rows].diff(dim=1).eq(1).all()
         assert group.rows.shape[1] == min(8, counts[int(group.scene[0])])
+        assert torch.equal(group.per_scene, torch.bincount(group.scene, minlength=4).clamp(min=1))

@@ -2,6 +2,7 @@ import pytest
 import torch
 from torch.nn import functional as F
 
+from vg2gt.voxels import sparse_conv
 from vg2gt.voxels.sparse_conv import SubmanifoldConv3d, neighbor_pairs
 
 
@@ -41,6 +42,15 @@ def test_a_batch_equals_separate_runs(random_voxels):
         rows = batch == scene
         alone = conv(features[rows], neighbor_pairs(grid[rows], torch.zeros_like(batch[rows]), 3))
         torch.testing.assert_close(together[rows], alone, atol=1e-12, rtol=0)
+
+
+def test_pairs_are_the_same_however_many_offsets_are_looked_up_at_once(random_voxels, monkeypatch):
+    grid, batch = random_voxels((60, 40), extent=6)
+    together = neighbor_pairs(grid, batch, 3)
+    monkeypatch.setattr(sparse_conv, "CHUNK", 5 * len(grid))
+    assert len(together) == 13
+    for ours, theirs in zip(neighbor_pairs(grid, batch, 3), together, strict=True):
+        assert all(torch.equal(a, b) for a, b in zip(ours, theirs, strict=True))
 
 
 def test_a_single_voxel_sees_its_centre_only():

@@ -56,7 +56,7 @@ def fault_of_batch(batch: Batch) -> Fault | None:
         "world_to_camera": batch.cameras.world_to_camera,
         "intrinsics": torch.where(focal > 0, batch.cameras.intrinsics.sum((-2, -1), keepdim=True)[..., 0], torch.nan),
     }
-    if all(_all_finite(tensor) for tensor in parts.values()):
+    if _all_finite(*parts.values()):
         return None
     bad = {name: ~torch.isfinite(tensor.flatten(1)).all(1) for name, tensor in parts.items()}
     scenes = tuple(name for i, name in enumerate(batch.scene) if any(bool(rows[i]) for rows in bad.values()))
@@ -66,7 +66,7 @@ def fault_of_batch(batch: Batch) -> Fault | None:
 def fault_of_prediction(prediction: Prediction, scenes: tuple[str, ...]) -> Fault | None:
     """Finds NaN or infinity in the Gaussians; names the part of the prediction where it begins."""
     gaussians = _tensors(replace(prediction.gaussians, background=None), "Gaussians'")  # that is the images' mean
-    if all(_all_finite(tensor) for tensor in gaussians.values()):
+    if _all_finite(*gaussians.values()):
         return None
     stages = _tensors(prediction.initial.cameras, "backbone's") | {"unit of the scene": prediction.unit}
     stages |= _tensors(prediction.voxels, "voxels'") if prediction.voxels is not None else {}
@@ -233,8 +233,9 @@ def _tensors(record: TensorRecord, owner: str) -> dict[str, Tensor]:
     return {name: value for name, value in values.items() if isinstance(value, Tensor) and value.is_floating_point()}
 
 
-def _all_finite(tensor: Tensor) -> bool:
-    return bool(torch.isfinite(tensor.detach()).all())
+def _all_finite(*tensors: Tensor) -> bool:
+    """Whether all of them are; the host waits for a GPU once."""
+    return bool(torch.stack([torch.isfinite(tensor.detach()).all() for tensor in tensors]).all())
 
 
 def _listed(names: Iterable[str]) -> str:

@@ -163,7 +163,7 @@ class CoarseModule(nn.Module):
         """
         plan = plan_voxels(points.cells, points.batch, torch.ones_like(points.batch, dtype=torch.bool))
         if points.views > 1:
-            warn_if_sparse(plan, "coarse")
+            warn_if_sparse(plan, len(points.voxel_size), "coarse")
         pooled = pool_mean(embedded, points.confidence, plan)  # f_m^v, eqn voxelfeature: [M, C]
         least = pool_min(points.confidence, plan)  # n_m^v, eqn voxelfeature: [M]
         inputs = (pooled, least.log()[:, None])
@@ -178,7 +178,9 @@ class CoarseModule(nn.Module):
         queries = (points.cells - origin[points.batch]).float()
         centers = (plan.grid - origin[plan.batch]).float() + 0.5
         # Paper, after eqn ptvzengqiang: distance-weighted over the 16 nearest voxel centres.
-        index, weights = interpolation_weights(queries, points.batch, centers, plan.batch, self.neighbors)  # [N, k]
+        index, weights = interpolation_weights(
+            queries, points.batch, centers, plan.batch, self.neighbors, len(points.voxel_size)
+        )  # [N, k]
         enhanced = interpolate(voxels, index, weights)  # [N, C]
         gain = torch.ones_like(points.voxel_size)
         if not self.surface_evidence:
@@ -246,8 +248,10 @@ class PatchPoints:
         scene = torch.arange(len(depth), device=depth.device).repeat_interleave(sampled[0].numel())  # [B V h w]
         cells = point_cells(points.flatten(0, -2), scene, voxel_size)  # [B V h w, 3]
         usable = valid.flatten() & in_range(cells)
-        self.placeholder = not bool(usable.any())
-        self.rows = usable.nonzero()[:, 0] if not self.placeholder else scene.new_zeros(1)
+        self.rows = usable.nonzero()[:, 0]
+        self.placeholder = not len(self.rows)
+        if self.placeholder:
+            self.rows = scene.new_zeros(1)
         self.batch = scene[self.rows]
         self.cells = cells[self.rows] if not self.placeholder else cells.new_zeros(1, 3)
         self.confidence = torch.where(valid, smallest, 1.0).flatten()[self.rows]

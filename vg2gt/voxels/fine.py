@@ -22,6 +22,7 @@ from vg2gt.voxels.grid import (
     pool_mean,
     pool_mean_of_chunks,
     pool_min,
+    scene_counts,
     scene_voxel_size,
     warn_if_sparse,
 )
@@ -112,7 +113,7 @@ class FineModule(nn.Module):
             points = _Points(geometry, size, self.drop_fringes)
             plan = self._plan(points)
             if images.shape[1] > 1:
-                warn_if_sparse(plan, "fine")
+                warn_if_sparse(plan, len(size), "fine")
         pooled = self._pool_features(tokens, images, points, plan)
         with torch.autocast(images.device.type, enabled=False):
             pixels = images.float().permute(0, 1, 3, 4, 2).reshape(-1, 3)  # [B V H W, 3]
@@ -120,7 +121,7 @@ class FineModule(nn.Module):
             offset, colors = means.split(3, -1)
             confidence = pool_min(points.confidence, plan)
             count = plan.counts.to(pooled.dtype)
-            density = torch.log(count / _scene_medians(count, plan.batch))
+            density = torch.log(count / _scene_medians(count, plan.batch, len(size)))
             extra = [2 * colors - 1, 2 * offset, density[:, None], confidence.log()[:, None]]
             # Not grid * size + ...: centre plus offset keeps the centroid inside its cell in float32.
             centroid = (plan.grid + 0.5 + offset.double()) * size.double()[plan.batch, None]
@@ -222,8 +223,7 @@ class _Points:
             log.warning("left out %d of %d points too far away to be numbered", far, usable.numel())
 
 
-def _scene_medians(values: Tensor, batch: Tensor) -> Tensor:
+def _scene_medians(values: Tensor, batch: Tensor, scenes: int) -> Tensor:
     """The median of ``[M]`` values within each voxel's scene, ``[M]``."""
-    counts = torch.bincount(batch)
-    medians = [part.median() if len(part) else part.new_ones(()) for part in values.split(counts.tolist())]
-    return torch.stack(medians)[batch] if medians else values
+    parts = values.split(scene_counts(batch, scenes).tolist())
+    return torch.stack([part.median() if len(part) else part.new_ones(()) for part in parts])[batch]

@@ -78,8 +78,9 @@ def mixed_radix_keys(grid: Tensor, batch: Tensor, margin: int = 0) -> tuple[Tens
     if not len(grid):
         return batch, (1, 1, 1)
     low = grid.amin(0)
-    extent: list[int] = (grid.amax(0) - low + 1 + 2 * margin).tolist()
-    scenes = int(batch.max()) + 1
+    # the host waits for a GPU once, not once a number
+    spans = torch.cat((grid.amax(0) - low + 1 + 2 * margin, batch.max()[None] + 1))
+    *extent, scenes = spans.tolist()
     if scenes * extent[0] * extent[1] * extent[2] >= 1 << 63:
         raise ValueError(
             f"{scenes} scenes of {extent[0]} x {extent[1]} x {extent[2]} voxels cannot be numbered in 63 bits; "
@@ -88,6 +89,11 @@ def mixed_radix_keys(grid: Tensor, batch: Tensor, margin: int = 0) -> tuple[Tens
     steps = (extent[1] * extent[2], extent[2], 1)
     x, y, z = (grid - low + margin).unbind(-1)
     return ((batch * extent[0] + x) * extent[1] + y) * extent[2] + z, steps
+
+
+def scene_counts(batch: Tensor, scenes: int) -> Tensor:
+    """Rows ``[B]`` of each scene where ``batch`` ``[M]`` is sorted; unlike ``bincount`` it makes no host wait."""
+    return torch.searchsorted(batch, torch.arange(scenes + 1, device=batch.device)).diff()
 
 
 def point_cells(points: Tensor, batch: Tensor, voxel_size: Tensor) -> Tensor:
@@ -124,8 +130,8 @@ def plan_voxels(cells: Tensor, batch: Tensor, valid: Tensor) -> VoxelPlan:
     Raises:
         ValueError: if the points span more cells than int64 can number.
     """
-    everything = bool(valid.all())
-    rows = None if everything else valid.nonzero()[:, 0]
+    valid_rows = valid.nonzero()[:, 0]
+    rows = None if len(valid_rows) == len(valid) else valid_rows
     floors = torch.floor(cells.detach() if rows is None else cells.detach()[rows]).long()
     scenes = batch if rows is None else batch[rows]
     keys, order = torch.sort(mixed_radix_keys(floors, scenes)[0], stable=True)
@@ -138,17 +144,19 @@ def plan_voxels(cells: Tensor, batch: Tensor, valid: Tensor) -> VoxelPlan:
     return VoxelPlan(floors[first], scenes[first], point_rows, starts, counts, voxel_of)
 
 
-def warn_if_sparse(plan: VoxelPlan, module: str) -> None:
+def warn_if_sparse(plan: VoxelPlan, scenes: int, module: str) -> None:
     """Says in the log, once per module and process, that a scene's voxels hold hardly more than one point each.
 
     Args:
         plan: the voxels of B scenes.
+        scenes: B.
         module: whose options to name, ``coarse`` or ``fine``.
     """
     if module in _warned_of_sparse or not len(plan):
         return
-    voxels, points = torch.bincount(plan.batch), torch.bincount(plan.batch, plan.counts)
-    fewest = float((points / voxels)[voxels > 0].min())
+    voxels = scene_counts(plan.batch, scenes)
+    points = torch.zeros_like(voxels).index_add_(0, plan.batch, plan.counts)
+    fewest = float(torch.where(voxels > 0, points / voxels, torch.inf).min())
     if fewest < MIN_POINTS_PER_VOXEL[module]:
         _warned_of_sparse.add(module)
         log.warning(
@@ -166,7 +174,7 @@ class _WeightedMean(torch.autograd.Function):
         dtype = torch.promote_types(values.dtype, torch.float32)
         ordered = weights.to(dtype)[plan.order]
         total = torch.segment_reduce(ordered, "sum", lengths=plan.counts, unsafe=True)
-        share = ordered / torch.repeat_interleave(total, plan.counts)
+        share = ordered / torch.repeat_interleave(total, plan.counts, output_size=len(plan.order))
         mean = F.embedding_bag(plan.order, values.to(dtype), plan.starts, mode="sum", per_sample_weights=share)
         ctx.save_for_backward(values, weights, total, mean)
         ctx.plan = plan
@@ -219,8 +227,8 @@ def pool_mean_of_chunks(chunks: Iterable[Tensor], weights: Tensor, plan: VoxelPl
     begin = 0
     for values in chunks:
         inside = ((plan.order >= begin) & (plan.order < begin + len(values))).nonzero()[:, 0]
-        counts = torch.bincount(voxel[inside], minlength=len(plan))
-        rows, starts = plan.order[inside] - begin, counts.cumsum(0) - counts
+        rows = plan.order[inside] - begin
+        starts = torch.searchsorted(voxel[inside], torch.arange(len(plan), device=voxel.device))
         part = F.embedding_bag(rows, values.to(dtype), starts, mode="sum", per_sample_weights=share[inside])
         means = part if means is None else means.add_(part)
         begin += len(values)
@@ -245,11 +253,13 @@ def scene_voxel_size(geometry: Geometry, voxel_size: float, min_footprint: float
     Returns:
         ``[B]`` float32, detached.
     """
+    if min_footprint <= 0:
+        return torch.full((len(geometry.depth),), voxel_size, dtype=torch.float32, device=geometry.depth.device)
     sizes = []
     for depth, intrinsics in zip(geometry.depth.detach(), geometry.cameras.intrinsics.detach(), strict=True):
         valid = depth[(depth > 0) & torch.isfinite(depth)]
         size = torch.full((), voxel_size, dtype=torch.float32, device=depth.device)
-        if min_footprint > 0 and valid.numel():
+        if valid.numel():
             focal = intrinsics[..., [0, 1], [0, 1]].mean()
             size = torch.maximum(size, (min_footprint * valid.median() / focal).float())
         sizes.append(size)

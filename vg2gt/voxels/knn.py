@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import torch
 from scipy.spatial import KDTree
 from torch import Tensor
@@ -35,7 +37,7 @@ def nearest_neighbors(queries: Tensor, points: Tensor, neighbors: int) -> Tensor
 
 
 def interpolation_weights(
-    queries: Tensor, query_batch: Tensor, points: Tensor, point_batch: Tensor, neighbors: int
+    queries: Tensor, query_batch: Tensor, points: Tensor, point_batch: Tensor, neighbors: int, scenes: int
 ) -> tuple[Tensor, Tensor]:
     """Neighbours within each scene and their weights ``1 / (d^2 + 1e-6)``, normalised to sum 1 (paper: 16 nearest).
 
@@ -45,6 +47,7 @@ def interpolation_weights(
         points: ``[M, 3]`` in voxel units.
         point_batch: ``[M]`` scene index, sorted; every scene with queries has at least one point.
         neighbors: how many per query; a scene with fewer points uses them all.
+        scenes: B.
 
     Returns:
         Rows of ``points`` ``[N, neighbors]`` (row 0 with weight 0 where there is none) and weights ``[N, neighbors]``,
@@ -52,12 +55,14 @@ def interpolation_weights(
     """
     index = torch.zeros(len(queries), neighbors, dtype=torch.int64, device=queries.device)
     found = torch.zeros_like(index, dtype=torch.bool)
-    for scene in query_batch.unique().tolist():
-        rows = slice(*_bounds(query_batch, scene))
-        first, last = _bounds(point_batch, scene)
-        nearest = nearest_neighbors(queries[rows], points[first:last], neighbors)
-        index[rows, : nearest.shape[1]] = nearest + first
-        found[rows, : nearest.shape[1]] = True
+    numbers = torch.arange(scenes + 1, device=queries.device)
+    bounds = torch.stack([torch.searchsorted(batch, numbers) for batch in (query_batch, point_batch)], -1).tolist()
+    for (begin, first), (end, last) in itertools.pairwise(bounds):
+        if begin == end:
+            continue
+        nearest = nearest_neighbors(queries[begin:end], points[first:last], neighbors)
+        index[begin:end, : nearest.shape[1]] = nearest + first
+        found[begin:end, : nearest.shape[1]] = True
     squared = (queries[:, None] - points[index]).square().sum(-1)  # [N, neighbors]
     weights = torch.where(found, 1 / (squared + 1e-6), 0)
     return index, weights / weights.sum(1, keepdim=True)
@@ -66,8 +71,3 @@ def interpolation_weights(
 def interpolate(features: Tensor, index: Tensor, weights: Tensor) -> Tensor:
     """Weighted sums of neighbours' features: ``[M, C]`` with ``[N, k]`` index and weights gives ``[N, C]``."""
     return F.embedding_bag(index, features, mode="sum", per_sample_weights=weights)
-
-
-def _bounds(batch: Tensor, scene: int) -> tuple[int, int]:
-    first, last = torch.searchsorted(batch, torch.tensor([scene, scene + 1], device=batch.device)).tolist()
-    return first, last

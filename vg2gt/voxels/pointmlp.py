@@ -7,7 +7,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.utils.checkpoint import checkpoint
 
-from vg2gt.voxels.serialization import Order, Windows, make_windows, relative_grid, serial_keys
+from vg2gt.voxels.grid import scene_counts
+from vg2gt.voxels.serialization import Order, WindowGroup, Windows, make_windows, relative_grid, serial_keys
 
 STAGE_ORDERS: tuple[Order, ...] = ("hilbert", "hilbert-trans", "z", "z-trans")
 
@@ -50,7 +51,7 @@ class GeometricStage(nn.Module):
             rows = group.rows.flatten()
             local = features.index_select(0, rows).unflatten(0, group.rows.shape)
             place = positions.index_select(0, rows).unflatten(0, group.rows.shape).to(local.dtype)
-            normalized = torch.cat((_standardize(local, group.scene), _standardize(place, group.scene)), -1)
+            normalized = torch.cat((_standardize(local, group), _standardize(place, group)), -1)
             affine = torch.addcmul(self.beta, self.alpha, normalized)
             hidden = self.before(self.inner(torch.cat((affine, local), -1)))
             context = self.after(hidden.amax(1))
@@ -62,13 +63,13 @@ class GeometricStage(nn.Module):
         return features + self.gamma * update.index_select(0, windows.owner)
 
 
-def _standardize(values: Tensor, scene: Tensor) -> Tensor:
+def _standardize(values: Tensor, group: WindowGroup) -> Tensor:
     """Deviations of ``[W, K, C]`` from their window's mean, over one standard deviation a scene."""
     deviation = values - values.mean(1, keepdim=True)
     per_window = deviation.square().mean((1, 2))
-    total = per_window.new_zeros(int(scene[-1]) + 1).index_add(0, scene, per_window)
-    windows = torch.bincount(scene).clamp(min=1)
-    sigma = (total / windows + 1e-10).sqrt()[scene]  # the constant keeps the root differentiable for single voxels
+    total = per_window.new_zeros(len(group.per_scene)).index_add(0, group.scene, per_window)
+    # the constant keeps the root differentiable for single voxels
+    sigma = (total / group.per_scene + 1e-10).sqrt()[group.scene]
     return deviation / (sigma[:, None, None] + 1e-5)
 
 
@@ -115,7 +116,7 @@ class PointMLP(nn.Module):
         if not len(features):
             # The stages have nothing to do, but every rank's parameters must be in the graph: the others would wait.
             return features + 0 * sum(parameter.sum() for parameter in self.stages.parameters())
-        local = relative_grid(grid, batch)
+        local = relative_grid(grid, batch, len(voxel_size))
         positions = local.float()
         for stage, windows in zip(self.stages, self._windows(local, batch, voxel_size), strict=True):
             if self.checkpoint and torch.is_grad_enabled():
@@ -126,7 +127,7 @@ class PointMLP(nn.Module):
 
     def _windows(self, grid: Tensor, batch: Tensor, voxel_size: Tensor) -> list[Windows]:
         orders = STAGE_ORDERS[: len(self.stages)]
-        counts = torch.bincount(batch).tolist()
+        counts = scene_counts(batch, len(voxel_size)).tolist()
         curves = [torch.argsort(key) for key in serial_keys(grid, batch, voxel_size, orders)]
         return [
             make_windows(curves[i % len(curves)], counts, self.window, shift=self.window // 2 * (i % 2))

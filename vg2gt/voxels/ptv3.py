@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from vg2gt.voxels.grid import scene_counts
 from vg2gt.voxels.serialization import ORDERS, Order, Windows, make_windows, relative_grid, serial_keys
 from vg2gt.voxels.sparse_conv import Pairs, SubmanifoldConv3d, neighbor_pairs
 
@@ -25,15 +26,18 @@ class Level:
     Args:
         grid: ``[M, 3]`` int64 cells.
         batch: ``[M]`` scene index, sorted.
+        scenes: B.
         keys: sort keys of every order.
         generator: shuffles the orders, so that blocks meet them in random sequence; None keeps them.
     """
 
-    def __init__(self, grid: Tensor, batch: Tensor, keys: list[Tensor], generator: torch.Generator | None) -> None:
+    def __init__(
+        self, grid: Tensor, batch: Tensor, scenes: int, keys: list[Tensor], generator: torch.Generator | None
+    ) -> None:
         self.grid = grid
         self.batch = batch
         self.keys = keys
-        self.counts: list[int] = torch.bincount(batch).tolist()
+        self.counts: list[int] = scene_counts(batch, scenes).tolist()
         count = len(keys)
         self.sequence = torch.randperm(count, generator=generator).tolist() if generator else list(range(count))
         self._windows: dict[tuple[int, int], Windows] = {}
@@ -157,7 +161,8 @@ class GridPool(nn.Module):
         first = order[counts.cumsum(0) - counts]
         projected = self.proj(features).index_select(0, order)  # [M, C']
         pooled = torch.segment_reduce(projected, "max", lengths=counts, unsafe=True)  # [M', C']
-        coarse = Level(level.grid[first] >> 1, level.batch[first], [key[first] >> 3 for key in level.keys], generator)
+        keys = [key[first] >> 3 for key in level.keys]
+        coarse = Level(level.grid[first] >> 1, level.batch[first], len(level.counts), keys, generator)
         return F.gelu(self.norm[0](pooled)), coarse, parent_of
 
 
@@ -284,10 +289,10 @@ class PTv3(nn.Module):
         """
         generator = generator if self.training else None
         # S of eqn ptvzengqiang; S^-1 is Windows.owner, with which attention returns to the voxels' own order.
-        local = relative_grid(grid, batch)
+        local = relative_grid(grid, batch, len(voxel_size))
         # One bit of the keys goes at every pooling.
         keys = serial_keys(local, batch, voxel_size, self.orders, min_bits=max(1, len(self.enc) - 1))
-        level = Level(local, batch, keys, generator)
+        level = Level(local, batch, len(voxel_size), keys, generator)
         stem = self.embedding["stem"]
         features = F.gelu(stem["norm"](stem["conv"](features, level.pairs(self.stem_kernel))))  # pyright: ignore
         skips = []

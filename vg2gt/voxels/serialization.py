@@ -77,11 +77,9 @@ def serial_codes(grid: Tensor, bits: int, order: Order) -> Tensor:
     return z_codes(grid) if order.startswith("z") else hilbert_codes(grid, -(-bits // 3) * 3)
 
 
-def relative_grid(grid: Tensor, batch: Tensor) -> Tensor:
+def relative_grid(grid: Tensor, batch: Tensor, scenes: int) -> Tensor:
     """Cells ``[M, 3]`` relative to their own scene's smallest, so that a code depends on no other scene."""
-    if not len(grid):
-        return grid
-    low = grid.new_zeros(int(batch.max()) + 1, 3)
+    low = grid.new_zeros(scenes, 3)
     low.scatter_reduce_(0, batch[:, None].expand_as(grid), grid, "amin", include_self=False)
     return grid - low[batch]
 
@@ -94,19 +92,19 @@ def serial_keys(
     Args:
         grid: ``[M, 3]`` cells relative to their scene's smallest.
         batch: ``[M]`` scene index.
-        voxel_size: ``[B]`` edge lengths, for the error's message only.
+        voxel_size: ``[B]`` edge lengths; how many says B, what they are only the error's message.
         orders: the wanted orders.
         min_bits: bits per axis at least, so that keys can be shifted to parents this many times.
 
     Raises:
         ValueError: if code and scene index do not fit into 63 bits, or an axis not into 21.
     """
-    extent = int(grid.max()) + 1
+    extent, scenes = int(grid.max()) + 1, len(voxel_size)
     bits = max(min_bits, (extent - 1).bit_length())
-    if bits > MAX_BITS or 3 * bits + int(batch.max()).bit_length() > 63:
+    if bits > MAX_BITS or 3 * bits + (scenes - 1).bit_length() > 63:
         sizes = ", ".join(f"{size:g}" for size in voxel_size.tolist())
         raise ValueError(
-            f"a scene spans {extent} voxels along an axis (voxel size {sizes}, {int(batch.max()) + 1} scenes); with "
+            f"a scene spans {extent} voxels along an axis (voxel size {sizes}, {scenes} scenes); with "
             f"the scene index that exceeds 63 bits of serial code; raise voxel_size or min_footprint"
         )
     scene = batch << (3 * bits)
@@ -120,10 +118,12 @@ class WindowGroup:
     Attributes:
         rows: ``[W, K]`` voxels of every window.
         scene: ``[W]`` the windows' scenes.
+        per_scene: ``[B]`` windows of each scene, at least 1 so that it can be divided by.
     """
 
     rows: Tensor
     scene: Tensor
+    per_scene: Tensor
 
 
 @dataclass(frozen=True)
@@ -151,26 +151,26 @@ def make_windows(order: Tensor, counts: list[int], length: int, shift: int = 0) 
         length: voxels per window; a scene with fewer makes one window of what it has.
         shift: the first window starts this many voxels before the scene does, 0 <= shift < length.
     """
-    by_length: dict[int, list[tuple[Tensor, Tensor, int]]] = {}
+    by_length: dict[int, list[tuple[int, int, int]]] = {}
     begin = 0
     for scene, count in enumerate(counts):
-        if not count:
-            continue
-        size = min(length, count)
-        first = -shift if count > length else 0
-        starts = torch.arange(first, count, size, device=order.device)  # [W]
-        inside = starts.clamp(0, count - size)
-        places = inside[:, None] + torch.arange(size, device=order.device)  # [W, K]
-        owned = (places >= starts[:, None]) & (places < starts[:, None] + size)
-        by_length.setdefault(size, []).append((order[begin + places], owned, scene))
+        if count:
+            by_length.setdefault(min(length, count), []).append((scene, begin, count))
         begin += count
-    groups, owned_rows = [], []
-    for parts in by_length.values():
-        scenes = torch.cat([torch.full((len(rows),), scene, device=order.device) for rows, _, scene in parts])
-        groups.append(WindowGroup(torch.cat([rows for rows, _, _ in parts]), scenes))
-        owned_rows += [owned.flatten() for _, owned, _ in parts]
-    rows = torch.cat([group.rows.flatten() for group in groups])  # [sum of W K]
-    places = torch.cat(owned_rows).nonzero()[:, 0]  # [M]
+    groups, base = [], 0
     owner = torch.empty_like(order)
-    owner[rows[places]] = places
+    for size, scenes in by_length.items():
+        rows, numbers, per_scene = [], [], [1] * len(counts)
+        for scene, begin, count in scenes:
+            voxels = order[begin : begin + count]
+            first = -shift if count > length else 0
+            inside = torch.arange(first, count, size, device=order.device).clamp(0, count - size)  # [W]
+            place = torch.arange(count, device=order.device)
+            window = (place - first) // size
+            owner[voxels] = base + window * size + place - inside[window]
+            rows.append(voxels[inside[:, None] + torch.arange(size, device=order.device)])  # [W, K]
+            numbers.append(torch.full_like(inside, scene))
+            per_scene[scene] = len(inside)
+            base += len(inside) * size
+        groups.append(WindowGroup(torch.cat(rows), torch.cat(numbers), order.new_tensor(per_scene)))
     return Windows(tuple(groups), owner)

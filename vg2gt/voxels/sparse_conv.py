@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from vg2gt.voxels.grid import mixed_radix_keys
 
 Pairs = list[tuple[Tensor, Tensor]]
+CHUNK = 1 << 22  # cells times offsets looked up at once
 
 
 def neighbor_pairs(grid: Tensor, batch: Tensor, kernel_size: int) -> Pairs:
@@ -29,13 +30,19 @@ def neighbor_pairs(grid: Tensor, batch: Tensor, kernel_size: int) -> Pairs:
     keys, steps = mixed_radix_keys(grid, batch, margin=radius)
     keys, order = torch.sort(keys)
     offsets = itertools.islice(itertools.product(range(-radius, radius + 1), repeat=3), kernel_size**3 // 2)
-    pairs = []
-    for offset in offsets:
-        wanted = keys + sum(o * s for o, s in zip(offset, steps, strict=True))
+    moves = keys.new_tensor([sum(o * s for o, s in zip(offset, steps, strict=True)) for offset in offsets])
+    counts, rows, neighbors = [], [], []
+    # many offsets at a time: how many pairs there are is a shape, for which the host waits
+    for some in moves.split(max(1, CHUNK // max(1, len(keys)))):
+        wanted = keys + some[:, None]
         place = torch.searchsorted(keys, wanted).clamp_(max=len(keys) - 1)
-        found = (keys[place] == wanted).nonzero()[:, 0]
-        pairs.append((order[found], order[place[found]]))
-    return pairs
+        found = keys[place] == wanted
+        offset, row = found.nonzero().unbind(-1)
+        counts.append(found.sum(-1))
+        rows.append(order[row])
+        neighbors.append(order[place[offset, row]])
+    lengths = torch.cat(counts).tolist()
+    return list(zip(torch.cat(rows).split(lengths), torch.cat(neighbors).split(lengths), strict=True))
 
 
 class _SubmanifoldConvolution(torch.autograd.Function):

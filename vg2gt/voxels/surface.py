@@ -17,7 +17,7 @@ from torch import Tensor
 from vg2gt.geometry.cameras import ray_directions
 from vg2gt.geometry.normals import normals_from_depth
 from vg2gt.types import Cameras
-from vg2gt.voxels.grid import VoxelPlan, pool_mean
+from vg2gt.voxels.grid import VoxelPlan, pool_mean, scene_counts
 
 CENTROID_CHANNELS = 3  # of a voxel: its points' centroid in the cell
 SURFACE_CHANNELS = 5  # of a point: a vector to the surface in camera axes (3), a change of depth; confidence
@@ -86,8 +86,8 @@ def disagreement(change: Tensor, usable: Tensor, batch: Tensor, scenes: int) -> 
         batch: ``[N]`` scene index, sorted.
         scenes: B.
     """
-    counts = torch.bincount(batch[usable], minlength=scenes).tolist()
-    parts = change[usable].abs().split(counts)
+    rows = usable.nonzero()[:, 0]
+    parts = change[rows].abs().split(scene_counts(batch[rows], scenes).tolist())
     return torch.stack([part.median() if len(part) else change.new_zeros(()) for part in parts])
 
 

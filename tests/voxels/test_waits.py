@@ -1,0 +1,77 @@
+"""How often the host waits for a GPU in the voxel modules, counted on the CPU."""
+
+import importlib
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+import torch
+
+BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
+
+
+@pytest.fixture
+def gpu_waits(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    return importlib.import_module("gpu_waits")
+
+
+def test_what_waits_is_counted(gpu_waits: ModuleType) -> None:
+    x = torch.arange(6)
+    for waits, act in (
+        (1, lambda: x.max().item()),
+        (1, lambda: bool(x.any())),
+        (1, lambda: x.tolist()),
+        (1, lambda: x[0].tolist()),
+        (1, lambda: x[x > 2]),
+        (1, lambda: x.nonzero()),
+        (2, lambda: x.bincount()),
+        (1, lambda: x.repeat_interleave(x)),
+        (1, lambda: x.unique_consecutive()),
+        (0, lambda: x.repeat_interleave(x, output_size=15)),
+        (0, lambda: x[x.flip(0)]),
+        (0, lambda: x.clone().masked_fill_(x > 2, 0).sort()),
+        (0, lambda: torch.searchsorted(x, x)),
+    ):
+        with gpu_waits.Waits() as counted:
+            act()
+        assert counted.total == waits
+
+
+def test_places_are_named(gpu_waits: ModuleType) -> None:
+    from vg2gt.voxels.grid import plan_voxels
+
+    batch = torch.zeros(5, dtype=torch.int64)
+    with gpu_waits.Waits() as waits:
+        plan_voxels(torch.rand(5, 3) * 2, batch, torch.ones(5, dtype=torch.bool))
+    assert waits.places == {"voxels/grid.py plan_voxels": 2, "voxels/grid.py mixed_radix_keys": 1}
+
+
+def test_the_modules_wait_for_shapes_and_for_two_warnings_only(gpu_waits, make_room, make_coarse, make_fine) -> None:
+    """As often for three scenes as for one, but for the footprint's medians."""
+    for scenes in (1, 3):
+        tokens, geometry, images = make_room(scenes)
+        coarse, fine = make_coarse(gate=True), make_fine(moments=True)
+        with gpu_waits.Waits() as waits:
+            coarse(tokens, geometry)
+            fine(tokens, geometry, images).features.sum().backward()
+        plan = {"voxels/grid.py plan_voxels": 2 * 2, "voxels/grid.py mixed_radix_keys": 2 + 3}
+        warnings = {"voxels/grid.py warn_if_sparse": 2, "voxels/fine.py _Points.__init__": 1}
+        levels = {"voxels/ptv3.py Level.__init__": 3, "voxels/ptv3.py GridPool.forward": 2}
+        assert waits.places == {
+            **plan,
+            **warnings,
+            **levels,
+            "voxels/coarse.py PatchPoints.__init__": 1,
+            "voxels/sparse_conv.py neighbor_pairs": 2 * 3,
+            "voxels/serialization.py serial_keys": 2,
+            "voxels/knn.py interpolation_weights": 1,
+            "voxels/surface.py disagreement": 2,
+            "voxels/fine.py _scene_medians": 1,
+            "voxels/grid.py pool_mean_of_chunks": -(-3 * scenes // 8),  # once for eight views
+            "voxels/pointmlp.py PointMLP._windows": 1,
+        }
+        fine = make_fine(min_footprint=1.0)
+        with gpu_waits.Waits() as footprint, torch.no_grad():
+            fine(tokens, geometry, images)
+        assert footprint.places["voxels/grid.py scene_voxel_size"] == scenes
