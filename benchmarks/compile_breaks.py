@@ -11,6 +11,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -44,7 +45,7 @@ class Breaks:
     Attributes:
         name: of the module.
         graphs: that it was traced into.
-        reasons: what parts them, one for each break.
+        reasons: what parts them and where, one for each break.
     """
 
     name: str
@@ -124,14 +125,18 @@ def _gaussian_head() -> Case:
     return Case(GaussianHead(WIDTH), (voxels,))
 
 
-def explain(name: str) -> Breaks:
+def explain(name: str, case: Case) -> Breaks:
     """Traces a module in inference."""
-    case = cases()[name]()
     torch._dynamo.reset()
     with torch.no_grad():
         found = torch._dynamo.explain(case.module.eval())(*case.arguments)
-    reasons = tuple(" ".join(str(each.reason).split())[:300] for each in found.break_reasons)
-    return Breaks(name, found.graph_count, reasons)
+    return Breaks(name, found.graph_count, tuple(_place(each) for each in found.break_reasons))
+
+
+def _place(reason: Any) -> str:
+    """Where a graph ends, and the first words on why."""
+    frame = reason.user_stack[-1]
+    return f"{Path(frame.filename).name} {frame.name}: {str(reason.reason).splitlines()[0]}"
 
 
 def compiled_error(name: str) -> float:
@@ -151,7 +156,7 @@ def main() -> None:
     arguments = options.parse_args()
     logging.getLogger("torch._dynamo").setLevel(logging.ERROR)
     torch.manual_seed(0)
-    found = [explain(name) for name in cases()]
+    found = [explain(name, make()) for name, make in cases().items()]
     rows = [[each.name, str(each.graphs), str(len(each.reasons)), "; ".join(each.reasons) or "-"] for each in found]
     print_table(["module", "graphs", "breaks", "why"], rows, text_columns=1, width=160)
     errors = {name: compiled_error(name) for name in arguments.inductor}

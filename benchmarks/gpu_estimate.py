@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass
 import torch
 from common import parser, write_results
 from gpu_kernels import assembly, variants
-from gpu_step import seen_by, tile_counts
+from gpu_step import seen_by
 from render_scene import room_cameras, room_gaussians
 from torch import Tensor
 
@@ -27,6 +27,7 @@ from vg2gt.types import Cameras, Gaussians
 SOURCE = (224, 448)  # pixels of the views that the room's Gaussians are made of
 CASES = ((100_000, 8, SOURCE), (1_000_000, 8, SOURCE), (100_000, 1, (1080, 1920)), (1_000_000, 1, (1080, 1920)))
 SAMPLE = 64  # tiles a view
+SIDES = (TILE, 16)  # pixels: our tiles and gsplat's
 # An H100 SXM: multiprocessors, schedulers of each, hertz; bytes a second. Warps wait for memory half of the time.
 ISSUED = 132 * 4 * 1.755e9 * 0.5
 BANDWIDTH = 3.35e12
@@ -44,7 +45,7 @@ class Loop:
 
 @dataclass(frozen=True)
 class Visits:
-    """What a tile's program goes through, in the mean over tiles.
+    """What a tile's program goes through, in the mean over a sample of tiles.
 
     Attributes:
         entries: of the tile.
@@ -61,13 +62,16 @@ class Visits:
     solved_met: float
 
 
-def tile_visits(gaussians: Gaussians, cameras: Cameras, sample: int, generator: torch.Generator) -> Visits:
-    """Means over ``sample`` random tiles of every view."""
+def count_entries(gaussians: Gaussians, cameras: Cameras, sample: int) -> tuple[dict[int, int], Visits]:
+    """Entries by the side of a tile, ours and gsplat's, and means over ``sample`` random tiles of every view."""
     height, width = cameras.size
     across, down = -(-width // TILE), -(-height // TILE)
-    found = []
+    generator = torch.Generator().manual_seed(0)
+    entries, found = dict.fromkeys(SIDES, 0), []
     for view in range(cameras.world_to_camera.shape[1]):
         splats, first, last, seen = seen_by(gaussians, cameras, view)
+        for side in SIDES:
+            entries[side] += int((last[seen] // side - first[seen] // side + 1).prod(-1).sum())
         for tile in torch.randint(across * down, (sample,), generator=generator).tolist():
             corner = torch.tensor([tile % across, tile // across]) * TILE
             near = (seen & (first < corner + TILE).all(-1) & (last >= corner).all(-1)).nonzero()[:, 0]
@@ -76,7 +80,7 @@ def tile_visits(gaussians: Gaussians, cameras: Cameras, sample: int, generator: 
             pixels = torch.stack((x, y), -1).view(-1, 2) + corner
             pixels = pixels[(pixels < torch.tensor([width, height])).all(-1)]
             found.append(_visits(*respond(splats[near], pixels[:, None].float())))
-    return Visits(*(sum(values) / len(values) for values in zip(*found, strict=True)))
+    return entries, Visits(*(sum(values) / len(values) for values in zip(*found, strict=True)))
 
 
 def _visits(response: Tensor, peak: Tensor, precision: Tensor) -> tuple[int, int, int, int, int]:
@@ -101,7 +105,7 @@ def _visits(response: Tensor, peak: Tensor, precision: Tensor) -> tuple[int, int
 
 
 def loops(text: str) -> list[Loop]:
-    """The innermost loops of a kernel's machine code that do arithmetic, in order."""
+    """The innermost loops of a kernel's machine code that load, in order."""
     places: dict[str, int] = {}
     code: list[str] = []
     for line in text.splitlines():
@@ -116,6 +120,8 @@ def loops(text: str) -> list[Loop]:
     inner = [(a, b) for a, b in back if b - a > 40 and not any(a <= c and d <= b and (a, b) != (c, d) for c, d in back)]
     found = []
     for begin, end in inner:
+        if not any("LDG" in line for line in code[begin:end]):
+            continue  # code out of line that jumps back
         skipped = max((to - at - 1 for at, to in jumps if begin <= at < to <= end), default=0)
         found.append(Loop(end - begin + 1, end - begin + 1 - skipped))
     return found
@@ -146,14 +152,12 @@ def main() -> None:
     rows, shown = [], []
     for count, views, (height, width) in CASES:
         gaussians, cameras = room_gaussians(count, SOURCE), room_cameras(views, (height, width))
-        entries = int(tile_counts(gaussians, cameras).sum())
-        coarse = int(tile_counts(gaussians, cameras, 16).sum())
         tiles = views * -(-height // TILE) * -(-width // TILE)
-        visits = tile_visits(gaussians, cameras, arguments.sample, torch.Generator().manual_seed(0))
-        times = milliseconds(visits, tiles, found)
+        by_side, visits = count_entries(gaussians, cameras, arguments.sample)
+        times, entries = milliseconds(visits, tiles, found), by_side[TILE]
         times["memory"] = 1e3 * (entries * ENTRY_BYTES + count * views * SLOT_BYTES) / BANDWIDTH
-        row = {"gaussians": count, "views": views, "size": (height, width), "entries": entries}
-        rows.append({**row, "entries_of_16_pixels": coarse, "visits": asdict(visits), "milliseconds": times})
+        row = {"gaussians": count, "views": views, "size": (height, width), "entries_by_side": by_side}
+        rows.append({**row, "visits": asdict(visits), "milliseconds": times})
         numbers = [visits.blended, visits.blended_met, visits.solved, visits.solved_met]
         shown.append(
             [f"{count} x {views} at {height}x{width}", str(entries), f"{visits.entries:.0f}"]

@@ -112,12 +112,12 @@ def seen_by(gaussians: Gaussians, cameras: Cameras, view: int) -> tuple[Splats, 
     return splats, first, last, bounded & in_front & (last >= first).all(-1)
 
 
-def tile_counts(gaussians: Gaussians, cameras: Cameras, side: int = TILE) -> Tensor:
-    """Tiles ``[V, G]`` of ``side`` pixels that each Gaussian covers in each view, by the reference projection."""
+def tile_counts(gaussians: Gaussians, cameras: Cameras) -> Tensor:
+    """Tiles ``[V, G]`` that each Gaussian covers in each view, by the reference projection."""
     rows = []
     for view in range(cameras.world_to_camera.shape[1]):
         _, first, last, seen = seen_by(gaussians, cameras, view)
-        rows.append(torch.where(seen, (last // side - first // side + 1).prod(-1), 0))
+        rows.append(torch.where(seen, (last // TILE - first // TILE + 1).prod(-1), 0))
     return torch.stack(rows)
 
 

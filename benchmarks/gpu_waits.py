@@ -86,6 +86,8 @@ def _waits(name: str, args: Any, kwargs: Any) -> int:
         return 0 if name != "index" and args[2].numel() == 1 else masks
     if name == "repeat_interleave":  # the length of the result
         return int(kwargs.get("output_size") is None)
+    if name == "segment_reduce":  # whether the lengths are good
+        return 2 * (not kwargs.get("unsafe"))
     return WAITING.get(name, 0)
 
 

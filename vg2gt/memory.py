@@ -77,7 +77,7 @@ def note_sizes(sizes: Mapping[str, int], anew: bool = False) -> None:
         sizes: how many of what, in the words of the message.
         anew: a new pass begins: what was noted of the one before is forgotten.
     """
-    noted = _sizes.get()
+    noted = None if torch.compiler.is_compiling() else _sizes.get()
     if noted is None:
         return
     if anew:

@@ -28,6 +28,8 @@ def test_what_waits_is_counted(gpu_waits: ModuleType) -> None:
         (2, lambda: x.bincount()),
         (1, lambda: x.repeat_interleave(x)),
         (1, lambda: x.unique_consecutive()),
+        (2, lambda: torch.segment_reduce(x.float(), "sum", lengths=x[2:3] * 3)),
+        (0, lambda: torch.segment_reduce(x.float(), "sum", lengths=x[2:3] * 3, unsafe=True)),
         (0, lambda: x.repeat_interleave(x, output_size=15)),
         (0, lambda: x[x.flip(0)]),
         (0, lambda: x.clone().masked_fill_(x > 2, 0).sort()),
@@ -51,11 +53,11 @@ def test_the_modules_wait_for_shapes_and_for_two_warnings_only(gpu_waits, make_r
     """As often for three scenes as for one, but for the footprint's medians."""
     for scenes in (1, 3):
         tokens, geometry, images = make_room(scenes)
-        coarse, fine = make_coarse(gate=True), make_fine(moments=True)
+        coarse, fine = make_coarse(gate=True), make_fine(moments=True, normal_kernel=3)
         with gpu_waits.Waits() as waits:
             coarse(tokens, geometry)
             fine(tokens, geometry, images).features.sum().backward()
-        plan = {"voxels/grid.py plan_voxels": 2 * 2, "voxels/grid.py mixed_radix_keys": 2 + 3}
+        plan = {"voxels/grid.py plan_voxels": 2 * 2, "voxels/grid.py mixed_radix_keys": 2 + 4}
         warnings = {"voxels/grid.py warn_if_sparse": 2, "voxels/fine.py _Points.__init__": 1}
         levels = {"voxels/ptv3.py Level.__init__": 3, "voxels/ptv3.py GridPool.forward": 2}
         assert waits.places == {
@@ -65,6 +67,7 @@ def test_the_modules_wait_for_shapes_and_for_two_warnings_only(gpu_waits, make_r
             "voxels/coarse.py PatchPoints.__init__": 1,
             "voxels/sparse_conv.py neighbor_pairs": 2 * 3,
             "voxels/serialization.py serial_keys": 2,
+            "voxels/normals.py _pairs": 1,
             "voxels/knn.py interpolation_weights": 1,
             "voxels/surface.py disagreement": 2,
             "voxels/fine.py _scene_medians": 1,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable, Mapping
 
+import torch
 from torch import Tensor
 
 log = logging.getLogger(__name__)
@@ -26,8 +27,12 @@ class IdleTerms:
 
     def see(self, terms: Mapping[str, Tensor]) -> None:
         """Takes the terms of one step."""
+        present = [name for name in self._idle if name in terms]
+        # the host waits for a GPU once, not once a term
+        values = torch.stack([terms[name].detach() for name in present]).tolist() if present else []
+        idle = {name for name, value in zip(present, values, strict=True) if not value}
         for name in list(self._idle):
-            self._idle[name] = 0 if name not in terms or float(terms[name]) else self._idle[name] + 1
+            self._idle[name] = self._idle[name] + 1 if name in idle else 0
             if self._idle[name] == self.patience:
                 del self._idle[name]
                 log.warning(

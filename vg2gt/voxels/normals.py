@@ -41,21 +41,21 @@ def with_normals(moments: VoxelMoments, offset: Tensor, plan: VoxelPlan, kernel:
 
 def _spread_around(spread: Tensor, normal: Tensor, offset: Tensor, plan: VoxelPlan) -> Tensor:
     """``[M, 3, 3]`` covariance of the points of a voxel and its neighbours."""
-    voxel, other, shift = _pairs(plan)
+    voxel, other, shift, lengths = _pairs(plan)
     x, y, z = (offset.index_select(0, other) - offset.index_select(0, voxel) + shift.to(offset.dtype)).unbind(-1)  # [P]
     height = (torch.stack((x, y, z), -1) * normal.index_select(0, voxel)).sum(-1) / SAME_SURFACE
     weight = plan.counts.to(offset.dtype).index_select(0, other) * torch.exp(-height.square() / 2)
     inner = spread[:, UPPER[0], UPPER[1]].index_select(0, other)  # [P, 6]
     products = inner + torch.stack((x * x, x * y, x * z, y * y, y * z, z * z), -1)
     weighted = torch.cat((torch.ones_like(x)[:, None], torch.stack((x, y, z), -1), products), -1) * weight[:, None]
-    sums = torch.segment_reduce(weighted, "sum", lengths=torch.bincount(voxel, minlength=len(plan)))
+    sums = torch.segment_reduce(weighted, "sum", lengths=lengths, unsafe=True)
     mean, products = (sums[:, 1:] / sums[:, :1]).split((3, 6), -1)
     around = products - mean[:, UPPER[0]] * mean[:, UPPER[1]]
     return around[:, FULL].unflatten(-1, (3, 3))
 
 
-def _pairs(plan: VoxelPlan) -> tuple[Tensor, Tensor, Tensor]:
-    """Rows ``[P]`` of voxels, sorted, those of a cell of their 3x3x3 each, and its shift ``[P, 3]``."""
+def _pairs(plan: VoxelPlan) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Rows ``[P]`` of voxels, sorted, those of a cell of their 3x3x3 each, its shift ``[P, 3]``, and pairs a voxel."""
     keys, (step_x, step_y, _) = mixed_radix_keys(plan.grid, plan.batch, margin=1)  # ascending, as the plan's voxels are
     columns = keys.new_tensor(list(itertools.product((-1, 0, 1), repeat=2)))  # [9, 2]
     lowest = keys[:, None] + columns @ keys.new_tensor([step_x, step_y]) - 1  # [M, 9]: the column's first cell
@@ -64,5 +64,6 @@ def _pairs(plan: VoxelPlan) -> tuple[Tensor, Tensor, Tensor]:
     row = row.clamp_(max=len(keys) - 1)
     above = keys[row] - lowest[..., None]
     found = (above >= 0) & (above < 3) & (row.diff(dim=-1, prepend=row[..., :1] - 1) > 0)
-    voxel, column, _ = found.nonzero(as_tuple=True)
-    return voxel, row[found], torch.cat((columns[column], above[found][:, None] - 1), -1)
+    place = found.nonzero(as_tuple=True)
+    voxel, column, _ = place
+    return voxel, row[place], torch.cat((columns[column], above[place][:, None] - 1), -1), found.sum((1, 2))
