@@ -26,7 +26,7 @@ from vg2gt.types import Cameras, Gaussians
 
 SOURCE = (224, 448)  # pixels of the views that the room's Gaussians are made of
 CASES = ((100_000, 8, SOURCE), (1_000_000, 8, SOURCE), (100_000, 1, (1080, 1920)), (1_000_000, 1, (1080, 1920)))
-SAMPLE = 64  # tiles a view
+SAMPLE = 32  # tiles a view
 SIDES = (TILE, 16)  # pixels: our tiles and gsplat's
 # An H100 SXM: multiprocessors, schedulers of each, hertz; bytes a second. Warps wait for memory half of the time.
 ISSUED = 132 * 4 * 1.755e9 * 0.5
