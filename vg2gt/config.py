@@ -85,12 +85,13 @@ def near_keys(name: str, overrides: Sequence[str], error: Exception) -> str:
     if unknown is None:
         return ""
     try:
-        config = compose(name, *(each for each in overrides if "." not in each.partition("=")[0]), "output_dir=.")
+        groups = [each for each in overrides if "." not in (key := each.partition("=")[0]) and key != unknown[1]]
+        config = compose(name, *groups, "output_dir=.")
     except ValueError:
         return ""
     keys = [key for key in flatten(OmegaConf.to_container(config, resolve=False)) if "_target_" not in key]
     room, _, last = unknown[1].rpartition(".")
-    inner = [key for key in keys if key.startswith(f"{room}.") and key.endswith(f".{last}")]
+    inner = [key for key in keys if key.startswith(f"{room}." if room else "") and key.endswith(f".{last}")]
     found = (inner or get_close_matches(unknown[1], keys, 3, 0.75))[:3]
     return f"there is no option {unknown[1]}, did you mean {' or '.join(found)}?" if found else ""
 

@@ -112,11 +112,18 @@ def test_a_steps_scenes_share_a_size_on_all_devices_and_differ_in_zoom_and_windo
     [
         {"fit": "squeeze"}, {"crop": "left"}, {"aspect": (2, 1)}, {"aspect": (0.5,)}, {"zoom": (0.5, 1)},
         {"fit": "pad", "crop": "random"}, {"fit": "pad", "zoom": (1, 1.2)}, {"size_multiple": 0},
+        {"zoom": 1.5}, {"aspect": 1.0},
     ],
 )  # fmt: skip
 def test_impossible_framings_are_refused(options):
     with pytest.raises(ValueError, match=r"data\."):
         FramingSampler((28, 56), **options)
+
+
+@pytest.mark.parametrize("size", [56, (56,), (28, 56, 3), "56", (28.5, 56), (0, 56)])
+def test_a_size_is_height_and_width(size):
+    with pytest.raises(ValueError, match=r"data\.image_size must be \[height, width\] in pixels, got"):
+        SceneDataModule(SyntheticScenes(1), SyntheticScenes(1, first_seed=9), image_size=size)
 
 
 def _module(rooms: SyntheticScenes, **options) -> SceneDataModule:

@@ -120,7 +120,7 @@ def test_a_missing_root_names_the_path_and_the_remedy(tmp_path):
         RGBDFolder(str(tmp_path / "nowhere"))
     with pytest.raises(FileNotFoundError, match=r"data\.root is not set.*data\.root=FOLDER"):
         RGBDFolder(None)
-    with pytest.raises(DataError, match=r"no scene of RGBDFolder in .*expected images"):
+    with pytest.raises(DataError, match=r"no scene in .*expected images.*; found: "):
         RGBDFolder(str(tmp_path))
 
 

@@ -4,6 +4,7 @@ import json
 import re
 import subprocess
 import sys
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -116,10 +117,26 @@ def test_one_line_says_what_is_wrong(arguments, said: str, tmp_path: Path, monke
     assert not (tmp_path / "out").exists()
 
 
-def test_missing_images_are_told_before_the_weights_are_loaded(tmp_path: Path) -> None:
-    absent = [str(tmp_path / "nowhere"), "--backend", "da3_tiny,pretrained=true,path=weights-that-are-not-there"]
-    with pytest.raises(SystemExit, match="nowhere does not exist"):
-        reconstruct_command.main([*absent, "--out", str(tmp_path / "out"), "--quiet"])
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("nowhere", "nowhere does not exist"),
+        ("empty", "no images in .*empty"),
+        ("note.txt", r"cannot read \S*note\.txt: .*restore the file or leave it out"),
+        ("films", r"no images in .*films .*it has videos, name one: .*a\.mp4"),
+        ("bare.r3d", r"bare\.r3d holds no images"),
+        ("note.r3d", r"note\.r3d: no readable archive"),
+    ],
+)
+def test_what_holds_no_images_is_told_before_the_weights_are_loaded(tmp_path: Path, name: str, said: str) -> None:
+    for folder in ("empty", "films"):
+        (tmp_path / folder).mkdir()
+    for file in ("note.txt", "note.r3d", "films/a.mp4"):
+        (tmp_path / file).write_text("a note")
+    zipfile.ZipFile(tmp_path / "bare.r3d", "w").close()
+    backend = "da3_tiny,pretrained=true,path=weights-that-are-not-there"
+    with pytest.raises(SystemExit, match=said):
+        reconstruct_command.main([str(tmp_path / name), "--backend", backend, "--out", str(tmp_path / "out")])
 
 
 def test_output_folder_that_cannot_be_written(photos: Path, tmp_path: Path) -> None:

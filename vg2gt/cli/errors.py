@@ -50,9 +50,19 @@ def errors_in_one_line() -> Iterator[None]:
             print(file=sys.stderr)  # ends a progress bar that was interrupted
         if isinstance(cause, (HydraException, OmegaConfBaseException)):
             said = hydra_message(cause)
+        elif isinstance(cause, TypeError) and HydraConfig.initialized():
+            given = " ".join(HydraConfig.get().overrides.task)
+            said = f"an option has a value of another kind than expected ({cause}); given were: {given}"
         else:
-            said = f"{type(cause).__name__}: {' '.join(str(cause).splitlines())}"
+            said = f"{type(cause).__name__}: {' '.join(_words_of(cause).splitlines())}"
         sys.exit(f"{said} ({TRACEBACK}=1 shows where)")
+
+
+def _words_of(error: BaseException) -> str:
+    """An error's message; the system's own begins with the file, not with its number."""
+    if not isinstance(error, OSError) or not error.strerror:
+        return str(error)
+    return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
 
 
 def in_a_sweep() -> bool:

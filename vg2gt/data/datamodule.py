@@ -91,8 +91,7 @@ class SceneDataModule(LightningDataModule):
             raise ValueError(f"data.train_scenes={train_scenes} must be at least 1, or null for all")
         self.sampler = ViewSampler(min_views, max_views, max_images, expand_ratio, target_views, seed, view_sets)
         self.eval_views = EvaluationViews(eval_context, eval_target, eval_window)
-        size = (int(image_size[0]), int(image_size[1]))
-        self.framing = FramingSampler(size, aspect, size_multiple, fit, crop, zoom, seed)
+        self.framing = FramingSampler(_size(image_size), aspect, size_multiple, fit, crop, zoom, seed)
         if resized_cache is not None:
             largest = ",".join(map(str, self.framing.largest))
             raise ValueError(
@@ -217,6 +216,13 @@ class SceneDataModule(LightningDataModule):
             worker_init_fn=_leave_interrupts_to_the_trainer,
             pin_memory=trainer is not None and trainer.strategy.root_device.type == "cuda",
         )
+
+
+def _size(image_size: Sequence[int]) -> tuple[int, int]:
+    pair = isinstance(image_size, Sequence) and len(image_size) == 2
+    if not (pair and all(isinstance(side, int) and side > 0 for side in image_size)):
+        raise ValueError(f"data.image_size must be [height, width] in pixels, got {image_size}")
+    return image_size[0], image_size[1]
 
 
 def _leave_interrupts_to_the_trainer(worker: int) -> None:

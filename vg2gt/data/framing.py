@@ -75,7 +75,8 @@ class FramingSampler:
             if value not in choices:
                 raise ValueError(f"data.{name} must be one of {', '.join(choices)}, got {value!r}")
         for name, bounds, least in (("aspect", self.aspect, 0.05), ("zoom", self.zoom, 1.0)):
-            if bounds is not None and (len(bounds) != 2 or not least <= bounds[0] <= bounds[1] <= 20):
+            pair = isinstance(bounds, Sequence) and len(bounds) == 2
+            if bounds is not None and not (pair and least <= bounds[0] <= bounds[1] <= 20):
                 raise ValueError(f"data.{name} must be a range [least, most] within [{least}, 20], got {bounds}")
         if self.size_multiple < 1:
             raise ValueError(f"data.size_multiple must be at least 1, got {self.size_multiple}")

@@ -44,7 +44,7 @@ def image_size(path: Path, scene: str, upright: bool = False, content: bytes | N
 
     Args:
         path: the file.
-        scene: the scene it belongs to, for messages.
+        scene: the scene it belongs to, for messages; empty for a photograph of none.
         upright: of a photograph turned upright as its EXIF data says.
         content: the encoded image where it is a part of the file; None: it is the file.
 
@@ -87,7 +87,7 @@ def read_color(
 
     Args:
         path: the file.
-        scene: the scene it belongs to, for messages.
+        scene: the scene it belongs to, for messages; empty for a photograph of none.
         size: the ``(height, width)`` it must have; None: any.
         content: the encoded image where it is a part of the file; None: it is the file.
         upright: turn a photograph upright as its EXIF data says.
@@ -146,9 +146,8 @@ def _opened(file: Path | io.BytesIO, path: Path, scene: str) -> Iterator[Image.I
     except DataError:
         raise
     except _DAMAGED as error:
-        raise DataError(
-            f"cannot read {path} of scene {scene}: {error}; restore the file or remove the frame"
-        ) from error
+        whose, remedy = (f" of scene {scene}", "remove the frame") if scene else ("", "leave it out")
+        raise DataError(f"cannot read {path}{whose}: {error}; restore the file or {remedy}") from error
 
 
 def _orientation(image: Image.Image) -> int:

@@ -22,12 +22,13 @@ from vg2gt.data.sources.parsing import IMAGE_SUFFIXES
 from vg2gt.data.transforms import from_bytes
 from vg2gt.io.image_files import focal_length, image_size, read_color
 from vg2gt.io.images import color_image
-from vg2gt.io.record3d import is_archive, read_recorded, recorded_files
-from vg2gt.io.video import VIDEO_SUFFIXES, count_frames, read_video
+from vg2gt.io.record3d import R3D, is_archive, read_recorded, recorded_files
+from vg2gt.io.video import VIDEO_SUFFIXES, count_frames, read_video, require_pyav
 
 ImagesLike: TypeAlias = "str | Path | Image.Image | NDArray[Any] | Tensor | Sequence[Any]"
 
 HEIC_SUFFIXES = (".heic", ".heif")
+_HOLDS_PICTURES = (*IMAGE_SUFFIXES, *HEIC_SUFFIXES, R3D)
 VIDEO_FRAMES = 32  # taken from a video when nobody says how many
 IMAGE_FOLDERS = ("images", "color", "rgb")
 
@@ -88,6 +89,27 @@ def find_pictures(images: ImagesLike, every: int = 1, max_images: int | None = N
     return with_unique_names(evenly(chosen, max_images))
 
 
+def check_pictures(images: ImagesLike) -> None:
+    """Refuses files and folders that hold no picture, without decoding any: before weights are downloaded.
+
+    Raises:
+        FileNotFoundError: if a path does not exist.
+        ImportError: if a video needs a package that is not installed.
+        ValueError: if there is no picture, or a file is none.
+    """
+    for item in as_items(images):
+        path = existing_path(item) if isinstance(item, (str, Path)) else None
+        if path is None:
+            continue
+        if _is_video(path):
+            if path.suffix.lower() != ".gif":
+                require_pyav(f"reading {path}")
+        elif path.is_file():
+            _pictures(path, 1, 1)
+        elif not any(file.suffix.lower() in _HOLDS_PICTURES for file in path.rglob("*")):
+            image_files(path)
+
+
 def as_items(images: ImagesLike) -> list[Any]:
     """What was given as a list."""
     return list(images) if isinstance(images, (list, tuple)) else [images]
@@ -99,8 +121,9 @@ def check_choice(every: int, max_images: int | None) -> None:
     Raises:
         ValueError: if a number is below 1.
     """
-    if every < 1 or (max_images is not None and max_images < 1):
-        raise ValueError(f"every and max_images must be at least 1, got {every} and {max_images}")
+    for name, value in (("every", every), ("max_images", max_images)):
+        if value is not None and value < 1:
+            raise ValueError(f"{name} must be at least 1, got {value}")
 
 
 def evenly(pictures: list[Picture], limit: int | None) -> list[Picture]:
@@ -139,7 +162,10 @@ def _pictures(item: Any, every: int, max_images: int | None) -> list[Picture]:
     if path.is_dir():
         return [_photo(file) for file in image_files(path)]
     if is_archive(path):
-        return [_photo(file, read_recorded) for file in recorded_files(path, ".jpg").values()]
+        files = recorded_files(path, ".jpg")
+        if not files:
+            raise ValueError(f"{path} holds no images (rgbd/0.jpg and so on): is it a recording of Record3D?")
+        return [_photo(file, read_recorded) for file in files.values()]
     return _video(path, every, max_images) if _is_video(path) else [_photo(path)]
 
 
@@ -164,13 +190,12 @@ def _photo(path: Path, content_of: Callable[[Path], bytes | None] = lambda _: No
     """A photograph; ``content_of`` reads what lies in an archive."""
     if path.suffix.lower() in HEIC_SUFFIXES:
         _open_heic(path)
-    place = path.parent.name or "."
 
     def read(size: tuple[int, int]) -> Frames:
-        return frame_of(shrunk(read_color(path, place, content=content_of(path), upright=True), size))
+        return frame_of(shrunk(read_color(path, "", content=content_of(path), upright=True), size))
 
     content = content_of(path)
-    size = image_size(path, place, upright=True, content=content)
+    size = image_size(path, "", upright=True, content=content)
     if content is not None:
         return Picture(path.stem, size, read)
     return Picture(path.stem, size, read, focal=focal_length(path, size), path=path)

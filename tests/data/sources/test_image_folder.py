@@ -99,5 +99,5 @@ def test_real_folders_of_mixed_files(shared):
 
 
 def test_an_empty_folder_says_what_is_expected(tmp_path):
-    with pytest.raises(DataError, match=r"no scene of ImageFolder.*expected images"):
+    with pytest.raises(DataError, match=r"no scene in .*expected images.*found: "):
         ImageFolder(str(tmp_path))

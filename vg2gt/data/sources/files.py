@@ -259,7 +259,8 @@ class FileSource(SceneSource):
         for root in roots:
             inside = self.find(root)
             if not inside:
-                raise DataError(f"no scene of {type(self).__name__} in {root}: expected {self.layout}")
+                names = sorted(path.name for path in root.iterdir())
+                raise DataError(f"no scene in {root}: expected {self.layout}; found: {_some(names, 5) or 'nothing'}")
             for name, folder in inside.items():
                 _add_scene(found, name, folder)
         return found
