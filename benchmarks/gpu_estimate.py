@@ -67,7 +67,8 @@ def count_entries(gaussians: Gaussians, cameras: Cameras, sample: int) -> tuple[
     height, width = cameras.size
     across, down = -(-width // TILE), -(-height // TILE)
     generator = torch.Generator().manual_seed(0)
-    entries, found = dict.fromkeys(SIDES, 0), []
+    entries: dict[int, int] = dict.fromkeys(SIDES, 0)
+    found = []
     for view in range(cameras.world_to_camera.shape[1]):
         splats, first, last, seen = seen_by(gaussians, cameras, view)
         for side in SIDES:

@@ -96,7 +96,8 @@ def _place(frame: FrameType | None) -> str:
         parts = Path(frame.f_code.co_filename).parts
         if PACKAGE in parts:
             within = len(parts) - parts[::-1].index(PACKAGE)
-            return f"{'/'.join(parts[within:])} {frame.f_code.co_qualname.replace('.<locals>', '')}"
+            name = getattr(frame.f_code, "co_qualname", frame.f_code.co_name)  # Python 3.10 knows the last part only
+            return f"{'/'.join(parts[within:])} {name.replace('.<locals>', '')}"
         frame = frame.f_back
     return "elsewhere"
 

@@ -63,7 +63,7 @@ def test_steps_are_in_units_of_each_gaussian(parameters: Parameters) -> None:
     scene = parameters.scene().gaussians
     assert parameters.step((scene.means * torch.randn_like(scene.means)).sum(), share=0.5)
     moved = (parameters.scene().gaussians.means.detach() - before).abs() / parameters.unit[:, None]
-    torch.testing.assert_close(moved, torch.full_like(moved, 0.5 * 0.05), rtol=0.05, atol=1e-3)
+    torch.testing.assert_close(moved, torch.full_like(moved, 0.5 * RefineRates().means), rtol=0.05, atol=1e-3)
 
 
 def test_a_gradient_that_is_not_finite_changes_nothing(parameters: Parameters) -> None:

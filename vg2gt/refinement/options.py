@@ -28,7 +28,7 @@ class RefineRates:
         ValueError: naming a rate that is negative.
     """
 
-    means: float = 0.05
+    means: float = 0.2
     quats: float = 0.01
     scales: float = 0.02
     opacities: float = 0.05
