@@ -52,7 +52,7 @@ class Model:
 
 MODELS = {
     REFERENCE: Model("vg2gt"),
-    "VG²GT, 2 px": Model("vg2gt_fine", ("model.fine.min_footprint=2.0",)),
+    "VG²GT, 2 px": Model("vg2gt_fine", ("model.fine.min_footprint=2.02",)),
     "VG²GT w/o coarse": Model("wo_coarse", ("ablation=wo_coarse",)),
     "pixel-aligned": Model("pixel_aligned", ("model=pixel_aligned",)),
     "voxel-merged": Model("voxel_merged", ("model=voxel_merged",)),
