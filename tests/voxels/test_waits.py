@@ -7,6 +7,8 @@ from types import ModuleType
 import pytest
 import torch
 
+from vg2gt.voxels import grid
+
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 
 
@@ -49,9 +51,12 @@ def test_places_are_named(gpu_waits: ModuleType) -> None:
     assert waits.places == {"voxels/grid.py plan_voxels": 2, "voxels/grid.py mixed_radix_keys": 1}
 
 
-def test_the_modules_wait_for_shapes_and_for_two_warnings_only(gpu_waits, make_room, make_coarse, make_fine) -> None:
+def test_the_modules_wait_for_shapes_and_for_two_warnings_only(
+    gpu_waits, make_room, make_coarse, make_fine, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """As often for three scenes as for one, but for the footprint's medians."""
     for scenes in (1, 3):
+        monkeypatch.setattr(grid, "_warned_of_sparse", set())  # what was warned of is not looked at again
         tokens, geometry, images = make_room(scenes)
         coarse, fine = make_coarse(gate=True), make_fine(moments=True, normal_kernel=3)
         with gpu_waits.Waits() as waits:
