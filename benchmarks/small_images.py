@@ -76,6 +76,7 @@ def main() -> None:
     began = time.process_time()
 
     def report(windows: list[dict[str, Any]]) -> None:
+        """Writes what is known so far beside other calls' results."""
         content = read_json(path) if path.is_file() else {"machine": machine(), "runs": {}}
         content["runs"][f"{height}x{width}, {arguments.views} views"] = {
             "command": " ".join(["python", "benchmarks/small_images.py", *sys.argv[1:]]),

@@ -1,6 +1,5 @@
 """The benchmark scripts run and write what they say, at sizes that measure nothing."""
 
-import importlib
 import json
 import subprocess
 import sys
@@ -50,15 +49,13 @@ def test_stages_of_the_papers_experiment(tmp_path: Path) -> None:
     assert json.loads(path.read_text())["precision"] == "bf16-mixed"
 
 
-def test_training_hours_count_every_device(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_training_hours_count_every_device(benchmark_script) -> None:
     """The paper: 49.5 hours of two devices, 420000 steps, are 99 device hours."""
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    assert importlib.import_module("stages").paper_training_hours(49.5 * 3600 / 420_000) == pytest.approx(99)
+    assert benchmark_script("stages").paper_training_hours(49.5 * 3600 / 420_000) == pytest.approx(99)
 
 
-def test_stages_run_in_the_precision_of_the_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    stages, device = importlib.import_module("stages"), torch.device("cpu")
+def test_stages_run_in_the_precision_of_the_training(tmp_path: Path, benchmark_script) -> None:
+    stages, device = benchmark_script("stages"), torch.device("cpu")
     overrides = ("trainer.precision=bf16-mixed", f"data.cache_dir={tmp_path}")
     run, batch = stages.prepare(stages.Case(2, (28, 56), overrides), device, str(tmp_path / "run"))
     seen: list[bool] = []

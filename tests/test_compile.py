@@ -1,22 +1,18 @@
 """``torch.compile`` takes the networks whole: no graph breaks inside a module whose shapes are known."""
 
-import importlib
-from pathlib import Path
 from types import ModuleType
 
 import pytest
 import torch
 from torch import Tensor, nn
 
-BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 WHOLE = ["dense head", "depth head (DPT)", "PTv3 block", "PointMLP stage", "Gaussian head"]
 
 
 @pytest.fixture
-def breaks(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
+def breaks(benchmark_script) -> ModuleType:
     torch.manual_seed(0)
-    return importlib.import_module("compile_breaks")
+    return benchmark_script("compile_breaks")
 
 
 @pytest.mark.parametrize("name", WHOLE)

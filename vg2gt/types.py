@@ -207,14 +207,14 @@ class VoxelMoments(TensorRecord):
         cross: ``[M, 3 (position), 3 (colour)]`` covariance of position and colour.
         facing: ``[M, 3]`` unit vectors towards the cameras that saw the points.
         pixel: ``[M]`` side of a pixel at the points' depth.
-        normal: ``[M, 3]`` of the surface through the cell, on the cameras' side; None: where the spread is least.
+        normal: ``[M, 3]`` of the surface through the cell, on the cameras' side.
     """
 
     spread: Tensor
     cross: Tensor
     facing: Tensor
     pixel: Tensor
-    normal: Tensor | None = None
+    normal: Tensor
 
 
 @dataclass(frozen=True)

@@ -132,6 +132,7 @@ class DA3Backend(NetworkBackend):
         self.given_poses = given_poses
 
         def make() -> DA3Network:
+            """The network without weights."""
             network = DA3Network(
                 Backbone(dim, depth, num_heads, ffn, multiview_from, image_size, patch_size),
                 CameraEncoder(dim, camera_depth, camera_heads) if given_poses else None,

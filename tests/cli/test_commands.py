@@ -118,7 +118,7 @@ MISTAKES = {
     "evaluate evaluation=dtu data.root=FOLDER": "no option data.root, did you mean data.train.root or data.val.root?",
     "train backend=da3_smal": r"there is no backend=da3_smal, did you mean da3_small\? Available options",
     "train lr=.1": "there is no option lr, did you mean optimizer.lr",
-    "train trainer.max_steps=abc": "^an option has a value of another kind .* given were: trainer.max_steps=abc ",
+    "train trainer.max_steps=abc": "^an option may have a value of another kind .* given were: trainer.max_steps=abc ",
     "train data=rgbd data.root=not_here": "the data folder not_here .* does not exist: set data.root=",
     "train name=../x": "^name=../x: a name inside outputs",
     "reconstruct . --out x --backend da3_smal": "unknown backend 'da3_smal'; did you mean da3_small",

@@ -165,7 +165,7 @@ def surfel_wall(**options):
     cross = torch.zeros(count, 3, 3)
     cross[:, 1] = 0.02 * torch.arange(1, 4)
     facing = torch.tensor([0.0, 0.0, -1.0]).expand(count, 3)
-    return replace(voxels, moments=VoxelMoments(spread, cross, facing, torch.full((count,), 0.1)))
+    return replace(voxels, moments=VoxelMoments(spread, cross, facing, torch.full((count,), 0.1), facing))
 
 
 @pytest.mark.parametrize("splits", [1, 2, 3, 4])

@@ -10,13 +10,15 @@ from torch.nn import functional as F
 from vg2gt.gaussians.surfel import ALONE, COLOR_GAIN, MIN_REACH, SHARED, THICKNESS, layout, surface_frame, surfel_start
 from vg2gt.geometry.rotations import quat_to_matrix
 from vg2gt.types import VoxelMoments
+from vg2gt.voxels.normals import facing_normals
 
 
 def moments_of(points: Tensor, colors: Tensor, facing: Tensor, pixel: float = 0.0) -> VoxelMoments:
     """Moments of one voxel from its points ``[N, 3]`` (cells), colours ``[N, 3]`` and how the camera sees it."""
     centered, tint = points - points.mean(0), colors - colors.mean(0)
     spread, cross = centered.T @ centered / len(points), centered.T @ tint / len(points)
-    return VoxelMoments(spread[None], cross[None], F.normalize(facing, dim=-1)[None], spread.new_tensor([pixel]))
+    spread, facing = spread[None], F.normalize(facing, dim=-1)[None]
+    return VoxelMoments(spread, cross[None], facing, spread.new_tensor([pixel]), facing_normals(spread, facing))
 
 
 def square(frame: Tensor, gradient: Tensor, extent: tuple[float, float] = (1.0, 1.0)) -> tuple[Tensor, Tensor]:

@@ -1,6 +1,5 @@
 """What a step asks of a GPU, counted without one; and the one command for those who have one."""
 
-import importlib
 import importlib.util
 import os
 from pathlib import Path
@@ -14,13 +13,10 @@ if importlib.util.find_spec("triton") is None:
 if os.environ.get("TRITON_INTERPRET") == "1":
     pytest.skip("the interpreter's kernels are not launched as others are", allow_module_level=True)
 
-BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
-
 
 @pytest.fixture
-def step(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    return importlib.import_module("gpu_step")
+def step(benchmark_script) -> ModuleType:
+    return benchmark_script("gpu_step")
 
 
 def test_a_step_is_a_few_launches_and_one_wait_whatever_the_views(step: ModuleType) -> None:
@@ -43,9 +39,8 @@ def test_memory_of_eighteen_views(step: ModuleType) -> None:
 
 
 @pytest.fixture
-def estimate(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    return importlib.import_module("gpu_estimate")
+def estimate(benchmark_script) -> ModuleType:
+    return benchmark_script("gpu_estimate")
 
 
 def march(response: list[list[float]]) -> tuple[int, int]:
@@ -111,9 +106,8 @@ def test_time_follows_visits(estimate: ModuleType) -> None:
 
 
 @pytest.fixture
-def gpu(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    return importlib.import_module("gpu")
+def gpu(benchmark_script) -> ModuleType:
+    return benchmark_script("gpu")
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="only without a GPU")

@@ -1,9 +1,7 @@
 """The Triton kernels compile to machine code for GPUs of three generations, within registers and without spills."""
 
-import importlib
 import importlib.util
 import os
-from pathlib import Path
 from types import ModuleType
 
 import pytest
@@ -13,7 +11,6 @@ if importlib.util.find_spec("triton") is None:
 if os.environ.get("TRITON_INTERPRET") == "1":
     pytest.skip("the interpreter's kernels cannot be compiled", allow_module_level=True)
 
-BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 NVIDIA = ("sm_80", "sm_90", "sm_100")
 # The most registers a thread may take, over all targets; none may spill. 1-warp programs of up to 64 registers fill all
 # 32 places of a multiprocessor, of up to 72 registers 28 of them.
@@ -28,9 +25,8 @@ SHORT = (
 
 
 @pytest.fixture
-def bench(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    return importlib.import_module("gpu_kernels")
+def bench(benchmark_script) -> ModuleType:
+    return benchmark_script("gpu_kernels")
 
 
 def hold(found: list) -> None:

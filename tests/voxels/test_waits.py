@@ -1,7 +1,5 @@
 """How often the host waits for a GPU in the voxel modules, counted on the CPU."""
 
-import importlib
-from pathlib import Path
 from types import ModuleType
 
 import pytest
@@ -9,13 +7,10 @@ import torch
 
 from vg2gt.voxels import grid
 
-BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
-
 
 @pytest.fixture
-def gpu_waits(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    return importlib.import_module("gpu_waits")
+def gpu_waits(benchmark_script) -> ModuleType:
+    return benchmark_script("gpu_waits")
 
 
 def test_what_waits_is_counted(gpu_waits: ModuleType) -> None:

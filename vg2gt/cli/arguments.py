@@ -36,6 +36,8 @@ def hydra_command(command: Command, config_name: str) -> Callable[[Callable[[Dic
     """
 
     def decorate(run: Callable[[DictConfig], None]) -> Callable[[], None]:
+        """The command that runs this function."""
+
         @wraps(run)
         def main() -> None:
             asked = os.environ.get(TRACEBACK)
@@ -74,6 +76,8 @@ def key_value_command(command: Command) -> Callable[[Callable[[list[str]], None]
     """Makes a command of a function of ``key=value`` arguments; its help is the function's docstring."""
 
     def decorate(run: Callable[[list[str]], None]) -> Callable[..., None]:
+        """The command that runs this function."""
+
         @wraps(run)
         def main(arguments: Sequence[str] | None = None) -> None:
             given = sys.argv[1:] if arguments is None else list(arguments)

@@ -52,7 +52,7 @@ def errors_in_one_line() -> Iterator[None]:
             said = hydra_message(cause)
         elif isinstance(cause, TypeError) and HydraConfig.initialized():
             given = " ".join(HydraConfig.get().overrides.task)
-            said = f"an option has a value of another kind than expected ({cause}); given were: {given}"
+            said = f"an option may have a value of another kind than expected ({cause}); given were: {given}"
         else:
             said = f"{type(cause).__name__}: {' '.join(_words_of(cause).splitlines())}"
         sys.exit(f"{said} ({TRACEBACK}=1 shows where)")

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from vg2gt.geometry.symmetric import facing_normals, principal_direction
+from vg2gt.geometry.symmetric import principal_direction
 from vg2gt.types import TensorRecord, VoxelMoments
 
 UNIFORM_VARIANCE = 1 / 12  # of points spread evenly over a cell, in cells^2
@@ -76,8 +76,7 @@ def surface_frame(moments: VoxelMoments) -> tuple[Tensor, Tensor, Tensor]:
         its third to the cameras; the colour gradient ``[M, 3 (place), 3 (colour)]`` in the tangent plane, per cell;
         and the points' extent ``[M, 2]`` along the first two axes, 1 for a full cell, at most 1.2.
     """
-    spread, cross, facing = moments.spread, moments.cross, moments.facing
-    normal = facing_normals(spread, facing) if moments.normal is None else moments.normal
+    spread, cross, facing, normal = moments.spread, moments.cross, moments.facing, moments.normal
     tangent = _orthogonal(normal)
     plane = torch.stack((tangent, torch.linalg.cross(normal, tangent)), -1)  # [M, 3, 2]
     inside = plane.transpose(1, 2) @ spread @ plane  # [M, 2, 2]

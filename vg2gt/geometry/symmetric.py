@@ -10,7 +10,6 @@ from torch.nn import functional as F
 
 UPPER = ((0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2))  # rows and columns of a symmetric 3x3 matrix's upper triangle
 FULL = (0, 1, 2, 1, 3, 4, 2, 4, 5)  # where its nine entries are among those six
-FACING_PRIOR = 1e-4  # cells^2: without evidence a surface faces its cameras
 
 
 def smallest_eigenvector(matrix: Tensor, fallback: Tensor) -> Tensor:
@@ -45,23 +44,6 @@ def smallest_eigenvector(matrix: Tensor, fallback: Tensor) -> Tensor:
     # The longest product is the product of the two other eigenvalues' distances: small if one of them is as small.
     single = lengths.take_along_dim(best, -1) > 1e-6
     return torch.where(single, F.normalize(vector, dim=-1, eps=1e-300), fallback.double()).to(matrix.dtype)
-
-
-def facing_normals(spread: Tensor, facing: Tensor) -> Tensor:
-    """Directions of least spread, on the side of the cameras.
-
-    Args:
-        spread: ``[M, 3, 3]`` covariances of positions, in cells^2.
-        facing: ``[M, 3]`` unit vectors towards the cameras; the normal where the spread knows none.
-
-    Returns:
-        ``[M, 3]`` unit vectors.
-    """
-    eye = torch.eye(3, dtype=spread.dtype, device=spread.device)
-    # A little variance everywhere but along the line of sight: with nothing else known, that line is the normal.
-    prior = FACING_PRIOR * (eye - facing[:, :, None] * facing[:, None])
-    normal = smallest_eigenvector(spread + prior, facing)
-    return torch.where((normal * facing).sum(-1, keepdim=True) < 0, -normal, normal)
 
 
 def principal_direction(a: Tensor, b: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:

@@ -40,9 +40,11 @@ class _Cursor:
 
     @property
     def place(self) -> str:
+        """The file and byte, for messages."""
         return f"{self.path}, byte {self.position}"
 
     def need(self, size: int, what: str) -> None:
+        """Raises a ``FormatError`` where fewer bytes are left than ``what`` takes."""
         left = len(self.data) - self.position
         if size > left:
             raise FormatError(
@@ -50,23 +52,27 @@ class _Cursor:
             )
 
     def unpack(self, layout: struct.Struct, what: str) -> tuple:
+        """The next record."""
         self.need(layout.size, what)
         values = layout.unpack_from(self.data, self.position)
         self.position += layout.size
         return values
 
     def count(self, smallest: int, what: str) -> int:
+        """How many entries follow, of at least ``smallest`` bytes each; so many must be left."""
         (count,) = self.unpack(_COUNT, f"the number of {what}")
         self.need(count * smallest, f"a list of {count} {what}")
         return count
 
     def array(self, dtype: np.dtype, count: int, what: str) -> NDArray:
+        """The next ``count`` numbers, as a view of the file's bytes."""
         self.need(count * dtype.itemsize, f"{count} {what}")
         values = np.frombuffer(self.data, dtype, count, self.position)
         self.position += count * dtype.itemsize
         return values
 
     def name(self) -> str:
+        """An image's name, which ends with a zero byte."""
         end = self.data.find(b"\0", self.position, self.position + _NAME_LIMIT)
         if end < 0:
             raise FormatError(f"{self.place}: an image name has no end; the file is truncated or damaged")
@@ -78,6 +84,7 @@ class _Cursor:
         return name
 
     def finish(self) -> None:
+        """Raises a ``FormatError`` where bytes are left over."""
         left = len(self.data) - self.position
         if left:
             raise FormatError(f"{self.place}: {left} bytes follow the last record; the file is damaged")

@@ -27,7 +27,7 @@ def fill_holes(
     seen: Observations,
     renderer: Renderer,
     views: Tensor,
-    side: float,
+    side: int,
     room: int,
 ) -> Gaussians:
     """Adds round Gaussians along rays that meet none, at depths spread from around each hole.
@@ -52,7 +52,7 @@ def fill_holes(
     holes = int((found.alpha < COVERED).sum())
     if not holes or room < 1:
         return gaussians
-    pixels = max(round(side), math.ceil(math.sqrt(holes / room)))
+    pixels = max(side, math.ceil(math.sqrt(holes / room)))
     for view in views.split(1):
         camera, shown = cameras.select(view), seen.views(view)
         rendered = renderer(gaussians, camera)

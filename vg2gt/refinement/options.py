@@ -76,7 +76,7 @@ class RefineOptions:
     check_every: int = 20
     holdout: int | None = None
     sh_degree: int | None = None
-    fill: float = 4.0
+    fill: int = 4
     prune_opacity: float = 0.02
     split_share: float = 0.0
     max_growth: float = 1.5
@@ -93,7 +93,7 @@ class RefineOptions:
             ("check_every", self.check_every >= 1, "at least 1"),
             ("holdout", self.holdout is None or self.holdout >= 2, "at least 2, or null"),
             ("sh_degree", self.sh_degree is None or 0 <= self.sh_degree <= MAX_DEGREE, f"0 to {MAX_DEGREE}, or null"),
-            ("fill", self.fill == 0 or self.fill >= 1, "at least 1, or 0"),
+            ("fill", self.fill >= 0, "at least 0"),
             ("prune_opacity", 0 <= self.prune_opacity < 1, "at least 0 and below 1"),
             ("split_share", 0 <= self.split_share <= 1, "between 0 and 1"),
             ("max_growth", self.max_growth >= 1, "at least 1"),

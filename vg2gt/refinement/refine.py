@@ -143,6 +143,7 @@ class _Refinement:
         self.began = clock()
         self.trainer = renderer if options.loss.needs_geometry else replace(renderer, geometry=False)
         self.order = ViewOrder(len(seen.images), options.holdout, options.seed)
+        self.trained = self.order.trained.to(seen.images.device)
         self.options = options.of(len(self.order.trained))
         self.limit = int(options.max_growth * len(gaussians))
         self.depth = _median_depth(gaussians, cameras, seen)
@@ -192,14 +193,12 @@ class _Refinement:
         """The start with Gaussians in its holes."""
         if not self.options.fill:
             return self.start
-        gaussians, trained = self.start.gaussians, self.order.trained.to(self.seen.images.device)
-        room = self.limit - len(gaussians)
-        filled = fill_holes(gaussians, self.start.cameras, self.seen, self.renderer, trained, self.options.fill, room)
-        return replace(self.start, gaussians=filled)
+        start, side, room = self.start, self.options.fill, self.limit - len(self.start.gaussians)
+        filled = fill_holes(start.gaussians, start.cameras, self.seen, self.renderer, self.trained, side, room)
+        return replace(start, gaussians=filled)
 
     def _parameters(self, scene: RefinedScene) -> Parameters:
-        trained = self.order.trained.to(self.seen.images.device)
-        return Parameters(scene, self.options.rates, self.pixel, self.depth, trained)
+        return Parameters(scene, self.options.rates, self.pixel, self.depth, self.trained)
 
     def _done(self) -> float:
         return self.options.done(self.steps, self.clock() - self.began)

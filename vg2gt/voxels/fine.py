@@ -26,7 +26,7 @@ from vg2gt.voxels.grid import (
     scene_voxel_size,
     warn_if_sparse,
 )
-from vg2gt.voxels.normals import with_normals
+from vg2gt.voxels.normals import surface_normals
 from vg2gt.voxels.pointmlp import PointMLP
 from vg2gt.voxels.silhouette import on_surface
 
@@ -167,8 +167,9 @@ class FineModule(nn.Module):
         spread = squares - offset[:, UPPER[0]] * offset[:, UPPER[1]]
         cross = mixed.unflatten(-1, (3, 3)) - offset[:, :, None] * color[:, None]
         facing = F.normalize(eye - centroid, dim=-1)
-        moments = VoxelMoments(spread[:, FULL].unflatten(-1, (3, 3)), cross, facing, pixel[:, 0])
-        return with_normals(moments, offset, plan, self.normal_kernel)
+        spread = spread[:, FULL].unflatten(-1, (3, 3))  # [M, 3, 3]
+        normal = surface_normals(spread, facing, offset, plan, self.normal_kernel)
+        return VoxelMoments(spread, cross, facing, pixel[:, 0], normal)
 
     def _pool_features(self, tokens: Tokens, images: Tensor, points: _Points, plan: VoxelPlan) -> Tensor:
         """``[M, C]``; without gradient the features of a few views are there at a time, which bounds the memory."""

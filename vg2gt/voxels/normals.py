@@ -7,36 +7,55 @@ differ, so the spread of its own points says little of how the surface runs. Ove
 from __future__ import annotations
 
 import itertools
-from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from vg2gt.geometry.symmetric import FULL, UPPER, facing_normals
-from vg2gt.types import VoxelMoments
+from vg2gt.geometry.symmetric import FULL, UPPER, smallest_eigenvector
 from vg2gt.voxels.grid import VoxelPlan, mixed_radix_keys
 
+FACING_PRIOR = 1e-4  # cells^2: without evidence a surface faces its cameras
 SAME_SURFACE = 0.5  # cells off the tangent plane at which a neighbour's points count e^-1/2
 
 
 @torch.no_grad()
-def with_normals(moments: VoxelMoments, offset: Tensor, plan: VoxelPlan, kernel: int) -> VoxelMoments:
-    """The moments with the normals of voxels.
+def surface_normals(spread: Tensor, facing: Tensor, offset: Tensor, plan: VoxelPlan, kernel: int) -> Tensor:
+    """Normals of the surface through every voxel, on the side of the cameras.
 
     With a kernel of 3 a normal is that of all points in 27 cells, weighted by how near their cell's mean lies to the
     voxel's own tangent plane: a plane fitted to one surface, so that edges stay.
 
     Args:
-        moments: second moments of M voxels.
+        spread: ``[M, 3, 3]`` covariances of the points' positions, in cells^2.
+        facing: ``[M, 3]`` unit vectors towards the cameras.
         offset: ``[M, 3]`` mean positions from the cells' centres, in cells.
         plan: which cells they are.
         kernel: cells a side that count, 1 or 3.
+
+    Returns:
+        ``[M, 3]`` unit vectors.
     """
-    own = facing_normals(moments.spread, moments.facing)
+    own = facing_normals(spread, facing)
     if kernel == 1 or not len(plan):
-        return replace(moments, normal=own)
-    spread = _spread_around(moments.spread, own, offset, plan)
-    return replace(moments, normal=facing_normals(spread, moments.facing))
+        return own
+    return facing_normals(_spread_around(spread, own, offset, plan), facing)
+
+
+def facing_normals(spread: Tensor, facing: Tensor) -> Tensor:
+    """Directions of least spread, on the side of the cameras.
+
+    Args:
+        spread: ``[M, 3, 3]`` covariances of positions, in cells^2.
+        facing: ``[M, 3]`` unit vectors towards the cameras; the normal where the spread knows none.
+
+    Returns:
+        ``[M, 3]`` unit vectors.
+    """
+    eye = torch.eye(3, dtype=spread.dtype, device=spread.device)
+    # A little variance everywhere but along the line of sight: with nothing else known, that line is the normal.
+    prior = FACING_PRIOR * (eye - facing[:, :, None] * facing[:, None])
+    normal = smallest_eigenvector(spread + prior, facing)
+    return torch.where((normal * facing).sum(-1, keepdim=True) < 0, -normal, normal)
 
 
 def _spread_around(spread: Tensor, normal: Tensor, offset: Tensor, plan: VoxelPlan) -> Tensor:
