@@ -73,7 +73,7 @@ def run(options: argparse.Namespace) -> None:
     from vg2gt.reconstruction.cameras import check_depth
     from vg2gt.reconstruction.monitor import Monitor
     from vg2gt.reconstruction.outputs import check_folder, check_outputs, cost_figures, write_outputs
-    from vg2gt.reconstruction.pictures import check_choice, check_pictures
+    from vg2gt.reconstruction.pictures import check_choice, check_pictures, existing_path
     from vg2gt.reconstruction.pipeline import reconstruct_with
     from vg2gt.reconstruction.refined import refine_scene
     from vg2gt.reconstruction.sfm import require_pycolmap
@@ -84,9 +84,11 @@ def run(options: argparse.Namespace) -> None:
     check_folder(options.out, [*options.save, *more], options.overwrite)
     how = None if options.refine is None else refine_options(steps=options.refine or None)
     check_choice(options.every, options.max_images)
-    check_pictures(options.images)  # before weights are downloaded
+    for item in options.images:  # before weights are downloaded
+        existing_path(item)
     if getattr(backend_class(options.ckpt, options.backend), "needs_depth", False):
         check_depth((options.backend or "of the checkpoint").partition(",")[0], options.images)
+    check_pictures(options.images)
     if options.poses == "sfm" and not (Path(options.out) / SFM).exists():
         require_pycolmap()
     if "orbit.mp4" in options.save:
