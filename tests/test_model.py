@@ -6,7 +6,9 @@ from typing import Any
 import pytest
 import torch
 
+from backends.oracle import OracleBackend
 from tests.training_helpers import full_model, small_config
+from vg2gt.baselines.pointcloud import PointCloud
 from vg2gt.evaluation.protocols import ground_truth_target_cameras, training_cameras
 from vg2gt.losses import VG2GTLoss
 from vg2gt.model import VG2GT, SceneScale, with_scale_of
@@ -37,6 +39,21 @@ def test_at_initialisation_the_second_decoding_is_the_first(model: VG2GT, batch:
     prediction = model(batch.context.images, batch.context.hints)
     assert torch.equal(prediction.geometry.depth, prediction.initial.depth)
     assert torch.equal(prediction.geometry.depth_conf, prediction.initial.depth_conf)
+
+
+def test_layers_that_a_backend_adds_late_are_frozen(run: Run) -> None:
+    """Its parent's constructor has frozen what was there before."""
+
+    class Later(OracleBackend):
+        def __init__(self) -> None:
+            super().__init__()
+            self.head = torch.nn.Sequential(torch.nn.Linear(2, 2), torch.nn.Dropout())
+
+    backend = Later()
+    assert any(parameter.requires_grad for parameter in backend.parameters())
+    model = PointCloud(backend, SceneScale("normalize"))
+    assert not model.trained_parameters()
+    assert not any(module.training for module in model.train().backend.modules())
 
 
 def test_world_is_the_frame_of_view_zero_in_scene_units(model: VG2GT, batch: Batch) -> None:

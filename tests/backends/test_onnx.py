@@ -185,6 +185,21 @@ def test_wrong_descriptions_are_refused(copy: Path, change: Callable[[dict[str, 
         OnnxBackend(str(copy))
 
 
+@pytest.mark.parametrize("file", ["encoder.onnx", "decoder.onnx"])
+def test_outputs_in_another_order_are_refused(copy: Path, file: str) -> None:
+    """They are taken by position: exchanged ones would be wrong depth without a word."""
+    if file == "decoder.onnx":
+        (copy / "decoder.safetensors").unlink()
+    network = onnx.load(copy / file)
+    first, second, *rest = network.graph.output
+    del network.graph.output[:]
+    network.graph.output.extend([second, first, *rest])
+    onnx.save(network, copy / file)
+    edit(copy, lambda description: None)
+    with pytest.raises(ValueError, match=rf"{file} gives .* expected {first.name}, {second.name}.* in this order"):
+        OnnxBackend(str(copy))
+
+
 def test_weights_beside_the_graph_are_read(copy: Path, shallow_da3: Exportable) -> None:
     """As for networks beyond 2 GB, whose weights do not fit into the ONNX file."""
     onnx.save(onnx.load(copy / "encoder.onnx"), copy / "encoder.onnx", save_as_external_data=True, location="data.bin")
