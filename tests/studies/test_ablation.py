@@ -5,6 +5,7 @@ import json
 import re
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -206,6 +207,13 @@ def test_what_the_study_decides_cannot_be_overridden() -> None:
     assert common_overrides(["seeds=2", "backend=da3_small", "+data.x=1"]) == ["backend=da3_small", "+data.x=1"]
     with pytest.raises(ValueError, match=r"trainer\.max_steps is decided by the study"):
         common_overrides(["trainer.max_steps=7"])
+
+
+@pytest.mark.parametrize("wrong", [{"seeds": 0}, {"seeds": "abc"}, {"steps": 1.5}, {"full_steps": 0}, {"splits": [0]}])
+def test_numbers_are_checked_first(tmp_path: Path, wrong: dict[str, Any]) -> None:
+    right = {"seeds": 1, "full_steps": 1, "steps": 1, "lr": 1e-3, "variants": [], "splits": [2]}
+    with pytest.raises(ValueError, match=f"{next(iter(wrong))}=.*: a study takes whole numbers from 1 on"):
+        Ablation(tmp_path, [], **(right | wrong))
 
 
 def test_the_readmes_line_in_a_shell(tmp_path: Path, cache: Path) -> None:

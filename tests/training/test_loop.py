@@ -184,6 +184,8 @@ REFUSED: list[tuple[list[str], str | None]] = [
     ),
     (["ckpt=auto", "trainer.max_steps=3"], r"step-4\.ckpt is at step 4, further than trainer\.max_steps=3 asks"),
     (["overwrite=true", "data.train_scenes=0"], r"data\.train_scenes=0 must be at least 1"),
+    (["overwrite=true", "data.workers=-1"], r"data\.workers=-1 must be at least 0"),
+    (["overwrite=true", "optimizer.lr=-1"], r"optimizer: Invalid learning rate: -1"),
     (["overwrite=true", "init_from=nowhere.ckpt"], "no checkpoint at nowhere"),
 ]
 
@@ -281,9 +283,12 @@ def test_non_finite_gaussians_are_a_skipped_step(tmp_path: Path, cache: Path) ->
 
 @pytest.mark.parametrize(
     ("override", "message"),
-    [("+trainer.accumulate_grad_batches=2", "accumulate"), ("+trainer.gradient_clip_algorithm=value", "use norm")],
+    [
+        ("+trainer.accumulate_grad_batches=2", "accumulate"),
+        ("+trainer.gradient_clip_algorithm=value", "use norm"),
+    ],
 )
-def test_unsupported_trainer_options_are_refused(tmp_path: Path, cache: Path, override: str, message: str) -> None:
+def test_unsupported_options_are_refused(tmp_path: Path, cache: Path, override: str, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         train(small_config(tmp_path, cache, "debug=fast_dev_run", override))
 

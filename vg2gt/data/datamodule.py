@@ -89,6 +89,8 @@ class SceneDataModule(LightningDataModule):
         super().__init__()
         if train_scenes is not None and train_scenes < 1:
             raise ValueError(f"data.train_scenes={train_scenes} must be at least 1, or null for all")
+        if workers < 0:
+            raise ValueError(f"data.workers={workers} must be at least 0, which decodes in the training process")
         self.sampler = ViewSampler(min_views, max_views, max_images, expand_ratio, target_views, seed, view_sets)
         self.eval_views = EvaluationViews(eval_context, eval_target, eval_window)
         self.framing = FramingSampler(_size(image_size), aspect, size_multiple, fit, crop, zoom, seed)

@@ -106,6 +106,9 @@ class Ablation:
         splits: numbers of Gaussians per voxel.
         results: metrics by run and seed.
         diverged: the continuations without a result.
+
+    Raises:
+        ValueError: naming a number that is not one, or too small.
     """
 
     folder: Path
@@ -119,6 +122,10 @@ class Ablation:
     diverged: list[str] = field(default_factory=list, init=False)
 
     def __post_init__(self) -> None:
+        counts = {name: getattr(self, name) for name in ("seeds", "full_steps", "steps")}
+        for name, count in (*counts.items(), *(("splits", count) for count in self.splits)):
+            if not isinstance(count, int) or count < 1:
+                raise ValueError(f"{name}={count}: a study takes whole numbers from 1 on")
         self.full_splits = int(compose_run(self.overrides, self.folder).model.gaussians.splits)
         self.runs = continuations(self.variants, self.splits, self.full_splits)
         self.results: dict[str, dict[int, Metrics]] = {run.name: {} for run in self.runs}

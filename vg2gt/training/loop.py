@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import logging
 import warnings
+from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -92,7 +93,7 @@ def build(config: DictConfig) -> Run:
         model=model,
         loss=instantiate(config.loss),
         renderer=instantiate(config.renderer),
-        optimizer=instantiate(config.optimizer),
+        optimizer=_optimizer(config.optimizer),
         **config.training,
         seed=config.seed,
     )
@@ -106,6 +107,16 @@ def build(config: DictConfig) -> Run:
         default_root_dir=config.output_dir,
     )
     return Run(module, datamodule, trainer, Path(config.output_dir), bool(config.trainer.get("fast_dev_run")))
+
+
+def _optimizer(config: DictConfig) -> Callable[..., torch.optim.Optimizer]:
+    """What makes the optimiser, tried on one number: Lightning would ask for it after the first evaluation only."""
+    make = instantiate(config)
+    try:
+        make([torch.nn.Parameter(torch.zeros(1))])
+    except ValueError as error:
+        raise ValueError(f"optimizer: {error}") from error
+    return make
 
 
 def _callbacks(config: DictConfig) -> list[lightning.Callback]:
