@@ -57,8 +57,8 @@ class RefineLoss:
     color_l1: float = 1.0
     ssim: float = 0.2
     depth_consistency: float = 2.0
-    normal_render: float = 0.05
-    normal_decoded: float = 0.05
+    normal_render: float = 0.1
+    normal_decoded: float = 0.1
     opacity: float = 0.0
     scale: float = 0.0
     confidence_weighted: bool = True
