@@ -224,6 +224,12 @@ def test_a_folder_is_one_processs_at_a_time(copied: Path, cache: Path) -> None:
     assert not (copied / ".lock").exists()
 
 
+def test_a_refused_start_leaves_no_folder(tmp_path: Path, cache: Path) -> None:
+    with pytest.raises(ValueError, match="optimizer: Invalid learning rate"):
+        train(small_config(tmp_path / "new", cache, "optimizer.lr=-1"))
+    assert not (tmp_path / "new").exists()
+
+
 def test_a_resumed_run_names_what_changed(copied: Path, cache: Path, caplog) -> None:
     report = train(small_config(copied, cache, "ckpt=last", "trainer.max_steps=5", "loss.enhance.weight=2"))
     assert report["steps"] == 5

@@ -40,6 +40,7 @@ def hydra_command(command: Command, config_name: str) -> Callable[[Callable[[Dic
 
         @wraps(run)
         def main() -> None:
+            """The command: Hydra composes the configuration, and errors are one line."""
             asked = os.environ.get(TRACEBACK)
 
             @wraps(run)

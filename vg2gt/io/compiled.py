@@ -42,6 +42,7 @@ def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """
 
     def compile_later(function: Callable[..., Any]) -> Any:
+        """The kernel, compiled when it is first called and kept in the folder of its sources' hash."""
         folder = _folder(_room(Path(function.__code__.co_filename)))
         if folder is None:
             return numba.njit(**options)(function)

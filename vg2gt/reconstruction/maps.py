@@ -54,6 +54,7 @@ def map_folder(folder: Path, kind: str, suffixes: Sequence[str]) -> Iterator[Add
         written: set[Path] = set()
 
         def add(view: RenderedView) -> None:
+            """Writes the maps of one view."""
             nonlocal too_deep
             name = view_stem(view.camera.name)
             stem = staged / name

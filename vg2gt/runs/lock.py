@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import socket
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 NAME = ".lock"
@@ -18,12 +18,14 @@ def only_process_in(folder: str | Path) -> Iterator[None]:
     Systems without POSIX locks (Windows) and file systems that refuse them are not locked.
 
     Args:
-        folder: made if needed; what is written to it besides the lock's file is the caller's.
+        folder: made if needed, and gone again if nothing was written to it: a refused start leaves none. What is
+            written to it besides the lock's file is the caller's.
 
     Raises:
         BlockingIOError: if another process holds the folder, naming it.
     """
     folder = Path(folder)
+    new = not folder.exists()
     folder.mkdir(parents=True, exist_ok=True)
     descriptor = _locked(folder / NAME)
     try:
@@ -32,6 +34,9 @@ def only_process_in(folder: str | Path) -> Iterator[None]:
         if descriptor is not None:
             (folder / NAME).unlink(missing_ok=True)
             os.close(descriptor)
+        if new:
+            with suppress(OSError):  # it holds something, or was renamed
+                folder.rmdir()
 
 
 def _locked(path: Path) -> int | None:

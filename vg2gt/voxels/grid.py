@@ -171,6 +171,7 @@ class _WeightedMean(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, values: Tensor, weights: Tensor, plan: VoxelPlan) -> Tensor:
+        """``[M, C]`` means of ``values [N, C]`` in each voxel, weighted by ``weights [N]``."""
         dtype = torch.promote_types(values.dtype, torch.float32)
         ordered = weights.to(dtype)[plan.order]
         total = torch.segment_reduce(ordered, "sum", lengths=plan.counts, unsafe=True)
@@ -182,6 +183,7 @@ class _WeightedMean(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, Tensor | None, None]:  # pyright: ignore
+        """Gradients of the values and of the weights."""
         (grad,) = grad_outputs
         values, weights, total, mean = ctx.saved_tensors
         plan: VoxelPlan = ctx.plan

@@ -50,6 +50,7 @@ class _SubmanifoldConvolution(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, features: Tensor, weight: Tensor, pairs: Pairs) -> Tensor:
+        """``[M, out]`` of ``features [M, in]`` and ``weight [out, k, k, k, in]``, summed over neighbouring voxels."""
         taps = weight.flatten(1, 3).unbind(1)  # k^3 times [out, in]
         out = features @ taps[len(pairs)].t()
         for t, (i, j) in enumerate(pairs):
@@ -61,6 +62,7 @@ class _SubmanifoldConvolution(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, Tensor, None]:  # pyright: ignore
+        """Gradients of the features and the weight; the products of the forward pass are made anew."""
         (grad,) = grad_outputs
         features, weight = ctx.saved_tensors
         pairs: Pairs = ctx.pairs

@@ -86,6 +86,7 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Colour ``[V, H, W, 3]``, normals alike, depth ``[V, H, W]`` and accumulated opacity of V views."""
         tensors, (size, options) = inputs[:8], inputs[8:]
         arrays = [_array(tensor) for tensor in tensors]
         count, (height, width), dtype = len(arrays[5]), size, arrays[0].dtype
@@ -106,6 +107,7 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor | None) -> tuple[Tensor | None, ...]:
+        """Gradients of the Gaussians, the cameras and the background; those of the median depth are implicit."""
         color, normal, depth, _, slope, transmittance = ctx.saved_tensors[8:]
         options: RenderOptions = ctx.options
         geometry = options.geometry and (grad_outputs[1] is not None or grad_outputs[2] is not None)

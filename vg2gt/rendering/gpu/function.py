@@ -83,6 +83,7 @@ class _Render(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Colour ``[B, V, 3, H, W]``, normals alike, depth ``[B, V, H, W]`` and accumulated opacity."""
         tensors = tuple(tensor.contiguous() for tensor in inputs[:9])
         (height, width), options = inputs[9:]
         poses, background = tensors[5], tensors[7]
@@ -111,6 +112,7 @@ class _Render(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor | None) -> tuple[Tensor | None, ...]:
+        """Gradients of the Gaussians, the cameras and the background."""
         saved = ctx.saved_tensors
         means, quats, scales, opacities, sh, poses, intrinsics, _, batch = saved[:9]
         records, ends, members, places, starts = saved[9:14]
