@@ -224,6 +224,15 @@ def test_a_folder_is_one_processs_at_a_time(copied: Path, cache: Path) -> None:
     assert not (copied / ".lock").exists()
 
 
+def test_lightning_says_nothing_of_its_own(tmp_path: Path, cache: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level("INFO"):
+        run = build(small_config(tmp_path, cache, "trainer.max_steps=1"))
+        run.trainer.fit(run.module, datamodule=run.datamodule)
+    assert not [
+        record.message for record in caplog.records if record.levelname == "INFO" and "lightning" in record.name
+    ]
+
+
 def test_a_refused_start_leaves_no_folder(tmp_path: Path, cache: Path) -> None:
     with pytest.raises(ValueError, match="optimizer: Invalid learning rate"):
         train(small_config(tmp_path / "new", cache, "optimizer.lr=-1"))

@@ -84,6 +84,7 @@ def build(config: DictConfig) -> Run:
     lightning.seed_everything(config.seed, workers=True, verbose=False)
     for message in EXPECTED_WARNINGS:
         warnings.filterwarnings("ignore", message=message)
+    _quieten_lightning()
     datamodule = instantiate(config.data)
     backend = instantiate(config.backend)
     model = instantiate(config.model, backend=backend)
@@ -107,6 +108,14 @@ def build(config: DictConfig) -> Run:
         default_root_dir=config.output_dir,
     )
     return Run(module, datamodule, trainer, Path(config.output_dir), bool(config.trainer.get("fast_dev_run")))
+
+
+def _quieten_lightning() -> None:
+    """Lightning's warnings, once: its news name options that nobody chose, and its own handler repeats Hydra's."""
+    logger = logging.getLogger("lightning.pytorch")
+    logger.setLevel(logging.WARNING)
+    if logging.getLogger().handlers:
+        logger.handlers.clear()
 
 
 def _optimizer(config: DictConfig) -> Callable[..., torch.optim.Optimizer]:
@@ -201,7 +210,7 @@ def _train(config: DictConfig, writes: bool) -> dict[str, Any]:
         else:
             run.trainer.callbacks.append(describe)  # pyright: ignore[reportAttributeAccessIssue]
 
-        log.info("the run's folder is %s", run.folder)
+        log.info("the run's folder is %s; it computes on %s", run.folder, run.trainer.strategy.root_device)
 
     with ending_together(run.trainer):
         untrained = _untrained_metrics(run, resumed=checkpoint is not None)
