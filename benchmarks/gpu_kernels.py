@@ -235,7 +235,11 @@ def main() -> None:
     options = parser(__doc__)
     options.add_argument("--targets", nargs="+", choices=TARGETS, default=list(TARGETS))
     arguments = options.parse_args()
-    found = [compile_for(launch, target) for launch in variants().values() for target in arguments.targets]
+    wanted = [(launch, target) for launch in variants().values() for target in arguments.targets]
+    found: list[Compiled] = []
+    for number, (launch, target) in enumerate(wanted, start=1):
+        print(f"{number}/{len(wanted)} {launch.variant} for {target}", flush=True)  # some take a minute
+        found.append(compile_for(launch, target))
     head = ["kernel", "target", "warps", "registers", "shared", "spilled bytes", "instructions"]
     print_table(head, [[str(value) for value in asdict(row).values()] for row in found], text_columns=2, width=120)
     rows = [asdict(row) for row in found]
