@@ -1,7 +1,5 @@
 """Training steps on chosen batches, with a record of what every step did to weights and moments."""
 
-import hashlib
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -109,7 +107,7 @@ def fit(run: Run, batches: Sequence[Batch]) -> Audit:
 
 
 class Poison(lightning.Callback):
-    """Spoils the images of some steps, on one rank or all; notes the weights after every step where ranks are told.
+    """Spoils the images of some steps, on one rank or all.
 
     Args:
         steps: numbers of the steps.
@@ -119,13 +117,7 @@ class Poison(lightning.Callback):
     def __init__(self, steps: Sequence[int], rank: int | None = None) -> None:
         self.steps = list(steps)
         self.rank = rank
-        self.weights: list[str] = []
 
     def on_train_batch_start(self, trainer: lightning.Trainer, pl_module: Any, batch: Batch, batch_idx: int) -> None:
         if trainer.global_step in self.steps and self.rank in (None, trainer.global_rank):
             batch.images[0, 0] = float("nan")
-
-    def on_train_batch_end(self, trainer: lightning.Trainer, pl_module: Any, *args: Any) -> None:
-        if self.rank is not None:
-            self.weights.append(hashlib.sha256(state(trainer, pl_module).numpy().tobytes()).hexdigest())
-            (Path(trainer.default_root_dir) / f"rank-{trainer.global_rank}.json").write_text(json.dumps(self.weights))

@@ -151,7 +151,7 @@ def test_no_variant_has_unused_parameters(tmp_path: Path, cache: Path, override:
 def two(tmp_path_factory: pytest.TempPathFactory, cache: Path) -> tuple[Path, list[subprocess.CompletedProcess]]:
     """All short scenarios, the one that fails last."""
     folder = tmp_path_factory.mktemp("two")
-    names = ("sgd", "empty_rank", "three_scenes", "one_scene", "broken_loader")
+    names = ("sgd", "empty_rank", "faulty_rank", "three_scenes", "one_scene", "broken_loader")
     return folder, two_ranks.run_on_two_ranks(folder, cache, *names)
 
 
@@ -191,6 +191,14 @@ def test_an_empty_rank_holds_nobody_up(two) -> None:
     assert first["dropped"] == second["dropped"]
     assert torch.equal(first["weights"], second["weights"])
     assert bool(first["weights"].isfinite().all())
+
+
+def test_a_fault_on_one_rank_drops_the_step_on_both(two) -> None:
+    first, second = results(two, "faulty_rank")
+    assert first["dropped"] == second["dropped"] == [False, True, False]
+    assert torch.equal(first["weights"], second["weights"])
+    (fault,) = first["faults"]
+    assert (fault["step"], fault["rank"], fault["cause"]) == (1, 1, "images of the batch")
 
 
 def test_evaluation_on_two_ranks_is_that_of_one(two, tmp_path: Path, cache: Path) -> None:

@@ -292,20 +292,6 @@ def small_overrides(folder: Path, cache: Path) -> list[str]:
     return [*SMALL, *[o for o in RESUMABLE if "poison" not in o], *poison, *places]
 
 
-def test_a_fault_on_one_rank_drops_the_step_on_both(tmp_path: Path, cache: Path) -> None:
-    ended = two_processes(tmp_path, cache, "+callbacks.poison.steps=[1]", "trainer.max_steps=3")
-    assert ended.returncode == 0, ended.stderr[-3000:]
-    skipped = json.loads((tmp_path / "metrics.json").read_text())["skipped_steps"]
-    assert skipped["total"] == 1
-    assert [(fault["step"], fault["rank"], fault["cause"]) for fault in skipped["faults"]] == [
-        (1, 1, "images of the batch")
-    ]
-    ranks = [json.loads((tmp_path / f"rank-{rank}.json").read_text()) for rank in (0, 1)]
-    assert ranks[0] == ranks[1]
-    before, dropped, after = ranks[0]
-    assert before == dropped != after
-
-
 @pytest.mark.slow
 def test_faults_on_one_rank_stop_both(tmp_path: Path, cache: Path) -> None:
     many = ["+callbacks.poison.steps=[1,2,3]", "training.max_skipped=3", "trainer.max_steps=9"]

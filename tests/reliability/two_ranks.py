@@ -82,6 +82,17 @@ def empty_rank(folder: Path, cache: Path) -> dict[str, Any]:
     return {"weights": weights(run), "steps": run.trainer.global_step, "dropped": audit.skipped}
 
 
+def faulty_rank(folder: Path, cache: Path) -> dict[str, Any]:
+    """The second of three batches of rank 1 holds a value that is not a number."""
+    run = tiny_run(folder, cache, *RANKS, "data.train_scenes=3")
+    batches = first_batches(run, 3)
+    if run.trainer.global_rank == 1:
+        batches[1].images[0, 0] = float("nan")
+    audit = fit(run, batches)
+    audit.assert_sound()
+    return {"weights": weights(run), "dropped": audit.skipped, "faults": run.module.skipped.summary()["faults"]}
+
+
 def three_scenes(folder: Path, cache: Path, *overrides: str) -> dict[str, Any]:
     """Evaluates three scenes, the second of them without depth."""
     run = tiny_run(folder, cache, "data.eval_scenes=3", *overrides)
@@ -123,6 +134,7 @@ SCENARIOS: dict[str, Callable[[Path, Path], dict[str, Any]]] = {
     "sgd_long": lambda folder, cache: equal_steps(folder, cache, SGD, 40),
     "adamw_long": lambda folder, cache: equal_steps(folder, cache, (), 40),
     "empty_rank": empty_rank,
+    "faulty_rank": faulty_rank,
     "three_scenes": lambda folder, cache: three_scenes(folder, cache, *RANKS),
     "one_scene": lambda folder, cache: one_scene(folder, cache, *RANKS),
     "broken_loader": broken_loader,

@@ -1,4 +1,4 @@
-"""The Triton kernels compile to machine code for GPUs of three generations, within registers and with next to no spills."""
+"""The Triton kernels compile to machine code for GPUs of three generations, within bounds of registers and spills."""
 
 import importlib.util
 import os
@@ -13,8 +13,8 @@ if os.environ.get("TRITON_INTERPRET") == "1":
 
 NVIDIA = ("sm_80", "sm_90", "sm_100")
 # The most registers a thread may take, over all targets. 1-warp programs of up to 64 registers fill all 32 places of a
-# multiprocessor, of up to 72 registers 28 of them. The last kernel of the backward pass may keep four of them in memory,
-# as the assembler prefers for sm_100 in three of its eight variants to fewer programs at once; no other may spill.
+# multiprocessor, of up to 72 registers 28 of them. The last kernel of the backward pass may keep four in memory, as the
+# assembler prefers for sm_100 in three of its eight variants to fewer programs at once; no other may spill.
 REGISTERS = {"project": 80, "emit": 40, "list": 40, "blend": 80, "backward": 80, "project_backward": 168}
 SPILLS = {"project_backward": 16}  # bytes a thread
 SHORT = (

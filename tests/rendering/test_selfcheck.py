@@ -3,8 +3,6 @@
 import importlib.util
 import logging
 import os
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +14,7 @@ from vg2gt.rendering.options import Mode
 from vg2gt.rendering.selfcheck import GRADIENTS, VALUES, Agreement
 
 INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
-interpreted = pytest.mark.skipif(not INTERPRETED, reason="runs in test_in_the_interpreter's process")
+interpreted = pytest.mark.skipif(not INTERPRETED, reason="runs in the process that test_triton.py starts")
 GPU = torch.device("cuda")
 
 # Kernels made wrong: the file, what is replaced in it, and by what. A Gaussian's gradient is the sum of one row a tile;
@@ -30,16 +28,6 @@ MUTANTS = {
         "count = tl.minimum(count, 1); most = tl.max(count, 0)",
     ),
 }
-
-
-@pytest.mark.skipif(INTERPRETED or importlib.util.find_spec("triton") is None, reason="the test that starts the others")
-@pytest.mark.parametrize("chosen", ["not slow", pytest.param("slow", marks=pytest.mark.slow)])
-def test_in_the_interpreter(chosen: str) -> None:
-    """Runs this file once more, because Triton must be told of its interpreter before it is first imported."""
-    command = [sys.executable, "-m", "pytest", "-n", "0", "-x", "-m", chosen, __file__]
-    environment = {**os.environ, "TRITON_INTERPRET": "1"}
-    result = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    assert result.returncode == 0, result.stdout[-5000:]
 
 
 @interpreted

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -36,9 +37,10 @@ runnable = pytest.mark.skipif(DEVICE == "cpu" and not INTERPRETED, reason="runs 
 @pytest.mark.skipif(DEVICE == "cuda" or INTERPRETED, reason="only where the kernels cannot run themselves")
 @pytest.mark.parametrize("chosen", ["not slow and not gpu", pytest.param("slow", marks=pytest.mark.slow)])
 def test_in_the_interpreter(chosen: str) -> None:
-    """Runs this file once more, because Triton must be told of its interpreter before it is first imported."""
+    """Runs two files once more, because Triton must be told of its interpreter before it is first imported."""
     environment = {**os.environ, "TRITON_INTERPRET": "1"}
-    command = [sys.executable, "-m", "pytest", "-n", "0", "-m", chosen, __file__]
+    files = [__file__, str(Path(__file__).with_name("test_selfcheck.py"))]
+    command = [sys.executable, "-m", "pytest", "-n", "0", "-m", chosen, *files]
     result = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert result.returncode == 0, result.stdout[-5000:]
 
