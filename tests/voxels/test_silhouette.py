@@ -1,7 +1,8 @@
 import pytest
 import torch
+from torch.nn import functional as F
 
-from vg2gt.voxels.silhouette import beside_silhouettes, on_surface
+from vg2gt.voxels.silhouette import _largest, beside_silhouettes, on_surface
 
 
 def _blurred_step(near: float, far: float) -> torch.Tensor:
@@ -67,3 +68,10 @@ def test_a_hole_is_no_silhouette_and_not_beside_one() -> None:
     depth = torch.full((1, 20, 20), 1.5)
     depth[:, :, 10:] = 0
     assert not beside_silhouettes(depth).any()
+
+
+@pytest.mark.parametrize("reach", [1, 2, 3, 6])
+def test_the_largest_within_reach_is_what_pooling_finds(reach: int) -> None:
+    values = torch.randn(2, 9, 13, generator=torch.Generator().manual_seed(reach))
+    expected = F.max_pool2d(values[:, None], 2 * reach + 1, 1, reach)[:, 0]
+    assert torch.equal(_largest(values, reach), expected)

@@ -63,10 +63,19 @@ def beside_silhouettes(depth: Tensor) -> Tensor:
 
 def _depth_range(depth: Tensor, reach: int) -> tuple[Tensor, Tensor]:
     """Least and largest valid depth within ``reach`` pixels to every side, as ``depth``."""
-    maps, window = depth.flatten(0, -3)[:, None], 2 * reach + 1  # [N, 1, H, W]
-    far = F.max_pool2d(maps, window, 1, reach)
-    near = -F.max_pool2d(-torch.where(maps > 0, maps, torch.inf), window, 1, reach)
-    return near.reshape(depth.shape), far.reshape(depth.shape)
+    return -_largest(-torch.where(depth > 0, depth, torch.inf), reach), _largest(depth, reach)
+
+
+def _largest(values: Tensor, reach: int) -> Tensor:
+    """Largest value within ``reach`` pixels to every side; on CPUs many times as fast as ``max_pool2d``."""
+    for axis in (values.dim() - 1, values.dim() - 2):
+        border = [0, 0] * (values.dim() - 1 - axis) + [reach, reach]
+        values, width, window = F.pad(values, border, value=-torch.inf), 1, 2 * reach + 1
+        while width < window:  # largest of twice as many neighbours each time
+            by = min(width, window - width)
+            length = values.shape[axis] - by
+            values, width = torch.maximum(values.narrow(axis, 0, length), values.narrow(axis, by, length)), width + by
+    return values
 
 
 def _shifted(values: Tensor, axis: int, by: int) -> Tensor:
