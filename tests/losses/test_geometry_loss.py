@@ -3,13 +3,15 @@
 import math
 from dataclasses import replace
 
+import pytest
 import torch
 from torch import Tensor
 
 from vg2gt.geometry.cameras import unproject
 from vg2gt.geometry.rotations import quat_to_matrix
 from vg2gt.losses import GeometryLoss
-from vg2gt.losses.geometry import camera_errors, depth_gradient_loss, point_normal_loss, trusted_pixels
+from vg2gt.losses.geometry import camera_errors, depth_gradient_loss, trusted_pixels
+from vg2gt.losses.point_normals import point_normal_loss, point_normal_reference
 from vg2gt.losses.truth import Truth, normalize_truth
 from vg2gt.types import Cameras
 
@@ -235,3 +237,38 @@ def test_truth_selects_views_and_scenes(sample) -> None:
     assert isinstance(part, Truth)
     assert torch.equal(part.depth[0, 1], truth.depth[1, 0])
     assert torch.equal(part.cameras.world_to_camera[0, 0], truth.cameras.world_to_camera[1, 2])
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 2e-5)])
+def test_compiled_normals_equal_the_plain_ones(sample, dtype: torch.dtype, tolerance: float) -> None:
+    """In value and gradient, with holes, at a size that no stride divides."""
+    truth, depth, _, cameras, valid = disturbed(sample, size=(25, 31))
+    truth, cameras = (record.map(lambda t: t.to(dtype) if t.is_floating_point() else t) for record in (truth, cameras))
+    found, expected = (depth[0].to(dtype).requires_grad_() for _ in range(2))
+    compiled = point_normal_loss(found, cameras, truth, valid[0])
+    plain = point_normal_reference(expected, cameras, truth, valid[0])
+    assert type(compiled.grad_fn) is not type(plain.grad_fn)
+    torch.testing.assert_close(compiled, plain, rtol=tolerance, atol=tolerance / 10)
+    (3 * compiled).backward()
+    (3 * plain).backward()
+    assert found.grad is not None
+    assert expected.grad is not None
+    assert (found.grad - expected.grad).norm() < tolerance * expected.grad.norm()
+
+
+def test_normals_give_cameras_a_gradient_where_they_ask_for_one(sample) -> None:
+    truth, depth, _, cameras, valid = disturbed(sample)
+    poses = cameras.world_to_camera.clone().requires_grad_()
+    loss = point_normal_loss(depth[0], replace(cameras, world_to_camera=poses), truth, valid[0])
+    (gradient,) = torch.autograd.grad(loss, poses)
+    assert gradient.any()
+
+
+def test_normals_without_a_valid_corner_cost_nothing(sample) -> None:
+    truth, depth, _, cameras, valid = disturbed(sample)
+    depth = depth[0].requires_grad_()
+    loss = point_normal_loss(depth, cameras, truth, torch.zeros_like(valid[0]))
+    loss.backward()
+    assert float(loss.detach()) == 0
+    assert depth.grad is not None
+    assert not depth.grad.any()

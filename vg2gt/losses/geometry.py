@@ -7,7 +7,6 @@ distances and angles do not change under a common rotation, and the ground truth
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -16,6 +15,7 @@ from torch import Tensor
 from vg2gt.geometry.cameras import invert_rigid
 from vg2gt.geometry.normals import ray_slopes
 from vg2gt.geometry.rotations import matrix_to_quat
+from vg2gt.losses.point_normals import point_normal_loss
 from vg2gt.losses.truth import Truth
 from vg2gt.types import Cameras
 
@@ -23,8 +23,6 @@ MAX_ERROR = 100.0
 SMALLEST_SQUARE = 1e-20  # keeps the square root's derivative finite
 QUANTILE_PIXELS = 1000
 DEPTH_STRIDES = (1, 2, 4, 8)
-POINT_STRIDES = (1, 2, 4)
-CORNERS = ((1, 1), (1, -1), (-1, 1), (-1, -1))
 
 
 @dataclass(frozen=True)
@@ -147,66 +145,6 @@ def point_errors(depth: Tensor, cameras: Cameras, truth: Truth) -> Tensor:
     x, y, z = true_points.unbind(1)
     squared = (depth * u - x).square() + (depth * v - y).square() + (depth - z).square()
     return squared.clamp(min=SMALLEST_SQUARE).sqrt()
-
-
-def point_normal_loss(depth: Tensor, cameras: Cameras, truth: Truth, valid: Tensor) -> Tensor:
-    """``mean(1 - cos)`` between predicted and true surface normals at every stride, averaged over strides.
-
-    Each pixel has four normals, one for each pair of a horizontal and a vertical neighbour (VGGT's cross products of
-    the point map's differences), counted where the pixel and both neighbours are valid. Arguments as in
-    :func:`point_errors`; ``valid`` is ``[V, H, W]``.
-    """
-    turn = cameras.world_to_camera[0, :, :3, :3] @ truth.cameras.world_to_camera[0, :, :3, :3].transpose(-1, -2)
-    total = depth.new_zeros(())
-    for stride in POINT_STRIDES:
-        mask = valid[:, ::stride, ::stride]
-        predicted = _corner_normals(depth, cameras.intrinsics[0], stride)
-        expected = _corner_normals(truth.depth[0], truth.cameras.intrinsics[0], stride)
-        disagreement, count = depth.new_zeros(()), mask.new_zeros((), dtype=torch.long)
-        for corner, (x, y, z), n in zip(CORNERS, predicted, expected, strict=True):
-            n = turn @ torch.stack(n, 1).flatten(2)
-            n = (n / n.square().sum(1, keepdim=True).sqrt()).unflatten(2, x.shape[1:])
-            cosine = (x * n[:, 0] + y * n[:, 1] + z * n[:, 2]) / (x * x + y * y + z * z).sqrt()
-            both = _corner_mask(mask, corner)
-            disagreement = disagreement + ((1 - cosine) * both).sum()
-            count = count + both.sum()
-        total = total + disagreement / count.clamp(min=1)
-    return total / len(POINT_STRIDES)
-
-
-def _corner(image: Tensor, corner: tuple[int, int]) -> Tensor:
-    """The pixels of an image ``[..., H, W]`` that have neighbours on the corner's sides (right/left, down/up)."""
-    across, down = corner
-    rows = slice(None, -1) if down > 0 else slice(1, None)
-    columns = slice(None, -1) if across > 0 else slice(1, None)
-    return image[..., rows, columns]
-
-
-def _corner_mask(valid: Tensor, corner: tuple[int, int]) -> Tensor:
-    across, down = corner
-    horizontal = _corner(valid, (-across, down))
-    vertical = _corner(valid, (across, -down))
-    return _corner(valid, corner) & horizontal & vertical
-
-
-def _corner_normals(depth: Tensor, intrinsics: Tensor, stride: int) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """Camera-frame normals of the strided depth ``[V, H, W]``, components ``[V, h - 1, w - 1]``, corner by corner.
-
-    The differences to the neighbours, ``(d1 - d) r + d1 / fx e_x`` and its like, have the cross product derived in
-    :mod:`vg2gt.geometry.normals` with ``gx = fx (d1 - d) / d1``. Not of unit length.
-    """
-    u, v = ray_slopes(intrinsics, (depth.shape[-2], depth.shape[-1]))
-    u, v = u[..., ::stride], v[..., ::stride, :]
-    depth = depth[:, ::stride, ::stride]
-    fx, fy = intrinsics[:, 0, 0, None, None] / stride, intrinsics[:, 1, 1, None, None] / stride
-    difference_x, difference_y = fx * (depth[..., 1:] - depth[..., :-1]), fy * (depth[:, 1:] - depth[:, :-1])
-    slope_x = {1: difference_x / depth[..., 1:], -1: difference_x / depth[..., :-1]}
-    slope_y = {1: difference_y / depth[:, 1:], -1: difference_y / depth[:, :-1]}
-    for across, down in CORNERS:
-        rows = slice(None, -1) if down > 0 else slice(1, None)
-        columns = slice(None, -1) if across > 0 else slice(1, None)
-        gx, gy = slope_x[across][:, rows], slope_y[down][..., columns]
-        yield gx, gy, -1 - u[..., columns] * gx - v[..., rows, :] * gy
 
 
 @torch.no_grad()
