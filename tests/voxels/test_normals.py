@@ -84,3 +84,15 @@ def test_nothing_and_one_point() -> None:
     assert surface_normals(*moments_of(torch.zeros(0, 3)), 3).shape == (0, 3)
     spread, facing, offset, plan = moments_of(torch.tensor([[5.2, 3.1, 0.4]]))
     torch.testing.assert_close(surface_normals(spread, facing, offset, plan, 3), facing)
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 1e-5)])
+def test_compiled_sums_equal_the_plain_ones(dtype: torch.dtype, tolerance: float) -> None:
+    """Two scenes, with cells of several points and of one."""
+    points = torch.cat([layers(torch.tensor([0.3, 0.1, 1.0]), 0.3, seed)[: 3000 + seed] for seed in range(2)])
+    batch = torch.arange(2).repeat_interleave(torch.tensor([3000, 3001]))
+    spread, facing, offset, plan = moments_of(points, batch)
+    parts = [values.to(dtype) for values in (spread[:, normals.UPPER[0], normals.UPPER[1]], facing, offset)]
+    found, expected = normals.sums_compiled(*parts, plan), normals.sums_reference(*parts, plan)
+    torch.testing.assert_close(found, expected, rtol=tolerance, atol=tolerance * float(plan.counts.max()))
+    assert (expected[:, 0] > plan.counts).any()

@@ -27,7 +27,14 @@ import numba
 log = logging.getLogger(__name__)
 
 PACKAGES = Path(__file__).resolve().parents[2]
-ROOMS = ("vg2gt/rendering", "vg2gt/losses", "vg2gt/data/synthetic", "vg2gt/data/sources", "backends/sweep")
+ROOMS = (
+    "vg2gt/rendering",
+    "vg2gt/losses",
+    "vg2gt/voxels",
+    "vg2gt/data/synthetic",
+    "vg2gt/data/sources",
+    "backends/sweep",
+)
 """Folders whose kernels take constants and functions from files of the same folder only (a test holds it)."""
 UNUSED_DAYS = 30
 VARIABLE = "NUMBA_CACHE_DIR"

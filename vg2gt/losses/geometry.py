@@ -106,13 +106,13 @@ class GeometryLoss:
 
 def trusted_pixels(error: Tensor, valid: Tensor, quantile: float) -> Tensor:
     """Marks the valid pixels whose error, clamped to 100, is at or below its quantile; all if they are at most 1000."""
-    clamped = error.detach().clamp(max=MAX_ERROR)
-    values = clamped[valid]
-    if values.numel() <= QUANTILE_PIXELS:
+    count = int(valid.sum())
+    if count <= QUANTILE_PIXELS:
         return valid
+    clamped = error.detach().clamp(max=MAX_ERROR)
     # An order statistic keeps the same pixels as an interpolated quantile, and has no limit on their number.
-    rank = math.floor(quantile * (values.numel() - 1)) + 1
-    return valid & (clamped <= values.kthvalue(rank).values)
+    rank = math.floor(quantile * (count - 1)) + 1
+    return valid & (clamped <= torch.where(valid, clamped, torch.inf).flatten().kthvalue(rank).values)
 
 
 def depth_gradient_loss(error: Tensor, valid: Tensor) -> Tensor:

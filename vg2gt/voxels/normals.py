@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import itertools
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from vg2gt.geometry.symmetric import FULL, UPPER, smallest_eigenvector
+from vg2gt.io.compiled import kernel
 from vg2gt.voxels.grid import VoxelPlan, mixed_radix_keys
 
 FACING_PRIOR = 1e-4  # cells^2: without evidence a surface faces its cameras
@@ -60,17 +62,71 @@ def facing_normals(spread: Tensor, facing: Tensor) -> Tensor:
 
 def _spread_around(spread: Tensor, normal: Tensor, offset: Tensor, plan: VoxelPlan) -> Tensor:
     """``[M, 3, 3]`` covariance of the points of a voxel and its neighbours."""
+    sums_around = sums_compiled if offset.device.type == "cpu" else sums_reference
+    sums = sums_around(spread[:, UPPER[0], UPPER[1]], normal, offset, plan)
+    mean, products = (sums[:, 1:] / sums[:, :1]).split((3, 6), -1)
+    around = products - mean[:, UPPER[0]] * mean[:, UPPER[1]]
+    return around[:, FULL].unflatten(-1, (3, 3))
+
+
+def sums_reference(spread: Tensor, normal: Tensor, offset: Tensor, plan: VoxelPlan) -> Tensor:
+    """Weighted sums over the 27 cells around every voxel, in plain torch.
+
+    Args:
+        spread: ``[M, 6]`` covariances of the points' positions, upper triangles, in cells^2.
+        normal: ``[M, 3]`` of each voxel's own tangent plane.
+        offset: ``[M, 3]`` mean positions from the cells' centres, in cells.
+        plan: which cells they are.
+
+    Returns:
+        ``[M, 10]``: weight, position from the voxel's own mean, products of positions (upper triangle).
+    """
     voxel, other, shift, lengths = _pairs(plan)
     x, y, z = (offset.index_select(0, other) - offset.index_select(0, voxel) + shift.to(offset.dtype)).unbind(-1)  # [P]
     height = (torch.stack((x, y, z), -1) * normal.index_select(0, voxel)).sum(-1) / SAME_SURFACE
     weight = plan.counts.to(offset.dtype).index_select(0, other) * torch.exp(-height.square() / 2)
-    inner = spread[:, UPPER[0], UPPER[1]].index_select(0, other)  # [P, 6]
-    products = inner + torch.stack((x * x, x * y, x * z, y * y, y * z, z * z), -1)
+    products = spread.index_select(0, other) + torch.stack((x * x, x * y, x * z, y * y, y * z, z * z), -1)  # [P, 6]
     weighted = torch.cat((torch.ones_like(x)[:, None], torch.stack((x, y, z), -1), products), -1) * weight[:, None]
-    sums = torch.segment_reduce(weighted, "sum", lengths=lengths, unsafe=True)
-    mean, products = (sums[:, 1:] / sums[:, :1]).split((3, 6), -1)
-    around = products - mean[:, UPPER[0]] * mean[:, UPPER[1]]
-    return around[:, FULL].unflatten(-1, (3, 3))
+    return torch.segment_reduce(weighted, "sum", lengths=lengths, unsafe=True)
+
+
+def sums_compiled(spread: Tensor, normal: Tensor, offset: Tensor, plan: VoxelPlan) -> Tensor:
+    """:func:`sums_reference` on a CPU, without a list of pairs."""
+    keys, (step_x, step_y, _) = mixed_radix_keys(plan.grid, plan.batch, margin=1)  # ascending, as the plan's voxels are
+    sums = offset.new_zeros(len(offset), 10)
+    arrays = [values.contiguous().numpy() for values in (keys, plan.counts, spread, normal, offset)]
+    _add_neighbors(*arrays, step_x, step_y, SAME_SURFACE, sums.numpy())
+    return sums
+
+
+@kernel(fastmath={"contract", "nsz", "arcp"}, error_model="numpy", nogil=True)
+def _add_neighbors(keys, counts, spread, normal, offset, step_x, step_y, same_surface, sums):
+    """The cells of a column have keys in a row, and with the voxels' keys those of their columns ascend."""
+    for i in range(-1, 2):
+        for j in range(-1, 2):
+            first = 0
+            for voxel in range(len(keys)):
+                lowest = keys[voxel] + i * step_x + j * step_y - 1
+                while first < len(keys) and keys[first] < lowest:
+                    first += 1
+                other = first
+                while other < len(keys) and keys[other] < lowest + 3:
+                    x = offset[other, 0] - offset[voxel, 0] + i
+                    y = offset[other, 1] - offset[voxel, 1] + j
+                    z = offset[other, 2] - offset[voxel, 2] + (keys[other] - lowest - 1)
+                    height = (x * normal[voxel, 0] + y * normal[voxel, 1] + z * normal[voxel, 2]) / same_surface
+                    weight = counts[other] * np.exp(-height * height / 2)
+                    sums[voxel, 0] += weight
+                    sums[voxel, 1] += weight * x
+                    sums[voxel, 2] += weight * y
+                    sums[voxel, 3] += weight * z
+                    sums[voxel, 4] += weight * (spread[other, 0] + x * x)
+                    sums[voxel, 5] += weight * (spread[other, 1] + x * y)
+                    sums[voxel, 6] += weight * (spread[other, 2] + x * z)
+                    sums[voxel, 7] += weight * (spread[other, 3] + y * y)
+                    sums[voxel, 8] += weight * (spread[other, 4] + y * z)
+                    sums[voxel, 9] += weight * (spread[other, 5] + z * z)
+                    other += 1
 
 
 def _pairs(plan: VoxelPlan) -> tuple[Tensor, Tensor, Tensor, Tensor]:
