@@ -153,10 +153,12 @@ class FineModule(nn.Module):
         cell = (focal * size[:, None])[..., None, None]
         pixel = (torch.where(geometry.depth > 0, geometry.depth, 1.0) / cell).float().flatten()  # [B V H W]
 
+        upper = torch.tensor(UPPER, device=pixels.device)
+
         def products(first: int) -> Tensor:
             rows = slice(first * per_view, (first + views) * per_view)
             offset, color = points.offset[rows], pixels[rows]
-            squares = offset[:, UPPER[0]] * offset[:, UPPER[1]]  # [n, 6]
+            squares = offset.index_select(1, upper[0]) * offset.index_select(1, upper[1])  # [n, 6]
             mixed = (offset[:, :, None] * color[:, None]).flatten(1)  # [n, 9]
             eye = centers[first : first + views].repeat_interleave(per_view, 0)  # [n, 3]
             return torch.cat((squares, mixed, eye, pixel[rows, None]), -1)
