@@ -191,5 +191,6 @@ def test_two_processes_and_given_weights(scenes: list[Path], tmp_path: Path) -> 
     assert done.returncode == 0, done.stderr[-3000:]
     with safe_open(tmp_path / "sweep.safetensors", "pt") as made, safe_open(SHIPPED, "pt") as given:
         assert float(made.metadata()["core_hours"]) >= float(given.metadata()["core_hours"])
+        assert made.metadata()["begun_with"] == SHIPPED.name
         for name in given.keys():  # noqa: SIM118 (no mapping)
             torch.testing.assert_close(made.get_tensor(name), given.get_tensor(name), rtol=0.05, atol=1e-3)
