@@ -243,7 +243,11 @@ def test_truth_selects_views_and_scenes(sample) -> None:
 def test_compiled_normals_equal_the_plain_ones(sample, dtype: torch.dtype, tolerance: float) -> None:
     """In value and gradient, with holes, at a size that no stride divides."""
     truth, depth, _, cameras, valid = disturbed(sample, size=(25, 31))
-    truth, cameras = (record.map(lambda t: t.to(dtype) if t.is_floating_point() else t) for record in (truth, cameras))
+
+    def cast(tensor: Tensor) -> Tensor:
+        return tensor.to(dtype) if tensor.is_floating_point() else tensor
+
+    truth, cameras = truth.map(cast), cameras.map(cast)
     found, expected = (depth[0].to(dtype).requires_grad_() for _ in range(2))
     compiled = point_normal_loss(found, cameras, truth, valid[0])
     plain = point_normal_reference(expected, cameras, truth, valid[0])

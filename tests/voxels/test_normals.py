@@ -92,7 +92,8 @@ def test_compiled_sums_equal_the_plain_ones(dtype: torch.dtype, tolerance: float
     points = torch.cat([layers(torch.tensor([0.3, 0.1, 1.0]), 0.3, seed)[: 3000 + seed] for seed in range(2)])
     batch = torch.arange(2).repeat_interleave(torch.tensor([3000, 3001]))
     spread, facing, offset, plan = moments_of(points, batch)
-    parts = [values.to(dtype) for values in (spread[:, normals.UPPER[0], normals.UPPER[1]], facing, offset)]
-    found, expected = normals.sums_compiled(*parts, plan), normals.sums_reference(*parts, plan)
+    upper, facing, offset = (v.to(dtype) for v in (spread[:, normals.UPPER[0], normals.UPPER[1]], facing, offset))
+    found = normals.sums_compiled(upper, facing, offset, plan)
+    expected = normals.sums_reference(upper, facing, offset, plan)
     torch.testing.assert_close(found, expected, rtol=tolerance, atol=tolerance * float(plan.counts.max()))
     assert (expected[:, 0] > plan.counts).any()
