@@ -1,4 +1,4 @@
-"""Depth errors after alignment (paper, eqn delta_n)."""
+"""Depth errors after alignment (paper, eq_delta_n)."""
 
 from __future__ import annotations
 

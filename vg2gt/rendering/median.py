@@ -139,6 +139,8 @@ def ray_depth(
 ) -> Tensor:
     """Depth of every ray in the mode and of the kind that the options say; 0 where a ray has none.
 
+    Rasterised expected depth is the paper's eqn sup_gs_depth_render.
+
     Args:
         alpha: opacity of every hit, 0 where a dense matrix has none.
         weight: blending weight of every hit.
