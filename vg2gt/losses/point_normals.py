@@ -126,7 +126,11 @@ def _pinholes(intrinsics: Tensor) -> np.ndarray:
 
 @kernel(fastmath={"contract", "nsz", "arcp"}, error_model="numpy", nogil=True)
 def _disagreement(depth, true, valid, pinholes, true_pinholes, turn, stride, strides, gradient):
-    """``mean(1 - cos) / strides`` of one stride; its derivative is added to ``gradient``. See _corner_normals."""
+    """``mean(1 - cos) / strides`` of one stride; its derivative is added to ``gradient``.
+
+    ``depth``, ``true``, ``valid``, ``gradient`` are ``[V, H, W]``, the pinholes ``[V, 4]`` (fx, fy, cx, cy in pixels),
+    ``turn`` is ``[V, 3, 3]``. The normals are those of :func:`_corner_normals`: x, y, z predicted, ex, ey, ez true.
+    """
     views, height, width = depth.shape
     count = 0
     for view in range(views):
