@@ -39,7 +39,7 @@ class Attention(nn.Module):
         return self.proj(out.transpose(1, 2).flatten(2))
 
 
-class MLP(nn.Module):
+class ViTMLP(nn.Module):
     """Two linear layers with a GELU between."""
 
     def __init__(self, dim: int, hidden: int, out: int | None = None) -> None:
@@ -107,7 +107,7 @@ class ViTBlock(nn.Module):
         self.norm2 = nn.LayerNorm(dim, eps=eps)
         if ffn not in get_args(FeedForward):
             raise ValueError(f"backend.ffn is {ffn!r}; choose one of {', '.join(get_args(FeedForward))}")
-        self.mlp = SwiGLU(dim, 4 * dim) if ffn == "swiglu" else MLP(dim, 4 * dim)
+        self.mlp = SwiGLU(dim, 4 * dim) if ffn == "swiglu" else ViTMLP(dim, 4 * dim)
         self.ls2 = LayerScale(dim, layer_scale)
 
     def forward(self, x: Tensor, rotary: Rotary | None = None) -> Tensor:

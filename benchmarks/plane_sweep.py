@@ -21,7 +21,7 @@ from torch.nn import functional as F
 
 from backends.sweep import SweepBackend
 from backends.sweep.correlate import SourceWarp
-from backends.sweep.network import Views
+from backends.sweep.network import PosedViews
 from backends.sweep.views import choose_sources
 from backends.sweep.volume import to_inverse
 from vg2gt import __version__
@@ -78,7 +78,7 @@ def scores(depth: Tensor, truth: Tensor, confidence: Tensor | None) -> dict[str,
     return result
 
 
-def classical(views: Views, depth_range: Tensor) -> Tensor:
+def classical(views: PosedViews, depth_range: Tensor) -> Tensor:
     """Winner-take-all plane sweep ``[V, H, W]``: mean normalised cross-correlation over three sources, 7x7 windows."""
     sources = choose_sources(views.world_to_camera, views.intrinsics, views.size, depth_range, 3)
     grey = F.avg_pool2d(views.images.mean(1, keepdim=True), 2)
@@ -125,7 +125,7 @@ def measure(backend: SweepBackend, batch: Batch, old: bool) -> dict[str, dict[st
     results = {"network": scores(geometry.depth[0], truth, geometry.depth_conf[0])}
     results["network"]["cpu_s_per_view"] = spent / len(truth)
     if old:
-        views = Views(batch.images[0], cameras.world_to_camera[0].float(), cameras.intrinsics[0].float())
+        views = PosedViews(batch.images[0], cameras.world_to_camera[0].float(), cameras.intrinsics[0].float())
         found = backend.network.find_range(backend.network.features(views.images), views, backend.sources)
         known = truth[truth > 0]
         true = torch.stack((known.quantile(0.01) * 0.75, known.quantile(0.99) * 1.5)) if len(known) < 2**24 else found

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from backends.poses import encode_pose
-from backends.vit import MLP, ViTBlock
+from backends.vit import ViTBlock, ViTMLP
 from vg2gt.geometry.cameras import invert_rigid, relative_to_first
 from vg2gt.types import Cameras
 
@@ -38,7 +38,7 @@ class CameraEncoder(nn.Module):
         self.trunk = nn.Sequential(*(ViTBlock(dim, num_heads, layer_scale=0.01, eps=1e-5) for _ in range(depth)))
         self.token_norm = nn.LayerNorm(dim, eps=1e-5)
         self.trunk_norm = nn.LayerNorm(dim, eps=1e-5)
-        self.pose_branch = MLP(POSE_DIM, dim // 2, dim)
+        self.pose_branch = ViTMLP(POSE_DIM, dim // 2, dim)
 
     def forward(self, cameras: Cameras) -> Tensor:
         """Encodes cameras, normalised by :func:`normalize_cameras`."""

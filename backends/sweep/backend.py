@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from backends.base import Backend, full_precision
-from backends.sweep.network import SweepNet, Views
+from backends.sweep.network import PosedViews, SweepNet
 from backends.sweep.tokens import DIM, PATCH, TAPS
 from backends.sweep.views import camera_extent, choose_sources
 from backends.weights import Weights
@@ -71,7 +71,7 @@ class SweepBackend(Backend):
         encoded = []
         with full_precision(images):
             for scene, pictures in enumerate(images.float()):
-                views = Views(pictures, cameras.world_to_camera[scene], cameras.intrinsics[scene])
+                views = PosedViews(pictures, cameras.world_to_camera[scene], cameras.intrinsics[scene])
                 self._check_parallax(views)
                 features = self.network.features(pictures)
                 depth_range = self._range(hints, scene)
@@ -104,7 +104,7 @@ class SweepBackend(Backend):
         depth_range = getattr(hints, "depth_range", None)
         return None if depth_range is None else depth_range[scene].float()
 
-    def _check_parallax(self, views: Views) -> None:
+    def _check_parallax(self, views: PosedViews) -> None:
         if len(views.images) < self.min_views:
             raise ValueError(_NO_PARALLAX.format(name=self.name, why="was given one view"))
         if not camera_extent(views.world_to_camera) > 0:

@@ -32,7 +32,7 @@ _FARTHEST = 4.0  # decoded depth at most, in multiples of the farthest plane
 WIDE_PLANES = 64  # of the sweep that finds the range
 
 
-class Views(NamedTuple):
+class PosedViews(NamedTuple):
     """V views of one scene.
 
     Attributes:
@@ -67,7 +67,7 @@ class Sweep(NamedTuple):
     mass: Tensor
 
 
-class Encoding(NamedTuple):
+class SweepEncoding(NamedTuple):
     """Everything between images and depth.
 
     Attributes:
@@ -107,7 +107,7 @@ class SweepNet(nn.Module):
         self.head = DepthHead()
 
     def coarse(
-        self, features: Features, views: Views, depth_range: Tensor, sources: Tensor, planes: int
+        self, features: Features, views: PosedViews, depth_range: Tensor, sources: Tensor, planes: int
     ) -> tuple[Sweep, Tensor]:
         """The first sweep over ``[near, far]`` and the agreement of its depths ``[V, 3, h, w]``."""
         warp = _warp(features.coarse, views, sources, 4)
@@ -118,7 +118,7 @@ class SweepNet(nn.Module):
         agreeing = agreement(to_inverse(t.detach(), depth_range), warp)
         return Sweep(logits, position, t, mass), agreeing
 
-    def find_range(self, features: Features, views: Views, sources: int) -> Tensor:
+    def find_range(self, features: Features, views: PosedViews, sources: int) -> Tensor:
         """Near and far ``[2]`` from the cameras alone: a wide sweep, then the depths on which views agree."""
         wide = wide_range(views.world_to_camera)
         chosen = choose_sources(views.world_to_camera, views.intrinsics, views.size, wide, sources)
@@ -126,7 +126,9 @@ class SweepNet(nn.Module):
         depth = 1 / to_inverse(sweep.t, wide)
         return agreed_range(depth, agreeing[:, 1:2] * (sweep.mass > 0.4), wide)
 
-    def encode(self, features: Features, views: Views, depth_range: Tensor, sources: Tensor, planes: int) -> Encoding:
+    def encode(
+        self, features: Features, views: PosedViews, depth_range: Tensor, sources: Tensor, planes: int
+    ) -> SweepEncoding:
         """Images to tokens.
 
         Args:
@@ -153,10 +155,10 @@ class SweepNet(nn.Module):
         with full_precision(depth):
             place = patch_places(depth.detach(), views.world_to_camera, views.intrinsics, depth_range, grid)
         taps = self.tokens(patches, place, grid)
-        return Encoding(taps, features.context, features.context_fine, swept, first, refined, center, second)
+        return SweepEncoding(taps, features.context, features.context_fine, swept, first, refined, center, second)
 
     def _narrow(
-        self, fine: Tensor, center: Tensor, views: Views, depth_range: Tensor, sources: Tensor, planes: int
+        self, fine: Tensor, center: Tensor, views: PosedViews, depth_range: Tensor, sources: Tensor, planes: int
     ) -> Sweep:
         """The second sweep, at half of the image, around the positions ``center [V, 1, 2 h, 2 w]``."""
         warp = _warp(fine, views, sources, 2)
@@ -185,7 +187,7 @@ def _match(sweep: PlaneSweep, volume: VolumeNet, features: Tensor, inverse: Tens
     return torch.cat([volume(sweep(features, inverse[part], warp.select(part)), planes) for part in parts])
 
 
-def _warp(maps: Tensor, views: Views, sources: Tensor, stride: int) -> SourceWarp:
+def _warp(maps: Tensor, views: PosedViews, sources: Tensor, stride: int) -> SourceWarp:
     """Correspondences of feature maps at ``1 / stride`` of the images; half precision would move them by pixels."""
     with full_precision(maps):
         intrinsics = resize_intrinsics(views.intrinsics, 1 / stride, 1 / stride)

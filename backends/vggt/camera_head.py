@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from backends.vit import MLP, ViTBlock
+from backends.vit import ViTBlock, ViTMLP
 
 ITERATIONS = 4
 POSE_DIM = 9
@@ -29,7 +29,7 @@ class CameraHead(nn.Module):
         self.trunk_norm = nn.LayerNorm(dim, eps=1e-5)
         self.embed_pose = nn.Linear(POSE_DIM, dim)
         self.poseLN_modulation = nn.Sequential(nn.SiLU(), nn.Linear(dim, 3 * dim))
-        self.pose_branch = MLP(dim, dim // 2, POSE_DIM)
+        self.pose_branch = ViTMLP(dim, dim // 2, POSE_DIM)
 
     def forward(self, camera: Tensor) -> Tensor:
         """Maps camera tokens ``[B, V, D]`` to pose encodings ``[B, V, 9]`` (camera from world)."""

@@ -11,7 +11,7 @@ from safetensors import safe_open
 from torch.nn import functional as F
 
 from backends.sweep.backend import SHIPPED, SweepBackend
-from backends.sweep.network import Encoding, Sweep
+from backends.sweep.network import Sweep, SweepEncoding
 from backends.sweep.recipe.objective import cell_inverse, objective
 from backends.sweep.recipe.samples import Sample, TrainingSamples, _choose_views, _crop, recolour
 from backends.sweep.recipe.scenes import make_scenes, read_scene
@@ -110,7 +110,7 @@ def test_cells_know_their_middle() -> None:
 
 
 @pytest.fixture
-def slope() -> tuple[Sample, Encoding, torch.Tensor]:
+def slope() -> tuple[Sample, SweepEncoding, torch.Tensor]:
     """A slanted plane, the sweeps that find it exactly, and its depth."""
     inverse = (0.2 + 0.01 * torch.arange(16.0).view(1, 1, 16) + 0.02 * torch.arange(16.0).view(1, 16, 1)).expand(
         2, -1, -1
@@ -128,7 +128,7 @@ def slope() -> tuple[Sample, Encoding, torch.Tensor]:
     first, second = sweeps
     swept = torch.cat((-cell_inverse(sample.depth, 2)[0].log(), second.mass), 1)
     nothing = torch.zeros(())
-    found = Encoding((), nothing, nothing, swept, first, first.t, second.t, second)
+    found = SweepEncoding((), nothing, nothing, swept, first, first.t, second.t, second)
     return sample, found, sample.depth
 
 
@@ -138,7 +138,7 @@ def test_the_objective_is_lowest_at_the_truth(slope) -> None:
     best = objective(found, depth, unsure, sample)[1]
     assert all(float(best[name]) < 1e-5 for name in ("depth", "gradient", "position", "swept"))
 
-    def worse(term: str, encoding: Encoding = found, decoded: torch.Tensor = depth) -> bool:
+    def worse(term: str, encoding: SweepEncoding = found, decoded: torch.Tensor = depth) -> bool:
         return float(objective(encoding, decoded, unsure, sample)[1][term]) > float(best[term]) + 1e-3
 
     assert worse("depth", decoded=1.1 * depth)

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from backends.base import full_precision
-from backends.sweep.network import Encoding, SweepNet, Views
+from backends.sweep.network import PosedViews, SweepEncoding, SweepNet
 from backends.sweep.recipe.objective import objective
 from backends.sweep.recipe.samples import Sample
 from backends.sweep.views import choose_sources
@@ -68,9 +68,9 @@ class SweepTraining(lightning.LightningModule):
         self.log_dict({f"train/{name}": term.detach() for name, term in terms.items()} | {"train/loss": loss.detach()})
         return loss
 
-    def _predict(self, sample: Sample) -> tuple[Encoding, Tensor, Tensor]:
+    def _predict(self, sample: Sample) -> tuple[SweepEncoding, Tensor, Tensor]:
         images = sample.images.contiguous(memory_format=torch.channels_last)
-        views = Views(images, sample.world_to_camera, sample.intrinsics)
+        views = PosedViews(images, sample.world_to_camera, sample.intrinsics)
         with torch.no_grad(), full_precision(images):
             sources = choose_sources(
                 views.world_to_camera, views.intrinsics, views.size, sample.depth_range, sample.sources, _SOURCE_JITTER

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from backends.sweep.network import Encoding, Sweep
+from backends.sweep.network import Sweep, SweepEncoding
 from backends.sweep.recipe.samples import Sample
 from backends.sweep.volume import from_inverse
 
@@ -14,7 +14,9 @@ _CLAMP = 2.0  # log-depth errors beyond it do not count more
 WEIGHTS = {"depth": 2.0, "uncertainty": 0.15, "gradient": 1.0, "planes": 0.4, "position": 2.0, "swept": 1.0}
 
 
-def objective(encoding: Encoding, depth: Tensor, log_scale: Tensor, sample: Sample) -> tuple[Tensor, dict[str, Tensor]]:
+def objective(
+    encoding: SweepEncoding, depth: Tensor, log_scale: Tensor, sample: Sample
+) -> tuple[Tensor, dict[str, Tensor]]:
     """The weighted sum and its terms.
 
     Args:
