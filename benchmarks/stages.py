@@ -28,7 +28,7 @@ from vg2gt.evaluation.paper import tables
 from vg2gt.evaluation.tables import print_table
 from vg2gt.studies.study import compose_run
 from vg2gt.training.loop import Run, build
-from vg2gt.training.schedule import weight_decay_groups
+from vg2gt.training.schedule import parameter_groups
 from vg2gt.types import Batch
 
 STAGES = {
@@ -102,7 +102,7 @@ def measure_training(run: Run, batch: Batch, passes: int, device: torch.device) 
     Data loading is not in it.
     """
     module, step_loss, clock = run.module, training_step(run), StageClock(device)
-    optimizer = module.make_optimizer(weight_decay_groups(module.model))
+    optimizer = module.make_optimizer(parameter_groups(module.model))
     for _ in range(passes + 1):
         with clock.stage("training step"):
             with run.trainer.precision_plugin.train_step_context():

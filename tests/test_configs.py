@@ -95,6 +95,31 @@ def test_every_preset_composes(tmp_path: Path, group: str) -> None:
         assert assert_signatures_fit(OmegaConf.to_container(config, resolve=True)) >= 8
 
 
+@pytest.mark.parametrize("model", group_options("model"))
+def test_the_shipped_backbones_preset_takes_every_model(tmp_path: Path, model: str) -> None:
+    config = composed(tmp_path, "experiment=sweep", f"model={model}")
+    assert assert_signatures_fit(OmegaConf.to_container(config, resolve=True)) >= 8
+
+
+def test_the_coarse_module_may_learn_at_a_rate_of_its_own(tmp_path: Path) -> None:
+    class Planned:
+        estimated_stepping_batches = 10
+
+    rates = []
+    for factor in (1.0, 3.0):
+        module = build(composed(tmp_path, f"training.coarse_lr_factor={factor}", "training.warmup_steps=0")).module
+        trainer = Planned()
+        module.trainer = trainer  # pyright: ignore[reportAttributeAccessIssue]
+        made = module.configure_optimizers()
+        by_parameter = {id(p): group["lr"] for group in made["optimizer"].param_groups for p in group["params"]}
+        named = [(n, p) for n, p in module.model.named_parameters() if p.requires_grad]
+        rates.append({name: by_parameter[id(parameter)] for name, parameter in named})
+        assert len(by_parameter) == len(named)
+    for name, rate in rates[0].items():
+        assert rates[1][name] == pytest.approx(rate * (3 if name.startswith("coarse.") else 1)), name
+    assert len(set(rates[1].values())) == 2
+
+
 @pytest.mark.parametrize("group", ["loss", "renderer", "optimizer"])
 def test_parts_instantiate(tmp_path: Path, group: str) -> None:
     for name in group_options(group):

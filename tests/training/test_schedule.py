@@ -5,7 +5,7 @@ from itertools import pairwise
 import pytest
 from torch import nn
 
-from vg2gt.training.schedule import cosine_with_warmup, weight_decay_groups
+from vg2gt.training.schedule import cosine_with_warmup, parameter_groups
 
 
 def test_papers_schedule_goes_from_initial_to_final_rate() -> None:
@@ -28,7 +28,20 @@ def test_warmup_rises_then_falls() -> None:
 def test_only_matrices_decay_and_frozen_parameters_are_left_out() -> None:
     module = nn.Sequential(nn.Linear(3, 4), nn.LayerNorm(4), nn.Linear(4, 2))
     module[2].requires_grad_(False)
-    decay, rest = weight_decay_groups(module)
+    decay, rest = parameter_groups(module)
     assert [tuple(p.shape) for p in decay["params"]] == [(4, 3)]
     assert [tuple(p.shape) for p in rest["params"]] == [(4,), (4,), (4,)]
     assert rest["weight_decay"] == 0.0
+
+
+def test_a_child_with_a_rate_of_its_own_stands_behind_the_others() -> None:
+    module = nn.ModuleDict({"coarse": nn.Linear(3, 4), "fine": nn.Linear(4, 2)})
+    groups = parameter_groups(module, {"coarse": 3.0, "absent": 2.0})
+    assert [([tuple(p.shape) for p in group["params"]], group.get("lr_factor", 1.0)) for group in groups] == [
+        ([(2, 4)], 1.0),
+        ([(2,)], 1.0),
+        ([(4, 3)], 3.0),
+        ([(4,)], 3.0),
+    ]
+    assert [group.get("weight_decay") for group in groups] == [None, 0.0, None, 0.0]
+    assert len(parameter_groups(module, {"coarse": 1.0})) == 2

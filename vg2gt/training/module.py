@@ -36,7 +36,7 @@ from vg2gt.training.faults import (
     gather_faults,
 )
 from vg2gt.training.idle_terms import IdleTerms
-from vg2gt.training.schedule import cosine_with_warmup, weight_decay_groups
+from vg2gt.training.schedule import cosine_with_warmup, parameter_groups
 from vg2gt.types import Batch, Prediction
 
 log = logging.getLogger(__name__)
@@ -54,6 +54,7 @@ class VG2GTModule(lightning.LightningModule):
         optimizer: makes the optimiser from parameter groups (Hydra partial); its ``lr`` is the initial rate.
         final_lr: learning rate at the end of the cosine schedule.
         warmup_steps: steps of linear warm-up.
+        coarse_lr_factor: the coarse module's learning rate over the optimiser's, from beginning to end.
         render_views: most views rendered in a training step, held-out views first; None renders all.
         max_skipped: stop after this many steps in a row whose loss or gradient was not finite.
         seed: seeds every random draw of a step, together with the step's number, so that a resumed run draws what the
@@ -68,6 +69,7 @@ class VG2GTModule(lightning.LightningModule):
         optimizer: Callable[..., Optimizer],
         final_lr: float = 1e-8,
         warmup_steps: int = 0,
+        coarse_lr_factor: float = 1.0,
         render_views: int | None = None,
         max_skipped: int = 20,
         seed: int = 0,
@@ -79,6 +81,7 @@ class VG2GTModule(lightning.LightningModule):
         self.make_optimizer = optimizer
         self.final_lr = final_lr
         self.warmup_steps = warmup_steps
+        self.coarse_lr_factor = coarse_lr_factor
         self.render_views = render_views
         self.seed = seed
         self.generator = torch.Generator()
@@ -214,8 +217,10 @@ class VG2GTModule(lightning.LightningModule):
 
     def configure_optimizers(self) -> dict[str, Any]:
         """Optimiser over the trained parameters and a per-step cosine schedule over the whole run."""
-        optimizer = self.make_optimizer(weight_decay_groups(self.model))
+        optimizer = self.make_optimizer(parameter_groups(self.model, {"coarse": self.coarse_lr_factor}))
         initial_lr = optimizer.param_groups[0]["lr"]
+        for group in optimizer.param_groups:
+            group["lr"] *= group.pop("lr_factor", 1.0)
         steps = int(self.trainer.estimated_stepping_batches)
         factor = cosine_with_warmup(steps, self.warmup_steps, self.final_lr / initial_lr)
         scheduler = LambdaLR(optimizer, factor)
