@@ -16,7 +16,7 @@ import torch
 from omegaconf import OmegaConf
 
 from tests.commands import run_vg2gt, shell
-from tests.training_helpers import SMALL, full_model, small_config, with_crash
+from tests.training_helpers import SMALL, full_model, small_config
 from vg2gt.config import compose
 from vg2gt.data import DataError, Frames, SyntheticScenes
 from vg2gt.gaussians import GaussianHead
@@ -93,20 +93,6 @@ def test_only_the_trained_part_changes(tmp_path: Path, cache: Path) -> None:
     assert any(name.startswith("model.coarse") for name in changed)
     assert not any(name.startswith("model.backend") for name in changed)
     assert not run.module.model.backend.training
-
-
-def test_killed_and_resumed_equals_uninterrupted(tmp_path: Path, cache: Path, full_run: Path) -> None:
-    with pytest.raises(InterruptedError):
-        train(with_crash(small_config(tmp_path, cache), step=3))
-    assert newest_valid(tmp_path / "checkpoints").name == "step-2.ckpt"
-    report = train(small_config(tmp_path, cache, "ckpt=last"))
-    whole = read_checkpoint(newest_valid(full_run / "checkpoints"))
-    resumed = read_checkpoint(newest_valid(tmp_path / "checkpoints"))
-    assert resumed["global_step"] == whole["global_step"] == 4
-    for name, tensor in whole["state_dict"].items():
-        assert torch.equal(tensor, resumed["state_dict"][name]), name
-    assert report["trained"] == json.loads((full_run / "metrics.json").read_text())["trained"]
-    assert report["untrained"] == json.loads((full_run / "metrics.json").read_text())["untrained"]
 
 
 def test_sigterm_saves_and_ends(tmp_path: Path, cache: Path) -> None:
