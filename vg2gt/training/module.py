@@ -54,11 +54,15 @@ class VG2GTModule(lightning.LightningModule):
         optimizer: makes the optimiser from parameter groups (Hydra partial); its ``lr`` is the initial rate.
         final_lr: learning rate at the end of the cosine schedule.
         warmup_steps: steps of linear warm-up.
-        coarse_lr_factor: the coarse module's learning rate over the optimiser's, from beginning to end.
+        coarse_lr_factor: the coarse module's learning rate over the optimiser's, from beginning to end; > 0, of no
+            effect on a model without that module.
         render_views: most views rendered in a training step, held-out views first; None renders all.
         max_skipped: stop after this many steps in a row whose loss or gradient was not finite.
         seed: seeds every random draw of a step, together with the step's number, so that a resumed run draws what the
             uninterrupted one would have drawn; the rank enters only where scenes draw apart (drop-path).
+
+    Raises:
+        ValueError: if ``coarse_lr_factor`` is not a positive number.
     """
 
     def __init__(
@@ -75,6 +79,10 @@ class VG2GTModule(lightning.LightningModule):
         seed: int = 0,
     ) -> None:
         super().__init__()
+        if not 0 < coarse_lr_factor < math.inf:  # the optimiser checks its own rate only
+            raise ValueError(
+                f"training.coarse_lr_factor={coarse_lr_factor} must be a positive number; 1 is the optimiser's rate"
+            )
         self.model = model
         self.loss = loss
         self.renderer = renderer
