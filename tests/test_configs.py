@@ -120,7 +120,7 @@ def test_the_coarse_module_may_learn_at_a_rate_of_its_own(tmp_path: Path) -> Non
     assert len(set(rates[1].values())) == 2
 
 
-@pytest.mark.parametrize("factor", ["0", "-1.0", ".nan", ".inf"])
+@pytest.mark.parametrize("factor", ["0", "-1.0", "nan", "inf"])
 def test_a_senseless_rate_of_the_coarse_module_is_refused(tmp_path: Path, factor: str) -> None:
     with pytest.raises(Exception, match=r"training\.coarse_lr_factor=.* must be a positive number"):
         build(composed(tmp_path, f"training.coarse_lr_factor={factor}"))
