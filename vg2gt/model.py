@@ -27,7 +27,7 @@ from vg2gt.geometry.alignment import fit_depth_scale
 from vg2gt.geometry.cameras import relative_to_first, scale_translations
 from vg2gt.memory import note_sizes
 from vg2gt.profiling import stage
-from vg2gt.types import Gaussians, Geometry, Hints, Prediction, Tokens, Voxels
+from vg2gt.types import Decoded, Gaussians, Geometry, Hints, Prediction, Tokens, Voxels
 
 Background = Literal["mean", "black"]
 ScaleSource = Literal["metric", "focal", "normalize", "groundtruth"]
@@ -242,22 +242,32 @@ class VG2GT(Reconstructor):
         Returns:
             Geometry before and after enhancement, voxels and Gaussians, in scene units and in the frame of view 0.
         """
-        tokens, initial, unit = self.read_views(images, hints)
-        geometry = initial
-        if self.coarse is not None:
-            with stage("coarse"):
-                tokens = self.coarse(tokens, initial, generator=generator)
-            with stage("decode_again"):
-                again = self.backend.decode(tokens)
-            # The camera token is untouched, so the cameras are the backbone's: decoded once, used throughout.
-            depth = again.depth * unit[:, None, None, None]
-            depth = depth if not self.keep_scale else with_scale_of(initial, depth)
-            geometry = replace(initial, depth=depth, depth_conf=again.depth_conf)
+        tokens, decoded = self.enhance(images, hints, generator)
         with stage("fine"):
-            voxels: Voxels = self.fine(tokens, geometry, images)
+            voxels: Voxels = self.fine(tokens, decoded.geometry, images)
         with stage("gaussians"):
-            gaussians: Gaussians = self.with_background(self.gaussians(voxels), images, initial.depth)
-        return Prediction(initial, geometry, voxels, gaussians, unit)
+            gaussians = self.with_background(self.gaussians(voxels), images, decoded.initial.depth)
+        return Prediction(decoded.initial, decoded.geometry, decoded.unit, voxels, gaussians)
+
+    def enhance(
+        self, images: Tensor, hints: Hints | None = None, generator: torch.Generator | None = None
+    ) -> tuple[Tokens, Decoded]:
+        """The part of the method up to the enhanced geometry (paper, Coarse-level); arguments as for a forward pass.
+
+        Returns:
+            The enhanced tokens, and geometry before and after enhancement.
+        """
+        tokens, initial, unit = self.read_views(images, hints)
+        if self.coarse is None:
+            return tokens, Decoded(initial, initial, unit)
+        with stage("coarse"):
+            tokens = self.coarse(tokens, initial, generator=generator)
+        with stage("decode_again"):
+            again = self.backend.decode(tokens)
+        # The camera token is untouched, so the cameras are the backbone's: decoded once, used throughout.
+        depth = again.depth * unit[:, None, None, None]
+        depth = depth if not self.keep_scale else with_scale_of(initial, depth)
+        return tokens, Decoded(initial, replace(initial, depth=depth, depth_conf=again.depth_conf), unit)
 
 
 def with_scale_of(initial: Geometry, depth: Tensor) -> Tensor:

@@ -307,19 +307,28 @@ class Render(TensorRecord):
 
 
 @dataclass(frozen=True)
-class Prediction(TensorRecord):
-    """Everything one forward pass yields, in the scene unit and the frame of context view 0.
+class Decoded(TensorRecord):
+    """The geometry of the context views, in the scene unit and the frame of view 0.
 
     Attributes:
         initial: the frozen backbone's geometry, before enhancement.
         geometry: geometry decoded again from the enhanced tokens; ``initial`` where nothing enhances them.
-        voxels: refined fine voxels; None for models that split no voxels.
-        gaussians: the Gaussian scene.
         unit: ``[B]`` scene units per unit of the backend's raw output (1 where nothing was rescaled).
     """
 
     initial: Geometry
     geometry: Geometry
+    unit: Tensor
+
+
+@dataclass(frozen=True)
+class Prediction(Decoded):
+    """Everything one forward pass yields.
+
+    Attributes:
+        voxels: refined fine voxels; None for models that split no voxels.
+        gaussians: the Gaussian scene.
+    """
+
     voxels: Voxels | None
     gaussians: Gaussians
-    unit: Tensor

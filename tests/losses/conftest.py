@@ -96,7 +96,7 @@ def make_sample(
     shown = torch.tensor(rendered)
     normals, _ = normals_from_depth(depth[:, shown], cameras.intrinsics[:, shown], edge_threshold=1e9)
     render = Render(images[:, shown], depth[:, shown] / unit, normals, torch.ones_like(depth[:, shown]))
-    prediction = Prediction(geometry, geometry, _no_voxels(), _no_gaussians(), factor)
+    prediction = Prediction(geometry, geometry, factor, _no_voxels(), _no_gaussians())
 
     def convert(tensor: Tensor) -> Tensor:
         return tensor.to(dtype) if tensor.is_floating_point() else tensor

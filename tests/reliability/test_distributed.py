@@ -120,7 +120,8 @@ def test_the_step_of_two_scenes_is_the_mean_of_theirs(tmp_path: Path, cache: Pat
     loss, gradient = step(run, batch)
     first, second = (step(run, batch.single(index)) for index in range(2))
     assert first[0] != second[0]
-    torch.testing.assert_close(loss, (first[0] + second[0]) / 2, rtol=1e-6, atol=0)
+    # The terms are of order one; the last digits of SSIM, made of local variances, depend on the processor (4e-7 seen).
+    torch.testing.assert_close(loss, (first[0] + second[0]) / 2, rtol=0, atol=1e-6)
     mean = (first[1] + second[1]) / 2
     # Rounding of float32: 1.0 to 2.2e-6 in eleven draws of weights and options; a twelfth gave 1.2e-4, unexplained.
     assert (gradient - mean).norm() < 5e-6 * mean.norm()

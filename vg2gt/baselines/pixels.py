@@ -120,7 +120,7 @@ class PixelReconstructor(Reconstructor):
             pixels = usable_pixels(geometry, images)
             features = F.gelu(dense.float()).index_select(0, pixels.rows)
             gaussians = self.with_background(self.make_gaussians(features, pixels, geometry), images, geometry.depth)
-        return Prediction(geometry, geometry, None, gaussians, unit)
+        return Prediction(geometry, geometry, unit, None, gaussians)
 
     @abstractmethod
     def make_gaussians(self, features: Tensor, pixels: Pixels, geometry: Geometry) -> Gaussians:

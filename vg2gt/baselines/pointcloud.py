@@ -69,7 +69,7 @@ class PointCloud(Reconstructor):
                 sh=rgb_to_sh(pixels.colors)[:, None],
                 batch=pixels.batch,
             )
-        return Prediction(geometry, geometry, None, self.with_background(gaussians, images, geometry.depth), unit)
+        return Prediction(geometry, geometry, unit, None, self.with_background(gaussians, images, geometry.depth))
 
 
 def _distance_to_neighbors(means: Tensor, pixels: Pixels) -> Tensor:

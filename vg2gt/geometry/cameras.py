@@ -47,6 +47,25 @@ def invert_rigid(transform: Tensor) -> Tensor:
     return torch.cat((torch.cat((rotation, translation), -1), transform[..., 3:, :]), -2)
 
 
+def rigid_motions(turns: Tensor, shifts: Tensor) -> Tensor:
+    """Rotation by vectors and translation as matrices.
+
+    Args:
+        turns: ``[..., 3]`` rotation vectors, rad.
+        shifts: ``[..., 3]`` translations after the rotation.
+
+    Returns:
+        ``[..., 4, 4]``.
+    """
+    skew = turns.new_zeros(*turns.shape[:-1], 3, 3)
+    for axis, (i, j) in enumerate(((2, 1), (0, 2), (1, 0))):
+        skew[..., i, j], skew[..., j, i] = turns[..., axis], -turns[..., axis]
+    motions = torch.eye(4, dtype=turns.dtype, device=turns.device).repeat(*turns.shape[:-1], 1, 1)
+    motions[..., :3, :3] = torch.matrix_exp(skew)
+    motions[..., :3, 3] = shifts
+    return motions
+
+
 def transform_points(transform: Tensor, points: Tensor) -> Tensor:
     """Applies rigid transforms ``[B, V, 4, 4]`` to points ``[B, V, ..., 3]``.
 

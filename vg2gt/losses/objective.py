@@ -12,7 +12,7 @@ from vg2gt.losses.gaussian import GaussianLoss, RenderTargets
 from vg2gt.losses.geometry import GeometryLoss, camera_errors
 from vg2gt.losses.scale import ScaleAlignment
 from vg2gt.losses.truth import Truth, normalize_truth
-from vg2gt.types import Batch, Cameras, Geometry, Prediction, Render, TensorRecord
+from vg2gt.types import Batch, Cameras, Decoded, Geometry, Render, TensorRecord
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ class VG2GTLoss(nn.Module):
 
     def forward(
         self,
-        prediction: Prediction,
+        prediction: Decoded,
         batch: Batch,
         rendered: Render | None = None,
         views: Tensor | None = None,
@@ -200,7 +200,7 @@ def _full_precision(tensor: Tensor) -> Tensor:
 
 
 def _checked(
-    prediction: Prediction, batch: Batch, rendered: Render | None, views: Tensor | None, cameras: Cameras | None
+    prediction: Decoded, batch: Batch, rendered: Render | None, views: Tensor | None, cameras: Cameras | None
 ) -> RenderedViews | None:
     """Checks that all inputs belong together; returns the rendered views in full precision, if there are any."""
     expected = (len(batch.scene), batch.num_context, *batch.images.shape[-2:])

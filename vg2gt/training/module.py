@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, Literal, get_args
 
 import lightning
 import torch
@@ -19,7 +19,7 @@ from vg2gt.evaluation import evaluate_scene
 from vg2gt.evaluation.protocols import training_cameras
 from vg2gt.losses import LossReport
 from vg2gt.memory import dropped_by
-from vg2gt.model import Reconstructor
+from vg2gt.model import VG2GT, Reconstructor
 from vg2gt.profiling import stage
 from vg2gt.rendering import Renderer, UnrenderableError
 from vg2gt.runs.checkpoints import MADE_OF, MODEL_PREFIX, model_state
@@ -36,11 +36,13 @@ from vg2gt.training.faults import (
     gather_faults,
 )
 from vg2gt.training.idle_terms import IdleTerms
+from vg2gt.training.pose_noise import with_pose_noise
 from vg2gt.training.schedule import cosine_with_warmup, parameter_groups
 from vg2gt.types import Batch, Prediction
 
 log = logging.getLogger(__name__)
 
+Part = Literal["all", "coarse"]
 IN_PROGRESS_BAR = ("loss", "train/color_l1", "train/depth_gt", "train/depth_reg", "train/normal")
 
 
@@ -56,13 +58,18 @@ class VG2GTModule(lightning.LightningModule):
         warmup_steps: steps of linear warm-up.
         coarse_lr_factor: the coarse module's learning rate over the optimiser's, from beginning to end; > 0, of no
             effect on a model without that module.
+        part: what is trained: ``all``, or the ``coarse`` module alone, on the geometry and enhancement losses; nothing
+            is rendered then and all other parameters stay as they are.
+        pose_noise: share of training scenes whose camera hints are slightly wrong; with ``part="coarse"`` only, as
+            views that are rendered need cameras that fit.
         render_views: most views rendered in a training step, held-out views first; None renders all.
         max_skipped: stop after this many steps in a row whose loss or gradient was not finite.
         seed: seeds every random draw of a step, together with the step's number, so that a resumed run draws what the
             uninterrupted one would have drawn; the rank enters only where scenes draw apart (drop-path).
 
     Raises:
-        ValueError: if ``coarse_lr_factor`` is not a positive number.
+        ValueError: if ``coarse_lr_factor`` is not a positive number, ``part`` is unknown or not in the model, or
+            ``pose_noise`` is no share, or not 0 where views are rendered.
     """
 
     def __init__(
@@ -74,6 +81,8 @@ class VG2GTModule(lightning.LightningModule):
         final_lr: float = 1e-8,
         warmup_steps: int = 0,
         coarse_lr_factor: float = 1.0,
+        part: Part = "all",
+        pose_noise: float = 0.0,
         render_views: int | None = None,
         max_skipped: int = 20,
         seed: int = 0,
@@ -84,6 +93,11 @@ class VG2GTModule(lightning.LightningModule):
                 f"training.coarse_lr_factor={coarse_lr_factor} must be a positive number; 1 is the optimiser's rate"
             )
         self.model = model
+        self.part = part
+        if part == "coarse":
+            _leave_only_coarse(model)
+        _check_part(part, pose_noise)
+        self.pose_noise = pose_noise
         self.loss = loss
         self.renderer = renderer
         self.make_optimizer = optimizer
@@ -131,6 +145,23 @@ class VG2GTModule(lightning.LightningModule):
 
     def _losses(self, batch: Batch) -> LossReport | None:
         """The training losses; what is not finite is noted, and None returned where it cannot be rendered."""
+        report = self._losses_of_geometry(batch) if self.part == "coarse" else self._losses_of_scene(batch)
+        if report is not None:
+            self._fault = fault_of_loss(report, batch.scene)
+            self._figures |= self._step_figures(report)
+            self._idle.see(report.terms)
+        return report
+
+    def _losses_of_geometry(self, batch: Batch) -> LossReport:
+        """Geometry and enhancement losses of what the coarse module makes of the context views."""
+        assert isinstance(self.model, VG2GT)
+        hints = with_pose_noise(batch.context, self.pose_noise)
+        _, decoded = self.model.enhance(batch.context.images, hints, self.generator)
+        with stage("loss"):
+            return self.loss(decoded, batch)
+
+    def _losses_of_scene(self, batch: Batch) -> LossReport | None:
+        """All losses: of the context views' geometry and of some rendered views."""
         prediction = self.model(batch.context.images, batch.context.hints, self.generator)
         self._fault = fault_of_prediction(prediction, batch.scene)
         if self._fault is not None:
@@ -143,12 +174,9 @@ class VG2GTModule(lightning.LightningModule):
         except UnrenderableError as error:
             self._fault = Fault(batch.scene, f"nothing to render: {error}")
             return None
+        self._figures = self._scene_figures(batch, prediction)
         with stage("loss"):
-            report: LossReport = self.loss(prediction, batch, rendered, views, cameras)
-        self._fault = fault_of_loss(report, batch.scene)
-        self._figures = self._step_figures(report, batch, prediction)
-        self._idle.see(report.terms)
-        return report
+            return self.loss(prediction, batch, rendered, views, cameras)
 
     def _lost_step(self) -> Tensor:
         """A loss that is NaN in every trained parameter: the step is then dropped on all ranks."""
@@ -166,17 +194,21 @@ class VG2GTModule(lightning.LightningModule):
             held_out = held_out[: max(self.render_views - 1, 0)]
         return torch.cat((held_out, context))[: self.render_views]
 
-    def _step_figures(self, report: LossReport, batch: Batch, prediction: Prediction) -> dict[str, Tensor]:
+    def _step_figures(self, report: LossReport) -> dict[str, Tensor]:
         """What is logged of a step; the mean over ranks is what one process with all scenes would log."""
         figures: dict[str, Tensor | float] = {"loss": report.total.detach()}
         figures |= {f"train/{name}": value for name, value in report.terms.items()}
-        figures["train/gaussians_per_view"] = len(prediction.gaussians) / (len(batch.scene) * batch.num_context)
-        if prediction.voxels is not None:
-            figures["train/voxels_per_pixel"] = len(prediction.voxels.grid) / batch.context.depth.numel()
         figures |= {f"train/{what}_dropped": float(count) for what, count in dropped_by(self.model).items()}
         figures["train/scenes_without_depth"] = float(report.skipped * world_size())
         as_tensor = partial(torch.as_tensor, dtype=torch.float32, device=report.total.device)
         return {name: as_tensor(value) for name, value in figures.items()}
+
+    def _scene_figures(self, batch: Batch, prediction: Prediction) -> dict[str, Tensor]:
+        """How many Gaussians and voxels a step's scenes have."""
+        figures = {"train/gaussians_per_view": len(prediction.gaussians) / (len(batch.scene) * batch.num_context)}
+        if prediction.voxels is not None:
+            figures["train/voxels_per_pixel"] = len(prediction.voxels.grid) / batch.context.depth.numel()
+        return {name: torch.tensor(value, device=self.device) for name, value in figures.items()}
 
     def _log_step(self, average: bool) -> None:
         """Logs the step's figures: means over ranks, or this rank's own of a step that was dropped."""
@@ -274,3 +306,35 @@ class VG2GTModule(lightning.LightningModule):
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False):
         """Loads the trained part; only backbone weights may be missing."""
         self.model.load_trained(model_state(state_dict), self.model.backend.identity())
+
+
+def _leave_only_coarse(model: Reconstructor) -> None:
+    """Freezes all but the coarse module.
+
+    Raises:
+        ValueError: if the model has none.
+    """
+    if not isinstance(model, VG2GT) or model.coarse is None:
+        raise ValueError(
+            "training.part=coarse trains the coarse module, which this model does not have: choose model=tiny or "
+            "another VG2GT without ablation=wo_coarse, or leave training.part=all"
+        )
+    for name, parameter in model.named_parameters():
+        parameter.requires_grad_(parameter.requires_grad and name.startswith("coarse."))
+
+
+def _check_part(part: str, pose_noise: float) -> None:
+    """Refuses what cannot be trained.
+
+    Raises:
+        ValueError: naming the option.
+    """
+    if part not in get_args(Part):
+        raise ValueError(f"training.part={part} is unknown: choose one of {', '.join(get_args(Part))}")
+    if not 0 <= pose_noise <= 1:
+        raise ValueError(f"training.pose_noise={pose_noise} must be a share of the scenes, 0 to 1")
+    if pose_noise and part == "all":
+        raise ValueError(
+            f"training.pose_noise={pose_noise} needs training.part=coarse: views are rendered from the hints' cameras, "
+            "which would not show what the images do"
+        )

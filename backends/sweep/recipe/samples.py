@@ -15,7 +15,7 @@ from torch.nn import functional as F
 from torch.utils.data import Dataset
 
 from backends.sweep.recipe.scenes import SceneFrames, read_scene
-from vg2gt.geometry.cameras import crop_intrinsics, resize_intrinsics
+from vg2gt.geometry.cameras import crop_intrinsics, resize_intrinsics, rigid_motions
 
 _SIZES = ((80, 160), (112, 224), (112, 144))
 _SIZE_SHARES = (0.75, 0.15, 0.1)
@@ -145,13 +145,7 @@ def _finish(views: _Crop, valid: Tensor, rng: Generator) -> Sample:
 
 def _pose_noise(views: int, median_depth: float, rng: Generator) -> Tensor:
     turns = torch.from_numpy(rng.normal(0, _TURN, (views, 3))).float()
-    skew = torch.zeros(views, 3, 3)
-    for axis, (i, j) in enumerate(((2, 1), (0, 2), (1, 0))):
-        skew[:, i, j], skew[:, j, i] = turns[:, axis], -turns[:, axis]
-    motion = torch.eye(4).repeat(views, 1, 1)
-    motion[:, :3, :3] = torch.matrix_exp(skew)
-    motion[:, :3, 3] = torch.from_numpy(rng.normal(0, _SHIFT * median_depth, (views, 3))).float()
-    return motion
+    return rigid_motions(turns, torch.from_numpy(rng.normal(0, _SHIFT * median_depth, (views, 3))).float())
 
 
 def recolour(images: Tensor, rng: Generator) -> Tensor:

@@ -16,6 +16,7 @@ from torch import Tensor
 from vg2gt.data.synthetic.outdoor import SyntheticOutdoor
 from vg2gt.data.synthetic.rooms import SyntheticRoom
 from vg2gt.data.synthetic.synthetic_scene import SyntheticScene
+from vg2gt.geometry.cameras import rigid_motions
 from vg2gt.io.files import write_cached
 from vg2gt.io.npz import read_npz
 
@@ -82,13 +83,9 @@ def _shake(scene: SyntheticScene, rng: np.random.Generator, metres: float) -> ND
     count = len(scene.world_to_camera)
     turns = rng.normal(0, 0.03, (count, 3))
     turns[:, 2] += rng.normal(0, 0.12)
-    skew = np.zeros((count, 3, 3))
-    for axis, (i, j) in enumerate(((2, 1), (0, 2), (1, 0))):
-        skew[:, i, j], skew[:, j, i] = turns[:, axis], -turns[:, axis]
-    motion = np.tile(np.eye(4), (count, 1, 1))
-    motion[:, :3, :3] = torch.matrix_exp(torch.from_numpy(skew)).numpy()
-    motion[:, :3, 3] = rng.normal(0, metres, (count, 3))
-    return motion @ scene.world_to_camera
+    shifts = rng.normal(0, metres, (count, 3))
+    motion = rigid_motions(torch.from_numpy(turns), torch.from_numpy(shifts)).numpy()
+    return np.asarray(motion @ scene.world_to_camera, np.float64)
 
 
 def make_scenes(folder: str | os.PathLike[str], count: int, first_seed: int = FIRST_SEED) -> Iterator[Path]:

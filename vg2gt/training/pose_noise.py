@@ -1,0 +1,50 @@
+"""Slightly wrong camera hints, so that what is trained does not trust poses more than recordings deserve."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import replace
+
+import numpy as np
+import torch
+from numpy.random import Generator
+from torch import Tensor
+
+from vg2gt.geometry.cameras import compose, rigid_motions
+from vg2gt.types import Batch, Hints
+
+TURN, SHIFT = 0.004, 0.006  # deviations at amount 1: rad; median depths
+AMOUNTS = (0.2, 1.5)
+
+
+def with_pose_noise(batch: Batch, share: float) -> Hints:
+    """The hints of a batch, a share of whose scenes have cameras that are turned and moved a little, each view apart.
+
+    The same views of a scene are always wrong in the same way, so that a token cache finds them again.
+
+    Args:
+        batch: the views that the backbone is to see, with true cameras.
+        share: of the scenes whose cameras are wrong, 0 to 1.
+    """
+    hints = batch.hints
+    if not share or hints.cameras is None:
+        return hints
+    motions = torch.stack([_motions(batch.single(index), share) for index in range(len(batch.scene))])
+    poses = hints.cameras.world_to_camera
+    return replace(hints, cameras=replace(hints.cameras, world_to_camera=compose(motions.to(poses), poses)))
+
+
+def _motions(scene: Batch, share: float) -> Tensor:
+    """What one scene's views ``[V, 4, 4]`` are moved by."""
+    rng = _rng(scene)
+    views = scene.images.shape[1]
+    amount = rng.uniform(*AMOUNTS) * (rng.random() < share)
+    known = scene.depth[scene.depth > 0]
+    unit = float(known.median()) if len(known) else 0.0
+    turns, shifts = rng.normal(0, TURN * amount, (views, 3)), rng.normal(0, SHIFT * amount * unit, (views, 3))
+    return rigid_motions(torch.from_numpy(turns), torch.from_numpy(shifts))
+
+
+def _rng(scene: Batch) -> Generator:
+    name = f"{scene.scene[0]}/{scene.frame_ids[0].tolist()}"
+    return np.random.default_rng(int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "big"))
