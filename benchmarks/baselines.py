@@ -1,11 +1,13 @@
-"""VG²GT against the baselines in one run: ``python benchmarks/baselines.py [steps=N] [seeds=N] [overrides]``.
+"""VG²GT against the baselines: ``python benchmarks/baselines.py [steps=N] [seeds=N] [coarse=FILE] [models=A,B] [...]``.
 
 Every model is trained from scratch for the same number of steps on the same backbone, losses, batches and machine, and
 evaluated on the same held-out scenes: VG²GT, VG²GT with finer voxels (about 40 % of the pixel-aligned Gaussians), VG²GT
 without its coarse module (which separates the voxels' part from the enhanced geometry's), one Gaussian per pixel, pixel
-Gaussians merged by voxels, and the coloured points, which need no training. Finished trainings are not repeated,
-interrupted ones go on. Writes runs, ``metrics.json``, ``metrics.md`` and ``models.png`` into ``outputs/<name>``;
-name=baselines.
+Gaussians merged by voxels, and the coloured points, which need no training. ``coarse=`` names a checkpoint whose coarse
+module, and nothing else, the models that have one begin with, at ``training.coarse_lr_factor=0.3``. ``models=`` takes
+only some, by the names of their folders. Finished trainings are not repeated, interrupted ones go on. Writes runs,
+``metrics.json``, ``metrics.md`` and ``models.png`` into ``outputs/<name>``; name=baselines. All else overrides
+``train.yaml``.
 """
 
 from __future__ import annotations
@@ -24,11 +26,21 @@ from vg2gt.evaluation.tables import Metric, columns
 from vg2gt.io.files import write_json, write_text
 from vg2gt.io.images import colorize_depth, grid, write_png
 from vg2gt.runs.checkpoints import read_checkpoint
-from vg2gt.studies.study import Metrics, compose_run, final_checkpoint, run_once, seeds_table, summarize
+from vg2gt.studies.study import (
+    Metrics,
+    compose_run,
+    final_checkpoint,
+    quoted,
+    run_once,
+    seeds_table,
+    summarize,
+    write_part,
+)
 from vg2gt.training.loop import Run, build
 from vg2gt.types import Batch
 
-DEFAULTS = {"name": "baselines", "steps": "400", "seeds": "1"}
+DEFAULTS = {"name": "baselines", "steps": "400", "seeds": "1", "coarse": "", "models": ""}
+COARSE = "model.coarse."
 REFERENCE = "VG²GT"
 MAX_ERROR = 0.1  # relative depth error shown as white
 COLUMNS = columns(
@@ -43,16 +55,17 @@ COLUMNS = columns(
 
 @dataclass(frozen=True)
 class Model:
-    """A row: its folder, its overrides, and whether there is anything to train."""
+    """A row: its folder, its overrides, whether there is anything to train, and whether it has a coarse module."""
 
     folder: str
     overrides: tuple[str, ...] = ()
     trained: bool = True
+    coarse: bool = False
 
 
 MODELS = {
-    REFERENCE: Model("vg2gt"),
-    "VG²GT, 2 px": Model("vg2gt_fine", ("model.fine.min_footprint=2.02",)),
+    REFERENCE: Model("vg2gt", coarse=True),
+    "VG²GT, 2 px": Model("vg2gt_fine", ("model.fine.min_footprint=2.02",), coarse=True),
     "VG²GT w/o coarse": Model("wo_coarse", ("ablation=wo_coarse",)),
     "pixel-aligned": Model("pixel_aligned", ("model=pixel_aligned",)),
     "voxel-merged": Model("voxel_merged", ("model=voxel_merged",)),
@@ -107,12 +120,30 @@ def truth(batch: Batch) -> list[torch.Tensor]:
     return [batch.target.images[0, 0], colorize_depth(true, near, far), torch.zeros_like(batch.target.images[0, 0])]
 
 
+def chosen(names: str) -> dict[str, Model]:
+    """The models of ``models=``, or all."""
+    folders = [model.folder for model in MODELS.values()]
+    if unknown := set(names.split(",")) - {*folders, ""}:
+        raise SystemExit(f"models={names}: no model {', '.join(sorted(unknown))}; there are {', '.join(folders)}")
+    return {name: model for name, model in MODELS.items() if not names or model.folder in names.split(",")}
+
+
+def coarse_start(path: str, home: Path) -> tuple[str, ...]:
+    """Overrides of a training that begins with the coarse module of a checkpoint; all else is anew for every seed."""
+    if not path:
+        return ()
+    home.mkdir(parents=True, exist_ok=True)
+    start = write_part(Path(path), home / "coarse.ckpt", lambda name: name.startswith(COARSE))
+    return f"init_from={quoted(start)}", "training.coarse_lr_factor=0.3"
+
+
 def report(results: Mapping[str, Mapping[int, Metrics]], options: Mapping[str, str]) -> str:
     """The table as Markdown."""
+    trained_first = " after a coarse module trained first and alone" if options["coarse"] else ""
     protocol = (
-        f"{options['steps']} training steps each, {options['seeds']} seed(s) (mean ± 95 % confidence interval where "
-        "there are several). Scenes never trained on, held-out views at ground-truth poses, rendered as stochastic "
-        "solids, depth aligned by one median scale per scene. Times: best of three passes on the first scene."
+        f"{options['steps']} training steps each, {options['seeds']} seed(s){trained_first} (mean ± 95 % confidence "
+        "interval where there are several). Scenes never trained on, held-out views at ground-truth poses, rendered as "
+        "stochastic solids, depth aligned by one median scale per scene. Times: best of three passes on one scene."
     )
     table = seeds_table({name: runs for name, runs in results.items() if runs}, COLUMNS)
     return f"# VG²GT and baselines\n\n{protocol}\n\n{table}\n"
@@ -131,13 +162,14 @@ def main() -> None:
         else:
             overrides.append(argument)
     home = Path("outputs").resolve() / options["name"]
-    results: dict[str, dict[int, Metrics]] = {name: {} for name in MODELS}
+    models, begin = chosen(options["models"]), coarse_start(options["coarse"], home)
+    results: dict[str, dict[int, Metrics]] = {name: {} for name in models}
     rows: list[list[torch.Tensor]] = []
     for seed in range(int(options["seeds"])):
-        for name, model in MODELS.items():
+        for name, model in models.items():
             folder = home / f"seed-{seed}" / model.folder
             steps = options["steps"] if model.trained else "0"
-            mine = [*overrides, f"seed={seed}", f"trainer.max_steps={steps}"]
+            mine = [*overrides, f"seed={seed}", f"trainer.max_steps={steps}", *(begin if model.coarse else ())]
             print(f"seed {seed}: {name}", flush=True)
             metrics = run_once([*mine, *model.overrides], folder)
             run, batch = restore(model, mine, int(steps), folder)
@@ -156,7 +188,7 @@ def main() -> None:
             write_json(home / "metrics.json", content)
             write_text(home / "metrics.md", report(results, options))
     print(report(results, options))
-    print(f"rows of models.png: truth, {', '.join(MODELS)}; colour, depth, relative depth error")
+    print(f"rows of models.png: truth, {', '.join(models)}; colour, depth, relative depth error")
     print(f"metrics: {home / 'metrics.json'}")
 
 

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from tests.commands import run_python
+from vg2gt.runs.checkpoints import read_checkpoint
 
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 TINY = ["data.image_size=[56,112]", "data.train_scenes=1", "data.eval_scenes=1"]
@@ -98,6 +99,22 @@ def test_baselines(tmp_path: Path) -> None:
     before = (home / "seed-0" / "vg2gt" / "metrics.json").stat().st_mtime_ns
     run("baselines.py", tmp_path, *arguments)
     assert (home / "seed-0" / "vg2gt" / "metrics.json").stat().st_mtime_ns == before
+    start = next((home / "seed-0" / "vg2gt" / "checkpoints").glob("*.ckpt"))
+    run("baselines.py", tmp_path, *arguments, "name=begun", f"coarse={start}", "models=vg2gt,wo_coarse")
+    begun = tmp_path / "outputs" / "begun"
+    assert set(json.loads((begun / "metrics.json").read_text())["runs"]) == {"VG²GT", "VG²GT w/o coarse"}
+    kept = read_checkpoint(begun / "coarse.ckpt")["state_dict"]
+    assert kept
+    assert all(name.startswith("model.coarse.") for name in kept)
+    assert (begun / "seed-0" / "vg2gt" / "start.json").is_file()
+    assert not (begun / "seed-0" / "wo_coarse" / "start.json").exists()
+
+
+def test_baselines_name_a_model_that_is_not_there(tmp_path: Path) -> None:
+    script = f"import sys; sys.path.insert(0, {str(BENCHMARKS)!r}); import baselines; baselines.main()"
+    shown = run_python(script, "models=vg2gt,pixel", folder=tmp_path)
+    assert shown.returncode != 0
+    assert "models=vg2gt,pixel: no model pixel; there are vg2gt, vg2gt_fine, wo_coarse" in shown.stderr
 
 
 @pytest.mark.slow

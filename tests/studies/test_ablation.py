@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+import vg2gt.studies.ablation
 import vg2gt.studies.study
 from tests.commands import ROOT, run_vg2gt, shell
 from tests.training_helpers import SMALL
@@ -222,8 +223,26 @@ def test_verdicts() -> None:
     assert verdict({0: {"psnr": 27.0}}, "psnr") == "+2.00"
 
 
+def test_only_full_models_begin_with_given_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The others begin with the full model of their seed."""
+    begun: dict[str, list[str]] = {}
+
+    def noted(overrides: list[str], folder: Path) -> dict[str, float]:
+        begun[folder.name] = [override for override in overrides if override.startswith("init_from=")]
+        return {"psnr": 20.0}
+
+    monkeypatch.setattr(vg2gt.studies.ablation, "run_once", noted)
+    monkeypatch.setattr(vg2gt.studies.ablation, "final_checkpoint", lambda folder, steps: folder / "end.ckpt")
+    some = Ablation(tmp_path, QUIET, 1, 2, 1, 1e-4, ["wo_coarse"], [2], init_from="begin.ckpt")
+    some.run()
+    assert begun["start"] == ["init_from='begin.ckpt'"]
+    assert begun["wo_coarse"] == begun["full"] == [f"init_from='{tmp_path / 'seed-0' / 'start' / 'end.ckpt'}'"]
+    assert "Full model 2 steps from begin.ckpt, then every row" in some.report()
+
+
 def test_what_the_study_decides_cannot_be_overridden() -> None:
-    assert common_overrides(["seeds=2", "backend=da3_small", "+data.x=1"]) == ["backend=da3_small", "+data.x=1"]
+    given = ["seeds=2", "backend=da3_small", "+data.x=1", "init_from=some.ckpt"]
+    assert common_overrides(given) == ["backend=da3_small", "+data.x=1"]
     with pytest.raises(ValueError, match=r"trainer\.max_steps is decided by the study"):
         common_overrides(["trainer.max_steps=7"])
 

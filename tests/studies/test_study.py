@@ -5,9 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from scipy import stats
 
 from vg2gt.evaluation.tables import columns
+from vg2gt.runs.checkpoints import read_checkpoint, write_checkpoint
 from vg2gt.studies.study import (
     Estimate,
     compose_run,
@@ -17,6 +19,7 @@ from vg2gt.studies.study import (
     quoted,
     seeds_table,
     summarize,
+    write_part,
 )
 
 
@@ -71,6 +74,13 @@ def test_one_row_per_run() -> None:
         "| full  | 25.0 ± 63.5 |",
         "| other |         n/a |",
     ]
+
+
+def test_a_part_of_a_checkpoint_leaves_the_rest_anew(tmp_path: Path) -> None:
+    start = tmp_path / "start.ckpt"
+    write_checkpoint({"state_dict": {"a.x": torch.ones(2), "b.x": torch.zeros(1)}, "global_step": 5}, start)
+    part = read_checkpoint(write_part(start, tmp_path / "part.ckpt", lambda name: name.startswith("a.")))
+    assert {name: tensor.tolist() for name, tensor in part["state_dict"].items()} == {"a.x": [1.0, 1.0]}
 
 
 def test_paths_survive_the_override_grammar(tmp_path: Path) -> None:

@@ -24,7 +24,6 @@ from omegaconf import DictConfig
 from vg2gt.evaluation.paper import tables
 from vg2gt.evaluation.tables import Metric, columns, markdown_table
 from vg2gt.io.files import write_json, write_text
-from vg2gt.runs.checkpoints import read_checkpoint, write_checkpoint
 from vg2gt.studies.study import (
     Estimate,
     Metrics,
@@ -36,12 +35,13 @@ from vg2gt.studies.study import (
     seeds_row,
     seeds_table,
     summarize,
+    write_part,
 )
 
 log = logging.getLogger(__name__)
 
-OWN_KEYS = ("name", "seeds", "full_steps", "steps", "lr", "variants", "splits")
-SETTLED_KEYS = ("seed", "ckpt", "init_from", "overwrite", "output_dir", "ablation", "trainer.max_steps")
+OWN_KEYS = ("name", "seeds", "full_steps", "steps", "lr", "variants", "splits", "init_from")
+SETTLED_KEYS = ("seed", "ckpt", "overwrite", "output_dir", "ablation", "trainer.max_steps")
 CONTINUATION_SEED = 1000  # the continuation's batches are not the first ones of the full model's training
 FULL, CONTROL = "full", "new_last_layer"
 LAST_LAYER = "model.gaussians.out."
@@ -104,6 +104,7 @@ class Ablation:
         lr: initial learning rate of every continuation.
         variants: options of the group ``ablation``.
         splits: numbers of Gaussians per voxel.
+        init_from: weights that the full models begin with; what they lack starts anew with every seed.
         results: metrics by run and seed.
         diverged: the continuations without a result.
 
@@ -119,6 +120,7 @@ class Ablation:
     lr: float
     variants: Sequence[str]
     splits: Sequence[int]
+    init_from: str | None = None
     diverged: list[str] = field(default_factory=list, init=False)
 
     def __post_init__(self) -> None:
@@ -141,7 +143,8 @@ class Ablation:
             home = self.folder / f"seed-{seed}"
             number += 1
             print(f"[{number}/{total}] seed {seed}: the full model, {self.full_steps} steps", flush=True)
-            run_once([*self.overrides, f"seed={seed}", f"trainer.max_steps={self.full_steps}"], home / "start")
+            begin = [f"init_from={quoted(Path(self.init_from))}"] if self.init_from else []
+            run_once([*self.overrides, *begin, f"seed={seed}", f"trainer.max_steps={self.full_steps}"], home / "start")
             start = final_checkpoint(home / "start", self.full_steps)
             for run in self.runs:
                 number += 1
@@ -155,7 +158,8 @@ class Ablation:
 
     def _go_on(self, run: Continuation, seed: int, start: Path, home: Path) -> Metrics:
         if run.new_last_layer:
-            start = _without_last_layer(start, home / "start" / "without_last_layer.ckpt")
+            cut = home / "start" / "without_last_layer.ckpt"
+            start = write_part(start, cut, lambda name: not name.startswith(LAST_LAYER))
         overrides = [*self.overrides, *run.overrides, f"seed={CONTINUATION_SEED + seed}"]
         overrides += [f"trainer.max_steps={self.steps}", f"optimizer.lr={self.lr}", f"init_from={quoted(start)}"]
         return run_once(overrides, home / run.name.replace("=", "-"))
@@ -168,6 +172,7 @@ class Ablation:
             "steps": self.steps,
             "lr": self.lr,
             "overrides": list(self.overrides),
+            "init_from": self.init_from,
             "diverged": self.diverged,
             "runs": {name: {str(seed): m for seed, m in runs.items()} for name, runs in self.results.items()},
             "summary": summarize(self.results, FULL),
@@ -210,9 +215,10 @@ class Ablation:
     def _protocol(self) -> str:
         done = min((len(runs) for runs in self.results.values()), default=0)
         diverged = f" Diverged: {'; '.join(self.diverged)}." if self.diverged else ""
+        begin = f" from {self.init_from}" if self.init_from else ""
         return (
-            f"Full model {self.full_steps} steps, then every row (the full model as well) {self.steps} steps more from "
-            f"it, at a learning rate of {self.lr:g}, with the same batches. "
+            f"Full model {self.full_steps} steps{begin}, then every row (the full model as well) {self.steps} steps "
+            f"more from it, at a learning rate of {self.lr:g}, with the same batches. "
             f"{done} of {self.seeds} seeds complete;{diverged} mean ± 95 % confidence interval over "
             "seeds (Student's t; none for one seed). Seeds differ in weights and training batches; all see the same "
             "held-out scenes, so the intervals say nothing of other scenes. Every difference is judged by itself: "
@@ -224,14 +230,6 @@ class Ablation:
             "and LPIPS of VGG; compare orders, not values. LPIPS is not measured while training: vg2gt "
             "evaluate ckpt=RUN has it, if its weights are there."
         )
-
-
-def _without_last_layer(start: Path, path: Path) -> Path:
-    """A checkpoint whose Gaussian head lacks its last layer, so that ``init_from`` starts that one anew."""
-    state = read_checkpoint(start)["state_dict"]
-    kept = {name: tensor for name, tensor in state.items() if not name.startswith(LAST_LAYER)}
-    write_checkpoint({"state_dict": kept}, path)
-    return path
 
 
 def _label(name: str) -> str:
@@ -325,4 +323,5 @@ def _study(config: DictConfig) -> Ablation:
         config.lr,
         list(config.variants),
         list(config.splits),
+        config.init_from,
     )

@@ -6,7 +6,7 @@ import gc
 import hashlib
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from torch import Tensor
 from vg2gt.config import compose, flatten
 from vg2gt.evaluation.tables import Metric, markdown_table, number
 from vg2gt.io.files import read_json, write_json, write_text
-from vg2gt.runs.checkpoints import newest_valid, read_checkpoint
+from vg2gt.runs.checkpoints import newest_valid, read_checkpoint, write_checkpoint
 from vg2gt.runs.trust import read_run_config
 from vg2gt.training.loop import build, evaluate, train
 
@@ -135,6 +135,13 @@ def final_checkpoint(folder: Path, steps: int) -> Path:
             f"{folder} ran {steps} steps, but its newest valid checkpoint is that of step {reached}: delete the "
             "folder, and the run is repeated"
         )
+    return path
+
+
+def write_part(start: Path, path: Path, keep: Callable[[str], bool]) -> Path:
+    """A checkpoint of the tensors whose names ``keep`` accepts, for ``init_from``: all others start anew."""
+    state = read_checkpoint(start)["state_dict"]
+    write_checkpoint({"state_dict": {name: tensor for name, tensor in state.items() if keep(name)}}, path)
     return path
 
 
