@@ -1,13 +1,13 @@
-"""VG²GT against the baselines: ``python benchmarks/baselines.py [steps=N] [seeds=N] [coarse=FILE] [models=A,B] [...]``.
+"""VG²GT against the baselines: ``python benchmarks/baselines.py [steps=N] [seeds=N] [overrides of train.yaml]``.
 
 Every model is trained from scratch for the same number of steps on the same backbone, losses, batches and machine, and
 evaluated on the same held-out scenes: VG²GT, VG²GT with finer voxels (about 40 % of the pixel-aligned Gaussians), VG²GT
 without its coarse module (which separates the voxels' part from the enhanced geometry's), one Gaussian per pixel, pixel
 Gaussians merged by voxels, and the coloured points, which need no training. ``coarse=`` names a checkpoint whose coarse
 module, and nothing else, the models that have one begin with, at ``training.coarse_lr_factor=0.3``. ``models=`` takes
-only some, by the names of their folders. Finished trainings are not repeated, interrupted ones go on. Writes runs,
-``metrics.json``, ``metrics.md`` and ``models.png`` into ``outputs/<name>``; name=baselines. All else overrides
-``train.yaml``.
+only some, by the names of their folders. With ``shared=``, the folder of the reference data, all are also evaluated on
+its recordings, which none was trained on. Finished trainings are not repeated, interrupted ones go on. Writes runs,
+``metrics.json``, ``metrics.md`` and ``models.png`` into ``outputs/<name>``; name=baselines.
 """
 
 from __future__ import annotations
@@ -18,9 +18,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from common import machine
+from common import RECORDINGS, evaluation_scenes, machine
 from stage_clock import StageClock
 
+from vg2gt.evaluation import evaluate_scene
 from vg2gt.evaluation.protocols import ground_truth_target_cameras
 from vg2gt.evaluation.tables import Metric, columns
 from vg2gt.io.files import write_json, write_text
@@ -39,7 +40,7 @@ from vg2gt.studies.study import (
 from vg2gt.training.loop import Run, build
 from vg2gt.types import Batch
 
-DEFAULTS = {"name": "baselines", "steps": "400", "seeds": "1", "coarse": "", "models": ""}
+DEFAULTS = {"name": "baselines", "steps": "400", "seeds": "1", "coarse": "", "models": "", "shared": ""}
 COARSE = "model.coarse."
 REFERENCE = "VG²GT"
 MAX_ERROR = 0.1  # relative depth error shown as white
@@ -51,6 +52,9 @@ COLUMNS = columns(
     "reconstruction_seconds": Metric("all, core-s", 2, False),
     "render_seconds": Metric("render a view, core-s", 3, False),
 }
+
+
+ON_RECORDINGS = columns("psnr", "ssim", "rmse", "abs_rel", "decoded_abs_rel", "normal_mean", "gaussians")
 
 
 @dataclass(frozen=True)
@@ -120,6 +124,17 @@ def truth(batch: Batch) -> list[torch.Tensor]:
     return [batch.target.images[0, 0], colorize_depth(true, near, far), torch.zeros_like(batch.target.images[0, 0])]
 
 
+@torch.no_grad()
+def on_recordings(run: Run, shared: str) -> dict[str, Metrics]:
+    """A trained model's means over the windows of each recording."""
+    found: dict[str, Metrics] = {}
+    for name, overrides in RECORDINGS.items() if shared else ():
+        scenes = evaluation_scenes(overrides.format(shared=shared))
+        rows = [evaluate_scene(run.module.model, run.module.renderer, scene.to(run.module.device)) for scene in scenes]
+        found[name] = {metric: sum(row[metric] for row in rows) / len(rows) for metric in rows[0]}
+    return found
+
+
 def chosen(names: str) -> dict[str, Model]:
     """The models of ``models=``, or all."""
     folders = [model.folder for model in MODELS.values()]
@@ -137,16 +152,25 @@ def coarse_start(path: str, home: Path) -> tuple[str, ...]:
     return f"init_from={quoted(start)}", "training.coarse_lr_factor=0.3"
 
 
-def report(results: Mapping[str, Mapping[int, Metrics]], options: Mapping[str, str]) -> str:
-    """The table as Markdown."""
+Results = dict[str, dict[int, Metrics]]  # by model and seed
+
+
+def report(results: Results, recordings: Mapping[str, Results], options: Mapping[str, str]) -> str:
+    """The tables as Markdown."""
     trained_first = " after a coarse module trained first and alone" if options["coarse"] else ""
     protocol = (
         f"{options['steps']} training steps each, {options['seeds']} seed(s){trained_first} (mean ± 95 % confidence "
         "interval where there are several). Scenes never trained on, held-out views at ground-truth poses, rendered as "
         "stochastic solids, depth aligned by one median scale per scene. Times: best of three passes on one scene."
     )
-    table = seeds_table({name: runs for name, runs in results.items() if runs}, COLUMNS)
-    return f"# VG²GT and baselines\n\n{protocol}\n\n{table}\n"
+    parts = ["# VG²GT and baselines", protocol, seeds_table(_measured(results), COLUMNS)]
+    for name, found in recordings.items():
+        parts += [f"## {name}, never trained on", seeds_table(_measured(found), ON_RECORDINGS)]
+    return "\n\n".join(parts) + "\n"
+
+
+def _measured(results: Results) -> Results:
+    return {name: runs for name, runs in results.items() if runs}
 
 
 def main() -> None:
@@ -163,7 +187,8 @@ def main() -> None:
             overrides.append(argument)
     home = Path("outputs").resolve() / options["name"]
     models, begin = chosen(options["models"]), coarse_start(options["coarse"], home)
-    results: dict[str, dict[int, Metrics]] = {name: {} for name in models}
+    results: Results = {name: {} for name in models}
+    recordings: dict[str, Results] = {}
     rows: list[list[torch.Tensor]] = []
     for seed in range(int(options["seeds"])):
         for name, model in models.items():
@@ -174,6 +199,8 @@ def main() -> None:
             metrics = run_once([*mine, *model.overrides], folder)
             run, batch = restore(model, mine, int(steps), folder)
             results[name][seed] = metrics | costs(run, batch)
+            for recording, found in on_recordings(run, options["shared"]).items():
+                recordings.setdefault(recording, {}).setdefault(name, {})[seed] = found
             if seed == 0:
                 rows = rows or [truth(batch)]
                 rows.append(panels(run, batch))
@@ -182,12 +209,13 @@ def main() -> None:
                 "options": options,
                 "overrides": overrides,
                 "machine": machine(run.module.device),
-                "runs": {key: {str(s): m for s, m in runs.items()} for key, runs in results.items()},
+                "runs": results,
                 "summary": summarize(results, REFERENCE),
+                "recordings": recordings,
             }
             write_json(home / "metrics.json", content)
-            write_text(home / "metrics.md", report(results, options))
-    print(report(results, options))
+            write_text(home / "metrics.md", report(results, recordings, options))
+    print(report(results, recordings, options))
     print(f"rows of models.png: truth, {', '.join(models)}; colour, depth, relative depth error")
     print(f"metrics: {home / 'metrics.json'}")
 

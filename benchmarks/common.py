@@ -7,18 +7,26 @@ import ctypes
 import os
 import platform
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from datetime import date
 from pathlib import Path
 from typing import Any
 
 import torch
+from hydra.utils import instantiate
 from torch import Tensor
 
+from vg2gt.config import compose
 from vg2gt.io.files import write_json
 from vg2gt.training.loop import Run
 from vg2gt.types import Batch
 
+# Real scenes that nothing here was trained on, as trainings evaluate theirs: 8 input views at the given poses.
+RECORDINGS = {
+    "HoloLens office": "data=rgbd data.root={shared}/hololens_office_a data.image_size=[112,168]",
+    "7-Scenes kitchen": "data=rgbd data.root={shared}/seven_scenes_redkitchen_a_registered data.image_size=[112,168]"
+    " data.eval_window=19",
+}
 RESULTS = Path(__file__).resolve().parent / "results"
 MEGABYTE = 1e6
 
@@ -57,6 +65,13 @@ def parser(
 def dated(folder: Path, name: str) -> Path:
     """Where today's results of a name go."""
     return folder / f"{date.today().isoformat()}-{name}.json"
+
+
+def evaluation_scenes(overrides: str) -> Iterator[Batch]:
+    """The scenes, or windows of a recording, on which a data configuration is evaluated."""
+    data = instantiate(compose("train", *overrides.split()).data)
+    data.setup("validate")
+    yield from data.val_dataloader()
 
 
 def write_results(folder: Path, name: str, content: Mapping[str, Any]) -> Path:

@@ -9,36 +9,20 @@ recordings. Prints a table and writes a dated JSON file.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import torch
-from common import machine, parser, write_results
-from hydra.utils import instantiate
+from common import RECORDINGS, evaluation_scenes, machine, parser, write_results
 from torch import Tensor
 
-from vg2gt.config import compose
 from vg2gt.evaluation.tables import print_table
 from vg2gt.geometry.cameras import project, unproject
 from vg2gt.metrics import near_depth_edges
 from vg2gt.runs.load import load_model
-from vg2gt.types import Batch, Cameras
+from vg2gt.types import Cameras
 
-SETS = {
-    "16 rooms": "data=synthetic data.image_size=[112,224]",
-    "HoloLens office": "data=rgbd data.root={shared}/hololens_office_a data.image_size=[112,168]",
-    "7-Scenes kitchen": "data=rgbd data.root={shared}/seven_scenes_redkitchen_a_registered data.image_size=[112,168]"
-    " data.eval_window=19",
-}
+SETS = {"16 rooms": "data=synthetic data.image_size=[112,224]"} | RECORDINGS
 SAME = 0.03  # relative difference of depth up to which another view sees the same point
-
-
-def batches(overrides: str) -> Iterator[Batch]:
-    """The input views of the evaluation of a data configuration."""
-    data = instantiate(compose("train", *overrides.split()).data)
-    data.setup("validate")
-    for batch in data.val_dataloader():
-        yield batch.context
 
 
 def seen_by_others(depth: Tensor, cameras: Cameras) -> Tensor:
@@ -91,7 +75,8 @@ def main() -> None:
         if "{shared}" in overrides and options.shared is None:
             continue
         sums: dict[str, Tensor] = {}
-        for batch in batches(overrides.format(shared=options.shared)):
+        for scene in evaluation_scenes(overrides.format(shared=options.shared)):
+            batch = scene.context
             prediction, truth = model(batch.images, batch.hints), batch.depth[0]
             errors = [relative_error(g.depth[0], truth) for g in (prediction.initial, prediction.geometry)]
             count = (truth > 0).sum()

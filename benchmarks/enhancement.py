@@ -13,33 +13,19 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import torch
-from common import machine, parser, write_results
-from hydra.utils import instantiate
+from common import RECORDINGS, evaluation_scenes, machine, parser, write_results
 from torch import Tensor, nn
 
 from backends.oracle import OracleBackend
 from vg2gt import load_model
-from vg2gt.config import compose
 from vg2gt.metrics import depth_metrics
 from vg2gt.model import VG2GT
 from vg2gt.types import Batch
 from vg2gt.voxels import CoarseModule, PTv3
 from vg2gt.voxels.surface import SURFACE_CHANNELS
 
-SETS = {
-    "rooms": "data=synthetic data.eval_scenes={scenes}",
-    "HoloLens office": "data=rgbd data.root={shared}/hololens_office_a data.image_size=[112,168]",
-    "7-Scenes kitchen": "data=rgbd data.root={shared}/seven_scenes_redkitchen_a_registered data.image_size=[112,168]"
-    " data.eval_window=19",
-}
+SETS = {"rooms": "data=synthetic data.eval_scenes={scenes}"} | RECORDINGS
 VARIANTS = ("before", "after", "PTv3's features averaged", "no surface evidence")
-
-
-def batches(overrides: str) -> list[Batch]:
-    """The input views of a data configuration's evaluation."""
-    data = instantiate(compose("train", *overrides.split()).data)
-    data.setup("validate")
-    return [batch.context for batch in data.val_dataloader()]
 
 
 def fused_inputs(model: VG2GT, variant: str) -> tuple[slice, bool]:
@@ -105,7 +91,8 @@ def main() -> None:
     for name, overrides in SETS.items():
         if "{shared}" in overrides and options.shared is None:
             continue
-        scenes = batches(overrides.format(shared=options.shared, scenes=options.scenes))
+        data = overrides.format(shared=options.shared, scenes=options.scenes)
+        scenes = [scene.context for scene in evaluation_scenes(data)]
         table[name] = {}
         for noise in options.noise:
             backend.depth_noise, backend.pose_noise = noise, 0.1 * noise
