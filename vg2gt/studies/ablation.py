@@ -1,10 +1,10 @@
 """The paper's ablations on our data: ``vg2gt ablate [seeds=N] [steps=N] [any override of train.yaml ...]``.
 
 As in the paper (appendix, Model Evaluation) no variant is trained from scratch. For every seed one full model is
-trained (``init_from`` is what it begins with); each variant starts from it and goes on for ``steps`` steps, and so does the full model itself, so that nobody
-is ahead by training longer. All continuations of a seed see the same batches and are evaluated on the same held-out
-views, so differences to the full model are taken seed by seed. Only the last layer starts anew where the number of
-splits changes; a control continues the full model with a new last layer as well.
+trained, from scratch or from ``init_from``; each variant starts from it and goes on for ``steps`` steps, and so does
+the full model itself, so that nobody is ahead by training longer. All continuations of a seed see the same batches and
+are evaluated on the same held-out views, so differences to the full model are taken seed by seed. Only the last layer
+starts anew where the number of splits changes; a control continues the full model with a new last layer as well.
 
 Finished runs are never repeated, interrupted ones go on; a run that diverges is named and the others are run all the
 same. Writes ``metrics.json`` and ``metrics.md`` into ``outputs/<name>``, after every run.
