@@ -52,8 +52,6 @@ COLUMNS = columns(
     "reconstruction_seconds": Metric("all, core-s", 2, False),
     "render_seconds": Metric("render a view, core-s", 3, False),
 }
-
-
 ON_RECORDINGS = columns("psnr", "ssim", "rmse", "abs_rel", "decoded_abs_rel", "normal_mean", "gaussians")
 
 
@@ -148,6 +146,8 @@ def coarse_start(path: str, home: Path) -> tuple[str, ...]:
     if not path:
         return ()
     home.mkdir(parents=True, exist_ok=True)
+    if not any(name.startswith(COARSE) for name in read_checkpoint(path)["state_dict"]):
+        raise SystemExit(f"coarse={path}: this checkpoint has no coarse module; take one of experiment=sweep_coarse")
     start = write_part(Path(path), home / "coarse.ckpt", lambda name: name.startswith(COARSE))
     return f"init_from={quoted(start)}", "training.coarse_lr_factor=0.3"
 

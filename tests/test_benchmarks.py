@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from tests.commands import run_python
-from vg2gt.runs.checkpoints import read_checkpoint
+from vg2gt.runs.checkpoints import read_checkpoint, write_checkpoint
 
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 TINY = ["data.image_size=[56,112]", "data.train_scenes=1", "data.eval_scenes=1"]
@@ -110,11 +110,16 @@ def test_baselines(tmp_path: Path) -> None:
     assert not (begun / "seed-0" / "wo_coarse" / "start.json").exists()
 
 
-def test_baselines_name_a_model_that_is_not_there(tmp_path: Path) -> None:
+def test_baselines_name_what_is_not_there(tmp_path: Path) -> None:
+    write_checkpoint({"state_dict": {"model.gaussians.x": torch.ones(1)}}, tmp_path / "other.ckpt")
     script = f"import sys; sys.path.insert(0, {str(BENCHMARKS)!r}); import baselines; baselines.main()"
-    shown = run_python(script, "models=vg2gt,pixel", folder=tmp_path)
-    assert shown.returncode != 0
-    assert "models=vg2gt,pixel: no model pixel; there are vg2gt, vg2gt_fine, wo_coarse" in shown.stderr
+    for argument, message in {
+        "models=vg2gt,pixel": "models=vg2gt,pixel: no model pixel; there are vg2gt, vg2gt_fine, wo_coarse",
+        "coarse=other.ckpt": "coarse=other.ckpt: this checkpoint has no coarse module",
+    }.items():
+        shown = run_python(script, argument, folder=tmp_path)
+        assert shown.returncode != 0
+        assert message in shown.stderr
 
 
 @pytest.mark.slow
