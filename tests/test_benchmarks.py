@@ -110,6 +110,17 @@ def test_baselines(tmp_path: Path) -> None:
     assert not (begun / "seed-0" / "wo_coarse" / "start.json").exists()
 
 
+@pytest.mark.slow
+def test_baselines_on_recordings(tmp_path: Path, shared: Path) -> None:
+    data = f"shared={shared / 'data'}"
+    run("baselines.py", tmp_path, "name=real", "models=pointcloud", data, "backend=sweep", *TINY, *QUIET)
+    home = tmp_path / "outputs" / "real"
+    recordings = json.loads((home / "metrics.json").read_text())["recordings"]
+    assert set(recordings) == {"HoloLens office", "7-Scenes kitchen"}
+    assert recordings["HoloLens office"]["coloured points"]["0"]["gaussians"] == 8 * 112 * 168
+    assert "## 7-Scenes kitchen, never trained on" in (home / "metrics.md").read_text()
+
+
 def test_baselines_name_what_is_not_there(tmp_path: Path) -> None:
     write_checkpoint({"state_dict": {"model.gaussians.x": torch.ones(1)}}, tmp_path / "other.ckpt")
     script = f"import sys; sys.path.insert(0, {str(BENCHMARKS)!r}); import baselines; baselines.main()"

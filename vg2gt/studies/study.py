@@ -139,7 +139,16 @@ def final_checkpoint(folder: Path, steps: int) -> Path:
 
 
 def write_part(start: Path, path: Path, keep: Callable[[str], bool]) -> Path:
-    """A checkpoint of the tensors whose names ``keep`` accepts, for ``init_from``: all others start anew."""
+    """Writes a checkpoint of some tensors for ``init_from``: a model that begins with it has all others anew.
+
+    Args:
+        start: checkpoint whose ``state_dict`` is taken; optimiser state and step are not.
+        path: the new checkpoint, replaced if it is there.
+        keep: says of a tensor's name, such as ``model.coarse.out.weight``, whether it is kept.
+
+    Returns:
+        ``path``.
+    """
     state = read_checkpoint(start)["state_dict"]
     write_checkpoint({"state_dict": {name: tensor for name, tensor in state.items() if keep(name)}}, path)
     return path
