@@ -12,13 +12,12 @@ its recordings, which none was trained on. Finished trainings are not repeated, 
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from common import RECORDINGS, evaluation_scenes, machine
+from common import RECORDINGS, evaluation_scenes, machine, settings
 from stage_clock import StageClock
 
 from vg2gt.evaluation import evaluate_scene
@@ -175,16 +174,7 @@ def _measured(results: Results) -> Results:
 
 def main() -> None:
     """Trains whatever is not trained, measures and writes."""
-    options, overrides = dict(DEFAULTS), []
-    for argument in sys.argv[1:]:
-        key, _, value = argument.partition("=")
-        if key in ("-h", "--help"):
-            print(__doc__)
-            return
-        if key in options:
-            options[key] = value
-        else:
-            overrides.append(argument)
+    options, overrides = settings(__doc__, DEFAULTS)
     home = Path("outputs").resolve() / options["name"]
     models, begin = chosen(options["models"]), coarse_start(options["coarse"], home)
     results: Results = {name: {} for name in models}

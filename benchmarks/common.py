@@ -6,6 +6,7 @@ import argparse
 import ctypes
 import os
 import platform
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from datetime import date
@@ -60,6 +61,25 @@ def parser(
     if overrides is not None:
         made.add_argument("overrides", nargs="*", help=overrides)
     return made
+
+
+def settings(doc: str | None, defaults: Mapping[str, str]) -> tuple[dict[str, str], list[str]]:
+    """The command line of a study: its own ``key=value`` pairs over their defaults, and all else, which is Hydra's.
+
+    Raises:
+        SystemExit: after printing ``doc`` where help is asked for.
+    """
+    own, overrides = dict(defaults), []
+    for argument in sys.argv[1:]:
+        key, _, value = argument.partition("=")
+        if key in ("-h", "--help"):
+            print(doc)
+            raise SystemExit(0)
+        if key in own:
+            own[key] = value
+        else:
+            overrides.append(argument)
+    return own, overrides
 
 
 def dated(folder: Path, name: str) -> Path:

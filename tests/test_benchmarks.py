@@ -134,6 +134,42 @@ def test_baselines_name_what_is_not_there(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_counts(tmp_path: Path) -> None:
+    """Sizes at which nothing is learnt; the number of the model without its coarse module follows the other's."""
+    arguments = ["steps=1", "name=short", *TINY, *QUIET]
+    run("baselines.py", tmp_path, *arguments, "models=vg2gt,pixel_aligned")
+    home = tmp_path / "outputs" / "short"
+    before = (home / "seed-0" / "vg2gt" / "metrics.json").stat().st_mtime_ns
+    shown = run("counts.py", tmp_path, *arguments)
+    assert (home / "seed-0" / "vg2gt" / "metrics.json").stat().st_mtime_ns == before
+    content = json.loads((home / "counts.json").read_text())
+    full, without, widened = content["equal"].values()
+    assert abs(widened["0"]["gaussians"] / full["0"]["gaussians"] - 1) < 0.05 or "NOT EQUAL" in shown
+    assert without["0"]["gaussians"] != widened["0"]["gaussians"]
+    curve = {(k, px): metrics["gaussians"] for k, cells in content["curve"].items() for px, metrics in cells.items()}
+    assert set(curve) == {
+        ("1", "2.02"),
+        ("1", "3.1"),
+        ("2", "2.02"),
+        ("2", "3.1"),
+        ("2", "4.5"),
+        ("4", "3.1"),
+        ("4", "4.5"),
+    }
+    assert curve["4", "4.5"] > curve["2", "4.5"]
+    assert (home / "counts.png").stat().st_size > 1000
+
+
+def test_cells_are_found_for_a_number_of_gaussians(benchmark_script) -> None:
+    """Numbers that fall as a power of the cell's edge, and ones that nothing changes."""
+    counts = benchmark_script("counts")
+    edge = counts.footprint_for(20_000, lambda pixels: 300_000 / pixels**1.7, 3.1)
+    assert 300_000 / edge**1.7 == pytest.approx(20_000, rel=0.01)
+    with pytest.raises(ValueError, match="no edge gives 20000 Gaussians within 1%"):
+        counts.footprint_for(20_000, lambda pixels: 50_000.0, 3.1)
+
+
+@pytest.mark.slow
 def test_memory(tmp_path: Path) -> None:
     run("memory.py", tmp_path, "--models", "tiny", "--out", str(tmp_path))
     (written,) = tmp_path.glob("*-memory-cpu.json")

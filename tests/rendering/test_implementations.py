@@ -1,6 +1,7 @@
 """Every implementation held to the dense float64 reference, in value and in gradient."""
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -26,6 +27,7 @@ from vg2gt.rendering.options import DepthKind, Mode
 from vg2gt.rendering.renderer import Implementation
 
 FAST = ("torch", "cpu")
+FIELDS = (*PARAMETERS, "batch")
 
 
 @pytest.mark.parametrize("degree", [0, 2])
@@ -48,6 +50,41 @@ def test_deep_translucent_rays_equal_the_reference(implementation: Implementatio
         for name in ("dense", implementation)
     )
     assert_same_render(found, expected)
+
+
+@pytest.mark.parametrize("options", [{"near": 2.6}, {"newton_steps": 0}])
+@pytest.mark.parametrize("implementation", FAST)
+def test_the_search_for_the_median_equals_the_reference(
+    implementation: Implementation, options: dict[str, Any]
+) -> None:
+    """Where Gaussians reach through the near plane, and by bisections alone."""
+    gaussians, cameras = soup(80, seed=3, size=0.3), pinhole((20, 24))
+    expected, found = (
+        render_with_gradients(gaussians, cameras, implementation=name, bisections=45, **options)
+        for name in ("dense", implementation)
+    )
+    depth = expected[0].depth
+    assert (depth > 0).float().mean() > 0.2
+    if "near" in options:
+        without = render(gaussians, cameras, implementation="dense", bisections=45, near=0.01)
+        assert ((depth == 0) & (without.depth > 0)).any()
+    assert_same_render(found, expected, atol=1e-10)
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 2e-6)])
+@pytest.mark.parametrize("opacity", [0.1, 0.3, 0.6])
+def test_the_compiled_search_crosses_gaps(opacity: float, dtype: torch.dtype, tolerance: float) -> None:
+    """A translucent wall, and one forty times as far: between them nothing tells where the median is."""
+    near, cameras = wall(2000, (32, 48))
+    far = replace(near, means=40 * near.means, scales=near.scales * torch.tensor([40.0, 40.0, 1.0]))
+    both = replace(near, **{name: torch.cat((getattr(near, name), getattr(far, name))) for name in FIELDS})
+    both = replace(both, opacities=opacity * both.opacities)
+    exact = render(both, cameras, implementation="torch", bisections=60).depth
+    found = render(floats_to(both, dtype), floats_to(cameras, dtype), implementation="cpu").depth
+    there = exact > 0
+    assert there.float().mean() > 0.6
+    assert torch.equal(found > 0, there)
+    assert ((found - exact).abs() / exact)[there].max() < tolerance
 
 
 @pytest.mark.parametrize("implementation", FAST)

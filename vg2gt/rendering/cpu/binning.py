@@ -38,19 +38,21 @@ def radix_order(keys, bits):
 
 
 @kernel(error_model="numpy", nogil=True)
-def count_tiles(boxes, visible, across, counts, offsets, starts):
-    """Counts tiles per Gaussian (offsets in the given depth order) and Gaussians per tile (as list starts)."""
+def count_tiles(boxes, across, counts, offsets, starts):
+    """Counts tiles per Gaussian (as offsets in their order) and Gaussians per tile (as list starts)."""
     for k in range(len(starts)):
         starts[k] = 0
     total = 0
-    for i in visible:
+    for i in range(len(boxes)):
+        counts[i], offsets[i] = 0, total
+        if boxes[i, 1] <= boxes[i, 0]:
+            continue
         x0, x1 = boxes[i, 0] >> TILE_BITS, (boxes[i, 1] - 1) >> TILE_BITS
         y0, y1 = boxes[i, 2] >> TILE_BITS, (boxes[i, 3] - 1) >> TILE_BITS
         for y in range(y0, y1 + 1):
             for x in range(x0, x1 + 1):
                 starts[y * across + x + 1] += 1
         counts[i] = (x1 - x0 + 1) * (y1 - y0 + 1)
-        offsets[i] = total
         total += counts[i]
     for k in range(len(starts) - 1):
         starts[k + 1] += starts[k]
@@ -58,18 +60,17 @@ def count_tiles(boxes, visible, across, counts, offsets, starts):
 
 @kernel(error_model="numpy", nogil=True)
 def fill_tiles(boxes, visible, across, offsets, starts, members, places):
-    """Writes the tiles' lists, front to back, and every Gaussian's places in them (adjoining, from its offset)."""
+    """Writes the tiles' lists, front to back, and the place of each entry among its Gaussian's, from its offset on."""
     ends = np.empty(len(starts) - 1, np.int64)
     for k in range(len(ends)):
         ends[k] = starts[k]
     for i in visible:
-        slot = offsets[i]
+        place = offsets[i]
         x0, x1 = boxes[i, 0] >> TILE_BITS, (boxes[i, 1] - 1) >> TILE_BITS
         y0, y1 = boxes[i, 2] >> TILE_BITS, (boxes[i, 3] - 1) >> TILE_BITS
         for y in range(y0, y1 + 1):
             for x in range(x0, x1 + 1):
                 position = ends[y * across + x]
-                members[position] = i
-                places[slot] = position
+                members[position], places[position] = i, place
                 ends[y * across + x] = position + 1
-                slot += 1
+                place += 1

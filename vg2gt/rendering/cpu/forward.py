@@ -1,10 +1,11 @@
 """Compiled forward pass over tiles of 16 x 16 pixels.
 
-A tile's Gaussians are visited front to back; each touches the rows of its exact box, and a row of 16 pixels is one
+A tile's Gaussians are visited front to back; each touches some of the tile's blocks of 4 x 4 pixels, and a block is one
 vector operation: the innermost loops have a fixed length and no branch, so that they vectorise. All state of a tile
 lies in planes of one flat scratch array, whose offsets are constants: with several arrays the compiler would have to
-guard every loop against overlap. Rays are stopped by the sign of their transmittance. Kernels are generic in the dtype:
-constants exact in float32 do not change the type they meet, others come in as an array.
+guard every loop against overlap. Rays are stopped by the sign of their transmittance. For the median depth every block
+keeps the hits of its rays, a hit for all 16 at once, with opacity 0 where a ray is not touched. Kernels are generic in
+the dtype: constants exact in float32 do not change the type they meet, others come in as an array.
 """
 
 # Written for the compiler: flat bodies, short names from rendering/projection.py's formulas.
@@ -21,22 +22,38 @@ from vg2gt.io.compiled import kernel
 from vg2gt.rendering.cpu import planes
 from vg2gt.rendering.cpu.constants import BIG, FAST, FOUR, HALF, ONE, QUARTER, TWO, ZERO
 from vg2gt.rendering.cpu.response import attenuate, exp, respond
-from vg2gt.rendering.cpu.tiles import HIT_SIZE, PLANE, STAGED, TILE, any_alive, stage, start_rays
+from vg2gt.rendering.cpu.tiles import (
+    BLOCKS,
+    BLOCKS_ACROSS,
+    HIT_SIZE,
+    LANES,
+    PLANE,
+    SIDE,
+    STAGED,
+    TILE,
+    any_alive,
+    any_positive,
+    place_of,
+    stage,
+    start_rays,
+)
+
+COLUMN, ROW_BITS = np.int32(SIDE - 1), np.int32(2)  # of a lane: lane & COLUMN, lane >> ROW_BITS
 
 
-def _make_blend_tile(geometry: bool) -> Callable[..., Any]:
-    """Compiles the blending of a tile with or without depth and normals: within it that is a constant."""
+def _make_blend_tile(geometry: bool, solid: bool) -> Callable[..., Any]:
+    """Compiles the blending of a tile with or without depth and normals: within it these are constants."""
 
     @kernel(fastmath=FAST, error_model="numpy", nogil=True)
-    def blend_tile(records, colors, boxes, members, x_tile, y_tile, solid, parameters, state, hits, staged, spans):
-        """Blends one tile front to back; returns the largest number of hits kept for the depth solver."""
+    def blend_tile(records, colors, boxes, members, x_tile, y_tile, parameters, state, hits, counts, staged, spans):
+        """Blends one tile front to back; leaves the numbers of hits that the blocks had for the depth solver."""
         alpha_max, stop, negligible = parameters[0], parameters[1], parameters[4]
-        capacity = len(hits) // (TILE * HIT_SIZE)
-        last_slot = np.int32(capacity - 1)
+        capacity = len(hits) // (BLOCKS * HIT_SIZE)
+        alive = np.empty(BLOCKS, np.bool_)
         for p in range(len(members)):
             j = p % STAGED
             if j == 0:
-                if not any_alive(state):
+                if not any_alive(state, alive):
                     break
                 stage(records, colors, boxes, members[p : p + STAGED], x_tile, y_tile, staged, spans)
             g = staged[j]
@@ -44,217 +61,219 @@ def _make_blend_tile(geometry: bool) -> Callable[..., Any]:
             a0, eps, opacity, cutoff = g[8], g[9], g[10], g[11]
             n0, n1, n2 = g[12], g[13], g[14]
             c0, c1, c2 = g[16], g[17], g[18]
-            left = np.float32(x_tile) - uc
-            first, last, top, bottom = spans[j, 0], spans[j, 1], spans[j, 2], spans[j, 3]
-            for y in range(top, bottom):
-                dy = np.float32(y_tile + y) - vc
-                s_row, e_row, f_row = ONE + q1 * dy, qc * dy * dy, TWO * qb * dy
-                base = np.uintp(y * TILE)
-                for lane in range(TILE):
-                    k = base + np.uintp(lane)
-                    dx = left + np.float32(lane)
-                    before = state[k]
-                    e, s, r, on = respond(dx, before, (qa, q0, eps, cutoff), s_row, e_row, f_row)
-                    if geometry:
-                        r = r if on else ONE
-                        inverse = ONE / r
-                        exponent = -HALF * e * inverse
-                    else:
-                        exponent = -HALF * e / r
-                    alpha, after, state[k] = attenuate(exponent, on, before, opacity, alpha_max, stop)
-                    weight = alpha * before  # paper, eqn 3dgs_render_preliminary
-                    state[k + planes.C0] += weight * c0
-                    state[k + planes.C1] += weight * c1
-                    state[k + planes.C2] += weight * c2
-                    if geometry:
-                        peak, precision = z * s * inverse, a0 * r
-                        state[k + planes.N0] += weight * n0
-                        state[k + planes.N1] += weight * n1
-                        state[k + planes.N2] += weight * n2
-                        state[k + planes.MEAN] += weight * peak
-                        crossing = (alpha > ZERO) & (before > HALF) & (after <= HALF)
-                        median = state[k + planes.MEDIAN]
-                        state[k + planes.MEDIAN] = peak if crossing else median
-                        state[k + planes.ALPHA] = alpha
-                        state[k + planes.PEAK] = peak
-                        state[k + planes.PRECISION] = precision
-                        # the median is in front of HI: a hit that begins far behind does not matter to it
-                        early = before > QUARTER
-                        hi = state[k + planes.HI]
-                        hi = max(hi, peak if early & (alpha > ZERO) else ZERO)
-                        state[k + planes.HI] = hi
-                        beyond = peak - hi
-                        near_enough = (beyond <= ZERO) | (precision * beyond * beyond <= negligible)
-                        matters = (alpha > ZERO) & (early | near_enough)
-                        slot = state[k + planes.COUNT]
-                        state[k + planes.SLOT] = slot
-                        state[k + planes.COUNT] = slot + (ONE if matters else ZERO)
-            if not (geometry and solid):
-                continue
-            for y in range(top, bottom):  # a loop of its own: reading what was just written as a vector would stall
-                base = np.uintp(y * TILE)
-                for lane in range(first, last):  # no branch: what does not matter is overwritten by the next hit
-                    k = base + np.uintp(lane)
-                    slot = min(np.int32(state[k + planes.SLOT]), last_slot) + y * capacity
-                    place = np.uintp(slot) * planes.HIT + np.uintp(lane)
-                    hits[place] = state[k + planes.ALPHA]
-                    hits[place + planes.HIT_PEAK] = state[k + planes.PEAK]
-                    hits[place + planes.HIT_PRECISION] = state[k + planes.PRECISION]
-        most = ZERO * state[0]
-        for k in range(PLANE):
-            most = max(most, state[np.uintp(k) + planes.COUNT])
-        return np.int64(most)
+            for row in range(spans[j, 2], spans[j, 3]):
+                top = np.float32(y_tile + row * SIDE) - vc
+                for column in range(spans[j, 0], spans[j, 1]):
+                    block = row * BLOCKS_ACROSS + column
+                    if not alive[block]:
+                        continue
+                    left = np.float32(x_tile + column * SIDE) - uc
+                    base = np.uintp(block * LANES)
+                    slot = min(counts[block], capacity - 1) if solid else 0
+                    place = np.uintp((block * capacity + slot) * HIT_SIZE)
+                    for lane in range(LANES):
+                        k = base + np.uintp(lane)
+                        dx = left + np.float32(np.int32(lane) & COLUMN)
+                        dy = top + np.float32(np.int32(lane) >> ROW_BITS)
+                        before = state[k]
+                        s_row, e_row, f_row = ONE + q1 * dy, qc * dy * dy, TWO * qb * dy
+                        e, s, r, on = respond(dx, before, (qa, q0, eps, cutoff), s_row, e_row, f_row)
+                        if geometry:
+                            r = r if on else ONE
+                            inverse = ONE / r
+                            exponent = -HALF * e * inverse
+                        else:
+                            exponent = -HALF * e / r
+                        alpha, after, state[k] = attenuate(exponent, on, before, opacity, alpha_max, stop)
+                        weight = alpha * before  # paper, eqn 3dgs_render_preliminary
+                        state[k + planes.C0] += weight * c0
+                        state[k + planes.C1] += weight * c1
+                        state[k + planes.C2] += weight * c2
+                        if geometry:
+                            peak = z * s * inverse
+                            state[k + planes.N0] += weight * n0
+                            state[k + planes.N1] += weight * n1
+                            state[k + planes.N2] += weight * n2
+                            crossing = (alpha > ZERO) & (before > HALF) & (after <= HALF)
+                            median = state[k + planes.MEDIAN]
+                            state[k + planes.MEDIAN] = peak if crossing else median
+                            if solid:
+                                precision = a0 * r
+                                lo, thin = state[k + planes.LO], state[k + planes.THIN]
+                                state[k + planes.LO] = min(lo, peak if alpha > ZERO else BIG)
+                                state[k + planes.THIN] = min(thin, precision if alpha > ZERO else BIG)
+                                # the median is in front of HI: a hit that begins far behind does not matter to it
+                                early = before > QUARTER
+                                hi = state[k + planes.HI]
+                                hi = max(hi, peak if early & (alpha > ZERO) else ZERO)
+                                state[k + planes.HI] = hi
+                                beyond = peak - hi
+                                near_enough = (beyond <= ZERO) | (precision * beyond * beyond <= negligible)
+                                matters = (alpha > ZERO) & (early | near_enough)
+                                # what does not matter is overwritten by the next hit
+                                to = place + np.uintp(lane)
+                                hits[to] = alpha if matters else ZERO
+                                hits[to + planes.HIT_PEAK] = peak
+                                hits[to + planes.HIT_PRECISION] = precision
+                            else:
+                                state[k + planes.MEAN] += weight * peak
+                    if solid:
+                        counts[block] += np.int64(any_positive(hits, place))  # pyright: ignore[reportCallIssue]
 
     return blend_tile
 
 
-_blend_all, _blend_color = _make_blend_tile(True), _make_blend_tile(False)
-
-
 @kernel(fastmath=FAST, error_model="numpy", nogil=True)
-def _transmit(state, hits, most, y):
-    """Squared transmittance of a row's rays at the depths in plane MEDIAN, as NUM / DEN: one exponential per hit."""
-    base, capacity = np.uintp(y * TILE), len(hits) // (TILE * HIT_SIZE)
-    for lane in range(TILE):
+def _transmit(state, hits, first, count, base):
+    """At the depths in plane MEDIAN squared transmittance, NUM / DEN, and its slope ``-d ln T^2 / dt``, into MEAN."""
+    for lane in range(LANES):
         k = base + np.uintp(lane)
         state[k + planes.NUM] = ONE
         state[k + planes.DEN] = ONE
-    for c in range(most):
-        hit = hits[(y * capacity + c) * HIT_SIZE : (y * capacity + c + 1) * HIT_SIZE]
-        for lane in range(TILE):
+        state[k + planes.MEAN] = ZERO
+    for c in range(first, first + count):
+        hit = hits[c * HIT_SIZE : (c + 1) * HIT_SIZE]
+        for lane in range(LANES):
             k = base + np.uintp(lane)
-            alpha = hit[np.uintp(lane)]
-            alpha = alpha if np.float32(c) < state[k + planes.COUNT] else ZERO
+            alpha, precision = hit[np.uintp(lane)], hit[np.uintp(lane) + planes.HIT_PRECISION]
             d = state[k + planes.MEDIAN] - hit[np.uintp(lane) + planes.HIT_PEAK]
-            free = ONE - alpha * exp(-HALF * hit[np.uintp(lane) + planes.HIT_PRECISION] * d * d)
+            g = alpha * exp(-HALF * precision * d * d)
+            free = ONE - g
             front = d <= ZERO
             state[k + planes.NUM] *= free if front else (ONE - alpha) * (ONE - alpha)
             state[k + planes.DEN] *= ONE if front else free
+            state[k + planes.MEAN] += g * precision * abs(d) / free
 
 
 @kernel(fastmath=FAST, error_model="numpy", nogil=True)
-def _slopes(state, hits, most, y):
-    """``-2 d ln T / dt`` of a row's rays at the depths in plane MEDIAN, into plane MEAN."""
-    base, capacity = np.uintp(y * TILE), len(hits) // (TILE * HIT_SIZE)
-    for lane in range(TILE):
-        state[base + np.uintp(lane) + planes.MEAN] = ZERO
-    for c in range(most):
-        hit = hits[(y * capacity + c) * HIT_SIZE : (y * capacity + c + 1) * HIT_SIZE]
-        for lane in range(TILE):
-            k = base + np.uintp(lane)
-            alpha = hit[np.uintp(lane)]
-            alpha = alpha if np.float32(c) < state[k + planes.COUNT] else ZERO
-            d = state[k + planes.MEDIAN] - hit[np.uintp(lane) + planes.HIT_PEAK]
-            g = alpha * exp(-HALF * hit[np.uintp(lane) + planes.HIT_PRECISION] * d * d)
-            state[k + planes.MEAN] += g * hit[np.uintp(lane) + planes.HIT_PRECISION] * abs(d) / (ONE - g)
+def _bracket(state, hits, first, count, base, median_max, near, newton):
+    """Begins the search in a block: LO and HI on both sides of the median, MEDIAN a guess, MOVING where one is sought.
 
-
-@kernel(fastmath=FAST, error_model="numpy", nogil=True)
-def _solve_row(state, hits, y, parameters, bisections, newton_steps):
-    """Median depth of a row's rays into plane MEDIAN (0: none), its slope S into plane MEAN."""
-    median_max, near = parameters[2], parameters[3]
-    base, capacity = np.uintp(y * TILE), len(hits) // (TILE * HIT_SIZE)
-    most = 0
-    for lane in range(TILE):
+    In front of LO every hit is more than four standard deviations away. HI lies behind the peaks of hits that together
+    pass at most a quarter, or four standard deviations behind all. The guess is the peak where blending fell to half.
+    """
+    cut = ZERO * near
+    for lane in range(LANES):
         k = base + np.uintp(lane)
-        if abs(state[k]) >= median_max:
-            state[k + planes.COUNT] = ZERO
-        most = max(most, np.int64(state[k + planes.COUNT]))
-        state[k + planes.LO] = BIG
-        state[k + planes.MEDIAN] = ZERO
-        if abs(state[k]) > QUARTER:
-            state[k + planes.HI] = ZERO
-    if most == 0:
+        final, guess = abs(state[k]), state[k + planes.MEDIAN]
+        reach = FOUR / math.sqrt(state[k + planes.THIN])
+        lo = state[k + planes.LO] - reach
+        wanted = final < median_max
+        cut += ONE if wanted & (lo < near) else ZERO
+        lo = max(lo, near)
+        hi = max(state[k + planes.HI] + (reach if final > QUARTER else ZERO), lo)
+        guess = guess if newton & (guess > lo) & (guess < hi) else HALF * (lo + hi)
+        state[k + planes.LO], state[k + planes.HI], state[k + planes.MEDIAN] = lo, hi, guess
+        state[k + planes.LAST] = BIG
+        state[k + planes.MOVING] = ONE if wanted else ZERO
+    if cut == ZERO:
         return
-    for c in range(most):
-        hit = hits[(y * capacity + c) * HIT_SIZE : (y * capacity + c + 1) * HIT_SIZE]
-        for lane in range(TILE):
-            k = base + np.uintp(lane)
-            there = np.float32(c) < state[k + planes.COUNT]
-            reach = FOUR / math.sqrt(hit[np.uintp(lane) + planes.HIT_PRECISION])
-            lo, hi = hit[np.uintp(lane) + planes.HIT_PEAK] - reach, hit[np.uintp(lane) + planes.HIT_PEAK] + reach
-            wide = there & (abs(state[k]) > QUARTER)
-            state[k + planes.LO] = min(state[k + planes.LO], lo if there else BIG)
-            state[k + planes.HI] = max(state[k + planes.HI], hi if wide else ZERO)
-    for lane in range(TILE):
+    for lane in range(LANES):  # something begins in front of the near plane: half of the ray may end there
         k = base + np.uintp(lane)
-        state[k + planes.LO] = max(state[k + planes.LO], near)
-        state[k + planes.MEDIAN] = state[k + planes.LO]
-    _transmit(state, hits, most, y)
-    for lane in range(TILE):
+        state[k + planes.LAST], state[k + planes.MEDIAN] = state[k + planes.MEDIAN], state[k + planes.LO]
+    _transmit(state, hits, first, count, base)
+    for lane in range(LANES):
         k = base + np.uintp(lane)
-        if not state[k + planes.NUM] > QUARTER * state[k + planes.DEN]:
-            state[k + planes.COUNT] = ZERO
-    for _ in range(bisections):
-        for lane in range(TILE):
+        state[k + planes.MEDIAN], state[k + planes.LAST] = state[k + planes.LAST], BIG
+        moving = state[k + planes.MOVING]
+        state[k + planes.MOVING] = moving if state[k + planes.NUM] > QUARTER * state[k + planes.DEN] else ZERO
+
+
+@kernel(fastmath=FAST, error_model="numpy", nogil=True)
+def _solve(state, hits, block, count, parameters, steps, newton):
+    """Median depth of a block's rays into plane MEDIAN (0: none), its slope S into plane MEAN.
+
+    Every step halves the bracket or, where that goes faster and stays inside of it, is one of Newton's; without
+    ``newton`` all halve it. The search of a block ends where none of its rays moves any more.
+    """
+    tolerance = parameters[5]
+    base, first = np.uintp(block * LANES), block * (len(hits) // (BLOCKS * HIT_SIZE))
+    _bracket(state, hits, first, count, base, parameters[2], parameters[3], newton)
+    for lane in range(LANES):
+        k = base + np.uintp(lane)
+        state[k + planes.SOUGHT] = state[k + planes.MOVING]
+    for _ in range(steps):
+        if not any_positive(state, base + planes.MOVING):  # pyright: ignore[reportCallIssue]
+            break
+        _transmit(state, hits, first, count, base)
+        for lane in range(LANES):
             k = base + np.uintp(lane)
-            state[k + planes.MEDIAN] = HALF * (state[k + planes.LO] + state[k + planes.HI])
-        _transmit(state, hits, most, y)
-        for lane in range(TILE):
-            k = base + np.uintp(lane)
-            nearer = state[k + planes.NUM] > QUARTER * state[k + planes.DEN]
+            num, den, slope = FOUR * state[k + planes.NUM], state[k + planes.DEN], state[k + planes.MEAN]
             lo, middle, hi = state[k + planes.LO], state[k + planes.MEDIAN], state[k + planes.HI]
-            state[k + planes.LO] = middle if nearer else lo
-            state[k + planes.HI] = hi if nearer else middle
-    for lane in range(TILE):
-        k = base + np.uintp(lane)
-        state[k + planes.MEDIAN] = HALF * (state[k + planes.LO] + state[k + planes.HI])
-    for _ in range(newton_steps):
-        _transmit(state, hits, most, y)
-        _slopes(state, hits, most, y)
-        for lane in range(TILE):
-            k = base + np.uintp(lane)
-            if state[k + planes.MEAN] > ZERO:
-                step = math.log(FOUR * state[k + planes.NUM] / state[k + planes.DEN]) / state[k + planes.MEAN]
-                state[k + planes.MEDIAN] = min(
-                    max(state[k + planes.MEDIAN] + step, state[k + planes.LO]), state[k + planes.HI]
-                )
-    _slopes(state, hits, most, y)
-    for lane in range(TILE):
+            lo, hi = (middle, hi) if num > den else (lo, middle)
+            # Newton's step for ln T^2, whose logarithm 2 (num - den) / (num + den) equals to the third order
+            aim = middle + TWO * (num - den) / ((num + den) * (slope if slope > ZERO else ONE))
+            good = newton & (slope > ZERO) & (aim >= lo) & (aim <= hi)
+            good &= abs(aim - middle) <= HALF * state[k + planes.LAST]
+            moved = aim if good else HALF * (lo + hi)
+            change = abs(moved - middle)
+            sought = state[k + planes.MOVING] > ZERO
+            state[k + planes.LO], state[k + planes.HI] = lo, hi
+            state[k + planes.LAST] = change
+            state[k + planes.MEDIAN] = moved if sought else middle
+            state[k + planes.MOVING] = change - tolerance * moved if sought else ZERO
+    if not newton:
+        _transmit(state, hits, first, count, base)
+    for lane in range(LANES):
         k = base + np.uintp(lane)
         state[k + planes.MEAN] *= HALF
-        if state[k + planes.COUNT] == ZERO:
-            state[k + planes.MEDIAN] = ZERO
+        median = state[k + planes.MEDIAN]
+        state[k + planes.MEDIAN] = median if state[k + planes.SOUGHT] > ZERO else ZERO
 
 
-@kernel(fastmath=FAST, error_model="numpy", nogil=True)
-def forward_tiles(
-    records, boxes, colors, members, starts, tiles, solid, expected, geometry, bisections, newton_steps,
-    parameters, background, state, hits, staged, spans, color, normal, depth, slope, transmittance,
-):  # fmt: skip
-    """Renders the tiles ``tiles[0] .. tiles[1] - 1`` of one view into the images."""
-    height, width = depth.shape
-    across = -(-width // TILE)
-    for tile in range(tiles[0], tiles[1]):
-        x_tile, y_tile = (tile % across) * TILE, (tile // across) * TILE
-        columns, rows = min(TILE, width - x_tile), min(TILE, height - y_tile)
-        mine = members[starts[tile] : starts[tile + 1]]
-        room = hits
-        while True:
-            state[:] = ZERO
-            start_rays(state, columns, rows)
-            given = (records, colors, boxes, mine, x_tile, y_tile, solid, parameters, state, room, staged, spans)
-            most = _blend_all(*given) if geometry else _blend_color(*given)
-            if most * HIT_SIZE * TILE <= len(room):
-                break
-            room = np.zeros(TILE * most * HIT_SIZE, hits.dtype)
-        for y in range(rows):
+def _make_forward_tiles(geometry: bool, solid: bool) -> Callable[..., None]:
+    """Compiles the rendering of tiles, for colour alone, or with normals and the one or the other depth."""
+    blend_tile = _make_blend_tile(geometry, solid)
+
+    @kernel(fastmath=FAST, error_model="numpy", nogil=True)
+    def forward_tiles(
+        records, boxes, colors, members, starts, tiles, expected, steps, newton, parameters, background,
+        state, hits, counts, staged, spans, color, normal, depth, slope, transmittance,
+    ):  # fmt: skip
+        """Renders the tiles ``tiles[0] .. tiles[1] - 1`` of one view into the images."""
+        height, width = depth.shape
+        across = -(-width // TILE)
+        for tile in range(tiles[0], tiles[1]):
+            x_tile, y_tile = (tile % across) * TILE, (tile // across) * TILE
+            columns, rows = min(TILE, width - x_tile), min(TILE, height - y_tile)
+            mine = members[starts[tile] : starts[tile + 1]]
+            while True:
+                state[:] = ZERO
+                counts[:] = 0
+                start_rays(state, columns, rows)
+                if solid:
+                    state[planes.LO : planes.LO + PLANE] = BIG
+                    state[planes.THIN : planes.THIN + PLANE] = BIG
+                blend_tile(records, colors, boxes, mine, x_tile, y_tile, parameters, state, hits, counts, staged, spans)
+                most = counts.max()
+                if most * HIT_SIZE * BLOCKS <= len(hits):
+                    break
+                hits = np.zeros(BLOCKS * most * HIT_SIZE, hits.dtype)
             if geometry and solid:
-                _solve_row(state, room, y, parameters, bisections, newton_steps)
-            for x in range(columns):
-                k = np.uintp(y * TILE + x)
-                final = abs(state[k])
-                row, column = y_tile + y, x_tile + x
-                transmittance[row, column] = final
-                color[row, column, 0] = state[k + planes.C0] + final * background[0]
-                color[row, column, 1] = state[k + planes.C1] + final * background[1]
-                color[row, column, 2] = state[k + planes.C2] + final * background[2]
-                if geometry:
-                    normal[row, column, 0] = state[k + planes.N0]
-                    normal[row, column, 1] = state[k + planes.N1]
-                    normal[row, column, 2] = state[k + planes.N2]
-                    slope[row, column] = state[k + planes.MEAN]
-                    if expected:
-                        depth[row, column] = state[k + planes.MEAN] / (ONE - final) if final < ONE else ZERO
-                    else:
-                        depth[row, column] = state[k + planes.MEDIAN]
+                for block in range(BLOCKS):
+                    _solve(state, hits, block, counts[block], parameters, steps, newton)
+            for y in range(rows):
+                for x in range(columns):
+                    k = place_of(y, x)
+                    final = abs(state[k])
+                    row, column = y_tile + y, x_tile + x
+                    transmittance[row, column] = final
+                    color[row, column, 0] = state[k + planes.C0] + final * background[0]
+                    color[row, column, 1] = state[k + planes.C1] + final * background[1]
+                    color[row, column, 2] = state[k + planes.C2] + final * background[2]
+                    if geometry:
+                        normal[row, column, 0] = state[k + planes.N0]
+                        normal[row, column, 1] = state[k + planes.N1]
+                        normal[row, column, 2] = state[k + planes.N2]
+                        slope[row, column] = state[k + planes.MEAN]
+                        if expected:
+                            depth[row, column] = state[k + planes.MEAN] / (ONE - final) if final < ONE else ZERO
+                        else:
+                            depth[row, column] = state[k + planes.MEDIAN]
+
+    return forward_tiles
+
+
+forward_color = _make_forward_tiles(False, False)
+forward_rasterized = _make_forward_tiles(True, False)
+forward_solid = _make_forward_tiles(True, True)

@@ -15,16 +15,19 @@ import torch
 from torch import Tensor
 
 from vg2gt.rendering.cpu import tiles
-from vg2gt.rendering.cpu.backward import backward_tiles
+from vg2gt.rendering.cpu.backward import backward_color, backward_rasterized, backward_solid
 from vg2gt.rendering.cpu.binning import count_tiles, fill_tiles, radix_order
-from vg2gt.rendering.cpu.forward import forward_tiles
-from vg2gt.rendering.cpu.projection import BLOCK, project_backward_block, project_block
+from vg2gt.rendering.cpu.forward import forward_color, forward_rasterized, forward_solid
+from vg2gt.rendering.cpu.projection import BLOCK, project_block
+from vg2gt.rendering.cpu.projection_backward import project_backward_block
 from vg2gt.rendering.cpu.threads import parallel_for
 from vg2gt.rendering.median import depth_factors
 from vg2gt.rendering.options import MEDIAN_MAX_TRANSMITTANCE, TRANSMITTANCE_STOP, Images, RenderOptions, SceneViews
 
 TILES_PER_ITEM = 8
-HIT_CAPACITY = 48  # hits that a pixel keeps for the depth solver before its tile is given more room
+HIT_CAPACITY = 128  # hits that a block of rays keeps for the depth solver before its tile is given more room
+CACHE_LINE = 64  # bytes
+CONVERGED = 4  # relative changes of the median, in units of rounding, at which its search ends
 NEGLIGIBLE = {np.dtype(np.float32): 30.0, np.dtype(np.float64): 90.0}  # squared sigmas at which a profile vanishes
 
 _local = threading.local()
@@ -123,7 +126,7 @@ class _Rasterize(torch.autograd.Function):
         grads = [np.zeros_like(array) for array in arrays]
         for index, lists in enumerate(ctx.lists):
             view = _select(arrays, index, ctx.size)
-            rows = np.empty((len(lists.members), tiles.ROW), view.means.dtype)
+            rows = _aligned(len(lists.members) * tiles.ROW, view.means.dtype).reshape(-1, tiles.ROW)
             planes = [array[index] for array in (*images, *incoming)]
             _backward(view, lists, options, geometry, planes, rows, grads, index)
         if ctx.needs_input_grad[7]:
@@ -165,7 +168,7 @@ def _prepare(view: _View, options: RenderOptions) -> _Lists:
     visible = visible[radix_order(keys, 8 * dtype.itemsize)]
     counts, offsets = np.empty(total, np.int32), np.empty(total, np.int64)
     starts = np.empty(view.tiles + 1, np.int64)
-    count_tiles(boxes, visible, view.across, counts, offsets, starts)
+    count_tiles(boxes, view.across, counts, offsets, starts)
     members, places = np.empty(starts[-1], np.int32), np.empty(starts[-1], np.int64)
     fill_tiles(boxes, visible, view.across, offsets, starts, members, places)
     return _Lists(records, boxes, counts, offsets, starts, members, places)
@@ -174,17 +177,19 @@ def _prepare(view: _View, options: RenderOptions) -> _Lists:
 def _parameters(options: RenderOptions, dtype: np.dtype) -> np.ndarray:
     values = (
         options.alpha_max, TRANSMITTANCE_STOP, MEDIAN_MAX_TRANSMITTANCE, options.near, NEGLIGIBLE[dtype],
+        CONVERGED * np.finfo(dtype).eps,
     )  # fmt: skip
     return np.array(values, dtype)
 
 
 @dataclass(frozen=True)
 class _Scratch:
-    """One thread's working memory (names as in the kernels); the hits must start finite."""
+    """One thread's working memory (names as in the kernels)."""
 
     state: np.ndarray
     sums: np.ndarray
     hits: np.ndarray
+    counts: np.ndarray
     staged: np.ndarray
     spans: np.ndarray
 
@@ -194,25 +199,39 @@ def _scratch(dtype: np.dtype) -> _Scratch:
     buffers = _local.__dict__.setdefault("buffers", {})
     if dtype not in buffers:
         buffers[dtype] = _Scratch(
-            np.zeros(tiles.PLANES * tiles.PLANE, dtype),
-            np.zeros(tiles.LANE_ROWS * tiles.TILE, dtype),
-            np.zeros(tiles.TILE * HIT_CAPACITY * tiles.HIT_SIZE, dtype),
+            _aligned(tiles.PLANES * tiles.PLANE, dtype),
+            _aligned(tiles.SUMS_ROWS * tiles.LANES, dtype),
+            _aligned(tiles.BLOCKS * HIT_CAPACITY * tiles.HIT_SIZE, dtype),
+            np.zeros(tiles.BLOCKS, np.int64),
             np.zeros((tiles.STAGED, tiles.RECORD + 3), dtype),
             np.zeros((tiles.STAGED, 4), np.int64),
         )
     return buffers[dtype]
 
 
+def _aligned(count: int, dtype: np.dtype) -> np.ndarray:
+    """Values that begin at a cache line: a block of rays then lies in one, and no vector operation touches two."""
+    memory = np.empty(count * dtype.itemsize + CACHE_LINE, np.uint8)
+    start = -memory.ctypes.data % CACHE_LINE
+    return memory[start : start + count * dtype.itemsize].view(dtype)
+
+
 def _forward(view: _View, lists: _Lists, options: RenderOptions, *outputs: np.ndarray) -> None:
     parameters = _parameters(options, view.means.dtype)
-    solid, expected = options.mode == "solid", options.depth == "expected"
+    render_tiles = forward_color
+    if options.geometry:
+        render_tiles = forward_solid if options.mode == "solid" else forward_rasterized
+
+    newton = options.newton_steps > 0
+    # one of Newton's may gain nothing: with twice as many steps the bracket shrinks as much as by bisection alone
+    steps = 2 * options.bisections + options.newton_steps if newton else options.bisections
 
     def run(tile_range: tuple[int, int]) -> None:
         scratch = _scratch(view.means.dtype)
-        forward_tiles(
-            lists.records, lists.boxes, view.colors, lists.members, lists.starts, tile_range, solid, expected,
-            options.geometry, options.bisections, options.newton_steps, parameters, view.background,
-            scratch.state, scratch.hits, scratch.staged, scratch.spans, *outputs,
+        render_tiles(
+            lists.records, lists.boxes, view.colors, lists.members, lists.starts, tile_range,
+            options.depth == "expected", steps, newton, parameters, view.background,
+            scratch.state, scratch.hits, scratch.counts, scratch.staged, scratch.spans, *outputs,
         )  # fmt: skip
 
     parallel_for(view.tile_ranges, run)
@@ -232,12 +251,15 @@ def _backward(
     parameters = _parameters(options, view.means.dtype)
     height, width = view.size
     solid = options.mode == "solid"
+    visit_tiles = backward_color
+    if geometry:
+        visit_tiles = backward_solid if solid else backward_rasterized
 
     def rasterize(tile_range: tuple[int, int]) -> None:
         scratch = _scratch(view.means.dtype)
-        backward_tiles(
-            lists.records, lists.boxes, view.colors, lists.members, lists.starts, tile_range, geometry,
-            parameters, scratch.state, scratch.sums, scratch.staged, scratch.spans, *[*planes, rows],
+        visit_tiles(
+            lists.records, lists.boxes, view.colors, lists.members, lists.places, lists.starts, tile_range, parameters,
+            scratch.state, scratch.sums, scratch.staged, scratch.spans, *[*planes, rows],
         )  # fmt: skip
 
     parallel_for(view.tile_ranges, rasterize)
@@ -247,7 +269,7 @@ def _backward(
     def project(block: int) -> None:
         project_backward_block(
             block, view.means, view.quats, view.scales, view.opacities, view.pose, view.intrinsics, height, width,
-            options.lowpass, solid, lists.boxes, lists.counts, lists.offsets, lists.places, rows, index % len(colors),
+            options.lowpass, solid, lists.counts, lists.offsets, rows, index % len(colors),
             means, quats, scales, opacities, colors, cameras,
         )  # fmt: skip
 

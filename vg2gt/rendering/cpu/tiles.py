@@ -3,35 +3,72 @@
 from __future__ import annotations
 
 import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
+from numba.np.arrayobj import make_array
 
 from vg2gt.io.compiled import kernel
-from vg2gt.rendering.cpu.constants import FAST, ONE, SUMS, ZERO
+from vg2gt.rendering.cpu.constants import FAST, ONE
 
 TILE = 16
+SIDE = 4  # a block of SIDE x SIDE rays is one vector operation
+BLOCKS_ACROSS = TILE // SIDE
+BLOCKS = BLOCKS_ACROSS**2
+LANES = SIDE**2
 PLANE = TILE * TILE
-PLANES = 18  # of PLANE values: the state of a tile
-LANE_ROWS = 15  # of TILE values: the sums of one Gaussian
-HIT_SIZE = 3 * TILE  # one hit of 16 rays: alpha, peak, precision
+PLANES = 17  # of PLANE values: the state of a tile
+SUMS_ROWS = 18  # of LANES values: the sums of one Gaussian
+HIT_SIZE = 3 * LANES  # one hit of a block's rays: alpha, peak, precision
 STAGED = 16  # Gaussians copied at a time, with their colours
 RECORD = 16  # projected Gaussian: centre 2, conic 3, tilt 2, z, a0, eps, opacity, cutoff, normal 3, unused
 ROW = 16  # gradient of one (tile, Gaussian): centre 2, conic 3, tilt 2, z, a0, opacity, colour 3, normal 3
 
 
-@kernel(fastmath=SUMS, error_model="numpy", nogil=True)
-def any_alive(state):
-    """Whether any ray of the tile still meets Gaussians."""
-    most = state[0]
-    for k in range(PLANE):
-        most = max(most, state[k])
-    return most > ZERO
+@intrinsic
+def any_positive(typing_context, values, first):
+    """Whether one of a block's values is positive: one comparison, where the compiler would go through them singly."""
+
+    def codegen(context, builder, signature, args):
+        array, item = signature.args[0], context.get_data_type(signature.args[0].dtype)
+        begin = builder.gep(make_array(array)(context, builder, args[0]).data, [args[1]])
+        lanes = builder.bitcast(begin, ir.VectorType(item, LANES).as_pointer())
+        loaded = builder.load(lanes, align=context.get_abi_alignment(item))
+        positive = builder.fcmp_ordered(">", loaded, ir.Constant(loaded.type, [0.0] * LANES))
+        bits = ir.IntType(LANES)
+        return builder.icmp_unsigned("!=", builder.bitcast(positive, bits), bits(0))
+
+    return types.boolean(values, first), codegen
+
+
+@kernel(error_model="numpy", nogil=True)
+def any_alive(state, alive):
+    """Notes for every block whether a ray of it still meets Gaussians; returns whether any does."""
+    found = False
+    for block in range(BLOCKS):
+        alive[block] = any_positive(state, np.uintp(block * LANES))  # pyright: ignore[reportCallIssue]
+        found |= alive[block]
+    return found
+
+
+@kernel(error_model="numpy", nogil=True)
+def _touched(first, last):
+    """Blocks that pixels ``first .. last - 1`` of a tile's row or column touch, the part beyond the tile left out."""
+    return max(first, 0) // SIDE, (min(last, TILE) + SIDE - 1) // SIDE
+
+
+@kernel(error_model="numpy", nogil=True)
+def place_of(y, x):
+    """Where the ray of a tile's pixel lies in a plane: blocks one after the other, rows of a block likewise."""
+    return np.uintp((y // SIDE * BLOCKS_ACROSS + x // SIDE) * LANES + y % SIDE * SIDE + x % SIDE)
 
 
 @kernel(error_model="numpy", nogil=True)
 def stage(records, colors, boxes, members, x_tile, y_tile, staged, spans):
     """Copies the next Gaussians of a tile side by side, so that their cache misses overlap.
 
-    ``staged`` receives the record and, from column RECORD on, the colour; ``spans`` the box clipped to the tile, in its
-    own pixels: columns first and last, rows first and last (ends excluded).
+    ``staged`` receives the record and, from column RECORD on, the colour; ``spans`` the tile's blocks that the box
+    touches: columns first and last, rows first and last (ends excluded).
     """
     for j in range(len(members)):
         i = np.uintp(members[j])
@@ -39,8 +76,8 @@ def stage(records, colors, boxes, members, x_tile, y_tile, staged, spans):
             staged[j, k] = records[i, k]
         for k in range(3):
             staged[j, RECORD + k] = colors[i, k]
-        spans[j, 0], spans[j, 1] = max(boxes[i, 0] - x_tile, 0), min(boxes[i, 1] - x_tile, TILE)
-        spans[j, 2], spans[j, 3] = max(boxes[i, 2] - y_tile, 0), min(boxes[i, 3] - y_tile, TILE)
+        spans[j, 0], spans[j, 1] = _touched(boxes[i, 0] - x_tile, boxes[i, 1] - x_tile)
+        spans[j, 2], spans[j, 3] = _touched(boxes[i, 2] - y_tile, boxes[i, 3] - y_tile)
 
 
 @kernel(fastmath=FAST, error_model="numpy", nogil=True)
@@ -48,4 +85,4 @@ def start_rays(state, columns, rows):
     """Transmittance 1 in the image's pixels, stopped rays beyond its border."""
     for y in range(TILE):
         for x in range(TILE):
-            state[np.uintp(y * TILE + x)] = ONE if (y < rows and x < columns) else -ONE
+            state[place_of(y, x)] = ONE if (y < rows and x < columns) else -ONE
