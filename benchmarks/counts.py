@@ -48,6 +48,7 @@ CURVE[2] = {2.02: MODELS["VG²GT, 2 px"], 3.1: MODELS[REFERENCE], **CURVE[2]}
 SHOWN = {name: COLUMNS[name] for name in ("psnr", "ssim", "rmse", "abs_rel", "normal_mean")} | columns(
     "edge_abs_rel", "edge_psnr", "cv", "gaussians"
 )
+TICKS = (10, 20, 50, 100, 200)  # thousand Gaussians
 PANELS = ("psnr", "ssim", "abs_rel", "normal_mean")
 
 
@@ -118,11 +119,13 @@ def plot(curve: Mapping[str, Mapping[str, Metrics]], points: Mapping[str, Metric
     for panel, name in zip(panels, PANELS, strict=True):
         for splits, cells in curve.items():
             ordered = sorted(cells.values(), key=lambda metrics: metrics["gaussians"])
-            numbers, values = ([metrics[key] for metrics in ordered] for key in ("gaussians", name))
-            panel.plot(numbers, values, "o-", label=f"VG²GT, {splits} a voxel")
+            thousands = [metrics["gaussians"] / 1e3 for metrics in ordered]
+            panel.plot(thousands, [metrics[name] for metrics in ordered], "o-", label=f"VG²GT, {splits} a voxel")
         for (label, metrics), mark in zip(points.items(), "sD^vPX", strict=False):
-            panel.plot([metrics["gaussians"]], [metrics[name]], mark, color="0.3", label=label)
-        panel.set(title=METRICS[name].label, xlabel="Gaussians a scene", xscale="log")
+            panel.plot([metrics["gaussians"] / 1e3], [metrics[name]], mark, color="0.3", label=label)
+        panel.set(title=METRICS[name].label, xlabel="thousand Gaussians a scene", xscale="log")
+        panel.minorticks_off()
+        panel.set_xticks(TICKS, map(str, TICKS))
     panels[0].legend(fontsize=7)
     figure.tight_layout()
     temporary = path.with_name(f".{path.name}.tmp.png")

@@ -25,7 +25,7 @@ from vg2gt.rendering.median import depth_factors
 from vg2gt.rendering.options import MEDIAN_MAX_TRANSMITTANCE, TRANSMITTANCE_STOP, Images, RenderOptions, SceneViews
 
 TILES_PER_ITEM = 8
-HIT_CAPACITY = 128  # hits that a block of rays keeps for the depth solver before its tile is given more room
+HIT_CAPACITY = 192  # hits that a block of rays keeps for the depth solver before its tile is given more room
 CACHE_LINE = 64  # bytes
 CONVERGED = 4  # relative changes of the median, in units of rounding, at which its search ends
 NEGLIGIBLE = {np.dtype(np.float32): 30.0, np.dtype(np.float64): 90.0}  # squared sigmas at which a profile vanishes
