@@ -216,9 +216,10 @@ def _solve(state, hits, block, count, parameters, steps, newton):
         _transmit(state, hits, first, count, base)
     for lane in range(LANES):
         k = base + np.uintp(lane)
-        state[k + planes.MEAN] *= HALF
-        median = state[k + planes.MEDIAN]
-        state[k + planes.MEDIAN] = median if state[k + planes.SOUGHT] > ZERO else ZERO
+        sought = state[k + planes.SOUGHT] > ZERO
+        median, slope = state[k + planes.MEDIAN], HALF * state[k + planes.MEAN]
+        state[k + planes.MEDIAN] = median if sought else ZERO
+        state[k + planes.MEAN] = slope if sought else ZERO
 
 
 def _make_forward_tiles(geometry: bool, solid: bool) -> Callable[..., None]:
