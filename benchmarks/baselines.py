@@ -23,8 +23,9 @@ from stage_clock import StageClock
 from vg2gt.evaluation import evaluate_scene
 from vg2gt.evaluation.protocols import ground_truth_target_cameras
 from vg2gt.evaluation.tables import Metric, columns
+from vg2gt.geometry.normals import normals_from_depth
 from vg2gt.io.files import write_json, write_text
-from vg2gt.io.images import colorize_depth, grid, write_png
+from vg2gt.io.images import colorize_depth, colorize_normals, grid, write_png
 from vg2gt.runs.checkpoints import read_checkpoint
 from vg2gt.studies.study import (
     Metrics,
@@ -101,7 +102,7 @@ def costs(run: Run, batch: Batch, passes: int = 3) -> Metrics:
 
 @torch.no_grad()
 def panels(run: Run, batch: Batch) -> list[torch.Tensor]:
-    """Rendered colour, rendered depth and its relative error (black none, white 10 % and holes) of a held-out view."""
+    """Rendered colour, depth, its relative error (black none, white 10 % and holes) and normals of a held-out view."""
     prediction = run.module.model(batch.context.images, batch.context.hints)
     cameras = ground_truth_target_cameras(batch, prediction).select(slice(0, 1))
     rendered, true = run.module.renderer(prediction.gaussians, cameras, mode="solid"), batch.target.depth[0, 0]
@@ -111,14 +112,17 @@ def panels(run: Run, batch: Batch) -> list[torch.Tensor]:
     error = ((depth / true.clamp_min(1e-6) - 1).abs() / MAX_ERROR).clamp(0, 1)
     error = torch.where(depth > 0, error, 1.0) * (true > 0)
     near, far = (float(true[true > 0].quantile(q)) for q in (0.02, 0.98))
-    return [rendered.color[0, 0], colorize_depth(depth, near, far), error.expand(3, -1, -1)]
+    normals = colorize_normals(rendered.normal[0, 0])
+    return [rendered.color[0, 0], colorize_depth(depth, near, far), error.expand(3, -1, -1), normals]
 
 
 def truth(batch: Batch) -> list[torch.Tensor]:
     """The held-out view itself, in the columns of :func:`panels`."""
     true = batch.target.depth[0, 0]
     near, far = (float(true[true > 0].quantile(q)) for q in (0.02, 0.98))
-    return [batch.target.images[0, 0], colorize_depth(true, near, far), torch.zeros_like(batch.target.images[0, 0])]
+    normals, _ = normals_from_depth(true, batch.target.cameras.intrinsics[0, 0])
+    image = batch.target.images[0, 0]
+    return [image, colorize_depth(true, near, far), torch.zeros_like(image), colorize_normals(normals)]
 
 
 @torch.no_grad()
@@ -206,7 +210,7 @@ def main() -> None:
             write_json(home / "metrics.json", content)
             write_text(home / "metrics.md", report(results, recordings, options))
     print(report(results, recordings, options))
-    print(f"rows of models.png: truth, {', '.join(models)}; colour, depth, relative depth error")
+    print(f"rows of models.png: truth, {', '.join(models)}; colour, depth, relative depth error, normals")
     print(f"metrics: {home / 'metrics.json'}")
 
 
