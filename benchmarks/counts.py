@@ -72,7 +72,8 @@ def footprint_for(wanted: float, count: Callable[[float], float], start: float) 
             power = -math.log(found / before[1]) / math.log(edge / before[0])
         before = (edge, found)
         edge = round(edge * (found / wanted) ** (1 / power), 3)
-    raise ValueError(f"no edge gives {wanted:.0f} Gaussians within {CLOSE:.0%}: {edge:g} px gives {found:.0f}")
+    last, found = before or (start, math.nan)
+    raise ValueError(f"no edge gives {wanted:.0f} Gaussians within {CLOSE:.0%}: {last:g} px gives {found:.0f}")
 
 
 def counter(overrides: list[str], folder: Path) -> tuple[Callable[[float], float], float]:

@@ -15,13 +15,14 @@ import numpy as np
 from vg2gt.io.compiled import kernel
 from vg2gt.rendering.cpu import planes
 from vg2gt.rendering.cpu.constants import FAST, HALF, ONE, SUMS, TWO, ZERO
-from vg2gt.rendering.cpu.forward import COLUMN, ROW_BITS
 from vg2gt.rendering.cpu.response import attenuate, exp, respond
 from vg2gt.rendering.cpu.tiles import (
     BLOCKS,
     BLOCKS_ACROSS,
+    COLUMN,
     LANES,
     ROW,
+    ROW_BITS,
     SIDE,
     STAGED,
     TILE,

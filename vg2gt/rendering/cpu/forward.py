@@ -25,9 +25,11 @@ from vg2gt.rendering.cpu.response import attenuate, exp, respond
 from vg2gt.rendering.cpu.tiles import (
     BLOCKS,
     BLOCKS_ACROSS,
+    COLUMN,
     HIT_SIZE,
     LANES,
     PLANE,
+    ROW_BITS,
     SIDE,
     STAGED,
     TILE,
@@ -37,8 +39,6 @@ from vg2gt.rendering.cpu.tiles import (
     stage,
     start_rays,
 )
-
-COLUMN, ROW_BITS = np.int32(SIDE - 1), np.int32(2)  # of a lane: lane & COLUMN, lane >> ROW_BITS
 
 
 def _make_blend_tile(geometry: bool, solid: bool) -> Callable[..., Any]:

@@ -268,7 +268,7 @@ def _backward(
 
     def project(block: int) -> None:
         project_backward_block(
-            block, view.means, view.quats, view.scales, view.opacities, view.pose, view.intrinsics, height, width,
+            block, view.means, view.quats, view.scales, view.pose, view.intrinsics, height, width,
             options.lowpass, solid, lists.counts, lists.offsets, rows, index % len(colors),
             means, quats, scales, opacities, colors, cameras,
         )  # fmt: skip

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from vg2gt.rendering.cpu.tiles import HIT_SIZE, LANES, PLANE, SUMS_ROWS
+from vg2gt.rendering.cpu.tiles import LANES, PLANE, SUMS_ROWS
 
 # state: plane 0 is the transmittance, negative once a ray has stopped; forward and backward use the same memory
 C0, C1, C2, N0, N1, N2, MEDIAN, MEAN, HI, LO, THIN, NUM, DEN, LAST, MOVING, SOUGHT = (
@@ -14,4 +14,4 @@ AX, AY, AXX, AXY, AYY, B, BX, BY, GR, GO, K0, K1, K2, M0, M1, M2, GZ, GP = (
     np.uintp(j * LANES) for j in range(SUMS_ROWS)
 )
 # one hit of a block's rays
-HIT, HIT_PEAK, HIT_PRECISION = np.uintp(HIT_SIZE), np.uintp(LANES), np.uintp(2 * LANES)
+HIT_PEAK, HIT_PRECISION = np.uintp(LANES), np.uintp(2 * LANES)

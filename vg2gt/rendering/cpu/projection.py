@@ -8,14 +8,13 @@ Everything is computed in float64, whatever the dtype of the arrays.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
 from vg2gt.io.compiled import kernel
+from vg2gt.rendering.cpu.constants import FAST
 from vg2gt.rendering.options import ALPHA_MIN, JACOBIAN_CLAMP
 
-FAST: Any = {"contract", "nsz", "arcp"}  # nothing that assumes finite values
 BLOCK = 2048  # Gaussians a work item; fixed, because camera gradients are summed block by block
 
 

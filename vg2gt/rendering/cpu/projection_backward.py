@@ -144,8 +144,8 @@ def _chain(work, count, pose, fx, fy, x_limit, y_limit, lowpass, solid):
         gfy += gjy * ify
         gu += gu0 + gu1 + gu2
         gv += gv0 + gv1 + gv2
-        gu += gus0 + gus1 + gus2 if abs(u) < x_limit else 0.0
-        gv += gvs0 + gvs1 + gvs2 if abs(v) < y_limit else 0.0
+        gu += (gus0 + gus1 + gus2) if abs(u) < x_limit else 0.0
+        gv += (gvs0 + gvs1 + gvs2) if abs(v) < y_limit else 0.0
         gz -= (gjx + gjy + gu * u + gv * v) * iz
         gx, gy = gu * iz, gv * iz
         work[GRAD_MEAN + c] = w00 * gx + w10 * gy + w20 * gz
@@ -209,7 +209,7 @@ def _scatter(
 
 @kernel(fastmath=FAST, error_model="numpy", nogil=True)
 def project_backward_block(
-    block, means, quats, scales, opacities, pose, intrinsics, height, width, lowpass, solid,
+    block, means, quats, scales, pose, intrinsics, height, width, lowpass, solid,
     counts, offsets, rows, color_view,
     grad_means, grad_quats, grad_scales, grad_opacities, grad_colors, grad_cameras,
 ):  # fmt: skip

@@ -16,6 +16,7 @@ SIDE = 4  # a block of SIDE x SIDE rays is one vector operation
 BLOCKS_ACROSS = TILE // SIDE
 BLOCKS = BLOCKS_ACROSS**2
 LANES = SIDE**2
+COLUMN, ROW_BITS = np.int32(SIDE - 1), np.int32(SIDE.bit_length() - 1)  # a lane's: lane & COLUMN, lane >> ROW_BITS
 PLANE = TILE * TILE
 PLANES = 17  # of PLANE values: the state of a tile
 SUMS_ROWS = 18  # of LANES values: the sums of one Gaussian
