@@ -27,6 +27,7 @@ from vg2gt.voxels.grid import (
     warn_if_sparse,
 )
 from vg2gt.voxels.normals import surface_normals
+from vg2gt.voxels.point_features import pool_point_features, pool_point_features_of_chunks
 from vg2gt.voxels.pointmlp import PointMLP
 from vg2gt.voxels.silhouette import on_surface
 
@@ -175,18 +176,14 @@ class FineModule(nn.Module):
 
     def _pool_features(self, tokens: Tokens, images: Tensor, points: _Points, plan: VoxelPlan) -> Tensor:
         """``[M, C]``; without gradient the features of a few views are there at a time, which bounds the memory."""
-        if torch.is_grad_enabled() or not len(plan):
-            features = self._point_features(self.dense_head(tokens, images), points.offset)
-            return pool_mean(features, points.confidence, plan)
-        pixels = self.dense_head.views_per_chunk * images.shape[-2] * images.shape[-1]
-        chunks = map(self._point_features, self.dense_head.chunks(tokens, images), points.offset.split(pixels))
-        return pool_mean_of_chunks(chunks, points.confidence, plan)
-
-    def _point_features(self, dense: Tensor, offset: Tensor) -> Tensor:
-        """Features ``[N, C]`` of the pixels of some views, their places within the cells ``[N, 3]`` mixed in."""
-        with torch.autocast(dense.device.type, enabled=False):
-            rows = dense.permute(0, 2, 3, 1).flatten(0, 2).float()
-            return F.gelu(torch.addmm(rows, offset, self.point_offset.weight.t()))
+        others = (points.offset, self.point_offset.weight, points.confidence, plan)
+        with_gradient = torch.is_grad_enabled() or not len(plan)
+        maps = [self.dense_head(tokens, images)] if with_gradient else self.dense_head.chunks(tokens, images)
+        chunks = (dense.permute(0, 2, 3, 1).flatten(0, 2).float() for dense in maps)  # [n H W, C] each
+        with torch.autocast(images.device.type, enabled=False):
+            if with_gradient:
+                return pool_point_features(next(chunks), *others)
+            return pool_point_features_of_chunks(chunks, *others)
 
     def _plan(self, points: _Points) -> VoxelPlan:
         plan = plan_voxels(points.cells, points.batch, points.valid)

@@ -13,9 +13,10 @@ from collections.abc import Callable
 import numpy as np
 
 from vg2gt.io.compiled import kernel
+from vg2gt.io.compiled_math import exp
 from vg2gt.rendering.cpu import planes
 from vg2gt.rendering.cpu.constants import FAST, HALF, ONE, SUMS, TWO, ZERO
-from vg2gt.rendering.cpu.response import attenuate, exp, respond
+from vg2gt.rendering.cpu.response import attenuate, respond
 from vg2gt.rendering.cpu.tiles import (
     BLOCKS,
     BLOCKS_ACROSS,

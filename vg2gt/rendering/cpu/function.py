@@ -14,13 +14,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from vg2gt.io.threads import parallel_for
 from vg2gt.rendering.cpu import tiles
 from vg2gt.rendering.cpu.backward import backward_color, backward_rasterized, backward_solid
 from vg2gt.rendering.cpu.binning import count_tiles, fill_tiles, radix_order
 from vg2gt.rendering.cpu.forward import forward_color, forward_rasterized, forward_solid
 from vg2gt.rendering.cpu.projection import BLOCK, project_block
 from vg2gt.rendering.cpu.projection_backward import project_backward_block
-from vg2gt.rendering.cpu.threads import parallel_for
 from vg2gt.rendering.median import depth_factors
 from vg2gt.rendering.options import MEDIAN_MAX_TRANSMITTANCE, TRANSMITTANCE_STOP, Images, RenderOptions, SceneViews
 

@@ -1,51 +1,11 @@
-"""A Gaussian's response along a ray, once for the compiled forward and backward pass; and the exponential it needs."""
+"""A Gaussian's response along a ray, once for the compiled forward and backward pass."""
 
 from __future__ import annotations
 
-import math
-from typing import Any
+from numba import njit
 
-import numpy as np
-from llvmlite import ir
-from numba import njit, types
-from numba.extending import intrinsic, overload
-
-from vg2gt.rendering.cpu.constants import FAST, HALF, ONE, ZERO
-
-LOG2E = np.float32(1.4426950408889634)
-LN2_HIGH, LN2_LOW = np.float32(0.693359375), np.float32(-2.12194440e-4)
-EXP2_BIAS, EXP2_SHIFT = np.int32(127), np.int32(23)
-UNDERFLOW = np.float32(-87.0)
-E6, E5, E4, E3, E2 = (np.float32(1 / math.factorial(n)) for n in (6, 5, 4, 3, 2))
-
-
-@intrinsic
-def _float32_of_bits(typing_context, bits):
-    def codegen(context, builder, signature, args):
-        return builder.bitcast(args[0], ir.FloatType())
-
-    return types.float32(types.int32), codegen
-
-
-def exp(x: Any) -> Any:
-    """Exponential of a number <= 0: vectorising in float32 (relative error 2e-7), the library's in float64."""
-    raise NotImplementedError("compiled code only")
-
-
-@overload(exp, jit_options={"fastmath": {"contract", "nsz", "arcp", "nnan"}, "error_model": "numpy"})
-def _exp_overload(x):
-    if x == types.float64:
-        return lambda x: math.exp(x)
-
-    def exp32(x):
-        x = max(x, UNDERFLOW)
-        n = np.floor(x * LOG2E + HALF)
-        f = x - n * LN2_HIGH
-        f = f - n * LN2_LOW
-        p = ((((E6 * f + E5) * f + E4) * f + E3) * f + E2) * f * f + f + ONE
-        return p * _float32_of_bits((np.int32(n) + EXP2_BIAS) << EXP2_SHIFT)  # pyright: ignore[reportCallIssue]
-
-    return exp32
+from vg2gt.io.compiled_math import exp
+from vg2gt.rendering.cpu.constants import FAST, ONE, ZERO
 
 
 @njit(fastmath=FAST, error_model="numpy", inline="always")

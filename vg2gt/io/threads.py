@@ -25,4 +25,4 @@ def parallel_for(items: Sequence[Item], function: Callable[[Item], None]) -> Non
 
 @lru_cache(maxsize=4)
 def _pool(threads: int, process: int) -> ThreadPoolExecutor:  # by process: a forked child must not use its parent's
-    return ThreadPoolExecutor(threads, thread_name_prefix=f"vg2gt-render-{process}")
+    return ThreadPoolExecutor(threads, thread_name_prefix=f"vg2gt-{process}")

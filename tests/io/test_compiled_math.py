@@ -1,0 +1,42 @@
+"""What compiled kernels calculate with, against the library's functions."""
+
+import numba
+import numpy as np
+import torch
+from torch.nn import functional as F
+
+from vg2gt.io.compiled_math import exp, gelu
+
+
+@numba.njit
+def exponentials(values, results):
+    for i in range(len(values)):
+        results[i] = exp(values[i])
+
+
+@numba.njit
+def gelus(values, results, slopes):
+    for i in range(len(values)):
+        results[i], slopes[i] = gelu(values[i])
+
+
+def test_exp_of_what_is_not_positive() -> None:
+    for dtype, relative in ((np.float32, 3e-7), (np.float64, 1e-15)):
+        values = np.linspace(-80, 0, 100_001).astype(dtype)
+        results = np.empty_like(values)
+        exponentials(values, results)
+        exact = np.exp(values.astype(np.float64))
+        assert np.abs(results / exact - 1).max() < relative
+
+
+def test_gelu_and_its_slope() -> None:
+    values = np.concatenate((np.linspace(-12, 12, 200_001), [0, -1e-30, 1e-30, -1e4, 1e4])).astype(np.float32)
+    results, slopes = np.empty_like(values), np.empty_like(values)
+    gelus(values, results, slopes)
+    x = torch.from_numpy(values).double().requires_grad_()
+    exact = F.gelu(x)
+    exact.sum().backward()
+    assert x.grad is not None
+    error = np.abs(results - exact.detach().numpy())
+    assert (error <= 5e-7 * np.maximum(1, np.abs(values))).all(), error.max()
+    assert np.abs(slopes - x.grad.numpy()).max() < 4e-7

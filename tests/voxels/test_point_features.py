@@ -1,0 +1,122 @@
+"""The compiled pass over pixels' features holds to the plain one, in value and gradient."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from vg2gt.voxels.grid import VoxelPlan, plan_voxels, pool_mean
+from vg2gt.voxels.point_features import point_features, pool_point_features, pool_point_features_of_chunks
+
+CHANNELS = 20  # no multiple of a vector's length
+
+
+def points(count: int = 3000, scale: float = 1.0) -> tuple[list[Tensor], VoxelPlan]:
+    """Dense features, places, weight and confidences of points in two scenes, a tenth of them in no voxel."""
+    generator = torch.Generator().manual_seed(3)
+    cells = 6 * torch.rand(count, 3, generator=generator, dtype=torch.float64)
+    batch = (torch.arange(count) >= count // 3).long()
+    plan = plan_voxels(cells, batch, torch.rand(count, generator=generator) > 0.1)
+    dense = scale * torch.randn(count, CHANNELS, generator=generator)
+    weight = torch.randn(CHANNELS, 3, generator=generator)
+    confidence = 0.1 + torch.rand(count, generator=generator)
+    return [dense, (cells - cells.floor() - 0.5).float(), weight, confidence], plan
+
+
+def with_gradients(inputs: list[Tensor], plan: VoxelPlan, plain: bool) -> list[Tensor]:
+    """The pooled features and the gradients of a weighted sum of them."""
+    leaves = [tensor.clone().requires_grad_() for tensor in inputs]
+    *of_features, confidence = leaves
+    if plain:
+        pooled = pool_mean(point_features(*of_features), confidence, plan)
+    else:
+        pooled = pool_point_features(*of_features, confidence, plan)
+    seen = torch.linspace(-1, 1, pooled.numel(), dtype=pooled.dtype).view_as(pooled)
+    (pooled * seen).sum().backward()
+    return [pooled.detach(), *(leaf.grad for leaf in leaves if leaf.grad is not None)]
+
+
+def in_float64(inputs: list[Tensor], plan: VoxelPlan) -> list[Tensor]:
+    """The plain functions with the inputs in double precision; ``point_features`` itself goes to float32."""
+    leaves = [tensor.double().requires_grad_() for tensor in inputs]
+    dense, offset, weight, confidence = leaves
+    pooled = pool_mean(torch.nn.functional.gelu(dense + offset @ weight.t()), confidence, plan)
+    seen = torch.linspace(-1, 1, pooled.numel(), dtype=pooled.dtype).view_as(pooled)
+    (pooled * seen).sum().backward()
+    return [pooled.detach(), *(leaf.grad for leaf in leaves if leaf.grad is not None)]
+
+
+@pytest.mark.parametrize("scale", [0.1, 1.0, 30.0])
+def test_values_and_gradients_are_the_plain_ones(scale: float) -> None:
+    inputs, plan = points(scale=scale)
+    assert 0 < int((plan.voxel_of < 0).sum()) < 600
+    compiled, exact = with_gradients(inputs, plan, plain=False), in_float64(inputs, plan)
+    assert len(compiled) == len(exact) == 5
+    for found, wanted in zip(compiled, exact, strict=True):
+        assert float((found - wanted).abs().max()) < 2e-6 * float(wanted.abs().max().clamp(min=1))
+
+
+def test_it_is_as_exact_as_plain_torch() -> None:
+    inputs, plan = points()
+    exact = in_float64(inputs, plan)
+    errors = [
+        [float((found - wanted).abs().max()) for found, wanted in zip(results, exact, strict=True)]
+        for results in (with_gradients(inputs, plan, plain) for plain in (False, True))
+    ]
+    assert all(compiled <= 4 * plain + 1e-7 for compiled, plain in zip(*errors, strict=True)), errors
+
+
+def test_threads_do_not_change_a_bit() -> None:
+    inputs, plan = points()
+    threads = torch.get_num_threads()
+    try:
+        results = []
+        for number in (1, 2, 3):
+            torch.set_num_threads(number)
+            results.append(with_gradients(inputs, plan, plain=False))
+    finally:
+        torch.set_num_threads(threads)
+    assert all(torch.equal(a, b) for other in results[1:] for a, b in zip(results[0], other, strict=True))
+
+
+def test_points_in_no_voxel_have_no_gradient_and_no_say() -> None:
+    inputs, plan = points()
+    left_out = plan.voxel_of < 0
+    before = with_gradients(inputs, plan, plain=False)
+    changed = [inputs[0].clone(), *inputs[1:]]
+    changed[0][left_out] = 1e6
+    after = with_gradients(changed, plan, plain=False)
+    assert torch.equal(before[0], after[0])
+    for gradient in (after[1], after[2], after[4]):
+        assert not gradient[left_out].any()
+        assert gradient[~left_out].any()
+
+
+def test_dropped_voxels_are_left_out() -> None:
+    inputs, plan = points()
+    keep = torch.arange(len(plan)) % 3 > 0
+    compiled = with_gradients(inputs, plan.select(keep), plain=False)
+    plain = with_gradients(inputs, plan.select(keep), plain=True)
+    torch.testing.assert_close(compiled, plain, atol=2e-5, rtol=1e-5)
+
+
+def test_chunks_give_the_whole() -> None:
+    inputs, plan = points()
+    dense, *others = inputs
+    torch.testing.assert_close(
+        pool_point_features_of_chunks(dense.split(700), *others, plan),
+        pool_point_features(dense, *others, plan),
+        atol=2e-6,
+        rtol=1e-5,
+    )
+
+
+def test_without_a_voxel_the_graph_stays() -> None:
+    inputs, plan = points(10)
+    nothing = plan.select(torch.zeros(len(plan), dtype=torch.bool))
+    leaves = [tensor.clone().requires_grad_() for tensor in inputs]
+    pooled = pool_point_features(*leaves, nothing)
+    assert pooled.shape == (0, CHANNELS)
+    pooled.sum().backward()
+    assert all(leaf.grad is not None and not leaf.grad.any() for leaf in leaves)
