@@ -27,11 +27,11 @@ def points(count: int = 3000, scale: float = 1.0) -> tuple[list[Tensor], VoxelPl
 def with_gradients(inputs: list[Tensor], plan: VoxelPlan, plain: bool) -> list[Tensor]:
     """The pooled features and the gradients of a weighted sum of them."""
     leaves = [tensor.clone().requires_grad_() for tensor in inputs]
-    *of_features, confidence = leaves
+    dense, offset, weight, confidence = leaves
     if plain:
-        pooled = pool_mean(point_features(*of_features), confidence, plan)
+        pooled = pool_mean(point_features(dense, offset, weight), confidence, plan)
     else:
-        pooled = pool_point_features(*of_features, confidence, plan)
+        pooled = pool_point_features(dense, offset, weight, confidence, plan)
     seen = torch.linspace(-1, 1, pooled.numel(), dtype=pooled.dtype).view_as(pooled)
     (pooled * seen).sum().backward()
     return [pooled.detach(), *(leaf.grad for leaf in leaves if leaf.grad is not None)]
@@ -103,10 +103,10 @@ def test_dropped_voxels_are_left_out() -> None:
 
 def test_chunks_give_the_whole() -> None:
     inputs, plan = points()
-    dense, *others = inputs
+    dense, offset, weight, confidence = inputs
     torch.testing.assert_close(
-        pool_point_features_of_chunks(dense.split(700), *others, plan),
-        pool_point_features(dense, *others, plan),
+        pool_point_features_of_chunks(dense.split(700), offset, weight, confidence, plan),
+        pool_point_features(dense, offset, weight, confidence, plan),
         atol=2e-6,
         rtol=1e-5,
     )
@@ -115,8 +115,8 @@ def test_chunks_give_the_whole() -> None:
 def test_without_a_voxel_the_graph_stays() -> None:
     inputs, plan = points(10)
     nothing = plan.select(torch.zeros(len(plan), dtype=torch.bool))
-    leaves = [tensor.clone().requires_grad_() for tensor in inputs]
-    pooled = pool_point_features(*leaves, nothing)
+    dense, offset, weight, confidence = leaves = [tensor.clone().requires_grad_() for tensor in inputs]
+    pooled = pool_point_features(dense, offset, weight, confidence, nothing)
     assert pooled.shape == (0, CHANNELS)
     pooled.sum().backward()
     assert all(leaf.grad is not None and not leaf.grad.any() for leaf in leaves)

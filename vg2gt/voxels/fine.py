@@ -180,10 +180,9 @@ class FineModule(nn.Module):
         with_gradient = torch.is_grad_enabled() or not len(plan)
         maps = [self.dense_head(tokens, images)] if with_gradient else self.dense_head.chunks(tokens, images)
         chunks = (dense.permute(0, 2, 3, 1).flatten(0, 2).float() for dense in maps)  # [n H W, C] each
-        with torch.autocast(images.device.type, enabled=False):
-            if with_gradient:
-                return pool_point_features(next(chunks), *others)
-            return pool_point_features_of_chunks(chunks, *others)
+        if with_gradient:
+            return pool_point_features(next(chunks), *others)
+        return pool_point_features_of_chunks(chunks, *others)
 
     def _plan(self, points: _Points) -> VoxelPlan:
         plan = plan_voxels(points.cells, points.batch, points.valid)

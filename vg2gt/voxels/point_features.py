@@ -56,8 +56,9 @@ def pool_point_features_of_chunks(
 
 
 def point_features(dense: Tensor, offset: Tensor, weight: Tensor) -> Tensor:
-    """``gelu(dense + offset W^T)``, ``[N, C]``."""
-    return F.gelu(torch.addmm(dense.float(), offset, weight.t()))
+    """``gelu(dense + offset W^T)``, ``[N, C]``, in float32 whatever the autocast."""
+    with torch.autocast(dense.device.type, enabled=False):
+        return F.gelu(torch.addmm(dense.float(), offset, weight.t()))
 
 
 def _compilable(*tensors: Tensor) -> bool:
