@@ -93,6 +93,20 @@ def test_points_in_no_voxel_have_no_gradient_and_no_say() -> None:
         assert gradient[~left_out].any()
 
 
+def test_nan_reaches_its_voxel_and_no_other() -> None:
+    """Training finds faults by what is not finite."""
+    inputs, plan = points()
+    row = int(plan.order[plan.starts[5]])
+    inputs[0][row, 3] = torch.nan
+    pooled, of_dense, _, of_weight, of_confidence = with_gradients(inputs, plan, plain=False)
+    hit = pooled.isnan()
+    assert hit[5, 3]
+    assert int(hit.sum()) == 1
+    assert of_dense[row, 3].isnan()
+    assert of_weight[3].isnan().all()
+    assert of_confidence[row].isnan()
+
+
 def test_dropped_voxels_are_left_out() -> None:
     inputs, plan = points()
     keep = torch.arange(len(plan)) % 3 > 0

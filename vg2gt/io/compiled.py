@@ -35,9 +35,9 @@ ROOMS = (
     "vg2gt/data/sources",
     "backends/sweep",
 )
-"""Folders whose kernels take constants and functions from files of the same folder, and of ``SHARED``, only (a test
+"""Folders whose kernels take constants and functions from files of the same folder and of ``SHARED`` only (a test
 holds it)."""
-SHARED = ("vg2gt/io/compiled_math.py",)
+SHARED = Path(__file__).with_name("compiled_math.py")
 UNUSED_DAYS = 30
 VARIABLE = "NUMBA_CACHE_DIR"
 
@@ -90,7 +90,7 @@ def _folder(room: Path) -> Path | None:
 def _digest(room: Path) -> str:
     versions = f"{numba.__version__} {llvmlite.__version__} {platform.python_version()}"
     content = hashlib.sha256(versions.encode())
-    for path in [Path(__file__), *(Path(__file__).parents[2] / name for name in SHARED), *sorted(room.rglob("*.py"))]:
+    for path in [Path(__file__), SHARED, *sorted(room.rglob("*.py"))]:
         content.update(path.name.encode() + b"\0" + path.read_bytes())
     return content.hexdigest()[:16]
 

@@ -47,7 +47,8 @@ def _exp_overload(x):
     return exp32
 
 
-# 1 - Phi(z) = t p(t) exp(-z^2 / 2) for z >= 0, t = 1 / (1 + TAIL z): least largest error of gelu and of its slope, 8e-9
+# 1 - Phi(z) = t p(t) exp(-z^2 / 2) for z >= 0, t = 1 / (1 + TAIL z). Chosen for the least largest error of gelu and of
+# its slope, 8e-9 before rounding to float32.
 TAIL = np.float32(0.28)
 T1, T2, T3, T4, T5, T6 = (
     np.float32(value) for value in (0.11683751, 0.06554693, 0.27367689, -0.24277995, 0.39336311, -0.10664452)
@@ -55,11 +56,10 @@ T1, T2, T3, T4, T5, T6 = (
 BELL = np.float32(1 / math.sqrt(2 * math.pi))
 
 
-@njit(fastmath={"contract", "nsz", "arcp", "nnan"}, error_model="numpy", inline="always")
+@njit(fastmath={"contract", "nsz", "arcp"}, error_model="numpy", inline="always")
 def gelu(x):
-    """``x Phi(x)`` of a float32 and its derivative ``Phi(x) + x phi(x)``, absolute error 4e-7."""
-    z = max(x, -x)
-    t = ONE / (ONE + TAIL * z)
+    """``x Phi(x)`` of a float32 and its derivative ``Phi(x) + x phi(x)``, absolute error 4e-7; NaN of NaN."""
+    t = ONE / (ONE + TAIL * np.abs(x))
     bell = exp(-HALF * x * x)
     above = ((((((T6 * t + T5) * t + T4) * t + T3) * t + T2) * t + T1) * t) * bell
     below = above if x < ZERO else ONE - above

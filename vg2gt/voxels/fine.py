@@ -179,7 +179,7 @@ class FineModule(nn.Module):
         others = (points.offset, self.point_offset.weight, points.confidence, plan)
         with_gradient = torch.is_grad_enabled() or not len(plan)
         maps = [self.dense_head(tokens, images)] if with_gradient else self.dense_head.chunks(tokens, images)
-        chunks = (dense.permute(0, 2, 3, 1).flatten(0, 2).float() for dense in maps)  # [n H W, C] each
+        chunks = map(_pixel_rows, maps)
         if with_gradient:
             return pool_point_features(next(chunks), *others)
         return pool_point_features_of_chunks(chunks, *others)
@@ -191,6 +191,11 @@ class FineModule(nn.Module):
             return plan
         keep = self.cap(self.max_voxels, pool_min(points.confidence.detach(), plan), plan.batch)
         return plan if keep is None else plan.select(keep)
+
+
+def _pixel_rows(dense: Tensor) -> Tensor:
+    """Maps ``[n, C, H, W]`` as float32 rows ``[n H W, C]``."""
+    return dense.permute(0, 2, 3, 1).flatten(0, 2).float()
 
 
 class _Points:

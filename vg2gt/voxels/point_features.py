@@ -45,14 +45,14 @@ def pool_point_features_of_chunks(
     chunks: Iterable[Tensor], offset: Tensor, weight: Tensor, confidence: Tensor, plan: VoxelPlan
 ) -> Tensor:
     """:func:`pool_point_features` of dense features that come in consecutive chunks of rows ``[n, C]``, no gradient."""
+    begin = 0
 
-    def features() -> Iterable[Tensor]:
-        begin = 0
-        for dense in chunks:
-            yield point_features(dense, offset[begin : begin + len(dense)], weight)
-            begin += len(dense)
+    def features(dense: Tensor) -> Tensor:  # no generator: it would keep a chunk while the next one is made
+        nonlocal begin
+        begin += len(dense)
+        return point_features(dense, offset[begin - len(dense) : begin], weight)
 
-    return pool_mean_of_chunks(features(), confidence, plan)
+    return pool_mean_of_chunks(map(features, chunks), confidence, plan)
 
 
 def point_features(dense: Tensor, offset: Tensor, weight: Tensor) -> Tensor:
@@ -104,7 +104,7 @@ def _parts(voxels: int) -> list[tuple[int, int, int]]:
     return list(zip(range(PARTS), bounds[:-1], bounds[1:], strict=True))
 
 
-@kernel(fastmath={"contract", "nsz", "arcp", "nnan"}, error_model="numpy", nogil=True)
+@kernel(fastmath={"contract", "nsz", "arcp"}, error_model="numpy", nogil=True)
 def _pool(dense, offset, weight, confidence, order, starts, ends, mean, total, first, last):
     """Means of voxels ``first`` to ``last`` and the sums of their points' confidences; ``weight`` is ``[3, C]``."""
     channels = dense.shape[1]
@@ -134,7 +134,7 @@ def _forget_left_out(voxel_of, of_dense, of_offset, of_confidence):
             of_confidence[point] = 0
 
 
-@kernel(fastmath={"contract", "nsz", "arcp", "nnan", "reassoc"}, error_model="numpy", nogil=True)
+@kernel(fastmath={"contract", "nsz", "arcp", "reassoc"}, error_model="numpy", nogil=True)
 def _pool_backward(
     dense, offset, weight, confidence, order, starts, ends, total,
     grad, along_mean, of_dense, of_offset, of_confidence, of_weight, part, first, last,
