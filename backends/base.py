@@ -18,7 +18,8 @@ class Backend(nn.Module, ABC):
     """A frozen network whose tokens can be changed and decoded again.
 
     A subclass calls ``super().__init__`` with what is said of it below, builds its modules, and ends its constructor
-    with ``self.freeze()``. It implements ``encode`` and ``decode`` and nothing else.
+    with ``self.freeze()``. It implements ``encode`` and ``decode``; the two methods that give cameras alone may be made
+    cheaper.
 
     Args:
         name: stands in checkpoints and messages.
@@ -87,6 +88,20 @@ class Backend(nn.Module, ABC):
         Returns:
             Depth and confidence (differentiable in ``tokens.patch`` where ``supports_gradient``) and raw cameras.
         """
+
+    def decode_cameras(self, tokens: Tokens) -> Cameras:
+        """The raw cameras of :meth:`decode`, to the bit; cheaper where they have a head of their own."""
+        return self.decode(tokens).cameras
+
+    @torch.no_grad()
+    def predict_cameras(self, images: Tensor, hints: Hints | None = None) -> Cameras:
+        """The raw cameras that these views decode to, to the bit, where nothing else of them is needed.
+
+        Args:
+            images: as :meth:`encode` takes them.
+            hints: likewise.
+        """
+        return self.decode_cameras(self.encode(images, hints))
 
     def freeze(self) -> None:
         """Takes every parameter out of training and puts every module into eval mode, for good."""

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from backends.base import Backend
 from backends.weights import Weights
-from vg2gt.types import Geometry, Hints, Tokens
+from vg2gt.types import Cameras, Geometry, Hints, Tokens
 
 
 class NetworkBackend(Backend):
@@ -73,6 +73,10 @@ class NetworkBackend(Backend):
     def decode(self, tokens: Tokens) -> Geometry:
         """See :meth:`Backend.decode`; the principal point is (W/2, H/2)."""
         return self.network.decode(tokens, self.head_chunk)
+
+    def decode_cameras(self, tokens: Tokens) -> Cameras:
+        """See :meth:`Backend.decode_cameras`; the depth head stays idle."""
+        return self.network.decode_cameras(tokens)
 
 
 @torch.no_grad()

@@ -97,6 +97,10 @@ class OnnxBackend(Backend):
         cameras = Cameras(world_to_camera, intrinsics, tokens.size)
         return Geometry(depth, confidence, cameras, torch.ones_like(depth[:, 0, 0, 0]))
 
+    def decode_cameras(self, tokens: Tokens) -> Cameras:
+        """See :meth:`Backend.decode_cameras`."""
+        return super().decode_cameras(tokens) if self.decoder is None else self.decoder.decode_cameras(tokens)
+
 
 def open_session(file: Path, provider: Provider) -> onnxruntime.InferenceSession:
     """Opens an ONNX file on the GPU of this process or on the CPU, with torch's number of threads.

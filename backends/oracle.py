@@ -113,7 +113,7 @@ class OracleBackend(Backend):
         with full_precision(images):
             images, depth = images.float(), hints.depth.float()
             noise = self._draw(hints, (height, width), depth)
-            cameras = self._predict_cameras(hints.cameras, depth, noise)
+            cameras = self._predict_cameras(hints.cameras, depth, noise.pose)
             predicted = _bleed(depth * (1 + self.depth_noise * noise.relative))
             confidence = self._predict_confidence(predicted, depth, noise)
             if self.background is not None:
@@ -139,19 +139,34 @@ class OracleBackend(Backend):
             depth = depth * torch.exp(self.response * residual.reshape(depth.shape))
         return Geometry(depth, tokens.state["confidence"], cameras, torch.ones_like(depth[:, 0, 0, 0]))
 
+    @torch.no_grad()
+    def predict_cameras(self, images: Tensor, hints: Hints | None = None) -> Cameras:
+        """See :meth:`Backend.predict_cameras`; no token and no depth is made."""
+        self.check_images(images)
+        hints = self.require_hints(images, hints, "depth", "cameras", "scene_key", "frame_ids")
+        assert hints.depth is not None
+        assert hints.cameras is not None
+        with full_precision(images):
+            depth = hints.depth.float()
+            poses = self._draw_parts(hints, 3, (0, 0), depth)[2]
+            return self._predict_cameras(hints.cameras, depth, poses)
+
     def _draw(self, hints: Hints, size: tuple[int, int], like: Tensor) -> _Noise:
         """Draws the noise of every view from its own generator."""
-        assert hints.frame_ids is not None
-        views = [
-            [self._draw_view(scene, frame, size) for frame in frames]
-            for scene, frames in zip(hints.scene_key, hints.frame_ids.tolist(), strict=True)
-        ]
-        fields, constants, poses, confidences = (
-            torch.from_numpy(np.stack([[view[part] for view in row] for row in views])).to(like) for part in range(4)
-        )
+        fields, constants, poses, confidences = self._draw_parts(hints, 4, size, like)
         smooth = F.interpolate(fields, size, mode="bicubic", align_corners=True)
         smooth = smooth / smooth.std((-2, -1), keepdim=True)
         return _Noise(SMOOTH_SHARE * smooth + VIEW_SHARE * constants, poses, confidences)
+
+    def _draw_parts(self, hints: Hints, count: int, size: tuple[int, int], like: Tensor) -> list[Tensor]:
+        """The first ``count`` parts of all views' noise, each ``[B, V, ...]``."""
+        assert hints.frame_ids is not None
+        views = [
+            [self._draw_view(scene, frame, size)[:count] for frame in frames]
+            for scene, frames in zip(hints.scene_key, hints.frame_ids.tolist(), strict=True)
+        ]
+        stacked = (np.stack([[view[part] for view in row] for row in views]) for part in range(count))
+        return [torch.from_numpy(part).to(like) for part in stacked]
 
     def _draw_view(self, scene: str, frame: int, size: tuple[int, int]) -> tuple[np.ndarray, ...]:
         key = hashlib.sha256(f"{self.seed}/{scene}/{frame}".encode()).digest()
@@ -159,10 +174,10 @@ class OracleBackend(Backend):
         shapes = (NOISE_GRID, (1, 1), (6,), size)
         return tuple(rng.standard_normal(shape, dtype=np.float32) for shape in shapes)
 
-    def _predict_cameras(self, cameras: Cameras, depth: Tensor, noise: _Noise) -> Cameras:
+    def _predict_cameras(self, cameras: Cameras, depth: Tensor, pose_noise: Tensor) -> Cameras:
         """Moves every camera but the first a little in its own frame, then the world into view 0's frame."""
-        turn = self.pose_noise * 0.5 * noise.pose[..., :3]
-        shift = self.pose_noise * noise.pose[..., 3:] * _median_depth(depth, per_view=True)[..., None]
+        turn = self.pose_noise * 0.5 * pose_noise[..., :3]
+        shift = self.pose_noise * pose_noise[..., 3:] * _median_depth(depth, per_view=True)[..., None]
         half = turn / 2
         quats = torch.cat((torch.ones_like(half[..., :1]), half), -1)  # the angle is small: tan is its argument
         error = torch.eye(4, dtype=depth.dtype, device=depth.device).repeat(*depth.shape[:2], 1, 1)

@@ -53,10 +53,14 @@ class DA3Decoder(nn.Module):
         """See :meth:`Backend.decode`; at most ``chunk`` views at a time go through the depth head."""
         with full_precision(tokens.camera):
             out = in_chunks(self.head, tokens.patch, tokens.grid, chunk)  # [B, V, 2, H, W]
-            camera_to_world, intrinsics = decode_pose(self.cam_dec(tokens.camera), tokens.size)
         depth, confidence = out[:, :, 0].exp(), 1 + out[:, :, 1].exp()
-        cameras = Cameras(invert_rigid(camera_to_world), intrinsics, tokens.size)
-        return Geometry(depth, confidence, cameras, torch.ones_like(depth[:, 0, 0, 0]))
+        return Geometry(depth, confidence, self.decode_cameras(tokens), torch.ones_like(depth[:, 0, 0, 0]))
+
+    def decode_cameras(self, tokens: Tokens) -> Cameras:
+        """See :meth:`Backend.decode_cameras`."""
+        with full_precision(tokens.camera):
+            camera_to_world, intrinsics = decode_pose(self.cam_dec(tokens.camera), tokens.size)
+        return Cameras(invert_rigid(camera_to_world), intrinsics, tokens.size)
 
 
 class DA3Network(DA3Decoder):

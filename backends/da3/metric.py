@@ -107,6 +107,10 @@ class DA3SingleViewBackend(NetworkBackend):
         depth = fill_sky(*self.decode_raw(tokens)) * tokens.state["factor"][..., None, None]
         return Geometry(depth, torch.ones_like(depth), tokens.state["cameras"], torch.ones_like(depth[:, 0, 0, 0]))
 
+    def decode_cameras(self, tokens: Tokens) -> Cameras:
+        """See :meth:`Backend.decode_cameras`."""
+        return tokens.state["cameras"]
+
 
 class DA3MetricBackend(DA3SingleViewBackend):
     """DA3's metric network: metres, if the translations of the data's cameras are in metres.
@@ -212,6 +216,15 @@ class DA3NestedBackend(Backend):
             depth_conf=torch.where(filled, SKY_CONFIDENCE, geometry.depth_conf),
             scale=tokens.state["scale"],
         )
+
+    def decode_cameras(self, tokens: Tokens) -> Cameras:
+        """See :meth:`Backend.decode_cameras`."""
+        return self.relative.decode_cameras(tokens)
+
+    @torch.no_grad()
+    def predict_cameras(self, images: Tensor, hints: Hints | None = None) -> Cameras:
+        """See :meth:`Backend.predict_cameras`; the metric network stays idle."""
+        return self.relative.predict_cameras(images, hints)
 
 
 def far_ends(depth: Tensor, sky: Tensor, scale: Tensor) -> Tensor:

@@ -138,10 +138,14 @@ class VGGTDecoder(nn.Module):
         """See :meth:`Backend.decode`; at most ``chunk`` views at a time go through the depth head."""
         with full_precision(tokens.camera):
             out = in_chunks(self.depth_head, tokens.patch, tokens.grid, chunk)  # [B, V, 2, H, W]
-            world_to_camera, intrinsics = decode_pose(self.camera_head(tokens.camera), tokens.size)
         depth, confidence = out[:, :, 0].exp(), 1 + out[:, :, 1].exp()
-        cameras = Cameras(world_to_camera, intrinsics, tokens.size)
-        return Geometry(depth, confidence, cameras, torch.ones_like(depth[:, 0, 0, 0]))
+        return Geometry(depth, confidence, self.decode_cameras(tokens), torch.ones_like(depth[:, 0, 0, 0]))
+
+    def decode_cameras(self, tokens: Tokens) -> Cameras:
+        """See :meth:`Backend.decode_cameras`."""
+        with full_precision(tokens.camera):
+            world_to_camera, intrinsics = decode_pose(self.camera_head(tokens.camera), tokens.size)
+        return Cameras(world_to_camera, intrinsics, tokens.size)
 
 
 class VGGTNetwork(VGGTDecoder):

@@ -69,6 +69,13 @@ def test_values_are_usable(geometry: Geometry) -> None:
     assert (geometry.cameras.intrinsics[..., [0, 1], [0, 1]] > 0).all()
 
 
+def test_cameras_alone_are_those_of_all(backend: Backend, scene, tokens: Tokens, geometry: Geometry) -> None:
+    for cameras in (backend.decode_cameras(tokens), backend.predict_cameras(*scene)):
+        assert torch.equal(cameras.world_to_camera, geometry.cameras.world_to_camera)
+        assert torch.equal(cameras.intrinsics, geometry.cameras.intrinsics)
+        assert cameras.size == geometry.cameras.size
+
+
 def test_intrinsics_are_in_pixels(geometry: Geometry) -> None:
     width, height = geometry.cameras.size[::-1]
     centre = geometry.cameras.intrinsics[..., :2, 2]

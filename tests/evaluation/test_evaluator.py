@@ -177,26 +177,45 @@ def test_given_cameras_need_no_joint_pass(module_and_batch, batch: Batch, monkey
     torch.testing.assert_close(found.world_to_camera[..., :3, 3], data[..., :3, 3] * prediction.unit[:, None, None])
 
 
+def test_the_joint_pass_decodes_depth_only_where_cameras_stand_still(
+    module_and_batch, batch: Batch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    backend = module_and_batch[0].model.backend
+    decoded = []
+    decode = backend.decode
+    monkeypatch.setattr(backend, "decode", lambda tokens: decoded.append(0) or decode(tokens))
+    for views, passes in ((3, 0), (1, 1)):
+        inputs = replace(batch, num_context=views)
+        with torch.no_grad():
+            prediction = module_and_batch[0].model(inputs.context.images, inputs.context.hints)
+        decoded.clear()
+        joint_target_cameras(module_and_batch[0].model, inputs, prediction)
+        assert len(decoded) == passes
+
+
 @pytest.mark.parametrize("views", [1, 3])
 def test_the_joint_pass_may_have_another_unit(module_and_batch, batch: Batch, views: int) -> None:
     """As backbones without metric scale have: three times larger as soon as held-out views are seen too."""
     module, _ = module_and_batch
     inputs = replace(batch, num_context=views)
-    decode = module.model.backend.decode
+    backend = module.model.backend
+    decode, predict_cameras = backend.decode, backend.predict_cameras
+
+    def larger(cameras):
+        return scale_translations(cameras, torch.full((1,), 3.0))
 
     def rescaled(tokens):
         geometry = decode(tokens)
-        larger = scale_translations(geometry.cameras, torch.full((1,), 3.0))
-        return replace(geometry, depth=geometry.depth * 3, cameras=larger)
+        return replace(geometry, depth=geometry.depth * 3, cameras=larger(geometry.cameras))
 
     with torch.no_grad():
         prediction = module.model(inputs.context.images, inputs.context.hints)
     plain = joint_target_cameras(module.model, inputs, prediction)
-    module.model.backend.decode = rescaled
+    backend.decode, backend.predict_cameras = rescaled, lambda *views: larger(predict_cameras(*views))
     try:
         found = joint_target_cameras(module.model, inputs, prediction)
     finally:
-        del module.model.backend.decode
+        del backend.decode, backend.predict_cameras
     torch.testing.assert_close(found.world_to_camera, plain.world_to_camera, rtol=1e-4, atol=1e-5)
 
 

@@ -120,8 +120,8 @@ def test_alignment_of_one_camera_keeps_the_scale() -> None:
 def test_still_cameras_take_the_given_scale_and_moving_ones_do_not() -> None:
     still, moving, given = random_cameras(1, 1), random_cameras(1, 3), torch.tensor([2.5], dtype=torch.float64)
     truth = random_similarity(1)
-    torch.testing.assert_close(align_cameras(still, truth.apply_cameras(still), given).scale, given)
-    torch.testing.assert_close(align_cameras(moving, truth.apply_cameras(moving), given).scale, truth.scale)
+    torch.testing.assert_close(align_cameras(still, truth.apply_cameras(still), lambda: given).scale, given)
+    torch.testing.assert_close(align_cameras(moving, truth.apply_cameras(moving), lambda: given).scale, truth.scale)
 
 
 def test_alignment_of_cameras_on_a_line_and_of_cameras_that_only_turn() -> None:

@@ -7,6 +7,7 @@ second, joint pass of the frozen backbone, brought into the first pass's frame b
 from __future__ import annotations
 
 import torch
+from torch import Tensor
 
 from vg2gt.geometry.alignment import align_cameras, fit_depth_scale
 from vg2gt.geometry.cameras import relative_to_first, scale_translations
@@ -32,12 +33,16 @@ def joint_target_cameras(model: Reconstructor, batch: Batch, prediction: Predict
     if not model.backend.predicts_cameras:  # they are the data's: no pass is needed to know them
         cameras = scale_translations(relative_to_first(batch.cameras), prediction.unit)
         return cameras.select(slice(batch.num_context, None))
-    geometry = model.backend.decode(model.backend.encode(batch.images, batch.hints))
-    joint = scale_translations(relative_to_first(geometry.cameras), prediction.unit)
+    cameras = model.backend.predict_cameras(batch.images, batch.hints)
+    joint = scale_translations(relative_to_first(cameras), prediction.unit)
     context = slice(0, batch.num_context)
-    depth, first_depth = geometry.depth[:, context] * prediction.unit[:, None, None, None], prediction.initial.depth
-    by_depth = fit_depth_scale(depth, first_depth, first_depth > 0).nan_to_num(1.0)
-    similarity = align_cameras(joint.select(context), prediction.geometry.cameras, by_depth)
+
+    def scale_of_depth() -> Tensor:
+        depth = model.backend.decode(model.backend.encode(batch.images, batch.hints)).depth[:, context]
+        first = prediction.initial.depth
+        return fit_depth_scale(depth * prediction.unit[:, None, None, None], first, first > 0).nan_to_num(1.0)
+
+    similarity = align_cameras(joint.select(context), prediction.geometry.cameras, scale_of_depth)
     return similarity.apply_cameras(joint.select(slice(batch.num_context, None)))
 
 
@@ -47,8 +52,12 @@ def ground_truth_target_cameras(batch: Batch, prediction: Prediction) -> Cameras
     The similarity comes from the context cameras; where they stand still, its scale comes from the depth.
     """
     context = batch.context
-    by_depth = fit_depth_scale(context.depth, prediction.geometry.depth, context.depth > 0).nan_to_num(1.0)
-    similarity = align_cameras(context.cameras, prediction.geometry.cameras, by_depth)
+    depth = prediction.geometry.depth
+
+    def scale_of_depth() -> Tensor:
+        return fit_depth_scale(context.depth, depth, context.depth > 0).nan_to_num(1.0)
+
+    similarity = align_cameras(context.cameras, prediction.geometry.cameras, scale_of_depth)
     return similarity.apply_cameras(batch.target.cameras)
 
 

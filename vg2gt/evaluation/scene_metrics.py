@@ -57,7 +57,7 @@ def depth_to_camera_scale(geometry: Geometry, truth: Batch) -> float:
     """
     depth = fit_depth_scale(geometry.depth, truth.depth, truth.depth > 0)
     unknown = torch.full_like(depth, torch.nan)
-    return float(align_cameras(geometry.cameras, truth.cameras, unknown).scale / depth)
+    return float(align_cameras(geometry.cameras, truth.cameras, lambda: unknown).scale / depth)
 
 
 def point_cloud_metrics(

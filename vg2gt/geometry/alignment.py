@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -112,7 +113,9 @@ class Similarity(TensorRecord):
         return Cameras(pose, cameras.intrinsics, cameras.size)
 
 
-def align_cameras(predicted: Cameras, reference: Cameras, still_scale: Tensor | None = None) -> Similarity:
+def align_cameras(
+    predicted: Cameras, reference: Cameras, still_scale: Callable[[], Tensor] | None = None
+) -> Similarity:
     """The similarity that brings predicted cameras onto reference cameras of the same views.
 
     The rotation is the mean of the cameras' relative orientations (orthogonal Procrustes); given it, scale and
@@ -122,8 +125,8 @@ def align_cameras(predicted: Cameras, reference: Cameras, still_scale: Tensor | 
     Args:
         predicted: B scenes, V views.
         reference: the same views in another frame and unit.
-        still_scale: ``[B]`` scale of scenes whose cameras stand still in either frame, which say nothing of it; None
-            means 1.
+        still_scale: gives the ``[B]`` scale of scenes whose cameras stand still in either frame, which say nothing of
+            it; only called where there is one. None means 1.
 
     Returns:
         ``[B]`` similarities from the predicted to the reference frame, computed in float64, in the input's dtype.
@@ -133,8 +136,7 @@ def align_cameras(predicted: Cameras, reference: Cameras, still_scale: Tensor | 
     rotation = _nearest_rotation((orientations[1].transpose(-1, -2) @ orientations[0]).sum(1))
 
     source, target = camera_centers(predicted).double(), camera_centers(reference).double()
-    still = 1.0 if still_scale is None else still_scale.double()
-    return _umeyama(rotation, source, target, _moves(source) & _moves(target), still, dtype)
+    return _umeyama(rotation, source, target, _moves(source) & _moves(target), still_scale, dtype)
 
 
 def align_points(points: Tensor, reference: Tensor) -> Similarity:
@@ -151,20 +153,27 @@ def align_points(points: Tensor, reference: Tensor) -> Similarity:
     source, target = points.double(), reference.double()
     centered, centered_target = source - source.mean(1)[:, None], target - target.mean(1)[:, None]
     rotation = _nearest_rotation(centered_target.transpose(-1, -2) @ centered)
-    return _umeyama(rotation, source, target, _moves(source), 1.0, points.dtype)
+    return _umeyama(rotation, source, target, _moves(source), None, points.dtype)
 
 
 def _umeyama(
-    rotation: Tensor, source: Tensor, target: Tensor, moves: Tensor, still: Tensor | float, dtype: torch.dtype
+    rotation: Tensor,
+    source: Tensor,
+    target: Tensor,
+    moves: Tensor,
+    still_scale: Callable[[], Tensor] | None,
+    dtype: torch.dtype,
 ) -> Similarity:
     """Least-squares scale and translation of points ``[B, N, 3]`` once turned (Umeyama 1991, eqn 41 and 42).
 
-    Scenes that do not move ``[B]``, or move against their target, take the scale ``still``.
+    Scenes that do not move ``[B]``, or move against their target, take the scale ``still_scale()``.
     """
     source_mean, target_mean = source.mean(1), target.mean(1)
     turned = (source - source_mean[:, None]) @ rotation.transpose(-1, -2)
     agreement = (turned * (target - target_mean[:, None])).sum((1, 2))
-    scale = torch.where(moves & (agreement > 0), agreement / turned.square().sum((1, 2)), still)
+    told = moves & (agreement > 0)
+    still = 1.0 if still_scale is None or bool(told.all()) else still_scale().double()
+    scale = torch.where(told, agreement / turned.square().sum((1, 2)), still)
     translation = target_mean - scale[:, None] * (rotation @ source_mean[..., None])[..., 0]
     return Similarity(scale.to(dtype), rotation.to(dtype), translation.to(dtype))
 
