@@ -2,6 +2,8 @@ import pytest
 import torch
 
 from vg2gt.voxels import PointMLP
+from vg2gt.voxels.pointmlp import GeometricStage
+from vg2gt.voxels.serialization import make_windows
 
 SIZE = torch.full((2,), 0.125)
 
@@ -83,3 +85,45 @@ def test_checkpointing_changes_no_gradient(random_voxels):
     for a, b in zip(*grads, strict=True):
         assert a is not None
         torch.testing.assert_close(a, b)
+
+
+def stage_as_written(stage, features, positions, windows, batch):
+    """The stage with its affine written out, a window at a time."""
+    updates = {}
+    for group in windows.groups:
+        scenes = batch[group.rows[:, 0]]
+        for rows, scene in zip(group.rows, scenes, strict=True):
+            values = torch.cat((features, positions), 1)[rows]
+            deviation, parts = values - values.mean(0), (slice(None, features.shape[1]), slice(features.shape[1], None))
+            sigmas = []
+            for part in parts:
+                of_scene = torch.cat((features, positions), 1)[group.rows[scenes == scene]][..., part]
+                variance = (of_scene - of_scene.mean(1, keepdim=True)).square().mean()
+                sigmas.append(((variance + 1e-10).sqrt() + 1e-5).expand(deviation[:, part].shape[1]))
+            affine = stage.alpha * deviation / torch.cat(sigmas) + stage.beta
+            hidden = stage.before(stage.inner(torch.cat((affine, features[rows]), 1)))
+            context = stage.after(hidden.amax(0, keepdim=True)).expand_as(hidden)
+            updates.setdefault(group.rows.shape[1], []).append(stage.out(torch.cat((hidden, context), 1)))
+    update = torch.cat([torch.cat(rows) for rows in updates.values()])
+    return features + stage.gamma * update[windows.owner]
+
+
+@pytest.mark.parametrize("counts", [[40], [40, 23, 5], [8, 0, 8], [1]])
+def test_a_stage_is_what_the_paper_says(counts):
+    torch.manual_seed(0)
+    stage = GeometricStage(6).double()
+    for parameter in stage.parameters():
+        torch.nn.init.normal_(parameter, std=0.5)
+    batch = torch.arange(len(counts)).repeat_interleave(torch.tensor(counts))
+    features = (3 + torch.randn(len(batch), 6, dtype=torch.float64)).requires_grad_()
+    positions = torch.randint(0, 1000, (len(batch), 3)).double()
+    windows = make_windows(torch.arange(len(batch)), counts, 8, shift=4)
+    outputs = [
+        stage(features, positions, windows),
+        stage_as_written(stage, features, positions, windows, batch),
+    ]
+    torch.testing.assert_close(*outputs)
+    inputs = [features, *stage.parameters()]
+    gradients = [torch.autograd.grad(out.sin().sum(), inputs) for out in outputs]
+    for found, exact in zip(*gradients, strict=True):
+        torch.testing.assert_close(found, exact)

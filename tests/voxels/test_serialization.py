@@ -95,7 +95,8 @@ def test_every_voxel_is_owned_once_by_a_window_of_its_scene(count, shift):
     assert torch.equal(rows[windows.owner], torch.arange(len(order)))
     position = order.argsort()
     for group in windows.groups:
-        assert torch.equal(batch[group.rows], group.scene[:, None].expand_as(group.rows))
+        scenes = batch[group.rows]
+        assert torch.equal(scenes, scenes[:, :1].expand_as(scenes))
+        assert torch.equal(scenes[:, 0].unique_consecutive(return_counts=True)[1], torch.tensor(group.counts))
         assert position[group.rows].diff(dim=1).eq(1).all()
-        assert group.rows.shape[1] == min(8, counts[int(group.scene[0])])
-        assert torch.equal(group.per_scene, torch.bincount(group.scene, minlength=4).clamp(min=1))
+        assert group.rows.shape[1] == min(8, counts[int(scenes[0, 0])])

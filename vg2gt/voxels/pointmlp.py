@@ -8,7 +8,8 @@ from torch.nn import functional as F
 from torch.utils.checkpoint import checkpoint
 
 from vg2gt.voxels.grid import scene_counts
-from vg2gt.voxels.serialization import Order, WindowGroup, Windows, make_windows, relative_grid, serial_keys
+from vg2gt.voxels.row_products import linear_rows
+from vg2gt.voxels.serialization import Order, Windows, make_windows, relative_grid, serial_keys
 
 STAGE_ORDERS: tuple[Order, ...] = ("hilbert", "hilbert-trans", "z", "z-trans")
 
@@ -24,11 +25,16 @@ class ResidualPointBlock(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Maps ``[..., C]`` to ``[..., C]``."""
-        return x + self.fc2(F.relu(self.fc1(self.norm(x))))
+        hidden = F.relu(linear_rows(self.norm(x), self.fc1.weight, self.fc1.bias))
+        return x + linear_rows(hidden, self.fc2.weight, self.fc2.bias)
 
 
 class GeometricStage(nn.Module):
     """One stage: geometric affine, residual MLP, max over the window, residual MLP, residual update.
+
+    The affine ``alpha (x - m) / s + beta`` of features and positions, m a window's mean and s one standard deviation a
+    scene, enters a linear layer together with the features themselves, ``W1 [affine] + W2 x``. Nothing lies between, so
+    the layer is applied as ``(W1 alpha / s + W2) (x - m)`` and ``W2 m``, the latter once a window.
 
     Args:
         channels: feature width C.
@@ -49,28 +55,35 @@ class GeometricStage(nn.Module):
         updates = []
         for group in windows.groups:
             rows = group.rows.flatten()
-            local = features.index_select(0, rows).unflatten(0, group.rows.shape)
-            place = positions.index_select(0, rows).unflatten(0, group.rows.shape).to(local.dtype)
-            normalized = torch.cat((_standardize(local, group), _standardize(place, group)), -1)
-            affine = torch.addcmul(self.beta, self.alpha, normalized)
-            hidden = self.before(self.inner(torch.cat((affine, local), -1)))
+            local = features.index_select(0, rows).unflatten(0, group.rows.shape).split(group.counts)
+            place = positions.index_select(0, rows).unflatten(0, group.rows.shape).split(group.counts)
+            first = [self._first_layer(x, p) for x, p in zip(local, place, strict=True)]
+            hidden = self.before(first[0] if len(first) == 1 else torch.cat(first))
             context = self.after(hidden.amax(1))
             # W_o [h | g], the window's half computed once a window
             weight_hidden, weight_context = self.out.weight.chunk(2, 1)
-            update = F.linear(hidden, weight_hidden, self.out.bias) + F.linear(context, weight_context)[:, None]
+            update = linear_rows(hidden, weight_hidden, self.out.bias) + F.linear(context, weight_context)[:, None]
             updates.append(update.flatten(0, 1))
         update = updates[0] if len(updates) == 1 else torch.cat(updates)
         return features + self.gamma * update.index_select(0, windows.owner)
 
+    def _first_layer(self, local: Tensor, place: Tensor) -> Tensor:
+        """Affine and linear layer of one scene's windows: features ``[W, K, C]``, positions ``[W, K, 3]``."""
+        channels = local.shape[-1]
+        of_affine, of_place, of_local = self.inner.weight.split((channels, 3, channels), 1)
+        mean = local.mean(1)  # [W, C]
+        local, place = local - mean[:, None], place.to(local.dtype)
+        place = place - place.mean(1, keepdim=True)
+        of_affine = of_affine * (self.alpha[:channels] / _root_mean_square(local))
+        of_place = of_place * (self.alpha[channels:] / _root_mean_square(place))
+        weight = torch.cat((of_affine + of_local, of_place), 1)
+        constant = self.inner.bias + self.inner.weight[:, : channels + 3] @ self.beta + F.linear(mean, of_local)
+        return linear_rows(torch.cat((local, place), -1), weight) + constant[:, None]
 
-def _standardize(values: Tensor, group: WindowGroup) -> Tensor:
-    """Deviations of ``[W, K, C]`` from their window's mean, over one standard deviation a scene."""
-    deviation = values - values.mean(1, keepdim=True)
-    per_window = deviation.square().mean((1, 2))
-    total = per_window.new_zeros(len(group.per_scene)).index_add(0, group.scene, per_window)
-    # the constant keeps the root differentiable for single voxels
-    sigma = (total / group.per_scene + 1e-10).sqrt()[group.scene]
-    return deviation / (sigma[:, None, None] + 1e-5)
+
+def _root_mean_square(deviation: Tensor) -> Tensor:
+    # the inner constant keeps the root differentiable for single voxels
+    return (deviation.square().mean() + 1e-10).sqrt() + 1e-5
 
 
 class PointMLP(nn.Module):

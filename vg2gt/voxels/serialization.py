@@ -116,14 +116,12 @@ class WindowGroup:
     """Windows of one length. Scenes shorter than the wanted length make a group of their own.
 
     Attributes:
-        rows: ``[W, K]`` voxels of every window.
-        scene: ``[W]`` the windows' scenes.
-        per_scene: ``[B]`` windows of each scene, at least 1 so that it can be divided by.
+        rows: ``[W, K]`` voxels of every window, scene after scene.
+        counts: windows of each scene that has some here.
     """
 
     rows: Tensor
-    scene: Tensor
-    per_scene: Tensor
+    counts: tuple[int, ...]
 
 
 @dataclass(frozen=True)
@@ -151,17 +149,17 @@ def make_windows(order: Tensor, counts: list[int], length: int, shift: int = 0) 
         length: voxels per window; a scene with fewer makes one window of what it has.
         shift: the first window starts this many voxels before the scene does, 0 <= shift < length.
     """
-    by_length: dict[int, list[tuple[int, int, int]]] = {}
+    by_length: dict[int, list[tuple[int, int]]] = {}
     begin = 0
-    for scene, count in enumerate(counts):
+    for count in counts:
         if count:
-            by_length.setdefault(min(length, count), []).append((scene, begin, count))
+            by_length.setdefault(min(length, count), []).append((begin, count))
         begin += count
     groups, base = [], 0
     owner = torch.empty_like(order)
     for size, scenes in by_length.items():
-        rows, numbers, per_scene = [], [], [1] * len(counts)
-        for scene, begin, count in scenes:
+        rows = []
+        for begin, count in scenes:
             voxels = order[begin : begin + count]
             first = -shift if count > length else 0
             inside = torch.arange(first, count, size, device=order.device).clamp(0, count - size)  # [W]
@@ -169,8 +167,6 @@ def make_windows(order: Tensor, counts: list[int], length: int, shift: int = 0) 
             window = (place - first) // size
             owner[voxels] = base + window * size + place - inside[window]
             rows.append(voxels[inside[:, None] + torch.arange(size, device=order.device)])  # [W, K]
-            numbers.append(torch.full_like(inside, scene))
-            per_scene[scene] = len(inside)
             base += len(inside) * size
-        groups.append(WindowGroup(torch.cat(rows), torch.cat(numbers), order.new_tensor(per_scene)))
+        groups.append(WindowGroup(torch.cat(rows), tuple(map(len, rows))))
     return Windows(tuple(groups), owner)

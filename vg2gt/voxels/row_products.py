@@ -1,0 +1,38 @@
+"""Linear layers over many rows by the faster of torch's two libraries."""
+
+from __future__ import annotations
+
+import platform
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+IMAGES = 16  # fewest for which torch gives a convolution of one thread to oneDNN
+MIN_ROWS = 1024  # below, calling a convolution costs more than it saves
+
+
+def linear_rows(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
+    """``F.linear``, on x86 processors as a 1x1 convolution over the rows.
+
+    torch multiplies matrices with MKL, which leaves half of some makers' vector units idle, but convolves with oneDNN,
+    which uses all of them; values and input gradients then come about twice as fast, elsewhere equally fast.
+
+    Args:
+        x: ``[..., C]``.
+        weight: ``[D, C]``.
+        bias: ``[D]`` or None.
+
+    Returns:
+        ``[..., D]``, equal to ``F.linear`` up to the order of summation.
+    """
+    rows = x.numel() // max(x.shape[-1], 1)
+    if rows < MIN_ROWS or rows % IMAGES or x.dtype != torch.float32 or not _has_onednn(x.device.type):
+        return F.linear(x, weight, bias)
+    images = x.reshape(IMAGES, -1, 1, x.shape[-1]).permute(0, 3, 1, 2)  # channels-last without moving anything
+    out = F.conv2d(images, weight[..., None, None], bias)
+    return out.permute(0, 2, 3, 1).reshape(*x.shape[:-1], len(weight))
+
+
+def _has_onednn(device: str) -> bool:
+    return device == "cpu" and platform.machine() in ("x86_64", "AMD64") and torch.backends.mkldnn.is_available()
