@@ -260,6 +260,41 @@ def test_compiled_normals_equal_the_plain_ones(sample, dtype: torch.dtype, toler
     assert (found.grad - expected.grad).norm() < tolerance * expected.grad.norm()
 
 
+def test_compiled_normals_of_wide_images(sample) -> None:
+    """Rows longer than what is worked on at a time."""
+    truth, depth, _, cameras, valid = disturbed(sample, size=(9, 600))
+    found, expected = (depth[0].clone().requires_grad_() for _ in range(2))
+    losses = [
+        point_normal_loss(found, cameras, truth, valid[0]),
+        point_normal_reference(expected, cameras, truth, valid[0]),
+    ]
+    torch.testing.assert_close(*losses, rtol=1e-12, atol=1e-13)
+    gradients = [torch.autograd.grad(loss, x)[0] for loss, x in zip(losses, (found, expected), strict=True)]
+    assert (gradients[0] - gradients[1]).norm() < 1e-12 * gradients[1].norm()
+
+
+def test_compiled_normals_do_not_depend_on_threads(sample) -> None:
+    truth, depth, _, cameras, valid = disturbed(sample)
+    results, threads = [], torch.get_num_threads()
+    try:
+        for number in (1, 2, 3):
+            torch.set_num_threads(number)
+            found = depth[0].clone().requires_grad_()
+            loss = point_normal_loss(found, cameras, truth, valid[0])
+            results.append((loss.detach(), *torch.autograd.grad(loss, found)))
+    finally:
+        torch.set_num_threads(threads)
+    for result in results[1:]:
+        assert all(torch.equal(*pair) for pair in zip(result, results[0], strict=True))
+
+
+def test_compiled_normals_hide_no_nan(sample) -> None:
+    truth, depth, _, cameras, valid = disturbed(sample)
+    broken = depth[0].clone()
+    broken[tuple(valid[0].nonzero()[100])] = torch.nan
+    assert point_normal_loss(broken, cameras, truth, valid[0]).isnan()
+
+
 def test_normals_give_cameras_a_gradient_where_they_ask_for_one(sample) -> None:
     truth, depth, _, cameras, valid = disturbed(sample)
     poses = cameras.world_to_camera.clone().requires_grad_()
