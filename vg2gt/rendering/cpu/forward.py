@@ -247,7 +247,9 @@ def _make_forward_tiles(geometry: bool, solid: bool) -> Callable[..., None]:
                     state[planes.LO : planes.LO + PLANE] = BIG
                     state[planes.THIN : planes.THIN + PLANE] = BIG
                 blend_tile(records, colors, boxes, mine, x_tile, y_tile, parameters, state, hits, counts, staged, spans)
-                most = counts.max()
+                most = counts[0]
+                for block in range(1, BLOCKS):
+                    most = max(most, counts[block])
                 if most * HIT_SIZE * BLOCKS <= len(hits):
                     break
                 hits = np.zeros(BLOCKS * most * HIT_SIZE, hits.dtype)
