@@ -5,7 +5,7 @@ from types import ModuleType
 import pytest
 import torch
 
-from vg2gt.voxels import grid, normals
+from vg2gt.voxels import grid, normals, point_moments
 
 
 @pytest.fixture
@@ -53,6 +53,7 @@ def test_the_modules_wait_for_shapes_and_for_two_warnings_only(
     for scenes in (1, 3):
         monkeypatch.setattr(grid, "_warned_of_sparse", set())  # what was warned of is not looked at again
         monkeypatch.setattr(normals, "sums_compiled", normals.sums_reference)  # as on a GPU
+        monkeypatch.setattr(point_moments, "compilable", lambda *_: False)
         tokens, geometry, images = make_room(scenes)
         coarse, fine = make_coarse(gate=True), make_fine(moments=True, normal_kernel=3)
         with gpu_waits.Waits() as waits:

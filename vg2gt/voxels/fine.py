@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from vg2gt.geometry.cameras import camera_centers, unproject
-from vg2gt.geometry.symmetric import FULL, UPPER
+from vg2gt.geometry.symmetric import UPPER
 from vg2gt.memory import Cap, check_limit, note_sizes
 from vg2gt.types import Geometry, Tokens, VoxelMoments, Voxels
 from vg2gt.voxels.dense_head import DenseHead
@@ -20,7 +20,6 @@ from vg2gt.voxels.grid import (
     plan_voxels,
     point_cells,
     pool_mean,
-    pool_mean_of_chunks,
     pool_min,
     scene_counts,
     scene_voxel_size,
@@ -28,6 +27,7 @@ from vg2gt.voxels.grid import (
 )
 from vg2gt.voxels.normals import surface_normals
 from vg2gt.voxels.point_features import pool_point_features, pool_point_features_of_chunks
+from vg2gt.voxels.point_moments import pool_point_moments
 from vg2gt.voxels.pointmlp import PointMLP
 from vg2gt.voxels.silhouette import on_surface
 
@@ -118,7 +118,8 @@ class FineModule(nn.Module):
         pooled = self._pool_features(tokens, images, points, plan)
         with torch.autocast(images.device.type, enabled=False):
             pixels = images.float().permute(0, 1, 3, 4, 2).reshape(-1, 3)  # [B V H W, 3]
-            means = pool_mean(torch.cat((points.offset, pixels), -1), points.confidence, plan)
+            values = torch.cat((points.offset, pixels), -1)  # [B V H W, 6]
+            means = pool_mean(values, points.confidence, plan)
             offset, colors = means.split(3, -1)
             confidence = pool_min(points.confidence, plan)
             count = plan.counts.to(pooled.dtype)
@@ -127,11 +128,11 @@ class FineModule(nn.Module):
             # Not grid * size + ...: centre plus offset keeps the centroid inside its cell in float32.
             centroid = (plan.grid + 0.5 + offset.double()) * size.double()[plan.batch, None]
             centroid = centroid.to(pooled.dtype)
-            moments = (
-                self._pool_moments(geometry, size, points, pixels, means, centroid, plan) if self.moments else None
-            )
-            if moments is not None:
-                extra += [12 * moments.spread[:, UPPER[0], UPPER[1]], 20 * moments.cross.flatten(1)]
+            moments = None
+            if self.moments:
+                moments = self._pool_moments(geometry, size, values, points.confidence, means, centroid, plan)
+                spread = [moments.spread[:, i, j] for i, j in zip(*UPPER, strict=True)]
+                extra += [12 * torch.stack(spread, -1), 20 * moments.cross.flatten(1)]
         refined = self.point_mlp(torch.cat((pooled, *extra), -1), plan.grid, plan.batch, size)
         return Voxels(refined, colors, plan.grid, plan.batch, confidence, count, centroid, size, moments)
 
@@ -140,39 +141,21 @@ class FineModule(nn.Module):
         self,
         geometry: Geometry,
         size: Tensor,
-        points: _Points,
-        pixels: Tensor,
+        values: Tensor,
+        confidence: Tensor,
         means: Tensor,
         centroid: Tensor,
         plan: VoxelPlan,
     ) -> VoxelMoments:
-        """Covariances about the pooled means ``[M, 6]``; a few views at a time, which bounds the memory."""
-        centers = camera_centers(geometry.cameras).flatten(0, 1).float()  # [B V, 3]
-        per_view = geometry.depth[0, 0].numel()
-        views = self.dense_head.views_per_chunk
-        focal = geometry.cameras.intrinsics[..., [0, 1], [0, 1]].mean(-1)  # [B, V]
-        cell = (focal * size[:, None])[..., None, None]
-        pixel = (torch.where(geometry.depth > 0, geometry.depth, 1.0) / cell).float().flatten()  # [B V H W]
-
-        upper = torch.tensor(UPPER, device=pixels.device)
-
-        def products(first: int) -> Tensor:
-            rows = slice(first * per_view, (first + views) * per_view)
-            offset, color = points.offset[rows], pixels[rows]
-            squares = offset.index_select(1, upper[0]) * offset.index_select(1, upper[1])  # [n, 6]
-            mixed = (offset[:, :, None] * color[:, None]).flatten(1)  # [n, 9]
-            eye = centers[first : first + views].repeat_interleave(per_view, 0)  # [n, 3]
-            return torch.cat((squares, mixed, eye, pixel[rows, None]), -1)
-
-        chunks = (products(first) for first in range(0, len(centers), views))
-        squares, mixed, eye, pixel = pool_mean_of_chunks(chunks, points.confidence, plan).split((6, 9, 3, 1), -1)
-        offset, color = means[:, :3], means[:, 3:]
-        spread = squares - offset[:, UPPER[0]] * offset[:, UPPER[1]]
-        cross = mixed.unflatten(-1, (3, 3)) - offset[:, :, None] * color[:, None]
+        """How the points of every voxel lie about the means ``[M, 6]`` of their places and colours ``[N, 6]``."""
+        centers = camera_centers(geometry.cameras).float()  # [B, V, 3]
+        focal = geometry.cameras.intrinsics[..., [0, 1], [0, 1]].mean(-1).float()  # [B, V]
+        views = torch.cat((centers, (focal * size[:, None])[..., None]), -1).flatten(0, 1)  # [B V, 4]
+        depth, chunk = geometry.depth.float().flatten(), self.dense_head.views_per_chunk
+        spread, cross, eye, pixel = pool_point_moments(values, depth, confidence, views, means, plan, chunk)
         facing = F.normalize(eye - centroid, dim=-1)
-        spread = spread[:, FULL].unflatten(-1, (3, 3))  # [M, 3, 3]
-        normal = surface_normals(spread, facing, offset, plan, self.normal_kernel)
-        return VoxelMoments(spread, cross, facing, pixel[:, 0], normal)
+        normal = surface_normals(spread, facing, means[:, :3], plan, self.normal_kernel)
+        return VoxelMoments(spread, cross, facing, pixel, normal)
 
     def _pool_features(self, tokens: Tokens, images: Tensor, points: _Points, plan: VoxelPlan) -> Tensor:
         """``[M, C]``; without gradient the features of a few views are there at a time, which bounds the memory."""

@@ -1,0 +1,180 @@
+"""The compiled pass over points' second moments holds to the plain one and to the definition."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor
+
+from vg2gt.voxels import point_moments
+from vg2gt.voxels.grid import VoxelPlan, plan_voxels, pool_mean
+from vg2gt.voxels.point_moments import Moments, moments_compiled, moments_reference, pool_point_moments
+
+VIEWS = 7
+CHUNK = 3  # of the views, where the pass is plain
+
+
+def points(per_view: int = 431) -> tuple[list[Tensor], VoxelPlan]:
+    """Values, depths, confidences and views of points in two scenes, a tenth of them in no voxel, and their plan."""
+    generator = torch.Generator().manual_seed(5)
+    count = VIEWS * per_view
+    cells = 6 * torch.rand(count, 3, generator=generator, dtype=torch.float64)
+    batch = (torch.arange(count) >= 3 * per_view).long()
+    plan = plan_voxels(cells, batch, torch.rand(count, generator=generator) > 0.1)
+    values = torch.cat(((cells - cells.floor() - 0.5).float(), torch.rand(count, 3, generator=generator)), -1)
+    depth, confidence = 0.5 + torch.rand(2, count, generator=generator)
+    views = torch.cat((torch.randn(VIEWS, 3, generator=generator), 1 + torch.rand(VIEWS, 1, generator=generator)), -1)
+    return [values, depth, confidence, views], plan
+
+
+def pooled(inputs: list[Tensor], plan: VoxelPlan) -> Moments:
+    values, depth, confidence, views = inputs
+    return pool_point_moments(values, depth, confidence, views, pool_mean(values, confidence, plan), plan, CHUNK)
+
+
+def by_definition(inputs: list[Tensor], plan: VoxelPlan) -> Moments:
+    """Voxel by voxel in float64."""
+    values, depth, confidence, views = (tensor.double() for tensor in inputs)
+    view = torch.arange(len(values)) // (len(values) // len(views))
+    rows = []
+    for voxel in range(len(plan)):
+        mine = (plan.voxel_of == voxel).nonzero()[:, 0]
+        share = (confidence[mine] / confidence[mine].sum())[:, None]
+        apart = values[mine] - (share * values[mine]).sum(0)
+        both = (share * apart).T @ apart
+        seen = views[view[mine]]
+        side = (share[:, 0] * depth[mine] / seen[:, 3]).sum()
+        rows.append((both[:3, :3], both[:3, 3:], (share * seen[:, :3]).sum(0), side))
+    spread, cross, eye, pixel = (torch.stack(parts) for parts in zip(*rows, strict=True))
+    return spread, cross, eye, pixel
+
+
+def largest_errors(found: Moments, wanted: Moments) -> list[float]:
+    return [float((a - b).abs().max()) for a, b in zip(found, wanted, strict=True)]
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_moments_are_those_of_the_definition(compiled: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    inputs, plan = points()
+    assert 0 < int((plan.voxel_of < 0).sum()) < 600
+    assert int(plan.counts.min()) == 1
+    monkeypatch.setattr(point_moments, "compilable", lambda *_: compiled)
+    assert max(largest_errors(pooled(inputs, plan), by_definition(inputs, plan))) < 1e-6
+
+
+def test_it_is_as_exact_as_plain_torch() -> None:
+    inputs, plan = points()
+    exact = by_definition(inputs, plan)
+    values, depth, confidence, views = inputs
+    means = pool_mean(values, confidence, plan)
+    compiled = largest_errors(moments_compiled(values, depth, confidence, views, means, plan), exact)
+    plain = largest_errors(moments_reference(values, depth, confidence, views, means, plan, CHUNK), exact)
+    assert all(a <= 2 * b + 1e-7 for a, b in zip(compiled, plain, strict=True)), (compiled, plain)
+
+
+def test_double_precision_is_kept_in_plain_torch() -> None:
+    inputs, plan = points()
+    found = pooled([tensor.double() for tensor in inputs], plan)
+    assert all(tensor.dtype == torch.float64 for tensor in found)
+    assert max(largest_errors(found, by_definition(inputs, plan))) < 1e-12
+
+
+@pytest.mark.parametrize("per_view", [1, 3, 49, 1000])
+def test_every_point_has_its_own_view(per_view: int) -> None:
+    """Each point a voxel of its own: nothing spreads, and the mean camera is the one that saw it."""
+    (_, depth, confidence, views), _ = points(per_view)
+    count = VIEWS * per_view
+    cells = torch.arange(count)[:, None].expand(count, 3) + 0.25
+    plan = plan_voxels(cells.double(), torch.zeros(count, dtype=torch.int64), torch.ones(count, dtype=torch.bool))
+    inputs = [torch.rand(count, 6), depth, confidence, views]
+    spread, cross, eye, pixel = pooled(inputs, plan)
+    seen = views.repeat_interleave(per_view, 0)
+    torch.testing.assert_close(eye, seen[:, :3])
+    torch.testing.assert_close(pixel, depth / seen[:, 3])
+    assert not spread.abs().max() > 1e-12
+    assert not cross.abs().max() > 1e-6
+
+
+def test_threads_do_not_change_a_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("vg2gt.voxels.passes.VOXELS_AT_ONCE", 50)
+    inputs, plan = points()
+    threads = torch.get_num_threads()
+    try:
+        results = []
+        for number in (1, 2, 3):
+            torch.set_num_threads(number)
+            results.append(pooled(inputs, plan))
+    finally:
+        torch.set_num_threads(threads)
+    assert all(torch.equal(a, b) for other in results[1:] for a, b in zip(results[0], other, strict=True))
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_points_in_no_voxel_have_no_say(compiled: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(point_moments, "compilable", lambda *_: compiled)
+    inputs, plan = points()
+    before, left_out = pooled(inputs, plan), plan.voxel_of < 0
+    inputs = [tensor.clone() for tensor in inputs]
+    for tensor in inputs[:3]:
+        tensor[left_out] = torch.nan
+    assert all(torch.equal(a, b) for a, b in zip(before, pooled(inputs, plan), strict=True))
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_dropped_voxels_leave_the_others_as_they_are(compiled: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(point_moments, "compilable", lambda *_: compiled)
+    inputs, plan = points()
+    keep = torch.arange(len(plan)) % 3 > 0
+    for part, whole in zip(pooled(inputs, plan.select(keep)), pooled(inputs, plan), strict=True):
+        torch.testing.assert_close(part, whole[keep], rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_no_voxel_has_no_moments(compiled: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(point_moments, "compilable", lambda *_: compiled)
+    inputs, plan = points(10)
+    nothing = plan.select(torch.zeros(len(plan), dtype=torch.bool))
+    shapes = [tuple(tensor.shape) for tensor in pooled(inputs, nothing)]
+    assert shapes == [(0, 3, 3), (0, 3, 3), (0, 3), (0,)]
+
+
+def spoil_place(inputs: list[Tensor], row: int) -> None:
+    inputs[0][row, 1] = torch.nan
+
+
+def spoil_color(inputs: list[Tensor], row: int) -> None:
+    inputs[0][row, 5] = torch.nan
+
+
+def spoil_depth(inputs: list[Tensor], row: int) -> None:
+    inputs[1][row] = torch.nan
+
+
+def spoil_confidence(inputs: list[Tensor], row: int) -> None:
+    inputs[2][row] = torch.nan
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize(
+    ("spoil", "numbers"),
+    [(spoil_place, 5 + 3), (spoil_color, 3), (spoil_depth, 1), (spoil_confidence, 9 + 9 + 3 + 1)],
+)
+def test_nan_reaches_its_voxel_and_no_other(
+    spoil: Callable[[list[Tensor], int], None], numbers: int, compiled: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Training finds faults by what is not finite."""
+    monkeypatch.setattr(point_moments, "compilable", lambda *_: compiled)
+    inputs, plan = points()
+    before, voxel = pooled(inputs, plan), 8
+    spoil(inputs, int(plan.order[plan.starts[voxel]]))
+    after = pooled(inputs, plan)
+    others = torch.arange(len(plan)) != voxel
+    assert all(torch.equal(a[others], b[others]) for a, b in zip(before, after, strict=True))
+    assert sum(int(tensor[voxel].isnan().sum()) for tensor in after) == numbers
+
+
+def test_there_is_no_gradient() -> None:
+    inputs, plan = points(20)
+    assert not any(tensor.requires_grad for tensor in pooled([tensor.requires_grad_() for tensor in inputs], plan))
