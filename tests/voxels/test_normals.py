@@ -86,14 +86,94 @@ def test_nothing_and_one_point() -> None:
     torch.testing.assert_close(surface_normals(spread, facing, offset, plan, 3), facing)
 
 
-@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 1e-5)])
-def test_compiled_sums_equal_the_plain_ones(dtype: torch.dtype, tolerance: float) -> None:
-    """Two scenes, with cells of several points and of one."""
+def two_scenes() -> tuple[Tensor, Tensor, Tensor, VoxelPlan]:
+    """Cells of several points and of one."""
     points = torch.cat([layers(torch.tensor([0.3, 0.1, 1.0]), 0.3, seed)[: 3000 + seed] for seed in range(2)])
-    batch = torch.arange(2).repeat_interleave(torch.tensor([3000, 3001]))
-    spread, facing, offset, plan = moments_of(points, batch)
-    upper, facing, offset = (v.to(dtype) for v in (spread[:, normals.UPPER[0], normals.UPPER[1]], facing, offset))
-    found = normals.sums_compiled(upper, facing, offset, plan)
-    expected = normals.sums_reference(upper, facing, offset, plan)
-    torch.testing.assert_close(found, expected, rtol=tolerance, atol=tolerance * float(plan.counts.max()))
-    assert (expected[:, 0] > plan.counts).any()
+    return moments_of(points, torch.arange(2).repeat_interleave(torch.tensor([3000, 3001])))
+
+
+def test_compiled_spread_of_neighbours_is_the_plain_one() -> None:
+    spread, facing, offset, plan = two_scenes()
+    normal = normals.facing_reference(spread, facing)
+    found = normals.around_compiled(spread, normal, offset, plan)
+    expected = normals.around_reference(spread.double(), normal.double(), offset.double(), plan)
+    torch.testing.assert_close(found.double(), expected, rtol=0, atol=2e-6)
+    assert not torch.allclose(expected, spread.double(), atol=0.1)
+
+
+@pytest.mark.parametrize("size", [1e-12, 1e-3, 1.0, 1e12])
+@pytest.mark.parametrize("values", [(1.0, 2.0, 3.0), (0.0, 1.0, 1.0), (1e-5, 0.08, 0.09), (0.0, 1e-3, 1.0)])
+def test_facing_normals_are_eigenvectors(size: float, values: tuple[float, ...]) -> None:
+    generator = torch.Generator().manual_seed(1)
+    axes = torch.linalg.qr(torch.randn(3000, 3, 3, generator=generator)).Q  # no multiple of a range of voxels
+    spread = size * axes @ torch.diag(torch.tensor(values)) @ axes.transpose(1, 2)
+    spread = (spread + spread.transpose(1, 2)) / 2  # to the last bit
+    facing = F.normalize(torch.randn(3000, 3, generator=generator), dim=-1)
+    sight = facing.double()
+    prior = normals.FACING_PRIOR * (torch.eye(3) - sight[:, :, None] * sight[:, None])
+    expected = torch.linalg.eigh(spread.double() + prior).eigenvectors[..., 0]
+    compiled = normals.facing_compiled(spread, facing).double()
+    plain = normals.facing_reference(spread.double(), sight)
+    for found, tolerance in ((compiled, 2e-7), (plain, 1e-9)):
+        assert torch.linalg.cross(found, expected).norm(dim=-1).max() < tolerance
+        assert (found * sight).sum(-1).min() > -1e-7
+
+
+@pytest.mark.parametrize("values", [(0.0, 0.0, 0.0), (1e6, 1e6, 1e6), (0.0, 0.0, 1e6), (2e6, 2e6, 3e6)])
+def test_without_a_single_least_direction_the_normal_faces_the_cameras(values: tuple[float, ...]) -> None:
+    """Cells with nothing but the prior, and those beside whose spread the prior is lost."""
+    facing = F.normalize(torch.randn(50, 3, generator=torch.Generator().manual_seed(2)), dim=-1)
+    spread = torch.diag(torch.tensor(values)).expand(50, 3, 3)
+    found = normals.facing_compiled(spread, facing)
+    torch.testing.assert_close(found, normals.facing_reference(spread.double(), facing.double()).float())
+    torch.testing.assert_close(found, facing)
+
+
+def test_threads_do_not_change_a_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("vg2gt.voxels.passes.VOXELS_AT_ONCE", 100)
+    parts, threads = two_scenes(), torch.get_num_threads()
+    assert len(parts[-1]) > 500
+    try:
+        results = []
+        for number in (1, 2, 3):
+            torch.set_num_threads(number)
+            results.append(surface_normals(*parts, 3))
+    finally:
+        torch.set_num_threads(threads)
+    assert all(torch.equal(results[0], other) for other in results[1:])
+    monkeypatch.setattr("vg2gt.voxels.passes.VOXELS_AT_ONCE", 1000)
+    torch.testing.assert_close(surface_normals(*parts, 3), results[0])
+
+
+@pytest.mark.parametrize("kernel", [1, 3])
+def test_plain_torch_does_the_same(kernel: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    spread, facing, offset, plan = two_scenes()
+    keep = torch.arange(len(plan)) % 5 > 0
+    spread, facing, offset, plan = spread[keep], facing[keep], offset[keep], plan.select(keep)
+    compiled = surface_normals(spread, facing, offset, plan, kernel)
+    exact = surface_normals(spread.double(), facing.double(), offset.double(), plan, kernel)
+    monkeypatch.setattr(normals, "compilable", lambda *_: False)
+    plain = surface_normals(spread, facing, offset, plan, kernel)
+    assert exact.dtype == torch.float64
+    torch.testing.assert_close(compiled.double(), exact, atol=1e-3, rtol=0)
+    torch.testing.assert_close(plain.double(), exact, atol=1e-2, rtol=0)
+
+
+def test_what_is_not_finite_stays_among_its_neighbours(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its normal faces the cameras, and is no number where their direction is none."""
+    spread, facing, offset, plan = two_scenes()
+    before = surface_normals(spread, facing, offset, plan, 3)
+    spread, facing = spread.clone(), facing.clone()
+    spread[50, 0, 1] = spread[50, 1, 0] = torch.nan
+    facing[70] = torch.nan
+    compiled = surface_normals(spread, facing, offset, plan, 3)
+    monkeypatch.setattr(normals, "compilable", lambda *_: False)
+    torch.testing.assert_close(
+        compiled, surface_normals(spread, facing, offset, plan, 3), equal_nan=True, atol=1e-2, rtol=0
+    )
+    assert compiled[70].isnan().all()
+    assert torch.equal(compiled[50], facing[50])
+    apart = (plan.grid - plan.grid[50]).abs().amax(1) > 1
+    apart[70] = False
+    assert torch.equal(compiled[apart], before[apart])
+    assert int(compiled.isnan().any(1).sum()) == 1

@@ -52,8 +52,8 @@ def test_the_modules_wait_for_shapes_and_for_two_warnings_only(
     """As often for three scenes as for one, but for the footprint's medians."""
     for scenes in (1, 3):
         monkeypatch.setattr(grid, "_warned_of_sparse", set())  # what was warned of is not looked at again
-        monkeypatch.setattr(normals, "sums_compiled", normals.sums_reference)  # as on a GPU
-        monkeypatch.setattr(point_moments, "compilable", lambda *_: False)
+        for module in (normals, point_moments):
+            monkeypatch.setattr(module, "compilable", lambda *_: False)  # as on a GPU
         tokens, geometry, images = make_room(scenes)
         coarse, fine = make_coarse(gate=True), make_fine(moments=True, normal_kernel=3)
         with gpu_waits.Waits() as waits:
