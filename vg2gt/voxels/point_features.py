@@ -18,6 +18,7 @@ from vg2gt.io.compiled import kernel
 from vg2gt.io.compiled_math import gelu
 from vg2gt.io.threads import parallel_for
 from vg2gt.voxels.grid import VoxelPlan, pool_mean, pool_mean_of_chunks
+from vg2gt.voxels.passes import compilable, over_voxels
 
 PARTS = 16  # of the voxels; their sums over all points are added in this order, whatever the number of threads
 
@@ -35,7 +36,7 @@ def pool_point_features(dense: Tensor, offset: Tensor, weight: Tensor, confidenc
     Returns:
         ``[M, C]``, differentiable in all tensors; compiled where they are float32 on a CPU.
     """
-    if len(plan) and _compilable(dense, offset, weight, confidence):
+    if len(plan) and compilable(dense, offset, weight, confidence):
         return _PooledFeatures.apply(dense, offset, weight, confidence, plan)  # pyright: ignore[reportReturnType]
     return pool_mean(point_features(dense, offset, weight), confidence, plan)
 
@@ -61,10 +62,6 @@ def point_features(dense: Tensor, offset: Tensor, weight: Tensor) -> Tensor:
         return F.gelu(torch.addmm(dense.float(), offset, weight.t()))
 
 
-def _compilable(*tensors: Tensor) -> bool:
-    return all(tensor.device.type == "cpu" and tensor.dtype == torch.float32 for tensor in tensors)
-
-
 class _PooledFeatures(torch.autograd.Function):
     """The compiled pass; the features are made again for the gradient instead of being kept."""
 
@@ -75,7 +72,7 @@ class _PooledFeatures(torch.autograd.Function):
         order, ends = plan.order, plan.starts + plan.counts
         mean, total = dense.new_empty(len(plan), dense.shape[1]), dense.new_empty(len(plan))
         arrays = [tensor.numpy() for tensor in (*inputs, order, plan.starts, ends, mean, total)]
-        parallel_for(_parts(len(plan)), lambda part: _pool(*arrays, *part[1:]))
+        over_voxels(len(plan), lambda first, last: _pool(*arrays, first, last))
         ctx.save_for_backward(*inputs, mean, total)
         ctx.plan = plan
         return mean
