@@ -50,6 +50,17 @@ def test_stages_of_the_papers_experiment(tmp_path: Path) -> None:
     assert json.loads(path.read_text())["precision"] == "bf16-mixed"
 
 
+@pytest.mark.slow
+def test_a_step_of_two_checkouts(tmp_path: Path) -> None:
+    options = ["--before", str(BENCHMARKS.parent), "--steps", "2", "--out", str(tmp_path)]
+    shown = run("before_after.py", tmp_path, *options, "data.image_size=[56,112]")
+    assert "median of pairs" in shown
+    (path,) = tmp_path.glob("*-step-before-after.json")
+    content = json.loads(path.read_text())
+    assert content["before"]["loss"] == pytest.approx(content["after"]["loss"], rel=1e-4)
+    assert content["before"]["step_core_seconds"] > 0
+
+
 def test_training_hours_count_every_device(benchmark_script) -> None:
     """The paper: 49.5 hours of two devices, 420000 steps, are 99 device hours."""
     assert benchmark_script("stages").paper_training_hours(49.5 * 3600 / 420_000) == pytest.approx(99)

@@ -1,3 +1,5 @@
+from functools import partial
+
 import pytest
 import torch
 from torch.nn import functional as F
@@ -8,13 +10,15 @@ from vg2gt.voxels.row_products import linear_rows
 
 @pytest.mark.parametrize("shape", [(1024, 7), (1040, 7), (1041, 7), (48, 32, 7), (0, 7), (5, 7)])
 @pytest.mark.parametrize("with_bias", [True, False])
-def test_rows_go_through_the_same_layer(shape: tuple[int, ...], with_bias: bool) -> None:
+@pytest.mark.parametrize("relu", [True, False])
+def test_rows_go_through_the_same_layer(shape: tuple[int, ...], with_bias: bool, relu: bool) -> None:
     generator = torch.Generator().manual_seed(0)
     values = [torch.randn(size, generator=generator, dtype=torch.float64) for size in (shape, (5, 7), (5,))]
     results = []
-    for layer, dtype in ((linear_rows, torch.float32), (F.linear, torch.float64)):
+    for layer, dtype in ((partial(linear_rows, relu=relu), torch.float32), (F.linear, torch.float64)):
         x, weight, bias = (value.to(dtype).requires_grad_() for value in values)
         out = layer(x, weight, bias if with_bias else None)
+        out = F.relu(out) if relu and layer is F.linear else out
         assert out.shape == (*shape[:-1], 5)
         assert out.dtype == dtype
         inputs = [x, weight, bias][: 2 + with_bias]

@@ -5,14 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from kornia.metrics import ssim
 from torch import Tensor
 
 from vg2gt.geometry.normals import normals_from_depth
+from vg2gt.losses.structure import structure_loss
 from vg2gt.types import Cameras, Render, TensorRecord
 
 NORMAL_TARGETS = ("render", "decoded", "gt")
-SSIM_WINDOW = 11  # kornia's Gaussian window has a standard deviation of 1.5 pixels
 
 
 @dataclass(frozen=True)
@@ -105,7 +104,7 @@ class GaussianLoss:
         near_decoded = hits & targets.decoded_valid & targets.comparable
         return {
             "color_l1": (color - targets.images).abs().mean(),
-            "ssim": (1 - ssim(color, targets.images, SSIM_WINDOW)).mean(),
+            "ssim": structure_loss(color, targets.images),
             "depth_consistency": weighted_mean((scaled - decoded).abs(), trust, near_decoded),
             "depth_gt": weighted_mean((scaled - targets.depth).abs(), torch.ones_like(scaled), hits & targets.valid),
             "normal": self._normal(rendered, cameras, targets, hits, trust),

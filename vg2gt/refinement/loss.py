@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 
 import torch
-from kornia.metrics import ssim
 from torch import Tensor
 
 from vg2gt.geometry.normals import normals_from_depth
-from vg2gt.losses.gaussian import SSIM_WINDOW, normal_error, weighted_mean
+from vg2gt.losses.gaussian import normal_error, weighted_mean
+from vg2gt.losses.structure import structure_loss
 from vg2gt.types import Cameras, Gaussians, Render, TensorRecord
 
 
@@ -88,7 +88,7 @@ class RefineLoss:
         if self.color_l1:
             terms["color_l1"] = (color - seen.images).abs().mean()
         if self.ssim:
-            terms["ssim"] = (1 - ssim(color, seen.images, SSIM_WINDOW)).mean()
+            terms["ssim"] = structure_loss(color, seen.images)
         if not self.needs_geometry:
             return terms
         hits = (depth > 0) & (rendered.alpha[0] > self.min_alpha)

@@ -25,7 +25,7 @@ class ResidualPointBlock(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Maps ``[..., C]`` to ``[..., C]``."""
-        hidden = F.relu(linear_rows(self.norm(x), self.fc1.weight, self.fc1.bias))
+        hidden = linear_rows(self.norm(x), self.fc1.weight, self.fc1.bias, relu=True)
         return x + linear_rows(hidden, self.fc2.weight, self.fc2.bias)
 
 
@@ -65,7 +65,7 @@ class GeometricStage(nn.Module):
             update = linear_rows(hidden, weight_hidden, self.out.bias) + F.linear(context, weight_context)[:, None]
             updates.append(update.flatten(0, 1))
         update = updates[0] if len(updates) == 1 else torch.cat(updates)
-        return features + self.gamma * update.index_select(0, windows.owner)
+        return torch.addcmul(features, self.gamma, update.index_select(0, windows.owner))
 
     def _first_layer(self, local: Tensor, place: Tensor) -> Tensor:
         """Affine and linear layer of one scene's windows: features ``[W, K, C]``, positions ``[W, K, 3]``."""
@@ -82,8 +82,9 @@ class GeometricStage(nn.Module):
 
 
 def _root_mean_square(deviation: Tensor) -> Tensor:
+    square = torch.linalg.vector_norm(deviation).square() / deviation.numel()
     # the inner constant keeps the root differentiable for single voxels
-    return (deviation.square().mean() + 1e-10).sqrt() + 1e-5
+    return (square + 1e-10).sqrt() + 1e-5
 
 
 class PointMLP(nn.Module):

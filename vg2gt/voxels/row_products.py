@@ -12,7 +12,7 @@ IMAGES = 16  # fewest for which torch gives a convolution of one thread to oneDN
 MIN_ROWS = 1024  # below, calling a convolution costs more than it saves
 
 
-def linear_rows(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
+def linear_rows(x: Tensor, weight: Tensor, bias: Tensor | None = None, relu: bool = False) -> Tensor:
     """``F.linear``, on x86 processors as a 1x1 convolution over the rows.
 
     torch multiplies matrices with MKL, which leaves half of some makers' vector units idle, but convolves with oneDNN,
@@ -22,15 +22,18 @@ def linear_rows(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor
         x: ``[..., C]``.
         weight: ``[D, C]``.
         bias: ``[D]`` or None.
+        relu: applies it as well, in place.
 
     Returns:
-        ``[..., D]``, equal to ``F.linear`` up to the order of summation.
+        ``[..., D]``, equal to ``F.linear`` and ``F.relu`` up to the order of summation.
     """
     rows = x.numel() // max(x.shape[-1], 1)
     if rows < MIN_ROWS or rows % IMAGES or x.dtype != torch.float32 or not _has_onednn(x.device.type):
-        return F.linear(x, weight, bias)
+        out = F.linear(x, weight, bias)
+        return out.relu_() if relu else out
     images = x.reshape(IMAGES, -1, 1, x.shape[-1]).permute(0, 3, 1, 2)  # channels-last without moving anything
     out = F.conv2d(images, weight[..., None, None], bias)
+    out = out.relu_() if relu else out
     return out.permute(0, 2, 3, 1).reshape(*x.shape[:-1], len(weight))
 
 

@@ -1,0 +1,163 @@
+"""A training step of two checkouts side by side: ``python benchmarks/before_after.py --before FOLDER [overrides]``.
+
+``git worktree add FOLDER COMMIT`` makes such a folder; ``--after`` is this checkout unless said otherwise. Two
+processes, each with the allocator as that checkout's ``train.py`` sets it, take a step in turns on the same scenes, so
+that whatever else the machine does meets both. Loading data is not counted. Prints processor time, the ratio of the
+means and the median of the pairs' ratios, peak memory and page faults, and writes them as a dated JSON file.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+HERE = Path(__file__).resolve().parents[1]
+WARMUP = 3
+SCENES = 12
+
+
+def serve(overrides: list[str], threads: int) -> None:
+    """Takes a step whenever a line arrives and answers with seconds forward, backward, loss, peak and page faults."""
+    sys.path[0] = str(Path(os.environ["PYTHONPATH"]) / "benchmarks")
+    answers = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)  # what libraries print is no answer
+    try:
+        from vg2gt.cli.allocator import give_back_large_blocks
+    except ImportError:  # before there was one
+        pass
+    else:
+        give_back_large_blocks()
+    import torch
+    from common import training_step
+
+    from vg2gt.studies.study import compose_run
+    from vg2gt.training.loop import build
+
+    torch.set_num_threads(threads)
+    with tempfile.TemporaryDirectory() as folder:
+        run = build(compose_run([f"data.train_scenes={SCENES}", *overrides], Path(folder)))
+        run.datamodule.setup("fit")
+        step_loss, loader = training_step(run), iter(run.datamodule.train_dataloader())
+        optimizer = torch.optim.AdamW(run.module.model.trained_parameters(), lr=1e-4, fused=True)
+        batches = [next(loader) for _ in range(SCENES)]
+        print("ready", file=answers, flush=True)
+        for number, _ in enumerate(sys.stdin):
+            start = time.process_time()
+            loss = step_loss(batches[number % SCENES])
+            middle = time.process_time()
+            loss.backward()
+            optimizer.step()
+            optimizer.zero_grad()
+            usage = resource.getrusage(resource.RUSAGE_SELF)
+            figures = (middle - start, time.process_time() - middle, float(loss.detach()))
+            print(*figures, usage.ru_maxrss / 1e3, usage.ru_minflt, file=answers, flush=True)
+
+
+class Side:
+    """A process that takes steps of one checkout.
+
+    Attributes:
+        rows: of every step after the warm-up: seconds forward, seconds backward, loss, peak MB, page faults so far.
+    """
+
+    def __init__(self, checkout: Path, arguments: list[str], threads: int) -> None:
+        self.rows: list[list[float]] = []
+        self.process = subprocess.Popen(
+            [sys.executable, __file__, "serve", str(threads), *arguments],
+            env={**os.environ, "PYTHONPATH": str(checkout), "OMP_NUM_THREADS": str(threads)},
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        self._answer()
+
+    def step(self, counts: bool) -> None:
+        """Takes one step."""
+        assert self.process.stdin is not None
+        print("step", file=self.process.stdin, flush=True)
+        row = [float(figure) for figure in self._answer().split()]
+        if counts:
+            self.rows.append(row)
+
+    def seconds(self) -> list[float]:
+        """Processor time of every step."""
+        return [row[0] + row[1] for row in self.rows]
+
+    def summary(self) -> dict[str, float]:
+        """Means over the steps."""
+        forward, backward, loss = (statistics.fmean(row[part] for row in self.rows) for part in range(3))
+        faults = (self.rows[-1][4] - self.rows[0][4]) / max(len(self.rows) - 1, 1)
+        return {
+            "step_core_seconds": forward + backward,
+            "forward_core_seconds": forward,
+            "backward_core_seconds": backward,
+            "loss": loss,
+            "peak_mb": self.rows[-1][3],
+            "page_faults": faults,
+        }
+
+    def _answer(self) -> str:
+        assert self.process.stdout is not None
+        line = self.process.stdout.readline()
+        if not line:
+            raise SystemExit(f"a side ended with exit status {self.process.wait()}; what it said stands above")
+        return line
+
+
+def commit(checkout: Path) -> str:
+    """Its commit, with a plus sign where files differ from it."""
+    command = ["git", "-C", str(checkout), "describe", "--always", "--dirty=+", "--exclude=*"]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+
+def compare(before: Path, after: Path, steps: int, threads: int, overrides: list[str]) -> dict[str, Any]:
+    """Takes the steps and returns what is written."""
+    sides = {name: Side(path, overrides, threads) for name, path in (("before", before), ("after", after))}
+    for step in range(WARMUP + steps):
+        for side in list(sides.values())[:: 1 if step % 2 else -1]:
+            side.step(step >= WARMUP)
+    summaries = {name: side.summary() for name, side in sides.items()}
+    pairs = zip(sides["before"].seconds(), sides["after"].seconds(), strict=True)
+    return {
+        "before": {"commit": commit(before), **summaries["before"]},
+        "after": {"commit": commit(after), **summaries["after"]},
+        "ratio": summaries["after"]["step_core_seconds"] / summaries["before"]["step_core_seconds"],
+        "median_of_pairs": statistics.median(late / early for early, late in pairs),
+        "steps": steps,
+        "threads": threads,
+        "overrides": overrides,
+    }
+
+
+def main() -> None:
+    """Measures, prints and writes."""
+    from common import machine, parser, write_results
+
+    from vg2gt.evaluation.tables import print_table
+
+    options = parser(__doc__, threads=1, overrides="Hydra overrides")
+    options.add_argument("--before", type=Path, required=True, help="a checkout")
+    options.add_argument("--after", type=Path, default=HERE, help="another; this one by default")
+    options.add_argument("--steps", type=int, default=24)
+    options.add_argument("--name", default="step-before-after", help="of the file, after the date")
+    arguments = options.parse_args()
+    sides = [path.resolve() for path in (arguments.before, arguments.after)]
+    found = compare(sides[0], sides[1], arguments.steps, arguments.threads, arguments.overrides)
+    rows = [[name, *(f"{found[side][name]:.4g}" for side in ("before", "after"))] for name in list(found["after"])[1:]]
+    ratios = f"ratio {found['ratio']:.3f}, median of pairs {found['median_of_pairs']:.3f}"
+    print_table(("", found["before"]["commit"], found["after"]["commit"]), rows, title=ratios)
+    write_results(arguments.out, arguments.name, {**found, "machine": machine()})
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["serve"]:
+        serve(sys.argv[3:], int(sys.argv[2]))
+    else:
+        main()
