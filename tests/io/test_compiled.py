@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
+from numba.core.dispatcher import Dispatcher
 
 from tests.commands import ROOT
 from vg2gt.io import compiled
@@ -124,3 +125,18 @@ def test_kernels_take_what_they_need_from_their_own_room() -> None:
         ]
     assert kernels >= 9
     assert not wrong
+
+
+def test_kernels_made_in_functions_are_found_again_by_other_processes() -> None:
+    """A kernel in a closure has another key in every process, which would compile anew and keep one file more."""
+    made = [
+        kernel
+        for room in compiled.ROOMS
+        for path in sorted((ROOT / room).rglob("*.py"))
+        if "import kernel" in path.read_text()
+        for kernel in vars(importlib.import_module(".".join(path.relative_to(ROOT).with_suffix("").parts))).values()
+        if isinstance(kernel, Dispatcher) and kernel.py_func.__closure__
+    ]
+    assert len(made) >= 12
+    for kernel in made:
+        assert all(isinstance(cell.cell_contents, bool) for cell in kernel.py_func.__closure__), kernel

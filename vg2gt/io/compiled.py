@@ -47,7 +47,8 @@ def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
     Compiled kernels are kept in the folder that the variable ``NUMBA_CACHE_DIR`` names, else in the user's cache
     folder, else in one of the user's own among temporary files; where none can be written to, every process compiles
-    anew.
+    anew. A kernel that is made inside a function takes other kernels by their modules' names, not from that function:
+    numba finds compiled code again by the values of the closure, and a kernel is another value in every process.
     """
 
     def compile_later(function: Callable[..., Any]) -> Any:

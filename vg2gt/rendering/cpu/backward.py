@@ -226,9 +226,14 @@ def _make_backward_tile(geometry: bool, solid: bool) -> Callable[..., None]:
     return backward_tile
 
 
+# By these names, not through a closure: numba could not find again what a closure with a kernel in it was compiled to.
+_backward_color = _make_backward_tile(False, False)
+_backward_rasterized = _make_backward_tile(True, False)
+_backward_solid = _make_backward_tile(True, True)
+
+
 def _make_backward_tiles(geometry: bool, solid: bool) -> Callable[..., None]:
     """Compiles the backward pass over tiles for what :mod:`vg2gt.rendering.cpu.forward` rendered."""
-    backward_tile = _make_backward_tile(geometry, solid)
 
     @kernel(fastmath=FAST, error_model="numpy", nogil=True)
     def backward_tiles(
@@ -249,10 +254,16 @@ def _make_backward_tiles(geometry: bool, solid: bool) -> Callable[..., None]:
                 grad_color, grad_normal, grad_alpha, grad_solid, grad_expected, grad_crossing,
             )  # fmt: skip
             begin, end = starts[tile], starts[tile + 1]
-            backward_tile(
+            args = (
                 records, colors, boxes, members[begin:end], places[begin:end], x_tile, y_tile, parameters,
                 state, sums, staged, spans, rows,
             )  # fmt: skip
+            if solid:
+                _backward_solid(*args)
+            elif geometry:
+                _backward_rasterized(*args)
+            else:
+                _backward_color(*args)
 
     return backward_tiles
 

@@ -223,9 +223,14 @@ def _solve(state, hits, block, count, parameters, steps, newton):
         state[k + planes.MEAN] = slope if sought else ZERO
 
 
+# By these names, not through a closure: numba could not find again what a closure with a kernel in it was compiled to.
+_blend_color = _make_blend_tile(False, False)
+_blend_rasterized = _make_blend_tile(True, False)
+_blend_solid = _make_blend_tile(True, True)
+
+
 def _make_forward_tiles(geometry: bool, solid: bool) -> Callable[..., None]:
     """Compiles the rendering of tiles, for colour alone, or with normals and the one or the other depth."""
-    blend_tile = _make_blend_tile(geometry, solid)
 
     @kernel(fastmath=FAST, error_model="numpy", nogil=True)
     def forward_tiles(
@@ -246,7 +251,13 @@ def _make_forward_tiles(geometry: bool, solid: bool) -> Callable[..., None]:
                 if solid:
                     state[planes.LO : planes.LO + PLANE] = BIG
                     state[planes.THIN : planes.THIN + PLANE] = BIG
-                blend_tile(records, colors, boxes, mine, x_tile, y_tile, parameters, state, hits, counts, staged, spans)
+                args = (records, colors, boxes, mine, x_tile, y_tile, parameters, state, hits, counts, staged, spans)
+                if solid:
+                    _blend_solid(*args)
+                elif geometry:
+                    _blend_rasterized(*args)
+                else:
+                    _blend_color(*args)
                 most = counts[0]
                 for block in range(1, BLOCKS):
                     most = max(most, counts[block])
