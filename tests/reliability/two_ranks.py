@@ -1,14 +1,10 @@
-"""Scenarios on two processes: ``python -m tests.reliability.two_ranks FOLDER CACHE NAME ...`` is one of them.
+"""Scenarios on two processes, several after one another on the same two."""
 
-Several scenarios share the processes, whose start takes longer than any of them.
-"""
-
-import os
 import socket
-import subprocess
-import sys
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from subprocess import CompletedProcess, TimeoutExpired
 from typing import Any
 from unittest.mock import patch
 
@@ -17,6 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
+from tests.commands import ROOT, become, warm_process
 from tests.reliability.degenerate import SCENES
 from tests.reliability.steps import first_batches, fit, tiny_run
 from vg2gt.data import DataError
@@ -141,47 +138,44 @@ SCENARIOS: dict[str, Callable[[Path, Path], dict[str, Any]]] = {
 }
 
 
-def run_on_two_ranks(folder: Path, cache: Path, *names: str, timeout: float = 900) -> list[subprocess.CompletedProcess]:
-    """Runs scenarios after one another; their results are ``FOLDER/<name>-<rank>.pt``.
+def run_on_two_ranks(folder: Path, cache: Path, *names: str, timeout: float = 900) -> list[CompletedProcess[str]]:
+    """Runs scenarios after one another; their results are ``FOLDER/<name>-<rank>.pt``, errors end a rank.
 
     Raises:
-        subprocess.TimeoutExpired: if they hang; nothing is left running.
+        TimeoutExpired: if they hang; nothing is left running.
     """
     address = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free_port()), "NODE_RANK": "0", "WORLD_SIZE": "2"}
-    command = [sys.executable, "-m", __name__, str(folder), str(cache), *names]
-    errors = [folder / f"errors-{rank}.txt" for rank in range(2)]
+    said = [folder / f"said-{rank}.txt" for rank in range(2)]
     ranks = [
-        subprocess.Popen(
-            command,
-            env={**os.environ, **address, "LOCAL_RANK": str(rank), "OMP_NUM_THREADS": "1"},
-            cwd=Path(__file__).parents[2],
-            stderr=path.open("w"),
-        )
-        for rank, path in enumerate(errors)
+        warm_process(_run_rank, folder, cache, names, path, address | {"LOCAL_RANK": str(rank)})
+        for rank, path in enumerate(said)
     ]
+    end = time.monotonic() + timeout
     try:
-        codes = [rank.wait(timeout) for rank in ranks]
+        for rank in ranks:
+            rank.join(max(0, end - time.monotonic()))
+        codes = [rank.exitcode for rank in ranks]
     finally:
         for rank in ranks:
             rank.kill()
-    return [
-        subprocess.CompletedProcess(command, code, stderr=path.read_text())
-        for code, path in zip(codes, errors, strict=True)
+    done = [
+        CompletedProcess(names, code, stderr=path.read_text())
+        for code, path in zip(codes, said, strict=True)
+        if code is not None
     ]
+    if len(done) < len(ranks):
+        raise TimeoutExpired(names, timeout)
+    return done
+
+
+def _run_rank(folder: Path, cache: Path, names: Sequence[str], said: Path, environment: dict[str, str | None]) -> None:
+    become(ROOT, [said], environment)
+    for name in names:
+        result = SCENARIOS[name](folder / name, cache)
+        torch.save(result, folder / f"{name}-{environment['LOCAL_RANK']}.pt")
 
 
 def free_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return probe.getsockname()[1]
-
-
-def main() -> None:
-    folder, cache, *names = sys.argv[1:]
-    for name in names:
-        result = SCENARIOS[name](Path(folder) / name, Path(cache))
-        torch.save(result, Path(folder) / f"{name}-{os.environ['LOCAL_RANK']}.pt")
-
-
-if __name__ == "__main__":
-    main()
