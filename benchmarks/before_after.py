@@ -1,9 +1,10 @@
 """A training step of two checkouts side by side: ``python benchmarks/before_after.py --before FOLDER [overrides]``.
 
 ``git worktree add FOLDER COMMIT`` makes such a folder; ``--after`` is this checkout unless said otherwise. Two
-processes, each with the allocator as that checkout's ``train.py`` sets it, take a step in turns on the same scenes, so
-that whatever else the machine does meets both. Loading data is not counted. Prints processor time, the ratio of the
-means and the median of the pairs' ratios, peak memory and page faults, and writes them as a dated JSON file.
+processes, each with the allocator as that checkout's ``train.py`` sets it, take a step in turns on the same views, so
+that whatever else the machine does meets both; as in training, no set of views comes twice. Loading them is not
+counted. Prints processor time, the ratio of the means and the median of the pairs' ratios, peak memory and page faults,
+and writes them as a dated JSON file.
 """
 
 from __future__ import annotations
@@ -46,11 +47,11 @@ def serve(overrides: list[str], threads: int) -> None:
         run.datamodule.setup("fit")
         step_loss, loader = training_step(run), iter(run.datamodule.train_dataloader())
         optimizer = torch.optim.AdamW(run.module.model.trained_parameters(), lr=1e-4, fused=True)
-        batches = [next(loader) for _ in range(SCENES)]
         print("ready", file=answers, flush=True)
-        for number, _ in enumerate(sys.stdin):
+        for _ in sys.stdin:
+            batch = next(loader)
             start = time.process_time()
-            loss = step_loss(batches[number % SCENES])
+            loss = step_loss(batch)
             middle = time.process_time()
             loss.backward()
             optimizer.step()

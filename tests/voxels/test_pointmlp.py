@@ -108,8 +108,9 @@ def stage_as_written(stage, features, positions, windows, batch):
     return features + stage.gamma * update[windows.owner]
 
 
-@pytest.mark.parametrize("counts", [[40], [40, 23, 5], [8, 0, 8], [1]])
-def test_a_stage_is_what_the_paper_says(counts):
+@pytest.mark.parametrize("few_sizes", [False, True])
+@pytest.mark.parametrize("counts", [[140], [40, 200, 5], [8, 0, 8], [1]])
+def test_a_stage_is_what_the_paper_says(counts, few_sizes):
     torch.manual_seed(0)
     stage = GeometricStage(6).double()
     for parameter in stage.parameters():
@@ -117,10 +118,11 @@ def test_a_stage_is_what_the_paper_says(counts):
     batch = torch.arange(len(counts)).repeat_interleave(torch.tensor(counts))
     features = (3 + torch.randn(len(batch), 6, dtype=torch.float64)).requires_grad_()
     positions = torch.randint(0, 1000, (len(batch), 3)).double()
-    windows = make_windows(torch.arange(len(batch)), counts, 8, shift=4)
+    order = torch.arange(len(batch))
+    windows, plain = (make_windows(order, counts, 8, shift=4, few_sizes=few) for few in (few_sizes, False))
     outputs = [
         stage(features, positions, windows),
-        stage_as_written(stage, features, positions, windows, batch),
+        stage_as_written(stage, features, positions, plain, batch),
     ]
     torch.testing.assert_close(*outputs)
     inputs = [features, *stage.parameters()]

@@ -8,7 +8,7 @@ from vg2gt.voxels import row_products
 from vg2gt.voxels.row_products import linear_rows
 
 
-@pytest.mark.parametrize("shape", [(1024, 7), (1040, 7), (1041, 7), (48, 32, 7), (0, 7), (5, 7)])
+@pytest.mark.parametrize("shape", [(1024, 7), (1152, 7), (1153, 7), (48, 32, 7), (0, 7), (5, 7)])
 @pytest.mark.parametrize("with_bias", [True, False])
 @pytest.mark.parametrize("relu", [True, False])
 def test_rows_go_through_the_same_layer(shape: tuple[int, ...], with_bias: bool, relu: bool) -> None:
@@ -40,7 +40,7 @@ def test_only_many_rows_in_float32_are_convolved(monkeypatch: pytest.MonkeyPatch
     conv2d = F.conv2d
     monkeypatch.setattr(F, "conv2d", lambda x, *others: convolved.append(x) or conv2d(x, *others))
     weight = torch.randn(5, 7)
-    for rows, dtype in ((1008, torch.float32), (1025, torch.float32), (1024, torch.float64)):
+    for rows, dtype in ((960, torch.float32), (1025, torch.float32), (1088, torch.float32), (1024, torch.float64)):
         linear_rows(torch.randn(rows, 7, dtype=dtype), weight.to(dtype))
     assert not convolved
     x = torch.randn(1024, 7)

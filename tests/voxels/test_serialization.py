@@ -3,6 +3,7 @@ import torch
 
 from vg2gt.voxels.serialization import (
     ORDERS,
+    WindowGroup,
     hilbert_codes,
     make_windows,
     relative_grid,
@@ -86,17 +87,33 @@ def test_too_large_a_scene_is_refused_with_its_size_and_extent():
 
 @pytest.mark.parametrize("count", [1, 7, 8, 9, 16, 17, 30])
 @pytest.mark.parametrize("shift", [0, 4])
-def test_every_voxel_is_owned_once_by_a_window_of_its_scene(count, shift):
+@pytest.mark.parametrize("few_sizes", [False, True])
+def test_every_voxel_is_owned_once_by_a_window_of_its_scene(count, shift, few_sizes):
     counts = [count, 11, 0, 3]
     batch = torch.arange(4).repeat_interleave(torch.tensor(counts))
     order = torch.cat([torch.randperm(n) + sum(counts[:i]) for i, n in enumerate(counts)])
-    windows = make_windows(order, counts, 8, shift)
+    windows = make_windows(order, counts, 8, shift, few_sizes)
     rows = torch.cat([group.rows.flatten() for group in windows.groups])
     assert torch.equal(rows[windows.owner], torch.arange(len(order)))
     position = order.argsort()
     for group in windows.groups:
+        group = WindowGroup(group.rows[: sum(group.counts)], group.counts)
         scenes = batch[group.rows]
         assert torch.equal(scenes, scenes[:, :1].expand_as(scenes))
         assert torch.equal(scenes[:, 0].unique_consecutive(return_counts=True)[1], torch.tensor(group.counts))
         assert position[group.rows].diff(dim=1).eq(1).all()
         assert group.rows.shape[1] == min(8, counts[int(scenes[0, 0])])
+
+
+def test_few_sizes_of_groups():
+    """An eighth more windows at most, each of them one voxel, and eight sizes from one power of two to the next."""
+    sizes = set()
+    for count in range(1, 600):
+        counts = [7 * count, 3]
+        (group, short) = make_windows(torch.arange(sum(counts)), counts, 7, few_sizes=True).groups
+        assert group.counts == (count,)
+        assert len(short.rows) == 1
+        assert count <= len(group.rows) <= 1.125 * count
+        assert (group.rows[count:] == group.rows[0, 0]).all()
+        sizes.add(len(group.rows))
+    assert len([size for size in sizes if 256 < size <= 512]) == 8

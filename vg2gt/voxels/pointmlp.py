@@ -55,9 +55,10 @@ class GeometricStage(nn.Module):
         updates = []
         for group in windows.groups:
             rows = group.rows.flatten()
-            local = features.index_select(0, rows).unflatten(0, group.rows.shape).split(group.counts)
-            place = positions.index_select(0, rows).unflatten(0, group.rows.shape).split(group.counts)
-            first = [self._first_layer(x, p) for x, p in zip(local, place, strict=True)]
+            sizes = (*group.counts[:-1], len(group.rows) - sum(group.counts[:-1]))  # the last with what nobody owns
+            local = features.index_select(0, rows).unflatten(0, group.rows.shape).split(sizes)
+            place = positions.index_select(0, rows).unflatten(0, group.rows.shape).split(sizes)
+            first = [self._first_layer(*scene) for scene in zip(local, place, group.counts, strict=True)]
             hidden = self.before(first[0] if len(first) == 1 else torch.cat(first))
             context = self.after(hidden.amax(1))
             # W_o [h | g], the window's half computed once a window
@@ -67,22 +68,25 @@ class GeometricStage(nn.Module):
         update = updates[0] if len(updates) == 1 else torch.cat(updates)
         return torch.addcmul(features, self.gamma, update.index_select(0, windows.owner))
 
-    def _first_layer(self, local: Tensor, place: Tensor) -> Tensor:
-        """Affine and linear layer of one scene's windows: features ``[W, K, C]``, positions ``[W, K, 3]``."""
+    def _first_layer(self, local: Tensor, place: Tensor, windows: int) -> Tensor:
+        """Affine and linear layer of one scene's windows: features ``[W, K, C]``, positions ``[W, K, 3]``.
+
+        Of those, ``windows`` count; others hold one voxel, which deviates from itself by nothing.
+        """
         channels = local.shape[-1]
         of_affine, of_place, of_local = self.inner.weight.split((channels, 3, channels), 1)
         mean = local.mean(1)  # [W, C]
         local, place = local - mean[:, None], place.to(local.dtype)
         place = place - place.mean(1, keepdim=True)
-        of_affine = of_affine * (self.alpha[:channels] / _root_mean_square(local))
-        of_place = of_place * (self.alpha[channels:] / _root_mean_square(place))
+        of_affine = of_affine * (self.alpha[:channels] / _root_mean_square(local, windows))
+        of_place = of_place * (self.alpha[channels:] / _root_mean_square(place, windows))
         weight = torch.cat((of_affine + of_local, of_place), 1)
         constant = self.inner.bias + self.inner.weight[:, : channels + 3] @ self.beta + F.linear(mean, of_local)
         return linear_rows(torch.cat((local, place), -1), weight) + constant[:, None]
 
 
-def _root_mean_square(deviation: Tensor) -> Tensor:
-    square = torch.linalg.vector_norm(deviation).square() / deviation.numel()
+def _root_mean_square(deviation: Tensor, windows: int) -> Tensor:
+    square = torch.linalg.vector_norm(deviation).square() / (windows * deviation[0].numel())
     # the inner constant keeps the root differentiable for single voxels
     return (square + 1e-10).sqrt() + 1e-5
 
@@ -144,6 +148,7 @@ class PointMLP(nn.Module):
         counts = scene_counts(batch, len(voxel_size)).tolist()
         curves = [torch.argsort(key) for key in serial_keys(grid, batch, voxel_size, orders)]
         return [
-            make_windows(curves[i % len(curves)], counts, self.window, shift=self.window // 2 * (i % 2))
+            # few sizes: a convolution is compiled for every new one
+            make_windows(curves[i % len(curves)], counts, self.window, shift=self.window // 2 * (i % 2), few_sizes=True)
             for i in range(len(self.stages))
         ]

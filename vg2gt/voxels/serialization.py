@@ -116,8 +116,8 @@ class WindowGroup:
     """Windows of one length. Scenes shorter than the wanted length make a group of their own.
 
     Attributes:
-        rows: ``[W, K]`` voxels of every window, scene after scene.
-        counts: windows of each scene that has some here.
+        rows: ``[W, K]`` voxels of every window, scene after scene; windows at the end that nobody owns hold one voxel.
+        counts: windows of each scene that has some here, without those.
     """
 
     rows: Tensor
@@ -140,7 +140,7 @@ class Windows:
     owner: Tensor
 
 
-def make_windows(order: Tensor, counts: list[int], length: int, shift: int = 0) -> Windows:
+def make_windows(order: Tensor, counts: list[int], length: int, shift: int = 0, few_sizes: bool = False) -> Windows:
     """Cuts the serialised voxels of every scene into windows.
 
     Args:
@@ -148,6 +148,7 @@ def make_windows(order: Tensor, counts: list[int], length: int, shift: int = 0) 
         counts: voxels of each scene.
         length: voxels per window; a scene with fewer makes one window of what it has.
         shift: the first window starts this many voxels before the scene does, 0 <= shift < length.
+        few_sizes: adds windows that nobody owns, at most an eighth, so that groups have few different sizes.
     """
     by_length: dict[int, list[tuple[int, int]]] = {}
     begin = 0
@@ -168,5 +169,10 @@ def make_windows(order: Tensor, counts: list[int], length: int, shift: int = 0) 
             owner[voxels] = base + window * size + place - inside[window]
             rows.append(voxels[inside[:, None] + torch.arange(size, device=order.device)])  # [W, K]
             base += len(inside) * size
-        groups.append(WindowGroup(torch.cat(rows), tuple(map(len, rows))))
+        windows = tuple(map(len, rows))
+        if few_sizes:
+            spare = -sum(windows) % (1 << max(sum(windows).bit_length() - 4, 0))
+            rows.append(rows[0][:1, :1].expand(spare, size))
+            base += spare * size
+        groups.append(WindowGroup(torch.cat(rows), windows))
     return Windows(tuple(groups), owner)
