@@ -21,7 +21,7 @@ ONE, TWO, ZERO = np.float32(1), np.float32(2), np.float32(0)
 
 
 def structure_loss(images: Tensor, reference: Tensor) -> Tensor:
-    """Mean of ``1 - SSIM`` over all pixels (Gaussian window 11 x 11, sigma 1.5, range 1, borders reflected).
+    """Mean of ``1 - SSIM`` over all pixels (paper, eqn gsloss): Gaussian window 11 x 11, sigma 1.5, borders reflected.
 
     Args:
         images: ``[R, C, H, W]``, at least 6 pixels high and wide.
