@@ -34,7 +34,7 @@ def test_rows_need_not_be_contiguous() -> None:
     torch.testing.assert_close(linear_rows(x, weight), F.linear(x, weight))
 
 
-@pytest.mark.skipif(not row_products._has_onednn("cpu"), reason="this processor's torch has no oneDNN")
+@pytest.mark.skipif(not row_products.has_onednn(torch.device("cpu")), reason="this processor's torch has no oneDNN")
 def test_only_many_rows_in_float32_are_convolved(monkeypatch: pytest.MonkeyPatch) -> None:
     convolved = []
     conv2d = F.conv2d

@@ -8,7 +8,7 @@ from torch.nn import functional as F
 from torch.utils.checkpoint import checkpoint
 
 from vg2gt.voxels.grid import scene_counts
-from vg2gt.voxels.row_products import linear_rows
+from vg2gt.voxels.row_products import has_onednn, linear_rows
 from vg2gt.voxels.serialization import Order, Windows, make_windows, relative_grid, serial_keys
 
 STAGE_ORDERS: tuple[Order, ...] = ("hilbert", "hilbert-trans", "z", "z-trans")
@@ -147,8 +147,8 @@ class PointMLP(nn.Module):
         orders = STAGE_ORDERS[: len(self.stages)]
         counts = scene_counts(batch, len(voxel_size)).tolist()
         curves = [torch.argsort(key) for key in serial_keys(grid, batch, voxel_size, orders)]
+        few_sizes = has_onednn(grid.device)  # which compiles a convolution for every new size
         return [
-            # few sizes: a convolution is compiled for every new one
-            make_windows(curves[i % len(curves)], counts, self.window, shift=self.window // 2 * (i % 2), few_sizes=True)
+            make_windows(curves[i % len(curves)], counts, self.window, self.window // 2 * (i % 2), few_sizes)
             for i in range(len(self.stages))
         ]

@@ -32,7 +32,7 @@ def linear_rows(x: Tensor, weight: Tensor, bias: Tensor | None = None, relu: boo
     """
     rows = x.numel() // max(x.shape[-1], 1)
     coarse = rows % (1 << max(rows.bit_length() - ROWS_BITS, 0)) == 0
-    if rows < MIN_ROWS or not coarse or x.dtype != torch.float32 or not _has_onednn(x.device.type):
+    if rows < MIN_ROWS or not coarse or x.dtype != torch.float32 or not has_onednn(x.device):
         out = F.linear(x, weight, bias)
         return out.relu_() if relu else out
     images = x.reshape(IMAGES, -1, 1, x.shape[-1]).permute(0, 3, 1, 2)  # channels-last without moving anything
@@ -41,5 +41,6 @@ def linear_rows(x: Tensor, weight: Tensor, bias: Tensor | None = None, relu: boo
     return out.permute(0, 2, 3, 1).reshape(*x.shape[:-1], len(weight))
 
 
-def _has_onednn(device: str) -> bool:
-    return device == "cpu" and platform.machine() in ("x86_64", "AMD64") and torch.backends.mkldnn.is_available()
+def has_onednn(device: torch.device) -> bool:
+    """Whether convolutions there go to oneDNN on an x86 processor."""
+    return device.type == "cpu" and platform.machine() in ("x86_64", "AMD64") and torch.backends.mkldnn.is_available()
