@@ -1,12 +1,17 @@
 """The example of docs/add-a-backend.md passes the contract test, as it says there."""
 
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests.commands import ROOT, run_python
+
+# PYTHONPATH=FOLDER pytest tests/backends/test_contract.py --backend my_pkg.LocalDepthBackend
+RUN = """
+import sys, pytest
+sys.path.insert(0, sys.argv[1])
+chosen = ["tests/backends/test_contract.py", "--backend", "my_pkg.LocalDepthBackend"]
+sys.exit(pytest.main([*chosen, "-n", "0", "-p", "no:cacheprovider"]))
+"""
 
 
 def test_example_passes_the_contract(tmp_path: Path) -> None:
@@ -16,15 +21,7 @@ def test_example_passes_the_contract(tmp_path: Path) -> None:
     code = match.group(1)
     assert len(code.splitlines()) <= 40
     (tmp_path / "my_pkg.py").write_text(code)
-    path = os.pathsep.join((str(tmp_path), str(ROOT), os.environ.get("PYTHONPATH", "")))
-    command = [sys.executable, "-m", "pytest", "tests/backends/test_contract.py", "-n", "0", "-p", "no:cacheprovider"]
-    result = subprocess.run(
-        [*command, "--backend", "my_pkg.LocalDepthBackend"],
-        cwd=ROOT,
-        env={**os.environ, "PYTHONPATH": path},
-        capture_output=True,
-        text=True,
-    )
+    result = run_python(RUN, str(tmp_path), folder=ROOT)
     assert result.returncode == 0, result.stdout
     assert " passed" in result.stdout
     assert "skipped" not in result.stdout

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from hydra.errors import HydraException
 
-from tests.commands import ROOT
+from tests.commands import ROOT, run_python, shell
 from vg2gt import __version__
 from vg2gt.cli import main
 from vg2gt.cli.commands import COMMANDS, DATA_COMMANDS, Command, dispatch
@@ -45,6 +45,10 @@ def helps(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     assert not list(folder.iterdir())
     texts = shown.stdout.split("HELP OF ")[1:]
     return {text.partition("\n")[0]: text for text in texts}
+
+
+def test_a_shell_finds_the_installed_command(tmp_path: Path) -> None:
+    assert f"vg2gt {__version__}" in shell("vg2gt --version", tmp_path)
 
 
 @pytest.mark.parametrize("words", ALL, ids=" ".join)
@@ -89,8 +93,7 @@ for module in {modules}:
 
 def test_modules_are_commands_too(tmp_path: Path) -> None:
     modules = ["vg2gt.data.synthetic", "vg2gt.data.splits", "vg2gt.data.shards", "backends.export"]
-    script = MODULES.format(modules=modules)
-    shown = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, check=False)
+    shown = run_python(MODULES.format(modules=modules), folder=tmp_path)
     assert shown.returncode == 0, shown.stderr[-2000:]
     assert shown.stdout.count("example: vg2gt ") == len(modules)
 

@@ -11,7 +11,7 @@ import pytest
 
 import vg2gt.studies.ablation
 import vg2gt.studies.study
-from tests.commands import ROOT, run_vg2gt, shell
+from tests.commands import ROOT, printed, run_vg2gt
 from tests.training_helpers import SMALL
 from vg2gt.evaluation.tables import METRICS
 from vg2gt.runs.checkpoints import newest_valid, read_checkpoint, write_checkpoint
@@ -40,7 +40,7 @@ def unpadded(report: str) -> str:
 
 @pytest.fixture(scope="module")
 def of_the_readme(tmp_path_factory: pytest.TempPathFactory, cache: Path) -> tuple[Path, str]:
-    """The README's line in a shell, as printed; later overrides make it short. Its folder, and what it prints."""
+    """The README's line, split as a shell does; later overrides make it short. Its folder, and what it prints."""
     folder = tmp_path_factory.mktemp("ablation")
     (line,) = re.findall(r"^(vg2gt ablate [^#\n]*?)(?: *#.*)?$", (ROOT / "README.md").read_text(), re.MULTILINE)
     short = [
@@ -54,8 +54,8 @@ def of_the_readme(tmp_path_factory: pytest.TempPathFactory, cache: Path) -> tupl
         *QUIET,
     ]
     short.append(f"data.cache_dir={cache}")
-    printed = shell(" ".join([line, *(f"'{override}'" for override in short)]), folder)
-    return folder / "outputs" / "short", printed
+    shown = printed(" ".join([line, *(f"'{override}'" for override in short)]), folder)
+    return folder / "outputs" / "short", shown
 
 
 @pytest.fixture(scope="module")

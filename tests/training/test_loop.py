@@ -1,12 +1,12 @@
 """Whole runs: every ablation, backends, resume, bad input."""
 
 import json
+import os
 import shlex
 import shutil
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ import torch
 from omegaconf import OmegaConf
 
 from tests.commands import run_vg2gt, shell
+from tests.reliability import crash_harness
 from tests.training_helpers import SMALL, full_model, small_config
 from vg2gt.config import compose
 from vg2gt.data import DataError, Frames, SyntheticScenes
@@ -97,23 +98,16 @@ def test_only_the_trained_part_changes(tmp_path: Path, cache: Path) -> None:
 
 def test_sigterm_saves_and_ends(tmp_path: Path, cache: Path) -> None:
     """In training the step is finished and saved; in the evaluation before it there is nothing to save."""
-    overrides = [*SMALL, f"output_dir={tmp_path}", f"hydra.run.dir={tmp_path}", f"data.cache_dir={cache}"]
+    folder = tmp_path / "run"
+    overrides = [*SMALL, f"output_dir={folder}", f"hydra.run.dir={folder}", f"data.cache_dir={cache}"]
     overrides += ["trainer.max_steps=100000", "callbacks.checkpoint.every_n_train_steps=100000"]
-    command = [sys.executable, "-m", "vg2gt.cli.train", *overrides]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-    deadline = time.monotonic() + 240
-    while process.poll() is None and time.monotonic() < deadline and not trains(tmp_path):
-        time.sleep(0.2)
-    process.send_signal(signal.SIGTERM)
-    _, errors = process.communicate(timeout=60)
-    assert process.returncode == 0, errors[-2000:]
-    saved = newest_valid(tmp_path / "checkpoints")
+    attempt = crash_harness.start(crash_harness.TRAIN, overrides, folder)
+    assert attempt.wait_for(lambda attempt: "train/" in attempt.log())
+    os.kill(attempt.process.pid, signal.SIGTERM)
+    assert attempt.wait() == 0, attempt.said()[-2000:]
+    saved = newest_valid(folder / "checkpoints")
     assert read_checkpoint(saved)["global_step"] >= 1
-    assert "go on with ckpt=last" in errors
-
-
-def trains(folder: Path) -> bool:
-    return any("train/" in path.read_text() for path in folder.glob("logs/*/metrics.csv"))
+    assert "go on with ckpt=last" in attempt.said()
 
 
 class Signalled(lightning.Callback):
