@@ -1,4 +1,8 @@
-"""Fixtures used by every test folder."""
+"""Fixtures used by every test folder.
+
+What takes seconds to import is imported by the fixtures: the process that starts the others loads this file as well,
+and they wait for it.
+"""
 
 import os
 
@@ -10,11 +14,8 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
-from hydra.utils import instantiate
 
-from backends.export import export
 from tests.sharing import made_once, shared_folder
-from vg2gt.config import compose
 
 SHALLOW = ["+backend=da3_tiny", "backend.depth=4", "backend.multiview_from=1", "backend.taps=[0,1,2,3]"]
 
@@ -51,10 +52,16 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def shallow_da3():
     """The network behind :func:`onnx_bundle`: da3_tiny with half its blocks, to export faster."""
+    from hydra.utils import instantiate
+
+    from vg2gt.config import compose
+
     return instantiate(compose(None, *SHALLOW).backend)
 
 
 @pytest.fixture(scope="session")
 def onnx_bundle(shallow_da3, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An exported network."""
+    from backends.export import export
+
     return made_once(tmp_path_factory, "onnx", lambda folder: export(shallow_da3, folder / "bundle")) / "bundle"

@@ -1,6 +1,8 @@
 """Who imports whom, read from the source: imports inside functions count as well."""
 
 import ast
+import subprocess
+import sys
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -125,3 +127,13 @@ def test_nothing_needs_a_recipe() -> None:
 def test_few_modules_stand_loose() -> None:
     loose = [path.name for path in (ROOT / "vg2gt").glob("*.py") if path.name != "__init__.py"]
     assert len(loose) <= 8, loose
+
+
+def test_data_and_reconstruction_are_imported_without_lightning() -> None:
+    code = """
+import sys, vg2gt.data, vg2gt.data.sources
+assert not {"lightning", "hydra"} & set(sys.modules)
+import vg2gt.reconstruction, vg2gt.reconstruction.outputs
+assert "lightning" not in sys.modules
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)

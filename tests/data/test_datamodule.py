@@ -1,7 +1,5 @@
 """Batches for training and evaluation, and the same batches after a resume."""
 
-import subprocess
-import sys
 from functools import partial
 from types import SimpleNamespace
 
@@ -219,11 +217,6 @@ def test_the_cache_of_resized_frames_leads_to_shards(rooms):
         ValueError, match=r"replaced by shards: .*shards out=.* size=\[28,56\] .*data=shards data\.root"
     ):
         _module(rooms, image_size=(28, 56), resized_cache="frames")
-
-
-def test_data_is_imported_without_lightning():
-    code = "import sys, vg2gt.data, vg2gt.data.sources; assert not {'lightning', 'hydra'} & set(sys.modules)"
-    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_an_option_of_another_loader_is_named():

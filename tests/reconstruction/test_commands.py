@@ -2,8 +2,6 @@
 
 import json
 import re
-import subprocess
-import sys
 import zipfile
 from dataclasses import replace
 from pathlib import Path
@@ -21,11 +19,6 @@ from vg2gt.reconstruction.scene import Scene
 ORACLE = "oracle,depth_noise=0"
 
 TINY = ["--backend", "da3_tiny", "--size", "70", "--quiet", "--device", "cpu"]
-
-
-def test_reconstruction_needs_no_lightning() -> None:
-    code = "import sys, vg2gt.reconstruction, vg2gt.reconstruction.outputs; sys.exit('lightning' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 def test_photographs_of_all_sizes(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
