@@ -87,11 +87,10 @@ def uv_embedding(channels: int, size: tuple[int, int], image_size: tuple[int, in
     y, x = (_centered(length, like.device) for length in size)
     quarter = channels // 4
     omega = 100.0 ** (-torch.arange(quarter, device=like.device, dtype=torch.float64) / quarter)
-    waves = []
-    for coordinate in ((x * x_extent)[None, :].expand(size), (y * y_extent)[:, None].expand(size)):
-        phase = omega[:, None, None] * coordinate
-        waves += [phase.sin(), phase.cos()]
-    return torch.cat(waves).to(like.dtype)
+    columns, rows = omega[:, None, None] * (x * x_extent), omega[:, None, None] * (y * y_extent)[:, None]
+    # A coordinate's waves are the same along the other axis: computed once, then repeated.
+    waves = [torch.cat((phase.sin(), phase.cos())).to(like.dtype) for phase in (columns, rows)]
+    return torch.cat([wave.expand(-1, *size) for wave in waves])
 
 
 def _centered(length: int, device: torch.device) -> Tensor:
