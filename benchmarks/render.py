@@ -20,6 +20,7 @@ from typing import Any
 
 import torch
 from common import MEGABYTE, PeakMemory, machine, parser, used_seconds, write_results
+from opensplat import rasterize
 from render_scene import room_cameras, room_gaussians
 from torch import Tensor
 
@@ -91,8 +92,8 @@ def measure_once(case: Case, gaussians: Gaussians, cameras: Cameras) -> Timing:
 
 
 def _run(case: Case, gaussians: Gaussians, cameras: Cameras) -> list[Tensor]:
-    if case.implementation == "gsplat":
-        return _run_gsplat(gaussians, cameras)
+    if case.implementation in PEERS:
+        return PEERS[case.implementation](gaussians, cameras)
     out = render(
         gaussians,
         cameras,
@@ -122,6 +123,9 @@ def _run_gsplat(gaussians: Gaussians, cameras: Cameras) -> list[Tensor]:
         render_mode="RGB+ED",
     )
     return [colors, alphas]
+
+
+PEERS: dict[str, Callable[[Gaussians, Cameras], list[Tensor]]] = {"gsplat": _run_gsplat}
 
 
 def compare(cases: list[Case], device: torch.device, passes: int) -> list[Timing]:
@@ -173,6 +177,16 @@ def cpu_suites(quick: bool) -> dict[str, list[Case]]:
     suites["views"] = [replace(base, gaussians=30_000, views=v) for v in (1, 2, 4, 8)]
     suites["threads"] = [replace(base, views=2, threads=t) for t in sorted({1, 2, cores // 2, cores} - {0})]
     return suites
+
+
+def peer_suite() -> dict[str, list[Case]]:
+    """Cases beside OpenSplat's CPU rasteriser, which has colour alone."""
+    suite = []
+    for count in (20_000, 100_000, 300_000):
+        base = Case("cpu", count, sigma=2.0 if count == 20_000 else 1.0)
+        peer = replace(base, implementation="opensplat", mode="rasterized", geometry=False)
+        suite += [peer, replace(peer, implementation="cpu"), replace(base, geometry=False), base]
+    return {"beside OpenSplat": suite}
 
 
 def gpu_suites(quick: bool) -> dict[str, list[Case]]:
@@ -260,23 +274,28 @@ def main() -> None:
     """Measures, prints and writes."""
     options = parser(__doc__, device=True, passes=3)
     options.add_argument("--quick", action="store_true", help="the small tables only")
+    options.add_argument("--opensplat", type=Path, help="a checkout of OpenSplat: one table beside its CPU rasteriser")
     options.add_argument("--memory-case", type=int, nargs=2, help=argparse.SUPPRESS)
     arguments = options.parse_args()
     if arguments.memory_case:
         gaussians, views = arguments.memory_case
         _memory_case(gaussians, views)
         return
-    device = torch.device(arguments.device)
+    device = torch.device("cpu" if arguments.opensplat else arguments.device)
     where = machine(device)
     print(json.dumps(where))
-    suites = (gpu_suites if device.type == "cuda" else cpu_suites)(arguments.quick)
+    if arguments.opensplat:
+        PEERS["opensplat"] = lambda gaussians, cameras: [rasterize(arguments.opensplat, gaussians, cameras)]
+        suites = peer_suite()
+    else:
+        suites = (gpu_suites if device.type == "cuda" else cpu_suites)(arguments.quick)
     unit = "milliseconds" if device.type == "cuda" else "core-milliseconds"
     results: dict[str, tuple[list[Case], list[Timing]]] = {}
     for title, cases in suites.items():
         results[title] = cases, compare(cases, device, arguments.passes)
         print_case_table(title, *results[title], unit)
     memory = {}
-    if device.type == "cpu" and Path("/proc/self/clear_refs").exists():
+    if device.type == "cpu" and not arguments.opensplat and Path("/proc/self/clear_refs").exists():
         for gaussians, views in ((100_000, 1),) if arguments.quick else ((100_000, 1), (300_000, 8)):
             memory[f"{gaussians} Gaussians, {views} views"] = peak_memory(gaussians, views)
         print("peak memory above inputs, MB:", memory)
@@ -285,8 +304,9 @@ def main() -> None:
         for title, result in results.items()
     }
     content = {"machine": where, "unit": unit, "passes": arguments.passes, "tables": tables, "peak_memory_mb": memory}
-    path = write_results(arguments.out, f"render-{device.type}", content)
-    if plot := plot_scaling(results, path.with_suffix(".png")):
+    name = "render-opensplat" if arguments.opensplat else f"render-{device.type}"
+    path = write_results(arguments.out, name, content)
+    if not arguments.opensplat and (plot := plot_scaling(results, path.with_suffix(".png"))):
         print(plot)
 
 

@@ -222,7 +222,9 @@ def test_the_joint_pass_may_have_another_unit(module_and_batch, batch: Batch, vi
 def test_the_figures_of_training_runs(module_and_batch, batch: Batch) -> None:
     """What ``train.py`` reports, spelt out once more."""
     module, _ = module_and_batch
-    found = evaluate_scene(module.model, module.renderer, batch)
+    found = evaluate_scene(module.model, module.renderer, batch, rasterized=True)
+    plain = evaluate_scene(module.model, module.renderer, batch)
+    assert found.keys() - plain.keys() == {"abs_rel_rasterized"}
     with torch.no_grad():
         prediction = module.model(batch.context.images, batch.context.hints)
         cameras = ground_truth_target_cameras(batch, prediction)

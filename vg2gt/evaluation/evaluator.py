@@ -37,19 +37,22 @@ Metrics = dict[str, float | None]
 
 
 @torch.no_grad()
-def evaluate_scene(model: Reconstructor, renderer: Renderer, batch: Batch) -> dict[str, float]:
+def evaluate_scene(
+    model: Reconstructor, renderer: Renderer, batch: Batch, rasterized: bool = False
+) -> dict[str, float]:
     """Reconstructs a scene from its context views and metrics it on its held-out views, as training runs do.
 
     Args:
         model: the model, in any mode; it is not changed.
         renderer: its options are used in both modes.
         batch: one scene (B = 1) with held-out views.
+        rasterized: score the depth of 3DGS rasterisation as well.
 
     Returns:
         ``psnr``, ``ssim``, ``rmse``, ``abs_rel``, ``delta_1.25``, ``delta_1.05``, ``coverage``, ``normal_mean`` on
-        held-out views at ground-truth poses, rendered as solids whatever the training renders; ``abs_rel_rasterized``
-        with 3DGS rasterisation; ``decoded_abs_rel_before`` and ``decoded_abs_rel`` on the context views; ``gaussians``,
-        ``cv``. Depth is aligned by one median scale per scene.
+        held-out views at ground-truth poses, rendered as solids whatever the training renders; with ``rasterized``
+        ``abs_rel_rasterized``, of the same views rasterised as in 3DGS; ``decoded_abs_rel_before`` and
+        ``decoded_abs_rel`` on the context views; ``gaussians``, ``cv``. Depth is aligned by one median scale per scene.
 
     Raises:
         ValueError: if the batch holds several scenes or no held-out view.
@@ -60,16 +63,15 @@ def evaluate_scene(model: Reconstructor, renderer: Renderer, batch: Batch) -> di
     prediction = model(batch.context.images, batch.context.hints)
     target = batch.target
     cameras = ground_truth_target_cameras(batch, prediction)
-    rendered, rasterized = (render_or_nan(renderer, prediction.gaussians, cameras, mode) for mode in MODES)
+    rendered = render_or_nan(renderer, prediction.gaussians, cameras, "solid")
     depth = depth_metrics(rendered.depth[0], target.depth[0], "scene")
 
     def abs_rel(found: torch.Tensor, truth: Batch) -> float:
         return depth_metrics(found[0], truth.depth[0], "scene")["abs_rel"]
 
-    return {
+    metrics = {
         **image_metrics(rendered, target),
         **{name: depth[name] for name in ("rmse", "abs_rel", "delta_1.25", "delta_1.05", "coverage")},
-        "abs_rel_rasterized": abs_rel(rasterized.depth, target),
         "normal_mean": rendered_normal_metrics(rendered, target)["normal_mean"],
         "decoded_abs_rel_before": abs_rel(prediction.initial.depth, batch.context),
         "decoded_abs_rel": abs_rel(prediction.geometry.depth, batch.context),
@@ -79,6 +81,10 @@ def evaluate_scene(model: Reconstructor, renderer: Renderer, batch: Batch) -> di
         "gaussians": float(len(prediction.gaussians)),
         "cv": cv(prediction.gaussians.means, max_queries=CV_QUERIES),
     }
+    if rasterized:
+        flat = render_or_nan(renderer, prediction.gaussians, cameras, "rasterized")
+        metrics["abs_rel_rasterized"] = abs_rel(flat.depth, target)
+    return metrics
 
 
 def render_or_nan(renderer: Renderer, gaussians: Gaussians, cameras: Cameras, mode: Any) -> Render:

@@ -56,6 +56,7 @@ def run_once(overrides: Sequence[str], folder: Path) -> Metrics:
         SystemExit: if the training was asked to stop (SIGTERM); the same call goes on with it.
     """
     config = compose_run(overrides, folder)
+    config.training.rasterized_depth = True  # studies report it
     _refuse_other_run(config, folder)
     _refuse_other_start(config, folder)
     result = folder / "metrics.json"

@@ -63,6 +63,8 @@ class VG2GTModule(lightning.LightningModule):
         pose_noise: share of training scenes whose camera hints are slightly wrong; with ``part="coarse"`` only, as
             views that are rendered need cameras that fit.
         render_views: most views rendered in a training step, held-out views first; None renders all.
+        rasterized_depth: evaluations score the depth of 3DGS rasterisation as well (``abs_rel_rasterized``), whose
+            kernels take seconds to compile on a new machine.
         max_skipped: stop after this many steps in a row whose loss or gradient was not finite.
         seed: seeds every random draw of a step, together with the step's number, so that a resumed run draws what the
             uninterrupted one would have drawn; the rank enters only where scenes draw apart (drop-path).
@@ -84,6 +86,7 @@ class VG2GTModule(lightning.LightningModule):
         part: Part = "all",
         pose_noise: float = 0.0,
         render_views: int | None = None,
+        rasterized_depth: bool = False,
         max_skipped: int = 20,
         seed: int = 0,
     ) -> None:
@@ -105,6 +108,7 @@ class VG2GTModule(lightning.LightningModule):
         self.warmup_steps = warmup_steps
         self.coarse_lr_factor = coarse_lr_factor
         self.render_views = render_views
+        self.rasterized_depth = rasterized_depth
         self.seed = seed
         self.generator = torch.Generator()
         self.skipped = SkippedSteps(max_skipped)
@@ -276,7 +280,8 @@ class VG2GTModule(lightning.LightningModule):
         """Evaluates one held-out scene batch."""
         for index, scene in enumerate(batch.scene):
             sample = (scene, *batch.frame_ids[index].tolist())
-            self._metrics[sample] = evaluate_scene(self.model, self.renderer, batch.single(index))
+            metrics = evaluate_scene(self.model, self.renderer, batch.single(index), self.rasterized_depth)
+            self._metrics[sample] = metrics
 
     def on_validation_epoch_end(self) -> None:
         """Logs every number as ``eval/<name>``: means over the scenes that have it, each counted once on all ranks.
