@@ -1,6 +1,7 @@
 """Compiled kernels are never older than the sources they are made of, and need no folder to be kept in."""
 
 import ast
+import gc
 import importlib.util
 import os
 import sys
@@ -9,7 +10,9 @@ import time
 from pathlib import Path
 
 import pytest
+from numba.core import event
 from numba.core.dispatcher import Dispatcher
+from numba.core.errors import TypingError
 
 from tests.commands import ROOT
 from vg2gt.io import compiled
@@ -140,3 +143,36 @@ def test_kernels_made_in_functions_are_found_again_by_other_processes() -> None:
     assert len(made) >= 12
     for kernel in made:
         assert all(isinstance(cell.cell_contents, bool) for cell in kernel.py_func.__closure__), kernel
+
+
+class CollectorSeen(event.Listener):
+    """Whether garbage may be collected, at the beginning of every compilation."""
+
+    def __init__(self) -> None:
+        self.seen: list[bool] = []
+
+    def on_start(self, event: event.Event) -> None:
+        """Looks."""
+        self.seen.append(gc.isenabled())
+
+    def on_end(self, event: event.Event) -> None:
+        """Nothing."""
+
+
+@pytest.mark.parametrize("before", [True, False])
+def test_no_garbage_is_collected_while_kernels_are_compiled(before: bool) -> None:
+    """After it as before, also where a kernel cannot be compiled or one within another."""
+    inner = compiled.numba.njit(lambda x: x + 1)
+    kernels = compiled.numba.njit(lambda x: inner(x) + 1), compiled.numba.njit(lambda x: x.nothing_of_the_kind)
+    gc.enable() if before else gc.disable()
+    try:
+        with event.install_listener("numba:compile", CollectorSeen()) as listener:
+            assert kernels[0](1) == 3
+            assert gc.isenabled() == before
+            with pytest.raises(TypingError, match="nothing_of_the_kind"):
+                kernels[1](1)
+        assert gc.isenabled() == before
+    finally:
+        gc.enable()
+    assert len(listener.seen) >= 3
+    assert not any(listener.seen)
