@@ -190,9 +190,11 @@ def test_gpus_train_in_mixed_precision_with_a_fused_optimizer(trainer: str, tmp_
     assert (config.trainer.accelerator, config.trainer.precision) == ("gpu", "bf16-mixed")
     assert config.trainer.max_steps == 420_000
     assert (config.optimizer.fused, config.optimizer.lr) == (True, 3e-6)
-    assert "fused" not in composed(tmp_path).optimizer  # bit for bit as ever
+    on_cpu = composed(tmp_path, "optimizer=adamw", "optimizer.lr=3e-6")
+    assert "fused" not in on_cpu.optimizer  # bit for bit as ever
+    assert composed(tmp_path, f"trainer={trainer}").optimizer == composed(tmp_path).optimizer  # fused everywhere
     steps = []
-    for options in (config.optimizer, composed(tmp_path, "optimizer.lr=3e-6").optimizer):
+    for options in (config.optimizer, on_cpu.optimizer):
         weight = nn.Parameter(torch.linspace(-1, 1, 9))
         optimizer = instantiate(options)([weight])
         for _ in range(3):

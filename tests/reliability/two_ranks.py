@@ -22,7 +22,7 @@ from vg2gt.training.distributed import ending_together
 from vg2gt.training.loop import Run, evaluate
 
 RANKS = ["trainer=ddp"]
-SGD = ["optimizer._target_=torch.optim.SGD", "~optimizer.betas", "optimizer.lr=0.05"]
+SGD = ["optimizer=adamw", "optimizer._target_=torch.optim.SGD", "~optimizer.betas", "optimizer.lr=0.05"]
 EMPTY = [
     "no depth",
     "one pixel with depth",

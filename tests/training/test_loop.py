@@ -159,8 +159,8 @@ REFUSED: list[tuple[list[str], str | None]] = [
     (["ckpt=last", "backend.taps=1"], r"step-4\.ckpt was trained with backend\.taps=4, here it is 1"),
     (["ckpt=last", "model.gaussians.splits=4"], r"first in model\.gaussians\.out"),
     (
-        ["ckpt=last", "optimizer._target_=torch.optim.Adagrad", "~optimizer.betas", "trainer.max_steps=6"],
-        r"trained with torch\.optim\.AdamW and cannot go on with torch\.optim\.Adagrad",
+        ["ckpt=last", "optimizer=adamw", "trainer.max_steps=6"],
+        r"trained with vg2gt\.training\.muon\.MuonAdamW and cannot go on with torch\.optim\.AdamW",
     ),
     (["ckpt=auto", "trainer.max_steps=3"], r"step-4\.ckpt is at step 4, further than trainer\.max_steps=3 asks"),
     (["overwrite=true", "data.train_scenes=0"], r"data\.train_scenes=0 must be at least 1"),

@@ -29,15 +29,28 @@ def test_only_matrices_decay_and_frozen_parameters_are_left_out() -> None:
     module = nn.Sequential(nn.Linear(3, 4), nn.LayerNorm(4), nn.Linear(4, 2))
     module[2].requires_grad_(False)
     decay, rest = parameter_groups(module)
-    assert [tuple(p.shape) for p in decay["params"]] == [(4, 3)]
-    assert [tuple(p.shape) for p in rest["params"]] == [(4,), (4,), (4,)]
+    assert [(name, tuple(p.shape)) for name, p in decay["params"]] == [("0.weight", (4, 3))]
+    assert [(name, tuple(p.shape)) for name, p in rest["params"]] == [
+        ("0.bias", (4,)),
+        ("1.weight", (4,)),
+        ("1.bias", (4,)),
+    ]
     assert rest["weight_decay"] == 0.0
+
+
+def test_no_group_is_empty() -> None:
+    """Torch takes no empty group beside named ones; ``training.part=coarse`` leaves the others nothing."""
+    module = nn.ModuleDict({"coarse": nn.Linear(3, 4, bias=False), "fine": nn.Linear(4, 2)})
+    module["fine"].requires_grad_(False)
+    (group,) = parameter_groups(module, {"coarse": 3.0})
+    assert [name for name, _ in group["params"]] == ["coarse.weight"]
+    assert group["lr_factor"] == 3.0
 
 
 def test_a_child_with_a_rate_of_its_own_stands_behind_the_others() -> None:
     module = nn.ModuleDict({"coarse": nn.Linear(3, 4), "fine": nn.Linear(4, 2)})
     groups = parameter_groups(module, {"coarse": 3.0, "absent": 2.0})
-    assert [([tuple(p.shape) for p in group["params"]], group.get("lr_factor", 1.0)) for group in groups] == [
+    assert [([tuple(p.shape) for _, p in group["params"]], group.get("lr_factor", 1.0)) for group in groups] == [
         ([(2, 4)], 1.0),
         ([(2,)], 1.0),
         ([(4, 3)], 3.0),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from omegaconf import DictConfig
 
 QUICK_STEPS = 400  # trainer=default
-QUICK_RATE = 1e-3  # optimizer=adamw
+QUICK_RATES = (4e-3, 1e-3)  # optimizer=muon and adamw
 LARGE_BACKBONE = 768  # width of tokens: BASE and above
 WIDE_FUSION = 512  # channels; model=tiny has 64, model=vg2gt 1024
 NOT_FOCAL = ("backends.oracle.", "backends.vggt.")
@@ -37,8 +37,8 @@ def _quick_settings(config: DictConfig) -> str | None:
     kept = []
     if config.trainer.max_steps == QUICK_STEPS:
         kept.append(f"trainer.max_steps={QUICK_STEPS}")
-    if config.optimizer.lr == QUICK_RATE:
-        kept.append(f"optimizer.lr={QUICK_RATE:g}")
+    if config.optimizer.lr in QUICK_RATES:
+        kept.append(f"optimizer.lr={config.optimizer.lr:g}")
     if loss.get("normal_target") == "gt" and loss.get("color_l1") == 3:
         kept.append("loss=quickstart")
     if not large or not kept:

@@ -8,6 +8,8 @@ from typing import Any
 
 from torch import nn
 
+Named = tuple[str, nn.Parameter]
+
 
 def cosine_with_warmup(steps: int, warmup_steps: int, final_factor: float) -> Callable[[int], float]:
     """Returns the learning-rate factor of a step: linear warm-up to 1, then cosine to ``final_factor`` at ``steps``."""
@@ -22,7 +24,7 @@ def cosine_with_warmup(steps: int, warmup_steps: int, final_factor: float) -> Ca
 
 
 def parameter_groups(module: nn.Module, factors: Mapping[str, float] | None = None) -> list[dict[str, Any]]:
-    """Splits the trainable parameters: matrices decay; biases, norms, gains and other vectors do not.
+    """Splits the trainable parameters, by name: matrices decay; biases, norms, gains and other vectors do not.
 
     Args:
         module: whose parameters they are.
@@ -30,16 +32,21 @@ def parameter_groups(module: nn.Module, factors: Mapping[str, float] | None = No
             parameters and say the factor as ``lr_factor``. A child that the module does not have is passed over.
     """
     apart = {name: factor for name, factor in (factors or {}).items() if factor != 1}
-    groups = _by_decay(p for name, p in module.named_parameters() if name.partition(".")[0] not in apart)
+    parameters = [(name, parameter) for name, parameter in module.named_parameters() if parameter.requires_grad]
+    groups = _by_decay(named for named in parameters if _child(named) not in apart)
     for child, factor in apart.items():
-        own = _by_decay(p for name, p in module.named_parameters() if name.partition(".")[0] == child)
-        groups += [group | {"lr_factor": factor} for group in own if group["params"]]
+        groups += [group | {"lr_factor": factor} for group in _by_decay(n for n in parameters if _child(n) == child)]
     return groups
 
 
-def _by_decay(parameters: Iterable[nn.Parameter]) -> list[dict[str, Any]]:
-    trainable = [parameter for parameter in parameters if parameter.requires_grad]
-    return [
-        {"params": [parameter for parameter in trainable if parameter.dim() > 1]},
-        {"params": [parameter for parameter in trainable if parameter.dim() <= 1], "weight_decay": 0.0},
+def _child(named: Named) -> str:
+    return named[0].partition(".")[0]
+
+
+def _by_decay(parameters: Iterable[Named]) -> list[dict[str, Any]]:
+    named = list(parameters)
+    groups = [
+        {"params": [(name, parameter) for name, parameter in named if parameter.dim() > 1]},
+        {"params": [(name, parameter) for name, parameter in named if parameter.dim() <= 1], "weight_decay": 0.0},
     ]
+    return [group for group in groups if group["params"]]

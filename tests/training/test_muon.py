@@ -1,0 +1,171 @@
+"""Muon for matrices, AdamW for all else."""
+
+import copy
+from collections.abc import Iterable
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from vg2gt.training.muon import MuonAdamW, orthogonalized
+from vg2gt.training.schedule import parameter_groups
+
+
+class Parts(nn.Module):
+    """A head with a linear layer, a convolution and a norm, and a coarse part."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.coarse = nn.Linear(6, 4)
+        self.fine = nn.ModuleList([nn.Linear(4, 5), nn.Conv2d(1, 3, 3), nn.LayerNorm(5)])
+        self.single = nn.Linear(4, 1, bias=False)
+
+    def parameters_named(self, *names: str) -> list[Tensor]:
+        """Copies of parameters."""
+        named = dict(self.named_parameters())
+        return [named[name].detach().clone() for name in names]
+
+
+MUONS = ("fine.0.weight", "fine.1.weight")
+
+
+def give_gradients(modules: Iterable[nn.Module], seed: int) -> None:
+    """The same gradients to all modules."""
+    for module in modules:
+        generator = torch.Generator().manual_seed(seed)
+        for parameter in module.parameters():
+            parameter.grad = torch.randn(parameter.shape, generator=generator)
+
+
+def optimizer_of(module: nn.Module, **options: Any) -> MuonAdamW:
+    """With its coarse part left to AdamW."""
+    return MuonAdamW(parameter_groups(module), adamw=["coarse"], **options)
+
+
+@pytest.mark.parametrize("shape", [(4, 9), (9, 4), (6, 6)])
+def test_orthogonalized_has_the_singular_vectors_and_nearly_unit_values(shape: tuple[int, int]) -> None:
+    torch.manual_seed(0)
+    matrices = [torch.randn(shape, dtype=torch.float64), 1e-4 * torch.randn(shape, dtype=torch.float64)]
+    for matrix, found in zip(matrices, orthogonalized(matrices), strict=True):
+        u, _, vh = torch.linalg.svd(matrix, full_matrices=False)
+        inside = u.mT @ found @ vh.mT
+        values = inside.diagonal()
+        assert values.min() > 0.65
+        assert values.max() < 1.25
+        torch.testing.assert_close(inside, torch.diag(values), rtol=0, atol=1e-9)
+
+
+def test_shapes_may_be_mixed() -> None:
+    torch.manual_seed(1)
+    matrices = [torch.randn(3, 5), torch.randn(5, 3), torch.randn(3, 5)]
+    together = orthogonalized(matrices)
+    for matrix, found in zip(matrices, together, strict=True):
+        torch.testing.assert_close(orthogonalized([matrix])[0], found)
+    assert orthogonalized([]) == []
+
+
+def test_matrices_move_by_their_orthogonalised_momentum() -> None:
+    """The formulas, spelt out once more, for two steps."""
+    torch.manual_seed(2)
+    module = Parts()
+    optimizer = optimizer_of(module, lr=3e-2, momentum=0.9, weight_decay=0.1)
+    expected = dict(zip(MUONS, module.parameters_named(*MUONS), strict=True))
+    momentum = {name: torch.zeros_like(value) for name, value in expected.items()}
+    for step in range(2):
+        give_gradients([module], step)
+        for name, parameter in module.named_parameters():
+            if name in MUONS:
+                assert parameter.grad is not None
+                momentum[name] = 0.9 * momentum[name] + 0.1 * parameter.grad
+                ahead = (0.1 * parameter.grad + 0.9 * momentum[name]).flatten(1)
+                update = orthogonalized([ahead])[0].view_as(parameter)
+                rows, columns = ahead.shape
+                expected[name] = (1 - 3e-2 * 0.1) * expected[name] - 3e-2 * 0.2 * max(rows, columns) ** 0.5 * update
+        optimizer.step()
+    for name, value in zip(MUONS, module.parameters_named(*MUONS), strict=True):
+        torch.testing.assert_close(value, expected[name])
+
+
+def test_all_else_is_adamws() -> None:
+    """Vectors, a matrix of one row, and the parts that are named."""
+    torch.manual_seed(3)
+    module = Parts()
+    other = copy.deepcopy(module)
+    optimizer = optimizer_of(module, lr=1e-3, weight_decay=0.1)
+    adamw = torch.optim.AdamW(parameter_groups(other), lr=1e-3, betas=(0.9, 0.99), weight_decay=0.1)
+    for step in range(3):
+        give_gradients((module, other), step)
+        optimizer.step()
+        adamw.step()
+    for (name, parameter), same in zip(module.named_parameters(), other.parameters(), strict=True):
+        if name in MUONS:
+            assert not torch.allclose(parameter, same)
+        else:
+            torch.testing.assert_close(parameter, same, rtol=1e-6, atol=1e-7)
+
+
+def test_without_gradients_nothing_moves_and_gradients_stay() -> None:
+    torch.manual_seed(4)
+    module = Parts()
+    optimizer = optimizer_of(module)
+    before = copy.deepcopy(module.state_dict())
+    optimizer.step()
+    assert all(torch.equal(value, before[name]) for name, value in module.state_dict().items())
+    give_gradients([module], 0)
+    given = [parameter.grad.clone() for parameter in module.parameters() if parameter.grad is not None]
+    optimizer.step()
+    for parameter, gradient in zip(module.parameters(), given, strict=True):
+        assert parameter.grad is not None
+        assert torch.equal(parameter.grad, gradient)
+
+
+def test_the_closure_computes_gradients() -> None:
+    module = Parts()
+    optimizer = optimizer_of(module)
+    before = module.parameters_named("fine.0.weight")[0]
+
+    def closure() -> Tensor:
+        optimizer.zero_grad()
+        loss = module.fine[0](torch.ones(2, 4)).square().sum()
+        loss.backward()
+        return loss
+
+    assert optimizer.step(closure) > 0
+    assert not torch.equal(before, module.parameters_named("fine.0.weight")[0])
+
+
+def test_a_saved_state_goes_on_bit_for_bit(tmp_path) -> None:
+    torch.manual_seed(5)
+    module = Parts()
+    optimizer = optimizer_of(module)
+    for step in range(2):
+        give_gradients([module], step)
+        optimizer.step()
+    other = copy.deepcopy(module)
+    resumed = optimizer_of(other)
+    torch.save(optimizer.state_dict(), tmp_path / "state.pt")
+    resumed.load_state_dict(torch.load(tmp_path / "state.pt", weights_only=True))
+    give_gradients((module, other), 7)
+    optimizer.step()
+    resumed.step()
+    assert all(torch.equal(a, b) for a, b in zip(module.parameters(), other.parameters(), strict=True))
+
+
+def test_unnamed_parameters_are_taken_too() -> None:
+    torch.manual_seed(6)
+    matrix = nn.Parameter(torch.randn(3, 4))
+    optimizer = MuonAdamW([matrix], lr=0.1, weight_decay=0.0)
+    before = matrix.detach().clone()
+    matrix.grad = torch.randn(3, 4)
+    expected = before - 0.1 * 0.2 * 2 * orthogonalized([matrix.grad])[0]
+    optimizer.step()
+    torch.testing.assert_close(matrix.detach(), expected)
+
+
+@pytest.mark.parametrize(
+    ("option", "named"), [({"momentum": 1.0}, "momentum"), ({"momentum": -0.1}, "momentum"), ({"lr": -1.0}, "rate")]
+)
+def test_numbers_out_of_range_are_named(option: dict[str, Any], named: str) -> None:
+    with pytest.raises(ValueError, match=named):
+        MuonAdamW([nn.Parameter(torch.zeros(1))], **option)
