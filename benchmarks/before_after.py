@@ -1,10 +1,11 @@
 """A training step of two checkouts side by side: ``python benchmarks/before_after.py --before FOLDER [overrides]``.
 
 ``git worktree add FOLDER COMMIT`` makes such a folder; ``--after`` is this checkout unless said otherwise. Two
-processes, each with the allocator as that checkout's ``train.py`` sets it, take a step in turns on the same views, so
-that whatever else the machine does meets both; as in training, no set of views comes twice. Loading them is not
-counted. Prints processor time, the ratio of the means and the median of the pairs' ratios, peak memory and page faults,
-and writes them as a dated JSON file.
+processes, each with the allocator as that checkout's ``train.py`` sets it, take a step in turns on the same scenes, so
+that whatever else the machine does meets both; as in training, no set of views comes twice. Every checkout has its own
+defaults, numbers of views and the optimiser among them, unless overrides say otherwise. Loading views is not counted.
+Prints processor time, the ratio of the means and the median of the pairs' ratios, peak memory and page faults, and
+writes them as a dated JSON file.
 """
 
 from __future__ import annotations
@@ -46,7 +47,10 @@ def serve(overrides: list[str], threads: int) -> None:
         run = build(compose_run([f"data.train_scenes={SCENES}", *overrides], Path(folder)))
         run.datamodule.setup("fit")
         step_loss, loader = training_step(run), iter(run.datamodule.train_dataloader())
-        optimizer = torch.optim.AdamW(run.module.model.trained_parameters(), lr=1e-4, fused=True)
+        named = [(name, p) for name, p in run.module.model.named_parameters() if p.requires_grad]
+        optimizer = run.module.make_optimizer(named)
+        for group in optimizer.param_groups:
+            group["lr"] = 1e-4
         print("ready", file=answers, flush=True)
         for _ in sys.stdin:
             batch = next(loader)
