@@ -276,9 +276,13 @@ def test_tasks_of_a_slurm_job_find_each_other(tmp_path: Path, cache: Path) -> No
 @pytest.mark.slow
 def test_forty_steps_on_two_processes(tmp_path: Path, cache: Path) -> None:
     """With SGD rounding stays rounding; Adam divides by the gradient's size and makes it grow."""
-    names = ("sgd_long", "adamw_long")
-    ended = two_ranks.run_on_two_ranks(tmp_path, cache, *names, timeout=1500)
-    for name, optimizer, loss, weights in zip(names, (two_ranks.SGD, ()), (5e-6, 5e-2), (5e-6, 2e-2), strict=True):
+    bounds = {  # of loss and weights
+        "sgd_long": (two_ranks.SGD, 5e-6, 5e-6),
+        "adamw_long": (two_ranks.ADAMW, 5e-2, 2e-2),
+        "muon_long": ((), 5e-2, 2e-2),
+    }
+    ended = two_ranks.run_on_two_ranks(tmp_path, cache, *bounds, timeout=1500)
+    for name, (optimizer, loss, weights) in bounds.items():
         one = two_ranks.trained(tiny_run(tmp_path, cache, *two_ranks.step_overrides(optimizer, 40, scenes=2)))
         ranks = results((tmp_path, ended), name)
         differences = [abs(a - b) for a, b in zip(one["losses"], ranks[0]["losses"], strict=True)]

@@ -23,6 +23,7 @@ from vg2gt.training.loop import Run, evaluate
 
 RANKS = ["trainer=ddp"]
 SGD = ["optimizer=adamw", "optimizer._target_=torch.optim.SGD", "~optimizer.betas", "optimizer.lr=0.05"]
+ADAMW = ["optimizer=adamw"]
 EMPTY = [
     "no depth",
     "one pixel with depth",
@@ -129,7 +130,8 @@ def broken_loader(folder: Path, cache: Path) -> dict[str, Any]:
 SCENARIOS: dict[str, Callable[[Path, Path], dict[str, Any]]] = {
     "sgd": lambda folder, cache: equal_steps(folder, cache, SGD, 4),
     "sgd_long": lambda folder, cache: equal_steps(folder, cache, SGD, 40),
-    "adamw_long": lambda folder, cache: equal_steps(folder, cache, (), 40),
+    "adamw_long": lambda folder, cache: equal_steps(folder, cache, ADAMW, 40),
+    "muon_long": lambda folder, cache: equal_steps(folder, cache, (), 40),
     "empty_rank": empty_rank,
     "faulty_rank": faulty_rank,
     "three_scenes": lambda folder, cache: three_scenes(folder, cache, *RANKS),
