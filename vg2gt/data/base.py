@@ -100,13 +100,6 @@ class SceneSource(ABC):
         options = {name: repr(value) for name, value in sorted(vars(self).items()) if not name.startswith("_")}
         return json.dumps([type(self).__qualname__, scene, options])
 
-    def prepare(self, scene: str) -> None:
-        """Makes and keeps what loading a scene would otherwise make first; nothing by default.
-
-        Called from another thread than ``load``, for another scene at a time.
-        """
-        return
-
     @abstractmethod
     def load(self, scene: str, frame_ids: Sequence[int]) -> Frames:
         """Decodes frames, in the order of ``frame_ids``.

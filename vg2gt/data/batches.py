@@ -8,7 +8,6 @@ from collections.abc import Callable, Sequence
 import torch
 from torch.utils.data import Dataset
 
-from vg2gt.data.ahead import ScenesAhead
 from vg2gt.data.base import DataError, Frames, SceneSource, training_frames
 from vg2gt.data.frame_cache import FrameCache
 from vg2gt.data.views import SceneSample
@@ -27,9 +26,6 @@ class BatchDataset(Dataset[Batch]):
         memory_mb: decoded frames kept in memory, in each process.
         replace_damaged: for training: the nearest readable frame takes the place of one that cannot be read, with a
             warning; otherwise that is an error.
-
-    Attributes:
-        ahead: makes scenes in the background of this process; None: nobody does.
     """
 
     def __init__(
@@ -39,7 +35,6 @@ class BatchDataset(Dataset[Batch]):
         self.cache = FrameCache(source, prepare, memory_mb * 2**20)
         self.replace_damaged = replace_damaged
         self.damaged: set[tuple[str, int]] = set()
-        self.ahead: ScenesAhead | None = None
 
     def __getitem__(self, views: tuple[SceneSample, ...]) -> Batch:
         loaded = [self._load(view) for view in views]
@@ -68,8 +63,6 @@ class BatchDataset(Dataset[Batch]):
         The result depends on the files alone, not on what was read before.
         """
         ids = view.frames
-        if self.ahead is not None:
-            self.ahead.claim(self.source, view.scene)
         if not self.replace_damaged:
             return self.cache.load(view.scene, ids), ids
         if self.damaged.isdisjoint((view.scene, frame) for frame in ids):

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import inspect
 import signal
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from typing import Any
 
 from lightning.pytorch import LightningDataModule
 from torch.utils.data import DataLoader
 
-from vg2gt.data.ahead import ScenesAhead
 from vg2gt.data.base import DataError, SceneSource, SourceMaker
 from vg2gt.data.batches import BatchDataset
 from vg2gt.data.framing import Crop, Fit, FramingSampler
@@ -19,9 +17,6 @@ from vg2gt.data.overlap import refuse_overlap, refuse_untrainable
 from vg2gt.data.views.even import EvaluationViews
 from vg2gt.data.views.sampling import StepSampler, ViewSampler, usable_scenes
 from vg2gt.types import Batch
-
-AHEAD = 64
-"""Training steps whose scenes are made in the background while the untrained model is evaluated."""
 
 
 class SceneDataModule(LightningDataModule):
@@ -168,38 +163,9 @@ class SceneDataModule(LightningDataModule):
         assert self._train is not None
         if not self._train.source.has_cameras:
             refuse_untrainable(self._train.source)
-        return self._loader(self._train, self._step_sampler(self._train.source))
-
-    @contextmanager
-    def scenes_ahead(self, steps: int) -> Iterator[None]:
-        """Inside the block scenes of the evaluation, then those of the first training steps, are made ahead.
-
-        Loading waits for the one that is being made. Loader processes make their own.
-
-        Args:
-            steps: training steps, from the first; for no more than ``AHEAD``.
-        """
-        self.setup()
-        assert self._train is not None
-        assert self._val is not None
-        if self.workers > 0 or not self._train.source.has_cameras:
-            yield
-            return
-        train, val = self._train, self._val
-        sampler = self._step_sampler(train.source)
-        drawn = [(train.source, view.scene) for step in range(min(steps, AHEAD)) for view in sampler.step(step)]
-        evaluated = [(val.source, views.scene) for views in self._val_views]
-        with ScenesAhead(dict.fromkeys((*evaluated, *drawn))) as ahead:
-            train.ahead = val.ahead = ahead
-            try:
-                yield
-            finally:
-                train.ahead = val.ahead = None
-
-    def _step_sampler(self, source: SceneSource) -> StepSampler:
         trainer = self.trainer
-        return StepSampler(
-            source,
+        sampler = StepSampler(
+            self._train.source,
             self._train_names,
             self.sampler,
             self.steps_per_epoch,
@@ -208,6 +174,7 @@ class SceneDataModule(LightningDataModule):
             world_size=trainer.world_size if trainer else 1,
             framing=self.framing,
         )
+        return self._loader(self._train, sampler)
 
     def val_dataloader(self) -> DataLoader[Batch]:
         """One batch (B = 1) per sample: context views, then held-out target views. Devices take the samples in turns.

@@ -82,11 +82,6 @@ class Mixture(SceneSource):
         """The part a scene belongs to."""
         return scene.partition("/")[0]
 
-    def prepare(self, scene: str) -> None:
-        """Makes what loading the part's scene would make first."""
-        source, name = self._find(scene)
-        source.prepare(name)
-
     def load(self, scene: str, frame_ids: Sequence[int]) -> Frames:
         """Decodes frames of a scene."""
         source, name = self._find(scene)

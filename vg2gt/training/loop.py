@@ -6,7 +6,7 @@ import importlib.util
 import logging
 import warnings
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from lightning.pytorch.loggers import TensorBoardLogger, WandbLogger
 from omegaconf import DictConfig, OmegaConf
 
 from backends.cache import TokenCache
-from vg2gt.data.datamodule import AHEAD, SceneDataModule
+from vg2gt.data.datamodule import SceneDataModule
 from vg2gt.evaluation.checks import refuse_without_hints
 from vg2gt.io.files import read_json, write_json, write_text
 from vg2gt.io.image_files import read_color
@@ -212,7 +212,7 @@ def _train(config: DictConfig, writes: bool) -> dict[str, Any]:
 
         log.info("the run's folder is %s; it computes on %s", run.folder, run.trainer.strategy.root_device)
 
-    with ending_together(run.trainer), _scenes_ahead(run):
+    with ending_together(run.trainer):
         untrained = _untrained_metrics(run, resumed=checkpoint is not None)
         run.trainer.fit(run.module, datamodule=run.datamodule, ckpt_path=checkpoint, weights_only=True)
         _save_last(run)
@@ -222,14 +222,6 @@ def _train(config: DictConfig, writes: bool) -> dict[str, Any]:
         log.info("evaluating the trained model")
         trained = evaluate(run)
         return _report(run, untrained, trained)
-
-
-def _scenes_ahead(run: Run) -> AbstractContextManager[None]:
-    """Procedural scenes are made while the first evaluation compiles and runs (``SceneDataModule.scenes_ahead``)."""
-    if run.trial or not run.trainer.is_global_zero or not isinstance(run.datamodule, SceneDataModule):
-        return nullcontext()
-    steps = run.trainer.max_steps  # -1: no end
-    return run.datamodule.scenes_ahead(steps if steps >= 0 else AHEAD)
 
 
 def _save_last(run: Run) -> None:

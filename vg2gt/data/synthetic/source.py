@@ -85,17 +85,11 @@ class SyntheticScenes(SceneSource):
         """Frame numbers along the camera path."""
         return range(self.num_frames)
 
-    def prepare(self, scene: str) -> None:
-        """Renders a scene into the cache, on one thread; nothing where it lies there, or nothing is kept."""
-        path = self.cache_file(scene)
-        if path is not None and not path.is_file():
-            self._write_cache(scene, self._render(scene, threads=1))
-
     def load(self, scene: str, frame_ids: Sequence[int]) -> Frames:
         """Returns frames of a scene, rendering the scene if the cache does not hold it."""
         arrays = self._read_cache(scene)
         if arrays is None:
-            arrays = self._render(scene, _threads())
+            arrays = self._render(scene)
             self._write_cache(scene, arrays)
         rows = list(frame_ids)
         intrinsics = torch.from_numpy(arrays["intrinsics"]).float().expand(len(rows), 3, 3)
@@ -122,9 +116,9 @@ class SyntheticScenes(SceneSource):
         version = VARIANTS[kind].version
         return json.dumps([type(self).__qualname__, scene, version, self.size, self.num_frames, self.highlights])
 
-    def _render(self, scene: str, threads: int) -> dict[str, NDArray]:
+    def _render(self, scene: str) -> dict[str, NDArray]:
         made = self.scene(scene)
-        frames = made.render(range(self.num_frames), threads)
+        frames = made.render(range(self.num_frames), _threads())
         return {
             "images": np.stack([frame.image for frame in frames]),
             "depth": np.stack([frame.depth for frame in frames]),
