@@ -10,6 +10,7 @@ writes them as a dated JSON file.
 
 from __future__ import annotations
 
+import json
 import os
 import resource
 import statistics
@@ -32,7 +33,7 @@ def serve(overrides: list[str], threads: int) -> None:
     os.dup2(2, 1)  # what libraries print is no answer
     try:
         from vg2gt.cli.allocator import give_back_large_blocks
-    except ImportError:  # before there was one
+    except ImportError:  # before there was one, or since the environment names another allocator
         pass
     else:
         give_back_large_blocks()
@@ -74,9 +75,10 @@ class Side:
 
     def __init__(self, checkout: Path, arguments: list[str], threads: int) -> None:
         self.rows: list[list[float]] = []
+        variables = {**os.environ, "PYTHONPATH": str(checkout), "OMP_NUM_THREADS": str(threads)}
         self.process = subprocess.Popen(
             [sys.executable, __file__, "serve", str(threads), *arguments],
-            env={**os.environ, "PYTHONPATH": str(checkout), "OMP_NUM_THREADS": str(threads)},
+            env={**variables, **_allocator(variables)},
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
@@ -114,6 +116,13 @@ class Side:
         if not line:
             raise SystemExit(f"a side ended with exit status {self.process.wait()}; what it said stands above")
         return line
+
+
+def _allocator(variables: dict[str, str]) -> dict[str, str]:
+    """Variables by which the commands of the checkout on ``PYTHONPATH`` replace the allocator."""
+    code = "import json, vg2gt.cli.allocator as found; print(json.dumps(found.mimalloc_environment()))"
+    asked = subprocess.run([sys.executable, "-c", code], env=variables, capture_output=True, text=True, check=False)
+    return json.loads(asked.stdout) if asked.returncode == 0 else {}
 
 
 def commit(checkout: Path) -> str:

@@ -1,45 +1,80 @@
-"""Freed blocks go back to the system where the commands that train ask for it."""
+"""Commands that compute run on mimalloc, unless somebody says otherwise; the programs they start do not."""
 
-import ctypes
+import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-# glibc raises its threshold to the size of a block that is freed: the next of that size stays in the process.
-SECOND_BLOCK = """
-import ctypes, os
-from vg2gt.cli.allocator import give_back_large_blocks
-if {asked}:
-    give_back_large_blocks()
-class Info(ctypes.Structure):
-    _fields_ = [(name, ctypes.c_size_t) for name in "arena ordblks smblks hblks hblkhd a b c d e".split()]
-library = ctypes.CDLL(None)
-library.malloc.restype, library.mallinfo2.restype = ctypes.c_void_p, Info
-library.free.argtypes = [ctypes.c_void_p]
-library.free(library.malloc(8 << 20))
-before = library.mallinfo2().hblks
-library.malloc({size} << 20)
-print(library.mallinfo2().hblks - before, os.environ.get("THP_MEM_ALLOC_ENABLE"))
-"""
+from vg2gt.cli.allocator import CHOICE, mimalloc_environment
+
+ROOT = Path(__file__).resolve().parents[2]
+BEGIN = "import sys; import vg2gt.cli.allocator as allocator; "
+SAY = (
+    "allocator.start_with_mimalloc(); import os; "
+    "print('libmimalloc' in open('/proc/self/maps').read(), sys.argv[1:], "
+    "sorted(name for name in os.environ if name.startswith(('LD_PRELOAD', 'MIMALLOC', 'ONEDNN', 'VG2GT'))))"
+)
 
 
-@pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "mallinfo2"), reason="needs glibc 2.33 or newer, which can be asked")
+@pytest.fixture(autouse=True)
+def _as_users_have_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(CHOICE)  # conftest.py sets it
+    if not mimalloc_environment():
+        pytest.skip("no mimalloc for this system (cmeel-mimalloc)")
+
+
+def _said(before: str = "", **variables: str) -> str:
+    environment = {"PATH": os.environ["PATH"], "PYTHONPATH": str(ROOT), **variables}
+    command = [sys.executable, "-c", f"{BEGIN}{before}{SAY}", "a=1", "b c"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=100, check=False)
+    return done.stdout.strip() or done.stderr.strip().splitlines()[-1]
+
+
+def test_a_command_starts_again_once_and_leaves_nothing_to_its_children() -> None:
+    assert _said() == "True ['a=1', 'b c'] ['ONEDNN_PRIMITIVE_CACHE_CAPACITY']"
+
+
 @pytest.mark.parametrize(
-    ("asked", "size", "environment", "said"),
+    ("before", "variables"),
     [
-        (False, 8, {}, "0 None"),
-        (True, 8, {}, "1 1"),
-        (True, 7, {}, "0 1"),
-        (True, 8, {"THP_MEM_ALLOC_ENABLE": "0"}, "1 0"),
-        (True, 8, {"MALLOC_MMAP_THRESHOLD_": "33554432"}, "0 None"),
-        (True, 2, {"MALLOC_MMAP_THRESHOLD_": "1048576"}, "1 None"),
+        ("sys.settrace(lambda *event: None); ", {}),
+        ("sys.setprofile(lambda *event: None); ", {}),
+        ("sys.modules['torch'] = sys; ", {}),
+        ("", {"VG2GT_ALLOCATOR": "system"}),
     ],
 )
-def test_large_blocks_are_given_back(asked: bool, size: int, environment: dict[str, str], said: str) -> None:
-    root = str(Path(__file__).resolve().parents[2])
-    code = SECOND_BLOCK.format(asked=asked, size=size)
-    environment = {"PATH": "", "PYTHONPATH": root, **environment}
-    found = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
-    assert found.stdout.strip() == said, found.stderr
+def test_it_stays_as_it_is(before: str, variables: dict[str, str]) -> None:
+    assert _said(before, **variables) == f"False ['a=1', 'b c'] {sorted(variables)}"
+
+
+def test_a_library_that_somebody_preloads_stays() -> None:
+    assert _said(LD_PRELOAD="libm.so.6") == "False ['a=1', 'b c'] ['LD_PRELOAD']"
+
+
+def test_given_options_have_the_last_word(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MIMALLOC_ALLOW_THP", "1")
+    monkeypatch.setenv("ONEDNN_PRIMITIVE_CACHE_CAPACITY", "9")
+    assert list(mimalloc_environment()) == ["LD_PRELOAD"]
+    kept = "['MIMALLOC_ALLOW_THP', 'ONEDNN_PRIMITIVE_CACHE_CAPACITY']"
+    assert _said(MIMALLOC_ALLOW_THP="1", ONEDNN_PRIMITIVE_CACHE_CAPACITY="9") == f"True ['a=1', 'b c'] {kept}"
+
+
+def test_an_unknown_choice_is_named() -> None:
+    assert "VG2GT_ALLOCATOR=tcmalloc is unknown: choose mimalloc or system" in _said(VG2GT_ALLOCATOR="tcmalloc")
+
+
+def test_train_py_runs_on_it() -> None:
+    code = "import os; print('preloaded', 'libmimalloc' in open('/proc/self/maps').read())"
+    watch = f"import runpy, sys, vg2gt.cli.train as train; train.main = lambda: exec({code!r}); "
+    start = f"sys.argv = ['train.py']; runpy.run_path({str(ROOT / 'train.py')!r}, run_name='__main__')"
+    done = subprocess.run(
+        [sys.executable, "-c", watch + start],
+        env={"PATH": os.environ["PATH"], "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=100,
+        check=False,
+    )
+    assert done.stdout == "preloaded True\n", done.stderr

@@ -2,7 +2,7 @@
 
 from omegaconf import DictConfig
 
-from vg2gt.cli.allocator import give_back_large_blocks
+from vg2gt.cli.allocator import start_with_mimalloc
 from vg2gt.cli.arguments import hydra_command
 from vg2gt.cli.commands import COMMANDS
 
@@ -10,11 +10,11 @@ from vg2gt.cli.commands import COMMANDS
 @hydra_command(COMMANDS["ablate"], "ablate")
 def main(config: DictConfig) -> None:
     """Runs the study that the configuration describes."""
-    give_back_large_blocks()
     from vg2gt.studies.ablation import run_study
 
     run_study(config)
 
 
 if __name__ == "__main__":
+    start_with_mimalloc()
     main()

@@ -1,29 +1,69 @@
-"""What the C library's allocator is told before torch is imported."""
+"""The C library's allocator is replaced before a command imports torch."""
 
 from __future__ import annotations
 
-import ctypes
 import os
 import sys
+from importlib.metadata import PackageNotFoundError, files
+from pathlib import Path
 
-_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # of mallopt in glibc's malloc.h
-_LARGE = 8 << 20  # bytes; the features of a default run's voxels lie below
-_SPARE = 64 << 20
+CHOICE = "VG2GT_ALLOCATOR"
+_AGAIN = "VG2GT_STARTED_AGAIN"  # names the variables that are for the start alone
+_PRELOAD = "LD_PRELOAD"
+_LARGE_PAGES = "MIMALLOC_ALLOW_THP"
+_KEPT_CODE = "ONEDNN_PRIMITIVE_CACHE_CAPACITY"
 
 
-def give_back_large_blocks() -> None:
-    """Blocks of 8 MiB and more go back to the system when they are freed (Linux with glibc; nothing elsewhere).
+def start_with_mimalloc() -> None:
+    """Starts the present command again, in the same process, with mimalloc in place of the C library's allocator.
 
-    Sizes differ from step to step with the voxels of their scenes. By default glibc keeps freed blocks of up to 32 MiB,
-    into which the next step's do not fit, and a training's memory grows. Giving back smaller ones too takes less memory
-    and more time, for they are fetched again many times a step (docs/reliability.md has both measured).
-    ``MALLOC_MMAP_THRESHOLD_`` and ``THP_MEM_ALLOC_ENABLE`` in the environment have the last word.
+    What a step allocates differs with the voxels of its scene. glibc finds no place for the next step's blocks among
+    those of the last one, so memory grows and every step fetches pages anew (docs/reliability.md has both measured).
+    Nothing is done on systems other than Linux, where torch is imported already, under a debugger or profiler, where
+    the environment preloads a library of its own, and with ``VG2GT_ALLOCATOR=system``. Programs that the command
+    starts do not inherit it.
     """
-    if sys.platform != "linux" or "MALLOC_MMAP_THRESHOLD_" in os.environ:
+    if _AGAIN in os.environ:
+        for name in os.environ.pop(_AGAIN).split(","):
+            os.environ.pop(name, None)
         return
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)  # other C libraries have none
-    if mallopt is None:
+    watched = sys.gettrace() is not None or sys.getprofile() is not None
+    if "torch" in sys.modules or watched or not sys.argv[0] or not sys.executable:
         return
-    mallopt(_MMAP_THRESHOLD, _LARGE)
-    mallopt(_TRIM_THRESHOLD, _SPARE)
-    os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")  # large pages; read by torch at its first allocation
+    settings = mimalloc_environment()
+    if not settings:
+        return
+    sys.stdout.flush()
+    sys.stderr.flush()
+    environment = {**os.environ, **settings, _AGAIN: ",".join({_PRELOAD, _LARGE_PAGES} & settings.keys())}
+    os.execve(sys.executable, [sys.executable, *sys.orig_argv[1:]], environment)
+
+
+def mimalloc_environment() -> dict[str, str]:
+    """Variables with which a Python process runs on mimalloc; none where it should not or cannot.
+
+    Raises:
+        ValueError: if ``VG2GT_ALLOCATOR`` is neither ``mimalloc`` nor ``system``.
+    """
+    choice = os.environ.get(CHOICE, "mimalloc")
+    if choice not in ("mimalloc", "system"):
+        raise ValueError(f"{CHOICE}={choice} is unknown: choose mimalloc or system")
+    library = _library() if choice == "mimalloc" and not os.environ.get(_PRELOAD) else None
+    if library is None:
+        return {}
+    # Large pages take more memory and save no time. oneDNN keeps code for the last 1024 shapes by default, and numbers
+    # of voxels seldom come twice.
+    options = {_LARGE_PAGES: "0", _KEPT_CODE: "256"}
+    return {_PRELOAD: str(library), **{name: value for name, value in options.items() if name not in os.environ}}
+
+
+def _library() -> Path | None:
+    """The shared library that the package ``cmeel-mimalloc`` has installed."""
+    if sys.platform != "linux":
+        return None
+    try:
+        found = [file for file in files("cmeel-mimalloc") or () if file.name == "libmimalloc.so"]
+    except PackageNotFoundError:
+        return None
+    paths = [Path(str(file.locate())).resolve() for file in found]
+    return next((path for path in paths if path.is_file()), None)

@@ -2,7 +2,7 @@
 
 from omegaconf import DictConfig
 
-from vg2gt.cli.allocator import give_back_large_blocks
+from vg2gt.cli.allocator import start_with_mimalloc
 from vg2gt.cli.arguments import hydra_command
 from vg2gt.cli.commands import COMMANDS
 
@@ -10,7 +10,6 @@ from vg2gt.cli.commands import COMMANDS
 @hydra_command(COMMANDS["train"], "train")
 def main(config: DictConfig) -> None:
     """Runs the training that the configuration describes."""
-    give_back_large_blocks()
     from vg2gt.cli.sweeps import needs_own_process, run_in_own_process
     from vg2gt.training.loop import train
 
@@ -21,4 +20,5 @@ def main(config: DictConfig) -> None:
 
 
 if __name__ == "__main__":
+    start_with_mimalloc()
     main()
