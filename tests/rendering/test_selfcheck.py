@@ -147,7 +147,7 @@ def test_the_identity_names_versions_and_the_kernels() -> None:
 
 def test_the_fixed_scene_does_not_depend_on_random_generators() -> None:
     torch.manual_seed(0)
-    first = selfcheck._scene()
+    first = selfcheck.fixed_scene()
     torch.manual_seed(1)
-    assert all(torch.equal(a, b) for a, b in zip(first, selfcheck._scene(), strict=True))
+    assert all(torch.equal(a, b) for a, b in zip(first, selfcheck.fixed_scene(), strict=True))
     assert 0.05 < float(first[3].min()) < float(first[3].max()) == 1.0

@@ -22,7 +22,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import llvmlite
+import llvmlite.binding
 import numba
 from numba.core import event
 
@@ -125,6 +125,13 @@ def _digest(room: Path) -> str:
     for path in [Path(__file__), SHARED, *sorted(room.rglob("*.py"))]:
         content.update(path.name.encode() + b"\0" + path.read_bytes())
     return content.hexdigest()[:16]
+
+
+def compiled_mark() -> Path | None:
+    """A folder that exists once a training's kernels were compiled on this kind of processor; None if nowhere."""
+    base = cache_folder()
+    parts = [llvmlite.binding.get_host_cpu_name(), *(_digest(PACKAGES / room) for room in ROOMS)]
+    return base and base / f"compiled-{hashlib.sha256(' '.join(parts).encode()).hexdigest()[:16]}"
 
 
 def cache_folder() -> Path | None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import importlib.metadata
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import lru_cache
@@ -138,18 +138,23 @@ def _run(
     render: RenderFunction, mode: Mode, device: torch.device, dtype: torch.dtype, implementation: str
 ) -> tuple[list[Tensor], list[Tensor]]:
     """All images and the gradients of a weighted sum of them in every input, in float64 on the CPU."""
-    inputs = [tensor.to(device, dtype).requires_grad_() for tensor in _scene()]
-    means, quats, scales, opacities, sh, poses, intrinsics, background = inputs
-    batch = torch.zeros(COUNT, dtype=torch.int64, device=device)
-    gaussians, cameras = Gaussians(means, quats, scales, opacities, sh, batch), Cameras(poses, intrinsics, SIZE)
-    out = render(gaussians, cameras, mode, background, implementation=implementation)
+    inputs = [tensor.to(device, dtype).requires_grad_() for tensor in fixed_scene()]
+    gaussians, cameras = as_scene(inputs)
+    out = render(gaussians, cameras, mode, inputs[-1], implementation=implementation)
     images = [out.color, out.depth, out.normal, out.alpha]
     weights = [_numbers(image.numel(), 20 + index).view(image.shape) for index, image in enumerate(images)]
     grads = torch.autograd.grad(images, inputs, [weight.to(device, dtype) for weight in weights])
     return [image.detach().cpu().double() for image in images], [grad.cpu().double() for grad in grads]
 
 
-def _scene() -> tuple[Tensor, ...]:
+def as_scene(inputs: Sequence[Tensor]) -> tuple[Gaussians, Cameras]:
+    """Gaussians and cameras of what :func:`fixed_scene` gave, in any precision, on any device."""
+    means, quats, scales, opacities, sh, poses, intrinsics, _ = inputs
+    batch = torch.zeros(COUNT, dtype=torch.int64, device=means.device)
+    return Gaussians(means, quats, scales, opacities, sh, batch), Cameras(poses, intrinsics, SIZE)
+
+
+def fixed_scene() -> tuple[Tensor, ...]:
     """Means, quats, scales, opacities, sh, poses, intrinsics, background in float64: Gaussians of all kinds."""
     height, width = SIZE
     depth = 2.5 + 1.2 * _numbers(COUNT, 0)

@@ -37,6 +37,7 @@ from vg2gt.runs.checkpoints import (
 from vg2gt.runs.load import made_of, refuse_other_tokens
 from vg2gt.runs.lock import only_process_in
 from vg2gt.training.checkpoint_io import AtomicCheckpointIO
+from vg2gt.training.compilation import compile_kernels
 from vg2gt.training.distributed import ending_together
 from vg2gt.training.module import VG2GTModule
 from vg2gt.training.notices import notices
@@ -212,6 +213,8 @@ def _train(config: DictConfig, writes: bool) -> dict[str, Any]:
 
         log.info("the run's folder is %s; it computes on %s", run.folder, run.trainer.strategy.root_device)
 
+    if writes and not run.trial and run.trainer.strategy.root_device.type == "cpu":
+        compile_kernels(run.module.renderer, lambda: _first_loss(run))
     with ending_together(run.trainer):
         untrained = _untrained_metrics(run, resumed=checkpoint is not None)
         run.trainer.fit(run.module, datamodule=run.datamodule, ckpt_path=checkpoint, weights_only=True)
@@ -222,6 +225,11 @@ def _train(config: DictConfig, writes: bool) -> dict[str, Any]:
         log.info("evaluating the trained model")
         trained = evaluate(run)
         return _report(run, untrained, trained)
+
+
+def _first_loss(run: Run) -> torch.Tensor:
+    """The loss of the first training step, outside the trainer's loop."""
+    return run.module.training_step(next(iter(run.datamodule.train_dataloader())), 0)
 
 
 def _save_last(run: Run) -> None:
