@@ -10,6 +10,7 @@ writes them as a dated JSON file.
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import resource
@@ -18,6 +19,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -31,12 +33,8 @@ def serve(overrides: list[str], threads: int) -> None:
     sys.path[0] = str(Path(os.environ["PYTHONPATH"]) / "benchmarks")
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # what libraries print is no answer
-    try:
-        from vg2gt.cli.allocator import give_back_large_blocks
-    except ImportError:  # before there was one, or since the environment names another allocator
-        pass
-    else:
-        give_back_large_blocks()
+    with suppress(ImportError, AttributeError):  # of commits before mimalloc
+        importlib.import_module("vg2gt.cli.allocator").give_back_large_blocks()
     import torch
     from common import training_step
 
@@ -78,7 +76,7 @@ class Side:
         variables = {**os.environ, "PYTHONPATH": str(checkout), "OMP_NUM_THREADS": str(threads)}
         self.process = subprocess.Popen(
             [sys.executable, __file__, "serve", str(threads), *arguments],
-            env={**variables, **_allocator(variables)},
+            env={**variables, **_allocator(checkout)},
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
@@ -118,10 +116,11 @@ class Side:
         return line
 
 
-def _allocator(variables: dict[str, str]) -> dict[str, str]:
-    """Variables by which the commands of the checkout on ``PYTHONPATH`` replace the allocator."""
+def _allocator(checkout: Path) -> dict[str, str]:
+    """Variables by which a checkout's commands replace the allocator."""
     code = "import json, vg2gt.cli.allocator as found; print(json.dumps(found.mimalloc_environment()))"
-    asked = subprocess.run([sys.executable, "-c", code], env=variables, capture_output=True, text=True, check=False)
+    command = [sys.executable, "-c", code]  # finds the package in the folder where it runs
+    asked = subprocess.run(command, cwd=checkout, capture_output=True, text=True, check=False)
     return json.loads(asked.stdout) if asked.returncode == 0 else {}
 
 

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from vg2gt.rendering import Renderer
+
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = ["data.image_size=[28,56]", "data.train_scenes=1", "data.eval_scenes=1", "trainer.max_steps=1"]
 # Every compilation that numba makes is one line; in another process it cannot be seen, its printing being turned off.
@@ -25,19 +27,31 @@ main()
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="processes are forked on Linux only")
-def test_a_training_compiles_nothing_itself_and_once(tmp_path: Path) -> None:
-    def said(name: str) -> str:
-        environment = {**os.environ, "PYTHONPATH": str(ROOT), "NUMBA_CACHE_DIR": str(tmp_path / "kernels")}
-        command = [sys.executable, "-c", WATCH, f"name={name}", f"data.cache_dir={tmp_path / 'rooms'}", *SMALL]
-        done = subprocess.run(
-            command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=500, check=False
-        )
-        assert done.returncode == 0, done.stderr[-3000:]
-        return done.stdout + done.stderr
+def test_the_first_training_of_a_machine_compiles_nothing_itself(tmp_path: Path) -> None:
+    kernels = tmp_path / "kernels"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "NUMBA_CACHE_DIR": str(kernels)}
+    command = [sys.executable, "-c", WATCH, f"data.cache_dir={tmp_path / 'rooms'}", *SMALL]
+    done = subprocess.run(
+        command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=500, check=False
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert "compiling kernels, once" in done.stdout + done.stderr
+    assert [line for line in done.stdout.splitlines() if line.startswith("COMPILES")] == []
+    assert len(list(kernels.rglob("*.nbc"))) > 20
+    assert len(list(kernels.glob("vg2gt/compiled-*"))) == 1
 
-    first, second = said("first"), said("second")
-    compiled = {line.split()[1] for line in first.splitlines() if line.startswith("COMPILES")}
-    assert "compiling kernels, once" in first
-    assert not compiled
-    assert "compiling kernels" not in second
-    assert "COMPILES" not in second
+
+@pytest.mark.parametrize(("marked", "threads"), [(True, 1), (False, 2)])
+def test_where_it_was_done_or_no_process_can_be_forked_nothing_is(
+    marked: bool, threads: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from vg2gt.training import compilation
+
+    mark = tmp_path / "compiled"
+    if marked:
+        mark.mkdir()
+    monkeypatch.setattr(compilation, "compiled_mark", lambda: mark)
+    monkeypatch.setattr(compilation.threading, "active_count", lambda: threads)
+    monkeypatch.setattr(compilation.multiprocessing, "get_context", lambda kind: pytest.fail("a process is forked"))
+    compilation.compile_kernels(Renderer(), lambda: pytest.fail("a step is taken"))
+    assert mark.is_dir() == marked

@@ -10,8 +10,13 @@ from pathlib import Path
 CHOICE = "VG2GT_ALLOCATOR"
 _AGAIN = "VG2GT_STARTED_AGAIN"  # names the variables that are for the start alone
 _PRELOAD = "LD_PRELOAD"
-_LARGE_PAGES = "MIMALLOC_ALLOW_THP"
-_KEPT_CODE = "ONEDNN_PRIMITIVE_CACHE_CAPACITY"
+_OPTIONS = {
+    "MIMALLOC_ALLOW_THP": "0",  # large pages take more memory and save no time
+    "MIMALLOC_PURGE_DELAY": "10000",  # ms until freed pages go back; 1000 by default, twice as many are fetched again
+}
+_KEPT_CODE = {
+    "ONEDNN_PRIMITIVE_CACHE_CAPACITY": "256"  # shapes, 1024 by default; numbers of voxels seldom come twice
+}
 
 
 def start_with_mimalloc() -> None:
@@ -35,7 +40,7 @@ def start_with_mimalloc() -> None:
         return
     sys.stdout.flush()
     sys.stderr.flush()
-    environment = {**os.environ, **settings, _AGAIN: ",".join({_PRELOAD, _LARGE_PAGES} & settings.keys())}
+    environment = {**os.environ, **settings, _AGAIN: ",".join(settings.keys() - _KEPT_CODE.keys())}
     os.execve(sys.executable, [sys.executable, *sys.orig_argv[1:]], environment)
 
 
@@ -51,9 +56,7 @@ def mimalloc_environment() -> dict[str, str]:
     library = _library() if choice == "mimalloc" and not os.environ.get(_PRELOAD) else None
     if library is None:
         return {}
-    # Large pages take more memory and save no time. oneDNN keeps code for the last 1024 shapes by default, and numbers
-    # of voxels seldom come twice.
-    options = {_LARGE_PAGES: "0", _KEPT_CODE: "256"}
+    options = {**_OPTIONS, **_KEPT_CODE}
     return {_PRELOAD: str(library), **{name: value for name, value in options.items() if name not in os.environ}}
 
 
