@@ -62,7 +62,11 @@ def test_given_options_have_the_last_word(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_an_unknown_choice_is_named() -> None:
-    assert "VG2GT_ALLOCATOR=tcmalloc is unknown: choose mimalloc or system" in _said(VG2GT_ALLOCATOR="tcmalloc")
+    said = "ValueError: VG2GT_ALLOCATOR=tcmalloc is unknown: choose mimalloc or system"
+    environment = {"PATH": os.environ["PATH"], "PYTHONPATH": str(ROOT), CHOICE: "tcmalloc"}
+    command = [sys.executable, str(ROOT / "train.py")]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=100, check=False)
+    assert (done.returncode, done.stderr.strip()) == (1, said)
 
 
 def test_train_py_runs_on_it() -> None:

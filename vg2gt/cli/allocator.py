@@ -27,6 +27,9 @@ def start_with_mimalloc() -> None:
     Nothing is done on systems other than Linux, where torch is imported already, under a debugger or profiler, where
     the environment preloads a library of its own, and with ``VG2GT_ALLOCATOR=system``. Programs that the command
     starts do not inherit it.
+
+    Raises:
+        SystemExit: if ``VG2GT_ALLOCATOR`` is neither ``mimalloc`` nor ``system``.
     """
     if _AGAIN in os.environ:
         for name in os.environ.pop(_AGAIN).split(","):
@@ -35,7 +38,10 @@ def start_with_mimalloc() -> None:
     watched = sys.gettrace() is not None or sys.getprofile() is not None
     if "torch" in sys.modules or watched or not sys.argv[0] or not sys.executable:
         return
-    settings = mimalloc_environment()
+    try:
+        settings = mimalloc_environment()
+    except ValueError as error:
+        sys.exit(f"{type(error).__name__}: {error}")
     if not settings:
         return
     sys.stdout.flush()

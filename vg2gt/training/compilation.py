@@ -24,6 +24,8 @@ from vg2gt.rendering.selfcheck import as_scene, fixed_scene
 
 log = logging.getLogger(__name__)
 
+PATIENCE = 300  # seconds; a step of a large backbone on a slow machine takes longer than compiling
+
 
 def compile_kernels(renderer: Renderer, step: Callable[[], torch.Tensor]) -> None:
     """Compiles what training on a CPU needs, once a machine and version; what fails here is compiled when it is used.
@@ -44,7 +46,9 @@ def compile_kernels(renderer: Renderer, step: Callable[[], torch.Tensor]) -> Non
     rest = forked.Process(target=_quietly, args=(_step, step, rendering.sentinel))
     rest.start()
     for process in (rendering, rest):
-        process.join()
+        process.join(PATIENCE)
+        if process.is_alive():
+            process.kill()
     with suppress(OSError):
         mark.mkdir(parents=True, exist_ok=True)
 
