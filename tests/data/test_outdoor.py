@@ -186,10 +186,10 @@ def test_training_copes_with_the_sky(tmp_path):
 
 def test_rays_find_the_ground_or_the_sky(streets):
     world = streets[0].world
-    none = np.empty(0, np.int64)
+    none, near = np.empty(0, np.int64), np.empty(0)
     walls = [
-        nearest_hit(none, 0, world.parts, world.groups, world.walls, 0.0, 0.0, 1.6, *d)[1]
+        nearest_hit(none, near, 0, world.parts, world.walls, 0.0, 0.0, 1.6, *d)[1]
         for d in ((0.0, 0.0, -1.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0))
     ]
     assert walls == [-5, -6, -2]
-    assert nearest_hit(none, 0, world.parts, world.groups, world.walls, 0.0, 0.0, 1.6, 0.0, 0.0, -1.0)[0] < FAR
+    assert nearest_hit(none, near, 0, world.parts, world.walls, 0.0, 0.0, 1.6, 0.0, 0.0, -1.0)[0] < FAR

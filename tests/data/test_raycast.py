@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from vg2gt.data.synthetic.furniture import Builder
-from vg2gt.data.synthetic.raycast import FAR, groups_in_cone, intersect_part, leave_walls, nearest_hit, surface
+from vg2gt.data.synthetic.raycast import FAR, intersect_part, leave_walls, nearest_hit, parts_in_cone, surface
 from vg2gt.data.synthetic.rooms import SyntheticRoom
 from vg2gt.data.synthetic.textures import Pattern, pattern_value, pulse_train, square_wave
 
@@ -66,9 +66,7 @@ def test_rays_leave_the_room_on_its_walls():
 def test_bounding_spheres_and_cones_lose_no_hit():
     room = SyntheticRoom(6, 1, (16, 16)).world
     origin = np.array([0.1, 0.2, 1.4])
-    every = np.arange(len(room.groups))
-    plain = room.groups.copy()
-    plain[:, 3] = 1e3  # spheres that exclude nothing
+    every, nowhere_near = np.arange(len(room.parts)), np.zeros(len(room.parts))
     visible, near = np.empty(len(every), np.int64), np.empty(len(every))
     rng = np.random.default_rng(0)
     for _ in range(200):
@@ -77,10 +75,11 @@ def test_bounding_spheres_and_cones_lose_no_hit():
         d = axis + rng.normal(0, 0.05, 3)
         d /= np.linalg.norm(d)
         spread = np.arccos(min(1.0, axis @ d)) + 1e-6
-        count = groups_in_cone(origin, axis, spread, FAR, room.groups, visible, near)
+        count = parts_in_cone(origin, axis, spread, FAR / 2, room.parts, room.groups, visible, near)
+        assert count < len(every)
         assert (np.diff(near[:count]) >= 0).all()
-        culled = nearest_hit(visible, count, room.parts, room.groups, room.walls, *origin, *d)
-        assert culled == nearest_hit(every, len(every), room.parts, plain, room.walls, *origin, *d)
+        culled = nearest_hit(visible, near, count, room.parts, room.walls, *origin, *d)
+        assert culled == nearest_hit(every, nowhere_near, len(every), room.parts, room.walls, *origin, *d)
 
 
 @pytest.mark.parametrize("width", [0.01, 0.2, 0.7, 1.0, 2.5])

@@ -5,6 +5,7 @@ from vg2gt.voxels.serialization import (
     ORDERS,
     WindowGroup,
     hilbert_codes,
+    hilbert_reference,
     make_windows,
     relative_grid,
     serial_codes,
@@ -25,6 +26,14 @@ def test_consecutive_hilbert_codes_are_face_neighbours(bits):
     assert torch.equal(codes.sort().values, torch.arange(len(cells)))
     steps = cells[codes.argsort()].diff(dim=0).abs().sum(1)
     assert steps.eq(1).all()
+
+
+@pytest.mark.parametrize("bits", [1, 2, 5, 12, 21])
+def test_compiled_hilbert_codes_are_those_of_the_reference(bits):
+    cells = torch.randint(0, 1 << bits, (500, 3))
+    assert torch.equal(hilbert_codes(cells, bits), hilbert_reference(cells, bits))
+    transposed = cells[:, [1, 0, 2]].t().contiguous().t()  # any strides
+    assert torch.equal(hilbert_codes(transposed, bits), hilbert_reference(transposed, bits))
 
 
 @pytest.mark.parametrize("order", ORDERS)

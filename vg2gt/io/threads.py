@@ -2,25 +2,71 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
+import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
+from pathlib import Path
 from typing import TypeVar
 
 import torch
 
 Item = TypeVar("Item")
+_Body = ctypes.CFUNCTYPE(None, ctypes.c_void_p)
 
 
 def parallel_for(items: Sequence[Item], function: Callable[[Item], None]) -> None:
-    """Calls ``function(item)`` for every item; which thread takes which is left open."""
+    """Calls ``function(item)`` for every item; which thread takes which is left open.
+
+    Raises:
+        Exception: the first one that ``function`` raised; items that no thread had begun are left out.
+    """
     threads = min(torch.get_num_threads(), len(items))
+    team = _openmp_team()
     if threads <= 1:
         for item in items:
             function(item)
-        return
-    list(_pool(threads, os.getpid()).map(function, items))
+    elif team is None:
+        list(_pool(threads, os.getpid()).map(function, items))
+    else:
+        _on_team(team, threads, items, function)
+
+
+def _on_team(team: Callable[..., None], threads: int, items: Sequence[Item], function: Callable[[Item], None]) -> None:
+    """Every thread of the team takes the next item until none is left."""
+    waiting, failures = iter(items), []
+
+    def body(_: int | None) -> None:
+        try:
+            for item in waiting:  # a sequence's iterator hands out every item once, under the interpreter's lock
+                if failures:
+                    return
+                function(item)
+        except BaseException as error:  # must not pass through OpenMP
+            failures.append(error)
+
+    team(_Body(body), None, threads, 0)
+    if failures:
+        raise failures[0]
+
+
+@lru_cache(maxsize=1)
+def _openmp_team() -> Callable[..., None] | None:
+    """OpenMP's entry point for a parallel region in the library that torch uses, or None where it has none.
+
+    Torch's own threads wait for its next operation by spinning: threads of ours would share the cores with them.
+    """
+    if sys.platform != "linux":
+        return None
+    library = Path(torch.__file__).parent / "lib" / "libtorch_cpu.so"
+    try:
+        parallel = ctypes.CDLL(str(library)).GOMP_parallel  # looked up in the libraries that this one needs
+    except (OSError, AttributeError):
+        return None
+    parallel.argtypes, parallel.restype = [_Body, ctypes.c_void_p, ctypes.c_uint, ctypes.c_uint], None
+    return parallel
 
 
 @lru_cache(maxsize=4)

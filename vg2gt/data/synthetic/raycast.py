@@ -129,14 +129,14 @@ def leave_walls(walls, ox, oy, oz, dx, dy, dz):
 
 
 @jit
-def nearest_hit(visible, count, parts, groups, walls, ox, oy, oz, dx, dy, dz):
+def nearest_hit(visible, near, count, parts, walls, ox, oy, oz, dx, dy, dz):
     """Nearest hit of a ray from inside the room: distance, and the part or ``-1 - wall``.
 
     Args:
-        visible: the groups to try, first the nearest.
+        visible: the parts to try.
+        near: a distance from the ray's origin that each is at least away, the least one first.
         count: how many of ``visible`` count.
         parts: ``[n, PART_COLUMNS]``.
-        groups: ``[g, GROUP_COLUMNS]``.
         walls: ``[2, 3]`` corners of the room.
         ox: the ray's origin, x.
         oy: y.
@@ -148,49 +148,51 @@ def nearest_hit(visible, count, parts, groups, walls, ox, oy, oz, dx, dy, dz):
     best, wall = leave_walls(walls, ox, oy, oz, dx, dy, dz)
     hit = -1 - wall
     for k in range(count):
-        g = visible[k]
-        x, y, z = groups[g, 0] - ox, groups[g, 1] - oy, groups[g, 2] - oz
-        radius = groups[g, RADIUS]
-        along = x * dx + y * dy + z * dz
-        if x * x + y * y + z * z - along * along > radius * radius or along - radius > best:
-            continue
-        for i in range(int(groups[g, FIRST]), int(groups[g, LAST])):
-            t = intersect_part(i, parts, ox, oy, oz, dx, dy, dz)
-            if t < best:
-                best, hit = t, i
+        if near[k] > best:
+            break
+        t = intersect_part(visible[k], parts, ox, oy, oz, dx, dy, dz)
+        if t < best:
+            best, hit = t, visible[k]
     return best, hit
 
 
 @jit
-def find_occluder(visible, count, parts, groups, ox, oy, oz, dx, dy, dz, distance, guess):
+def find_occluder(visible, count, parts, ox, oy, oz, dx, dy, dz, distance, guess):
     """A part that a ray meets within ``distance``, -1 if none; part ``guess`` (unless -1) is tried first."""
     if guess >= 0 and intersect_part(guess, parts, ox, oy, oz, dx, dy, dz) < distance:
         return guess
     for k in range(count):
-        g = visible[k]
-        x, y, z = groups[g, 0] - ox, groups[g, 1] - oy, groups[g, 2] - oz
-        radius = groups[g, RADIUS]
-        along = x * dx + y * dy + z * dz
-        if along < -radius or x * x + y * y + z * z - along * along > radius * radius:
-            continue
-        for i in range(int(groups[g, FIRST]), int(groups[g, LAST])):
-            if intersect_part(i, parts, ox, oy, oz, dx, dy, dz) < distance:
-                return i
+        if intersect_part(visible[k], parts, ox, oy, oz, dx, dy, dz) < distance:
+            return visible[k]
     return -1
 
 
 @jit
-def groups_in_cone(apex, axis, spread, reach, groups, visible, near):
-    """Finds the groups whose sphere meets a cone, nearest first.
+def _enters_cone(x, y, z, radius, axis, spread, reach):
+    """Least distance between a cone's tip and a sphere around (x, y, z), seen from the tip; FAR where they miss."""
+    distance = math.sqrt(x * x + y * y + z * z)
+    if distance - radius > reach:
+        return FAR
+    if distance > radius:
+        cosine = (x * axis[0] + y * axis[1] + z * axis[2]) / distance
+        if math.acos(min(max(cosine, -1.0), 1.0)) > spread + math.asin(radius / distance):
+            return FAR
+    return distance - radius
+
+
+@jit
+def parts_in_cone(apex, axis, spread, reach, parts, groups, visible, near):
+    """Finds the parts whose sphere meets a cone, those of the nearest group first, a group's own in their order.
 
     Args:
         apex: ``[3]`` tip of the cone.
         axis: ``[3]`` unit direction.
         spread: half opening angle (rad).
-        reach: length of the cone.
-        groups: ``[g, GROUP_COLUMNS]``.
-        visible: ``[g]`` receives the groups.
-        near: ``[g]`` receives their distances.
+        reach: length of the cone, less than ``FAR``.
+        parts: ``[n, PART_COLUMNS]``.
+        groups: ``[g, GROUP_COLUMNS]``; those that miss the cone are passed over as a whole.
+        visible: ``[n]`` receives the parts.
+        near: ``[n]`` receives the least distance of each one's group.
 
     Returns:
         How many there are.
@@ -198,20 +200,19 @@ def groups_in_cone(apex, axis, spread, reach, groups, visible, near):
     count = 0
     for g in range(groups.shape[0]):
         x, y, z = groups[g, 0] - apex[0], groups[g, 1] - apex[1], groups[g, 2] - apex[2]
-        distance = math.sqrt(x * x + y * y + z * z)
-        radius = groups[g, RADIUS]
-        if distance > radius:
-            cosine = (x * axis[0] + y * axis[1] + z * axis[2]) / distance
-            if math.acos(min(max(cosine, -1.0), 1.0)) > spread + math.asin(radius / distance):
-                continue
-        if distance - radius > reach:
+        least = _enters_cone(x, y, z, groups[g, RADIUS], axis, spread, reach)
+        if least == FAR:
             continue
-        k = count
-        while k > 0 and near[k - 1] > distance - radius:
-            near[k], visible[k] = near[k - 1], visible[k - 1]
-            k -= 1
-        near[k], visible[k] = distance - radius, g
-        count += 1
+        for i in range(int(groups[g, FIRST]), int(groups[g, LAST])):
+            x, y, z = parts[i, 0] - apex[0], parts[i, 1] - apex[1], parts[i, 2] - apex[2]
+            if _enters_cone(x, y, z, math.sqrt(parts[i, RADIUS2]), axis, spread, reach) == FAR:
+                continue
+            k = count
+            while k > 0 and near[k - 1] > least:
+                near[k], visible[k] = near[k - 1], visible[k - 1]
+                k -= 1
+            near[k], visible[k] = least, i
+            count += 1
     return count
 
 

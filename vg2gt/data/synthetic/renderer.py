@@ -1,7 +1,7 @@
 """Renders a world of textured parts with point lights and shadows: colour, exact z-depth and normals.
 
 One numba kernel renders a frame and releases the interpreter's lock, so frames are rendered by threads. The image is
-worked on in tiles: all rays of a tile are cast first, then shaded with the groups that can throw a shadow on what the
+worked on in tiles: all rays of a tile are cast first, then shaded with the parts that can throw a shadow on what the
 tile sees. Highlights and the sky are compiled in only where a world has them (``None`` is a type to numba).
 """
 
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vg2gt.data.synthetic.raycast import FAR, find_occluder, groups_in_cone, jit, nearest_hit, surface, unowned
+from vg2gt.data.synthetic.raycast import FAR, find_occluder, jit, nearest_hit, parts_in_cone, surface, unowned
 from vg2gt.data.synthetic.sky import GROUND, add_sky
 from vg2gt.data.synthetic.textures import fractal_noise, pattern_value
 
@@ -108,10 +108,10 @@ def render_frame(
 
 def _workspace(world: World, samples: int) -> tuple[NDArray, ...]:
     """Memory of the kernel: it works on arrays without owners (``unowned``), so Python has to own them."""
-    rays, lights, groups = _TILE * _TILE * samples**2, len(world.lights), len(world.groups)
+    rays, lights, parts = _TILE * _TILE * samples**2, len(world.lights), len(world.parts)
     hits = (np.empty((rays, 3)), np.empty((rays, 3)), np.empty(rays), np.empty(rays, np.int64))
-    seen = (np.empty(groups, np.int64), np.empty(groups))
-    shadows = (np.empty((lights, groups), np.int64), np.zeros(lights, np.int64), np.full(lights, -1))
+    seen = (np.empty(parts, np.int64), np.empty(parts))
+    shadows = (np.empty((lights, parts), np.int64), np.zeros(lights, np.int64), np.full(lights, -1))
     return (*hits, *seen, *shadows, np.empty(3), np.empty(3))
 
 
@@ -142,16 +142,15 @@ def _tile_cone(y0, x0, y1, x1, rotation, camera, axis):
 @jit
 def _light_cone(light, points, count, axis):
     """Writes the axis of a cone from a light around points; returns its half opening angle and length."""
-    low, high = points[0].copy(), points[0].copy()
-    for k in range(count):
-        for i in range(3):
-            low[i] = min(low[i], points[k, i])
-            high[i] = max(high[i], points[k, i])
-    radius = 1e-3 + 0.5 * math.sqrt((high[0] - low[0]) ** 2 + (high[1] - low[1]) ** 2 + (high[2] - low[2]) ** 2)
-    distance = 0.0
+    distance = squared = 0.0
     for i in range(3):
-        axis[i] = 0.5 * (low[i] + high[i]) - light[i]
+        low = high = points[0, i]
+        for k in range(count):
+            low, high = min(low, points[k, i]), max(high, points[k, i])
+        squared += (high - low) ** 2
+        axis[i] = 0.5 * (low + high) - light[i]
         distance += axis[i] * axis[i]
+    radius = 1e-3 + 0.5 * math.sqrt(squared)
     distance = math.sqrt(distance)
     for i in range(3):
         axis[i] /= max(distance, 1e-9)
@@ -161,17 +160,17 @@ def _light_cone(light, points, count, axis):
 @jit
 def _leave_out_sky(hits, points, count, origin):
     """Moves points in the sky, on which nothing throws a shadow, onto another point of the tile."""
-    solid = origin
+    x, y, z = origin[0], origin[1], origin[2]
     for k in range(count):
         if hits[k] < 0 and hits[k] != GROUND:
-            points[k] = solid
+            points[k, 0], points[k, 1], points[k, 2] = x, y, z
         else:
-            solid = points[k]
+            x, y, z = points[k, 0], points[k, 1], points[k, 2]
 
 
 @jit
-def _shade(hit, t, p, d, footprint, parts, groups, look, highlights, sky, shadowing, counts, guesses, color):
-    """Adds the linear colour of one ray's hit to ``color``; ``shadowing`` lists the groups to ask for every light."""
+def _shade(hit, t, p, d, footprint, parts, look, highlights, sky, shadowing, counts, guesses, color):
+    """Adds the linear colour of one ray's hit to ``color``; ``shadowing`` lists the parts to ask for every light."""
     part_materials, wall_materials, materials, lights, ambient = look
     shallow = 0.15
     if sky is not None:
@@ -197,7 +196,7 @@ def _shade(hit, t, p, d, footprint, parts, groups, look, highlights, sky, shadow
         if facing <= 0.0:
             continue
         sx, sy, sz = p[0] + _LIFT * nx, p[1] + _LIFT * ny, p[2] + _LIFT * nz
-        guess = find_occluder(shadowing[i], counts[i], parts, groups, sx, sy, sz, ex, ey, ez, distance, guesses[i])
+        guess = find_occluder(shadowing[i], counts[i], parts, sx, sy, sz, ex, ey, ez, distance, guesses[i])
         guesses[i] = guess
         strength = (_SHADOW if guess >= 0 else 1.0) * facing / (0.5 + 0.25 * squared)
         red += strength * lights[i, 3]
@@ -216,18 +215,20 @@ def _shade(hit, t, p, d, footprint, parts, groups, look, highlights, sky, shadow
 
 
 @jit
-def _cast_centers(y0, x0, y1, x1, origin, rotation, camera, geometry, sky, visible, count, depth, normal):
+def _cast_centers(y0, x0, y1, x1, origin, rotation, camera, geometry, sky, seen, depth, normal):
     """Depth and normals of a tile at its pixel centres."""
-    parts, groups, walls = geometry
+    parts, _, walls = geometry
+    visible, near, count = seen
     ox, oy, oz = origin
     d = np.empty(3)
     for y in range(y0, y1):
         for x in range(x0, x1):
             z = _ray(x, y, rotation, camera, d)
-            t, hit = nearest_hit(visible, count, parts, groups, walls, ox, oy, oz, d[0], d[1], d[2])
+            t, hit = nearest_hit(visible, near, count, parts, walls, ox, oy, oz, d[0], d[1], d[2])
             if sky is not None and hit < 0 and hit != GROUND:
                 depth[y, x] = 0.0
-                normal[y, x, :] = 0.0
+                for i in range(3):
+                    normal[y, x, i] = 0.0
                 continue
             n = surface(hit, parts, ox + t * d[0], oy + t * d[1], oz + t * d[2])
             depth[y, x] = t * z
@@ -252,8 +253,9 @@ def _render(pose, camera, geometry, look, extras, samples, workspace, out):
         for x0 in range(0, width, _TILE):
             y1, x1 = min(y0 + _TILE, height), min(x0 + _TILE, width)
             spread = _tile_cone(y0, x0, y1, x1, rotation, camera, axis)
-            count = groups_in_cone(origin, axis, spread, FAR, groups, visible, near)
-            _cast_centers(y0, x0, y1, x1, (ox, oy, oz), rotation, camera, geometry, sky, visible, count, depth, normal)
+            count = parts_in_cone(origin, axis, spread, FAR / 2, parts, groups, visible, near)
+            seen = (visible, near, count)
+            _cast_centers(y0, x0, y1, x1, (ox, oy, oz), rotation, camera, geometry, sky, seen, depth, normal)
             k = 0
             for y in range(y0, y1):
                 for x in range(x0, x1):
@@ -262,7 +264,7 @@ def _render(pose, camera, geometry, look, extras, samples, workspace, out):
                         sx = x + (sample % samples + 0.5) * step - 0.5
                         sy = y + (sample // samples + 0.5) * step - 0.5
                         _ray(sx, sy, rotation, camera, d)
-                        t, hits[k] = nearest_hit(visible, count, parts, groups, walls, ox, oy, oz, d[0], d[1], d[2])
+                        t, hits[k] = nearest_hit(visible, near, count, parts, walls, ox, oy, oz, d[0], d[1], d[2])
                         distances[k] = t
                         points[k, 0], points[k, 1], points[k, 2] = ox + t * d[0], oy + t * d[1], oz + t * d[2]
                         k += 1
@@ -270,15 +272,15 @@ def _render(pose, camera, geometry, look, extras, samples, workspace, out):
                 _leave_out_sky(hits, points, k, origin)
             for i in range(len(lights)):
                 spread, reach = _light_cone(lights[i], points, k, axis)
-                counts[i] = groups_in_cone(lights[i, :3], axis, spread, reach, groups, shadowing[i], near)
+                counts[i] = parts_in_cone(lights[i, :3], axis, spread, reach, parts, groups, shadowing[i], near)
             k = 0
             for y in range(y0, y1):
                 for x in range(x0, x1):
-                    color[:] = 0.0
+                    color[0] = color[1] = color[2] = 0.0
                     for _ in range(per_pixel):
                         _shade(
                             hits[k], distances[k], points[k], directions[k], step / camera[0],
-                            parts, groups, look, highlights, sky, shadowing, counts, guesses, color,
+                            parts, look, highlights, sky, shadowing, counts, guesses, color,
                         )  # fmt: skip
                         k += 1
                     for i in range(3):

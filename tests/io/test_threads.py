@@ -1,0 +1,76 @@
+import sys
+import threading
+import time
+
+import pytest
+import torch
+
+from vg2gt.io import threads
+from vg2gt.io.threads import parallel_for
+
+
+@pytest.fixture(params=["team", "pool"])
+def two_threads(request, monkeypatch):
+    """Two threads, those of OpenMP or, where it has no entry point, our own."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    if request.param == "pool":
+        monkeypatch.setattr(threads, "_openmp_team", lambda: None)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_every_item_is_taken_once_and_by_two_threads():
+    seen, takers = [], set()
+
+    def take(item):
+        seen.append(item)
+        takers.add(threading.get_ident())
+        time.sleep(0.005)
+
+    parallel_for(range(40), take)
+    assert sorted(seen) == list(range(40))
+    assert len(takers) == 2
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_an_error_is_raised_and_the_next_loop_runs():
+    def refuse(item):
+        if item == 3:
+            raise ValueError("item 3")
+
+    with pytest.raises(ValueError, match="item 3"):
+        parallel_for(range(8), refuse)
+    seen = []
+    parallel_for(range(8), seen.append)
+    assert sorted(seen) == list(range(8))
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_torch_computes_on_between_loops_and_inside_them():
+    values = torch.arange(400_000, dtype=torch.float64)
+    sums = [0.0] * 4
+
+    def add(item):
+        sums[item] = float((values + item).sum())
+
+    for _ in range(3):
+        parallel_for(range(4), add)
+        assert sums == [float(values.sum()) + item * len(values) for item in range(4)]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere torch's OpenMP has no such entry point")
+def test_the_loop_runs_on_torchs_own_threads():
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    torch.rand(1_000_000).exp()
+    running = _threads_of_this_process()
+    parallel_for(range(20), lambda _: time.sleep(0.001))
+    torch.set_num_threads(before)
+    assert _threads_of_this_process() == running
+
+
+def _threads_of_this_process():
+    with open("/proc/self/status") as status:
+        return next(int(line.split()[1]) for line in status if line.startswith("Threads:"))
