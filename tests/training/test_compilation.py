@@ -3,11 +3,15 @@
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
+import torch
 
 from vg2gt.rendering import Renderer
+from vg2gt.studies.study import compose_run
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = ["data.image_size=[28,56]", "data.train_scenes=1", "data.eval_scenes=1", "trainer.max_steps=1"]
@@ -55,3 +59,39 @@ def test_where_it_was_done_or_no_process_can_be_forked_nothing_is(
     monkeypatch.setattr(compilation.multiprocessing, "get_context", lambda kind: pytest.fail("a process is forked"))
     compilation.compile_kernels(Renderer(), lambda: pytest.fail("a step is taken"))
     assert mark.is_dir() == marked
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [["debug=fast_dev_run"], ["trainer=gpu"], ["trainer=ddp"]],
+    ids=["a trial", "on a GPU", "on several devices"],
+)
+def test_nothing_is_begun_for_a_run_that_would_not_wait_for_it(
+    overrides: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from vg2gt.training import compilation
+
+    monkeypatch.setattr(compilation, "_to_compile", lambda: True)
+    monkeypatch.setattr(compilation, "_forked", lambda *work: pytest.fail("a process is forked"))
+    assert compilation.begin_compiling(compose_run(overrides, tmp_path)) is None
+
+
+def test_the_parent_works_on_one_thread_until_the_other_process_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    from vg2gt.training import compilation
+
+    alive = iter([True, True, True, False])
+    monkeypatch.setattr(compilation, "_to_compile", lambda: True)
+    monkeypatch.setattr(compilation, "compiled_mark", lambda: None)
+    forked = [Mock(name="rendering", **{"is_alive.return_value": False}), Mock(name="rest")]
+    forked[1].is_alive = lambda: next(alive, False)
+    monkeypatch.setattr(compilation, "_forked", lambda *work: forked.pop(0))
+    before, threads = torch.get_num_threads(), []
+
+    def pieces() -> Iterator[int]:
+        while True:
+            threads.append(torch.get_num_threads())
+            yield 0
+
+    compilation.compile_kernels(Renderer(), lambda: torch.zeros(()), meanwhile=pieces())
+    assert threads == [1, 1, 1]
+    assert torch.get_num_threads() == before

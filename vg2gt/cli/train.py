@@ -10,13 +10,17 @@ from vg2gt.cli.commands import COMMANDS
 @hydra_command(COMMANDS["train"], "train")
 def main(config: DictConfig) -> None:
     """Runs the training that the configuration describes."""
+    from vg2gt.training.compilation import begin_compiling
+
+    compiling = begin_compiling(config)
+    # Lightning, which these import, takes seconds.
     from vg2gt.cli.sweeps import needs_own_process, run_in_own_process
     from vg2gt.training.loop import train
 
     if needs_own_process(config):
         run_in_own_process(config)
     else:
-        train(config)
+        train(config, compiling)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """A training's kernels are compiled before it begins, in processes of their own.
 
-The compiler needs some 200 MB that a process does not give back, and two processes compile side by side.
+The compiler needs some 200 MB that a process does not give back. What needs neither the model nor the data is compiled
+while the command still imports Lightning, which takes seconds on one core; the rest when the run stands.
 """
 
 from __future__ import annotations
@@ -11,12 +12,17 @@ import os
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from multiprocessing import connection
+from multiprocessing.process import BaseProcess
 
 import torch
+from hydra.utils import instantiate
+from omegaconf import DictConfig
 
+from vg2gt.data.synthetic import SyntheticScenes
 from vg2gt.io.compiled import compiled_mark
 from vg2gt.profiling import listening
 from vg2gt.rendering import Renderer
@@ -25,9 +31,48 @@ from vg2gt.rendering.selfcheck import as_scene, fixed_scene
 log = logging.getLogger(__name__)
 
 PATIENCE = 300  # seconds; a step of a large backbone on a slow machine takes longer than compiling
+BEGINS = "compiling kernels, once on this machine and version (about 10 s)"
+SYNTHETIC = "vg2gt.data.SyntheticScenes"  # the only source of scenes with kernels of its own
 
 
-def compile_kernels(renderer: Renderer, step: Callable[[], torch.Tensor]) -> None:
+@dataclass(frozen=True)
+class Compiling:
+    """Processes that compile.
+
+    Attributes:
+        rooms: what rooms are made with; None where none are trained on.
+        rendering: the renderer.
+    """
+
+    rooms: BaseProcess | None
+    rendering: BaseProcess
+
+
+def begin_compiling(config: DictConfig) -> Compiling | None:
+    """Begins to compile what the rooms and the renderer of a training on a CPU need, in processes beside this one.
+
+    Args:
+        config: of the training.
+
+    Returns:
+        The processes, for :func:`compile_kernels`; None where all was compiled before or it cannot be done.
+    """
+    trainer = config.trainer
+    on_gpu = trainer.accelerator not in ("cpu", "auto") or (trainer.accelerator == "auto" and torch.cuda.is_available())
+    if on_gpu or trainer.get("fast_dev_run") or str(trainer.devices) != "1" or not _to_compile():
+        return None
+    log.info(BEGINS)
+    synthetic = config.data.get("train", {}).get("_target_") == SYNTHETIC
+    rooms = _forked(_make_rooms, config.data.variant) if synthetic else None
+    return Compiling(rooms, _forked(_render, config.renderer))
+
+
+def compile_kernels(
+    renderer: Renderer,
+    step: Callable[[], torch.Tensor],
+    begun: Compiling | None = None,
+    meanwhile: Iterator[object] | None = None,
+) -> None:
     """Compiles what training on a CPU needs, once a machine and version; what fails here is compiled when it is used.
 
     Nothing is done where a process cannot be forked safely (other systems than Linux, other threads).
@@ -35,22 +80,48 @@ def compile_kernels(renderer: Renderer, step: Callable[[], torch.Tensor]) -> Non
     Args:
         renderer: the run's.
         step: takes a training step up to its loss; called in another process, whose changes are lost.
+        begun: what :func:`begin_compiling` began.
+        meanwhile: work for one thread of this process, a piece at a time, until the others have ended.
     """
-    mark = compiled_mark()
-    if sys.platform != "linux" or threading.active_count() > 1 or mark is None or mark.is_dir():
-        return
-    log.info("compiling kernels, once on this machine and version (about 10 s)")
-    forked = multiprocessing.get_context("fork")
-    rendering = forked.Process(target=_quietly, args=(_render, renderer))
-    rendering.start()
-    rest = forked.Process(target=_quietly, args=(_step, step, rendering.sentinel))
-    rest.start()
-    for process in (rendering, rest):
+    if begun is None:
+        if not _to_compile():
+            return
+        log.info(BEGINS)
+        begun = Compiling(None, _forked(_render, renderer))
+    if begun.rooms is not None:
+        begun.rooms.join(PATIENCE)
+    rest = _forked(_step, step, begun.rendering.sentinel)
+    _work_until_ended(rest, meanwhile or iter(()))
+    for process in (begun.rendering, rest):
         process.join(PATIENCE)
         if process.is_alive():
             process.kill()
+    mark = compiled_mark()
     with suppress(OSError):
-        mark.mkdir(parents=True, exist_ok=True)
+        if mark is not None:
+            mark.mkdir(parents=True, exist_ok=True)
+
+
+def _work_until_ended(process: BaseProcess, pieces: Iterator[object]) -> None:
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        while process.is_alive() and next(pieces, None) is not None:
+            pass
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _to_compile() -> bool:
+    """Whether this was not done yet, and a process can be forked safely."""
+    mark = compiled_mark()
+    return sys.platform == "linux" and threading.active_count() == 1 and mark is not None and not mark.is_dir()
+
+
+def _forked(work: Callable[..., None], *arguments: object) -> BaseProcess:
+    process = multiprocessing.get_context("fork").Process(target=_quietly, args=(work, *arguments), daemon=True)
+    process.start()
+    return process
 
 
 def _quietly(work: Callable[..., None], *arguments: object) -> None:
@@ -64,13 +135,21 @@ def _quietly(work: Callable[..., None], *arguments: object) -> None:
     work(*arguments)
 
 
-def _render(renderer: Renderer) -> None:
+def _make_rooms(variant: str | Sequence[str]) -> None:
+    """Makes a small picture of the first scenes."""
+    source = SyntheticScenes(4, num_frames=1, size=(16, 16), variant=variant)
+    for scene in source.scenes:
+        source.load(scene, [0])
+
+
+def _render(renderer: Renderer | DictConfig) -> None:
     """Renders a small scene, with and without gradients."""
+    render: Renderer = instantiate(renderer) if isinstance(renderer, DictConfig) else renderer
     inputs = [tensor.float() for tensor in fixed_scene()]
     with torch.no_grad():
-        renderer(*as_scene(inputs), mode="solid")
+        render(*as_scene(inputs), mode="solid")
     gaussians, cameras = as_scene([*(tensor.requires_grad_() for tensor in inputs[:5]), *inputs[5:]])
-    out = renderer(gaussians, cameras)
+    out = render(gaussians, cameras)
     (out.color.sum() + out.depth.sum() + out.normal.sum() + out.alpha.sum()).backward()
 
 

@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +38,7 @@ from vg2gt.runs.checkpoints import (
 from vg2gt.runs.load import made_of, refuse_other_tokens
 from vg2gt.runs.lock import only_process_in
 from vg2gt.training.checkpoint_io import AtomicCheckpointIO
-from vg2gt.training.compilation import compile_kernels
+from vg2gt.training.compilation import Compiling, compile_kernels
 from vg2gt.training.distributed import ending_together
 from vg2gt.training.module import VG2GTModule
 from vg2gt.training.notices import notices
@@ -155,13 +156,17 @@ def _check_trainer(config: DictConfig) -> None:
 
 
 @memory_advice(TRAINING)
-def train(config: DictConfig) -> dict[str, Any]:
+def train(config: DictConfig, compiling: Compiling | None = None) -> dict[str, Any]:
     """Runs the configuration from beginning to end.
 
     A refused start changes nothing of a run that the folder holds, and a trial (``fast_dev_run``) writes nothing.
 
     Writes into ``outputs/<name>``: the resolved configuration, checkpoints, ``metrics.json``, ``metrics.md`` and
     ``preview.png``.
+
+    Args:
+        config: of the training.
+        compiling: the processes of ``begin_compiling``, if kernels are being compiled already.
 
     Returns:
         The content of ``metrics.json``.
@@ -175,10 +180,10 @@ def train(config: DictConfig) -> dict[str, Any]:
     """
     writes = rank_zero_only.rank == 0 and not config.trainer.get("fast_dev_run")
     with only_process_in(config.output_dir) if writes else nullcontext():
-        return _train(config, writes)
+        return _train(config, writes, compiling)
 
 
-def _train(config: DictConfig, writes: bool) -> dict[str, Any]:
+def _train(config: DictConfig, writes: bool, compiling: Compiling | None) -> dict[str, Any]:
     """:func:`train` in a folder that is this process's own; ``writes``: by this process, and not a trial."""
     checkpoint = checkpoint_to_resume(config)
     for notice in notices(config) if rank_zero_only.rank == 0 else ():
@@ -214,7 +219,9 @@ def _train(config: DictConfig, writes: bool) -> dict[str, Any]:
         log.info("the run's folder is %s; it computes on %s", run.folder, run.trainer.strategy.root_device)
 
     if writes and not run.trial and run.trainer.strategy.root_device.type == "cpu":
-        compile_kernels(run.module.renderer, lambda: _first_loss(run))
+        # Rooms are kept on disk once they were made.
+        batches = chain(run.datamodule.val_dataloader(), run.datamodule.train_dataloader())
+        compile_kernels(run.module.renderer, lambda: _first_loss(run), compiling, batches)
     with ending_together(run.trainer):
         untrained = _untrained_metrics(run, resumed=checkpoint is not None)
         run.trainer.fit(run.module, datamodule=run.datamodule, ckpt_path=checkpoint, weights_only=True)
