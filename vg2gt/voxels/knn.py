@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import itertools
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from torch import Tensor
 from torch.nn import functional as F
 
+from vg2gt.io.threads import parallel_for
+
 CHUNK = 1 << 26  # distances held at once
+QUERIES_AT_ONCE = 256  # by one thread
 
 
 def nearest_neighbors(queries: Tensor, points: Tensor, neighbors: int) -> Tensor:
@@ -26,14 +31,23 @@ def nearest_neighbors(queries: Tensor, points: Tensor, neighbors: int) -> Tensor
     count = min(neighbors, len(points))
     queries, points = queries.detach(), points.detach()
     if queries.device.type == "cpu":
-        tree = KDTree(points.numpy())
-        index = tree.query(queries.numpy(), k=count, workers=torch.get_num_threads())[1]
-        return torch.from_numpy(index).long().reshape(len(queries), count)
+        return _by_tree(queries.numpy(), KDTree(points.numpy()), count)
     parts = [
         torch.cdist(part, points, compute_mode="donot_use_mm_for_euclid_dist").topk(count, largest=False).indices
         for part in queries.split(max(1, CHUNK // len(points)))
     ]
     return torch.cat(parts) if parts else torch.empty((0, count), dtype=torch.int64, device=queries.device)
+
+
+def _by_tree(queries: NDArray, tree: KDTree, count: int) -> Tensor:
+    index = np.empty((len(queries), count), np.int64)
+
+    def find(first: int) -> None:
+        part = slice(first, first + QUERIES_AT_ONCE)
+        index[part] = tree.query(queries[part], k=count)[1].reshape(-1, count)
+
+    parallel_for(range(0, len(queries), QUERIES_AT_ONCE), find)
+    return torch.from_numpy(index)
 
 
 def interpolation_weights(
