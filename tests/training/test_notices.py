@@ -36,11 +36,11 @@ def test_usual_runs_are_not_commented(overrides: list[str], tmp_path: Path) -> N
     [
         (
             ["backend=da3_giant", "model=vg2gt"],
-            ["backend=da3_giant and a model of the paper's", "max_steps=350, optimizer.lr=0.004, loss=quickstart of"],
+            ["backend=da3_giant and a model of the paper's", "max_steps=320, optimizer.lr=0.004, loss=quickstart of"],
         ),
-        (["backend=da3_nested", "loss=paper", "optimizer.lr=1e-4"], ["backend=da3_nested with trainer.max_steps=350"]),
+        (["backend=da3_nested", "loss=paper", "optimizer.lr=1e-4"], ["backend=da3_nested with trainer.max_steps=320"]),
         (["backend=vggt_1b", "trainer.max_steps=9000", "loss=paper"], ["backend=vggt_1b with optimizer.lr=0.004 of"]),
-        (["model=vg2gt", "optimizer=adamw", "loss=paper"], ["max_steps=350, optimizer.lr=0.001 of the quick run"]),
+        (["model=vg2gt", "optimizer=adamw", "loss=paper"], ["max_steps=320, optimizer.lr=0.001 of the quick run"]),
         (["model=vg2gt", "trainer.max_steps=9000", "optimizer.lr=1e-4"], ["widths with loss=quickstart of"]),
         (["model.fine.min_footprint=0"], ["voxel_size=0.002", "the median depth is 1", "experiment=paper_counts"]),
         (["model.scale.source=focal"], ["model.scale.source=focal", "backends.oracle.OracleBackend", "normalize"]),

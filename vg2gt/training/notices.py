@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from omegaconf import DictConfig
 
-QUICK_STEPS = 350  # trainer=default
+QUICK_STEPS = 320  # trainer=default
 QUICK_RATES = (4e-3, 1e-3)  # optimizer=muon and adamw
 LARGE_BACKBONE = 768  # width of tokens: BASE and above
 WIDE_FUSION = 512  # channels; model=tiny has 64, model=vg2gt 1024
