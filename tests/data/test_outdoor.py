@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.kernel_parts import compiled_part
 from tests.training_helpers import small_config
 from vg2gt.data import Frames, SyntheticScenes
 from vg2gt.data.synthetic.builder import Builder
@@ -187,9 +188,10 @@ def test_training_copes_with_the_sky(tmp_path):
 def test_rays_find_the_ground_or_the_sky(streets):
     world = streets[0].world
     none, near = np.empty(0, np.int64), np.empty(0)
+    hit = compiled_part(nearest_hit)
     walls = [
-        nearest_hit(none, near, 0, world.parts, world.walls, 0.0, 0.0, 1.6, *d)[1]
+        hit(none, near, 0, world.parts, world.walls, 0.0, 0.0, 1.6, *d)[1]
         for d in ((0.0, 0.0, -1.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0))
     ]
     assert walls == [-5, -6, -2]
-    assert nearest_hit(none, near, 0, world.parts, world.walls, 0.0, 0.0, 1.6, 0.0, 0.0, -1.0)[0] < FAR
+    assert hit(none, near, 0, world.parts, world.walls, 0.0, 0.0, 1.6, 0.0, 0.0, -1.0)[0] < FAR

@@ -3,10 +3,20 @@
 import numpy as np
 import pytest
 
+from tests.kernel_parts import compiled_part
+from vg2gt.data.synthetic import raycast, textures
 from vg2gt.data.synthetic.furniture import Builder
-from vg2gt.data.synthetic.raycast import FAR, intersect_part, leave_walls, nearest_hit, parts_in_cone, surface
+from vg2gt.data.synthetic.raycast import FAR
 from vg2gt.data.synthetic.rooms import SyntheticRoom
-from vg2gt.data.synthetic.textures import Pattern, pattern_value, pulse_train, square_wave
+from vg2gt.data.synthetic.textures import Pattern
+
+intersect_part, leave_walls, nearest_hit, parts_in_cone, surface = (
+    compiled_part(getattr(raycast, name))
+    for name in ("intersect_part", "leave_walls", "nearest_hit", "parts_in_cone", "surface")
+)
+pattern_value, pulse_train, square_wave = (
+    compiled_part(getattr(textures, name)) for name in ("pattern_value", "pulse_train", "square_wave")
+)
 
 
 def _inside(kind: int, local: np.ndarray, half: np.ndarray) -> np.ndarray:

@@ -1,5 +1,6 @@
 """Every implementation held to the dense float64 reference, in value and in gradient."""
 
+import threading
 from dataclasses import replace
 from typing import Any
 
@@ -23,6 +24,7 @@ from tests.rendering.scenes import (
     with_gradients,
 )
 from vg2gt.rendering import render
+from vg2gt.rendering.cpu import function, tiles
 from vg2gt.rendering.options import DepthKind, Mode
 from vg2gt.rendering.renderer import Implementation
 
@@ -50,6 +52,23 @@ def test_deep_translucent_rays_equal_the_reference(implementation: Implementatio
         for name in ("dense", implementation)
     )
     assert_same_render(found, expected)
+
+
+def test_tiles_with_more_hits_than_there_is_room_for_are_rendered_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    gaussians, cameras = soup(200, size=0.6), pinhole((20, 40))
+    gaussians = replace(gaussians, opacities=gaussians.opacities * 0.1)
+    expected = render(gaussians, cameras, implementation="cpu")
+    given = []
+    aligned = function._aligned
+    monkeypatch.setattr(function, "_local", threading.local())  # no memory of other tests
+    monkeypatch.setattr(function, "HIT_CAPACITY", 3)
+    monkeypatch.setattr(function, "_aligned", lambda count, dtype: given.append(count) or aligned(count, dtype))
+    found = render(gaussians, cameras, implementation="cpu")
+    sizes = [count // (tiles.BLOCKS * tiles.HIT_SIZE) for count in given]
+    assert 3 in sizes
+    assert max(sizes) > 10
+    for image, other in zip(images(expected), images(found), strict=True):
+        assert torch.equal(image, other)
 
 
 @pytest.mark.parametrize("options", [{"near": 2.6}, {"newton_steps": 0}])

@@ -21,7 +21,9 @@ import sys
 from numba.core import event
 class Say(event.Listener):
     def on_start(self, event):
-        print("COMPILES", event.data["dispatcher"].py_func.__name__, flush=True)
+        name = event.data["dispatcher"].py_func.__name__
+        if name != "_nothing":  # which loads the compiler before it is needed
+            print("COMPILES", name, flush=True)
     def on_end(self, event):
         pass
 event.register("numba:compile", Say())
@@ -41,7 +43,7 @@ def test_the_first_training_of_a_machine_compiles_nothing_itself(tmp_path: Path)
     assert done.returncode == 0, done.stderr[-3000:]
     assert "compiling kernels, once" in done.stdout + done.stderr
     assert [line for line in done.stdout.splitlines() if line.startswith("COMPILES")] == []
-    assert len(list(kernels.rglob("*.nbc"))) > 20
+    assert len(list(kernels.rglob("*.nbc"))) > 15
     assert len(list(kernels.glob("vg2gt/compiled-*"))) == 1
 
 
@@ -57,7 +59,7 @@ def test_where_it_was_done_or_no_process_can_be_forked_nothing_is(
     monkeypatch.setattr(compilation, "compiled_mark", lambda: mark)
     monkeypatch.setattr(compilation.threading, "active_count", lambda: threads)
     monkeypatch.setattr(compilation.multiprocessing, "get_context", lambda kind: pytest.fail("a process is forked"))
-    compilation.compile_kernels(Renderer(), lambda: pytest.fail("a step is taken"))
+    compilation.compile_kernels(Renderer(), lambda: pytest.fail("a step is prepared"))
     assert mark.is_dir() == marked
 
 
@@ -92,6 +94,6 @@ def test_the_parent_works_on_one_thread_until_the_other_process_ends(monkeypatch
             threads.append(torch.get_num_threads())
             yield 0
 
-    compilation.compile_kernels(Renderer(), lambda: torch.zeros(()), meanwhile=pieces())
+    compilation.compile_kernels(Renderer(), lambda: lambda: torch.zeros(()), meanwhile=pieces())
     assert threads == [1, 1, 1]
     assert torch.get_num_threads() == before

@@ -25,6 +25,7 @@ from typing import Any
 import llvmlite.binding
 import numba
 from numba.core import event
+from numba.extending import register_jitable
 
 log = logging.getLogger(__name__)
 
@@ -81,6 +82,7 @@ def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     anew. A kernel that is made inside a function takes other kernels by their modules' names, not from that function:
     numba finds compiled code again by the values of the closure, and a kernel is another value in every process.
     """
+    options["no_cfunc_wrapper"] = True  # nothing calls a kernel as a C function, and compiling that takes time
 
     def compile_later(function: Callable[..., Any]) -> Any:
         """The kernel, compiled when it is first called and kept in the folder of its sources' hash."""
@@ -95,6 +97,14 @@ def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
             config.CACHE_DIR = chosen
 
     return compile_later
+
+
+def kernel_part(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """For functions that kernels call: compiled with them and kept within them, without an entry of their own.
+
+    Called from Python such a function is interpreted.
+    """
+    return register_jitable(no_cfunc_wrapper=True, **options)
 
 
 def _room(source: Path) -> Path:

@@ -7,11 +7,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import njit
 from torch import Tensor
 
 from vg2gt.geometry.normals import ray_slopes
-from vg2gt.io.compiled import kernel
+from vg2gt.io.compiled import kernel, kernel_part
 from vg2gt.io.threads import parallel_for
 from vg2gt.losses.truth import Truth
 from vg2gt.types import Cameras
@@ -197,7 +196,7 @@ def _disagreement(view, depth, true, valid, pinholes, true_pinholes, turn, strid
         totals[view] += weight * sums
 
 
-@njit(fastmath={"contract", "nsz", "arcp", "reassoc"}, error_model="numpy")
+@kernel_part(fastmath={"contract", "nsz", "arcp", "reassoc"}, error_model="numpy")
 def _row(table, columns, v, w, sx, sy, tx, ty, r):
     """``sum 1 - cos`` over a row's corners; writes their derivatives into the table's last five lines.
 
@@ -232,7 +231,7 @@ def _row(table, columns, v, w, sx, sy, tx, ty, r):
     return total
 
 
-@njit(fastmath={"contract", "nsz", "arcp", "reassoc"}, error_model="numpy", inline="always")
+@kernel_part(fastmath={"contract", "nsz", "arcp", "reassoc"}, error_model="numpy", forceinline=True)
 def _turn_of_corner(x, y, ex, ey, u, v, q, w, r, counts):
     """``1 - cos`` of one corner and minus its derivatives by ``x`` and ``y``, all times ``counts``."""
     z = -ONE - u * x - v * y

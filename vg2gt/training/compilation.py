@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from multiprocessing import connection
 from multiprocessing.process import BaseProcess
 
+import numba
 import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig
@@ -62,6 +63,7 @@ def begin_compiling(config: DictConfig) -> Compiling | None:
     if on_gpu or trainer.get("fast_dev_run") or str(trainer.devices) != "1" or not _to_compile():
         return None
     log.info(BEGINS)
+    _start_compiler()
     synthetic = config.data.get("train", {}).get("_target_") == SYNTHETIC
     rooms = _forked(_make_rooms, config.data.variant) if synthetic else None
     return Compiling(rooms, _forked(_render, config.renderer))
@@ -69,7 +71,7 @@ def begin_compiling(config: DictConfig) -> Compiling | None:
 
 def compile_kernels(
     renderer: Renderer,
-    step: Callable[[], torch.Tensor],
+    prepare_step: Callable[[], Callable[[], torch.Tensor]],
     begun: Compiling | None = None,
     meanwhile: Iterator[object] | None = None,
 ) -> None:
@@ -79,7 +81,8 @@ def compile_kernels(
 
     Args:
         renderer: the run's.
-        step: takes a training step up to its loss; called in another process, whose changes are lost.
+        prepare_step: loads what a training step needs and returns the step up to its loss, which is taken in another
+            process, whose changes are lost.
         begun: what :func:`begin_compiling` began.
         meanwhile: work for one thread of this process, a piece at a time, until the others have ended.
     """
@@ -87,11 +90,15 @@ def compile_kernels(
         if not _to_compile():
             return
         log.info(BEGINS)
+        _start_compiler()
         begun = Compiling(None, _forked(_render, renderer))
     if begun.rooms is not None:
         begun.rooms.join(PATIENCE)
-    rest = _forked(_step, step, begun.rendering.sentinel)
-    _work_until_ended(rest, meanwhile or iter(()))
+    pieces = meanwhile or iter(())
+    with _one_thread():
+        rest = _forked(_step, prepare_step(), begun.rendering.sentinel)
+        while rest.is_alive() and next(pieces, None) is not None:
+            pass
     for process in (begun.rendering, rest):
         process.join(PATIENCE)
         if process.is_alive():
@@ -102,14 +109,23 @@ def compile_kernels(
             mark.mkdir(parents=True, exist_ok=True)
 
 
-def _work_until_ended(process: BaseProcess, pieces: Iterator[object]) -> None:
+@contextmanager
+def _one_thread() -> Iterator[None]:
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        while process.is_alive() and next(pieces, None) is not None:
-            pass
+        yield
     finally:
         torch.set_num_threads(threads)
+
+
+def _start_compiler() -> None:
+    """Makes numba load what compiling and running kernels needs: here and not in every process again."""
+    numba.njit(_nothing)()
+
+
+def _nothing() -> None:
+    """Compiled in a blink."""
 
 
 def _to_compile() -> bool:

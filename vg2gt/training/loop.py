@@ -221,7 +221,7 @@ def _train(config: DictConfig, writes: bool, compiling: Compiling | None) -> dic
     if writes and not run.trial and run.trainer.strategy.root_device.type == "cpu":
         # Rooms are kept on disk once they were made.
         batches = chain(run.datamodule.val_dataloader(), run.datamodule.train_dataloader())
-        compile_kernels(run.module.renderer, lambda: _first_loss(run), compiling, batches)
+        compile_kernels(run.module.renderer, lambda: _first_step(run), compiling, batches)
     with ending_together(run.trainer):
         untrained = _untrained_metrics(run, resumed=checkpoint is not None)
         run.trainer.fit(run.module, datamodule=run.datamodule, ckpt_path=checkpoint, weights_only=True)
@@ -234,9 +234,10 @@ def _train(config: DictConfig, writes: bool, compiling: Compiling | None) -> dic
         return _report(run, untrained, trained)
 
 
-def _first_loss(run: Run) -> torch.Tensor:
-    """The loss of the first training step, outside the trainer's loop."""
-    return run.module.training_step(next(iter(run.datamodule.train_dataloader())), 0)
+def _first_step(run: Run) -> Callable[[], torch.Tensor]:
+    """The first training step up to its loss, outside the trainer's loop."""
+    batch = next(iter(run.datamodule.train_dataloader()))
+    return lambda: run.module.training_step(batch, 0)
 
 
 def _save_last(run: Run) -> None:

@@ -13,7 +13,7 @@ from llvmlite.ir import Constant
 from numba import types
 from numba.extending import intrinsic
 
-from vg2gt.io.compiled import kernel
+from vg2gt.io.compiled import kernel, kernel_part
 
 BOX, CYLINDER, ELLIPSOID = 0, 1, 2
 
@@ -27,6 +27,7 @@ _EPSILON = 1e-9
 _FLAGS = {"reassoc", "contract", "arcp", "nsz"}  # not the flags that forbid infinities
 
 jit = kernel(nogil=True, error_model="numpy", fastmath=_FLAGS)
+part = kernel_part(error_model="numpy", fastmath=_FLAGS)
 
 
 def _without_owner(context: Any, builder: Any, kind: Any, value: Any) -> Any:
@@ -55,12 +56,12 @@ def _unowned(context: Any, value: Any) -> Any:
 unowned: Any = intrinsic(_unowned)
 
 
-@jit
+@part
 def _inverse(x):
     return 1.0 / x if abs(x) > 1e-12 else 1e12
 
 
-@jit
+@part
 def intersect_part(i, parts, ox, oy, oz, dx, dy, dz):
     """Distance at which a ray from outside enters part ``i``; ``FAR`` if it does not."""
     x, y, z = parts[i, 0] - ox, parts[i, 1] - oy, parts[i, 2] - oz
@@ -110,7 +111,7 @@ def intersect_part(i, parts, ox, oy, oz, dx, dy, dz):
     return enter if enter > _EPSILON else FAR
 
 
-@jit
+@part
 def leave_walls(walls, ox, oy, oz, dx, dy, dz):
     """Distance to the wall of the room along a ray from inside, and the wall: 0..5 for x-, x+, y-, y+, floor, ceiling.
 
@@ -128,7 +129,7 @@ def leave_walls(walls, ox, oy, oz, dx, dy, dz):
     return tz, 4 + sz
 
 
-@jit
+@part
 def nearest_hit(visible, near, count, parts, walls, ox, oy, oz, dx, dy, dz):
     """Nearest hit of a ray from inside the room: distance, and the part or ``-1 - wall``.
 
@@ -156,7 +157,7 @@ def nearest_hit(visible, near, count, parts, walls, ox, oy, oz, dx, dy, dz):
     return best, hit
 
 
-@jit
+@part
 def find_occluder(visible, count, parts, ox, oy, oz, dx, dy, dz, distance, guess):
     """A part that a ray meets within ``distance``, -1 if none; part ``guess`` (unless -1) is tried first."""
     if guess >= 0 and intersect_part(guess, parts, ox, oy, oz, dx, dy, dz) < distance:
@@ -167,7 +168,7 @@ def find_occluder(visible, count, parts, ox, oy, oz, dx, dy, dz, distance, guess
     return -1
 
 
-@jit
+@part
 def _enters_cone(x, y, z, radius, axis, spread, reach):
     """Least distance between a cone's tip and a sphere around (x, y, z), seen from the tip; FAR where they miss."""
     distance = math.sqrt(x * x + y * y + z * z)
@@ -180,7 +181,7 @@ def _enters_cone(x, y, z, radius, axis, spread, reach):
     return distance - radius
 
 
-@jit
+@part
 def parts_in_cone(apex, axis, spread, reach, parts, groups, visible, near):
     """Finds the parts whose sphere meets a cone, those of the nearest group first, a group's own in their order.
 
@@ -216,7 +217,7 @@ def parts_in_cone(apex, axis, spread, reach, parts, groups, visible, near):
     return count
 
 
-@jit
+@part
 def surface(hit, parts, px, py, pz):
     """Outward world normal (3) and surface coordinates in metres (2) of a point on a part or on a wall."""
     if hit < 0:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vg2gt.data.synthetic.raycast import FAR, find_occluder, jit, nearest_hit, parts_in_cone, surface, unowned
+from vg2gt.data.synthetic.raycast import FAR, find_occluder, jit, nearest_hit, part, parts_in_cone, surface, unowned
 from vg2gt.data.synthetic.sky import GROUND, add_sky
 from vg2gt.data.synthetic.textures import fractal_noise, pattern_value
 
@@ -106,16 +106,16 @@ def render_frame(
     return frame
 
 
-def _workspace(world: World, samples: int) -> tuple[NDArray, ...]:
+def _workspace(world: World, samples: int) -> tuple[tuple[NDArray, ...], ...]:
     """Memory of the kernel: it works on arrays without owners (``unowned``), so Python has to own them."""
     rays, lights, parts = _TILE * _TILE * samples**2, len(world.lights), len(world.parts)
     hits = (np.empty((rays, 3)), np.empty((rays, 3)), np.empty(rays), np.empty(rays, np.int64))
     seen = (np.empty(parts, np.int64), np.empty(parts))
     shadows = (np.empty((lights, parts), np.int64), np.zeros(lights, np.int64), np.full(lights, -1))
-    return (*hits, *seen, *shadows, np.empty(3), np.empty(3))
+    return hits, seen, shadows, (np.empty(3), np.empty(3), np.empty(3))
 
 
-@jit
+@part
 def _ray(x, y, rotation, camera, d):
     """Writes the unit world direction through image position (x, y) into ``d``; returns its camera-frame z."""
     cx = (x - camera[2]) / camera[0]
@@ -126,10 +126,9 @@ def _ray(x, y, rotation, camera, d):
     return z
 
 
-@jit
-def _tile_cone(y0, x0, y1, x1, rotation, camera, axis):
-    """Writes the axis of a cone around a tile's rays; returns its half opening angle."""
-    corner = np.empty(3)
+@part
+def _tile_cone(y0, x0, y1, x1, rotation, camera, corner, axis):
+    """Writes the axis of a cone around a tile's rays; returns its half opening angle. ``corner`` is overwritten."""
     _ray(0.5 * (x0 + x1 - 1), 0.5 * (y0 + y1 - 1), rotation, camera, axis)
     cosine = 1.0
     for x in (x0 - 0.5, x1 - 0.5):
@@ -139,7 +138,7 @@ def _tile_cone(y0, x0, y1, x1, rotation, camera, axis):
     return math.acos(min(cosine, 1.0)) + 1e-6
 
 
-@jit
+@part
 def _light_cone(light, points, count, axis):
     """Writes the axis of a cone from a light around points; returns its half opening angle and length."""
     distance = squared = 0.0
@@ -147,7 +146,7 @@ def _light_cone(light, points, count, axis):
         low = high = points[0, i]
         for k in range(count):
             low, high = min(low, points[k, i]), max(high, points[k, i])
-        squared += (high - low) ** 2
+        squared += (high - low) * (high - low)
         axis[i] = 0.5 * (low + high) - light[i]
         distance += axis[i] * axis[i]
     radius = 1e-3 + 0.5 * math.sqrt(squared)
@@ -157,7 +156,7 @@ def _light_cone(light, points, count, axis):
     return (math.asin(radius / distance) if radius < distance else math.pi), distance + radius
 
 
-@jit
+@part
 def _leave_out_sky(hits, points, count, origin):
     """Moves points in the sky, on which nothing throws a shadow, onto another point of the tile."""
     x, y, z = origin[0], origin[1], origin[2]
@@ -168,7 +167,7 @@ def _leave_out_sky(hits, points, count, origin):
             x, y, z = points[k, 0], points[k, 1], points[k, 2]
 
 
-@jit
+@part
 def _shade(hit, t, p, d, footprint, parts, look, highlights, sky, shadowing, counts, guesses, color):
     """Adds the linear colour of one ray's hit to ``color``; ``shadowing`` lists the parts to ask for every light."""
     part_materials, wall_materials, materials, lights, ambient = look
@@ -214,16 +213,17 @@ def _shade(hit, t, p, d, footprint, parts, look, highlights, sky, shadowing, cou
     color[2] += tone * (materials[m, 5] + mix * (materials[m, 8] - materials[m, 5])) * blue
 
 
-@jit
-def _cast_centers(y0, x0, y1, x1, origin, rotation, camera, geometry, sky, seen, depth, normal):
-    """Depth and normals of a tile at its pixel centres."""
+@part
+def _cast_centers(tile, origin, rotation, camera, geometry, sky, seen, d, out):
+    """Depth and normals of a tile at its pixels' centres; ``d`` is overwritten."""
     parts, _, walls = geometry
     visible, near, count = seen
-    ox, oy, oz = origin
-    d = np.empty(3)
+    _, depth, normal = out
+    y0, x0, y1, x1 = tile
+    ox, oy, oz = origin[0], origin[1], origin[2]
     for y in range(y0, y1):
         for x in range(x0, x1):
-            z = _ray(x, y, rotation, camera, d)
+            z = _ray(float(x), float(y), rotation, camera, d)
             t, hit = nearest_hit(visible, near, count, parts, walls, ox, oy, oz, d[0], d[1], d[2])
             if sky is not None and hit < 0 and hit != GROUND:
                 depth[y, x] = 0.0
@@ -236,38 +236,52 @@ def _cast_centers(y0, x0, y1, x1, origin, rotation, camera, geometry, sky, seen,
                 normal[y, x, i] = rotation[i, 0] * n[0] + rotation[i, 1] * n[1] + rotation[i, 2] * n[2]
 
 
+@part
+def _cast_samples(tile, samples, origin, rotation, camera, geometry, seen, rays):
+    """Hits of a tile's colour samples, one pixel's after the other's; returns how many samples there are."""
+    parts, _, walls = geometry
+    visible, near, count = seen
+    points, directions, distances, hits = rays
+    y0, x0, y1, x1 = tile
+    ox, oy, oz = origin[0], origin[1], origin[2]
+    step = 1.0 / samples
+    k = 0
+    for y in range(y0, y1):
+        for x in range(x0, x1):
+            for sample in range(samples * samples):
+                d = directions[k]
+                sx = x + (sample % samples + 0.5) * step - 0.5
+                sy = y + (sample // samples + 0.5) * step - 0.5
+                _ray(sx, sy, rotation, camera, d)
+                t, hits[k] = nearest_hit(visible, near, count, parts, walls, ox, oy, oz, d[0], d[1], d[2])
+                distances[k] = t
+                points[k, 0], points[k, 1], points[k, 2] = ox + t * d[0], oy + t * d[1], oz + t * d[2]
+                k += 1
+    return k
+
+
 @jit
 def _render(pose, camera, geometry, look, extras, samples, workspace, out):
     origin, rotation = unowned(pose)
     geometry, look = unowned(geometry), unowned(look)
-    parts, groups, walls = geometry
+    parts, groups, _ = geometry
     lights = look[3]
     highlights, sky = unowned(extras)
-    points, directions, distances, hits, visible, near, shadowing, counts, guesses, axis, color = unowned(workspace)
-    image, depth, normal = unowned(out)
-    height, width = depth.shape
-    ox, oy, oz = origin[0], origin[1], origin[2]
+    rays, (visible, near), (shadowing, counts, guesses), (axis, color, ray) = unowned(workspace)
+    points, directions, distances, hits = rays
+    out = unowned(out)
+    image = out[0]
+    height, width = image.shape[:2]
     per_pixel = samples * samples
-    step = 1.0 / samples
     for y0 in range(0, height, _TILE):
         for x0 in range(0, width, _TILE):
             y1, x1 = min(y0 + _TILE, height), min(x0 + _TILE, width)
-            spread = _tile_cone(y0, x0, y1, x1, rotation, camera, axis)
+            spread = _tile_cone(y0, x0, y1, x1, rotation, camera, ray, axis)
             count = parts_in_cone(origin, axis, spread, FAR / 2, parts, groups, visible, near)
             seen = (visible, near, count)
-            _cast_centers(y0, x0, y1, x1, (ox, oy, oz), rotation, camera, geometry, sky, seen, depth, normal)
-            k = 0
-            for y in range(y0, y1):
-                for x in range(x0, x1):
-                    for sample in range(per_pixel):
-                        d = directions[k]
-                        sx = x + (sample % samples + 0.5) * step - 0.5
-                        sy = y + (sample // samples + 0.5) * step - 0.5
-                        _ray(sx, sy, rotation, camera, d)
-                        t, hits[k] = nearest_hit(visible, near, count, parts, walls, ox, oy, oz, d[0], d[1], d[2])
-                        distances[k] = t
-                        points[k, 0], points[k, 1], points[k, 2] = ox + t * d[0], oy + t * d[1], oz + t * d[2]
-                        k += 1
+            tile = (y0, x0, y1, x1)
+            _cast_centers(tile, origin, rotation, camera, geometry, sky, seen, ray, out)
+            k = _cast_samples(tile, samples, origin, rotation, camera, geometry, seen, rays)
             if sky is not None:
                 _leave_out_sky(hits, points, k, origin)
             for i in range(len(lights)):
@@ -279,7 +293,7 @@ def _render(pose, camera, geometry, look, extras, samples, workspace, out):
                     color[0] = color[1] = color[2] = 0.0
                     for _ in range(per_pixel):
                         _shade(
-                            hits[k], distances[k], points[k], directions[k], step / camera[0],
+                            hits[k], distances[k], points[k], directions[k], 1.0 / samples / camera[0],
                             parts, look, highlights, sky, shadowing, counts, guesses, color,
                         )  # fmt: skip
                         k += 1

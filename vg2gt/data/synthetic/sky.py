@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from vg2gt.data.synthetic.raycast import jit
+from vg2gt.data.synthetic.raycast import part
 from vg2gt.data.synthetic.textures import fractal_noise
 
 # Columns of a sky: colours at the horizon and at the zenith, direction of the sun, its glow; share, size and seed of
@@ -25,7 +25,7 @@ def draw_sky(rng: np.random.Generator, sun: NDArray[np.float64]) -> NDArray[np.f
     return np.array([*haze, *blue, *sun, rng.uniform(0.1, 0.5), *clouds])
 
 
-@jit
+@part
 def add_sky(sky, d, angle, color):
     """Adds the linear colour of the sky in unit direction ``d`` to ``color``; ``angle`` is a pixel's width (rad)."""
     height = max(d[2], 0.0)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from enum import IntEnum
 
-from vg2gt.data.synthetic.raycast import jit
+from vg2gt.data.synthetic.raycast import part
 
 
 class Pattern(IntEnum):
@@ -35,7 +35,7 @@ PLAIN, STRIPES, CHECKS, BRICKS, DOTS, CLOUDS, WOOD, MOSAIC, WEAVE, PLANKS, WINDO
 _MIN_WIDTH = 1e-4  # filter width below which a pattern counts as unfiltered
 
 
-@jit
+@part
 def hash_cell(x, y, seed):
     """Pseudo-random number in [0, 1) of an integer lattice cell."""
     h = (x * 0x27D4EB2D + y * 0x165667B1 + seed * 0x9E3779B1) & 0xFFFFFFFF
@@ -44,7 +44,7 @@ def hash_cell(x, y, seed):
     return ((h ^ (h >> 15)) & 0xFFFFFF) / 16777216.0
 
 
-@jit
+@part
 def _blend_cells(x, y, seed, width):
     """Random value per unit cell, box-filtered: cells are constant, their borders ``width`` cells wide."""
     width = min(max(width, _MIN_WIDTH), 1.0)
@@ -61,7 +61,7 @@ def _blend_cells(x, y, seed, width):
     return low * (1 - v) + high * v
 
 
-@jit
+@part
 def value_noise(x, y, seed):
     """Smooth noise in [-1, 1] with unit lattice spacing."""
     ix = math.floor(x)
@@ -77,7 +77,7 @@ def value_noise(x, y, seed):
     return 2 * (low * (1 - v) + high * v) - 1
 
 
-@jit
+@part
 def fractal_noise(x, y, frequency, octaves, footprint, seed):
     """Sum of noise octaves, each damped by ``exp(-(frequency * footprint)^2)`` and dropped below 3 %."""
     total = 0.0
@@ -93,7 +93,7 @@ def fractal_noise(x, y, frequency, octaves, footprint, seed):
     return total
 
 
-@jit
+@part
 def square_wave(x, width):
     """Box-filtered wave of period 1: 1 on the first half, 0 on the second."""
     width = max(width, _MIN_WIDTH)
@@ -104,7 +104,7 @@ def square_wave(x, width):
     return 0.5 + 0.5 * rise / width
 
 
-@jit
+@part
 def pulse_train(x, duty, width):
     """Box-filtered train of period 1: 1 on a ``duty`` long interval centred at integers, 0 elsewhere."""
     width = max(width, _MIN_WIDTH)
@@ -115,7 +115,7 @@ def pulse_train(x, duty, width):
     return (until_right - until_left) / width
 
 
-@jit
+@part
 def _dots(x, y, width):
     u = x - math.floor(x) - 0.5
     v = y - math.floor(y) - 0.5
@@ -124,7 +124,7 @@ def _dots(x, y, width):
     return inside * fade + 0.2827 * (1 - fade)
 
 
-@jit
+@part
 def _grain(x, y, frequency, footprint, seed):
     """Wood grain along x: lines bent by noise that is stretched along them."""
     bend = fractal_noise(x * 0.3, y * 2.0, frequency, 3, 2.0 * footprint, seed)
@@ -133,7 +133,7 @@ def _grain(x, y, frequency, footprint, seed):
     return min(max(0.5 + 0.25 * lines + 0.3 * bend, 0.0), 1.0)
 
 
-@jit
+@part
 def pattern_value(kind, x, y, frequency, footprint, seed):
     """Mixing weight in [0, 1] between a material's two colours.
 

@@ -12,13 +12,12 @@ from collections.abc import Callable
 
 import numpy as np
 
-from vg2gt.io.compiled import kernel
+from vg2gt.io.compiled import kernel, kernel_part
 from vg2gt.io.compiled_math import exp
 from vg2gt.rendering.cpu import planes
 from vg2gt.rendering.cpu.constants import FAST, HALF, ONE, SUMS, TWO, ZERO
 from vg2gt.rendering.cpu.response import attenuate, respond
 from vg2gt.rendering.cpu.tiles import (
-    BLOCKS,
     BLOCKS_ACROSS,
     COLUMN,
     LANES,
@@ -27,14 +26,14 @@ from vg2gt.rendering.cpu.tiles import (
     SIDE,
     STAGED,
     TILE,
-    any_alive,
+    alive_blocks,
     place_of,
     stage,
     start_rays,
 )
 
 
-@kernel(fastmath=FAST, error_model="numpy", nogil=True)
+@kernel_part(fastmath=FAST, error_model="numpy")
 def _load_gradients(
     state, x_tile, y_tile, columns, rows, geometry, color, normal, depth, transmittance,
     grad_color, grad_normal, grad_alpha, grad_solid, grad_expected, grad_crossing,
@@ -61,7 +60,7 @@ def _load_gradients(
             state[k + planes.REST] = rest
 
 
-@kernel(fastmath=SUMS, error_model="numpy", nogil=True)
+@kernel_part(fastmath=SUMS, error_model="numpy")
 def _reduce_color(sums, g, row):
     """Sums the lanes of one (tile, Gaussian) into its gradient row, the part that colour and alpha need."""
     gx = gxx = gxy = gy = gyy = gs = gsx = gsy = gr = go = k0 = k1 = k2 = ZERO * g[0]
@@ -89,7 +88,7 @@ def _reduce_color(sums, g, row):
     row[13], row[14], row[15] = ZERO, ZERO, ZERO
 
 
-@kernel(fastmath=SUMS, error_model="numpy", nogil=True)
+@kernel_part(fastmath=SUMS, error_model="numpy")
 def _reduce_geometry(sums, row):
     """Adds what depth and normal need to a gradient row."""
     gz = gp = m0 = m1 = m2 = ZERO * row[0]
@@ -108,18 +107,19 @@ def _reduce_geometry(sums, row):
 def _make_backward_tile(geometry: bool, solid: bool) -> Callable[..., None]:
     """Compiles the visit of a tile with or without what depth and normals need: within it these are constants."""
 
-    @kernel(fastmath=FAST, error_model="numpy", nogil=True)
+    @kernel_part(fastmath=FAST, error_model="numpy")
     def backward_tile(
         records, colors, boxes, members, places, x_tile, y_tile, parameters, state, sums, staged, spans, rows
     ):
         """Visits a tile's Gaussians front to back again and writes one gradient row for each, at its place."""
         alpha_max, stop = parameters[0], parameters[1]
-        alive = np.empty(BLOCKS, np.bool_)
+        alive = 0
         visited = len(members)
         for p in range(len(members)):
             j = p % STAGED
             if j == 0:
-                if not any_alive(state, alive):
+                alive = alive_blocks(state)
+                if not alive:
                     visited = p
                     break
                 stage(records, colors, boxes, members[p : p + STAGED], x_tile, y_tile, staged, spans)
@@ -137,7 +137,7 @@ def _make_backward_tile(geometry: bool, solid: bool) -> Callable[..., None]:
                 top = np.float32(y_tile + block_row * SIDE) - vc
                 for block_column in range(spans[j, 0], spans[j, 1]):
                     block = block_row * BLOCKS_ACROSS + block_column
-                    if not alive[block]:
+                    if not alive >> block & 1:
                         continue
                     left = np.float32(x_tile + block_column * SIDE) - uc
                     base = np.uintp(block * LANES)

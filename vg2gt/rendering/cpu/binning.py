@@ -7,17 +7,19 @@ import numpy as np
 from vg2gt.io.compiled import kernel
 
 DIGIT_BITS = 11
+DIGITS = 1 << DIGIT_BITS
 TILE_BITS = 4  # tiles are 16 pixels wide and high
 
 
 @kernel(error_model="numpy", nogil=True)
-def radix_order(keys, bits):
-    """Stable ascending order ``[N]`` of unsigned integers with the given number of bits."""
-    order, spare = np.empty(len(keys), np.int32), np.empty(len(keys), np.int32)
+def radix_order(keys, bits, order, spare, counts):
+    """Stable ascending order ``[N]`` of unsigned integers with the given number of bits.
+
+    ``order`` and ``spare`` ``[N]`` are overwritten and one of them is returned; so is ``counts`` ``[DIGITS]``.
+    """
     for i in range(len(keys)):
         order[i] = i
-    counts = np.empty(1 << DIGIT_BITS, np.int64)
-    mask = np.uint64((1 << DIGIT_BITS) - 1)
+    mask = np.uint64(DIGITS - 1)
     for shift in range(0, bits, DIGIT_BITS):
         for digit in range(len(counts)):
             counts[digit] = 0
@@ -59,11 +61,11 @@ def count_tiles(boxes, across, counts, offsets, starts):
 
 
 @kernel(error_model="numpy", nogil=True)
-def fill_tiles(boxes, visible, across, offsets, starts, members, places):
-    """Writes the tiles' lists, front to back, and the place of each entry among its Gaussian's, from its offset on."""
-    ends = np.empty(len(starts) - 1, np.int64)
-    for k in range(len(ends)):
-        ends[k] = starts[k]
+def fill_tiles(boxes, visible, across, offsets, ends, members, places):
+    """Writes the tiles' lists, front to back, and the place of each entry among its Gaussian's, from its offset on.
+
+    ``ends`` holds the lists' starts, and afterwards their ends.
+    """
     for i in visible:
         place = offsets[i]
         x0, x1 = boxes[i, 0] >> TILE_BITS, (boxes[i, 1] - 1) >> TILE_BITS

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from vg2gt.io.compiled import kernel
+from vg2gt.io.compiled import kernel, kernel_part
 from vg2gt.io.compiled_math import exp
 from vg2gt.rendering.cpu import planes
 from vg2gt.rendering.cpu.constants import BIG, FAST, FOUR, HALF, ONE, QUARTER, TWO, ZERO
@@ -34,7 +34,7 @@ from vg2gt.rendering.cpu.tiles import (
     SIDE,
     STAGED,
     TILE,
-    any_alive,
+    alive_blocks,
     any_positive,
     place_of,
     stage,
@@ -45,16 +45,17 @@ from vg2gt.rendering.cpu.tiles import (
 def _make_blend_tile(geometry: bool, solid: bool) -> Callable[..., Any]:
     """Compiles the blending of a tile with or without depth and normals: within it these are constants."""
 
-    @kernel(fastmath=FAST, error_model="numpy", nogil=True)
+    @kernel_part(fastmath=FAST, error_model="numpy")
     def blend_tile(records, colors, boxes, members, x_tile, y_tile, parameters, state, hits, counts, staged, spans):
         """Blends one tile front to back; leaves the numbers of hits that the blocks had for the depth solver."""
         alpha_max, stop, negligible = parameters[0], parameters[1], parameters[4]
         capacity = len(hits) // (BLOCKS * HIT_SIZE)
-        alive = np.empty(BLOCKS, np.bool_)
+        alive = 0
         for p in range(len(members)):
             j = p % STAGED
             if j == 0:
-                if not any_alive(state, alive):
+                alive = alive_blocks(state)
+                if not alive:
                     break
                 stage(records, colors, boxes, members[p : p + STAGED], x_tile, y_tile, staged, spans)
             g = staged[j]
@@ -66,7 +67,7 @@ def _make_blend_tile(geometry: bool, solid: bool) -> Callable[..., Any]:
                 top = np.float32(y_tile + row * SIDE) - vc
                 for column in range(spans[j, 0], spans[j, 1]):
                     block = row * BLOCKS_ACROSS + column
-                    if not alive[block]:
+                    if not alive >> block & 1:
                         continue
                     left = np.float32(x_tile + column * SIDE) - uc
                     base = np.uintp(block * LANES)
@@ -124,7 +125,7 @@ def _make_blend_tile(geometry: bool, solid: bool) -> Callable[..., Any]:
     return blend_tile
 
 
-@kernel(fastmath=FAST, error_model="numpy", nogil=True)
+@kernel_part(fastmath=FAST, error_model="numpy")
 def _transmit(state, hits, first, count, base):
     """At the depths in plane MEDIAN squared transmittance, NUM / DEN, and its slope ``-d ln T^2 / dt``, into MEAN."""
     for lane in range(LANES):
@@ -146,7 +147,7 @@ def _transmit(state, hits, first, count, base):
             state[k + planes.MEAN] += g * precision * abs(d) / free
 
 
-@kernel(fastmath=FAST, error_model="numpy", nogil=True)
+@kernel_part(fastmath=FAST, error_model="numpy")
 def _bracket(state, hits, first, count, base, median_max, near, newton):
     """Begins the search in a block: LO and HI on both sides of the median, MEDIAN a guess, MOVING where one is sought.
 
@@ -180,7 +181,7 @@ def _bracket(state, hits, first, count, base, median_max, near, newton):
         state[k + planes.MOVING] = moving if state[k + planes.NUM] > QUARTER * state[k + planes.DEN] else ZERO
 
 
-@kernel(fastmath=FAST, error_model="numpy", nogil=True)
+@kernel_part(fastmath=FAST, error_model="numpy")
 def _solve(state, hits, block, count, parameters, steps, newton):
     """Median depth of a block's rays into plane MEDIAN (0: none), its slope S into plane MEAN.
 
@@ -237,34 +238,35 @@ def _make_forward_tiles(geometry: bool, solid: bool) -> Callable[..., None]:
         records, boxes, colors, members, starts, tiles, expected, steps, newton, parameters, background,
         state, hits, counts, staged, spans, color, normal, depth, slope, transmittance,
     ):  # fmt: skip
-        """Renders the tiles ``tiles[0] .. tiles[1] - 1`` of one view into the images."""
+        """Renders the tiles ``tiles[0] .. tiles[1] - 1`` of one view into the images.
+
+        Returns 0, or how many ``hits`` it takes where they were too few: the tiles are then to be rendered again.
+        """
         height, width = depth.shape
         across = -(-width // TILE)
         for tile in range(tiles[0], tiles[1]):
             x_tile, y_tile = (tile % across) * TILE, (tile // across) * TILE
             columns, rows = min(TILE, width - x_tile), min(TILE, height - y_tile)
             mine = members[starts[tile] : starts[tile + 1]]
-            while True:
-                state[:] = ZERO
-                counts[:] = 0
-                start_rays(state, columns, rows)
-                if solid:
-                    state[planes.LO : planes.LO + PLANE] = BIG
-                    state[planes.THIN : planes.THIN + PLANE] = BIG
-                args = (records, colors, boxes, mine, x_tile, y_tile, parameters, state, hits, counts, staged, spans)
-                if solid:
-                    _blend_solid(*args)
-                elif geometry:
-                    _blend_rasterized(*args)
-                else:
-                    _blend_color(*args)
-                most = counts[0]
-                for block in range(1, BLOCKS):
-                    most = max(most, counts[block])
-                if most * HIT_SIZE * BLOCKS <= len(hits):
-                    break
-                hits = np.zeros(BLOCKS * most * HIT_SIZE, hits.dtype)
+            state[:] = ZERO
+            counts[:] = 0
+            start_rays(state, columns, rows)
+            if solid:
+                state[planes.LO : planes.LO + PLANE] = BIG
+                state[planes.THIN : planes.THIN + PLANE] = BIG
+            args = (records, colors, boxes, mine, x_tile, y_tile, parameters, state, hits, counts, staged, spans)
+            if solid:
+                _blend_solid(*args)
+            elif geometry:
+                _blend_rasterized(*args)
+            else:
+                _blend_color(*args)
             if geometry and solid:
+                most = 0
+                for block in range(BLOCKS):
+                    most = max(most, counts[block])
+                if most * HIT_SIZE * BLOCKS > len(hits):
+                    return most * HIT_SIZE * BLOCKS
                 for block in range(BLOCKS):
                     _solve(state, hits, block, counts[block], parameters, steps, newton)
             for y in range(rows):
@@ -285,6 +287,7 @@ def _make_forward_tiles(geometry: bool, solid: bool) -> Callable[..., None]:
                             depth[row, column] = state[k + planes.MEAN] / (ONE - final) if final < ONE else ZERO
                         else:
                             depth[row, column] = state[k + planes.MEDIAN]
+        return 0
 
     return forward_tiles
 

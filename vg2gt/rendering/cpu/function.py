@@ -17,10 +17,10 @@ from torch import Tensor
 from vg2gt.io.threads import parallel_for
 from vg2gt.rendering.cpu import tiles
 from vg2gt.rendering.cpu.backward import backward_color, backward_rasterized, backward_solid
-from vg2gt.rendering.cpu.binning import count_tiles, fill_tiles, radix_order
+from vg2gt.rendering.cpu.binning import DIGITS, count_tiles, fill_tiles, radix_order
 from vg2gt.rendering.cpu.forward import forward_color, forward_rasterized, forward_solid
 from vg2gt.rendering.cpu.projection import BLOCK, project_block
-from vg2gt.rendering.cpu.projection_backward import project_backward_block
+from vg2gt.rendering.cpu.projection_backward import CHUNK, FIELDS, project_backward_block
 from vg2gt.rendering.median import depth_factors
 from vg2gt.rendering.options import MEDIAN_MAX_TRANSMITTANCE, TRANSMITTANCE_STOP, Images, RenderOptions, SceneViews
 
@@ -165,12 +165,13 @@ def _prepare(view: _View, options: RenderOptions) -> _Lists:
     parallel_for(view.blocks, project)
     visible = np.flatnonzero(boxes[:, 1] > boxes[:, 0]).astype(np.int32)
     keys = np.ascontiguousarray(records[visible, 7]).view(f"u{dtype.itemsize}")
-    visible = visible[radix_order(keys, 8 * dtype.itemsize)]
+    order, spare, digits = np.empty_like(visible), np.empty_like(visible), np.empty(DIGITS, np.int64)
+    visible = visible[radix_order(keys, 8 * dtype.itemsize, order, spare, digits)]
     counts, offsets = np.empty(total, np.int32), np.empty(total, np.int64)
     starts = np.empty(view.tiles + 1, np.int64)
     count_tiles(boxes, view.across, counts, offsets, starts)
     members, places = np.empty(starts[-1], np.int32), np.empty(starts[-1], np.int64)
-    fill_tiles(boxes, visible, view.across, offsets, starts, members, places)
+    fill_tiles(boxes, visible, view.across, offsets, starts[:-1].copy(), members, places)
     return _Lists(records, boxes, counts, offsets, starts, members, places)
 
 
@@ -192,6 +193,9 @@ class _Scratch:
     counts: np.ndarray
     staged: np.ndarray
     spans: np.ndarray
+    total: np.ndarray
+    work: np.ndarray
+    indices: np.ndarray
 
 
 def _scratch(dtype: np.dtype) -> _Scratch:
@@ -205,6 +209,9 @@ def _scratch(dtype: np.dtype) -> _Scratch:
             np.zeros(tiles.BLOCKS, np.int64),
             np.zeros((tiles.STAGED, tiles.RECORD + 3), dtype),
             np.zeros((tiles.STAGED, 4), np.int64),
+            np.empty(16, np.float64),
+            np.ones(FIELDS * CHUNK, np.float64),
+            np.empty(CHUNK, np.int64),
         )
     return buffers[dtype]
 
@@ -228,11 +235,15 @@ def _forward(view: _View, lists: _Lists, options: RenderOptions, *outputs: np.nd
 
     def run(tile_range: tuple[int, int]) -> None:
         scratch = _scratch(view.means.dtype)
-        render_tiles(
-            lists.records, lists.boxes, view.colors, lists.members, lists.starts, tile_range,
-            options.depth == "expected", steps, newton, parameters, view.background,
-            scratch.state, scratch.hits, scratch.counts, scratch.staged, scratch.spans, *outputs,
-        )  # fmt: skip
+        hits, missing = scratch.hits, 1
+        while missing:
+            missing = render_tiles(
+                lists.records, lists.boxes, view.colors, lists.members, lists.starts, tile_range,
+                options.depth == "expected", steps, newton, parameters, view.background,
+                scratch.state, hits, scratch.counts, scratch.staged, scratch.spans, *outputs,
+            )  # fmt: skip
+            if missing:
+                hits = _aligned(missing, view.means.dtype)
 
     parallel_for(view.tile_ranges, run)
 
@@ -265,11 +276,14 @@ def _backward(
     parallel_for(view.tile_ranges, rasterize)
     cameras = np.empty((len(view.blocks), 16), np.float64)
     means, quats, scales, opacities, colors = grads[:5]
+    pose = view.pose.astype(np.float64)
 
     def project(block: int) -> None:
+        scratch = _scratch(view.means.dtype)
         project_backward_block(
-            block, view.means, view.quats, view.scales, view.pose, view.intrinsics, height, width,
+            block, view.means, view.quats, view.scales, pose, view.intrinsics, height, width,
             options.lowpass, solid, lists.counts, lists.offsets, rows, index % len(colors),
+            scratch.total, scratch.work, scratch.indices,
             means, quats, scales, opacities, colors, cameras,
         )  # fmt: skip
 

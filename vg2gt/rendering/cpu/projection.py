@@ -11,14 +11,14 @@ import math
 
 import numpy as np
 
-from vg2gt.io.compiled import kernel
+from vg2gt.io.compiled import kernel, kernel_part
 from vg2gt.rendering.cpu.constants import FAST
 from vg2gt.rendering.options import ALPHA_MIN, JACOBIAN_CLAMP
 
 BLOCK = 2048  # Gaussians a work item; fixed, because camera gradients are summed block by block
 
 
-@kernel(error_model="numpy", nogil=True, inline="always")
+@kernel_part(fastmath=FAST, error_model="numpy", forceinline=True)
 def rotation(w, x, y, z):
     """Rotation matrix of a unit quaternion, row by row."""
     return (
@@ -107,7 +107,7 @@ def project_block(
         g[8], g[9], g[10], g[11], g[12], g[13], g[14] = a0, eps, opacity, cutoff, l0 * length, l1 * length, l2 * length
 
 
-@kernel(fastmath=FAST, error_model="numpy", nogil=True, inline="always")
+@kernel_part(fastmath=FAST, error_model="numpy", forceinline=True)
 def whiten(b0, b1, b2, scale, fx, fy, u, v, us, vs, iz):
     """One axis of a Gaussian: its Jacobian row pair, and its component of the ray in units of the axis's length."""
     return scale * fx * (b0 - us * b2) * iz, scale * fy * (b1 - vs * b2) * iz, (b0 * u + b1 * v + b2) / scale

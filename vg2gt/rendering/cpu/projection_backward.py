@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from vg2gt.io.compiled import kernel
+from vg2gt.io.compiled import kernel, kernel_part
 from vg2gt.rendering.cpu.constants import FAST
 from vg2gt.rendering.cpu.projection import BLOCK, rotation, whiten
 from vg2gt.rendering.options import JACOBIAN_CLAMP
@@ -24,7 +24,7 @@ GRAD_MEAN, GRAD_QUAT, GRAD_SCALE, CAMERA = (np.uintp(j * CHUNK) for j in (26, 29
 VECTOR = 8  # the chain's loop is as long as a multiple of this, so that nothing of it remains for a scalar loop
 
 
-@kernel(fastmath=FAST, error_model="numpy", nogil=True, inline="always")
+@kernel_part(fastmath=FAST, error_model="numpy", forceinline=True)
 def _axis_gradient(b0, b1, b2, scale, fx, fy, u, v, us, vs, iz, jx, jy, h, s_xx, s_xy, s_yy, gl0, gl1, gl2, ga0):
     """Gradients through one axis: camera-frame axis (3), scale, the Jacobian's products (2) and slopes (2), u, v."""
     inverse = 1 / scale
@@ -39,10 +39,13 @@ def _axis_gradient(b0, b1, b2, scale, fx, fy, u, v, us, vs, iz, jx, jy, h, s_xx,
     return g0, g1, g2, (gjx + gjy - gw * w) * inverse - gh * h, gjx, gjy, -px * b2, -py * b2, gh * b0, gh * b1
 
 
-@kernel(error_model="numpy", nogil=True)
-def _gather(begin, end, means, quats, scales, counts, offsets, rows, work, indices):
-    """Sums the gradient rows of some Gaussians, in order, and lays those with any side by side; returns how many."""
-    total, found = np.empty(16, np.float64), 0
+@kernel_part(fastmath=FAST, error_model="numpy")
+def _gather(begin, end, means, quats, scales, counts, offsets, rows, total, work, indices):
+    """Sums the gradient rows of some Gaussians, in order, and lays those with any side by side; returns how many.
+
+    ``total`` ``[16]`` is overwritten.
+    """
+    found = 0
     for i in range(begin, end):
         if counts[i] == 0:
             continue
@@ -69,7 +72,7 @@ def _gather(begin, end, means, quats, scales, counts, offsets, rows, work, indic
     return found
 
 
-@kernel(fastmath=FAST, error_model="numpy", nogil=True)
+@kernel_part(fastmath=FAST, error_model="numpy")
 def _chain(work, count, pose, fx, fy, x_limit, y_limit, lowpass, solid):
     """Gradients of means, quaternions, scales and camera, each Gaussian's; ``solid`` is 1 or 0."""
     w00, w01, w02, t0 = pose[0, 0], pose[0, 1], pose[0, 2], pose[0, 3]
@@ -189,7 +192,7 @@ def _chain(work, count, pose, fx, fy, x_limit, y_limit, lowpass, solid):
         work[GRAD_QUAT + 3 * CHUNK + c] = (gqz - qz * radial) * norm
 
 
-@kernel(error_model="numpy", nogil=True)
+@kernel_part(fastmath=FAST, error_model="numpy")
 def _scatter(
     work, indices, count, color_view, grad_means, grad_quats, grad_scales, grad_opacities, grad_colors, camera
 ):
@@ -210,26 +213,27 @@ def _scatter(
 @kernel(fastmath=FAST, error_model="numpy", nogil=True)
 def project_backward_block(
     block, means, quats, scales, pose, intrinsics, height, width, lowpass, solid,
-    counts, offsets, rows, color_view,
+    counts, offsets, rows, color_view, total, work, indices,
     grad_means, grad_quats, grad_scales, grad_opacities, grad_colors, grad_cameras,
 ):  # fmt: skip
     """Sums every Gaussian's gradient rows, in order, and chains them to the 3D parameters (added to) and the camera.
 
-    ``grad_cameras[block]`` receives the gradient of the pose's upper three rows and of fx, fy, cx, cy.
+    ``grad_cameras[block]`` receives the gradient of the pose's upper three rows and of fx, fy, cx, cy. ``pose`` is
+    float64; ``total`` ``[16]``, ``work`` ``[FIELDS CHUNK]`` (float64) and ``indices`` ``[CHUNK]`` are overwritten.
     """
-    fx, fy, world = np.float64(intrinsics[0, 0]), np.float64(intrinsics[1, 1]), pose.astype(np.float64)
+    fx, fy = np.float64(intrinsics[0, 0]), np.float64(intrinsics[1, 1])
     # without bounds, whatever the field of view, the Jacobian of a solid is not clamped
     x_limit = math.inf if solid else JACOBIAN_CLAMP * 0.5 * width / fx
     y_limit = math.inf if solid else JACOBIAN_CLAMP * 0.5 * height / fy
-    work, indices, camera = np.ones(FIELDS * CHUNK, np.float64), np.empty(CHUNK, np.int64), np.zeros(16, np.float64)
+    camera = grad_cameras[block]
+    for j in range(16):
+        camera[j] = 0.0
     end = min((block + 1) * BLOCK, len(means))
     for begin in range(block * BLOCK, end, CHUNK):
         last = min(begin + CHUNK, end)
-        count = _gather(begin, last, means, quats, scales, counts, offsets, rows, work, indices)
-        _chain(work, count, world, fx, fy, x_limit, y_limit, lowpass, 1.0 if solid else 0.0)
+        count = _gather(begin, last, means, quats, scales, counts, offsets, rows, total, work, indices)
+        _chain(work, count, pose, fx, fy, x_limit, y_limit, lowpass, 1.0 if solid else 0.0)
         _scatter(
             work, indices, count, color_view,
             grad_means, grad_quats, grad_scales, grad_opacities, grad_colors, camera,
         )  # fmt: skip
-    for j in range(16):
-        grad_cameras[block, j] = camera[j]

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from numba import njit
-
+from vg2gt.io.compiled import kernel_part
 from vg2gt.io.compiled_math import exp
 from vg2gt.rendering.cpu.constants import FAST, ONE, ZERO
 
 
-@njit(fastmath=FAST, error_model="numpy", inline="always")
+@kernel_part(fastmath=FAST, error_model="numpy", forceinline=True)
 def respond(dx, before, g, s_row, e_row, f_row):
     """A Gaussian's response along a ray (rendering/projection.py): E, 1 + s, r, and whether it counts.
 
@@ -21,7 +20,7 @@ def respond(dx, before, g, s_row, e_row, f_row):
     return e, s, r, (e <= cutoff * r) & (s > ZERO) & (before > ZERO)
 
 
-@njit(fastmath=FAST, error_model="numpy", inline="always")
+@kernel_part(fastmath=FAST, error_model="numpy", forceinline=True)
 def attenuate(exponent, on, before, opacity, alpha_max, stop):
     """Opacity at the pixel, 0 where the hit does not count or stops the ray; transmittance behind; its next state."""
     full = min(opacity * exp(exponent), alpha_max)

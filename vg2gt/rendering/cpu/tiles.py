@@ -8,7 +8,7 @@ from numba import types
 from numba.extending import intrinsic
 from numba.np.arrayobj import make_array
 
-from vg2gt.io.compiled import kernel
+from vg2gt.io.compiled import kernel_part
 from vg2gt.rendering.cpu.constants import FAST, ONE
 
 TILE = 16
@@ -42,29 +42,28 @@ def any_positive(typing_context, values, first):
     return types.boolean(values, first), codegen
 
 
-@kernel(error_model="numpy", nogil=True)
-def any_alive(state, alive):
-    """Notes for every block whether a ray of it still meets Gaussians; returns whether any does."""
-    found = False
+@kernel_part(fastmath=FAST, error_model="numpy")
+def alive_blocks(state):
+    """The blocks of which a ray still meets Gaussians, a bit each."""
+    alive = 0
     for block in range(BLOCKS):
-        alive[block] = any_positive(state, np.uintp(block * LANES))  # pyright: ignore[reportCallIssue]
-        found |= alive[block]
-    return found
+        alive |= np.int64(any_positive(state, np.uintp(block * LANES))) << block  # pyright: ignore[reportCallIssue]
+    return alive
 
 
-@kernel(error_model="numpy", nogil=True)
+@kernel_part(fastmath=FAST, error_model="numpy")
 def _touched(first, last):
     """Blocks that pixels ``first .. last - 1`` of a tile's row or column touch, the part beyond the tile left out."""
     return max(first, 0) // SIDE, (min(last, TILE) + SIDE - 1) // SIDE
 
 
-@kernel(error_model="numpy", nogil=True)
+@kernel_part(fastmath=FAST, error_model="numpy")
 def place_of(y, x):
     """Where the ray of a tile's pixel lies in a plane: blocks one after the other, rows of a block likewise."""
     return np.uintp((y // SIDE * BLOCKS_ACROSS + x // SIDE) * LANES + y % SIDE * SIDE + x % SIDE)
 
 
-@kernel(error_model="numpy", nogil=True)
+@kernel_part(fastmath=FAST, error_model="numpy")
 def stage(records, colors, boxes, members, x_tile, y_tile, staged, spans):
     """Copies the next Gaussians of a tile side by side, so that their cache misses overlap.
 
@@ -81,7 +80,7 @@ def stage(records, colors, boxes, members, x_tile, y_tile, staged, spans):
         spans[j, 2], spans[j, 3] = _touched(boxes[i, 2] - y_tile, boxes[i, 3] - y_tile)
 
 
-@kernel(fastmath=FAST, error_model="numpy", nogil=True)
+@kernel_part(fastmath=FAST, error_model="numpy")
 def start_rays(state, columns, rows):
     """Transmittance 1 in the image's pixels, stopped rays beyond its border."""
     for y in range(TILE):
