@@ -112,7 +112,8 @@ class _PointNormals(torch.autograd.Function):
         counts = [_count_corners(maps[2], stride) for stride in POINT_STRIDES]
         weights = np.array([1 / (max(count, 1) * len(POINT_STRIDES)) for count in counts])
         gradient, totals = np.zeros_like(maps[0]), np.zeros(len(maps[0]))
-        arrays = (*maps, *pinholes, turn, np.array(POINT_STRIDES), weights, gradient, totals)
+        tables = np.zeros((len(totals), LINES * PITCH), gradient.dtype)
+        arrays = (*maps, *pinholes, turn, np.array(POINT_STRIDES), weights, tables, gradient, totals)
         parallel_for(range(len(totals)), lambda view: _disagreement(view, *arrays))
         ctx.gradient = torch.from_numpy(gradient)
         return depth.new_tensor(totals.sum())
@@ -146,16 +147,17 @@ def _count_corners(valid, stride):
 
 
 @kernel(fastmath={"contract", "nsz", "arcp", "reassoc"}, error_model="numpy", nogil=True)
-def _disagreement(view, depth, true, valid, pinholes, true_pinholes, turn, strides, weights, gradient, totals):
+def _disagreement(view, depth, true, valid, pinholes, true_pinholes, turn, strides, weights, tables, gradient, totals):
     """``sum weight (1 - cos)`` of one view's corners at all strides; its derivative is added to ``gradient``.
 
     ``depth``, ``true``, ``valid``, ``gradient`` are ``[V, H, W]``, the pinholes ``[V, 4]`` (fx, fy, cx, cy in pixels),
     ``turn`` is ``[V, 3, 3]``, ``weights`` one a stride, ``totals`` ``[V]``. Rows are worked on in pieces that are first
-    copied into one table, whose lines the compiler knows to be apart: so it makes vector instructions. Invalid
-    pixels, and the columns beside the image, are copied as depth one that does not count.
+    copied into the view's own of the ``tables`` ``[V, LINES PITCH]``, whose lines the compiler knows to be apart: so it
+    makes vector instructions. Invalid pixels, and the columns beside the image, are copied as depth one that does not
+    count.
     """
     height, width = valid.shape[1:]
-    table = np.zeros(LINES * PITCH, depth.dtype)
+    table = tables[view]
     fx, fy, cx, cy = pinholes[view]
     gx, gy, hx, hy = true_pinholes[view]
     for level in range(len(strides)):

@@ -164,12 +164,12 @@ def around_compiled(spread: Tensor, normal: Tensor, offset: Tensor, plan: VoxelP
     inputs = (torch.cat((keys, above)), columns, plan.counts, spread, normal, offset, around)
     arrays = [values.detach().contiguous().numpy() for values in inputs]
     sharpness = np.float32(math.sqrt(0.5) / SAME_SURFACE)
-    over_voxels(len(keys), lambda first, last: _spread_around(*arrays, sharpness, first, last))
+    over_voxels(len(keys), lambda first, last: _spread_around(*arrays, np.empty(9, np.uintp), sharpness, first, last))
     return around
 
 
 @kernel(fastmath={"contract", "nsz", "arcp"}, error_model="numpy", nogil=True)
-def _spread_around(keys, columns, counts, spread, normal, offset, around, sharpness, first, last):
+def _spread_around(keys, columns, counts, spread, normal, offset, around, starts, sharpness, first, last):
     """Cells of a column have keys in a row, and with the voxels' keys those of their columns ascend.
 
     Args:
@@ -180,12 +180,12 @@ def _spread_around(keys, columns, counts, spread, normal, offset, around, sharpn
         normal: ``[M, 3]``.
         offset: ``[M, 3]``.
         around: ``[M, 3, 3]``, the result.
+        starts: ``[9]``, overwritten.
         sharpness: one over the cells off the tangent plane at which points count 1 / e.
         first: voxel to begin with.
         last: voxel to end before.
     """
     one = np.float32(1)
-    starts = np.empty(9, np.uintp)
     for column in range(9):
         lowest, low, high = keys[first] + columns[column], 0, len(keys)
         while low < high:

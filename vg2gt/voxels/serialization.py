@@ -54,14 +54,13 @@ def hilbert_codes(grid: Tensor, bits: int) -> Tensor:
     if grid.device.type != "cpu":
         return hilbert_reference(grid, bits)
     codes = grid.new_empty(len(grid))
-    _hilbert(grid.numpy(), bits, codes.numpy())
+    _hilbert(grid.numpy(), bits, np.empty(3, np.int64), codes.numpy())
     return codes
 
 
 @kernel(nogil=True)
-def _hilbert(grid: NDArray[np.int64], bits: int, codes: NDArray[np.int64]) -> None:
-    """:func:`hilbert_reference`, one cell after the other."""
-    axes = np.empty(3, np.int64)
+def _hilbert(grid: NDArray[np.int64], bits: int, axes: NDArray[np.int64], codes: NDArray[np.int64]) -> None:
+    """:func:`hilbert_reference`, one cell after the other; ``axes`` ``[3]`` is overwritten."""
     for m in range(len(grid)):
         axes[0], axes[1], axes[2] = grid[m, 0], grid[m, 1], grid[m, 2]
         for level in range(bits - 1, 0, -1):
