@@ -240,7 +240,8 @@ def _make_forward_tiles(geometry: bool, solid: bool) -> Callable[..., None]:
     ):  # fmt: skip
         """Renders the tiles ``tiles[0] .. tiles[1] - 1`` of one view into the images.
 
-        Returns 0, or how many ``hits`` it takes where they were too few: the tiles are then to be rendered again.
+        Returns ``tiles[1]``, or the first tile that there were too few ``hits`` for; ``counts`` holds how many its
+        blocks have.
         """
         height, width = depth.shape
         across = -(-width // TILE)
@@ -265,8 +266,8 @@ def _make_forward_tiles(geometry: bool, solid: bool) -> Callable[..., None]:
                 most = 0
                 for block in range(BLOCKS):
                     most = max(most, counts[block])
-                if most * HIT_SIZE * BLOCKS > len(hits):
-                    return most * HIT_SIZE * BLOCKS
+                if (most + 1) * HIT_SIZE * BLOCKS > len(hits):  # what does not matter takes the place behind the last
+                    return tile
                 for block in range(BLOCKS):
                     _solve(state, hits, block, counts[block], parameters, steps, newton)
             for y in range(rows):
@@ -287,7 +288,7 @@ def _make_forward_tiles(geometry: bool, solid: bool) -> Callable[..., None]:
                             depth[row, column] = state[k + planes.MEAN] / (ONE - final) if final < ONE else ZERO
                         else:
                             depth[row, column] = state[k + planes.MEDIAN]
-        return 0
+        return tiles[1]
 
     return forward_tiles
 

@@ -235,15 +235,15 @@ def _forward(view: _View, lists: _Lists, options: RenderOptions, *outputs: np.nd
 
     def run(tile_range: tuple[int, int]) -> None:
         scratch = _scratch(view.means.dtype)
-        hits, missing = scratch.hits, 1
-        while missing:
-            missing = render_tiles(
-                lists.records, lists.boxes, view.colors, lists.members, lists.starts, tile_range,
+        hits, (first, last) = scratch.hits, tile_range
+        while first < last:
+            first = render_tiles(
+                lists.records, lists.boxes, view.colors, lists.members, lists.starts, (first, last),
                 options.depth == "expected", steps, newton, parameters, view.background,
                 scratch.state, hits, scratch.counts, scratch.staged, scratch.spans, *outputs,
             )  # fmt: skip
-            if missing:
-                hits = _aligned(missing, view.means.dtype)
+            if first < last:
+                hits = _aligned(tiles.BLOCKS * (int(scratch.counts.max()) + 1) * tiles.HIT_SIZE, view.means.dtype)
 
     parallel_for(view.tile_ranges, run)
 
