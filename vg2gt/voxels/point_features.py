@@ -86,7 +86,9 @@ class _PooledFeatures(torch.autograd.Function):
         along_mean = (grad * mean).sum(-1)
         gradients = [torch.empty_like(dense), torch.empty_like(offset), torch.empty_like(confidence)]
         if len(plan.order) < len(dense):
-            _forget_left_out(plan.voxel_of.numpy(), *(gradient.numpy() for gradient in gradients))
+            left_out = (plan.voxel_of < 0).nonzero().squeeze(1)
+            for gradient in gradients:
+                gradient.index_fill_(0, left_out, 0)
         of_weight = dense.new_zeros(PARTS, *weight.shape)
         inputs = (dense, offset, weight, confidence, plan.order, plan.starts, plan.starts + plan.counts, total)
         arrays = [tensor.numpy() for tensor in (*inputs, grad, along_mean, *gradients, of_weight)]
@@ -119,16 +121,6 @@ def _pool(dense, offset, weight, confidence, order, starts, ends, mean, total, f
         share = np.float32(1) / sum_of_weights
         for c in range(channels):
             mean[voxel, c] *= share
-
-
-@kernel(nogil=True)
-def _forget_left_out(voxel_of, of_dense, of_offset, of_confidence):
-    """Points in no voxel have no gradient."""
-    for point in range(len(voxel_of)):
-        if voxel_of[point] < 0:
-            of_dense[point] = 0
-            of_offset[point] = 0
-            of_confidence[point] = 0
 
 
 @kernel(fastmath={"contract", "nsz", "arcp", "reassoc"}, error_model="numpy", nogil=True)

@@ -1,42 +1,24 @@
-"""Compiled binning: depth order and the tiles' lists of Gaussians for one view."""
+"""Binning: depth order and, compiled, the tiles' lists of Gaussians for one view."""
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vg2gt.io.compiled import kernel
 
-DIGIT_BITS = 11
-DIGITS = 1 << DIGIT_BITS
 TILE_BITS = 4  # tiles are 16 pixels wide and high
 
 
-@kernel(error_model="numpy", nogil=True)
-def radix_order(keys, bits, order, spare, counts):
-    """Stable ascending order ``[N]`` of unsigned integers with the given number of bits.
-
-    ``order`` and ``spare`` ``[N]`` are overwritten and one of them is returned; so is ``counts`` ``[DIGITS]``.
-    """
-    for i in range(len(keys)):
-        order[i] = i
-    mask = np.uint64(DIGITS - 1)
-    for shift in range(0, bits, DIGIT_BITS):
-        for digit in range(len(counts)):
-            counts[digit] = 0
-        for i in range(len(keys)):
-            counts[(np.uint64(keys[i]) >> np.uint64(shift)) & mask] += 1
-        total = 0
-        for digit in range(len(counts)):
-            count = counts[digit]
-            counts[digit] = total
-            total += count
-        for position in range(len(keys)):
-            i = order[position]
-            digit = (np.uint64(keys[i]) >> np.uint64(shift)) & mask
-            spare[counts[digit]] = i
-            counts[digit] += 1
-        order, spare = spare, order
-    return order
+def depth_order(depths: NDArray) -> NDArray:
+    """Order ``[N]`` of positive depths, front to back, equal ones as they came."""
+    if depths.dtype != np.float32:
+        return np.argsort(depths, kind="stable")
+    # Bits of positive numbers ascend as they do; with the place below them all keys differ, and any sort is stable.
+    keys = depths.view(np.uint32).astype(np.uint64) << np.uint64(32)
+    keys |= np.arange(len(keys), dtype=np.uint64)
+    keys.sort()
+    return keys.astype(np.uint32)
 
 
 @kernel(error_model="numpy", nogil=True)

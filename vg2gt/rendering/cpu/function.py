@@ -17,7 +17,7 @@ from torch import Tensor
 from vg2gt.io.threads import parallel_for
 from vg2gt.rendering.cpu import tiles
 from vg2gt.rendering.cpu.backward import backward_color, backward_rasterized, backward_solid
-from vg2gt.rendering.cpu.binning import DIGITS, count_tiles, fill_tiles, radix_order
+from vg2gt.rendering.cpu.binning import count_tiles, depth_order, fill_tiles
 from vg2gt.rendering.cpu.forward import forward_color, forward_rasterized, forward_solid
 from vg2gt.rendering.cpu.projection import BLOCK, project_block
 from vg2gt.rendering.cpu.projection_backward import CHUNK, FIELDS, project_backward_block
@@ -164,9 +164,7 @@ def _prepare(view: _View, options: RenderOptions) -> _Lists:
 
     parallel_for(view.blocks, project)
     visible = np.flatnonzero(boxes[:, 1] > boxes[:, 0]).astype(np.int32)
-    keys = np.ascontiguousarray(records[visible, 7]).view(f"u{dtype.itemsize}")
-    order, spare, digits = np.empty_like(visible), np.empty_like(visible), np.empty(DIGITS, np.int64)
-    visible = visible[radix_order(keys, 8 * dtype.itemsize, order, spare, digits)]
+    visible = visible[depth_order(records[visible, 7])]
     counts, offsets = np.empty(total, np.int32), np.empty(total, np.int64)
     starts = np.empty(view.tiles + 1, np.int64)
     count_tiles(boxes, view.across, counts, offsets, starts)
