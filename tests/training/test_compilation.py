@@ -1,6 +1,7 @@
 """Kernels are compiled before a training, in processes of their own, once."""
 
 import os
+import resource
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -97,3 +98,34 @@ def test_the_parent_works_on_one_thread_until_the_other_process_ends(monkeypatch
     compilation.compile_kernels(Renderer(), lambda: lambda: torch.zeros(()), meanwhile=pieces())
     assert threads == [1, 1, 1]
     assert torch.get_num_threads() == before
+
+
+def most_page_faults() -> int:
+    """The largest number of page faults of a hundred calls, from anywhere on the stack."""
+
+    def leaf() -> None:
+        pass
+
+    leaf.__code__ = leaf.__code__.replace(co_stacksize=100)  # so that it does not fit where little is left
+
+    def down(levels: int) -> int:
+        if levels:
+            return down(levels - 1)
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+        for _ in range(100):
+            leaf()
+        return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+    return max(down(levels) for levels in range(300))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="page faults are counted as on Linux")
+def test_calls_of_what_compiles_take_no_memory_from_the_system() -> None:
+    from vg2gt.training import compilation
+
+    found: list[int] = []
+    compilation._in_one_chunk(lambda *given: found.extend((*given, most_page_faults())), (1, 2))
+    assert found[:2] == [1, 2]
+    if most_page_faults() < 90:
+        pytest.skip("this Python keeps the memory of frames")
+    assert found[2] < 20

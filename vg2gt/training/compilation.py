@@ -6,6 +6,7 @@ while the command still imports Lightning, which takes seconds on one core; the 
 
 from __future__ import annotations
 
+import gc
 import logging
 import multiprocessing
 import os
@@ -17,6 +18,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing import connection
 from multiprocessing.process import BaseProcess
+from types import FunctionType
 
 import numba
 import torch
@@ -31,6 +33,7 @@ from vg2gt.rendering.selfcheck import as_scene, fixed_scene
 
 log = logging.getLogger(__name__)
 
+LARGE_FRAME = (1 << 16) + 64  # values of 8 bytes; a little more than a power of two leaves the other half of a chunk
 PATIENCE = 300  # seconds; a step of a large backbone on a slow machine takes longer than compiling
 BEGINS = "compiling kernels, once on this machine and version (about 10 s)"
 SYNTHETIC = "vg2gt.data.SyntheticScenes"  # the only source of scenes with kernels of its own
@@ -141,14 +144,31 @@ def _forked(work: Callable[..., None], *arguments: object) -> BaseProcess:
 
 
 def _quietly(work: Callable[..., None], *arguments: object) -> None:
-    """Works without a word and on one thread: those of OpenMP do not survive a fork."""
+    """Works without a word and on one thread: those of OpenMP do not survive a fork.
+
+    No garbage is collected in a process that ends so soon; every page that the collector touched would be copied.
+    """
+    gc.disable()
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 1)
     os.dup2(nowhere, 2)
     logging.disable()
     warnings.simplefilter("ignore")
     torch.set_num_threads(1)
+    _in_one_chunk(work, arguments)
+
+
+def _call(work: Callable[..., None], arguments: Sequence[object]) -> None:
     work(*arguments)
+
+
+_in_one_chunk = FunctionType(_call.__code__.replace(co_stacksize=LARGE_FRAME), globals())
+"""Calls a function with room for all its calls' frames in one piece of memory.
+
+CPython (since 3.11) takes memory for frames in chunks of 16 kB from the operating system, and gives one back when calls
+leave it: a compiler that goes to and fro across the end of a chunk spent a third of its time in the kernel. A function
+with a large frame is given a chunk of up to twice its size, and the frames of what it calls lie in the rest.
+"""
 
 
 def _make_rooms(variant: str | Sequence[str]) -> None:

@@ -43,6 +43,8 @@ class SyntheticScene:
         def render(frame: int) -> RenderedFrame:
             return render_frame(self.world, self.world_to_camera[frame], self.intrinsics, self.size, samples)
 
+        if threads == 1:
+            return [render(frame) for frame in frames]
         with ThreadPoolExecutor(threads) as pool:
             return list(pool.map(render, frames))
 

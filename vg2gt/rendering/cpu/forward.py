@@ -230,7 +230,7 @@ _blend_rasterized = _make_blend_tile(True, False)
 _blend_solid = _make_blend_tile(True, True)
 
 
-def _make_forward_tiles(geometry: bool, solid: bool) -> Callable[..., None]:
+def _make_forward_tiles(geometry: bool, solid: bool) -> Callable[..., int]:
     """Compiles the rendering of tiles, for colour alone, or with normals and the one or the other depth."""
 
     @kernel(fastmath=FAST, error_model="numpy", nogil=True)
