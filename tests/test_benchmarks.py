@@ -61,6 +61,15 @@ def test_a_step_of_two_checkouts(tmp_path: Path) -> None:
     assert content["before"]["step_core_seconds"] > 0
 
 
+@pytest.mark.slow
+def test_compilation_of_two_checkouts(tmp_path: Path) -> None:
+    shown = run("compilation.py", tmp_path, "--before", str(BENCHMARKS.parent), "--passes", "1", "--out", str(tmp_path))
+    assert "processes of their own" in shown
+    (path,) = tmp_path.glob("*-compilation-before-after.json")
+    (taken,) = json.loads(path.read_text())["core_seconds"].values()
+    assert min(taken["one process"] + taken["processes of their own"]) > 1
+
+
 def test_training_hours_count_every_device(benchmark_script) -> None:
     """The paper: 49.5 hours of two devices, 420000 steps, are 99 device hours."""
     assert benchmark_script("stages").paper_training_hours(49.5 * 3600 / 420_000) == pytest.approx(99)

@@ -44,7 +44,7 @@ def test_the_first_training_of_a_machine_compiles_nothing_itself(tmp_path: Path)
     assert done.returncode == 0, done.stderr[-3000:]
     assert "compiling kernels, once" in done.stdout + done.stderr
     assert [line for line in done.stdout.splitlines() if line.startswith("COMPILES")] == []
-    assert len(list(kernels.rglob("*.nbc"))) > 15
+    assert len(list(kernels.rglob("*.nbc"))) > 12
     assert len(list(kernels.glob("vg2gt/compiled-*"))) == 1
 
 

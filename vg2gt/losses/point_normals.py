@@ -109,7 +109,7 @@ class _PointNormals(torch.autograd.Function):
         maps = [values.detach().contiguous().numpy() for values in (depth, truth.depth[0].to(depth), valid)]
         pinholes = [_pinholes(c.intrinsics[0].to(depth)) for c in (cameras, truth.cameras)]
         turn = _turn(cameras, truth).detach().to(depth).contiguous().numpy()
-        counts = [_count_corners(maps[2], stride) for stride in POINT_STRIDES]
+        counts = [_count_corners(valid, stride) for stride in POINT_STRIDES]
         weights = np.array([1 / (max(count, 1) * len(POINT_STRIDES)) for count in counts])
         gradient, totals = np.zeros_like(maps[0]), np.zeros(len(maps[0]))
         tables = np.zeros((len(totals), LINES * PITCH), gradient.dtype)
@@ -130,20 +130,15 @@ def _pinholes(intrinsics: Tensor) -> np.ndarray:
     return torch.stack(columns, -1).detach().numpy()
 
 
-@kernel(nogil=True)
-def _count_corners(valid, stride):
-    """Corners of ``valid`` ``[V, H, W]`` at a stride whose pixel and both neighbours are valid."""
-    views, height, width = valid.shape
-    count = 0
-    for view in range(views):
-        for i in range(0, height, stride):
-            for j in range(0, width, stride):
-                across = int(j + stride < width and valid[view, i, j + stride])
-                across += int(j >= stride and valid[view, i, j - stride])
-                down = int(i + stride < height and valid[view, i + stride, j])
-                down += int(i >= stride and valid[view, i - stride, j])
-                count += valid[view, i, j] * across * down
-    return count
+def _count_corners(valid: Tensor, stride: int) -> int:
+    """Corners of ``valid`` ``[V, H, W]`` at a stride whose pixel and both neighbours are valid.
+
+    Every square of four neighbours has four corners; one of them is left where one pixel is not valid, none otherwise.
+    """
+    pixels = valid[:, ::stride, ::stride].to(torch.uint8)
+    pairs = pixels[:, 1:] + pixels[:, :-1]
+    squares = pairs[..., 1:] + pairs[..., :-1]
+    return 4 * int((squares == 4).sum()) + int((squares == 3).sum())
 
 
 @kernel(fastmath={"contract", "nsz", "arcp", "reassoc"}, error_model="numpy", nogil=True)
