@@ -6,7 +6,9 @@ import hashlib
 import io
 import logging
 import os
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -17,11 +19,13 @@ from vg2gt.types import Cameras, Geometry, Hints, TensorRecord, Tokens
 
 log = logging.getLogger(__name__)
 
+Found = TypeVar("Found")
+
 _RECORDS = [Tokens, Geometry, Cameras]  # all that a file may hold beside tensors and plain values
 
 
 class TokenCache:
-    """Keeps tokens and initially decoded geometry per set of views, exactly.
+    """Keeps tokens and initially decoded geometry per set of views, exactly; of held-out views' sets the cameras alone.
 
     The key is a hash of the images and hints themselves, the backend's identity (its weights) and options, and torch's
     version, so whatever changes is computed anew. It pays where view sets come again (``data.view_sets``,
@@ -44,15 +48,27 @@ class TokenCache:
     @torch.no_grad()
     def read(self, backend: Backend, images: Tensor, hints: Hints | None) -> tuple[Tokens, Geometry]:
         """Tokens of ``images`` and what they decode to, from the folder or from the backend."""
-        path = self.folder / f"{cache_key(backend, images, hints)}.pt"
-        found = self._load(path, images.device)
-        if found is None:
+
+        def make() -> tuple[Tokens, Geometry]:
             tokens = backend.encode(images, hints)
-            found = tokens, backend.decode(tokens)
+            return tokens, backend.decode(tokens)
+
+        return self._kept(cache_key(backend, images, hints), images.device, make)
+
+    def cameras(self, backend: Backend, images: Tensor, hints: Hints | None) -> Cameras:
+        """The raw cameras of ``images`` alone, from the folder or from the backend."""
+        key = f"{cache_key(backend, images, hints)}-cameras"
+        return self._kept(key, images.device, lambda: backend.predict_cameras(images, hints))
+
+    def _kept(self, key: str, device: torch.device, make: Callable[[], Found]) -> Found:
+        path = self.folder / f"{key}.pt"
+        found = self._load(path, device)
+        if found is None:
+            found = make()
             self._store(path, found)
         return found
 
-    def _load(self, path: Path, device: torch.device) -> tuple[Tokens, Geometry] | None:
+    def _load(self, path: Path, device: torch.device) -> Any:
         try:
             with torch.serialization.safe_globals(_RECORDS):
                 found = torch.load(path, map_location=device, weights_only=True)
@@ -64,7 +80,7 @@ class TokenCache:
             return None
         return found
 
-    def _store(self, path: Path, found: tuple[Tokens, Geometry]) -> None:
+    def _store(self, path: Path, found: object) -> None:
         buffer = io.BytesIO()
         torch.save(found, buffer)
         write_cached(path, buffer.getvalue(), self.folder)
@@ -79,10 +95,11 @@ class TokenCache:
 
 def cache_key(backend: Backend, images: Tensor, hints: Hints | None) -> str:
     """Hash of everything that decides what the backend makes of these views."""
+    identity = backend.identity()  # first: the backend keeps it
     plain = (bool, int, float, str, tuple, type(None))
     options = {name: value for name, value in sorted(vars(backend).items()) if isinstance(value, plain)}
     options.pop("training", None)
-    digest = hashlib.sha256(repr((backend.identity(), options, torch.__version__)).encode())
+    digest = hashlib.sha256(repr((identity, options, torch.__version__)).encode())
 
     def add(tensor: Tensor) -> Tensor:
         digest.update(f"{tuple(tensor.shape)} {tensor.dtype}".encode())

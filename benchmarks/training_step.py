@@ -26,6 +26,7 @@ STAGES = {
     "second decode": "decode_again",
     "fine voxels": "fine",
     "Gaussian head": "gaussians",
+    "cameras of held-out views": "cameras",
     "render": "render",
     "loss": "loss",
 }

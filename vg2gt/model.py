@@ -27,7 +27,7 @@ from vg2gt.geometry.alignment import fit_depth_scale
 from vg2gt.geometry.cameras import relative_to_first, scale_translations
 from vg2gt.memory import note_sizes
 from vg2gt.profiling import stage
-from vg2gt.types import Decoded, Gaussians, Geometry, Hints, Prediction, Tokens, Voxels
+from vg2gt.types import Cameras, Decoded, Gaussians, Geometry, Hints, Prediction, Tokens, Voxels
 
 Background = Literal["mean", "black"]
 ScaleSource = Literal["metric", "focal", "normalize", "groundtruth"]
@@ -123,16 +123,36 @@ class Reconstructor(nn.Module, ABC):
         """
         scenes, views, _, height, width = images.shape
         note_sizes({f"images of {height}x{width} in {scenes} scene{'s' * (scenes > 1)}": scenes * views}, anew=True)
-        if self.token_cache is not None:
-            with stage("encode"):
-                tokens, raw = self.token_cache.read(self.backend, images, hints)
-        else:
-            with stage("encode"):
-                tokens = self.backend.encode(images, hints)
-            with stage("decode"), torch.no_grad():
-                raw = self.backend.decode(tokens)
+        tokens, raw = self.run_backbone(images, hints)
         unit = self.scale(raw, hints)
         return tokens, _to_scene_frame(raw, unit), unit
+
+    def run_backbone(self, images: Tensor, hints: Hints | None) -> tuple[Tokens, Geometry]:
+        """The backbone's tokens and the geometry that its heads decode of them, kept from before where there is a cache.
+
+        Args:
+            images: ``[B, V, 3, H, W]`` in [0, 1].
+            hints: what the data knows of these views.
+        """
+        if self.token_cache is not None:
+            with stage("encode"):
+                return self.token_cache.read(self.backend, images, hints)
+        with stage("encode"):
+            tokens = self.backend.encode(images, hints)
+        with stage("decode"), torch.no_grad():
+            return tokens, self.backend.decode(tokens)
+
+    def predict_cameras(self, images: Tensor, hints: Hints | None) -> Cameras:
+        """The backbone's raw cameras of views of which nothing else is needed, likewise.
+
+        Args:
+            images: ``[B, V, 3, H, W]`` in [0, 1].
+            hints: what the data knows of these views.
+        """
+        with stage("cameras"):
+            if self.token_cache is not None:
+                return self.token_cache.cameras(self.backend, images, hints)
+            return self.backend.predict_cameras(images, hints)
 
     def with_background(self, gaussians: Gaussians, images: Tensor, depth: Tensor) -> Gaussians:
         """Sets what rays see that meet none of the Gaussians.

@@ -25,12 +25,27 @@ def scene(make_scene):
 def test_a_second_look_is_bit_equal_and_costs_nothing(tmp_path: Path, scene) -> None:
     backend = Counting()
     first = TokenCache(tmp_path).read(backend, *scene)
-    tokens, geometry = TokenCache(tmp_path).read(backend, *scene)  # as another process would
+    tokens, geometry = TokenCache(tmp_path).read(backend, *scene)
+    TokenCache(tmp_path).read(Counting(), *scene)  # as another process would
     assert backend.runs == [1]
+    assert len(list(tmp_path.iterdir())) == 1
     assert all(torch.equal(a, b) for a, b in zip(tokens.patch, first[0].patch, strict=True))
     assert torch.equal(geometry.depth, first[1].depth)
     assert torch.equal(backend.decode(tokens).depth, geometry.depth)
     assert torch.equal(geometry.cameras.world_to_camera, backend.decode(first[0]).cameras.world_to_camera)
+
+
+def test_cameras_alone_are_kept_alone(tmp_path: Path, make_scene, make_backend) -> None:
+    backend, views = make_backend("da3_tiny"), make_scene(1, 3, (28, 42))
+    first = TokenCache(tmp_path).cameras(backend, *views)
+    (file,) = tmp_path.iterdir()
+    assert file.stat().st_size < 10_000
+    backend.encode = lambda *views: pytest.fail("run again")
+    again = TokenCache(tmp_path).cameras(backend, *views)
+    expected = make_backend("da3_tiny").predict_cameras(*views)
+    for found in (first, again):
+        assert torch.equal(found.world_to_camera, expected.world_to_camera)
+        assert torch.equal(found.intrinsics, expected.intrinsics)
 
 
 def test_whatever_decides_the_result_decides_the_key(tmp_path: Path, scene, make_scene) -> None:

@@ -33,12 +33,12 @@ def joint_target_cameras(model: Reconstructor, batch: Batch, prediction: Predict
     if not model.backend.predicts_cameras:  # they are the data's: no pass is needed to know them
         cameras = scale_translations(relative_to_first(batch.cameras), prediction.unit)
         return cameras.select(slice(batch.num_context, None))
-    cameras = model.backend.predict_cameras(batch.images, batch.hints)
+    cameras = model.predict_cameras(batch.images, batch.hints)
     joint = scale_translations(relative_to_first(cameras), prediction.unit)
     context = slice(0, batch.num_context)
 
     def scale_of_depth() -> Tensor:
-        depth = model.backend.decode(model.backend.encode(batch.images, batch.hints)).depth[:, context]
+        depth = model.run_backbone(batch.images, batch.hints)[1].depth[:, context]
         first = prediction.initial.depth
         return fit_depth_scale(depth * prediction.unit[:, None, None, None], first, first > 0).nan_to_num(1.0)
 
