@@ -70,6 +70,19 @@ def test_compilation_of_two_checkouts(tmp_path: Path) -> None:
     assert min(taken["one process"] + taken["processes of their own"]) > 1
 
 
+@pytest.mark.slow
+def test_waits_of_two_checkouts(tmp_path: Path) -> None:
+    options = ("--passes", "1", "--gaussians", "500", "--out", str(tmp_path))
+    shown = run("waits.py", tmp_path, "--before", str(BENCHMARKS.parent), *options)
+    assert "vg2gt reconstruct --help" in shown
+    assert "losses bit-equal" in shown
+    (path,) = tmp_path.glob("*-waits-before-after.json")
+    found = json.loads(path.read_text())
+    assert all(value > 0 for both in found["core_seconds"].values() for side in both for value in side)
+    first, again = found["token_cache"].values()
+    assert 0 < again < first
+
+
 def test_training_hours_count_every_device(benchmark_script) -> None:
     """The paper: 49.5 hours of two devices, 420000 steps, are 99 device hours."""
     assert benchmark_script("stages").paper_training_hours(49.5 * 3600 / 420_000) == pytest.approx(99)

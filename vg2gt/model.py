@@ -128,7 +128,7 @@ class Reconstructor(nn.Module, ABC):
         return tokens, _to_scene_frame(raw, unit), unit
 
     def run_backbone(self, images: Tensor, hints: Hints | None) -> tuple[Tokens, Geometry]:
-        """The backbone's tokens and the geometry that its heads decode of them, kept from before where there is a cache.
+        """The backbone's tokens and the geometry that its heads decode of them; from the cache where there is one.
 
         Args:
             images: ``[B, V, 3, H, W]`` in [0, 1].
