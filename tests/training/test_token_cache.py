@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from tests.training_helpers import small_config
 
+from tests.training_helpers import small_config
 from vg2gt.training.loop import Run, build
 from vg2gt.types import Batch
 
