@@ -239,7 +239,12 @@ def _first_step(run: Run) -> Callable[[], torch.Tensor]:
     batch = next(iter(run.datamodule.train_dataloader())).single(0)
     few = batch.views(slice(max(batch.num_context - 2, 0), batch.num_context + 1))
     batch = replace(few, num_context=min(batch.num_context, 2))
-    return lambda: run.module.training_step(batch, 0)
+
+    def step() -> torch.Tensor:
+        run.module.model.token_cache = None  # these views do not come again; the step is another process's
+        return run.module.training_step(batch, 0)
+
+    return step
 
 
 def _save_last(run: Run) -> None:
