@@ -6,7 +6,10 @@ import hashlib
 import io
 import logging
 import os
+import sys
 from collections.abc import Callable
+from contextlib import suppress
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -27,9 +30,10 @@ _RECORDS = [Tokens, Geometry, Cameras]  # all that a file may hold beside tensor
 class TokenCache:
     """Keeps tokens and initially decoded geometry per set of views, exactly; of held-out views' sets the cameras alone.
 
-    The key is a hash of the images and hints themselves, the backend's identity (its weights) and options, and torch's
-    version, so whatever changes is computed anew. It pays where view sets come again (``data.view_sets``,
-    evaluation before and after training) and the backbone costs more than reading a file.
+    The key is a hash of the images and hints themselves, the backend's identity (its weights), options and source, the
+    kind of device and torch's version, so whatever changes is computed anew. It pays where view sets come again
+    (``data.view_sets``, evaluation before and after training) and the backbone costs more than reading a file.
+    Several processes may share the folder.
 
     Args:
         folder: of the files, made when needed (``~`` is the home folder).
@@ -72,34 +76,42 @@ class TokenCache:
         try:
             with torch.serialization.safe_globals(_RECORDS):
                 found = torch.load(path, map_location=device, weights_only=True)
-            os.utime(path)
         except FileNotFoundError:
             return None
         except Exception as error:  # damaged files fail in many ways; all of them are mended by writing it again
             log.warning("%s cannot be read (%s): made again", path, error)
             return None
+        with suppress(OSError):  # a folder that may only be read
+            os.utime(path)
         return found
 
     def _store(self, path: Path, found: object) -> None:
         buffer = io.BytesIO()
         torch.save(found, buffer)
         write_cached(path, buffer.getvalue(), self.folder)
-        files = sorted(self.folder.glob("*.pt"), key=lambda file: file.stat().st_mtime)
-        excess = sum(file.stat().st_size for file in files) - self.max_bytes
-        for file in files[:-1]:
+        self._remove_oldest()
+
+    def _remove_oldest(self) -> None:
+        kept = []
+        for file in self.folder.glob("*.pt"):
+            with suppress(OSError):  # another process has removed it
+                found = file.stat()
+                kept.append((found.st_mtime, found.st_size, file))
+        kept.sort()
+        excess = sum(size for _, size, _ in kept) - self.max_bytes
+        for _, size, file in kept[:-1]:
             if excess <= 0:
                 break
-            excess -= file.stat().st_size
-            file.unlink(missing_ok=True)
+            with suppress(OSError):
+                file.unlink(missing_ok=True)
+            excess -= size
 
 
 def cache_key(backend: Backend, images: Tensor, hints: Hints | None) -> str:
     """Hash of everything that decides what the backend makes of these views."""
-    identity = backend.identity()  # first: the backend keeps it
-    plain = (bool, int, float, str, tuple, type(None))
-    options = {name: value for name, value in sorted(vars(backend).items()) if isinstance(value, plain)}
-    options.pop("training", None)
-    digest = hashlib.sha256(repr((identity, options, torch.__version__)).encode())
+    source = _source(frozenset(base.__module__ for base in type(backend).__mro__))
+    made_by = (backend.identity(), _options(backend), source, images.device.type, torch.__version__)
+    digest = hashlib.sha256(repr(made_by).encode())
 
     def add(tensor: Tensor) -> Tensor:
         digest.update(f"{tuple(tensor.shape)} {tensor.dtype}".encode())
@@ -111,3 +123,26 @@ def cache_key(backend: Backend, images: Tensor, hints: Hints | None) -> str:
         digest.update(repr(hints.scene_key).encode())
         hints.map(add)
     return digest.hexdigest()[:40]
+
+
+def _options(backend: Backend) -> list[tuple[str, str, object]]:
+    """Plain attributes of the backend and of all modules in it, such as those of a backend within another."""
+    plain = (bool, int, float, str, tuple, type(None))
+    return [
+        (path, name, value)
+        for path, module in backend.named_modules()
+        for name, value in sorted(vars(module).items())
+        if name != "training" and not name.startswith("_") and isinstance(value, plain)
+    ]
+
+
+@lru_cache
+def _source(modules: frozenset[str]) -> str:
+    """Hash of this package's source, and of the modules that a backend's classes come from: somebody's own too."""
+    named = {getattr(sys.modules.get(module), "__file__", None) for module in modules}
+    files = {*Path(__file__).parent.rglob("*.py"), *(Path(path) for path in named if path)}
+    digest = hashlib.sha256()
+    for path in sorted(files):
+        with suppress(OSError):  # classes made in a notebook have none
+            digest.update(path.read_bytes())
+    return digest.hexdigest()

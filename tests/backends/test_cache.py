@@ -1,11 +1,15 @@
 """Tokens that are kept on disk are those that the backbone would make again."""
 
+import os
+import sys
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 import torch
 
-from backends.cache import TokenCache
+from backends import cache
+from backends.cache import TokenCache, cache_key
 from backends.oracle import OracleBackend
 
 
@@ -62,6 +66,38 @@ def test_whatever_decides_the_result_decides_the_key(tmp_path: Path, scene, make
     assert other.runs == [1]
 
 
+def test_options_of_a_backend_within_another_decide_the_key(make_backend, scene) -> None:
+    """A nested model's relative network chooses the view that defines the world frame."""
+    outer = make_backend("da3_tiny")
+    outer.relative = make_backend("da3_tiny")
+    before = cache_key(outer, *scene)
+    outer.relative.reference_view = "middle"
+    assert cache_key(outer, *scene) != before
+
+
+@pytest.mark.parametrize("name", ["da3_tiny", "vggt_tiny", "oracle"])
+def test_a_pass_leaves_the_key_as_it_is(name: str, make_backend, scene) -> None:
+    backend = make_backend(name)
+    before = cache_key(backend, *scene)
+    backend.decode(backend.encode(*scene))
+    assert cache_key(backend, *scene) == before
+
+
+def test_the_source_of_somebodys_own_backend_decides_the_key(
+    tmp_path: Path, scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keys = []
+    for line in ("depth = 1", "depth = 1", "depth = 2"):
+        cache._source.cache_clear()  # as in another process
+        module = ModuleType("somebodys_own")
+        module.__file__ = str(tmp_path / "somebodys_own.py")
+        Path(module.__file__).write_text(line)
+        monkeypatch.setitem(sys.modules, module.__name__, module)
+        own = type("Own", (OracleBackend,), {"__module__": module.__name__})
+        keys.append(cache_key(own(), *scene))
+    assert keys[0] == keys[1] != keys[2]
+
+
 def test_a_damaged_file_is_made_again(tmp_path: Path, scene, caplog: pytest.LogCaptureFixture) -> None:
     backend, cache = Counting(), TokenCache(tmp_path)
     first, _ = cache.read(backend, *scene)
@@ -85,3 +121,31 @@ def test_the_oldest_go_when_the_folder_is_full(tmp_path: Path, make_scene) -> No
     assert not first.exists()
     with pytest.raises(ValueError, match=r"token_cache\.max_gb"):
         TokenCache(tmp_path, 0)
+
+
+def test_processes_that_share_a_full_folder_do_not_disturb_each_other(
+    tmp_path: Path, make_scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another one has removed the oldest files between their being listed and their being looked at."""
+    backend, cache = Counting(), TokenCache(tmp_path, max_gb=1e-9)
+    listed = [tmp_path / f"{name}.pt" for name in ("gone", "also-gone")]
+    glob = Path.glob
+    monkeypatch.setattr(Path, "glob", lambda folder, pattern: [*listed, *glob(folder, pattern)])
+    for seed in (1, 2):
+        cache.read(backend, *make_scene(1, 2, (28, 42), seed))
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_a_file_that_may_only_be_read_is_used(
+    tmp_path: Path, scene, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    backend, cache = Counting(), TokenCache(tmp_path)
+    cache.read(backend, *scene)
+
+    def refuse(path: Path) -> None:
+        raise PermissionError(30, "Read-only file system", str(path))
+
+    monkeypatch.setattr(os, "utime", refuse)
+    cache.read(backend, *scene)
+    assert backend.runs == [1]
+    assert not caplog.records
