@@ -27,6 +27,9 @@ import numba
 from numba.core import event
 from numba.extending import register_jitable
 
+from vg2gt.io import compiled_files
+from vg2gt.io.compiled_files import KernelCache
+
 log = logging.getLogger(__name__)
 
 PACKAGES = Path(__file__).resolve().parents[2]
@@ -92,9 +95,11 @@ def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
         config: Any = numba.config  # pyright: ignore[reportPrivateImportUsage]
         chosen, config.CACHE_DIR = config.CACHE_DIR, str(folder)  # numba reads it while it decorates
         try:
-            return numba.njit(cache=True, **options)(function)
+            made: Any = numba.njit(**options)(function)
+            made._cache = KernelCache(function)
         finally:
             config.CACHE_DIR = chosen
+        return made
 
     return compile_later
 
@@ -132,7 +137,7 @@ def _folder(room: Path) -> Path | None:
 def _digest(room: Path) -> str:
     versions = f"{numba.__version__} {llvmlite.__version__} {platform.python_version()}"
     content = hashlib.sha256(versions.encode())
-    for path in [Path(__file__), SHARED, *sorted(room.rglob("*.py"))]:
+    for path in [Path(__file__), Path(compiled_files.__file__), SHARED, *sorted(room.rglob("*.py"))]:
         content.update(path.name.encode() + b"\0" + path.read_bytes())
     return content.hexdigest()[:16]
 
