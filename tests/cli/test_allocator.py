@@ -4,9 +4,11 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
+from vg2gt.cli import allocator
 from vg2gt.cli.allocator import CHOICE, mimalloc_environment
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -42,6 +44,8 @@ def test_a_command_starts_again_once_and_leaves_nothing_to_its_children() -> Non
         ("sys.settrace(lambda *event: None); ", {}),
         ("sys.setprofile(lambda *event: None); ", {}),
         ("sys.modules['torch'] = sys; ", {}),
+        ("sys.modules['IPython'] = sys; ", {}),
+        ("sys.ps1 = '>>> '; ", {}),
         ("", {"VG2GT_ALLOCATOR": "system"}),
     ],
 )
@@ -69,16 +73,53 @@ def test_an_unknown_choice_is_named() -> None:
     assert (done.returncode, done.stderr.strip()) == (1, said)
 
 
-def test_train_py_runs_on_it() -> None:
-    code = "import os; print('preloaded', 'libmimalloc' in open('/proc/self/maps').read())"
-    watch = f"import runpy, sys, vg2gt.cli.train as train; train.main = lambda: exec({code!r}); "
-    start = f"sys.argv = ['train.py']; runpy.run_path({str(ROOT / 'train.py')!r}, run_name='__main__')"
+def _watching(folder: Path) -> dict[str, str]:
+    """An environment in which training says what it runs on instead of training."""
+    say = "import os; print('preloaded', 'libmimalloc' in open('/proc/self/maps').read(), flush=True)"
+    (folder / "sitecustomize.py").write_text(f"import vg2gt.cli.train as train\ntrain.main = lambda: exec({say!r})\n")
+    return {"PATH": os.environ["PATH"], "PYTHONPATH": f"{folder}:{ROOT}"}
+
+
+@pytest.mark.parametrize(
+    "arguments", [[str(ROOT / "train.py")], ["-c", "import vg2gt.cli; vg2gt.cli.console()", "train"]]
+)
+def test_commands_run_on_it(arguments: list[str], tmp_path: Path) -> None:
+    command, watching = [sys.executable, *arguments], _watching(tmp_path)
+    done = subprocess.run(command, env=watching, capture_output=True, text=True, timeout=100, check=False)
+    assert done.stdout == "preloaded True\n", done.stderr
+
+
+TRAIN = "print('once', flush=True); import runpy, sys; sys.argv = ['train.py']; "
+RUN = f"runpy.run_path({str(ROOT / 'train.py')!r}, run_name='__main__')"
+CALL = "sys.argv = [sys.argv[0], 'train']; import vg2gt.cli; vg2gt.cli.main()"
+
+
+@pytest.mark.parametrize("program", [TRAIN + RUN, TRAIN + CALL])
+@pytest.mark.parametrize("piped", [False, True])
+def test_a_program_that_runs_a_command_is_not_started_again(program: str, piped: bool, tmp_path: Path) -> None:
+    """What it did before would be done twice; what came through a pipe could not even be done again."""
+    script = tmp_path / "script.py"
+    script.write_text(program)
+    arguments = ["-", "a"] if piped else [str(script)]
     done = subprocess.run(
-        [sys.executable, "-c", watch + start],
-        env={"PATH": os.environ["PATH"], "PYTHONPATH": str(ROOT)},
+        [sys.executable, *arguments],
+        env=_watching(tmp_path),
+        input=program if piped else "",
         capture_output=True,
         text=True,
         timeout=100,
         check=False,
     )
-    assert done.stdout == "preloaded True\n", done.stderr
+    assert done.stdout == "once\npreloaded False\n", done.stderr
+
+
+@pytest.mark.parametrize("name", ["with space", "with:colon"])
+def test_a_path_that_cannot_be_preloaded_is_left(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    library = tmp_path / name / "libmimalloc.so"
+    library.parent.mkdir()
+    library.touch()
+    found = SimpleNamespace(name=library.name, locate=lambda: library)
+    monkeypatch.setattr(allocator, "files", lambda package: [found])
+    assert mimalloc_environment() == {}
+    library = library.rename(tmp_path / library.name)
+    assert mimalloc_environment()["LD_PRELOAD"] == str(library)

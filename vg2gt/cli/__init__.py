@@ -1,5 +1,6 @@
 """The console script ``vg2gt COMMAND``."""
 
+from vg2gt.cli.allocator import start_with_mimalloc
 from vg2gt.cli.commands import COMMANDS, dispatch
 from vg2gt.cli.leaving import run_and_leave
 
@@ -10,5 +11,5 @@ def main() -> None:
 
 
 def console() -> None:
-    """:func:`main` as a process of its own, which ends with it."""
-    run_and_leave(main)
+    """:func:`main` as a process of its own, which may start again and ends with the command."""
+    run_and_leave(lambda: dispatch("vg2gt", COMMANDS, start_with_mimalloc))

@@ -24,9 +24,10 @@ def start_with_mimalloc() -> None:
 
     What a step allocates differs with the voxels of its scene. glibc finds no place for the next step's blocks among
     those of the last one, so memory grows and every step fetches pages anew (docs/reliability.md has both measured).
-    Nothing is done on systems other than Linux, where torch is imported already, under a debugger or profiler, where
-    the environment preloads a library of its own, and with ``VG2GT_ALLOCATOR=system``. Programs that the command
-    starts do not inherit it.
+    Only for a process that was started for its command: what it did before this call is done a second time. Nothing is
+    done on systems other than Linux, in a notebook or another interactive session, where torch is imported already,
+    under a debugger or profiler, where the environment preloads a library of its own, and with
+    ``VG2GT_ALLOCATOR=system``. Programs that the command starts do not inherit it.
 
     Raises:
         SystemExit: if ``VG2GT_ALLOCATOR`` is neither ``mimalloc`` nor ``system``.
@@ -35,8 +36,7 @@ def start_with_mimalloc() -> None:
         for name in os.environ.pop(_AGAIN).split(","):
             os.environ.pop(name, None)
         return
-    watched = sys.gettrace() is not None or sys.getprofile() is not None
-    if "torch" in sys.modules or watched or not sys.argv[0] or not sys.executable:
+    if "torch" in sys.modules or not sys.executable or _watched() or not _started_for_this():
         return
     try:
         settings = mimalloc_environment()
@@ -48,6 +48,17 @@ def start_with_mimalloc() -> None:
     sys.stderr.flush()
     environment = {**os.environ, **settings, _AGAIN: ",".join(settings.keys() - _KEPT_CODE.keys())}
     os.execve(sys.executable, [sys.executable, *sys.orig_argv[1:]], environment)
+
+
+def _watched() -> bool:
+    return sys.gettrace() is not None or sys.getprofile() is not None
+
+
+def _started_for_this() -> bool:
+    """Whether the process is that of a command: not a session or a script that runs the command's file."""
+    interactive = hasattr(sys, "ps1") or "IPython" in sys.modules
+    read = not sys.argv[0] or sys.argv[0] == "-"  # the program came through a pipe, and is gone
+    return not interactive and not read and bool({sys.argv[0], "-m"} & set(sys.orig_argv))
 
 
 def mimalloc_environment() -> dict[str, str]:
@@ -67,7 +78,7 @@ def mimalloc_environment() -> dict[str, str]:
 
 
 def _library() -> Path | None:
-    """The shared library that the package ``cmeel-mimalloc`` has installed."""
+    """The shared library that the package ``cmeel-mimalloc`` has installed, if its path can be preloaded."""
     if sys.platform != "linux":
         return None
     try:
@@ -75,4 +86,5 @@ def _library() -> Path | None:
     except PackageNotFoundError:
         return None
     paths = [Path(str(file.locate())).resolve() for file in found]
-    return next((path for path in paths if path.is_file()), None)
+    separators = set(" :")  # of the loader's list, which knows no quotes
+    return next((path for path in paths if path.is_file() and not separators & set(str(path))), None)

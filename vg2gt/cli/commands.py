@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
 
 import vg2gt
-from vg2gt.cli.allocator import start_with_mimalloc
 
 
 @dataclass(frozen=True)
@@ -116,8 +115,13 @@ DATA_COMMANDS = {
 }
 
 
-def dispatch(program: str, commands: Mapping[str, Command]) -> None:
+def dispatch(program: str, commands: Mapping[str, Command], before_computing: Callable[[], None] | None = None) -> None:
     """Runs ``program COMMAND [arguments]``; lists the commands if none is named.
+
+    Args:
+        program: its name, for messages.
+        commands: by name.
+        before_computing: called before a command that computes is imported.
 
     Raises:
         SystemExit: if there is no such command, naming the nearest.
@@ -134,8 +138,8 @@ def dispatch(program: str, commands: Mapping[str, Command]) -> None:
         advice = f", did you mean {near[0]}?" if near else ""
         print(f"{program}: unknown command {asked!r}{advice} ({program} --help lists all)", file=sys.stderr)
         sys.exit(2)
-    if commands[asked].computes and not {"-h", "--help"} & set(sys.argv):
-        start_with_mimalloc()
+    if before_computing and commands[asked].computes and not {"-h", "--help"} & set(sys.argv):
+        before_computing()
     module, _, function = commands[asked].entry.partition(":")
     command = importlib.import_module(module)
     # Further processes (DDP) are started as argv says: by the command's own file, without the command's name.
