@@ -1,3 +1,4 @@
+import subprocess
 import sys
 import threading
 import time
@@ -5,6 +6,7 @@ import time
 import pytest
 import torch
 
+from tests.commands import ROOT
 from vg2gt.io import threads
 from vg2gt.io.threads import parallel_for
 
@@ -74,3 +76,37 @@ def test_the_loop_runs_on_torchs_own_threads():
 def _threads_of_this_process():
     with open("/proc/self/status") as status:
         return next(int(line.split()[1]) for line in status if line.startswith("Threads:"))
+
+
+INTERRUPTED = """
+import os, random, signal, threading, time
+import torch
+from vg2gt.io.threads import parallel_for
+
+def interrupt():
+    time.sleep(2e-4 + 2e-3 * random.random())
+    os.kill(os.getpid(), signal.SIGINT)
+
+torch.set_num_threads(2)
+random.seed(0)
+parallel_for(range(2), lambda _: None)
+for _ in range(80):
+    thread = threading.Thread(target=interrupt)
+    try:
+        thread.start()
+        end = time.monotonic() + 10
+        while time.monotonic() < end:
+            parallel_for(range(2), lambda _: None)
+        raise SystemExit("an interruption was lost")
+    except KeyboardInterrupt:
+        thread.join()
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere torch's OpenMP has no such entry point")
+def test_no_interruption_is_lost():
+    """It may come as a thread enters the loop's function, from where ctypes reports it and goes on."""
+    done = subprocess.run(
+        [sys.executable, "-c", INTERRUPTED], cwd=ROOT, capture_output=True, text=True, timeout=200, check=False
+    )
+    assert done.returncode == 0, done.stderr[-2000:]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import os
 import sys
+import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
@@ -36,10 +37,11 @@ def parallel_for(items: Sequence[Item], function: Callable[[Item], None]) -> Non
 
 def _on_team(team: Callable[..., None], threads: int, items: Sequence[Item], function: Callable[[Item], None]) -> None:
     """Every thread of the team takes the next item until none is left."""
-    waiting, failures = iter(items), []
+    waiting, failures, begun = iter(items), [], []
 
     def body(_: int | None) -> None:
         try:
+            begun.append(threading.get_ident())
             for item in waiting:  # a sequence's iterator hands out every item once, under the interpreter's lock
                 if failures:
                     return
@@ -50,6 +52,8 @@ def _on_team(team: Callable[..., None], threads: int, items: Sequence[Item], fun
     team(_Body(body), None, threads, 0)
     if failures:
         raise failures[0]
+    if threading.get_ident() not in begun:  # an interruption came as ``body`` began here, and ctypes only reports it
+        raise KeyboardInterrupt
 
 
 @lru_cache(maxsize=1)
