@@ -1,18 +1,24 @@
 """Kernels are compiled before a training, in processes of their own, once."""
 
+import multiprocessing
 import os
 import resource
 import subprocess
 import sys
 from collections.abc import Iterator
+from itertools import count
 from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
 import torch
 
+from tests.training_helpers import small_config
+from vg2gt.data.datamodule import SceneDataModule
 from vg2gt.rendering import Renderer
 from vg2gt.studies.study import compose_run
+from vg2gt.training import loop
+from vg2gt.training.loop import build
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = ["data.image_size=[28,56]", "data.train_scenes=1", "data.eval_scenes=1", "trainer.max_steps=1"]
@@ -98,6 +104,34 @@ def test_the_parent_works_on_one_thread_until_the_other_process_ends(monkeypatch
     compilation.compile_kernels(Renderer(), lambda: lambda: torch.zeros(()), meanwhile=pieces())
     assert threads == [1, 1, 1]
     assert torch.get_num_threads() == before
+
+
+def test_a_process_that_does_not_end_is_not_waited_for_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    from vg2gt.training import compilation
+
+    monkeypatch.setattr(compilation, "_to_compile", lambda: True)
+    monkeypatch.setattr(compilation, "compiled_mark", lambda: None)
+    monkeypatch.setattr(compilation, "PATIENCE", 0.1)
+    rest = Mock(**{"is_alive.return_value": True})
+    forked = [Mock(**{"is_alive.return_value": False}), rest]
+    monkeypatch.setattr(compilation, "_forked", lambda *work: forked.pop(0))
+    compilation.compile_kernels(Renderer(), lambda: lambda: torch.zeros(()), meanwhile=count())
+    rest.kill.assert_called_once_with()
+
+
+def test_the_loaders_processes_are_not_started_to_compile(tmp_path: Path) -> None:
+    """They would hold a second copy of the frames for as long as the run lasts."""
+    run = build(small_config(tmp_path, tmp_path / "rooms", "data.workers=1"))
+    data = run.datamodule
+    assert isinstance(data, SceneDataModule)
+    before = set(multiprocessing.active_children())
+    step = loop._first_step(run.module, data)
+    assert not list(loop._first_batches(data))
+    assert set(multiprocessing.active_children()) <= before
+    assert step().isfinite()
+    data.workers = 0
+    batches = loop._first_batches(data)
+    assert next(batches).num_context == next(iter(data.val_dataloader())).num_context
 
 
 def most_page_faults() -> int:

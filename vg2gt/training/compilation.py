@@ -12,6 +12,7 @@ import multiprocessing
 import os
 import sys
 import threading
+import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -100,7 +101,8 @@ def compile_kernels(
     pieces = meanwhile or iter(())
     with _one_thread():
         rest = _forked(_step, prepare_step(), begun.rendering.sentinel)
-        while rest.is_alive() and next(pieces, None) is not None:
+        end = time.monotonic() + PATIENCE
+        while rest.is_alive() and time.monotonic() < end and next(pieces, None) is not None:
             pass
     for process in (begun.rendering, rest):
         process.join(PATIENCE)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.util
 import logging
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from itertools import chain
@@ -45,6 +45,7 @@ from vg2gt.training.notices import notices
 from vg2gt.training.preview import write_preview
 from vg2gt.training.report import comparison_table, print_comparison
 from vg2gt.training.start import WriteConfig, checkpoint_to_resume, clear, name_differences
+from vg2gt.types import Batch
 
 log = logging.getLogger(__name__)
 
@@ -218,10 +219,9 @@ def _train(config: DictConfig, writes: bool, compiling: Compiling | None) -> dic
 
         log.info("the run's folder is %s; it computes on %s", run.folder, run.trainer.strategy.root_device)
 
-    if writes and not run.trial and run.trainer.strategy.root_device.type == "cpu":
-        # Rooms are kept on disk once they were made.
-        batches = chain(run.datamodule.val_dataloader(), run.datamodule.train_dataloader())
-        compile_kernels(run.module.renderer, lambda: _first_step(run), compiling, batches)
+    data, on_cpu = run.datamodule, run.trainer.strategy.root_device.type == "cpu"
+    if writes and not run.trial and on_cpu and isinstance(data, SceneDataModule):
+        compile_kernels(run.module.renderer, lambda: _first_step(run.module, data), compiling, _first_batches(data))
     with ending_together(run.trainer):
         untrained = _untrained_metrics(run, resumed=checkpoint is not None)
         run.trainer.fit(run.module, datamodule=run.datamodule, ckpt_path=checkpoint, weights_only=True)
@@ -234,15 +234,23 @@ def _train(config: DictConfig, writes: bool, compiling: Compiling | None) -> dic
         return _report(run, untrained, trained)
 
 
-def _first_step(run: Run) -> Callable[[], torch.Tensor]:
+def _first_batches(data: SceneDataModule) -> Iterator[Batch]:
+    """Batches of the evaluation and of training, for what they leave on disk: rooms are kept there once made."""
+    if data.workers == 0:  # else other processes read the frames
+        yield from chain(data.val_dataloader(), data.train_dataloader())
+
+
+def _first_step(module: VG2GTModule, data: SceneDataModule) -> Callable[[], torch.Tensor]:
     """A training step up to its loss, outside the trainer's loop: of three views, which run what many do."""
-    batch = next(iter(run.datamodule.train_dataloader())).single(0)
+    loader = data.train_dataloader()
+    batch: Batch = loader.dataset[next(iter(loader.sampler))]  # without the loader's workers, which a fork disturbs
+    batch = batch.single(0)
     few = batch.views(slice(max(batch.num_context - 2, 0), batch.num_context + 1))
     batch = replace(few, num_context=min(batch.num_context, 2))
 
     def step() -> torch.Tensor:
-        run.module.model.token_cache = None  # these views do not come again; the step is another process's
-        return run.module.training_step(batch, 0)
+        module.model.token_cache = None  # these views do not come again; the step is another process's
+        return module.training_step(batch, 0)
 
     return step
 
