@@ -21,6 +21,7 @@ from vg2gt.memory import (
     memory_advice,
     note_sizes,
 )
+from vg2gt.profiling import peak_memory_mib
 from vg2gt.studies.study import compose_run
 from vg2gt.training.loop import train
 from vg2gt.types import Voxels
@@ -242,3 +243,9 @@ def test_a_real_failure_to_allocate(tmp_path: Path) -> None:
     assert "CAUGHT OutOfMemory memory is full with" in done.stdout, done.stdout[-2000:] + done.stderr[-2000:]
     assert "images of 224x448" in done.stdout
     assert "data.max_images" in done.stdout
+
+
+def test_where_the_system_does_not_tell_its_peak_is_zero(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert peak_memory_mib(torch.device("cpu")) > 50
+    monkeypatch.setitem(sys.modules, "resource", None)  # as on Windows
+    assert peak_memory_mib(torch.device("cpu")) == 0

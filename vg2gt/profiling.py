@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -90,8 +89,15 @@ def reset_peak_memory(device: torch.device) -> None:
 
 
 def peak_memory_mib(device: torch.device) -> float:
-    """Peak memory in MiB: allocated on the GPU since the last reset, or resident in the process since its start."""
+    """Peak memory in MiB: allocated on the GPU since the last reset, or resident in the process since its start.
+
+    0 where the system does not tell it (Windows).
+    """
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device) / MIB
+    try:
+        import resource
+    except ImportError:
+        return 0.0
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / MIB if sys.platform == "darwin" else peak / 1024

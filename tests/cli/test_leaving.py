@@ -37,3 +37,10 @@ def test_a_failure_keeps_its_status_and_its_message() -> None:
     ended = _run("raise ValueError('named')")
     assert ended.returncode == 1
     assert "ValueError: named" in ended.stderr
+
+
+def test_without_anywhere_to_write_to_it_ends_without_a_word() -> None:
+    program = "from vg2gt.cli.leaving import run_and_leave; run_and_leave(lambda: None)"
+    command = f'exec "{sys.executable}" -c "{program}" >&-'
+    ended = subprocess.run(command, shell=True, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stderr) == (0, "")

@@ -18,8 +18,9 @@ def run_and_leave(command: Callable[[], None]) -> None:
 
     def leave() -> None:
         if succeeded:
-            sys.stdout.flush()
-            sys.stderr.flush()
+            for stream in (sys.stdout, sys.stderr):
+                if stream is not None:  # closed by whoever started the command
+                    stream.flush()
             os._exit(0)
 
     atexit.register(leave)
