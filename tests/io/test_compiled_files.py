@@ -1,6 +1,7 @@
 """Compiled kernels survive damage, full disks and other processes."""
 
 import errno
+import os
 from pathlib import Path
 from typing import Any
 
@@ -71,6 +72,22 @@ def test_a_damaged_file_is_written_again(damage: str, tmp_path: Path, kernel, ca
     assert last(1) == 2
     assert not last.stats.cache_misses
     assert not caplog.records
+
+
+@pytest.mark.skipif(os.name != "posix", reason="files have no owner in the sense of POSIX")
+def test_code_of_another_user_is_not_run(
+    tmp_path: Path, kernel, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    kernel()(1)
+    (file,) = kept(tmp_path)
+    if os.geteuid() == 0:
+        os.chown(file, 1000, -1)
+    else:
+        monkeypatch.setattr(os, "geteuid", lambda: file.stat().st_uid + 1)
+    last = kernel()
+    assert last(1) == 2
+    assert not last.stats.cache_hits
+    assert f"{file} belongs to another user" in caplog.text
 
 
 def test_what_another_version_wrote_is_compiled_again(

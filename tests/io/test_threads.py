@@ -87,6 +87,7 @@ def interrupt():
     time.sleep(2e-4 + 2e-3 * random.random())
     os.kill(os.getpid(), signal.SIGINT)
 
+signal.signal(signal.SIGINT, signal.default_int_handler)  # what a shell starts in the background ignores it
 torch.set_num_threads(2)
 random.seed(0)
 parallel_for(range(2), lambda _: None)

@@ -113,18 +113,21 @@ def test_the_step_of_two_scenes_is_the_mean_of_theirs(tmp_path: Path, cache: Pat
     """From images to gradients, through backbone, voxels, Gaussians and renders."""
     run = tiny_run(tmp_path, cache, "data.max_images=4")
     batch = first_batches(run, 1)[0]
-    generator = torch.Generator().manual_seed(0)
-    with torch.no_grad():  # away from the zero convolutions
-        for parameter in run.module.model.trained_parameters():
-            parameter += 0.02 * torch.randn(parameter.shape, generator=generator)
-    loss, gradient = step(run, batch)
-    first, second = (step(run, batch.single(index)) for index in range(2))
-    assert first[0] != second[0]
-    # The terms are of order one; the last digits of SSIM, made of local variances, depend on the processor (4e-7 seen).
-    torch.testing.assert_close(loss, (first[0] + second[0]) / 2, rtol=0, atol=1e-6)
-    mean = (first[1] + second[1]) / 2
-    # Rounding of float32: 1.0 to 2.2e-6 in eleven draws of weights and options; a twelfth gave 1.2e-4, unexplained.
-    assert (gradient - mean).norm() < 5e-6 * mean.norm()
+    generator, deviations = torch.Generator().manual_seed(0), []
+    for _ in range(3):
+        with torch.no_grad():  # away from the zero convolutions
+            for parameter in run.module.model.trained_parameters():
+                parameter += 0.02 * torch.randn(parameter.shape, generator=generator)
+        loss, gradient = step(run, batch)
+        first, second = (step(run, batch.single(index)) for index in range(2))
+        assert first[0] != second[0]
+        # Terms of order one; the last digits of SSIM, made of local variances, depend on the processor (4e-7 seen).
+        torch.testing.assert_close(loss, (first[0] + second[0]) / 2, rtol=0, atol=1e-6)
+        mean = (first[1] + second[1]) / 2
+        deviations.append((gradient - mean).norm() / mean.norm())
+    # Rounding of float32: 1e-6 to 3e-6 in 21 of 23 draws, 1e-4 in two. In the one looked into, a rendered pixel
+    # had its image's colour to the last bit, and rounding decides the gradient of its L1 error. Mixed scenes spoil all.
+    assert min(deviations) < 5e-6, deviations
 
 
 # ------------------------------------------------------------------------------------------------ nobody is waited for

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import os
 import pickle
 from collections.abc import Callable
 from contextlib import suppress
@@ -54,14 +55,18 @@ class _Files:
         """What was saved under this key, or None."""
         path = self._path(key)
         try:
-            content = path.read_bytes()
+            with path.open("rb") as file:
+                owner, content = os.fstat(file.fileno()).st_uid, file.read()
         except OSError:
+            return None
+        if os.name == "posix" and owner not in (0, os.geteuid()):
+            log.warning("%s belongs to another user, whose code is not run: compiled again", path)
             return None
         checksum, data = content[:_CHECKSUM], content[_CHECKSUM:]
         if hashlib.sha256(data).digest() != checksum:
             log.warning("%s is damaged: compiled again", path)
             return None
-        return pickle.loads(data)  # in a folder of this user's own: what lies in it is executed
+        return pickle.loads(data)  # this user's or the administrator's own: numba pickles what belongs to code
 
     def save(self, key: object, data: object) -> None:
         """Keeps ``data`` under this key."""
