@@ -28,6 +28,17 @@ SHARED = Path(__file__).resolve().parents[2] / "shared"
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 
 
+def pytest_collection_finish() -> None:
+    """Leaves what was imported out of full collections."""
+    gc.collect()
+    gc.freeze()
+
+
+def pytest_unconfigure() -> None:
+    """Lets the interpreter take it apart at its end."""
+    gc.unfreeze()
+
+
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int | None:
     """One process for the tests of a GPU, which others would take the memory of; otherwise one a core."""
     return 0 if config.option.markexpr == "gpu" else None

@@ -91,7 +91,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)  # what a shell starts 
 torch.set_num_threads(2)
 random.seed(0)
 parallel_for(range(2), lambda _: None)
-for _ in range(80):
+for _ in range(40):
     thread = threading.Thread(target=interrupt)
     try:
         thread.start()
