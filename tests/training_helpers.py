@@ -1,4 +1,4 @@
-"""A training run small enough for a test: two rooms of 56x112, four views."""
+"""A training run small enough for a test: two rooms of 28x56, four views."""
 
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ from vg2gt.model import VG2GT
 from vg2gt.training.loop import Run
 
 SMALL = [
-    "data.image_size=[56,112]",
+    "data.image_size=[28,56]",
     "data.train_scenes=2",
     "data.eval_scenes=1",
     "data.min_views=4",

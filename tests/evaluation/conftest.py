@@ -16,7 +16,7 @@ from vg2gt.types import Batch
 def module_and_batch(tmp_path_factory: pytest.TempPathFactory) -> tuple[VG2GTModule, Batch]:
     """An untrained head on the oracle, and a room of 56x112 with 8 context and 3 target views."""
     folder = tmp_path_factory.mktemp("scene")
-    run = build(small_config(folder, folder / "cache"))
+    run = build(small_config(folder, folder / "cache", "data.image_size=[56,112]"))
     run.module.eval()
     return run.module, next(iter(run.datamodule.val_dataloader()))
 
@@ -39,6 +39,6 @@ def result(evaluator: SceneEvaluator, batch: Batch) -> SceneResult:
 
 
 def evaluate_overrides(folder: Path, cache: Path, *overrides: str) -> list[str]:
-    """Overrides of ``configs/evaluate.yaml`` for an evaluation of two rooms of 56x112."""
-    small = ["data.image_size=[56,112]", "data.eval_scenes=2", "views=[2]", "device=cpu", "name=test"]
+    """Overrides of ``configs/evaluate.yaml`` for an evaluation of two rooms of 28x56."""
+    small = ["data.image_size=[28,56]", "data.eval_scenes=2", "views=[2]", "device=cpu", "name=test"]
     return [*small, f"output_dir={folder}", f"data.cache_dir={cache}", *overrides]
