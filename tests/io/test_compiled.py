@@ -4,10 +4,12 @@ import ast
 import gc
 import importlib.util
 import os
+import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 from numba.core import event
@@ -203,3 +205,49 @@ def test_no_garbage_is_collected_while_kernels_are_compiled(before: bool) -> Non
         gc.enable()
     assert len(listener.seen) >= 3
     assert not any(listener.seen)
+
+
+@pytest.mark.parametrize(
+    ("features", "name", "chosen", "wide"),
+    [
+        ({"avx512vbmi2": True}, None, None, True),
+        ({"avx512vbmi2": False, "avx512f": True}, None, None, False),
+        ({}, None, None, False),
+        ({"avx512vbmi2": True}, "haswell", None, False),
+        ({"avx512vbmi2": True}, None, "+avx2", False),
+    ],
+    ids=["whole vectors", "processors that slow down", "unknown", "another processor chosen", "features chosen"],
+)
+def test_vectors_are_as_wide_as_the_processor_is_fast(
+    features: dict[str, bool], name: str | None, chosen: str | None, wide: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config: Any = compiled.numba.config  # pyright: ignore[reportPrivateImportUsage]
+    monkeypatch.setattr(config, "CPU_NAME", name)
+    monkeypatch.setattr(config, "CPU_FEATURES", chosen)
+    monkeypatch.setattr(compiled, "_cpu_features", lambda: features)
+    compiled.use_wide_vectors()
+    found = config.CPU_FEATURES
+    assert (found or "").endswith(",-prefer-256-bit") == wide
+    assert wide or found == chosen
+
+
+ADD = """
+from vg2gt.io.compiled import numba
+
+@numba.njit("void(float32[::1], float32[::1])")
+def add(x, y):
+    for i in range(len(x)):
+        x[i] += y[i]
+
+print(*add.inspect_asm().values())
+"""
+
+
+@pytest.mark.skipif(not compiled._cpu_features().get("avx512vbmi2"), reason="a processor without such vectors")
+def test_kernels_compute_with_whole_vectors() -> None:
+    """In a process of its own: numba asks once."""
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("NUMBA_CPU")}
+    shown = subprocess.run(
+        [sys.executable, "-c", ADD], cwd=ROOT, env=environment, capture_output=True, text=True, check=True
+    )
+    assert "zmm" in shown.stdout

@@ -16,7 +16,7 @@ import shutil
 import stat
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
@@ -24,7 +24,7 @@ from typing import Any
 
 import llvmlite.binding
 import numba
-from numba.core import event
+from numba.core import codegen, event
 from numba.extending import register_jitable
 
 from vg2gt.io import compiled_files
@@ -75,6 +75,27 @@ class _CollectorPaused(event.Listener):
 
 
 event.register("numba:compile", _CollectorPaused())
+
+
+def use_wide_vectors() -> None:
+    """Lets numba use all 512 bits of a vector where the processor computes with them at full speed.
+
+    LLVM takes half of them on Intel's processors, the first of which slowed down otherwise (Skylake to Cooper Lake,
+    which have no VBMI2). It must be said before numba prepares its first function; what the user has chosen
+    (``NUMBA_CPU_NAME``, ``NUMBA_CPU_FEATURES``) stays.
+    """
+    config: Any = numba.config  # pyright: ignore[reportPrivateImportUsage]
+    if config.CPU_NAME is None and config.CPU_FEATURES is None and _cpu_features().get("avx512vbmi2"):
+        config.CPU_FEATURES = codegen.get_host_cpu_features() + ",-prefer-256-bit"
+
+
+def _cpu_features() -> Mapping[str, bool]:
+    with suppress(RuntimeError):  # LLVM cannot tell everywhere
+        return llvmlite.binding.get_host_cpu_features()
+    return {}
+
+
+use_wide_vectors()
 
 
 def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
