@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -190,7 +191,8 @@ def test_counts(tmp_path: Path) -> None:
         ("4", "4.5"),
     }
     assert curve["4", "4.5"] > curve["2", "4.5"]
-    assert (home / "counts.png").stat().st_size > 1000
+    if find_spec("matplotlib"):  # extra: eval
+        assert (home / "counts.png").stat().st_size > 1000
 
 
 def test_cells_are_found_for_a_number_of_gaussians(benchmark_script) -> None:
@@ -215,7 +217,8 @@ def test_memory(tmp_path: Path) -> None:
     capped = next(point for point in points if point["overrides"] == ["model.fine.max_voxels=1000"])
     assert capped["forward"]["voxels"] == 1000
     assert capped["training"]["pass_mib"] < views[-1]["training"]["pass_mib"]
-    assert written.with_suffix(".md").read_text().count("| views |") == 4
+    lines = written.with_suffix(".md").read_text().splitlines()
+    assert [line.split("|")[2].strip() for line in lines if line.startswith("| views ")] == ["2", "4", "8", "16"]
 
 
 @pytest.mark.slow
