@@ -1,9 +1,11 @@
 """A training step of two checkouts side by side: ``python benchmarks/before_after.py --before FOLDER [overrides]``.
 
 ``git worktree add FOLDER COMMIT`` makes such a folder; ``--after`` is this checkout unless said otherwise. Two
-processes, each with the allocator as that checkout's ``train.py`` sets it, take a step in turns on the same scenes, so
-that whatever else the machine does meets both; as in training, no set of views comes twice. Every checkout has its own
-defaults, numbers of views and the optimiser among them, unless overrides say otherwise. Loading views is not counted.
+processes, each with the allocator as that checkout's ``train.py`` sets it, take three steps in turns on the same
+scenes, so that whatever else the machine does meets both; as in training, no set of views comes twice. The first step
+of a turn is not counted: while the other side is at work, the allocator gives memory back that it would keep in
+training. Every checkout has its own defaults, numbers of views and the optimiser among them, unless overrides say
+otherwise. Loading views is not counted.
 Prints processor time, the ratio of the means and the median of the pairs' ratios, peak memory and page faults, and
 writes them as a dated JSON file.
 """
@@ -24,7 +26,7 @@ from pathlib import Path
 from typing import Any
 
 HERE = Path(__file__).resolve().parents[1]
-WARMUP = 3
+TURN = 3  # steps in a row; the first turn is for warming up
 SCENES = 12
 
 
@@ -53,22 +55,27 @@ def serve(overrides: list[str], threads: int) -> None:
         print("ready", file=answers, flush=True)
         for _ in sys.stdin:
             batch = next(loader)
-            start = time.process_time()
+            faults, start = page_faults(), time.process_time()
             loss = step_loss(batch)
             middle = time.process_time()
             loss.backward()
             optimizer.step()
             optimizer.zero_grad()
-            usage = resource.getrusage(resource.RUSAGE_SELF)
             figures = (middle - start, time.process_time() - middle, float(loss.detach()))
-            print(*figures, usage.ru_maxrss / 1e3, usage.ru_minflt, file=answers, flush=True)
+            peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+            print(*figures, peak, page_faults() - faults, file=answers, flush=True)
+
+
+def page_faults() -> int:
+    """Pages that this process has been given so far."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt
 
 
 class Side:
     """A process that takes steps of one checkout.
 
     Attributes:
-        rows: of every step after the warm-up: seconds forward, seconds backward, loss, peak MB, page faults so far.
+        rows: of every step that counts: seconds forward, seconds backward, loss, peak MB so far, page faults.
     """
 
     def __init__(self, checkout: Path, arguments: list[str], threads: int) -> None:
@@ -97,8 +104,7 @@ class Side:
 
     def summary(self) -> dict[str, float]:
         """Means over the steps."""
-        forward, backward, loss = (statistics.fmean(row[part] for row in self.rows) for part in range(3))
-        faults = (self.rows[-1][4] - self.rows[0][4]) / max(len(self.rows) - 1, 1)
+        forward, backward, loss, _, faults = map(statistics.fmean, zip(*self.rows, strict=True))
         return {
             "step_core_seconds": forward + backward,
             "forward_core_seconds": forward,
@@ -133,9 +139,11 @@ def commit(checkout: Path) -> str:
 def compare(before: Path, after: Path, steps: int, threads: int, overrides: list[str]) -> dict[str, Any]:
     """Takes the steps and returns what is written."""
     sides = {name: Side(path, overrides, threads) for name, path in (("before", before), ("after", after))}
-    for step in range(WARMUP + steps):
-        for side in list(sides.values())[:: 1 if step % 2 else -1]:
-            side.step(step >= WARMUP)
+    turns = 1 + -(-steps // (TURN - 1))
+    for turn in range(turns):
+        for side in list(sides.values())[:: 1 if turn % 2 else -1]:
+            for step in range(TURN):
+                side.step(counts=turn > 0 and step > 0)
     summaries = {name: side.summary() for name, side in sides.items()}
     pairs = zip(sides["before"].seconds(), sides["after"].seconds(), strict=True)
     return {
@@ -143,7 +151,7 @@ def compare(before: Path, after: Path, steps: int, threads: int, overrides: list
         "after": {"commit": commit(after), **summaries["after"]},
         "ratio": summaries["after"]["step_core_seconds"] / summaries["before"]["step_core_seconds"],
         "median_of_pairs": statistics.median(late / early for early, late in pairs),
-        "steps": steps,
+        "steps": len(sides["after"].rows),
         "threads": threads,
         "overrides": overrides,
     }

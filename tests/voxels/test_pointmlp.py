@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from vg2gt.voxels import PointMLP
-from vg2gt.voxels.pointmlp import GeometricStage
+from vg2gt.voxels.pointmlp import GeometricStage, window_max
 from vg2gt.voxels.serialization import make_windows
 
 SIZE = torch.full((2,), 0.125)
@@ -129,3 +129,18 @@ def test_a_stage_is_what_the_paper_says(counts, few_sizes):
     gradients = [torch.autograd.grad(out.sin().sum(), inputs) for out in outputs]
     for found, exact in zip(*gradients, strict=True):
         torch.testing.assert_close(found, exact)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
+def test_the_largest_of_a_window_and_its_gradient_are_torchs(dtype):
+    generator = torch.Generator().manual_seed(0)
+    values = torch.randint(0, 9, (5, 8, 6), generator=generator).to(dtype)  # equal maxima in most windows
+    values[2] = 1  # a window of one voxel
+    weight = torch.randn(5, 6, generator=generator).to(dtype)
+    ours, theirs = values.clone().requires_grad_(), values.clone().requires_grad_()
+    out, exact = window_max(ours), theirs.amax(1)
+    assert torch.equal(out, exact)
+    for result in (out, exact):
+        (result * weight).sum().backward()
+    assert torch.equal(ours.grad, theirs.grad)
+    assert (ours.grad != 0).sum((1, 2)).max() == 48  # shared among all of the window that is constant

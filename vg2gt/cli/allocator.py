@@ -12,7 +12,8 @@ _AGAIN = "VG2GT_STARTED_AGAIN"  # names the variables that are for the start alo
 _PRELOAD = "LD_PRELOAD"
 _OPTIONS = {
     "MIMALLOC_ALLOW_THP": "0",  # large pages take more memory and save no time
-    "MIMALLOC_PURGE_DELAY": "10000",  # ms until freed pages go back; 1000 by default, twice as many are fetched again
+    # ms until freed pages go back, 1000 by default: with 10,000 a large step fetches five times as many again
+    "MIMALLOC_PURGE_DELAY": "60000",
 }
 _KEPT_CODE = {
     "ONEDNN_PRIMITIVE_CACHE_CAPACITY": "256"  # shapes, 1024 by default; numbers of voxels seldom come twice
