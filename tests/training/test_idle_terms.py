@@ -19,6 +19,16 @@ def test_a_weighted_term_that_never_acts_is_named_once(caplog: pytest.LogCapture
     ]
 
 
+def test_a_hinge_that_rests_is_no_warning(caplog: pytest.LogCaptureFixture) -> None:
+    idle = IdleTerms(("enhance_depth",), patience=5)
+    with caplog.at_level(logging.INFO):
+        for _ in range(20):
+            idle.see({"enhance_depth": torch.tensor(0.0)})
+    (record,) = caplog.records
+    assert record.levelno == logging.INFO
+    assert "enhance_depth has rested for 5 steps" in record.getMessage()
+
+
 def test_the_objective_names_its_weighted_terms() -> None:
     gaussian = ("color_l1", "ssim", "depth_consistency", "depth_gt", "normal")
     assert VG2GTLoss().weighted == ("enhance_depth", "enhance_point", *gaussian)

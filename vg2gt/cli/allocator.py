@@ -12,7 +12,7 @@ _AGAIN = "VG2GT_STARTED_AGAIN"  # names the variables that are for the start alo
 _PRELOAD = "LD_PRELOAD"
 _OPTIONS = {
     "MIMALLOC_ALLOW_THP": "0",  # large pages take more memory and save no time
-    # ms until freed pages go back, 1000 by default: with 10,000 a large step fetches five times as many again
+    # ms until freed pages go back, 1000 by default: after 10,000 a large step fetches five times as many again
     "MIMALLOC_PURGE_DELAY": "60000",
 }
 _KEPT_CODE = {

@@ -11,10 +11,11 @@ from torch import Tensor
 log = logging.getLogger(__name__)
 
 PATIENCE = 100  # steps
+HINGES = ("enhance_depth", "enhance_point")  # zero is what they are for
 
 
 class IdleTerms:
-    """Counts for how long each weighted term has been exactly zero, and says it once per term.
+    """Counts for how long each weighted term has been exactly zero, and says it once per term; warns of no hinge.
 
     Args:
         names: terms with a weight, as the loss's report names them.
@@ -35,9 +36,15 @@ class IdleTerms:
             self._idle[name] = self._idle[name] + 1 if name in idle else 0
             if self._idle[name] == self.patience:
                 del self._idle[name]
-                log.warning(
-                    "the loss term %s has a weight, but was 0 in each of the last %d steps: it does not act "
-                    "(depth_consistency needs rendered context views, enhance_* rests while enhancement does no harm)",
-                    name,
-                    self.patience,
-                )
+                _say(name, self.patience)
+
+
+def _say(name: str, steps: int) -> None:
+    if name in HINGES:
+        log.info("the loss term %s has rested for %d steps: enhanced tokens decode no worse than before", name, steps)
+    else:
+        log.warning(
+            "the loss term %s has a weight, but was 0 in each of the last %d steps: it does not act "
+            "(depth_consistency needs rendered context views)",
+            *(name, steps),
+        )

@@ -160,8 +160,8 @@ def warn_if_sparse(plan: VoxelPlan, scenes: int, module: str) -> None:
     if fewest < MIN_POINTS_PER_VOXEL[module]:
         _warned_of_sparse.add(module)
         log.warning(
-            "the %s voxels of a scene hold %.2f points each: nearly nothing is fused across views. Raise "
-            "model.%s.voxel_size, or set model.%s.min_footprint (pixels per voxel edge at the median depth)",
+            "the %s voxels of a scene hold %.2f points each: nearly nothing is fused across views. Where these see the "
+            "same surfaces, raise model.%s.voxel_size or model.%s.min_footprint (pixels per edge at the median depth)",
             *(module, fewest, module, module),
         )
 
