@@ -12,9 +12,10 @@ from vg2gt.io.threads import parallel_for
 VOXELS_AT_ONCE = 2048
 
 
-def compilable(*tensors: Tensor) -> bool:
-    """Whether all are float32 on a CPU: kernels are compiled for nothing else."""
-    return all(tensor.device.type == "cpu" and tensor.dtype == torch.float32 for tensor in tensors)
+def compilable(*tensors: Tensor, dtype: torch.dtype = torch.float32) -> bool:
+    """Whether all are of that type on a CPU, and ``torch.compile``, which cannot read kernels, is not tracing."""
+    suits = all(tensor.device.type == "cpu" and tensor.dtype == dtype for tensor in tensors)
+    return suits and not torch.compiler.is_compiling()
 
 
 def over_voxels(voxels: int, run: Callable[[int, int], None]) -> None:

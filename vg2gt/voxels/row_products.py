@@ -10,6 +10,8 @@ from torch.nn import functional as F
 
 IMAGES = 16  # fewest for which torch gives a convolution of one thread to oneDNN
 MIN_ROWS = 1024  # below, calling a convolution costs more than it saves
+# asked here: torch.compile traces through neither question
+ONEDNN = platform.machine() in ("x86_64", "AMD64") and torch.backends.mkldnn.is_available()
 ROWS_BITS = 4  # rows with more significant bits are left to MKL: oneDNN compiles and keeps code for every new number
 
 
@@ -43,4 +45,4 @@ def linear_rows(x: Tensor, weight: Tensor, bias: Tensor | None = None, relu: boo
 
 def has_onednn(device: torch.device) -> bool:
     """Whether convolutions there go to oneDNN on an x86 processor."""
-    return device.type == "cpu" and platform.machine() in ("x86_64", "AMD64") and torch.backends.mkldnn.is_available()
+    return device.type == "cpu" and ONEDNN

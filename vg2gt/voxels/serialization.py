@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from vg2gt.io.compiled import kernel
+from vg2gt.voxels.passes import compilable
 
 Order = Literal["z", "z-trans", "hilbert", "hilbert-trans"]
 ORDERS: tuple[Order, ...] = get_args(Order)
@@ -51,7 +52,7 @@ def hilbert_codes(grid: Tensor, bits: int) -> Tensor:
         ``[M]`` int64 < 2^(3 bits); cells with consecutive codes share a face, and dropping the last three bits
         gives the code of the parent cell.
     """
-    if grid.device.type != "cpu":
+    if not compilable(grid, dtype=torch.int64):
         return hilbert_reference(grid, bits)
     codes = grid.new_empty(len(grid))
     _hilbert(grid.numpy(), bits, np.empty(3, np.int64), codes.numpy())
