@@ -133,7 +133,7 @@ def unpack_lzfse(content: bytes, size: int, where: Path) -> bytes:
     said = unpacked_size(content, where)
     try:
         unpacked = lzfse.decompress(content) if said == size else b""
-    except lzfse.error as error:
+    except (lzfse.error, MemoryError) as error:  # matches without end; what the stream says it unpacks to is little
         raise FormatError(f"{where}: damaged LZFSE data; export the recording again") from error
     if len(unpacked) != size:
         found = said if said != size else len(unpacked)

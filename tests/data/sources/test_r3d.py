@@ -145,3 +145,11 @@ def test_the_sizes_of_streams_are_told(tmp_path: Path) -> None:
         packed = lzfse.compress(content)
         assert unpacked_size(packed, tmp_path) == len(content)
         assert unpack_lzfse(packed, len(content), tmp_path) == content
+
+
+def test_a_stream_that_unpacks_without_end_is_damaged(tmp_path: Path) -> None:
+    pytest.importorskip("lzfse")
+    matches = bytes.fromhex("680102f0fff0ffccfff0fff059e27702060000000000c000")  # a flipped byte asks for more and more
+    stream = b"bvxn" + struct.pack("<II", 1200, len(matches)) + matches + b"bvx$"
+    with pytest.raises(FormatError, match=r"3\.conf: damaged LZFSE data"):
+        unpack_lzfse(stream, 1200, tmp_path / "3.conf")
