@@ -94,7 +94,7 @@ def _forward(model: Reconstructor, views: Views, device: torch.device, monitor: 
 
 
 def _scene(prediction: Prediction, views: Views, renderer: Renderer, is_metric: bool) -> Scene:
-    geometry = prediction.geometry.detach()
+    geometry = prediction.surface.detach()
     if not len(prediction.gaussians):
         raise ValueError("the backend found no depth in any image, so there is nothing to reconstruct")
     return Scene(
