@@ -278,6 +278,11 @@ class Gaussians(TensorRecord):
     def __len__(self) -> int:
         return self.means.shape[0]
 
+    def select(self, rows: Tensor) -> Gaussians:
+        """Returns some of them: ``rows`` are sorted indices or ``[G]`` bool."""
+        names = [each.name for each in fields(self) if each.name != "background"]
+        return replace(self, **{name: getattr(self, name)[rows] for name in names})
+
     def scene(self, index: int) -> Gaussians:
         """Returns one scene's Gaussians, its ``batch`` set to 0."""
         bounds = torch.searchsorted(self.batch, torch.tensor([index, index + 1], device=self.batch.device))
