@@ -222,8 +222,8 @@ def test_experiments_train_on_any_machine(
 ) -> None:
     """The trainer that Lightning makes on a machine that pretends to have eight GPUs."""
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    monkeypatch.setattr(lightning.fabric.accelerators.cuda, "num_cuda_devices", lambda: 8)
-    monkeypatch.setattr(lightning.pytorch.accelerators.cuda, "num_cuda_devices", lambda: 8)
+    for package in ("fabric", "pytorch"):
+        monkeypatch.setattr(f"lightning.{package}.accelerators.cuda.num_cuda_devices", lambda: 8)
     job = {"SLURM_JOB_ID": "7", "SLURM_JOB_NAME": "paper", "SLURM_NTASKS": "12", "SLURM_NTASKS_PER_NODE": "4"}
     job |= {"SLURM_JOB_NUM_NODES": "3", "SLURM_NNODES": "3", "SLURM_LOCALID": "0", "SLURM_PROCID": "0"}
     for name, value in {**job, "SLURM_NODEID": "0", "SLURM_NODELIST": "a"}.items() if "slurm" in machine else ():

@@ -10,7 +10,7 @@ from typing import Any
 import lightning
 import pytest
 import torch
-from torch.utils.data import DataLoader
+from torch.utils.data import DataLoader, TensorDataset
 
 from vg2gt.rendering import render, renderer, selfcheck
 from vg2gt.rendering.options import Mode
@@ -82,7 +82,8 @@ class Validating(lightning.LightningModule):
 
 def validating(act: Callable[[], None]) -> None:
     options: Any = {"accelerator": "cpu", "logger": False, "enable_progress_bar": False, "precision": "bf16-mixed"}
-    lightning.Trainer(**options, enable_checkpointing=False).validate(Validating(act), DataLoader([0]), verbose=False)
+    trainer = lightning.Trainer(**options, enable_checkpointing=False)
+    trainer.validate(Validating(act), DataLoader(TensorDataset(torch.zeros(1))), verbose=False)
 
 
 @interpreted

@@ -185,7 +185,7 @@ def fixed_scene() -> tuple[Tensor, ...]:
     Gaussians of both scenes are packed; there are as many views of each.
     """
     (height, width), total = SIZE, SCENES * COUNT
-    depth = 2.5 + 1.2 * _numbers(total, STREAM + 0)
+    depth = 2.5 + 1.2 * _numbers(total, STREAM)
     sides = torch.stack((0.45 * _numbers(total, STREAM + 1), 0.3 * _numbers(total, STREAM + 2)), -1) * depth[:, None]
     poses = torch.eye(4, dtype=torch.float64).repeat(SCENES, VIEWS, 1, 1)
     poses[:, 1, :3, :3] = quat_to_matrix(torch.tensor([1.0, 0.04, -0.05, 0.03], dtype=torch.float64))
