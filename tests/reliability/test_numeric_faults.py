@@ -288,8 +288,7 @@ def two_processes(folder: Path, cache: Path, *overrides: str) -> subprocess.Comp
 
 def small_overrides(folder: Path, cache: Path) -> list[str]:
     poison = [f"+callbacks.poison._target_={Poison.__module__}.Poison", "+callbacks.poison.rank=1"]
-    places = [f"output_dir={folder}", f"hydra.run.dir={folder}", f"data.cache_dir={cache}"]
-    places += ["trainer=ddp", "trainer.precision=32-true"]
+    places = [f"output_dir={folder}", f"hydra.run.dir={folder}", f"data.cache_dir={cache}", "trainer=ddp"]
     return [*SMALL, *[o for o in RESUMABLE if "poison" not in o], *poison, *places]
 
 

@@ -367,8 +367,7 @@ def test_other_loggers_get_curves_and_the_picture(
 
 @pytest.mark.slow
 def test_two_processes_from_the_console_script(tmp_path: Path, cache: Path) -> None:
-    overrides = [*SMALL, f"data.cache_dir={cache}", "trainer=ddp", "trainer.precision=32-true"]
-    overrides += ["trainer.max_steps=2", "name=two"]
+    overrides = [*SMALL, f"data.cache_dir={cache}", "trainer=ddp", "trainer.max_steps=2", "name=two"]
     shell(shlex.join(["vg2gt", "train", *overrides]), tmp_path)
     assert json.loads((tmp_path / "outputs" / "two" / "metrics.json").read_text())["steps"] == 2
 

@@ -24,6 +24,7 @@ from omegaconf import DictConfig, OmegaConf
 from backends.cache import TokenCache
 from vg2gt.data.datamodule import SceneDataModule
 from vg2gt.evaluation.checks import refuse_without_hints
+from vg2gt.geometry.precision import trainer_precision
 from vg2gt.io.files import read_json, write_json, write_text
 from vg2gt.io.image_files import read_color
 from vg2gt.memory import TRAINING, memory_advice
@@ -58,7 +59,7 @@ EXPECTED_WARNINGS = (
 )
 
 LOGGER_PACKAGES = {"TensorBoardLogger": "tensorboard", "WandbLogger": "wandb"}
-PRECISIONS = ("32-true", "bf16-mixed", "32", "bf16")  # the last two are Lightning's short names
+PRECISIONS = ("auto", "32-true", "bf16-mixed", "32", "bf16")  # the last two are Lightning's short names
 
 
 @dataclass(frozen=True)
@@ -102,9 +103,11 @@ def build(config: DictConfig) -> Run:
         seed=config.seed,
     )
     module.made_of = made_of(config)
+    accelerator = _accelerator(config.trainer.accelerator)
     trainer = instantiate(
         config.trainer,
-        accelerator=_accelerator(config.trainer.accelerator),
+        accelerator=accelerator,
+        precision=trainer_precision(str(config.trainer.precision), accelerator),
         callbacks=_callbacks(config),
         logger=[instantiate(logger) for logger in config.logger.values() if logger],
         plugins=[AtomicCheckpointIO()],
@@ -143,11 +146,11 @@ def _accelerator(asked: str) -> str:
 
 
 def _check_trainer(config: DictConfig) -> None:
-    if str(config.trainer.get("precision", "32-true")) not in PRECISIONS:
+    if str(config.trainer.precision) not in PRECISIONS:
         raise ValueError(
             f"trainer.precision={config.trainer.precision} is not supported: geometry, voxels, rendering and losses "
             "are float32, which half precision cannot hold and float64 does not improve; use bf16-mixed (networks in "
-            "bfloat16) or 32-true"
+            "bfloat16), 32-true, or auto, which is the former on a GPU"
         )
     if config.trainer.get("accumulate_grad_batches", 1) != 1:
         raise ValueError(
