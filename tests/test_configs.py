@@ -266,3 +266,5 @@ def test_paper_experiment_holds_the_papers_numbers(tmp_path: Path) -> None:
     assert (config.data.min_views, config.data.max_views) == (3, 18)
     assert set(config.data.weights) == {"infinigen", "kitti", "scannet"}
     assert config.training.render_views is None
+    # ours: an evaluation that ends in minutes, where all stretches of 30 scenes would be some 200
+    assert (config.data.eval_scenes, config.trainer.limit_val_batches) == (9, 40)

@@ -26,20 +26,21 @@ if importlib.util.find_spec("triton") is None:
     pytest.skip("needs triton, which has wheels for Linux on x86-64 only", allow_module_level=True)
 INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
 interpreted = pytest.mark.skipif(not INTERPRETED, reason="runs in test_in_the_interpreter's process")
-on_devices = pytest.mark.parametrize(
-    "device", [pytest.param("cpu", marks=interpreted), pytest.param("cuda", marks=pytest.mark.gpu)]
-)
-# The paper's model, large voxels: the interpreter takes a millisecond for an entry of a tile.
-MODEL = ["model=vg2gt", "model.fine.min_footprint=10", "model.coarse.min_footprint=4", "optimizer=adamw"]
-MODEL += ["model.coarse.ptv3.drop_path=0", "data.min_views=2", "data.max_images=4", "data.train_scenes=2"]
+GPU = pytest.param("cuda", marks=pytest.mark.gpu)
+on_devices = pytest.mark.parametrize("device", [pytest.param("cpu", marks=interpreted), GPU])
+slowly_on_a_cpu = pytest.mark.parametrize("device", [pytest.param("cpu", marks=[interpreted, pytest.mark.slow]), GPU])
+# The paper's model; the interpreter takes a millisecond for an entry of a tile: few of both.
+MODEL = ["model=vg2gt", "model.coarse.min_footprint=4", "optimizer=adamw", "model.coarse.ptv3.drop_path=0"]
+MODEL += ["data.min_views=2", "data.max_images=4", "data.train_scenes=2", "training.render_views=1"]
+SIZES = {"cpu": ((14, 28), 10), "cuda": ((56, 112), 2)}  # of images, and pixels a voxel
 
 
 @pytest.fixture(autouse=True)
-def like_a_gpu(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def like_a_gpu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What is kept of the kernels' check is a test's own; an interpreted CPU's check is of one mode, for its time."""
     monkeypatch.setattr(selfcheck, "cache_folder", lambda: tmp_path)
     selfcheck._refusal.cache_clear()
-    if request.node.callspec.params.get("device") == "cpu" if hasattr(request.node, "callspec") else False:
+    if INTERPRETED:
         monkeypatch.setattr(selfcheck, "compare", partial(selfcheck.compare, modes=("rasterized",)))
 
 
@@ -61,8 +62,13 @@ def as_on_a_gpu(monkeypatch: pytest.MonkeyPatch) -> Any:
     return switch
 
 
-def made(folder: Path, cache: Path) -> Run:
-    return build(small_config(folder, cache, *TINY, *MODEL))
+def sized(device: str) -> list[str]:
+    (height, width), pixels = SIZES[device]
+    return [*TINY, *MODEL, f"data.image_size=[{height},{width}]", f"model.fine.min_footprint={pixels}"]
+
+
+def made(folder: Path, cache: Path, device: str) -> Run:
+    return build(small_config(folder, cache, *sized(device)))
 
 
 def step_of(run: Run, device: str) -> tuple[Tensor, dict[str, Tensor], list[str]]:
@@ -86,10 +92,10 @@ def step_of(run: Run, device: str) -> tuple[Tensor, dict[str, Tensor], list[str]
 
 @on_devices
 def test_a_training_step_of_the_papers_model(device: str, tmp_path: Path, cache: Path, as_on_a_gpu: Any) -> None:
-    expected, expected_grads, stages = step_of(made(tmp_path / "cpu", cache), "cpu")
+    expected, expected_grads, stages = step_of(made(tmp_path / "cpu", cache, device), "cpu")
     if device == "cpu":
         as_on_a_gpu()
-    loss, grads, again = step_of(made(tmp_path / "gpu", cache), device)
+    loss, grads, again = step_of(made(tmp_path / "gpu", cache, device), device)
     assert again == stages
     assert {"coarse", "fine", "gaussians", "render", "loss"} <= set(stages)
     # A point on a cell's face may fall to the other side elsewhere.
@@ -99,33 +105,35 @@ def test_a_training_step_of_the_papers_model(device: str, tmp_path: Path, cache:
     assert (together[0] - together[1]).norm() < (1e-3 if device == "cpu" else 5e-2) * together[1].norm()
 
 
-@on_devices
+@slowly_on_a_cpu
 def test_an_evaluation(device: str, tmp_path: Path, cache: Path, as_on_a_gpu: Any) -> None:
-    def metrics(name: str, device: str) -> dict[str, float]:
-        run = made(tmp_path / name, cache)
+    def metrics(where: str) -> dict[str, float]:
+        run = made(tmp_path / where, cache, device)
         run.datamodule.setup("validate")
-        batch = next(iter(run.datamodule.val_dataloader())).to(torch.device(device))
+        batch = next(iter(run.datamodule.val_dataloader())).to(torch.device(where))
         with torch.inference_mode():
-            return evaluate_scene(run.module.model.eval().to(device), run.module.renderer, batch)
+            return evaluate_scene(run.module.model.eval().to(where), run.module.renderer, batch)
 
-    expected = metrics("cpu", "cpu")
+    expected = metrics("cpu")
     if device == "cpu":
         as_on_a_gpu()
-    found = metrics("gpu", device)
+    found = metrics(device)
     assert found.keys() == expected.keys()
     for name, value in expected.items():
         assert found[name] == pytest.approx(value, rel=1e-2, abs=1e-3), name
 
 
-@on_devices
+@slowly_on_a_cpu
 def test_a_reconstruction(device: str, as_on_a_gpu: Any) -> None:
     """Untrained, of random weights, which is as good as any."""
 
-    def scene(device: str) -> tuple[int, Tensor]:
-        options = ["model.fine.min_footprint=10", "model.coarse.min_footprint=4"]
-        ready = load_model(None, "da3_tiny", "vg2gt", options, device)
-        images = torch.rand(3, 3, 14, 28, generator=torch.Generator().manual_seed(0))
-        made = reconstruct_with(ready.model, images, size=(28, 56), renderer=ready.renderer)
+    size, pixels = SIZES[device]
+
+    def scene(where: str) -> tuple[int, Tensor]:
+        options = [f"model.fine.min_footprint={pixels}", "model.coarse.min_footprint=4"]
+        ready = load_model(None, "da3_tiny", "vg2gt", options, where)
+        images = torch.rand(3, 3, *size, generator=torch.Generator().manual_seed(0))
+        made = reconstruct_with(ready.model, images, size=size, renderer=ready.renderer)
         (view,) = made.render(made.named_cameras()[:1])
         return len(made.gaussians), view.color
 
@@ -141,7 +149,7 @@ def test_a_reconstruction(device: str, as_on_a_gpu: Any) -> None:
 def test_a_run_from_beginning_to_end(device: str, tmp_path: Path, cache: Path, as_on_a_gpu: Any) -> None:
     """``train.py debug=fast_dev_run``; its first render, in which the kernels are checked, is an evaluation's."""
     accelerator = "gpu" if device == "cuda" else "cpu"
-    options = [*TINY, *MODEL, "debug=fast_dev_run", f"trainer.accelerator={accelerator}"]
+    options = [*sized(device), "debug=fast_dev_run", f"trainer.accelerator={accelerator}"]
     if device == "cpu":
         as_on_a_gpu()
     else:

@@ -12,6 +12,8 @@ import pytest
 import torch
 
 from vg2gt.io.files import read_json
+from vg2gt.rendering.options import RenderOptions
+from vg2gt.types import Cameras, Gaussians
 
 if importlib.util.find_spec("triton") is None:
     pytest.skip("needs triton, which has wheels for Linux on x86-64 only", allow_module_level=True)
@@ -176,3 +178,29 @@ def test_parts_run_apart_and_within_their_time(
 def only_seconds(run: Any, limits: dict[str, float], command: list[str], **options: Any) -> Any:
     """Runs a command with another limit, by the part that it measures."""
     return run(command, **{**options, "timeout": limits.get(command[3], options["timeout"])})
+
+
+def test_many_refused_slots_do_not_overflow_their_sum(benchmark_script) -> None:
+    """One bad camera seen by ten million Gaussians: with 2^40 a slot the sum was negative, and memory was asked for."""
+    from vg2gt.rendering.gpu import RefusedError, render_triton
+    from vg2gt.rendering.gpu.projection import REFUSED, SLOTS
+
+    assert SLOTS * REFUSED < 1 << 63
+    count = (1 << 23) + 5
+    one, matrix = torch.zeros(1, 3).expand(count, 3), torch.eye(4).expand(1, 1, 4, 4)
+    gaussians = Gaussians(one, torch.ones(1, 4).expand(count, 4), one, one[:, 0], one[:, None], one[:, 0].long())
+    cameras = Cameras(matrix, matrix[..., :3, :3], (8, 8))
+    with benchmark_script("gpu_kernels").recorded({"project_kernel": lambda counts, **_: counts.fill_(REFUSED)}):
+        with pytest.raises(RefusedError, match="cannot be rendered"):
+            render_triton(gaussians, cameras, torch.zeros(3), RenderOptions())
+
+
+def test_more_slots_than_can_be_numbered_are_refused(benchmark_script) -> None:
+    """A view whose Gaussians are so many; views are rendered in parts."""
+    from vg2gt.rendering.gpu.function import _list
+
+    views, count = (1 << 19) + 1, 1 << 11
+    few, matrix = torch.zeros(count, 3), torch.eye(4).expand(1, views, 4, 4)
+    tensors = (few, torch.ones(count, 4), few, few[:, 0], few[:, None], matrix, matrix[..., :3, :3], few[0])
+    with benchmark_script("gpu_kernels").recorded(), pytest.raises(ValueError, match="2048 Gaussians in 524289 views"):
+        _list((*tensors, few[:, 0].long()), (8, 8), RenderOptions(), 1)

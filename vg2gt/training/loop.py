@@ -53,10 +53,11 @@ log = logging.getLogger(__name__)
 EXPECTED_WARNINGS = (
     r"Found \d+ module\(s\) in eval mode",  # the frozen backbone
     r"You're resuming from a checkpoint that ended before the epoch",  # batches are a function of the step's number
-    r"The '\w+_dataloader' does not have many workers",  # rooms come from the memory cache
     r"It is recommended to use `self.log\('eval/",  # all ranks log the same
     r".*isinstance\(treespec, LeafSpec\)",  # inside Lightning
 )
+
+FEW_WORKERS = r"The '\w+_dataloader' does not have many workers"  # expected on a CPU, whose cores compute
 
 LOGGER_PACKAGES = {"TensorBoardLogger": "tensorboard", "WandbLogger": "wandb"}
 PRECISIONS = ("auto", "32-true", "bf16-mixed", "32", "bf16")  # the last two are Lightning's short names
@@ -86,7 +87,8 @@ def build(config: DictConfig) -> Run:
     _check_trainer(config)
     _check_loggers(config)
     lightning.seed_everything(config.seed, workers=True, verbose=False)
-    for message in EXPECTED_WARNINGS:
+    accelerator = _accelerator(config.trainer.accelerator)
+    for message in EXPECTED_WARNINGS if accelerator == "gpu" else (*EXPECTED_WARNINGS, FEW_WORKERS):
         warnings.filterwarnings("ignore", message=message)
     _quieten_lightning()
     datamodule = instantiate(config.data)
@@ -103,7 +105,6 @@ def build(config: DictConfig) -> Run:
         seed=config.seed,
     )
     module.made_of = made_of(config)
-    accelerator = _accelerator(config.trainer.accelerator)
     trainer = instantiate(
         config.trainer,
         accelerator=accelerator,
@@ -239,7 +240,7 @@ def _train(config: DictConfig, writes: bool, compiling: Compiling | None) -> dic
 
 def _first_batches(data: SceneDataModule) -> Iterator[Batch]:
     """Batches of the evaluation and of training, for what they leave on disk: rooms are kept there once made."""
-    if data.workers == 0:  # else other processes read the frames
+    if data.loader_processes == 0:  # else other processes read the frames
         yield from chain(data.val_dataloader(), data.train_dataloader())
 
 

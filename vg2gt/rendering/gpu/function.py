@@ -33,6 +33,7 @@ NEGLIGIBLE = {torch.float32: 30.0, torch.float64: 90.0}  # squared sigmas at whi
 BISECTIONS = 3  # that one visit of a tile's Gaussians amounts to
 ROW_SHARE = 64  # one part in so many of a GPU's memory is for gradient rows
 ROWS = 3_000_000  # gradient rows held at once where there is no GPU
+SLOT_SHARE, SLOT_BYTES = 8, 256  # one part in so many is for views rendered at once; a Gaussian in one, with entries
 
 
 class RefusedError(ValueError):
@@ -58,7 +59,12 @@ def render_triton(
     tensors = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
     tensors = (*tensors, cameras.world_to_camera, cameras.intrinsics, background)
     with torch.cuda.device_of(gaussians.means):  # Triton launches on the current device
-        color, normal, depth, alpha = _Render.apply(*tensors, gaussians.batch, cameras.size, options, rows)
+        some = max(1, _slots_at_once(gaussians.means.device) // max(1, len(gaussians)))
+        parts = []
+        for poses, intrinsics in zip(tensors[5].split(some, 1), tensors[6].split(some, 1), strict=True):
+            inputs = (*tensors[:5], poses, intrinsics, background, gaussians.batch, cameras.size, options, rows)
+            parts.append(_Render.apply(*inputs))
+    color, normal, depth, alpha = parts[0] if len(parts) == 1 else map(_join_views, zip(*parts, strict=True))
     return Render(color, depth, normal, alpha)
 
 
@@ -174,6 +180,17 @@ def _tiles(height: int, width: int) -> tuple[int, int]:
 
 def _degree(sh: Tensor) -> int:
     return round(sh.shape[1] ** 0.5) - 1
+
+
+def _join_views(images: tuple[Tensor, ...]) -> Tensor:
+    return torch.cat(images, 1)
+
+
+def _slots_at_once(device: torch.device) -> int:
+    """Gaussians times views that are rendered at once: views beyond wait, so that sorting does not fill the memory."""
+    if device.type != "cuda":
+        return SLOTS
+    return torch.cuda.get_device_properties(device).total_memory // (SLOT_SHARE * SLOT_BYTES)
 
 
 def _rows_at_once(device: torch.device) -> int:
