@@ -26,9 +26,9 @@ class TensorRecord:
         """Returns a copy whose tensors are ``function(tensor)``; everything else is kept."""
         return replace(self, **{f.name: _map_value(getattr(self, f.name), function) for f in fields(self)})
 
-    def to(self: Record, device: torch.device | str) -> Record:
-        """Returns a copy on ``device``."""
-        return self.map(lambda tensor: tensor.to(device))
+    def to(self: Record, device: torch.device | str, non_blocking: bool = False) -> Record:
+        """Returns a copy on ``device``; without blocking, page-locked memory is copied while the host goes on."""
+        return self.map(lambda tensor: tensor.to(device, non_blocking=non_blocking))
 
     def pin_memory(self: Record) -> Record:
         """Returns a copy in page-locked memory, from where copies to a GPU are faster."""

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import torch
 
+from vg2gt.geometry.precision import half_precision_on_gpu
 from vg2gt.memory import RECONSTRUCTION, memory_advice, note_sizes
 from vg2gt.model import Reconstructor
 from vg2gt.reconstruction.cameras import Poses, pictures_for
@@ -89,8 +90,9 @@ def reconstruct_with(
 
 def _forward(model: Reconstructor, views: Views, device: torch.device, monitor: Monitor) -> Prediction:
     hints = None if views.hints is None else views.hints.to(device)
-    with monitor.stage("reconstruct"), monitor.watching():
-        return model(views.images[None].to(device), hints)
+    images = views.images[None].to(device)
+    with monitor.stage("reconstruct"), monitor.watching(), half_precision_on_gpu(images):
+        return model(images, hints)
 
 
 def _scene(prediction: Prediction, views: Views, renderer: Renderer, is_metric: bool) -> Scene:
