@@ -63,15 +63,6 @@ def test_a_step_of_two_checkouts(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_compilation_of_two_checkouts(tmp_path: Path) -> None:
-    shown = run("compilation.py", tmp_path, "--before", str(BENCHMARKS.parent), "--passes", "1", "--out", str(tmp_path))
-    assert "processes of their own" in shown
-    (path,) = tmp_path.glob("*-compilation-before-after.json")
-    (taken,) = json.loads(path.read_text())["core_seconds"].values()
-    assert min(taken["one process"] + taken["processes of their own"]) > 1
-
-
-@pytest.mark.slow
 def test_waits_of_two_checkouts(tmp_path: Path) -> None:
     options = ("--passes", "1", "--gaussians", "500", "--out", str(tmp_path))
     shown = run("waits.py", tmp_path, "--before", str(BENCHMARKS.parent), *options)

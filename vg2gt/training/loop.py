@@ -5,10 +5,9 @@ from __future__ import annotations
 import importlib.util
 import logging
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
-from itertools import chain
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -38,14 +37,12 @@ from vg2gt.runs.checkpoints import (
 from vg2gt.runs.load import made_of, refuse_other_tokens
 from vg2gt.runs.lock import only_process_in
 from vg2gt.training.checkpoint_io import AtomicCheckpointIO
-from vg2gt.training.compilation import Compiling, compile_kernels
 from vg2gt.training.distributed import ending_together
 from vg2gt.training.module import VG2GTModule
 from vg2gt.training.notices import notices
 from vg2gt.training.preview import write_preview
 from vg2gt.training.report import comparison_table, print_comparison
 from vg2gt.training.start import WriteConfig, checkpoint_to_resume, clear, name_differences
-from vg2gt.types import Batch
 
 log = logging.getLogger(__name__)
 
@@ -157,7 +154,7 @@ def _check_trainer(config: DictConfig) -> None:
 
 
 @memory_advice(TRAINING)
-def train(config: DictConfig, compiling: Compiling | None = None) -> dict[str, Any]:
+def train(config: DictConfig) -> dict[str, Any]:
     """Runs the configuration from beginning to end.
 
     A refused start changes nothing of a run that the folder holds, and a trial (``fast_dev_run``) writes nothing.
@@ -167,7 +164,6 @@ def train(config: DictConfig, compiling: Compiling | None = None) -> dict[str, A
 
     Args:
         config: of the training.
-        compiling: the processes of ``begin_compiling``, if kernels are being compiled already.
 
     Returns:
         The content of ``metrics.json``.
@@ -181,10 +177,10 @@ def train(config: DictConfig, compiling: Compiling | None = None) -> dict[str, A
     """
     writes = rank_zero_only.rank == 0 and not config.trainer.get("fast_dev_run")
     with only_process_in(config.output_dir) if writes else nullcontext():
-        return _train(config, writes, compiling)
+        return _train(config, writes)
 
 
-def _train(config: DictConfig, writes: bool, compiling: Compiling | None) -> dict[str, Any]:
+def _train(config: DictConfig, writes: bool) -> dict[str, Any]:
     """:func:`train` in a folder that is this process's own; ``writes``: by this process, and not a trial."""
     checkpoint = checkpoint_to_resume(config)
     for notice in notices(config) if rank_zero_only.rank == 0 else ():
@@ -219,9 +215,6 @@ def _train(config: DictConfig, writes: bool, compiling: Compiling | None) -> dic
 
         log.info("the run's folder is %s; it computes on %s", run.folder, run.trainer.strategy.root_device)
 
-    data, on_cpu = run.datamodule, run.trainer.strategy.root_device.type == "cpu"
-    if writes and not run.trial and on_cpu and isinstance(data, SceneDataModule):
-        compile_kernels(run.module.renderer, lambda: _first_step(run.module, data), compiling, _first_batches(data))
     with ending_together(run.trainer):
         untrained = _untrained_metrics(run, resumed=checkpoint is not None)
         run.trainer.fit(run.module, datamodule=run.datamodule, ckpt_path=checkpoint, weights_only=True)
@@ -232,27 +225,6 @@ def _train(config: DictConfig, writes: bool, compiling: Compiling | None) -> dic
         log.info("evaluating the trained model")
         trained = evaluate(run)
         return _report(run, untrained, trained)
-
-
-def _first_batches(data: SceneDataModule) -> Iterator[Batch]:
-    """Batches of the evaluation and of training, for what they leave on disk: rooms are kept there once made."""
-    if data.workers == 0:  # else other processes read the frames
-        yield from chain(data.val_dataloader(), data.train_dataloader())
-
-
-def _first_step(module: VG2GTModule, data: SceneDataModule) -> Callable[[], torch.Tensor]:
-    """A training step up to its loss, outside the trainer's loop: of three views, which run what many do."""
-    loader = data.train_dataloader()
-    batch: Batch = loader.dataset[next(iter(loader.sampler))]  # without the loader's workers, which a fork disturbs
-    batch = batch.single(0)
-    few = batch.views(slice(max(batch.num_context - 2, 0), batch.num_context + 1))
-    batch = replace(few, num_context=min(batch.num_context, 2))
-
-    def step() -> torch.Tensor:
-        module.model.token_cache = None  # these views do not come again; the step is another process's
-        return module.training_step(batch, 0)
-
-    return step
 
 
 def _save_last(run: Run) -> None:
