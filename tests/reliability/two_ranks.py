@@ -88,7 +88,7 @@ def faulty_rank(folder: Path, cache: Path) -> dict[str, Any]:
         batches[1].images[0, 0] = float("nan")
     audit = fit(run, batches)
     audit.assert_sound()
-    return {"weights": weights(run), "dropped": audit.skipped, "faults": run.module.skipped.summary()["faults"]}
+    return {"weights": weights(run), "dropped": audit.skipped, "faults": run.module.skipped.state_dict()["faults"]}
 
 
 def three_scenes(folder: Path, cache: Path, *overrides: str) -> dict[str, Any]:

@@ -39,7 +39,6 @@ from vg2gt.runs.lock import only_process_in
 from vg2gt.training.checkpoint_io import AtomicCheckpointIO
 from vg2gt.training.distributed import ending_together
 from vg2gt.training.module import VG2GTModule
-from vg2gt.training.notices import notices
 from vg2gt.training.preview import write_preview
 from vg2gt.training.report import comparison_table, print_comparison
 from vg2gt.training.start import WriteConfig, checkpoint_to_resume, clear, name_differences
@@ -183,8 +182,6 @@ def train(config: DictConfig) -> dict[str, Any]:
 def _train(config: DictConfig, writes: bool) -> dict[str, Any]:
     """:func:`train` in a folder that is this process's own; ``writes``: by this process, and not a trial."""
     checkpoint = checkpoint_to_resume(config)
-    for notice in notices(config) if rank_zero_only.rank == 0 else ():
-        log.warning(notice)
     run = build(config)
     if isinstance(run.datamodule, SceneDataModule):
         run.datamodule.setup("fit")  # before anything is measured: faults of the data are named first
@@ -259,7 +256,7 @@ def _report(run: Run, untrained: dict[str, float], trained: dict[str, float]) ->
         "untrained": untrained,
         "trained": trained,
         "steps": run.trainer.global_step,
-        "skipped_steps": run.module.skipped.summary(),
+        "skipped_steps": run.module.skipped.state_dict(),
     }
     if run.trainer.is_global_zero and not run.trial:
         write_json(run.folder / "metrics.json", report)
