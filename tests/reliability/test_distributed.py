@@ -19,9 +19,9 @@ from tests.reliability.degenerate import SCENES
 from tests.reliability.steps import TINY, first_batches, tiny_run
 from tests.training_helpers import SMALL
 from vg2gt.losses import EnhancementLoss, GaussianLoss, ScaleAlignment, VG2GTLoss
-from vg2gt.training.callbacks import StopOnSignal
 from vg2gt.training.distributed import interleave
 from vg2gt.training.loop import Run
+from vg2gt.training.stop_on_signal import StopOnSignal
 from vg2gt.types import Batch
 
 # --------------------------------------------------------------------------------------------- scenes count alike

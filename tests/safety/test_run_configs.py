@@ -44,7 +44,7 @@ ATTACKS: dict[str, Attack] = {
     "a function of ours": lambda c: {"_target_": "vg2gt.io.files.write_text", "path": c, "content": ""},
     "training": lambda c: {"_target_": "vg2gt.training.loop.train", "config": {"output_dir": c}},
     "a method of ours": lambda c: {"_target_": "backends.bundle.Description.write", "folder": c},
-    "a class that writes": lambda c: {"_target_": "vg2gt.training.callbacks.NewestCheckpoints", "dirpath": c},
+    "a class that writes": lambda c: {"_target_": "vg2gt.training.stop_on_signal.StopOnSignal", "folder": c},
     "almost ours": lambda c: {"_target_": "vg2gt_evil.Backend", "path": c},
     "no name": lambda c: {"_target_": ["os", "system"], "path": c},
     "a list": lambda c: [{"_target_": "os.mkdir", "path": c}],  # pyright: ignore[reportAssignmentType]
