@@ -1,22 +1,17 @@
 """Archives that would fill memory, lead elsewhere, or claim more than they hold."""
 
 import io
-import json
 import logging
-import tarfile
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 from tests.safety.conftest import SIZE
-from vg2gt.data import DataError, ShardedScenes, SyntheticScenes
-from vg2gt.data.sharded_scenes import INDEX
+from vg2gt.data import DataError, SyntheticScenes
 from vg2gt.io.arrays import load_npy
 from vg2gt.io.errors import FormatError
 from vg2gt.io.npz import load_npz, read_npz
@@ -131,135 +126,6 @@ def test_a_tensor_longer_than_its_record_is_refused(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(torch, "load", lambda *_, **__: whole)
     with pytest.raises(ValueError, match=r"short\.pt is damaged: a tensor of 396 bytes has a record of another length"):
         read_torch(tmp_path / "short.pt")
-
-
-def edited_index(folder: Path, change: Callable[[dict[str, Any], dict[str, Any]], None]) -> None:
-    with np.load(folder / INDEX) as stored:
-        arrays = dict(stored)
-    meta = json.loads(str(arrays["meta"]))
-    change(arrays, meta)
-    arrays["meta"] = np.array(json.dumps(meta))
-    np.savez(folder / INDEX, **arrays)
-
-
-def put(name: str, value: Any) -> Callable[[dict[str, Any], dict[str, Any]], None]:
-    def change(arrays: dict[str, Any], meta: dict[str, Any]) -> None:
-        arrays[name] = np.broadcast_to(np.asarray(value, arrays[name].dtype), arrays[name].shape).copy()
-
-    return change
-
-
-def scene_of(meta: dict[str, Any]) -> dict[str, Any]:
-    return next(iter(meta["scenes"].values()))
-
-
-INDICES: dict[str, Callable[[dict[str, Any], dict[str, Any]], Any]] = {
-    "huge image": put("image", [0, 1 << 60]),
-    "large image": put("image", [0, 8 << 30]),
-    "negative offset": put("image", [-(1 << 40), 100]),
-    "negative length": put("depth", [0, -5]),
-    "far depth": put("depth", [1 << 60, 100]),
-    "shard of no name": put("shard", -1),
-    "other shapes": lambda arrays, meta: arrays.update(image=arrays["image"].reshape(-1)),
-    "no numbers": lambda arrays, meta: arrays.update(intrinsics=np.array(["x"] * len(arrays["image"]))),
-    "a single number": lambda arrays, meta: arrays.update(frame_ids=np.array(1)),
-    "huge rows": lambda arrays, meta: scene_of(meta).update(rows=[0, 1 << 60]),
-    "rows of a name": lambda arrays, meta: scene_of(meta).update(rows=["..", "/"]),
-    "no scenes": lambda arrays, meta: meta.update(scenes=["../../etc"]),
-    "no place": lambda arrays, meta: scene_of(meta).pop("place"),
-    "other version": lambda arrays, meta: meta.update(version=2),
-}
-
-
-@pytest.mark.parametrize("name", INDICES)
-def test_shard_indices_that_do_not_fit(write_shards_to, tmp_path: Path, name: str) -> None:
-    folder = write_shards_to(tmp_path / "shards")
-    edited_index(folder, INDICES[name])
-    with pytest.raises(DataError, match=r"index\.npz is (damaged|of version)"):
-        ShardedScenes(str(folder))
-
-
-MEMBERS = {
-    "parent folder": {"name": "../../escaped.png"},
-    "absolute": {"name": "/tmp/escaped.png"},
-    "symlink": {"type": tarfile.SYMTYPE, "linkname": "/etc/passwd"},
-    "hard link": {"type": tarfile.LNKTYPE, "linkname": "/etc/passwd"},
-    "device": {"type": tarfile.CHRTYPE, "devmajor": 1, "devminor": 5},
-    "fifo": {"type": tarfile.FIFOTYPE},
-    "huge size": {"size": 1 << 60},
-}
-
-
-@pytest.mark.parametrize("name", MEMBERS)
-def test_members_of_shards_are_ranges_of_bytes(write_shards_to, tmp_path: Path, name: str) -> None:
-    """Whatever the tar file's own headers say: nothing is extracted, no link is followed."""
-    folder = write_shards_to(tmp_path / "inner" / "shards")
-    (shard,) = folder.glob("*.tar")
-    info = tarfile.TarInfo("room/00000000.png")
-    for field, value in MEMBERS[name].items():
-        setattr(info, field, value)
-    shard.write_bytes(info.tobuf(tarfile.GNU_FORMAT) + shard.read_bytes()[512:])
-    before = sorted(tmp_path.rglob("*"))
-    shards = ShardedScenes(str(folder))
-    scene = shards.scenes[0]
-    assert shards.load(scene, shards.frames(scene)).images.shape[0] == 3
-    edited_index(folder, put("image", [0, 512]))  # the header in place of the image
-    shards = ShardedScenes(str(folder))
-    with pytest.raises(DataError, match=r"cannot read frame 0 of scene .* in .*shard-000000\.tar"):
-        shards.load(scene, [0])
-    assert sorted(tmp_path.rglob("*")) == before
-
-
-def png(size: tuple[int, int]) -> bytes:
-    """A black image; zeros compress a thousandfold."""
-    buffer = io.BytesIO()
-    Image.new("1", size).save(buffer, "PNG")
-    return buffer.getvalue()
-
-
-def test_bombs_in_shards(write_shards_to, tmp_path: Path, bomb: bytes) -> None:
-    folder = write_shards_to(tmp_path / "shards")
-    (shard,) = folder.glob("*.tar")
-    good = ShardedScenes(str(folder))
-    offset, length = good._arrays["image"][0].tolist()
-    image = shard.read_bytes()[offset : offset + length]
-    for picture, depth, said in (
-        (image, bomb, "unpack to"),
-        (png((20_000, 20_000)), bomb, "exceeds limit"),
-        (b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n", bomb, "cannot identify"),
-        (image, b"", "no readable archive"),
-    ):
-        shard.write_bytes(picture + depth)
-
-        def change(arrays: dict[str, Any], meta: dict[str, Any], picture=picture, depth=depth) -> None:
-            put("image", [0, len(picture)])(arrays, meta)
-            put("depth", [len(picture), len(depth)])(arrays, meta)
-
-        edited_index(folder, change)
-        shards = ShardedScenes(str(folder))
-        with pytest.raises(DataError, match=rf"cannot read frame .*{said}"):
-            shards.load(shards.scenes[0], [0])
-
-
-@pytest.mark.parametrize(
-    ("root", "options"),
-    [
-        ("reference://x", {"fo": {"version": 1, "templates": {"u": "{{ cycler.__init__ }}"}}}),
-        ("simplecache::reference://x", {}),
-        ("filecache::http://127.0.0.1/x", {}),
-        ("zip://x::file:///tmp/a.zip", {}),
-        ("ssh://127.0.0.1/x", {}),
-        ("smb://127.0.0.1/x", {}),
-        ("git://x", {}),
-        ("jupyter://127.0.0.1/x", {}),
-        ("dask://x", {}),
-        ("libarchive://x", {}),
-        ("/tmp", {"protocol": "reference"}),
-    ],
-)
-def test_addresses_that_lead_on_are_refused(root: str, options: dict[str, Any]) -> None:
-    with pytest.raises(DataError, match="shards are not read from"):
-        ShardedScenes(root, storage_options=options)
 
 
 def test_a_bomb_in_the_cache_of_rooms(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -69,7 +69,7 @@ COMMANDS = {
     ),
     "data": Command(
         "vg2gt.cli.data:main",
-        "makes scenes, shards, splits and lists of views",
+        "makes scenes, splits and lists of views",
         "vg2gt data synthetic out=rooms scenes=100",
     ),
     "curves": Command(
@@ -89,11 +89,6 @@ DATA_COMMANDS = {
         "vg2gt.cli.data:synthetic",
         "writes procedural rooms and streets as RGB-D recordings",
         "vg2gt data synthetic out=rooms scenes=100",
-    ),
-    "shards": Command(
-        "vg2gt.cli.data:shards",
-        "writes a dataset as a few large tar files",
-        "vg2gt data shards out=shards/train data=rgbd data.root=RECORDINGS",
     ),
     "splits": Command(
         "vg2gt.cli.data:splits",
