@@ -1,4 +1,4 @@
-"""Trains the plane sweep: ``python -m backends.sweep.recipe [key=value ...]``; options in ``train.yaml``."""
+"""Trains the plane sweep: ``python -m recipes.sweep [key=value ...]``; options in ``train.yaml``."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from lightning.pytorch.strategies import DDPStrategy
 from omegaconf import DictConfig
 from torch.utils.data import DataLoader, Subset
 
-from backends.sweep.recipe.module import SweepTraining
-from backends.sweep.recipe.samples import TrainingSamples
-from backends.sweep.recipe.scenes import make_scenes
-from backends.sweep.recipe.weights import begin_with, newest_checkpoint, start_step, write_weights
+from recipes.sweep.module import SweepTraining
+from recipes.sweep.samples import TrainingSamples
+from recipes.sweep.scenes import make_scenes
+from recipes.sweep.weights import begin_with, newest_checkpoint, start_step, write_weights
 
 
 @hydra.main(config_path=".", config_name="train", version_base="1.3")

@@ -7,8 +7,8 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from backends.sweep.network import Sweep, SweepEncoding
-from backends.sweep.recipe.samples import Sample
 from backends.sweep.volume import from_inverse
+from recipes.sweep.samples import Sample
 
 _CLAMP = 2.0  # log-depth errors beyond it do not count more
 WEIGHTS = {"depth": 2.0, "uncertainty": 0.15, "gradient": 1.0, "planes": 0.4, "position": 2.0, "swept": 1.0}

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn import functional as F
 from torch.utils.data import Dataset
 
-from backends.sweep.recipe.scenes import SceneFrames, read_scene
+from recipes.sweep.scenes import SceneFrames, read_scene
 from vg2gt.geometry.cameras import crop_intrinsics, resize_intrinsics, rigid_motions
 
 _SIZES = ((80, 160), (112, 224), (112, 144))

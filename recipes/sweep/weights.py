@@ -9,7 +9,7 @@ from omegaconf import DictConfig
 from safetensors import safe_open
 from safetensors.torch import save
 
-from backends.sweep.recipe.module import SweepTraining
+from recipes.sweep.module import SweepTraining
 from vg2gt.io.files import write_bytes
 
 
