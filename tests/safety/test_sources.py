@@ -29,7 +29,6 @@ NEEDED = {  # call: keyword with its only value
 }
 ALLOWED = {  # file: what it may call nevertheless, because there it is made safe
     "vg2gt/io/images.py": {"Image.open"},
-    "benchmarks/data_loading.py": {"Image.open"},  # its own pictures
     "vg2gt/runs/trust.py": {"OmegaConf.load"},
     "vg2gt/io/compiled_files.py": {"pickle.loads"},  # files of this user's or the administrator's only
 }
