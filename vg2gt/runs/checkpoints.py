@@ -17,7 +17,6 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from vg2gt.io.files import flush_folder, flush_to_disk, write_bytes
-from vg2gt.io.tensors import load_plain, refuse_foreign
 
 log = logging.getLogger(__name__)
 
@@ -64,9 +63,8 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     if path.suffix == SLIM:
         return _read_slim(path)
     try:
-        refuse_foreign(path)
         _verify_checksums(path)
-        content = load_plain(path)
+        content = torch.load(path, map_location="cpu", weights_only=True)
         if not isinstance(content, dict):
             raise ValueError(f"it holds a {type(content).__name__}")
     except Exception as error:  # there is no end to what readers raise over damaged bytes
