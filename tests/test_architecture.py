@@ -133,3 +133,13 @@ import vg2gt.reconstruction, vg2gt.reconstruction.outputs
 assert "lightning" not in sys.modules
 """
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_training_imports_little_of_the_project() -> None:
+    """Someone who changes the training has this much to read at most: no reader of data, no format."""
+    code = """
+import sys, vg2gt.training.module
+ours = [name for name in sys.modules if name.split(".")[0] in ("vg2gt", "backends")]
+assert len(ours) <= 120, len(ours)
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)

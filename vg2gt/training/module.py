@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
-from vg2gt.evaluation import evaluate_scene
+from vg2gt.evaluation.in_training import evaluate_scene
 from vg2gt.evaluation.protocols import training_cameras
 from vg2gt.losses import LossReport
 from vg2gt.memory import dropped_by
