@@ -23,7 +23,7 @@ from vg2gt.runs.checkpoints import (
     read_checkpoint,
     write_checkpoint,
 )
-from vg2gt.training.checkpoint_io import AtomicCheckpointIO
+from vg2gt.training.checkpointing import AtomicCheckpointIO
 from vg2gt.training.start import prepare_folder
 
 

@@ -23,7 +23,7 @@ from vg2gt.io.tensors import read_tensors
 from vg2gt.metrics.lpips import load_lpips
 from vg2gt.runs.checkpoints import initialize_from, read_checkpoint
 from vg2gt.runs.load import load_model
-from vg2gt.training.checkpoint_io import AtomicCheckpointIO
+from vg2gt.training.checkpointing import AtomicCheckpointIO
 
 
 def zipped(armed: Armed) -> bytes:

@@ -29,7 +29,7 @@ from vg2gt.memory import TRAINING, memory_advice
 from vg2gt.runs.checkpoints import newest_valid
 from vg2gt.runs.load import made_of
 from vg2gt.runs.lock import only_process_in
-from vg2gt.training.checkpoint_io import AtomicCheckpointIO
+from vg2gt.training.checkpointing import AtomicCheckpointIO
 from vg2gt.training.distributed import ending_together
 from vg2gt.training.module import VG2GTModule
 from vg2gt.training.preview import write_preview

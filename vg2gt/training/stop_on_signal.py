@@ -55,7 +55,8 @@ class StopOnSignal(lightning.Callback):
         log.warning("stopping as asked by a signal: saved %s, continue with ckpt=last", path)
 
     def teardown(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, stage: str) -> None:
-        """Gives the signals back, after an error as well."""
+        """Gives back the signals that Lightning has not given back itself, after an error as well."""
         for number, handler in self._previous.items():
-            signal.signal(number, handler)
+            if signal.getsignal(number) == self._note:
+                signal.signal(number, handler)
         self._previous = {}
