@@ -45,7 +45,7 @@ def write_checkpoint(checkpoint: Mapping[str, Any], path: str | Path) -> None:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
         raise OSError(
-            f"checkpoint {target} could not be written, is the disk full? ({error}); earlier checkpoints are intact: "
+            f"checkpoint {target} could not be written ({error}; is the disk full?); earlier checkpoints are intact: "
             "make room and continue with ckpt=last"
         ) from error
 

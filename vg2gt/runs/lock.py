@@ -16,12 +16,13 @@ def only_process_in(folder: str | Path) -> Iterator[None]:
     """Holds a folder for this process; the lock ends with the process, however it ends.
 
     Args:
-        folder: made if needed, and removed at the end if nothing was written to it.
+        folder: made if needed, and then removed at the end if nothing was written to it.
 
     Raises:
         BlockingIOError: if another process holds the folder.
     """
     folder = Path(folder)
+    new = not folder.exists()
     folder.mkdir(parents=True, exist_ok=True)
     lock = FileLock(folder / NAME)
     try:
@@ -37,5 +38,6 @@ def only_process_in(folder: str | Path) -> Iterator[None]:
     finally:
         (folder / NAME).unlink(missing_ok=True)
         lock.release()
-        with suppress(OSError):  # it holds something
-            folder.rmdir()
+        if new:
+            with suppress(OSError):  # it holds something
+                folder.rmdir()
