@@ -190,9 +190,9 @@ def test_many_refused_slots_do_not_overflow_their_sum(benchmark_script) -> None:
     one, matrix = torch.zeros(1, 3).expand(count, 3), torch.eye(4).expand(1, 1, 4, 4)
     gaussians = Gaussians(one, torch.ones(1, 4).expand(count, 4), one, one[:, 0], one[:, None], one[:, 0].long())
     cameras = Cameras(matrix, matrix[..., :3, :3], (8, 8))
-    with benchmark_script("gpu_kernels").recorded({"project_kernel": lambda counts, **_: counts.fill_(REFUSED)}):
-        with pytest.raises(RefusedError, match="cannot be rendered"):
-            render_triton(gaussians, cameras, torch.zeros(3), RenderOptions())
+    recorded = benchmark_script("gpu_kernels").recorded({"project_kernel": lambda counts, **_: counts.fill_(REFUSED)})
+    with recorded, pytest.raises(RefusedError, match="cannot be rendered"):
+        render_triton(gaussians, cameras, torch.zeros(3), RenderOptions())
 
 
 def test_more_slots_than_can_be_numbered_are_refused(benchmark_script) -> None:

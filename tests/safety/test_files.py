@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from examples.data_sets.tum import TUM
 from vg2gt.data import DataError
-from vg2gt.data.sources import COLMAP, TUM, Nerfstudio
+from vg2gt.data.sources import COLMAP, Nerfstudio
 from vg2gt.data.sources.parsing import read_numbers
 from vg2gt.io import (
     FormatError,

@@ -110,12 +110,6 @@ class GaussianLoss:
             "normal": self._normal(rendered, cameras, targets, hits, trust),
         }
 
-    @property
-    def weighted(self) -> tuple[str, ...]:
-        """Names of the terms that have a weight."""
-        names = ("color_l1", "ssim", "depth_consistency", "depth_gt", "normal")
-        return tuple(name for name in names if self.weight * getattr(self, name))
-
     def total(self, terms: dict[str, Tensor]) -> Tensor:
         """The weighted sum of the terms."""
         return self.weight * torch.stack([getattr(self, name) * value for name, value in terms.items()]).sum()

@@ -93,12 +93,6 @@ class VG2GTLoss(nn.Module):
         self.gaussian = gaussian or GaussianLoss()
         self.align = align or ScaleAlignment()
 
-    @property
-    def weighted(self) -> tuple[str, ...]:
-        """Names of the terms of a report that have a weight and may be zero: hinges and those of rendered views."""
-        hinges = ("enhance_depth", "enhance_point") if self.enhance.weight else ()
-        return hinges + self.gaussian.weighted
-
     def forward(
         self,
         prediction: Decoded,

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import fnmatch
 import hashlib
-import inspect
 import json
 import logging
 from abc import abstractmethod
 from collections import Counter, OrderedDict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, TypedDict
+from typing import ClassVar, TypedDict
 
 import numpy as np
 import torch
@@ -84,21 +83,6 @@ class FileSource(SceneSource):
     """Stored depth that means none, beside 0."""
     depth_remedy: ClassVar[str] = "correct the depth unit and the values that mean 'invalid'"
     """What to do where a frame has no valid depth, for messages."""
-
-    __signature__: ClassVar[inspect.Signature]
-
-    def __init_subclass__(cls, **options: Any) -> None:
-        """Names the shared arguments in the signature of a constructor that hands them on: it is the YAML's schema."""
-        super().__init_subclass__(**options)
-        parameters = list(inspect.signature(cls.__init__).parameters.values())[1:]
-        own = [parameter for parameter in parameters if parameter.kind is not parameter.VAR_KEYWORD]
-        if len(own) < len(parameters):
-            shared = list(inspect.signature(FileSource.__init__).parameters.values())[1:]
-            names = {parameter.name for parameter in own}
-            more = [
-                parameter.replace(kind=parameter.KEYWORD_ONLY) for parameter in shared if parameter.name not in names
-            ]
-            cls.__signature__ = inspect.Signature([*own, *more])
 
     def __init__(
         self,
