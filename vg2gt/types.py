@@ -85,6 +85,7 @@ class Hints(TensorRecord):
         frame_ids: ``[B, V]`` int64 frame numbers; seed simulated noise.
         depth_range: ``[B, 2]`` z-depth (near, far) between which nearly all of what the views see lies, such as sparse
             points of structure from motion tell, in the unit of the cameras' translations; None if unknown.
+        mask: ``[B, V, H, W]`` in [0, 1], how much each pixel counts (alpha, mask images); None: all count.
     """
 
     depth: Tensor | None = None
@@ -92,6 +93,7 @@ class Hints(TensorRecord):
     scene_key: tuple[str, ...] = ()
     frame_ids: Tensor | None = None
     depth_range: Tensor | None = None
+    mask: Tensor | None = None
 
 
 @dataclass(frozen=True)
