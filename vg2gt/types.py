@@ -108,6 +108,7 @@ class Batch(TensorRecord):
         frame_ids: ``[B, V]`` int64.
         scene: one name a scene.
         num_context: number of input views, 1 <= num_context <= V.
+        mask: ``[B, V, H, W]`` in [0, 1], how much each pixel counts (alpha, mask images); None: all count.
     """
 
     images: Tensor
@@ -117,6 +118,7 @@ class Batch(TensorRecord):
     frame_ids: Tensor
     scene: tuple[str, ...]
     num_context: int
+    mask: Tensor | None = None
 
     def views(self, views: slice) -> Batch:
         """Returns the batch restricted to a slice of its views, all of them counted as context."""
@@ -129,6 +131,7 @@ class Batch(TensorRecord):
             self.frame_ids[:, views],
             self.scene,
             images.shape[1],
+            None if self.mask is None else self.mask[:, views],
         )
 
     def single(self, index: int) -> Batch:
@@ -142,6 +145,7 @@ class Batch(TensorRecord):
             self.frame_ids[rows],
             self.scene[rows],
             self.num_context,
+            None if self.mask is None else self.mask[rows],
         )
 
     @property
@@ -157,7 +161,7 @@ class Batch(TensorRecord):
     @property
     def hints(self) -> Hints:
         """What a backend may be told about all views of this batch."""
-        return Hints(self.depth, self.cameras, self.scene, self.frame_ids)
+        return Hints(self.depth, self.cameras, self.scene, self.frame_ids, mask=self.mask)
 
 
 @dataclass(frozen=True)

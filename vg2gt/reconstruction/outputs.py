@@ -226,10 +226,13 @@ def _images(scene: Scene, target: Path) -> None:
 
 
 def _views(scene: Scene, path: Path) -> None:
-    """``images [V, H, W, 3]`` uint8, ``depth`` and ``depth_conf [V, H, W]`` float32."""
+    """``images [V, H, W, 3]`` uint8; ``depth``, ``depth_conf`` and, if not all pixels count, ``mask [V, H, W]`` float32."""
     buffer = io.BytesIO()
     images = np.stack([to_pixels(image) for image in scene.images])
-    np.savez_compressed(buffer, images=images, depth=scene.depth.numpy(), depth_conf=scene.depth_conf.numpy())
+    arrays = {"images": images, "depth": scene.depth.numpy(), "depth_conf": scene.depth_conf.numpy()}
+    if scene.mask is not None:
+        arrays["mask"] = scene.mask.numpy()
+    np.savez_compressed(buffer, **arrays)  # pyright: ignore[reportArgumentType]
     write_bytes(path, buffer.getvalue())
 
 
