@@ -203,6 +203,10 @@ class Geometry(TensorRecord):
     cameras: Cameras
     scale: Tensor
 
+    def where(self, keep: Tensor | None) -> Geometry:
+        """The geometry without depth (0) where ``keep`` ``[B, V, H, W]`` is false; None keeps all."""
+        return self if keep is None else replace(self, depth=torch.where(keep, self.depth, 0.0))
+
 
 @dataclass(frozen=True)
 class VoxelMoments(TensorRecord):
@@ -334,7 +338,14 @@ class Prediction(Decoded):
     Attributes:
         voxels: refined fine voxels; None for models that split no voxels.
         gaussians: the Gaussian scene.
+        supported: ``[B, V, H, W]`` bool, pixels whose depth the scene is made of; None: all that have one.
     """
 
     voxels: Voxels | None
     gaussians: Gaussians
+    supported: Tensor | None = None
+
+    @property
+    def surface(self) -> Geometry:
+        """The geometry with depth only where the scene is made of it."""
+        return self.geometry.where(self.supported)

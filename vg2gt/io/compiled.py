@@ -37,6 +37,7 @@ ROOMS = (
     "vg2gt/rendering",
     "vg2gt/losses",
     "vg2gt/voxels",
+    "vg2gt/visibility",
     "vg2gt/data/synthetic",
     "vg2gt/data/sources",
     "backends/sweep",

@@ -226,7 +226,7 @@ def _images(scene: Scene, target: Path) -> None:
 
 
 def _views(scene: Scene, path: Path) -> None:
-    """``images [V, H, W, 3]`` uint8; ``depth``, ``depth_conf`` and, if not all pixels count, ``mask [V, H, W]`` float32."""
+    """``images [V, H, W, 3]`` uint8; ``depth``, ``depth_conf`` and, where there is one, ``mask [V, H, W]`` float32."""
     buffer = io.BytesIO()
     images = np.stack([to_pixels(image) for image in scene.images])
     arrays = {"images": images, "depth": scene.depth.numpy(), "depth_conf": scene.depth_conf.numpy()}

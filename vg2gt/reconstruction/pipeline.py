@@ -100,7 +100,7 @@ def _forward(model: Reconstructor, views: Views, device: torch.device, monitor: 
 
 
 def _scene(prediction: Prediction, views: Views, renderer: Renderer, is_metric: bool, wanted: FrameName) -> Scene:
-    geometry = prediction.geometry.detach()
+    geometry = prediction.surface.detach()
     source = views.pictures[0].source
     kind = "predicted" if not source else "found" if source.startswith(SFM_SOURCE) else "given"
     check_frame(wanted, kind)

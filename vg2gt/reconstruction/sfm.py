@@ -262,7 +262,8 @@ def _map(work: Path, count: int, monitor: Monitor) -> Reconstruction | None:
             options=_mapping_options(),
             next_image_callback=lambda: advance() if next(expected, None) is not None else None,
         )
-    return max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
+    sound = [model for model in models.values() if model.num_points3D() and model.num_reg_images() > 1]
+    return max(sound, key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
 
 
 def _mapping_options() -> IncrementalPipelineOptions:
