@@ -50,6 +50,7 @@ def parser() -> argparse.ArgumentParser:
     add("--frames", type=int, default=ORBIT_FRAMES, metavar="N", help=f"length of the orbit, default {ORBIT_FRAMES}")
     add("--mesh-voxel", type=float, metavar="X", help="edge of the mesh's voxels in scene units")
     add("--device", default="auto", help="auto, cpu, cuda, cuda:N")
+    add("--skip-damaged", action="store_true", help="go on without images that cannot be read")
     add("--overwrite", action="store_true", help="replace outputs that are there")
     add("--quiet", action="store_true", help="no progress bars")
     return arguments
@@ -95,7 +96,7 @@ def run(options: argparse.Namespace) -> None:
         existing_path(item)
     if getattr(backend_class(options.ckpt, options.backend), "needs_depth", False):
         check_depth((options.backend or "of the checkpoint").partition(",")[0], options.images)
-    check_pictures(options.images)
+    check_pictures(options.images, options.skip_damaged)
     if options.poses == "sfm" and not (Path(options.out) / SFM).exists():
         require_pycolmap()
     if "orbit.mp4" in options.save:
@@ -114,6 +115,7 @@ def run(options: argparse.Namespace) -> None:
             poses=options.poses,
             sfm_folder=Path(options.out) / SFM,
             frame=options.frame,
+            skip_damaged=options.skip_damaged,
         )
         if how is not None:
             scene = refine_scene(scene, how, monitor)

@@ -29,8 +29,8 @@ class SceneFrame:
     """Where a scene's world is in the world of the cameras that it was made of.
 
     Attributes:
-        name: ``first`` (camera of the first view, median depth about 1), ``upright`` (the same, y along gravity) or
-            ``given``.
+        name: ``reference`` (camera of the view that the model took for its first, median depth about 1), ``first``
+            (that of the first image), ``upright`` (the reference's, turned until y points along gravity) or ``given``.
         to_source: ``[4, 4]`` float64 similarity from the scene's world to that of the cameras as they were given, found
             or predicted; its scale is source units per scene unit.
         poses: ``[V, 4, 4]`` float64 ``world_to_camera`` as given or found; None where the backbone predicted them.
@@ -72,7 +72,7 @@ def check_frame(wanted: str, source: str | None = None) -> None:
 def first_frame(
     cameras: Cameras, unit: float, poses: NDArray[np.float64] | None, source: str, wanted: FrameName
 ) -> SceneFrame:
-    """The frame of a new scene, whose world is its first camera's.
+    """The frame of a new scene, whose world is the camera of one of its views.
 
     Args:
         cameras: the scene's (B = 1).
@@ -83,11 +83,11 @@ def first_frame(
     """
     scaled = np.diag([1 / unit, 1 / unit, 1 / unit, 1.0])
     if poses is None:
-        return SceneFrame("first", scaled, None, source, wanted)
+        return SceneFrame("reference", scaled, None, source, wanted)
     own = replace(cameras, world_to_camera=cameras.world_to_camera.detach().cpu().double())
     given = replace(own, world_to_camera=torch.from_numpy(poses)[None])
     return SceneFrame(
-        "first", _matrix(align_cameras(own, given, lambda: torch.tensor([1 / unit]))), poses, source, wanted
+        "reference", _matrix(align_cameras(own, given, lambda: torch.tensor([1 / unit]))), poses, source, wanted
     )
 
 
@@ -102,7 +102,9 @@ def move_to_target(frame: SceneFrame, cameras: Cameras, depth: float) -> tuple[S
     move = np.eye(4)
     if frame.target == "given":
         move = _near_origin(frame.to_source.copy(), frame.scale * depth)
-    elif frame.target == "upright" and frame.name == "first":
+    elif frame.target == "first":
+        move = cameras.world_to_camera[0, 0].detach().cpu().double().numpy()
+    elif frame.target == "upright":
         move[:3, :3] = upright_rotation(cameras.world_to_camera[0].detach().cpu().double().numpy())
     return replace(frame, name=frame.target, to_source=frame.to_source @ np.linalg.inv(move)), _similarity(move)
 

@@ -159,12 +159,12 @@ def _given(folder: Path, depth: bool) -> list[Picture] | None:
 def _places(folder: Path) -> Iterator[tuple[Path, str, bool]]:
     """Folders where the cameras of a folder's images may be, the images as seen from there, whether they must fit."""
     inside = image_folders(folder) if folder.is_dir() else []
+    if (folder / "dense" / "images").is_dir() and not inside:  # a workspace without its distorted originals
+        yield folder / "dense", "images", True
     yield folder, inside[0].name if inside else ".", True
     above = folder.resolve().parent
     if folder.is_dir():
         yield above, folder.resolve().name, is_image_folder(folder.name)
-    if (folder / "dense" / "images").is_dir():
-        yield folder / "dense", "images", True
 
 
 def _pictures_of(place: Path, images: str, depth: bool) -> list[Picture] | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib.util
 import logging
 import math
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageOps
 from torch import Tensor
 
-from vg2gt.data.base import Frames
+from vg2gt.data.base import DataError, Frames
 from vg2gt.data.sources.masks import FOLDER as MASKS
 from vg2gt.data.sources.masks import joined_masks, mask_of, resized_mask
 from vg2gt.data.sources.parsing import IMAGE_SUFFIXES
@@ -38,6 +39,7 @@ _HOLDS_PICTURES = (*IMAGE_SUFFIXES, *HEIC_SUFFIXES, R3D)
 VIDEO_FRAMES = 32  # taken from a video when nobody says how many
 IMAGE_FOLDERS = ("images", "color", "rgb", "image", "input")
 _NO_PHOTOGRAPHS = ("masks", "depth", "depths", "color", "normals", "sfm", "sparse", "colmap", "nerfstudio")
+SKIP_DAMAGED = " (--skip-damaged goes on without what cannot be read)"
 SFM_SOURCE = "structure from motion"  # how the source of cameras found by it begins
 UNKNOWN_LENS = "unknown"  # of images that structure from motion has undistorted
 
@@ -74,7 +76,9 @@ class Picture:
     lens: str = ""
 
 
-def find_pictures(images: ImagesLike, every: int = 1, max_images: int | None = None) -> list[Picture]:
+def find_pictures(
+    images: ImagesLike, every: int = 1, max_images: int | None = None, skip_damaged: bool = False
+) -> list[Picture]:
     """Lists the pictures of whatever somebody wants reconstructed, without their cameras.
 
     Args:
@@ -82,6 +86,7 @@ def find_pictures(images: ImagesLike, every: int = 1, max_images: int | None = N
             ``[3, H, W]`` or ``[V, 3, H, W]`` in [0, 1], or a sequence of these, in any mixture.
         every: take every this many-th picture (of videos: frame) only.
         max_images: take at most so many, evenly spread; None: all, of a video 32 frames unless ``every`` is given.
+        skip_damaged: leave out photographs that cannot be read, named in a warning.
 
     Returns:
         The pictures in order, their names unique.
@@ -92,19 +97,26 @@ def find_pictures(images: ImagesLike, every: int = 1, max_images: int | None = N
     """
     check_choice(every, max_images)
     chosen: list[Picture] = []
+    damaged: list[str] = []
     stills = 0
     for item in as_items(images):
-        found = _pictures(item, every, max_images)
+        try:
+            found = _pictures(item, every, max_images, skip_damaged)
+        except DataError as error:
+            damaged.append(str(error).removesuffix(SKIP_DAMAGED))
+            continue
         if not _is_video(item):  # of a video every so many-th frame was decoded
             stills += len(found)
             found = [picture for i, picture in enumerate(found, stills - len(found)) if i % every == 0]
         chosen += found
+    if damaged:
+        raise DataError("; ".join(damaged) + SKIP_DAMAGED)
     if not chosen:
         raise ValueError("there are no images to reconstruct; give image files, a folder of them, or a video")
     return with_unique_names(evenly(chosen, max_images))
 
 
-def check_pictures(images: ImagesLike) -> None:
+def check_pictures(images: ImagesLike, skip_damaged: bool = False) -> None:
     """Refuses files and folders that hold no picture, without decoding any: before weights are downloaded.
 
     Raises:
@@ -112,6 +124,7 @@ def check_pictures(images: ImagesLike) -> None:
         ImportError: if a video needs a package that is not installed.
         ValueError: if there is no picture, or a file is none.
     """
+    damaged: list[str] = []
     for item in as_items(images):
         path = existing_path(item) if isinstance(item, (str, Path)) else None
         if path is None:
@@ -120,9 +133,14 @@ def check_pictures(images: ImagesLike) -> None:
             if path.suffix.lower() != ".gif":
                 require_pyav(f"reading {path}")
         elif path.is_file():
-            _pictures(path, 1, 1)
+            try:
+                _pictures(path, 1, 1, skip_damaged)
+            except DataError as error:
+                damaged.append(str(error).removesuffix(SKIP_DAMAGED))
         elif not any(file.suffix.lower() in _HOLDS_PICTURES for file in path.rglob("*")):
             image_files(path)
+    if damaged:
+        raise DataError("; ".join(damaged) + SKIP_DAMAGED)
 
 
 def as_items(images: ImagesLike) -> list[Any]:
@@ -182,18 +200,86 @@ def mask_for(path: Path, upright: bool = True, content: bytes | None = None) -> 
     return joined_masks(parts)
 
 
-def _pictures(item: Any, every: int, max_images: int | None) -> list[Picture]:
+def _pictures(item: Any, every: int, max_images: int | None, skip_damaged: bool = False) -> list[Picture]:
     if not isinstance(item, (str, Path)):
         return _from_memory(item)
     path = existing_path(item)
     if path.is_dir():
-        return [_photo(file) for file in image_files(path)]
+        return _photos(image_files(path), skip_damaged)
     if is_archive(path):
         files = recorded_files(path, ".jpg")
         if not files:
             raise ValueError(f"{path} holds no images (rgbd/0.jpg and so on): is it a recording of Record3D?")
         return [_photo(file, read_recorded) for file in files.values()]
-    return _video(path, every, max_images) if _is_video(path) else [_photo(path)]
+    return _video(path, every, max_images) if _is_video(path) else _photos([path], skip_damaged)
+
+
+def _photos(files: Sequence[Path], skip_damaged: bool) -> list[Picture]:
+    """Photographs; those whose files are damaged are named all at once, or left out."""
+    found: list[Picture] = []
+    errors: dict[str, Exception] = {}
+    for file in files:
+        try:
+            picture = _photo(file)
+            if skip_damaged:
+                picture.read((64, 64))
+            found.append(picture)
+        except DataError as error:
+            errors[file.name] = error
+    if errors and not skip_damaged:
+        raise DataError("; ".join(str(error) for error in errors.values()) + SKIP_DAMAGED)
+    if errors:
+        log.warning("%d images cannot be read and are left out: %s", len(errors), ", ".join(errors))
+    return found
+
+
+def readable(pictures: Sequence[Picture]) -> list[Picture]:
+    """Those that can be decoded; the others are named in a warning."""
+    found = []
+    for picture in pictures:
+        try:
+            picture.read((64, 64))
+            found.append(picture)
+        except DataError as error:
+            log.warning("left out: %s", error)
+    return found
+
+
+def without_copies(pictures: Sequence[Picture]) -> list[Picture]:
+    """Pictures without those whose file is equal to an earlier one's, byte for byte; they are named in a warning."""
+    first: dict[str, str] = {}
+    found, copies = [], []
+    for picture in pictures:
+        whole = picture.path is not None and picture.path.suffix.lower() in (*IMAGE_SUFFIXES, *HEIC_SUFFIXES)
+        key = _digest(picture.path) if whole and picture.path is not None else ""
+        if key and key in first:
+            copies.append(f"{picture.name} (as {first[key]})")
+        else:
+            found.append(picture)
+            first[key] = picture.name
+    if copies:
+        log.warning("%d images are copies of others and are left out: %s", len(copies), ", ".join(copies[:10]))
+    return found
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def name_damaged(pictures: Sequence[Picture], error: Exception) -> DataError:
+    """The error that names all pictures that cannot be read, after one could not.
+
+    Args:
+        pictures: all of them.
+        error: of the one.
+    """
+    errors = []
+    for picture in pictures:
+        try:
+            picture.read((64, 64))
+        except ValueError as other:
+            errors.append(str(other))
+    return DataError("; ".join(errors or [str(error)]) + SKIP_DAMAGED)
 
 
 def image_files(folder: Path) -> list[Path]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from vg2gt.reconstruction.cameras import Poses, pictures_for
 from vg2gt.reconstruction.frame import FrameName, check_frame, first_frame
 from vg2gt.reconstruction.inputs import Views, load_views, working_size
 from vg2gt.reconstruction.monitor import Monitor
+from vg2gt.reconstruction.order import as_given, in_order, working_order
 from vg2gt.reconstruction.pictures import SFM_SOURCE, ImagesLike
 from vg2gt.reconstruction.scene import Scene
 from vg2gt.rendering import Renderer
@@ -48,6 +50,7 @@ def reconstruct_with(
     poses: Poses = "auto",
     sfm_folder: str | Path | None = None,
     frame: FrameName = "auto",
+    skip_damaged: bool = False,
 ) -> Scene:
     """Reconstructs a scene from any number of images.
 
@@ -63,6 +66,7 @@ def reconstruct_with(
         sfm_folder: where cameras that structure from motion finds are kept, and found again; None: they are not.
         frame: the scene's frame and unit (:class:`vg2gt.reconstruction.frame.SceneFrame`): ``given`` cameras',
             ``first`` camera's, ``upright``, or ``auto``.
+        skip_damaged: go on without images that cannot be read, named in a warning; otherwise they are an error.
 
     Returns:
         The scene, in the frame that was asked for; its Gaussians stay on the model's device.
@@ -84,23 +88,35 @@ def reconstruct_with(
         max_images=max_images,
         sfm_folder=None if sfm_folder is None else Path(sfm_folder),
         monitor=monitor,
+        skip_damaged=skip_damaged,
     )
     with memory_advice(RECONSTRUCTION), chosen as pictures:
         target = working_size([p.size for p in pictures], model.backend.patch_size, device.type, size)
         note_sizes({f"images of {target[0]}x{target[1]}": len(pictures)})
         views = load_views(pictures, target, monitor)
-        prediction = _forward(model.eval(), views, device, monitor)
-    return _scene(prediction, views, renderer or Renderer(), model.backend.is_metric, frame)
+        order = working_order(views.images)
+        prediction = _forward(model.eval(), views, order, device, monitor)
+    return _scene(prediction, views, order, renderer or Renderer(), model.backend.is_metric, frame)
 
 
-def _forward(model: Reconstructor, views: Views, device: torch.device, monitor: Monitor) -> Prediction:
-    hints = None if views.hints is None else views.hints.to(device)
+def _forward(
+    model: Reconstructor, views: Views, order: Sequence[int], device: torch.device, monitor: Monitor
+) -> Prediction:
+    images, hints = in_order(views, order)
+    hints = None if hints is None else hints.to(device)
     with monitor.stage("reconstruct"), monitor.watching():
-        return model(views.images[None].to(device), hints)
+        return model(images[None].to(device), hints)
 
 
-def _scene(prediction: Prediction, views: Views, renderer: Renderer, is_metric: bool, wanted: FrameName) -> Scene:
-    geometry = prediction.surface.detach()
+def _scene(
+    prediction: Prediction,
+    views: Views,
+    order: Sequence[int],
+    renderer: Renderer,
+    is_metric: bool,
+    wanted: FrameName,
+) -> Scene:
+    geometry = as_given(prediction.surface.detach(), order)
     source = views.pictures[0].source
     kind = "predicted" if not source else "found" if source.startswith(SFM_SOURCE) else "given"
     check_frame(wanted, kind)

@@ -23,6 +23,7 @@ import numpy as np
 import torch
 from PIL import Image
 
+from vg2gt.data.base import DataError
 from vg2gt.data.sources.colmap_model import COLMAP, model_folder_of
 from vg2gt.data.transforms import reduce_to_fit, to_bytes
 from vg2gt.io.colmap import EXTRA, quiet_colmap
@@ -32,7 +33,7 @@ from vg2gt.io.json_checks import load_json
 from vg2gt.reconstruction.given_cameras import LAYOUTS, recording_pictures
 from vg2gt.reconstruction.maps import whole_folder
 from vg2gt.reconstruction.monitor import Monitor
-from vg2gt.reconstruction.pictures import SFM_SOURCE, UNKNOWN_LENS, Picture
+from vg2gt.reconstruction.pictures import SFM_SOURCE, UNKNOWN_LENS, Picture, name_damaged
 
 if TYPE_CHECKING:
     from pycolmap import IncrementalPipelineOptions, Reconstruction  # pyright: ignore[reportMissingImports]
@@ -181,7 +182,10 @@ def _stage(pictures: Sequence[Picture], work: Path, advance: Any) -> dict[tuple[
     for number, picture in enumerate(pictures):
         shrink = min(1.0, IMAGE_SIDE / max(picture.size))
         target = (round(picture.size[0] * shrink), round(picture.size[1] * shrink))
-        frames = reduce_to_fit(picture.read(target), (IMAGE_SIDE, IMAGE_SIDE))
+        try:
+            frames = reduce_to_fit(picture.read(target), (IMAGE_SIDE, IMAGE_SIDE))
+        except DataError as error:
+            raise name_damaged(pictures, error) from error
         pixels = to_bytes(frames.images[0]).permute(1, 2, 0).numpy()
         name = f"{number:06d}.jpg"
         Image.fromarray(pixels).save(work / "images" / name, quality=_QUALITY, subsampling=0)
