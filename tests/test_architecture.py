@@ -20,7 +20,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "baselines": {"model", "voxels", "visibility", "gaussians", "backends"} | BASICS,
     "runs": {"baselines", "model", "rendering", "data"} | BASICS,
     "viewer": {"rendering"} | BASICS,
-    "refinement": {"losses", "metrics", "rendering", "gaussians"} | BASICS,
+    "refinement": {"losses", "metrics", "rendering", "gaussians", "visibility"} | BASICS,
     "evaluation": {"refinement", "runs", "model", "rendering", "metrics", "data"} | BASICS,
     "reconstruction": {"refinement", "runs", "model", "rendering", "data"} | BASICS,
     "training": {"evaluation", "runs", "model", "losses", "rendering", "data", "backends"} | BASICS,

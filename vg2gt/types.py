@@ -26,9 +26,9 @@ class TensorRecord:
         """Returns a copy whose tensors are ``function(tensor)``; everything else is kept."""
         return replace(self, **{f.name: _map_value(getattr(self, f.name), function) for f in fields(self)})
 
-    def to(self: Record, device: torch.device | str) -> Record:
-        """Returns a copy on ``device``."""
-        return self.map(lambda tensor: tensor.to(device))
+    def to(self: Record, device: torch.device | str, non_blocking: bool = False) -> Record:
+        """Returns a copy on ``device``; without blocking, page-locked memory is copied while the host goes on."""
+        return self.map(lambda tensor: tensor.to(device, non_blocking=non_blocking))
 
     def pin_memory(self: Record) -> Record:
         """Returns a copy in page-locked memory, from where copies to a GPU are faster."""
@@ -283,6 +283,11 @@ class Gaussians(TensorRecord):
 
     def __len__(self) -> int:
         return self.means.shape[0]
+
+    def select(self, rows: Tensor) -> Gaussians:
+        """Returns some of them: ``rows`` are sorted indices or ``[G]`` bool."""
+        names = [each.name for each in fields(self) if each.name != "background"]
+        return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
     def scene(self, index: int) -> Gaussians:
         """Returns one scene's Gaussians, its ``batch`` set to 0."""

@@ -34,17 +34,13 @@ def test_what_was_dropped_says_nothing_in_the_next_round() -> None:
     # Views 1 and 2 both guess, far behind the wall and at different depths: each looks through view 0's wall.
     found.depth[0, 1], found.depth[0, 2] = 8.0, 16.0
     found.depth[0, 0, :, :14] = 0
-    assert not ViewCheck(rounds=1, doubtful=0)(found)[0, 0].any()
+    assert not ViewCheck(rounds=1)(found)[0, 0].any()
 
 
-def test_a_guess_that_nobody_sees_stays_only_if_it_is_confident() -> None:
+def test_what_a_single_view_sees_stays() -> None:
     found = wall(3)
     found.depth[0, 0, :, :8] = 50.0  # behind what the others see: not contradicted, not agreed with
-    found.depth_conf[0, 0, 10:, :8] = 1.0
-    keep = ViewCheck(doubtful=0.25)(found)[0, 0, :, :6]
-    assert keep[:9].all()
-    assert not keep[11:].any()
-    assert ViewCheck(doubtful=0)(found)[0, 0, :, :6].all()
+    assert ViewCheck()(found)[0, 0, :, :6].all()
 
 
 def test_scenes_are_checked_apart_and_pixels_without_depth_are_never_kept() -> None:
@@ -68,9 +64,7 @@ def test_a_single_view_is_taken_as_it_is() -> None:
     assert ViewCheck()(wall(1)).all()
 
 
-@pytest.mark.parametrize(
-    ("option", "value"), [("tolerance", 0.0), ("margin", 0.01), ("rounds", 0), ("doubtful", -1.0), ("partners", 0)]
-)
+@pytest.mark.parametrize(("option", "value"), [("tolerance", 0.0), ("margin", 0.01), ("rounds", 0), ("partners", 0)])
 def test_options_out_of_range_are_named(option: str, value: float) -> None:
     with pytest.raises(ValueError, match=rf"model\.visibility\.{option} must be"):
         ViewCheck(**{option: value})  # type: ignore[arg-type]

@@ -20,6 +20,7 @@ from vg2gt.evaluation.scene_metrics import (
     present,
     rendered_normal_metrics,
 )
+from vg2gt.geometry.precision import full_precision, half_precision_on_gpu
 from vg2gt.metrics import LPIPS, camera_metrics, cv, depth_metrics
 from vg2gt.model import Reconstructor
 from vg2gt.profiling import clocked, now, peak_memory_mib, reset_peak_memory
@@ -61,6 +62,11 @@ def evaluate_scene(
     if len(batch.scene) != 1 or not held_out:
         raise ValueError(f"evaluation takes one scene with held-out views, got {batch.scene} with {held_out} of them")
     prediction = model(batch.context.images, batch.context.hints)
+    with full_precision(batch.images):
+        return _scene_figures(prediction, renderer, batch, rasterized)
+
+
+def _scene_figures(prediction: Prediction, renderer: Renderer, batch: Batch, rasterized: bool) -> dict[str, float]:
     target = batch.target
     cameras = ground_truth_target_cameras(batch, prediction)
     rendered = render_or_nan(renderer, prediction.gaussians, cameras, "solid")
@@ -199,7 +205,7 @@ class SceneEvaluator:
     def _reconstruct(self, batch: Batch) -> tuple[Prediction, dict[str, float]]:
         device = batch.images.device
         reset_peak_memory(device)
-        with clocked(device) as clock:
+        with clocked(device) as clock, half_precision_on_gpu(batch.images):
             prediction = self.model(batch.context.images, batch.context.hints)
         gaussians = len(prediction.gaussians)
         return prediction, {

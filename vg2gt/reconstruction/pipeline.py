@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from vg2gt.geometry.precision import half_precision_on_gpu
 from vg2gt.memory import RECONSTRUCTION, memory_advice, note_sizes
 from vg2gt.model import Reconstructor
 from vg2gt.reconstruction.cameras import Poses, pictures_for
@@ -102,10 +103,11 @@ def reconstruct_with(
 def _forward(
     model: Reconstructor, views: Views, order: Sequence[int], device: torch.device, monitor: Monitor
 ) -> Prediction:
-    images, hints = in_order(views, order)
+    ordered, hints = in_order(views, order)
     hints = None if hints is None else hints.to(device)
-    with monitor.stage("reconstruct"), monitor.watching():
-        return model(images[None].to(device), hints)
+    images = ordered[None].to(device)
+    with monitor.stage("reconstruct"), monitor.watching(), half_precision_on_gpu(images):
+        return model(images, hints)
 
 
 def _scene(

@@ -17,6 +17,12 @@ if TYPE_CHECKING:
     from vg2gt.reconstruction.scene import Scene
 
 ROWS = 4
+RECORDINGS = ("RGBDFolder", "TUM")  # whose poses were measured, and fit their depth better than bundle adjustment
+
+
+def refinement_of(scene: Scene) -> str:
+    """The options in ``configs/refine`` that suit a scene: ``photographs``, or ``default`` for RGB-D recordings."""
+    return "default" if scene.cameras_from.startswith(RECORDINGS) else "photographs"
 
 
 def refine_scene(scene: Scene, options: RefineOptions, monitor: Monitor | None = None) -> Scene:

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from vg2gt.types import Cameras, Geometry
-from vg2gt.visibility.counts import ViewCounts, count_views
+from vg2gt.visibility.counts import count_views
 from vg2gt.visibility.partners import choose_partners
 
 
@@ -23,15 +23,12 @@ class ViewCheck:
     """Decides which pixels' depth enters the scene.
 
     A pixel is dropped where more views look through its point than agree with it. Pixels that are dropped say nothing
-    in the next round. A pixel that no view agrees with and none contradicts stays if it is confident: what a single
-    view sees is kept, its guesses are not.
+    in the next round. A pixel that no view agrees with and none contradicts stays.
 
     Args:
         tolerance: relative difference of depth up to which two views agree.
         margin: relative difference from which on a view looks through a point.
         rounds: how often the views are counted.
-        doubtful: smallest confidence of a pixel that no other view agrees with, as a share of the median confidence of
-            those that some view agrees with; 0 keeps them all.
         partners: most views that each view is compared with, which bounds the time.
 
     Raises:
@@ -41,7 +38,6 @@ class ViewCheck:
     tolerance: float = 0.02
     margin: float = 0.04
     rounds: int = 2
-    doubtful: float = 0.25
     partners: int = 24
 
     def __post_init__(self) -> None:
@@ -49,7 +45,6 @@ class ViewCheck:
             ("tolerance", self.tolerance > 0, "positive"),
             ("margin", self.tolerance <= self.margin < 1, "at least the tolerance and below 1"),
             ("rounds", self.rounds >= 1, "at least 1"),
-            ("doubtful", self.doubtful >= 0, "at least 0"),
             ("partners", self.partners >= 1, "at least 1"),
         ):
             if not good:
@@ -67,29 +62,21 @@ class ViewCheck:
         """
         return torch.stack([self._supported(*_scene(geometry, index)) for index in range(len(geometry.depth))])
 
-    def counts(self, depth: Tensor, cameras: Cameras, partners: Tensor) -> ViewCounts:
-        """What the ``partners [V, K]`` say of each pixel of one scene; arguments as of :func:`count_views`."""
-        return count_views(depth, cameras, partners, torch.ones_like(depth), self.tolerance, self.margin)
-
-    def _supported(self, depth: Tensor, confidence: Tensor, cameras: Cameras) -> Tensor:
+    def _supported(self, depth: Tensor, cameras: Cameras) -> Tensor:
         keep = depth > 0
         partners = choose_partners(depth, cameras, self.partners)
         if not partners.shape[1]:
             return keep
-        counts = self.counts(depth, cameras, partners)
-        keep = keep & (counts.through <= counts.agree)
-        for _ in range(self.rounds - 1):
-            counts = self.counts(torch.where(keep, depth, 0.0), cameras, partners)
+        weight = torch.ones_like(depth)
+        for _ in range(self.rounds):
+            left = torch.where(keep, depth, 0.0)
+            counts = count_views(left, cameras, partners, weight, self.tolerance, self.margin)
             keep = keep & (counts.through <= counts.agree)
-        agreed = keep & (counts.agree > 0)
-        if self.doubtful and agreed.any():
-            keep = agreed | (keep & (confidence >= self.doubtful * confidence[agreed].median()))
         return keep
 
 
-def _scene(geometry: Geometry, index: int) -> tuple[Tensor, Tensor, Cameras]:
-    """Depth and confidence ``[V, H, W]`` of one scene, 0 where not finite, and its cameras (B = 1)."""
-    maps = (geometry.depth[index].float(), geometry.depth_conf[index].float())
-    depth, confidence = (values.nan_to_num(0.0, 0.0, 0.0) for values in maps)
+def _scene(geometry: Geometry, index: int) -> tuple[Tensor, Cameras]:
+    """Depth ``[V, H, W]`` of one scene, 0 where not finite, and its cameras (B = 1)."""
+    depth = geometry.depth[index].float().nan_to_num(0.0, 0.0, 0.0)
     one, cameras = slice(index, index + 1), geometry.cameras
-    return depth, confidence, Cameras(cameras.world_to_camera[one], cameras.intrinsics[one], cameras.size)
+    return depth, Cameras(cameras.world_to_camera[one], cameras.intrinsics[one], cameras.size)

@@ -168,3 +168,36 @@ def _count_view(view, depth, weight, partners, matrix, tolerance, margin, agree,
                     through[view, y, x] += counts
                 else:
                     hidden[view, y, x] += counts
+
+
+@torch.no_grad()
+def count_points(
+    points: Tensor, depth: Tensor, cameras: Cameras, tolerance: float, margin: float
+) -> tuple[Tensor, Tensor]:
+    """How many views agree with points in space, and how many look through them.
+
+    Args:
+        points: ``[N, 3]`` in the world of the cameras.
+        depth: ``[V, H, W]`` z-depth of the views, 0 = none.
+        cameras: of the views (B = 1).
+        tolerance: relative difference of depth up to which a view agrees.
+        margin: relative difference of depth from which on a view looks through a point.
+
+    Returns:
+        Views that agree and views that look through, ``[N]`` int64 each.
+    """
+    height, width = depth.shape[1:]
+    agree, through = (torch.zeros(len(points), dtype=torch.int64, device=points.device) for _ in range(2))
+    for view, pose, intrinsics in zip(depth, cameras.world_to_camera[0], cameras.intrinsics[0], strict=True):
+        seen = transform_points(pose[None, None].to(points), points[None, None])[0, 0]  # [N, 3]
+        z = seen[:, 2]
+        focal, center = intrinsics[[0, 1], [0, 1]], intrinsics[:2, 2]
+        column, row = (seen[:, :2] / z[:, None].clamp(min=NEAREST) * focal + center).round().unbind(-1)
+        inside = (z > NEAREST) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        index = row.clamp(0, height - 1).nan_to_num().long() * width + column.clamp(0, width - 1).nan_to_num().long()
+        found = view.flatten()[index]
+        ratio = z / found.clamp(min=NEAREST)
+        known = inside & (found > 0)
+        agree += known & ((ratio - 1).abs() < tolerance)
+        through += known & (ratio < 1 - margin)
+    return agree, through
