@@ -134,6 +134,7 @@ class Reconstructor(nn.Module, ABC):
         scenes, views, _, height, width = images.shape
         note_sizes({f"images of {height}x{width} in {scenes} scene{'s' * (scenes > 1)}": scenes * views}, anew=True)
         tokens, raw = self.run_backbone(images, hints)
+        raw = masked(raw, hints)
         unit = self.scale(raw, hints)
         return tokens, _to_scene_frame(raw, unit), unit
 
@@ -303,11 +304,19 @@ class VG2GT(Reconstructor):
         with stage("coarse"):
             tokens = self.coarse(tokens, initial, generator=generator)
         with stage("decode_again"):
-            again = self.backend.decode(tokens)
+            again = masked(self.backend.decode(tokens), hints)
         # The camera token is untouched, so the cameras are the backbone's: decoded once, used throughout.
         depth = again.depth * unit[:, None, None, None]
         depth = depth if not self.keep_scale else with_scale_of(initial, depth)
         return tokens, Decoded(initial, replace(initial, depth=depth, depth_conf=again.depth_conf), unit)
+
+
+def masked(geometry: Geometry, hints: Hints | None) -> Geometry:
+    """Takes depth away where a mask says that pixels do not count, and confidence as far as they count less."""
+    if hints is None or hints.mask is None:
+        return geometry
+    kept = geometry.where(hints.mask > 0.5)
+    return replace(kept, depth_conf=geometry.depth_conf * hints.mask.clamp(min=1e-3))
 
 
 def with_scale_of(initial: Geometry, depth: Tensor) -> Tensor:

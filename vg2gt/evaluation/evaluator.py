@@ -119,7 +119,9 @@ class SceneEvaluator:
         device, geometry = batch.images.device, prediction.geometry
         reset_peak_memory(device)
         began = now(device)
-        seen = Observations(batch.context.images[0], geometry.depth[0], geometry.depth_conf[0])
+        context = batch.context
+        mask = None if context.mask is None else context.mask[0]
+        seen = Observations(context.images[0], geometry.depth[0], geometry.depth_conf[0], mask)
         found = refine(prediction.gaussians, geometry.cameras, seen, self.renderer, options)
         cost = {"refine_seconds": now(device) - began, "peak_memory_mib": peak_memory_mib(device)}
         gaussians = found.scene.gaussians

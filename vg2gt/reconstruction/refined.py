@@ -37,7 +37,7 @@ def refine_scene(scene: Scene, options: RefineOptions, monitor: Monitor | None =
         The refined scene; its images, decoded depth and names are the old ones.
     """
     device = scene.gaussians.means.device
-    seen = Observations(scene.images, scene.depth, scene.depth_conf).to(device)
+    seen = Observations(scene.images, scene.depth, scene.depth_conf, scene.mask).to(device)
     with (monitor or Monitor()).measure("refine") as show:
 
         def observe(progress: Progress) -> None:
