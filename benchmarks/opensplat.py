@@ -27,6 +27,7 @@ from vg2gt.types import Cameras, Gaussians
 STEPS = 100  # of the first try, which tells how long a step takes
 NEAR_ENOUGH = 0.1  # of a budget
 TRIES = 3
+BACKGROUND = (0.6130, 0.0101, 0.3984)  # its own, where nothing is opaque
 SOURCE = Path("rasterizer/gsplat-cpu/gsplat_cpu.cpp")
 NEAR, FAR = 0.01, 100.0
 BINDINGS = r"""
@@ -147,7 +148,7 @@ def train(
     Args:
         binary: the program.
         photos: COLMAP scene.
-        scene: PLY file to write.
+        scene: PLY file to write; its cameras are written to the same folder.
         budget: core-seconds.
         extra: options over those chosen here.
         pace: core-seconds that a step is expected to take; None: this is tried first.
@@ -182,6 +183,7 @@ def schedule(steps: int) -> list[str]:
 
 def _train(binary: Path, photos: Path, scene: Path, steps: int, extra: Sequence[str]) -> Training:
     scene.unlink(missing_ok=True)
+    scene.parent.mkdir(parents=True, exist_ok=True)
     chosen = {option.partition("=")[0]: option for option in (*schedule(steps), *extra)}
     command = [str(binary), str(photos), "--cpu", "--keep-crs", f"--output={scene}", *chosen.values()]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}

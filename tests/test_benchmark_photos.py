@@ -27,7 +27,7 @@ from vg2gt.io import (
 from vg2gt.io.images import to_pixels
 from vg2gt.types import Cameras, Gaussians
 
-SIZE = (56, 84)
+SIZE = (56, 80)
 HELD_OUT = [2, 6]
 PROGRAM = """#!{python} -S
 import shutil, sys, time
@@ -70,7 +70,7 @@ def command(tmp_path: Path, benchmark_script, monkeypatch: pytest.MonkeyPatch) -
     script = benchmark_script("photos")
 
     def run(*arguments: str) -> list[dict[str, Any]]:
-        where = ["--poses", "given", "--size", "84", "--out", str(tmp_path), "--work", str(tmp_path / "work")]
+        where = ["--poses", "given", "--size", "80", "--out", str(tmp_path), "--work", str(tmp_path / "work")]
         monkeypatch.setattr(sys, "argv", ["photos.py", *arguments, *where])
         script.main()
         return json.loads(max(tmp_path.glob("*-photos.json")).read_text())["rows"]
@@ -120,21 +120,21 @@ def program(folder: Path, works: bool = True) -> Path:
 
 
 def test_rows_are_measured_and_merged(command, photos: Path, tmp_path: Path, capsys) -> None:
-    rows = command(str(photos), "--budgets", "4", "--refine", "fill=0")
-    assert [row["budget"] for row in rows] == ["feed-forward", 4.0]
+    rows = command(str(photos), "--budgets", "2", "--refine", "fill=0")
+    assert [row["budget"] for row in rows] == ["feed-forward", 2.0]
     assert {(row["set"], row["size"], row["program"], row["settings"]) for row in rows} == {
-        ("room", 84, "VG²GT", "refine.fill=0")
+        ("room", 80, "VG²GT", "refine.fill=0")
     }
     assert all(row["views"] == [5, 2] for row in rows)
     first, refined = rows
     assert first["psnr"] > 10
     assert refined["psnr_given"] > first["psnr_given"]
-    assert 0 < first["core_seconds"] < 4 <= refined["core_seconds"] < 8
+    assert 0 < first["core_seconds"] < 2 <= refined["core_seconds"] < 6
     assert refined["steps"] > 0
     assert all(0 < row["ssim"] < 1 for row in rows)
     assert all(row["gaussians"] > 100 and row["peak_memory_mb"] > 100 for row in rows)
-    assert Image.open(tmp_path / "work" / "room-84.png").size == (3 * 84 + 8, 2 * 56 + 4)
-    given = [path.name for path in (tmp_path / "work" / "room" / "84" / "images").iterdir()]
+    assert Image.open(tmp_path / "work" / "room-80.png").size == (3 * 80 + 8, 2 * 56 + 4)
+    given = [path.name for path in (tmp_path / "work" / "room" / "80" / "images").iterdir()]
     assert sorted(given) == [f"{index:06d}.png" for index in range(7) if index not in HELD_OUT]
 
     rows = command(f"other={photos}", "--budgets", "--model", "fine.min_footprint=9")
@@ -149,7 +149,7 @@ def test_rows_are_measured_and_merged(command, photos: Path, tmp_path: Path, cap
 
 def test_what_only_left_out_views_saw_is_not_given(photos: Path, room, tmp_path: Path, benchmark_script) -> None:
     add_points(photos, room)
-    prepared = benchmark_script("photo_sets").prepare("room", photos, tmp_path / "work", 84, 14, "given")
+    prepared = benchmark_script("photo_sets").prepare("room", photos, tmp_path / "work", 80, 8, "given")
     assert list(prepared.held_out) == HELD_OUT
     assert prepared.points == 2
     model = read_colmap(prepared.folder / "sparse" / "0")
@@ -191,7 +191,7 @@ def test_sets_that_cannot_be_scored_are_refused(photos: Path, tmp_path: Path, be
     for index in range(2, 7):
         (photos / f"IMG_{index}.png").unlink()
     with pytest.raises(ValueError, match="room: 2 photographs have cameras; 4 are needed at least"):
-        prepare("room", photos, tmp_path / "work", 84, 14, "given")
+        prepare("room", photos, tmp_path / "work", 80, 8, "given")
     (photos / "cameras.json").unlink()
     with pytest.raises(ValueError, match=r"no cameras beside its images: expected cameras.json.*--poses sfm"):
-        prepare("room", photos, tmp_path / "work", 84, 14, "given")
+        prepare("room", photos, tmp_path / "work", 80, 8, "given")
