@@ -12,16 +12,17 @@ from vg2gt.data.splits import split_scenes
 HEIGHT, WIDTH = 4, 6
 
 
-def write_view(folder, name, depth, shift=0.0):
+def write_view(folder, name, depth, shift=0.0, camera=0):
     """One view with a symmetric camera, as Blender describes it."""
-    for kind in ("Image", "Depth", "camview"):
-        (folder / "frames" / kind / "camera_0").mkdir(parents=True, exist_ok=True)
-    Image.fromarray(np.full((HEIGHT, WIDTH, 3), 90, np.uint8)).save(folder / f"frames/Image/camera_0/Image_{name}.png")
-    np.save(folder / f"frames/Depth/camera_0/Depth_{name}.npy", depth)
+    places = {kind: folder / "frames" / kind / f"camera_{camera}" for kind in ("Image", "Depth", "camview")}
+    for place in places.values():
+        place.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(np.full((HEIGHT, WIDTH, 3), 90, np.uint8)).save(places["Image"] / f"Image_{name}.png")
+    np.save(places["Depth"] / f"Depth_{name}.npy", depth)
     pose = np.eye(4)
     pose[0, 3] = shift
     intrinsics = np.array([[5.0, 0, WIDTH / 2], [0, 5.0, HEIGHT / 2], [0, 0, 1]])
-    np.savez(folder / f"frames/camview/camera_0/camview_{name}.npz", K=intrinsics, T=pose)
+    np.savez(places["camview"] / f"camview_{name}.npz", K=intrinsics, T=pose)
 
 
 def plain():
@@ -151,3 +152,20 @@ def test_a_header_that_asks_for_much_memory_is_refused(tmp_path):
     path.write_bytes(content)
     with pytest.raises(DataError, match=r"cannot read .*Depth_0_0_0001_0\.npy of scene a: mmap length"):
         Infinigen(str(tmp_path)).frames("a")
+
+
+def test_both_cameras_of_a_rig_are_held_out_together(tmp_path):
+    for frame in range(4):
+        write_view(tmp_path / "a", f"0_0_{frame:04d}_0", plain())
+        write_view(tmp_path / "a", f"0_0_{frame:04d}_1", plain() + 1, shift=0.075, camera=1)
+    source = Infinigen(str(tmp_path), cameras=[0, 1], holdout=2)
+    second = 1_000_000_000
+    assert source.frames("a") == (0, 1, 2, 3, second, second + 1, second + 2, second + 3)
+    assert source.held_out("a") == (1, 3, second + 1, second + 3)
+    frames = source.load("a", [2, second + 2])
+    assert frames.depth[:, 0, 0].tolist() == [2, 3]
+    assert frames.world_to_camera[:, 0, 3].tolist() == pytest.approx([0, -0.075])
+    assert Infinigen(str(tmp_path)).frames("a") == (0, 1, 2, 3)
+    assert Infinigen(str(tmp_path), cameras=[1]).load("a", [second]).depth[0, 0, 0] == 3
+    with pytest.raises(ValueError, match=r"cameras must be different numbers .* got \[0, 0\]"):
+        Infinigen(str(tmp_path), cameras=[0, 0])
