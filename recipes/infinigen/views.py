@@ -49,7 +49,7 @@ class Room:
         _show_what_is_rendered()
         self._scene = bpy.context.scene
         self._graph = bpy.context.evaluated_depsgraph_get()
-        meshes = [item for item in bpy.data.objects if item.type == "MESH" and not item.hide_render]
+        meshes = [item for item in bpy.data.objects if item.type == "MESH" and item.visible_get()]
         floors = [item for item in meshes if item.name.startswith(KINDS[kind]) and ".floor" in item.name]
         if not floors:
             raise SystemExit(f"the scene has no floor of a {kind}")
