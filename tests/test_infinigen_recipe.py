@@ -216,6 +216,10 @@ def test_rooms_are_made_in_stages_that_resume(recipe, tmp_path):
     figures.write_text(json.dumps({"ok": False}) + "\n")
     run(2)
     assert (out / "rejected/room_0002").exists()
+    held = make.Rooms(out, interpreter, args)
+    with pytest.raises(SystemExit, match="another process makes rooms in"):
+        make.Rooms(out, interpreter, args)
+    del held
     rows = list(csv.DictReader((out / "log.csv").open()))
     assert [row["result"] for row in rows if row["room"] == "room_0000"] == ["ok", "exit 1", "ok", "ok"]
     assert all(float(row["wall_seconds"]) >= 0 for row in rows)

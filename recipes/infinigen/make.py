@@ -13,9 +13,11 @@ from __future__ import annotations
 
 import argparse
 import csv
+import fcntl
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -27,9 +29,11 @@ from rooms import kind, name, part
 HERE = Path(__file__).resolve().parent
 INFINIGEN, BLENDER = "infinigen==1.15.5", "bpy==4.2.0"
 _THREADS = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "MKL", "OPENBLAS", "NUMBA")}
-# No landscape outside, and small things on four pieces of furniture only: solving for them takes most of the time.
+# No landscape outside, fewer steps than in fast_solve.gin (100 and 40), and small things on four pieces of furniture
+# only: placing them takes most of the time.
 _FASTER = (
-    "compose_indoors.terrain_enabled=False", "compose_indoors.solve_steps_medium=25",
+    "compose_indoors.terrain_enabled=False",
+    "compose_indoors.solve_steps_large=60", "compose_indoors.solve_steps_medium=25",
     "restrict_solving.solve_max_parent_obj=4",
 )  # fmt: skip
 _COLUMNS = ("room", "seed", "kind", "stage", "result", "wall_seconds", "core_seconds", "peak_gigabytes", "ended")
@@ -88,6 +92,13 @@ class Rooms:
         self.out, self.interpreter, self.args = out, interpreter, args
         self.links = out / "work" / "packages"
         link_packages(interpreter, self.links)
+        self._lock = (out / "work" / "lock").open("w")
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise SystemExit(
+                f"another process makes rooms in {out}: wait for it, end it, or give another --out"
+            ) from None
 
     def make(self, seed: int) -> None:
         """Makes one room, unless it is there or has failed before."""
@@ -187,6 +198,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # the running stage ends, too
     try:
         main()
     except KeyboardInterrupt:
