@@ -17,6 +17,12 @@ if TYPE_CHECKING:
     from vg2gt.reconstruction.scene import Scene
 
 ROWS = 4
+RECORDINGS = ("RGBDFolder", "TUM")  # whose poses were measured, and fit their depth better than bundle adjustment
+
+
+def refinement_of(scene: Scene) -> str:
+    """The options in ``configs/refine`` that suit a scene: ``photographs``, or ``default`` for RGB-D recordings."""
+    return "default" if scene.cameras_from.startswith(RECORDINGS) else "photographs"
 
 
 def refine_scene(scene: Scene, options: RefineOptions, monitor: Monitor | None = None) -> Scene:
@@ -31,7 +37,7 @@ def refine_scene(scene: Scene, options: RefineOptions, monitor: Monitor | None =
         The refined scene; its images, decoded depth and names are the old ones.
     """
     device = scene.gaussians.means.device
-    seen = Observations(scene.images, scene.depth, scene.depth_conf).to(device)
+    seen = Observations(scene.images, scene.depth, scene.depth_conf, scene.mask).to(device)
     with (monitor or Monitor()).measure("refine") as show:
 
         def observe(progress: Progress) -> None:

@@ -1,4 +1,4 @@
-"""Cameras of photographs by structure from motion: COLMAP's incremental mapper, from pycolmap (``vg2gt[sfm]``).
+"""Cameras of photographs by structure from motion: COLMAP's incremental mapper, from pycolmap (``vg2gt[colmap]``).
 
 What is found is kept as a folder that every command reads as a COLMAP recording: undistorted ``images/``, a model of
 PINHOLE cameras in ``sparse/``, and ``sfm.json``, which says of which pictures it was made. COLMAP's own lens model with
@@ -14,8 +14,7 @@ import json
 import logging
 import shutil
 import tempfile
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,15 +23,17 @@ import numpy as np
 import torch
 from PIL import Image
 
+from vg2gt.data.base import DataError
 from vg2gt.data.sources.colmap_model import COLMAP, model_folder_of
 from vg2gt.data.transforms import reduce_to_fit, to_bytes
+from vg2gt.io.colmap import EXTRA, quiet_colmap
 from vg2gt.io.errors import FormatError
 from vg2gt.io.files import write_json
 from vg2gt.io.json_checks import load_json
 from vg2gt.reconstruction.given_cameras import LAYOUTS, recording_pictures
 from vg2gt.reconstruction.maps import whole_folder
 from vg2gt.reconstruction.monitor import Monitor
-from vg2gt.reconstruction.pictures import Picture
+from vg2gt.reconstruction.pictures import SFM_SOURCE, UNKNOWN_LENS, Picture, name_damaged
 
 if TYPE_CHECKING:
     from pycolmap import IncrementalPipelineOptions, Reconstruction  # pyright: ignore[reportMissingImports]
@@ -64,7 +65,7 @@ def require_pycolmap() -> None:
     """
     if importlib.util.find_spec("pycolmap") is None:
         raise ImportError(
-            f"finding the cameras of photographs needs pycolmap: pip install 'vg2gt[sfm]'; or put their cameras beside "
+            f"finding the cameras of photographs needs pycolmap: {EXTRA}; or put their cameras beside "
             f"them ({LAYOUTS}), or take a backend that works from images alone, such as da3_small"
         )
 
@@ -105,8 +106,10 @@ def find_cameras(pictures: Sequence[Picture], folder: Path, monitor: Monitor) ->
             count, len(pictures), names,
         )  # fmt: skip
     names = state["images"]
-    source = f"structure from motion, {len(names)} of {len(pictures)} images"
-    return [replace(p, name=names[f"{p.name}.jpg"], source=source) for p in recording_pictures(COLMAP(str(folder)))]
+    source = f"{SFM_SOURCE}, {len(names)} of {len(pictures)} images"
+    paths = {picture.name: picture.path for picture in pictures}
+    found = [(names[f"{p.name}.jpg"], p) for p in recording_pictures(COLMAP(str(folder)))]
+    return [replace(p, name=name, source=source, path=paths[name], lens=UNKNOWN_LENS) for name, p in found]
 
 
 def _key(pictures: Sequence[Picture]) -> str:
@@ -142,7 +145,7 @@ def _check_ours(folder: Path) -> None:
 
 
 def _solve(pictures: Sequence[Picture], folder: Path, key: str, monitor: Monitor) -> dict[str, Any]:
-    with tempfile.TemporaryDirectory(prefix="vg2gt-sfm-") as temporary, _silent():
+    with tempfile.TemporaryDirectory(prefix="vg2gt-sfm-") as temporary, quiet_colmap():
         work = Path(temporary)
         with monitor.stage("read photographs", len(pictures)) as advance:
             lenses = _stage(pictures, work, advance)
@@ -179,7 +182,10 @@ def _stage(pictures: Sequence[Picture], work: Path, advance: Any) -> dict[tuple[
     for number, picture in enumerate(pictures):
         shrink = min(1.0, IMAGE_SIDE / max(picture.size))
         target = (round(picture.size[0] * shrink), round(picture.size[1] * shrink))
-        frames = reduce_to_fit(picture.read(target), (IMAGE_SIDE, IMAGE_SIDE))
+        try:
+            frames = reduce_to_fit(picture.read(target), (IMAGE_SIDE, IMAGE_SIDE))
+        except DataError as error:
+            raise name_damaged(pictures, error) from error
         pixels = to_bytes(frames.images[0]).permute(1, 2, 0).numpy()
         name = f"{number:06d}.jpg"
         Image.fromarray(pixels).save(work / "images" / name, quality=_QUALITY, subsampling=0)
@@ -260,7 +266,8 @@ def _map(work: Path, count: int, monitor: Monitor) -> Reconstruction | None:
             options=_mapping_options(),
             next_image_callback=lambda: advance() if next(expected, None) is not None else None,
         )
-    return max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
+    sound = [model for model in models.values() if model.num_points3D() and model.num_reg_images() > 1]
+    return max(sound, key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
 
 
 def _mapping_options() -> IncrementalPipelineOptions:
@@ -293,16 +300,3 @@ def _write(model: Reconstruction, work: Path, folder: Path) -> None:
 def _threads() -> int:
     """More than are images at once are of no use to features; matching goes the same way."""
     return min(_AT_ONCE, torch.get_num_threads())
-
-
-@contextmanager
-def _silent() -> Iterator[None]:
-    """Keeps COLMAP from telling its whole story on the console."""
-    import pycolmap  # pyright: ignore[reportMissingImports]
-
-    before = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
-    try:
-        yield
-    finally:
-        pycolmap.logging.minloglevel = before
