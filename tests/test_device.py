@@ -165,7 +165,7 @@ def test_a_reconstruction(device: str, as_on_a_gpu: Any) -> None:
     assert (again - color).abs().mean() < (1e-5 if device == "cpu" else 5e-2)
 
 
-@on_devices
+@slowly_on_a_cpu
 def test_a_run_from_beginning_to_end(device: str, tmp_path: Path, cache: Path, as_on_a_gpu: Any) -> None:
     """``train.py debug=fast_dev_run``; its first render, in which the kernels are checked, is an evaluation's."""
     accelerator = "gpu" if device == "cuda" else "cpu"
