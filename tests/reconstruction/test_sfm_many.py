@@ -97,7 +97,8 @@ def kept(photos: Path, tmp_path: Path) -> Path:
     """A finished folder of four photographs, one by one pixel images."""
     folder = tmp_path / "sfm"
     (folder / "sparse").mkdir(parents=True)
-    (folder / "sparse" / "cameras.bin").touch()
+    for part in ("cameras", "images", "points3D"):
+        (folder / "sparse" / f"{part}.bin").write_bytes(bytes(8))
     (folder / "images").mkdir()
     names = [picture.name for picture in find_pictures(photos)]
     for number in range(3):
