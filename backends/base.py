@@ -33,11 +33,13 @@ class Backend(nn.Module, ABC):
         predicts_cameras: False if its cameras are those of the hints.
 
     Attributes:
+        needs_cameras: of a class whose ``encode`` always needs cameras, given or found.
         needs_depth: of a class whose ``encode`` also needs the data's depth: it can do nothing with photographs, which
             commands say before they build it.
     """
 
     needs_depth: ClassVar[bool] = False
+    needs_cameras: ClassVar[bool] = False
 
     def __init__(
         self,

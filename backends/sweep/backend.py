@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -44,6 +45,8 @@ class SweepBackend(Backend):
         FileNotFoundError: if the weights cannot be found.
         ValueError: if they do not fit, or a number is out of range.
     """
+
+    needs_cameras: ClassVar[bool] = True
 
     def __init__(
         self, pretrained: bool = True, path: str | None = None, planes: int = 48, sources: int = 3, seed: int = 0

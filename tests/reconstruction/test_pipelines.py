@@ -498,3 +498,18 @@ def test_cameras_to_render_come_from_any_file(folder: Path, frames, tmp_path: Pa
     (tmp_path / "3dgs.json").write_text(json.dumps([{"img_name": "a"}]))
     with pytest.raises(ValueError, match="no camera of 3D Gaussian Splatting"):
         read_cameras(tmp_path / "3dgs.json")
+
+
+@pytest.mark.parametrize("given", [False, True])
+def test_without_pycolmap_one_line_comes_before_any_work(
+    folder: Path, frames, given: bool, tmp_path: Path, monkeypatch
+) -> None:
+    """A COLMAP model that cannot be read, and photographs whose cameras cannot be found."""
+    if given:
+        put_colmap(folder, frames)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    monkeypatch.setattr("vg2gt.runs.load.build_model", lambda *_: pytest.fail("built a model"))
+    said = "reading the COLMAP model .* needs pycolmap" if given else "finding the cameras .* needs pycolmap"
+    with pytest.raises(SystemExit, match=rf"{said}: pip install 'vg2gt\[colmap\]'"):
+        reconstruct_command.main([str(folder), "--out", str(tmp_path / "out"), "--quiet", "--device", "cpu"])
+    assert not (tmp_path / "out").exists()

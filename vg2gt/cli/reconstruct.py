@@ -81,13 +81,12 @@ def run(options: argparse.Namespace) -> None:
     """Reconstructs and writes."""
     from vg2gt.io.video import require_pyav
     from vg2gt.memory import RECONSTRUCTION, memory_advice
-    from vg2gt.reconstruction.cameras import check_depth
+    from vg2gt.reconstruction.cameras import check_depth, check_pycolmap
     from vg2gt.reconstruction.monitor import Monitor
     from vg2gt.reconstruction.outputs import check_folder, check_outputs, cost_figures, write_outputs
     from vg2gt.reconstruction.pictures import check_choice, check_pictures, existing_path
     from vg2gt.reconstruction.pipeline import reconstruct_with
     from vg2gt.reconstruction.refined import refine_scene
-    from vg2gt.reconstruction.sfm import require_pycolmap
     from vg2gt.runs.load import backend_class, choose_device, load_model
 
     options.out = str(Path(options.out).expanduser())
@@ -96,11 +95,12 @@ def run(options: argparse.Namespace) -> None:
     check_choice(options.every, options.max_images)
     for item in options.images:  # before weights are downloaded
         existing_path(item)
-    if getattr(backend_class(options.ckpt, options.backend), "needs_depth", False):
+    kind = backend_class(options.ckpt, options.backend)
+    if getattr(kind, "needs_depth", False):
         check_depth((options.backend or "of the checkpoint").partition(",")[0], options.images)
     check_pictures(options.images, options.skip_damaged)
-    if options.poses == "sfm" and not (Path(options.out) / SFM).exists():
-        require_pycolmap()
+    if options.poses == "sfm" or (options.poses != "backbone" and getattr(kind, "needs_cameras", False)):
+        check_pycolmap(options.images, options.poses)
     if "orbit.mp4" in options.save:
         require_pyav("writing orbit.mp4")
     with Monitor(show=not options.quiet, device=choose_device(options.device)) as monitor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import logging
 import tempfile
 from collections.abc import Iterator
@@ -15,7 +16,7 @@ from vg2gt.model import Reconstructor
 from vg2gt.reconstruction.given_cameras import LAYOUTS, describe, given_pictures
 from vg2gt.reconstruction.monitor import Monitor
 from vg2gt.reconstruction.pictures import ImagesLike, Picture, find_pictures, readable, without_copies
-from vg2gt.reconstruction.sfm import find_cameras
+from vg2gt.reconstruction.sfm import find_cameras, require_pycolmap
 
 log = logging.getLogger(__name__)
 
@@ -106,6 +107,20 @@ def check_depth(backend: str, images: ImagesLike) -> None:
     """
     if given_pictures(images, depth=True) is None:
         raise ValueError(_no_depth(backend, images))
+
+
+def check_pycolmap(images: ImagesLike, poses: Poses) -> None:
+    """Refuses images whose cameras only pycolmap reads or finds, where it is not installed, before anything is built.
+
+    Args:
+        images: what is to be reconstructed.
+        poses: see :func:`pictures_for`.
+
+    Raises:
+        ImportError: naming what needs it, and the command that installs it.
+    """
+    if importlib.util.find_spec("pycolmap") is None and (poses == "sfm" or given_pictures(images) is None):
+        require_pycolmap()
 
 
 def _no_depth(backend: str, images: ImagesLike) -> str:
