@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager
 from typing import ClassVar
 
 import torch
@@ -208,14 +208,3 @@ def seeded_initialisation(seed: int) -> Iterator[None]:
     with torch.random.fork_rng(devices=[]):
         torch.default_generator.manual_seed(seed)
         yield
-
-
-def half_precision_on_gpu(like: Tensor) -> torch.autocast:
-    """A context with bfloat16 autocast if ``like`` is on a GPU, and with autocast off on a CPU."""
-    return torch.autocast(like.device.type, torch.bfloat16, enabled=like.is_cuda)
-
-
-def full_precision(like: Tensor) -> AbstractContextManager[object]:
-    """A context in which autocast is off on the device of ``like``; nothing at all where it already is."""
-    device = like.device.type
-    return torch.autocast(device, enabled=False) if torch.is_autocast_enabled(device) else nullcontext()

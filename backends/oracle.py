@@ -17,9 +17,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from backends.base import Backend, full_precision, seeded_initialisation
+from backends.base import Backend, seeded_initialisation
 from backends.vit import PatchEmbed, ViTBlock
 from vg2gt.geometry.cameras import invert_rigid, relative_to_first, unproject
+from vg2gt.geometry.precision import full_precision
 from vg2gt.geometry.rotations import quat_to_matrix
 from vg2gt.types import Cameras, Geometry, Hints, Tokens
 

@@ -8,7 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from backends.base import full_precision
+from vg2gt.geometry.precision import full_precision
 
 Resampling = Literal["size", "scale"]
 

@@ -22,6 +22,9 @@ CASES = {
     "rooms with highlights": ("room", True),
     "outdoor": ("outdoor", False),
     "outdoor with highlights": ("outdoor", True),
+    "wide rooms": ("wide", False),
+    "objects": ("object", False),
+    "landmarks": ("landmark", False),
 }
 
 

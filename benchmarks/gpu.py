@@ -1,108 +1,338 @@
-"""Everything there is to measure on a GPU, in about ten minutes: ``python benchmarks/gpu.py``.
+"""What there is to measure on a GPU, in at most eight minutes: ``python benchmarks/gpu.py [--parts NAME ...]``.
 
-The one command for those who have a GPU. Runs, each in a process of its own: ``vg2gt doctor`` (do the kernels agree
-with the reference here), the renderer against torch's and gsplat's where that is installed (``render.py``), the stages
-of a reconstruction and a training step beside the paper's (``stages.py``), peak memory against views (``memory.py``).
-What a part wrote is collected into one dated JSON file and one Markdown file in ``benchmarks/results``, ready to
-commit; a part that fails is told in them and holds up no other.
+The one command for a day on which a GPU is at hand. In order of importance: do the kernels agree with the reference
+here (``selfcheck``), ``pytest -m gpu`` (``tests``), renderer forward and backward beside gsplat where that is installed
+(``render``), training steps of ``experiment=paper`` with random weights, by stage (``step``), nearest neighbours
+(``knn``), ``reconstruct`` of 50 images (``reconstruct``). Every part is a process of its own with a limit of its own,
+and writes ``<date>-gpu-<part>.json`` into ``--out`` (default: the variable OUT, or benchmarks/results) after every
+measurement: what fails or is stopped leaves what it had found. ``--small`` makes all sizes tiny, for a CPU as well.
 """
 
 from __future__ import annotations
 
-import json
+import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
-from dataclasses import dataclass
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
-from common import machine, parser, write_results
+from common import MEGABYTE, dated, machine, parser
 
-from vg2gt.io.files import read_json, write_text
+from vg2gt.io.files import read_json, write_json
+from vg2gt.profiling import now
 
-HERE = Path(__file__).resolve().parent
-# the paper's modules at their sizes on a small backbone with random weights: what it costs does not depend on them
-MODEL = ("backend=da3_small", "backend.pretrained=false", "model=vg2gt", "data=synthetic", "trainer=gpu")
+ROOT = Path(__file__).resolve().parents[1]
+Result = dict[str, Any]
+LINES = 25  # of what a part printed
+
+
+@dataclass(frozen=True)
+class Setting:
+    """Where and how large.
+
+    Attributes:
+        device: a GPU, or a CPU.
+        small: sizes that measure nothing.
+    """
+
+    device: torch.device
+    small: bool
+
+    def timed(self, run: Callable[[], Any], passes: int = 3) -> float:
+        """Milliseconds of the fastest pass after one that warms up."""
+        run()
+        taken = []
+        for _ in range(1 if self.small else passes):
+            begin = now(self.device)
+            run()
+            taken.append(1e3 * (now(self.device) - begin))
+        return min(taken)
+
+    def peak_mb(self) -> float:
+        """Most memory allocated on the GPU since :meth:`forget_peak`."""
+        return torch.cuda.max_memory_allocated(self.device) / MEGABYTE if self.device.type == "cuda" else 0.0
+
+    def forget_peak(self) -> None:
+        """Begins a new measurement, with what earlier ones left given back."""
+        if self.device.type == "cuda":
+            torch.cuda.empty_cache()
+            torch.cuda.reset_peak_memory_stats(self.device)
+
+
+def selfcheck(setting: Setting) -> Iterator[Result]:
+    """How far the kernels are off, and how long they take to compile and check."""
+    from vg2gt.rendering import render
+    from vg2gt.rendering.selfcheck import MODES, compare, identity
+
+    yield {"identity": identity(setting.device)}
+    for mode in MODES[1:] if setting.small else MODES:
+        begin = time.perf_counter()
+        found = compare(render, setting.device, (mode,))
+        seconds = time.perf_counter() - begin
+        yield {mode: {"values": found.values, "gradients": found.gradients, "good": found.good, "seconds": seconds}}
+
+
+def tests(setting: Setting) -> Iterator[Result]:
+    """The suite's tests of a GPU; in the small form they are only collected."""
+    files = [str(path) for path in sorted((ROOT / "tests").rglob("test_*.py")) if "mark.gpu" in path.read_text()]
+    options = ["-o", "addopts=", "--import-mode=importlib", "-p", "no:cacheprovider", "-q", "-m", "gpu and not slow"]
+    options += ["--collect-only"] if setting.small else ["--durations=5", "--tb=short"]
+    command = [sys.executable, "-m", "pytest", *options, *files]
+    ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    shown = ended.stdout.strip().splitlines() or [ended.stderr.strip()[-500:]]
+    yield {"status": ended.returncode, "summary": shown[-1], "shown": shown[-4 * LINES :]}
+    if ended.returncode:
+        raise RuntimeError(f"pytest ended with status {ended.returncode}: {shown[-1]}")
+
+
+def render(setting: Setting) -> Iterator[Result]:
+    """Forward and backward pass of 8 views of 224x448, in turns with gsplat; colour and expected depth there."""
+    from importlib.util import find_spec
+
+    from render import Case, compare
+
+    ours = "triton" if setting.device.type == "cuda" else "cpu"
+    names = (ours, "gsplat") if setting.device.type == "cuda" and find_spec("gsplat") else (ours,)
+    size, views = ((16, 32), 1) if setting.small else ((224, 448), 8)
+    for count in (500,) if setting.small else (100_000, 1_000_000):
+        cases = [Case(name, count, size=size, views=views) for name in names]
+        cases.append(Case(ours, count, size=size, views=views, mode="rasterized"))
+        for case, timing in zip(cases, compare(cases, setting.device, 1 if setting.small else 5), strict=True):
+            yield {
+                f"{case.implementation} {case.mode} {count}": {
+                    "forward_ms": timing.forward,
+                    "backward_ms": timing.backward,
+                    "peak_mb": timing.memory,
+                }
+            }
+
+
+def step(setting: Setting) -> Iterator[Result]:
+    """Training steps of the paper's experiment: time, memory, stages, and what the device is asked to do."""
+    from stages import Case
+
+    if setting.small:
+        tiny = ("backend=da3_tiny", "model=tiny", "trainer.precision=bf16-mixed")
+        cases = {"tiny": Case(2, (28, 56), ("experiment=paper", "trainer=gpu", "data=synthetic", *tiny))}
+    else:
+        paper = ("experiment=paper", "trainer=gpu", "data=synthetic", "backend.pretrained=false")
+        paper = (*paper, "renderer.implementation=triton")  # times are wanted even if the check refuses the kernels
+        cases = {
+            "da3_large, 8 views": Case(8, (224, 448), (*paper, "backend=da3_large")),
+            "da3_giant, 15 views": Case(15, (224, 448), (*paper, "backend=da3_giant")),
+        }
+    for name, case in cases.items():
+        for found in _step(setting, case):
+            yield {f"{name}: {what}": value for what, value in found.items()}
+
+
+def _step(setting: Setting, case: Any) -> Iterator[Result]:
+    from common import training_step
+    from stage_clock import StageClock
+    from stages import prepare
+
+    from vg2gt.training.schedule import parameter_groups
+
+    device = setting.device
+    setting.forget_peak()
+    with tempfile.TemporaryDirectory() as folder:
+        run, batch = prepare(case, device, folder)
+    module, step_loss, clock = run.module, training_step(run), StageClock(device)
+    optimizer, batch = module.make_optimizer(parameter_groups(module.model)), batch.context
+
+    def whole() -> None:
+        with run.trainer.precision_plugin.train_step_context():
+            loss = step_loss(batch)
+        with clock.stage("backward"):
+            loss.backward()
+        with clock.stage("optimizer"):
+            torch.nn.utils.clip_grad_norm_(module.model.trained_parameters(), 1.0)
+            optimizer.step()
+            optimizer.zero_grad(set_to_none=True)
+
+    milliseconds = setting.timed(whole)
+    yield {"step_ms": milliseconds, "peak_mb": setting.peak_mb()}
+    clock.stages.clear()
+    with clock.listening():
+        whole()
+    yield {
+        "stage_ms": {stage: 1e3 * passes.best for stage, passes in clock.stages.items()},
+        "stage_peak_mb": {stage: passes.memory for stage, passes in clock.stages.items()},
+    }
+    yield {"profile": _profile(device, whole)}
+
+
+def _profile(device: torch.device, act: Callable[[], None]) -> Result:
+    """Operations or kernels of one pass, what they took, and which took most."""
+    from torch.profiler import ProfilerActivity, profile
+
+    on_gpu = device.type == "cuda"
+    activities = [ProfilerActivity.CPU, *([ProfilerActivity.CUDA] if on_gpu else [])]
+    begin = now(device)
+    with profile(activities=activities) as found:
+        act()
+        wall = 1e3 * (now(device) - begin)
+    rows = found.key_averages()
+    of_device = [row for row in rows if str(row.device_type).endswith("CUDA")] if on_gpu else list(rows)
+
+    def taken(row: Any) -> float:
+        return (row.self_device_time_total if on_gpu else row.self_cpu_time_total) / 1e3
+
+    waits = {row.key: row.count for row in rows if "Synchronize" in row.key or row.key == "aten::_local_scalar_dense"}
+    return {
+        "wall_ms": wall,
+        "busy_ms": sum(map(taken, of_device)),
+        "launches": sum(row.count for row in of_device),
+        "waits": waits,
+        "most": [[row.key[:90], row.count, taken(row)] for row in sorted(of_device, key=taken)[: -LINES - 1 : -1]],
+    }
+
+
+def knn(setting: Setting) -> Iterator[Result]:
+    """Nearest neighbours: 16 voxels of every patch point, and 3 points of every pixel for the coloured points."""
+    from vg2gt.voxels.cell_search import nearest_by_cells
+
+    for name, views, step, neighbors in (("patch points", 18, 7, 16), ("pixels", 10, 1, 4)):
+        height, width = (14, 28) if setting.small else (224, 448)
+        rows, columns = torch.meshgrid(torch.arange(0, height, step), torch.arange(0, width, step), indexing="ij")
+        depth = 2 + torch.sin(columns / 60) + torch.cos(rows / 50)
+        u, v = (columns - width / 2) / width * depth, (rows - height / 2) / width * depth
+        points = torch.cat([torch.stack((u + 0.1 * n, v + 0.01 * n, depth), -1).view(-1, 3) for n in range(views)])
+        points = (points / 0.01).float().to(setting.device)
+        found_in = points if neighbors == 4 else torch.unique(points.floor(), dim=0) + 0.5
+        zeros = torch.zeros(len(points), dtype=torch.int64, device=setting.device)
+        setting.forget_peak()
+
+        def search(
+            points: torch.Tensor = points, found_in: torch.Tensor = found_in, k: int = neighbors,
+            zeros: torch.Tensor = zeros,
+        ) -> None:  # fmt: skip
+            nearest_by_cells(points, zeros, found_in, zeros[: len(found_in)], k, 1)
+
+        yield {name: {"queries": len(points), "ms": setting.timed(search), "peak_mb": setting.peak_mb()}}
+
+
+def reconstruct(setting: Setting) -> Iterator[Result]:
+    """The paper's model on 50 images, random weights; then all of its views rendered."""
+    from vg2gt.reconstruction.pipeline import reconstruct_with
+    from vg2gt.runs.load import load_model
+
+    backend, model, size = ("da3_tiny", "tiny", (28, 56)) if setting.small else ("da3_large", "vg2gt", (224, 448))
+    ready = load_model(None, f"{backend},pretrained=false", model, device=str(setting.device))
+    implementation = "triton" if setting.device.type == "cuda" else "auto"  # whether or not the check refuses it
+    renderer = replace(ready.renderer, implementation=implementation)
+    for count in (2,) if setting.small else (10, 50):
+        generator = torch.Generator().manual_seed(0)
+        small = torch.rand(count, 3, size[0] // 7, size[1] // 7, generator=generator)
+        images = torch.nn.functional.interpolate(small, size=size, mode="bilinear")
+        setting.forget_peak()
+        begin = now(setting.device)
+        scene = reconstruct_with(ready.model, images, size=size, renderer=renderer)
+        taken = now(setting.device) - begin
+        found = {"seconds": taken, "peak_mb": setting.peak_mb(), "gaussians": len(scene.gaussians)}
+        setting.forget_peak()
+        begin = now(setting.device)
+        for _ in scene.render():
+            pass
+        rendered = {"render_seconds": now(setting.device) - begin, "render_peak_mb": setting.peak_mb()}
+        yield {f"{count} images": found | rendered}
 
 
 @dataclass(frozen=True)
 class Part:
-    """One measurement.
+    """One measurement and the seconds that it may take."""
 
-    Attributes:
-        name: in the results.
-        command: after the interpreter; ``--out FOLDER`` is added to scripts.
-        seconds: that it may take.
-    """
-
-    name: str
-    command: tuple[str, ...]
+    measure: Callable[[Setting], Iterator[Result]]
     seconds: int
 
 
-PARTS = (
-    Part("doctor", ("-c", "from vg2gt.cli.doctor import main; main([])"), 120),
-    Part("render", (str(HERE / "render.py"), "--device", "cuda", "--quick"), 180),
-    Part(
-        "stages",
-        (str(HERE / "stages.py"), "--device", "cuda", "--training", "--views", "15", "--size", "224", "448", *MODEL),
-        180,
-    ),
-    Part("memory", (str(HERE / "memory.py"), "--device", "cuda"), 180),
-)
+PARTS = {
+    "selfcheck": Part(selfcheck, 90),
+    "tests": Part(tests, 150),
+    "render": Part(render, 90),
+    "step": Part(step, 150),
+    "knn": Part(knn, 45),
+    "reconstruct": Part(reconstruct, 90),
+}
 
 
-def measure(part: Part) -> dict[str, Any]:
-    """Runs a part; returns what it printed, its result files' contents, and how it ended."""
-    with tempfile.TemporaryDirectory() as folder:
-        # options come before the Hydra overrides, which take all that is left
-        first, *rest = part.command
-        out = [] if first == "-c" else ["--out", folder]
-        try:
-            done = subprocess.run(
-                [sys.executable, first, *out, *rest],
-                capture_output=True, text=True, check=False, timeout=part.seconds,
-            )  # fmt: skip
-            ended = "done" if done.returncode == 0 else f"failed: {(done.stderr.strip() or 'no message')[-500:]}"
-            shown = done.stdout
-        except subprocess.TimeoutExpired as error:
-            ended = f"stopped after {part.seconds} s"
-            shown = error.stdout.decode() if isinstance(error.stdout, bytes) else error.stdout or ""
-        results = [read_json(path) for path in sorted(Path(folder).glob("*.json"))]
-    return {"ended": ended, "shown": shown, "results": results}
+def measure(name: str, setting: Setting, path: Path) -> Result:
+    """Runs a part here, and writes what is known after every measurement; an error is a result, too."""
+    content: Result = {"machine": machine(setting.device), "ended": "stopped", "results": {}}
+    write_json(path, content)
+    begin = time.perf_counter()
+    try:
+        for found in PARTS[name].measure(setting):
+            content["results"] |= found
+            content["seconds"] = time.perf_counter() - begin
+            write_json(path, content)
+        content["ended"] = "done"
+    except Exception as error:  # all that was found is kept
+        content["ended"] = f"{type(error).__name__}: {' '.join(str(error).split())[:1000]}"
+    content["seconds"] = time.perf_counter() - begin
+    write_json(path, content)
+    return content
 
 
-def markdown(where: dict[str, Any], found: dict[str, dict[str, Any]]) -> str:
-    """The machine, and what every part printed."""
-    lines = ["# Measured on a GPU", "", f"`{json.dumps(where)}`"]
-    for name, part in found.items():
-        lines += ["", f"## {name}: {part['ended']}", "", "```", part["shown"].strip(), "```"]
-    return "\n".join([*lines, ""])
+def measure_apart(name: str, arguments: Any, seconds: float) -> str:
+    """Runs a part in a process of its own; returns how it ended."""
+    path = dated(arguments.out, f"gpu-{name}")
+    command = [sys.executable, __file__, "--here", name, "--device", arguments.device, "--out", str(arguments.out)]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join((str(ROOT), os.environ.get("PYTHONPATH", "")))}
+    if arguments.device == "cpu":
+        environment["TRITON_INTERPRET"] = "1"
+    try:
+        done = subprocess.run(
+            [*command, *(["--small"] if arguments.small else [])],
+            env=environment, capture_output=True, text=True, check=False, timeout=seconds,
+        )  # fmt: skip
+        ended = "" if done.returncode == 0 else f"status {done.returncode}: {done.stderr.strip()[-1000:]}"
+    except subprocess.TimeoutExpired:
+        ended = f"stopped after {seconds:.0f} s"
+    if ended and path.is_file():
+        write_json(path, {**read_json(path), "ended": ended})
+    return ended or str(read_json(path)["ended"])
+
+
+def brief(value: Any) -> str:
+    """A result in few words."""
+    if isinstance(value, dict):
+        return ", ".join(f"{key} {brief(item)}" for key, item in value.items() if not isinstance(item, (dict, list)))
+    return f"{value:.4g}" if isinstance(value, float) else str(value)[:160]
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Measures and writes.
-
-    Raises:
-        SystemExit: where there is no GPU.
-    """
-    options = parser(__doc__)
-    options.add_argument("--parts", nargs="+", choices=[part.name for part in PARTS], metavar="NAME")
+    """Measures and writes; prints a few lines a part."""
+    options = parser(__doc__, out=Path(os.environ.get("OUT") or ROOT / "benchmarks" / "results"), device=True)
+    options.add_argument("--parts", nargs="+", choices=list(PARTS), default=list(PARTS), metavar="NAME")
+    options.add_argument("--small", action="store_true", help="tiny sizes")
+    options.add_argument("--minutes", type=float, default=8, help="that all parts together may take")
+    options.add_argument("--here", choices=list(PARTS), help="run this part in this process")
     arguments = options.parse_args(argv)
-    if not torch.cuda.is_available():
-        sys.exit("benchmarks/gpu.py needs a GPU that torch can use; python benchmarks/gpu_step.py counts without one")
-    where, found = machine("cuda"), {}
-    for part in PARTS:
-        if arguments.parts and part.name not in arguments.parts:
+    if arguments.device == "cpu" and not arguments.small:
+        sys.exit("benchmarks/gpu.py needs a GPU that torch can use, or --small, which measures nothing")
+    if arguments.here:
+        setting = Setting(torch.device(arguments.device), arguments.small)
+        measure(arguments.here, setting, dated(arguments.out, f"gpu-{arguments.here}"))
+        return
+    end = time.monotonic() + 60 * arguments.minutes
+    for name in arguments.parts:
+        left = min(PARTS[name].seconds, end - time.monotonic())
+        if left < 10:
+            print(f"{name}: no time left", flush=True)
             continue
-        print(f"{part.name} (at most {part.seconds} s) ...", flush=True)
-        found[part.name] = measure(part)
-        print(found[part.name]["shown"], found[part.name]["ended"], flush=True)
-        path = write_results(arguments.out, "gpu", {"machine": where, "parts": found})
-        write_text(path.with_suffix(".md"), markdown(where, found))
+        begin = time.monotonic()
+        ended = measure_apart(name, arguments, left)
+        print(f"{name}: {ended} ({time.monotonic() - begin:.0f} s)", flush=True)
+        path = dated(arguments.out, f"gpu-{name}")
+        for what, value in (read_json(path)["results"] if path.is_file() else {}).items():
+            if not isinstance(value, list):
+                print(f"  {what}: {brief(value)}", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """What the synthetic generator makes: ``python benchmarks/synthetic_figure.py [--out PICTURE]``.
 
-A room, the same room with highlights, and two outdoor scenes: two frames of the camera's path, then depth
-(logarithmic, grey where there is none) and normals of the first.
+A room, the same room with highlights, two outdoor scenes, two objects and a landmark: two frames of the camera's path,
+then depth (logarithmic, grey where there is none) and normals of the first.
 """
 
 from __future__ import annotations
@@ -15,7 +15,10 @@ from torch import Tensor
 from vg2gt.data.synthetic import SyntheticScenes
 from vg2gt.io.images import colorize_depth, colorize_normals, grid, write_png
 
-ROWS = (("room", 2, False), ("room", 2, True), ("outdoor", 12, True), ("outdoor", 14, False))
+ROWS = (
+    ("room", 2, False), ("room", 2, True), ("outdoor", 12, True), ("outdoor", 14, False),
+    ("object", 1, False), ("object", 2, True), ("landmark", 0, False),
+)  # fmt: skip
 FRAMES = (9, 12)  # of 16
 
 

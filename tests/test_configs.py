@@ -6,15 +6,18 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, get_args
 
+import lightning
 import pytest
 import torch
 from hydra.utils import get_class, instantiate
+from lightning.pytorch.strategies import DDPStrategy, SingleDeviceStrategy
 from omegaconf import DictConfig, OmegaConf
 from torch import nn
 from typing_extensions import get_type_hints
 
 from tests.training_helpers import full_model
-from vg2gt.config import compose, group_options
+from vg2gt.config import compose, config_dir, group_options
+from vg2gt.geometry.precision import trainer_precision
 from vg2gt.losses import VG2GTLoss
 from vg2gt.refinement import RefineOptions
 from vg2gt.training.loop import build
@@ -189,10 +192,10 @@ def test_paper_counts_differs_from_the_paper_in_its_voxels_only(tmp_path: Path) 
     assert {key: counts[key] for key in counts} == {key: paper[key] for key in paper}
 
 
-@pytest.mark.parametrize("trainer", ["gpu", "slurm"])
+@pytest.mark.parametrize("trainer", ["gpu", "ddp", "slurm"])
 def test_gpus_train_in_mixed_precision_with_a_fused_optimizer(trainer: str, tmp_path: Path) -> None:
     config = composed(tmp_path, "experiment=paper", f"trainer={trainer}")
-    assert (config.trainer.accelerator, config.trainer.precision) == ("gpu", "bf16-mixed")
+    assert (config.trainer.accelerator, config.trainer.precision) == ("gpu", "auto")
     assert config.trainer.max_steps == 420_000
     assert (config.optimizer.fused, config.optimizer.lr) == (True, 3e-6)
     on_cpu = composed(tmp_path, "optimizer=adamw", "optimizer.lr=3e-6")
@@ -207,6 +210,50 @@ def test_gpus_train_in_mixed_precision_with_a_fused_optimizer(trainer: str, tmp_
             optimizer.step()
         steps.append(weight.detach())
     torch.testing.assert_close(*steps, rtol=1e-6, atol=0)
+
+
+MACHINES = {  # what the trainers of the experiments compute on
+    "trainer=gpu": {"devices": [0], "nodes": 1, "strategy": SingleDeviceStrategy},
+    "trainer=ddp": {"devices": [0, 1], "nodes": 1, "strategy": DDPStrategy},
+    "trainer=ddp trainer.devices=8": {"devices": list(range(8)), "nodes": 1, "strategy": DDPStrategy},
+    "trainer=ddp trainer.devices=-1": {"devices": list(range(8)), "nodes": 1, "strategy": DDPStrategy},
+    "trainer=slurm": {"devices": [0, 1, 2, 3], "nodes": 3, "strategy": DDPStrategy},
+}
+
+
+@pytest.mark.parametrize("experiment", ["paper", "paper_counts", "finetune"])
+@pytest.mark.parametrize("machine", MACHINES)
+def test_experiments_train_on_any_machine(
+    tmp_path: Path, experiment: str, machine: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The trainer that Lightning makes on a machine that pretends to have eight GPUs."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    for package in ("fabric", "pytorch"):
+        monkeypatch.setattr(f"lightning.{package}.accelerators.cuda.num_cuda_devices", lambda: 8)
+    job = {"SLURM_JOB_ID": "7", "SLURM_JOB_NAME": "paper", "SLURM_NTASKS": "12", "SLURM_NTASKS_PER_NODE": "4"}
+    job |= {"SLURM_JOB_NUM_NODES": "3", "SLURM_NNODES": "3", "SLURM_LOCALID": "0", "SLURM_PROCID": "0"}
+    for name, value in {**job, "SLURM_NODEID": "0", "SLURM_NODELIST": "a"}.items() if "slurm" in machine else ():
+        monkeypatch.setenv(name, value)
+    config = composed(tmp_path, f"experiment={experiment}", *machine.split())
+    precision = trainer_precision(config.trainer.precision, config.trainer.accelerator)
+    trainer: lightning.Trainer = instantiate(config.trainer, precision=precision, logger=False)
+    expected = MACHINES[machine]
+    assert trainer.device_ids == expected["devices"]
+    assert trainer.num_nodes == expected["nodes"]
+    assert trainer.world_size == len(expected["devices"]) * expected["nodes"]
+    assert type(trainer.strategy) is expected["strategy"]
+    assert trainer.precision == "bf16-mixed"
+    assert config.optimizer.fused
+    if isinstance(trainer.strategy, DDPStrategy):
+        assert trainer.strategy._ddp_kwargs == {"broadcast_buffers": False}
+
+
+def test_no_preset_but_a_trainers_chooses_the_machine() -> None:
+    """Presets win over groups: one that sets devices or precision makes the trainer of the command line void."""
+    for path in Path(config_dir()).rglob("*.yaml"):
+        if path.parent.name != "trainer":
+            chosen = (OmegaConf.load(path).get("trainer") or {}).keys()  # pyright: ignore
+            assert not chosen & {"accelerator", "devices", "num_nodes", "strategy", "precision"}, path
 
 
 def test_paper_experiment_holds_the_papers_numbers(tmp_path: Path) -> None:
@@ -224,3 +271,5 @@ def test_paper_experiment_holds_the_papers_numbers(tmp_path: Path) -> None:
     assert (config.data.min_views, config.data.max_views) == (3, 18)
     assert set(config.data.weights) == {"infinigen", "kitti", "scannet"}
     assert config.training.render_views is None
+    # ours: an evaluation that ends in minutes, where all stretches of 30 scenes would be some 200
+    assert (config.data.eval_scenes, config.trainer.limit_val_batches) == (9, 40)

@@ -28,6 +28,7 @@ from vg2gt.geometry.cameras import relative_to_first, scale_translations
 from vg2gt.memory import note_sizes
 from vg2gt.profiling import stage
 from vg2gt.types import Cameras, Decoded, Gaussians, Geometry, Hints, Prediction, Tokens, Voxels
+from vg2gt.visibility import ViewCheck
 
 Background = Literal["mean", "black"]
 ScaleSource = Literal["metric", "focal", "normalize", "groundtruth"]
@@ -81,12 +82,20 @@ class Reconstructor(nn.Module, ABC):
         scale: fixes the scene unit.
         background: what rays see that meet no Gaussian: the ``mean`` colour of the pixels without a depth, or of all
             where there are none, or ``black``.
+        visibility: not in the paper: decides by what other views see which pixels' depth the scene is made of; None
+            takes all.
 
     Raises:
         ValueError: if the scale is to be metric and the backend is not, or the background is unknown.
     """
 
-    def __init__(self, backend: Backend, scale: SceneScale, background: Background = "black") -> None:
+    def __init__(
+        self,
+        backend: Backend,
+        scale: SceneScale,
+        background: Background = "black",
+        visibility: ViewCheck | None = None,
+    ) -> None:
         super().__init__()
         if background not in get_args(Background):
             raise ValueError(f"model.background is {background!r}; choose one of {', '.join(get_args(Background))}")
@@ -99,6 +108,7 @@ class Reconstructor(nn.Module, ABC):
         self.backend = backend
         self.scale = scale
         self.background: Background = background
+        self.visibility = visibility
         self.token_cache: TokenCache | None = None  # set where view sets come again
 
     @abstractmethod
@@ -124,6 +134,7 @@ class Reconstructor(nn.Module, ABC):
         scenes, views, _, height, width = images.shape
         note_sizes({f"images of {height}x{width} in {scenes} scene{'s' * (scenes > 1)}": scenes * views}, anew=True)
         tokens, raw = self.run_backbone(images, hints)
+        raw = masked(raw, hints)
         unit = self.scale(raw, hints)
         return tokens, _to_scene_frame(raw, unit), unit
 
@@ -153,6 +164,13 @@ class Reconstructor(nn.Module, ABC):
             if self.token_cache is not None:
                 return self.token_cache.cameras(self.backend, images, hints)
             return self.backend.predict_cameras(images, hints)
+
+    def supported(self, geometry: Geometry) -> Tensor | None:
+        """Pixels ``[B, V, H, W]`` whose depth the other views do not contradict; None where nothing is checked."""
+        if self.visibility is None:
+            return None
+        with stage("visibility"):
+            return self.visibility(geometry)
 
     def with_background(self, gaussians: Gaussians, images: Tensor, depth: Tensor) -> Gaussians:
         """Sets what rays see that meet none of the Gaussians.
@@ -227,6 +245,7 @@ class VG2GT(Reconstructor):
         gaussians: makes the self-splitting Gaussian head from ``in_channels``.
         keep_scale: the enhanced depth keeps the scale of the backbone's, see :func:`with_scale_of`.
         background: see :class:`Reconstructor`.
+        visibility: see :class:`Reconstructor`; it checks the enhanced geometry before the fine level.
 
     Raises:
         ValueError: if the scale is to be metric and the backend is not, or the background is unknown.
@@ -241,8 +260,9 @@ class VG2GT(Reconstructor):
         gaussians: Callable[..., nn.Module],
         keep_scale: bool = True,
         background: Background = "black",
+        visibility: ViewCheck | None = None,
     ) -> None:
-        super().__init__(backend, scale, background)
+        super().__init__(backend, scale, background, visibility)
         dims, patch = backend.token_dims, backend.patch_size
         self.keep_scale = keep_scale
         self.coarse = coarse(token_dims=dims, patch_size=patch) if coarse else None
@@ -263,11 +283,12 @@ class VG2GT(Reconstructor):
             Geometry before and after enhancement, voxels and Gaussians, in scene units and in the frame of view 0.
         """
         tokens, decoded = self.enhance(images, hints, generator)
+        supported = self.supported(decoded.geometry)
         with stage("fine"):
-            voxels: Voxels = self.fine(tokens, decoded.geometry, images)
+            voxels: Voxels = self.fine(tokens, decoded.geometry.where(supported), images)
         with stage("gaussians"):
             gaussians = self.with_background(self.gaussians(voxels), images, decoded.initial.depth)
-        return Prediction(decoded.initial, decoded.geometry, decoded.unit, voxels, gaussians)
+        return Prediction(decoded.initial, decoded.geometry, decoded.unit, voxels, gaussians, supported)
 
     def enhance(
         self, images: Tensor, hints: Hints | None = None, generator: torch.Generator | None = None
@@ -283,11 +304,19 @@ class VG2GT(Reconstructor):
         with stage("coarse"):
             tokens = self.coarse(tokens, initial, generator=generator)
         with stage("decode_again"):
-            again = self.backend.decode(tokens)
+            again = masked(self.backend.decode(tokens), hints)
         # The camera token is untouched, so the cameras are the backbone's: decoded once, used throughout.
         depth = again.depth * unit[:, None, None, None]
         depth = depth if not self.keep_scale else with_scale_of(initial, depth)
         return tokens, Decoded(initial, replace(initial, depth=depth, depth_conf=again.depth_conf), unit)
+
+
+def masked(geometry: Geometry, hints: Hints | None) -> Geometry:
+    """Takes depth away where a mask says that pixels do not count, and confidence as far as they count less."""
+    if hints is None or hints.mask is None:
+        return geometry
+    kept = geometry.where(hints.mask > 0.5)
+    return replace(kept, depth_conf=geometry.depth_conf * hints.mask.clamp(min=1e-3))
 
 
 def with_scale_of(initial: Geometry, depth: Tensor) -> Tensor:

@@ -26,9 +26,9 @@ class TensorRecord:
         """Returns a copy whose tensors are ``function(tensor)``; everything else is kept."""
         return replace(self, **{f.name: _map_value(getattr(self, f.name), function) for f in fields(self)})
 
-    def to(self: Record, device: torch.device | str) -> Record:
-        """Returns a copy on ``device``."""
-        return self.map(lambda tensor: tensor.to(device))
+    def to(self: Record, device: torch.device | str, non_blocking: bool = False) -> Record:
+        """Returns a copy on ``device``; without blocking, page-locked memory is copied while the host goes on."""
+        return self.map(lambda tensor: tensor.to(device, non_blocking=non_blocking))
 
     def pin_memory(self: Record) -> Record:
         """Returns a copy in page-locked memory, from where copies to a GPU are faster."""
@@ -85,6 +85,7 @@ class Hints(TensorRecord):
         frame_ids: ``[B, V]`` int64 frame numbers; seed simulated noise.
         depth_range: ``[B, 2]`` z-depth (near, far) between which nearly all of what the views see lies, such as sparse
             points of structure from motion tell, in the unit of the cameras' translations; None if unknown.
+        mask: ``[B, V, H, W]`` in [0, 1], how much each pixel counts (alpha, mask images); None: all count.
     """
 
     depth: Tensor | None = None
@@ -92,6 +93,7 @@ class Hints(TensorRecord):
     scene_key: tuple[str, ...] = ()
     frame_ids: Tensor | None = None
     depth_range: Tensor | None = None
+    mask: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -106,6 +108,7 @@ class Batch(TensorRecord):
         frame_ids: ``[B, V]`` int64.
         scene: one name a scene.
         num_context: number of input views, 1 <= num_context <= V.
+        mask: ``[B, V, H, W]`` in [0, 1], how much each pixel counts (alpha, mask images); None: all count.
     """
 
     images: Tensor
@@ -115,6 +118,7 @@ class Batch(TensorRecord):
     frame_ids: Tensor
     scene: tuple[str, ...]
     num_context: int
+    mask: Tensor | None = None
 
     def views(self, views: slice) -> Batch:
         """Returns the batch restricted to a slice of its views, all of them counted as context."""
@@ -127,6 +131,7 @@ class Batch(TensorRecord):
             self.frame_ids[:, views],
             self.scene,
             images.shape[1],
+            None if self.mask is None else self.mask[:, views],
         )
 
     def single(self, index: int) -> Batch:
@@ -140,6 +145,7 @@ class Batch(TensorRecord):
             self.frame_ids[rows],
             self.scene[rows],
             self.num_context,
+            None if self.mask is None else self.mask[rows],
         )
 
     @property
@@ -155,7 +161,7 @@ class Batch(TensorRecord):
     @property
     def hints(self) -> Hints:
         """What a backend may be told about all views of this batch."""
-        return Hints(self.depth, self.cameras, self.scene, self.frame_ids)
+        return Hints(self.depth, self.cameras, self.scene, self.frame_ids, mask=self.mask)
 
 
 @dataclass(frozen=True)
@@ -196,6 +202,10 @@ class Geometry(TensorRecord):
     depth_conf: Tensor
     cameras: Cameras
     scale: Tensor
+
+    def where(self, keep: Tensor | None) -> Geometry:
+        """The geometry without depth (0) where ``keep`` ``[B, V, H, W]`` is false; None keeps all."""
+        return self if keep is None else replace(self, depth=torch.where(keep, self.depth, 0.0))
 
 
 @dataclass(frozen=True)
@@ -274,6 +284,11 @@ class Gaussians(TensorRecord):
     def __len__(self) -> int:
         return self.means.shape[0]
 
+    def select(self, rows: Tensor) -> Gaussians:
+        """Returns some of them: ``rows`` are sorted indices or ``[G]`` bool."""
+        names = [each.name for each in fields(self) if each.name != "background"]
+        return replace(self, **{name: getattr(self, name)[rows] for name in names})
+
     def scene(self, index: int) -> Gaussians:
         """Returns one scene's Gaussians, its ``batch`` set to 0."""
         bounds = torch.searchsorted(self.batch, torch.tensor([index, index + 1], device=self.batch.device))
@@ -328,7 +343,14 @@ class Prediction(Decoded):
     Attributes:
         voxels: refined fine voxels; None for models that split no voxels.
         gaussians: the Gaussian scene.
+        supported: ``[B, V, H, W]`` bool, pixels whose depth the scene is made of; None: all that have one.
     """
 
     voxels: Voxels | None
     gaussians: Gaussians
+    supported: Tensor | None = None
+
+    @property
+    def surface(self) -> Geometry:
+        """The geometry with depth only where the scene is made of it."""
+        return self.geometry.where(self.supported)

@@ -8,7 +8,6 @@ from typing import get_args
 import torch
 from torch import Tensor, nn
 
-from backends.base import full_precision, half_precision_on_gpu
 from backends.da3.backbone import Backbone, PretrainedBackbone, ReferenceView
 from backends.da3.camera import CameraDecoder, CameraEncoder, normalize_cameras
 from backends.dpt import DPT, in_chunks
@@ -18,6 +17,7 @@ from backends.poses import decode_pose
 from backends.vit import FeedForward
 from backends.weights import Weights
 from vg2gt.geometry.cameras import invert_rigid
+from vg2gt.geometry.precision import full_precision, half_precision_on_gpu
 from vg2gt.types import Cameras, Geometry, Hints, Tokens
 
 RAY_BRANCH = tuple(

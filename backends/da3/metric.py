@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from backends.base import Backend, full_precision, half_precision_on_gpu
+from backends.base import Backend
 from backends.da3.backbone import Backbone, PretrainedBackbone
 from backends.da3.backend import NESTED_PARTS, DA3Backend
 from backends.dpt import DPT, in_chunks
@@ -19,6 +19,7 @@ from backends.network import NetworkBackend
 from backends.normalization import normalize_images
 from backends.weights import Weights
 from vg2gt.geometry.alignment import fit_depth_scale
+from vg2gt.geometry.precision import full_precision, half_precision_on_gpu
 from vg2gt.types import Cameras, Geometry, Hints, Tokens
 
 CANONICAL_FOCAL = 300.0  # pixels at network resolution

@@ -8,12 +8,13 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from backends.base import Backend, full_precision
+from backends.base import Backend
 from backends.sweep.network import PosedViews, SweepNet
 from backends.sweep.tokens import DIM, PATCH, TAPS
 from backends.sweep.views import camera_extent, choose_sources
 from backends.weights import Weights
 from vg2gt.geometry.cameras import relative_to_first
+from vg2gt.geometry.precision import full_precision
 from vg2gt.types import Geometry, Hints, Tokens
 
 SHIPPED = Path(__file__).parent / "weights" / "sweep.safetensors"

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from backends.base import full_precision
 from backends.sweep.correlate import SourceWarp
 from backends.sweep.features import CONTEXT_COARSE, FeaturePyramid, Features
 from backends.sweep.head import DepthHead
@@ -23,6 +22,7 @@ from backends.sweep.volume import (
     to_inverse,
 )
 from vg2gt.geometry.cameras import resize_intrinsics
+from vg2gt.geometry.precision import full_precision
 
 _BINS = 16  # channels that the planes' probability is summed into
 _FINE_PLANES = 12

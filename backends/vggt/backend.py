@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from backends.base import half_precision_on_gpu
 from backends.network import NetworkBackend, predict
 from backends.vggt.camera_head import ITERATIONS
 from backends.vggt.network import Aggregator, VGGTNetwork
 from backends.weights import Weights
+from vg2gt.geometry.precision import half_precision_on_gpu
 from vg2gt.types import Hints, Tokens
 
 IGNORABLE = ("track_head.", "point_head.", "aggregator.patch_embed.mask_token")

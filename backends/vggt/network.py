@@ -10,7 +10,6 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from backends.base import full_precision
 from backends.dpt import DPT, in_chunks
 from backends.normalization import normalize_images
 from backends.poses import decode_pose
@@ -18,6 +17,7 @@ from backends.positions import resize_position_embedding
 from backends.rope import grid_positions, rotary_2d
 from backends.vggt.camera_head import CameraHead
 from backends.vit import PatchEmbed, ViTBlock, first_and_others
+from vg2gt.geometry.precision import full_precision
 from vg2gt.types import Cameras, Geometry, Tokens
 
 REGISTERS = 4

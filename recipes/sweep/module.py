@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from backends.base import full_precision
 from backends.sweep.network import PosedViews, SweepEncoding, SweepNet
 from backends.sweep.views import choose_sources
 from recipes.sweep.objective import objective
 from recipes.sweep.samples import Sample
+from vg2gt.geometry.precision import full_precision
 
 _LARGEST_GRADIENT = 1.0
 _SOURCE_JITTER = 0.4  # of the scores of sources, so that not only the best pairs are trained on

@@ -260,7 +260,7 @@ def test_tasks_of_a_slurm_job_find_each_other(tmp_path: Path, cache: Path) -> No
     job = {"SLURM_JOB_ID": "4242", "SLURM_JOB_NAME": "train", "SLURM_NODELIST": "127.0.0.1", "SLURM_NODEID": "0"}
     job |= {"SLURM_NTASKS": "2", "SLURM_NTASKS_PER_NODE": "2", "SLURM_JOB_NUM_NODES": "1"}
     job |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(two_ranks.free_port())}
-    small = [*SMALL, *TINY[:7], f"data.cache_dir={cache}", "trainer=slurm", "trainer.precision=32-true", "name=job"]
+    small = [*SMALL, *TINY[:7], f"data.cache_dir={cache}", "trainer=slurm", "name=job"]
     command = [sys.executable, "-m", "vg2gt.cli.train", *small]
     tasks = [
         subprocess.Popen(

@@ -22,7 +22,7 @@ from vg2gt.data.batches import BatchDataset
 from vg2gt.training.distributed import ending_together
 from vg2gt.training.loop import Run, evaluate
 
-RANKS = ["trainer=ddp"]
+RANKS = ["trainer=ddp", "trainer.accelerator=cpu"]
 SGD = ["optimizer=adamw", "optimizer._target_=torch.optim.SGD", "~optimizer.betas", "optimizer.lr=0.05"]
 ADAMW = ["optimizer=adamw"]
 EMPTY = [

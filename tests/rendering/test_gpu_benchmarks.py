@@ -2,11 +2,18 @@
 
 import importlib.util
 import os
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 import torch
+
+from vg2gt.io.files import read_json
+from vg2gt.rendering.options import RenderOptions
+from vg2gt.types import Cameras, Gaussians
 
 if importlib.util.find_spec("triton") is None:
     pytest.skip("needs triton, which has wheels for Linux on x86-64 only", allow_module_level=True)
@@ -117,23 +124,83 @@ def test_without_a_gpu_the_command_says_so(gpu: ModuleType, tmp_path: Path) -> N
     assert not list(tmp_path.iterdir())
 
 
-def test_parts_are_collected_and_failures_told(gpu: ModuleType, tmp_path: Path) -> None:
-    script = tmp_path / "part.py"
-    script.write_text("import sys, pathlib; pathlib.Path(sys.argv[2], 'a.json').write_text('[3]'); print(sys.argv[3:])")
-    good = gpu.measure(gpu.Part("good", (str(script), "--quick"), 60))
-    assert good == {"ended": "done", "shown": "['--quick']\n", "results": [[3]]}
-    bad = gpu.measure(gpu.Part("bad", ("-c", "raise ValueError('no such GPU')"), 60))
-    assert bad["ended"].startswith("failed: ")
-    assert bad["ended"].endswith("ValueError: no such GPU")
-    late = gpu.measure(gpu.Part("late", ("-c", "import time; print('so far', flush=True); time.sleep(60)"), 2))
-    assert late["ended"] == "stopped after 2 s"
-    assert late["shown"] == "so far\n"
-    text = gpu.markdown({"gpu": "X"}, {"good": good, "bad": bad})
-    assert "## good: done" in text
-    assert "no such GPU" in text
+@pytest.mark.parametrize(
+    ("part", "found"),
+    [
+        ("render", {"cpu solid 500", "cpu rasterized 500"}),
+        ("step", {"tiny: step_ms", "tiny: peak_mb", "tiny: stage_ms", "tiny: stage_peak_mb", "tiny: profile"}),
+        ("knn", {"patch points", "pixels"}),
+        ("reconstruct", {"2 images"}),
+    ],
+)
+def test_every_part_measures_on_a_cpu_as_well(
+    gpu: ModuleType, part: str, found: set[str], tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("VG2GT_CACHE", str(cache))
+    content = gpu.measure(part, gpu.Setting(torch.device("cpu"), small=True), tmp_path / "part.json")
+    assert content["ended"] == "done"
+    assert content["results"].keys() == found
+    assert read_json(tmp_path / "part.json") == content
+    if part == "step":
+        stages = content["results"]["tiny: stage_ms"]
+        assert {"encode", "coarse", "fine", "render", "loss", "backward", "optimizer"} <= stages.keys()
+        assert all(taken > 0 for taken in stages.values())
+        assert content["results"]["tiny: profile"]["launches"] > 1000
 
 
-def test_every_part_names_a_script_that_is_there(gpu: ModuleType) -> None:
-    for part in gpu.PARTS:
-        assert part.command[0] == "-c" or Path(part.command[0]).is_file()
-    assert sum(part.seconds for part in gpu.PARTS) <= 700
+def test_what_a_part_found_before_it_failed_is_kept(
+    gpu: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(setting: Any) -> Iterator[dict[str, Any]]:
+        yield {"first": 1}
+        raise RuntimeError("CUDA error:\nan illegal memory access")
+
+    monkeypatch.setitem(gpu.PARTS, "knn", gpu.Part(fails, 9))
+    content = gpu.measure("knn", gpu.Setting(torch.device("cpu"), small=True), tmp_path / "part.json")
+    assert content["ended"] == "RuntimeError: CUDA error: an illegal memory access"
+    assert content["results"] == {"first": 1}
+    assert read_json(tmp_path / "part.json") == content
+
+
+def test_parts_run_apart_and_within_their_time(
+    gpu: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(gpu.subprocess, "run", partial(only_seconds, gpu.subprocess.run, {"step": 0.01}))
+    gpu.main(["--device", "cpu", "--small", "--out", str(tmp_path), "--parts", "knn", "step"])
+    shown = capsys.readouterr().out
+    assert "knn: done (" in shown
+    assert "  patch points: ms " in shown
+    assert "step: stopped after 150 s (" in shown
+    assert [path.name.split("-", 3)[3] for path in tmp_path.iterdir()] == ["gpu-knn.json"]
+    assert sum(part.seconds for part in gpu.PARTS.values()) <= 640  # all together end after --minutes
+
+
+def only_seconds(run: Any, limits: dict[str, float], command: list[str], **options: Any) -> Any:
+    """Runs a command with another limit, by the part that it measures."""
+    return run(command, **{**options, "timeout": limits.get(command[3], options["timeout"])})
+
+
+def test_many_refused_slots_do_not_overflow_their_sum(benchmark_script) -> None:
+    """One bad camera seen by ten million Gaussians: with 2^40 a slot the sum was negative, and memory was asked for."""
+    from vg2gt.rendering.gpu import RefusedError, render_triton
+    from vg2gt.rendering.gpu.projection import REFUSED, SLOTS
+
+    assert SLOTS * REFUSED < 1 << 63
+    count = (1 << 23) + 5
+    one, matrix = torch.zeros(1, 3).expand(count, 3), torch.eye(4).expand(1, 1, 4, 4)
+    gaussians = Gaussians(one, torch.ones(1, 4).expand(count, 4), one, one[:, 0], one[:, None], one[:, 0].long())
+    cameras = Cameras(matrix, matrix[..., :3, :3], (8, 8))
+    recorded = benchmark_script("gpu_kernels").recorded({"project_kernel": lambda counts, **_: counts.fill_(REFUSED)})
+    with recorded, pytest.raises(RefusedError, match="cannot be rendered"):
+        render_triton(gaussians, cameras, torch.zeros(3), RenderOptions())
+
+
+def test_more_slots_than_can_be_numbered_are_refused(benchmark_script) -> None:
+    """A view whose Gaussians are so many; views are rendered in parts."""
+    from vg2gt.rendering.gpu.function import _list
+
+    views, count = (1 << 19) + 1, 1 << 11
+    few, matrix = torch.zeros(count, 3), torch.eye(4).expand(1, views, 4, 4)
+    tensors = (few, torch.ones(count, 4), few, few[:, 0], few[:, None], matrix, matrix[..., :3, :3], few[0])
+    with benchmark_script("gpu_kernels").recorded(), pytest.raises(ValueError, match="2048 Gaussians in 524289 views"):
+        _list((*tensors, few[:, 0].long()), (8, 8), RenderOptions(), 1)

@@ -1,17 +1,20 @@
 """The kernels are checked on the device before they are relied on: right ones pass, wrong ones are refused."""
 
 import importlib.util
-import logging
 import os
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import lightning
 import pytest
 import torch
+from torch.utils.data import DataLoader, TensorDataset
 
 from vg2gt.rendering import render, renderer, selfcheck
 from vg2gt.rendering.options import Mode
-from vg2gt.rendering.selfcheck import GRADIENTS, VALUES, Agreement
+from vg2gt.rendering.selfcheck import GRADIENTS, VALUES, Agreement, KernelsRefusedError
 
 INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
 interpreted = pytest.mark.skipif(not INTERPRETED, reason="runs in the process that test_triton.py starts")
@@ -47,7 +50,7 @@ def test_wrong_kernels_are_refused(name: str, tmp_path: Path, monkeypatch: pytes
     from vg2gt.rendering.gpu import kernels
 
     module, before, after = MUTANTS[name]
-    source = (selfcheck.KERNELS / f"{module}.py").read_text()
+    source = Path(kernels.__file__).with_name(f"{module}.py").read_text()
     assert source.count(before) == 1
     path = tmp_path / "wrong_kernels.py"
     path.write_text(source.replace(before, after))
@@ -65,6 +68,49 @@ def test_wrong_kernels_are_refused(name: str, tmp_path: Path, monkeypatch: pytes
     assert not max(found.values / VALUES, found.gradients / GRADIENTS) <= 10
 
 
+class Validating(lightning.LightningModule):
+    """Acts once in the validation step of an evaluation."""
+
+    def __init__(self, act: Callable[[], None]) -> None:
+        super().__init__()
+        self.act = act
+
+    def validation_step(self, batch: Any, index: int) -> None:
+        assert torch.is_inference_mode_enabled()
+        self.act()
+
+
+def validating(act: Callable[[], None]) -> None:
+    options: Any = {"accelerator": "cpu", "logger": False, "enable_progress_bar": False, "precision": "bf16-mixed"}
+    trainer = lightning.Trainer(**options, enable_checkpointing=False)
+    trainer.validate(Validating(act), DataLoader(TensorDataset(torch.zeros(1))), verbose=False)
+
+
+@interpreted
+@pytest.mark.parametrize(
+    "surrounded",
+    [
+        torch.no_grad(),
+        pytest.param(torch.inference_mode(), marks=pytest.mark.slow),
+        validating,
+    ],
+    ids=["no_grad", "inference_mode", "validation step"],
+)
+def test_the_check_does_not_depend_on_what_surrounds_the_first_render(
+    surrounded: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The real check, of one mode; its error was taken for a disagreement wherever gradients were off."""
+    monkeypatch.setattr(selfcheck, "compare", partial(selfcheck.compare, modes=("rasterized",)))
+    monkeypatch.setattr(selfcheck, "cache_folder", lambda: tmp_path)
+    selfcheck._refusal.cache_clear()
+    act = partial(selfcheck.require_trusted, render, torch.device("cpu"))
+    if surrounded is validating:
+        validating(act)
+    else:
+        surrounded(act)()
+    assert (tmp_path / "gpu_agreement.json").is_file()
+
+
 @pytest.fixture
 def checks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[str]:
     """Devices that were checked, on a machine that pretends to have some; what is found is kept in ``tmp_path``."""
@@ -78,14 +124,14 @@ def checks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[str]:
     monkeypatch.setattr(selfcheck, "identity", lambda device: f"device {device}, triton 3")
     monkeypatch.setattr(selfcheck, "cache_folder", lambda: tmp_path)
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
-    selfcheck._trusted.cache_clear()
+    selfcheck._refusal.cache_clear()
     return asked
 
 
 def test_agreement_makes_auto_triton_and_is_found_out_once(checks: list[str]) -> None:
     assert renderer.automatic(torch.device("cpu")) == "cpu"
     assert renderer.automatic(GPU) == renderer.automatic(GPU) == "triton"
-    selfcheck._trusted.cache_clear()  # as in another process
+    selfcheck._refusal.cache_clear()  # as in another process
     assert renderer.automatic(GPU) == "triton"
     assert checks == ["cuda"]
     assert renderer.automatic(torch.device("cuda", 1)) == "triton"  # another device is another matter
@@ -101,32 +147,42 @@ def test_agreement_makes_auto_triton_and_is_found_out_once(checks: list[str]) ->
         Agreement(0.0, float("nan")),
     ],
 )
-def test_disagreement_falls_back_with_one_line(
-    checks: list[str], found: Agreement, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+def test_disagreement_is_an_error_that_says_what_to_report_and_what_to_choose(
+    checks: list[str], found: Agreement, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(selfcheck, "compare", lambda *_: found)
-    with caplog.at_level(logging.WARNING):
-        assert renderer.automatic(GPU) == renderer.automatic(GPU) == "torch"
-    (record,) = caplog.records
-    assert "disagree with the reference: values off by" in record.getMessage()
-    assert record.getMessage().endswith("Please report this line: device cuda, triton 3")
-    selfcheck._trusted.cache_clear()
-    assert renderer.automatic(GPU) == "torch"
+    for again in (False, True):  # the next process knows it, too
+        with pytest.raises(KernelsRefusedError, match="disagree with the reference: values off by") as error:
+            renderer.automatic(GPU)
+        assert "Please report this line: device cuda, triton 3. renderer.implementation=torch" in str(error.value)
+        if not again:
+            selfcheck._refusal.cache_clear()
 
 
-def test_kernels_that_do_not_run_fall_back_and_are_tried_again_by_the_next_process(
-    checks: list[str], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+def test_kernels_that_do_not_run_are_an_error_and_are_tried_again_by_the_next_process(
+    checks: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    tries = []
+
     def broken(*_: Any) -> Agreement:
+        tries.append(1)
         raise RuntimeError("no C compiler\nwas found")
 
     with monkeypatch.context() as patched:
         patched.setattr(selfcheck, "compare", broken)
-        assert renderer.automatic(GPU) == renderer.automatic(GPU) == "torch"
-    (record,) = caplog.records
-    assert "do not run (RuntimeError: no C compiler was found)" in record.getMessage()
-    selfcheck._trusted.cache_clear()
+        for _ in range(2):
+            with pytest.raises(KernelsRefusedError, match=r"do not run \(RuntimeError: no C compiler was found\)"):
+                renderer.automatic(GPU)
+    assert len(tries) == 1
+    selfcheck._refusal.cache_clear()
     assert renderer.automatic(GPU) == "triton"
+
+
+def test_a_gpu_without_triton_is_told_so(checks: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(KernelsRefusedError, match=r"triton.* is not installed\. renderer\.implementation=torch"):
+        renderer.automatic(GPU)
+    assert renderer._resolve("torch", GPU) == "torch"
 
 
 def test_without_a_folder_to_keep_it_in_every_process_checks(
@@ -134,7 +190,7 @@ def test_without_a_folder_to_keep_it_in_every_process_checks(
 ) -> None:
     monkeypatch.setattr(selfcheck, "cache_folder", lambda: None)
     assert renderer.automatic(GPU) == "triton"
-    selfcheck._trusted.cache_clear()
+    selfcheck._refusal.cache_clear()
     assert renderer.automatic(GPU) == "triton"
     assert checks == ["cuda", "cuda"]
 
@@ -143,6 +199,14 @@ def test_the_identity_names_versions_and_the_kernels() -> None:
     found = selfcheck.identity(torch.device("cpu"))
     assert f"torch {torch.__version__}" in found
     assert "kernels " in found
+
+
+def test_the_fixed_scenes_are_two_of_the_models_degree_in_several_parts() -> None:
+    gaussians, cameras = selfcheck.as_scene(selfcheck.fixed_scene())
+    assert cameras.world_to_camera.shape[:2] == (selfcheck.SCENES, selfcheck.VIEWS) == (2, 2)
+    assert gaussians.sh.shape[1] == 9
+    assert gaussians.batch.bincount().tolist() == [selfcheck.COUNT] * 2
+    assert selfcheck.ROWS < selfcheck.COUNT * selfcheck.SCENES  # every Gaussian has a row a view at least
 
 
 def test_the_fixed_scene_does_not_depend_on_random_generators() -> None:

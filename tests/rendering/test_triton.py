@@ -32,15 +32,18 @@ if importlib.util.find_spec("triton") is None:
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
 runnable = pytest.mark.skipif(DEVICE == "cpu" and not INTERPRETED, reason="runs in test_in_the_interpreter's process")
+if DEVICE == "cuda":
+    runnable = pytest.mark.gpu
 
 
 @pytest.mark.skipif(DEVICE == "cuda" or INTERPRETED, reason="only where the kernels cannot run themselves")
-@pytest.mark.parametrize("chosen", ["not slow and not gpu", pytest.param("slow", marks=pytest.mark.slow)])
-def test_in_the_interpreter(chosen: str) -> None:
-    """Runs two files once more, because Triton must be told of its interpreter before it is first imported."""
+@pytest.mark.parametrize("chosen", ["not slow and not gpu", pytest.param("slow and not gpu", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("files", [("test_triton.py", "test_selfcheck.py"), ("../test_device.py",)])
+def test_in_the_interpreter(files: tuple[str, ...], chosen: str) -> None:
+    """Runs files once more, because Triton must be told of its interpreter before it is first imported."""
     environment = {**os.environ, "TRITON_INTERPRET": "1"}
-    files = [__file__, str(Path(__file__).with_name("test_selfcheck.py"))]
-    command = [sys.executable, "-m", "pytest", "-n", "0", "-m", chosen, *files]
+    paths = [str(Path(__file__).parent / file) for file in files]
+    command = [sys.executable, "-m", "pytest", "-n", "0", "-m", chosen, *paths]
     result = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert result.returncode == 0, result.stdout[-5000:]
 
@@ -86,13 +89,14 @@ def test_color_only_and_rays_with_many_hits() -> None:
 def test_gradients_are_the_same_however_many_views_are_held_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     from vg2gt.rendering.gpu import function
 
-    assert function._chunks([4, 4, 9, 10]) == ((0, 4, 0, 10),)
+    assert function._chunks([4, 4, 9, 10], function.ROWS) == ((0, 4, 0, 10),)
     gaussians, cameras = soup(7, size=0.25), cameras_around((5, 11), views=3)
     options = {"mode": "rasterized", "implementation": "triton"}
     _, expected = render_with_gradients(gaussians, cameras, DEVICE, **options)
-    monkeypatch.setattr(function, "ROWS", 5)
-    assert function._chunks([4, 4, 9, 10]) == ((0, 2, 0, 4), (2, 1, 4, 9), (3, 1, 9, 10))
-    assert function._chunks([9, 18]) == ((0, 1, 0, 9), (1, 1, 9, 18))
+    assert function._chunks([4, 4, 9, 10], 5) == ((0, 2, 0, 4), (2, 1, 4, 9), (3, 1, 9, 10))
+    assert function._chunks([9, 18], 5) == ((0, 1, 0, 9), (1, 1, 9, 18))
+    monkeypatch.setattr(function, "_rows_at_once", lambda device: 5)
+    monkeypatch.setattr(function, "_slots_at_once", lambda device: 2 * len(gaussians))  # two views, then one
     _, grads = render_with_gradients(gaussians, cameras, DEVICE, **options)
     for name, grad in expected.items():
         torch.testing.assert_close(grads[name], grad, rtol=1e-12, atol=1e-12)  # summed in another order

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from vg2gt.types import Cameras
-from vg2gt.voxels import grid
+from vg2gt.voxels import coarse, grid
 from vg2gt.voxels.coarse import PatchPoints
 
 
@@ -125,13 +125,31 @@ def test_scaling_scene_and_voxel_by_a_power_of_two_changes_nothing(make_coarse, 
         assert torch.equal(a, b)
 
 
-def test_autocast_changes_nothing(make_coarse, make_room):
+def test_autocast_rounds_the_networks_and_nothing_else(make_coarse, make_room, monkeypatch):
+    """The same voxels, points and weights to the bit; changes within bfloat16's rounding; tokens of their own type."""
     tokens, geometry, _ = make_room()
-    module = perturb(make_coarse())
+    module = perturb(make_coarse(gate=True)).eval()
+    seen = []
+    for name in ("plan_voxels", "interpolation_weights", "gate"):
+        original = getattr(coarse, name)
+
+        def noted(*args, original=original, **kwargs):
+            seen.append(original(*args, **kwargs))
+            return seen[-1]
+
+        monkeypatch.setattr(coarse, name, noted)
     plain = module(tokens, geometry)
     with torch.autocast("cpu", torch.bfloat16):
         cast = module(tokens, geometry)
-    assert all(torch.equal(a, b) for a, b in zip(plain.patch, cast.patch, strict=True))
+    plan, (index, weights), gain, again, (found, others), scale = seen
+    assert torch.equal(plan.grid, again.grid)
+    assert torch.equal(plan.order, again.order)
+    assert torch.equal(index, found)
+    assert torch.equal(weights, others)
+    assert torch.equal(gain, scale)
+    for before, exact, rounded in zip(tokens.patch, plain.patch, cast.patch, strict=True):
+        assert rounded.dtype == before.dtype
+        assert 0 < (rounded - exact).norm() < 0.03 * (exact - before).norm()
 
 
 def test_scenes_do_not_influence_each_other(make_coarse, make_room):

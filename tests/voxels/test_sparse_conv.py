@@ -3,7 +3,13 @@ import torch
 from torch.nn import functional as F
 
 from vg2gt.voxels import sparse_conv
-from vg2gt.voxels.sparse_conv import SubmanifoldConv3d, neighbor_pairs
+from vg2gt.voxels.sparse_conv import SubmanifoldConv3d, neighbor_pairs, neighbor_table
+
+
+@pytest.fixture(params=[neighbor_pairs, neighbor_table])
+def find(request):
+    """Everything here holds of the convolution on a CPU and of the one elsewhere."""
+    return request.param
 
 
 def dense_result(conv, features, grid, batch):
@@ -16,13 +22,15 @@ def dense_result(conv, features, grid, batch):
 
 
 @pytest.mark.parametrize("kernel_size", [3, 5])
-def test_equals_dense_convolution_with_gradients(kernel_size, random_voxels):
+@pytest.mark.parametrize("held", [1 << 28, 2000])
+def test_equals_dense_convolution_with_gradients(kernel_size, held, find, random_voxels, monkeypatch):
+    monkeypatch.setattr(sparse_conv, "HELD", held)
     grid, batch = random_voxels((150, 100), extent=7)  # dense enough to touch every border and offset
     conv = SubmanifoldConv3d(4, 3, kernel_size).double()
     assert conv.bias is not None
     features = torch.randn(len(grid), 4, dtype=torch.float64, requires_grad=True)
-    pairs = neighbor_pairs(grid, batch, kernel_size)
-    assert all(len(i) for i, _ in pairs)
+    pairs = find(grid, batch, kernel_size)
+    assert all(len(i) for i, _ in neighbor_pairs(grid, batch, kernel_size))
     out, dense = conv(features, pairs), dense_result(conv, features, grid, batch)
     torch.testing.assert_close(out, dense, atol=1e-12, rtol=1e-12)
     probe = torch.randn_like(out)
@@ -33,14 +41,14 @@ def test_equals_dense_convolution_with_gradients(kernel_size, random_voxels):
         torch.testing.assert_close(ours, reference, atol=1e-11, rtol=1e-11)
 
 
-def test_a_batch_equals_separate_runs(random_voxels):
+def test_a_batch_equals_separate_runs(find, random_voxels):
     grid, batch = random_voxels((60, 40), extent=6)
     conv = SubmanifoldConv3d(4, 4, 3).double()
     features = torch.randn(len(grid), 4, dtype=torch.float64)
-    together = conv(features, neighbor_pairs(grid, batch, 3))
+    together = conv(features, find(grid, batch, 3))
     for scene in (0, 1):
         rows = batch == scene
-        alone = conv(features[rows], neighbor_pairs(grid[rows], torch.zeros_like(batch[rows]), 3))
+        alone = conv(features[rows], find(grid[rows], torch.zeros_like(batch[rows]), 3))
         torch.testing.assert_close(together[rows], alone, atol=1e-12, rtol=0)
 
 
@@ -53,9 +61,34 @@ def test_pairs_are_the_same_however_many_offsets_are_looked_up_at_once(random_vo
         assert all(torch.equal(a, b) for a, b in zip(ours, theirs, strict=True))
 
 
-def test_a_single_voxel_sees_its_centre_only():
+def test_a_single_voxel_sees_its_centre_only(find):
     conv = SubmanifoldConv3d(2, 2, 3)
     assert conv.bias is not None
     features = torch.randn(1, 2)
-    out = conv(features, neighbor_pairs(torch.zeros(1, 3, dtype=torch.int64), torch.zeros(1, dtype=torch.int64), 3))
+    out = conv(features, find(torch.zeros(1, 3, dtype=torch.int64), torch.zeros(1, dtype=torch.int64), 3))
     torch.testing.assert_close(out, features @ conv.weight[:, 1, 1, 1].t() + conv.bias)
+
+
+def test_bfloat16_products_are_summed_in_float32(find, random_voxels):
+    """Within the rounding of the factors; sums of 27 numbers of bfloat16 would be off by more."""
+    grid, batch = random_voxels((150, 100), extent=7)
+    conv, features = SubmanifoldConv3d(16, 8, 3), torch.randn(len(grid), 16, requires_grad=True)
+    expected = conv.double()(features.double(), find(grid, batch, 3))
+    (wanted,) = torch.autograd.grad(expected.square().sum(), features)
+    with torch.autocast("cpu", torch.bfloat16):
+        out = conv.float()(features, find(grid, batch, 3))
+    (grad,) = torch.autograd.grad(out.square().sum(), features)
+    assert out.dtype == grad.dtype == torch.float32
+    assert (out - expected).norm() < 4e-3 * expected.norm()
+    assert (grad - wanted).norm() < 8e-3 * wanted.norm()
+
+
+def test_launches_do_not_grow_with_the_kernel(random_voxels):
+    grid, batch = random_voxels((150, 100), extent=7)
+    features, counted = torch.randn(len(grid), 4), []
+    for kernel_size in (3, 5):
+        conv, found = SubmanifoldConv3d(4, 4, kernel_size), neighbor_table(grid, batch, kernel_size)
+        with torch.profiler.profile() as profile:
+            conv(features.clone().requires_grad_(), found).sum().backward()
+        counted.append(sum(row.count for row in profile.key_averages() if row.key.startswith("aten::")))
+    assert counted[0] == counted[1] < 300  # one offset after the other: some thousand

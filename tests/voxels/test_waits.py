@@ -5,7 +5,7 @@ from types import ModuleType
 import pytest
 import torch
 
-from vg2gt.voxels import grid, normals, point_moments
+from vg2gt.voxels import grid, knn, normals, point_moments, sparse_conv
 
 
 @pytest.fixture
@@ -52,8 +52,9 @@ def test_the_modules_wait_for_shapes_and_for_two_warnings_only(
     """As often for three scenes as for one, but for the footprint's medians."""
     for scenes in (1, 3):
         monkeypatch.setattr(grid, "_warned_of_sparse", set())  # what was warned of is not looked at again
-        for module in (normals, point_moments):
+        for module in (knn, normals, point_moments):
             monkeypatch.setattr(module, "compilable", lambda *_: False)  # as on a GPU
+        monkeypatch.setattr(sparse_conv, "one_by_one", lambda device: False)
         tokens, geometry, images = make_room(scenes)
         coarse, fine = make_coarse(gate=True), make_fine(moments=True, normal_kernel=3)
         with gpu_waits.Waits() as waits:
@@ -67,10 +68,11 @@ def test_the_modules_wait_for_shapes_and_for_two_warnings_only(
             **warnings,
             **levels,
             "voxels/coarse.py PatchPoints.__init__": 1,
-            "voxels/sparse_conv.py neighbor_pairs": 2 * 3,
+            "voxels/sparse_conv.py neighbor_table": 3,
             "voxels/serialization.py serial_keys": 2,
             "voxels/normals.py _pairs": 1,
-            "voxels/knn.py interpolation_weights": 1,
+            "voxels/cell_search.py _search": 2,
+            "voxels/cell_search.py _nearest": 1,
             "voxels/surface.py disagreement": 2,
             "voxels/fine.py _scene_medians": 1,
             "voxels/grid.py pool_mean_of_chunks": -(-3 * scenes // 8),  # once for eight views

@@ -15,6 +15,7 @@ from vg2gt.geometry.cameras import invert_rigid, ray_directions
 from vg2gt.model import Background, Reconstructor, SceneScale
 from vg2gt.profiling import stage
 from vg2gt.types import Gaussians, Geometry, Hints, Prediction, TensorRecord
+from vg2gt.visibility import ViewCheck
 from vg2gt.voxels import DenseHead
 
 SMALLEST_FOOTPRINT = 1e-7  # scene units; a hundredth of it is still a scale that renders
@@ -95,6 +96,7 @@ class PixelReconstructor(Reconstructor):
         dense_head: makes the dense head from ``token_dims`` and ``patch_size``.
         gaussians: makes the pixel head from ``in_channels``.
         background: see :class:`vg2gt.model.Reconstructor`.
+        visibility: see :class:`vg2gt.model.Reconstructor`.
     """
 
     def __init__(
@@ -104,8 +106,9 @@ class PixelReconstructor(Reconstructor):
         dense_head: Callable[..., DenseHead],
         gaussians: Callable[..., nn.Module],
         background: Background = "black",
+        visibility: ViewCheck | None = None,
     ) -> None:
-        super().__init__(backend, scale, background)
+        super().__init__(backend, scale, background, visibility)
         self.dense_head = dense_head(token_dims=backend.token_dims, patch_size=backend.patch_size)
         self.gaussians = gaussians(in_channels=self.dense_head.out_channels)
 
@@ -114,13 +117,14 @@ class PixelReconstructor(Reconstructor):
     ) -> Prediction:
         """Reconstructs B scenes; see :meth:`vg2gt.model.Reconstructor.forward`. Nothing is random here."""
         tokens, geometry, unit = self.read_views(images, hints)
+        supported = self.supported(geometry)
         with stage("fine"):
             dense = self.dense_head(tokens, images).permute(0, 2, 3, 1).flatten(0, 2)
         with stage("gaussians"), torch.autocast(images.device.type, enabled=False):
-            pixels = usable_pixels(geometry, images)
+            pixels = usable_pixels(geometry.where(supported), images)
             features = F.gelu(dense.float()).index_select(0, pixels.rows)
             gaussians = self.with_background(self.make_gaussians(features, pixels, geometry), images, geometry.depth)
-        return Prediction(geometry, geometry, unit, None, gaussians)
+        return Prediction(geometry, geometry, unit, None, gaussians, supported)
 
     @abstractmethod
     def make_gaussians(self, features: Tensor, pixels: Pixels, geometry: Geometry) -> Gaussians:

@@ -13,6 +13,7 @@ from vg2gt.geometry.spherical_harmonics import rgb_to_sh
 from vg2gt.model import Background, Reconstructor, SceneScale
 from vg2gt.profiling import stage
 from vg2gt.types import Gaussians, Hints, Prediction
+from vg2gt.visibility import ViewCheck
 from vg2gt.voxels.knn import nearest_neighbors
 
 Spacing = Literal["pixel", "neighbors"]
@@ -30,6 +31,7 @@ class PointCloud(Reconstructor):
         width: standard deviation over the spacing.
         opacity: of every Gaussian, in (0, 1).
         background: see :class:`vg2gt.model.Reconstructor`.
+        visibility: see :class:`vg2gt.model.Reconstructor`.
 
     Raises:
         ValueError: if the spacing is unknown.
@@ -43,10 +45,11 @@ class PointCloud(Reconstructor):
         width: float = 0.5,
         opacity: float = 0.9,
         background: Background = "black",
+        visibility: ViewCheck | None = None,
     ) -> None:
         if spacing not in get_args(Spacing):
             raise ValueError(f"model.spacing is {spacing!r}; choose one of {', '.join(get_args(Spacing))}")
-        super().__init__(backend, scale, background)
+        super().__init__(backend, scale, background, visibility)
         self.spacing = spacing
         self.width = width
         self.opacity = opacity
@@ -57,8 +60,9 @@ class PointCloud(Reconstructor):
     ) -> Prediction:
         """Reconstructs B scenes; see :meth:`vg2gt.model.Reconstructor.forward`. Nothing is random here."""
         _, geometry, unit = self.read_views(images, hints)
+        supported = self.supported(geometry)
         with stage("gaussians"), torch.autocast(images.device.type, enabled=False):
-            pixels = usable_pixels(geometry, images)
+            pixels = usable_pixels(geometry.where(supported), images)
             means = pixels.to_world(pixels.rays * pixels.depth[:, None])
             spacing = pixels.footprint.mean(-1) if self.spacing == "pixel" else _distance_to_neighbors(means, pixels)
             gaussians = Gaussians(
@@ -69,7 +73,8 @@ class PointCloud(Reconstructor):
                 sh=rgb_to_sh(pixels.colors)[:, None],
                 batch=pixels.batch,
             )
-        return Prediction(geometry, geometry, unit, None, self.with_background(gaussians, images, geometry.depth))
+        gaussians = self.with_background(gaussians, images, geometry.depth)
+        return Prediction(geometry, geometry, unit, None, gaussians, supported)
 
 
 def _distance_to_neighbors(means: Tensor, pixels: Pixels) -> Tensor:

@@ -12,6 +12,7 @@ from backends.base import Backend
 from vg2gt.baselines.pixels import PixelReconstructor, Pixels
 from vg2gt.model import Background, SceneScale
 from vg2gt.types import Gaussians, Geometry
+from vg2gt.visibility import ViewCheck
 from vg2gt.voxels import DenseHead
 from vg2gt.voxels.grid import VoxelPlan, in_range, plan_voxels, point_cells, pool_mean, scene_voxel_size
 
@@ -42,8 +43,9 @@ class VoxelMerged(PixelReconstructor):
         voxel_size: float = 0.002,
         min_footprint: float = 1.0,
         background: Background = "black",
+        visibility: ViewCheck | None = None,
     ) -> None:
-        super().__init__(backend, scale, dense_head, gaussians, background)
+        super().__init__(backend, scale, dense_head, gaussians, background, visibility)
         self.voxel_size = voxel_size
         self.min_footprint = min_footprint
 

@@ -49,9 +49,11 @@ class SyntheticOptions:
     frames: int = 16
     size: tuple[int, int] = (224, 448)
     variant: Any = "room"
-    highlights: bool = False
+    highlights: Any = False
     normals: bool = False
     depth_scale: float = 1000.0
+    exposure: float = 0.0
+    jpeg: Any = None
     workers: int = field(default_factory=_cores)
 
     @property
@@ -73,10 +75,12 @@ def synthetic(arguments: list[str]) -> None:
       first_seed=0      seed of the first one
       frames=16         frames per scene
       size=[224,448]    image height and width
-      variant=room      room, outdoor, or a list that takes turns: [room,room,outdoor]
-      highlights=false  surfaces shine: colours depend on the view
+      variant=room      room, outdoor, wide, object, landmark, or a list that takes turns: [room,room,outdoor]
+      highlights=false  surfaces shine: colours depend on the view; lobes: strongly
       normals=false     write normals/NNNNN.npz too
       depth_scale=1000  stored depth units per metre; deeper than 65534 units is written as no depth
+      exposure=0        scenes too dark or too bright, standard deviation in stops
+      jpeg=null         [30,95]: images are compressed at qualities of this range
       workers=N         processes; as many as there are cores
     """
     from rich.progress import track

@@ -100,10 +100,14 @@ def _renderer(device: torch.device, timed: bool) -> Iterator[tuple[str, str]]:
     """Which renderer ``auto`` is there, how far the kernels are off (measured anew), and how long it takes."""
     from vg2gt.rendering import render
     from vg2gt.rendering.renderer import automatic
-    from vg2gt.rendering.selfcheck import compare, identity
+    from vg2gt.rendering.selfcheck import KernelsRefusedError, compare, identity
 
     where = "" if device.type == "cpu" else f" on {identity(device)}"
-    yield "renderer", f"auto is '{automatic(device)}'{where}"
+    try:
+        chosen = f"auto is '{automatic(device)}'{where}"
+    except KernelsRefusedError as error:
+        chosen, timed = str(error), False
+    yield "renderer", chosen
     if device.type != "cpu" and _version("triton") != "missing":
         try:
             yield "kernels", f"'triton': {compare(render, device)}"

@@ -20,6 +20,11 @@ POSES = (
     "the first of these that the backbone needs and that is there"
 )
 
+FRAME = (
+    "frame and unit of what is written: of the given cameras, of the first image's camera, or upright (y down); auto: "
+    "given if cameras are given, else upright"
+)
+
 if TYPE_CHECKING:
     from vg2gt.runs.load import LoadedModel
 
@@ -35,6 +40,7 @@ def parser() -> argparse.ArgumentParser:
     add("--model", metavar="NAME[,KEY=VALUE...]", help="of configs/model; default: the run's own")
     add("--set", action="append", default=[], metavar="KEY=VALUE", help="another option, such as model.fine.max_voxels")
     add("--poses", choices=("auto", "given", "sfm", "backbone"), default="auto", help=POSES)
+    add("--frame", choices=("auto", "given", "first", "upright"), default="auto", help=FRAME)
     add("--save", type=list_of_names, default=list(DEFAULT), metavar="LIST", help=f"default: {','.join(DEFAULT)}")
     add("--size", type=_size, metavar="N|HxW", help="longer side, or height x width, in pixels; default 518, CPU 280")
     add("--every", type=int, default=1, metavar="N", help="take every N-th image or frame only")
@@ -44,6 +50,7 @@ def parser() -> argparse.ArgumentParser:
     add("--frames", type=int, default=ORBIT_FRAMES, metavar="N", help=f"length of the orbit, default {ORBIT_FRAMES}")
     add("--mesh-voxel", type=float, metavar="X", help="edge of the mesh's voxels in scene units")
     add("--device", default="auto", help="auto, cpu, cuda, cuda:N")
+    add("--skip-damaged", action="store_true", help="go on without images that cannot be read")
     add("--overwrite", action="store_true", help="replace outputs that are there")
     add("--quiet", action="store_true", help="no progress bars")
     return arguments
@@ -79,6 +86,7 @@ def run(options: argparse.Namespace) -> None:
     from vg2gt.reconstruction.sfm import require_pycolmap
     from vg2gt.runs.load import backend_class, choose_device, load_model
 
+    options.out = str(Path(options.out).expanduser())
     check_outputs(options.save)
     more = [] if options.refine is None else [REFINED]
     check_folder(options.out, [*options.save, *more], options.overwrite)
@@ -88,7 +96,7 @@ def run(options: argparse.Namespace) -> None:
         existing_path(item)
     if getattr(backend_class(options.ckpt, options.backend), "needs_depth", False):
         check_depth((options.backend or "of the checkpoint").partition(",")[0], options.images)
-    check_pictures(options.images)
+    check_pictures(options.images, options.skip_damaged)
     if options.poses == "sfm" and not (Path(options.out) / SFM).exists():
         require_pycolmap()
     if "orbit.mp4" in options.save:
@@ -106,6 +114,8 @@ def run(options: argparse.Namespace) -> None:
             monitor=monitor,
             poses=options.poses,
             sfm_folder=Path(options.out) / SFM,
+            frame=options.frame,
+            skip_damaged=options.skip_damaged,
         )
         if how is not None:
             scene = refine_scene(scene, how, monitor)

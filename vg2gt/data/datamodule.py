@@ -15,7 +15,10 @@ from vg2gt.data.framing import Crop, Fit, FramingSampler
 from vg2gt.data.overlap import refuse_overlap, refuse_untrainable
 from vg2gt.data.views.even import EvaluationViews
 from vg2gt.data.views.sampling import StepSampler, ViewSampler, usable_scenes
+from vg2gt.data.workers import automatic_workers
 from vg2gt.types import Batch
+
+PIXEL_BYTES = 4 * (3 + 1 + 1)  # colour and depth, and as much as one of them for what some datasets add
 
 
 class SceneDataModule(LightningDataModule):
@@ -41,7 +44,8 @@ class SceneDataModule(LightningDataModule):
         eval_window: evaluate long scenes in stretches of this many frames; None: whole.
         steps_per_epoch: training steps in an epoch.
         seed: seeds the choice of scenes and views.
-        workers: loader processes; 0 decodes in the training process.
+        workers: loader processes; 0 decodes in the training process; None: as many as cores and memory allow where a
+            GPU trains, else 0.
         memory_mb: decoded frames kept in memory by each process.
         fit: ``cover``: frames are resized until they cover ``image_size`` and cropped; ``pad``: until they fit into it,
             with black around them that has no depth.
@@ -74,7 +78,7 @@ class SceneDataModule(LightningDataModule):
         eval_window: int | None = None,
         steps_per_epoch: int = 1000,
         seed: int = 0,
-        workers: int = 0,
+        workers: int | None = None,
         memory_mb: int = 1024,
         fit: Fit = "cover",
         aspect: Sequence[float] | None = None,
@@ -86,8 +90,10 @@ class SceneDataModule(LightningDataModule):
         super().__init__()
         if train_scenes is not None and train_scenes < 1:
             raise ValueError(f"data.train_scenes={train_scenes} must be at least 1, or null for all")
-        if workers < 0:
-            raise ValueError(f"data.workers={workers} must be at least 0, which decodes in the training process")
+        if workers is not None and workers < 0:
+            raise ValueError(
+                f"data.workers={workers} must be at least 0, which decodes in the training process; null: by cores"
+            )
         self.sampler = ViewSampler(min_views, max_views, max_images, expand_ratio, target_views, seed, view_sets)
         self.eval_views = EvaluationViews(eval_context, eval_target, eval_window)
         self.framing = FramingSampler(_size(image_size), aspect, size_multiple, fit, crop, zoom, seed)
@@ -198,14 +204,26 @@ class SceneDataModule(LightningDataModule):
                 "it, choose another preset or remove it with '~data.NAME'"
             ) from error
 
-    def _loader(self, dataset: BatchDataset, sampler: object) -> DataLoader[Batch]:
+    @property
+    def loader_processes(self) -> int:
+        """Loader processes of this rank, with ``workers`` chosen."""
         trainer = self.trainer
+        if self.workers is not None:
+            return self.workers
+        if trainer is None or trainer.strategy.root_device.type != "cuda":
+            return 0  # its cores compute
+        height, width = self.framing.largest
+        views = self.sampler.max_images * (1 + self.sampler.target_views / self.sampler.min_views)
+        return automatic_workers(trainer.num_devices, self.memory_mb, views * height * width * PIXEL_BYTES / 1e6)
+
+    def _loader(self, dataset: BatchDataset, sampler: object) -> DataLoader[Batch]:
+        trainer, workers = self.trainer, self.loader_processes
         return DataLoader(
             dataset,
             batch_size=None,  # the sampler's items are whole batches
             sampler=sampler,  # pyright: ignore[reportArgumentType]
-            num_workers=self.workers,
-            persistent_workers=self.workers > 0,
+            num_workers=workers,
+            persistent_workers=workers > 0,
             worker_init_fn=_leave_interrupts_to_the_trainer,
             pin_memory=trainer is not None and trainer.strategy.root_device.type == "cuda",
         )

@@ -19,6 +19,7 @@ from vg2gt.evaluation.scene_metrics import (
     present,
     rendered_normal_metrics,
 )
+from vg2gt.geometry.precision import half_precision_on_gpu
 from vg2gt.metrics import LPIPS, camera_metrics, cv, depth_metrics
 from vg2gt.model import Reconstructor
 from vg2gt.profiling import clocked, now, peak_memory_mib, reset_peak_memory
@@ -118,7 +119,9 @@ class SceneEvaluator:
         device, geometry = batch.images.device, prediction.geometry
         reset_peak_memory(device)
         began = now(device)
-        seen = Observations(batch.context.images[0], geometry.depth[0], geometry.depth_conf[0])
+        context = batch.context
+        mask = None if context.mask is None else context.mask[0]
+        seen = Observations(context.images[0], geometry.depth[0], geometry.depth_conf[0], mask)
         found = refine(prediction.gaussians, geometry.cameras, seen, self.renderer, options)
         cost = {"refine_seconds": now(device) - began, "peak_memory_mib": peak_memory_mib(device)}
         gaussians = found.scene.gaussians
@@ -129,7 +132,7 @@ class SceneEvaluator:
     def _reconstruct(self, batch: Batch) -> tuple[Prediction, dict[str, float]]:
         device = batch.images.device
         reset_peak_memory(device)
-        with clocked(device) as clock:
+        with clocked(device) as clock, half_precision_on_gpu(batch.images):
             prediction = self.model(batch.context.images, batch.context.hints)
         gaussians = len(prediction.gaussians)
         return prediction, {

@@ -14,10 +14,11 @@ from vg2gt.evaluation.scene_metrics import (
     image_metrics,
     rendered_normal_metrics,
 )
+from vg2gt.geometry.precision import full_precision
 from vg2gt.metrics import cv, depth_metrics
 from vg2gt.model import Reconstructor
 from vg2gt.rendering import Renderer, UnrenderableError
-from vg2gt.types import Batch, Cameras, Gaussians, Render
+from vg2gt.types import Batch, Cameras, Gaussians, Prediction, Render
 
 log = logging.getLogger(__name__)
 
@@ -49,6 +50,11 @@ def evaluate_scene(
     if len(batch.scene) != 1 or not held_out:
         raise ValueError(f"evaluation takes one scene with held-out views, got {batch.scene} with {held_out} of them")
     prediction = model(batch.context.images, batch.context.hints)
+    with full_precision(batch.images):
+        return _scene_figures(prediction, renderer, batch, rasterized)
+
+
+def _scene_figures(prediction: Prediction, renderer: Renderer, batch: Batch, rasterized: bool) -> dict[str, float]:
     target = batch.target
     cameras = ground_truth_target_cameras(batch, prediction)
     rendered = render_or_nan(renderer, prediction.gaussians, cameras, "solid")

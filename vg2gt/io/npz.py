@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import BinaryIO
@@ -36,6 +37,19 @@ def read_npz(file: str | Path | BinaryIO, names: Sequence[str]) -> dict[str, NDA
         raise
     except Exception as error:  # damage raises whatever zipfile, zlib and the header's parser raise; sizes MemoryError
         raise FormatError(f"no readable archive of plain arrays: {error or type(error).__name__}") from error
+
+
+def npz_names(path: Path) -> tuple[str, ...]:
+    """Names of the arrays in an ``.npz`` file.
+
+    Raises:
+        FormatError: if it is no archive.
+    """
+    try:
+        with zipfile.ZipFile(regular(path)) as archive:
+            return tuple(name.removesuffix(".npy") for name in archive.namelist())
+    except zipfile.BadZipFile as error:
+        raise FormatError(f"no readable archive of plain arrays: {error}") from error
 
 
 def load_npz(path: Path, scene: str, names: Sequence[str]) -> dict[str, NDArray]:

@@ -186,6 +186,7 @@ def _render_targets(batch: Batch, geometry: Geometry, truth: Truth, views: Tenso
         decoded_conf=geometry.depth_conf[:, source],
         decoded_valid=(decoded > 0) & is_context[:, None, None],
         comparable=torch.ones_like(known),  # of a scene without depth both are in scene units
+        mask=None if batch.mask is None else _full_precision(batch.mask[:, views]),
     )
 
 

@@ -5,9 +5,29 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from vg2gt.gaussians.far_shell import is_far
 from vg2gt.gaussians.surfel import ALONE, layout
 from vg2gt.geometry.rotations import quat_to_matrix
 from vg2gt.refinement.parameters import Parameters
+from vg2gt.types import Cameras, Gaussians
+from vg2gt.visibility import count_points
+
+TOLERANCE, MARGIN = 0.03, 0.05  # relative differences of depth at which a view agrees with a Gaussian, or looks through
+
+
+def supported(gaussians: Gaussians, cameras: Cameras, depth: Tensor, views: int) -> Gaussians:
+    """The Gaussians where at least so many views see a surface, and not more look through; all if there are none.
+
+    Args:
+        gaussians: the scene (B = 1).
+        cameras: of its V views (B = 1).
+        depth: ``[V, H, W]`` what they see, 0 = unknown.
+        views: least number of views that agree; at most half of V is asked for.
+    """
+    agree, through = count_points(gaussians.means, depth, cameras, TOLERANCE, MARGIN)
+    keep = (agree >= min(views, len(depth) // 2)) & (through <= agree)
+    keep |= is_far(gaussians, depth, cameras)  # the shell behind everything
+    return gaussians.select(keep) if keep.any() else gaussians
 
 
 def prune(parameters: Parameters, min_opacity: float) -> int:

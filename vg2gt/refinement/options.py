@@ -58,6 +58,8 @@ class RefineOptions:
         holdout: every this many-th view is never trained on, but scored before and after; None: none.
         sh_degree: of the colours, if it is higher than the scene's; None: the scene's.
         fill: side in pixels of the blocks that get a Gaussian where the scene has none; 0: they stay empty.
+        min_views: Gaussians that fewer views' depth agrees with, or more views look through than agree with, are left
+            out at the start: what a single view supports overfits it. 0: all stay.
         prune_opacity: Gaussians less opaque are removed.
         split_share: share of the Gaussians that a check splits, those whose positions are pulled the most.
         max_growth: the scene has at most this many times its Gaussians.
@@ -77,6 +79,7 @@ class RefineOptions:
     holdout: int | None = None
     sh_degree: int | None = None
     fill: int = 4
+    min_views: int = 0
     prune_opacity: float = 0.02
     split_share: float = 0.0
     max_growth: float = 1.5
@@ -94,6 +97,7 @@ class RefineOptions:
             ("holdout", self.holdout is None or self.holdout >= 2, "at least 2, or null"),
             ("sh_degree", self.sh_degree is None or 0 <= self.sh_degree <= MAX_DEGREE, f"0 to {MAX_DEGREE}, or null"),
             ("fill", self.fill >= 0, "at least 0"),
+            ("min_views", self.min_views >= 0, "at least 0"),
             ("prune_opacity", 0 <= self.prune_opacity < 1, "at least 0 and below 1"),
             ("split_share", 0 <= self.split_share <= 1, "between 0 and 1"),
             ("max_growth", self.max_growth >= 1, "at least 1"),

@@ -11,8 +11,9 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
+from vg2gt.losses.gaussian import where_it_counts
 from vg2gt.metrics import psnr
-from vg2gt.refinement.density import prune, split
+from vg2gt.refinement.density import prune, split, supported
 from vg2gt.refinement.fill import fill_holes
 from vg2gt.refinement.loss import Observations
 from vg2gt.refinement.options import RefineOptions
@@ -23,7 +24,7 @@ from vg2gt.types import Cameras, Gaussians
 
 log = logging.getLogger(__name__)
 
-WORSE = 2.0  # a left-out view whose loss has grown that much since the best state shows a divergence
+WORSE = 2.0  # left-out views whose loss is so many times that of the best state show a divergence
 RETREATS = 4  # with each the rates are halved
 SMOOTH = 3  # checks whose scores are averaged: each is of other views
 
@@ -145,6 +146,8 @@ class _Refinement:
         self.order = ViewOrder(len(seen.images), options.holdout, options.seed)
         self.trained = self.order.trained.to(seen.images.device)
         self.options = options.of(len(self.order.trained))
+        if options.min_views:
+            gaussians = supported(gaussians, cameras, seen.depth, options.min_views)
         self.limit = int(options.max_growth * len(gaussians))
         self.depth = _median_depth(gaussians, cameras, seen)
         self.pixel = 1 / float(cameras.intrinsics[..., [0, 1], [0, 1]].mean())
@@ -238,7 +241,8 @@ class _Refinement:
         """The loss of some views, and their PSNR ``[R]``."""
         loss, cameras, seen = self.options.loss, scene.cameras.select(views), self.seen.views(views)
         rendered = self.trainer(scene.gaussians, cameras)
-        rendered = replace(rendered, color=scene.exposed(rendered.color, views))
+        color = where_it_counts(scene.exposed(rendered.color, views)[0], seen.images, seen.mask)
+        rendered = replace(rendered, color=color[None])
         terms = loss.of_views(rendered, cameras, seen, self.depth)
         terms |= loss.of_gaussians(scene.gaussians, self.parameters.size) if torch.is_grad_enabled() else {}
         return loss.total(terms), psnr(rendered.color[0].detach(), seen.images)
@@ -257,8 +261,10 @@ class _Refinement:
         score = float((loss / self.start_loss[views]).mean())
         if not math.isfinite(score):
             return "the loss is not finite"
-        if score > WORSE * min(1.0, self.best_score):
-            return f"views that were left out have {score:.1f} times the loss of the start"
+        if score > WORSE * min(1.0, self.best_score):  # of other views, perhaps: compare the same ones
+            best, _ = self._score(self.best, views)
+            if score > WORSE * float((best / self.start_loss[views]).mean()):
+                return f"views that were left out have {score:.1f} times the loss of the start"
         self.scores = [*self.scores, score][-SMOOTH:]
         smooth = sum(self.scores) / len(self.scores)
         since = self.recent[-self.options.check_every :]

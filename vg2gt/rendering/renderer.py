@@ -20,7 +20,7 @@ from vg2gt.rendering.cpu import rasterize_cpu
 from vg2gt.rendering.dense import rasterize_dense
 from vg2gt.rendering.options import Images, Mode, RenderOptions, SceneViews, check_choice
 from vg2gt.rendering.pairs import rasterize_pairs
-from vg2gt.rendering.selfcheck import trusted
+from vg2gt.rendering.selfcheck import require_trusted
 from vg2gt.types import Cameras, Gaussians, Render
 
 Implementation = Literal["auto", "torch", "dense", "cpu", "triton"]
@@ -41,8 +41,8 @@ class Renderer(RenderOptions):
 
     Attributes:
         implementation: ``cpu`` compiled tile renderer; ``triton`` the same for CUDA devices; ``torch`` sparse pairs on
-            any device; ``dense`` the slow reference; ``auto`` chooses ``cpu`` on CPU, ``triton`` on CUDA devices on
-            which it was found to agree with the reference (:mod:`vg2gt.rendering.selfcheck`), ``torch`` elsewhere.
+            any device; ``dense`` the slow reference; ``auto`` chooses ``cpu`` on CPU, ``triton`` on CUDA devices, where
+            it must agree with the reference (:mod:`vg2gt.rendering.selfcheck`), ``torch`` elsewhere.
     """
 
     implementation: Implementation = "auto"
@@ -184,11 +184,15 @@ def _resolve(implementation: Implementation, device: torch.device) -> str:
 
 
 def automatic(device: torch.device) -> str:
-    """The implementation that ``auto`` stands for on a device; on a CUDA device the kernels are checked once."""
-    if device.type == "cpu":
-        return "cpu"
-    can = device.type == "cuda" and importlib.util.find_spec("triton") is not None
-    return "triton" if can and trusted(render, device) else "torch"
+    """The implementation that ``auto`` stands for on a device; on a CUDA device the kernels are checked once.
+
+    Raises:
+        KernelsRefusedError: if the kernels of a CUDA device cannot be relied on.
+    """
+    if device.type == "cuda":
+        require_trusted(render, device)
+        return "triton"
+    return "cpu" if device.type == "cpu" else "torch"
 
 
 def _floats_to(dtype: torch.dtype) -> Callable[[Tensor], Tensor]:

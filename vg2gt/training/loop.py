@@ -23,6 +23,7 @@ from omegaconf import DictConfig
 from backends.cache import TokenCache
 from vg2gt.data.datamodule import SceneDataModule
 from vg2gt.evaluation.checks import refuse_without_hints
+from vg2gt.geometry.precision import trainer_precision
 from vg2gt.io.files import read_json, write_json, write_text
 from vg2gt.io.image_files import read_color
 from vg2gt.memory import TRAINING, memory_advice
@@ -41,14 +42,15 @@ log = logging.getLogger(__name__)
 EXPECTED_WARNINGS = (
     r"Found \d+ module\(s\) in eval mode",  # the frozen backbone
     r"You're resuming from a checkpoint that ended before the epoch",  # batches are a function of the step's number
-    r"The '\w+_dataloader' does not have many workers",  # rooms come from the memory cache
     r"It is recommended to use `self.log\('eval/",  # all ranks log the same
     r".*isinstance\(treespec, LeafSpec\)",  # inside Lightning
     r"Checkpoint directory .* exists and is not empty",  # of a run that continues
 )
 
+FEW_WORKERS = r"The '\w+_dataloader' does not have many workers"  # expected on a CPU, whose cores compute
+
 LOGGER_PACKAGES = {"TensorBoardLogger": "tensorboard", "WandbLogger": "wandb"}
-PRECISIONS = ("32-true", "bf16-mixed", "32", "bf16")  # the last two are Lightning's short names
+PRECISIONS = ("auto", "32-true", "bf16-mixed", "32", "bf16")  # the last two are Lightning's short names
 
 
 @dataclass(frozen=True)
@@ -75,7 +77,8 @@ def build(config: DictConfig) -> Run:
     _check_trainer(config)
     _check_loggers(config)
     lightning.seed_everything(config.seed, workers=True, verbose=False)
-    for message in EXPECTED_WARNINGS:
+    accelerator = _accelerator(config.trainer.accelerator)
+    for message in EXPECTED_WARNINGS if accelerator == "gpu" else (*EXPECTED_WARNINGS, FEW_WORKERS):
         warnings.filterwarnings("ignore", message=message)
     _quieten_lightning()
     datamodule = instantiate(config.data)
@@ -94,7 +97,8 @@ def build(config: DictConfig) -> Run:
     module.made_of = made_of(config)
     trainer = instantiate(
         config.trainer,
-        accelerator=_accelerator(config.trainer.accelerator),
+        accelerator=accelerator,
+        precision=trainer_precision(str(config.trainer.precision), accelerator),
         callbacks=_callbacks(config),
         logger=[instantiate(logger) for logger in config.logger.values() if logger],
         plugins=[AtomicCheckpointIO()],
@@ -133,11 +137,11 @@ def _accelerator(asked: str) -> str:
 
 
 def _check_trainer(config: DictConfig) -> None:
-    if str(config.trainer.get("precision", "32-true")) not in PRECISIONS:
+    if str(config.trainer.precision) not in PRECISIONS:
         raise ValueError(
             f"trainer.precision={config.trainer.precision} is not supported: geometry, voxels, rendering and losses "
             "are float32, which half precision cannot hold and float64 does not improve; use bf16-mixed (networks in "
-            "bfloat16) or 32-true"
+            "bfloat16), 32-true, or auto, which is the former on a GPU"
         )
     if config.trainer.get("accumulate_grad_batches", 1) != 1:
         raise ValueError(

@@ -8,6 +8,7 @@ import torch
 from lightning.pytorch import LightningDataModule
 
 from vg2gt.evaluation.protocols import ground_truth_target_cameras
+from vg2gt.geometry.precision import half_precision_on_gpu
 from vg2gt.io.images import colorize_depth, colorize_normals, grid, write_png
 from vg2gt.training.module import VG2GTModule
 from vg2gt.types import Batch
@@ -37,7 +38,8 @@ def write_preview(module: VG2GTModule, datamodule: LightningDataModule, path: st
 
 
 def _row(module: VG2GTModule, batch: Batch) -> list[torch.Tensor]:
-    prediction = module.model(batch.context.images, batch.context.hints)
+    with half_precision_on_gpu(batch.images):
+        prediction = module.model(batch.context.images, batch.context.hints)
     middle = (batch.images.shape[1] - batch.num_context) // 2
     cameras = ground_truth_target_cameras(batch, prediction).select(slice(middle, middle + 1))
     rendered = module.renderer(prediction.gaussians, cameras)

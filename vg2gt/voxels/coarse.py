@@ -14,8 +14,18 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from vg2gt.geometry.cameras import crop_intrinsics, unproject
+from vg2gt.geometry.precision import full_precision
 from vg2gt.types import Cameras, Geometry, Tokens
-from vg2gt.voxels.grid import in_range, plan_voxels, point_cells, pool_mean, pool_min, scene_voxel_size, warn_if_sparse
+from vg2gt.voxels.grid import (
+    VoxelPlan,
+    in_range,
+    plan_voxels,
+    point_cells,
+    pool_mean,
+    pool_min,
+    scene_voxel_size,
+    warn_if_sparse,
+)
 from vg2gt.voxels.knn import interpolate, interpolation_weights
 from vg2gt.voxels.ptv3 import PTv3
 from vg2gt.voxels.silhouette import beside_silhouettes
@@ -129,18 +139,18 @@ class CoarseModule(nn.Module):
         Raises:
             ValueError: if a scene spans too many voxels to be numbered.
         """
-        with torch.autocast(geometry.depth.device.type, enabled=False):
+        with full_precision(geometry.depth):
             size = scene_voxel_size(geometry, self.voxel_size, self.min_footprint)
             points = PatchPoints(geometry, self.cell, size, away_from_silhouettes=self.gate)
-            embedded = self._embed(tokens)[points.rows]  # f(p): [N, C]
-            enhanced, gain = self._enhance(embedded, points, generator)
-            if self.embedding_skip:
-                enhanced = torch.cat((enhanced, embedded), -1)
-            patches, seen = self._to_patches(enhanced, points, tokens)
-            maps = patches.flatten(0, 1).transpose(1, 2).unflatten(-1, tokens.grid)  # [B V, C, rows, columns]
-            fused = self.fuse(maps)
-            # Zero convolution: what it adds to each of the taps' tokens, nothing before training.
-            updates = [gain * _to_patch_rows(branch(fused), seen) for branch in self.zero]  # [B, V, P, D] each
+        embedded = self._embed(tokens)[points.rows]  # f(p): [N, C]
+        enhanced, gain = self._enhance(embedded, points, generator)
+        if self.embedding_skip:
+            enhanced = torch.cat((enhanced, embedded), -1)
+        patches, seen = self._to_patches(enhanced, points, tokens)
+        maps = patches.flatten(0, 1).transpose(1, 2).unflatten(-1, tokens.grid)  # [B V, C, rows, columns]
+        fused = self.fuse(maps)
+        # Zero convolution: what it adds to each of the taps' tokens, nothing before training.
+        updates = [gain * _to_patch_rows(branch(fused), seen) for branch in self.zero]  # [B, V, P, D] each
         untouched = tokens.patch[: len(tokens.patch) - len(updates)]
         changed = tokens.patch[len(untouched) :]
         return tokens.with_patch(
@@ -161,17 +171,23 @@ class CoarseModule(nn.Module):
 
         Also the gate on changes, ``[B, 1, 1, 1]``; 1 without one.
         """
-        plan = plan_voxels(points.cells, points.batch, torch.ones_like(points.batch, dtype=torch.bool))
-        if points.views > 1:
-            warn_if_sparse(plan, len(points.voxel_size), "coarse")
-        pooled = pool_mean(embedded, points.confidence, plan)  # f_m^v, eqn voxelfeature: [M, C]
-        least = pool_min(points.confidence, plan)  # n_m^v, eqn voxelfeature: [M]
-        inputs = (pooled, least.log()[:, None])
-        if self.surface_evidence:
-            centroid = cell_centroids(points.cells, points.confidence, plan)
-            inputs = (pooled, 2 * centroid, least.log()[:, None])
+        with full_precision(embedded):
+            plan = plan_voxels(points.cells, points.batch, torch.ones_like(points.batch, dtype=torch.bool))
+            if points.views > 1:
+                warn_if_sparse(plan, len(points.voxel_size), "coarse")
+            pooled = pool_mean(embedded, points.confidence, plan)  # f_m^v, eqn voxelfeature: [M, C]
+            least = pool_min(points.confidence, plan)  # n_m^v, eqn voxelfeature: [M]
+            centroid = cell_centroids(points.cells, points.confidence, plan) if self.surface_evidence else None
+        inputs = (pooled, least.log()[:, None]) if centroid is None else (pooled, 2 * centroid, least.log()[:, None])
         # S, T and S^-1 of eqn ptvzengqiang: PTv3 serialises, enhances and returns the voxels in the order given.
         voxels = self.ptv3(torch.cat(inputs, -1), plan.grid, plan.batch, points.voxel_size, generator=generator)
+        with full_precision(embedded):
+            return self._read_back(voxels.float(), plan, centroid, points)
+
+    def _read_back(
+        self, voxels: Tensor, plan: VoxelPlan, centroid: Tensor | None, points: PatchPoints
+    ) -> tuple[Tensor, Tensor]:
+        """What the points read from the enhanced voxels ``[M, C]``, and the gate on changes, as :meth:`_enhance`."""
         # Cells relative to their scene's first one: differences, and so the weights, keep their precision in float32.
         first = torch.searchsorted(plan.batch, torch.arange(len(points.voxel_size), device=plan.batch.device))
         origin = plan.grid[first.clamp(max=len(plan) - 1)]
@@ -183,7 +199,7 @@ class CoarseModule(nn.Module):
         )  # [N, k]
         enhanced = interpolate(voxels, index, weights)  # [N, C]
         gain = torch.ones_like(points.voxel_size)
-        if not self.surface_evidence:
+        if centroid is None:
             return enhanced, gain[:, None, None, None]
         evidence = torch.where(weights > 0, voxel_evidence(points.confidence, plan)[index], 0)
         to_surface = vectors_to_surface(queries, centers + centroid, evidence, index)

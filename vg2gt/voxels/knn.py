@@ -12,13 +12,14 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from vg2gt.io.threads import parallel_for
+from vg2gt.voxels.cell_search import nearest_by_cells
+from vg2gt.voxels.passes import compilable
 
-CHUNK = 1 << 26  # distances held at once
 QUERIES_AT_ONCE = 256  # by one thread
 
 
 def nearest_neighbors(queries: Tensor, points: Tensor, neighbors: int) -> Tensor:
-    """Indices of the nearest points, nearest first.
+    """Indices of the nearest points, nearest first; exact.
 
     Args:
         queries: ``[N, 3]``.
@@ -26,17 +27,44 @@ def nearest_neighbors(queries: Tensor, points: Tensor, neighbors: int) -> Tensor
         neighbors: how many; at most M are found.
 
     Returns:
-        ``[N, min(neighbors, M)]`` int64. Exact: a k-d tree on the CPU, chunks of all distances elsewhere.
+        ``[N, min(neighbors, M)]`` int64.
     """
+    batches = (torch.zeros(len(rows), dtype=torch.int64, device=rows.device) for rows in (queries, points))
+    query_batch, point_batch = batches
     count = min(neighbors, len(points))
+    return nearest_in_scenes(queries, query_batch, points, point_batch, count, 1)[0]
+
+
+def nearest_in_scenes(
+    queries: Tensor, query_batch: Tensor, points: Tensor, point_batch: Tensor, neighbors: int, scenes: int
+) -> tuple[Tensor, Tensor]:
+    """Nearest points of a query's own scene, nearest first; exact: k-d trees on the CPU, sorted cells elsewhere.
+
+    Args:
+        queries: ``[N, 3]``.
+        query_batch: ``[N]`` scene index, sorted.
+        points: ``[M, 3]``.
+        point_batch: ``[M]`` scene index, sorted; every scene with queries has at least one point.
+        neighbors: k.
+        scenes: B.
+
+    Returns:
+        Rows of ``points`` ``[N, k]`` int64 and whether there are so many ``[N, k]`` bool; row 0 where not.
+    """
     queries, points = queries.detach(), points.detach()
-    if queries.device.type == "cpu":
-        return _by_tree(queries.numpy(), KDTree(points.numpy()), count)
-    parts = [
-        torch.cdist(part, points, compute_mode="donot_use_mm_for_euclid_dist").topk(count, largest=False).indices
-        for part in queries.split(max(1, CHUNK // len(points)))
-    ]
-    return torch.cat(parts) if parts else torch.empty((0, count), dtype=torch.int64, device=queries.device)
+    if not compilable(queries, points):
+        return nearest_by_cells(queries, query_batch, points, point_batch, neighbors, scenes)
+    index = torch.zeros(len(queries), neighbors, dtype=torch.int64)
+    found = torch.zeros_like(index, dtype=torch.bool)
+    numbers = torch.arange(scenes + 1)
+    bounds = torch.stack([torch.searchsorted(batch, numbers) for batch in (query_batch, point_batch)], -1).tolist()
+    for (begin, first), (end, last) in itertools.pairwise(bounds):
+        if begin < end:
+            count = min(neighbors, last - first)
+            tree = KDTree(points[first:last].numpy())
+            index[begin:end, :count] = _by_tree(queries[begin:end].numpy(), tree, count) + first
+            found[begin:end, :count] = True
+    return index, found
 
 
 def _by_tree(queries: NDArray, tree: KDTree, count: int) -> Tensor:
@@ -67,16 +95,7 @@ def interpolation_weights(
         Rows of ``points`` ``[N, neighbors]`` (row 0 with weight 0 where there is none) and weights ``[N, neighbors]``,
         differentiable in queries and points.
     """
-    index = torch.zeros(len(queries), neighbors, dtype=torch.int64, device=queries.device)
-    found = torch.zeros_like(index, dtype=torch.bool)
-    numbers = torch.arange(scenes + 1, device=queries.device)
-    bounds = torch.stack([torch.searchsorted(batch, numbers) for batch in (query_batch, point_batch)], -1).tolist()
-    for (begin, first), (end, last) in itertools.pairwise(bounds):
-        if begin == end:
-            continue
-        nearest = nearest_neighbors(queries[begin:end], points[first:last], neighbors)
-        index[begin:end, : nearest.shape[1]] = nearest + first
-        found[begin:end, : nearest.shape[1]] = True
+    index, found = nearest_in_scenes(queries, query_batch, points, point_batch, neighbors, scenes)
     squared = (queries[:, None] - points[index]).square().sum(-1)  # [N, neighbors]
     weights = torch.where(found, 1 / (squared + 1e-6), 0)
     return index, weights / weights.sum(1, keepdim=True)

@@ -15,7 +15,7 @@ from torch.nn import functional as F
 
 from vg2gt.voxels.grid import scene_counts
 from vg2gt.voxels.serialization import ORDERS, Order, Windows, make_windows, relative_grid, serial_keys
-from vg2gt.voxels.sparse_conv import Pairs, SubmanifoldConv3d, neighbor_pairs
+from vg2gt.voxels.sparse_conv import NeighborTable, Pairs, SubmanifoldConv3d, neighbors
 
 Norm = Literal["layer", "group", "batch"]
 
@@ -41,7 +41,7 @@ class Level:
         count = len(keys)
         self.sequence = torch.randperm(count, generator=generator).tolist() if generator else list(range(count))
         self._windows: dict[tuple[int, int], Windows] = {}
-        self._pairs: dict[int, Pairs] = {}
+        self._pairs: dict[int, Pairs | NeighborTable] = {}
 
     def windows(self, order: int, length: int) -> Windows:
         """Attention windows along the curve that block number ``order`` uses."""
@@ -51,10 +51,10 @@ class Level:
             self._windows[which, length] = make_windows(curve, self.counts, length)
         return self._windows[which, length]
 
-    def pairs(self, kernel_size: int) -> Pairs:
+    def pairs(self, kernel_size: int) -> Pairs | NeighborTable:
         """Neighbour pairs for a convolution."""
         if kernel_size not in self._pairs:
-            self._pairs[kernel_size] = neighbor_pairs(self.grid, self.batch, kernel_size)
+            self._pairs[kernel_size] = neighbors(self.grid, self.batch, kernel_size)
         return self._pairs[kernel_size]
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,45 +18,54 @@ from vg2gt.io.arrays import load_matrices, load_npy, npy_size
 from vg2gt.io.image_files import Size
 
 _RIG_STEP = 100_000
+_CAMERA_STEP = 1_000_000_000
+_FILES = {"Image": (".png", ".jpg"), "Depth": (".npy",), "camview": (".npz",)}
 _NAME = re.compile(r"_(\d+)_(\d+)_(\d+)_(\d+)$")
 
-_View = tuple[int, int]
+_View = tuple[int, int, int]  # camera, rig, frame
 
 
 class Infinigen(FileSource):
     """Scenes rendered by Infinigen: a scene is a folder with ``frames/{Image,Depth,camview}/camera_0``.
 
-    Files are ``{Image,Depth,camview}_{rig}_{resample}_{frame:04d}_{subcam}.{png,npy,npz}``. A scene with one rig is a
-    video and its frame ids are frame numbers; in the export of InsScene-15K one frame is seen by many rigs and the ids
-    are rig numbers; with several of both the id is ``100000 rig + frame``. Resamples show the same view in other
-    materials: the first is taken.
+    Files are ``{Image,Depth,camview}_{rig}_{resample}_{frame:04d}_{camera}.{png,npy,npz}``; images may be JPEG
+    (``.jpg``). A scene with one rig is a video and its frame ids are frame numbers; in the export of InsScene-15K one
+    frame is seen by many rigs and the ids are rig numbers; with several of both the id is ``100000 rig + frame``.
+    Resamples show the same view in other materials: the first is taken. Infinigen's rigs have two cameras, 7.5 cm
+    apart, in folders ``camera_0`` and ``camera_1``: the ids of camera c are ``10^9 c`` higher.
 
     The camview files hold ``T``, camera-to-world in OpenCV axes, and ``K``, whose principal point is W/2, H/2 as
-    Blender counts: 1/2 is subtracted. Depth is z-depth in metres, of the images' size or twice that (the OpenGL
-    annotations), then reduced to every second pixel. The centre of an image pixel lies between four depth pixels; of
-    these equally near ones the lower right is taken, 1/4 of an image pixel away, because their mean would be a point
-    in mid-air at edges.
+    Blender counts: 1/2 is subtracted. Depth is z-depth in metres (checked on what Infinigen 1.15.5 writes), of the
+    images' size or twice that (the OpenGL annotations), then reduced to every second pixel. The centre of an image
+    pixel lies between four depth pixels; of these equally near ones the lower right is taken, 1/4 of an image pixel
+    away, because their mean would be a point in mid-air at edges.
 
     Args:
         root: a scene, or a folder of scenes (up to two levels deep; those in one folder below it count as one place,
             see ``place``), or a list of such.
         max_depth: farther points (metres), and the sky, which is infinite or huge, have no depth. A frame that shows
             nothing nearer is one without valid depth: training replaces it, evaluation refuses it.
+        cameras: which cameras of a rig are used. ``holdout`` holds out the same frames of all of them.
         shared: see ``FileSource``.
     """
 
     layout = "SCENE/frames/{Image,Depth,camview}/camera_0, there or up to two folders deeper"
     scene_marks = ("frames/Image/camera_0",)
     names_are_paths = True
+    index_options = ("cameras",)
     depth_remedy = "raise data.max_depth, beyond which points have no depth (nor has the sky)"
 
     def __init__(
         self,
         root: str | Sequence[str] | None,
         max_depth: float = 30.0,
+        cameras: Sequence[int] = (0,),
         **shared: Unpack[HoldoutOptions],
     ) -> None:
         self.max_depth = positive("max_depth", max_depth, "metres")
+        self.cameras = tuple(cameras)
+        if not self.cameras or len(set(self.cameras)) < len(self.cameras) or min(self.cameras) < 0:
+            raise ValueError(f"cameras must be different numbers of a rig's cameras, such as [0, 1]; got {cameras}")
         super().__init__(root, **shared)
 
     def find(self, root: Path) -> Mapping[str, Path]:
@@ -74,8 +83,12 @@ class Infinigen(FileSource):
     def index(self, scene: str, folder: Path) -> SceneIndex:
         """Lists a scene's files and reads its cameras."""
         color, depth, cameras = (
-            _views(folder / kind / "camera_0", kind, suffix, scene)
-            for kind, suffix in (("Image", ".png"), ("Depth", ".npy"), ("camview", ".npz"))
+            {
+                view: path
+                for camera in self.cameras
+                for view, path in _views(folder / kind, kind, suffixes, camera, scene)
+            }
+            for kind, suffixes in _FILES.items()
         )
         check_found(scene, folder, {"Image files": color, "Depth files": depth})
         ids = _frame_ids({*color, *depth, *cameras})
@@ -90,31 +103,44 @@ class Infinigen(FileSource):
             depth_size=npy_size(next(iter(depth.values())), scene),
         )
 
+    def held_out(self, scene: str) -> Sequence[int]:
+        """Every ``holdout``-th frame, as seen by all cameras."""
+        if not self.holdout:
+            return ()
+        shown = sorted({frame % _CAMERA_STEP for frame in self.frames(scene)})
+        chosen = set(shown[self.holdout // 2 :: self.holdout])
+        return tuple(frame for frame in self.frames(scene) if frame % _CAMERA_STEP in chosen)
+
     def read_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
         """Reads depth; what is farther than ``max_depth`` or not a number is none."""
         depth = load_npy(index.depth[row], index.name, size)
         return np.where((depth > 0) & (depth <= self.max_depth), depth, np.float32(0))
 
 
-def _views(folder: Path, kind: str, suffix: str, scene: str) -> dict[_View, Path]:
-    """Files of one kind by rig and frame, in this order; the first resample of each."""
-    views: dict[tuple[int, ...], Path] = {}
-    for path in sorted(folder.glob(f"{kind}_*{suffix}")):
+def _views(folder: Path, kind: str, suffixes: tuple[str, ...], camera: int, scene: str) -> Iterator[tuple[_View, Path]]:
+    """Files of one kind and one camera with the camera, rig and frame, in this order; the first resample of each."""
+    found: dict[tuple[int, ...], Path] = {}
+    for path in sorted((folder / f"camera_{camera}").glob(f"{kind}_*")):
+        if path.suffix not in suffixes:
+            continue
         name = _NAME.search(path.stem)
         if name is None:
-            raise DataError(f"{path} of scene {scene} is not named {kind}_RIG_RESAMPLE_FRAME_SUBCAM{suffix}")
-        rig, resample, frame, subcam = map(int, name.groups())
-        views[rig, frame, resample, subcam] = path
-    first: dict[_View, Path] = {}
-    for rig, frame, resample, subcam in sorted(views):
-        first.setdefault((rig, frame), views[rig, frame, resample, subcam])
-    return first
+            names = " or ".join(f"{kind}_RIG_RESAMPLE_FRAME_CAMERA{suffix}" for suffix in suffixes)
+            raise DataError(f"{path} of scene {scene} is not named {names}")
+        rig, resample, frame, _ = map(int, name.groups())
+        found.setdefault((rig, frame, resample), path)
+    taken: set[_View] = set()
+    for rig, frame, resample in sorted(found):
+        view = (camera, rig, frame)
+        if view not in taken:
+            taken.add(view)
+            yield view, found[rig, frame, resample]
 
 
 def _frame_ids(views: set[_View]) -> dict[_View, int]:
-    rigs, frames = ({view[i] for view in views} for i in (0, 1))
+    rigs, frames = ({view[i] for view in views} for i in (1, 2))
     if len(rigs) == 1:
-        return {view: view[1] for view in views}
-    if len(frames) == 1:
-        return {view: view[0] for view in views}
-    return {view: _RIG_STEP * view[0] + view[1] for view in views}
+        rig_step, frame_step = 0, 1
+    else:
+        rig_step, frame_step = (1, 0) if len(frames) == 1 else (_RIG_STEP, 1)
+    return {view: _CAMERA_STEP * view[0] + rig_step * view[1] + frame_step * view[2] for view in views}

@@ -103,13 +103,16 @@ class Builder:
         self.parts.append(np.concatenate((position, [radius2], axes.ravel(), half, [kind])))
         self.part_materials.append(material)
 
+    def corners(self, first: int, last: int | None = None) -> NDArray[np.float64]:
+        """Corners ``[8 n, 3]`` of the boxes around the parts from ``first`` up to ``last``."""
+        rows = self.parts[first:last]
+        return np.concatenate([row[:3] + (_CORNERS * row[HALF:KIND]) @ row[AXES:HALF].reshape(3, 3) for row in rows])
+
     def groups(self) -> NDArray[np.float64]:
         """Groups ``[g, GROUP_COLUMNS]`` of the parts, with spheres that hold the boxes around their parts."""
         rows = []
         for first, last in zip(self._group_start[:-1], self._group_start[1:], strict=True):
-            corners = np.concatenate(
-                [row[:3] + (_CORNERS * row[HALF:KIND]) @ row[AXES:HALF].reshape(3, 3) for row in self.parts[first:last]]
-            )
+            corners = self.corners(first, last)
             middle = (corners.min(0) + corners.max(0)) / 2
             radius = np.linalg.norm(corners - middle, axis=1).max() + 1e-6
             rows.append([*middle, radius, first, last])

@@ -42,21 +42,27 @@ class SceneSettings:
         frames: frames per scene.
         size: image ``(height, width)``.
         variant: as in :class:`SyntheticScenes`.
-        highlights: whether surfaces shine.
+        highlights: as in :class:`SyntheticScenes`.
         normals: write normals too.
         depth_scale: stored depth units per metre.
+        exposure: as in :class:`SyntheticScenes`.
+        jpeg: the same; the files are PNG all the same.
     """
 
     frames: int = 16
     size: tuple[int, int] = (224, 448)
     variant: Any = "room"
-    highlights: bool = False
+    highlights: Any = False
     normals: bool = False
     depth_scale: float = 1000.0
+    exposure: float = 0.0
+    jpeg: Any = None
 
     def source(self, scenes: int, first_seed: int) -> SyntheticScenes:
         """The scenes, as they are written."""
-        return SyntheticScenes(scenes, first_seed, self.frames, self.size, self.variant, self.highlights)
+        return SyntheticScenes(
+            scenes, first_seed, self.frames, self.size, self.variant, self.highlights, None, self.exposure, self.jpeg
+        )
 
 
 def missing_scenes(out: Path, scenes: int, first_seed: int, settings: SceneSettings) -> list[str]:
@@ -102,12 +108,17 @@ def write_scenes(out: Path, names: Sequence[str], settings: SceneSettings, worke
 
 def _claim(out: Path, settings: SceneSettings) -> None:
     """Writes the settings into a new folder; refuses one with other settings or with other content."""
-    versions = {name: scene.version for name, scene in VARIANTS.items()}
     variants = settings.variant if isinstance(settings.variant, str) else list(settings.variant)
-    wanted = asdict(settings) | {"size": list(settings.size), "variant": variants, "versions": versions}
+    used = {variants} if isinstance(variants, str) else set(variants)
+    versions = {name: scene.version for name, scene in VARIANTS.items() if name in used}
+    jpeg = None if settings.jpeg is None else list(settings.jpeg)
+    wanted = asdict(settings) | {
+        "size": list(settings.size), "variant": variants, "jpeg": jpeg, "versions": versions,
+    }  # fmt: skip
     path = out / SETTINGS_FILE
     if path.is_file():
-        found = read_json(path)
+        found = {"exposure": 0.0, "jpeg": None} | read_json(path)  # older folders lack what came later
+        found["versions"] = {name: version for name, version in found.get("versions", {}).items() if name in used}
         other = [key for key in wanted if found.get(key) != wanted[key]]
         if other:
             differences = ", ".join(f"{key}={found.get(key)} instead of {wanted[key]}" for key in other)

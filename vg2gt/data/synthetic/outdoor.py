@@ -21,7 +21,7 @@ _BOUNDS = np.array([[-40.0, -60.0, 0.0], [90.0, 60.0, 60.0]])  # beyond it, even
 _FREE = 1.4  # metres either side of the camera's line that stay free
 _SUN_DISTANCE = 1e4  # so that shadows are parallel to half a degree
 
-_GROUND = ((0.12, 0.22, 0.06), (0.22, 0.25, 0.1), (0.3, 0.26, 0.2), (0.26, 0.25, 0.24))
+GROUND_COLORS = ((0.12, 0.22, 0.06), (0.22, 0.25, 0.1), (0.3, 0.26, 0.2), (0.26, 0.25, 0.24))
 _PAVING = (Pattern.CHECKS, Pattern.BRICKS, Pattern.MOSAIC, Pattern.PLANKS, Pattern.CLOUDS)
 
 
@@ -53,17 +53,17 @@ class SyntheticOutdoor(SyntheticScene):
         seed: decides everything, together with the number of frames.
         num_frames: cameras on the path, at least 1.
         size: image ``(height, width)``.
-        highlights: whether surfaces shine; nothing but the colour changes.
+        highlights: as in ``draw_highlights``; nothing but the colour changes.
     """
 
     version = 1  # raise it whenever the same seed would give other pixels
 
-    def __init__(self, seed: int, num_frames: int, size: tuple[int, int], highlights: bool = False) -> None:
+    def __init__(self, seed: int, num_frames: int, size: tuple[int, int], highlights: bool | str = False) -> None:
         stream = (self.version, seed, _STREAM)
         rng = np.random.default_rng(stream)
         builder = Builder(rng)
         plan = _draw_plan(rng)
-        ground = builder.tinted_material(street.pick(builder, _GROUND), (Pattern.CLOUDS,), (1, 6))
+        ground = builder.tinted_material(street.pick(builder, GROUND_COLORS), (Pattern.CLOUDS,), (1, 6))
         if plan.road:
             _pave(builder, plan)
             _park(builder, plan)
@@ -74,7 +74,7 @@ class SyntheticOutdoor(SyntheticScene):
         builder.end_group()
         world = _finish(builder, ground)
         if highlights:
-            world = replace(world, highlights=draw_highlights(stream, len(world.materials)))
+            world = replace(world, highlights=draw_highlights(stream, len(world.materials), highlights))
         super().__init__(world, _camera_path(rng, num_frames), rng.uniform(1.1, 1.5), size)
 
 
@@ -177,12 +177,18 @@ def _scatter(builder: Builder, plan: _Plan) -> None:
         make(builder)
 
 
-def _finish(builder: Builder, ground: int) -> World:
-    rng = builder.rng
+def draw_daylight(rng: np.random.Generator) -> tuple[NDArray[np.float64], float, NDArray[np.float64]]:
+    """Draws a sun: its light ``[1, 6]``, the ambient light and the sky around it ``[SKY_COLUMNS]``."""
     height, turn = rng.uniform(0.4, 1.1), rng.uniform(0, 2 * np.pi)
     sun = np.array([np.cos(height) * np.cos(turn), np.cos(height) * np.sin(turn), np.sin(height)])
     color = rng.uniform(0.85, 1.25) * np.array([1.0, rng.uniform(0.88, 0.97), rng.uniform(0.7, 0.92)])
     color *= 0.5 + 0.25 * _SUN_DISTANCE**2  # undoes the fall-off with distance
+    light = np.concatenate((_SUN_DISTANCE * sun, color))[None]
+    return light, float(rng.uniform(0.35, 0.55)), draw_sky(rng, sun)
+
+
+def _finish(builder: Builder, ground: int) -> World:
+    lights, ambient, sky = draw_daylight(builder.rng)
     return World(
         walls=_BOUNDS,
         wall_materials=np.full(6, ground),
@@ -190,9 +196,9 @@ def _finish(builder: Builder, ground: int) -> World:
         part_materials=np.array(builder.part_materials, np.int64),
         groups=builder.groups(),
         materials=np.array(builder.materials),
-        lights=np.concatenate((_SUN_DISTANCE * sun, color))[None],
-        ambient=float(rng.uniform(0.35, 0.55)),
-        sky=draw_sky(rng, sun),
+        lights=lights,
+        ambient=ambient,
+        sky=sky,
     )
 
 

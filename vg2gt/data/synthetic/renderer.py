@@ -21,7 +21,7 @@ _TILE = 8
 SAMPLES = 2  # colour samples per axis and pixel
 _LIFT = 1e-4  # metres by which a shadow ray starts above its surface
 _SHADOW = 0.2  # share of a light that reaches a point in its shadow, standing in for bounced light
-_GAMMA = 1 / 1.8
+GAMMA = 1 / 1.8
 
 
 @dataclass(frozen=True)
@@ -298,5 +298,5 @@ def _render(pose, camera, geometry, look, extras, samples, workspace, out):
                         )  # fmt: skip
                         k += 1
                     for i in range(3):
-                        value = min(max(color[i] / per_pixel, 0.0), 1.0) ** _GAMMA
+                        value = min(max(color[i] / per_pixel, 0.0), 1.0) ** GAMMA
                         image[y, x, i] = int(255.0 * value + 0.5)

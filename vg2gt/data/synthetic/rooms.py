@@ -28,12 +28,12 @@ class SyntheticRoom(SyntheticScene):
         seed: decides everything, together with the number of frames.
         num_frames: cameras on the path, at least 1.
         size: image ``(height, width)``.
-        highlights: whether surfaces shine; nothing but the colour changes.
+        highlights: as in ``draw_highlights``; nothing but the colour changes.
     """
 
     version = 1  # raise it whenever the same seed would give other pixels
 
-    def __init__(self, seed: int, num_frames: int, size: tuple[int, int], highlights: bool = False) -> None:
+    def __init__(self, seed: int, num_frames: int, size: tuple[int, int], highlights: bool | str = False) -> None:
         rng = np.random.default_rng((self.version, seed))
         extent = rng.uniform((3.5, 3.5, 2.4), (7.0, 7.0, 3.3))
         builder = Builder(rng)
@@ -42,9 +42,44 @@ class SyntheticRoom(SyntheticScene):
         occupied = _furnish(builder, extent)
         world = _finish(builder, extent, shell)
         if highlights:
-            world = replace(world, highlights=draw_highlights((self.version, seed), len(world.materials)))
-        poses = _camera_path(rng, extent, occupied, num_frames)
+            world = replace(world, highlights=draw_highlights((self.version, seed), len(world.materials), highlights))
+        poses = self._path(rng, extent, occupied, num_frames)
         super().__init__(world, poses, rng.uniform(1.2, 1.55), size)
+
+    def _path(
+        self, rng: np.random.Generator, extent: NDArray[np.float64], occupied: NDArray[np.float64], count: int
+    ) -> NDArray[np.float64]:
+        """Camera-to-world poses ``[count, 4, 4]``: an arc around free floor while the view pans and nods smoothly."""
+        s = np.linspace(0, 1, count)
+        floor = _free_arc(rng, extent, occupied, s)
+        height = rng.uniform(1.0, 1.7) + 0.15 * np.sin(s * np.pi * rng.uniform(0.5, 2) + rng.uniform(0, 6))
+        height = np.minimum(height, extent[2] - 0.4)
+        pan = rng.uniform(0, 2 * np.pi) + rng.choice((-1, 1)) * rng.uniform(1.2, 2.4) * s + 0.1 * np.sin(7 * s)
+        nod = -rng.uniform(0, 0.35) + 0.15 * np.sin(s * np.pi * rng.uniform(0.6, 2) + rng.uniform(0, 6))
+        return level_poses(np.column_stack((floor, height)), pan, nod)
+
+
+class SyntheticWideRoom(SyntheticRoom):
+    """The room of the same seed, photographed across from free places all around: wide baselines."""
+
+    def _path(
+        self, rng: np.random.Generator, extent: NDArray[np.float64], occupied: NDArray[np.float64], count: int
+    ) -> NDArray[np.float64]:
+        """Camera-to-world poses ``[count, 4, 4]``, in the order of their angle around the room's middle."""
+        draws = rng.uniform(-0.5, 0.5, (max(_TRIES, 20 * count), 2)) * (extent[:2] - 0.7)
+        gaps = np.linalg.norm(draws[:, None] - occupied[None, :, :2], axis=-1) - occupied[None, :, 2]
+        free = np.argsort(-np.minimum(gaps.min(1, initial=np.inf), 0.2), kind="stable")
+        places = draws[free[: 3 * count]]
+        chosen = [0]  # every next one as far as possible from all before
+        while len(chosen) < count:
+            apart = np.linalg.norm(places[:, None] - places[None, chosen], axis=-1).min(1)
+            chosen.append(int(np.argmax(apart)))
+        places = places[chosen]
+        places = places[np.argsort(np.arctan2(places[:, 1], places[:, 0]))]
+        ahead = rng.normal(0, 0.1, (count, 2)) * extent[:2] - places
+        height = np.minimum(rng.uniform(0.9, 1.8, count), extent[2] - 0.4)
+        pan = np.arctan2(ahead[:, 1], ahead[:, 0]) + rng.normal(0, 0.25, count)
+        return level_poses(np.column_stack((places, height)), pan, rng.uniform(-0.4, 0.05, count))
 
 
 def _shell_materials(builder: Builder) -> NDArray[np.int64]:
@@ -97,11 +132,7 @@ def _candidate_place(rng: np.random.Generator, extent: NDArray[np.float64]) -> t
 
 
 def _finish(builder: Builder, extent: NDArray[np.float64], shell: NDArray[np.int64]) -> World:
-    rng = builder.rng
-    count = int(rng.integers(1, 4))
-    position = rng.uniform(-0.4, 0.4, (count, 3)) * extent
-    position[:, 2] = extent[2] - rng.uniform(0.1, 0.5, count)
-    color = rng.uniform(0.8, 1.1, (count, 1)) * (1 + rng.uniform(-0.12, 0.12, (count, 3))) / np.sqrt(count)
+    lights, ambient = draw_lamps(builder.rng, extent)
     half = extent[:2] / 2
     return World(
         walls=np.array([[-half[0], -half[1], 0.0], [half[0], half[1], extent[2]]]),
@@ -110,22 +141,18 @@ def _finish(builder: Builder, extent: NDArray[np.float64], shell: NDArray[np.int
         part_materials=np.array(builder.part_materials, np.int64),
         groups=builder.groups(),
         materials=np.array(builder.materials),
-        lights=np.concatenate((position, color), 1),
-        ambient=float(rng.uniform(0.35, 0.6)),
+        lights=lights,
+        ambient=ambient,
     )
 
 
-def _camera_path(
-    rng: np.random.Generator, extent: NDArray[np.float64], occupied: NDArray[np.float64], count: int
-) -> NDArray[np.float64]:
-    """Camera-to-world poses ``[count, 4, 4]``: an arc around free floor while the view pans and nods smoothly."""
-    s = np.linspace(0, 1, count)
-    floor = _free_arc(rng, extent, occupied, s)
-    height = rng.uniform(1.0, 1.7) + 0.15 * np.sin(s * np.pi * rng.uniform(0.5, 2) + rng.uniform(0, 6))
-    height = np.minimum(height, extent[2] - 0.4)
-    pan = rng.uniform(0, 2 * np.pi) + rng.choice((-1, 1)) * rng.uniform(1.2, 2.4) * s + 0.1 * np.sin(7 * s)
-    nod = -rng.uniform(0, 0.35) + 0.15 * np.sin(s * np.pi * rng.uniform(0.6, 2) + rng.uniform(0, 6))
-    return level_poses(np.column_stack((floor, height)), pan, nod)
+def draw_lamps(rng: np.random.Generator, extent: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """Draws one to three lamps ``[l, 6]`` (position, colour) below the ceiling, and the ambient light."""
+    count = int(rng.integers(1, 4))
+    position = rng.uniform(-0.4, 0.4, (count, 3)) * extent
+    position[:, 2] = extent[2] - rng.uniform(0.1, 0.5, count)
+    color = rng.uniform(0.8, 1.1, (count, 1)) * (1 + rng.uniform(-0.12, 0.12, (count, 3))) / np.sqrt(count)
+    return np.concatenate((position, color), 1), float(rng.uniform(0.35, 0.6))
 
 
 def _free_arc(

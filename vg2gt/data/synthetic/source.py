@@ -6,6 +6,7 @@ import io
 import json
 import logging
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +14,11 @@ import torch
 from numpy.typing import NDArray
 
 from vg2gt.data.base import Frames, SceneSource
+from vg2gt.data.synthetic.orbits import SyntheticLandmark, SyntheticObject
 from vg2gt.data.synthetic.outdoor import SyntheticOutdoor
-from vg2gt.data.synthetic.rooms import SyntheticRoom
-from vg2gt.data.synthetic.synthetic_scene import SyntheticScene
+from vg2gt.data.synthetic.photograph import Photograph
+from vg2gt.data.synthetic.rooms import SyntheticRoom, SyntheticWideRoom
+from vg2gt.data.synthetic.synthetic_scene import LOBES, SyntheticScene
 from vg2gt.data.transforms import from_bytes
 from vg2gt.io.errors import FormatError
 from vg2gt.io.files import write_cached
@@ -23,14 +26,17 @@ from vg2gt.io.npz import read_npz
 
 log = logging.getLogger(__name__)
 
-VARIANTS: dict[str, type[SyntheticRoom] | type[SyntheticOutdoor]] = {
+VARIANTS: dict[str, type[SyntheticRoom] | type[SyntheticOutdoor] | type[SyntheticObject] | type[SyntheticLandmark]] = {
     "room": SyntheticRoom,
     "outdoor": SyntheticOutdoor,
+    "wide": SyntheticWideRoom,
+    "object": SyntheticObject,
+    "landmark": SyntheticLandmark,
 }
 
 
 class SyntheticScenes(SceneSource):
-    """Furnished rooms and outdoor scenes with exact depth and poses.
+    """Rooms, outdoor scenes and objects with exact depth and poses.
 
     Scene k of a source has the seed ``first_seed + k`` and the name ``<variant>-<seed>``, so sources whose seed ranges
     do not overlap share no scene. The sky of outdoor scenes has no depth.
@@ -39,10 +45,15 @@ class SyntheticScenes(SceneSource):
         num_scenes: scenes in this source.
         first_seed: seed of the first scene.
         num_frames: frames on a scene's camera path.
-        size: image ``(height, width)``; best the size that is trained on.
-        variant: ``room`` or ``outdoor``, or a list: seeds take turns, ``[room, room, outdoor]`` is one third outdoor.
+        size: image ``(height, width)``; best the size that is trained on. Upright images are upright photographs: the
+            field of view is along the longer side.
+        variant: ``room``, ``outdoor``, ``wide`` (rooms from all around), ``object`` (orbits) or ``landmark`` (far
+            backgrounds), or a list: seeds take turns, ``[room, room, outdoor]`` is one third outdoor.
         highlights: whether surfaces shine, with colours that depend on the view; geometry and textures stay the same.
+            ``lobes``: strongly.
         cache_dir: folder for the rendered frames (``~`` is the home folder); None keeps nothing on disk.
+        exposure: scenes are too dark or too bright by this many stops (standard deviation), with noise; 0: none is.
+        jpeg: range of qualities, such as ``[30, 95]``, at which images are compressed; None: they are not.
 
     Raises:
         ValueError: if a number is out of range or a variant unknown.
@@ -55,8 +66,10 @@ class SyntheticScenes(SceneSource):
         num_frames: int = 16,
         size: Sequence[int] = (112, 224),
         variant: str | Sequence[str] = "room",
-        highlights: bool = False,
+        highlights: bool | str = False,
         cache_dir: str | None = None,
+        exposure: float = 0.0,
+        jpeg: Sequence[int] | None = None,
     ) -> None:
         if num_scenes < 1 or num_frames < 1 or first_seed < 0:
             raise ValueError(
@@ -66,9 +79,12 @@ class SyntheticScenes(SceneSource):
         variants = [variant] if isinstance(variant, str) else list(variant)
         if not variants or not set(variants) <= set(VARIANTS):
             raise ValueError(f"variant must be one of {', '.join(VARIANTS)}, or a list of them; got {variant!r}")
+        if highlights not in (True, False, LOBES):
+            raise ValueError(f"highlights must be true, false or {LOBES}; got {highlights!r}")
         self.num_frames = num_frames
         self.size = (int(size[0]), int(size[1]))
         self.highlights = highlights
+        self._photograph = Photograph.of(exposure, jpeg)
         self.cache_dir = Path(cache_dir).expanduser() if cache_dir else None
         self._seeds: dict[str, tuple[str, int]] = {}
         for seed in range(first_seed, first_seed + num_scenes):
@@ -108,13 +124,24 @@ class SyntheticScenes(SceneSource):
     def scene(self, scene: str) -> SyntheticScene:
         """Makes a scene, ready to be rendered."""
         kind, seed = self._seeds[scene]
-        return VARIANTS[kind](seed, self.num_frames, self.size, self.highlights)
+        made = VARIANTS[kind](seed, self.num_frames, self.size, self.highlights)
+        made.develop = partial(self._photograph.develop, seed) if self._photograph else None
+        return made
 
     def identity(self, scene: str) -> str:
         """What decides the pixels, with the version of the generator."""
         kind = self._seeds[scene][0]
         version = VARIANTS[kind].version
-        return json.dumps([type(self).__qualname__, scene, version, self.size, self.num_frames, self.highlights])
+        look = self._look[1:]
+        more = [look] if look not in ("", "highlights") else []
+        return json.dumps([type(self).__qualname__, scene, version, self.size, self.num_frames, self.highlights, *more])
+
+    @property
+    def _look(self) -> str:
+        """What decides the pixels beside scene and size, as part of file names."""
+        highlights = {True: "-highlights", False: ""}.get(self.highlights, f"-{self.highlights}")  # pyright: ignore
+        upright = "-upright" if self.size[0] > self.size[1] else ""  # where the field of view was once horizontal
+        return highlights + upright + (self._photograph.name if self._photograph else "")
 
     def _render(self, scene: str) -> dict[str, NDArray]:
         made = self.scene(scene)
@@ -131,9 +158,8 @@ class SyntheticScenes(SceneSource):
         if self.cache_dir is None:
             return None
         kind = self._seeds[scene][0]
-        look = "-highlights" if self.highlights else ""
         size = f"{self.size[0]}x{self.size[1]}x{self.num_frames}"
-        folder = f"{kind}s{look}-v{VARIANTS[kind].version}-{size}"
+        folder = f"{kind}s{self._look}-v{VARIANTS[kind].version}-{size}"
         return self.cache_dir / folder / f"{scene}.npz"
 
     def _read_cache(self, scene: str) -> dict[str, NDArray] | None:

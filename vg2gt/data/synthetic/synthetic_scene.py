@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,8 @@ from vg2gt.data.synthetic.renderer import SAMPLES, RenderedFrame, World, render_
 
 _HIGHLIGHTS = 1  # tells the random stream of the highlights from that of the scene
 _MATT_SHARE = 0.3
+LOBES = "lobes"
+"""Value of ``highlights`` for strong ones."""
 
 
 class SyntheticScene:
@@ -20,12 +23,13 @@ class SyntheticScene:
     Args:
         world: what is seen.
         camera_to_world: ``[n, 4, 4]`` OpenCV.
-        field_of_view: horizontal, rad.
+        field_of_view: along the longer side of the image, rad.
         size: image ``(height, width)``.
 
     Attributes:
         world_to_camera: ``[n, 4, 4]`` float64.
         intrinsics: ``[3, 3]`` float64 in pixels, integer pixel centres.
+        develop: what is done to the image of a frame, given the frame's number; None: nothing.
     """
 
     def __init__(
@@ -33,15 +37,17 @@ class SyntheticScene:
     ) -> None:
         self.world = world
         self.size = size
+        self.develop: Callable[[NDArray[np.uint8], int], NDArray[np.uint8]] | None = None
         self.world_to_camera = np.linalg.inv(camera_to_world)
-        focal = 0.5 * size[1] / np.tan(field_of_view / 2)
+        focal = 0.5 * max(size) / np.tan(field_of_view / 2)
         self.intrinsics = np.array([[focal, 0, (size[1] - 1) / 2], [0, focal, (size[0] - 1) / 2], [0, 0, 1]])
 
     def render(self, frames: Sequence[int], threads: int, samples: int = SAMPLES) -> list[RenderedFrame]:
         """Renders the given frames of the path, ``threads`` at a time, with ``samples`` ** 2 colour samples a pixel."""
 
         def render(frame: int) -> RenderedFrame:
-            return render_frame(self.world, self.world_to_camera[frame], self.intrinsics, self.size, samples)
+            made = render_frame(self.world, self.world_to_camera[frame], self.intrinsics, self.size, samples)
+            return replace(made, image=self.develop(made.image, frame)) if self.develop else made
 
         if threads == 1:
             return [render(frame) for frame in frames]
@@ -70,13 +76,20 @@ def level_poses(
     return poses
 
 
-def draw_highlights(seed: tuple[int, ...], materials: int) -> NDArray[np.float64]:
+def draw_highlights(seed: tuple[int, ...], materials: int, kind: bool | str = True) -> NDArray[np.float64]:
     """Strength and Blinn-Phong exponent ``[m, 2]`` of every material; a third of the materials stays matt.
 
     Drawn from a random stream of its own, so that nothing else of the scene changes. The exponent is that of a surface
     whose microfacets have slopes of ``roughness`` standard deviation, ``2 / roughness^2 - 2``.
+
+    Args:
+        seed: of the scene's random stream.
+        materials: how many there are.
+        kind: True, or ``lobes``: up to three times stronger, and from sharp to broad, as lacquer, metal and windows
+            seen in a floor are.
     """
     rng = np.random.default_rng((*seed, _HIGHLIGHTS))
-    strength = rng.uniform(0.15, 0.9, materials) * (rng.random(materials) >= _MATT_SHARE)
-    roughness = np.exp(rng.uniform(np.log(0.1), np.log(0.6), materials))
+    strong = kind == LOBES
+    strength = rng.uniform(*((0.3, 2.7) if strong else (0.15, 0.9)), materials) * (rng.random(materials) >= _MATT_SHARE)
+    roughness = np.exp(rng.uniform(np.log(0.04 if strong else 0.1), np.log(0.8 if strong else 0.6), materials))
     return np.stack((strength, 2 / roughness**2 - 2), 1)

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from vg2gt.rendering.gpu import kernels as launchable
 from vg2gt.rendering.gpu.binning import ENTRIES
-from vg2gt.rendering.gpu.projection import BLOCK, REFUSED
+from vg2gt.rendering.gpu.projection import BLOCK, REFUSED, SLOTS
 from vg2gt.rendering.gpu.projection_backward import CAMERA
 from vg2gt.rendering.gpu.tiles import RECORD, TILE
 from vg2gt.rendering.options import (
@@ -31,14 +31,18 @@ kernels: Any = launchable  # Triton makes its functions objects that take a grid
 
 NEGLIGIBLE = {torch.float32: 30.0, torch.float64: 90.0}  # squared sigmas at which a profile vanishes
 BISECTIONS = 3  # that one visit of a tile's Gaussians amounts to
-ROWS = 3_000_000  # gradient rows (64 bytes each) held at once: as many views as have no more, one at least
+ROW_SHARE = 64  # one part in so many of a GPU's memory is for gradient rows
+ROWS = 3_000_000  # gradient rows held at once where there is no GPU
+SLOT_SHARE, SLOT_BYTES = 8, 256  # one part in so many is for views rendered at once; a Gaussian in one, with entries
 
 
 class RefusedError(ValueError):
     """The kernels met a value that cannot be rendered; which one is for the caller to say."""
 
 
-def render_triton(gaussians: Gaussians, cameras: Cameras, background: Tensor, options: RenderOptions) -> Render:
+def render_triton(
+    gaussians: Gaussians, cameras: Cameras, background: Tensor, options: RenderOptions, rows: int | None = None
+) -> Render:
     """Renders every view of every scene; differentiable in every floating-point tensor.
 
     Args:
@@ -46,14 +50,21 @@ def render_triton(gaussians: Gaussians, cameras: Cameras, background: Tensor, op
         cameras: the views.
         background: ``[3]``.
         options: the number of bisections is rounded up to a multiple of 3.
+        rows: gradient rows held at once, of one view at least; None: by the device's memory.
 
     Raises:
         RefusedError: if a value is not finite or out of range (as :mod:`vg2gt.rendering.checks` has it).
+        ValueError: if there are more Gaussians and views than can be numbered.
     """
     tensors = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
     tensors = (*tensors, cameras.world_to_camera, cameras.intrinsics, background)
     with torch.cuda.device_of(gaussians.means):  # Triton launches on the current device
-        color, normal, depth, alpha = _Render.apply(*tensors, gaussians.batch, cameras.size, options)
+        some = max(1, _slots_at_once(gaussians.means.device) // max(1, len(gaussians)))
+        parts = []
+        for poses, intrinsics in zip(tensors[5].split(some, 1), tensors[6].split(some, 1), strict=True):
+            inputs = (*tensors[:5], poses, intrinsics, background, gaussians.batch, cameras.size, options, rows)
+            parts.append(_Render.apply(*inputs))
+    color, normal, depth, alpha = parts[0] if len(parts) == 1 else map(_join_views, zip(*parts, strict=True))
     return Render(color, depth, normal, alpha)
 
 
@@ -85,10 +96,10 @@ class _Render(torch.autograd.Function):
     def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Colour ``[B, V, 3, H, W]``, normals alike, depth ``[B, V, H, W]`` and accumulated opacity."""
         tensors = tuple(tensor.contiguous() for tensor in inputs[:9])
-        (height, width), options = inputs[9:]
+        (height, width), options, rows = inputs[9:]
         poses, background = tensors[5], tensors[7]
         scenes, views = poses.shape[:2]
-        lists = _list(tensors, (height, width), options)
+        lists = _list(tensors, (height, width), options, rows or _rows_at_once(poses.device))
         solid = options.mode == "solid"
         across, tiles = _tiles(height, width)
         make = torch.empty if options.geometry else torch.zeros
@@ -158,7 +169,7 @@ class _Render(torch.autograd.Function):
             grad_intrinsics = summed[:, 16:].view(intrinsics.shape)
         if ctx.needs_input_grad[7]:
             grad_background = (incoming[0] * transmittance[:, :, None]).sum((0, 1, 3, 4))
-        return (*grads, grad_poses, grad_intrinsics, grad_background, None, None, None)
+        return (*grads, grad_poses, grad_intrinsics, grad_background, None, None, None, None)
 
 
 def _tiles(height: int, width: int) -> tuple[int, int]:
@@ -171,11 +182,31 @@ def _degree(sh: Tensor) -> int:
     return round(sh.shape[1] ** 0.5) - 1
 
 
-def _list(tensors: tuple[Tensor, ...], size: tuple[int, int], options: RenderOptions) -> _Lists:
+def _join_views(images: tuple[Tensor, ...]) -> Tensor:
+    return torch.cat(images, 1)
+
+
+def _slots_at_once(device: torch.device) -> int:
+    """Gaussians times views that are rendered at once: views beyond wait, so that sorting does not fill the memory."""
+    if device.type != "cuda":
+        return SLOTS
+    return torch.cuda.get_device_properties(device).total_memory // (SLOT_SHARE * SLOT_BYTES)
+
+
+def _rows_at_once(device: torch.device) -> int:
+    """Rows of float32 in a share of a GPU's whole memory: of what is free, results would depend on what else runs."""
+    if device.type != "cuda":
+        return ROWS
+    return torch.cuda.get_device_properties(device).total_memory // (ROW_SHARE * 4 * RECORD)
+
+
+def _list(tensors: tuple[Tensor, ...], size: tuple[int, int], options: RenderOptions, rows: int) -> _Lists:
     """Projects and lists all Gaussians."""
     means, quats, scales, opacities, sh, poses, intrinsics, background, batch = tensors
     (scenes, views), (height, width), total = poses.shape[:2], size, len(means)
     across, tiles = _tiles(height, width)
+    if total * views > SLOTS:
+        raise ValueError(f"{total} Gaussians in {views} views are too many to render at once; render fewer views")
     records = means.new_empty(views, total, RECORD)
     rects = batch.new_empty(views, total, 2, dtype=torch.int32)
     ends = batch.new_empty(views * total)
@@ -191,7 +222,10 @@ def _list(tensors: tuple[Tensor, ...], size: tuple[int, int], options: RenderOpt
         per_view = ends[total - 1 :: total].tolist()  # the host waits here, and nowhere else
     entries = per_view[-1]
     if entries >= REFUSED:
-        raise RefusedError("a Gaussian, a camera or the background cannot be rendered")
+        raise RefusedError(
+            f"a Gaussian, a camera or the background cannot be rendered, or {total} Gaussians cover more than "
+            f"{REFUSED} tiles in {views} views: render fewer views at once"
+        )
     keys, owners = batch.new_empty(entries), batch.new_empty(entries, dtype=torch.int32)
     if entries:
         kernels.emit_kernel[(-(-entries // ENTRIES),)](
@@ -207,15 +241,15 @@ def _list(tensors: tuple[Tensor, ...], size: tuple[int, int], options: RenderOpt
         keys, order, owners, members, places, starts, entries, scenes * views * tiles, entries.bit_length(),
         num_warps=4,
     )  # fmt: skip
-    return _Lists(records, ends, members, places, starts, _chunks(per_view))
+    return _Lists(records, ends, members, places, starts, _chunks(per_view, rows))
 
 
-def _chunks(ends: list[int]) -> tuple[tuple[int, int, int, int], ...]:
-    """Parts views so that each part has at most ``ROWS`` entries or one view: first view, views, first entry, end."""
+def _chunks(ends: list[int], rows: int) -> tuple[tuple[int, int, int, int], ...]:
+    """Parts views so that each part has at most ``rows`` entries or one view: first view, views, first entry, end."""
     chunks: list[tuple[int, int, int, int]] = []
     first, begin = 0, 0
     for view in range(1, len(ends) + 1):
-        if view == len(ends) or ends[view] - begin > ROWS:
+        if view == len(ends) or ends[view] - begin > rows:
             chunks.append((first, view - first, begin, ends[view - 1]))
             first, begin = view, ends[view - 1]
     return tuple(chunks)

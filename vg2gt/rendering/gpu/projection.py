@@ -17,7 +17,10 @@ from vg2gt.rendering.gpu.tiles import RECORD, TILE
 BLOCK = 128
 TINY = 1e-24  # a squared quaternion is taken as this at least, as F.normalize does
 CLAMP = 0.65  # half of options.JACOBIAN_CLAMP
-REFUSED = 1 << 40  # tiles that a Gaussian counts for which cannot be rendered, so that the total tells it
+SLOTS = 1 << 30  # Gaussians times views: their places are int32, and sums of two places must be, too
+# Tiles that a Gaussian counts for which cannot be rendered: the total tells it. No fewer than there can be entries,
+# whose places are int32 up to the end of a block, and few enough that all slots together do not overflow int64.
+REFUSED = (1 << 31) - (1 << 10)
 
 _BLOCK = tl.constexpr(BLOCK)
 _RECORD = tl.constexpr(RECORD)

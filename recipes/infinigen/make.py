@@ -1,0 +1,205 @@
+"""Makes furnished rooms with Infinigen and renders views of them: ``python make.py --rooms 40 --out FOLDER``.
+
+One room after another, on one thread: about 15 core-minutes for a room and 5 for 60 views of 224x112. Run the same
+command again after an interruption: rooms, and views of a room, that are there are not made again. Standard library
+only; Infinigen and Blender come into an environment of their own, ``OUT/environment`` unless ``--env`` says otherwise.
+
+Results: ``OUT/train/room_NNNN`` and ``OUT/held_out/room_NNNN``, folders for ``data=infinigen``; ``OUT/log.csv`` with
+the time of every stage. A room that fails leaves ``OUT/work/room_NNNN/failed.txt``, and is passed over from then on;
+one whose views contradict each other goes to ``OUT/rejected``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import fcntl
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from rooms import kind, name, part
+
+HERE = Path(__file__).resolve().parent
+INFINIGEN, BLENDER = "infinigen==1.15.5", "bpy==4.2.0"
+_THREADS = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "MKL", "OPENBLAS", "NUMBA")}
+# No landscape outside, fewer steps than in fast_solve.gin (100 and 40), and small things on four pieces of furniture
+# only: placing them takes most of the time.
+_FASTER = (
+    "compose_indoors.terrain_enabled=False",
+    "compose_indoors.solve_steps_large=60", "compose_indoors.solve_steps_medium=25",
+    "restrict_solving.solve_max_parent_obj=4",
+)  # fmt: skip
+_COLUMNS = ("room", "seed", "kind", "stage", "result", "wall_seconds", "core_seconds", "peak_gigabytes", "ended")
+
+
+class StageError(Exception):
+    """A stage of a room ended with an error."""
+
+
+def make_environment(env: Path, python: str) -> Path:
+    """Installs Infinigen and Blender into ``env``, unless they are there; returns its interpreter."""
+    interpreter, done = env / "bin" / "python", env / "complete"
+    if done.exists():
+        return interpreter
+    version = subprocess.run([python, "-c", "import sys; print(sys.version_info[:2])"], capture_output=True, text=True)
+    if version.stdout.strip() != "(3, 11)":
+        raise SystemExit(f"{python} is not Python 3.11, which Blender 4.2 needs: name one with --python")
+    subprocess.run([python, "-m", "venv", str(env)], check=True)
+    pip = [str(interpreter), "-m", "pip", "install", "-q"]
+    subprocess.run([*pip, "--no-deps", INFINIGEN, BLENDER], check=True)
+    subprocess.run([*pip, "-r", str(HERE / "requirements.txt")], check=True)
+    subprocess.run([str(interpreter), "-m", "pip", "uninstall", "-q", "-y", "typing"], check=True)
+    if subprocess.run([str(interpreter), "-c", "import bpy, infinigen"], capture_output=True).returncode:
+        raise SystemExit(
+            f"Blender cannot be imported in {env}; on Debian: apt-get install libxi6 libxxf86vm1 libxfixes3 "
+            "libxrender1 libsm6 libegl1 libxkbcommon0 libgl1"
+        )
+    done.touch()
+    return interpreter
+
+
+def link_packages(interpreter: Path, folder: Path) -> None:
+    """Makes a working folder with links to Infinigen's packages: it looks for its settings there."""
+    folder.mkdir(parents=True, exist_ok=True)
+    where = subprocess.run(
+        [str(interpreter), "-c", "import sysconfig; print(sysconfig.get_paths()['purelib'])"],
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    for package in ("infinigen", "infinigen_examples"):
+        link = folder / package
+        if not link.exists():
+            link.unlink(missing_ok=True)
+            link.symlink_to(Path(where.stdout.strip()) / package)
+
+
+class Rooms:
+    """Makes rooms in a folder.
+
+    Args:
+        out: the folder.
+        interpreter: of Infinigen's environment.
+        args: options of the command line.
+    """
+
+    def __init__(self, out: Path, interpreter: Path, args: argparse.Namespace) -> None:
+        self.out, self.interpreter, self.args = out, interpreter, args
+        self.links = out / "work" / "packages"
+        link_packages(interpreter, self.links)
+        self._lock = (out / "work" / "lock").open("w")
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise SystemExit(
+                f"another process makes rooms in {out}: wait for it, end it, or give another --out"
+            ) from None
+
+    def make(self, seed: int) -> None:
+        """Makes one room, unless it is there or has failed before."""
+        room = name(seed)
+        work = self.out / "work" / room
+        if any((self.out / place / room).exists() for place in (part(seed), "rejected")):
+            return
+        if (work / "failed.txt").exists():
+            print(f"{room} failed before ({work / 'failed.txt'}); remove that file to try it again", flush=True)
+            return
+        work.mkdir(parents=True, exist_ok=True)
+        try:
+            if not (work / "coarse").exists():
+                self._coarse(seed, work)
+            self._views(seed, work)
+        except StageError as error:
+            (work / "failed.txt").write_text(f"{error}\n")
+            print(f"{room} failed: {error}", flush=True)
+
+    def _coarse(self, seed: int, work: Path) -> None:
+        new = work / "coarse.new"
+        shutil.rmtree(new, ignore_errors=True)
+        command = [
+            HERE / "coarse.py", "--seed", seed, "--task", "coarse", "--output_folder", new,
+            "-g", "fast_solve.gin", "singleroom.gin", "-p", *_FASTER,
+            f'restrict_solving.restrict_parent_rooms=["{kind(seed)}"]',
+        ]  # fmt: skip
+        self._stage(seed, "coarse", command, work / "coarse.log")
+        if not (new / "scene.blend").exists():
+            raise StageError(f"coarse wrote no scene.blend; see {work / 'coarse.log'}")
+        new.rename(work / "coarse")
+
+    def _views(self, seed: int, work: Path) -> None:
+        args, views = self.args, work / "views"
+        command = [
+            HERE / "views.py", work / "coarse" / "scene.blend", views, "--seed", seed, "--kind", kind(seed),
+            "--views", args.views, "--size", *args.size, "--samples", args.samples,
+        ]  # fmt: skip
+        self._stage(seed, "views", command, work / "views.log")
+        log = work / "check.json"
+        self._stage(seed, "check", [HERE / "check.py", views], log)
+        figures = json.loads(log.read_text().splitlines()[-1])
+        (views / "check.json").write_text(json.dumps(figures | {"seed": seed, "kind": kind(seed)}) + "\n")
+        print(f"{name(seed)} ({kind(seed)}): {figures}", flush=True)
+        place = self.out / (part(seed) if figures["ok"] else "rejected")
+        place.mkdir(exist_ok=True)
+        views.rename(place / name(seed))
+        if not args.keep_blend:
+            shutil.rmtree(work / "coarse")
+
+    def _stage(self, seed: int, stage: str, command: Sequence[object], log: Path) -> None:
+        """Runs one stage in Infinigen's environment and adds a line to the log."""
+        begun = time.monotonic()
+        with log.open("w") as file:
+            process = subprocess.Popen(
+                [str(self.interpreter), *map(str, command)],
+                cwd=self.links, env={**os.environ, **_THREADS}, stdout=file, stderr=subprocess.STDOUT,
+            )  # fmt: skip
+            try:
+                _, status, usage = os.wait4(process.pid, 0)
+            except BaseException:
+                process.terminate()
+                raise
+        process.returncode = os.waitstatus_to_exitcode(status)
+        result = "ok" if process.returncode == 0 else f"exit {process.returncode}"
+        row = (name(seed), seed, kind(seed), stage, result, round(time.monotonic() - begun, 1),
+               round(usage.ru_utime + usage.ru_stime, 1), round(usage.ru_maxrss / 2**20, 2),
+               time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()))  # fmt: skip
+        path = self.out / "log.csv"
+        is_new = not path.exists()
+        with path.open("a", newline="") as file:
+            writer = csv.writer(file)
+            writer.writerows([_COLUMNS, row] if is_new else [row])
+        if process.returncode:
+            raise StageError(f"{stage}: {result}; see {log}")
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rooms", type=int, default=40, help="seeds 0 to this many; ten of the first 40 are held out")
+    parser.add_argument("--out", type=Path, required=True, help="folder of the rooms")
+    parser.add_argument("--views", type=int, default=60, help="views a room")
+    parser.add_argument("--size", type=int, nargs=2, default=(112, 224), metavar=("HEIGHT", "WIDTH"))
+    parser.add_argument("--samples", type=int, default=8, help="rays a pixel")
+    parser.add_argument("--keep-blend", action="store_true", help="keep every room's scene.blend (400 to 500 MB)")
+    parser.add_argument("--env", type=Path, help="folder of Infinigen's environment (3 GB)")
+    parser.add_argument("--python", default="python3.11", help="interpreter that the environment is made with")
+    parser.add_argument("--first", type=int, nargs="*", default=[], metavar="SEED", help="seeds to begin with")
+    args = parser.parse_args()
+    out = args.out.resolve()
+    out.mkdir(parents=True, exist_ok=True)
+    interpreter = make_environment((args.env or out / "environment").resolve(), args.python)
+    rooms = Rooms(out, interpreter, args)
+    for seed in dict.fromkeys([*args.first, *range(args.rooms)]):
+        rooms.make(seed)
+
+
+if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # the running stage ends, too
+    try:
+        main()
+    except KeyboardInterrupt:
+        sys.exit("interrupted; run the same command to go on")

@@ -1,0 +1,225 @@
+"""The Infinigen recipe without Infinigen: camera paths in a box, the check of a room, resuming."""
+
+import argparse
+import csv
+import importlib
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.commands import ROOT
+from vg2gt.data.sources import Infinigen
+from vg2gt.data.synthetic.rooms import SyntheticRoom
+from vg2gt.data.synthetic.synthetic_scene import SyntheticScene
+
+RECIPE = ROOT / "recipes" / "infinigen"
+
+
+@pytest.fixture
+def recipe(monkeypatch):
+    """Imports a module of the recipe."""
+    monkeypatch.syspath_prepend(str(RECIPE))
+    return importlib.import_module
+
+
+class Box:
+    """An empty room with solid boxes: a ``paths.Space``."""
+
+    def __init__(self, size=(5.0, 4.0, 2.6), boxes=((0.6, 0.2, 0.35, 0.35), (-1.2, -0.9, 0.3, 0.3))):
+        self.low = np.array([-size[0] / 2, -size[1] / 2, 0.0])
+        self.high = np.array([size[0] / 2, size[1] / 2, size[2]])
+        self.objects = np.array([(x, y, height, 1.7 * half) for x, y, height, half in boxes]).reshape(-1, 4)
+        self._boxes = [
+            (np.array([x - half, y - half, 0.0]), np.array([x + half, y + half, 2 * height]))
+            for x, y, height, half in boxes
+        ]
+
+    def inside(self, point):
+        return bool((point[:2] > self.low[:2]).all() and (point[:2] < self.high[:2]).all())
+
+    def cast(self, origin, direction):
+        with np.errstate(divide="ignore"):
+            inverse = 1 / np.where(direction == 0, 1e-12, direction)
+
+        def cross(low, high):
+            a, b = (low - origin) * inverse, (high - origin) * inverse
+            return np.minimum(a, b).max(), np.maximum(a, b).min()
+
+        best, back = cross(self.low, self.high)[1], False
+        for low, high in self._boxes:
+            enter, leave = cross(low, high)
+            if 0 < enter < min(leave, best):
+                best, back = enter, False
+            elif enter <= 0 < leave < best:
+                best, back = leave, True
+        return float(best), back
+
+
+def test_paths_are_free_and_of_every_kind(recipe):
+    paths = recipe("paths")
+    room = Box()
+    views = paths.plan(room, np.random.default_rng(0), 60)
+    assert len(views) == 60
+    kinds = {view.path.rsplit("_", 1)[0] for view in views}
+    assert kinds == set(paths.SHARES)
+    for view in views:
+        assert room.inside(view.position)
+        assert min(room.cast(view.position, side)[0] for side in paths._SIDES) >= paths._MARGIN
+        assert not any(room.cast(view.position, side)[1] for side in paths._SIDES)
+        pose = view.camera_to_world()
+        np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-9)
+        assert np.linalg.det(pose[:3, :3]) > 0
+        assert pose[2, 1] < -0.5  # upright
+    walking = [view for view in views if view.path.startswith("walk")]
+    assert all(1.0 < view.position[2] < 1.9 for view in walking)
+    again = paths.plan(room, np.random.default_rng(0), 60)
+    assert all(np.array_equal(a.position, b.position) for a, b in zip(views, again, strict=True))
+
+
+def test_orbits_go_around_a_thing_in_steps_of_10_to_40_degrees(recipe):
+    paths = recipe("paths")
+    room = Box(boxes=((0.0, 0.0, 0.35, 0.35),))
+    steps, turns = [], []
+    for seed in range(6):
+        views = paths.plan(room, np.random.default_rng(seed), 60)
+        orbits = {}
+        for view in views:
+            if view.path.startswith("orbit"):
+                orbits.setdefault(view.path, []).append(np.arctan2(view.position[1], view.position[0]))
+                hit, _ = room.cast(view.position, view.forward)
+                assert np.hypot(*(view.position + hit * view.forward)[:2]) < 0.6  # the thing is in the middle
+        for angles in orbits.values():
+            turned = np.abs(np.diff(np.unwrap(angles)))
+            steps += np.degrees(turned).tolist()
+            turns.append(np.degrees(turned.sum()))
+    assert min(steps) > 5
+    assert np.median(steps) > 10
+    assert np.quantile(steps, 0.9) < 45
+    assert max(turns) > 200
+
+
+def test_a_room_without_space_is_an_error(recipe):
+    with pytest.raises(ValueError, match=r"the room has space for \d+ of 60 views"):
+        recipe("paths").plan(Box((0.8, 0.8, 2.6), ()), np.random.default_rng(0), 60)
+
+
+def test_ten_rooms_are_held_out_two_of_each_kind(recipe):
+    rooms = recipe("rooms")
+    kinds = [rooms.kind(seed) for seed in rooms.HELD_OUT]
+    assert len(set(rooms.HELD_OUT)) == 10
+    assert max(rooms.HELD_OUT) < 40
+    assert {kind: kinds.count(kind) for kind in rooms.KINDS} == dict.fromkeys(rooms.KINDS, 2)
+    assert {rooms.part(seed) for seed in rooms.HELD_OUT} == {"held_out"}
+    assert rooms.part(0) == "train"
+
+
+def write_room(folder: Path, scene: SyntheticScene, ray_depth=False, shift=0.0) -> None:
+    """Views of a procedural room as ``views.py`` writes them."""
+    for kind in ("Image", "Depth", "camview"):
+        (folder / "frames" / kind / "camera_0").mkdir(parents=True)
+    count = len(scene.world_to_camera)
+    (folder / "views.json").write_text(json.dumps([{"path": "walk_0"}] * count))
+    height, width = scene.size
+    intrinsics = scene.intrinsics + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+    rays = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1) - intrinsics[:2, 2]
+    longer = np.sqrt(1 + ((rays / intrinsics[0, 0]) ** 2).sum(-1))
+    for i, frame in enumerate(scene.render(range(count), 1)):
+        name = f"0_0_{i:04d}_0"
+        Image.fromarray(frame.image).save(folder / f"frames/Image/camera_0/Image_{name}.jpg", quality=92)
+        depth = frame.depth * longer if ray_depth else frame.depth
+        depth[:4] = np.inf
+        np.save(folder / f"frames/Depth/camera_0/Depth_{name}.npy", depth.astype(np.float16))
+        pose = np.linalg.inv(scene.world_to_camera[i])
+        pose[0, 3] += shift * (i % 2)
+        np.savez(folder / f"frames/camview/camera_0/camview_{name}.npz", K=intrinsics, T=pose, HW=scene.size)
+
+
+def test_the_check_finds_wrong_depth_and_wrong_poses(recipe, tmp_path):
+    check = recipe("check")
+    room = SyntheticRoom(3, 8, (56, 112))
+    write_room(tmp_path / "right", room)
+    write_room(tmp_path / "rays", room, ray_depth=True)
+    write_room(tmp_path / "poses", room, shift=0.2)
+    right, rays, poses = (check.check_room(tmp_path / name) for name in ("right", "rays", "poses"))
+    assert right["ok"]
+    assert right["pairs"] == 7
+    assert right["difference"] < 5e-4  # 16 bits
+    assert right["contradictions"] < 0.01
+    assert right["beyond"] == pytest.approx(4 / 56, abs=1e-4)
+    assert not rays["ok"]
+    assert not poses["ok"]
+
+
+def test_rooms_are_read_by_the_loader(tmp_path):
+    room = SyntheticRoom(3, 2, (56, 112))
+    write_room(tmp_path / "train" / "room_0001", room)
+    source = Infinigen(str(tmp_path / "train"))
+    frames = source.load("room_0001", [1])
+    (rendered,) = room.render([1], 1)
+    np.testing.assert_allclose(frames.depth[0, 4:], rendered.depth[4:], rtol=5e-4)
+    assert (frames.depth[0, :4] == 0).all()  # beyond the window
+    np.testing.assert_allclose(frames.world_to_camera[0], room.world_to_camera[1], atol=1e-6)
+    np.testing.assert_allclose(frames.intrinsics[0], room.intrinsics, rtol=1e-6)
+    decoded = np.asarray(Image.open(tmp_path / "train/room_0001/frames/Image/camera_0/Image_0_0_0001_0.jpg"))
+    np.testing.assert_array_equal((255 * frames.images[0]).round().permute(1, 2, 0).numpy(), decoded)
+
+
+FAKE = """#!/bin/sh
+# Stands in for Infinigen's interpreter: its first argument is the script.
+echo "$@" >> {calls}
+case "$1" in
+  -c) echo /packages;;
+  */coarse.py) [ "$3" = 1 ] && exit 3; mkdir -p "$7"; touch "$7/scene.blend";;
+  */views.py) [ -e {broken} ] && exit 1; mkdir -p "$3"; touch "$3/views.json";;
+  */check.py) cat {figures};;
+esac
+"""
+
+
+def test_rooms_are_made_in_stages_that_resume(recipe, tmp_path):
+    make = recipe("make")
+    calls, broken, figures = tmp_path / "calls", tmp_path / "broken", tmp_path / "figures"
+    calls.touch()
+    figures.write_text(json.dumps({"ok": True}) + "\n")
+    interpreter = tmp_path / "python"
+    interpreter.write_text(FAKE.format(calls=calls, broken=broken, figures=figures))
+    interpreter.chmod(0o755)
+    out = tmp_path / "out"
+    out.mkdir()
+    args = argparse.Namespace(views=60, size=(112, 224), samples=8, keep_blend=False)
+
+    def run(*seeds):
+        rooms = make.Rooms(out, interpreter, args)
+        calls.write_text("")
+        for seed in seeds:
+            rooms.make(seed)
+        scripts = [line.split()[0] for line in calls.read_text().splitlines()]
+        return [Path(script).stem for script in scripts if script != "-c"]
+
+    broken.touch()
+    assert run(0, 1) == ["coarse", "views", "coarse"]  # room 0 ends in its views, room 1 in its first stage
+    assert "views: exit 1" in (out / "work/room_0000/failed.txt").read_text()
+    broken.unlink()
+    assert run(0, 1) == []  # passed over until told otherwise
+    (out / "work/room_0000/failed.txt").unlink()
+    assert run(0, 1) == ["views", "check"]
+    assert (out / "train/room_0000/views.json").exists()
+    assert not (out / "work/room_0000/coarse").exists()  # the large file
+    assert run(0) == []
+    args.keep_blend = True
+    assert run(3) == ["coarse", "views", "check"]
+    assert json.loads((out / "held_out/room_0003/check.json").read_text())["kind"] == "Kitchen"
+    assert (out / "work/room_0003/coarse/scene.blend").exists()
+    figures.write_text(json.dumps({"ok": False}) + "\n")
+    run(2)
+    assert (out / "rejected/room_0002").exists()
+    held = make.Rooms(out, interpreter, args)
+    with pytest.raises(SystemExit, match="another process makes rooms in"):
+        make.Rooms(out, interpreter, args)
+    del held
+    rows = list(csv.DictReader((out / "log.csv").open()))
+    assert [row["result"] for row in rows if row["room"] == "room_0000"] == ["ok", "exit 1", "ok", "ok"]
+    assert all(float(row["wall_seconds"]) >= 0 for row in rows)

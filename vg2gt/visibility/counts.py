@@ -1,0 +1,203 @@
+"""How many other views agree with the depth of a pixel, and how many look through its point.
+
+The point of a pixel is projected into another view. With ``r`` the point's depth there over that view's own depth, the
+view *agrees* where ``|r - 1| < tolerance``, looks *through* the point where ``r < 1 - margin`` (it sees something
+behind), and the point is *hidden* from it where ``r`` is larger. A view without depth at that pixel says nothing.
+The four pixels around the projection are read: one that agrees is enough, and all four must look through.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from vg2gt.geometry.cameras import compose, invert_rigid, ray_directions, transform_points
+from vg2gt.io.compiled import kernel
+from vg2gt.io.threads import parallel_for
+from vg2gt.types import Cameras, TensorRecord
+
+NEAREST = 1e-6  # smallest depth in another camera, in scene units
+
+
+@dataclass(frozen=True)
+class ViewCounts(TensorRecord):
+    """Sums over other views, each view counting by its confidence weight.
+
+    Attributes:
+        agree: ``[V, H, W]`` views that see a surface where the pixel's point is.
+        through: ``[V, H, W]`` views that look through the point at something behind it.
+        hidden: ``[V, H, W]`` views that see something in front of the point.
+    """
+
+    agree: Tensor
+    through: Tensor
+    hidden: Tensor
+
+
+@torch.no_grad()
+def count_views(
+    depth: Tensor, cameras: Cameras, partners: Tensor, weight: Tensor, tolerance: float, margin: float
+) -> ViewCounts:
+    """Counts what the partners of each view say of its pixels, for one scene.
+
+    Args:
+        depth: ``[V, H, W]`` z-depth, 0 = none.
+        cameras: of the views (B = 1), in the unit of the depth.
+        partners: ``[V, K]`` int64 views that each view is compared with; -1 = none.
+        weight: ``[V, H, W]`` what each pixel of a partner counts.
+        tolerance: relative difference of depth up to which views agree.
+        margin: relative difference of depth from which on a view looks through a point.
+
+    Returns:
+        The sums; 0 for pixels without depth.
+    """
+    if depth.device.type == "cpu":
+        return _count_compiled(depth, cameras, partners, weight, tolerance, margin)
+    return count_views_reference(depth, cameras, partners, weight, tolerance, margin)
+
+
+def count_views_reference(
+    depth: Tensor, cameras: Cameras, partners: Tensor, weight: Tensor, tolerance: float, margin: float
+) -> ViewCounts:
+    """:func:`count_views` in plain torch, for any device and precision."""
+    height, width = depth.shape[1:]
+    pose, intrinsics = cameras.world_to_camera[0].to(depth), cameras.intrinsics[0].to(depth)
+    rays = ray_directions(intrinsics, (height, width))  # [V, H, W, 3]
+    known = depth > 0
+    sums = ViewCounts(*(torch.zeros_like(depth) for _ in range(3)))
+    for other in partners.T:  # one partner of each view
+        there = other.clamp(min=0)
+        motion = compose(pose[there], invert_rigid(pose))  # [V, 4, 4]
+        points = transform_points(motion[None], (rays * depth[..., None])[None])[0]
+        z = points[..., 2]
+        seen = intrinsics[there][:, None, None]
+        safe = z.clamp(min=NEAREST)
+        column = points[..., 0] / safe * seen[..., 0, 0] + seen[..., 0, 2]
+        row = points[..., 1] / safe * seen[..., 1, 1] + seen[..., 1, 2]
+        inside = known & (z > NEAREST) & (other >= 0)[:, None, None]
+        inside &= (column > -0.5) & (column < width - 0.5) & (row > -0.5) & (row < height - 0.5)
+        left, top = column.floor(), row.floor()
+        agree, through, says = torch.zeros_like(inside), inside.clone(), torch.zeros_like(inside)
+        counts = torch.zeros_like(depth)
+        for down in (0, 1):
+            for right in (0, 1):
+                u = (left + right).clamp(0, width - 1).nan_to_num().long()
+                v = (top + down).clamp(0, height - 1).nan_to_num().long()
+                found = depth[there[:, None, None], v, u]
+                ratio = z / found.clamp(min=NEAREST)
+                valid = inside & (found > 0)
+                agree |= valid & ((ratio - 1).abs() < tolerance)
+                through &= valid & (ratio < 1 - margin)
+                says |= valid
+                nearest = ((column - left >= 0.5) == bool(right)) & ((row - top >= 0.5) == bool(down))
+                counts = torch.where(nearest, weight[there[:, None, None], v, u], counts)
+        hidden = says & ~agree & ~through
+        for total, chosen in zip((sums.agree, sums.through, sums.hidden), (agree, through, hidden), strict=True):
+            total += torch.where(chosen, counts, 0)
+    return sums
+
+
+def _count_compiled(
+    depth: Tensor, cameras: Cameras, partners: Tensor, weight: Tensor, tolerance: float, margin: float
+) -> ViewCounts:
+    pose = cameras.world_to_camera[0].double()
+    intrinsics = cameras.intrinsics[0].double()
+    there = partners.clamp(min=0)
+    motion = compose(pose[there], invert_rigid(pose)[:, None])[..., :3, :]  # [V, K, 3, 4]
+    # From a pixel's homogeneous coordinates times depth to those in the partner's image, in one matrix.
+    to_pixel = intrinsics[there] @ motion  # [V, K, 3, 4]
+    back = torch.linalg.inv(intrinsics)[:, None]
+    matrix = torch.cat((to_pixel[..., :3] @ back, to_pixel[..., 3:]), -1).float().contiguous().numpy()
+    maps = [values.detach().float().contiguous().numpy() for values in (depth, weight)]
+    sums = [np.zeros(depth.shape, np.float32) for _ in range(3)]
+    chosen = partners.contiguous().numpy()
+    parallel_for(
+        range(len(depth)),
+        lambda view: _count_view(view, *maps, chosen, matrix, np.float32(tolerance), np.float32(margin), *sums),
+    )
+    return ViewCounts(*(torch.from_numpy(total).to(depth.dtype) for total in sums))
+
+
+@kernel(fastmath={"contract", "nsz", "arcp"}, error_model="numpy", nogil=True)
+def _count_view(view, depth, weight, partners, matrix, tolerance, margin, agree, through, hidden):
+    """One view's sums over its partners; ``matrix [V, K, 3, 4]`` takes ``depth * (x, y, 1)`` into a partner's image."""
+    height, width = depth.shape[1:]
+    half, most = np.float32(0.5), np.float32(1) - margin
+    for k in range(partners.shape[1]):
+        other = partners[view, k]
+        if other < 0:
+            continue
+        m = matrix[view, k]
+        for y in range(height):
+            for x in range(width):
+                d = depth[view, y, x]
+                if d <= 0:
+                    continue
+                fx, fy = np.float32(x), np.float32(y)
+                z = (m[2, 0] * fx + m[2, 1] * fy + m[2, 2]) * d + m[2, 3]
+                if z <= np.float32(NEAREST):
+                    continue
+                inverse = np.float32(1) / z
+                u = ((m[0, 0] * fx + m[0, 1] * fy + m[0, 2]) * d + m[0, 3]) * inverse
+                v = ((m[1, 0] * fx + m[1, 1] * fy + m[1, 2]) * d + m[1, 3]) * inverse
+                if not (u > -half and u < width - half and v > -half and v < height - half):
+                    continue
+                left, top = int(np.floor(u)), int(np.floor(v))
+                u0, v0 = max(left, 0), max(top, 0)
+                u1, v1 = min(left + 1, width - 1), min(top + 1, height - 1)
+                agrees, looks, says = False, True, False
+                for yy in (v0, v1):
+                    for xx in (u0, u1):
+                        found = depth[other, yy, xx]
+                        if found > 0:
+                            says = True
+                            ratio = z / found
+                            agrees |= abs(ratio - np.float32(1)) < tolerance
+                            looks &= ratio < most
+                        else:
+                            looks = False
+                if not says:
+                    continue
+                counts = weight[other, v0 if v - top < half else v1, u0 if u - left < half else u1]
+                if agrees:
+                    agree[view, y, x] += counts
+                elif looks:
+                    through[view, y, x] += counts
+                else:
+                    hidden[view, y, x] += counts
+
+
+@torch.no_grad()
+def count_points(
+    points: Tensor, depth: Tensor, cameras: Cameras, tolerance: float, margin: float
+) -> tuple[Tensor, Tensor]:
+    """How many views agree with points in space, and how many look through them.
+
+    Args:
+        points: ``[N, 3]`` in the world of the cameras.
+        depth: ``[V, H, W]`` z-depth of the views, 0 = none.
+        cameras: of the views (B = 1).
+        tolerance: relative difference of depth up to which a view agrees.
+        margin: relative difference of depth from which on a view looks through a point.
+
+    Returns:
+        Views that agree and views that look through, ``[N]`` int64 each.
+    """
+    height, width = depth.shape[1:]
+    agree, through = (torch.zeros(len(points), dtype=torch.int64, device=points.device) for _ in range(2))
+    for view, pose, intrinsics in zip(depth, cameras.world_to_camera[0], cameras.intrinsics[0], strict=True):
+        seen = transform_points(pose[None, None].to(points), points[None, None])[0, 0]  # [N, 3]
+        z = seen[:, 2]
+        focal, center = intrinsics[[0, 1], [0, 1]], intrinsics[:2, 2]
+        column, row = (seen[:, :2] / z[:, None].clamp(min=NEAREST) * focal + center).round().unbind(-1)
+        inside = (z > NEAREST) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        index = row.clamp(0, height - 1).nan_to_num().long() * width + column.clamp(0, width - 1).nan_to_num().long()
+        found = view.flatten()[index]
+        ratio = z / found.clamp(min=NEAREST)
+        known = inside & (found > 0)
+        agree += known & ((ratio - 1).abs() < tolerance)
+        through += known & (ratio < 1 - margin)
+    return agree, through
