@@ -14,7 +14,7 @@ from torch import Tensor
 
 from tests.reliability.steps import TINY, first_batches
 from tests.training_helpers import SMALL, small_config
-from vg2gt.evaluation import evaluate_scene
+from vg2gt.evaluation.in_training import evaluate_scene
 from vg2gt.profiling import listening
 from vg2gt.reconstruction.pipeline import reconstruct_with
 from vg2gt.rendering import renderer, selfcheck
