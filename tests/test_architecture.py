@@ -18,7 +18,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     **dict.fromkeys(("rendering", "voxels", "visibility", "gaussians", "losses", "metrics"), BASICS),
     "model": {"voxels", "visibility", "gaussians", "backends"} | BASICS,
     "baselines": {"model", "voxels", "visibility", "gaussians", "backends"} | BASICS,
-    "runs": {"baselines", "model", "rendering", "data"} | BASICS,
+    "runs": {"baselines", "model", "visibility", "rendering", "data"} | BASICS,
     "viewer": {"rendering"} | BASICS,
     "refinement": {"losses", "metrics", "rendering", "gaussians", "visibility"} | BASICS,
     "evaluation": {"refinement", "runs", "model", "rendering", "metrics", "data"} | BASICS,

@@ -22,10 +22,11 @@ from vg2gt.data.base import SceneSource
 from vg2gt.io.files import regular
 from vg2gt.model import SceneScale
 from vg2gt.rendering import Renderer
+from vg2gt.visibility import ViewCheck
 
 ENVIRONMENT = "VG2GT_TRUST"
 OWN = ("vg2gt", "backends")
-KINDS = (nn.Module, SceneSource, SceneScale, Renderer)
+KINDS = (nn.Module, SceneSource, SceneScale, Renderer, ViewCheck)
 """Of ours, what a run's file may name besides data modules: their constructors read files at most."""
 
 
