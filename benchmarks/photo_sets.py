@@ -9,17 +9,18 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from vg2gt.data.sources.colmap_model import model_folder_of
 from vg2gt.geometry.cameras import project
-from vg2gt.io import ColmapImage, ColmapModel, ColmapPoints, colmap_camera, colmap_image, read_colmap, write_colmap
-from vg2gt.io.colmap import PIXEL_CENTER
+from vg2gt.io import colmap_from_views, read_colmap, write_colmap
 from vg2gt.io.images import write_png
 from vg2gt.io.json_checks import load_json
 from vg2gt.reconstruction.given_cameras import LAYOUTS, given_pictures
@@ -28,6 +29,9 @@ from vg2gt.reconstruction.monitor import Monitor
 from vg2gt.reconstruction.pictures import find_pictures
 from vg2gt.reconstruction.sfm import find_cameras
 from vg2gt.types import Cameras
+
+if TYPE_CHECKING:
+    from pycolmap import Reconstruction  # pyright: ignore[reportMissingImports]
 
 EVERY = 4  # one view of so many is left out, the one in the middle
 FEWEST = 2  # views that must have seen a point
@@ -104,38 +108,53 @@ def prepare(name: str, photos: Path, out: Path, size: int, patch: int, poses: st
     shutil.rmtree(folder, ignore_errors=True)
     for index in context:
         write_png(folder / "images" / f"{view_name(index)}.png", views.images[index])
-    sparse = ColmapModel({}, {}, ColmapPoints.empty()) if model is None else read_colmap(model)
     names = [picture.name for picture in pictures]
-    seen = {titles.get(image.name, Path(image.name).stem): image for image in sparse.images.values()}
-    rows = {index: seen[names[index]] for index in context if names[index] in seen}
-    written = _scene(views.hints.cameras, context, rows, sparse.points)
+    points = _points(model, titles, [names[index] for index in context])
+    written = _scene(views.hints.cameras.select(torch.tensor(context)), context, points)
     write_colmap(folder / "sparse" / "0", written)
-    return PhotoSet(name, folder, views.images, views.hints.cameras, context, held_out, len(written.points))
+    return PhotoSet(name, folder, views.images, views.hints.cameras, context, held_out, written.num_points3D())
 
 
-def _scene(cameras: Cameras, context: Sequence[int], seen: dict[int, ColmapImage], points: ColmapPoints) -> ColmapModel:
-    """The given views' cameras, with the points that two of them saw at least."""
-    row_of = {number: row for row, number in enumerate(points.ids.tolist())}
-    sees = np.zeros((len(context), len(points)), bool)
-    for view, index in enumerate(context):
-        numbers = seen[index].point3d_ids.tolist() if index in seen else []
-        sees[view, [row_of[number] for number in numbers if number in row_of]] = True
+@dataclass(frozen=True)
+class SparsePoints:
+    """Points of a model that two of the given views saw at least.
+
+    Attributes:
+        positions: ``[N, 3]``.
+        colors: ``[N, 3]`` uint8.
+        sees: ``[views, N]`` bool.
+    """
+
+    positions: NDArray[np.float64]
+    colors: NDArray[np.uint8]
+    sees: NDArray[np.bool_]
+
+
+def _points(folder: Path | None, titles: dict[str, str], names: Sequence[str]) -> SparsePoints:
+    """The points that views of these names saw; ``titles`` are the names of the model's files where they differ."""
+    if folder is None:
+        return SparsePoints(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros((len(names), 0), bool))
+    model = read_colmap(folder)
+    view_of = {
+        image.image_id: names.index(title)
+        for image in model.images.values()
+        if (title := titles.get(image.name, Path(image.name).stem)) in names
+    }
+    points = list(model.points3D.values())
+    sees = np.zeros((len(names), len(points)), bool)
+    for column, point in enumerate(points):
+        rows = [view_of[element.image_id] for element in point.track.elements if element.image_id in view_of]
+        sees[rows, column] = True
     kept = np.flatnonzero(sees.sum(0) >= FEWEST)
-    sees = sees[:, kept]
-    optics, images, place = {}, {}, np.zeros(sees.shape, np.int64)  # a point's row among those that a view saw
-    for view, index in enumerate(context):
-        camera, number, rows = cameras.select(slice(index, index + 1)), view + 1, kept[sees[view]]
-        optics[number] = colmap_camera(number, camera.intrinsics[0, 0].double().numpy(), cameras.size)
-        pixels, _ = project(torch.from_numpy(points.positions[rows]).float()[None, None], camera)
-        pose = camera.world_to_camera[0, 0].double().numpy()
-        image = colmap_image(number, pose, number, f"{view_name(index)}.png")
-        images[number] = replace(
-            image, points2d=pixels[0, 0].double().numpy() + PIXEL_CENTER, point3d_ids=points.ids[rows]
-        )
-        place[view, sees[view]] = np.arange(len(rows))
-    column, view = np.nonzero(sees.T)
-    tracks = np.stack((view + 1, place[view, column]), -1)
-    sparse = ColmapPoints(
-        points.ids[kept], points.positions[kept], points.colors[kept], points.errors[kept], tracks, sees.sum(0)
-    )
-    return ColmapModel(optics, images, sparse)
+    positions = np.array([points[index].xyz for index in kept]).reshape(-1, 3)
+    colors = np.array([points[index].color for index in kept], np.uint8).reshape(-1, 3)
+    return SparsePoints(positions, colors, sees[:, kept])
+
+
+def _scene(cameras: Cameras, context: Sequence[int], points: SparsePoints) -> Reconstruction:
+    """The given views' cameras at the working size, with the points where they see them."""
+    view, point = np.nonzero(points.sees)
+    seen = torch.from_numpy(points.positions).float().expand(1, len(context), -1, -1)
+    pixels = project(seen, cameras)[0][0].double().numpy()[view, point]
+    names = [f"{view_name(index)}.png" for index in context]
+    return colmap_from_views(cameras, names, points.positions, points.colors, (point, view, pixels))

@@ -230,7 +230,7 @@ def main() -> None:
     given = arguments()
     torch.set_num_threads(given.threads)
     changes = [f"refine.{change}" for change in given.refine]
-    refinement: RefineOptions = instantiate(compose(None, "+refine=default", *changes).refine)
+    refinement: RefineOptions = instantiate(compose(None, "+refine=photographs", *changes).refine)
     loaded = load_model(given.ckpt, options=[f"model.{change}" for change in given.model], device="cpu")
     lpips = lpips_or_none()
     for item in given.folders:

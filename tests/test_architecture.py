@@ -22,7 +22,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "viewer": {"rendering"} | BASICS,
     "refinement": {"losses", "metrics", "rendering", "gaussians", "visibility"} | BASICS,
     "evaluation": {"refinement", "runs", "model", "rendering", "metrics", "data"} | BASICS,
-    "reconstruction": {"refinement", "runs", "model", "rendering", "data"} | BASICS,
+    "reconstruction": {"refinement", "runs", "model", "gaussians", "rendering", "data"} | BASICS,
     "training": {"evaluation", "runs", "model", "losses", "rendering", "data", "backends"} | BASICS,
     "studies": {"training", "evaluation", "runs"} | BASICS,
     "cli": {

@@ -4,7 +4,6 @@ import json
 import stat
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,6 @@ from PIL import Image
 from vg2gt.data import SyntheticScenes
 from vg2gt.geometry.cameras import project, unproject
 from vg2gt.io import (
-    ColmapPoints,
     colmap_from_views,
     named_cameras,
     read_colmap,
@@ -85,25 +83,12 @@ def add_points(photos: Path, room) -> None:
     (photos / "images").mkdir()
     for path in photos.glob("*.png"):
         path.rename(photos / "images" / path.name)
-    model = colmap_from_views(cameras, [f"IMG_{index}.png" for index in range(7)])
     seen = [(0, 2), (2, 6), (0, 1), (1, 2, 4), (3,)]
     positions = unproject(frames.depth[None], cameras)[0, 0, 20:25, 30].double().numpy()
-    images = dict(model.images)
-    for view in range(7):
-        ids = np.array([number for number, views in enumerate(seen, 11) if view in views], np.int64)
-        images[view + 1] = replace(images[view + 1], points2d=np.zeros((len(ids), 2)), point3d_ids=ids)
-    tracks = [
-        (view + 1, images[view + 1].point3d_ids.tolist().index(n)) for n, of in enumerate(seen, 11) for view in of
-    ]
-    points = ColmapPoints(
-        np.arange(11, 16),
-        positions,
-        np.full((5, 3), 99, np.uint8),
-        np.zeros(5),
-        np.array(tracks),
-        np.array([2, 2, 2, 3, 1]),
-    )
-    write_colmap(photos / "sparse" / "0", replace(model, images=images, points=points))
+    point, view = np.array([(point, view) for point, views in enumerate(seen) for view in views]).T
+    sources = (point, view, np.zeros((len(point), 2)))
+    names = [f"IMG_{index}.png" for index in range(7)]
+    write_colmap(photos / "sparse" / "0", colmap_from_views(cameras, names, positions, None, sources))
 
 
 def program(folder: Path, works: bool = True) -> Path:
@@ -153,16 +138,19 @@ def test_what_only_left_out_views_saw_is_not_given(photos: Path, room, tmp_path:
     assert list(prepared.held_out) == HELD_OUT
     assert prepared.points == 2
     model = read_colmap(prepared.folder / "sparse" / "0")
-    assert model.points.ids.tolist() == [13, 14]
-    assert model.points.track_lengths.tolist() == [2, 2]
-    views = {view.name: view for view in model.images.values()}
-    assert {name: view.point3d_ids.tolist() for name, view in views.items()} == {
-        "000000.png": [13], "000001.png": [13, 14], "000003.png": [], "000004.png": [14], "000005.png": []
+    points = list(model.points3D.values())
+    seen = {image.name: image for image in model.images.values()}
+    saw = {
+        name: [v.image_id in {e.image_id for e in point.track.elements} for point in points] for name, v in seen.items()
+    }
+    assert saw == {
+        "000000.png": [True, False], "000001.png": [True, True], "000003.png": [False, False],
+        "000004.png": [False, True], "000005.png": [False, False],
     }  # fmt: skip
-    for (image, row), number in zip(model.points.tracks.tolist(), (13, 13, 14, 14), strict=True):
-        assert model.images[image].point3d_ids[row] == number
-    pixels, _ = project(torch.from_numpy(model.points.positions).float()[None, None], room[1].select(slice(1, 2)))
-    assert views["000001.png"].points2d == pytest.approx(pixels[0, 0].numpy() + 0.5, abs=1e-3)
+    positions = np.array([point.xyz for point in points])
+    pixels, _ = project(torch.from_numpy(positions).float()[None, None], room[1].select(slice(1, 2)))
+    found = sorted(point.xy.tolist() for point in seen["000001.png"].points2D)
+    assert np.array(found) == pytest.approx(np.array(sorted((pixels[0, 0] + 0.5).tolist())), abs=1e-3)
 
 
 def test_the_peer_gets_the_same_core_seconds(command, photos: Path, room, tmp_path: Path) -> None:

@@ -54,11 +54,12 @@ def accepts(target: dict[str, Any], key: str) -> bool:
     """Whether a constructor has an argument, or hands it on to parts of its own that all have it."""
     made = get_class(target["_target_"])
     parameters = inspect.signature(made).parameters
-    if "shared" in parameters:  # **shared: Unpack[FileOptions]
-        options = get_args(get_type_hints(made.__init__, include_extras=True)["shared"])[0]
-        return key in parameters or key in get_type_hints(options)
-    if key in parameters or not any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters.values()):
-        return key in parameters
+    if key in parameters:
+        return True
+    if shared := get_type_hints(made.__init__, include_extras=True).get("shared"):  # **shared: Unpack[FileOptions]
+        return key in get_type_hints(get_args(shared)[0])
+    if not any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters.values()):
+        return False
     if target["_target_"] == "vg2gt.data.SceneDataModule":
         return accepts(target["train"], key) and accepts(target["val"], key)
     if target["_target_"] == "vg2gt.data.Mixture":

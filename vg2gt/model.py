@@ -28,7 +28,7 @@ from vg2gt.geometry.cameras import relative_to_first, scale_translations
 from vg2gt.memory import note_sizes
 from vg2gt.profiling import stage
 from vg2gt.types import Cameras, Decoded, Gaussians, Geometry, Hints, Prediction, Tokens, Voxels
-from vg2gt.visibility import ViewCheck
+from vg2gt.visibility import Support, ViewCheck
 
 Background = Literal["mean", "black"]
 ScaleSource = Literal["metric", "focal", "normalize", "groundtruth"]
@@ -165,8 +165,8 @@ class Reconstructor(nn.Module, ABC):
                 return self.token_cache.cameras(self.backend, images, hints)
             return self.backend.predict_cameras(images, hints)
 
-    def supported(self, geometry: Geometry) -> Tensor | None:
-        """Pixels ``[B, V, H, W]`` whose depth the other views do not contradict; None where nothing is checked."""
+    def support(self, geometry: Geometry) -> Support | None:
+        """What the views say of each other's depth; None where nothing is checked."""
         if self.visibility is None:
             return None
         with stage("visibility"):
@@ -283,12 +283,13 @@ class VG2GT(Reconstructor):
             Geometry before and after enhancement, voxels and Gaussians, in scene units and in the frame of view 0.
         """
         tokens, decoded = self.enhance(images, hints, generator)
-        supported = self.supported(decoded.geometry)
+        support = self.support(decoded.geometry)
+        keep, coarsen = (None, None) if support is None else (support.keep, support.coarsen)
         with stage("fine"):
-            voxels: Voxels = self.fine(tokens, decoded.geometry.where(supported), images)
+            voxels: Voxels = self.fine(tokens, decoded.geometry.where(keep), images, coarsen)
         with stage("gaussians"):
             gaussians = self.with_background(self.gaussians(voxels), images, decoded.initial.depth)
-        return Prediction(decoded.initial, decoded.geometry, decoded.unit, voxels, gaussians, supported)
+        return Prediction(decoded.initial, decoded.geometry, decoded.unit, voxels, gaussians, keep)
 
     def enhance(
         self, images: Tensor, hints: Hints | None = None, generator: torch.Generator | None = None

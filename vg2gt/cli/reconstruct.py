@@ -25,7 +25,11 @@ FRAME = (
     "given if cameras are given, else upright"
 )
 
+REFINE = "steps of refinement on the images; default: 500 for photographs, 0 for RGB-D recordings; 0: feed-forward"
+
 if TYPE_CHECKING:
+    from vg2gt.reconstruction.scene import Scene
+    from vg2gt.refinement import RefineOptions
     from vg2gt.runs.load import LoadedModel
 
 
@@ -46,7 +50,7 @@ def parser() -> argparse.ArgumentParser:
     add("--every", type=int, default=1, metavar="N", help="take every N-th image or frame only")
     add("--max-images", type=int, metavar="N", help="take at most N, evenly spread; of a video 32 by default")
     add("--mode", choices=("solid", "rasterized"), default="solid", help="how views are rendered")
-    add("--refine", nargs="?", type=_steps, const=0, metavar="N", help="optimise the scene on its images, N steps")
+    add("--refine", type=_steps, metavar="N", help=REFINE)
     add("--frames", type=int, default=ORBIT_FRAMES, metavar="N", help=f"length of the orbit, default {ORBIT_FRAMES}")
     add("--mesh-voxel", type=float, metavar="X", help="edge of the mesh's voxels in scene units")
     add("--device", default="auto", help="auto, cpu, cuda, cuda:N")
@@ -88,9 +92,7 @@ def run(options: argparse.Namespace) -> None:
 
     options.out = str(Path(options.out).expanduser())
     check_outputs(options.save)
-    more = [] if options.refine is None else [REFINED]
-    check_folder(options.out, [*options.save, *more], options.overwrite)
-    how = None if options.refine is None else refine_options(steps=options.refine or None)
+    check_folder(options.out, [*options.save, REFINED], options.overwrite)
     check_choice(options.every, options.max_images)
     for item in options.images:  # before weights are downloaded
         existing_path(item)
@@ -117,6 +119,7 @@ def run(options: argparse.Namespace) -> None:
             frame=options.frame,
             skip_damaged=options.skip_damaged,
         )
+        how = _refinement(scene, options.refine)
         if how is not None:
             scene = refine_scene(scene, how, monitor)
         figures = _figures(ready)
@@ -139,7 +142,24 @@ def run(options: argparse.Namespace) -> None:
         print_refinement(scene)
     print(f"weights: {figures['weights']}; cameras: {scene.cameras_from or 'predicted by the backbone'}")
     print(f"seconds: {times}; peak memory {cost['peak_memory_mib']} MiB")
+    more = [] if how is None else [REFINED]
     print(f"written: {', '.join(str(folder / name) for name in (*options.save, *more))}")
+
+
+def _refinement(scene: Scene, steps: int | None) -> RefineOptions | None:
+    """How a scene is refined: photographs unless ``steps`` is 0, recordings only where it is given."""
+    from vg2gt.reconstruction.refined import refinement_of
+    from vg2gt.refinement import RefineRates
+
+    kind = refinement_of(scene)
+    if steps == 0 or (steps is None and kind == "default"):
+        return None
+    how = refine_options(kind, steps)
+    if not scene.cameras_from:  # predicted: not bundle-adjusted
+        how = replace(how, rates=replace(how.rates, cameras=RefineRates().cameras))
+    if steps is None:
+        print(f"refining for {how.steps} steps, about 30 s on two cores; --refine 0 gives the feed-forward scene")
+    return how
 
 
 def _figures(ready: LoadedModel) -> dict[str, Any]:
@@ -152,8 +172,8 @@ def _figures(ready: LoadedModel) -> dict[str, Any]:
 
 
 def _steps(text: str) -> int:
-    if not text.isdigit() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is no number of steps; write --refine=N, or --refine at the end")
+    if not text.isdigit():
+        raise argparse.ArgumentTypeError(f"{text!r} is no number of steps; 0 leaves the refinement out")
     return int(text)
 
 

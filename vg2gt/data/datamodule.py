@@ -6,6 +6,7 @@ import signal
 from collections.abc import Sequence
 from typing import Any
 
+import torch
 from lightning.pytorch import LightningDataModule
 from torch.utils.data import DataLoader
 
@@ -182,6 +183,10 @@ class SceneDataModule(LightningDataModule):
         trainer = self.trainer
         own = self._val_views[trainer.global_rank :: trainer.world_size] if trainer else self._val_views
         return self._loader(self._val, [(views,) for views in own or self._val_views[:1]])
+
+    def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
+        """Copies a batch from page-locked memory while the device still computes."""
+        return batch.to(device, non_blocking=device.type == "cuda")
 
     def test_dataloader(self) -> DataLoader[Batch]:
         """The evaluation batches."""

@@ -20,6 +20,7 @@ from vg2gt.geometry.rotations import matrix_to_quat
 from vg2gt.geometry.spherical_harmonics import rgb_to_sh
 from vg2gt.types import Cameras, Gaussians
 
+COUNT = 1000  # Gaussians of the whole sphere
 RADIUS = 20.0  # median depths
 FAR = 8.0  # median depths from every camera: only the shell is that far
 BLUR = 1.5  # spacings of the shell's Gaussians, standard deviation
@@ -31,20 +32,23 @@ LEAST = 0.005  # share of pixels without support below which there is no shell
 
 
 @torch.no_grad()
-def far_shell(images: Tensor, depth: Tensor, cameras: Cameras, count: int) -> Gaussians | None:
+def far_shell(
+    images: Tensor, depth: Tensor, cameras: Cameras, mask: Tensor | None = None, count: int = COUNT
+) -> Gaussians | None:
     """The shell of one scene.
 
     Args:
         images: ``[V, 3, H, W]`` in [0, 1].
         depth: ``[V, H, W]`` supported z-depth, 0 = none.
         cameras: of the views (B = 1).
+        mask: ``[V, H, W]`` in [0, 1], how much each pixel counts; None: all count.
         count: Gaussians of the whole sphere.
 
     Returns:
         ``count`` flat Gaussians that face the cameras, or None where nearly every pixel has a depth, or none has.
     """
-    missing = depth <= 0
-    if not count or missing.float().mean() < LEAST or missing.all():
+    missing = depth <= 0 if mask is None else (depth <= 0) & (mask > 0.5)
+    if missing.float().mean() < LEAST or not (depth > 0).any():
         return None
     rows = missing.flatten().nonzero()[:, 0]
     rows = rows[:: max(1, len(rows) // RAYS)]
@@ -57,7 +61,7 @@ def far_shell(images: Tensor, depth: Tensor, cameras: Cameras, count: int) -> Ga
     for ray, color in zip(rays.split(4096), colors.split(4096), strict=True):
         weight = torch.exp((ray @ directions.T - 1) / (BLUR * spacing) ** 2)
         total += weight.T @ F.pad(color, (0, 1), value=1.0)
-    radius = RADIUS * depth[~missing].median()
+    radius = RADIUS * depth[depth > 0].median()
     return Gaussians(
         means=camera_centers(cameras)[0].mean(0) + radius * directions,
         quats=_facing(directions),

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from vg2gt.gaussians.far_shell import far_shell, with_shell
 from vg2gt.geometry.precision import half_precision_on_gpu
 from vg2gt.memory import RECONSTRUCTION, memory_advice, note_sizes
 from vg2gt.model import Reconstructor
@@ -97,7 +99,8 @@ def reconstruct_with(
         views = load_views(pictures, target, monitor)
         order = working_order(views.images)
         prediction = _forward(model.eval(), views, order, device, monitor)
-    return _scene(prediction, views, order, renderer or Renderer(), model.backend.is_metric, frame)
+    scene = _scene(prediction, views, order, renderer or Renderer(), model.backend.is_metric, frame)
+    return scene if model.visibility is None else _with_far_shell(scene)
 
 
 def _forward(
@@ -108,6 +111,14 @@ def _forward(
     images = ordered[None].to(device)
     with monitor.stage("reconstruct"), monitor.watching(), half_precision_on_gpu(images):
         return model(images, hints)
+
+
+def _with_far_shell(scene: Scene) -> Scene:
+    """The scene with what no view places behind it."""
+    shell = far_shell(scene.images, scene.depth, scene.cameras.to("cpu"), scene.mask)
+    if shell is None:
+        return scene
+    return replace(scene, gaussians=with_shell(scene.gaussians, shell.to(scene.gaussians.means.device)))
 
 
 def _scene(

@@ -26,7 +26,7 @@ from vg2gt.visibility import ViewCheck
 
 ENVIRONMENT = "VG2GT_TRUST"
 OWN = ("vg2gt", "backends")
-KINDS = (nn.Module, SceneSource, SceneScale, Renderer, ViewCheck)
+KINDS = (nn.Module, SceneSource, SceneScale, ViewCheck, Renderer)
 """Of ours, what a run's file may name besides data modules: their constructors read files at most."""
 
 

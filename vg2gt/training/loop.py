@@ -45,7 +45,6 @@ EXPECTED_WARNINGS = (
     r"It is recommended to use `self.log\('eval/",  # all ranks log the same
     r".*isinstance\(treespec, LeafSpec\)",  # inside Lightning
     r"Checkpoint directory .* exists and is not empty",  # of a run that continues
-    r"You have overridden `transfer_batch_to_device`",  # the module's is meant
 )
 
 FEW_WORKERS = r"The '\w+_dataloader' does not have many workers"  # expected on a CPU, whose cores compute

@@ -115,10 +115,6 @@ class VG2GTModule(lightning.LightningModule):
         self.generator.manual_seed(step_seed)  # curve orders, rendered views
         torch.manual_seed(step_seed + self.global_rank)  # drop-path
 
-    def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
-        """Copies a batch while the device still computes."""
-        return batch.to(device, non_blocking=device.type == "cuda")
-
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Reconstructs the context views, renders some views and returns the training loss.
 
