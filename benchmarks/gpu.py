@@ -254,7 +254,7 @@ class Part:
 
 PARTS = {
     "selfcheck": Part(selfcheck, 90),
-    "tests": Part(tests, 150),
+    "tests": Part(tests, 210),
     "render": Part(render, 90),
     "step": Part(step, 170),
     "knn": Part(knn, 45),
