@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import runpy
 import secrets
@@ -17,18 +18,9 @@ from torch import Tensor, nn
 from torch.export import Dim
 
 from backends.base import Backend
-from backends.bundle import (
-    CONVENTIONS,
-    DECODER,
-    DECODER_WEIGHTS,
-    ENCODER,
-    Description,
-    decoder_class,
-    decoder_weights,
-    sha256,
-)
+from backends.bundle import CONVENTIONS, DECODER, DECODER_WEIGHTS, ENCODER, Description, decoder_class, decoder_weights
 from backends.da3 import DA3Backend
-from backends.onnx import open_session, run_session
+from backends.onnx import DECODED, open_session, run_session
 from backends.vggt import VGGTBackend
 from vg2gt.types import Cameras, Hints, Tokens
 
@@ -37,7 +29,6 @@ Exportable = VGGTBackend | DA3Backend
 TRACED = (2, 3, 4, 6)  # scenes, views, patch rows, patch columns: all different, none 1
 CHECKED = ((1, 1, 3, 2), (1, 2, 2, 5), (2, 4, 3, 3))
 TOLERANCE = 1e-3  # relative; a wrong graph is off by far more, a right one by about 1e-6
-OUTPUTS = ("depth", "depth_conf", "world_to_camera", "intrinsics")
 
 
 class EncoderGraph(nn.Module):
@@ -95,7 +86,8 @@ def export(backend: Backend, out: Path) -> Description:
         raise ValueError(f"backend {backend.name} cannot be exported: VGGT and the relative DA3 networks can")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise FileExistsError(f"{out} exists already: remove it or choose another out=FOLDER")
-    _require("onnx", "onnxscript")
+    if not all(importlib.util.find_spec(package) for package in ("onnx", "onnxscript")):
+        raise ImportError("export needs onnx and onnxscript: pip install 'vg2gt[export]'")
     folder = out.with_name(f".{out.name}.{secrets.token_hex(8)}.tmp")
     folder.mkdir(parents=True)
     try:
@@ -114,7 +106,7 @@ def _write(backend: Exportable, folder: Path) -> Description:
     names = ["images", "world_to_camera", "intrinsics"][: len(inputs)]
     token_names = [*(f"patch_{index}" for index in range(len(backend.token_dims))), "camera"]
     export_graph(encoder, inputs, names, token_names, folder / ENCODER)
-    export_graph(decoder, tokens, token_names, list(OUTPUTS), folder / DECODER)
+    export_graph(decoder, tokens, token_names, list(DECODED), folder / DECODER)
     (folder / DECODER_WEIGHTS).write_bytes(save(decoder_weights(backend.network)))
     description = Description(
         name=backend.name,
@@ -127,7 +119,6 @@ def _write(backend: Exportable, folder: Path) -> Description:
         decoder={"class": decoder_class(backend.network).__name__, "arguments": backend.network.arguments},
         conventions=CONVENTIONS,
         max_difference=_compare(encoder, decoder, names, token_names, folder),
-        files={file.name: sha256(file) for file in sorted(folder.iterdir())},
     )
     description.write(folder)
     return description
@@ -221,8 +212,11 @@ def _compare(
 ) -> dict[str, float]:
     """Largest max|diff| / max|torch| of every output at other sizes than the traced ones."""
     worst = {}
-    runs = (("encoder", encoder, ENCODER, names), ("decoder", decoder, DECODER, token_names))
-    for part, graph, file, keys in runs:
+    runs = (
+        ("encoder", encoder, ENCODER, names, token_names),
+        ("decoder", decoder, DECODER, token_names, DECODED),
+    )
+    for part, graph, file, keys, results in runs:
         session = open_session(folder / file, "cpu")
         worst[part] = 0.0
         for shape in CHECKED:
@@ -230,7 +224,7 @@ def _compare(
             with torch.no_grad():
                 inputs = inputs if graph is encoder else encoder(*inputs)
                 expected = graph(*inputs)
-            found = run_session(session, dict(zip(keys, inputs, strict=True)))
+            found = run_session(session, dict(zip(keys, inputs, strict=True)), results)
             worst[part] = max(worst[part], *map(relative_difference, found, expected))
             if not worst[part] <= TOLERANCE:
                 raise RuntimeError(f"{file} differs from torch by {worst[part]:.1e} at {shape} scenes, views, patches")
@@ -242,14 +236,6 @@ def relative_difference(found: Tensor, expected: Tensor) -> float:
     if found.shape != expected.shape:
         return float("inf")
     return float((found - expected).abs().max() / expected.abs().max())
-
-
-def _require(*packages: str) -> None:
-    for package in packages:
-        try:
-            __import__(package)
-        except ImportError as error:
-            raise ImportError(f"export needs {package}: pip install 'vg2gt[export]'") from error
 
 
 if __name__ == "__main__":  # python -m backends.export, the same as vg2gt export

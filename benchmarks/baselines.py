@@ -20,7 +20,7 @@ import torch
 from common import RECORDINGS, evaluation_scenes, machine, settings
 from stage_clock import StageClock
 
-from vg2gt.evaluation import evaluate_scene
+from vg2gt.evaluation.in_training import evaluate_scene
 from vg2gt.evaluation.protocols import ground_truth_target_cameras
 from vg2gt.evaluation.tables import Metric, columns
 from vg2gt.geometry.normals import normals_from_depth

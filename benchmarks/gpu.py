@@ -156,7 +156,8 @@ def _step(setting: Setting, case: Any) -> Iterator[Result]:
             optimizer.zero_grad(set_to_none=True)
 
     milliseconds = setting.timed(whole)
-    yield {"step_ms": milliseconds, "peak_mb": setting.peak_mb()}
+    reserved = torch.cuda.max_memory_reserved(device) / MEGABYTE if device.type == "cuda" else 0.0
+    yield {"step_ms": milliseconds, "peak_mb": setting.peak_mb(), "peak_reserved_mb": reserved}
     clock.stages.clear()
     with clock.listening():
         whole()
@@ -255,7 +256,7 @@ PARTS = {
     "selfcheck": Part(selfcheck, 90),
     "tests": Part(tests, 150),
     "render": Part(render, 90),
-    "step": Part(step, 150),
+    "step": Part(step, 170),
     "knn": Part(knn, 45),
     "reconstruct": Part(reconstruct, 90),
 }

@@ -7,7 +7,6 @@ and they wait for it.
 import os
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is imported: there is a test process a core
-os.environ["VG2GT_ALLOCATOR"] = "system"  # commands that tests call must not start the test process again
 
 import gc
 import importlib

@@ -18,11 +18,11 @@ MAY_IMPORT: dict[str, set[str]] = {
     **dict.fromkeys(("rendering", "voxels", "visibility", "gaussians", "losses", "metrics"), BASICS),
     "model": {"voxels", "visibility", "gaussians", "backends"} | BASICS,
     "baselines": {"model", "voxels", "visibility", "gaussians", "backends"} | BASICS,
-    "runs": {"baselines", "model", "rendering", "data"} | BASICS,
+    "runs": {"baselines", "model", "visibility", "rendering", "data"} | BASICS,
     "viewer": {"rendering"} | BASICS,
     "refinement": {"losses", "metrics", "rendering", "gaussians", "visibility"} | BASICS,
     "evaluation": {"refinement", "runs", "model", "rendering", "metrics", "data"} | BASICS,
-    "reconstruction": {"refinement", "runs", "model", "rendering", "data"} | BASICS,
+    "reconstruction": {"refinement", "runs", "model", "gaussians", "rendering", "data"} | BASICS,
     "training": {"evaluation", "runs", "model", "losses", "rendering", "data", "backends"} | BASICS,
     "studies": {"training", "evaluation", "runs"} | BASICS,
     "cli": {
@@ -41,8 +41,6 @@ MAY_IMPORT: dict[str, set[str]] = {
     **{command: {"cli"} for command in ("evaluate", "ablate", "curves")},
 }
 OF_BACKENDS = ("vg2gt.types", "vg2gt.geometry", "vg2gt.io.tensors", "vg2gt.io.files", "vg2gt.io.compiled")
-RECIPE = "backends.sweep.recipe"  # makes weights from procedural scenes; a command, which nothing else imports
-OF_RECIPE = (*OF_BACKENDS, "vg2gt.data.synthetic", "vg2gt.io.npz")
 
 
 def modules() -> dict[str, Path]:
@@ -111,17 +109,15 @@ def test_backends_need_little_of_the_project() -> None:
         for module, imported in GRAPH.items()
         if room(module) == "backends"
         for other in imported
-        if room(other) != "backends" and not other.startswith(OF_RECIPE if module.startswith(RECIPE) else OF_BACKENDS)
+        if room(other) != "backends" and not other.startswith(OF_BACKENDS)
     ]
     assert not wrong
 
 
-def test_nothing_needs_a_recipe() -> None:
-    assert not [
-        module
-        for module, imported in GRAPH.items()
-        if not module.startswith(RECIPE) and any(other.startswith(RECIPE) for other in imported)
-    ]
+def test_nothing_needs_recipes_or_examples() -> None:
+    """They are not in the wheel."""
+    needed = ("import recipes", "from recipes", "import examples", "from examples")
+    assert not [name for name, path in MODULES.items() if any(word in path.read_text() for word in needed)]
 
 
 def test_few_modules_stand_loose() -> None:
@@ -135,5 +131,15 @@ import sys, vg2gt.data, vg2gt.data.sources
 assert not {"lightning", "hydra"} & set(sys.modules)
 import vg2gt.reconstruction, vg2gt.reconstruction.outputs
 assert "lightning" not in sys.modules
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_training_imports_little_of_the_project() -> None:
+    """Someone who changes the training has this much to read at most: no reader of data, no format."""
+    code = """
+import sys, vg2gt.training.module
+ours = [name for name in sys.modules if name.split(".")[0] in ("vg2gt", "backends")]
+assert len(ours) <= 120, len(ours)
 """
     subprocess.run([sys.executable, "-c", code], check=True)

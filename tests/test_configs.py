@@ -4,7 +4,7 @@ import importlib.util
 import inspect
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import lightning
 import pytest
@@ -13,6 +13,7 @@ from hydra.utils import get_class, instantiate
 from lightning.pytorch.strategies import DDPStrategy, SingleDeviceStrategy
 from omegaconf import DictConfig, OmegaConf
 from torch import nn
+from typing_extensions import get_type_hints
 
 from tests.training_helpers import full_model
 from vg2gt.config import compose, config_dir, group_options
@@ -51,9 +52,14 @@ def assert_signatures_fit(node: Any) -> int:
 
 def accepts(target: dict[str, Any], key: str) -> bool:
     """Whether a constructor has an argument, or hands it on to parts of its own that all have it."""
-    parameters = inspect.signature(get_class(target["_target_"])).parameters
-    if key in parameters or not any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters.values()):
-        return key in parameters
+    made = get_class(target["_target_"])
+    parameters = inspect.signature(made).parameters
+    if key in parameters:
+        return True
+    if shared := get_type_hints(made.__init__, include_extras=True).get("shared"):  # **shared: Unpack[FileOptions]
+        return key in get_type_hints(get_args(shared)[0])
+    if not any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters.values()):
+        return False
     if target["_target_"] == "vg2gt.data.SceneDataModule":
         return accepts(target["train"], key) and accepts(target["val"], key)
     if target["_target_"] == "vg2gt.data.Mixture":

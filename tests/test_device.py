@@ -14,7 +14,7 @@ from torch import Tensor
 
 from tests.reliability.steps import TINY, first_batches
 from tests.training_helpers import SMALL, small_config
-from vg2gt.evaluation import evaluate_scene
+from vg2gt.evaluation.in_training import evaluate_scene
 from vg2gt.profiling import listening
 from vg2gt.reconstruction.pipeline import reconstruct_with
 from vg2gt.rendering import renderer, selfcheck
@@ -33,12 +33,20 @@ slowly_on_a_cpu = pytest.mark.parametrize("device", [pytest.param("cpu", marks=[
 MODEL = ["model=vg2gt", "model.coarse.min_footprint=4", "optimizer=adamw", "model.coarse.ptv3.drop_path=0"]
 MODEL += ["data.min_views=2", "data.max_images=4", "data.train_scenes=2", "training.render_views=1"]
 SIZES = {"cpu": ((14, 28), 10), "cuda": ((56, 112), 2)}  # of images, and pixels a voxel
+NARROW = ["model.coarse.hidden=[64,32]", "model.coarse.fuse_channels=32", "model.fine.dense_head.features=16"]
+NARROW += [
+    "model.coarse.ptv3.enc_channels=[32,32,32,32,32]",
+    "model.coarse.ptv3.dec_channels=[32,32,32,32]",
+]
+NARROW += ["model.coarse.ptv3.enc_heads=[2,2,2,2,2]", "model.coarse.ptv3.dec_heads=[2,2,2,2]"]
+WIDTHS = {"cpu": NARROW, "cuda": []}
 
 
 @pytest.fixture(autouse=True)
 def like_a_gpu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What is kept of the kernels' check is a test's own; an interpreted CPU's check is of one mode, for its time."""
     monkeypatch.setattr(selfcheck, "cache_folder", lambda: tmp_path)
+    monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", False)  # a CPU has none
     selfcheck._refusal.cache_clear()
     if INTERPRETED:
         monkeypatch.setattr(selfcheck, "compare", partial(selfcheck.compare, modes=("rasterized",)))
@@ -52,6 +60,7 @@ def as_on_a_gpu(monkeypatch: pytest.MonkeyPatch) -> Any:
         for module in (knn, normals, point_features, point_moments, serialization):
             monkeypatch.setattr(module, "compilable", lambda *_, **__: False)
         monkeypatch.setattr(sparse_conv, "one_by_one", lambda device: False)
+        monkeypatch.setattr(serialization, "has_kernel", lambda device: True)
 
         def automatic(device: torch.device) -> str:
             selfcheck.require_trusted(renderer.render, device)
@@ -62,9 +71,19 @@ def as_on_a_gpu(monkeypatch: pytest.MonkeyPatch) -> Any:
     return switch
 
 
+@on_devices
+@pytest.mark.parametrize("bits", [3, 12, 21])
+def test_hilbert_codes(device: str, bits: int) -> None:
+    from vg2gt.voxels.hilbert_kernel import hilbert_in_one_kernel
+
+    cells = torch.randint(0, 1 << bits, (700, 3), generator=torch.Generator().manual_seed(bits))
+    found = hilbert_in_one_kernel(cells.to(device), bits)
+    assert torch.equal(found.cpu(), serialization.hilbert_reference(cells, bits))
+
+
 def sized(device: str) -> list[str]:
     (height, width), pixels = SIZES[device]
-    return [*TINY, *MODEL, f"data.image_size=[{height},{width}]", f"model.fine.min_footprint={pixels}"]
+    return [*TINY, *MODEL, *WIDTHS[device], f"data.image_size=[{height},{width}]", f"model.fine.min_footprint={pixels}"]
 
 
 def made(folder: Path, cache: Path, device: str) -> Run:
@@ -130,7 +149,7 @@ def test_a_reconstruction(device: str, as_on_a_gpu: Any) -> None:
     size, pixels = SIZES[device]
 
     def scene(where: str) -> tuple[int, Tensor]:
-        options = [f"model.fine.min_footprint={pixels}", "model.coarse.min_footprint=4"]
+        options = [f"model.fine.min_footprint={pixels}", "model.coarse.min_footprint=4", *WIDTHS[device]]
         ready = load_model(None, "da3_tiny", "vg2gt", options, where)
         images = torch.rand(3, 3, *size, generator=torch.Generator().manual_seed(0))
         made = reconstruct_with(ready.model, images, size=size, renderer=ready.renderer)
@@ -141,11 +160,12 @@ def test_a_reconstruction(device: str, as_on_a_gpu: Any) -> None:
     if device == "cpu":
         as_on_a_gpu()
     found, again = scene(device)
-    assert abs(found - count) <= 0.02 * count
-    assert (again - color).abs().mean() < (1e-5 if device == "cpu" else 1e-2)
+    # On a GPU backbone and networks are bfloat16: depth is rounded by half a percent, and a voxel is a few wide.
+    assert abs(found - count) <= (0 if device == "cpu" else 0.1) * count
+    assert (again - color).abs().mean() < (1e-5 if device == "cpu" else 5e-2)
 
 
-@on_devices
+@slowly_on_a_cpu
 def test_a_run_from_beginning_to_end(device: str, tmp_path: Path, cache: Path, as_on_a_gpu: Any) -> None:
     """``train.py debug=fast_dev_run``; its first render, in which the kernels are checked, is an evaluation's."""
     accelerator = "gpu" if device == "cuda" else "cpu"

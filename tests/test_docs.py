@@ -30,14 +30,3 @@ def test_presets_and_files_exist() -> None:
         assert (ROOT / "docs" / link).exists(), link
     for path in re.findall(r"`((?:docs|vg2gt|configs)/[\w./-]+)`", TEXT):
         assert (ROOT / path).exists(), path
-
-
-def test_the_readme_opens_with_a_picture_and_the_command_that_makes_it() -> None:
-    text = PAGES[0].read_text()
-    opening = text.splitlines()[:20]
-    command = next(number for number, line in enumerate(opening) if "vg2gt reconstruct photos/" in line)
-    picture = next(number for number, line in enumerate(opening) if line.startswith("!["))
-    assert command < picture
-    for path in re.findall(r"!\[[^\]]*\]\(([^)]+)\)", text):
-        assert (ROOT / path).is_file(), path
-    assert text.index("![") < text.index("\n|")  # before any table

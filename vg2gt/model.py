@@ -28,7 +28,7 @@ from vg2gt.geometry.cameras import relative_to_first, scale_translations
 from vg2gt.memory import note_sizes
 from vg2gt.profiling import stage
 from vg2gt.types import Cameras, Decoded, Gaussians, Geometry, Hints, Prediction, Tokens, Voxels
-from vg2gt.visibility import ViewCheck
+from vg2gt.visibility import Support, ViewCheck
 
 Background = Literal["mean", "black"]
 ScaleSource = Literal["metric", "focal", "normalize", "groundtruth"]
@@ -134,6 +134,7 @@ class Reconstructor(nn.Module, ABC):
         scenes, views, _, height, width = images.shape
         note_sizes({f"images of {height}x{width} in {scenes} scene{'s' * (scenes > 1)}": scenes * views}, anew=True)
         tokens, raw = self.run_backbone(images, hints)
+        raw = masked(raw, hints)
         unit = self.scale(raw, hints)
         return tokens, _to_scene_frame(raw, unit), unit
 
@@ -164,8 +165,8 @@ class Reconstructor(nn.Module, ABC):
                 return self.token_cache.cameras(self.backend, images, hints)
             return self.backend.predict_cameras(images, hints)
 
-    def supported(self, geometry: Geometry) -> Tensor | None:
-        """Pixels ``[B, V, H, W]`` whose depth the other views do not contradict; None where nothing is checked."""
+    def support(self, geometry: Geometry) -> Support | None:
+        """What the views say of each other's depth; None where nothing is checked."""
         if self.visibility is None:
             return None
         with stage("visibility"):
@@ -282,12 +283,13 @@ class VG2GT(Reconstructor):
             Geometry before and after enhancement, voxels and Gaussians, in scene units and in the frame of view 0.
         """
         tokens, decoded = self.enhance(images, hints, generator)
-        supported = self.supported(decoded.geometry)
+        support = self.support(decoded.geometry)
+        keep, coarsen = (None, None) if support is None else (support.keep, support.coarsen)
         with stage("fine"):
-            voxels: Voxels = self.fine(tokens, decoded.geometry.where(supported), images)
+            voxels: Voxels = self.fine(tokens, decoded.geometry.where(keep), images, coarsen)
         with stage("gaussians"):
             gaussians = self.with_background(self.gaussians(voxels), images, decoded.initial.depth)
-        return Prediction(decoded.initial, decoded.geometry, decoded.unit, voxels, gaussians, supported)
+        return Prediction(decoded.initial, decoded.geometry, decoded.unit, voxels, gaussians, keep)
 
     def enhance(
         self, images: Tensor, hints: Hints | None = None, generator: torch.Generator | None = None
@@ -303,11 +305,19 @@ class VG2GT(Reconstructor):
         with stage("coarse"):
             tokens = self.coarse(tokens, initial, generator=generator)
         with stage("decode_again"):
-            again = self.backend.decode(tokens)
+            again = masked(self.backend.decode(tokens), hints)
         # The camera token is untouched, so the cameras are the backbone's: decoded once, used throughout.
         depth = again.depth * unit[:, None, None, None]
         depth = depth if not self.keep_scale else with_scale_of(initial, depth)
         return tokens, Decoded(initial, replace(initial, depth=depth, depth_conf=again.depth_conf), unit)
+
+
+def masked(geometry: Geometry, hints: Hints | None) -> Geometry:
+    """Takes depth away where a mask says that pixels do not count, and confidence as far as they count less."""
+    if hints is None or hints.mask is None:
+        return geometry
+    kept = geometry.where(hints.mask > 0.5)
+    return replace(kept, depth_conf=geometry.depth_conf * hints.mask.clamp(min=1e-3))
 
 
 def with_scale_of(initial: Geometry, depth: Tensor) -> Tensor:

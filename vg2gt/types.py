@@ -85,6 +85,7 @@ class Hints(TensorRecord):
         frame_ids: ``[B, V]`` int64 frame numbers; seed simulated noise.
         depth_range: ``[B, 2]`` z-depth (near, far) between which nearly all of what the views see lies, such as sparse
             points of structure from motion tell, in the unit of the cameras' translations; None if unknown.
+        mask: ``[B, V, H, W]`` in [0, 1], how much each pixel counts (alpha, mask images); None: all count.
     """
 
     depth: Tensor | None = None
@@ -92,6 +93,7 @@ class Hints(TensorRecord):
     scene_key: tuple[str, ...] = ()
     frame_ids: Tensor | None = None
     depth_range: Tensor | None = None
+    mask: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -106,6 +108,7 @@ class Batch(TensorRecord):
         frame_ids: ``[B, V]`` int64.
         scene: one name a scene.
         num_context: number of input views, 1 <= num_context <= V.
+        mask: ``[B, V, H, W]`` in [0, 1], how much each pixel counts (alpha, mask images); None: all count.
     """
 
     images: Tensor
@@ -115,6 +118,7 @@ class Batch(TensorRecord):
     frame_ids: Tensor
     scene: tuple[str, ...]
     num_context: int
+    mask: Tensor | None = None
 
     def views(self, views: slice) -> Batch:
         """Returns the batch restricted to a slice of its views, all of them counted as context."""
@@ -127,6 +131,7 @@ class Batch(TensorRecord):
             self.frame_ids[:, views],
             self.scene,
             images.shape[1],
+            None if self.mask is None else self.mask[:, views],
         )
 
     def single(self, index: int) -> Batch:
@@ -140,6 +145,7 @@ class Batch(TensorRecord):
             self.frame_ids[rows],
             self.scene[rows],
             self.num_context,
+            None if self.mask is None else self.mask[rows],
         )
 
     @property
@@ -155,7 +161,7 @@ class Batch(TensorRecord):
     @property
     def hints(self) -> Hints:
         """What a backend may be told about all views of this batch."""
-        return Hints(self.depth, self.cameras, self.scene, self.frame_ids)
+        return Hints(self.depth, self.cameras, self.scene, self.frame_ids, mask=self.mask)
 
 
 @dataclass(frozen=True)

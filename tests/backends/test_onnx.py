@@ -9,11 +9,10 @@ from typing import Any
 import onnx
 import pytest
 import torch
-from onnx import TensorProto, helper
 
 from backends import export as exporting
 from backends.base import Backend
-from backends.bundle import DESCRIPTION, external_data, sha256
+from backends.bundle import DESCRIPTION
 from backends.export import (
     TRACED,
     Exportable,
@@ -72,9 +71,8 @@ def copy(onnx_bundle: Path, tmp_path: Path) -> Path:
 
 
 def edit(bundle: Path, change: Callable[[dict[str, Any]], Any]) -> None:
-    """Changes the description and makes its hashes fit the files."""
+    """Changes the description."""
     description = json.loads((bundle / DESCRIPTION).read_text())
-    description["files"] = {f.name: sha256(f) for f in sorted(bundle.iterdir()) if f.name != DESCRIPTION}
     change(description)
     (bundle / DESCRIPTION).write_text(json.dumps(description))
 
@@ -131,23 +129,13 @@ def test_missing_folder_and_files_are_named(copy: Path, tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"nowhere is no ONNX bundle.*vg2gt export"):
         OnnxBackend(str(tmp_path / "nowhere"))
     (copy / "encoder.onnx").unlink()
-    with pytest.raises(FileNotFoundError, match=r"has no encoder\.onnx"):
-        OnnxBackend(str(copy))
-
-
-@pytest.mark.parametrize("name", ["encoder.onnx", "decoder.onnx", "decoder.safetensors"])
-def test_damaged_files_are_refused(copy: Path, name: str) -> None:
-    content = bytearray((copy / name).read_bytes())
-    content[-1] ^= 1
-    (copy / name).write_bytes(content)
-    with pytest.raises(ValueError, match=rf"{name} is damaged.*sha256"):
+    with pytest.raises(FileNotFoundError, match=r"it has no encoder\.onnx"):
         OnnxBackend(str(copy))
 
 
 def test_what_is_not_onnx_is_refused(copy: Path) -> None:
     for content in (b"no protocol buffer at all", b"\x08\x08", b"\xff" * 64):
         (copy / "encoder.onnx").write_bytes(content)
-        edit(copy, lambda description: None)
         with pytest.raises(ValueError, match=r"encoder\.onnx"):
             OnnxBackend(str(copy))
 
@@ -156,10 +144,7 @@ def test_what_is_not_onnx_is_refused(copy: Path) -> None:
     ("change", "message"),
     [
         (lambda d: d.update(format=2), "format 1"),
-        (lambda d: d.pop("licence"), "lacks or adds licence"),
-        (lambda d: d.update(files=[]), r"files=\[\], expected dict"),
-        (lambda d: d["files"].update({"../encoder.onnx": "0"}), "not a file of the folder"),
-        (lambda d: d["files"].pop("encoder.onnx"), r"encoder\.onnx is damaged or not of this bundle"),
+        (lambda d: d.pop("licence"), "licence"),
         (lambda d: d["decoder"].update({"class": "subprocess.Popen"}), "known are VGGTDecoder, DA3Decoder"),
         (lambda d: d["decoder"].update({"class": "VGGTDecoder"}), "wrong arguments for VGGTDecoder"),
         (lambda d: d["decoder"]["arguments"].update(features=-32), "wrong arguments for DA3Decoder"),
@@ -172,50 +157,21 @@ def test_wrong_descriptions_are_refused(copy: Path, change: Callable[[dict[str, 
         OnnxBackend(str(copy))
 
 
-@pytest.mark.parametrize("file", ["encoder.onnx", "decoder.onnx"])
-def test_outputs_in_another_order_are_refused(copy: Path, file: str) -> None:
-    """They are taken by position: exchanged ones would be wrong depth without a word."""
-    if file == "decoder.onnx":
-        (copy / "decoder.safetensors").unlink()
-    network = onnx.load(copy / file)
+def test_outputs_are_taken_by_name(copy: Path, shallow_da3: Exportable) -> None:
+    network = onnx.load(copy / "encoder.onnx")
     first, second, *rest = network.graph.output
     del network.graph.output[:]
     network.graph.output.extend([second, first, *rest])
-    onnx.save(network, copy / file)
-    edit(copy, lambda description: None)
-    with pytest.raises(ValueError, match=rf"{file} gives .* expected {first.name}, {second.name}.* in this order"):
-        OnnxBackend(str(copy))
+    onnx.save(network, copy / "encoder.onnx")
+    assert worst_difference(OnnxBackend(str(copy)), shallow_da3) <= LIMIT
 
 
 def test_weights_beside_the_graph_are_read(copy: Path, shallow_da3: Exportable) -> None:
     """As for networks beyond 2 GB, whose weights do not fit into the ONNX file."""
     onnx.save(onnx.load(copy / "encoder.onnx"), copy / "encoder.onnx", save_as_external_data=True, location="data.bin")
-    assert external_data(copy / "encoder.onnx") == ["data.bin"]
-    edit(copy, lambda description: None)
     assert worst_difference(OnnxBackend(str(copy)), shallow_da3) <= LIMIT
     (copy / "data.bin").unlink()
-    with pytest.raises(FileNotFoundError, match=r"has no data\.bin"):
-        OnnxBackend(str(copy))
-
-
-@pytest.mark.parametrize("place", ["initializer", "constant", "branch"])
-@pytest.mark.parametrize("location", ["../secret.bin", "/etc/hostname", "unlisted.bin"])
-def test_data_outside_the_folder_is_refused(copy: Path, place: str, location: str) -> None:
-    (copy.parent / "secret.bin").write_bytes(bytes(4))
-    tensor = TensorProto(name="w", data_type=TensorProto.FLOAT, dims=[1], data_location=TensorProto.EXTERNAL)
-    tensor.external_data.add(key="location", value=location)
-    constant = helper.make_node("Constant", [], ["w"], value=tensor)
-    out = helper.make_tensor_value_info("w", TensorProto.FLOAT, [1])
-    branch = helper.make_graph([constant], "branch", [], [out])
-    nodes = {
-        "initializer": [],
-        "constant": [constant],
-        "branch": [helper.make_node("If", ["c"], ["w"], then_branch=branch, else_branch=branch)],
-    }
-    graph = helper.make_graph(nodes[place], "g", [], [out], [tensor] if place == "initializer" else [])
-    (copy / "encoder.onnx").write_bytes(helper.make_model(graph).SerializeToString())
-    edit(copy, lambda description: None)
-    with pytest.raises(ValueError, match="reads data outside the bundle"):
+    with pytest.raises(ValueError, match=r"cannot open .*encoder\.onnx"):
         OnnxBackend(str(copy))
 
 

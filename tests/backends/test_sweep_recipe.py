@@ -12,11 +12,11 @@ from torch.nn import functional as F
 
 from backends.sweep.backend import SHIPPED, SweepBackend
 from backends.sweep.network import Sweep, SweepEncoding
-from backends.sweep.recipe.objective import cell_inverse, objective
-from backends.sweep.recipe.samples import Sample, TrainingSamples, _choose_views, _crop, recolour
-from backends.sweep.recipe.scenes import make_scenes, read_scene
-from backends.sweep.recipe.weights import newest_checkpoint
 from backends.sweep.volume import from_inverse
+from recipes.sweep.objective import cell_inverse, objective
+from recipes.sweep.samples import Sample, TrainingSamples, _choose_views, _crop, recolour
+from recipes.sweep.scenes import make_scenes, read_scene
+from recipes.sweep.weights import newest_checkpoint
 from tests.commands import ROOT
 from vg2gt.geometry.cameras import project, unproject
 from vg2gt.types import Cameras
@@ -167,7 +167,7 @@ def test_training_resumes_and_writes_weights(scenes: list[Path], tmp_path: Path)
 
     def train(out: Path, *options: str) -> str:
         common = [f"scenes.folder={scenes[0].parent}", "scenes.count=2", "save_every=1", f"out={out}"]
-        command = [sys.executable, "-m", "backends.sweep.recipe", *common, *options]
+        command = [sys.executable, "-m", "recipes.sweep", *common, *options]
         done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr[-3000:]
         return done.stdout
@@ -186,7 +186,7 @@ def test_training_resumes_and_writes_weights(scenes: list[Path], tmp_path: Path)
 def test_two_processes_and_given_weights(scenes: list[Path], tmp_path: Path) -> None:
     """Both processes end on the same weights, which are near those that the training began with."""
     common = [f"scenes.folder={scenes[0].parent}", "scenes.count=2", f"out={tmp_path}", "training.steps=1"]
-    command = [sys.executable, "-m", "backends.sweep.recipe", *common, "processes=2", f"begin={SHIPPED}"]
+    command = [sys.executable, "-m", "recipes.sweep", *common, "processes=2", f"begin={SHIPPED}"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-3000:]
     with safe_open(tmp_path / "sweep.safetensors", "pt") as made, safe_open(SHIPPED, "pt") as given:

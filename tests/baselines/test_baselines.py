@@ -11,7 +11,7 @@ from tests.training_helpers import small_config
 from vg2gt.baselines import PixelAligned, VoxelMerged
 from vg2gt.baselines.pixels import usable_pixels
 from vg2gt.baselines.voxel_merged import merge_by_voxel
-from vg2gt.evaluation import evaluate_scene
+from vg2gt.evaluation.in_training import evaluate_scene
 from vg2gt.geometry.cameras import unproject
 from vg2gt.geometry.rotations import quat_to_matrix
 from vg2gt.geometry.spherical_harmonics import sh_to_rgb

@@ -76,7 +76,7 @@ def test_the_front_door(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureF
         assert command.example in said("vg2gt")
     assert said("vg2gt", "--version") == f"vg2gt {__version__}\n"
     assert said("vg2gt", "trian") == "vg2gt: unknown command 'trian', did you mean train? (vg2gt --help lists all)\n"
-    assert "did you mean shards?" in said("vg2gt data", "shard")
+    assert "did you mean splits?" in said("vg2gt data", "split")
     assert said("vg2gt", "zzz") == "vg2gt: unknown command 'zzz' (vg2gt --help lists all)\n"
 
 
@@ -92,7 +92,7 @@ for module in {modules}:
 
 
 def test_modules_are_commands_too(tmp_path: Path) -> None:
-    modules = ["vg2gt.data.synthetic", "vg2gt.data.splits", "vg2gt.data.shards", "backends.export"]
+    modules = ["vg2gt.data.synthetic", "vg2gt.data.splits", "backends.export"]
     shown = run_python(MODULES.format(modules=modules), folder=tmp_path)
     assert shown.returncode == 0, shown.stderr[-2000:]
     assert shown.stdout.count("example: vg2gt ") == len(modules)

@@ -212,13 +212,6 @@ def test_data_that_cannot_be_trained_on_is_named_before_overlap_and_lengths(room
     assert len(module.val_dataloader()) == 2
 
 
-def test_the_cache_of_resized_frames_leads_to_shards(rooms):
-    with pytest.raises(
-        ValueError, match=r"replaced by shards: .*shards out=.* size=\[28,56\] .*data=shards data\.root"
-    ):
-        _module(rooms, image_size=(28, 56), resized_cache="frames")
-
-
 def test_an_option_of_another_loader_is_named():
     module = SceneDataModule(partial(SyntheticScenes, 1), partial(SyntheticScenes, 1), every=2)
     with pytest.raises(DataError, match=r"unexpected keyword argument 'every' \(data\.\*\): leave the option out"):

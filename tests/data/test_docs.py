@@ -10,7 +10,6 @@ import torch
 from PIL import Image
 
 from tests.commands import run_python
-from vg2gt.config import compose
 
 ROOT = Path(__file__).resolve().parents[2]
 TEXT = (ROOT / "docs" / "add-a-dataset.md").read_text()
@@ -62,9 +61,3 @@ def test_the_example_trains(example: Path) -> None:
     arguments = ["train", "--config-dir", "my_configs", "data=mine", "data.root=data", *small]
     result = run_python(code, *arguments, folder=example)
     assert result.returncode == 0, result.stderr[-3000:]
-
-
-def test_the_documented_options_exist() -> None:
-    config = compose("train", "data=paper_mix").data
-    for option in set(re.findall(r"(?<!vg2gt\.)data\.([a-z_]+)[=`]", TEXT)) - {"root", "holdout"}:
-        assert option in config, option

@@ -4,8 +4,9 @@ from dataclasses import asdict, replace
 import pytest
 import torch
 
-from vg2gt.evaluation import EvaluationOptions, PointOptions, SceneEvaluator, SceneResult, evaluate_scene
-from vg2gt.evaluation.evaluator import MODES, PROTOCOLS
+from vg2gt.evaluation.evaluator import MODES, PROTOCOLS, SceneEvaluator, SceneResult
+from vg2gt.evaluation.in_training import evaluate_scene
+from vg2gt.evaluation.options import EvaluationOptions, PointOptions
 from vg2gt.evaluation.protocols import ground_truth_target_cameras, joint_target_cameras
 from vg2gt.evaluation.scene_metrics import align_geometry, depth_to_camera_scale, point_cloud_metrics
 from vg2gt.geometry.alignment import Similarity

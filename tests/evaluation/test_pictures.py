@@ -1,6 +1,6 @@
 import torch
 
-from vg2gt.evaluation import SceneResult
+from vg2gt.evaluation.evaluator import SceneResult
 from vg2gt.evaluation.pictures import PANELS, colorize_error, scene_picture
 from vg2gt.types import Batch
 

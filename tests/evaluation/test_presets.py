@@ -9,7 +9,8 @@ from omegaconf import DictConfig
 from tests.commands import run_vg2gt
 from vg2gt.config import compose, group_options
 from vg2gt.data.views.drawn import index_path
-from vg2gt.evaluation import EvaluationOptions, paper
+from vg2gt.evaluation import paper
+from vg2gt.evaluation.options import EvaluationOptions
 
 PRESETS = group_options("evaluation")
 

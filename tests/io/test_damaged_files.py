@@ -9,7 +9,7 @@ import pytest
 from tests.io.gaussian_scenes import scene
 from tests.io.mutations import survives
 from tests.io.test_cameras_json import mixed
-from tests.io.test_colmap import FILES, small_model
+from tests.io.test_colmap import small_model
 from tests.io.test_nerfstudio import random_transforms
 from tests.io.test_ply import header
 from tests.io.test_splat import displayable
@@ -27,6 +27,7 @@ from vg2gt.io import (
     write_splat,
     write_transforms,
 )
+from vg2gt.io.colmap import FILES
 
 
 def ascii_points(path: Path) -> None:

@@ -31,9 +31,3 @@ def test_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
     monkeypatch.chdir(tmp_path)
     exec(compile(code, str(PAGE), "exec"), {})
     assert capsys.readouterr().out == printed
-
-
-def test_page_names_every_reader_and_writer() -> None:
-    functions = [name for name in vg2gt.io.__all__ if name.startswith(("read_", "write_", "fuse_"))]
-    text = PAGE.read_text()
-    assert [name for name in functions if f"`{name}`" not in text] == []

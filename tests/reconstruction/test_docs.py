@@ -13,7 +13,6 @@ from vg2gt.cli import reconstruct as reconstruct_command
 from vg2gt.cli import render as render_command
 from vg2gt.io import read_cameras_json
 from vg2gt.io.video import has_pyav
-from vg2gt.reconstruction.output_names import OUTPUTS
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "reconstruct.md"
@@ -70,11 +69,3 @@ def test_page(workplace: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
     exec(compile(example, str(PAGE), "exec"), {})
     assert capsys.readouterr().out == "008 (4, 3, 84, 112) (84, 112)\nTrue True\n"
     assert len(read_cameras_json(workplace / "outputs" / "python" / "cameras.json")) == 4
-
-
-def test_page_names_every_output_and_shows_pictures_that_are_there() -> None:
-    text = PAGE.read_text()
-    assert [name for name in OUTPUTS if f"`{name}`" not in text] == []
-    pictures = re.findall(r"!\[.*?\]\((.*?)\)", text)
-    assert pictures
-    assert all((PAGE.parent / picture).is_file() for picture in pictures)

@@ -86,7 +86,7 @@ def test_a_damaged_last_checkpoint_is_set_aside(tmp_path: Path, cache: Path, who
     harness.assert_same(whole, folder)
     said = folder.with_name("run.out").read_text()
     assert "trying the one before" in said
-    assert "goes on from step-4.ckpt" in said
+    assert "continuing from step-4.ckpt" in said
 
 
 def test_auto_does_not_start_over_where_all_checkpoints_are_damaged(tmp_path: Path, cache: Path) -> None:

@@ -1,6 +1,5 @@
 """A full disk ends a run with one error that names the file; what was there before stays, and the run goes on."""
 
-import csv
 import re
 import resource
 import subprocess
@@ -14,8 +13,6 @@ from tests.reliability import crash_harness as harness
 from tests.reliability.crash_harness import TRAIN, Attempt
 from vg2gt.io.files import read_json, write_json
 from vg2gt.runs.checkpoints import newest_valid
-from vg2gt.studies.curves import read_curves
-from vg2gt.training.log import WholeRowsLogger
 
 
 @contextmanager
@@ -47,25 +44,6 @@ def test_a_json_file_that_does_not_fit(tmp_path: Path) -> None:
         write_json(path, list(range(1000)))
     assert read_json(path) == {"psnr": 20.0}
     assert [file.name for file in tmp_path.iterdir()] == ["metrics.json"]
-
-
-def test_a_log_that_does_not_fit_keeps_whole_rows(tmp_path: Path) -> None:
-    logger = WholeRowsLogger(str(tmp_path))
-    path = tmp_path / "logs" / "version_0" / "metrics.csv"
-    for step in range(3):
-        logger.log_metrics({"loss": 0.1 + step}, step)
-        logger.save()
-    before = path.read_bytes()
-    logger.log_metrics({"loss": 1 / 3}, 3)
-    with largest_file(len(before) + 5), pytest.raises(OSError, match=r"metrics\.csv could not be written"):
-        logger.save()
-    assert path.read_bytes() == before
-    logger.save()
-    logger.log_metrics({"loss": 0.5, "eval/psnr": 20.0}, 4)
-    logger.save()
-    assert read_curves(tmp_path)["loss"] == {0: 0.1, 1: 1.1, 2: 2.1, 3: 1 / 3, 4: 0.5}
-    with open(path, newline="") as file:
-        assert next(csv.reader(file)) == ["eval/psnr", "loss", "step"]
 
 
 def test_training_ends_and_goes_on(tmp_path: Path, cache: Path, whole: Path) -> None:

@@ -19,9 +19,9 @@ from tests.reliability.degenerate import SCENES
 from tests.reliability.steps import TINY, first_batches, tiny_run
 from tests.training_helpers import SMALL
 from vg2gt.losses import EnhancementLoss, GaussianLoss, ScaleAlignment, VG2GTLoss
-from vg2gt.training.callbacks import StopOnSignal
 from vg2gt.training.distributed import interleave
 from vg2gt.training.loop import Run
+from vg2gt.training.stop_on_signal import StopOnSignal
 from vg2gt.types import Batch
 
 # --------------------------------------------------------------------------------------------- scenes count alike
@@ -202,7 +202,7 @@ def test_a_fault_on_one_rank_drops_the_step_on_both(two) -> None:
     assert first["dropped"] == second["dropped"] == [False, True, False]
     assert torch.equal(first["weights"], second["weights"])
     (fault,) = first["faults"]
-    assert (fault["step"], fault["rank"], fault["cause"]) == (1, 1, "images of the batch")
+    assert (fault["step"], fault["rank"], fault["cause"]) == (1, 1, "images, depth or cameras of the batch")
 
 
 def test_evaluation_on_two_ranks_is_that_of_one(two, tmp_path: Path, cache: Path) -> None:
@@ -278,19 +278,26 @@ def test_tasks_of_a_slurm_job_find_each_other(tmp_path: Path, cache: Path) -> No
 
 @pytest.mark.slow
 def test_forty_steps_on_two_processes(tmp_path: Path, cache: Path) -> None:
-    """With SGD rounding stays rounding; Adam divides by the gradient's size and makes it grow."""
-    bounds = {  # of loss and weights
-        "sgd_long": (two_ranks.SGD, 5e-6, 5e-6),
-        "adamw_long": (two_ranks.ADAMW, 5e-2, 2e-2),
-        "muon_long": ((), 5e-2, 2e-2),
-    }
-    ended = two_ranks.run_on_two_ranks(tmp_path, cache, *bounds, timeout=1500)
-    for name, (optimizer, loss, weights) in bounds.items():
-        one = two_ranks.trained(tiny_run(tmp_path, cache, *two_ranks.step_overrides(optimizer, 40, scenes=2)))
+    """The ranks stay equal to the bit; at their weights one process with both scenes has their loss and gradient.
+
+    Two trainings are not compared: rounding that moves a point to another cell or tile makes them part.
+    """
+    optimizers = {"sgd_long": two_ranks.SGD, "adamw_long": two_ranks.ADAMW, "muon_long": ()}
+    ended = two_ranks.run_on_two_ranks(tmp_path, cache, *optimizers, timeout=1500)
+    for name, optimizer in optimizers.items():
         ranks = results((tmp_path, ended), name)
-        differences = [abs(a - b) for a, b in zip(one["losses"], ranks[0]["losses"], strict=True)]
-        print(name, "loss", max(differences), "weights", float((one["weights"] - ranks[0]["weights"]).abs().max()))
-        assert_trained_alike(one, ranks, loss, weights)
+        assert torch.equal(ranks[0]["weights"], ranks[1]["weights"])
+        assert ranks[0]["losses"] == ranks[1]["losses"]
+        run = tiny_run(tmp_path, cache, *two_ranks.step_overrides(optimizer, 40, scenes=2))
+        one = two_ranks.trained(run, two_ranks.Steps(ranks[0]["at"]))
+        losses = torch.tensor([one["losses"], ranks[0]["losses"]])[:, ::4].diff(dim=0).abs().flatten()
+        pairs = zip(one["gradients"], ranks[0]["gradients"], strict=True)
+        gradients = torch.stack([(a - b).norm() / b.norm() for a, b in pairs])
+        print(name, "loss", losses.tolist(), "gradient", gradients.tolist())
+        assert len(gradients) == 10
+        assert losses.median() < 2e-6
+        assert gradients.median() < 5e-6
+        assert gradients.max() < 1e-2  # a cell or tile may flip at equal weights, too
 
 
 @pytest.mark.slow

@@ -22,7 +22,7 @@ import vg2gt.voxels.fine
 import vg2gt.voxels.surface
 from tests.reliability.steps import first_batches, fit, tiny_run
 from tests.training_helpers import full_model
-from vg2gt.evaluation import evaluate_scene
+from vg2gt.evaluation.in_training import evaluate_scene
 from vg2gt.losses.gaussian import GaussianLoss
 from vg2gt.losses.geometry import GeometryLoss
 from vg2gt.model import SceneScale

@@ -12,6 +12,7 @@ import lightning
 import torch
 from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
+from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from tests.commands import ROOT, become, warm_process
 from tests.reliability.degenerate import SCENES
@@ -48,12 +49,36 @@ class Curve(lightning.Callback):
             self.averaged = sum(bucket.buffer().numel() for bucket in reducer._get_zeros_like_grad_buckets())
 
 
-def trained(run: Run) -> dict[str, Any]:
-    """Trains a run to its end; its loss curve, final weights and number of averaged elements."""
+class Steps(lightning.Callback):
+    """Notes weights and gradient of every fourth step.
+
+    Args:
+        given: weights to take these steps at instead.
+    """
+
+    def __init__(self, given: Sequence[Tensor] | None = None) -> None:
+        self.given = given
+        self.weights: list[Tensor] = []
+        self.gradients: list[Tensor] = []
+
+    def on_train_batch_start(self, trainer: lightning.Trainer, pl_module: Any, *args: Any) -> None:
+        if trainer.global_step % 4 == 0:
+            if self.given is not None:
+                vector_to_parameters(self.given[len(self.weights)], pl_module.model.trained_parameters())
+            self.weights.append(parameters_to_vector(pl_module.model.trained_parameters()).detach().clone())
+
+    def on_before_optimizer_step(self, trainer: lightning.Trainer, pl_module: Any, *args: Any) -> None:
+        if trainer.global_step % 4 == 0:
+            self.gradients.append(torch.cat([p.grad.flatten() for p in pl_module.model.trained_parameters()]))
+
+
+def trained(run: Run, steps: Steps | None = None) -> dict[str, Any]:
+    """Trains a run to its end; its loss curve, final weights and number of averaged elements, and what steps noted."""
     curve = Curve()
-    run.trainer.callbacks.append(curve)  # pyright: ignore[reportAttributeAccessIssue]
+    run.trainer.callbacks += [curve, *([steps] if steps else [])]  # pyright: ignore[reportAttributeAccessIssue]
     run.trainer.fit(run.module, datamodule=run.datamodule)
-    return {"losses": curve.losses, "weights": weights(run), "averaged": curve.averaged}
+    noted = {"at": steps.weights, "gradients": steps.gradients} if steps else {}
+    return {"losses": curve.losses, "weights": weights(run), "averaged": curve.averaged, **noted}
 
 
 def weights(run: Run) -> Tensor:
@@ -66,7 +91,8 @@ def step_overrides(optimizer: Sequence[str], steps: int, scenes: int) -> list[st
 
 
 def equal_steps(folder: Path, cache: Path, optimizer: Sequence[str], steps: int) -> dict[str, Any]:
-    return trained(tiny_run(folder, cache, *RANKS, *step_overrides(optimizer, steps, scenes=1)))
+    run = tiny_run(folder, cache, *RANKS, *step_overrides(optimizer, steps, scenes=1))
+    return trained(run, Steps() if steps > 4 else None)
 
 
 def empty_rank(folder: Path, cache: Path) -> dict[str, Any]:
@@ -88,7 +114,7 @@ def faulty_rank(folder: Path, cache: Path) -> dict[str, Any]:
         batches[1].images[0, 0] = float("nan")
     audit = fit(run, batches)
     audit.assert_sound()
-    return {"weights": weights(run), "dropped": audit.skipped, "faults": run.module.skipped.summary()["faults"]}
+    return {"weights": weights(run), "dropped": audit.skipped, "faults": run.module.skipped.state_dict()["faults"]}
 
 
 def three_scenes(folder: Path, cache: Path, *overrides: str) -> dict[str, Any]:

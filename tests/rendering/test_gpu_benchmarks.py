@@ -112,6 +112,9 @@ def test_time_follows_visits(estimate: ModuleType) -> None:
     assert times["newton"] == pytest.approx(0.75 * times["section"])
 
 
+STEP = ("step_ms", "peak_mb", "peak_reserved_mb", "stage_ms", "stage_peak_mb", "profile")
+
+
 @pytest.fixture
 def gpu(benchmark_script) -> ModuleType:
     return benchmark_script("gpu")
@@ -128,7 +131,7 @@ def test_without_a_gpu_the_command_says_so(gpu: ModuleType, tmp_path: Path) -> N
     ("part", "found"),
     [
         ("render", {"cpu solid 500", "cpu rasterized 500"}),
-        ("step", {"tiny: step_ms", "tiny: peak_mb", "tiny: stage_ms", "tiny: stage_peak_mb", "tiny: profile"}),
+        ("step", {f"tiny: {what}" for what in STEP}),
         ("knn", {"patch points", "pixels"}),
         ("reconstruct", {"2 images"}),
     ],
@@ -170,9 +173,9 @@ def test_parts_run_apart_and_within_their_time(
     shown = capsys.readouterr().out
     assert "knn: done (" in shown
     assert "  patch points: ms " in shown
-    assert "step: stopped after 150 s (" in shown
+    assert "step: stopped after 170 s (" in shown
     assert [path.name.split("-", 3)[3] for path in tmp_path.iterdir()] == ["gpu-knn.json"]
-    assert sum(part.seconds for part in gpu.PARTS.values()) <= 640  # all together end after --minutes
+    assert sum(part.seconds for part in gpu.PARTS.values()) <= 660  # all together end after --minutes
 
 
 def only_seconds(run: Any, limits: dict[str, float], command: list[str], **options: Any) -> Any:
@@ -190,9 +193,9 @@ def test_many_refused_slots_do_not_overflow_their_sum(benchmark_script) -> None:
     one, matrix = torch.zeros(1, 3).expand(count, 3), torch.eye(4).expand(1, 1, 4, 4)
     gaussians = Gaussians(one, torch.ones(1, 4).expand(count, 4), one, one[:, 0], one[:, None], one[:, 0].long())
     cameras = Cameras(matrix, matrix[..., :3, :3], (8, 8))
-    with benchmark_script("gpu_kernels").recorded({"project_kernel": lambda counts, **_: counts.fill_(REFUSED)}):
-        with pytest.raises(RefusedError, match="cannot be rendered"):
-            render_triton(gaussians, cameras, torch.zeros(3), RenderOptions())
+    refused = benchmark_script("gpu_kernels").recorded({"project_kernel": lambda counts, **_: counts.fill_(REFUSED)})
+    with refused, pytest.raises(RefusedError, match="cannot be rendered"):
+        render_triton(gaussians, cameras, torch.zeros(3), RenderOptions())
 
 
 def test_more_slots_than_can_be_numbered_are_refused(benchmark_script) -> None:

@@ -2,7 +2,7 @@
 
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +11,6 @@ import torch
 from omegaconf import OmegaConf
 
 from vg2gt.data import SyntheticScenes
-from vg2gt.data.shards import write_shards
 from vg2gt.runs.load import compose_part, load_model
 
 SIZE = (24, 32)
@@ -73,14 +72,3 @@ def run_folder(harmless_run: Path, tmp_path: Path) -> Path:
 @pytest.fixture(scope="session")
 def rooms(tmp_path_factory: pytest.TempPathFactory) -> SyntheticScenes:
     return SyntheticScenes(1, num_frames=3, size=SIZE, cache_dir=str(tmp_path_factory.mktemp("rooms")))
-
-
-@pytest.fixture(scope="session")
-def write_shards_to(rooms: SyntheticScenes, tmp_path_factory: pytest.TempPathFactory) -> Callable[[Path], Path]:
-    whole = tmp_path_factory.mktemp("shards") / "whole"
-    write_shards(rooms, whole)
-
-    def write(folder: Path) -> Path:
-        return Path(shutil.copytree(whole, folder))
-
-    return write

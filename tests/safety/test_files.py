@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from examples.data_sets.tum import TUM
 from vg2gt.data import DataError
-from vg2gt.data.sources import COLMAP, TUM, Nerfstudio
+from vg2gt.data.sources import COLMAP, Nerfstudio
 from vg2gt.data.sources.parsing import read_numbers
 from vg2gt.io import (
     FormatError,
@@ -158,7 +159,7 @@ def colmap_model(folder: Path, name: str = "a.png", files: Mapping[str, bytes] |
 
 @pytest.mark.parametrize("name", MODELS)
 def test_colmap_headers(tmp_path: Path, name: str) -> None:
-    assert read_colmap(colmap_model(tmp_path / "good")).images[1].name == "a.png"
+    assert read_colmap(colmap_model(tmp_path / "good")).image(1).name == "a.png"
     with pytest.raises(FormatError, match=r"bad"):
         read_colmap(colmap_model(tmp_path / "bad", files=MODELS[name]))
 

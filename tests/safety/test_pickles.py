@@ -1,4 +1,4 @@
-"""Nothing that is loaded is unpickled: checkpoints, weights, arrays, caches, shards."""
+"""Nothing that is loaded is unpickled: checkpoints, weights, arrays, caches."""
 
 import io
 import logging
@@ -15,8 +15,7 @@ import torch
 from backends.vggt import VGGTBackend
 from backends.weights import find_weights
 from tests.safety.conftest import SIZE, Armed
-from vg2gt.data import DataError, RGBDFolder, ShardedScenes, SyntheticScenes
-from vg2gt.data.sharded_scenes import INDEX
+from vg2gt.data import DataError, RGBDFolder, SyntheticScenes
 from vg2gt.io.arrays import load_matrices, load_npy
 from vg2gt.io.errors import FormatError
 from vg2gt.io.npz import load_npz, read_npz
@@ -24,7 +23,7 @@ from vg2gt.io.tensors import read_tensors
 from vg2gt.metrics.lpips import load_lpips
 from vg2gt.runs.checkpoints import initialize_from, read_checkpoint
 from vg2gt.runs.load import load_model
-from vg2gt.training.checkpoint_io import AtomicCheckpointIO
+from vg2gt.training.checkpointing import AtomicCheckpointIO
 
 
 def zipped(armed: Armed) -> bytes:
@@ -215,17 +214,3 @@ def test_rooms(tmp_path: Path, pickled_array: np.ndarray, armed: Armed, caplog: 
         with caplog.at_level(logging.WARNING):
             assert torch.equal(depth(), expected)
         assert re.search("cached scene .* is damaged", caplog.text)
-
-
-def test_shard_indices(write_shards_to, tmp_path: Path, pickled_array: np.ndarray, armed: Armed) -> None:
-    folder = write_shards_to(tmp_path / "shards")
-    with np.load(folder / INDEX) as stored:
-        good = dict(stored)
-    for name in ("meta", "frame_ids", "image", "intrinsics"):
-        np.savez(folder / INDEX, **{**good, name: pickled_array})  # pyright: ignore[reportArgumentType]
-        with pytest.raises(DataError, match=r"index\.npz is damaged"):
-            ShardedScenes(str(folder))
-    for content in (pickle.dumps(armed), by_name(armed), zipped(armed)):
-        (folder / INDEX).write_bytes(content)
-        with pytest.raises(DataError, match=r"index\.npz is damaged"):
-            ShardedScenes(str(folder))

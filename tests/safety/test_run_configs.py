@@ -44,7 +44,7 @@ ATTACKS: dict[str, Attack] = {
     "a function of ours": lambda c: {"_target_": "vg2gt.io.files.write_text", "path": c, "content": ""},
     "training": lambda c: {"_target_": "vg2gt.training.loop.train", "config": {"output_dir": c}},
     "a method of ours": lambda c: {"_target_": "backends.bundle.Description.write", "folder": c},
-    "a class that writes": lambda c: {"_target_": "vg2gt.training.callbacks.NewestCheckpoints", "dirpath": c},
+    "a class that writes": lambda c: {"_target_": "vg2gt.training.stop_on_signal.StopOnSignal", "folder": c},
     "almost ours": lambda c: {"_target_": "vg2gt_evil.Backend", "path": c},
     "no name": lambda c: {"_target_": ["os", "system"], "path": c},
     "a list": lambda c: [{"_target_": "os.mkdir", "path": c}],  # pyright: ignore[reportAssignmentType]
@@ -113,17 +113,14 @@ def test_what_the_user_names_is_called(run_folder: Path) -> None:
 
 
 YAMLS = {
-    "object": ("!!python/object/apply:os.system ['touch {canary}']", "the tag"),
-    "new object": ("!!python/object/new:os.system ['touch {canary}']", "the tag"),
-    "name": ("!!python/name:os.system ''", "the tag"),
-    "module": ("!!python/module:antigravity ''", "the tag"),
-    "own tag": ("!evil 1", "the tag"),
-    "environment": ("${{oc.env:SECRET}}", "the interpolation"),
-    "nested interpolation": ("a${{oc.env:${{b}}}}", "the interpolation"),
-    "decode": ("${{oc.decode:'1'}}", "the interpolation"),
-    "bomb": ("[&a [x,x], &b [*a,*a], &c [*b,*b]]", "an alias"),
-    "deep": ("[" * 3000 + "]" * 3000, "nested more than"),
-    "long": ("x" * (2 << 20), "has .* bytes"),
+    "object": ("!!python/object/apply:os.system ['touch {canary}']", "is not a run's configuration"),
+    "new object": ("!!python/object/new:os.system ['touch {canary}']", "is not a run's configuration"),
+    "name": ("!!python/name:os.system ''", "is not a run's configuration"),
+    "module": ("!!python/module:antigravity ''", "is not a run's configuration"),
+    "own tag": ("!evil 1", "is not a run's configuration"),
+    "environment": ("${{oc.env:SECRET}}", "an interpolation"),
+    "nested interpolation": ("a${{oc.env:${{b}}}}", "an interpolation"),
+    "decode": ("${{oc.decode:'1'}}", "an interpolation"),
     "no YAML": ("{{", "is not a run's configuration"),
     "no text": ("\udcff", "is not a run's configuration"),
 }
@@ -151,7 +148,7 @@ def test_no_command_reads_the_environment_for_a_runs_configuration(
     monkeypatch.setenv("SECRET", "hunter2")
     with (run_folder / "config.yaml").open("a") as file:
         file.write("${oc.env:SECRET}: 1\nx: ${oc.env:SECRET}\n")
-    with caplog.at_level(logging.DEBUG), pytest.raises(UntrustedError, match="the interpolation") as caught:
+    with caplog.at_level(logging.DEBUG), pytest.raises(UntrustedError, match="an interpolation") as caught:
         read(OmegaConf.create({"output_dir": str(run_folder)}))
     assert "hunter2" not in caplog.text + str(caught.value)
 
@@ -163,7 +160,7 @@ def test_the_configuration_in_a_checkpoint_calls_nothing_either(run_folder: Path
     for hostile in (text + "extra: ${oc.env:SECRET}\n", text.replace("backends.oracle.OracleBackend", "os.mkdir")):
         torch.save(content | {"config": hostile}, path)
         with pytest.raises(
-            UntrustedError, match=r"step-7\.ckpt: (config, line .*interpolation|backend\._target_ is 'os)"
+            UntrustedError, match=r"step-7\.ckpt: (config holds an interpolation|backend\._target_ is 'os)"
         ):
             load_model(run_folder, device="cpu")
     torch.save(content | {"config": text}, path)

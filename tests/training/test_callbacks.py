@@ -1,7 +1,6 @@
-"""What a run keeps: the newest checkpoints, the row of a checkpoint's step, the state at SIGTERM."""
+"""What a run keeps: the newest checkpoints, its curves, the state at SIGTERM."""
 
 import multiprocessing
-import shutil
 import signal
 from collections.abc import Callable
 from pathlib import Path
@@ -12,10 +11,10 @@ import lightning
 import pytest
 
 from tests.reliability.crash_harness import RUN
-from tests.training_helpers import small_config
-from vg2gt.runs.checkpoints import newest_valid, read_checkpoint
+from tests.training_helpers import small_config, with_crash
+from vg2gt.runs.checkpoints import newest_valid
 from vg2gt.studies.curves import read_curves
-from vg2gt.training.callbacks import NewestCheckpoints
+from vg2gt.training.checkpointing import NewestCheckpoints
 from vg2gt.training.distributed import ending_together
 from vg2gt.training.loop import build, train
 
@@ -40,16 +39,13 @@ def names(folder: Path) -> list[str]:
     return sorted(path.name for path in (folder / "checkpoints").iterdir())
 
 
-def test_the_newest_are_kept_whoever_saved_them(tmp_path: Path, cache: Path) -> None:
-    """As after a kill between a rename and a deletion, and a stop by SIGTERM: nothing stays for good."""
-    folder = tmp_path / "checkpoints"
-    folder.mkdir()
-    for name in ("step-0.ckpt", "step-0-old.ckpt"):
-        (folder / name).write_bytes(b"an older one")
-    (folder / "of the user.ckpt").write_bytes(b"something else")
-    run = build(small_config(tmp_path, cache, *RUN, "callbacks.checkpoint.save_top_k=2", "logger.csv=null"))
-    run.trainer.fit(run.module, datamodule=run.datamodule)
-    assert names(tmp_path) == ["of the user.ckpt", "step-4.ckpt", "step-6.ckpt"]
+def test_the_newest_are_kept(tmp_path: Path, cache: Path) -> None:
+    """Across an interruption."""
+    overrides = [*RUN, "callbacks.checkpoint.save_top_k=2", "callbacks.checkpoint.every_n_train_steps=1"]
+    train(small_config(tmp_path, cache, *overrides, "trainer.max_steps=3"))
+    assert names(tmp_path) == ["step-2.ckpt", "step-3.ckpt"]
+    train(small_config(tmp_path, cache, *overrides, "trainer.max_steps=5", "ckpt=last"))
+    assert names(tmp_path) == ["step-4.ckpt", "step-5.ckpt"]
 
 
 def test_all_can_be_kept(tmp_path: Path, cache: Path) -> None:
@@ -65,20 +61,14 @@ def test_senseless_numbers_are_refused(every: int, kept: int) -> None:
         NewestCheckpoints("checkpoints", every, kept)
 
 
-def test_a_checkpoint_carries_the_row_of_its_step(tmp_path: Path, cache: Path) -> None:
-    """A process that goes on from it, without the log of the one before, writes it."""
-    overrides = ["callbacks.checkpoint.every_n_train_steps=4", "trainer.val_check_interval=1000"]
-    run = build(small_config(tmp_path, cache, *RUN, *overrides))
-    run.trainer.fit(run.module, datamodule=run.datamodule)
-    logged = {name: curve[3] for name, curve in read_curves(tmp_path).items() if 3 in curve}
-    saved = read_checkpoint(tmp_path / "checkpoints" / "step-4.ckpt")["last_row"]
-    assert saved == {"step": 3, "epoch": 0, "values": logged}
-    assert len(logged) > 5
-    shutil.rmtree(tmp_path / "logs")
-    train(small_config(tmp_path, cache, *RUN, "ckpt=last"))
-    curves = read_curves(tmp_path)
-    assert {name: curve[3] for name, curve in curves.items() if 3 in curve} == logged
-    assert list(curves["loss"]) == [3, 4, 5]
+def test_a_resumed_run_logs_what_the_uninterrupted_one_does(tmp_path: Path, cache: Path) -> None:
+    train(small_config(tmp_path / "whole", cache, *RUN))
+    with pytest.raises(InterruptedError):
+        train(with_crash(small_config(tmp_path / "cut", cache, *RUN), step=3))
+    train(small_config(tmp_path / "cut", cache, *RUN, "ckpt=last"))
+    whole, cut = (read_curves(tmp_path / name) for name in ("whole", "cut"))
+    assert cut == whole
+    assert list(whole["loss"]) == [0, 1, 2, 3, 4, 5]
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
@@ -89,16 +79,6 @@ def test_a_signal_saves_without_another_evaluation(tmp_path: Path, cache: Path, 
     run.trainer.fit(run.module, datamodule=run.datamodule)
     assert newest_valid(tmp_path / "checkpoints").name == "step-3.ckpt"
     assert stopped.evaluations == 0
-
-
-def test_a_run_whose_folder_vanishes_is_kept_beside_it(tmp_path: Path, cache: Path) -> None:
-    folder, renamed = tmp_path / "run", tmp_path / "renamed"
-    run = build(small_config(folder, cache, *RUN))
-    run.trainer.callbacks.append(HappensAt(3, lambda: folder.rename(renamed)))  # pyright: ignore
-    with pytest.raises(FileNotFoundError, match=r"run was deleted or renamed .* saved .*run-kept.*step-3\.ckpt; go on"):
-        run.trainer.fit(run.module, datamodule=run.datamodule)
-    assert read_checkpoint(tmp_path / "run-kept" / "checkpoints" / "step-3.ckpt")["global_step"] == 3
-    assert "step-2.ckpt" in [path.name for path in (renamed / "checkpoints").iterdir()]
 
 
 def test_a_killed_process_that_loads_data_is_one_error(tmp_path: Path, cache: Path) -> None:

@@ -17,13 +17,13 @@ def wall(views: int) -> Geometry:
 
 
 def test_good_depth_stays() -> None:
-    assert ViewCheck()(wall(4)).all()
+    assert ViewCheck()(wall(4)).keep.all()
 
 
 def test_what_more_views_look_through_than_agree_with_is_dropped() -> None:
     found = wall(4)
     found.depth[0, 0, 8:12, 10:16] = 1.0  # a guess in the air
-    keep = ViewCheck()(found)[0]
+    keep = ViewCheck()(found).keep[0]
     assert not keep[0, 8:12, 10:16].any()
     assert keep[0, :6].all()
     assert keep[1:, :, 4:-4].all()
@@ -34,13 +34,13 @@ def test_what_was_dropped_says_nothing_in_the_next_round() -> None:
     # Views 1 and 2 both guess, far behind the wall and at different depths: each looks through view 0's wall.
     found.depth[0, 1], found.depth[0, 2] = 8.0, 16.0
     found.depth[0, 0, :, :14] = 0
-    assert not ViewCheck(rounds=1)(found)[0, 0].any()
+    assert not ViewCheck(rounds=1)(found).keep[0, 0].any()
 
 
 def test_what_a_single_view_sees_stays() -> None:
     found = wall(3)
     found.depth[0, 0, :, :8] = 50.0  # behind what the others see: not contradicted, not agreed with
-    assert ViewCheck()(found)[0, 0, :, :6].all()
+    assert ViewCheck()(found).keep[0, 0, :, :6].all()
 
 
 def test_scenes_are_checked_apart_and_pixels_without_depth_are_never_kept() -> None:
@@ -54,17 +54,31 @@ def test_scenes_are_checked_apart_and_pixels_without_depth_are_never_kept() -> N
     both = Geometry(
         torch.cat((one.depth, other.depth)), torch.cat((one.depth_conf, other.depth_conf)), cameras, torch.ones(2)
     )
-    keep = ViewCheck()(both)
-    assert torch.equal(keep[0], ViewCheck()(one)[0])
-    assert torch.equal(keep[1], ViewCheck()(other)[0])
+    keep = ViewCheck()(both).keep
+    assert torch.equal(keep[0], ViewCheck()(one).keep[0])
+    assert torch.equal(keep[1], ViewCheck()(other).keep[0])
     assert not keep[0, 1, :2].any()
 
 
 def test_a_single_view_is_taken_as_it_is() -> None:
-    assert ViewCheck()(wall(1)).all()
+    assert ViewCheck()(wall(1)).keep.all()
 
 
-@pytest.mark.parametrize(("option", "value"), [("tolerance", 0.0), ("margin", 0.01), ("rounds", 0), ("partners", 0)])
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [("tolerance", 0.0), ("margin", 0.01), ("rounds", 0), ("partners", 0), ("fine_below", 0), ("coarsest", 0.5)],
+)
 def test_options_out_of_range_are_named(option: str, value: float) -> None:
     with pytest.raises(ValueError, match=rf"model\.visibility\.{option} must be"):
         ViewCheck(**{option: value})  # type: ignore[arg-type]
+
+
+def test_voxels_are_coarser_where_views_disagree() -> None:
+    """Depth of view 1 is 10 % off: 2.5 pixels at a focal length of 25."""
+    found = wall(2)
+    assert ViewCheck()(found).coarsen.tolist() == [1.0]
+    found.depth[0, 1] *= 1.1
+    off = (0.1 + (1 - 1 / 1.1)) / 2 * 25
+    coarsen = ViewCheck(fine_below=1.4, coarsest=4)(found).coarsen
+    assert coarsen.item() == pytest.approx(off / 1.4, rel=0.1)
+    assert ViewCheck(fine_below=1.4, coarsest=1.5)(found).coarsen.tolist() == [1.5]

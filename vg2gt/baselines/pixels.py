@@ -117,14 +117,15 @@ class PixelReconstructor(Reconstructor):
     ) -> Prediction:
         """Reconstructs B scenes; see :meth:`vg2gt.model.Reconstructor.forward`. Nothing is random here."""
         tokens, geometry, unit = self.read_views(images, hints)
-        supported = self.supported(geometry)
+        support = self.support(geometry)
+        keep = None if support is None else support.keep
         with stage("fine"):
             dense = self.dense_head(tokens, images).permute(0, 2, 3, 1).flatten(0, 2)
         with stage("gaussians"), torch.autocast(images.device.type, enabled=False):
-            pixels = usable_pixels(geometry.where(supported), images)
+            pixels = usable_pixels(geometry.where(keep), images)
             features = F.gelu(dense.float()).index_select(0, pixels.rows)
             gaussians = self.with_background(self.make_gaussians(features, pixels, geometry), images, geometry.depth)
-        return Prediction(geometry, geometry, unit, None, gaussians, supported)
+        return Prediction(geometry, geometry, unit, None, gaussians, keep)
 
     @abstractmethod
     def make_gaussians(self, features: Tensor, pixels: Pixels, geometry: Geometry) -> Gaussians:

@@ -60,9 +60,10 @@ class PointCloud(Reconstructor):
     ) -> Prediction:
         """Reconstructs B scenes; see :meth:`vg2gt.model.Reconstructor.forward`. Nothing is random here."""
         _, geometry, unit = self.read_views(images, hints)
-        supported = self.supported(geometry)
+        support = self.support(geometry)
+        keep = None if support is None else support.keep
         with stage("gaussians"), torch.autocast(images.device.type, enabled=False):
-            pixels = usable_pixels(geometry.where(supported), images)
+            pixels = usable_pixels(geometry.where(keep), images)
             means = pixels.to_world(pixels.rays * pixels.depth[:, None])
             spacing = pixels.footprint.mean(-1) if self.spacing == "pixel" else _distance_to_neighbors(means, pixels)
             gaussians = Gaussians(
@@ -74,7 +75,7 @@ class PointCloud(Reconstructor):
                 batch=pixels.batch,
             )
         gaussians = self.with_background(gaussians, images, geometry.depth)
-        return Prediction(geometry, geometry, unit, None, gaussians, supported)
+        return Prediction(geometry, geometry, unit, None, gaussians, keep)
 
 
 def _distance_to_neighbors(means: Tensor, pixels: Pixels) -> Tensor:

@@ -2,7 +2,6 @@
 
 from omegaconf import DictConfig
 
-from vg2gt.cli.allocator import start_with_mimalloc
 from vg2gt.cli.arguments import hydra_command
 from vg2gt.cli.commands import COMMANDS
 
@@ -16,5 +15,4 @@ def main(config: DictConfig) -> None:
 
 
 if __name__ == "__main__":
-    start_with_mimalloc()
     main()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
 
@@ -19,13 +19,11 @@ class Command:
         entry: ``module:function``; the function takes its arguments from ``sys.argv``.
         does: one line of what it does.
         example: a command line.
-        computes: it reconstructs or trains, for which the allocator is replaced.
     """
 
     entry: str
     does: str
     example: str
-    computes: bool = False
 
 
 COMMANDS = {
@@ -33,31 +31,26 @@ COMMANDS = {
         "vg2gt.cli.train:main",
         "trains a model and shows what it gave; the same as python train.py",
         "vg2gt train name=first trainer.max_steps=200",
-        computes=True,
     ),
     "evaluate": Command(
         "vg2gt.cli.evaluate:main",
         "measures a checkpoint on a data set",
         "vg2gt evaluate ckpt=outputs/quickstart data=synthetic 'views=[3,10,20]'",
-        computes=True,
     ),
     "ablate": Command(
         "vg2gt.cli.ablate:main",
         "trains and compares the paper's ablations over seeds",
         "vg2gt ablate seeds=3 steps=100",
-        computes=True,
     ),
     "reconstruct": Command(
         "vg2gt.cli.reconstruct:main",
         "makes a scene of Gaussians from images, a folder of them or a video",
         "vg2gt reconstruct photos/ --backend da3_small --out outputs/photos",
-        computes=True,
     ),
     "refine": Command(
         "vg2gt.cli.refine:main",
         "optimises a reconstructed scene on its own images",
         "vg2gt refine outputs/photos --seconds 60 --holdout 8",
-        computes=True,
     ),
     "render": Command(
         "vg2gt.cli.render:main",
@@ -76,7 +69,7 @@ COMMANDS = {
     ),
     "data": Command(
         "vg2gt.cli.data:main",
-        "makes scenes, shards, splits and lists of views",
+        "makes scenes, splits and lists of views",
         "vg2gt data synthetic out=rooms scenes=100",
     ),
     "curves": Command(
@@ -97,11 +90,6 @@ DATA_COMMANDS = {
         "writes procedural rooms and streets as RGB-D recordings",
         "vg2gt data synthetic out=rooms scenes=100",
     ),
-    "shards": Command(
-        "vg2gt.cli.data:shards",
-        "writes a dataset as a few large tar files",
-        "vg2gt data shards out=shards/train data=rgbd data.root=RECORDINGS",
-    ),
     "splits": Command(
         "vg2gt.cli.data:splits",
         "divides a dataset's scenes into training and evaluation lists",
@@ -115,13 +103,12 @@ DATA_COMMANDS = {
 }
 
 
-def dispatch(program: str, commands: Mapping[str, Command], before_computing: Callable[[], None] | None = None) -> None:
+def dispatch(program: str, commands: Mapping[str, Command]) -> None:
     """Runs ``program COMMAND [arguments]``; lists the commands if none is named.
 
     Args:
         program: its name, for messages.
         commands: by name.
-        before_computing: called before a command that computes is imported.
 
     Raises:
         SystemExit: if there is no such command, naming the nearest.
@@ -138,8 +125,6 @@ def dispatch(program: str, commands: Mapping[str, Command], before_computing: Ca
         advice = f", did you mean {near[0]}?" if near else ""
         print(f"{program}: unknown command {asked!r}{advice} ({program} --help lists all)", file=sys.stderr)
         sys.exit(2)
-    if before_computing and commands[asked].computes and not {"-h", "--help"} & set(sys.argv):
-        before_computing()
     module, _, function = commands[asked].entry.partition(":")
     command = importlib.import_module(module)
     # Further processes (DDP) are started as argv says: by the command's own file, without the command's name.

@@ -1,4 +1,4 @@
-"""``vg2gt data synthetic | shards | splits | views``: what is made of data before training or evaluating."""
+"""``vg2gt data synthetic | splits | views``: what is made of data before training or evaluating."""
 
 from __future__ import annotations
 
@@ -110,50 +110,6 @@ def synthetic(arguments: list[str]) -> None:
         f"{out}: wrote {len(names)} scenes of {options.frames} frames in {seconds:.0f} s, "
         f"{options.scenes - len(names)} were there; use them: vg2gt train data=rgbd data.root={out}"
     )
-
-
-@dataclass
-class ShardOptions:
-    """Options of ``vg2gt data shards``."""
-
-    out: str = MISSING
-    subset: str = "train"
-    size: list[int] = field(default_factory=lambda: [224, 448])
-    quality: int = 0
-    shard_mb: float = 256.0
-    workers: int = 0
-
-
-@key_value_command(DATA_COMMANDS["shards"])
-def shards(arguments: list[str]) -> None:
-    """Writes a dataset as a few large tar files, to be read by range from a disk or straight from an object store.
-
-    vg2gt data shards out=FOLDER/train data=rgbd data.root=RECORDINGS [key=value ...]
-
-      out=FOLDER/train    a new folder; data=shards reads FOLDER/train, and FOLDER/val written with subset=val
-      subset=train        train or val: which scenes of the dataset
-      size=[224,448]      frames are made smaller until they just cover this size; []: they stay as they are
-      quality=0           1 to 100: colour as JPEG of this quality; 0: lossless (PNG)
-      shard_mb=256        a new tar file is begun after so many megabytes
-      workers=0           processes that decode and encode
-
-    All other arguments choose the dataset as in `vg2gt train`. Frames that cannot be read are left out and counted. The
-    tar files are in WebDataset's format. Copy the folder to where it is to be read from and train with
-    data=shards data.root=FOLDER, which may be a URL (s3://, gs://, https://).
-    """
-    from vg2gt.data.shards import Encoding, write_shards
-
-    options, overrides = read_options(ShardOptions, arguments)
-    if options.subset not in ("train", "val"):
-        raise ValueError(f"option subset must be train or val, got {options.subset}")
-    if len(options.size) not in (0, 2):
-        raise ValueError(f"option size: give [height,width] or [], got {options.size}")
-    module = data_module(overrides)
-    source = module.train_source() if options.subset == "train" else module.val_source()
-    out = Path(options.out).expanduser()
-    encoding = Encoding((options.size[0], options.size[1]) if options.size else None, options.quality)
-    counts = write_shards(source, out, encoding, options.shard_mb, options.workers, progress=True)
-    print(f"{out}: " + ", ".join(f"{count} {what}" for what, count in counts.items()))
 
 
 @dataclass

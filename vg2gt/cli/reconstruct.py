@@ -20,7 +20,16 @@ POSES = (
     "the first of these that the backbone needs and that is there"
 )
 
+FRAME = (
+    "frame and unit of what is written: of the given cameras, of the first image's camera, or upright (y down); auto: "
+    "given if cameras are given, else upright"
+)
+
+REFINE = "steps of refinement on the images; default: 500 for photographs, 0 for RGB-D recordings; 0: feed-forward"
+
 if TYPE_CHECKING:
+    from vg2gt.reconstruction.scene import Scene
+    from vg2gt.refinement import RefineOptions
     from vg2gt.runs.load import LoadedModel
 
 
@@ -35,15 +44,17 @@ def parser() -> argparse.ArgumentParser:
     add("--model", metavar="NAME[,KEY=VALUE...]", help="of configs/model; default: the run's own")
     add("--set", action="append", default=[], metavar="KEY=VALUE", help="another option, such as model.fine.max_voxels")
     add("--poses", choices=("auto", "given", "sfm", "backbone"), default="auto", help=POSES)
+    add("--frame", choices=("auto", "given", "first", "upright"), default="auto", help=FRAME)
     add("--save", type=list_of_names, default=list(DEFAULT), metavar="LIST", help=f"default: {','.join(DEFAULT)}")
     add("--size", type=_size, metavar="N|HxW", help="longer side, or height x width, in pixels; default 518, CPU 280")
     add("--every", type=int, default=1, metavar="N", help="take every N-th image or frame only")
     add("--max-images", type=int, metavar="N", help="take at most N, evenly spread; of a video 32 by default")
     add("--mode", choices=("solid", "rasterized"), default="solid", help="how views are rendered")
-    add("--refine", nargs="?", type=_steps, const=0, metavar="N", help="optimise the scene on its images, N steps")
+    add("--refine", type=_steps, metavar="N", help=REFINE)
     add("--frames", type=int, default=ORBIT_FRAMES, metavar="N", help=f"length of the orbit, default {ORBIT_FRAMES}")
     add("--mesh-voxel", type=float, metavar="X", help="edge of the mesh's voxels in scene units")
     add("--device", default="auto", help="auto, cpu, cuda, cuda:N")
+    add("--skip-damaged", action="store_true", help="go on without images that cannot be read")
     add("--overwrite", action="store_true", help="replace outputs that are there")
     add("--quiet", action="store_true", help="no progress bars")
     return arguments
@@ -79,16 +90,15 @@ def run(options: argparse.Namespace) -> None:
     from vg2gt.reconstruction.sfm import require_pycolmap
     from vg2gt.runs.load import backend_class, choose_device, load_model
 
+    options.out = str(Path(options.out).expanduser())
     check_outputs(options.save)
-    more = [] if options.refine is None else [REFINED]
-    check_folder(options.out, [*options.save, *more], options.overwrite)
-    how = None if options.refine is None else refine_options(steps=options.refine or None)
+    check_folder(options.out, [*options.save, REFINED], options.overwrite)
     check_choice(options.every, options.max_images)
     for item in options.images:  # before weights are downloaded
         existing_path(item)
     if getattr(backend_class(options.ckpt, options.backend), "needs_depth", False):
         check_depth((options.backend or "of the checkpoint").partition(",")[0], options.images)
-    check_pictures(options.images)
+    check_pictures(options.images, options.skip_damaged)
     if options.poses == "sfm" and not (Path(options.out) / SFM).exists():
         require_pycolmap()
     if "orbit.mp4" in options.save:
@@ -106,7 +116,10 @@ def run(options: argparse.Namespace) -> None:
             monitor=monitor,
             poses=options.poses,
             sfm_folder=Path(options.out) / SFM,
+            frame=options.frame,
+            skip_damaged=options.skip_damaged,
         )
+        how = _refinement(scene, options.refine)
         if how is not None:
             scene = refine_scene(scene, how, monitor)
         figures = _figures(ready)
@@ -129,7 +142,24 @@ def run(options: argparse.Namespace) -> None:
         print_refinement(scene)
     print(f"weights: {figures['weights']}; cameras: {scene.cameras_from or 'predicted by the backbone'}")
     print(f"seconds: {times}; peak memory {cost['peak_memory_mib']} MiB")
+    more = [] if how is None else [REFINED]
     print(f"written: {', '.join(str(folder / name) for name in (*options.save, *more))}")
+
+
+def _refinement(scene: Scene, steps: int | None) -> RefineOptions | None:
+    """How a scene is refined: photographs unless ``steps`` is 0, recordings only where it is given."""
+    from vg2gt.reconstruction.refined import refinement_of
+    from vg2gt.refinement import RefineRates
+
+    kind = refinement_of(scene)
+    if steps == 0 or (steps is None and kind == "default"):
+        return None
+    how = refine_options(kind, steps)
+    if not scene.cameras_from:  # predicted: not bundle-adjusted
+        how = replace(how, rates=replace(how.rates, cameras=RefineRates().cameras))
+    if steps is None:
+        print(f"refining for {how.steps} steps, about 30 s on two cores; --refine 0 gives the feed-forward scene")
+    return how
 
 
 def _figures(ready: LoadedModel) -> dict[str, Any]:
@@ -142,8 +172,8 @@ def _figures(ready: LoadedModel) -> dict[str, Any]:
 
 
 def _steps(text: str) -> int:
-    if not text.isdigit() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is no number of steps; write --refine=N, or --refine at the end")
+    if not text.isdigit():
+        raise argparse.ArgumentTypeError(f"{text!r} is no number of steps; 0 leaves the refinement out")
     return int(text)
 
 

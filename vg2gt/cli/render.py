@@ -24,7 +24,12 @@ def parser() -> argparse.ArgumentParser:
     arguments = flag_parser("render", COMMANDS["render"], listing(OUTPUTS))
     add = arguments.add_argument
     add("scene", help="scene.ply or scene.splat")
-    add("--cameras", required=True, metavar="PATH", help="cameras.json")
+    add(
+        "--cameras",
+        required=True,
+        metavar="PATH",
+        help="cameras.json (ours or of 3DGS), transforms.json, or a COLMAP model's folder",
+    )
     add("--out", required=True, metavar="DIR", help="where to write")
     add("--save", type=list_of_names, default=list(DEFAULT), metavar="LIST", help=f"default: {','.join(DEFAULT)}")
     add("--mode", choices=("solid", "rasterized"), default="solid")
@@ -47,8 +52,8 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Renders and writes."""
-    from vg2gt.io import read_cameras_json
     from vg2gt.io.video import require_pyav
+    from vg2gt.reconstruction.camera_files import read_cameras
     from vg2gt.reconstruction.camera_paths import interpolate
     from vg2gt.reconstruction.maps import animation, feed, map_sinks
     from vg2gt.reconstruction.monitor import Monitor
@@ -61,11 +66,13 @@ def run(options: argparse.Namespace) -> None:
     check_outputs(outputs, OUTPUTS)
     if "video.mp4" in outputs:
         require_pyav("writing video.mp4")
-    cameras = read_cameras_json(options.cameras)
+    cameras = read_cameras(options.cameras)
     if not cameras:
         raise ValueError(f"{options.cameras} names no camera; there is nothing to render")
     cameras = cameras if options.interpolate is None else interpolate(cameras, options.interpolate)
     gaussians = read_gaussians(options.scene).to(choose_device(options.device))
+    if not len(gaussians):
+        raise ValueError(f"{options.scene} holds no Gaussians; there is nothing to render")
     renderer = Renderer(mode=options.mode, depth=options.depth, near=options.near)
     folder = prepare_folder(options.out, outputs, options.overwrite)
     sinks = map_sinks(folder, outputs)

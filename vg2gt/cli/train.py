@@ -2,7 +2,6 @@
 
 from omegaconf import DictConfig
 
-from vg2gt.cli.allocator import start_with_mimalloc
 from vg2gt.cli.arguments import hydra_command
 from vg2gt.cli.commands import COMMANDS
 
@@ -10,9 +9,6 @@ from vg2gt.cli.commands import COMMANDS
 @hydra_command(COMMANDS["train"], "train")
 def main(config: DictConfig) -> None:
     """Runs the training that the configuration describes."""
-    from vg2gt.training.compilation import begin_compiling
-
-    compiling = begin_compiling(config)
     # Lightning, which these import, takes seconds.
     from vg2gt.cli.sweeps import needs_own_process, run_in_own_process
     from vg2gt.training.loop import train
@@ -20,9 +16,8 @@ def main(config: DictConfig) -> None:
     if needs_own_process(config):
         run_in_own_process(config)
     else:
-        train(config, compiling)
+        train(config)
 
 
 if __name__ == "__main__":
-    start_with_mimalloc()
     main()

@@ -4,7 +4,6 @@ from typing import TYPE_CHECKING, Any
 
 from vg2gt.data.base import DataError, Frames, SceneSource
 from vg2gt.data.mixture import Mixture
-from vg2gt.data.sharded_scenes import ShardedScenes
 from vg2gt.data.sources.rgbd import RGBDFolder
 from vg2gt.data.synthetic import SyntheticScenes
 
@@ -18,7 +17,6 @@ __all__ = [
     "RGBDFolder",
     "SceneDataModule",
     "SceneSource",
-    "ShardedScenes",
     "SyntheticScenes",
 ]
 

@@ -27,6 +27,7 @@ class Frames(TensorRecord):
         intrinsics: ``[V, 3, 3]`` float32 in pixels, integer pixel centres.
         sparse_depth: depth stands at single pixels (laser, triangulated points): resizing moves the points instead of
             looking up the nearest pixel.
+        mask: ``[V, H, W]`` float32 in [0, 1], how much each pixel counts (alpha, mask images); None: all count.
     """
 
     images: Tensor
@@ -34,12 +35,17 @@ class Frames(TensorRecord):
     world_to_camera: Tensor
     intrinsics: Tensor
     sparse_depth: bool = False
+    mask: Tensor | None = None
 
     @staticmethod
     def concatenate(parts: Sequence[Frames]) -> Frames:
         """Joins frames of one scene and size along the views."""
         names = ("images", "depth", "world_to_camera", "intrinsics")
-        return replace(parts[0], **{name: torch.cat([getattr(part, name) for part in parts]) for name in names})
+        mask = None
+        if any(part.mask is not None for part in parts):
+            mask = torch.cat([torch.ones_like(part.depth) if part.mask is None else part.mask for part in parts])
+        joined = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
+        return replace(parts[0], **joined, mask=mask)
 
 
 class SceneSource(ABC):
@@ -52,12 +58,14 @@ class SceneSource(ABC):
     Attributes:
         is_metric: whether the unit of depth and poses is the metre, in all scenes.
         has_depth: whether frames have depth; without it a source serves reconstruction and novel views, not training.
+        dense_depth: whether depth, where there is any, covers images as a depth camera's does.
         has_cameras: whether poses and intrinsics are known; without them they are placeholders, for reconstruction
             only, which makes its own.
     """
 
     is_metric: bool = True
     has_depth: bool = True
+    dense_depth: bool = True
     has_cameras: bool = True
 
     @property

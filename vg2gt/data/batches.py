@@ -46,7 +46,10 @@ class BatchDataset(Dataset[Batch]):
         def stack(name: str) -> torch.Tensor:
             return torch.stack([getattr(scene, name) for scene in scenes])
 
-        depth = stack("depth")
+        depth, mask = stack("depth"), None
+        if any(scene.mask is not None for scene in scenes):
+            mask = torch.stack([torch.ones_like(s.depth) if s.mask is None else s.mask for s in scenes])
+            depth = torch.where(mask > 0.5, depth, 0.0)
         return Batch(
             images=stack("images"),
             depth=depth,
@@ -55,6 +58,7 @@ class BatchDataset(Dataset[Batch]):
             frame_ids=torch.tensor([ids for _, ids in loaded], dtype=torch.int64),
             scene=tuple(view.scene for view in views),
             num_context=len(views[0].context),
+            mask=mask,
         )
 
     def _load(self, view: SceneSample) -> tuple[Frames, Sequence[int]]:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import inspect
 import signal
 from collections.abc import Sequence
 from typing import Any
 
+import torch
 from lightning.pytorch import LightningDataModule
 from torch.utils.data import DataLoader
 
@@ -55,7 +55,6 @@ class SceneDataModule(LightningDataModule):
         size_multiple: drawn sizes are multiples of this; the backbone's patch size.
         crop: training crops at the ``center`` or at ``random``.
         zoom: range from which a training scene's zoom is drawn.
-        resized_cache: no longer an option, refused unless None: shards keep reduced frames.
         common: arguments that ``train`` and ``val`` share, such as the dataset's ``root``.
 
     Raises:
@@ -87,7 +86,6 @@ class SceneDataModule(LightningDataModule):
         size_multiple: int = 14,
         crop: Crop = "center",
         zoom: Sequence[float] = (1.0, 1.0),
-        resized_cache: str | None = None,
         **common: Any,
     ) -> None:
         super().__init__()
@@ -100,13 +98,6 @@ class SceneDataModule(LightningDataModule):
         self.sampler = ViewSampler(min_views, max_views, max_images, expand_ratio, target_views, seed, view_sets)
         self.eval_views = EvaluationViews(eval_context, eval_target, eval_window)
         self.framing = FramingSampler(_size(image_size), aspect, size_multiple, fit, crop, zoom, seed)
-        if resized_cache is not None:
-            largest = ",".join(map(str, self.framing.largest))
-            raise ValueError(
-                "data.resized_cache is replaced by shards: write the reduced frames once with `vg2gt data "
-                f"shards out=FOLDER/train size=[{largest}] data=...` (and out=FOLDER/val subset=val), then train with "
-                "data=shards data.root=FOLDER"
-            )
         self.common = common
         self.train_scenes = train_scenes
         self.eval_scenes = eval_scenes
@@ -193,6 +184,10 @@ class SceneDataModule(LightningDataModule):
         own = self._val_views[trainer.global_rank :: trainer.world_size] if trainer else self._val_views
         return self._loader(self._val, [(views,) for views in own or self._val_views[:1]])
 
+    def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
+        """Copies a batch from page-locked memory while the device still computes."""
+        return batch.to(device, non_blocking=device.type == "cuda")
+
     def test_dataloader(self) -> DataLoader[Batch]:
         """The evaluation batches."""
         return self.val_dataloader()
@@ -205,13 +200,14 @@ class SceneDataModule(LightningDataModule):
         if isinstance(make, SceneSource):
             return make
         try:
-            inspect.signature(make).bind(**self.common)
+            return make(**self.common)
         except TypeError as error:
+            if "argument" not in str(error):  # Python's own words about a call
+                raise
             raise DataError(
                 f"the dataset's loader {error} (data.*): leave the option out; if a preset (evaluation=synthetic) sets "
                 "it, choose another preset or remove it with '~data.NAME'"
             ) from error
-        return make(**self.common)
 
     @property
     def loader_processes(self) -> int:

@@ -57,4 +57,5 @@ class FrameCache:
 
 
 def _size(frames: Frames) -> int:
-    return frames.images.nbytes + frames.depth.nbytes + frames.world_to_camera.nbytes + frames.intrinsics.nbytes
+    mask = 0 if frames.mask is None else frames.mask.nbytes
+    return mask + frames.images.nbytes + frames.depth.nbytes + frames.world_to_camera.nbytes + frames.intrinsics.nbytes

@@ -41,6 +41,7 @@ class Mixture(SceneSource):
         self.sources = {name: _make(name, parts[name], list(parts), common) for name in self.weights}
         self.is_metric = all(source.is_metric for source in self.sources.values())
         self.has_depth = all(source.has_depth for source in self.sources.values())
+        self.dense_depth = all(source.dense_depth for source in self.sources.values())
         self.has_cameras = all(source.has_cameras for source in self.sources.values())
         self._scenes = _select(_interleave(self.sources), scenes)
 

@@ -28,6 +28,7 @@ def resize(frames: Frames, size: tuple[int, int]) -> Frames:
         images=resize_images(frames.images, size),
         depth=resize_depth(frames.depth, size, frames.sparse_depth),
         intrinsics=resize_intrinsics(frames.intrinsics, size[1] / width, size[0] / height),
+        mask=None if frames.mask is None else resize_images(frames.mask[:, None], size)[:, 0],
     )
 
 
@@ -65,13 +66,14 @@ def crop(frames: Frames, top: int, left: int, size: tuple[int, int]) -> Frames:
         images=window(frames.images),
         depth=window(frames.depth),
         intrinsics=crop_intrinsics(frames.intrinsics, left, top),
+        mask=None if frames.mask is None else window(frames.mask),
     )
 
 
 def pad(frames: Frames, top: int, left: int, size: tuple[int, int]) -> Frames:
     """Puts frames into black images of ``size`` (height, width), their first pixel at (``top``, ``left``).
 
-    What is added has no depth.
+    What is added has no depth, and does not count where there is a mask.
     """
     height, width = frames.depth.shape[-2:]
     margins = (left, size[1] - left - width, top, size[0] - top - height)
@@ -80,6 +82,7 @@ def pad(frames: Frames, top: int, left: int, size: tuple[int, int]) -> Frames:
         images=constant_pad(frames.images, margins),
         depth=constant_pad(frames.depth, margins),
         intrinsics=crop_intrinsics(frames.intrinsics, -left, -top),
+        mask=None if frames.mask is None else constant_pad(frames.mask, margins),
     )
 
 

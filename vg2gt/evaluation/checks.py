@@ -75,10 +75,11 @@ def refuse_without_hints(model: Reconstructor, source: SceneSource) -> None:
     """
     backend = model.backend
     needed = {"depth": backend.needs_depth, "cameras": backend.needs_hints}
-    there = {"depth": source.has_depth, "cameras": source.has_cameras}
+    there = {"depth": source.has_depth and source.dense_depth, "cameras": source.has_cameras}
     lacking = [name for name, needs in needed.items() if needs and not there[name]]
     if lacking:
         raise DataError(
-            f"backend {backend.name} needs the data's {' and '.join(lacking)}, and {type(source).__name__} has none: "
-            "choose another backend= or other data"
+            f"backend {backend.name} needs the data's {' and '.join(lacking)}, and {type(source).__name__} has none"
+            + (" (depth at sparse points is not enough)" if source.has_depth and not source.dense_depth else "")
+            + ": choose another backend=, such as sweep, or other data"
         )

@@ -1,4 +1,4 @@
-"""One scene reconstructed and scored: briefly while training, completely by the evaluate command."""
+"""One scene reconstructed and scored by the evaluate command."""
 
 from __future__ import annotations
 
@@ -9,103 +9,30 @@ from typing import Any
 
 import torch
 
+from vg2gt.evaluation.in_training import CV_QUERIES, render_or_nan
 from vg2gt.evaluation.options import EvaluationOptions
 from vg2gt.evaluation.protocols import ground_truth_target_cameras, joint_target_cameras
 from vg2gt.evaluation.scene_metrics import (
     align_geometry,
-    depth_to_camera_scale,
-    edge_metrics,
     image_metrics,
     point_cloud_metrics,
     present,
     rendered_normal_metrics,
 )
-from vg2gt.geometry.precision import full_precision, half_precision_on_gpu
+from vg2gt.geometry.precision import half_precision_on_gpu
 from vg2gt.metrics import LPIPS, camera_metrics, cv, depth_metrics
 from vg2gt.model import Reconstructor
 from vg2gt.profiling import clocked, now, peak_memory_mib, reset_peak_memory
 from vg2gt.refinement import Observations, RefineOptions, refine
-from vg2gt.rendering import Renderer, UnrenderableError
-from vg2gt.types import Batch, Cameras, Gaussians, Prediction, Render
+from vg2gt.rendering import Renderer
+from vg2gt.types import Batch, Cameras, Prediction, Render
 
 log = logging.getLogger(__name__)
 
-CV_QUERIES = 20_000
 MODES = ("solid", "rasterized")
 PROTOCOLS = ("novel", "gt_pose", "context")
 
 Metrics = dict[str, float | None]
-
-
-@torch.no_grad()
-def evaluate_scene(
-    model: Reconstructor, renderer: Renderer, batch: Batch, rasterized: bool = False
-) -> dict[str, float]:
-    """Reconstructs a scene from its context views and metrics it on its held-out views, as training runs do.
-
-    Args:
-        model: the model, in any mode; it is not changed.
-        renderer: its options are used in both modes.
-        batch: one scene (B = 1) with held-out views.
-        rasterized: score the depth of 3DGS rasterisation as well.
-
-    Returns:
-        ``psnr``, ``ssim``, ``rmse``, ``abs_rel``, ``delta_1.25``, ``delta_1.05``, ``coverage``, ``normal_mean`` on
-        held-out views at ground-truth poses, rendered as solids whatever the training renders; with ``rasterized``
-        ``abs_rel_rasterized``, of the same views rasterised as in 3DGS; ``decoded_abs_rel_before`` and
-        ``decoded_abs_rel`` on the context views; ``gaussians``, ``cv``. Depth is aligned by one median scale per scene.
-
-    Raises:
-        ValueError: if the batch holds several scenes or no held-out view.
-    """
-    held_out = batch.images.shape[1] - batch.num_context
-    if len(batch.scene) != 1 or not held_out:
-        raise ValueError(f"evaluation takes one scene with held-out views, got {batch.scene} with {held_out} of them")
-    prediction = model(batch.context.images, batch.context.hints)
-    with full_precision(batch.images):
-        return _scene_figures(prediction, renderer, batch, rasterized)
-
-
-def _scene_figures(prediction: Prediction, renderer: Renderer, batch: Batch, rasterized: bool) -> dict[str, float]:
-    target = batch.target
-    cameras = ground_truth_target_cameras(batch, prediction)
-    rendered = render_or_nan(renderer, prediction.gaussians, cameras, "solid")
-    depth = depth_metrics(rendered.depth[0], target.depth[0], "scene")
-
-    def abs_rel(found: torch.Tensor, truth: Batch) -> float:
-        return depth_metrics(found[0], truth.depth[0], "scene")["abs_rel"]
-
-    metrics = {
-        **image_metrics(rendered, target),
-        **{name: depth[name] for name in ("rmse", "abs_rel", "delta_1.25", "delta_1.05", "coverage")},
-        "normal_mean": rendered_normal_metrics(rendered, target)["normal_mean"],
-        "decoded_abs_rel_before": abs_rel(prediction.initial.depth, batch.context),
-        "decoded_abs_rel": abs_rel(prediction.geometry.depth, batch.context),
-        **edge_metrics(rendered, target, "scene"),
-        "depth_to_camera_scale_before": depth_to_camera_scale(prediction.initial, batch.context),
-        "depth_to_camera_scale": depth_to_camera_scale(prediction.geometry, batch.context),
-        "gaussians": float(len(prediction.gaussians)),
-        "cv": cv(prediction.gaussians.means, max_queries=CV_QUERIES),
-    }
-    if rasterized:
-        flat = render_or_nan(renderer, prediction.gaussians, cameras, "rasterized")
-        metrics["abs_rel_rasterized"] = abs_rel(flat.depth, target)
-    return metrics
-
-
-def render_or_nan(renderer: Renderer, gaussians: Gaussians, cameras: Cameras, mode: Any) -> Render:
-    """Renders; where Gaussians or cameras cannot be rendered, says so in the log and returns views of NaN.
-
-    Figures of such views are NaN, which reports show as n/a: one scene does not end an evaluation.
-    """
-    try:
-        return renderer(gaussians, cameras, mode=mode)
-    except UnrenderableError as error:
-        log.warning("a scene has nothing to render: %s", error)
-    views = cameras.world_to_camera.shape[:2]
-    flat = gaussians.means.new_full((*views, *cameras.size), torch.nan)
-    three = flat[:, :, None].expand(-1, -1, 3, -1, -1)
-    return Render(color=three, depth=flat, normal=three, alpha=flat)
 
 
 @dataclass(frozen=True)
@@ -192,7 +119,9 @@ class SceneEvaluator:
         device, geometry = batch.images.device, prediction.geometry
         reset_peak_memory(device)
         began = now(device)
-        seen = Observations(batch.context.images[0], geometry.depth[0], geometry.depth_conf[0])
+        context = batch.context
+        mask = None if context.mask is None else context.mask[0]
+        seen = Observations(context.images[0], geometry.depth[0], geometry.depth_conf[0], mask)
         found = refine(prediction.gaussians, geometry.cameras, seen, self.renderer, options)
         cost = {"refine_seconds": now(device) - began, "peak_memory_mib": peak_memory_mib(device)}
         gaussians = found.scene.gaussians

@@ -2,13 +2,8 @@
 
 from vg2gt.io.cameras_json import NamedCamera, named_cameras, read_cameras_json, write_cameras_json
 from vg2gt.io.colmap import (
-    ColmapCamera,
-    ColmapImage,
-    ColmapModel,
-    ColmapPoints,
-    colmap_camera,
     colmap_from_views,
-    colmap_image,
+    colmap_images,
     colmap_intrinsics,
     colmap_pose,
     read_colmap,
@@ -23,10 +18,6 @@ from vg2gt.io.splat import read_splat, write_splat
 from vg2gt.io.video import read_video, write_video
 
 __all__ = [
-    "ColmapCamera",
-    "ColmapImage",
-    "ColmapModel",
-    "ColmapPoints",
     "ColoredPoints",
     "FormatError",
     "Lens",
@@ -34,9 +25,8 @@ __all__ = [
     "NamedCamera",
     "Transforms",
     "TransformsFrame",
-    "colmap_camera",
     "colmap_from_views",
-    "colmap_image",
+    "colmap_images",
     "colmap_intrinsics",
     "colmap_pose",
     "fuse_depth",

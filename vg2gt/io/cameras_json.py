@@ -1,7 +1,9 @@
 """``cameras.json``: the posed cameras of a scene, each with its own image size, in our conventions.
 
 The file is a list of objects ``name``, ``width``, ``height``, ``intrinsics`` (3 rows of 3, integer pixel centres) and
-``world_to_camera`` (4 rows of 4, OpenCV axes). Other fields are ignored. (3D Gaussian Splatting writes a file of the
+``world_to_camera`` (4 rows of 4, OpenCV axes). A reconstruction adds ``photo`` (the whole photograph's camera),
+``similarity`` (4 rows of 4: from this file's world to that of the cameras as they were given or found) and
+``metres_per_unit`` (null: unknown). Other fields are ignored. (3D Gaussian Splatting writes a file of the
 same name with other fields; it is refused, naming the missing one.)
 
 Example:
@@ -38,6 +40,25 @@ _ROTATION_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
+class Photo:
+    """The camera of a whole photograph, of which a view may be a reduced and cropped part.
+
+    Attributes:
+        name: of the file.
+        width: in pixels, upright and undistorted.
+        height: in pixels.
+        intrinsics: ``[3, 3]`` float64, integer pixel centres.
+        lens: what the file must be undistorted from (``vg2gt.data.sources.undistortion.lens_text``); empty: nothing.
+    """
+
+    name: str
+    width: int
+    height: int
+    intrinsics: NDArray[np.float64]
+    lens: str = ""
+
+
+@dataclass(frozen=True, eq=False)
 class NamedCamera:
     """One pinhole camera.
 
@@ -47,6 +68,9 @@ class NamedCamera:
         height: of the image in pixels.
         intrinsics: ``[3, 3]`` float64 in pixels, integer pixel centres.
         world_to_camera: ``[4, 4]`` float64, OpenCV axes, scene units.
+        photo: the whole photograph's camera, if known.
+        similarity: ``[4, 4]`` from this world to that of the cameras as they were given or found, if known.
+        metres_per_unit: metres per scene unit, if known.
     """
 
     name: str
@@ -54,6 +78,9 @@ class NamedCamera:
     height: int
     intrinsics: NDArray[np.float64]
     world_to_camera: NDArray[np.float64]
+    photo: Photo | None = None
+    similarity: NDArray[np.float64] | None = None
+    metres_per_unit: float | None = None
 
     def cameras(self) -> Cameras:
         """This camera as the renderer takes it: one scene, one view, float32."""
@@ -62,13 +89,22 @@ class NamedCamera:
 
     def fields(self) -> dict[str, Any]:
         """This camera as plain values, as it stands in a file."""
-        return {
+        fields: dict[str, Any] = {
             "name": self.name,
             "width": int(self.width),
             "height": int(self.height),
             "intrinsics": np.asarray(self.intrinsics, np.float64).tolist(),
             "world_to_camera": np.asarray(self.world_to_camera, np.float64).tolist(),
         }
+        if self.photo is not None:
+            photo = self.photo
+            intrinsics = np.asarray(photo.intrinsics, np.float64).tolist()
+            size = {"name": photo.name, "width": int(photo.width), "height": int(photo.height)}
+            fields["photo"] = {**size, "intrinsics": intrinsics, "lens": photo.lens}
+        if self.similarity is not None:
+            fields["similarity"] = np.asarray(self.similarity, np.float64).tolist()
+            fields["metres_per_unit"] = self.metres_per_unit
+        return fields
 
 
 def invert_pose(pose: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -134,18 +170,37 @@ def _camera(place: str, entry: Any) -> NamedCamera:
     name = entry.get("name")
     if not isinstance(name, str) or not name:
         raise FormatError(f"{place}.name is {short(name)}, expected the view's name")
-    intrinsics, pose = _matrix(place, entry, "intrinsics", 3), _matrix(place, entry, "world_to_camera", 4)
+    pose = _matrix(place, entry, "world_to_camera", 4)
+    check_rigid(f"{place}.world_to_camera", pose, _ROTATION_TOLERANCE)
+    (width, height), intrinsics = _optics(place, entry)
+    photo = entry.get("photo")
+    if photo is not None:
+        if not isinstance(photo, dict) or not all(isinstance(photo.get(key), str) for key in ("name", "lens")):
+            raise FormatError(f"{place}.photo is {short(photo)}, expected an object with name and lens")
+        (photo_width, photo_height), matrix = _optics(f"{place}.photo", photo)
+        photo = Photo(photo["name"], photo_width, photo_height, matrix, photo["lens"])
+    similarity = None if entry.get("similarity") is None else _matrix(place, entry, "similarity", 4)
+    metres = entry.get("metres_per_unit")
+    if metres is not None and (
+        isinstance(metres, bool) or not isinstance(metres, (int, float)) or not 0 < metres < 1e30
+    ):
+        raise FormatError(f"{place}.metres_per_unit is {short(metres)}, expected a positive number or null")
+    return NamedCamera(name, width, height, intrinsics, pose, photo, similarity, metres)
+
+
+def _optics(place: str, entry: dict[str, Any]) -> tuple[tuple[int, int], NDArray[np.float64]]:
+    """(width, height) and intrinsics of an entry."""
+    intrinsics = _matrix(place, entry, "intrinsics", 3)
     focal = intrinsics[[0, 1], [0, 1]]
     if (focal <= 0).any() or np.abs(intrinsics[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]] - [0, 0, 0, 0, 1]).max() > 1e-9:
         raise FormatError(
             f"{place}.intrinsics is {intrinsics.tolist()}, expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with "
             "positive focal lengths and no skew; undistort the images"
         )
-    check_rigid(f"{place}.world_to_camera", pose, _ROTATION_TOLERANCE)
     width, height = _pixels(place, entry, "width"), _pixels(place, entry, "height")
     if width * height > MOST_PIXELS:
         raise FormatError(f"{place} has {width}x{height} pixels, more than {MOST_PIXELS} in all")
-    return NamedCamera(name, width, height, intrinsics, pose)
+    return (width, height), intrinsics
 
 
 def _pixels(place: str, entry: dict[str, Any], field: str) -> int:

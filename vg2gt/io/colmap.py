@@ -1,93 +1,121 @@
-"""COLMAP models, text and binary: cameras, posed images, sparse points.
+"""COLMAP models, text and binary, by pycolmap (``pip install 'vg2gt[colmap]'``): cameras, posed images, sparse points.
 
-The records hold the files' own numbers, so that reading and writing is exact. Our conventions come in at four named
-places only: :func:`colmap_intrinsics` and :func:`colmap_camera` move the principal point by half a pixel (COLMAP has
-the centre of the first pixel at (1/2, 1/2), we at (0, 0)), :func:`colmap_pose` and :func:`colmap_image` turn COLMAP's
-quaternion and translation into our ``world_to_camera`` and back (both are OpenCV cameras).
+A model is a ``pycolmap.Reconstruction``, in COLMAP's conventions. Ours come in at four places only:
+:func:`colmap_intrinsics` and :func:`colmap_from_views` move the principal point by half a pixel (COLMAP has the centre
+of the first pixel at (1/2, 1/2), we at (0, 0)), :func:`colmap_pose` and :func:`colmap_from_views` turn COLMAP's pose
+into our ``world_to_camera`` and back (both are OpenCV cameras).
 
 Example:
-    >>> import numpy as np, tempfile
-    >>> from vg2gt.io import colmap_camera, colmap_image, colmap_intrinsics, read_colmap, write_colmap
-    >>> from vg2gt.io import ColmapModel, ColmapPoints
-    >>> intrinsics = np.array([[500.0, 0, 319.5], [0, 500.0, 239.5], [0, 0, 1]])
-    >>> camera = colmap_camera(1, intrinsics, size=(480, 640))
-    >>> image = colmap_image(1, np.eye(4), camera.id, "room/0001.png")
-    >>> model = ColmapModel({1: camera}, {1: image}, ColmapPoints.empty())
+    >>> import tempfile, torch
+    >>> from vg2gt.io import colmap_from_views, colmap_images, colmap_intrinsics, read_colmap, write_colmap
+    >>> from vg2gt.types import Cameras
+    >>> intrinsics = torch.tensor([[500.0, 0, 319.5], [0, 500.0, 239.5], [0, 0, 1]])
+    >>> cameras = Cameras(torch.eye(4)[None, None], intrinsics[None, None], (480, 640))
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     model = read_colmap(write_colmap(folder, model))
-    >>> model.cameras[1].params, model.images[1].name
-    ((500.0, 500.0, 320.0, 240.0), 'room/0001.png')
-    >>> bool((colmap_intrinsics(model.cameras[1]) == intrinsics).all())
-    True
+    ...     model = read_colmap(write_colmap(folder, colmap_from_views(cameras, ["room/0001.png"])))
+    >>> (image,) = colmap_images(model)
+    >>> image.name, image.camera.params.tolist(), colmap_intrinsics(image.camera)[0].tolist()
+    ('room/0001.png', [500.0, 500.0, 320.0, 240.0], [500.0, 0.0, 319.5])
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+import importlib.util
+import os
+import re
+import struct
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeAlias
 
 import numpy as np
-import torch
+import PIL.Image  # noqa: F401  first: the other way round, the two mix up their copies of zlib
 from numpy.typing import ArrayLike, NDArray
 
-from vg2gt.geometry.rotations import matrix_to_quat, quat_to_matrix
-from vg2gt.io import colmap_binary, colmap_text
-from vg2gt.io.colmap_records import (
-    CAMERA_MODELS,
-    ColmapCamera,
-    ColmapImage,
-    ColmapModel,
-    ColmapPoints,
-    check_camera,
-)
 from vg2gt.io.errors import FormatError
-from vg2gt.io.files import write_bytes
+from vg2gt.io.files import regular
+from vg2gt.io.names import by_number
 from vg2gt.types import Cameras
 
+# Of pycolmap, which is imported only where it is needed.
+Reconstruction: TypeAlias = Any
+Image: TypeAlias = Any
+Camera: TypeAlias = Any
+
 PIXEL_CENTER = 0.5  # where COLMAP has the centre of the first pixel; ours is at 0
+FILES = ("cameras", "images", "points3D")
+_NOT_FINITE = re.compile(r"[+-]?(nan(\(.*\))?|inf(inity)?|1\.#\w+)", re.IGNORECASE)
+_FAR = 1e30
+EXTRA = "pip install 'vg2gt[colmap]'"
 
-_FILES = ("cameras", "images", "points3D")
-Numbered = TypeVar("Numbered", ColmapCamera, ColmapImage)
 
-
-def read_colmap(folder: str | Path) -> ColmapModel:
-    """Reads a model, binary if its three ``.bin`` files are there and text (``.txt``) otherwise.
+def require_pycolmap(purpose: str) -> None:
+    """Checks early that pycolmap is installed.
 
     Args:
-        folder: the folder with ``cameras``, ``images`` and ``points3D``, usually ``sparse/0``. Newer files beside them
-            (``rigs``, ``frames``) only repeat the poses and are not needed.
-
-    Returns:
-        The model, in COLMAP's conventions. Poses may hold NaN if the file does: see :func:`colmap_pose`.
+        purpose: what needs it, the start of the message.
 
     Raises:
-        FormatError: if there is no model, or if a file is damaged, naming the file, the place and what is wrong.
+        ImportError: if it is not, with the command that installs it.
     """
-    folder = Path(folder)
-    for ending, reader in ((".bin", colmap_binary), (".txt", colmap_text)):
-        paths = [folder / f"{name}{ending}" for name in _FILES]
-        if all(path.is_file() for path in paths):
-            model = ColmapModel(
-                _by_id(reader.read_cameras(paths[0]), paths[0]),
-                _by_id(reader.read_images(paths[1]), paths[1]),
-                reader.read_points(paths[2]),
-            )
-            _check_references(model, paths[1], paths[2])
-            return model
-    names = ", ".join(_FILES)
-    raise FormatError(
-        f"{folder}: no COLMAP model here, expected {names} all as .bin or all as .txt; give the model's own folder, "
-        "usually sparse/0"
-    )
+    if importlib.util.find_spec("pycolmap") is None:
+        raise ImportError(f"{purpose} needs pycolmap: {EXTRA}")
 
 
-def write_colmap(folder: str | Path, model: ColmapModel, *, text: bool = False) -> Path:
-    """Writes a model; each file appears whole or not at all. Reading it back gives the same numbers exactly.
+def colmap_files(folder: Path) -> dict[str, Path]:
+    """The model's files by ``FILES``; empty if the folder holds no model.
+
+    ``.bin`` goes before ``.txt``. Upper and lower case are the same, and ``points3D`` may be missing.
+    """
+    found = {path.name.lower(): path for path in sorted(folder.iterdir())} if folder.is_dir() else {}
+    for ending in (".bin", ".txt"):
+        files = {name: found[f"{name.lower()}{ending}"] for name in FILES if f"{name.lower()}{ending}" in found}
+        if "cameras" in files and "images" in files:
+            return files
+    return {}
+
+
+def read_colmap(folder: str | Path) -> Reconstruction:
+    """Reads a model of any camera models.
 
     Args:
-        folder: made if needed. Files of the other kind already there would be read instead or beside: they are refused.
+        folder: the folder with ``cameras``, ``images`` and usually ``points3D``, such as ``sparse/0``. ``rigs`` and
+            ``frames`` of newer versions repeat the poses and are not read.
+
+    Returns:
+        The model. Poses and points may be NaN if the files hold NaN, see :func:`colmap_pose`; the parameters of a
+        camera of which one is not finite are all 0, see :func:`colmap_intrinsics`.
+
+    Raises:
+        FormatError: if there is no model, or a file is damaged, naming the file.
+        ImportError: if pycolmap is not installed.
+    """
+    folder = Path(folder)
+    files = colmap_files(folder)
+    if not files:
+        raise FormatError(
+            f"{folder}: no COLMAP model here, expected {', '.join(FILES)} all as .bin or all as .txt; give the model's "
+            "own folder, usually sparse/0"
+        )
+    require_pycolmap(f"reading the COLMAP model {folder}")
+    import pycolmap  # pyright: ignore[reportMissingImports]
+
+    with tempfile.TemporaryDirectory(prefix="vg2gt-colmap-") as temporary, quiet_colmap():
+        for name in FILES:
+            _stage(name, files.get(name), Path(temporary), files["cameras"].suffix.lower())
+        try:
+            return pycolmap.Reconstruction(temporary)
+        except (ValueError, IndexError, KeyError, RuntimeError, MemoryError) as error:
+            raise FormatError(f"{folder}: damaged COLMAP model ({_reason(error)})") from error
+
+
+def write_colmap(folder: str | Path, model: Reconstruction, *, text: bool = False) -> Path:
+    """Writes a model, each file whole or not at all.
+
+    Args:
+        folder: made if needed. Files of the other kind already there would be read instead: they are refused.
         model: what to write; not changed.
         text: True writes ``.txt``, False ``.bin``.
 
@@ -95,62 +123,51 @@ def write_colmap(folder: str | Path, model: ColmapModel, *, text: bool = False) 
         The folder.
 
     Raises:
-        ValueError: if the model contradicts itself, or a name cannot be written.
         FileExistsError: if the folder holds a model of the other kind.
     """
     folder = Path(folder)
-    _check_writable(model)
-    writer, ending, other = (colmap_text, ".txt", ".bin") if text else (colmap_binary, ".bin", ".txt")
-    for name in _FILES:
-        if (folder / f"{name}{other}").exists():
-            raise FileExistsError(f"{folder} holds {name}{other} of another model; write to an empty folder")
-    contents = (
-        writer.cameras_content(list(model.cameras.values())),
-        writer.images_content(list(model.images.values())),
-        writer.points_content(model.points),
-    )
-    for name, content in zip(_FILES, contents, strict=True):
-        write_bytes(folder / f"{name}{ending}", content)
+    folder.mkdir(parents=True, exist_ok=True)
+    other = colmap_files(folder).get("cameras")
+    if other is not None and (other.suffix.lower() == ".txt") != text:
+        raise FileExistsError(f"{folder} holds {other.name} of another model; write to an empty folder")
+    with tempfile.TemporaryDirectory(prefix=".colmap-", dir=folder) as temporary, quiet_colmap():
+        (model.write_text if text else model.write_binary)(temporary)
+        for path in sorted(Path(temporary).iterdir()):
+            os.replace(path, folder / path.name)
     return folder
 
 
-def colmap_intrinsics(camera: ColmapCamera) -> NDArray[np.float64]:
+def colmap_images(model: Reconstruction) -> list[Image]:
+    """A model's images in the order of their names, numbers in names by their value (``2.jpg`` before ``10.jpg``)."""
+    return sorted(model.images.values(), key=lambda image: by_number(image.name))
+
+
+def colmap_intrinsics(camera: Camera) -> NDArray[np.float64]:
     """Pinhole part of a camera ``[3, 3]`` in pixels, with our integer pixel centres; distortion is left out.
+
+    All NaN where the file's parameters are not finite.
 
     Raises:
         ValueError: if the camera model has no focal length (EQUIRECTANGULAR).
     """
-    if "cx" not in CAMERA_MODELS[camera.model][1]:
-        raise ValueError(f"camera {camera.id}: {camera.model} has no pinhole part; reproject the images to PINHOLE")
-    fx, fy, cx, cy = (camera.param(name) for name in ("fx", "fy", "cx", "cy"))
-    return np.array([[fx, 0, cx - PIXEL_CENTER], [0, fy, cy - PIXEL_CENTER], [0, 0, 1]])
+    if not len(camera.focal_length_idxs()):
+        raise ValueError(f"camera {camera.camera_id}: {camera.model_name} has no pinhole part; cut it into cube faces")
+    if not np.any(camera.params):
+        return np.full((3, 3), np.nan)
+    matrix = np.array(camera.calibration_matrix(), np.float64)
+    matrix[:2, 2] -= PIXEL_CENTER
+    return matrix
 
 
-def colmap_camera(number: int, intrinsics: ArrayLike, size: tuple[int, int]) -> ColmapCamera:
-    """PINHOLE camera of our intrinsics ``[3, 3]`` (integer pixel centres) and image ``(height, width)``."""
-    k = np.asarray(intrinsics, np.float64)
-    params = (k[0, 0], k[1, 1], k[0, 2] + PIXEL_CENTER, k[1, 2] + PIXEL_CENTER)
-    return ColmapCamera(number, "PINHOLE", int(size[1]), int(size[0]), tuple(float(value) for value in params))
-
-
-def colmap_pose(image: ColmapImage) -> NDArray[np.float64]:
-    """``world_to_camera`` ``[4, 4]`` of an image; all NaN where its quaternion is zero or anything is not finite."""
-    values = np.array((*image.quat, *image.translation))
-    if not np.isfinite(values).all() or not np.abs(values[:4]).max() > 0:
-        return np.full((4, 4), np.nan)
-    pose = np.eye(4)
-    # divided by the largest component first: squares of extreme values would overflow or vanish
-    pose[:3, :3] = quat_to_matrix(torch.from_numpy(values[:4] / np.abs(values[:4]).max())).numpy()
-    pose[:3, 3] = values[4:]
+def colmap_pose(image: Image) -> NDArray[np.float64]:
+    """``world_to_camera`` ``[4, 4]`` of an image; all NaN where it has none or anything in it is not finite."""
+    pose = np.full((4, 4), np.nan)
+    if image.has_pose:
+        rigid = np.asarray(image.cam_from_world().matrix(), np.float64)
+        turn = np.linalg.norm(image.cam_from_world().rotation.quat)
+        if (np.abs(rigid) < _FAR).all() and turn > 0.5:
+            pose = np.vstack((rigid, [0, 0, 0, 1]))
     return pose
-
-
-def colmap_image(number: int, world_to_camera: ArrayLike, camera_id: int, name: str) -> ColmapImage:
-    """Image without features at a rigid pose ``world_to_camera`` ``[4, 4]``."""
-    pose = np.asarray(world_to_camera, np.float64)
-    qw, qx, qy, qz = matrix_to_quat(torch.from_numpy(pose[:3, :3].copy())).tolist()
-    tx, ty, tz = pose[:3, 3].tolist()
-    return ColmapImage(number, (qw, qx, qy, qz), (tx, ty, tz), camera_id, name, np.zeros((0, 2)), np.zeros(0, np.int64))
 
 
 def colmap_from_views(
@@ -158,8 +175,9 @@ def colmap_from_views(
     names: Sequence[str],
     positions: ArrayLike | None = None,
     colors: ArrayLike | None = None,
-    sources: tuple[ArrayLike, ArrayLike] | None = None,
-) -> ColmapModel:
+    sources: tuple[ArrayLike, ArrayLike, ArrayLike] | None = None,
+    sizes: Sequence[tuple[int, int]] | None = None,
+) -> Reconstruction:
     """Model of one scene's views, one PINHOLE camera each, numbered from 1, and points seen in them.
 
     Args:
@@ -167,18 +185,18 @@ def colmap_from_views(
         names: V file names relative to the image folder.
         positions: ``[N, 3]`` world positions; None for no points.
         colors: ``[N, 3]`` uint8; None is mid grey.
-        sources: where each point comes from: its view ``[N]`` and the pixel ``[N, 2]`` as (x, y), integer centres;
-            becomes the point's only observation. None leaves points without observations.
-
-    Returns:
-        The model, in COLMAP's conventions.
+        sources: observations: the point ``[T]``, the view ``[T]`` and the pixel ``[T, 2]`` as (x, y), integer centres.
+            None leaves points without observations.
+        sizes: the images' ``(height, width)`` where each view has its own; None: that of the cameras.
 
     Raises:
+        ImportError: if pycolmap is not installed.
         ValueError: if the shapes disagree.
     """
-    poses, intrinsics = (
-        tensor.detach().cpu().double().numpy() for tensor in (cameras.world_to_camera, cameras.intrinsics)
-    )
+    require_pycolmap("writing a COLMAP model")
+    import pycolmap  # pyright: ignore[reportMissingImports]
+
+    poses, matrices = (t.detach().cpu().double().numpy() for t in (cameras.world_to_camera, cameras.intrinsics))
     if len(poses) != 1 or poses.shape[1] != len(names):
         raise ValueError(
             f"expected one scene with as many views as names ({len(names)}), got cameras of shape "
@@ -190,65 +208,154 @@ def colmap_from_views(
         raise ValueError(
             f"positions must be [N, 3] and colors uint8 [N, 3], got {list(xyz.shape)} and {rgb.dtype} {list(rgb.shape)}"
         )
-    ids = np.arange(1, len(xyz) + 1)
-    images = [
-        colmap_image(i + 1, pose, i + 1, name) for i, (pose, name) in enumerate(zip(poses[0], names, strict=True))
-    ]
-    tracks, lengths = np.zeros((0, 2), np.int64), np.zeros(len(xyz), np.int64)
-    if sources is not None:
-        views, pixels = np.asarray(sources[0], np.int64), np.asarray(sources[1], np.float64)
-        if views.shape != (len(xyz),) or pixels.shape != (len(xyz), 2):
-            raise ValueError(f"sources must be [N] and [N, 2] for {len(xyz)} points, got {views.shape}, {pixels.shape}")
-        rows = np.zeros(len(xyz), np.int64)
-        for view, image in enumerate(images):
-            seen = np.flatnonzero(views == view)
-            rows[seen] = np.arange(len(seen))
-            images[view] = replace(image, points2d=pixels[seen] + PIXEL_CENTER, point3d_ids=ids[seen])
-        tracks, lengths = np.stack((views + 1, rows), -1), np.ones(len(xyz), np.int64)
-    return ColmapModel(
-        {i + 1: colmap_camera(i + 1, k, cameras.size) for i, k in enumerate(intrinsics[0])},
-        {image.id: image for image in images},
-        ColmapPoints(ids, xyz, rgb, np.full(len(xyz), -1.0), tracks, lengths),
-    )
+    owner, view_of, pixels = _observations(sources, len(xyz), len(names))
+    tracks = [pycolmap.Track() for _ in xyz]
+    model = pycolmap.Reconstruction()
+    for view, name in enumerate(names):
+        size, k = (cameras.size if sizes is None else sizes[view]), matrices[0, view]
+        params = [k[0, 0], k[1, 1], k[0, 2] + PIXEL_CENTER, k[1, 2] + PIXEL_CENTER]
+        model.add_camera_with_trivial_rig(
+            pycolmap.Camera(camera_id=view + 1, model="PINHOLE", width=size[1], height=size[0], params=params)
+        )
+        seen = np.flatnonzero(view_of == view)
+        for row, observation in enumerate(seen.tolist()):
+            tracks[owner[observation]].add_element(view + 1, row)
+        image = pycolmap.Image(name, pixels[seen] + PIXEL_CENTER, view + 1, view + 1)
+        pose = np.ascontiguousarray(poses[0, view, :3])
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose))
+    for position, track, color in zip(xyz, tracks, rgb, strict=True):
+        model.add_point3D(position, track, color)
+    return model
 
 
-def _by_id(records: list[Numbered], path: Path) -> dict[int, Numbered]:
-    by_id = {record.id: record for record in records}
-    if len(by_id) != len(records):
-        raise FormatError(f"{path}: {len(records) - len(by_id)} numbers occur twice; the file is damaged")
-    return by_id
+@contextmanager
+def quiet_colmap() -> Iterator[None]:
+    """Keeps COLMAP's own log off the console."""
+    import pycolmap  # pyright: ignore[reportMissingImports]
+
+    before = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = before
 
 
-def _check_references(model: ColmapModel, images: Path, points: Path) -> None:
-    """Every number that a file refers to must exist; features and tracks are compared by their ends only."""
-    for image in model.images.values():
-        if image.camera_id not in model.cameras:
-            raise FormatError(f"{images}: image {image.id} ({image.name}) names camera {image.camera_id}, not a camera")
-    if len(np.unique(model.points.ids)) != len(model.points):
-        raise FormatError(f"{points}: a point number occurs twice; the file is damaged")
-    sizes = {image.id: len(image.points2d) for image in model.images.values()}
-    numbers, which = np.unique(model.points.tracks[:, 0], return_inverse=True)
-    limits = np.array([sizes.get(number, 0) for number in numbers.tolist()], np.int64)
-    bad = np.flatnonzero(model.points.tracks[:, 1] >= limits[which]) if len(numbers) else np.zeros(0, np.int64)
-    if len(bad):
-        number, row = model.points.tracks[bad[0]].tolist()
-        raise FormatError(f"{points}: a track names feature {row} of image {number}, which {images.name} does not have")
+def _observations(sources: Any, points: int, views: int) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray]:
+    if sources is None:
+        return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2))
+    owner, view, pixels = (np.asarray(part) for part in sources)
+    count = len(owner)
+    inside = count == 0 or (owner.min() >= 0 and owner.max() < points and view.min() >= 0 and view.max() < views)
+    if owner.shape != (count,) or view.shape != (count,) or pixels.shape != (count, 2) or not inside:
+        raise ValueError(
+            f"sources must be points [T] below {points}, views [T] below {views} and pixels [T, 2], got shapes "
+            f"{owner.shape}, {view.shape}, {pixels.shape}"
+        )
+    return owner.astype(np.int64), view.astype(np.int64), pixels.astype(np.float64)
 
 
-def _check_writable(model: ColmapModel) -> None:
-    for number, camera in model.cameras.items():
-        check_camera(camera, f"camera {number}")
-    numbered = (*model.cameras.items(), *model.images.items())
-    for number, record in numbered:
-        if record.id != number or not 0 <= number < 1 << 32:
-            raise ValueError(f"{record.id} stands under number {number}; numbers must agree and fit into 32 bits")
-    for number, image in model.images.items():
-        if image.camera_id not in model.cameras:
-            raise ValueError(f"image {number} names camera {image.camera_id}, which the model does not have")
-        if not image.name or "\0" in image.name or "\n" in image.name:
-            raise ValueError(f"image {number} is called {image.name!r}; a name must not be empty or hold a line break")
-        if image.points2d.shape != (len(image.point3d_ids), 2):
-            raise ValueError(f"image {number}: points2d {image.points2d.shape}, expected {len(image.point3d_ids), 2}")
-    observations, expected = len(model.points.tracks), model.points.track_lengths.sum()
-    if observations != expected:
-        raise ValueError(f"track_lengths sum to {expected}, but tracks have {observations} rows; they must agree")
+def _stage(name: str, path: Path | None, folder: Path, ending: str) -> None:
+    """Puts one file where pycolmap finds it, checked or cleaned."""
+    target = folder / f"{name}{ending}"
+    if path is None:  # a model without points
+        target.write_bytes(bytes(8) if ending == ".bin" else b"")
+    elif ending == ".bin":
+        data = _checked(name, path)
+        if name == "cameras":
+            target.write_bytes(data)
+        else:
+            target.symlink_to(path.resolve())
+    else:
+        try:
+            text = regular(path).read_text(encoding="utf-8-sig")
+        except UnicodeDecodeError as error:
+            raise FormatError(f"{path}: not UTF-8 text ({error}); the file is damaged or not a text model") from error
+        if name == "cameras" or re.search(r"(?i)[\s-](nan|inf)\b", text):
+            text = "\n".join(_clean_line(name, line) for line in text.split("\n"))
+        target.write_text(text, encoding="utf-8")
+
+
+def _clean_line(name: str, line: str) -> str:
+    """A line as pycolmap reads it: camera models in upper case, and something finite in place of what is not.
+
+    Of a camera all parameters become 0; an image and a point go so far away that they count as unknown.
+    """
+    fields = line.split(" ") if name == "images" else line.split()
+    if not fields or fields[0].startswith("#"):
+        return line
+    spoilt = [_NOT_FINITE.fullmatch(field) is not None for field in fields]
+    if name == "cameras" and len(fields) > 4:
+        fields[1] = fields[1].upper()
+        fields[4:] = ["0"] * len(fields[4:]) if any(spoilt[4:]) else fields[4:]
+    elif name == "images" and any(spoilt):
+        pose = len(fields) > 9 and re.search("[A-Za-z]", fields[9])  # the line before an image's features
+        fields = (
+            [fields[0], "1", "0", "0", "0", *(["1e300"] * 3), *fields[8:]] if pose else _replaced(fields, spoilt, "0")
+        )
+    elif name == "points3D" and any(spoilt):
+        fields = [*_replaced(fields[:7], spoilt, "1e300"), *_replaced(fields[7:], spoilt[7:], "-1")]
+    return " ".join(fields)
+
+
+def _replaced(fields: list[str], spoilt: list[bool], by: str) -> list[str]:
+    return [by if bad else field for field, bad in zip(fields, spoilt, strict=False)]
+
+
+def _checked(name: str, path: Path) -> bytes | bytearray:
+    """Walks over a binary file's records: pycolmap believes any count, and fills the memory with what is not there.
+
+    Returns:
+        The content, the parameters of cameras that are not finite all set to 0.
+
+    Raises:
+        FormatError: if the file ends early, or goes on after its last record.
+    """
+    data = regular(path).read_bytes()
+    if name == "cameras":
+        data = bytearray(data)
+    place = 8
+    for number in range(_count(data, 0, path, "records")):
+        if name == "cameras":
+            size = 24 + 8 * _parameters(data, place + 4, path)
+            params = np.frombuffer(data[place + 24 : place + size], np.uint8)
+            if len(params) == size - 24 and not np.isfinite(params.view("<f8")).all():
+                data[place + 24 : place + size] = bytes(size - 24)  # pyright: ignore[reportIndexIssue]
+        elif name == "images":
+            end = data.find(b"\0", place + 64, place + 64 + 4096)
+            size = len(data) if end < 0 else end + 9 - place + 24 * _count(data, end + 1, path, "features")
+        else:
+            size = 51 + 8 * _count(data, place + 43, path, "observations")
+        place += size
+        if place > len(data):
+            raise FormatError(
+                f"{path}: record {number + 1} ends after the file's {len(data)} bytes; the file is truncated or damaged"
+            )
+    if place != len(data):
+        raise FormatError(f"{path}: {len(data) - place} bytes follow the last record; the file is damaged")
+    return data
+
+
+def _count(data: bytes | bytearray, place: int, path: Path, what: str) -> int:
+    if place + 8 > len(data):
+        raise FormatError(f"{path}: ends before a number of {what} at byte {place}; the file is truncated or damaged")
+    (count,) = struct.unpack_from("<Q", data, place)
+    if count > len(data):
+        raise FormatError(f"{path}, byte {place}: {count} {what} cannot be in {len(data)} bytes; the file is damaged")
+    return count
+
+
+def _parameters(data: bytes | bytearray, place: int, path: Path) -> int:
+    """How many parameters a camera's model has."""
+    import pycolmap  # pyright: ignore[reportMissingImports]
+
+    try:
+        (number,) = struct.unpack_from("<i", data, place)
+        return len(pycolmap.Camera.create_from_model_id(0, pycolmap.CameraModelId(number), 1.0, 1, 1).params)
+    except (struct.error, ValueError, IndexError, RuntimeError) as error:
+        raise FormatError(f"{path}, byte {place}: unknown camera model; the file is damaged") from error
+
+
+def _reason(error: BaseException) -> str:
+    text = " ".join(str(error).split()) or type(error).__name__
+    return re.sub(r"^\[[\w.]+:\d+\] ", "", text)[:200]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
 from vg2gt.io.errors import DataError
-from vg2gt.io.images import color_image, open_image
+from vg2gt.io.images import color_image, has_alpha, open_image
 
 # What Pillow raises for files that are damaged in one way or another.
 _DAMAGED = (OSError, SyntaxError, ValueError, EOFError, zlib.error, struct.error, Image.DecompressionBombError)
@@ -103,6 +103,45 @@ def read_color(
         if turn is not None:
             pixels = np.array(Image.fromarray(pixels).transpose(turn))
     return pixels
+
+
+def read_mask(
+    path: Path, scene: str, content: bytes | None = None, upright: bool = False
+) -> NDArray[np.float32] | None:
+    """What counts of an image: its alpha, or the brightness of a mask image without one; ``[H, W]`` in [0, 1].
+
+    Args:
+        path: the file.
+        scene: the scene it belongs to, for messages; empty for a photograph of none.
+        content: the encoded image where it is a part of the file; None: it is the file.
+        upright: turn a photograph upright as its EXIF data says.
+
+    Returns:
+        None where everything counts, which for an image in colour means that it has no transparency.
+
+    Raises:
+        DataError: if the file is missing or damaged.
+    """
+    with _opened(path if content is None else io.BytesIO(content), path, scene) as image:
+        grey = image.mode in ("1", "L", "I", "I;16") and "transparency" not in image.info
+        if not grey and not has_alpha(image):
+            return None
+        turn = _TURNS.get(_orientation(image)) if upright else None
+        plane = image.convert("L") if image.mode in ("1", "L") else image
+        plane = plane if grey else image.convert("RGBA").getchannel("A")
+        values = np.array(plane if turn is None else plane.transpose(turn), np.float32)
+    largest = 255 if values.max(initial=0) <= 255 else 65535
+    return None if values.min(initial=largest) >= largest else (values / largest).astype(np.float32)
+
+
+def orientation(path: Path, scene: str) -> int:
+    """EXIF orientation of an image, 1 (upright) where it says none.
+
+    Raises:
+        DataError: if the file is missing or not an image.
+    """
+    with _opened(path, path, scene) as image:
+        return _orientation(image)
 
 
 def read_depth(path: Path, scene: str, size: Size | None = None) -> NDArray[np.int64]:

@@ -28,6 +28,8 @@ _DEPTH_ANCHORS = torch.tensor(
 )
 
 
+BACKGROUND = (255, 255, 255, 255)  # behind transparent pixels
+
 # Pillow tries every format it knows, whatever a file is called; some of them run other programs (EPS: Ghostscript).
 _FORMATS = ("PNG", "JPEG", "MPO", "PPM", "TIFF", "WEBP", "BMP", "GIF", "HEIF")
 
@@ -44,8 +46,16 @@ def open_image(file: str | Path | IO[bytes]) -> Image.Image:
     return Image.open(file, formats=[name for name in _FORMATS if name in Image.OPEN])
 
 
+def has_alpha(image: Image.Image) -> bool:
+    """Whether an image has transparency; nothing is decoded."""
+    return "A" in image.getbands() or "a" in image.getbands() or "transparency" in image.info
+
+
 def color_image(image: Image.Image) -> Image.Image:
     """A photograph in 8-bit colour; 16-bit grey is scaled, where Pillow's own conversion would cut it off at 255.
+
+    Transparency is composited over white, as the field does with synthetic sets: what lies hidden under alpha 0 is no
+    part of the picture.
 
     Raises:
         OSError: if its values have no known range: 32-bit integers and floats.
@@ -56,6 +66,9 @@ def color_image(image: Image.Image) -> Image.Image:
     elif image.mode in ("I", "F"):
         kind = "32-bit integers" if image.mode == "I" else "floating-point numbers"
         raise OSError(f"a photograph of {kind} has no known white: save it with 8 or 16 bits a channel")
+    if has_alpha(image):
+        image = image.convert("RGBA")
+        image = Image.alpha_composite(Image.new("RGBA", image.size, BACKGROUND), image)
     return image.convert("RGB")
 
 

@@ -76,7 +76,7 @@ class Lens:
     @property
     def is_distorted(self) -> bool:
         """Whether the images are not those of a pinhole camera."""
-        return any(value != 0 for value in self.distortion.values()) or "FISHEYE" in (self.camera_model or "")
+        return any(value != 0 for value in self.distortion.values()) or "FISHEYE" in (self.camera_model or "").upper()
 
     @staticmethod
     def from_intrinsics(
@@ -280,6 +280,8 @@ def _read_lens(fields: _Fields, shared: Lens) -> Lens:
         **{name: fields.number(name, *limits) for name, limits in _LIMITS.items()},
         "camera_model": fields.get("camera_model", str, "a camera model's name"),
     }
+    if fields.content.get("is_fisheye") is True:  # instant-ngp's way to say it
+        own["camera_model"] = "OPENCV_FISHEYE"
     coefficients = {name: fields.number(name) for name in DISTORTION}
     given = {name: value for name, value in coefficients.items() if value is not None}
     return replace(
@@ -290,7 +292,7 @@ def _read_lens(fields: _Fields, shared: Lens) -> Lens:
 
 
 def _read_frame(fields: _Fields, shared: Lens) -> TransformsFrame:
-    file_path = fields.text("file_path")
+    file_path = (fields.text("file_path") or "").replace("\\", "/")  # as written on Windows
     if not file_path:
         raise fields.wrong("file_path", file_path, "the name of an image file")
     lens = _read_lens(fields, shared)

@@ -1,4 +1,4 @@
-"""NumPy archives from anywhere: no pickles, and no more memory than the archive can justify."""
+"""NumPy archives from anywhere: no pickles."""
 
 from __future__ import annotations
 
@@ -13,21 +13,17 @@ from numpy.typing import NDArray
 from vg2gt.io.errors import DataError, FormatError
 from vg2gt.io.files import regular
 
-_ALWAYS = 256 << 20  # bytes that an archive may unpack to, however small it is
-_RATIO = 100  # more bytes than this for each byte of the archive are no data of ours (zeros reach 1000)
 
-
-def read_npz(file: str | Path | BinaryIO, names: Sequence[str], limit: int | None = None) -> dict[str, NDArray]:
+def read_npz(file: str | Path | BinaryIO, names: Sequence[str]) -> dict[str, NDArray]:
     """Reads named arrays of an ``.npz`` archive without executing anything in it.
 
     Args:
         file: a path, or an open file.
         names: the arrays to read; others are left alone.
-        limit: most bytes that the named arrays may unpack to; None: 256 MiB, or 100 times the archive's size.
 
     Raises:
         KeyError: naming an array that is not there.
-        FormatError: if the file is no archive, damaged, holds Python objects, or unpacks to more.
+        FormatError: if the file is no archive, damaged, or holds Python objects.
         OSError: if it cannot be opened.
     """
     try:
@@ -36,12 +32,24 @@ def read_npz(file: str | Path | BinaryIO, names: Sequence[str], limit: int | Non
         with np.load(file, allow_pickle=False) as stored:
             if not isinstance(stored, np.lib.npyio.NpzFile):
                 raise FormatError("it is a single array, not an archive")
-            _check_sizes(stored, names, limit)
             return {name: stored[name] for name in names}
     except (OSError, KeyError, FormatError):
         raise
     except Exception as error:  # damage raises whatever zipfile, zlib and the header's parser raise; sizes MemoryError
         raise FormatError(f"no readable archive of plain arrays: {error or type(error).__name__}") from error
+
+
+def npz_names(path: Path) -> tuple[str, ...]:
+    """Names of the arrays in an ``.npz`` file.
+
+    Raises:
+        FormatError: if it is no archive.
+    """
+    try:
+        with zipfile.ZipFile(regular(path)) as archive:
+            return tuple(name.removesuffix(".npy") for name in archive.namelist())
+    except zipfile.BadZipFile as error:
+        raise FormatError(f"no readable archive of plain arrays: {error}") from error
 
 
 def load_npz(path: Path, scene: str, names: Sequence[str]) -> dict[str, NDArray]:
@@ -56,15 +64,3 @@ def load_npz(path: Path, scene: str, names: Sequence[str]) -> dict[str, NDArray]
         raise DataError(f"{path} of scene {scene} has no array {error}; expected {', '.join(names)}") from error
     except (OSError, FormatError) as error:
         raise DataError(f"cannot read {path} of scene {scene}: {error}") from error
-
-
-def _check_sizes(stored: np.lib.npyio.NpzFile, names: Sequence[str], limit: int | None) -> None:
-    archive: zipfile.ZipFile | None = stored.zip
-    assert archive is not None
-    members = archive.infolist()
-    if limit is None:
-        limit = max(_ALWAYS, _RATIO * sum(member.compress_size for member in members))
-    wanted = {f"{name}.npy" for name in names} | set(names)
-    size = sum(member.file_size for member in members if member.filename in wanted)
-    if size > limit:
-        raise FormatError(f"its arrays unpack to {size} bytes, at most {limit} were expected; the file is damaged")

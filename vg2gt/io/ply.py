@@ -27,15 +27,17 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
+from vg2gt.io.compressed_ply import unpacked
 from vg2gt.io.errors import FormatError
 from vg2gt.io.files import write_bytes
 from vg2gt.io.gaussian_arrays import OPACITY_MARGIN, GaussianArrays, to_arrays, to_gaussians
-from vg2gt.io.ply_container import read_comments, read_vertices, vertices_content
+from vg2gt.io.ply_container import read_comments, read_elements, read_vertices, vertices_content
 from vg2gt.types import Gaussians
 
 POSITION = ("x", "y", "z")
 NORMAL = ("nx", "ny", "nz")
 COLOR = ("red", "green", "blue")
+FLATNESS = 0.01  # thickness of 2DGS's Gaussians, which have none, over their smaller side
 FULL_REST = 45  # spherical harmonics of degree 3 without the constant one
 _DC = tuple(f"f_dc_{i}" for i in range(3))
 _SCALE = tuple(f"scale_{i}" for i in range(3))
@@ -99,7 +101,9 @@ def read_gaussian_ply(path: str | Path) -> Gaussians:
 
     Args:
         path: the file. Normals may be missing, there may be 0, 9, 24 or 45 ``f_rest``, and other properties are
-            ignored. Rows with values that are not finite or a zero quaternion are left out with a warning.
+            ignored. Without ``scale_2`` (2DGS) Gaussians are flat. SuperSplat's compressed PLY is read too
+            (:mod:`vg2gt.io.compressed_ply`). Rows with values that are not finite or a zero quaternion are left out
+            with a warning.
 
     Returns:
         The Gaussians as scene 0, float32, in our activations: standard deviations, opacities, quaternions as they are.
@@ -108,8 +112,11 @@ def read_gaussian_ply(path: str | Path) -> Gaussians:
         FormatError: if the file is damaged or holds something else.
     """
     path = Path(path)
-    table = read_vertices(path)
+    elements = read_elements(path, "vertex", "chunk", "sh")
+    table = elements["vertex"]
     found = table.dtype.names or ()
+    if "packed_position" in found:
+        return to_gaussians(path, unpacked(path, elements))
     rest = [name for name in found if name.startswith("f_rest_")]
     if len(rest) not in (0, 9, 24, 45):
         raise FormatError(
@@ -126,7 +133,10 @@ def read_gaussian_ply(path: str | Path) -> Gaussians:
     )
     with np.errstate(over="ignore"):  # an infinite result is found and counted
         opacities = 1 / (1 + np.exp(-_columns(path, table, ("opacity",))[:, 0]))
-        scales = np.exp(_columns(path, table, _SCALE))
+        sides = _SCALE if _SCALE[2] in found or _SCALE[0] not in found else _SCALE[:2]
+        scales = np.exp(_columns(path, table, sides))
+        if len(sides) == 2:
+            scales = np.concatenate((scales, FLATNESS * scales.min(1, keepdims=True)), 1)
     means, quats = _columns(path, table, POSITION), _columns(path, table, _ROTATION)
     gaussians = to_gaussians(path, GaussianArrays(means, quats, scales, opacities, sh))
     return replace(gaussians, background=_background(path))
@@ -177,7 +187,7 @@ def read_point_ply(path: str | Path) -> ColoredPoints:
     """Reads the vertices of a PLY file as points; faces and other properties are ignored.
 
     Args:
-        path: the file, binary little endian or ASCII.
+        path: the file, binary or ASCII.
 
     Returns:
         Positions (float64 where the file has doubles), and colours where it has uchar ``red green blue``.

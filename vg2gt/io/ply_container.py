@@ -25,7 +25,7 @@ _TYPES = {
 _NAMES = {np.dtype("<f4"): "float", np.dtype("<f8"): "double", np.dtype("u1"): "uchar"}
 _HEADER_LIMIT = 1 << 16
 _END = b"end_header"
-_ENCODINGS = ("binary_little_endian", "ascii")
+_ENCODINGS = ("binary_little_endian", "binary_big_endian", "ascii")
 
 
 @dataclass(frozen=True)
@@ -49,14 +49,28 @@ def read_vertices(path: Path) -> NDArray:
     """The ``vertex`` element as a structured array; what follows it in the file is ignored.
 
     Raises:
-        FormatError: if the file is damaged, has no vertices or is big endian.
+        FormatError: if the file is damaged or has no vertices.
+    """
+    return read_elements(path, "vertex")["vertex"]
+
+
+def read_elements(path: Path, *wanted: str) -> dict[str, NDArray]:
+    """Elements of a file as structured arrays in little endian, by name; those that it does not have are left out.
+
+    Raises:
+        FormatError: if the file is damaged or has no vertices.
     """
     data = regular(path).read_bytes()
     encoding, elements, start = _header(path, data)
     names = [element.name for element in elements]
     if "vertex" not in names:
         raise FormatError(f"{path}: no element vertex, only {', '.join(names) or 'none'}; this is no file of points")
-    before, vertex = elements[: names.index("vertex")], elements[names.index("vertex")]
+    found = [name for name in wanted if name in names]
+    return {name: _read_element(path, data, start, encoding, elements, names.index(name)) for name in found}
+
+
+def _read_element(path: Path, data: bytes, start: int, encoding: str, elements: list[_Element], number: int) -> NDArray:
+    before, vertex = elements[:number], elements[number]
     if vertex.has_list or any(element.has_list for element in before):
         raise FormatError(f"{path}: a list property in or before the vertices; write the file with the vertices first")
     if not vertex.properties:
@@ -71,6 +85,8 @@ def read_vertices(path: Path) -> NDArray:
             f"{path}, byte {offset}: {vertex.count} vertices of {dtype.itemsize} bytes need {needed} bytes, {left} are "
             "left; the file is truncated or damaged"
         )
+    if encoding == "binary_big_endian":
+        return np.frombuffer(data, dtype.newbyteorder(">"), vertex.count, offset).astype(dtype)
     return np.frombuffer(data, dtype, vertex.count, offset)
 
 

@@ -27,6 +27,7 @@ class RenderTargets(TensorRecord):
         decoded_conf: ``[R, H, W]`` its confidence.
         decoded_valid: ``[R, H, W]`` bool, False for views without decoded depth (held-out ones).
         comparable: ``[1, 1, 1]`` bool, whether decoded and rendered depth are in one unit.
+        mask: ``[R, H, W]`` in [0, 1], how much each pixel's colour counts; None: all count.
     """
 
     images: Tensor
@@ -37,6 +38,7 @@ class RenderTargets(TensorRecord):
     decoded_conf: Tensor
     decoded_valid: Tensor
     comparable: Tensor
+    mask: Tensor | None = None
 
     def scene(self, index: int) -> RenderTargets:
         """Returns one scene of B."""
@@ -96,7 +98,7 @@ class GaussianLoss:
         Returns:
             Scalars with graph, named like the weights.
         """
-        color, hits = rendered.color[0], self.hits(rendered)[0]
+        color, hits = where_it_counts(rendered.color[0], targets.images, targets.mask), self.hits(rendered)[0]
         depth = torch.where(hits, rendered.depth[0], 1.0)
         scaled = depth * scale[:, None, None]
         decoded, trust = targets.decoded.detach(), targets.decoded_conf.detach()
@@ -109,12 +111,6 @@ class GaussianLoss:
             "depth_gt": weighted_mean((scaled - targets.depth).abs(), torch.ones_like(scaled), hits & targets.valid),
             "normal": self._normal(rendered, cameras, targets, hits, trust),
         }
-
-    @property
-    def weighted(self) -> tuple[str, ...]:
-        """Names of the terms that have a weight."""
-        names = ("color_l1", "ssim", "depth_consistency", "depth_gt", "normal")
-        return tuple(name for name in names if self.weight * getattr(self, name))
 
     def total(self, terms: dict[str, Tensor]) -> Tensor:
         """The weighted sum of the terms."""
@@ -132,6 +128,11 @@ class GaussianLoss:
             expected, valid = normals_from_depth(torch.where(targets.valid, targets.depth, 0.0), targets.intrinsics)
         weights = trust if self.normal_target == "decoded" else torch.ones_like(trust)
         return normal_error(rendered.normal[0], expected, weights, hits & valid)
+
+
+def where_it_counts(color: Tensor, images: Tensor, mask: Tensor | None) -> Tensor:
+    """Rendered colours ``[R, 3, H, W]`` with those of the images as far as pixels do not count (``mask [R, H, W]``)."""
+    return color if mask is None else torch.lerp(images, color, mask[:, None].to(color.dtype))
 
 
 def normal_error(normals: Tensor, expected: Tensor, weights: Tensor, mask: Tensor) -> Tensor:

@@ -93,12 +93,6 @@ class VG2GTLoss(nn.Module):
         self.gaussian = gaussian or GaussianLoss()
         self.align = align or ScaleAlignment()
 
-    @property
-    def weighted(self) -> tuple[str, ...]:
-        """Names of the terms of a report that have a weight and may be zero: hinges and those of rendered views."""
-        hinges = ("enhance_depth", "enhance_point") if self.enhance.weight else ()
-        return hinges + self.gaussian.weighted
-
     def forward(
         self,
         prediction: Decoded,
@@ -192,6 +186,7 @@ def _render_targets(batch: Batch, geometry: Geometry, truth: Truth, views: Tenso
         decoded_conf=geometry.depth_conf[:, source],
         decoded_valid=(decoded > 0) & is_context[:, None, None],
         comparable=torch.ones_like(known),  # of a scene without depth both are in scene units
+        mask=None if batch.mask is None else _full_precision(batch.mask[:, views]),
     )
 
 

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import logging
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal, get_args
 
+from vg2gt.data.base import DataError
+from vg2gt.io.names import by_number
 from vg2gt.model import Reconstructor
 from vg2gt.reconstruction.given_cameras import LAYOUTS, describe, given_pictures
 from vg2gt.reconstruction.monitor import Monitor
-from vg2gt.reconstruction.pictures import ImagesLike, Picture, find_pictures
+from vg2gt.reconstruction.pictures import ImagesLike, Picture, find_pictures, readable, without_copies
 from vg2gt.reconstruction.sfm import find_cameras
+
+log = logging.getLogger(__name__)
 
 Poses = Literal["auto", "given", "sfm", "backbone"]
 
@@ -27,6 +32,7 @@ def pictures_for(
     max_images: int | None = None,
     sfm_folder: Path | None = None,
     monitor: Monitor | None = None,
+    skip_damaged: bool = False,
 ) -> Iterator[list[Picture]]:
     """The pictures to reconstruct, with cameras if the backbone takes any; they can be read inside the block.
 
@@ -41,9 +47,10 @@ def pictures_for(
         max_images: take at most so many, evenly spread.
         sfm_folder: where structure from motion keeps its result; None: it is thrown away.
         monitor: told of the stages.
+        skip_damaged: leave out photographs that cannot be read, named in a warning.
 
     Yields:
-        The pictures.
+        The pictures; of equal files the first one only.
 
     Raises:
         FileNotFoundError: if a path does not exist.
@@ -53,11 +60,18 @@ def pictures_for(
     backend = model.backend
     _check(model, poses)
     if not backend.needs_hints:
-        yield find_pictures(images, every, max_images)
+        yield without_copies(find_pictures(images, every, max_images, skip_damaged))
         return
-    given = None if poses == "sfm" else given_pictures(images, every, max_images, depth=backend.needs_depth)
+    given = None
+    if poses != "sfm":
+        try:
+            given = given_pictures(images, every, max_images, depth=backend.needs_depth)
+        except DataError as error:
+            if poses == "given" or backend.needs_depth:
+                raise
+            log.warning("cameras that are there are not used, structure from motion finds others: %s", error)
     if given is not None:
-        yield given
+        yield without_copies(readable(given) if skip_damaged else given)
         return
     if backend.needs_depth:
         raise ValueError(_no_depth(backend.name, images))
@@ -66,8 +80,17 @@ def pictures_for(
             f"no cameras lie beside {describe(images)}: expected {LAYOUTS}; --poses sfm finds them from the images"
         )
     with tempfile.TemporaryDirectory(prefix="vg2gt-sfm-") as temporary:
-        pictures = find_pictures(images, every, max_images)
-        yield find_cameras(pictures, sfm_folder or Path(temporary) / "sfm", monitor or Monitor())
+        pictures = without_copies(find_pictures(images, every, max_images, skip_damaged))
+        yield _found(pictures, sfm_folder or Path(temporary) / "sfm", monitor or Monitor())
+
+
+def _found(pictures: list[Picture], folder: Path, monitor: Monitor) -> list[Picture]:
+    """Pictures with found cameras; files are taken in the order of their names, so that any order gives the same."""
+    if any(picture.path is None for picture in pictures):
+        return find_cameras(pictures, folder, monitor)
+    ordered = sorted(pictures, key=lambda picture: by_number(str(picture.path)))
+    place = {picture.name: number for number, picture in enumerate(pictures)}
+    return sorted(find_cameras(ordered, folder, monitor), key=lambda picture: place[picture.name])
 
 
 def check_depth(backend: str, images: ImagesLike) -> None:

@@ -1,9 +1,9 @@
-"""Pictures with the cameras that lie beside them: cameras.json, transforms.json, a COLMAP model, a list of poses."""
+"""Pictures with the cameras that are next to them: cameras.json, transforms.json, a COLMAP model, a list of poses."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,16 +13,18 @@ import torch
 from vg2gt.data.base import DataError, Frames
 from vg2gt.data.sources.colmap_model import COLMAP, model_folder_of
 from vg2gt.data.sources.files import FileSource
-from vg2gt.data.sources.nerfstudio import Nerfstudio
+from vg2gt.data.sources.nerfstudio import Nerfstudio, transforms_files
 from vg2gt.data.sources.phone import app_of
+from vg2gt.data.sources.posed import size_on_disk
 from vg2gt.data.sources.rgbd import RGBDFolder
+from vg2gt.data.sources.undistortion import undistortion_of
 from vg2gt.geometry.cameras import resize_intrinsics
-from vg2gt.io.cameras_json import NamedCamera, read_cameras_json
-from vg2gt.io.image_files import image_size, read_color
+from vg2gt.io.cameras_json import NamedCamera, Photo, read_cameras_json
+from vg2gt.io.image_files import read_color
 from vg2gt.io.nerfstudio import read_transforms
 from vg2gt.io.record3d import R3D
 from vg2gt.reconstruction.pictures import (
-    IMAGE_FOLDERS,
+    UNKNOWN_LENS,
     ImagesLike,
     Picture,
     as_items,
@@ -31,6 +33,9 @@ from vg2gt.reconstruction.pictures import (
     existing_path,
     frame_of,
     image_files,
+    image_folders,
+    is_image_folder,
+    mask_for,
     shrunk,
     with_unique_names,
 )
@@ -44,13 +49,14 @@ LAYOUTS = f"{_CAMERAS}, {_TRANSFORMS}, a COLMAP model in sparse/0, or poses.txt 
 def given_pictures(
     images: ImagesLike, every: int = 1, max_images: int | None = None, depth: bool = False
 ) -> list[Picture] | None:
-    """Lists the pictures of folders that hold their cameras.
+    """Lists the pictures whose cameras are in files next to them.
 
-    In each folder, and in the one above if the folder is called ``images``, ``color`` or ``rgb``, is looked for, in
-    this order: ``cameras.json``, ``transforms.json``, a COLMAP model, a recording with poses (with depth or without).
+    Looked for are, in this order: ``cameras.json``, ``transforms.json`` (or Blender's ``transforms_train.json``), a
+    COLMAP model, a recording with poses (with depth or without); in the folder of the images, in the folder above it,
+    and in ``dense/`` of a COLMAP workspace whose images are only there.
 
     Args:
-        images: a folder or an ``.r3d`` file, or a sequence of such.
+        images: a folder, image files, or an ``.r3d`` file, or a sequence of such.
         every: take every this many-th picture only.
         max_images: take at most so many, evenly spread; None: all.
         depth: depth is needed as well: what has none is passed over.
@@ -60,21 +66,25 @@ def given_pictures(
 
     Raises:
         FileNotFoundError: if a path does not exist.
+        ImportError: if pycolmap is needed and not installed.
         ValueError: if a file of cameras is damaged, or belongs to other images.
     """
     check_choice(every, max_images)
+    items = as_items(images)
+    if not all(isinstance(item, (str, Path)) for item in items):
+        return None
+    paths = [existing_path(item) for item in items]
     found: list[Picture] = []
-    for item in as_items(images):
-        path = existing_path(item) if isinstance(item, (str, Path)) else None
-        own = _given(path, depth) if path is not None and (path.is_dir() or app_of(path)) else None
+    for folder, files in _by_folder(paths):
+        own = _given(folder, depth)
         if own is None:
             return None
-        found += own
+        found += own if files is None else _only(own, files, folder)
     return with_unique_names(evenly(found[::every], max_images))
 
 
 def recording_pictures(source: FileSource) -> list[Picture]:
-    """The pictures of a source's only scene, with their cameras and depth.
+    """The pictures of a source's only scene, with their cameras and depth, each of its own size.
 
     Raises:
         ValueError: if the source has several scenes.
@@ -84,39 +94,92 @@ def recording_pictures(source: FileSource) -> list[Picture]:
     scene = source.scenes[0]
     index = source.scene_index(scene)
     kind = f"{type(source).__name__} {index.folder}"
+    metric = source.is_metric or (isinstance(source, RGBDFolder) and (index.folder / "depth").is_dir())
 
     def picture(frame: int) -> Picture:
         def read(size: tuple[int, int]) -> Frames:
-            return source.load(scene, [frame])
+            return source.load_whole(scene, frame)
 
-        points = source.point_depths(scene, frame) if isinstance(source, COLMAP) else None
-        return Picture(index.color[index.row(frame)].stem, index.size, read, kind, source.has_depth, points)
+        row = index.row(frame)
+        return Picture(
+            index.color[row].stem,
+            index.own_size(row),
+            read,
+            kind,
+            source.has_depth,
+            source.point_depths(scene, frame) if isinstance(source, COLMAP) else None,
+            path=index.color[row],
+            pose=index.world_to_camera[row],
+            is_metric=metric,
+            lens=index.lens(row),
+        )
 
-    return [picture(frame) for frame in source.frames(scene)]
+    tests = set(source.held_out(scene)) if isinstance(source, Nerfstudio) else set()
+    return [picture(frame) for frame in source.frames(scene) if frame not in tests]
+
+
+def _by_folder(paths: Sequence[Path]) -> Iterator[tuple[Path, list[Path] | None]]:
+    """What was given by folder: a folder or recording as a whole (None), single images together by their folder."""
+    files: dict[Path, list[Path]] = {}
+    for path in paths:
+        if path.is_file() and app_of(path) is None:
+            files.setdefault(path.parent, []).append(path)
+    for path in paths:
+        if path.is_dir() or app_of(path):
+            yield path, None
+        elif path.parent in files:
+            yield path.parent, files.pop(path.parent)
+
+
+def _only(pictures: list[Picture], files: list[Path], folder: Path) -> list[Picture]:
+    """Those of the named files, in their order."""
+    by_path = {picture.path.resolve(): picture for picture in pictures if picture.path is not None}
+    found = [by_path[file.resolve()] for file in dict.fromkeys(files) if file.resolve() in by_path]
+    _name_left_out([file.name for file in files if file.resolve() not in by_path], f"the cameras with {folder}")
+    if not found:
+        raise DataError(f"the cameras with {folder} are not those of {files[0].name}")
+    return found
 
 
 def _given(folder: Path, depth: bool) -> list[Picture] | None:
-    for place, images in _places(folder):
-        if not depth and (place / _CAMERAS).is_file():
-            return _from_cameras_json(place / _CAMERAS, place / images)
-        source = _source(place, images, depth)
-        if source is not None:
-            return recording_pictures(source)
+    for place, images, sure in _places(folder):
+        try:
+            pictures = _pictures_of(place, images, depth)
+        except DataError as error:
+            if sure:
+                raise
+            log.warning("cameras in %s are not taken for the images in %s: %s", place, folder, error)
+            continue
+        if pictures is not None:
+            _name_missing(pictures, place / images)
+            return pictures
     return None
 
 
-def _places(folder: Path) -> Iterator[tuple[Path, str]]:
-    """Folders where the cameras of a folder's images may lie, with the images' folder as seen from there."""
-    yield folder, next((name for name in IMAGE_FOLDERS if (folder / name).is_dir()), ".")
-    name = folder.resolve().name
-    if name in IMAGE_FOLDERS:
-        yield folder.resolve().parent, name
+def _places(folder: Path) -> Iterator[tuple[Path, str, bool]]:
+    """Folders where the cameras of a folder's images may be, the images as seen from there, whether they must fit."""
+    inside = image_folders(folder) if folder.is_dir() else []
+    if (folder / "dense" / "images").is_dir() and not inside:  # a workspace without its distorted originals
+        yield folder / "dense", "images", True
+    yield folder, inside[0].name if inside else ".", True
+    above = folder.resolve().parent
+    if folder.is_dir():
+        yield above, folder.resolve().name, is_image_folder(folder.name)
+
+
+def _pictures_of(place: Path, images: str, depth: bool) -> list[Picture] | None:
+    if not depth and (place / _CAMERAS).is_file():
+        pictures = _from_cameras_json(place / _CAMERAS, place / images)
+        if pictures is not None:
+            return pictures
+    source = _source(place, images, depth)
+    return None if source is None else recording_pictures(source)
 
 
 def _source(folder: Path, images: str, depth: bool) -> FileSource | None:
-    """The recording that a folder holds, with depth where it has any; None for mere photographs."""
-    if (folder / _TRANSFORMS).is_file():
-        with_depth = any(frame.depth_file_path for frame in read_transforms(folder / _TRANSFORMS).frames)
+    """The recording that a folder holds, with depth where it is needed; None for mere photographs."""
+    if files := transforms_files(folder):
+        with_depth = depth and any(frame.depth_file_path for frame in read_transforms(files[0]).frames)
         if with_depth or not depth:
             return Nerfstudio(str(folder), depth=with_depth)
     if not depth and model_folder_of(folder) is not None:
@@ -131,48 +194,83 @@ def _source(folder: Path, images: str, depth: bool) -> FileSource | None:
     return None
 
 
-def _from_cameras_json(path: Path, folder: Path) -> list[Picture]:
+def _name_missing(pictures: list[Picture], folder: Path) -> None:
+    """Says which images of a folder have no camera."""
+    known = {picture.path.resolve() for picture in pictures if picture.path is not None}
+    if not folder.is_dir() or not all(path.suffix.lower() != ".r3d" for path in known):
+        return
+    try:
+        files = image_files(folder)
+    except ValueError:
+        return
+    if any(file.resolve() in known for file in files):
+        _name_left_out([file.name for file in files if file.resolve() not in known], pictures[0].source)
+
+
+def _name_left_out(names: Sequence[str], where: str) -> None:
+    if names:
+        shown = ", ".join(names[:10]) + (f" and {len(names) - 10} more" if len(names) > 10 else "")
+        log.warning("%s has no cameras for %d images, which are left out: %s", where, len(names), shown)
+
+
+def _from_cameras_json(path: Path, folder: Path) -> list[Picture] | None:
     """Pictures of a folder whose cameras a ``cameras.json`` names, by the file's name with or without its ending.
+
+    Returns:
+        None if they are of undistorted images and the folder has the photographs that these were made of.
 
     Raises:
         ValueError: if it names none of them.
     """
-    cameras = {Path(camera.name).name: camera for camera in read_cameras_json(path)}
+    named = read_cameras_json(path)
+    cameras = {Path(camera.name).name: camera for camera in named}
+    cameras |= {camera.photo.name: camera for camera in named if camera.photo is not None}
     by_stem = {Path(name).stem: camera for name, camera in cameras.items()}
     files = image_files(folder)
     found = [(file, cameras.get(file.name) or by_stem.get(file.stem) or by_stem.get(file.name)) for file in files]
-    pictures = [_photo(file, camera, path) for file, camera in found if camera is not None]
-    if not pictures:
+    known = [(file, camera) for file, camera in found if camera is not None]
+    if not known:
         raise DataError(f"{path} names none of the {len(files)} images in {folder}, such as {files[0].name}")
-    if len(pictures) < len(files):
-        without = ", ".join(file.name for file, camera in found if camera is None)
-        log.warning(
-            "%s has no cameras for %d images, which are left out: %s", path, len(files) - len(pictures), without
-        )
-    return pictures
+    if any(
+        camera.photo and camera.photo.lens == UNKNOWN_LENS and camera.photo.name == file.name for file, camera in known
+    ):
+        log.warning("%s is of undistorted images and is not taken for the photographs in %s", path, folder)
+        return None
+    return [_photo(file, camera, path) for file, camera in known]
 
 
 def _photo(path: Path, camera: NamedCamera, cameras: Path) -> Picture:
-    size = image_size(path, path.parent.name)
-    # Sizes are whole pixels, so that both sides of a reduced image may be off by one.
-    if abs(size[0] * camera.width / (size[1] * camera.height) - 1) > 2 / min(size):
-        raise DataError(
-            f"{path} is {size[1]}x{size[0]} pixels, but {cameras} was made for {camera.width}x{camera.height}: it is "
-            "not the image the camera belongs to, nor a reduced one"
-        )
-    return Picture(path.stem, size, _reader(path, camera), f"{_CAMERAS} {cameras.parent}", path=path)
+    """A photograph with its camera: that of the whole photograph where the file knows it."""
+    photo = camera.photo
+    if photo is None or photo.name != path.name:
+        photo = Photo(path.name, camera.width, camera.height, camera.intrinsics)
+    undistortion = undistortion_of(photo.lens) if photo.lens else None
+    expected = undistortion.lens_size if undistortion else (photo.height, photo.width)
+    size, upright = size_on_disk(path, path.parent.name, expected, str(cameras))
+    intrinsics = torch.from_numpy(photo.intrinsics)
+    pose = torch.from_numpy(camera.world_to_camera)
 
-
-def _reader(path: Path, camera: NamedCamera) -> Callable[[tuple[int, int]], Frames]:
-    def read(size: tuple[int, int]) -> Frames:
-        frames = frame_of(shrunk(read_color(path, path.parent.name), size))
+    def read(wanted: tuple[int, int]) -> Frames:
+        pixels = read_color(path, path.parent.name, upright=upright)
+        mask = mask_for(path, upright)
+        if undistortion is None:
+            frames = frame_of(shrunk(pixels, wanted), mask)
+        else:
+            frames = frame_of(undistortion.color(pixels), None if mask is None else undistortion.depth(mask))
         height, width = frames.images.shape[-2:]
-        intrinsics = torch.from_numpy(camera.intrinsics)
-        intrinsics = resize_intrinsics(intrinsics, width / camera.width, height / camera.height)
-        pose = torch.from_numpy(camera.world_to_camera)
-        return replace(frames, world_to_camera=pose.float()[None], intrinsics=intrinsics.float()[None])
+        matrix = resize_intrinsics(intrinsics, width / photo.width, height / photo.height)
+        return replace(frames, world_to_camera=pose.float()[None], intrinsics=matrix.float()[None])
 
-    return read
+    return Picture(
+        path.stem,
+        (photo.height, photo.width) if undistortion else size,
+        read,
+        f"{_CAMERAS} {cameras.parent}",
+        path=path,
+        pose=camera.world_to_camera,
+        is_metric=camera.metres_per_unit == 1,
+        lens=photo.lens,
+    )
 
 
 def describe(images: Any) -> str:

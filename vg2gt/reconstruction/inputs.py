@@ -5,16 +5,18 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from vg2gt.data.base import Frames
+from vg2gt.data.base import DataError, Frames
 from vg2gt.data.transforms import resize_to_cover
+from vg2gt.geometry.cameras import crop_intrinsics, resize_intrinsics
+from vg2gt.io.cameras_json import NamedCamera, Photo
 from vg2gt.reconstruction.monitor import Monitor
-from vg2gt.reconstruction.pictures import Picture
+from vg2gt.reconstruction.pictures import Picture, name_damaged
 from vg2gt.types import Cameras, Hints
 
 log = logging.getLogger(__name__)
@@ -34,12 +36,16 @@ class Views:
         names: one per view, unique.
         kept: share of each picture's area that is in its image; the rest was cropped.
         hints: what the data know, on the CPU; None where they know nothing.
+        mask: ``[V, H, W]`` float32 in [0, 1], how much each pixel counts (alpha, mask images); None: all count.
+        pictures: where the images come from, one per view.
     """
 
     images: Tensor
     names: tuple[str, ...]
     kept: tuple[float, ...]
     hints: Hints | None
+    mask: Tensor | None = None
+    pictures: tuple[Picture, ...] = ()
 
 
 def working_size(
@@ -82,7 +88,10 @@ def load_views(pictures: Sequence[Picture], size: tuple[int, int], monitor: Moni
     frames: list[Frames] = []
     with monitor.stage("load images", len(pictures)) as advance:
         for picture in pictures:
-            frames.append(resize_to_cover(picture.read(size), size))
+            try:
+                frames.append(resize_to_cover(picture.read(size), size))
+            except DataError as error:
+                raise name_damaged(pictures, error) from error
             advance()
     kept = tuple(_kept(picture.size, size) for picture in pictures)
     much = [picture.name for picture, share in zip(pictures, kept, strict=True) if share < 1 - _MUCH_LOST]
@@ -92,8 +101,27 @@ def load_views(pictures: Sequence[Picture], size: tuple[int, int], monitor: Moni
             "%s; reconstruct images of one shape together, or choose another size",
             len(much), len(pictures), size[0], size[1], much[0],
         )  # fmt: skip
-    images = torch.cat([frame.images for frame in frames])
-    return Views(images, tuple(picture.name for picture in pictures), kept, _hints(pictures, frames, size))
+    joined = Frames.concatenate(frames)
+    hints = _hints(pictures, joined, size)
+    if hints is not None or joined.mask is not None:
+        mask = None if joined.mask is None else joined.mask[None]
+        hints = replace(hints or Hints(), mask=mask)
+    names = tuple(picture.name for picture in pictures)
+    return Views(joined.images, names, kept, hints, joined.mask, tuple(pictures))
+
+
+def photo_of(camera: NamedCamera, picture: Picture) -> Photo:
+    """The camera of a view's whole photograph, from that of the view (the reverse of ``resize_to_cover``)."""
+    name = camera.name if picture.path is None else picture.path.name
+    height, width = picture.size
+    scale = max(camera.height / height, camera.width / width)
+    covering = [
+        max(least, math.floor(side * scale + 0.5)) for least, side in ((camera.height, height), (camera.width, width))
+    ]
+    room = ((covering[0] - camera.height) // 2, (covering[1] - camera.width) // 2)
+    matrix = crop_intrinsics(torch.from_numpy(camera.intrinsics), -room[1], -room[0])
+    matrix = resize_intrinsics(matrix, width / covering[1], height / covering[0])
+    return Photo(name, width, height, matrix.numpy(), picture.lens)
 
 
 def _kept(size: tuple[int, int], window: tuple[int, int]) -> float:
@@ -101,7 +129,7 @@ def _kept(size: tuple[int, int], window: tuple[int, int]) -> float:
     return min(ratio, 1 / ratio)
 
 
-def _hints(pictures: Sequence[Picture], frames: Sequence[Frames], size: tuple[int, int]) -> Hints | None:
+def _hints(pictures: Sequence[Picture], frames: Frames, size: tuple[int, int]) -> Hints | None:
     """What recordings know; None if any picture is not from one.
 
     Raises:
@@ -113,13 +141,20 @@ def _hints(pictures: Sequence[Picture], frames: Sequence[Frames], size: tuple[in
     if len(sources) > 1:
         raise ValueError(f"cameras of several recordings cannot be mixed: {', '.join(sorted(sources))}; give one")
     has_depth = all(picture.has_depth for picture in pictures)
-    cameras = Cameras(
-        torch.cat([frame.world_to_camera for frame in frames])[None],
-        torch.cat([frame.intrinsics for frame in frames])[None],
-        size,
-    )
-    depth = torch.cat([frame.depth for frame in frames])[None] if has_depth else None
-    return Hints(depth, cameras, tuple(sources), torch.arange(len(frames))[None], depth_range(pictures))
+    cameras = Cameras(_given_poses(pictures, frames)[None], frames.intrinsics[None], size)
+    depth = frames.depth[None] if has_depth else None
+    return Hints(depth, cameras, tuple(sources), torch.arange(len(pictures))[None], depth_range(pictures))
+
+
+def _given_poses(pictures: Sequence[Picture], frames: Frames) -> Tensor:
+    """Poses ``[V, 4, 4]`` about the first camera's place: map coordinates would lose their digits in float32."""
+    if any(picture.pose is None for picture in pictures):
+        return frames.world_to_camera
+    poses = np.stack([picture.pose for picture in pictures if picture.pose is not None])
+    shift = np.eye(4)
+    shift[:3, 3] = -poses[0, :3, :3].T @ poses[0, :3, 3]
+    far = np.abs(poses[:, :3, 3]).max() > 1e3 * np.abs((poses @ shift)[:, :3, 3]).max()
+    return torch.from_numpy(poses @ shift if far else poses).float()
 
 
 def depth_range(pictures: Sequence[Picture]) -> Tensor | None:

@@ -32,6 +32,7 @@ from vg2gt.io.files import write_bytes, write_json
 from vg2gt.io.images import to_pixels, write_png
 from vg2gt.io.video import require_pyav
 from vg2gt.reconstruction.camera_paths import orbit
+from vg2gt.reconstruction.export import exported_views
 from vg2gt.reconstruction.maps import AddView, animation, feed, map_sinks, whole_folder
 from vg2gt.reconstruction.monitor import Monitor
 from vg2gt.reconstruction.output_names import DEFAULT, FPS, MAPS, ORBIT_FRAMES, OUTPUTS, REFINED
@@ -63,7 +64,7 @@ def check_folder(folder: str | Path, outputs: Sequence[str], overwrite: bool) ->
         FileExistsError: if an output is there already and must not be overwritten.
         PermissionError: if the folder cannot be made or written to.
     """
-    folder = Path(folder)
+    folder = Path(folder).expanduser()
     place = next(place for place in (folder, *folder.parents) if place.exists())
     if not place.is_dir():
         raise PermissionError(f"the output folder {folder} cannot be made ({place} is a file); choose another")
@@ -174,7 +175,18 @@ def scene_figures(scene: Scene) -> dict[str, Any]:
         "mode": scene.renderer.mode,
         **refinement_figures(scene),
         "cameras": scene.cameras_from or "predicted by the backbone",
+        **frame_figures(scene),
     }
+
+
+def frame_figures(scene: Scene) -> dict[str, Any]:
+    """The frame and unit of a scene: which, and the similarity from it to the cameras as they were given or found."""
+    if scene.frame is None:
+        return {}
+    matrix, scale = scene.frame.to_source, scene.frame.scale
+    unit = "that of the given cameras" if scene.frame.name == "given" else "the median depth of the views, about"
+    similarity = {"scale": scale, "rotation": (matrix[:3, :3] / scale).tolist(), "translation": matrix[:3, 3].tolist()}
+    return {"frame": scene.frame.name, "unit": unit, "similarity_to_cameras": similarity}
 
 
 def cost_figures(monitor: Monitor) -> dict[str, Any]:
@@ -214,33 +226,36 @@ def _images(scene: Scene, target: Path) -> None:
 
 
 def _views(scene: Scene, path: Path) -> None:
-    """``images [V, H, W, 3]`` uint8, ``depth`` and ``depth_conf [V, H, W]`` float32."""
+    """``images [V, H, W, 3]`` uint8; ``depth``, ``depth_conf`` and, where there is one, ``mask [V, H, W]`` float32."""
     buffer = io.BytesIO()
     images = np.stack([to_pixels(image) for image in scene.images])
-    np.savez_compressed(buffer, images=images, depth=scene.depth.numpy(), depth_conf=scene.depth_conf.numpy())
+    arrays = {"images": images, "depth": scene.depth.numpy(), "depth_conf": scene.depth_conf.numpy()}
+    if scene.mask is not None:
+        arrays["mask"] = scene.mask.numpy()
+    np.savez_compressed(buffer, **arrays)  # pyright: ignore[reportArgumentType]
     write_bytes(path, buffer.getvalue())
 
 
-def _colmap(scene: Scene, target: Path) -> None:
-    points = scene.points()
-    names = [camera.name for camera in scene.named_cameras()]
-    model = colmap_from_views(scene.cameras, names, points.positions, points.colors, (points.views, points.pixels))
+def _colmap(scene: Scene, target: Path, whole: bool = True) -> None:
+    exported = exported_views(scene, whole)
+    points, sources = scene.points(), exported.observations(scene)
+    model = colmap_from_views(
+        exported.cameras, exported.names, points.positions, points.colors, sources, exported.sizes
+    )
     with whole_folder(target) as folder:
-        _write_images(scene, folder / "images")
+        exported.write_images(folder / "images")
         write_colmap(folder / "sparse" / "0", model)
 
 
-def _nerfstudio(scene: Scene, target: Path) -> None:
+def _nerfstudio(scene: Scene, target: Path, whole: bool = True) -> None:
+    exported = exported_views(scene, whole)
+    poses, intrinsics = (t[0].double().numpy() for t in (exported.cameras.world_to_camera, exported.cameras.intrinsics))
     frames = [
-        TransformsFrame(
-            f"images/{camera.name}",
-            camera.world_to_camera,
-            Lens.from_intrinsics(camera.intrinsics, (camera.height, camera.width)),
-        )
-        for camera in scene.named_cameras()
+        TransformsFrame(f"images/{name}", pose, Lens.from_intrinsics(k, size))
+        for name, pose, k, size in zip(exported.names, poses, intrinsics, exported.sizes, strict=True)
     ]
     with whole_folder(target) as folder:
-        _write_images(scene, folder / "images")
+        exported.write_images(folder / "images")
         _points_ply(scene, folder / "points.ply")
         write_transforms(folder / "transforms.json", Transforms(tuple(frames), ply_file_path="points.ply"))
 
@@ -269,5 +284,7 @@ _WRITERS: dict[str, Callable[[Scene, Path], Any]] = {
     "points.glb": _points_glb,
     "images": _images,
     "colmap": _colmap,
+    "colmap-small": lambda scene, path: _colmap(scene, path, whole=False),
     "nerfstudio": _nerfstudio,
+    "nerfstudio-small": lambda scene, path: _nerfstudio(scene, path, whole=False),
 }

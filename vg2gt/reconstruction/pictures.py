@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib.util
+import logging
 import math
+import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -16,21 +19,29 @@ from numpy.typing import NDArray
 from PIL import Image, ImageOps
 from torch import Tensor
 
-from vg2gt.data.base import Frames
-from vg2gt.data.sources.image_folder import by_number
+from vg2gt.data.base import DataError, Frames
+from vg2gt.data.sources.masks import FOLDER as MASKS
+from vg2gt.data.sources.masks import joined_masks, mask_of, resized_mask
 from vg2gt.data.sources.parsing import IMAGE_SUFFIXES
 from vg2gt.data.transforms import from_bytes
-from vg2gt.io.image_files import focal_length, image_size, read_color
-from vg2gt.io.images import color_image
+from vg2gt.io.image_files import focal_length, image_size, read_color, read_mask
+from vg2gt.io.images import color_image, has_alpha
+from vg2gt.io.names import by_number
 from vg2gt.io.record3d import R3D, is_archive, read_recorded, recorded_files
 from vg2gt.io.video import VIDEO_SUFFIXES, count_frames, read_video, require_pyav
+
+log = logging.getLogger(__name__)
 
 ImagesLike: TypeAlias = "str | Path | Image.Image | NDArray[Any] | Tensor | Sequence[Any]"
 
 HEIC_SUFFIXES = (".heic", ".heif")
 _HOLDS_PICTURES = (*IMAGE_SUFFIXES, *HEIC_SUFFIXES, R3D)
 VIDEO_FRAMES = 32  # taken from a video when nobody says how many
-IMAGE_FOLDERS = ("images", "color", "rgb")
+IMAGE_FOLDERS = ("images", "color", "rgb", "image", "input")
+_NO_PHOTOGRAPHS = ("masks", "depth", "depths", "color", "normals", "sfm", "sparse", "colmap", "nerfstudio")
+SKIP_DAMAGED = " (--skip-damaged goes on without what cannot be read)"
+SFM_SOURCE = "structure from motion"  # how the source of cameras found by it begins
+UNKNOWN_LENS = "unknown"  # of images that structure from motion has undistorted
 
 
 @dataclass(frozen=True)
@@ -47,6 +58,9 @@ class Picture:
         point_depths: ``[n]`` z-depth of the sparse points that it sees; None where there are none.
         focal: focal length in pixels that a photograph's EXIF data tell; None where they do not.
         path: its file; None if it has none of its own.
+        pose: ``[4, 4]`` float64 given ``world_to_camera``; None where there is none.
+        is_metric: whether the unit of its camera (and depth) is the metre.
+        lens: what its file was undistorted from (``undistortion.lens_text``); empty for a pinhole's image.
     """
 
     name: str
@@ -57,9 +71,14 @@ class Picture:
     point_depths: NDArray[np.float32] | None = None
     focal: float | None = None
     path: Path | None = None
+    pose: NDArray[np.float64] | None = None
+    is_metric: bool = False
+    lens: str = ""
 
 
-def find_pictures(images: ImagesLike, every: int = 1, max_images: int | None = None) -> list[Picture]:
+def find_pictures(
+    images: ImagesLike, every: int = 1, max_images: int | None = None, skip_damaged: bool = False
+) -> list[Picture]:
     """Lists the pictures of whatever somebody wants reconstructed, without their cameras.
 
     Args:
@@ -67,6 +86,7 @@ def find_pictures(images: ImagesLike, every: int = 1, max_images: int | None = N
             ``[3, H, W]`` or ``[V, 3, H, W]`` in [0, 1], or a sequence of these, in any mixture.
         every: take every this many-th picture (of videos: frame) only.
         max_images: take at most so many, evenly spread; None: all, of a video 32 frames unless ``every`` is given.
+        skip_damaged: leave out photographs that cannot be read, named in a warning.
 
     Returns:
         The pictures in order, their names unique.
@@ -77,19 +97,26 @@ def find_pictures(images: ImagesLike, every: int = 1, max_images: int | None = N
     """
     check_choice(every, max_images)
     chosen: list[Picture] = []
+    damaged: list[str] = []
     stills = 0
     for item in as_items(images):
-        found = _pictures(item, every, max_images)
+        try:
+            found = _pictures(item, every, max_images, skip_damaged)
+        except DataError as error:
+            damaged.append(str(error).removesuffix(SKIP_DAMAGED))
+            continue
         if not _is_video(item):  # of a video every so many-th frame was decoded
             stills += len(found)
             found = [picture for i, picture in enumerate(found, stills - len(found)) if i % every == 0]
         chosen += found
+    if damaged:
+        raise DataError("; ".join(damaged) + SKIP_DAMAGED)
     if not chosen:
         raise ValueError("there are no images to reconstruct; give image files, a folder of them, or a video")
     return with_unique_names(evenly(chosen, max_images))
 
 
-def check_pictures(images: ImagesLike) -> None:
+def check_pictures(images: ImagesLike, skip_damaged: bool = False) -> None:
     """Refuses files and folders that hold no picture, without decoding any: before weights are downloaded.
 
     Raises:
@@ -97,6 +124,7 @@ def check_pictures(images: ImagesLike) -> None:
         ImportError: if a video needs a package that is not installed.
         ValueError: if there is no picture, or a file is none.
     """
+    damaged: list[str] = []
     for item in as_items(images):
         path = existing_path(item) if isinstance(item, (str, Path)) else None
         if path is None:
@@ -105,9 +133,14 @@ def check_pictures(images: ImagesLike) -> None:
             if path.suffix.lower() != ".gif":
                 require_pyav(f"reading {path}")
         elif path.is_file():
-            _pictures(path, 1, 1)
+            try:
+                _pictures(path, 1, 1, skip_damaged)
+            except DataError as error:
+                damaged.append(str(error).removesuffix(SKIP_DAMAGED))
         elif not any(file.suffix.lower() in _HOLDS_PICTURES for file in path.rglob("*")):
             image_files(path)
+    if damaged:
+        raise DataError("; ".join(damaged) + SKIP_DAMAGED)
 
 
 def as_items(images: ImagesLike) -> list[Any]:
@@ -149,41 +182,146 @@ def shrunk(pixels: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8
     return pixels if factor < 2 else np.array(Image.fromarray(pixels).reduce(factor))
 
 
-def frame_of(pixels: NDArray[np.uint8]) -> Frames:
-    """Frame of one image ``[H, W, 3]`` of which nothing else is known."""
+def frame_of(pixels: NDArray[np.uint8], mask: NDArray[np.float32] | None = None) -> Frames:
+    """Frame of one image ``[H, W, 3]`` of which nothing else is known but a mask ``[h, w]`` of it."""
     images = from_bytes(torch.from_numpy(np.ascontiguousarray(pixels))).permute(2, 0, 1)[None]
-    return Frames(images.contiguous(), torch.zeros_like(images[:, 0]), torch.eye(4)[None], torch.eye(3)[None])
+    poses, intrinsics = torch.eye(4)[None], torch.eye(3)[None]
+    counts = None if mask is None else torch.from_numpy(resized_mask(mask, (images.shape[-2], images.shape[-1])))[None]
+    return Frames(images.contiguous(), torch.zeros_like(images[:, 0]), poses, intrinsics, mask=counts)
 
 
-def _pictures(item: Any, every: int, max_images: int | None) -> list[Picture]:
+def mask_for(path: Path, upright: bool = True, content: bytes | None = None) -> NDArray[np.float32] | None:
+    """How much each pixel of a photograph counts: its alpha, and its mask in ``masks/`` there or one folder up."""
+    parts = [read_mask(path, "", content=content, upright=upright)]
+    files = [mask_of(place / MASKS, path.name) for place in (path.parent, path.parent.parent)]
+    file = next((file for file in files if file is not None), None)
+    if content is None and file is not None:
+        parts.append(read_mask(file, "", upright=upright))
+    return joined_masks(parts)
+
+
+def _pictures(item: Any, every: int, max_images: int | None, skip_damaged: bool = False) -> list[Picture]:
     if not isinstance(item, (str, Path)):
         return _from_memory(item)
     path = existing_path(item)
     if path.is_dir():
-        return [_photo(file) for file in image_files(path)]
+        return _photos(image_files(path), skip_damaged)
     if is_archive(path):
         files = recorded_files(path, ".jpg")
         if not files:
             raise ValueError(f"{path} holds no images (rgbd/0.jpg and so on): is it a recording of Record3D?")
         return [_photo(file, read_recorded) for file in files.values()]
-    return _video(path, every, max_images) if _is_video(path) else [_photo(path)]
+    return _video(path, every, max_images) if _is_video(path) else _photos([path], skip_damaged)
+
+
+def _photos(files: Sequence[Path], skip_damaged: bool) -> list[Picture]:
+    """Photographs; those whose files are damaged are named all at once, or left out."""
+    found: list[Picture] = []
+    errors: dict[str, Exception] = {}
+    for file in files:
+        try:
+            picture = _photo(file)
+            if skip_damaged:
+                picture.read((64, 64))
+            found.append(picture)
+        except DataError as error:
+            errors[file.name] = error
+    if errors and not skip_damaged:
+        raise DataError("; ".join(str(error) for error in errors.values()) + SKIP_DAMAGED)
+    if errors:
+        log.warning("%d images cannot be read and are left out: %s", len(errors), ", ".join(errors))
+    return found
+
+
+def readable(pictures: Sequence[Picture]) -> list[Picture]:
+    """Those that can be decoded; the others are named in a warning."""
+    found = []
+    for picture in pictures:
+        try:
+            picture.read((64, 64))
+            found.append(picture)
+        except DataError as error:
+            log.warning("left out: %s", error)
+    return found
+
+
+def without_copies(pictures: Sequence[Picture]) -> list[Picture]:
+    """Pictures without those whose file is equal to an earlier one's, byte for byte; they are named in a warning."""
+    first: dict[str, str] = {}
+    found, copies = [], []
+    for picture in pictures:
+        whole = picture.path is not None and picture.path.suffix.lower() in (*IMAGE_SUFFIXES, *HEIC_SUFFIXES)
+        key = _digest(picture.path) if whole and picture.path is not None else ""
+        if key and key in first:
+            copies.append(f"{picture.name} (as {first[key]})")
+        else:
+            found.append(picture)
+            first[key] = picture.name
+    if copies:
+        log.warning("%d images are copies of others and are left out: %s", len(copies), ", ".join(copies[:10]))
+    return found
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def name_damaged(pictures: Sequence[Picture], error: Exception) -> DataError:
+    """The error that names all pictures that cannot be read, after one could not.
+
+    Args:
+        pictures: all of them.
+        error: of the one.
+    """
+    errors = []
+    for picture in pictures:
+        try:
+            picture.read((64, 64))
+        except ValueError as other:
+            errors.append(str(other))
+    return DataError("; ".join(errors or [str(error)]) + SKIP_DAMAGED)
 
 
 def image_files(folder: Path) -> list[Path]:
-    """Images of a folder or, where it has none, of its folder of images; in the order of the numbers in their names.
+    """Images of a folder, or of its folder of images if that has more; in the order of the numbers in their names.
+
+    What is passed over is said in a warning.
 
     Raises:
         ValueError: if there are none.
     """
-    suffixes = (*IMAGE_SUFFIXES, *HEIC_SUFFIXES)
-    for place in (folder, *(folder / name for name in IMAGE_FOLDERS)):
-        inside = sorted(place.iterdir(), key=by_number) if place.is_dir() else []
-        files = [file for file in inside if file.suffix.lower() in suffixes and not file.name.startswith(".")]
-        if files:
-            return files
-    videos = sorted(file.name for file in folder.iterdir() if file.suffix.lower() in VIDEO_SUFFIXES)
-    hint = f"; it has videos, name one: {folder / videos[0]}" if videos else ""
-    raise ValueError(f"no images in {folder} (looked for {', '.join(suffixes)}, there and in images/){hint}")
+    places = [folder, *image_folders(folder)]
+    found = {place: [file for file in place.iterdir() if _is_image(file) and file.is_file()] for place in places}
+    taken = max(places, key=lambda place: len(found[place]))  # of equal ones the first
+    if not found[taken]:
+        videos = sorted(file.name for file in folder.iterdir() if file.suffix.lower() in VIDEO_SUFFIXES)
+        hint = f"; it has videos, name one: {folder / videos[0]}" if videos else ""
+        suffixes = ", ".join((*IMAGE_SUFFIXES, *HEIC_SUFFIXES))
+        raise ValueError(f"no images in {folder} (looked for {suffixes}, there and in images/){hint}")
+    if taken == folder:
+        others = [path for path in folder.iterdir() if path.is_dir() and path.name.lower() not in _NO_PHOTOGRAPHS]
+        passed = [f"{path.name}/" for path in others if any(_is_image(file) for file in path.iterdir())]
+    else:
+        passed = [file.name for file in found[folder]]
+    if passed:
+        log.warning("images are taken from %s; not from the same folder: %s", taken, ", ".join(sorted(passed)[:10]))
+    return sorted(found[taken], key=lambda file: by_number(file.name))
+
+
+def image_folders(folder: Path) -> list[Path]:
+    """Folders of images in a folder, without regard to case; reduced ones (``images_4``) last."""
+    found = [path for path in folder.iterdir() if path.is_dir() and is_image_folder(path.name)]
+    order = {name: number for number, name in enumerate(IMAGE_FOLDERS)}
+    return sorted(found, key=lambda path: (order.get(path.name.lower(), len(order)), by_number(path.name)))
+
+
+def is_image_folder(name: str) -> bool:
+    """Whether a folder of this name usually holds a scene's images."""
+    return name.lower() in IMAGE_FOLDERS or re.fullmatch(r"images_\d+", name.lower()) is not None
+
+
+def _is_image(path: Path) -> bool:
+    return path.suffix.lower() in (*IMAGE_SUFFIXES, *HEIC_SUFFIXES) and not path.name.startswith(".")
 
 
 def _photo(path: Path, content_of: Callable[[Path], bytes | None] = lambda _: None) -> Picture:
@@ -192,7 +330,9 @@ def _photo(path: Path, content_of: Callable[[Path], bytes | None] = lambda _: No
         _open_heic(path)
 
     def read(size: tuple[int, int]) -> Frames:
-        return frame_of(shrunk(read_color(path, "", content=content_of(path), upright=True), size))
+        content = content_of(path)
+        pixels = read_color(path, "", content=content, upright=True)
+        return frame_of(shrunk(pixels, size), mask_for(path, content=content))
 
     content = content_of(path)
     size = image_size(path, "", upright=True, content=content)
@@ -223,16 +363,19 @@ def _video(path: Path, every: int, max_images: int | None) -> list[Picture]:
     return [_in_memory(f"{path.stem}-{number:06d}", pixels) for number, pixels in read_video(path, every)]
 
 
-def _in_memory(name: str, pixels: NDArray[np.uint8]) -> Picture:
+def _in_memory(name: str, pixels: NDArray[np.uint8], mask: NDArray[np.float32] | None = None) -> Picture:
     def read(size: tuple[int, int]) -> Frames:
-        return frame_of(shrunk(pixels, size))
+        return frame_of(shrunk(pixels, size), mask)
 
     return Picture(name, (pixels.shape[0], pixels.shape[1]), read)
 
 
 def _from_memory(item: Any) -> list[Picture]:
     if isinstance(item, Image.Image):
-        return [_in_memory("image", np.array(color_image(ImageOps.exif_transpose(item))))]
+        upright = ImageOps.exif_transpose(item)
+        plane = np.array(upright.convert("RGBA").getchannel("A"), np.float32)
+        alpha = (plane / 255).astype(np.float32) if has_alpha(upright) else None
+        return [_in_memory("image", np.array(color_image(upright)), alpha)]
     pixels = item.detach().cpu().movedim(-3, -1).numpy() if isinstance(item, Tensor) else np.asarray(item)
     if pixels.ndim not in (3, 4) or pixels.shape[-1] != 3 or 0 in pixels.shape:
         raise ValueError(

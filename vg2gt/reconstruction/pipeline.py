@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import torch
 
+from vg2gt.gaussians.far_shell import far_shell, with_shell
 from vg2gt.geometry.precision import half_precision_on_gpu
 from vg2gt.memory import RECONSTRUCTION, memory_advice, note_sizes
 from vg2gt.model import Reconstructor
 from vg2gt.reconstruction.cameras import Poses, pictures_for
+from vg2gt.reconstruction.frame import FrameName, check_frame, first_frame
 from vg2gt.reconstruction.inputs import Views, load_views, working_size
 from vg2gt.reconstruction.monitor import Monitor
-from vg2gt.reconstruction.pictures import ImagesLike
+from vg2gt.reconstruction.order import as_given, in_order, working_order
+from vg2gt.reconstruction.pictures import SFM_SOURCE, ImagesLike
 from vg2gt.reconstruction.scene import Scene
 from vg2gt.rendering import Renderer
 from vg2gt.runs.load import load_model
@@ -46,6 +52,8 @@ def reconstruct_with(
     monitor: Monitor | None = None,
     poses: Poses = "auto",
     sfm_folder: str | Path | None = None,
+    frame: FrameName = "auto",
+    skip_damaged: bool = False,
 ) -> Scene:
     """Reconstructs a scene from any number of images.
 
@@ -59,9 +67,12 @@ def reconstruct_with(
         monitor: told of the stages.
         poses: where cameras come from, see :func:`vg2gt.reconstruction.cameras.pictures_for`.
         sfm_folder: where cameras that structure from motion finds are kept, and found again; None: they are not.
+        frame: the scene's frame and unit (:class:`vg2gt.reconstruction.frame.SceneFrame`): ``given`` cameras',
+            ``first`` camera's, ``upright``, or ``auto``.
+        skip_damaged: go on without images that cannot be read, named in a warning; otherwise they are an error.
 
     Returns:
-        The scene, in the frame of the first image's camera; its Gaussians stay on the model's device.
+        The scene, in the frame that was asked for; its Gaussians stay on the model's device.
 
     Raises:
         FileNotFoundError: if a path does not exist.
@@ -69,6 +80,7 @@ def reconstruct_with(
         ValueError: if there are no images, one cannot be read, or the backend needs what they do not have.
         OutOfMemory: if the device's memory is full.
     """
+    check_frame(frame)
     monitor = monitor or Monitor()
     device = next((parameter.device for parameter in model.parameters()), torch.device("cpu"))
     chosen = pictures_for(
@@ -79,24 +91,53 @@ def reconstruct_with(
         max_images=max_images,
         sfm_folder=None if sfm_folder is None else Path(sfm_folder),
         monitor=monitor,
+        skip_damaged=skip_damaged,
     )
     with memory_advice(RECONSTRUCTION), chosen as pictures:
         target = working_size([p.size for p in pictures], model.backend.patch_size, device.type, size)
         note_sizes({f"images of {target[0]}x{target[1]}": len(pictures)})
         views = load_views(pictures, target, monitor)
-        prediction = _forward(model.eval(), views, device, monitor)
-    return _scene(prediction, views, renderer or Renderer(), model.backend.is_metric)
+        order = working_order(views.images)
+        prediction = _forward(model.eval(), views, order, device, monitor)
+    scene = _scene(prediction, views, order, renderer or Renderer(), model.backend.is_metric, frame)
+    return scene if model.visibility is None else _with_far_shell(scene)
 
 
-def _forward(model: Reconstructor, views: Views, device: torch.device, monitor: Monitor) -> Prediction:
-    hints = None if views.hints is None else views.hints.to(device)
-    images = views.images[None].to(device)
+def _forward(
+    model: Reconstructor, views: Views, order: Sequence[int], device: torch.device, monitor: Monitor
+) -> Prediction:
+    ordered, hints = in_order(views, order)
+    hints = None if hints is None else hints.to(device)
+    images = ordered[None].to(device)
     with monitor.stage("reconstruct"), monitor.watching(), half_precision_on_gpu(images):
         return model(images, hints)
 
 
-def _scene(prediction: Prediction, views: Views, renderer: Renderer, is_metric: bool) -> Scene:
-    geometry = prediction.surface.detach()
+def _with_far_shell(scene: Scene) -> Scene:
+    """The scene with what no view places behind it."""
+    shell = far_shell(scene.images, scene.depth, scene.cameras.to("cpu"), scene.mask)
+    if shell is None:
+        return scene
+    return replace(scene, gaussians=with_shell(scene.gaussians, shell.to(scene.gaussians.means.device)))
+
+
+def _scene(
+    prediction: Prediction,
+    views: Views,
+    order: Sequence[int],
+    renderer: Renderer,
+    is_metric: bool,
+    wanted: FrameName,
+) -> Scene:
+    geometry = as_given(prediction.surface.detach(), order)
+    source = views.pictures[0].source
+    kind = "predicted" if not source else "found" if source.startswith(SFM_SOURCE) else "given"
+    check_frame(wanted, kind)
+    known = [picture.pose for picture in views.pictures if picture.pose is not None]
+    poses = np.stack(known) if kind != "predicted" and len(known) == len(views.names) else None
+    unit = float(prediction.unit)
+    frame = first_frame(geometry.cameras, unit, poses, kind, wanted)
+    metres = float(geometry.scale) if is_metric else frame.scale if views.pictures[0].is_metric else None
     if not len(prediction.gaussians):
         raise ValueError("the backend found no depth in any image, so there is nothing to reconstruct")
     return Scene(
@@ -107,6 +148,9 @@ def _scene(prediction: Prediction, views: Views, renderer: Renderer, is_metric: 
         depth_conf=geometry.depth_conf[0].cpu(),
         names=views.names,
         renderer=renderer,
-        metres_per_unit=float(geometry.scale) if is_metric else None,
-        cameras_from="" if views.hints is None else views.hints.scene_key[0],
-    )
+        metres_per_unit=metres,
+        cameras_from=source,
+        frame=frame,
+        mask=views.mask,
+        pictures=views.pictures,
+    ).placed()

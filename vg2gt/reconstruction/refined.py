@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -25,25 +27,31 @@ def refinement_of(scene: Scene) -> str:
     return "default" if scene.cameras_from.startswith(RECORDINGS) else "photographs"
 
 
-def refine_scene(scene: Scene, options: RefineOptions, monitor: Monitor | None = None) -> Scene:
+def refine_scene(
+    scene: Scene,
+    options: RefineOptions,
+    monitor: Monitor | None = None,
+    clock: Callable[[], float] = time.monotonic,
+) -> Scene:
     """Optimises a scene's Gaussians and cameras on its images (:func:`vg2gt.refinement.refine`).
 
     Args:
         scene: the start; it is not changed.
         options: how long and how.
         monitor: shows PSNR and the time that is left.
+        clock: what the options' seconds are; ``time.process_time`` counts those of all cores.
 
     Returns:
         The refined scene; its images, decoded depth and names are the old ones.
     """
     device = scene.gaussians.means.device
-    seen = Observations(scene.images, scene.depth, scene.depth_conf).to(device)
+    seen = Observations(scene.images, scene.depth, scene.depth_conf, scene.mask).to(device)
     with (monitor or Monitor()).measure("refine") as show:
 
         def observe(progress: Progress) -> None:
             show(progress.done, f"{progress.psnr:.2f} dB")
 
-        refined = refine(scene.gaussians, scene.cameras, seen, scene.renderer, options, observe)
+        refined = refine(scene.gaussians, scene.cameras, seen, scene.renderer, options, observe, clock)
     return replace(scene, gaussians=refined.scene.gaussians, cameras=refined.scene.cameras, refined=refined)
 
 

@@ -13,8 +13,9 @@ from vg2gt.io.cameras_json import NamedCamera
 from vg2gt.io.errors import FormatError
 from vg2gt.io.files import read_json
 from vg2gt.io.images import open_image
-from vg2gt.io.npz import read_npz
+from vg2gt.io.npz import npz_names, read_npz
 from vg2gt.reconstruction.camera_paths import view_stem
+from vg2gt.reconstruction.frame import SceneFrame
 from vg2gt.reconstruction.scene import Scene
 from vg2gt.rendering import Renderer
 from vg2gt.types import Cameras, Gaussians
@@ -43,12 +44,11 @@ def read_scene(folder: str | Path, renderer: Renderer, device: torch.device | st
     named = read_cameras_json(folder / "cameras.json")
     cameras = _cameras(folder, named).to(device)
     if (folder / "views.npz").is_file():
-        images, depth, conf = _read_views(folder / "views.npz", len(named), cameras.size)
+        images, depth, conf, mask = _read_views(folder / "views.npz", len(named), cameras.size)
     else:
-        images = _read_images(folder / "images", named)
+        images, mask = _read_images(folder / "images", named), None
         depth = _rendered_depth(renderer, gaussians, cameras)
         conf = torch.ones_like(depth)
-    report = folder / "report.json"
     return Scene(
         gaussians=gaussians,
         cameras=cameras,
@@ -57,8 +57,28 @@ def read_scene(folder: str | Path, renderer: Renderer, device: torch.device | st
         depth_conf=conf,
         names=tuple(view_stem(camera.name) for camera in named),
         renderer=renderer,
-        metres_per_unit=read_json(report).get("metres_per_unit") if report.is_file() else None,
+        metres_per_unit=_metres_per_unit(folder, named[0]),
+        frame=_frame(folder, named),
+        mask=mask,
+        poses=torch.from_numpy(np.stack([camera.world_to_camera for camera in named])),
     )
+
+
+def _metres_per_unit(folder: Path, camera: NamedCamera) -> float | None:
+    report = folder / "report.json"
+    if camera.metres_per_unit is not None or not report.is_file():
+        return camera.metres_per_unit
+    return read_json(report).get("metres_per_unit")
+
+
+def _frame(folder: Path, named: list[NamedCamera]) -> SceneFrame | None:
+    """The frame that the scene was written in; it is kept."""
+    if named[0].similarity is None:
+        return None
+    report = folder / "report.json"
+    name = str(read_json(report).get("frame", "given")) if report.is_file() else "given"
+    name = name if name in ("given", "first", "upright") else "given"
+    return SceneFrame(name, named[0].similarity, None, "given", name)  # pyright: ignore[reportArgumentType]
 
 
 def _cameras(folder: Path, named: list[NamedCamera]) -> Cameras:
@@ -74,9 +94,11 @@ def _cameras(folder: Path, named: list[NamedCamera]) -> Cameras:
     return Cameras(poses, intrinsics, sizes[0])
 
 
-def _read_views(path: Path, views: int, size: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
+def _read_views(path: Path, views: int, size: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
     try:
-        arrays = read_npz(path, ARRAYS)
+        arrays, mask = read_npz(path, ARRAYS), None
+        if "mask" in npz_names(path):
+            mask = torch.from_numpy(read_npz(path, ["mask"])["mask"].astype(np.float32))
     except (KeyError, FormatError) as error:
         raise FormatError(f"{path}: {error}; write it again with vg2gt reconstruct --save views.npz") from error
     shapes = {name: (views, *size, *([3] if name == "images" else [])) for name in ARRAYS}
@@ -88,7 +110,9 @@ def _read_views(path: Path, views: int, size: tuple[int, int]) -> tuple[Tensor, 
         )
     images = torch.from_numpy(arrays["images"]).permute(0, 3, 1, 2).float() / 255
     depth, conf = (torch.from_numpy(arrays[name].astype(np.float32)) for name in ("depth", "depth_conf"))
-    return images, depth.nan_to_num(0.0, 0.0, 0.0).clamp(min=0), conf.nan_to_num(0.0, 0.0, 0.0).clamp(min=0)
+    if mask is not None and mask.shape != depth.shape:
+        raise FormatError(f"{path}: mask {tuple(mask.shape)} does not belong to depth {tuple(depth.shape)}")
+    return images, depth.nan_to_num(0.0, 0.0, 0.0).clamp(min=0), conf.nan_to_num(0.0, 0.0, 0.0).clamp(min=0), mask
 
 
 def _read_images(folder: Path, named: list[NamedCamera]) -> Tensor:

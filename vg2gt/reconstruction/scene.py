@@ -14,6 +14,9 @@ from torch import Tensor
 
 from vg2gt.geometry.cameras import unproject
 from vg2gt.io.cameras_json import NamedCamera, named_cameras
+from vg2gt.reconstruction.frame import SceneFrame, move_to_target, moved_cameras, moved_gaussians
+from vg2gt.reconstruction.inputs import photo_of
+from vg2gt.reconstruction.pictures import Picture
 from vg2gt.refinement import Refined, RefineOptions
 from vg2gt.rendering import Renderer
 from vg2gt.types import Cameras, Gaussians
@@ -61,7 +64,8 @@ class ScenePoints:
 class Scene:
     """What :func:`vg2gt.reconstruct` gives.
 
-    The world is the frame of the first image's camera (x right, y down, z forward).
+    The world is that of ``frame``: the given cameras' world and unit, or the first image's camera turned upright (x
+    right, y down, z forward) in a unit in which the median depth is about 1.
 
     Attributes:
         gaussians: the scene, on the device it was made on.
@@ -74,6 +78,10 @@ class Scene:
         metres_per_unit: metres per scene unit; None where nobody knows.
         refined: how it was refined; None where it was not.
         cameras_from: where the backbone was given cameras from; empty if it predicted them.
+        frame: where the world is in that of the given or found cameras; None where nobody knows.
+        mask: ``[V, H, W]`` in [0, 1], how much each input pixel counts; None: all count.
+        pictures: where the images come from, one per view; empty for a scene read from files.
+        poses: ``[V, 4, 4]`` float64 ``world_to_camera`` where they are known better than ``cameras`` has them.
     """
 
     gaussians: Gaussians
@@ -86,10 +94,45 @@ class Scene:
     metres_per_unit: float | None = None
     cameras_from: str = ""
     refined: Refined | None = None
+    frame: SceneFrame | None = None
+    mask: Tensor | None = None
+    pictures: tuple[Picture, ...] = ()
+    poses: Tensor | None = None
 
     def named_cameras(self) -> list[NamedCamera]:
         """The views' cameras, named like the image files that :meth:`save` writes."""
-        return named_cameras(self.cameras, [f"{name}.png" for name in self.names])
+        named = named_cameras(self.cameras, [f"{name}.png" for name in self.names])
+        if self.poses is not None and torch.equal(self.poses.float(), self.cameras.world_to_camera[0].cpu().float()):
+            named = [
+                replace(camera, world_to_camera=pose.numpy()) for camera, pose in zip(named, self.poses, strict=True)
+            ]
+        if self.frame is None:
+            return named
+        found = [
+            replace(camera, similarity=self.frame.to_source, metres_per_unit=self.metres_per_unit) for camera in named
+        ]
+        if len(self.pictures) != len(found):
+            return found
+        return [replace(c, photo=photo_of(c, picture)) for c, picture in zip(found, self.pictures, strict=True)]
+
+    def placed(self) -> Scene:
+        """The scene in the frame and unit that are wanted of it: ``frame.target``."""
+        if self.frame is None or self.frame.name == self.frame.target:
+            return self
+        depth = self.depth[self.depth > 0]
+        frame, move = move_to_target(self.frame, self.cameras, float(depth.median()) if len(depth) else 1.0)
+        cameras, poses = moved_cameras(self.cameras, move, frame)
+        scale = float(move.scale)
+        return replace(
+            self,
+            gaussians=moved_gaussians(self.gaussians, move),
+            cameras=cameras,
+            depth=self.depth * scale,
+            metres_per_unit=None if self.metres_per_unit is None else self.metres_per_unit / scale,
+            renderer=replace(self.renderer, near=self.renderer.near * min(scale, 1.0)),
+            frame=frame,
+            poses=poses,
+        )
 
     def render(self, cameras: Sequence[NamedCamera] | None = None) -> Iterator[RenderedView]:
         """Renders views one by one, so that memory does not grow with their number; None: the input views."""

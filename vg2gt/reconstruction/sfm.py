@@ -1,4 +1,7 @@
-"""Cameras of photographs by structure from motion: COLMAP's incremental mapper, from pycolmap (``vg2gt[sfm]``).
+"""Cameras of photographs by structure from motion: COLMAP's mappers, from pycolmap (``vg2gt[colmap]``).
+
+Of up to 60 photographs every pair is compared and cameras are placed one by one. Of more, likely pairs are
+(:mod:`vg2gt.reconstruction.sfm_pairs`), with fewer features, and the global mapper places all cameras at once.
 
 What is found is kept as a folder that every command reads as a COLMAP recording: undistorted ``images/``, a model of
 PINHOLE cameras in ``sparse/``, and ``sfm.json``, which says of which pictures it was made. COLMAP's own lens model with
@@ -14,28 +17,32 @@ import json
 import logging
 import shutil
 import tempfile
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from PIL import Image
 
+from vg2gt.data.base import DataError
 from vg2gt.data.sources.colmap_model import COLMAP, model_folder_of
 from vg2gt.data.transforms import reduce_to_fit, to_bytes
+from vg2gt.io.colmap import EXTRA, quiet_colmap
 from vg2gt.io.errors import FormatError
 from vg2gt.io.files import write_json
 from vg2gt.io.json_checks import load_json
 from vg2gt.reconstruction.given_cameras import LAYOUTS, recording_pictures
 from vg2gt.reconstruction.maps import whole_folder
 from vg2gt.reconstruction.monitor import Monitor
-from vg2gt.reconstruction.pictures import Picture
+from vg2gt.reconstruction.pictures import SFM_SOURCE, UNKNOWN_LENS, Picture, name_damaged
+from vg2gt.reconstruction.sfm_models import FEWEST_POINTS, map_cameras, other_parts, placed_images, sound_models
+from vg2gt.reconstruction.sfm_pairs import ALL_PAIRS, likely_pairs
 
 if TYPE_CHECKING:
-    from pycolmap import IncrementalPipelineOptions, Reconstruction  # pyright: ignore[reportMissingImports]
+    from pycolmap import Reconstruction  # pyright: ignore[reportMissingImports]
 
 log = logging.getLogger(__name__)
 
@@ -43,6 +50,7 @@ FORMAT = 1
 """Of the folder; raise it when it is written otherwise."""
 IMAGE_SIDE = 1600  # pixels of the kept images' longer side, at most
 FEATURE_SIDE, FEATURES = 1280, 4096  # features are looked for in images of this longer side, so many at most
+MANY_SIDE, MANY_FEATURES = 1024, 2048  # where there are more photographs than every pair is compared of
 SEED = 0
 _MODEL = "SIMPLE_RADIAL"
 _QUALITY = 95  # of the kept JPEGs
@@ -64,7 +72,7 @@ def require_pycolmap() -> None:
     """
     if importlib.util.find_spec("pycolmap") is None:
         raise ImportError(
-            f"finding the cameras of photographs needs pycolmap: pip install 'vg2gt[sfm]'; or put their cameras beside "
+            f"finding the cameras of photographs needs pycolmap: {EXTRA}; or put their cameras beside "
             f"them ({LAYOUTS}), or take a backend that works from images alone, such as da3_small"
         )
 
@@ -88,6 +96,7 @@ def find_cameras(pictures: Sequence[Picture], folder: Path, monitor: Monitor) ->
         FileExistsError: if the folder holds something else.
         ValueError: if no model of the scene is found, with what to try.
     """
+    pictures = _without_copies(pictures)
     key = _key(pictures)
     state = _read_state(folder)
     if state is None or state["key"] != key:
@@ -98,20 +107,45 @@ def find_cameras(pictures: Sequence[Picture], folder: Path, monitor: Monitor) ->
         state = _solve(pictures, folder, key, monitor)
     else:
         log.info("the cameras of these very images are taken from %s", folder)
+    _tell_left_out(state, len(pictures))
+    names = state["images"]
+    source = f"{SFM_SOURCE}, {len(names)} of {len(pictures)} images"
+    paths = {picture.name: picture.path for picture in pictures}
+    found = [(names[f"{p.name}.jpg"], p) for p in recording_pictures(COLMAP(str(folder)))]
+    return [replace(p, name=name, source=source, path=paths[name], lens=UNKNOWN_LENS) for name, p in found]
+
+
+def _without_copies(pictures: Sequence[Picture]) -> list[Picture]:
+    """The pictures, of equal files the first: a second view from the same place tells nothing."""
+    first: dict[str, Picture] = {}
+    copies = []
+    for picture in pictures:
+        original = first.setdefault(_digest(picture), picture)
+        if original is not picture:
+            copies.append(f"{picture.name} (of {original.name})")
+    if copies:
+        log.warning("%d images are copies of others and are left out: %s", len(copies), ", ".join(copies))
+    return list(first.values())
+
+
+def _tell_left_out(state: dict[str, Any], count: int) -> None:
+    """Names the images without cameras, and those of other parts."""
     if state["left_out"]:
-        names, count = ", ".join(state["left_out"]), len(state["left_out"])
         log.warning(
             "%d of %d images show too little of what the others show; they have no cameras and are left out: %s",
-            count, len(pictures), names,
+            len(state["left_out"]), count, ", ".join(state["left_out"]),
         )  # fmt: skip
-    names = state["images"]
-    source = f"structure from motion, {len(names)} of {len(pictures)} images"
-    return [replace(p, name=names[f"{p.name}.jpg"], source=source) for p in recording_pictures(COLMAP(str(folder)))]
+    for part in state.get("other_parts", []):
+        log.warning(
+            "%d of them form another part, which nothing connects with the %d images taken; take photographs in "
+            "between, or reconstruct that part alone: %s",
+            len(part), len(state["images"]), ", ".join(part),
+        )  # fmt: skip
 
 
 def _key(pictures: Sequence[Picture]) -> str:
     """Changes with the content, the names or the order of the pictures, and with how they are worked on."""
-    settings = [FORMAT, IMAGE_SIDE, FEATURE_SIDE, FEATURES, SEED, _MODEL, _QUALITY]
+    settings = [FORMAT, IMAGE_SIDE, *_feature_settings(len(pictures)), SEED, _MODEL, _QUALITY]
     contents = [[picture.name, picture.size, _digest(picture)] for picture in pictures]
     return hashlib.sha256(json.dumps([settings, contents]).encode()).hexdigest()
 
@@ -128,8 +162,9 @@ def _read_state(folder: Path) -> dict[str, Any] | None:
         state = load_json(folder / _STATE)
     except (FormatError, OSError):
         return None
-    kinds = {"key": str, "images": dict, "left_out": list}
+    kinds = {"key": str, "images": dict, "left_out": list, "points": int}
     known = isinstance(state, dict) and all(isinstance(state.get(name), kind) for name, kind in kinds.items())
+    known = known and state["points"] >= FEWEST_POINTS  # earlier versions kept models without any
     whole = known and all((folder / "images" / name).is_file() for name in state["images"])
     return state if whole and model_folder_of(folder) is not None else None
 
@@ -142,26 +177,29 @@ def _check_ours(folder: Path) -> None:
 
 
 def _solve(pictures: Sequence[Picture], folder: Path, key: str, monitor: Monitor) -> dict[str, Any]:
-    with tempfile.TemporaryDirectory(prefix="vg2gt-sfm-") as temporary, _silent():
+    with tempfile.TemporaryDirectory(prefix="vg2gt-sfm-") as temporary, quiet_colmap():
         work = Path(temporary)
         with monitor.stage("read photographs", len(pictures)) as advance:
             lenses = _stage(pictures, work, advance)
         names = sorted(name for members in lenses.values() for name in members)
         _find_features(work, lenses, names, monitor)
         _match(work, names, monitor)
-        model = _map(work, len(names), monitor)
-        if model is None:
+        models = sound_models(map_cameras(work, len(names), SEED, monitor))
+        if not models:
             raise ValueError(
                 f"the cameras of these {len(pictures)} images cannot be found: too few of them show the same things "
                 f"from places that are near, but not equal; {ADVICE}"
             )
-        placed = {image.name for image in model.images.values() if image.has_pose}
-        _write(model, work, folder)
+        model, *others = models
+        placed = placed_images(model)
+        _write(model, work)
         titles = {name: picture.name for name, picture in zip(names, pictures, strict=True)}
+        parts = other_parts(others, placed)
         state = {
             "key": key,
             "images": {name: title for name, title in titles.items() if name in placed},
             "left_out": [title for name, title in titles.items() if name not in placed],
+            "other_parts": [[titles[name] for name in part] for part in parts],
             "points": model.num_points3D(),
             "reprojection_error": round(model.compute_mean_reprojection_error(), 3),
         }
@@ -179,7 +217,10 @@ def _stage(pictures: Sequence[Picture], work: Path, advance: Any) -> dict[tuple[
     for number, picture in enumerate(pictures):
         shrink = min(1.0, IMAGE_SIDE / max(picture.size))
         target = (round(picture.size[0] * shrink), round(picture.size[1] * shrink))
-        frames = reduce_to_fit(picture.read(target), (IMAGE_SIDE, IMAGE_SIDE))
+        try:
+            frames = reduce_to_fit(picture.read(target), (IMAGE_SIDE, IMAGE_SIDE))
+        except DataError as error:
+            raise name_damaged(pictures, error) from error
         pixels = to_bytes(frames.images[0]).permute(1, 2, 0).numpy()
         name = f"{number:06d}.jpg"
         Image.fromarray(pixels).save(work / "images" / name, quality=_QUALITY, subsampling=0)
@@ -188,6 +229,11 @@ def _stage(pictures: Sequence[Picture], work: Path, advance: Any) -> dict[tuple[
         lenses.setdefault((height, width, focal), []).append(name)
         advance()
     return lenses
+
+
+def _feature_settings(count: int) -> tuple[int, int]:
+    """Longer side of the images in which features are looked for, and how many at most."""
+    return (FEATURE_SIDE, FEATURES) if count <= ALL_PAIRS else (MANY_SIDE, MANY_FEATURES)
 
 
 def _find_features(
@@ -208,8 +254,7 @@ def _find_features(
     options = pycolmap.FeatureExtractionOptions()
     options.use_gpu = False
     options.num_threads = _threads()
-    options.max_image_size = FEATURE_SIDE
-    options.sift.max_num_features = FEATURES
+    options.max_image_size, options.sift.max_num_features = _feature_settings(len(names))
     with monitor.stage("find features", len(names)) as advance:
         for start in range(0, len(names), _AT_ONCE):
             some = list(names[start : start + _AT_ONCE])
@@ -221,9 +266,15 @@ def _find_features(
 
 
 def _match(work: Path, names: Sequence[str], monitor: Monitor) -> None:
-    """Matches every image with all before it."""
+    """Matches every image with all before it, or of many with those that are likely to show the same."""
     import pycolmap  # pyright: ignore[reportMissingImports]
 
+    database = work / "database.db"
+    earlier = {later: list(range(later)) for later in range(1, len(names))}
+    if len(names) > ALL_PAIRS:
+        earlier = {}
+        for before, later in likely_pairs(_descriptors(database, names), SEED):
+            earlier.setdefault(later, []).append(before)
     matching = pycolmap.FeatureMatchingOptions()
     matching.use_gpu = False
     matching.num_threads = _threads()
@@ -231,12 +282,11 @@ def _match(work: Path, names: Sequence[str], monitor: Monitor) -> None:
     checking.ransac.random_seed = SEED
     pairs = pycolmap.ImportedPairingOptions()
     pairs.match_list_path = work / "pairs.txt"
-    with monitor.stage("match features", len(names) - 1) as advance:
-        for number in range(1, len(names)):
-            lines = [f"{before} {names[number]}\n" for before in names[:number]]
-            (work / "pairs.txt").write_text("".join(lines))
+    with monitor.stage("match features", len(earlier)) as advance:
+        for later, before in earlier.items():
+            (work / "pairs.txt").write_text("".join(f"{names[number]} {names[later]}\n" for number in before))
             pycolmap.match_image_pairs(
-                work / "database.db",
+                database,
                 matching_options=matching,
                 pairing_options=pairs,
                 verification_options=checking,
@@ -245,34 +295,18 @@ def _match(work: Path, names: Sequence[str], monitor: Monitor) -> None:
             advance()
 
 
-def _map(work: Path, count: int, monitor: Monitor) -> Reconstruction | None:
-    """The largest model, or None."""
+def _descriptors(database: Path, names: Sequence[str]) -> list[NDArray[np.uint8]]:
     import pycolmap  # pyright: ignore[reportMissingImports]
 
-    pycolmap.set_random_seed(SEED)
-    (work / "models").mkdir()
-    expected = iter(range(count))
-    with monitor.stage("place cameras", count) as advance:
-        models = pycolmap.incremental_mapping(
-            work / "database.db",
-            work / "images",
-            work / "models",
-            options=_mapping_options(),
-            next_image_callback=lambda: advance() if next(expected, None) is not None else None,
-        )
-    return max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
+    opened = pycolmap.Database.open(database)
+    try:
+        numbers = {image.name: image.image_id for image in opened.read_all_images()}
+        return [np.asarray(opened.read_descriptors(numbers[name]).data) for name in names]
+    finally:
+        opened.close()
 
 
-def _mapping_options() -> IncrementalPipelineOptions:
-    import pycolmap  # pyright: ignore[reportMissingImports]
-
-    options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads = options.mapper.num_threads = 1  # sums in a fixed order: the same images, the same cameras
-    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = SEED
-    return options
-
-
-def _write(model: Reconstruction, work: Path, folder: Path) -> None:
+def _write(model: Reconstruction, work: Path) -> None:
     """Brings the points' median depth to 1 and writes undistorted images and their model to ``work/undistorted``."""
     import pycolmap  # pyright: ignore[reportMissingImports]
 
@@ -293,16 +327,3 @@ def _write(model: Reconstruction, work: Path, folder: Path) -> None:
 def _threads() -> int:
     """More than are images at once are of no use to features; matching goes the same way."""
     return min(_AT_ONCE, torch.get_num_threads())
-
-
-@contextmanager
-def _silent() -> Iterator[None]:
-    """Keeps COLMAP from telling its whole story on the console."""
-    import pycolmap  # pyright: ignore[reportMissingImports]
-
-    before = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
-    try:
-        yield
-    finally:
-        pycolmap.logging.minloglevel = before

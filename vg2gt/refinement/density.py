@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from vg2gt.gaussians.far_shell import is_far
 from vg2gt.gaussians.surfel import ALONE, layout
 from vg2gt.geometry.rotations import quat_to_matrix
 from vg2gt.refinement.parameters import Parameters
@@ -25,6 +26,7 @@ def supported(gaussians: Gaussians, cameras: Cameras, depth: Tensor, views: int)
     """
     agree, through = count_points(gaussians.means, depth, cameras, TOLERANCE, MARGIN)
     keep = (agree >= min(views, len(depth) // 2)) & (through <= agree)
+    keep |= is_far(gaussians, depth, cameras)  # the shell behind everything
     return gaussians.select(keep) if keep.any() else gaussians
 
 

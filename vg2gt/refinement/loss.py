@@ -21,11 +21,13 @@ class Observations(TensorRecord):
         images: ``[V, 3, H, W]`` in [0, 1].
         depth: ``[V, H, W]`` decoded z-depth in scene units, 0 = none.
         depth_conf: ``[V, H, W]`` its confidence > 0.
+        mask: ``[V, H, W]`` in [0, 1], how much each pixel counts; None: all count.
     """
 
     images: Tensor
     depth: Tensor
     depth_conf: Tensor
+    mask: Tensor | None = None
 
     def views(self, views: Tensor) -> Observations:
         """Returns those of some views."""

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
+from vg2gt.losses.gaussian import where_it_counts
 from vg2gt.metrics import psnr
 from vg2gt.refinement.density import prune, split, supported
 from vg2gt.refinement.fill import fill_holes
@@ -240,7 +241,8 @@ class _Refinement:
         """The loss of some views, and their PSNR ``[R]``."""
         loss, cameras, seen = self.options.loss, scene.cameras.select(views), self.seen.views(views)
         rendered = self.trainer(scene.gaussians, cameras)
-        rendered = replace(rendered, color=scene.exposed(rendered.color, views))
+        color = where_it_counts(scene.exposed(rendered.color, views)[0], seen.images, seen.mask)
+        rendered = replace(rendered, color=color[None])
         terms = loss.of_views(rendered, cameras, seen, self.depth)
         terms |= loss.of_gaussians(scene.gaussians, self.parameters.size) if torch.is_grad_enabled() else {}
         return loss.total(terms), psnr(rendered.color[0].detach(), seen.images)

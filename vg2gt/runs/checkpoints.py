@@ -9,7 +9,7 @@ import zipfile
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -17,7 +17,6 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from vg2gt.io.files import flush_folder, flush_to_disk, write_bytes
-from vg2gt.io.tensors import load_plain, refuse_foreign
 
 log = logging.getLogger(__name__)
 
@@ -36,38 +35,19 @@ def write_checkpoint(checkpoint: Mapping[str, Any], path: str | Path) -> None:
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
     temporary = target.with_name(target.name + ".tmp")
-    noting = None
     try:
         with open(temporary, "wb") as file:
-            noting = _NotingFile(file)
-            torch.save(checkpoint, noting)  # pyright: ignore[reportArgumentType]: it has what is asked of a file
+            torch.save(checkpoint, file)
             flush_to_disk(file)
         os.replace(temporary, target)
         flush_folder(target.parent)
     except (OSError, RuntimeError) as error:  # torch's writer may make a RuntimeError of a full disk
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
-        reason = error if noting is None or noting.error is None else noting.error
         raise OSError(
-            f"checkpoint {target} could not be written ({reason}); earlier checkpoints are intact: make room and go "
-            "on with ckpt=last"
+            f"checkpoint {target} could not be written ({error}; is the disk full?); earlier checkpoints are intact: "
+            "make room and continue with ckpt=last"
         ) from error
-
-
-class _NotingFile:
-    """A file that remembers the disk's own error, of which torch's writer says "unexpected pos"."""
-
-    def __init__(self, file: IO[bytes]) -> None:
-        self.error: OSError | None = None
-        self.flush = file.flush
-        self._write = file.write
-
-    def write(self, content: Any) -> int:
-        try:
-            return self._write(content)
-        except OSError as error:
-            self.error = error
-            raise
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
@@ -83,9 +63,8 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     if path.suffix == SLIM:
         return _read_slim(path)
     try:
-        refuse_foreign(path)
         _verify_checksums(path)
-        content = load_plain(path)
+        content = torch.load(path, map_location="cpu", weights_only=True)
         if not isinstance(content, dict):
             raise ValueError(f"it holds a {type(content).__name__}")
     except Exception as error:  # there is no end to what readers raise over damaged bytes
@@ -184,33 +163,6 @@ def by_age(folder: Path) -> list[Path]:
 def _step_of(path: Path) -> int:
     digits = path.stem.removeprefix("step-").split("-")[0]
     return int(digits) if digits.isdecimal() else -1
-
-
-def remove_leftovers(folder: Path, newest: Path | None) -> None:
-    """Clears what an interrupted run left behind, before the folder is written to again.
-
-    Half-written files are deleted. Whatever stands in the way of checkpoints still to come, because it is named like a
-    newer one than the run goes on from, is damaged and renamed to ``*.damaged``.
-
-    Args:
-        folder: the run's own.
-        newest: the checkpoint that the run goes on from; None: from the beginning.
-    """
-    for path in [*folder.glob(".*.tmp"), *(folder / "checkpoints").glob("*.tmp")]:
-        if path.is_symlink() or path.is_file():
-            path.unlink()
-    if newest is None:
-        return
-    for path in by_age(folder / "checkpoints"):
-        if path.name == newest.name:
-            break
-        aside = path.with_name(f"{path.name}.damaged")
-        number = 1
-        while aside.exists():
-            number += 1
-            aside = path.with_name(f"{path.name}.damaged-{number}")
-        path.rename(aside)
-        log.warning("%s is damaged and now named %s; the run goes on from %s", path, aside.name, newest.name)
 
 
 def initialize_from(module: nn.Module, path: str | Path) -> None:

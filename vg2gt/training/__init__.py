@@ -1,1 +1,1 @@
-"""Training: the Lightning module, the run around it, callbacks, faults."""
+"""Training: the Lightning module, the run around it, callbacks."""

@@ -5,10 +5,9 @@ from __future__ import annotations
 import importlib.util
 import logging
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
-from itertools import chain
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from lightning.fabric.utilities.rank_zero import rank_zero_only
 from lightning.pytorch import LightningDataModule, Trainer
 from lightning.pytorch.callbacks import ProgressBar
 from lightning.pytorch.loggers import TensorBoardLogger, WandbLogger
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from backends.cache import TokenCache
 from vg2gt.data.datamodule import SceneDataModule
@@ -28,25 +27,15 @@ from vg2gt.geometry.precision import trainer_precision
 from vg2gt.io.files import read_json, write_json, write_text
 from vg2gt.io.image_files import read_color
 from vg2gt.memory import TRAINING, memory_advice
-from vg2gt.runs.checkpoints import (
-    initialize_from,
-    model_state,
-    newest_valid,
-    read_checkpoint,
-    refuse_not_finite,
-    remove_leftovers,
-)
-from vg2gt.runs.load import made_of, refuse_other_tokens
+from vg2gt.runs.checkpoints import newest_valid
+from vg2gt.runs.load import made_of
 from vg2gt.runs.lock import only_process_in
-from vg2gt.training.checkpoint_io import AtomicCheckpointIO
-from vg2gt.training.compilation import Compiling, compile_kernels
+from vg2gt.training.checkpointing import AtomicCheckpointIO
 from vg2gt.training.distributed import ending_together
 from vg2gt.training.module import VG2GTModule
-from vg2gt.training.notices import notices
 from vg2gt.training.preview import write_preview
 from vg2gt.training.report import comparison_table, print_comparison
-from vg2gt.training.start import WriteConfig, checkpoint_to_resume, clear, name_differences
-from vg2gt.types import Batch
+from vg2gt.training.start import checkpoint_to_resume, load_start, prepare_folder
 
 log = logging.getLogger(__name__)
 
@@ -55,6 +44,7 @@ EXPECTED_WARNINGS = (
     r"You're resuming from a checkpoint that ended before the epoch",  # batches are a function of the step's number
     r"It is recommended to use `self.log\('eval/",  # all ranks log the same
     r".*isinstance\(treespec, LeafSpec\)",  # inside Lightning
+    r"Checkpoint directory .* exists and is not empty",  # of a run that continues
 )
 
 FEW_WORKERS = r"The '\w+_dataloader' does not have many workers"  # expected on a CPU, whose cores compute
@@ -161,7 +151,7 @@ def _check_trainer(config: DictConfig) -> None:
 
 
 @memory_advice(TRAINING)
-def train(config: DictConfig, compiling: Compiling | None = None) -> dict[str, Any]:
+def train(config: DictConfig) -> dict[str, Any]:
     """Runs the configuration from beginning to end.
 
     A refused start changes nothing of a run that the folder holds, and a trial (``fast_dev_run``) writes nothing.
@@ -171,7 +161,6 @@ def train(config: DictConfig, compiling: Compiling | None = None) -> dict[str, A
 
     Args:
         config: of the training.
-        compiling: the processes of ``begin_compiling``, if kernels are being compiled already.
 
     Returns:
         The content of ``metrics.json``.
@@ -185,17 +174,30 @@ def train(config: DictConfig, compiling: Compiling | None = None) -> dict[str, A
     """
     writes = rank_zero_only.rank == 0 and not config.trainer.get("fast_dev_run")
     with only_process_in(config.output_dir) if writes else nullcontext():
-        return _train(config, writes, compiling)
+        checkpoint = checkpoint_to_resume(config)
+        run = build(config)
+        check_run(run)
+        load_start(run.module, config, checkpoint)
+        if writes:
+            prepare_folder(config, checkpoint)
+            log.info("the run's folder is %s; it computes on %s", run.folder, run.trainer.strategy.root_device)
+        with ending_together(run.trainer):
+            untrained = _untrained_metrics(run, resumed=checkpoint is not None)
+            if not fit(run, checkpoint):
+                return {}
+            log.info("evaluating the trained model")
+            return report(run, untrained, evaluate(run))
 
 
-def _train(config: DictConfig, writes: bool, compiling: Compiling | None) -> dict[str, Any]:
-    """:func:`train` in a folder that is this process's own; ``writes``: by this process, and not a trial."""
-    checkpoint = checkpoint_to_resume(config)
-    for notice in notices(config) if rank_zero_only.rank == 0 else ():
-        log.warning(notice)
-    run = build(config)
+def check_run(run: Run) -> None:
+    """Checks data and model before anything is measured or written.
+
+    Raises:
+        DataError: if the data lacks what the model needs.
+        ValueError: if the model has no trained part.
+    """
     if isinstance(run.datamodule, SceneDataModule):
-        run.datamodule.setup("fit")  # before anything is measured: faults of the data are named first
+        run.datamodule.setup("fit")
         for source in run.datamodule.sources:
             refuse_without_hints(run.module.model, source)
     if not run.module.model.trained_parameters():
@@ -203,68 +205,20 @@ def _train(config: DictConfig, writes: bool, compiling: Compiling | None) -> dic
             f"{type(run.module.model).__name__} has no trained part: evaluate it as it is (vg2gt evaluate), "
             "or choose another model="
         )
-    if checkpoint is not None:
-        content = read_checkpoint(checkpoint)  # refused before anything is written
-        refuse_not_finite(content["state_dict"], checkpoint)
-        refuse_other_tokens(config.backend, content, checkpoint)
-        run.module.model.load_trained(model_state(content["state_dict"]), content.get("backend"))
-        name_differences(config)
-    elif config.init_from:
-        initialize_from(run.module, config.init_from)
-    if writes:
-        if checkpoint is None:
-            clear(run.folder)
-        remove_leftovers(run.folder, checkpoint)
-        describe = WriteConfig(run.folder / "config.yaml", OmegaConf.to_yaml(config, resolve=True))
-        if checkpoint is None or not describe.path.is_file():
-            describe.write()
-        else:
-            run.trainer.callbacks.append(describe)  # pyright: ignore[reportAttributeAccessIssue]
-
-        log.info("the run's folder is %s; it computes on %s", run.folder, run.trainer.strategy.root_device)
-
-    data, on_cpu = run.datamodule, run.trainer.strategy.root_device.type == "cpu"
-    if writes and not run.trial and on_cpu and isinstance(data, SceneDataModule):
-        compile_kernels(run.module.renderer, lambda: _first_step(run.module, data), compiling, _first_batches(data))
-    with ending_together(run.trainer):
-        untrained = _untrained_metrics(run, resumed=checkpoint is not None)
-        run.trainer.fit(run.module, datamodule=run.datamodule, ckpt_path=checkpoint, weights_only=True)
-        _save_last(run)
-        if not run.trial and run.trainer.global_step < run.trainer.max_steps:
-            log.warning("training ended at step %d of %d", run.trainer.global_step, run.trainer.max_steps)
-            return {}
-        log.info("evaluating the trained model")
-        trained = evaluate(run)
-        return _report(run, untrained, trained)
 
 
-def _first_batches(data: SceneDataModule) -> Iterator[Batch]:
-    """Batches of the evaluation and of training, for what they leave on disk: rooms are kept there once made."""
-    if data.loader_processes == 0:  # else other processes read the frames
-        yield from chain(data.val_dataloader(), data.train_dataloader())
-
-
-def _first_step(module: VG2GTModule, data: SceneDataModule) -> Callable[[], torch.Tensor]:
-    """A training step up to its loss, outside the trainer's loop: of three views, which run what many do."""
-    loader = data.train_dataloader()
-    batch: Batch = loader.dataset[next(iter(loader.sampler))]  # without the loader's workers, which a fork disturbs
-    batch = batch.single(0)
-    few = batch.views(slice(max(batch.num_context - 2, 0), batch.num_context + 1))
-    batch = replace(few, num_context=min(batch.num_context, 2))
-
-    def step() -> torch.Tensor:
-        module.model.token_cache = None  # these views do not come again; the step is another process's
-        return module.training_step(batch, 0)
-
-    return step
-
-
-def _save_last(run: Run) -> None:
-    """Saves the final weights where the last step was not a checkpoint's turn."""
-    path = run.folder / "checkpoints" / f"step-{run.trainer.global_step}.ckpt"
+def fit(run: Run, checkpoint: Path | None) -> bool:
+    """Trains from the beginning or a checkpoint and saves the final weights; False if it was stopped before its end."""
+    trainer = run.trainer
+    trainer.fit(run.module, datamodule=run.datamodule, ckpt_path=checkpoint, weights_only=True)
+    last = run.folder / "checkpoints" / f"step-{trainer.global_step}.ckpt"
     # Rank 0 decides for all: saving is collective, and it makes the file appear.
-    if run.trainer.strategy.broadcast(not run.trial and not path.is_file()):
-        run.trainer.save_checkpoint(path)
+    if trainer.strategy.broadcast(not run.trial and not last.is_file()):
+        trainer.save_checkpoint(last)
+    if run.trial or trainer.global_step >= trainer.max_steps:
+        return True
+    log.warning("training ended at step %d of %d", trainer.global_step, trainer.max_steps)
+    return False
 
 
 def evaluate(run: Run) -> dict[str, float]:
@@ -286,15 +240,16 @@ def _untrained_metrics(run: Run, resumed: bool) -> dict[str, float]:
     return metrics
 
 
-def _report(run: Run, untrained: dict[str, float], trained: dict[str, float]) -> dict[str, Any]:
-    report = {
+def report(run: Run, untrained: dict[str, float], trained: dict[str, float]) -> dict[str, Any]:
+    """Writes and prints the results; returns the content of ``metrics.json``."""
+    content = {
         "untrained": untrained,
         "trained": trained,
         "steps": run.trainer.global_step,
-        "skipped_steps": run.module.skipped.summary(),
+        "skipped_steps": run.module.skipped.state_dict(),
     }
     if run.trainer.is_global_zero and not run.trial:
-        write_json(run.folder / "metrics.json", report)
+        write_json(run.folder / "metrics.json", content)
         write_text(run.folder / "metrics.md", comparison_table(untrained, trained))
         print_comparison(untrained, trained)
         run.module.to(run.trainer.strategy.root_device)  # the strategy's teardown has moved it to the CPU
@@ -308,7 +263,7 @@ def _report(run: Run, untrained: dict[str, float], trained: dict[str, float]) ->
         ):
             print(f"{name}: {path}")
         print(f"curves: {_where_curves_are(run)}")
-    return report
+    return content
 
 
 def _log_picture(run: Run, picture: Path) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from functools import partial
 from typing import Any, Literal, get_args
 
@@ -15,7 +14,7 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
-from vg2gt.evaluation import evaluate_scene
+from vg2gt.evaluation.in_training import evaluate_scene
 from vg2gt.evaluation.protocols import training_cameras
 from vg2gt.losses import LossReport
 from vg2gt.memory import dropped_by
@@ -24,20 +23,9 @@ from vg2gt.profiling import stage
 from vg2gt.rendering import Renderer, UnrenderableError
 from vg2gt.runs.checkpoints import MADE_OF, MODEL_PREFIX, model_state
 from vg2gt.training.distributed import all_gather_object, interleave, world_size
-from vg2gt.training.faults import (
-    Fault,
-    GradientGrowth,
-    GradientWatch,
-    SkippedSteps,
-    described,
-    fault_of_batch,
-    fault_of_loss,
-    fault_of_prediction,
-    gather_faults,
-)
-from vg2gt.training.idle_terms import IdleTerms
 from vg2gt.training.pose_noise import with_pose_noise
 from vg2gt.training.schedule import cosine_with_warmup, parameter_groups
+from vg2gt.training.skipped import Fault, SkippedSteps, finite
 from vg2gt.types import Batch, Prediction
 
 log = logging.getLogger(__name__)
@@ -112,10 +100,7 @@ class VG2GTModule(lightning.LightningModule):
         self.seed = seed
         self.generator = torch.Generator()
         self.skipped = SkippedSteps(max_skipped)
-        self._idle = IdleTerms(getattr(loss, "weighted", ()))
-        self._watch = GradientWatch(())
-        self._growth = GradientGrowth()
-        self._fault: Fault | None = None
+        self._cause: str | None = None  # of the step to be skipped
         self._scenes: tuple[str, ...] = ()
         self._figures: dict[str, Tensor] = {}
         self._metrics: dict[tuple[str | int, ...], dict[str, float]] = {}
@@ -130,35 +115,29 @@ class VG2GTModule(lightning.LightningModule):
         self.generator.manual_seed(step_seed)  # curve orders, rendered views
         torch.manual_seed(step_seed + self.global_rank)  # drop-path
 
-    def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
-        """Copies a batch while the device still computes."""
-        return batch.to(device, non_blocking=device.type == "cuda")
-
-    def on_fit_start(self) -> None:
-        """Begins to watch the gradients."""
-        named = self.model.named_parameters()
-        self._watch = GradientWatch((name, parameter) for name, parameter in named if parameter.requires_grad)
-
-    def on_fit_end(self) -> None:
-        """Stops watching them."""
-        self._watch.remove()
-
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        """Reconstructs the context views, renders some views and returns the training loss."""
-        self._watch.clear()
-        self._scenes, self._figures = batch.scene, {}
-        self._fault = fault_of_batch(batch)
-        report = self._losses(batch) if self._fault is None else None
-        return report.total if report is not None and self._fault is None else self._lost_step()
+        """Reconstructs the context views, renders some views and returns the training loss.
+
+        Where something is not finite, the loss is NaN: the step is then skipped on all ranks.
+        """
+        self._scenes, self._figures, self._cause = batch.scene, {}, None
+        report = self._losses(batch)
+        if report is not None:
+            self._figures |= self._step_figures(report)
+            if finite(report.total):
+                return report.total
+            bad = [name for name, value in report.terms.items() if not finite(value)]
+            self._cause = f"loss ({', '.join(bad) or 'finite terms, infinite sum'})"
+        # every parameter takes part, as DDP expects
+        return torch.stack([parameter.sum() for parameter in self.model.trained_parameters()]).sum() * torch.nan
 
     def _losses(self, batch: Batch) -> LossReport | None:
-        """The training losses; what is not finite is noted, and None returned where it cannot be rendered."""
-        report = self._losses_of_geometry(batch) if self.part == "coarse" else self._losses_of_scene(batch)
-        if report is not None:
-            self._fault = fault_of_loss(report, batch.scene)
-            self._figures |= self._step_figures(report)
-            self._idle.see(report.terms)
-        return report
+        """The training losses; None, with the cause noted, where the model or the renderer cannot go on."""
+        focal = batch.cameras.intrinsics[..., [0, 1], [0, 1]]
+        if not finite(batch.images, batch.depth, batch.cameras.world_to_camera, batch.cameras.intrinsics, focal.log()):
+            self._cause = "images, depth or cameras of the batch"
+            return None
+        return self._losses_of_geometry(batch) if self.part == "coarse" else self._losses_of_scene(batch)
 
     def _losses_of_geometry(self, batch: Batch) -> LossReport:
         """Geometry and enhancement losses of what the coarse module makes of the context views."""
@@ -171,24 +150,21 @@ class VG2GTModule(lightning.LightningModule):
     def _losses_of_scene(self, batch: Batch) -> LossReport | None:
         """All losses: of the context views' geometry and of some rendered views."""
         prediction = self.model(batch.context.images, batch.context.hints, self.generator)
-        self._fault = fault_of_prediction(prediction, batch.scene)
-        if self._fault is not None:
+        gaussians = prediction.gaussians
+        if not finite(gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh):
+            self._cause = "Gaussians"
             return None
         views = self._draw_views(batch)
         cameras = training_cameras(self.model, batch, prediction).select(views.to(self.device))
         try:
             with stage("render"):
-                rendered = self.renderer(prediction.gaussians, cameras)
+                rendered = self.renderer(gaussians, cameras)
         except UnrenderableError as error:
-            self._fault = Fault(batch.scene, f"nothing to render: {error}")
+            self._cause = f"nothing to render: {error}"
             return None
         self._figures = self._scene_figures(batch, prediction)
         with stage("loss"):
             return self.loss(prediction, batch, rendered, views, cameras)
-
-    def _lost_step(self) -> Tensor:
-        """A loss that is NaN in every trained parameter: the step is then dropped on all ranks."""
-        return torch.stack([parameter.sum() for parameter in self.model.trained_parameters()]).sum() * torch.nan
 
     def _draw_views(self, batch: Batch) -> Tensor:
         """Indices of the views to render: held-out views first, but at least one context view, drawn at random.
@@ -234,33 +210,31 @@ class VG2GTModule(lightning.LightningModule):
         gradient_clip_val: int | float | None = None,
         gradient_clip_algorithm: str | None = None,
     ) -> None:
-        """Clips the global gradient norm; drops the step on all ranks if a loss or gradient is not finite on any."""
+        """Clips the global gradient norm; skips the step on all ranks if a loss or gradient is not finite on any."""
         if gradient_clip_algorithm not in (None, "norm"):
             raise ValueError(f"trainer.gradient_clip_algorithm={gradient_clip_algorithm} is not supported; use norm")
         limit = float(gradient_clip_val) if gradient_clip_val and gradient_clip_val > 0 else float("inf")
         norm = nn.utils.clip_grad_norm_(self.model.trained_parameters(), limit)
-        sound = self._fault is None and bool(torch.isfinite(norm))
-        # Every rank sees the sum, so all of them drop the step or none does.
-        unsound = self.trainer.strategy.reduce(norm.new_tensor(float(not sound)), reduce_op="sum")
-        if float(unsound) > 0:
-            # Without gradients the optimiser leaves parameters and moments as they are: no decay, no NaN.
+        bad = self._cause is not None or not bool(torch.isfinite(norm))
+        # All ranks see the sum, so all of them skip the step or none does.
+        bad_ranks = float(self.trainer.strategy.reduce(norm.new_tensor(float(bad)), reduce_op="sum"))
+        if bad_ranks:
+            # Without gradients the optimiser leaves parameters and moments as they are.
             optimizer.zero_grad(set_to_none=True)
-            self._drop_step()
+            self._skip_step()
         else:
-            self.skipped.good()
-            self._growth.see(float(norm.detach()), self.global_step, warn=self.trainer.is_global_zero)
-        self._log_step(average=float(unsound) == 0)
+            self.skipped.in_a_row = 0
+        self._log_step(average=not bad_ranks)
         self.log("train/grad_norm", norm.detach())
         self.log("train/skipped_steps", float(self.skipped.total))
 
-    def _drop_step(self) -> None:
-        """Counts a dropped step and says what every rank found."""
-        fault = self._fault
-        if fault is None and (name := self._watch.first_bad()):
-            fault = Fault(self._scenes, f"gradient of {name}")
-        faults = gather_faults(fault and replace(fault, step=self.global_step, rank=self.global_rank))
+    def _skip_step(self) -> None:
+        """Counts a skipped step and names what every rank found."""
+        cause = self._cause or "gradient"  # after averaging, the gradient of all ranks
+        found = all_gather_object(Fault(self._scenes, cause, self.global_step, self.global_rank))
+        faults = [fault for fault in found if fault.cause != "gradient"] or found
         if self.trainer.is_global_zero:
-            log.warning("step %d skipped: %s", self.global_step, described(faults))
+            log.warning("step %d skipped, not finite: %s", self.global_step, "; ".join(map(str, faults)))
         self.skipped.add(faults)
 
     def configure_optimizers(self) -> dict[str, Any]:
@@ -310,7 +284,7 @@ class VG2GTModule(lightning.LightningModule):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Refuses a checkpoint that was trained on another backbone."""
         self.model.check_backend(checkpoint.get("backend"))
-        self.skipped.load_state_dict(checkpoint.get("skipped_steps", 0))
+        self.skipped.load_state_dict(checkpoint["skipped_steps"])
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False):
         """Loads the trained part; only backbone weights may be missing."""

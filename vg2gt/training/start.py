@@ -6,13 +6,21 @@ import logging
 import shutil
 from pathlib import Path
 
-import lightning
 from omegaconf import DictConfig, OmegaConf
 
 from vg2gt.config import flatten
 from vg2gt.io.files import write_text
-from vg2gt.runs.checkpoints import newest_valid, read_checkpoint
+from vg2gt.runs.checkpoints import (
+    by_age,
+    initialize_from,
+    model_state,
+    newest_valid,
+    read_checkpoint,
+    refuse_not_finite,
+)
+from vg2gt.runs.load import refuse_other_tokens
 from vg2gt.runs.trust import read_run_config
+from vg2gt.training.module import VG2GTModule
 
 OPTIMIZER = "optimizer._target_"
 
@@ -57,14 +65,43 @@ def checkpoint_to_resume(config: DictConfig) -> Path | None:
     return path
 
 
-def clear(folder: Path) -> None:
-    """Removes the run that ``overwrite=true`` replaces: neither its curve nor its result are the new run's."""
-    old = sorted((folder / "checkpoints").glob("*.ckpt"))
-    for path in old:
-        path.unlink(missing_ok=True)
-    if old:
+def load_start(module: VG2GTModule, config: DictConfig, checkpoint: Path | None) -> None:
+    """Loads the weights that a run starts from: a checkpoint's, those of ``init_from``, or none. Writes nothing.
+
+    Raises:
+        ValueError: if they are not finite or belong to another model, backbone or optimiser.
+    """
+    if checkpoint is not None:
+        content = read_checkpoint(checkpoint)
+        refuse_not_finite(content["state_dict"], checkpoint)
+        refuse_other_tokens(config.backend, content, checkpoint)
+        module.model.load_trained(model_state(content["state_dict"]), content.get("backend"))
+        name_differences(config)
+    elif config.init_from:
+        initialize_from(module, config.init_from)
+
+
+def prepare_folder(config: DictConfig, checkpoint: Path | None) -> None:
+    """Removes half-written files and the run that is overwritten, renames damaged checkpoints, writes ``config.yaml``.
+
+    Args:
+        config: of the training.
+        checkpoint: the one to continue from; newer ones of the folder are damaged.
+    """
+    folder = Path(config.output_dir)
+    for path in [*folder.glob(".*.tmp"), *(folder / "checkpoints").glob("*.tmp")]:
+        path.unlink()
+    old = by_age(folder / "checkpoints")
+    if checkpoint is not None:
+        for path in old[: next((i for i, path in enumerate(old) if path.name == checkpoint.name), 0)]:
+            path.rename(f"{path}.damaged")
+            log.warning("%s is damaged and renamed to *.damaged; continuing from %s", path, checkpoint.name)
+    elif old:
+        for path in old:
+            path.unlink()
         shutil.rmtree(folder / "logs", ignore_errors=True)
         (folder / "metrics.json").unlink(missing_ok=True)
+    write_text(folder / "config.yaml", OmegaConf.to_yaml(config, resolve=True))
 
 
 def name_differences(config: DictConfig) -> None:
@@ -86,23 +123,3 @@ def name_differences(config: DictConfig) -> None:
     different = [key for key in different if key not in ("ckpt", "output_dir", "overwrite")]
     if different:
         log.warning("the resumed run differs from the interrupted one in %s", ", ".join(different))
-
-
-class WriteConfig(lightning.Callback):
-    """Writes a run's configuration, of one that goes on once its first step is sure to be taken.
-
-    Args:
-        path: the file.
-        text: the resolved configuration.
-    """
-
-    def __init__(self, path: Path, text: str) -> None:
-        self.path, self.text = path, text
-
-    def write(self) -> None:
-        """Writes the file."""
-        write_text(self.path, self.text)
-
-    def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        """Writes it when everything of the checkpoint was restored."""
-        self.write()

@@ -1,4 +1,4 @@
-"""Which pixels' depth the other views support: our addition to the paper.
+"""Which pixels' depth the other views support, and how fine voxels may be: our addition to the paper.
 
 A view's depth is right where there is something to match, and a guess elsewhere: on bare walls, in the sky, beyond the
 range that was searched. Around an object such guesses hang in the air in front of the cameras on the other side. Other
@@ -13,14 +13,28 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from vg2gt.types import Cameras, Geometry
+from vg2gt.types import Cameras, Geometry, TensorRecord
 from vg2gt.visibility.counts import count_views
+from vg2gt.visibility.disagreement import disagreement
 from vg2gt.visibility.partners import choose_partners
 
 
 @dataclass(frozen=True)
+class Support(TensorRecord):
+    """What views say of each other's depth.
+
+    Attributes:
+        keep: ``[B, V, H, W]`` bool, pixels that have a depth the scene is made of.
+        coarsen: ``[B]`` factor >= 1 of the smallest voxel.
+    """
+
+    keep: Tensor
+    coarsen: Tensor
+
+
+@dataclass(frozen=True)
 class ViewCheck:
-    """Decides which pixels' depth enters the scene.
+    """Decides which pixels' depth enters the scene, and how fine its voxels may be.
 
     A pixel is dropped where more views look through its point than agree with it. Pixels that are dropped say nothing
     in the next round. A pixel that no view agrees with and none contradicts stays.
@@ -30,6 +44,9 @@ class ViewCheck:
         margin: relative difference from which on a view looks through a point.
         rounds: how often the views are counted.
         partners: most views that each view is compared with, which bounds the time.
+        fine_below: median disagreement of views in pixels up to which voxels are as fine as configured; above, the
+            smallest voxel grows in proportion.
+        coarsest: largest factor by which it grows.
 
     Raises:
         ValueError: naming an option that is out of range.
@@ -39,6 +56,8 @@ class ViewCheck:
     margin: float = 0.04
     rounds: int = 2
     partners: int = 24
+    fine_below: float = 1.4
+    coarsest: float = 2.0
 
     def __post_init__(self) -> None:
         for name, good, expected in (
@@ -46,33 +65,28 @@ class ViewCheck:
             ("margin", self.tolerance <= self.margin < 1, "at least the tolerance and below 1"),
             ("rounds", self.rounds >= 1, "at least 1"),
             ("partners", self.partners >= 1, "at least 1"),
+            ("fine_below", self.fine_below > 0, "positive"),
+            ("coarsest", self.coarsest >= 1, "at least 1"),
         ):
             if not good:
                 raise ValueError(f"model.visibility.{name} must be {expected}, got {getattr(self, name)}")
 
     @torch.no_grad()
-    def __call__(self, geometry: Geometry) -> Tensor:
-        """Tells which pixels have a depth that the scene is made of.
+    def __call__(self, geometry: Geometry) -> Support:
+        """Checks the depth of B scenes; ``keep`` is false where there is none."""
+        scenes = [self._check(*_scene(geometry, index)) for index in range(len(geometry.depth))]
+        return Support(*(torch.stack(parts) for parts in zip(*scenes, strict=True)))
 
-        Args:
-            geometry: depth, confidence and cameras of B scenes.
-
-        Returns:
-            ``[B, V, H, W]`` bool; false where there is no depth.
-        """
-        return torch.stack([self._supported(*_scene(geometry, index)) for index in range(len(geometry.depth))])
-
-    def _supported(self, depth: Tensor, cameras: Cameras) -> Tensor:
+    def _check(self, depth: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
         keep = depth > 0
         partners = choose_partners(depth, cameras, self.partners)
-        if not partners.shape[1]:
-            return keep
+        coarsen = (disagreement(depth, cameras, partners) / self.fine_below).clamp(1, self.coarsest)
         weight = torch.ones_like(depth)
         for _ in range(self.rounds):
             left = torch.where(keep, depth, 0.0)
             counts = count_views(left, cameras, partners, weight, self.tolerance, self.margin)
             keep = keep & (counts.through <= counts.agree)
-        return keep
+        return keep, coarsen
 
 
 def _scene(geometry: Geometry, index: int) -> tuple[Tensor, Cameras]:

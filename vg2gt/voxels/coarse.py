@@ -142,7 +142,7 @@ class CoarseModule(nn.Module):
         with full_precision(geometry.depth):
             size = scene_voxel_size(geometry, self.voxel_size, self.min_footprint)
             points = PatchPoints(geometry, self.cell, size, away_from_silhouettes=self.gate)
-        embedded = self._embed(tokens)[points.rows]  # f(p): [N, C]
+        embedded = self._embed(tokens)[points.rows].float()  # f(p): [N, C]
         enhanced, gain = self._enhance(embedded, points, generator)
         if self.embedding_skip:
             enhanced = torch.cat((enhanced, embedded), -1)

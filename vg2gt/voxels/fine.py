@@ -95,13 +95,14 @@ class FineModule(nn.Module):
         self.point_mlp = point_mlp(in_channels=width + EXTRA_CHANNELS + MOMENT_CHANNELS * moments)
         self.out_channels = self.point_mlp.out_channels
 
-    def forward(self, tokens: Tokens, geometry: Geometry, images: Tensor) -> Voxels:
+    def forward(self, tokens: Tokens, geometry: Geometry, images: Tensor, coarsen: Tensor | None = None) -> Voxels:
         """Builds the fine voxels of B scenes.
 
         Args:
             tokens: enhanced tokens.
             geometry: decoded depth, confidence and cameras, in scene units and the frame of context view 0.
             images: ``[B, V, 3, H, W]`` in [0, 1].
+            coarsen: ``[B]`` factors of the smallest edge; None: 1.
 
         Returns:
             Refined voxels; differentiable in features, confidence and positions, not in which pixel lies where.
@@ -110,7 +111,7 @@ class FineModule(nn.Module):
             ValueError: if a scene spans too many voxels to be numbered.
         """
         with torch.autocast(images.device.type, enabled=False):
-            size = scene_voxel_size(geometry, self.voxel_size, self.min_footprint)
+            size = scene_voxel_size(geometry, self.voxel_size, self.min_footprint, coarsen)
             points = _Points(geometry, size, self.drop_fringes)
             plan = self._plan(points)
             if images.shape[1] > 1:

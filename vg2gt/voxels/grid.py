@@ -244,13 +244,16 @@ def pool_min(values: Tensor, plan: VoxelPlan) -> Tensor:
     return torch.segment_reduce(ordered, "min", lengths=plan.counts, unsafe=True) if len(plan) else ordered
 
 
-def scene_voxel_size(geometry: Geometry, voxel_size: float, min_footprint: float) -> Tensor:
+def scene_voxel_size(
+    geometry: Geometry, voxel_size: float, min_footprint: float, coarsen: Tensor | None = None
+) -> Tensor:
     """Edge length of a scene's voxels: the configured one, but never below a number of pixels at the median depth.
 
     Args:
         geometry: depth and cameras in scene units.
         voxel_size: edge length in scene units.
         min_footprint: smallest edge in pixels, ``min_footprint * median(depth) / focal``; 0 switches it off.
+        coarsen: ``[B]`` factors of the smallest edge; None: 1.
 
     Returns:
         ``[B]`` float32, detached.
@@ -258,11 +261,13 @@ def scene_voxel_size(geometry: Geometry, voxel_size: float, min_footprint: float
     if min_footprint <= 0:
         return torch.full((len(geometry.depth),), voxel_size, dtype=torch.float32, device=geometry.depth.device)
     sizes = []
-    for depth, intrinsics in zip(geometry.depth.detach(), geometry.cameras.intrinsics.detach(), strict=True):
+    factors = torch.ones_like(geometry.scale) if coarsen is None else coarsen
+    scenes = (geometry.depth.detach(), geometry.cameras.intrinsics.detach(), factors.detach())
+    for depth, intrinsics, factor in zip(*scenes, strict=True):
         valid = depth[(depth > 0) & torch.isfinite(depth)]
         size = torch.full((), voxel_size, dtype=torch.float32, device=depth.device)
         if valid.numel():
             focal = intrinsics[..., [0, 1], [0, 1]].mean()
-            size = torch.maximum(size, (min_footprint * valid.median() / focal).float())
+            size = torch.maximum(size, (factor * min_footprint * valid.median() / focal).float())
         sizes.append(size)
     return torch.stack(sizes)

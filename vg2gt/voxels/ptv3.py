@@ -159,7 +159,7 @@ class GridPool(nn.Module):
         parent_of = torch.empty_like(inverse)
         parent_of[order] = inverse
         first = order[counts.cumsum(0) - counts]
-        projected = self.proj(features).index_select(0, order)  # [M, C']
+        projected = self.proj(features).to(features.dtype).index_select(0, order)  # [M, C']
         pooled = torch.segment_reduce(projected, "max", lengths=counts, unsafe=True)  # [M', C']
         keys = [key[first] >> 3 for key in level.keys]
         coarse = Level(level.grid[first] >> 1, level.batch[first], len(level.counts), keys, generator)

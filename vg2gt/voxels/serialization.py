@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
@@ -42,7 +43,7 @@ def z_codes(grid: Tensor) -> Tensor:
 
 
 def hilbert_codes(grid: Tensor, bits: int) -> Tensor:
-    """Hilbert codes of cells (J. Skilling, "Programming the Hilbert curve", 2004); compiled on a CPU.
+    """Hilbert codes of cells (J. Skilling, "Programming the Hilbert curve", 2004); compiled on a CPU and with Triton.
 
     Args:
         grid: ``[M, 3]`` int64 with 0 <= coordinate < 2^bits.
@@ -52,11 +53,21 @@ def hilbert_codes(grid: Tensor, bits: int) -> Tensor:
         ``[M]`` int64 < 2^(3 bits); cells with consecutive codes share a face, and dropping the last three bits
         gives the code of the parent cell.
     """
+    if has_kernel(grid.device):
+        from vg2gt.voxels.hilbert_kernel import hilbert_in_one_kernel
+
+        return hilbert_in_one_kernel(grid, bits)
     if not compilable(grid, dtype=torch.int64):
         return hilbert_reference(grid, bits)
     codes = grid.new_empty(len(grid))
     _hilbert(grid.numpy(), bits, np.empty(3, np.int64), codes.numpy())
     return codes
+
+
+def has_kernel(device: torch.device) -> bool:
+    """Whether Hilbert codes are a Triton kernel there."""
+    cuda = device.type == "cuda" and not torch.compiler.is_compiling()
+    return cuda and importlib.util.find_spec("triton") is not None
 
 
 @kernel(nogil=True)

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
+from examples.data_sets.scannetpp import ScanNetPPiPhone
 from vg2gt.data import Frames
-from vg2gt.data.sources import ScanNetPPiPhone
 
 from .layout_scannet import JPEG_ERROR, millimetres
 from .layouts import Layout, camera_to_world, pixels, save

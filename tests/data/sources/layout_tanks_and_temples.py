@@ -3,10 +3,12 @@
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from vg2gt.data import Frames
 from vg2gt.data.sources import TanksAndTemples
-from vg2gt.io import ColmapModel, ColmapPoints, colmap_camera, colmap_image, write_colmap
+from vg2gt.io import colmap_from_views, write_colmap
+from vg2gt.types import Cameras
 
 from .layouts import SIZE, Layout, camera_to_world, pixels, save
 
@@ -29,10 +31,10 @@ def write(root: Path, frames: Frames) -> None:
         blocks.append("\n".join([f"{i} {i if registered else -1} 0", *rows]))
     (folder / "Barn_COLMAP_SfM.log").write_text("\n".join(blocks) + "\n")
     np.savetxt(folder / "Barn_trans.txt", TO_SCAN)
-    intrinsics = frames.intrinsics.double().numpy()
-    images = {i + 1: colmap_image(i + 1, np.eye(4), i + 1, f"{i + 1:06d}.png") for i in range(len(poses))}
-    cameras = {i + 1: colmap_camera(i + 1, matrix, SIZE) for i, matrix in enumerate(intrinsics)}
-    write_colmap(folder / "sparse", ColmapModel(cameras, images, ColmapPoints.empty()))
+    names = [f"{i + 1:06d}.png" for i in range(len(poses))]
+    elsewhere = torch.eye(4, dtype=torch.float64).repeat(1, len(poses), 1, 1)
+    cameras = Cameras(elsewhere, frames.intrinsics[None].double(), SIZE)
+    write_colmap(folder / "sparse", colmap_from_views(cameras, names))
 
 
 def read(root: Path, depth: str | None = None) -> TanksAndTemples:

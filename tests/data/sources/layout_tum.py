@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from examples.data_sets.tum import TUM
 from vg2gt.data import Frames
-from vg2gt.data.sources import TUM
 
 from .layouts import Layout, camera_of, camera_to_world, pixels, room, save
 

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
+from examples.data_sets.virtual_kitti import VirtualKITTI2
 from vg2gt.data import Frames
-from vg2gt.data.sources import VirtualKITTI2
 
 from .layout_scannet import JPEG_ERROR
 from .layouts import Layout, pixels, save

@@ -1,15 +1,17 @@
 """COLMAP scenes: a real model, which cameras are refused, reduced images, absent images, points."""
 
-from dataclasses import replace
-from shutil import copytree
-
 import numpy as np
+import pycolmap  # pyright: ignore[reportMissingImports]
 import pytest
+import torch
 from PIL import Image
 
 from vg2gt.data import DataError
 from vg2gt.data.sources import COLMAP
-from vg2gt.io import ColmapCamera, read_colmap, write_colmap
+from vg2gt.data.sources.undistortion import pinhole_camera
+from vg2gt.geometry.cameras import resize_intrinsics, unproject
+from vg2gt.io import colmap_from_views, colmap_images, read_colmap, write_colmap
+from vg2gt.types import Cameras
 
 from .layout_colmap import POINTS_A_VIEW, write
 from .layouts import SIZE, room
@@ -27,15 +29,15 @@ def test_real_model_reprojects(statue):
     index = source.scene_index(scene)
     assert len(index.frame_ids) == 23
     model = read_colmap(statue / "dense" / "0" / "sparse")
-    rows = {number: row for row, number in enumerate(model.points.ids.tolist())}
     errors = []
-    for row, image in enumerate(sorted(model.images.values(), key=lambda image: image.name)):
-        seen = image.point3d_ids >= 0
-        points = model.points.positions[[rows[number] for number in image.point3d_ids[seen].tolist()]]
+    for row, image in enumerate(colmap_images(model)):
+        features = image.get_observation_points2D()
+        points = np.array([model.points3D[feature.point3D_id].xyz for feature in features])
         pose = index.world_to_camera[row]
         projected = (points @ pose[:3, :3].T + pose[:3, 3]) @ index.intrinsics[row].T
         # The features' own convention has the first pixel's centre at 1/2.
-        errors.append(np.linalg.norm(projected[:, :2] / projected[:, 2:] + 0.5 - image.points2d[seen], axis=1))
+        seen = np.array([feature.xy for feature in features])
+        errors.append(np.linalg.norm(projected[:, :2] / projected[:, 2:] + 0.5 - seen, axis=1))
     assert np.median(np.concatenate(errors)) == pytest.approx(0.25, rel=0.1)
 
     frames = source.load(scene, [0, 22])
@@ -46,11 +48,158 @@ def test_real_model_reprojects(statue):
     assert not source.is_metric
 
 
-def test_real_distorted_model_is_refused(statue, tmp_path):
-    copytree(statue / "sparse", tmp_path / "sparse")
+@pytest.fixture(scope="module")
+def distorted(statue, tmp_path_factory):
+    """The originals, made again from the undistorted images: ``images/`` and the model of SIMPLE_RADIAL cameras."""
+    folder = tmp_path_factory.mktemp("workspace") / "statue"
+    model = read_colmap(statue / "sparse" / "0")
+    (folder / "images").mkdir(parents=True)
+    write_colmap(folder / "sparse" / "0", model)
+    for image in colmap_images(model)[:4]:
+        camera, size = image.camera, (334, 505)
+        camera.rescale(size[1], size[0])
+        target = pinhole_camera(camera)
+        with Image.open(statue / "dense" / "0" / "images" / image.name) as picture:
+            pixels = np.array(picture.resize((target.width, target.height)))
+        y, x = np.mgrid[: size[0], : size[1]] + 0.5
+        rays = camera.cam_from_img(np.stack((x, y), -1).reshape(-1, 2))
+        places = target.img_from_cam(np.concatenate((rays, np.ones((len(rays), 1))), 1)).astype(int)
+        places = places.clip(0, [target.width - 1, target.height - 1])
+        Image.fromarray(pixels[places[:, 1], places[:, 0]].reshape(*size, 3)).save(folder / "images" / image.name)
+    return folder
+
+
+def test_a_distorted_model_beside_the_originals(statue, distorted):
+    """Item 16: COLMAP's default camera; what comes out is what COLMAP's own undistortion wrote."""
+    source = COLMAP(str(distorted), depth="points")
+    (scene,) = source.scenes
+    index = source.scene_index(scene)
+    assert len(index.color) == 4
+    theirs = COLMAP(str(statue / "dense")).scene_index("0")
+    for row, path in enumerate(index.color):
+        other = [color.name for color in theirs.color].index(path.name)
+        np.testing.assert_allclose(index.world_to_camera[row], theirs.world_to_camera[other], atol=1e-9)
+        height, width = index.own_size(row)
+        full = theirs.own_size(other)
+        matrix = resize_intrinsics(torch.from_numpy(theirs.intrinsics[other]), width / full[1], height / full[0])
+        np.testing.assert_allclose(index.intrinsics[row], matrix.numpy(), rtol=6e-3)  # whole pixels
+        with Image.open(statue / "dense" / "0" / "images" / path.name) as picture:
+            expected = np.array(picture.resize((width, height)), np.float32) / 255
+        loaded = source.load_whole(scene, index.frame_ids[row]).images[0].permute(1, 2, 0).numpy()
+        assert np.abs(loaded - expected).mean() < 0.03
+    depth = source.load(scene, [index.frame_ids[0]]).depth[0]
+    assert (depth > 0).sum() > 50
+
+
+def test_all_models_undistort_and_zero_coefficients_are_a_pinhole(tmp_path):
+    write(tmp_path, room(2))
+    folder = tmp_path / "statue" / "sparse" / "0"
+    plain = COLMAP(str(tmp_path)).scene_index("statue")
+    for name, extra, still in (
+        ("SIMPLE_RADIAL", [0.0], True),
+        ("SIMPLE_RADIAL", [0.1], False),
+        ("RADIAL", [0.1, -0.02], False),
+        ("OPENCV", [0.1, 0.01, 0.001, 0.0], False),
+        ("FULL_OPENCV", [0.1] + [0.0] * 7, False),
+        ("OPENCV_FISHEYE", [0.0] * 4, False),
+        ("SIMPLE_RADIAL_FISHEYE", [0.02], False),
+    ):
+        model = read_colmap(folder)
+        for camera in model.cameras.values():
+            focal, center = camera.focal_length_x, [camera.principal_point_x, camera.principal_point_y]
+            camera.model = getattr(pycolmap.CameraModelId, name)
+            camera.params = [*([focal] if "SIMPLE" in name or name == "RADIAL" else [focal, focal]), *center, *extra]
+        write_colmap(folder, model)
+        index = COLMAP(str(tmp_path)).scene_index("statue")
+        assert ("lens" not in index.extra) == still, name
+        if still:
+            np.testing.assert_allclose(index.intrinsics, plain.intrinsics)
+        assert COLMAP(str(tmp_path)).load("statue", [0]).images.isfinite().all()
+
+
+def test_a_model_of_equirectangular_images_is_refused_in_one_line(tmp_path):
+    write(tmp_path, room(1))
+    folder = tmp_path / "statue" / "sparse" / "0"
+    model = read_colmap(folder)
+    model.cameras[1].model = pycolmap.CameraModelId.EQUIRECTANGULAR
+    model.cameras[1].params = [40.0, 30.0]
+    write_colmap(folder, model)
+    with pytest.raises(DataError, match="EQUIRECTANGULAR has no pinhole part; cut it into cube faces"):
+        COLMAP(str(tmp_path)).scene_index("statue")
+
+
+def test_the_larger_model_is_taken_and_the_other_named(tmp_path, caplog):
+    """Item 8."""
+    frames = room(4)
+    write(tmp_path, frames)
+    scene = tmp_path / "statue"
+    (scene / "sparse" / "0").rename(scene / "sparse" / "1")
+    cameras = Cameras(frames.world_to_camera[None, :2].double(), frames.intrinsics[None, :2].double(), SIZE)
+    write_colmap(scene / "sparse" / "0", colmap_from_views(cameras, ["left/000.png", "left/009.png"]))
+    assert len(COLMAP(str(tmp_path)).frames("statue")) == 4
+    assert "has 2 COLMAP models: sparse/1 with 4 images is taken; not taken: sparse/0 (2)" in caplog.text
+
+
+@pytest.mark.parametrize("orientation", [3, 6, 8])
+@pytest.mark.parametrize("stored", [False, True])
+def test_exif_orientation_with_given_cameras(tmp_path, orientation, stored):
+    """Item 6: cameras of upright images, and of images as COLMAP reads them, whose points' colours tell it."""
+    frames = room(2)
+    cameras = Cameras(frames.world_to_camera[None].double(), frames.intrinsics[None].double(), SIZE)
+    pixels = [(image.permute(1, 2, 0).numpy() * 255 + 0.5).astype(np.uint8) for image in frames.images]
+    world = unproject(frames.depth[None].double(), cameras)[0].numpy()
+    y, x = (axis.ravel() for axis in np.mgrid[2:30:5, 2:40:5])
+    positions = np.concatenate([view[y, x] for view in world])
+    colors = np.concatenate([picture[y, x] for picture in pixels])
+    sources = (np.arange(2 * len(y)), np.repeat([0, 1], len(y)), np.tile(np.stack((x, y), -1), (2, 1)))
+    names = ["0.jpg", "1.jpg"]
+    write_colmap(tmp_path / "s" / "sparse" / "0", colmap_from_views(cameras, names, positions, colors, sources))
+    (tmp_path / "s" / "images").mkdir()
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    turn = {3: Image.Transpose.ROTATE_180, 6: Image.Transpose.ROTATE_90, 8: Image.Transpose.ROTATE_270}[orientation]
+    for name, picture in zip(names, pixels, strict=True):
+        image = Image.fromarray(picture) if stored else Image.fromarray(picture).transpose(turn)
+        image.save(tmp_path / "s" / "images" / name, exif=exif, quality=95, subsampling=0)
+    loaded = COLMAP(str(tmp_path)).load("s", [0, 1])
+    assert (loaded.images - frames.images).abs().mean() < 0.02
+    assert torch.allclose(loaded.intrinsics, frames.intrinsics)
+
+
+def test_an_exif_orientation_that_fits_no_camera_is_named(tmp_path):
+    write(tmp_path, room(1))
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.new("RGB", (40, 36)).save(tmp_path / "statue" / "images" / "left" / "000.png", exif=exif)
+    with pytest.raises(DataError, match=r"40x36 pixels \(EXIF orientation 6, upright 36x40\), but its camera"):
+        COLMAP(str(tmp_path)).scene_index("statue")
+
+
+def test_values_that_are_not_finite_leave_their_image_out_by_name(tmp_path, caplog):
+    """Item 21."""
+    write(tmp_path, room(4), text=True)
+    folder = tmp_path / "statue" / "sparse" / "0"
+    lines = (folder / "cameras.txt").read_text().splitlines()
+    lines[-1] = " ".join([*lines[-1].split()[:4], "-nan(ind)", *lines[-1].split()[5:]])
+    (folder / "cameras.txt").write_text("\n".join(lines))
+    assert len(COLMAP(str(tmp_path)).frames("statue")) == 3
+    assert "cameras whose values are not finite, their images are left out: left/" in caplog.text
+
+
+def test_masks_beside_images(tmp_path, caplog):
+    """Item 7: a folder of masks, partly filled."""
+    write(tmp_path, room(3))
+    masks = tmp_path / "statue" / "masks" / "left"
+    masks.mkdir(parents=True)
+    half = Image.fromarray(np.where(np.arange(40) < 20, 0, 255).astype(np.uint8) * np.ones((30, 1), np.uint8))
+    half.save(masks / "000.png")
+    half.save(masks / "009.png.png")
     source = COLMAP(str(tmp_path))
-    with pytest.raises(DataError, match=r"SIMPLE_RADIAL.*colmap image_undistorter"):
-        source.frames(source.scenes[0])
+    loaded = source.load("statue", [0, 1, 2])
+    assert loaded.mask is not None
+    assert loaded.mask.mean((1, 2)).tolist() == [0.5, 0.5, 1]
+    assert "1 of 3 images have no mask in" in caplog.text
+    assert "left/018.png" in caplog.text
 
 
 def test_reduced_images_have_reduced_intrinsics(tmp_path):
@@ -66,7 +215,7 @@ def test_reduced_images_have_reduced_intrinsics(tmp_path):
     full = frames.intrinsics[0].numpy()
     np.testing.assert_allclose(index.intrinsics[0][0], [full[0, 0] / 2, 0, (full[0, 2] + 0.5) / 2 - 0.5], rtol=1e-6)
     Image.new("RGB", (20, 20)).save(scene / "images_2" / "left" / "000.png")
-    with pytest.raises(DataError, match="20x20 pixels, but its camera in the model 40x30"):
+    with pytest.raises(DataError, match=r"20x20 pixels, but its camera in .* 40x30"):
         COLMAP(str(tmp_path), images="images_2").scene_index("statue")
 
 
@@ -91,11 +240,11 @@ def test_images_of_several_sizes_are_cropped_to_one(tmp_path):
     """One camera of another shape: its frame is cut to the common size and points still project into its pixels."""
     frames = room(3)
     write(tmp_path, frames)
-    model = read_colmap(tmp_path / "statue" / "sparse" / "0")
-    wide = ColmapCamera(2, "PINHOLE", 60, 30, (27.0, 27.0, 30.0, 15.0))
-    folder = tmp_path / "statue" / "sparse" / "1"
-    write_colmap(folder, replace(model, cameras={**model.cameras, 2: wide}))
-    copytree(folder, tmp_path / "statue" / "sparse" / "0", dirs_exist_ok=True)
+    folder = tmp_path / "statue" / "sparse" / "0"
+    model = read_colmap(folder)
+    wide = model.camera(2)
+    wide.width, wide.height, wide.params = 60, 30, [27.0, 27.0, 30.0, 15.0]
+    write_colmap(folder, model)
     Image.new("RGB", (60, 30)).save(tmp_path / "statue" / "images" / "left" / "009.png")
     source = COLMAP(str(tmp_path))
     loaded = source.load("statue", [0, 1])
@@ -110,10 +259,11 @@ def test_points_need_three_views_and_the_nearest_wins(tmp_path):
     assert 0.7 * POINTS_A_VIEW < int((depth > 0).sum()) <= POINTS_A_VIEW
     folder = tmp_path / "statue" / "sparse" / "0"
     model = read_colmap(folder)
-    lengths = np.where(np.arange(len(model.points)) < POINTS_A_VIEW, 2, 3)  # frame 0's own points
-    kept = np.concatenate([np.arange(3 * i, 3 * i + length) for i, length in enumerate(lengths)])
-    points = replace(model.points, tracks=model.points.tracks[kept], track_lengths=lengths)
-    write_colmap(folder, replace(model, points=points))
+    for number in range(1, POINTS_A_VIEW + 1):  # frame 0's own points
+        point = model.point3D(number)
+        other = next(element for element in point.track.elements if element.image_id != 1)
+        model.delete_observation(other.image_id, other.point2D_idx)
+    write_colmap(folder, model)
     source = COLMAP(str(tmp_path), depth="points")
     assert tuple(source.frames("statue")) == (1, 2)
     assert source.scene_index("statue").dropped == {"without a depth file": 1}

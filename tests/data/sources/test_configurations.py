@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 from hydra.utils import instantiate
 
+from tests.commands import ROOT
 from vg2gt.config import compose
 from vg2gt.data import SceneDataModule
 
@@ -53,6 +54,7 @@ def _virtual_kitti(root: Path, frames) -> None:
         layout_virtual_kitti.write(root, frames, scene)
 
 
+EXAMPLES = ROOT / "examples" / "data_sets" / "configs"
 REPLICA = "data.intrinsics=[27,27,19.5,14.5]"
 CONFIGURATIONS = {
     "infinigen": (_infinigen, [], {"a"}, {"a"}),
@@ -90,7 +92,14 @@ def test_scenes_are_split_and_batched(tmp_path, frames, name):
     write, changes, train, val = CONFIGURATIONS[name]
     write(tmp_path / "data", frames)
     small = ["image_size=[28,42]", "min_views=2", "max_views=2", "max_images=2", "target_views=0", "eval_context=2"]
-    overrides = [f"data={name}", f"data.root={tmp_path / 'data'}", f"data.index_cache={tmp_path / 'cache'}", *changes]
+    examples = [f"hydra.searchpath=[{EXAMPLES}]"] if (EXAMPLES / "data" / f"{name}.yaml").is_file() else []
+    overrides = [
+        *examples,
+        f"data={name}",
+        f"data.root={tmp_path / 'data'}",
+        f"data.index_cache={tmp_path / 'cache'}",
+        *changes,
+    ]
     config = compose("train", *overrides, *(f"data.{change}" for change in small), "data.eval_target=1")
     module = instantiate(config.data)
     assert isinstance(module, SceneDataModule)

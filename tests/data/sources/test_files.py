@@ -16,7 +16,7 @@ from vg2gt.data.sources.index import index_to_bytes, make_index, read_index
 from .layout_rgbd import write_recording
 from .layouts import room
 
-OTHERS = ("paper_mix", "shards", "synthetic")
+OTHERS = ("paper_mix", "synthetic")
 """Configurations of data that are no scenes in files."""
 CONFIGURATIONS = sorted({path.stem for path in Path(config_dir(), "data").glob("*.yaml")} - set(OTHERS))
 

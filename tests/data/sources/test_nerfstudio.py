@@ -6,10 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from vg2gt.data import DataError
 from vg2gt.data.sources import Nerfstudio
-from vg2gt.data.transforms import resize
+from vg2gt.data.transforms import crop, resize
 
 from .layout_nerfstudio import write
 from .layouts import SIZE, room
@@ -49,12 +50,145 @@ def test_distortion_changes_image_depth_and_intrinsics(tmp_path):
     _edit(tmp_path, lambda content: content.update(k1=0.5))
     source = Nerfstudio(str(tmp_path), depth=True)
     loaded = source.load("desk", [0])
-    zoom = float(loaded.intrinsics[0, 0, 0] / plain.intrinsics[0, 0, 0])
-    assert 1.05 < zoom < 1.5
-    # The axis stays where it is; off it, the enlarged image shows what the plain one has nearer to the axis.
-    assert float((loaded.images - plain.images).abs().mean()) > 0.01
+    size = (loaded.images.shape[-2], loaded.images.shape[-1])
+    assert 0.5 * SIZE[0] < size[0] < SIZE[0]  # pixels keep their size, and the border bends inwards
+    top, left = (SIZE[0] - size[0]) // 2, (SIZE[1] - size[1]) // 2
+    cut = crop(plain, top, left, size)
+    assert torch.allclose(loaded.intrinsics[:, :2, :2], cut.intrinsics[:, :2, :2])
+    assert float((loaded.images - cut.images).abs().mean()) > 0.01
     assert set(loaded.depth.unique().tolist()) <= set(plain.depth.unique().tolist())
-    assert not torch.equal(loaded.depth, plain.depth)
+    assert not torch.equal(loaded.depth, cut.depth)
+
+
+def test_instant_ngps_fisheye_is_a_fisheye(tmp_path):
+    """Item 3: ``is_fisheye`` and k1 to k4, which was read as a pinhole with radial terms."""
+    write(tmp_path, room(2))
+    angles = {"k1": 0.02, "k2": 0.01, "k3": 0.0, "k4": 0.001}
+    _edit(tmp_path, lambda content: content.update(camera_model="OPENCV_FISHEYE", **angles))
+    right = Nerfstudio(str(tmp_path)).load("desk", [0, 1])
+    _edit(tmp_path, lambda content: content.pop("camera_model"))
+    _edit(tmp_path, lambda content: content.update(is_fisheye=True))
+    found = Nerfstudio(str(tmp_path)).load("desk", [0, 1])
+    assert torch.equal(found.images, right.images)
+    assert torch.equal(found.intrinsics, right.intrinsics)
+    _edit(tmp_path, lambda content: content.pop("is_fisheye"))
+    with pytest.raises(DataError, match="radial k4, which is read of fisheye cameras alone"):
+        Nerfstudio(str(tmp_path)).load("desk", [0])
+
+
+def test_frames_are_ordered_as_people_count(tmp_path):
+    """Item 11: 1, 10, 2 as text."""
+    write(tmp_path, room(4))
+    folder = tmp_path / "desk"
+    for old, new in (("0003", "11"), ("0002", "10"), ("0001", "2"), ("0000", "1")):
+        (folder / "images" / f"{old}.png").rename(folder / "images" / f"{new}.png")
+        text = (folder / "transforms.json").read_text().replace(f"images/{old}", f"images/{new}")
+        (folder / "transforms.json").write_text(text)
+    index = Nerfstudio(str(tmp_path)).scene_index("desk")
+    assert [path.name for path in index.color] == ["1.png", "2.png", "10.png", "11.png"]
+
+
+@pytest.mark.parametrize("folder", ["images", "images_2"])
+def test_images_made_smaller_since_have_smaller_intrinsics(tmp_path, folder):
+    """Item 19."""
+    write(tmp_path, room(2))
+    full = Nerfstudio(str(tmp_path)).scene_index("desk").intrinsics[0]
+    (tmp_path / "desk" / folder).mkdir(exist_ok=True)
+    for path in sorted((tmp_path / "desk" / "images").glob("*.png")):
+        with Image.open(path) as image:
+            image.reduce(2).save(tmp_path / "desk" / folder / path.name)
+    path = tmp_path / "desk" / "transforms.json"
+    path.write_text(path.read_text().replace("images/", f"{folder}/"))
+    index = Nerfstudio(str(tmp_path)).scene_index("desk")
+    assert index.size == (15, 20)
+    expected = [full[0, 0] / 2, 0, (full[0, 2] + 0.5) / 2 - 0.5]
+    np.testing.assert_allclose(index.intrinsics[0][0], expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("named", "there"),
+    [
+        ("images/0000", "images/0000.jpg"),
+        ("images/a.b.0000", "images/a.b.0000.png"),
+        ("images\\0000.png", "images/0000.png"),
+        ("../images/0000.png", "images/0000.png"),
+        ("images/0000.jpg", "images/0000.png"),
+        ("images/0000.jpg", "images/0000.JPG"),
+        ("Images/0000.png".lower(), "images/0000.PNG"),
+    ],
+)
+def test_images_are_found_under_the_names_that_people_have(tmp_path, named, there):
+    """Item 20."""
+    write(tmp_path, room(1))
+    folder = tmp_path / "desk"
+    with Image.open(folder / "images" / "0000.png") as image:
+        pixels = image.convert("RGB")
+    (folder / "images" / "0000.png").unlink()
+    pixels.save(folder / there)
+    _edit(tmp_path, lambda content: content["frames"][0].update(file_path=named))
+    assert Nerfstudio(str(tmp_path)).scene_index("desk").color[0].name == there.split("/")[-1]
+    (folder / there).unlink()
+    with pytest.raises(
+        DataError, match=r"none of the 1 images of .*transforms.json.* exists; tried .*desk|lies outside"
+    ):
+        Nerfstudio(str(tmp_path)).scene_index("desk")
+
+
+def test_blenders_synthetic_sets(tmp_path):
+    """Item 18: three files, RGBA, an angle in place of a focal length, no endings, the test frames held out."""
+    frames = room(6)
+    write(tmp_path, frames, depth=False)
+    folder = tmp_path / "desk"
+    content = json.loads((folder / "transforms.json").read_text())
+    (folder / "transforms.json").unlink()
+    records = sorted(content["frames"], key=lambda frame: frame["file_path"])
+    for part, chosen in (("train", records[:3]), ("val", records[3:4]), ("test", records[4:])):
+        (folder / part).mkdir()
+        own = []
+        for i, record in enumerate(chosen):
+            with Image.open(folder / "images" / f"{records.index(record):04d}.png") as image:
+                image.putalpha(
+                    Image.fromarray(np.where(np.arange(40) < 20, 0, 255).astype(np.uint8) * np.ones((30, 1), np.uint8))
+                )
+                image.save(folder / part / f"r_{i}.png")
+            own.append({"file_path": f"./{part}/r_{i}", "transform_matrix": record["transform_matrix"]})
+        angle = 2 * np.arctan(20 / float(frames.intrinsics[0, 0, 0]))
+        (folder / f"transforms_{part}.json").write_text(json.dumps({"camera_angle_x": angle, "frames": own}))
+    source = Nerfstudio(str(tmp_path), holdout=8)
+    assert source.held_out("desk") == [4, 5]
+    assert [path.parent.name for path in source.scene_index("desk").color] == ["train"] * 3 + ["val"] + ["test"] * 2
+    loaded = source.load("desk", range(6))
+    assert torch.allclose(loaded.world_to_camera, frames.world_to_camera, atol=1e-5)
+    assert torch.allclose(loaded.intrinsics[:, 0, 0], frames.intrinsics[:, 0, 0], rtol=1e-5)
+    assert (loaded.images[..., :20] == 1).all()  # item 7: what was hidden under alpha 0 is no part of the scene
+    assert torch.allclose(loaded.images[..., 20:], frames.images[..., 20:], atol=1 / 400)
+    assert loaded.mask is not None
+    assert torch.equal(loaded.mask[0, 0], (torch.arange(40) >= 20).float())
+
+
+def test_masks_that_are_named_and_one_that_is_missing(tmp_path, caplog):
+    """Item 7: ``mask_path``."""
+    write(tmp_path, room(2))
+    (tmp_path / "desk" / "m").mkdir()
+    mask = np.zeros((30, 40), np.uint8)
+    mask[:, :10] = 255
+    Image.fromarray(mask).save(tmp_path / "desk" / "m" / "0.png")
+    _edit(tmp_path, lambda content: [f.update(mask_path=f"m/{i}.png") for i, f in enumerate(content["frames"][::-1])])
+    loaded = Nerfstudio(str(tmp_path)).load("desk", [0, 1])
+    assert loaded.mask is not None
+    assert loaded.mask[0].sum() == 300
+    assert loaded.mask[1].all()
+    assert "names masks that are not there, their images count as a whole" in caplog.text
+    assert "m/1.png" in caplog.text
+
+
+def test_frames_without_depth_stay_where_none_is_needed_and_go_where_it_is(tmp_path):
+    """Item 10."""
+    write(tmp_path, room(3))
+    (tmp_path / "desk" / "depth" / "0001.png").unlink()
+    (tmp_path / "desk" / "depth" / "0002.png").write_text("broken")
+    assert len(Nerfstudio(str(tmp_path)).load("desk", [0, 1, 2]).images) == 3
+    assert tuple(Nerfstudio(str(tmp_path), depth=True).frames("desk")) == (0, 2)
 
 
 def test_numbers_follow_names_and_absent_files_are_counted(tmp_path):
@@ -72,7 +206,7 @@ def test_numbers_follow_names_and_absent_files_are_counted(tmp_path):
     ("change", "message"),
     [
         (lambda content: content.update(camera_model="EQUIRECTANGULAR"), "model EQUIRECTANGULAR; read are: PINHOLE"),
-        (lambda content: content.update(w=80, h=60), "says 80x60 pixels, but the image is 40x30"),
+        (lambda content: content.update(w=80, h=80), "is 40x30 pixels, but its camera in .* 80x80"),
         (lambda content: content.update(k1=1e6), "scene desk.*takes the image's border out"),
         (lambda content: content.update(frames=[]), "none of the 0 images"),
         (lambda content: content["frames"][0].update(transform_matrix=[[1]]), "scene desk.*transform_matrix"),

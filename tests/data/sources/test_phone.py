@@ -76,13 +76,9 @@ def test_frames_of_a_video_are_found_alone(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "content", "said"),
     [
-        (
-            "odometry.csv",
-            "timestamp, frame\n0, 0\n",
-            r"odometry\.csv: expected columns frame, x, .*found timestamp, frame",
-        ),
-        ("odometry.csv", "", r"odometry\.csv is empty"),
-        ("camera_matrix.csv", "1,2\n3,4\n", r"camera_matrix\.csv must hold 3x3 numbers"),
+        ("odometry.csv", "timestamp, frame\n0, 0\n", "is damaged"),
+        ("odometry.csv", "", r"odometry\.csv .*is damaged|has no frames"),
+        ("camera_matrix.csv", "1,2\n3,4\n", "is damaged"),
         ("camera_matrix.csv", "a,b\n", "is damaged"),
     ],
 )

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
+from examples.data_sets.scannetpp import ScanNetPPiPhone
 from vg2gt.data import DataError
-from vg2gt.data.sources import ScanNetPPiPhone
 
 from .layout_scannetpp import write, write_cameras
 from .layouts import camera_to_world, room

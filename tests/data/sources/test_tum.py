@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from examples.data_sets.tum import INTRINSICS, TUM, associate
 from vg2gt.data import DataError
-from vg2gt.data.sources import TUM
-from vg2gt.data.sources.tum import INTRINSICS, associate
 
 from .layout_tum import write
 from .layouts import room

@@ -1,11 +1,15 @@
 """Undistortion against kornia's distortion and against images whose undistorted form is known."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
 from kornia.geometry.calibration import distort_points
 
-from vg2gt.data.sources.undistortion import Undistortion
+from vg2gt.data.sources.undistortion import Undistortion, is_pinhole, lens_text, undistortion_of
+
+pycolmap: Any = pytest.importorskip("pycolmap")
 
 K = np.array([[110.0, 0, 62.3], [0, 108.0, 44.1], [0, 0, 1]])
 SIZE = (90, 130)
@@ -15,39 +19,81 @@ LENSES = {
 }
 
 
-def _directions(matrix: np.ndarray) -> np.ndarray:
+def camera(k: dict, fisheye: bool = False):
+    names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+    params = [K[0, 0], K[1, 1], *(K[:2, 2] + 0.5), *(k.get(name, 0.0) for name in names)]
+    return pycolmap.Camera(
+        model="OPENCV_FISHEYE" if fisheye else "FULL_OPENCV", width=SIZE[1], height=SIZE[0], params=params
+    )
+
+
+def undistortion(k: dict, fisheye: bool = False) -> Undistortion:
+    return Undistortion.of(camera(k, fisheye))
+
+
+def _directions(matrix: np.ndarray, size=SIZE) -> np.ndarray:
     """x/z and y/z of every pixel of a pinhole camera."""
-    x, y = np.meshgrid(np.arange(SIZE[1]), np.arange(SIZE[0]))
+    x, y = np.meshgrid(np.arange(size[1]), np.arange(size[0]))
     return np.stack(((x - matrix[0, 2]) / matrix[0, 0], (y - matrix[1, 2]) / matrix[1, 1]), -1)
 
 
 @pytest.mark.parametrize("name", LENSES)
 def test_pixels_are_looked_up_where_kornia_distorts_them_to(name):
-    k = LENSES[name]
-    undistortion = Undistortion(K, k, False, SIZE)
-    x, y = np.meshgrid(np.arange(SIZE[1]), np.arange(SIZE[0]))
+    k, found = LENSES[name], undistortion(LENSES[name])
+    x, y = np.meshgrid(np.arange(found.size[1]), np.arange(found.size[0]))
     pixels = torch.from_numpy(np.stack((x, y), -1).reshape(-1, 2).astype(np.float64))
     coefficients = torch.tensor([[k.get(key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3")]], dtype=torch.float64)
     expected = distort_points(
-        pixels, torch.from_numpy(K)[None], coefficients, new_K=torch.from_numpy(undistortion.intrinsics)[None]
+        pixels, torch.from_numpy(K)[None], coefficients, new_K=torch.from_numpy(found.intrinsics)[None]
     )
-    np.testing.assert_allclose(undistortion.places.reshape(-1, 2), expected.reshape(-1, 2).numpy(), atol=1e-9)
+    np.testing.assert_allclose(found.places.reshape(-1, 2), expected.reshape(-1, 2).numpy(), atol=1e-4)
 
 
 @pytest.mark.parametrize("name", LENSES)
-def test_the_view_is_as_wide_as_the_lens_allows(name):
-    undistortion = Undistortion(K, LENSES[name], False, SIZE)
-    places = undistortion.places
-    margin = np.minimum(places + 0.5, np.array([SIZE[1] - 0.5, SIZE[0] - 0.5]) - places).min()
-    assert margin >= -1e-9
-    zoom = undistortion.intrinsics[0, 0] / K[0, 0]
-    assert zoom == pytest.approx(undistortion.intrinsics[1, 1] / K[1, 1])
-    assert (undistortion.intrinsics[:2, 2] == K[:2, 2]).all()
-    if name == "barrel":
-        assert zoom == 1
-    else:
-        assert 1 < zoom < 1.05
-        assert margin < 0.05
+def test_no_pixel_is_blank_and_none_is_wasted(name):
+    found = undistortion(LENSES[name])
+    margin = np.minimum(found.places + 0.5, np.array([SIZE[1] - 0.5, SIZE[0] - 0.5]) - found.places)
+    assert -1 < margin.min() < 2
+    assert 0.8 < found.size[0] / SIZE[0] < 1.3
+    # Pixels keep their size on the axis.
+    np.testing.assert_allclose(found.intrinsics[[0, 1], [0, 1]], K[[0, 1], [0, 1]])
+
+
+MODELS = {
+    "SIMPLE_RADIAL": [110.0, 65.0, 45.0, 0.1],
+    "RADIAL": [110.0, 65.0, 45.0, 0.1, -0.02],
+    "OPENCV": [110.0, 108.0, 65.0, 45.0, 0.1, -0.02, 0.001, 0.002],
+    "FULL_OPENCV": [110.0, 108.0, 65.0, 45.0, 0.1, -0.02, 0.001, 0.002, 0, 0, 0, 0],
+    "OPENCV_FISHEYE": [110.0, 108.0, 65.0, 45.0, 0.01, 0, 0, 0],
+    "SIMPLE_RADIAL_FISHEYE": [110.0, 65.0, 45.0, 0.01],
+}
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_every_model_of_colmap_becomes_a_pinhole(name):
+    """Item 16: directions of the pinhole's pixels project with the lens to where they are looked up."""
+    lens = pycolmap.Camera(model=name, width=130, height=90, params=MODELS[name])
+    found = Undistortion.of(lens)
+    rays = np.concatenate((_directions(found.intrinsics, found.size), np.ones((*found.size, 1))), -1)
+    expected = lens.img_from_cam(rays.reshape(-1, 3)).reshape(*found.size, 2) - 0.5
+    np.testing.assert_allclose(found.places, expected, atol=1e-4)
+    assert not is_pinhole(lens)
+    large = undistortion_of(lens_text(lens, (1800, 2600)))  # of larger images, where places are interpolated
+    np.testing.assert_allclose(large.intrinsics[:2, :2], 20 * found.intrinsics[:2, :2])
+    rays = np.concatenate((_directions(large.intrinsics, large.size), np.ones((*large.size, 1))), -1)[::37, ::41]
+    lens.rescale(2600, 1800)
+    expected = lens.img_from_cam(np.ascontiguousarray(rays.reshape(-1, 3))).reshape(*rays.shape[:2], 2) - 0.5
+    np.testing.assert_allclose(large.places[::37, ::41], expected, atol=0.01)
+
+
+def test_coefficients_of_zero_are_a_pinhole_but_for_a_fisheye():
+    zeros = {
+        name: [*params[:-1], 0] if "SIMPLE" in name else [*params[:4], 0, 0, 0, 0] for name, params in MODELS.items()
+    }
+    for name in ("SIMPLE_RADIAL", "OPENCV"):
+        assert is_pinhole(pycolmap.Camera(model=name, width=130, height=90, params=zeros[name]))
+    for name in ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE"):
+        assert not is_pinhole(pycolmap.Camera(model=name, width=130, height=90, params=zeros[name]))
 
 
 def test_an_image_becomes_the_pinhole_cameras():
@@ -67,31 +113,32 @@ def test_an_image_becomes_the_pinhole_cameras():
         shift_x = 2 * k["p1"] * x * y + k["p2"] * (square + 2 * x**2)
         shift_y = k["p1"] * (square + 2 * y**2) + 2 * k["p2"] * x * y
         rays = (seen - np.concatenate((shift_x, shift_y), -1)) / radial
-    undistortion = Undistortion(K, k, False, SIZE)
-    result = undistortion.color(pattern(rays)).astype(int)
-    expected = pattern(_directions(undistortion.intrinsics)).astype(int)
-    assert np.abs(result - pattern(rays)).max() > 40  # otherwise nothing was put to the test
+    found = undistortion(k)
+    result = found.color(pattern(rays)).astype(int)
+    expected = pattern(_directions(found.intrinsics, found.size)).astype(int)
+    inner = (slice(0, 80), slice(0, 120))
+    assert np.abs(result[inner] - pattern(rays)[inner]).max() > 40  # otherwise nothing was put to the test
     assert np.abs(result - expected).max() <= 2
 
 
 def test_fisheye_follows_the_angle():
     k = {"k1": 0.03, "k2": -0.01}
-    undistortion = Undistortion(K, k, True, SIZE)
-    x, y = 120, 10
-    ray = np.array([*_directions(undistortion.intrinsics)[y, x], 1.0])
+    found = undistortion(k, fisheye=True)
+    x, y = found.size[1] - 1, 0  # a corner, where nothing is interpolated
+    ray = np.array([*_directions(found.intrinsics, found.size)[y, x], 1.0])
     angle = np.arccos(1 / np.linalg.norm(ray))
     radius = angle * (1 + k["k1"] * angle**2 + k["k2"] * angle**4)
     expected = ray[:2] / np.linalg.norm(ray[:2]) * radius * [K[0, 0], K[1, 1]] + K[:2, 2]
-    np.testing.assert_allclose(undistortion.places[y, x], expected, atol=1e-9)
+    np.testing.assert_allclose(found.places[y, x], expected, atol=1e-4)
 
 
 def test_depth_takes_one_pixel_and_holes_stay():
     depth = np.where(np.arange(SIZE[1]) < 60, 2.0, 5.0).astype(np.float32) * np.ones(SIZE, np.float32)
     depth[::4] = 0
-    assert set(np.unique(Undistortion(K, LENSES["pincushion"], False, SIZE).depth(depth))) == {0.0, 2.0, 5.0}
+    assert set(np.unique(undistortion(LENSES["pincushion"]).depth(depth))) == {0.0, 2.0, 5.0}
 
 
-@pytest.mark.parametrize("k", [{"k1": 30.0}, {"k1": -30.0}, {"k2": 1e300}, {"p1": 5.0}])
+@pytest.mark.parametrize("k", [{"k1": 3000.0}, {"k1": -30.0}, {"k2": 1e300}, {"p1": 5.0}])
 def test_senseless_coefficients_are_refused(k):
     with pytest.raises(ValueError, match="takes the image's border out of the image"):
-        Undistortion(K, k, False, SIZE)
+        undistortion(k)

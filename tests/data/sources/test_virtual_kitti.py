@@ -5,8 +5,8 @@ import pytest
 import torch
 from PIL import Image
 
+from examples.data_sets.virtual_kitti import VirtualKITTI2
 from vg2gt.data import DataError
-from vg2gt.data.sources import VirtualKITTI2
 
 from .layout_virtual_kitti import write
 from .layouts import room

@@ -7,8 +7,7 @@ import pytest
 from vg2gt.cli.data import write_views
 from vg2gt.data.base import DataError, Frames, SceneSource
 from vg2gt.data.views import SceneSample
-from vg2gt.data.views.drawn import INDICES, index_path, make_index, read_index
-from vg2gt.evaluation import ViewSelection
+from vg2gt.data.views.drawn import INDICES, ViewSelection, index_path, make_index, read_index
 
 
 class Listed(SceneSource):

@@ -8,24 +8,18 @@ from vg2gt.data.sources.kitti import KITTI
 from vg2gt.data.sources.nerfstudio import Nerfstudio
 from vg2gt.data.sources.replica import Replica
 from vg2gt.data.sources.scannet import ScanNet, ScanNetSens
-from vg2gt.data.sources.scannetpp import ScanNetPPiPhone
 from vg2gt.data.sources.tanks_and_temples import TanksAndTemples
-from vg2gt.data.sources.tum import TUM
-from vg2gt.data.sources.virtual_kitti import VirtualKITTI2
 
 __all__ = [
     "COLMAP",
     "DTU",
     "KITTI",
-    "TUM",
     "DTUTraining",
     "ImageFolder",
     "Infinigen",
     "Nerfstudio",
     "Replica",
     "ScanNet",
-    "ScanNetPPiPhone",
     "ScanNetSens",
     "TanksAndTemples",
-    "VirtualKITTI2",
 ]

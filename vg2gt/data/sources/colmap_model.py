@@ -1,35 +1,42 @@
-"""COLMAP models with their undistorted images; depth, if wanted, at the model's own points."""
+"""COLMAP models with their images; depth, if wanted, at the model's own points."""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from typing_extensions import Unpack
 
 from vg2gt.data.base import DataError
 from vg2gt.data.sources.files import FileSource, HoldoutOptions
-from vg2gt.data.sources.index import SceneIndex, make_index
-from vg2gt.data.sources.parsing import errors_name, named_file, to_world
-from vg2gt.data.sources.sparse_points import SparsePoints, in_order
-from vg2gt.geometry.cameras import resize_intrinsics
-from vg2gt.io import ColmapImage, ColmapModel, colmap_intrinsics, colmap_pose, read_colmap
-from vg2gt.io.image_files import Size, image_size
+from vg2gt.data.sources.index import PosedImage, SceneIndex, make_index
+from vg2gt.data.sources.masks import FOLDER as MASKS
+from vg2gt.data.sources.masks import find_masks
+from vg2gt.data.sources.parsing import IMAGE_SUFFIXES, errors_name, existing_image, named_file, to_world
+from vg2gt.data.sources.posed import posed_image, size_on_disk
+from vg2gt.data.sources.sparse_points import SparsePoints
+from vg2gt.io import colmap_images, colmap_pose, read_colmap
+from vg2gt.io.colmap import Image, Reconstruction, colmap_files
+from vg2gt.io.files import regular
+from vg2gt.io.image_files import Size, read_color
 
-_MODELS = ("sparse/0", "sparse")
-_FILES = ("cameras.bin", "cameras.txt")
+log = logging.getLogger(__name__)
+
+_MODELS = ("sparse", "colmap/sparse", ".")
 _SCENES_IN_MEMORY = 16
+_CLEARLY = 0.7  # of the difference of colours: the other orientation is right
 
 
 class COLMAP(FileSource):
     """Scenes of ``images/`` with a COLMAP model in ``sparse/0`` or ``sparse``, text or binary; the scale is arbitrary.
 
-    Frames are numbered 0, 1, ... in the order of the model's image names, also where an image is absent (left out and
-    counted). Only undistorted cameras (PINHOLE, SIMPLE_PINHOLE) are read. Images of several sizes are resized to cover
-    the median size and cropped.
+    Frames are numbered 0, 1, ... in the order of the model's image names (numbers by their value), also where an image
+    is absent (left out and counted). Images of any camera model but EQUIRECTANGULAR are undistorted when they are read.
+    Images of several sizes are resized to cover the median size and cropped. Alpha and ``masks/`` say what counts.
 
     Args:
         root: a scene, a folder of scenes (one or two levels deep), or a list of such folders.
@@ -40,12 +47,14 @@ class COLMAP(FileSource):
         shared: see ``FileSource``.
     """
 
-    layout = "a COLMAP model in sparse/0 or sparse and its undistorted images/, there or up to two folders deeper"
+    layout = "a COLMAP model in sparse/0 or sparse and its images/, there or up to two folders deeper"
     names_are_paths = True
-    index_version = 3
+    index_version = 4
     index_options = ("images", "has_depth")
     sparse_depth = True
+    reads_masks = True
     is_metric = False
+    dense_depth = False
 
     def __init__(
         self,
@@ -58,8 +67,7 @@ class COLMAP(FileSource):
             raise ValueError(f"depth must be points (at the model's points) or null (none), got {depth!r}")
         self.images = images
         self.has_depth = depth is not None
-        self._points: dict[str, SparsePoints] = {}
-        self._all_points: dict[str, SparsePoints] = {}
+        self._points: dict[tuple[str, bool], SparsePoints] = {}
         super().__init__(root, **shared)
 
     def is_scene(self, folder: Path) -> bool:
@@ -67,32 +75,36 @@ class COLMAP(FileSource):
         return model_folder_of(folder) is not None
 
     def watched(self, scene: str, folder: Path) -> Sequence[Path | None]:
-        """Also the model's folder."""
-        return folder, model_folder_of(folder)
+        """Also the model's folder and the masks."""
+        return folder, model_folder_of(folder), folder / MASKS
 
     def index(self, scene: str, folder: Path) -> SceneIndex:
         """Reads the model and the sizes of its images."""
         model, model_folder = self._read_model(scene, folder)
-        refuse_distorted(model, f"{model_folder} (scene {scene})")
-        records = in_order(model)
+        records = colmap_images(model)
         where = f"{model_folder} of scene {scene}"
         named = {i: named_file(folder / self.images, record.name, where) for i, record in enumerate(records)}
         with errors_name(scene):
-            color = {i: path for i, path in named.items() if path.is_file()}
+            color = {i: found for i, path in named.items() if (found := existing_image(path)) is not None}
         if not color:
             names = f"the first is {records[0].name}, expected at {named[0]}" if records else "it names none"
             raise DataError(
                 f"scene {scene}: none of the model's {len(records)} images is in {folder / self.images}; {names}. Copy "
                 "them there, or name their folder by data.images="
             )
-        sizes = {i: image_size(path, scene) for i, path in color.items()}
+        masks = find_masks(folder / MASKS, {i: records[i].name for i in color}, f"scene {scene}")
         poses = {i: to_world(colmap_pose(record)) for i, record in enumerate(records)}
-        intrinsics = {i: image_intrinsics(model, records[i], sizes[i], path) for i, path in color.items()}
+        posed = {i: self._posed(scene, where, model, records[i], path, masks.get(i)) for i, path in color.items()}
+        usable = {i: image for i, image in posed.items() if np.isfinite(image.intrinsics).all()}
+        if len(usable) < len(posed):
+            names = ", ".join(records[i].name for i in posed if i not in usable)
+            log.warning("scene %s: cameras whose values are not finite, their images are left out: %s", scene, names)
+            color = {i: path for i, path in color.items() if i in usable}
         depth = None
         if self.has_depth:
             points = self._scene_points(scene, folder)
             depth = {i: model_folder for i in color if len(points.depth(i))}
-        return make_index(scene, folder, color, depth, poses, intrinsics, color_size=sizes)
+        return make_index(scene, folder, color, depth, poses, {}, posed=usable)
 
     def read_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
         """Depth of the points a view saw, at the pixels where it saw them; the nearest wins a pixel."""
@@ -105,63 +117,81 @@ class COLMAP(FileSource):
 
     def point_depths(self, scene: str, frame: int) -> NDArray[np.float32]:
         """``[n]`` positive z-depth of all points that a frame's image saw, however many others did."""
-        if scene not in self._all_points:
-            self._all_points = {scene: SparsePoints(self._read_model(scene, self._folders[scene])[0], sound=False)}
-        return self._all_points[scene].depth(frame)
+        return self._scene_points(scene, self._folders[scene], sound=False).depth(frame)
 
-    def _scene_points(self, scene: str, folder: Path) -> SparsePoints:
-        if scene not in self._points:
+    def _posed(
+        self, scene: str, where: str, model: Reconstruction, record: Image, path: Path, mask: Path | None
+    ) -> PosedImage:
+        camera = record.camera
+        if not np.any(camera.params):
+            return PosedImage((camera.height, camera.width), np.full((3, 3), np.nan))
+        expected = (camera.height, camera.width)
+        size, upright = size_on_disk(path, scene, expected, where, partial(_is_stored, model, record, path))
+        return posed_image(camera, expected, size, upright, mask, f"{where}, {record.name}")
+
+    def _scene_points(self, scene: str, folder: Path, sound: bool = True) -> SparsePoints:
+        if (scene, sound) not in self._points:
             if len(self._points) >= _SCENES_IN_MEMORY:
                 self._points.clear()
-            self._points[scene] = SparsePoints(self._read_model(scene, folder)[0])
-        return self._points[scene]
+            self._points[scene, sound] = SparsePoints(self._read_model(scene, folder)[0], sound)
+        return self._points[scene, sound]
 
-    def _read_model(self, scene: str, folder: Path) -> tuple[ColmapModel, Path]:
-        model_folder = model_folder_of(folder)
-        if model_folder is None:
-            raise DataError(f"scene {scene} has no COLMAP model in {folder}: expected {' or '.join(_MODELS)}")
+    def _read_model(self, scene: str, folder: Path) -> tuple[Reconstruction, Path]:
+        models = models_of(folder)
+        if not models:
+            raise DataError(f"scene {scene} has no COLMAP model in {folder}: expected sparse/0 or sparse")
+        if len(models) > 1:
+            others = ", ".join(f"{place.relative_to(folder)} ({count})" for place, count in models[1:])
+            log.warning(
+                "scene %s has %d COLMAP models: %s with %d images is taken; not taken: %s",
+                scene, len(models), models[0][0].relative_to(folder), models[0][1], others,
+            )  # fmt: skip
         with errors_name(scene):
-            return read_colmap(model_folder), model_folder
+            return read_colmap(models[0][0]), models[0][0]
+
+
+def models_of(folder: Path) -> list[tuple[Path, int]]:
+    """The models of a scene with their number of images, the largest first; those of one place only."""
+    for name in _MODELS:
+        place = folder / name
+        if not place.is_dir() or (name == "." and not _has_images(place)):
+            continue
+        inside = sorted(path for path in place.iterdir() if path.name.isdigit()) if name != "." else []
+        found = [(path, _count_images(path)) for path in (*inside, place) if colmap_files(path)]
+        if found:
+            return sorted(found, key=lambda model: -model[1])
+    return []
 
 
 def model_folder_of(folder: Path) -> Path | None:
-    """The folder of a scene's model, if it has one."""
-    inside = [folder / name for name in _MODELS]
-    return next((place for place in inside if any((place / name).is_file() for name in _FILES)), None)
+    """The folder of a scene's model, if it has one: of several the one with the most images."""
+    return next((place for place, _ in models_of(folder)), None)
 
 
-def refuse_distorted(model: ColmapModel, where: str) -> None:
-    """Refuses a model of distorted images.
-
-    Raises:
-        DataError: naming the camera models found, and the command that undistorts.
-    """
-    distorted = sorted({camera.model for camera in model.cameras.values() if not camera.is_pinhole})
-    if distorted:
-        raise DataError(
-            f"the cameras in {where} are {', '.join(distorted)}; only undistorted ones (PINHOLE, SIMPLE_PINHOLE) are "
-            "read. Undistort: colmap image_undistorter --image_path IMAGES --input_path MODEL --output_path SCENE"
-        )
+def _has_images(folder: Path) -> bool:
+    return any(path.suffix.lower() in IMAGE_SUFFIXES or path.name == "images" for path in folder.iterdir())
 
 
-def image_intrinsics(model: ColmapModel, record: ColmapImage, size: Size, path: Path) -> NDArray[np.float64]:
-    """Intrinsics ``[3, 3]`` of an image as it is on disk, which may be a reduced one.
+def _count_images(folder: Path) -> int:
+    """About how many images a model has; the file is not read whole."""
+    path = colmap_files(folder)["images"]
+    if path.suffix.lower() == ".bin":
+        with regular(path).open("rb") as file:
+            return int.from_bytes(file.read(8), "little")
+    with regular(path).open("rb") as file:
+        return sum(not line.lstrip().startswith(b"#") for line in file) // 2
 
-    Args:
-        model: the model.
-        record: the image's record in it.
-        size: the image's ``(height, width)`` on disk.
-        path: the image, for the message.
 
-    Raises:
-        DataError: if the image has another shape than its camera.
-    """
-    camera = model.cameras[record.camera_id]
-    scale = (size[1] / camera.width, size[0] / camera.height)
-    # Sizes are whole pixels, so that both directions of a reduced image may be off by one.
-    if abs(scale[0] / scale[1] - 1) > 2 / min(size):
-        raise DataError(
-            f"{path} is {size[1]}x{size[0]} pixels, but its camera in the model {camera.width}x{camera.height}: it is "
-            "not the image the model was made of, nor a reduced one"
-        )
-    return resize_intrinsics(torch.from_numpy(colmap_intrinsics(camera)), *scale).numpy()
+def _is_stored(model: Reconstruction, record: Image, path: Path) -> bool:
+    """Whether the colours of a model's points speak for an image as stored, against the same turned upright."""
+    camera, differences = record.camera, []
+    features = [feature for feature in record.points2D if feature.has_point3D()]
+    if not features:
+        return False
+    expected = np.array([model.points3D[feature.point3D_id].color for feature in features], np.float64)
+    places = np.array([feature.xy for feature in features]) / (camera.width, camera.height)
+    for upright in (False, True):
+        pixels = read_color(path, "", upright=upright)
+        x, y = (places * pixels.shape[1::-1]).astype(np.int64).clip(0, np.array(pixels.shape[1::-1]) - 1).T
+        differences.append(np.abs(pixels[y, x] - expected).mean())
+    return bool(differences[0] < _CLEARLY * differences[1])

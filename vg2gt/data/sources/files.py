@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import fnmatch
 import hashlib
-import inspect
 import json
 import logging
 from abc import abstractmethod
 from collections import Counter, OrderedDict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, TypedDict
+from typing import ClassVar, TypedDict
 
 import numpy as np
 import torch
@@ -19,10 +18,12 @@ from numpy.typing import NDArray
 
 from vg2gt.data.base import DataError, Frames, SceneSource
 from vg2gt.data.sources.index import FORMAT, SceneIndex, folder_state, index_to_bytes, read_index
+from vg2gt.data.sources.masks import joined_masks, resized_mask
 from vg2gt.data.sources.parsing import expanded
+from vg2gt.data.sources.undistortion import undistortion_of
 from vg2gt.data.transforms import from_bytes, resize_depth, resize_images, resize_to_cover
 from vg2gt.io.files import write_cached
-from vg2gt.io.image_files import Size, read_color, read_depth
+from vg2gt.io.image_files import Size, read_color, read_depth, read_mask
 
 log = logging.getLogger(__name__)
 
@@ -78,27 +79,14 @@ class FileSource(SceneSource):
     index_options: ClassVar[tuple[str, ...]] = ()
     """Attributes that decide an index, beside the folder; part of the cache's key."""
     sparse_depth: ClassVar[bool] = False
+    reads_masks: ClassVar[bool] = False
+    """Alpha and mask files decide how much a pixel counts; otherwise alpha is composited alone."""
     depth_scale: float = 1000.0
     """Stored depth units for one unit of the poses."""
     invalid: tuple[int, ...] = ()
     """Stored depth that means none, beside 0."""
     depth_remedy: ClassVar[str] = "correct the depth unit and the values that mean 'invalid'"
     """What to do where a frame has no valid depth, for messages."""
-
-    __signature__: ClassVar[inspect.Signature]
-
-    def __init_subclass__(cls, **options: Any) -> None:
-        """Names the shared arguments in the signature of a constructor that hands them on: it is the YAML's schema."""
-        super().__init_subclass__(**options)
-        parameters = list(inspect.signature(cls.__init__).parameters.values())[1:]
-        own = [parameter for parameter in parameters if parameter.kind is not parameter.VAR_KEYWORD]
-        if len(own) < len(parameters):
-            shared = list(inspect.signature(FileSource.__init__).parameters.values())[1:]
-            names = {parameter.name for parameter in own}
-            more = [
-                parameter.replace(kind=parameter.KEYWORD_ONLY) for parameter in shared if parameter.name not in names
-            ]
-            cls.__signature__ = inspect.Signature([*own, *more])
 
     def __init__(
         self,
@@ -155,7 +143,29 @@ class FileSource(SceneSource):
         Raises:
             DataError: if it is missing, damaged, or of another size than the index says.
         """
-        return read_color(index.color[row], index.name, index.color_size)
+        lens, upright = index.lens(row), index.upright(row)
+        if not lens:
+            return read_color(index.color[row], index.name, index.color_size, upright=upright)
+        undistortion = undistortion_of(lens)
+        return undistortion.color(read_color(index.color[row], index.name, undistortion.lens_size, upright=upright))
+
+    def read_mask(self, index: SceneIndex, row: int) -> NDArray[np.float32] | None:
+        """How much each pixel of a colour image counts ``[h, w]``, by its mask file and its alpha; None: all do.
+
+        Raises:
+            DataError: if a file is missing or damaged.
+        """
+        if not self.reads_masks:
+            return None
+        path, upright = index.mask(row), index.upright(row)
+        parts = [read_mask(index.color[row], index.name, upright=upright)]
+        if path is not None:
+            parts.append(read_mask(path, index.name, upright=upright))
+        mask = joined_masks(parts)
+        if mask is None or not (lens := index.lens(row)):
+            return mask
+        undistortion = undistortion_of(lens)
+        return undistortion.depth(resized_mask(mask, undistortion.lens_size))
 
     def read_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
         """Decodes the depth ``[h, w]`` of a row of the index: z-depth in the dataset's unit, 0 = invalid.
@@ -170,11 +180,13 @@ class FileSource(SceneSource):
         Raises:
             DataError: if it is missing, damaged, or of another size.
         """
-        stored = read_depth(index.depth[row], index.name, size)
+        undistortion = undistortion_of(index.lens(row)) if index.lens(row) else None
+        stored = read_depth(index.depth[row], index.name, undistortion.lens_size if undistortion else size)
         depth = stored / self.depth_scale
         if self.invalid:
             depth = np.where(np.isin(stored, self.invalid), 0, depth)
-        return depth.astype(np.float32)
+        depth = depth.astype(np.float32)
+        return undistortion.depth(depth) if undistortion else depth
 
     def watched(self, scene: str, folder: Path) -> Sequence[Path | None]:
         """Folders and files that decide a scene's index, as far as they exist; by default the scene's folder."""
@@ -212,6 +224,15 @@ class FileSource(SceneSource):
         index = self.scene_index(scene)
         return Frames.concatenate([self._load_frame(index, index.row(frame)) for frame in frame_ids])
 
+    def load_whole(self, scene: str, frame: int) -> Frames:
+        """Decodes one frame at its own size (``SceneIndex.own_size``), uncut.
+
+        Raises:
+            DataError: as ``load``.
+        """
+        index = self.scene_index(scene)
+        return self._load_frame(index, index.row(frame), whole=True)
+
     def identity(self, scene: str) -> str:
         """Also the version of the loader and the state of the scene's files; not which frames are chosen."""
         choice = ("holdout", "every", "index_cache")
@@ -232,7 +253,7 @@ class FileSource(SceneSource):
         self._indices.move_to_end(scene)
         return self._indices[scene]
 
-    def _load_frame(self, index: SceneIndex, row: int) -> Frames:
+    def _load_frame(self, index: SceneIndex, row: int, whole: bool = False) -> Frames:
         pixels = self.read_color(index, row)
         images = from_bytes(torch.from_numpy(pixels)).permute(2, 0, 1)[None].contiguous()  # [1, 3, H, W]
         depth = torch.zeros_like(images[:, 0])  # [1, H, W]
@@ -240,10 +261,14 @@ class FileSource(SceneSource):
             depth = torch.from_numpy(self._valid_depth(index, row, index.depth_size or pixels.shape[:2]))[None]
         poses = torch.from_numpy(index.world_to_camera[row : row + 1]).float()
         intrinsics = torch.from_numpy(index.intrinsics[row : row + 1]).float()
+        stored = self.read_mask(index, row)
+        mask = None if stored is None else torch.from_numpy(resized_mask(stored, pixels.shape[:2]))[None]
         if index.color_size is None:
-            return resize_to_cover(Frames(images, depth, poses, intrinsics, self.sparse_depth), index.size)
+            frames = Frames(images, depth, poses, intrinsics, self.sparse_depth, mask)
+            return frames if whole else resize_to_cover(frames, index.size)
         depth = resize_depth(depth, index.size, self.sparse_depth)
-        return Frames(resize_images(images, index.size), depth, poses, intrinsics, self.sparse_depth)
+        mask = None if mask is None else resize_images(mask[:, None], index.size)[:, 0]
+        return Frames(resize_images(images, index.size), depth, poses, intrinsics, self.sparse_depth, mask)
 
     def _valid_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
         depth = self.read_depth(index, row, size)

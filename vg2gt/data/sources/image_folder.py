@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from vg2gt.data.sources.files import FileSource
 from vg2gt.data.sources.index import SceneIndex, make_index
 from vg2gt.data.sources.parsing import IMAGE_SUFFIXES, pinhole
 from vg2gt.io.image_files import Size, image_size, read_color
+from vg2gt.io.names import by_number
 
 FOCAL = 1.2
 """Placeholder focal length, in the larger side of the image: the usual first guess of structure from motion."""
@@ -72,10 +72,4 @@ def _guess(size: Size) -> NDArray[np.float64]:
 
 def _images(folder: Path) -> list[Path]:
     files = [path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()]
-    return sorted((path for path in files if not path.name.startswith(".")), key=by_number)
-
-
-def by_number(path: Path) -> tuple[list[str | int], str]:
-    """Sorting key of a file by its name, runs of digits by their value; they stand at the odd places of the split."""
-    parts = re.split(r"(\d+)", path.name)
-    return [int(part) if i % 2 else part for i, part in enumerate(parts)], path.name
+    return sorted((path for path in files if not path.name.startswith(".")), key=lambda path: by_number(path.name))

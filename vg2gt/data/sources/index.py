@@ -44,7 +44,8 @@ class SceneIndex:
         color_size: of the colour files; None: each has its own, and is resized to cover ``size`` and cropped.
         depth_size: of the depth files; None: each has its colour image's.
         dropped: frames left out, by reason.
-        extra: what else a loader keeps of a scene, as arrays.
+        extra: what else a loader keeps of a scene, as arrays; ``sizes [n, 2]``, ``lens``, ``upright`` and ``mask`` of
+            the frames are known to all (``make_index``).
     """
 
     name: str
@@ -70,6 +71,43 @@ class SceneIndex:
         if place == len(self.frame_ids) or self.frame_ids[place] != frame:
             raise DataError(f"scene {self.name} in {self.folder} has no usable frame {frame}")
         return place
+
+    def own_size(self, row: int) -> Size:
+        """``(height, width)`` of a frame before it is brought to ``size``."""
+        height, width = self.extra["sizes"][row].tolist() if "sizes" in self.extra else self.size
+        return height, width
+
+    def lens(self, row: int) -> str:
+        """The lens of a frame's files as ``undistortion.lens_text`` writes it; empty for a pinhole."""
+        return str(self.extra["lens"][row]) if "lens" in self.extra else ""
+
+    def upright(self, row: int) -> bool:
+        """Whether a frame's file is turned upright as its EXIF data says."""
+        return bool(self.extra["upright"][row]) if "upright" in self.extra else False
+
+    def mask(self, row: int) -> Path | None:
+        """The mask file of a frame, if it has one."""
+        name = str(self.extra["mask"][row]) if "mask" in self.extra else ""
+        return Path(name) if name else None
+
+
+@dataclass(frozen=True)
+class PosedImage:
+    """What is known of one image with a camera.
+
+    Attributes:
+        size: ``(height, width)`` upright and undistorted.
+        intrinsics: ``[3, 3]`` of an image of that size, integer pixel centres.
+        lens: see ``SceneIndex.lens``.
+        upright: see ``SceneIndex.upright``.
+        mask: path of its mask file, or empty.
+    """
+
+    size: Size
+    intrinsics: NDArray[np.float64]
+    lens: str = ""
+    upright: bool = False
+    mask: str = ""
 
 
 def first_size(files: Mapping[int, Path], scene: str) -> Size:
@@ -98,6 +136,7 @@ def make_index(
     color_size: Size | Mapping[int, Size] | None = None,
     size: Size | None = None,
     depth_size: Size | None = None,
+    posed: Mapping[int, PosedImage] | None = None,
 ) -> SceneIndex:
     """Joins what a layout holds of each frame; frames that lack something are left out and counted.
 
@@ -111,10 +150,15 @@ def make_index(
         color_size: ``(height, width)`` of the colour files, or of each by frame number; None: the first one's.
         size: of decoded frames; None: that of the colour files, or the median where they differ.
         depth_size: of the depth files; None: each has its colour image's.
+        posed: what is known of each image by frame number, in place of ``intrinsics`` and ``color_size``.
 
     Raises:
         DataError: if no frame is left, a pose is not rigid, or intrinsics are not usable.
     """
+    if posed is not None:
+        intrinsics = {i: image.intrinsics for i, image in posed.items()}
+        color_size = {i: image.size for i, image in posed.items()}
+    sizes = color_size if isinstance(color_size, Mapping) else None
     if isinstance(color_size, Mapping):
         size = size or typical_size(color_size.values())
         color_size = size if set(color_size.values()) == {size} else None
@@ -147,6 +191,13 @@ def make_index(
         raise DataError(f"no usable frame in {where}: it has {found}{reasons}")
     for reason, count in dropped.items():
         log.warning("scene %s: %d of %d frames %s are left out", name, count, len(listed), reason)
+    extra: dict[str, NDArray] = {}
+    if sizes is not None:
+        extra["sizes"] = np.array([sizes[number] for number in kept], np.int64)
+    for key in ("lens", "upright", "mask"):
+        values = np.array([getattr(posed[number], key) for number in kept] if posed else [])
+        if any(values.tolist()):
+            extra[key] = values
     poses = rigid(np.stack([camera_to_world[number] for number in kept]).astype(np.float64), kept, where)
     if isinstance(intrinsics, Mapping):
         matrices = np.stack([intrinsics[number] for number in kept]).astype(np.float64)
@@ -164,6 +215,7 @@ def make_index(
         color_size=color_size,
         depth_size=depth_size or color_size,
         dropped=dict(dropped),
+        extra=extra,
     )
 
 

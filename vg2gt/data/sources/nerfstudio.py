@@ -1,7 +1,9 @@
-"""Captures with a ``transforms.json``, as nerfstudio, instant-ngp and many capture apps write it."""
+"""Captures with a ``transforms.json``, as nerfstudio, instant-ngp, Blender scripts and many capture apps write it."""
 
 from __future__ import annotations
 
+import logging
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,13 +13,27 @@ from typing_extensions import Unpack
 
 from vg2gt.data.base import DataError
 from vg2gt.data.sources.files import FileSource, HoldoutOptions
-from vg2gt.data.sources.index import SceneIndex, make_index
-from vg2gt.data.sources.parsing import check_intrinsics, errors_name, named_file, positive, to_world
-from vg2gt.data.sources.undistortion import Undistortion
+from vg2gt.data.sources.index import PosedImage, SceneIndex, make_index
+from vg2gt.data.sources.masks import FOLDER as MASKS
+from vg2gt.data.sources.masks import find_masks
+from vg2gt.data.sources.parsing import (
+    check_intrinsics,
+    errors_name,
+    existing_image,
+    named_file,
+    positive,
+    to_world,
+)
+from vg2gt.data.sources.posed import posed_image, size_on_disk
 from vg2gt.io import Lens, TransformsFrame, read_transforms
+from vg2gt.io.colmap import PIXEL_CENTER, Camera, require_pycolmap
 from vg2gt.io.image_files import Size, image_size
+from vg2gt.io.names import by_number
 
-_FILE = "transforms.json"
+log = logging.getLogger(__name__)
+
+FILE = "transforms.json"
+BLENDER = ("transforms_train.json", "transforms_val.json", "transforms_test.json")
 _SCENES_IN_MEMORY = 64
 _MODELS = (None, "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE")
 
@@ -25,9 +41,12 @@ _MODELS = (None, "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV
 class Nerfstudio(FileSource):
     """Scenes with a ``transforms.json`` (camera-to-world, OpenGL axes); the scale is arbitrary.
 
-    Frames are numbered 0, 1, ... in the order of their file names, also where an image is absent (left out and
-    counted). Distorted images are undistorted when they are read (``Undistortion``). Images of several sizes are
-    resized to cover the median size and cropped.
+    Also Blender's synthetic sets of ``transforms_train.json``, ``_val`` and ``_test``: frames of the last are held out,
+    whatever ``holdout`` says.
+
+    Frames are numbered 0, 1, ... in the order of their file names (numbers by their value), also where an image is
+    absent (left out and counted). Distorted images are undistorted when they are read (``Undistortion``). Images of
+    several sizes are resized to cover the median size and cropped. Alpha, ``mask_path`` and ``masks/`` say what counts.
 
     Args:
         root: a scene, a folder of scenes (one or two levels deep), or a list of such folders.
@@ -36,10 +55,11 @@ class Nerfstudio(FileSource):
         shared: see ``FileSource``.
     """
 
-    layout = f"{_FILE}, there or up to two folders deeper"
-    scene_marks = (_FILE,)
+    layout = f"{FILE}, or Blender's {', '.join(BLENDER)}, there or up to two folders deeper"
     names_are_paths = True
+    index_version = 3
     index_options = ("has_depth",)
+    reads_masks = True
     is_metric = False
 
     def __init__(
@@ -51,76 +71,119 @@ class Nerfstudio(FileSource):
     ) -> None:
         self.has_depth = depth
         self.depth_scale = positive("depth_scale", depth_scale, "stored units for one of the poses")
-        self._frames: dict[str, list[TransformsFrame]] = {}
-        self._last: tuple[Lens, Undistortion] | None = None
+        self._frames: dict[str, tuple[list[TransformsFrame], int]] = {}
         super().__init__(root, **shared)
+
+    def is_scene(self, folder: Path) -> bool:
+        """Whether it holds one of the files."""
+        return bool(transforms_files(folder))
+
+    def watched(self, scene: str, folder: Path) -> Sequence[Path | None]:
+        """Also the masks."""
+        return folder, folder / MASKS
+
+    def held_out(self, scene: str) -> Sequence[int]:
+        """Blender's test frames where there are any, else by ``holdout``."""
+        first_test = self._records(scene, self._folders[scene])[1]
+        return [frame for frame in self.frames(scene) if frame >= first_test] or super().held_out(scene)
 
     def index(self, scene: str, folder: Path) -> SceneIndex:
         """Reads the file and the sizes of its images."""
-        records = self._records(scene, folder)
-        where = f"{folder / _FILE} of scene {scene}"
+        records = self._records(scene, folder)[0]
+        where = f"{transforms_files(folder)[0]} of scene {scene}"
         with errors_name(scene):
-            color = {i: _image_path(named_file(folder, record.file_path, where)) for i, record in enumerate(records)}
-            color = {i: path for i, path in color.items() if path.is_file()}
-            named = {i: record.depth_file_path for i, record in enumerate(records) if record.depth_file_path}
-            depth = {i: named_file(folder, name, where) for i, name in named.items()}
+            named = {i: _named_image(folder, record.file_path, where) for i, record in enumerate(records)}
+            color = {i: found for i, path in named.items() if (found := existing_image(path)) is not None}
+            depth = _named_files(folder, records, "depth_file_path", where)
+            depth = {i: path for i, path in depth.items() if path.is_file()}
+            masks = self._masks(scene, folder, records, color, where)
         if not color:
-            raise DataError(f"scene {scene}: none of the {len(records)} images of {folder / _FILE} exists")
-        sizes = {i: image_size(path, scene) for i, path in color.items()}
+            tried = f"; tried {named[0]} and other endings" if named else ""
+            raise DataError(f"scene {scene}: none of the {len(records)} images of {where} exists{tried}")
         poses = {i: to_world(np.asarray(record.world_to_camera, np.float64)) for i, record in enumerate(records)}
-        intrinsics = {i: self._intrinsics(scene, records[i], sizes[i], path) for i, path in color.items()}
-        return make_index(scene, folder, color, depth if self.has_depth else None, poses, intrinsics, color_size=sizes)
+        posed = {i: _posed(scene, where, records[i].lens, path, masks.get(i)) for i, path in color.items()}
+        return make_index(scene, folder, color, depth if self.has_depth else None, poses, {}, posed=posed)
 
-    def read_color(self, index: SceneIndex, row: int) -> NDArray[np.uint8]:
-        """Decodes a colour image and undistorts it."""
-        pixels = super().read_color(index, row)
-        size = (pixels.shape[0], pixels.shape[1])
-        undistortion = self._undistortion(index.name, self._record(index, row).lens, size, index.color[row])
-        return undistortion.color(pixels) if undistortion else pixels
+    def _masks(
+        self, scene: str, folder: Path, records: Sequence[TransformsFrame], color: dict[int, Path], where: str
+    ) -> dict[int, Path]:
+        named = {i: path for i, path in _named_files(folder, records, "mask_path", where).items() if i in color}
+        missing = [str(path) for path in named.values() if not path.is_file()]
+        if missing:
+            log.warning(
+                "%s names masks that are not there, their images count as a whole: %s", where, ", ".join(missing)
+            )
+        found = {i: path for i, path in named.items() if path.is_file()}
+        rest = {i: path.name for i, path in color.items() if i not in named}
+        return found if named else find_masks(folder / MASKS, rest, f"scene {scene}")
 
-    def read_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
-        """Decodes an integer depth image and undistorts it like its colour image."""
-        depth = super().read_depth(index, row, size)
-        undistortion = self._undistortion(index.name, self._record(index, row).lens, size, index.color[row])
-        return undistortion.depth(depth) if undistortion else depth
-
-    def _records(self, scene: str, folder: Path) -> list[TransformsFrame]:
+    def _records(self, scene: str, folder: Path) -> tuple[list[TransformsFrame], int]:
+        """The frames in their order, and the number of the first that is Blender's test frame."""
         if scene not in self._frames:
             if len(self._frames) >= _SCENES_IN_MEMORY:
                 self._frames.clear()
-            with errors_name(scene):
-                frames = read_transforms(folder / _FILE).frames
-            self._frames[scene] = sorted(frames, key=lambda frame: frame.file_path)
+            frames, first_test = [], 0
+            for path in transforms_files(folder):
+                with errors_name(scene):
+                    own = read_transforms(path).frames
+                first_test = len(frames) if path.name == BLENDER[-1] else len(frames) + len(own)
+                frames += sorted(own, key=lambda frame: by_number(frame.file_path))
+            self._frames[scene] = frames, first_test
         return self._frames[scene]
 
-    def _record(self, index: SceneIndex, row: int) -> TransformsFrame:
-        return self._records(index.name, index.folder)[index.frame_ids[row]]
 
-    def _intrinsics(self, scene: str, record: TransformsFrame, size: Size, path: Path) -> NDArray[np.float64]:
-        undistortion = self._undistortion(scene, record.lens, size, path)
-        matrix = undistortion.intrinsics if undistortion else record.lens.intrinsics(size)
-        return np.asarray(matrix, np.float64)
-
-    def _undistortion(self, scene: str, lens: Lens, size: Size, path: Path) -> Undistortion | None:
-        """How to undistort an image of a lens; None where there is nothing to do."""
-        where = f"{_FILE} of scene {scene}, for {path}"
-        if (lens.height or size[0], lens.width or size[1]) != size:
-            raise DataError(f"{where} says {lens.width}x{lens.height} pixels, but the image is {size[1]}x{size[0]}")
-        if lens.camera_model not in _MODELS:
-            names = ", ".join(name for name in _MODELS if name)
-            raise DataError(f"{where} has a camera of model {lens.camera_model}; read are: {names}")
-        matrix = check_intrinsics(np.asarray(lens.intrinsics(size), np.float64), where)
-        if not lens.is_distorted:
-            return None
-        if self._last is None or self._last[0] != lens or self._last[1].size != size:
-            try:
-                undistortion = Undistortion(matrix, lens.distortion, "FISHEYE" in (lens.camera_model or ""), size)
-            except ValueError as error:
-                raise DataError(f"{where}: {error}") from error
-            self._last = lens, undistortion
-        return self._last[1]
+def transforms_files(folder: Path) -> list[Path]:
+    """``transforms.json`` of a folder, or Blender's files."""
+    if (folder / FILE).is_file():
+        return [folder / FILE]
+    return [folder / name for name in BLENDER if (folder / name).is_file()]
 
 
-def _image_path(path: Path) -> Path:
-    """The file, which some writers name without its suffix."""
-    return path if path.is_file() or path.suffix else Path(f"{path}.png")
+def _named_files(folder: Path, records: Sequence[TransformsFrame], field: str, where: str) -> dict[int, Path]:
+    named = {i: getattr(record, field) for i, record in enumerate(records) if getattr(record, field)}
+    return {i: named_file(folder, name.replace("\\", "/"), where) for i, name in named.items()}
+
+
+def _named_image(folder: Path, name: str, where: str) -> Path:
+    """The image of a name; ``../images/a.png`` of a file that was moved up is looked for as ``images/a.png``."""
+    inside = folder / re.sub(r"^(\.\./)+", "", name)
+    return inside if name.startswith("../") and existing_image(inside) else named_file(folder, name, where)
+
+
+def _posed(scene: str, where: str, lens: Lens, path: Path, mask: Path | None) -> PosedImage:
+    """What is known of an image; it may be smaller than the file says."""
+    where = f"{where}, for {path}"
+    if (lens.camera_model or "PINHOLE").upper() not in _MODELS:
+        names = ", ".join(name for name in _MODELS if name)
+        raise DataError(f"{where} has a camera of model {lens.camera_model}; read are: {names}")
+    if lens.width and lens.height:
+        expected = (lens.height, lens.width)
+        size, upright = size_on_disk(path, scene, expected, where)
+    else:
+        size, upright = image_size(path, scene, upright=True), True
+        expected = size
+    matrix = check_intrinsics(np.asarray(lens.intrinsics(expected), np.float64), where)
+    camera = _distorted(lens, matrix, expected, where) if lens.is_distorted else matrix
+    return posed_image(camera, expected, size, upright, mask, where)
+
+
+def _distorted(lens: Lens, matrix: NDArray[np.float64], size: Size, where: str) -> Camera:
+    """The lens as COLMAP's camera: OPENCV_FISHEYE, or FULL_OPENCV, which has all other coefficients but k4."""
+    require_pycolmap(f"undistorting the images of {where}")
+    import pycolmap  # pyright: ignore[reportMissingImports]
+
+    k = lens.distortion
+    fisheye = "FISHEYE" in (lens.camera_model or "").upper()
+    if not fisheye and k.get("k4"):
+        raise DataError(
+            f"{where} has a radial k4, which is read of fisheye cameras alone: set camera_model or is_fisheye"
+        )
+    names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
+    coefficients = [k.get(name, 0.0) for name in names] + ([] if fisheye else [0.0] * 3)
+    center = matrix[:2, 2] + PIXEL_CENTER
+    return pycolmap.Camera(
+        model="OPENCV_FISHEYE" if fisheye else "FULL_OPENCV",
+        width=size[1],
+        height=size[0],
+        params=[matrix[0, 0], matrix[1, 1], *center, *coefficients],
+    )

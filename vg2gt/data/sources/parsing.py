@@ -8,6 +8,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -117,6 +118,27 @@ def named_file(folder: Path, name: str, where: str) -> Path:
             "inside and name it relative to the folder"
         )
     return folder / os.path.relpath(path, root)
+
+
+def existing_image(path: Path) -> Path | None:
+    """A named image, or the one in its folder that differs in its ending or in upper and lower case; None: none.
+
+    Models and lists often name files as they were before somebody converted them.
+    """
+    if path.is_file():
+        return path
+    if not path.parent.is_dir():
+        return None
+    files = _images_by_name(path.parent, path.parent.stat().st_mtime_ns)
+    name, stem = path.name.lower(), path.stem.lower()
+    candidates = (name, *(name + suffix for suffix in IMAGE_SUFFIXES), *(stem + suffix for suffix in IMAGE_SUFFIXES))
+    return next((files[candidate] for candidate in candidates if candidate in files), None)
+
+
+@lru_cache(maxsize=16)
+def _images_by_name(folder: Path, state: int) -> dict[str, Path]:
+    """Images of a folder by their names in lower case; ``state`` is the folder's time of change."""
+    return {path.name.lower(): path for path in sorted(folder.iterdir()) if path.suffix.lower() in IMAGE_SUFFIXES}
 
 
 @contextmanager

@@ -14,7 +14,6 @@ Principal points count from the images' corner, as ARKit's do.
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -28,17 +27,15 @@ from vg2gt.data.sources.parsing import CORNER_TO_CENTER, errors_name, numbered, 
 from vg2gt.data.sources.rgbd_cameras import pose_file_of, pose_matrices
 from vg2gt.io.errors import FormatError
 from vg2gt.io.exr import read_exr
-from vg2gt.io.files import regular
 from vg2gt.io.image_files import Size, image_size, read_color
 from vg2gt.io.json_checks import load_json
-from vg2gt.io.record3d import is_archive, is_recorded, read_recorded, recorded_files, unpack_lzfse, unpacked_size
+from vg2gt.io.record3d import is_archive, read_recorded, recorded_files, unpack_lzfse
 from vg2gt.io.video import video_size
 
 EXR = ".exr"
 PACKED = ".depth"
 VIDEO = "rgb.mp4"
 RECORD3D, R3D, POLYCAM, STRAY = "Record3D", "Record3D (.r3d)", "Polycam", "Stray Scanner"
-_LARGEST = 1e9  # of what is a number of pixels, metres or frames
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # camera axes of ARKit to OpenCV's
 
 
@@ -124,23 +121,28 @@ def read_color_file(path: Path, scene: str, size: Size | None) -> NDArray[np.uin
 
 
 def read_packed_depth(path: Path, size: Size) -> NDArray[np.float32]:
-    """Reads a ``.depth`` file ``[H, W]`` in metres, 0 where the ``.conf`` beside it, if there is one, has none (0).
+    """Reads a ``.depth`` file ``[H, W]`` in metres, 0 where the ``.conf`` next to it, if there is one, has none (0).
 
     Raises:
         FormatError: if it is damaged or not of this size.
         ImportError: if the package ``lzfse`` is not installed.
     """
-    pixels = size[0] * size[1]
-    depth = np.frombuffer(unpack_lzfse(read_recorded(path), 4 * pixels, path), "<f4").reshape(size)
-    beside = path.with_suffix(".conf")
-    if not is_recorded(beside):
-        return depth
-    confidence = np.frombuffer(unpack_lzfse(read_recorded(beside), pixels, beside), np.uint8).reshape(size)
-    return np.where(confidence > 0, depth, 0)
+    depth = _unpacked(path, np.dtype("<f4"), size)
+    with suppress(FileNotFoundError):
+        return np.where(_unpacked(path.with_suffix(".conf"), np.dtype(np.uint8), size) > 0, depth, 0)
+    return depth
+
+
+def _unpacked(path: Path, kind: np.dtype[Any], size: Size) -> NDArray[Any]:
+    content = unpack_lzfse(path)
+    expected = kind.itemsize * size[0] * size[1]
+    if len(content) != expected:
+        raise FormatError(f"{path} unpacks to {len(content)} bytes, expected {expected}; export the recording again")
+    return np.frombuffer(content, kind).reshape(size)
 
 
 def _read_record3d(folder: Path, scene: str) -> PhoneExport:
-    """Files beside each other."""
+    """Separate files."""
     path = folder / "metadata.json"
     color, depth = numbered(folder / "rgb", scene), numbered(folder / "depth", scene, suffixes=(EXR,))
     size = image_size(next(iter(color.values())), scene) if color else (0, 0)
@@ -148,7 +150,7 @@ def _read_record3d(folder: Path, scene: str) -> PhoneExport:
 
 
 def _read_r3d(recording: Path, scene: str) -> PhoneExport:
-    """The size of the depth is in newer files; in others what it unpacks to tells, the shape being the images'."""
+    """Newer files tell the depth's size; in older ones it has the images' shape."""
     path = recording / "metadata"
     content = load_json(path, read_recorded(path))
     color, depth = recorded_files(recording, ".jpg"), recorded_files(recording, PACKED)
@@ -158,10 +160,9 @@ def _read_r3d(recording: Path, scene: str) -> PhoneExport:
     if not (color and depth):
         return export
     if "dh" in content and "dw" in content:
-        height, width = _size(path, content, "dh", "dw")
+        height, width = _numbers(path, content, "dh", "dw").astype(int).tolist()
     else:
-        packed = next(iter(depth.values()))
-        pixels = unpacked_size(read_recorded(packed), packed) / 4
+        pixels = len(unpack_lzfse(next(iter(depth.values())))) / 4
         height, width = (round((pixels * size[i] / size[1 - i]) ** 0.5) for i in (0, 1))
     if not 0 < height * width <= size[0] * size[1]:
         raise FormatError(f"{path}: depth of {width}x{height} pixels with images of {size[1]}x{size[0]}")
@@ -172,17 +173,18 @@ def _of_metadata(
     app: str, path: Path, content: Any, color: dict[int, Path], depth: dict[int, Path], size: Size
 ) -> PhoneExport:
     """``poses`` are lists of qx qy qz qw x y z; ``K`` goes column by column; newer files have one for every frame."""
-    rows = _numbers(path, content, "poses", 7)
-    if isinstance(content.get("perFrameIntrinsicCoeffs"), list) and content["perFrameIntrinsicCoeffs"]:
-        cameras = [pinhole(*row) for row in _numbers(path, content, "perFrameIntrinsicCoeffs", 4)]
-    else:
-        cameras = [_numbers(path, {"K": [content.get("K")]}, "K", 9)[0].reshape(3, 3).T] * len(rows)
-    if len(cameras) != len(rows):
-        raise FormatError(f"{path} has {len(rows)} poses, but intrinsics of {len(cameras)} frames")
-    said = _size(path, content, "h", "w")
-    if color and not np.isclose(said[0] * size[1], said[1] * size[0], rtol=0.02):
-        raise FormatError(f"{path} says {said[1]:g}x{said[0]:g} pixels, but the images are {size[1]}x{size[0]}")
-    scale = np.diag([size[1] / said[1], size[0] / said[0], 1.0])
+    height, width = _numbers(path, content, "h", "w")
+    if color and not np.isclose(height * size[1], width * size[0], rtol=0.02):
+        raise FormatError(f"{path} says {width:g}x{height:g} pixels, but the images are {size[1]}x{size[0]}")
+    try:
+        rows = np.asarray(content["poses"], np.float64).reshape(-1, 7)
+        if coefficients := content.get("perFrameIntrinsicCoeffs"):
+            cameras = [pinhole(*row) for row in np.asarray(coefficients, np.float64).reshape(len(rows), 4)]
+        else:
+            cameras = [np.asarray(content["K"], np.float64).reshape(3, 3).T] * len(rows)
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise FormatError(f"{path}: expected poses and intrinsics as Record3D writes them ({error})") from error
+    scale = np.diag([size[1] / width, size[0] / height, 1.0])
     return PhoneExport(
         app,
         color,
@@ -198,16 +200,13 @@ def _read_polycam(folder: Path, scene: str) -> PhoneExport:
     inside = folder / "keyframes"
     corrected = (inside / "corrected_cameras").is_dir() and (inside / "corrected_images").is_dir()
     before = "corrected_" if corrected else ""
-    color = numbered(inside / f"{before}images", scene)
-    depth = numbered(inside / "depth", scene)
+    color, depth = numbered(inside / f"{before}images", scene), numbered(inside / "depth", scene)
     poses, intrinsics = {}, {}
     for frame, path in numbered(inside / f"{before}cameras", scene, suffixes=(".json",)).items():
         content = load_json(path)
-        names = [f"t_{row}{column}" for row in range(3) for column in range(4)]
-        pose = np.eye(4)
-        pose[:3] = _fields(path, content, names).reshape(3, 4)
-        poses[frame] = pose @ _OPENGL
-        intrinsics[frame] = pinhole(*_fields(path, content, ["fx", "fy", "cx", "cy"])) - CORNER_TO_CENTER
+        rows = _numbers(path, content, *(f"t_{row}{column}" for row in range(3) for column in range(4)))
+        poses[frame] = np.vstack((rows.reshape(3, 4), [0, 0, 0, 1])) @ _OPENGL
+        intrinsics[frame] = pinhole(*_numbers(path, content, "fx", "fy", "cx", "cy")) - CORNER_TO_CENTER
     size = image_size(next(iter(color.values())), scene) if color else (0, 0)
     return PhoneExport(POLYCAM, color, depth, poses, intrinsics, size)
 
@@ -215,67 +214,28 @@ def _read_polycam(folder: Path, scene: str) -> PhoneExport:
 def _read_stray(folder: Path, scene: str) -> PhoneExport:
     """``odometry.csv``: a header, then timestamp, frame, x, y, z, qx, qy, qz, qw of cameras with OpenCV's axes."""
     path = folder / "odometry.csv"
-    rows = _table(path)
-    header = [name.strip() for name in rows[0]]
-    wanted = ["frame", "x", "y", "z", "qx", "qy", "qz", "qw"]
-    if not set(wanted) <= set(header):
-        raise FormatError(f"{path}: expected columns {', '.join(wanted)}, found {', '.join(header)}")
-    columns = [header.index(name) for name in wanted]
     try:
-        numbers = np.array([[float(row[column]) for column in columns] for row in rows[1:]])
-        matrix = np.array([[float(word) for word in row] for row in _table(folder / "camera_matrix.csv")])
-    except (ValueError, IndexError) as error:
-        raise FormatError(f"{path} or camera_matrix.csv beside it is damaged: {error}") from error
-    if matrix.shape != (3, 3) or not len(numbers):
-        raise FormatError(f"{folder}: camera_matrix.csv must hold 3x3 numbers and odometry.csv a pose at least")
-    if not (np.abs(numbers[:, 0]) < _LARGEST).all():
-        raise FormatError(f"{path}: a frame's number is none")
-    frames = numbers[:, 0].astype(int).tolist()
-    depth = numbered(folder / "depth", scene)
+        rows = np.loadtxt(path, delimiter=",", skiprows=1, usecols=range(1, 9), ndmin=2)
+        matrix = np.loadtxt(folder / "camera_matrix.csv", delimiter=",").reshape(3, 3)
+    except (ValueError, IndexError) as error:  # a text that is none is a ValueError, too
+        raise FormatError(f"{path} or camera_matrix.csv next to it is damaged: {error}") from error
+    if not len(rows) or not (np.abs(rows[:, 0]) < 2**31).all():
+        raise FormatError(f"{path} has no frames, or numbers of frames that are none")
+    frames = rows[:, 0].astype(int).tolist()
     return PhoneExport(
         STRAY,
         dict.fromkeys(frames, folder / VIDEO),
-        depth,
-        dict(zip(frames, pose_matrices(numbers[:, 1:]), strict=True)),
+        numbered(folder / "depth", scene),
+        dict(zip(frames, pose_matrices(rows[:, 1:]), strict=True)),
         dict.fromkeys(frames, matrix - CORNER_TO_CENTER),
         video_size(folder / VIDEO),
     )
 
 
-def _table(path: Path) -> list[list[str]]:
-    """Rows of a CSV file, without empty ones; at least one."""
-    try:
-        text = regular(path).read_text(encoding="utf-8")
-    except UnicodeDecodeError as error:
-        raise FormatError(f"{path}: not text ({error})") from error
-    rows = [row for row in csv.reader(text.splitlines()) if row]
-    if not rows:
-        raise FormatError(f"{path} is empty")
-    return rows
-
-
-def _size(path: Path, content: Any, *names: str) -> Size:
-    """Height and width in pixels, by their keys."""
-    height, width = _numbers(path, {"size": [[content.get(name) for name in names]]}, "size", 2)[0]
-    if not (0 < height < _LARGEST and 0 < width < _LARGEST):
-        raise FormatError(f"{path}: {' and '.join(names)} must be a size in pixels, got {height:g} and {width:g}")
-    return int(height), int(width)
-
-
-def _numbers(path: Path, content: Any, key: str, columns: int) -> NDArray[np.float64]:
-    """``[n, columns]`` of a key of a JSON object, n at least 1."""
-    values: NDArray[np.float64] = np.zeros((0, 0))
-    with suppress(KeyError, TypeError, ValueError, OverflowError):
-        values = np.asarray(content[key], np.float64)
-    if values.ndim != 2 or values.shape[1] != columns or not len(values):
-        raise FormatError(f"{path}: expected {key} with {columns} numbers each, as Record3D writes it")
-    return values
-
-
-def _fields(path: Path, content: Any, names: list[str]) -> NDArray[np.float64]:
-    """The numbers that a JSON object has under some names."""
+def _numbers(path: Path, content: Any, *names: str) -> NDArray[np.float64]:
+    """The finite numbers that a JSON object has under some names; sizes must be above 0."""
     found = [content.get(name) if isinstance(content, dict) else None for name in names]
-    numbers = [value for value in found if isinstance(value, (int, float)) and abs(value) < _LARGEST]
-    if len(numbers) < len(names):
-        raise FormatError(f"{path}: expected numbers {names[0]} to {names[-1]}, as Polycam writes them")
-    return np.array(numbers, np.float64)
+    numbers = [float(value) for value in found if isinstance(value, (int, float)) and abs(value) < 1e9]
+    if len(numbers) < len(names) or (len(names) == 2 and min(numbers) < 1):
+        raise FormatError(f"{path}: expected numbers {', '.join(names)}")
+    return np.array(numbers)

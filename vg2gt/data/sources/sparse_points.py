@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from vg2gt.io import ColmapCamera, ColmapImage, ColmapModel, colmap_intrinsics, colmap_pose
+from vg2gt.data.sources.undistortion import pinhole_camera
+from vg2gt.io import colmap_images, colmap_pose
+from vg2gt.io.colmap import Camera, Image, Reconstruction
 
 MIN_TRACK = 3
 """Views that must see a point before its depth counts: two are not enough to notice a wrong match."""
@@ -24,34 +29,33 @@ class SparsePoints:
     """The points that each view saw, by frame number: where in the image, as a part of its size, and how deep.
 
     Args:
-        model: frames are numbered in the order of its images' names.
+        model: frames are numbered in the order of its images' names. Places are those of the undistorted images.
         sound: leave out what is likely to be wrong: points of few views, of nearly parallel rays, alone in space or
             that half of the images saw elsewhere, and observations that a point does not project to.
     """
 
-    def __init__(self, model: ColmapModel, sound: bool = True) -> None:
-        used: NDArray[np.bool_] = np.asarray((np.abs(model.points.positions) < _FAR).all(1))
+    def __init__(self, model: Reconstruction, sound: bool = True) -> None:
+        images = colmap_images(model)
+        poses = np.array([colmap_pose(image) for image in images]).reshape(-1, 4, 4)
+        scene = _Points.of(model, images)
+        used: NDArray[np.bool_] = np.asarray((np.abs(scene.positions) < _FAR).all(1))
         if sound:
-            used &= (model.points.track_lengths >= MIN_TRACK) & (model.points.track_lengths > 0)
-            used = used & (_ray_angles(model) >= MIN_ANGLE)
-            used[used] = _near_others(model, used)
-        order = np.argsort(model.points.ids)
-        observed = np.zeros(len(model.points), np.int64)  # in images
-        agreeing = np.zeros(len(model.points), np.int64)  # and where the point projects to
+            used &= np.bincount(scene.owner, minlength=len(used)) >= MIN_TRACK
+            used = used & (_ray_angles(scene, poses) >= MIN_ANGLE)
+            used[used] = _near_others(scene, poses, used)
+        observed = np.zeros(len(used), np.int64)  # in images
+        agreeing = np.zeros(len(used), np.int64)  # and where the point projects to
         views = []
-        for record in in_order(model):
-            camera, pose = model.cameras[record.camera_id], colmap_pose(record)
-            row = np.searchsorted(model.points.ids, record.point3d_ids, sorter=order).clip(max=len(order) - 1)
-            known = np.zeros(len(row), bool)
-            if len(order):
-                known = (model.points.ids[order[row]] == record.point3d_ids) & used[order[row]]
-            rows = order[row[known]]
-            seen = model.points.positions[rows] @ pose[:3, :3].T + pose[:3, 3]
-            place = record.points2d[known] / (camera.width, camera.height)
+        for view, (image, pose) in enumerate(zip(images, poses, strict=True)):
+            own = (scene.view == view) & used[scene.owner]
+            rows, features, camera = scene.owner[own], scene.features[own], image.camera
+            seen = scene.positions[rows] @ pose[:3, :3].T + pose[:3, 3]
+            place = _undistorted(features, camera)
             inside = (place >= 0).all(1) & (place < 1).all(1)
             good = inside & (seen[:, 2] > 1e-6) & (seen[:, 2] < _FAR)
             if sound:
-                good &= _reprojection(seen, camera, record.points2d[known]) <= MAX_REPROJECTION
+                error = np.linalg.norm(camera.img_from_cam(seen) - features, axis=1)
+                good &= error <= MAX_REPROJECTION
                 np.add.at(observed, rows[inside], 1)
                 np.add.at(agreeing, rows[good], 1)
             views.append((rows[good], place[good], seen[good, 2].astype(np.float32)))
@@ -67,55 +71,65 @@ class SparsePoints:
         return self._views[frame][1]
 
 
-def in_order(model: ColmapModel) -> list[ColmapImage]:
-    """A model's images by name, the order of frames."""
-    return sorted(model.images.values(), key=lambda image: image.name)
+@dataclass(frozen=True)
+class _Points:
+    """``positions [N, 3]``, and every observation: its point's row, its view, and the feature in pixels ``[T, 2]``."""
+
+    positions: NDArray[np.float64]
+    owner: NDArray[np.int64]
+    view: NDArray[np.int64]
+    features: NDArray[np.float64]
+
+    @staticmethod
+    def of(model: Reconstruction, images: Sequence[Image]) -> _Points:
+        points = model.points3D
+        row_of = {number: row for row, number in enumerate(points)}
+        rows, views, features = [], [], []
+        for view, image in enumerate(images):
+            for feature in image.get_observation_points2D():
+                rows.append(row_of[feature.point3D_id])
+                views.append(view)
+                features.append(feature.xy)
+        positions = np.array([point.xyz for point in points.values()], np.float64).reshape(-1, 3)
+        where = np.array(features, np.float64).reshape(-1, 2)
+        return _Points(positions, np.array(rows, np.int64), np.array(views, np.int64), where)
 
 
-def _reprojection(
-    seen: NDArray[np.float64], camera: ColmapCamera, points2d: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Pixels ``[n]`` between points in the camera's frame and where they were seen."""
-    depth = np.maximum(seen[:, 2:], 1e-6)
-    projected = (seen / depth) @ colmap_intrinsics(camera)[:2].T + 0.5  # features count from the corner
-    return np.linalg.norm(projected - points2d, axis=1)
+def _undistorted(features: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
+    """Places ``[n, 2]`` of features in the undistorted image, as a part of its size."""
+    target = pinhole_camera(camera)
+    rays = camera.cam_from_img(np.ascontiguousarray(features))
+    return target.img_from_cam(np.concatenate((rays, np.ones((len(rays), 1))), 1)) / (target.width, target.height)
 
 
-def _rays(model: ColmapModel) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """From the points to the cameras that saw them ``[T, 3]``, and the points' rows ``[T]``; unknown images: NaN."""
-    names = np.array(list(model.images), np.int64)
-    poses = np.array([colmap_pose(image) for image in model.images.values()]).reshape(-1, 4, 4)
-    centers = np.concatenate((-(poses[:, :3, :3].swapaxes(1, 2) @ poses[:, :3, 3:])[..., 0], np.full((1, 3), np.nan)))
-    order = np.argsort(names)
-    wanted = model.points.tracks[:, 0]
-    place = np.searchsorted(names, wanted, sorter=order).clip(max=len(names) - 1)
-    image = np.where(names[order[place]] == wanted, order[place], len(names)) if len(names) else np.zeros(0, np.int64)
-    owner = np.repeat(np.arange(len(model.points)), model.points.track_lengths)
-    return centers[image] - model.points.positions[owner], owner
+def _rays(scene: _Points, poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """From the points to the cameras that saw them ``[T, 3]``; NaN where a pose is unknown."""
+    centers = -(poses[:, :3, :3].swapaxes(1, 2) @ poses[:, :3, 3:])[..., 0]
+    return centers[scene.view] - scene.positions[scene.owner]
 
 
-def _ray_angles(model: ColmapModel) -> NDArray[np.float64]:
+def _ray_angles(scene: _Points, poses: NDArray[np.float64]) -> NDArray[np.float64]:
     """Twice the largest angle in degrees of a point's rays to their mean ``[N]``: of two rays, that between them."""
+    owner, count = scene.owner, len(scene.positions)
     with np.errstate(all="ignore"):
-        rays, owner = _rays(model)
+        rays = _rays(scene, poses)
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         known = np.isfinite(rays).all(1)
-        mean = np.zeros((len(model.points), 3))
+        mean = np.zeros((count, 3))
         np.add.at(mean, owner[known], rays[known])
         mean /= np.linalg.norm(mean, axis=1, keepdims=True)
         cosine = (rays * mean[owner]).sum(1).clip(-1, 1)
-        angles = np.zeros(len(model.points))
+        angles = np.zeros(count)
         np.maximum.at(angles, owner[known], 2 * np.degrees(np.arccos(cosine[known])))
     return np.nan_to_num(angles, nan=180.0)  # rays from all sides have no mean
 
 
-def _near_others(model: ColmapModel, used: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _near_others(scene: _Points, poses: NDArray[np.float64], used: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Of the used points, which have others near by; all of them where there are too few to tell."""
-    positions = model.points.positions[used]
+    positions = scene.positions[used]
     if len(positions) <= 10 * _NEIGHBOURS:
         return np.ones(len(positions), bool)
-    rays, owner = _rays(model)
-    distance = np.full(len(model.points), np.inf)
-    np.fmin.at(distance, owner, np.linalg.norm(rays, axis=1))
+    distance = np.full(len(used), np.inf)
+    np.fmin.at(distance, scene.owner, np.linalg.norm(_rays(scene, poses), axis=1))
     gap = np.asarray(KDTree(positions).query(positions, _NEIGHBOURS + 1)[0])[:, -1]
     return gap <= MAX_GAP * distance[used]

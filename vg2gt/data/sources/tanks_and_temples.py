@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from typing_extensions import Unpack
 
 from vg2gt.data.base import DataError
-from vg2gt.data.sources.colmap_model import image_intrinsics, model_folder_of, refuse_distorted
+from vg2gt.data.sources.colmap_model import model_folder_of
 from vg2gt.data.sources.files import FileSource, HoldoutOptions
-from vg2gt.data.sources.index import SceneIndex, first_size, make_index
+from vg2gt.data.sources.index import SceneIndex, make_index
 from vg2gt.data.sources.parsing import (
     errors_name,
     expanded,
@@ -22,8 +22,11 @@ from vg2gt.data.sources.parsing import (
     read_matrix,
     read_text_lines,
 )
+from vg2gt.data.sources.posed import posed_image, size_on_disk
 from vg2gt.data.sources.scan_depth import VERSION, ScanDepth
-from vg2gt.io import read_colmap
+from vg2gt.data.sources.undistortion import is_pinhole
+from vg2gt.io import colmap_images, read_colmap
+from vg2gt.io.colmap import Camera
 from vg2gt.io.image_files import Size
 
 _LOG = "_COLMAP_SfM.log"
@@ -99,7 +102,7 @@ class TanksAndTemples(FileSource):
         if self.has_depth and not scan.is_file():
             raise DataError(f"scene {scene} has no scan {scan}: add it, or set data.depth=null")
         registered = {i: pose for i, pose in zip(color, poses, strict=True) if pose is not None}
-        intrinsics = self._intrinsics(scene, folder, color, first_size(color, scene))
+        intrinsics = self._intrinsics(scene, folder, color)
         to_world = {i: moved(to_scan, pose) for i, pose in registered.items() if i in intrinsics}
         depth = dict.fromkeys(color, scan) if self.has_depth else None
         return make_index(scene, folder, color, depth, to_world, intrinsics)
@@ -109,9 +112,7 @@ class TanksAndTemples(FileSource):
         pose, matrix = index.world_to_camera[row], index.intrinsics[row]
         return self._scan_depth.read(index.depth[row], index.name, pose, matrix, size)
 
-    def _intrinsics(
-        self, scene: str, folder: Path, color: Mapping[int, Path], size: Size
-    ) -> dict[int, NDArray[np.float64]]:
+    def _intrinsics(self, scene: str, folder: Path, color: Mapping[int, Path]) -> dict[int, NDArray[np.float64]]:
         if self.intrinsics is not None:
             return dict.fromkeys(color, pinhole(*self.intrinsics))
         model_folder = model_folder_of(folder)
@@ -122,11 +123,21 @@ class TanksAndTemples(FileSource):
             )
         with errors_name(scene):
             model = read_colmap(model_folder)
-        refuse_distorted(model, f"{model_folder} (scene {scene})")
-        records = {Path(image.name).name: image for image in model.images.values()}
+        records = {Path(image.name).name: image for image in colmap_images(model)}
         # The benchmark's images that the model lacks were not registered, and have no use.
         known = {number: (path, records[path.name]) for number, path in color.items() if path.name in records}
-        return {number: image_intrinsics(model, record, size, path) for number, (path, record) in known.items()}
+        return {number: _matrix(record.camera, path, scene) for number, (path, record) in known.items()}
+
+
+def _matrix(camera: Camera, path: Path, scene: str) -> NDArray[np.float64]:
+    if not is_pinhole(camera):
+        raise DataError(
+            f"the camera of {path} is {camera.model_name}: the benchmark's images are read as they are; undistort them "
+            "with colmap image_undistorter, and give the model that it writes"
+        )
+    expected = (camera.height, camera.width)
+    size, _ = size_on_disk(path, scene, expected, f"the model of scene {scene}")
+    return posed_image(camera, expected, size, False, None, str(path)).intrinsics
 
 
 def read_log(path: Path, scene: str) -> list[NDArray[np.float64] | None]:

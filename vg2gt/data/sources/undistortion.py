@@ -1,76 +1,77 @@
-"""From images of a lens with known distortion to those of a pinhole camera, by looking every pixel up."""
+"""From images of a lens with known distortion to those of a pinhole camera, by looking every pixel up.
+
+Camera models and the choice of the pinhole camera are pycolmap's; looking up is ours, because depth and masks are
+undistorted with the same map as colours.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch.nn.functional import grid_sample
+from torch.nn.functional import grid_sample, interpolate
 
-_LARGEST_ZOOM = 3.0
+from vg2gt.io.colmap import PIXEL_CENTER, Camera, colmap_intrinsics, require_pycolmap
+from vg2gt.io.image_files import Size
+
+_STEP, _FEWEST = 8, 256  # pixels between those whose place is computed, and how many a side; others: to 0.01 pixels
+_SMALLEST = 0.3  # share of the lens's width and height that an undistorted image must keep
+_OUTSIDE = 1.0  # pixels by which the pinhole camera's border may lie outside the lens's image
+
+
+def is_pinhole(camera: Camera) -> bool:
+    """Whether a camera has no distortion: by its model, or because its coefficients are 0."""
+    return "FISHEYE" not in camera.model_name and camera.is_undistorted() and len(camera.focal_length_idxs()) > 0
+
+
+def pinhole_camera(camera: Camera) -> Camera:
+    """The pinhole camera without blank pixels that takes a lens's place, by COLMAP's rule; a pinhole stays itself."""
+    import pycolmap  # pyright: ignore[reportMissingImports]
+
+    return camera if is_pinhole(camera) else pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
 
 
 @dataclass(frozen=True, eq=False)
 class Undistortion:
-    """A lens, and the pinhole camera that takes its place.
-
-    The distortion maps directions to pixels in closed form, so that looking pixels up needs no iteration and is exact.
+    """A lens's image looked up from a pinhole camera.
 
     Attributes:
-        lens: ``[3, 3]`` intrinsics of the lens, integer pixel centres.
-        distortion: OpenCV coefficients: ``k1 k2 k3 k4 p1 p2`` (radial polynomial in the tangent of the angle from the
-            axis, tangential), or ``k1 k2 k3 k4`` of the fisheye model (polynomial in the angle).
-        fisheye: whether the coefficients are those of the fisheye model.
-        size: ``(height, width)`` of the images, before and after.
-        intrinsics: ``[3, 3]`` of the undistorted images: the lens's own, with both focal lengths enlarged just so far
-            that no pixel falls outside the lens's image.
-
-    Raises:
-        ValueError: if no enlargement up to 3 achieves that: the coefficients cannot be those of the images' camera.
+        lens_size: ``(height, width)`` of the lens's images.
+        size: ``(height, width)`` of the undistorted ones.
+        intrinsics: ``[3, 3]`` of the undistorted ones, integer pixel centres.
+        places: ``[h, w, 2]`` float32 pixel (x, y) in the lens's image of each undistorted pixel.
     """
 
-    lens: NDArray[np.float64]
-    distortion: Mapping[str, float]
-    fisheye: bool
-    size: tuple[int, int]
-    intrinsics: NDArray[np.float64] = field(init=False)
+    lens_size: Size
+    size: Size
+    intrinsics: NDArray[np.float64]
+    places: NDArray[np.float32]
 
-    def __post_init__(self) -> None:
-        height, width = self.size
-        x, y = np.meshgrid(np.arange(width), np.arange(height), sparse=True)
-        # Where the border lies inside and nothing is folded on the way to it, everything lies inside.
-        steps = np.linspace(0, 1, 1000)
-        lines = [(x, y[:1]), (x, y[-1:]), (x[:, :1], y), (x[:, -1:], y)]
-        for corner in ((0, 0), (width - 1, 0), (0, height - 1), (width - 1, height - 1)):
-            lines.append(tuple(c + (end - c) * steps for c, end in zip(self.lens[:2, 2], corner, strict=True)))
+    @staticmethod
+    def of(camera: Camera) -> Undistortion:
+        """Computes it.
 
-        def fits(zoom: float) -> bool:
-            places = np.concatenate([self._look_up(self._zoomed(zoom), *line).reshape(-1, 2) for line in lines])
-            return bool(((places >= -0.5) & (places <= [width - 0.5, height - 0.5])).all())
-
-        low, high = 1.0, 1.0
-        while not fits(high):
-            low, high = high, high * 1.25
-            if high > _LARGEST_ZOOM:
-                raise ValueError(f"the distortion {dict(self.distortion)} takes the image's border out of the image")
-        while high - low > 1e-4:
-            middle = (low + high) / 2
-            low, high = (low, middle) if fits(middle) else (middle, high)
-        object.__setattr__(self, "intrinsics", self._zoomed(high))
-
-    @cached_property
-    def places(self) -> NDArray[np.float64]:
-        """``[h, w, 2]`` pixel (x, y) in the lens's image of each undistorted pixel."""
-        x, y = np.meshgrid(np.arange(self.size[1]), np.arange(self.size[0]), sparse=True)
-        return self._look_up(self.intrinsics, x, y)
+        Raises:
+            ValueError: if the lens has no pinhole part, or its coefficients cannot be those of the images' camera.
+        """
+        intrinsics = colmap_intrinsics(camera)  # refuses what has no pinhole part
+        target = pinhole_camera(camera)
+        size, lens_size = (target.height, target.width), (camera.height, camera.width)
+        if min(size[0] / lens_size[0], size[1] / lens_size[1]) < _SMALLEST:
+            raise ValueError(_senseless(camera))
+        intrinsics = colmap_intrinsics(target)
+        places = _places(camera, intrinsics, size)
+        inside = (places >= -0.5 - _OUTSIDE) & (places <= np.array(lens_size[::-1]) - 0.5 + _OUTSIDE)
+        if not inside.all():  # also where one is NaN
+            raise ValueError(_senseless(camera))
+        return Undistortion(lens_size, size, intrinsics, places)
 
     def color(self, pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Undistorts an image ``[h, w, 3]``, bilinearly."""
-        sampled = self._sample(torch.from_numpy(pixels).permute(2, 0, 1).float(), "bilinear")  # [3, h, w]
+        """Undistorts an image ``[h, w, C]``, bilinearly."""
+        sampled = self._sample(torch.from_numpy(pixels).permute(2, 0, 1).float(), "bilinear")  # [C, h, w]
         return (sampled + 0.5).clamp(0, 255).byte().permute(1, 2, 0).contiguous().numpy()
 
     def depth(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -78,41 +79,46 @@ class Undistortion:
         return self._sample(torch.from_numpy(depth)[None], "nearest")[0].numpy()
 
     def _sample(self, image: torch.Tensor, mode: str) -> torch.Tensor:
-        grid = (self.places + 0.5) * (2 / np.array(self.size[::-1])) - 1
-        grid = torch.from_numpy(grid).float()[None]  # [1, h, w, 2]
-        return grid_sample(image[None], grid, mode, padding_mode="border", align_corners=False)[0]
-
-    def _zoomed(self, zoom: float) -> NDArray[np.float64]:
-        return self.lens * np.array([[zoom, 1, 1], [1, zoom, 1], [1, 1, 1]])
-
-    def _look_up(self, pinhole: NDArray[np.float64], x: NDArray, y: NDArray) -> NDArray[np.float64]:
-        pixels = np.stack(np.broadcast_arrays(x, y), -1)
-        directions = (pixels - pinhole[[0, 1], [2, 2]]) / pinhole[[0, 1], [0, 1]]
-        with np.errstate(all="ignore"):  # senseless coefficients overflow; the result does not fit
-            distorted = _fisheye(directions, self.distortion) if self.fisheye else _radial(directions, self.distortion)
-            return distorted * self.lens[[0, 1], [0, 1]] + self.lens[[0, 1], [2, 2]]
+        grid = (torch.from_numpy(self.places) + 0.5) * (2 / torch.tensor(self.lens_size[::-1])) - 1
+        return grid_sample(image[None], grid[None], mode, padding_mode="border", align_corners=False)[0]
 
 
-def _radial(directions: NDArray[np.float64], k: Mapping[str, float]) -> NDArray[np.float64]:
-    """Directions ``[..., 2]`` (x/z, y/z) as a lens with radial and tangential distortion shows them."""
-    square = (directions**2).sum(-1, keepdims=True)
-    p1, p2 = k.get("p1", 0.0), k.get("p2", 0.0)
-    x, y = directions[..., :1], directions[..., 1:]
-    tangential_x = 2 * p1 * x * y + p2 * (square + 2 * x**2)
-    tangential_y = p1 * (square + 2 * y**2) + 2 * p2 * x * y
-    return directions * _series(k, square) + np.concatenate((tangential_x, tangential_y), -1)
+@lru_cache(maxsize=4)
+def undistortion_of(lens: str) -> Undistortion:
+    """The undistortion of a lens by its text, see :func:`lens_text`; those last used are kept.
+
+    Raises:
+        ValueError: as :meth:`Undistortion.of`.
+    """
+    require_pycolmap("undistorting images")
+    import pycolmap  # pyright: ignore[reportMissingImports]
+
+    model, width, height, *params = lens.split()
+    camera = pycolmap.Camera(model=model, width=int(width), height=int(height), params=[float(p) for p in params])
+    return Undistortion.of(camera)
 
 
-def _fisheye(directions: NDArray[np.float64], k: Mapping[str, float]) -> NDArray[np.float64]:
-    """Directions ``[..., 2]`` (x/z, y/z) as an equidistant fisheye lens shows them."""
-    radius = np.sqrt((directions**2).sum(-1, keepdims=True))
-    angle = np.arctan(radius)
-    return directions * _series(k, angle**2) * np.where(radius > 1e-9, angle / np.maximum(radius, 1e-9), 1)
+def lens_text(camera: Camera, size: Size) -> str:
+    """A camera, resized to images of ``(height, width)``, as text: the model, width, height, parameters."""
+    resized = type(camera)(camera.todict())
+    resized.rescale(size[1], size[0])
+    params = " ".join(repr(float(value)) for value in resized.params)
+    return f"{resized.model_name} {size[1]} {size[0]} {params}"
 
 
-def _series(k: Mapping[str, float], square: NDArray[np.float64]) -> NDArray[np.float64]:
-    """1 + k1 s + k2 s^2 + k3 s^3 + k4 s^4; NaN beyond where the lens would fold the image over itself."""
-    coefficients = [k.get(f"k{i}", 0.0) for i in (1, 2, 3, 4)]
-    slope = 1 + sum((2 * i + 3) * value * square ** (i + 1) for i, value in enumerate(coefficients))
-    series = 1 + sum(value * square ** (i + 1) for i, value in enumerate(coefficients))
-    return np.where(slope > 0, series, np.nan)
+def _places(camera: Camera, intrinsics: NDArray[np.float64], size: Size) -> NDArray[np.float32]:
+    rows, columns = (min(side, max(-(-side // _STEP), _FEWEST)) for side in size)
+    y, x = np.meshgrid(np.linspace(0, size[0] - 1, rows), np.linspace(0, size[1] - 1, columns), indexing="ij")
+    rays = np.stack((x, y, np.ones_like(x)), -1).reshape(-1, 3) @ np.linalg.inv(intrinsics).T
+    with np.errstate(all="ignore"):
+        coarse = camera.img_from_cam(np.ascontiguousarray(rays)) - PIXEL_CENTER
+    coarse = torch.from_numpy(coarse.reshape(1, rows, columns, 2)).permute(0, 3, 1, 2)
+    fine = interpolate(coarse, size, mode="bilinear", align_corners=True)
+    return fine[0].permute(1, 2, 0).float().contiguous().numpy()
+
+
+def _senseless(camera: Camera) -> str:
+    return (
+        f"the distortion of a {camera.model_name} camera ({camera.params_info}: {camera.params_to_string()}) takes the "
+        "image's border out of the image; it cannot be that of these images"
+    )

@@ -1,0 +1,160 @@
+"""Sets of photographs prepared for comparison: cameras found once, every fourth view left out.
+
+What is left over is written as a COLMAP scene of the working size (``images/``, ``sparse/0``), which every program is
+given, so that all start from the same pixels, cameras and points. Points that fewer than two of its views saw are left
+out: the views that are scored have no part in it.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from vg2gt.data.sources.colmap_model import model_folder_of
+from vg2gt.geometry.cameras import project
+from vg2gt.io import colmap_from_views, read_colmap, write_colmap
+from vg2gt.io.images import write_png
+from vg2gt.io.json_checks import load_json
+from vg2gt.reconstruction.given_cameras import LAYOUTS, given_pictures
+from vg2gt.reconstruction.inputs import load_views, working_size
+from vg2gt.reconstruction.monitor import Monitor
+from vg2gt.reconstruction.pictures import find_pictures
+from vg2gt.reconstruction.sfm import find_cameras
+from vg2gt.types import Cameras
+
+if TYPE_CHECKING:
+    from pycolmap import Reconstruction  # pyright: ignore[reportMissingImports]
+
+EVERY = 4  # one view of so many is left out, the one in the middle
+FEWEST = 2  # views that must have seen a point
+
+
+@dataclass(frozen=True)
+class PhotoSet:
+    """Photographs with cameras at the working size.
+
+    Attributes:
+        name: of the set.
+        folder: COLMAP scene of the views that programs are given.
+        images: ``[V, 3, H, W]`` of all views, in [0, 1].
+        cameras: of all views ``[1, V]``, in the scene's frame.
+        context: indices of the views in ``folder``.
+        held_out: indices of the others.
+        points: how many sparse points ``folder`` has.
+    """
+
+    name: str
+    folder: Path
+    images: Tensor
+    cameras: Cameras
+    context: tuple[int, ...]
+    held_out: tuple[int, ...]
+    points: int
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width in pixels."""
+        return self.cameras.size
+
+    @property
+    def given(self) -> list[str]:
+        """Names of the views in ``folder``, without ending."""
+        return [view_name(index) for index in self.context]
+
+
+def view_name(index: int) -> str:
+    """How the files of a view are called."""
+    return f"{index:06d}"
+
+
+def prepare(name: str, photos: Path, out: Path, size: int, patch: int, poses: str) -> PhotoSet:
+    """Finds the cameras of a folder of photographs, once, and writes the views that programs are given.
+
+    Args:
+        name: of the set.
+        photos: the folder.
+        out: where cameras and views are kept: ``sfm/`` and ``SIZE/``.
+        size: longer side in pixels.
+        patch: of which the sides are multiples.
+        poses: ``sfm`` or ``given``: those that lie beside the photographs.
+
+    Raises:
+        ValueError: if there are no cameras, or too few views.
+    """
+    if poses == "given":
+        pictures, model = given_pictures(photos), model_folder_of(photos)
+        if pictures is None:
+            raise ValueError(f"{photos} has no cameras beside its images: expected {LAYOUTS}; or take --poses sfm")
+        titles: dict[str, str] = {}
+    else:
+        pictures = find_cameras(find_pictures(photos), out / "sfm", Monitor())
+        model, titles = model_folder_of(out / "sfm"), load_json(out / "sfm" / "sfm.json")["images"]
+    views = load_views(pictures, working_size([p.size for p in pictures], patch, "cpu", size), Monitor())
+    held_out = tuple(i for i in range(len(pictures)) if i % EVERY == EVERY // 2)
+    context = tuple(i for i in range(len(pictures)) if i not in held_out)
+    if len(context) < FEWEST or not held_out:
+        raise ValueError(f"{photos}: {len(pictures)} photographs have cameras; {EVERY} are needed at least")
+    assert views.hints is not None
+    assert views.hints.cameras is not None
+    folder = out / str(size)
+    shutil.rmtree(folder, ignore_errors=True)
+    for index in context:
+        write_png(folder / "images" / f"{view_name(index)}.png", views.images[index])
+    names = [picture.name for picture in pictures]
+    points = _points(model, titles, [names[index] for index in context])
+    written = _scene(views.hints.cameras.select(torch.tensor(context)), context, points)
+    write_colmap(folder / "sparse" / "0", written)
+    return PhotoSet(name, folder, views.images, views.hints.cameras, context, held_out, written.num_points3D())
+
+
+@dataclass(frozen=True)
+class SparsePoints:
+    """Points of a model that two of the given views saw at least.
+
+    Attributes:
+        positions: ``[N, 3]``.
+        colors: ``[N, 3]`` uint8.
+        sees: ``[views, N]`` bool.
+    """
+
+    positions: NDArray[np.float64]
+    colors: NDArray[np.uint8]
+    sees: NDArray[np.bool_]
+
+
+def _points(folder: Path | None, titles: dict[str, str], names: Sequence[str]) -> SparsePoints:
+    """The points that views of these names saw; ``titles`` are the names of the model's files where they differ."""
+    if folder is None:
+        return SparsePoints(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros((len(names), 0), bool))
+    model = read_colmap(folder)
+    view_of = {
+        image.image_id: names.index(title)
+        for image in model.images.values()
+        if (title := titles.get(image.name, Path(image.name).stem)) in names
+    }
+    points = list(model.points3D.values())
+    sees = np.zeros((len(names), len(points)), bool)
+    for column, point in enumerate(points):
+        rows = [view_of[element.image_id] for element in point.track.elements if element.image_id in view_of]
+        sees[rows, column] = True
+    kept = np.flatnonzero(sees.sum(0) >= FEWEST)
+    positions = np.array([points[index].xyz for index in kept]).reshape(-1, 3)
+    colors = np.array([points[index].color for index in kept], np.uint8).reshape(-1, 3)
+    return SparsePoints(positions, colors, sees[:, kept])
+
+
+def _scene(cameras: Cameras, context: Sequence[int], points: SparsePoints) -> Reconstruction:
+    """The given views' cameras at the working size, with the points where they see them."""
+    view, point = np.nonzero(points.sees)
+    seen = torch.from_numpy(points.positions).float().expand(1, len(context), -1, -1)
+    pixels = project(seen, cameras)[0][0].double().numpy()[view, point]
+    names = [f"{view_name(index)}.png" for index in context]
+    return colmap_from_views(cameras, names, points.positions, points.colors, (point, view, pixels))

@@ -1,0 +1,275 @@
+"""Photographs held out, feed-forward and refined: ``python benchmarks/photos.py FOLDER [FOLDER ...]``.
+
+Cameras are found by structure from motion once and kept in ``--work``. Every fourth view is left out: no program sees
+it, nor points that only it saw. Scored are the feed-forward scene and scenes refined from it up to ``--budgets``
+core-seconds: of one thread, structure from motion not counted, the feed-forward pass counted. ``--model`` and
+``--refine`` change settings, so that they can be compared, such as ``--model fine.min_footprint=6.2`` or
+``--refine rates.cameras=0``. ``--opensplat BINARY`` trains OpenSplat on the same images, cameras and points for the
+same core-seconds. Rows of today's file are replaced where set, size, program, settings and budget agree; others of the
+newest file are kept. Writes JSON and a table to ``benchmarks/results`` and a picture of each set to ``--work``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+import torch
+from common import MEGABYTE, PeakMemory, machine, parser, write_results
+from hydra.utils import instantiate
+from opensplat import BACKGROUND, train
+from photo_sets import PhotoSet, prepare
+from torch import Tensor
+
+from vg2gt.config import compose
+from vg2gt.evaluation.tables import METRICS, columns, markdown_table, number
+from vg2gt.geometry.alignment import align_cameras
+from vg2gt.io import read_gaussian_ply
+from vg2gt.io.files import write_text
+from vg2gt.io.images import grid, write_png
+from vg2gt.metrics import LPIPS, WeightsNotFoundError, load_lpips, psnr, ssim
+from vg2gt.reconstruction.pipeline import reconstruct_with
+from vg2gt.reconstruction.refined import refine_scene
+from vg2gt.reconstruction.scene import Scene
+from vg2gt.refinement import RefineOptions
+from vg2gt.rendering import Renderer
+from vg2gt.runs.load import LoadedModel, load_model
+from vg2gt.types import Cameras, Gaussians
+
+OURS, PEER = "VG²GT", "OpenSplat"
+FEED_FORWARD = "feed-forward"
+PICTURED = 4  # held-out views of a picture, evenly spread
+KEY = ("set", "size", "program", "settings", "budget")
+Row = dict[str, Any]
+
+
+@dataclass
+class Scores:
+    """Scores scenes of one set.
+
+    Attributes:
+        photos: the set.
+        lpips: None where its weights are missing.
+        panels: of the picture: what was rendered of some held-out views, by label.
+    """
+
+    photos: PhotoSet
+    lpips: LPIPS | None
+    panels: dict[str, list[Tensor]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.panels["photograph"] = [self.photos.images[view] for view in self._pictured()]
+
+    @torch.no_grad()
+    def __call__(self, label: str, gaussians: Gaussians, cameras: Cameras, renderer: Renderer) -> Row:
+        """Figures of the given views and of those held out, whose cameras are brought into the scene's frame.
+
+        Args:
+            label: of the panels.
+            gaussians: the scene.
+            cameras: of the given views, in the scene's frame.
+            renderer: how it is rendered.
+        """
+        photos, plain = self.photos, replace(renderer, geometry=False)
+        similarity = align_cameras(photos.cameras.select(torch.tensor(photos.context)), cameras)
+        held_out = similarity.apply_cameras(photos.cameras.select(torch.tensor(photos.held_out)))
+        row: Row = {"gaussians": len(gaussians)}
+        for suffix, views, where in (("_given", photos.context, cameras), ("", photos.held_out, held_out)):
+            shown = [plain(gaussians, where.select(slice(k, k + 1))).color[0, 0].clamp(0, 1) for k in range(len(views))]
+            rendered, truth = torch.stack(shown), photos.images[list(views)]
+            row[f"psnr{suffix}"] = float(psnr(rendered, truth).mean())
+            row[f"ssim{suffix}"] = float(ssim(rendered, truth).mean())
+            if self.lpips is not None and not suffix:
+                row["lpips"] = float(self.lpips(rendered, truth).mean())
+            if not suffix:
+                self.panels[label] = [rendered[views.index(view)] for view in self._pictured()]
+        return row
+
+    def _pictured(self) -> list[int]:
+        held_out = self.photos.held_out
+        count = min(PICTURED, len(held_out))
+        return [held_out[i * (len(held_out) - 1) // max(count - 1, 1)] for i in range(count)]
+
+    def write_picture(self, path: Path) -> Path:
+        """One line for each of some held-out views: the photograph, then what was scored, in that order."""
+        return write_png(path, grid(list(zip(*self.panels.values(), strict=True))))
+
+
+def given_cameras(scene: Scene, photos: PhotoSet) -> Cameras:
+    """The scene's cameras in the order of the views that it was given."""
+    return scene.cameras.select(torch.tensor([scene.names.index(name) for name in photos.given]))
+
+
+def ours(loaded: LoadedModel, scores: Scores, refinement: RefineOptions, budgets: Sequence[float]) -> list[Row]:
+    """The feed-forward scene and those refined from it, each from the start."""
+    photos, memory = scores.photos, PeakMemory(torch.device("cpu"))
+    began = time.process_time()
+    scene = reconstruct_with(loaded.model, photos.folder, size=photos.size, renderer=loaded.renderer)
+    taken = time.process_time() - began
+
+    def scored(label: str, scene: Scene, seconds: float, steps: int) -> Row:
+        used = {"core_seconds": seconds, "peak_memory_mb": memory.peak / MEGABYTE, "steps": steps}
+        return {**used, **scores(label, scene.gaussians, given_cameras(scene, photos), scene.renderer)}
+
+    rows = [{"budget": FEED_FORWARD, **scored(FEED_FORWARD, scene, taken, 0)}]
+    for budget in budgets:
+        if budget <= taken:
+            print(f"{photos.name}: {taken:.0f} core-seconds are over before refinement begins, {budget:g} left out")
+            continue
+        memory.restart()
+        began = time.process_time()
+        options = replace(refinement, steps=None, seconds=budget - taken)
+        refined = refine_scene(scene, options, clock=time.process_time)
+        seconds = taken + time.process_time() - began
+        assert refined.refined is not None
+        rows.append({"budget": budget, **scored(_budget(budget), refined, seconds, refined.refined.steps)})
+    return rows
+
+
+def peer(binary: Path, scores: Scores, extra: Sequence[str], budgets: Sequence[float]) -> list[Row]:
+    """OpenSplat's scenes, rendered as it renders them (agrees with its own pictures to 53 dB)."""
+    photos, rows, pace = scores.photos, [], None
+    if not photos.points:
+        raise ValueError(f"{PEER} starts from sparse points, and {photos.folder} has none: take --poses sfm")
+    renderer = Renderer(mode="rasterized", lowpass=0.3, alpha_max=0.999, geometry=False)
+    cameras = photos.cameras.select(torch.tensor(photos.context))
+    for budget in sorted(budgets):
+        target = photos.folder.parent / f"{PEER}-{photos.folder.name}-{budget:g}" / "splat.ply"
+        run = train(binary, photos.folder, target, budget, extra, pace)
+        pace = run.core_seconds / run.steps
+        used = {"core_seconds": run.core_seconds, "peak_memory_mb": run.peak_memory / MEGABYTE, "steps": run.steps}
+        scene = replace(read_gaussian_ply(run.scene), background=torch.tensor([BACKGROUND]))
+        found = scores(f"{PEER}, {_budget(budget)}", scene, cameras, renderer)
+        rows.append({"budget": budget, **used, **found})
+    return rows
+
+
+def warm_up(loaded: LoadedModel, photos: PhotoSet, refinement: RefineOptions) -> None:
+    """Compiles and loads what is compiled and loaded once, on two small views."""
+    patch = loaded.model.backend.patch_size
+    size = (max(2, photos.size[0] // patch // 4) * patch, max(2, photos.size[1] // patch // 4) * patch)
+    scene = reconstruct_with(loaded.model, photos.folder, size=size, max_images=2, renderer=loaded.renderer)
+    refine_scene(scene, replace(refinement, steps=2, seconds=None))
+
+
+def merged(folder: Path, rows: Sequence[Row]) -> list[Row]:
+    """The newest file's rows with these in the place of those that have the same key."""
+    newest = max(folder.glob("*-photos.json"), default=None)
+    old = [] if newest is None else json.loads(newest.read_text())["rows"]
+    by_key = {tuple(row[name] for name in KEY): row for row in [*old, *rows]}
+    return sorted(by_key.values(), key=_order)
+
+
+def _order(row: Row) -> tuple[Any, ...]:
+    budget = 0.0 if row["budget"] == FEED_FORWARD else float(row["budget"])
+    return row["size"], row["set"], row["program"] != OURS, row["settings"], budget
+
+
+def tables(rows: Sequence[Row]) -> str:
+    """Markdown: held-out PSNR and SSIM by size and budget, then all figures."""
+    parts = ["# Held-out photographs", "PSNR in dB and SSIM of every fourth view, by core-seconds of one thread."]
+    for size in sorted({row["size"] for row in rows}):
+        some = [row for row in rows if row["size"] == size]
+        budgets = list(dict.fromkeys(row["budget"] for row in sorted(some, key=lambda row: _order(row)[-1])))
+        lines: dict[tuple[str, ...], dict[Any, Row]] = {}
+        for row in some:
+            lines.setdefault((row["set"], row["program"], row["settings"]), {})[row["budget"]] = row
+        cells = [[*key, *(_short(of.get(budget)) for budget in budgets)] for key, of in lines.items()]
+        head = ("set", "program", "settings", *map(_budget, budgets))
+        parts += [f"## Longer side {size}", markdown_table(head, cells, 3)]
+    shown = columns("psnr", "ssim", "lpips", "gaussians", decimals={"psnr": 2})
+    shown |= {
+        f"{name}_given": replace(METRICS[name], label=f"{METRICS[name].label}, given") for name in ("psnr", "ssim")
+    }
+    head = (*KEY, *(metric.label for metric in shown.values()), "steps", "core-s", "MB")
+    cells = [
+        [
+            *(str(row[name]) for name in KEY[:-1]),
+            _budget(row["budget"]),
+            *(number(row.get(name), m.decimals) for name, m in shown.items()),
+        ]
+        + [number(row[name], 0) for name in ("steps", "core_seconds", "peak_memory_mb")]
+        for row in rows
+    ]
+    return "\n\n".join([*parts, "## All figures", markdown_table(head, cells, len(KEY))]) + "\n"
+
+
+def _budget(budget: float | str) -> str:
+    return budget if isinstance(budget, str) else f"{budget:g} s"
+
+
+def _short(row: Row | None) -> str:
+    return "" if row is None else f"{row['psnr']:.2f} {row['ssim']:.3f}"
+
+
+def arguments() -> argparse.Namespace:
+    """The command line."""
+    options = parser(__doc__, threads=1)
+    options.add_argument("folders", nargs="+", metavar="FOLDER", help="of photographs; NAME=FOLDER names the set")
+    options.add_argument("--size", type=int, default=280, help="longer side in pixels")
+    options.add_argument("--budgets", type=float, nargs="*", default=[30.0, 100.0, 300.0], metavar="CORE_SECONDS")
+    options.add_argument("--poses", choices=("sfm", "given"), default="sfm")
+    options.add_argument("--ckpt", help="default: the weights in the package")
+    options.add_argument("--model", nargs="+", default=[], metavar="KEY=VALUE", help="of configs/model")
+    options.add_argument("--refine", nargs="+", default=[], metavar="KEY=VALUE", help="of configs/refine")
+    options.add_argument("--opensplat", type=Path, metavar="BINARY", help="run it as well")
+    options.add_argument("--peer", nargs="+", default=[], metavar="KEY=VALUE", help="options of OpenSplat")
+    options.add_argument("--only-peer", action="store_true", help="leave ours out")
+    options.add_argument("--work", type=Path, default=Path("outputs/photos"), help="cameras, views, pictures")
+    return options.parse_args()
+
+
+def main() -> None:
+    """Measures, prints and writes after every set."""
+    given = arguments()
+    torch.set_num_threads(given.threads)
+    changes = [f"refine.{change}" for change in given.refine]
+    refinement: RefineOptions = instantiate(compose(None, "+refine=photographs", *changes).refine)
+    loaded = load_model(given.ckpt, options=[f"model.{change}" for change in given.model], device="cpu")
+    lpips = lpips_or_none()
+    for item in given.folders:
+        name, _, folder = item.rpartition("=")
+        folder = Path(folder)
+        name = name or folder.resolve().name
+        photos = prepare(name, folder, given.work / name, given.size, loaded.model.backend.patch_size, given.poses)
+        scores = Scores(photos, lpips)
+        common = {"set": name, "size": given.size, "views": [len(photos.context), len(photos.held_out)]}
+        common |= {"poses": given.poses, "date": date.today().isoformat(), "machine": machine()}
+        rows: list[Row] = []
+        if not given.only_peer:
+            warm_up(loaded, photos, refinement)
+            settings = _settings([*(f"model.{change}" for change in given.model), *changes])
+            found = ours(loaded, scores, refinement, given.budgets)
+            rows += [{**common, "program": OURS, "settings": settings, **row} for row in found]
+        if given.opensplat:
+            found = peer(given.opensplat, scores, [f"--{change}" for change in given.peer], given.budgets)
+            rows += [{**common, "program": PEER, "settings": _settings(given.peer), **row} for row in found]
+        for row in rows:
+            spent = f"{row['core_seconds']:.0f} core-seconds, {row['gaussians']} Gaussians"
+            print(f"{name}, {row['program']}, {_budget(row['budget'])}: {_short(row)}, {spent}", flush=True)
+        print(scores.write_picture(given.work / f"{name}-{given.size}.png"))
+        rows = merged(given.out, rows)
+        path = write_results(given.out, "photos", {"threads": given.threads, "rows": rows})
+        write_text(path.with_suffix(".md"), tables(rows))
+
+
+def lpips_or_none() -> LPIPS | None:
+    """LPIPS, where there are weights."""
+    try:
+        return load_lpips()
+    except WeightsNotFoundError:
+        return None
+
+
+def _settings(changes: Sequence[str]) -> str:
+    return " ".join(sorted(changes)) or "default"
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""How shipped weights are made; run from a checkout, not part of the installed package."""

@@ -1,0 +1,68 @@
+"""Trains the plane sweep: ``python -m recipes.sweep [key=value ...]``; options in ``train.yaml``."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+# Convolutions are compiled per shape; the default of 1024 kept kernels is less than one step of each shape needs.
+os.environ.setdefault("ONEDNN_PRIMITIVE_CACHE_CAPACITY", "20000")
+
+import hydra
+import lightning
+import torch
+from lightning.pytorch.callbacks import ModelCheckpoint, RichProgressBar
+from lightning.pytorch.loggers import CSVLogger
+from lightning.pytorch.strategies import DDPStrategy
+from omegaconf import DictConfig
+from torch.utils.data import DataLoader, Subset
+
+from recipes.sweep.module import SweepTraining
+from recipes.sweep.samples import TrainingSamples
+from recipes.sweep.scenes import make_scenes
+from recipes.sweep.weights import begin_with, newest_checkpoint, start_step, write_weights
+
+
+@hydra.main(config_path=".", config_name="train", version_base="1.3")
+def main(config: DictConfig) -> None:
+    """Renders what is missing of the scenes, trains or goes on training, and writes the weights."""
+    torch.set_num_threads(config.threads)
+    lightning.seed_everything(config.seed)
+    out = Path(config.out)
+    out.mkdir(parents=True, exist_ok=True)
+    files = []
+    for number, path in enumerate(make_scenes(config.scenes.folder, config.scenes.count, config.scenes.first_seed), 1):
+        files.append(path)
+        if number % 50 == 0 or number == config.scenes.count:
+            print(f"scenes: {number} of {config.scenes.count}", flush=True)
+    checkpoint = newest_checkpoint(out) if config.resume == "auto" else config.resume
+    training: SweepTraining = hydra.utils.instantiate(config.training)
+    first = start_step(checkpoint) if checkpoint else 0
+    per_step = config.processes
+    every = TrainingSamples(files, training.steps * per_step, config.seed)
+    samples = Subset(every, range(first * per_step, len(every)))
+    if config.begin and not checkpoint:
+        begin_with(training, Path(config.begin))
+    if checkpoint:
+        print(f"going on with {checkpoint} at step {first} of {training.steps}", flush=True)
+    keep = ModelCheckpoint(
+        out, "step-{step:06d}", every_n_train_steps=config.save_every, save_top_k=-1, auto_insert_metric_name=False
+    )
+    trainer = lightning.Trainer(
+        accelerator="cpu",
+        devices=config.processes,
+        strategy="auto" if config.processes == 1 else DDPStrategy(gradient_as_bucket_view=True),
+        precision="bf16-mixed",
+        max_steps=training.steps,
+        callbacks=[keep, RichProgressBar()],
+        logger=CSVLogger(out, name="", version=""),
+        log_every_n_steps=50,
+        enable_model_summary=False,
+    )
+    trainer.fit(training, DataLoader(samples, batch_size=None), ckpt_path=checkpoint, weights_only=True)
+    if trainer.is_global_zero:
+        print(write_weights(training, out / "sweep.safetensors", config))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,89 @@
+"""What the network is trained for: log-depth at every stage, the planes' cross-entropy, edges and uncertainty."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from backends.sweep.network import Sweep, SweepEncoding
+from backends.sweep.volume import from_inverse
+from recipes.sweep.samples import Sample
+
+_CLAMP = 2.0  # log-depth errors beyond it do not count more
+WEIGHTS = {"depth": 2.0, "uncertainty": 0.15, "gradient": 1.0, "planes": 0.4, "position": 2.0, "swept": 1.0}
+
+
+def objective(
+    encoding: SweepEncoding, depth: Tensor, log_scale: Tensor, sample: Sample
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """The weighted sum and its terms.
+
+    Args:
+        encoding: of the sample's images.
+        depth: ``[V, H, W]`` decoded.
+        log_scale: ``[V, H, W]`` of its relative error.
+        sample: the truth and the planes' range.
+    """
+    valid = (sample.depth > 0).float()
+    truth = torch.where(sample.depth > 0, sample.depth, 1.0)
+    error = depth.log() - truth.log()
+    absolute = error.abs().clamp_max(_CLAMP)
+    log_scale = log_scale.clamp(-6, 1)
+    terms = {
+        "depth": _mean(absolute, valid),
+        "uncertainty": _mean(absolute * torch.exp(-log_scale) + log_scale, valid),
+        "gradient": sum((_gradient(error[:, ::k, ::k], valid[:, ::k, ::k]) for k in (1, 2, 4)), torch.zeros(())),
+    }
+    planes, positions = [], []
+    for sweep, cell in ((encoding.first, 4), (encoding.second, 2)):
+        inverse, known = cell_inverse(sample.depth, cell)
+        t = from_inverse(inverse, sample.depth_range)
+        planes.append(_cross_entropy(sweep, t, known))
+        positions.append(_mean((sweep.t - t).abs().clamp_max(0.3), known))
+        if cell == 4:
+            positions.append(_mean((encoding.refined - t).abs().clamp_max(0.3), known))
+        else:
+            positions.append(_mean((encoding.center - t).abs().clamp_max(0.3), known))
+            terms["swept"] = _mean((encoding.swept[:, :1] + inverse.log()).abs().clamp_max(_CLAMP), known)
+    terms["planes"] = torch.stack(planes).sum()
+    terms["position"] = torch.stack(positions).sum()
+    return torch.stack([WEIGHTS[name] * term for name, term in terms.items()]).sum(), terms
+
+
+def cell_inverse(depth: Tensor, cell: int) -> tuple[Tensor, Tensor]:
+    """Inverse depth at the middle of cells of ``cell`` pixels, ``[V, 1, h, w]``, and 1 where all of it is known.
+
+    The middle lies between pixels; its inverse depth is the mean of the four around it, exact on planes.
+    """
+    at = (cell // 2 - 1, cell // 2)
+    around = torch.stack([depth[:, i::cell, j::cell] for i in at for j in at], 1)
+    known = (around > 0).all(1, keepdim=True)
+    inverse = around.clamp_min(1e-3).reciprocal().mean(1, keepdim=True)
+    return torch.where(known, inverse, 1.0), known.float()
+
+
+def _mean(values: Tensor, weights: Tensor) -> Tensor:
+    return (values * weights).sum() / weights.sum().clamp_min(1)
+
+
+def _gradient(error: Tensor, valid: Tensor) -> Tensor:
+    """Mean absolute difference of the errors of neighbours, zero where the shape is right whatever the scale."""
+    down = (error[:, 1:] - error[:, :-1]).abs().clamp_max(1) * valid[:, 1:] * valid[:, :-1]
+    right = (error[:, :, 1:] - error[:, :, :-1]).abs().clamp_max(1) * valid[:, :, 1:] * valid[:, :, :-1]
+    return down.mean() + right.mean()
+
+
+def _cross_entropy(sweep: Sweep, t: Tensor, known: Tensor) -> Tensor:
+    """Cross-entropy of the planes, the truth ``t [V, 1, h, w]`` shared linearly between the two around it."""
+    position = sweep.position.expand(len(t), -1, *t.shape[-2:]) if sweep.position.shape[0] == 1 else sweep.position
+    count = position.shape[1]
+    spacing = position[:, 1:2] - position[:, :1]
+    place = (t - position[:, :1]) / spacing
+    known = known * (place >= 0) * (place <= count - 1)
+    low = place.floor().clamp(0, count - 2)
+    share = (place - low).clamp(0, 1)
+    likely = F.log_softmax(sweep.logits, 1)
+    low = low.long()
+    entropy = -(likely.gather(1, low) * (1 - share) + likely.gather(1, low + 1) * share)
+    return _mean(entropy, known)

@@ -1,0 +1,187 @@
+"""Training samples: a few overlapping views of one scene, cropped, zoomed, recoloured, with slightly wrong poses."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.random import Generator
+from torch import Tensor
+from torch.nn import functional as F
+from torch.utils.data import Dataset
+
+from recipes.sweep.scenes import SceneFrames, read_scene
+from vg2gt.geometry.cameras import crop_intrinsics, resize_intrinsics, rigid_motions
+
+_SIZES = ((80, 160), (112, 224), (112, 144))
+_SIZE_SHARES = (0.75, 0.15, 0.1)
+_VIEWS = 4
+_PLANES = (32, 48)  # few sizes: CPUs compile their convolutions for each
+_SOURCES, _SOURCE_SHARES = (2, 3), (0.7, 0.3)
+_POSE_SHARE, _TURN, _SHIFT = 0.5, 0.0015, 0.002  # share of samples with pose noise; rad; median depths
+_LEAST_PIXELS = 5000  # with depth; samples with fewer are drawn again
+_GREY_SHARE = 0.2
+
+
+class Sample(NamedTuple):
+    """V views of one scene and the sweep they are to be matched with.
+
+    Attributes:
+        images: ``[V, 3, H, W]`` in [0, 1].
+        depth: ``[V, H, W]``, 0 = unknown.
+        world_to_camera: ``[V, 4, 4]``, as exact as poses are in practice.
+        intrinsics: ``[V, 3, 3]`` in pixels.
+        depth_range: ``[2]`` near and far of the planes.
+        planes: their number.
+        sources: number of sources per view.
+    """
+
+    images: Tensor
+    depth: Tensor
+    world_to_camera: Tensor
+    intrinsics: Tensor
+    depth_range: Tensor
+    planes: int
+    sources: int
+
+
+class TrainingSamples(Dataset[Sample]):
+    """Sample n depends on ``(seed, n)`` only, so a resumed training goes on with what it would have seen.
+
+    Args:
+        files: cached scenes.
+        count: number of samples.
+        seed: of all draws.
+    """
+
+    def __init__(self, files: Sequence[Path], count: int, seed: int) -> None:
+        self.files, self.count, self.seed = list(files), count, seed
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, index: int) -> Sample:
+        rng = np.random.default_rng((self.seed, index))
+        while True:
+            scene = read_scene(self.files[rng.integers(len(self.files))])
+            views = _crop(_choose_views(scene, rng), rng)
+            valid = views.depth[views.depth > 0]
+            if len(valid) >= _LEAST_PIXELS:
+                return _finish(views, valid, rng)
+
+
+class _Crop(NamedTuple):
+    images: Tensor  # [V, 3, H, W] in [0, 1]
+    depth: Tensor
+    world_to_camera: Tensor
+    intrinsics: Tensor  # [V, 3, 3]
+
+
+def _choose_views(scene: SceneFrames, rng: Generator) -> _Crop:
+    """Views within a stretch of the path that turns by at most 0.3 to 1.1 fields of view, so that they overlap."""
+    frames = len(scene.images)
+    count = _VIEWS
+    field = 2 * math.atan(0.5 * scene.images.shape[2] / float(scene.intrinsics[0, 0]))
+    most = field * rng.uniform(0.3, 1.1)
+    first = int(rng.integers(0, frames - count + 1))
+    rotations = scene.world_to_camera[:, :3, :3]
+    end = first + count
+    while end < frames and _angle(rotations[first], rotations[end]) < most:
+        end += 1
+    rows = np.sort(first + rng.permutation(end - first)[:count])
+    images = scene.images[rows].permute(0, 3, 1, 2).float() / 255
+    intrinsics = scene.intrinsics.expand(count, 3, 3)
+    return _Crop(images, scene.depth[rows].float(), scene.world_to_camera[rows], intrinsics)
+
+
+def _angle(first: Tensor, second: Tensor) -> float:
+    cosine = (float((first * second).sum()) - 1) / 2
+    return math.acos(max(-1.0, min(1.0, cosine)))
+
+
+def _crop(views: _Crop, rng: Generator) -> _Crop:
+    """One random window of all views, resized to one of the training sizes; half of them mirrored."""
+    height, width = views.depth.shape[-2:]
+    target = _SIZES[rng.choice(len(_SIZES), p=_SIZE_SHARES)]
+    most = min(height / target[0], width / target[1])
+    zoom = math.exp(rng.uniform(math.log(0.8), math.log(most)))
+    rows, columns = int(target[0] * zoom), int(target[1] * zoom)
+    top, left = int(rng.integers(0, height - rows + 1)), int(rng.integers(0, width - columns + 1))
+    window = (..., slice(top, top + rows), slice(left, left + columns))
+    images = F.interpolate(views.images[window], target, mode="bilinear", align_corners=False, antialias=True)
+    depth = F.interpolate(views.depth[window][:, None], target, mode="nearest-exact")[:, 0]
+    intrinsics = crop_intrinsics(views.intrinsics, left, top)
+    intrinsics = resize_intrinsics(intrinsics, target[1] / columns, target[0] / rows)
+    poses = views.world_to_camera
+    if rng.random() < 0.5:
+        images, depth = images.flip(-1), depth.flip(-1)
+        intrinsics[:, 0, 2] = target[1] - 1 - intrinsics[:, 0, 2]
+        mirror = torch.diag(torch.tensor([-1.0, 1, 1, 1]))
+        poses = mirror @ poses @ mirror
+    return _Crop(images.clamp(0, 1), depth, poses.clone(), intrinsics)
+
+
+def _finish(views: _Crop, valid: Tensor, rng: Generator) -> Sample:
+    """Draws the unit, the planes' range around the true one, the noise of the poses and the look."""
+    unit = math.exp(rng.normal(0, 0.5))  # the world's unit is nothing to go by
+    poses, depth = views.world_to_camera.clone(), views.depth * unit
+    poses[:, :3, 3] *= unit
+    low, middle, high = (
+        float(unit * torch.quantile(valid[:: max(len(valid) // 4000, 1)], q)) for q in (0.01, 0.5, 0.99)
+    )
+    near = low * math.exp(-(rng.uniform(0.02, 0.5) if rng.random() < 0.75 else rng.uniform(0, 1.8)))
+    far = high * math.exp(rng.uniform(0, 0.6) if rng.random() < 0.75 else rng.uniform(0, 2.5))
+    if rng.random() < _POSE_SHARE:
+        poses = _pose_noise(len(poses), middle, rng) @ poses
+    planes = int(rng.choice(_PLANES))
+    sources = int(rng.choice(_SOURCES, p=_SOURCE_SHARES))
+    look = recolour(views.images, rng)
+    return Sample(look, depth, poses, views.intrinsics, torch.tensor([near, far]), planes, sources)
+
+
+def _pose_noise(views: int, median_depth: float, rng: Generator) -> Tensor:
+    turns = torch.from_numpy(rng.normal(0, _TURN, (views, 3))).float()
+    return rigid_motions(turns, torch.from_numpy(rng.normal(0, _SHIFT * median_depth, (views, 3))).float())
+
+
+def recolour(images: Tensor, rng: Generator) -> Tensor:
+    """Changes the look of views ``[V, 3, H, W]`` as cameras do: colour mixing, contrast, gamma, exposure, blur, noise.
+
+    Most changes are common to all views; exposure, white balance and blur differ from view to view.
+    """
+    mixing = torch.eye(3)
+    if rng.random() < 0.6:
+        mixing = mixing + torch.from_numpy(rng.normal(0, 0.12, (3, 3))).float()
+    if rng.random() < _GREY_SHARE:
+        mixing = torch.full((3, 3), 0.3) + 0.1 * mixing
+    images = torch.einsum("ij,vjhw->vihw", mixing, images).clamp(1e-3, 1)
+    mean = images.mean()
+    images = (mean + (images - mean) * rng.uniform(0.45, 1.25)) * rng.uniform(0.5, 1.3)
+    images = images.clamp(1e-3, 1) ** math.exp(rng.uniform(-0.6, 0.6))
+    views = len(images)
+    if rng.random() < 0.6:
+        exposure = rng.normal(1, 0.07, (views, 1, 1, 1)) * rng.normal(1, 0.02, (views, 3, 1, 1))
+        images = images * torch.from_numpy(exposure).float()
+        images = images + torch.from_numpy(rng.normal(0, 0.015, (views, 1, 1, 1))).float()
+    if rng.random() < 0.35:
+        blurred = _blur(images, rng.uniform(0.4, 1.1))
+        chosen = torch.from_numpy(rng.random(views) < rng.uniform(0.3, 1.0))
+        images = torch.where(chosen[:, None, None, None], blurred, images)
+    if rng.random() < 0.7:
+        noise = torch.from_numpy(rng.standard_normal(tuple(images.shape), dtype=np.float32)) * rng.uniform(0, 0.025)
+        if rng.random() < 0.5:  # as left by a camera's own smoothing
+            noise = 2 * F.avg_pool2d(noise, 3, 1, 1)
+        images = images + noise
+    return images.clamp(0, 1)
+
+
+def _blur(images: Tensor, deviation: float) -> Tensor:
+    steps = torch.arange(-2, 3).float()
+    kernel = torch.exp(-steps.square() / (2 * deviation**2))
+    kernel = kernel / kernel.sum()
+    padded = F.pad(images.flatten(0, 1)[:, None], (2, 2, 2, 2), mode="reflect")
+    return F.conv2d(padded, (kernel[:, None] * kernel)[None, None]).view_as(images)

@@ -1,0 +1,490 @@
+"""What people bring to ``vg2gt reconstruct`` and take away: cameras, frames, names, masks, damaged files, orders."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from tests.reconstruction.test_given_cameras import NAMES, SIZE, STAND_IN, put_cameras, put_colmap, put_transforms
+from vg2gt.cli import reconstruct as reconstruct_command
+from vg2gt.cli import render as render_command
+from vg2gt.geometry.cameras import project
+from vg2gt.io import (
+    colmap_images,
+    colmap_intrinsics,
+    colmap_pose,
+    read_cameras_json,
+    read_colmap,
+    read_gaussian_ply,
+    write_cameras_json,
+    write_colmap,
+    write_gaussian_ply,
+)
+from vg2gt.reconstruction import sfm
+from vg2gt.reconstruction.camera_files import read_cameras
+from vg2gt.reconstruction.cameras import pictures_for
+from vg2gt.reconstruction.frame import upright_rotation
+from vg2gt.reconstruction.given_cameras import given_pictures
+from vg2gt.reconstruction.inputs import load_views, working_size
+from vg2gt.reconstruction.monitor import Monitor
+from vg2gt.reconstruction.order import working_order
+from vg2gt.reconstruction.pictures import find_pictures
+from vg2gt.reconstruction.pipeline import reconstruct_with
+from vg2gt.reconstruction.saved import read_scene
+from vg2gt.rendering import Renderer
+from vg2gt.runs.load import load_model
+from vg2gt.types import Gaussians
+
+
+@pytest.fixture(scope="module")
+def model():
+    return load_model(backend=STAND_IN, device="cpu").model
+
+
+@pytest.fixture
+def folder(recording: Path, tmp_path: Path) -> Path:
+    shutil.copytree(recording / "images", tmp_path / "room" / "images")
+    return tmp_path / "room"
+
+
+def run(*arguments: str | Path) -> None:
+    plain = ["--backend", STAND_IN, "--device", "cpu", "--quiet"]
+    reconstruct_command.main([*map(str, arguments), *plain])
+
+
+@pytest.mark.parametrize("put", [put_colmap, put_transforms, put_cameras])
+def test_landscape_and_portrait_mixed_are_read_whole(folder: Path, frames, put, caplog) -> None:
+    """Item 1: sizes were read after the images were cut to the median shape, and nobody heard of it."""
+    put(folder, frames)
+    turned = folder / "images" / NAMES[3]
+    with Image.open(turned) as image:
+        image.resize((84, 112)).save(turned)
+    if put is put_colmap:
+        model = read_colmap(folder / "sparse" / "0")
+        camera = model.camera(4)
+        camera.width, camera.height, camera.params = 84, 112, [77.0, 77.0, 42.0, 56.0]
+        write_colmap(folder / "sparse" / "0", model)
+    elif put is put_transforms:
+        content = json.loads((folder / "transforms.json").read_text())
+        lens = {key: content.pop(key) for key in ("w", "h", "cx", "cy")}
+        for number, frame in enumerate(content["frames"]):
+            frame.update(lens if number < 3 else {"w": 84, "h": 112, "cx": 42.0, "cy": 56.0})
+        (folder / "transforms.json").write_text(json.dumps(content))
+    else:
+        cameras = read_cameras_json(folder / "cameras.json")
+        cameras[3] = replace(cameras[3], width=84, height=112)
+        write_cameras_json(folder / "cameras.json", cameras)
+    pictures = given_pictures(folder)
+    assert pictures is not None
+    assert [picture.size for picture in pictures] == [SIZE] * 3 + [(112, 84)]
+    assert pictures[3].read((112, 84)).images.shape[-2:] == (112, 84)
+    size = working_size([picture.size for picture in pictures], 14, "cpu")
+    assert size[0] / size[1] > 0.8  # as without cameras
+    load_views(pictures, size, Monitor())
+    assert "images have another shape" in caplog.text
+
+
+@pytest.mark.parametrize("layout", ["named", "reduced", "among", "other case", "any folder"])
+def test_cameras_are_found_where_people_have_them(folder: Path, frames, layout: str) -> None:
+    """Item 4."""
+    put_colmap(folder, frames)
+    images, given = folder / "images", folder
+    if layout == "named":
+        given = [images / name for name in NAMES[::-1]]
+    elif layout == "reduced":
+        images.rename(folder / "images_4")
+        for path in (folder / "images_4").iterdir():
+            with Image.open(path) as image:
+                image.reduce(2).save(path)
+    elif layout == "among":
+        for path in (folder / "sparse" / "0").iterdir():
+            shutil.move(path, images / path.name)
+        given = images
+    elif layout == "other case":
+        for path in list((folder / "sparse" / "0").iterdir()):
+            path.rename(path.with_name(path.name.capitalize()))
+        images.rename(folder / "Images")
+    else:
+        images.rename(folder / "my photographs")
+        given = folder / "my photographs"
+    pictures = given_pictures(given)
+    assert pictures is not None
+    names = [Path(name).stem for name in NAMES]
+    assert [picture.name for picture in pictures] == (names[::-1] if layout == "named" else names)
+    assert all(picture.source.startswith("COLMAP") for picture in pictures)
+    poses = frames.world_to_camera[3] if layout == "named" else frames.world_to_camera[0]
+    assert torch.allclose(pictures[0].read(SIZE).world_to_camera[0], poses, atol=1e-5)
+
+
+def test_a_model_that_cannot_be_read_is_said_where_others_are_found(model, folder: Path, frames, caplog, monkeypatch):
+    """Item 4."""
+    put_colmap(folder, frames)
+    path = folder / "sparse" / "0" / "images.bin"
+    path.write_bytes(path.read_bytes()[:100])
+    monkeypatch.setattr("vg2gt.reconstruction.cameras.find_cameras", lambda pictures, *_: pictures)
+    with pictures_for(model, folder):
+        assert "cameras that are there are not used, structure from motion finds others:" in caplog.text
+        assert "images.bin" in caplog.text
+    with pytest.raises(ValueError, match=r"images\.bin"), pictures_for(model, folder, "given"):
+        pass
+
+
+def test_a_photograph_without_a_camera_is_named(folder: Path, frames, caplog) -> None:
+    """Item 8."""
+    put_colmap(folder, frames)
+    shutil.copy(folder / "images" / NAMES[0], folder / "images" / "extra.png")
+    assert len(given_pictures(folder) or []) == 4
+    assert "has no cameras for 1 images, which are left out: extra.png" in caplog.text
+
+
+def test_a_workspace_takes_what_fits(folder: Path, frames) -> None:
+    """Item 17: no originals, and the undistorted images in dense/."""
+    put_colmap(folder, frames)
+    (folder / "dense").mkdir()
+    shutil.move(folder / "images", folder / "dense" / "images")
+    shutil.copytree(folder / "sparse" / "0", folder / "dense" / "sparse")
+    pictures = given_pictures(folder)
+    assert pictures is not None
+    assert pictures[0].source == f"COLMAP {folder / 'dense'}"
+
+
+@pytest.mark.parametrize("put", [put_colmap, put_transforms, put_cameras])
+def test_given_cameras_keep_their_frame_and_unit(folder: Path, frames, put, tmp_path: Path) -> None:
+    """Item 9."""
+    put(folder, frames)
+    given = {picture.name: picture.pose for picture in given_pictures(folder) or []}
+    run(folder, "--out", tmp_path / "out", "--save", "cameras.json,scene.ply,report.json,views.npz")
+    cameras = read_cameras_json(tmp_path / "out" / "cameras.json")
+    for camera in cameras:
+        pose = given[Path(camera.name).stem]
+        assert pose is not None
+        np.testing.assert_allclose(camera.world_to_camera, pose, atol=1e-6)
+        assert camera.similarity is not None
+        np.testing.assert_allclose(camera.similarity, np.eye(4), atol=1e-5)
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["frame"] == "given"
+    assert report["similarity_to_cameras"]["scale"] == pytest.approx(1, abs=1e-5)
+    scene = read_scene(tmp_path / "out", Renderer())
+    assert scene.frame is not None
+    assert scene.frame.name == "given"
+    seen = scene.depth[scene.depth > 0].median()
+    assert seen == pytest.approx(float(frames.depth[frames.depth > 0].median()), rel=0.6)  # the stand-in's plane
+    # Gaussians project to where the decoded depth is: means, cameras and depth moved together.
+    pixels, depth = project(scene.gaussians.means[None, None], scene.cameras.select(slice(0, 1)))
+    inside = (depth[0, 0] > 0) & (pixels[0, 0] >= 0).all(-1) & (pixels[0, 0] < torch.tensor(SIZE[::-1])).all(-1)
+    assert inside.float().mean() > 0.2
+
+
+def test_frames_that_can_be_chosen_go_into_one_another(folder: Path, frames, model, tmp_path: Path) -> None:
+    """Item 9: the similarity in report.json takes any of them to the given one."""
+    put_colmap(folder, frames)
+    scenes = {name: reconstruct_with(model, folder, frame=name) for name in ("given", "first", "upright")}
+    given = scenes["given"]
+    for name, scene in scenes.items():
+        assert scene.frame is not None
+        to_given = torch.from_numpy(scene.frame.to_source).float()
+        means = scene.gaussians.means @ to_given[:3, :3].T + to_given[:3, 3]
+        torch.testing.assert_close(means, given.gaussians.means, atol=2e-4, rtol=0)
+        scale = float(torch.linalg.det(to_given[:3, :3]) ** (1 / 3))
+        torch.testing.assert_close(scene.gaussians.scales * scale, given.gaussians.scales, atol=1e-6, rtol=1e-3)
+        torch.testing.assert_close(scene.depth * scale, given.depth, atol=1e-5, rtol=1e-4)
+        one, other = next(scene.render()), next(given.render())
+        assert (one.color - other.color).abs().mean() < 2e-3, name
+    assert torch.allclose(scenes["first"].cameras.world_to_camera[0, 0], torch.eye(4), atol=1e-5)
+    down = scenes["upright"].cameras.world_to_camera[0, :, 1, :3].mean(0)
+    assert down[1] / down.norm() > 0.9
+    assert scenes["upright"].metres_per_unit is None
+
+
+def test_metric_cameras_give_metres(recording: Path, ready) -> None:
+    """Item 9: metres_per_unit was null."""
+    scene = reconstruct_with(ready.model, recording)
+    assert scene.metres_per_unit == pytest.approx(1)
+    first = reconstruct_with(ready.model, recording, frame="first")
+    assert first.metres_per_unit is not None
+    assert first.frame is not None
+    assert first.metres_per_unit == pytest.approx(first.frame.scale)
+    assert first.metres_per_unit != pytest.approx(1, abs=0.01)
+
+
+def test_map_coordinates_keep_their_digits(folder: Path, frames, model, caplog) -> None:
+    """Item 9: GPS. The shift is left out of what single precision has to hold, and said."""
+    shift = np.array([4_400_000.0, 600_000.0, 300.0])
+    poses = frames.world_to_camera.double().clone()
+    poses[:, :3, 3] -= poses[:, :3, :3] @ torch.from_numpy(shift)
+    put_cameras(folder, replace(frames, world_to_camera=poses))
+    scene = reconstruct_with(model, folder)
+    assert "the scene is written shifted by" in caplog.text
+    assert scene.gaussians.means.abs().max() < 1000
+    assert scene.frame is not None
+    np.testing.assert_allclose(scene.frame.to_source[:3, 3], shift, atol=20)
+    for camera, pose in zip(scene.named_cameras(), poses.numpy(), strict=True):
+        np.testing.assert_allclose(camera.world_to_camera @ np.linalg.inv(scene.frame.to_source), pose, atol=2e-6 * 4e6)
+
+
+def test_there_is_no_given_frame_without_given_cameras(photos: Path) -> None:
+    images_alone = load_model(backend="da3_tiny", device="cpu").model
+    with pytest.raises(ValueError, match="no given cameras, so --frame given means nothing"):
+        reconstruct_with(images_alone, photos, frame="given")
+    scene = reconstruct_with(images_alone, photos)
+    assert scene.frame is not None
+    assert scene.frame.name == "upright"
+
+
+def test_gravity_is_across_the_cameras_even_if_they_look_down() -> None:
+    poses = []
+    for angle in np.linspace(0, 2, 9):  # part of an orbit, looking down by 40 degrees
+        turn = np.array([[np.cos(angle), 0, -np.sin(angle)], [0, 1, 0], [np.sin(angle), 0, np.cos(angle)]])
+        pitch, c, s = np.eye(3), np.cos(0.7), np.sin(0.7)
+        pitch[1:, 1:] = [[c, s], [-s, c]]
+        pose = np.eye(4)
+        pose[:3, :3] = pitch @ turn
+        poses.append(pose)
+    tilt = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+    tilt *= np.sign(np.linalg.det(tilt))
+    tilted = np.stack(poses)
+    tilted[:, :3, :3] = tilted[:, :3, :3] @ tilt.T
+    down = upright_rotation(tilted) @ tilt @ [0, 1, 0]
+    assert down[1] > 0.999
+
+
+def test_output_in_the_photographs_folder_does_not_become_input(folder: Path, frames, monkeypatch) -> None:
+    """Item 5: cameras of undistorted images were taken for the distorted originals."""
+    put_colmap(folder, frames)
+    found = [
+        replace(picture, source="structure from motion, 4 of 4 images", lens="unknown")
+        for picture in given_pictures(folder) or []
+    ]
+    shutil.rmtree(folder / "sparse")
+    asked = []
+    monkeypatch.setattr("vg2gt.reconstruction.cameras.find_cameras", lambda *_: asked.append(1) or found)
+    monkeypatch.setattr(sfm, "require_pycolmap", lambda: None)
+    images = folder / "images"
+    for number in (1, 2):
+        run(images, "--out", images, "--save", "cameras.json,report.json", "--overwrite")
+        assert len(asked) == number
+        assert json.loads((images / "report.json").read_text())["cameras"].startswith("structure from motion")
+
+
+def test_own_cameras_serve_the_original_photographs(folder: Path, frames, tmp_path: Path) -> None:
+    """Item 23: of whole photographs, also where the working size cut them."""
+    put_colmap(folder, frames)
+    run(folder, "--out", tmp_path / "out", "--save", "cameras.json", "--size", "70x70")
+    shutil.rmtree(folder / "sparse")
+    shutil.copy(tmp_path / "out" / "cameras.json", folder)
+    pictures = given_pictures(folder)
+    assert pictures is not None
+    loaded = pictures[2].read(SIZE)
+    assert loaded.images.shape[-2:] == SIZE
+    assert torch.allclose(loaded.intrinsics[0], frames.intrinsics[2], atol=1e-3)
+    assert torch.allclose(loaded.world_to_camera[0], frames.world_to_camera[2], atol=1e-6)
+
+
+def test_a_tilde_is_the_home_folder(folder: Path, frames, tmp_path: Path, monkeypatch) -> None:
+    """Item 12."""
+    put_colmap(folder, frames)
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.chdir(tmp_path)
+    run(folder, "--out", "~/x", "--save", "cameras.json")
+    assert (tmp_path / "home" / "x" / "cameras.json").is_file()
+    assert not (tmp_path / "~").exists()
+
+
+def transparent(folder: Path) -> None:
+    """The left half of every image hidden under alpha 0, with other colours below it."""
+    for path in (folder / "images").iterdir():
+        with Image.open(path) as image:
+            pixels = np.array(image.convert("RGBA"))
+        pixels[:, :56] = 255, 0, 255, 0
+        Image.fromarray(pixels).save(path)
+
+
+@pytest.mark.parametrize("kind", ["alpha", "masks"])
+def test_what_is_hidden_is_no_part_of_the_scene(folder: Path, frames, model, kind: str, tmp_path: Path) -> None:
+    """Item 7: colours under alpha 0 became scene; masks likewise."""
+    put_colmap(folder, frames)
+    if kind == "alpha":
+        transparent(folder)
+    else:
+        (folder / "masks").mkdir()
+        half = np.where(np.arange(112) < 56, 0, 255).astype(np.uint8) * np.ones((84, 1), np.uint8)
+        for name in NAMES:
+            Image.fromarray(half).save(folder / "masks" / name)
+    scene = reconstruct_with(model, folder)
+    assert scene.mask is not None
+    assert torch.equal(scene.mask[0, 0], (torch.arange(112) >= 56).float())
+    assert (scene.depth[..., :56] == 0).all()
+    assert (scene.depth[..., 60:] > 0).any()
+    if kind == "alpha":
+        assert (scene.images[..., :56] == 1).all()
+        magenta = (scene.gaussians.sh[:, 0] * 0.2821 + 0.5 - torch.tensor([1.0, 0, 1])).norm(dim=-1)
+        assert magenta.min() > 0.2
+    scene.save(tmp_path / "out", ["scene.ply", "cameras.json", "views.npz"])
+    again = read_scene(tmp_path / "out", Renderer())
+    assert again.mask is not None
+    assert torch.equal(again.mask, scene.mask)
+
+
+def test_masks_of_photographs_without_cameras(folder: Path) -> None:
+    """Item 7: also one folder up, and alpha of Pillow images."""
+    (folder / "masks").mkdir()
+    Image.new("L", (112, 84), 0).save(folder / "masks" / f"{NAMES[1]}.png")
+    views = load_views(find_pictures(folder / "images"), SIZE, Monitor())
+    assert views.mask is not None
+    assert views.mask.mean((1, 2)).tolist() == [1, 0, 1, 1]
+    image = Image.new("RGBA", (112, 84), (255, 0, 255, 0))
+    views = load_views(find_pictures([image]), SIZE, Monitor())
+    assert views.mask is not None
+    assert not views.mask.any()
+    assert (views.images == 1).all()
+
+
+def test_photographs_come_back_with_their_names_and_sizes(folder: Path, frames, tmp_path: Path) -> None:
+    """Item 28."""
+    put_colmap(folder, frames)
+    save = "colmap,nerfstudio,colmap-small"
+    run(folder, "--out", tmp_path / "out", "--save", save, "--size", "56x56")
+    whole = tmp_path / "out" / "colmap"
+    model = read_colmap(whole / "sparse" / "0")
+    for number, image in enumerate(colmap_images(model)):
+        assert image.name == NAMES[number]
+        assert (whole / "images" / image.name).read_bytes() == (folder / "images" / image.name).read_bytes()
+        np.testing.assert_allclose(colmap_intrinsics(image.camera), frames.intrinsics[number], atol=1e-3)
+        np.testing.assert_allclose(colmap_pose(image), frames.world_to_camera[number], atol=1e-6)
+    content = json.loads((tmp_path / "out" / "nerfstudio" / "transforms.json").read_text())
+    assert [frame["file_path"] for frame in content["frames"]] == [f"images/{name}" for name in NAMES]
+    with Image.open(tmp_path / "out" / "colmap-small" / "images" / NAMES[0]) as image:
+        assert image.size == (56, 56)
+
+
+def test_damaged_photographs_are_named_together_and_may_be_skipped(photos: Path, tmp_path: Path, caplog) -> None:
+    """Item 24."""
+    folder = Path(shutil.copytree(photos, tmp_path / "photos"))
+    for name in ("IMG_9.jpg", "IMG_11.png"):
+        path = folder / name
+        path.write_bytes(path.read_bytes()[: len(path.read_bytes()) // 2])
+    (folder / "IMG_12.jpg").write_text("no picture")
+    with pytest.raises(ValueError, match=r"IMG_12.jpg.*--skip-damaged"):
+        find_pictures(folder)
+    (folder / "IMG_12.jpg").unlink()
+    with pytest.raises(ValueError, match=r"IMG_9\.jpg.*IMG_11\.png.*--skip-damaged"):
+        load_views(find_pictures(folder), SIZE, Monitor())
+    named = [folder / name for name in ("IMG_8.png", "IMG_9.jpg", "IMG_10.jpg", "IMG_11.png")]
+    for given in (folder, named):
+        caplog.clear()
+        assert [p.name for p in find_pictures(given, skip_damaged=True)] == ["IMG_8", "IMG_10"]
+        assert "IMG_9.jpg" in caplog.text
+        assert "IMG_11.png" in caplog.text
+
+
+def test_images_and_a_photograph_beside_their_folder(folder: Path, caplog) -> None:
+    """Item 26: the one beside images/ was taken alone; folders were passed over without a word."""
+    shutil.copy(folder / "images" / NAMES[0], folder / "preview.png")
+    assert len(find_pictures(folder)) == 4
+    assert "not from the same folder: preview.png" in caplog.text
+    (folder / "images" / "more").mkdir()
+    shutil.copy(folder / "images" / NAMES[0], folder / "images" / "more" / "a.png")
+    caplog.clear()
+    assert len(find_pictures(folder / "images")) == 4
+    assert "not from the same folder: more/" in caplog.text
+
+
+def test_the_order_of_photographs_decides_nothing_and_copies_count_once(folder: Path, frames, model, caplog) -> None:
+    """Item 27."""
+    put_colmap(folder, frames)
+    files = [folder / "images" / name for name in NAMES]
+    one = reconstruct_with(model, files)
+    other = reconstruct_with(model, [files[2], files[0], files[3], files[1]])
+    assert other.names == ("010", "008", "011", "009")
+    for view, same in zip(one.render(other.named_cameras()), other.render(), strict=True):
+        error = (view.color - same.color).square().mean()
+        assert -10 * torch.log10(error.clamp(min=1e-12)) > 50
+    shutil.copy(files[1], folder / "images" / "copy.png")
+    (folder / "sparse").rename(folder / "elsewhere")
+    images_alone = load_model(backend="da3_tiny", device="cpu").model
+    scene = reconstruct_with(images_alone, [*files, folder / "images" / "copy.png"])
+    assert scene.names == ("008", "009", "010", "011")
+    assert "1 images are copies of others and are left out: copy (as 009)" in caplog.text
+
+
+def test_the_reference_is_the_view_that_shows_what_the_others_show() -> None:
+    images = torch.rand(5, 3, 56, 70, generator=torch.Generator().manual_seed(0))
+    images[1:] = 0.3 * images[1:] + 0.7 * images[1:2]
+    order = working_order(images)
+    assert order[0] != 0
+    shuffled = torch.tensor([3, 1, 4, 0, 2])
+    again = working_order(images[shuffled])
+    assert [int(shuffled[view]) for view in again] == order
+
+
+def test_a_model_without_points_is_refused_and_not_kept(tmp_path: Path, monkeypatch) -> None:
+    """Item 13: a turning camera. Its median depth was NaN, and every further run failed."""
+    import pycolmap  # pyright: ignore[reportMissingImports]
+
+    empty = pycolmap.Reconstruction()
+    monkeypatch.setattr(pycolmap, "incremental_mapping", lambda *_, **__: {0: empty})
+    images = [np.random.default_rng(i).integers(0, 255, (60, 80, 3), np.uint8) for i in range(3)]
+    with pytest.raises(ValueError, match=r"cameras of these 3 images cannot be found.*rather than turning on the spot"):
+        sfm.find_cameras(find_pictures(images), tmp_path / "sfm", Monitor())
+    assert not (tmp_path / "sfm").exists()
+
+
+@pytest.mark.parametrize("kind", ["empty", "not finite"])
+def test_render_refuses_a_scene_of_nothing(tmp_path: Path, frames, kind: str) -> None:
+    """Item 15: it ended with status 0 and a black picture."""
+    put_cameras(tmp_path, frames)
+    count = 0 if kind == "empty" else 3
+    ones, batch = torch.ones(count, 3), torch.zeros(count, dtype=torch.int64)
+    scene = Gaussians(ones, torch.ones(count, 4), ones, torch.full((count,), 0.5), ones[:, None], batch)
+    path = write_gaussian_ply(tmp_path / "scene.ply", scene)
+    if count:
+        content = path.read_bytes()
+        path.write_bytes(content[: -count * 68] + np.full(17 * count, np.nan, "<f4").tobytes())
+        assert not len(read_gaussian_ply(path))
+    with pytest.raises(SystemExit, match="holds no Gaussians; there is nothing to render"):
+        render_command.main([str(path), "--cameras", str(tmp_path / "cameras.json"), "--out", str(tmp_path / "out")])
+    assert not (tmp_path / "out").exists()
+
+
+def test_cameras_to_render_come_from_any_file(folder: Path, frames, tmp_path: Path) -> None:
+    """Item 23."""
+    put_colmap(folder, frames)
+    put_transforms(folder, frames)
+    put_cameras(folder, frames)
+    to_world = np.linalg.inv(frames.world_to_camera.double().numpy())
+    k = frames.intrinsics.double().numpy()
+    theirs = [
+        {
+            "id": i,
+            "img_name": name,
+            "width": 112,
+            "height": 84,
+            "position": to_world[i, :3, 3].tolist(),
+            "rotation": to_world[i, :3, :3].tolist(),
+            "fx": k[i, 0, 0],
+            "fy": k[i, 1, 1],
+        }
+        for i, name in enumerate(NAMES)
+    ]
+    (tmp_path / "3dgs.json").write_text(json.dumps(theirs))
+    places = [
+        folder,
+        folder / "sparse" / "0",
+        folder / "transforms.json",
+        folder / "cameras.json",
+        tmp_path / "3dgs.json",
+    ]
+    for place in places:
+        cameras = read_cameras(place)
+        assert [(camera.width, camera.height) for camera in cameras] == [(112, 84)] * 4
+        for camera, pose, matrix in zip(cameras, frames.world_to_camera, k, strict=True):
+            np.testing.assert_allclose(camera.world_to_camera, pose, atol=1e-5)
+            np.testing.assert_allclose(camera.intrinsics, matrix, atol=1e-4)
+    (tmp_path / "3dgs.json").write_text(json.dumps([{"img_name": "a"}]))
+    with pytest.raises(ValueError, match="no camera of 3D Gaussian Splatting"):
+        read_cameras(tmp_path / "3dgs.json")

@@ -1,0 +1,164 @@
+"""Structure from motion of many photographs, of parts, of copies, and of what cannot be solved."""
+
+import json
+import shutil
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from vg2gt.geometry.alignment import align_points
+from vg2gt.geometry.cameras import camera_centers
+from vg2gt.reconstruction import sfm, sfm_models, sfm_pairs
+from vg2gt.reconstruction.inputs import load_views
+from vg2gt.reconstruction.monitor import Monitor
+from vg2gt.reconstruction.pictures import Picture, find_pictures
+from vg2gt.types import Cameras
+
+PLACES = 40
+
+
+def office_photos(shared: Path, count: int) -> list[Path]:
+    return sorted((shared / "data" / "hololens_office_a" / "images").iterdir())[:count]
+
+
+def center_errors(pictures: list[Picture], shared: Path, rows: list[int]) -> torch.Tensor:
+    """Distances of found to recorded centres, after one similarity, as shares of the path's extent."""
+    views = load_views(pictures, (56, 84), Monitor())
+    assert views.hints is not None
+    assert views.hints.cameras is not None
+    poses = np.linalg.inv(np.loadtxt(shared / "data" / "hololens_office_a" / "poses.txt").reshape(-1, 4, 4)[rows])
+    true = Cameras(torch.from_numpy(poses)[None].float(), views.hints.cameras.intrinsics, (56, 84))
+    found, known = camera_centers(views.hints.cameras), camera_centers(true)
+    errors = (align_points(found, known).apply(found) - known).norm(dim=-1)[0]
+    return errors / torch.cdist(known, known).max()
+
+
+def test_pairs_of_many_are_neighbours_and_those_that_look_alike() -> None:
+    """Two walks past the same places: each image shows two of them, in another light the second time."""
+    rng = np.random.default_rng(0)
+    places = rng.integers(0, 100, (PLACES + 1, 30, 128))
+    shown = [np.concatenate((places[i % PLACES], places[i % PLACES + 1])) for i in range(2 * PLACES)]
+    descriptors = [(rows + rng.integers(0, 20, rows.shape)).astype(np.uint8) for rows in shown]
+    pairs = sfm_pairs.likely_pairs(descriptors)
+    assert all(0 <= before < later < 2 * PLACES for before, later in pairs)
+    assert len(set(pairs)) == len(pairs) <= 2 * PLACES * (len(sfm_pairs.DISTANCES) + sfm_pairs.ALIKE)
+    assert {(i, i + step) for step in (1, 2, 4, 8, 16) for i in range(2 * PLACES - step)} <= set(pairs)
+    assert {(i, i + PLACES) for i in range(PLACES)} <= set(pairs)
+    assert sfm_pairs.likely_pairs(descriptors) == pairs
+
+
+@pytest.mark.parametrize("seen", [0, 1])
+def test_images_without_features_have_pairs_too(seen: int) -> None:
+    """Words of fewer features than there are words."""
+    descriptors = [np.full((seen if i == 3 else 0, 128), 9, np.uint8) for i in range(70)]
+    assert {(i, i + 1) for i in range(69)} <= set(sfm_pairs.likely_pairs(descriptors))
+
+
+def test_many_photographs_are_placed_at_once(shared: Path, tmp_path: Path, monkeypatch) -> None:
+    """The way of many, for eight."""
+    pycolmap = pytest.importorskip("pycolmap")
+    for module in (sfm, sfm_models):
+        monkeypatch.setattr(module, "ALL_PAIRS", 5)
+    monkeypatch.setattr(sfm_pairs, "ALIKE", 1)
+    monkeypatch.setattr(pycolmap, "incremental_mapping", lambda *_, **__: pytest.fail("one by one"))
+    pictures = sfm.find_cameras(find_pictures(office_photos(shared, 8)), tmp_path / "sfm", Monitor())
+    assert len(pictures) == 8
+    assert center_errors(pictures, shared, list(range(8))).median() < 0.03
+
+
+def test_a_camera_that_only_turns_is_refused_and_nothing_is_kept(shared: Path, tmp_path: Path) -> None:
+    pytest.importorskip("pycolmap")
+    wide = np.array(Image.open(office_photos(shared, 9)[8]).resize((1080, 720)))
+    row, column = np.mgrid[:300, :400]
+    views = []
+    for turn in np.linspace(-0.35, 0.35, 8):
+        x, z = (column - 200) * np.cos(turn) + 400 * np.sin(turn), 400 * np.cos(turn) - (column - 200) * np.sin(turn)
+        places = np.round((row - 150) / z * 400 + 360), np.round(x / z * 400 + 540)
+        views.append(wide[places[0].clip(0, 719).astype(int), places[1].clip(0, 1079).astype(int)])
+    with pytest.raises(ValueError, match=r"cameras of these 8 images cannot be found.*rather than turning on the spot"):
+        sfm.find_cameras(find_pictures(views), tmp_path / "sfm", Monitor())
+    assert not (tmp_path / "sfm").exists()
+
+
+@pytest.fixture
+def kept(photos: Path, tmp_path: Path) -> Path:
+    """A finished folder of four photographs, one by one pixel images."""
+    folder = tmp_path / "sfm"
+    (folder / "sparse").mkdir(parents=True)
+    (folder / "sparse" / "cameras.bin").touch()
+    (folder / "images").mkdir()
+    names = [picture.name for picture in find_pictures(photos)]
+    for number in range(3):
+        Image.new("RGB", (1, 1)).save(folder / "images" / f"{number:06d}.jpg")
+    state = {
+        "key": sfm._key(find_pictures(photos)),
+        "images": {f"{number:06d}.jpg": name for number, name in enumerate(names[:3])},
+        "left_out": names[3:],
+        "other_parts": [names[3:]],
+        "points": 100,
+    }
+    (folder / "sfm.json").write_text(json.dumps(state))
+    return folder
+
+
+def test_a_kept_model_without_points_is_computed_again(kept: Path, photos: Path, monkeypatch) -> None:
+    def solve(*_: object) -> None:
+        raise ValueError("computed again")
+
+    monkeypatch.setattr(sfm, "_solve", solve)
+    monkeypatch.setattr(sfm, "recording_pictures", lambda _: [])
+    assert sfm.find_cameras(find_pictures(photos), kept, Monitor()) == []
+    state = json.loads((kept / "sfm.json").read_text())
+    (kept / "sfm.json").write_text(json.dumps(state | {"points": 0}))
+    with pytest.raises(ValueError, match="computed again"):
+        sfm.find_cameras(find_pictures(photos), kept, Monitor())
+
+
+def test_copies_count_once_and_parts_are_named(kept: Path, photos: Path, tmp_path: Path, monkeypatch, caplog) -> None:
+    monkeypatch.setattr(sfm, "_solve", lambda *_: pytest.fail("computed again"))
+    monkeypatch.setattr(sfm, "recording_pictures", lambda _: [])
+    (tmp_path / "more").mkdir()
+    shutil.copy(photos / "IMG_9.jpg", tmp_path / "more" / "same.jpg")
+    sfm.find_cameras(find_pictures([photos, tmp_path / "more"]), kept, Monitor())
+    assert "1 images are copies of others and are left out: same (of IMG_9)" in caplog.text
+    assert "1 of 4 images show too little of what the others show" in caplog.text
+    assert "1 of them form another part, which nothing connects with the 3 images taken" in caplog.text
+    assert "reconstruct that part alone: IMG_11" in caplog.text
+
+
+def model(names: str, points: int) -> SimpleNamespace:
+    images = {i: SimpleNamespace(name=name, has_pose=name.islower()) for i, name in enumerate(names)}
+    placed = sum(image.has_pose for image in images.values())
+    return SimpleNamespace(images=images, num_points3D=lambda: points, num_reg_images=lambda: placed)
+
+
+def test_the_largest_model_with_points_is_taken() -> None:
+    empty, small, large = model("abcdefgh", 0), model("xy", 500), model("abcD", 90)
+    assert sfm_models.sound_models([empty, small, large]) == [large, small]  # pyright: ignore[reportArgumentType]
+    others = [model("cdxyZ", 50), model("yz", 40), model("ab", 40)]
+    parts = sfm_models.other_parts(others, {"a", "b", "c"})  # pyright: ignore[reportArgumentType]
+    assert parts == [["d", "x", "y"], ["z"]]
+
+
+@pytest.mark.slow
+def test_turned_photographs_are_placed(shared: Path, tmp_path: Path) -> None:
+    """Every third lies on its side, without a word of it in its EXIF data: another lens, another size."""
+    pytest.importorskip("pycolmap")
+    pixels = [np.array(Image.open(path)) for path in office_photos(shared, 12)]
+    views = [np.rot90(image).copy() if i % 3 == 2 else image for i, image in enumerate(pixels)]
+    pictures = sfm.find_cameras(find_pictures(views), tmp_path / "sfm", Monitor())
+    assert len(pictures) == 12
+    assert center_errors(pictures, shared, list(range(12))).median() < 0.03
+
+
+@pytest.mark.slow
+def test_the_larger_of_two_scenes_is_taken_and_the_other_named(shared: Path, tmp_path: Path, caplog) -> None:
+    pytest.importorskip("pycolmap")
+    fox = sorted((shared / "data" / "ingp_fox" / "images").iterdir())[:10]
+    pictures = sfm.find_cameras(find_pictures([*fox, *office_photos(shared, 14)]), tmp_path / "sfm", Monitor())
+    assert [picture.name for picture in pictures] == [path.stem for path in office_photos(shared, 14)]
+    assert "10 of them form another part, which nothing connects with the 14 images taken" in caplog.text

@@ -1,0 +1,66 @@
+"""Masks next to images: which file belongs to which image, and how masks are joined."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from vg2gt.io.image_files import Size
+
+log = logging.getLogger(__name__)
+
+FOLDER = "masks"
+_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp")
+
+
+def mask_of(folder: Path, name: str) -> Path | None:
+    """The mask of an image in a folder of masks: the image's name, ``NAME.png`` (COLMAP), or another ending.
+
+    Args:
+        folder: the masks.
+        name: the image's, relative to the folder of images.
+    """
+    stem = folder / name
+    candidates = [Path(f"{stem}.png"), *(stem.with_suffix(ending) for ending in _ENDINGS), stem]
+    return next((path for path in candidates if path.is_file()), None)
+
+
+def find_masks(folder: Path, names: Mapping[int, str], where: str) -> dict[int, Path]:
+    """Masks of images by frame number; images without one are named in a warning if others have one.
+
+    Args:
+        folder: the masks; it need not exist.
+        names: the images, relative to the folder of images.
+        where: the scene, for the message.
+    """
+    if not folder.is_dir():
+        return {}
+    found = {number: mask_of(folder, name) for number, name in names.items()}
+    lacking = [names[number] for number, path in found.items() if path is None]
+    if lacking:
+        log.warning(
+            "%s: %d of %d images have no mask in %s and count as a whole: %s",
+            where, len(lacking), len(names), folder, ", ".join(lacking[:10]),
+        )  # fmt: skip
+    return {number: path for number, path in found.items() if path is not None}
+
+
+def joined_masks(masks: Sequence[NDArray[np.float32] | None]) -> NDArray[np.float32] | None:
+    """The product of masks of one image, at the size of the first; None where everything counts."""
+    known = [mask for mask in masks if mask is not None]
+    if not known:
+        return None
+    size = (known[0].shape[0], known[0].shape[1])
+    return np.prod([resized_mask(mask, size) for mask in known], 0, dtype=np.float32)
+
+
+def resized_mask(mask: NDArray[np.float32], size: Size) -> NDArray[np.float32]:
+    """A mask ``[h, w]`` at another ``(height, width)``."""
+    if mask.shape == tuple(size):
+        return mask
+    return np.array(Image.fromarray(mask).resize((size[1], size[0]), Image.Resampling.BILINEAR))

@@ -1,0 +1,105 @@
+"""What nobody can place: a far shell of Gaussians in the colours of the pixels whose depth no view supports.
+
+The sky, what lies beyond the searched range and distant walls without texture have no depth that views agree on. A
+shell around all cameras shows their colours by direction, blurred: it is behind everything, so it never hangs in space
+that a view looks through, and any viewer shows it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import fields, replace
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from vg2gt.gaussians.surfel import ALONE
+from vg2gt.geometry.cameras import camera_centers, ray_directions
+from vg2gt.geometry.rotations import matrix_to_quat
+from vg2gt.geometry.spherical_harmonics import rgb_to_sh
+from vg2gt.types import Cameras, Gaussians
+
+COUNT = 1000  # Gaussians of the whole sphere
+RADIUS = 20.0  # median depths
+FAR = 8.0  # median depths from every camera: only the shell is that far
+BLUR = 1.5  # spacings of the shell's Gaussians, standard deviation
+PRIOR = 3.0  # pixels of the mean colour in every direction
+THIN = 0.02  # of the width
+OPACITY = 0.95
+RAYS = 60_000  # pixels that are looked at, at most
+LEAST = 0.005  # share of pixels without support below which there is no shell
+
+
+@torch.no_grad()
+def far_shell(
+    images: Tensor, depth: Tensor, cameras: Cameras, mask: Tensor | None = None, count: int = COUNT
+) -> Gaussians | None:
+    """The shell of one scene.
+
+    Args:
+        images: ``[V, 3, H, W]`` in [0, 1].
+        depth: ``[V, H, W]`` supported z-depth, 0 = none.
+        cameras: of the views (B = 1).
+        mask: ``[V, H, W]`` in [0, 1], how much each pixel counts; None: all count.
+        count: Gaussians of the whole sphere.
+
+    Returns:
+        ``count`` flat Gaussians that face the cameras, or None where nearly every pixel has a depth, or none has.
+    """
+    missing = depth <= 0 if mask is None else (depth <= 0) & (mask > 0.5)
+    if missing.float().mean() < LEAST or not (depth > 0).any():
+        return None
+    rows = missing.flatten().nonzero()[:, 0]
+    rows = rows[:: max(1, len(rows) // RAYS)]
+    rays = ray_directions(cameras.intrinsics[0], cameras.size) @ cameras.world_to_camera[0, :, None, :3, :3]
+    rays = F.normalize(rays.reshape(-1, 3)[rows], dim=-1)
+    colors = images.movedim(1, -1).reshape(-1, 3)[rows]
+    directions = _fibonacci(count).to(rays)
+    spacing = math.sqrt(4 * math.pi / count)
+    total = PRIOR * F.pad(colors.mean(0, keepdim=True), (0, 1), value=1.0).repeat(count, 1)  # [N, 4]
+    for ray, color in zip(rays.split(4096), colors.split(4096), strict=True):
+        weight = torch.exp((ray @ directions.T - 1) / (BLUR * spacing) ** 2)
+        total += weight.T @ F.pad(color, (0, 1), value=1.0)
+    radius = RADIUS * depth[depth > 0].median()
+    return Gaussians(
+        means=camera_centers(cameras)[0].mean(0) + radius * directions,
+        quats=_facing(directions),
+        scales=radius * spacing * ALONE * directions.new_tensor([1.0, 1.0, THIN]).repeat(count, 1),
+        opacities=directions.new_full((count,), OPACITY),
+        sh=rgb_to_sh(total[:, :3] / total[:, 3:])[:, None],
+        batch=torch.zeros(count, dtype=torch.int64, device=rays.device),
+    )
+
+
+def with_shell(gaussians: Gaussians, shell: Gaussians | None) -> Gaussians:
+    """A scene with its shell in front of its own Gaussians' rows; its background and degree stay."""
+    if shell is None:
+        return gaussians
+    shell = replace(shell, sh=F.pad(shell.sh, (0, 0, 0, gaussians.sh.shape[1] - shell.sh.shape[1])))
+    names = [field.name for field in fields(Gaussians) if field.name != "background"]
+    return replace(gaussians, **{name: torch.cat((getattr(gaussians, name), getattr(shell, name))) for name in names})
+
+
+def is_far(gaussians: Gaussians, depth: Tensor, cameras: Cameras) -> Tensor:
+    """``[G]`` bool: Gaussians of the shell, told by their distance from every camera; depth as of :func:`far_shell`."""
+    known = depth[depth > 0]
+    if not len(known):
+        return torch.zeros_like(gaussians.batch, dtype=torch.bool)
+    return torch.cdist(gaussians.means, camera_centers(cameras)[0]).amin(1) > FAR * known.median()
+
+
+def _fibonacci(count: int) -> Tensor:
+    """Directions ``[N, 3]`` spread evenly over the sphere."""
+    step = torch.arange(count, dtype=torch.float64) + 0.5
+    z, angle = 1 - 2 * step / count, math.pi * (1 + math.sqrt(5)) * step
+    ring = (1 - z.square()).sqrt()
+    return torch.stack((ring * angle.cos(), ring * angle.sin(), z), -1)
+
+
+def _facing(directions: Tensor) -> Tensor:
+    """Rotations ``[N, 4]`` whose third axis is the direction."""
+    up = directions.new_tensor([[0.0, 1.0, 0.0]]).expand_as(directions)
+    first = F.normalize(torch.linalg.cross(up, directions), dim=-1)
+    second = torch.linalg.cross(directions, first)
+    return matrix_to_quat(torch.stack((first, second, directions), -1))

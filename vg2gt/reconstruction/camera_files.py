@@ -1,0 +1,82 @@
+"""Cameras to render, from the files that people have: our cameras.json, 3DGS's, transforms.json, a COLMAP model."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vg2gt.data.sources.undistortion import pinhole_camera
+from vg2gt.io import colmap_images, colmap_intrinsics, colmap_pose, read_cameras_json, read_colmap, read_transforms
+from vg2gt.io.cameras_json import NamedCamera, invert_pose
+from vg2gt.io.colmap import colmap_files
+from vg2gt.io.errors import FormatError
+from vg2gt.io.json_checks import load_json
+from vg2gt.io.names import by_number
+
+
+def read_cameras(path: str | Path) -> list[NamedCamera]:
+    """Reads cameras of any of these kinds; lens distortion is left out.
+
+    Args:
+        path: a ``cameras.json`` of ours or of 3D Gaussian Splatting, a ``transforms.json``, or the folder of a COLMAP
+            model or of a scene with one in ``sparse/0`` or ``sparse``.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        FormatError: if it is damaged or of no such kind.
+        ImportError: if a COLMAP model is to be read and pycolmap is not installed.
+    """
+    path = Path(path).expanduser()
+    if path.is_dir():
+        return _of_colmap(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"no cameras at {path}")
+    content = load_json(path)
+    if isinstance(content, dict) and "frames" in content:
+        return _of_transforms(path)
+    if isinstance(content, list) and content and isinstance(content[0], dict) and "img_name" in content[0]:
+        return [_of_3dgs(f"{path}: [{index}]", entry) for index, entry in enumerate(content)]
+    return read_cameras_json(path)
+
+
+def _of_colmap(folder: Path) -> list[NamedCamera]:
+    places = [folder, folder / "sparse" / "0", folder / "sparse"]
+    model = read_colmap(next((place for place in places if colmap_files(place)), folder))
+    cameras = []
+    for image in colmap_images(model):
+        lens, pose = pinhole_camera(image.camera), colmap_pose(image)
+        if np.isfinite(pose).all():
+            cameras.append(NamedCamera(image.name, lens.width, lens.height, colmap_intrinsics(lens), pose))
+    return cameras
+
+
+def _of_transforms(path: Path) -> list[NamedCamera]:
+    cameras = []
+    for frame in sorted(read_transforms(path).frames, key=lambda frame: by_number(frame.file_path)):
+        lens = frame.lens
+        if not (lens.width and lens.height):
+            raise FormatError(f"{path}: {frame.file_path} has no image size (w and h), which rendering needs")
+        pose = np.asarray(frame.world_to_camera, np.float64)
+        if np.isfinite(pose).all():
+            matrix = np.asarray(lens.intrinsics(), np.float64)
+            cameras.append(NamedCamera(frame.file_path, lens.width, lens.height, matrix, pose))
+    return cameras
+
+
+def _of_3dgs(place: str, entry: Any) -> NamedCamera:
+    """An entry of 3DGS's ``cameras.json``: centre and camera-to-world rotation, focal lengths, no principal point."""
+    try:
+        to_world = np.eye(4)
+        to_world[:3, :3] = np.asarray(entry["rotation"], np.float64)
+        to_world[:3, 3] = np.asarray(entry["position"], np.float64)
+        width, height = int(entry["width"]), int(entry["height"])
+        fx, fy = float(entry["fx"]), float(entry["fy"])
+        name = str(entry["img_name"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise FormatError(f"{place}: no camera of 3D Gaussian Splatting ({error!r})") from error
+    if not (np.isfinite(to_world).all() and min(width, height) > 0 and min(fx, fy) > 0):
+        raise FormatError(f"{place}: values that are not finite, or no positive size and focal length")
+    matrix = np.array([[fx, 0, (width - 1) / 2], [0, fy, (height - 1) / 2], [0, 0, 1]])
+    return NamedCamera(name, width, height, matrix, invert_pose(to_world))

@@ -1,0 +1,129 @@
+"""Views as other programs take them: whole photographs with their own names, points with the views that see them."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from vg2gt.data.base import DataError
+from vg2gt.geometry.cameras import project
+from vg2gt.io.files import write_bytes
+from vg2gt.io.images import encode_image, to_pixels
+from vg2gt.types import Cameras
+
+if TYPE_CHECKING:
+    from vg2gt.reconstruction.scene import Scene
+
+AGREE = 0.05  # relative difference of depths up to which a view is taken to see a point
+_VIEWS_A_POINT = 12  # observations of a point, at most
+_QUALITY = 95  # of JPEGs that are written again
+
+
+@dataclass(frozen=True)
+class ExportedViews:
+    """The views of a scene with images of their own sizes.
+
+    Attributes:
+        cameras: ``[1, V]`` float64; ``size`` is that of the first view.
+        sizes: ``(height, width)`` of each view.
+        names: file names, unique.
+        writers: write the image of a view to a path.
+    """
+
+    cameras: Cameras
+    sizes: tuple[tuple[int, int], ...]
+    names: tuple[str, ...]
+    writers: tuple[Callable[[Path], None], ...]
+
+    def write_images(self, folder: Path) -> None:
+        """Writes all images."""
+        for name, write in zip(self.names, self.writers, strict=True):
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            write(folder / name)
+
+    def observations(self, scene: Scene) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+        """Which views see the scene's points, and where: points ``[T]``, views ``[T]``, pixels ``[T, 2]``.
+
+        A view sees a point if its decoded depth agrees with the point's; the view that a point comes from always does.
+        """
+        points = scene.points()
+        small = scene.cameras.to("cpu").map(torch.Tensor.double)
+        positions = torch.from_numpy(points.positions)
+        rows, views, pixels = [], [], []
+        for view, depth in enumerate(scene.depth):
+            place, z = project(positions[None, None], small.select(slice(view, view + 1)))
+            x, y = place[0, 0].round().nan_to_num(-1, -1, -1).long().unbind(-1)
+            inside = (z[0, 0] > 0) & (x >= 0) & (y >= 0) & (x < depth.shape[1]) & (y < depth.shape[0])
+            found = torch.where(inside, depth[y.clamp(0, depth.shape[0] - 1), x.clamp(0, depth.shape[1] - 1)], 0)
+            agrees = inside & ((found / z[0, 0] - 1).abs() < AGREE)
+            seen = agrees.numpy() | (points.views == view)
+            (own,) = np.nonzero(seen)
+            rows.append(own)
+            views.append(np.full(len(own), view))
+            pixels.append(self._in_image(place[0, 0].numpy()[own], view, small))
+        owner, view, pixel = np.concatenate(rows), np.concatenate(views), np.concatenate(pixels)
+        kept = _fewer(owner, view == points.views[owner])
+        return owner[kept], view[kept], pixel[kept]
+
+    def _in_image(self, pixels: NDArray[np.float64], view: int, small: Cameras) -> NDArray[np.float64]:
+        """Pixels of the working size as pixels of the exported image."""
+        before, after = small.intrinsics[0, view].numpy(), self.cameras.intrinsics[0, view].numpy()
+        directions = (pixels - before[:2, 2]) / before[[0, 1], [0, 1]]
+        return directions * after[[0, 1], [0, 1]] + after[:2, 2]
+
+
+def exported_views(scene: Scene, whole: bool) -> ExportedViews:
+    """The views with the whole photographs where they are known and wanted, else with the images of working size."""
+    named = scene.named_cameras()
+    poses = torch.from_numpy(np.stack([camera.world_to_camera for camera in named]))
+    small = [(camera.height, camera.width) for camera in named]
+    photos = [camera.photo for camera in named] if whole else [None] * len(named)
+    sizes = tuple((p.height, p.width) if p is not None else s for p, s in zip(photos, small, strict=True))
+    matrices = np.stack([c.intrinsics if p is None else p.intrinsics for c, p in zip(named, photos, strict=True)])
+    names = [camera.name if photo is None else photo.name for camera, photo in zip(named, photos, strict=True)]
+    if len({name.lower() for name in names}) < len(names):  # of several folders
+        names = [f"{camera.name[:-4]}{Path(name).suffix}" for camera, name in zip(named, names, strict=True)]
+    cameras = Cameras(poses[None], torch.from_numpy(matrices)[None], sizes[0])
+    writers = tuple(_writer(scene, view, photos[view] is not None) for view in range(len(named)))
+    return ExportedViews(cameras, sizes, tuple(names), writers)
+
+
+def _writer(scene: Scene, view: int, whole: bool) -> Callable[[Path], None]:
+    picture = scene.pictures[view] if whole else None
+
+    def write(path: Path) -> None:
+        image = scene.images[view]
+        if picture is not None:
+            same = picture.path is not None and not picture.lens and picture.path.suffix.lower() == path.suffix.lower()
+            if same and picture.path is not None and _is_upright(picture.path):
+                shutil.copyfile(picture.path, path)
+                return
+            image = picture.read(picture.size).images[0]
+        kind = {".jpg": "JPEG", ".jpeg": "JPEG"}.get(path.suffix.lower(), "PNG")
+        options = {"quality": _QUALITY, "subsampling": 0} if kind == "JPEG" else {}
+        write_bytes(path, encode_image(to_pixels(image), kind, **options))
+
+    return write
+
+
+def _is_upright(path: Path) -> bool:
+    from vg2gt.io.image_files import orientation
+
+    try:
+        return orientation(path, "") == 1
+    except DataError:
+        return False
+
+
+def _fewer(owner: NDArray[np.int64], own: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Rows of at most ``_VIEWS_A_POINT`` observations of each point, that of the view it comes from first."""
+    order = np.lexsort((~own, owner))
+    start = np.searchsorted(owner[order], owner[order])
+    return np.sort(order[np.arange(len(order)) - start < _VIEWS_A_POINT])

@@ -1,0 +1,189 @@
+"""The frame and unit of a scene: those of given cameras, those of its first camera, or upright."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+from typing import Literal, get_args
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from vg2gt.geometry.alignment import Similarity, align_cameras
+from vg2gt.geometry.rotations import matrix_to_quat, multiply_quats
+from vg2gt.geometry.spherical_harmonics import rotation_of_coefficients
+from vg2gt.types import Cameras, Gaussians
+
+log = logging.getLogger(__name__)
+
+FrameName = Literal["auto", "given", "first", "upright"]
+FAR = 1e4  # units of depth from the origin at which float32 has about a thousandth of one left
+SAME = 1e-4  # of the extent: cameras that differ by less from the given ones are the given ones
+_LEVEL = 0.2  # shortest mean of the cameras' down vectors that still tells where down is
+
+
+@dataclass(frozen=True, eq=False)
+class SceneFrame:
+    """Where a scene's world is in the world of the cameras that it was made of.
+
+    Attributes:
+        name: ``reference`` (camera of the view that the model took for its first, median depth about 1), ``first``
+            (that of the first image), ``upright`` (the reference's, turned until y points along gravity) or ``given``.
+        to_source: ``[4, 4]`` float64 similarity from the scene's world to that of the cameras as they were given, found
+            or predicted; its scale is source units per scene unit.
+        poses: ``[V, 4, 4]`` float64 ``world_to_camera`` as given or found; None where the backbone predicted them.
+        source: ``given``, ``found`` or ``predicted``.
+        wanted: the frame in which it is to be written; ``auto``: the given one if there is one, else upright.
+    """
+
+    name: str
+    to_source: NDArray[np.float64]
+    poses: NDArray[np.float64] | None = None
+    source: str = "predicted"
+    wanted: FrameName = "auto"
+
+    @property
+    def scale(self) -> float:
+        """Source units per scene unit."""
+        return float(np.cbrt(np.linalg.det(self.to_source[:3, :3])))
+
+    @property
+    def target(self) -> str:
+        """The frame in which the scene is to be written."""
+        if self.wanted != "auto":
+            return self.wanted
+        return "given" if self.source == "given" else "upright"
+
+
+def check_frame(wanted: str, source: str | None = None) -> None:
+    """Checks the name of a frame, and that there is a given one where it is asked for.
+
+    Raises:
+        ValueError: naming the choices, or what is missing.
+    """
+    if wanted not in get_args(FrameName):
+        raise ValueError(f"frame is {wanted!r}; choose one of {', '.join(get_args(FrameName))}")
+    if wanted == "given" and source not in (None, "given"):
+        raise ValueError("there are no given cameras, so --frame given means nothing: take --frame upright or first")
+
+
+def first_frame(
+    cameras: Cameras, unit: float, poses: NDArray[np.float64] | None, source: str, wanted: FrameName
+) -> SceneFrame:
+    """The frame of a new scene, whose world is the camera of one of its views.
+
+    Args:
+        cameras: the scene's (B = 1).
+        unit: scene units per source unit, where the cameras do not move and say nothing of it.
+        poses: ``[V, 4, 4]`` of the cameras as they were given or found.
+        source: ``given``, ``found`` or ``predicted``.
+        wanted: see :class:`SceneFrame`.
+    """
+    scaled = np.diag([1 / unit, 1 / unit, 1 / unit, 1.0])
+    if poses is None:
+        return SceneFrame("reference", scaled, None, source, wanted)
+    own = replace(cameras, world_to_camera=cameras.world_to_camera.detach().cpu().double())
+    given = replace(own, world_to_camera=torch.from_numpy(poses)[None])
+    return SceneFrame(
+        "reference", _matrix(align_cameras(own, given, lambda: torch.tensor([1 / unit]))), poses, source, wanted
+    )
+
+
+def move_to_target(frame: SceneFrame, cameras: Cameras, depth: float) -> tuple[SceneFrame, Similarity]:
+    """The frame in which a scene is to be written, and the similarity that takes it there (float64, B = 1).
+
+    Args:
+        frame: where the scene is.
+        cameras: its views (B = 1).
+        depth: its median depth in scene units.
+    """
+    move = np.eye(4)
+    if frame.target == "given":
+        move = _near_origin(frame.to_source.copy(), frame.scale * depth)
+    elif frame.target == "first":
+        move = cameras.world_to_camera[0, 0].detach().cpu().double().numpy()
+    elif frame.target == "upright":
+        move[:3, :3] = upright_rotation(cameras.world_to_camera[0].detach().cpu().double().numpy())
+    return replace(frame, name=frame.target, to_source=frame.to_source @ np.linalg.inv(move)), _similarity(move)
+
+
+def upright_rotation(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The smallest rotation ``[3, 3]`` that brings gravity to +y, as the cameras ``[V, 4, 4]`` tell it.
+
+    People hold cameras level: gravity is at right angles to the cameras' x axes as far as these point in different
+    directions, and is their mean down vector otherwise. Cameras that hang in all directions leave the world as it is.
+    """
+    down = poses[:, 1, :3].mean(0)
+    if np.linalg.norm(down) < _LEVEL:
+        return np.eye(3)
+    down /= np.linalg.norm(down)
+    sideways = poses[:, 0, :3]
+    values, vectors = np.linalg.eigh(sideways.T @ sideways / len(poses))
+    normal = vectors[:, 0] * np.sign(vectors[:, 0] @ down)
+    if values[1] > 0.05 and values[0] < 0.3 * values[1] and normal @ down > 0.5:
+        down = normal
+    axis, cosine = np.cross(down, [0, 1, 0]), down[1]
+    if cosine < -0.999999:
+        return np.diag([1.0, -1, -1])
+    cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    return np.eye(3) + cross + cross @ cross / (1 + cosine)
+
+
+def moved_gaussians(gaussians: Gaussians, move: Similarity) -> Gaussians:
+    """One scene's Gaussians moved by a similarity (B = 1), computed in float64."""
+    move = move.to(gaussians.means.device)
+    turn, dtype = move.rotation[0], gaussians.means.dtype
+    degree = round(gaussians.sh.shape[1] ** 0.5) - 1
+    return replace(
+        gaussians,
+        means=move.apply(gaussians.means[None].double())[0].to(dtype),
+        quats=multiply_quats(matrix_to_quat(turn)[None], gaussians.quats.double()).to(dtype),
+        scales=(gaussians.scales.double() * move.scale).to(dtype),
+        sh=(rotation_of_coefficients(turn, degree) @ gaussians.sh.double()).to(dtype),
+    )
+
+
+def moved_cameras(cameras: Cameras, move: Similarity, frame: SceneFrame) -> tuple[Cameras, Tensor]:
+    """Cameras moved by a similarity (B = 1), and their poses ``[V, 4, 4]`` in float64.
+
+    In the given frame the poses are the given ones, to the last digit, unless they were changed.
+    """
+    own = replace(cameras, world_to_camera=cameras.world_to_camera.detach().cpu().double())
+    poses = move.to("cpu").apply_cameras(own).world_to_camera[0]
+    if frame.poses is not None and len(frame.poses) == len(poses):
+        given = torch.from_numpy(frame.poses @ frame.to_source)  # seen from the frame's world, not yet rigid
+        given[:, :3] /= frame.scale
+        extent = max(float(given[:, :3, 3].abs().max()), 1e-12)
+        if (given - poses).abs().max() < SAME * max(extent, 1.0):
+            poses = given
+    moved = poses.to(cameras.world_to_camera.device, cameras.world_to_camera.dtype)
+    return replace(cameras, world_to_camera=moved[None]), poses
+
+
+def _near_origin(move: NDArray[np.float64], depth: float) -> NDArray[np.float64]:
+    """Leaves out a shift that float32 could not hold, such as map coordinates, and says so."""
+    far = float(np.linalg.norm(move[:3, 3]))
+    if far > FAR * depth:
+        offset = move[:3, 3].round()
+        log.warning(
+            "the given cameras are %.3g depths from their origin, more than single precision holds: the scene is "
+            "written shifted by %s; report.json and cameras.json have the similarity to the given frame",
+            far / depth, (-offset).tolist(),
+        )  # fmt: skip
+        move[:3, 3] -= offset
+    return move
+
+
+def _matrix(similarity: Similarity) -> NDArray[np.float64]:
+    matrix = np.eye(4)
+    matrix[:3, :3] = float(similarity.scale[0]) * similarity.rotation[0].double().numpy()
+    matrix[:3, 3] = similarity.translation[0].double().numpy()
+    return matrix
+
+
+def _similarity(matrix: NDArray[np.float64]) -> Similarity:
+    linear, shift = torch.from_numpy(matrix[:3, :3].copy()), torch.from_numpy(matrix[:3, 3].copy())
+    scale = torch.linalg.det(linear) ** (1 / 3)
+    return Similarity(scale[None], (linear / scale)[None], shift[None])

@@ -1,0 +1,49 @@
+"""The order in which views are worked on: the same for the same images, in whatever order they are given."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from vg2gt.data.transforms import to_bytes
+from vg2gt.reconstruction.inputs import Views
+from vg2gt.types import Cameras, Geometry, Hints
+
+_THUMBNAIL = 24  # pixels a side
+
+
+def working_order(images: Tensor) -> list[int]:
+    """Positions of views ``[V, 3, H, W]`` in the order in which they are worked on.
+
+    The first one gives the scene its frame: the view that looks most like the others, by the correlation of
+    thumbnails. The others follow in an order of their contents.
+    """
+    contents = [hashlib.sha256(to_bytes(image).numpy().tobytes()).hexdigest() for image in images]
+    order = sorted(range(len(contents)), key=lambda view: contents[view])
+    small = F.interpolate(images[order].mean(1, keepdim=True), (_THUMBNAIL, _THUMBNAIL), mode="area").flatten(1)
+    unit = F.normalize(small.double() - small.double().mean(1, keepdim=True), dim=1)
+    reference = int((unit @ unit.mean(0)).argmax())
+    return [order[reference], *(view for place, view in enumerate(order) if place != reference)]
+
+
+def in_order(views: Views, order: Sequence[int]) -> tuple[Tensor, Hints | None]:
+    """Images ``[V, 3, H, W]`` and hints of views in another order."""
+    hints = views.hints
+    if hints is not None:
+        cameras = None if hints.cameras is None else hints.cameras.select(torch.tensor(order))
+        parts = {name: getattr(hints, name) for name in ("depth", "frame_ids", "mask")}
+        chosen = {name: None if value is None else value[:, list(order)] for name, value in parts.items()}
+        hints = replace(hints, cameras=cameras, **chosen)
+    return views.images[list(order)], hints
+
+
+def as_given(geometry: Geometry, order: Sequence[int]) -> Geometry:
+    """Geometry of views in working order as of the views as they were given."""
+    back = torch.tensor(order).argsort()
+    cameras: Cameras = geometry.cameras.select(back.to(geometry.depth.device))
+    return replace(geometry, depth=geometry.depth[:, back], depth_conf=geometry.depth_conf[:, back], cameras=cameras)

@@ -1,0 +1,77 @@
+"""Which photographs structure from motion compares: all pairs of few, likely pairs of many.
+
+Of many, each is compared with some before it in the order given, at distances that double (a walk has little baseline
+between neighbours), and with those that look alike. How alike two are is told by VLAD (Jegou et al. 2010) of their SIFT
+features, whose words are found in these very photographs: no vocabulary needs to be fetched.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+ALL_PAIRS = 60  # photographs of which every pair is compared
+DISTANCES = (1, 2, 4, 8, 16)  # in the order given
+ALIKE = 10  # photographs that look alike, for each
+APART = 3  # of those, none is so near in the order to another: frames of a video would all be neighbours
+WORDS, ROUNDS, SAMPLE = 64, 10, 20_000  # of k-means
+LEAST = 1e-9
+
+
+def likely_pairs(descriptors: Sequence[NDArray[np.uint8]], seed: int = 0) -> list[tuple[int, int]]:
+    """Pairs (earlier, later) of many photographs that probably show the same things.
+
+    Args:
+        descriptors: ``[n, 128]`` SIFT of each photograph, in order; ``n`` may be 0.
+        seed: of the words.
+
+    Returns:
+        Each pair once, sorted by the later photograph.
+    """
+    likeness = _vlad(descriptors, seed)
+    likeness = likeness @ likeness.T
+    count = len(descriptors)
+    pairs = {(i - distance, i) for distance in DISTANCES for i in range(distance, count)}
+    for i in range(count):
+        taken = [i]
+        for j in np.argsort(-likeness[i], kind="stable").tolist():
+            if len(taken) > ALIKE:
+                break
+            if min(abs(j - k) for k in taken) > APART:
+                taken.append(j)
+                pairs.add((min(i, j), max(i, j)))
+    return sorted(pairs, key=lambda pair: pair[::-1])
+
+
+def _vlad(descriptors: Sequence[NDArray[np.uint8]], seed: int) -> NDArray[np.float32]:
+    """One unit vector ``[N, words * 128]`` a photograph: summed differences of its features to their nearest words."""
+    rng = np.random.default_rng(seed)
+    everything = np.concatenate([np.zeros((0, 128), np.uint8), *descriptors])
+    if not len(everything):
+        return np.zeros((len(descriptors), 1), np.float32)
+    sample = everything[rng.permutation(len(everything))[:SAMPLE]].astype(np.float32)
+    words = sample[:WORDS]
+    for _ in range(ROUNDS):
+        nearest = _nearest(sample, words)
+        sums = np.zeros_like(words)
+        np.add.at(sums, nearest, sample)
+        members = np.bincount(nearest, minlength=len(words))[:, None]
+        words = np.where(members > 0, sums / np.maximum(members, 1), words).astype(np.float32)
+    found = np.zeros((len(descriptors), *words.shape), np.float32)
+    for row, own in enumerate(descriptors):
+        features = own.astype(np.float32)
+        nearest = _nearest(features, words)
+        np.add.at(found[row], nearest, features - words[nearest])
+    # First every word's part, so that none outweighs the others.
+    return _unit(_unit(found).reshape(len(found), -1))
+
+
+def _unit(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
+    length = np.sqrt((vectors**2).sum(-1, keepdims=True, dtype=np.float32))
+    return vectors / np.maximum(length, np.float32(LEAST))
+
+
+def _nearest(features: NDArray[np.float32], words: NDArray[np.float32]) -> NDArray[np.int64]:
+    return np.argmin((words**2).sum(1) - 2 * features @ words.T, axis=1)

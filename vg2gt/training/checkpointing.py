@@ -1,0 +1,60 @@
+"""Lightning's checkpoints: written whole or not at all, the newest kept."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import lightning
+from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.plugins.io import TorchCheckpointIO
+
+from vg2gt.runs.checkpoints import by_age, read_checkpoint, write_checkpoint
+
+
+class AtomicCheckpointIO(TorchCheckpointIO):
+    """Writes a checkpoint whole or not at all, and loads tensors and plain values only (no pickled code)."""
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any | None = None) -> None:
+        """Saves by :func:`vg2gt.runs.checkpoints.write_checkpoint`."""
+        write_checkpoint(checkpoint, path)
+
+    def load_checkpoint(self, path: Any, map_location: Any = "cpu", weights_only: bool | None = True) -> dict[str, Any]:
+        """Loads on the CPU with ``weights_only=True``, whatever is asked for."""
+        return read_checkpoint(path)
+
+
+class NewestCheckpoints(ModelCheckpoint):
+    """Saves ``step-<number>.ckpt`` every few steps and keeps the newest in the folder, whoever saved them.
+
+    Lightning's own choice by ``monitor="step"`` skips the last step of an epoch and never deletes the checkpoint that a
+    run was resumed from: a job that is requeued often would fill the disk.
+
+    Args:
+        dirpath: the folder.
+        every_n_train_steps: a checkpoint every this many steps.
+        save_top_k: how many are kept; -1: all.
+    """
+
+    def __init__(self, dirpath: str, every_n_train_steps: int = 100, save_top_k: int = 3) -> None:
+        if every_n_train_steps < 1 or (save_top_k < 1 and save_top_k != -1):
+            raise ValueError(
+                f"every_n_train_steps={every_n_train_steps} must be at least 1, save_top_k={save_top_k} at least 1, or "
+                "-1 for all"
+            )
+        super().__init__(
+            dirpath,
+            "step-{step}",
+            every_n_train_steps=every_n_train_steps,
+            save_top_k=-1,
+            auto_insert_metric_name=False,
+            enable_version_counter=False,
+        )
+        self.kept = save_top_k
+
+    def on_train_batch_end(self, trainer: lightning.Trainer, *args: Any, **more: Any) -> None:
+        """Saves when it is the step's turn, then deletes all but the newest."""
+        super().on_train_batch_end(trainer, *args, **more)
+        if trainer.is_global_zero and self.kept > 0 and not getattr(trainer, "fast_dev_run", False):
+            for path in by_age(Path(str(self.dirpath)))[self.kept :]:
+                path.unlink(missing_ok=True)

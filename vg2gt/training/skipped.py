@@ -1,0 +1,90 @@
+"""Steps that are skipped because something in them is not finite.
+
+A skipped step changes neither weights nor optimiser moments, on any rank. It still counts as a step: data, random draws
+and learning rate go on, so that a resumed run meets the same steps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+KEPT = 20  # faults in the report of a run
+
+
+@dataclass(frozen=True)
+class Fault:
+    """What a rank found wrong with a step.
+
+    Attributes:
+        scenes: scenes of the rank's batch.
+        cause: what is not finite.
+        step: number of the optimiser's step.
+        rank: the process.
+    """
+
+    scenes: tuple[str, ...]
+    cause: str
+    step: int
+    rank: int
+
+    def __str__(self) -> str:
+        return f"rank {self.rank}, {', '.join(self.scenes)}: {self.cause}"
+
+
+def finite(*tensors: Tensor) -> bool:
+    """Whether every value is finite; a GPU is waited for once where it is."""
+    sums = torch.stack([tensor.detach().sum().float() for tensor in tensors])  # a bad value shows in the sum
+    return bool(sums.isfinite().all()) or all(bool(tensor.detach().isfinite().all()) for tensor in tensors)
+
+
+class SkippedSteps:
+    """Counts skipped steps.
+
+    Args:
+        limit: the run ends after this many skipped steps in a row.
+
+    Attributes:
+        total: steps skipped since the run began.
+        in_a_row: steps skipped since the last good one.
+        faults: the first faults of the run, at most :data:`KEPT`.
+
+    Raises:
+        ValueError: if the limit is below 1.
+    """
+
+    def __init__(self, limit: int) -> None:
+        if limit < 1:
+            raise ValueError(f"training.max_skipped must be at least 1, got {limit}")
+        self.limit = limit
+        self.total = 0
+        self.in_a_row = 0
+        self.faults: list[Fault] = []
+
+    def add(self, faults: list[Fault]) -> None:
+        """Counts a skipped step.
+
+        Raises:
+            FloatingPointError: if it is one too many in a row.
+        """
+        self.total += 1
+        self.in_a_row += 1
+        self.faults = (self.faults + faults)[:KEPT]
+        if self.in_a_row >= self.limit:
+            raise FloatingPointError(
+                f"{self.in_a_row} steps in a row had a non-finite loss or gradient, the last: "
+                f"{'; '.join(map(str, faults))}. Look at its scenes, lower optimizer.lr, or raise training.max_skipped"
+            )
+
+    def state_dict(self) -> dict[str, Any]:
+        """Plain values, for a checkpoint and the report of a run."""
+        faults = [asdict(fault) | {"scenes": list(fault.scenes)} for fault in self.faults]
+        return {"total": self.total, "in_a_row": self.in_a_row, "faults": faults}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continues the count of a checkpoint."""
+        self.total, self.in_a_row = state["total"], state["in_a_row"]
+        self.faults = [Fault(**{**fault, "scenes": tuple(fault["scenes"])}) for fault in state["faults"]]

@@ -1,0 +1,62 @@
+"""Saves and ends a training when the machine asks it to stop."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import lightning
+
+log = logging.getLogger(__name__)
+
+SIGNALS = (signal.SIGTERM, signal.SIGINT, *((signal.SIGUSR1,) if hasattr(signal, "SIGUSR1") else ()))
+
+
+class StopOnSignal(lightning.Callback):
+    """On SIGTERM, Ctrl-C or SIGUSR1: finishes the step, writes a checkpoint and ends normally.
+
+    SLURM announces the end of a job's time by SIGUSR1. A second Ctrl-C ends at once. ``ckpt=last`` continues the run.
+    Signals outside the training, as in the evaluation before it, end the process as usual.
+
+    Args:
+        folder: where the checkpoint is written, that of the checkpoint callback.
+    """
+
+    def __init__(self, folder: str) -> None:
+        self.folder = Path(folder)
+        self.received = False
+        self._previous: dict[signal.Signals, Any] = {}
+
+    def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        """Takes over the signals for the time of the training."""
+        self._previous = {number: signal.signal(number, self._note) for number in SIGNALS}
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        self.received = True
+        if number == signal.SIGINT:
+            signal.signal(number, signal.default_int_handler)
+            os.write(2, b"\nending after this step with a checkpoint; Ctrl-C again ends at once\n")
+
+    def on_train_batch_end(self, trainer: lightning.Trainer, *args: Any) -> None:
+        """Saves and stops at the end of the step in which a signal reached any rank."""
+        # Lightning's own handler only takes a note of a SIGTERM before the training starts.
+        asked = self.received or bool(getattr(trainer, "received_sigterm", False))
+        if not trainer.strategy.reduce_boolean_decision(asked, all=False):
+            return
+        path = self.folder / f"step-{trainer.global_step}.ckpt"
+        if not getattr(trainer, "fast_dev_run", False):
+            trainer.save_checkpoint(path)
+        trainer.limit_val_batches = 0  # a trainer that is told to stop would evaluate once more
+        trainer.should_stop = True
+        log.warning("stopping as asked by a signal: saved %s, continue with ckpt=last", path)
+
+    def teardown(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, stage: str) -> None:
+        """Gives back the signals that Lightning has not given back itself, after an error as well."""
+        for number, handler in self._previous.items():
+            if signal.getsignal(number) == self._note:
+                signal.signal(number, handler)
+        self._previous = {}
