@@ -54,7 +54,7 @@ def test_stages_of_the_papers_experiment(tmp_path: Path) -> None:
 
 def test_every_script_is_in_the_table() -> None:
     scripts = {path.name for path in BENCHMARKS.glob("*.py")} - {"common.py", "stage_clock.py"}
-    helpers = {"found_poses.py", "opensplat.py", "render_scene.py"}
+    helpers = {"found_poses.py", "opensplat.py", "photo_sets.py", "render_scene.py"}
     assert set(re.findall(r"`(\w+\.py)`", (BENCHMARKS / "README.md").read_text())) - {"train.py"} == scripts - helpers
 
 

@@ -61,9 +61,10 @@ def read_views(room: Path) -> Iterator[tuple[str, Camera, NDArray[np.float64]]]:
     """Path, camera and depth of a room's views, in order."""
     for index, view in enumerate(json.loads((room / "views.json").read_text())):
         stem = f"0_0_{index:04d}_0"
-        with np.load(room / f"frames/camview/camera_0/camview_{stem}.npz") as file:
+        with np.load(room / f"frames/camview/camera_0/camview_{stem}.npz", allow_pickle=False) as file:
             camera = (file["K"], file["T"])
-        yield view["path"], camera, np.load(room / f"frames/Depth/camera_0/Depth_{stem}.npy").astype(np.float64)
+        depth = np.load(room / f"frames/Depth/camera_0/Depth_{stem}.npy", allow_pickle=False)
+        yield view["path"], camera, depth.astype(np.float64)
 
 
 def check_room(room: Path) -> dict[str, float | int | bool]:

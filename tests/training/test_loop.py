@@ -7,6 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -106,6 +107,16 @@ def test_sigterm_saves_and_ends(tmp_path: Path, cache: Path) -> None:
     saved = newest_valid(folder / "checkpoints")
     assert read_checkpoint(saved)["global_step"] >= 1
     assert "continue with ckpt=last" in attempt.said()
+
+
+def test_sigterm_ends_an_evaluation_at_once(tmp_path: Path, cache: Path) -> None:
+    folder = tmp_path / "run"
+    overrides = [*SMALL, f"output_dir={folder}", f"hydra.run.dir={folder}", f"data.cache_dir={cache}"]
+    attempt = crash_harness.start(crash_harness.TRAIN, [*overrides, "data.eval_scenes=1000"], folder)
+    assert attempt.wait_for(lambda attempt: "compil" in attempt.said() or "evaluating the untrained" in attempt.said())
+    time.sleep(5)
+    os.kill(attempt.process.pid, signal.SIGTERM)
+    assert attempt.wait() == -signal.SIGTERM
 
 
 def test_a_run_never_restarts_silently(full_run: Path, cache: Path, tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ Kernels are therefore kept in a folder named by a hash of all sources they can b
 
 from __future__ import annotations
 
+import gc
 import hashlib
 import logging
 import os
@@ -103,6 +104,7 @@ class _Announcement(event.Listener):
         """Says it at the first compilation."""
         if not self._said:
             log.info("compiling kernels, once on this machine and version (about 20 s in all)")
+            gc.freeze()  # else the collector walks through all of torch again and again meanwhile
         self._said = True
 
     def on_end(self, event: event.Event) -> None:

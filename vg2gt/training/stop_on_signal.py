@@ -10,6 +10,7 @@ from types import FrameType
 from typing import Any
 
 import lightning
+from lightning.pytorch.trainer.states import TrainerFn
 
 log = logging.getLogger(__name__)
 
@@ -34,6 +35,11 @@ class StopOnSignal(lightning.Callback):
     def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Takes over the signals for the time of the training."""
         self._previous = {number: signal.signal(number, self._note) for number in SIGNALS}
+
+    def on_validation_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        """Outside the training there is nothing to save: Lightning's handler would only take a note."""
+        if trainer.state.fn == TrainerFn.VALIDATING:
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
     def _note(self, number: int, frame: FrameType | None) -> None:
         self.received = True
