@@ -15,8 +15,9 @@ from vg2gt.io.names import by_number
 from vg2gt.model import Reconstructor
 from vg2gt.reconstruction.given_cameras import LAYOUTS, describe, given_pictures
 from vg2gt.reconstruction.monitor import Monitor
-from vg2gt.reconstruction.pictures import ImagesLike, Picture, find_pictures, readable, without_copies
+from vg2gt.reconstruction.pictures import ImagesLike, Picture, find_pictures
 from vg2gt.reconstruction.sfm import find_cameras, require_pycolmap
+from vg2gt.reconstruction.sound import readable, without_copies
 
 log = logging.getLogger(__name__)
 

@@ -16,7 +16,8 @@ from vg2gt.data.transforms import resize_to_cover
 from vg2gt.geometry.cameras import crop_intrinsics, resize_intrinsics
 from vg2gt.io.cameras_json import NamedCamera, Photo
 from vg2gt.reconstruction.monitor import Monitor
-from vg2gt.reconstruction.pictures import Picture, name_damaged
+from vg2gt.reconstruction.pictures import Picture
+from vg2gt.reconstruction.sound import name_damaged
 from vg2gt.types import Cameras, Hints
 
 log = logging.getLogger(__name__)

@@ -184,7 +184,7 @@ def frame_figures(scene: Scene) -> dict[str, Any]:
     if scene.frame is None:
         return {}
     matrix, scale = scene.frame.to_source, scene.frame.scale
-    unit = "that of the given cameras" if scene.frame.name == "given" else "the median depth of the views, about"
+    unit = "that of the given cameras" if scene.frame.name == "given" else "about the median depth of the views"
     similarity = {"scale": scale, "rotation": (matrix[:3, :3] / scale).tolist(), "translation": matrix[:3, 3].tolist()}
     return {"frame": scene.frame.name, "unit": unit, "similarity_to_cameras": similarity}
 

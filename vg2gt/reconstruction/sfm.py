@@ -37,9 +37,10 @@ from vg2gt.io.json_checks import load_json
 from vg2gt.reconstruction.given_cameras import LAYOUTS, recording_pictures
 from vg2gt.reconstruction.maps import whole_folder
 from vg2gt.reconstruction.monitor import Monitor
-from vg2gt.reconstruction.pictures import SFM_SOURCE, UNKNOWN_LENS, Picture, name_damaged
+from vg2gt.reconstruction.pictures import SFM_SOURCE, UNKNOWN_LENS, Picture
 from vg2gt.reconstruction.sfm_models import FEWEST_POINTS, map_cameras, other_parts, placed_images, sound_models
 from vg2gt.reconstruction.sfm_pairs import ALL_PAIRS, likely_pairs
+from vg2gt.reconstruction.sound import name_damaged
 
 if TYPE_CHECKING:
     from pycolmap import Reconstruction  # pyright: ignore[reportMissingImports]
