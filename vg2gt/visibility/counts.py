@@ -115,7 +115,7 @@ def _count_compiled(depth: Tensor, cameras: Cameras, partners: Tensor, tolerance
 
 @kernel(fastmath={"contract", "nsz", "arcp"}, error_model="numpy", nogil=True)
 def _count_view(view, depth, partners, matrix, tolerance, margin, agree, through, hidden):
-    """One view's counts over its partners; ``matrix [V, K, 3, 4]`` takes ``depth * (x, y, 1)`` into a partner's image."""
+    """Counts of one view; ``matrix [V, K, 3, 4]`` takes ``depth * (x, y, 1)`` into a partner's image."""
     height, width = depth.shape[1:]
     one, half = np.float32(1), np.float32(0.5)
     most = one - margin
