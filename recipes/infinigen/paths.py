@@ -128,7 +128,11 @@ def _free(space: Space, point: Vector, margin: float = _MARGIN) -> bool:
 
 
 def _looks_at_room(space: Space, position: Vector, forward: Vector, field_of_view: float, least: float) -> bool:
-    """Whether nothing fills the view from close by: the middle distance of a grid of rays is at least ``least``."""
+    """Whether a view shows more than one thing from close by, asked by a grid of rays.
+
+    Their middle distance is at least ``least``, and from 0.8 m on, the longest is 1.5 times the shortest: a bare wall
+    alone teaches little.
+    """
     right = np.cross(forward, (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right)
     up = np.cross(right, forward)
@@ -138,7 +142,8 @@ def _looks_at_room(space: Space, position: Vector, forward: Vector, field_of_vie
         for y in (-0.35, 0.0, 0.35):
             ray = forward + half * (x * right + y * up)
             distances.append(space.cast(position, ray / np.linalg.norm(ray))[0])
-    return float(np.median(distances)) >= least and min(distances) > 0.1
+    varied = least < 0.8 or max(distances) > 1.5 * min(distances)
+    return varied and float(np.median(distances)) >= least and min(distances) > 0.1
 
 
 def _look(pan: float, nod: float) -> Vector:

@@ -35,7 +35,7 @@ _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # between the axes of Blender's cameras
 _SKY = 1e4  # metres; Blender's depth of the sky is 1e10
 _THINGS = (0.08, 1.3)  # radii (metres) of what can be looked at
 _FIXED = ("Window", "Door", "CeilingLight", "Skirting", "Curtain", "Rug", "Ceiling", "Wall", "Pillar")
-_GRAY = 0.16  # mean linear brightness that an exposure aims at
+_GRAY = 0.22  # mean linear brightness that an exposure aims at
 
 
 class Room:

@@ -165,3 +165,22 @@ def test_held_out_views_have_no_decoded_depth_to_agree_with(sample) -> None:
 def test_unknown_normal_target_is_refused() -> None:
     with pytest.raises(ValueError, match=r"loss\.gaussian\.normal_target.*'world'"):
         GaussianLoss(normal_target="world")
+
+
+def test_colours_that_do_not_count_change_nothing(case) -> None:
+    """Issue 47, item 7: what a mask hides is neither in the error nor in the structure of its neighbours."""
+    rendered, cameras, targets, scale = case
+    mask = torch.ones(2, *SIZE, dtype=torch.float64)
+    mask[..., :8] = 0
+    masked = replace(targets, mask=mask)
+    other = replace(rendered, color=rendered.color.clone())
+    other.color[..., :8] = 0.123
+    color = other.color.requires_grad_(True)
+    one, same = GaussianLoss()(rendered, cameras, masked, scale), GaussianLoss()(other, cameras, masked, scale)
+    for name in ("color_l1", "ssim"):
+        torch.testing.assert_close(one[name], same[name], rtol=0, atol=0)
+    (same["color_l1"] + same["ssim"]).backward()
+    assert color.grad is not None
+    assert (color.grad[..., :8] == 0).all()
+    assert (color.grad[..., 8:] != 0).any()
+    assert GaussianLoss()(other, cameras, targets, scale)["color_l1"] != one["color_l1"]

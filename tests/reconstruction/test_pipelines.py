@@ -382,6 +382,16 @@ def test_damaged_photographs_are_named_together_and_may_be_skipped(photos: Path,
         assert "IMG_11.png" in caplog.text
 
 
+def test_panoramas_are_refused_in_one_line(tmp_path: Path) -> None:
+    """Item 25."""
+    Image.new("RGB", (200, 100)).save(tmp_path / "wide.jpg")
+    assert len(find_pictures(tmp_path)) == 1
+    note = b'<x:xmpmeta><rdf:Description GPano:ProjectionType="equirectangular"/></x:xmpmeta>'
+    Image.new("RGB", (200, 100)).save(tmp_path / "sphere.jpg", xmp=note)
+    with pytest.raises(ValueError, match=r"sphere\.jpg is a 360 degree panorama.*faces of a cube"):
+        find_pictures(tmp_path)
+
+
 def test_images_and_a_photograph_beside_their_folder(folder: Path, caplog) -> None:
     """Item 26: the one beside images/ was taken alone; folders were passed over without a word."""
     shutil.copy(folder / "images" / NAMES[0], folder / "preview.png")

@@ -12,10 +12,12 @@ import torch
 from PIL import Image
 
 from vg2gt.cli import main
+from vg2gt.cli.reconstruct import _refinement
 from vg2gt.io import read_cameras_json, read_gaussian_ply
 from vg2gt.reconstruction.outputs import write_outputs
 from vg2gt.reconstruction.saved import read_scene
 from vg2gt.reconstruction.scene import Scene
+from vg2gt.refinement import RefineOptions, RefineRates
 
 ORACLE = ["--backend", "oracle,depth_noise=0.02", "--quiet", "--device", "cpu"]
 
@@ -94,8 +96,23 @@ def test_reconstruct_refines_at_once(
     assert report["seconds"]["refine"] > 0
     assert (tmp_path / "out" / "refine.png").is_file()
     with pytest.raises(SystemExit):
-        vg2gt(monkeypatch, "reconstruct", "--refine", str(recording), *ORACLE, "--out", str(tmp_path / "x"))
-    assert "write --refine=N" in capsys.readouterr().err
+        vg2gt(monkeypatch, "reconstruct", str(recording), "--refine", "x", *ORACLE, "--out", str(tmp_path / "x"))
+    assert "'x' is no number of steps" in capsys.readouterr().err
+
+
+def test_photographs_are_refined_unless_asked_not_to(scene: Scene) -> None:
+    """Cameras from bundle adjustment stay, predicted ones move; recordings are refined on demand, as before."""
+    photographs = replace(scene, cameras_from="structure from motion, 4 of 4 images")
+    by_default = _refinement(photographs, None)
+    assert by_default is not None
+    assert (by_default.steps, by_default.rates.cameras, by_default.min_views) == (500, 0.0, 2)
+    assert _refinement(photographs, 0) is None
+    predicted = _refinement(replace(scene, cameras_from=""), 7)
+    assert predicted is not None
+    assert (predicted.steps, predicted.rates.cameras) == (7, RefineRates().cameras)
+    recording = replace(scene, cameras_from="RGBDFolder somewhere")
+    assert _refinement(recording, None) is None
+    assert _refinement(recording, 7) == RefineOptions(steps=7)
 
 
 @pytest.mark.parametrize(

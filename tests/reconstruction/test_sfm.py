@@ -14,7 +14,7 @@ from tests.reconstruction.test_given_cameras import STAND_IN
 from vg2gt.cli import reconstruct as reconstruct_command
 from vg2gt.geometry.alignment import align_points
 from vg2gt.geometry.cameras import camera_centers
-from vg2gt.io import read_colmap
+from vg2gt.io import colmap_images, read_colmap
 from vg2gt.io.image_files import focal_length
 from vg2gt.metrics.cameras import relative_pose_errors
 from vg2gt.reconstruction import sfm
@@ -128,16 +128,15 @@ def test_points_project_to_where_they_were_seen(given: Path, solved: Path) -> No
     """In our pixels, whose centres are whole numbers: half a pixel's mistake would show."""
     pictures = again(given, solved)
     model = read_colmap(solved / "sparse")
-    places = dict(zip(model.points.ids.tolist(), model.points.positions, strict=True))
     errors, depths = [], []
-    for picture, image in zip(pictures, sorted(model.images.values(), key=lambda image: image.name), strict=True):
+    for picture, image in zip(pictures, colmap_images(model), strict=True):
         frames = picture.read(picture.size)
         camera, k = frames.world_to_camera[0].double(), frames.intrinsics[0].double()
-        seen = image.point3d_ids >= 0
-        world = torch.from_numpy(np.stack([places[number] for number in image.point3d_ids[seen].tolist()]))
+        features = image.get_observation_points2D()
+        world = torch.from_numpy(np.stack([model.points3D[feature.point3D_id].xyz for feature in features]))
         local = world @ camera[:3, :3].mT + camera[:3, 3]
         pixels = (local @ k.mT)[:, :2] / local[:, 2:]
-        errors.append(pixels - torch.from_numpy(image.points2d[seen] - 0.5))
+        errors.append(pixels - torch.from_numpy(np.stack([feature.xy for feature in features]) - 0.5))
         depths.append(local[:, 2])
     error: Tensor = torch.cat(errors)
     assert len(error) > 300

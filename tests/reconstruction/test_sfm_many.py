@@ -4,6 +4,7 @@ import json
 import shutil
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -58,15 +59,22 @@ def test_images_without_features_have_pairs_too(seen: int) -> None:
     assert {(i, i + 1) for i in range(69)} <= set(sfm_pairs.likely_pairs(descriptors))
 
 
-def test_many_photographs_are_placed_at_once(shared: Path, tmp_path: Path, monkeypatch) -> None:
-    """The way of many, for eight."""
+def test_many_photographs_are_matched_in_likely_pairs(shared: Path, tmp_path: Path, monkeypatch) -> None:
+    """The way of many, for eight: 17 of 28 pairs."""
     pycolmap = pytest.importorskip("pycolmap")
-    for module in (sfm, sfm_models):
-        monkeypatch.setattr(module, "ALL_PAIRS", 5)
-    monkeypatch.setattr(sfm_pairs, "ALIKE", 1)
-    monkeypatch.setattr(pycolmap, "incremental_mapping", lambda *_, **__: pytest.fail("one by one"))
+    pairs: list[str] = []
+    match = pycolmap.match_image_pairs
+
+    def count(database: Path, **options: Any) -> None:
+        pairs.extend(options["pairing_options"].match_list_path.read_text().splitlines())
+        match(database, **options)
+
+    monkeypatch.setattr(sfm, "ALL_PAIRS", 5)
+    monkeypatch.setattr(sfm_pairs, "ALIKE", 0)
+    monkeypatch.setattr(pycolmap, "match_image_pairs", count)
     pictures = sfm.find_cameras(find_pictures(office_photos(shared, 8)), tmp_path / "sfm", Monitor())
     assert len(pictures) == 8
+    assert len(pairs) == 7 + 6 + 4
     assert center_errors(pictures, shared, list(range(8))).median() < 0.03
 
 
@@ -89,7 +97,8 @@ def kept(photos: Path, tmp_path: Path) -> Path:
     """A finished folder of four photographs, one by one pixel images."""
     folder = tmp_path / "sfm"
     (folder / "sparse").mkdir(parents=True)
-    (folder / "sparse" / "cameras.bin").touch()
+    for part in ("cameras", "images", "points3D"):
+        (folder / "sparse" / f"{part}.bin").write_bytes(bytes(8))
     (folder / "images").mkdir()
     names = [picture.name for picture in find_pictures(photos)]
     for number in range(3):

@@ -8,6 +8,7 @@ import torch
 
 from tests.refinement.conftest import VIEWS, Start
 from vg2gt.refinement import Progress, Refined, RefinedScene, RefineLoss, RefineOptions, RefineRates, refine
+from vg2gt.refinement.density import supported
 
 COLOUR = RefineLoss(depth_consistency=0, normal_render=0, normal_decoded=0)
 
@@ -91,6 +92,34 @@ def test_a_divergence_goes_back_and_says_so(start: Start, trouble: str, caplog: 
     assert all(getattr(found.scene.gaussians, f.name).isfinite().all() for f in fields(found.scene.gaussians))
     if trouble == "means":
         assert found.psnr[1].mean() >= found.psnr[0].mean()
+
+
+def test_what_few_views_support_is_left_out_at_the_start(start: Start) -> None:
+    """A guess in the air before the cameras, which every view looks through, and one far away, which none can place."""
+    depth = float(start.seen.depth.median())
+    middle = start.gaussians.select(torch.arange(2))
+    means = torch.tensor([[0.0, 0.0, 0.3 * depth], [0.0, 0.0, 50 * depth]])
+    names = [field.name for field in fields(start.gaussians) if field.name != "background"]
+    added = replace(middle, means=means)
+    more = replace(
+        start.gaussians, **{name: torch.cat((getattr(start.gaussians, name), getattr(added, name))) for name in names}
+    )
+    kept = supported(more, start.cameras, start.seen.depth, 2)
+    assert (kept.means == means[1]).all(-1).any()
+    assert not (kept.means == means[0]).all(-1).any()
+    assert 0.3 * len(start.gaussians) < len(kept) < len(more)
+    found = run(replace(start, gaussians=more), RefineOptions(steps=2, check_every=2, min_views=2, fill=0, loss=COLOUR))
+    assert len(found.start.gaussians) == len(kept)
+
+
+def test_the_guard_compares_the_same_views(start: Start) -> None:
+    """One view is three times as hard as the others, and stays so: no reason to fall back."""
+    images = start.seen.images.clone()
+    noise = torch.rand(images[2].shape, generator=torch.Generator().manual_seed(0))
+    images[2] = (images[2] + 0.02 * noise).clamp(0, 1)
+    hard = replace(start, seen=replace(start.seen, images=images))
+    found = run(hard, RefineOptions(steps=40, check_every=4, loss=COLOUR))
+    assert found.retreats == 0
 
 
 def test_what_lies_behind_the_scene_stays(start: Start) -> None:

@@ -145,6 +145,14 @@ def test_full_size_on_the_gpu_equals_the_cpu(mode: Mode, depth: DepthKind) -> No
     for value, reference in zip(images(first), images(expected), strict=True):
         assert (value - reference).abs().flatten().quantile(0.99) < 1e-4
     for name in PARAMETERS:
-        assert (grads[name] - expected_grads[name]).norm() < 1e-4 * expected_grads[name].norm()
+        # A ray whose transmittance passes one half between two Gaussians takes either depth after rounding, and its
+        # whole gradient goes to the one or the other: one Gaussian in a thousand may be such a ray's.
+        error, norm = (
+            (grads[name] - expected_grads[name]).reshape(len(grads[name]), -1).norm(dim=1),
+            expected_grads[name].norm(),
+        )
+        kept = error.sort().values[: -len(error) // 1000] if depth == "median" else error
+        assert kept.norm() < (2e-5 if depth == "median" else 1e-4) * norm
+        assert error.norm() < 1e-3 * norm
         assert torch.equal(grads[name], again[name])
     assert all(torch.equal(a, b) for a, b in zip(images(first), images(second), strict=True))

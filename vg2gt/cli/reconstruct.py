@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 from vg2gt.cli.arguments import flag_parser, list_of_names, listing, refuse_unknown
 from vg2gt.cli.commands import COMMANDS
 from vg2gt.cli.errors import errors_in_one_line
-from vg2gt.cli.refine import print_refinement, refine_options
-from vg2gt.reconstruction.output_names import DEFAULT, ORBIT_FRAMES, OUTPUTS, REFINED, SFM
+from vg2gt.cli.refine import options_for, print_refinement
+from vg2gt.reconstruction.output_names import DEFAULT, ORBIT_FRAMES, OUTPUTS, PREDICTED, REFINED, SFM
 
 POSES = (
     "cameras from files beside the images, from structure from motion (kept in DIR/sfm), or the backbone's own; auto: "
@@ -140,7 +140,7 @@ def run(options: argparse.Namespace) -> None:
     print(f"{len(scene.names)} images of {height}x{width}: {len(scene.gaussians)} Gaussians")
     if scene.refined is not None:
         print_refinement(scene)
-    print(f"weights: {figures['weights']}; cameras: {scene.cameras_from or 'predicted by the backbone'}")
+    print(f"weights: {figures['weights']}; cameras: {scene.cameras_from or PREDICTED}")
     print(f"seconds: {times}; peak memory {cost['peak_memory_mib']} MiB")
     more = [] if how is None else [REFINED]
     print(f"written: {', '.join(str(folder / name) for name in (*options.save, *more))}")
@@ -149,14 +149,10 @@ def run(options: argparse.Namespace) -> None:
 def _refinement(scene: Scene, steps: int | None) -> RefineOptions | None:
     """How a scene is refined: photographs unless ``steps`` is 0, recordings only where it is given."""
     from vg2gt.reconstruction.refined import refinement_of
-    from vg2gt.refinement import RefineRates
 
-    kind = refinement_of(scene)
-    if steps == 0 or (steps is None and kind == "default"):
+    if steps == 0 or (steps is None and refinement_of(scene) == "default"):
         return None
-    how = refine_options(kind, steps)
-    if not scene.cameras_from:  # predicted: not bundle-adjusted
-        how = replace(how, rates=replace(how.rates, cameras=RefineRates().cameras))
+    how = options_for(scene, steps=steps)
     if steps is None:
         print(f"refining for {how.steps} steps, about 30 s on two cores; --refine 0 gives the feed-forward scene")
     return how

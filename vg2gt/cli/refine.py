@@ -30,7 +30,7 @@ def parser() -> argparse.ArgumentParser:
     add("--steps", type=int, metavar="N", help="default: that of the options")
     add("--seconds", type=float, metavar="S", help="end after so many seconds; alone: without a number of steps")
     add("--holdout", type=int, metavar="N", help="leave every N-th view out and say its PSNR before and after")
-    add("--options", default="default", metavar="NAME[,KEY=VALUE...]", help="of configs/refine; default: default")
+    add("--options", metavar="NAME[,KEY=VALUE...]", help="of configs/refine; default: what suits the scene's cameras")
     add("--save", type=list_of_names, default=list(DEFAULT), metavar="LIST", help=f"default: {','.join(DEFAULT)}")
     add("--mode", choices=("solid", "rasterized"), default="solid", help="how views are rendered")
     add("--device", default="auto", help="auto, cpu, cuda, cuda:N")
@@ -60,11 +60,13 @@ def run(options: argparse.Namespace) -> None:
     check_outputs(options.save)
     out = Path(options.out or Path(options.scene) / "refined")
     check_folder(out, [*options.save, REFINED], options.overwrite)
-    how = refine_options(options.options, options.steps, options.seconds, options.holdout)
+    if options.options is not None:
+        refine_options(options.options)  # a wrong option is said before anything is read
     device = choose_device(options.device)
     with Monitor(show=not options.quiet, device=device) as monitor, memory_advice(ADVICE):
         with monitor.stage("read scene"):
             scene = read_scene(options.scene, Renderer(mode=options.mode), device)
+        how = options_for(scene, options.options, options.steps, options.seconds, options.holdout)
         scene = refine_scene(scene, how, monitor)
         folder = write_outputs(scene, out, options.save, overwrite=options.overwrite, monitor=monitor)
     print_refinement(scene)
@@ -77,6 +79,23 @@ def print_refinement(scene: Scene) -> None:
 
     assert scene.refined is not None
     print("\n".join(refinement_lines(scene.refined)))
+
+
+def options_for(
+    scene: Scene,
+    spec: str | None = None,
+    steps: int | None = None,
+    seconds: float | None = None,
+    holdout: int | None = None,
+) -> RefineOptions:
+    """Options for a scene: ``spec``, or what suits its cameras; predicted ones, which nothing adjusted, are refined."""
+    from vg2gt.reconstruction.refined import refinement_of
+    from vg2gt.refinement import RefineRates
+
+    found = refine_options(spec or refinement_of(scene), steps, seconds, holdout)
+    if spec is None and not scene.cameras_from:
+        found = replace(found, rates=replace(found.rates, cameras=RefineRates().cameras))
+    return found
 
 
 def refine_options(

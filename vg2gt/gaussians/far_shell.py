@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from vg2gt.gaussians.surfel import ALONE
 from vg2gt.geometry.cameras import camera_centers, ray_directions
 from vg2gt.geometry.rotations import matrix_to_quat
 from vg2gt.geometry.spherical_harmonics import rgb_to_sh
@@ -25,6 +24,7 @@ RADIUS = 20.0  # median depths
 FAR = 8.0  # median depths from every camera: only the shell is that far
 BLUR = 1.5  # spacings of the shell's Gaussians, standard deviation
 PRIOR = 3.0  # pixels of the mean colour in every direction
+WIDTH = 0.6  # spacings, standard deviation of each: they overlap without gaps
 THIN = 0.02  # of the width
 OPACITY = 0.95
 RAYS = 60_000  # pixels that are looked at, at most
@@ -65,7 +65,7 @@ def far_shell(
     return Gaussians(
         means=camera_centers(cameras)[0].mean(0) + radius * directions,
         quats=_facing(directions),
-        scales=radius * spacing * ALONE * directions.new_tensor([1.0, 1.0, THIN]).repeat(count, 1),
+        scales=radius * spacing * WIDTH * directions.new_tensor([1.0, 1.0, THIN]).repeat(count, 1),
         opacities=directions.new_full((count,), OPACITY),
         sh=rgb_to_sh(total[:, :3] / total[:, 3:])[:, None],
         batch=torch.zeros(count, dtype=torch.int64, device=rays.device),

@@ -34,4 +34,5 @@ OUTPUTS = {
     "report.json": "the run's figures: backend, weights, sizes, time per stage, peak memory",
 }
 DEFAULT = ("scene.ply", "cameras.json", "views.npz", "report.png", "report.json")
+PREDICTED = "predicted by the backbone"  # what a report says of such cameras
 REFINED = "refine.png"  # written of every refined scene: views before and after

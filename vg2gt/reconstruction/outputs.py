@@ -35,7 +35,7 @@ from vg2gt.reconstruction.camera_paths import orbit
 from vg2gt.reconstruction.export import exported_views
 from vg2gt.reconstruction.maps import AddView, animation, feed, map_sinks, whole_folder
 from vg2gt.reconstruction.monitor import Monitor
-from vg2gt.reconstruction.output_names import DEFAULT, FPS, MAPS, ORBIT_FRAMES, OUTPUTS, REFINED
+from vg2gt.reconstruction.output_names import DEFAULT, FPS, MAPS, ORBIT_FRAMES, OUTPUTS, PREDICTED, REFINED
 from vg2gt.reconstruction.refined import before_and_after, refinement_figures
 from vg2gt.reconstruction.report import html_rows, png_report, write_html_report
 
@@ -174,7 +174,7 @@ def scene_figures(scene: Scene) -> dict[str, Any]:
         "metres_per_unit": scene.metres_per_unit,
         "mode": scene.renderer.mode,
         **refinement_figures(scene),
-        "cameras": scene.cameras_from or "predicted by the backbone",
+        "cameras": scene.cameras_from or PREDICTED,
         **frame_figures(scene),
     }
 

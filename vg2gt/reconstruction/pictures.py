@@ -24,7 +24,7 @@ from vg2gt.data.sources.masks import FOLDER as MASKS
 from vg2gt.data.sources.masks import joined_masks, mask_of, resized_mask
 from vg2gt.data.sources.parsing import IMAGE_SUFFIXES
 from vg2gt.data.transforms import from_bytes
-from vg2gt.io.image_files import focal_length, image_size, read_color, read_mask
+from vg2gt.io.image_files import focal_length, image_size, is_panorama, read_color, read_mask
 from vg2gt.io.images import color_image, has_alpha
 from vg2gt.io.names import by_number
 from vg2gt.io.record3d import R3D, is_archive, read_recorded, recorded_files
@@ -336,6 +336,11 @@ def _photo(path: Path, content_of: Callable[[Path], bytes | None] = lambda _: No
 
     content = content_of(path)
     size = image_size(path, "", upright=True, content=content)
+    if content is None and is_panorama(path, size):
+        raise ValueError(
+            f"{path} is a 360 degree panorama (equirectangular), which no pinhole camera takes: cut it into the faces "
+            "of a cube and give these"
+        )
     if content is not None:
         return Picture(path.stem, size, read)
     return Picture(path.stem, size, read, focal=focal_length(path, size), path=path)

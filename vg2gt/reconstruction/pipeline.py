@@ -100,7 +100,8 @@ def reconstruct_with(
         order = working_order(views.images)
         prediction = _forward(model.eval(), views, order, device, monitor)
     scene = _scene(prediction, views, order, renderer or Renderer(), model.backend.is_metric, frame)
-    return scene if model.visibility is None else _with_far_shell(scene)
+    scene = scene if model.visibility is None else _with_far_shell(scene)
+    return scene.placed()
 
 
 def _forward(
@@ -153,4 +154,4 @@ def _scene(
         frame=frame,
         mask=views.mask,
         pictures=views.pictures,
-    ).placed()
+    )

@@ -16,6 +16,7 @@ from vg2gt.io.images import open_image
 from vg2gt.io.npz import npz_names, read_npz
 from vg2gt.reconstruction.camera_paths import view_stem
 from vg2gt.reconstruction.frame import SceneFrame
+from vg2gt.reconstruction.output_names import PREDICTED
 from vg2gt.reconstruction.scene import Scene
 from vg2gt.rendering import Renderer
 from vg2gt.types import Cameras, Gaussians
@@ -58,10 +59,18 @@ def read_scene(folder: str | Path, renderer: Renderer, device: torch.device | st
         names=tuple(view_stem(camera.name) for camera in named),
         renderer=renderer,
         metres_per_unit=_metres_per_unit(folder, named[0]),
+        cameras_from=_cameras_from(folder),
         frame=_frame(folder, named),
         mask=mask,
         poses=torch.from_numpy(np.stack([camera.world_to_camera for camera in named])),
     )
+
+
+def _cameras_from(folder: Path) -> str:
+    """Where the cameras came from as the report says; empty if the backbone predicted them or nobody knows."""
+    report = folder / "report.json"
+    known = str(read_json(report).get("cameras", PREDICTED)) if report.is_file() else PREDICTED
+    return "" if known == PREDICTED else known
 
 
 def _metres_per_unit(folder: Path, camera: NamedCamera) -> float | None:

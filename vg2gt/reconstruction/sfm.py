@@ -1,7 +1,7 @@
-"""Cameras of photographs by structure from motion: COLMAP's mappers, from pycolmap (``vg2gt[colmap]``).
+"""Cameras of photographs by structure from motion: COLMAP's incremental mapper, from pycolmap (``vg2gt[colmap]``).
 
-Of up to 60 photographs every pair is compared and cameras are placed one by one. Of more, likely pairs are
-(:mod:`vg2gt.reconstruction.sfm_pairs`), with fewer features, and the global mapper places all cameras at once.
+Of up to 60 photographs every pair is compared; of more, likely pairs are (:mod:`vg2gt.reconstruction.sfm_pairs`), with
+fewer features.
 
 What is found is kept as a folder that every command reads as a COLMAP recording: undistorted ``images/``, a model of
 PINHOLE cameras in ``sparse/``, and ``sfm.json``, which says of which pictures it was made. COLMAP's own lens model with

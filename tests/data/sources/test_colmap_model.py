@@ -7,10 +7,15 @@ import torch
 from PIL import Image
 
 from vg2gt.data import DataError
+from vg2gt.data.batches import BatchDataset
+from vg2gt.data.framing import Framing
 from vg2gt.data.sources import COLMAP
 from vg2gt.data.sources.undistortion import pinhole_camera
+from vg2gt.data.views import SceneSample
+from vg2gt.evaluation.checks import refuse_without_hints
 from vg2gt.geometry.cameras import resize_intrinsics, unproject
 from vg2gt.io import colmap_from_views, colmap_images, read_colmap, write_colmap
+from vg2gt.runs.load import load_model
 from vg2gt.types import Cameras
 
 from .layout_colmap import POINTS_A_VIEW, write
@@ -269,3 +274,33 @@ def test_points_need_three_views_and_the_nearest_wins(tmp_path):
     assert source.scene_index("statue").dropped == {"without a depth file": 1}
     with pytest.raises(ValueError, match="depth must be points"):
         COLMAP(str(tmp_path), depth="dense")
+
+
+def test_masks_go_with_a_batch_and_take_its_depth_away(tmp_path):
+    """Issue 47, item 7."""
+    write(tmp_path, room(3))
+    masks = tmp_path / "statue" / "masks" / "left"
+    masks.mkdir(parents=True)
+    half = Image.fromarray(np.where(np.arange(40) < 20, 0, 255).astype(np.uint8) * np.ones((30, 1), np.uint8))
+    for name in ("000.png", "009.png", "018.png"):
+        half.save(masks / name)
+    whole = COLMAP(str(tmp_path), depth="points").load("statue", [0, 1, 2])
+    data = BatchDataset(COLMAP(str(tmp_path), depth="points"), Framing((28, 42)).apply, 10)
+    batch = data[(SceneSample("statue", (0, 1), (2,)),)]
+    assert batch.mask is not None
+    assert batch.hints.mask is not None
+    assert batch.context.mask is not None
+    assert batch.context.mask.shape == (1, 2, 28, 42)
+    assert (batch.depth[..., :20] == 0).all()
+    assert (batch.depth[..., 22:] > 0).any()
+    assert (whole.depth[..., :20] > 0).any()
+
+
+def test_depth_at_points_is_not_enough_for_a_backend_that_needs_depth(tmp_path):
+    """Issue 47, item 2: the oracle was trained on them as if they were a depth camera's."""
+    write(tmp_path, room(3))
+    source = COLMAP(str(tmp_path), depth="points")
+    model = load_model(backend="oracle", device="cpu").model
+    with pytest.raises(DataError, match=r"oracle needs the data's depth, and COLMAP has none \(depth at sparse points"):
+        refuse_without_hints(model, source)
+    refuse_without_hints(load_model(backend="sweep", device="cpu").model, source)

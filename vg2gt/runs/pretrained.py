@@ -1,0 +1,106 @@
+"""Models by name: shipped with the package, in a folder, or on the Hugging Face hub; safetensors only, no pickles."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from vg2gt.io.files import write_text
+from vg2gt.runs.checkpoints import MADE_OF, read_checkpoint, write_slim
+from vg2gt.runs.find import checkpoint_path
+from vg2gt.runs.load import SHIPPED, LoadedModel, load_model
+
+WEIGHTS, CONFIG = "model.safetensors", "model.yaml"
+MODELS = {"sweep-tiny": SHIPPED}
+"""Names of the models in the package; their backbone's weights are in it too."""
+
+
+def list_models() -> tuple[str, ...]:
+    """Names that :func:`from_pretrained` knows without a download."""
+    return tuple(MODELS)
+
+
+def from_pretrained(
+    name: str | Path, *, backend: str | None = None, revision: str | None = None, device: str = "auto"
+) -> LoadedModel:
+    """Builds a trained model by name.
+
+    Args:
+        name: one of :func:`list_models`, a folder that :func:`save_pretrained` wrote, a run's folder or checkpoint, or
+            ``OWNER/NAME`` of a model on the hub.
+        backend: see :func:`vg2gt.load_model`, such as the path of the backbone's weights.
+        revision: of a model on the hub.
+        device: ``auto``, ``cpu``, ``cuda`` or ``cuda:N``.
+
+    Returns:
+        The model in eval mode, with its renderer and where its weights come from.
+
+    Raises:
+        FileNotFoundError: if there is no such model.
+        ImportError: if it is on the hub and huggingface_hub is not installed.
+        ValueError: if it was trained on another backbone, or its files are damaged.
+    """
+    return load_model(_weights(name, revision), backend, device=device)
+
+
+def save_pretrained(ckpt: str | Path, folder: str | Path) -> Path:
+    """Writes what others need of a trained model: its weights, and the configuration in words.
+
+    Args:
+        ckpt: a run's folder or checkpoint.
+        folder: made if needed.
+
+    Returns:
+        The folder.
+    """
+    folder = Path(folder).expanduser()
+    folder.mkdir(parents=True, exist_ok=True)
+    checkpoint = checkpoint_path(ckpt)
+    assert checkpoint is not None
+    write_slim(checkpoint, folder / WEIGHTS)
+    write_text(folder / CONFIG, str(read_checkpoint(checkpoint)[MADE_OF]))
+    return folder
+
+
+def push_to_hub(ckpt: str | Path, repo: str, folder: str | Path, private: bool = False) -> str:
+    """Saves a model into a folder and uploads it.
+
+    Args:
+        ckpt: a run's folder or checkpoint.
+        repo: ``OWNER/NAME``; made if needed, with the account that ``hf auth login`` knows.
+        folder: where :func:`save_pretrained` writes first.
+        private: of a new repository.
+
+    Returns:
+        The commit's address.
+
+    Raises:
+        ImportError: if huggingface_hub is not installed.
+    """
+    try:
+        from huggingface_hub import HfApi  # pyright: ignore[reportMissingImports]
+    except ImportError as error:
+        raise ImportError("push_to_hub needs huggingface_hub: pip install 'vg2gt[hub]'") from error
+    saved = save_pretrained(ckpt, folder)
+    api = HfApi()
+    api.create_repo(repo, private=private, exist_ok=True)
+    return str(api.upload_folder(repo_id=repo, folder_path=str(saved), allow_patterns=[WEIGHTS, CONFIG]))
+
+
+def _weights(name: str | Path, revision: str | None) -> Path:
+    if str(name) in MODELS:
+        return MODELS[str(name)]
+    path = Path(name).expanduser()
+    if (path / WEIGHTS).is_file():
+        return path / WEIGHTS
+    if path.exists() or not re.fullmatch(r"[\w.-]+/[\w.-]+", str(name)):
+        found = checkpoint_path(path)
+        assert found is not None
+        return found
+    try:
+        from huggingface_hub import hf_hub_download  # pyright: ignore[reportMissingImports]
+    except ImportError as error:
+        raise ImportError(
+            f"{name} is no folder here; a model on the hub needs huggingface_hub: pip install 'vg2gt[hub]'"
+        ) from error
+    return Path(hf_hub_download(str(name), WEIGHTS, revision=revision))
