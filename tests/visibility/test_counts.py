@@ -36,11 +36,10 @@ def test_compiled_pass_equals_the_reference(seed: int) -> None:
     depth[torch.rand(depth.shape, generator=random) < 0.1] = 0
     turns, shifts = (scale * torch.randn(views, 3, generator=random) for scale in (0.1, 0.2))
     several = cameras(rigid_motions(turns, shifts))
-    weight = torch.rand(depth.shape, generator=random)
     partners = choose_partners(depth, several, 4)
     partners[0, -1] = -1
-    found = count_views(depth, several, partners, weight, 0.03, 0.05)
-    expected = count_views_reference(depth.double(), several.map(Tensor.double), partners, weight.double(), 0.03, 0.05)
+    found = count_views(depth, several, partners, 0.03, 0.05)
+    expected = count_views_reference(depth.double(), several.map(Tensor.double), partners, 0.03, 0.05)
     for name in ("agree", "through", "hidden"):
         total = getattr(expected, name)
         assert total.mean() > 0.05, name
@@ -50,7 +49,7 @@ def test_compiled_pass_equals_the_reference(seed: int) -> None:
 
 def test_a_plane_agrees_everywhere_it_is_seen() -> None:
     depth = torch.full((3, *SIZE), 2.0)
-    counts = count_views(depth, sideways(0, 0.1, 0.2), everyone(3), torch.ones_like(depth), 0.02, 0.04)
+    counts = count_views(depth, sideways(0, 0.1, 0.2), everyone(3), 0.02, 0.04)
     assert counts.through.max() == 0
     assert counts.hidden.max() == 0
     assert (counts.agree[:, :, 5:-5] == 2).all()
@@ -61,7 +60,7 @@ def test_what_hangs_in_front_is_looked_through_and_what_lies_behind_is_hidden() 
     depth = torch.full((3, *SIZE), 2.0)
     depth[0, 8:12, 10:16] = 1.0
     depth[1, 2:6, 10:16] = 4.0
-    counts = count_views(depth, sideways(0, 0.02, 0.04), everyone(3), torch.ones_like(depth), 0.02, 0.04)
+    counts = count_views(depth, sideways(0, 0.02, 0.04), everyone(3), 0.02, 0.04)
     assert (counts.through[0, 8:12, 10:16] == 2).all()
     assert (counts.agree[0, 8:12, 10:16] == 0).all()
     assert (counts.hidden[1, 3:5, 11:15] == 2).all()
@@ -71,14 +70,6 @@ def test_what_hangs_in_front_is_looked_through_and_what_lies_behind_is_hidden() 
 def test_a_view_without_depth_there_says_nothing() -> None:
     depth = torch.full((2, *SIZE), 2.0)
     depth[1] = 0
-    counts = count_views(depth, sideways(0, 0.02), everyone(2), torch.ones_like(depth), 0.02, 0.04)
+    counts = count_views(depth, sideways(0, 0.02), everyone(2), 0.02, 0.04)
     for total in (counts.agree, counts.through, counts.hidden):
         assert total.max() == 0
-
-
-def test_views_count_by_their_weight() -> None:
-    depth = torch.full((3, *SIZE), 2.0)
-    weight = torch.tensor([1.0, 0.25, 0.5])[:, None, None].expand_as(depth)
-    counts = count_views(depth, sideways(0, 0.0, 0.0), everyone(3), weight, 0.02, 0.04)
-    for view, expected in enumerate((0.75, 1.5, 1.25)):
-        assert torch.allclose(counts.agree[view], torch.tensor(expected))

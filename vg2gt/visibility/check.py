@@ -81,10 +81,9 @@ class ViewCheck:
         keep = depth > 0
         partners = choose_partners(depth, cameras, self.partners)
         coarsen = (disagreement(depth, cameras, partners) / self.fine_below).clamp(1, self.coarsest)
-        weight = torch.ones_like(depth)
         for _ in range(self.rounds):
             left = torch.where(keep, depth, 0.0)
-            counts = count_views(left, cameras, partners, weight, self.tolerance, self.margin)
+            counts = count_views(left, cameras, partners, self.tolerance, self.margin)
             keep = keep & (counts.through <= counts.agree)
         return keep, coarsen
 

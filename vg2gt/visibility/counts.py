@@ -24,7 +24,7 @@ NEAREST = 1e-6  # smallest depth in another camera, in scene units
 
 @dataclass(frozen=True)
 class ViewCounts(TensorRecord):
-    """Sums over other views, each view counting by its confidence weight.
+    """Numbers of other views, as floats.
 
     Attributes:
         agree: ``[V, H, W]`` views that see a surface where the pixel's point is.
@@ -38,29 +38,26 @@ class ViewCounts(TensorRecord):
 
 
 @torch.no_grad()
-def count_views(
-    depth: Tensor, cameras: Cameras, partners: Tensor, weight: Tensor, tolerance: float, margin: float
-) -> ViewCounts:
+def count_views(depth: Tensor, cameras: Cameras, partners: Tensor, tolerance: float, margin: float) -> ViewCounts:
     """Counts what the partners of each view say of its pixels, for one scene.
 
     Args:
         depth: ``[V, H, W]`` z-depth, 0 = none.
         cameras: of the views (B = 1), in the unit of the depth.
         partners: ``[V, K]`` int64 views that each view is compared with; -1 = none.
-        weight: ``[V, H, W]`` what each pixel of a partner counts.
         tolerance: relative difference of depth up to which views agree.
         margin: relative difference of depth from which on a view looks through a point.
 
     Returns:
-        The sums; 0 for pixels without depth.
+        The numbers; 0 for pixels without depth.
     """
     if depth.device.type == "cpu":
-        return _count_compiled(depth, cameras, partners, weight, tolerance, margin)
-    return count_views_reference(depth, cameras, partners, weight, tolerance, margin)
+        return _count_compiled(depth, cameras, partners, tolerance, margin)
+    return count_views_reference(depth, cameras, partners, tolerance, margin)
 
 
 def count_views_reference(
-    depth: Tensor, cameras: Cameras, partners: Tensor, weight: Tensor, tolerance: float, margin: float
+    depth: Tensor, cameras: Cameras, partners: Tensor, tolerance: float, margin: float
 ) -> ViewCounts:
     """:func:`count_views` in plain torch, for any device and precision."""
     height, width = depth.shape[1:]
@@ -81,7 +78,6 @@ def count_views_reference(
         inside &= (column > -0.5) & (column < width - 0.5) & (row > -0.5) & (row < height - 0.5)
         left, top = column.floor(), row.floor()
         agree, through, says = torch.zeros_like(inside), inside.clone(), torch.zeros_like(inside)
-        counts = torch.zeros_like(depth)
         for down in (0, 1):
             for right in (0, 1):
                 u = (left + right).clamp(0, width - 1).nan_to_num().long()
@@ -92,17 +88,13 @@ def count_views_reference(
                 agree |= valid & ((ratio - 1).abs() < tolerance)
                 through &= valid & (ratio < 1 - margin)
                 says |= valid
-                nearest = ((column - left >= 0.5) == bool(right)) & ((row - top >= 0.5) == bool(down))
-                counts = torch.where(nearest, weight[there[:, None, None], v, u], counts)
         hidden = says & ~agree & ~through
         for total, chosen in zip((sums.agree, sums.through, sums.hidden), (agree, through, hidden), strict=True):
-            total += torch.where(chosen, counts, 0)
+            total += chosen
     return sums
 
 
-def _count_compiled(
-    depth: Tensor, cameras: Cameras, partners: Tensor, weight: Tensor, tolerance: float, margin: float
-) -> ViewCounts:
+def _count_compiled(depth: Tensor, cameras: Cameras, partners: Tensor, tolerance: float, margin: float) -> ViewCounts:
     pose = cameras.world_to_camera[0].double()
     intrinsics = cameras.intrinsics[0].double()
     there = partners.clamp(min=0)
@@ -111,21 +103,22 @@ def _count_compiled(
     to_pixel = intrinsics[there] @ motion  # [V, K, 3, 4]
     back = torch.linalg.inv(intrinsics)[:, None]
     matrix = torch.cat((to_pixel[..., :3] @ back, to_pixel[..., 3:]), -1).float().contiguous().numpy()
-    maps = [values.detach().float().contiguous().numpy() for values in (depth, weight)]
+    maps = depth.detach().float().contiguous().numpy()
     sums = [np.zeros(depth.shape, np.float32) for _ in range(3)]
     chosen = partners.contiguous().numpy()
     parallel_for(
         range(len(depth)),
-        lambda view: _count_view(view, *maps, chosen, matrix, np.float32(tolerance), np.float32(margin), *sums),
+        lambda view: _count_view(view, maps, chosen, matrix, np.float32(tolerance), np.float32(margin), *sums),
     )
     return ViewCounts(*(torch.from_numpy(total).to(depth.dtype) for total in sums))
 
 
 @kernel(fastmath={"contract", "nsz", "arcp"}, error_model="numpy", nogil=True)
-def _count_view(view, depth, weight, partners, matrix, tolerance, margin, agree, through, hidden):
-    """One view's sums over its partners; ``matrix [V, K, 3, 4]`` takes ``depth * (x, y, 1)`` into a partner's image."""
+def _count_view(view, depth, partners, matrix, tolerance, margin, agree, through, hidden):
+    """Counts of one view; ``matrix [V, K, 3, 4]`` takes ``depth * (x, y, 1)`` into a partner's image."""
     height, width = depth.shape[1:]
-    half, most = np.float32(0.5), np.float32(1) - margin
+    one, half = np.float32(1), np.float32(0.5)
+    most = one - margin
     for k in range(partners.shape[1]):
         other = partners[view, k]
         if other < 0:
@@ -140,7 +133,7 @@ def _count_view(view, depth, weight, partners, matrix, tolerance, margin, agree,
                 z = (m[2, 0] * fx + m[2, 1] * fy + m[2, 2]) * d + m[2, 3]
                 if z <= np.float32(NEAREST):
                     continue
-                inverse = np.float32(1) / z
+                inverse = one / z
                 u = ((m[0, 0] * fx + m[0, 1] * fy + m[0, 2]) * d + m[0, 3]) * inverse
                 v = ((m[1, 0] * fx + m[1, 1] * fy + m[1, 2]) * d + m[1, 3]) * inverse
                 if not (u > -half and u < width - half and v > -half and v < height - half):
@@ -155,19 +148,18 @@ def _count_view(view, depth, weight, partners, matrix, tolerance, margin, agree,
                         if found > 0:
                             says = True
                             ratio = z / found
-                            agrees |= abs(ratio - np.float32(1)) < tolerance
+                            agrees |= abs(ratio - one) < tolerance
                             looks &= ratio < most
                         else:
                             looks = False
                 if not says:
                     continue
-                counts = weight[other, v0 if v - top < half else v1, u0 if u - left < half else u1]
                 if agrees:
-                    agree[view, y, x] += counts
+                    agree[view, y, x] += one
                 elif looks:
-                    through[view, y, x] += counts
+                    through[view, y, x] += one
                 else:
-                    hidden[view, y, x] += counts
+                    hidden[view, y, x] += one
 
 
 @torch.no_grad()
@@ -186,18 +178,35 @@ def count_points(
     Returns:
         Views that agree and views that look through, ``[N]`` int64 each.
     """
-    height, width = depth.shape[1:]
     agree, through = (torch.zeros(len(points), dtype=torch.int64, device=points.device) for _ in range(2))
-    for view, pose, intrinsics in zip(depth, cameras.world_to_camera[0], cameras.intrinsics[0], strict=True):
-        seen = transform_points(pose[None, None].to(points), points[None, None])[0, 0]  # [N, 3]
-        z = seen[:, 2]
-        focal, center = intrinsics[[0, 1], [0, 1]], intrinsics[:2, 2]
-        column, row = (seen[:, :2] / z[:, None].clamp(min=NEAREST) * focal + center).round().unbind(-1)
-        inside = (z > NEAREST) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        index = row.clamp(0, height - 1).nan_to_num().long() * width + column.clamp(0, width - 1).nan_to_num().long()
-        found = view.flatten()[index]
-        ratio = z / found.clamp(min=NEAREST)
-        known = inside & (found > 0)
-        agree += known & ((ratio - 1).abs() < tolerance)
-        through += known & (ratio < 1 - margin)
+    for view in range(len(depth)):
+        one = slice(view, view + 1)
+        pose, intrinsics = cameras.world_to_camera[0, one], cameras.intrinsics[0, one]
+        ratio, known = depth_ratio(points[None], depth[one], pose.to(points), intrinsics.to(points))
+        agree += (known & ((ratio - 1).abs() < tolerance))[0]
+        through += (known & (ratio < 1 - margin))[0]
     return agree, through
+
+
+def depth_ratio(points: Tensor, depth: Tensor, to_camera: Tensor, intrinsics: Tensor) -> tuple[Tensor, Tensor]:
+    """Depth of points in views over the views' own depth at the nearest pixel.
+
+    Args:
+        points: ``[V, P, 3]``.
+        depth: ``[V, H, W]`` z-depth of the views, 0 = none.
+        to_camera: ``[V, 4, 4]`` from the points' frames into the views'.
+        intrinsics: ``[V, 3, 3]`` in pixels.
+
+    Returns:
+        The ratio ``[V, P]``, and whether the point is in the image where the view has a depth.
+    """
+    height, width = depth.shape[1:]
+    seen = transform_points(to_camera[None], points[None])[0]
+    z = seen[..., 2]
+    focal, center = intrinsics[:, [0, 1], [0, 1]], intrinsics[:, :2, 2]
+    pixel = seen[..., :2] / z[..., None].clamp(min=NEAREST) * focal[:, None] + center[:, None]
+    column, row = pixel.round().unbind(-1)
+    inside = (z > NEAREST) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    index = row.clamp(0, height - 1).nan_to_num().long() * width + column.clamp(0, width - 1).nan_to_num().long()
+    found = depth.flatten(1).gather(1, index)
+    return z / found.clamp(min=NEAREST), inside & (found > 0)
