@@ -256,9 +256,9 @@ PARTS = {
     "selfcheck": Part(selfcheck, 90),
     "tests": Part(tests, 210),
     "render": Part(render, 90),
-    "step": Part(step, 170),
+    "step": Part(step, 150),
     "knn": Part(knn, 45),
-    "reconstruct": Part(reconstruct, 90),
+    "reconstruct": Part(reconstruct, 75),
 }
 
 

@@ -126,7 +126,7 @@ MISTAKES = {
     "train name=../x": "^name=../x: a name inside outputs",
     "reconstruct . --out x --backend da3_smal": "unknown backend 'da3_smal'; did you mean da3_small",
     "curves nowhere": "nowhere|matplotlib",
-    "render scene.ply --cameras no.json --out x": r"^FileNotFoundError: no\.json: No such file",
+    "render scene.ply --cameras no.json --out x": r"^FileNotFoundError: no cameras at no\.json",
     "reconstruct . --out x --every 0": "^ValueError: every must be at least 1, got 0",
     "export backend=oracle out=bundle": "backend oracle cannot be exported",
     "data views out=views.json evaluation=nonsense": "there is no evaluation=nonsense; Available options",
@@ -174,7 +174,7 @@ def test_an_interrupted_command_says_so(said: Said, monkeypatch: pytest.MonkeyPa
         raise KeyboardInterrupt
 
     monkeypatch.setattr("vg2gt.cli.render.read_gaussians", interrupted)
-    monkeypatch.setattr("vg2gt.io.read_cameras_json", lambda path: [path])
+    monkeypatch.setattr("vg2gt.reconstruction.camera_files.read_cameras", lambda path: [path])
     assert said("render", "scene.ply", "--cameras", "c.json", "--out", "x") == (130, "interrupted\n")
 
 

@@ -222,7 +222,7 @@ def test_batches_are_pinned_for_a_gpu_only(rooms):
     module = _module(rooms)
     for kind in ("cpu", "cuda"):
         strategy = SimpleNamespace(root_device=torch.device(kind))
-        module.trainer = SimpleNamespace(strategy=strategy, global_step=0, global_rank=0, world_size=1)  # type: ignore
+        module.trainer = SimpleNamespace(strategy=strategy, global_step=0, global_rank=0, world_size=1, num_devices=1)  # type: ignore
         assert module.train_dataloader().pin_memory == (kind == "cuda")
         assert module.val_dataloader().pin_memory == (kind == "cuda")
 

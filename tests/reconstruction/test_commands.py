@@ -24,7 +24,7 @@ TINY = ["--backend", "da3_tiny", "--size", "70", "--quiet", "--device", "cpu"]
 def test_photographs_of_all_sizes(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     reconstruct_command.main([str(photos), "--out", str(tmp_path / "out"), *TINY])
     names = {"scene.ply", "cameras.json", "views.npz", "report.png", "report.json"}
-    assert {p.name for p in (tmp_path / "out").iterdir()} == names
+    assert {p.name for p in (tmp_path / "out").iterdir()} == names | {"refine.png"}
     figures = json.loads((tmp_path / "out" / "report.json").read_text())
     assert figures["weights"] == "none: the head is untrained"
     assert figures["backend"]["name"] == "da3_tiny"
@@ -34,6 +34,7 @@ def test_photographs_of_all_sizes(photos: Path, tmp_path: Path, capsys: pytest.C
     printed = capsys.readouterr().out
     assert "4 images of 56x70" in printed
     assert "untrained" in printed
+    assert "refining for 500 steps" in printed
     assert "peak memory" in printed
 
 

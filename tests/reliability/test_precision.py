@@ -291,7 +291,7 @@ def test_decoding_does_not_depend_on_the_precision(tmp_path: Path, cache: Path, 
 
 @pytest.mark.parametrize("precision", ["16-mixed", "bf16-true", "16-true", "64-true", "16", "64"])
 def test_other_precisions_are_refused(tmp_path: Path, cache: Path, precision: str) -> None:
-    with pytest.raises(ValueError, match=rf"trainer\.precision={precision} .* use bf16-mixed .* or 32-true"):
+    with pytest.raises(ValueError, match=rf"trainer\.precision={precision} .* use bf16-mixed .*, 32-true, or auto"):
         tiny_run(tmp_path, cache, f"trainer.precision={precision}")
 
 
