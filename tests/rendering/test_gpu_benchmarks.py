@@ -173,7 +173,7 @@ def test_parts_run_apart_and_within_their_time(
     shown = capsys.readouterr().out
     assert "knn: done (" in shown
     assert "  patch points: ms " in shown
-    assert "step: stopped after 170 s (" in shown
+    assert "step: stopped after 150 s (" in shown
     assert [path.name.split("-", 3)[3] for path in tmp_path.iterdir()] == ["gpu-knn.json"]
     assert sum(part.seconds for part in gpu.PARTS.values()) <= 660  # all together end after --minutes
 
