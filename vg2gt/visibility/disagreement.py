@@ -30,7 +30,8 @@ def disagreement(depth: Tensor, cameras: Cameras, partners: Tensor) -> Tensor:
     shifted = crop_intrinsics(intrinsics, STRIDE // 2, STRIDE // 2)
     strided = torch.cat((shifted[:, :2] / STRIDE, shifted[:, 2:]), 1)
     to_world = invert_rigid(pose)
-    local = Cameras(torch.eye(4).to(depth).repeat(1, len(depth), 1, 1), strided[None], (sampled.shape[1], sampled.shape[2]))
+    size = (sampled.shape[1], sampled.shape[2])
+    local = Cameras(torch.eye(4).to(depth).repeat(1, len(depth), 1, 1), strided[None], size)
     points = unproject(sampled[None], local)[0].flatten(1, 2)  # [V, P, 3] in each view's own frame
     ratios = []
     for other in partners[:, :NEIGHBORS].T:
