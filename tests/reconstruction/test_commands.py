@@ -34,7 +34,7 @@ def test_photographs_of_all_sizes(photos: Path, tmp_path: Path, capsys: pytest.C
     printed = capsys.readouterr().out
     assert "4 images of 56x70" in printed
     assert "untrained" in printed
-    assert "refining for 500 steps" in printed
+    assert "refining for 400 steps" in printed
     assert "peak memory" in printed
 
 

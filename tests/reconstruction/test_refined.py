@@ -105,7 +105,7 @@ def test_photographs_are_refined_unless_asked_not_to(scene: Scene) -> None:
     photographs = replace(scene, cameras_from="structure from motion, 4 of 4 images")
     by_default = _refinement(photographs, None)
     assert by_default is not None
-    assert (by_default.steps, by_default.rates.cameras, by_default.min_views) == (500, 0.0, 2)
+    assert (by_default.steps, by_default.rates.cameras, by_default.min_views) == (400, 0.0, 2)
     assert _refinement(photographs, 0) is None
     predicted = _refinement(replace(scene, cameras_from=""), 7)
     assert predicted is not None

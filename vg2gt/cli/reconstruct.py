@@ -25,7 +25,7 @@ FRAME = (
     "given if cameras are given, else upright"
 )
 
-REFINE = "steps of refinement on the images; default: 500 for photographs, 0 for RGB-D recordings; 0: feed-forward"
+REFINE = "steps of refinement on the images; default: 400 for photographs, 0 for RGB-D recordings; 0: feed-forward"
 
 if TYPE_CHECKING:
     from vg2gt.reconstruction.scene import Scene
