@@ -84,7 +84,7 @@ def prepare(name: str, photos: Path, out: Path, size: int, patch: int, poses: st
         out: where cameras and views are kept: ``sfm/`` and ``SIZE/``.
         size: longer side in pixels.
         patch: of which the sides are multiples.
-        poses: ``sfm`` or ``given``: those that lie beside the photographs.
+        poses: ``sfm`` or ``given``: camera files next to the photographs.
 
     Raises:
         ValueError: if there are no cameras, or too few views.

@@ -289,6 +289,13 @@ class Gaussians(TensorRecord):
         names = [each.name for each in fields(self) if each.name != "background"]
         return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
+    def joined(self, more: Gaussians) -> Gaussians:
+        """Returns one scene's Gaussians followed by others of at most its degree; its own background stays."""
+        padded = torch.nn.functional.pad(more.sh, (0, 0, 0, self.sh.shape[1] - more.sh.shape[1]))
+        more = replace(more, sh=padded)
+        names = [each.name for each in fields(self) if each.name != "background"]
+        return replace(self, **{name: torch.cat((getattr(self, name), getattr(more, name))) for name in names})
+
     def scene(self, index: int) -> Gaussians:
         """Returns one scene's Gaussians, its ``batch`` set to 0."""
         bounds = torch.searchsorted(self.batch, torch.tensor([index, index + 1], device=self.batch.device))

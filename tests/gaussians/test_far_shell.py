@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from vg2gt.gaussians.far_shell import COUNT, far_shell, is_far, with_shell
+from vg2gt.gaussians.far_shell import COUNT, far_shell, is_far
 from vg2gt.geometry.rotations import quat_to_matrix
 from vg2gt.rendering import render
 from vg2gt.types import Cameras, Gaussians
@@ -86,8 +86,7 @@ def test_a_scene_keeps_its_degree_and_background(seen: tuple[torch.Tensor, torch
     own = Gaussians(
         own.means / 20, own.quats, own.scales, own.opacities, torch.zeros(5, 4, 3), own.batch, torch.rand(1, 3)
     )
-    both = with_shell(own, shell)
+    both = own.joined(shell)
     assert len(both) == 5 + COUNT
     assert both.sh.shape == (5 + COUNT, 4, 3)
     assert both.background is own.background
-    assert with_shell(own, None) is own

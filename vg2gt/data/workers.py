@@ -1,4 +1,4 @@
-"""How many processes load data beside one that trains on a GPU."""
+"""How many processes load data for one that trains on a GPU."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 MOST = 16  # more wait for the disk
 PREFETCHED = 2  # batches that a process has ready: torch's default
-PROCESS_MB = 600  # of a loader process, beside its decoded frames
+PROCESS_MB = 600  # of a loader process, without its decoded frames
 SHARED_MEMORY = Path("/dev/shm")  # through which batches reach the trainer
 
 

@@ -8,7 +8,6 @@ that a view looks through, and any viewer shows it.
 from __future__ import annotations
 
 import math
-from dataclasses import fields, replace
 
 import torch
 from torch import Tensor
@@ -70,15 +69,6 @@ def far_shell(
         sh=rgb_to_sh(total[:, :3] / total[:, 3:])[:, None],
         batch=torch.zeros(count, dtype=torch.int64, device=rays.device),
     )
-
-
-def with_shell(gaussians: Gaussians, shell: Gaussians | None) -> Gaussians:
-    """A scene with its shell in front of its own Gaussians' rows; its background and degree stay."""
-    if shell is None:
-        return gaussians
-    shell = replace(shell, sh=F.pad(shell.sh, (0, 0, 0, gaussians.sh.shape[1] - shell.sh.shape[1])))
-    names = [field.name for field in fields(Gaussians) if field.name != "background"]
-    return replace(gaussians, **{name: torch.cat((getattr(gaussians, name), getattr(shell, name))) for name in names})
 
 
 def is_far(gaussians: Gaussians, depth: Tensor, cameras: Cameras) -> Tensor:

@@ -77,7 +77,7 @@ def unpack_lzfse(path: Path) -> bytes:
 def _archive(path: Path) -> zipfile.ZipFile:
     try:
         return _open(str(regular(path)), path.stat().st_mtime_ns, os.getpid())
-    except Exception as error:  # likewise
+    except Exception as error:  # whatever zipfile raises of a damaged archive
         raise FormatError(f"{path}: no readable archive ({error}); export the recording again") from error
 
 

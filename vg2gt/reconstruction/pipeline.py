@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from vg2gt.gaussians.far_shell import far_shell, with_shell
+from vg2gt.gaussians.far_shell import far_shell
 from vg2gt.geometry.precision import half_precision_on_gpu
 from vg2gt.memory import RECONSTRUCTION, memory_advice, note_sizes
 from vg2gt.model import Reconstructor
@@ -119,7 +119,7 @@ def _with_far_shell(scene: Scene) -> Scene:
     shell = far_shell(scene.images, scene.depth, scene.cameras.to("cpu"), scene.mask)
     if shell is None:
         return scene
-    return replace(scene, gaussians=with_shell(scene.gaussians, shell.to(scene.gaussians.means.device)))
+    return replace(scene, gaussians=scene.gaussians.joined(shell.to(scene.gaussians.means.device)))
 
 
 def _scene(

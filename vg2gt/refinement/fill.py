@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import fields, replace
 
 import torch
 from torch import Tensor
@@ -60,7 +59,7 @@ def fill_holes(
         depth = torch.where(shown.depth > 0, shown.depth, torch.where(hole[:, 0] > 0, 0.0, rendered.depth[0]))
         if not (depth > 0).any():
             continue
-        gaussians = _with(gaussians, _blocks(shown.images, hole, spread(depth), camera, pixels))
+        gaussians = gaussians.joined(_blocks(shown.images, hole, spread(depth), camera, pixels))
     return gaussians
 
 
@@ -101,10 +100,3 @@ def _blocks(images: Tensor, hole: Tensor, depth: Tensor, camera: Cameras, pixels
         rgb_to_sh(mean(images))[:, None],
         torch.zeros_like(size[:, 0], dtype=torch.int64),
     )
-
-
-def _with(gaussians: Gaussians, more: Gaussians) -> Gaussians:
-    """One scene of the Gaussians of two, with the background and the degree of the first."""
-    more = replace(more, sh=F.pad(more.sh, (0, 0, 0, gaussians.sh.shape[1] - more.sh.shape[1])))
-    names = [field.name for field in fields(Gaussians) if field.name != "background"]
-    return replace(gaussians, **{name: torch.cat((getattr(gaussians, name), getattr(more, name))) for name in names})

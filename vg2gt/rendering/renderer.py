@@ -184,7 +184,7 @@ def _resolve(implementation: Implementation, device: torch.device) -> str:
 
 
 def automatic(device: torch.device) -> str:
-    """The implementation that ``auto`` stands for on a device; on a CUDA device the kernels are checked once.
+    """The implementation that ``auto`` chooses on a device; on a CUDA device the kernels are checked once.
 
     Raises:
         KernelsRefusedError: if the kernels of a CUDA device cannot be relied on.

@@ -138,7 +138,7 @@ class SyntheticScenes(SceneSource):
 
     @property
     def _look(self) -> str:
-        """What decides the pixels beside scene and size, as part of file names."""
+        """What decides the pixels apart from scene and size, as part of file names."""
         highlights = {True: "-highlights", False: ""}.get(self.highlights, f"-{self.highlights}")  # pyright: ignore
         upright = "-upright" if self.size[0] > self.size[1] else ""  # where the field of view was once horizontal
         return highlights + upright + (self._photograph.name if self._photograph else "")
