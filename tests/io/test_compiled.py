@@ -14,11 +14,11 @@ import pytest
 from numba.core.dispatcher import Dispatcher
 
 from tests.commands import ROOT
-from vg2gt.io import compiled
+from vg2gt.kernels import compiled
 
 CONSTANTS = "LIMIT = {}\n"
 KERNEL = """
-from vg2gt.io.compiled import kernel
+from vg2gt.kernels.compiled import kernel
 from made.constants import LIMIT
 
 @kernel()
@@ -74,7 +74,7 @@ def test_without_a_home_kernels_run(
 
 
 ONE = """
-from vg2gt.io.compiled import kernel
+from vg2gt.kernels.compiled import kernel
 
 @kernel()
 def add_one(x):
@@ -133,7 +133,7 @@ def test_a_full_disk_does_not_end_the_work(tmp_path: Path, make, monkeypatch: py
 
 
 PARTS = """
-from vg2gt.io.compiled import kernel, kernel_part
+from vg2gt.kernels.compiled import kernel, kernel_part
 
 @kernel_part(error_model="numpy")
 def share(x, of):
@@ -209,7 +209,7 @@ def test_kernels_made_in_functions_are_found_again_by_other_processes() -> None:
 
 
 ADD = """
-from vg2gt.io.compiled import numba
+from vg2gt.kernels.compiled import numba
 
 @numba.njit("void(float32[::1], float32[::1])")
 def add(x, y):

@@ -161,7 +161,7 @@ def test_duplicated_views_add_no_voxels_and_new_views_few(make_fine, make_room):
 def test_cap_keeps_the_most_confident_and_says_so(make_fine, make_room, caplog):
     inputs = make_room(scenes=2)
     everything = make_fine()(*inputs)
-    with caplog.at_level(logging.WARNING, logger="vg2gt.voxels.fine"):
+    with caplog.at_level(logging.WARNING, logger="vg2gt.method.fine"):
         capped = make_fine(max_voxels=50)(*inputs)
     assert "max_voxels=50" in caplog.text
     assert torch.bincount(capped.batch).tolist() == [50, 50]
@@ -200,7 +200,7 @@ def test_without_gradient_views_are_pooled_a_few_at_a_time_to_the_same_voxels(ma
 
 @pytest.mark.parametrize(("views", "voxel_size", "warned"), [(2, 1e-4, True), (1, 1e-4, False), (2, 0.125, False)])
 def test_sparse_voxels_are_named_once(views, voxel_size, warned, make_fine, make_room, monkeypatch, caplog):
-    monkeypatch.setattr("vg2gt.voxels.grid._warned_of_sparse", set())
+    monkeypatch.setattr("vg2gt.method.grid._warned_of_sparse", set())
     module = make_fine(voxel_size=voxel_size).eval()
     with torch.no_grad():
         for _ in range(2):

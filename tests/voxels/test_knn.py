@@ -3,9 +3,10 @@ import torch
 from scipy.spatial import KDTree
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from vg2gt.voxels import cell_search, knn
-from vg2gt.voxels.cell_search import nearest_by_cells
-from vg2gt.voxels.knn import interpolate, interpolation_weights, nearest_neighbors
+from vg2gt.kernels import cell_search
+from vg2gt.kernels.cell_search import nearest_by_cells
+from vg2gt.method import knn
+from vg2gt.method.knn import interpolate, interpolation_weights, nearest_neighbors
 
 
 @pytest.fixture(params=["trees", "cells"], autouse=True)

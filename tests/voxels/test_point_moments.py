@@ -8,9 +8,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from vg2gt.voxels import point_moments
-from vg2gt.voxels.grid import VoxelPlan, plan_voxels, pool_mean
-from vg2gt.voxels.point_moments import Moments, moments_compiled, moments_reference, pool_point_moments
+from vg2gt.kernels.point_moments import Moments, moments_compiled
+from vg2gt.method.additions import point_moments
+from vg2gt.method.additions.point_moments import moments_reference, pool_point_moments
+from vg2gt.method.grid import VoxelPlan, plan_voxels, pool_mean
 
 VIEWS = 7
 CHUNK = 3  # of the views, where the pass is plain
@@ -69,7 +70,9 @@ def test_it_is_as_exact_as_plain_torch() -> None:
     exact = by_definition(inputs, plan)
     values, depth, confidence, views = inputs
     means = pool_mean(values, confidence, plan)
-    compiled = largest_errors(moments_compiled(values, depth, confidence, views, means, plan), exact)
+    compiled = largest_errors(
+        moments_compiled(values, depth, confidence, views, means, plan.order, plan.starts, plan.counts), exact
+    )
     plain = largest_errors(moments_reference(values, depth, confidence, views, means, plan, CHUNK), exact)
     assert all(a <= 2 * b + 1e-7 for a, b in zip(compiled, plain, strict=True)), (compiled, plain)
 
@@ -98,7 +101,7 @@ def test_every_point_has_its_own_view(per_view: int) -> None:
 
 
 def test_threads_do_not_change_a_bit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vg2gt.voxels.passes.VOXELS_AT_ONCE", 50)
+    monkeypatch.setattr("vg2gt.kernels.threads.VOXELS_AT_ONCE", 50)
     inputs, plan = points()
     threads = torch.get_num_threads()
     try:

@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from vg2gt.voxels.silhouette import _largest, beside_silhouettes, on_surface
+from vg2gt.method.additions.silhouette import _largest, beside_silhouettes, on_surface
 
 
 def _blurred_step(near: float, far: float) -> torch.Tensor:

@@ -5,7 +5,8 @@ from types import ModuleType
 import pytest
 import torch
 
-from vg2gt.voxels import grid, knn, normals, point_moments, sparse_conv
+from vg2gt.method import grid, knn, sparse_conv
+from vg2gt.method.additions import point_moments, voxel_normals
 
 
 @pytest.fixture
@@ -38,12 +39,12 @@ def test_what_waits_is_counted(gpu_waits: ModuleType) -> None:
 
 
 def test_places_are_named(gpu_waits: ModuleType) -> None:
-    from vg2gt.voxels.grid import plan_voxels
+    from vg2gt.method.grid import plan_voxels
 
     batch = torch.zeros(5, dtype=torch.int64)
     with gpu_waits.Waits() as waits:
         plan_voxels(torch.rand(5, 3) * 2, batch, torch.ones(5, dtype=torch.bool))
-    assert waits.places == {"voxels/grid.py plan_voxels": 2, "voxels/grid.py mixed_radix_keys": 1}
+    assert waits.places == {"method/grid.py plan_voxels": 2, "method/grid.py mixed_radix_keys": 1}
 
 
 def test_the_modules_wait_for_shapes_and_for_two_warnings_only(
@@ -52,7 +53,7 @@ def test_the_modules_wait_for_shapes_and_for_two_warnings_only(
     """As often for three scenes as for one, but for the footprint's medians."""
     for scenes in (1, 3):
         monkeypatch.setattr(grid, "_warned_of_sparse", set())  # what was warned of is not looked at again
-        for module in (knn, normals, point_moments):
+        for module in (knn, voxel_normals, point_moments):
             monkeypatch.setattr(module, "compilable", lambda *_: False)  # as on a GPU
         monkeypatch.setattr(sparse_conv, "one_by_one", lambda device: False)
         tokens, geometry, images = make_room(scenes)
@@ -60,25 +61,25 @@ def test_the_modules_wait_for_shapes_and_for_two_warnings_only(
         with gpu_waits.Waits() as waits:
             coarse(tokens, geometry)
             fine(tokens, geometry, images).features.sum().backward()
-        plan = {"voxels/grid.py plan_voxels": 2 * 2, "voxels/grid.py mixed_radix_keys": 2 + 4}
-        warnings = {"voxels/grid.py warn_if_sparse": 2, "voxels/fine.py _Points.__init__": 1}
-        levels = {"voxels/ptv3.py Level.__init__": 3, "voxels/ptv3.py GridPool.forward": 2}
+        plan = {"method/grid.py plan_voxels": 2 * 2, "method/grid.py mixed_radix_keys": 2 + 4}
+        warnings = {"method/grid.py warn_if_sparse": 2, "method/fine.py _Points.__init__": 1}
+        levels = {"method/ptv3.py Level.__init__": 3, "method/ptv3.py GridPool.forward": 2}
         assert waits.places == {
             **plan,
             **warnings,
             **levels,
-            "voxels/coarse.py PatchPoints.__init__": 1,
-            "voxels/sparse_conv.py neighbor_table": 3,
-            "voxels/serialization.py serial_keys": 2,
-            "voxels/normals.py _pairs": 1,
-            "voxels/cell_search.py _search": 2,
-            "voxels/cell_search.py _nearest": 1,
-            "voxels/surface.py disagreement": 2,
-            "voxels/fine.py _scene_medians": 1,
-            "voxels/grid.py pool_mean_of_chunks": -(-3 * scenes // 8),  # once for eight views
-            "voxels/pointmlp.py PointMLP._windows": 1,
+            "method/coarse.py PatchPoints.__init__": 1,
+            "method/sparse_conv.py neighbor_table": 3,
+            "method/serialization.py serial_keys": 2,
+            "method/additions/voxel_normals.py _pairs": 1,
+            "kernels/cell_search.py _search": 2,
+            "kernels/cell_search.py _nearest": 1,
+            "method/additions/surface_evidence.py disagreement": 2,
+            "method/fine.py _scene_medians": 1,
+            "method/grid.py pool_mean_of_chunks": -(-3 * scenes // 8),  # once for eight views
+            "method/point_mlp.py PointMLP._windows": 1,
         }
         fine = make_fine(min_footprint=1.0)
         with gpu_waits.Waits() as footprint, torch.no_grad():
             fine(tokens, geometry, images)
-        assert footprint.places["voxels/grid.py scene_voxel_size"] == scenes
+        assert footprint.places["method/grid.py scene_voxel_size"] == scenes
