@@ -33,6 +33,10 @@ SETS = {
     "rooms": "data=synthetic data.eval_scenes={scenes} data.val.first_seed={seed} data.image_size=[112,224]",
     "outdoors": "data=synthetic data.eval_scenes={scenes} data.val.first_seed={seed} data.image_size=[112,224]"
     " data.variant=outdoor",
+    "objects": "data=synthetic data.eval_scenes={scenes} data.val.first_seed={seed} data.image_size=[112,224]"
+    " data.variant=object",
+    "wide rooms": "data=synthetic data.eval_scenes={scenes} data.val.first_seed={seed} data.image_size=[112,224]"
+    " data.variant=wide",
     "HoloLens office": "data=rgbd data.root={shared}/hololens_office_a data.image_size=[112,224]",
     "7-Scenes kitchen": "data=rgbd data.root={shared}/seven_scenes_redkitchen_a_registered data.image_size=[112,224]"
     " data.eval_window=10",
