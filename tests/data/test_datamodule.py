@@ -6,16 +6,14 @@ from types import SimpleNamespace
 import lightning
 import pytest
 import torch
-from hydra.utils import instantiate
 
-from vg2gt.config import compose
 from vg2gt.data import DataError, SceneDataModule, SyntheticScenes
 from vg2gt.data.frame_cache import FrameCache
 from vg2gt.data.framing import Framing
 from vg2gt.data.views.even import EvaluationViews
 from vg2gt.data.views.sampling import StepSampler
 
-from .conftest import SIZE, assert_same_batches
+from .conftest import SIZE
 
 
 def _module(rooms: SyntheticScenes, **options) -> SceneDataModule:
@@ -52,12 +50,6 @@ def test_evaluation_batches_are_context_then_targets(rooms):
     assert batches[0].frame_ids.tolist() == [[0, 2, 4, 1, 3]]
     assert batches[0].num_context == 3
     assert batches[0].target.frame_ids.tolist() == [[1, 3]]
-
-
-def test_workers_do_not_change_batches(rooms):
-    alone, *helped = (list(_module(rooms, workers=workers).train_dataloader()) for workers in (0, 1, 2))
-    for other in helped:
-        assert_same_batches(other, alone)
 
 
 def test_limits_on_scenes(rooms):
@@ -176,12 +168,6 @@ def test_evaluation_views_by_number_and_window(rooms):
         assert not set(window.context) & set(window.target)
 
 
-def test_no_evaluation_targets_when_none_are_asked_for(rooms):
-    (views,) = EvaluationViews(context=4, target=0).choose(rooms, "room-000000")
-    assert len(views.context) == 4
-    assert views.target == ()
-
-
 class _Frame(int):
     """A frame id that counts how often it is looked up."""
 
@@ -234,15 +220,3 @@ def test_evaluation_positions_are_checked(rooms):
         EvaluationViews([0, 1], [1]).choose(rooms, "room-000000")
     with pytest.raises(ValueError, match="numbers of views"):
         EvaluationViews([0, 1], [1], window=4)
-
-
-@pytest.mark.parametrize("name", ["synthetic", "rgbd"])
-def test_the_configuration_makes_a_data_module(name, write_recording, tmp_path, monkeypatch):
-    monkeypatch.setenv("VG2GT_CACHE", str(tmp_path))
-    config = compose("train", f"data={name}", f"output_dir={tmp_path}")
-    if name == "rgbd":
-        config.data.update(root=str(write_recording(frames=6)), max_views=2, min_views=2, max_images=2)
-    module = instantiate(config.data)
-    assert isinstance(module, SceneDataModule)
-    module.setup()
-    assert module.sampler.max_views == config.data.max_views

@@ -96,32 +96,6 @@ def test_a_distorted_model_beside_the_originals(statue, distorted):
     assert (depth > 0).sum() > 50
 
 
-def test_all_models_undistort_and_zero_coefficients_are_a_pinhole(tmp_path):
-    write(tmp_path, room(2))
-    folder = tmp_path / "statue" / "sparse" / "0"
-    plain = COLMAP(str(tmp_path)).scene_index("statue")
-    for name, extra, still in (
-        ("SIMPLE_RADIAL", [0.0], True),
-        ("SIMPLE_RADIAL", [0.1], False),
-        ("RADIAL", [0.1, -0.02], False),
-        ("OPENCV", [0.1, 0.01, 0.001, 0.0], False),
-        ("FULL_OPENCV", [0.1] + [0.0] * 7, False),
-        ("OPENCV_FISHEYE", [0.0] * 4, False),
-        ("SIMPLE_RADIAL_FISHEYE", [0.02], False),
-    ):
-        model = read_colmap(folder)
-        for camera in model.cameras.values():
-            focal, center = camera.focal_length_x, [camera.principal_point_x, camera.principal_point_y]
-            camera.model = getattr(pycolmap.CameraModelId, name)
-            camera.params = [*([focal] if "SIMPLE" in name or name == "RADIAL" else [focal, focal]), *center, *extra]
-        write_colmap(folder, model)
-        index = COLMAP(str(tmp_path)).scene_index("statue")
-        assert ("lens" not in index.extra) == still, name
-        if still:
-            np.testing.assert_allclose(index.intrinsics, plain.intrinsics)
-        assert COLMAP(str(tmp_path)).load("statue", [0]).images.isfinite().all()
-
-
 def test_a_model_of_equirectangular_images_is_refused_in_one_line(tmp_path):
     write(tmp_path, room(1))
     folder = tmp_path / "statue" / "sparse" / "0"

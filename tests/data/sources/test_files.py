@@ -1,7 +1,6 @@
 """What all loaders of files share: lists of scenes, and the memory that indices take."""
 
 import logging
-import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +9,7 @@ import pytest
 
 from vg2gt.config import compose, config_dir
 from vg2gt.data import DataError, RGBDFolder, SyntheticScenes
-from vg2gt.data.sources import files, parsing
+from vg2gt.data.sources import files
 from vg2gt.data.sources.index import index_to_bytes, make_index, read_index
 
 from .layout_rgbd import write_recording
@@ -59,15 +58,6 @@ def test_few_indices_stay_in_memory_and_the_rest_come_from_the_cache(dataset, tm
         assert source.frames(scene) == ids[scene] == (10, 11)
 
 
-def test_a_changed_scene_is_indexed_again(dataset, tmp_path):
-    write_recording(tmp_path, room(3), "d")
-    cache = str(tmp_path / "cache")
-    assert RGBDFolder(str(tmp_path / "d"), holdout=None, index_cache=cache).frames("d") == (10, 11, 12)
-    (tmp_path / "d/depth/00011.png").unlink()
-    assert RGBDFolder(str(tmp_path / "d"), holdout=None, index_cache=cache).frames("d") == (10, 12)
-    assert len(list((tmp_path / "cache").rglob("*.npz"))) == 1
-
-
 def test_an_index_keeps_names_below_the_folder_and_shared_intrinsics_once(tmp_path):
     folder, beside = tmp_path / "scene", tmp_path / "depth"
     count = 500
@@ -111,17 +101,6 @@ def test_a_cache_that_cannot_be_written_is_told_once(dataset, tmp_path, caplog):
         rooms = SyntheticScenes(2, num_frames=1, size=(14, 14), cache_dir=str(tmp_path / "cache"))
         assert rooms.load("room-000000", [0]).depth.shape == (1, 14, 14)
     assert sum("nothing more is kept" in record.getMessage() for record in caplog.records) == 1
-
-
-def test_poses_are_read_several_at_a_time(tmp_path, monkeypatch):
-    meeting = threading.Barrier(2)
-
-    def read(path, scene, shapes):
-        meeting.wait(timeout=20)
-        return np.eye(4)
-
-    monkeypatch.setattr(parsing, "read_matrix", read)
-    assert list(parsing.read_poses({i: tmp_path / str(i) for i in (3, 1)}, "a")) == [3, 1]
 
 
 @pytest.mark.parametrize("name", CONFIGURATIONS)

@@ -87,17 +87,3 @@ def test_training_is_refused(tmp_path):
     module = instantiate(compose("train", *overrides, "data.index_cache=null").data)
     with pytest.raises(DataError, match="ImageFolder has no depth and no cameras"):
         module.train_dataloader()
-
-
-def test_real_folders_of_mixed_files(shared):
-    source = ImageFolder(str(shared / "data" / "unposed"))
-    assert source.scenes == ("da3_soh", "pi3_house", "vggt_room")
-    assert source.scene_index("pi3_house").color_size == (378, 672)
-    mixed = source.scene_index("vggt_room")
-    assert mixed.color_size is None
-    assert source.load("vggt_room", mixed.frame_ids[:2]).images.shape == (2, 3, *mixed.size)
-
-
-def test_an_empty_folder_says_what_is_expected(tmp_path):
-    with pytest.raises(DataError, match=r"no scene in .*expected images.*found: "):
-        ImageFolder(str(tmp_path))

@@ -109,15 +109,3 @@ def test_only_frames_with_depth_and_the_split_count(tmp_path):
     elsewhere.mkdir()
     (tmp_path / "train").rename(elsewhere / "train")
     assert tuple(KITTI(str(tmp_path), depth_root=str(elsewhere)).frames(DRIVE)) == (5, 7)
-
-
-def test_new_depth_renews_the_cached_index(tmp_path):
-    write(tmp_path / "data", room(3))
-    depth = tmp_path / "data" / "train" / DRIVE / "proj_depth" / "groundtruth" / "image_02"
-
-    def frames():
-        return KITTI(str(tmp_path / "data"), index_cache=str(tmp_path / "cache")).frames(DRIVE)
-
-    assert tuple(frames()) == (5, 6, 7)
-    (depth / "0000000006.png").unlink()
-    assert tuple(frames()) == (5, 7)

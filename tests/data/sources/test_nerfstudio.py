@@ -202,23 +202,6 @@ def test_numbers_follow_names_and_absent_files_are_counted(tmp_path):
     assert deep.scene_index("desk").dropped == {"without a colour image": 1, "without a depth file": 1}
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda content: content.update(camera_model="EQUIRECTANGULAR"), "model EQUIRECTANGULAR; read are: PINHOLE"),
-        (lambda content: content.update(w=80, h=80), "is 40x30 pixels, but its camera in .* 80x80"),
-        (lambda content: content.update(k1=1e6), "scene desk.*takes the image's border out"),
-        (lambda content: content.update(frames=[]), "none of the 0 images"),
-        (lambda content: content["frames"][0].update(transform_matrix=[[1]]), "scene desk.*transform_matrix"),
-    ],
-)
-def test_refused(tmp_path, change, message):
-    write(tmp_path, room(3))
-    _edit(tmp_path, change)
-    with pytest.raises(DataError, match=message):
-        Nerfstudio(str(tmp_path)).frames("desk")
-
-
 def test_size_may_come_from_the_images(tmp_path):
     """Blender's files give the field of view only."""
     write(tmp_path, room(3))

@@ -9,7 +9,7 @@ import torch
 
 from vg2gt.data import DataError, Frames, SyntheticScenes
 from vg2gt.data.sources import DTU, TanksAndTemples
-from vg2gt.data.sources.scan_depth import ScanDepth, read_points, render_points
+from vg2gt.data.sources.scan_depth import ScanDepth, render_points
 from vg2gt.geometry.cameras import unproject
 from vg2gt.io.ply_container import vertices_content
 from vg2gt.types import Cameras
@@ -124,41 +124,6 @@ def test_images_are_kept_and_made_again_when_the_scan_changes(tmp_path):
 def test_senseless_options_are_refused(options):
     with pytest.raises(ValueError, match="must be"):
         ScanDepth(**options)
-
-
-def test_a_cache_that_cannot_be_written_is_gone_without(tmp_path, caplog):
-    (tmp_path / "scan.ply").write_bytes(_ply(_wall(0.05, 4, 4, 2.0)))
-    (tmp_path / "cache").write_text("a file where the folder should be")
-    depth = ScanDepth(tmp_path / "cache").read(tmp_path / "scan.ply", "a", np.eye(4), K, VIEW)
-    assert (depth > 0).any()
-    assert "nothing more is kept in the cache folder" in caplog.text
-
-
-def test_damaged_scans_are_named(tmp_path):
-    scan = tmp_path / "scan.ply"
-    with pytest.raises(DataError, match=r"scene barn.*scan\.ply"):
-        read_points(scan, "barn")
-    whole = _ply(_wall(0.5, 4, 4, 2.0))
-    rng = np.random.default_rng(0)
-    messages = []
-    for _ in range(300):
-        content = bytearray(whole)
-        if rng.random() < 0.3:
-            content = content[: rng.integers(len(content))]
-        for place in rng.integers(0, max(1, min(len(content), 200 if rng.random() < 0.7 else 10**6)), 3):
-            content[place : place + 1] = bytes([rng.integers(256)])
-        scan.write_bytes(content)
-        try:
-            points = read_points(scan, "barn")
-        except DataError as error:
-            messages.append(str(error))
-        else:
-            assert np.isfinite(points).all()
-    assert 100 < len(messages) < 300
-    assert all("barn" in message for message in messages)
-    scan.write_bytes(_ply(np.full((4, 3), np.nan)))
-    with pytest.raises(DataError, match="has no points"):
-        read_points(scan, "barn")
 
 
 def _points(frames: Frames) -> np.ndarray:

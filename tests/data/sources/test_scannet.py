@@ -17,7 +17,6 @@ from .layout_scannet import millimetres, sens_frame, sens_header, write_export, 
 from .layouts import camera_to_world, pixels, room
 
 SCENE = "scene0707_00"
-COUNT_AT = 4 + 8 + 15 + 4 * 64 + 2 * 4 + 4 * 4 + 4
 """First byte of the number of frames."""
 
 
@@ -91,16 +90,6 @@ def test_a_stream_holds_what_its_export_does(tmp_path, frames):
     assert torch.allclose(ours.intrinsics, theirs.intrinsics, atol=1e-4)
 
 
-def test_a_cached_stream_is_not_scanned_again(tmp_path, frames, monkeypatch):
-    write_sens(tmp_path / "raw", frames, lost=1)
-    root, cache = str(tmp_path / "raw"), str(tmp_path / "cache")
-    first = ScanNetSens(root, index_cache=cache).load(SCENE, [3, 2])
-    monkeypatch.setattr("vg2gt.data.sources.scannet.scan_sens", lambda *_: pytest.fail("scanned again"))
-    again = ScanNetSens(root, index_cache=cache).load(SCENE, [3, 2])
-    assert torch.equal(again.images, first.images)
-    assert torch.equal(again.depth, first.depth)
-
-
 def test_edited_intrinsics_are_read_again(tmp_path, frames):
     write_export(tmp_path / "data", frames)
     path = tmp_path / "data" / "scans" / SCENE / "intrinsic" / "intrinsic_depth.txt"
@@ -141,35 +130,6 @@ def test_a_frame_is_read_without_the_rest_of_the_file(tmp_path, frames):
     assert torch.equal(loaded.depth[0] > 0, frames.depth[1] > 0)
 
 
-def _overwrite(content: bytes, place: int, *values: bytes) -> bytes:
-    new = b"".join(values)
-    return content[:place] + new + content[place + len(new) :]
-
-
-HUGE = struct.pack("<Q", 1 << 61)
-DAMAGE = {
-    "another version": (lambda c: _overwrite(c, 0, b"\5"), "version 5 of the format, expected 4"),
-    "a long name": (lambda c: _overwrite(c, 4, HUGE), "sensor's name of 2305843009213693952 bytes"),
-    "an unknown compression": (lambda c: _overwrite(c, COUNT_AT - 24, b"\2"), "colour of type 2 and depth of type 2"),
-    "wide images": (lambda c: _overwrite(c, COUNT_AT - 20, b"\xff\xff\xff\xff"), "images of 4294967295x30"),
-    "no unit": (lambda c: _overwrite(c, COUNT_AT - 4, bytes(4)), "0.0 depth units per metre"),
-    "many frames": (lambda c: _overwrite(c, COUNT_AT, HUGE), "it ends .*within"),
-    "no frame": (lambda c: _overwrite(c, COUNT_AT, bytes(8)), "it holds no frame"),
-    "a long image": (lambda c: _overwrite(c, COUNT_AT + 8 + 64 + 16, HUGE), "it ends within frame 0 of 4"),
-    "cut within a frame": (lambda c: c[: len(c) * 3 // 4], "it ends .*within"),
-    "cut within the heading": (lambda c: c[:100], "it ends after 100 bytes, within a header"),
-}
-
-
-@pytest.mark.parametrize("name", DAMAGE)
-def test_a_damaged_stream_is_refused_by_what_is_wrong(tmp_path, frames, name):
-    path = write_sens(tmp_path, frames)
-    damage, message = DAMAGE[name]
-    path.write_bytes(damage(path.read_bytes()))
-    with pytest.raises(DataError, match=rf"cannot read .*{SCENE}\.sens of scene {SCENE}: .*{message}"):
-        ScanNetSens(str(tmp_path)).frames(SCENE)
-
-
 def test_depth_that_expands_without_end_is_refused(tmp_path, frames):
     packed = zlib.compress(bytes(1 << 26))
     frame = sens_frame(pixels(frames)[0], millimetres(frames)[0], np.eye(4), True, True)
@@ -189,16 +149,3 @@ def test_a_stream_that_shrinks_after_it_was_indexed_is_an_error(tmp_path, frames
     path.write_bytes(path.read_bytes()[:2000])
     with pytest.raises(DataError, match=r"scene0707_00\.sens of scene scene0707_00 has become shorter"):
         source.load(SCENE, [3])
-
-
-def test_a_real_recording_in_this_layout_reads_as_an_rgbd_folder_does(shared):
-    """The geometry of that folder is checked in the tests of the RGB-D folder."""
-    root = shared / "data" / "seven_scenes_redkitchen_a_registered"
-    ours, theirs = ScanNet(str(root)), RGBDFolder(str(root))
-    (scene,) = ours.scenes
-    ids = ours.frames(scene)
-    assert len(ids) == 56
-    assert ids == tuple(theirs.frames(scene))
-    first, second = ours.load(scene, ids[::20]), theirs.load(scene, ids[::20])
-    for name in ("images", "depth", "world_to_camera", "intrinsics"):
-        assert torch.equal(getattr(first, name), getattr(second, name))

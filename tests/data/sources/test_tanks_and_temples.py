@@ -66,24 +66,6 @@ def test_intrinsics_come_from_the_model_or_the_argument(tmp_path):
         TanksAndTemples(str(tmp_path), intrinsics=[30.0])
 
 
-@pytest.mark.parametrize(
-    ("name", "text", "message"),
-    [
-        ("Barn_trans.txt", "1 0 0 0\n0 1 0 0\n0 0 -1 0\n0 0 0 1\n", "not a rotation, a scale and a translation"),
-        ("Barn_trans.txt", "1 0 0 0\n0 2 0 0\n0 0 1 0\n0 0 0 1\n", "not a rotation, a scale and a translation"),
-        ("Barn_trans.txt", "nan 0 0 0\n0 2 0 0\n0 0 1 0\n0 0 0 1\n", "not a rotation, a scale and a translation"),
-        ("Barn_COLMAP_SfM.log", "0 0 0\n1 0 0 0\n", "has 2 lines; expected five for each image"),
-        ("Barn_COLMAP_SfM.log", "0 0\n" + "1 0 0 0\n" * 4, "image 0: expected 3 numbers"),
-        ("Barn_COLMAP_SfM.log", "0 x 0\n" + "1 0 0 0\n" * 4, "image 0: invalid literal"),
-    ],
-)
-def test_damage_is_named(tmp_path, name, text, message):
-    write(tmp_path, room(3))
-    (tmp_path / "Barn" / name).write_text(text)
-    with pytest.raises(DataError, match=f"{name} of scene Barn.*{message}"):
-        read(tmp_path).frames("Barn")
-
-
 def test_images_may_lie_in_a_folder(tmp_path):
     write(tmp_path, room(3))
     folder = tmp_path / "Barn"

@@ -5,7 +5,6 @@ import shutil
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from examples.data_sets.tum import INTRINSICS, TUM, associate
 from vg2gt.data import DataError
@@ -80,33 +79,6 @@ def test_files_are_listed_in_order_of_time(tmp_path, frames):
     assert np.array_equal(TUM(str(tmp_path)).load(SCENE, [0, 1, 2]).images, expected.images)
 
 
-LINE = "1305031102.0 1 2 3 0 0 0 1\n"
-DAMAGE = {
-    "no poses": ("groundtruth.txt", None, f"scene {SCENE} in .* has no groundtruth.txt"),
-    "no list": ("depth.txt", None, r"cannot read .*depth\.txt of scene"),
-    "an empty list": ("depth.txt", "# nothing\n", r"depth\.txt of scene .* lists no file"),
-    "no path": ("rgb.txt", "1305031102.0\n", "must have lines of 'timestamp path', not '1305031102.0'"),
-    "no time": ("rgb.txt", "nan rgb/a.png\n", "must have lines of 'timestamp path'"),
-    "a time twice": ("rgb.txt", "1.5 rgb/a.png\n1.50 rgb/b.png\n", r"lists 1\.50 twice"),
-    "matrices": ("groundtruth.txt", "0 " * 13, "lines of 'timestamp tx ty tz qx qy qz qw', not 13 numbers"),
-    "no rotation": ("groundtruth.txt", LINE.replace(" 1\n", " 0\n"), "1 frames whose pose is not finite"),
-    "a lost pose": ("groundtruth.txt", LINE.replace("2 3", "nan 3"), "1 frames whose pose is not finite"),
-}
-
-
-@pytest.mark.parametrize("name", DAMAGE)
-def test_damage_is_named(tmp_path, frames, name):
-    write(tmp_path, frames)
-    file, content, message = DAMAGE[name]
-    path = tmp_path / SCENE / file
-    if content is None:
-        path.unlink()
-    else:
-        path.write_text(content)
-    with pytest.raises(DataError, match=message):
-        TUM(str(tmp_path)).frames(SCENE)
-
-
 def test_a_real_recording_without_poses_and_with_made_up_ones(shared, tmp_path, caplog):
     original = shared / "data" / "tum_layout"
     source = TUM(str(original), intrinsics=[525, 525, 319.5, 239.5])
@@ -125,30 +97,3 @@ def test_a_real_recording_without_poses_and_with_made_up_ones(shared, tmp_path, 
     assert float(loaded.depth.max()) < 65535 / 5000
     assert float((loaded.depth > 0).float().mean()) == pytest.approx(1 - 0.357 - 0.030, abs=0.001)  # 0 and 65535
     assert float(loaded.depth[loaded.depth > 0].median()) == pytest.approx(1.111, abs=0.001)
-
-
-def test_real_ground_truth_is_a_smooth_path(shared, tmp_path):
-    """Motion capture took 100 poses per second, but none for 0.11 s, which costs two frames."""
-    folder = tmp_path / "rgbd_dataset_freiburg1_xyz"
-    folder.mkdir()
-    shutil.copy(shared / "data/trajectories/tum_freiburg1_xyz_groundtruth.txt", folder / "groundtruth.txt")
-    times = 1305031098.7 + np.arange(0, 29, 1 / 30)
-    for kind in ("rgb", "depth"):
-        (folder / kind).mkdir()
-        (folder / f"{kind}.txt").write_text("".join(f"{time:.6f} {kind}/{time:.6f}.png\n" for time in times))
-    write_small(folder, times)
-    index = TUM(str(folder)).scene_index(folder.name)
-    assert index.dropped == {"without a pose": 2}
-    centres = -np.einsum("nji,nj->ni", index.world_to_camera[:, :3, :3], index.world_to_camera[:, :3, 3])
-    assert np.linalg.norm(np.diff(centres, axis=0), axis=1).max() < 0.08
-    assert centres.min(0) == pytest.approx([1.01, 0.27, 1.32], abs=0.01)
-    assert centres.max(0) == pytest.approx([1.46, 0.96, 1.76], abs=0.01)
-
-
-def write_small(folder, times):
-    """The same small image for every time."""
-    Image.fromarray(np.ones((3, 4), np.uint16)).save(folder / "d.png")
-    Image.fromarray(np.ones((3, 4, 3), np.uint8)).save(folder / "c.png")
-    for time in times:
-        (folder / "rgb" / f"{time:.6f}.png").symlink_to(folder / "c.png")
-        (folder / "depth" / f"{time:.6f}.png").symlink_to(folder / "d.png")

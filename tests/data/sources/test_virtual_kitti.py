@@ -6,7 +6,6 @@ import torch
 from PIL import Image
 
 from examples.data_sets.virtual_kitti import VirtualKITTI2
-from vg2gt.data import DataError
 
 from .layout_virtual_kitti import write
 from .layouts import room
@@ -53,51 +52,3 @@ def test_variations_and_cameras_of_a_drive_show_one_place(tmp_path, frames):
     assert [source.place(scene) for scene in source.scenes] == ["Scene06", "Scene06", "Scene20"]
     assert VirtualKITTI2(str(tmp_path), scenes=["Scene06/*"]).scenes == (SCENE, "Scene06/rain/Camera_1")
     assert VirtualKITTI2(str(tmp_path), scenes=["*/Camera_0"]).scenes == (SCENE, "Scene20/clone/Camera_0")
-
-
-def test_a_cached_index_is_made_again_when_an_image_is_removed(tmp_path, frames):
-    write(tmp_path / "data", frames)
-    cache = str(tmp_path / "cache")
-    assert VirtualKITTI2(str(tmp_path / "data"), index_cache=cache).frames(SCENE) == (0, 1, 2)
-    (tmp_path / "data/Scene06/fog/frames/depth/Camera_0/depth_00001.png").unlink()
-    assert VirtualKITTI2(str(tmp_path / "data"), index_cache=cache).frames(SCENE) == (0, 2)
-
-
-def _edit(name, change):
-    def edit(folder):
-        lines = (folder / name).read_text().splitlines()
-        (folder / name).write_text("\n".join(change(lines)) + "\n")
-
-    return edit
-
-
-DAMAGE = {
-    "no heading": (_edit("extrinsic.txt", lambda lines: lines[1:]), None),
-    "a row twice": (_edit("extrinsic.txt", lambda lines: [*lines, lines[1]]), "has frame 0 of camera 0 twice"),
-    "a short row": (_edit("intrinsic.txt", lambda lines: [line[: line.rindex(" ")] for line in lines]), "not of 5"),
-    "half a frame": (
-        _edit("extrinsic.txt", lambda lines: [*lines, lines[1].replace("0 0 ", "0.5 0 ", 1)]),
-        "no whole numbers",
-    ),
-    "not rigid": (
-        _edit("extrinsic.txt", lambda lines: [lines[0], "0 0 " + "2 " * 16, *lines[2:]]),
-        "pose of frame 0 .*not a rigid transform",
-    ),
-    "no intrinsics of the camera": (
-        _edit("intrinsic.txt", lambda lines: [line for line in lines if line.split()[1] != "0"]),
-        "3 frames without a pose",
-    ),
-}
-
-
-@pytest.mark.parametrize("name", DAMAGE)
-def test_damage_is_named(tmp_path, frames, name):
-    write(tmp_path, frames)
-    damage, message = DAMAGE[name]
-    damage(tmp_path / "Scene06/fog")
-    source = VirtualKITTI2(str(tmp_path))
-    if message is None:  # the first row was taken for the heading: its frame has no pose
-        assert source.frames(SCENE) == (1, 2)
-        return
-    with pytest.raises(DataError, match=message):
-        source.frames(SCENE)

@@ -111,13 +111,6 @@ def test_view_sets_are_fixed_draws_per_scene():
         ViewSampler(view_sets=0)
 
 
-def test_devices_own_disjoint_places_of_the_row():
-    views = ViewSampler(2, 6, max_images=12)
-    places = [place for step in range(50) for rank in range(3) for place in views.slots(step, rank, 3)]
-    assert len(places) == len(set(places))
-    assert places == sorted(places)
-
-
 def test_scenes_of_one_step_draw_different_views():
     sampler = ViewSampler(4, 4)
     assert sampler.views(0, "a", range(100), 0).context != sampler.views(0, "a", range(100), 1).context
@@ -168,13 +161,6 @@ def test_scenes_that_cannot_be_indexed_are_named_and_left_out(caplog):
     assert "1 of 3 training scenes cannot be read" in caplog.text
     with pytest.raises(DataError, match="1 scenes cannot be read"):
         usable_scenes(source, ViewSampler(6, 6), None)
-
-
-def test_one_frame_is_enough_for_one_view():
-    source = SyntheticScenes(1, num_frames=1)
-    sampler = ViewSampler(1, 1)
-    assert usable_scenes(source, sampler, None) == ["room-000000"]
-    assert sampler.views(4, "room-000000", [0], 0).context == (0,)
 
 
 @pytest.mark.parametrize("arguments", [(0, 3), (4, 3), (3, 4, 8, 0.5), (3, 4, 8, 2.0, -1), (2, 8, 4)])
