@@ -8,10 +8,8 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
-import torch
 
-from tests.commands import run_python
-from vg2gt.runs.checkpoints import read_checkpoint, write_checkpoint
+from vg2gt.runs.checkpoints import read_checkpoint
 
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 TINY = ["data.image_size=[56,112]", "data.train_scenes=1", "data.eval_scenes=1"]
@@ -42,36 +40,10 @@ def test_stages(tmp_path: Path) -> None:
     assert case["training_step"] > sum(case["seconds"].values()) / 2
 
 
-@pytest.mark.slow
-def test_stages_of_the_papers_experiment(tmp_path: Path) -> None:
-    """Its settings ask for two devices and bfloat16; measured is one device's share, networks in bfloat16."""
-    options = ["--views", "3", "--size", "56", "112", "--passes", "1", "--device", "cpu", "--out", str(tmp_path)]
-    small = ["backend=da3_tiny", "data=synthetic", "trainer=gpu", "model=tiny", "training.render_views=null"]
-    run("stages.py", tmp_path, *options, "experiment=paper", *small)
-    (path,) = tmp_path.glob("*-stages-da3_tiny-tiny-cpu.json")
-    assert json.loads(path.read_text())["precision"] == "bf16-mixed"
-
-
 def test_every_script_is_in_the_table() -> None:
     scripts = {path.name for path in BENCHMARKS.glob("*.py")} - {"common.py", "stage_clock.py"}
     helpers = {"found_poses.py", "opensplat.py", "photo_sets.py", "render_scene.py"}
     assert set(re.findall(r"`(\w+\.py)`", (BENCHMARKS / "README.md").read_text())) - {"train.py"} == scripts - helpers
-
-
-def test_training_hours_count_every_device(benchmark_script) -> None:
-    """The paper: 49.5 hours of two devices, 420000 steps, are 99 device hours."""
-    assert benchmark_script("stages").paper_training_hours(49.5 * 3600 / 420_000) == pytest.approx(99)
-
-
-def test_stages_run_in_the_precision_of_the_training(tmp_path: Path, benchmark_script) -> None:
-    stages, device = benchmark_script("stages"), torch.device("cpu")
-    overrides = ("trainer.precision=bf16-mixed", f"data.cache_dir={tmp_path}")
-    run, batch = stages.prepare(stages.Case(2, (28, 56), overrides), device, str(tmp_path / "run"))
-    seen: list[bool] = []
-    run.module.model.fine.register_forward_pre_hook(lambda *_: seen.append(torch.is_autocast_enabled("cpu")))
-    stages.measure_inference(run, batch, 1, device)
-    stages.measure_training(run, batch, 1, device)
-    assert seen == 4 * [True]
 
 
 @pytest.mark.slow
@@ -83,14 +55,6 @@ def test_primitives(tmp_path: Path) -> None:
     assert rows["pixel-aligned", 6] == 3 * rows["pixel-aligned", 2] == 6 * 56 * 112
     assert rows["VG²GT, 4 px", 6] < 2 * rows["VG²GT, 4 px", 2]
     assert rows["VG²GT, 4 px", 6] < rows["VG²GT, 2 px", 6]
-
-
-def test_primitives_take_no_weights(tmp_path: Path) -> None:
-    """They would be passed over."""
-    script = f"import sys; sys.path.insert(0, {str(BENCHMARKS)!r}); import primitives; primitives.main()"
-    shown = run_python(script, "init_from=some.ckpt", folder=tmp_path)
-    assert shown.returncode != 0
-    assert "init_from=some.ckpt: only untrained models are measured here" in shown.stderr
 
 
 @pytest.mark.slow
@@ -119,29 +83,6 @@ def test_baselines(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_baselines_on_recordings(tmp_path: Path, shared: Path) -> None:
-    data = f"shared={shared / 'data'}"
-    run("baselines.py", tmp_path, "name=real", "models=pointcloud", data, "backend=sweep", *TINY, *QUIET)
-    home = tmp_path / "outputs" / "real"
-    recordings = json.loads((home / "metrics.json").read_text())["recordings"]
-    assert set(recordings) == {"HoloLens office", "7-Scenes kitchen"}
-    assert recordings["HoloLens office"]["coloured points"]["0"]["gaussians"] == 8 * 112 * 168
-    assert "## 7-Scenes kitchen, never trained on" in (home / "metrics.md").read_text()
-
-
-def test_baselines_name_what_is_not_there(tmp_path: Path) -> None:
-    write_checkpoint({"state_dict": {"model.gaussians.x": torch.ones(1)}}, tmp_path / "other.ckpt")
-    script = f"import sys; sys.path.insert(0, {str(BENCHMARKS)!r}); import baselines; baselines.main()"
-    for argument, message in {
-        "models=vg2gt,pixel": "models=vg2gt,pixel: no model pixel; there are vg2gt, vg2gt_fine, wo_coarse",
-        "coarse=other.ckpt": "coarse=other.ckpt: this checkpoint has no coarse module",
-    }.items():
-        shown = run_python(script, argument, folder=tmp_path)
-        assert shown.returncode != 0
-        assert message in shown.stderr
-
-
-@pytest.mark.slow
 def test_counts(tmp_path: Path) -> None:
     """Sizes at which nothing is learnt; the number of the model without its coarse module follows the other's."""
     arguments = ["steps=1", "name=short", *TINY, *QUIET]
@@ -167,15 +108,6 @@ def test_counts(tmp_path: Path) -> None:
     assert curve["4", "4.5"] > curve["2", "4.5"]
     if find_spec("matplotlib"):  # extra: eval
         assert (home / "counts.png").stat().st_size > 1000
-
-
-def test_cells_are_found_for_a_number_of_gaussians(benchmark_script) -> None:
-    """Numbers that fall as a power of the cell's edge, and ones that nothing changes."""
-    counts = benchmark_script("counts")
-    edge = counts.footprint_for(20_000, lambda pixels: 300_000 / pixels**1.7, 3.1)
-    assert 300_000 / edge**1.7 == pytest.approx(20_000, rel=0.01)
-    with pytest.raises(ValueError, match="no edge gives 20000 Gaussians within 1%"):
-        counts.footprint_for(20_000, lambda pixels: 50_000.0, 3.1)
 
 
 @pytest.mark.slow

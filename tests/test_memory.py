@@ -6,14 +6,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from hydra.utils import instantiate
 
 from tests.commands import ROOT, run_python
-from vg2gt.config import compose
 from vg2gt.gaussians import GaussianHead
 from vg2gt.memory import (
-    EVALUATION,
-    RECONSTRUCTION,
     TRAINING,
     Cap,
     OutOfMemory,
@@ -21,7 +17,6 @@ from vg2gt.memory import (
     memory_advice,
     note_sizes,
 )
-from vg2gt.profiling import peak_memory_mib
 from vg2gt.studies.study import compose_run
 from vg2gt.training.loop import train
 from vg2gt.types import Voxels
@@ -116,23 +111,6 @@ def test_the_kept_ones_have_their_gradients() -> None:
     assert float(capped.out.weight.grad.abs().sum()) > 0  # pyright: ignore[reportOptionalMemberAccess]
 
 
-def test_what_is_dropped_is_not_told_in_every_pass(caplog: pytest.LogCaptureFixture) -> None:
-    cap, batch = Cap("model.x", "things", "least"), torch.zeros(10, dtype=torch.int64)
-    for _ in range(1000):
-        cap(4, torch.arange(10.0), batch)
-        assert cap.dropped == 6
-    assert len(caplog.records) == 10  # 1, 2, 4, ..., 512
-    cap(20, torch.arange(10.0), batch)
-    assert cap.dropped == 0
-
-
-@pytest.mark.parametrize("option", ["model.fine.max_voxels", "model.gaussians.max_gaussians"])
-def test_a_limit_of_nothing_is_refused(option: str) -> None:
-    config = compose(None, "+backend=oracle", "+model=tiny", f"{option}=0")
-    with pytest.raises(Exception, match=f"{option} must be at least 1, or null"):
-        instantiate(config.model, backend=instantiate(config.backend))
-
-
 def test_training_logs_what_was_dropped(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     overrides = ["model.fine.max_voxels=200", "model.gaussians.max_gaussians=300", "trainer.max_steps=1"]
     config = compose_run([*SMALL, *overrides, "trainer.log_every_n_steps=1", f"name={tmp_path.name}"], tmp_path)
@@ -173,12 +151,6 @@ def test_full_memory_is_one_error(error: Exception) -> None:
     note_sizes({"voxels": 1})  # outside: nobody listens
 
 
-def test_other_errors_pass() -> None:
-    for error in (RuntimeError("shapes cannot be multiplied"), ValueError("memory"), OutOfMemory("said already")):
-        with pytest.raises(type(error), match=str(error)), memory_advice(TRAINING):
-            raise error
-
-
 @pytest.mark.parametrize("stage", ["model.fine.point_mlp", "renderer"])
 def test_training_names_sizes_and_options(stage: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: object, **__: object) -> None:
@@ -191,23 +163,6 @@ def test_training_names_sizes_and_options(stage: str, tmp_path: Path, monkeypatc
     sizes += r", \d+ Gaussians" if stage == "renderer" else r" \("
     with pytest.raises(OutOfMemory, match=rf"{sizes}.*data\.max_images.*data\.image_size.*model\.fine\.max_voxels"):
         train(config)
-
-
-def options_in(advice: str) -> list[str]:
-    words = advice.replace("(", " ").replace(")", " ").replace(",", " ").split()
-    return [word.split("=")[0].lstrip("+") for word in words if "." in word and not word.startswith("--")]
-
-
-@pytest.mark.parametrize("advice", [TRAINING, EVALUATION, RECONSTRUCTION])
-def test_the_options_exist(advice: str) -> None:
-    config = compose("train", "model=vg2gt", "backend=da3_small", "output_dir=.")
-    named = options_in(advice)
-    assert len(named) >= 4
-    for name in named:
-        node = config
-        for key in name.split("."):
-            assert key in node, name
-            node = node[key]
 
 
 SCRIPT = """
@@ -243,9 +198,3 @@ def test_a_real_failure_to_allocate(tmp_path: Path) -> None:
     assert "CAUGHT OutOfMemory memory is full with" in done.stdout, done.stdout[-2000:] + done.stderr[-2000:]
     assert "images of 224x448" in done.stdout
     assert "data.max_images" in done.stdout
-
-
-def test_where_the_system_does_not_tell_its_peak_is_zero(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert peak_memory_mib(torch.device("cpu")) > 50
-    monkeypatch.setitem(sys.modules, "resource", None)  # as on Windows
-    assert peak_memory_mib(torch.device("cpu")) == 0

@@ -123,19 +123,6 @@ def test_the_oldest_go_when_the_folder_is_full(tmp_path: Path, make_scene) -> No
         TokenCache(tmp_path, 0)
 
 
-def test_processes_that_share_a_full_folder_do_not_disturb_each_other(
-    tmp_path: Path, make_scene, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Another one has removed the oldest files between their being listed and their being looked at."""
-    backend, cache = Counting(), TokenCache(tmp_path, max_gb=1e-9)
-    listed = [tmp_path / f"{name}.pt" for name in ("gone", "also-gone")]
-    glob = Path.glob
-    monkeypatch.setattr(Path, "glob", lambda folder, pattern: [*listed, *glob(folder, pattern)])
-    for seed in (1, 2):
-        cache.read(backend, *make_scene(1, 2, (28, 42), seed))
-    assert len(list(tmp_path.iterdir())) == 1
-
-
 def test_a_file_that_may_only_be_read_is_used(
     tmp_path: Path, scene, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

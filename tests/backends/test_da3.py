@@ -53,11 +53,6 @@ def test_reference_strategies_keep_the_view_order(make_backend, make_scene, view
         torch.testing.assert_close(shuffled.depth, b.depth[:, order], rtol=1e-4, atol=1e-5)
 
 
-def test_unknown_strategy_is_refused(make_backend) -> None:
-    with pytest.raises(Exception, match="saddle_balanced"):
-        make_backend("da3_tiny", "reference_view=best")
-
-
 def test_given_poses_are_used_up_to_world_frame_and_scale(make_backend, make_scene) -> None:
     images, hints = make_scene(1, 3, SIZE)
     backend = make_backend("da3_tiny", "given_poses=true")

@@ -5,7 +5,6 @@ import shutil
 import pytest
 import torch
 from torch import Tensor, nn
-from torch.export import Dim
 
 from backends.da3 import DA3Backend
 from backends.normalization import normalize_images
@@ -51,15 +50,6 @@ def test_half_precision_stays_near(encoder: Encoder) -> None:
 
 
 @pytest.mark.slow
-def test_compiles_without_graph_breaks(encoder: Encoder) -> None:
-    compiled = torch.compile(encoder, backend="eager", fullgraph=True)
-    for shape in SHAPES:
-        images = random_images(shape)
-        for a, b in zip(compiled(images), encoder(images), strict=True):
-            torch.testing.assert_close(a, b)
-
-
-@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("g++") is None, reason="torch.compile needs a C++ compiler on a CPU")
 @pytest.mark.parametrize("name", ["vggt_tiny", "da3_tiny"])
 def test_compiled_backend_equals_the_eager_one(make_backend, name: str) -> None:
@@ -74,13 +64,3 @@ def test_compiled_backend_equals_the_eager_one(make_backend, name: str) -> None:
         pairs += [(geometry.cameras.world_to_camera, expected.cameras.world_to_camera)]
         for value, reference in pairs:
             assert float((value - reference).abs().max() / reference.abs().max()) < 5e-6
-
-
-@pytest.mark.slow
-def test_exports_with_free_views_and_sizes(encoder: Encoder) -> None:
-    free = ({0: Dim.AUTO, 1: Dim.AUTO, 3: Dim.AUTO, 4: Dim.AUTO},)
-    exported = torch.export.export(encoder, (random_images(SHAPES[0]),), dynamic_shapes=free, strict=False).module()
-    for shape in SHAPES:
-        images = random_images(shape)
-        for a, b in zip(exported(images), encoder(images), strict=True):
-            torch.testing.assert_close(a, b)

@@ -157,15 +157,6 @@ def test_wrong_descriptions_are_refused(copy: Path, change: Callable[[dict[str, 
         OnnxBackend(str(copy))
 
 
-def test_outputs_are_taken_by_name(copy: Path, shallow_da3: Exportable) -> None:
-    network = onnx.load(copy / "encoder.onnx")
-    first, second, *rest = network.graph.output
-    del network.graph.output[:]
-    network.graph.output.extend([second, first, *rest])
-    onnx.save(network, copy / "encoder.onnx")
-    assert worst_difference(OnnxBackend(str(copy)), shallow_da3) <= LIMIT
-
-
 def test_weights_beside_the_graph_are_read(copy: Path, shallow_da3: Exportable) -> None:
     """As for networks beyond 2 GB, whose weights do not fit into the ONNX file."""
     onnx.save(onnx.load(copy / "encoder.onnx"), copy / "encoder.onnx", save_as_external_data=True, location="data.bin")

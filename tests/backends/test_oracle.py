@@ -120,30 +120,6 @@ def test_tokens_do_not_know_the_truth(make_scene) -> None:
     assert rank == 1  # the confidence channel alone tells them apart
 
 
-def test_tokens_carry_the_predicted_depth(make_scene) -> None:
-    """A linear read-out finds the patch's predicted log-depth in the tokens of every tap."""
-    images, hints = make_scene(4, 4, SIZE)
-    backend = OracleBackend(depth_noise=0.1)
-    tokens = backend.encode(images, hints)
-    log_depth = torch.nn.functional.avg_pool2d(tokens.state["depth"].log(), 14).flatten(2)
-    target = (log_depth - log_depth.mean((1, 2), keepdim=True)).flatten()[:, None]
-    for patch in tokens.patch:
-        features = torch.cat((patch.flatten(0, 2), torch.ones(target.shape[0], 1)), 1)
-        residual = target - features @ torch.linalg.lstsq(features, target).solution
-        assert residual.std() < 0.2 * target.std()
-
-
-def test_response_is_smooth_and_of_the_stated_size(make_scene) -> None:
-    images, hints = make_scene(2, 4, SIZE)
-    backend = OracleBackend(response=0.03)
-    tokens = backend.encode(images, hints)
-    torch.manual_seed(0)
-    changed = backend.decode(tokens.with_patch(tuple(patch + torch.randn_like(patch) for patch in tokens.patch)))
-    residual = (changed.depth / backend.decode(tokens).depth).log()
-    assert 0.02 < residual.std() < 0.04
-    assert residual.diff(dim=-1).abs().mean() < 0.2 * residual.std()
-
-
 def test_token_changes_can_undo_the_noise(make_scene) -> None:
     """Fitting the tokens by gradient alone removes most of the error: the decoder can represent the correction."""
     images, hints = make_scene(1, 2, SIZE)
@@ -190,10 +166,3 @@ def test_each_missing_hint_is_named(make_scene, name: str) -> None:
     images, hints = make_scene(1, 2, SIZE)
     with pytest.raises(ValueError, match=f"missing: {name}\\."):
         OracleBackend().encode(images, replace(hints, **{name: None}))
-
-
-def test_bad_settings_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"backend\.dim"):
-        OracleBackend(dim=32)
-    with pytest.raises(ValueError, match="negative"):
-        OracleBackend(depth_noise=-0.1)

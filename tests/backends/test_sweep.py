@@ -7,13 +7,11 @@ from torch import Tensor
 from backends.sweep.backend import SweepBackend
 from backends.sweep.correlate import GROUPS, SourceWarp, correlate, correlate_reference
 from backends.sweep.head import RESPONSE, DepthHead
-from backends.sweep.network import SweepNet
 from backends.sweep.refine import convex_upsample
 from backends.sweep.tokens import DIM
 from backends.sweep.views import agreed_range, choose_sources, wide_range
-from backends.sweep.volume import agreement, expectation, from_inverse, to_inverse, to_planes
+from backends.sweep.volume import agreement, expectation
 from vg2gt.data import SyntheticScenes
-from vg2gt.geometry.cameras import resize_intrinsics
 from vg2gt.types import Batch, Cameras, Hints
 
 SIZE = (13, 22)
@@ -151,14 +149,6 @@ def test_ranges() -> None:
     assert torch.equal(agreed_range(depth, 0 * agreeing, wide_range(poses)), wide_range(poses))
 
 
-def test_positions_are_inverse_depth() -> None:
-    depth_range = torch.tensor([0.5, 8.0])
-    t = torch.linspace(0, 1, 5)
-    inverse = to_inverse(t, depth_range)
-    torch.testing.assert_close(inverse[[0, -1]], torch.tensor([1 / 8, 2.0]))
-    torch.testing.assert_close(from_inverse(inverse, depth_range), t)
-
-
 def test_expectation_ignores_far_planes() -> None:
     logits = torch.full((1, 9, 1, 1), -20.0)
     logits[0, [2, 3]] = 5.0
@@ -166,14 +156,6 @@ def test_expectation_ignores_far_planes() -> None:
     t, mass = expectation(logits, torch.arange(9.0).view(1, -1, 1, 1))
     torch.testing.assert_close(t, torch.full((1, 1, 1, 1), 2.5), rtol=1e-4, atol=0)
     assert 0.5 < float(mass) < 0.9
-
-
-def test_planes_are_images_in_channels_last_memory() -> None:
-    volume = torch.randn(2, 3, 4, 5 * 6).to(memory_format=torch.channels_last)
-    images = to_planes(volume, (5, 6))
-    assert images.is_contiguous(memory_format=torch.channels_last)
-    assert images.data_ptr() == volume.data_ptr()  # no copy
-    assert torch.equal(images[4 + 1, 2], volume[1, 2, 1].view(5, 6))
 
 
 def test_head_answers_the_correction_channels_linearly() -> None:
@@ -215,26 +197,6 @@ def test_depth_is_in_the_unit_of_the_cameras(make_scene) -> None:
     hints.cameras.world_to_camera[..., :3, 3] *= 1000
     large = backend.decode(backend.encode(images, Hints(cameras=hints.cameras))).depth
     torch.testing.assert_close(large / 1000, depth, rtol=2e-2, atol=0)
-
-
-def test_bad_options_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"backend\.planes"):
-        SweepBackend(pretrained=False, planes=4)
-    with pytest.raises(ValueError, match=r"backend\.sources"):
-        SweepBackend(pretrained=False, sources=0)
-
-
-def test_size_is_what_the_card_says() -> None:
-    parameters = sum(parameter.numel() for parameter in SweepNet().parameters())
-    assert 2 * parameters < 8e6  # bytes of the shipped file
-
-
-def test_intrinsics_of_feature_maps() -> None:
-    """A quarter of the image: the middle of the first cell lies between the pixels 1 and 2."""
-    _, intrinsics = row_of_cameras(1)
-    quarter = resize_intrinsics(intrinsics, 1 / 4, 1 / 4)
-    x = (1.5 - intrinsics[0, 0, 2]) / intrinsics[0, 0, 0]
-    torch.testing.assert_close(x * quarter[0, 0, 0] + quarter[0, 0, 2], torch.tensor(0.0), rtol=0, atol=1e-5)
 
 
 @pytest.fixture(scope="module")

@@ -157,12 +157,6 @@ def test_wrong_options_are_named(options, told: str) -> None:
         EvaluationOptions(**options)
 
 
-@pytest.mark.parametrize("name", ["threshold", "downsample", "cap"])
-def test_lengths_are_positive(name: str) -> None:
-    with pytest.raises(ValueError, match=rf"evaluation\.points\.{name}=-1"):
-        PointOptions(**{name: -1})
-
-
 def test_given_cameras_need_no_joint_pass(module_and_batch, batch: Batch, monkeypatch: pytest.MonkeyPatch) -> None:
     """A backend whose cameras are the data's is not asked for those of held-out views."""
     module, _ = module_and_batch

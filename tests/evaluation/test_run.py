@@ -3,27 +3,22 @@
 import json
 import logging
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 from omegaconf import OmegaConf
 
 from tests.evaluation.conftest import evaluate_overrides
 from tests.training_helpers import small_config
 from vg2gt.cli.evaluate import run_name
 from vg2gt.config import compose
-from vg2gt.data.base import DataError, Frames
+from vg2gt.data.base import DataError
 from vg2gt.data.synthetic import SyntheticScenes
 from vg2gt.evaluation.evaluator import SceneEvaluator
 from vg2gt.evaluation.run import evaluate
-from vg2gt.metrics.lpips import STAGES
 from vg2gt.runs.checkpoints import read_checkpoint, write_checkpoint
 from vg2gt.runs.find import checkpoint_path
-from vg2gt.runs.lock import only_process_in
 from vg2gt.runs.trust import read_run_config
 from vg2gt.training.loop import train
 
@@ -174,27 +169,6 @@ def test_scenes_of_the_training_are_refused(tmp_path: Path, cache: Path, trained
         run(tmp_path, cache, f"ckpt={trained}", "data.val.first_seed=0")
 
 
-class OtherLoader(SyntheticScenes):
-    """Another loader of the same scenes."""
-
-
-def test_scenes_of_the_training_are_refused_whatever_loads_them(tmp_path: Path, cache: Path, trained: Path) -> None:
-    other = [f"data.val._target_={__name__}.OtherLoader", "data.val.first_seed=0"]
-    with pytest.raises(DataError, match="scene room-000000 is used for training and for evaluation"):
-        run(tmp_path, cache, f"ckpt={trained}", *other)
-
-
-def test_scenes_in_a_mixture_that_was_trained_on_are_refused(tmp_path: Path, cache: Path, copied: Path) -> None:
-    config = OmegaConf.load(copied / "config.yaml")
-    part = config.data.train
-    config.data.train = {
-        "_target_": "vg2gt.data.Mixture", "_partial_": True, "parts": {"rooms": part}, "weights": {"rooms": 1}
-    }  # fmt: skip
-    OmegaConf.save(config, copied / "config.yaml")
-    with pytest.raises(DataError, match="scene room-000000 is used for training and for evaluation"):
-        run(tmp_path / "out", cache, f"ckpt={copied}", "data.val.first_seed=0")
-
-
 def test_what_the_weights_before_were_trained_on_is_refused(
     tmp_path: Path, cache: Path, trained: Path, copied: Path, caplog
 ) -> None:
@@ -282,39 +256,12 @@ def test_a_checkpoint_knows_what_it_was_trained_with(tmp_path: Path, cache: Path
     assert lone["views"]["2"]["mean"][name] == whole["views"]["2"]["mean"][name]
 
 
-@pytest.mark.parametrize("content", ["", "foo: 1", "model: null"])
-def test_a_configuration_without_the_runs_parts_is_named(
-    tmp_path: Path, cache: Path, copied: Path, content: str
-) -> None:
-    (copied / "config.yaml").write_text(content)
-    with pytest.raises(ValueError, match=r"config\.yaml (names no (data|backend)|is not a run's configuration)"):
-        run(tmp_path / "out", cache, f"ckpt={copied}")
-
-
 def test_a_training_runs_folder_is_left_as_it_is(cache: Path, trained: Path, copied: Path) -> None:
     for more in ([], ["overwrite=true"]):
         with pytest.raises(FileExistsError, match=r"holds metrics\.json, .*config\.yaml of something"):
             run(copied, cache, f"ckpt={copied}", "data.eval_scenes=1", *more)
     for name in ("config.yaml", "metrics.json", "metrics.md"):
         assert (copied / name).read_bytes() == (trained / name).read_bytes()
-
-
-def test_a_folder_is_one_processs_at_a_time(cache: Path, joined: Path) -> None:
-    code = (
-        "import sys; from vg2gt.runs.lock import *\nwith only_process_in(sys.argv[1]): print('held', flush=1); input()"
-    )
-    before = (joined / "metrics.json").read_bytes()
-    with subprocess.Popen(
-        [sys.executable, "-c", code, str(joined)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-    ) as other:
-        assert other.stdout
-        assert other.stdout.readline() == b"held\n"
-        with pytest.raises(BlockingIOError, match="copy is in use by another process"):
-            run(joined, cache, "overwrite=true")
-        other.kill()
-    assert (joined / "metrics.json").read_bytes() == before
-    with only_process_in(joined):  # the other was killed: it holds nothing
-        pass
 
 
 def test_times_of_another_device_do_not_join(tmp_path: Path, cache: Path, trained: Path) -> None:
@@ -324,28 +271,6 @@ def test_times_of_another_device_do_not_join(tmp_path: Path, cache: Path, traine
     (tmp_path / "identity.json").write_text(json.dumps(identity | {"device": "Some GPU"}))
     with pytest.raises(FileExistsError, match=r"device \(Some GPU -> cpu\)"):
         run(tmp_path, cache, f"ckpt={trained}", "data.eval_scenes=1")
-
-
-class WithoutDepth(SyntheticScenes):
-    """Rooms of which one has no depth."""
-
-    def load(self, scene: str, frame_ids: Any) -> Frames:
-        frames = super().load(scene, frame_ids)
-        if scene == "room-1000000":
-            frames.depth.zero_()
-        return frames
-
-
-def test_a_scene_without_depth_has_no_depth_error(tmp_path: Path, cache: Path) -> None:
-    data = [f"data.val._target_={__name__}.WithoutDepth", "backend=vggt_tiny"]
-    report = run(tmp_path, cache, *data)
-    blind, seeing = (report["views"]["2"]["scenes"][f"room-100000{i}"] for i in (0, 1))
-    name = "rendered/gt_pose/solid/abs_rel"
-    assert blind[name] is None
-    assert seeing[name] is not None
-    assert blind["rendered/novel/solid/psnr"] is not None
-    assert report["views"]["2"]["mean"][name] == seeing[name]
-    assert "n/a" in (tmp_path / "metrics.md").read_text()
 
 
 class WithoutCameras(SyntheticScenes):
@@ -360,24 +285,6 @@ def test_a_backend_that_is_told_the_cameras_needs_some(tmp_path: Path, cache: Pa
         run(tmp_path, cache, *data)
     report = run(tmp_path, cache, *data, "backend=vggt_tiny")
     assert "rendered/gt_pose/solid/psnr" not in report["views"]["2"]["mean"]
-
-
-def test_lpips_from_a_local_file(tmp_path: Path, cache: Path, trained: Path) -> None:
-    generator, state, channels, position = torch.Generator().manual_seed(0), {}, 3, 0
-    for stage, widths in enumerate(STAGES):
-        for width in widths:
-            shape = (width, channels, 3, 3)
-            state[f"features.{position}.weight"] = torch.randn(shape, generator=generator) / (4.5 * channels) ** 0.5
-            state[f"features.{position}.bias"] = torch.zeros(width)
-            channels, position = width, position + 2
-        position += 1
-        state[f"lin{stage}.model.1.weight"] = torch.rand(1, channels, 1, 1, generator=generator)
-    torch.save(state, tmp_path / "weights.pth")
-    out = tmp_path / "out"
-    chosen = ["data.eval_scenes=1", f"evaluation.lpips={tmp_path / 'weights.pth'}"]
-    report = run(out, cache, f"ckpt={trained}", *chosen)
-    assert report["settings"]["lpips"].startswith("VGG-16")
-    assert report["views"]["2"]["mean"]["rendered/novel/solid/lpips"] > 0
 
 
 def test_a_checkpoint_is_a_file_or_the_newest_of_a_run(trained: Path) -> None:

@@ -99,11 +99,6 @@ def test_any_number_of_gaussians_is_laid_out_evenly(splits: int) -> None:
     torch.testing.assert_close(places[:, 0].mean(), torch.zeros((), dtype=torch.float64))
 
 
-def test_four_lie_in_a_square() -> None:
-    places, _ = layout(4, torch.zeros(()))
-    torch.testing.assert_close(places.abs(), torch.full((4, 2), 0.3))
-
-
 @pytest.mark.parametrize("points", ["one", "line", "same place"])
 def test_degenerate_voxels_face_their_cameras(points: str) -> None:
     facing = F.normalize(torch.tensor([0.2, -0.3, 0.9], dtype=torch.float64), dim=-1)

@@ -1,6 +1,5 @@
 """Other people's programs open our files. Each test skips where its program is not installed."""
 
-import importlib.util
 import shutil
 import subprocess
 from dataclasses import replace
@@ -11,8 +10,7 @@ import pytest
 import torch
 import trimesh
 
-from tests.io.gaussian_scenes import scene, views
-from tests.io.splat_oracle import rotations
+from tests.io.gaussian_scenes import scene
 from vg2gt.geometry.spherical_harmonics import DC
 from vg2gt.io import (
     read_gaussian_ply,
@@ -22,12 +20,6 @@ from vg2gt.io import (
 )
 
 pytestmark = pytest.mark.slow
-
-
-def needs(package: str):
-    if importlib.util.find_spec(package) is None:
-        pytest.skip(f"needs {package}: pip install {package}")
-    return importlib.import_module(package)
 
 
 def splat_transform(*arguments: Path | str) -> None:
@@ -83,23 +75,3 @@ def test_trimesh_loads_both_kinds_of_ply(tmp_path: Path) -> None:
     gaussians = trimesh.load(write_gaussian_ply(tmp_path / "scene.ply", before))
     assert isinstance(gaussians, trimesh.PointCloud)
     np.testing.assert_array_equal(gaussians.vertices, before.means.numpy())
-
-
-def test_viser_shows_what_the_reader_returns(tmp_path: Path) -> None:
-    viser = needs("viser")
-    gaussians = read_gaussian_ply(write_gaussian_ply(tmp_path / "scene.ply", scene(50)))
-    scaled = torch.from_numpy(rotations(gaussians.quats.numpy()).astype(np.float32)) * gaussians.scales[:, None]
-    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
-    try:
-        handle = server.scene.add_gaussian_splats(
-            "/scene",
-            centers=gaussians.means.numpy(),
-            covariances=(scaled @ scaled.transpose(1, 2)).numpy(),
-            rgbs=(0.5 + DC * gaussians.sh[:, 0]).clamp(0, 1).numpy(),
-            opacities=gaussians.opacities[:, None].numpy(),
-        )
-        assert handle is not None
-        cameras = views()
-        server.scene.add_camera_frustum("/camera", fov=0.9, aspect=cameras.size[1] / cameras.size[0])
-    finally:
-        server.stop()

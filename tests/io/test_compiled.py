@@ -3,13 +3,10 @@
 import ast
 import errno
 import importlib.util
-import os
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
-import llvmlite.binding
 import pytest
 from numba.core.dispatcher import Dispatcher
 
@@ -206,27 +203,3 @@ def test_kernels_made_in_functions_are_found_again_by_other_processes() -> None:
     assert len(made) >= 6
     for kernel in made:
         assert all(isinstance(cell.cell_contents, bool) for cell in kernel.py_func.__closure__), kernel
-
-
-ADD = """
-from vg2gt.io.compiled import numba
-
-@numba.njit("void(float32[::1], float32[::1])")
-def add(x, y):
-    for i in range(len(x)):
-        x[i] += y[i]
-
-print(*add.inspect_asm().values())
-"""
-
-
-@pytest.mark.skipif(
-    not llvmlite.binding.get_host_cpu_features().get("avx512vbmi2"), reason="a processor without such vectors"
-)
-def test_kernels_compute_with_whole_vectors() -> None:
-    """In a process of its own: numba asks once."""
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("NUMBA_CPU")}
-    shown = subprocess.run(
-        [sys.executable, "-c", ADD], cwd=ROOT, env=environment, capture_output=True, text=True, check=True
-    )
-    assert "zmm" in shown.stdout

@@ -4,13 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from vg2gt.io.files import read_json, replacing, write_bytes, write_json
-
-
-def test_round_trip_makes_folders_and_leaves_no_temporary_file(tmp_path: Path) -> None:
-    path = write_json(tmp_path / "a" / "b.json", {"x": [1, 2.5, None]})
-    assert read_json(path) == {"x": [1, 2.5, None]}
-    assert [p.name for p in path.parent.iterdir()] == ["b.json"]
+from vg2gt.io.files import read_json, replacing, write_bytes
 
 
 def test_failure_keeps_the_old_content(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

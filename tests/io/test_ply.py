@@ -180,14 +180,6 @@ def test_points_round_trip(tmp_path: Path, count: int, colored: bool) -> None:
         np.testing.assert_array_equal(read.colors, rgb)
 
 
-def test_real_points(shared: Path, tmp_path: Path) -> None:
-    garden = np.load(shared / "data" / "gsplat_garden" / "test_garden.npz")
-    xyz, rgb = garden["means3d"], garden["colors"]
-    read = read_point_ply(write_point_ply(tmp_path / "garden.ply", xyz, rgb))
-    np.testing.assert_array_equal(read.positions, xyz.astype(np.float32))
-    np.testing.assert_array_equal(read.colors, rgb)
-
-
 def test_ascii_points_with_faces(tmp_path: Path) -> None:
     path = tmp_path / "mesh.ply"
     head = (

@@ -12,7 +12,7 @@ from vg2gt.geometry.rotations import quat_to_matrix
 from vg2gt.losses import GeometryLoss
 from vg2gt.losses.geometry import camera_errors, depth_gradient_loss, trusted_pixels
 from vg2gt.losses.point_normals import point_normal_loss, point_normal_reference
-from vg2gt.losses.truth import Truth, normalize_truth
+from vg2gt.losses.truth import normalize_truth
 from vg2gt.types import Cameras
 
 
@@ -231,14 +231,6 @@ def test_camera_errors_by_hand() -> None:
     assert math.isclose(float(errors["camera_F"]), (math.atan(2) - math.atan(1)), rel_tol=1e-9)
 
 
-def test_truth_selects_views_and_scenes(sample) -> None:
-    truth = normalize_truth(sample(scenes=2).batch)
-    part = truth.scene(1).views(torch.tensor([2, 0]))
-    assert isinstance(part, Truth)
-    assert torch.equal(part.depth[0, 1], truth.depth[1, 0])
-    assert torch.equal(part.cameras.world_to_camera[0, 0], truth.cameras.world_to_camera[1, 2])
-
-
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 2e-5)])
 def test_compiled_normals_equal_the_plain_ones(sample, dtype: torch.dtype, tolerance: float) -> None:
     """In value and gradient, with holes, at a size that no stride divides."""
@@ -260,19 +252,6 @@ def test_compiled_normals_equal_the_plain_ones(sample, dtype: torch.dtype, toler
     assert (found.grad - expected.grad).norm() < tolerance * expected.grad.norm()
 
 
-def test_compiled_normals_of_wide_images(sample) -> None:
-    """Rows longer than what is worked on at a time."""
-    truth, depth, _, cameras, valid = disturbed(sample, size=(9, 600))
-    found, expected = (depth[0].clone().requires_grad_() for _ in range(2))
-    losses = [
-        point_normal_loss(found, cameras, truth, valid[0]),
-        point_normal_reference(expected, cameras, truth, valid[0]),
-    ]
-    torch.testing.assert_close(*losses, rtol=1e-12, atol=1e-13)
-    gradients = [torch.autograd.grad(loss, x)[0] for loss, x in zip(losses, (found, expected), strict=True)]
-    assert (gradients[0] - gradients[1]).norm() < 1e-12 * gradients[1].norm()
-
-
 def test_compiled_normals_do_not_depend_on_threads(sample) -> None:
     truth, depth, _, cameras, valid = disturbed(sample)
     results, threads = [], torch.get_num_threads()
@@ -286,13 +265,6 @@ def test_compiled_normals_do_not_depend_on_threads(sample) -> None:
         torch.set_num_threads(threads)
     for result in results[1:]:
         assert all(torch.equal(*pair) for pair in zip(result, results[0], strict=True))
-
-
-def test_compiled_normals_hide_no_nan(sample) -> None:
-    truth, depth, _, cameras, valid = disturbed(sample)
-    broken = depth[0].clone()
-    broken[tuple(valid[0].nonzero()[100])] = torch.nan
-    assert point_normal_loss(broken, cameras, truth, valid[0]).isnan()
 
 
 def test_normals_give_cameras_a_gradient_where_they_ask_for_one(sample) -> None:

@@ -24,14 +24,6 @@ def noisy(made, seed=0, amount=0.03):
     return made.with_render(color=0.8 * made.rendered.color + 0.2 * shade, depth=1.01 * made.rendered.depth)
 
 
-def joined(first, second):
-    """Two records of one scene each as one record of two scenes."""
-    rest: list[torch.Tensor] = []
-    second.map(lambda tensor: rest.append(tensor) or tensor)
-    remaining = iter(rest)
-    return first.map(lambda tensor: torch.cat((tensor, next(remaining))))
-
-
 def in_unit(made, factor: float):
     """The same prediction in another unit."""
     factors = torch.full_like(made.prediction.unit, factor)
@@ -134,26 +126,6 @@ def test_scales_are_constants(sample) -> None:
     assert abs(float((gradient * depth.detach()).sum())) > 1e-4
 
 
-def test_scenes_count_alike(sample) -> None:
-    first, second = (noisy(sample(seed=seed), seed) for seed in (1, 2))
-    holes = second.batch.depth.clone()
-    holes[:, :, :15] = 0  # fewer pixels must not mean less weight
-    second = second.with_truth(holes)
-    both = replace(
-        first,
-        batch=replace(joined(first.batch, second.batch), scene=("a", "b")),
-        prediction=joined(first.prediction, second.prediction),
-        rendered=joined(first.rendered, second.rendered),
-        cameras=joined(first.cameras, second.cameras),
-    )
-    reports = [VG2GTLoss()(*made.inputs) for made in (first, second)]
-    joint = VG2GTLoss()(*both.inputs)
-    torch.testing.assert_close(joint.total, (reports[0].total + reports[1].total) / 2)
-    for name in joint.terms:
-        torch.testing.assert_close(joint.terms[name], (reports[0].terms[name] + reports[1].terms[name]) / 2)
-    torch.testing.assert_close(joint.scale, torch.cat([r.scale for r in reports]))
-
-
 @pytest.mark.parametrize("align", [ScaleAlignment(), ScaleAlignment("rendered", per_view=True)])
 def test_a_scene_without_depth_still_trains_its_colours(sample, align: ScaleAlignment) -> None:
     made = noisy(sample(scenes=2))
@@ -222,16 +194,6 @@ def test_term_weights_reach_the_total(sample) -> None:
     terms = report.terms
     expected = 2 * sum(terms[n] for n in DEPTH_TERMS[:3]) + 0.5 * sum(terms[n] for n in DEPTH_TERMS[3:])
     torch.testing.assert_close(report.total, expected + 0.1 * (terms["color_l1"] + terms["ssim"] + terms["normal"]))
-
-
-def test_autocast_and_half_precision_inputs_change_nothing(sample) -> None:
-    made = noisy(sample(dtype=torch.float32))
-    half = made.prediction.geometry.depth.bfloat16()
-    with torch.autocast("cpu", torch.bfloat16):
-        inside = VG2GTLoss()(*made.with_depth(half).inputs)
-    outside = VG2GTLoss()(*made.with_depth(half.float()).inputs)
-    assert inside.total.dtype == torch.float32
-    assert torch.equal(inside.total, outside.total)
 
 
 @pytest.mark.parametrize(

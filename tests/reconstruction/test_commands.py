@@ -147,24 +147,6 @@ def test_sizes() -> None:
         parse(["a", "--out", "b", "--size", "large"])
 
 
-def test_help_lists_all_outputs(capsys: pytest.CaptureFixture) -> None:
-    with pytest.raises(SystemExit):
-        reconstruct_command.main(["--help"])
-    text = capsys.readouterr().out
-    assert all(name in text for name in ("scene.splat", "nerfstudio", "report.html", "depth.npy"))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["pi3_house", "da3_soh", "vggt_room"])
-def test_real_photographs(name: str, shared: Path, tmp_path: Path) -> None:
-    folder = shared / "data" / "unposed" / name
-    save = "scene.ply,cameras.json,depth.png,normals.png,mesh.ply,colmap,orbit.gif,report.html"
-    reconstruct_command.main([str(folder), "--out", str(tmp_path), "--save", save, "--frames", "8", *TINY])
-    cameras = read_cameras_json(tmp_path / "cameras.json")
-    assert len(cameras) == len([p for p in folder.iterdir() if p.suffix in (".png", ".jpg")])
-    assert len(list((tmp_path / "depth").iterdir())) == len(cameras)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "psnr"),

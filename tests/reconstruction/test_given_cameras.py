@@ -25,7 +25,6 @@ from vg2gt.io import (
     write_colmap,
     write_transforms,
 )
-from vg2gt.reconstruction import sfm
 from vg2gt.reconstruction.cameras import pictures_for
 from vg2gt.reconstruction.given_cameras import given_pictures
 from vg2gt.reconstruction.inputs import Views, depth_range, load_views
@@ -238,17 +237,6 @@ def test_photographs_for_the_oracle_are_refused_before_any_work(
     assert "--backend da3_small" in said
     assert "hints" not in said
     assert not (tmp_path / "out").exists()
-
-
-def test_without_pycolmap_one_line_names_the_extra(model, photos: Path, tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(sfm.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(ImportError, match=r"pip install 'vg2gt\[colmap\]'"):
-        reconstruct_with(model, photos)
-    monkeypatch.setattr("vg2gt.runs.load.build_model", lambda *_: pytest.fail("built a model"))
-    with pytest.raises(SystemExit, match=r"pip install 'vg2gt\[colmap\]'"):
-        reconstruct_command.main(
-            [str(photos), "--backend", STAND_IN, "--poses", "sfm", "--out", str(tmp_path / "out"), "--quiet"]
-        )
 
 
 @pytest.mark.parametrize("needed", [False, True])

@@ -35,12 +35,6 @@ def test_order_and_mixture_of_arguments_are_kept(photos: Path, frames) -> None:
     assert torch.allclose(views.images[[0, 3, 4]], frames.images[[3, 0, 1]], atol=1 / 500)
 
 
-def test_every_and_max_images_spread_evenly(photos: Path) -> None:
-    assert [p.name for p in find_pictures(photos, every=2)] == ["IMG_8", "IMG_10"]
-    assert [p.name for p in find_pictures(photos, max_images=2)] == ["IMG_8", "IMG_11"]
-    assert [p.name for p in find_pictures(photos, max_images=1)] == ["IMG_8"]
-
-
 def test_frames_of_a_video(tmp_path: Path) -> None:
     frames = [np.zeros((20, 70, 3), np.uint8) for _ in range(70)]
     for i, frame in enumerate(frames):

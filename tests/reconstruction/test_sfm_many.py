@@ -52,13 +52,6 @@ def test_pairs_of_many_are_neighbours_and_those_that_look_alike() -> None:
     assert sfm_pairs.likely_pairs(descriptors) == pairs
 
 
-@pytest.mark.parametrize("seen", [0, 1])
-def test_images_without_features_have_pairs_too(seen: int) -> None:
-    """Words of fewer features than there are words."""
-    descriptors = [np.full((seen if i == 3 else 0, 128), 9, np.uint8) for i in range(70)]
-    assert {(i, i + 1) for i in range(69)} <= set(sfm_pairs.likely_pairs(descriptors))
-
-
 def test_many_photographs_are_matched_in_likely_pairs(shared: Path, tmp_path: Path, monkeypatch) -> None:
     """The way of many, for eight: 17 of 28 pairs."""
     pycolmap = pytest.importorskip("pycolmap")

@@ -10,7 +10,6 @@ from pathlib import Path
 import lightning
 import pytest
 import torch
-from omegaconf import OmegaConf
 from torch import Tensor
 
 from tests.losses.conftest import Sample, make_sample
@@ -298,14 +297,3 @@ def test_forty_steps_on_two_processes(tmp_path: Path, cache: Path) -> None:
         assert losses.median() < 2e-6
         assert gradients.median() < 5e-6
         assert gradients.max() < 1e-2  # a cell or tile may flip at equal weights, too
-
-
-@pytest.mark.slow
-def test_a_sweep_over_numbers_of_devices(tmp_path: Path, cache: Path) -> None:
-    small = [*SMALL, *TINY[:7], f"data.cache_dir={cache}", "trainer.max_steps=1", "name=sweep"]
-    command = [sys.executable, "-m", "vg2gt.cli.train", "-m", *small, "trainer=default,ddp"]
-    sweep = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=1200, check=False)
-    assert sweep.returncode == 0, sweep.stderr[-3000:]
-    folders = [tmp_path / "outputs" / "sweep" / job for job in "01"]
-    assert [OmegaConf.load(folder / "config.yaml").trainer.devices for folder in folders] == [1, 2]
-    assert all((folder / "metrics.json").is_file() for folder in folders)

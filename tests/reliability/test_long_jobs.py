@@ -12,8 +12,6 @@ from tests.reliability.crash_harness import ABLATE, EVALUATE, Attempt, Moment
 from tests.training_helpers import SMALL
 from vg2gt.io.files import read_json
 
-SYNTHETIC = "vg2gt.data.synthetic"
-
 
 def kill_and_finish(module: str, arguments: list[str], folder: Path, moments: list[Moment], warm: bool = True) -> int:
     """Returns how many of the moments came before the end."""
@@ -31,11 +29,6 @@ def kill_and_finish(module: str, arguments: list[str], folder: Path, moments: li
 def after_a_scene(attempt: Attempt) -> bool:
     """A scene is evaluated."""
     return any(name.startswith("scenes/2/") for name in attempt.new())
-
-
-def after_a_recording(attempt: Attempt) -> bool:
-    """A scene is written."""
-    return any(name.startswith("room-") for name in attempt.new())
 
 
 def without_cost(node: Any) -> Any:
@@ -81,17 +74,3 @@ def test_study(tmp_path: Path, cache: Path) -> None:
         assert (expected / name).read_bytes() == (folder / name).read_bytes(), name
     print(f"{kills} kills survived: a study")
     assert kills >= 3
-
-
-@pytest.mark.slow
-def test_export_of_synthetic_scenes(tmp_path: Path) -> None:
-    def arguments(folder: Path) -> list[str]:
-        return [f"out={folder}", "scenes=6", "frames=4", "size=[28,56]", "workers=1"]
-
-    expected, folder = tmp_path / "whole", tmp_path / "killed"
-    harness.finish(SYNTHETIC, arguments(expected), expected, warm=False)
-    kills = kill_and_finish(SYNTHETIC, arguments(folder), folder, [after_a_recording] * 3, warm=False)
-    files = [{p.relative_to(f): p.read_bytes() for p in f.rglob("*") if p.is_file()} for f in (expected, folder)]
-    assert files[0] == files[1]
-    print(f"{kills} kills survived: an export")
-    assert kills >= 2

@@ -272,30 +272,7 @@ def test_voxel_grids_do_not_depend_on_the_precision(tmp_path: Path, cache: Path)
     assert not torch.equal(exact.features.float(), mixed.features.float())
 
 
-@pytest.mark.parametrize("backend", ["oracle", "da3_tiny", "vggt_tiny"])
-def test_decoding_does_not_depend_on_the_precision(tmp_path: Path, cache: Path, backend: str) -> None:
-    run = tiny_run(tmp_path, cache, f"backend={backend}")
-    (batch,) = first_batches(run, 1)
-    frozen = run.module.model.backend
-    with torch.no_grad():
-        tokens = frozen.encode(batch.context.images, batch.context.hints)
-        exact = frozen.decode(tokens)
-        with autocast(True):
-            mixed = frozen.decode(tokens)
-            again = frozen.encode(batch.context.images, batch.context.hints)
-    assert torch.equal(exact.depth, mixed.depth)
-    assert torch.equal(exact.cameras.world_to_camera, mixed.cameras.world_to_camera)
-    assert torch.equal(exact.cameras.intrinsics, mixed.cameras.intrinsics)
-    assert torch.equal(again.patch[-1], tokens.patch[-1])
-
-
 @pytest.mark.parametrize("precision", ["16-mixed", "bf16-true", "16-true", "64-true", "16", "64"])
 def test_other_precisions_are_refused(tmp_path: Path, cache: Path, precision: str) -> None:
     with pytest.raises(ValueError, match=rf"trainer\.precision={precision} .* use bf16-mixed .*, 32-true, or auto"):
         tiny_run(tmp_path, cache, f"trainer.precision={precision}")
-
-
-@pytest.mark.parametrize("precision", ["32", "bf16"])
-def test_short_names_of_supported_precisions(tmp_path: Path, cache: Path, precision: str) -> None:
-    run = tiny_run(tmp_path, cache, f"trainer.precision={precision}")
-    assert run.trainer.precision in ("32-true", "bf16-mixed")

@@ -191,20 +191,6 @@ def test_color_only_changes_nothing_but_what_it_leaves_out(implementation: Imple
         torch.testing.assert_close(complete, reduced, rtol=1e-12, atol=1e-12)
 
 
-def test_cpu_gradients_of_single_outputs_add_up() -> None:
-    gaussians, cameras = with_gradients(soup(40)), cameras_around((20, 24))
-    inputs = [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities]
-    out = render(gaussians, cameras, implementation="cpu")
-    weights = random_like(out)
-    total = torch.autograd.grad(images(out), inputs, weights, retain_graph=True)
-    parts = [
-        torch.autograd.grad(image, inputs, weight, retain_graph=True)
-        for image, weight in zip(images(out), weights, strict=True)
-    ]
-    for index, whole in enumerate(total):
-        torch.testing.assert_close(sum(part[index] for part in parts), whole, rtol=1e-9, atol=1e-9)
-
-
 @pytest.mark.parametrize("implementation", ["dense", *FAST])
 def test_no_gradient_passes_the_alpha_cap(implementation: Implementation) -> None:
     gaussians = soup(1, size=3.0)

@@ -185,33 +185,7 @@ def test_a_gpu_without_triton_is_told_so(checks: list[str], monkeypatch: pytest.
     assert renderer._resolve("torch", GPU) == "torch"
 
 
-def test_without_a_folder_to_keep_it_in_every_process_checks(
-    checks: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(selfcheck, "cache_folder", lambda: None)
-    assert renderer.automatic(GPU) == "triton"
-    selfcheck._refusal.cache_clear()
-    assert renderer.automatic(GPU) == "triton"
-    assert checks == ["cuda", "cuda"]
-
-
 def test_the_identity_names_versions_and_the_kernels() -> None:
     found = selfcheck.identity(torch.device("cpu"))
     assert f"torch {torch.__version__}" in found
     assert "kernels " in found
-
-
-def test_the_fixed_scenes_are_two_of_the_models_degree_in_several_parts() -> None:
-    gaussians, cameras = selfcheck.as_scene(selfcheck.fixed_scene())
-    assert cameras.world_to_camera.shape[:2] == (selfcheck.SCENES, selfcheck.VIEWS) == (2, 2)
-    assert gaussians.sh.shape[1] == 9
-    assert gaussians.batch.bincount().tolist() == [selfcheck.COUNT] * 2
-    assert selfcheck.ROWS < selfcheck.COUNT * selfcheck.SCENES  # every Gaussian has a row a view at least
-
-
-def test_the_fixed_scene_does_not_depend_on_random_generators() -> None:
-    torch.manual_seed(0)
-    first = selfcheck.fixed_scene()
-    torch.manual_seed(1)
-    assert all(torch.equal(a, b) for a, b in zip(first, selfcheck.fixed_scene(), strict=True))
-    assert 0.05 < float(first[3].min()) < float(first[3].max()) == 1.0

@@ -81,35 +81,6 @@ def bundle(tmp_path: Path) -> Path:
     return folder
 
 
-@pytest.mark.filterwarnings("ignore:.*decodes without gradient")
-def test_a_harmless_bundle_is_read(bundle: Path) -> None:
-    assert OnnxBackend(str(bundle)).name == "da3_tiny"
-
-
-def field(number: int, content: bytes) -> bytes:
-    """One field of a protocol buffer."""
-    length, digits = len(content), []
-    while length > 127:
-        digits.append(length & 127 | 128)
-        length >>= 7
-    return bytes([number << 3 | 2, *digits, length]) + content
-
-
-def nested_graphs(depth: int) -> bytes:
-    """A graph in an attribute of a node of a graph in ..."""
-    graph = b""
-    for _ in range(depth):
-        graph = field(1, field(5, field(6, graph)))
-    return field(7, graph)
-
-
-def test_what_is_no_network(bundle: Path) -> None:
-    for content in (b"", b"\x08\x08", b"\x7fELF" + bytes(64), b"ORTM" * 9, bytes(range(256)), nested_graphs(2000)):
-        (bundle / ENCODER).write_bytes(content)
-        with pytest.raises(ValueError, match=r"encoder\.onnx"):
-            OnnxBackend(str(bundle))
-
-
 @pytest.mark.parametrize(
     ("domain", "operator", "attributes"),
     [

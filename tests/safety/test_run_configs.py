@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 from vg2gt.config import config_dir
 from vg2gt.evaluation.checks import refuse_training_views
 from vg2gt.runs.load import load_model
-from vg2gt.runs.trust import ENVIRONMENT, UntrustedError, check_targets, read_run_config
+from vg2gt.runs.trust import ENVIRONMENT, UntrustedError, check_targets
 from vg2gt.studies.study import _refuse_other_run
 from vg2gt.training.start import name_differences
 
@@ -206,20 +206,3 @@ def test_everything_of_the_projects_configurations_is_trusted() -> None:
         assert files
         for path in files:
             check_targets(OmegaConf.load(path), path)
-
-
-def test_a_runs_own_configuration_is_read_back(run_folder: Path) -> None:
-    path = run_folder / "config.yaml"
-    assert read_run_config(path) == OmegaConf.load(path)
-    path.write_text("- 1\n")
-    with pytest.raises(ValueError, match="expected a mapping"):
-        read_run_config(path)
-
-
-def test_the_attacks_are_attacks(tmp_path: Path) -> None:
-    """Without the check Hydra, or Python, would do what they say."""
-    from hydra.utils import instantiate
-
-    path = tmp_path / "folder"
-    instantiate({"_target_": "os.mkdir", "path": str(path)})
-    assert path.is_dir()

@@ -107,16 +107,6 @@ def test_every_rule_finds_its_fault(source: str, found: str) -> None:
     assert list(complaints(source)) == [found]
 
 
-def test_what_is_fine_is_fine() -> None:
-    for source in (
-        "model.eval()",
-        "torch.load(path, weights_only=True)",
-        "np.load(path, allow_pickle=False)",
-        "subprocess.run([program, argument], shell=False)",
-    ):
-        assert list(complaints(source)) == []
-
-
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.relative_to(ROOT).as_posix())
 def test_sources(path: Path) -> None:
     allowed = ALLOWED.get(path.relative_to(ROOT).as_posix(), set())

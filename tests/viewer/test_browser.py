@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -75,12 +74,6 @@ def test_screenshot_is_our_rasterized_image_of_a_room(
 def test_screenshot_of_gaussians_of_all_shapes_and_colours(page: Page, tmp_path: Path, degree: int) -> None:
     figures = compare(page, tmp_path / "scene.html", scene(300, degree), views((120, 168)))
     assert min(figures) > CLOSE
-
-
-def test_equal_depths_keep_the_order_of_the_renderer(page: Page, tmp_path: Path) -> None:
-    before = scene(200)
-    flat = replace(before, means=before.means * torch.tensor([1.0, 1, 0]) + torch.tensor([0.0, 0, 3]))
-    assert min(compare(page, tmp_path / "flat.html", flat, views((120, 168)).select(slice(0, 1)))) > CLOSE
 
 
 def test_light_shines_through_the_alpha_cap(page: Page, tmp_path: Path) -> None:
@@ -180,48 +173,3 @@ def test_page_fetches_nothing_and_hostile_names_do_nothing(page: Page, tmp_path:
     )
     assert page.run("fetch('data:,x').then(() => 'fetched', () => 'refused')") == "refused"
     assert page.run("window.hole") is None
-
-
-@contextmanager
-def lacking(page: Page, script: str) -> Iterator[None]:
-    """Runs a script before every page's own."""
-    number = page.call("Page.addScriptToEvaluateOnNewDocument", source=script)["identifier"]
-    yield
-    page.call("Page.removeScriptToEvaluateOnNewDocument", identifier=number)
-
-
-@pytest.mark.parametrize(
-    ("script", "least"),
-    [
-        ("window.Worker = undefined", CLOSE),
-        ("WebGL2RenderingContext.prototype.getExtension = () => null", 40.0),  # rounds to 8 bits at every splat
-    ],
-)
-def test_browsers_that_lack_something(page: Page, tmp_path: Path, script: str, least: float) -> None:
-    with lacking(page, script):
-        assert min(compare(page, tmp_path / "page.html", scene(300), views((120, 168)))) > least
-
-
-def test_browser_without_webgl_says_so(page: Page, tmp_path: Path) -> None:
-    path = write_viewer_html(tmp_path / "page.html", pictured_scene())
-    with lacking(page, "HTMLCanvasElement.prototype.getContext = () => null"):
-        page.open(path.as_uri(), 400, 300)
-        page.run("vg2gtViewer.ready.catch(() => null)")
-        assert "no WebGL 2" in page.run("document.getElementById('status').textContent")
-
-
-def test_narrow_screen(page: Page, tmp_path: Path) -> None:
-    address = write_viewer_html(tmp_path / "page.html", pictured_scene("a-very-" + "long-" * 30 + "name")).as_uri()
-    page.open(address, 360, 640, mobile=True)
-    page.run("vg2gtViewer.ready.then(() => null)")
-    assert page.run("document.documentElement.scrollWidth") <= 360
-    places = page.run(
-        "[...document.querySelectorAll('#panel button, #panel select, #panel label, #panel summary')]"
-        ".map((e) => e.getBoundingClientRect()).map((r) => [r.left, r.right, r.width, r.height])"
-    )
-    assert all(left >= 0 and right <= 360 and width > 0 and height >= 16 for left, right, width, height in places)
-    unnamed = page.run(
-        "[...document.querySelectorAll('button, select, input, canvas')].filter((e) => "
-        "!(e.getAttribute('aria-label') || e.textContent.trim() || e.closest('label')?.textContent.trim())).length"
-    )
-    assert unnamed == 0

@@ -4,7 +4,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from vg2gt.geometry.cameras import camera_centers, scale_translations, unproject
+from vg2gt.geometry.cameras import camera_centers, unproject
 from vg2gt.types import Cameras
 
 
@@ -96,28 +96,6 @@ def test_a_scene_without_points_has_no_voxels(make_fine, make_room, moments):
     nothing.features.sum().backward()
 
 
-def test_a_single_voxel_and_coordinates_of_two_hundred_units(make_fine, make_room):
-    tokens, geometry, images = make_room()
-    voxels = make_fine(voxel_size=1000.0)(tokens, geometry, images)
-    assert len(voxels.grid) <= 8
-    voxels.features.sum().backward()
-    far = replace(geometry, depth=geometry.depth * 140)
-    voxels = make_fine(voxel_size=0.002)(tokens, far, images)
-    assert voxels.centroid.abs().max() > 150
-    assert torch.isfinite(voxels.features).all()
-
-
-def test_autocast_leaves_the_grid_identical(make_fine, make_room):
-    tokens, geometry, images = make_room()
-    module = make_fine()
-    plain = module(tokens, geometry, images)
-    with torch.autocast("cpu", torch.bfloat16):
-        cast = module(tokens, geometry, images)
-    assert torch.equal(plain.grid, cast.grid)
-    assert torch.equal(plain.centroid, cast.centroid)
-    assert torch.equal(plain.colors, cast.colors)
-
-
 def test_scaling_scene_and_voxel_by_a_power_of_two(make_fine, make_room):
     tokens, geometry, images = make_room()
     poses = geometry.cameras.world_to_camera.clone()
@@ -173,13 +151,6 @@ def test_cap_keeps_the_most_confident_and_says_so(make_fine, make_room, caplog):
     assert not caplog.text
 
 
-def test_footprint_guard(make_fine, make_room):
-    tokens, geometry, images = make_room()
-    voxels = make_fine(voxel_size=1e-4, min_footprint=3)(tokens, geometry, images)
-    expected = 3 * geometry.depth.median() / geometry.cameras.intrinsics[0, 0, 0, 0]
-    torch.testing.assert_close(voxels.voxel_size, expected[None])
-
-
 def test_without_gradient_views_are_pooled_a_few_at_a_time_to_the_same_voxels(make_fine, make_room):
     tokens, geometry, images = make_room(scenes=2, views=3)
     depth = geometry.depth.clone()
@@ -231,17 +202,6 @@ def test_moments_are_the_covariances_of_the_pixels(make_fine, make_room):
             torch.testing.assert_close(voxels.moments.pixel[row].double(), (share[:, 0] * depth).sum() / focal / 0.125)
             sight = voxels.centroid[row] - camera_centers(geometry.cameras)[scene].mean(0)
             assert (voxels.moments.facing[row] * sight).sum() < 0
-
-
-def test_moments_of_a_scaled_scene_are_the_same(make_fine, make_room):
-    tokens, geometry, images = make_room()
-    small = make_fine(moments=True)(tokens, geometry, images).moments
-    cameras = scale_translations(geometry.cameras, torch.tensor([1024.0]))
-    large = make_fine(moments=True, voxel_size=128.0)(
-        tokens, replace(geometry, depth=1024 * geometry.depth, cameras=cameras), images
-    ).moments
-    for name in ("spread", "cross", "facing", "pixel"):
-        torch.testing.assert_close(getattr(small, name), getattr(large, name), atol=1e-6, rtol=1e-5)
 
 
 def test_fringes_of_silhouettes_make_no_voxels(make_fine, make_room):

@@ -104,31 +104,11 @@ def test_shifting_by_whole_voxels_shifts_the_grid_only():
     assert torch.equal(pool_mean(values, weights, plan), pool_mean(values, weights, moved))
 
 
-def test_duplicating_all_points():
-    points, batch, values, weights = cloud()
-    twice = [torch.cat((x, x)) for x in (points, batch, values, weights)]
-    plan, double = planned(points, batch), planned(*twice[:2])
-    assert torch.equal(plan.grid, double.grid)
-    assert torch.equal(2 * plan.counts, double.counts)
-    assert torch.equal(pool_min(weights, plan), pool_min(twice[3], double))
-    torch.testing.assert_close(
-        pool_mean(values, weights, plan), pool_mean(twice[2], twice[3], double), atol=1e-12, rtol=0
-    )
-
-
 def test_far_cells_do_not_alias():
     # 16-bit packed keys put all of these into one voxel
     cells = torch.tensor([[0, 0, 0], [65536, 0, 0], [0, 65536, 0], [-65536, 0, 0], [0, 0, -65536]])
     batch = torch.zeros(5, dtype=torch.int64)
     assert mixed_radix_keys(cells, batch)[0].unique().numel() == 5
-
-
-def test_two_hundred_metres_at_two_millimetres():
-    points = torch.tensor([[-200.0, -200, -200], [200, 200, 200], [0.001, 0.001, 0.001]])
-    batch = torch.zeros(3, dtype=torch.int64)
-    plan = planned(points, batch, size=torch.tensor([0.002]))
-    assert len(plan) == 3
-    assert plan.grid.abs().max() <= 100_001
 
 
 def test_cells_too_far_apart_are_refused_by_name():

@@ -80,12 +80,6 @@ def test_scenes_are_apart() -> None:
     torch.testing.assert_close(both, torch.cat(alone))
 
 
-def test_nothing_and_one_point() -> None:
-    assert surface_normals(*moments_of(torch.zeros(0, 3)), 3).shape == (0, 3)
-    spread, facing, offset, plan = moments_of(torch.tensor([[5.2, 3.1, 0.4]]))
-    torch.testing.assert_close(surface_normals(spread, facing, offset, plan, 3), facing)
-
-
 def two_scenes() -> tuple[Tensor, Tensor, Tensor, VoxelPlan]:
     """Cells of several points and of one."""
     points = torch.cat([layers(torch.tensor([0.3, 0.1, 1.0]), 0.3, seed)[: 3000 + seed] for seed in range(2)])

@@ -4,7 +4,6 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from vg2gt.voxels import row_products
 from vg2gt.voxels.row_products import linear_rows
 
 
@@ -32,19 +31,3 @@ def test_rows_go_through_the_same_layer(shape: tuple[int, ...], with_bias: bool,
 def test_rows_need_not_be_contiguous() -> None:
     x, weight = torch.randn(7, 2048).t(), torch.randn(5, 7)
     torch.testing.assert_close(linear_rows(x, weight), F.linear(x, weight))
-
-
-@pytest.mark.skipif(not row_products.has_onednn(torch.device("cpu")), reason="this processor's torch has no oneDNN")
-def test_only_many_rows_in_float32_are_convolved(monkeypatch: pytest.MonkeyPatch) -> None:
-    convolved = []
-    conv2d = F.conv2d
-    monkeypatch.setattr(F, "conv2d", lambda x, *others: convolved.append(x) or conv2d(x, *others))
-    weight = torch.randn(5, 7)
-    for rows, dtype in ((960, torch.float32), (1025, torch.float32), (1088, torch.float32), (1024, torch.float64)):
-        linear_rows(torch.randn(rows, 7, dtype=dtype), weight.to(dtype))
-    assert not convolved
-    x = torch.randn(1024, 7)
-    linear_rows(x, weight)
-    (images,) = convolved
-    assert images.data_ptr() == x.data_ptr()  # nothing was moved
-    assert images.is_contiguous(memory_format=torch.channels_last)

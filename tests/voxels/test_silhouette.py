@@ -23,12 +23,6 @@ def test_pixels_between_foreground_and_background_are_told_apart(turned: bool, u
     assert torch.equal(found, expected)
 
 
-def test_a_sharp_silhouette_loses_no_pixel() -> None:
-    depth = torch.full((2, 3, 12, 16), 2.0)
-    depth[..., 3:9, 5:11] = 1.0
-    assert on_surface(depth).all()
-
-
 def test_planes_are_surfaces_however_they_lean() -> None:
     v, u = torch.meshgrid(torch.linspace(-0.5, 0.5, 40), torch.linspace(-1, 1, 80), indexing="ij")
     for lean in (0.0, 0.5, 0.8):
@@ -40,12 +34,6 @@ def test_noise_without_a_silhouette_is_left_alone() -> None:
     generator = torch.Generator().manual_seed(0)
     depth = 2 * (1 + 0.015 * torch.rand(1, 30, 40, generator=generator))
     assert on_surface(depth).all()
-
-
-def test_unknown_depth_is_no_silhouette() -> None:
-    depth = torch.full((1, 20, 20), 1.5)
-    depth[:, :, 10:] = 0
-    assert on_surface(depth)[depth > 0].all()
 
 
 @pytest.mark.parametrize(("step", "beside"), [(1.14, False), (1.16, True)])

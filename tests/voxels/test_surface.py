@@ -58,11 +58,6 @@ def test_where_no_normal_is_known_it_is_the_cameras_axis() -> None:
     torch.testing.assert_close(frame(slope=0.5, row=12).normal, slanted)
 
 
-@pytest.mark.parametrize(("step", "known"), [(0.18, True), (0.22, False)])
-def test_no_normal_across_an_edge(step: float, known: bool) -> None:
-    assert (frame(row=13, step=step).normal[0, 0].abs() > 0.1) == known
-
-
 def test_change_of_depth_is_in_units_of_two_percent_and_positive_behind() -> None:
     # half a voxel of 8 cm behind: 4 cm of 2 m are 2 %
     assert measured(frame(), (0.3, 0.1, 0.5)) == pytest.approx([0.3, 0.1, 0.5, 1.0])
@@ -113,12 +108,6 @@ def test_voxels_count_by_their_points_squared_confidence() -> None:
     centroids = torch.tensor([[-1.0, 0, 0], [1, 0, 0]])
     found = vectors_to_surface(torch.zeros(1, 3), centroids, evidence[None], torch.tensor([[0, 1]]))
     torch.testing.assert_close(found, torch.tensor([[(10 - 4) / 14, 0, 0]]))
-
-
-def test_a_neighbour_that_is_not_there_does_not_count() -> None:
-    centroids, evidence = torch.tensor([[5.0, 0, 0], [1, 0, 0]]), torch.tensor([[0.0, 1], [0, 0]])
-    found = vectors_to_surface(torch.zeros(2, 3), centroids, evidence, torch.tensor([[0, 1], [0, 1]]))
-    assert found.tolist() == [[1, 0, 0], [0, 0, 0]]
 
 
 def two_views_of_a_plane(farther: float, confidence: float) -> Geometry:
