@@ -14,14 +14,7 @@ from PIL import Image
 
 from vg2gt.data import SyntheticScenes
 from vg2gt.geometry.cameras import project, unproject
-from vg2gt.io import (
-    colmap_from_views,
-    named_cameras,
-    read_colmap,
-    write_cameras_json,
-    write_colmap,
-    write_gaussian_ply,
-)
+from vg2gt.io import colmap_from_views, named_cameras, read_colmap, write_cameras_json, write_colmap, write_gaussian_ply
 from vg2gt.io.images import to_pixels
 from vg2gt.types import Cameras, Gaussians
 

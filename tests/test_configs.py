@@ -176,9 +176,7 @@ PAPER = {"surface_evidence": False, "embedding_skip": False, "fuse_kernel": 1, "
         (["experiment=finetune"], ADDITIONS, "centroid"),
     ],
 )
-def test_the_papers_presets_have_none_of_our_additions(
-    tmp_path: Path, overrides: list[str], coarse: dict[str, Any], anchor: str
-) -> None:
+def test_the_papers_presets_have_none_of_our_additions(tmp_path, overrides, coarse, anchor):
     model = composed(tmp_path, *overrides).model
     assert {key: model.coarse[key] for key in coarse} == coarse
     assert model.gaussians.anchor == anchor
@@ -224,9 +222,7 @@ MACHINES = {  # what the trainers of the experiments compute on
 
 @pytest.mark.parametrize("experiment", ["paper", "paper_counts", "finetune"])
 @pytest.mark.parametrize("machine", MACHINES)
-def test_experiments_train_on_any_machine(
-    tmp_path: Path, experiment: str, machine: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_experiments_train_on_any_machine(tmp_path, experiment, machine, monkeypatch):
     """The trainer that Lightning makes on a machine that pretends to have eight GPUs."""
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     for package in ("fabric", "pytorch"):

@@ -9,14 +9,7 @@ import torch
 
 from tests.commands import ROOT, run_python
 from vg2gt.gaussians import GaussianHead
-from vg2gt.memory import (
-    TRAINING,
-    Cap,
-    OutOfMemory,
-    dropped_by,
-    memory_advice,
-    note_sizes,
-)
+from vg2gt.memory import TRAINING, Cap, OutOfMemory, dropped_by, memory_advice, note_sizes
 from vg2gt.studies.study import compose_run
 from vg2gt.training.loop import train
 from vg2gt.types import Voxels
@@ -136,7 +129,7 @@ def test_training_logs_what_was_dropped(tmp_path: Path, caplog: pytest.LogCaptur
         RuntimeError("CUDA error: CUBLAS_STATUS_ALLOC_FAILED when calling `cublasCreate(handle)`"),
     ],
 )
-def test_full_memory_is_one_error(error: Exception) -> None:
+def test_full_memory_is_one_error(error):
     @memory_advice(TRAINING)
     def fail() -> None:
         note_sizes({"images of 1x1": 1, "Gaussians": 5}, anew=True)

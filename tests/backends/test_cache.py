@@ -1,6 +1,5 @@
 """Tokens that are kept on disk are those that the backbone would make again."""
 
-import os
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -83,9 +82,7 @@ def test_a_pass_leaves_the_key_as_it_is(name: str, make_backend, scene) -> None:
     assert cache_key(backend, *scene) == before
 
 
-def test_the_source_of_somebodys_own_backend_decides_the_key(
-    tmp_path: Path, scene, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_source_of_somebodys_own_backend_decides_the_key(tmp_path, scene, monkeypatch):
     keys = []
     for line in ("depth = 1", "depth = 1", "depth = 2"):
         cache._source.cache_clear()  # as in another process
@@ -121,18 +118,3 @@ def test_the_oldest_go_when_the_folder_is_full(tmp_path: Path, make_scene) -> No
     assert not first.exists()
     with pytest.raises(ValueError, match=r"token_cache\.max_gb"):
         TokenCache(tmp_path, 0)
-
-
-def test_a_file_that_may_only_be_read_is_used(
-    tmp_path: Path, scene, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    backend, cache = Counting(), TokenCache(tmp_path)
-    cache.read(backend, *scene)
-
-    def refuse(path: Path) -> None:
-        raise PermissionError(30, "Read-only file system", str(path))
-
-    monkeypatch.setattr(os, "utime", refuse)
-    cache.read(backend, *scene)
-    assert backend.runs == [1]
-    assert not caplog.records

@@ -60,7 +60,6 @@ def test_given_poses_are_used_up_to_world_frame_and_scale(make_backend, make_sce
         backend.encode(images)
     hints = Hints(cameras=Cameras(hints.cameras.world_to_camera, hints.cameras.intrinsics, SIZE))
     cameras = hints.cameras
-    assert cameras is not None
     poses = cameras.world_to_camera.clone()
     poses[..., :3, 3] *= 20  # beyond the smallest distance that is normalised
     moved = poses @ invert_rigid(relative_to_first(cameras).world_to_camera[:, 1:2])

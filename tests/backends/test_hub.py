@@ -43,13 +43,7 @@ print(json.dumps(results))
 
 @dataclass
 class Hub:
-    """What the hub holds and what it was asked for.
-
-    Attributes:
-        files: content by repository, revision and file.
-        asked: method, repository, revision and file of every request.
-        address: of the server.
-    """
+    """What the hub holds and what it was asked for."""
 
     files: dict[tuple[str, str, str], bytes] = field(default_factory=dict)
     asked: list[tuple[str, str, str, str]] = field(default_factory=list)

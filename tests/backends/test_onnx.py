@@ -13,14 +13,7 @@ import torch
 from backends import export as exporting
 from backends.base import Backend
 from backends.bundle import DESCRIPTION
-from backends.export import (
-    TRACED,
-    Exportable,
-    example_inputs,
-    export,
-    export_graph,
-    relative_difference,
-)
+from backends.export import TRACED, Exportable, example_inputs, export, export_graph, relative_difference
 from backends.onnx import OnnxBackend
 from vg2gt.cli.export import main
 from vg2gt.types import Cameras, Geometry, Hints
@@ -187,9 +180,7 @@ def test_export_refuses_what_it_cannot_do(make_backend, shallow_da3: Exportable,
         export(shallow_da3, tmp_path)
 
 
-def test_a_failed_export_leaves_nothing(
-    shallow_da3: Exportable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failed_export_leaves_nothing(shallow_da3, tmp_path, monkeypatch):
     def fail(*_: Any) -> None:
         raise RuntimeError("no graph")
 

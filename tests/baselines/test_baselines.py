@@ -72,16 +72,6 @@ def test_point_cloud_is_evaluated_and_not_trained(tmp_path: Path, cache: Path) -
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_untrained_models_show_the_room(make, batch: Batch, name: str) -> None:
-    model = make(name)
-    prediction = predict(model, batch)
-    shown = render(prediction.gaussians.detach(), prediction.geometry.cameras)
-    seen = prediction.geometry.depth > 0
-    assert float((shown.depth[seen] == 0).float().mean()) < 0.01
-    assert float((shown.color - batch.context.images).abs().mean()) < 0.06
-
-
-@pytest.mark.parametrize("name", ALL)
 def test_one_gaussian_a_valid_pixel(make, batch: Batch, name: str) -> None:
     """All pixels of the views, less those without depth; merging by voxels only ever makes fewer."""
     depth = batch.context.depth.clone()
@@ -111,27 +101,9 @@ def test_untrained_gaussians_lie_on_their_pixels(make, batch: Batch) -> None:
     torch.testing.assert_close(prediction.gaussians.scales[:, 0], 0.5 * footprint)
 
 
-def test_gaussians_stay_near_their_pixels(make, batch: Batch) -> None:
-    model = make("pixel_aligned", seed=1)
-    with torch.no_grad():
-        model.gaussians.out.weight *= 20
-        prediction = predict(model, batch)
-    pixels = usable_pixels(prediction.geometry, batch.context.images)
-    local = (pixels.rotation * (prediction.gaussians.means - pixels.center)[..., None]).sum(-2)
-    relative = local[:, 2] / pixels.depth
-    assert 0.05 < float((relative - 1).abs().max()) < 0.1 + 1e-5
-    sideways = (local[:, :2] - pixels.rays[:, :2] * pixels.depth[:, None] * relative[:, None]) / pixels.footprint
-    assert 0.5 < float(sideways.abs().max()) < 1 + 1e-3
-    widths = prediction.gaussians.scales / pixels.footprint[:, :1]
-    assert 0.009 < float(widths.min()) < float(widths.max()) < 4.001
-
-
 def reordered(batch: Batch, order: list[int]) -> tuple[torch.Tensor, Hints]:
     context = batch.context
     hints = context.hints
-    assert hints.depth is not None
-    assert hints.cameras is not None
-    assert hints.frame_ids is not None
     views = torch.tensor(order)
     changed = Hints(hints.depth[:, views], hints.cameras.select(views), hints.scene_key, hints.frame_ids[:, views])
     return context.images[:, views], changed

@@ -1,7 +1,6 @@
 """Batches for training and evaluation, and the same batches after a resume."""
 
 from functools import partial
-from types import SimpleNamespace
 
 import lightning
 import pytest
@@ -168,26 +167,6 @@ def test_evaluation_views_by_number_and_window(rooms):
         assert not set(window.context) & set(window.target)
 
 
-class _Frame(int):
-    """A frame id that counts how often it is looked up."""
-
-    hashes = 0
-
-    def __hash__(self) -> int:
-        _Frame.hashes += 1
-        return int.__hash__(self)
-
-
-@pytest.mark.parametrize("window", [None, 20])
-def test_the_work_of_choosing_evaluation_views_grows_with_the_frames(window):
-    source = SyntheticScenes(1)
-    frames = [_Frame(number) for number in range(400)]
-    source.frames, source.held_out = lambda scene: frames, lambda scene: frames[::6]
-    _Frame.hashes = 0
-    EvaluationViews(8, 3, window).choose(source, "room-000000")
-    assert _Frame.hashes < 8 * len(frames)
-
-
 def test_data_that_cannot_be_trained_on_is_named_before_overlap_and_lengths(rooms, tmp_path):
     blind = SyntheticScenes(2, num_frames=1, size=SIZE, cache_dir=str(tmp_path))
     blind.has_cameras = False
@@ -202,15 +181,6 @@ def test_an_option_of_another_loader_is_named():
     module = SceneDataModule(partial(SyntheticScenes, 1), partial(SyntheticScenes, 1), every=2)
     with pytest.raises(DataError, match=r"unexpected keyword argument 'every' \(data\.\*\): leave the option out"):
         module.evaluation_data()
-
-
-def test_batches_are_pinned_for_a_gpu_only(rooms):
-    module = _module(rooms)
-    for kind in ("cpu", "cuda"):
-        strategy = SimpleNamespace(root_device=torch.device(kind))
-        module.trainer = SimpleNamespace(strategy=strategy, global_step=0, global_rank=0, world_size=1, num_devices=1)  # type: ignore
-        assert module.train_dataloader().pin_memory == (kind == "cuda")
-        assert module.val_dataloader().pin_memory == (kind == "cuda")
 
 
 def test_evaluation_positions_are_checked(rooms):

@@ -69,10 +69,3 @@ def test_parts_of_one_mixture_are_different_datasets():
     both = _mixture(a=Scans(1), b=Scans(1))
     _check(both, ["a/scene0001_00"], both, "b/scene0001_00", (3,))
     _check(both, ["a/scene0001_00"], both, "b/scene0001_01", (3,))
-
-
-def test_held_out_frames_are_listed_once_a_scene():
-    train = Scans(1)
-    windows = [SceneSample("scene0000_00", (0,), (frame,)) for frame in (2, 5, 8) * 20]
-    refuse_overlap(train, train.scenes, OtherReader(1), windows)
-    assert train.asked == ["scene0000_00"]

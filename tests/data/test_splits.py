@@ -69,18 +69,3 @@ def test_the_command_writes_lists_that_the_data_module_takes(write_recording, tm
     main([*arguments, f"out={tmp_path / 'lists'}"])  # the same again
     with pytest.raises(SystemExit, match="holds another split"):
         main([*arguments, f"out={tmp_path / 'lists'}", "split_seed=1"])
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["data=rgbd"], "give out="),
-        (["out=x", "data=rgbd", "data.root=not_here"], "not_here"),
-        (["out=x", "fraction=half"], "option fraction: Value 'half'"),
-        (["out=x", "data.rot=y", "data=rgbd"], "rot"),
-        (["out=x", "data=nothing"], "nothing"),
-    ],
-)
-def test_wrong_arguments_are_named(arguments, message):
-    with pytest.raises(SystemExit, match=message):
-        main(arguments)

@@ -139,7 +139,6 @@ def test_a_damaged_cache_file_is_made_again(tmp_path, caplog, monkeypatch):
     rooms = one(cache_dir=str(tmp_path))
     whole = rooms.load("room-000000", [0, 1])
     path = rooms.cache_file("room-000000")
-    assert path is not None
     content = path.read_bytes()
     flipped = bytearray(content)
     flipped[len(content) // 3] ^= 0xFF

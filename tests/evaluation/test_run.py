@@ -14,7 +14,6 @@ from tests.training_helpers import small_config
 from vg2gt.cli.evaluate import run_name
 from vg2gt.config import compose
 from vg2gt.data.base import DataError
-from vg2gt.data.synthetic import SyntheticScenes
 from vg2gt.evaluation.evaluator import SceneEvaluator
 from vg2gt.evaluation.run import evaluate
 from vg2gt.runs.checkpoints import read_checkpoint, write_checkpoint
@@ -82,9 +81,7 @@ def test_the_untrained_head_says_so_and_scores_otherwise(tmp_path: Path, cache: 
     )
 
 
-def test_an_interrupted_evaluation_goes_on(
-    tmp_path: Path, cache: Path, trained: Path, evaluated: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interrupted_evaluation_goes_on(tmp_path, cache, trained, evaluated, monkeypatch):
     original, seen = SceneEvaluator.__call__, []
 
     def counted(self, batch, has_cameras=True):
@@ -169,9 +166,7 @@ def test_scenes_of_the_training_are_refused(tmp_path: Path, cache: Path, trained
         run(tmp_path, cache, f"ckpt={trained}", "data.val.first_seed=0")
 
 
-def test_what_the_weights_before_were_trained_on_is_refused(
-    tmp_path: Path, cache: Path, trained: Path, copied: Path, caplog
-) -> None:
+def test_what_the_weights_before_were_trained_on_is_refused(tmp_path, cache, trained, copied, caplog):
     """A run on other rooms that began with ``init_from``, or went on in a new folder with ``ckpt``."""
     for key, start in (("init_from", trained / "checkpoints" / "step-2.ckpt"), ("ckpt", trained)):
         config = read_run_config(trained / "config.yaml")
@@ -271,20 +266,6 @@ def test_times_of_another_device_do_not_join(tmp_path: Path, cache: Path, traine
     (tmp_path / "identity.json").write_text(json.dumps(identity | {"device": "Some GPU"}))
     with pytest.raises(FileExistsError, match=r"device \(Some GPU -> cpu\)"):
         run(tmp_path, cache, f"ckpt={trained}", "data.eval_scenes=1")
-
-
-class WithoutCameras(SyntheticScenes):
-    """Rooms whose cameras are not known."""
-
-    has_cameras = False
-
-
-def test_a_backend_that_is_told_the_cameras_needs_some(tmp_path: Path, cache: Path) -> None:
-    data = [f"data.val._target_={__name__}.WithoutCameras", "data.eval_scenes=1"]
-    with pytest.raises(DataError, match=r"backend oracle needs the data's cameras, and WithoutCameras has none"):
-        run(tmp_path, cache, *data)
-    report = run(tmp_path, cache, *data, "backend=vggt_tiny")
-    assert "rendered/gt_pose/solid/psnr" not in report["views"]["2"]["mean"]
 
 
 def test_a_checkpoint_is_a_file_or_the_newest_of_a_run(trained: Path) -> None:

@@ -81,7 +81,7 @@ def test_scale_ignores_invalid_pixels_and_has_no_graph() -> None:
     assert fit_depth_scale(predicted, reference, torch.zeros_like(good)).isnan().all()
 
 
-def test_subsampling_takes_one_pixel_near_the_centre_of_every_cell() -> None:
+def test_subsampling_takes_one_pixel_near_the_centre_of_every_cell():
     # 128 x 192 pixels: cells of 2 x 3, whose middle column is nearest to the centre.
     ratio = torch.full((1, 1, 128, 192), 50.0, dtype=torch.float64)
     ratio[..., 1::3] = 2.0

@@ -12,12 +12,7 @@ import trimesh
 
 from tests.io.gaussian_scenes import scene
 from vg2gt.geometry.spherical_harmonics import DC
-from vg2gt.io import (
-    read_gaussian_ply,
-    write_gaussian_ply,
-    write_point_ply,
-    write_splat,
-)
+from vg2gt.io import read_gaussian_ply, write_gaussian_ply, write_point_ply, write_splat
 
 pytestmark = pytest.mark.slow
 

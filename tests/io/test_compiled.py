@@ -57,9 +57,7 @@ def test_a_changed_constant_of_another_file_is_used(room: Path, tmp_path: Path) 
     assert {path: path.stat().st_mtime_ns for path in cache.rglob("*.nbc")} == before, "it was compiled again"
 
 
-def test_without_a_home_kernels_run(
-    room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_without_a_home_kernels_run(room, tmp_path, monkeypatch, caplog):
     """As in a read-only container."""
     missing = tmp_path / "file" / "folder"
     missing.parent.write_text("")
@@ -142,9 +140,7 @@ def sum_of_shares(x, of):
 """
 
 
-def test_parts_of_kernels_are_compiled_and_kept_with_them_and_interpreted_from_python(
-    room: Path, tmp_path: Path
-) -> None:
+def test_parts_of_kernels_are_compiled_and_kept_with_them_and_interpreted_from_python(room, tmp_path):
     (room / "parts.py").write_text(PARTS)
     made = importlib.import_module("made.parts")
     assert made.sum_of_shares(3.0, 2.0) == 2.5

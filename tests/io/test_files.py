@@ -20,9 +20,7 @@ def test_failure_keeps_the_old_content(tmp_path: Path, monkeypatch: pytest.Monke
     assert len(list(tmp_path.iterdir())) == 1
 
 
-def test_writers_with_one_process_number_have_their_own_temporary_names(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_writers_with_one_process_number_have_their_own_temporary_names(tmp_path, monkeypatch):
     """Two containers on one folder."""
     monkeypatch.setattr("os.getpid", lambda: 7)
     with replacing(tmp_path / "x") as one, replacing(tmp_path / "x") as other:

@@ -61,7 +61,6 @@ def test_sphere_lies_within_a_voxel_and_is_closed(sphere) -> None:
     _, neighbours = np.unique(body.edges_sorted, axis=0, return_counts=True)
     assert (neighbours % 2 == 0).all()  # closed
     assert body.volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.01)  # positive: faces look outwards
-    assert mesh.colors is not None
     assert (mesh.colors == [255, 0, 0]).all()
 
 

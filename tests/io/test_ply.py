@@ -190,7 +190,6 @@ def test_ascii_points_with_faces(tmp_path: Path) -> None:
     path.write_bytes((head + colors + faces + "0.1 2 3 255 0 1\r\n4 5 6 7 8 9\r\n3 0 1 0\r\n").encode())
     read = read_point_ply(path)
     assert read.positions.tolist() == [[0.1, 2.0, 3.0], [4.0, 5.0, 6.0]]
-    assert read.colors is not None
     assert read.colors.tolist() == [[255, 0, 1], [7, 8, 9]]
 
 

@@ -104,7 +104,6 @@ def test_nothing_rendered_gives_zeros_with_graph_and_finite_gradients(case) -> N
     assert all(float(terms[name].detach()) == 0 for name in ("depth_gt", "depth_consistency", "normal"))
     loss.total(terms).backward()
     for leaf in (depth, normal):
-        assert leaf.grad is not None
         assert (leaf.grad == 0).all()
 
 
@@ -180,7 +179,6 @@ def test_colours_that_do_not_count_change_nothing(case) -> None:
     for name in ("color_l1", "ssim"):
         torch.testing.assert_close(one[name], same[name], rtol=0, atol=0)
     (same["color_l1"] + same["ssim"]).backward()
-    assert color.grad is not None
     assert (color.grad[..., :8] == 0).all()
     assert (color.grad[..., 8:] != 0).any()
     assert GaussianLoss()(other, cameras, targets, scale)["color_l1"] != one["color_l1"]

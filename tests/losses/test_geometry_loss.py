@@ -117,7 +117,6 @@ def test_an_outlier_has_no_gradient_and_errors_stop_at_100(sample) -> None:
     depth.requires_grad_()
     task, point = GeometryLoss()(depth, conf, cameras, truth, everywhere)
     (task.reg + task.conf + point.reg + point.conf).backward()
-    assert depth.grad is not None
     assert depth.grad[0, 1, 5, 5] == 0
     assert depth.grad[0, 1, 5, 6] != 0
     assert float(depth_gradient_loss(depth[0].detach() - truth.depth[0], everywhere[0])) < 2
@@ -155,8 +154,6 @@ def test_holes_and_infinities_outside_the_mask_leave_gradients_finite(sample) ->
     conf.requires_grad_()
     task, point = GeometryLoss()(depth, conf, cameras, truth, valid)
     (task.total + point.total).backward()
-    assert depth.grad is not None
-    assert conf.grad is not None
     assert torch.isfinite(task.total + point.total)
     assert torch.isfinite(depth.grad).all()
     assert torch.isfinite(conf.grad).all()
@@ -177,7 +174,6 @@ def test_fewer_than_100_pixels_give_a_zero_with_graph(sample) -> None:
     task, point = GeometryLoss()(depth, made.prediction.geometry.depth_conf, context.cameras, context, context.valid)
     (task.total + point.total).backward()
     assert float(task.total.detach()) == float(point.total.detach()) == 0
-    assert depth.grad is not None
     assert (depth.grad == 0).all()
 
 
@@ -247,24 +243,7 @@ def test_compiled_normals_equal_the_plain_ones(sample, dtype: torch.dtype, toler
     torch.testing.assert_close(compiled, plain, rtol=tolerance, atol=tolerance / 10)
     (3 * compiled).backward()
     (3 * plain).backward()
-    assert found.grad is not None
-    assert expected.grad is not None
     assert (found.grad - expected.grad).norm() < tolerance * expected.grad.norm()
-
-
-def test_compiled_normals_do_not_depend_on_threads(sample) -> None:
-    truth, depth, _, cameras, valid = disturbed(sample)
-    results, threads = [], torch.get_num_threads()
-    try:
-        for number in (1, 2, 3):
-            torch.set_num_threads(number)
-            found = depth[0].clone().requires_grad_()
-            loss = point_normal_loss(found, cameras, truth, valid[0])
-            results.append((loss.detach(), *torch.autograd.grad(loss, found)))
-    finally:
-        torch.set_num_threads(threads)
-    for result in results[1:]:
-        assert all(torch.equal(*pair) for pair in zip(result, results[0], strict=True))
 
 
 def test_normals_give_cameras_a_gradient_where_they_ask_for_one(sample) -> None:
@@ -281,5 +260,4 @@ def test_normals_without_a_valid_corner_cost_nothing(sample) -> None:
     loss = point_normal_loss(depth, cameras, truth, torch.zeros_like(valid[0]))
     loss.backward()
     assert float(loss.detach()) == 0
-    assert depth.grad is not None
     assert not depth.grad.any()

@@ -197,8 +197,7 @@ def test_term_weights_reach_the_total(sample) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "weights"),
-    [("paper", (1.0, 1.0, 1.0, 1.0, 1.0, 1.0)), ("release", (10.0, 0.9, 0.1, 0.25, 0.25, 0.001))],
+    ("name", "weights"), [("paper", (1.0, 1.0, 1.0, 1.0, 1.0, 1.0)), ("release", (10.0, 0.9, 0.1, 0.25, 0.25, 0.001))]
 )
 def test_configurations_hold_the_published_weights(name: str, weights: tuple[float, ...]) -> None:
     loss = instantiate(compose(f"loss/{name}", "loss.enhance.on=reg", "loss.align.source=rendered").loss)

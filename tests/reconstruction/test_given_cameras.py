@@ -81,17 +81,13 @@ def put_cameras(folder: Path, frames, names=NAMES, size=SIZE, intrinsics=None) -
 
 
 def views_of(pictures: list[Picture] | None) -> Views:
-    assert pictures is not None
     return load_views(pictures, SIZE, Monitor())
 
 
 def check_cameras(pictures: list[Picture] | None, frames, kind: str) -> None:
-    assert pictures is not None
     assert {picture.source.split(" ")[0] for picture in pictures} == {kind}
     views = views_of(pictures)
     assert views.names == ("008", "009", "010", "011")
-    assert views.hints is not None
-    assert views.hints.cameras is not None
     assert torch.allclose(views.hints.cameras.world_to_camera[0], frames.world_to_camera, atol=1e-4)
     assert torch.allclose(views.hints.cameras.intrinsics[0], frames.intrinsics, atol=1e-3)
     assert torch.allclose(views.images, frames.images, atol=1 / 400)
@@ -145,8 +141,6 @@ def test_cameras_json_of_larger_images_and_without_some(folder: Path, frames, ca
     assert [p.name for p in pictures or []] == ["008", "009", "010"]
     assert "left out: 011.png" in caplog.text
     hints = views_of(pictures).hints
-    assert hints is not None
-    assert hints.cameras is not None
     assert torch.allclose(hints.cameras.intrinsics[0], frames.intrinsics[:3], atol=1e-3)
     put_cameras(folder, frames, size=(84, 84))
     with pytest.raises(ValueError, match=r"008.png is 112x84 pixels, but its camera in .*cameras.json 84x84"):
@@ -159,8 +153,6 @@ def test_cameras_json_of_larger_images_and_without_some(folder: Path, frames, ca
 def test_range_of_depth_is_that_of_the_points_widened(folder: Path, frames) -> None:
     put_colmap(folder, frames)
     hints = views_of(given_pictures(folder)).hints
-    assert hints is not None
-    assert hints.depth_range is not None
     near, far = hints.depth_range[0].tolist()
     seen = frames.depth[frames.depth > 0]
     assert near < seen.quantile(0.01)
@@ -174,7 +166,6 @@ def test_range_of_depth_ignores_a_few_wild_points_and_needs_some() -> None:
 
     rows = np.linspace(2, 4, 500)
     told = depth_range([picture(rows), picture([*rows, 1e6, 1e-6])])
-    assert told is not None
     assert told.tolist()[0] == pytest.approx([0.8 * 2.02, 1.4 * 3.98], rel=0.01)
     assert depth_range([picture(rows[:5])]) is None
     assert depth_range([replace(picture(rows), point_depths=None)]) is None
@@ -225,9 +216,7 @@ def test_who_gets_which_cameras(model, folder: Path, recording: Path, ready, mon
 
 
 @pytest.mark.parametrize("trained", [False, True])
-def test_photographs_for_the_oracle_are_refused_before_any_work(
-    trained: bool, photos: Path, run_folder: Path, tmp_path: Path, monkeypatch
-) -> None:
+def test_photographs_for_the_oracle_are_refused_before_any_work(trained, photos, run_folder, tmp_path, monkeypatch):
     monkeypatch.setattr("vg2gt.runs.load.build_model", lambda *_: pytest.fail("built a model"))
     chosen = ["--ckpt", str(run_folder)] if trained else ["--backend", "oracle"]
     with pytest.raises(SystemExit) as stopped:
@@ -249,7 +238,6 @@ def test_a_phones_export_is_read_at_the_size_of_its_photographs(needed: bool, tm
             coarse = np.array(image)[::2, ::2]
         Image.fromarray(coarse).save(path)
     pictures = given_pictures([tmp_path / "kitchen"], depth=needed)
-    assert pictures is not None
     assert [picture.size for picture in pictures] == [(15, 20) if needed else (30, 40)] * 2
     loaded = pictures[1].read((30, 40))
     assert bool(loaded.depth.any()) == needed

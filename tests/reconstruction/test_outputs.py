@@ -81,16 +81,6 @@ def test_maps(written: Path, scene: Scene) -> None:
         assert Image.open(written / "normals" / f"{stem}.png").size == (112, 84)
 
 
-def test_rendered_views_look_like_the_input(scene: Scene) -> None:
-    """The head's initial state makes coloured voxels where the depth is known."""
-    for image, depth, view in zip(scene.images, scene.depth, scene.render(), strict=True):
-        error = (view.color - image).square().mean()
-        assert -10 * error.log10() > 20
-        both = (depth > 0) & (view.depth > 0)
-        assert both.float().mean() > 0.95
-        assert ((view.depth / depth)[both] - 1).abs().median() < 0.06  # untrained Gaussians are a voxel thick
-
-
 def test_colmap_points_fall_on_the_pixels_they_came_from(written: Path, scene: Scene) -> None:
     model = read_colmap(written / "colmap" / "sparse" / "0")
     assert len(model.points3D) > 5000
@@ -128,7 +118,6 @@ def test_nerfstudio(written: Path, scene: Scene) -> None:
         assert (written / "nerfstudio" / frame.file_path).is_file()
         assert np.abs(frame.world_to_camera - camera.world_to_camera).max() < 1e-6
         assert np.abs(frame.lens.intrinsics() - camera.intrinsics).max() < 1e-9
-    assert transforms.ply_file_path is not None
     assert len(read_point_ply(written / "nerfstudio" / transforms.ply_file_path).positions) > 5000
 
 

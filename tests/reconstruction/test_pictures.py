@@ -60,12 +60,8 @@ def test_large_pictures_are_shrunk_while_they_are_read(tmp_path: Path) -> None:
 
 def test_a_recording_gives_its_cameras_and_depth(recording: Path, frames) -> None:
     pictures = given_pictures(recording, depth=True)
-    assert pictures is not None
     views = load_views(pictures, (56, 84), Monitor())
     assert views.names == ("008", "009", "010", "011")
-    assert views.hints is not None
-    assert views.hints.cameras is not None
-    assert views.hints.depth is not None
     assert views.hints.depth.shape == (1, 4, 56, 84)
     assert torch.allclose(views.hints.cameras.world_to_camera[0], frames.world_to_camera, atol=1e-5)
     scale = 84 / 112
@@ -73,10 +69,7 @@ def test_a_recording_gives_its_cameras_and_depth(recording: Path, frames) -> Non
     assert [p.name for p in find_pictures(recording)] == ["008", "009", "010", "011"]  # as mere photographs
 
 
-@pytest.mark.parametrize(
-    ("size", "expected"),
-    [(None, (210, 280)), (140, (112, 140)), ((28, 56), (28, 56))],
-)
+@pytest.mark.parametrize(("size", "expected"), [(None, (210, 280)), (140, (112, 140)), ((28, 56), (28, 56))])
 def test_working_size(size, expected) -> None:
     assert working_size([(600, 800)] * 3, 14, "cpu", size) == expected
 

@@ -80,7 +80,6 @@ def test_landscape_and_portrait_mixed_are_read_whole(folder: Path, frames, put, 
         cameras[3] = replace(cameras[3], width=84, height=112)
         write_cameras_json(folder / "cameras.json", cameras)
     pictures = given_pictures(folder)
-    assert pictures is not None
     assert [picture.size for picture in pictures] == [SIZE] * 3 + [(112, 84)]
     assert pictures[3].read((112, 84)).images.shape[-2:] == (112, 84)
     size = working_size([picture.size for picture in pictures], 14, "cpu")
@@ -113,7 +112,6 @@ def test_cameras_are_found_where_people_have_them(folder: Path, frames, layout: 
         images.rename(folder / "my photographs")
         given = folder / "my photographs"
     pictures = given_pictures(given)
-    assert pictures is not None
     names = [Path(name).stem for name in NAMES]
     assert [picture.name for picture in pictures] == (names[::-1] if layout == "named" else names)
     assert all(picture.source.startswith("COLMAP") for picture in pictures)
@@ -149,7 +147,6 @@ def test_a_workspace_takes_what_fits(folder: Path, frames) -> None:
     shutil.move(folder / "images", folder / "dense" / "images")
     shutil.copytree(folder / "sparse" / "0", folder / "dense" / "sparse")
     pictures = given_pictures(folder)
-    assert pictures is not None
     assert pictures[0].source == f"COLMAP {folder / 'dense'}"
 
 
@@ -162,15 +159,12 @@ def test_given_cameras_keep_their_frame_and_unit(folder: Path, frames, put, tmp_
     cameras = read_cameras_json(tmp_path / "out" / "cameras.json")
     for camera in cameras:
         pose = given[Path(camera.name).stem]
-        assert pose is not None
         np.testing.assert_allclose(camera.world_to_camera, pose, atol=1e-6)
-        assert camera.similarity is not None
         np.testing.assert_allclose(camera.similarity, np.eye(4), atol=1e-5)
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert report["frame"] == "given"
     assert report["similarity_to_cameras"]["scale"] == pytest.approx(1, abs=1e-5)
     scene = read_scene(tmp_path / "out", Renderer())
-    assert scene.frame is not None
     assert scene.frame.name == "given"
     seen = scene.depth[scene.depth > 0].median()
     assert seen == pytest.approx(float(frames.depth[frames.depth > 0].median()), rel=0.6)  # the stand-in's plane
@@ -186,7 +180,6 @@ def test_frames_that_can_be_chosen_go_into_one_another(folder: Path, frames, mod
     scenes = {name: reconstruct_with(model, folder, frame=name) for name in ("given", "first", "upright")}
     given = scenes["given"]
     for name, scene in scenes.items():
-        assert scene.frame is not None
         to_given = torch.from_numpy(scene.frame.to_source).float()
         means = scene.gaussians.means @ to_given[:3, :3].T + to_given[:3, 3]
         torch.testing.assert_close(means, given.gaussians.means, atol=2e-4, rtol=0)
@@ -206,8 +199,6 @@ def test_metric_cameras_give_metres(recording: Path, ready) -> None:
     scene = reconstruct_with(ready.model, recording)
     assert scene.metres_per_unit == pytest.approx(1)
     first = reconstruct_with(ready.model, recording, frame="first")
-    assert first.metres_per_unit is not None
-    assert first.frame is not None
     assert first.metres_per_unit == pytest.approx(first.frame.scale)
     assert first.metres_per_unit != pytest.approx(1, abs=0.01)
 
@@ -221,7 +212,6 @@ def test_map_coordinates_keep_their_digits(folder: Path, frames, model, caplog) 
     scene = reconstruct_with(model, folder)
     assert "the scene is written shifted by" in caplog.text
     assert scene.gaussians.means.abs().max() < 1000
-    assert scene.frame is not None
     np.testing.assert_allclose(scene.frame.to_source[:3, 3], shift, atol=20)
     for camera, pose in zip(scene.named_cameras(), poses.numpy(), strict=True):
         np.testing.assert_allclose(camera.world_to_camera @ np.linalg.inv(scene.frame.to_source), pose, atol=2e-6 * 4e6)
@@ -232,7 +222,6 @@ def test_there_is_no_given_frame_without_given_cameras(photos: Path) -> None:
     with pytest.raises(ValueError, match="no given cameras, so --frame given means nothing"):
         reconstruct_with(images_alone, photos, frame="given")
     scene = reconstruct_with(images_alone, photos)
-    assert scene.frame is not None
     assert scene.frame.name == "upright"
 
 
@@ -278,7 +267,6 @@ def test_own_cameras_serve_the_original_photographs(folder: Path, frames, tmp_pa
     shutil.rmtree(folder / "sparse")
     shutil.copy(tmp_path / "out" / "cameras.json", folder)
     pictures = given_pictures(folder)
-    assert pictures is not None
     loaded = pictures[2].read(SIZE)
     assert loaded.images.shape[-2:] == SIZE
     assert torch.allclose(loaded.intrinsics[0], frames.intrinsics[2], atol=1e-3)
@@ -316,7 +304,6 @@ def test_what_is_hidden_is_no_part_of_the_scene(folder: Path, frames, model, kin
         for name in NAMES:
             Image.fromarray(half).save(folder / "masks" / name)
     scene = reconstruct_with(model, folder)
-    assert scene.mask is not None
     assert torch.equal(scene.mask[0, 0], (torch.arange(112) >= 56).float())
     assert (scene.depth[..., :56] == 0).all()
     assert (scene.depth[..., 60:] > 0).any()
@@ -326,7 +313,6 @@ def test_what_is_hidden_is_no_part_of_the_scene(folder: Path, frames, model, kin
         assert magenta.min() > 0.2
     scene.save(tmp_path / "out", ["scene.ply", "cameras.json", "views.npz"])
     again = read_scene(tmp_path / "out", Renderer())
-    assert again.mask is not None
     assert torch.equal(again.mask, scene.mask)
 
 
@@ -335,11 +321,9 @@ def test_masks_of_photographs_without_cameras(folder: Path) -> None:
     (folder / "masks").mkdir()
     Image.new("L", (112, 84), 0).save(folder / "masks" / f"{NAMES[1]}.png")
     views = load_views(find_pictures(folder / "images"), SIZE, Monitor())
-    assert views.mask is not None
     assert views.mask.mean((1, 2)).tolist() == [1, 0, 1, 1]
     image = Image.new("RGBA", (112, 84), (255, 0, 255, 0))
     views = load_views(find_pictures([image]), SIZE, Monitor())
-    assert views.mask is not None
     assert not views.mask.any()
     assert (views.images == 1).all()
 
@@ -501,9 +485,7 @@ def test_cameras_to_render_come_from_any_file(folder: Path, frames, tmp_path: Pa
 
 
 @pytest.mark.parametrize("given", [False, True])
-def test_without_pycolmap_one_line_comes_before_any_work(
-    folder: Path, frames, given: bool, tmp_path: Path, monkeypatch
-) -> None:
+def test_without_pycolmap_one_line_comes_before_any_work(folder, frames, given, tmp_path, monkeypatch):
     """A COLMAP model that cannot be read, and photographs whose cameras cannot be found."""
     if given:
         put_colmap(folder, frames)

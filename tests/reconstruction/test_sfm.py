@@ -98,9 +98,7 @@ def test_other_images_are_computed_anew(given: Path, solved: Path, tmp_path: Pat
 
 def test_cameras_are_those_of_the_recording(given: Path, solved: Path, office: Path) -> None:
     views = load_views(again(given, solved), (320, 480), Monitor())
-    assert views.hints is not None
     found = views.hints.cameras
-    assert found is not None
     poses = np.linalg.inv(np.loadtxt(office / "poses.txt").reshape(-1, 4, 4)[:COUNT])
     true = Cameras(torch.from_numpy(poses)[None].float(), found.intrinsics, found.size)
     rotation, _ = relative_pose_errors(found, true)
@@ -119,7 +117,6 @@ def test_cameras_are_those_of_the_recording(given: Path, solved: Path, office: P
     depth = torch.from_numpy(np.stack([np.array(Image.open(name), np.float32) for name in names])) / 1000
     seen = depth[depth > 0][::50] / similarity.scale
     near_far = views.hints.depth_range
-    assert near_far is not None
     assert ((seen > near_far[0, 0]) & (seen < near_far[0, 1])).float().mean() > 0.95
     assert near_far[0, 1] / near_far[0, 0] < 6
 

@@ -29,8 +29,6 @@ def office_photos(shared: Path, count: int) -> list[Path]:
 def center_errors(pictures: list[Picture], shared: Path, rows: list[int]) -> torch.Tensor:
     """Distances of found to recorded centres, after one similarity, as shares of the path's extent."""
     views = load_views(pictures, (56, 84), Monitor())
-    assert views.hints is not None
-    assert views.hints.cameras is not None
     poses = np.linalg.inv(np.loadtxt(shared / "data" / "hololens_office_a" / "poses.txt").reshape(-1, 4, 4)[rows])
     true = Cameras(torch.from_numpy(poses)[None].float(), views.hints.cameras.intrinsics, (56, 84))
     found, known = camera_centers(views.hints.cameras), camera_centers(true)

@@ -26,10 +26,7 @@ def random_moments(count: int, seed: int, longest: float = 3.0) -> list[Moment]:
     return [harness.after_seconds(seconds) for seconds in np.random.default_rng(seed).uniform(0, longest, count)]
 
 
-QUICK = Case(
-    "one of each",
-    (harness.in_first_evaluation, harness.while_a_checkpoint_is_written, harness.in_validation),
-)
+QUICK = Case("one of each", (harness.in_first_evaluation, harness.while_a_checkpoint_is_written, harness.in_validation))
 CASES = [
     Case("at random", random_moments(6, seed=0)),
     Case("at random, started as a user does", random_moments(3, seed=1), warm=False),

@@ -40,9 +40,7 @@ def first(tmp_path_factory: pytest.TempPathFactory, cache: Path) -> Tensor:
 
 
 @pytest.mark.parametrize("workers", [0, 1, 2])
-def test_two_runs_are_bit_equal_with_any_number_of_workers(
-    first: Tensor, tmp_path: Path, cache: Path, workers: int
-) -> None:
+def test_two_runs_are_bit_equal_with_any_number_of_workers(first, tmp_path, cache, workers):
     assert torch.equal(trained_weights(tmp_path, cache, f"data.workers={workers}"), first)
 
 

@@ -36,10 +36,7 @@ def assert_goes_on(whole: Path, folder: Path, cache: Path) -> None:
 
 def test_a_json_file_that_does_not_fit(tmp_path: Path) -> None:
     path = write_json(tmp_path / "metrics.json", {"psnr": 20.0})
-    with (
-        largest_file(1000),
-        pytest.raises(OSError, match=r"metrics\.json could not be written: File too large"),
-    ):
+    with largest_file(1000), pytest.raises(OSError, match=r"metrics\.json could not be written: File too large"):
         write_json(path, list(range(1000)))
     assert read_json(path) == {"psnr": 20.0}
     assert [file.name for file in tmp_path.iterdir()] == ["metrics.json"]

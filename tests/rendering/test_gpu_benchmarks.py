@@ -2,7 +2,6 @@
 
 import importlib.util
 import os
-from pathlib import Path
 from types import ModuleType
 
 import pytest
@@ -54,9 +53,7 @@ STEP = ("step_ms", "peak_mb", "peak_reserved_mb", "stage_ms", "stage_peak_mb", "
         ("reconstruct", {"2 images"}),
     ],
 )
-def test_every_part_measures_on_a_cpu_as_well(
-    gpu: ModuleType, part: str, found: set[str], tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_every_part_measures_on_a_cpu_as_well(gpu, part, found, tmp_path, cache, monkeypatch):
     monkeypatch.setenv("VG2GT_CACHE", str(cache))
     content = gpu.measure(part, gpu.Setting(torch.device("cpu"), small=True), tmp_path / "part.json")
     assert content["ended"] == "done"

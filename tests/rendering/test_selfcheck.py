@@ -55,8 +55,6 @@ def test_wrong_kernels_are_refused(name: str, tmp_path: Path, monkeypatch: pytes
     path = tmp_path / "wrong_kernels.py"
     path.write_text(source.replace(before, after))
     spec = importlib.util.spec_from_file_location("wrong_kernels", path)
-    assert spec is not None
-    assert spec.loader is not None
     wrong = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(wrong)
     for kernel in kernels.__all__:
@@ -89,16 +87,10 @@ def validating(act: Callable[[], None]) -> None:
 @interpreted
 @pytest.mark.parametrize(
     "surrounded",
-    [
-        torch.no_grad(),
-        pytest.param(torch.inference_mode(), marks=pytest.mark.slow),
-        validating,
-    ],
+    [torch.no_grad(), pytest.param(torch.inference_mode(), marks=pytest.mark.slow), validating],
     ids=["no_grad", "inference_mode", "validation step"],
 )
-def test_the_check_does_not_depend_on_what_surrounds_the_first_render(
-    surrounded: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_check_does_not_depend_on_what_surrounds_the_first_render(surrounded, tmp_path, monkeypatch):
     """The real check, of one mode; its error was taken for a disagreement wherever gradients were off."""
     monkeypatch.setattr(selfcheck, "compare", partial(selfcheck.compare, modes=("rasterized",)))
     monkeypatch.setattr(selfcheck, "cache_folder", lambda: tmp_path)
@@ -147,9 +139,7 @@ def test_agreement_makes_auto_triton_and_is_found_out_once(checks: list[str]) ->
         Agreement(0.0, float("nan")),
     ],
 )
-def test_disagreement_is_an_error_that_says_what_to_report_and_what_to_choose(
-    checks: list[str], found: Agreement, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_disagreement_is_an_error_that_says_what_to_report_and_what_to_choose(checks, found, monkeypatch):
     monkeypatch.setattr(selfcheck, "compare", lambda *_: found)
     for again in (False, True):  # the next process knows it, too
         with pytest.raises(KernelsRefusedError, match="disagree with the reference: values off by") as error:
@@ -159,9 +149,7 @@ def test_disagreement_is_an_error_that_says_what_to_report_and_what_to_choose(
             selfcheck._refusal.cache_clear()
 
 
-def test_kernels_that_do_not_run_are_an_error_and_are_tried_again_by_the_next_process(
-    checks: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_kernels_that_do_not_run_are_an_error_and_are_tried_again_by_the_next_process(checks, monkeypatch):
     tries = []
 
     def broken(*_: Any) -> Agreement:

@@ -14,12 +14,7 @@ from omegaconf import OmegaConf
 from torch import nn
 
 from tests.reliability.crash_harness import assert_equal
-from vg2gt.runs.checkpoints import (
-    initialize_from,
-    newest_valid,
-    read_checkpoint,
-    write_checkpoint,
-)
+from vg2gt.runs.checkpoints import initialize_from, newest_valid, read_checkpoint, write_checkpoint
 from vg2gt.training.start import prepare_folder
 
 

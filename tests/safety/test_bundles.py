@@ -9,15 +9,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
-from backends.bundle import (
-    CONVENTIONS,
-    DECODER,
-    DECODER_WEIGHTS,
-    DESCRIPTION,
-    ENCODER,
-    Description,
-    read_bundle,
-)
+from backends.bundle import CONVENTIONS, DECODER, DECODER_WEIGHTS, DESCRIPTION, ENCODER, Description, read_bundle
 from backends.onnx import OnnxBackend, open_session
 
 onnx = pytest.importorskip("onnx", reason="needs onnx: pip install 'vg2gt[export]'")

@@ -271,9 +271,7 @@ def test_named_pipes_are_not_waited_for(tmp_path: Path, name: str) -> None:
         PIPES[name](tmp_path / name)
 
 
-def test_pictures_of_another_size_are_refused_before_they_are_decoded(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_pictures_of_another_size_are_refused_before_they_are_decoded(tmp_path, monkeypatch):
     (tmp_path / "large.png").write_bytes(png_of(13_000, 13_000))
     monkeypatch.setattr("PIL.ImageFile.ImageFile.load", lambda *_: pytest.fail("it was decoded"))
     with pytest.raises(DataError, match=r"large\.png of scene room is 13000x13000 pixels"):

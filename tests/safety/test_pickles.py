@@ -142,9 +142,7 @@ def recording(rooms: SyntheticScenes, tmp_path: Path) -> Path:
     return folder
 
 
-def test_index_caches(
-    recording: Path, tmp_path: Path, pickled_array: np.ndarray, armed: Armed, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_index_caches(recording, tmp_path, pickled_array, armed, caplog):
     cache = tmp_path / "cache"
 
     def frames() -> list[int]:

@@ -127,9 +127,7 @@ YAMLS = {
 
 
 @pytest.mark.parametrize("name", YAMLS)
-def test_a_runs_configuration_is_plain(
-    run_folder: Path, canary: Path, name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_runs_configuration_is_plain(run_folder, canary, name, monkeypatch):
     monkeypatch.setenv("SECRET", "hunter2")
     value, said = YAMLS[name]
     path = run_folder / "config.yaml"
@@ -142,9 +140,7 @@ def test_a_runs_configuration_is_plain(
 
 
 @pytest.mark.parametrize("read", [name_differences, lambda config: _refuse_other_run(config, Path(config.output_dir))])
-def test_no_command_reads_the_environment_for_a_runs_configuration(
-    read: Callable, run_folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_no_command_reads_the_environment_for_a_runs_configuration(read, run_folder, monkeypatch, caplog):
     monkeypatch.setenv("SECRET", "hunter2")
     with (run_folder / "config.yaml").open("a") as file:
         file.write("${oc.env:SECRET}: 1\nx: ${oc.env:SECRET}\n")

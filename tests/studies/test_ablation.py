@@ -10,18 +10,10 @@ import pytest
 
 import vg2gt.studies.ablation
 import vg2gt.studies.study
-from tests.commands import run_vg2gt
 from tests.training_helpers import SMALL
 from vg2gt.evaluation.tables import METRICS
 from vg2gt.runs.checkpoints import newest_valid, read_checkpoint, write_checkpoint
-from vg2gt.studies.ablation import (
-    CONTROL,
-    FULL,
-    Ablation,
-    _verdict,
-    common_overrides,
-    continuations,
-)
+from vg2gt.studies.ablation import CONTROL, FULL, Ablation, _verdict, common_overrides, continuations
 from vg2gt.studies.study import paired_difference
 
 QUIET = [override for override in SMALL if not override.startswith("trainer.max_steps")]
@@ -213,9 +205,3 @@ def test_numbers_are_checked_first(tmp_path: Path, wrong: dict[str, Any]) -> Non
     right = {"seeds": 1, "full_steps": 1, "steps": 1, "lr": 1e-3, "variants": [], "splits": [2]}
     with pytest.raises(ValueError, match=f"{next(iter(wrong))}=.*: a study takes whole numbers from 1 on"):
         Ablation(tmp_path, [], **(right | wrong))
-
-
-def test_several_devices_are_refused(tmp_path: Path) -> None:
-    shown = run_vg2gt("ablate", "trainer.devices=2", folder=tmp_path)
-    assert shown.returncode != 0
-    assert "trainer.devices=2: a study runs its trainings one after another on one device" in shown.stderr

@@ -63,11 +63,7 @@ def test_summary_has_no_numbers_that_do_not_exist() -> None:
 def test_one_row_per_run() -> None:
     runs = {"full": {0: {"psnr": 20.0}, 1: {"psnr": 30.0}}, "other": {0: {"psnr": 19.0}, 1: {}}}
     table = seeds_table(runs, columns("psnr", decimals={"psnr": 1}))
-    assert table.splitlines()[1:] == [
-        "| ----- | ----------: |",
-        "| full  | 25.0 ± 63.5 |",
-        "| other |         n/a |",
-    ]
+    assert table.splitlines()[1:] == ["| ----- | ----------: |", "| full  | 25.0 ± 63.5 |", "| other |         n/a |"]
 
 
 def test_a_part_of_a_checkpoint_leaves_the_rest_anew(tmp_path: Path) -> None:

@@ -14,7 +14,6 @@ from tests.reliability.crash_harness import RUN
 from tests.training_helpers import small_config, with_crash
 from vg2gt.runs.checkpoints import newest_valid
 from vg2gt.studies.curves import read_curves
-from vg2gt.training.checkpointing import NewestCheckpoints
 from vg2gt.training.distributed import ending_together
 from vg2gt.training.loop import build, train
 
@@ -53,12 +52,6 @@ def test_all_can_be_kept(tmp_path: Path, cache: Path) -> None:
     run = build(small_config(tmp_path, cache, *RUN, *overrides))
     run.trainer.fit(run.module, datamodule=run.datamodule)
     assert len(names(tmp_path)) == 6
-
-
-@pytest.mark.parametrize(("every", "kept"), [(0, 3), (10, 0), (10, -2)])
-def test_senseless_numbers_are_refused(every: int, kept: int) -> None:
-    with pytest.raises(ValueError, match=f"every_n_train_steps={every} .* save_top_k={kept}"):
-        NewestCheckpoints("checkpoints", every, kept)
 
 
 def test_a_resumed_run_logs_what_the_uninterrupted_one_does(tmp_path: Path, cache: Path) -> None:
@@ -105,9 +98,3 @@ def test_a_rank_that_has_ended_is_named(said: str) -> None:
         raise RuntimeError(said)
     with pytest.raises(RuntimeError, match="shapes"), ending_together(trainer):
         raise RuntimeError("shapes differ")
-
-
-def test_signals_are_as_before_the_run(tmp_path: Path, cache: Path) -> None:
-    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)}
-    train(small_config(tmp_path, cache, *RUN, "trainer.max_steps=1"))
-    assert {number: signal.getsignal(number) for number in before} == before

@@ -30,7 +30,6 @@ def one_step(run: Run) -> tuple[Tensor, dict[str, Tensor]]:
     batch = next(iter(run.datamodule.train_dataloader()))
     generator = torch.Generator().manual_seed(0)
     coarse = full_model(run).coarse
-    assert coarse is not None
     with torch.no_grad():
         for parameter in coarse.parameters():
             parameter += 0.02 * torch.randn(parameter.shape, generator=generator)
@@ -95,11 +94,8 @@ def test_a_share_of_the_scenes_has_wrong_poses_always_the_same_way(tmp_path: Pat
     turns, shifts, wrong = [], [], 0
     for batch in (batch.context for batch in batches):
         true = batch.hints.cameras
-        assert true is not None
         for share in (0.0, 0.5, 1.0):
             first, again = (with_pose_noise(batch, share).cameras for _ in range(2))
-            assert first is not None
-            assert again is not None
             assert torch.equal(first.world_to_camera, again.world_to_camera)
             assert torch.equal(first.intrinsics, true.intrinsics)
             same = (first.world_to_camera == true.world_to_camera).flatten(1).all(1)

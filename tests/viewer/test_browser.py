@@ -57,9 +57,7 @@ def compare(page: Page, path: Path, gaussians: Gaussians, cameras: Cameras) -> l
 
 
 @pytest.mark.parametrize(("size", "voxel_size"), [((240, 320), 0.05), ((480, 640), 0.02)])
-def test_screenshot_is_our_rasterized_image_of_a_room(
-    page: Page, tmp_path: Path, size: tuple[int, int], voxel_size: float
-) -> None:
+def test_screenshot_is_our_rasterized_image_of_a_room(page, tmp_path, size, voxel_size):
     gaussians, cameras, _ = voxel_room(size=size, voxel_size=voxel_size)
     assert len(gaussians) > 20_000
     path = tmp_path / f"room-{len(gaussians)}.html"

@@ -77,13 +77,10 @@ def test_gaussians_of_one_size_are_packed() -> None:
 
 
 @pytest.mark.parametrize(("behind", "shown"), [(None, [0, 0, 0]), (torch.tensor([[0.25, 0.5, 1.0]]), [0.25, 0.5, 1])])
-def test_page_knows_the_colour_behind_the_scene(
-    tmp_path: Path, behind: torch.Tensor | None, shown: list[float]
-) -> None:
+def test_page_knows_the_colour_behind_the_scene(tmp_path, behind, shown):
     gaussians = replace(scene(20, 0), background=behind)
     page = write_viewer_html(tmp_path / "page.html", ViewerScene(gaussians)).read_text()
     content = re.search(r'id="scene">([^<]*)<', page)
-    assert content is not None
     assert json.loads(content[1])["settings"]["background"] == shown
     assert "clearColor(...this.settings.background, 1)" in page
 

@@ -97,7 +97,6 @@ def test_command_serves_until_interrupted(tmp_path: Path) -> None:
     command = [sys.executable, "-c", code, "view", str(path), "--port", "0"]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
-    assert process.stdout is not None
     try:
         lines = iter(process.stdout.readline, "")
         address = next(line.split()[0] for line in lines if line.startswith("http://127.0.0.1:"))

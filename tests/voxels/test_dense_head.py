@@ -27,7 +27,6 @@ def test_every_tap_and_the_image_reach_every_view(make_room):
     inputs = [tap.requires_grad_() for tap in tokens.patch] + [images.requires_grad_()]
     head(tokens, images).square().sum().backward()
     for x in inputs:
-        assert x.grad is not None
         assert (x.grad.flatten(2).abs().sum(-1) > 0).all()
     assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in head.parameters())
 

@@ -42,7 +42,6 @@ def test_gradients_reach_tokens_depth_confidence_and_every_parameter(make_fine, 
     voxels = module(tokens, geometry, images)
     (voxels.features.square().sum() + voxels.centroid.sum()).backward()
     for x in (*inputs, *module.parameters()):
-        assert x.grad is not None
         assert torch.isfinite(x.grad).all()
         assert x.grad.abs().sum() > 0
 
@@ -77,7 +76,6 @@ def test_sky_and_non_finite_pixels_are_left_out(make_fine, make_room):
     for values in (voxels.features, voxels.colors, voxels.centroid, voxels.confidence):
         assert torch.isfinite(values).all()
     (voxels.features.sum() + voxels.centroid.sum()).backward()
-    assert depth.grad is not None
     assert torch.isfinite(depth.grad).all()
     assert depth.grad[0, 0, :20].eq(0).all()
     assert all(torch.isfinite(p.grad).all() for p in module.parameters() if p.grad is not None)
@@ -182,7 +180,6 @@ def test_sparse_voxels_are_named_once(views, voxel_size, warned, make_fine, make
 def test_moments_are_the_covariances_of_the_pixels(make_fine, make_room):
     tokens, geometry, images = make_room(scenes=2)
     voxels = make_fine(moments=True)(tokens, geometry, images)
-    assert voxels.moments is not None
     points = unproject(geometry.depth, geometry.cameras)
     focal = geometry.cameras.intrinsics[0, 0, 0, 0]
     for scene in (0, 1):

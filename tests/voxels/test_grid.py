@@ -131,18 +131,6 @@ def test_points_on_faces_fall_by_division():
     assert torch.equal(torch.floor(cells[:, 0]), count)
 
 
-def test_select_keeps_some_voxels():
-    points, batch, values, weights = cloud()
-    plan = planned(points, batch)
-    keep = torch.arange(len(plan)) % 3 != 0
-    part = plan.select(keep)
-    assert torch.equal(part.grid, plan.grid[keep])
-    assert torch.equal(pool_mean(values, weights, part), pool_mean(values, weights, plan)[keep])
-    kept_points = (plan.voxel_of >= 0) & keep[plan.voxel_of]
-    assert torch.equal(part.voxel_of >= 0, kept_points)
-    assert torch.equal(part.grid[part.voxel_of[kept_points]], plan.grid[plan.voxel_of[kept_points]])
-
-
 def test_no_valid_point_gives_no_voxel():
     points, batch, values, weights = cloud(20)
     plan = planned(points, batch, torch.zeros(20, dtype=torch.bool))

@@ -123,22 +123,6 @@ def test_without_a_single_least_direction_the_normal_faces_the_cameras(values: t
     torch.testing.assert_close(found, facing)
 
 
-def test_threads_do_not_change_a_bit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vg2gt.voxels.passes.VOXELS_AT_ONCE", 100)
-    parts, threads = two_scenes(), torch.get_num_threads()
-    assert len(parts[-1]) > 500
-    try:
-        results = []
-        for number in (1, 2, 3):
-            torch.set_num_threads(number)
-            results.append(surface_normals(*parts, 3))
-    finally:
-        torch.set_num_threads(threads)
-    assert all(torch.equal(results[0], other) for other in results[1:])
-    monkeypatch.setattr("vg2gt.voxels.passes.VOXELS_AT_ONCE", 1000)
-    torch.testing.assert_close(surface_normals(*parts, 3), results[0])
-
-
 @pytest.mark.parametrize("kernel", [1, 3])
 def test_plain_torch_does_the_same(kernel: int, monkeypatch: pytest.MonkeyPatch) -> None:
     spread, facing, offset, plan = two_scenes()

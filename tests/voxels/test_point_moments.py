@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import pytest
 import torch
 from torch import Tensor
@@ -77,20 +75,6 @@ def test_every_point_has_its_own_view(per_view: int) -> None:
     assert not cross.abs().max() > 1e-6
 
 
-def test_threads_do_not_change_a_bit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vg2gt.voxels.passes.VOXELS_AT_ONCE", 50)
-    inputs, plan = points()
-    threads = torch.get_num_threads()
-    try:
-        results = []
-        for number in (1, 2, 3):
-            torch.set_num_threads(number)
-            results.append(pooled(inputs, plan))
-    finally:
-        torch.set_num_threads(threads)
-    assert all(torch.equal(a, b) for other in results[1:] for a, b in zip(results[0], other, strict=True))
-
-
 @pytest.mark.parametrize("compiled", [True, False])
 def test_points_in_no_voxel_have_no_say(compiled: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(point_moments, "compilable", lambda *_: compiled)
@@ -138,12 +122,9 @@ def spoil_confidence(inputs: list[Tensor], row: int) -> None:
 
 @pytest.mark.parametrize("compiled", [True, False])
 @pytest.mark.parametrize(
-    ("spoil", "numbers"),
-    [(spoil_place, 5 + 3), (spoil_color, 3), (spoil_depth, 1), (spoil_confidence, 9 + 9 + 3 + 1)],
+    ("spoil", "numbers"), [(spoil_place, 5 + 3), (spoil_color, 3), (spoil_depth, 1), (spoil_confidence, 9 + 9 + 3 + 1)]
 )
-def test_nan_reaches_its_voxel_and_no_other(
-    spoil: Callable[[list[Tensor], int], None], numbers: int, compiled: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_nan_reaches_its_voxel_and_no_other(spoil, numbers, compiled, monkeypatch):
     """Training finds faults by what is not finite."""
     monkeypatch.setattr(point_moments, "compilable", lambda *_: compiled)
     inputs, plan = points()

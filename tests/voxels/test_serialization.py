@@ -59,12 +59,6 @@ def test_z_order_interleaves_bits():
     assert z_codes(cells).tolist() == [4, 2, 1, 32, spread]
 
 
-@pytest.mark.parametrize("order", ORDERS)
-def test_codes_do_not_depend_on_the_other_scenes_extent(order):
-    cells = cube(3)
-    assert torch.equal(serial_codes(cells, 3, order), serial_codes(cells, 5, order))
-
-
 def test_relative_grid_is_each_scenes_own():
     grid = torch.tensor([[5, -3, 2], [6, -1, 9], [100, 200, 300]])
     assert relative_grid(grid, torch.tensor([0, 0, 1]), 2).tolist() == [[0, 0, 0], [1, 2, 7], [0, 0, 0]]

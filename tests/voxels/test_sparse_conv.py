@@ -27,7 +27,6 @@ def test_equals_dense_convolution_with_gradients(kernel_size, held, find, random
     monkeypatch.setattr(sparse_conv, "HELD", held)
     grid, batch = random_voxels((150, 100), extent=7)  # dense enough to touch every border and offset
     conv = SubmanifoldConv3d(4, 3, kernel_size).double()
-    assert conv.bias is not None
     features = torch.randn(len(grid), 4, dtype=torch.float64, requires_grad=True)
     pairs = find(grid, batch, kernel_size)
     assert all(len(i) for i, _ in neighbor_pairs(grid, batch, kernel_size))

@@ -58,14 +58,14 @@ def test_where_no_normal_is_known_it_is_the_cameras_axis() -> None:
     torch.testing.assert_close(frame(slope=0.5, row=12).normal, slanted)
 
 
-def test_change_of_depth_is_in_units_of_two_percent_and_positive_behind() -> None:
+def test_change_of_depth_is_in_units_of_two_percent_and_positive_behind():
     # half a voxel of 8 cm behind: 4 cm of 2 m are 2 %
     assert measured(frame(), (0.3, 0.1, 0.5)) == pytest.approx([0.3, 0.1, 0.5, 1.0])
     assert measured(frame(), (0.3, 0.1, -0.5)) == pytest.approx([0.3, 0.1, -0.5, -1.0])
     assert measured(frame(), (0, 0, 0.5), voxel_size=0.04)[3] == pytest.approx(0.5)
 
 
-def test_change_of_depth_is_along_the_ray_to_the_tangent_plane() -> None:
+def test_change_of_depth_is_along_the_ray_to_the_tangent_plane():
     # (1, 0, 1/2) lies in the plane z = x / 2: the surface is where the point is
     assert measured(frame(slope=0.5), (1, 0, 0.5))[3] == pytest.approx(0, abs=1e-6)
     # the plane z = x / 2 - 1/4 through a point half a voxel aside: a quarter of a voxel, half a unit, nearer
@@ -127,9 +127,7 @@ def inputs_of(network: torch.nn.Module) -> list[Tensor]:
 
 
 @pytest.mark.parametrize(("confidence", "changes"), [(1.0, (1.0, -1.0)), (3.0, (1.5, -0.5))])
-def test_each_view_is_told_how_far_it_is_from_the_surface_both_agree_on(
-    confidence: float, changes: tuple[float, float], make_room, make_coarse
-) -> None:
+def test_each_view_is_told_how_far_it_is_from_the_surface_both_agree_on(confidence, changes, make_room, make_coarse):
     """4 % apart, in voxels that hold both: the surface is their mean, weighted by confidence."""
     tokens = make_room(views=2)[0]
     module = make_coarse(voxel_size=0.15)  # 1.95 to 2.10 along the axis
@@ -207,7 +205,6 @@ def test_beside_a_silhouette_there_is_no_evidence(make_room, make_coarse) -> Non
     assert (evidence[:, 4:] > 0).any() or (evidence[:, :2] > 0).any()
     # of a patch's four points the two next to the step (7 pixels wide, the step's reach is 3) are left out
     points = coarse.PatchPoints(geometry, 7, torch.tensor([0.15]), away_from_silhouettes=True)
-    assert points.clear is not None
     columns = points.rows % 12
     assert set(columns[~points.clear].tolist()) == {5, 6}
 
@@ -286,9 +283,7 @@ def test_normals_enter_with_surface_evidence_only(options: dict, same: bool, mak
         ("fuse_kernel", 3, 12 + 1, 24, 3),
     ],
 )
-def test_every_switch_adds_what_it_names(
-    option: str, value: object, voxel_channels: int, fused_channels: int, kernel: int, make_room, make_coarse
-) -> None:
+def test_every_switch_adds_what_it_names(option, value, voxel_channels, fused_channels, kernel, make_room, make_coarse):
     module = make_coarse(**{**PAPER, option: value})
     assert module.ptv3.embedding["stem"]["conv"].weight.shape[-1] == voxel_channels
     assert module.fuse[0].weight.shape[1:] == (fused_channels, kernel, kernel)

@@ -37,9 +37,6 @@ def write_cameras(folder: Path, names: list[str], poses: list[np.ndarray], intri
 
 LAYOUTS = {
     "scannetpp_iphone": Layout(
-        write,
-        lambda root: ScanNetPPiPhone(str(root)),
-        image_error=JPEG_ERROR,
-        frame_ids=tuple(range(0, 60, 10)),
+        write, lambda root: ScanNetPPiPhone(str(root)), image_error=JPEG_ERROR, frame_ids=tuple(range(0, 60, 10))
     )
 }

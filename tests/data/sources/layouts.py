@@ -24,16 +24,7 @@ SIZE = (30, 40)
 
 @dataclass(frozen=True)
 class Layout:
-    """A dataset's layout on disk.
-
-    Attributes:
-        write: lays frames out below an empty folder, as scene number 0 of a dataset would be.
-        read: makes the loader of that folder.
-        image_error: largest mean absolute difference of images (PNG: 0; JPEG: the codec's).
-        depth_quantum: step of stored depth, or the step at depth z, ``quantum(z)``; None where the layout has no depth.
-        frame_ids: ids under which frames 0, 1, ... come back; None: unchanged.
-        moved_world: poses come back up to one rigid transform of the world.
-    """
+    """A dataset's layout on disk."""
 
     write: Callable[[Path, Frames], None]
     read: Callable[[Path], FileSource]

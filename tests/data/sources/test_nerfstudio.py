@@ -162,7 +162,6 @@ def test_blenders_synthetic_sets(tmp_path):
     assert torch.allclose(loaded.intrinsics[:, 0, 0], frames.intrinsics[:, 0, 0], rtol=1e-5)
     assert (loaded.images[..., :20] == 1).all()  # item 7: what was hidden under alpha 0 is no part of the scene
     assert torch.allclose(loaded.images[..., 20:], frames.images[..., 20:], atol=1 / 400)
-    assert loaded.mask is not None
     assert torch.equal(loaded.mask[0, 0], (torch.arange(40) >= 20).float())
 
 
@@ -175,7 +174,6 @@ def test_masks_that_are_named_and_one_that_is_missing(tmp_path, caplog):
     Image.fromarray(mask).save(tmp_path / "desk" / "m" / "0.png")
     _edit(tmp_path, lambda content: [f.update(mask_path=f"m/{i}.png") for i, f in enumerate(content["frames"][::-1])])
     loaded = Nerfstudio(str(tmp_path)).load("desk", [0, 1])
-    assert loaded.mask is not None
     assert loaded.mask[0].sum() == 300
     assert loaded.mask[1].all()
     assert "names masks that are not there, their images count as a whole" in caplog.text

@@ -73,13 +73,6 @@ def test_what_is_behind_a_sparse_surface_is_hidden():
     assert (shining == 4).mean() > 0.5  # without the window, the wall would be full of holes
 
 
-def test_points_behind_and_beside_the_camera_do_not_count():
-    points = np.array([[0, 0, -1], [50, 0, 1], [0, 0, 0], [0, 0, 2]], np.float32)
-    depth = render_points(points, np.eye(4), K, VIEW)
-    assert (depth > 0).sum() == 1
-    assert depth[40, 50] == 2  # the principal point (49.5, 39.5) is the corner of four pixels
-
-
 def test_a_furnished_room_agrees_with_its_ray_caster():
     """The procedural room's depth in one view against its points from all views."""
     size = (120, 160)

@@ -51,13 +51,6 @@ def test_colour_is_resized_to_the_depth_images_whose_intrinsics_count(tmp_path, 
     assert torch.allclose(loaded.intrinsics, frames.intrinsics, atol=1e-4)
 
 
-def test_the_depth_intrinsics_are_needed(tmp_path, frames):
-    write_export(tmp_path, frames)
-    (tmp_path / "scans" / SCENE / "intrinsic" / "intrinsic_depth.txt").unlink()
-    with pytest.raises(DataError, match=r"intrinsic_depth\.txt of scene scene0707_00"):
-        ScanNet(str(tmp_path)).frames(SCENE)
-
-
 def test_scans_of_one_room_show_one_place(tmp_path, frames):
     for scene in (SCENE, "scene0707_01", "scene0706_00"):
         write_export(tmp_path, frames, scene)

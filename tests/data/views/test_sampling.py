@@ -10,14 +10,6 @@ from vg2gt.data import DataError, SyntheticScenes
 from vg2gt.data.views.sampling import ScenePool, StepSampler, ViewSampler, shares, usable_scenes
 
 
-def test_the_number_of_views_stays_in_range_and_takes_every_value():
-    sampler = ViewSampler(3, 18, max_images=40)
-    drawn = [sampler.num_views(step) for step in range(600)]
-    assert set(drawn) == set(range(3, 19))
-    for step in range(50):
-        assert sampler.num_scenes(step) == 40 // drawn[step]
-
-
 @pytest.mark.parametrize(
     ("sampler", "digest"),
     [
