@@ -4,7 +4,6 @@ import json
 import re
 import subprocess
 import sys
-from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -80,60 +79,3 @@ def test_baselines(tmp_path: Path) -> None:
     assert all(name.startswith("model.coarse.") for name in kept)
     assert (begun / "seed-0" / "vg2gt" / "start.json").is_file()
     assert not (begun / "seed-0" / "wo_coarse" / "start.json").exists()
-
-
-@pytest.mark.slow
-def test_counts(tmp_path: Path) -> None:
-    """Sizes at which nothing is learnt; the number of the model without its coarse module follows the other's."""
-    arguments = ["steps=1", "name=short", *TINY, *QUIET]
-    run("baselines.py", tmp_path, *arguments, "models=vg2gt,pixel_aligned")
-    home = tmp_path / "outputs" / "short"
-    before = (home / "seed-0" / "vg2gt" / "metrics.json").stat().st_mtime_ns
-    assert "## At equal counts" in run("counts.py", tmp_path, *arguments)
-    assert (home / "seed-0" / "vg2gt" / "metrics.json").stat().st_mtime_ns == before
-    content = json.loads((home / "counts.json").read_text())
-    full, _, widened = content["equal"].values()
-    assert abs(widened["0"]["gaussians"] / full["0"]["gaussians"] - 1) < 0.05
-    assert any(path.name.startswith("wo_coarse-") for path in (home / "seed-0").iterdir())
-    curve = {(k, px): metrics["gaussians"] for k, cells in content["curve"].items() for px, metrics in cells.items()}
-    assert set(curve) == {
-        ("1", "2.02"),
-        ("1", "3.1"),
-        ("2", "2.02"),
-        ("2", "3.1"),
-        ("2", "4.5"),
-        ("4", "3.1"),
-        ("4", "4.5"),
-    }
-    assert curve["4", "4.5"] > curve["2", "4.5"]
-    if find_spec("matplotlib"):  # extra: eval
-        assert (home / "counts.png").stat().st_size > 1000
-
-
-@pytest.mark.slow
-def test_memory(tmp_path: Path) -> None:
-    run("memory.py", tmp_path, "--models", "tiny", "--out", str(tmp_path))
-    (written,) = tmp_path.glob("*-memory-cpu.json")
-    points = json.loads(written.read_text())["points"]
-    views = [point for point in points if point["varied"] == "views"]
-    for mode in ("forward", "training"):
-        passes = [point[mode]["pass_mib"] for point in views]
-        assert passes == sorted(passes)
-    assert views[-1]["training"]["pass_mib"] > views[-1]["forward"]["pass_mib"] > 0
-    capped = next(point for point in points if point["overrides"] == ["model.fine.max_voxels=1000"])
-    assert capped["forward"]["voxels"] == 1000
-    assert capped["training"]["pass_mib"] < views[-1]["training"]["pass_mib"]
-    lines = written.with_suffix(".md").read_text().splitlines()
-    assert [line.split("|")[2].strip() for line in lines if line.startswith("| views ")] == ["2", "4", "8", "16"]
-
-
-@pytest.mark.slow
-def test_refine(tmp_path: Path) -> None:
-    where = ["--out", str(tmp_path), "--figures", str(tmp_path), "--device", "cpu", "--scenes", "1", "--seconds", "1"]
-    run("refine.py", tmp_path, *where, TINY[0], "data.train_scenes=1", f"data.cache_dir={tmp_path}")
-    (path,) = tmp_path.glob("*-refine-rooms-cpu.json")
-    curves = json.loads(path.read_text())["curves"]
-    assert set(curves) == {"VG²GT, untrained", "pixel-aligned, untrained", "voxel-merged, untrained", "point cloud"}
-    for points in curves.values():
-        assert points[0]["step"] == 0 < points[-1]["step"]
-        assert points[-1]["psnr"] > points[0]["psnr"]

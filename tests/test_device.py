@@ -142,7 +142,6 @@ def test_an_evaluation(device: str, tmp_path: Path, cache: Path, as_on_a_gpu: An
 @slowly_on_a_cpu
 def test_a_reconstruction(device: str, as_on_a_gpu: Any) -> None:
     """Untrained, of random weights, which is as good as any."""
-
     size, pixels = SIZES[device]
 
     def scene(where: str) -> tuple[int, Tensor]:

@@ -9,7 +9,7 @@ import torch
 
 from tests.commands import ROOT, run_python
 from vg2gt.gaussians import GaussianHead
-from vg2gt.memory import TRAINING, Cap, OutOfMemory, dropped_by, memory_advice, note_sizes
+from vg2gt.memory import TRAINING, OutOfMemory, dropped_by, memory_advice, note_sizes
 from vg2gt.studies.study import compose_run
 from vg2gt.training.loop import train
 from vg2gt.types import Voxels
@@ -73,20 +73,6 @@ def test_a_scene_is_capped_as_if_it_were_alone() -> None:
     torch.testing.assert_close(head(50)(alone).means, both.scene(0).means)
 
 
-def test_which_are_dropped_does_not_depend_on_their_order() -> None:
-    generator = torch.Generator().manual_seed(0)
-    ranks, batch = torch.rand(500, generator=generator), torch.arange(2).repeat_interleave(250)
-    order = torch.cat((torch.randperm(250, generator=generator), 250 + torch.randperm(250, generator=generator)))
-    keep = Cap("o", "things", "least")(100, ranks, batch)
-    shuffled = Cap("o", "things", "least")(100, ranks[order], batch)
-    assert keep is not None and shuffled is not None  # noqa: PT018
-    assert torch.equal(keep[order], shuffled)
-    assert torch.bincount(batch[keep]).tolist() == [100, 100]
-    ties, again = (Cap("o", "things", "least")(100, torch.ones(500), batch) for _ in range(2))
-    assert ties is not None and again is not None  # noqa: PT018
-    assert torch.equal(ties, again)
-
-
 def test_below_the_limit_nothing_changes(caplog: pytest.LogCaptureFixture) -> None:
     voxels = some_voxels()
     for limit in (120, 10**6):
@@ -95,13 +81,6 @@ def test_below_the_limit_nothing_changes(caplog: pytest.LogCaptureFixture) -> No
             assert torch.equal(getattr(made, name), getattr(expected, name))
     assert not caplog.records
     assert dropped_by(head()) == {}
-
-
-def test_the_kept_ones_have_their_gradients() -> None:
-    voxels, capped = some_voxels(), head(50)
-    capped(voxels).means.sum().backward()
-    assert torch.isfinite(capped.out.weight.grad).all()  # pyright: ignore[reportArgumentType]
-    assert float(capped.out.weight.grad.abs().sum()) > 0  # pyright: ignore[reportOptionalMemberAccess]
 
 
 def test_training_logs_what_was_dropped(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -106,7 +106,6 @@ def test_gradient_reaches_the_last_coarse_layer_first_and_the_transformer_next(r
     names = [name for name, _ in model.coarse.named_parameters()]
     transformer = [name for name in names if name.startswith("ptv3.")]
     assert transformer
-
     coarse = model.coarse
 
     def gradients() -> dict[str, float]:
@@ -186,11 +185,6 @@ def test_autocast_never_touches_geometry(model: VG2GT, batch: Batch) -> None:
     assert prediction.gaussians.means.dtype == torch.float32
 
 
-def test_metric_scale_needs_a_metric_backend(model: VG2GT) -> None:
-    with pytest.raises(ValueError, match="oracle does not"):
-        VG2GT(model.backend, SceneScale("metric"), None, lambda **_: model.fine, lambda **_: model.gaussians)
-
-
 def test_target_cameras_of_both_protocols_agree(model: VG2GT, batch: Batch) -> None:
     prediction = model(batch.context.images, batch.context.hints)
     joint = training_cameras(model, batch, prediction)
@@ -199,11 +193,6 @@ def test_target_cameras_of_both_protocols_agree(model: VG2GT, batch: Batch) -> N
     assert joint.world_to_camera.shape[1] == batch.images.shape[1]
     assert float((held_out[..., :3, :3] - truth.world_to_camera[..., :3, :3]).abs().max()) < 0.02
     assert float((held_out[..., :3, 3] - truth.world_to_camera[..., :3, 3]).abs().max()) < 0.05
-
-
-def test_unknown_scale_source_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"model\.scale\.source is 'metres'"):
-        SceneScale("metres")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("source", ["metric", "focal", "normalize", "groundtruth"])

@@ -152,7 +152,6 @@ def test_downloads_what_was_asked_for_and_then_lives_off_the_cache(hub: Hub, mak
         assert "backend.pretrained=false" in message
         assert "backend.path=" in message
         assert "\n" not in message
-
     hub.asked.clear()
     offline = load(
         tmp_path,

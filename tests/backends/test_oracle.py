@@ -88,24 +88,6 @@ def test_the_background_lies_behind_the_scene(make_scene) -> None:
         OracleBackend(background=0.5)
 
 
-def test_depth_bleeds_over_edges_only(make_scene) -> None:
-    images, hints = make_scene(1, 1, SIZE)
-    depth = torch.full((1, 1, *SIZE), 2.0)
-    depth[..., 50:] = 3.0
-    geometry = simulate(images, replace(hints, depth=depth), depth_noise=0)
-    changed = (geometry.depth != depth).any(-2)[0, 0].nonzero()[:, 0].tolist()
-    assert changed == [49, 50]
-    assert 2 < geometry.depth[0, 0, 20, 49] < geometry.depth[0, 0, 20, 50] < 3
-
-
-def test_confidence_knows_the_error(make_scene) -> None:
-    images, hints = make_scene(2, 4, SIZE)
-    geometry = simulate(images, hints)
-    error = relative_error(geometry, hints).abs()
-    sure = geometry.depth_conf > geometry.depth_conf.median()
-    assert error[sure].mean() < 0.7 * error[~sure].mean()
-
-
 def test_tokens_do_not_know_the_truth(make_scene) -> None:
     """Two different truths that look the same to the network (same prediction) have the same tokens."""
     images, hints = make_scene(1, 2, SIZE)

@@ -6,9 +6,8 @@ from torch import Tensor
 
 from backends.sweep.backend import SweepBackend
 from backends.sweep.correlate import GROUPS, SourceWarp, correlate, correlate_reference
-from backends.sweep.refine import convex_upsample
 from backends.sweep.views import agreed_range, choose_sources, wide_range
-from backends.sweep.volume import agreement, expectation
+from backends.sweep.volume import agreement
 from vg2gt.data import SyntheticScenes
 from vg2gt.types import Batch, Cameras, Hints
 
@@ -135,24 +134,6 @@ def test_ranges() -> None:
     found = agreed_range(depth, agreeing, wide_range(poses))
     torch.testing.assert_close(found, torch.tensor([2.04 * 0.8, 3.96 * 1.4]), rtol=1e-2, atol=0)
     assert torch.equal(agreed_range(depth, 0 * agreeing, wide_range(poses)), wide_range(poses))
-
-
-def test_expectation_ignores_far_planes() -> None:
-    logits = torch.full((1, 9, 1, 1), -20.0)
-    logits[0, [2, 3]] = 5.0
-    logits[0, 8] = 4.0
-    t, mass = expectation(logits, torch.arange(9.0).view(1, -1, 1, 1))
-    torch.testing.assert_close(t, torch.full((1, 1, 1, 1), 2.5), rtol=1e-4, atol=0)
-    assert 0.5 < float(mass) < 0.9
-
-
-def test_upsampling_is_a_convex_mixture() -> None:
-    generator = torch.Generator().manual_seed(0)
-    x = torch.rand(1, 2, 4, 5, generator=generator)
-    up = convex_upsample(x, 5 * torch.randn(1, 36, 4, 5, generator=generator))
-    assert up.shape == (1, 2, 8, 10)
-    around = torch.nn.functional.max_pool2d(torch.nn.functional.pad(x, (1, 1, 1, 1), mode="replicate"), 3, 1)
-    assert (up <= torch.nn.functional.interpolate(around, scale_factor=2.0) + 1e-6).all()
 
 
 def test_cameras_in_one_place_are_refused(make_scene) -> None:

@@ -9,7 +9,6 @@ from safetensors.torch import save_file
 from torch import nn
 
 from backends.weights import find_weights, load_strictly
-from vg2gt.io.tensors import read_tensors
 
 
 def published(backend, prefix: str = "model.") -> dict[str, torch.Tensor]:
@@ -58,16 +57,6 @@ def test_offending_tensors_are_named() -> None:
     assert "model.0.weight is [3, 4], expected [3, 2]" in message
     assert "unexpected model.2.weight" in message
     assert "unused" not in message
-
-
-def test_a_folder_may_have_a_dot_and_weights_are_copies(tmp_path: Path) -> None:
-    folder = tmp_path / "DA3-LARGE-1.1"
-    folder.mkdir()
-    save_file({"a": torch.ones(3)}, folder / "model.safetensors")
-    file = find_weights("name", None, None, str(folder))
-    state = read_tensors(file)
-    file.write_bytes(bytes(file.stat().st_size))  # while the network runs
-    assert state["a"].tolist() == [1, 1, 1]
 
 
 def test_weights_that_are_not_finite_are_refused() -> None:

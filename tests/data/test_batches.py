@@ -42,23 +42,12 @@ def test_the_nearest_readable_frame_takes_the_place_of_a_damaged_one(write_recor
     assert "00012.png" in warnings[0]
     assert "number 2" in warnings[1]
     assert "00013.png" in warnings[1]
-
     caplog.clear()
     assert dataset[views].frame_ids.tolist() == [[11, 10, 14, 15]]
     assert not caplog.records  # warned once
     others = [_dataset(folder, 0, replace_damaged=True), dataset]
     others[0][(SceneSample("office", (13, 14)),)]  # another history
     assert all(other[views].frame_ids.tolist() == [[11, 10, 14, 15]] for other in others)
-
-
-@pytest.mark.parametrize("replace_damaged", [False, True])
-def test_a_frame_is_decoded_once_a_batch(write_recording, replace_damaged, monkeypatch):
-    dataset = _dataset(write_recording(frames=6), 0, replace_damaged=replace_damaged)
-    decoded = []
-    load = RGBDFolder.load
-    monkeypatch.setattr(RGBDFolder, "load", lambda self, scene, ids: decoded.extend(ids) or load(self, scene, ids))
-    assert dataset[(SceneSample("office", (12, 10), (15,)),)].num_context == 2
-    assert decoded == [12, 10, 15]
 
 
 def test_evaluation_never_replaces_frames(write_recording):

@@ -31,10 +31,8 @@ def test_training_batches(rooms):
     for batch in batches:
         scenes, views = batch.frame_ids.shape
         assert scenes == len(batch.scene) == 4 // batch.num_context
-        assert views == batch.num_context + 1
-        assert batch.images.shape == (scenes, views, 3, *SIZE)
-        assert batch.depth.shape == (scenes, views, *SIZE)
-        assert batch.cameras.size == SIZE
+        assert (views, batch.images.shape) == (batch.num_context + 1, (scenes, views, 3, *SIZE))
+        assert (batch.depth.shape, batch.cameras.size) == ((scenes, views, *SIZE), SIZE)
         assert batch.is_metric.tolist() == [True] * scenes
         direct = rooms.load(batch.scene[0], batch.frame_ids[0].tolist())
         torch.testing.assert_close(batch.images[0], direct.images, atol=1e-6, rtol=0)
@@ -46,8 +44,7 @@ def test_training_batches(rooms):
 def test_evaluation_batches_are_context_then_targets(rooms):
     batches = list(_module(rooms).val_dataloader())
     assert [batch.scene for batch in batches] == [("room-000100",), ("room-000101",)]
-    assert batches[0].frame_ids.tolist() == [[0, 2, 4, 1, 3]]
-    assert batches[0].num_context == 3
+    assert (batches[0].frame_ids.tolist(), batches[0].num_context) == ([[0, 2, 4, 1, 3]], 3)
     assert batches[0].target.frame_ids.tolist() == [[1, 3]]
 
 
@@ -158,8 +155,7 @@ def test_evaluation_views_by_number_and_window(rooms):
     source = SyntheticScenes(1, num_frames=20)
     source.held_out = lambda scene: range(3, 20, 6)
     (views,) = EvaluationViews(context=4, target=2).choose(source, "room-000000")
-    assert views.context == (0, 6, 13, 19)
-    assert views.target == (3, 15)
+    assert (views.context, views.target) == ((0, 6, 13, 19), (3, 15))
     windows = EvaluationViews(context=3, target=9, window=10).choose(source, "room-000000")
     assert [window.target for window in windows] == [(3, 9), (15,)]
     assert windows[1].context[0] == 10

@@ -136,20 +136,6 @@ def test_hololens_frames_agree_as_its_description_says(shared):
     assert np.median(far) == pytest.approx(7.2e-3, rel=0.1)
 
 
-def test_raw_seven_scenes_depth_agrees_as_its_description_says(shared):
-    source = RGBDFolder(str(shared / "data/seven_scenes_redkitchen_a"), holdout=None)
-    (scene,) = source.scenes
-    frames = source.load(scene, source.frames(scene))
-    assert float((frames.depth > 0).float().mean()) == pytest.approx(0.883, abs=0.001)
-    count = len(frames.depth)
-    pairs = [depth_differences(frames, a, b, stride=10) for a in range(count) for b in range(count) if a != b]
-    together = torch.cat([differences for differences, overlap in pairs if overlap >= 0.3])
-    assert float(together.median()) == pytest.approx(12.2e-3, rel=0.1)
-    assert float((together < 0.03).float().mean()) == pytest.approx(0.78, abs=0.02)
-    neighbours = [float(depth_differences(frames, a, a + 1, stride=4)[0].median()) for a in range(count - 1)]
-    assert np.median(neighbours) == pytest.approx(6.0e-3, rel=0.1)
-
-
 def test_a_real_recording_with_quaternions(shared):
     """Its description says: poses are rough, depth of two frames differs by 76 mm in the median."""
     source = RGBDFolder(str(shared / "data" / "slambook_rgbd"), intrinsics=(518, 519, 325.5, 253.5), holdout=None)

@@ -24,8 +24,7 @@ def test_recordings_of_a_place_stay_together():
     train, val = split_scenes(source, 0.25, seed=3)
     assert sorted(train + val) == list(source.scenes)
     assert not {source.place(scene) for scene in train} & {source.place(scene) for scene in val}
-    assert len(val) == 15
-    assert split_scenes(source, 0.25, seed=3) == (train, val)
+    assert (len(val), split_scenes(source, 0.25, seed=3)) == (15, (train, val))
     assert split_scenes(source, 0.25, seed=4) != (train, val)
 
 
@@ -53,7 +52,6 @@ def test_the_command_writes_lists_that_the_data_module_takes(write_recording, tm
     assert "val.txt: 2 scenes" in capsys.readouterr().out
     lists = [str(tmp_path / "lists" / name) for name in ("train.txt", "val.txt")]
     assert sorted(name for path in lists for name in read_split(path)) == ["attic", "cellar", "hall", "kitchen"]
-
     train, val = (partial(RGBDFolder, scenes=path, holdout=None) for path in lists)
     options: dict[str, Any] = {
         "root": str(tmp_path / "home"),
@@ -65,7 +63,6 @@ def test_the_command_writes_lists_that_the_data_module_takes(write_recording, tm
     SceneDataModule(train, val, **options).setup()
     with pytest.raises(DataError, match="used for training and for evaluation"):
         SceneDataModule(train, train, **options).setup()
-
     main([*arguments, f"out={tmp_path / 'lists'}"])  # the same again
     with pytest.raises(SystemExit, match="holds another split"):
         main([*arguments, f"out={tmp_path / 'lists'}", "split_seed=1"])

@@ -9,7 +9,6 @@ import torch
 
 from tests.training_helpers import small_config
 from vg2gt.data import SyntheticScenes
-from vg2gt.data.synthetic.photograph import Photograph
 from vg2gt.data.synthetic.renderer import render_frame
 from vg2gt.data.synthetic.rooms import SyntheticRoom
 from vg2gt.data.synthetic.source import VARIANTS
@@ -235,10 +234,3 @@ def test_exposure_and_jpeg_change_the_image_only(tmp_path):
     assert min(levels) < 0.25
     assert max(levels) > 0.8
     assert np.median(ratios) < 1.4  # frames of one scene are alike
-
-
-def test_jpeg_quality_is_that_of_the_range():
-    image = SyntheticRoom(3, 1, LARGE).render([0], 1)[0].image
-    errors = [np.abs(Photograph(jpeg=(q, q)).develop(1, image, 0) - image.astype(float)).mean() for q in (10, 60, 95)]
-    assert errors[0] > 1.1 * errors[1] > 1.5 * errors[2] > 0
-    assert np.array_equal(Photograph().develop(1, image, 0), image)

@@ -11,7 +11,7 @@ from vg2gt.cli.arguments import read_options
 from vg2gt.cli.data import SyntheticOptions
 from vg2gt.cli.data import synthetic as main
 from vg2gt.data import DataError, RGBDFolder
-from vg2gt.data.synthetic.export import SceneSettings, missing_scenes, store_depth, write_scenes
+from vg2gt.data.synthetic.export import SceneSettings, missing_scenes, write_scenes
 
 SETTINGS = SceneSettings(frames=2, size=(24, 32), variant=["room", "outdoor"], normals=True)
 
@@ -41,12 +41,6 @@ def test_a_written_scene_is_read_back(tmp_path):
         with np.load(tmp_path / "out" / name / "normals" / "00001.npz") as stored_normals:
             normals = torch.from_numpy(stored_normals["normals"].astype(np.float32)).permute(2, 0, 1)
         torch.testing.assert_close(normals, source.normals(name, [1])[0], atol=1e-3, rtol=0)
-
-
-def test_depth_that_does_not_fit_is_none():
-    depth = np.array([[0.0, 1.2344, 65.534, 65.536, 80.0]], np.float32)
-    assert store_depth(depth, 1000).tolist() == [[0, 1234, 65534, 0, 0]]
-    assert store_depth(depth, 500).tolist() == [[0, 617, 32767, 32768, 40000]]
 
 
 def test_an_interrupted_run_is_continued(tmp_path):

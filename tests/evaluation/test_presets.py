@@ -21,8 +21,7 @@ def composed(preset: str) -> DictConfig:
 def test_presets_instantiate(preset: str) -> None:
     config = composed(preset)
     options: EvaluationOptions = instantiate(config.evaluation, _convert_="all")
-    assert list(config.views) == [3, 10, 20]
-    assert config.data._target_ == "vg2gt.data.SceneDataModule"
+    assert (list(config.views), config.data._target_) == ([3, 10, 20], "vg2gt.data.SceneDataModule")
     if options.selection.index is not None:
         assert index_path(options.selection.index).is_file()
     if options.table is not None:

@@ -1,7 +1,6 @@
 """Whole evaluations of two small rooms."""
 
 import json
-import logging
 import shutil
 from pathlib import Path
 from typing import Any
@@ -195,20 +194,6 @@ def test_a_lone_checkpoint_is_not_checked_and_that_is_told(tmp_path: Path, cache
     assert "whether the evaluated scenes were trained on cannot be checked" in caplog.text
 
 
-def test_training_data_that_is_gone_is_told(tmp_path: Path, cache: Path, trained: Path, copied: Path, caplog) -> None:
-    config = OmegaConf.load(copied / "config.yaml")
-    for target in ("vg2gt.data.sources.ScanNet", "no_longer_installed.Loader"):
-        config.data.train = {"_target_": target, "_partial_": True}
-        config.data.root = str(tmp_path / "gone")
-        for key in ("num_frames", "size", "cache_dir"):
-            config.data.pop(key, None)
-        OmegaConf.save(config, copied / "config.yaml")
-        caplog.clear()
-        with caplog.at_level(logging.WARNING):
-            run(tmp_path / target, cache, f"ckpt={copied}", "data.eval_scenes=1")
-        assert "whether the evaluated scenes were trained on cannot be checked" in caplog.text
-
-
 def test_what_is_missing_or_wrong_is_named(tmp_path: Path, cache: Path, trained: Path) -> None:
     with pytest.raises(FileNotFoundError, match="ckpt=nowhere: no such checkpoint or run"):
         run(tmp_path, cache, "ckpt=nowhere")
@@ -271,8 +256,7 @@ def test_times_of_another_device_do_not_join(tmp_path: Path, cache: Path, traine
 def test_a_checkpoint_is_a_file_or_the_newest_of_a_run(trained: Path) -> None:
     newest = trained / "checkpoints" / "step-2.ckpt"
     assert checkpoint_path(None) is None
-    assert checkpoint_path(str(trained)) == newest
-    assert checkpoint_path(str(trained / "checkpoints")) == newest
+    assert (checkpoint_path(str(trained)), checkpoint_path(str(trained / "checkpoints"))) == (newest, newest)
     assert checkpoint_path(str(newest)) == newest
 
 

@@ -81,6 +81,5 @@ def test_a_scene_keeps_its_degree_and_background(seen: tuple[torch.Tensor, torch
         own.means / 20, own.quats, own.scales, own.opacities, torch.zeros(5, 4, 3), own.batch, torch.rand(1, 3)
     )
     both = own.joined(shell)
-    assert len(both) == 5 + COUNT
-    assert both.sh.shape == (5 + COUNT, 4, 3)
+    assert (len(both), both.sh.shape) == (5 + COUNT, (5 + COUNT, 4, 3))
     assert both.background is own.background

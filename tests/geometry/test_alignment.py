@@ -97,22 +97,6 @@ def test_alignment_recovers_a_similarity(views: int) -> None:
         torch.testing.assert_close(getattr(found, name), getattr(truth, name), rtol=1e-9, atol=1e-9)
 
 
-def test_alignment_of_one_camera_keeps_the_scale() -> None:
-    predicted, truth = random_cameras(2, 1), random_similarity(2)
-    reference = truth.apply_cameras(predicted)
-    found = align_cameras(predicted, reference)
-    torch.testing.assert_close(found.scale, torch.ones(2, dtype=torch.float64))
-    torch.testing.assert_close(found.rotation, truth.rotation)
-    torch.testing.assert_close(found.apply_cameras(predicted).world_to_camera, reference.world_to_camera)
-
-
-def test_still_cameras_take_the_given_scale_and_moving_ones_do_not() -> None:
-    still, moving, given = random_cameras(1, 1), random_cameras(1, 3), torch.tensor([2.5], dtype=torch.float64)
-    truth = random_similarity(1)
-    torch.testing.assert_close(align_cameras(still, truth.apply_cameras(still), lambda: given).scale, given)
-    torch.testing.assert_close(align_cameras(moving, truth.apply_cameras(moving), lambda: given).scale, truth.scale)
-
-
 def test_alignment_of_cameras_on_a_line_and_of_cameras_that_only_turn() -> None:
     predicted, truth = random_cameras(1, 5), random_similarity(1)
     for direction in (torch.tensor([0.3, 0.1, 0.2], dtype=torch.float64), torch.zeros(3, dtype=torch.float64)):

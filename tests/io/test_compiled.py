@@ -49,8 +49,7 @@ def value_with(constant: int, room: Path) -> int:
 
 def test_a_changed_constant_of_another_file_is_used(room: Path, tmp_path: Path) -> None:
     cache = tmp_path / "cache" / "vg2gt"
-    assert value_with(1, room) == 1
-    assert value_with(22, room) == 22
+    assert (value_with(1, room), value_with(22, room)) == (1, 22)
     assert len(list(cache.iterdir())) == 2
     before = {path: path.stat().st_mtime_ns for path in cache.rglob("*.nbc")}
     assert value_with(1, room) == 1
@@ -146,8 +145,7 @@ def test_parts_of_kernels_are_compiled_and_kept_with_them_and_interpreted_from_p
     assert made.sum_of_shares(3.0, 2.0) == 2.5
     assert made.sum_of_shares(3.0, 0.0) != made.sum_of_shares(3.0, 0.0)  # NaN: numpy's way, no exception
     kept = [path.name.split("-")[0] for path in (tmp_path / "cache").rglob("*.nbc")]
-    assert kept == ["parts.sum_of_shares"]
-    assert made.share(3.0, 2.0) == 1.5
+    assert (kept, made.share(3.0, 2.0)) == (["parts.sum_of_shares"], 1.5)
     with pytest.raises(ZeroDivisionError):
         made.share(3.0, 0.0)
 

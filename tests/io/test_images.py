@@ -30,13 +30,10 @@ def test_normal_facing_the_camera_is_the_usual_blue() -> None:
 def test_grid_places_panels(tmp_path: Path) -> None:
     panels = [[torch.full((3, 4, 6), value) for value in row] for row in ((0.0, 0.2), (0.4, 0.6))]
     picture = grid(panels, gap=2)
-    assert picture.shape == (3, 10, 14)
-    assert picture[0, 0, 8] == 0.2
-    assert picture[0, 6, 0] == 0.4
-    assert picture[0, 4, 0] == 1
+    assert (picture.shape, picture[0, 0, 8]) == ((3, 10, 14), 0.2)
+    assert (picture[0, 6, 0], picture[0, 4, 0]) == (0.4, 1)
     written = np.asarray(Image.open(write_png(tmp_path / "grid.png", picture)))
-    assert written.shape == (10, 14, 3)
-    assert written[0, 8, 0] == 51
+    assert (written.shape, written[0, 8, 0]) == ((10, 14, 3), 51)
 
 
 RAMP = np.linspace(0, 65535, 24 * 32).reshape(24, 32)

@@ -82,8 +82,7 @@ def test_activations_and_channel_order(tmp_path: Path) -> None:
     one = scene(1, 3)
     content = write_gaussian_ply(tmp_path / "scene.ply", one).read_bytes()
     row = struct.unpack("<62f", content[-62 * 4 :])
-    assert row[:3] == tuple(one.means[0].tolist())
-    assert row[3:6] == (0, 0, 0)
+    assert (row[:3], row[3:6]) == (tuple(one.means[0].tolist()), (0, 0, 0))
     assert row[6:9] == tuple(one.sh[0, 0].tolist())
     for channel in range(3):
         assert row[9 + 15 * channel : 24 + 15 * channel] == tuple(one.sh[0, 1:, channel].tolist())
@@ -174,8 +173,7 @@ def test_points_round_trip(tmp_path: Path, count: int, colored: bool) -> None:
     assert path.read_bytes()[: len(expected)] == expected
     read = read_point_ply(path)
     np.testing.assert_array_equal(read.positions, xyz)
-    assert read.positions.dtype == np.float32
-    assert (read.colors is None) == (rgb is None)
+    assert (read.positions.dtype, read.colors is None) == (np.float32, rgb is None)
     if read.colors is not None and rgb is not None:
         np.testing.assert_array_equal(read.colors, rgb)
 

@@ -32,8 +32,7 @@ def test_every_item_is_taken_once_and_by_two_threads():
         time.sleep(0.005)
 
     parallel_for(range(40), take)
-    assert sorted(seen) == list(range(40))
-    assert len(takers) == 2
+    assert (sorted(seen), len(takers)) == (list(range(40)), 2)
 
 
 @pytest.mark.usefixtures("two_threads")

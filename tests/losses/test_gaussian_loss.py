@@ -126,13 +126,6 @@ def test_gradients_are_finite_with_holes_and_zero_normals(case, target: str) -> 
         assert (leaf.grad != 0).any(), name
 
 
-def test_group_and_term_weights(case) -> None:
-    weights = {"color_l1": 0.9, "ssim": 0.1, "depth_consistency": 0.25, "depth_gt": 0.5, "normal": 0.001}
-    loss = replace(GaussianLoss(weight=10), **weights)
-    terms = loss(*case)
-    torch.testing.assert_close(loss.total(terms), 10 * sum(weights[name] * terms[name] for name in weights))
-
-
 def test_decoded_depth_and_confidence_are_constants_of_the_gaussian_losses(sample) -> None:
     made = sample()
     depth = (1.02 * made.prediction.geometry.depth).requires_grad_()
@@ -159,11 +152,6 @@ def test_held_out_views_have_no_decoded_depth_to_agree_with(sample) -> None:
     assert float(terms["depth_gt"]) > 0.1
     only_held_out = VG2GTLoss()(*sample(rendered=(3,)).inputs).terms
     assert float(only_held_out["depth_consistency"]) == float(only_held_out["normal"]) == 0
-
-
-def test_unknown_normal_target_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"loss\.gaussian\.normal_target.*'world'"):
-        GaussianLoss(normal_target="world")
 
 
 def test_colours_that_do_not_count_change_nothing(case) -> None:

@@ -32,10 +32,3 @@ def test_ssim_matches_torchmetrics_where_the_window_lies_inside_the_image(images
     expected = full[..., 5:-5, 5:-5].mean((1, 2, 3))
     torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
     assert (found.diff() < 0).all()
-
-
-def test_leading_axes_are_kept(images) -> None:
-    predicted, reference = (image.unflatten(0, (2, 2)) for image in images)
-    assert psnr(predicted, reference).shape == ssim(predicted, reference).shape == (2, 2)
-    assert ssim(images[0][0], images[1][0]).shape == ()
-    torch.testing.assert_close(ssim(predicted, reference).flatten(), ssim(*images))

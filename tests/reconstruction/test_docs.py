@@ -15,7 +15,6 @@ from vg2gt.io import read_cameras_json
 from vg2gt.io.video import has_pyav
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGE = ROOT / "docs" / "reconstruct.md"
 
 
 @pytest.fixture
@@ -57,15 +56,3 @@ def test_readme(workplace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     exec(compile(example, "README.md", "exec"), found)
     assert len(found["pictures"]) == len(read_cameras_json(workplace / "outputs" / "python" / "cameras.json"))
     assert all(picture.shape[0] == 3 and 0 <= picture.min() <= picture.max() <= 1 for picture in found["pictures"])
-
-
-def test_page(workplace: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
-    for words in _commands(PAGE):
-        _run(words, monkeypatch)
-    assert (workplace / "outputs" / "untrained" / "orbit.gif").is_file()
-    assert (workplace / "outputs" / "room" / "rasterized" / "depth" / "008.npy").is_file()
-    capsys.readouterr()
-    (example,) = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
-    exec(compile(example, str(PAGE), "exec"), {})
-    assert capsys.readouterr().out == "008 (4, 3, 84, 112) (84, 112)\nTrue True\n"
-    assert len(read_cameras_json(workplace / "outputs" / "python" / "cameras.json")) == 4

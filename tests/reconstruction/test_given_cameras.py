@@ -108,15 +108,6 @@ def test_cameras_are_looked_for_in_their_order(inside: bool, folder: Path, recor
     check_cameras(given_pictures(place), frames, "cameras.json")
 
 
-def test_cameras_among_the_images(folder: Path, recording: Path, frames) -> None:
-    put_poses(folder / "images", recording)
-    check_cameras(given_pictures(folder / "images"), frames, "RGBDFolder")
-    put_colmap(folder / "images", frames)
-    check_cameras(given_pictures(folder / "images"), frames, "COLMAP")
-    put_cameras(folder / "images", frames)
-    check_cameras(given_pictures(folder / "images"), frames, "cameras.json")
-
-
 def test_depth_is_read_where_a_recording_has_it(recording: Path, tmp_path: Path, frames) -> None:
     shutil.copytree(recording, tmp_path / "room")
     put_cameras(tmp_path / "room", frames)  # goes before the recording for whoever needs no depth
@@ -192,8 +183,7 @@ def test_who_gets_which_cameras(model, folder: Path, recording: Path, ready, mon
 
     monkeypatch.setattr("vg2gt.reconstruction.cameras.find_cameras", find)
     images_alone = load_model(backend="da3_tiny", device="cpu").model
-    assert {p.source for p in choose(model, folder)} == {"sfm"}
-    assert asked == [4]
+    assert ({p.source for p in choose(model, folder)}, asked) == ({"sfm"}, [4])
     with pytest.raises(ValueError, match=r"no cameras lie beside .*room: expected cameras.json.*--poses sfm finds"):
         choose(model, folder, "given")
     put_poses(folder, recording)

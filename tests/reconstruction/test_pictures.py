@@ -61,8 +61,7 @@ def test_large_pictures_are_shrunk_while_they_are_read(tmp_path: Path) -> None:
 def test_a_recording_gives_its_cameras_and_depth(recording: Path, frames) -> None:
     pictures = given_pictures(recording, depth=True)
     views = load_views(pictures, (56, 84), Monitor())
-    assert views.names == ("008", "009", "010", "011")
-    assert views.hints.depth.shape == (1, 4, 56, 84)
+    assert (views.names, views.hints.depth.shape) == (("008", "009", "010", "011"), (1, 4, 56, 84))
     assert torch.allclose(views.hints.cameras.world_to_camera[0], frames.world_to_camera, atol=1e-5)
     scale = 84 / 112
     assert views.hints.cameras.intrinsics[0, 0, 0, 0].item() == pytest.approx(frames.intrinsics[0, 0, 0] * scale)
@@ -83,16 +82,6 @@ def test_working_size_of_mixed_and_extreme_shapes() -> None:
         working_size([(60, 50)], 14, "cpu", (30, 60))
     with pytest.raises(ValueError, match="smaller than one patch"):
         working_size([(60, 50)], 14, "cpu", 10)
-
-
-def test_nothing_to_reconstruct(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="no images to reconstruct"):
-        find_pictures([])
-    (tmp_path / "clip.mp4").touch()
-    with pytest.raises(ValueError, match=r"no images in .* name one: .*clip.mp4"):
-        find_pictures(tmp_path)
-    with pytest.raises(FileNotFoundError, match=r"nowhere.jpg"):
-        find_pictures(tmp_path / "nowhere.jpg")
 
 
 def test_what_cannot_be_read_is_named(tmp_path: Path, monkeypatch) -> None:

@@ -137,9 +137,3 @@ def test_mistakes_are_one_line(saved, damage, said, tmp_path, monkeypatch):
     words = {"option": ["--options", "default,rats.sh=1"], "value": ["--holdout", "1"]}.get(damage, [])
     with pytest.raises(SystemExit, match=said):
         vg2gt(monkeypatch, "refine", str(folder), "--steps", "1", "--quiet", "--device", "cpu", *words)
-
-
-def test_a_scene_without_decoded_depth_still_refines(scene: Scene) -> None:
-    blind = replace(scene, depth=torch.zeros_like(scene.depth))
-    refined = blind.refine(steps=3).refined
-    assert refined.ended == "steps"

@@ -64,8 +64,7 @@ def test_many_photographs_are_matched_in_likely_pairs(shared: Path, tmp_path: Pa
     monkeypatch.setattr(sfm_pairs, "ALIKE", 0)
     monkeypatch.setattr(pycolmap, "match_image_pairs", count)
     pictures = sfm.find_cameras(find_pictures(office_photos(shared, 8)), tmp_path / "sfm", Monitor())
-    assert len(pictures) == 8
-    assert len(pairs) == 7 + 6 + 4
+    assert (len(pictures), len(pairs)) == (8, 7 + 6 + 4)
     assert center_errors(pictures, shared, list(range(8))).median() < 0.03
 
 

@@ -175,12 +175,6 @@ def test_the_kernels_that_know_one_background_get_each_scenes_own(monkeypatch: p
     torch.testing.assert_close(found, render(gaussians, cameras, implementation="dense").color)
 
 
-def test_a_background_of_another_number_of_scenes_is_refused() -> None:
-    gaussians = replace(soup(5), background=torch.zeros(2, 3))
-    with pytest.raises(ValueError, match=r"one colour per scene \[1, 3\], got \[2, 3\]"):
-        render(gaussians, pinhole((4, 4)))
-
-
 def test_half_precision_input_renders_in_float32() -> None:
     gaussians = floats_to(soup(10), torch.float16)
     with torch.autocast("cpu", dtype=torch.bfloat16):

@@ -7,7 +7,6 @@ from types import ModuleType
 import pytest
 import torch
 
-from vg2gt.io.files import read_json
 from vg2gt.rendering.options import RenderOptions
 from vg2gt.types import Cameras, Gaussians
 
@@ -42,28 +41,6 @@ def test_memory_of_eighteen_views(step: ModuleType) -> None:
 
 
 STEP = ("step_ms", "peak_mb", "peak_reserved_mb", "stage_ms", "stage_peak_mb", "profile")
-
-
-@pytest.mark.parametrize(
-    ("part", "found"),
-    [
-        ("render", {"cpu solid 500", "cpu rasterized 500"}),
-        ("step", {f"tiny: {what}" for what in STEP}),
-        ("knn", {"patch points", "pixels"}),
-        ("reconstruct", {"2 images"}),
-    ],
-)
-def test_every_part_measures_on_a_cpu_as_well(gpu, part, found, tmp_path, cache, monkeypatch):
-    monkeypatch.setenv("VG2GT_CACHE", str(cache))
-    content = gpu.measure(part, gpu.Setting(torch.device("cpu"), small=True), tmp_path / "part.json")
-    assert content["ended"] == "done"
-    assert content["results"].keys() == found
-    assert read_json(tmp_path / "part.json") == content
-    if part == "step":
-        stages = content["results"]["tiny: stage_ms"]
-        assert {"encode", "coarse", "fine", "render", "loss", "backward", "optimizer"} <= stages.keys()
-        assert all(taken > 0 for taken in stages.values())
-        assert content["results"]["tiny: profile"]["launches"] > 1000
 
 
 def test_many_refused_slots_do_not_overflow_their_sum(benchmark_script) -> None:

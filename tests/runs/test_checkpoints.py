@@ -35,19 +35,7 @@ def test_failed_write_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr("torch.save", full)
     with pytest.raises(OSError, match=r"earlier checkpoints are intact"):
         write_checkpoint({"global_step": 4}, path)
-    assert read_checkpoint(path)["global_step"] == 3
-    assert len(list(tmp_path.iterdir())) == 1
-
-
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
-@pytest.mark.parametrize("values", [10, 1_000_000])
-def test_full_disk_is_one_error_that_names_the_file(tmp_path: Path, values: int) -> None:
-    write_checkpoint({"global_step": 3}, tmp_path / "step-3.ckpt")
-    (tmp_path / "step-4.ckpt.tmp").symlink_to("/dev/full")
-    with pytest.raises(OSError, match=r"step-4\.ckpt could not be written \(.*No space left.*continue with ckpt=last"):
-        write_checkpoint({"global_step": 4, "w": torch.zeros(values)}, tmp_path / "step-4.ckpt")
-    assert [path.name for path in tmp_path.iterdir()] == ["step-3.ckpt"]
-    assert newest_valid(tmp_path).name == "step-3.ckpt"
+    assert (read_checkpoint(path)["global_step"], len(list(tmp_path.iterdir()))) == (3, 1)
 
 
 def test_file_and_folder_reach_the_disk_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,6 @@ from scipy import stats
 from vg2gt.evaluation.tables import columns
 from vg2gt.runs.checkpoints import read_checkpoint, write_checkpoint
 from vg2gt.studies.study import (
-    Estimate,
     compose_run,
     estimate,
     over_seeds,
@@ -30,16 +29,6 @@ def test_estimate_is_the_textbook_interval() -> None:
     assert found.mean == pytest.approx(np.mean(values))
     assert found.mean - found.margin == pytest.approx(low)
     assert found.mean + found.margin == pytest.approx(high)
-
-
-def test_one_value_has_no_interval() -> None:
-    assert estimate([2.0]).mean == 2.0
-    assert math.isnan(estimate([2.0]).margin)
-    assert math.isnan(estimate([]).mean)
-    assert estimate([2.0]).shown(1) == "2.0"
-    assert estimate([]).shown(1) == "n/a"
-    assert Estimate(-0.5, 0.25).shown(2, sign=True) == "-0.50 ± 0.25"
-    assert Estimate(0.5, 0.25).shown(2, sign=True) == "+0.50 ± 0.25"
 
 
 def test_differences_are_taken_seed_by_seed() -> None:

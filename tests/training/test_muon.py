@@ -109,21 +109,6 @@ def test_without_gradients_nothing_moves_and_gradients_stay() -> None:
         assert torch.equal(parameter.grad, gradient)
 
 
-def test_the_closure_computes_gradients() -> None:
-    module = Parts()
-    optimizer = optimizer_of(module)
-    before = module.parameters_named("fine.0.weight")[0]
-
-    def closure() -> Tensor:
-        optimizer.zero_grad()
-        loss = module.fine[0](torch.ones(2, 4)).square().sum()
-        loss.backward()
-        return loss
-
-    assert optimizer.step(closure) > 0
-    assert not torch.equal(before, module.parameters_named("fine.0.weight")[0])
-
-
 def test_a_saved_state_goes_on_bit_for_bit(tmp_path) -> None:
     torch.manual_seed(5)
     module = Parts()

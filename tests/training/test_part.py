@@ -3,7 +3,6 @@
 from itertools import islice
 from pathlib import Path
 
-import pytest
 import torch
 from torch import Tensor
 
@@ -69,22 +68,6 @@ def test_all_is_trained_from_what_it_leaves(tmp_path: Path, cache: Path) -> None
     assert "train/color_l1" not in curve
     options = ["debug=fast_dev_run", f"init_from={checkpoint}"]
     assert train(small_config(tmp_path / "next", cache, *options))["trained"]
-
-
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        (["training.part=coarse", "ablation=wo_coarse"], "training.part=coarse trains the coarse module, which this"),
-        (["training.part=coarse", "model=pixel_aligned"], "training.part=coarse trains the coarse module, which this"),
-        (["training.part=fine"], "training.part=fine is unknown: choose one of all, coarse"),
-        (["training.pose_noise=0.1"], "training.pose_noise=0.1 needs training.part=coarse"),
-        (["training.part=coarse", "training.pose_noise=1.5"], "training.pose_noise=1.5 must be a share"),
-        (["training.part=coarse", "training.pose_noise=nan"], "training.pose_noise=nan must be a share"),
-    ],
-)
-def test_what_it_cannot_be(tmp_path: Path, cache: Path, overrides: list[str], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        build(small_config(tmp_path, cache, *overrides))
 
 
 def test_a_share_of_the_scenes_has_wrong_poses_always_the_same_way(tmp_path: Path, cache: Path) -> None:

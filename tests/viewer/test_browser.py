@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,6 @@ from benchmarks.viewer_scene import voxel_room
 from tests.io.gaussian_scenes import scene, views
 from tests.viewer.chromium import Page, chromium
 from tests.viewer.test_page import HOSTILE, pictured_scene
-from vg2gt.geometry.spherical_harmonics import rgb_to_sh
 from vg2gt.io import named_cameras
 from vg2gt.rendering import render
 from vg2gt.types import Cameras, Gaussians
@@ -66,28 +64,6 @@ def test_screenshot_is_our_rasterized_image_of_a_room(page, tmp_path, size, voxe
     megabytes = path.stat().st_size / 1e6
     print(f"{len(gaussians)} Gaussians, {megabytes:.2f} MB, loaded in {seconds:.2f} s, PSNR {figures}")
     assert min(figures) > CLOSE
-
-
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_screenshot_of_gaussians_of_all_shapes_and_colours(page: Page, tmp_path: Path, degree: int) -> None:
-    figures = compare(page, tmp_path / "scene.html", scene(300, degree), views((120, 168)))
-    assert min(figures) > CLOSE
-
-
-def test_light_shines_through_the_alpha_cap(page: Page, tmp_path: Path) -> None:
-    """A dark opaque Gaussian before a translucent one forty times as bright as white."""
-    pair = replace(
-        scene(2),
-        means=torch.tensor([[0.0, 0, 2], [0, 0, 4]]),
-        scales=torch.tensor([[9.0, 9, 0.01], [9, 9, 0.01]]),
-        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(2, 1),
-        opacities=torch.tensor([1.0, 0.5]),
-        sh=rgb_to_sh(torch.tensor([[[0.0] * 3], [[40.0] * 3]])),
-    )
-    cameras = views((120, 168)).select(slice(0, 1))
-    truth = render(pair, cameras, "rasterized", geometry=False).color
-    assert 0.15 < truth[0, 0, :, 60, 84].mean() < 0.25
-    assert min(compare(page, tmp_path / "pair.html", pair, cameras)) > CLOSE
 
 
 def test_cameras_from_script_and_address(page: Page, tmp_path: Path) -> None:

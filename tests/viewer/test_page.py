@@ -17,7 +17,6 @@ from tests.io.gaussian_scenes import scene, views
 from vg2gt.io import FormatError, named_cameras
 from vg2gt.rendering import render
 from vg2gt.viewer import ViewerScene, load_pictures, read_viewer_html, write_viewer_html
-from vg2gt.viewer.packing import pack
 
 HOSTILE = "</script><script>alert(1)</script><!-- {{script}} \"'&\u2028 \\u003c"
 
@@ -61,19 +60,6 @@ def test_page_holds_the_gaussians(tmp_path: Path, degree: int) -> None:
     torch.testing.assert_close(after.sh, before.sh, rtol=1e-3, atol=1e-6)
     images = [render(gaussians, views(), "rasterized").color for gaussians in (before, after)]
     assert (images[0] - images[1]).abs().max() < 2e-3
-
-
-def test_colour_bands_of_zeros_take_no_room() -> None:
-    plain = scene(200)
-    padded = replace(plain, sh=torch.cat((plain.sh, torch.zeros(200, 15, 3)), 1))
-    assert pack(padded) == pack(plain)
-    linear = replace(padded, sh=padded.sh + torch.tensor([0.0, 0, 0.1] + [0] * 13)[:, None])
-    assert pack(linear).degree == 1
-
-
-def test_gaussians_of_one_size_are_packed() -> None:
-    after = pack(replace(scene(5), scales=torch.full((5, 3), 0.02)))
-    assert (after.log_scale_min, after.log_scale_max) == pytest.approx((np.log(0.02), np.log(0.02)))
 
 
 @pytest.mark.parametrize(("behind", "shown"), [(None, [0, 0, 0]), (torch.tensor([[0.25, 0.5, 1.0]]), [0.25, 0.5, 1])])
@@ -129,11 +115,6 @@ def test_other_files_are_no_pages(tmp_path: Path) -> None:
     path.write_bytes(b"\xff\xfe")
     with pytest.raises(FormatError):
         read_viewer_html(path)
-
-
-def test_empty_scene_is_refused() -> None:
-    with pytest.raises(ValueError, match="no Gaussians"):
-        ViewerScene(scene(0))
 
 
 def test_initial_view_sees_the_scene() -> None:

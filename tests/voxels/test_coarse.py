@@ -129,12 +129,3 @@ def test_scenes_do_not_influence_each_other(make_coarse, make_room):
         out = module(tokens.map(lambda t, rows=rows: t[rows]), alone)
         for a, b in zip(out.patch, both.patch, strict=True):
             torch.testing.assert_close(a, b[rows], atol=1e-5, rtol=1e-5)
-
-
-def test_bad_options_are_refused(make_coarse):
-    with pytest.raises(ValueError, match=r"coarse\.inject"):
-        make_coarse(inject="first")
-    with pytest.raises(ValueError, match="does not divide"):
-        make_coarse(upsample=3)
-    with pytest.raises(ValueError, match=r"coarse\.fuse_kernel"):
-        make_coarse(fuse_kernel=2)

@@ -1,4 +1,3 @@
-import pytest
 import torch
 
 from vg2gt.voxels import DenseHead
@@ -29,10 +28,3 @@ def test_every_tap_and_the_image_reach_every_view(make_room):
     for x in inputs:
         assert (x.grad.flatten(2).abs().sum(-1) > 0).all()
     assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in head.parameters())
-
-
-def test_taps_that_do_not_match_are_refused():
-    with pytest.raises(ValueError, match="taps 2 layers"):
-        DenseHead([24, 24], 14, tap_channels=[8])
-    with pytest.raises(ValueError, match="finest"):
-        DenseHead([24, 24], 14, finest=3)

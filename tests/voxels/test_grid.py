@@ -131,17 +131,6 @@ def test_points_on_faces_fall_by_division():
     assert torch.equal(torch.floor(cells[:, 0]), count)
 
 
-def test_no_valid_point_gives_no_voxel():
-    points, batch, values, weights = cloud(20)
-    plan = planned(points, batch, torch.zeros(20, dtype=torch.bool))
-    values.requires_grad_()
-    mean = pool_mean(values, weights, plan)
-    assert mean.shape == (0, 5)
-    mean.sum().backward()
-    assert values.grad is not None
-    assert pool_min(weights, plan).shape == (0,)
-
-
 def test_voxel_size_guard():
     depth = torch.full((2, 1, 4, 4), 2.0)
     depth[1] = 0  # nothing valid: the configured size stands

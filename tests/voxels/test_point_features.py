@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from vg2gt.voxels.grid import VoxelPlan, plan_voxels, pool_mean
-from vg2gt.voxels.point_features import point_features, pool_point_features, pool_point_features_of_chunks
+from vg2gt.voxels.point_features import point_features, pool_point_features
 
 CHANNELS = 20  # no multiple of a vector's length
 
@@ -103,24 +103,3 @@ def test_dropped_voxels_are_left_out() -> None:
     compiled = with_gradients(inputs, plan.select(keep), plain=False)
     plain = with_gradients(inputs, plan.select(keep), plain=True)
     torch.testing.assert_close(compiled, plain, atol=2e-5, rtol=1e-5)
-
-
-def test_chunks_give_the_whole() -> None:
-    inputs, plan = points()
-    dense, offset, weight, confidence = inputs
-    torch.testing.assert_close(
-        pool_point_features_of_chunks(dense.split(700), offset, weight, confidence, plan),
-        pool_point_features(dense, offset, weight, confidence, plan),
-        atol=2e-6,
-        rtol=1e-5,
-    )
-
-
-def test_without_a_voxel_the_graph_stays() -> None:
-    inputs, plan = points(10)
-    nothing = plan.select(torch.zeros(len(plan), dtype=torch.bool))
-    dense, offset, weight, confidence = leaves = [tensor.clone().requires_grad_() for tensor in inputs]
-    pooled = pool_point_features(dense, offset, weight, confidence, nothing)
-    assert pooled.shape == (0, CHANNELS)
-    pooled.sum().backward()
-    assert all(leaf.grad is not None and not leaf.grad.any() for leaf in leaves)

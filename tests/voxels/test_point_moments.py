@@ -86,24 +86,6 @@ def test_points_in_no_voxel_have_no_say(compiled: bool, monkeypatch: pytest.Monk
     assert all(torch.equal(a, b) for a, b in zip(before, pooled(inputs, plan), strict=True))
 
 
-@pytest.mark.parametrize("compiled", [True, False])
-def test_dropped_voxels_leave_the_others_as_they_are(compiled: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(point_moments, "compilable", lambda *_: compiled)
-    inputs, plan = points()
-    keep = torch.arange(len(plan)) % 3 > 0
-    for part, whole in zip(pooled(inputs, plan.select(keep)), pooled(inputs, plan), strict=True):
-        torch.testing.assert_close(part, whole[keep], rtol=1e-6, atol=1e-7)
-
-
-@pytest.mark.parametrize("compiled", [True, False])
-def test_no_voxel_has_no_moments(compiled: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(point_moments, "compilable", lambda *_: compiled)
-    inputs, plan = points(10)
-    nothing = plan.select(torch.zeros(len(plan), dtype=torch.bool))
-    shapes = [tuple(tensor.shape) for tensor in pooled(inputs, nothing)]
-    assert shapes == [(0, 3, 3), (0, 3, 3), (0, 3), (0,)]
-
-
 def spoil_place(inputs: list[Tensor], row: int) -> None:
     inputs[0][row, 1] = torch.nan
 

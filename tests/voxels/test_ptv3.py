@@ -118,8 +118,3 @@ def test_state_dict_has_the_official_names():
     assert expected.items() <= names.items()
     assert "enc.enc0.down.proj.weight" not in names
     assert net.out_channels == 1024
-
-
-def test_widths_that_do_not_match_are_refused():
-    with pytest.raises(ValueError, match="one fewer in the decoder"):
-        PTv3(8, enc_channels=(16, 32))

@@ -18,8 +18,7 @@ def test_rows_go_through_the_same_layer(shape: tuple[int, ...], with_bias: bool,
         x, weight, bias = (value.to(dtype).requires_grad_() for value in values)
         out = layer(x, weight, bias if with_bias else None)
         out = F.relu(out) if relu and layer is F.linear else out
-        assert out.shape == (*shape[:-1], 5)
-        assert out.dtype == dtype
+        assert (out.shape, out.dtype) == ((*shape[:-1], 5), dtype)
         inputs = [x, weight, bias][: 2 + with_bias]
         results.append([out.detach(), *torch.autograd.grad(out.square().sum(), inputs)])
     for found, exact in zip(*results, strict=True):

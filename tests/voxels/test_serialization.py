@@ -7,7 +7,6 @@ from vg2gt.voxels.serialization import (
     hilbert_codes,
     hilbert_reference,
     make_windows,
-    relative_grid,
     serial_codes,
     serial_keys,
     z_codes,
@@ -39,8 +38,7 @@ def test_compiled_hilbert_codes_are_those_of_the_reference(bits):
 @pytest.mark.parametrize("order", ORDERS)
 def test_codes_are_bijections(order):
     codes = serial_codes(cube(4), 4, order)
-    assert codes.unique().numel() == 16**3
-    assert codes.min() == 0
+    assert (codes.unique().numel(), codes.min()) == (16**3, 0)
 
 
 def test_dropping_three_bits_gives_the_parent():
@@ -57,11 +55,6 @@ def test_z_order_interleaves_bits():
     cells = torch.tensor([[1, 0, 0], [0, 1, 0], [0, 0, 1], [2, 0, 0], [(1 << 21) - 1, 0, 0]])
     spread = sum(1 << (3 * bit + 2) for bit in range(21))
     assert z_codes(cells).tolist() == [4, 2, 1, 32, spread]
-
-
-def test_relative_grid_is_each_scenes_own():
-    grid = torch.tensor([[5, -3, 2], [6, -1, 9], [100, 200, 300]])
-    assert relative_grid(grid, torch.tensor([0, 0, 1]), 2).tolist() == [[0, 0, 0], [1, 2, 7], [0, 0, 0]]
 
 
 def test_too_large_a_scene_is_refused_with_its_size_and_extent():

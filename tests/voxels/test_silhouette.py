@@ -1,8 +1,7 @@
 import pytest
 import torch
-from torch.nn import functional as F
 
-from vg2gt.voxels.silhouette import _largest, beside_silhouettes, on_surface
+from vg2gt.voxels.silhouette import beside_silhouettes, on_surface
 
 
 def _blurred_step(near: float, far: float) -> torch.Tensor:
@@ -21,13 +20,6 @@ def test_pixels_between_foreground_and_background_are_told_apart(turned: bool, u
     expected = torch.ones(1, 12, 16, dtype=torch.bool)
     expected[..., 7:9] = False
     assert torch.equal(found, expected)
-
-
-def test_planes_are_surfaces_however_they_lean() -> None:
-    v, u = torch.meshgrid(torch.linspace(-0.5, 0.5, 40), torch.linspace(-1, 1, 80), indexing="ij")
-    for lean in (0.0, 0.5, 0.8):
-        depth = 1 / (1 - lean * u * 0.9 + 0.2 * v)
-        assert on_surface(depth[None]).all(), lean
 
 
 def test_noise_without_a_silhouette_is_left_alone() -> None:
@@ -56,10 +48,3 @@ def test_a_hole_is_no_silhouette_and_not_beside_one() -> None:
     depth = torch.full((1, 20, 20), 1.5)
     depth[:, :, 10:] = 0
     assert not beside_silhouettes(depth).any()
-
-
-@pytest.mark.parametrize("reach", [1, 2, 3, 6])
-def test_the_largest_within_reach_is_what_pooling_finds(reach: int) -> None:
-    values = torch.randn(2, 9, 13, generator=torch.Generator().manual_seed(reach))
-    expected = F.max_pool2d(values[:, None], 2 * reach + 1, 1, reach)[:, 0]
-    assert torch.equal(_largest(values, reach), expected)

@@ -145,21 +145,6 @@ def test_each_view_is_told_how_far_it_is_from_the_surface_both_agree_on(confiden
     assert torch.equal(voxels[0][:, 15], torch.zeros(len(voxels[0])))
 
 
-def test_a_scene_of_few_voxels_is_told_of_its_own_only(make_room, make_coarse) -> None:
-    """Fewer than 16: what stands in for the missing neighbours is another scene's voxel."""
-    tokens, geometry, _ = make_room(scenes=2)
-    module = make_coarse(voxel_size=2.0).eval()
-    told = inputs_of(module.fuse[0])
-    module(tokens, geometry)
-    cameras = geometry.cameras
-    pose, intrinsics = cameras.world_to_camera[1:], cameras.intrinsics[1:]
-    alone = Geometry(
-        geometry.depth[1:], geometry.depth_conf[1:], Cameras(pose, intrinsics, cameras.size), geometry.scale[1:]
-    )
-    module(tokens.map(lambda tensor: tensor[1:]), alone)
-    torch.testing.assert_close(told[0][3:, 24:29], told[1][:, 24:29])
-
-
 # ------------------------------------------------------------------------------------------------- the gate
 
 
@@ -298,13 +283,3 @@ def test_the_skip_is_the_patches_own_embedding(make_room, make_coarse) -> None:
     module(tokens, geometry)
     own = module._embed(tokens).view(3, 3, 2, 6, 2, 12).mean((2, 4)).permute(0, 3, 1, 2)
     torch.testing.assert_close(fused[0][:, 24:], own)
-
-
-def test_a_fusing_patch_of_kernel_one_is_deaf_to_its_neighbours(make_room, make_coarse) -> None:
-    maps = torch.randn(1, 24, 3, 6)
-    other = maps.clone()
-    other[..., 0] += 1
-    alone = make_coarse(**PAPER).fuse
-    assert torch.equal(alone(maps)[..., 1:], alone(other)[..., 1:])
-    together = make_coarse(**{**PAPER, "fuse_kernel": 3}).fuse
-    assert not torch.equal(together(maps)[..., 1:], together(other)[..., 1:])

@@ -44,7 +44,6 @@ def test_real_model_reprojects(statue):
         seen = np.array([feature.xy for feature in features])
         errors.append(np.linalg.norm(projected[:, :2] / projected[:, 2:] + 0.5 - seen, axis=1))
     assert np.median(np.concatenate(errors)) == pytest.approx(0.25, rel=0.1)
-
     frames = source.load(scene, [0, 22])
     assert frames.images.shape[-2:] == index.size
     assert abs(index.size[0] - 658) < 10
@@ -212,22 +211,6 @@ def test_a_model_without_its_images_says_what_it_expects_where(tmp_path):
     with pytest.raises(DataError, match=expected):
         COLMAP(str(tmp_path / "statue")).frames("statue")
     assert COLMAP(str(tmp_path / "statue"), images="photos").frames("statue") == (0, 1)
-
-
-def test_images_of_several_sizes_are_cropped_to_one(tmp_path):
-    """One camera of another shape: its frame is cut to the common size and points still project into its pixels."""
-    frames = room(3)
-    write(tmp_path, frames)
-    folder = tmp_path / "statue" / "sparse" / "0"
-    model = read_colmap(folder)
-    wide = model.camera(2)
-    wide.width, wide.height, wide.params = 60, 30, [27.0, 27.0, 30.0, 15.0]
-    write_colmap(folder, model)
-    Image.new("RGB", (60, 30)).save(tmp_path / "statue" / "images" / "left" / "009.png")
-    source = COLMAP(str(tmp_path))
-    loaded = source.load("statue", [0, 1])
-    assert loaded.images.shape[-2:] == SIZE
-    assert loaded.intrinsics[1, 0].tolist() == pytest.approx([27.0, 0, 30 - 0.5 - 10])
 
 
 def test_points_need_three_views_and_the_nearest_wins(tmp_path):

@@ -1,16 +1,13 @@
 """What all loaders of files share: lists of scenes, and the memory that indices take."""
 
 import logging
-from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from vg2gt.config import compose, config_dir
 from vg2gt.data import DataError, RGBDFolder, SyntheticScenes
 from vg2gt.data.sources import files
-from vg2gt.data.sources.index import index_to_bytes, make_index, read_index
 
 from .layout_rgbd import write_recording
 from .layouts import room
@@ -56,39 +53,6 @@ def test_few_indices_stay_in_memory_and_the_rest_come_from_the_cache(dataset, tm
     for scene in source.scenes:
         assert source.load(scene, ids[scene]).depth.shape[0] == 2
         assert source.frames(scene) == ids[scene] == (10, 11)
-
-
-def test_an_index_keeps_names_below_the_folder_and_shared_intrinsics_once(tmp_path):
-    folder, beside = tmp_path / "scene", tmp_path / "depth"
-    count = 500
-    index = make_index(
-        name="scene",
-        folder=folder,
-        color={i: folder / "color" / f"{i}.jpg" for i in range(count)},
-        depth={i: beside / f"{i}.png" for i in range(count)},
-        camera_to_world={i: np.eye(4) for i in range(count)},
-        intrinsics=np.diag([30.0, 30.0, 1.0]),
-        size=(30, 40),
-        color_size=(30, 40),
-    )
-    index = replace(index, extra={"spans": np.arange(count)})
-    content = index_to_bytes(index, "state")
-    assert len(content) < count * (8 * 16 + 8 + 8 + 20 + len(str(beside)) + 10) + 6000
-    (tmp_path / "index.npz").write_bytes(content)
-    again = read_index(tmp_path / "index.npz", "scene", folder, "state")
-    for name, value in vars(index).items():
-        if name != "extra":
-            assert (
-                np.array_equal(getattr(again, name), value)
-                if isinstance(value, np.ndarray)
-                else (getattr(again, name) == value)
-            )
-    assert np.array_equal(again.extra["spans"], np.arange(count))
-    (tmp_path / "video").write_bytes(b"")
-    alone = replace(index, folder=tmp_path / "video", color=(tmp_path / "video",) * count, depth=())
-    (tmp_path / "index.npz").write_bytes(index_to_bytes(alone, "state"))
-    again = read_index(tmp_path / "index.npz", "scene", tmp_path / "video", "state")
-    assert (again.color, again.depth) == (alone.color, ())
 
 
 def test_a_cache_that_cannot_be_written_is_told_once(dataset, tmp_path, caplog):

@@ -51,13 +51,6 @@ def test_photos_are_turned_upright(tmp_path, orientation):
     assert torch.equal(frames.images[0], frames.images[1])
 
 
-def test_broken_exif_is_no_orientation(tmp_path):
-    _save(tmp_path / "a.jpg", _photo(), 6)
-    content = (tmp_path / "a.jpg").read_bytes()
-    (tmp_path / "a.jpg").write_bytes(content.replace(b"MM\x00*", b"XX\x00*").replace(b"II*\x00", b"XX*\x00"))
-    assert ImageFolder(str(tmp_path)).scene_index(tmp_path.name).size == (20, 30)
-
-
 def test_order_sizes_and_placeholders(tmp_path):
     for i, name in enumerate(("IMG_10.png", "IMG_9.png", "IMG_009b.PNG", "notes.txt", ".hidden.png")):
         if name.endswith("txt"):

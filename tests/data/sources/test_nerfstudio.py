@@ -22,8 +22,7 @@ def test_real_capture_by_plane_sweep(shared):
     source = Nerfstudio(str(shared / "data" / "ingp_fox"))
     (scene,) = source.scenes
     ids = source.frames(scene)
-    assert len(ids) == 24
-    assert source.scene_index(scene).dropped == {"without a colour image": 43}
+    assert (len(ids), source.scene_index(scene).dropped) == (24, {"without a colour image": 43})
     assert not source.is_metric
     frames = resize(source.load(scene, [ids[0], ids[1], ids[3]]), (240, 135))
     opengl = torch.diag(torch.tensor([1.0, -1, -1, 1]))
@@ -187,29 +186,3 @@ def test_frames_without_depth_stay_where_none_is_needed_and_go_where_it_is(tmp_p
     (tmp_path / "desk" / "depth" / "0002.png").write_text("broken")
     assert len(Nerfstudio(str(tmp_path)).load("desk", [0, 1, 2]).images) == 3
     assert tuple(Nerfstudio(str(tmp_path), depth=True).frames("desk")) == (0, 2)
-
-
-def test_numbers_follow_names_and_absent_files_are_counted(tmp_path):
-    write(tmp_path, room(4))
-    (tmp_path / "desk" / "images" / "0001.png").unlink()
-    _edit(tmp_path, lambda content: content["frames"][0].pop("depth_file_path"))  # the file lists frame 3 first
-    source = Nerfstudio(str(tmp_path / "desk"))
-    assert tuple(source.frames("desk")) == (0, 2, 3)
-    deep = Nerfstudio(str(tmp_path / "desk"), depth=True)
-    assert tuple(deep.frames("desk")) == (0, 2)
-    assert deep.scene_index("desk").dropped == {"without a colour image": 1, "without a depth file": 1}
-
-
-def test_size_may_come_from_the_images(tmp_path):
-    """Blender's files give the field of view only."""
-    write(tmp_path, room(3))
-
-    def only_angle(content):
-        for key in ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_model"):
-            content.pop(key, None)
-        content["camera_angle_x"] = 1.2
-
-    _edit(tmp_path, only_angle)
-    matrix = Nerfstudio(str(tmp_path)).scene_index("desk").intrinsics[0]
-    focal = SIZE[1] / 2 / np.tan(0.6)
-    np.testing.assert_allclose(matrix, [[focal, 0, 19.5], [0, focal, 14.5], [0, 0, 1]])

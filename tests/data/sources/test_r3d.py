@@ -87,15 +87,6 @@ def test_what_is_wrong_is_named(tmp_path: Path, files: dict[str, bytes], said: s
         RGBDFolder(str(tmp_path), holdout=None).load("sofa.r3d", [0])
 
 
-def test_a_cut_archive_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "lzfse", FakeLzfse)
-    write_r3d(tmp_path, room(1))
-    path = tmp_path / "sofa.r3d"
-    path.write_bytes(path.read_bytes()[:-200])
-    with pytest.raises(DataError, match=r"sofa\.r3d: no readable archive"):
-        RGBDFolder(str(tmp_path)).frames("sofa.r3d")
-
-
 def test_depth_is_not_larger_than_the_image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "lzfse", FakeLzfse)
     write_r3d(tmp_path, room(1))

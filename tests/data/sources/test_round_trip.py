@@ -33,7 +33,6 @@ def test_a_scene_comes_back(name, frames, tmp_path):
     order = [2, 0, 4]
     loaded = source.load(scene, [ids[i] for i in order])
     expected = frames.map(lambda tensor: tensor[order])
-
     assert loaded.images.shape[-2:] == SIZE
     assert float((loaded.images - expected.images).abs().mean()) <= layout.image_error + 1e-6
     if not source.has_cameras:

@@ -5,9 +5,8 @@ from functools import partial
 
 import numpy as np
 import pytest
-import torch
 
-from vg2gt.data import DataError, Frames, SyntheticScenes
+from vg2gt.data import DataError, Frames
 from vg2gt.data.sources import DTU, TanksAndTemples
 from vg2gt.data.sources.scan_depth import ScanDepth, render_points
 from vg2gt.geometry.cameras import unproject
@@ -73,22 +72,6 @@ def test_what_is_behind_a_sparse_surface_is_hidden():
     assert (shining == 4).mean() > 0.5  # without the window, the wall would be full of holes
 
 
-def test_a_furnished_room_agrees_with_its_ray_caster():
-    """The procedural room's depth in one view against its points from all views."""
-    size = (120, 160)
-    source = SyntheticScenes(1, num_frames=4, size=size)
-    frames = source.load(source.scenes[0], range(4))
-    points = _points(frames)
-    pose, intrinsics = frames.world_to_camera[2].double().numpy(), frames.intrinsics[2].double().numpy()
-    depth = torch.from_numpy(render_points(points, pose, intrinsics, size, window=3))
-    seen = depth > 0
-    error = (depth / frames.depth[2] - 1).abs()[seen]
-    assert float(seen.float().mean()) > 0.8
-    assert float(error.median()) < 0.005
-    # Of the farther of two surfaces that meet in a pixel, nothing is left.
-    assert float((depth / frames.depth[2])[seen].quantile(0.999)) < 1.02
-
-
 def test_images_are_kept_and_made_again_when_the_scan_changes(tmp_path):
     scan, points = tmp_path / "scan.ply", _wall(0.02, 4, 4, 2.0)
     scan.write_bytes(_ply(points))
@@ -111,12 +94,6 @@ def test_images_are_kept_and_made_again_when_the_scan_changes(tmp_path):
     os.utime(scan, ns=(1, 1))
     assert read()[40, 50] == 4
     assert ScanDepth().read(scan, "barn", np.eye(4), K, VIEW, unit=0.5)[40, 50] == 2
-
-
-@pytest.mark.parametrize("options", [{"occlusion": 0.9}, {"window": 4}, {"window": 0}])
-def test_senseless_options_are_refused(options):
-    with pytest.raises(ValueError, match="must be"):
-        ScanDepth(**options)
 
 
 def _points(frames: Frames) -> np.ndarray:

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from vg2gt.data import DataError
 from vg2gt.data.sources import TanksAndTemples
@@ -10,7 +9,7 @@ from vg2gt.data.sources.tanks_and_temples import moved, read_log
 from vg2gt.io import read_colmap, write_colmap
 
 from .layout_tanks_and_temples import TO_SCAN, read, write
-from .layouts import SIZE, room
+from .layouts import room
 
 
 def test_real_trajectory(shared):
@@ -64,14 +63,3 @@ def test_intrinsics_come_from_the_model_or_the_argument(tmp_path):
         read(tmp_path).frames("Barn")
     with pytest.raises(ValueError, match=r"must be \[fx, fy, cx, cy\]"):
         TanksAndTemples(str(tmp_path), intrinsics=[30.0])
-
-
-def test_images_may_lie_in_a_folder(tmp_path):
-    write(tmp_path, room(3))
-    folder = tmp_path / "Barn"
-    (folder / "images").mkdir()
-    for path in folder.glob("*.png"):
-        with Image.open(path) as image:
-            assert image.size == SIZE[::-1]
-        path.rename(folder / "images" / path.name)
-    assert tuple(read(tmp_path).frames("Barn")) == (1, 2, 3)

@@ -36,8 +36,7 @@ def test_views_lie_in_a_limited_range_and_targets_between_them(count: int) -> No
     starts = set()
     for scene in map(str, range(30)):
         views = selection.draw(source, scene, count)
-        assert len(views.context) == count
-        assert len(views.target) == min(4, len(views.target))
+        assert (len(views.context), len(views.target)) == (count, min(4, len(views.target)))
         assert not set(views.context) & set(views.target)
         assert list(views.context) == sorted(views.context)
         chosen = [*views.context, *views.target]
@@ -104,8 +103,7 @@ def test_an_index_overrides_the_draw_and_gaps_are_drawn_with_a_warning(tmp_path:
     selection = ViewSelection(index=str(path))
     source = Listed(range(40))
     first, second = selection.choose(source, ["a", "b"], 2)
-    assert first == SceneSample("a", (7, 5), (6,))
-    assert second == selection.draw(source, "b", 2)
+    assert (first, second) == (SceneSample("a", (7, 5), (6,)), selection.draw(source, "b", 2))
     assert "mine.json holds no 2 views of 1 of 2 scenes (the first is b)" in caplog.text
 
 
