@@ -1,7 +1,6 @@
 """Compiled kernels are never older than the sources they are made of, and need no folder to be kept in."""
 
 import ast
-import errno
 import importlib.util
 import sys
 from pathlib import Path
@@ -113,41 +112,6 @@ def test_a_damaged_file_is_compiled_again(ending: str, tmp_path: Path, make, cap
     assert last(1) == 2
     assert not last.stats.cache_misses
     assert not caplog.records
-
-
-def test_a_full_disk_does_not_end_the_work(tmp_path: Path, make, monkeypatch: pytest.MonkeyPatch) -> None:
-    made = make()
-
-    def full(*arguments: Any) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(made._cache._cache_file, "_dump", full)
-    assert (made(1), made(1.5)) == (2, 2.5)
-    assert not list((tmp_path / "cache").rglob("*.nbc"))
-
-
-PARTS = """
-from vg2gt.io.compiled import kernel, kernel_part
-
-@kernel_part(error_model="numpy")
-def share(x, of):
-    return x / of
-
-@kernel(error_model="numpy")
-def sum_of_shares(x, of):
-    return share(x, of) + share(of, of)
-"""
-
-
-def test_parts_of_kernels_are_compiled_and_kept_with_them_and_interpreted_from_python(room, tmp_path):
-    (room / "parts.py").write_text(PARTS)
-    made = importlib.import_module("made.parts")
-    assert made.sum_of_shares(3.0, 2.0) == 2.5
-    assert made.sum_of_shares(3.0, 0.0) != made.sum_of_shares(3.0, 0.0)  # NaN: numpy's way, no exception
-    kept = [path.name.split("-")[0] for path in (tmp_path / "cache").rglob("*.nbc")]
-    assert (kept, made.share(3.0, 2.0)) == (["parts.sum_of_shares"], 1.5)
-    with pytest.raises(ZeroDivisionError):
-        made.share(3.0, 0.0)
 
 
 def test_kernels_take_what_they_need_from_their_own_room() -> None:

@@ -194,18 +194,14 @@ def test_ascii_points_with_faces(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"", "not a PLY file"),
         (b"ply\nformat binary_little_endian 1.0\n", "not a PLY file"),
         (b"ply\nelement vertex 0\nproperty float x\nend_header\n", "no line 'format'"),
-        (b"ply\nformat binary_middle_endian 1.0\nend_header\n", "format binary_middle_endian"),
         (b"ply\nformat ascii 1.0\nelement face 0\nend_header\n", "no element vertex, only face"),
         (b"ply\nformat ascii 1.0\nelement vertex -1\nend_header\n", "line 3 of the header: unexpected"),
-        (header(0, ["x", "x"]), "property x occurs twice"),
         (header(0, ["x"], "quad"), "expected 'property TYPE NAME'"),
         (header(9 * 10**17, ["x", "y", "z"]), "need 10800000000000000000 bytes, 0 are left"),
         (header(0, ["x", "y"]), "vertices have no z, only x, y"),
         (header(3, ["x", "y", "z"]) + b"\0" * 35, "need 36 bytes, 35 are left"),
-        (header(1, []) + b"\0" * 35, "no properties"),
         (header(1, ["x", "y", "z"]).replace(b"binary_little_endian", b"ascii") + b"1 2\n", "vertex 0 has 2 numbers"),
         (header(1, ["x", "y", "z"]).replace(b"binary_little_endian", b"ascii") + b"1 2 a\n", "else than numbers"),
     ],

@@ -33,16 +33,6 @@ def test_a_step_is_a_few_launches_and_one_wait_whatever_the_views(step: ModuleTy
     assert torch_.waits > 2
 
 
-@pytest.mark.slow
-def test_memory_of_eighteen_views(step: ModuleType) -> None:
-    count = step.count_step("triton", 100_000, 18)
-    assert count.entries > 1_000_000
-    assert 100 < count.megabytes <= 600
-
-
-STEP = ("step_ms", "peak_mb", "peak_reserved_mb", "stage_ms", "stage_peak_mb", "profile")
-
-
 def test_many_refused_slots_do_not_overflow_their_sum(benchmark_script) -> None:
     """One bad camera seen by ten million Gaussians: with 2^40 a slot the sum was negative, and memory was asked for."""
     from vg2gt.rendering.gpu import RefusedError, render_triton

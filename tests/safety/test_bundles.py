@@ -78,9 +78,7 @@ def bundle(tmp_path: Path) -> Path:
     [
         ("com.evil", "Run", {"command": "touch canary"}),
         ("ai.onnx.contrib", "PyOp", {"code": "open('canary', 'w')"}),
-        ("pyop", "PyOp", {"module": "os", "class_name": "system"}),
         ("com.microsoft", "EPContext", {"ep_cache_context": "../engine.bin", "embed_mode": 0}),
-        ("org.pytorch.aten", "ATen", {"operator": "system"}),
         ("", "NoSuchOperator", {}),
     ],
 )
@@ -111,14 +109,9 @@ DESCRIPTIONS: dict[str, Callable[[dict[str, Any]], Any]] = {
     "a target": lambda content: content.update(_target_="os.system"),
     "decoder a target": lambda content: content.update(decoder=CALL),
     "class os.system": lambda content: content["decoder"].update({"class": "os.system"}),
-    "class builtins.eval": lambda content: content["decoder"].update({"class": "builtins.eval"}),
-    "class Popen": lambda content: content["decoder"].update({"class": "subprocess.Popen"}),
     "class a path": lambda content: content["decoder"].update({"class": "../decoder.py:Decoder"}),
-    "class __init__": lambda content: content["decoder"].update({"class": "__init__"}),
     "class a list": lambda content: content["decoder"].update({"class": ["DA3Decoder"]}),
     "arguments a target": lambda content: content["decoder"].update(arguments=CALL),
-    "an argument a target": lambda content: content["decoder"].update(arguments={"features": CALL}),
-    "arguments a list": lambda content: content["decoder"].update(arguments=[CALL]),
 }
 
 

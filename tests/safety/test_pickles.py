@@ -12,8 +12,9 @@ import torch
 
 from backends.vggt import VGGTBackend
 from backends.weights import find_weights
+from tests.data.sources.layout_rgbd import write_recording
 from tests.safety.conftest import Armed
-from vg2gt.data import DataError, RGBDFolder, SyntheticScenes
+from vg2gt.data import DataError, RGBDFolder
 from vg2gt.io.arrays import load_matrices, load_npy
 from vg2gt.io.errors import FormatError
 from vg2gt.io.npz import load_npz, read_npz
@@ -123,38 +124,23 @@ def test_arrays(tmp_path: Path, pickled_array: np.ndarray, armed: Armed) -> None
             load_npy(flat, "s", (1, 1))
 
 
-@pytest.fixture
-def recording(rooms: SyntheticScenes, tmp_path: Path) -> Path:
-    from PIL import Image
-
-    folder = tmp_path / "office"
-    frames = rooms.load(rooms.scenes[0], [0, 1])
-    for name in ("images", "depth"):
-        (folder / name).mkdir(parents=True)
-    for i in range(2):
-        colour = (frames.images[i].permute(1, 2, 0).numpy() * 255).astype(np.uint8)
-        Image.fromarray(colour).save(folder / "images" / f"{i}.png")
-        Image.fromarray((frames.depth[i].numpy() * 1000).astype(np.uint16)).save(folder / "depth" / f"{i}.png")
-    np.savetxt(folder / "poses.txt", np.linalg.inv(frames.world_to_camera.double().numpy()).reshape(-1, 16))
-    np.savetxt(folder / "K.txt", frames.intrinsics[0].numpy())
-    return folder
-
-
-def test_index_caches(recording, tmp_path, pickled_array, armed, caplog):
+def test_index_caches(rooms, tmp_path, pickled_array, armed, caplog):
     cache = tmp_path / "cache"
 
+    write_recording(tmp_path, rooms.load(rooms.scenes[0], [0, 1]))
+
     def frames() -> list[int]:
-        source = RGBDFolder(str(recording), holdout=None, index_cache=str(cache))
+        source = RGBDFolder(str(tmp_path / "office"), holdout=None, index_cache=str(cache))
         return list(source.frames(source.scenes[0]))
 
-    assert frames() == [0, 1]
+    assert frames() == [10, 11]
     (path,) = cache.rglob("*.npz")
     with np.load(path) as stored:
         good = dict(stored)
     for name in ("state", "extra", "color", "frame_ids"):
         caplog.clear()
         np.savez(path, **{**good, name: pickled_array})  # pyright: ignore[reportArgumentType]
-        assert frames() == [0, 1]
+        assert frames() == [10, 11]
         assert "the cached index is damaged and is made again" in caplog.text
     path.write_bytes(pickle.dumps(armed))
-    assert frames() == [0, 1]
+    assert frames() == [10, 11]

@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from benchmarks.viewer_scene import voxel_room
-from tests.io.gaussian_scenes import scene, views
 from tests.viewer.chromium import Page, chromium
 from tests.viewer.test_page import HOSTILE, pictured_scene
 from vg2gt.io import named_cameras
@@ -66,19 +65,6 @@ def test_screenshot_is_our_rasterized_image_of_a_room(page, tmp_path, size, voxe
     assert min(figures) > CLOSE
 
 
-def test_cameras_from_script_and_address(page: Page, tmp_path: Path) -> None:
-    gaussians, cameras = scene(300), views((120, 168))
-    records = named_cameras(cameras, ["a", "b", "c"])
-    truth = render(gaussians, cameras, "rasterized", geometry=False).color[0]
-    show(page, tmp_path / "page.html", ViewerScene(gaussians, records), cameras.size, "#camera=2&ui=off")
-    assert psnr(page.screenshot(), truth[2]) > CLOSE
-    rows = records[1].world_to_camera.tolist(), records[1].intrinsics.tolist()
-    record = f"{{width: 168, height: 120, world_to_camera: {rows[0]}, intrinsics: {rows[1]}}}"
-    page.run(f"vg2gtViewer.setCamera({record}).then(() => null)")
-    assert psnr(page.screenshot(), truth[1]) > CLOSE
-    assert psnr(page.screenshot(), truth[2]) < 30
-
-
 def test_controls_move_the_view_and_reset_brings_it_back(page: Page, tmp_path: Path) -> None:
     show(page, tmp_path / "page.html", pictured_scene(), (400, 700), "")
     before = page.screenshot()
@@ -109,29 +95,6 @@ def test_controls_move_the_view_and_reset_brings_it_back(page: Page, tmp_path: P
         page.run("document.getElementById('reset').click()")
         page.run(settle)
         assert (page.screenshot() == before).all(), name
-
-
-def test_cameras_and_images_can_be_shown(page: Page, tmp_path: Path) -> None:
-    shown_scene = pictured_scene()
-    show(page, tmp_path / "page.html", shown_scene, (400, 700), "")
-    pose = np.eye(4)
-    pose[2, 3] = 2.0  # from behind the cameras
-    intrinsics = shown_scene.cameras[0].intrinsics.tolist()
-    record = f"{{width: 56, height: 40, world_to_camera: {pose.tolist()}, intrinsics: {intrinsics}}}"
-    page.run(f"vg2gtViewer.setCamera({record}).then(() => null)")
-    before = page.screenshot()
-    shown = []
-    for box in ("show-cameras", "show-images"):
-        page.run(f"document.getElementById('{box}').click()")
-        page.run("new Promise((resolve) => setTimeout(resolve, 700))")
-        shown.append(page.screenshot())
-    assert count(shown[0], [255, 184, 51]) > 20
-    assert count(shown[1], [90, 90, 90]) > count(before, [90, 90, 90]) + 20
-
-
-def count(image: np.ndarray, color: list[int]) -> int:
-    """Pixels of a colour right of the controls."""
-    return int((np.abs(image[:, 310:].astype(int) - color).max(-1) < 4).sum())
 
 
 def test_page_fetches_nothing_and_hostile_names_do_nothing(page: Page, tmp_path: Path) -> None:
