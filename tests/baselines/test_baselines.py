@@ -15,7 +15,6 @@ from vg2gt.geometry.rotations import quat_to_matrix
 from vg2gt.geometry.spherical_harmonics import sh_to_rgb
 from vg2gt.model import Reconstructor
 from vg2gt.rendering import render
-from vg2gt.runs.checkpoints import newest_valid, read_checkpoint
 from vg2gt.training.loop import build, train
 from vg2gt.types import Batch, Gaussians, Hints, Prediction
 
@@ -219,23 +218,6 @@ def test_point_cloud_as_3dgs_starts(make, batch: Batch) -> None:
     expected = distances.square().mean(1).sqrt().float()
     torch.testing.assert_close(gaussians.scales[some, 0], expected, atol=1e-5, rtol=1e-4)
     assert float(gaussians.opacities.max()) == pytest.approx(0.1)
-
-
-@pytest.mark.parametrize("name", TRAINED)
-def test_checkpoint_round_trip(tmp_path: Path, cache: Path, name: str) -> None:
-    def config(folder: str, *overrides: str):
-        return small_config(tmp_path / folder, cache, f"model={name}", "trainer.max_steps=2", *overrides)
-
-    first = train(config("first"))
-    stored = newest_valid(tmp_path / "first" / "checkpoints")
-    assert not [key for key in read_checkpoint(stored)["state_dict"] if ".backend." in key]
-    again = train(config("second", f"init_from={stored}", "trainer.max_steps=1"))
-    assert again["untrained"] == first["trained"]
-    other = "voxel_merged" if name == "pixel_aligned" else "tiny"
-    with pytest.raises(ValueError, match="does not fit this model"):
-        train(
-            small_config(tmp_path / "third", cache, f"model={other}", f"ckpt={stored}", "model.gaussians.sh_degree=1")
-        )
 
 
 def test_two_scenes_equal_two_runs(make, batch: Batch) -> None:

@@ -10,7 +10,6 @@ from vg2gt.data import DataError, SceneDataModule, SyntheticScenes
 from vg2gt.data.frame_cache import FrameCache
 from vg2gt.data.framing import Framing
 from vg2gt.data.views.even import EvaluationViews
-from vg2gt.data.views.sampling import StepSampler
 
 from .conftest import SIZE
 
@@ -120,21 +119,6 @@ def test_a_resumed_run_sees_the_batches_of_the_uninterrupted_one(rooms, tmp_path
     _trainer(10).fit(second, datamodule=_module(rooms, workers=workers, **drawn), ckpt_path=tmp_path / "stop.ckpt")
     assert first.seen + second.seen == whole.seen
     assert torch.equal(second.weight, whole.weight)
-
-
-@pytest.mark.filterwarnings("ignore")
-def test_a_run_sees_the_planned_steps_in_order_whatever_the_workers(rooms):
-    module = _module(rooms, workers=2)
-    recorder = _Recorder()
-    trainer = _trainer(10, val_check_interval=3, check_val_every_n_epoch=None, num_sanity_val_steps=0)
-    (before,) = trainer.validate(recorder, datamodule=module, verbose=False)
-    assert before["targets"] == 2
-    trainer.fit(recorder, datamodule=module)
-    plan = StepSampler(rooms, rooms.scenes, module.sampler, steps=10)
-    planned = [[views.context for views in step] for step in plan]
-    assert [step[-sum(map(len, views)) :] for step, views in zip(recorder.seen, planned, strict=True)] == [
-        tuple(str(frame) for context in views for frame in context) for views in planned
-    ]
 
 
 def test_the_memory_cache_forgets_the_oldest_frame(rooms, monkeypatch):

@@ -3,14 +3,12 @@
 from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
 import trimesh
 
 from tests.io.gaussian_scenes import views
 from vg2gt.io import write_glb
 from vg2gt.io.glb import FRUSTA, POINTS, frusta
-from vg2gt.types import Cameras
 
 
 def load(path: Path) -> tuple[dict[str, np.ndarray], trimesh.Scene]:
@@ -49,17 +47,3 @@ def test_frusta_are_the_images_outlines() -> None:
         pixels = (local / local[:, 2:]) @ cameras.intrinsics[0, view].double().T
         expected = torch.tensor([[-0.5, -0.5], [55.5, -0.5], [55.5, 39.5], [-0.5, 39.5], [27.5, -10.5]]).double()
         torch.testing.assert_close(pixels[1:, :2], expected, atol=1e-4, rtol=0)
-
-
-def test_wrong_arguments_are_named(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="neither points nor cameras"):
-        write_glb(tmp_path / "a.glb", np.zeros((0, 3)))
-    with pytest.raises(ValueError, match="finite"):
-        write_glb(tmp_path / "a.glb", np.full((1, 3), np.nan))
-    with pytest.raises(ValueError, match="uint8"):
-        write_glb(tmp_path / "a.glb", np.zeros((1, 3)), np.zeros((1, 3)))
-    two = views()
-    two = Cameras(two.world_to_camera.repeat(2, 1, 1, 1), two.intrinsics.repeat(2, 1, 1, 1), two.size)
-    with pytest.raises(ValueError, match="one scene"):
-        write_glb(tmp_path / "a.glb", np.zeros((1, 3)), cameras=two)
-    assert not list(tmp_path.iterdir())

@@ -141,16 +141,6 @@ def test_cameras_json_of_larger_images_and_without_some(folder: Path, frames, ca
         given_pictures(folder)
 
 
-def test_range_of_depth_is_that_of_the_points_widened(folder: Path, frames) -> None:
-    put_colmap(folder, frames)
-    hints = views_of(given_pictures(folder)).hints
-    near, far = hints.depth_range[0].tolist()
-    seen = frames.depth[frames.depth > 0]
-    assert near < seen.quantile(0.01)
-    assert far > seen.quantile(0.99)
-    assert far / near < 2.5 * float(seen.quantile(0.99) / seen.quantile(0.01))
-
-
 def test_range_of_depth_ignores_a_few_wild_points_and_needs_some() -> None:
     def picture(depths) -> Picture:
         return Picture("a", SIZE, lambda size: None, point_depths=np.asarray(depths, np.float32))  # pyright: ignore

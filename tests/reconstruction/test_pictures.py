@@ -49,15 +49,6 @@ def test_frames_of_a_video(tmp_path: Path) -> None:
     assert [p.name for p in mixed] == ["image", "clip-000000", "clip-000030", "clip-000060"]
 
 
-def test_large_pictures_are_shrunk_while_they_are_read(tmp_path: Path) -> None:
-    Image.new("RGB", (1200, 900), (10, 20, 30)).save(tmp_path / "large.png")
-    (picture,) = find_pictures(tmp_path)
-    assert picture.size == (900, 1200)
-    read = picture.read((84, 112))
-    assert read.images.shape == (1, 3, 180, 240)
-    assert (read.images[0, :, 5, 5] * 255).round().tolist() == [10, 20, 30]
-
-
 def test_a_recording_gives_its_cameras_and_depth(recording: Path, frames) -> None:
     pictures = given_pictures(recording, depth=True)
     views = load_views(pictures, (56, 84), Monitor())

@@ -416,18 +416,6 @@ def test_the_reference_is_the_view_that_shows_what_the_others_show() -> None:
     assert [int(shuffled[view]) for view in again] == order
 
 
-def test_a_model_without_points_is_refused_and_not_kept(tmp_path: Path, monkeypatch) -> None:
-    """Item 13: a turning camera. Its median depth was NaN, and every further run failed."""
-    import pycolmap  # pyright: ignore[reportMissingImports]
-
-    empty = pycolmap.Reconstruction()
-    monkeypatch.setattr(pycolmap, "incremental_mapping", lambda *_, **__: {0: empty})
-    images = [np.random.default_rng(i).integers(0, 255, (60, 80, 3), np.uint8) for i in range(3)]
-    with pytest.raises(ValueError, match=r"cameras of these 3 images cannot be found.*rather than turning on the spot"):
-        sfm.find_cameras(find_pictures(images), tmp_path / "sfm", Monitor())
-    assert not (tmp_path / "sfm").exists()
-
-
 @pytest.mark.parametrize("kind", ["empty", "not finite"])
 def test_render_refuses_a_scene_of_nothing(tmp_path: Path, frames, kind: str) -> None:
     """Item 15: it ended with status 0 and a black picture."""

@@ -277,10 +277,7 @@ def test_tasks_of_a_slurm_job_find_each_other(tmp_path: Path, cache: Path) -> No
 
 @pytest.mark.slow
 def test_forty_steps_on_two_processes(tmp_path: Path, cache: Path) -> None:
-    """The ranks stay equal to the bit; at their weights one process with both scenes has their loss and gradient.
-
-    Two trainings are not compared: rounding that moves a point to another cell or tile makes them part.
-    """
+    """The ranks stay equal to the bit."""
     optimizers = {"sgd_long": two_ranks.SGD, "adamw_long": two_ranks.ADAMW, "muon_long": ()}
     ended = two_ranks.run_on_two_ranks(tmp_path, cache, *optimizers, timeout=1500)
     for name, optimizer in optimizers.items():

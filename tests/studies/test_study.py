@@ -17,7 +17,6 @@ from vg2gt.studies.study import (
     paired_difference,
     quoted,
     seeds_table,
-    summarize,
     write_part,
 )
 
@@ -40,13 +39,6 @@ def test_differences_are_taken_seed_by_seed() -> None:
     assert change.margin < 0.3
     assert over_seeds(variant, "psnr").margin > 10
     assert math.isnan(paired_difference(variant, full, "lpips").mean)
-
-
-def test_summary_has_no_numbers_that_do_not_exist() -> None:
-    results = {"full": {0: {"psnr": 20.0}}, "other": {0: {"psnr": 19.0, "lpips": 0.2}}}
-    summary = summarize(results, "full")
-    assert summary["other"] == {"psnr": {"mean": 19.0, "difference": -1.0}, "lpips": {"mean": 0.2}}
-    assert summary["full"]["psnr"] == {"mean": 20.0, "difference": 0.0}
 
 
 def test_one_row_per_run() -> None:

@@ -17,7 +17,6 @@ import torch
 from tests.commands import shell
 from tests.reliability import crash_harness
 from tests.training_helpers import SMALL, full_model, small_config
-from vg2gt.config import compose
 from vg2gt.data import DataError, Frames, SyntheticScenes
 from vg2gt.gaussians import GaussianHead
 from vg2gt.runs.checkpoints import newest_valid, read_checkpoint
@@ -202,15 +201,6 @@ def test_wo_split_starts_from_a_full_model(full_run: Path, cache: Path, tmp_path
     assert report["steps"] == 1
     fresh = next(record.getMessage() for record in caplog.records if "re-initialised" in record.getMessage())
     assert fresh == "re-initialised layers: model.gaussians.out"
-
-
-def test_real_rgbd_recording(tmp_path: Path, shared: Path) -> None:
-    root = shared / "data" / "hololens_office_a"
-    small = [override for override in SMALL if not override.startswith(("data.train_", "data.eval_"))]
-    data = ["data=rgbd", f"data.root={root}", "data.eval_context=4"]
-    report = train(compose("train", f"output_dir={tmp_path}", "debug=fast_dev_run", *small, *data))
-    assert report["trained"]["psnr"] > 10
-    assert 0 < report["trained"]["abs_rel"] < 0.2
 
 
 def test_non_finite_gaussians_are_a_skipped_step(tmp_path: Path, cache: Path) -> None:

@@ -117,14 +117,6 @@ def test_other_files_are_no_pages(tmp_path: Path) -> None:
         read_viewer_html(path)
 
 
-def test_initial_view_sees_the_scene() -> None:
-    ahead = scene(100)  # in view of the world's own frame
-    assert (ViewerScene(ahead).initial().world_to_camera == np.eye(4)).all()
-    for moved in (torch.tensor([0.0, 0, -20]), torch.tensor([300.0, -50, 7])):
-        away = replace(ahead, means=ahead.means + moved)
-        assert render(away, ViewerScene(away).initial().cameras(), geometry=False).alpha.mean() > 0.1
-
-
 def test_pictures_are_found_inside_their_folder_only(tmp_path: Path) -> None:
     folder = tmp_path / "images"
     folder.mkdir()

@@ -167,16 +167,6 @@ def test_without_gradient_views_are_pooled_a_few_at_a_time_to_the_same_voxels(ma
     torch.testing.assert_close(chunked.features, whole.features, atol=1e-5, rtol=1e-5)
 
 
-@pytest.mark.parametrize(("views", "voxel_size", "warned"), [(2, 1e-4, True), (1, 1e-4, False), (2, 0.125, False)])
-def test_sparse_voxels_are_named_once(views, voxel_size, warned, make_fine, make_room, monkeypatch, caplog):
-    monkeypatch.setattr("vg2gt.voxels.grid._warned_of_sparse", set())
-    module = make_fine(voxel_size=voxel_size).eval()
-    with torch.no_grad():
-        for _ in range(2):
-            module(*make_room(views=views))
-    assert ["model.fine.min_footprint" in record.getMessage() for record in caplog.records] == [True] * warned
-
-
 def test_moments_are_the_covariances_of_the_pixels(make_fine, make_room):
     tokens, geometry, images = make_room(scenes=2)
     voxels = make_fine(moments=True)(tokens, geometry, images)

@@ -10,10 +10,10 @@ from PIL import Image
 
 from vg2gt.data import DataError
 from vg2gt.data.sources import Nerfstudio
-from vg2gt.data.transforms import crop, resize
+from vg2gt.data.transforms import resize
 
 from .layout_nerfstudio import write
-from .layouts import SIZE, room
+from .layouts import room
 from .plane_sweep import median_best_ncc
 
 
@@ -41,22 +41,6 @@ def _edit(folder, change) -> None:
     content = json.loads(path.read_text())
     change(content)
     path.write_text(json.dumps(content))
-
-
-def test_distortion_changes_image_depth_and_intrinsics(tmp_path):
-    write(tmp_path, room(3))
-    plain = Nerfstudio(str(tmp_path), depth=True).load("desk", [0])
-    _edit(tmp_path, lambda content: content.update(k1=0.5))
-    source = Nerfstudio(str(tmp_path), depth=True)
-    loaded = source.load("desk", [0])
-    size = (loaded.images.shape[-2], loaded.images.shape[-1])
-    assert 0.5 * SIZE[0] < size[0] < SIZE[0]  # pixels keep their size, and the border bends inwards
-    top, left = (SIZE[0] - size[0]) // 2, (SIZE[1] - size[1]) // 2
-    cut = crop(plain, top, left, size)
-    assert torch.allclose(loaded.intrinsics[:, :2, :2], cut.intrinsics[:, :2, :2])
-    assert float((loaded.images - cut.images).abs().mean()) > 0.01
-    assert set(loaded.depth.unique().tolist()) <= set(plain.depth.unique().tolist())
-    assert not torch.equal(loaded.depth, cut.depth)
 
 
 def test_instant_ngps_fisheye_is_a_fisheye(tmp_path):

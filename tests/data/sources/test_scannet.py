@@ -2,19 +2,17 @@
 
 import logging
 import struct
-import tracemalloc
 import zlib
 
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 from vg2gt.data import DataError, RGBDFolder
 from vg2gt.data.sources import ScanNet, ScanNetSens
 
 from .layout_scannet import millimetres, sens_frame, sens_header, write_export, write_sens
-from .layouts import camera_to_world, pixels, room
+from .layouts import pixels, room
 
 SCENE = "scene0707_00"
 """First byte of the number of frames."""
@@ -35,20 +33,6 @@ def test_frames_are_sorted_by_number_and_lost_ones_left_out(tmp_path, frames, ca
     assert "1 of 4 frames whose pose is not finite are left out" in caplog.text
     assert loader is ScanNet or "folders color/ and depth/, 3 frames" in caplog.text
     assert torch.allclose(source.load(SCENE, [10]).world_to_camera[0], frames.world_to_camera[2], atol=1e-6)
-
-
-@pytest.mark.parametrize("loader", [ScanNet, RGBDFolder])
-def test_colour_is_resized_to_the_depth_images_whose_intrinsics_count(tmp_path, frames, loader):
-    """The layout's colour intrinsics are those of images twice as large."""
-    write_export(tmp_path, frames)
-    for path in (tmp_path / "scans" / SCENE / "color").iterdir():
-        with Image.open(path) as image:
-            larger = image.resize((2 * image.width, 2 * image.height), Image.Resampling.NEAREST)
-        larger.save(path, quality=95, subsampling=0)
-    loaded = loader(str(tmp_path / "scans")).load(SCENE, [8, 9, 10, 11])
-    assert loaded.images.shape == frames.images.shape
-    assert float((loaded.images - frames.images).abs().mean()) < 0.03
-    assert torch.allclose(loaded.intrinsics, frames.intrinsics, atol=1e-4)
 
 
 def test_scans_of_one_room_show_one_place(tmp_path, frames):
@@ -80,30 +64,6 @@ def test_a_stream_holds_what_its_export_does(tmp_path, frames):
     assert torch.equal(ours.depth, theirs.depth)
     assert torch.allclose(ours.world_to_camera, theirs.world_to_camera, atol=1e-6)
     assert torch.allclose(ours.intrinsics, theirs.intrinsics, atol=1e-4)
-
-
-def test_a_frame_is_read_without_the_rest_of_the_file(tmp_path, frames):
-    """Between two frames lies an image of 2 GiB, as a hole."""
-    parts = [
-        sens_frame(pixels(frames)[i], millimetres(frames)[i], camera_to_world(frames)[i], True, True) for i in (0, 1)
-    ]
-    path = tmp_path / f"{SCENE}.sens"
-    hole = 1 << 31
-    with path.open("wb") as file:
-        file.write(sens_header(frames, 3, 2, 1) + parts[0])
-        file.write(np.eye(4, dtype="<f4").tobytes() + struct.pack("<4Q", 0, 0, hole, 0))
-        file.seek(hole, 1)
-        file.write(parts[1])
-    source = ScanNetSens(str(tmp_path))
-    tracemalloc.start()
-    try:
-        assert source.frames(SCENE) == (0, 1, 2)
-        loaded = source.load(SCENE, [2])
-        assert tracemalloc.get_traced_memory()[1] < 2**23
-    finally:
-        tracemalloc.stop()
-        path.unlink()
-    assert torch.equal(loaded.depth[0] > 0, frames.depth[1] > 0)
 
 
 def test_depth_that_expands_without_end_is_refused(tmp_path, frames):

@@ -5,27 +5,11 @@ import pytest
 
 from vg2gt.data import DataError
 from vg2gt.data.sources import TanksAndTemples
-from vg2gt.data.sources.tanks_and_temples import moved, read_log
+from vg2gt.data.sources.tanks_and_temples import moved
 from vg2gt.io import read_colmap, write_colmap
 
 from .layout_tanks_and_temples import TO_SCAN, read, write
 from .layouts import room
-
-
-def test_real_trajectory(shared):
-    poses = read_log(shared / "data" / "trajectories" / "tanks_and_temples_test.log", "test")
-    assert len(poses) == 151
-    whole = np.stack([pose for pose in poses if pose is not None])
-    assert len(whole) == 151
-    rotations = whole[:, :3, :3]
-    np.testing.assert_allclose(rotations @ rotations.swapaxes(1, 2), np.tile(np.eye(3), (151, 1, 1)), atol=1e-5)
-    # Camera-to-world of a walk around an object: neighbours are near, and all look towards the middle.
-    centers = whole[:, :3, 3]
-    steps = np.linalg.norm(np.diff(centers, axis=0), axis=1)
-    assert np.median(steps) < 0.1 * np.linalg.norm(centers - centers.mean(0), axis=1).max()
-    middle = centers.mean(0)
-    looking = ((middle - centers) * rotations[:, :, 2]).sum(1)
-    assert (looking > 0).mean() > 0.95
 
 
 def test_a_similarity_moves_the_camera_and_keeps_its_rotation():
