@@ -13,18 +13,9 @@ from PIL import Image
 from tests.data.sources.layout_phone import write_polycam
 from tests.data.sources.layouts import room
 from tests.reconstruction.stand_in import PlaneAhead
+from vg2gt import io
 from vg2gt.cli import reconstruct as reconstruct_command
 from vg2gt.geometry.cameras import resize_intrinsics, unproject
-from vg2gt.io import (
-    Lens,
-    NamedCamera,
-    Transforms,
-    TransformsFrame,
-    colmap_from_views,
-    write_cameras_json,
-    write_colmap,
-    write_transforms,
-)
 from vg2gt.reconstruction.cameras import pictures_for
 from vg2gt.reconstruction.given_cameras import given_pictures
 from vg2gt.reconstruction.inputs import Views, depth_range, load_views
@@ -63,21 +54,21 @@ def put_colmap(folder: Path, frames) -> None:
     points = torch.cat([view[pixels[:, 1], pixels[:, 0]] for view in world]).numpy()
     views = np.repeat(np.arange(4), len(pixels))
     sources = (np.arange(len(views)), views, np.tile(pixels, (4, 1)))
-    write_colmap(folder / "sparse" / "0", colmap_from_views(cameras, NAMES, points, sources=sources))
+    io.write_colmap(folder / "sparse" / "0", io.colmap_from_views(cameras, NAMES, points, sources=sources))
 
 
 def put_transforms(folder: Path, frames) -> None:
-    lens = Lens.from_intrinsics(frames.intrinsics[0].double().numpy(), SIZE)
+    lens = io.Lens.from_intrinsics(frames.intrinsics[0].double().numpy(), SIZE)
     poses = frames.world_to_camera.double().numpy()
-    records = [TransformsFrame(f"images/{name}", pose, lens) for name, pose in zip(NAMES, poses, strict=True)]
-    write_transforms(folder / "transforms.json", Transforms(tuple(records)))
+    records = [io.TransformsFrame(f"images/{name}", pose, lens) for name, pose in zip(NAMES, poses, strict=True)]
+    io.write_transforms(folder / "transforms.json", io.Transforms(tuple(records)))
 
 
 def put_cameras(folder: Path, frames, names=NAMES, size=SIZE, intrinsics=None) -> None:
     k = frames.intrinsics[0].double().numpy() if intrinsics is None else intrinsics
     poses = frames.world_to_camera.double().numpy()
-    cameras = [NamedCamera(name, size[1], size[0], k, pose) for name, pose in zip(names, poses, strict=False)]
-    write_cameras_json(folder / "cameras.json", cameras)
+    cameras = [io.NamedCamera(name, size[1], size[0], k, pose) for name, pose in zip(names, poses, strict=False)]
+    io.write_cameras_json(folder / "cameras.json", cameras)
 
 
 def views_of(pictures: list[Picture] | None) -> Views:

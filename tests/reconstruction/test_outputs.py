@@ -11,19 +11,8 @@ import torch
 import trimesh
 from PIL import Image
 
+from vg2gt import io
 from vg2gt.geometry.cameras import project, scale_translations
-from vg2gt.io import (
-    colmap_images,
-    colmap_intrinsics,
-    colmap_pose,
-    read_cameras_json,
-    read_colmap,
-    read_gaussian_ply,
-    read_point_ply,
-    read_splat,
-    read_transforms,
-    read_video,
-)
 from vg2gt.reconstruction.output_names import OUTPUTS
 from vg2gt.reconstruction.outputs import write_outputs
 from vg2gt.reconstruction.scene import Scene
@@ -51,14 +40,14 @@ def test_only_what_was_asked_is_there(written: Path) -> None:
 
 
 def test_gaussians(written: Path, scene: Scene) -> None:
-    back = read_gaussian_ply(written / "scene.ply")
+    back = io.read_gaussian_ply(written / "scene.ply")
     for field in ("means", "scales", "opacities"):
         _close(getattr(back, field), getattr(scene.gaussians, field), 1e-5)
-    assert torch.equal(read_splat(written / "scene.splat").means, scene.gaussians.means)
+    assert torch.equal(io.read_splat(written / "scene.splat").means, scene.gaussians.means)
 
 
 def test_cameras(written: Path, scene: Scene) -> None:
-    back = read_cameras_json(written / "cameras.json")
+    back = io.read_cameras_json(written / "cameras.json")
     assert [camera.name for camera in back] == ["008.png", "009.png", "010.png", "011.png"]
     poses = torch.cat([camera.cameras().world_to_camera for camera in back], 1)
     assert torch.equal(poses, scene.cameras.world_to_camera)
@@ -82,15 +71,15 @@ def test_maps(written: Path, scene: Scene) -> None:
 
 
 def test_colmap_points_fall_on_the_pixels_they_came_from(written: Path, scene: Scene) -> None:
-    model = read_colmap(written / "colmap" / "sparse" / "0")
+    model = io.read_colmap(written / "colmap" / "sparse" / "0")
     assert len(model.points3D) > 5000
-    for index, image in enumerate(colmap_images(model)):
+    for index, image in enumerate(io.colmap_images(model)):
         features = image.get_observation_points2D()
         points = [model.points3D[feature.point3D_id] for feature in features]
         seen = np.array([feature.xy for feature in features])
-        pose = colmap_pose(image)
+        pose = io.colmap_pose(image)
         local = np.array([point.xyz for point in points]) @ pose[:3, :3].T + pose[:3, 3]
-        pixels = local @ colmap_intrinsics(image.camera).T
+        pixels = local @ io.colmap_intrinsics(image.camera).T
         assert np.abs(pixels[:, :2] / pixels[:, 2:] + 0.5 - seen).max() < 1e-3
         picture = np.array(Image.open(written / "colmap" / "images" / image.name))
         own = np.abs(seen % 1 - 0.5).max(1) < 1e-3  # the view's own points come from the middle of a pixel
@@ -102,27 +91,27 @@ def test_colmap_points_fall_on_the_pixels_they_came_from(written: Path, scene: S
 
 def test_colmap_points_have_tracks_over_the_views_that_see_them(written: Path) -> None:
     """Item 28: dense stereo finds its source images by common points."""
-    model = read_colmap(written / "colmap" / "sparse" / "0")
+    model = io.read_colmap(written / "colmap" / "sparse" / "0")
     lengths = np.array([point.track.length() for point in model.points3D.values()])
     assert lengths.min() >= 1
     assert (lengths >= 2).mean() > 0.5
     first, second = (set() for _ in range(2))
-    for image, ids in zip(colmap_images(model), (first, second), strict=False):
+    for image, ids in zip(io.colmap_images(model), (first, second), strict=False):
         ids |= {feature.point3D_id for feature in image.get_observation_points2D()}
     assert len(first & second) > 500
 
 
 def test_nerfstudio(written: Path, scene: Scene) -> None:
-    transforms = read_transforms(written / "nerfstudio" / "transforms.json")
+    transforms = io.read_transforms(written / "nerfstudio" / "transforms.json")
     for frame, camera in zip(transforms.frames, scene.named_cameras(), strict=True):
         assert (written / "nerfstudio" / frame.file_path).is_file()
         assert np.abs(frame.world_to_camera - camera.world_to_camera).max() < 1e-6
         assert np.abs(frame.lens.intrinsics() - camera.intrinsics).max() < 1e-9
-    assert len(read_point_ply(written / "nerfstudio" / transforms.ply_file_path).positions) > 5000
+    assert len(io.read_point_ply(written / "nerfstudio" / transforms.ply_file_path).positions) > 5000
 
 
 def test_points_and_meshes_lie_on_the_surfaces(written: Path, scene: Scene) -> None:
-    points = read_point_ply(written / "points.ply").positions
+    points = io.read_point_ply(written / "points.ply").positions
     loaded = trimesh.load(written / "points.glb")
     assert isinstance(loaded, trimesh.Scene)
     assert set(loaded.geometry) == {"points", "cameras"}
@@ -140,7 +129,7 @@ def test_points_and_meshes_lie_on_the_surfaces(written: Path, scene: Scene) -> N
 
 
 def test_animation_and_reports(written: Path, scene: Scene) -> None:
-    frames = [frame for _, frame in read_video(written / "orbit.gif")]
+    frames = [frame for _, frame in io.read_video(written / "orbit.gif")]
     assert [frame.shape for frame in frames] == [(84, 112, 3)] * 4
     assert Image.open(written / "report.png").size == (4 * 112 + 12, 4 * 84 + 12)
     figures = json.loads((written / "report.json").read_text())

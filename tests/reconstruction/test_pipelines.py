@@ -11,20 +11,10 @@ import torch
 from PIL import Image
 
 from tests.reconstruction.test_given_cameras import NAMES, SIZE, STAND_IN, put_cameras, put_colmap, put_transforms
+from vg2gt import io
 from vg2gt.cli import reconstruct as reconstruct_command
 from vg2gt.cli import render as render_command
 from vg2gt.geometry.cameras import project
-from vg2gt.io import (
-    colmap_images,
-    colmap_intrinsics,
-    colmap_pose,
-    read_cameras_json,
-    read_colmap,
-    read_gaussian_ply,
-    write_cameras_json,
-    write_colmap,
-    write_gaussian_ply,
-)
 from vg2gt.reconstruction import sfm
 from vg2gt.reconstruction.camera_files import read_cameras
 from vg2gt.reconstruction.cameras import pictures_for
@@ -65,10 +55,10 @@ def test_landscape_and_portrait_mixed_are_read_whole(folder: Path, frames, put, 
     with Image.open(turned) as image:
         image.resize((84, 112)).save(turned)
     if put is put_colmap:
-        model = read_colmap(folder / "sparse" / "0")
+        model = io.read_colmap(folder / "sparse" / "0")
         camera = model.camera(4)
         camera.width, camera.height, camera.params = 84, 112, [77.0, 77.0, 42.0, 56.0]
-        write_colmap(folder / "sparse" / "0", model)
+        io.write_colmap(folder / "sparse" / "0", model)
     elif put is put_transforms:
         content = json.loads((folder / "transforms.json").read_text())
         lens = {key: content.pop(key) for key in ("w", "h", "cx", "cy")}
@@ -76,9 +66,9 @@ def test_landscape_and_portrait_mixed_are_read_whole(folder: Path, frames, put, 
             frame.update(lens if number < 3 else {"w": 84, "h": 112, "cx": 42.0, "cy": 56.0})
         (folder / "transforms.json").write_text(json.dumps(content))
     else:
-        cameras = read_cameras_json(folder / "cameras.json")
+        cameras = io.read_cameras_json(folder / "cameras.json")
         cameras[3] = replace(cameras[3], width=84, height=112)
-        write_cameras_json(folder / "cameras.json", cameras)
+        io.write_cameras_json(folder / "cameras.json", cameras)
     pictures = given_pictures(folder)
     assert [picture.size for picture in pictures] == [SIZE] * 3 + [(112, 84)]
     assert pictures[3].read((112, 84)).images.shape[-2:] == (112, 84)
@@ -156,7 +146,7 @@ def test_given_cameras_keep_their_frame_and_unit(folder: Path, frames, put, tmp_
     put(folder, frames)
     given = {picture.name: picture.pose for picture in given_pictures(folder) or []}
     run(folder, "--out", tmp_path / "out", "--save", "cameras.json,scene.ply,report.json,views.npz")
-    cameras = read_cameras_json(tmp_path / "out" / "cameras.json")
+    cameras = io.read_cameras_json(tmp_path / "out" / "cameras.json")
     for camera in cameras:
         pose = given[Path(camera.name).stem]
         np.testing.assert_allclose(camera.world_to_camera, pose, atol=1e-6)
@@ -334,12 +324,12 @@ def test_photographs_come_back_with_their_names_and_sizes(folder: Path, frames, 
     save = "colmap,nerfstudio,colmap-small"
     run(folder, "--out", tmp_path / "out", "--save", save, "--size", "56x56")
     whole = tmp_path / "out" / "colmap"
-    model = read_colmap(whole / "sparse" / "0")
-    for number, image in enumerate(colmap_images(model)):
+    model = io.read_colmap(whole / "sparse" / "0")
+    for number, image in enumerate(io.colmap_images(model)):
         assert image.name == NAMES[number]
         assert (whole / "images" / image.name).read_bytes() == (folder / "images" / image.name).read_bytes()
-        np.testing.assert_allclose(colmap_intrinsics(image.camera), frames.intrinsics[number], atol=1e-3)
-        np.testing.assert_allclose(colmap_pose(image), frames.world_to_camera[number], atol=1e-6)
+        np.testing.assert_allclose(io.colmap_intrinsics(image.camera), frames.intrinsics[number], atol=1e-3)
+        np.testing.assert_allclose(io.colmap_pose(image), frames.world_to_camera[number], atol=1e-6)
     content = json.loads((tmp_path / "out" / "nerfstudio" / "transforms.json").read_text())
     assert [frame["file_path"] for frame in content["frames"]] == [f"images/{name}" for name in NAMES]
     with Image.open(tmp_path / "out" / "colmap-small" / "images" / NAMES[0]) as image:
@@ -423,11 +413,11 @@ def test_render_refuses_a_scene_of_nothing(tmp_path: Path, frames, kind: str) ->
     count = 0 if kind == "empty" else 3
     ones, batch = torch.ones(count, 3), torch.zeros(count, dtype=torch.int64)
     scene = Gaussians(ones, torch.ones(count, 4), ones, torch.full((count,), 0.5), ones[:, None], batch)
-    path = write_gaussian_ply(tmp_path / "scene.ply", scene)
+    path = io.write_gaussian_ply(tmp_path / "scene.ply", scene)
     if count:
         content = path.read_bytes()
         path.write_bytes(content[: -count * 68] + np.full(17 * count, np.nan, "<f4").tobytes())
-        assert not len(read_gaussian_ply(path))
+        assert not len(io.read_gaussian_ply(path))
     with pytest.raises(SystemExit, match="holds no Gaussians; there is nothing to render"):
         render_command.main([str(path), "--cameras", str(tmp_path / "cameras.json"), "--out", str(tmp_path / "out")])
     assert not (tmp_path / "out").exists()

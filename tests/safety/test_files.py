@@ -14,18 +14,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from vg2gt import io as formats
 from vg2gt.data import DataError
 from vg2gt.data.sources import COLMAP, Nerfstudio
 from vg2gt.data.sources.parsing import read_numbers
-from vg2gt.io import (
-    FormatError,
-    read_cameras_json,
-    read_colmap,
-    read_gaussian_ply,
-    read_splat,
-    read_transforms,
-    read_video,
-)
 from vg2gt.io.cameras_json import NamedCamera
 from vg2gt.io.image_files import image_size, read_color, read_depth
 from vg2gt.io.images import open_image
@@ -87,8 +79,8 @@ def test_pictures(tmp_path: Path, canary: Path, name: str) -> None:
                 image_size(path, "s", upright)
     moving = tmp_path / "moving.gif"
     moving.write_bytes(path.read_bytes())
-    with pytest.raises(FormatError, match=r"moving\.gif"):
-        list(read_video(moving))
+    with pytest.raises(formats.FormatError, match=r"moving\.gif"):
+        list(formats.read_video(moving))
 
 
 def test_ordinary_pictures_are_read(tmp_path: Path) -> None:
@@ -117,8 +109,8 @@ PLYS = {
 def test_ply_headers(tmp_path: Path, name: str) -> None:
     path = tmp_path / "scene.ply"
     path.write_bytes(PLYS[name])
-    with pytest.raises(FormatError, match=r"scene\.ply"):
-        read_gaussian_ply(path)
+    with pytest.raises(formats.FormatError, match=r"scene\.ply"):
+        formats.read_gaussian_ply(path)
 
 
 COUNT = struct.pack("<Q", HUGE)
@@ -144,9 +136,9 @@ def colmap_model(folder: Path, name: str = "a.png", files: Mapping[str, bytes] |
 
 @pytest.mark.parametrize("name", MODELS)
 def test_colmap_headers(tmp_path: Path, name: str) -> None:
-    assert read_colmap(colmap_model(tmp_path / "good")).image(1).name == "a.png"
-    with pytest.raises(FormatError, match=r"bad"):
-        read_colmap(colmap_model(tmp_path / "bad", files=MODELS[name]))
+    assert formats.read_colmap(colmap_model(tmp_path / "good")).image(1).name == "a.png"
+    with pytest.raises(formats.FormatError, match=r"bad"):
+        formats.read_colmap(colmap_model(tmp_path / "bad", files=MODELS[name]))
 
 
 NAMES = ["../secret.png", "/etc/passwd", "a/../../secret.png", "images/../../secret.png", "../scene/../secret.png"]
@@ -216,14 +208,14 @@ PIPES: dict[str, Callable[[Path], object]] = {
     "poses.txt": lambda path: read_numbers(path, "room"),
     "depth.npz": lambda path: load_npz(path, "room", ["depth"]),
     "scan.sens": lambda path: scan_sens(path, "room"),
-    "scene.ply": read_gaussian_ply,
-    "scene.splat": read_splat,
-    "clip.mp4": lambda path: list(read_video(path)),
-    "clip.gif": lambda path: list(read_video(path)),
-    "cameras.json": read_cameras_json,
-    "transforms.json": read_transforms,
-    "cameras.txt": lambda path: read_colmap(path.parent),
-    "cameras.bin": lambda path: read_colmap(path.parent),
+    "scene.ply": formats.read_gaussian_ply,
+    "scene.splat": formats.read_splat,
+    "clip.mp4": lambda path: list(formats.read_video(path)),
+    "clip.gif": lambda path: list(formats.read_video(path)),
+    "cameras.json": formats.read_cameras_json,
+    "transforms.json": formats.read_transforms,
+    "cameras.txt": lambda path: formats.read_colmap(path.parent),
+    "cameras.bin": lambda path: formats.read_colmap(path.parent),
     "model.pt": read_tensors,
     "model.safetensors": read_tensors,
     "step-1.ckpt": read_checkpoint,
