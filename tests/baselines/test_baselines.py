@@ -100,23 +100,6 @@ def table(gaussians: Gaussians) -> torch.Tensor:
     )
 
 
-@pytest.mark.parametrize("name", ALL)
-def test_order_of_the_later_views_does_not_matter(make, batch: Batch, name: str) -> None:
-    """View 0 is the world frame; the others may come in any order."""
-    model = make(name, seed=None if name == "pointcloud" else 2)
-    order = [0, 3, 1, 2]
-    images, hints = reordered(batch, order)
-    with torch.no_grad():
-        one = table(predict(model, batch).gaussians)
-        two = table(model(images, hints).gaussians)
-    if name == "voxel_merged":  # sorted by voxel, whatever the order of what is in it
-        assert one.shape == two.shape
-        assert float((one - two).abs().max()) < 1e-4
-    else:
-        moved = one.unflatten(0, (VIEWS, -1))[torch.tensor(order)].flatten(0, 1)
-        torch.testing.assert_close(two, moved, atol=1e-5, rtol=1e-5)
-
-
 @pytest.mark.parametrize("name", ["pixel_aligned", "pointcloud"])
 def test_another_first_view_turns_the_scene_and_nothing_else(make, batch: Batch, name: str) -> None:
     """All is predicted in camera axes, so the Gaussians move with the cameras; like predictions for all pixels."""

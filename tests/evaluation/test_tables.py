@@ -1,4 +1,3 @@
-import math
 import re
 from pathlib import Path
 from typing import Any
@@ -7,7 +6,6 @@ import pytest
 
 from vg2gt.evaluation import paper
 from vg2gt.evaluation.sections import report_markdown
-from vg2gt.evaluation.tables import markdown_table, number
 
 
 def report(**settings: Any) -> dict[str, Any]:
@@ -54,18 +52,6 @@ def test_figures_stand_where_they_belong() -> None:
     assert "k = 8" in text
     assert "## Cameras of the input views\n\nn/a" in text
     assert "paper" not in text
-
-
-def test_a_table_is_aligned_and_says_what_is_missing() -> None:
-    cells = [number(1.25, 1), number(None, 1), number(math.inf, 1), number(0.5, 2, sign=True)]
-    assert cells == ["1.2", "n/a", "n/a", "+0.50"]
-    table = markdown_table(["", "value"], [["a", cells[0]], ["longer", cells[1]]])
-    assert table.splitlines() == [
-        "|        | value |",
-        "| ------ | ----: |",
-        "| a      |   1.2 |",
-        "| longer |   n/a |",
-    ]
 
 
 def test_lpips_without_weights_says_how_to_get_them() -> None:

@@ -2,12 +2,10 @@
 
 from dataclasses import replace
 
-import hydra
 import pytest
 import torch
 
 from tests.rendering.scenes import IMPLEMENTATIONS, cameras_around, floats_to, images, pinhole, soup, with_gradients
-from vg2gt.config import compose
 from vg2gt.rendering import Renderer, render
 from vg2gt.rendering.options import Mode, RenderOptions
 from vg2gt.rendering.renderer import Implementation
@@ -126,18 +124,6 @@ def test_bad_shapes_and_order_are_refused() -> None:
 def test_bad_options_are_refused(options: dict[str, object]) -> None:
     with pytest.raises(ValueError, match=r"depth|mode|near|alpha_max|implementation"):
         Renderer(**options)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("name", MODES)
-def test_configuration_builds_the_renderer(name: Mode) -> None:
-    renderer = hydra.utils.instantiate(compose(f"renderer/{name}").renderer)
-    assert isinstance(renderer, Renderer)
-    assert renderer.mode == name
-    gaussians, cameras = soup(30), pinhole((12, 15))
-    out = renderer(gaussians, cameras, background=(1.0, 0.0, 0.0))
-    torch.testing.assert_close(out.color, render(gaussians, cameras, name, (1.0, 0.0, 0.0)).color)
-    other = renderer(gaussians, cameras, mode="solid")
-    torch.testing.assert_close(other.depth, render(gaussians, cameras, "solid").depth)
 
 
 def two_scenes() -> tuple[Gaussians, Cameras]:
