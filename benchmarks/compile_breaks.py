@@ -20,11 +20,10 @@ from torch import Tensor, nn
 
 from backends.dpt import DPT
 from vg2gt.evaluation.tables import print_table
-from vg2gt.gaussians import GaussianHead
+from vg2gt.method import DenseHead, GaussianHead, PointMLP, PTv3
+from vg2gt.method.ptv3 import Level
+from vg2gt.method.serialization import ORDERS, relative_grid, serial_keys
 from vg2gt.types import Tokens, Voxels
-from vg2gt.voxels import DenseHead, PointMLP, PTv3
-from vg2gt.voxels.ptv3 import Level
-from vg2gt.voxels.serialization import ORDERS, relative_grid, serial_keys
 
 PATCHES, PATCH, WIDTH, TAPS = (4, 8), 14, 32, 4
 COUNTS = (90, 60)  # voxels of two scenes

@@ -3,7 +3,7 @@
 Takes a model trained on the simulated backbone (``CKPT``: a checkpoint or a run's folder) and lets the backbone err
 more or less than it did in training: on rooms that the model was not trained on and, with ``--shared FOLDER``, on real
 recordings. To tell what carries the gain, PTv3's features are replaced by their mean over the views, and the surface
-evidence (:mod:`vg2gt.voxels.surface`) by zero. Prints a table and writes a dated JSON file.
+evidence (:mod:`vg2gt.method.additions.surface_evidence`) by zero. Prints a table and writes a dated JSON file.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from torch import Tensor, nn
 
 from backends.oracle import OracleBackend
 from vg2gt import load_model
+from vg2gt.method import CoarseModule, PTv3
+from vg2gt.method.additions.surface_evidence import SURFACE_CHANNELS
 from vg2gt.metrics import depth_metrics
 from vg2gt.model import VG2GT
 from vg2gt.types import Batch
-from vg2gt.voxels import CoarseModule, PTv3
-from vg2gt.voxels.surface import SURFACE_CHANNELS
 
 SETS = {"rooms": "data=synthetic data.eval_scenes={scenes}"} | RECORDINGS
 VARIANTS = ("before", "after", "PTv3's features averaged", "no surface evidence")

@@ -196,7 +196,7 @@ def _profile(device: torch.device, act: Callable[[], None]) -> Result:
 
 def knn(setting: Setting) -> Iterator[Result]:
     """Nearest neighbours: 16 voxels of every patch point, and 3 points of every pixel for the coloured points."""
-    from vg2gt.voxels.cell_search import nearest_by_cells
+    from vg2gt.kernels.cell_search import nearest_by_cells
 
     for name, views, step, neighbors in (("patch points", 18, 7, 16), ("pixels", 10, 1, 4)):
         height, width = (14, 28) if setting.small else (224, 448)

@@ -18,9 +18,10 @@ from render_scene import room_cameras, room_gaussians
 from torch import Tensor
 
 from vg2gt.evaluation.tables import print_table
-from vg2gt.rendering.gpu.function import NEGLIGIBLE
-from vg2gt.rendering.gpu.tiles import TILE
-from vg2gt.rendering.options import ALPHA_MIN, MEDIAN_MAX_TRANSMITTANCE, TRANSMITTANCE_STOP, RenderOptions
+from vg2gt.kernels.constants import ALPHA_MIN, MEDIAN_MAX_TRANSMITTANCE, TRANSMITTANCE_STOP
+from vg2gt.kernels.render_gpu.tiles import TILE
+from vg2gt.rendering.gpu_tiles import NEGLIGIBLE
+from vg2gt.rendering.options import RenderOptions
 from vg2gt.rendering.projection import respond
 from vg2gt.types import Cameras, Gaussians
 

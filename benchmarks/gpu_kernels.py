@@ -29,8 +29,8 @@ from triton import knobs  # pyright: ignore[reportMissingImports]
 from triton.backends.compiler import GPUTarget  # pyright: ignore[reportMissingImports]
 
 from vg2gt.evaluation.tables import print_table
+from vg2gt.kernels.render_gpu import kernels
 from vg2gt.rendering import Renderer
-from vg2gt.rendering.gpu import kernels
 
 TARGETS = {
     "sm_80": GPUTarget("cuda", 80, 32),

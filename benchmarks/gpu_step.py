@@ -22,8 +22,8 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from vg2gt.evaluation.tables import print_table
+from vg2gt.kernels.render_gpu.tiles import TILE
 from vg2gt.rendering import Renderer
-from vg2gt.rendering.gpu.tiles import TILE
 from vg2gt.rendering.options import RenderOptions, SceneViews
 from vg2gt.rendering.projection import Splats, pixel_boxes, project, screen_box
 from vg2gt.types import Cameras, Gaussians

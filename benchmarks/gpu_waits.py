@@ -36,7 +36,7 @@ class Waits(TorchDispatchMode):
     """Counts what waits inside its block.
 
     Attributes:
-        places: how often, by the innermost function of the package that asked, such as ``voxels/grid.py plan_voxels``.
+        places: how often, by the innermost function of the package that asked, such as ``method/grid.py plan_voxels``.
     """
 
     def __init__(self) -> None:
@@ -108,9 +108,9 @@ def main() -> None:
     from stages import Case, prepare
 
     from vg2gt.evaluation.tables import print_table
-    from vg2gt.voxels import normals, point_moments
+    from vg2gt.method.additions import point_moments, voxel_normals
 
-    normals.compilable = point_moments.compilable = lambda *_: False  # as on a GPU
+    voxel_normals.compilable = point_moments.compilable = lambda *_: False  # as on a GPU
     options = parser(__doc__, overrides="Hydra overrides, such as model=vg2gt")
     options.add_argument("--views", type=int, default=4)
     options.add_argument("--size", type=int, nargs=2, default=[112, 224])

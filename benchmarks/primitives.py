@@ -22,9 +22,9 @@ from hydra.utils import instantiate
 from stage_clock import StageClock
 
 from vg2gt.evaluation.tables import print_table
+from vg2gt.method.grid import scene_voxel_size
 from vg2gt.studies.study import compose_run
 from vg2gt.types import Batch
-from vg2gt.voxels.grid import scene_voxel_size
 
 LABELS = {"pixel_aligned": "pixel-aligned", "voxel_merged": "voxel-merged", "tiny": "VG²GT", "vg2gt": "VG²GT (large)"}
 FIGURES = RESULTS.parents[1] / "docs" / "figures"

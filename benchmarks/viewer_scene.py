@@ -17,8 +17,8 @@ from vg2gt.geometry.cameras import invert_rigid, ray_directions, transform_point
 from vg2gt.geometry.spherical_harmonics import rgb_to_sh
 from vg2gt.io import named_cameras, write_cameras_json, write_gaussian_ply
 from vg2gt.io.images import write_png
+from vg2gt.method.grid import plan_voxels, pool_mean
 from vg2gt.types import Cameras, Gaussians
-from vg2gt.voxels.grid import plan_voxels, pool_mean
 
 SIGMA_SHARE = 0.6  # of a voxel's edge, the standard deviation of its Gaussian
 OPACITY = 0.95

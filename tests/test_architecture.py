@@ -10,19 +10,20 @@ from tests.commands import ROOT
 
 # What a room of vg2gt may import beside itself and the leaves, which import no other room.
 LEAVES = {"types", "config", "memory", "profiling"}
-BASICS = {"geometry", "io"}
+BASICS = {"geometry", "io", "kernels"}
 MAY_IMPORT: dict[str, set[str]] = {
     "geometry": set(),
+    "kernels": set(),
     "io": {"geometry"},
     "data": BASICS,
-    **dict.fromkeys(("rendering", "voxels", "visibility", "gaussians", "losses", "metrics"), BASICS),
-    "model": {"voxels", "visibility", "gaussians", "backends"} | BASICS,
-    "baselines": {"model", "voxels", "visibility", "gaussians", "backends"} | BASICS,
-    "runs": {"baselines", "model", "visibility", "rendering", "data"} | BASICS,
+    **dict.fromkeys(("rendering", "method", "losses", "metrics"), BASICS),
+    "model": {"method", "backends"} | BASICS,
+    "baselines": {"model", "method", "backends"} | BASICS,
+    "runs": {"baselines", "model", "method", "rendering", "data"} | BASICS,
     "viewer": {"rendering"} | BASICS,
-    "refinement": {"losses", "metrics", "rendering", "gaussians", "visibility"} | BASICS,
+    "refinement": {"losses", "metrics", "rendering", "method"} | BASICS,
     "evaluation": {"refinement", "runs", "model", "rendering", "metrics", "data"} | BASICS,
-    "reconstruction": {"refinement", "runs", "model", "gaussians", "rendering", "data"} | BASICS,
+    "reconstruction": {"refinement", "runs", "model", "method", "rendering", "data"} | BASICS,
     "training": {"evaluation", "runs", "model", "losses", "rendering", "data", "backends"} | BASICS,
     "studies": {"training", "evaluation", "runs"} | BASICS,
     "cli": {
@@ -40,7 +41,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     | BASICS,
     **{command: {"cli"} for command in ("evaluate", "ablate", "curves")},
 }
-OF_BACKENDS = ("vg2gt.types", "vg2gt.geometry", "vg2gt.io.tensors", "vg2gt.io.files", "vg2gt.io.compiled")
+OF_BACKENDS = ("vg2gt.types", "vg2gt.geometry", "vg2gt.io.tensors", "vg2gt.io.files", "vg2gt.kernels.compiled")
 
 
 def modules() -> dict[str, Path]:

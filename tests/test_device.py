@@ -15,12 +15,14 @@ from torch import Tensor
 from tests.reliability.steps import TINY, first_batches
 from tests.training_helpers import SMALL, small_config
 from vg2gt.evaluation.in_training import evaluate_scene
+from vg2gt.kernels import curve_codes
+from vg2gt.method import knn, point_features, sparse_conv
+from vg2gt.method.additions import point_moments, voxel_normals
 from vg2gt.profiling import listening
 from vg2gt.reconstruction.pipeline import reconstruct_with
 from vg2gt.rendering import renderer, selfcheck
 from vg2gt.runs.load import load_model
 from vg2gt.training.loop import Run, build, train
-from vg2gt.voxels import knn, normals, point_features, point_moments, serialization, sparse_conv
 
 if importlib.util.find_spec("triton") is None:
     pytest.skip("needs triton, which has wheels for Linux on x86-64 only", allow_module_level=True)
@@ -54,10 +56,10 @@ def as_on_a_gpu(monkeypatch: pytest.MonkeyPatch) -> Any:
     """Makes a CPU run what a GPU runs: no compiled passes, and the kernels as ``auto``'s choice once checked."""
 
     def switch() -> None:
-        for module in (knn, normals, point_features, point_moments, serialization):
+        for module in (knn, voxel_normals, point_features, point_moments, curve_codes):
             monkeypatch.setattr(module, "compilable", lambda *_, **__: False)
         monkeypatch.setattr(sparse_conv, "one_by_one", lambda device: False)
-        monkeypatch.setattr(serialization, "has_kernel", lambda device: True)
+        monkeypatch.setattr(curve_codes, "has_kernel", lambda device: True)
 
         def automatic(device: torch.device) -> str:
             selfcheck.require_trusted(renderer.render, device)
@@ -71,11 +73,11 @@ def as_on_a_gpu(monkeypatch: pytest.MonkeyPatch) -> Any:
 @on_devices
 @pytest.mark.parametrize("bits", [3, 12, 21])
 def test_hilbert_codes(device: str, bits: int) -> None:
-    from vg2gt.voxels.hilbert_kernel import hilbert_in_one_kernel
+    from vg2gt.kernels.hilbert import hilbert_in_one_kernel
 
     cells = torch.randint(0, 1 << bits, (700, 3), generator=torch.Generator().manual_seed(bits))
     found = hilbert_in_one_kernel(cells.to(device), bits)
-    assert torch.equal(found.cpu(), serialization.hilbert_reference(cells, bits))
+    assert torch.equal(found.cpu(), curve_codes.hilbert_reference(cells, bits))
 
 
 def sized(device: str) -> list[str]:

@@ -8,8 +8,14 @@ import pytest
 import torch
 
 from tests.commands import ROOT, run_python
-from vg2gt.gaussians import GaussianHead
-from vg2gt.memory import TRAINING, OutOfMemory, dropped_by, memory_advice, note_sizes
+from vg2gt.memory import (
+    TRAINING,
+    OutOfMemory,
+    dropped_by,
+    memory_advice,
+    note_sizes,
+)
+from vg2gt.method import GaussianHead
 from vg2gt.studies.study import compose_run
 from vg2gt.training.loop import train
 from vg2gt.types import Voxels
@@ -128,7 +134,7 @@ def test_training_names_sizes_and_options(stage: str, tmp_path: Path, monkeypatc
     def fail(*_: object, **__: object) -> None:
         raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB")
 
-    place = "vg2gt.rendering.renderer.Renderer.__call__" if stage == "renderer" else "vg2gt.voxels.PointMLP.forward"
+    place = "vg2gt.rendering.renderer.Renderer.__call__" if stage == "renderer" else "vg2gt.method.PointMLP.forward"
     monkeypatch.setattr(place, fail)
     config = compose_run([*SMALL, "trainer.max_steps=1", f"name={tmp_path.name}"], tmp_path)
     sizes = r"memory is full with 2 images of 28x28 in 1 scene, \d+ voxels"

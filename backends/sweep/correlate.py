@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from backends.sweep.views import rays, relative_poses
-from vg2gt.io.compiled import kernel
+from vg2gt.kernels.compiled import kernel
 
 GROUPS = 8  # similarities per point: dot products over the channels c with equal c % GROUPS
 BEHIND = 1e-3  # depth in a source, per depth here, below which a point does not count as seen

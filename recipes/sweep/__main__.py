@@ -19,7 +19,7 @@ from torch.utils.data import DataLoader, Subset
 
 from recipes.sweep.module import SweepTraining
 from recipes.sweep.samples import TrainingSamples
-from recipes.sweep.scenes import make_scenes
+from recipes.sweep.scenes import make_scenes, read_infinigen
 from recipes.sweep.weights import begin_with, newest_checkpoint, start_step, write_weights
 
 
@@ -39,7 +39,8 @@ def main(config: DictConfig) -> None:
     training: SweepTraining = hydra.utils.instantiate(config.training)
     first = start_step(checkpoint) if checkpoint else 0
     per_step = config.processes
-    every = TrainingSamples(files, training.steps * per_step, config.seed)
+    rooms = read_infinigen(config.infinigen.folder, config.scenes.folder) if config.infinigen.folder else []
+    every = TrainingSamples(files, training.steps * per_step, config.seed, rooms, config.infinigen.share)
     samples = Subset(every, range(first * per_step, len(every)))
     if config.begin and not checkpoint:
         begin_with(training, Path(config.begin))

@@ -11,6 +11,8 @@ from backends.sweep.volume import from_inverse
 from recipes.sweep.samples import Sample
 
 _CLAMP = 2.0  # log-depth errors beyond it do not count more
+_BEYOND = 1.5  # times the farthest plane: what is farther, or sky, only has to be said to be at least that far
+_BEYOND_ERROR = 0.7  # relative error that the uncertainty of such pixels should state at least
 WEIGHTS = {"depth": 2.0, "uncertainty": 0.15, "gradient": 1.0, "planes": 0.4, "position": 2.0, "swept": 1.0}
 
 
@@ -23,21 +25,26 @@ def objective(
         encoding: of the sample's images.
         depth: ``[V, H, W]`` decoded.
         log_scale: ``[V, H, W]`` of its relative error.
-        sample: the truth and the planes' range.
+        sample: the truth (0 = unknown, infinite in the sky) and the planes' range.
     """
-    valid = (sample.depth > 0).float()
-    truth = torch.where(sample.depth > 0, sample.depth, 1.0)
-    error = depth.log() - truth.log()
-    absolute = error.abs().clamp_max(_CLAMP)
+    farthest = _BEYOND * sample.depth_range[1]
+    beyond = sample.depth > farthest
+    seen = (sample.depth > 0).float()
+    valid = seen * ~beyond
+    error = depth.log() - torch.where(valid > 0, sample.depth, farthest).log()
+    absolute = torch.where(beyond, -error, error.abs()).clamp(0, _CLAMP)
+    stated = torch.where(beyond, absolute.clamp_min(_BEYOND_ERROR), absolute)
     log_scale = log_scale.clamp(-6, 1)
     terms = {
-        "depth": _mean(absolute, valid),
-        "uncertainty": _mean(absolute * torch.exp(-log_scale) + log_scale, valid),
+        "depth": _mean(absolute, seen),
+        "uncertainty": _mean(stated * torch.exp(-log_scale) + log_scale, seen),
         "gradient": sum((_gradient(error[:, ::k, ::k], valid[:, ::k, ::k]) for k in (1, 2, 4)), torch.zeros(())),
     }
     planes, positions = [], []
     for sweep, cell in ((encoding.first, 4), (encoding.second, 2)):
         inverse, known = cell_inverse(sample.depth, cell)
+        finite = known * (inverse > 1 / farthest)
+        inverse = inverse.clamp_min(1 / farthest)
         t = from_inverse(inverse, sample.depth_range)
         planes.append(_cross_entropy(sweep, t, known))
         positions.append(_mean((sweep.t - t).abs().clamp_max(0.3), known))
@@ -45,7 +52,7 @@ def objective(
             positions.append(_mean((encoding.refined - t).abs().clamp_max(0.3), known))
         else:
             positions.append(_mean((encoding.center - t).abs().clamp_max(0.3), known))
-            terms["swept"] = _mean((encoding.swept[:, :1] + inverse.log()).abs().clamp_max(_CLAMP), known)
+            terms["swept"] = _mean((encoding.swept[:, :1] + inverse.log()).abs().clamp_max(_CLAMP), finite)
     terms["planes"] = torch.stack(planes).sum()
     terms["position"] = torch.stack(positions).sum()
     return torch.stack([WEIGHTS[name] * term for name, term in terms.items()]).sum(), terms
@@ -80,6 +87,8 @@ def _cross_entropy(sweep: Sweep, t: Tensor, known: Tensor) -> Tensor:
     count = position.shape[1]
     spacing = position[:, 1:2] - position[:, :1]
     place = (t - position[:, :1]) / spacing
+    if sweep.position.shape[-1] == 1:  # the first sweep: what is beyond its farthest plane belongs to that plane
+        place = place.clamp_min(0)
     known = known * (place >= 0) * (place <= count - 1)
     low = place.floor().clamp(0, count - 2)
     share = (place - low).clamp(0, 1)

@@ -4,25 +4,32 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.random import Generator
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 from torch.utils.data import Dataset
 
 from recipes.sweep.scenes import SceneFrames, read_scene
-from vg2gt.geometry.cameras import crop_intrinsics, resize_intrinsics, rigid_motions
+from vg2gt.geometry.cameras import crop_intrinsics, project, resize_intrinsics, rigid_motions, unproject
+from vg2gt.types import Cameras
 
-_SIZES = ((80, 160), (112, 224), (112, 144))
-_SIZE_SHARES = (0.75, 0.15, 0.1)
+_SIZES = ((80, 160), (112, 224), (112, 144), (144, 192))
+_SIZE_SHARES = (0.6, 0.15, 0.15, 0.1)
+_UPRIGHT_SHARE = 0.3  # of samples turned by 90 degrees, as upright photographs are
+_CUT_SHARE = 0.25  # of samples whose planes end before the scene does
+_LEAST_OVERLAP = 0.15
+_WALK_FRAMES, _WALK_STEP = 14, math.radians(9)  # paths of more frames, or larger turns between them, are no walks
 _VIEWS = 4
 _PLANES = (32, 48)  # few sizes: CPUs compile their convolutions for each
 _SOURCES, _SOURCE_SHARES = (2, 3), (0.7, 0.3)
-_POSE_SHARE, _TURN, _SHIFT = 0.5, 0.0015, 0.002  # share of samples with pose noise; rad; median depths
+_POSE_SHARE, _TURN, _SHIFT = 0.5, 0.0015, 0.002  # share of samples with pose noise; rad; depths
 _LEAST_PIXELS = 5000  # with depth; samples with fewer are drawn again
 _GREY_SHARE = 0.2
 
@@ -32,7 +39,7 @@ class Sample(NamedTuple):
 
     Attributes:
         images: ``[V, 3, H, W]`` in [0, 1].
-        depth: ``[V, H, W]``, 0 = unknown.
+        depth: ``[V, H, W]``, 0 = unknown, infinite in the sky.
         world_to_camera: ``[V, 4, 4]``, as exact as poses are in practice.
         intrinsics: ``[V, 3, 3]`` in pixels.
         depth_range: ``[2]`` near and far of the planes.
@@ -56,10 +63,15 @@ class TrainingSamples(Dataset[Sample]):
         files: cached scenes.
         count: number of samples.
         seed: of all draws.
+        more: scenes of a second kind, such as rooms of Infinigen.
+        share: of the samples that come from ``more``, if there are any.
     """
 
-    def __init__(self, files: Sequence[Path], count: int, seed: int) -> None:
+    def __init__(
+        self, files: Sequence[Path], count: int, seed: int, more: Sequence[Path] = (), share: float = 0.25
+    ) -> None:
         self.files, self.count, self.seed = list(files), count, seed
+        self.more, self.share = list(more), share if more else 0.0
 
     def __len__(self) -> int:
         return self.count
@@ -67,9 +79,10 @@ class TrainingSamples(Dataset[Sample]):
     def __getitem__(self, index: int) -> Sample:
         rng = np.random.default_rng((self.seed, index))
         while True:
-            scene = read_scene(self.files[rng.integers(len(self.files))])
-            views = _crop(_choose_views(scene, rng), rng)
-            valid = views.depth[views.depth > 0]
+            files = self.more if self.share and rng.random() < self.share else self.files
+            scene = read_scene(files[rng.integers(len(files))])
+            views = _upright(_crop(_choose_views(scene, rng), rng), rng)
+            valid = views.depth[(views.depth > 0) & views.depth.isfinite()]
             if len(valid) >= _LEAST_PIXELS:
                 return _finish(views, valid, rng)
 
@@ -82,20 +95,42 @@ class _Crop(NamedTuple):
 
 
 def _choose_views(scene: SceneFrames, rng: Generator) -> _Crop:
-    """Views within a stretch of the path that turns by at most 0.3 to 1.1 fields of view, so that they overlap."""
-    frames = len(scene.images)
-    count = _VIEWS
-    field = 2 * math.atan(0.5 * scene.images.shape[2] / float(scene.intrinsics[0, 0]))
-    most = field * rng.uniform(0.3, 1.1)
-    first = int(rng.integers(0, frames - count + 1))
+    """Views that overlap: a stretch of a walk, or of other paths what sees the same as a view drawn at random."""
     rotations = scene.world_to_camera[:, :3, :3]
-    end = first + count
-    while end < frames and _angle(rotations[first], rotations[end]) < most:
-        end += 1
-    rows = np.sort(first + rng.permutation(end - first)[:count])
+    frames, count = len(scene.images), _VIEWS
+    step = np.median([_angle(*pair) for pair in pairwise(rotations)])
+    if frames <= _WALK_FRAMES and step < _WALK_STEP:
+        field = 2 * math.atan(0.5 * scene.images.shape[2] / float(scene.intrinsics[0, 0, 0]))
+        most = field * rng.uniform(0.3, 1.1)
+        first = int(rng.integers(0, frames - count + 1))
+        end = first + count
+        while end < frames and _angle(rotations[first], rotations[end]) < most:
+            end += 1
+        rows = np.sort(first + rng.permutation(end - first)[:count])
+    else:
+        rows = _overlapping(scene, count, rng)
     images = scene.images[rows].permute(0, 3, 1, 2).float() / 255
-    intrinsics = scene.intrinsics.expand(count, 3, 3)
-    return _Crop(images, scene.depth[rows].float(), scene.world_to_camera[rows], intrinsics)
+    return _Crop(images, scene.depth[rows].float(), scene.world_to_camera[rows], scene.intrinsics[rows])
+
+
+def _overlapping(scene: SceneFrames, count: int, rng: Generator) -> NDArray[np.int64]:
+    """A view drawn at random and others, drawn by how much of it they see."""
+    first = int(rng.integers(len(scene.images)))
+    height, width = scene.depth.shape[-2:]
+    cameras = Cameras(scene.world_to_camera[None], scene.intrinsics[None], (height, width))
+    depth = scene.depth[first].float()
+    points = unproject(depth.nan_to_num(posinf=0)[None, None], cameras.select(slice(first, first + 1)))[0, 0]
+    points = points[6::12, 6::12][(depth > 0)[6::12, 6::12] & depth.isfinite()[6::12, 6::12]]  # [P, 3]
+    pixels, z = project(points[None, None].expand(1, len(scene.images), -1, -1), cameras)
+    u, v, z = pixels[0, ..., 0].round().long(), pixels[0, ..., 1].round().long(), z[0]
+    inside = (z > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    rows = torch.arange(len(u))[:, None]
+    there = scene.depth[rows, v.clamp(0, height - 1), u.clamp(0, width - 1)].float()
+    overlap = (inside & (z < 1.05 * there)).float().mean(1).numpy() if len(points) else np.ones(len(u))
+    overlap[first] = 0
+    likely = np.maximum(overlap, 1e-3) ** rng.uniform(0, 2) * np.where(overlap > _LEAST_OVERLAP, 1.0, 1e-4)
+    likely[first] = 0
+    return np.append(first, rng.choice(len(likely), count - 1, replace=False, p=likely / likely.sum()))
 
 
 def _angle(first: Tensor, second: Tensor) -> float:
@@ -108,7 +143,7 @@ def _crop(views: _Crop, rng: Generator) -> _Crop:
     height, width = views.depth.shape[-2:]
     target = _SIZES[rng.choice(len(_SIZES), p=_SIZE_SHARES)]
     most = min(height / target[0], width / target[1])
-    zoom = math.exp(rng.uniform(math.log(0.8), math.log(most)))
+    zoom = math.exp(rng.uniform(math.log(min(0.8, most)), math.log(most)))
     rows, columns = int(target[0] * zoom), int(target[1] * zoom)
     top, left = int(rng.integers(0, height - rows + 1)), int(rng.integers(0, width - columns + 1))
     window = (..., slice(top, top + rows), slice(left, left + columns))
@@ -125,6 +160,22 @@ def _crop(views: _Crop, rng: Generator) -> _Crop:
     return _Crop(images.clamp(0, 1), depth, poses.clone(), intrinsics)
 
 
+def _upright(views: _Crop, rng: Generator) -> _Crop:
+    """Turns all views by 90 degrees to the left, in a share of the draws, half of them to the right."""
+    draw = rng.random()
+    if draw >= _UPRIGHT_SHARE:
+        return views
+    images, depth, poses, intrinsics = views
+    turn = torch.tensor([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    for _ in range(1 if draw < _UPRIGHT_SHARE / 2 else 3):
+        turned = torch.zeros_like(intrinsics)  # a pixel (x, y) comes to (y, W - 1 - x)
+        turned[:, 0, 0], turned[:, 1, 1], turned[:, 2, 2] = intrinsics[:, 1, 1], intrinsics[:, 0, 0], 1.0
+        turned[:, 0, 2], turned[:, 1, 2] = intrinsics[:, 1, 2], images.shape[-1] - 1 - intrinsics[:, 0, 2]
+        images, depth = images.rot90(1, (-2, -1)), depth.rot90(1, (-2, -1))
+        poses, intrinsics = turn @ poses, turned
+    return _Crop(images.contiguous(), depth.contiguous(), poses, intrinsics)
+
+
 def _finish(views: _Crop, valid: Tensor, rng: Generator) -> Sample:
     """Draws the unit, the planes' range around the true one, the noise of the poses and the look."""
     unit = math.exp(rng.normal(0, 0.5))  # the world's unit is nothing to go by
@@ -133,19 +184,21 @@ def _finish(views: _Crop, valid: Tensor, rng: Generator) -> Sample:
     low, middle, high = (
         float(unit * torch.quantile(valid[:: max(len(valid) // 4000, 1)], q)) for q in (0.01, 0.5, 0.99)
     )
+    if rng.random() < _CUT_SHARE:  # as structure from motion does that found no point in the background
+        high = float(unit * torch.quantile(valid[:: max(len(valid) // 4000, 1)], rng.uniform(0.5, 0.98)))
     near = low * math.exp(-(rng.uniform(0.02, 0.5) if rng.random() < 0.75 else rng.uniform(0, 1.8)))
     far = high * math.exp(rng.uniform(0, 0.6) if rng.random() < 0.75 else rng.uniform(0, 2.5))
     if rng.random() < _POSE_SHARE:
-        poses = _pose_noise(len(poses), middle, rng) @ poses
+        poses = _pose_noise(len(poses), min(middle, 3 * low), rng) @ poses
     planes = int(rng.choice(_PLANES))
     sources = int(rng.choice(_SOURCES, p=_SOURCE_SHARES))
     look = recolour(views.images, rng)
     return Sample(look, depth, poses, views.intrinsics, torch.tensor([near, far]), planes, sources)
 
 
-def _pose_noise(views: int, median_depth: float, rng: Generator) -> Tensor:
+def _pose_noise(views: int, depth: float, rng: Generator) -> Tensor:
     turns = torch.from_numpy(rng.normal(0, _TURN, (views, 3))).float()
-    return rigid_motions(turns, torch.from_numpy(rng.normal(0, _SHIFT * median_depth, (views, 3))).float())
+    return rigid_motions(turns, torch.from_numpy(rng.normal(0, _SHIFT * depth, (views, 3))).float())
 
 
 def recolour(images: Tensor, rng: Generator) -> Tensor:

@@ -1,10 +1,11 @@
-"""Procedural training scenes with free cameras (focal length, roll, shake), rendered once and cached."""
+"""Training scenes: procedural ones with free cameras (focal length, roll, shake), cached, and rooms of Infinigen."""
 
 from __future__ import annotations
 
 import io
 import os
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,9 +14,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from vg2gt.data.synthetic.outdoor import SyntheticOutdoor
-from vg2gt.data.synthetic.rooms import SyntheticRoom
-from vg2gt.data.synthetic.synthetic_scene import SyntheticScene
+from vg2gt.data.sources.infinigen import Infinigen
+from vg2gt.data.synthetic.photograph import Photograph
+from vg2gt.data.synthetic.source import VARIANTS
+from vg2gt.data.synthetic.synthetic_scene import LOBES, SyntheticScene
 from vg2gt.geometry.cameras import rigid_motions
 from vg2gt.io.files import write_cached
 from vg2gt.io.npz import read_npz
@@ -24,17 +26,20 @@ FIRST_SEED = 5_000_000  # far from the seeds that VG²GT is trained (0 ...) and 
 SIZE = (144, 288)
 FRAMES = 14
 _STREAM = 77  # tells the random stream of the cameras from that of the scene
+_KINDS = ("room", "object", "room", "wide", "object", "room", "landmark", "object", "wide", "outdoor")  # take turns
+_WALKS = ("room", "outdoor")
+_EXPOSURE, _JPEG = 0.7, (40, 95)  # of two thirds of the scenes: stops, quality
 _PATH_LENGTHS = (14, 20, 32, 44)  # of the whole path, of which FRAMES consecutive ones are taken: fewer are wider apart
 
 
 class SceneFrames(NamedTuple):
-    """Consecutive frames of one scene.
+    """Frames of one scene.
 
     Attributes:
         images: ``[N, H, W, 3]`` uint8.
-        depth: ``[N, H, W]`` z-depth in metres, float16, 0 in the sky.
+        depth: ``[N, H, W]`` z-depth in metres, float16, 0 where it is unknown, infinite in the sky.
         world_to_camera: ``[N, 4, 4]`` float32.
-        intrinsics: ``[3, 3]`` float32.
+        intrinsics: ``[N, 3, 3]`` float32.
     """
 
     images: Tensor
@@ -55,26 +60,45 @@ def read_scene(path: Path) -> SceneFrames:
 
 
 def render_scene(seed: int, threads: int = 1) -> dict[str, NDArray]:
-    """Renders one training scene; every fifth is outdoors.
+    """Renders one training scene: a room, an object, a landmark or a street, the kinds of ``_KINDS`` taking turns.
 
-    The world is that of :mod:`vg2gt.data.synthetic`; focal length, roll, shake and highlights are drawn here, because
-    photographs have them and matching must not depend on level cameras of one field of view.
+    The world is that of :mod:`vg2gt.data.synthetic`; focal length, roll, shake, highlights and the look of the images
+    are drawn here, because photographs have them and matching must not depend on level cameras of one field of view.
     """
     rng = np.random.default_rng((_STREAM, seed))
-    outdoor = seed % 5 == 4
-    path = int(rng.choice(_PATH_LENGTHS))
-    scene = (SyntheticOutdoor if outdoor else SyntheticRoom)(seed, path, SIZE, bool(rng.random() < 0.4))
+    kind = _KINDS[seed % len(_KINDS)]
+    path = int(rng.choice(_PATH_LENGTHS)) if kind in _WALKS else FRAMES
+    shine = (False, True, LOBES)[rng.choice(3, p=(0.5, 0.3, 0.2))]
+    scene = VARIANTS[kind](seed, path, SIZE, shine)
     focal = 0.5 * SIZE[1] / np.tan(rng.uniform(0.75, 1.5) / 2)
-    scene.intrinsics = np.array([[focal, 0, (SIZE[1] - 1) / 2], [0, focal, (SIZE[0] - 1) / 2], [0, 0, 1]])
+    if kind in _WALKS or kind == "wide":
+        scene.intrinsics = np.array([[focal, 0, (SIZE[1] - 1) / 2], [0, focal, (SIZE[0] - 1) / 2], [0, 0, 1]])
     first = int(rng.integers(0, path - FRAMES + 1))
     frames = np.arange(first, first + FRAMES)
-    scene.world_to_camera = _shake(scene, rng, 0.06 if outdoor else 0.02)
+    reach = 1.0 if kind == "room" else float(np.linalg.norm(scene.world_to_camera[:, :3, 3], axis=1).mean()) / 2
+    scene.world_to_camera = _shake(scene, rng, 0.06 if kind == "outdoor" else 0.02 * reach)
+    photograph = Photograph(_EXPOSURE, _JPEG)
+    if rng.random() < 0.67:
+        scene.develop = partial(photograph.develop, seed)
     rendered = scene.render(frames.tolist(), threads, samples=1)
+    depth = np.stack([frame.depth for frame in rendered])
     return {
         "images": np.stack([frame.image for frame in rendered]),
-        "depth": np.stack([frame.depth for frame in rendered]).astype(np.float16),
+        "depth": np.where(depth > 0, depth, np.inf).astype(np.float16),
         "world_to_camera": scene.world_to_camera[frames].astype(np.float32),
-        "intrinsics": scene.intrinsics.astype(np.float32),
+        "intrinsics": np.tile(scene.intrinsics.astype(np.float32), (FRAMES, 1, 1)),
+    }
+
+
+def infinigen_scene(source: Infinigen, scene: str) -> dict[str, NDArray]:
+    """A room of ``recipes/infinigen`` as the same arrays: what its windows show is the sky."""
+    frames = source.load(scene, source.frames(scene))
+    depth = frames.depth.numpy()
+    return {
+        "images": (frames.images.permute(0, 2, 3, 1) * 255).round().byte().numpy(),
+        "depth": np.where(depth > 0, depth, np.inf).astype(np.float16),
+        "world_to_camera": frames.world_to_camera.numpy().astype(np.float32),
+        "intrinsics": frames.intrinsics.numpy().astype(np.float32),
     }
 
 
@@ -94,7 +118,23 @@ def make_scenes(folder: str | os.PathLike[str], count: int, first_seed: int = FI
     for seed in range(first_seed, first_seed + count):
         path = scene_file(root, seed)
         if not path.is_file():
-            buffer = io.BytesIO()
-            np.savez(buffer, **render_scene(seed))  # pyright: ignore[reportArgumentType]
-            write_cached(path, buffer.getvalue(), root)
+            _write(path, render_scene(seed), root)
         yield path
+
+
+def read_infinigen(folder: str | os.PathLike[str], cache: str | os.PathLike[str]) -> list[Path]:
+    """Copies the rooms that there are below ``folder`` into files that are quick to read; returns these."""
+    root, paths = Path(cache).expanduser(), []
+    source = Infinigen(str(folder))
+    for scene in source.scenes:
+        path = root / f"infinigen-{scene.replace('/', '-')}.npz"
+        if not path.is_file():
+            _write(path, infinigen_scene(source, scene), root)
+        paths.append(path)
+    return paths
+
+
+def _write(path: Path, arrays: dict[str, NDArray], root: Path) -> None:
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)  # pyright: ignore[reportArgumentType]
+    write_cached(path, buffer.getvalue(), root)

@@ -15,43 +15,48 @@ from backends.sweep.network import Sweep, SweepEncoding
 from backends.sweep.volume import from_inverse
 from recipes.sweep.objective import cell_inverse, objective
 from recipes.sweep.samples import Sample, TrainingSamples, _choose_views, _crop, recolour
-from recipes.sweep.scenes import make_scenes, read_scene
+from recipes.sweep.scenes import make_scenes, read_infinigen, read_scene
 from recipes.sweep.weights import newest_checkpoint
 from tests.commands import ROOT
+from tests.data.sources import layout_infinigen
+from tests.data.sources.layouts import room
 from vg2gt.geometry.cameras import project, unproject
 from vg2gt.types import Cameras
 
 
 @pytest.fixture(scope="module")
 def scenes(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    return list(make_scenes(tmp_path_factory.mktemp("scenes"), 2))
+    return list(make_scenes(tmp_path_factory.mktemp("scenes"), 4))  # two rooms, an object, a room from all around
 
 
 def test_scenes_are_made_once(scenes: list[Path]) -> None:
     before = [path.stat().st_mtime_ns for path in scenes]
-    assert list(make_scenes(scenes[0].parent, 2)) == scenes
+    assert list(make_scenes(scenes[0].parent, 4)) == scenes
     assert [path.stat().st_mtime_ns for path in scenes] == before
 
 
-@pytest.mark.parametrize("index", [0, 1, 2, 3])
-def test_views_of_a_sample_see_the_same_points(scenes: list[Path], index: int) -> None:
-    """Crop, zoom, mirror and unit change images, depth, poses and intrinsics together."""
-    sample: Sample = TrainingSamples(scenes, 10, seed=3)[index]
-    views = len(sample.depth)
-    size = (sample.depth.shape[-2], sample.depth.shape[-1])
-    cameras = Cameras(sample.world_to_camera[None], sample.intrinsics[None], size)
-    points = unproject(sample.depth[None], cameras)[0]  # [V, H, W, 3]
-    agreed = []
-    for other in range(1, views):
-        pixels, depth = project(points[0].reshape(1, 1, -1, 3), cameras.select(slice(other, other + 1)))
-        u, v, z = pixels[0, 0, :, 0], pixels[0, 0, :, 1], depth[0, 0]
-        inside = (z > 0) & (u > 0) & (v > 0) & (u < size[1] - 1) & (v < size[0] - 1) & (sample.depth[0].flatten() > 0)
-        grid = torch.stack(((2 * u + 1) / size[1] - 1, (2 * v + 1) / size[0] - 1), -1)[None, None]
-        there = F.grid_sample(sample.depth[other][None, None], grid, mode="nearest", align_corners=False)[0, 0, 0]
-        if inside.sum() > 200:
-            agreed.append(float((((there / z) - 1).abs() < 0.03)[inside].float().mean()))
-    assert agreed
+def test_views_of_a_sample_see_the_same_points(scenes: list[Path]) -> None:
+    """Crop, zoom, mirror, turn and unit change images, depth, poses and intrinsics together."""
+    samples = TrainingSamples(scenes, 10, seed=3)
+    agreed, through = [], []
+    for sample in (samples[index] for index in range(10)):
+        size = (sample.depth.shape[-2], sample.depth.shape[-1])
+        cameras = Cameras(sample.world_to_camera[None], sample.intrinsics[None], size)
+        points = unproject(sample.depth[None], cameras)[0]  # [V, H, W, 3]
+        known = ((sample.depth[0] > 0) & sample.depth[0].isfinite()).flatten()
+        for other in range(1, len(sample.depth)):
+            pixels, depth = project(points[0].reshape(1, 1, -1, 3), cameras.select(slice(other, other + 1)))
+            u, v, z = pixels[0, 0, :, 0], pixels[0, 0, :, 1], depth[0, 0]
+            inside = (z > 0) & (u > 0) & (v > 0) & (u < size[1] - 1) & (v < size[0] - 1) & known
+            grid = torch.stack(((2 * u + 1) / size[1] - 1, (2 * v + 1) / size[0] - 1), -1)[None, None]
+            there = F.grid_sample(sample.depth[other][None, None], grid, mode="nearest", align_corners=False)
+            ratio = there[0, 0, 0] / z
+            if inside.sum() > 200:
+                agreed.append(float(((ratio - 1).abs() < 0.03)[inside].float().mean()))
+                through.append(float((ratio > 1.03)[inside].float().mean()))
+    assert len(agreed) > 15
     assert np.median(agreed) > 0.6  # the rest is hidden there
+    assert np.median(through) < 0.05  # almost nothing that one view sees is looked through by another
 
 
 class _Draws:
@@ -159,6 +164,32 @@ def test_uncertainty_is_lowest_where_it_says_the_error(slope) -> None:
     scales = torch.linspace(-4, 0, 41)
     terms = [objective(found, 1.1 * depth, torch.full_like(depth, float(s)), sample)[1]["uncertainty"] for s in scales]
     assert abs(float(scales[torch.stack(terms).argmin()].exp()) - np.log(1.1)) < 0.01
+
+
+def test_what_is_beyond_the_planes_only_has_to_be_far(slope) -> None:
+    """Sky and what is farther than 1.5 times the farthest plane (10): any larger depth is right, no nearer one is."""
+    sample, found, depth = slope
+    unsure = torch.full_like(depth, -0.3)
+    for truth in (100.0, torch.inf):
+        beyond = sample._replace(depth=torch.full_like(depth, truth))
+        depths = [torch.full_like(depth, value) for value in (3.0, 12.0, 15.1, 90.0)]
+        terms = [objective(found, value, unsure, beyond)[1] for value in depths]
+        near, less_near, far, farther = (float(term["depth"]) for term in terms)
+        assert near > less_near > 0.2
+        assert far == farther == 0
+        assert all(torch.isfinite(value).all() for term in terms for value in term.values())
+        sure = objective(found, depths[2], torch.full_like(depth, -4.0), beyond)[1]
+        assert float(sure["uncertainty"]) > float(terms[2]["uncertainty"])
+
+
+def test_rooms_of_infinigen_are_read(tmp_path: Path) -> None:
+    layout_infinigen.write(tmp_path / "rooms" / "a", room(), [f"0_0_{n:04d}_0" for n in range(6)], 1)
+    (path,) = read_infinigen(tmp_path / "rooms", tmp_path / "cache")
+    scene, truth = read_scene(path), room()
+    assert scene.images.shape[:1] == scene.intrinsics.shape[:1] == truth.images.shape[:1]
+    shown = truth.depth > 0
+    torch.testing.assert_close(scene.depth.float()[shown], truth.depth[shown], rtol=1e-3, atol=0)
+    assert scene.depth[~shown].isinf().all()
 
 
 @pytest.mark.slow

@@ -6,8 +6,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from vg2gt.gaussians.far_shell import COUNT, far_shell, is_far
 from vg2gt.geometry.rotations import quat_to_matrix
+from vg2gt.method.additions.far_shell import COUNT, far_shell, is_far
 from vg2gt.rendering import render
 from vg2gt.types import Cameras, Gaussians
 

@@ -5,9 +5,9 @@ import pytest
 import torch
 from torch import nn
 
-from vg2gt.gaussians import GaussianHead
-from vg2gt.gaussians.surfel import surfel_start
 from vg2gt.geometry.rotations import quat_to_matrix
+from vg2gt.method import GaussianHead
+from vg2gt.method.additions.surfel import surfel_start
 from vg2gt.types import VoxelMoments, Voxels
 
 

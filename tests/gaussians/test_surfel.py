@@ -7,10 +7,18 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from vg2gt.gaussians.surfel import ALONE, COLOR_GAIN, MIN_REACH, SHARED, THICKNESS, surface_frame, surfel_start
 from vg2gt.geometry.rotations import quat_to_matrix
+from vg2gt.method.additions.surfel import (
+    ALONE,
+    COLOR_GAIN,
+    MIN_REACH,
+    SHARED,
+    THICKNESS,
+    surface_frame,
+    surfel_start,
+)
+from vg2gt.method.additions.voxel_normals import facing_normals
 from vg2gt.types import VoxelMoments
-from vg2gt.voxels.normals import facing_normals
 
 
 def moments_of(points: Tensor, colors: Tensor, facing: Tensor, pixel: float = 0.0) -> VoxelMoments:

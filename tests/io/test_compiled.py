@@ -10,11 +10,11 @@ import pytest
 from numba.core.dispatcher import Dispatcher
 
 from tests.commands import ROOT
-from vg2gt.io import compiled
+from vg2gt.kernels import compiled
 
 CONSTANTS = "LIMIT = {}\n"
 KERNEL = """
-from vg2gt.io.compiled import kernel
+from vg2gt.kernels.compiled import kernel
 from made.constants import LIMIT
 
 @kernel()
@@ -67,7 +67,7 @@ def test_without_a_home_kernels_run(room, tmp_path, monkeypatch, caplog):
 
 
 ONE = """
-from vg2gt.io.compiled import kernel
+from vg2gt.kernels.compiled import kernel
 
 @kernel()
 def add_one(x):

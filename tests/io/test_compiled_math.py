@@ -5,7 +5,7 @@ import numpy as np
 import torch
 from torch.nn import functional as F
 
-from vg2gt.io.compiled_math import exp, gelu
+from vg2gt.kernels.compiled_math import exp, gelu
 
 
 @numba.njit

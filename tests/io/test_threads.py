@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from tests.commands import ROOT
-from vg2gt.io import threads
-from vg2gt.io.threads import parallel_for
+from vg2gt.kernels import threads
+from vg2gt.kernels.threads import parallel_for
 
 
 @pytest.fixture(params=["team", "pool"])
@@ -51,7 +51,7 @@ def test_an_error_is_raised_and_the_next_loop_runs():
 INTERRUPTED = """
 import os, random, signal, threading, time
 import torch
-from vg2gt.io.threads import parallel_for
+from vg2gt.kernels.threads import parallel_for
 
 def interrupt():
     time.sleep(2e-4 + 2e-3 * random.random())

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from tests.refinement.conftest import VIEWS, Start
-from vg2gt.gaussians.surfel import ALONE, SPACING
 from vg2gt.geometry.cameras import invert_rigid
+from vg2gt.method.additions.surfel import ALONE, SPACING
 from vg2gt.refinement import RefinedScene, RefineLoss, RefineRates
 from vg2gt.refinement.density import prune, split
 from vg2gt.refinement.parameters import Parameters

@@ -15,11 +15,11 @@ from torch.nn import functional as F
 import vg2gt.baselines.pixels
 import vg2gt.baselines.voxel_merged
 import vg2gt.losses.objective
+import vg2gt.method.additions.surface_evidence
+import vg2gt.method.coarse
+import vg2gt.method.fine
 import vg2gt.rendering.renderer
 import vg2gt.training.module
-import vg2gt.voxels.coarse
-import vg2gt.voxels.fine
-import vg2gt.voxels.surface
 from tests.reliability.steps import first_batches, fit, tiny_run
 from tests.training_helpers import full_model
 from vg2gt.evaluation.in_training import evaluate_scene
@@ -151,18 +151,18 @@ def dtypes(value: Any, skip: tuple[str, ...] = ()) -> Iterator[tuple[str, torch.
 NETWORKS = ("patch", "camera", "features")
 
 PLACES: list[tuple[Any, str]] = [
-    (vg2gt.voxels.coarse, "unproject"),
-    (vg2gt.voxels.coarse, "scene_voxel_size"),
-    (vg2gt.voxels.coarse, "point_cells"),
-    (vg2gt.voxels.coarse, "pool_mean"),
-    (vg2gt.voxels.coarse, "pool_min"),
-    (vg2gt.voxels.coarse, "interpolation_weights"),
-    (vg2gt.voxels.surface, "normals_from_depth"),
-    (vg2gt.voxels.fine, "unproject"),
-    (vg2gt.voxels.fine, "scene_voxel_size"),
-    (vg2gt.voxels.fine, "point_cells"),
-    (vg2gt.voxels.fine, "pool_mean"),
-    (vg2gt.voxels.fine, "pool_min"),
+    (vg2gt.method.coarse, "unproject"),
+    (vg2gt.method.coarse, "scene_voxel_size"),
+    (vg2gt.method.coarse, "point_cells"),
+    (vg2gt.method.coarse, "pool_mean"),
+    (vg2gt.method.coarse, "pool_min"),
+    (vg2gt.method.coarse, "interpolation_weights"),
+    (vg2gt.method.additions.surface_evidence, "normals_from_depth"),
+    (vg2gt.method.fine, "unproject"),
+    (vg2gt.method.fine, "scene_voxel_size"),
+    (vg2gt.method.fine, "point_cells"),
+    (vg2gt.method.fine, "pool_mean"),
+    (vg2gt.method.fine, "pool_min"),
     (vg2gt.training.module, "training_cameras"),
     (vg2gt.rendering.renderer, "_scene_views"),
     (Renderer, "__call__"),

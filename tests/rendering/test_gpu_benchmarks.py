@@ -35,8 +35,8 @@ def test_a_step_is_a_few_launches_and_one_wait_whatever_the_views(step: ModuleTy
 
 def test_many_refused_slots_do_not_overflow_their_sum(benchmark_script) -> None:
     """One bad camera seen by ten million Gaussians: with 2^40 a slot the sum was negative, and memory was asked for."""
-    from vg2gt.rendering.gpu import RefusedError, render_triton
-    from vg2gt.rendering.gpu.projection import REFUSED, SLOTS
+    from vg2gt.kernels.render_gpu.projection import REFUSED, SLOTS
+    from vg2gt.rendering.gpu_tiles import RefusedError, render_triton
 
     assert SLOTS * REFUSED < 1 << 63
     count = (1 << 23) + 5
@@ -50,7 +50,7 @@ def test_many_refused_slots_do_not_overflow_their_sum(benchmark_script) -> None:
 
 def test_more_slots_than_can_be_numbered_are_refused(benchmark_script) -> None:
     """A view whose Gaussians are so many; views are rendered in parts."""
-    from vg2gt.rendering.gpu.function import _list
+    from vg2gt.rendering.gpu_tiles import _list
 
     views, count = (1 << 19) + 1, 1 << 11
     few, matrix = torch.zeros(count, 3), torch.eye(4).expand(1, views, 4, 4)

@@ -22,8 +22,8 @@ from tests.rendering.scenes import (
     wall,
     with_gradients,
 )
-from vg2gt.rendering import render
-from vg2gt.rendering.cpu import function, tiles
+from vg2gt.kernels.render_cpu import tiles
+from vg2gt.rendering import cpu_tiles, render
 from vg2gt.rendering.options import DepthKind, Mode
 from vg2gt.rendering.renderer import Implementation
 
@@ -58,10 +58,10 @@ def test_tiles_with_more_hits_than_there_is_room_for_are_rendered_again(monkeypa
     gaussians = replace(gaussians, opacities=gaussians.opacities * 0.1)
     expected = render(gaussians, cameras, implementation="cpu")
     given = []
-    aligned = function._aligned
-    monkeypatch.setattr(function, "_local", threading.local())  # no memory of other tests
-    monkeypatch.setattr(function, "HIT_CAPACITY", 3)
-    monkeypatch.setattr(function, "_aligned", lambda count, dtype: given.append(count) or aligned(count, dtype))
+    aligned = cpu_tiles._aligned
+    monkeypatch.setattr(cpu_tiles, "_local", threading.local())  # no memory of other tests
+    monkeypatch.setattr(cpu_tiles, "HIT_CAPACITY", 3)
+    monkeypatch.setattr(cpu_tiles, "_aligned", lambda count, dtype: given.append(count) or aligned(count, dtype))
     found = render(gaussians, cameras, implementation="cpu")
     sizes = [count // (tiles.BLOCKS * tiles.HIT_SIZE) for count in given]
     assert 3 in sizes

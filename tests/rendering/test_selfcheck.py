@@ -47,7 +47,7 @@ def test_right_kernels_agree_far_within_the_bounds(mode: Mode) -> None:
     "name", [name if name == "rows not summed" else pytest.param(name, marks=pytest.mark.slow) for name in MUTANTS]
 )
 def test_wrong_kernels_are_refused(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from vg2gt.rendering.gpu import kernels
+    from vg2gt.kernels.render_gpu import kernels
 
     module, before, after = MUTANTS[name]
     source = Path(kernels.__file__).with_name(f"{module}.py").read_text()

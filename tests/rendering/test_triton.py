@@ -87,16 +87,16 @@ def test_color_only_and_rays_with_many_hits() -> None:
 
 @runnable
 def test_gradients_are_the_same_however_many_views_are_held_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    from vg2gt.rendering.gpu import function
+    from vg2gt.rendering import gpu_tiles
 
-    assert function._chunks([4, 4, 9, 10], function.ROWS) == ((0, 4, 0, 10),)
+    assert gpu_tiles._chunks([4, 4, 9, 10], gpu_tiles.ROWS) == ((0, 4, 0, 10),)
     gaussians, cameras = soup(7, size=0.25), cameras_around((5, 11), views=3)
     options = {"mode": "rasterized", "implementation": "triton"}
     _, expected = render_with_gradients(gaussians, cameras, DEVICE, **options)
-    assert function._chunks([4, 4, 9, 10], 5) == ((0, 2, 0, 4), (2, 1, 4, 9), (3, 1, 9, 10))
-    assert function._chunks([9, 18], 5) == ((0, 1, 0, 9), (1, 1, 9, 18))
-    monkeypatch.setattr(function, "_rows_at_once", lambda device: 5)
-    monkeypatch.setattr(function, "_slots_at_once", lambda device: 2 * len(gaussians))  # two views, then one
+    assert gpu_tiles._chunks([4, 4, 9, 10], 5) == ((0, 2, 0, 4), (2, 1, 4, 9), (3, 1, 9, 10))
+    assert gpu_tiles._chunks([9, 18], 5) == ((0, 1, 0, 9), (1, 1, 9, 18))
+    monkeypatch.setattr(gpu_tiles, "_rows_at_once", lambda device: 5)
+    monkeypatch.setattr(gpu_tiles, "_slots_at_once", lambda device: 2 * len(gaussians))  # two views, then one
     _, grads = render_with_gradients(gaussians, cameras, DEVICE, **options)
     for name, grad in expected.items():
         torch.testing.assert_close(grads[name], grad, rtol=1e-12, atol=1e-12)  # summed in another order

@@ -18,7 +18,7 @@ from tests.commands import shell
 from tests.reliability import crash_harness
 from tests.training_helpers import SMALL, full_model, small_config
 from vg2gt.data import DataError, Frames, SyntheticScenes
-from vg2gt.gaussians import GaussianHead
+from vg2gt.method import GaussianHead
 from vg2gt.runs.checkpoints import newest_valid, read_checkpoint
 from vg2gt.runs.lock import only_process_in
 from vg2gt.training.loop import build, evaluate, train

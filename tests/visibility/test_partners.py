@@ -5,8 +5,8 @@ import math
 import torch
 
 from tests.visibility.test_counts import INTRINSICS, SIZE, sideways
+from vg2gt.method.additions.visibility import choose_partners
 from vg2gt.types import Cameras
-from vg2gt.visibility import choose_partners
 
 
 def ring(views: int, radius: float = 2.0) -> Cameras:

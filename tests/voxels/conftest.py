@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from vg2gt.geometry.cameras import invert_rigid, ray_directions
+from vg2gt.method import CoarseModule, DenseHead, FineModule, PointMLP, PTv3
 from vg2gt.types import Cameras, Geometry, Tokens
-from vg2gt.voxels import CoarseModule, DenseHead, FineModule, PointMLP, PTv3
 
 PATCH = 14
 TOKEN_DIM = 24

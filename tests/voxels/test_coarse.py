@@ -3,8 +3,8 @@ from dataclasses import replace
 import pytest
 import torch
 
+from vg2gt.method.coarse import PatchPoints
 from vg2gt.types import Cameras
-from vg2gt.voxels.coarse import PatchPoints
 
 
 def perturb(module, seed=0):

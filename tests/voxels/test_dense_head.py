@@ -1,6 +1,6 @@
 import torch
 
-from vg2gt.voxels import DenseHead
+from vg2gt.method import DenseHead
 
 
 def test_full_resolution_for_every_number_of_taps(make_room):

@@ -137,7 +137,7 @@ def test_duplicated_views_add_no_voxels_and_new_views_few(make_fine, make_room):
 def test_cap_keeps_the_most_confident_and_says_so(make_fine, make_room, caplog):
     inputs = make_room(scenes=2)
     everything = make_fine()(*inputs)
-    with caplog.at_level(logging.WARNING, logger="vg2gt.voxels.fine"):
+    with caplog.at_level(logging.WARNING, logger="vg2gt.method.fine"):
         capped = make_fine(max_voxels=50)(*inputs)
     assert "max_voxels=50" in caplog.text
     assert torch.bincount(capped.batch).tolist() == [50, 50]

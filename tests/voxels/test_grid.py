@@ -3,9 +3,8 @@ import math
 import pytest
 import torch
 
-from vg2gt.types import Cameras, Geometry
-from vg2gt.voxels import grid
-from vg2gt.voxels.grid import (
+from vg2gt.method import grid
+from vg2gt.method.grid import (
     in_range,
     mixed_radix_keys,
     plan_voxels,
@@ -15,6 +14,7 @@ from vg2gt.voxels.grid import (
     scene_voxel_size,
     warn_if_sparse,
 )
+from vg2gt.types import Cameras, Geometry
 
 SIZE = torch.tensor([0.125, 0.25])
 

@@ -2,9 +2,10 @@ import pytest
 import torch
 from scipy.spatial import KDTree
 
-from vg2gt.voxels import cell_search, knn
-from vg2gt.voxels.cell_search import nearest_by_cells
-from vg2gt.voxels.knn import interpolate, interpolation_weights, nearest_neighbors
+from vg2gt.kernels import cell_search
+from vg2gt.kernels.cell_search import nearest_by_cells
+from vg2gt.method import knn
+from vg2gt.method.knn import interpolate, interpolation_weights, nearest_neighbors
 
 
 @pytest.fixture(params=["trees", "cells"], autouse=True)

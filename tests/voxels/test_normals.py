@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from vg2gt.voxels import normals
-from vg2gt.voxels.grid import VoxelPlan, plan_voxels, pool_mean
-from vg2gt.voxels.normals import surface_normals
+from vg2gt.method.additions import voxel_normals as normals
+from vg2gt.method.additions.voxel_normals import surface_normals
+from vg2gt.method.grid import VoxelPlan, plan_voxels, pool_mean
 
 UP = torch.tensor([0.1, -0.2, 1.0])
 FLOOR = torch.tensor([0.0, 0.0, 1.0])
@@ -106,7 +106,7 @@ def test_facing_normals_are_eigenvectors(size: float, values: tuple[float, ...])
     sight = facing.double()
     prior = normals.FACING_PRIOR * (torch.eye(3) - sight[:, :, None] * sight[:, None])
     expected = torch.linalg.eigh(spread.double() + prior).eigenvectors[..., 0]
-    compiled = normals.facing_compiled(spread, facing).double()
+    compiled = normals.facing_compiled(spread, facing, normals.FACING_PRIOR).double()
     plain = normals.facing_reference(spread.double(), sight)
     for found, tolerance in ((compiled, 2e-7), (plain, 1e-9)):
         assert torch.linalg.cross(found, expected).norm(dim=-1).max() < tolerance
@@ -118,7 +118,7 @@ def test_without_a_single_least_direction_the_normal_faces_the_cameras(values: t
     """Cells with nothing but the prior, and those beside whose spread the prior is lost."""
     facing = F.normalize(torch.randn(50, 3, generator=torch.Generator().manual_seed(2)), dim=-1)
     spread = torch.diag(torch.tensor(values)).expand(50, 3, 3)
-    found = normals.facing_compiled(spread, facing)
+    found = normals.facing_compiled(spread, facing, normals.FACING_PRIOR)
     torch.testing.assert_close(found, normals.facing_reference(spread.double(), facing.double()).float())
     torch.testing.assert_close(found, facing)
 

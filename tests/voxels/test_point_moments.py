@@ -6,9 +6,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from vg2gt.voxels import point_moments
-from vg2gt.voxels.grid import VoxelPlan, plan_voxels, pool_mean
-from vg2gt.voxels.point_moments import Moments, pool_point_moments
+from vg2gt.kernels.point_moments import Moments
+from vg2gt.method.additions import point_moments
+from vg2gt.method.additions.point_moments import pool_point_moments
+from vg2gt.method.grid import VoxelPlan, plan_voxels, pool_mean
 
 VIEWS = 7
 CHUNK = 3  # of the views, where the pass is plain

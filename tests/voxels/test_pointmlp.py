@@ -1,9 +1,9 @@
 import pytest
 import torch
 
-from vg2gt.voxels import PointMLP
-from vg2gt.voxels.pointmlp import GeometricStage, window_max
-from vg2gt.voxels.serialization import make_windows
+from vg2gt.method import PointMLP
+from vg2gt.method.point_mlp import GeometricStage, window_max
+from vg2gt.method.serialization import make_windows
 
 SIZE = torch.full((2,), 0.125)
 

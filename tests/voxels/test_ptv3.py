@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from tests.references import draw_weights, read_cases, read_json
-from vg2gt.voxels import PTv3
+from vg2gt.method import PTv3
 
 SIZE = torch.full((2,), 0.125)
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from vg2gt.voxels.row_products import linear_rows
+from vg2gt.kernels.row_products import linear_rows
 
 
 @pytest.mark.parametrize("shape", [(1024, 7), (1152, 7), (1153, 7), (48, 32, 7), (0, 7), (5, 7)])

@@ -1,15 +1,13 @@
 import pytest
 import torch
 
-from vg2gt.voxels.serialization import (
+from vg2gt.kernels.curve_codes import hilbert_codes, hilbert_reference, z_codes
+from vg2gt.method.serialization import (
     ORDERS,
     WindowGroup,
-    hilbert_codes,
-    hilbert_reference,
     make_windows,
     serial_codes,
     serial_keys,
-    z_codes,
 )
 
 

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from vg2gt.voxels.silhouette import beside_silhouettes, on_surface
+from vg2gt.method.additions.silhouette import beside_silhouettes, on_surface
 
 
 def _blurred_step(near: float, far: float) -> torch.Tensor:

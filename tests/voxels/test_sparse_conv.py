@@ -2,8 +2,8 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from vg2gt.voxels import sparse_conv
-from vg2gt.voxels.sparse_conv import SubmanifoldConv3d, neighbor_pairs, neighbor_table
+from vg2gt.method import sparse_conv
+from vg2gt.method.sparse_conv import SubmanifoldConv3d, neighbor_pairs, neighbor_table
 
 
 @pytest.fixture(params=[neighbor_pairs, neighbor_table])

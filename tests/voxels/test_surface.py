@@ -7,10 +7,17 @@ import pytest
 import torch
 from torch import Tensor
 
+from vg2gt.method import coarse
+from vg2gt.method.additions.surface_evidence import (
+    PointFrames,
+    cell_centroids,
+    disagreement,
+    gate,
+    vectors_to_surface,
+    voxel_evidence,
+)
+from vg2gt.method.grid import plan_voxels
 from vg2gt.types import Cameras, Geometry
-from vg2gt.voxels import coarse
-from vg2gt.voxels.grid import plan_voxels
-from vg2gt.voxels.surface import PointFrames, cell_centroids, disagreement, gate, vectors_to_surface, voxel_evidence
 
 TURN = torch.tensor([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]])  # world z becomes the camera's -x, world x its z
 
@@ -256,7 +263,7 @@ def test_normals_enter_with_surface_evidence_only(options: dict, same: bool, mak
     tokens, geometry, _ = make_room()
     module = make_coarse(**options)
     before = result(module, tokens, geometry)
-    monkeypatch.setattr("vg2gt.voxels.surface.NORMAL_EDGE", 0.0)
+    monkeypatch.setattr("vg2gt.method.additions.surface_evidence.NORMAL_EDGE", 0.0)
     assert torch.equal(before, result(module, tokens, geometry)) == same
 
 

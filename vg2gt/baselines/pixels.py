@@ -12,11 +12,11 @@ from torch.nn import functional as F
 
 from backends.base import Backend
 from vg2gt.geometry.cameras import invert_rigid, ray_directions
+from vg2gt.method import DenseHead
+from vg2gt.method.additions.visibility import ViewCheck
 from vg2gt.model import Background, Reconstructor, SceneScale
 from vg2gt.profiling import stage
 from vg2gt.types import Gaussians, Geometry, Hints, Prediction, TensorRecord
-from vg2gt.visibility import ViewCheck
-from vg2gt.voxels import DenseHead
 
 SMALLEST_FOOTPRINT = 1e-7  # scene units; a hundredth of it is still a scale that renders
 

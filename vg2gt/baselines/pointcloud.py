@@ -10,11 +10,11 @@ from torch import Tensor
 from backends.base import Backend
 from vg2gt.baselines.pixels import Pixels, usable_pixels
 from vg2gt.geometry.spherical_harmonics import rgb_to_sh
+from vg2gt.method.additions.visibility import ViewCheck
+from vg2gt.method.knn import nearest_neighbors
 from vg2gt.model import Background, Reconstructor, SceneScale
 from vg2gt.profiling import stage
 from vg2gt.types import Gaussians, Hints, Prediction
-from vg2gt.visibility import ViewCheck
-from vg2gt.voxels.knn import nearest_neighbors
 
 Spacing = Literal["pixel", "neighbors"]
 NEIGHBORS = 3

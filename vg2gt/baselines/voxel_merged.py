@@ -10,11 +10,11 @@ from torch.nn import functional as F
 
 from backends.base import Backend
 from vg2gt.baselines.pixels import PixelReconstructor, Pixels
+from vg2gt.method import DenseHead
+from vg2gt.method.additions.visibility import ViewCheck
+from vg2gt.method.grid import VoxelPlan, in_range, plan_voxels, point_cells, pool_mean, scene_voxel_size
 from vg2gt.model import Background, SceneScale
 from vg2gt.types import Gaussians, Geometry
-from vg2gt.visibility import ViewCheck
-from vg2gt.voxels import DenseHead
-from vg2gt.voxels.grid import VoxelPlan, in_range, plan_voxels, point_cells, pool_mean, scene_voxel_size
 
 
 class VoxelMerged(PixelReconstructor):

@@ -80,7 +80,7 @@ def _optional() -> Iterator[tuple[str, str]]:
 
 def _folders() -> Iterator[tuple[str, str]]:
     """Where data and what was computed are kept, and how much."""
-    from vg2gt.io.compiled import cache_folder
+    from vg2gt.kernels.compiled import cache_folder
 
     data = Path(os.environ.get("VG2GT_CACHE", "~/.cache/vg2gt")).expanduser()
     yield "data", f"{data} ({_size(data)}; the variable VG2GT_CACHE names another folder)"

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from vg2gt.gaussians.far_shell import far_shell
 from vg2gt.geometry.precision import half_precision_on_gpu
 from vg2gt.memory import RECONSTRUCTION, memory_advice, note_sizes
+from vg2gt.method.additions.far_shell import far_shell
 from vg2gt.model import Reconstructor
 from vg2gt.reconstruction.cameras import Poses, pictures_for
 from vg2gt.reconstruction.frame import FrameName, check_frame, first_frame

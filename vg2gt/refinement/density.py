@@ -5,12 +5,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from vg2gt.gaussians.far_shell import is_far
-from vg2gt.gaussians.surfel import ALONE, layout
 from vg2gt.geometry.rotations import quat_to_matrix
+from vg2gt.method.additions.far_shell import is_far
+from vg2gt.method.additions.surfel import ALONE, layout
+from vg2gt.method.additions.visibility import count_points
 from vg2gt.refinement.parameters import Parameters
 from vg2gt.types import Cameras, Gaussians
-from vg2gt.visibility import count_points
 
 TOLERANCE, MARGIN = 0.03, 0.05  # relative differences of depth at which a view agrees with a Gaussian, or looks through
 

@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from vg2gt.gaussians.surfel import ALONE
 from vg2gt.geometry.cameras import unproject
 from vg2gt.geometry.spherical_harmonics import rgb_to_sh
+from vg2gt.method.additions.surfel import ALONE
 from vg2gt.refinement.loss import Observations
 from vg2gt.rendering import Renderer
 from vg2gt.types import Cameras, Gaussians

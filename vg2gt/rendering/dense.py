@@ -6,8 +6,9 @@ import torch
 from torch import Tensor
 
 from vg2gt.geometry.cameras import pixel_grid
+from vg2gt.kernels.constants import ALPHA_MIN, TRANSMITTANCE_STOP
 from vg2gt.rendering.median import Rays, ray_depth
-from vg2gt.rendering.options import ALPHA_MIN, TRANSMITTANCE_STOP, Images, RenderOptions, SceneViews
+from vg2gt.rendering.options import Images, RenderOptions, SceneViews
 from vg2gt.rendering.projection import Splats, respond, visible_splats
 
 CELLS_PER_CHUNK = 1 << 21  # pixels times Gaussians held at once

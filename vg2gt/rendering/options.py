@@ -11,12 +11,6 @@ from torch import Tensor
 Mode = Literal["solid", "rasterized"]
 DepthKind = Literal["median", "expected"]
 
-ALPHA_MIN = 1.0 / 255.0  # a Gaussian weaker than this at a pixel is no hit (3DGS)
-TRANSMITTANCE_STOP = 1e-4  # the hit that would bring transmittance below this is dropped with all behind it (3DGS)
-MEDIAN_MAX_TRANSMITTANCE = 0.45  # a solid ray whose final transmittance is larger has no median depth
-BRACKET_SIGMAS = 4.0  # the median lies within this many standard deviations of the hits' peaks
-JACOBIAN_CLAMP = 1.3  # half fields of view at which 3DGS clamps the projection's Jacobian (rasterized only)
-
 
 @dataclass(frozen=True)
 class RenderOptions:

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from vg2gt.kernels.constants import ALPHA_MIN, TRANSMITTANCE_STOP
 from vg2gt.rendering.median import Rays, ray_depth
-from vg2gt.rendering.options import ALPHA_MIN, TRANSMITTANCE_STOP, Images, RenderOptions, SceneViews
+from vg2gt.rendering.options import Images, RenderOptions, SceneViews
 from vg2gt.rendering.projection import Splats, list_cells, pixel_boxes, respond, visible_splats
 
 

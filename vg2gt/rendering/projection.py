@@ -22,7 +22,8 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from vg2gt.geometry.rotations import quat_to_matrix
-from vg2gt.rendering.options import ALPHA_MIN, JACOBIAN_CLAMP, RenderOptions, SceneViews
+from vg2gt.kernels.constants import ALPHA_MIN, JACOBIAN_CLAMP
+from vg2gt.rendering.options import RenderOptions, SceneViews
 
 
 @dataclass(frozen=True)

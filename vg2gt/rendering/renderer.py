@@ -16,7 +16,7 @@ from vg2gt.geometry.cameras import invert_rigid
 from vg2gt.geometry.spherical_harmonics import sh_to_rgb
 from vg2gt.memory import note_sizes
 from vg2gt.rendering.checks import background_colors, check_finite, check_shapes, check_values
-from vg2gt.rendering.cpu import rasterize_cpu
+from vg2gt.rendering.cpu_tiles import rasterize_cpu
 from vg2gt.rendering.dense import rasterize_dense
 from vg2gt.rendering.options import Images, Mode, RenderOptions, SceneViews, check_choice
 from vg2gt.rendering.pairs import rasterize_pairs
@@ -136,7 +136,7 @@ def _render_triton(gaussians: Gaussians, cameras: Cameras, background: Tensor, o
         raise ValueError(
             "implementation 'triton' needs the package triton; install a CUDA build of torch or use 'torch'"
         )
-    from vg2gt.rendering.gpu import RefusedError, render_triton
+    from vg2gt.rendering.gpu_tiles import RefusedError, render_triton
 
     black = background.new_zeros(3)
     try:

@@ -20,8 +20,8 @@ import torch
 from torch import Tensor
 
 from vg2gt.geometry.rotations import quat_to_matrix
-from vg2gt.io.compiled import cache_folder
 from vg2gt.io.files import read_json, write_json
+from vg2gt.kernels.compiled import cache_folder
 from vg2gt.rendering.options import Mode, RenderOptions
 from vg2gt.types import Cameras, Gaussians, Render
 
@@ -141,7 +141,7 @@ def compare(render: RenderFunction, device: torch.device, modes: tuple[Mode, ...
         device: where the kernels run; a CPU if Triton interprets them.
         modes: how they render.
     """
-    from vg2gt.rendering.gpu import render_triton
+    from vg2gt.rendering.gpu_tiles import render_triton
 
     def kernels(gaussians: Gaussians, cameras: Cameras, mode: Mode, background: Tensor) -> Render:
         return render_triton(gaussians, cameras, background, RenderOptions(mode=mode), rows=ROWS)

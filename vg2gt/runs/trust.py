@@ -20,9 +20,9 @@ from torch import nn
 
 from vg2gt.data.base import SceneSource
 from vg2gt.io.files import regular
+from vg2gt.method.additions.visibility import ViewCheck
 from vg2gt.model import SceneScale
 from vg2gt.rendering import Renderer
-from vg2gt.visibility import ViewCheck
 
 ENVIRONMENT = "VG2GT_TRUST"
 OWN = ("vg2gt", "backends")

@@ -17,7 +17,8 @@ from typing import Any
 from vg2gt.io.errors import FormatError
 from vg2gt.io.files import write_text
 from vg2gt.io.images import encode_image
-from vg2gt.rendering.options import ALPHA_MIN, JACOBIAN_CLAMP, RenderOptions
+from vg2gt.kernels.constants import ALPHA_MIN, JACOBIAN_CLAMP
+from vg2gt.rendering.options import RenderOptions
 from vg2gt.types import Gaussians
 from vg2gt.viewer.content import ViewerScene
 from vg2gt.viewer.packing import PackedGaussians, pack, unpack

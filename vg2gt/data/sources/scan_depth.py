@@ -14,11 +14,11 @@ from scipy.ndimage import minimum_filter
 
 from vg2gt.data.base import DataError
 from vg2gt.data.sources.parsing import errors_name
-from vg2gt.io.compiled import kernel
 from vg2gt.io.files import write_cached
 from vg2gt.io.image_files import Size
 from vg2gt.io.npz import load_npz
 from vg2gt.io.ply_container import read_vertices
+from vg2gt.kernels.compiled import kernel
 
 VERSION = 1
 """Raise it when the same scan would give other depth: it is part of the cache's key."""

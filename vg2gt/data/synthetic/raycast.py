@@ -13,7 +13,7 @@ from llvmlite.ir import Constant
 from numba import types
 from numba.extending import intrinsic
 
-from vg2gt.io.compiled import kernel, kernel_part
+from vg2gt.kernels.compiled import kernel, kernel_part
 
 BOX, CYLINDER, ELLIPSOID = 0, 1, 2
 

@@ -1,5 +1,0 @@
-"""From voxels to Gaussians."""
-
-from vg2gt.gaussians.head import GaussianHead
-
-__all__ = ["GaussianHead"]

@@ -1,0 +1,109 @@
+"""Codes of cells along space-filling curves: Morton, and Hilbert in plain torch, compiled for CPUs and with Triton."""
+
+from __future__ import annotations
+
+import importlib.util
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from vg2gt.kernels.compiled import kernel
+from vg2gt.kernels.threads import compilable
+
+
+def _spread_bits(values: Tensor) -> Tensor:
+    """Moves bit i of 21-bit integers to bit 3 i, by doubling the gaps between halves."""
+    for shift, mask in (
+        (32, 0x1F00000000FFFF),
+        (16, 0x1F0000FF0000FF),
+        (8, 0x100F00F00F00F00F),
+        (4, 0x10C30C30C30C30C3),
+        (2, 0x1249249249249249),
+    ):
+        values = (values | values << shift) & mask
+    return values
+
+
+def _interleave(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
+    return _spread_bits(x) << 2 | _spread_bits(y) << 1 | _spread_bits(z)
+
+
+def z_codes(grid: Tensor) -> Tensor:
+    """Morton codes ``[M]`` of cells ``[M, 3]`` with 0 <= coordinate < 2^21; x holds the highest bit of each triple."""
+    return _interleave(*grid.unbind(-1))
+
+
+def hilbert_codes(grid: Tensor, bits: int) -> Tensor:
+    """Hilbert codes of cells (J. Skilling, "Programming the Hilbert curve", 2004); compiled on a CPU and with Triton.
+
+    Args:
+        grid: ``[M, 3]`` int64 with 0 <= coordinate < 2^bits.
+        bits: bits per axis, 1 to 21.
+
+    Returns:
+        ``[M]`` int64 < 2^(3 bits); cells with consecutive codes share a face, and dropping the last three bits
+        gives the code of the parent cell.
+    """
+    if has_kernel(grid.device):
+        from vg2gt.kernels.hilbert import hilbert_in_one_kernel
+
+        return hilbert_in_one_kernel(grid, bits)
+    if not compilable(grid, dtype=torch.int64):
+        return hilbert_reference(grid, bits)
+    codes = grid.new_empty(len(grid))
+    _hilbert(grid.numpy(), bits, np.empty(3, np.int64), codes.numpy())
+    return codes
+
+
+def has_kernel(device: torch.device) -> bool:
+    """Whether Hilbert codes are a Triton kernel there."""
+    cuda = device.type == "cuda" and not torch.compiler.is_compiling()
+    return cuda and importlib.util.find_spec("triton") is not None
+
+
+@kernel(nogil=True)
+def _hilbert(grid: NDArray[np.int64], bits: int, axes: NDArray[np.int64], codes: NDArray[np.int64]) -> None:
+    """:func:`hilbert_reference`, one cell after the other; ``axes`` ``[3]`` is overwritten."""
+    for m in range(len(grid)):
+        axes[0], axes[1], axes[2] = grid[m, 0], grid[m, 1], grid[m, 2]
+        for level in range(bits - 1, 0, -1):
+            below = (1 << level) - 1
+            for i in range(3):
+                if axes[i] >> level & 1:
+                    axes[0] ^= below
+                else:
+                    swapped = (axes[0] ^ axes[i]) & below
+                    axes[0] ^= swapped
+                    axes[i] ^= swapped
+        axes[1] ^= axes[0]
+        axes[2] ^= axes[1]
+        flip, code = 0, 0
+        for level in range(bits - 1, 0, -1):
+            flip ^= ((1 << level) - 1) * (axes[2] >> level & 1)
+        for level in range(bits - 1, -1, -1):
+            for i in range(3):
+                code = code << 1 | ((axes[i] ^ flip) >> level & 1)
+        codes[m] = code
+
+
+def hilbert_reference(grid: Tensor, bits: int) -> Tensor:
+    """:func:`hilbert_codes` in plain torch, all cells at once."""
+    axes = list(grid.unbind(-1))
+    for level in range(bits - 1, 0, -1):
+        below = (1 << level) - 1
+        for i in range(3):
+            is_set = (axes[i] >> level & 1).bool()
+            swapped = (axes[0] ^ axes[i]) & below
+            # A set bit inverts the lower bits of x; a clear one exchanges them with those of axis i.
+            axes[0] = axes[0] ^ torch.where(is_set, below, swapped)
+            if i:
+                axes[i] = axes[i] ^ torch.where(is_set, 0, swapped)
+    # Gray-encode across the axes, then along the bits.
+    axes[1] = axes[1] ^ axes[0]
+    axes[2] = axes[2] ^ axes[1]
+    flip = torch.zeros_like(axes[0])
+    for level in range(bits - 1, 0, -1):
+        flip = flip ^ torch.where((axes[2] >> level & 1).bool(), (1 << level) - 1, 0)
+    return _interleave(*(axis ^ flip for axis in axes))

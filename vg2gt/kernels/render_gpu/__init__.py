@@ -1,0 +1,4 @@
+"""Triton kernels of the tile renderer for CUDA devices, driven by :mod:`vg2gt.rendering.gpu_tiles`.
+
+They need the package ``triton``, which comes with torch's CUDA builds.
+"""

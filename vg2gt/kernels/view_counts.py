@@ -1,0 +1,84 @@
+"""The compiled count of :mod:`vg2gt.method.additions.visibility.counts`."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vg2gt.kernels.compiled import kernel
+from vg2gt.kernels.threads import parallel_for
+
+NEAREST = 1e-6  # smallest depth in another camera, in scene units
+
+
+def count_compiled(
+    depth: NDArray[np.float32],
+    partners: NDArray[np.int64],
+    matrix: NDArray[np.float32],
+    tolerance: float,
+    margin: float,
+) -> list[NDArray[np.float32]]:
+    """Views that agree, look through and are hidden, ``[V, H, W]`` each.
+
+    Args:
+        depth: ``[V, H, W]`` z-depth, 0 = none.
+        partners: ``[V, K]`` views that each view is compared with; -1 = none.
+        matrix: ``[V, K, 3, 4]`` takes ``depth * (x, y, 1)`` into a partner's image.
+        tolerance: relative difference of depth up to which views agree.
+        margin: relative difference of depth from which on a view looks through a point.
+    """
+    sums = [np.zeros(depth.shape, np.float32) for _ in range(3)]
+    parallel_for(
+        range(len(depth)),
+        lambda view: _count_view(view, depth, partners, matrix, np.float32(tolerance), np.float32(margin), *sums),
+    )
+    return sums
+
+
+@kernel(fastmath={"contract", "nsz", "arcp"}, error_model="numpy", nogil=True)
+def _count_view(view, depth, partners, matrix, tolerance, margin, agree, through, hidden):
+    """Counts of one view; ``matrix [V, K, 3, 4]`` takes ``depth * (x, y, 1)`` into a partner's image."""
+    height, width = depth.shape[1:]
+    one, half = np.float32(1), np.float32(0.5)
+    most = one - margin
+    for k in range(partners.shape[1]):
+        other = partners[view, k]
+        if other < 0:
+            continue
+        m = matrix[view, k]
+        for y in range(height):
+            for x in range(width):
+                d = depth[view, y, x]
+                if d <= 0:
+                    continue
+                fx, fy = np.float32(x), np.float32(y)
+                z = (m[2, 0] * fx + m[2, 1] * fy + m[2, 2]) * d + m[2, 3]
+                if z <= np.float32(NEAREST):
+                    continue
+                inverse = one / z
+                u = ((m[0, 0] * fx + m[0, 1] * fy + m[0, 2]) * d + m[0, 3]) * inverse
+                v = ((m[1, 0] * fx + m[1, 1] * fy + m[1, 2]) * d + m[1, 3]) * inverse
+                if not (u > -half and u < width - half and v > -half and v < height - half):
+                    continue
+                left, top = int(np.floor(u)), int(np.floor(v))
+                u0, v0 = max(left, 0), max(top, 0)
+                u1, v1 = min(left + 1, width - 1), min(top + 1, height - 1)
+                agrees, looks, says = False, True, False
+                for yy in (v0, v1):
+                    for xx in (u0, u1):
+                        found = depth[other, yy, xx]
+                        if found > 0:
+                            says = True
+                            ratio = z / found
+                            agrees |= abs(ratio - one) < tolerance
+                            looks &= ratio < most
+                        else:
+                            looks = False
+                if not says:
+                    continue
+                if agrees:
+                    agree[view, y, x] += one
+                elif looks:
+                    through[view, y, x] += one
+                else:
+                    hidden[view, y, x] += one

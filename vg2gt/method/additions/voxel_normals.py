@@ -1,0 +1,116 @@
+"""Normals of the surface through each voxel, from its own points or from those of the cells around it (ours).
+
+A cell of a few pixels holds pieces of the surfaces that several views saw, one above the other by what their depths
+differ, so the spread of its own points says little of how the surface runs. Over three cells it shows.
+"""
+
+from __future__ import annotations
+
+import itertools
+
+import torch
+from torch import Tensor
+
+from vg2gt.geometry.symmetric import FULL, UPPER, smallest_eigenvector
+from vg2gt.kernels.threads import compilable
+from vg2gt.kernels.voxel_normals import facing_compiled, spread_around
+from vg2gt.method.grid import VoxelPlan, mixed_radix_keys
+
+FACING_PRIOR = 1e-4  # cells^2: without evidence a surface faces its cameras
+SAME_SURFACE = 0.5  # cells off the tangent plane at which a neighbour's points count e^-1/2
+COLUMNS = tuple(itertools.product((-1, 0, 1), repeat=2))  # steps along x and y to the nine columns around a cell
+
+
+@torch.no_grad()
+def surface_normals(spread: Tensor, facing: Tensor, offset: Tensor, plan: VoxelPlan, kernel: int) -> Tensor:
+    """Normals of the surface through every voxel, on the side of the cameras.
+
+    With a kernel of 3 a normal is that of all points in 27 cells, weighted by how near their cell's mean lies to the
+    voxel's own tangent plane: a plane fitted to one surface, so that edges stay.
+
+    Args:
+        spread: ``[M, 3, 3]`` covariances of the points' positions, in cells^2.
+        facing: ``[M, 3]`` unit vectors towards the cameras.
+        offset: ``[M, 3]`` mean positions from the cells' centres, in cells.
+        plan: which cells they are.
+        kernel: cells a side that count, 1 or 3.
+
+    Returns:
+        ``[M, 3]`` unit vectors; compiled for float32 on a CPU.
+    """
+    own = facing_normals(spread, facing)
+    if kernel == 1 or not len(plan):
+        return own
+    around = around_compiled if compilable(spread, own, offset) else around_reference
+    return facing_normals(around(spread, own, offset, plan), facing)
+
+
+def facing_normals(spread: Tensor, facing: Tensor) -> Tensor:
+    """Directions of least spread, on the side of the cameras.
+
+    Args:
+        spread: ``[M, 3, 3]`` covariances of positions, in cells^2.
+        facing: ``[M, 3]`` unit vectors towards the cameras; the normal where the spread knows none.
+
+    Returns:
+        ``[M, 3]`` unit vectors; compiled for float32 on a CPU.
+    """
+    if compilable(spread, facing):
+        return facing_compiled(spread, facing, FACING_PRIOR)
+    return facing_reference(spread, facing)
+
+
+def facing_reference(spread: Tensor, facing: Tensor) -> Tensor:
+    """:func:`facing_normals` in plain torch."""
+    eye = torch.eye(3, dtype=spread.dtype, device=spread.device)
+    # A little variance everywhere but along the line of sight: with nothing else known, that line is the normal.
+    prior = FACING_PRIOR * (eye - facing[:, :, None] * facing[:, None])
+    normal = smallest_eigenvector(spread + prior, facing)
+    return torch.where((normal * facing).sum(-1, keepdim=True) < 0, -normal, normal)
+
+
+def around_reference(spread: Tensor, normal: Tensor, offset: Tensor, plan: VoxelPlan) -> Tensor:
+    """Covariances of the points of every voxel and of the 26 around it, in plain torch.
+
+    Args:
+        spread: ``[M, 3, 3]`` covariances of the points' positions, in cells^2.
+        normal: ``[M, 3]`` of each voxel's own tangent plane.
+        offset: ``[M, 3]`` mean positions from the cells' centres, in cells.
+        plan: which cells they are.
+
+    Returns:
+        ``[M, 3, 3]``, weighted by the number of a cell's points and by how near the tangent plane their mean lies.
+    """
+    voxel, other, shift, lengths = _pairs(plan)
+    x, y, z = (offset.index_select(0, other) - offset.index_select(0, voxel) + shift.to(offset.dtype)).unbind(-1)  # [P]
+    height = (torch.stack((x, y, z), -1) * normal.index_select(0, voxel)).sum(-1) / SAME_SURFACE
+    weight = plan.counts.to(offset.dtype).index_select(0, other) * torch.exp(-height.square() / 2)
+    upper = spread[:, UPPER[0], UPPER[1]].index_select(0, other)
+    products = upper + torch.stack((x * x, x * y, x * z, y * y, y * z, z * z), -1)  # [P, 6]
+    weighted = torch.cat((torch.ones_like(x)[:, None], torch.stack((x, y, z), -1), products), -1) * weight[:, None]
+    sums = torch.segment_reduce(weighted, "sum", lengths=lengths, unsafe=True)
+    mean, products = (sums[:, 1:] / sums[:, :1]).split((3, 6), -1)
+    around = products - mean[:, UPPER[0]] * mean[:, UPPER[1]]
+    return around[:, FULL].unflatten(-1, (3, 3))
+
+
+def around_compiled(spread: Tensor, normal: Tensor, offset: Tensor, plan: VoxelPlan) -> Tensor:
+    """:func:`around_reference` on a CPU, without a list of pairs."""
+    keys, (step_x, step_y, _) = mixed_radix_keys(plan.grid, plan.batch, margin=1)  # ascending, as the plan's voxels are
+    columns = torch.tensor([i * step_x + j * step_y - 1 for i, j in COLUMNS])
+    return spread_around(keys, columns, plan.counts, spread, normal, offset, SAME_SURFACE)
+
+
+def _pairs(plan: VoxelPlan) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Rows ``[P]`` of voxels, sorted, those of a cell of their 3x3x3 each, its shift ``[P, 3]``, and pairs a voxel."""
+    keys, (step_x, step_y, _) = mixed_radix_keys(plan.grid, plan.batch, margin=1)  # ascending, as the plan's voxels are
+    columns = keys.new_tensor(COLUMNS)  # [9, 2]
+    lowest = keys[:, None] + columns @ keys.new_tensor([step_x, step_y]) - 1  # [M, 9]: the column's first cell
+    # The cells of a column have keys in a row, so its voxels do.
+    row = torch.searchsorted(keys, lowest)[..., None] + torch.arange(3, device=keys.device)  # [M, 9, 3]
+    row = row.clamp_(max=len(keys) - 1)
+    above = keys[row] - lowest[..., None]
+    found = (above >= 0) & (above < 3) & (row.diff(dim=-1, prepend=row[..., :1] - 1) > 0)
+    place = found.nonzero(as_tuple=True)
+    voxel, column, _ = place
+    return voxel, row[place], torch.cat((columns[column], above[place][:, None] - 1), -1), found.sum((1, 2))

@@ -1,0 +1,217 @@
+"""Fine-level voxels: dense features of all views pooled into small cells and refined (paper, Fine-level decoding)."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from vg2gt.geometry.cameras import camera_centers, unproject
+from vg2gt.geometry.symmetric import UPPER
+from vg2gt.memory import Cap, check_limit, note_sizes
+from vg2gt.method.additions.point_moments import pool_point_moments
+from vg2gt.method.additions.silhouette import on_surface
+from vg2gt.method.additions.voxel_normals import surface_normals
+from vg2gt.method.dense_head import DenseHead
+from vg2gt.method.grid import (
+    VoxelPlan,
+    in_range,
+    plan_voxels,
+    point_cells,
+    pool_mean,
+    pool_min,
+    scene_counts,
+    scene_voxel_size,
+    warn_if_sparse,
+)
+from vg2gt.method.point_features import pool_point_features, pool_point_features_of_chunks
+from vg2gt.method.point_mlp import PointMLP
+from vg2gt.types import Geometry, Tokens, VoxelMoments, Voxels
+
+log = logging.getLogger(__name__)
+
+EXTRA_CHANNELS = 8  # colour (3), position of the centroid in the cell (3), number of points, confidence
+MOMENT_CHANNELS = 15  # spread (6), covariance with colour (9)
+
+
+class FineModule(nn.Module):
+    """Pools the dense features, colours and positions of all pixels into voxels and refines them.
+
+    A pixel's place within its cell enters its feature before pooling, so that the pooled feature can tell how the
+    surface runs through the cell.
+
+    Args:
+        token_dims: width of each tapped layer.
+        patch_size: pixels a patch.
+        dense_head: makes the dense head from ``token_dims`` and ``patch_size``.
+        point_mlp: makes the voxel network from ``in_channels``.
+        voxel_size: edge length in scene units.
+        min_footprint: smallest edge in pixels at the scene's median depth; 0 switches the guard off.
+        max_voxels: most voxels a scene; beyond it the least confident are dropped, with a warning in the log and
+            the metric ``train/voxels_dropped``. None keeps all.
+        moments: second moments of the points are pooled too: further inputs of the voxel network, and what the
+            Gaussian head's surfel start is made of.
+        normal_kernel: cells a side, 1 or 3, whose points say how the surface runs through a voxel
+            (:mod:`vg2gt.method.additions.voxel_normals`).
+        drop_fringes: pixels between foreground and background (:mod:`vg2gt.method.additions.silhouette`) are left out.
+
+    Attributes:
+        out_channels: width of the refined features.
+        cap: counts what ``max_voxels`` drops.
+
+    Raises:
+        ValueError: if ``max_voxels`` is below 1, or ``normal_kernel`` neither 1 nor 3.
+    """
+
+    def __init__(
+        self,
+        token_dims: Sequence[int],
+        patch_size: int,
+        dense_head: Callable[..., DenseHead],
+        point_mlp: Callable[..., PointMLP],
+        voxel_size: float = 0.002,
+        min_footprint: float = 1.0,
+        max_voxels: int | None = None,
+        moments: bool = False,
+        normal_kernel: int = 1,
+        drop_fringes: bool = False,
+    ) -> None:
+        super().__init__()
+        if normal_kernel not in (1, 3):
+            raise ValueError(f"model.fine.normal_kernel must be 1 or 3, got {normal_kernel}")
+        self.voxel_size = voxel_size
+        self.min_footprint = min_footprint
+        self.max_voxels = check_limit("model.fine.max_voxels", max_voxels)
+        self.cap = Cap("model.fine.max_voxels", "voxels", "least confident")
+        self.dense_head = dense_head(token_dims=token_dims, patch_size=patch_size)
+        width = self.dense_head.out_channels
+        self.point_offset = nn.Linear(3, width, bias=False)
+        self.moments = moments
+        self.normal_kernel = normal_kernel
+        self.drop_fringes = drop_fringes
+        self.point_mlp = point_mlp(in_channels=width + EXTRA_CHANNELS + MOMENT_CHANNELS * moments)
+        self.out_channels = self.point_mlp.out_channels
+
+    def forward(self, tokens: Tokens, geometry: Geometry, images: Tensor, coarsen: Tensor | None = None) -> Voxels:
+        """Builds the fine voxels of B scenes.
+
+        Args:
+            tokens: enhanced tokens.
+            geometry: decoded depth, confidence and cameras, in scene units and the frame of context view 0.
+            images: ``[B, V, 3, H, W]`` in [0, 1].
+            coarsen: ``[B]`` factors of the smallest edge; None: 1.
+
+        Returns:
+            Refined voxels; differentiable in features, confidence and positions, not in which pixel lies where.
+
+        Raises:
+            ValueError: if a scene spans too many voxels to be numbered.
+        """
+        with torch.autocast(images.device.type, enabled=False):
+            size = scene_voxel_size(geometry, self.voxel_size, self.min_footprint, coarsen)
+            points = _Points(geometry, size, self.drop_fringes)
+            plan = self._plan(points)
+            if images.shape[1] > 1:
+                warn_if_sparse(plan, len(size), "fine")
+        pooled = self._pool_features(tokens, images, points, plan)
+        with torch.autocast(images.device.type, enabled=False):
+            pixels = images.float().permute(0, 1, 3, 4, 2).reshape(-1, 3)  # [B V H W, 3]
+            values = torch.cat((points.offset, pixels), -1)  # [B V H W, 6]
+            means = pool_mean(values, points.confidence, plan)
+            offset, colors = means.split(3, -1)
+            confidence = pool_min(points.confidence, plan)
+            count = plan.counts.to(pooled.dtype)
+            density = torch.log(count / _scene_medians(count, plan.batch, len(size)))
+            extra = [2 * colors - 1, 2 * offset, density[:, None], confidence.log()[:, None]]
+            # Not grid * size + ...: centre plus offset keeps the centroid inside its cell in float32.
+            centroid = (plan.grid + 0.5 + offset.double()) * size.double()[plan.batch, None]
+            centroid = centroid.to(pooled.dtype)
+            moments = None
+            if self.moments:
+                moments = self._pool_moments(geometry, size, values, points.confidence, means, centroid, plan)
+                spread = [moments.spread[:, i, j] for i, j in zip(*UPPER, strict=True)]
+                extra += [12 * torch.stack(spread, -1), 20 * moments.cross.flatten(1)]
+        refined = self.point_mlp(torch.cat((pooled, *extra), -1), plan.grid, plan.batch, size)
+        return Voxels(refined, colors, plan.grid, plan.batch, confidence, count, centroid, size, moments)
+
+    @torch.no_grad()
+    def _pool_moments(
+        self,
+        geometry: Geometry,
+        size: Tensor,
+        values: Tensor,
+        confidence: Tensor,
+        means: Tensor,
+        centroid: Tensor,
+        plan: VoxelPlan,
+    ) -> VoxelMoments:
+        """How the points of every voxel lie about the means ``[M, 6]`` of their places and colours ``[N, 6]``."""
+        centers = camera_centers(geometry.cameras).float()  # [B, V, 3]
+        focal = geometry.cameras.intrinsics[..., [0, 1], [0, 1]].mean(-1).float()  # [B, V]
+        views = torch.cat((centers, (focal * size[:, None])[..., None]), -1).flatten(0, 1)  # [B V, 4]
+        depth, chunk = geometry.depth.float().flatten(), self.dense_head.views_per_chunk
+        spread, cross, eye, pixel = pool_point_moments(values, depth, confidence, views, means, plan, chunk)
+        facing = F.normalize(eye - centroid, dim=-1)
+        normal = surface_normals(spread, facing, means[:, :3], plan, self.normal_kernel)
+        return VoxelMoments(spread, cross, facing, pixel, normal)
+
+    def _pool_features(self, tokens: Tokens, images: Tensor, points: _Points, plan: VoxelPlan) -> Tensor:
+        """``[M, C]``; without gradient the features of a few views are there at a time, which bounds the memory."""
+        others = (points.offset, self.point_offset.weight, points.confidence, plan)
+        with_gradient = torch.is_grad_enabled() or not len(plan)
+        maps = [self.dense_head(tokens, images)] if with_gradient else self.dense_head.chunks(tokens, images)
+        chunks = map(_pixel_rows, maps)
+        if with_gradient:
+            return pool_point_features(next(chunks), *others)
+        return pool_point_features_of_chunks(chunks, *others)
+
+    def _plan(self, points: _Points) -> VoxelPlan:
+        plan = plan_voxels(points.cells, points.batch, points.valid)
+        note_sizes({"voxels": len(plan)})
+        if self.max_voxels is None:
+            return plan
+        keep = self.cap(self.max_voxels, pool_min(points.confidence.detach(), plan), plan.batch)
+        return plan if keep is None else plan.select(keep)
+
+
+def _pixel_rows(dense: Tensor) -> Tensor:
+    """Maps ``[n, C, H, W]`` as float32 rows ``[n H W, C]``."""
+    return dense.permute(0, 2, 3, 1).flatten(0, 2).float()
+
+
+class _Points:
+    """All pixels as points, invalid ones replaced by finite stand-ins that no voxel uses.
+
+    Attributes:
+        batch: ``[N]`` scene index.
+        valid: ``[N]`` bool.
+        confidence: ``[N]`` > 0.
+        cells: ``[N, 3]`` float64 positions in voxel units.
+        offset: ``[N, 3]`` positions within the cell, from its centre, in [-1/2, 1/2]; differentiable.
+    """
+
+    def __init__(self, geometry: Geometry, voxel_size: Tensor, drop_fringes: bool) -> None:
+        depth, confidence = geometry.depth.float(), geometry.depth_conf.float()
+        usable = torch.isfinite(depth) & (depth > 0) & torch.isfinite(confidence) & (confidence > 0)
+        if drop_fringes:
+            usable = usable & on_surface(torch.where(usable, depth.detach(), 0.0))
+        points = unproject(torch.where(usable, depth, 1.0), geometry.cameras).flatten(0, -2)
+        scenes, per_scene = len(depth), depth[0].numel()
+        self.batch = torch.arange(scenes, device=depth.device).repeat_interleave(per_scene)
+        self.confidence = torch.where(usable, confidence, 1.0).flatten()
+        self.cells = point_cells(points, self.batch, voxel_size)
+        near = in_range(self.cells.detach())
+        self.valid = usable.flatten() & near
+        self.offset = (self.cells - self.cells.detach().floor() - 0.5).float()
+        far = int((usable.flatten() & ~near).sum())
+        if far:
+            log.warning("left out %d of %d points too far away to be numbered", far, usable.numel())
+
+
+def _scene_medians(values: Tensor, batch: Tensor, scenes: int) -> Tensor:
+    """The median of ``[M]`` values within each voxel's scene, ``[M]``."""
+    parts = values.split(scene_counts(batch, scenes).tolist())
+    return torch.stack([part.median() if len(part) else part.new_ones(()) for part in parts])[batch]

@@ -1,0 +1,138 @@
+"""Self-splitting Gaussian head: every voxel becomes K Gaussians (paper, Fine-level Gaussian Scene Decoding)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Literal, get_args
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from vg2gt.geometry.rotations import matrix_to_quat, multiply_quats
+from vg2gt.geometry.spherical_harmonics import MAX_DEGREE, rgb_to_sh
+from vg2gt.memory import Cap, check_limit, note_sizes
+from vg2gt.method.additions.surfel import SurfelStart, surfel_start
+from vg2gt.types import Gaussians, Voxels
+
+Anchor = Literal["centroid", "center"]
+Start = Literal["plain", "surfel"]
+MAX_SCALE = 2.0  # voxels: the paper's bound
+PLAIN_SCALE = 0.5  # voxels
+MIN_SCALE = 1e-3  # voxels: renderers need a finite inverse
+INITIAL_ALPHA = 0.95  # of a voxel's K Gaussians together, before training (plain start)
+SURFEL_ALPHA = 0.88  # of each Gaussian of the surfel start
+
+
+class GaussianHead(nn.Module):
+    """Two-layer MLP from a voxel's feature to K sets of Gaussian parameters.
+
+    With the ``plain`` start (the paper's parametrisation) an untrained voxel's Gaussians lie near its anchor with half
+    a voxel's standard deviation, the voxel's colour and a joint opacity of 0.95, so that coloured voxels render without
+    holes. With the ``surfel`` start they lie on the voxel's surface, along its colour gradient
+    (:mod:`vg2gt.method.additions.surfel`), and what the network says is a residual in that surface's frame.
+
+    Args:
+        in_channels: width of the voxel features.
+        splits: K Gaussians a voxel.
+        sh_degree: degree L of the spherical harmonics, 0 to 3.
+        anchor: means are offsets from the voxel's ``centroid`` or, as in the paper, from its ``center``.
+        start: ``plain``, or ``surfel``, which needs voxels with moments.
+        max_offset: rho, largest offset along an axis in voxels.
+        hidden: width of the hidden layer; None takes ``in_channels``.
+        max_gaussians: most Gaussians a scene; beyond it the least opaque are dropped, with a warning in the log and the
+            metric ``train/gaussians_dropped``. None keeps all.
+
+    Attributes:
+        out: the last layer, whose width depends on ``splits`` and ``sh_degree``.
+        cap: counts what ``max_gaussians`` drops.
+    """
+
+    def __init__(
+        self,
+        in_channels: int,
+        splits: int = 2,
+        sh_degree: int = 0,
+        anchor: Anchor = "centroid",
+        start: Start = "plain",
+        max_offset: float = 1.0,
+        hidden: int | None = None,
+        max_gaussians: int | None = None,
+    ) -> None:
+        super().__init__()
+        if splits < 1:
+            raise ValueError(f"gaussians.splits must be at least 1, got {splits}")
+        if not 0 <= sh_degree <= MAX_DEGREE:
+            raise ValueError(f"gaussians.sh_degree must be 0 to {MAX_DEGREE}, got {sh_degree}")
+        if anchor not in get_args(Anchor):
+            raise ValueError(f"gaussians.anchor is {anchor!r}; choose one of {', '.join(get_args(Anchor))}")
+        if start not in get_args(Start):
+            raise ValueError(f"gaussians.start is {start!r}; choose one of {', '.join(get_args(Start))}")
+        self.splits = splits
+        self.start: Start = start
+        self.sh_degree = sh_degree
+        self.anchor = anchor
+        self.max_offset = max_offset
+        self.max_gaussians = check_limit("model.gaussians.max_gaussians", max_gaussians)
+        self.cap = Cap("model.gaussians.max_gaussians", "Gaussians", "least opaque")
+        bands = (sh_degree + 1) ** 2
+        self.parts = (3, 3, 4, 1, 3 * bands)
+        self.hidden = nn.Linear(in_channels, hidden or in_channels)
+        self.out = nn.Linear(hidden or in_channels, splits * sum(self.parts))
+        # Small random weights: with zeros the K splits would stay identical for ever.
+        nn.init.normal_(self.out.weight, std=0.02)
+        nn.init.zeros_(self.out.bias)
+        plain = 1 - (1 - INITIAL_ALPHA) ** (1 / splits)
+        self.opacity_bias = _logit(plain if start == "plain" else SURFEL_ALPHA)
+        degrees = [degree for degree in range(sh_degree + 1) for _ in range(2 * degree + 1)]
+        gains = torch.tensor([0.1 * 0.25**degree if degree else 1.0 for degree in degrees])
+        self.sh_gain: Tensor
+        self.register_buffer("sh_gain", gains[:, None], persistent=False)
+
+    def forward(self, voxels: Voxels) -> Gaussians:
+        """Splits every voxel.
+
+        Args:
+            voxels: refined voxels of B scenes.
+
+        Returns:
+            ``M * splits`` Gaussians (fewer beyond ``max_gaussians``), those of a voxel adjacent: scales in (0, 2 v),
+            means within ``max_offset`` v of the anchor along each axis, unit quaternions.
+        """
+        raw = self.out(F.gelu(self.hidden(voxels.features))).float().unflatten(-1, (self.splits, -1))
+        offset, scale, rotation, opacity, color = raw.split(self.parts, -1)
+        size = voxels.voxel_size[voxels.batch][:, None, None]
+        anchor = voxels.centroid if self.anchor == "centroid" else voxels.centers
+        offset = self.max_offset * torch.tanh(offset)
+        quats = F.normalize(rotation + rotation.new_tensor([1.0, 0.0, 0.0, 0.0]), dim=-1)
+        start_scale, colors = scale.new_tensor(PLAIN_SCALE), voxels.colors[:, None]
+        if self.start == "surfel":
+            start = self._surfels(voxels)
+            offset = start.offsets + torch.einsum("mij,mkj->mki", start.frame, offset)
+            quats = multiply_quats(matrix_to_quat(start.frame)[:, None], quats)
+            start_scale, colors = start.scales, (colors + start.colors).clamp(0, 1)
+        means = anchor[:, None] + size * offset
+        scale = MAX_SCALE * torch.sigmoid(scale + torch.logit(start_scale / MAX_SCALE))
+        scales = size * scale.clamp(min=MIN_SCALE)
+        opacities = torch.sigmoid(opacity[..., 0] + self.opacity_bias)
+        base = F.pad(rgb_to_sh(colors)[:, :, None], (0, 0, 0, len(self.sh_gain) - 1))
+        sh = base + self.sh_gain * color.unflatten(-1, (-1, 3))
+        batch = voxels.batch.repeat_interleave(self.splits)
+        note_sizes({"Gaussians": len(batch)})
+        parts = Gaussians(*(part.flatten(0, 1) for part in (means, quats, scales, opacities, sh)), batch=batch)
+        keep = self.cap(self.max_gaussians, parts.opacities, batch)
+        return parts if keep is None else parts.map(lambda tensor: tensor[keep])
+
+    def _surfels(self, voxels: Voxels) -> SurfelStart:
+        if voxels.moments is None:
+            raise ValueError("model.gaussians.start=surfel needs voxels with moments: model.fine.moments=true")
+        start = surfel_start(voxels.moments, self.splits)
+        if self.anchor == "centroid":
+            return start
+        shift = ((voxels.centroid - voxels.centers) / voxels.voxel_size[voxels.batch, None]).detach()
+        return replace(start, offsets=start.offsets + shift[:, None])
+
+
+def _logit(probability: float) -> float:
+    return math.log(probability / (1 - probability))

@@ -1,0 +1,178 @@
+"""PointMLP over windows of serialised voxels, linear in their number (paper, eqn pointmlp)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+from torch.utils.checkpoint import checkpoint
+
+from vg2gt.kernels.row_products import has_onednn, linear_rows
+from vg2gt.method.grid import scene_counts
+from vg2gt.method.serialization import Order, Windows, make_windows, relative_grid, serial_keys
+
+STAGE_ORDERS: tuple[Order, ...] = ("hilbert", "hilbert-trans", "z", "z-trans")
+
+
+class ResidualPointBlock(nn.Module):
+    """``x + W2 relu(W1 LN(x))`` on every row."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.norm = nn.LayerNorm(channels)
+        self.fc1 = nn.Linear(channels, channels)
+        self.fc2 = nn.Linear(channels, channels)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Maps ``[..., C]`` to ``[..., C]``."""
+        hidden = linear_rows(self.norm(x), self.fc1.weight, self.fc1.bias, relu=True)
+        return x + linear_rows(hidden, self.fc2.weight, self.fc2.bias)
+
+
+class GeometricStage(nn.Module):
+    """One stage: geometric affine, residual MLP, max over the window, residual MLP, residual update.
+
+    The affine ``alpha (x - m) / s + beta`` of features and positions, m a window's mean and s one standard deviation a
+    scene, enters a linear layer together with the features themselves, ``W1 [affine] + W2 x``. Nothing lies between, so
+    the layer is applied as ``(W1 alpha / s + W2) (x - m)`` and ``W2 m``, the latter once a window.
+
+    Args:
+        channels: feature width C.
+    """
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.alpha = nn.Parameter(torch.ones(channels + 3))
+        self.beta = nn.Parameter(torch.zeros(channels + 3))
+        self.inner = nn.Linear(2 * channels + 3, channels)
+        self.before = ResidualPointBlock(channels)
+        self.after = ResidualPointBlock(channels)
+        self.out = nn.Linear(2 * channels, channels)
+        self.gamma = nn.Parameter(torch.ones(channels))
+
+    def forward(self, features: Tensor, positions: Tensor, windows: Windows) -> Tensor:
+        """Updates ``[M, C]`` features of voxels at ``[M, 3]`` positions (voxel units)."""
+        updates = []
+        for group in windows.groups:
+            rows = group.rows.flatten()
+            sizes = (*group.counts[:-1], len(group.rows) - sum(group.counts[:-1]))  # the last with what nobody owns
+            local = features.index_select(0, rows).unflatten(0, group.rows.shape).split(sizes)
+            place = positions.index_select(0, rows).unflatten(0, group.rows.shape).split(sizes)
+            first = [self._first_layer(*scene) for scene in zip(local, place, group.counts, strict=True)]
+            hidden = self.before(first[0] if len(first) == 1 else torch.cat(first))
+            context = self.after(window_max(hidden))
+            # W_o [h | g], the window's half computed once a window
+            weight_hidden, weight_context = self.out.weight.chunk(2, 1)
+            update = linear_rows(hidden, weight_hidden, self.out.bias) + F.linear(context, weight_context)[:, None]
+            updates.append(update.flatten(0, 1))
+        update = updates[0] if len(updates) == 1 else torch.cat(updates)
+        return torch.addcmul(features, self.gamma, update.index_select(0, windows.owner))
+
+    def _first_layer(self, local: Tensor, place: Tensor, windows: int) -> Tensor:
+        """Affine and linear layer of one scene's windows: features ``[W, K, C]``, positions ``[W, K, 3]``.
+
+        Of those, ``windows`` count; others hold one voxel, which deviates from itself by nothing.
+        """
+        channels = local.shape[-1]
+        of_affine, of_place, of_local = self.inner.weight.split((channels, 3, channels), 1)
+        mean = local.mean(1)  # [W, C]
+        local, place = local - mean[:, None], place.to(local.dtype)
+        place = place - place.mean(1, keepdim=True)
+        of_affine = of_affine * (self.alpha[:channels] / _root_mean_square(local, windows))
+        of_place = of_place * (self.alpha[channels:] / _root_mean_square(place, windows))
+        weight = torch.cat((of_affine + of_local, of_place), 1)
+        constant = self.inner.bias + self.inner.weight[:, : channels + 3] @ self.beta + F.linear(mean, of_local)
+        return linear_rows(torch.cat((local, place), -1), weight) + constant[:, None]
+
+
+def window_max(x: Tensor) -> Tensor:
+    """``x.amax(1)`` of ``[W, K, C]``; its gradient, shared among equal maxima as well, in a quarter of the time."""
+    return _WindowMax.apply(x)  # pyright: ignore[reportReturnType]
+
+
+class _WindowMax(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        """``[W, C]``."""
+        largest = x.amax(1)
+        ctx.save_for_backward(x, largest)
+        return largest
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """``[W, K, C]``."""
+        x, largest = ctx.saved_tensors
+        # Written as 0 and 1 of x's type: torch's own way over booleans converts them twice.
+        share = torch.eq(x, largest[:, None], out=torch.empty_like(x))
+        return share.mul_((grad_outputs[0] / share.sum(1))[:, None])
+
+
+def _root_mean_square(deviation: Tensor, windows: int) -> Tensor:
+    square = torch.linalg.vector_norm(deviation).square() / (windows * deviation[0].numel())
+    # the inner constant keeps the root differentiable for single voxels
+    return (square + 1e-10).sqrt() + 1e-5
+
+
+class PointMLP(nn.Module):
+    """Refines voxel features with their neighbours along space-filling curves.
+
+    The original's farthest-point sampling and nearest neighbours are quadratic; here a local group is a window of
+    consecutive voxels of a curve, another curve every stage, odd stages shifted by half a window.
+
+    Args:
+        in_channels: channels of the pooled features.
+        channels: width C.
+        stages: number of stages.
+        window: voxels a local group.
+        checkpoint: recomputes each stage in the backward pass to save memory.
+    """
+
+    def __init__(
+        self, in_channels: int, channels: int = 128, stages: int = 2, window: int = 32, checkpoint: bool = False
+    ) -> None:
+        super().__init__()
+        self.out_channels = channels
+        self.window = window
+        self.checkpoint = checkpoint
+        self.embed = nn.Sequential(nn.Linear(in_channels, channels), nn.LayerNorm(channels), nn.ReLU())
+        self.stages = nn.ModuleList(GeometricStage(channels) for _ in range(stages))
+
+    def forward(self, features: Tensor, grid: Tensor, batch: Tensor, voxel_size: Tensor) -> Tensor:
+        """Refines features.
+
+        Args:
+            features: ``[M, in_channels]``.
+            grid: ``[M, 3]`` int64 cells.
+            batch: ``[M]`` scene index, sorted.
+            voxel_size: ``[B]`` edge lengths, named in errors.
+
+        Returns:
+            ``[M, channels]``.
+
+        Raises:
+            ValueError: if a scene spans too many voxels to be serialised.
+        """
+        features = self.embed(features)
+        if not len(features):
+            # The stages have nothing to do, but every rank's parameters must be in the graph: the others would wait.
+            return features + 0 * sum(parameter.sum() for parameter in self.stages.parameters())
+        local = relative_grid(grid, batch, len(voxel_size))
+        positions = local.float()
+        for stage, windows in zip(self.stages, self._windows(local, batch, voxel_size), strict=True):
+            if self.checkpoint and torch.is_grad_enabled():
+                features = checkpoint(stage, features, positions, windows, use_reentrant=False)
+            else:
+                features = stage(features, positions, windows)
+        return features
+
+    def _windows(self, grid: Tensor, batch: Tensor, voxel_size: Tensor) -> list[Windows]:
+        orders = STAGE_ORDERS[: len(self.stages)]
+        counts = scene_counts(batch, len(voxel_size)).tolist()
+        curves = [torch.argsort(key) for key in serial_keys(grid, batch, voxel_size, orders)]
+        few_sizes = has_onednn(grid.device)  # which compiles a convolution for every new size
+        return [
+            make_windows(curves[i % len(curves)], counts, self.window, self.window // 2 * (i % 2), few_sizes)
+            for i in range(len(self.stages))
+        ]

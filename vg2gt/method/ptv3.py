@@ -1,0 +1,329 @@
+"""Point Transformer V3 in plain torch (Wu et al., CVPR 2024), for packed voxels.
+
+Parameter names are those of the official implementation, so that its state dicts load.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from typing import Literal, get_args
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from vg2gt.method.grid import scene_counts
+from vg2gt.method.serialization import ORDERS, Order, Windows, make_windows, relative_grid, serial_keys
+from vg2gt.method.sparse_conv import NeighborTable, Pairs, SubmanifoldConv3d, neighbors
+
+Norm = Literal["layer", "group", "batch"]
+
+
+class Level:
+    """The voxels of one resolution: their curves, windows and neighbours, computed once each. No features.
+
+    Args:
+        grid: ``[M, 3]`` int64 cells.
+        batch: ``[M]`` scene index, sorted.
+        scenes: B.
+        keys: sort keys of every order.
+        generator: shuffles the orders, so that blocks meet them in random sequence; None keeps them.
+    """
+
+    def __init__(
+        self, grid: Tensor, batch: Tensor, scenes: int, keys: list[Tensor], generator: torch.Generator | None
+    ) -> None:
+        self.grid = grid
+        self.batch = batch
+        self.keys = keys
+        self.counts: list[int] = scene_counts(batch, scenes).tolist()
+        count = len(keys)
+        self.sequence = torch.randperm(count, generator=generator).tolist() if generator else list(range(count))
+        self._windows: dict[tuple[int, int], Windows] = {}
+        self._pairs: dict[int, Pairs | NeighborTable] = {}
+
+    def windows(self, order: int, length: int) -> Windows:
+        """Attention windows along the curve that block number ``order`` uses."""
+        which = self.sequence[order % len(self.sequence)]
+        if (which, length) not in self._windows:
+            curve = torch.argsort(self.keys[which])
+            self._windows[which, length] = make_windows(curve, self.counts, length)
+        return self._windows[which, length]
+
+    def pairs(self, kernel_size: int) -> Pairs | NeighborTable:
+        """Neighbour pairs for a convolution."""
+        if kernel_size not in self._pairs:
+            self._pairs[kernel_size] = neighbors(self.grid, self.batch, kernel_size)
+        return self._pairs[kernel_size]
+
+
+class SerializedAttention(nn.Module):
+    """Multi-head attention within windows of consecutive voxels.
+
+    Args:
+        channels: width.
+        heads: number of heads.
+        window: voxels per window.
+        order: number of the curve in the level's sequence.
+    """
+
+    def __init__(self, channels: int, heads: int, window: int, order: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.window = window
+        self.order = order
+        self.qkv = nn.Linear(channels, 3 * channels)
+        self.proj = nn.Linear(channels, channels)
+
+    def forward(self, features: Tensor, level: Level) -> Tensor:
+        """Maps ``[M, C]`` to ``[M, C]``."""
+        windows = level.windows(self.order, self.window)
+        qkv = self.qkv(features)  # [M, 3 C]
+        parts = []
+        for group in windows.groups:
+            rows = qkv.index_select(0, group.rows.flatten())  # [W K, 3 C]
+            rows = rows.view(*group.rows.shape, 3, self.heads, -1)  # [W, K, 3, heads, C / heads]
+            query, key, value = rows.permute(2, 0, 3, 1, 4)  # [W, heads, K, C / heads] each
+            attended = F.scaled_dot_product_attention(query, key, value)
+            parts.append(attended.transpose(1, 2).flatten(2).flatten(0, 1))  # [W K, C]
+        attended = parts[0] if len(parts) == 1 else torch.cat(parts)
+        return self.proj(attended.index_select(0, windows.owner))
+
+
+class MLP(nn.Module):
+    """Two linear layers with a GELU between."""
+
+    def __init__(self, channels: int, ratio: float) -> None:
+        super().__init__()
+        self.fc1 = nn.Linear(channels, int(channels * ratio))
+        self.fc2 = nn.Linear(int(channels * ratio), channels)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Maps ``[M, C]`` to ``[M, C]``."""
+        return self.fc2(F.gelu(self.fc1(x)))
+
+
+class PTv3Block(nn.Module):
+    """Conditional positional encoding by sparse convolution (xCPE), attention and MLP, each residual.
+
+    Args:
+        channels: width.
+        heads: attention heads.
+        window: voxels per attention window.
+        order: number of the curve.
+        mlp_ratio: hidden width of the MLP over ``channels``.
+        drop_path: probability that a voxel skips a residual branch while training.
+    """
+
+    def __init__(self, channels: int, heads: int, window: int, order: int, mlp_ratio: float, drop_path: float) -> None:
+        super().__init__()
+        self.drop_path = drop_path
+        self.cpe = nn.ModuleList(
+            [SubmanifoldConv3d(channels, channels, 3), nn.Linear(channels, channels), nn.LayerNorm(channels)]
+        )
+        self.norm1 = nn.ModuleList([nn.LayerNorm(channels)])
+        self.attn = SerializedAttention(channels, heads, window, order)
+        self.norm2 = nn.ModuleList([nn.LayerNorm(channels)])
+        self.mlp = nn.ModuleList([MLP(channels, mlp_ratio)])
+
+    def forward(self, features: Tensor, level: Level, conv_input: Tensor | None = None) -> Tensor:
+        """Maps ``[M, C]`` to ``[M, C]``; ``conv_input`` replaces what the xCPE sees (legacy)."""
+        conv, linear, norm = self.cpe
+        x = conv(features if conv_input is None else conv_input, level.pairs(3))
+        features = features + norm(linear(x))
+        features = features + self._drop(self.attn(self.norm1[0](features), level))
+        return features + self._drop(self.mlp[0](self.norm2[0](features)))
+
+    def _drop(self, branch: Tensor) -> Tensor:
+        if not (self.training and self.drop_path):
+            return branch
+        kept = torch.rand(len(branch), 1, device=branch.device) >= self.drop_path
+        return branch * kept / (1 - self.drop_path)
+
+
+class GridPool(nn.Module):
+    """Max pooling into cells of twice the size, after a projection."""
+
+    def __init__(self, in_channels: int, out_channels: int, norm: Norm) -> None:
+        super().__init__()
+        self.proj = nn.Linear(in_channels, out_channels)
+        self.norm = nn.ModuleList([_make_norm(norm, out_channels)])
+
+    def forward(
+        self, features: Tensor, level: Level, generator: torch.Generator | None
+    ) -> tuple[Tensor, Level, Tensor]:
+        """Returns pooled features ``[M', C']``, their level and every voxel's parent ``[M]``."""
+        parents, order = torch.sort(level.keys[0] >> 3, stable=True)  # [M]
+        _, inverse, counts = torch.unique_consecutive(parents, return_inverse=True, return_counts=True)
+        parent_of = torch.empty_like(inverse)
+        parent_of[order] = inverse
+        first = order[counts.cumsum(0) - counts]
+        projected = self.proj(features).to(features.dtype).index_select(0, order)  # [M, C']
+        pooled = torch.segment_reduce(projected, "max", lengths=counts, unsafe=True)  # [M', C']
+        keys = [key[first] >> 3 for key in level.keys]
+        coarse = Level(level.grid[first] >> 1, level.batch[first], len(level.counts), keys, generator)
+        return F.gelu(self.norm[0](pooled)), coarse, parent_of
+
+
+class GridUnpool(nn.Module):
+    """Brings parents' features back to their voxels and adds the skip connection, both projected."""
+
+    def __init__(self, in_channels: int, skip_channels: int, out_channels: int, norm: Norm) -> None:
+        super().__init__()
+        self.proj = nn.ModuleList([nn.Linear(in_channels, out_channels), _make_norm(norm, out_channels)])
+        self.proj_skip = nn.ModuleList([nn.Linear(skip_channels, out_channels), _make_norm(norm, out_channels)])
+
+    def forward(self, features: Tensor, skip: Tensor, parent_of: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns the sum ``[M, C]`` and the projected skip connection alone ``[M, C]``."""
+        up = F.gelu(self.proj[1](self.proj[0](features)))
+        skip = F.gelu(self.proj_skip[1](self.proj_skip[0](skip)))
+        return skip + up.index_select(0, parent_of), skip
+
+
+class PTv3(nn.Module):
+    """U-shaped transformer over voxels (paper, eqn ptvzengqiang).
+
+    The defaults of widths, depths and heads are AMB3R's, as the paper uses them.
+
+    Args:
+        in_channels: width of the input features.
+        enc_channels: widths of the encoder's stages, finest first; each next stage halves the resolution.
+        enc_depths: blocks of the encoder's stages.
+        enc_heads: attention heads of the encoder's stages.
+        dec_channels: widths of the decoder's stages, finest first, one fewer than the encoder's.
+        dec_depths: blocks of the decoder's stages.
+        dec_heads: attention heads of the decoder's stages.
+        window: voxels per attention window.
+        stem_kernel: edge length of the first convolution.
+        mlp_ratio: hidden width of the MLPs over their width.
+        drop_path: largest probability of skipping a residual branch; it grows linearly with depth.
+        norm: normalisation in stem, pooling and unpooling; blocks always use layer normalisation.
+        orders: serialisation orders; successive blocks use successive ones.
+        legacy: feeds the convolution of each decoder stage's first block with the skip connection only, as the
+            official code does; needed for results equal to the official ones.
+
+    Attributes:
+        out_channels: width of the result, ``dec_channels[0]``.
+    """
+
+    def __init__(
+        self,
+        in_channels: int = 1024,
+        enc_channels: Sequence[int] = (128, 128, 128, 256, 512),
+        enc_depths: Sequence[int] = (2, 2, 2, 6, 2),
+        enc_heads: Sequence[int] = (2, 4, 8, 16, 32),
+        dec_channels: Sequence[int] = (1024, 256, 128, 256),
+        dec_depths: Sequence[int] = (2, 2, 2, 2),
+        dec_heads: Sequence[int] = (32, 8, 8, 16),
+        window: int = 64,
+        stem_kernel: int = 5,
+        mlp_ratio: float = 4,
+        drop_path: float = 0.3,
+        norm: Norm = "layer",
+        orders: Sequence[Order] = ORDERS,
+        legacy: bool = False,
+    ) -> None:
+        super().__init__()
+        stages = len(enc_channels)
+        lengths = [len(enc_depths), len(enc_heads), *(len(x) + 1 for x in (dec_channels, dec_depths, dec_heads))]
+        if any(length != stages for length in lengths):
+            raise ValueError(
+                f"ptv3: {stages} encoder widths need as many depths and heads and one fewer in the decoder, "
+                f"got encoder {len(enc_depths)}, {len(enc_heads)} and decoder "
+                f"{len(dec_channels)}, {len(dec_depths)}, {len(dec_heads)}"
+            )
+        self.out_channels = dec_channels[0] if stages > 1 else enc_channels[0]
+        self.orders = tuple(orders)
+        self.legacy = legacy
+
+        stem = nn.ModuleDict(
+            {
+                "conv": SubmanifoldConv3d(in_channels, enc_channels[0], stem_kernel, bias=False),
+                "norm": _make_norm(norm, enc_channels[0]),
+            }
+        )
+        self.stem_kernel = stem_kernel
+        self.embedding = nn.ModuleDict({"stem": stem})
+
+        def blocks(channels: int, heads: int, rates: list[float]) -> dict[str, nn.Module]:
+            return {
+                f"block{i}": PTv3Block(channels, heads, window, i % len(self.orders), mlp_ratio, rate)
+                for i, rate in enumerate(rates)
+            }
+
+        enc_rates = _ramp(drop_path, enc_depths)
+        dec_rates = [rates[::-1] for rates in _ramp(drop_path, dec_depths)]
+        self.enc = nn.ModuleDict()
+        self.dec = nn.ModuleDict()
+        for s in range(stages):
+            down = {"down": GridPool(enc_channels[s - 1], enc_channels[s], norm)} if s else {}
+            self.enc[f"enc{s}"] = nn.ModuleDict({**down, **blocks(enc_channels[s], enc_heads[s], enc_rates[s])})
+        below = [*dec_channels, enc_channels[-1]]
+        for s in reversed(range(stages - 1)):
+            up = {"up": GridUnpool(below[s + 1], enc_channels[s], dec_channels[s], norm)}
+            self.dec[f"dec{s}"] = nn.ModuleDict({**up, **blocks(dec_channels[s], dec_heads[s], dec_rates[s])})
+
+    def forward(
+        self,
+        features: Tensor,
+        grid: Tensor,
+        batch: Tensor,
+        voxel_size: Tensor,
+        generator: torch.Generator | None = None,
+    ) -> Tensor:
+        """Enhances voxel features.
+
+        Args:
+            features: ``[M, in_channels]``, M >= 1.
+            grid: ``[M, 3]`` int64 distinct cells.
+            batch: ``[M]`` scene index, sorted.
+            voxel_size: ``[B]`` edge lengths, named in errors.
+            generator: while training, shuffles the sequence of orders at every resolution (on the CPU).
+
+        Returns:
+            ``[M, out_channels]``.
+
+        Raises:
+            ValueError: if a scene spans too many voxels to be serialised.
+        """
+        generator = generator if self.training else None
+        # S of eqn ptvzengqiang; S^-1 is Windows.owner, with which attention returns to the voxels' own order.
+        local = relative_grid(grid, batch, len(voxel_size))
+        # One bit of the keys goes at every pooling.
+        keys = serial_keys(local, batch, voxel_size, self.orders, min_bits=max(1, len(self.enc) - 1))
+        level = Level(local, batch, len(voxel_size), keys, generator)
+        stem = self.embedding["stem"]
+        features = F.gelu(stem["norm"](stem["conv"](features, level.pairs(self.stem_kernel))))  # pyright: ignore
+        skips = []
+        for stage in self.enc.values():
+            for name, module in stage.items():  # pyright: ignore
+                if name == "down":
+                    pooled, coarse, parent_of = module(features, level, generator)
+                    skips.append((features, level, parent_of))
+                    features, level = pooled, coarse
+                else:
+                    features = module(features, level)
+        for stage in self.dec.values():
+            skip, level, parent_of = skips.pop()
+            features, skip = stage["up"](features, skip, parent_of)  # pyright: ignore
+            conv_input = skip if self.legacy else None
+            for name, block in stage.items():  # pyright: ignore
+                if name != "up":
+                    features, conv_input = block(features, level, conv_input), None
+        return features
+
+
+def _ramp(largest: float, depths: Sequence[int]) -> list[list[float]]:
+    """Rates from 0 to ``largest`` over all blocks, split by stage."""
+    step = largest / max(1, sum(depths) - 1)
+    starts = itertools.accumulate(depths, initial=0)
+    return [[step * (start + i) for i in range(depth)] for start, depth in zip(starts, depths, strict=False)]
+
+
+def _make_norm(kind: Norm, channels: int) -> nn.Module:
+    if kind not in get_args(Norm):
+        raise ValueError(f"ptv3.norm is {kind!r}; choose one of {', '.join(get_args(Norm))}")
+    if kind == "batch":
+        return nn.BatchNorm1d(channels, eps=1e-3, momentum=0.01)
+    return nn.GroupNorm(32, channels, eps=1e-3) if kind == "group" else nn.LayerNorm(channels)

@@ -1,0 +1,236 @@
+"""Submanifold sparse convolution in plain torch: outputs exist exactly where inputs do.
+
+On a CPU one kernel offset is gathered, multiplied and added after the other. Elsewhere many offsets go together: one
+gather, one batched product and one sum for as many as memory allows, so that launches do not grow with the kernel.
+Both are deterministic.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from vg2gt.geometry.precision import autocast_dtype
+from vg2gt.method.grid import mixed_radix_keys
+
+Pairs = list[tuple[Tensor, Tensor]]
+CHUNK = 1 << 22  # cells times offsets looked up at once
+HELD = 1 << 28  # numbers of gathered rows and products held at once, off the CPU
+
+
+@dataclass(frozen=True)
+class NeighborTable:
+    """Neighbours at all T = k^3 - 1 offsets but the centre's, x slowest; offset T - 1 - t mirrors t.
+
+    Attributes:
+        sources: ``[T, P + 1]`` rows of the neighbours of those voxels that have one; else M, as in the last column.
+        targets: ``[T, P + 1]`` rows of these voxels; else M.
+        slots: ``[M, T]`` place of a voxel's neighbour in ``sources.flatten()``; where it has none, the last of a row.
+    """
+
+    sources: Tensor
+    targets: Tensor
+    slots: Tensor
+
+    def parts(self, width: int) -> Iterator[slice]:
+        """Offsets whose rows of ``width`` numbers may be held together."""
+        offsets, rows = self.sources.shape
+        some = max(1, HELD // (rows * width))
+        return (slice(begin, min(begin + some, offsets)) for begin in range(0, offsets, some))
+
+
+def neighbors(grid: Tensor, batch: Tensor, kernel_size: int) -> Pairs | NeighborTable:
+    """What a convolution needs to know of ``[M, 3]`` distinct cells: pairs on a CPU, a table elsewhere."""
+    find = neighbor_pairs if one_by_one(grid.device) else neighbor_table
+    return find(grid, batch, kernel_size)
+
+
+def one_by_one(device: torch.device) -> bool:
+    """Whether offsets are convolved one after the other there."""
+    return device.type == "cpu"
+
+
+def neighbor_table(grid: Tensor, batch: Tensor, kernel_size: int) -> NeighborTable:
+    """All neighbours; the host waits for the cells' extent and for the largest number of pairs at an offset."""
+    keys, order, moves = _sorted_cells(grid, batch, kernel_size)
+    count, half = len(keys), len(moves)
+    rows = torch.arange(count, device=keys.device)
+    place = torch.searchsorted(keys, keys + moves[:, None]).clamp_(max=count - 1)  # [T / 2, M]
+    found = keys[place] == keys + moves[:, None]
+    before = torch.empty_like(place)
+    before[:, order] = torch.where(found, order[place], count)
+    # whose neighbour at an offset is j is j's neighbour at the opposite one; the last column is nobody's
+    after = before.new_full((half, count + 1), count).scatter_(1, before, rows.expand(half, -1))[:, :-1]
+    table = torch.cat((before, after.flip(0)))  # [T, M]
+    there = table < count
+    rank = there.cumsum(1) - 1
+    most = int(rank[:, -1].max()) + 1 if half and count else 0
+    column = torch.where(there, rank, most)
+    sources, targets = (table.new_full((2 * half, most + 1), count) for _ in range(2))
+    sources.scatter_(1, column, table)
+    targets.scatter_(1, column, torch.where(there, rows, count))
+    slots = column + (most + 1) * torch.arange(2 * half, device=keys.device)[:, None]
+    return NeighborTable(sources, targets, slots.t().contiguous())
+
+
+def neighbor_pairs(grid: Tensor, batch: Tensor, kernel_size: int) -> Pairs:
+    """Pairs of occupied cells at each offset of the first half of a cubic kernel; the other half mirrors them.
+
+    Args:
+        grid: ``[M, 3]`` int64 distinct cells.
+        batch: ``[M]`` scene index.
+        kernel_size: odd edge length of the kernel.
+
+    Returns:
+        For offset number t (x slowest) of the ``kernel_size^3 // 2`` before the centre, the rows ``(i, j)`` with
+        ``grid[j] = grid[i] + offset``.
+    """
+    keys, order, moves = _sorted_cells(grid, batch, kernel_size)
+    counts, rows, neighbors = [], [], []
+    # many offsets at a time: how many pairs there are is a shape, for which the host waits
+    for some in moves.split(max(1, CHUNK // max(1, len(keys)))):
+        wanted = keys + some[:, None]
+        place = torch.searchsorted(keys, wanted).clamp_(max=len(keys) - 1)
+        found = keys[place] == wanted
+        offset, row = found.nonzero().unbind(-1)
+        counts.append(found.sum(-1))
+        rows.append(order[row])
+        neighbors.append(order[place[offset, row]])
+    lengths = torch.cat(counts).tolist()
+    return list(zip(torch.cat(rows).split(lengths), torch.cat(neighbors).split(lengths), strict=True))
+
+
+def _sorted_cells(grid: Tensor, batch: Tensor, kernel_size: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Sorted keys ``[M]``, row of each, and what the offsets before the kernel's centre add to a key."""
+    radius = kernel_size // 2
+    keys, steps = mixed_radix_keys(grid, batch, margin=radius)
+    keys, order = torch.sort(keys)
+    offsets = itertools.islice(itertools.product(range(-radius, radius + 1), repeat=3), kernel_size**3 // 2)
+    moves = keys.new_tensor([sum(o * s for o, s in zip(offset, steps, strict=True)) for offset in offsets])
+    return keys, order, moves
+
+
+class _BatchedConvolution(torch.autograd.Function):
+    """Gathers, multiplies and sums many kernel offsets at once; the backward pass gathers again."""
+
+    @staticmethod
+    def forward(ctx: Any, features: Tensor, weight: Tensor, table: NeighborTable) -> Tensor:
+        """``[M, out]`` of ``features [M, in]`` and ``weight [out, k, k, k, in]``, summed over neighbouring voxels."""
+        taps, center = _taps(weight)
+        ctx.save_for_backward(features, weight)
+        ctx.table = table
+        return _sum_products(features, taps, center, table)
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, Tensor, None]:  # pyright: ignore
+        """Gradients of the features and the weight."""
+        features, weight = ctx.saved_tensors
+        table: NeighborTable = ctx.table
+        grad = grad_outputs[0].to(features.dtype)
+        taps, center = _taps(weight)
+        grad_features = _sum_products(grad, taps.flip(0).mT, center.t(), table).to(features.dtype)
+        of_taps = torch.empty_like(taps)
+        padded_grad, padded = (F.pad(rows, (0, 0, 0, 1)) for rows in (grad, features))
+        for some in table.parts(grad.shape[1] + features.shape[1]):
+            pairs = (padded[table.sources[some]], padded_grad[table.targets[some]])  # [t, P + 1, in], [t, P + 1, out]
+            of_taps[some] = pairs[0].mT @ pairs[1]
+        half = len(taps) // 2
+        of_all = torch.cat((of_taps[:half], (features.t() @ grad)[None], of_taps[half:]))  # [k^3, in, out]
+        return grad_features, of_all.permute(2, 0, 1).reshape(weight.shape), None
+
+
+def _taps(weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Matrices ``[T, in, out]`` of all offsets but the centre's, and that one's."""
+    taps = weight.flatten(1, 3).permute(1, 2, 0)
+    half = len(taps) // 2
+    return torch.cat((taps[:half], taps[half + 1 :])), taps[half]
+
+
+def _sum_products(features: Tensor, taps: Tensor, center: Tensor, table: NeighborTable) -> Tensor:
+    """``[M, out]`` in float32 at least: every voxel's own product and those of its neighbours."""
+    out = (features @ center).to(torch.promote_types(features.dtype, torch.float32))
+    padded = F.pad(features, (0, 0, 0, 1))
+    for some in table.parts(taps.shape[1] + taps.shape[2]):
+        products = (padded[table.sources[some]] @ taps[some]).flatten(0, 1)  # [t (P + 1), out]
+        slots = table.slots[:, some] - some.start * table.sources.shape[1]
+        out += F.embedding_bag(slots, products, mode="sum")
+    return out
+
+
+class _SubmanifoldConvolution(torch.autograd.Function):
+    """Gathers, multiplies and adds one kernel offset after the other; the backward pass gathers again."""
+
+    @staticmethod
+    def forward(ctx: Any, features: Tensor, weight: Tensor, pairs: Pairs) -> Tensor:
+        """``[M, out]`` of ``features [M, in]`` and ``weight [out, k, k, k, in]``, summed over neighbouring voxels."""
+        taps = weight.flatten(1, 3).unbind(1)  # k^3 times [out, in]
+        out = (features @ taps[len(pairs)].t()).to(torch.promote_types(features.dtype, torch.float32))
+        for t, (i, j) in enumerate(pairs):
+            out.index_add_(0, i, (features.index_select(0, j) @ taps[t].t()).to(out.dtype))
+            out.index_add_(0, j, (features.index_select(0, i) @ taps[-1 - t].t()).to(out.dtype))
+        ctx.save_for_backward(features, weight)
+        ctx.pairs = pairs
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, Tensor, None]:  # pyright: ignore
+        """Gradients of the features and the weight; the products of the forward pass are made anew."""
+        features, weight = ctx.saved_tensors
+        grad = grad_outputs[0].to(features.dtype)
+        pairs: Pairs = ctx.pairs
+        taps = weight.flatten(1, 3).unbind(1)  # k^3 times [out, in]
+        grad_weight = torch.empty_like(weight)
+        grad_taps = grad_weight.flatten(1, 3).unbind(1)
+        grad_features = grad @ taps[len(pairs)]
+        grad_taps[len(pairs)].copy_(grad.t() @ features)
+        for t, (i, j) in enumerate(pairs):
+            for tap, target, source in ((t, i, j), (-1 - t, j, i)):
+                grad_rows = grad.index_select(0, target)
+                grad_features.index_add_(0, source, grad_rows @ taps[tap])
+                grad_taps[tap].copy_(grad_rows.t() @ features.index_select(0, source))
+        return grad_features, grad_weight, None
+
+
+class SubmanifoldConv3d(nn.Module):
+    """Convolution over occupied voxels; equals a dense ``conv3d`` with zeros elsewhere, read at the occupied cells.
+
+    Args:
+        in_channels: input channels.
+        out_channels: output channels.
+        kernel_size: odd edge length of the cubic kernel.
+        bias: adds a bias.
+
+    Attributes:
+        weight: ``[out, k, k, k, in]``, axes x, y, z.
+    """
+
+    def __init__(self, in_channels: int, out_channels: int, kernel_size: int, bias: bool = True) -> None:
+        super().__init__()
+        self.kernel_size = kernel_size
+        bound = (in_channels * kernel_size**3) ** -0.5
+        shape = (out_channels, kernel_size, kernel_size, kernel_size, in_channels)
+        self.weight = nn.Parameter(torch.empty(shape).uniform_(-bound, bound))
+        self.bias = nn.Parameter(torch.zeros(out_channels)) if bias else None
+
+    def forward(self, features: Tensor, pairs: Pairs | NeighborTable) -> Tensor:
+        """Convolves ``[M, in]`` features.
+
+        Args:
+            features: ``[M, in]``.
+            pairs: :func:`neighbors` for this kernel size.
+
+        Returns:
+            ``[M, out]``; under autocast products are of its type, and their sums float32.
+        """
+        weight = self.weight
+        if torch.is_autocast_enabled(features.device.type):
+            features, weight = features.to(autocast_dtype(features)), weight.to(autocast_dtype(features))
+        convolve = _BatchedConvolution if isinstance(pairs, NeighborTable) else _SubmanifoldConvolution
+        out: Tensor = convolve.apply(features, weight, pairs)  # pyright: ignore
+        return out if self.bias is None else out + self.bias

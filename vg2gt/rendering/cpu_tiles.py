@@ -1,0 +1,292 @@
+"""Drives the compiled kernels over views and blocks of work, and joins them to autograd.
+
+Deterministic to the bit for any number of threads: tiles write pixels and gradient rows of their own, blocks of
+Gaussians sum their rows in list order, blocks' camera gradients are summed in block order.
+"""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from vg2gt.kernels.constants import MEDIAN_MAX_TRANSMITTANCE, TRANSMITTANCE_STOP
+from vg2gt.kernels.render_cpu import tiles
+from vg2gt.kernels.render_cpu.backward import backward_color, backward_rasterized, backward_solid
+from vg2gt.kernels.render_cpu.binning import count_tiles, depth_order, fill_tiles
+from vg2gt.kernels.render_cpu.forward import forward_color, forward_rasterized, forward_solid
+from vg2gt.kernels.render_cpu.projection import BLOCK, project_block
+from vg2gt.kernels.render_cpu.projection_backward import CHUNK, FIELDS, project_backward_block
+from vg2gt.kernels.threads import parallel_for
+from vg2gt.rendering.median import depth_factors
+from vg2gt.rendering.options import Images, RenderOptions, SceneViews
+
+TILES_PER_ITEM = 8
+HIT_CAPACITY = 192  # hits that a block of rays keeps for the depth solver before its tile is given more room
+CACHE_LINE = 64  # bytes
+CONVERGED = 4  # relative changes of the median, in units of rounding, at which its search ends
+NEGLIGIBLE = {np.dtype(np.float32): 30.0, np.dtype(np.float64): 90.0}  # squared sigmas at which a profile vanishes
+
+_local = threading.local()
+
+
+def rasterize_cpu(scene: SceneViews, options: RenderOptions) -> Images:
+    """Renders every view; differentiable in every tensor of the scene."""
+    color, normal, depth, alpha = _Rasterize.apply(*scene.tensors, scene.size, options)
+    return Images(color, normal, depth, alpha)
+
+
+@dataclass(frozen=True)
+class _Lists:
+    """One view's projected Gaussians and tile lists (numpy; names as in the kernels)."""
+
+    records: np.ndarray
+    boxes: np.ndarray
+    counts: np.ndarray
+    offsets: np.ndarray
+    starts: np.ndarray
+    members: np.ndarray
+    places: np.ndarray
+
+
+@dataclass(frozen=True)
+class _View:
+    """Inputs of one view (numpy)."""
+
+    means: np.ndarray
+    quats: np.ndarray
+    scales: np.ndarray
+    opacities: np.ndarray
+    colors: np.ndarray
+    pose: np.ndarray
+    intrinsics: np.ndarray
+    background: np.ndarray
+    size: tuple[int, int]
+
+    @property
+    def across(self) -> int:
+        return -(-self.size[1] // tiles.TILE)
+
+    @property
+    def tiles(self) -> int:
+        return self.across * -(-self.size[0] // tiles.TILE)
+
+    @property
+    def tile_ranges(self) -> list[tuple[int, int]]:
+        starts = range(0, self.tiles, TILES_PER_ITEM)
+        return [(start, min(start + TILES_PER_ITEM, self.tiles)) for start in starts]
+
+    @property
+    def blocks(self) -> range:
+        return range(-(-len(self.means) // BLOCK))
+
+
+class _Rasterize(torch.autograd.Function):
+    """Forward and backward of all views of a scene."""
+
+    @staticmethod
+    def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Colour ``[V, H, W, 3]``, normals alike, depth ``[V, H, W]`` and accumulated opacity of V views."""
+        tensors, (size, options) = inputs[:8], inputs[8:]
+        arrays = [_array(tensor) for tensor in tensors]
+        count, (height, width), dtype = len(arrays[5]), size, arrays[0].dtype
+        color = np.empty((count, height, width, 3), dtype)
+        normal, depth = np.zeros_like(color), np.zeros((count, height, width), dtype)
+        slope, transmittance = np.zeros_like(depth), np.empty_like(depth)
+        lists: list[_Lists] = []
+        for index in range(count):
+            view = _select(arrays, index, size)
+            lists.append(_prepare(view, options))
+            outputs = (array[index] for array in (color, normal, depth, slope, transmittance))
+            _forward(view, lists[-1], options, *outputs)
+        images = [torch.from_numpy(array) for array in (color, normal, depth, 1 - transmittance)]
+        ctx.save_for_backward(*tensors, *images, torch.from_numpy(slope), torch.from_numpy(transmittance))
+        ctx.lists, ctx.size, ctx.options = lists, size, options
+        ctx.set_materialize_grads(False)
+        return images[0], images[1], images[2], images[3]
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Tensor | None) -> tuple[Tensor | None, ...]:
+        """Gradients of the Gaussians, the cameras and the background; those of the median depth are implicit."""
+        color, normal, depth, _, slope, transmittance = ctx.saved_tensors[8:]
+        options: RenderOptions = ctx.options
+        geometry = options.geometry and (grad_outputs[1] is not None or grad_outputs[2] is not None)
+        grad_color, grad_normal, grad_depth, grad_alpha = (
+            torch.zeros_like(image) if grad is None else grad
+            for grad, image in zip(grad_outputs, (color, normal, depth, depth), strict=True)
+        )
+        factors = depth_factors(grad_depth, grad_alpha, depth, slope, transmittance, options)
+        solid, expected, crossing, grad_alpha = factors
+        images = [_array(image) for image in (color, normal, depth, transmittance)]
+        incoming = [_array(grad) for grad in (grad_color, grad_normal, grad_alpha, solid, expected, crossing)]
+        arrays = [_array(tensor) for tensor in ctx.saved_tensors[:8]]
+        grads = [np.zeros_like(array) for array in arrays]
+        for index, lists in enumerate(ctx.lists):
+            view = _select(arrays, index, ctx.size)
+            rows = _aligned(len(lists.members) * tiles.ROW, view.means.dtype).reshape(-1, tiles.ROW)
+            planes = [array[index] for array in (*images, *incoming)]
+            _backward(view, lists, options, geometry, planes, rows, grads, index)
+        if ctx.needs_input_grad[7]:
+            grads[7] = np.einsum("vhwc,vhw->c", incoming[0], images[3])
+        result = [
+            torch.from_numpy(grad) if needed else None
+            for grad, needed in zip(grads, ctx.needs_input_grad[:8], strict=True)
+        ]
+        return (*result, None, None)
+
+
+def _array(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().contiguous().numpy()
+
+
+def _select(arrays: list[np.ndarray], index: int, size: tuple[int, int]) -> _View:
+    means, quats, scales, opacities, colors, poses, intrinsics, background = arrays
+    color = colors[index % len(colors)]
+    return _View(means, quats, scales, opacities, color, poses[index], intrinsics[index], background, size)
+
+
+def _prepare(view: _View, options: RenderOptions) -> _Lists:
+    """Projects one view's Gaussians, orders them by depth and lists them by tile."""
+    total, dtype = len(view.means), view.means.dtype
+    records = np.empty((total, tiles.RECORD), dtype)
+    boxes = np.empty((total, 4), np.int32)
+    height, width = view.size
+    solid = options.mode == "solid"
+
+    def project(block: int) -> None:
+        project_block(
+            block, view.means, view.quats, view.scales, view.opacities, view.pose, view.intrinsics, height, width,
+            options.lowpass, options.near, solid, records, boxes,
+        )  # fmt: skip
+
+    parallel_for(view.blocks, project)
+    visible = np.flatnonzero(boxes[:, 1] > boxes[:, 0]).astype(np.int32)
+    visible = visible[depth_order(records[visible, 7])]
+    counts, offsets = np.empty(total, np.int32), np.empty(total, np.int64)
+    starts = np.empty(view.tiles + 1, np.int64)
+    count_tiles(boxes, view.across, counts, offsets, starts)
+    members, places = np.empty(starts[-1], np.int32), np.empty(starts[-1], np.int64)
+    fill_tiles(boxes, visible, view.across, offsets, starts[:-1].copy(), members, places)
+    return _Lists(records, boxes, counts, offsets, starts, members, places)
+
+
+def _parameters(options: RenderOptions, dtype: np.dtype) -> np.ndarray:
+    values = (
+        options.alpha_max, TRANSMITTANCE_STOP, MEDIAN_MAX_TRANSMITTANCE, options.near, NEGLIGIBLE[dtype],
+        CONVERGED * np.finfo(dtype).eps,
+    )  # fmt: skip
+    return np.array(values, dtype)
+
+
+@dataclass(frozen=True)
+class _Scratch:
+    """One thread's working memory (names as in the kernels)."""
+
+    state: np.ndarray
+    sums: np.ndarray
+    hits: np.ndarray
+    counts: np.ndarray
+    staged: np.ndarray
+    spans: np.ndarray
+    total: np.ndarray
+    work: np.ndarray
+    indices: np.ndarray
+
+
+def _scratch(dtype: np.dtype) -> _Scratch:
+    """This thread's working memory, kept between calls."""
+    buffers = _local.__dict__.setdefault("buffers", {})
+    if dtype not in buffers:
+        buffers[dtype] = _Scratch(
+            _aligned(tiles.PLANES * tiles.PLANE, dtype),
+            _aligned(tiles.SUMS_ROWS * tiles.LANES, dtype),
+            _aligned(tiles.BLOCKS * HIT_CAPACITY * tiles.HIT_SIZE, dtype),
+            np.zeros(tiles.BLOCKS, np.int64),
+            np.zeros((tiles.STAGED, tiles.RECORD + 3), dtype),
+            np.zeros((tiles.STAGED, 4), np.int64),
+            np.empty(16, np.float64),
+            np.ones(FIELDS * CHUNK, np.float64),
+            np.empty(CHUNK, np.int64),
+        )
+    return buffers[dtype]
+
+
+def _aligned(count: int, dtype: np.dtype) -> np.ndarray:
+    """Values that begin at a cache line: a block of rays then lies in one, and no vector operation touches two."""
+    memory = np.empty(count * dtype.itemsize + CACHE_LINE, np.uint8)
+    start = -memory.ctypes.data % CACHE_LINE
+    return memory[start : start + count * dtype.itemsize].view(dtype)
+
+
+def _forward(view: _View, lists: _Lists, options: RenderOptions, *outputs: np.ndarray) -> None:
+    parameters = _parameters(options, view.means.dtype)
+    render_tiles = forward_color
+    if options.geometry:
+        render_tiles = forward_solid if options.mode == "solid" else forward_rasterized
+
+    newton = options.newton_steps > 0
+    # one of Newton's may gain nothing: with twice as many steps the bracket shrinks as much as by bisection alone
+    steps = 2 * options.bisections + options.newton_steps if newton else options.bisections
+
+    def run(tile_range: tuple[int, int]) -> None:
+        scratch = _scratch(view.means.dtype)
+        hits, (first, last) = scratch.hits, tile_range
+        while first < last:
+            first = render_tiles(
+                lists.records, lists.boxes, view.colors, lists.members, lists.starts, (first, last),
+                options.depth == "expected", steps, newton, parameters, view.background,
+                scratch.state, hits, scratch.counts, scratch.staged, scratch.spans, *outputs,
+            )  # fmt: skip
+            if first < last:
+                hits = _aligned(tiles.BLOCKS * (int(scratch.counts.max()) + 1) * tiles.HIT_SIZE, view.means.dtype)
+
+    parallel_for(view.tile_ranges, run)
+
+
+def _backward(
+    view: _View,
+    lists: _Lists,
+    options: RenderOptions,
+    geometry: bool,
+    planes: list[np.ndarray],
+    rows: np.ndarray,
+    grads: list[np.ndarray],
+    index: int,
+) -> None:
+    """Adds one view's gradients to ``grads`` (order of SceneViews.tensors); ``planes``: images and their gradients."""
+    parameters = _parameters(options, view.means.dtype)
+    height, width = view.size
+    solid = options.mode == "solid"
+    visit_tiles = backward_color
+    if geometry:
+        visit_tiles = backward_solid if solid else backward_rasterized
+
+    def rasterize(tile_range: tuple[int, int]) -> None:
+        scratch = _scratch(view.means.dtype)
+        visit_tiles(
+            lists.records, lists.boxes, view.colors, lists.members, lists.places, lists.starts, tile_range, parameters,
+            scratch.state, scratch.sums, scratch.staged, scratch.spans, *[*planes, rows],
+        )  # fmt: skip
+
+    parallel_for(view.tile_ranges, rasterize)
+    cameras = np.empty((len(view.blocks), 16), np.float64)
+    means, quats, scales, opacities, colors = grads[:5]
+    pose = view.pose.astype(np.float64)
+
+    def project(block: int) -> None:
+        scratch = _scratch(view.means.dtype)
+        project_backward_block(
+            block, view.means, view.quats, view.scales, pose, view.intrinsics, height, width,
+            options.lowpass, solid, lists.counts, lists.offsets, rows, index % len(colors),
+            scratch.total, scratch.work, scratch.indices,
+            means, quats, scales, opacities, colors, cameras,
+        )  # fmt: skip
+
+    parallel_for(view.blocks, project)
+    camera = cameras.sum(0)
+    grads[5][index, :3] = camera[:12].reshape(3, 4)
+    grads[6][index, [0, 1, 0, 1], [0, 1, 2, 2]] = camera[12:]

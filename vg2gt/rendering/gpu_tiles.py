@@ -1,0 +1,251 @@
+"""Drives the Triton kernels for all views of all scenes at once, and joins them to autograd.
+
+Forward: project every Gaussian into every view of its scene, count its tiles, read the counts (the only time that the
+host waits), write one entry a (tile, Gaussian), sort the entries by view, tile and depth, blend the tiles. Backward:
+visit the tiles again, write one gradient row an entry, sum and chain the rows of every Gaussian. Deterministic: tiles
+write pixels and rows of their own; a Gaussian's rows adjoin and are summed in order by its own lane.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from vg2gt.kernels.constants import BRACKET_SIGMAS, MEDIAN_MAX_TRANSMITTANCE, TRANSMITTANCE_STOP
+from vg2gt.kernels.render_gpu import kernels as launchable
+from vg2gt.kernels.render_gpu.binning import ENTRIES
+from vg2gt.kernels.render_gpu.projection import BLOCK, REFUSED, SLOTS
+from vg2gt.kernels.render_gpu.projection_backward import CAMERA
+from vg2gt.kernels.render_gpu.tiles import RECORD, TILE
+from vg2gt.rendering.options import RenderOptions
+from vg2gt.types import Cameras, Gaussians, Render
+
+kernels: Any = launchable  # Triton makes its functions objects that take a grid: kernel[grid](...)
+
+NEGLIGIBLE = {torch.float32: 30.0, torch.float64: 90.0}  # squared sigmas at which a profile vanishes
+BISECTIONS = 3  # that one visit of a tile's Gaussians amounts to
+ROW_SHARE = 64  # one part in so many of a GPU's memory is for gradient rows
+ROWS = 3_000_000  # gradient rows held at once where there is no GPU
+SLOT_SHARE, SLOT_BYTES = 8, 256  # one part in so many is for views rendered at once; a Gaussian in one, with entries
+
+
+class RefusedError(ValueError):
+    """The kernels met a value that cannot be rendered; which one is for the caller to say."""
+
+
+def render_triton(
+    gaussians: Gaussians, cameras: Cameras, background: Tensor, options: RenderOptions, rows: int | None = None
+) -> Render:
+    """Renders every view of every scene; differentiable in every floating-point tensor.
+
+    Args:
+        gaussians: of all scenes, sorted by scene; shapes were checked.
+        cameras: the views.
+        background: ``[3]``.
+        options: the number of bisections is rounded up to a multiple of 3.
+        rows: gradient rows held at once, of one view at least; None: by the device's memory.
+
+    Raises:
+        RefusedError: if a value is not finite or out of range (as :mod:`vg2gt.rendering.checks` has it).
+        ValueError: if there are more Gaussians and views than can be numbered.
+    """
+    tensors = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
+    tensors = (*tensors, cameras.world_to_camera, cameras.intrinsics, background)
+    with torch.cuda.device_of(gaussians.means):  # Triton launches on the current device
+        some = max(1, _slots_at_once(gaussians.means.device) // max(1, len(gaussians)))
+        parts = []
+        for poses, intrinsics in zip(tensors[5].split(some, 1), tensors[6].split(some, 1), strict=True):
+            inputs = (*tensors[:5], poses, intrinsics, background, gaussians.batch, cameras.size, options, rows)
+            parts.append(_Render.apply(*inputs))
+    color, normal, depth, alpha = parts[0] if len(parts) == 1 else map(_join_views, zip(*parts, strict=True))
+    return Render(color, depth, normal, alpha)
+
+
+@dataclass(frozen=True)
+class _Lists:
+    """Entries of all tiles.
+
+    Attributes:
+        records: ``[V, G, 16]``, see ``tiles.RECORD``; only those of visible Gaussians are written.
+        ends: ``[V * G]`` entries up to and with a slot's own.
+        members: slot of every sorted entry.
+        places: the sorted entry's place among those in slots' order, which is that of its gradient row.
+        starts: first sorted entry of every tile of every view, and the end.
+        chunks: views whose gradient rows are held at once: first view, number of views, first entry, end.
+    """
+
+    records: Tensor
+    ends: Tensor
+    members: Tensor
+    places: Tensor
+    starts: Tensor
+    chunks: tuple[tuple[int, int, int, int], ...]
+
+
+class _Render(torch.autograd.Function):
+    """Forward and backward of all views."""
+
+    @staticmethod
+    def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Colour ``[B, V, 3, H, W]``, normals alike, depth ``[B, V, H, W]`` and accumulated opacity."""
+        tensors = tuple(tensor.contiguous() for tensor in inputs[:9])
+        (height, width), options, rows = inputs[9:]
+        poses, background = tensors[5], tensors[7]
+        scenes, views = poses.shape[:2]
+        lists = _list(tensors, (height, width), options, rows or _rows_at_once(poses.device))
+        solid = options.mode == "solid"
+        across, tiles = _tiles(height, width)
+        make = torch.empty if options.geometry else torch.zeros
+        shape, like = (scenes, views, height, width), {"dtype": poses.dtype, "device": poses.device}
+        color = torch.empty((scenes, views, 3, height, width), **like)
+        normal, depth = make((scenes, views, 3, height, width), **like), make(shape, **like)
+        alpha, transmittance, slopes = (torch.empty(shape, **like) for _ in range(3))
+        kernels.blend_kernel[(scenes * views * tiles,)](
+            lists.records, lists.members, lists.starts, background, color, normal, depth, alpha, transmittance, slopes,
+            height, width, across, tiles,
+            near=options.near, alpha_max=options.alpha_max, stop=TRANSMITTANCE_STOP,
+            negligible=NEGLIGIBLE[poses.dtype], median_max=MEDIAN_MAX_TRANSMITTANCE, sigmas=BRACKET_SIGMAS,
+            sections=-(-options.bisections // BISECTIONS), newton_steps=options.newton_steps,
+            solid=solid, geometry=options.geometry, mean=options.depth == "expected", num_warps=1,
+        )  # fmt: skip
+        listed = (lists.records, lists.ends, lists.members, lists.places, lists.starts)
+        ctx.save_for_backward(*tensors, *listed, color, normal, depth, transmittance, slopes)
+        ctx.chunks, ctx.size, ctx.options = lists.chunks, (height, width), options
+        ctx.set_materialize_grads(False)
+        return color, normal, depth, alpha
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Tensor | None) -> tuple[Tensor | None, ...]:
+        """Gradients of the Gaussians, the cameras and the background."""
+        saved = ctx.saved_tensors
+        means, quats, scales, opacities, sh, poses, intrinsics, _, batch = saved[:9]
+        records, ends, members, places, starts = saved[9:14]
+        lists = _Lists(records, ends, members, places, starts, ctx.chunks)
+        images = saved[14:]
+        color, _, depth, transmittance, _ = images
+        options: RenderOptions = ctx.options
+        solid, geometry = options.mode == "solid", options.geometry and any(g is not None for g in grad_outputs[1:3])
+        incoming = [
+            torch.zeros_like(image) if grad is None else grad.contiguous()
+            for grad, image in zip(grad_outputs, (color, images[1], depth, depth), strict=True)
+        ]
+        scenes, views = poses.shape[:2]
+        height, width = ctx.size
+        across, tiles = _tiles(height, width)
+        total = len(means)
+        blocks = -(-total // BLOCK)
+        grads = [torch.zeros_like(tensor) for tensor in (means, quats, scales, opacities, sh)]
+        of_cameras = ctx.needs_input_grad[5] or ctx.needs_input_grad[6]
+        grad_cameras = poses.new_zeros(blocks if of_cameras else 1, scenes * views, CAMERA)
+        degree = _degree(sh)
+        for first, some, begin, end in lists.chunks:
+            if begin == end:
+                continue
+            rows = means.new_zeros(end - begin, RECORD)
+            kernels.backward_kernel[(scenes * some * tiles,)](
+                lists.records, lists.members, lists.places, lists.starts, *images, *incoming, rows,
+                height, width, across, tiles, views, first, some, begin,
+                alpha_max=options.alpha_max, stop=TRANSMITTANCE_STOP, slope_floor=options.slope_floor,
+                tiny=torch.finfo(means.dtype).tiny,
+                solid=solid, geometry=geometry, mean=options.depth == "expected", num_warps=1,
+            )  # fmt: skip
+            kernels.project_backward_kernel[(blocks,)](
+                means, quats, scales, opacities, sh, batch, poses, intrinsics, lists.records, lists.ends, rows,
+                *grads, grad_cameras, total, views, scenes, height, width, first, some, begin,
+                lowpass=options.lowpass, solid=solid, degree=degree, cameras=of_cameras, num_warps=BLOCK // 32,
+            )  # fmt: skip
+            del rows  # before those of the next views are made
+        grad_poses = grad_intrinsics = grad_background = None
+        if of_cameras:
+            summed = grad_cameras.sum(0)
+            grad_poses = summed[:, :16].view(poses.shape)
+            grad_intrinsics = summed[:, 16:].view(intrinsics.shape)
+        if ctx.needs_input_grad[7]:
+            grad_background = (incoming[0] * transmittance[:, :, None]).sum((0, 1, 3, 4))
+        return (*grads, grad_poses, grad_intrinsics, grad_background, None, None, None, None)
+
+
+def _tiles(height: int, width: int) -> tuple[int, int]:
+    """Tiles in an image row, and of a view."""
+    across = -(-width // TILE)
+    return across, across * -(-height // TILE)
+
+
+def _degree(sh: Tensor) -> int:
+    return round(sh.shape[1] ** 0.5) - 1
+
+
+def _join_views(images: tuple[Tensor, ...]) -> Tensor:
+    return torch.cat(images, 1)
+
+
+def _slots_at_once(device: torch.device) -> int:
+    """Gaussians times views that are rendered at once: views beyond wait, so that sorting does not fill the memory."""
+    if device.type != "cuda":
+        return SLOTS
+    return torch.cuda.get_device_properties(device).total_memory // (SLOT_SHARE * SLOT_BYTES)
+
+
+def _rows_at_once(device: torch.device) -> int:
+    """Rows of float32 in a share of a GPU's whole memory: of what is free, results would depend on what else runs."""
+    if device.type != "cuda":
+        return ROWS
+    return torch.cuda.get_device_properties(device).total_memory // (ROW_SHARE * 4 * RECORD)
+
+
+def _list(tensors: tuple[Tensor, ...], size: tuple[int, int], options: RenderOptions, rows: int) -> _Lists:
+    """Projects and lists all Gaussians."""
+    means, quats, scales, opacities, sh, poses, intrinsics, background, batch = tensors
+    (scenes, views), (height, width), total = poses.shape[:2], size, len(means)
+    across, tiles = _tiles(height, width)
+    if total * views > SLOTS:
+        raise ValueError(f"{total} Gaussians in {views} views are too many to render at once; render fewer views")
+    records = means.new_empty(views, total, RECORD)
+    rects = batch.new_empty(views, total, 2, dtype=torch.int32)
+    ends = batch.new_empty(views * total)
+    per_view = [0] * views
+    if total:
+        kernels.project_kernel[(-(-total // BLOCK), views)](
+            means, quats, scales, opacities, sh, batch, poses, intrinsics, background, records, rects, ends,
+            total, views, scenes, height, width, across,
+            near=options.near, lowpass=options.lowpass, solid=options.mode == "solid", degree=_degree(sh),
+            num_warps=BLOCK // 32,
+        )  # fmt: skip
+        ends = torch.cumsum(ends, 0)
+        per_view = ends[total - 1 :: total].tolist()  # the host waits here, and nowhere else
+    entries = per_view[-1]
+    if entries >= REFUSED:
+        raise RefusedError(
+            f"a Gaussian, a camera or the background cannot be rendered, or {total} Gaussians cover more than "
+            f"{REFUSED} tiles in {views} views: render fewer views at once"
+        )
+    keys, owners = batch.new_empty(entries), batch.new_empty(entries, dtype=torch.int32)
+    if entries:
+        kernels.emit_kernel[(-(-entries // ENTRIES),)](
+            records, rects, ends, batch, keys, owners,
+            total, views, tiles, across, entries, (views * total).bit_length(), num_warps=4,
+        )  # fmt: skip
+        keys, order = torch.sort(keys, stable=True)
+    else:
+        order = keys
+    members, places = torch.empty_like(owners), torch.empty_like(owners)
+    starts = batch.new_empty(scenes * views * tiles + 1, dtype=torch.int32)
+    kernels.list_kernel[(-(-max(entries, len(starts)) // ENTRIES),)](
+        keys, order, owners, members, places, starts, entries, scenes * views * tiles, entries.bit_length(),
+        num_warps=4,
+    )  # fmt: skip
+    return _Lists(records, ends, members, places, starts, _chunks(per_view, rows))
+
+
+def _chunks(ends: list[int], rows: int) -> tuple[tuple[int, int, int, int], ...]:
+    """Parts views so that each part has at most ``rows`` entries or one view: first view, views, first entry, end."""
+    chunks: list[tuple[int, int, int, int]] = []
+    first, begin = 0, 0
+    for view in range(1, len(ends) + 1):
+        if view == len(ends) or ends[view] - begin > rows:
+            chunks.append((first, view - first, begin, ends[view - 1]))
+            first, begin = view, ends[view - 1]
+    return tuple(chunks)
