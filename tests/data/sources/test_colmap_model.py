@@ -1,5 +1,7 @@
 """COLMAP scenes: a real model, which cameras are refused, reduced images, absent images, points."""
 
+from contextlib import contextmanager
+
 import numpy as np
 import pycolmap  # pyright: ignore[reportMissingImports]
 import pytest
@@ -95,13 +97,35 @@ def test_a_distorted_model_beside_the_originals(statue, distorted):
     assert (depth > 0).sum() > 50
 
 
+@contextmanager
+def edited(root):
+    """The model of a written scene, to be changed."""
+    folder = root / "statue" / "sparse" / "0"
+    model = read_colmap(folder)
+    yield model
+    write_colmap(folder, model)
+
+
+def put_masks(root, *names):
+    """Masks that hide the left half."""
+    folder = root / "statue" / "masks" / "left"
+    folder.mkdir(parents=True)
+    half = Image.fromarray(np.where(np.arange(40) < 20, 0, 255).astype(np.uint8) * np.ones((30, 1), np.uint8))
+    for name in names:
+        half.save(folder / name)
+
+
+def turned(orientation):
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    return exif
+
+
 def test_a_model_of_equirectangular_images_is_refused_in_one_line(tmp_path):
     write(tmp_path, room(1))
-    folder = tmp_path / "statue" / "sparse" / "0"
-    model = read_colmap(folder)
-    model.cameras[1].model = pycolmap.CameraModelId.EQUIRECTANGULAR
-    model.cameras[1].params = [40.0, 30.0]
-    write_colmap(folder, model)
+    with edited(tmp_path) as model:
+        model.cameras[1].model = pycolmap.CameraModelId.EQUIRECTANGULAR
+        model.cameras[1].params = [40.0, 30.0]
     with pytest.raises(DataError, match="EQUIRECTANGULAR has no pinhole part; cut it into cube faces"):
         COLMAP(str(tmp_path)).scene_index("statue")
 
@@ -133,12 +157,10 @@ def test_exif_orientation_with_given_cameras(tmp_path, orientation, stored):
     names = ["0.jpg", "1.jpg"]
     write_colmap(tmp_path / "s" / "sparse" / "0", colmap_from_views(cameras, names, positions, colors, sources))
     (tmp_path / "s" / "images").mkdir()
-    exif = Image.Exif()
-    exif[0x0112] = orientation
     turn = {3: Image.Transpose.ROTATE_180, 6: Image.Transpose.ROTATE_90, 8: Image.Transpose.ROTATE_270}[orientation]
     for name, picture in zip(names, pixels, strict=True):
         image = Image.fromarray(picture) if stored else Image.fromarray(picture).transpose(turn)
-        image.save(tmp_path / "s" / "images" / name, exif=exif, quality=95, subsampling=0)
+        image.save(tmp_path / "s" / "images" / name, exif=turned(orientation), quality=95, subsampling=0)
     loaded = COLMAP(str(tmp_path)).load("s", [0, 1])
     assert (loaded.images - frames.images).abs().mean() < 0.02
     assert torch.allclose(loaded.intrinsics, frames.intrinsics)
@@ -146,9 +168,7 @@ def test_exif_orientation_with_given_cameras(tmp_path, orientation, stored):
 
 def test_an_exif_orientation_that_fits_no_camera_is_named(tmp_path):
     write(tmp_path, room(1))
-    exif = Image.Exif()
-    exif[0x0112] = 6
-    Image.new("RGB", (40, 36)).save(tmp_path / "statue" / "images" / "left" / "000.png", exif=exif)
+    Image.new("RGB", (40, 36)).save(tmp_path / "statue" / "images" / "left" / "000.png", exif=turned(6))
     with pytest.raises(DataError, match=r"40x36 pixels \(EXIF orientation 6, upright 36x40\), but its camera"):
         COLMAP(str(tmp_path)).scene_index("statue")
 
@@ -156,10 +176,9 @@ def test_an_exif_orientation_that_fits_no_camera_is_named(tmp_path):
 def test_values_that_are_not_finite_leave_their_image_out_by_name(tmp_path, caplog):
     """Item 21."""
     write(tmp_path, room(4), text=True)
-    folder = tmp_path / "statue" / "sparse" / "0"
-    lines = (folder / "cameras.txt").read_text().splitlines()
-    lines[-1] = " ".join([*lines[-1].split()[:4], "-nan(ind)", *lines[-1].split()[5:]])
-    (folder / "cameras.txt").write_text("\n".join(lines))
+    path = tmp_path / "statue" / "sparse" / "0" / "cameras.txt"
+    *before, last = path.read_text().splitlines()
+    path.write_text("\n".join([*before, " ".join([*last.split()[:4], "-nan(ind)", *last.split()[5:]])]))
     assert len(COLMAP(str(tmp_path)).frames("statue")) == 3
     assert "cameras whose values are not finite, their images are left out: left/" in caplog.text
 
@@ -167,13 +186,8 @@ def test_values_that_are_not_finite_leave_their_image_out_by_name(tmp_path, capl
 def test_masks_beside_images(tmp_path, caplog):
     """Item 7: a folder of masks, partly filled."""
     write(tmp_path, room(3))
-    masks = tmp_path / "statue" / "masks" / "left"
-    masks.mkdir(parents=True)
-    half = Image.fromarray(np.where(np.arange(40) < 20, 0, 255).astype(np.uint8) * np.ones((30, 1), np.uint8))
-    half.save(masks / "000.png")
-    half.save(masks / "009.png.png")
-    source = COLMAP(str(tmp_path))
-    loaded = source.load("statue", [0, 1, 2])
+    put_masks(tmp_path, "000.png", "009.png.png")
+    loaded = COLMAP(str(tmp_path)).load("statue", [0, 1, 2])
     assert loaded.mask.mean((1, 2)).tolist() == [0.5, 0.5, 1]
     assert "1 of 3 images have no mask in" in caplog.text
     assert "left/018.png" in caplog.text
@@ -218,13 +232,10 @@ def test_points_need_three_views_and_the_nearest_wins(tmp_path):
     source = COLMAP(str(tmp_path), depth="points")
     depth = source.load("statue", [0]).depth[0]
     assert 0.7 * POINTS_A_VIEW < int((depth > 0).sum()) <= POINTS_A_VIEW
-    folder = tmp_path / "statue" / "sparse" / "0"
-    model = read_colmap(folder)
-    for number in range(1, POINTS_A_VIEW + 1):  # frame 0's own points
-        point = model.point3D(number)
-        other = next(element for element in point.track.elements if element.image_id != 1)
-        model.delete_observation(other.image_id, other.point2D_idx)
-    write_colmap(folder, model)
+    with edited(tmp_path) as model:
+        for number in range(1, POINTS_A_VIEW + 1):  # frame 0's own points
+            other = next(each for each in model.point3D(number).track.elements if each.image_id != 1)
+            model.delete_observation(other.image_id, other.point2D_idx)
     source = COLMAP(str(tmp_path), depth="points")
     assert tuple(source.frames("statue")) == (1, 2)
     assert source.scene_index("statue").dropped == {"without a depth file": 1}
@@ -235,11 +246,7 @@ def test_points_need_three_views_and_the_nearest_wins(tmp_path):
 def test_masks_go_with_a_batch_and_take_its_depth_away(tmp_path):
     """Issue 47, item 7."""
     write(tmp_path, room(3))
-    masks = tmp_path / "statue" / "masks" / "left"
-    masks.mkdir(parents=True)
-    half = Image.fromarray(np.where(np.arange(40) < 20, 0, 255).astype(np.uint8) * np.ones((30, 1), np.uint8))
-    for name in ("000.png", "009.png", "018.png"):
-        half.save(masks / name)
+    put_masks(tmp_path, "000.png", "009.png", "018.png")
     whole = COLMAP(str(tmp_path), depth="points").load("statue", [0, 1, 2])
     data = BatchDataset(COLMAP(str(tmp_path), depth="points"), Framing((28, 42)).apply, 10)
     batch = data[(SceneSample("statue", (0, 1), (2,)),)]
