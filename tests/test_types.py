@@ -2,19 +2,12 @@
 
 import torch
 
-from vg2gt.types import Batch, Cameras, Gaussians, Tokens, Voxels
+from vg2gt.types import Batch, Cameras, Gaussians, Voxels
 
 
 def cameras(scenes: int, views: int) -> Cameras:
     poses = torch.eye(4).repeat(scenes, views, 1, 1)
     return Cameras(poses, torch.eye(3).repeat(scenes, views, 1, 1), (4, 6))
-
-
-def test_map_reaches_nested_records_tuples_and_mappings() -> None:
-    tokens = Tokens((torch.zeros(1), torch.zeros(2)), torch.zeros(3), (1, 1), (14, 14), {"depth": torch.zeros(4)})
-    mapped = tokens.map(lambda tensor: tensor + 1)
-    assert all(bool((tensor == 1).all()) for tensor in (*mapped.patch, mapped.camera, mapped.state["depth"]))
-    assert mapped.grid == (1, 1)
 
 
 def test_batch_splits_context_and_target() -> None:

@@ -94,10 +94,6 @@ def test_is_frozen(backend: Backend, tokens: Tokens) -> None:
     assert not any(tensor.requires_grad for tensor in (*tokens.patch, tokens.camera))
 
 
-def test_stays_in_eval_mode(backend: Backend) -> None:
-    assert not any(module.training for module in backend.train().modules())
-
-
 def test_other_sizes_than_multiples_of_the_patch_are_refused(backend: Backend, make_scene) -> None:
     size = (4 * backend.patch_size + 1, 6 * backend.patch_size)
     with pytest.raises(ValueError, match=r"multiple of the patch size"):

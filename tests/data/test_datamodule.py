@@ -47,12 +47,6 @@ def test_evaluation_batches_are_context_then_targets(rooms):
     assert batches[0].target.frame_ids.tolist() == [[1, 3]]
 
 
-def test_limits_on_scenes(rooms):
-    module = _module(rooms, train_scenes=1, eval_scenes=1)
-    assert {name for batch in module.train_dataloader() for name in batch.scene} == {"room-000000"}
-    assert len(module.val_dataloader()) == 1
-
-
 def test_training_and_evaluation_on_the_same_scenes_is_refused(rooms):
     same = SyntheticScenes(2, num_frames=6, size=SIZE, first_seed=3)
     with pytest.raises(DataError, match="room-000003 is used for training and for evaluation"):

@@ -63,9 +63,3 @@ def test_of_a_scene_trained_on_only_held_out_frames_are_scored():
         for target in ((2, 3), (100,)):  # 100 was not trained on, but lies among frames that were
             with pytest.raises(DataError, match=f"{scene} is used for training and for evaluation: 1 of its"):
                 _check(train, list(train.scenes), val, scene, target)
-
-
-def test_parts_of_one_mixture_are_different_datasets():
-    both = _mixture(a=Scans(1), b=Scans(1))
-    _check(both, ["a/scene0001_00"], both, "b/scene0001_00", (3,))
-    _check(both, ["a/scene0001_00"], both, "b/scene0001_01", (3,))

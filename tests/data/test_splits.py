@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from vg2gt.cli.data import splits as main
-from vg2gt.data import DataError, Mixture, RGBDFolder, SceneDataModule, SyntheticScenes
+from vg2gt.data import DataError, RGBDFolder, SceneDataModule, SyntheticScenes
 from vg2gt.data.sources.files import read_split
 from vg2gt.data.splits import split_scenes
 
@@ -26,14 +26,6 @@ def test_recordings_of_a_place_stay_together():
     assert not {source.place(scene) for scene in train} & {source.place(scene) for scene in val}
     assert (len(val), split_scenes(source, 0.25, seed=3)) == (15, (train, val))
     assert split_scenes(source, 0.25, seed=4) != (train, val)
-
-
-def test_every_part_of_a_mixture_is_divided():
-    mixture = Mixture({"a": SyntheticScenes(20), "b": Floors(6), "c": SyntheticScenes(1)}, {"a": 1, "b": 5, "c": 1})
-    train, val = split_scenes(mixture, 0.1)
-    assert sum(scene.startswith("a/") for scene in val) == 2
-    assert sum(scene.startswith("b/") for scene in val) == 3
-    assert "c/room-000000" in train
 
 
 def test_one_place_cannot_be_divided():

@@ -16,7 +16,6 @@ from vg2gt.data.base import DataError
 from vg2gt.evaluation.evaluator import SceneEvaluator
 from vg2gt.evaluation.run import evaluate
 from vg2gt.runs.checkpoints import read_checkpoint, write_checkpoint
-from vg2gt.runs.find import checkpoint_path
 from vg2gt.runs.trust import read_run_config
 from vg2gt.training.loop import train
 
@@ -149,11 +148,6 @@ def test_the_papers_rows_do_not_stand_beside_other_data(tmp_path: Path, cache: P
     assert "tbl_" not in text
 
 
-def test_one_key_of_the_runs_model_can_be_changed(tmp_path: Path, cache: Path, trained: Path) -> None:
-    report = run(tmp_path, cache, f"ckpt={trained}", "+model.fine.max_voxels=200", "data.eval_scenes=1")
-    assert report["views"]["2"]["mean"]["scene/gaussians"] == 400
-
-
 def test_a_model_without_a_trained_part(tmp_path: Path, cache: Path) -> None:
     report = run(tmp_path, cache, "model=pointcloud", "data.eval_scenes=1")
     assert report["settings"]["weights"] == "none: the model has no trained part"
@@ -251,13 +245,6 @@ def test_times_of_another_device_do_not_join(tmp_path: Path, cache: Path, traine
     (tmp_path / "identity.json").write_text(json.dumps(identity | {"device": "Some GPU"}))
     with pytest.raises(FileExistsError, match=r"device \(Some GPU -> cpu\)"):
         run(tmp_path, cache, f"ckpt={trained}", "data.eval_scenes=1")
-
-
-def test_a_checkpoint_is_a_file_or_the_newest_of_a_run(trained: Path) -> None:
-    newest = trained / "checkpoints" / "step-2.ckpt"
-    assert checkpoint_path(None) is None
-    assert (checkpoint_path(str(trained)), checkpoint_path(str(trained / "checkpoints"))) == (newest, newest)
-    assert checkpoint_path(str(newest)) == newest
 
 
 @pytest.mark.parametrize(

@@ -54,11 +54,6 @@ def test_figures_stand_where_they_belong() -> None:
     assert "paper" not in text
 
 
-def test_lpips_without_weights_says_how_to_get_them() -> None:
-    text = report_markdown(report(lpips="n/a (weights not found: evaluation.lpips=download or PATH)"))
-    assert "LPIPS n/a (weights not found: evaluation.lpips=download or PATH)" in text
-
-
 def test_the_papers_rows_stand_beside_ours() -> None:
     text = report_markdown(report(paper="replica"))
     assert re.search(r"\| 3 +\| paper, tbl_depth_whole +\| solid +\| +0\.0070 \| +n/a \| +0\.0690 \|", text)

@@ -131,14 +131,6 @@ def test_higher_bands_learn_slower():
     assert gains == pytest.approx([1, 0.025, 0.025, 0.025] + [0.00625] * 5)
 
 
-def test_no_voxels_give_no_gaussians():
-    voxels = surfel_wall().map(lambda t: t[:0] if len(t) > 1 else t)
-    for start in ("plain", "surfel"):
-        g = head(start=start)(voxels)
-        assert len(g) == 0
-        g.means.sum().backward()
-
-
 def test_gradients_reach_every_parameter_and_the_anchor():
     voxels = wall()
     voxels.centroid.requires_grad_()

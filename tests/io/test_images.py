@@ -9,7 +9,7 @@ from PIL import Image
 
 from vg2gt.io.errors import DataError
 from vg2gt.io.image_files import read_color
-from vg2gt.io.images import colorize_depth, colorize_normals, grid, write_png
+from vg2gt.io.images import colorize_depth, grid, write_png
 
 
 def test_depth_colours_are_monotone_in_brightness_and_holes_are_grey() -> None:
@@ -20,11 +20,6 @@ def test_depth_colours_are_monotone_in_brightness_and_holes_are_grey() -> None:
     brightness = picture.mean(0)[0]
     keep = torch.arange(50) != 10
     assert bool((brightness[keep].diff() < 0).all())
-
-
-def test_normal_facing_the_camera_is_the_usual_blue() -> None:
-    normal = torch.tensor([0.0, 0.0, -1.0])[:, None, None]
-    assert colorize_normals(normal).flatten().tolist() == [0.5, 0.5, 1.0]
 
 
 def test_grid_places_panels(tmp_path: Path) -> None:

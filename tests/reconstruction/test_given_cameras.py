@@ -21,7 +21,6 @@ from vg2gt.reconstruction.given_cameras import given_pictures
 from vg2gt.reconstruction.inputs import Views, depth_range, load_views
 from vg2gt.reconstruction.monitor import Monitor
 from vg2gt.reconstruction.pictures import Picture
-from vg2gt.reconstruction.pipeline import reconstruct_with
 from vg2gt.runs.load import load_model
 from vg2gt.types import Cameras
 
@@ -141,13 +140,6 @@ def test_range_of_depth_ignores_a_few_wild_points_and_needs_some() -> None:
     assert told.tolist()[0] == pytest.approx([0.8 * 2.02, 1.4 * 3.98], rel=0.01)
     assert depth_range([picture(rows[:5])]) is None
     assert depth_range([replace(picture(rows), point_depths=None)]) is None
-
-
-def test_a_backend_that_needs_cameras_gets_them_with_the_range(model, folder: Path, frames) -> None:
-    put_colmap(folder, frames)
-    scene = reconstruct_with(model, folder)
-    assert scene.cameras_from == f"COLMAP {folder}"
-    assert torch.allclose(scene.cameras.world_to_camera[0], frames.world_to_camera, atol=1e-6)
 
 
 def choose(model, images, poses: Any = "auto", **options):

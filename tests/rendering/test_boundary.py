@@ -159,9 +159,3 @@ def test_the_kernels_that_know_one_background_get_each_scenes_own(monkeypatch: p
     found = render(gaussians, cameras).color
     monkeypatch.undo()
     torch.testing.assert_close(found, render(gaussians, cameras, implementation="dense").color)
-
-
-def test_half_precision_input_renders_in_float32() -> None:
-    gaussians = floats_to(soup(10), torch.float16)
-    with torch.autocast("cpu", dtype=torch.bfloat16):
-        assert render(gaussians, pinhole((8, 8)).map(torch.Tensor.half)).color.dtype == torch.float32

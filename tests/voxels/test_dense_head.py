@@ -1,5 +1,3 @@
-import torch
-
 from vg2gt.method import DenseHead
 
 
@@ -10,14 +8,6 @@ def test_full_resolution_for_every_number_of_taps(make_room):
         for finest in (1, 4):
             head = DenseHead([24] * taps, 14, features=8, out_channels=5, merge_channels=6, finest=finest)
             assert head(chosen, images).shape == (6, 5, 42, 84)
-
-
-def test_chunks_change_nothing(make_room):
-    tokens, _, images = make_room(scenes=2)
-    head = DenseHead([24, 24], 14, features=8, out_channels=5, views_per_chunk=4)
-    whole = DenseHead([24, 24], 14, features=8, out_channels=5, views_per_chunk=100)
-    whole.load_state_dict(head.state_dict())
-    torch.testing.assert_close(head(tokens, images), whole(tokens, images), atol=1e-5, rtol=1e-5)
 
 
 def test_every_tap_and_the_image_reach_every_view(make_room):

@@ -43,16 +43,6 @@ def test_a_batch_equals_separate_runs(random_voxels):
         torch.testing.assert_close(together[rows], alone, atol=1e-12, rtol=0)
 
 
-def test_stages_use_other_neighbourhoods(random_voxels):
-    grid, batch = random_voxels((64,))
-    net = network()
-    windows = net._windows(grid - grid.amin(0), batch, SIZE)
-    neighbours = [
-        {frozenset(row) for group in stage.groups for row in group.rows.sort(1).values.tolist()} for stage in windows
-    ]
-    assert len(set(map(frozenset, neighbours))) == 4
-
-
 def test_checkpointing_changes_no_gradient(random_voxels):
     grid, batch = random_voxels()
     features = features_of(grid)

@@ -25,8 +25,3 @@ def test_rows_go_through_the_same_layer(shape: tuple[int, ...], with_bias: bool,
         torch.testing.assert_close(
             found.double(), exact, rtol=1e-5, atol=1e-5 * max(float(exact.abs().sum()), 1) ** 0.5
         )
-
-
-def test_rows_need_not_be_contiguous() -> None:
-    x, weight = torch.randn(7, 2048).t(), torch.randn(5, 7)
-    torch.testing.assert_close(linear_rows(x, weight), F.linear(x, weight))

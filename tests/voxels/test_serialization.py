@@ -33,12 +33,6 @@ def test_compiled_hilbert_codes_are_those_of_the_reference(bits):
     assert torch.equal(hilbert_codes(transposed, bits), hilbert_reference(transposed, bits))
 
 
-@pytest.mark.parametrize("order", ORDERS)
-def test_codes_are_bijections(order):
-    codes = serial_codes(cube(4), 4, order)
-    assert (codes.unique().numel(), codes.min()) == (16**3, 0)
-
-
 def test_dropping_three_bits_gives_the_parent():
     cells = cube(4)
     assert torch.equal(z_codes(cells) >> 3, z_codes(cells >> 1))

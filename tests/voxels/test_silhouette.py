@@ -22,12 +22,6 @@ def test_pixels_between_foreground_and_background_are_told_apart(turned: bool, u
     assert torch.equal(found, expected)
 
 
-def test_noise_without_a_silhouette_is_left_alone() -> None:
-    generator = torch.Generator().manual_seed(0)
-    depth = 2 * (1 + 0.015 * torch.rand(1, 30, 40, generator=generator))
-    assert on_surface(depth).all()
-
-
 @pytest.mark.parametrize(("step", "beside"), [(1.14, False), (1.16, True)])
 def test_three_pixels_on_either_side_of_a_step_are_beside_it(step: float, beside: bool) -> None:
     depth = torch.full((2, 12, 16), 2.0)
@@ -42,9 +36,3 @@ def test_what_lies_between_foreground_and_background_is_beside_a_silhouette() ->
     assert beside_silhouettes(depth).flatten().nonzero().flatten().tolist() == [
         16 * row + column for row in range(12) for column in (7, 8)
     ]
-
-
-def test_a_hole_is_no_silhouette_and_not_beside_one() -> None:
-    depth = torch.full((1, 20, 20), 1.5)
-    depth[:, :, 10:] = 0
-    assert not beside_silhouettes(depth).any()

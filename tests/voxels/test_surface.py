@@ -59,12 +59,6 @@ def test_every_point_has_its_own_views_rotation() -> None:
     assert torch.equal(frames.rotation, torch.stack((TURN, torch.eye(3))))
 
 
-def test_where_no_normal_is_known_it_is_the_cameras_axis() -> None:
-    torch.testing.assert_close(frame(slope=0.5, row=0).normal, torch.tensor([[0.0, 0, -1]]))
-    slanted = torch.tensor([[0.5, 0, -1]]) / math.hypot(0.5, 1)
-    torch.testing.assert_close(frame(slope=0.5, row=12).normal, slanted)
-
-
 def test_change_of_depth_is_in_units_of_two_percent_and_positive_behind():
     # half a voxel of 8 cm behind: 4 cm of 2 m are 2 %
     assert measured(frame(), (0.3, 0.1, 0.5)) == pytest.approx([0.3, 0.1, 0.5, 1.0])
@@ -81,27 +75,6 @@ def test_change_of_depth_is_along_the_ray_to_the_tangent_plane():
     off_axis = frame(slope=0.5, row=13)
     expected = 1 / 1.9 * 0.08 / (float(off_axis.depth) * 0.02)
     assert measured(off_axis, (0, 0, 0.5))[3] == pytest.approx(expected)
-
-
-def test_change_of_depth_is_clamped_at_three_units() -> None:
-    assert measured(frame(), (0, 0, 1.45))[3] == pytest.approx(2.9)
-    assert measured(frame(), (0, 0, 1.55))[3] == 3
-    assert measured(frame(), (0, 0, -1.55))[3] == -3
-
-
-@pytest.mark.parametrize(("facing", "change"), [(-0.21, 1 / 0.21), (-0.19, 0.0)])
-def test_a_grazing_ray_says_nothing_of_the_depth(facing: float, change: float) -> None:
-    frames = frame()
-    frames.normal = torch.tensor([[math.sqrt(1 - facing**2), 0, facing]])
-    along = 0.01 * frames.normal[0]  # a hundredth of a voxel towards the camera's side
-    assert measured(frames, tuple(along.tolist()))[3] == pytest.approx(-0.02 * change, abs=1e-6)
-
-
-def test_voxels_count_by_a_gaussian_of_two_voxels() -> None:
-    centroids = torch.tensor([[0.0, 9, 9], [1, 0, 0], [3, 0, 0]])
-    found = vectors_to_surface(torch.zeros(1, 3), centroids, torch.ones(1, 2), torch.tensor([[1, 2]]))
-    # exp(-9/8) / exp(-1/8) = 1/e
-    torch.testing.assert_close(found, torch.tensor([[(1 + 3 / math.e) / (1 + 1 / math.e), 0, 0]]))
 
 
 def test_voxels_count_by_their_points_squared_confidence() -> None:

@@ -48,14 +48,6 @@ def test_views_lie_in_a_limited_range_and_targets_between_them(count: int) -> No
     assert len(starts) > 20  # anywhere in the scene
 
 
-def test_a_draw_depends_on_seed_scene_and_number_alone() -> None:
-    source = Listed(range(100))
-    first = ViewSelection(seed=1).draw(source, "a", 5)
-    assert ViewSelection(seed=1).draw(Listed(range(100), ["a"]), "a", 5) == first
-    assert ViewSelection(seed=2).draw(source, "a", 5).context != first.context
-    assert ViewSelection(seed=1).draw(source, "b", 5).context != first.context
-
-
 def test_targets_are_held_out_frames_and_inputs_never() -> None:
     held_out = range(0, 60, 6)
     source = Listed(range(60), held_out=held_out)
