@@ -77,6 +77,8 @@ def test_every_option_composes_and_fits_its_constructor(tmp_path: Path, group: s
         pytest.skip(f"{name} is not installed (extra: log)")
     config = composed(tmp_path, f"{group}={name}", *(["data.root=somewhere"] if name == "rgbd" else []))
     assert assert_signatures_fit(OmegaConf.to_container(config[group], resolve=True)) >= 1
+    if group == "data" and name not in ("synthetic", "paper_mix"):  # scenes in files
+        assert {"every", "index_cache", "fit", "max_views"} <= set(config.data)
 
 
 @pytest.mark.parametrize("name", group_options("refine"))

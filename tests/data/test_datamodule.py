@@ -99,7 +99,7 @@ def _trainer(steps: int, **options) -> lightning.Trainer:
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize(("stop", "workers"), [(2, 0), (4, 0), (6, 0), (4, 2), (6, 2), (7, 1)])
+@pytest.mark.parametrize(("stop", "workers"), [(2, 0), (4, 2), (6, 1)])
 def test_a_resumed_run_sees_the_batches_of_the_uninterrupted_one(rooms, tmp_path, stop, workers):
     """Stops within an epoch, at its end and within the next one (4 steps each); workers read ahead of the stop."""
     drawn = {"aspect": [0.5, 1.0], "size_multiple": 2, "crop": "random", "zoom": [1, 1.2]} if stop == 6 else {}

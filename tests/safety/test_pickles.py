@@ -87,7 +87,7 @@ def test_checkpoints(run_folder: Path, armed: Armed, kind: str) -> None:
 
 @pytest.mark.filterwarnings("ignore:Detected pickle protocol")
 @pytest.mark.parametrize("kind", PICKLES)
-@pytest.mark.parametrize("suffix", [".pt", ".bin", ".pth", ".safetensors"])
+@pytest.mark.parametrize("suffix", [".pt", ".pth", ".safetensors"])
 def test_weights(tmp_path: Path, armed: Armed, kind: str, suffix: str) -> None:
     path = tmp_path / f"model{suffix}"
     path.write_bytes(PICKLES[kind](armed))

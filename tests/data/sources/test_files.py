@@ -1,20 +1,14 @@
 """What all loaders of files share: lists of scenes, and the memory that indices take."""
 
 import logging
-from pathlib import Path
 
 import pytest
 
-from vg2gt.config import compose, config_dir
 from vg2gt.data import DataError, RGBDFolder, SyntheticScenes
 from vg2gt.data.sources import files
 
 from .layout_rgbd import write_recording
 from .layouts import room
-
-OTHERS = ("paper_mix", "synthetic")
-"""Configurations of data that are no scenes in files."""
-CONFIGURATIONS = sorted({path.stem for path in Path(config_dir(), "data").glob("*.yaml")} - set(OTHERS))
 
 
 @pytest.fixture(scope="module")
@@ -63,11 +57,6 @@ def test_a_cache_that_cannot_be_written_is_told_once(dataset, tmp_path, caplog):
         rooms = SyntheticScenes(2, num_frames=1, size=(14, 14), cache_dir=str(tmp_path / "cache"))
         assert rooms.load("room-000000", [0]).depth.shape == (1, 14, 14)
     assert sum("nothing more is kept" in record.getMessage() for record in caplog.records) == 1
-
-
-@pytest.mark.parametrize("name", CONFIGURATIONS)
-def test_every_configuration_of_files_has_the_shared_options(name):
-    assert {"every", "index_cache", "fit", "max_views"} <= set(compose("train", f"data={name}").data)
 
 
 def test_every_second_frame(dataset):
