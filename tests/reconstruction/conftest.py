@@ -2,12 +2,13 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from omegaconf import OmegaConf
 from PIL import Image
 
+from tests.data.sources.layout_rgbd import write_recording
+from tests.data.sources.layouts import pixels
 from vg2gt.data import SyntheticScenes
 from vg2gt.reconstruction.pipeline import reconstruct_with
 from vg2gt.reconstruction.scene import Scene
@@ -26,18 +27,7 @@ def frames():
 @pytest.fixture(scope="session")
 def recording(frames, tmp_path_factory) -> Path:
     """``images/ depth/ poses.txt K.txt``."""
-    folder = tmp_path_factory.mktemp("recordings") / "room"
-    for sub in ("images", "depth"):
-        (folder / sub).mkdir(parents=True)
-    for i in range(4):
-        pixels = (frames.images[i].permute(1, 2, 0).numpy() * 255 + 0.5).astype(np.uint8)
-        Image.fromarray(pixels).save(folder / "images" / f"{i + 8:03d}.png")
-        millimetres = (frames.depth[i].numpy() * 1000 + 0.5).astype(np.uint16)
-        Image.fromarray(millimetres).save(folder / "depth" / f"{i + 8:03d}.png")
-    poses = np.linalg.inv(frames.world_to_camera.double().numpy())
-    np.savetxt(folder / "poses.txt", poses.reshape(-1, 16))
-    np.savetxt(folder / "K.txt", frames.intrinsics[0].numpy())
-    return folder
+    return write_recording(tmp_path_factory.mktemp("recordings"), frames, "room", first=8, digits=3)
 
 
 @pytest.fixture(scope="session")
@@ -45,7 +35,7 @@ def photos(frames, tmp_path_factory) -> Path:
     """The same pictures: whole, larger as JPEG, lying on its side as its EXIF data say, cut to a portrait."""
     folder = tmp_path_factory.mktemp("holiday") / "photos"
     folder.mkdir()
-    pictures = [Image.fromarray((f.permute(1, 2, 0).numpy() * 255 + 0.5).astype(np.uint8)) for f in frames.images]
+    pictures = [Image.fromarray(image) for image in pixels(frames)]
     pictures[0].save(folder / "IMG_8.png")
     pictures[1].resize((448, 336)).save(folder / "IMG_9.jpg", quality=95)
     exif = Image.Exif()

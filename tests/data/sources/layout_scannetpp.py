@@ -7,8 +7,8 @@ import numpy as np
 from examples.data_sets.scannetpp import ScanNetPPiPhone
 from vg2gt.data import Frames
 
-from .layout_scannet import JPEG_ERROR, millimetres
-from .layouts import Layout, camera_to_world, pixels, save
+from .layout_scannet import JPEG_ERROR
+from .layouts import Layout, camera_to_world, millimetres, pixels, save
 
 
 def write(root: Path, frames: Frames) -> None:

@@ -26,7 +26,7 @@ SIZE = (30, 40)
 class Layout:
     """A dataset's layout on disk."""
 
-    write: Callable[[Path, Frames], None]
+    write: Callable[[Path, Frames], object]
     read: Callable[[Path], FileSource]
     image_error: float = 0.0
     depth_quantum: Callable[[torch.Tensor], torch.Tensor] | float | None = 1e-3
@@ -62,6 +62,11 @@ def camera_of(frames: Frames) -> list[float]:
 def pixels(frames: Frames) -> np.ndarray:
     """``[V, H, W, 3]`` uint8 images of frames."""
     return (frames.images.permute(0, 2, 3, 1).numpy() * 255 + 0.5).astype(np.uint8)
+
+
+def millimetres(frames: Frames) -> np.ndarray:
+    """``[V, H, W]`` uint16 depth of frames."""
+    return (frames.depth.numpy() * 1000 + 0.5).astype(np.uint16)
 
 
 def save(path: Path, image: np.ndarray) -> None:

@@ -21,7 +21,7 @@ from vg2gt.runs.load import load_model
 from vg2gt.types import Cameras
 
 from .layout_colmap import POINTS_A_VIEW, write
-from .layouts import SIZE, room
+from .layouts import SIZE, pixels, room
 
 
 @pytest.fixture(scope="module")
@@ -148,17 +148,16 @@ def test_exif_orientation_with_given_cameras(tmp_path, orientation, stored):
     """Item 6: cameras of upright images, and of images as COLMAP reads them, whose points' colours tell it."""
     frames = room(2)
     cameras = Cameras(frames.world_to_camera[None].double(), frames.intrinsics[None].double(), SIZE)
-    pixels = [(image.permute(1, 2, 0).numpy() * 255 + 0.5).astype(np.uint8) for image in frames.images]
     world = unproject(frames.depth[None].double(), cameras)[0].numpy()
     y, x = (axis.ravel() for axis in np.mgrid[2:30:5, 2:40:5])
     positions = np.concatenate([view[y, x] for view in world])
-    colors = np.concatenate([picture[y, x] for picture in pixels])
+    colors = np.concatenate([picture[y, x] for picture in pixels(frames)])
     sources = (np.arange(2 * len(y)), np.repeat([0, 1], len(y)), np.tile(np.stack((x, y), -1), (2, 1)))
     names = ["0.jpg", "1.jpg"]
     write_colmap(tmp_path / "s" / "sparse" / "0", colmap_from_views(cameras, names, positions, colors, sources))
     (tmp_path / "s" / "images").mkdir()
     turn = {3: Image.Transpose.ROTATE_180, 6: Image.Transpose.ROTATE_90, 8: Image.Transpose.ROTATE_270}[orientation]
-    for name, picture in zip(names, pixels, strict=True):
+    for name, picture in zip(names, pixels(frames), strict=True):
         image = Image.fromarray(picture) if stored else Image.fromarray(picture).transpose(turn)
         image.save(tmp_path / "s" / "images" / name, exif=turned(orientation), quality=95, subsampling=0)
     loaded = COLMAP(str(tmp_path)).load("s", [0, 1])

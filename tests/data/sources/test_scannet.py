@@ -11,8 +11,8 @@ import torch
 from vg2gt.data import DataError, RGBDFolder
 from vg2gt.data.sources import ScanNet, ScanNetSens
 
-from .layout_scannet import millimetres, sens_frame, sens_header, write_export, write_sens
-from .layouts import pixels, room
+from .layout_scannet import sens_frame, sens_header, write_export, write_sens
+from .layouts import millimetres, pixels, room
 
 SCENE = "scene0707_00"
 """First byte of the number of frames."""
