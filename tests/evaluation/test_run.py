@@ -132,13 +132,6 @@ def test_refined_rows_stand_apart(tmp_path: Path, cache: Path, trained: Path, jo
     assert "refined" not in (joined / "metrics.md").read_text()
 
 
-def test_another_backbone_or_model_is_refused(tmp_path: Path, cache: Path, trained: Path) -> None:
-    with pytest.raises(ValueError, match="trained on backbone"):
-        run(tmp_path, cache, f"ckpt={trained}", "backend=oracle", "backend.seed=1")
-    with pytest.raises(ValueError, match=r"does not fit this model, first in model\.gaussians\.out"):
-        run(tmp_path, cache, f"ckpt={trained}", "+model.gaussians.splits=4")
-
-
 def test_the_papers_rows_do_not_stand_beside_other_data(tmp_path: Path, cache: Path, trained: Path) -> None:
     chosen = ["evaluation.table=replica", "data.eval_scenes=1", "views=[3]"]
     report = run(tmp_path, cache, f"ckpt={trained}", *chosen)

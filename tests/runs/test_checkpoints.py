@@ -53,17 +53,6 @@ def test_file_and_folder_reach_the_disk_in_order(tmp_path: Path, monkeypatch: py
     assert done == ["step-3.ckpt.tmp", "rename", tmp_path.name]
 
 
-def test_newest_valid_passes_over_damaged_files(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    for step in (9, 10, 100):
-        write_checkpoint({"global_step": step}, tmp_path / f"step-{step}.ckpt")
-    assert newest_valid(tmp_path).name == "step-100.ckpt"
-    content = (tmp_path / "step-100.ckpt").read_bytes()
-    (tmp_path / "step-100.ckpt").write_bytes(content[: len(content) // 2])
-    with caplog.at_level(logging.WARNING):
-        assert newest_valid(tmp_path).name == "step-10.ckpt"
-    assert "step-100.ckpt" in caplog.text
-
-
 def test_no_valid_checkpoint_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "step-1.ckpt").write_bytes(b"nothing")
     with pytest.raises(FileNotFoundError, match=r"no valid checkpoint in .* \(1 damaged\).* overwrite=true"):

@@ -11,9 +11,8 @@ import lightning
 import pytest
 
 from tests.reliability.crash_harness import RUN
-from tests.training_helpers import small_config, with_crash
+from tests.training_helpers import small_config
 from vg2gt.runs.checkpoints import newest_valid
-from vg2gt.studies.curves import read_curves
 from vg2gt.training.distributed import ending_together
 from vg2gt.training.loop import build, train
 
@@ -45,15 +44,6 @@ def test_the_newest_are_kept(tmp_path: Path, cache: Path) -> None:
     assert names(tmp_path) == ["step-2.ckpt", "step-3.ckpt"]
     train(small_config(tmp_path, cache, *overrides, "trainer.max_steps=5", "ckpt=last"))
     assert names(tmp_path) == ["step-4.ckpt", "step-5.ckpt"]
-
-
-def test_a_resumed_run_logs_what_the_uninterrupted_one_does(tmp_path: Path, cache: Path) -> None:
-    train(small_config(tmp_path / "whole", cache, *RUN))
-    with pytest.raises(InterruptedError):
-        train(with_crash(small_config(tmp_path / "cut", cache, *RUN), step=3))
-    train(small_config(tmp_path / "cut", cache, *RUN, "ckpt=last"))
-    whole, cut = (read_curves(tmp_path / name) for name in ("whole", "cut"))
-    assert (cut, list(whole["loss"])) == (whole, [0, 1, 2, 3, 4, 5])
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
