@@ -34,7 +34,7 @@ RUN = [
     "trainer.val_check_interval=4",
 ]
 
-TRAIN, EVALUATE, ABLATE = "vg2gt.cli.train", "vg2gt.cli.evaluate", "vg2gt.cli.ablate"
+TRAIN, EVALUATE = "vg2gt.cli.train", "vg2gt.cli.evaluate"
 
 Moment = Callable[["Attempt"], bool]
 
@@ -101,9 +101,7 @@ class Attempt:
         raise TimeoutError(f"{self.folder} waited {PATIENCE:g} s:\n{self.said()[-3000:]}")
 
 
-def start(
-    module: str, arguments: Sequence[str], folder: Path, warm: bool = True, environment: dict[str, str] | None = None
-) -> Attempt:
+def start(module: str, arguments: Sequence[str], folder: Path, warm: bool = True) -> Attempt:
     """Starts a command in a new process group."""
     output, before = folder.with_name(f"{folder.name}.out"), _contents(folder)
     if warm:
@@ -116,7 +114,7 @@ def start(
             stderr=file,
             cwd=ROOT,
             start_new_session=True,
-            env={**os.environ, "OMP_NUM_THREADS": "1", **(environment or {})},
+            env={**os.environ, "OMP_NUM_THREADS": "1"},
         )
     return Attempt(folder, output, process, before)
 
