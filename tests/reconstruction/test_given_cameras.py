@@ -12,7 +12,7 @@ from PIL import Image
 
 from tests.data.sources.layout_phone import write_polycam
 from tests.data.sources.layouts import room
-from tests.reconstruction.stand_in import PlaneAhead
+from tests.reconstruction.conftest import SIZE
 from vg2gt import io
 from vg2gt.cli import reconstruct as reconstruct_command
 from vg2gt.geometry.cameras import resize_intrinsics, unproject
@@ -24,21 +24,7 @@ from vg2gt.reconstruction.pictures import Picture
 from vg2gt.runs.load import load_model
 from vg2gt.types import Cameras
 
-STAND_IN = f"custom,_target_={PlaneAhead.__module__}.{PlaneAhead.__name__}"
-SIZE = (84, 112)
 NAMES = [f"{8 + i:03d}.png" for i in range(4)]
-
-
-@pytest.fixture(scope="module")
-def model():
-    return load_model(backend=STAND_IN, device="cpu").model
-
-
-@pytest.fixture
-def folder(recording: Path, tmp_path: Path) -> Path:
-    """The recording's images alone."""
-    shutil.copytree(recording / "images", tmp_path / "room" / "images")
-    return tmp_path / "room"
 
 
 def put_poses(folder: Path, recording: Path) -> None:

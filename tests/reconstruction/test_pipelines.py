@@ -10,7 +10,8 @@ import pytest
 import torch
 from PIL import Image
 
-from tests.reconstruction.test_given_cameras import NAMES, SIZE, STAND_IN, put_cameras, put_colmap, put_transforms
+from tests.reconstruction.conftest import SIZE, STAND_IN
+from tests.reconstruction.test_given_cameras import NAMES, put_cameras, put_colmap, put_transforms
 from vg2gt import io
 from vg2gt.cli import reconstruct as reconstruct_command
 from vg2gt.cli import render as render_command
@@ -29,17 +30,6 @@ from vg2gt.reconstruction.saved import read_scene
 from vg2gt.rendering import Renderer
 from vg2gt.runs.load import load_model
 from vg2gt.types import Gaussians
-
-
-@pytest.fixture(scope="module")
-def model():
-    return load_model(backend=STAND_IN, device="cpu").model
-
-
-@pytest.fixture
-def folder(recording: Path, tmp_path: Path) -> Path:
-    shutil.copytree(recording / "images", tmp_path / "room" / "images")
-    return tmp_path / "room"
 
 
 def run(*arguments: str | Path) -> None:

@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from tests.reconstruction.test_given_cameras import STAND_IN
+from tests.reconstruction.conftest import STAND_IN
 from vg2gt.cli import reconstruct as reconstruct_command
 from vg2gt.geometry.alignment import align_points
 from vg2gt.geometry.cameras import camera_centers
