@@ -102,15 +102,19 @@ class Scores:
 
 
 def given_cameras(scene: Scene, photos: PhotoSet) -> Cameras:
-    """The scene's cameras in the order of the views that it was given."""
-    return scene.cameras.select(torch.tensor([scene.names.index(name) for name in photos.given]))
+    """The scene's cameras in the order of the views that it was given, for images of the size that is scored."""
+    order = torch.tensor([scene.names.index(name) for name in photos.given])
+    intrinsics = photos.cameras.intrinsics[:, list(photos.context)].to(scene.cameras.intrinsics)
+    return Cameras(scene.cameras.world_to_camera[:, order], intrinsics, photos.size)
 
 
-def ours(loaded: LoadedModel, scores: Scores, refinement: RefineOptions, budgets: Sequence[float]) -> list[Row]:
-    """The feed-forward scene and those refined from it, each from the start."""
+def ours(
+    loaded: LoadedModel, scores: Scores, refinement: RefineOptions, budgets: Sequence[float], size: int | None
+) -> list[Row]:
+    """The feed-forward scene and those refined from it, each from the start; ``size``: longer side they work at."""
     photos, memory = scores.photos, PeakMemory(torch.device("cpu"))
     began = time.process_time()
-    scene = reconstruct_with(loaded.model, photos.folder, size=photos.size, renderer=loaded.renderer)
+    scene = reconstruct_with(loaded.model, photos.folder, size=size or photos.size, renderer=loaded.renderer)
     taken = time.process_time() - began
 
     def scored(label: str, scene: Scene, seconds: float, steps: int) -> Row:
@@ -213,6 +217,7 @@ def arguments() -> argparse.Namespace:
     options = parser(__doc__, threads=1)
     options.add_argument("folders", nargs="+", metavar="FOLDER", help="of photographs; NAME=FOLDER names the set")
     options.add_argument("--size", type=int, default=280, help="longer side in pixels")
+    options.add_argument("--working-size", type=int, help="longer side that ours works at; --size is scored")
     options.add_argument("--budgets", type=float, nargs="*", default=[30.0, 100.0, 300.0], metavar="CORE_SECONDS")
     options.add_argument("--poses", choices=("sfm", "given"), default="sfm")
     options.add_argument("--ckpt", help="default: the weights in the package")
@@ -244,8 +249,9 @@ def main() -> None:
         rows: list[Row] = []
         if not given.only_peer:
             warm_up(loaded, photos, refinement)
-            settings = _settings([*(f"model.{change}" for change in given.model), *changes])
-            found = ours(loaded, scores, refinement, given.budgets)
+            size = [f"working-size={given.working_size}"] if given.working_size else []
+            settings = _settings([*size, *(f"model.{change}" for change in given.model), *changes])
+            found = ours(loaded, scores, refinement, given.budgets, given.working_size)
             rows += [{**common, "program": OURS, "settings": settings, **row} for row in found]
         if given.opensplat:
             found = peer(given.opensplat, scores, [f"--{change}" for change in given.peer], given.budgets)

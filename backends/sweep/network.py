@@ -29,6 +29,7 @@ _FINE_PLANES = 12
 _FINE_REACH = 1.5  # of the second sweep on either side, in spacings of the first
 _VIEWS_AT_A_TIME = 4
 _FARTHEST = 4.0  # decoded depth at most, in multiples of the farthest plane
+_LOG_DEPTH = 20.0  # of decoded depth at most either way: finite whatever the tokens are
 WIDE_PLANES = 64  # of the sweep that finds the range
 
 
@@ -176,7 +177,7 @@ class SweepNet(nn.Module):
         """Tokens to depth and log-scale of its relative error, each ``[V, H, W]``; see :class:`DepthHead`."""
         grid = (context.shape[-2] // 2, context.shape[-1] // 2)
         log_depth, log_scale = self.head(taps, grid, context, context_fine, swept)
-        return log_depth.exp(), log_scale
+        return log_depth.clamp(-_LOG_DEPTH, _LOG_DEPTH).exp(), log_scale
 
 
 def _match(sweep: PlaneSweep, volume: VolumeNet, features: Tensor, inverse: Tensor, warp: SourceWarp) -> Tensor:

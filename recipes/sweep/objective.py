@@ -12,6 +12,7 @@ from recipes.sweep.samples import Sample
 
 _CLAMP = 2.0  # log-depth errors beyond it do not count more
 _BEYOND = 1.5  # times the farthest plane: what is farther, or sky, only has to be said to be at least that far
+_ROOM = 1.0  # log-depth behind that at which it may be, so that it does not run away
 _BEYOND_ERROR = 0.7  # relative error that the uncertainty of such pixels should state at least
 WEIGHTS = {"depth": 2.0, "uncertainty": 0.15, "gradient": 1.0, "planes": 0.4, "position": 2.0, "swept": 1.0}
 
@@ -32,7 +33,8 @@ def objective(
     seen = (sample.depth > 0).float()
     valid = seen * ~beyond
     error = depth.log() - torch.where(valid > 0, sample.depth, farthest).log()
-    absolute = torch.where(beyond, -error, error.abs()).clamp(0, _CLAMP)
+    outside = (-error).clamp_min(0) + (error - _ROOM).clamp_min(0)
+    absolute = torch.where(beyond, outside, error.abs()).clamp_max(_CLAMP)
     stated = torch.where(beyond, absolute.clamp_min(_BEYOND_ERROR), absolute)
     log_scale = log_scale.clamp(-6, 1)
     terms = {

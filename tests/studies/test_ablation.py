@@ -2,6 +2,7 @@
 
 import json
 import re
+import shlex
 import shutil
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ import pytest
 
 import vg2gt.studies.ablation
 import vg2gt.studies.study
+from tests.commands import printed
 from tests.training_helpers import SMALL
 from vg2gt.evaluation.tables import METRICS
 from vg2gt.runs.checkpoints import newest_valid, read_checkpoint, write_checkpoint
@@ -29,9 +31,12 @@ def unpadded(report: str) -> str:
 
 
 @pytest.fixture(scope="module")
-def finished(of_the_readme: tuple[Path, str]) -> Path:
-    """A finished study, as :func:`study` makes it."""
-    return of_the_readme[0]
+def finished(tmp_path_factory: pytest.TempPathFactory, cache: Path) -> Path:
+    """What :func:`study` does, by the command."""
+    folder = tmp_path_factory.mktemp("ablation")
+    short = ["name=short", "seeds=1", "full_steps=2", "steps=1", "lr=1e-4", "variants=[wo_split]", "splits=[1,2]"]
+    assert "w/o Split" in printed(shlex.join(["vg2gt", "ablate", *short, *QUIET, f"data.cache_dir={cache}"]), folder)
+    return folder / "outputs" / "short"
 
 
 @pytest.fixture
