@@ -88,16 +88,6 @@ def test_refinements_instantiate_and_the_default_is_the_codes(name: str) -> None
     assert (instantiate(config) == RefineOptions()) == (name == "default")
 
 
-@pytest.mark.parametrize("name", group_options("data"))
-def test_misspelt_options_of_data_are_found(tmp_path: Path, name: str) -> None:
-    config = OmegaConf.to_container(composed(tmp_path, f"data={name}").data, resolve=True)
-    assert isinstance(config, dict)
-    with pytest.raises(AssertionError, match="eval_windw"):
-        assert_signatures_fit({**config, "eval_windw": 30})
-    with pytest.raises(AssertionError, match="scnes"):
-        assert_signatures_fit({**config, "train": {**config["train"], "scnes": None}})
-
-
 @pytest.mark.parametrize("group", ["experiment", "ablation", "debug"])
 def test_every_preset_composes(tmp_path: Path, group: str) -> None:
     assert group_options(group)
