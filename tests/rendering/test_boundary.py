@@ -145,7 +145,7 @@ def test_every_scene_has_its_own_background_unless_one_is_given(implementation: 
 
 
 def test_the_kernels_that_know_one_background_get_each_scenes_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    gpu = pytest.importorskip("vg2gt.kernels.render_gpu", exc_type=ImportError)
+    gpu = pytest.importorskip("vg2gt.rendering.gpu_tiles", exc_type=ImportError)
     gaussians, cameras = two_scenes()
     monkeypatch.setattr("vg2gt.rendering.renderer._resolve", lambda *_: "triton")
 
