@@ -27,13 +27,7 @@ def warm_process(target: Callable[..., None], *arguments: Any) -> BaseProcess:
 
 
 def become(folder: Path | str, outputs: Sequence[Path | str], environment: dict[str, str | None] | None = None) -> None:
-    """Makes a warm process what a shell would have started: in a folder, with files for what it prints, and variables.
-
-    Args:
-        folder: to be in.
-        outputs: files for stdout and stderr, or one for both; what they hold stays.
-        environment: changed variables; None: unset.
-    """
+    """Makes a warm process what a shell would have started."""
     for descriptor, path in zip((1, 2), (*outputs, outputs[0]), strict=False):
         file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
         os.dup2(file, descriptor)

@@ -21,7 +21,6 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import torch
 
-ROOMS = "~/.cache/vg2gt"
 FIVE_STEPS = ("trainer.max_steps=5", "data.image_size=[56,112]", "data.train_scenes=3", "data.eval_scenes=1")
 SHIPPED_ROOMS = ("data.eval_scenes=2", "data.image_size=[56,112]", "views=[4]", "evaluation.lpips=null", "device=cpu")
 

@@ -14,14 +14,7 @@ from PIL import Image
 
 from vg2gt.data import SyntheticScenes
 from vg2gt.geometry.cameras import project, unproject
-from vg2gt.io import (
-    colmap_from_views,
-    named_cameras,
-    read_colmap,
-    write_cameras_json,
-    write_colmap,
-    write_gaussian_ply,
-)
+from vg2gt.io import colmap_from_views, named_cameras, read_colmap, write_cameras_json, write_colmap, write_gaussian_ply
 from vg2gt.io.images import to_pixels
 from vg2gt.types import Cameras, Gaussians
 
@@ -121,7 +114,6 @@ def test_rows_are_measured_and_merged(command, photos: Path, tmp_path: Path, cap
     assert Image.open(tmp_path / "work" / "room-80.png").size == (3 * 80 + 8, 2 * 56 + 4)
     given = [path.name for path in (tmp_path / "work" / "room" / "80" / "images").iterdir()]
     assert sorted(given) == [f"{index:06d}.png" for index in range(7) if index not in HELD_OUT]
-
     rows = command(f"other={photos}", "--budgets", "--model", "fine.min_footprint=9")
     assert [(row["set"], row["settings"]) for row in rows] == [
         ("other", "model.fine.min_footprint=9"), ("room", "refine.fill=0"), ("room", "refine.fill=0")
@@ -135,8 +127,7 @@ def test_rows_are_measured_and_merged(command, photos: Path, tmp_path: Path, cap
 def test_what_only_left_out_views_saw_is_not_given(photos: Path, room, tmp_path: Path, benchmark_script) -> None:
     add_points(photos, room)
     prepared = benchmark_script("photo_sets").prepare("room", photos, tmp_path / "work", 80, 8, "given")
-    assert list(prepared.held_out) == HELD_OUT
-    assert prepared.points == 2
+    assert (list(prepared.held_out), prepared.points) == (HELD_OUT, 2)
     model = read_colmap(prepared.folder / "sparse" / "0")
     points = list(model.points3D.values())
     seen = {image.name: image for image in model.images.values()}
@@ -161,8 +152,7 @@ def test_the_peer_gets_the_same_core_seconds(command, photos: Path, room, tmp_pa
     assert row["core_seconds"] == pytest.approx(1, rel=0.15)
     assert row["steps"] == pytest.approx(250, rel=0.15)
     tried, *others = (tmp_path / "log").read_text().splitlines()
-    assert tried == "100 7"
-    assert others[-1] == f"{row['steps']} 7"
+    assert (tried, others[-1]) == ("100 7", f"{row['steps']} 7")
 
 
 def test_a_peer_that_cannot_be_run_is_an_error(command, photos: Path, room, tmp_path: Path) -> None:

@@ -36,10 +36,7 @@ MODEL = ["model=vg2gt", "model.coarse.min_footprint=4", "optimizer=adamw", "mode
 MODEL += ["data.min_views=2", "data.max_images=4", "data.train_scenes=2", "training.render_views=1"]
 SIZES = {"cpu": ((14, 28), 10), "cuda": ((56, 112), 2)}  # of images, and pixels a voxel
 NARROW = ["model.coarse.hidden=[64,32]", "model.coarse.fuse_channels=32", "model.fine.dense_head.features=16"]
-NARROW += [
-    "model.coarse.ptv3.enc_channels=[32,32,32,32,32]",
-    "model.coarse.ptv3.dec_channels=[32,32,32,32]",
-]
+NARROW += ["model.coarse.ptv3.enc_channels=[32,32,32,32,32]", "model.coarse.ptv3.dec_channels=[32,32,32,32]"]
 NARROW += ["model.coarse.ptv3.enc_heads=[2,2,2,2,2]", "model.coarse.ptv3.dec_heads=[2,2,2,2]"]
 WIDTHS = {"cpu": NARROW, "cuda": []}
 
@@ -147,7 +144,6 @@ def test_an_evaluation(device: str, tmp_path: Path, cache: Path, as_on_a_gpu: An
 @slowly_on_a_cpu
 def test_a_reconstruction(device: str, as_on_a_gpu: Any) -> None:
     """Untrained, of random weights, which is as good as any."""
-
     size, pixels = SIZES[device]
 
     def scene(where: str) -> tuple[int, Tensor]:

@@ -30,7 +30,6 @@ def test_installed_wheel_trains_from_an_empty_folder(tmp_path: Path, cache: Path
     assert {info.filename for info in weights} == shipped
     assert sum(info.file_size for info in weights) < 12e6
     assert not [name for name in members if name.startswith(("tests/", "benchmarks/", "outputs/"))]
-
     site, empty = tmp_path / "site", tmp_path / "empty"
     empty.mkdir()
     install = [sys.executable, "-m", "pip", "install", "--no-deps", "--no-index", "--no-compile"]

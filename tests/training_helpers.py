@@ -4,10 +4,12 @@ from pathlib import Path
 from typing import Any
 
 import lightning
-from omegaconf import DictConfig, open_dict
+import torch
+from omegaconf import DictConfig, OmegaConf, open_dict
 
 from vg2gt.config import compose
-from vg2gt.model import VG2GT
+from vg2gt.model import VG2GT, Reconstructor
+from vg2gt.runs.load import compose_part
 from vg2gt.training.loop import Run
 
 SMALL = [
@@ -30,6 +32,19 @@ SMALL = [
 def small_config(folder: Path, cache: Path, *overrides: str) -> DictConfig:
     """Composes the default configuration with :data:`SMALL` and ``overrides``."""
     return compose("train", f"output_dir={folder}", f"data.cache_dir={cache}", *SMALL, *overrides)
+
+
+def write_run(folder: Path, model: Reconstructor, mark: float = 0.0) -> Path:
+    """A training run's folder of an oracle's tiny model, its head known by a mark in one weight."""
+    (folder / "checkpoints").mkdir(parents=True)
+    parts = {"backend": "oracle", "model": "tiny", "renderer": "solid"}
+    config = {name: compose_part(name, choice) for name, choice in parts.items()}
+    OmegaConf.save(OmegaConf.create(config), folder / "config.yaml")
+    state = {f"model.{key}": value for key, value in model.state_dict().items() if not key.startswith("backend.")}
+    state["model.gaussians.out.bias"] = state["model.gaussians.out.bias"] + mark
+    checkpoint = {"state_dict": state, "backend": dict(model.backend.identity()), "global_step": 7}
+    torch.save(checkpoint, folder / "checkpoints" / "step-7.ckpt")
+    return folder
 
 
 class CrashAfter(lightning.Callback):

@@ -1,7 +1,6 @@
 """Scenes and the choice of backends for the contract test."""
 
 import importlib
-from pathlib import Path
 
 import pytest
 import torch
@@ -16,7 +15,6 @@ from vg2gt.geometry.rotations import quat_to_matrix
 from vg2gt.types import Cameras, Hints
 
 BUILT_IN = ("oracle", "sweep", "vggt_tiny", "da3_tiny", "onnx")
-CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -13,16 +13,8 @@ import torch
 from backends import export as exporting
 from backends.base import Backend
 from backends.bundle import DESCRIPTION
-from backends.export import (
-    TRACED,
-    Exportable,
-    example_inputs,
-    export,
-    export_graph,
-    relative_difference,
-)
+from backends.export import Exportable, example_inputs, export, relative_difference
 from backends.onnx import OnnxBackend
-from vg2gt.cli.export import main
 from vg2gt.types import Cameras, Geometry, Hints
 
 UNSEEN = [(1, 1, 5, 5), (1, 2, 6, 4), (2, 5, 3, 8), (3, 4, 2, 7), (1, 1, 1, 1)]  # scenes, views, patch rows, columns
@@ -118,11 +110,6 @@ def test_attention_never_holds_the_weights_of_all_pairs(onnx_bundle: Path, name:
     assert (("com.microsoft", "MultiHeadAttention") in kinds) == (name == "encoder.onnx")
 
 
-def test_files_tell_nothing_of_the_machine(onnx_bundle: Path) -> None:
-    root = str(Path(__file__).resolve().parents[2]).encode()
-    assert not any(root in file.read_bytes() for file in onnx_bundle.iterdir())
-
-
 def test_missing_folder_and_files_are_named(copy: Path, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"backend\.path=FOLDER"):
         OnnxBackend()
@@ -157,15 +144,6 @@ def test_wrong_descriptions_are_refused(copy: Path, change: Callable[[dict[str, 
         OnnxBackend(str(copy))
 
 
-def test_outputs_are_taken_by_name(copy: Path, shallow_da3: Exportable) -> None:
-    network = onnx.load(copy / "encoder.onnx")
-    first, second, *rest = network.graph.output
-    del network.graph.output[:]
-    network.graph.output.extend([second, first, *rest])
-    onnx.save(network, copy / "encoder.onnx")
-    assert worst_difference(OnnxBackend(str(copy)), shallow_da3) <= LIMIT
-
-
 def test_weights_beside_the_graph_are_read(copy: Path, shallow_da3: Exportable) -> None:
     """As for networks beyond 2 GB, whose weights do not fit into the ONNX file."""
     onnx.save(onnx.load(copy / "encoder.onnx"), copy / "encoder.onnx", save_as_external_data=True, location="data.bin")
@@ -196,9 +174,7 @@ def test_export_refuses_what_it_cannot_do(make_backend, shallow_da3: Exportable,
         export(shallow_da3, tmp_path)
 
 
-def test_a_failed_export_leaves_nothing(
-    shallow_da3: Exportable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failed_export_leaves_nothing(shallow_da3, tmp_path, monkeypatch):
     def fail(*_: Any) -> None:
         raise RuntimeError("no graph")
 
@@ -206,32 +182,3 @@ def test_a_failed_export_leaves_nothing(
     with pytest.raises(RuntimeError, match="no graph"):
         export(shallow_da3, tmp_path / "out")
     assert not list(tmp_path.iterdir())
-
-
-def test_fixed_sizes_are_found(shallow_da3: Exportable, tmp_path: Path) -> None:
-    class Fixed(torch.nn.Module):
-        def forward(self, images: torch.Tensor) -> torch.Tensor:
-            return images.sum() * (2.0 if images.shape[1] == 3 else 1.0)
-
-    inputs = example_inputs(shallow_da3, *TRACED)
-    with pytest.raises(RuntimeError, match=r"fixed the axes \[1\] of images"):
-        export_graph(Fixed(), inputs, ["images"], ["out"], tmp_path / "fixed.onnx")
-
-
-def test_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = []
-
-    def fake(backend: Backend, out: Path) -> Any:
-        asked.append((backend.name, backend.token_dims, out))
-        raise SystemExit
-
-    monkeypatch.setattr(exporting, "export", fake)
-    with pytest.raises(SystemExit):
-        main(["backend=da3_tiny", "backend.dim=96", f"out={tmp_path / 'x'}"])
-    assert asked == [("da3_tiny", (192,) * 4, tmp_path / "x")]
-    with pytest.raises(SystemExit, match="give out="):
-        main(["backend=da3_tiny"])
-    with pytest.raises(SystemExit, match="da3_tiny"):
-        main(["backend=unknown", f"out={tmp_path / 'x'}"])
-    with pytest.raises(SystemExit, match=r"backend\.pretrained=false"):
-        main(["backend=da3_tiny", "backend.pretrained=true", f"out={tmp_path / 'x'}"])

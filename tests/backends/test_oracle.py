@@ -88,24 +88,6 @@ def test_the_background_lies_behind_the_scene(make_scene) -> None:
         OracleBackend(background=0.5)
 
 
-def test_depth_bleeds_over_edges_only(make_scene) -> None:
-    images, hints = make_scene(1, 1, SIZE)
-    depth = torch.full((1, 1, *SIZE), 2.0)
-    depth[..., 50:] = 3.0
-    geometry = simulate(images, replace(hints, depth=depth), depth_noise=0)
-    changed = (geometry.depth != depth).any(-2)[0, 0].nonzero()[:, 0].tolist()
-    assert changed == [49, 50]
-    assert 2 < geometry.depth[0, 0, 20, 49] < geometry.depth[0, 0, 20, 50] < 3
-
-
-def test_confidence_knows_the_error(make_scene) -> None:
-    images, hints = make_scene(2, 4, SIZE)
-    geometry = simulate(images, hints)
-    error = relative_error(geometry, hints).abs()
-    sure = geometry.depth_conf > geometry.depth_conf.median()
-    assert error[sure].mean() < 0.7 * error[~sure].mean()
-
-
 def test_tokens_do_not_know_the_truth(make_scene) -> None:
     """Two different truths that look the same to the network (same prediction) have the same tokens."""
     images, hints = make_scene(1, 2, SIZE)
@@ -120,48 +102,6 @@ def test_tokens_do_not_know_the_truth(make_scene) -> None:
     assert rank == 1  # the confidence channel alone tells them apart
 
 
-def test_tokens_carry_the_predicted_depth(make_scene) -> None:
-    """A linear read-out finds the patch's predicted log-depth in the tokens of every tap."""
-    images, hints = make_scene(4, 4, SIZE)
-    backend = OracleBackend(depth_noise=0.1)
-    tokens = backend.encode(images, hints)
-    log_depth = torch.nn.functional.avg_pool2d(tokens.state["depth"].log(), 14).flatten(2)
-    target = (log_depth - log_depth.mean((1, 2), keepdim=True)).flatten()[:, None]
-    for patch in tokens.patch:
-        features = torch.cat((patch.flatten(0, 2), torch.ones(target.shape[0], 1)), 1)
-        residual = target - features @ torch.linalg.lstsq(features, target).solution
-        assert residual.std() < 0.2 * target.std()
-
-
-def test_response_is_smooth_and_of_the_stated_size(make_scene) -> None:
-    images, hints = make_scene(2, 4, SIZE)
-    backend = OracleBackend(response=0.03)
-    tokens = backend.encode(images, hints)
-    torch.manual_seed(0)
-    changed = backend.decode(tokens.with_patch(tuple(patch + torch.randn_like(patch) for patch in tokens.patch)))
-    residual = (changed.depth / backend.decode(tokens).depth).log()
-    assert 0.02 < residual.std() < 0.04
-    assert residual.diff(dim=-1).abs().mean() < 0.2 * residual.std()
-
-
-def test_token_changes_can_undo_the_noise(make_scene) -> None:
-    """Fitting the tokens by gradient alone removes most of the error: the decoder can represent the correction."""
-    images, hints = make_scene(1, 2, SIZE)
-    backend = OracleBackend(response=0.05)
-    tokens = backend.encode(images, hints)
-    changes = [torch.zeros_like(patch).requires_grad_() for patch in tokens.patch]
-    optimiser = torch.optim.Adam(changes, lr=0.02)
-    start, error = float("nan"), torch.tensor(torch.nan)
-    for step in range(60):
-        patch = tuple(patch + change for patch, change in zip(tokens.patch, changes, strict=True))
-        error = (backend.decode(tokens.with_patch(patch)).depth.log() - hints.depth.log()).abs().mean()
-        start = error.item() if step == 0 else start
-        optimiser.zero_grad()
-        error.backward()
-        optimiser.step()
-    assert error.item() < 0.2 * start
-
-
 def test_construction_leaves_the_global_generator_alone() -> None:
     torch.manual_seed(3)
     expected = torch.rand(2)
@@ -172,28 +112,8 @@ def test_construction_leaves_the_global_generator_alone() -> None:
     assert first.identity() != OracleBackend(seed=1).identity()
 
 
-def test_identity_does_not_depend_on_threads() -> None:
-    """A checkpoint trained with two threads is read with one, though the last bits of the weights may differ."""
-    threads = torch.get_num_threads()
-    try:
-        identities = []
-        for count in (1, 2):
-            torch.set_num_threads(count)
-            identities.append(OracleBackend().identity())
-    finally:
-        torch.set_num_threads(threads)
-    assert identities[0] == identities[1]
-
-
 @pytest.mark.parametrize("name", ["depth", "cameras", "frame_ids"])
 def test_each_missing_hint_is_named(make_scene, name: str) -> None:
     images, hints = make_scene(1, 2, SIZE)
     with pytest.raises(ValueError, match=f"missing: {name}\\."):
         OracleBackend().encode(images, replace(hints, **{name: None}))
-
-
-def test_bad_settings_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"backend\.dim"):
-        OracleBackend(dim=32)
-    with pytest.raises(ValueError, match="negative"):
-        OracleBackend(depth_noise=-0.1)

@@ -124,7 +124,6 @@ def test_multi_view(weights: Callable[[str], str], network: str, case: int) -> N
         # The reference fed these cameras as they are; encode() would first normalise them.
         size = (images.shape[-2], images.shape[-1])
         cameras = Cameras(reference["in_extrinsics_w2c"], reference["in_intrinsics"], size)
-        assert backend.network.cam_enc is not None
         given = backend.network.cam_enc(cameras)
         reference.check("given", given)
         tokens = backend.encode_with(images, given)

@@ -6,14 +6,9 @@ from torch import Tensor
 
 from backends.sweep.backend import SweepBackend
 from backends.sweep.correlate import GROUPS, SourceWarp, correlate, correlate_reference
-from backends.sweep.head import RESPONSE, DepthHead
-from backends.sweep.network import SweepNet
-from backends.sweep.refine import convex_upsample
-from backends.sweep.tokens import DIM
 from backends.sweep.views import agreed_range, choose_sources, wide_range
-from backends.sweep.volume import agreement, expectation, from_inverse, to_inverse, to_planes
+from backends.sweep.volume import agreement
 from vg2gt.data import SyntheticScenes
-from vg2gt.geometry.cameras import resize_intrinsics
 from vg2gt.types import Batch, Cameras, Hints
 
 SIZE = (13, 22)
@@ -120,16 +115,6 @@ def test_sources_overlap_and_have_parallax() -> None:
     assert choose_sources(still, intrinsics, size, depth_range, 1)[0, 0] != 1
 
 
-def test_sources_are_not_too_far_aside() -> None:
-    """All look at a point 4 in front of view 0, from 0, 60 and 10 degrees."""
-    angles = torch.deg2rad(torch.tensor([0.0, 60, 10]))
-    poses, intrinsics = row_of_cameras(3)
-    poses[:, 0, 0], poses[:, 0, 2] = angles.cos(), angles.sin()
-    poses[:, 2, 0], poses[:, 2, 2] = -angles.sin(), angles.cos()
-    poses[:, :3, 3] = torch.tensor([0.0, 0, 4]) - poses[:, :3, :3] @ torch.tensor([0.0, 0, 4])
-    assert choose_sources(poses, intrinsics, (14, 22), torch.tensor([3.0, 6.0]), 1)[0].tolist() == [2]
-
-
 def test_sources_together_cover_the_view() -> None:
     """View 0 looks at what 1 and 2 see on the left and 3 on the right: the two best see the same half."""
     poses, intrinsics = row_of_cameras(4)
@@ -151,54 +136,6 @@ def test_ranges() -> None:
     assert torch.equal(agreed_range(depth, 0 * agreeing, wide_range(poses)), wide_range(poses))
 
 
-def test_positions_are_inverse_depth() -> None:
-    depth_range = torch.tensor([0.5, 8.0])
-    t = torch.linspace(0, 1, 5)
-    inverse = to_inverse(t, depth_range)
-    torch.testing.assert_close(inverse[[0, -1]], torch.tensor([1 / 8, 2.0]))
-    torch.testing.assert_close(from_inverse(inverse, depth_range), t)
-
-
-def test_expectation_ignores_far_planes() -> None:
-    logits = torch.full((1, 9, 1, 1), -20.0)
-    logits[0, [2, 3]] = 5.0
-    logits[0, 8] = 4.0
-    t, mass = expectation(logits, torch.arange(9.0).view(1, -1, 1, 1))
-    torch.testing.assert_close(t, torch.full((1, 1, 1, 1), 2.5), rtol=1e-4, atol=0)
-    assert 0.5 < float(mass) < 0.9
-
-
-def test_planes_are_images_in_channels_last_memory() -> None:
-    volume = torch.randn(2, 3, 4, 5 * 6).to(memory_format=torch.channels_last)
-    images = to_planes(volume, (5, 6))
-    assert images.is_contiguous(memory_format=torch.channels_last)
-    assert images.data_ptr() == volume.data_ptr()  # no copy
-    assert torch.equal(images[4 + 1, 2], volume[1, 2, 1].view(5, 6))
-
-
-def test_head_answers_the_correction_channels_linearly() -> None:
-    torch.manual_seed(0)
-    head = DepthHead()  # its convolutions say nothing before training
-    taps = (torch.randn(1, 2 * 3, DIM), torch.randn(1, 2 * 3, DIM))
-    taps[1][..., :4] = 0
-    context, fine = torch.randn(1, 48, 4, 6), torch.randn(1, 16, 8, 12)
-    swept = torch.cat((torch.full((1, 1, 8, 12), 0.7), torch.ones(1, 1, 8, 12)), 1)
-    before = head(taps, (2, 3), context, fine, swept)[0]
-    torch.testing.assert_close(before, torch.full_like(before, 0.7), rtol=1e-5, atol=0)
-    taps[1][..., :4] = 3
-    after = head(taps, (2, 3), context, fine, swept)[0]
-    torch.testing.assert_close(after - before, torch.full_like(before, 3 * RESPONSE), rtol=1e-4, atol=1e-6)
-
-
-def test_upsampling_is_a_convex_mixture() -> None:
-    generator = torch.Generator().manual_seed(0)
-    x = torch.rand(1, 2, 4, 5, generator=generator)
-    up = convex_upsample(x, 5 * torch.randn(1, 36, 4, 5, generator=generator))
-    assert up.shape == (1, 2, 8, 10)
-    around = torch.nn.functional.max_pool2d(torch.nn.functional.pad(x, (1, 1, 1, 1), mode="replicate"), 3, 1)
-    assert (up <= torch.nn.functional.interpolate(around, scale_factor=2.0) + 1e-6).all()
-
-
 def test_cameras_in_one_place_are_refused(make_scene) -> None:
     backend = SweepBackend(pretrained=False)
     images, hints = make_scene(1, 3, (32, 48))
@@ -215,26 +152,6 @@ def test_depth_is_in_the_unit_of_the_cameras(make_scene) -> None:
     hints.cameras.world_to_camera[..., :3, 3] *= 1000
     large = backend.decode(backend.encode(images, Hints(cameras=hints.cameras))).depth
     torch.testing.assert_close(large / 1000, depth, rtol=2e-2, atol=0)
-
-
-def test_bad_options_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"backend\.planes"):
-        SweepBackend(pretrained=False, planes=4)
-    with pytest.raises(ValueError, match=r"backend\.sources"):
-        SweepBackend(pretrained=False, sources=0)
-
-
-def test_size_is_what_the_card_says() -> None:
-    parameters = sum(parameter.numel() for parameter in SweepNet().parameters())
-    assert 2 * parameters < 8e6  # bytes of the shipped file
-
-
-def test_intrinsics_of_feature_maps() -> None:
-    """A quarter of the image: the middle of the first cell lies between the pixels 1 and 2."""
-    _, intrinsics = row_of_cameras(1)
-    quarter = resize_intrinsics(intrinsics, 1 / 4, 1 / 4)
-    x = (1.5 - intrinsics[0, 0, 2]) / intrinsics[0, 0, 0]
-    torch.testing.assert_close(x * quarter[0, 0, 0] + quarter[0, 0, 2], torch.tensor(0.0), rtol=0, atol=1e-5)
 
 
 @pytest.fixture(scope="module")

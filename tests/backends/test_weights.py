@@ -9,7 +9,6 @@ from safetensors.torch import save_file
 from torch import nn
 
 from backends.weights import find_weights, load_strictly
-from vg2gt.io.tensors import read_tensors
 
 
 def published(backend, prefix: str = "model.") -> dict[str, torch.Tensor]:
@@ -60,22 +59,6 @@ def test_offending_tensors_are_named() -> None:
     assert "unused" not in message
 
 
-def test_a_file_of_another_model_is_refused_briefly() -> None:
-    network = nn.Sequential(*(nn.Linear(2, 2) for _ in range(8)))
-    with pytest.raises(ValueError, match="and 12 more"):
-        load_strictly(network, {"other": torch.zeros(1)}, "", (), "x")
-
-
-def test_a_folder_may_have_a_dot_and_weights_are_copies(tmp_path: Path) -> None:
-    folder = tmp_path / "DA3-LARGE-1.1"
-    folder.mkdir()
-    save_file({"a": torch.ones(3)}, folder / "model.safetensors")
-    file = find_weights("name", None, None, str(folder))
-    state = read_tensors(file)
-    file.write_bytes(bytes(file.stat().st_size))  # while the network runs
-    assert state["a"].tolist() == [1, 1, 1]
-
-
 def test_weights_that_are_not_finite_are_refused() -> None:
     network = nn.Linear(2, 2)
     state = {name: value.clone() for name, value in network.state_dict().items()}
@@ -111,10 +94,3 @@ def test_missing_hub_library_is_explained(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
     with pytest.raises(ImportError, match=r"pip install 'vg2gt\[hub\]'"):
         find_weights("name", "some/repo", None, None)
-
-
-def test_files_that_hold_more_than_tensors_are_refused(tmp_path: Path) -> None:
-    file = tmp_path / "model.pt"
-    torch.save({"state_dict": {"a": torch.zeros(1)}}, file)
-    with pytest.raises(ValueError, match="mapping of names to tensors"):
-        read_tensors(file)

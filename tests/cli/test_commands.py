@@ -157,9 +157,7 @@ WITHOUT_EXTRAS = {
 
 
 @pytest.mark.parametrize("words", WITHOUT_EXTRAS)
-def test_a_missing_optional_package_is_one_line_before_any_work(
-    words: str, said: Said, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_missing_optional_package_is_one_line_before_any_work(words, said, tmp_path, monkeypatch):
     for package in ("viser", "matplotlib", "tensorboard", "wandb", "huggingface_hub", "av", "onnx", "onnxscript"):
         monkeypatch.setitem(sys.modules, package, None)
     (tmp_path / "clip.mp4").touch()  # neither it nor scene.ply, which is not there, is looked at
@@ -189,9 +187,7 @@ def test_arguments_of_train_are_translated_for_reconstruct(said: Said) -> None:
     ("words", "error"),
     [("train backend=dav3", HydraException), ("render x.ply --cameras no.json --out x", FileNotFoundError)],
 )
-def test_tracebacks_are_there_for_who_asks(
-    words: str, error: type[Exception], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_tracebacks_are_there_for_who_asks(words, error, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
     monkeypatch.setattr(sys, "argv", ["vg2gt", *words.split()])

@@ -40,11 +40,9 @@ def ran(name: str) -> None:
 
 
 def test_runs_are_named_by_what_was_chosen() -> None:
-    assert folder() == "quickstart"
-    assert folder({"data": "rgbd"}) == "rgbd-oracle-tiny"
+    assert (folder(), folder({"data": "rgbd"})) == ("quickstart", "rgbd-oracle-tiny")
     assert folder({"experiment": "paper", "data": "paper_mix"}) == "paper_mix-oracle-tiny-paper"
-    assert folder({"data": "rgbd"}, name="mine") == "mine"
-    assert folder(trial=True) == "trials/quickstart"
+    assert (folder({"data": "rgbd"}, name="mine"), folder(trial=True)) == ("mine", "trials/quickstart")
     assert folder(mode="MULTIRUN") == "sweep"
 
 
@@ -55,8 +53,7 @@ def test_a_taken_name_gets_a_number_unless_it_is_meant(monkeypatch: pytest.Monke
     ran("sweep/0")
     ran("rgbd-oracle-tiny")
     ran("rgbd-oracle-tiny-2")
-    assert folder({"data": "rgbd"}) == "rgbd-oracle-tiny-3"
-    assert folder(mode="MULTIRUN") == "sweep-2"
+    assert (folder({"data": "rgbd"}), folder(mode="MULTIRUN")) == ("rgbd-oracle-tiny-3", "sweep-2")
     assert folder({"data": "rgbd"}, overwrite=True) == "rgbd-oracle-tiny"
     for ckpt in ("auto", "last"):
         assert folder({"data": "rgbd"}, ckpt=ckpt) == "rgbd-oracle-tiny"

@@ -34,7 +34,6 @@ def write_recording(tmp_path, rooms) -> Callable[..., Path]:
     """Returns a function that writes a room as an RGB-D recording with ``images/ depth/ poses.txt K.txt``."""
 
     def write(name: str = "office", scene: int = 0, frames: int = 6) -> Path:
-        layout_rgbd.write_recording(tmp_path, rooms.load(rooms.scenes[scene], range(frames)), name)
-        return tmp_path / name
+        return layout_rgbd.write_recording(tmp_path, rooms.load(rooms.scenes[scene], range(frames)), name)
 
     return write

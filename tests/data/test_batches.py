@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from vg2gt.data import DataError, RGBDFolder, SceneDataModule, SyntheticScenes
+from vg2gt.data import DataError, RGBDFolder, SceneDataModule
 from vg2gt.data.batches import BatchDataset
 from vg2gt.data.framing import Framing
 from vg2gt.data.views import SceneSample
@@ -42,23 +42,12 @@ def test_the_nearest_readable_frame_takes_the_place_of_a_damaged_one(write_recor
     assert "00012.png" in warnings[0]
     assert "number 2" in warnings[1]
     assert "00013.png" in warnings[1]
-
     caplog.clear()
     assert dataset[views].frame_ids.tolist() == [[11, 10, 14, 15]]
     assert not caplog.records  # warned once
     others = [_dataset(folder, 0, replace_damaged=True), dataset]
     others[0][(SceneSample("office", (13, 14)),)]  # another history
     assert all(other[views].frame_ids.tolist() == [[11, 10, 14, 15]] for other in others)
-
-
-@pytest.mark.parametrize("replace_damaged", [False, True])
-def test_a_frame_is_decoded_once_a_batch(write_recording, replace_damaged, monkeypatch):
-    dataset = _dataset(write_recording(frames=6), 0, replace_damaged=replace_damaged)
-    decoded = []
-    load = RGBDFolder.load
-    monkeypatch.setattr(RGBDFolder, "load", lambda self, scene, ids: decoded.extend(ids) or load(self, scene, ids))
-    assert dataset[(SceneSample("office", (12, 10), (15,)),)].num_context == 2
-    assert decoded == [12, 10, 15]
 
 
 def test_evaluation_never_replaces_frames(write_recording):
@@ -99,28 +88,3 @@ def test_a_damaged_recording_trains_in_workers_as_without(write_recording):
     assert all(12 not in batch.frame_ids.flatten() for batch in runs[0])
     for other in runs[1:]:
         assert_same_batches(other, runs[0])
-
-
-class Floors(SyntheticScenes):
-    """Every two scenes are recordings of one place."""
-
-    def place(self, scene: str) -> str:
-        return f"floor-{int(scene[-6:]) // 2}"
-
-
-def test_evaluation_of_a_place_that_is_trained_on_is_refused():
-    train, val = Floors(3, num_frames=6, size=SIZE), Floors(1, first_seed=3, num_frames=6, size=SIZE)
-    module = SceneDataModule(train, val, min_views=2, max_views=2, eval_context=[0], eval_target=[1])
-    with pytest.raises(DataError, match=r"room-000003 and training scene room-000002 show the same place \(floor-1\)"):
-        module.setup()
-    SceneDataModule(train, val, train_scenes=2, min_views=2, max_views=2, eval_context=[0], eval_target=[1]).setup()
-
-
-def test_scenes_without_cameras_are_not_trained_on():
-    train = SyntheticScenes(2, num_frames=6, size=SIZE)
-    train.has_cameras = False
-    val = SyntheticScenes(1, first_seed=9, num_frames=6, size=SIZE)
-    module = SceneDataModule(train, val, min_views=2, max_views=2, eval_context=[0], eval_target=[1])
-    with pytest.raises(DataError, match="no cameras"):
-        module.train_dataloader()
-    assert len(module.val_dataloader()) == 1

@@ -5,7 +5,6 @@ import torch
 
 from vg2gt.data import Frames, SceneDataModule, SyntheticScenes
 from vg2gt.data.framing import Framing, FramingSampler
-from vg2gt.data.transforms import pad, reduce_to_cover
 from vg2gt.data.views.sampling import StepSampler, ViewSampler
 from vg2gt.geometry.cameras import ray_directions
 
@@ -58,25 +57,6 @@ def test_sparse_depth_follows_a_zoom():
     valid = framed.depth[0] > 0
     assert 0 < valid.float().mean() < 0.6
     assert float((framed.depth[0] - 1 - expected).abs()[valid].max()) < 0.51 / 90
-
-
-def test_padding_moves_the_principal_point():
-    framed = pad(_rays(), 3, 5, (70, 90))
-    assert torch.equal(framed.images[..., 3:63, 5:85], _rays().images)
-    assert float(framed.images.sum()) == pytest.approx(float(_rays().images.sum()), rel=1e-6)
-    assert framed.intrinsics[0, :2, 2].tolist() == pytest.approx([43.2, 33.9])
-
-
-def test_reduced_frames_cover_and_are_never_enlarged():
-    assert reduce_to_cover(_rays(), (20, 56)).depth.shape[-2:] == (42, 56)
-    assert reduce_to_cover(_rays(), (100, 56)).depth.shape[-2:] == (60, 80)
-
-
-def test_nothing_is_drawn_by_default():
-    sampler = FramingSampler((28, 56))
-    assert not sampler.moves
-    assert sampler.draw(3, 1) is None
-    assert sampler.size(5) == sampler.largest == (28, 56)
 
 
 def test_drawn_sizes_keep_the_area_and_stay_in_range():

@@ -106,8 +106,3 @@ def test_a_part_without_a_usable_scene_is_an_error():
 def test_weights_must_fit_the_parts(weights):
     with pytest.raises(ValueError, match="weight"):
         Mixture({"a": SyntheticScenes(1), "b": SyntheticScenes(1)}, weights)
-
-
-def test_an_unknown_part_is_named():
-    with pytest.raises(DataError, match="no scene elsewhere/x"):
-        _mixture().frames("elsewhere/x")

@@ -63,16 +63,3 @@ def test_of_a_scene_trained_on_only_held_out_frames_are_scored():
         for target in ((2, 3), (100,)):  # 100 was not trained on, but lies among frames that were
             with pytest.raises(DataError, match=f"{scene} is used for training and for evaluation: 1 of its"):
                 _check(train, list(train.scenes), val, scene, target)
-
-
-def test_parts_of_one_mixture_are_different_datasets():
-    both = _mixture(a=Scans(1), b=Scans(1))
-    _check(both, ["a/scene0001_00"], both, "b/scene0001_00", (3,))
-    _check(both, ["a/scene0001_00"], both, "b/scene0001_01", (3,))
-
-
-def test_held_out_frames_are_listed_once_a_scene():
-    train = Scans(1)
-    windows = [SceneSample("scene0000_00", (0,), (frame,)) for frame in (2, 5, 8) * 20]
-    refuse_overlap(train, train.scenes, OtherReader(1), windows)
-    assert train.asked == ["scene0000_00"]

@@ -8,7 +8,6 @@ from vg2gt.data.synthetic import raycast, textures
 from vg2gt.data.synthetic.furniture import Builder
 from vg2gt.data.synthetic.raycast import FAR
 from vg2gt.data.synthetic.rooms import SyntheticRoom
-from vg2gt.data.synthetic.textures import Pattern
 
 intersect_part, leave_walls, nearest_hit, parts_in_cone, surface = (
     compiled_part(getattr(raycast, name))
@@ -61,18 +60,6 @@ def test_parts_are_entered_where_a_march_along_the_ray_enters_them(kind):
     assert hits > 15
 
 
-def test_rays_leave_the_room_on_its_walls():
-    walls = np.array([[-2.0, -1.0, 0.0], [3.0, 2.0, 2.5]])
-    rng = np.random.default_rng(0)
-    for d in rng.normal(size=(50, 3)):
-        d /= np.linalg.norm(d)
-        t, wall = leave_walls(walls, 0.5, 0.2, 1.0, *d)
-        point = np.array([0.5, 0.2, 1.0]) + t * d
-        assert point[wall // 2] == pytest.approx(walls[wall % 2, wall // 2])
-        assert (point > walls[0] - 1e-9).all()
-        assert (point < walls[1] + 1e-9).all()
-
-
 def test_bounding_spheres_and_cones_lose_no_hit():
     room = SyntheticRoom(6, 1, (16, 16)).world
     origin = np.array([0.1, 0.2, 1.4])
@@ -101,19 +88,3 @@ def test_filtered_waves_are_means_of_the_sharp_ones(width):
         pulses = (np.abs(samples - np.round(samples)) < 0.15).mean()
         assert square_wave(x, width) == pytest.approx(square, abs=2e-3)
         assert pulse_train(x, 0.3, width) == pytest.approx(pulses, abs=2e-3)
-
-
-@pytest.mark.parametrize("kind", list(Pattern))
-def test_patterns_flatten_when_a_pixel_covers_many_periods(kind):
-    rng = np.random.default_rng(2)
-    places = rng.uniform(-5, 5, (400, 2))
-    sharp = np.array([pattern_value(int(kind), x, y, 3.0, 1e-3, 9) for x, y in places])
-    blurred = np.array([pattern_value(int(kind), x, y, 3.0, 5.0, 9) for x, y in places])
-    assert sharp.min() >= 0
-    assert sharp.max() <= 1
-    if kind is Pattern.PLAIN:
-        assert sharp.std() == 0
-        return
-    assert sharp.std() > 0.1
-    limit = 0.75 if kind is Pattern.MOSAIC else 0.2  # cells are blended with their neighbours only
-    assert blurred.std() < limit * sharp.std()

@@ -3,7 +3,6 @@
 import shutil
 from collections import Counter
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -124,142 +123,6 @@ def test_a_missing_root_names_the_path_and_the_remedy(tmp_path):
         RGBDFolder(str(tmp_path))
 
 
-def _truncate(path):
-    path.write_bytes(path.read_bytes()[:120])
-
-
-def _save(path, array):
-    Image.fromarray(array).save(path)
-
-
-def _drop_a_pose(folder):
-    path = folder / "poses.txt"
-    path.write_text("\n".join(path.read_text().splitlines()[1:]))
-
-
-def _empty(folder):
-    shutil.rmtree(folder)
-    folder.mkdir()
-
-
-def _widen(folder):
-    for path in folder.iterdir():
-        _save(path, np.ones((24, 40, 3), np.uint8))
-
-
-def _matrix(folder: Path, place: tuple[int, int], value: float) -> None:
-    matrix = np.loadtxt(folder / "K.txt")
-    matrix[place] = value
-    np.savetxt(folder / "K.txt", matrix)
-
-
-def _short_log(folder: Path) -> None:
-    (folder / "poses.txt").unlink()
-    (folder / "trajectory.log").write_text("0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
-
-
-def _odd_json(folder: Path) -> None:
-    (folder / "K.txt").unlink()
-    (folder / "camera_intrinsic.json").write_text('{"intrinsic_matrix": [1, 2]}')
-
-
-def _transposed(folder: Path) -> None:
-    np.savetxt(folder / "K.txt", np.loadtxt(folder / "K.txt").T)
-
-
-def _resized(folder: Path, factor: float) -> None:
-    np.savetxt(folder / "K.txt", np.diag([factor, factor, 1]) @ np.loadtxt(folder / "K.txt"))
-
-
-DAMAGE = {
-    "no images": (lambda f: _empty(f / "images"), "scene office has no colour images"),
-    "image removed": (
-        lambda f: (f / "images/00012.png").unlink(),
-        "one line of 16 numbers .* for each of the 5 images; it has 6",
-    ),
-    "poses missing": (
-        lambda f: (f / "poses.txt").unlink(),
-        r"scene office in .* has 6 colour and 6 depth images but no poses: add poses\.txt",
-    ),
-    "an odd log": (_short_log, r"trajectory\.log of scene office has 1 poses for 6 images"),
-    "another json": (_odd_json, r"camera_intrinsic\.json: expected Open3D's intrinsic_matrix"),
-    "a pose missing": (_drop_a_pose, "each of the 6 images; it has 5 lines of 16"),
-    "words": (lambda f: (f / "poses.txt").write_text("a b\n"), r"cannot read .*poses\.txt of scene office"),
-    "not rigid": (
-        lambda f: np.savetxt(f / "poses.txt", 2 * np.loadtxt(f / "poses.txt")),
-        "frame 10 in .*scene office.* not a rigid",
-    ),
-    "not finite": (
-        lambda f: np.savetxt(f / "poses.txt", np.full((6, 16), np.nan)),
-        "no usable frame .*; 6 frames whose pose is not finite",
-    ),
-    "no intrinsics": (lambda f: (f / "K.txt").unlink(), r"no intrinsics: add K\.txt"),
-    "no 3x3": (lambda f: np.savetxt(f / "K.txt", np.ones((2, 3))), r"K\.txt .* 3x3 or 4x4 or 1x4 matrix, not 2x3"),
-    "a transposed matrix": (_transposed, r"are not fx 0 cx, 0 fy cy, 0 0 1 \(transposed"),
-    "skew": (lambda f: _matrix(f, (0, 1), 3.0), "have skew, which is not modelled"),
-    "a distant principal point": (lambda f: _matrix(f, (0, 2), 1e5), "is far outside"),
-    "the matrix of larger images": (
-        lambda f: _resized(f, 2),
-        r"K\.txt of scene .* another resolution \(about 62x46\)\? Scale it",
-    ),
-    "the matrix of smaller images": (lambda f: _resized(f, 0.25), r"another resolution \(about 8x6\)"),
-    "no focal length": (lambda f: np.savetxt(f / "K.txt", np.zeros((3, 3))), "no positive focal lengths"),
-    "truncated image": (lambda f: _truncate(f / "images/00012.png"), r"cannot read .*s/00012\.png of scene office"),
-    "truncated depth": (lambda f: _truncate(f / "depth/00012.png"), r"cannot read .*h/00012\.png of scene office"),
-    "wrong size": (
-        lambda f: _save(f / "depth/00012.png", np.ones((24, 30), np.uint16)),
-        r"00012\.png of scene office is 30x24 .* 32x24",
-    ),
-    "other aspect ratio": (lambda f: _widen(f / "images"), "different aspect ratios"),
-    "colour for depth": (
-        lambda f: _save(f / "depth/00012.png", np.ones((*SIZE, 3), np.uint8)),
-        r"00012\.png of scene office is not a depth image",
-    ),
-    "no valid depth": (
-        lambda f: _save(f / "depth/00012.png", np.full(SIZE, 65535, np.uint16)),
-        r"00012\.png of scene office has no valid depth",
-    ),
-}
-
-
-@pytest.mark.parametrize("name", DAMAGE)
-def test_damage_is_named_by_file_and_scene(write_recording, name):
-    folder = write_recording()
-    damage, message = DAMAGE[name]
-    damage(folder)
-    with pytest.raises(DataError, match=message):
-        RGBDFolder(str(folder)).load("office", range(10, 16))
-
-
-def test_any_damage_to_an_image_is_a_data_error_or_a_picture(write_recording):
-    folder = write_recording()
-    source = RGBDFolder(str(folder))
-    rng = np.random.default_rng(0)
-    failures = 0
-    for kind in ("images", "depth"):
-        path = folder / kind / "00012.png"
-        whole = path.read_bytes()
-        for _ in range(100):
-            damaged = bytearray(whole[: rng.integers(1, len(whole))] if rng.random() < 0.3 else whole)
-            for place in rng.integers(0, len(damaged), 3):
-                damaged[place] = rng.integers(256)
-            path.write_bytes(bytes(damaged))
-            try:
-                assert source.load("office", [12]).images.shape == (1, 3, *SIZE)
-            except DataError as error:
-                failures += "00012.png" in str(error)
-        path.write_bytes(whole)
-    assert failures > 50
-
-
-def test_a_recording_of_one_frame(write_recording):
-    folder = write_recording(frames=1)
-    source = RGBDFolder(str(folder))
-    assert list(source.frames("office")) == [10]
-    assert list(source.held_out("office")) == []
-    assert source.load("office", [10]).depth.shape == (1, *SIZE)
-
-
 def test_hololens_frames_agree_as_its_description_says(shared):
     source = RGBDFolder(str(shared / "data/hololens_office_a"))
     ids = source.frames("hololens_office_a")
@@ -271,31 +134,6 @@ def test_hololens_frames_agree_as_its_description_says(shared):
     pairs = [depth_differences(frames, a, b, stride=3) for a in range(24) for b in range(24) if abs(a - b) >= 8]
     far = [float(differences.median()) for differences, overlap in pairs if overlap >= 0.3]
     assert np.median(far) == pytest.approx(7.2e-3, rel=0.1)
-
-
-def test_registered_seven_scenes_frames_agree_as_their_description_says(shared):
-    source = RGBDFolder(str(shared / "data/seven_scenes_redkitchen_a_registered"))
-    (scene,) = source.scenes
-    ids = source.frames(scene)
-    assert len(ids) == 56
-    frames = source.load(scene, ids)
-    pairs = [depth_differences(frames, a, b, stride=10) for a in range(56) for b in range(a + 1, 56)]
-    medians = [float(differences.median()) for differences, overlap in pairs if overlap >= 0.3]
-    assert np.median(medians) == pytest.approx(12.0e-3, rel=0.1)
-
-
-def test_raw_seven_scenes_depth_agrees_as_its_description_says(shared):
-    source = RGBDFolder(str(shared / "data/seven_scenes_redkitchen_a"), holdout=None)
-    (scene,) = source.scenes
-    frames = source.load(scene, source.frames(scene))
-    assert float((frames.depth > 0).float().mean()) == pytest.approx(0.883, abs=0.001)
-    count = len(frames.depth)
-    pairs = [depth_differences(frames, a, b, stride=10) for a in range(count) for b in range(count) if a != b]
-    together = torch.cat([differences for differences, overlap in pairs if overlap >= 0.3])
-    assert float(together.median()) == pytest.approx(12.2e-3, rel=0.1)
-    assert float((together < 0.03).float().mean()) == pytest.approx(0.78, abs=0.02)
-    neighbours = [float(depth_differences(frames, a, a + 1, stride=4)[0].median()) for a in range(count - 1)]
-    assert np.median(neighbours) == pytest.approx(6.0e-3, rel=0.1)
 
 
 def test_a_real_recording_with_quaternions(shared):

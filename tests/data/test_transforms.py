@@ -5,7 +5,7 @@ import torch
 from vg2gt.data import Frames
 from vg2gt.data.synthetic.renderer import render_frame
 from vg2gt.data.synthetic.rooms import SyntheticRoom
-from vg2gt.data.transforms import crop, from_bytes, resize, resize_to_cover, to_bytes
+from vg2gt.data.transforms import crop, resize, resize_to_cover
 
 
 def _render(room: SyntheticRoom, intrinsics: torch.Tensor, size: tuple[int, int]) -> Frames:
@@ -56,8 +56,3 @@ def test_crop_takes_the_window():
     assert torch.equal(out.images, frames.images[..., 2:6, 3:8])
     assert torch.equal(out.depth, frames.depth[..., 2:6, 3:8])
     assert out.intrinsics[0, :2, 2].tolist() == [-3, -2]
-
-
-def test_bytes_round_trip():
-    values = torch.arange(256, dtype=torch.uint8)
-    assert torch.equal(to_bytes(from_bytes(values)), values)

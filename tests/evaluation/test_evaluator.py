@@ -1,4 +1,3 @@
-import math
 from dataclasses import asdict, replace
 
 import pytest
@@ -8,14 +7,13 @@ from vg2gt.evaluation.evaluator import MODES, PROTOCOLS, SceneEvaluator, SceneRe
 from vg2gt.evaluation.in_training import evaluate_scene
 from vg2gt.evaluation.options import EvaluationOptions, PointOptions
 from vg2gt.evaluation.protocols import ground_truth_target_cameras, joint_target_cameras
-from vg2gt.evaluation.scene_metrics import align_geometry, depth_to_camera_scale, point_cloud_metrics
+from vg2gt.evaluation.scene_metrics import align_geometry, point_cloud_metrics
 from vg2gt.geometry.alignment import Similarity
 from vg2gt.geometry.cameras import relative_to_first, scale_translations
 from vg2gt.geometry.normals import normals_from_depth
 from vg2gt.metrics import cv, depth_metrics, near_depth_edges, normal_metrics, psnr, ssim
-from vg2gt.profiling import clocked
 from vg2gt.refinement import RefineOptions
-from vg2gt.types import Batch, Geometry
+from vg2gt.types import Batch
 
 
 def test_scores_are_the_metrics_of_the_renders(result: SceneResult, batch: Batch) -> None:
@@ -61,12 +59,6 @@ def test_refined_scenes_have_figures_of_their_own(evaluator: SceneEvaluator, res
     assert (found["refined/scene/refine_seconds"] or 0) > 0
     assert found["refined/cameras/auc_3"] is not None
     assert not any(name.startswith("refined/decoded") for name in found)
-
-
-def test_context_renders_are_of_the_inputs(result: SceneResult, batch: Batch) -> None:
-    assert result.renders["context"].color.shape[1] == batch.num_context
-    expected = float(psnr(result.renders["context"].color[0], batch.context.images[0]).mean())
-    assert result.metrics["rendered/context/solid/psnr"] == expected
 
 
 def test_without_true_depth_what_needs_it_is_none_and_not_zero(evaluator: SceneEvaluator, batch: Batch) -> None:
@@ -123,7 +115,6 @@ def test_true_depth_out_of_range_is_unknown_to_every_figure(module_and_batch, ba
     expected = normal_metrics(render.normal[0], normals, valid & (render.depth[0] > 0))["mean"]
     assert limited.metrics["rendered/gt_pose/solid/normal_mean"] == expected
     similarity = align_geometry(limited.prediction.geometry, near.context)
-    assert similarity is not None
     geometry, options = limited.prediction.geometry, asdict(PointOptions())
     points = point_cloud_metrics(geometry.depth, geometry.cameras, near.context, similarity, **options)
     assert limited.metrics["points/decoded/f_score"] == points["f_score"]
@@ -157,12 +148,6 @@ def test_wrong_options_are_named(options, told: str) -> None:
         EvaluationOptions(**options)
 
 
-@pytest.mark.parametrize("name", ["threshold", "downsample", "cap"])
-def test_lengths_are_positive(name: str) -> None:
-    with pytest.raises(ValueError, match=rf"evaluation\.points\.{name}=-1"):
-        PointOptions(**{name: -1})
-
-
 def test_given_cameras_need_no_joint_pass(module_and_batch, batch: Batch, monkeypatch: pytest.MonkeyPatch) -> None:
     """A backend whose cameras are the data's is not asked for those of held-out views."""
     module, _ = module_and_batch
@@ -176,22 +161,6 @@ def test_given_cameras_need_no_joint_pass(module_and_batch, batch: Batch, monkey
     data = relative_to_first(batch.cameras).world_to_camera[:, 3:]
     torch.testing.assert_close(found.world_to_camera[..., :3, :3], data[..., :3, :3])
     torch.testing.assert_close(found.world_to_camera[..., :3, 3], data[..., :3, 3] * prediction.unit[:, None, None])
-
-
-def test_the_joint_pass_decodes_depth_only_where_cameras_stand_still(
-    module_and_batch, batch: Batch, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    backend = module_and_batch[0].model.backend
-    decoded = []
-    decode = backend.decode
-    monkeypatch.setattr(backend, "decode", lambda tokens: decoded.append(0) or decode(tokens))
-    for views, passes in ((3, 0), (1, 1)):
-        inputs = replace(batch, num_context=views)
-        with torch.no_grad():
-            prediction = module_and_batch[0].model(inputs.context.images, inputs.context.hints)
-        decoded.clear()
-        joint_target_cameras(module_and_batch[0].model, inputs, prediction)
-        assert len(decoded) == passes
 
 
 @pytest.mark.parametrize("views", [1, 3])
@@ -245,25 +214,3 @@ def test_the_figures_of_training_runs(module_and_batch, batch: Batch) -> None:
     assert found["edge_psnr"] < found["psnr"]
     with pytest.raises(ValueError, match="held-out views"):
         evaluate_scene(module.model, module.renderer, batch.context)
-
-
-@pytest.mark.parametrize("factor", [0.9, 1.0, 1.08])
-def test_scale_of_depth_against_the_cameras(batch: Batch, factor: float) -> None:
-    context = batch.context
-    unit = torch.tensor([7.0])
-    cameras = scale_translations(relative_to_first(context.cameras), unit)
-    geometry = Geometry(7 * factor * context.depth, torch.ones_like(context.depth), cameras, unit)
-    assert depth_to_camera_scale(geometry, context) == pytest.approx(factor, rel=1e-4)
-    still = replace(cameras, world_to_camera=cameras.world_to_camera[:, :1].expand_as(cameras.world_to_camera))
-    assert math.isnan(depth_to_camera_scale(replace(geometry, cameras=still), context))
-
-
-def test_the_clock_leaves_the_model_as_it_was(module_and_batch, batch: Batch) -> None:
-    module, _ = module_and_batch
-    model = module.model
-    with clocked(torch.device("cpu")) as clock:
-        model(batch.context.images, batch.context.hints)
-    assert 0 < clock.before_head < clock.total
-    assert clock.head == clock.total - clock.before_head
-    assert "encode" not in vars(model.backend)
-    assert "forward" not in vars(model.coarse)

@@ -1,12 +1,9 @@
 """Every preset composes, fits its constructors and holds what the paper says."""
 
-from pathlib import Path
-
 import pytest
 from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig
 
-from tests.commands import run_vg2gt
 from vg2gt.config import compose, group_options
 from vg2gt.data.views.drawn import index_path
 from vg2gt.evaluation import paper
@@ -24,8 +21,7 @@ def composed(preset: str) -> DictConfig:
 def test_presets_instantiate(preset: str) -> None:
     config = composed(preset)
     options: EvaluationOptions = instantiate(config.evaluation, _convert_="all")
-    assert list(config.views) == [3, 10, 20]
-    assert config.data._target_ == "vg2gt.data.SceneDataModule"
+    assert (list(config.views), config.data._target_) == ([3, 10, 20], "vg2gt.data.SceneDataModule")
     if options.selection.index is not None:
         assert index_path(options.selection.index).is_file()
     if options.table is not None:
@@ -46,16 +42,3 @@ def test_the_papers_presets_are_the_papers(preset: str) -> None:
     }
     assert paper.obstacle(preset, **read, told=False) is None
     assert paper.obstacle(preset, **read, told=True) is not None
-
-
-def test_dtu_is_compared_with_its_own_options() -> None:
-    options: EvaluationOptions = instantiate(composed("dtu").evaluation, _convert_="all")
-    assert options.selection.fixed == {3: [23, 24, 33]}
-    assert (options.points.downsample, options.points.cap) == (0.0002, 0.02)  # 0.2 mm, 20 mm
-
-
-def test_a_wrong_option_is_one_line(tmp_path: Path) -> None:
-    run = run_vg2gt("evaluate", "evaluation.alignment=affine", folder=tmp_path)
-    assert run.returncode != 0
-    said = "ValueError: evaluation.alignment='affine': choose one of median, scene, wmed, scale_shift, none"
-    assert run.stderr.strip() == f"{said} (HYDRA_FULL_ERROR=1 shows where)"

@@ -1,29 +1,21 @@
 """Whole evaluations of two small rooms."""
 
 import json
-import logging
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 from omegaconf import OmegaConf
 
 from tests.evaluation.conftest import evaluate_overrides
 from tests.training_helpers import small_config
 from vg2gt.cli.evaluate import run_name
 from vg2gt.config import compose
-from vg2gt.data.base import DataError, Frames
-from vg2gt.data.synthetic import SyntheticScenes
+from vg2gt.data.base import DataError
 from vg2gt.evaluation.evaluator import SceneEvaluator
 from vg2gt.evaluation.run import evaluate
-from vg2gt.metrics.lpips import STAGES
 from vg2gt.runs.checkpoints import read_checkpoint, write_checkpoint
-from vg2gt.runs.find import checkpoint_path
-from vg2gt.runs.lock import only_process_in
 from vg2gt.runs.trust import read_run_config
 from vg2gt.training.loop import train
 
@@ -87,9 +79,7 @@ def test_the_untrained_head_says_so_and_scores_otherwise(tmp_path: Path, cache: 
     )
 
 
-def test_an_interrupted_evaluation_goes_on(
-    tmp_path: Path, cache: Path, trained: Path, evaluated: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interrupted_evaluation_goes_on(tmp_path, cache, trained, evaluated, monkeypatch):
     original, seen = SceneEvaluator.__call__, []
 
     def counted(self, batch, has_cameras=True):
@@ -142,13 +132,6 @@ def test_refined_rows_stand_apart(tmp_path: Path, cache: Path, trained: Path, jo
     assert "refined" not in (joined / "metrics.md").read_text()
 
 
-def test_another_backbone_or_model_is_refused(tmp_path: Path, cache: Path, trained: Path) -> None:
-    with pytest.raises(ValueError, match="trained on backbone"):
-        run(tmp_path, cache, f"ckpt={trained}", "backend=oracle", "backend.seed=1")
-    with pytest.raises(ValueError, match=r"does not fit this model, first in model\.gaussians\.out"):
-        run(tmp_path, cache, f"ckpt={trained}", "+model.gaussians.splits=4")
-
-
 def test_the_papers_rows_do_not_stand_beside_other_data(tmp_path: Path, cache: Path, trained: Path) -> None:
     chosen = ["evaluation.table=replica", "data.eval_scenes=1", "views=[3]"]
     report = run(tmp_path, cache, f"ckpt={trained}", *chosen)
@@ -156,11 +139,6 @@ def test_the_papers_rows_do_not_stand_beside_other_data(tmp_path: Path, cache: P
     text = (tmp_path / "metrics.md").read_text()
     assert "the paper's rows are left out: the data is read by SyntheticScenes" in text
     assert "tbl_" not in text
-
-
-def test_one_key_of_the_runs_model_can_be_changed(tmp_path: Path, cache: Path, trained: Path) -> None:
-    report = run(tmp_path, cache, f"ckpt={trained}", "+model.fine.max_voxels=200", "data.eval_scenes=1")
-    assert report["views"]["2"]["mean"]["scene/gaussians"] == 400
 
 
 def test_a_model_without_a_trained_part(tmp_path: Path, cache: Path) -> None:
@@ -174,30 +152,7 @@ def test_scenes_of_the_training_are_refused(tmp_path: Path, cache: Path, trained
         run(tmp_path, cache, f"ckpt={trained}", "data.val.first_seed=0")
 
 
-class OtherLoader(SyntheticScenes):
-    """Another loader of the same scenes."""
-
-
-def test_scenes_of_the_training_are_refused_whatever_loads_them(tmp_path: Path, cache: Path, trained: Path) -> None:
-    other = [f"data.val._target_={__name__}.OtherLoader", "data.val.first_seed=0"]
-    with pytest.raises(DataError, match="scene room-000000 is used for training and for evaluation"):
-        run(tmp_path, cache, f"ckpt={trained}", *other)
-
-
-def test_scenes_in_a_mixture_that_was_trained_on_are_refused(tmp_path: Path, cache: Path, copied: Path) -> None:
-    config = OmegaConf.load(copied / "config.yaml")
-    part = config.data.train
-    config.data.train = {
-        "_target_": "vg2gt.data.Mixture", "_partial_": True, "parts": {"rooms": part}, "weights": {"rooms": 1}
-    }  # fmt: skip
-    OmegaConf.save(config, copied / "config.yaml")
-    with pytest.raises(DataError, match="scene room-000000 is used for training and for evaluation"):
-        run(tmp_path / "out", cache, f"ckpt={copied}", "data.val.first_seed=0")
-
-
-def test_what_the_weights_before_were_trained_on_is_refused(
-    tmp_path: Path, cache: Path, trained: Path, copied: Path, caplog
-) -> None:
+def test_what_the_weights_before_were_trained_on_is_refused(tmp_path, cache, trained, copied, caplog):
     """A run on other rooms that began with ``init_from``, or went on in a new folder with ``ckpt``."""
     for key, start in (("init_from", trained / "checkpoints" / "step-2.ckpt"), ("ckpt", trained)):
         config = read_run_config(trained / "config.yaml")
@@ -224,20 +179,6 @@ def test_a_lone_checkpoint_is_not_checked_and_that_is_told(tmp_path: Path, cache
         config[part] = parts[part]
     evaluate(config)
     assert "whether the evaluated scenes were trained on cannot be checked" in caplog.text
-
-
-def test_training_data_that_is_gone_is_told(tmp_path: Path, cache: Path, trained: Path, copied: Path, caplog) -> None:
-    config = OmegaConf.load(copied / "config.yaml")
-    for target in ("vg2gt.data.sources.ScanNet", "no_longer_installed.Loader"):
-        config.data.train = {"_target_": target, "_partial_": True}
-        config.data.root = str(tmp_path / "gone")
-        for key in ("num_frames", "size", "cache_dir"):
-            config.data.pop(key, None)
-        OmegaConf.save(config, copied / "config.yaml")
-        caplog.clear()
-        with caplog.at_level(logging.WARNING):
-            run(tmp_path / target, cache, f"ckpt={copied}", "data.eval_scenes=1")
-        assert "whether the evaluated scenes were trained on cannot be checked" in caplog.text
 
 
 def test_what_is_missing_or_wrong_is_named(tmp_path: Path, cache: Path, trained: Path) -> None:
@@ -282,39 +223,12 @@ def test_a_checkpoint_knows_what_it_was_trained_with(tmp_path: Path, cache: Path
     assert lone["views"]["2"]["mean"][name] == whole["views"]["2"]["mean"][name]
 
 
-@pytest.mark.parametrize("content", ["", "foo: 1", "model: null"])
-def test_a_configuration_without_the_runs_parts_is_named(
-    tmp_path: Path, cache: Path, copied: Path, content: str
-) -> None:
-    (copied / "config.yaml").write_text(content)
-    with pytest.raises(ValueError, match=r"config\.yaml (names no (data|backend)|is not a run's configuration)"):
-        run(tmp_path / "out", cache, f"ckpt={copied}")
-
-
 def test_a_training_runs_folder_is_left_as_it_is(cache: Path, trained: Path, copied: Path) -> None:
     for more in ([], ["overwrite=true"]):
         with pytest.raises(FileExistsError, match=r"holds metrics\.json, .*config\.yaml of something"):
             run(copied, cache, f"ckpt={copied}", "data.eval_scenes=1", *more)
     for name in ("config.yaml", "metrics.json", "metrics.md"):
         assert (copied / name).read_bytes() == (trained / name).read_bytes()
-
-
-def test_a_folder_is_one_processs_at_a_time(cache: Path, joined: Path) -> None:
-    code = (
-        "import sys; from vg2gt.runs.lock import *\nwith only_process_in(sys.argv[1]): print('held', flush=1); input()"
-    )
-    before = (joined / "metrics.json").read_bytes()
-    with subprocess.Popen(
-        [sys.executable, "-c", code, str(joined)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-    ) as other:
-        assert other.stdout
-        assert other.stdout.readline() == b"held\n"
-        with pytest.raises(BlockingIOError, match="copy is in use by another process"):
-            run(joined, cache, "overwrite=true")
-        other.kill()
-    assert (joined / "metrics.json").read_bytes() == before
-    with only_process_in(joined):  # the other was killed: it holds nothing
-        pass
 
 
 def test_times_of_another_device_do_not_join(tmp_path: Path, cache: Path, trained: Path) -> None:
@@ -324,68 +238,6 @@ def test_times_of_another_device_do_not_join(tmp_path: Path, cache: Path, traine
     (tmp_path / "identity.json").write_text(json.dumps(identity | {"device": "Some GPU"}))
     with pytest.raises(FileExistsError, match=r"device \(Some GPU -> cpu\)"):
         run(tmp_path, cache, f"ckpt={trained}", "data.eval_scenes=1")
-
-
-class WithoutDepth(SyntheticScenes):
-    """Rooms of which one has no depth."""
-
-    def load(self, scene: str, frame_ids: Any) -> Frames:
-        frames = super().load(scene, frame_ids)
-        if scene == "room-1000000":
-            frames.depth.zero_()
-        return frames
-
-
-def test_a_scene_without_depth_has_no_depth_error(tmp_path: Path, cache: Path) -> None:
-    data = [f"data.val._target_={__name__}.WithoutDepth", "backend=vggt_tiny"]
-    report = run(tmp_path, cache, *data)
-    blind, seeing = (report["views"]["2"]["scenes"][f"room-100000{i}"] for i in (0, 1))
-    name = "rendered/gt_pose/solid/abs_rel"
-    assert blind[name] is None
-    assert seeing[name] is not None
-    assert blind["rendered/novel/solid/psnr"] is not None
-    assert report["views"]["2"]["mean"][name] == seeing[name]
-    assert "n/a" in (tmp_path / "metrics.md").read_text()
-
-
-class WithoutCameras(SyntheticScenes):
-    """Rooms whose cameras are not known."""
-
-    has_cameras = False
-
-
-def test_a_backend_that_is_told_the_cameras_needs_some(tmp_path: Path, cache: Path) -> None:
-    data = [f"data.val._target_={__name__}.WithoutCameras", "data.eval_scenes=1"]
-    with pytest.raises(DataError, match=r"backend oracle needs the data's cameras, and WithoutCameras has none"):
-        run(tmp_path, cache, *data)
-    report = run(tmp_path, cache, *data, "backend=vggt_tiny")
-    assert "rendered/gt_pose/solid/psnr" not in report["views"]["2"]["mean"]
-
-
-def test_lpips_from_a_local_file(tmp_path: Path, cache: Path, trained: Path) -> None:
-    generator, state, channels, position = torch.Generator().manual_seed(0), {}, 3, 0
-    for stage, widths in enumerate(STAGES):
-        for width in widths:
-            shape = (width, channels, 3, 3)
-            state[f"features.{position}.weight"] = torch.randn(shape, generator=generator) / (4.5 * channels) ** 0.5
-            state[f"features.{position}.bias"] = torch.zeros(width)
-            channels, position = width, position + 2
-        position += 1
-        state[f"lin{stage}.model.1.weight"] = torch.rand(1, channels, 1, 1, generator=generator)
-    torch.save(state, tmp_path / "weights.pth")
-    out = tmp_path / "out"
-    chosen = ["data.eval_scenes=1", f"evaluation.lpips={tmp_path / 'weights.pth'}"]
-    report = run(out, cache, f"ckpt={trained}", *chosen)
-    assert report["settings"]["lpips"].startswith("VGG-16")
-    assert report["views"]["2"]["mean"]["rendered/novel/solid/lpips"] > 0
-
-
-def test_a_checkpoint_is_a_file_or_the_newest_of_a_run(trained: Path) -> None:
-    newest = trained / "checkpoints" / "step-2.ckpt"
-    assert checkpoint_path(None) is None
-    assert checkpoint_path(str(trained)) == newest
-    assert checkpoint_path(str(trained / "checkpoints")) == newest
-    assert checkpoint_path(str(newest)) == newest
 
 
 @pytest.mark.parametrize(

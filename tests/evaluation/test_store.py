@@ -4,7 +4,7 @@ import pytest
 
 from vg2gt.data.views import SceneSample
 from vg2gt.evaluation.run import mean_metrics
-from vg2gt.evaluation.store import ResultStore, file_name
+from vg2gt.evaluation.store import ResultStore
 
 VIEWS = SceneSample("kitchen/seq-01", (1, 2), (3,))
 
@@ -32,12 +32,6 @@ def test_other_settings_are_refused_and_named(tmp_path: Path) -> None:
         ResultStore(tmp_path, {"alignment": "scene", "k": 8})
     replaced = ResultStore(tmp_path, {"alignment": "scene", "k": 8}, overwrite=True)
     assert replaced.read(VIEWS) is None
-
-
-def test_different_scenes_have_different_files() -> None:
-    names = ["a/b", "a%2Fb", "a_b", "a"]
-    assert len({file_name(name) for name in names}) == len(names)
-    assert "/" not in file_name("a/b")
 
 
 def test_means_leave_out_what_is_missing_and_times_are_medians() -> None:

@@ -1,6 +1,4 @@
-import math
 import re
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +6,6 @@ import pytest
 
 from vg2gt.evaluation import paper
 from vg2gt.evaluation.sections import report_markdown
-from vg2gt.evaluation.tables import METRICS, columns, markdown_table, number
 
 
 def report(**settings: Any) -> dict[str, Any]:
@@ -55,35 +52,6 @@ def test_figures_stand_where_they_belong() -> None:
     assert "k = 8" in text
     assert "## Cameras of the input views\n\nn/a" in text
     assert "paper" not in text
-
-
-def test_a_table_is_aligned_and_says_what_is_missing() -> None:
-    cells = [number(1.25, 1), number(None, 1), number(math.inf, 1), number(0.5, 2, sign=True)]
-    assert cells == ["1.2", "n/a", "n/a", "+0.50"]
-    table = markdown_table(["", "value"], [["a", cells[0]], ["longer", cells[1]]])
-    assert table.splitlines() == [
-        "|        | value |",
-        "| ------ | ----: |",
-        "| a      |   1.2 |",
-        "| longer |   n/a |",
-    ]
-
-
-def test_columns_are_the_specifications_but_for_what_a_table_says() -> None:
-    path = "rendered/gt_pose/solid/abs_rel"
-    chosen = columns("psnr", path, labels={path: "error"}, decimals={"psnr": 1})
-    assert chosen["psnr"] == replace(METRICS["psnr"], decimals=1)
-    assert chosen[path] == replace(METRICS["abs_rel"], label="error")
-
-
-def test_a_range_of_depths_is_said() -> None:
-    assert "of true depths from 0 to 10" in report_markdown(report(depth_range=[None, 10]))
-    assert "of true depths from 0.5 to any" in report_markdown(report(depth_range=[0.5, None]))
-
-
-def test_lpips_without_weights_says_how_to_get_them() -> None:
-    text = report_markdown(report(lpips="n/a (weights not found: evaluation.lpips=download or PATH)"))
-    assert "LPIPS n/a (weights not found: evaluation.lpips=download or PATH)" in text
 
 
 def test_the_papers_rows_stand_beside_ours() -> None:

@@ -40,7 +40,6 @@ def seen() -> tuple[torch.Tensor, torch.Tensor]:
 def test_every_direction_has_its_colour(seen: tuple[torch.Tensor, torch.Tensor]) -> None:
     images, depth = seen
     shell = far_shell(images, depth, ring())
-    assert shell is not None
     assert len(shell) == COUNT
     shown = render(shell, ring()).color[0]
     for view in range(4):
@@ -52,7 +51,6 @@ def test_every_direction_has_its_colour(seen: tuple[torch.Tensor, torch.Tensor])
 def test_it_is_far_and_faces_the_cameras(seen: tuple[torch.Tensor, torch.Tensor]) -> None:
     images, depth = seen
     shell = far_shell(images, depth, ring())
-    assert shell is not None
     assert torch.allclose(shell.means.norm(dim=-1), torch.tensor(40.0), rtol=1e-4)
     axis = quat_to_matrix(shell.quats)[..., 2]
     assert torch.allclose((axis * shell.means / 40).sum(-1).abs(), torch.ones(COUNT), atol=1e-4)
@@ -65,15 +63,12 @@ def test_masked_pixels_leave_no_colour(seen: tuple[torch.Tensor, torch.Tensor]) 
     mask = torch.ones_like(depth)
     mask[0] = 0  # the red ones
     shell = far_shell(images, depth, ring(), mask)
-    assert shell is not None
     ahead = shell.sh[shell.means[:, 2] > 30, 0]
     assert (ahead[:, 0] < 0.3).all()  # about a half without red: 0 is mid grey
 
 
 @pytest.mark.parametrize("missing", ["nothing", "everything"])
-def test_no_shell_where_there_is_nothing_to_show_or_no_scale(
-    seen: tuple[torch.Tensor, torch.Tensor], missing: str
-) -> None:
+def test_no_shell_where_there_is_nothing_to_show_or_no_scale(seen, missing):
     images, depth = seen
     assert far_shell(images, torch.full_like(depth, 2.0 * (missing == "nothing")), ring()) is None
 
@@ -81,12 +76,10 @@ def test_no_shell_where_there_is_nothing_to_show_or_no_scale(
 def test_a_scene_keeps_its_degree_and_background(seen: tuple[torch.Tensor, torch.Tensor]) -> None:
     images, depth = seen
     shell = far_shell(images, depth, ring())
-    assert shell is not None
     own = shell.select(torch.arange(5))
     own = Gaussians(
         own.means / 20, own.quats, own.scales, own.opacities, torch.zeros(5, 4, 3), own.batch, torch.rand(1, 3)
     )
     both = own.joined(shell)
-    assert len(both) == 5 + COUNT
-    assert both.sh.shape == (5 + COUNT, 4, 3)
+    assert (len(both), both.sh.shape) == (5 + COUNT, (5 + COUNT, 4, 3))
     assert both.background is own.background

@@ -14,7 +14,6 @@ from vg2gt.method.additions.surfel import (
     MIN_REACH,
     SHARED,
     THICKNESS,
-    layout,
     surface_frame,
     surfel_start,
 )
@@ -54,19 +53,6 @@ def test_normal_direction_and_gradient_of_a_coloured_square(frame: Tensor, side:
     torch.testing.assert_close(reach[0], torch.ones(2, dtype=torch.float64), atol=0.01, rtol=0)
 
 
-def test_the_first_axis_leads_to_the_brighter_side() -> None:
-    frame = FRAMES[0]
-    found, _, _ = surface_frame(moments_of(*square(frame, -GRADIENT), frame[:, 2]))
-    torch.testing.assert_close(found[0, :, 0], -frame[:, 0], atol=1e-3, rtol=0)
-
-
-def test_without_a_gradient_the_longest_axis_is_the_first() -> None:
-    frame = FRAMES[1]
-    found, _, reach = surface_frame(moments_of(*square(frame, 0 * GRADIENT, (0.3, 0.9)), frame[:, 2]))
-    torch.testing.assert_close((found[0, :, 0] * frame[:, 1]).sum().abs(), torch.ones((), dtype=torch.float64))
-    torch.testing.assert_close(reach[0], torch.tensor([0.9, 0.3], dtype=torch.float64), atol=0.01, rtol=0)
-
-
 def test_two_gaussians_lie_along_the_gradient_and_share_its_colours() -> None:
     frame = FRAMES[2]
     start = surfel_start(moments_of(*square(frame, GRADIENT), frame[:, 2]), 2)
@@ -96,21 +82,6 @@ def test_few_points_stand_for_their_pixels() -> None:
     _, _, reach = surface_frame(moments_of(*square(frame, 0 * GRADIENT, (0.8, 0.4)), leaning, pixel=0.3))
     expected = torch.tensor([(0.8**2 + 0.6**2) ** 0.5, (0.4**2 + 0.3**2) ** 0.5], dtype=torch.float64)
     torch.testing.assert_close(reach[0], expected, atol=5e-3, rtol=0)
-
-
-@pytest.mark.parametrize("splits", range(1, 10))
-def test_any_number_of_gaussians_is_laid_out_evenly(splits: int) -> None:
-    places, scales = layout(splits, torch.zeros((), dtype=torch.float64))
-    assert places.shape == (splits, 2)
-    assert scales.shape == (splits, 3)
-    assert places.abs().max() < 0.61
-    assert len({tuple(place) for place in places.tolist()}) == splits
-    torch.testing.assert_close(places[:, 0].mean(), torch.zeros((), dtype=torch.float64))
-
-
-def test_four_lie_in_a_square() -> None:
-    places, _ = layout(4, torch.zeros(()))
-    torch.testing.assert_close(places.abs(), torch.full((4, 2), 0.3))
 
 
 @pytest.mark.parametrize("points", ["one", "line", "same place"])

@@ -35,18 +35,6 @@ def random_depth(scenes: int = 2, views: int = 3) -> Tensor:
     return 1 + torch.rand(scenes, views, *SIZE, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
 
 
-def test_pixel_centres_are_integers() -> None:
-    grid = pixel_grid(2, 3, torch.zeros(1))
-    assert grid.tolist() == [[[0, 0], [1, 0], [2, 0]], [[0, 1], [1, 1], [2, 1]]]
-
-
-def test_the_ray_through_the_principal_point_is_the_axis() -> None:
-    intrinsics = torch.tensor([[7.0, 0, 3], [0, 6, 2], [0, 0, 1]])
-    rays = ray_directions(intrinsics, SIZE)
-    assert rays[2, 3].tolist() == [0, 0, 1]
-    torch.testing.assert_close(rays[0, 5], torch.tensor([2 / 7, -2 / 6, 1]))
-
-
 def test_unprojection_by_hand_and_back() -> None:
     cameras, depth = random_cameras(), random_depth()
     points = unproject(depth, cameras)

@@ -63,26 +63,6 @@ def test_holes_and_depth_edges_have_no_normal() -> None:
     assert wide[10, 14]
 
 
-def test_does_not_depend_on_the_unit() -> None:
-    depth = wavy_depth()
-    near, valid_near = normals_from_depth(depth, K)
-    far, valid_far = normals_from_depth(1000 * depth, K)
-    assert torch.equal(valid_near, valid_far)
-    torch.testing.assert_close(near, far)
-
-
-def test_batches_have_their_own_intrinsics() -> None:
-    depth = wavy_depth().expand(2, 3, *SIZE)
-    intrinsics = K.repeat(2, 3, 1, 1)
-    intrinsics[1, 2, 0, 0] = 50
-    normals, valid = normals_from_depth(depth, intrinsics)
-    assert normals.shape == (2, 3, 3, *SIZE)
-    assert valid.shape == (2, 3, *SIZE)
-    for b, v in ((0, 0), (1, 2)):
-        torch.testing.assert_close(normals[b, v], normals_from_depth(depth[b, v], intrinsics[b, v])[0])
-    assert not torch.allclose(normals[0, 0], normals[1, 2])
-
-
 def test_gradients_are_right_and_finite_with_holes() -> None:
     depth = wavy_depth()[:6, :7].clone()
     depth[2, 2] = 0

@@ -43,12 +43,6 @@ def test_order_and_signs_are_those_of_gaussian_splatting() -> None:
     torch.testing.assert_close(values, torch.tensor(expected, dtype=torch.float64))
 
 
-def test_lower_degrees_are_prefixes() -> None:
-    directions = sphere(10)
-    for degree in range(3):
-        assert torch.equal(basis(directions, degree), basis(directions, 3)[:, : (degree + 1) ** 2])
-
-
 def test_colours_come_back_and_are_not_negative() -> None:
     rgb = torch.rand(5, 3, generator=torch.Generator().manual_seed(0))
     directions = sphere(5).float()

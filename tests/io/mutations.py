@@ -38,11 +38,7 @@ def mutations(content: bytes, count: int, seed: int = 0) -> Iterator[bytes]:
 
 
 def survives(read: Callable[[], object], path: Path, count: int, seed: int = 0) -> tuple[int, int]:
-    """Damages ``path`` in turn and reads; any other exception than the documented one escapes.
-
-    Returns:
-        How many damaged files were refused and how many were read (a flipped bit of a number is no damage one can see).
-    """
+    """Damages ``path`` in turn and reads; any other exception than the documented one escapes."""
     content = path.read_bytes()
     refused = 0
     for damaged in mutations(content, count, seed):

@@ -78,13 +78,11 @@ def render_ply(
     sigma = np.exp(stack("scale_0", "scale_1", "scale_2"))
     rest = sum(name.startswith("f_rest_") for name in table) // 3
     channels = [stack(f"f_dc_{c}", *(f"f_rest_{c * rest + k}" for k in range(rest))) for c in range(3)]
-
     rotation, translation = world_to_camera[:3, :3], world_to_camera[:3, 3]
     direction = means + rotation.T @ translation
     basis = sh_basis(direction / np.linalg.norm(direction, axis=-1, keepdims=True))[:, : rest + 1]
     color = np.stack([(basis * channel).sum(-1) for channel in channels], -1)
     color = np.maximum(color + 0.5, 0)
-
     camera = means @ rotation.T + translation
     order = np.argsort(camera[:, 2], kind="stable")
     order = order[camera[order, 2] > near]
@@ -99,7 +97,6 @@ def render_ply(
     half = jacobian @ rotation @ (axes * sigma[:, None, :])
     conic = np.linalg.inv(half @ half.swapaxes(1, 2) + 0.3 * np.eye(2))
     center = np.stack([camera[:, 0] / z * fx + cx, camera[:, 1] / z * fy + cy], -1)
-
     image = np.zeros((height, width, 3))
     for row in range(height):
         for column in range(width):

@@ -82,10 +82,3 @@ def test_other_files_are_refused(tmp_path: Path, content: str) -> None:
     path.write_text(content)
     with pytest.raises(FormatError, match=r"cameras\.json"):
         read_cameras_json(path)
-
-
-def test_cameras_that_are_none_are_not_written(tmp_path: Path) -> None:
-    bad = NamedCamera("a", 10, 10, K, np.full((4, 4), np.nan))
-    with pytest.raises(ValueError, match=r"cameras\[0\]\.world_to_camera"):
-        write_cameras_json(tmp_path / "cameras.json", [bad])
-    assert not list(tmp_path.iterdir())

@@ -1,33 +1,16 @@
 """Other people's programs open our files. Each test skips where its program is not installed."""
 
-import importlib.util
 import shutil
 import subprocess
-from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
-import trimesh
 
-from tests.io.gaussian_scenes import scene, views
-from tests.io.splat_oracle import rotations
-from vg2gt.geometry.spherical_harmonics import DC
-from vg2gt.io import (
-    read_gaussian_ply,
-    write_gaussian_ply,
-    write_point_ply,
-    write_splat,
-)
+from tests.io.gaussian_scenes import scene
+from vg2gt.io import read_gaussian_ply, write_gaussian_ply
 
 pytestmark = pytest.mark.slow
-
-
-def needs(package: str):
-    if importlib.util.find_spec(package) is None:
-        pytest.skip(f"needs {package}: pip install {package}")
-    return importlib.import_module(package)
 
 
 def splat_transform(*arguments: Path | str) -> None:
@@ -58,48 +41,3 @@ def test_splat_transform_reads_and_converts_our_ply(tmp_path: Path, degree: int)
     torch.testing.assert_close(packed.sh, after.sh[order], rtol=0, atol=0.05)
     unit = torch.nn.functional.normalize(after.quats[order], dim=-1)
     assert (packed.quats * unit).sum(-1).abs().min() > 0.999
-
-
-def test_splat_transform_reads_and_converts_our_splat(tmp_path: Path) -> None:
-    before = scene(200)
-    before = replace(before, sh=(torch.sigmoid(before.sh) - 0.5) / DC)
-    splat_transform(write_splat(tmp_path / "scene.splat", before), tmp_path / "theirs.ply")
-    after = read_gaussian_ply(tmp_path / "theirs.ply")
-    torch.testing.assert_close(after.means, before.means, rtol=0, atol=0)
-    torch.testing.assert_close(after.scales, before.scales, rtol=1e-5, atol=0)
-    torch.testing.assert_close(after.sh * DC, before.sh * DC, rtol=0, atol=1 / 500)
-    torch.testing.assert_close(after.opacities, before.opacities, rtol=0, atol=1 / 250)
-    unit, other = (torch.nn.functional.normalize(g.quats, dim=-1) for g in (before, after))
-    assert (unit * other).sum(-1).abs().min() > 0.9999
-
-
-def test_trimesh_loads_both_kinds_of_ply(tmp_path: Path) -> None:
-    before = scene(50)
-    rgb = np.random.default_rng(0).integers(0, 256, (50, 3)).astype(np.uint8)
-    points = trimesh.load(write_point_ply(tmp_path / "points.ply", before.means.numpy(), rgb))
-    assert isinstance(points, trimesh.PointCloud)
-    np.testing.assert_array_equal(points.vertices, before.means.numpy())
-    np.testing.assert_array_equal(points.colors[:, :3], rgb)
-    gaussians = trimesh.load(write_gaussian_ply(tmp_path / "scene.ply", before))
-    assert isinstance(gaussians, trimesh.PointCloud)
-    np.testing.assert_array_equal(gaussians.vertices, before.means.numpy())
-
-
-def test_viser_shows_what_the_reader_returns(tmp_path: Path) -> None:
-    viser = needs("viser")
-    gaussians = read_gaussian_ply(write_gaussian_ply(tmp_path / "scene.ply", scene(50)))
-    scaled = torch.from_numpy(rotations(gaussians.quats.numpy()).astype(np.float32)) * gaussians.scales[:, None]
-    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
-    try:
-        handle = server.scene.add_gaussian_splats(
-            "/scene",
-            centers=gaussians.means.numpy(),
-            covariances=(scaled @ scaled.transpose(1, 2)).numpy(),
-            rgbs=(0.5 + DC * gaussians.sh[:, 0]).clamp(0, 1).numpy(),
-            opacities=gaussians.opacities[:, None].numpy(),
-        )
-        assert handle is not None
-        cameras = views()
-        server.scene.add_camera_frustum("/camera", fov=0.9, aspect=cameras.size[1] / cameras.size[0])
-    finally:
-        server.stop()

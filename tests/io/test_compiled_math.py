@@ -46,7 +46,6 @@ def test_gelu_and_its_slope() -> None:
     x = torch.from_numpy(values).double().requires_grad_()
     exact = F.gelu(x)
     exact.sum().backward()
-    assert x.grad is not None
     error = np.abs(results - exact.detach().numpy())
     assert (error <= 5e-7 * np.maximum(1, np.abs(values))).all(), error.max()
     assert np.abs(slopes - x.grad.numpy()).max() < 4e-7

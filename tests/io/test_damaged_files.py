@@ -13,40 +13,30 @@ from tests.io.test_colmap import small_model
 from tests.io.test_nerfstudio import random_transforms
 from tests.io.test_ply import header
 from tests.io.test_splat import displayable
-from vg2gt.io import (
-    read_cameras_json,
-    read_colmap,
-    read_gaussian_ply,
-    read_point_ply,
-    read_splat,
-    read_transforms,
-    write_cameras_json,
-    write_colmap,
-    write_gaussian_ply,
-    write_point_ply,
-    write_splat,
-    write_transforms,
-)
+from vg2gt import io
 from vg2gt.io.colmap import FILES
 
 
 def ascii_points(path: Path) -> None:
     head = header(20, ["x", "y", "z"]).replace(b"binary_little_endian", b"ascii")
     path.write_bytes(head + b"1.5 -2e3 7\n" * 20)
-    assert len(read_point_ply(path).positions) == 20
+    assert len(io.read_point_ply(path).positions) == 20
 
 
 CASES: dict[str, tuple[Callable[[Path], object], Callable[[Path], object]]] = {
-    "scene.ply": (lambda path: write_gaussian_ply(path, scene(12, 1)), read_gaussian_ply),
-    "points.ply": (lambda path: write_point_ply(path, np.ones((20, 3)), np.zeros((20, 3), np.uint8)), read_point_ply),
-    "ascii.ply": (ascii_points, read_point_ply),
-    "scene.splat": (lambda path: write_splat(path, displayable(12)), read_splat),
-    "transforms.json": (lambda path: write_transforms(path, random_transforms(False, 3)), read_transforms),
-    "cameras.json": (lambda path: write_cameras_json(path, mixed()), read_cameras_json),
+    "scene.ply": (lambda path: io.write_gaussian_ply(path, scene(12, 1)), io.read_gaussian_ply),
+    "points.ply": (
+        lambda path: io.write_point_ply(path, np.ones((20, 3)), np.zeros((20, 3), np.uint8)),
+        io.read_point_ply,
+    ),
+    "ascii.ply": (ascii_points, io.read_point_ply),
+    "scene.splat": (lambda path: io.write_splat(path, displayable(12)), io.read_splat),
+    "transforms.json": (lambda path: io.write_transforms(path, random_transforms(False, 3)), io.read_transforms),
+    "cameras.json": (lambda path: io.write_cameras_json(path, mixed()), io.read_cameras_json),
     **{
         f"{name}{suffix}": (
-            lambda path: write_colmap(path.parent, small_model(points=20), text=path.suffix == ".txt"),
-            lambda path: read_colmap(path.parent),
+            lambda path: io.write_colmap(path.parent, small_model(points=20), text=path.suffix == ".txt"),
+            lambda path: io.read_colmap(path.parent),
         )
         for name in FILES
         for suffix in (".bin", ".txt")

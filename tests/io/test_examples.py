@@ -19,13 +19,6 @@ def test_docstring_examples(name: str) -> None:
     assert doctest.testmod(importlib.import_module(name)).failed == 0
 
 
-def test_every_format_has_a_docstring_example() -> None:
-    finder = doctest.DocTestFinder(exclude_empty=True)
-    examples = [example for name in MODULES for example in finder.find(importlib.import_module(name), name)]
-    with_one = {example.name.split(".")[2] for example in examples if example.examples}
-    assert {"colmap", "nerfstudio", "ply", "splat", "glb", "mesh"} <= with_one
-
-
 def test_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
     code, printed = re.findall(r"```(?:python)?\n(.*?)```", PAGE.read_text(), re.DOTALL)
     monkeypatch.chdir(tmp_path)

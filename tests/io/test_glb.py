@@ -1,18 +1,14 @@
 """GLB of points and cameras, read back with trimesh."""
 
-import json
-import struct
 from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
 import trimesh
 
 from tests.io.gaussian_scenes import views
 from vg2gt.io import write_glb
 from vg2gt.io.glb import FRUSTA, POINTS, frusta
-from vg2gt.types import Cameras
 
 
 def load(path: Path) -> tuple[dict[str, np.ndarray], trimesh.Scene]:
@@ -51,34 +47,3 @@ def test_frusta_are_the_images_outlines() -> None:
         pixels = (local / local[:, 2:]) @ cameras.intrinsics[0, view].double().T
         expected = torch.tensor([[-0.5, -0.5], [55.5, -0.5], [55.5, 39.5], [-0.5, 39.5], [27.5, -10.5]]).double()
         torch.testing.assert_close(pixels[1:, :2], expected, atol=1e-4, rtol=0)
-
-
-def test_size_of_frusta_follows_the_scene(tmp_path: Path) -> None:
-    wide = np.random.default_rng(0).uniform(-10, 10, (500, 3))
-    placed, _ = load(write_glb(tmp_path / "wide.glb", wide, cameras=views()))
-    spread = np.ptp(placed[FRUSTA][:, 2])
-    assert 1 < spread < 5
-    placed, _ = load(write_glb(tmp_path / "alone.glb", np.zeros((0, 3)), cameras=views().select(slice(0, 1))))
-    assert np.ptp(placed[FRUSTA], axis=0).max() > 0.01
-
-
-def test_file_is_binary_gltf_2(tmp_path: Path) -> None:
-    content = write_glb(tmp_path / "scene.glb", np.zeros((3, 3)), cameras=views()).read_bytes()
-    magic, version, length, chunk, kind = struct.unpack("<4sII I4s", content[:20])
-    assert (magic, version, length, kind) == (b"glTF", 2, len(content), b"JSON")
-    body = json.loads(content[20 : 20 + chunk])
-    assert {primitive["mode"] for mesh in body["meshes"] for primitive in mesh["primitives"]} <= {0, 1, 3}
-
-
-def test_wrong_arguments_are_named(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="neither points nor cameras"):
-        write_glb(tmp_path / "a.glb", np.zeros((0, 3)))
-    with pytest.raises(ValueError, match="finite"):
-        write_glb(tmp_path / "a.glb", np.full((1, 3), np.nan))
-    with pytest.raises(ValueError, match="uint8"):
-        write_glb(tmp_path / "a.glb", np.zeros((1, 3)), np.zeros((1, 3)))
-    two = views()
-    two = Cameras(two.world_to_camera.repeat(2, 1, 1, 1), two.intrinsics.repeat(2, 1, 1, 1), two.size)
-    with pytest.raises(ValueError, match="one scene"):
-        write_glb(tmp_path / "a.glb", np.zeros((1, 3)), cameras=two)
-    assert not list(tmp_path.iterdir())

@@ -47,7 +47,6 @@ def test_round_trip(tmp_path: Path, shared_lens: bool, frames: int) -> None:
         np.testing.assert_allclose(other.world_to_camera, one.world_to_camera, atol=1e-14)
         assert other.lens == one.lens
         assert (other.file_path, other.depth_file_path, other.mask_path) == (one.file_path, one.depth_file_path, None)
-    assert before.applied_transform is not None
     np.testing.assert_array_equal(after.applied_transform, before.applied_transform)
     assert after.ply_file_path == "points.ply"
     content = json.loads((tmp_path / "transforms.json").read_text())
@@ -99,7 +98,6 @@ def test_real_file(shared: Path, tmp_path: Path) -> None:
     assert lens.is_distorted
     assert lens.distortion == {"k1": 0.0578421, "k2": -0.0805099, "p1": -0.000980296, "p2": 0.00015575}
     np.testing.assert_allclose(lens.intrinsics(), [[1375.52, 0, 554.058], [0, 1374.49, 964.768], [0, 0, 1]])
-    assert lens.camera_angle_x is not None
     assert pytest.approx(lens.fl_x, rel=1e-5) == 1080 / 2 / np.tan(lens.camera_angle_x / 2)
     poses = np.stack([frame.world_to_camera for frame in fox.frames])
     np.testing.assert_allclose(
@@ -122,14 +120,9 @@ def test_real_file(shared: Path, tmp_path: Path) -> None:
         ("{", "not valid JSON"),
         ("[" * 100_000, "not valid JSON"),
         ("{}", "frames is missing"),
-        ('{"frames": {}}', "frames is dict, expected a list of frames"),
         ('{"frames": [3]}', r"frames\[0\] should be an object, got 3"),
         ('{"fl_x": "wide", "frames": []}', "fl_x is 'wide', expected a finite number"),
-        ('{"fl_x": -1, "frames": []}', "fl_x is -1"),
-        ('{"fl_x": true, "frames": []}', "fl_x is True"),
         ('{"w": 10.5, "frames": []}', "whole number of pixels"),
-        ('{"w": 1e999, "frames": []}', "w is inf"),
-        ('{"fl_x": 1, "frames": [{}]}', r"frames\[0\]\.file_path is missing"),
         ('{"frames": [{"file_path": "a"}]}', r"frames\[0\]\.fl_x is missing"),
         ('{"fl_x": 1, "frames": [{"file_path": "a"}]}', r"frames\[0\]\.transform_matrix is missing"),
         ('{"fl_x": 1, "frames": [{"file_path": "a", "transform_matrix": [[1], [2], [3]]}]}', "row 0"),

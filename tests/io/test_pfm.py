@@ -29,15 +29,12 @@ ZEROS = b"\0" * 48
     "content",
     [
         b"",
-        b"Pf",
         b"PF\n4 3\n-1\n" + ZEROS * 3,
         b"Pf\n0 3\n-1\n",
-        b"Pf\n4 3\n0\n" + ZEROS,
         b"Pf\n4 3\nnan\n" + ZEROS,
         b"Pf\n4 3\n-1\n" + ZEROS[1:],
         b"Pf\n4 3\n-1\n" + ZEROS + b"\0",
         b"Pf\n999999 999999\n-1\n\0",
-        b"Pf\n-4 3\n-1\n",
     ],
 )
 def test_damage_is_named(tmp_path: Path, content: bytes) -> None:

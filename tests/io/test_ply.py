@@ -82,8 +82,7 @@ def test_activations_and_channel_order(tmp_path: Path) -> None:
     one = scene(1, 3)
     content = write_gaussian_ply(tmp_path / "scene.ply", one).read_bytes()
     row = struct.unpack("<62f", content[-62 * 4 :])
-    assert row[:3] == tuple(one.means[0].tolist())
-    assert row[3:6] == (0, 0, 0)
+    assert (row[:3], row[3:6]) == (tuple(one.means[0].tolist()), (0, 0, 0))
     assert row[6:9] == tuple(one.sh[0, 0].tolist())
     for channel in range(3):
         assert row[9 + 15 * channel : 24 + 15 * channel] == tuple(one.sh[0, 1:, channel].tolist())
@@ -174,18 +173,9 @@ def test_points_round_trip(tmp_path: Path, count: int, colored: bool) -> None:
     assert path.read_bytes()[: len(expected)] == expected
     read = read_point_ply(path)
     np.testing.assert_array_equal(read.positions, xyz)
-    assert read.positions.dtype == np.float32
-    assert (read.colors is None) == (rgb is None)
+    assert (read.positions.dtype, read.colors is None) == (np.float32, rgb is None)
     if read.colors is not None and rgb is not None:
         np.testing.assert_array_equal(read.colors, rgb)
-
-
-def test_real_points(shared: Path, tmp_path: Path) -> None:
-    garden = np.load(shared / "data" / "gsplat_garden" / "test_garden.npz")
-    xyz, rgb = garden["means3d"], garden["colors"]
-    read = read_point_ply(write_point_ply(tmp_path / "garden.ply", xyz, rgb))
-    np.testing.assert_array_equal(read.positions, xyz.astype(np.float32))
-    np.testing.assert_array_equal(read.colors, rgb)
 
 
 def test_ascii_points_with_faces(tmp_path: Path) -> None:
@@ -198,25 +188,20 @@ def test_ascii_points_with_faces(tmp_path: Path) -> None:
     path.write_bytes((head + colors + faces + "0.1 2 3 255 0 1\r\n4 5 6 7 8 9\r\n3 0 1 0\r\n").encode())
     read = read_point_ply(path)
     assert read.positions.tolist() == [[0.1, 2.0, 3.0], [4.0, 5.0, 6.0]]
-    assert read.colors is not None
     assert read.colors.tolist() == [[255, 0, 1], [7, 8, 9]]
 
 
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"", "not a PLY file"),
         (b"ply\nformat binary_little_endian 1.0\n", "not a PLY file"),
         (b"ply\nelement vertex 0\nproperty float x\nend_header\n", "no line 'format'"),
-        (b"ply\nformat binary_middle_endian 1.0\nend_header\n", "format binary_middle_endian"),
         (b"ply\nformat ascii 1.0\nelement face 0\nend_header\n", "no element vertex, only face"),
         (b"ply\nformat ascii 1.0\nelement vertex -1\nend_header\n", "line 3 of the header: unexpected"),
-        (header(0, ["x", "x"]), "property x occurs twice"),
         (header(0, ["x"], "quad"), "expected 'property TYPE NAME'"),
         (header(9 * 10**17, ["x", "y", "z"]), "need 10800000000000000000 bytes, 0 are left"),
         (header(0, ["x", "y"]), "vertices have no z, only x, y"),
         (header(3, ["x", "y", "z"]) + b"\0" * 35, "need 36 bytes, 35 are left"),
-        (header(1, []) + b"\0" * 35, "no properties"),
         (header(1, ["x", "y", "z"]).replace(b"binary_little_endian", b"ascii") + b"1 2\n", "vertex 0 has 2 numbers"),
         (header(1, ["x", "y", "z"]).replace(b"binary_little_endian", b"ascii") + b"1 2 a\n", "else than numbers"),
     ],

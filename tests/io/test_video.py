@@ -61,8 +61,7 @@ def test_frames_come_upright_and_mirrored_as_the_file_says(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(
-    ("codec", "pixels"),
-    [("libx264", "yuv420p10le"), ("libx264", "gray10le"), ("ffv1", "rgb48le")],
+    ("codec", "pixels"), [("libx264", "yuv420p10le"), ("libx264", "gray10le"), ("ffv1", "rgb48le")]
 )
 def test_ten_bits_and_more_are_read_as_eight(tmp_path: Path, codec: str, pixels: str) -> None:
     av = pytest.importorskip("av")

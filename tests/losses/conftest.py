@@ -102,11 +102,7 @@ def make_sample(
         return tensor.to(dtype) if tensor.is_floating_point() else tensor
 
     return Sample(
-        batch.map(convert),
-        prediction.map(convert),
-        render.map(convert),
-        shown,
-        predicted.select(shown).map(convert),
+        batch.map(convert), prediction.map(convert), render.map(convert), shown, predicted.select(shown).map(convert)
     )
 
 

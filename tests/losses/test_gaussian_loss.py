@@ -104,7 +104,6 @@ def test_nothing_rendered_gives_zeros_with_graph_and_finite_gradients(case) -> N
     assert all(float(terms[name].detach()) == 0 for name in ("depth_gt", "depth_consistency", "normal"))
     loss.total(terms).backward()
     for leaf in (depth, normal):
-        assert leaf.grad is not None
         assert (leaf.grad == 0).all()
 
 
@@ -125,13 +124,6 @@ def test_gradients_are_finite_with_holes_and_zero_normals(case, target: str) -> 
         assert leaf.grad is not None, name
         assert torch.isfinite(leaf.grad).all(), name
         assert (leaf.grad != 0).any(), name
-
-
-def test_group_and_term_weights(case) -> None:
-    weights = {"color_l1": 0.9, "ssim": 0.1, "depth_consistency": 0.25, "depth_gt": 0.5, "normal": 0.001}
-    loss = replace(GaussianLoss(weight=10), **weights)
-    terms = loss(*case)
-    torch.testing.assert_close(loss.total(terms), 10 * sum(weights[name] * terms[name] for name in weights))
 
 
 def test_decoded_depth_and_confidence_are_constants_of_the_gaussian_losses(sample) -> None:
@@ -162,11 +154,6 @@ def test_held_out_views_have_no_decoded_depth_to_agree_with(sample) -> None:
     assert float(only_held_out["depth_consistency"]) == float(only_held_out["normal"]) == 0
 
 
-def test_unknown_normal_target_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"loss\.gaussian\.normal_target.*'world'"):
-        GaussianLoss(normal_target="world")
-
-
 def test_colours_that_do_not_count_change_nothing(case) -> None:
     """Issue 47, item 7: what a mask hides is neither in the error nor in the structure of its neighbours."""
     rendered, cameras, targets, scale = case
@@ -180,7 +167,6 @@ def test_colours_that_do_not_count_change_nothing(case) -> None:
     for name in ("color_l1", "ssim"):
         torch.testing.assert_close(one[name], same[name], rtol=0, atol=0)
     (same["color_l1"] + same["ssim"]).backward()
-    assert color.grad is not None
     assert (color.grad[..., :8] == 0).all()
     assert (color.grad[..., 8:] != 0).any()
     assert GaussianLoss()(other, cameras, targets, scale)["color_l1"] != one["color_l1"]

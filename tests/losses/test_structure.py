@@ -25,33 +25,3 @@ def test_the_compiled_loss_equals_the_plain_one(size: tuple[int, int]) -> None:
     torch.testing.assert_close(loss.double(), expected, rtol=1e-6, atol=1e-7)
     gradients = [torch.autograd.grad(3 * value, x)[0] for value, x in ((loss, found), (expected, exact))]
     assert (gradients[0] - gradients[1]).abs().max() < 1e-5 * gradients[1].abs().max()
-
-
-def test_threads_change_nothing() -> None:
-    images, reference = pictures(30, 44)
-    results, threads = [], torch.get_num_threads()
-    try:
-        for number in (1, 2, 3):
-            torch.set_num_threads(number)
-            found = images.clone().requires_grad_()
-            loss = structure_loss(found, reference)
-            results.append((loss.detach(), *torch.autograd.grad(loss, found)))
-    finally:
-        torch.set_num_threads(threads)
-    for result in results[1:]:
-        assert all(torch.equal(*pair) for pair in zip(result, results[0], strict=True))
-
-
-def test_nan_stays_visible() -> None:
-    images, reference = pictures(20, 20)
-    images[0, 0, 3, 3] = torch.nan
-    assert structure_loss(images, reference).isnan()
-
-
-def test_plain_where_it_must_be() -> None:
-    """In float64, and where the reference asks for a gradient too."""
-    images, reference = pictures(12, 12)
-    assert "Structure" not in str(structure_loss(images.double().requires_grad_(), reference.double()).grad_fn)
-    reference.requires_grad_()
-    (gradient,) = torch.autograd.grad(structure_loss(images, reference), reference)
-    assert gradient.any()

@@ -78,11 +78,6 @@ def test_area_under_curve_matches_the_histogram() -> None:
         assert area_under_curve(errors, threshold) == pytest.approx(expected)
 
 
-def test_a_single_view_is_refused() -> None:
-    with pytest.raises(ValueError, match="at least 2 views"):
-        camera_metrics(random_cameras(views=1), random_cameras(views=1))
-
-
 def test_cameras_that_turn_in_one_place_have_no_direction_wherever_that_is() -> None:
     turns = Rotation.from_rotvec(np.random.default_rng(1).normal(size=(5, 3))).as_matrix()
 

@@ -86,19 +86,6 @@ def test_one_scale_a_scene() -> None:
     assert found["abs_rel"] > depth_metrics(predicted, reference, "median")["abs_rel"]
 
 
-def test_default_is_the_median_of_each_image() -> None:
-    predicted, reference = maps()
-    assert depth_metrics(predicted, reference) == depth_metrics(predicted, reference, "median")
-
-
-def test_images_count_alike_whatever_their_valid_pixels() -> None:
-    reference = torch.full((2, 10, 10), 2.0)
-    predicted = reference.clone()
-    predicted[0] = 2.2
-    reference[1, 1:] = 0  # ten pixels against a hundred
-    assert depth_metrics(predicted, reference, "none")["abs_rel"] == pytest.approx(0.05)
-
-
 def test_holes_lower_coverage_and_fail_the_delta_test_with_holes_only() -> None:
     reference = torch.full((2, 4, 5), 3.0)
     predicted = reference.clone()
@@ -119,10 +106,3 @@ def test_unusable_pixels_and_images_are_left_out() -> None:
     assert found["coverage"] == 1
     nothing = depth_metrics(predicted, torch.zeros_like(reference))
     assert all(math.isnan(value) for value in nothing.values())
-
-
-def test_wrong_inputs_are_named() -> None:
-    with pytest.raises(ValueError, match=r"\[V, H, W\].*\(2, 3\)"):
-        depth_metrics(torch.ones(2, 3), torch.ones(2, 3))
-    with pytest.raises(ValueError, match=r"alignment.*'affine'"):
-        depth_metrics(torch.ones(1, 2, 3), torch.ones(1, 2, 3), "affine")

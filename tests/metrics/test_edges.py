@@ -13,12 +13,6 @@ def test_three_pixels_on_either_side_of_a_step() -> None:
     assert torch.equal(near_depth_edges(1000 * depth.transpose(1, 2)), expected.transpose(1, 2))
 
 
-def test_a_step_to_unknown_depth_is_none() -> None:
-    depth = torch.full((2, 1, 10, 20), 1.0)
-    depth[..., 10:] = 0
-    assert not near_depth_edges(depth).any()
-
-
 def test_scores_of_a_region_are_aligned_by_all_pixels() -> None:
     truth = torch.full((1, 10, 20), 2.0)
     predicted = truth.clone() / 4

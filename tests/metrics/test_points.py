@@ -1,5 +1,3 @@
-import math
-
 import numpy as np
 import pytest
 import torch
@@ -48,19 +46,3 @@ def test_thinning_keeps_one_point_per_cell() -> None:
     assert thin(points, 0.5).tolist() == points[[0, 2, 3]].tolist()
     dense = torch.cat((cloud(50, 0), cloud(50, 0) + 1e-6))
     assert point_metrics(dense, cloud(50, 0), 0.1, downsample=1e-3)["accuracy"] < 1e-6
-
-
-def test_nothing_to_compare_has_no_figure() -> None:
-    empty = torch.empty(0, 3)
-    assert all(math.isnan(value) for value in point_metrics(empty, cloud(5, 0), 0.1).values())
-    assert all(math.isnan(value) for value in point_metrics(cloud(5, 0), empty, 0.1).values())
-    far = point_metrics(cloud(5, 0), cloud(5, 0) + 100, 0.1, cap=20)
-    assert math.isnan(far["chamfer"])
-    assert far["f_score"] == 0
-
-
-def test_wrong_inputs_are_named() -> None:
-    with pytest.raises(ValueError, match=r"predicted points must be \[N, 3\].*\(3, 4\)"):
-        point_metrics(torch.ones(3, 4), torch.ones(3, 3), 0.1)
-    with pytest.raises(ValueError, match=r"threshold must be a positive length, got 0"):
-        point_metrics(torch.ones(3, 3), torch.ones(3, 3), 0)

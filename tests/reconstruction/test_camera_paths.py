@@ -39,8 +39,7 @@ def test_orbit_faces_one_point_and_closes() -> None:
 def test_interpolation_passes_through_the_cameras() -> None:
     given = [_camera(0), _camera(1, 0.4, focal=60.0), _camera(3, 0.2)]
     path = interpolate(given, 3)
-    assert len(path) == 9
-    assert path[::4] == given
+    assert (len(path), path[::4]) == (9, given)
     assert len({camera.name for camera in path}) == 9
     assert path[2].intrinsics[0, 0] == pytest.approx(55)
     jumps = [np.abs(a.world_to_camera - b.world_to_camera).max() for a, b in pairwise(path)]

@@ -11,19 +11,8 @@ import torch
 import trimesh
 from PIL import Image
 
+from vg2gt import io
 from vg2gt.geometry.cameras import project, scale_translations
-from vg2gt.io import (
-    colmap_images,
-    colmap_intrinsics,
-    colmap_pose,
-    read_cameras_json,
-    read_colmap,
-    read_gaussian_ply,
-    read_point_ply,
-    read_splat,
-    read_transforms,
-    read_video,
-)
 from vg2gt.reconstruction.output_names import OUTPUTS
 from vg2gt.reconstruction.outputs import write_outputs
 from vg2gt.reconstruction.scene import Scene
@@ -51,14 +40,14 @@ def test_only_what_was_asked_is_there(written: Path) -> None:
 
 
 def test_gaussians(written: Path, scene: Scene) -> None:
-    back = read_gaussian_ply(written / "scene.ply")
+    back = io.read_gaussian_ply(written / "scene.ply")
     for field in ("means", "scales", "opacities"):
         _close(getattr(back, field), getattr(scene.gaussians, field), 1e-5)
-    assert torch.equal(read_splat(written / "scene.splat").means, scene.gaussians.means)
+    assert torch.equal(io.read_splat(written / "scene.splat").means, scene.gaussians.means)
 
 
 def test_cameras(written: Path, scene: Scene) -> None:
-    back = read_cameras_json(written / "cameras.json")
+    back = io.read_cameras_json(written / "cameras.json")
     assert [camera.name for camera in back] == ["008.png", "009.png", "010.png", "011.png"]
     poses = torch.cat([camera.cameras().world_to_camera for camera in back], 1)
     assert torch.equal(poses, scene.cameras.world_to_camera)
@@ -81,26 +70,16 @@ def test_maps(written: Path, scene: Scene) -> None:
         assert Image.open(written / "normals" / f"{stem}.png").size == (112, 84)
 
 
-def test_rendered_views_look_like_the_input(scene: Scene) -> None:
-    """The head's initial state makes coloured voxels where the depth is known."""
-    for image, depth, view in zip(scene.images, scene.depth, scene.render(), strict=True):
-        error = (view.color - image).square().mean()
-        assert -10 * error.log10() > 20
-        both = (depth > 0) & (view.depth > 0)
-        assert both.float().mean() > 0.95
-        assert ((view.depth / depth)[both] - 1).abs().median() < 0.06  # untrained Gaussians are a voxel thick
-
-
 def test_colmap_points_fall_on_the_pixels_they_came_from(written: Path, scene: Scene) -> None:
-    model = read_colmap(written / "colmap" / "sparse" / "0")
+    model = io.read_colmap(written / "colmap" / "sparse" / "0")
     assert len(model.points3D) > 5000
-    for index, image in enumerate(colmap_images(model)):
+    for index, image in enumerate(io.colmap_images(model)):
         features = image.get_observation_points2D()
         points = [model.points3D[feature.point3D_id] for feature in features]
         seen = np.array([feature.xy for feature in features])
-        pose = colmap_pose(image)
+        pose = io.colmap_pose(image)
         local = np.array([point.xyz for point in points]) @ pose[:3, :3].T + pose[:3, 3]
-        pixels = local @ colmap_intrinsics(image.camera).T
+        pixels = local @ io.colmap_intrinsics(image.camera).T
         assert np.abs(pixels[:, :2] / pixels[:, 2:] + 0.5 - seen).max() < 1e-3
         picture = np.array(Image.open(written / "colmap" / "images" / image.name))
         own = np.abs(seen % 1 - 0.5).max(1) < 1e-3  # the view's own points come from the middle of a pixel
@@ -112,28 +91,27 @@ def test_colmap_points_fall_on_the_pixels_they_came_from(written: Path, scene: S
 
 def test_colmap_points_have_tracks_over_the_views_that_see_them(written: Path) -> None:
     """Item 28: dense stereo finds its source images by common points."""
-    model = read_colmap(written / "colmap" / "sparse" / "0")
+    model = io.read_colmap(written / "colmap" / "sparse" / "0")
     lengths = np.array([point.track.length() for point in model.points3D.values()])
     assert lengths.min() >= 1
     assert (lengths >= 2).mean() > 0.5
     first, second = (set() for _ in range(2))
-    for image, ids in zip(colmap_images(model), (first, second), strict=False):
+    for image, ids in zip(io.colmap_images(model), (first, second), strict=False):
         ids |= {feature.point3D_id for feature in image.get_observation_points2D()}
     assert len(first & second) > 500
 
 
 def test_nerfstudio(written: Path, scene: Scene) -> None:
-    transforms = read_transforms(written / "nerfstudio" / "transforms.json")
+    transforms = io.read_transforms(written / "nerfstudio" / "transforms.json")
     for frame, camera in zip(transforms.frames, scene.named_cameras(), strict=True):
         assert (written / "nerfstudio" / frame.file_path).is_file()
         assert np.abs(frame.world_to_camera - camera.world_to_camera).max() < 1e-6
         assert np.abs(frame.lens.intrinsics() - camera.intrinsics).max() < 1e-9
-    assert transforms.ply_file_path is not None
-    assert len(read_point_ply(written / "nerfstudio" / transforms.ply_file_path).positions) > 5000
+    assert len(io.read_point_ply(written / "nerfstudio" / transforms.ply_file_path).positions) > 5000
 
 
 def test_points_and_meshes_lie_on_the_surfaces(written: Path, scene: Scene) -> None:
-    points = read_point_ply(written / "points.ply").positions
+    points = io.read_point_ply(written / "points.ply").positions
     loaded = trimesh.load(written / "points.glb")
     assert isinstance(loaded, trimesh.Scene)
     assert set(loaded.geometry) == {"points", "cameras"}
@@ -151,17 +129,15 @@ def test_points_and_meshes_lie_on_the_surfaces(written: Path, scene: Scene) -> N
 
 
 def test_animation_and_reports(written: Path, scene: Scene) -> None:
-    frames = [frame for _, frame in read_video(written / "orbit.gif")]
+    frames = [frame for _, frame in io.read_video(written / "orbit.gif")]
     assert [frame.shape for frame in frames] == [(84, 112, 3)] * 4
     assert Image.open(written / "report.png").size == (4 * 112 + 12, 4 * 84 + 12)
     figures = json.loads((written / "report.json").read_text())
-    assert figures["views"] == 4
-    assert figures["gaussians"] == len(scene.gaussians)
+    assert (figures["views"], figures["gaussians"]) == (4, len(scene.gaussians))
     assert set(figures["seconds"]) >= {"write files", "render views", "render orbit"}
     assert figures["peak_memory_mib"] > 100
     page = (written / "report.html").read_text()
-    assert page.count("data:image/jpeg;base64,") == 16
-    assert page.count("data:image/gif;base64,") == 1
+    assert (page.count("data:image/jpeg;base64,"), page.count("data:image/gif;base64,")) == (16, 1)
     assert "&lt;none&gt;" in page
     assert "http" not in re.sub(r"base64,[\w+/=]*", "", page)
 
@@ -173,14 +149,6 @@ def test_nothing_is_replaced_unasked(written: Path, scene: Scene, tmp_path: Path
     (tmp_path / "color" / "stale.png").touch()
     write_outputs(scene, tmp_path, ["color.png"], overwrite=True)
     assert not (tmp_path / "color" / "stale.png").exists()
-
-
-def test_unknown_outputs_and_folders_that_cannot_be(scene: Scene, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"unknown output 'scene.obj'; choose from: scene.ply"):
-        scene.save(tmp_path, ["scene.obj"])
-    (tmp_path / "file").touch()
-    with pytest.raises(PermissionError, match="file"):
-        scene.save(tmp_path / "file" / "folder")
 
 
 def test_depth_too_deep_for_a_png_is_said(scene: Scene, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

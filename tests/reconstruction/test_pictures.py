@@ -35,12 +35,6 @@ def test_order_and_mixture_of_arguments_are_kept(photos: Path, frames) -> None:
     assert torch.allclose(views.images[[0, 3, 4]], frames.images[[3, 0, 1]], atol=1 / 500)
 
 
-def test_every_and_max_images_spread_evenly(photos: Path) -> None:
-    assert [p.name for p in find_pictures(photos, every=2)] == ["IMG_8", "IMG_10"]
-    assert [p.name for p in find_pictures(photos, max_images=2)] == ["IMG_8", "IMG_11"]
-    assert [p.name for p in find_pictures(photos, max_images=1)] == ["IMG_8"]
-
-
 def test_frames_of_a_video(tmp_path: Path) -> None:
     frames = [np.zeros((20, 70, 3), np.uint8) for _ in range(70)]
     for i, frame in enumerate(frames):
@@ -55,34 +49,17 @@ def test_frames_of_a_video(tmp_path: Path) -> None:
     assert [p.name for p in mixed] == ["image", "clip-000000", "clip-000030", "clip-000060"]
 
 
-def test_large_pictures_are_shrunk_while_they_are_read(tmp_path: Path) -> None:
-    Image.new("RGB", (1200, 900), (10, 20, 30)).save(tmp_path / "large.png")
-    (picture,) = find_pictures(tmp_path)
-    assert picture.size == (900, 1200)
-    read = picture.read((84, 112))
-    assert read.images.shape == (1, 3, 180, 240)
-    assert (read.images[0, :, 5, 5] * 255).round().tolist() == [10, 20, 30]
-
-
 def test_a_recording_gives_its_cameras_and_depth(recording: Path, frames) -> None:
     pictures = given_pictures(recording, depth=True)
-    assert pictures is not None
     views = load_views(pictures, (56, 84), Monitor())
-    assert views.names == ("008", "009", "010", "011")
-    assert views.hints is not None
-    assert views.hints.cameras is not None
-    assert views.hints.depth is not None
-    assert views.hints.depth.shape == (1, 4, 56, 84)
+    assert (views.names, views.hints.depth.shape) == (("008", "009", "010", "011"), (1, 4, 56, 84))
     assert torch.allclose(views.hints.cameras.world_to_camera[0], frames.world_to_camera, atol=1e-5)
     scale = 84 / 112
     assert views.hints.cameras.intrinsics[0, 0, 0, 0].item() == pytest.approx(frames.intrinsics[0, 0, 0] * scale)
     assert [p.name for p in find_pictures(recording)] == ["008", "009", "010", "011"]  # as mere photographs
 
 
-@pytest.mark.parametrize(
-    ("size", "expected"),
-    [(None, (210, 280)), (140, (112, 140)), ((28, 56), (28, 56))],
-)
+@pytest.mark.parametrize(("size", "expected"), [(None, (210, 280)), (140, (112, 140)), ((28, 56), (28, 56))])
 def test_working_size(size, expected) -> None:
     assert working_size([(600, 800)] * 3, 14, "cpu", size) == expected
 
@@ -96,16 +73,6 @@ def test_working_size_of_mixed_and_extreme_shapes() -> None:
         working_size([(60, 50)], 14, "cpu", (30, 60))
     with pytest.raises(ValueError, match="smaller than one patch"):
         working_size([(60, 50)], 14, "cpu", 10)
-
-
-def test_nothing_to_reconstruct(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="no images to reconstruct"):
-        find_pictures([])
-    (tmp_path / "clip.mp4").touch()
-    with pytest.raises(ValueError, match=r"no images in .* name one: .*clip.mp4"):
-        find_pictures(tmp_path)
-    with pytest.raises(FileNotFoundError, match=r"nowhere.jpg"):
-        find_pictures(tmp_path / "nowhere.jpg")
 
 
 def test_what_cannot_be_read_is_named(tmp_path: Path, monkeypatch) -> None:

@@ -10,21 +10,12 @@ import pytest
 import torch
 from PIL import Image
 
-from tests.reconstruction.test_given_cameras import NAMES, SIZE, STAND_IN, put_cameras, put_colmap, put_transforms
+from tests.reconstruction.conftest import SIZE, STAND_IN
+from tests.reconstruction.test_given_cameras import NAMES, put_cameras, put_colmap, put_transforms
+from vg2gt import io
 from vg2gt.cli import reconstruct as reconstruct_command
 from vg2gt.cli import render as render_command
 from vg2gt.geometry.cameras import project
-from vg2gt.io import (
-    colmap_images,
-    colmap_intrinsics,
-    colmap_pose,
-    read_cameras_json,
-    read_colmap,
-    read_gaussian_ply,
-    write_cameras_json,
-    write_colmap,
-    write_gaussian_ply,
-)
 from vg2gt.reconstruction import sfm
 from vg2gt.reconstruction.camera_files import read_cameras
 from vg2gt.reconstruction.cameras import pictures_for
@@ -41,17 +32,6 @@ from vg2gt.runs.load import load_model
 from vg2gt.types import Gaussians
 
 
-@pytest.fixture(scope="module")
-def model():
-    return load_model(backend=STAND_IN, device="cpu").model
-
-
-@pytest.fixture
-def folder(recording: Path, tmp_path: Path) -> Path:
-    shutil.copytree(recording / "images", tmp_path / "room" / "images")
-    return tmp_path / "room"
-
-
 def run(*arguments: str | Path) -> None:
     plain = ["--backend", STAND_IN, "--device", "cpu", "--quiet"]
     reconstruct_command.main([*map(str, arguments), *plain])
@@ -65,10 +45,10 @@ def test_landscape_and_portrait_mixed_are_read_whole(folder: Path, frames, put, 
     with Image.open(turned) as image:
         image.resize((84, 112)).save(turned)
     if put is put_colmap:
-        model = read_colmap(folder / "sparse" / "0")
+        model = io.read_colmap(folder / "sparse" / "0")
         camera = model.camera(4)
         camera.width, camera.height, camera.params = 84, 112, [77.0, 77.0, 42.0, 56.0]
-        write_colmap(folder / "sparse" / "0", model)
+        io.write_colmap(folder / "sparse" / "0", model)
     elif put is put_transforms:
         content = json.loads((folder / "transforms.json").read_text())
         lens = {key: content.pop(key) for key in ("w", "h", "cx", "cy")}
@@ -76,11 +56,10 @@ def test_landscape_and_portrait_mixed_are_read_whole(folder: Path, frames, put, 
             frame.update(lens if number < 3 else {"w": 84, "h": 112, "cx": 42.0, "cy": 56.0})
         (folder / "transforms.json").write_text(json.dumps(content))
     else:
-        cameras = read_cameras_json(folder / "cameras.json")
+        cameras = io.read_cameras_json(folder / "cameras.json")
         cameras[3] = replace(cameras[3], width=84, height=112)
-        write_cameras_json(folder / "cameras.json", cameras)
+        io.write_cameras_json(folder / "cameras.json", cameras)
     pictures = given_pictures(folder)
-    assert pictures is not None
     assert [picture.size for picture in pictures] == [SIZE] * 3 + [(112, 84)]
     assert pictures[3].read((112, 84)).images.shape[-2:] == (112, 84)
     size = working_size([picture.size for picture in pictures], 14, "cpu")
@@ -113,7 +92,6 @@ def test_cameras_are_found_where_people_have_them(folder: Path, frames, layout: 
         images.rename(folder / "my photographs")
         given = folder / "my photographs"
     pictures = given_pictures(given)
-    assert pictures is not None
     names = [Path(name).stem for name in NAMES]
     assert [picture.name for picture in pictures] == (names[::-1] if layout == "named" else names)
     assert all(picture.source.startswith("COLMAP") for picture in pictures)
@@ -149,7 +127,6 @@ def test_a_workspace_takes_what_fits(folder: Path, frames) -> None:
     shutil.move(folder / "images", folder / "dense" / "images")
     shutil.copytree(folder / "sparse" / "0", folder / "dense" / "sparse")
     pictures = given_pictures(folder)
-    assert pictures is not None
     assert pictures[0].source == f"COLMAP {folder / 'dense'}"
 
 
@@ -159,18 +136,15 @@ def test_given_cameras_keep_their_frame_and_unit(folder: Path, frames, put, tmp_
     put(folder, frames)
     given = {picture.name: picture.pose for picture in given_pictures(folder) or []}
     run(folder, "--out", tmp_path / "out", "--save", "cameras.json,scene.ply,report.json,views.npz")
-    cameras = read_cameras_json(tmp_path / "out" / "cameras.json")
+    cameras = io.read_cameras_json(tmp_path / "out" / "cameras.json")
     for camera in cameras:
         pose = given[Path(camera.name).stem]
-        assert pose is not None
         np.testing.assert_allclose(camera.world_to_camera, pose, atol=1e-6)
-        assert camera.similarity is not None
         np.testing.assert_allclose(camera.similarity, np.eye(4), atol=1e-5)
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert report["frame"] == "given"
     assert report["similarity_to_cameras"]["scale"] == pytest.approx(1, abs=1e-5)
     scene = read_scene(tmp_path / "out", Renderer())
-    assert scene.frame is not None
     assert scene.frame.name == "given"
     seen = scene.depth[scene.depth > 0].median()
     assert seen == pytest.approx(float(frames.depth[frames.depth > 0].median()), rel=0.6)  # the stand-in's plane
@@ -186,7 +160,6 @@ def test_frames_that_can_be_chosen_go_into_one_another(folder: Path, frames, mod
     scenes = {name: reconstruct_with(model, folder, frame=name) for name in ("given", "first", "upright")}
     given = scenes["given"]
     for name, scene in scenes.items():
-        assert scene.frame is not None
         to_given = torch.from_numpy(scene.frame.to_source).float()
         means = scene.gaussians.means @ to_given[:3, :3].T + to_given[:3, 3]
         torch.testing.assert_close(means, given.gaussians.means, atol=2e-4, rtol=0)
@@ -206,8 +179,6 @@ def test_metric_cameras_give_metres(recording: Path, ready) -> None:
     scene = reconstruct_with(ready.model, recording)
     assert scene.metres_per_unit == pytest.approx(1)
     first = reconstruct_with(ready.model, recording, frame="first")
-    assert first.metres_per_unit is not None
-    assert first.frame is not None
     assert first.metres_per_unit == pytest.approx(first.frame.scale)
     assert first.metres_per_unit != pytest.approx(1, abs=0.01)
 
@@ -221,7 +192,6 @@ def test_map_coordinates_keep_their_digits(folder: Path, frames, model, caplog) 
     scene = reconstruct_with(model, folder)
     assert "the scene is written shifted by" in caplog.text
     assert scene.gaussians.means.abs().max() < 1000
-    assert scene.frame is not None
     np.testing.assert_allclose(scene.frame.to_source[:3, 3], shift, atol=20)
     for camera, pose in zip(scene.named_cameras(), poses.numpy(), strict=True):
         np.testing.assert_allclose(camera.world_to_camera @ np.linalg.inv(scene.frame.to_source), pose, atol=2e-6 * 4e6)
@@ -232,7 +202,6 @@ def test_there_is_no_given_frame_without_given_cameras(photos: Path) -> None:
     with pytest.raises(ValueError, match="no given cameras, so --frame given means nothing"):
         reconstruct_with(images_alone, photos, frame="given")
     scene = reconstruct_with(images_alone, photos)
-    assert scene.frame is not None
     assert scene.frame.name == "upright"
 
 
@@ -278,7 +247,6 @@ def test_own_cameras_serve_the_original_photographs(folder: Path, frames, tmp_pa
     shutil.rmtree(folder / "sparse")
     shutil.copy(tmp_path / "out" / "cameras.json", folder)
     pictures = given_pictures(folder)
-    assert pictures is not None
     loaded = pictures[2].read(SIZE)
     assert loaded.images.shape[-2:] == SIZE
     assert torch.allclose(loaded.intrinsics[0], frames.intrinsics[2], atol=1e-3)
@@ -316,7 +284,6 @@ def test_what_is_hidden_is_no_part_of_the_scene(folder: Path, frames, model, kin
         for name in NAMES:
             Image.fromarray(half).save(folder / "masks" / name)
     scene = reconstruct_with(model, folder)
-    assert scene.mask is not None
     assert torch.equal(scene.mask[0, 0], (torch.arange(112) >= 56).float())
     assert (scene.depth[..., :56] == 0).all()
     assert (scene.depth[..., 60:] > 0).any()
@@ -326,7 +293,6 @@ def test_what_is_hidden_is_no_part_of_the_scene(folder: Path, frames, model, kin
         assert magenta.min() > 0.2
     scene.save(tmp_path / "out", ["scene.ply", "cameras.json", "views.npz"])
     again = read_scene(tmp_path / "out", Renderer())
-    assert again.mask is not None
     assert torch.equal(again.mask, scene.mask)
 
 
@@ -335,11 +301,9 @@ def test_masks_of_photographs_without_cameras(folder: Path) -> None:
     (folder / "masks").mkdir()
     Image.new("L", (112, 84), 0).save(folder / "masks" / f"{NAMES[1]}.png")
     views = load_views(find_pictures(folder / "images"), SIZE, Monitor())
-    assert views.mask is not None
     assert views.mask.mean((1, 2)).tolist() == [1, 0, 1, 1]
     image = Image.new("RGBA", (112, 84), (255, 0, 255, 0))
     views = load_views(find_pictures([image]), SIZE, Monitor())
-    assert views.mask is not None
     assert not views.mask.any()
     assert (views.images == 1).all()
 
@@ -350,12 +314,12 @@ def test_photographs_come_back_with_their_names_and_sizes(folder: Path, frames, 
     save = "colmap,nerfstudio,colmap-small"
     run(folder, "--out", tmp_path / "out", "--save", save, "--size", "56x56")
     whole = tmp_path / "out" / "colmap"
-    model = read_colmap(whole / "sparse" / "0")
-    for number, image in enumerate(colmap_images(model)):
+    model = io.read_colmap(whole / "sparse" / "0")
+    for number, image in enumerate(io.colmap_images(model)):
         assert image.name == NAMES[number]
         assert (whole / "images" / image.name).read_bytes() == (folder / "images" / image.name).read_bytes()
-        np.testing.assert_allclose(colmap_intrinsics(image.camera), frames.intrinsics[number], atol=1e-3)
-        np.testing.assert_allclose(colmap_pose(image), frames.world_to_camera[number], atol=1e-6)
+        np.testing.assert_allclose(io.colmap_intrinsics(image.camera), frames.intrinsics[number], atol=1e-3)
+        np.testing.assert_allclose(io.colmap_pose(image), frames.world_to_camera[number], atol=1e-6)
     content = json.loads((tmp_path / "out" / "nerfstudio" / "transforms.json").read_text())
     assert [frame["file_path"] for frame in content["frames"]] == [f"images/{name}" for name in NAMES]
     with Image.open(tmp_path / "out" / "colmap-small" / "images" / NAMES[0]) as image:
@@ -432,18 +396,6 @@ def test_the_reference_is_the_view_that_shows_what_the_others_show() -> None:
     assert [int(shuffled[view]) for view in again] == order
 
 
-def test_a_model_without_points_is_refused_and_not_kept(tmp_path: Path, monkeypatch) -> None:
-    """Item 13: a turning camera. Its median depth was NaN, and every further run failed."""
-    import pycolmap  # pyright: ignore[reportMissingImports]
-
-    empty = pycolmap.Reconstruction()
-    monkeypatch.setattr(pycolmap, "incremental_mapping", lambda *_, **__: {0: empty})
-    images = [np.random.default_rng(i).integers(0, 255, (60, 80, 3), np.uint8) for i in range(3)]
-    with pytest.raises(ValueError, match=r"cameras of these 3 images cannot be found.*rather than turning on the spot"):
-        sfm.find_cameras(find_pictures(images), tmp_path / "sfm", Monitor())
-    assert not (tmp_path / "sfm").exists()
-
-
 @pytest.mark.parametrize("kind", ["empty", "not finite"])
 def test_render_refuses_a_scene_of_nothing(tmp_path: Path, frames, kind: str) -> None:
     """Item 15: it ended with status 0 and a black picture."""
@@ -451,11 +403,11 @@ def test_render_refuses_a_scene_of_nothing(tmp_path: Path, frames, kind: str) ->
     count = 0 if kind == "empty" else 3
     ones, batch = torch.ones(count, 3), torch.zeros(count, dtype=torch.int64)
     scene = Gaussians(ones, torch.ones(count, 4), ones, torch.full((count,), 0.5), ones[:, None], batch)
-    path = write_gaussian_ply(tmp_path / "scene.ply", scene)
+    path = io.write_gaussian_ply(tmp_path / "scene.ply", scene)
     if count:
         content = path.read_bytes()
         path.write_bytes(content[: -count * 68] + np.full(17 * count, np.nan, "<f4").tobytes())
-        assert not len(read_gaussian_ply(path))
+        assert not len(io.read_gaussian_ply(path))
     with pytest.raises(SystemExit, match="holds no Gaussians; there is nothing to render"):
         render_command.main([str(path), "--cameras", str(tmp_path / "cameras.json"), "--out", str(tmp_path / "out")])
     assert not (tmp_path / "out").exists()
@@ -501,9 +453,7 @@ def test_cameras_to_render_come_from_any_file(folder: Path, frames, tmp_path: Pa
 
 
 @pytest.mark.parametrize("given", [False, True])
-def test_without_pycolmap_one_line_comes_before_any_work(
-    folder: Path, frames, given: bool, tmp_path: Path, monkeypatch
-) -> None:
+def test_without_pycolmap_one_line_comes_before_any_work(folder, frames, given, tmp_path, monkeypatch):
     """A COLMAP model that cannot be read, and photographs whose cameras cannot be found."""
     if given:
         put_colmap(folder, frames)

@@ -55,7 +55,6 @@ def test_without_views_its_images_and_own_depth_serve(saved: Path, scene: Scene,
 
 def test_in_python(scene: Scene, tmp_path: Path) -> None:
     refined = scene.refine(steps=6, check_every=3)
-    assert refined.refined is not None
     assert refined.refined.psnr[1].mean() > refined.refined.psnr[0].mean()
     assert not torch.equal(refined.gaussians.sh, scene.gaussians.sh)
     assert scene.refined is None
@@ -86,9 +85,7 @@ def test_the_command(saved: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytes
         vg2gt(monkeypatch, *again)
 
 
-def test_reconstruct_refines_at_once(
-    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
+def test_reconstruct_refines_at_once(recording, tmp_path, monkeypatch, capsys):
     vg2gt(monkeypatch, "reconstruct", str(recording), *ORACLE, "--refine=5", "--out", str(tmp_path / "out"))
     assert "trained on     4 views:" in capsys.readouterr().out
     report = json.loads((tmp_path / "out" / "report.json").read_text())
@@ -104,11 +101,9 @@ def test_photographs_are_refined_unless_asked_not_to(scene: Scene) -> None:
     """Cameras from bundle adjustment stay, predicted ones move; recordings are refined on demand, as before."""
     photographs = replace(scene, cameras_from="structure from motion, 4 of 4 images")
     by_default = _refinement(photographs, None)
-    assert by_default is not None
     assert (by_default.steps, by_default.rates.cameras, by_default.min_views) == (400, 0.0, 2)
     assert _refinement(photographs, 0) is None
     predicted = _refinement(replace(scene, cameras_from=""), 7)
-    assert predicted is not None
     assert (predicted.steps, predicted.rates.cameras) == (7, RefineRates().cameras)
     recording = replace(scene, cameras_from="RGBDFolder somewhere")
     assert _refinement(recording, None) is None
@@ -126,9 +121,7 @@ def test_photographs_are_refined_unless_asked_not_to(scene: Scene) -> None:
         ("value", "refine.holdout must be at least 2"),
     ],
 )
-def test_mistakes_are_one_line(
-    saved: Path, damage: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_mistakes_are_one_line(saved, damage, said, tmp_path, monkeypatch):
     folder = shutil.copytree(saved, tmp_path / "copy", ignore=shutil.ignore_patterns("refined"))
     if damage == "scene.ply":
         (folder / "scene.ply").unlink()
@@ -144,10 +137,3 @@ def test_mistakes_are_one_line(
     words = {"option": ["--options", "default,rats.sh=1"], "value": ["--holdout", "1"]}.get(damage, [])
     with pytest.raises(SystemExit, match=said):
         vg2gt(monkeypatch, "refine", str(folder), "--steps", "1", "--quiet", "--device", "cpu", *words)
-
-
-def test_a_scene_without_decoded_depth_still_refines(scene: Scene) -> None:
-    blind = replace(scene, depth=torch.zeros_like(scene.depth))
-    refined = blind.refine(steps=3).refined
-    assert refined is not None
-    assert refined.ended == "steps"

@@ -34,7 +34,7 @@ RUN = [
     "trainer.val_check_interval=4",
 ]
 
-TRAIN, EVALUATE, ABLATE = "vg2gt.cli.train", "vg2gt.cli.evaluate", "vg2gt.cli.ablate"
+TRAIN, EVALUATE = "vg2gt.cli.train", "vg2gt.cli.evaluate"
 
 Moment = Callable[["Attempt"], bool]
 
@@ -49,15 +49,7 @@ def _run_main(module: str, arguments: list[str], output: str, folder: str) -> No
 
 @dataclass
 class Attempt:
-    """One process of a run.
-
-    Attributes:
-        folder: the run's folder.
-        output: the file that its terminal output goes to.
-        process: of the standard library, of either kind.
-        before: names and times of all in the folder when it was started.
-        seen: notes of the moment that is waited for.
-    """
+    """One process of a run."""
 
     folder: Path
     output: Path
@@ -109,18 +101,8 @@ class Attempt:
         raise TimeoutError(f"{self.folder} waited {PATIENCE:g} s:\n{self.said()[-3000:]}")
 
 
-def start(
-    module: str, arguments: Sequence[str], folder: Path, warm: bool = True, environment: dict[str, str] | None = None
-) -> Attempt:
-    """Starts a command in a new process group.
-
-    Args:
-        module: whose ``main`` is the command.
-        arguments: its command line.
-        folder: the run's; output goes to a file beside it.
-        warm: forks a process that has imported everything; otherwise ``python -m`` as a user starts it.
-        environment: more variables, for cold starts.
-    """
+def start(module: str, arguments: Sequence[str], folder: Path, warm: bool = True) -> Attempt:
+    """Starts a command in a new process group."""
     output, before = folder.with_name(f"{folder.name}.out"), _contents(folder)
     if warm:
         process = warm_process(_run_main, module, list(arguments), str(output), str(folder.parent))
@@ -132,7 +114,7 @@ def start(
             stderr=file,
             cwd=ROOT,
             start_new_session=True,
-            env={**os.environ, "OMP_NUM_THREADS": "1", **(environment or {})},
+            env={**os.environ, "OMP_NUM_THREADS": "1"},
         )
     return Attempt(folder, output, process, before)
 

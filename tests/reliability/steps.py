@@ -32,14 +32,7 @@ TINY = [
 
 
 class Audit(lightning.Callback):
-    """Compares weights and optimiser moments after every step with those before it.
-
-    Attributes:
-        changed: for every step, whether anything changed.
-        finite: for every step, whether all is finite after it.
-        skipped: for every step, whether it was counted as dropped.
-        rates: learning rate of every step.
-    """
+    """Compares weights and optimiser moments after every step with those before it."""
 
     def __init__(self) -> None:
         self.changed: list[bool] = []
@@ -107,12 +100,7 @@ def fit(run: Run, batches: Sequence[Batch]) -> Audit:
 
 
 class Poison(lightning.Callback):
-    """Spoils the images of some steps, on one rank or all.
-
-    Args:
-        steps: numbers of the steps.
-        rank: the only rank whose images are spoiled; None: all.
-    """
+    """Spoils the images of some steps, on one rank or all."""
 
     def __init__(self, steps: Sequence[int], rank: int | None = None) -> None:
         self.steps = list(steps)

@@ -4,12 +4,14 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from tests.reliability import crash_harness as harness
-from tests.reliability.crash_harness import TRAIN, Moment
+from tests.reliability.crash_harness import EVALUATE, TRAIN, Attempt, Moment
+from vg2gt.io.files import read_json
 
 
 @dataclass(frozen=True)
@@ -26,10 +28,7 @@ def random_moments(count: int, seed: int, longest: float = 3.0) -> list[Moment]:
     return [harness.after_seconds(seconds) for seconds in np.random.default_rng(seed).uniform(0, longest, count)]
 
 
-QUICK = Case(
-    "one of each",
-    (harness.in_first_evaluation, harness.while_a_checkpoint_is_written, harness.in_validation),
-)
+QUICK = Case("one of each", (harness.in_first_evaluation, harness.while_a_checkpoint_is_written, harness.in_validation))
 CASES = [
     Case("at random", random_moments(6, seed=0)),
     Case("at random, started as a user does", random_moments(3, seed=1), warm=False),
@@ -110,3 +109,43 @@ def test_twenty_kills(tmp_path: Path, cache: Path, whole: Path) -> None:
     print(f"{sum(kills.values())} kills survived, every result equal bit for bit")
     assert sum(kills.values()) >= 20
     assert all(kills.values()), kills
+
+
+def after_a_scene(attempt: Attempt) -> bool:
+    """A scene is evaluated."""
+    return any(name.startswith("scenes/2/") for name in attempt.new())
+
+
+def without_cost(node: Any) -> Any:
+    """Without times and memory."""
+    if isinstance(node, dict):
+        return {k: without_cost(v) for k, v in node.items() if not k.endswith(("_seconds", "_mib"))}
+    return node
+
+
+@pytest.mark.slow
+def test_a_killed_evaluation_goes_on(tmp_path: Path, cache: Path, whole: Path) -> None:
+    run, expected, folder = tmp_path / "run", tmp_path / "whole", tmp_path / "killed"
+    shutil.copytree(whole, run)
+
+    def arguments(folder: Path) -> list[str]:
+        small = ["data.image_size=[28,56]", "data.eval_scenes=5", "views=[2]", "device=cpu", "name=test"]
+        places = [f"output_dir={folder}", f"hydra.run.dir={folder}", f"data.cache_dir={cache}", f"ckpt={run}"]
+        return [*small, *places, "evaluation.pictures=2"]
+
+    harness.finish(EVALUATE, arguments(expected), expected)
+    kills = 0
+    for _ in range(4):
+        attempt = harness.start(EVALUATE, arguments(folder), folder)
+        if attempt.wait_for(after_a_scene):
+            attempt.kill()
+        assert attempt.status() in (0, -9), attempt.said()[-4000:]
+        kills += attempt.status() == -9
+    harness.finish(EVALUATE, arguments(folder), folder)
+    results = [read_json(path / "metrics.json") for path in (expected, folder)]
+    for result in results:
+        del result["settings"]["name"]  # that of the folder
+    assert without_cost(results[0]) == without_cost(results[1])
+    for path in (expected / "pictures").iterdir():
+        assert path.read_bytes() == (folder / "pictures" / path.name).read_bytes()
+    assert kills >= 3

@@ -54,17 +54,13 @@ def check_training(
 
 
 @pytest.mark.parametrize("overrides", [FULL, BASELINES[1]], ids=" ".join)
-def test_degenerate_scenes_do_no_harm(
-    overrides: tuple[str, ...], tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_degenerate_scenes_do_no_harm(overrides, tmp_path, cache, monkeypatch):
     check_training(overrides, 1, tmp_path, cache, monkeypatch)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("overrides", [FULL, *ABLATIONS, *BASELINES, *OPTIONS], ids=" ".join)
-def test_degenerate_scenes_do_no_harm_in_several_steps(
-    overrides: tuple[str, ...], tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_degenerate_scenes_do_no_harm_in_several_steps(overrides, tmp_path, cache, monkeypatch):
     check_training(overrides, 3, tmp_path, cache, monkeypatch)
 
 
@@ -93,9 +89,7 @@ def test_degenerate_scenes_can_be_evaluated(tmp_path: Path, cache: Path, monkeyp
     [*ABLATIONS, *BASELINES, *OPTIONS, ("model=pointcloud",), ("model=pointcloud", "model.spacing=neighbors")],
     ids=" ".join,
 )
-def test_degenerate_scenes_can_be_evaluated_by_every_model(
-    overrides: tuple[str, ...], tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_degenerate_scenes_can_be_evaluated_by_every_model(overrides, tmp_path, cache, monkeypatch):
     check_evaluation(overrides, tmp_path, cache, monkeypatch)
 
 

@@ -2,15 +2,14 @@
 
 import re
 import resource
-import subprocess
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
 from tests.reliability import crash_harness as harness
-from tests.reliability.crash_harness import TRAIN, Attempt
+from tests.reliability.crash_harness import TRAIN
 from vg2gt.io.files import read_json, write_json
 from vg2gt.runs.checkpoints import newest_valid
 
@@ -37,10 +36,7 @@ def assert_goes_on(whole: Path, folder: Path, cache: Path) -> None:
 
 def test_a_json_file_that_does_not_fit(tmp_path: Path) -> None:
     path = write_json(tmp_path / "metrics.json", {"psnr": 20.0})
-    with (
-        largest_file(1000),
-        pytest.raises(OSError, match=r"metrics\.json could not be written: File too large"),
-    ):
+    with largest_file(1000), pytest.raises(OSError, match=r"metrics\.json could not be written: File too large"):
         write_json(path, list(range(1000)))
     assert read_json(path) == {"psnr": 20.0}
     assert [file.name for file in tmp_path.iterdir()] == ["metrics.json"]
@@ -67,55 +63,3 @@ def test_training_ends_and_goes_on(tmp_path: Path, cache: Path, whole: Path) -> 
 
 
 # ----------------------------------------------------------------------------------------- a file system of our own
-
-
-@pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A file system of 64 MiB; needs the right to mount one."""
-    folder = tmp_path / "disk"
-    folder.mkdir()
-    mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=64m", "tmpfs", str(folder)], capture_output=True, text=True, check=False
-    )
-    if mounted.returncode:
-        pytest.skip(f"needs the right to mount a file system: {mounted.stderr.strip()}")
-    yield folder
-    subprocess.run(["umount", "--lazy", str(folder)], check=True)
-
-
-def fill(disk: Path) -> Path:
-    """Leaves no byte free."""
-    filler = disk / "filler"
-    with suppress(OSError), open(filler, "wb", buffering=0) as file:
-        while True:
-            file.write(bytes(4096))
-    return filler
-
-
-def in_the_first_step(attempt: Attempt) -> bool:
-    """The first row of the training is there."""
-    return "train/" in attempt.log()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("moment", "named"),
-    [
-        (harness.in_first_evaluation, r"(metrics\.csv|untrained\.json|step-2\.ckpt)"),
-        (in_the_first_step, r"step-\d\.ckpt"),
-        (harness.after_a_checkpoint, r"step-\d\.ckpt"),
-        (harness.in_last_evaluation, r"(metrics\.csv|metrics\.json|metrics\.md|preview\.png)"),
-    ],
-)
-def test_full_file_system(small_disk: Path, cache: Path, whole: Path, moment: harness.Moment, named: str) -> None:
-    folder = small_disk / "run"
-    attempt = harness.start(TRAIN, harness.training(folder, cache), folder)
-    assert attempt.wait_for(moment)
-    filler = fill(small_disk)
-    status = attempt.wait()
-    kept = [path.name for path in checkpoints(folder)]
-    filler.unlink()
-    print(f"{moment}: status {status}, checkpoints {kept}: {attempt.said()[-300:]}")
-    assert status == 1
-    assert_goes_on(whole, folder, cache)
-    assert re.search(named, attempt.said())

@@ -10,7 +10,6 @@ from pathlib import Path
 import lightning
 import pytest
 import torch
-from omegaconf import OmegaConf
 from torch import Tensor
 
 from tests.losses.conftest import Sample, make_sample
@@ -278,10 +277,7 @@ def test_tasks_of_a_slurm_job_find_each_other(tmp_path: Path, cache: Path) -> No
 
 @pytest.mark.slow
 def test_forty_steps_on_two_processes(tmp_path: Path, cache: Path) -> None:
-    """The ranks stay equal to the bit; at their weights one process with both scenes has their loss and gradient.
-
-    Two trainings are not compared: rounding that moves a point to another cell or tile makes them part.
-    """
+    """The ranks stay equal to the bit."""
     optimizers = {"sgd_long": two_ranks.SGD, "adamw_long": two_ranks.ADAMW, "muon_long": ()}
     ended = two_ranks.run_on_two_ranks(tmp_path, cache, *optimizers, timeout=1500)
     for name, optimizer in optimizers.items():
@@ -298,14 +294,3 @@ def test_forty_steps_on_two_processes(tmp_path: Path, cache: Path) -> None:
         assert losses.median() < 2e-6
         assert gradients.median() < 5e-6
         assert gradients.max() < 1e-2  # a cell or tile may flip at equal weights, too
-
-
-@pytest.mark.slow
-def test_a_sweep_over_numbers_of_devices(tmp_path: Path, cache: Path) -> None:
-    small = [*SMALL, *TINY[:7], f"data.cache_dir={cache}", "trainer.max_steps=1", "name=sweep"]
-    command = [sys.executable, "-m", "vg2gt.cli.train", "-m", *small, "trainer=default,ddp"]
-    sweep = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=1200, check=False)
-    assert sweep.returncode == 0, sweep.stderr[-3000:]
-    folders = [tmp_path / "outputs" / "sweep" / job for job in "01"]
-    assert [OmegaConf.load(folder / "config.yaml").trainer.devices for folder in folders] == [1, 2]
-    assert all((folder / "metrics.json").is_file() for folder in folders)

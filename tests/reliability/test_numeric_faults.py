@@ -1,10 +1,7 @@
 """NaN and infinity in data, backbone, losses and gradients: the step is dropped everywhere, counted and named."""
 
 import json
-import os
 import re
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -16,8 +13,7 @@ import torch
 from torch import Tensor
 
 from tests.reliability.steps import TINY, Poison, first_batches, fit, named, tiny_run
-from tests.training_helpers import SMALL, small_config, with_crash
-from vg2gt.losses.objective import VG2GTLoss
+from tests.training_helpers import small_config, with_crash
 from vg2gt.runs.checkpoints import newest_valid, read_checkpoint
 from vg2gt.training.loop import Run, train
 from vg2gt.training.skipped import Fault
@@ -124,24 +120,6 @@ def test_a_bad_value_from_the_backbone_does_no_harm(run: Run, monkeypatch: pytes
         assert expected is None or skipped is expected
 
 
-def test_a_bad_loss_term_is_named(run: Run, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
-    loss = run.module.loss
-    assert isinstance(loss, VG2GTLoss)
-    original = loss._gaussian_terms
-
-    def spoil(*args: Any) -> Any:
-        scene = original(*args)
-        value = VALUES[run.trainer.global_step] if run.trainer.global_step < len(VALUES) else 0.0
-        return replace(scene, total=scene.total + value, terms=scene.terms | {"ssim": scene.terms["ssim"] + value})
-
-    monkeypatch.setattr(loss, "_gaussian_terms", spoil)
-    (good,) = first_batches(run, 1)
-    audit = fit(run, [good] * (len(VALUES) + 1))
-    audit.assert_sound()
-    assert audit.skipped == [True] * len(VALUES) + [False]
-    assert f"step 0 skipped, not finite: rank 0, {good.scene[0]}: loss (ssim)" in caplog.text
-
-
 def bad_gradients(run: Run, names: list[str]) -> None:
     """Spoils the gradient of the n-th parameter in the n-th step."""
     parameters = dict(run.module.model.named_parameters())
@@ -171,15 +149,6 @@ def test_a_bad_gradient_of_one_parameter_skips_the_step(run: Run, caplog: pytest
     assert f"step 1 skipped, not finite: rank 0, {good.scene[0]}: gradient" in caplog.text
 
 
-def test_a_norm_that_overflows_drops_the_step(run: Run, caplog: pytest.LogCaptureFixture) -> None:
-    name = trained_names(run)[0]
-    dict(run.module.model.named_parameters())[name].register_hook(lambda gradient: torch.full_like(gradient, 1e30))
-    audit = fit(run, first_batches(run, 1))
-    audit.assert_sound()
-    assert audit.skipped == [True]
-    assert "step 0 skipped, not finite" in caplog.text
-
-
 def test_too_many_in_a_row_stop_the_run_with_their_causes(tmp_path: Path, cache: Path) -> None:
     run = tiny_run(tmp_path, cache, "training.max_skipped=3")
     (good,) = first_batches(run, 1)
@@ -202,8 +171,7 @@ def test_a_dropped_step_counts_for_schedule_and_data(tmp_path: Path, cache: Path
     disturbed = fit(run, [one, spoiled(two, "images", float("nan")), three])
     assert run.trainer.global_step == 3
     undisturbed = fit(tiny_run(tmp_path / "b", cache), [one, two, three])
-    assert disturbed.rates == undisturbed.rates
-    assert len(set(disturbed.rates)) == 3
+    assert (disturbed.rates, len(set(disturbed.rates))) == (undisturbed.rates, 3)
     steps = {int(state["step"]) for state in run.trainer.optimizers[0].state.values()}
     assert steps == {2}
 
@@ -218,8 +186,7 @@ def test_resume_across_dropped_steps_equals_the_uninterrupted_run(tmp_path: Path
     with pytest.raises(InterruptedError):
         train(with_crash(small_config(tmp_path / "cut", cache, *RESUMABLE), step=3))
     resumed = train(small_config(tmp_path / "cut", cache, *RESUMABLE, "ckpt=last"))
-    assert resumed == whole
-    assert whole["skipped_steps"]["total"] == 2
+    assert (resumed, whole["skipped_steps"]["total"]) == (whole, 2)
     assert [fault["step"] for fault in whole["skipped_steps"]["faults"]] == [1, 2]
     assert json.loads((tmp_path / "cut" / "metrics.json").read_text()) == resumed
     first, second = (read_checkpoint(newest_valid(tmp_path / name / "checkpoints")) for name in ("whole", "cut"))
@@ -230,26 +197,3 @@ def test_resume_across_dropped_steps_equals_the_uninterrupted_run(tmp_path: Path
     counts = [row.split(",") for row in next((tmp_path / "whole").glob("logs/*/metrics.csv")).read_text().splitlines()]
     column = counts[0].index("train/skipped_steps")
     assert [row[column] for row in counts[1:] if row[column]] == ["0.0", "1.0", "2.0", "2.0"]
-
-
-def two_processes(folder: Path, cache: Path, *overrides: str) -> subprocess.CompletedProcess[str]:
-    """Trains on two gloo processes; fails if they hang."""
-    small = [o for o in small_overrides(folder, cache) if not o.startswith("data.train_scenes")]
-    command = [sys.executable, "-c", "import vg2gt.cli; vg2gt.cli.main()", "train", *small, *overrides]
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
-    return subprocess.run(command, capture_output=True, text=True, cwd=folder, timeout=600, env=environment)
-
-
-def small_overrides(folder: Path, cache: Path) -> list[str]:
-    poison = [f"+callbacks.poison._target_={Poison.__module__}.Poison", "+callbacks.poison.rank=1"]
-    places = [f"output_dir={folder}", f"hydra.run.dir={folder}", f"data.cache_dir={cache}", "trainer=ddp"]
-    return [*SMALL, *[o for o in RESUMABLE if "poison" not in o], *poison, *places]
-
-
-@pytest.mark.slow
-def test_faults_on_one_rank_stop_both(tmp_path: Path, cache: Path) -> None:
-    many = ["+callbacks.poison.steps=[1,2,3]", "training.max_skipped=3", "trainer.max_steps=9"]
-    ended = two_processes(tmp_path, cache, *many)
-    assert ended.returncode != 0
-    assert "3 steps in a row" in ended.stderr
-    assert "the last: rank 1, room-" in ended.stderr

@@ -50,11 +50,7 @@ class Curve(lightning.Callback):
 
 
 class Steps(lightning.Callback):
-    """Notes weights and gradient of every fourth step.
-
-    Args:
-        given: weights to take these steps at instead.
-    """
+    """Notes weights and gradient of every fourth step."""
 
     def __init__(self, given: Sequence[Tensor] | None = None) -> None:
         self.given = given
@@ -167,11 +163,7 @@ SCENARIOS: dict[str, Callable[[Path, Path], dict[str, Any]]] = {
 
 
 def run_on_two_ranks(folder: Path, cache: Path, *names: str, timeout: float = 900) -> list[CompletedProcess[str]]:
-    """Runs scenarios after one another; their results are ``FOLDER/<name>-<rank>.pt``, errors end a rank.
-
-    Raises:
-        TimeoutExpired: if they hang; nothing is left running.
-    """
+    """Runs scenarios after one another; their results are ``FOLDER/<name>-<rank>.pt``, errors end a rank."""
     address = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free_port()), "NODE_RANK": "0", "WORLD_SIZE": "2"}
     said = [folder / f"said-{rank}.txt" for rank in range(2)]
     ranks = [

@@ -2,12 +2,10 @@
 
 from dataclasses import replace
 
-import hydra
 import pytest
 import torch
 
 from tests.rendering.scenes import IMPLEMENTATIONS, cameras_around, floats_to, images, pinhole, soup, with_gradients
-from vg2gt.config import compose
 from vg2gt.rendering import Renderer, render
 from vg2gt.rendering.options import Mode, RenderOptions
 from vg2gt.rendering.renderer import Implementation
@@ -128,18 +126,6 @@ def test_bad_options_are_refused(options: dict[str, object]) -> None:
         Renderer(**options)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("name", MODES)
-def test_configuration_builds_the_renderer(name: Mode) -> None:
-    renderer = hydra.utils.instantiate(compose(f"renderer/{name}").renderer)
-    assert isinstance(renderer, Renderer)
-    assert renderer.mode == name
-    gaussians, cameras = soup(30), pinhole((12, 15))
-    out = renderer(gaussians, cameras, background=(1.0, 0.0, 0.0))
-    torch.testing.assert_close(out.color, render(gaussians, cameras, name, (1.0, 0.0, 0.0)).color)
-    other = renderer(gaussians, cameras, mode="solid")
-    torch.testing.assert_close(other.depth, render(gaussians, cameras, "solid").depth)
-
-
 def two_scenes() -> tuple[Gaussians, Cameras]:
     """Two scenes of 20 Gaussians in two views each, each with a background of its own."""
     colors = torch.tensor([[1.0, 0.5, 0.0], [0.1, 0.2, 0.9]], dtype=torch.float64)
@@ -149,7 +135,6 @@ def two_scenes() -> tuple[Gaussians, Cameras]:
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
 def test_every_scene_has_its_own_background_unless_one_is_given(implementation: Implementation) -> None:
     gaussians, cameras = two_scenes()
-    assert gaussians.background is not None
     out = render(gaussians, cameras, implementation=implementation)
     for scene, color in enumerate(gaussians.background):
         alone = render(gaussians.scene(scene), cameras.scene(scene), implementation=implementation)
@@ -160,7 +145,7 @@ def test_every_scene_has_its_own_background_unless_one_is_given(implementation: 
 
 
 def test_the_kernels_that_know_one_background_get_each_scenes_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    gpu = pytest.importorskip("vg2gt.kernels.render_gpu", exc_type=ImportError)
+    gpu = pytest.importorskip("vg2gt.rendering.gpu_tiles", exc_type=ImportError)
     gaussians, cameras = two_scenes()
     monkeypatch.setattr("vg2gt.rendering.renderer._resolve", lambda *_: "triton")
 
@@ -174,15 +159,3 @@ def test_the_kernels_that_know_one_background_get_each_scenes_own(monkeypatch: p
     found = render(gaussians, cameras).color
     monkeypatch.undo()
     torch.testing.assert_close(found, render(gaussians, cameras, implementation="dense").color)
-
-
-def test_a_background_of_another_number_of_scenes_is_refused() -> None:
-    gaussians = replace(soup(5), background=torch.zeros(2, 3))
-    with pytest.raises(ValueError, match=r"one colour per scene \[1, 3\], got \[2, 3\]"):
-        render(gaussians, pinhole((4, 4)))
-
-
-def test_half_precision_input_renders_in_float32() -> None:
-    gaussians = floats_to(soup(10), torch.float16)
-    with torch.autocast("cpu", dtype=torch.bfloat16):
-        assert render(gaussians, pinhole((8, 8)).map(torch.Tensor.half)).color.dtype == torch.float32

@@ -88,7 +88,6 @@ def test_slope_floor_bounds_the_gradient_on_a_plateau() -> None:
     for floor in (0.0, 30.0):
         a = alpha.clone().requires_grad_()
         solve(a, peak, precision, RenderOptions(bisections=60, slope_floor=floor)).sum().backward()
-        assert a.grad is not None
         gradients.append(float(a.grad.abs().max()))
     assert gradients[1] < 0.21
     assert gradients[0] > 10 * gradients[1]

@@ -115,16 +115,6 @@ def test_bad_values_are_refused_by_name_though_the_host_looks_at_none(name: str,
 
 
 @runnable
-def test_bad_cameras_and_backgrounds_are_refused_by_name() -> None:
-    gaussians, cameras = soup(5).to(DEVICE), pinhole((4, 4)).to(DEVICE)
-    for name, sign in (("world_to_camera", float("nan")), ("intrinsics", -1.0)):
-        with pytest.raises(ValueError, match=rf"^{name} "):
-            render(gaussians, replace(cameras, **{name: getattr(cameras, name) * sign}), implementation="triton")
-    with pytest.raises(ValueError, match=r"^background holds"):
-        render(gaussians, cameras, background=(0.0, float("nan"), 0.0), implementation="triton")
-
-
-@runnable
 def test_nothing_to_see() -> None:
     for scene in (soup(0), replace(soup(3), means=-soup(3).means)):
         leaves = with_gradients(scene.to(DEVICE))

@@ -1,28 +1,17 @@
 """Checkpoints: atomic, newest valid, no code execution, initialisation from weights."""
 
-import io
 import logging
 import os
-import pickle
-from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from omegaconf import OmegaConf
 from torch import nn
 
+from tests.io.mutations import mutations
 from tests.reliability.crash_harness import assert_equal
-from vg2gt.runs.checkpoints import (
-    initialize_from,
-    newest_valid,
-    read_checkpoint,
-    write_checkpoint,
-)
-from vg2gt.training.checkpointing import AtomicCheckpointIO
+from vg2gt.runs.checkpoints import initialize_from, newest_valid, read_checkpoint, write_checkpoint
 from vg2gt.training.start import prepare_folder
 
 
@@ -43,19 +32,7 @@ def test_failed_write_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr("torch.save", full)
     with pytest.raises(OSError, match=r"earlier checkpoints are intact"):
         write_checkpoint({"global_step": 4}, path)
-    assert read_checkpoint(path)["global_step"] == 3
-    assert len(list(tmp_path.iterdir())) == 1
-
-
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
-@pytest.mark.parametrize("values", [10, 1_000_000])
-def test_full_disk_is_one_error_that_names_the_file(tmp_path: Path, values: int) -> None:
-    write_checkpoint({"global_step": 3}, tmp_path / "step-3.ckpt")
-    (tmp_path / "step-4.ckpt.tmp").symlink_to("/dev/full")
-    with pytest.raises(OSError, match=r"step-4\.ckpt could not be written \(.*No space left.*continue with ckpt=last"):
-        write_checkpoint({"global_step": 4, "w": torch.zeros(values)}, tmp_path / "step-4.ckpt")
-    assert [path.name for path in tmp_path.iterdir()] == ["step-3.ckpt"]
-    assert newest_valid(tmp_path).name == "step-3.ckpt"
+    assert (read_checkpoint(path)["global_step"], len(list(tmp_path.iterdir()))) == (3, 1)
 
 
 def test_file_and_folder_reach_the_disk_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -74,17 +51,6 @@ def test_file_and_folder_reach_the_disk_in_order(tmp_path: Path, monkeypatch: py
     monkeypatch.setattr("os.replace", noted_replace)
     write_checkpoint({"global_step": 3}, tmp_path / "step-3.ckpt")
     assert done == ["step-3.ckpt.tmp", "rename", tmp_path.name]
-
-
-def test_newest_valid_passes_over_damaged_files(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    for step in (9, 10, 100):
-        write_checkpoint({"global_step": step}, tmp_path / f"step-{step}.ckpt")
-    assert newest_valid(tmp_path).name == "step-100.ckpt"
-    content = (tmp_path / "step-100.ckpt").read_bytes()
-    (tmp_path / "step-100.ckpt").write_bytes(content[: len(content) // 2])
-    with caplog.at_level(logging.WARNING):
-        assert newest_valid(tmp_path).name == "step-10.ckpt"
-    assert "step-100.ckpt" in caplog.text
 
 
 def test_no_valid_checkpoint_is_an_error(tmp_path: Path) -> None:
@@ -117,72 +83,27 @@ def test_flipped_bits_in_weights_are_found(tmp_path: Path) -> None:
         read_checkpoint(path)
 
 
-def state(seed: int) -> dict[str, Any]:
-    """What a training saves, small."""
+def test_damaged_checkpoints_are_never_taken(tmp_path: Path) -> None:
+    """Either refused or, where only padding was hit, exactly what was saved."""
     module = nn.Linear(16, 16)
-    generator = torch.Generator().manual_seed(seed)
-    nn.init.normal_(module.weight, generator=generator)
     optimizer = torch.optim.AdamW(module.parameters())
-    module(torch.ones(1, 16)).sum().backward()
-    optimizer.step()
-    return {
-        "state_dict": module.state_dict(),
-        "optimizer_states": [optimizer.state_dict()],
-        "global_step": seed,
-        "loops": {"fit_loop": {"total": {"ready": seed}}},
-        "backend": {"name": "oracle"},
-    }
-
-
-def mutations(content: bytes, other: bytes, count: int, seed: int) -> Iterator[tuple[str, bytes]]:
-    """Damaged versions of a file: ``count`` of every kind."""
-    generator = np.random.default_rng(seed)
-    size = len(content)
-    for _ in range(count):
-        start, end = sorted(int(n) for n in generator.integers(0, size, 2))
-        yield "truncated", content[:start]
-        flipped = bytearray(content)
-        flipped[start] ^= 1 << int(generator.integers(8))
-        yield "one bit", bytes(flipped)
-        for place in generator.integers(0, size, 20):
-            flipped[place] ^= 1 << int(generator.integers(8))
-        yield "21 bits", bytes(flipped)
-        yield "stretch of zeros", content[:start] + bytes(end - start) + content[end:]
-        yield "stretch lost", content[:start] + content[end:]
-        yield "stretch twice", content[:end] + content[start:]
-        yield "stretch of noise", content[:start] + generator.bytes(end - start) + content[end:]
-        yield "begins as another", other[:start] + content[start:]
-        yield "ends as another", content[:start] + other[start:]
-        yield "appended", content + other[start:]
-
-
-def test_damaged_checkpoints_are_never_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Either refused or, where only padding was hit, exactly what was saved; nothing is executed."""
-    monkeypatch.chdir(tmp_path)
-    first, second = state(1), state(2)
-    write_checkpoint(first, tmp_path / "step-1.ckpt")
-    write_checkpoint(second, tmp_path / "step-2.ckpt")
-    malicious = io.BytesIO()
-    torch.save({"state_dict": Malicious(), "padding": torch.zeros(2000)}, malicious)
-    content, tried, refused = (tmp_path / "step-2.ckpt").read_bytes(), Counter(), Counter()
-    others = ((tmp_path / "step-1.ckpt").read_bytes(), malicious.getvalue())
-    for seed, other in enumerate(others):
-        for kind, damaged in mutations(content, other, count=30, seed=seed):
-            if damaged == content:
-                continue
-            (tmp_path / "step-2.ckpt").write_bytes(damaged)
-            taken = newest_valid(tmp_path)
-            tried[kind] += 1
-            refused[kind] += taken.name == "step-1.ckpt"
-            if taken.name == "step-2.ckpt":
-                found = read_checkpoint(taken)
-                # Appended files may be another whole checkpoint, which is as valid as the one before it.
-                whole = [saved for saved in (first, second) if saved["global_step"] == found["global_step"]]
-                assert_equal(whole[0], found, kind)
-    assert not (tmp_path / "executed").exists()
-    print(f"{sum(tried.values())} mutations, {sum(refused.values())} refused: {dict(tried - refused)} were harmless")
-    assert sum(tried.values()) >= 500
-    assert all(refused[kind] > 0.8 * tried[kind] for kind in tried if kind != "appended")
+    for step in (1, 2):
+        module(torch.ones(1, 16)).sum().backward()
+        optimizer.step()
+        saved = {"state_dict": module.state_dict(), "optimizer_states": [optimizer.state_dict()], "global_step": step}
+        write_checkpoint(saved, tmp_path / f"step-{step}.ckpt")
+    path, refused = tmp_path / "step-2.ckpt", 0
+    whole = [read_checkpoint(tmp_path / f"step-{step}.ckpt") for step in (1, 2)]
+    first, content = (tmp_path / "step-1.ckpt").read_bytes(), path.read_bytes()
+    spliced = [first[:place] + content[place:] for place in range(100, len(content), 100)]
+    for damaged in (*mutations(content, 300), *spliced):
+        path.write_bytes(damaged)
+        taken = newest_valid(tmp_path)
+        refused += taken != path
+        if taken == path:
+            found = read_checkpoint(taken)  # which may be the other one, spliced whole
+            assert_equal(whole[found["global_step"] - 1], found, "taken")
+    assert refused > 0.8 * (300 + len(spliced))
 
 
 def test_leftovers_are_cleared(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -197,21 +118,6 @@ def test_leftovers_are_cleared(tmp_path: Path, caplog: pytest.LogCaptureFixture)
     assert sorted(path.name for path in folder.iterdir()) == ["step-1.ckpt", "step-2.ckpt", "step-3.ckpt.damaged"]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["checkpoints", "config.yaml", "notes.tmp"]
     assert "continuing from step-2.ckpt" in caplog.text
-
-
-class Malicious:
-    def __reduce__(self):
-        return (Path.touch, (Path("executed"),))
-
-
-def test_loading_never_executes_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    torch.save({"state_dict": Malicious()}, tmp_path / "step-1.ckpt")
-    (tmp_path / "step-2.ckpt").write_bytes(pickle.dumps(Malicious()))
-    for name in ("step-1.ckpt", "step-2.ckpt"):
-        with pytest.raises(ValueError, match="damaged or not a checkpoint"):
-            AtomicCheckpointIO().load_checkpoint(tmp_path / name, weights_only=False)
-    assert not (tmp_path / "executed").exists()
 
 
 def test_initialize_from_names_the_layers_that_start_anew(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

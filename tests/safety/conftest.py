@@ -7,11 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
-from omegaconf import OmegaConf
 
+from tests.training_helpers import write_run
 from vg2gt.data import SyntheticScenes
-from vg2gt.runs.load import compose_part, load_model
+from vg2gt.runs.load import load_model
 
 SIZE = (24, 32)
 
@@ -52,15 +51,7 @@ def model():
 
 @pytest.fixture(scope="session")
 def harmless_run(model, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("harmless") / "run"
-    (folder / "checkpoints").mkdir(parents=True)
-    parts = {"backend": "oracle", "model": "tiny", "renderer": "solid"}
-    config = {name: compose_part(name, choice) for name, choice in parts.items()}
-    OmegaConf.save(OmegaConf.create(config), folder / "config.yaml")
-    state = {f"model.{key}": value for key, value in model.state_dict().items() if not key.startswith("backend.")}
-    checkpoint = {"state_dict": state, "backend": dict(model.backend.identity()), "global_step": 7}
-    torch.save(checkpoint, folder / "checkpoints" / "step-7.ckpt")
-    return folder
+    return write_run(tmp_path_factory.mktemp("harmless") / "run", model)
 
 
 @pytest.fixture

@@ -2,18 +2,14 @@
 
 import io
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from vg2gt.data import DataError
 from vg2gt.io.arrays import load_npy
-from vg2gt.io.npz import load_npz, read_npz
-from vg2gt.io.tensors import read_tensors
-from vg2gt.runs.checkpoints import read_checkpoint
+from vg2gt.io.npz import load_npz
 
 
 def npy_header(shape: tuple[int, ...], kind: str = "<f4") -> bytes:
@@ -34,45 +30,3 @@ def test_arrays_that_claim_more_than_they_hold(tmp_path: Path, count: int) -> No
         load_npz(tmp_path / "a.npz", "s", ("depth",))
     with pytest.raises(DataError, match=r"cannot read .*a\.npy"):
         load_npy(tmp_path / "a.npy", "s", (2, 2))
-
-
-def test_members_of_an_archive_are_never_written_to_disk(tmp_path: Path) -> None:
-    buffer = io.BytesIO()
-    array = io.BytesIO()
-    np.save(array, np.arange(3.0))
-    with zipfile.ZipFile(buffer, "w") as archive:
-        for name in ("depth.npy", "../escaped.npy", "/tmp/escaped.npy", "..\\escaped.npy"):
-            archive.writestr(name, array.getvalue())
-    (tmp_path / "inner").mkdir()
-    (tmp_path / "inner" / "a.npz").write_bytes(buffer.getvalue())
-    assert read_npz(tmp_path / "inner" / "a.npz", ("depth",))["depth"].tolist() == [0, 1, 2]
-    assert sorted(path.name for path in tmp_path.rglob("*")) == ["a.npz", "inner"]
-
-
-def rezipped(content: bytes, change: Callable[[str, bytes], tuple[str, bytes]], kind: int = 0) -> bytes:
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(io.BytesIO(content)) as old, zipfile.ZipFile(buffer, "w", kind) as new:
-        for member in old.infolist():
-            new.writestr(*change(member.filename, old.read(member)))
-    return buffer.getvalue()
-
-
-ZIPS: dict[str, Callable[[bytes], bytes]] = {
-    "no pickle": lambda content: rezipped(content, lambda n, c: (n.replace("data.pkl", "data.txt"), c)),
-    "short storage": lambda content: rezipped(content, lambda n, c: (n, c[:4] if "data/0" in n else c)),
-    "truncated": lambda content: content[: len(content) // 2],
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", ZIPS)
-def test_zip_files_of_torch(tmp_path: Path, name: str) -> None:
-    buffer = io.BytesIO()
-    torch.save({"w": torch.arange(99.0)}, buffer)
-    for file in ("model.pt", "step-1.ckpt"):
-        (tmp_path / "inner").mkdir(exist_ok=True)
-        (tmp_path / "inner" / file).write_bytes(ZIPS[name](buffer.getvalue()))
-    read = {"model.pt": read_tensors, "step-1.ckpt": read_checkpoint}
-    for file, reader in read.items():
-        with pytest.raises(ValueError, match=file):
-            reader(tmp_path / "inner" / file)
-    assert sorted(path.name for path in tmp_path.rglob("*")) == ["inner", "model.pt", "step-1.ckpt"]

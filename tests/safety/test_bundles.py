@@ -9,15 +9,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
-from backends.bundle import (
-    CONVENTIONS,
-    DECODER,
-    DECODER_WEIGHTS,
-    DESCRIPTION,
-    ENCODER,
-    Description,
-    read_bundle,
-)
+from backends.bundle import CONVENTIONS, DECODER, DECODER_WEIGHTS, DESCRIPTION, ENCODER, Description
 from backends.onnx import OnnxBackend, open_session
 
 onnx = pytest.importorskip("onnx", reason="needs onnx: pip install 'vg2gt[export]'")
@@ -81,43 +73,12 @@ def bundle(tmp_path: Path) -> Path:
     return folder
 
 
-@pytest.mark.filterwarnings("ignore:.*decodes without gradient")
-def test_a_harmless_bundle_is_read(bundle: Path) -> None:
-    assert OnnxBackend(str(bundle)).name == "da3_tiny"
-
-
-def field(number: int, content: bytes) -> bytes:
-    """One field of a protocol buffer."""
-    length, digits = len(content), []
-    while length > 127:
-        digits.append(length & 127 | 128)
-        length >>= 7
-    return bytes([number << 3 | 2, *digits, length]) + content
-
-
-def nested_graphs(depth: int) -> bytes:
-    """A graph in an attribute of a node of a graph in ..."""
-    graph = b""
-    for _ in range(depth):
-        graph = field(1, field(5, field(6, graph)))
-    return field(7, graph)
-
-
-def test_what_is_no_network(bundle: Path) -> None:
-    for content in (b"", b"\x08\x08", b"\x7fELF" + bytes(64), b"ORTM" * 9, bytes(range(256)), nested_graphs(2000)):
-        (bundle / ENCODER).write_bytes(content)
-        with pytest.raises(ValueError, match=r"encoder\.onnx"):
-            OnnxBackend(str(bundle))
-
-
 @pytest.mark.parametrize(
     ("domain", "operator", "attributes"),
     [
         ("com.evil", "Run", {"command": "touch canary"}),
         ("ai.onnx.contrib", "PyOp", {"code": "open('canary', 'w')"}),
-        ("pyop", "PyOp", {"module": "os", "class_name": "system"}),
         ("com.microsoft", "EPContext", {"ep_cache_context": "../engine.bin", "embed_mode": 0}),
-        ("org.pytorch.aten", "ATen", {"operator": "system"}),
         ("", "NoSuchOperator", {}),
     ],
 )
@@ -148,14 +109,9 @@ DESCRIPTIONS: dict[str, Callable[[dict[str, Any]], Any]] = {
     "a target": lambda content: content.update(_target_="os.system"),
     "decoder a target": lambda content: content.update(decoder=CALL),
     "class os.system": lambda content: content["decoder"].update({"class": "os.system"}),
-    "class builtins.eval": lambda content: content["decoder"].update({"class": "builtins.eval"}),
-    "class Popen": lambda content: content["decoder"].update({"class": "subprocess.Popen"}),
     "class a path": lambda content: content["decoder"].update({"class": "../decoder.py:Decoder"}),
-    "class __init__": lambda content: content["decoder"].update({"class": "__init__"}),
     "class a list": lambda content: content["decoder"].update({"class": ["DA3Decoder"]}),
     "arguments a target": lambda content: content["decoder"].update(arguments=CALL),
-    "an argument a target": lambda content: content["decoder"].update(arguments={"features": CALL}),
-    "arguments a list": lambda content: content["decoder"].update(arguments=[CALL]),
 }
 
 
@@ -166,12 +122,3 @@ def test_descriptions(bundle: Path, canary: Path, name: str, monkeypatch: pytest
     describe(bundle, DESCRIPTIONS[name])
     with pytest.raises((ValueError, FileNotFoundError), match=r"bundle"):
         OnnxBackend(str(bundle))
-
-
-@pytest.mark.parametrize(
-    "content", ["[" * 100_000, "{" * 9, "", "\0", '{"format": ' + "1" * 9999 + "}", "!!python/object:os"]
-)
-def test_descriptions_that_are_none(bundle: Path, content: str) -> None:
-    (bundle / DESCRIPTION).write_text(content)
-    with pytest.raises(ValueError, match=r"backend\.json is not"):
-        read_bundle(bundle)

@@ -1,25 +1,15 @@
 """Statistics over seeds, against scipy and by hand."""
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from scipy import stats
 
-from vg2gt.evaluation.tables import columns
-from vg2gt.runs.checkpoints import read_checkpoint, write_checkpoint
 from vg2gt.studies.study import (
-    Estimate,
-    compose_run,
     estimate,
     over_seeds,
     paired_difference,
-    quoted,
-    seeds_table,
-    summarize,
-    write_part,
 )
 
 
@@ -32,22 +22,6 @@ def test_estimate_is_the_textbook_interval() -> None:
     assert found.mean + found.margin == pytest.approx(high)
 
 
-def test_interval_holds_the_truth_as_often_as_it_says() -> None:
-    rng = np.random.default_rng(0)
-    inside = [abs((e := estimate(list(rng.normal(2, 1, 3)))).mean - 2) <= e.margin for _ in range(2000)]
-    assert 0.93 < np.mean(inside) < 0.97
-
-
-def test_one_value_has_no_interval() -> None:
-    assert estimate([2.0]).mean == 2.0
-    assert math.isnan(estimate([2.0]).margin)
-    assert math.isnan(estimate([]).mean)
-    assert estimate([2.0]).shown(1) == "2.0"
-    assert estimate([]).shown(1) == "n/a"
-    assert Estimate(-0.5, 0.25).shown(2, sign=True) == "-0.50 ± 0.25"
-    assert Estimate(0.5, 0.25).shown(2, sign=True) == "+0.50 ± 0.25"
-
-
 def test_differences_are_taken_seed_by_seed() -> None:
     """What seeds share cancels: a small difference shows although the seeds lie far apart."""
     full = {0: {"psnr": 20.0}, 1: {"psnr": 30.0}, 2: {"psnr": 25.0}, 7: {"psnr": 1.0}}
@@ -57,32 +31,3 @@ def test_differences_are_taken_seed_by_seed() -> None:
     assert change.margin < 0.3
     assert over_seeds(variant, "psnr").margin > 10
     assert math.isnan(paired_difference(variant, full, "lpips").mean)
-
-
-def test_summary_has_no_numbers_that_do_not_exist() -> None:
-    results = {"full": {0: {"psnr": 20.0}}, "other": {0: {"psnr": 19.0, "lpips": 0.2}}}
-    summary = summarize(results, "full")
-    assert summary["other"] == {"psnr": {"mean": 19.0, "difference": -1.0}, "lpips": {"mean": 0.2}}
-    assert summary["full"]["psnr"] == {"mean": 20.0, "difference": 0.0}
-
-
-def test_one_row_per_run() -> None:
-    runs = {"full": {0: {"psnr": 20.0}, 1: {"psnr": 30.0}}, "other": {0: {"psnr": 19.0}, 1: {}}}
-    table = seeds_table(runs, columns("psnr", decimals={"psnr": 1}))
-    assert table.splitlines()[1:] == [
-        "| ----- | ----------: |",
-        "| full  | 25.0 ± 63.5 |",
-        "| other |         n/a |",
-    ]
-
-
-def test_a_part_of_a_checkpoint_leaves_the_rest_anew(tmp_path: Path) -> None:
-    start = tmp_path / "start.ckpt"
-    write_checkpoint({"state_dict": {"a.x": torch.ones(2), "b.x": torch.zeros(1)}, "global_step": 5}, start)
-    part = read_checkpoint(write_part(start, tmp_path / "part.ckpt", lambda name: name.startswith("a.")))
-    assert {name: tensor.tolist() for name, tensor in part["state_dict"].items()} == {"a.x": [1.0, 1.0]}
-
-
-def test_paths_survive_the_override_grammar(tmp_path: Path) -> None:
-    folder = tmp_path / "it's a, {run}=[1] \\ of $two"
-    assert compose_run([f"name={quoted(folder)}"], folder).output_dir == str(folder)

@@ -38,15 +38,6 @@ def test_only_matrices_decay_and_frozen_parameters_are_left_out() -> None:
     assert rest["weight_decay"] == 0.0
 
 
-def test_no_group_is_empty() -> None:
-    """Torch takes no empty group beside named ones; ``training.part=coarse`` leaves the others nothing."""
-    module = nn.ModuleDict({"coarse": nn.Linear(3, 4, bias=False), "fine": nn.Linear(4, 2)})
-    module["fine"].requires_grad_(False)
-    (group,) = parameter_groups(module, {"coarse": 3.0})
-    assert [name for name, _ in group["params"]] == ["coarse.weight"]
-    assert group["lr_factor"] == 3.0
-
-
 def test_a_child_with_a_rate_of_its_own_stands_behind_the_others() -> None:
     module = nn.ModuleDict({"coarse": nn.Linear(3, 4), "fine": nn.Linear(4, 2)})
     groups = parameter_groups(module, {"coarse": 3.0, "absent": 2.0})

@@ -43,7 +43,5 @@ def test_the_backbone_runs_once_for_a_set_of_views(tmp_path: Path, context: int 
     torch.manual_seed(0)
     (plain, every), (cached, once) = (losses_and_runs(run, context) for run in runs)
     assert min(every) > 0
-    assert once[:SCENES] == every[:SCENES]
-    assert once[SCENES:] == [0] * (STEPS - SCENES)
-    assert cached == plain
-    assert sorted(cached[:SCENES]) == sorted(cached[SCENES:])
+    assert (once[:SCENES], once[SCENES:]) == (every[:SCENES], [0] * (STEPS - SCENES))
+    assert (cached, sorted(cached[:SCENES])) == (plain, sorted(cached[SCENES:]))

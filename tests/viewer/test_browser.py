@@ -2,8 +2,6 @@
 
 import math
 from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +9,8 @@ import pytest
 import torch
 
 from benchmarks.viewer_scene import voxel_room
-from tests.io.gaussian_scenes import scene, views
 from tests.viewer.chromium import Page, chromium
 from tests.viewer.test_page import HOSTILE, pictured_scene
-from vg2gt.geometry.spherical_harmonics import rgb_to_sh
 from vg2gt.io import named_cameras
 from vg2gt.rendering import render
 from vg2gt.types import Cameras, Gaussians
@@ -58,9 +54,7 @@ def compare(page: Page, path: Path, gaussians: Gaussians, cameras: Cameras) -> l
 
 
 @pytest.mark.parametrize(("size", "voxel_size"), [((240, 320), 0.05), ((480, 640), 0.02)])
-def test_screenshot_is_our_rasterized_image_of_a_room(
-    page: Page, tmp_path: Path, size: tuple[int, int], voxel_size: float
-) -> None:
+def test_screenshot_is_our_rasterized_image_of_a_room(page, tmp_path, size, voxel_size):
     gaussians, cameras, _ = voxel_room(size=size, voxel_size=voxel_size)
     assert len(gaussians) > 20_000
     path = tmp_path / f"room-{len(gaussians)}.html"
@@ -69,47 +63,6 @@ def test_screenshot_is_our_rasterized_image_of_a_room(
     megabytes = path.stat().st_size / 1e6
     print(f"{len(gaussians)} Gaussians, {megabytes:.2f} MB, loaded in {seconds:.2f} s, PSNR {figures}")
     assert min(figures) > CLOSE
-
-
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_screenshot_of_gaussians_of_all_shapes_and_colours(page: Page, tmp_path: Path, degree: int) -> None:
-    figures = compare(page, tmp_path / "scene.html", scene(300, degree), views((120, 168)))
-    assert min(figures) > CLOSE
-
-
-def test_equal_depths_keep_the_order_of_the_renderer(page: Page, tmp_path: Path) -> None:
-    before = scene(200)
-    flat = replace(before, means=before.means * torch.tensor([1.0, 1, 0]) + torch.tensor([0.0, 0, 3]))
-    assert min(compare(page, tmp_path / "flat.html", flat, views((120, 168)).select(slice(0, 1)))) > CLOSE
-
-
-def test_light_shines_through_the_alpha_cap(page: Page, tmp_path: Path) -> None:
-    """A dark opaque Gaussian before a translucent one forty times as bright as white."""
-    pair = replace(
-        scene(2),
-        means=torch.tensor([[0.0, 0, 2], [0, 0, 4]]),
-        scales=torch.tensor([[9.0, 9, 0.01], [9, 9, 0.01]]),
-        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(2, 1),
-        opacities=torch.tensor([1.0, 0.5]),
-        sh=rgb_to_sh(torch.tensor([[[0.0] * 3], [[40.0] * 3]])),
-    )
-    cameras = views((120, 168)).select(slice(0, 1))
-    truth = render(pair, cameras, "rasterized", geometry=False).color
-    assert 0.15 < truth[0, 0, :, 60, 84].mean() < 0.25
-    assert min(compare(page, tmp_path / "pair.html", pair, cameras)) > CLOSE
-
-
-def test_cameras_from_script_and_address(page: Page, tmp_path: Path) -> None:
-    gaussians, cameras = scene(300), views((120, 168))
-    records = named_cameras(cameras, ["a", "b", "c"])
-    truth = render(gaussians, cameras, "rasterized", geometry=False).color[0]
-    show(page, tmp_path / "page.html", ViewerScene(gaussians, records), cameras.size, "#camera=2&ui=off")
-    assert psnr(page.screenshot(), truth[2]) > CLOSE
-    rows = records[1].world_to_camera.tolist(), records[1].intrinsics.tolist()
-    record = f"{{width: 168, height: 120, world_to_camera: {rows[0]}, intrinsics: {rows[1]}}}"
-    page.run(f"vg2gtViewer.setCamera({record}).then(() => null)")
-    assert psnr(page.screenshot(), truth[1]) > CLOSE
-    assert psnr(page.screenshot(), truth[2]) < 30
 
 
 def test_controls_move_the_view_and_reset_brings_it_back(page: Page, tmp_path: Path) -> None:
@@ -144,29 +97,6 @@ def test_controls_move_the_view_and_reset_brings_it_back(page: Page, tmp_path: P
         assert (page.screenshot() == before).all(), name
 
 
-def test_cameras_and_images_can_be_shown(page: Page, tmp_path: Path) -> None:
-    shown_scene = pictured_scene()
-    show(page, tmp_path / "page.html", shown_scene, (400, 700), "")
-    pose = np.eye(4)
-    pose[2, 3] = 2.0  # from behind the cameras
-    intrinsics = shown_scene.cameras[0].intrinsics.tolist()
-    record = f"{{width: 56, height: 40, world_to_camera: {pose.tolist()}, intrinsics: {intrinsics}}}"
-    page.run(f"vg2gtViewer.setCamera({record}).then(() => null)")
-    before = page.screenshot()
-    shown = []
-    for box in ("show-cameras", "show-images"):
-        page.run(f"document.getElementById('{box}').click()")
-        page.run("new Promise((resolve) => setTimeout(resolve, 700))")
-        shown.append(page.screenshot())
-    assert count(shown[0], [255, 184, 51]) > 20
-    assert count(shown[1], [90, 90, 90]) > count(before, [90, 90, 90]) + 20
-
-
-def count(image: np.ndarray, color: list[int]) -> int:
-    """Pixels of a colour right of the controls."""
-    return int((np.abs(image[:, 310:].astype(int) - color).max(-1) < 4).sum())
-
-
 def test_page_fetches_nothing_and_hostile_names_do_nothing(page: Page, tmp_path: Path) -> None:
     show(page, tmp_path / "page.html", pictured_scene(HOSTILE), (400, 700), "")
     assert [address for address in page.requests if address.startswith("blob:")]  # the sorting worker is let in
@@ -180,48 +110,3 @@ def test_page_fetches_nothing_and_hostile_names_do_nothing(page: Page, tmp_path:
     )
     assert page.run("fetch('data:,x').then(() => 'fetched', () => 'refused')") == "refused"
     assert page.run("window.hole") is None
-
-
-@contextmanager
-def lacking(page: Page, script: str) -> Iterator[None]:
-    """Runs a script before every page's own."""
-    number = page.call("Page.addScriptToEvaluateOnNewDocument", source=script)["identifier"]
-    yield
-    page.call("Page.removeScriptToEvaluateOnNewDocument", identifier=number)
-
-
-@pytest.mark.parametrize(
-    ("script", "least"),
-    [
-        ("window.Worker = undefined", CLOSE),
-        ("WebGL2RenderingContext.prototype.getExtension = () => null", 40.0),  # rounds to 8 bits at every splat
-    ],
-)
-def test_browsers_that_lack_something(page: Page, tmp_path: Path, script: str, least: float) -> None:
-    with lacking(page, script):
-        assert min(compare(page, tmp_path / "page.html", scene(300), views((120, 168)))) > least
-
-
-def test_browser_without_webgl_says_so(page: Page, tmp_path: Path) -> None:
-    path = write_viewer_html(tmp_path / "page.html", pictured_scene())
-    with lacking(page, "HTMLCanvasElement.prototype.getContext = () => null"):
-        page.open(path.as_uri(), 400, 300)
-        page.run("vg2gtViewer.ready.catch(() => null)")
-        assert "no WebGL 2" in page.run("document.getElementById('status').textContent")
-
-
-def test_narrow_screen(page: Page, tmp_path: Path) -> None:
-    address = write_viewer_html(tmp_path / "page.html", pictured_scene("a-very-" + "long-" * 30 + "name")).as_uri()
-    page.open(address, 360, 640, mobile=True)
-    page.run("vg2gtViewer.ready.then(() => null)")
-    assert page.run("document.documentElement.scrollWidth") <= 360
-    places = page.run(
-        "[...document.querySelectorAll('#panel button, #panel select, #panel label, #panel summary')]"
-        ".map((e) => e.getBoundingClientRect()).map((r) => [r.left, r.right, r.width, r.height])"
-    )
-    assert all(left >= 0 and right <= 360 and width > 0 and height >= 16 for left, right, width, height in places)
-    unnamed = page.run(
-        "[...document.querySelectorAll('button, select, input, canvas')].filter((e) => "
-        "!(e.getAttribute('aria-label') || e.textContent.trim() || e.closest('label')?.textContent.trim())).length"
-    )
-    assert unnamed == 0

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.commands import run_vg2gt
 from tests.io.gaussian_scenes import scene, views
 from vg2gt.cli import view
 from vg2gt.io import named_cameras, write_cameras_json, write_gaussian_ply, write_splat
@@ -50,12 +49,6 @@ def test_images_in_the_folder_that_reconstruct_writes(files: Path, capsys: pytes
     assert (files / "page.html").read_text().count('"picture": "') == 2
     run(files / "scene.ply", "--cameras", files / "cameras.json", "--images", files, *page)
     assert "0 of 3 cameras have their image" in capsys.readouterr().out
-
-
-def test_script_starts_it(files: Path) -> None:
-    done = run_vg2gt("view", "scene.ply", "--html", "page.html", "--title", "mine", folder=files)
-    assert done.returncode == 0, done.stderr
-    assert "<title>mine</title>" in (files / "page.html").read_text()
 
 
 def test_mistakes_end_with_one_line(files: Path, capsys: pytest.CaptureFixture) -> None:

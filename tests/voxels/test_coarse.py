@@ -3,7 +3,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from vg2gt.method import coarse, grid
 from vg2gt.method.coarse import PatchPoints
 from vg2gt.types import Cameras
 
@@ -30,17 +29,6 @@ def test_injection_changes_the_chosen_taps_and_never_the_camera(make_coarse, mak
         out = perturb(make_coarse(inject=inject))(tokens, geometry)
         assert [not torch.equal(a, b) for a, b in zip(out.patch, tokens.patch, strict=True)] == changed
         assert out.camera is tokens.camera
-
-
-@pytest.mark.parametrize("inject", ["all", "last"])
-def test_taps_may_differ_in_width(inject, make_coarse, make_room):
-    tokens, geometry, _ = make_room()
-    narrow = tokens.patch[0][..., :5]
-    tokens = tokens.with_patch((narrow, *tokens.patch[1:]))
-    out = perturb(make_coarse(token_dims=[tap.shape[-1] for tap in tokens.patch], inject=inject))(tokens, geometry)
-    assert [tap.shape for tap in out.patch] == [tap.shape for tap in tokens.patch]
-    assert torch.equal(out.patch[0], narrow) == (inject == "last")
-    assert not torch.equal(out.patch[-1], tokens.patch[-1])
 
 
 def test_last_layer_learns_at_step_one_and_ptv3_from_step_two(make_coarse, make_room):
@@ -125,33 +113,6 @@ def test_scaling_scene_and_voxel_by_a_power_of_two_changes_nothing(make_coarse, 
         assert torch.equal(a, b)
 
 
-def test_autocast_rounds_the_networks_and_nothing_else(make_coarse, make_room, monkeypatch):
-    """The same voxels, points and weights to the bit; changes within bfloat16's rounding; tokens of their own type."""
-    tokens, geometry, _ = make_room()
-    module = perturb(make_coarse(gate=True)).eval()
-    seen = []
-    for name in ("plan_voxels", "interpolation_weights", "gate"):
-        original = getattr(coarse, name)
-
-        def noted(*args, original=original, **kwargs):
-            seen.append(original(*args, **kwargs))
-            return seen[-1]
-
-        monkeypatch.setattr(coarse, name, noted)
-    plain = module(tokens, geometry)
-    with torch.autocast("cpu", torch.bfloat16):
-        cast = module(tokens, geometry)
-    plan, (index, weights), gain, again, (found, others), scale = seen
-    assert torch.equal(plan.grid, again.grid)
-    assert torch.equal(plan.order, again.order)
-    assert torch.equal(index, found)
-    assert torch.equal(weights, others)
-    assert torch.equal(gain, scale)
-    for before, exact, rounded in zip(tokens.patch, plain.patch, cast.patch, strict=True):
-        assert rounded.dtype == before.dtype
-        assert 0 < (rounded - exact).norm() < 0.03 * (exact - before).norm()
-
-
 def test_scenes_do_not_influence_each_other(make_coarse, make_room):
     tokens, geometry, _ = make_room(scenes=2)
     module = perturb(make_coarse()).eval()
@@ -168,30 +129,3 @@ def test_scenes_do_not_influence_each_other(make_coarse, make_room):
         out = module(tokens.map(lambda t, rows=rows: t[rows]), alone)
         for a, b in zip(out.patch, both.patch, strict=True):
             torch.testing.assert_close(a, b[rows], atol=1e-5, rtol=1e-5)
-
-
-def test_footprint_guard_enlarges_voxels(make_coarse, make_room):
-    tokens, geometry, _ = make_room()
-    small, guarded = perturb(make_coarse(voxel_size=1e-4)), perturb(make_coarse(voxel_size=1e-4, min_footprint=7))
-    assert not torch.equal(small(tokens, geometry).patch[-1], guarded(tokens, geometry).patch[-1])
-
-
-def test_bad_options_are_refused(make_coarse):
-    with pytest.raises(ValueError, match=r"coarse\.inject"):
-        make_coarse(inject="first")
-    with pytest.raises(ValueError, match="does not divide"):
-        make_coarse(upsample=3)
-    with pytest.raises(ValueError, match=r"coarse\.fuse_kernel"):
-        make_coarse(fuse_kernel=2)
-
-
-@pytest.mark.parametrize(("views", "voxel_size", "warned"), [(3, 1e-3, True), (1, 1e-3, False), (3, 0.5, False)])
-def test_sparse_voxels_are_named_once(views, voxel_size, warned, make_coarse, make_room, monkeypatch, caplog):
-    monkeypatch.setattr(grid, "_warned_of_sparse", set())
-    tokens, geometry, _ = make_room(scenes=2, views=views)
-    module = make_coarse(voxel_size=voxel_size)
-    for _ in range(2):
-        module(tokens, geometry)
-    messages = [record.getMessage() for record in caplog.records]
-    assert len(messages) == warned
-    assert all("1.00 points each" in m and "model.coarse.min_footprint" in m for m in messages)

@@ -5,7 +5,6 @@ import torch
 
 from vg2gt.method import grid
 from vg2gt.method.grid import (
-    in_range,
     mixed_radix_keys,
     plan_voxels,
     point_cells,
@@ -104,43 +103,11 @@ def test_shifting_by_whole_voxels_shifts_the_grid_only():
     assert torch.equal(pool_mean(values, weights, plan), pool_mean(values, weights, moved))
 
 
-def test_duplicating_all_points():
-    points, batch, values, weights = cloud()
-    twice = [torch.cat((x, x)) for x in (points, batch, values, weights)]
-    plan, double = planned(points, batch), planned(*twice[:2])
-    assert torch.equal(plan.grid, double.grid)
-    assert torch.equal(2 * plan.counts, double.counts)
-    assert torch.equal(pool_min(weights, plan), pool_min(twice[3], double))
-    torch.testing.assert_close(
-        pool_mean(values, weights, plan), pool_mean(twice[2], twice[3], double), atol=1e-12, rtol=0
-    )
-
-
-def test_far_cells_do_not_alias():
-    # 16-bit packed keys put all of these into one voxel
-    cells = torch.tensor([[0, 0, 0], [65536, 0, 0], [0, 65536, 0], [-65536, 0, 0], [0, 0, -65536]])
-    batch = torch.zeros(5, dtype=torch.int64)
-    assert mixed_radix_keys(cells, batch)[0].unique().numel() == 5
-
-
-def test_two_hundred_metres_at_two_millimetres():
-    points = torch.tensor([[-200.0, -200, -200], [200, 200, 200], [0.001, 0.001, 0.001]])
-    batch = torch.zeros(3, dtype=torch.int64)
-    plan = planned(points, batch, size=torch.tensor([0.002]))
-    assert len(plan) == 3
-    assert plan.grid.abs().max() <= 100_001
-
-
 def test_cells_too_far_apart_are_refused_by_name():
     far = torch.tensor([[0, 0, 0], [1 << 21, 1 << 21, 1 << 21]])
     batch = torch.tensor([0, 1])
     with pytest.raises(ValueError, match="raise the voxel size"):
         mixed_radix_keys(far, batch)
-
-
-def test_non_finite_and_distant_points_are_out_of_range():
-    cells = torch.tensor([[0.0, 1, 2], [math.nan, 0, 0], [0, math.inf, 0], [0, 0, -2.7e5], [2.6e5, 0, 0]])
-    assert in_range(cells).tolist() == [True, False, False, False, True]
 
 
 def test_points_on_faces_fall_by_division():
@@ -149,29 +116,6 @@ def test_points_on_faces_fall_by_division():
     points = torch.stack((count * float(size), count * 0, count * 0), 1)
     cells = point_cells(points, torch.zeros(100, dtype=torch.int64), size)
     assert torch.equal(torch.floor(cells[:, 0]), count)
-
-
-def test_select_keeps_some_voxels():
-    points, batch, values, weights = cloud()
-    plan = planned(points, batch)
-    keep = torch.arange(len(plan)) % 3 != 0
-    part = plan.select(keep)
-    assert torch.equal(part.grid, plan.grid[keep])
-    assert torch.equal(pool_mean(values, weights, part), pool_mean(values, weights, plan)[keep])
-    kept_points = (plan.voxel_of >= 0) & keep[plan.voxel_of]
-    assert torch.equal(part.voxel_of >= 0, kept_points)
-    assert torch.equal(part.grid[part.voxel_of[kept_points]], plan.grid[plan.voxel_of[kept_points]])
-
-
-def test_no_valid_point_gives_no_voxel():
-    points, batch, values, weights = cloud(20)
-    plan = planned(points, batch, torch.zeros(20, dtype=torch.bool))
-    values.requires_grad_()
-    mean = pool_mean(values, weights, plan)
-    assert mean.shape == (0, 5)
-    mean.sum().backward()
-    assert values.grad is not None
-    assert pool_min(weights, plan).shape == (0,)
 
 
 def test_voxel_size_guard():

@@ -49,16 +49,6 @@ def test_layers_of_several_views_make_one_surface(normal: tuple[float, ...]) -> 
     assert around < 0.35 * own, (own, around)
 
 
-def test_a_cell_alone_keeps_its_own_normal() -> None:
-    truth = torch.tensor([0.2, 0.4, 1.0])
-    points = layers(truth, apart=0.0)
-    cells = points.floor().long()
-    parts = moments_of(points[(cells % 3 == 0).all(1)])  # no two of these cells touch
-    own, around = surface_normals(*parts, 1), surface_normals(*parts, 3)
-    torch.testing.assert_close(around, own, atol=1e-3, rtol=0)
-    assert float(error(own, truth).median()) < 1
-
-
 def test_a_step_of_the_floor_stays_a_step(monkeypatch: pytest.MonkeyPatch) -> None:
     """It is 1.5 cells high; a plane through all points beside it leans."""
     points = layers(FLOOR, apart=0.0)
@@ -70,20 +60,6 @@ def test_a_step_of_the_floor_stays_a_step(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(normals, "SAME_SURFACE", 100.0)
     leaning = error(surface_normals(*parts, 3), FLOOR)[beside].mean()
     assert wrong < 12 < 0.5 * leaning, (wrong, leaning)
-
-
-def test_scenes_are_apart() -> None:
-    first, second = (layers(torch.tensor(n), 0.3, seed) for seed, n in enumerate([(0.3, 0.1, 1.0), (-0.5, 0.4, 1.0)]))
-    batch = torch.arange(2).repeat_interleave(len(first))
-    both = surface_normals(*moments_of(torch.cat((first, second)), batch), 3)
-    alone = [surface_normals(*moments_of(points), 3) for points in (first, second)]
-    torch.testing.assert_close(both, torch.cat(alone))
-
-
-def test_nothing_and_one_point() -> None:
-    assert surface_normals(*moments_of(torch.zeros(0, 3)), 3).shape == (0, 3)
-    spread, facing, offset, plan = moments_of(torch.tensor([[5.2, 3.1, 0.4]]))
-    torch.testing.assert_close(surface_normals(spread, facing, offset, plan, 3), facing)
 
 
 def two_scenes() -> tuple[Tensor, Tensor, Tensor, VoxelPlan]:
@@ -127,22 +103,6 @@ def test_without_a_single_least_direction_the_normal_faces_the_cameras(values: t
     found = normals.facing_compiled(spread, facing, normals.FACING_PRIOR)
     torch.testing.assert_close(found, normals.facing_reference(spread.double(), facing.double()).float())
     torch.testing.assert_close(found, facing)
-
-
-def test_threads_do_not_change_a_bit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vg2gt.kernels.threads.VOXELS_AT_ONCE", 100)
-    parts, threads = two_scenes(), torch.get_num_threads()
-    assert len(parts[-1]) > 500
-    try:
-        results = []
-        for number in (1, 2, 3):
-            torch.set_num_threads(number)
-            results.append(surface_normals(*parts, 3))
-    finally:
-        torch.set_num_threads(threads)
-    assert all(torch.equal(results[0], other) for other in results[1:])
-    monkeypatch.setattr("vg2gt.kernels.threads.VOXELS_AT_ONCE", 1000)
-    torch.testing.assert_close(surface_normals(*parts, 3), results[0])
 
 
 @pytest.mark.parametrize("kernel", [1, 3])

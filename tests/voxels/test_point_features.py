@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from vg2gt.method.grid import VoxelPlan, plan_voxels, pool_mean
-from vg2gt.method.point_features import point_features, pool_point_features, pool_point_features_of_chunks
+from vg2gt.method.point_features import point_features, pool_point_features
 
 CHANNELS = 20  # no multiple of a vector's length
 
@@ -57,16 +57,6 @@ def test_values_and_gradients_are_the_plain_ones(scale: float) -> None:
         assert float((found - wanted).abs().max()) < 2e-6 * float(wanted.abs().max().clamp(min=1))
 
 
-def test_it_is_as_exact_as_plain_torch() -> None:
-    inputs, plan = points()
-    exact = in_float64(inputs, plan)
-    errors = [
-        [float((found - wanted).abs().max()) for found, wanted in zip(results, exact, strict=True)]
-        for results in (with_gradients(inputs, plan, plain) for plain in (False, True))
-    ]
-    assert all(compiled <= 4 * plain + 1e-7 for compiled, plain in zip(*errors, strict=True)), errors
-
-
 def test_threads_do_not_change_a_bit() -> None:
     inputs, plan = points()
     threads = torch.get_num_threads()
@@ -113,24 +103,3 @@ def test_dropped_voxels_are_left_out() -> None:
     compiled = with_gradients(inputs, plan.select(keep), plain=False)
     plain = with_gradients(inputs, plan.select(keep), plain=True)
     torch.testing.assert_close(compiled, plain, atol=2e-5, rtol=1e-5)
-
-
-def test_chunks_give_the_whole() -> None:
-    inputs, plan = points()
-    dense, offset, weight, confidence = inputs
-    torch.testing.assert_close(
-        pool_point_features_of_chunks(dense.split(700), offset, weight, confidence, plan),
-        pool_point_features(dense, offset, weight, confidence, plan),
-        atol=2e-6,
-        rtol=1e-5,
-    )
-
-
-def test_without_a_voxel_the_graph_stays() -> None:
-    inputs, plan = points(10)
-    nothing = plan.select(torch.zeros(len(plan), dtype=torch.bool))
-    dense, offset, weight, confidence = leaves = [tensor.clone().requires_grad_() for tensor in inputs]
-    pooled = pool_point_features(dense, offset, weight, confidence, nothing)
-    assert pooled.shape == (0, CHANNELS)
-    pooled.sum().backward()
-    assert all(leaf.grad is not None and not leaf.grad.any() for leaf in leaves)

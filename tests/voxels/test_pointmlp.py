@@ -43,37 +43,6 @@ def test_a_batch_equals_separate_runs(random_voxels):
         torch.testing.assert_close(together[rows], alone, atol=1e-12, rtol=0)
 
 
-def test_a_voxel_reaches_others_of_its_window(random_voxels):
-    grid, batch = random_voxels((64,))
-    features, net = features_of(grid), network(stages=1)
-    changed = features.clone()
-    changed[10] += 3
-    moved = (net(changed, grid, batch, SIZE) - net(features, grid, batch, SIZE)).abs().amax(1) > 1e-4
-    assert moved.sum() >= 4
-
-
-def test_stages_use_other_neighbourhoods(random_voxels):
-    grid, batch = random_voxels((64,))
-    net = network()
-    windows = net._windows(grid - grid.amin(0), batch, SIZE)
-    neighbours = [
-        {frozenset(row) for group in stage.groups for row in group.rows.sort(1).values.tolist()} for stage in windows
-    ]
-    assert len(set(map(frozenset, neighbours))) == 4
-
-
-@pytest.mark.parametrize("count", [0, 1, 2, 7, 8, 9])
-def test_few_voxels_have_finite_gradients(count):
-    grid = torch.arange(3 * count).view(count, 3)
-    batch = torch.zeros(count, dtype=torch.int64)
-    net = network()
-    features = features_of(grid).requires_grad_()
-    net(features, grid, batch, SIZE).square().sum().backward()
-    assert features.grad is not None
-    assert torch.isfinite(features.grad).all()
-    assert all(torch.isfinite(p.grad).all() for p in net.parameters() if p.grad is not None)
-
-
 def test_checkpointing_changes_no_gradient(random_voxels):
     grid, batch = random_voxels()
     features = features_of(grid)
@@ -83,7 +52,6 @@ def test_checkpointing_changes_no_gradient(random_voxels):
         net(features, grid, batch, SIZE).square().sum().backward()
         grads.append([p.grad for p in net.parameters()])
     for a, b in zip(*grads, strict=True):
-        assert a is not None
         torch.testing.assert_close(a, b)
 
 
@@ -120,10 +88,7 @@ def test_a_stage_is_what_the_paper_says(counts, few_sizes):
     positions = torch.randint(0, 1000, (len(batch), 3)).double()
     order = torch.arange(len(batch))
     windows, plain = (make_windows(order, counts, 8, shift=4, few_sizes=few) for few in (few_sizes, False))
-    outputs = [
-        stage(features, positions, windows),
-        stage_as_written(stage, features, positions, plain, batch),
-    ]
+    outputs = [stage(features, positions, windows), stage_as_written(stage, features, positions, plain, batch)]
     torch.testing.assert_close(*outputs)
     inputs = [features, *stage.parameters()]
     gradients = [torch.autograd.grad(out.sin().sum(), inputs) for out in outputs]

@@ -37,26 +37,6 @@ def test_a_batch_equals_separate_runs(random_voxels, make_ptv3):
         torch.testing.assert_close(together[rows], alone, atol=1e-10, rtol=0)
 
 
-@pytest.mark.parametrize("count", [1, 15, 16, 17])
-def test_few_voxels_have_finite_gradients(count, make_ptv3):
-    grid = torch.arange(3 * count).view(count, 3)
-    features = features_of(grid).requires_grad_()
-    net = make_ptv3().double()
-    out = net(features, grid, torch.zeros(count, dtype=torch.int64), SIZE)
-    assert out.shape == (count, net.out_channels)
-    out.square().sum().backward()
-    assert all(p.grad is not None and torch.isfinite(p.grad).all() for p in net.parameters())
-
-
-def test_a_voxel_reaches_others_of_its_window(random_voxels, make_ptv3):
-    grid, batch = random_voxels((100,))
-    features, net = features_of(grid), make_ptv3().double().eval()
-    changed = features.clone()
-    changed[10] += 3
-    moved = (net(changed, grid, batch, SIZE) - net(features, grid, batch, SIZE)).abs().amax(1) > 1e-6
-    assert moved.sum() > 16
-
-
 def test_orders_are_shuffled_in_training_only_and_from_the_generator(random_voxels, make_ptv3):
     grid, batch = random_voxels()
     features, net = features_of(grid), make_ptv3().double()
@@ -138,18 +118,3 @@ def test_state_dict_has_the_official_names():
     assert expected.items() <= names.items()
     assert "enc.enc0.down.proj.weight" not in names
     assert net.out_channels == 1024
-
-
-@pytest.mark.parametrize("norm", ["layer", "group", "batch"])
-def test_norms(norm, random_voxels, make_ptv3):
-    grid, batch = random_voxels()
-    widths = {"enc_channels": (64, 64, 64), "dec_channels": (64, 64), "enc_heads": (2, 2, 2), "dec_heads": (2, 2)}
-    net = make_ptv3(norm=norm, **widths).double()
-    assert torch.isfinite(net(features_of(grid), grid, batch, SIZE)).all()
-    with pytest.raises(ValueError, match=r"ptv3\.norm"):
-        make_ptv3(norm="instance")
-
-
-def test_widths_that_do_not_match_are_refused():
-    with pytest.raises(ValueError, match="one fewer in the decoder"):
-        PTv3(8, enc_channels=(16, 32))

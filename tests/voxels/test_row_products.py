@@ -4,7 +4,6 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from vg2gt.kernels import row_products
 from vg2gt.kernels.row_products import linear_rows
 
 
@@ -19,32 +18,10 @@ def test_rows_go_through_the_same_layer(shape: tuple[int, ...], with_bias: bool,
         x, weight, bias = (value.to(dtype).requires_grad_() for value in values)
         out = layer(x, weight, bias if with_bias else None)
         out = F.relu(out) if relu and layer is F.linear else out
-        assert out.shape == (*shape[:-1], 5)
-        assert out.dtype == dtype
+        assert (out.shape, out.dtype) == ((*shape[:-1], 5), dtype)
         inputs = [x, weight, bias][: 2 + with_bias]
         results.append([out.detach(), *torch.autograd.grad(out.square().sum(), inputs)])
     for found, exact in zip(*results, strict=True):
         torch.testing.assert_close(
             found.double(), exact, rtol=1e-5, atol=1e-5 * max(float(exact.abs().sum()), 1) ** 0.5
         )
-
-
-def test_rows_need_not_be_contiguous() -> None:
-    x, weight = torch.randn(7, 2048).t(), torch.randn(5, 7)
-    torch.testing.assert_close(linear_rows(x, weight), F.linear(x, weight))
-
-
-@pytest.mark.skipif(not row_products.has_onednn(torch.device("cpu")), reason="this processor's torch has no oneDNN")
-def test_only_many_rows_in_float32_are_convolved(monkeypatch: pytest.MonkeyPatch) -> None:
-    convolved = []
-    conv2d = F.conv2d
-    monkeypatch.setattr(F, "conv2d", lambda x, *others: convolved.append(x) or conv2d(x, *others))
-    weight = torch.randn(5, 7)
-    for rows, dtype in ((960, torch.float32), (1025, torch.float32), (1088, torch.float32), (1024, torch.float64)):
-        linear_rows(torch.randn(rows, 7, dtype=dtype), weight.to(dtype))
-    assert not convolved
-    x = torch.randn(1024, 7)
-    linear_rows(x, weight)
-    (images,) = convolved
-    assert images.data_ptr() == x.data_ptr()  # nothing was moved
-    assert images.is_contiguous(memory_format=torch.channels_last)

@@ -6,7 +6,6 @@ from vg2gt.method.serialization import (
     ORDERS,
     WindowGroup,
     make_windows,
-    relative_grid,
     serial_codes,
     serial_keys,
 )
@@ -34,13 +33,6 @@ def test_compiled_hilbert_codes_are_those_of_the_reference(bits):
     assert torch.equal(hilbert_codes(transposed, bits), hilbert_reference(transposed, bits))
 
 
-@pytest.mark.parametrize("order", ORDERS)
-def test_codes_are_bijections(order):
-    codes = serial_codes(cube(4), 4, order)
-    assert codes.unique().numel() == 16**3
-    assert codes.min() == 0
-
-
 def test_dropping_three_bits_gives_the_parent():
     cells = cube(4)
     assert torch.equal(z_codes(cells) >> 3, z_codes(cells >> 1))
@@ -55,31 +47,6 @@ def test_z_order_interleaves_bits():
     cells = torch.tensor([[1, 0, 0], [0, 1, 0], [0, 0, 1], [2, 0, 0], [(1 << 21) - 1, 0, 0]])
     spread = sum(1 << (3 * bit + 2) for bit in range(21))
     assert z_codes(cells).tolist() == [4, 2, 1, 32, spread]
-
-
-def test_hilbert_with_21_bits_is_local():
-    start = torch.tensor([[1_234_567, 99, 2_000_000]])
-    cells = start + cube(2)
-    assert hilbert_codes(cells, 21).unique().numel() == 64
-    assert hilbert_codes(cells, 21).min() >= 0
-
-
-@pytest.mark.parametrize("order", ORDERS)
-def test_codes_do_not_depend_on_the_other_scenes_extent(order):
-    cells = cube(3)
-    assert torch.equal(serial_codes(cells, 3, order), serial_codes(cells, 5, order))
-
-
-def test_relative_grid_is_each_scenes_own():
-    grid = torch.tensor([[5, -3, 2], [6, -1, 9], [100, 200, 300]])
-    assert relative_grid(grid, torch.tensor([0, 0, 1]), 2).tolist() == [[0, 0, 0], [1, 2, 7], [0, 0, 0]]
-
-
-def test_keys_sort_by_scene_first(random_voxels):
-    grid, batch = random_voxels((40, 30, 50))
-    for key in serial_keys(relative_grid(grid, batch, 3), batch, torch.ones(3), ORDERS):
-        assert torch.equal(batch[key.argsort()], batch)
-        assert key.unique().numel() == len(key)
 
 
 def test_too_large_a_scene_is_refused_with_its_size_and_extent():
@@ -110,17 +77,3 @@ def test_every_voxel_is_owned_once_by_a_window_of_its_scene(count, shift, few_si
         assert torch.equal(scenes[:, 0].unique_consecutive(return_counts=True)[1], torch.tensor(group.counts))
         assert position[group.rows].diff(dim=1).eq(1).all()
         assert group.rows.shape[1] == min(8, counts[int(scenes[0, 0])])
-
-
-def test_few_sizes_of_groups():
-    """An eighth more windows at most, each of them one voxel, and eight sizes from one power of two to the next."""
-    sizes = set()
-    for count in range(1, 600):
-        counts = [7 * count, 3]
-        (group, short) = make_windows(torch.arange(sum(counts)), counts, 7, few_sizes=True).groups
-        assert group.counts == (count,)
-        assert len(short.rows) == 1
-        assert count <= len(group.rows) <= 1.125 * count
-        assert (group.rows[count:] == group.rows[0, 0]).all()
-        sizes.add(len(group.rows))
-    assert len([size for size in sizes if 256 < size <= 512]) == 8

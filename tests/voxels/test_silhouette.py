@@ -1,8 +1,7 @@
 import pytest
 import torch
-from torch.nn import functional as F
 
-from vg2gt.method.additions.silhouette import _largest, beside_silhouettes, on_surface
+from vg2gt.method.additions.silhouette import beside_silhouettes, on_surface
 
 
 def _blurred_step(near: float, far: float) -> torch.Tensor:
@@ -23,31 +22,6 @@ def test_pixels_between_foreground_and_background_are_told_apart(turned: bool, u
     assert torch.equal(found, expected)
 
 
-def test_a_sharp_silhouette_loses_no_pixel() -> None:
-    depth = torch.full((2, 3, 12, 16), 2.0)
-    depth[..., 3:9, 5:11] = 1.0
-    assert on_surface(depth).all()
-
-
-def test_planes_are_surfaces_however_they_lean() -> None:
-    v, u = torch.meshgrid(torch.linspace(-0.5, 0.5, 40), torch.linspace(-1, 1, 80), indexing="ij")
-    for lean in (0.0, 0.5, 0.8):
-        depth = 1 / (1 - lean * u * 0.9 + 0.2 * v)
-        assert on_surface(depth[None]).all(), lean
-
-
-def test_noise_without_a_silhouette_is_left_alone() -> None:
-    generator = torch.Generator().manual_seed(0)
-    depth = 2 * (1 + 0.015 * torch.rand(1, 30, 40, generator=generator))
-    assert on_surface(depth).all()
-
-
-def test_unknown_depth_is_no_silhouette() -> None:
-    depth = torch.full((1, 20, 20), 1.5)
-    depth[:, :, 10:] = 0
-    assert on_surface(depth)[depth > 0].all()
-
-
 @pytest.mark.parametrize(("step", "beside"), [(1.14, False), (1.16, True)])
 def test_three_pixels_on_either_side_of_a_step_are_beside_it(step: float, beside: bool) -> None:
     depth = torch.full((2, 12, 16), 2.0)
@@ -62,16 +36,3 @@ def test_what_lies_between_foreground_and_background_is_beside_a_silhouette() ->
     assert beside_silhouettes(depth).flatten().nonzero().flatten().tolist() == [
         16 * row + column for row in range(12) for column in (7, 8)
     ]
-
-
-def test_a_hole_is_no_silhouette_and_not_beside_one() -> None:
-    depth = torch.full((1, 20, 20), 1.5)
-    depth[:, :, 10:] = 0
-    assert not beside_silhouettes(depth).any()
-
-
-@pytest.mark.parametrize("reach", [1, 2, 3, 6])
-def test_the_largest_within_reach_is_what_pooling_finds(reach: int) -> None:
-    values = torch.randn(2, 9, 13, generator=torch.Generator().manual_seed(reach))
-    expected = F.max_pool2d(values[:, None], 2 * reach + 1, 1, reach)[:, 0]
-    assert torch.equal(_largest(values, reach), expected)

@@ -14,39 +14,6 @@ def gpu_waits(benchmark_script) -> ModuleType:
     return benchmark_script("gpu_waits")
 
 
-def test_what_waits_is_counted(gpu_waits: ModuleType) -> None:
-    x = torch.arange(6)
-    for waits, act in (
-        (1, lambda: x.max().item()),
-        (1, lambda: bool(x.any())),
-        (1, lambda: x.tolist()),
-        (1, lambda: x[0].tolist()),
-        (1, lambda: x[x > 2]),
-        (1, lambda: x.nonzero()),
-        (2, lambda: x.bincount()),
-        (1, lambda: x.repeat_interleave(x)),
-        (1, lambda: x.unique_consecutive()),
-        (2, lambda: torch.segment_reduce(x.float(), "sum", lengths=x[2:3] * 3)),
-        (0, lambda: torch.segment_reduce(x.float(), "sum", lengths=x[2:3] * 3, unsafe=True)),
-        (0, lambda: x.repeat_interleave(x, output_size=15)),
-        (0, lambda: x[x.flip(0)]),
-        (0, lambda: x.clone().masked_fill_(x > 2, 0).sort()),
-        (0, lambda: torch.searchsorted(x, x)),
-    ):
-        with gpu_waits.Waits() as counted:
-            act()
-        assert counted.total == waits
-
-
-def test_places_are_named(gpu_waits: ModuleType) -> None:
-    from vg2gt.method.grid import plan_voxels
-
-    batch = torch.zeros(5, dtype=torch.int64)
-    with gpu_waits.Waits() as waits:
-        plan_voxels(torch.rand(5, 3) * 2, batch, torch.ones(5, dtype=torch.bool))
-    assert waits.places == {"method/grid.py plan_voxels": 2, "method/grid.py mixed_radix_keys": 1}
-
-
 def test_the_modules_wait_for_shapes_and_for_two_warnings_only(
     gpu_waits, make_room, make_coarse, make_fine, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -2,13 +2,11 @@
 
 from pathlib import Path
 
-import numpy as np
-
 from vg2gt.data import Frames
 from vg2gt.data.sources import Nerfstudio
 from vg2gt.io import Lens, Transforms, TransformsFrame, write_transforms
 
-from .layouts import SIZE, Layout, pixels, save
+from .layouts import SIZE, Layout, millimetres, pixels, save
 
 
 def write(root: Path, frames: Frames, depth: bool = True) -> None:
@@ -16,7 +14,7 @@ def write(root: Path, frames: Frames, depth: bool = True) -> None:
     records = []
     for i, image in enumerate(pixels(frames)):
         save(root / "desk" / "images" / f"{i:04d}.png", image)
-        save(root / "desk" / "depth" / f"{i:04d}.png", (frames.depth[i].numpy() * 1000 + 0.5).astype(np.uint16))
+        save(root / "desk" / "depth" / f"{i:04d}.png", millimetres(frames)[i])
         lens = Lens.from_intrinsics(frames.intrinsics[i].double().numpy(), SIZE)
         pose = frames.world_to_camera[i].double().numpy()
         # Some writers leave the suffix out.

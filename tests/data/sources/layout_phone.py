@@ -14,14 +14,10 @@ from scipy.spatial.transform import Rotation
 from vg2gt.data import Frames, RGBDFolder
 from vg2gt.io import write_video
 
-from .layouts import SIZE, Layout, camera_of, camera_to_world, pixels, save
+from .layouts import SIZE, Layout, camera_of, camera_to_world, millimetres, pixels, save
 
 OPENGL = np.diag([1.0, -1, -1, 1])
 CORNER = np.array([0, 0, 0.5, 0.5])  # from the middle of the first pixel to its corner
-
-
-def _millimetres(frames: Frames) -> np.ndarray:
-    return (frames.depth.numpy() * 1000 + 0.5).astype(np.uint16)
 
 
 def write_record3d(root: Path, frames: Frames, per_frame: bool = False) -> None:
@@ -85,7 +81,7 @@ def write_polycam(root: Path, frames: Frames, corrected: bool = True) -> None:
         camera |= {f"t_{row}{column}": pose[row, column] for row in range(3) for column in range(4)}
         before = "corrected_" if corrected else ""
         save(folder / f"{before}images" / f"{name}.jpg", pixels(frames)[i])
-        save(folder / "depth" / f"{name}.png", _millimetres(frames)[i])
+        save(folder / "depth" / f"{name}.png", millimetres(frames)[i])
         for kind in {"cameras", f"{before}cameras"}:
             (folder / kind).mkdir(exist_ok=True)
             other = {"t_03": 0.0} if corrected and kind == "cameras" else {}
@@ -99,7 +95,7 @@ def write_stray(root: Path, frames: Frames) -> None:
     write_video(folder / "rgb.mp4", list(pixels(frames)), fps=30)
     rows = [["timestamp", " frame", " x", " y", " z", " qx", " qy", " qz", " qw"]]
     for i, pose in enumerate(camera_to_world(frames)):
-        save(folder / "depth" / f"{i:06d}.png", _millimetres(frames)[i])
+        save(folder / "depth" / f"{i:06d}.png", millimetres(frames)[i])
         quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat()
         rows.append([f"{i / 30:.4f}", f" {i:06d}", *map(repr, [*pose[:3, 3].tolist(), *quaternion.tolist()])])
     with open(folder / "odometry.csv", "w", newline="") as file:

@@ -8,20 +8,17 @@ from scipy.spatial.transform import Rotation
 
 from vg2gt.data import Frames, RGBDFolder
 
-from .layouts import Layout, camera_of, camera_to_world, pixels, save
+from .layouts import Layout, camera_of, camera_to_world, millimetres, pixels, save
 
 
-def _millimetres(frames: Frames) -> np.ndarray:
-    return (frames.depth.numpy() * 1000 + 0.5).astype(np.uint16)
-
-
-def write_recording(root: Path, frames: Frames, scene: str = "office") -> None:
-    """``images/ depth/ poses.txt K.txt``; frames 10, 11, ..."""
-    for i, (image, depth) in enumerate(zip(pixels(frames), _millimetres(frames), strict=True)):
-        save(root / scene / "images" / f"{i + 10:05d}.png", image)
-        save(root / scene / "depth" / f"{i + 10:05d}.png", depth)
+def write_recording(root: Path, frames: Frames, scene: str = "office", first: int = 10, digits: int = 5) -> Path:
+    """``images/ depth/ poses.txt K.txt``; frames 10, 11, ... Returns its folder."""
+    for i, (image, depth) in enumerate(zip(pixels(frames), millimetres(frames), strict=True)):
+        save(root / scene / "images" / f"{i + first:0{digits}d}.png", image)
+        save(root / scene / "depth" / f"{i + first:0{digits}d}.png", depth)
     np.savetxt(root / scene / "poses.txt", camera_to_world(frames).reshape(-1, 16))
     np.savetxt(root / scene / "K.txt", frames.intrinsics[0].numpy())
+    return root / scene
 
 
 def _write_pose_files(root: Path, frames: Frames) -> None:
@@ -29,7 +26,7 @@ def _write_pose_files(root: Path, frames: Frames) -> None:
         (root / "hall" / sub).mkdir(parents=True)
     for i, pose in enumerate(camera_to_world(frames)):
         save(root / "hall" / "rgb" / f"{i + 8}.jpg", pixels(frames)[i])
-        save(root / "hall" / "depth" / f"{i + 8}.png", _millimetres(frames)[i])
+        save(root / "hall" / "depth" / f"{i + 8}.png", millimetres(frames)[i])
         np.savetxt(root / "hall" / "pose" / f"{i + 8}.txt", pose)
     matrix = np.eye(4)
     matrix[:3, :3] = frames.intrinsics[0].numpy()
@@ -42,7 +39,7 @@ def write_seven_scenes(root: Path, frames: Frames) -> None:
     folder.mkdir(parents=True)
     for i, pose in enumerate(camera_to_world(frames)):
         save(folder / f"frame-{i:06d}.color.png", pixels(frames)[i])
-        depth = _millimetres(frames)[i]
+        depth = millimetres(frames)[i]
         save(folder / f"frame-{i:06d}.depth.png", np.where(depth == 0, 65535, depth))
         np.savetxt(folder / f"frame-{i:06d}.pose.txt", pose)
     np.savetxt(root / "chess" / "camera-intrinsics.txt", frames.intrinsics[0].numpy())
@@ -53,7 +50,7 @@ def _write_open3d(root: Path, frames: Frames) -> None:
     lines = []
     for i, pose in enumerate(camera_to_world(frames)):
         save(root / "den" / "image" / f"{i + 1:06d}.png", pixels(frames)[i])
-        save(root / "den" / "depth" / f"{i + 1:06d}.png", _millimetres(frames)[i])
+        save(root / "den" / "depth" / f"{i + 1:06d}.png", millimetres(frames)[i])
         lines += [f"{i} {i} {i + 1}", *(" ".join(map(repr, row)) for row in pose.tolist())]
     (root / "den" / "trajectory.log").write_text("\n".join(lines))
     height, width = frames.depth.shape[-2:]

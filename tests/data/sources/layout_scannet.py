@@ -11,14 +11,10 @@ from PIL import Image
 from vg2gt.data import Frames
 from vg2gt.data.sources import ScanNet, ScanNetSens
 
-from .layouts import Layout, camera_to_world, pixels, save
+from .layouts import Layout, camera_to_world, millimetres, pixels, save
 
 JPEG_ERROR = 0.009
 """Mean absolute error of images of the test's room as JPEG of quality 95 (measured: 0.0060 to 0.0077)."""
-
-
-def millimetres(frames: Frames) -> np.ndarray:
-    return (frames.depth.numpy() * 1000 + 0.5).astype(np.uint16)
 
 
 def write_export(root: Path, frames: Frames, scene: str = "scene0707_00") -> None:

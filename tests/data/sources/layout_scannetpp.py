@@ -7,8 +7,8 @@ import numpy as np
 from examples.data_sets.scannetpp import ScanNetPPiPhone
 from vg2gt.data import Frames
 
-from .layout_scannet import JPEG_ERROR, millimetres
-from .layouts import Layout, camera_to_world, pixels, save
+from .layout_scannet import JPEG_ERROR
+from .layouts import Layout, camera_to_world, millimetres, pixels, save
 
 
 def write(root: Path, frames: Frames) -> None:
@@ -37,9 +37,6 @@ def write_cameras(folder: Path, names: list[str], poses: list[np.ndarray], intri
 
 LAYOUTS = {
     "scannetpp_iphone": Layout(
-        write,
-        lambda root: ScanNetPPiPhone(str(root)),
-        image_error=JPEG_ERROR,
-        frame_ids=tuple(range(0, 60, 10)),
+        write, lambda root: ScanNetPPiPhone(str(root)), image_error=JPEG_ERROR, frame_ids=tuple(range(0, 60, 10))
     )
 }

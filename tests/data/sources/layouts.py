@@ -24,18 +24,9 @@ SIZE = (30, 40)
 
 @dataclass(frozen=True)
 class Layout:
-    """A dataset's layout on disk.
+    """A dataset's layout on disk."""
 
-    Attributes:
-        write: lays frames out below an empty folder, as scene number 0 of a dataset would be.
-        read: makes the loader of that folder.
-        image_error: largest mean absolute difference of images (PNG: 0; JPEG: the codec's).
-        depth_quantum: step of stored depth, or the step at depth z, ``quantum(z)``; None where the layout has no depth.
-        frame_ids: ids under which frames 0, 1, ... come back; None: unchanged.
-        moved_world: poses come back up to one rigid transform of the world.
-    """
-
-    write: Callable[[Path, Frames], None]
+    write: Callable[[Path, Frames], object]
     read: Callable[[Path], FileSource]
     image_error: float = 0.0
     depth_quantum: Callable[[torch.Tensor], torch.Tensor] | float | None = 1e-3
@@ -71,6 +62,11 @@ def camera_of(frames: Frames) -> list[float]:
 def pixels(frames: Frames) -> np.ndarray:
     """``[V, H, W, 3]`` uint8 images of frames."""
     return (frames.images.permute(0, 2, 3, 1).numpy() * 255 + 0.5).astype(np.uint8)
+
+
+def millimetres(frames: Frames) -> np.ndarray:
+    """``[V, H, W]`` uint16 depth of frames."""
+    return (frames.depth.numpy() * 1000 + 0.5).astype(np.uint16)
 
 
 def save(path: Path, image: np.ndarray) -> None:

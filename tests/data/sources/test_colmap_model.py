@@ -1,5 +1,7 @@
 """COLMAP scenes: a real model, which cameras are refused, reduced images, absent images, points."""
 
+from contextlib import contextmanager
+
 import numpy as np
 import pycolmap  # pyright: ignore[reportMissingImports]
 import pytest
@@ -19,7 +21,7 @@ from vg2gt.runs.load import load_model
 from vg2gt.types import Cameras
 
 from .layout_colmap import POINTS_A_VIEW, write
-from .layouts import SIZE, room
+from .layouts import SIZE, pixels, room
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +46,6 @@ def test_real_model_reprojects(statue):
         seen = np.array([feature.xy for feature in features])
         errors.append(np.linalg.norm(projected[:, :2] / projected[:, 2:] + 0.5 - seen, axis=1))
     assert np.median(np.concatenate(errors)) == pytest.approx(0.25, rel=0.1)
-
     frames = source.load(scene, [0, 22])
     assert frames.images.shape[-2:] == index.size
     assert abs(index.size[0] - 658) < 10
@@ -96,39 +97,35 @@ def test_a_distorted_model_beside_the_originals(statue, distorted):
     assert (depth > 0).sum() > 50
 
 
-def test_all_models_undistort_and_zero_coefficients_are_a_pinhole(tmp_path):
-    write(tmp_path, room(2))
-    folder = tmp_path / "statue" / "sparse" / "0"
-    plain = COLMAP(str(tmp_path)).scene_index("statue")
-    for name, extra, still in (
-        ("SIMPLE_RADIAL", [0.0], True),
-        ("SIMPLE_RADIAL", [0.1], False),
-        ("RADIAL", [0.1, -0.02], False),
-        ("OPENCV", [0.1, 0.01, 0.001, 0.0], False),
-        ("FULL_OPENCV", [0.1] + [0.0] * 7, False),
-        ("OPENCV_FISHEYE", [0.0] * 4, False),
-        ("SIMPLE_RADIAL_FISHEYE", [0.02], False),
-    ):
-        model = read_colmap(folder)
-        for camera in model.cameras.values():
-            focal, center = camera.focal_length_x, [camera.principal_point_x, camera.principal_point_y]
-            camera.model = getattr(pycolmap.CameraModelId, name)
-            camera.params = [*([focal] if "SIMPLE" in name or name == "RADIAL" else [focal, focal]), *center, *extra]
-        write_colmap(folder, model)
-        index = COLMAP(str(tmp_path)).scene_index("statue")
-        assert ("lens" not in index.extra) == still, name
-        if still:
-            np.testing.assert_allclose(index.intrinsics, plain.intrinsics)
-        assert COLMAP(str(tmp_path)).load("statue", [0]).images.isfinite().all()
+@contextmanager
+def edited(root):
+    """The model of a written scene, to be changed."""
+    folder = root / "statue" / "sparse" / "0"
+    model = read_colmap(folder)
+    yield model
+    write_colmap(folder, model)
+
+
+def put_masks(root, *names):
+    """Masks that hide the left half."""
+    folder = root / "statue" / "masks" / "left"
+    folder.mkdir(parents=True)
+    half = Image.fromarray(np.where(np.arange(40) < 20, 0, 255).astype(np.uint8) * np.ones((30, 1), np.uint8))
+    for name in names:
+        half.save(folder / name)
+
+
+def turned(orientation):
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    return exif
 
 
 def test_a_model_of_equirectangular_images_is_refused_in_one_line(tmp_path):
     write(tmp_path, room(1))
-    folder = tmp_path / "statue" / "sparse" / "0"
-    model = read_colmap(folder)
-    model.cameras[1].model = pycolmap.CameraModelId.EQUIRECTANGULAR
-    model.cameras[1].params = [40.0, 30.0]
-    write_colmap(folder, model)
+    with edited(tmp_path) as model:
+        model.cameras[1].model = pycolmap.CameraModelId.EQUIRECTANGULAR
+        model.cameras[1].params = [40.0, 30.0]
     with pytest.raises(DataError, match="EQUIRECTANGULAR has no pinhole part; cut it into cube faces"):
         COLMAP(str(tmp_path)).scene_index("statue")
 
@@ -151,21 +148,18 @@ def test_exif_orientation_with_given_cameras(tmp_path, orientation, stored):
     """Item 6: cameras of upright images, and of images as COLMAP reads them, whose points' colours tell it."""
     frames = room(2)
     cameras = Cameras(frames.world_to_camera[None].double(), frames.intrinsics[None].double(), SIZE)
-    pixels = [(image.permute(1, 2, 0).numpy() * 255 + 0.5).astype(np.uint8) for image in frames.images]
     world = unproject(frames.depth[None].double(), cameras)[0].numpy()
     y, x = (axis.ravel() for axis in np.mgrid[2:30:5, 2:40:5])
     positions = np.concatenate([view[y, x] for view in world])
-    colors = np.concatenate([picture[y, x] for picture in pixels])
+    colors = np.concatenate([picture[y, x] for picture in pixels(frames)])
     sources = (np.arange(2 * len(y)), np.repeat([0, 1], len(y)), np.tile(np.stack((x, y), -1), (2, 1)))
     names = ["0.jpg", "1.jpg"]
     write_colmap(tmp_path / "s" / "sparse" / "0", colmap_from_views(cameras, names, positions, colors, sources))
     (tmp_path / "s" / "images").mkdir()
-    exif = Image.Exif()
-    exif[0x0112] = orientation
     turn = {3: Image.Transpose.ROTATE_180, 6: Image.Transpose.ROTATE_90, 8: Image.Transpose.ROTATE_270}[orientation]
-    for name, picture in zip(names, pixels, strict=True):
+    for name, picture in zip(names, pixels(frames), strict=True):
         image = Image.fromarray(picture) if stored else Image.fromarray(picture).transpose(turn)
-        image.save(tmp_path / "s" / "images" / name, exif=exif, quality=95, subsampling=0)
+        image.save(tmp_path / "s" / "images" / name, exif=turned(orientation), quality=95, subsampling=0)
     loaded = COLMAP(str(tmp_path)).load("s", [0, 1])
     assert (loaded.images - frames.images).abs().mean() < 0.02
     assert torch.allclose(loaded.intrinsics, frames.intrinsics)
@@ -173,9 +167,7 @@ def test_exif_orientation_with_given_cameras(tmp_path, orientation, stored):
 
 def test_an_exif_orientation_that_fits_no_camera_is_named(tmp_path):
     write(tmp_path, room(1))
-    exif = Image.Exif()
-    exif[0x0112] = 6
-    Image.new("RGB", (40, 36)).save(tmp_path / "statue" / "images" / "left" / "000.png", exif=exif)
+    Image.new("RGB", (40, 36)).save(tmp_path / "statue" / "images" / "left" / "000.png", exif=turned(6))
     with pytest.raises(DataError, match=r"40x36 pixels \(EXIF orientation 6, upright 36x40\), but its camera"):
         COLMAP(str(tmp_path)).scene_index("statue")
 
@@ -183,10 +175,9 @@ def test_an_exif_orientation_that_fits_no_camera_is_named(tmp_path):
 def test_values_that_are_not_finite_leave_their_image_out_by_name(tmp_path, caplog):
     """Item 21."""
     write(tmp_path, room(4), text=True)
-    folder = tmp_path / "statue" / "sparse" / "0"
-    lines = (folder / "cameras.txt").read_text().splitlines()
-    lines[-1] = " ".join([*lines[-1].split()[:4], "-nan(ind)", *lines[-1].split()[5:]])
-    (folder / "cameras.txt").write_text("\n".join(lines))
+    path = tmp_path / "statue" / "sparse" / "0" / "cameras.txt"
+    *before, last = path.read_text().splitlines()
+    path.write_text("\n".join([*before, " ".join([*last.split()[:4], "-nan(ind)", *last.split()[5:]])]))
     assert len(COLMAP(str(tmp_path)).frames("statue")) == 3
     assert "cameras whose values are not finite, their images are left out: left/" in caplog.text
 
@@ -194,14 +185,8 @@ def test_values_that_are_not_finite_leave_their_image_out_by_name(tmp_path, capl
 def test_masks_beside_images(tmp_path, caplog):
     """Item 7: a folder of masks, partly filled."""
     write(tmp_path, room(3))
-    masks = tmp_path / "statue" / "masks" / "left"
-    masks.mkdir(parents=True)
-    half = Image.fromarray(np.where(np.arange(40) < 20, 0, 255).astype(np.uint8) * np.ones((30, 1), np.uint8))
-    half.save(masks / "000.png")
-    half.save(masks / "009.png.png")
-    source = COLMAP(str(tmp_path))
-    loaded = source.load("statue", [0, 1, 2])
-    assert loaded.mask is not None
+    put_masks(tmp_path, "000.png", "009.png.png")
+    loaded = COLMAP(str(tmp_path)).load("statue", [0, 1, 2])
     assert loaded.mask.mean((1, 2)).tolist() == [0.5, 0.5, 1]
     assert "1 of 3 images have no mask in" in caplog.text
     assert "left/018.png" in caplog.text
@@ -241,34 +226,15 @@ def test_a_model_without_its_images_says_what_it_expects_where(tmp_path):
     assert COLMAP(str(tmp_path / "statue"), images="photos").frames("statue") == (0, 1)
 
 
-def test_images_of_several_sizes_are_cropped_to_one(tmp_path):
-    """One camera of another shape: its frame is cut to the common size and points still project into its pixels."""
-    frames = room(3)
-    write(tmp_path, frames)
-    folder = tmp_path / "statue" / "sparse" / "0"
-    model = read_colmap(folder)
-    wide = model.camera(2)
-    wide.width, wide.height, wide.params = 60, 30, [27.0, 27.0, 30.0, 15.0]
-    write_colmap(folder, model)
-    Image.new("RGB", (60, 30)).save(tmp_path / "statue" / "images" / "left" / "009.png")
-    source = COLMAP(str(tmp_path))
-    loaded = source.load("statue", [0, 1])
-    assert loaded.images.shape[-2:] == SIZE
-    assert loaded.intrinsics[1, 0].tolist() == pytest.approx([27.0, 0, 30 - 0.5 - 10])
-
-
 def test_points_need_three_views_and_the_nearest_wins(tmp_path):
     write(tmp_path, room(3))
     source = COLMAP(str(tmp_path), depth="points")
     depth = source.load("statue", [0]).depth[0]
     assert 0.7 * POINTS_A_VIEW < int((depth > 0).sum()) <= POINTS_A_VIEW
-    folder = tmp_path / "statue" / "sparse" / "0"
-    model = read_colmap(folder)
-    for number in range(1, POINTS_A_VIEW + 1):  # frame 0's own points
-        point = model.point3D(number)
-        other = next(element for element in point.track.elements if element.image_id != 1)
-        model.delete_observation(other.image_id, other.point2D_idx)
-    write_colmap(folder, model)
+    with edited(tmp_path) as model:
+        for number in range(1, POINTS_A_VIEW + 1):  # frame 0's own points
+            other = next(each for each in model.point3D(number).track.elements if each.image_id != 1)
+            model.delete_observation(other.image_id, other.point2D_idx)
     source = COLMAP(str(tmp_path), depth="points")
     assert tuple(source.frames("statue")) == (1, 2)
     assert source.scene_index("statue").dropped == {"without a depth file": 1}
@@ -279,17 +245,12 @@ def test_points_need_three_views_and_the_nearest_wins(tmp_path):
 def test_masks_go_with_a_batch_and_take_its_depth_away(tmp_path):
     """Issue 47, item 7."""
     write(tmp_path, room(3))
-    masks = tmp_path / "statue" / "masks" / "left"
-    masks.mkdir(parents=True)
-    half = Image.fromarray(np.where(np.arange(40) < 20, 0, 255).astype(np.uint8) * np.ones((30, 1), np.uint8))
-    for name in ("000.png", "009.png", "018.png"):
-        half.save(masks / name)
+    put_masks(tmp_path, "000.png", "009.png", "018.png")
     whole = COLMAP(str(tmp_path), depth="points").load("statue", [0, 1, 2])
     data = BatchDataset(COLMAP(str(tmp_path), depth="points"), Framing((28, 42)).apply, 10)
     batch = data[(SceneSample("statue", (0, 1), (2,)),)]
     assert batch.mask is not None
     assert batch.hints.mask is not None
-    assert batch.context.mask is not None
     assert batch.context.mask.shape == (1, 2, 28, 42)
     assert (batch.depth[..., :20] == 0).all()
     assert (batch.depth[..., 22:] > 0).any()

@@ -73,12 +73,7 @@ CONFIGURATIONS = {
         {f"{drive}/Camera_0" for drive in ("Scene01/rain", "Scene02/clone", "Scene06/fog", "Scene18/clone")},
         {"Scene20/clone/Camera_0"},
     ),
-    "tum": (
-        layout_tum.write,
-        ["data.every=1"],
-        {"rgbd_dataset_freiburg1_desk"},
-        {"rgbd_dataset_freiburg1_desk"},
-    ),
+    "tum": (layout_tum.write, ["data.every=1"], {"rgbd_dataset_freiburg1_desk"}, {"rgbd_dataset_freiburg1_desk"}),
 }
 
 

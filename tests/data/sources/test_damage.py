@@ -1,42 +1,42 @@
 """Every layout with files truncated, altered, exchanged or removed: the documented error, or frames; never a crash.
 
-The plain suite damages each layout a few times; ``pytest -m slow`` does it 250 times.
+The plain suite damages each layout a few times at random (``pytest -m slow``: 250 times), and chosen files in chosen
+ways, whose error must name what is wrong.
 """
 
+import json
+import struct
+from collections.abc import Callable
 from pathlib import Path
 from shutil import copytree, rmtree
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
+from tests.io.mutations import mutations
 from vg2gt.data import DataError
 
-from .layouts import Layout, all_layouts, room
+from .layouts import SIZE, Layout, all_layouts, room
 
 LAYOUTS = all_layouts()
 PICTURES = (".png", ".jpg", ".jpeg")
 NUMBERS = (b"nan", b"inf", b"-1", b"0", b"1e30", b"999999999999", b"word", b"")
 
 
+@pytest.fixture(scope="module")
+def frames():
+    return room()
+
+
+@pytest.mark.parametrize("count", [6, pytest.param(250, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", LAYOUTS)
-def test_damage_is_a_data_error_or_frames(name, tmp_path):
-    _damage_often(LAYOUTS[name], tmp_path, range(12))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", LAYOUTS)
-def test_much_damage_is_a_data_error_or_frames(name, tmp_path):
-    refused = _damage_often(LAYOUTS[name], tmp_path, range(1000, 1250))
-    print(f"{name}: 250 mutations, {refused} refused with the documented error, the others read as frames")
-
-
-def _damage_often(layout: Layout, folder: Path, seeds: range) -> int:
-    whole = folder / "whole"
-    layout.write(whole, room())
-    refused = 0
-    for seed in seeds:
-        copy = folder / "damaged"
+def test_damage_is_a_data_error_or_frames(name, count, tmp_path, frames):
+    layout, whole, copy, refused = LAYOUTS[name], tmp_path / "whole", tmp_path / "damaged", 0
+    layout.write(whole, frames)
+    for seed in range(2000, 2000 + count):
         copytree(whole, copy)
         what = _damage(copy, np.random.default_rng(seed))
         try:
@@ -50,7 +50,6 @@ def _damage_often(layout: Layout, folder: Path, seeds: range) -> int:
             pytest.fail(f"{what} (seed {seed}) ended in {type(error).__name__}: {error}")
         rmtree(copy)
     assert refused > 0
-    return refused
 
 
 def _read_all(layout: Layout, folder: Path) -> None:
@@ -75,26 +74,225 @@ def _damage(folder: Path, rng: np.random.Generator) -> str:
     chosen = others if others and rng.random() < 0.5 else files
     path = chosen[rng.integers(len(chosen))]
     content = path.read_bytes()
-    kind = str(rng.choice(["truncate", "flip", "remove", "noise", "exchange", "number", "lines"]))
-    if kind == "truncate":
-        path.write_bytes(content[: rng.integers(0, max(1, len(content)))])
-    elif kind == "flip":
-        damaged = bytearray(content)
-        for place in rng.integers(0, max(1, len(content)), 1 + rng.integers(8)):
-            damaged[place : place + 1] = bytes([rng.integers(256)])
-        path.write_bytes(damaged)
-    elif kind == "remove":
-        path.unlink()
-    elif kind == "noise":
-        path.write_bytes(rng.bytes(int(rng.integers(0, 2000))))
+    kind = str(rng.choice(["bytes", "bytes", "remove", "exchange", "number", "lines"]))
+    if kind == "bytes" and content:
+        kinds = list(mutations(content, 6, int(rng.integers(1 << 30))))
+        path.write_bytes(kinds[rng.integers(6)])
     elif kind == "exchange":
         path.write_bytes(files[rng.integers(len(files))].read_bytes())
     elif kind == "number":
         words = content.split(b" ")
         words[rng.integers(len(words))] = NUMBERS[rng.integers(len(NUMBERS))]
         path.write_bytes(b" ".join(words))
-    else:
+    elif kind == "lines":
         lines = content.split(b"\n")
         first = int(rng.integers(len(lines)))
         path.write_bytes(b"\n".join(lines[:first] + lines[first + 1 + int(rng.integers(3)) :]))
+    else:
+        path.unlink()
     return f"{kind} {path.relative_to(folder)}"
+
+
+# ------------------------------------------------------------------------------------------ what is wrong is named
+
+
+def swap(old: str, new: str) -> Callable[[Path], Any]:
+    return lambda path: path.write_text(path.read_text().replace(old, new))
+
+
+def put(text: str) -> Callable[[Path], Any]:
+    return lambda path: path.write_text(text)
+
+
+def lines(change: Callable[[list[str]], list[str]]) -> Callable[[Path], Any]:
+    return lambda path: path.write_text("\n".join(change(path.read_text().splitlines())) + "\n")
+
+
+def entries(change: Callable[[dict[str, Any]], Any]) -> Callable[[Path], Any]:
+    """Changes what a JSON file holds."""
+
+    def edit(path: Path) -> None:
+        content = json.loads(path.read_text())
+        change(content)
+        path.write_text(json.dumps(content))
+
+    return edit
+
+
+def arrays(**changes: Any) -> Callable[[Path], Any]:
+    """Exchanges arrays of an ``.npz`` file; None removes one."""
+
+    def edit(path: Path) -> None:
+        changed = {**np.load(path), **changes}
+        np.savez(path, **{name: array for name, array in changed.items() if array is not None})
+
+    return edit
+
+
+def numbers(change: Callable[[np.ndarray], Any]) -> Callable[[Path], Any]:
+    """Changes the matrix in a text file."""
+    return lambda path: np.savetxt(path, change(np.loadtxt(path)))
+
+
+def skewed(place: tuple[int, int], value: float) -> Callable[[Path], Any]:
+    def change(matrix: np.ndarray) -> np.ndarray:
+        matrix[place] = value
+        return matrix
+
+    return numbers(change)
+
+
+def image(*shape: int, kind: type = np.uint16, value: int = 1) -> Callable[[Path], Any]:
+    return lambda path: Image.fromarray(np.full(shape, value, kind)).save(path)
+
+
+def array(*shape: int, kind: type = np.float32, value: float = 1) -> Callable[[Path], Any]:
+    return lambda path: np.save(path, np.full(shape, value, kind))
+
+
+def cut(share: float) -> Callable[[Path], Any]:
+    return lambda path: path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+
+
+def at(place: int, *values: bytes) -> Callable[[Path], Any]:
+    def edit(path: Path) -> None:
+        content, new = path.read_bytes(), b"".join(values)
+        path.write_bytes(content[:place] + new + content[place + len(new) :])
+
+    return edit
+
+
+def renamed(name: str) -> Callable[[Path], Any]:
+    return lambda path: path.rename(path.with_name(name))
+
+
+gone = Path.unlink
+POSE = "1305031102.0 1 2 3 0 0 0 1\n"
+HUGE = struct.pack("<Q", 1 << 61)
+SENS = 4 + 8 + 15 + 4 * 64 + 2 * 4 + 4 * 4 + 4  # first byte of the number of frames
+TIMES = "must have lines of 'timestamp path'"
+SIMILARITY = "Barn_trans.txt of scene Barn.*not a rotation, a scale and a translation"
+CAMERA, LOG, VIEW = "00000001_cam.txt", "Barn_COLMAP_SfM.log", "Depth_0_0_0048_0.npy"
+NAMED: dict[str, list[tuple[str, Callable[[Path], Any], str]]] = {
+    "dtu": [
+        (CAMERA, swap("intrinsic", "intrinsics"), f"{CAMERA} of scene scan65.*not a camera of MVSNet"),
+        (CAMERA, swap("extrinsic\n", "extrinsic\n2.0 "), "not a camera of MVSNet"),
+        (CAMERA, swap("0.0 0.0 0.0 1.0", "0.0 0.0 0.5 1.0"), f"{CAMERA}.*not a rigid transform"),
+        (CAMERA, put(""), "not a camera of MVSNet"),
+    ],
+    "tanks_and_temples": [
+        ("Barn_trans.txt", put("1 0 0 0\n0 1 0 0\n0 0 -1 0\n0 0 0 1\n"), SIMILARITY),
+        ("Barn_trans.txt", put("1 0 0 0\n0 2 0 0\n0 0 1 0\n0 0 0 1\n"), SIMILARITY),
+        ("Barn_trans.txt", put("nan 0 0 0\n0 2 0 0\n0 0 1 0\n0 0 0 1\n"), SIMILARITY),
+        (LOG, put("0 0 0\n1 0 0 0\n"), f"{LOG} of scene Barn.*has 2 lines; expected five for each image"),
+        (LOG, put("0 0\n" + "1 0 0 0\n" * 4), "image 0: expected 3 numbers"),
+        (LOG, put("0 x 0\n" + "1 0 0 0\n" * 4), "image 0: invalid literal"),
+    ],
+    "tum": [
+        ("groundtruth.txt", gone, "scene rgbd_dataset_freiburg1_desk in .* has no groundtruth.txt"),
+        ("depth.txt", gone, r"cannot read .*depth\.txt of scene"),
+        ("depth.txt", put("# nothing\n"), r"depth\.txt of scene .* lists no file"),
+        ("rgb.txt", put("1305031102.0\n"), f"{TIMES}, not '1305031102.0'"),
+        ("rgb.txt", put("nan rgb/a.png\n"), TIMES),
+        ("rgb.txt", put("1.5 rgb/a.png\n1.50 rgb/b.png\n"), r"lists 1\.50 twice"),
+        ("groundtruth.txt", put("0 " * 13), "lines of 'timestamp tx ty tz qx qy qz qw', not 13 numbers"),
+        ("groundtruth.txt", put(POSE.replace(" 1\n", " 0\n")), "1 frames whose pose is not finite"),
+    ],
+    "virtual_kitti": [
+        ("extrinsic.txt", lines(lambda rows: [*rows, rows[1]]), "has frame 0 of camera 0 twice"),
+        ("intrinsic.txt", lines(lambda rows: [row[: row.rindex(" ")] for row in rows]), "not of 5"),
+        ("extrinsic.txt", lines(lambda rows: [*rows, rows[1].replace("0 0 ", "0.5 0 ", 1)]), "no whole numbers"),
+        (
+            "extrinsic.txt",
+            lines(lambda rows: [rows[0], "0 0 " + "2 " * 16, *rows[2:]]),
+            "pose of frame 0 .*not a rigid transform",
+        ),
+        ("intrinsic.txt", lines(lambda rows: [r for r in rows if r.split()[1] != "0"]), "6 frames without a pose"),
+    ],
+    "scannetpp_iphone": [
+        ("*.npz", arrays(trajectories=np.eye(4)[None]), "trajectories in .* must hold 7x4x4 numbers"),
+        ("*.npz", arrays(intrinsics=None), "has no array"),
+        ("*.npz", arrays(images=np.arange(7)), "must be a list of file names"),
+        ("*.npz", arrays(images=np.array(["a"] * 7, object)), "cannot read .*metadata.npz of scene"),
+        ("*.npz", arrays(images=np.array([f"DSC0{i}.JPG" for i in range(7)])), r"names an image 'DSC00.JPG'"),
+        ("*.npz", arrays(images=np.array(["frame_000010.jpg"] * 7)), "names frame 10 twice"),
+        ("*.npz", arrays(images=np.array([f"frame_{i}.jpg" for i in range(1, 8)])), "no images of iPhone frames"),
+    ],
+    "infinigen": [
+        (VIEW, renamed("Depth_x.npy"), "is not named Depth_RIG"),
+        ("camview_*", lambda path: [each.unlink() for each in path.parent.iterdir()], "6 frames without a pose"),
+        (VIEW, array(60, 80, kind=int), rf"{VIEW} of scene 1a2b3c is not a depth image"),
+        (VIEW, array(60, 40), "different aspect ratios"),
+        ("camview_*_0048_0.npz", arrays(T=np.eye(4)[:3]), r"T in .*0048_0\.npz of scene 1a2b3c must hold 4x4 numbers"),
+        (VIEW, array(60, 80, value=1e10), rf"{VIEW} of scene 1a2b3c has no valid depth .*data\.max_depth"),
+    ],
+    "nerfstudio": [
+        ("*.json", entries(lambda c: c.update(camera_model="EQUIRECTANGULAR")), "model EQUIRECTANGULAR; read are: PIN"),
+        ("*.json", entries(lambda c: c.update(w=80, h=80)), "is 40x30 pixels, but its camera in .* 80x80"),
+        ("*.json", entries(lambda c: c.update(k1=1e6)), "scene desk.*takes the image's border out"),
+        ("*.json", entries(lambda c: c.update(frames=[])), "none of the 0 images"),
+        ("*.json", entries(lambda c: c["frames"][0].update(transform_matrix=[[1]])), "scene desk.*transform_matrix"),
+    ],
+    "stray_scanner": [
+        ("odometry.csv", put("timestamp, frame\n0, 0\n"), "is damaged"),
+        ("odometry.csv", put(""), r"odometry\.csv .*is damaged|has no frames"),
+        ("camera_matrix.csv", put("1,2\n3,4\n"), "is damaged"),
+        ("camera_matrix.csv", put("a,b\n"), "is damaged"),
+    ],
+    "scannet_sens": [
+        ("*.sens", at(0, b"\5"), r"cannot read .*\.sens of scene scene0707_00: .*version 5 of the format, expected 4"),
+        ("*.sens", at(4, HUGE), "sensor's name of 2305843009213693952 bytes"),
+        ("*.sens", at(SENS - 24, b"\2"), "colour of type 2 and depth of type 2"),
+        ("*.sens", at(SENS - 20, b"\xff\xff\xff\xff"), "images of 4294967295x30"),
+        ("*.sens", at(SENS - 4, bytes(4)), "0.0 depth units per metre"),
+        ("*.sens", at(SENS, HUGE), "it ends .*within"),
+        ("*.sens", at(SENS, bytes(8)), "it holds no frame"),
+        ("*.sens", at(SENS + 8 + 64 + 16, HUGE), "it ends within frame 0 of 6"),
+        ("*.sens", at(SENS + 8 + 64 + 16, b"\xff" * 8), "it ends within frame 0 of 6"),
+        ("*.sens", cut(0.75), "it ends .*within"),
+        ("*.sens", lambda path: path.write_bytes(path.read_bytes()[:100]), "it ends after 100 bytes, within a header"),
+    ],
+    "rgbd": [
+        ("images/00012.png", gone, "one line of 16 numbers .* for each of the 5 images; it has 6"),
+        ("poses.txt", gone, r"scene office in .* has 6 colour and 6 depth images but no poses: add poses\.txt"),
+        ("poses.txt", lines(lambda rows: rows[1:]), "each of the 6 images; it has 5 lines of 16"),
+        ("poses.txt", put("a b\n"), r"cannot read .*poses\.txt of scene office"),
+        ("poses.txt", numbers(lambda poses: 2 * poses), "frame 10 in .*scene office.* not a rigid"),
+        ("poses.txt", numbers(lambda poses: poses * np.nan), "no usable frame .*; 6 frames whose pose is not finite"),
+        ("K.txt", gone, r"no intrinsics: add K\.txt"),
+        ("K.txt", put("1 1 1\n1 1 1\n"), r"K\.txt .* 3x3 or 4x4 or 1x4 matrix, not 2x3"),
+        ("K.txt", numbers(np.transpose), r"are not fx 0 cx, 0 fy cy, 0 0 1 \(transposed"),
+        ("K.txt", skewed((0, 1), 3.0), "have skew, which is not modelled"),
+        ("K.txt", skewed((0, 2), 1e5), "is far outside"),
+        (
+            "K.txt",
+            numbers(lambda k: np.diag([2, 2, 1]) @ k),
+            r"K\.txt of scene .* resolution \(about 78x58\)\? Scale it",
+        ),
+        ("K.txt", numbers(lambda k: np.diag([0.25, 0.25, 1]) @ k), r"another resolution \(about 10x7\)"),
+        ("K.txt", numbers(lambda k: 0 * k), "no positive focal lengths"),
+        ("images/00012.png", cut(0.3), r"cannot read .*s/00012\.png of scene office"),
+        ("depth/00012.png", cut(0.3), r"cannot read .*h/00012\.png of scene office"),
+        ("depth/00012.png", image(30, 38), r"00012\.png of scene office is 38x30 .* 40x30"),
+        ("depth/00012.png", image(*SIZE, 3, kind=np.uint8), r"00012\.png of scene office is not a depth image"),
+        ("depth/00012.png", image(*SIZE, value=65535), r"00012\.png of scene office has no valid depth"),
+    ],
+    "rgbd_open3d": [
+        ("trajectory.log", put("0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"), r"\.log of scene den has 1 poses for 6"),
+        ("camera_intrinsic.json", put('{"intrinsic_matrix": [1, 2]}'), "expected Open3D's intrinsic_matrix"),
+    ],
+    "replica": [
+        ("traj.txt", lines(lambda rows: rows[:3]), r"traj\.txt of scene .*frames 0 to 5; it has 3 lines of 16")
+    ],
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "case"), [(name, case) for name, cases in NAMED.items() for case in range(len(cases))]
+)
+def test_what_is_wrong_is_named(name, case, tmp_path, frames):
+    pattern, damage, message = NAMED[name][case]
+    LAYOUTS[name].write(tmp_path, frames)
+    damage(sorted(tmp_path.rglob(pattern))[0])
+    with pytest.raises(DataError, match=message):
+        _read_all(LAYOUTS[name], tmp_path)

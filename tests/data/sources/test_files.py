@@ -1,24 +1,14 @@
 """What all loaders of files share: lists of scenes, and the memory that indices take."""
 
 import logging
-import threading
-from dataclasses import replace
-from pathlib import Path
 
-import numpy as np
 import pytest
 
-from vg2gt.config import compose, config_dir
 from vg2gt.data import DataError, RGBDFolder, SyntheticScenes
-from vg2gt.data.sources import files, parsing
-from vg2gt.data.sources.index import index_to_bytes, make_index, read_index
+from vg2gt.data.sources import files
 
 from .layout_rgbd import write_recording
 from .layouts import room
-
-OTHERS = ("paper_mix", "synthetic")
-"""Configurations of data that are no scenes in files."""
-CONFIGURATIONS = sorted({path.stem for path in Path(config_dir(), "data").glob("*.yaml")} - set(OTHERS))
 
 
 @pytest.fixture(scope="module")
@@ -59,50 +49,6 @@ def test_few_indices_stay_in_memory_and_the_rest_come_from_the_cache(dataset, tm
         assert source.frames(scene) == ids[scene] == (10, 11)
 
 
-def test_a_changed_scene_is_indexed_again(dataset, tmp_path):
-    write_recording(tmp_path, room(3), "d")
-    cache = str(tmp_path / "cache")
-    assert RGBDFolder(str(tmp_path / "d"), holdout=None, index_cache=cache).frames("d") == (10, 11, 12)
-    (tmp_path / "d/depth/00011.png").unlink()
-    assert RGBDFolder(str(tmp_path / "d"), holdout=None, index_cache=cache).frames("d") == (10, 12)
-    assert len(list((tmp_path / "cache").rglob("*.npz"))) == 1
-
-
-def test_an_index_keeps_names_below_the_folder_and_shared_intrinsics_once(tmp_path):
-    folder, beside = tmp_path / "scene", tmp_path / "depth"
-    count = 500
-    index = make_index(
-        name="scene",
-        folder=folder,
-        color={i: folder / "color" / f"{i}.jpg" for i in range(count)},
-        depth={i: beside / f"{i}.png" for i in range(count)},
-        camera_to_world={i: np.eye(4) for i in range(count)},
-        intrinsics=np.diag([30.0, 30.0, 1.0]),
-        size=(30, 40),
-        color_size=(30, 40),
-    )
-    index = replace(index, extra={"spans": np.arange(count)})
-    content = index_to_bytes(index, "state")
-    assert len(content) < count * (8 * 16 + 8 + 8 + 20 + len(str(beside)) + 10) + 6000
-    (tmp_path / "index.npz").write_bytes(content)
-    again = read_index(tmp_path / "index.npz", "scene", folder, "state")
-    assert again is not None
-    for name, value in vars(index).items():
-        if name != "extra":
-            assert (
-                np.array_equal(getattr(again, name), value)
-                if isinstance(value, np.ndarray)
-                else (getattr(again, name) == value)
-            )
-    assert np.array_equal(again.extra["spans"], np.arange(count))
-    (tmp_path / "video").write_bytes(b"")
-    alone = replace(index, folder=tmp_path / "video", color=(tmp_path / "video",) * count, depth=())
-    (tmp_path / "index.npz").write_bytes(index_to_bytes(alone, "state"))
-    again = read_index(tmp_path / "index.npz", "scene", tmp_path / "video", "state")
-    assert again is not None
-    assert (again.color, again.depth) == (alone.color, ())
-
-
 def test_a_cache_that_cannot_be_written_is_told_once(dataset, tmp_path, caplog):
     (tmp_path / "cache").write_text("a file where the folder should be")
     with caplog.at_level(logging.WARNING):
@@ -111,22 +57,6 @@ def test_a_cache_that_cannot_be_written_is_told_once(dataset, tmp_path, caplog):
         rooms = SyntheticScenes(2, num_frames=1, size=(14, 14), cache_dir=str(tmp_path / "cache"))
         assert rooms.load("room-000000", [0]).depth.shape == (1, 14, 14)
     assert sum("nothing more is kept" in record.getMessage() for record in caplog.records) == 1
-
-
-def test_poses_are_read_several_at_a_time(tmp_path, monkeypatch):
-    meeting = threading.Barrier(2)
-
-    def read(path, scene, shapes):
-        meeting.wait(timeout=20)
-        return np.eye(4)
-
-    monkeypatch.setattr(parsing, "read_matrix", read)
-    assert list(parsing.read_poses({i: tmp_path / str(i) for i in (3, 1)}, "a")) == [3, 1]
-
-
-@pytest.mark.parametrize("name", CONFIGURATIONS)
-def test_every_configuration_of_files_has_the_shared_options(name):
-    assert {"every", "index_cache", "fit", "max_views"} <= set(compose("train", f"data={name}").data)
 
 
 def test_every_second_frame(dataset):

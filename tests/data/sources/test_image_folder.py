@@ -51,13 +51,6 @@ def test_photos_are_turned_upright(tmp_path, orientation):
     assert torch.equal(frames.images[0], frames.images[1])
 
 
-def test_broken_exif_is_no_orientation(tmp_path):
-    _save(tmp_path / "a.jpg", _photo(), 6)
-    content = (tmp_path / "a.jpg").read_bytes()
-    (tmp_path / "a.jpg").write_bytes(content.replace(b"MM\x00*", b"XX\x00*").replace(b"II*\x00", b"XX*\x00"))
-    assert ImageFolder(str(tmp_path)).scene_index(tmp_path.name).size == (20, 30)
-
-
 def test_order_sizes_and_placeholders(tmp_path):
     for i, name in enumerate(("IMG_10.png", "IMG_9.png", "IMG_009b.PNG", "notes.txt", ".hidden.png")):
         if name.endswith("txt"):
@@ -87,17 +80,3 @@ def test_training_is_refused(tmp_path):
     module = instantiate(compose("train", *overrides, "data.index_cache=null").data)
     with pytest.raises(DataError, match="ImageFolder has no depth and no cameras"):
         module.train_dataloader()
-
-
-def test_real_folders_of_mixed_files(shared):
-    source = ImageFolder(str(shared / "data" / "unposed"))
-    assert source.scenes == ("da3_soh", "pi3_house", "vggt_room")
-    assert source.scene_index("pi3_house").color_size == (378, 672)
-    mixed = source.scene_index("vggt_room")
-    assert mixed.color_size is None
-    assert source.load("vggt_room", mixed.frame_ids[:2]).images.shape == (2, 3, *mixed.size)
-
-
-def test_an_empty_folder_says_what_is_expected(tmp_path):
-    with pytest.raises(DataError, match=r"no scene in .*expected images.*found: "):
-        ImageFolder(str(tmp_path))

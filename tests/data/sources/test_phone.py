@@ -9,7 +9,7 @@ import pytest
 import torch
 from PIL import Image
 
-from vg2gt.data import DataError, RGBDFolder
+from vg2gt.data import RGBDFolder
 from vg2gt.io import FormatError
 from vg2gt.io.video import read_frame, read_video
 
@@ -71,19 +71,3 @@ def test_frames_of_a_video_are_found_alone(tmp_path: Path) -> None:
         assert np.array_equal(read_frame(video, number), whole[number])
     with pytest.raises(FormatError, match=r"rgb\.mp4 has 6 frames, none of number 6"):
         read_frame(video, 6)
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "said"),
-    [
-        ("odometry.csv", "timestamp, frame\n0, 0\n", "is damaged"),
-        ("odometry.csv", "", r"odometry\.csv .*is damaged|has no frames"),
-        ("camera_matrix.csv", "1,2\n3,4\n", "is damaged"),
-        ("camera_matrix.csv", "a,b\n", "is damaged"),
-    ],
-)
-def test_what_is_wrong_is_named(tmp_path: Path, name: str, content: str, said: str) -> None:
-    write_stray(tmp_path, room(2))
-    (tmp_path / "71de12f9" / name).write_text(content)
-    with pytest.raises(DataError, match=said):
-        RGBDFolder(str(tmp_path)).frames("71de12f9")

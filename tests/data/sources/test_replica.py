@@ -47,9 +47,3 @@ def test_a_pose_is_the_line_of_its_frame_number(tmp_path):
     source = Replica(str(tmp_path / "room1"))
     assert source.scenes == ("room1",)
     assert source.load("room1", [1, 3]).world_to_camera[:, 0, 3].tolist() == [-1, -3]
-
-
-def test_too_few_lines_are_an_error(tmp_path):
-    write(tmp_path, (17, 30), frames=(0, 1, 2, 3), lines=3)
-    with pytest.raises(DataError, match=r"traj\.txt of scene room1 .*frames 0 to 3; it has 3 lines of 16"):
-        Replica(str(tmp_path)).frames("room1")

@@ -1,16 +1,20 @@
 """Synthetic scene -> a dataset's layout on disk -> its loader: the same images, depth, poses and intrinsics."""
 
 import pickle
+from contextlib import nullcontext
 
 import pytest
 import torch
 
+from vg2gt.data import DataError
 from vg2gt.geometry.cameras import relative_to_first
 from vg2gt.types import Cameras
 
 from .layouts import SIZE, Layout, all_layouts, room
 
 LAYOUTS = all_layouts()
+NEED_ALL = ("rgbd", "rgbd_open3d", "rgbd_icl_nuim", "tanks_and_temples")
+"""Poses belong to images by their order, so that none may be absent."""
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +33,6 @@ def test_a_scene_comes_back(name, frames, tmp_path):
     order = [2, 0, 4]
     loaded = source.load(scene, [ids[i] for i in order])
     expected = frames.map(lambda tensor: tensor[order])
-
     assert loaded.images.shape[-2:] == SIZE
     assert float((loaded.images - expected.images).abs().mean()) <= layout.image_error + 1e-6
     if not source.has_cameras:
@@ -57,7 +60,7 @@ def test_a_scene_comes_back(name, frames, tmp_path):
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
-def test_a_loader_travels_to_workers_and_its_index_is_cached(name, frames, tmp_path):
+def test_a_loader_travels_to_workers_and_its_index_is_cached_until_files_change(name, frames, tmp_path):
     layout: Layout = LAYOUTS[name]
     layout.write(tmp_path / "data", frames)
     source = layout.read(tmp_path / "data")
@@ -71,6 +74,13 @@ def test_a_loader_travels_to_workers_and_its_index_is_cached(name, frames, tmp_p
         for value, expected in zip(vars(again).values(), vars(direct).values(), strict=True):
             assert torch.equal(value, expected) if isinstance(value, torch.Tensor) else value == expected
         assert len(list((tmp_path / "cache").rglob("*.npz"))) == 1
+    files = [path for path in sorted((tmp_path / "data").rglob("*")) if path.suffix in (".png", ".jpg", ".npy", ".pfm")]
+    if len(files) > 2:  # else all is in one file
+        files[-1].unlink()
+        changed = layout.read(tmp_path / "data")
+        changed.index_cache = tmp_path / "cache"
+        with pytest.raises(DataError) if name in NEED_ALL else nullcontext():
+            assert len(changed.frames(scene)) == len(source.frames(scene)) - 1
 
 
 def _from_first(poses: torch.Tensor, frames) -> torch.Tensor:

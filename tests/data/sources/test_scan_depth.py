@@ -5,11 +5,10 @@ from functools import partial
 
 import numpy as np
 import pytest
-import torch
 
-from vg2gt.data import DataError, Frames, SyntheticScenes
+from vg2gt.data import DataError, Frames
 from vg2gt.data.sources import DTU, TanksAndTemples
-from vg2gt.data.sources.scan_depth import ScanDepth, read_points, render_points
+from vg2gt.data.sources.scan_depth import ScanDepth, render_points
 from vg2gt.geometry.cameras import unproject
 from vg2gt.io.ply_container import vertices_content
 from vg2gt.types import Cameras
@@ -73,29 +72,6 @@ def test_what_is_behind_a_sparse_surface_is_hidden():
     assert (shining == 4).mean() > 0.5  # without the window, the wall would be full of holes
 
 
-def test_points_behind_and_beside_the_camera_do_not_count():
-    points = np.array([[0, 0, -1], [50, 0, 1], [0, 0, 0], [0, 0, 2]], np.float32)
-    depth = render_points(points, np.eye(4), K, VIEW)
-    assert (depth > 0).sum() == 1
-    assert depth[40, 50] == 2  # the principal point (49.5, 39.5) is the corner of four pixels
-
-
-def test_a_furnished_room_agrees_with_its_ray_caster():
-    """The procedural room's depth in one view against its points from all views."""
-    size = (120, 160)
-    source = SyntheticScenes(1, num_frames=4, size=size)
-    frames = source.load(source.scenes[0], range(4))
-    points = _points(frames)
-    pose, intrinsics = frames.world_to_camera[2].double().numpy(), frames.intrinsics[2].double().numpy()
-    depth = torch.from_numpy(render_points(points, pose, intrinsics, size, window=3))
-    seen = depth > 0
-    error = (depth / frames.depth[2] - 1).abs()[seen]
-    assert float(seen.float().mean()) > 0.8
-    assert float(error.median()) < 0.005
-    # Of the farther of two surfaces that meet in a pixel, nothing is left.
-    assert float((depth / frames.depth[2])[seen].quantile(0.999)) < 1.02
-
-
 def test_images_are_kept_and_made_again_when_the_scan_changes(tmp_path):
     scan, points = tmp_path / "scan.ply", _wall(0.02, 4, 4, 2.0)
     scan.write_bytes(_ply(points))
@@ -118,47 +94,6 @@ def test_images_are_kept_and_made_again_when_the_scan_changes(tmp_path):
     os.utime(scan, ns=(1, 1))
     assert read()[40, 50] == 4
     assert ScanDepth().read(scan, "barn", np.eye(4), K, VIEW, unit=0.5)[40, 50] == 2
-
-
-@pytest.mark.parametrize("options", [{"occlusion": 0.9}, {"window": 4}, {"window": 0}])
-def test_senseless_options_are_refused(options):
-    with pytest.raises(ValueError, match="must be"):
-        ScanDepth(**options)
-
-
-def test_a_cache_that_cannot_be_written_is_gone_without(tmp_path, caplog):
-    (tmp_path / "scan.ply").write_bytes(_ply(_wall(0.05, 4, 4, 2.0)))
-    (tmp_path / "cache").write_text("a file where the folder should be")
-    depth = ScanDepth(tmp_path / "cache").read(tmp_path / "scan.ply", "a", np.eye(4), K, VIEW)
-    assert (depth > 0).any()
-    assert "nothing more is kept in the cache folder" in caplog.text
-
-
-def test_damaged_scans_are_named(tmp_path):
-    scan = tmp_path / "scan.ply"
-    with pytest.raises(DataError, match=r"scene barn.*scan\.ply"):
-        read_points(scan, "barn")
-    whole = _ply(_wall(0.5, 4, 4, 2.0))
-    rng = np.random.default_rng(0)
-    messages = []
-    for _ in range(300):
-        content = bytearray(whole)
-        if rng.random() < 0.3:
-            content = content[: rng.integers(len(content))]
-        for place in rng.integers(0, max(1, min(len(content), 200 if rng.random() < 0.7 else 10**6)), 3):
-            content[place : place + 1] = bytes([rng.integers(256)])
-        scan.write_bytes(content)
-        try:
-            points = read_points(scan, "barn")
-        except DataError as error:
-            messages.append(str(error))
-        else:
-            assert np.isfinite(points).all()
-    assert 100 < len(messages) < 300
-    assert all("barn" in message for message in messages)
-    scan.write_bytes(_ply(np.full((4, 3), np.nan)))
-    with pytest.raises(DataError, match="has no points"):
-        read_points(scan, "barn")
 
 
 def _points(frames: Frames) -> np.ndarray:

@@ -2,22 +2,19 @@
 
 import logging
 import struct
-import tracemalloc
 import zlib
 
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 from vg2gt.data import DataError, RGBDFolder
 from vg2gt.data.sources import ScanNet, ScanNetSens
 
-from .layout_scannet import millimetres, sens_frame, sens_header, write_export, write_sens
-from .layouts import camera_to_world, pixels, room
+from .layout_scannet import sens_frame, sens_header, write_export, write_sens
+from .layouts import millimetres, pixels, room
 
 SCENE = "scene0707_00"
-COUNT_AT = 4 + 8 + 15 + 4 * 64 + 2 * 4 + 4 * 4 + 4
 """First byte of the number of frames."""
 
 
@@ -36,27 +33,6 @@ def test_frames_are_sorted_by_number_and_lost_ones_left_out(tmp_path, frames, ca
     assert "1 of 4 frames whose pose is not finite are left out" in caplog.text
     assert loader is ScanNet or "folders color/ and depth/, 3 frames" in caplog.text
     assert torch.allclose(source.load(SCENE, [10]).world_to_camera[0], frames.world_to_camera[2], atol=1e-6)
-
-
-@pytest.mark.parametrize("loader", [ScanNet, RGBDFolder])
-def test_colour_is_resized_to_the_depth_images_whose_intrinsics_count(tmp_path, frames, loader):
-    """The layout's colour intrinsics are those of images twice as large."""
-    write_export(tmp_path, frames)
-    for path in (tmp_path / "scans" / SCENE / "color").iterdir():
-        with Image.open(path) as image:
-            larger = image.resize((2 * image.width, 2 * image.height), Image.Resampling.NEAREST)
-        larger.save(path, quality=95, subsampling=0)
-    loaded = loader(str(tmp_path / "scans")).load(SCENE, [8, 9, 10, 11])
-    assert loaded.images.shape == frames.images.shape
-    assert float((loaded.images - frames.images).abs().mean()) < 0.03
-    assert torch.allclose(loaded.intrinsics, frames.intrinsics, atol=1e-4)
-
-
-def test_the_depth_intrinsics_are_needed(tmp_path, frames):
-    write_export(tmp_path, frames)
-    (tmp_path / "scans" / SCENE / "intrinsic" / "intrinsic_depth.txt").unlink()
-    with pytest.raises(DataError, match=r"intrinsic_depth\.txt of scene scene0707_00"):
-        ScanNet(str(tmp_path)).frames(SCENE)
 
 
 def test_scans_of_one_room_show_one_place(tmp_path, frames):
@@ -82,92 +58,12 @@ def test_a_stream_holds_what_its_export_does(tmp_path, frames):
     write_export(tmp_path / "exported", frames)
     raw, exported = ScanNetSens(str(tmp_path / "raw")), ScanNet(str(tmp_path / "exported"))
     assert raw.scenes == exported.scenes == ScanNetSens(str(path.parent)).scenes == (SCENE,)
-    assert raw.place(SCENE) == "scene0707"
-    assert raw.frames(SCENE) == (0, 2, 3)
+    assert (raw.place(SCENE), raw.frames(SCENE)) == ("scene0707", (0, 2, 3))
     ours, theirs = raw.load(SCENE, [3, 0]), exported.load(SCENE, [11, 8])
     assert torch.equal(ours.images, theirs.images)
     assert torch.equal(ours.depth, theirs.depth)
     assert torch.allclose(ours.world_to_camera, theirs.world_to_camera, atol=1e-6)
     assert torch.allclose(ours.intrinsics, theirs.intrinsics, atol=1e-4)
-
-
-def test_a_cached_stream_is_not_scanned_again(tmp_path, frames, monkeypatch):
-    write_sens(tmp_path / "raw", frames, lost=1)
-    root, cache = str(tmp_path / "raw"), str(tmp_path / "cache")
-    first = ScanNetSens(root, index_cache=cache).load(SCENE, [3, 2])
-    monkeypatch.setattr("vg2gt.data.sources.scannet.scan_sens", lambda *_: pytest.fail("scanned again"))
-    again = ScanNetSens(root, index_cache=cache).load(SCENE, [3, 2])
-    assert torch.equal(again.images, first.images)
-    assert torch.equal(again.depth, first.depth)
-
-
-def test_edited_intrinsics_are_read_again(tmp_path, frames):
-    write_export(tmp_path / "data", frames)
-    path = tmp_path / "data" / "scans" / SCENE / "intrinsic" / "intrinsic_depth.txt"
-
-    def focal(loader) -> float:
-        source = loader(str(tmp_path / "data"), index_cache=str(tmp_path / "cache"))
-        return float(source.load(source.scenes[0], [8]).intrinsics[0, 0, 0])
-
-    for loader in (ScanNet, RGBDFolder):
-        before = focal(loader)
-        matrix = np.loadtxt(path)
-        matrix[0, 0] *= 2
-        np.savetxt(path, matrix)
-        assert focal(loader) == pytest.approx(2 * before)
-
-
-def test_a_frame_is_read_without_the_rest_of_the_file(tmp_path, frames):
-    """Between two frames lies an image of 2 GiB, as a hole."""
-    parts = [
-        sens_frame(pixels(frames)[i], millimetres(frames)[i], camera_to_world(frames)[i], True, True) for i in (0, 1)
-    ]
-    path = tmp_path / f"{SCENE}.sens"
-    hole = 1 << 31
-    with path.open("wb") as file:
-        file.write(sens_header(frames, 3, 2, 1) + parts[0])
-        file.write(np.eye(4, dtype="<f4").tobytes() + struct.pack("<4Q", 0, 0, hole, 0))
-        file.seek(hole, 1)
-        file.write(parts[1])
-    source = ScanNetSens(str(tmp_path))
-    tracemalloc.start()
-    try:
-        assert source.frames(SCENE) == (0, 1, 2)
-        loaded = source.load(SCENE, [2])
-        assert tracemalloc.get_traced_memory()[1] < 2**23
-    finally:
-        tracemalloc.stop()
-        path.unlink()
-    assert torch.equal(loaded.depth[0] > 0, frames.depth[1] > 0)
-
-
-def _overwrite(content: bytes, place: int, *values: bytes) -> bytes:
-    new = b"".join(values)
-    return content[:place] + new + content[place + len(new) :]
-
-
-HUGE = struct.pack("<Q", 1 << 61)
-DAMAGE = {
-    "another version": (lambda c: _overwrite(c, 0, b"\5"), "version 5 of the format, expected 4"),
-    "a long name": (lambda c: _overwrite(c, 4, HUGE), "sensor's name of 2305843009213693952 bytes"),
-    "an unknown compression": (lambda c: _overwrite(c, COUNT_AT - 24, b"\2"), "colour of type 2 and depth of type 2"),
-    "wide images": (lambda c: _overwrite(c, COUNT_AT - 20, b"\xff\xff\xff\xff"), "images of 4294967295x30"),
-    "no unit": (lambda c: _overwrite(c, COUNT_AT - 4, bytes(4)), "0.0 depth units per metre"),
-    "many frames": (lambda c: _overwrite(c, COUNT_AT, HUGE), "it ends .*within"),
-    "no frame": (lambda c: _overwrite(c, COUNT_AT, bytes(8)), "it holds no frame"),
-    "a long image": (lambda c: _overwrite(c, COUNT_AT + 8 + 64 + 16, HUGE), "it ends within frame 0 of 4"),
-    "cut within a frame": (lambda c: c[: len(c) * 3 // 4], "it ends .*within"),
-    "cut within the heading": (lambda c: c[:100], "it ends after 100 bytes, within a header"),
-}
-
-
-@pytest.mark.parametrize("name", DAMAGE)
-def test_a_damaged_stream_is_refused_by_what_is_wrong(tmp_path, frames, name):
-    path = write_sens(tmp_path, frames)
-    damage, message = DAMAGE[name]
-    path.write_bytes(damage(path.read_bytes()))
-    with pytest.raises(DataError, match=rf"cannot read .*{SCENE}\.sens of scene {SCENE}: .*{message}"):
-        ScanNetSens(str(tmp_path)).frames(SCENE)
 
 
 def test_depth_that_expands_without_end_is_refused(tmp_path, frames):
@@ -189,16 +85,3 @@ def test_a_stream_that_shrinks_after_it_was_indexed_is_an_error(tmp_path, frames
     path.write_bytes(path.read_bytes()[:2000])
     with pytest.raises(DataError, match=r"scene0707_00\.sens of scene scene0707_00 has become shorter"):
         source.load(SCENE, [3])
-
-
-def test_a_real_recording_in_this_layout_reads_as_an_rgbd_folder_does(shared):
-    """The geometry of that folder is checked in the tests of the RGB-D folder."""
-    root = shared / "data" / "seven_scenes_redkitchen_a_registered"
-    ours, theirs = ScanNet(str(root)), RGBDFolder(str(root))
-    (scene,) = ours.scenes
-    ids = ours.frames(scene)
-    assert len(ids) == 56
-    assert ids == tuple(theirs.frames(scene))
-    first, second = ours.load(scene, ids[::20]), theirs.load(scene, ids[::20])
-    for name in ("images", "depth", "world_to_camera", "intrinsics"):
-        assert torch.equal(getattr(first, name), getattr(second, name))

@@ -31,10 +31,7 @@ def model_of(
     seen_as: Callable[[np.ndarray], np.ndarray] = lambda positions: positions,
     observed: bool = True,
 ):
-    """Points in a box 4 to 6 units before the cameras, features off by 0.3 pixels.
-
-    ``moved`` changes what the model says of the points, ``seen_as`` where the views saw them.
-    """
+    """Points in a box 4 to 6 units before the cameras, features off by 0.3 pixels."""
     rng = np.random.default_rng(0)
     positions = rng.uniform((-1, -1, 4), (1, 1, 6), (POINTS, 3))
     poses = poses_of(baseline)

@@ -1,13 +1,9 @@
 """TUM RGB-D's own traps: three clocks, lists of absent files, cameras known by the folder's name."""
 
-import logging
-import shutil
-
 import numpy as np
 import pytest
-from PIL import Image
 
-from examples.data_sets.tum import INTRINSICS, TUM, associate
+from examples.data_sets.tum import TUM, associate
 from vg2gt.data import DataError
 
 from .layout_tum import write
@@ -31,124 +27,7 @@ def test_times_are_paired_nearest_first_and_once():
     assert associate(times, np.zeros(0), 0.02) == {}
 
 
-def test_absent_files_are_counted(tmp_path, frames, caplog):
-    """The layout's lists name two images that do not exist."""
-    write(tmp_path, frames)
-    (tmp_path / SCENE / "depth").joinpath(sorted(p.name for p in (tmp_path / SCENE / "depth").iterdir())[1]).unlink()
-    with caplog.at_level(logging.WARNING):
-        assert TUM(str(tmp_path)).frames(SCENE) == (0, 2)
-    assert "1 of 5 frames without a depth file" in caplog.text
-    assert "2 of 5 frames without a colour image" in caplog.text
-
-
-def test_frames_apart_in_time_do_not_belong_together(tmp_path, frames):
-    """Depth is taken 11 ms after colour, poses are 3 ms apart."""
-    write(tmp_path, frames)
-    assert len(TUM(str(tmp_path), max_difference=0.012).frames(SCENE)) == 3
-    with pytest.raises(DataError, match=r"has no depth images: none of those listed in depth\.txt"):
-        TUM(str(tmp_path), max_difference=0.010).frames(SCENE)
-
-
-@pytest.mark.parametrize(
-    ("name", "camera"),
-    [
-        ("rgbd_dataset_freiburg1_xyz", "freiburg1"),
-        ("rgbd_dataset_freiburg2_large_no_loop", "freiburg2"),
-        ("fr3_office", "freiburg3"),
-    ],
-)
-def test_the_folders_name_says_which_camera(tmp_path, frames, name, camera):
-    write(tmp_path, frames, name)
-    index = TUM(str(tmp_path)).scene_index(name)
-    fx, fy, cx, cy = INTRINSICS[camera]
-    assert index.intrinsics[0].tolist() == [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]
-    given = TUM(str(tmp_path), intrinsics=[1, 2, 3, 4]).scene_index(name)
-    assert given.intrinsics[0].tolist() == [[1, 0, 3], [0, 2, 4], [0, 0, 1]]
-
-
 def test_an_unknown_camera_is_asked_for(tmp_path, frames):
     write(tmp_path, frames, "freiburg12")
     with pytest.raises(DataError, match=r"scene freiburg12 .*data.intrinsics=\[fx,fy,cx,cy\]"):
         TUM(str(tmp_path)).frames("freiburg12")
-
-
-def test_files_are_listed_in_order_of_time(tmp_path, frames):
-    write(tmp_path, frames)
-    expected = TUM(str(tmp_path)).load(SCENE, [0, 1, 2])
-    path = tmp_path / SCENE / "rgb.txt"
-    path.write_text("\n".join(reversed(path.read_text().splitlines())))
-    assert np.array_equal(TUM(str(tmp_path)).load(SCENE, [0, 1, 2]).images, expected.images)
-
-
-LINE = "1305031102.0 1 2 3 0 0 0 1\n"
-DAMAGE = {
-    "no poses": ("groundtruth.txt", None, f"scene {SCENE} in .* has no groundtruth.txt"),
-    "no list": ("depth.txt", None, r"cannot read .*depth\.txt of scene"),
-    "an empty list": ("depth.txt", "# nothing\n", r"depth\.txt of scene .* lists no file"),
-    "no path": ("rgb.txt", "1305031102.0\n", "must have lines of 'timestamp path', not '1305031102.0'"),
-    "no time": ("rgb.txt", "nan rgb/a.png\n", "must have lines of 'timestamp path'"),
-    "a time twice": ("rgb.txt", "1.5 rgb/a.png\n1.50 rgb/b.png\n", r"lists 1\.50 twice"),
-    "matrices": ("groundtruth.txt", "0 " * 13, "lines of 'timestamp tx ty tz qx qy qz qw', not 13 numbers"),
-    "no rotation": ("groundtruth.txt", LINE.replace(" 1\n", " 0\n"), "1 frames whose pose is not finite"),
-    "a lost pose": ("groundtruth.txt", LINE.replace("2 3", "nan 3"), "1 frames whose pose is not finite"),
-}
-
-
-@pytest.mark.parametrize("name", DAMAGE)
-def test_damage_is_named(tmp_path, frames, name):
-    write(tmp_path, frames)
-    file, content, message = DAMAGE[name]
-    path = tmp_path / SCENE / file
-    if content is None:
-        path.unlink()
-    else:
-        path.write_text(content)
-    with pytest.raises(DataError, match=message):
-        TUM(str(tmp_path)).frames(SCENE)
-
-
-def test_a_real_recording_without_poses_and_with_made_up_ones(shared, tmp_path, caplog):
-    original = shared / "data" / "tum_layout"
-    source = TUM(str(original), intrinsics=[525, 525, 319.5, 239.5])
-    with pytest.raises(DataError, match=r"tum_layout.*has no groundtruth\.txt"):
-        source.frames("tum_layout")
-    folder = tmp_path / "freiburg1_recording"
-    shutil.copytree(original, folder)
-    times = [line.split()[0] for line in (folder / "rgb.txt").read_text().splitlines()[1:]]
-    (folder / "groundtruth.txt").write_text("".join(f"{time} 0 0 0 0 0 0 1\n" for time in times))
-    with caplog.at_level(logging.WARNING):
-        source = TUM(str(folder))
-        assert source.frames(folder.name) == tuple(range(10))
-    assert f"{len(times) - 10} of {len(times)} frames without a colour image" in caplog.text
-    loaded = source.load(folder.name, range(10))
-    assert loaded.images.shape[-2:] == (480, 640)
-    assert float(loaded.depth.max()) < 65535 / 5000
-    assert float((loaded.depth > 0).float().mean()) == pytest.approx(1 - 0.357 - 0.030, abs=0.001)  # 0 and 65535
-    assert float(loaded.depth[loaded.depth > 0].median()) == pytest.approx(1.111, abs=0.001)
-
-
-def test_real_ground_truth_is_a_smooth_path(shared, tmp_path):
-    """Motion capture took 100 poses per second, but none for 0.11 s, which costs two frames."""
-    folder = tmp_path / "rgbd_dataset_freiburg1_xyz"
-    folder.mkdir()
-    shutil.copy(shared / "data/trajectories/tum_freiburg1_xyz_groundtruth.txt", folder / "groundtruth.txt")
-    times = 1305031098.7 + np.arange(0, 29, 1 / 30)
-    for kind in ("rgb", "depth"):
-        (folder / kind).mkdir()
-        (folder / f"{kind}.txt").write_text("".join(f"{time:.6f} {kind}/{time:.6f}.png\n" for time in times))
-    write_small(folder, times)
-    index = TUM(str(folder)).scene_index(folder.name)
-    assert index.dropped == {"without a pose": 2}
-    centres = -np.einsum("nji,nj->ni", index.world_to_camera[:, :3, :3], index.world_to_camera[:, :3, 3])
-    assert np.linalg.norm(np.diff(centres, axis=0), axis=1).max() < 0.08
-    assert centres.min(0) == pytest.approx([1.01, 0.27, 1.32], abs=0.01)
-    assert centres.max(0) == pytest.approx([1.46, 0.96, 1.76], abs=0.01)
-
-
-def write_small(folder, times):
-    """The same small image for every time."""
-    Image.fromarray(np.ones((3, 4), np.uint16)).save(folder / "d.png")
-    Image.fromarray(np.ones((3, 4, 3), np.uint8)).save(folder / "c.png")
-    for time in times:
-        (folder / "rgb" / f"{time:.6f}.png").symlink_to(folder / "c.png")
-        (folder / "depth" / f"{time:.6f}.png").symlink_to(folder / "d.png")

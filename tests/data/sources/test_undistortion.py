@@ -121,17 +121,6 @@ def test_an_image_becomes_the_pinhole_cameras():
     assert np.abs(result - expected).max() <= 2
 
 
-def test_fisheye_follows_the_angle():
-    k = {"k1": 0.03, "k2": -0.01}
-    found = undistortion(k, fisheye=True)
-    x, y = found.size[1] - 1, 0  # a corner, where nothing is interpolated
-    ray = np.array([*_directions(found.intrinsics, found.size)[y, x], 1.0])
-    angle = np.arccos(1 / np.linalg.norm(ray))
-    radius = angle * (1 + k["k1"] * angle**2 + k["k2"] * angle**4)
-    expected = ray[:2] / np.linalg.norm(ray[:2]) * radius * [K[0, 0], K[1, 1]] + K[:2, 2]
-    np.testing.assert_allclose(found.places[y, x], expected, atol=1e-4)
-
-
 def test_depth_takes_one_pixel_and_holes_stay():
     depth = np.where(np.arange(SIZE[1]) < 60, 2.0, 5.0).astype(np.float32) * np.ones(SIZE, np.float32)
     depth[::4] = 0

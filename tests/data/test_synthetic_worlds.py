@@ -1,0 +1,176 @@
+"""What the generator's rooms, streets, objects and landmarks are like, and how they shine."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from vg2gt.data.synthetic.builder import Builder
+from vg2gt.data.synthetic.orbits import SyntheticLandmark, SyntheticObject
+from vg2gt.data.synthetic.outdoor import SyntheticOutdoor
+from vg2gt.data.synthetic.raycast import AXES, HALF, KIND, PART_COLUMNS
+from vg2gt.data.synthetic.renderer import World, render_frame
+from vg2gt.data.synthetic.rooms import SyntheticRoom, SyntheticWideRoom
+from vg2gt.data.synthetic.source import VARIANTS
+from vg2gt.data.synthetic.synthetic_scene import level_poses
+
+SIZE = (28, 56)
+
+
+@pytest.fixture(scope="module")
+def streets() -> list[SyntheticOutdoor]:
+    return [SyntheticOutdoor(seed, 8, SIZE) for seed in range(12)]
+
+
+def places(scene) -> np.ndarray:
+    return np.linalg.inv(scene.world_to_camera)[:, :3, 3]
+
+
+def turned(scene) -> float:
+    """Degrees from the first to the last camera, around the middle."""
+    position = places(scene)
+    angles = np.unwrap(np.arctan2(position[:, 1], position[:, 0]))
+    return float(np.degrees(abs(angles[-1] - angles[0])))
+
+
+@pytest.mark.parametrize("kind", VARIANTS.values())
+def test_the_seed_decides_the_world_and_highlights_its_colour_alone(kind):
+    scene, again, other = kind(3, 4, SIZE), kind(3, 4, SIZE), kind(4, 4, SIZE)
+    a, b = scene.render([2], 1)[0], again.render([2], 1)[0]
+    assert np.array_equal(a.image, b.image)
+    assert np.array_equal(a.depth, b.depth)
+    assert not np.array_equal(a.depth, other.render([2], 1)[0].depth)
+    shiny = kind(3, 4, SIZE, highlights=True)
+    for name in ("parts", "part_materials", "materials", "lights", "walls"):
+        assert np.array_equal(getattr(scene.world, name), getattr(shiny.world, name))
+    assert np.array_equal(scene.world_to_camera, shiny.world_to_camera)
+    brighter = 0
+    for a, b in zip(scene.render(range(4), 1), shiny.render(range(4), 1), strict=True):
+        assert np.array_equal(a.depth, b.depth)
+        assert np.array_equal(a.normal, b.normal)
+        assert (b.image.astype(int) - a.image >= -1).all()  # light is added, never taken
+        brighter += (b.image > a.image + 3).any(-1).mean()
+    assert brighter > 0.001
+
+
+@pytest.mark.parametrize("kind", [SyntheticObject, SyntheticLandmark, SyntheticWideRoom])
+def test_cameras_are_outside_of_everything_and_inside_the_world(kind):
+    for seed in range(25):
+        scene = kind(seed, 16, SIZE)
+        walls, position = scene.world.walls, places(scene)
+        assert (position > walls[0] + 0.05).all()
+        assert (position < walls[1] - 0.05).all()
+        for row in scene.world.parts:
+            own = np.abs((position - row[:3]) @ row[AXES:HALF].reshape(3, 3).T) / row[HALF:KIND]
+            assert (own.max(1) > 1).all()  # outside of the box around the part
+
+
+def test_streets_are_deep_and_their_sky_has_no_depth(streets):
+    skies, deepest = [], []
+    for scene in streets:
+        for frame in scene.render([0, 7], 1):
+            sky = frame.depth == 0
+            assert frame.depth[~sky].min() > 0.5  # nothing stands on the camera's line
+            skies.append(sky.mean())
+            deepest.append(frame.depth.max())
+    assert 0.03 < np.mean(skies) < 0.5
+    assert np.median(deepest) > 50
+    assert max(deepest) < 91
+
+
+def test_culling_and_the_sun_lose_no_hit(streets):
+    """Every part is hit, and shadowed, as if there were no bounding spheres."""
+    scene = streets[0]
+    everything = scene.world.groups.copy()
+    everything[:, 3] = 1e6
+    plain = replace(scene.world, groups=everything)
+    pose = scene.world_to_camera[3]
+    culled, full = (render_frame(world, pose, scene.intrinsics, SIZE) for world in (scene.world, plain))
+    assert np.array_equal(culled.depth, full.depth)
+    assert (culled.image != full.image).mean() < 1e-3  # a ray that grazes two parts
+
+
+def test_objects_are_seen_from_all_around_in_steps_of_10_to_40_degrees():
+    steps, around, open_air = [], [], []
+    for seed in range(40):
+        scene = SyntheticObject(seed, 24, SIZE)
+        position = places(scene)
+        angles = np.unwrap(np.arctan2(position[:, 1], position[:, 0]))
+        steps.append(np.degrees(np.abs(np.diff(angles))))
+        around.append(turned(scene))
+        open_air.append(scene.world.sky is not None)
+    steps = np.concatenate(steps)
+    assert steps.min() >= 8
+    assert steps.max() <= 48  # a fifth of a step more or less, as a hand does
+    assert np.median(around) > 360
+    assert 0.2 < np.mean(open_air) < 0.6
+
+
+def test_an_object_is_in_the_middle_of_the_picture_and_does_not_fill_it():
+    centered, covered = [], []
+    for seed in range(20):
+        scene = SyntheticObject(seed, 4, (56, 112))
+        distance = np.linalg.norm(places(scene)[0])
+        depth = scene.render([0], 1)[0].depth
+        middle = depth[18:38, 46:66]
+        centered.append((middle > 0).any() and middle[middle > 0].min() < distance)
+        covered.append(((depth > 0) & (depth < 0.8 * distance)).mean())
+    assert np.mean(centered) > 0.9
+    assert np.median(covered) < 0.3  # the floor before it included
+
+
+def test_landmarks_have_a_sky_a_far_background_and_wide_baselines():
+    skies, deepest, around = [], [], []
+    for seed in range(12):
+        scene = SyntheticLandmark(seed, 8, SIZE)
+        around.append(turned(scene))
+        frames = scene.render([0, 5], 1)
+        skies.append(np.mean([frame.depth == 0 for frame in frames]))
+        deepest.append(max(frame.depth.max() for frame in frames))
+        assert min(frame.depth[frame.depth > 0].min() for frame in frames) > 1
+    assert 0.2 < np.mean(skies) < 0.6
+    assert np.median(deepest) > 150
+    assert max(deepest) < 1000
+    assert np.median(around) > 70
+
+
+def test_a_wide_room_is_the_room_of_its_seed_seen_from_all_around():
+    steps = []
+    for seed in range(8):
+        room, wide = SyntheticRoom(seed, 12, SIZE), SyntheticWideRoom(seed, 12, SIZE)
+        assert np.array_equal(room.world.parts, wide.world.parts)
+        assert np.array_equal(room.world.materials, wide.world.materials)
+        steps.append([np.linalg.norm(np.diff(places(each), axis=0), axis=1).mean() for each in (room, wide)])
+    narrow, spread = np.mean(steps, 0)
+    assert spread > 5 * narrow
+
+
+def test_a_point_looks_the_same_from_everywhere_unless_it_shines():
+    """The colour of one point of the floor, seen from eight places through a pixel too small to blur anything."""
+    builder = Builder(np.random.default_rng(0))
+    floor = builder.new_material()
+    world = World(
+        walls=np.array([[-3.0, -3.0, 0.0], [3.0, 3.0, 3.0]]),
+        wall_materials=np.full(6, floor),
+        parts=np.empty((0, PART_COLUMNS)),
+        part_materials=np.empty(0, np.int64),
+        groups=builder.groups(),
+        materials=np.array(builder.materials),
+        lights=np.array([[1.0, 0.0, 2.0, 0.6, 0.6, 0.6]]),
+        ambient=0.3,
+    )
+    shiny = replace(world, highlights=np.array([[0.5, 20.0]]))
+    point, intrinsics = np.array([0.2, 0.1, 0.0]), np.diag([1e6, 1e6, 1.0])
+    colors = []  # [8, matt and shiny, 3]
+    for angle in np.arange(8) * np.pi / 4:
+        eye = point + 1.5 * np.array([np.cos(angle), np.sin(angle), 1.0])
+        toward = point - eye
+        pan, nod = np.arctan2(toward[1], toward[0]), np.arcsin(toward[2] / np.linalg.norm(toward))
+        pose = np.linalg.inv(level_poses(eye[None], np.array([pan]), np.array([nod]))[0])
+        seen = [render_frame(each, pose, intrinsics, (1, 1)) for each in (world, shiny)]
+        assert seen[0].depth == seen[1].depth == pytest.approx(1.5 * np.sqrt(2), rel=1e-6)
+        colors.append([each.image[0, 0].astype(int) for each in seen])
+    matt, shining = np.array(colors).swapaxes(0, 1)
+    assert np.ptp(matt, axis=0).max() <= 1
+    assert np.ptp(shining, axis=0).min() > 20
+    assert shining.sum(1).argmax() == 4  # opposite the lamp
