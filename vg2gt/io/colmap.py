@@ -106,9 +106,13 @@ def read_colmap(folder: str | Path) -> Reconstruction:
         for name in FILES:
             _stage(name, files.get(name), Path(temporary), files["cameras"].suffix.lower())
         try:
-            return pycolmap.Reconstruction(temporary)
+            model = pycolmap.Reconstruction(temporary)
         except (ValueError, IndexError, KeyError, RuntimeError, MemoryError) as error:
             raise FormatError(f"{folder}: damaged COLMAP model ({_reason(error)})") from error
+    empty = [camera.camera_id for camera in model.cameras.values() if not camera.width * camera.height]
+    if empty:
+        raise FormatError(f"{files['cameras']}: camera {empty[0]} has images without pixels; the file is damaged")
+    return model
 
 
 def write_colmap(folder: str | Path, model: Reconstruction, *, text: bool = False) -> Path:

@@ -185,7 +185,7 @@ def _count_images(folder: Path) -> int:
 def _is_stored(model: Reconstruction, record: Image, path: Path) -> bool:
     """Whether the colours of a model's points speak for an image as stored, against the same turned upright."""
     camera, differences = record.camera, []
-    features = [feature for feature in record.points2D if feature.has_point3D()]
+    features = [feature for feature in record.points2D if feature.point3D_id in model.points3D]
     if not features:
         return False
     expected = np.array([model.points3D[feature.point3D_id].color for feature in features], np.float64)

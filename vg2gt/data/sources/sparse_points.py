@@ -87,6 +87,8 @@ class _Points:
         rows, views, features = [], [], []
         for view, image in enumerate(images):
             for feature in image.get_observation_points2D():
+                if feature.point3D_id not in row_of:  # a model without its file of points
+                    continue
                 rows.append(row_of[feature.point3D_id])
                 views.append(view)
                 features.append(feature.xy)
