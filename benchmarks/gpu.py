@@ -224,7 +224,7 @@ def reconstruct(setting: Setting) -> Iterator[Result]:
     from vg2gt.runs.load import load_model
 
     backend, model, size = ("da3_tiny", "tiny", (28, 56)) if setting.small else ("da3_large", "vg2gt", (224, 448))
-    ready = load_model(None, f"{backend},pretrained=false", model, device=str(setting.device))
+    ready = load_model(None, backend, ["backend.pretrained=false", f"model={model}"], str(setting.device))
     implementation = "triton" if setting.device.type == "cuda" else "auto"  # whether or not the check refuses it
     renderer = replace(ready.renderer, implementation=implementation)
     for count in (2,) if setting.small else (10, 50):

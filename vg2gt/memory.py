@@ -22,9 +22,9 @@ EVALUATION = (
     "(+backend.head_chunk=2, +model.fine.dense_head.views_per_chunk=2)"
 )
 RECONSTRUCTION = (
-    "fewer images (--max-images, --every), smaller ones (--size), fewer voxels (--set model.fine.max_voxels=500000), "
-    "fewer Gaussians (--set model.gaussians.max_gaussians=1000000) or smaller chunks (--set backend.head_chunk=2, "
-    "--set model.fine.dense_head.views_per_chunk=2)"
+    "fewer images (--max-images, --every), smaller ones (--size), fewer voxels (model.fine.max_voxels=500000), "
+    "fewer Gaussians (model.gaussians.max_gaussians=1000000) or smaller chunks (backend.head_chunk=2, "
+    "model.fine.dense_head.views_per_chunk=2)"
 )
 
 # Parts of the messages of torch's allocators and of CUDA's, where the error has no class of its own.

@@ -127,8 +127,8 @@ def check_pycolmap(images: ImagesLike, poses: Poses) -> None:
 def _no_depth(backend: str, images: ImagesLike) -> str:
     return (
         f"backend {backend} works from measured depth, and there is none with {describe(images)}: it reconstructs "
-        "recordings only (depth/ beside images/, with poses.txt and K.txt). For photographs leave --backend and --ckpt "
-        "out (the plane sweep in the package is taken), or take --backend da3_small; a checkpoint fits the backend it "
+        "recordings only (depth/ next to images/, with poses.txt and K.txt). For photographs leave backend= and --ckpt "
+        "out (the plane sweep in the package is taken), or take backend=da3_small; a checkpoint fits the backend it "
         "was trained on"
     )
 
@@ -142,7 +142,7 @@ def _check(model: Reconstructor, poses: str) -> None:
     if poses in ("given", "sfm") and not backend.needs_hints:
         raise ValueError(
             f"backend {backend.name} takes no cameras, it predicts its own: leave --poses out, or choose one that "
-            "takes them, such as --backend da3_small,given_poses=true"
+            "takes them, such as backend=da3_small backend.given_poses=true"
         )
     if poses == "sfm" and backend.needs_depth:
         raise ValueError(f"backend {backend.name} works from the depth and poses of a recording; leave --poses out")

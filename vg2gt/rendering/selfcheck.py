@@ -36,7 +36,7 @@ ROWS = 8  # gradient rows held at once: fewer than a view has, so that views are
 SOURCES = (Path(__file__).resolve(), *sorted((Path(__file__).resolve().parent / "gpu").glob("*.py")))
 ADVICE = (
     "renderer.implementation=torch renders without these kernels, many times slower "
-    "(vg2gt reconstruct: --set renderer.implementation=torch; other commands: --device cpu)"
+    "(vg2gt reconstruct: renderer.implementation=torch; other commands: --device cpu)"
 )
 
 
