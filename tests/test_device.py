@@ -62,7 +62,7 @@ def as_on_a_gpu(monkeypatch: pytest.MonkeyPatch) -> Any:
         monkeypatch.setattr(curve_codes, "has_kernel", lambda device: True)
 
         def automatic(device: torch.device) -> str:
-            selfcheck.require_trusted(renderer.render, device)
+            selfcheck.require_trusted(device)
             return "triton"
 
         monkeypatch.setattr(renderer, "automatic", automatic)

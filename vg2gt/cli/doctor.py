@@ -98,7 +98,6 @@ def _size(folder: Path) -> str:
 
 def _renderer(device: torch.device, timed: bool) -> Iterator[tuple[str, str]]:
     """Which renderer ``auto`` is there, how far the kernels are off (measured anew), and how long it takes."""
-    from vg2gt.rendering import render
     from vg2gt.rendering.renderer import automatic
     from vg2gt.rendering.selfcheck import KernelsRefusedError, compare, identity
 
@@ -110,7 +109,7 @@ def _renderer(device: torch.device, timed: bool) -> Iterator[tuple[str, str]]:
     yield "renderer", chosen
     if device.type != "cpu" and _version("triton") != "missing":
         try:
-            yield "kernels", f"'triton': {compare(render, device)}"
+            yield "kernels", f"'triton': {compare(device)}"
         except Exception as error:  # the report is what this command is for
             yield "kernels", f"'triton' does not run: {type(error).__name__}: {' '.join(str(error).split())[:300]}"
     if timed:

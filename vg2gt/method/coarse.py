@@ -21,8 +21,6 @@ from vg2gt.method.additions.surface_evidence import (
     SURFACE_CHANNELS,
     PointFrames,
     cell_centroids,
-    disagreement,
-    gate,
     vectors_to_surface,
     voxel_evidence,
 )
@@ -199,16 +197,13 @@ class CoarseModule(nn.Module):
         )  # [N, k]
         enhanced = interpolate(voxels, index, weights)  # [N, C]
         gain = torch.ones_like(points.voxel_size)
-        if centroid is None:
-            return enhanced, gain[:, None, None, None]
-        evidence = torch.where(weights > 0, voxel_evidence(points.confidence, plan)[index], 0)
-        to_surface = vectors_to_surface(queries, centers + centroid, evidence, index)
-        frames = PointFrames(points.depth, points.cameras, points.rows)
-        seen = frames.in_camera(to_surface, points.voxel_size[points.batch])
-        if points.clear is not None:
-            seen = torch.where(points.clear[:, None], seen, 0)
-            gain = gate(disagreement(seen[:, -1], points.clear, points.batch, len(gain)))
-        return torch.cat((enhanced, seen, points.confidence.log()[:, None]), -1), gain[:, None, None, None]
+        if centroid is not None:
+            evidence = torch.where(weights > 0, voxel_evidence(points.confidence, plan)[index], 0)
+            to_surface = vectors_to_surface(queries, centers + centroid, evidence, index)
+            frames = PointFrames(points.depth, points.cameras, points.rows)
+            seen, gain = frames.evidence(to_surface, points.voxel_size, points.batch, points.clear)
+            enhanced = torch.cat((enhanced, seen, points.confidence.log()[:, None]), -1)
+        return enhanced, gain[:, None, None, None]
 
     def _to_patches(self, features: Tensor, points: PatchPoints, tokens: Tokens) -> tuple[Tensor, Tensor]:
         """Averages the valid points of every patch: ``[B, V, P, C]`` and whether there were any ``[B, V, P, 1]``."""
