@@ -74,7 +74,7 @@ def export(backend: Backend, out: Path) -> Description:
         out: a folder that does not exist yet, or is empty.
 
     Returns:
-        What stands in the folder's ``backend.json``.
+        What is in the folder's ``backend.json``.
 
     Raises:
         ValueError: if the backend has no graph to export.

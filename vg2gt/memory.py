@@ -70,17 +70,17 @@ def memory_advice(advice: str) -> Iterator[None]:
         _sizes.reset(token)
 
 
-def note_sizes(sizes: Mapping[str, int], anew: bool = False) -> None:
+def note_sizes(sizes: Mapping[str, int], first: bool = False) -> None:
     """Notes how large a pass is, for the message should it fail.
 
     Args:
         sizes: how many of what, in the words of the message.
-        anew: a new pass begins: what was noted of the one before is forgotten.
+        first: a new pass begins: what was noted of the one before is forgotten.
     """
     noted = None if torch.compiler.is_compiling() else _sizes.get()
     if noted is None:
         return
-    if anew:
+    if first:
         noted.clear()
     noted.update(sizes)
 

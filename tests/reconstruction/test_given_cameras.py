@@ -143,7 +143,7 @@ def test_who_gets_which_cameras(model, folder: Path, recording: Path, ready, mon
     monkeypatch.setattr("vg2gt.reconstruction.cameras.find_cameras", find)
     images_alone = load_model(backend="da3_tiny", device="cpu").model
     assert ({p.source for p in choose(model, folder)}, asked) == ({"sfm"}, [4])
-    with pytest.raises(ValueError, match=r"no cameras lie beside .*room: expected cameras.json.*--poses sfm finds"):
+    with pytest.raises(ValueError, match=r"no cameras next to .*room: expected cameras.json.*--poses sfm finds"):
         choose(model, folder, "given")
     put_poses(folder, recording)
     assert {p.source for p in choose(model, folder)} == {p.source for p in choose(model, folder, "given")} != {"sfm"}

@@ -16,7 +16,7 @@ from vg2gt.cli.refine import options_for, print_refinement
 from vg2gt.reconstruction.output_names import DEFAULT, ORBIT_FRAMES, OUTPUTS, PREDICTED, REFINED, SFM
 
 POSES = (
-    "cameras from files beside the images, from structure from motion (kept in DIR/sfm), or the backbone's own; auto: "
+    "cameras from files next to the images, from structure from motion (kept in DIR/sfm), or the backbone's own; auto: "
     "the first of these that the backbone needs and that is there"
 )
 

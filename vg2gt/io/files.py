@@ -48,7 +48,7 @@ def replacing(path: str | Path, durable: bool = False) -> Iterator[Path]:
 
 
 def temporary_name(path: Path) -> Path:
-    """A name beside ``path`` that no other process takes: containers that share a folder may have equal process ids."""
+    """A name next to ``path`` that no other process takes: containers may have equal process ids."""
     return path.with_name(f".{path.name}.{secrets.token_hex(8)}.tmp")
 
 

@@ -185,7 +185,7 @@ def _pixel_rows(dense: Tensor) -> Tensor:
 
 
 class _Points:
-    """All pixels as points, invalid ones replaced by finite stand-ins that no voxel uses.
+    """All pixels as points, invalid ones replaced by finite placeholders that no voxel uses.
 
     Attributes:
         batch: ``[N]`` scene index.

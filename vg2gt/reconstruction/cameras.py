@@ -1,4 +1,4 @@
-"""Where the cameras of a reconstruction come from: beside the images, structure from motion, or the backbone."""
+"""Where the cameras of a reconstruction come from: files next to the images, structure from motion, or the backbone."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def pictures_for(
     Args:
         model: whose backbone looks at them.
         images: see :func:`vg2gt.reconstruction.pictures.find_pictures`.
-        poses: ``auto``: a backbone that needs cameras gets those beside the images
+        poses: ``auto``: a backbone that needs cameras gets those next to the images
             (:func:`~vg2gt.reconstruction.given_cameras.given_pictures`), else those of structure from motion
             (:func:`~vg2gt.reconstruction.sfm.find_cameras`); others predict their own. ``given``, ``sfm`` and
             ``backbone`` allow one of these alone.
@@ -79,7 +79,7 @@ def pictures_for(
         raise ValueError(_no_depth(backend.name, images))
     if poses == "given":
         raise ValueError(
-            f"no cameras lie beside {describe(images)}: expected {LAYOUTS}; --poses sfm finds them from the images"
+            f"there are no cameras next to {describe(images)}: expected {LAYOUTS}; --poses sfm finds them from the images"
         )
     with tempfile.TemporaryDirectory(prefix="vg2gt-sfm-") as temporary:
         pictures = without_copies(find_pictures(images, every, max_images, skip_damaged))

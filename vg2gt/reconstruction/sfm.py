@@ -60,7 +60,7 @@ _STATE = "sfm.json"
 
 ADVICE = (
     "take more photographs, 20 or more, walking around the scene rather than turning on the spot, each showing two "
-    f"thirds of what the one before shows; or put their cameras beside them ({LAYOUTS}); or take a backend that works "
+    f"thirds of what the one before shows; or put their cameras next to them ({LAYOUTS}); or take a backend that works "
     "from images alone, such as da3_small"
 )
 
@@ -73,7 +73,7 @@ def require_pycolmap() -> None:
     """
     if importlib.util.find_spec("pycolmap") is None:
         raise ImportError(
-            f"finding the cameras of photographs needs pycolmap: {EXTRA}; or put their cameras beside "
+            f"finding the cameras of photographs needs pycolmap: {EXTRA}; or put their cameras next to "
             f"them ({LAYOUTS}), or take a backend that works from images alone, such as da3_small"
         )
 

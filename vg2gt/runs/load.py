@@ -157,7 +157,7 @@ def resolve_parts(config: DictConfig, checkpoint: Path | None) -> dict[str, Dict
     """Configurations of backend, model and renderer: the run's own, changed by those that ``config`` names.
 
     ``model=tiny`` replaces the run's model, ``+model.fine.max_voxels=100000`` changes one key of it. Without a
-    checkpoint the training defaults stand for the run.
+    checkpoint the training defaults are used.
 
     Raises:
         FileNotFoundError: if the run's ``config.yaml`` is needed and missing.

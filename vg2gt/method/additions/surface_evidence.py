@@ -5,7 +5,7 @@ to be seen in the frozen geometry itself: the voxels around a point hold the oth
 numbers a point tell it to the network; the centroids that they are taken from are ``CENTROID_CHANNELS`` more inputs of
 the voxels. ``model.coarse.surface_evidence`` switches both (docs/reproduce.md, Deviations from the paper).
 
-Where views agree already there is nothing to be gained and much to be spoilt, and beside silhouettes this evidence says
+Where views agree already there is nothing to gain and much to spoil, and next to silhouettes this evidence says
 nothing: ``model.coarse.gate`` scales what the module changes by how much the views disagree (:func:`disagreement`).
 """
 
