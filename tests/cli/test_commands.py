@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from hydra.errors import HydraException
 
-from tests.commands import ROOT, run_python, shell
+from tests.commands import ROOT, shell
 from vg2gt import __version__
 from vg2gt.cli import main
 from vg2gt.cli.commands import COMMANDS, DATA_COMMANDS, Command, dispatch
@@ -78,24 +78,6 @@ def test_the_front_door(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureF
     assert said("vg2gt", "trian") == "vg2gt: unknown command 'trian', did you mean train? (vg2gt --help lists all)\n"
     assert "did you mean splits?" in said("vg2gt data", "split")
     assert said("vg2gt", "zzz") == "vg2gt: unknown command 'zzz' (vg2gt --help lists all)\n"
-
-
-MODULES = """
-import runpy, sys
-for module in {modules}:
-    sys.argv = [module, "--help"]
-    try:
-        runpy.run_module(module, run_name="__main__")
-    except SystemExit as ended:
-        assert not ended.code, module
-"""
-
-
-def test_modules_are_commands_too(tmp_path: Path) -> None:
-    modules = ["vg2gt.data.synthetic", "vg2gt.data.splits", "backends.export"]
-    shown = run_python(MODULES.format(modules=modules), folder=tmp_path)
-    assert shown.returncode == 0, shown.stderr[-2000:]
-    assert shown.stdout.count("example: vg2gt ") == len(modules)
 
 
 @pytest.fixture

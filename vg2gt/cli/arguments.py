@@ -69,6 +69,16 @@ def flag_parser(name: str, command: Command, details: str = "") -> argparse.Argu
     )
 
 
+def add_common_flags(parser: argparse.ArgumentParser, saved: Sequence[str]) -> None:
+    """Adds the flags of all commands that render; ``saved`` is the default of ``--save``."""
+    add = parser.add_argument
+    add("--save", type=list_of_names, default=list(saved), metavar="LIST", help=f"default: {','.join(saved)}")
+    add("--mode", choices=("solid", "rasterized"), default="solid", help="how views are rendered")
+    add("--device", default="auto", help="auto, cpu, cuda, cuda:N")
+    add("--overwrite", action="store_true", help="replace outputs that are there")
+    add("--quiet", action="store_true", help="no progress bars")
+
+
 def separate(argv: Sequence[str] | None) -> tuple[list[str], list[str]]:
     """A command line's own arguments, and its ``key=value`` overrides: what has that form and is no file."""
     given = sys.argv[1:] if argv is None else list(argv)

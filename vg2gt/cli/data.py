@@ -151,7 +151,3 @@ def write_views(out: str, overrides: Sequence[str]) -> Path:
     # One line per list of frames: readable, and a change of one draw is a change of one line.
     text = re.sub(r"\[[^\[\]{}]*\]", lambda found: re.sub(r"\s+", " ", found[0]), json.dumps(index, indent=1))
     return write_text(out, text.replace("[ ", "[").replace(" ]", "]") + "\n")
-
-
-if __name__ == "__main__":
-    main()

@@ -1,4 +1,4 @@
-"""``vg2gt export``, or ``python -m backends.export``: a frozen network as an ONNX bundle."""
+"""``vg2gt export``: a frozen network as an ONNX bundle."""
 
 from __future__ import annotations
 
@@ -34,7 +34,3 @@ def main(argv: Sequence[str] | None = None) -> None:
         found = f"{out}: {description.name}, licence: {description.licence}"
         differences = ", ".join(f"{part} {value:.1e}" for part, value in description.max_difference.items())
         print(f"{found}; largest difference to torch: {differences}")
-
-
-if __name__ == "__main__":
-    main()

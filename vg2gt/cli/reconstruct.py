@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vg2gt.cli.arguments import OVERRIDES, flag_parser, list_of_names, listing, separate
+from vg2gt.cli.arguments import OVERRIDES, add_common_flags, flag_parser, listing, separate
 from vg2gt.cli.commands import COMMANDS
 from vg2gt.cli.errors import errors_in_one_line
 from vg2gt.cli.refine import options_for, print_refinement
@@ -42,18 +42,14 @@ def parser() -> argparse.ArgumentParser:
     add("--ckpt", metavar="PATH", help="a checkpoint or a run's folder; without it the head is untrained")
     add("--poses", choices=("auto", "given", "sfm", "backbone"), default="auto", help=POSES)
     add("--frame", choices=("auto", "given", "first", "upright"), default="auto", help=FRAME)
-    add("--save", type=list_of_names, default=list(DEFAULT), metavar="LIST", help=f"default: {','.join(DEFAULT)}")
     add("--size", type=_size, metavar="N|HxW", help="longer side, or height x width, in pixels; default 518, CPU 280")
     add("--every", type=int, default=1, metavar="N", help="take every N-th image or frame only")
     add("--max-images", type=int, metavar="N", help="take at most N, evenly spread; of a video 32 by default")
-    add("--mode", choices=("solid", "rasterized"), default="solid", help="how views are rendered")
     add("--refine", type=_steps, metavar="N", help=REFINE)
     add("--frames", type=int, default=ORBIT_FRAMES, metavar="N", help=f"length of the orbit, default {ORBIT_FRAMES}")
     add("--mesh-voxel", type=float, metavar="X", help="edge of the mesh's voxels in scene units")
-    add("--device", default="auto", help="auto, cpu, cuda, cuda:N")
     add("--skip-damaged", action="store_true", help="go on without images that cannot be read")
-    add("--overwrite", action="store_true", help="replace outputs that are there")
-    add("--quiet", action="store_true", help="no progress bars")
+    add_common_flags(arguments, DEFAULT)
     return arguments
 
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vg2gt.cli.arguments import flag_parser, list_of_names, listing, separate
+from vg2gt.cli.arguments import add_common_flags, flag_parser, listing, separate
 from vg2gt.cli.commands import COMMANDS
 from vg2gt.cli.errors import errors_in_one_line
 from vg2gt.reconstruction.output_names import DEFAULT, OUTPUTS, REFINED
@@ -31,11 +31,7 @@ def parser() -> argparse.ArgumentParser:
     add("--steps", type=int, metavar="N", help="default: that of the options")
     add("--seconds", type=float, metavar="S", help="end after so many seconds; alone: without a number of steps")
     add("--holdout", type=int, metavar="N", help="leave every N-th view out and say its PSNR before and after")
-    add("--save", type=list_of_names, default=list(DEFAULT), metavar="LIST", help=f"default: {','.join(DEFAULT)}")
-    add("--mode", choices=("solid", "rasterized"), default="solid", help="how views are rendered")
-    add("--device", default="auto", help="auto, cpu, cuda, cuda:N")
-    add("--overwrite", action="store_true", help="replace outputs that are there")
-    add("--quiet", action="store_true", help="no progress bars")
+    add_common_flags(arguments, DEFAULT)
     return arguments
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from vg2gt.data.base import DataError
-from vg2gt.io.names import by_number
+from vg2gt.io.files import by_number
 from vg2gt.model import Reconstructor
 from vg2gt.reconstruction.given_cameras import LAYOUTS, describe, given_pictures
 from vg2gt.reconstruction.monitor import Monitor
@@ -79,7 +79,7 @@ def pictures_for(
         raise ValueError(_no_depth(backend.name, images))
     if poses == "given":
         raise ValueError(
-            f"there are no cameras next to {describe(images)}: expected {LAYOUTS}; --poses sfm finds them from the images"
+            f"no cameras next to {describe(images)}: expected {LAYOUTS}; --poses sfm finds them from the images"
         )
     with tempfile.TemporaryDirectory(prefix="vg2gt-sfm-") as temporary:
         pictures = without_copies(find_pictures(images, every, max_images, skip_damaged))

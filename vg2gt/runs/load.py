@@ -18,8 +18,14 @@ from omegaconf.errors import OmegaConfBaseException
 from vg2gt.config import compose, compose_groups, flatten
 from vg2gt.model import Reconstructor
 from vg2gt.rendering import Renderer
-from vg2gt.runs.checkpoints import MADE_OF, model_state, read_checkpoint, refuse_not_finite
-from vg2gt.runs.find import checkpoint_path, run_config_path
+from vg2gt.runs.checkpoints import (
+    MADE_OF,
+    checkpoint_path,
+    model_state,
+    read_checkpoint,
+    refuse_not_finite,
+    run_config_path,
+)
 from vg2gt.runs.trust import check_targets, parse_run_config, read_run_config
 
 log = logging.getLogger(__name__)

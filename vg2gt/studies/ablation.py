@@ -4,7 +4,7 @@ As in the paper (appendix, Model Evaluation) no variant is trained from scratch.
 trained, from scratch or from ``init_from``; each variant starts from it and goes on for ``steps`` steps, and so does
 the full model itself, so that nobody is ahead by training longer. All continuations of a seed see the same batches and
 are evaluated on the same held-out views, so differences to the full model are taken seed by seed. Only the last layer
-is initialised again where the number of splits changes; a control continues the full model with a new last layer as well.
+is new where the number of splits changes; a control continues the full model with a new last layer as well.
 
 Finished runs are never repeated, interrupted ones go on; a run that diverges is named and the others are run all the
 same. Writes ``metrics.json`` and ``metrics.md`` into ``outputs/<name>``, after every run.
@@ -53,7 +53,7 @@ LABELS = {
     "wo_enhance": "w/o Enhance",
     "wo_split": "w/o Split",
     FULL: "VG²GT (full)",
-    CONTROL: "full, last layer anew",
+    CONTROL: "full, last layer new",
 }
 PAPER_COLUMNS = columns(
     *("psnr", "ssim", "lpips", "rmse", "abs_rel", "delta_1.25", "delta_1.05"),
@@ -225,7 +225,7 @@ class Ablation:
             "of twenty true zeros one is called better or worse. Views never trained on, at ground-truth "
             "poses; depth rendered as stochastic solids and aligned by one median scale per scene, whatever the "
             "training rendered (the 3DGS row too: its own rasterised depth is given below). Where the number of splits "
-            "differs from the full model's, the last layer is initialised again; the control shows what that alone costs, and "
+            "differs from the full model's, the last layer is new; the control shows what that alone costs, and "
             "is what these rows are compared with in the last table. The paper's rows are Replica, 30000 more steps, "
             "and LPIPS of VGG; compare orders, not values. LPIPS is not measured while training: vg2gt "
             "evaluate ckpt=RUN has it, if its weights are there."
