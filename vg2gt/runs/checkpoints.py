@@ -206,12 +206,13 @@ def checkpoint_path(ckpt: str | Path | None) -> Path | None:
             return newest_valid(folder)
         except FileNotFoundError as error:
             raise FileNotFoundError(
-                f"ckpt={ckpt}: no valid checkpoint in {folder}; give a run's folder such as outputs/quickstart, a checkpoint's file, or ckpt=null "
-                "for the untrained head"
+                f"ckpt={ckpt}: no valid checkpoint in {folder}; give a run's folder such as outputs/quickstart, a "
+                "checkpoint's file, or ckpt=null for the untrained head"
             ) from error
     if not path.is_file():
         raise FileNotFoundError(
-            f"ckpt={ckpt}: no such checkpoint or run; give a file, a run's folder such as outputs/quickstart, or ckpt=null for the untrained head"
+            f"ckpt={ckpt}: no such checkpoint or run; give a file, a run's folder such as outputs/quickstart, or "
+            "ckpt=null for the untrained head"
         )
     return path
 
