@@ -22,7 +22,7 @@ class Backend(nn.Module, ABC):
     cheaper.
 
     Args:
-        name: stands in checkpoints and messages.
+        name: used in checkpoints and messages.
         patch_size: edge of a patch in pixels; image sizes must be multiples of it.
         token_dims: channels of the patch tokens, one entry per tapped layer, in tap order.
         licence: licence of the weights, printed when they are loaded.

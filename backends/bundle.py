@@ -23,7 +23,7 @@ from vg2gt.io.tensors import read_tensors
 DESCRIPTION = "backend.json"
 ENCODER, DECODER, DECODER_WEIGHTS = "encoder.onnx", "decoder.onnx", "decoder.safetensors"
 FORMAT = 1
-REMEDY = "write it with vg2gt export backend=NAME out=FOLDER"
+REMEDY = "write it with vg2gt export backend=NAME --out FOLDER"
 
 Decoder = VGGTDecoder | DA3Decoder
 DECODERS: dict[str, type[VGGTDecoder] | type[DA3Decoder]] = {

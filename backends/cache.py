@@ -24,14 +24,14 @@ log = logging.getLogger(__name__)
 
 Found = TypeVar("Found")
 
-_RECORDS = [Tokens, Geometry, Cameras]  # all that a file may hold beside tensors and plain values
+_RECORDS = [Tokens, Geometry, Cameras]  # all that a file may hold besides tensors and plain values
 
 
 class TokenCache:
     """Keeps tokens and initially decoded geometry per set of views, exactly; of held-out views' sets the cameras alone.
 
     The key is a hash of the images and hints themselves, the backend's identity (its weights), options and source, the
-    kind of device and torch's version, so whatever changes is computed anew. It pays where view sets come again
+    kind of device and torch's version, so whatever changes is computed again. It pays where view sets come again
     (``data.view_sets``, evaluation before and after training) and the backbone costs more than reading a file.
     Several processes may share the folder.
 

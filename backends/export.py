@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import os
-import runpy
 import secrets
 import shutil
 import warnings
@@ -74,7 +73,7 @@ def export(backend: Backend, out: Path) -> Description:
         out: a folder that does not exist yet, or is empty.
 
     Returns:
-        What stands in the folder's ``backend.json``.
+        What is in the folder's ``backend.json``.
 
     Raises:
         ValueError: if the backend has no graph to export.
@@ -236,7 +235,3 @@ def relative_difference(found: Tensor, expected: Tensor) -> float:
     if found.shape != expected.shape:
         return float("inf")
     return float((found - expected).abs().max() / expected.abs().max())
-
-
-if __name__ == "__main__":  # python -m backends.export, the same as vg2gt export
-    runpy.run_module("vg2gt.cli.export", run_name="__main__")

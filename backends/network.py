@@ -17,7 +17,7 @@ class NetworkBackend(Backend):
     """What the networks of VGGT and DA3 share; their constructors take these arguments besides their own.
 
     Args:
-        name: stands in checkpoints and messages.
+        name: used in checkpoints and messages.
         licence: of the weights.
         dim: channels C of the blocks.
         num_heads: attention heads.

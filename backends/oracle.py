@@ -194,7 +194,7 @@ class OracleBackend(Backend):
         return torch.where(depth > 0, confidence, INVALID_CONFIDENCE)
 
     def _tokens(self, images: Tensor, geometry: Tensor) -> tuple[Tensor, ...]:
-        """Image features of every tapped block beside the geometry ``[B, V, P, 32]``, channels mixed."""
+        """Image features of every tapped block next to the geometry ``[B, V, P, 32]``, channels mixed."""
         features = self.patch_embed((images.flatten(0, 1) - 0.5) * 4)
         tokens = []
         for block, mixing in zip(self.blocks, self.mixing, strict=True):

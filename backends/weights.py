@@ -108,7 +108,7 @@ def find_weights(name: str, repo: str | None, revision: str | None, path: str | 
 
 @contextmanager
 def _quiet(name: str) -> Iterator[None]:
-    """Leaves out a package's warnings: what is wrong stands in the error."""
+    """Leaves out a package's warnings: what is wrong is in the error."""
     logger = logging.getLogger(name)
     level = logger.level
     logger.setLevel(logging.ERROR)

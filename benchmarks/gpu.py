@@ -66,13 +66,12 @@ class Setting:
 
 def selfcheck(setting: Setting) -> Iterator[Result]:
     """How far the kernels are off, and how long they take to compile and check."""
-    from vg2gt.rendering import render
     from vg2gt.rendering.selfcheck import MODES, compare, identity
 
     yield {"identity": identity(setting.device)}
     for mode in MODES[1:] if setting.small else MODES:
         begin = time.perf_counter()
-        found = compare(render, setting.device, (mode,))
+        found = compare(setting.device, (mode,))
         seconds = time.perf_counter() - begin
         yield {mode: {"values": found.values, "gradients": found.gradients, "good": found.good, "seconds": seconds}}
 
@@ -224,7 +223,7 @@ def reconstruct(setting: Setting) -> Iterator[Result]:
     from vg2gt.runs.load import load_model
 
     backend, model, size = ("da3_tiny", "tiny", (28, 56)) if setting.small else ("da3_large", "vg2gt", (224, 448))
-    ready = load_model(None, f"{backend},pretrained=false", model, device=str(setting.device))
+    ready = load_model(None, backend, ["backend.pretrained=false", f"model={model}"], str(setting.device))
     implementation = "triton" if setting.device.type == "cuda" else "auto"  # whether or not the check refuses it
     renderer = replace(ready.renderer, implementation=implementation)
     for count in (2,) if setting.small else (10, 50):

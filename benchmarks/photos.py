@@ -236,7 +236,7 @@ def main() -> None:
     torch.set_num_threads(given.threads)
     changes = [f"refine.{change}" for change in given.refine]
     refinement: RefineOptions = instantiate(compose(None, "+refine=photographs", *changes).refine)
-    loaded = load_model(given.ckpt, options=[f"model.{change}" for change in given.model], device="cpu")
+    loaded = load_model(given.ckpt, overrides=[f"model.{change}" for change in given.model], device="cpu")
     lpips = lpips_or_none()
     for item in given.folders:
         name, _, folder = item.rpartition("=")

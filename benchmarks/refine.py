@@ -36,10 +36,10 @@ from vg2gt.types import Batch, Cameras, Prediction
 
 FIGURES = RESULTS.parents[1] / "docs" / "figures"
 STARTS = {
-    "VG²GT": "tiny",
-    "pixel-aligned": "pixel_aligned",
-    "voxel-merged": "voxel_merged",
-    "point cloud": "pointcloud,spacing=neighbors,width=1,opacity=0.1",
+    "VG²GT": ["model=tiny"],
+    "pixel-aligned": ["model=pixel_aligned"],
+    "voxel-merged": ["model=voxel_merged"],
+    "point cloud": ["model=pointcloud", "model.spacing=neighbors", "model.width=1", "model.opacity=0.1"],
 }
 COLUMNS = ("cameras", "gaussians")
 FIGURE = {"psnr": "PSNR [dB]", "ssim": "SSIM", "abs_rel": "abs_rel", "normal_mean": "normals [deg]"}
@@ -186,7 +186,7 @@ def main() -> None:
         kind = "" if label == "point cloud" else ", trained" if label in trained else ", untrained"
         names[label + kind] = (label, trained.get(label))
     for name, (label, ckpt) in names.items():
-        loaded = load_model(ckpt, None if ckpt else "oracle", None if ckpt else STARTS[label], backend, str(device))
+        loaded = load_model(ckpt, None if ckpt else "oracle", [*([] if ckpt else STARTS[label]), *backend], str(device))
         curve(loaded, batches[0], replace(how, steps=1), [])  # compiles
         curves[name] = mean_curve([curve(loaded, batch, how, marks) for batch in batches])
         last = curves[name][-1]

@@ -39,7 +39,6 @@ MAY_IMPORT: dict[str, set[str]] = {
         "backends",
     }
     | BASICS,
-    **{command: {"cli"} for command in ("evaluate", "ablate", "curves")},
 }
 OF_BACKENDS = ("vg2gt.types", "vg2gt.geometry", "vg2gt.io.tensors", "vg2gt.io.files", "vg2gt.kernels.compiled")
 

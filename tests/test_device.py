@@ -62,7 +62,7 @@ def as_on_a_gpu(monkeypatch: pytest.MonkeyPatch) -> Any:
         monkeypatch.setattr(curve_codes, "has_kernel", lambda device: True)
 
         def automatic(device: torch.device) -> str:
-            selfcheck.require_trusted(renderer.render, device)
+            selfcheck.require_trusted(device)
             return "triton"
 
         monkeypatch.setattr(renderer, "automatic", automatic)
@@ -148,7 +148,7 @@ def test_a_reconstruction(device: str, as_on_a_gpu: Any) -> None:
 
     def scene(where: str) -> tuple[int, Tensor]:
         options = [f"model.fine.min_footprint={pixels}", "model.coarse.min_footprint=4", *WIDTHS[device]]
-        ready = load_model(None, "da3_tiny", "vg2gt", options, where)
+        ready = load_model(None, "da3_tiny", ["model=vg2gt", *options], where)
         images = torch.rand(3, 3, *size, generator=torch.Generator().manual_seed(0))
         made = reconstruct_with(ready.model, images, size=size, renderer=ready.renderer)
         (view,) = made.render(made.named_cameras()[:1])

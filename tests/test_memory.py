@@ -117,8 +117,8 @@ def test_training_logs_what_was_dropped(tmp_path: Path, caplog: pytest.LogCaptur
 def test_full_memory_is_one_error(error):
     @memory_advice(TRAINING)
     def fail() -> None:
-        note_sizes({"images of 1x1": 1, "Gaussians": 5}, anew=True)
-        note_sizes({"images of 28x28": 4}, anew=True)
+        note_sizes({"images of 1x1": 1, "Gaussians": 5}, first=True)
+        note_sizes({"images of 28x28": 4}, first=True)
         note_sizes({"voxels": 7})
         raise error
 

@@ -7,9 +7,8 @@ import lightning
 import torch
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from vg2gt.config import compose
+from vg2gt.config import compose, compose_groups
 from vg2gt.model import VG2GT, Reconstructor
-from vg2gt.runs.load import compose_part
 from vg2gt.training.loop import Run
 
 SMALL = [
@@ -37,9 +36,7 @@ def small_config(folder: Path, cache: Path, *overrides: str) -> DictConfig:
 def write_run(folder: Path, model: Reconstructor, mark: float = 0.0) -> Path:
     """A training run's folder of an oracle's tiny model, its head known by a mark in one weight."""
     (folder / "checkpoints").mkdir(parents=True)
-    parts = {"backend": "oracle", "model": "tiny", "renderer": "solid"}
-    config = {name: compose_part(name, choice) for name, choice in parts.items()}
-    OmegaConf.save(OmegaConf.create(config), folder / "config.yaml")
+    OmegaConf.save(compose_groups("backend=oracle", "model=tiny", "renderer=solid"), folder / "config.yaml")
     state = {f"model.{key}": value for key, value in model.state_dict().items() if not key.startswith("backend.")}
     state["model.gaussians.out.bias"] = state["model.gaussians.out.bias"] + mark
     checkpoint = {"state_dict": state, "backend": dict(model.backend.identity()), "global_step": 7}

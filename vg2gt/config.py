@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from contextlib import nullcontext
 from difflib import get_close_matches
@@ -21,7 +20,7 @@ _PACKAGE = Path(__file__).resolve().parent
 
 
 def config_dir() -> str:
-    """Returns the absolute path of the configuration folder: inside the installed package, or beside it in a checkout.
+    """Returns the absolute path of the configuration folder: in the installed package, or next to it in a checkout.
 
     Raises:
         FileNotFoundError: if neither the package nor the checkout holds it.
@@ -29,7 +28,7 @@ def config_dir() -> str:
     for folder in (_PACKAGE / "configs", _PACKAGE.parent / "configs"):
         if (folder / "train.yaml").is_file():
             return str(folder)
-    raise FileNotFoundError(f"no configuration folder with train.yaml in or beside {_PACKAGE}; reinstall vg2gt")
+    raise FileNotFoundError(f"no configuration folder with train.yaml in or next to {_PACKAGE}; reinstall vg2gt")
 
 
 def group_options(group: str) -> list[str]:
@@ -46,7 +45,7 @@ def compose(name: str | None, *overrides: str) -> DictConfig:
         overrides: as on the command line.
 
     Raises:
-        ValueError: if an override is wrong, with Hydra's reason in one line.
+        ValueError: if an override is wrong, with Hydra's reason.
     """
     # Inside a command Hydra is initialised already, with the same folder.
     inside = GlobalHydra.instance().is_initialized()
@@ -54,46 +53,37 @@ def compose(name: str | None, *overrides: str) -> DictConfig:
         with nullcontext() if inside else hydra.initialize_config_dir(config_dir(), version_base="1.3"):
             return hydra.compose(name, list(overrides))
     except (HydraException, OmegaConfBaseException) as error:
-        raise ValueError(hydra_message(error)) from error
+        said = str(error).partition("Config search path")[0].partition("    full_key")[0]
+        raise ValueError(" ".join(said.split())) from error
 
 
-def hydra_message(error: Exception) -> str:
-    """What Hydra or OmegaConf say, in one line; where they have looked is left out."""
-    said = str(error).partition("Config search path")[0].removeprefix("In '_dummy_empty_config_': ")
-    said = said.partition("Error raised while resolving interpolation: ")[2] or said
-    if missing := re.match(r".*Could not find '([^']+)/([^'/]+)'", said):
-        near = get_close_matches(missing[2], group_options(missing[1]), 1)
-        near_by = f", did you mean {near[0]}?" if near else ";"
-        said = f"there is no {missing[1]}={missing[2]}{near_by} {said[missing.end() :].strip()}"
-    if isinstance(error.__cause__, OmegaConfBaseException):
-        said += f" ({str(error.__cause__).splitlines()[0]})"
-    return " ".join(said.partition("    full_key")[0].split())
+def compose_groups(*overrides: str) -> DictConfig:
+    """Composes nothing but the groups that ``group=option`` names, changed by ``group.key=value``."""
+    return compose(None, *(each if "." in each.partition("=")[0] else f"+{each.lstrip('+')}" for each in overrides))
 
 
-def near_keys(name: str, overrides: Sequence[str], error: Exception) -> str:
-    """What an unknown key of a command line may have meant: keys of the same last part, or alike.
+def near_keys(name: str, overrides: Sequence[str]) -> str:
+    """A line that says what unknown keys of a command line may have meant; empty if there is nothing alike.
 
     Args:
         name: of the configuration that was composed.
         overrides: the command line's.
-        error: that composing them raised.
-
-    Returns:
-        The message; empty if the error is another one, or nothing is alike.
     """
-    unknown = re.match(r"Could not override '([^']+)'", str(error))
-    if unknown is None:
-        return ""
+    keys = {each.partition("=")[0] for each in overrides if "=" in each and each[0] not in "+~-"}
+    groups = [each for each in overrides if (Path(config_dir()) / each.partition("=")[0]).is_dir()]
     try:
-        groups = [each for each in overrides if "." not in (key := each.partition("=")[0]) and key != unknown[1]]
         config = compose(name, *groups, "output_dir=.")
     except ValueError:
         return ""
-    keys = [key for key in flatten(OmegaConf.to_container(config, resolve=False)) if "_target_" not in key]
-    room, _, last = unknown[1].rpartition(".")
-    inner = [key for key in keys if key.startswith(f"{room}." if room else "") and key.endswith(f".{last}")]
-    found = (inner or get_close_matches(unknown[1], keys, 3, 0.75))[:3]
-    return f"there is no option {unknown[1]}, did you mean {' or '.join(found)}?" if found else ""
+    known = [key for key in flatten(OmegaConf.to_container(config, resolve=False)) if "_target_" not in key]
+    lines = []
+    for key in sorted(keys - {each.partition("=")[0] for each in groups}):
+        if key not in known and not any(each.startswith(f"{key}.") for each in known):
+            room, _, last = key.rpartition(".")
+            same = [each for each in known if each.startswith(room) and each.endswith(f".{last}")]
+            near = same[:3] or get_close_matches(key, known, 3, 0.75)
+            lines += [f"there is no option {key}, did you mean {' or '.join(near)}?\n"] if near else []
+    return "".join(lines)
 
 
 def flatten(node: Any, prefix: str = "") -> dict[str, Any]:

@@ -22,9 +22,9 @@ EVALUATION = (
     "(+backend.head_chunk=2, +model.fine.dense_head.views_per_chunk=2)"
 )
 RECONSTRUCTION = (
-    "fewer images (--max-images, --every), smaller ones (--size), fewer voxels (--set model.fine.max_voxels=500000), "
-    "fewer Gaussians (--set model.gaussians.max_gaussians=1000000) or smaller chunks (--set backend.head_chunk=2, "
-    "--set model.fine.dense_head.views_per_chunk=2)"
+    "fewer images (--max-images, --every), smaller ones (--size), fewer voxels (model.fine.max_voxels=500000), "
+    "fewer Gaussians (model.gaussians.max_gaussians=1000000) or smaller chunks (backend.head_chunk=2, "
+    "model.fine.dense_head.views_per_chunk=2)"
 )
 
 # Parts of the messages of torch's allocators and of CUDA's, where the error has no class of its own.
@@ -70,17 +70,17 @@ def memory_advice(advice: str) -> Iterator[None]:
         _sizes.reset(token)
 
 
-def note_sizes(sizes: Mapping[str, int], anew: bool = False) -> None:
+def note_sizes(sizes: Mapping[str, int], first: bool = False) -> None:
     """Notes how large a pass is, for the message should it fail.
 
     Args:
         sizes: how many of what, in the words of the message.
-        anew: a new pass begins: what was noted of the one before is forgotten.
+        first: a new pass begins: what was noted of the one before is forgotten.
     """
     noted = None if torch.compiler.is_compiling() else _sizes.get()
     if noted is None:
         return
-    if anew:
+    if first:
         noted.clear()
     noted.update(sizes)
 

@@ -132,7 +132,7 @@ class Reconstructor(nn.Module, ABC):
         Returns its tokens, its geometry in the scene frame, and the unit ``[B]``.
         """
         scenes, views, _, height, width = images.shape
-        note_sizes({f"images of {height}x{width} in {scenes} scene{'s' * (scenes > 1)}": scenes * views}, anew=True)
+        note_sizes({f"images of {height}x{width} in {scenes} scene{'s' * (scenes > 1)}": scenes * views}, first=True)
         tokens, raw = self.run_backbone(images, hints)
         raw = masked(raw, hints)
         unit = self.scale(raw, hints)
@@ -154,7 +154,7 @@ class Reconstructor(nn.Module, ABC):
             return tokens, self.backend.decode(tokens)
 
     def predict_cameras(self, images: Tensor, hints: Hints | None) -> Cameras:
-        """The backbone's raw cameras of views of which nothing else is needed, likewise.
+        """The backbone's raw cameras alone, from the cache where there is one.
 
         Args:
             images: ``[B, V, 3, H, W]`` in [0, 1].

@@ -75,7 +75,7 @@ class Backbone(nn.Module):
 
         Returns:
             Patch tokens of every tap and the last tap's camera token ``[B, V, D]``. Multi-view networks: D = 2C, the
-            last single-view output beside the current one, whose patch tokens alone are normalised. Single-view
+            last single-view output next to the current one, whose patch tokens alone are normalised. Single-view
             networks: D = C.
         """
         batch, views = images.shape[:2]

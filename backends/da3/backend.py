@@ -29,7 +29,7 @@ NESTED_PARTS = ("model.da3.", "model.da3_metric.")  # a nested file holds two ne
 
 
 class DA3Decoder(nn.Module):
-    """What stands behind the tokens: depth head and camera decoder; names and shapes as published.
+    """What follows the tokens: depth head and camera decoder; names and shapes as published.
 
     Args:
         token_dim: channels of the tokens.

@@ -184,7 +184,7 @@ class DA3NestedBackend(Backend):
     Args:
         relative: predicts geometry.
         metric: predicts metric depth.
-        name: stands in checkpoints and messages.
+        name: used in checkpoints and messages.
     """
 
     def __init__(self, relative: DA3Backend, metric: DA3MetricBackend, name: str = "da3_nested") -> None:

@@ -102,7 +102,7 @@ def _alternating_block(dim: int, num_heads: int) -> ViTBlock:
 
 
 class VGGTDecoder(nn.Module):
-    """What stands behind the tokens: camera and depth head; names and shapes as published.
+    """What follows the tokens: camera and depth head; names and shapes as published.
 
     Args:
         token_dim: channels of the tokens.

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from hydra.errors import HydraException
 
-from tests.commands import ROOT, run_python, shell
+from tests.commands import ROOT, shell
 from vg2gt import __version__
 from vg2gt.cli import main
 from vg2gt.cli.commands import COMMANDS, DATA_COMMANDS, Command, dispatch
@@ -80,24 +80,6 @@ def test_the_front_door(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureF
     assert said("vg2gt", "zzz") == "vg2gt: unknown command 'zzz' (vg2gt --help lists all)\n"
 
 
-MODULES = """
-import runpy, sys
-for module in {modules}:
-    sys.argv = [module, "--help"]
-    try:
-        runpy.run_module(module, run_name="__main__")
-    except SystemExit as ended:
-        assert not ended.code, module
-"""
-
-
-def test_modules_are_commands_too(tmp_path: Path) -> None:
-    modules = ["vg2gt.data.synthetic", "vg2gt.data.splits", "backends.export"]
-    shown = run_python(MODULES.format(modules=modules), folder=tmp_path)
-    assert shown.returncode == 0, shown.stderr[-2000:]
-    assert shown.stdout.count("example: vg2gt ") == len(modules)
-
-
 @pytest.fixture
 def said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Iterator[Said]:
     """Runs ``vg2gt WORDS`` in an empty folder of this process; what it ends with, and what it has written to stderr."""
@@ -116,20 +98,16 @@ def said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capture
 
 
 MISTAKES = {
-    "train model.gausians.splits=4": "there is no option model.gausians.splits, did you mean model.gaussians.splits",
-    "train +model.gausians=4 foo.x=1": r"Could not override 'foo.x'",
-    "evaluate evaluation=dtu data.root=FOLDER": "no option data.root, did you mean data.train.root or data.val.root?",
-    "train backend=da3_smal": r"there is no backend=da3_smal, did you mean da3_small\? Available options",
-    "train lr=.1": "there is no option lr, did you mean optimizer.lr",
-    "train trainer.max_steps=abc": "^an option may have a value of another kind .* given were: trainer.max_steps=abc ",
+    "train trainer.max_steps=abc": "TypeError: .*; is a value of the wrong type.* were: trainer.max_steps=abc ",
+    "train name=../x": "InterpolationResolutionError: .* name=../x: a name inside outputs",
     "train data=rgbd data.root=not_here": "the data folder not_here .* does not exist: set data.root=",
-    "train name=../x": "^name=../x: a name inside outputs",
-    "reconstruct . --out x --backend da3_smal": "unknown backend 'da3_smal'; did you mean da3_small",
+    "reconstruct . --out x backend=da3_smal": "Could not find 'backend/da3_smal' Available options .*da3_small",
+    "reconstruct . --out x foo=1": "option 'foo=1': expected key=value of backend, model, renderer",
     "curves nowhere": "nowhere|matplotlib",
     "render scene.ply --cameras no.json --out x": r"^FileNotFoundError: no cameras at no\.json",
     "reconstruct . --out x --every 0": "^ValueError: every must be at least 1, got 0",
-    "export backend=oracle out=bundle": "backend oracle cannot be exported",
-    "data views out=views.json evaluation=nonsense": "there is no evaluation=nonsense; Available options",
+    "export backend=oracle --out bundle": "backend oracle cannot be exported",
+    "data views --out views.json evaluation=nonsense": "Could not find 'evaluation/nonsense' Available options",
 }
 
 
@@ -144,15 +122,32 @@ def test_mistakes_are_one_line(words: str, said: Said, tmp_path: Path) -> None:
     assert not list(tmp_path.rglob("config.yaml"))
 
 
+OVERRIDES = {
+    "train model.gausians.splits=4": "there is no option model.gausians.splits, did you mean model.gaussians.splits",
+    "train foo.x=1": "Could not override 'foo.x'",
+    "evaluate evaluation=dtu data.root=FOLDER": "no option data.root, did you mean data.train.root or data.val.root",
+    "train backend=da3_smal": r"Could not find 'backend/da3_smal'\s+Available options",
+    "train lr=.1": "there is no option lr, did you mean optimizer.lr",
+}
+
+
+@pytest.mark.parametrize("words", OVERRIDES)
+def test_hydra_says_what_is_wrong_with_an_override_and_what_is_near(words: str, said: Said, tmp_path: Path) -> None:
+    status, printed = said(*words.split())
+    assert status == 1
+    assert re.search(OVERRIDES[words], printed), printed
+    assert not list(tmp_path.rglob("config.yaml"))
+
+
 WITHOUT_EXTRAS = {
     "view scene.ply": "view",
     "curves run": "eval",
     "train logger=tensorboard": "log",
     "train logger=wandb": "log",
     "train backend=da3_small": "hub",
-    "reconstruct clip.mp4 --backend da3_tiny --out x": "video",
+    "reconstruct clip.mp4 backend=da3_tiny --out x": "video",
     "render scene.ply --cameras cameras.json --save video.mp4 --out x": "video",
-    "export backend=da3_tiny out=x": "export",
+    "export backend=da3_tiny --out x": "export",
 }
 
 
@@ -174,13 +169,6 @@ def test_an_interrupted_command_says_so(said: Said, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr("vg2gt.cli.render.read_gaussians", interrupted)
     monkeypatch.setattr("vg2gt.reconstruction.camera_files.read_cameras", lambda path: [path])
     assert said("render", "scene.ply", "--cameras", "c.json", "--out", "x") == (130, "interrupted\n")
-
-
-def test_arguments_of_train_are_translated_for_reconstruct(said: Said) -> None:
-    words = "reconstruct photos --backend da3_small backend.pretrained=false --out x model.fine.y=2"
-    status, line = said(*words.split())
-    assert status == 2
-    assert "(write --backend NAME,pretrained=false --model NAME,fine.y=2)" in line
 
 
 @pytest.mark.parametrize(

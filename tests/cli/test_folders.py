@@ -9,7 +9,6 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from vg2gt.cli import folders
-from vg2gt.config import hydra_message
 
 DEFAULT = {"data": "synthetic", "backend": "oracle", "model": "tiny", "experiment": None, "ablation": None}
 
@@ -66,7 +65,7 @@ def test_a_taken_name_gets_a_number_unless_it_is_meant(monkeypatch: pytest.Monke
 def test_names_do_not_lead_out(name: str) -> None:
     with pytest.raises(OmegaConfBaseException) as caught:
         folder(name=name)
-    assert hydra_message(caught.value).startswith(f"name={name}: a name inside outputs")
+    assert f"name={name}: a name inside outputs" in str(caught.value)
 
 
 @pytest.mark.parametrize("name", ["mine", "paper/first", "ein Name", "名前", "..x", "12:30"])

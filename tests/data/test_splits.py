@@ -39,8 +39,8 @@ def test_the_command_writes_lists_that_the_data_module_takes(write_recording, tm
     folder = write_recording("home/kitchen")
     for name in ("hall", "attic", "cellar"):
         shutil.copytree(folder, tmp_path / "home" / name)
-    arguments = ["data=rgbd", f"data.root={tmp_path / 'home'}", "data.holdout=null", "fraction=0.5"]
-    main([*arguments, f"out={tmp_path / 'lists'}"])
+    arguments = ["data=rgbd", f"data.root={tmp_path / 'home'}", "data.holdout=null", "--fraction=0.5"]
+    main([*arguments, f"--out={tmp_path / 'lists'}"])
     assert "val.txt: 2 scenes" in capsys.readouterr().out
     lists = [str(tmp_path / "lists" / name) for name in ("train.txt", "val.txt")]
     assert sorted(name for path in lists for name in read_split(path)) == ["attic", "cellar", "hall", "kitchen"]
@@ -55,6 +55,6 @@ def test_the_command_writes_lists_that_the_data_module_takes(write_recording, tm
     SceneDataModule(train, val, **options).setup()
     with pytest.raises(DataError, match="used for training and for evaluation"):
         SceneDataModule(train, train, **options).setup()
-    main([*arguments, f"out={tmp_path / 'lists'}"])  # the same again
+    main([*arguments, f"--out={tmp_path / 'lists'}"])  # the same again
     with pytest.raises(SystemExit, match="holds another split"):
-        main([*arguments, f"out={tmp_path / 'lists'}", "split_seed=1"])
+        main([*arguments, f"--out={tmp_path / 'lists'}", "--seed=1"])

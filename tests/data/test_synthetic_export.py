@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 import torch
 
-from vg2gt.cli.arguments import read_options
-from vg2gt.cli.data import SyntheticOptions
 from vg2gt.cli.data import synthetic as main
 from vg2gt.data import DataError, RGBDFolder
 from vg2gt.data.synthetic.export import SceneSettings, missing_scenes, write_scenes
@@ -79,17 +77,35 @@ def test_other_settings_or_another_folder_are_refused(tmp_path):
 
 
 def test_the_command_writes_and_continues(tmp_path, capsys):
-    arguments = [f"out={tmp_path / 'out'}", "frames=1", "size=[24,32]", "workers=1", "highlights=true", "first_seed=7"]
-    main([*arguments, "scenes=1"])
+    settings = "--frames 1 --size 24 32 --workers 1 --highlights soft --first-seed 7"
+    arguments = ["--out", str(tmp_path / "out"), *settings.split()]
+    main([*arguments, "--scenes=1"])
     assert "wrote 1 scenes of 1 frames" in capsys.readouterr().out
-    main([*arguments, "scenes=2"])
+    main([*arguments, "--scenes=2"])
     assert "wrote 1 scenes" in capsys.readouterr().out
     assert sorted(RGBDFolder(str(tmp_path / "out")).scenes) == ["room-000007", "room-000008"]
 
 
-def test_out_is_needed_and_options_are_typed():
-    with pytest.raises(ValueError, match="give out="):
-        read_options(SyntheticOptions, ["scenes=3"])
-    given = ["out=x", "variant=[room,outdoor]", "size=[56,112]", "normals=true", "depth_scale=500"]
-    options, _ = read_options(SyntheticOptions, given)
-    assert options.settings == SceneSettings(16, (56, 112), ["room", "outdoor"], False, True, 500.0)
+@pytest.mark.parametrize(
+    ("argument", "message"),
+    [
+        ("--variant=space", "variant must be one of room, outdoor"),
+        ("--workers=0", "--workers must be at least 1"),
+        ("--depth-scale=0", "depth_scale must be positive"),
+        ("--scenes=0", "num_scenes >= 1"),
+    ],
+)
+def test_wrong_arguments_are_one_clear_error(tmp_path, argument, message):
+    with pytest.raises(SystemExit, match="ValueError: ") as error:
+        main(["--out", str(tmp_path / "out"), argument])
+    assert message in str(error.value)
+    assert not list(tmp_path.iterdir())
+
+
+def test_options_become_settings(tmp_path, monkeypatch):
+    given = []
+    monkeypatch.setattr("vg2gt.cli.data.write_synthetic", lambda *arguments: given.append(arguments))
+    main(["--out", "x", "--variant", "room,outdoor", "--size", "56", "112", "--normals", "--depth-scale", "500"])
+    main(["--out", "x", "--highlights", "lobes", "--jpeg", "30", "95"])
+    assert given[0][3] == SceneSettings(16, (56, 112), ["room", "outdoor"], False, True, 500.0)
+    assert given[1][3] == SceneSettings(highlights="lobes", jpeg=[30, 95])

@@ -16,8 +16,8 @@ from vg2gt.reconstruction.scene import Scene
 from vg2gt.runs.load import LoadedModel, load_model
 
 SIZE = (84, 112)
-ORACLE = "oracle,depth_noise=0"
-STAND_IN = f"custom,_target_={PlaneAhead.__module__}.{PlaneAhead.__name__}"
+ORACLE = ["backend=oracle", "backend.depth_noise=0"]
+STAND_IN = ["backend=custom", f"backend._target_={PlaneAhead.__module__}.{PlaneAhead.__name__}"]
 
 
 @pytest.fixture(scope="session")
@@ -42,7 +42,7 @@ def folder(recording: Path, tmp_path: Path) -> Path:
 @pytest.fixture(scope="session")
 def model():
     """One that needs cameras and nothing else."""
-    return load_model(backend=STAND_IN, device="cpu").model
+    return load_model(overrides=STAND_IN, device="cpu").model
 
 
 @pytest.fixture(scope="session")
@@ -62,7 +62,7 @@ def photos(frames, tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def ready() -> LoadedModel:
-    return load_model(backend=ORACLE, device="cpu")
+    return load_model(overrides=ORACLE, device="cpu")
 
 
 @pytest.fixture(scope="session")

@@ -16,9 +16,9 @@ from vg2gt.io import read_cameras_json, read_gaussian_ply, write_cameras_json
 from vg2gt.io.video import count_frames
 from vg2gt.reconstruction.scene import Scene
 
-ORACLE = "oracle,depth_noise=0"
+ORACLE = ["backend=oracle", "backend.depth_noise=0"]
 
-TINY = ["--backend", "da3_tiny", "--size", "70", "--quiet", "--device", "cpu"]
+TINY = ["backend=da3_tiny", "--size", "70", "--quiet", "--device", "cpu"]
 
 
 def test_photographs_of_all_sizes(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
@@ -93,9 +93,9 @@ def test_names_of_views_that_cannot_be_files(names, said: str, scene: Scene, tmp
         (["nowhere.jpg", *TINY], r"FileNotFoundError: nowhere.jpg does not exist"),
         (["empty", *TINY], "ValueError: no images in empty"),
         (["broken.png", *TINY], r"DataError: cannot read broken.png"),
-        (["broken.png", "--backend", "dinosaur"], "unknown backend 'dinosaur'"),
+        (["broken.png", "backend=dinosaur"], "Could not find 'backend/dinosaur' Available options"),
         (["broken.png", "--save", "scene.fbx", *TINY], r"unknown output 'scene.fbx'"),
-        (["broken.png", "--backend", "oracle"], "measured depth, and there is none with broken.png"),
+        (["broken.png", "backend=oracle"], "measured depth, and there is none with broken.png"),
     ],
 )
 def test_one_line_says_what_is_wrong(arguments, said: str, tmp_path: Path, monkeypatch) -> None:
@@ -127,9 +127,9 @@ def test_what_holds_no_images_is_told_before_the_weights_are_loaded(tmp_path: Pa
     for file in ("note.txt", "note.r3d", "films/a.mp4"):
         (tmp_path / file).write_text("a note")
     zipfile.ZipFile(tmp_path / "bare.r3d", "w").close()
-    backend = "da3_tiny,pretrained=true,path=weights-that-are-not-there"
+    backend = ["backend=da3_tiny", "backend.pretrained=true", "backend.path=weights-that-are-not-there"]
     with pytest.raises(SystemExit, match=said):
-        reconstruct_command.main([str(tmp_path / name), "--backend", backend, "--out", str(tmp_path / "out")])
+        reconstruct_command.main([str(tmp_path / name), *backend, "--out", str(tmp_path / "out")])
 
 
 def test_output_folder_that_cannot_be_written(photos: Path, tmp_path: Path) -> None:
@@ -145,7 +145,7 @@ def test_output_folder_that_cannot_be_written(photos: Path, tmp_path: Path) -> N
 )
 def test_real_recordings(name: str, psnr: float, shared: Path, tmp_path: Path) -> None:
     folder = shared / "data" / name
-    arguments = ["--backend", ORACLE, "--size", "168", "--max-images", "8", "--quiet", "--device", "cpu"]
+    arguments = [*ORACLE, "--size", "168", "--max-images", "8", "--quiet", "--device", "cpu"]
     save = "scene.ply,cameras.json,color.png,images"
     reconstruct_command.main([str(folder), "--out", str(tmp_path), "--save", save, *arguments])
     errors = []

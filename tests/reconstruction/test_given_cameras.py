@@ -143,7 +143,7 @@ def test_who_gets_which_cameras(model, folder: Path, recording: Path, ready, mon
     monkeypatch.setattr("vg2gt.reconstruction.cameras.find_cameras", find)
     images_alone = load_model(backend="da3_tiny", device="cpu").model
     assert ({p.source for p in choose(model, folder)}, asked) == ({"sfm"}, [4])
-    with pytest.raises(ValueError, match=r"no cameras lie beside .*room: expected cameras.json.*--poses sfm finds"):
+    with pytest.raises(ValueError, match=r"no cameras next to .*room: expected cameras.json.*--poses sfm finds"):
         choose(model, folder, "given")
     put_poses(folder, recording)
     assert {p.source for p in choose(model, folder)} == {p.source for p in choose(model, folder, "given")} != {"sfm"}
@@ -167,12 +167,12 @@ def test_who_gets_which_cameras(model, folder: Path, recording: Path, ready, mon
 @pytest.mark.parametrize("trained", [False, True])
 def test_photographs_for_the_oracle_are_refused_before_any_work(trained, photos, run_folder, tmp_path, monkeypatch):
     monkeypatch.setattr("vg2gt.runs.load.build_model", lambda *_: pytest.fail("built a model"))
-    chosen = ["--ckpt", str(run_folder)] if trained else ["--backend", "oracle"]
+    chosen = ["--ckpt", str(run_folder)] if trained else ["backend=oracle"]
     with pytest.raises(SystemExit) as stopped:
         reconstruct_command.main([str(photos), *chosen, "--out", str(tmp_path / "out"), "--quiet"])
     said = str(stopped.value)
     assert "works from measured depth, and there is none with" in said
-    assert "--backend da3_small" in said
+    assert "backend=da3_small" in said
     assert "hints" not in said
     assert not (tmp_path / "out").exists()
 

@@ -3,12 +3,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from omegaconf import OmegaConf
 
 import vg2gt
+from vg2gt.config import compose_groups
 from vg2gt.memory import OutOfMemory
 from vg2gt.runs.checkpoints import read_checkpoint, write_checkpoint, write_slim
-from vg2gt.runs.load import SHIPPED, compose_part, load_model, made_of, split_outside_brackets
+from vg2gt.runs.load import SHIPPED, load_model, made_of
 from vg2gt.runs.trust import read_run_config
 
 
@@ -21,34 +21,28 @@ def test_a_run_is_rebuilt_with_its_weights(run_folder: Path, ready) -> None:
 
 
 def test_options_change_parts(run_folder: Path) -> None:
-    options = ["model.fine.max_voxels=50", "renderer.near=0.5"]
-    loaded = load_model(run_folder, "oracle,depth_noise=0.5,taps=4", options=options, device="cpu")
-    assert (loaded.model.backend.depth_noise, loaded.model.get_submodule("fine").max_voxels) == (0.5, 50)
-    assert loaded.renderer.near == 0.5
-
-
-def test_lists_are_values() -> None:
-    assert split_outside_brackets("da3_tiny, taps=[0,1],path={a: 1,b: 2}") == [
-        "da3_tiny",
-        "taps=[0,1]",
-        "path={a: 1,b: 2}",
-    ]
+    overrides = ["backend.depth_noise=0.5", "backend.taps=4", "model.fine.max_voxels=50", "renderer.near=0.5"]
+    for backend in ("oracle", None):  # named again, or the run's own
+        loaded = load_model(run_folder, backend, overrides, device="cpu")
+        assert (loaded.model.backend.depth_noise, loaded.model.get_submodule("fine").max_voxels) == (0.5, 50)
+        assert loaded.renderer.near == 0.5
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("overrides", "said"),
     [
-        ({"backend": "dinosaur"}, "unknown backend 'dinosaur'; choose one of: .*da3_tiny"),
-        ({"backend": "oracle,noise=1"}, "oracle has no option 'noise'; it has .*depth_noise"),
-        ({"backend": "oracle,taps"}, "must be key=value"),
-        ({"backend": "oracle", "model": "huge"}, "unknown model 'huge'"),
-        ({"backend": "oracle", "options": ["loss.x=1"]}, "must begin with one of"),
-        ({"backend": "oracle,depth_noise=-1"}, "noise must not be negative"),
+        (["backend=dinosaur"], "Could not find 'backend/dinosaur' Available options in 'backend': .*da3_tiny"),
+        (["backend=oracle", "backend.noise=1"], r"Could not override 'backend\.noise'"),
+        (["backend.noise=1"], r"option 'backend\.noise=1': .*not in struct; backend has .*planes"),
+        (["backend=oracle", "backend.taps"], "expected key=value"),
+        (["backend=oracle", "model=huge"], "Could not find 'model/huge'"),
+        (["backend=oracle", "loss.x=1"], "option 'loss.x=1': expected key=value of backend, model, renderer"),
+        (["backend=oracle", "backend.depth_noise=-1"], "noise must not be negative"),
     ],
 )
-def test_what_is_unknown_is_named(arguments, said: str) -> None:
+def test_what_is_unknown_is_named(overrides: list[str], said: str) -> None:
     with pytest.raises(ValueError, match=said):
-        load_model(**arguments)
+        load_model(overrides=overrides)
 
 
 def test_a_slim_checkpoint_is_the_same_model(run_folder: Path, tmp_path: Path) -> None:
@@ -75,7 +69,7 @@ def test_what_ships_needs_no_name() -> None:
     loaded = load_model(device="cpu")
     assert (loaded.model.backend.name, loaded.weights.path) == ("sweep", SHIPPED)
     assert load_model(backend="sweep", device="cpu").weights.path == SHIPPED
-    assert load_model(backend="sweep,planes=32", device="cpu").weights.path is None
+    assert load_model(None, "sweep", ["backend.planes=32"], device="cpu").weights.path is None
 
 
 def test_another_backbone_is_refused(run_folder: Path) -> None:
@@ -95,17 +89,16 @@ def test_another_backbone_is_refused(run_folder: Path) -> None:
 def test_the_same_weights_with_other_tokens_are_refused(option: str, said: str, tmp_path: Path) -> None:
     """Neither changes a shape or the weights' hash."""
     built = load_model(backend="da3_tiny", device="cpu")
-    parts = {"backend": "da3_tiny", "model": "tiny", "renderer": "solid"}
     checkpoint = {
         "state_dict": {f"model.{name}": value for name, value in built.model.trained_state().items()},
         "backend": dict(built.model.backend.identity()),
         "global_step": 1,
-        "config": made_of(OmegaConf.create({part: compose_part(part, name) for part, name in parts.items()})),
+        "config": made_of(compose_groups("backend=da3_tiny", "model=tiny", "renderer=solid")),
     }
     write_checkpoint(checkpoint, tmp_path / "step-1.ckpt")
-    assert load_model(tmp_path / "step-1.ckpt", "da3_tiny,head_chunk=2", device="cpu").weights.step == 1
+    assert load_model(tmp_path / "step-1.ckpt", "da3_tiny", ["backend.head_chunk=2"], device="cpu").weights.step == 1
     with pytest.raises(ValueError, match=said):
-        load_model(tmp_path / "step-1.ckpt", f"da3_tiny,{option}", device="cpu")
+        load_model(tmp_path / "step-1.ckpt", "da3_tiny", [f"backend.{option}"], device="cpu")
 
 
 def test_weights_of_a_diverged_training_are_refused(run_folder: Path, tmp_path: Path) -> None:

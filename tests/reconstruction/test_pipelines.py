@@ -33,7 +33,7 @@ from vg2gt.types import Gaussians
 
 
 def run(*arguments: str | Path) -> None:
-    plain = ["--backend", STAND_IN, "--device", "cpu", "--quiet"]
+    plain = [*STAND_IN, "--device", "cpu", "--quiet"]
     reconstruct_command.main([*map(str, arguments), *plain])
 
 

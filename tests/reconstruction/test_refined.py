@@ -19,7 +19,7 @@ from vg2gt.reconstruction.saved import read_scene
 from vg2gt.reconstruction.scene import Scene
 from vg2gt.refinement import RefineOptions, RefineRates
 
-ORACLE = ["--backend", "oracle,depth_noise=0.02", "--quiet", "--device", "cpu"]
+ORACLE = ["backend=oracle", "backend.depth_noise=0.02", "--quiet", "--device", "cpu"]
 
 
 def vg2gt(monkeypatch: pytest.MonkeyPatch, *words: str) -> None:
@@ -65,7 +65,7 @@ def test_in_python(scene: Scene, tmp_path: Path) -> None:
 
 
 def test_the_command(saved: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
-    options = ["--steps", "8", "--holdout", "4", "--options", "default,check_every=4"]
+    options = ["--steps", "8", "--holdout", "4", "refine=default", "refine.check_every=4"]
     vg2gt(monkeypatch, "refine", str(saved), *options, "--quiet", "--device", "cpu")
     printed = capsys.readouterr().out
     assert "trained on     3 views:" in printed
@@ -117,7 +117,7 @@ def test_photographs_are_refined_unless_asked_not_to(scene: Scene) -> None:
         ("views.npz", "has no views.npz and no images/008.png"),
         ("shape", r"does not belong to the 4 cameras of 84x112 .*depth \(3, 84, 112\)"),
         ("picture", "has 10x10 pixels, its camera 84x112"),
-        ("option", "default has no option 'rats.sh'"),
+        ("option", "Could not override 'refine.rats.sh'"),
         ("value", "refine.holdout must be at least 2"),
     ],
 )
@@ -134,6 +134,6 @@ def test_mistakes_are_one_line(saved, damage, said, tmp_path, monkeypatch):
     elif damage == "picture":
         (folder / "views.npz").unlink()
         Image.new("RGB", (10, 10)).save(folder / "images" / "008.png")
-    words = {"option": ["--options", "default,rats.sh=1"], "value": ["--holdout", "1"]}.get(damage, [])
+    words = {"option": ["refine=default", "refine.rats.sh=1"], "value": ["--holdout", "1"]}.get(damage, [])
     with pytest.raises(SystemExit, match=said):
         vg2gt(monkeypatch, "refine", str(folder), "--steps", "1", "--quiet", "--device", "cpu", *words)

@@ -31,7 +31,7 @@ def start() -> Start:
     frames = source.load(source.scenes[0], range(VIEWS))
     cameras = Cameras(frames.world_to_camera[None], frames.intrinsics[None], SIZE)
     hints = Hints(frames.depth[None], cameras, ("room",), torch.arange(VIEWS)[None])
-    loaded = load_model(backend="oracle,depth_noise=0.02", device="cpu")
+    loaded = load_model(None, "oracle", ["backend.depth_noise=0.02"], device="cpu")
     with torch.no_grad():
         prediction = loaded.model(frames.images[None], hints)
     geometry = prediction.geometry

@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch.utils.data import DataLoader, TensorDataset
 
-from vg2gt.rendering import render, renderer, selfcheck
+from vg2gt.rendering import renderer, selfcheck
 from vg2gt.rendering.options import Mode
 from vg2gt.rendering.selfcheck import GRADIENTS, VALUES, Agreement, KernelsRefusedError
 
@@ -36,7 +36,7 @@ MUTANTS = {
 @interpreted
 @pytest.mark.parametrize("mode", ["rasterized", pytest.param("solid", marks=pytest.mark.slow)])
 def test_right_kernels_agree_far_within_the_bounds(mode: Mode) -> None:
-    found = selfcheck.compare(render, torch.device("cpu"), (mode,))
+    found = selfcheck.compare(torch.device("cpu"), (mode,))
     assert found.good
     assert found.values < VALUES / 10
     assert found.gradients < GRADIENTS / 10
@@ -60,7 +60,7 @@ def test_wrong_kernels_are_refused(name: str, tmp_path: Path, monkeypatch: pytes
     for kernel in kernels.__all__:
         if hasattr(wrong, kernel):
             monkeypatch.setattr(kernels, kernel, getattr(wrong, kernel))
-    found = selfcheck.compare(render, torch.device("cpu"), ("rasterized",))
+    found = selfcheck.compare(torch.device("cpu"), ("rasterized",))
     assert not found.good
     # Far outside the bounds, or not a number: a tile that is left out keeps whatever was in memory.
     assert not max(found.values / VALUES, found.gradients / GRADIENTS) <= 10
@@ -95,7 +95,7 @@ def test_the_check_does_not_depend_on_what_surrounds_the_first_render(surrounded
     monkeypatch.setattr(selfcheck, "compare", partial(selfcheck.compare, modes=("rasterized",)))
     monkeypatch.setattr(selfcheck, "cache_folder", lambda: tmp_path)
     selfcheck._refusal.cache_clear()
-    act = partial(selfcheck.require_trusted, render, torch.device("cpu"))
+    act = partial(selfcheck.require_trusted, torch.device("cpu"))
     if surrounded is validating:
         validating(act)
     else:
@@ -108,7 +108,7 @@ def checks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[str]:
     """Devices that were checked, on a machine that pretends to have some; what is found is kept in ``tmp_path``."""
     asked: list[str] = []
 
-    def compare(_: Any, device: torch.device) -> Agreement:
+    def compare(device: torch.device) -> Agreement:
         asked.append(str(device))
         return Agreement(1e-6, 1e-6)
 
@@ -176,3 +176,9 @@ def test_the_identity_names_versions_and_the_kernels() -> None:
     found = selfcheck.identity(torch.device("cpu"))
     assert f"torch {torch.__version__}" in found
     assert "kernels " in found
+
+
+def test_what_was_found_holds_for_these_kernels_alone() -> None:
+    """The kernels' sources are part of what an agreement is kept for."""
+    names = {path.name for path in selfcheck.SOURCES if path.is_file()}
+    assert {"tiles.py", "projection.py", "binning.py", "harmonics.py", "gpu_tiles.py"} <= names

@@ -46,7 +46,7 @@ def pickled_array(armed: Armed) -> np.ndarray:
 
 @pytest.fixture(scope="session")
 def model():
-    return load_model(backend="oracle,depth_noise=0", device="cpu").model
+    return load_model(overrides=["backend=oracle", "backend.depth_noise=0"], device="cpu").model
 
 
 @pytest.fixture(scope="session")

@@ -77,7 +77,7 @@ def test_wherever_it_stands(run_folder: Path, canary: Path, place: str) -> None:
     with pytest.raises(UntrustedError, match=r"_target_ is 'os\.mkdir'"):
         load_model(run_folder, device="cpu")
     with pytest.raises(UntrustedError, match=r"_target_ is 'os\.mkdir'"):  # other changes do not hide it
-        load_model(run_folder, device="cpu", options=["renderer.near=0.5", "model.fine.max_voxels=5"])
+        load_model(run_folder, device="cpu", overrides=["renderer.near=0.5", "model.fine.max_voxels=5"])
 
 
 def test_the_runs_data_call_nothing_foreign(run_folder: Path, canary: Path, rooms, caplog) -> None:
@@ -92,14 +92,14 @@ def test_what_the_user_names_is_called(run_folder: Path) -> None:
     """Untrusted is the file, not the command line."""
     edit(run_folder, lambda config: config.update(renderer={"_target_": "os.mkdir", "path": "nowhere"}))
     with pytest.raises(UntrustedError):
-        load_model(run_folder, "oracle", "tiny", device="cpu")
+        load_model(run_folder, overrides=["backend=oracle", "model=tiny"], device="cpu")
     edit(
         run_folder,
         lambda config: config.update(
             backend={"_target_": "os.mkdir"}, renderer={"_target_": "vg2gt.rendering.Renderer"}
         ),
     )
-    assert load_model(run_folder, "oracle,depth_noise=0", device="cpu").weights.step == 7
+    assert load_model(run_folder, "oracle", ["backend.depth_noise=0"], device="cpu").weights.step == 7
 
 
 YAMLS = {

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from vg2gt.method.additions.silhouette import beside_silhouettes, on_surface
+from vg2gt.method.additions.silhouette import near_silhouettes, on_surface
 
 
 def _blurred_step(near: float, far: float) -> torch.Tensor:
@@ -28,11 +28,11 @@ def test_three_pixels_on_either_side_of_a_step_are_beside_it(step: float, beside
     depth[..., 8:] *= step
     expected = torch.zeros(2, 12, 16, dtype=torch.bool)
     expected[..., 5:11] = beside
-    assert torch.equal(beside_silhouettes(depth), expected)
+    assert torch.equal(near_silhouettes(depth), expected)
 
 
 def test_what_lies_between_foreground_and_background_is_beside_a_silhouette() -> None:
     depth = _blurred_step(1.0, 1.12)  # too small a step for a surface to break off
-    assert beside_silhouettes(depth).flatten().nonzero().flatten().tolist() == [
+    assert near_silhouettes(depth).flatten().nonzero().flatten().tolist() == [
         16 * row + column for row in range(12) for column in (7, 8)
     ]

@@ -1,4 +1,4 @@
-"""``vg2gt ablate``, or ``python -m vg2gt.ablate``: the paper's ablations on our data."""
+"""``vg2gt ablate``: the paper's ablations on our data."""
 
 from omegaconf import DictConfig
 
@@ -12,7 +12,3 @@ def main(config: DictConfig) -> None:
     from vg2gt.studies.ablation import run_study
 
     run_study(config)
-
-
-if __name__ == "__main__":
-    main()

@@ -45,7 +45,7 @@ COMMANDS = {
     "reconstruct": Command(
         "vg2gt.cli.reconstruct:main",
         "makes a scene of Gaussians from images, a folder of them or a video",
-        "vg2gt reconstruct photos/ --backend da3_small --out outputs/photos",
+        "vg2gt reconstruct photos/ backend=da3_small --out outputs/photos",
     ),
     "refine": Command(
         "vg2gt.cli.refine:main",
@@ -65,12 +65,12 @@ COMMANDS = {
     "export": Command(
         "vg2gt.cli.export:main",
         "writes a frozen network as an ONNX bundle",
-        "vg2gt export backend=da3_small out=bundles/da3_small",
+        "vg2gt export backend=da3_small --out bundles/da3_small",
     ),
     "data": Command(
         "vg2gt.cli.data:main",
         "makes scenes, splits and lists of views",
-        "vg2gt data synthetic out=rooms scenes=100",
+        "vg2gt data synthetic --out rooms --scenes 100",
     ),
     "curves": Command(
         "vg2gt.cli.curves:main",
@@ -88,17 +88,17 @@ DATA_COMMANDS = {
     "synthetic": Command(
         "vg2gt.cli.data:synthetic",
         "writes procedural rooms and streets as RGB-D recordings",
-        "vg2gt data synthetic out=rooms scenes=100",
+        "vg2gt data synthetic --out rooms --scenes 100",
     ),
     "splits": Command(
         "vg2gt.cli.data:splits",
         "divides a dataset's scenes into training and evaluation lists",
-        "vg2gt data splits out=lists data=rgbd data.root=RECORDINGS",
+        "vg2gt data splits data=rgbd data.root=RECORDINGS --out lists",
     ),
     "views": Command(
         "vg2gt.cli.data:views",
         "draws the views of an evaluation and writes them down",
-        "vg2gt data views evaluation=rgbd data.root=RECORDINGS out=views.json",
+        "vg2gt data views evaluation=rgbd data.root=RECORDINGS --out views.json",
     ),
 }
 

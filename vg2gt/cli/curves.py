@@ -1,4 +1,4 @@
-"""``vg2gt curves``, or ``python -m vg2gt.curves``: training curves as a picture (extra: eval)."""
+"""``vg2gt curves``: training curves as a picture (extra: eval)."""
 
 from __future__ import annotations
 

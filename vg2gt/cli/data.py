@@ -8,19 +8,26 @@ import re
 import time
 from collections.abc import Sequence
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from omegaconf import MISSING
-
-from vg2gt.cli.arguments import key_value_command, read_options
+from vg2gt.cli.arguments import flag_parser, list_of_names, separate
 from vg2gt.cli.commands import DATA_COMMANDS, dispatch
+from vg2gt.cli.errors import errors_in_one_line
 from vg2gt.config import compose
 
 if TYPE_CHECKING:
     from vg2gt.data.datamodule import SceneDataModule
     from vg2gt.data.synthetic.export import SceneSettings
+
+SYNTHETIC = "\nRun it again to continue or to add scenes; data=rgbd reads them."
+SPLITS = """
+key=value arguments choose the dataset as in vg2gt train; the scenes of data.train are divided, recordings of one place
+stay together. Use the lists with data.train.scenes=DIR/train.txt data.val.scenes=DIR/val.txt"""
+VIEWS = """
+key=value arguments are those of vg2gt evaluate: which data, which scenes (data.eval_scenes), which numbers of views and
+how they are drawn (evaluation.selection). Read the file with evaluation.selection.index=FILE.json. Equal arguments and
+data give equal files."""
 
 
 def main() -> None:
@@ -28,76 +35,55 @@ def main() -> None:
     dispatch("vg2gt data", DATA_COMMANDS)
 
 
-def data_module(overrides: Sequence[str]) -> SceneDataModule:
-    """The data that the arguments of ``vg2gt train`` choose."""
-    from hydra.utils import instantiate
-
-    return instantiate(compose("train", *overrides).data)
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-@dataclass
-class SyntheticOptions:
-    """Options of ``vg2gt data synthetic``; most are those of :class:`SceneSettings`."""
-
-    out: str = MISSING
-    scenes: int = 100
-    first_seed: int = 0
-    frames: int = 16
-    size: tuple[int, int] = (224, 448)
-    variant: Any = "room"
-    highlights: Any = False
-    normals: bool = False
-    depth_scale: float = 1000.0
-    exposure: float = 0.0
-    jpeg: Any = None
-    workers: int = field(default_factory=_cores)
-
-    @property
-    def settings(self) -> SceneSettings:
-        """The options that decide what a scene holds."""
+def synthetic(argv: Sequence[str] | None = None) -> None:
+    """Writes synthetic scenes as RGB-D recordings."""
+    parser = flag_parser("data synthetic", DATA_COMMANDS["synthetic"], SYNTHETIC)
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    add = parser.add_argument
+    add("--out", type=Path, required=True, metavar="DIR", help="where to write")
+    add("--scenes", type=int, default=100, metavar="N", help="how many, default 100")
+    add("--first-seed", type=int, default=0, metavar="N", help="seed of the first one, default 0")
+    add("--frames", type=int, default=16, metavar="N", help="frames per scene, default 16")
+    add("--size", type=int, nargs=2, default=(224, 448), metavar=("H", "W"), help="of the images, default 224 448")
+    add("--variant", type=list_of_names, default=["room"], metavar="LIST", help="room, outdoor, wide, object, landmark "
+        "or several that take turns: room,room,outdoor")  # fmt: skip
+    add("--highlights", choices=("none", "soft", "lobes"), default="none", help="surfaces shine; lobes: strongly")
+    add("--normals", action="store_true", help="write normals/NNNNN.npz too")
+    add("--depth-scale", type=float, default=1000.0, metavar="X", help="stored depth units per metre, default 1000; "
+        "deeper than 65534 units is written as no depth")  # fmt: skip
+    add("--exposure", type=float, default=0.0, metavar="X", help="scenes too dark or bright, deviation in stops")
+    add("--jpeg", type=int, nargs=2, metavar="Q", help="compress images at qualities of this range, such as 30 95")
+    add("--workers", type=int, default=cores, metavar="N", help="processes; default: as many as there are cores")
+    options = parser.parse_args(argv)
+    with errors_in_one_line():
         from vg2gt.data.synthetic.export import SceneSettings
 
-        chosen: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(SceneSettings)}
-        return SceneSettings(**{**chosen, "size": tuple(self.size)})
+        variant = options.variant[0] if len(options.variant) == 1 else options.variant
+        highlights = {"none": False, "soft": True}.get(options.highlights, options.highlights)
+        settings = SceneSettings(
+            options.frames, tuple(options.size), variant, highlights, options.normals, options.depth_scale,
+            options.exposure, options.jpeg,
+        )  # fmt: skip
+        write_synthetic(options.out.expanduser(), options.scenes, options.first_seed, settings, options.workers)
 
 
-@key_value_command(DATA_COMMANDS["synthetic"])
-def synthetic(arguments: list[str]) -> None:
-    """Writes synthetic scenes as RGB-D recordings for data=rgbd; run it again to continue or to add scenes.
+def write_synthetic(out: Path, scenes: int, first_seed: int, settings: SceneSettings, workers: int) -> None:
+    """Writes those of the scenes that are missing in ``out``.
 
-    vg2gt data synthetic out=FOLDER [key=value ...]
-
-      scenes=100        how many
-      first_seed=0      seed of the first one
-      frames=16         frames per scene
-      size=[224,448]    image height and width
-      variant=room      room, outdoor, wide, object, landmark, or a list that takes turns: [room,room,outdoor]
-      highlights=false  surfaces shine: colours depend on the view; lobes: strongly
-      normals=false     write normals/NNNNN.npz too
-      depth_scale=1000  stored depth units per metre; deeper than 65534 units is written as no depth
-      exposure=0        scenes too dark or too bright, standard deviation in stops
-      jpeg=null         [30,95]: images are compressed at qualities of this range
-      workers=N         processes; as many as there are cores
+    Raises:
+        ValueError: if a setting is wrong.
+        OSError: if a process was killed.
     """
     from rich.progress import track
 
     from vg2gt.data.synthetic.export import missing_scenes, write_scenes
 
-    options, unknown = read_options(SyntheticOptions, arguments)
-    if unknown:
-        known = ", ".join(f"{field.name}=" for field in fields(SyntheticOptions))
-        raise ValueError(f"unknown option {unknown[0]!r}; options are {known}")
-    if options.workers < 1:
-        raise ValueError(f"option workers: must be at least 1, got {options.workers}")
+    if workers < 1:
+        raise ValueError(f"--workers must be at least 1, got {workers}")
     started = time.perf_counter()
-    out = Path(options.out).expanduser()
-    names = missing_scenes(out, options.scenes, options.first_seed, options.settings)
+    names = missing_scenes(out, scenes, first_seed, settings)
     try:
-        for _ in track(write_scenes(out, names, options.settings, options.workers), "scenes", total=len(names)):
+        for _ in track(write_scenes(out, names, settings, workers), "scenes", total=len(names)):
             pass
     except BrokenProcessPool as error:
         raise OSError(
@@ -107,66 +93,45 @@ def synthetic(arguments: list[str]) -> None:
         raise SystemExit("interrupted; finished scenes are kept, run the command again to continue") from None
     seconds = time.perf_counter() - started
     print(
-        f"{out}: wrote {len(names)} scenes of {options.frames} frames in {seconds:.0f} s, "
-        f"{options.scenes - len(names)} were there; use them: vg2gt train data=rgbd data.root={out}"
+        f"{out}: wrote {len(names)} scenes of {settings.frames} frames in {seconds:.0f} s, "
+        f"{scenes - len(names)} were there; use them: vg2gt train data=rgbd data.root={out}"
     )
 
 
-@dataclass
-class SplitOptions:
-    """Options of ``vg2gt data splits``."""
+def splits(argv: Sequence[str] | None = None) -> None:
+    """Divides the scenes of a dataset into training and evaluation lists."""
+    given, overrides = separate(argv)
+    parser = flag_parser("data splits", DATA_COMMANDS["splits"], SPLITS)
+    add = parser.add_argument
+    add("--out", type=Path, required=True, metavar="DIR", help="where train.txt and val.txt are written")
+    add("--fraction", type=float, default=0.1, metavar="X", help="share of the places for val.txt, default 0.1; of "
+        "every part of a mixture")  # fmt: skip
+    add("--seed", type=int, default=0, metavar="N", help="another seed, another division")
+    options = parser.parse_args(given)
+    with errors_in_one_line():
+        from hydra.utils import instantiate
 
-    out: str = MISSING
-    fraction: float = 0.1
-    split_seed: int = 0
+        from vg2gt.data.splits import write_splits
 
-
-@key_value_command(DATA_COMMANDS["splits"])
-def splits(arguments: list[str]) -> None:
-    """Divides the scenes of a dataset into training and evaluation lists; recordings of one place stay together.
-
-    vg2gt data splits out=FOLDER data=rgbd data.root=RECORDINGS [key=value ...]
-
-      out=FOLDER        where train.txt and val.txt are written
-      fraction=0.1      share of the places that goes to val.txt, of every part of a mixture
-      split_seed=0      another seed, another division
-
-    All other arguments choose the dataset as in `vg2gt train`; the scenes of data.train are divided. Use the lists with
-    data.train.scenes=FOLDER/train.txt data.val.scenes=FOLDER/val.txt
-    """
-    from vg2gt.data.splits import write_splits
-
-    options, overrides = read_options(SplitOptions, arguments)
-    source = data_module(overrides).train_source()
-    for path in write_splits(Path(options.out).expanduser(), source, options.fraction, options.split_seed):
-        print(f"{path}: {len(path.read_text().splitlines()) - 1} scenes")
+        source = instantiate(compose("train", *overrides).data).train_source()
+        for path in write_splits(options.out.expanduser(), source, options.fraction, options.seed):
+            print(f"{path}: {len(path.read_text().splitlines()) - 1} scenes")
 
 
-@dataclass
-class ViewOptions:
-    """Options of ``vg2gt data views``."""
-
-    out: str = MISSING
-
-
-@key_value_command(DATA_COMMANDS["views"])
-def views(arguments: list[str]) -> None:
-    """Makes an index of views: which views of which scenes an evaluation takes.
-
-    vg2gt data views evaluation=rgbd data.root=FOLDER out=FILE.json [key=value ...]
-
-    All arguments but out are those of `vg2gt evaluate`; they say which data, which scenes (data.eval_scenes), which
-    numbers of views and how they are drawn (evaluation.selection). The file is then read with
-    evaluation.selection.index=FILE.json. Equal arguments and data give equal files.
-    """
-    print(write_views(arguments))
+def views(argv: Sequence[str] | None = None) -> None:
+    """Writes an index of views: which views of which scenes an evaluation takes."""
+    given, overrides = separate(argv)
+    parser = flag_parser("data views", DATA_COMMANDS["views"], VIEWS)
+    parser.add_argument("--out", required=True, metavar="FILE.json", help="the index to write")
+    with errors_in_one_line():
+        print(write_views(parser.parse_args(given).out, overrides))
 
 
-def write_views(arguments: Sequence[str]) -> Path:
-    """Writes the index that the arguments ask for; returns its path.
+def write_views(out: str, overrides: Sequence[str]) -> Path:
+    """Writes the index that the overrides of ``vg2gt evaluate`` ask for; returns its path.
 
     Raises:
-        ValueError: if ``out`` is missing or an argument is wrong.
+        ValueError: if ``out`` is no JSON file or an override is wrong.
         DataError: if a scene has too few frames.
     """
     from hydra.utils import instantiate
@@ -175,9 +140,8 @@ def write_views(arguments: Sequence[str]) -> Path:
     from vg2gt.evaluation.run import view_counts
     from vg2gt.io.files import write_text
 
-    options, overrides = read_options(ViewOptions, arguments)
-    if not options.out.endswith(".json"):
-        raise ValueError(f"give the index file to write, out=FILE.json, got out={options.out}")
+    if not out.endswith(".json"):
+        raise ValueError(f"give the index file to write, --out FILE.json, got {out}")
     config = compose("evaluate", "output_dir=.", "name=index", *overrides)
     evaluation = instantiate(config.evaluation, _convert_="all")
     datamodule: SceneDataModule = instantiate(config.data)
@@ -186,8 +150,4 @@ def write_views(arguments: Sequence[str]) -> Path:
     index = make_index(evaluation.selection, source, scenes, view_counts(config.views))
     # One line per list of frames: readable, and a change of one draw is a change of one line.
     text = re.sub(r"\[[^\[\]{}]*\]", lambda found: re.sub(r"\s+", " ", found[0]), json.dumps(index, indent=1))
-    return write_text(options.out, text.replace("[ ", "[").replace(" ]", "]") + "\n")
-
-
-if __name__ == "__main__":
-    main()
+    return write_text(out, text.replace("[ ", "[").replace(" ]", "]") + "\n")

@@ -85,7 +85,10 @@ def _folders() -> Iterator[tuple[str, str]]:
     data = Path(os.environ.get("VG2GT_CACHE", "~/.cache/vg2gt")).expanduser()
     yield "data", f"{data} ({_size(data)}; the variable VG2GT_CACHE names another folder)"
     kernels = cache_folder()
-    yield "kernels", "cannot be kept: every start compiles anew" if kernels is None else f"{kernels} ({_size(kernels)})"
+    yield (
+        "kernels",
+        "cannot be kept: every start compiles again" if kernels is None else f"{kernels} ({_size(kernels)})",
+    )
     triton = Path(os.environ.get("TRITON_CACHE_DIR", "~/.triton/cache")).expanduser()
     yield "triton", f"{triton} ({_size(triton)})"
 
@@ -97,8 +100,7 @@ def _size(folder: Path) -> str:
 
 
 def _renderer(device: torch.device, timed: bool) -> Iterator[tuple[str, str]]:
-    """Which renderer ``auto`` is there, how far the kernels are off (measured anew), and how long it takes."""
-    from vg2gt.rendering import render
+    """Which renderer ``auto`` is there, how far the kernels are off (measured again), and how long it takes."""
     from vg2gt.rendering.renderer import automatic
     from vg2gt.rendering.selfcheck import KernelsRefusedError, compare, identity
 
@@ -110,7 +112,7 @@ def _renderer(device: torch.device, timed: bool) -> Iterator[tuple[str, str]]:
     yield "renderer", chosen
     if device.type != "cpu" and _version("triton") != "missing":
         try:
-            yield "kernels", f"'triton': {compare(render, device)}"
+            yield "kernels", f"'triton': {compare(device)}"
         except Exception as error:  # the report is what this command is for
             yield "kernels", f"'triton' does not run: {type(error).__name__}: {' '.join(str(error).split())[:300]}"
     if timed:

@@ -1,4 +1,4 @@
-"""``vg2gt evaluate``, or ``python -m vg2gt.evaluate``: a checkpoint's figures on a data set."""
+"""``vg2gt evaluate``: a checkpoint's figures on a data set."""
 
 from __future__ import annotations
 
@@ -28,7 +28,3 @@ def main(config: DictConfig) -> None:
     from vg2gt.evaluation.run import evaluate
 
     evaluate(config)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,47 +1,36 @@
-"""``vg2gt export``, or ``python -m backends.export``: a frozen network as an ONNX bundle."""
+"""``vg2gt export``: a frozen network as an ONNX bundle."""
 
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 
-from omegaconf import MISSING
-
-from vg2gt.cli.arguments import key_value_command, read_options
+from vg2gt.cli.arguments import flag_parser, separate
 from vg2gt.cli.commands import COMMANDS
-from vg2gt.config import compose
+from vg2gt.cli.errors import errors_in_one_line
+from vg2gt.config import compose_groups
+
+DETAILS = """
+backend=NAME is a network of configs/backend, VGGT or a relative DA3 network, backend.key=value one of its options.
+Numbers of scenes, views, rows and columns stay free."""
 
 
-@dataclass
-class ExportOptions:
-    """The command's own options."""
+def main(argv: Sequence[str] | None = None) -> None:
+    """Writes the bundle; ends with one line on what is wrong where something is."""
+    given, overrides = separate(argv)
+    parser = flag_parser("export", COMMANDS["export"], DETAILS)
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder")
+    out = parser.parse_args(given).out
+    if not any(override.startswith("backend=") for override in overrides):
+        parser.error("give backend=NAME")
+    with errors_in_one_line():
+        from hydra.utils import instantiate
 
-    out: str = MISSING
-    backend: str = MISSING
+        from backends.export import export
 
-
-@key_value_command(COMMANDS["export"])
-def main(arguments: list[str]) -> None:
-    """Writes a frozen network as an ONNX bundle with free numbers of scenes, views, rows and columns.
-
-    vg2gt export backend=NAME out=FOLDER [backend.key=value ...]
-
-      backend=NAME      of configs/backend: VGGT or a relative DA3 network
-      out=FOLDER        a new folder
-    """
-    from hydra.utils import instantiate
-
-    from backends.export import export
-
-    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
-    options, overrides = read_options(ExportOptions, arguments)
-    config = compose(None, f"+backend={options.backend}", *overrides)
-    description = export(instantiate(config.backend), Path(options.out).expanduser())
-    found = f"{options.out}: {description.name}, licence: {description.licence}"
-    differences = ", ".join(f"{part} {value:.1e}" for part, value in description.max_difference.items())
-    print(f"{found}; largest difference to torch: {differences}")
-
-
-if __name__ == "__main__":
-    main()
+        logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+        description = export(instantiate(compose_groups(*overrides).backend), out.expanduser())
+        found = f"{out}: {description.name}, licence: {description.licence}"
+        differences = ", ".join(f"{part} {value:.1e}" for part, value in description.max_difference.items())
+        print(f"{found}; largest difference to torch: {differences}")

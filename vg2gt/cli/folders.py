@@ -25,7 +25,7 @@ def run_folder(_root_: DictConfig) -> str:
     """Folder of a training inside ``outputs``: ``name``, or what was chosen and a number if that is taken.
 
     Where a run is to go on (``ckpt=last``, ``ckpt=auto``) or to be replaced (``overwrite=true``), and where several
-    processes are started at once, the name stands without a number. Trials (``fast_dev_run``) are kept apart.
+    processes are started at once, the name has no number. Trials (``fast_dev_run``) are kept apart.
     """
     config = _root_
     sweep = str(config.hydra.mode).endswith("MULTIRUN")
@@ -50,7 +50,7 @@ def chosen(choices: DictConfig) -> str:
 
 @lru_cache
 def free(name: str) -> str:
-    """The name, or the first with a number behind it whose folder holds no run; the same for all jobs of a sweep."""
+    """The name, or the first with a number after it whose folder has no run; the same for all jobs of a sweep."""
     number, candidate = 1, name
     while any((Path("outputs", candidate) / part).exists() for part in OF_A_RUN) or _holds_jobs(candidate):
         number += 1

@@ -9,14 +9,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vg2gt.cli.arguments import flag_parser, list_of_names, listing, refuse_unknown
+from vg2gt.cli.arguments import OVERRIDES, add_common_flags, flag_parser, listing, separate
 from vg2gt.cli.commands import COMMANDS
 from vg2gt.cli.errors import errors_in_one_line
 from vg2gt.cli.refine import options_for, print_refinement
 from vg2gt.reconstruction.output_names import DEFAULT, ORBIT_FRAMES, OUTPUTS, PREDICTED, REFINED, SFM
 
 POSES = (
-    "cameras from files beside the images, from structure from motion (kept in DIR/sfm), or the backbone's own; auto: "
+    "cameras from files next to the images, from structure from motion (kept in DIR/sfm), or the backbone's own; auto: "
     "the first of these that the backbone needs and that is there"
 )
 
@@ -35,28 +35,21 @@ if TYPE_CHECKING:
 
 def parser() -> argparse.ArgumentParser:
     """The command's arguments."""
-    arguments = flag_parser("reconstruct", COMMANDS["reconstruct"], listing(OUTPUTS))
+    arguments = flag_parser("reconstruct", COMMANDS["reconstruct"], OVERRIDES + listing(OUTPUTS))
     add = arguments.add_argument
     add("images", nargs="+", help="image files, a folder of them, a video, or a recording with known cameras")
     add("--out", required=True, metavar="DIR", help="where to write")
     add("--ckpt", metavar="PATH", help="a checkpoint or a run's folder; without it the head is untrained")
-    add("--backend", metavar="NAME[,KEY=VALUE...]", help="of configs/backend; default: the run's own")
-    add("--model", metavar="NAME[,KEY=VALUE...]", help="of configs/model; default: the run's own")
-    add("--set", action="append", default=[], metavar="KEY=VALUE", help="another option, such as model.fine.max_voxels")
     add("--poses", choices=("auto", "given", "sfm", "backbone"), default="auto", help=POSES)
     add("--frame", choices=("auto", "given", "first", "upright"), default="auto", help=FRAME)
-    add("--save", type=list_of_names, default=list(DEFAULT), metavar="LIST", help=f"default: {','.join(DEFAULT)}")
     add("--size", type=_size, metavar="N|HxW", help="longer side, or height x width, in pixels; default 518, CPU 280")
     add("--every", type=int, default=1, metavar="N", help="take every N-th image or frame only")
     add("--max-images", type=int, metavar="N", help="take at most N, evenly spread; of a video 32 by default")
-    add("--mode", choices=("solid", "rasterized"), default="solid", help="how views are rendered")
     add("--refine", type=_steps, metavar="N", help=REFINE)
     add("--frames", type=int, default=ORBIT_FRAMES, metavar="N", help=f"length of the orbit, default {ORBIT_FRAMES}")
     add("--mesh-voxel", type=float, metavar="X", help="edge of the mesh's voxels in scene units")
-    add("--device", default="auto", help="auto, cpu, cuda, cuda:N")
     add("--skip-damaged", action="store_true", help="go on without images that cannot be read")
-    add("--overwrite", action="store_true", help="replace outputs that are there")
-    add("--quiet", action="store_true", help="no progress bars")
+    add_common_flags(arguments, DEFAULT)
     return arguments
 
 
@@ -65,19 +58,18 @@ def main(argv: Sequence[str] | None = None) -> None:
     from rich.console import Console
     from rich.logging import RichHandler
 
-    arguments = parser()
-    options, unknown = arguments.parse_known_args(argv)
-    refuse_unknown(arguments, unknown)
+    given, overrides = separate(argv)
+    options = parser().parse_args(given)
     logging.basicConfig(
         level=logging.WARNING,
         format="%(message)s",
         handlers=[RichHandler(console=Console(stderr=True), show_time=False, show_path=False)],
     )
     with errors_in_one_line():
-        run(options)
+        run(options, overrides)
 
 
-def run(options: argparse.Namespace) -> None:
+def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     """Reconstructs and writes."""
     from vg2gt.io.video import require_pyav
     from vg2gt.memory import RECONSTRUCTION, memory_advice
@@ -95,9 +87,9 @@ def run(options: argparse.Namespace) -> None:
     check_choice(options.every, options.max_images)
     for item in options.images:  # before weights are downloaded
         existing_path(item)
-    kind = backend_class(options.ckpt, options.backend)
+    kind = backend_class(options.ckpt, overrides)
     if getattr(kind, "needs_depth", False):
-        check_depth((options.backend or "of the checkpoint").partition(",")[0], options.images)
+        check_depth(kind.__name__, options.images)
     check_pictures(options.images, options.skip_damaged)
     if options.poses == "sfm" or (options.poses != "backbone" and getattr(kind, "needs_cameras", False)):
         check_pycolmap(options.images, options.poses)
@@ -105,7 +97,7 @@ def run(options: argparse.Namespace) -> None:
         require_pyav("writing orbit.mp4")
     with Monitor(show=not options.quiet, device=choose_device(options.device)) as monitor:
         with monitor.stage("load model"):
-            ready = load_model(options.ckpt, options.backend, options.model, options.set, device=options.device)
+            ready = load_model(options.ckpt, overrides=overrides, device=options.device)
         scene = reconstruct_with(
             ready.model,
             options.images,

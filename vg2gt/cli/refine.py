@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vg2gt.cli.arguments import flag_parser, list_of_names, listing
+from vg2gt.cli.arguments import add_common_flags, flag_parser, listing, separate
 from vg2gt.cli.commands import COMMANDS
 from vg2gt.cli.errors import errors_in_one_line
 from vg2gt.reconstruction.output_names import DEFAULT, OUTPUTS, REFINED
@@ -18,36 +18,33 @@ if TYPE_CHECKING:
     from vg2gt.reconstruction.scene import Scene
     from vg2gt.refinement import RefineOptions
 
+HOW = "\nrefine=NAME of configs/refine and refine.key=value say how; default: what suits the scene's cameras"
 ADVICE = "fewer or smaller images (vg2gt reconstruct --max-images, --size) or fewer Gaussians"
 
 
 def parser() -> argparse.ArgumentParser:
     """The command's arguments."""
-    arguments = flag_parser("refine", COMMANDS["refine"], listing(OUTPUTS))
+    arguments = flag_parser("refine", COMMANDS["refine"], HOW + listing(OUTPUTS))
     add = arguments.add_argument
     add("scene", metavar="DIR", help="a folder that vg2gt reconstruct has written")
     add("--out", metavar="DIR", help="where to write; default: refined/ in the scene's folder")
     add("--steps", type=int, metavar="N", help="default: that of the options")
     add("--seconds", type=float, metavar="S", help="end after so many seconds; alone: without a number of steps")
     add("--holdout", type=int, metavar="N", help="leave every N-th view out and say its PSNR before and after")
-    add("--options", metavar="NAME[,KEY=VALUE...]", help="of configs/refine; default: what suits the scene's cameras")
-    add("--save", type=list_of_names, default=list(DEFAULT), metavar="LIST", help=f"default: {','.join(DEFAULT)}")
-    add("--mode", choices=("solid", "rasterized"), default="solid", help="how views are rendered")
-    add("--device", default="auto", help="auto, cpu, cuda, cuda:N")
-    add("--overwrite", action="store_true", help="replace outputs that are there")
-    add("--quiet", action="store_true", help="no progress bars")
+    add_common_flags(arguments, DEFAULT)
     return arguments
 
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Runs the command; ends with one line on what is wrong where something is."""
-    options = parser().parse_args(argv)
+    given, overrides = separate(argv)
+    options = parser().parse_args(given)
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     with errors_in_one_line():
-        run(options)
+        run(options, overrides)
 
 
-def run(options: argparse.Namespace) -> None:
+def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     """Refines and writes."""
     from vg2gt.memory import memory_advice
     from vg2gt.reconstruction.monitor import Monitor
@@ -60,13 +57,12 @@ def run(options: argparse.Namespace) -> None:
     check_outputs(options.save)
     out = Path(options.out or Path(options.scene) / "refined")
     check_folder(out, [*options.save, REFINED], options.overwrite)
-    if options.options is not None:
-        refine_options(options.options)  # a wrong option is said before anything is read
+    refine_options("default", overrides)  # says what is wrong before anything is read
     device = choose_device(options.device)
     with Monitor(show=not options.quiet, device=device) as monitor, memory_advice(ADVICE):
         with monitor.stage("read scene"):
             scene = read_scene(options.scene, Renderer(mode=options.mode), device)
-        how = options_for(scene, options.options, options.steps, options.seconds, options.holdout)
+        how = options_for(scene, overrides, options.steps, options.seconds, options.holdout)
         scene = refine_scene(scene, how, monitor)
         folder = write_outputs(scene, out, options.save, overwrite=options.overwrite, monitor=monitor)
     print_refinement(scene)
@@ -83,25 +79,30 @@ def print_refinement(scene: Scene) -> None:
 
 def options_for(
     scene: Scene,
-    spec: str | None = None,
+    overrides: Sequence[str] = (),
     steps: int | None = None,
     seconds: float | None = None,
     holdout: int | None = None,
 ) -> RefineOptions:
-    """Options for a scene: ``spec``, or what suits its cameras; predicted ones, which nothing adjusted, are refined."""
+    """Options for a scene: those that suit its cameras, changed by ``overrides`` and then by the other arguments.
+
+    Predicted cameras, which nothing has adjusted, are refined unless the overrides choose a ``refine=NAME``.
+    """
     from vg2gt.reconstruction.refined import refinement_of
     from vg2gt.refinement import RefineRates
 
-    found = refine_options(spec or refinement_of(scene), steps, seconds, holdout)
-    if spec is None and not scene.cameras_from:
+    found = refine_options(refinement_of(scene), overrides)
+    if not overrides and not scene.cameras_from:
         found = replace(found, rates=replace(found.rates, cameras=RefineRates().cameras))
-    return found
+    if seconds is not None:
+        found = replace(found, seconds=seconds, steps=steps)
+    elif steps is not None:
+        found = replace(found, steps=steps)
+    return found if holdout is None else replace(found, holdout=holdout)
 
 
-def refine_options(
-    spec: str = "default", steps: int | None = None, seconds: float | None = None, holdout: int | None = None
-) -> RefineOptions:
-    """Options of ``NAME[,KEY=VALUE...]`` of ``configs/refine``; the other arguments stand above it where given.
+def refine_options(name: str, overrides: Sequence[str]) -> RefineOptions:
+    """Options of ``refine=NAME refine.key=value``; ``name`` where the overrides choose none.
 
     Raises:
         ValueError: if a name is unknown or a value out of range.
@@ -109,16 +110,12 @@ def refine_options(
     from hydra.errors import InstantiationException
     from hydra.utils import instantiate
 
-    from vg2gt.runs.load import compose_part
+    from vg2gt.config import compose_groups
 
+    chosen = any(override.startswith("refine=") for override in overrides)
     try:
-        found = instantiate(compose_part("refine", spec))
+        return instantiate(compose_groups(*([] if chosen else [f"refine={name}"]), *overrides).refine)
     except InstantiationException as error:
         if not isinstance(error.__cause__, ValueError):
             raise
         raise error.__cause__ from error
-    if seconds is not None:
-        found = replace(found, seconds=seconds, steps=steps)
-    elif steps is not None:
-        found = replace(found, steps=steps)
-    return found if holdout is None else replace(found, holdout=holdout)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vg2gt.cli.arguments import flag_parser, list_of_names, listing
+from vg2gt.cli.arguments import add_common_flags, flag_parser, listing
 from vg2gt.cli.commands import COMMANDS
 from vg2gt.cli.errors import errors_in_one_line
 from vg2gt.reconstruction.output_names import FPS, MAPS
@@ -31,15 +31,11 @@ def parser() -> argparse.ArgumentParser:
         help="cameras.json (ours or of 3DGS), transforms.json, or a COLMAP model's folder",
     )
     add("--out", required=True, metavar="DIR", help="where to write")
-    add("--save", type=list_of_names, default=list(DEFAULT), metavar="LIST", help=f"default: {','.join(DEFAULT)}")
-    add("--mode", choices=("solid", "rasterized"), default="solid")
     add("--depth", choices=("median", "expected"), default="median", help="expected: rasterized only")
     add("--interpolate", type=int, metavar="N", help="go smoothly through the cameras with N new ones between each two")
     add("--fps", type=float, default=FPS, help=f"of the animation, default {FPS:g}")
     add("--near", type=float, default=0.01, help="near plane in scene units")
-    add("--device", default="auto", help="auto, cpu, cuda, cuda:N")
-    add("--overwrite", action="store_true", help="replace outputs that are there")
-    add("--quiet", action="store_true", help="no progress bars")
+    add_common_flags(arguments, DEFAULT)
     return arguments
 
 

@@ -37,4 +37,4 @@ def run_in_own_process(config: DictConfig) -> None:
     folder = f'hydra.run.dir="{config.output_dir}"'
     ended = subprocess.run([sys.executable, *program, *hydra, *overrides.task, folder], check=False)
     if ended.returncode:
-        raise RuntimeError(f"{config.output_dir}: the job ended with status {ended.returncode}, its error stands above")
+        raise RuntimeError(f"{config.output_dir}: the job ended with status {ended.returncode}, its error is above")

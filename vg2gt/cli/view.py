@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from vg2gt.io.cameras_json import NamedCamera
     from vg2gt.viewer import ViewerScene
 
-IMAGE_FOLDER = "images"  # beside cameras.json, as `vg2gt reconstruct --save images` writes it
+IMAGE_FOLDER = "images"  # next to cameras.json, as `vg2gt reconstruct --save images` writes it
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -79,8 +79,8 @@ def _scene(arguments: argparse.Namespace) -> ViewerScene:
     if arguments.cameras is None:
         return ViewerScene(gaussians, title=title)
     cameras = read_cameras_json(arguments.cameras)
-    beside = arguments.cameras.parent
-    folders = [arguments.images] if arguments.images is not None else [beside, beside / IMAGE_FOLDER]
+    near = arguments.cameras.parent
+    folders = [arguments.images] if arguments.images is not None else [near, near / IMAGE_FOLDER]
     return ViewerScene(gaussians, cameras, _pictures(cameras, folders), title)
 
 

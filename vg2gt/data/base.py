@@ -25,7 +25,7 @@ class Frames(TensorRecord):
         depth: ``[V, H, W]`` float32 z-depth in the dataset's unit, 0 = invalid; the same pixels as ``images``.
         world_to_camera: ``[V, 4, 4]`` float32 rigid OpenCV poses.
         intrinsics: ``[V, 3, 3]`` float32 in pixels, integer pixel centres.
-        sparse_depth: depth stands at single pixels (laser, triangulated points): resizing moves the points instead of
+        sparse_depth: depth is at single pixels only (laser, triangulated points): resizing moves points instead of
             looking up the nearest pixel.
         mask: ``[V, H, W]`` float32 in [0, 1], how much each pixel counts (alpha, mask images); None: all count.
     """

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import logging
-import runpy
-import sys
 import zlib
 from pathlib import Path
 
@@ -62,7 +60,7 @@ def write_splits(out: Path, source: SceneSource, fraction: float, seed: int) -> 
     paths = (out / "train.txt", out / "val.txt")
     both = split_scenes(source, fraction, seed)
     texts = [
-        f"# {len(names)} scenes; python -m vg2gt.data.splits fraction={fraction} split_seed={seed}\n"
+        f"# {len(names)} scenes; vg2gt data splits --fraction {fraction} --seed {seed}\n"
         + "".join(f"{name}\n" for name in names)
         for names in both
     ]
@@ -72,8 +70,3 @@ def write_splits(out: Path, source: SceneSource, fraction: float, seed: int) -> 
     for path, text in zip(paths, texts, strict=True):
         write_text(path, text)
     return paths
-
-
-if __name__ == "__main__":  # python -m vg2gt.data.splits, the same as vg2gt data splits
-    sys.argv[1:1] = ["splits"]
-    runpy.run_module("vg2gt.cli.data", run_name="__main__")

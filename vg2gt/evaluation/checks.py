@@ -15,7 +15,7 @@ from vg2gt.data.datamodule import SceneDataModule
 from vg2gt.data.overlap import refuse_overlap
 from vg2gt.data.views import SceneSample
 from vg2gt.model import Reconstructor
-from vg2gt.runs.find import checkpoint_path, run_config_path
+from vg2gt.runs.checkpoints import checkpoint_path, run_config_path
 from vg2gt.runs.trust import check_targets, read_run_config
 
 log = logging.getLogger(__name__)

@@ -1,4 +1,4 @@
-"""What an evaluation compares, and how: every option stands in its configuration and in its report."""
+"""What an evaluation compares, and how: every option is in its configuration and its report."""
 
 from __future__ import annotations
 

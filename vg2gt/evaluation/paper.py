@@ -1,4 +1,4 @@
-"""The paper's tables (``paper_tables.json``), to be printed beside our figures and for nothing else."""
+"""The paper's tables (``paper_tables.json``), printed next to our figures and used for nothing else."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def obstacle(
     depth_range: Sequence[float | None],
     told: bool,
 ) -> str | None:
-    """What keeps figures from standing beside the paper's rows on a data set; None if nothing does.
+    """Why figures cannot be compared with the paper's rows on a data set; None if nothing does.
 
     Args:
         dataset: as in the tables, such as ``replica``.

@@ -27,7 +27,7 @@ def joint_target_cameras(model: Reconstructor, batch: Batch, prediction: Predict
     """Predicted cameras of the held-out views (protocol ``novel``).
 
     The backbone sees context and held-out views together; a similarity between its context cameras and those of the
-    context-only pass brings the held-out cameras into the Gaussians' frame. Where the context cameras stand still, as a
+    context-only pass brings the held-out cameras into the Gaussians' frame. Where the context cameras do not move, as a
     single one does, its scale comes from the depth that both passes decode of the context views.
     """
     if not model.backend.predicts_cameras:  # they are the data's: no pass is needed to know them
@@ -49,7 +49,7 @@ def joint_target_cameras(model: Reconstructor, batch: Batch, prediction: Predict
 def ground_truth_target_cameras(batch: Batch, prediction: Prediction) -> Cameras:
     """Ground-truth cameras of the held-out views in the Gaussians' frame (protocol ``gt_pose``).
 
-    The similarity comes from the context cameras; where they stand still, its scale comes from the depth.
+    The similarity comes from the context cameras; where they do not move, its scale comes from the depth.
     """
     context = batch.context
     depth = prediction.geometry.depth

@@ -30,7 +30,7 @@ from vg2gt.io.images import write_png
 from vg2gt.memory import EVALUATION, memory_advice
 from vg2gt.metrics import LPIPS, WeightsNotFoundError, load_lpips
 from vg2gt.model import Reconstructor
-from vg2gt.runs.find import checkpoint_path
+from vg2gt.runs.checkpoints import checkpoint_path
 from vg2gt.runs.load import TrainedWeights, build_model, choose_device, load_weights, resolve_parts
 from vg2gt.runs.lock import only_process_in
 

@@ -53,7 +53,7 @@ def depth_to_camera_scale(geometry: Geometry, truth: Batch) -> float:
     """Size of decoded depth over that of the cameras' translations, 1 where both fit together; one scene.
 
     Either is measured against the truth: depth by the factor of least relative L1 error, cameras by the similarity onto
-    the true ones. NaN without depth or with cameras that stand still.
+    the true ones. NaN without depth or with cameras that do not move.
     """
     depth = fit_depth_scale(geometry.depth, truth.depth, truth.depth > 0)
     unknown = torch.full_like(depth, torch.nan)

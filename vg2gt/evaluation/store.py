@@ -40,7 +40,7 @@ class ResultStore:
                     "choose another output_dir= or name="
                 )
         elif overwrite:
-            # The report first: an interruption must not leave it beside other settings.
+            # The report first: an interruption must not leave it with other settings.
             for name in REPORTS:
                 (folder / name).unlink(missing_ok=True)
             for name in FOLDERS:

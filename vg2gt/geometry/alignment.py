@@ -125,7 +125,7 @@ def align_cameras(
     Args:
         predicted: B scenes, V views.
         reference: the same views in another frame and unit.
-        still_scale: gives the ``[B]`` scale of scenes whose cameras stand still in either frame, which say nothing of
+        still_scale: gives the ``[B]`` scale of scenes whose cameras do not move in either frame, which say nothing of
             it; only called where there is one. None means 1.
 
     Returns:

@@ -88,7 +88,7 @@ class NamedCamera:
         return Cameras(pose, intrinsics, (self.height, self.width))
 
     def fields(self) -> dict[str, Any]:
-        """This camera as plain values, as it stands in a file."""
+        """This camera as plain values, as it is in a file."""
         fields: dict[str, Any] = {
             "name": self.name,
             "width": int(self.width),
@@ -164,7 +164,7 @@ def read_cameras_json(path: str | Path) -> list[NamedCamera]:
 
 
 def _camera(place: str, entry: Any) -> NamedCamera:
-    """Checks one entry; ``place`` is where it stands, for messages."""
+    """Checks one entry; ``place`` is where it is, for messages."""
     if not isinstance(entry, dict):
         raise FormatError(f"{place} is {type(entry).__name__}, expected an object")
     name = entry.get("name")

@@ -35,8 +35,7 @@ import PIL.Image  # noqa: F401  first: the other way round, the two mix up their
 from numpy.typing import ArrayLike, NDArray
 
 from vg2gt.io.errors import FormatError
-from vg2gt.io.files import regular
-from vg2gt.io.names import by_number
+from vg2gt.io.files import by_number, regular
 from vg2gt.types import Cameras
 
 # Of pycolmap, which is imported only where it is needed.

@@ -6,6 +6,7 @@ import errno
 import json
 import logging
 import os
+import re
 import secrets
 import stat
 from collections.abc import Iterator
@@ -48,7 +49,7 @@ def replacing(path: str | Path, durable: bool = False) -> Iterator[Path]:
 
 
 def temporary_name(path: Path) -> Path:
-    """A name beside ``path`` that no other process takes: containers that share a folder may have equal process ids."""
+    """A name next to ``path`` that no other process takes: containers may have equal process ids."""
     return path.with_name(f".{path.name}.{secrets.token_hex(8)}.tmp")
 
 
@@ -131,3 +132,9 @@ def read_json(path: str | Path) -> Any:
         return json.loads(regular(path).read_text())
     except json.JSONDecodeError as error:
         raise ValueError(f"{path} is not valid JSON: {error}") from error
+
+
+def by_number(name: str) -> tuple[list[str | int], str]:
+    """Sorting key of a name: runs of digits count by their value, so that ``IMG_9`` comes before ``IMG_10``."""
+    parts = re.split(r"(\d+)", name)  # digits are at the odd places
+    return [int(part) if i % 2 else part for i, part in enumerate(parts)], name

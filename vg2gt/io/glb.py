@@ -1,7 +1,7 @@
 """GLB (binary glTF 2.0): points and camera frusta for any 3D viewer.
 
 glTF has y up and cameras looking along -z, our world is OpenCV's (y down, z forward): the file's root turns the scene
-by half a turn about x, so that it stands upright. Colours are written as they are, in sRGB.
+by half a turn about x, so that it is upright. Colours are written as they are, in sRGB.
 
 Example:
     >>> import tempfile, torch

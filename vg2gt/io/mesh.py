@@ -90,8 +90,8 @@ def extract_surface(volume: Volume) -> Mesh:
     Every voxel edge whose ends differ in sign is crossed by the surface. A cell's vertex is the mean of the crossings
     on its edges, and every crossed edge makes a quad of the vertices of its four cells.
     """
-    # Free space beyond the truncation says nothing about where a surface is: beside a depth edge it would close the gap
-    # between the front and what lies behind it.
+    # Free space beyond the truncation says nothing about where a surface is: next to a depth edge it would close the
+    # gap between the front and what lies behind it.
     seen = ((volume.weight > 0) & (volume.distance < 1)).reshape(-1)
     inside = torch.stack(torch.meshgrid(*3 * [torch.arange(BLOCK)], indexing="ij"), -1).reshape(-1, 3)
     keys = pack((volume.blocks[:, None] * BLOCK + inside).reshape(-1, 3)[seen])

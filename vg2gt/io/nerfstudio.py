@@ -195,7 +195,7 @@ def read_transforms(path: str | Path) -> Transforms:
 
 
 def write_transforms(path: str | Path, transforms: Transforms) -> Path:
-    """Writes a ``transforms.json``, atomically; intrinsics stand at the top if all frames share them.
+    """Writes a ``transforms.json``, atomically; intrinsics are at the top if all frames share them.
 
     Args:
         path: the file.

@@ -2,7 +2,7 @@
 
 A Gaussian file has one ``vertex`` element of floats, in this order: ``x y z``, ``nx ny nz`` (zeros), ``f_dc_0..2``,
 ``f_rest_*`` (none or 45, all of red before green before blue), ``opacity`` (logit), ``scale_0..2`` (logarithms),
-``rot_0..3`` (wxyz). The colour behind a scene stands in a comment, ``background R G B`` in [0, 1], which other programs
+``rot_0..3`` (wxyz). The colour behind a scene is in a comment, ``background R G B`` in [0, 1], which other programs
 ignore.
 
 Example:

@@ -91,7 +91,7 @@ def read_video(path: str | Path, every: int = 1) -> Iterator[tuple[int, NDArray[
 
 
 def read_frame(path: str | Path, number: int) -> NDArray[np.uint8]:
-    """Decodes one frame ``[H, W, 3]`` of a video, from the last frame before it that stands for itself.
+    """Decodes one frame ``[H, W, 3]`` of a video, from the last key frame before it.
 
     Raises:
         FormatError: if the file cannot be read or has no such frame.

@@ -29,7 +29,7 @@ log = logging.getLogger(__name__)
 
 PACKAGES = Path(__file__).resolve().parents[2]
 SHARED = Path(__file__).with_name("compiled_math.py")
-"""Kernels take constants and functions from their own package (``vg2gt/rendering``) and from here; a test checks it."""
+"""Kernels take constants and functions from their own package (``vg2gt/kernels``) and from here; a test checks it."""
 VARIABLE = "NUMBA_CACHE_DIR"
 
 config: Any = numba.config  # pyright: ignore[reportPrivateImportUsage]

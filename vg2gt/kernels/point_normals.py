@@ -67,7 +67,7 @@ def _disagreement(view, depth, true, valid, pinholes, true_pinholes, turn, strid
     ``depth``, ``true``, ``valid``, ``gradient`` are ``[V, H, W]``, the pinholes ``[V, 4]`` (fx, fy, cx, cy in pixels),
     ``turn`` is ``[V, 3, 3]``, ``weights`` one a stride, ``totals`` ``[V]``. Rows are worked on in pieces that are first
     copied into the view's own of the ``tables`` ``[V, LINES PITCH]``, whose lines the compiler knows to be apart: so it
-    makes vector instructions. Invalid pixels, and the columns beside the image, are copied as depth one that does not
+    makes vector instructions. Invalid pixels, and the columns next to the image, are copied as depth one that does not
     count.
     """
     height, width = valid.shape[1:]

@@ -15,14 +15,12 @@ from torch.nn import functional as F
 
 from vg2gt.geometry.cameras import crop_intrinsics, unproject
 from vg2gt.geometry.precision import full_precision
-from vg2gt.method.additions.silhouette import beside_silhouettes
+from vg2gt.method.additions.silhouette import near_silhouettes
 from vg2gt.method.additions.surface_evidence import (
     CENTROID_CHANNELS,
     SURFACE_CHANNELS,
     PointFrames,
     cell_centroids,
-    disagreement,
-    gate,
     vectors_to_surface,
     voxel_evidence,
 )
@@ -62,7 +60,7 @@ class CoarseModule(nn.Module):
         upsample: points per patch along each axis.
         surface_evidence: not in the paper: the voxels' centroids enter PTv3, and how far every point is from the
             surface that the views agree on enters the fusion.
-        embedding_skip: not in the paper: the patches' own embedding enters the fusion beside the voxels' features.
+        embedding_skip: not in the paper: the patches' own embedding enters the fusion next to the voxels' features.
         fuse_kernel: edge length of the fusing convolutions: 1 fuses every patch by itself (paper), 3 reads its
             neighbours.
         gate: not in the paper: evidence counts away from silhouettes only, and all changes are scaled by how much the
@@ -199,16 +197,13 @@ class CoarseModule(nn.Module):
         )  # [N, k]
         enhanced = interpolate(voxels, index, weights)  # [N, C]
         gain = torch.ones_like(points.voxel_size)
-        if centroid is None:
-            return enhanced, gain[:, None, None, None]
-        evidence = torch.where(weights > 0, voxel_evidence(points.confidence, plan)[index], 0)
-        to_surface = vectors_to_surface(queries, centers + centroid, evidence, index)
-        frames = PointFrames(points.depth, points.cameras, points.rows)
-        seen = frames.in_camera(to_surface, points.voxel_size[points.batch])
-        if points.clear is not None:
-            seen = torch.where(points.clear[:, None], seen, 0)
-            gain = gate(disagreement(seen[:, -1], points.clear, points.batch, len(gain)))
-        return torch.cat((enhanced, seen, points.confidence.log()[:, None]), -1), gain[:, None, None, None]
+        if centroid is not None:
+            evidence = torch.where(weights > 0, voxel_evidence(points.confidence, plan)[index], 0)
+            to_surface = vectors_to_surface(queries, centers + centroid, evidence, index)
+            frames = PointFrames(points.depth, points.cameras, points.rows)
+            seen, gain = frames.evidence(to_surface, points.voxel_size, points.batch, points.clear)
+            enhanced = torch.cat((enhanced, seen, points.confidence.log()[:, None]), -1)
+        return enhanced, gain[:, None, None, None]
 
     def _to_patches(self, features: Tensor, points: PatchPoints, tokens: Tokens) -> tuple[Tensor, Tensor]:
         """Averages the valid points of every patch: ``[B, V, P, C]`` and whether there were any ``[B, V, P, 1]``."""
@@ -229,7 +224,7 @@ class PatchPoints:
     """The points of the upsampled patch grid that have a valid depth, packed.
 
     Depth is taken at the central pixel of every cell, never averaged across an edge; confidence is the smallest of
-    the cell. Where nothing at all is valid one placeholder point stands in, so that the network's parameters stay in
+    the cell. Where nothing at all is valid one placeholder point is used, so that the network's parameters stay in
     the autograd graph; its features are discarded.
 
     Args:
@@ -248,7 +243,7 @@ class PatchPoints:
         views: V.
         depth: ``[B, V, h, w]`` of the grid, scene units, 0 = invalid.
         cameras: whose pixels are the grid's.
-        clear: ``[N]`` bool, whether no pixel of the cell is beside a silhouette; None where nobody asked.
+        clear: ``[N]`` bool, whether no pixel of the cell is next to a silhouette; None where nobody asked.
     """
 
     def __init__(self, geometry: Geometry, cell: int, voxel_size: Tensor, away_from_silhouettes: bool = False) -> None:
@@ -273,8 +268,8 @@ class PatchPoints:
         self.confidence = torch.where(valid, smallest, 1.0).flatten()[self.rows]
         self.clear: Tensor | None = None
         if away_from_silhouettes:
-            beside = beside_silhouettes(torch.where(torch.isfinite(depth), depth, 0.0)).to(depth.dtype)
-            self.clear = (F.max_pool2d(beside, cell) == 0).flatten()[self.rows]
+            near = near_silhouettes(torch.where(torch.isfinite(depth), depth, 0.0)).to(depth.dtype)
+            self.clear = (F.max_pool2d(near, cell) == 0).flatten()[self.rows]
 
 
 def _to_patch_rows(maps: Tensor, seen: Tensor) -> Tensor:

@@ -35,6 +35,8 @@ log = logging.getLogger(__name__)
 
 EXTRA_CHANNELS = 8  # colour (3), position of the centroid in the cell (3), number of points, confidence
 MOMENT_CHANNELS = 15  # spread (6), covariance with colour (9)
+# What brings inputs of the voxel network to about [-1, 1]: a cell evenly filled has a spread of 1 / 12.
+SPREAD_SCALE, CROSS_SCALE = 12, 20
 
 
 class FineModule(nn.Module):
@@ -133,7 +135,7 @@ class FineModule(nn.Module):
             if self.moments:
                 moments = self._pool_moments(geometry, size, values, points.confidence, means, centroid, plan)
                 spread = [moments.spread[:, i, j] for i, j in zip(*UPPER, strict=True)]
-                extra += [12 * torch.stack(spread, -1), 20 * moments.cross.flatten(1)]
+                extra += [SPREAD_SCALE * torch.stack(spread, -1), CROSS_SCALE * moments.cross.flatten(1)]
         refined = self.point_mlp(torch.cat((pooled, *extra), -1), plan.grid, plan.batch, size)
         return Voxels(refined, colors, plan.grid, plan.batch, confidence, count, centroid, size, moments)
 
@@ -183,7 +185,7 @@ def _pixel_rows(dense: Tensor) -> Tensor:
 
 
 class _Points:
-    """All pixels as points, invalid ones replaced by finite stand-ins that no voxel uses.
+    """All pixels as points, invalid ones replaced by finite placeholders that no voxel uses.
 
     Attributes:
         batch: ``[N]`` scene index.

@@ -180,7 +180,7 @@ class _SubmanifoldConvolution(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, Tensor, None]:  # pyright: ignore
-        """Gradients of the features and the weight; the products of the forward pass are made anew."""
+        """Gradients of the features and the weight; the products of the forward pass are computed again."""
         features, weight = ctx.saved_tensors
         grad = grad_outputs[0].to(features.dtype)
         pairs: Pairs = ctx.pairs

@@ -30,5 +30,5 @@ def near_depth_edges(depth: Tensor, step: float = EDGE, near: int = NEAR) -> Ten
         edges.narrow(axis, 0, depth.shape[axis] - 1).logical_or_(broken)
         edges.narrow(axis, 1, depth.shape[axis] - 1).logical_or_(broken)
     flat = edges.to(torch.float32).flatten(0, -3)[:, None]  # [N, 1, H, W]
-    # A pixel beside an edge is half a pixel from it: near - 1 more steps reach the distance.
+    # A pixel next to an edge is half a pixel from it: near - 1 more steps reach the distance.
     return (F.max_pool2d(flat, 2 * near - 1, 1, near - 1) > 0).reshape(depth.shape)

@@ -12,8 +12,8 @@ from vg2gt.io import colmap_images, colmap_intrinsics, colmap_pose, read_cameras
 from vg2gt.io.cameras_json import NamedCamera, invert_pose
 from vg2gt.io.colmap import colmap_files
 from vg2gt.io.errors import FormatError
+from vg2gt.io.files import by_number
 from vg2gt.io.json_checks import load_json
-from vg2gt.io.names import by_number
 
 
 def read_cameras(path: str | Path) -> list[NamedCamera]:

@@ -1,4 +1,4 @@
-"""Where the cameras of a reconstruction come from: beside the images, structure from motion, or the backbone."""
+"""Where the cameras of a reconstruction come from: files next to the images, structure from motion, or the backbone."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from vg2gt.data.base import DataError
-from vg2gt.io.names import by_number
+from vg2gt.io.files import by_number
 from vg2gt.model import Reconstructor
 from vg2gt.reconstruction.given_cameras import LAYOUTS, describe, given_pictures
 from vg2gt.reconstruction.monitor import Monitor
@@ -41,7 +41,7 @@ def pictures_for(
     Args:
         model: whose backbone looks at them.
         images: see :func:`vg2gt.reconstruction.pictures.find_pictures`.
-        poses: ``auto``: a backbone that needs cameras gets those beside the images
+        poses: ``auto``: a backbone that needs cameras gets those next to the images
             (:func:`~vg2gt.reconstruction.given_cameras.given_pictures`), else those of structure from motion
             (:func:`~vg2gt.reconstruction.sfm.find_cameras`); others predict their own. ``given``, ``sfm`` and
             ``backbone`` allow one of these alone.
@@ -79,7 +79,7 @@ def pictures_for(
         raise ValueError(_no_depth(backend.name, images))
     if poses == "given":
         raise ValueError(
-            f"no cameras lie beside {describe(images)}: expected {LAYOUTS}; --poses sfm finds them from the images"
+            f"no cameras next to {describe(images)}: expected {LAYOUTS}; --poses sfm finds them from the images"
         )
     with tempfile.TemporaryDirectory(prefix="vg2gt-sfm-") as temporary:
         pictures = without_copies(find_pictures(images, every, max_images, skip_damaged))
@@ -127,8 +127,8 @@ def check_pycolmap(images: ImagesLike, poses: Poses) -> None:
 def _no_depth(backend: str, images: ImagesLike) -> str:
     return (
         f"backend {backend} works from measured depth, and there is none with {describe(images)}: it reconstructs "
-        "recordings only (depth/ beside images/, with poses.txt and K.txt). For photographs leave --backend and --ckpt "
-        "out (the plane sweep in the package is taken), or take --backend da3_small; a checkpoint fits the backend it "
+        "recordings only (depth/ next to images/, with poses.txt and K.txt). For photographs leave backend= and --ckpt "
+        "out (the plane sweep in the package is taken), or take backend=da3_small; a checkpoint fits the backend it "
         "was trained on"
     )
 
@@ -142,7 +142,7 @@ def _check(model: Reconstructor, poses: str) -> None:
     if poses in ("given", "sfm") and not backend.needs_hints:
         raise ValueError(
             f"backend {backend.name} takes no cameras, it predicts its own: leave --poses out, or choose one that "
-            "takes them, such as --backend da3_small,given_poses=true"
+            "takes them, such as backend=da3_small backend.given_poses=true"
         )
     if poses == "sfm" and backend.needs_depth:
         raise ValueError(f"backend {backend.name} works from the depth and poses of a recording; leave --poses out")

@@ -80,7 +80,7 @@ def map_folder(folder: Path, kind: str, suffixes: Sequence[str]) -> Iterator[Add
         yield add
     if too_deep:
         log.warning(
-            "%d pixels deeper than %g scene units do not fit into a 16-bit PNG and stand as 0; save depth.npy",
+            "%d pixels deeper than %g scene units do not fit into a 16-bit PNG and are written as 0; save depth.npy",
             too_deep, _LARGEST / DEPTH_STEPS,
         )  # fmt: skip
 

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 import torch
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from vg2gt.profiling import listening, now, peak_memory_mib, reset_peak_memory
 
@@ -63,32 +63,31 @@ class Monitor:
     @contextmanager
     def stage(self, name: str, total: int = 1) -> Iterator[Callable[[], None]]:
         """Measures the block; yields what to call after each of ``total`` steps (the end of the block completes it)."""
+        with self._running_as(name, total) as task:
+            yield lambda: self._progress.update(task, advance=1)
+
+    @contextmanager
+    def measure(self, name: str) -> Iterator[Callable[[float, str], None]]:
+        """Measures the block; yields what takes the share that is done and a note, shown with the time that is left."""
+        with self._running_as(name, 100) as task:
+            began = now(self.device)
+
+            def show(done: float, note: str) -> None:
+                left = (now(self.device) - began) * (1 - done) / done if done > 0 else 0.0
+                said = f"{name} {note}, {left:.0f} s left"
+                self._progress.update(task, completed=round(100 * done), description=said)
+
+            yield show
+
+    @contextmanager
+    def _running_as(self, name: str, total: int) -> Iterator[TaskID]:
         self._settle()
         self._running.append(name)
         self.seconds.setdefault(name, 0.0)
         task = self._progress.add_task(name, total=total)
         try:
-            yield lambda: self._progress.update(task, advance=1)
-            self._progress.update(task, completed=total)
-        finally:
-            self._settle()
-            self._running.pop()
-
-    @contextmanager
-    def measure(self, name: str) -> Iterator[Callable[[float, str], None]]:
-        """Measures the block; yields what takes the share that is done and a note, shown with the time that is left."""
-        self._settle()
-        self._running.append(name)
-        self.seconds.setdefault(name, 0.0)
-        task, began = self._progress.add_task(name, total=100), now(self.device)
-
-        def show(done: float, note: str) -> None:
-            left = (now(self.device) - began) * (1 - done) / done if done > 0 else 0.0
-            self._progress.update(task, completed=round(100 * done), description=f"{name} {note}, {left:.0f} s left")
-
-        try:
-            yield show
-            self._progress.update(task, completed=100, description=name)
+            yield task
+            self._progress.update(task, completed=total, description=name)
         finally:
             self._settle()
             self._running.pop()

@@ -113,7 +113,7 @@ def write_outputs(
         overwrite: replace what is there.
         frames: length of the orbit.
         mesh_voxel: edge of the mesh's voxels in scene units; None: two pixels at the median depth.
-        figures: what ``report.json`` and ``report.html`` say beside the scene's own figures.
+        figures: what ``report.json`` and ``report.html`` say in addition to the scene's own figures.
         monitor: told of the stages.
 
     Returns:

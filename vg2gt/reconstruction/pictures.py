@@ -23,9 +23,9 @@ from vg2gt.data.sources.masks import FOLDER as MASKS
 from vg2gt.data.sources.masks import joined_masks, mask_of, resized_mask
 from vg2gt.data.sources.parsing import IMAGE_SUFFIXES
 from vg2gt.data.transforms import from_bytes
+from vg2gt.io.files import by_number
 from vg2gt.io.image_files import focal_length, image_size, is_panorama, read_color, read_mask
 from vg2gt.io.images import color_image, has_alpha
-from vg2gt.io.names import by_number
 from vg2gt.io.record3d import R3D, is_archive, read_recorded, recorded_files
 from vg2gt.io.video import VIDEO_SUFFIXES, count_frames, read_video, require_pyav
 

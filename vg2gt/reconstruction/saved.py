@@ -29,7 +29,7 @@ def read_scene(folder: str | Path, renderer: Renderer, device: torch.device | st
 
     Args:
         folder: holds ``scene.ply``, ``cameras.json`` and ``views.npz``. Without ``views.npz``, images are read from
-            ``images/``, where cameras.json names them, and the scene's own rendered depth stands for the decoded one.
+            ``images/``, where cameras.json names them, and the scene's own rendered depth replaces the decoded one.
         renderer: how the scene is rendered.
         device: where the Gaussians go.
 
@@ -114,7 +114,7 @@ def _read_views(path: Path, views: int, size: tuple[int, int]) -> tuple[Tensor, 
     wrong = [f"{name} {array.shape}" for name, array in arrays.items() if array.shape != shapes[name]]
     if wrong or arrays["images"].dtype != np.uint8:
         raise FormatError(
-            f"{path} does not belong to the {views} cameras of {size[0]}x{size[1]} beside it: "
+            f"{path} does not belong to the {views} cameras of {size[0]}x{size[1]} next to it: "
             f"{', '.join(wrong) or 'its images are not uint8'}"
         )
     images = torch.from_numpy(arrays["images"]).permute(0, 3, 1, 2).float() / 255

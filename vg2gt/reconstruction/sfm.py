@@ -40,7 +40,7 @@ from vg2gt.reconstruction.monitor import Monitor
 from vg2gt.reconstruction.pictures import SFM_SOURCE, UNKNOWN_LENS, Picture
 from vg2gt.reconstruction.sfm_models import FEWEST_POINTS, map_cameras, other_parts, placed_images, sound_models
 from vg2gt.reconstruction.sfm_pairs import ALL_PAIRS, likely_pairs
-from vg2gt.reconstruction.sound import name_damaged
+from vg2gt.reconstruction.sound import digest, name_damaged, without_copies
 
 if TYPE_CHECKING:
     from pycolmap import Reconstruction  # pyright: ignore[reportMissingImports]
@@ -60,7 +60,7 @@ _STATE = "sfm.json"
 
 ADVICE = (
     "take more photographs, 20 or more, walking around the scene rather than turning on the spot, each showing two "
-    f"thirds of what the one before shows; or put their cameras beside them ({LAYOUTS}); or take a backend that works "
+    f"thirds of what the one before shows; or put their cameras next to them ({LAYOUTS}); or take a backend that works "
     "from images alone, such as da3_small"
 )
 
@@ -73,7 +73,7 @@ def require_pycolmap() -> None:
     """
     if importlib.util.find_spec("pycolmap") is None:
         raise ImportError(
-            f"finding the cameras of photographs needs pycolmap: {EXTRA}; or put their cameras beside "
+            f"finding the cameras of photographs needs pycolmap: {EXTRA}; or put their cameras next to "
             f"them ({LAYOUTS}), or take a backend that works from images alone, such as da3_small"
         )
 
@@ -97,7 +97,7 @@ def find_cameras(pictures: Sequence[Picture], folder: Path, monitor: Monitor) ->
         FileExistsError: if the folder holds something else.
         ValueError: if no model of the scene is found, with what to try.
     """
-    pictures = _without_copies(pictures)
+    pictures = without_copies(pictures, decode=True)
     key = _key(pictures)
     state = _read_state(folder)
     if state is None or state["key"] != key:
@@ -114,19 +114,6 @@ def find_cameras(pictures: Sequence[Picture], folder: Path, monitor: Monitor) ->
     paths = {picture.name: picture.path for picture in pictures}
     found = [(names[f"{p.name}.jpg"], p) for p in recording_pictures(COLMAP(str(folder)))]
     return [replace(p, name=name, source=source, path=paths[name], lens=UNKNOWN_LENS) for name, p in found]
-
-
-def _without_copies(pictures: Sequence[Picture]) -> list[Picture]:
-    """The pictures, of equal files the first: a second view from the same place tells nothing."""
-    first: dict[str, Picture] = {}
-    copies = []
-    for picture in pictures:
-        original = first.setdefault(_digest(picture), picture)
-        if original is not picture:
-            copies.append(f"{picture.name} (of {original.name})")
-    if copies:
-        log.warning("%d images are copies of others and are left out: %s", len(copies), ", ".join(copies))
-    return list(first.values())
 
 
 def _tell_left_out(state: dict[str, Any], count: int) -> None:
@@ -147,14 +134,8 @@ def _tell_left_out(state: dict[str, Any], count: int) -> None:
 def _key(pictures: Sequence[Picture]) -> str:
     """Changes with the content, the names or the order of the pictures, and with how they are worked on."""
     settings = [FORMAT, IMAGE_SIDE, *_feature_settings(len(pictures)), SEED, _MODEL, _QUALITY]
-    contents = [[picture.name, picture.size, _digest(picture)] for picture in pictures]
+    contents = [[picture.name, picture.size, digest(picture)] for picture in pictures]
     return hashlib.sha256(json.dumps([settings, contents]).encode()).hexdigest()
-
-
-def _digest(picture: Picture) -> str:
-    if picture.path is not None:
-        return hashlib.sha256(picture.path.read_bytes()).hexdigest()
-    return hashlib.sha256(to_bytes(picture.read(picture.size).images).numpy().tobytes()).hexdigest()
 
 
 def _read_state(folder: Path) -> dict[str, Any] | None:

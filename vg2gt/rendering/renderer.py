@@ -5,27 +5,23 @@ from __future__ import annotations
 import importlib.util
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
-from vg2gt.geometry.cameras import invert_rigid
-from vg2gt.geometry.spherical_harmonics import sh_to_rgb
 from vg2gt.memory import note_sizes
 from vg2gt.rendering.checks import background_colors, check_finite, check_shapes, check_values
 from vg2gt.rendering.cpu_tiles import rasterize_cpu
 from vg2gt.rendering.dense import rasterize_dense
-from vg2gt.rendering.options import Images, Mode, RenderOptions, SceneViews, check_choice
+from vg2gt.rendering.options import Mode, RenderOptions, check_choice
 from vg2gt.rendering.pairs import rasterize_pairs
+from vg2gt.rendering.scenes import Rasterizer, render_scenes
 from vg2gt.rendering.selfcheck import require_trusted
 from vg2gt.types import Cameras, Gaussians, Render
 
 Implementation = Literal["auto", "torch", "dense", "cpu", "triton"]
-Rasterizer = Callable[[SceneViews, RenderOptions], Images]
-
 
 RASTERIZERS: dict[str, Rasterizer] = {
     "torch": rasterize_pairs,
@@ -81,17 +77,7 @@ class Renderer(RenderOptions):
             check_values(gaussians, cameras)
             check_finite("background", color)
             gaussians, cameras = gaussians.map(_floats_to(dtype)), cameras.map(_floats_to(dtype))
-            rasterize = RASTERIZERS[implementation]
-            images = [rasterize(_scene_views(gaussians.scene(b), cameras, b, color[b]), options) for b in range(scenes)]
-        stacked = {
-            field.name: torch.stack([getattr(image, field.name) for image in images]) for field in fields(Images)
-        }
-        return Render(
-            color=stacked["color"].permute(0, 1, 4, 2, 3),  # [B, V, 3, H, W]
-            depth=stacked["depth"],
-            normal=stacked["normal"].permute(0, 1, 4, 2, 3),  # [B, V, 3, H, W]
-            alpha=stacked["alpha"],
-        )
+            return render_scenes(RASTERIZERS[implementation], gaussians, cameras, color, options)
 
 
 def render(
@@ -152,27 +138,6 @@ def _render_triton(gaussians: Gaussians, cameras: Cameras, background: Tensor, o
     return replace(render, color=render.color + behind)
 
 
-def _scene_views(gaussians: Gaussians, cameras: Cameras, scene: int, background: Tensor) -> SceneViews:
-    """One scene with its colours seen from every view (one copy where they do not depend on it)."""
-    poses = cameras.world_to_camera[scene]
-    if gaussians.sh.shape[1] == 1:
-        directions = gaussians.means[None]  # a constant colour does not look at them
-    else:
-        centers = invert_rigid(poses)[:, None, :3, 3]
-        directions = F.normalize(gaussians.means - centers, dim=-1)
-    return SceneViews(
-        gaussians.means,
-        gaussians.quats,
-        gaussians.scales,
-        gaussians.opacities,
-        sh_to_rgb(gaussians.sh, directions),
-        poses,
-        cameras.intrinsics[scene],
-        background,
-        cameras.size,
-    )
-
-
 def _resolve(implementation: Implementation, device: torch.device) -> str:
     if implementation == "auto":
         return automatic(device)
@@ -190,7 +155,7 @@ def automatic(device: torch.device) -> str:
         KernelsRefusedError: if the kernels of a CUDA device cannot be relied on.
     """
     if device.type == "cuda":
-        require_trusted(render, device)
+        require_trusted(device)
         return "triton"
     return "cpu" if device.type == "cpu" else "torch"
 

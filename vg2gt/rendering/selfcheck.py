@@ -13,7 +13,7 @@ import importlib.util
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
 
 import torch
@@ -22,7 +22,9 @@ from torch import Tensor
 from vg2gt.geometry.rotations import quat_to_matrix
 from vg2gt.io.files import read_json, write_json
 from vg2gt.kernels.compiled import cache_folder
+from vg2gt.rendering.dense import rasterize_dense
 from vg2gt.rendering.options import Mode, RenderOptions
+from vg2gt.rendering.scenes import render_scenes
 from vg2gt.types import Cameras, Gaussians, Render
 
 RenderFunction = Callable[..., Render]
@@ -33,10 +35,14 @@ MODES: tuple[Mode, ...] = ("solid", "rasterized")
 SCENES, COUNT, SIZE, VIEWS, DEGREE = 2, 7, (9, 11), 2, 2  # COUNT: Gaussians a scene; DEGREE: of model=vg2gt
 STREAM = 44  # first of the scenes' numbers; with these three quarters of the rays have a depth, well conditioned
 ROWS = 8  # gradient rows held at once: fewer than a view has, so that views are taken one by one
-SOURCES = (Path(__file__).resolve(), *sorted((Path(__file__).resolve().parent / "gpu").glob("*.py")))
+_VG2GT = Path(__file__).resolve().parents[1]
+SOURCES = (
+    Path(__file__).resolve(), _VG2GT / "rendering" / "gpu_tiles.py",
+    *sorted((_VG2GT / "kernels" / "render_gpu").glob("*.py")),
+)  # fmt: skip
 ADVICE = (
     "renderer.implementation=torch renders without these kernels, many times slower "
-    "(vg2gt reconstruct: --set renderer.implementation=torch; other commands: --device cpu)"
+    "(vg2gt reconstruct: renderer.implementation=torch; other commands: --device cpu)"
 )
 
 
@@ -65,11 +71,10 @@ class Agreement:
         return f"values off by {self.values:.1e} (bound {VALUES:g}), gradients by {self.gradients:.1e} ({GRADIENTS:g})"
 
 
-def require_trusted(render: RenderFunction, device: torch.device) -> None:
+def require_trusted(device: torch.device) -> None:
     """Checks once that the Triton kernels may render on a device.
 
     Args:
-        render: :func:`vg2gt.rendering.render`.
         device: a CUDA or ROCm device.
 
     Raises:
@@ -79,17 +84,17 @@ def require_trusted(render: RenderFunction, device: torch.device) -> None:
     found_on = identity(device)
     if importlib.util.find_spec("triton") is None:
         raise KernelsRefusedError(f"the package triton, which renders on {found_on}, is not installed. {ADVICE}")
-    if why := _refusal(render, found_on, str(device)):
+    if why := _refusal(found_on, str(device)):
         raise KernelsRefusedError(f"the Triton kernels {why}. Please report this line: {found_on}. {ADVICE}")
 
 
 @lru_cache
-def _refusal(render: RenderFunction, found_on: str, device: str) -> str:
+def _refusal(found_on: str, device: str) -> str:
     """What is wrong with the kernels; empty if they can be relied on."""
     agreement = known(found_on)
     if agreement is None:
         try:
-            agreement = compare(render, torch.device(device))
+            agreement = compare(torch.device(device))
         except Exception as error:
             reason = " ".join(str(error).split()) or type(error).__name__
             return f"do not run ({type(error).__name__}: {reason[:300]})"
@@ -133,11 +138,10 @@ def _file() -> Path:
     return folder / "gpu_agreement.json"
 
 
-def compare(render: RenderFunction, device: torch.device, modes: tuple[Mode, ...] = MODES) -> Agreement:
+def compare(device: torch.device, modes: tuple[Mode, ...] = MODES) -> Agreement:
     """Renders the fixed scenes with the kernels on ``device`` and with the reference; how far they are apart.
 
     Args:
-        render: :func:`vg2gt.rendering.render`, for the reference.
         device: where the kernels run; a CPU if Triton interprets them.
         modes: how they render.
     """
@@ -150,13 +154,16 @@ def compare(render: RenderFunction, device: torch.device, modes: tuple[Mode, ...
     # Whoever renders first may be evaluating: without gradients there would be nothing to compare.
     with torch.inference_mode(False), torch.enable_grad(), torch.autocast(device.type, enabled=False):
         for mode in modes:
-            reference = partial(render, implementation="dense")
-            expected, expected_grads = _run(reference, mode, torch.device("cpu"), torch.float64)
+            expected, expected_grads = _run(_reference, mode, torch.device("cpu"), torch.float64)
             found, grads = _run(kernels, mode, device, torch.float32)
             values = [(a - b).abs().max() for a, b in zip(found, expected, strict=True)]
             relative = [(a - b).norm() / b.norm() for a, b in zip(grads, expected_grads, strict=True)]
             worst = torch.maximum(worst, torch.stack((torch.stack(values).max(), torch.stack(relative).max())))
     return Agreement(*worst.tolist())
+
+
+def _reference(gaussians: Gaussians, cameras: Cameras, mode: Mode, background: Tensor) -> Render:
+    return render_scenes(rasterize_dense, gaussians, cameras, background.expand(SCENES, 3), RenderOptions(mode=mode))
 
 
 def _run(

@@ -6,7 +6,6 @@ import hashlib
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +15,17 @@ from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from vg2gt.config import compose, flatten, group_options
+from vg2gt.config import compose, compose_groups, flatten
 from vg2gt.model import Reconstructor
 from vg2gt.rendering import Renderer
-from vg2gt.runs.checkpoints import MADE_OF, model_state, read_checkpoint, refuse_not_finite
-from vg2gt.runs.find import checkpoint_path, run_config_path
+from vg2gt.runs.checkpoints import (
+    MADE_OF,
+    checkpoint_path,
+    model_state,
+    read_checkpoint,
+    refuse_not_finite,
+    run_config_path,
+)
 from vg2gt.runs.trust import check_targets, parse_run_config, read_run_config
 
 log = logging.getLogger(__name__)
@@ -70,8 +75,7 @@ class LoadedModel:
 def load_model(
     ckpt: str | Path | None = None,
     backend: str | None = None,
-    model: str | None = None,
-    options: Sequence[str] = (),
+    overrides: Sequence[str] = (),
     device: str = "auto",
     seed: int = 0,
 ) -> LoadedModel:
@@ -80,9 +84,9 @@ def load_model(
     Args:
         ckpt: a checkpoint or a run's folder; None: what ships with the package (:data:`SHIPPED`), or with
             another backend than ``sweep`` the untrained head, which makes coloured voxels.
-        backend: ``NAME[,key=value...]`` of ``configs/backend``; None: the run's own.
-        model: ``NAME[,key=value...]`` of ``configs/model``; None: the run's own, ``tiny`` without a checkpoint.
-        options: further ``part.key=value``, part being ``backend``, ``model`` or ``renderer``.
+        backend: a name in ``configs/backend``, short for the override ``backend=NAME``; None: the run's own.
+        overrides: as on the command line: ``backend=NAME``, ``model=NAME`` and ``renderer=NAME`` replace the run's,
+            ``backend.key=value`` and the like change one key.
         device: ``auto``, ``cpu``, ``cuda`` or ``cuda:N``.
         seed: of the untrained head.
 
@@ -90,13 +94,7 @@ def load_model(
         FileNotFoundError: if there is no such checkpoint, or its run's ``config.yaml`` or a weight file is missing.
         ValueError: if a name or an option is unknown, or the checkpoint belongs to another backbone.
     """
-    checkpoint = _weights_of(ckpt, backend)
-    parts = _named_parts(checkpoint, backend, model)
-    for option in options:
-        part, _, change = option.partition(".")
-        if part not in PARTS:
-            raise ValueError(f"option {option!r} must begin with one of {', '.join(f'{name}.' for name in PARTS)}")
-        _update(parts[part], change, part)
+    checkpoint, parts = model_parts(ckpt, [*([f"backend={backend}"] if backend else []), *overrides])
     try:
         built = build_model(parts, seed, choose_device(device))
         renderer: Renderer = instantiate(parts["renderer"])
@@ -111,38 +109,61 @@ def load_model(
     return LoadedModel(built, replace(renderer, mode="solid", depth="median"), weights)
 
 
-def backend_class(ckpt: str | Path | None = None, backend: str | None = None) -> type:
-    """Class of the backend that :func:`load_model` would build, which can be asked before that takes its time.
-
-    What no class can be found for is left to :func:`load_model`, and ``object`` returned.
+def model_parts(ckpt: str | Path | None, overrides: Sequence[str]) -> tuple[Path | None, dict[str, DictConfig]]:
+    """The checkpoint and the configurations of backend, model and renderer that :func:`load_model` builds.
 
     Raises:
         FileNotFoundError: if there is no such checkpoint, or its run's ``config.yaml`` is missing.
-        ValueError: if a name is unknown.
+        ValueError: if a name or an option is unknown.
     """
-    target = _named_parts(_weights_of(ckpt, backend), backend, None)["backend"]["_target_"]
+    keys = [override.partition("=")[0].lstrip("+~") for override in overrides]
+    for override, key in zip(overrides, keys, strict=True):
+        if "=" not in override or key.partition(".")[0] not in PARTS:
+            raise ValueError(f"option {override!r}: expected key=value of {', '.join(PARTS)}")
+    named = {key for key in keys if "." not in key}
+    of_backend = [key.removeprefix("backend.") for key in keys if key.startswith("backend.")]
+    suits = "backend" not in named or ("backend=sweep" in overrides and all(key in FREE for key in of_backend))
+    checkpoint = checkpoint_path(SHIPPED if ckpt is None and suits else ckpt)
+    chosen = [override for override, key in zip(overrides, keys, strict=True) if key.partition(".")[0] in named]
+    parts = resolve_parts(compose_groups(*chosen) if chosen else OmegaConf.create(), checkpoint)
+    for override in overrides:
+        if override not in chosen:
+            parts = _changed(parts, override)
+    return checkpoint, parts
+
+
+def backend_class(ckpt: str | Path | None, overrides: Sequence[str]) -> type:
+    """Class of the backend that :func:`load_model` would build; ``object`` where the class cannot be found.
+
+    Raises:
+        FileNotFoundError: as :func:`model_parts`.
+        ValueError: as :func:`model_parts`.
+    """
     try:
-        return get_class(target)
-    except (ValueError, ImportError):
+        return get_class(model_parts(ckpt, overrides)[1]["backend"]["_target_"])
+    except ImportError:
         return object
 
 
-def _weights_of(ckpt: str | Path | None, backend: str | None) -> Path | None:
-    """The checkpoint that is meant: the one that ships, where none is named and no backend that it does not fit."""
-    return checkpoint_path(SHIPPED if ckpt is None and backend in (None, "sweep") else ckpt)
-
-
-def _named_parts(checkpoint: Path | None, backend: str | None, model: str | None) -> dict[str, DictConfig]:
-    given = {"backend": backend, "model": model}
-    config = OmegaConf.create({part: compose_part(part, spec) for part, spec in given.items() if spec is not None})
-    return resolve_parts(config, checkpoint)
+def _changed(parts: dict[str, DictConfig], override: str) -> dict[str, DictConfig]:
+    """The parts of a run with one more ``key=value``; a new key needs a plus, as with Hydra."""
+    config = OmegaConf.create({part: OmegaConf.to_container(value) for part, value in parts.items()})
+    OmegaConf.set_struct(config, not override.startswith("+"))
+    try:
+        config.merge_with_dotlist([override.lstrip("+")])
+    except (OmegaConfBaseException, ValueError) as error:
+        part = override.lstrip("+").partition(".")[0]
+        raise ValueError(
+            f"option {override!r}: {str(error).splitlines()[0]}; {part} has {', '.join(parts[part])}"
+        ) from error
+    return {part: config[part] for part in parts}
 
 
 def resolve_parts(config: DictConfig, checkpoint: Path | None) -> dict[str, DictConfig]:
     """Configurations of backend, model and renderer: the run's own, changed by those that ``config`` names.
 
     ``model=tiny`` replaces the run's model, ``+model.fine.max_voxels=100000`` changes one key of it. Without a
-    checkpoint the training defaults stand for the run.
+    checkpoint the training defaults are used.
 
     Raises:
         FileNotFoundError: if the run's ``config.yaml`` is needed and missing.
@@ -163,7 +184,7 @@ def resolve_parts(config: DictConfig, checkpoint: Path | None) -> dict[str, Dict
 def refuse_other_tokens(backend: Any, checkpoint: Mapping[str, Any], path: Path) -> None:
     """Refuses a backend that makes other tokens of images than the one a checkpoint was trained with.
 
-    Its weights' hash says nothing of :data:`TOKENS`. Checkpoints of old, which keep no configuration, pass.
+    Its weights' hash says nothing of :data:`TOKENS`. Old checkpoints, which keep no configuration, pass.
 
     Args:
         backend: the backend's configuration.
@@ -184,7 +205,7 @@ def refuse_other_tokens(backend: Any, checkpoint: Mapping[str, Any], path: Path)
         if key.rpartition(".")[2] in TOKENS and here[key] != there[key]:
             raise ValueError(
                 f"{path} was trained with backend.{key}={there[key]}, here it is {here[key]}: choose the same, or "
-                "train anew from these weights with init_from="
+                "start a new run from these weights with init_from="
             )
 
 
@@ -196,7 +217,7 @@ def made_of(config: DictConfig) -> str:
 def _config_of(checkpoint: Path, parts: Sequence[str]) -> DictConfig:
     """Configuration of a checkpoint's run: its file, which must agree with what the checkpoint knows, or the latter."""
     path = run_config_path(checkpoint)
-    text = read_checkpoint(checkpoint).get(MADE_OF)  # missing in checkpoints of old
+    text = read_checkpoint(checkpoint).get(MADE_OF)  # missing in old checkpoints
     known = parse_run_config(text, f"{checkpoint}: {MADE_OF}") if isinstance(text, str) else None
     if path.is_file():
         run, source = read_run_config(path), path
@@ -230,49 +251,6 @@ def _refuse_differences(run: DictConfig, known: DictConfig, parts: Sequence[str]
             f"{path} does not describe {checkpoint}: {'; '.join(different[:5])}. Put it right, or remove it: the "
             "checkpoint knows what it was trained with"
         )
-
-
-def compose_part(part: str, spec: str) -> DictConfig:
-    """Configuration of ``NAME[,key=value...]`` of a group: ``backend``, ``model`` or ``renderer``.
-
-    Raises:
-        ValueError: if the name or an option is unknown.
-    """
-    name, *changes = split_outside_brackets(spec)
-    if name not in group_options(part):
-        near = get_close_matches(name, group_options(part), 1)
-        advice = f"did you mean {near[0]}? All: " if near else "choose one of: "
-        raise ValueError(f"unknown {part} {name!r}; {advice}{', '.join(group_options(part))}")
-    config = compose(None, f"+{part}={name}")[part]
-    for change in changes:
-        _update(config, change, f"{part} {name}", anything=name == "custom")
-    return config
-
-
-def _update(config: DictConfig, change: str, place: str, anything: bool = False) -> None:
-    key, equals, _ = change.partition("=")
-    if not equals:
-        raise ValueError(f"option {change!r} of {place} must be key=value")
-    missing = object()
-    if not anything and OmegaConf.select(config, key, default=missing) is missing:
-        raise ValueError(f"{place} has no option {key!r}; it has {', '.join(str(name) for name in config)}")
-    try:
-        OmegaConf.set_struct(config, False)
-        config.merge_with_dotlist([change])
-    except (OmegaConfBaseException, ValueError) as error:
-        raise ValueError(f"option {change!r} of {place}: {error}") from error
-
-
-def split_outside_brackets(text: str) -> list[str]:
-    """Splits at commas that are in no brackets, so that values may be lists."""
-    parts, depth = [""], 0
-    for character in text:
-        depth += (character in "[{(") - (character in "]})")
-        if character == "," and depth == 0:
-            parts.append("")
-        else:
-            parts[-1] += character
-    return [part.strip() for part in parts]
 
 
 def build_model(parts: dict[str, DictConfig], seed: int, device: torch.device) -> Reconstructor:

@@ -6,8 +6,7 @@ import re
 from pathlib import Path
 
 from vg2gt.io.files import write_text
-from vg2gt.runs.checkpoints import MADE_OF, read_checkpoint, write_slim
-from vg2gt.runs.find import checkpoint_path
+from vg2gt.runs.checkpoints import MADE_OF, checkpoint_path, read_checkpoint, write_slim
 from vg2gt.runs.load import SHIPPED, LoadedModel, load_model
 
 WEIGHTS, CONFIG = "model.safetensors", "model.yaml"

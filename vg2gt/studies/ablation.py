@@ -4,7 +4,7 @@ As in the paper (appendix, Model Evaluation) no variant is trained from scratch.
 trained, from scratch or from ``init_from``; each variant starts from it and goes on for ``steps`` steps, and so does
 the full model itself, so that nobody is ahead by training longer. All continuations of a seed see the same batches and
 are evaluated on the same held-out views, so differences to the full model are taken seed by seed. Only the last layer
-starts anew where the number of splits changes; a control continues the full model with a new last layer as well.
+is new where the number of splits changes; a control continues the full model with a new last layer as well.
 
 Finished runs are never repeated, interrupted ones go on; a run that diverges is named and the others are run all the
 same. Writes ``metrics.json`` and ``metrics.md`` into ``outputs/<name>``, after every run.
@@ -53,7 +53,7 @@ LABELS = {
     "wo_enhance": "w/o Enhance",
     "wo_split": "w/o Split",
     FULL: "VG²GT (full)",
-    CONTROL: "full, last layer anew",
+    CONTROL: "full, last layer new",
 }
 PAPER_COLUMNS = columns(
     *("psnr", "ssim", "lpips", "rmse", "abs_rel", "delta_1.25", "delta_1.05"),
@@ -72,7 +72,7 @@ class Continuation:
     Attributes:
         name: of its folder and of its row.
         overrides: what it changes.
-        new_last_layer: the Gaussian head's last layer starts anew although it would fit.
+        new_last_layer: the Gaussian head's last layer is initialised again although it would fit.
     """
 
     name: str
@@ -104,7 +104,7 @@ class Ablation:
         lr: initial learning rate of every continuation.
         variants: options of the group ``ablation``.
         splits: numbers of Gaussians per voxel.
-        init_from: weights that the full models begin with; what they lack starts anew with every seed.
+        init_from: weights that the full models begin with; what they lack is initialised with every seed.
         results: metrics by run and seed.
         diverged: the continuations without a result.
 
@@ -182,7 +182,7 @@ class Ablation:
         write_text(self.folder / "metrics.md", self.report())
 
     def report(self) -> str:
-        """Both tables as Markdown, the paper's rows beside ours, and the differences to the full model."""
+        """Both tables as Markdown, the paper's rows next to ours, and the differences to the full model."""
         splits = {f"splits={count}": self._row_of(count) for count in self.splits}
         parts = [
             "# Ablations",
@@ -224,8 +224,8 @@ class Ablation:
             "held-out scenes, so the intervals say nothing of other scenes. Every difference is judged by itself: "
             "of twenty true zeros one is called better or worse. Views never trained on, at ground-truth "
             "poses; depth rendered as stochastic solids and aligned by one median scale per scene, whatever the "
-            "training rendered (the 3DGS row too: its own rasterised depth stands below). Where the number of splits "
-            "differs from the full model's, the last layer starts anew; the control shows what that alone costs, and "
+            "training rendered (the 3DGS row too: its own rasterised depth is given below). Where the number of splits "
+            "differs from the full model's, the last layer is new; the control shows what that alone costs, and "
             "is what these rows are compared with in the last table. The paper's rows are Replica, 30000 more steps, "
             "and LPIPS of VGG; compare orders, not values. LPIPS is not measured while training: vg2gt "
             "evaluate ckpt=RUN has it, if its weights are there."
@@ -245,7 +245,7 @@ def _paper_row(name: str) -> Mapping[str, float] | None:
 
 
 def _beside_paper(results: Mapping[str, Mapping[int, Metrics]], rows: Mapping[str, str]) -> str:
-    """Ours and the paper's; ``rows`` maps what the paper calls a row to the run that stands for it."""
+    """Ours and the paper's; ``rows`` maps what the paper calls a row to the run that corresponds to it."""
     lines = []
     for name, run in rows.items():
         lines.append([_label(name), *seeds_row(results[run], PAPER_COLUMNS)])

@@ -99,7 +99,7 @@ def _refuse_other_run(config: DictConfig, folder: Path) -> None:
 
 
 def _refuse_other_start(config: DictConfig, folder: Path) -> None:
-    """Notes the weights a new run starts from; by their content, for a folder may be moved, or filled anew."""
+    """Notes the weights a new run starts from; by their content, for a folder may be moved, or filled again."""
     if not config.init_from:
         return
     path, weights = folder / START, weights_digest(read_checkpoint(config.init_from)["state_dict"])
@@ -140,7 +140,7 @@ def final_checkpoint(folder: Path, steps: int) -> Path:
 
 
 def write_part(start: Path, path: Path, keep: Callable[[str], bool]) -> Path:
-    """Writes a checkpoint of some tensors for ``init_from``: a model that begins with it has all others anew.
+    """Writes a checkpoint of some tensors for ``init_from``: a model that begins with it initialises all others.
 
     Args:
         start: checkpoint whose ``state_dict`` is taken; optimiser state and step are not.

@@ -1,4 +1,4 @@
-"""What several processes of a run tell each other, beside gradients."""
+"""What several processes of a run tell each other, besides gradients."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def interleave(parts: Sequence[Mapping[Key, Value]]) -> dict[Key, Value]:
 
 @contextmanager
 def ending_together(trainer: lightning.Trainer) -> Iterator[None]:
-    """Ends the ranks that this process started if it fails itself: they would wait for it in vain.
+    """Ends the ranks that this process started if it fails itself: they would wait for ever.
 
     The other way round Lightning watches them, and whoever starts ranks on several machines watches all.
 

@@ -55,7 +55,7 @@ PRECISIONS = ("auto", "32-true", "bf16-mixed", "32", "bf16")  # the last two are
 
 @dataclass(frozen=True)
 class Run:
-    """What a configuration stands for.
+    """What a configuration describes.
 
     Attributes:
         module: model, loss, renderer and optimiser.
@@ -108,7 +108,7 @@ def build(config: DictConfig) -> Run:
 
 
 def _quieten_lightning() -> None:
-    """Lightning's warnings, once: its news name options that nobody chose, and its own handler repeats Hydra's."""
+    """Lightning's warnings, once: only its warnings, and not twice."""
     logger = logging.getLogger("lightning.pytorch")
     logger.setLevel(logging.WARNING)
     if logging.getLogger().handlers:
@@ -228,7 +228,7 @@ def evaluate(run: Run) -> dict[str, float]:
 
 
 def _untrained_metrics(run: Run, resumed: bool) -> dict[str, float]:
-    """Metrics of the head as initialised: measured once a run and kept beside it for resumed runs."""
+    """Metrics of the head as initialised: measured once and kept in the run's folder for when it is resumed."""
     path = run.folder / "untrained.json"
     if resumed and path.is_file():
         return read_json(path)

@@ -1,4 +1,4 @@
-"""How a run begins: anew or from a checkpoint of its folder, never silently over another run."""
+"""How a run begins: from scratch or from a checkpoint of its folder, never silently over another run."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def checkpoint_to_resume(config: DictConfig) -> Path | None:
     if 0 <= most < step:
         raise ValueError(
             f"{path} is at step {step}, further than trainer.max_steps={most} asks: nothing was changed. Raise "
-            "trainer.max_steps to go on, or take another name= to train anew"
+            "trainer.max_steps to go on, or take another name= to start a new run"
         )
     return path
 

@@ -108,7 +108,7 @@ def _jpeg(scene: ViewerScene, index: int) -> str | None:
 
 
 def _json_in_html(content: Any) -> str:
-    """JSON that cannot end the element it stands in, whatever its strings hold."""
+    """JSON that cannot end the element it is in, whatever its strings hold."""
     text = json.dumps(content, allow_nan=False)  # everything beyond ASCII is escaped
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 

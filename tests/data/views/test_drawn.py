@@ -116,14 +116,14 @@ def test_wrong_indices_and_too_few_frames_are_named(tmp_path: Path) -> None:
 
 
 def test_the_command_writes_what_is_committed(tmp_path: Path) -> None:
-    path = write_views(["evaluation=synthetic", f"out={tmp_path / 'again.json'}"])
+    path = write_views(str(tmp_path / "again.json"), ["evaluation=synthetic"])
     assert path.read_text() == index_path("synthetic").read_text()
     assert set(read_index("synthetic")["room-1000000"]) == {"3", "10", "20"}
 
 
 def test_the_command_repeats_the_index_of_real_recordings(tmp_path: Path, shared: Path) -> None:
     roots = ",".join(str(shared / "data" / scene) for scene in sorted(read_index("rgbd")))
-    path = write_views(["evaluation=rgbd", f"data.root=[{roots}]", f"out={tmp_path / 'again.json'}"])
+    path = write_views(str(tmp_path / "again.json"), ["evaluation=rgbd", f"data.root=[{roots}]"])
     assert path.read_text() == index_path("rgbd").read_text()
 
 

@@ -117,7 +117,7 @@ class DTUTraining(FileSource):
 class DTU(FileSource):
     """Scans with ``images/``, ``cams/%08d_cam.txt`` and ``pair.txt`` (not needed), as MVSNet is tested on.
 
-    The intrinsics are those of the images as they are. The layout has no depth; it can come from beside it.
+    The intrinsics are those of the images as they are. The layout has no depth; it can come from another folder.
 
     Args:
         root: a scan, a folder of scans, or a list.
@@ -207,7 +207,7 @@ def read_camera(path: Path, scene: str) -> tuple[NDArray[np.float64], NDArray[np
     """Reads a camera of MVSNet: ``extrinsic``, 4x4 world-to-camera in mm, ``intrinsic``, 3x3, and a depth range.
 
     Returns:
-        Camera-to-world ``[4, 4]`` in metres, and intrinsics ``[3, 3]`` as they stand in the file, which are of the
+        Camera-to-world ``[4, 4]`` in metres, and intrinsics ``[3, 3]`` as they are in the file, which are of the
         image size that the file was made for.
 
     Raises:
@@ -258,7 +258,7 @@ def _scaled(intrinsics: NDArray[np.float64], scale: float, shift: tuple[float, f
 
 
 def _masked_depth(path: Path, scene: str) -> NDArray[np.float32]:
-    """Depth in metres, 0 where the mask beside it says that there is none."""
+    """Depth in metres, 0 where the mask next to it says that there is none."""
     depth = read_pfm(path, scene)
     mask = read_depth(path.with_name(path.stem.replace("depth_map", "depth_visual") + ".png"), scene, depth.shape)
     valid = (mask > MASK_THRESHOLD) & np.isfinite(depth) & (depth > 0)

@@ -56,7 +56,7 @@ class FileSource(SceneSource):
         holdout: hold out every this many-th frame as an evaluation target; None: none.
         every: use every this many-th frame only.
         index_cache: folder for the indices (file lists, poses, intrinsics), so that they are read from the dataset
-            only once; None: they are read anew by every process. An index is made again when the scene's folder
+            only once; None: every process reads them again. An index is made again when the scene's folder
             changes; a pose file edited in place inside a folder of pose files is not noticed.
 
     Raises:
@@ -77,14 +77,14 @@ class FileSource(SceneSource):
     index_version: ClassVar[int] = 2
     """Raise it when ``index`` would give another result for the same files."""
     index_options: ClassVar[tuple[str, ...]] = ()
-    """Attributes that decide an index, beside the folder; part of the cache's key."""
+    """Attributes that decide an index, besides the folder; part of the cache's key."""
     sparse_depth: ClassVar[bool] = False
     reads_masks: ClassVar[bool] = False
     """Alpha and mask files decide how much a pixel counts; otherwise alpha is composited alone."""
     depth_scale: float = 1000.0
     """Stored depth units for one unit of the poses."""
     invalid: tuple[int, ...] = ()
-    """Stored depth that means none, beside 0."""
+    """Stored depth that means none, besides 0."""
     depth_remedy: ClassVar[str] = "correct the depth unit and the values that mean 'invalid'"
     """What to do where a frame has no valid depth, for messages."""
 
@@ -197,7 +197,7 @@ class FileSource(SceneSource):
         return " ".join(folder_state(place) for place in self.watched(scene, folder) if place and place.exists())
 
     def options(self) -> Mapping[str, object]:
-        """What decides an index, beside the folder; part of the cache's key. By default the ``index_options``."""
+        """What decides an index, besides the folder; part of the cache's key. By default the ``index_options``."""
         return {name: getattr(self, name) for name in self.index_options}
 
     @property
@@ -242,7 +242,7 @@ class FileSource(SceneSource):
         return json.dumps([type(self).__qualname__, scene, options, state])
 
     def scene_index(self, scene: str) -> SceneIndex:
-        """The index of a scene, from memory, from the cache, or read anew."""
+        """The index of a scene, from memory, from the cache, or from the dataset."""
         if scene not in self._folders:
             raise DataError(f"there is no scene {scene}; found are: {_some(self._folders)}")
         if scene not in self._indices:

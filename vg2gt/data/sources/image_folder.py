@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from vg2gt.data.sources.files import FileSource
 from vg2gt.data.sources.index import SceneIndex, make_index
 from vg2gt.data.sources.parsing import IMAGE_SUFFIXES, pinhole
+from vg2gt.io.files import by_number
 from vg2gt.io.image_files import Size, image_size, read_color
-from vg2gt.io.names import by_number
 
 FOCAL = 1.2
 """Placeholder focal length, in the larger side of the image: the usual first guess of structure from motion."""

@@ -247,7 +247,7 @@ def _folders_in(folder: Path) -> list[Path]:
 def index_to_bytes(index: SceneIndex, state: str) -> bytes:
     """An ``.npz`` file of an index and of the state of the folder it was made from.
 
-    Thousands of scenes are kept: names of files stand in it without the scene's folder, and intrinsics that all frames
+    Thousands of scenes are kept: names of files are kept without the scene's folder, and intrinsics that all frames
     share only once.
     """
     shared = (index.intrinsics == index.intrinsics[:1]).all()

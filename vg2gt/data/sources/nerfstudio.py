@@ -27,8 +27,8 @@ from vg2gt.data.sources.parsing import (
 from vg2gt.data.sources.posed import posed_image, size_on_disk
 from vg2gt.io import Lens, TransformsFrame, read_transforms
 from vg2gt.io.colmap import PIXEL_CENTER, Camera, require_pycolmap
+from vg2gt.io.files import by_number
 from vg2gt.io.image_files import Size, image_size
-from vg2gt.io.names import by_number
 
 log = logging.getLogger(__name__)
 

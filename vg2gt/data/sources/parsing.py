@@ -289,7 +289,7 @@ def expanded(path: str | None) -> Path | None:
 
 
 def existing_depth_root(path: str | None) -> Path | None:
-    """The folder of depth beside a dataset.
+    """The folder of depth next to a dataset.
 
     Raises:
         FileNotFoundError: if it is named but does not exist.

@@ -104,7 +104,7 @@ def read_export(folder: Path, scene: str) -> PhoneExport | None:
 
 
 def confidence_of(depth: Path) -> Path | None:
-    """The confidence beside a depth image, if there is any."""
+    """The confidence next to a depth image, if there is any."""
     path = depth.parent.parent / "confidence" / depth.name
     return path if path.is_file() else None
 

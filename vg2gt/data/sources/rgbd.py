@@ -94,7 +94,7 @@ class RGBDFolder(FileSource):
         invalid: stored values that mean "no depth".
         holdout: hold out every this many-th frame; None: none.
         intrinsics: (fx, fy, cx, cy) in pixels of the colour images, where the folder has no intrinsics or wrong ones.
-        depth: read depth; False: posed images alone, which may also lie beside ``poses.txt`` and ``K.txt``.
+        depth: read depth; False: posed images alone, which may also be next to ``poses.txt`` and ``K.txt``.
         shared: see ``FileSource``.
     """
 
@@ -141,7 +141,7 @@ class RGBDFolder(FileSource):
         return room_of_scan(folder.name) if re.fullmatch(r"scene\d{4}_\d\d", folder.name) else scene
 
     def watched(self, scene: str, folder: Path) -> Sequence[Path | None]:
-        """Also the intrinsics, which lie deeper or beside the recording."""
+        """Also the intrinsics, which are in a folder of it or next to it."""
         return folder, *_exported_intrinsics(folder), *_beside(folder.parent), folder / "keyframes"
 
     def index(self, scene: str, folder: Path) -> SceneIndex:
@@ -272,7 +272,7 @@ def _files_in_folders(folder: Path, scene: str) -> _Files:
 
 def _files_of_seven_scenes(folder: Path, scene: str) -> _Files:
     _say(f"scene {scene}: raw 7-Scenes streams are not registered; colour and depth do not match", logging.WARNING)
-    # The intrinsics lie beside the frames, or beside the sequences of a scene.
+    # The intrinsics are next to the frames, or next to the sequences of a scene.
     candidates = [*_beside(folder), *_beside(folder.parent)]
     return _Files(
         layout="7-Scenes layout",

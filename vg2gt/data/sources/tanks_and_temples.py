@@ -33,7 +33,7 @@ _LOG = "_COLMAP_SfM.log"
 
 
 class TanksAndTemples(FileSource):
-    """Scenes ``S`` with ``S_COLMAP_SfM.log``, ``S_trans.txt``, ``S.ply`` and images in ``images/`` or beside them.
+    """Scenes ``S`` with ``S_COLMAP_SfM.log``, ``S_trans.txt``, ``S.ply`` and images in ``images/`` or next to them.
 
     The log has a camera-to-world pose for each image in the order of the images' names, in the arbitrary unit of
     structure from motion; ``S_trans.txt`` takes that world to the scan's, which is in metres. Images that the log marks

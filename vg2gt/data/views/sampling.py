@@ -40,7 +40,7 @@ class ViewSampler:
         target_views: held-out views drawn from the same window, in addition.
         seed: seeds every draw.
         view_sets: every scene's views come from this many fixed draws, so that what a frozen backbone makes of them
-            can be kept (``backends.cache``); None draws anew at every step.
+            can be kept (``backends.cache``); None draws again at every step.
     """
 
     min_views: int = 3
@@ -118,7 +118,7 @@ class ViewSampler:
 
 @dataclass(frozen=True)
 class ScenePool:
-    """An endless row of scenes from one or several parts; what stands at a place is a function of seed and place.
+    """An endless row of scenes from one or several parts; what is at a place is a function of seed and place.
 
     The row is cut into blocks of ``sum(shares)`` places. Every block holds ``shares[k]`` scenes of part k in an order
     of its own, so any stretch of whole blocks holds the parts exactly in their shares. The scenes of a part come in

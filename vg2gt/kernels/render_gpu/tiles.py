@@ -2,7 +2,7 @@
 
 One program is one warp and one tile of 8 x 8 pixels of one view, a vector of 64 rays. Gaussians are read one at a time,
 front to back, as scalars; one that no ray of the tile hits costs a comparison. Rays are stopped by the sign of their
-transmittance. Nothing is kept per hit: the solver visits the tile's Gaussians anew, eight depths at a time, as far as
+transmittance. Nothing is kept per hit: the solver visits the tile's Gaussians again, eight depths at a time, as far as
 they can matter to the median. Formulas: vg2gt/rendering/projection.py, vg2gt/rendering/median.py.
 
 Options are compile-time constants, so that float64 (for tests) keeps their digits. Loops are ``while`` loops because

@@ -1,6 +1,6 @@
 """Second moments of the points in every voxel, plain and in one compiled pass (ours).
 
-How the points lie in their cell, how colour changes among them, where the cameras stand that saw them and how large
+How the points lie in their cell, how colour changes among them, where the cameras are that saw them and how large
 their pixels are: confidence-weighted means of 19 products. Written as separate operations, those of all points come and
 go a few views at a time; the compiled pass keeps none.
 """

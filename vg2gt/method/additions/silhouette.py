@@ -1,8 +1,8 @@
 """Points between foreground and background, which lie on no surface (our addition to both levels of the paper).
 
 Decoded depth does not break off at a silhouette, it runs from the foreground to the background within a few pixels.
-Unprojected and put into voxels those pixels become the fringe of splinters that surrounds every object. Beside them the
-coarse level cannot tell a view's error from the step of the silhouette itself.
+Unprojected and put into voxels those pixels become the fringe of splinters that surrounds every object. Next to them
+the coarse level cannot tell a view's error from the step of the silhouette itself.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ STEEPEST = 0.12  # relative change of depth from pixel to pixel beyond which eve
 CONTRAST = 0.08  # relative range of depth in a window without which there is no silhouette
 INSIDE = 0.05  # share of that range by which a pixel lies behind the front and before the back
 REACH = 2  # pixels to every side in which the range of depth is taken
-STEP = 0.15  # relative range of depth around a pixel from which on it is beside a silhouette
+STEP = 0.15  # relative range of depth around a pixel from which on it is next to a silhouette
 STEP_REACH = 3  # pixels to every side
 
 
@@ -48,7 +48,7 @@ def on_surface(depth: Tensor) -> Tensor:
     return ~(broken & between)
 
 
-def beside_silhouettes(depth: Tensor) -> Tensor:
+def near_silhouettes(depth: Tensor) -> Tensor:
     """Tells the pixels on no surface, and those on a surface that breaks off within a few pixels.
 
     Args:

@@ -5,7 +5,7 @@ to be seen in the frozen geometry itself: the voxels around a point hold the oth
 numbers a point tell it to the network; the centroids that they are taken from are ``CENTROID_CHANNELS`` more inputs of
 the voxels. ``model.coarse.surface_evidence`` switches both (docs/reproduce.md, Deviations from the paper).
 
-Where views agree already there is nothing to be gained and much to be spoilt, and beside silhouettes this evidence says
+Where views agree already there is nothing to gain and much to spoil, and next to silhouettes this evidence says
 nothing: ``model.coarse.gate`` scales what the module changes by how much the views disagree (:func:`disagreement`).
 """
 
@@ -75,6 +75,24 @@ class PointFrames:
         change = steps * voxel_size / (self.depth * DEPTH_CHANGE_UNIT)
         change = torch.where(facing < -GRAZING, change, 0.0).clamp(-MAX_DEPTH_CHANGE, MAX_DEPTH_CHANGE)
         return torch.cat((local, change[:, None]), -1)
+
+    def evidence(
+        self, to_surface: Tensor, voxel_size: Tensor, batch: Tensor, clear: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """What :meth:`in_camera` gives ``[N, 4]``, and the gate ``[B]`` on what the network changes.
+
+        Args:
+            to_surface: ``[N, 3]`` in world axes and voxels.
+            voxel_size: ``[B]`` scene units per voxel.
+            batch: ``[N]`` scene index, sorted.
+            clear: ``[N]`` bool, which points lie away from silhouettes; the evidence of others is 0. None: there is no
+                gate, and all count.
+        """
+        seen = self.in_camera(to_surface, voxel_size[batch])
+        if clear is None:
+            return seen, torch.ones_like(voxel_size)
+        seen = torch.where(clear[:, None], seen, 0)
+        return seen, gate(disagreement(seen[:, -1], clear, batch, len(voxel_size)))
 
 
 def disagreement(change: Tensor, usable: Tensor, batch: Tensor, scenes: int) -> Tensor:

@@ -93,7 +93,7 @@ def surface_frame(moments: VoxelMoments) -> tuple[Tensor, Tensor, Tensor]:
     across = torch.stack((-along[:, 1], along[:, 0]), -1)
     axes = torch.stack((along, across), -1)  # [M, 2, 2], columns in the tangent plane
     frame = torch.cat((plane @ axes, normal[:, :, None]), -1)
-    # A point stands for its pixel, which covers more of a surface the more it leans away from the line of sight.
+    # A point represents its pixel, which covers more of a surface the more it leans away from the line of sight.
     sight = (frame.transpose(1, 2) @ facing[:, :, None])[..., 0]  # [M, 3], of unit length
     lean = sight[:, :2].square() / sight[:, 2:].clamp(min=GRAZING).square()
     variance = (axes * (inside @ axes)).sum(1) + (1 + lean) * moments.pixel[:, None].square() * UNIFORM_VARIANCE
