@@ -1,13 +1,19 @@
 """What README and docs say can be found and run: links, commands, options, files, tables, the site."""
 
+import io
 import re
 import shlex
 import shutil
+import sys
+from contextlib import redirect_stdout, suppress
+from functools import cache
 from pathlib import Path
 
 import pytest
 
+import vg2gt.cli
 from tests.commands import ROOT
+from vg2gt.cli.arguments import separate
 from vg2gt.cli.commands import COMMANDS, DATA_COMMANDS
 from vg2gt.config import compose, config_dir, group_options
 
@@ -83,8 +89,29 @@ def test_commands_and_their_options_exist(page: Path) -> None:
         if words[0] == "vg2gt":
             assert program in COMMANDS, line
             assert program != "data" or words[2] in DATA_COMMANDS, line
-        if program in HYDRA and not {"-m", "-h", "-hh"} & set(words):
-            composes(HYDRA[program], words[2:], line)
+        if program in HYDRA:
+            if not {"-m", "-h"} & set(words):
+                composes(HYDRA[program], words[2:], line)
+        elif words[0] == "vg2gt":
+            command = words[1:3] if program == "data" else words[1:2]
+            overrides = separate(words[1 + len(command) :])[1]
+            flags = {word for word in words if word.startswith("--")} - {"--help"}
+            assert flags <= set(re.findall(r"--[\w-]+", help_of(*command))), line
+            composes(
+                "evaluate" if command[-1] == "views" else "train",
+                [f"+{o}" if program == "refine" else o for o in overrides],
+                line,
+            )
+
+
+@cache
+def help_of(*command: str) -> str:
+    """What ``vg2gt COMMAND --help`` prints."""
+    shown = io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(shown), suppress(SystemExit):
+        patch.setattr(sys, "argv", ["vg2gt", *command, "--help"])
+        vg2gt.cli.main()
+    return shown.getvalue()
 
 
 def composes(config: str, words: list[str], line: str) -> None:

@@ -13,6 +13,7 @@ import vg2gt.cli
 from tests.commands import ROOT
 from vg2gt.cli import reconstruct as reconstruct_command
 from vg2gt.cli import render as render_command
+from vg2gt.cli.arguments import separate
 from vg2gt.io import read_cameras_json
 from vg2gt.io.video import has_pyav
 
@@ -44,7 +45,8 @@ def _run(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("page", [page for page in PAGES if _commands(page, *PARSERS)], ids=lambda page: page.name)
 def test_commands_are_understood(page: Path) -> None:
     for words in _commands(page, *PARSERS):
-        PARSERS[words[1]]().parse_args(words[2:])
+        given, _ = separate(words[2:])
+        PARSERS[words[1]]().parse_args(given)
 
 
 def test_a_recording_is_reconstructed_and_rendered(workplace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
