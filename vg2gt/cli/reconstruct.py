@@ -54,14 +54,14 @@ def parser() -> argparse.ArgumentParser:
     add("--frames", type=int, default=ORBIT_FRAMES, metavar="N", help=f"length of the orbit, default {ORBIT_FRAMES}")
     add("--mesh-voxel", type=float, metavar="X", help="edge of the mesh's voxels in scene units")
     add("--device", default="auto", help="auto, cpu, cuda, cuda:N")
-    add("--skip-damaged", action="store_true", help="go on without images that cannot be read")
-    add("--overwrite", action="store_true", help="replace outputs that are there")
+    add("--skip-damaged", action="store_true", help="skip images that cannot be read")
+    add("--overwrite", action="store_true", help="replace existing outputs")
     add("--quiet", action="store_true", help="no progress bars")
     return arguments
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Runs the command; ends with one line on what is wrong where something is."""
+    """Runs the command; an error is one line."""
     from rich.console import Console
     from rich.logging import RichHandler
 
@@ -169,7 +169,7 @@ def _figures(ready: LoadedModel) -> dict[str, Any]:
 
 def _steps(text: str) -> int:
     if not text.isdigit():
-        raise argparse.ArgumentTypeError(f"{text!r} is no number of steps; 0 leaves the refinement out")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of steps; 0 disables refinement")
     return int(text)
 
 

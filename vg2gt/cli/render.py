@@ -38,7 +38,7 @@ def parser() -> argparse.ArgumentParser:
     add("--fps", type=float, default=FPS, help=f"of the animation, default {FPS:g}")
     add("--near", type=float, default=0.01, help="near plane in scene units")
     add("--device", default="auto", help="auto, cpu, cuda, cuda:N")
-    add("--overwrite", action="store_true", help="replace outputs that are there")
+    add("--overwrite", action="store_true", help="replace existing outputs")
     add("--quiet", action="store_true", help="no progress bars")
     return arguments
 
