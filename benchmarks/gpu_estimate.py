@@ -2,7 +2,7 @@
 
 Counts for the benchmark's room how many entries (tile, Gaussian) there are, and for a sample of tiles how many the
 kernels visit and how many of those a ray meets; multiplies by the instructions that a warp executes for either in the
-loops compiled for sm_90. Bytes are those of the layouts (docs/gpu.md). Prints milliseconds, writes a dated JSON file.
+loops compiled for sm_90. Bytes are those of the layouts. Prints milliseconds, writes a dated JSON file.
 """
 
 from __future__ import annotations

@@ -1,32 +1,178 @@
-"""What docs/reproduce.md tells to run is there: commands, presets, figures."""
+"""What README and docs say can be found and run: links, commands, options, files, tables, the site."""
 
+import io
 import re
+import shlex
+import shutil
+import sys
+from contextlib import redirect_stdout, suppress
+from functools import cache
+from pathlib import Path
 
+import pytest
+
+import vg2gt.cli
 from tests.commands import ROOT
+from vg2gt.cli.arguments import separate
 from vg2gt.cli.commands import COMMANDS, DATA_COMMANDS
-from vg2gt.config import group_options
+from vg2gt.config import compose, config_dir, group_options
 
-TEXT = (ROOT / "docs" / "reproduce.md").read_text()
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-
-
-def test_commands_and_scripts_exist() -> None:
-    scripts = set(re.findall(r"python ([\w/]+\.py)", TEXT))
-    assert {"benchmarks/baselines.py", "benchmarks/primitives.py", "benchmarks/stages.py"} <= scripts
-    for script in scripts:
-        assert (ROOT / script).is_file(), script
-    assert {"evaluate", "ablate", "curves"} <= set(re.findall(r"vg2gt (\w+)", TEXT))
-    for page in PAGES:
-        for name, second in re.findall(r"(?:^|`)vg2gt (\w+) ?(\w*)", page.read_text(), re.MULTILINE):
-            assert name in COMMANDS, page
-            assert name != "data" or second in DATA_COMMANDS, page
+DOCS = sorted((ROOT / "docs").rglob("*.md"))
+PAGES = [
+    *sorted(ROOT.glob("*.md")),
+    *DOCS,
+    *sorted(ROOT.glob("*/README.md")),
+    *sorted(ROOT.glob("recipes/*/README.md")),
+]
+HYDRA = {"train.py": "train", "train": "train", "evaluate": "evaluate", "ablate": "ablate"}
+SOURCES = ("vg2gt", "backends", "configs", "recipes", "examples", "benchmarks", "tests")
 
 
-def test_presets_and_files_exist() -> None:
-    for group in ("evaluation", "model", "backend", "data", "experiment"):
-        named = set(re.findall(rf"(?<![\w.]){group}=([a-z]\w*)", TEXT))
-        assert named <= set(group_options(group)), group
-    for link in re.findall(r"\]\(([^)#]+)\)", TEXT):
-        assert (ROOT / "docs" / link).exists(), link
-    for path in re.findall(r"`((?:docs|vg2gt|configs)/[\w./-]+)`", TEXT):
-        assert (ROOT / path).exists(), path
+def named(page: Path) -> str:
+    return page.relative_to(ROOT).as_posix()
+
+
+def slug(heading: str) -> str:
+    """As GitHub and mkdocs name a heading's anchor."""
+    plain = re.sub(r"\[(.*?)\]\(.*?\)|[`*]", r"\1", heading)
+    return re.sub(r"\s+", "-", re.sub(r"[^\w\s-]", "", plain).strip().lower())
+
+
+def without_code(text: str) -> str:
+    return re.sub(r"```.*?```|`[^`\n]*`", "", text, flags=re.DOTALL)
+
+
+def commands(page: Path) -> list[str]:
+    """Lines of the page's code blocks and code in its tables that start one of our programs."""
+    text = page.read_text()
+    blocks = [line for block in re.findall(r"```\w*\n(.*?)```", text, re.DOTALL) for line in block.splitlines()]
+    inline = re.findall(r"`([^`\n]+)`", re.sub(r"```.*?```", "", text, flags=re.DOTALL))
+    starts = ("vg2gt ", "python train.py", "srun python train.py", "python benchmarks/", "python -m recipes")
+    return [line.split(" #")[0].strip() for line in [*blocks, *inline] if line.startswith(starts)]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=named)
+def test_relative_links_and_anchors_lead_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)\s]+)\)", without_code(page.read_text())):
+        if re.match(r"\w+:", target):
+            continue
+        path, _, anchor = target.partition("#")
+        place = (page.parent / path).resolve() if path else page
+        assert place.exists(), f"{named(page)} links to {target}"
+        if anchor:
+            headings = re.findall(r"^#+ (.+)$", place.read_text(), re.MULTILINE)
+            assert anchor in {slug(heading) for heading in headings}, f"{named(page)} links to {target}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=named)
+def test_files_that_are_named_exist(page: Path) -> None:
+    for path in re.findall(
+        r"`((?:docs|examples|backends|recipes|benchmarks|tests|vg2gt|configs)/[\w./-]+)`", page.read_text()
+    ):
+        assert (ROOT / path).exists(), f"{named(page)} names {path}"
+    for path in re.findall(r"--8<-- \"(.+?)\"", page.read_text()):
+        assert (ROOT / path).is_file(), f"{named(page)} shows {path}"
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if commands(page)], ids=named)
+def test_commands_and_their_options_exist(page: Path) -> None:
+    for line in commands(page):
+        words = shlex.split(line)
+        if words[1].isupper() or "NAME" in words[1]:
+            continue
+        if words[:2] == ["srun", "python"]:
+            words = words[1:]
+        if words[0] == "python" and words[1].startswith("benchmarks/"):
+            assert (ROOT / words[1]).is_file(), line
+            continue
+        program = words[1] if words[0] in ("vg2gt", "python") else ""
+        if words[0] == "vg2gt":
+            assert program in COMMANDS, line
+            assert program != "data" or words[2] in DATA_COMMANDS, line
+        if program in HYDRA:
+            if not {"-m", "-h"} & set(words):
+                composes(HYDRA[program], words[2:], line)
+        elif words[0] == "vg2gt":
+            command = words[1:3] if program == "data" else words[1:2]
+            overrides = separate(words[1 + len(command) :])[1]
+            flags = {word for word in words if word.startswith("--")} - {"--help"}
+            assert flags <= set(re.findall(r"--[\w-]+", help_of(*command))), line
+            composes(
+                "evaluate" if command[-1] == "views" else "train",
+                [f"+{o}" if program == "refine" else o for o in overrides],
+                line,
+            )
+
+
+@cache
+def help_of(*command: str) -> str:
+    """What ``vg2gt COMMAND --help`` prints."""
+    shown = io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(shown), suppress(SystemExit):
+        patch.setattr(sys, "argv", ["vg2gt", *command, "--help"])
+        vg2gt.cli.main()
+    return shown.getvalue()
+
+
+def composes(config: str, words: list[str], line: str) -> None:
+    """Hydra takes the line's overrides; capital words stand for what a reader has."""
+    folders = [words[i + 1] for i, word in enumerate(words) if word == "--config-dir"]
+    overrides = [word for word in words if "=" in word and not word.startswith("-")]
+    path = [f"hydra.searchpath=[{ROOT / folder}]" for folder in folders]
+    try:
+        compose(config, "output_dir=unused", *path, *overrides)
+    except Exception as error:
+        raise AssertionError(f"{line}: {error}") from error
+
+
+@pytest.mark.parametrize("page", PAGES, ids=named)
+def test_options_of_groups_exist(page: Path) -> None:
+    text = page.read_text()
+    examples = {path.stem for path in ROOT.glob("examples/**/configs/data/*.yaml")}
+    examples |= {path.stem for path in ROOT.glob("examples/configs/data/*.yaml")}
+    for group in (path.name for path in Path(config_dir()).iterdir() if path.is_dir() and path.name != "hydra"):
+        for option in re.findall(rf"(?<![\w.=+/-]){group}=([a-z]\w*)(?![\w.*/])", text):
+            found = {*group_options(group), *(examples if group == "data" else ())}
+            assert option in found or option == "null", f"{named(page)}: {group}={option}"
+
+
+def test_code_names_pages_that_exist() -> None:
+    for path in (path for source in SOURCES for path in (ROOT / source).rglob("*") if path.suffix in (".py", ".yaml")):
+        for page in re.findall(r"docs/[\w/-]+\.md", path.read_text()):
+            assert (ROOT / page).is_file(), f"{named(path)} names {page}"
+
+
+def test_every_figure_is_shown() -> None:
+    shown = "".join(page.read_text() for page in PAGES)
+    for figure in (ROOT / "docs" / "figures").iterdir():
+        assert f"figures/{figure.name}" in shown, figure.name
+
+
+def test_readme_and_docs_are_short() -> None:
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 120
+    words = (word for page in DOCS for word in page.read_text().split() if re.search(r"\w", word))  # no bars of tables
+    assert sum(1 for _ in words) <= 15_000
+
+
+def rows(path: Path) -> set[tuple[str, ...]]:
+    lines = [line for line in path.read_text().splitlines() if line.startswith("|")]
+    return {tuple(cell.strip() for cell in line.strip("|").split("|")) for line in lines}
+
+
+def test_figures_of_photos_are_the_newest_measured() -> None:
+    """The rows of README and docs/results.md are those that benchmarks/photos.py wrote; copy them when they change."""
+    measured = rows(max((ROOT / "benchmarks" / "results").glob("*-photos.md")))
+    shown = {row for row in rows(ROOT / "docs" / "results.md") if "default" in row}
+    assert len(shown) >= 10
+    assert shown <= measured
+    assert {row for row in rows(ROOT / "README.md") if "default" in row} <= shown
+
+
+def test_the_site_builds(tmp_path: Path) -> None:
+    pytest.importorskip("material", reason='needs pip install -e ".[docs]"')
+    from mkdocs.commands.build import build  # pyright: ignore[reportMissingImports]
+    from mkdocs.config import load_config  # pyright: ignore[reportMissingImports]
+
+    build(load_config(str(ROOT / "mkdocs.yml"), strict=True, site_dir=str(tmp_path / "site")))
+    assert (tmp_path / "site" / "results" / "index.html").is_file()
+    shutil.rmtree(tmp_path / "site")

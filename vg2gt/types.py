@@ -1,6 +1,6 @@
 """The frozen records that pass between the parts of VG²GT.
 
-Conventions (``docs/conventions.md``): OpenCV cameras (x right, y down, z forward), ``world_to_camera`` 4x4,
+Conventions (``docs/concepts/conventions.md``): OpenCV cameras (x right, y down, z forward), ``world_to_camera`` 4x4,
 intrinsics in pixels with integer pixel centres (the centre of pixel (0, 0) is at (0, 0)), z-depth with 0 where invalid.
 Letters in shapes: B scenes, V views, H x W pixels, P patches, M voxels, G Gaussians, K splits.
 Sparse records (voxels, Gaussians) are packed over scenes: one row per element and a sorted ``batch`` index.

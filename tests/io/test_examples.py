@@ -1,4 +1,4 @@
-"""The examples in the docstrings of the formats and in docs/formats.md run as written."""
+"""The examples in the docstrings of the formats and in docs/reference/formats.md run as written."""
 
 import doctest
 import importlib
@@ -11,7 +11,7 @@ import pytest
 import vg2gt.io
 
 MODULES = [f"vg2gt.io.{module.name}" for module in pkgutil.iter_modules(vg2gt.io.__path__)]
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "formats.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "reference" / "formats.md"
 
 
 @pytest.mark.parametrize("name", MODULES)

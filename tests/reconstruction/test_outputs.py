@@ -143,7 +143,7 @@ def test_animation_and_reports(written: Path, scene: Scene) -> None:
 
 
 def test_nothing_is_replaced_unasked(written: Path, scene: Scene, tmp_path: Path) -> None:
-    with pytest.raises(FileExistsError, match=r"scene.ply is there already"):
+    with pytest.raises(FileExistsError, match=r"scene.ply already exists"):
         write_outputs(scene, written, ["scene.ply"])
     write_outputs(scene, tmp_path, ["color.png"])
     (tmp_path / "color" / "stale.png").touch()

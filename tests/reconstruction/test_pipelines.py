@@ -106,7 +106,7 @@ def test_a_model_that_cannot_be_read_is_said_where_others_are_found(model, folde
     path.write_bytes(path.read_bytes()[:100])
     monkeypatch.setattr("vg2gt.reconstruction.cameras.find_cameras", lambda pictures, *_: pictures)
     with pictures_for(model, folder):
-        assert "cameras that are there are not used, structure from motion finds others:" in caplog.text
+        assert "camera files are not used, structure from motion runs instead:" in caplog.text
         assert "images.bin" in caplog.text
     with pytest.raises(ValueError, match=r"images\.bin"), pictures_for(model, folder, "given"):
         pass
@@ -199,7 +199,7 @@ def test_map_coordinates_keep_their_digits(folder: Path, frames, model, caplog) 
 
 def test_there_is_no_given_frame_without_given_cameras(photos: Path) -> None:
     images_alone = load_model(backend="da3_tiny", device="cpu").model
-    with pytest.raises(ValueError, match="no given cameras, so --frame given means nothing"):
+    with pytest.raises(ValueError, match="no cameras are given, so --frame given is not possible"):
         reconstruct_with(images_alone, photos, frame="given")
     scene = reconstruct_with(images_alone, photos)
     assert scene.frame.name == "upright"
@@ -360,12 +360,12 @@ def test_images_and_a_photograph_beside_their_folder(folder: Path, caplog) -> No
     """Item 26: the one beside images/ was taken alone; folders were passed over without a word."""
     shutil.copy(folder / "images" / NAMES[0], folder / "preview.png")
     assert len(find_pictures(folder)) == 4
-    assert "not from the same folder: preview.png" in caplog.text
+    assert "ignored in the same folder: preview.png" in caplog.text
     (folder / "images" / "more").mkdir()
     shutil.copy(folder / "images" / NAMES[0], folder / "images" / "more" / "a.png")
     caplog.clear()
     assert len(find_pictures(folder / "images")) == 4
-    assert "not from the same folder: more/" in caplog.text
+    assert "ignored in the same folder: more/" in caplog.text
 
 
 def test_the_order_of_photographs_decides_nothing_and_copies_count_once(folder: Path, frames, model, caplog) -> None:
@@ -448,7 +448,7 @@ def test_cameras_to_render_come_from_any_file(folder: Path, frames, tmp_path: Pa
             np.testing.assert_allclose(camera.world_to_camera, pose, atol=1e-5)
             np.testing.assert_allclose(camera.intrinsics, matrix, atol=1e-4)
     (tmp_path / "3dgs.json").write_text(json.dumps([{"img_name": "a"}]))
-    with pytest.raises(ValueError, match="no camera of 3D Gaussian Splatting"):
+    with pytest.raises(ValueError, match="not a camera of 3D Gaussian Splatting"):
         read_cameras(tmp_path / "3dgs.json")
 
 

@@ -81,7 +81,7 @@ def test_the_command(saved: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytes
     assert Image.open(out / "refine.png").size == (5 * 112 + 4 * 4, 4 * 84 + 3 * 4)
     again = ["refine", str(out), "--seconds", "0.1", "--quiet", "--device", "cpu"]
     vg2gt(monkeypatch, *again)  # a refined folder is one too
-    with pytest.raises(SystemExit, match="is there already"):
+    with pytest.raises(SystemExit, match="already exists"):
         vg2gt(monkeypatch, *again)
 
 
@@ -94,7 +94,7 @@ def test_reconstruct_refines_at_once(recording, tmp_path, monkeypatch, capsys):
     assert (tmp_path / "out" / "refine.png").is_file()
     with pytest.raises(SystemExit):
         vg2gt(monkeypatch, "reconstruct", str(recording), "--refine", "x", *ORACLE, "--out", str(tmp_path / "x"))
-    assert "'x' is no number of steps" in capsys.readouterr().err
+    assert "'x' is not a number of steps" in capsys.readouterr().err
 
 
 def test_photographs_are_refined_unless_asked_not_to(scene: Scene) -> None:

@@ -67,7 +67,7 @@ def unsolvable(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_same_images_are_not_computed_again_and_the_unplaced_is_named(given: Path, solved: Path, caplog) -> None:
     pictures = again(given, solved)
     assert [picture.name for picture in pictures] == [picture.name for picture in find_pictures(given)[:COUNT]]
-    assert "1 of 9 images show too little" in caplog.text
+    assert "1 of 9 images overlap too little" in caplog.text
     assert "left out: 99999 of something else" in caplog.text
     assert {picture.source for picture in pictures} == {"structure from motion, 8 of 9 images"}
 

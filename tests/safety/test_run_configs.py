@@ -164,7 +164,7 @@ def test_hyper_parameters_of_a_checkpoint_call_nothing(run_folder: Path, canary:
 
 
 def test_a_package_is_trusted_by_name(run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, model) -> None:
-    """docs/add-a-backend.md: training with an own backend, then reading the run."""
+    """docs/guides/backend.md: training with an own backend, then reading the run."""
     (tmp_path / "my_own_pkg.py").write_text(
         "import os\nfrom backends.oracle import OracleBackend\nclass Mine(OracleBackend):\n    pass\n"
     )

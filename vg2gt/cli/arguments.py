@@ -75,7 +75,7 @@ def add_common_flags(parser: argparse.ArgumentParser, saved: Sequence[str]) -> N
     add("--save", type=list_of_names, default=list(saved), metavar="LIST", help=f"default: {','.join(saved)}")
     add("--mode", choices=("solid", "rasterized"), default="solid", help="how views are rendered")
     add("--device", default="auto", help="auto, cpu, cuda, cuda:N")
-    add("--overwrite", action="store_true", help="replace outputs that are there")
+    add("--overwrite", action="store_true", help="replace existing outputs")
     add("--quiet", action="store_true", help="no progress bars")
 
 

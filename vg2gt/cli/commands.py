@@ -29,7 +29,7 @@ class Command:
 COMMANDS = {
     "train": Command(
         "vg2gt.cli.train:main",
-        "trains a model and shows what it gave; the same as python train.py",
+        "trains and evaluates a model; the same as python train.py",
         "vg2gt train name=first trainer.max_steps=200",
     ),
     "evaluate": Command(
@@ -44,7 +44,7 @@ COMMANDS = {
     ),
     "reconstruct": Command(
         "vg2gt.cli.reconstruct:main",
-        "makes a scene of Gaussians from images, a folder of them or a video",
+        "makes a scene of Gaussians from images, a folder or a video",
         "vg2gt reconstruct photos/ backend=da3_small --out outputs/photos",
     ),
     "refine": Command(
@@ -79,7 +79,7 @@ COMMANDS = {
     ),
     "doctor": Command(
         "vg2gt.cli.doctor:main",
-        "shows what this machine has, which renderer it gets, whether its kernels are right and how fast",
+        "checks this machine: packages, devices, renderer, correctness and speed of the kernels",
         "vg2gt doctor --no-speed",
     ),
 }
@@ -97,7 +97,7 @@ DATA_COMMANDS = {
     ),
     "views": Command(
         "vg2gt.cli.data:views",
-        "draws the views of an evaluation and writes them down",
+        "draws the views of an evaluation and writes an index",
         "vg2gt data views evaluation=rgbd data.root=RECORDINGS --out views.json",
     ),
 }

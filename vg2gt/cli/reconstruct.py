@@ -48,13 +48,13 @@ def parser() -> argparse.ArgumentParser:
     add("--refine", type=_steps, metavar="N", help=REFINE)
     add("--frames", type=int, default=ORBIT_FRAMES, metavar="N", help=f"length of the orbit, default {ORBIT_FRAMES}")
     add("--mesh-voxel", type=float, metavar="X", help="edge of the mesh's voxels in scene units")
-    add("--skip-damaged", action="store_true", help="go on without images that cannot be read")
+    add("--skip-damaged", action="store_true", help="skip images that cannot be read")
     add_common_flags(arguments, DEFAULT)
     return arguments
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Runs the command; ends with one line on what is wrong where something is."""
+    """Runs the command; an error is one line."""
     from rich.console import Console
     from rich.logging import RichHandler
 
@@ -161,7 +161,7 @@ def _figures(ready: LoadedModel) -> dict[str, Any]:
 
 def _steps(text: str) -> int:
     if not text.isdigit():
-        raise argparse.ArgumentTypeError(f"{text!r} is no number of steps; 0 leaves the refinement out")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of steps; 0 disables refinement")
     return int(text)
 
 

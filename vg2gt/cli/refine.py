@@ -28,15 +28,15 @@ def parser() -> argparse.ArgumentParser:
     add = arguments.add_argument
     add("scene", metavar="DIR", help="a folder that vg2gt reconstruct has written")
     add("--out", metavar="DIR", help="where to write; default: refined/ in the scene's folder")
-    add("--steps", type=int, metavar="N", help="default: that of the options")
-    add("--seconds", type=float, metavar="S", help="end after so many seconds; alone: without a number of steps")
-    add("--holdout", type=int, metavar="N", help="leave every N-th view out and say its PSNR before and after")
+    add("--steps", type=int, metavar="N", help="default: 12 per view, 400 for photos")
+    add("--seconds", type=float, metavar="S", help="stop after S seconds, or after --steps if that comes first")
+    add("--holdout", type=int, metavar="N", help="exclude every N-th view and print its PSNR before and after")
     add_common_flags(arguments, DEFAULT)
     return arguments
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Runs the command; ends with one line on what is wrong where something is."""
+    """Runs the command; an error is one line."""
     given, overrides = separate(argv)
     options = parser().parse_args(given)
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
@@ -70,7 +70,7 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
 
 
 def print_refinement(scene: Scene) -> None:
-    """Prints what refining a scene gave."""
+    """Prints the result of a refinement."""
     from vg2gt.reconstruction.refined import refinement_lines
 
     assert scene.refined is not None

@@ -40,7 +40,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Runs the command; ends with one line on what is wrong where something is."""
+    """Runs the command; an error is one line."""
     options = parser().parse_args(argv)
     with errors_in_one_line():
         run(options)

@@ -1,4 +1,4 @@
-"""``vg2gt view SCENE``: a scene in the browser, live or as one self-contained page (docs/view.md)."""
+"""``vg2gt view SCENE``: a scene in the browser, live or as one self-contained page (docs/guides/view.md)."""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ class Frames(TensorRecord):
 
 
 class SceneSource(ABC):
-    """Scenes of a dataset, in the framework's conventions (``docs/conventions.md``).
+    """Scenes of a dataset, in the framework's conventions (``docs/concepts/conventions.md``).
 
     A source says which scenes and frames there are without decoding them, and decodes frames when asked. It neither
     resizes nor caches decoded frames: the data module does that for all sources. It must be picklable, and what it

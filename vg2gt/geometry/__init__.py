@@ -1,1 +1,1 @@
-"""Geometry in OpenCV conventions (see docs/conventions.md)."""
+"""Geometry in OpenCV conventions (see docs/concepts/conventions.md)."""

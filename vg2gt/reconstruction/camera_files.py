@@ -75,7 +75,7 @@ def _of_3dgs(place: str, entry: Any) -> NamedCamera:
         fx, fy = float(entry["fx"]), float(entry["fy"])
         name = str(entry["img_name"])
     except (KeyError, TypeError, ValueError) as error:
-        raise FormatError(f"{place}: no camera of 3D Gaussian Splatting ({error!r})") from error
+        raise FormatError(f"{place}: not a camera of 3D Gaussian Splatting ({error!r})") from error
     if not (np.isfinite(to_world).all() and min(width, height) > 0 and min(fx, fy) > 0):
         raise FormatError(f"{place}: values that are not finite, or no positive size and focal length")
     matrix = np.array([[fx, 0, (width - 1) / 2], [0, fy, (height - 1) / 2], [0, 0, 1]])

@@ -48,7 +48,7 @@ def pictures_for(
         every: take every this many-th picture only.
         max_images: take at most so many, evenly spread.
         sfm_folder: where structure from motion keeps its result; None: it is thrown away.
-        monitor: told of the stages.
+        monitor: shows and times the stages.
         skip_damaged: leave out photographs that cannot be read, named in a warning.
 
     Yields:
@@ -71,7 +71,7 @@ def pictures_for(
         except DataError as error:
             if poses == "given" or backend.needs_depth:
                 raise
-            log.warning("cameras that are there are not used, structure from motion finds others: %s", error)
+            log.warning("camera files are not used, structure from motion runs instead: %s", error)
     if given is not None:
         yield without_copies(readable(given) if skip_damaged else given)
         return

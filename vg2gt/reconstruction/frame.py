@@ -66,7 +66,7 @@ def check_frame(wanted: str, source: str | None = None) -> None:
     if wanted not in get_args(FrameName):
         raise ValueError(f"frame is {wanted!r}; choose one of {', '.join(get_args(FrameName))}")
     if wanted == "given" and source not in (None, "given"):
-        raise ValueError("there are no given cameras, so --frame given means nothing: take --frame upright or first")
+        raise ValueError("no cameras are given, so --frame given is not possible: use --frame upright or first")
 
 
 def first_frame(

@@ -148,7 +148,7 @@ def _given(folder: Path, depth: bool) -> list[Picture] | None:
         except DataError as error:
             if sure:
                 raise
-            log.warning("cameras in %s are not taken for the images in %s: %s", place, folder, error)
+            log.warning("cameras in %s are ignored for the images in %s: %s", place, folder, error)
             continue
         if pictures is not None:
             _name_missing(pictures, place / images)
@@ -234,7 +234,7 @@ def _from_cameras_json(path: Path, folder: Path) -> list[Picture] | None:
     if any(
         camera.photo and camera.photo.lens == UNKNOWN_LENS and camera.photo.name == file.name for file, camera in known
     ):
-        log.warning("%s is of undistorted images and is not taken for the photographs in %s", path, folder)
+        log.warning("%s describes undistorted images and is ignored for the photos in %s", path, folder)
         return None
     return [_photo(file, camera, path) for file, camera in known]
 

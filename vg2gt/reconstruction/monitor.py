@@ -1,4 +1,4 @@
-"""What a command is doing, how long each stage took, and how much memory."""
+"""Progress, time and memory of a command's stages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What can be written of a scene. Imports nothing, so that a command's help lists it at once."""
+"""Names of the outputs of a scene. Imports nothing, so that a command's help is fast."""
 
 ORBIT_FRAMES, FPS = 72, 24.0
 SFM = "sfm"  # folder of the cameras that structure from motion found, in the output folder

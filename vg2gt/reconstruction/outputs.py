@@ -1,4 +1,4 @@
-"""Everything that can be written of a scene, by the name of its file."""
+"""Writes the outputs of a scene, by name."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def check_outputs(outputs: Sequence[str], known: Mapping[str, str] = OUTPUTS) ->
     """Checks names of outputs.
 
     Raises:
-        ValueError: if one is unknown, or there is none; lists what there is.
+        ValueError: if one is unknown or the list is empty; lists the known ones.
     """
     for output in outputs or [""]:
         if output not in known:
@@ -61,7 +61,7 @@ def check_folder(folder: str | Path, outputs: Sequence[str], overwrite: bool) ->
     """Checks that the outputs can be written into a folder, which need not be there; makes nothing.
 
     Raises:
-        FileExistsError: if an output is there already and must not be overwritten.
+        FileExistsError: if an output exists and must not be overwritten.
         PermissionError: if the folder cannot be made or written to.
     """
     folder = Path(folder).expanduser()
@@ -72,7 +72,7 @@ def check_folder(folder: str | Path, outputs: Sequence[str], overwrite: bool) ->
         raise PermissionError(f"the output folder {folder} is not writable; choose another")
     there = [target for target in (folder / _target(output) for output in outputs) if target.exists()]
     if there and not overwrite:
-        raise FileExistsError(f"{there[0]} is there already; choose another folder, or overwrite it (--overwrite)")
+        raise FileExistsError(f"{there[0]} already exists; choose another folder or add --overwrite")
     return folder
 
 
@@ -80,7 +80,7 @@ def prepare_folder(folder: str | Path, outputs: Sequence[str], overwrite: bool) 
     """Makes the output folder after :func:`check_folder`.
 
     Raises:
-        FileExistsError: if an output is there already and must not be overwritten.
+        FileExistsError: if an output exists and must not be overwritten.
         PermissionError: if the folder cannot be made or written to.
     """
     folder = check_folder(folder, outputs, overwrite)
@@ -114,13 +114,13 @@ def write_outputs(
         frames: length of the orbit.
         mesh_voxel: edge of the mesh's voxels in scene units; None: two pixels at the median depth.
         figures: what ``report.json`` and ``report.html`` say in addition to the scene's own figures.
-        monitor: told of the stages.
+        monitor: shows and times the stages.
 
     Returns:
         The folder.
 
     Raises:
-        FileExistsError: if an output is there already.
+        FileExistsError: if an output exists.
         PermissionError: if the folder cannot be written to.
         MissingDecoderError: if an animation needs PyAV and there is none.
         ValueError: if an output is unknown.
@@ -165,7 +165,7 @@ def write_outputs(
 
 
 def scene_figures(scene: Scene) -> dict[str, Any]:
-    """What a report says of a scene."""
+    """The figures of a scene's report."""
     height, width = scene.cameras.size
     return {
         "views": len(scene.names),

@@ -1,4 +1,4 @@
-"""What may be reconstructed: photographs, folders, videos, arrays; one list of pictures of it all."""
+"""Inputs of a reconstruction: photos, folders, videos and arrays as one list of pictures."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ ImagesLike: TypeAlias = "str | Path | Image.Image | NDArray[Any] | Tensor | Sequ
 
 HEIC_SUFFIXES = (".heic", ".heif")
 _HOLDS_PICTURES = (*IMAGE_SUFFIXES, *HEIC_SUFFIXES, R3D)
-VIDEO_FRAMES = 32  # taken from a video when nobody says how many
+VIDEO_FRAMES = 32  # frames taken from a video by default
 IMAGE_FOLDERS = ("images", "color", "rgb", "image", "input")
 _NO_PHOTOGRAPHS = ("masks", "depth", "depths", "color", "normals", "sfm", "sparse", "colmap", "nerfstudio")
-SKIP_DAMAGED = " (--skip-damaged goes on without what cannot be read)"
+SKIP_DAMAGED = " (--skip-damaged skips what cannot be read)"
 SFM_SOURCE = "structure from motion"  # how the source of cameras found by it begins
 UNKNOWN_LENS = "unknown"  # of images that structure from motion has undistorted
 
@@ -78,7 +78,7 @@ class Picture:
 def find_pictures(
     images: ImagesLike, every: int = 1, max_images: int | None = None, skip_damaged: bool = False
 ) -> list[Picture]:
-    """Lists the pictures of whatever somebody wants reconstructed, without their cameras.
+    """Lists the pictures of an input, without their cameras.
 
     Args:
         images: a file, folder or video, a Pillow image, an array ``[H, W, 3]`` or ``[V, H, W, 3]`` (uint8), a tensor
@@ -254,7 +254,7 @@ def image_files(folder: Path) -> list[Path]:
     else:
         passed = [file.name for file in found[folder]]
     if passed:
-        log.warning("images are taken from %s; not from the same folder: %s", taken, ", ".join(sorted(passed)[:10]))
+        log.warning("images are taken from %s; ignored in the same folder: %s", taken, ", ".join(sorted(passed)[:10]))
     return sorted(found[taken], key=lambda file: by_number(file.name))
 
 
@@ -299,9 +299,7 @@ def _photo(path: Path, content_of: Callable[[Path], bytes | None] = lambda _: No
 def _open_heic(path: Path) -> None:
     """Lets Pillow read HEIC files, for which it needs help."""
     if importlib.util.find_spec("pillow_heif") is None:
-        raise ValueError(
-            f"{path} is HEIC, which Pillow cannot read alone: pip install pillow-heif, or save the photographs as JPEG"
-        )
+        raise ValueError(f"{path} is HEIC, which needs pip install pillow-heif; or save the photos as JPEG")
     from pillow_heif import register_heif_opener  # pyright: ignore[reportMissingImports]
 
     register_heif_opener()

@@ -64,12 +64,12 @@ def reconstruct_with(
         max_images: take at most so many, evenly spread.
         size: see :func:`vg2gt.reconstruction.working_size`.
         renderer: how the scene will be rendered; None: as solids, with the default options.
-        monitor: told of the stages.
+        monitor: shows and times the stages.
         poses: where cameras come from, see :func:`vg2gt.reconstruction.cameras.pictures_for`.
         sfm_folder: where cameras that structure from motion finds are kept, and found again; None: they are not.
         frame: the scene's frame and unit (:class:`vg2gt.reconstruction.frame.SceneFrame`): ``given`` cameras',
             ``first`` camera's, ``upright``, or ``auto``.
-        skip_damaged: go on without images that cannot be read, named in a warning; otherwise they are an error.
+        skip_damaged: skip images that cannot be read, with a warning; otherwise they are an error.
 
     Returns:
         The scene, in the frame that was asked for; its Gaussians stay on the model's device.
@@ -115,7 +115,7 @@ def _forward(
 
 
 def _with_far_shell(scene: Scene) -> Scene:
-    """The scene with what no view places behind it."""
+    """The scene with a far shell for pixels that no view can place."""
     shell = far_shell(scene.images, scene.depth, scene.cameras.to("cpu"), scene.mask)
     if shell is None:
         return scene

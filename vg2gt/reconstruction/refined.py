@@ -1,4 +1,4 @@
-"""A scene refined on its own images, and what there is to tell of it."""
+"""A scene refined on its own images, and what is reported about it."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def refine_scene(
 
 
 def refinement_figures(scene: Scene) -> dict[str, Any]:
-    """What a report says of a scene's refinement; nothing where there was none."""
+    """The figures of a scene's refinement; empty if it was not refined."""
     refined = scene.refined
     if refined is None:
         return {}

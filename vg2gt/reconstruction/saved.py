@@ -67,7 +67,7 @@ def read_scene(folder: str | Path, renderer: Renderer, device: torch.device | st
 
 
 def _cameras_from(folder: Path) -> str:
-    """Where the cameras came from as the report says; empty if the backbone predicted them or nobody knows."""
+    """Where the cameras came from as the report says; empty if the backbone predicted them or it is unknown."""
     report = folder / "report.json"
     known = str(read_json(report).get("cameras", PREDICTED)) if report.is_file() else PREDICTED
     return "" if known == PREDICTED else known

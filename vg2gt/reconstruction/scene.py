@@ -62,7 +62,7 @@ class ScenePoints:
 
 @dataclass(frozen=True)
 class Scene:
-    """What :func:`vg2gt.reconstruct` gives.
+    """The result of :func:`vg2gt.reconstruct`.
 
     The world is that of ``frame``: the given cameras' world and unit, or the first image's camera turned upright (x
     right, y down, z forward) in a unit in which the median depth is about 1.
@@ -75,10 +75,10 @@ class Scene:
         depth_conf: ``[V, H, W]`` its confidence, larger is better.
         names: one per view.
         renderer: how it is rendered.
-        metres_per_unit: metres per scene unit; None where nobody knows.
+        metres_per_unit: metres per scene unit; None if unknown.
         refined: how it was refined; None where it was not.
         cameras_from: where the backbone was given cameras from; empty if it predicted them.
-        frame: where the world is in that of the given or found cameras; None where nobody knows.
+        frame: where the world is in that of the given or found cameras; None if unknown.
         mask: ``[V, H, W]`` in [0, 1], how much each input pixel counts; None: all count.
         pictures: where the images come from, one per view; empty for a scene read from files.
         poses: ``[V, 4, 4]`` float64 ``world_to_camera`` where they are known better than ``cameras`` has them.
@@ -165,10 +165,10 @@ class Scene:
         return refine_scene(self, replace(options or RefineOptions(), **changes))
 
     def save(self, folder: str | Path, outputs: Sequence[str] = ("scene.ply", "cameras.json", "report.png")) -> None:
-        """Writes files into a folder; :data:`vg2gt.reconstruction.output_names.OUTPUTS` lists what there is.
+        """Writes files into a folder; :data:`vg2gt.reconstruction.output_names.OUTPUTS` lists them.
 
         Raises:
-            FileExistsError: if one is there already.
+            FileExistsError: if one exists.
             ValueError: if an output is unknown.
         """
         from vg2gt.reconstruction.outputs import write_outputs

@@ -87,7 +87,7 @@ def find_cameras(pictures: Sequence[Picture], folder: Path, monitor: Monitor) ->
     Args:
         pictures: in order; their cameras, if any, are not used.
         folder: where the result is kept; if it holds that of the very same pictures, nothing is computed.
-        monitor: told of the stages.
+        monitor: shows and times the stages.
 
     Returns:
         The placed pictures in the same order and of the same names; the others are named in a warning.
@@ -104,10 +104,10 @@ def find_cameras(pictures: Sequence[Picture], folder: Path, monitor: Monitor) ->
         require_pycolmap()
         _check_ours(folder)
         if len(pictures) < 2:
-            raise ValueError(f"one image alone tells nothing about depth or cameras: {ADVICE}")
+            raise ValueError(f"a single image tells nothing about depth or cameras: {ADVICE}")
         state = _solve(pictures, folder, key, monitor)
     else:
-        log.info("the cameras of these very images are taken from %s", folder)
+        log.info("cameras of the same images are reused from %s", folder)
     _tell_left_out(state, len(pictures))
     names = state["images"]
     source = f"{SFM_SOURCE}, {len(names)} of {len(pictures)} images"
@@ -120,7 +120,7 @@ def _tell_left_out(state: dict[str, Any], count: int) -> None:
     """Names the images without cameras, and those of other parts."""
     if state["left_out"]:
         log.warning(
-            "%d of %d images show too little of what the others show; they have no cameras and are left out: %s",
+            "%d of %d images overlap too little with the others; they have no cameras and are left out: %s",
             len(state["left_out"]), count, ", ".join(state["left_out"]),
         )  # fmt: skip
     for part in state.get("other_parts", []):
@@ -155,7 +155,7 @@ def _check_ours(folder: Path) -> None:
     """Refuses to replace a folder that is not of our making."""
     empty = not folder.exists() or (folder.is_dir() and not any(folder.iterdir()))
     if not empty and not (folder / _STATE).is_file():
-        raise FileExistsError(f"{folder} is there already and holds other things; move it, or choose another --out")
+        raise FileExistsError(f"{folder} already exists and contains other files; move it or choose another --out")
 
 
 def _solve(pictures: Sequence[Picture], folder: Path, key: str, monitor: Monitor) -> dict[str, Any]:
@@ -169,8 +169,8 @@ def _solve(pictures: Sequence[Picture], folder: Path, key: str, monitor: Monitor
         models = sound_models(map_cameras(work, len(names), SEED, monitor))
         if not models:
             raise ValueError(
-                f"the cameras of these {len(pictures)} images cannot be found: too few of them show the same things "
-                f"from places that are near, but not equal; {ADVICE}"
+                f"the cameras of these {len(pictures)} images cannot be found: too few of them overlap, seen "
+                f"from places that are near but different; {ADVICE}"
             )
         model, *others = models
         placed = placed_images(model)

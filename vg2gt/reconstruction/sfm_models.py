@@ -28,7 +28,7 @@ def map_cameras(work: Path, count: int, seed: int, monitor: Monitor) -> list[Rec
         work: folder with ``database.db``, in which features are matched, and ``images/``.
         count: how many images there are.
         seed: the same seed gives the same models.
-        monitor: told of the stage.
+        monitor: shows and times the stage.
     """
     import pycolmap  # pyright: ignore[reportMissingImports]
 

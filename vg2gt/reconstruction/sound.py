@@ -1,4 +1,4 @@
-"""Pictures that can be read, and each once."""
+"""Leaves out pictures that cannot be read, and copies."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""What this project adds to the paper's method; each can be switched off (docs/paper.md lists them)."""
+"""What this project adds to the paper's method; each can be switched off (docs/concepts/method.md lists them)."""

@@ -3,7 +3,7 @@
 The paper reads enhanced voxel features back at the points and nothing else. But a view's depth error along its ray is
 to be seen in the frozen geometry itself: the voxels around a point hold the other views' points. ``SURFACE_CHANNELS``
 numbers a point tell it to the network; the centroids that they are taken from are ``CENTROID_CHANNELS`` more inputs of
-the voxels. ``model.coarse.surface_evidence`` switches both (docs/reproduce.md, Deviations from the paper).
+the voxels. ``model.coarse.surface_evidence`` switches both (docs/concepts/deviations.md).
 
 Where views agree already there is nothing to gain and much to spoil, and next to silhouettes this evidence says
 nothing: ``model.coarse.gate`` scales what the module changes by how much the views disagree (:func:`disagreement`).
@@ -113,7 +113,7 @@ def gate(disagreement: Tensor) -> Tensor:
     """Factor ``[B]`` on what is changed: next to nothing where views agree, so that clean depth stays clean.
 
     The power lets what is left on clean depth vanish faster than the disagreement that silhouettes, relief and sensors
-    leave there; its two constants were chosen on six rooms and two recordings with 0 to 5 % noise (docs/reproduce.md).
+    leave there; its two constants were chosen on six rooms and two recordings with 0 to 5 % noise (docs/results.md).
     """
     return (disagreement / GATE_OPEN).pow(GATE_POWER).clamp(max=GATE_MOST)
 

@@ -1,4 +1,4 @@
-"""Views that check each other's depth: our addition to the paper (docs/reproduce.md, Deviations from the paper)."""
+"""Views that check each other's depth: our addition to the paper (docs/concepts/deviations.md)."""
 
 from vg2gt.method.additions.visibility.check import Support, ViewCheck
 from vg2gt.method.additions.visibility.counts import ViewCounts, count_points, count_views

@@ -1,0 +1,91 @@
+"""Commands and examples of README and docs about scenes run as printed."""
+
+import re
+import runpy
+import shlex
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import vg2gt.cli
+from tests.commands import ROOT
+from vg2gt.cli import reconstruct as reconstruct_command
+from vg2gt.cli import render as render_command
+from vg2gt.cli.arguments import separate
+from vg2gt.io import read_cameras_json
+from vg2gt.io.video import has_pyav
+
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PARSERS = {"reconstruct": reconstruct_command.parser, "render": render_command.parser}
+
+
+@pytest.fixture
+def workplace(run_folder: Path, recording: Path, photos: Path, tmp_path: Path, monkeypatch) -> Path:
+    """A folder with a recording, photos and a training run, as the pages name them."""
+    (tmp_path / "recording").symlink_to(recording)
+    (tmp_path / "photos").symlink_to(photos)
+    (tmp_path / "outputs").mkdir()
+    (tmp_path / "outputs" / "quickstart").symlink_to(run_folder)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def _commands(path: Path, *names: str) -> list[list[str]]:
+    lines = re.findall(rf"^vg2gt (?:{'|'.join(names)}) [^#\n]*", path.read_text(), re.MULTILINE)
+    return [shlex.split(line) for line in lines]
+
+
+def _run(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", words)
+    vg2gt.cli.main()
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if _commands(page, *PARSERS)], ids=lambda page: page.name)
+def test_commands_are_understood(page: Path) -> None:
+    for words in _commands(page, *PARSERS):
+        given, _ = separate(words[2:])
+        PARSERS[words[1]]().parse_args(given)
+
+
+def test_a_recording_is_reconstructed_and_rendered(workplace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    commands = _commands(ROOT / "docs/guides/photos.md", "reconstruct")
+    (words,) = [words for words in commands if "recording/" in words]
+    _run(words, monkeypatch)
+    room = workplace / "outputs" / "room"
+    assert {p.name for p in room.iterdir()} == {"scene.ply", "cameras.json", "views.npz", "report.png", "report.json"}
+    for words in _commands(ROOT / "docs/guides/view.md", "render"):
+        if "video.mp4" not in words or has_pyav():
+            _run(words, monkeypatch)
+    assert (room / "rasterized" / "depth" / "008.npy").is_file()
+    assert (room / "video.gif").is_file()
+
+
+def test_python_of_the_readme(workplace: Path) -> None:
+    (example,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    found: dict[str, Any] = {}
+    exec(compile(example, "README.md", "exec"), found)
+    assert len(found["pictures"]) == len(read_cameras_json(workplace / "outputs" / "python" / "cameras.json"))
+    assert all(picture.shape[0] == 3 and 0 <= picture.min() <= picture.max() <= 1 for picture in found["pictures"])
+
+
+def test_python_of_the_reference(workplace: Path, capsys: pytest.CaptureFixture) -> None:
+    examples = re.findall(r"```python\n(.*?)```", (ROOT / "docs/reference/python.md").read_text(), re.DOTALL)
+    assert len(examples) == 2
+    for example in examples:
+        exec(compile(example, "python.md", "exec"), {})
+    assert capsys.readouterr().out == "008 (4, 3, 84, 112) (84, 112)\nTrue True\n(1, 1, 3, 48, 64) 1.95\n"
+    assert len(read_cameras_json(workplace / "outputs" / "python" / "cameras.json")) == 4
+
+
+def test_the_script_from_photos_to_a_scene(workplace: Path, monkeypatch, capsys: pytest.CaptureFixture) -> None:
+    """On posed images, so that no structure from motion is needed, with fewer steps."""
+    script = (ROOT / "examples" / "photos_to_scene.py").read_text()
+    short = workplace / "short.py"
+    short.write_text(script.replace("size=280", "size=112").replace("steps=100", "steps=2"))
+    assert short.read_text() != script
+    monkeypatch.setattr(sys, "argv", [str(short), "recording", "outputs/scene"])
+    runpy.run_path(str(short), run_name="__main__")
+    assert "Gaussians from 4 views" in capsys.readouterr().out
+    assert (workplace / "outputs" / "scene" / "scene.ply").is_file()
