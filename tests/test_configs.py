@@ -81,6 +81,22 @@ def test_every_option_composes_and_fits_its_constructor(tmp_path: Path, group: s
         assert {"every", "index_cache", "fit", "max_views"} <= set(config.data)
 
 
+def test_devices_and_several_loggers(tmp_path: Path) -> None:
+    """Item 32 of issue 47."""
+    assert build(composed(tmp_path, "trainer=cpu")).trainer.accelerator.__class__.__name__ == "CPUAccelerator"
+    with pytest.raises(ValueError, match=r"MPS has no float64.*trainer=cpu"):
+        build(composed(tmp_path, "trainer.accelerator=mps"))
+    trainer = build(composed(tmp_path, "logger=[csv,tensorboard]", "trainer=cpu")).trainer
+    assert [type(logger).__name__ for logger in trainer.loggers] == ["CSVLogger", "TensorBoardLogger"]
+
+
+@pytest.mark.parametrize("name", ["paper", "finetune"])
+def test_long_presets_evaluate_while_they_train(tmp_path: Path, name: str) -> None:
+    config = composed(tmp_path, f"experiment={name}")
+    assert config.trainer.max_steps / config.trainer.val_check_interval >= 10
+    assert config.callbacks.checkpoint.monitor == "eval/psnr"
+
+
 @pytest.mark.parametrize("name", group_options("refine"))
 def test_refinements_instantiate_and_the_default_is_the_codes(name: str) -> None:
     config = compose(None, f"+refine={name}").refine

@@ -9,7 +9,9 @@ import zipfile
 from pathlib import Path
 
 import pytest
+import yaml
 
+import vg2gt
 from tests.commands import ROOT
 from tests.training_helpers import small_config
 from vg2gt.training.loop import build
@@ -25,6 +27,8 @@ def test_installed_wheel_trains_from_an_empty_folder(tmp_path: Path, cache: Path
     assert "vg2gt/configs/train.yaml" in members
     assert "backends/oracle.py" in members
     assert "vg2gt/viewer/static/page.html" in members
+    if vg2gt.source() != "unknown":  # of a checkout
+        assert zipfile.ZipFile(wheel).read("vg2gt/SOURCE").decode().strip() == vg2gt.source()
     weights = [info for info in zipfile.ZipFile(wheel).infolist() if info.filename.endswith(".safetensors")]
     shipped = {"backends/sweep/weights/sweep.safetensors", "vg2gt/weights/sweep-tiny.safetensors"}
     assert {info.filename for info in weights} == shipped
@@ -82,3 +86,18 @@ def test_the_lowest_versions_do(tmp_path: Path) -> None:
             [str(python), *command], cwd=folder, env=environment, capture_output=True, text=True, check=False
         )
         assert ran.returncode == 0, (ran.stdout + ran.stderr)[-5000:]
+
+
+def test_container_and_hosted_ci_name_what_is_there() -> None:
+    """Item 34 of issue 47."""
+    project = (ROOT / "pyproject.toml").read_text()
+    container = (ROOT / "Dockerfile").read_text()
+    (extras,) = re.findall(r"/src\[(.+?)\]", container)
+    assert all(re.search(rf"^{extra} = \[", project, re.MULTILINE) for extra in extras.split(","))
+    (torch,) = re.findall(r'"(torch>.+?)"', container)
+    assert f'"{torch}"' in project
+    jobs = yaml.safe_load((ROOT / ".github" / "workflows" / "ci.yml").read_text())["jobs"]
+    assert {"run": ".ci/run"} in jobs["linux"]["steps"]
+    (tried,) = [step["run"] for step in jobs["others"]["steps"] if step.get("run", "").startswith("pytest")]
+    assert all((ROOT / folder).is_dir() for folder in tried.split()[1:])
+    assert os.access(ROOT / ".ci" / "run", os.X_OK)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+import subprocess
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -33,6 +35,18 @@ _HOMES = {
     "reconstruct": "vg2gt.reconstruction.pipeline",
     "reconstruct_with": "vg2gt.reconstruction.pipeline",
 }
+
+
+def source() -> str:
+    """Where this copy comes from: ``git describe`` of the checkout, or of that which the wheel was built from."""
+    stored = Path(__file__).with_name("SOURCE")
+    if stored.is_file():
+        return stored.read_text().strip()
+    command = ["git", "-C", str(Path(__file__).parents[1]), "describe", "--always", "--dirty", "--tags"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
 
 
 def __getattr__(name: str) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 from collections.abc import Sequence
 from contextlib import nullcontext
 from difflib import get_close_matches
@@ -9,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import hydra
+from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
@@ -17,6 +19,34 @@ from omegaconf.errors import OmegaConfBaseException
 OmegaConf.register_new_resolver("last_part", lambda path: Path(str(path)).name, replace=True)
 
 _PACKAGE = Path(__file__).resolve().parent
+ENTRY_POINTS = {"backend": "vg2gt.backends", "data": "vg2gt.datasets"}
+"""By group of configurations, the entry points by which installed packages add options to it."""
+
+
+def plugin_targets() -> dict[str, dict[str, str]]:
+    """Classes of installed packages by group and name; none is imported.
+
+    A package adds ``backend=NAME`` by an entry point ``NAME = "module:Class"`` in ``vg2gt.backends``, and ``data=NAME``
+    by one in ``vg2gt.datasets``, where the class is a :class:`~vg2gt.data.sources.files.FileSource`.
+    """
+    return {
+        group: {entry.name: entry.value.replace(":", ".") for entry in importlib.metadata.entry_points(group=points)}
+        for group, points in ENTRY_POINTS.items()
+    }
+
+
+def _register_plugins() -> None:
+    """Makes options of the plug-ins; a file of the same name in ``configs/`` goes before."""
+    store = ConfigStore.instance()
+    for name, target in plugin_targets()["backend"].items():
+        store.store(name, {"_target_": target}, group="backend")
+    for name, target in plugin_targets()["data"].items():
+        ends = {end: {"_target_": target} for end in ("train", "val")}
+        node = {"defaults": [{"shared@_here_": "files"}, "_self_"], **ends, "image_size": [224, 336]}
+        store.store(name, node, group="data")
+
+
+_register_plugins()
 
 
 def config_dir() -> str:
@@ -33,7 +63,8 @@ def config_dir() -> str:
 
 def group_options(group: str) -> list[str]:
     """The names that ``group=`` takes, sorted."""
-    return sorted(path.stem for path in Path(config_dir(), group).glob("*.yaml"))
+    plugins = plugin_targets().get(group, {})
+    return sorted({*plugins, *(path.stem for path in Path(config_dir(), group).glob("*.yaml"))})
 
 
 def compose(name: str | None, *overrides: str) -> DictConfig:

@@ -166,7 +166,7 @@ def test_an_interrupted_command_says_so(said: Said, monkeypatch: pytest.MonkeyPa
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("vg2gt.cli.render.read_gaussians", interrupted)
+    monkeypatch.setattr("vg2gt.io.read_gaussians", interrupted)
     monkeypatch.setattr("vg2gt.reconstruction.camera_files.read_cameras", lambda path: [path])
     assert said("render", "scene.ply", "--cameras", "c.json", "--out", "x") == (130, "interrupted\n")
 

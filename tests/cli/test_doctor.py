@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
+import vg2gt
 from vg2gt.cli import doctor
 
 
@@ -15,6 +16,7 @@ def test_doctor(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.
     monkeypatch.setattr(doctor, "BENCHMARK", {"cpu": (500, 1), "cuda": (500, 1)})
     doctor.main([])
     shown = capsys.readouterr().out
+    assert re.search(rf"vg2gt +{re.escape(vg2gt.__version__)} \({re.escape(vg2gt.source())}\), Python", shown)
     assert f"torch {torch.__version__}" in shown
     assert str(tmp_path) in shown
     assert re.search(r"renderer +auto is 'cpu'\n", shown)

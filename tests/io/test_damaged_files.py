@@ -31,6 +31,9 @@ CASES: dict[str, tuple[Callable[[Path], object], Callable[[Path], object]]] = {
     ),
     "ascii.ply": (ascii_points, io.read_point_ply),
     "scene.splat": (lambda path: io.write_splat(path, displayable(12)), io.read_splat),
+    "scene.spz": (lambda path: io.write_spz(path, scene(12, 1)), io.read_spz),
+    "scene.glb": (lambda path: io.write_gaussian_glb(path, scene(12, 1)), io.read_gaussian_glb),
+    "scene.compressed.ply": (lambda path: io.write_compressed_ply(path, scene(12, 1)), io.read_gaussian_ply),
     "transforms.json": (lambda path: io.write_transforms(path, random_transforms(False, 3)), io.read_transforms),
     "cameras.json": (lambda path: io.write_cameras_json(path, mixed()), io.read_cameras_json),
     **{

@@ -13,7 +13,7 @@ import torch
 from tests.io.gaussian_scenes import scene
 from vg2gt.geometry.spherical_harmonics import DC
 from vg2gt.io import FormatError, read_gaussian_ply, read_point_ply, write_gaussian_ply, write_point_ply
-from vg2gt.io.ply_container import read_vertices, vertices_content
+from vg2gt.io.ply_container import ply_content, read_vertices
 from vg2gt.types import Gaussians
 
 BEFORE_REST = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
@@ -234,7 +234,7 @@ def test_scales_of_nothing_are_raised_so_that_every_command_takes_them(tmp_path:
     """Item 14: other programs write -inf for a flat side; refinement refused it."""
     table = table_of(scene(5, 1))
     table["scale_2"] = -np.inf
-    (tmp_path / "scene.ply").write_bytes(vertices_content(table))
+    (tmp_path / "scene.ply").write_bytes(ply_content({"vertex": table}))
     read = read_gaussian_ply(tmp_path / "scene.ply")
     assert len(read) == 5
     assert (read.scales > 0).all()
@@ -248,7 +248,9 @@ def test_2dgs_is_read_as_flat(tmp_path: Path) -> None:
     before = scene(7, 1)
     table = table_of(before)
     names = [name for name in table.dtype.names or () if name != "scale_2"]
-    (tmp_path / "scene.ply").write_bytes(vertices_content(table[names].astype([(name, "<f4") for name in names])))
+    (tmp_path / "scene.ply").write_bytes(
+        ply_content({"vertex": table[names].astype([(name, "<f4") for name in names])})
+    )
     read = read_gaussian_ply(tmp_path / "scene.ply")
     torch.testing.assert_close(read.scales[:, :2], before.scales[:, :2])
     torch.testing.assert_close(read.scales[:, 2], 0.01 * before.scales[:, :2].min(1).values)
@@ -259,10 +261,10 @@ def test_big_endian_is_read(tmp_path: Path) -> None:
     """Item 22."""
     table = table_of(scene(7, 1))
     swapped = table.astype(table.dtype.newbyteorder(">"))
-    head = vertices_content(table[:0]).replace(b"little", b"big").replace(b"vertex 0", b"vertex 7")
+    head = ply_content({"vertex": table[:0]}).replace(b"little", b"big").replace(b"vertex 0", b"vertex 7")
     (tmp_path / "scene.ply").write_bytes(head + swapped.tobytes())
     little = tmp_path / "little.ply"
-    little.write_bytes(vertices_content(table))
+    little.write_bytes(ply_content({"vertex": table}))
     for name in ("means", "quats", "scales", "opacities", "sh"):
         one, other = (getattr(read_gaussian_ply(path), name) for path in (tmp_path / "scene.ply", little))
         torch.testing.assert_close(one, other, rtol=0, atol=0)

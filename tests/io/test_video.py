@@ -29,6 +29,14 @@ def test_gif_round_trip(tmp_path: Path) -> None:
         assert np.abs(frame.astype(int) - _frames()[number]).mean() < 6
 
 
+def test_the_same_frames_give_the_same_mp4(tmp_path: Path) -> None:
+    """Item 26 of issue 47: encoders with several threads gave other bytes in every second file."""
+    noise = np.random.default_rng(0).integers(0, 256, (160, 280, 3)).astype(np.uint8)
+    frames = [np.roll(noise, shift, 1) for shift in range(40)]
+    files = {write_video(tmp_path / f"{i}.mp4", frames).read_bytes() for i in range(4)}
+    assert len(files) == 1
+
+
 def test_mp4_round_trip(tmp_path: Path) -> None:
     pytest.importorskip("av")
     path = write_video(tmp_path / "12:30.mp4", _frames(size=(33, 48)), fps=12)  # no protocol called 12

@@ -302,6 +302,10 @@ def test_masks_of_photographs_without_cameras(folder: Path) -> None:
     Image.new("L", (112, 84), 0).save(folder / "masks" / f"{NAMES[1]}.png")
     views = load_views(find_pictures(folder / "images"), SIZE, Monitor())
     assert views.mask.mean((1, 2)).tolist() == [1, 0, 1, 1]
+    Image.new("RGB", (112, 84), 0).save(folder / "masks" / f"{NAMES[1]}.png")  # stored in colour: had no effect
+    views = load_views(find_pictures(folder / "images"), SIZE, Monitor())
+    assert views.mask is not None
+    assert views.mask.mean((1, 2)).tolist() == [1, 0, 1, 1]
     image = Image.new("RGBA", (112, 84), (255, 0, 255, 0))
     views = load_views(find_pictures([image]), SIZE, Monitor())
     assert not views.mask.any()

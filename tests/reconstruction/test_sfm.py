@@ -188,3 +188,35 @@ def test_images_of_one_size_and_focal_length_share_a_lens(photos: Path, tmp_path
         (84, 56, 0): 1,
         (1200, 1600, round(expected * 0.8, 1)): 2,
     }
+
+
+def test_masks_go_through(office: Path, tmp_path: Path) -> None:
+    """Item 7 of issue 47: no feature is taken where a mask says so, and the mask is that of the undistorted image."""
+    pycolmap = pytest.importorskip("pycolmap")
+    photos = tmp_path / "photos"
+    (photos / "masks").mkdir(parents=True)
+    for number, path in enumerate(sorted((office / "images").iterdir())[:6]):
+        shutil.copy(path, photos / path.name)
+        with Image.open(path) as image:
+            mask = np.full((image.height, image.width), 255, np.uint8)
+        mask[:, : mask.shape[1] // 5] = 0
+        if number:  # the first one has none
+            Image.fromarray(mask).save(photos / "masks" / f"{path.stem}.png")
+    before = sfm._key(find_pictures(photos))
+    pictures = sfm.find_cameras(find_pictures(photos), tmp_path / "sfm", Monitor())
+    model = pycolmap.Reconstruction(tmp_path / "sfm" / "sparse")
+    features = {image.name: min(point.xy[0] for point in image.points2D) for image in model.images.values()}
+    assert len(pictures) == len(features) > 3
+    for picture, (name, leftmost) in zip(pictures, sorted(features.items()), strict=True):
+        mask, edge = picture.read(picture.size).mask, picture.size[1] // 5
+        if name == "000000.jpg":
+            assert mask is None or mask[..., 8:-8, 8:-8].min() > 0.95
+            assert leftmost < edge / 2
+        else:
+            assert mask is not None
+            assert mask[..., : edge - 8].max() < 0.05
+            assert mask[..., 8:-8, edge + 8 : -8].min() > 0.95
+            assert leftmost > edge - 8
+    path = next((photos / "masks").iterdir())
+    Image.fromarray(255 - np.array(Image.open(path))).save(path)
+    assert sfm._key(find_pictures(photos)) != before

@@ -210,6 +210,8 @@ PIPES: dict[str, Callable[[Path], object]] = {
     "scan.sens": lambda path: scan_sens(path, "room"),
     "scene.ply": formats.read_gaussian_ply,
     "scene.splat": formats.read_splat,
+    "scene.spz": formats.read_spz,
+    "scene.glb": formats.read_gaussian_glb,
     "clip.mp4": lambda path: list(formats.read_video(path)),
     "clip.gif": lambda path: list(formats.read_video(path)),
     "cameras.json": formats.read_cameras_json,

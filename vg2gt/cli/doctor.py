@@ -42,7 +42,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def findings(timed: bool) -> Iterator[tuple[str, str]]:
     """What was looked at and what was found."""
-    yield "vg2gt", f"{vg2gt.__version__}, Python {platform.python_version()}, {platform.platform()}"
+    yield "vg2gt", f"{vg2gt.__version__} ({vg2gt.source()}), Python {platform.python_version()}, {platform.platform()}"
     yield "packages", ", ".join(f"{name} {_version(name)}" for name in NEEDED)
     yield from _optional()
     yield from _folders()

@@ -4,16 +4,11 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING
 
 from vg2gt.cli.arguments import add_common_flags, flag_parser, listing
 from vg2gt.cli.commands import COMMANDS
 from vg2gt.cli.errors import errors_in_one_line
 from vg2gt.reconstruction.output_names import FPS, MAPS
-
-if TYPE_CHECKING:
-    from vg2gt.types import Gaussians
 
 OUTPUTS = {**MAPS, "video.gif": "the colour of all views as an animation", "video.mp4": "the same as H.264"}
 DEFAULT = ("color.png",)
@@ -23,7 +18,7 @@ def parser() -> argparse.ArgumentParser:
     """The command's arguments."""
     arguments = flag_parser("render", COMMANDS["render"], listing(OUTPUTS))
     add = arguments.add_argument
-    add("scene", help="scene.ply or scene.splat")
+    add("scene", help="scene.ply, .spz, .splat or .glb")
     add(
         "--cameras",
         required=True,
@@ -48,6 +43,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Renders and writes."""
+    from vg2gt.io import read_gaussians
     from vg2gt.io.video import require_pyav
     from vg2gt.reconstruction.camera_files import read_cameras
     from vg2gt.reconstruction.camera_paths import interpolate
@@ -80,21 +76,3 @@ def run(options: argparse.Namespace) -> None:
     seconds = sum(cost["seconds"].values())
     print(f"{len(cameras)} views of {len(gaussians)} Gaussians: {seconds:.1f} s, peak {cost['peak_memory_mib']} MiB")
     print(f"written: {', '.join(str(folder / name) for name in outputs)}")
-
-
-def read_gaussians(path: str | Path) -> Gaussians:
-    """Reads a scene by its suffix.
-
-    Raises:
-        FileNotFoundError: if there is none.
-        ValueError: if it cannot be read or has another suffix.
-    """
-    from vg2gt.io import read_gaussian_ply, read_splat
-
-    path = Path(path)
-    readers = {".ply": read_gaussian_ply, ".splat": read_splat}
-    if path.suffix.lower() not in readers:
-        raise ValueError(f"{path}: expected a scene of Gaussians, {' or '.join(readers)}")
-    if not path.is_file():
-        raise FileNotFoundError(f"no scene at {path}")
-    return readers[path.suffix.lower()](path)

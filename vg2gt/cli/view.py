@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 from vg2gt.cli.arguments import flag_parser
 from vg2gt.cli.commands import COMMANDS
 from vg2gt.cli.errors import errors_in_one_line
-from vg2gt.cli.render import read_gaussians
 
 if TYPE_CHECKING:
     import numpy as np
@@ -50,7 +49,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = flag_parser("view", COMMANDS["view"])
     add = parser.add_argument
-    add("scene", type=Path, help="scene.ply or scene.splat")
+    add("scene", type=Path, help="scene.ply, .spz, .splat or .glb")
     add("--cameras", type=Path, help="cameras.json of the scene; the first one is the initial view")
     add("--images", type=Path, help="folder of the cameras' images; default: that of cameras.json, or images/ in it")
     add("--html", type=Path, help="write one self-contained page to this file instead of serving")
@@ -69,7 +68,7 @@ def _port(text: str) -> int:
 
 
 def _scene(arguments: argparse.Namespace) -> ViewerScene:
-    from vg2gt.io import read_cameras_json
+    from vg2gt.io import read_cameras_json, read_gaussians
     from vg2gt.viewer import ViewerScene
 
     gaussians = read_gaussians(arguments.scene)

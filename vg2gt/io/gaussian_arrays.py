@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +17,8 @@ log = logging.getLogger(__name__)
 MIN_SCALE = 1e-10  # smaller standard deviations overflow the renderers' inverse covariance
 OPACITY_MARGIN = 2.0**-24  # opacities are written between this and one minus this, so that their logits are finite
 _FLOAT_MAX = float(np.finfo(np.float32).max)
+_UPRIGHT = np.array([1.0, -1, -1])  # half a turn about x, of positions ...
+_UPRIGHT_SH = np.array([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1])  # ... and of spherical harmonics
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +55,46 @@ def to_arrays(gaussians: Gaussians) -> GaussianArrays:
     if arrays["sh"].ndim != 3 or arrays["sh"].shape[1] not in (1, 4, 9, 16):
         raise ValueError(f"sh must be [G, 1, 4, 9 or 16, 3], got {list(arrays['sh'].shape)}")
     return GaussianArrays(**arrays)
+
+
+def upright(arrays: GaussianArrays) -> GaussianArrays:
+    """Half a turn about x: from our axes (y down, z forward) to those of OpenGL (y up, z backward), or back."""
+    turned = arrays.sh * _UPRIGHT_SH[: arrays.sh.shape[1], None]
+    quats = arrays.quats * np.array([1.0, *_UPRIGHT])
+    return replace(arrays, means=arrays.means * _UPRIGHT, quats=quats, sh=turned)
+
+
+def spatial_order(means: NDArray[np.floating]) -> NDArray[np.int64]:
+    """An order ``[N]`` in which neighbours in space are neighbours in the file (Morton's), by ranks on each axis."""
+    cells = np.argsort(np.argsort(means, axis=0, kind="stable"), axis=0) * 1024 // max(len(means), 1)
+    code = np.zeros(len(means), np.int64)
+    for bit in range(10):
+        for axis in range(3):
+            code |= (cells[:, axis] >> bit & 1) << (3 * bit + axis)
+    return np.argsort(code, kind="stable")
+
+
+def smallest_three(quats: NDArray[np.floating]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Place ``[N]`` of the largest component of each quaternion, and the other three ``[N, 3]`` with that one positive.
+
+    Raises:
+        ValueError: if a quaternion is zero.
+    """
+    length = np.linalg.norm(quats, axis=-1, keepdims=True)
+    if (length == 0).any():
+        raise ValueError("quats must not be zero: a rotation has no direction then")
+    place = np.abs(quats).argmax(1)[:, None]
+    unit = quats / (length * np.sign(np.take_along_axis(quats, place, 1)))
+    return place[:, 0], unit[np.arange(4) != place].reshape(-1, 3)
+
+
+def from_smallest_three(place: NDArray[np.integer], others: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Unit quaternions ``[N, 4]``, the reverse of :func:`smallest_three`."""
+    largest = np.arange(4) == place[:, None]
+    quats = np.empty(largest.shape)
+    quats[~largest] = others.ravel()
+    quats[largest] = np.sqrt(np.maximum(1 - (others**2).sum(1), 0))
+    return quats
 
 
 def to_gaussians(path: Path, arrays: GaussianArrays) -> Gaussians:

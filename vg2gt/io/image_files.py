@@ -115,28 +115,30 @@ def read_color(
 
 
 def read_mask(
-    path: Path, scene: str, content: bytes | None = None, upright: bool = False
+    path: Path, scene: str, content: bytes | None = None, upright: bool = False, is_mask: bool = False
 ) -> NDArray[np.float32] | None:
-    """What counts of an image: its alpha, or the brightness of a mask image without one; ``[H, W]`` in [0, 1].
+    """What counts of an image: its alpha, or the brightness of a grey or mask image without; ``[H, W]`` in [0, 1].
 
     Args:
         path: the file.
         scene: the scene it belongs to, for messages; empty for a photograph of none.
         content: the encoded image where it is a part of the file; None: it is the file.
         upright: turn a photograph upright as its EXIF data says.
+        is_mask: the file is a mask, of which the brightness counts also if it is stored in colour.
 
     Returns:
-        None where everything counts, which for an image in colour means that it has no transparency.
+        None where everything counts, as in a photograph in colour that has no transparency.
 
     Raises:
         DataError: if the file is missing or damaged.
     """
     with _opened(path if content is None else io.BytesIO(content), path, scene) as image:
         grey = image.mode in ("1", "L", "I", "I;16") and "transparency" not in image.info
-        if not grey and not has_alpha(image):
+        if not grey and not has_alpha(image) and not is_mask:
             return None
         turn = _TURNS.get(_orientation(image)) if upright else None
-        plane = image.convert("L") if image.mode in ("1", "L") else image
+        grey = grey or not has_alpha(image)
+        plane = image if image.mode in ("I", "I;16") else image.convert("L") if grey else image
         plane = plane if grey else image.convert("RGBA").getchannel("A")
         values = np.array(plane if turn is None else plane.transpose(turn), np.float32)
     largest = 255 if values.max(initial=0) <= 255 else 65535

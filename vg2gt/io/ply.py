@@ -31,7 +31,7 @@ from vg2gt.io.compressed_ply import unpacked
 from vg2gt.io.errors import FormatError
 from vg2gt.io.files import write_bytes
 from vg2gt.io.gaussian_arrays import OPACITY_MARGIN, GaussianArrays, to_arrays, to_gaussians
-from vg2gt.io.ply_container import read_comments, read_elements, read_vertices, vertices_content
+from vg2gt.io.ply_container import ply_content, read_comments, read_elements, read_vertices
 from vg2gt.types import Gaussians
 
 POSITION = ("x", "y", "z")
@@ -93,7 +93,7 @@ def write_gaussian_ply(path: str | Path, gaussians: Gaussians, *, full_sh: bool 
     comments = []
     if gaussians.background is not None:
         comments = ["background " + " ".join(f"{value:.6g}" for value in gaussians.background[0].tolist())]
-    return write_bytes(path, vertices_content(table, comments))
+    return write_bytes(path, ply_content({"vertex": table}, comments))
 
 
 def read_gaussian_ply(path: str | Path) -> Gaussians:
@@ -180,7 +180,7 @@ def write_point_ply(path: str | Path, positions: ArrayLike, colors: ArrayLike | 
     table = np.empty(len(xyz), names)
     for (name, _), column in zip(names, columns, strict=True):
         table[name] = column
-    return write_bytes(path, vertices_content(table))
+    return write_bytes(path, ply_content({"vertex": table}))
 
 
 def read_point_ply(path: str | Path) -> ColoredPoints:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,7 +22,7 @@ _TYPES = {
     **dict.fromkeys(("float", "float32"), "<f4"),
     **dict.fromkeys(("double", "float64"), "<f8"),
 }
-_NAMES = {np.dtype("<f4"): "float", np.dtype("<f8"): "double", np.dtype("u1"): "uchar"}
+_NAMES = {np.dtype("<f4"): "float", np.dtype("<f8"): "double", np.dtype("u1"): "uchar", np.dtype("<u4"): "uint"}
 _HEADER_LIMIT = 1 << 16
 _END = b"end_header"
 _ENCODINGS = ("binary_little_endian", "binary_big_endian", "ascii")
@@ -36,13 +36,13 @@ class _Element:
     has_list: bool
 
 
-def vertices_content(table: NDArray, comments: Sequence[str] = ()) -> bytes:
-    """A binary little-endian file with one ``vertex`` element: a structured array, its fields in their order."""
-    names = table.dtype.names or ()
+def ply_content(elements: Mapping[str, NDArray], comments: Sequence[str] = ()) -> bytes:
+    """A binary little-endian file of structured arrays, elements and their fields in their order."""
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]
-    lines += [f"element vertex {len(table)}"]
-    lines += [f"property {_NAMES[table.dtype[name]]} {name}" for name in names]
-    return "\n".join([*lines, "end_header", ""]).encode() + table.tobytes()
+    for element, table in elements.items():
+        lines += [f"element {element} {len(table)}"]
+        lines += [f"property {_NAMES[table.dtype[name]]} {name}" for name in table.dtype.names or ()]
+    return "\n".join([*lines, "end_header", ""]).encode() + b"".join(table.tobytes() for table in elements.values())
 
 
 def read_vertices(path: Path) -> NDArray:

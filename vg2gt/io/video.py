@@ -258,6 +258,7 @@ def _write_mp4(path: Path, frames: Sequence[NDArray[np.uint8]], fps: float) -> P
             with av.open(f"file:{temporary}", "w", format="mp4", options={"movflags": "+faststart"}) as container:
                 stream = container.add_stream("libx264", Fraction(f"{fps:g}"), {"crf": _QUALITY})
                 stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+                stream.codec_context.thread_count = 1  # with more, the same frames give other bytes each time
                 for pixels in frames:
                     even = np.ascontiguousarray(pixels[:height, :width])
                     container.mux(stream.encode(av.VideoFrame.from_ndarray(even, "rgb24")))

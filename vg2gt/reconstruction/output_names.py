@@ -13,7 +13,10 @@ MAPS = {
 
 OUTPUTS = {
     "scene.ply": "the Gaussians, as 3D Gaussian Splatting writes them",
-    "scene.splat": "the Gaussians, 32 bytes each, for web viewers",
+    "scene.splat": "the same, 32 bytes each, for web viewers; no colour that depends on the view",
+    "scene.spz": "the same, about 16 bytes each (Niantic's SPZ, version 3)",
+    "scene.compressed.ply": "the same, about 16 bytes each, as SuperSplat compresses them",
+    "scene.glb": "the same as glTF, KHR_gaussian_splatting",
     "cameras.json": "the cameras of the views",
     "points.ply": "coloured points of the decoded depth",
     "points.glb": "the same points and the cameras, for any 3D viewer",

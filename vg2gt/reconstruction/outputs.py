@@ -21,11 +21,10 @@ from vg2gt.io import (
     fuse_depth,
     write_cameras_json,
     write_colmap,
-    write_gaussian_ply,
+    write_gaussians,
     write_glb,
     write_mesh,
     write_point_ply,
-    write_splat,
     write_transforms,
 )
 from vg2gt.io.files import write_bytes, write_json
@@ -276,8 +275,10 @@ def _target(output: str) -> str:
 
 
 _WRITERS: dict[str, Callable[[Scene, Path], Any]] = {
-    "scene.ply": lambda scene, path: write_gaussian_ply(path, scene.gaussians),
-    "scene.splat": lambda scene, path: write_splat(path, scene.gaussians),
+    **dict.fromkeys(
+        (name for name in OUTPUTS if name.startswith("scene.")),
+        lambda scene, path: write_gaussians(path, scene.gaussians),
+    ),
     "cameras.json": lambda scene, path: write_cameras_json(path, scene.named_cameras()),
     "points.ply": _points_ply,
     "views.npz": _views,

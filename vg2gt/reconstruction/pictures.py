@@ -189,13 +189,18 @@ def frame_of(pixels: NDArray[np.uint8], mask: NDArray[np.float32] | None = None)
     return Frames(images.contiguous(), torch.zeros_like(images[:, 0]), poses, intrinsics, mask=counts)
 
 
+def mask_file(path: Path) -> Path | None:
+    """The mask of a photograph in ``masks/`` in its folder or one folder up."""
+    files = [mask_of(place / MASKS, path.name) for place in (path.parent, path.parent.parent)]
+    return next((file for file in files if file is not None), None)
+
+
 def mask_for(path: Path, upright: bool = True, content: bytes | None = None) -> NDArray[np.float32] | None:
     """How much each pixel of a photograph counts: its alpha, and its mask in ``masks/`` there or one folder up."""
     parts = [read_mask(path, "", content=content, upright=upright)]
-    files = [mask_of(place / MASKS, path.name) for place in (path.parent, path.parent.parent)]
-    file = next((file for file in files if file is not None), None)
+    file = mask_file(path)
     if content is None and file is not None:
-        parts.append(read_mask(file, "", upright=upright))
+        parts.append(read_mask(file, "", upright=upright, is_mask=True))
     return joined_masks(parts)
 
 

@@ -3,10 +3,10 @@
 Of up to 60 photographs every pair is compared; of more, likely pairs are (:mod:`vg2gt.reconstruction.sfm_pairs`), with
 fewer features.
 
-What is found is kept as a folder that every command reads as a COLMAP recording: undistorted ``images/``, a model of
-PINHOLE cameras in ``sparse/``, and ``sfm.json``, which says of which pictures it was made. COLMAP's own lens model with
-one radial coefficient is fitted and the images are undistorted with it: a pinhole fitted to a distorted lens errs in
-its focal length.
+What is found is kept as a folder that every command reads as a COLMAP recording: undistorted ``images/``, ``masks/``
+if there are masks, a model of PINHOLE cameras in ``sparse/``, and ``sfm.json``, which says of which pictures it was
+made. COLMAP's own lens model with one radial coefficient is fitted and the images are undistorted with it: a pinhole
+fitted to a distorted lens errs in its focal length.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from vg2gt.io.json_checks import load_json
 from vg2gt.reconstruction.given_cameras import LAYOUTS, recording_pictures
 from vg2gt.reconstruction.maps import whole_folder
 from vg2gt.reconstruction.monitor import Monitor
-from vg2gt.reconstruction.pictures import SFM_SOURCE, UNKNOWN_LENS, Picture
+from vg2gt.reconstruction.pictures import SFM_SOURCE, UNKNOWN_LENS, Picture, mask_file
 from vg2gt.reconstruction.sfm_models import FEWEST_POINTS, map_cameras, other_parts, placed_images, sound_models
 from vg2gt.reconstruction.sfm_pairs import ALL_PAIRS, likely_pairs
 from vg2gt.reconstruction.sound import digest, name_damaged, without_copies
@@ -57,6 +57,7 @@ _MODEL = "SIMPLE_RADIAL"
 _QUALITY = 95  # of the kept JPEGs
 _AT_ONCE = 4  # images whose features are looked for at the same time, which bounds the memory
 _STATE = "sfm.json"
+_MASKS = "masks"
 
 ADVICE = (
     "take more photographs, 20 or more, walking around the scene rather than turning on the spot, each showing two "
@@ -134,7 +135,12 @@ def _tell_left_out(state: dict[str, Any], count: int) -> None:
 def _key(pictures: Sequence[Picture]) -> str:
     """Changes with the content, the names or the order of the pictures, and with how they are worked on."""
     settings = [FORMAT, IMAGE_SIDE, *_feature_settings(len(pictures)), SEED, _MODEL, _QUALITY]
-    contents = [[picture.name, picture.size, digest(picture)] for picture in pictures]
+    masks = [None if picture.path is None else mask_file(picture.path) for picture in pictures]
+    hashes = [None if mask is None else hashlib.sha256(mask.read_bytes()).hexdigest() for mask in masks]
+    contents = [
+        [picture.name, picture.size, digest(picture), *([mask] if mask else [])]
+        for picture, mask in zip(pictures, hashes, strict=True)
+    ]
     return hashlib.sha256(json.dumps([settings, contents]).encode()).hexdigest()
 
 
@@ -188,13 +194,19 @@ def _solve(pictures: Sequence[Picture], folder: Path, key: str, monitor: Monitor
         with whole_folder(folder) as staged:
             for part in ("images", "sparse"):
                 shutil.move(work / "undistorted" / part, staged / part)
+            if (work / _MASKS).exists():
+                shutil.move(work / "undistorted-masks" / "images", staged / "masks")
             write_json(staged / _STATE, state)
     return state
 
 
 def _stage(pictures: Sequence[Picture], work: Path, advance: Any) -> dict[tuple[int, int, float], list[str]]:
-    """Writes the pictures as numbered upright JPEGs; their names by (height, width, focal length or 0)."""
+    """Writes the pictures as numbered upright JPEGs; their names by (height, width, focal length or 0).
+
+    If one has a mask, masks of all are written, in ``masks/`` as COLMAP wants them and in ``mask-images/``.
+    """
     lenses: dict[tuple[int, int, float], list[str]] = {}
+    masks: dict[str, NDArray[np.uint8]] = {}
     (work / "images").mkdir()
     for number, picture in enumerate(pictures):
         shrink = min(1.0, IMAGE_SIDE / max(picture.size))
@@ -209,7 +221,15 @@ def _stage(pictures: Sequence[Picture], work: Path, advance: Any) -> dict[tuple[
         height, width = pixels.shape[:2]
         focal = 0.0 if picture.focal is None else round(picture.focal * width / picture.size[1], 1)
         lenses.setdefault((height, width, focal), []).append(name)
+        if frames.mask is not None:
+            masks[name] = to_bytes(frames.mask[0]).numpy()
         advance()
+    for (height, width, _), names in lenses.items():
+        for name in names if masks else []:
+            mask = Image.fromarray(masks.get(name, np.full((height, width), 255, np.uint8)))
+            for file in (work / _MASKS / f"{name}.png", work / "mask-images" / name):
+                file.parent.mkdir(exist_ok=True)
+                mask.save(file, quality=_QUALITY)
     return lenses
 
 
@@ -237,11 +257,19 @@ def _find_features(
     options.use_gpu = False
     options.num_threads = _threads()
     options.max_image_size, options.sift.max_num_features = _feature_settings(len(names))
+    masked = pycolmap.ImageReaderOptions()
+    if (work / _MASKS).exists():
+        masked.mask_path = work / _MASKS
     with monitor.stage("find features", len(names)) as advance:
         for start in range(0, len(names), _AT_ONCE):
             some = list(names[start : start + _AT_ONCE])
             pycolmap.extract_features(
-                database, images, image_names=some, extraction_options=options, device=pycolmap.Device.cpu
+                database,
+                images,
+                image_names=some,
+                reader_options=masked,
+                extraction_options=options,
+                device=pycolmap.Device.cpu,
             )
             for _ in some:
                 advance()
@@ -301,9 +329,11 @@ def _write(model: Reconstruction, work: Path) -> None:
     model.transform(pycolmap.Sim3d(1 / float(np.median(depths)), pycolmap.Rotation3d(), np.zeros(3)))
     (work / "model").mkdir()
     model.write(work / "model")
-    pycolmap.undistort_images(
-        work / "undistorted", work / "model", work / "images", jpeg_quality=_QUALITY, num_threads=_threads()
-    )
+    for source, target in (("images", "undistorted"), ("mask-images", "undistorted-masks")):
+        if (work / source).exists():
+            pycolmap.undistort_images(
+                work / target, work / "model", work / source, jpeg_quality=_QUALITY, num_threads=_threads()
+            )
 
 
 def _threads() -> int:

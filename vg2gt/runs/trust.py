@@ -2,8 +2,9 @@
 
 Hydra calls whatever a configuration names. The project's own YAML and the command line are the user's word; the
 ``config.yaml`` in a run's folder is not: a run may be downloaded together with its checkpoint. From such a file only
-the project's own networks, backends, renderers and datasets are built. A package of one's own is named in the
-environment: ``VG2GT_TRUST=my_pkg,other_pkg``.
+the project's own networks, backends, renderers and datasets are built, and the classes that installed packages declare
+(:func:`vg2gt.config.plugin_targets`). A package of one's own is named in the environment:
+``VG2GT_TRUST=my_pkg,other_pkg``.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
+from vg2gt.config import plugin_targets
 from vg2gt.data.base import SceneSource
 from vg2gt.io.files import regular
 from vg2gt.method.additions.visibility import ViewCheck
@@ -73,7 +75,10 @@ def check_targets(config: Any, source: str | Path) -> None:
     """
     trusted = [name.strip() for name in os.environ.get(ENVIRONMENT, "").split(",") if name.strip()]
     plain = OmegaConf.to_container(config, resolve=False) if OmegaConf.is_config(config) else config
+    declared = {target for targets in plugin_targets().values() for target in targets.values()}
     for key, target in _targets(plain, ""):
+        if isinstance(target, str) and target in declared:
+            continue
         said = f"{source}.{key}_target_ is {str(target)[:100]!r}"
         package = str(target).partition(".")[0]
         if not isinstance(target, str) or package not in (*OWN, *trusted):

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import lightning
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
+from lightning.pytorch.trainer.states import TrainerFn
 
 from vg2gt.runs.checkpoints import by_age, read_checkpoint, write_checkpoint
+
+BEST = "best.ckpt"
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
@@ -34,9 +37,21 @@ class NewestCheckpoints(ModelCheckpoint):
         dirpath: the folder.
         every_n_train_steps: a checkpoint every this many steps.
         save_top_k: how many are kept; -1: all.
+        monitor: metric of the evaluations while training, such as ``eval/psnr``, whose best state is kept as
+            ``best.ckpt``; None: no such file.
+        mode: ``max`` or ``min``, whichever is better.
     """
 
-    def __init__(self, dirpath: str, every_n_train_steps: int = 100, save_top_k: int = 3) -> None:
+    def __init__(
+        self,
+        dirpath: str,
+        every_n_train_steps: int = 100,
+        save_top_k: int = 3,
+        monitor: str | None = None,
+        mode: Literal["max", "min"] = "max",
+    ) -> None:
+        if mode not in ("max", "min"):
+            raise ValueError(f"callbacks.checkpoint.mode is {mode!r}; choose max or min")
         if every_n_train_steps < 1 or (save_top_k < 1 and save_top_k != -1):
             raise ValueError(
                 f"every_n_train_steps={every_n_train_steps} must be at least 1, save_top_k={save_top_k} at least 1, or "
@@ -51,6 +66,8 @@ class NewestCheckpoints(ModelCheckpoint):
             enable_version_counter=False,
         )
         self.kept = save_top_k
+        self.watched, self.sign = monitor, 1 if mode == "max" else -1
+        self.best: float | None = None
 
     def on_train_batch_end(self, trainer: lightning.Trainer, *args: Any, **more: Any) -> None:
         """Saves when it is the step's turn, then deletes all but the newest."""
@@ -58,3 +75,29 @@ class NewestCheckpoints(ModelCheckpoint):
         if trainer.is_global_zero and self.kept > 0 and not getattr(trainer, "fast_dev_run", False):
             for path in by_age(Path(str(self.dirpath)))[self.kept :]:
                 path.unlink(missing_ok=True)
+
+    def on_validation_end(self, trainer: lightning.Trainer, *args: Any) -> None:
+        """Keeps the best state by the watched metric of an evaluation while training.
+
+        Raises:
+            ValueError: if there is no such metric, naming those there are.
+        """
+        super().on_validation_end(trainer, *args)
+        if self.watched is None or trainer.state.fn != TrainerFn.FITTING or getattr(trainer, "fast_dev_run", False):
+            return
+        if self.watched not in trainer.callback_metrics:
+            known = ", ".join(sorted(name for name in trainer.callback_metrics if name.startswith("eval/")))
+            raise ValueError(f"callbacks.checkpoint.monitor={self.watched}: evaluations measure {known}")
+        value = float(trainer.callback_metrics[self.watched])
+        if value == value and (self.best is None or self.sign * (value - self.best) > 0):
+            self.best = value
+            trainer.save_checkpoint(Path(str(self.dirpath)) / BEST)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Lightning's, and the best value."""
+        return {**super().state_dict(), "best": self.best}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """As :meth:`state_dict` gave it; checkpoints of old have no best value."""
+        self.best = state_dict.pop("best", None)
+        super().load_state_dict(state_dict)

@@ -132,7 +132,13 @@ def _callbacks(config: DictConfig) -> list[lightning.Callback]:
 
 
 def _accelerator(asked: str) -> str:
-    """``auto`` means CUDA or the CPU: Apple's MPS has no float64, which the geometry needs."""
+    """``auto`` means CUDA or the CPU.
+
+    Raises:
+        ValueError: for Apple's MPS.
+    """
+    if asked == "mps":
+        raise ValueError("trainer.accelerator=mps: MPS has no float64, which the geometry needs; use trainer=cpu")
     return asked if asked != "auto" else "gpu" if torch.cuda.is_available() else "cpu"
 
 

@@ -20,6 +20,7 @@ from vg2gt.runs.checkpoints import (
 )
 from vg2gt.runs.load import refuse_other_tokens
 from vg2gt.runs.trust import read_run_config
+from vg2gt.training.checkpointing import BEST
 from vg2gt.training.module import VG2GTModule
 
 OPTIMIZER = "optimizer._target_"
@@ -99,6 +100,7 @@ def prepare_folder(config: DictConfig, checkpoint: Path | None) -> None:
     elif old:
         for path in old:
             path.unlink()
+        (folder / "checkpoints" / BEST).unlink(missing_ok=True)
         shutil.rmtree(folder / "logs", ignore_errors=True)
         (folder / "metrics.json").unlink(missing_ok=True)
     write_text(folder / "config.yaml", OmegaConf.to_yaml(config, resolve=True))

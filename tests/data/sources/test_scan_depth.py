@@ -10,7 +10,7 @@ from vg2gt.data import DataError, Frames
 from vg2gt.data.sources import DTU, TanksAndTemples
 from vg2gt.data.sources.scan_depth import ScanDepth, render_points
 from vg2gt.geometry.cameras import unproject
-from vg2gt.io.ply_container import vertices_content
+from vg2gt.io.ply_container import ply_content
 from vg2gt.types import Cameras
 
 from .layout_dtu import write_test
@@ -44,7 +44,7 @@ def _ply(points: np.ndarray) -> bytes:
     table = np.zeros(len(points), [(axis, "<f4") for axis in "xyz"])
     for i, axis in enumerate("xyz"):
         table[axis] = points[:, i]
-    return vertices_content(table)
+    return ply_content({"vertex": table})
 
 
 def test_a_slanted_wall_within_the_sampling():

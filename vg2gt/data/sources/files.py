@@ -160,7 +160,7 @@ class FileSource(SceneSource):
         path, upright = index.mask(row), index.upright(row)
         parts = [read_mask(index.color[row], index.name, upright=upright)]
         if path is not None:
-            parts.append(read_mask(path, index.name, upright=upright))
+            parts.append(read_mask(path, index.name, upright=upright, is_mask=True))
         mask = joined_masks(parts)
         if mask is None or not (lens := index.lens(row)):
             return mask

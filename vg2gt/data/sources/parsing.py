@@ -123,12 +123,17 @@ def named_file(folder: Path, name: str, where: str) -> Path:
 def existing_image(path: Path) -> Path | None:
     """A named image, or the one in its folder that differs in its ending or in upper and lower case; None: none.
 
-    Models and lists often name files as they were before somebody converted them.
+    Models and lists often name files as they were before somebody converted them. Where the folder is missing, the
+    largest reduced one is taken (``images_4`` of ``images_4`` and ``images_8``, as DL3DV comes).
     """
     if path.is_file():
         return path
-    if not path.parent.is_dir():
-        return None
+    folder = path.parent
+    if not folder.is_dir():
+        known = sorted(folder.parent.iterdir()) if folder.parent.is_dir() else []
+        reduced = [each for each in known if re.fullmatch(rf"{re.escape(folder.name)}_\d+", each.name)]
+        largest = min(reduced, key=lambda each: int(each.name.rpartition("_")[2]), default=None)
+        return None if largest is None else existing_image(largest / path.name)
     files = _images_by_name(path.parent, path.parent.stat().st_mtime_ns)
     name, stem = path.name.lower(), path.stem.lower()
     candidates = (name, *(name + suffix for suffix in IMAGE_SUFFIXES), *(stem + suffix for suffix in IMAGE_SUFFIXES))

@@ -135,6 +135,8 @@ def index_path(name: str) -> Path:
 def read_index(name: str | None) -> Mapping[str, Mapping[str, Any]]:
     """The scenes of an index: scene -> number of views -> ``context`` and ``target`` frame ids; empty for None.
 
+    Indices of pixelSplat and its successors (scene -> ``context``, ``target``, or null) are read too.
+
     Raises:
         FileNotFoundError: if there is no such index, naming those there are.
         ValueError: if the file is not an index.
@@ -150,6 +152,8 @@ def read_index(name: str | None) -> Mapping[str, Mapping[str, Any]]:
         )
     content = read_json(path)
     scenes = content.get("scenes") if isinstance(content, dict) else None
+    if scenes is None and isinstance(content, dict) and any(_is_entry(entry) for entry in content.values()):
+        scenes = {scene: {str(len(v["context"])): v} for scene, v in content.items() if _is_entry(v)}
     if not isinstance(scenes, dict) or not all(_is_entry(v) for views in scenes.values() for v in views.values()):
         raise ValueError(f"{path} is not an index of evaluation views (scenes -> number -> context, target)")
     return scenes

@@ -1,0 +1,37 @@
+"""A backend and a data set in a package of their own (docs/add-a-backend.md, docs/add-a-dataset.md)."""
+
+from torch.nn import functional as F
+
+from backends.base import Backend
+from vg2gt.data import RGBDFolder
+from vg2gt.types import Geometry, Tokens
+
+
+class BrightIsNear(Backend):
+    """Depth is 2 minus brightness: a token holds the colours of a patch; cameras come from the data."""
+
+    def __init__(self, patch_size: int = 14) -> None:
+        super().__init__("bright", patch_size, (3 * patch_size**2,), licence="Apache-2.0", needs_hints=True)
+        self.freeze()
+
+    def encode(self, images, hints=None):
+        """Colours of patches."""
+        hints = self.require_hints(images, hints, "cameras")
+        patch = F.pixel_unshuffle(images.flatten(0, 1), self.patch_size).flatten(2).mT.unflatten(0, images.shape[:2])
+        size = (images.shape[-2], images.shape[-1])
+        grid = (size[0] // self.patch_size, size[1] // self.patch_size)
+        return Tokens((patch,), patch.mean(2), grid, size, {"cameras": hints.cameras})
+
+    def decode(self, tokens):
+        """Depth of the colours."""
+        cells = tokens.patch[0].flatten(0, 1).mT.unflatten(-1, tokens.grid)
+        depth = 2 - F.pixel_shuffle(cells, self.patch_size).mean(1).unflatten(0, tokens.camera.shape[:2])
+        return Geometry(depth, depth * 0 + 1, tokens.state["cameras"], depth.new_ones(len(depth)))
+
+
+class Centimetres(RGBDFolder):
+    """RGB-D folders whose depth images count centimetres, not millimetres."""
+
+    def read_depth(self, index, row, size):
+        """Metres."""
+        return super().read_depth(index, row, size) * 10

@@ -1,0 +1,123 @@
+"""Chunks of pixelSplat (RealEstate10K, ACID), its evaluation indices, and DL3DV's transforms.json; as documented."""
+
+import io
+import json
+import pickle
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from examples.data_sets.re10k import PixelSplatChunks
+from tests.data.sources.layouts import camera_to_world, pixels, room, save
+from vg2gt.data import DataError, Frames
+from vg2gt.data.sources import Nerfstudio
+from vg2gt.data.views.drawn import ViewSelection
+from vg2gt.geometry.cameras import invert_rigid
+
+
+def write_chunks(root: Path, frames: Frames, split: str = "test") -> None:
+    """One chunk of two scenes."""
+    height, width = frames.depth.shape[-2:]
+    cameras = torch.zeros(len(frames.images), 18)
+    k = frames.intrinsics
+    cameras[:, 0], cameras[:, 1] = k[:, 0, 0] / width, k[:, 1, 1] / height
+    cameras[:, 2], cameras[:, 3] = (k[:, 0, 2] + 0.5) / width, (k[:, 1, 2] + 0.5) / height
+    cameras[:, 6:] = frames.world_to_camera[:, :3].flatten(1)
+    images = []
+    for image in pixels(frames):
+        buffer = io.BytesIO()
+        Image.fromarray(image).save(buffer, "JPEG", quality=95, subsampling=0)
+        images.append(torch.frombuffer(bytearray(buffer.getvalue()), dtype=torch.uint8))
+    scenes = [
+        {
+            "url": "https://video",
+            "timestamps": torch.arange(len(images)),
+            "key": key,
+            "cameras": cameras,
+            "images": images,
+        }
+        for key in ("0a1b", "2c3d")
+    ]
+    (root / split).mkdir(parents=True)
+    torch.save(scenes, root / split / "000000.torch")
+    (root / split / "index.json").write_text(json.dumps({scene["key"]: "000000.torch" for scene in scenes}))
+
+
+def test_chunks_are_read(tmp_path: Path) -> None:
+    frames = room()
+    write_chunks(tmp_path, frames)
+    source = PixelSplatChunks(str(tmp_path), "test", holdout=3)
+    assert source.scenes == ("0a1b", "2c3d")
+    assert list(source.frames("0a1b")) == list(range(6))
+    assert source.held_out("2c3d") == [0, 3]
+    assert not source.has_depth
+    read = pickle.loads(pickle.dumps(source)).load("2c3d", [4, 1])
+    torch.testing.assert_close(read.world_to_camera, frames.world_to_camera[[4, 1]])
+    torch.testing.assert_close(read.intrinsics, frames.intrinsics[[4, 1]])
+    assert (read.images - frames.images[[4, 1]]).abs().mean() < 0.02
+    assert list(PixelSplatChunks(str(tmp_path), "test", ["2c3d"], every=4).frames("2c3d")) == [0, 4]
+
+
+def test_what_is_wrong_is_named(tmp_path: Path) -> None:
+    write_chunks(tmp_path, room(2))
+    with pytest.raises(DataError, match=r"no index\.json in .*train"):
+        PixelSplatChunks(str(tmp_path), "train")
+    with pytest.raises(DataError, match="no scene 9z"):
+        PixelSplatChunks(str(tmp_path), "test", ["9z"])
+    with pytest.raises(DataError, match=r"data\.root"):
+        PixelSplatChunks(None, "test")
+
+    class Evil:
+        def __reduce__(self):
+            return (Path(tmp_path / "ran").touch, ())
+
+    for content in (b"no chunk", pickle.dumps([Evil()])):
+        shutil.rmtree(tmp_path / "bad", ignore_errors=True)
+        shutil.copytree(tmp_path / "test", tmp_path / "bad")
+        (tmp_path / "bad" / "000000.torch").write_bytes(content)
+        with pytest.raises(DataError, match=r"000000\.torch is no chunk"):
+            PixelSplatChunks(str(tmp_path), "bad").frames("0a1b")
+    torch.save([Evil()], tmp_path / "bad" / "000001.torch")
+    (tmp_path / "bad" / "index.json").write_text('{"0a1b": "000001.torch"}')
+    with pytest.raises(DataError, match=r"000001\.torch is no chunk"):
+        PixelSplatChunks(str(tmp_path), "bad").frames("0a1b")
+    assert not (tmp_path / "ran").exists()
+
+
+def test_their_evaluation_index_chooses_the_views(tmp_path: Path) -> None:
+    write_chunks(tmp_path, room())
+    index = tmp_path / "evaluation_index_re10k.json"
+    index.write_text(json.dumps({"0a1b": {"context": [0, 5], "target": [1, 2, 4], "overlap": "large"}, "2c3d": None}))
+    source = PixelSplatChunks(str(tmp_path), "test")
+    (views,) = ViewSelection(str(index)).choose(source, ["0a1b"], 2)
+    assert (views.context, views.target) == ((0, 5), (1, 2, 4))
+
+
+def test_dl3dv_is_read_from_its_reduced_images(tmp_path: Path) -> None:
+    """``HASH/{transforms.json,images_4/}``: names and intrinsics are of the full images, which few people download."""
+    frames = room()
+    height, width = frames.depth.shape[-2:]
+    scene = tmp_path / "1K" / ("0" * 64)
+    fx, fy = (4 * float(frames.intrinsics[0, i, i]) for i in (0, 1))
+    cx, cy = (4 * (float(frames.intrinsics[0, i, 2]) + 0.5) for i in (0, 1))
+    content = {"w": 4 * width, "h": 4 * height, "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "camera_model": "OPENCV"}
+    content["frames"] = []
+    for number, (image, pose) in enumerate(zip(pixels(frames), camera_to_world(frames), strict=True)):
+        name = f"frame_{number + 1:05d}.png"
+        save(scene / "images_4" / name, image)
+        opengl = pose @ np.diag([1.0, -1, -1, 1])
+        content["frames"].append({"file_path": f"images/{name}", "transform_matrix": opengl.tolist()})
+    (scene / "transforms.json").write_text(json.dumps(content))
+    source = Nerfstudio(str(tmp_path / "1K"), holdout=None)
+    (name,) = source.scenes
+    read = source.load(name, source.frames(name))
+    torch.testing.assert_close(read.intrinsics, frames.intrinsics, rtol=0, atol=1e-3)
+    relative = read.world_to_camera @ invert_rigid(read.world_to_camera[:1])
+    torch.testing.assert_close(
+        relative, frames.world_to_camera @ invert_rigid(frames.world_to_camera[:1]), rtol=0, atol=1e-4
+    )
+    assert torch.equal(read.images, frames.images) or (read.images - frames.images).abs().max() < 1 / 250

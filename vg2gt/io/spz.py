@@ -1,0 +1,144 @@
+"""``.spz``, Niantic's compressed Gaussians: a gzip stream of columns, about a tenth of a PLY.
+
+A header of 16 bytes (magic, version, number of Gaussians, degree, fractional bits, flags), then all positions (24-bit
+fixed point), opacities, colours, log-scales (a byte each), rotations (version 3: the smallest three of x y z w in 32
+bits; version 2: x y z in a byte each) and higher spherical harmonics (a byte each). Axes are those of the PLY, as
+Niantic's converter and SuperSplat write them; the format itself names none. Format: https://github.com/nianticlabs/spz
+
+What is lost against a PLY file: positions are exact to 2^-21 of the scene's extent or 2^-20 units, scales to 3.2 % and
+clipped to [4.5e-5, 380], opacities to 1/510, colours to 1/270 and clipped to [-0.44, 1.44], rotations to 1/700,
+higher spherical harmonics to 1/256 and clipped to [-1, 1].
+"""
+
+from __future__ import annotations
+
+import gzip
+import io
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vg2gt.io.errors import FormatError
+from vg2gt.io.files import regular, write_bytes
+from vg2gt.io.gaussian_arrays import (
+    GaussianArrays,
+    from_smallest_three,
+    smallest_three,
+    to_arrays,
+    to_gaussians,
+)
+from vg2gt.types import Gaussians
+
+_HEADER = struct.Struct("<4sIIBBBB")
+_MAGIC = b"NGSP"
+_DEGREES = {1: 0, 4: 1, 9: 2, 16: 3}  # by number of coefficients
+_MOST_BITS = 20  # of a position's fraction
+_COLOR = 0.15  # a byte holds 0.5 + 0.15 times the constant coefficient
+
+
+def write_spz(path: str | Path, gaussians: Gaussians) -> Path:
+    """Writes one scene's Gaussians in their order, version 3, atomically; the module says what is lost.
+
+    Args:
+        path: the file.
+        gaussians: one scene; not changed.
+
+    Returns:
+        The path.
+
+    Raises:
+        ValueError: on more than one scene and on values that cannot be written.
+    """
+    arrays = to_arrays(gaussians)
+    extent = float(np.abs(arrays.means).max(initial=1e-6))
+    bits = min(_MOST_BITS, int(np.floor(np.log2((2**23 - 1) / extent))))
+    if bits < 0:
+        raise ValueError(f"positions reach {extent:.3g} units, .spz holds 8 million: write a PLY, or scale the scene")
+    fixed = np.rint(arrays.means * 2.0**bits).astype("<i4")
+    place, others = smallest_three(np.roll(arrays.quats, -1, 1))
+    rotation = place.astype("<u4")
+    for column in others.T:
+        rotation = (
+            rotation << 10 | (column < 0).astype("<u4") << 9 | np.rint(abs(column) * np.sqrt(2) * 511).astype("<u4")
+        )
+    columns = (
+        fixed[:, :, None].view("u1")[:, :, :3],
+        _bytes(arrays.opacities * 255),
+        _bytes((arrays.sh[:, 0] * _COLOR + 0.5) * 255),
+        _bytes((np.log(arrays.scales) + 10) * 16),
+        rotation,
+        _bytes(arrays.sh[:, 1:] * 128 + 128),
+    )
+    head = _HEADER.pack(_MAGIC, 3, len(fixed), _DEGREES[arrays.sh.shape[1]], bits, 0, 0)
+    return write_bytes(path, gzip.compress(head + b"".join(column.tobytes() for column in columns), mtime=0))
+
+
+def read_spz(path: str | Path) -> Gaussians:
+    """Reads a ``.spz`` file of version 2 or 3.
+
+    Args:
+        path: the file.
+
+    Returns:
+        The Gaussians as scene 0, float32.
+
+    Raises:
+        FormatError: if the file is damaged or of another version.
+    """
+    path = Path(path)
+    content = regular(path).read_bytes()
+    if content.startswith(_MAGIC):
+        raise FormatError(
+            f"{path}: a .spz of version 4; versions 2 and 3 can be read: splat-transform --spz-version 3 converts it"
+        )
+    try:
+        with gzip.open(io.BytesIO(content)) as file:
+            magic, version, count, degree, bits, _, _ = _HEADER.unpack(file.read(_HEADER.size))
+            if magic != _MAGIC or version not in (2, 3) or degree > 3 or bits > 23:
+                raise FormatError(
+                    f"{path}: magic {magic!r}, version {version}, degree {degree}, {bits} fractional bits; expected a "
+                    ".spz of version 2 or 3 and degree 0 to 3"
+                )
+            sides = (9, 1, 3, 3, 4 if version == 3 else 3, 3 * ((degree + 1) ** 2 - 1))
+            data = file.read(count * sum(sides) + 1)
+    except (OSError, EOFError, zlib.error, struct.error) as error:
+        raise FormatError(f"{path}: not a .spz file, or damaged: {error}") from error
+    if len(data) != count * sum(sides):
+        raise FormatError(
+            f"{path}: {count} Gaussians need {count * sum(sides)} bytes, found {len(data)}; it is damaged"
+        )
+    ends = np.cumsum([count * side for side in sides])[:-1]
+    position, alpha, color, scale, rotation, rest = (
+        part.reshape(count, side) for part, side in zip(np.split(np.frombuffer(data, "u1"), ends), sides, strict=True)
+    )
+    fixed = np.zeros((count, 3, 4), "u1")
+    fixed[:, :, 1:] = position.reshape(count, 3, 3)
+    sh = np.concatenate(
+        ((color[:, None] / 255 - 0.5) / _COLOR, (rest.reshape(count, sides[5] // 3, 3) - 128.0) / 128), 1
+    )
+    arrays = GaussianArrays(
+        (fixed.view("<i4")[:, :, 0] >> 8) / 2.0**bits,
+        np.roll(_rotations(rotation), 1, 1),
+        np.exp(scale / 16.0 - 10),
+        alpha[:, 0] / 255,
+        sh,
+    )
+    return to_gaussians(path, arrays)
+
+
+def _bytes(values: NDArray[np.floating]) -> NDArray[np.uint8]:
+    return np.rint(values).clip(0, 255).astype("u1")
+
+
+def _rotations(packed: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """Unit quaternions ``[N, 4]`` xyzw of either version's bytes."""
+    if packed.shape[1] == 3:
+        axis = packed / 127.5 - 1
+        return np.concatenate((axis, np.sqrt(np.maximum(1 - (axis**2).sum(1, keepdims=True), 0))), 1)
+    word = np.ascontiguousarray(packed).view("<u4")
+    parts = word >> np.array([20, 10, 0], "<u4") & 1023
+    others = np.where(parts >> 9, -1, 1) * (parts & 511) / (511 * np.sqrt(2))
+    return from_smallest_three(word[:, 0] >> 30, others)
