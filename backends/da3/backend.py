@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import get_args
 
 import torch
@@ -10,6 +11,7 @@ from torch import Tensor, nn
 
 from backends.da3.backbone import Backbone, PretrainedBackbone, ReferenceView
 from backends.da3.camera import CameraDecoder, CameraEncoder, normalize_cameras
+from backends.da3.gaussians import GaussianHead
 from backends.dpt import DPT, in_chunks
 from backends.network import NetworkBackend, predict
 from backends.normalization import normalize_images
@@ -156,6 +158,18 @@ class DA3Backend(NetworkBackend):
         ignorable = (*(prefix + part for part in unused), *(part for part in NESTED_PARTS if part != prefix))
         weights = Weights(name, licence, pretrained, repo, revision, path, seed, prefix, ignorable)
         self._build(make, weights, taps, head_chunk, compile)
+
+    def gaussian_head(self) -> GaussianHead:
+        """DA3's own Gaussian head, frozen, from the same file.
+
+        Raises:
+            ValueError: if the file holds none: only GIANT's does.
+        """
+        weights = replace(self.weights, prefix=f"{self.weights.prefix}gs_head.", ignorable=("",))
+        try:
+            return weights.build(lambda: GaussianHead(**self.network.arguments)).requires_grad_(False)
+        except ValueError as error:
+            raise ValueError(f"backend {self.name} has no Gaussian head, da3_giant has one: {error}") from error
 
     @torch.no_grad()
     def encode_checked(self, images: Tensor, hints: Hints | None) -> Tokens:
