@@ -22,6 +22,7 @@ from vg2gt.io.files import read_json, write_json, write_text
 from vg2gt.runs.checkpoints import newest_valid, read_checkpoint, write_checkpoint
 from vg2gt.runs.trust import read_run_config
 from vg2gt.training.loop import build, evaluate, train
+from vg2gt.training.start import load_start
 
 log = logging.getLogger(__name__)
 
@@ -72,9 +73,13 @@ def run_once(overrides: Sequence[str], folder: Path) -> Metrics:
 
 
 def _only_evaluate(config: DictConfig, folder: Path) -> dict[str, Any]:
-    """The result of a run of no steps."""
+    """The result of a run of no steps: the model as it begins, and its checkpoint if it has a trained part."""
     write_text(folder / "config.yaml", OmegaConf.to_yaml(config, resolve=True))
-    metrics = evaluate(build(config))
+    run = build(config)
+    load_start(run.module, config, None)
+    metrics = evaluate(run)
+    if run.module.model.trained_parameters():
+        run.trainer.save_checkpoint(folder / "checkpoints" / "step-0.ckpt")
     report = {"untrained": metrics, "trained": metrics, "steps": 0}
     write_json(folder / "metrics.json", report)
     return report
