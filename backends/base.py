@@ -110,7 +110,7 @@ class Backend(nn.Module, ABC):
     def freeze(self) -> None:
         """Takes every parameter out of training and puts every module into eval mode, for good.
 
-        A backend that is not ``frozen`` keeps its parameters in training, and the identity of the weights it begins with.
+        One that is not ``frozen`` keeps its parameters in training, and the identity of the weights it begins with.
         """
         self.requires_grad_(not self.frozen)
         self.eval()
