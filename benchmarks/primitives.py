@@ -1,11 +1,11 @@
 """Primitives and decoding time against the number of views: ``python benchmarks/primitives.py [--views N ...]``.
 
 VG²GT (at several voxel sizes) against one Gaussian per pixel (``--reference da3_gs``: DA3's own) and against pixel
-Gaussians merged by voxels, on procedural rooms or, with ``data=rgbd data.root=FOLDER``, on a recording (paper, figure on the number of primitives and
-the time of the decoding head). Nothing is trained: counts follow from the backbone's geometry, here the simulated
-one's, whose noise is printed. Training changes those of VG²GT: its enhanced depth agrees better among views, so they
-fall. Times are the best of several passes: core-seconds on a CPU, CUDA events on a GPU. Prints a table, writes a dated
-JSON file to ``benchmarks/results`` and a plot to ``docs/figures``.
+Gaussians merged by voxels, on procedural rooms or, with ``data=rgbd data.root=FOLDER``, on a recording (paper, figure
+on the number of primitives and the time of the decoding head). Nothing is trained: counts follow from the backbone's
+geometry, here the simulated one's, whose noise is printed. Training changes those of VG²GT: its enhanced depth agrees
+better among views, so they fall. Times are the best of several passes: core-seconds on a CPU, CUDA events on a GPU.
+Prints a table, writes a dated JSON file to ``benchmarks/results`` and a plot to ``docs/figures``.
 """
 
 from __future__ import annotations

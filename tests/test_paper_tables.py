@@ -26,11 +26,8 @@ def own_keys(script: str) -> set[str]:
 @pytest.mark.parametrize("command", COMMANDS)
 def test_composes(command: str, tmp_path: Path) -> None:
     program, name, *arguments = shlex.split(command)
-    overrides = [
-        a
-        for a in arguments
-        if "=" in a and a.split("=")[0] not in own_keys(name if program == "python" else "train.py")
-    ]
+    own = own_keys(name) if program == "python" else set()
+    overrides = [argument for argument in arguments if "=" in argument and argument.split("=")[0] not in own]
     settled = ["name=x", f"output_dir={tmp_path}"]
     if program == "python":
         assert (ROOT / name).is_file()

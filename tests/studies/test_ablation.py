@@ -212,7 +212,18 @@ def test_given_weights_on_a_protocol(
         f"data.cache_dir={cache}",
     ]
     scenes += ["evaluation.selection.index=null"]
-    arguments = (tmp_path, [*QUIET, f"data.cache_dir={cache}"], 1, 0, 0, 1e-4, ["wo_split"], (2,), str(given))
+    elsewhere = ["data=replica", "data.root=/nowhere"]  # the training's data is not needed
+    arguments = (
+        tmp_path,
+        [*(q for q in QUIET if not q.startswith("data.")), *elsewhere],
+        1,
+        0,
+        0,
+        1e-4,
+        ["wo_split"],
+        (2,),
+        str(given),
+    )
     some = Ablation(*arguments, "synthetic", scenes)
     some.run()
     for run in (FULL, "wo_split"):

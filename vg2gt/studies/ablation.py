@@ -163,7 +163,8 @@ class Ablation:
             number += 1
             print(f"[{number}/{total}] seed {seed}: the full model, {self.full_steps} steps", flush=True)
             begin = [f"init_from={quoted(Path(self.init_from))}"] if self.init_from else []
-            run_once([*self.overrides, *begin, f"seed={seed}", f"trainer.max_steps={self.full_steps}"], home / "start")
+            overrides = [*self.overrides, *begin, f"seed={seed}", f"trainer.max_steps={self.full_steps}"]
+            run_once(overrides, home / "start", scored=self.protocol is None)
             start = final_checkpoint(home / "start", self.full_steps)
             for run in self.runs:
                 number += 1
@@ -182,7 +183,7 @@ class Ablation:
         overrides = [*self.overrides, *run.overrides, f"seed={CONTINUATION_SEED + seed}"]
         overrides += [f"trainer.max_steps={self.steps}", f"optimizer.lr={self.lr}", f"init_from={quoted(start)}"]
         folder = home / run.name.replace("=", "-")
-        metrics = run_once(overrides, folder)
+        metrics = run_once(overrides, folder, scored=self.protocol is None)
         return metrics if self.protocol is None else _figures(evaluate(self._on_protocol(folder)))
 
     def _on_protocol(self, folder: Path) -> DictConfig:
