@@ -74,19 +74,21 @@ class DA3Gaussians(Reconstructor):
         with stage("gaussians"), torch.autocast(images.device.type, enabled=False):
             pixels = usable_pixels(geometry.where(keep), images)
             own = self.backend.decode_cameras(tokens).world_to_camera[..., :3, :3].mT.flatten(0, 1)
-            gaussians = place(raw[pixels.rows], pixels, unit, own)
+            frame = geometry.cameras.world_to_camera[..., :3, :3].mT.flatten(0, 1) @ own.mT
+            gaussians = place(raw[pixels.rows], pixels, unit, matrix_to_quat(own), matrix_to_quat(frame))
         gaussians = self.with_background(gaussians, images, geometry.depth)
         return Prediction(geometry, geometry, unit, None, gaussians, keep)
 
 
-def place(raw: Tensor, pixels: Pixels, unit: Tensor, own: Tensor) -> Gaussians:
+def place(raw: Tensor, pixels: Pixels, unit: Tensor, own: Tensor, frame: Tensor) -> Gaussians:
     """Turns raw Gaussians into Gaussians of the scene.
 
     Args:
         raw: ``[N, sum(PARTS)]``, see :meth:`backends.da3.gaussians.GaussianHead.predict`.
         pixels: the same N pixels.
         unit: ``[B]`` scene units per unit of the network.
-        own: ``[B * V, 3, 3]`` camera to world as the network predicts it.
+        own: ``[B * V, 4]`` quaternions of camera to world as the network predicts it.
+        frame: ``[B * V, 4]`` quaternions of the network's world to the scene.
     """
     shift, scale, rotation, color, change, opacity = raw.float().split(PARTS, -1)
     depth = pixels.depth + unit[pixels.batch] * change[:, 0]
@@ -97,9 +99,8 @@ def place(raw: Tensor, pixels: Pixels, unit: Tensor, own: Tensor) -> Gaussians:
     sides = MIN_SCALE + (MAX_SCALE - MIN_SCALE) * torch.sigmoid(scale)
     scales = SCALE_UNIT * (depth * pixel.sum(-1))[:, None].abs() * sides
     # Like the official code: (z, w, x, y) of what it calls xyzw, turned in its own world, then xyzw rendered as wxyz.
-    raw_turn = matrix_to_quat(own)[pixels.view]
-    quats = multiply_quats(raw_turn, F.normalize(rotation, dim=-1).roll(2, -1)).roll(-1, -1)
-    quats = multiply_quats(matrix_to_quat(pixels.rotation @ own.mT[pixels.view]), quats)
+    quats = multiply_quats(own[pixels.view], F.normalize(rotation, dim=-1).roll(2, -1)).roll(-1, -1)
+    quats = multiply_quats(frame[pixels.view], quats)
     sh = harmonic_gains(SH_DEGREE).to(color) * color.unflatten(-1, (3, -1)).mT
     return Gaussians(
         means=means,
@@ -113,6 +114,5 @@ def place(raw: Tensor, pixels: Pixels, unit: Tensor, own: Tensor) -> Gaussians:
 
 def _centred(cameras: Cameras) -> Cameras:
     """Cameras whose principal point is half a pixel nearer to the origin."""
-    return replace(
-        cameras, intrinsics=cameras.intrinsics - F.pad(torch.full((2, 1), 0.5), (2, 0, 0, 1)).to(cameras.intrinsics)
-    )
+    half = cameras.intrinsics.new_tensor([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+    return replace(cameras, intrinsics=cameras.intrinsics - half)
