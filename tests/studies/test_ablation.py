@@ -185,7 +185,7 @@ def test_only_full_models_begin_with_given_weights(tmp_path: Path, monkeypatch: 
     """The others begin with the full model of their seed."""
     begun: dict[str, list[str]] = {}
 
-    def noted(overrides: list[str], folder: Path) -> dict[str, float]:
+    def noted(overrides: list[str], folder: Path, scored: bool) -> dict[str, float]:
         begun[folder.name] = [override for override in overrides if override.startswith("init_from=")]
         return {"psnr": 20.0}
 
