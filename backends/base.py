@@ -33,11 +33,13 @@ class Backend(nn.Module, ABC):
         predicts_cameras: False if its cameras are those of the hints.
 
     Attributes:
+        frozen: whether nothing in it is trained.
         needs_cameras: of a class whose ``encode`` always needs cameras, given or found.
         needs_depth: of a class whose ``encode`` also needs the data's depth: it can do nothing with photographs, which
             commands say before they build it.
     """
 
+    frozen = True
     needs_depth: ClassVar[bool] = False
     needs_cameras: ClassVar[bool] = False
 
@@ -106,12 +108,21 @@ class Backend(nn.Module, ABC):
         return self.decode_cameras(self.encode(images, hints))
 
     def freeze(self) -> None:
-        """Takes every parameter out of training and puts every module into eval mode, for good."""
-        self.requires_grad_(False)
+        """Takes every parameter out of training and puts every module into eval mode, for good.
+
+        One that is not ``frozen`` keeps its parameters in training, and the identity of the weights it begins with.
+        """
+        self.requires_grad_(not self.frozen)
         self.eval()
+        if not self.frozen:
+            self.identity()
+
+    def gradients(self) -> torch.set_grad_enabled:
+        """A context without gradients where the network is frozen."""
+        return torch.set_grad_enabled(torch.is_grad_enabled() and not self.frozen)
 
     def train(self, mode: bool = True) -> Backend:
-        """Stays in eval mode whatever ``mode`` says: a frozen network has no training behaviour."""
+        """Stays in eval mode whatever ``mode`` says: its training behaviour is not wanted."""
         return super().train(False)
 
     def identity(self) -> dict[str, str]:

@@ -34,10 +34,13 @@ class NetworkBackend(Backend):
         seed: of random weights.
         head_chunk: views decoded at a time; None decodes all at once.
         compile: whether to ``torch.compile`` the backbone.
+        freeze: whether nothing of it is trained. Otherwise all but its cameras is, which stay constants, as does its
+            first geometry; checkpoints then hold it.
     """
 
     network: Any
     backbone_name: str  # of the module that makes tokens
+    camera_name = ""  # of the module that makes cameras of them
 
     def _build(
         self,
@@ -46,6 +49,7 @@ class NetworkBackend(Backend):
         taps: Sequence[int],
         head_chunk: int | None,
         compile: bool = False,
+        freeze: bool = True,
     ) -> None:
         """Ends the constructor: makes the network with its weights and freezes it."""
         if list(taps) != sorted(set(taps)):
@@ -56,15 +60,22 @@ class NetworkBackend(Backend):
         self.network = weights.build(make)
         if compile:
             self.network.get_submodule(self.backbone_name).compile()
+        self.frozen = freeze
         self.freeze()
 
-    @torch.no_grad()
+    def freeze(self) -> None:
+        """See :meth:`Backend.freeze`."""
+        super().freeze()
+        if not self.frozen:
+            self.network.get_submodule(self.camera_name).requires_grad_(False)
+
     def encode(self, images: Tensor, hints: Hints | None = None) -> Tokens:
         """See :meth:`Backend.encode`; ``hints.cameras`` are needed, and used, where the network takes given poses."""
         self.check_images(images)
         if self.needs_hints:
             hints = self.require_hints(images, hints, "cameras")
-        return self.encode_checked(images, hints)
+        with self.gradients():
+            return self.encode_checked(images, hints)
 
     def encode_checked(self, images: Tensor, hints: Hints | None) -> Tokens:
         """Encodes what :meth:`encode` has checked: tensor operations only, so that it can be exported."""

@@ -5,7 +5,8 @@ evaluated on the same held-out scenes: VG²GT, VG²GT with finer voxels (about 4
 without its coarse module (which separates the voxels' part from the enhanced geometry's), one Gaussian per pixel, pixel
 Gaussians merged by voxels, and the coloured points, which need no training. ``coarse=`` names a checkpoint whose coarse
 module, and nothing else, the models that have one begin with, at ``training.coarse_lr_factor=0.3``. ``models=`` takes
-only some, by the names of their folders. With ``shared=``, the folder of the reference data, all are also evaluated on
+only some, by the names of their folders, such as ``da3_gs``, DA3's own Gaussians, which need ``backend=da3_giant`` and
+are left out otherwise. With ``shared=``, the folder of the reference data, all are also evaluated on
 its recordings, which none was trained on. Finished trainings are not repeated, interrupted ones go on. Writes runs,
 ``metrics.json``, ``metrics.md`` and ``models.png`` into ``outputs/<name>``; name=baselines.
 """
@@ -57,12 +58,13 @@ ON_RECORDINGS = columns("psnr", "ssim", "rmse", "abs_rel", "decoded_abs_rel", "n
 
 @dataclass(frozen=True)
 class Model:
-    """A row: its folder, its overrides, whether there is anything to train, and whether it has a coarse module."""
+    """A row: its folder, its overrides, whether it is trained, has a coarse module, and is run only if named."""
 
     folder: str
     overrides: tuple[str, ...] = ()
     trained: bool = True
     coarse: bool = False
+    asked: bool = False
 
 
 MODELS = {
@@ -72,6 +74,7 @@ MODELS = {
     "pixel-aligned": Model("pixel_aligned", ("model=pixel_aligned",)),
     "voxel-merged": Model("voxel_merged", ("model=voxel_merged",)),
     "coloured points": Model("pointcloud", ("model=pointcloud",), trained=False),
+    "DA3": Model("da3_gs", ("model=da3_gs",), trained=False, asked=True),
 }
 
 
@@ -137,11 +140,15 @@ def on_recordings(run: Run, shared: str) -> dict[str, Metrics]:
 
 
 def chosen(names: str) -> dict[str, Model]:
-    """The models of ``models=``, or all."""
+    """The models of ``models=``, or all that any backend can run."""
     folders = [model.folder for model in MODELS.values()]
     if unknown := set(names.split(",")) - {*folders, ""}:
         raise SystemExit(f"models={names}: no model {', '.join(sorted(unknown))}; there are {', '.join(folders)}")
-    return {name: model for name, model in MODELS.items() if not names or model.folder in names.split(",")}
+    return {
+        name: model
+        for name, model in MODELS.items()
+        if (model.folder in names.split(",") if names else not model.asked)
+    }
 
 
 def coarse_start(path: str, home: Path) -> tuple[str, ...]:

@@ -1,11 +1,11 @@
 """Primitives and decoding time against the number of views: ``python benchmarks/primitives.py [--views N ...]``.
 
-VG²GT (at several voxel sizes) against one Gaussian per pixel and against pixel Gaussians merged by voxels, on
-procedural rooms or, with ``data=rgbd data.root=FOLDER``, on a recording (paper, figure on the number of primitives and
-the time of the decoding head). Nothing is trained: counts follow from the backbone's geometry, here the simulated
-one's, whose noise is printed. Training changes those of VG²GT: its enhanced depth agrees better among views, so they
-fall. Times are the best of several passes: core-seconds on a CPU, CUDA events on a GPU. Prints a table, writes a dated
-JSON file to ``benchmarks/results`` and a plot to ``docs/figures``.
+VG²GT (at several voxel sizes) against one Gaussian per pixel (``--reference da3_gs``: DA3's own) and against pixel
+Gaussians merged by voxels, on procedural rooms or, with ``data=rgbd data.root=FOLDER``, on a recording (paper, figure
+on the number of primitives and the time of the decoding head). Nothing is trained: counts follow from the backbone's
+geometry, here the simulated one's, whose noise is printed. Training changes those of VG²GT: its enhanced depth agrees
+better among views, so they fall. Times are the best of several passes: core-seconds on a CPU, CUDA events on a GPU.
+Prints a table, writes a dated JSON file to ``benchmarks/results`` and a plot to ``docs/figures``.
 """
 
 from __future__ import annotations
@@ -26,7 +26,13 @@ from vg2gt.method.grid import scene_voxel_size
 from vg2gt.studies.study import compose_run
 from vg2gt.types import Batch
 
-LABELS = {"pixel_aligned": "pixel-aligned", "voxel_merged": "voxel-merged", "tiny": "VG²GT", "vg2gt": "VG²GT (large)"}
+LABELS = {
+    "pixel_aligned": "pixel-aligned",
+    "da3_gs": "DA3",
+    "voxel_merged": "voxel-merged",
+    "tiny": "VG²GT",
+    "vg2gt": "VG²GT (large)",
+}
 FIGURES = RESULTS.parents[1] / "docs" / "figures"
 
 
@@ -110,9 +116,10 @@ def measure(method: Method, batches: list[Batch], overrides: list[str], passes: 
 
 
 def print_rows(title: str, rows: list[Row], pixels: int) -> None:
-    """One row per method and number of views, with ratios to the pixel-aligned one."""
-    head = ("method", "views", "primitives", "of pixels", "of pixel-aligned", "head, s", "of pixel-aligned", "all, s")
-    reference = {row.views: row for row in rows if row.method == LABELS["pixel_aligned"]}
+    """One row per method and number of views, with ratios to the first method."""
+    first = rows[0].method
+    head = ("method", "views", "primitives", "of pixels", f"of {first}", "head, s", f"of {first}", "all, s")
+    reference = {row.views: row for row in rows if row.method == first}
     cells = [
         [
             row.method,
@@ -171,6 +178,7 @@ def main() -> None:
     options.add_argument("--views", type=int, nargs="+", default=[4, 10, 20, 50])
     options.add_argument("--footprints", type=float, nargs="+", default=[1.0, 2.0, 3.3], help="voxel edges in pixels")
     options.add_argument("--model", default="tiny", choices=("tiny", "vg2gt"))
+    options.add_argument("--reference", default="pixel_aligned", choices=("pixel_aligned", "da3_gs"))
     options.add_argument("--scenes", type=int, default=1)
     options.add_argument("--name", default="rooms", help="part of the files' names, and of the plot's title")
     options.add_argument("--figures", type=Path, default=FIGURES)
@@ -182,7 +190,7 @@ def main() -> None:
         options.error(f"{weights[0]}: only untrained models are measured here; vg2gt evaluate counts trained ones")
     if not any(override.startswith("data=") for override in overrides):
         overrides = ["data.num_frames=64", *overrides]
-    methods = [Method("pixel_aligned", None)]
+    methods = [Method(arguments.reference, None)]
     methods += [Method("voxel_merged", arguments.footprints[-1])]
     methods += [Method(arguments.model, footprint) for footprint in arguments.footprints]
     rows: list[Row] = []

@@ -145,7 +145,7 @@ class Reconstructor(nn.Module, ABC):
             images: ``[B, V, 3, H, W]`` in [0, 1].
             hints: what the data knows of these views.
         """
-        if self.token_cache is not None:
+        if self.token_cache is not None and self.backend.frozen:
             with stage("encode"):
                 return self.token_cache.read(self.backend, images, hints)
         with stage("encode"):
@@ -161,7 +161,7 @@ class Reconstructor(nn.Module, ABC):
             hints: what the data knows of these views.
         """
         with stage("cameras"):
-            if self.token_cache is not None:
+            if self.token_cache is not None and self.backend.frozen:
                 return self.token_cache.cameras(self.backend, images, hints)
             return self.backend.predict_cameras(images, hints)
 
@@ -190,15 +190,18 @@ class Reconstructor(nn.Module, ABC):
         return replace(gaussians, background=total / weight.sum((1, 3, 4)))
 
     def trained_parameters(self) -> list[nn.Parameter]:
-        """The parameters that training changes: everything but the backbone."""
+        """The parameters that training changes: everything but a frozen backbone."""
         return [parameter for parameter in self.parameters() if parameter.requires_grad]
 
     def trained_state(self) -> dict[str, Tensor]:
-        """What a checkpoint holds of the model: the state of everything but the backbone."""
-        return {name: value for name, value in self.state_dict().items() if not name.startswith(BACKBONE_PREFIX)}
+        """What a checkpoint holds of the model: the state of everything but a frozen backbone."""
+        return {name: value for name, value in self.state_dict().items() if self._stored(name)}
+
+    def _stored(self, name: str) -> bool:
+        return not (self.backend.frozen and name.startswith(BACKBONE_PREFIX))
 
     def load_trained(self, state: Mapping[str, Tensor], backend: Mapping[str, Any] | None) -> None:
-        """Loads the trained part, which must be whole; the backbone is never stored.
+        """Loads the trained part, which must be whole; a backbone that was frozen in training is not in it.
 
         Args:
             state: as :meth:`trained_state` gave it.
@@ -209,7 +212,7 @@ class Reconstructor(nn.Module, ABC):
         """
         self.check_backend(backend)
         present = {name: value.shape for name, value in self.trained_state().items()}
-        stored = {name: value.shape for name, value in state.items() if not name.startswith(BACKBONE_PREFIX)}
+        stored = {name: value.shape for name, value in state.items() if self._stored(name)}
         if stored != present:
             wrong = sorted(name for name in stored.keys() | present.keys() if stored.get(name) != present.get(name))
             raise ValueError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import get_args
 
 import torch
@@ -10,6 +11,7 @@ from torch import Tensor, nn
 
 from backends.da3.backbone import Backbone, PretrainedBackbone, ReferenceView
 from backends.da3.camera import CameraDecoder, CameraEncoder, normalize_cameras
+from backends.da3.gaussians import GaussianHead
 from backends.dpt import DPT, in_chunks
 from backends.network import NetworkBackend, predict
 from backends.normalization import normalize_images
@@ -99,6 +101,7 @@ class DA3Backend(NetworkBackend):
     """
 
     backbone_name = "backbone.pretrained"
+    camera_name = "cam_dec"
     network: DA3Network
 
     def __init__(
@@ -127,6 +130,7 @@ class DA3Backend(NetworkBackend):
         seed: int = 0,
         head_chunk: int | None = 8,
         compile: bool = False,
+        freeze: bool = True,
     ) -> None:
         if reference_view not in get_args(ReferenceView):
             known = ", ".join(get_args(ReferenceView))
@@ -155,9 +159,20 @@ class DA3Backend(NetworkBackend):
         unused = (*RAY_BRANCH, "gs_head.", *(() if given_poses else ("cam_enc.",)))
         ignorable = (*(prefix + part for part in unused), *(part for part in NESTED_PARTS if part != prefix))
         weights = Weights(name, licence, pretrained, repo, revision, path, seed, prefix, ignorable)
-        self._build(make, weights, taps, head_chunk, compile)
+        self._build(make, weights, taps, head_chunk, compile, freeze)
 
-    @torch.no_grad()
+    def gaussian_head(self) -> GaussianHead:
+        """DA3's own Gaussian head, frozen, from the same file.
+
+        Raises:
+            ValueError: if the file holds none: only GIANT's does.
+        """
+        weights = replace(self.weights, prefix=f"{self.weights.prefix}gs_head.", ignorable=("",))
+        try:
+            return weights.build(lambda: GaussianHead(**self.network.arguments)).requires_grad_(False)
+        except ValueError as error:
+            raise ValueError(f"backend {self.name} has no Gaussian head, da3_giant has one: {error}") from error
+
     def encode_checked(self, images: Tensor, hints: Hints | None) -> Tokens:
         """See :meth:`NetworkBackend.encode_checked`."""
         given = None
@@ -166,7 +181,6 @@ class DA3Backend(NetworkBackend):
                 given = self.network.cam_enc(normalize_cameras(hints.cameras))
         return self.encode_with(images, given)
 
-    @torch.no_grad()
     def encode_with(self, images: Tensor, camera_tokens: Tensor | None) -> Tokens:
         """Encodes checked images, with camera tokens ``[B, V, C]`` from the camera encoder if there are any."""
         with half_precision_on_gpu(images):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import torch
 from torch import Tensor
 
 from backends.network import NetworkBackend, predict
@@ -28,6 +27,7 @@ class VGGTBackend(NetworkBackend):
     """
 
     backbone_name = "aggregator"
+    camera_name = "camera_head"
     network: VGGTNetwork
 
     def __init__(
@@ -52,6 +52,7 @@ class VGGTBackend(NetworkBackend):
         seed: int = 0,
         head_chunk: int | None = 8,
         compile: bool = False,
+        freeze: bool = True,
     ) -> None:
         super().__init__(name, patch_size, (2 * dim,) * len(taps), licence)
 
@@ -63,9 +64,8 @@ class VGGTBackend(NetworkBackend):
             return network
 
         weights = Weights(name, licence, pretrained, repo, revision, path, seed, ignorable=IGNORABLE)
-        self._build(make, weights, taps, head_chunk, compile)
+        self._build(make, weights, taps, head_chunk, compile, freeze)
 
-    @torch.no_grad()
     def encode_checked(self, images: Tensor, hints: Hints | None) -> Tokens:
         """See :meth:`NetworkBackend.encode_checked`."""
         with half_precision_on_gpu(images):

@@ -54,3 +54,11 @@ def test_a_published_file_would_load(make_backend, load_config, name: str) -> No
         backend = make_backend(name, "pretrained=false")
         state = {key: torch.empty(shape) for key, shape in manifest["tensors"].items()}
     load_strictly(backend.network, state, backend.weights.prefix, backend.weights.ignorable, "file")
+
+
+def test_names_and_shapes_of_the_gaussian_head(make_backend) -> None:
+    with torch.device("meta"):
+        head = make_backend("da3_giant", "pretrained=false").gaussian_head()
+    prefix = "model.gs_head."
+    published = read_json("manifests")["da3-giant"]["tensors"]
+    assert tensors(head, prefix) == {key: shape for key, shape in published.items() if key.startswith(prefix)}

@@ -14,6 +14,10 @@ from backends.da3 import DA3Backend, DA3MetricBackend
 from backends.da3.metric import fill_sky
 from backends.vggt import VGGTBackend
 from tests.references import draw_weights, read_cases, read_json
+from vg2gt.baselines import DA3Gaussians
+from vg2gt.geometry.rotations import quat_to_matrix
+from vg2gt.geometry.spherical_harmonics import rotation_of_coefficients
+from vg2gt.model import SceneScale
 from vg2gt.types import Cameras, Hints, Tokens
 
 TOLERANCE = 2e-5
@@ -28,7 +32,7 @@ class Reference:
         description = read_json("networks")[network]
         self.config, self.case = description["config"], description["cases"][case]
         tensors = read_cases(network)
-        self.images = tensors[f"{self.case.get('images_of', case)}.images"]
+        self.images = tensors.get(f"{self.case.get('images_of', case)}.images", torch.empty(0))
         prefix = f"{case}."
         self.tensors = {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
 
@@ -145,6 +149,41 @@ def check_geometry(reference: Reference, backend: VGGTBackend | DA3Backend, toke
     reference.check(prefix + "pose_enc", head(tokens.camera))
     reference.check(prefix + "extrinsics", geometry.cameras.world_to_camera[..., :3, :])
     reference.check(prefix + "intrinsics", geometry.cameras.intrinsics)
+
+
+@pytest.mark.parametrize("case", [0, 1])
+def test_gaussians(tmp_path: Path, case: int) -> None:
+    """From images to every 41st Gaussian of a scene, brought from the frame of the first view to the network's."""
+    reference, gaussians = Reference("da3_tiny_swiglu", case), Reference("da3_tiny_gs", case)
+    weights = draw_weights("da3_tiny_swiglu") | draw_weights("da3_tiny_gs")
+    save_file(weights, tmp_path / "model.safetensors")
+    backend = da3(reference.config, {}, str(tmp_path))
+    model = DA3Gaussians(backend, SceneScale("normalize", median_depth=2.0))
+    prediction = model(reference.images)
+    found, scenes = prediction.gaussians, len(reference.images)
+    unit, frame = prediction.unit[found.batch], reference["extrinsics"][:, 0][found.batch]
+    rotation, translation = frame[..., :3], frame[..., 3]
+    means = (found.means / unit[:, None] - translation)[:, None] @ rotation
+    turned = rotation.mT @ quat_to_matrix(found.quats)
+    turns = rotation_of_coefficients(reference["extrinsics"][:, 0, :, :3].mT, 2)[found.batch]
+    gaussians.check("means", every(means[:, 0], scenes))
+    gaussians.check("harmonics", every((turns @ found.sh).mT, scenes))
+    gaussians.check("opacities", every(found.opacities, scenes))
+    scales, rotations = gaussians["scales"], gaussians["rotations"]  # signs of both mean nothing
+    gaussians.tensors |= {"scales": scales.abs(), "rotations": quat_to_matrix(rotations)}
+    gaussians.check("scales", every(found.scales / unit[:, None], scenes))
+    gaussians.check("rotations", every(turned, scenes))
+    centers = [
+        cameras.intrinsics[0, 0, :2, 2].tolist()
+        for cameras in (prediction.geometry.cameras, model.predict_cameras(reference.images, None))
+    ]
+    height, width = reference.images.shape[-2:]
+    assert centers == [[(width - 1) / 2, (height - 1) / 2]] * 2
+
+
+def every(rows: Tensor, scenes: int) -> Tensor:
+    """Every 41st Gaussian of each scene."""
+    return rows.unflatten(0, (scenes, -1))[:, ::41]
 
 
 @pytest.mark.parametrize("case", [0, 1])

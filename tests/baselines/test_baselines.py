@@ -1,13 +1,15 @@
 """The models to compare with: counts, order of views, gradients, whole runs."""
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 from hydra.utils import instantiate
+from safetensors.torch import save_file
 
-from tests.training_helpers import small_config
+from tests.training_helpers import SMALL, small_config
 from vg2gt.baselines import VoxelMerged
 from vg2gt.baselines.pixels import usable_pixels
 from vg2gt.baselines.voxel_merged import merge_by_voxel
@@ -15,6 +17,7 @@ from vg2gt.geometry.rotations import quat_to_matrix
 from vg2gt.geometry.spherical_harmonics import sh_to_rgb
 from vg2gt.model import Reconstructor
 from vg2gt.rendering import render
+from vg2gt.studies.study import run_once
 from vg2gt.training.loop import build, train
 from vg2gt.types import Batch, Gaussians, Hints, Prediction
 
@@ -201,6 +204,26 @@ def test_point_cloud_as_3dgs_starts(make, batch: Batch) -> None:
     expected = distances.square().mean(1).sqrt().float()
     torch.testing.assert_close(gaussians.scales[some, 0], expected, atol=1e-5, rtol=1e-4)
     assert float(gaussians.opacities.max()) == pytest.approx(0.1)
+
+
+def test_gaussians_of_da3(make, batch: Batch, tmp_path: Path, cache: Path) -> None:
+    """On random weights, from the frames to the scores: nothing is trained, a Gaussian is made of every pixel."""
+    given = ["model=da3_gs", "backend=da3_tiny", "data.eval_context=[0,4,8,12]", f"data.cache_dir={cache}"]
+    scores = run_once([*SMALL, *given, "trainer.max_steps=0"], tmp_path)
+    assert scores["gaussians"] == batch.context.depth.numel()
+    assert all(math.isfinite(scores[name]) for name in ("psnr", "abs_rel", "cv"))
+    with pytest.raises(Exception, match="take backend=da3_giant, not oracle"):
+        make("da3_gs")
+
+
+def test_a_file_without_a_gaussian_head_is_refused(make, tmp_path: Path) -> None:
+    backend = make("pointcloud", "backend=da3_tiny").backend
+    file = tmp_path / "model.safetensors"
+    save_file({f"model.{name}": value for name, value in backend.network.state_dict().items()}, file)
+    given = ["backend=da3_tiny", "backend.pretrained=true", f"backend.path={file}"]
+    make("pointcloud", *given)
+    with pytest.raises(Exception, match=r"da3_tiny has no Gaussian head, da3_giant has one: .*missing model\.gs_head"):
+        make("da3_gs", *given)
 
 
 def test_two_scenes_equal_two_runs(make, batch: Batch) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
 import vg2gt.studies.ablation
 import vg2gt.studies.study
@@ -184,7 +185,7 @@ def test_only_full_models_begin_with_given_weights(tmp_path: Path, monkeypatch: 
     """The others begin with the full model of their seed."""
     begun: dict[str, list[str]] = {}
 
-    def noted(overrides: list[str], folder: Path) -> dict[str, float]:
+    def noted(overrides: list[str], folder: Path, scored: bool) -> dict[str, float]:
         begun[folder.name] = [override for override in overrides if override.startswith("init_from=")]
         return {"psnr": 20.0}
 
@@ -197,6 +198,50 @@ def test_only_full_models_begin_with_given_weights(tmp_path: Path, monkeypatch: 
     assert "Full model 2 steps from begin.ckpt, then every row" in some.report()
 
 
+def test_given_weights_on_a_protocol(
+    finished: Path, tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without a step of training: every variant of the given weights is scored as ``vg2gt evaluate`` scores it."""
+    monkeypatch.setattr(vg2gt.studies.study, "train", lambda config: pytest.fail(f"trained {config.output_dir}"))
+    given = newest_valid(finished / "seed-0" / "start" / "checkpoints")
+    scenes = [
+        "views=2",
+        "data.image_size=[28,56]",
+        "data.eval_scenes=1",
+        "data.num_frames=8",
+        f"data.cache_dir={cache}",
+    ]
+    scenes += ["evaluation.selection.index=null"]
+    elsewhere = ["data=replica", "data.root=/nowhere"]  # the training's data is not needed
+    arguments = (
+        tmp_path,
+        [*(q for q in QUIET if not q.startswith("data.")), *elsewhere],
+        1,
+        0,
+        0,
+        1e-4,
+        ["wo_split"],
+        (2,),
+        str(given),
+    )
+    some = Ablation(*arguments, "synthetic", scenes)
+    some.run()
+    for run in (FULL, "wo_split"):
+        report = json.loads((tmp_path / "seed-0" / run / "synthetic" / "metrics.json").read_text())
+        mean = report["views"]["2"]["mean"]
+        assert some.results[run][0]["psnr"] == mean["rendered/gt_pose/solid/psnr"]
+        assert some.results[run][0]["gaussians"] == mean["scene/gaussians"]
+        weights = read_checkpoint(newest_valid(tmp_path / "seed-0" / run / "checkpoints"))["state_dict"]
+        kept = read_checkpoint(given)["state_dict"]
+        assert torch.equal(weights["model.gaussians.hidden.weight"], kept["model.gaussians.hidden.weight"])
+    assert some.results["wo_split"][0]["gaussians"] < 0.7 * some.results[FULL][0]["gaussians"]
+    assert "as in vg2gt evaluate evaluation=synthetic views=2" in some.report()
+    with pytest.raises(ValueError, match=r"protocol_overrides: views=\[3, 10\].*give one number"):
+        Ablation(*arguments, "synthetic", ["views=[3,10]"])
+    with pytest.raises(ValueError, match="there is no evaluation=replicas, did you mean replica"):
+        Ablation(*arguments, "replicas")
+
+
 def test_what_the_study_decides_cannot_be_overridden() -> None:
     given = ["seeds=2", "backend=da3_small", "+data.x=1", "init_from=some.ckpt"]
     assert common_overrides(given) == ["backend=da3_small", "+data.x=1"]
@@ -204,8 +249,8 @@ def test_what_the_study_decides_cannot_be_overridden() -> None:
         common_overrides(["trainer.max_steps=7"])
 
 
-@pytest.mark.parametrize("wrong", [{"seeds": 0}, {"seeds": "abc"}, {"steps": 1.5}, {"full_steps": 0}, {"splits": [0]}])
+@pytest.mark.parametrize("wrong", [{"seeds": 0}, {"seeds": "abc"}, {"steps": 1.5}, {"full_steps": -1}, {"splits": [0]}])
 def test_numbers_are_checked_first(tmp_path: Path, wrong: dict[str, Any]) -> None:
     right = {"seeds": 1, "full_steps": 1, "steps": 1, "lr": 1e-3, "variants": [], "splits": [2]}
-    with pytest.raises(ValueError, match=f"{next(iter(wrong))}=.*: a study takes whole numbers from 1 on"):
+    with pytest.raises(ValueError, match=f"{next(iter(wrong))}=.*: a study takes whole numbers from [01] on"):
         Ablation(tmp_path, [], **(right | wrong))

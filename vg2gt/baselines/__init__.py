@@ -1,7 +1,8 @@
 """Models to compare with, on the same frozen backbone, losses and data (paper, Baselines)."""
 
+from vg2gt.baselines.da3_gaussians import DA3Gaussians
 from vg2gt.baselines.pixel_aligned import PixelAligned, PixelHead
 from vg2gt.baselines.pointcloud import PointCloud
 from vg2gt.baselines.voxel_merged import VoxelMerged
 
-__all__ = ["PixelAligned", "PixelHead", "PointCloud", "VoxelMerged"]
+__all__ = ["DA3Gaussians", "PixelAligned", "PixelHead", "PointCloud", "VoxelMerged"]

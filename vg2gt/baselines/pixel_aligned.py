@@ -8,9 +8,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from vg2gt.baselines.pixels import PixelReconstructor, Pixels
+from vg2gt.baselines.pixels import PixelReconstructor, Pixels, harmonic_gains
 from vg2gt.geometry.rotations import matrix_to_quat, multiply_quats
-from vg2gt.geometry.spherical_harmonics import MAX_DEGREE, rgb_to_sh, rotation_of_coefficients
+from vg2gt.geometry.spherical_harmonics import MAX_DEGREE, rgb_to_sh
 from vg2gt.types import Gaussians, Geometry
 
 MAX_SCALE = 4.0  # footprints
@@ -60,10 +60,8 @@ class PixelHead(nn.Module):
         nn.init.zeros_(self.out.bias)
         self.scale_bias = _logit(INITIAL_SCALE / MAX_SCALE)
         self.opacity_bias = _logit(INITIAL_OPACITY)
-        degrees = [degree for degree in range(sh_degree + 1) for _ in range(2 * degree + 1)]
-        gains = torch.tensor([0.1 * 0.25**degree if degree else 1.0 for degree in degrees])
         self.sh_gain: Tensor
-        self.register_buffer("sh_gain", gains[:, None], persistent=False)
+        self.register_buffer("sh_gain", harmonic_gains(sh_degree), persistent=False)
 
     def forward(
         self, features: Tensor, pixels: Pixels, min_footprint: Tensor | None = None
@@ -91,7 +89,7 @@ class PixelHead(nn.Module):
         quats = F.normalize(rotation + rotation.new_tensor([1.0, 0.0, 0.0, 0.0]), dim=-1)
         quats = multiply_quats(matrix_to_quat(pixels.rotation), quats)
         base = F.pad(rgb_to_sh(pixels.colors)[:, None], (0, 0, 0, len(self.sh_gain) - 1))
-        change = self._turn_to_world(self.sh_gain * color.unflatten(-1, (-1, 3)), pixels)
+        change = pixels.turn_to_world(self.sh_gain * color.unflatten(-1, (-1, 3)))
         gaussians = Gaussians(
             means=means,
             quats=quats,
@@ -102,16 +100,6 @@ class PixelHead(nn.Module):
         )
         # softplus(ln(e - 1)) = 1: the confidence of the depth, until training knows better.
         return gaussians, pixels.confidence * F.softplus(trust[:, 0] + math.log(math.e - 1)).clamp(min=1e-6)
-
-    def _turn_to_world(self, sh: Tensor, pixels: Pixels) -> Tensor:
-        """Coefficients ``[N, (L + 1)^2, 3]`` in camera axes to those of the same colours in world axes."""
-        if self.sh_degree == 0:
-            return sh
-        counts = torch.bincount(pixels.view)
-        last = counts.cumsum(0) - 1  # a view without pixels takes its neighbour's, and turns nothing
-        turns = rotation_of_coefficients(pixels.rotation[last.clamp(min=0)], self.sh_degree)
-        parts = sh.split(counts.tolist())
-        return torch.cat([turn @ part for turn, part in zip(turns, parts, strict=True)]) if parts else sh
 
 
 class PixelAligned(PixelReconstructor):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ from torch.nn import functional as F
 
 from backends.base import Backend
 from vg2gt.geometry.cameras import invert_rigid, ray_directions
+from vg2gt.geometry.spherical_harmonics import rotation_of_coefficients
 from vg2gt.method import DenseHead
 from vg2gt.method.additions.visibility import ViewCheck
 from vg2gt.model import Background, Reconstructor, SceneScale
@@ -53,6 +55,17 @@ class Pixels(TensorRecord):
         """Moves camera-frame points ``[N, 3]``, one per pixel, into the world; elementwise: no autocast rounds it."""
         return (self.rotation * local[:, None, :]).sum(-1) + self.center
 
+    def turn_to_world(self, sh: Tensor) -> Tensor:
+        """Coefficients ``[N, (L + 1)^2, 3]`` in camera axes to those of the same colours in world axes."""
+        degree = math.isqrt(sh.shape[1]) - 1
+        if degree == 0:
+            return sh
+        counts = torch.bincount(self.view)
+        last = counts.cumsum(0) - 1  # a view without pixels takes its neighbour's, and turns nothing
+        turns = rotation_of_coefficients(self.rotation[last.clamp(min=0)], degree)
+        parts = sh.split(counts.tolist())
+        return torch.cat([turn @ part for turn, part in zip(turns, parts, strict=True)]) if parts else sh
+
 
 def usable_pixels(geometry: Geometry, images: Tensor) -> Pixels:
     """Lists the pixels whose depth and confidence are finite and positive.
@@ -85,6 +98,12 @@ def usable_pixels(geometry: Geometry, images: Tensor) -> Pixels:
         rotation=camera_to_world[view, :3, :3],
         center=camera_to_world[view, :3, 3],
     )
+
+
+def harmonic_gains(degree: int) -> Tensor:
+    """Factors ``[(degree + 1)^2, 1]`` with which predicted SH coefficients begin small in higher degrees."""
+    degrees = [each for each in range(degree + 1) for _ in range(2 * each + 1)]
+    return torch.tensor([0.1 * 0.25**each if each else 1.0 for each in degrees])[:, None]
 
 
 class PixelReconstructor(Reconstructor):

@@ -177,7 +177,7 @@ def initialize_from(module: nn.Module, path: str | Path) -> None:
     """
     stored: Mapping[str, Tensor] = read_checkpoint(path).get("state_dict", {})
     refuse_not_finite(stored, path)
-    present = {k: v for k, v in module.state_dict().items() if not k.startswith("model.backend.")}
+    present = {k: v for k, v in module.state_dict().items() if k in stored or not k.startswith("model.backend.")}
     fitting = {k: v for k, v in stored.items() if k in present and present[k].shape == v.shape}
     if not fitting:
         raise ValueError(f"init_from={path}: none of its {len(stored)} tensors fits this model")

@@ -7,7 +7,8 @@ are evaluated on the same held-out views, so differences to the full model are t
 is new where the number of splits changes; a control continues the full model with a new last layer as well.
 
 Finished runs are never repeated, interrupted ones go on; a run that diverges is named and the others are run all the
-same. Writes ``metrics.json`` and ``metrics.md`` into ``outputs/<name>``, after every run.
+same. With ``protocol=PRESET`` the figures are those of ``vg2gt evaluate evaluation=PRESET``, LPIPS among them. Writes
+``metrics.json`` and ``metrics.md`` into ``outputs/<name>``, after every run.
 """
 
 from __future__ import annotations
@@ -17,11 +18,14 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
+from vg2gt.config import compose
 from vg2gt.evaluation.paper import tables
+from vg2gt.evaluation.run import evaluate, view_counts
 from vg2gt.evaluation.tables import Metric, columns, markdown_table
 from vg2gt.io.files import write_json, write_text
 from vg2gt.studies.study import (
@@ -41,6 +45,7 @@ from vg2gt.studies.study import (
 log = logging.getLogger(__name__)
 
 OWN_KEYS = ("name", "seeds", "full_steps", "steps", "lr", "variants", "splits", "init_from")
+OWN_KEYS += ("protocol", "protocol_overrides")
 SETTLED_KEYS = ("seed", "ckpt", "overwrite", "output_dir", "ablation", "trainer.max_steps")
 CONTINUATION_SEED = 1000  # the continuation's batches are not the first ones of the full model's training
 FULL, CONTROL = "full", "new_last_layer"
@@ -63,6 +68,13 @@ OUR_COLUMNS = columns("abs_rel_rasterized", "decoded_abs_rel", "normal_mean", "c
 # The rows of the paper's tables of the same meaning (Replica).
 PAPER_ABLATION, PAPER_SPLIT, PAPER_DATA = "tbl_ablation", "tbl_split", "replica"
 PAPER_FULL = "VG2GT (full)"
+# Where an evaluation keeps the figures that are not under GT_POSE.
+GT_POSE = "rendered/gt_pose/solid/"
+PATHS = {
+    "abs_rel_rasterized": "rendered/gt_pose/rasterized/abs_rel",
+    "decoded_abs_rel": "decoded/after/abs_rel",
+    **{name: f"scene/{name}" for name in ("cv", "gaussians")},
+}
 
 
 @dataclass(frozen=True)
@@ -105,6 +117,8 @@ class Ablation:
         variants: options of the group ``ablation``.
         splits: numbers of Gaussians per voxel.
         init_from: weights that the full models begin with; what they lack is initialised with every seed.
+        protocol: preset of the group ``evaluation`` on which every run is scored; None: on the training's own scenes.
+        protocol_overrides: of ``evaluate.yaml``, for the protocol; one number of views.
         results: metrics by run and seed.
         diverged: the continuations without a result.
 
@@ -121,13 +135,18 @@ class Ablation:
     variants: Sequence[str]
     splits: Sequence[int]
     init_from: str | None = None
+    protocol: str | None = None
+    protocol_overrides: Sequence[str] = ()
     diverged: list[str] = field(default_factory=list, init=False)
 
     def __post_init__(self) -> None:
         counts = {name: getattr(self, name) for name in ("seeds", "full_steps", "steps")}
         for name, count in (*counts.items(), *(("splits", count) for count in self.splits)):
-            if not isinstance(count, int) or count < 1:
-                raise ValueError(f"{name}={count}: a study takes whole numbers from 1 on")
+            least = 0 if name.endswith("steps") else 1
+            if not isinstance(count, int) or count < least:
+                raise ValueError(f"{name}={count}: a study takes whole numbers from {least} on")
+        if self.protocol is not None:
+            self._on_protocol(self.folder)
         self.full_splits = int(compose_run(self.overrides, self.folder).model.gaussians.splits)
         self.runs = continuations(self.variants, self.splits, self.full_splits)
         self.results: dict[str, dict[int, Metrics]] = {run.name: {} for run in self.runs}
@@ -144,7 +163,8 @@ class Ablation:
             number += 1
             print(f"[{number}/{total}] seed {seed}: the full model, {self.full_steps} steps", flush=True)
             begin = [f"init_from={quoted(Path(self.init_from))}"] if self.init_from else []
-            run_once([*self.overrides, *begin, f"seed={seed}", f"trainer.max_steps={self.full_steps}"], home / "start")
+            overrides = [*self.overrides, *begin, f"seed={seed}", f"trainer.max_steps={self.full_steps}"]
+            run_once(overrides, home / "start", scored=self.protocol is None)
             start = final_checkpoint(home / "start", self.full_steps)
             for run in self.runs:
                 number += 1
@@ -162,7 +182,19 @@ class Ablation:
             start = write_part(start, cut, lambda name: not name.startswith(LAST_LAYER))
         overrides = [*self.overrides, *run.overrides, f"seed={CONTINUATION_SEED + seed}"]
         overrides += [f"trainer.max_steps={self.steps}", f"optimizer.lr={self.lr}", f"init_from={quoted(start)}"]
-        return run_once(overrides, home / run.name.replace("=", "-"))
+        folder = home / run.name.replace("=", "-")
+        metrics = run_once(overrides, folder, scored=self.protocol is None)
+        return metrics if self.protocol is None else _figures(evaluate(self._on_protocol(folder)))
+
+    def _on_protocol(self, folder: Path) -> DictConfig:
+        """The evaluation of the run in ``folder`` on the protocol."""
+        settled = ("name=protocol", f"ckpt={quoted(folder)}", f"output_dir={quoted(folder / str(self.protocol))}")
+        config = compose("evaluate", f"evaluation={self.protocol}", "views=10", *self.protocol_overrides, *settled)
+        if len(view_counts(config.views)) > 1:
+            raise ValueError(
+                f"protocol_overrides: views={config.views}, but a study has one row a run: give one number"
+            )
+        return config
 
     def write(self) -> None:
         """Writes ``metrics.json`` and ``metrics.md``."""
@@ -173,6 +205,7 @@ class Ablation:
             "lr": self.lr,
             "overrides": list(self.overrides),
             "init_from": self.init_from,
+            "protocol": [self.protocol, *self.protocol_overrides],
             "diverged": self.diverged,
             "runs": {name: {str(seed): m for seed, m in runs.items()} for name, runs in self.results.items()},
             "summary": summarize(self.results, FULL),
@@ -216,6 +249,9 @@ class Ablation:
         done = min((len(runs) for runs in self.results.values()), default=0)
         diverged = f" Diverged: {'; '.join(self.diverged)}." if self.diverged else ""
         begin = f" from {self.init_from}" if self.init_from else ""
+        scenes = ", depth aligned by one median scale per scene"
+        if self.protocol is not None:
+            scenes = f", as in vg2gt evaluate evaluation={self.protocol} {' '.join(self.protocol_overrides)}".rstrip()
         return (
             f"Full model {self.full_steps} steps{begin}, then every row (the full model as well) {self.steps} steps "
             f"more from it, at a learning rate of {self.lr:g}, with the same batches. "
@@ -223,13 +259,19 @@ class Ablation:
             "seeds (Student's t; none for one seed). Seeds differ in weights and training batches; all see the same "
             "held-out scenes, so the intervals say nothing of other scenes. Every difference is judged by itself: "
             "of twenty true zeros one is called better or worse. Views never trained on, at ground-truth "
-            "poses; depth rendered as stochastic solids and aligned by one median scale per scene, whatever the "
-            "training rendered (the 3DGS row too: its own rasterised depth is given below). Where the number of splits "
-            "differs from the full model's, the last layer is new; the control shows what that alone costs, and "
-            "is what these rows are compared with in the last table. The paper's rows are Replica, 30000 more steps, "
-            "and LPIPS of VGG; compare orders, not values. LPIPS is not measured while training: vg2gt "
-            "evaluate ckpt=RUN has it, if its weights are there."
+            f"poses{scenes}; depth rendered as stochastic solids, whatever the training rendered (the 3DGS row too: "
+            "its own rasterised depth is given below). Where the number of splits differs from the full model's, the "
+            "last layer is new; the control shows what that alone costs, and is what these rows are compared "
+            "with in the last table. The paper's rows are Replica, 10 views, 30000 more steps, and LPIPS of VGG; "
+            "compare orders, not values. LPIPS is measured on a protocol only, where its weights are there."
         )
+
+
+def _figures(report: Mapping[str, Any]) -> Metrics:
+    """What the tables show of an evaluation's report, by the names that a training's figures have."""
+    ((_, views),) = report["views"].items()
+    found = {name: views["mean"].get(PATHS.get(name, GT_POSE + name)) for name in (*PAPER_COLUMNS, *OUR_COLUMNS)}
+    return {name: value for name, value in found.items() if value is not None}
 
 
 def _label(name: str) -> str:
@@ -324,4 +366,6 @@ def _study(config: DictConfig) -> Ablation:
         list(config.variants),
         list(config.splits),
         config.init_from,
+        config.protocol,
+        list(config.protocol_overrides),
     )

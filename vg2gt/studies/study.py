@@ -22,6 +22,7 @@ from vg2gt.io.files import read_json, write_json, write_text
 from vg2gt.runs.checkpoints import newest_valid, read_checkpoint, write_checkpoint
 from vg2gt.runs.trust import read_run_config
 from vg2gt.training.loop import build, evaluate, train
+from vg2gt.training.start import load_start
 
 log = logging.getLogger(__name__)
 
@@ -39,14 +40,15 @@ def compose_run(overrides: Sequence[str], folder: Path) -> DictConfig:
     return compose("train", *overrides, f"output_dir={quoted(folder)}")
 
 
-def run_once(overrides: Sequence[str], folder: Path) -> Metrics:
+def run_once(overrides: Sequence[str], folder: Path, scored: bool = True) -> Metrics:
     """Trains and evaluates one run unless ``folder`` already holds its result.
 
-    A run that was interrupted goes on from its newest checkpoint; a model without a trained part is only evaluated.
+    A run that was interrupted goes on from its newest checkpoint; a run of no steps is only evaluated.
 
     Args:
         overrides: of ``train.yaml``.
         folder: the run's own.
+        scored: whether a run of no steps is evaluated, for which its data is needed.
 
     Returns:
         The metrics after training.
@@ -63,7 +65,7 @@ def run_once(overrides: Sequence[str], folder: Path) -> Metrics:
     if result.is_file():
         return read_json(result)["trained"]
     config.ckpt = "auto"
-    report = train(config) if config.trainer.max_steps else _only_evaluate(config, folder)
+    report = train(config) if config.trainer.max_steps else _without_steps(config, folder, scored)
     gc.collect()  # trainer, module and data refer to each other: without it every run's frames stay until much later
     if not report:
         log.warning("interrupted in %s; the same command goes on from there", folder)
@@ -71,10 +73,16 @@ def run_once(overrides: Sequence[str], folder: Path) -> Metrics:
     return report["trained"]
 
 
-def _only_evaluate(config: DictConfig, folder: Path) -> dict[str, Any]:
-    """The result of a run of no steps."""
+def _without_steps(config: DictConfig, folder: Path, scored: bool) -> dict[str, Any]:
+    """The result of a run of no steps: the model as it begins, and its checkpoint if it has a trained part."""
     write_text(folder / "config.yaml", OmegaConf.to_yaml(config, resolve=True))
-    metrics = evaluate(build(config))
+    run = build(config)
+    load_start(run.module, config, None)
+    metrics = evaluate(run) if scored else {}
+    if run.module.model.trained_parameters():
+        checkpoint: dict[str, Any] = {"global_step": 0}
+        run.module.on_save_checkpoint(checkpoint)
+        write_checkpoint(checkpoint, folder / "checkpoints" / "step-0.ckpt")
     report = {"untrained": metrics, "trained": metrics, "steps": 0}
     write_json(folder / "metrics.json", report)
     return report

@@ -46,6 +46,7 @@ class VG2GTModule(lightning.LightningModule):
         warmup_steps: steps of linear warm-up.
         coarse_lr_factor: the coarse module's learning rate over the optimiser's, from beginning to end; > 0, of no
             effect on a model without that module.
+        backend_lr_factor: the backbone's learning rate over the optimiser's, where it is trained; > 0.
         part: what is trained: ``all``, or the ``coarse`` module alone, on the geometry and enhancement losses; nothing
             is rendered then and all other parameters stay as they are.
         pose_noise: share of training scenes whose camera hints are slightly wrong; with ``part="coarse"`` only, as
@@ -58,8 +59,8 @@ class VG2GTModule(lightning.LightningModule):
             uninterrupted one would have drawn; the rank enters only where scenes draw apart (drop-path).
 
     Raises:
-        ValueError: if ``coarse_lr_factor`` is not a positive number, ``part`` is unknown or not in the model, or
-            ``pose_noise`` is no share, or not 0 where views are rendered.
+        ValueError: if a factor of the learning rate is not a positive number, ``part`` is unknown or not in the model,
+            or ``pose_noise`` is no share, or not 0 where views are rendered.
     """
 
     def __init__(
@@ -71,6 +72,7 @@ class VG2GTModule(lightning.LightningModule):
         final_lr: float = 1e-8,
         warmup_steps: int = 0,
         coarse_lr_factor: float = 1.0,
+        backend_lr_factor: float = 0.1,
         part: Part = "all",
         pose_noise: float = 0.0,
         render_views: int | None = None,
@@ -79,10 +81,12 @@ class VG2GTModule(lightning.LightningModule):
         seed: int = 0,
     ) -> None:
         super().__init__()
-        if not 0 < coarse_lr_factor < math.inf:  # the optimiser checks its own rate only
-            raise ValueError(
-                f"training.coarse_lr_factor={coarse_lr_factor} must be a positive number; 1 is the optimiser's rate"
-            )
+        self.lr_factors = {"coarse": coarse_lr_factor, "backend": backend_lr_factor}
+        for name, factor in self.lr_factors.items():
+            if not 0 < factor < math.inf:  # the optimiser checks its own rate only
+                raise ValueError(
+                    f"training.{name}_lr_factor={factor} must be a positive number; 1 is the optimiser's rate"
+                )
         self.model = model
         self.part = part
         if part == "coarse":
@@ -94,7 +98,6 @@ class VG2GTModule(lightning.LightningModule):
         self.make_optimizer = optimizer
         self.final_lr = final_lr
         self.warmup_steps = warmup_steps
-        self.coarse_lr_factor = coarse_lr_factor
         self.render_views = render_views
         self.rasterized_depth = rasterized_depth
         self.seed = seed
@@ -105,7 +108,9 @@ class VG2GTModule(lightning.LightningModule):
         self._figures: dict[str, Tensor] = {}
         self._metrics: dict[tuple[str | int, ...], dict[str, float]] = {}
         self.made_of: str | None = None  # the configuration of the model's parts, for checkpoints
-        self.strict_loading = False  # backbone weights are never stored; load_state_dict checks everything else
+        self.strict_loading = (
+            False  # weights of a frozen backbone are not stored; load_state_dict checks everything else
+        )
 
     # ------------------------------------------------------------------------------------------------- training
 
@@ -239,7 +244,7 @@ class VG2GTModule(lightning.LightningModule):
 
     def configure_optimizers(self) -> dict[str, Any]:
         """Optimiser over the trained parameters and a per-step cosine schedule over the whole run."""
-        optimizer = self.make_optimizer(parameter_groups(self.model, {"coarse": self.coarse_lr_factor}))
+        optimizer = self.make_optimizer(parameter_groups(self.model, self.lr_factors))
         initial_lr = optimizer.param_groups[0]["lr"]
         for group in optimizer.param_groups:
             group["lr"] *= group.pop("lr_factor", 1.0)
@@ -274,7 +279,7 @@ class VG2GTModule(lightning.LightningModule):
     # ---------------------------------------------------------------------------------------------- checkpoints
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Keeps the trained part only, the backbone's identity, and how the model was configured."""
+        """Keeps the trained part only, the identity of the backbone it began with, and how the model was configured."""
         checkpoint["state_dict"] = {MODEL_PREFIX + name: value for name, value in self.model.trained_state().items()}
         checkpoint["backend"] = dict(self.model.backend.identity())
         checkpoint["skipped_steps"] = self.skipped.state_dict()
