@@ -1,4 +1,4 @@
-"""A backend and a data set in a package of their own (docs/add-a-backend.md, docs/add-a-dataset.md)."""
+"""A backend and a data set in a package of their own (docs/guides/backend.md, docs/guides/dataset.md)."""
 
 from torch.nn import functional as F
 
