@@ -11,7 +11,7 @@ from backends.sweep.volume import from_inverse
 from recipes.sweep.samples import Sample
 
 _CLAMP = 2.0  # log-depth errors beyond it do not count more
-_BEYOND = 4.0  # times the farthest plane, the most that is decoded: what is farther has to be said to be so
+_BEYOND = 1.5  # times the farthest plane: what is farther, or sky, only has to be said to be at least that far
 _ROOM = 1.0  # log-depth behind that at which it may be, so that it does not run away
 _BEYOND_ERROR = 0.7  # relative error that the uncertainty of such pixels should state at least
 WEIGHTS = {"depth": 2.0, "uncertainty": 0.15, "gradient": 1.0, "planes": 0.4, "position": 2.0, "swept": 1.0}

@@ -23,7 +23,7 @@ from vg2gt.types import Cameras
 _SIZES = ((80, 160), (112, 224), (112, 144), (144, 192))
 _SIZE_SHARES = (0.6, 0.15, 0.15, 0.1)
 _UPRIGHT_SHARE = 0.3  # of samples turned by 90 degrees, as upright photographs are
-_CUT_SHARE = 0.1  # of samples whose planes end before the scene does
+_CUT_SHARE = 0.25  # of samples whose planes end before the scene does
 _LEAST_OVERLAP = 0.15
 _WALK_FRAMES, _WALK_STEP = 14, math.radians(9)  # paths of more frames, or larger turns between them, are no walks
 _VIEWS = 4

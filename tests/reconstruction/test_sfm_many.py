@@ -123,7 +123,7 @@ def test_copies_count_once_and_parts_are_named(kept: Path, photos: Path, tmp_pat
     (tmp_path / "more").mkdir()
     shutil.copy(photos / "IMG_9.jpg", tmp_path / "more" / "same.jpg")
     sfm.find_cameras(find_pictures([photos, tmp_path / "more"]), kept, Monitor())
-    assert "1 images are copies of others and are left out: same (of IMG_9)" in caplog.text
+    assert "1 images are copies of others and are left out: same (as IMG_9)" in caplog.text
     assert "1 of 4 images overlap too little with the others" in caplog.text
     assert "1 of them form another part, which nothing connects with the 3 images taken" in caplog.text
     assert "reconstruct that part alone: IMG_11" in caplog.text

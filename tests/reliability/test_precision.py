@@ -19,6 +19,7 @@ import vg2gt.method.additions.surface_evidence
 import vg2gt.method.coarse
 import vg2gt.method.fine
 import vg2gt.rendering.renderer
+import vg2gt.rendering.scenes
 import vg2gt.training.module
 from tests.reliability.steps import first_batches, fit, tiny_run
 from tests.training_helpers import full_model
@@ -164,7 +165,7 @@ PLACES: list[tuple[Any, str]] = [
     (vg2gt.method.fine, "pool_mean"),
     (vg2gt.method.fine, "pool_min"),
     (vg2gt.training.module, "training_cameras"),
-    (vg2gt.rendering.renderer, "_scene_views"),
+    (vg2gt.rendering.scenes, "_scene_views"),
     (Renderer, "__call__"),
     (SceneScale, "__call__"),
     (GeometryLoss, "__call__"),

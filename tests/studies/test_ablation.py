@@ -238,7 +238,7 @@ def test_given_weights_on_a_protocol(
     assert "as in vg2gt evaluate evaluation=synthetic views=2" in some.report()
     with pytest.raises(ValueError, match=r"protocol_overrides: views=\[3, 10\].*give one number"):
         Ablation(*arguments, "synthetic", ["views=[3,10]"])
-    with pytest.raises(ValueError, match="there is no evaluation=replicas, did you mean replica"):
+    with pytest.raises(ValueError, match="Could not find 'evaluation/replicas'"):
         Ablation(*arguments, "replicas")
 
 

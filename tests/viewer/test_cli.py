@@ -58,7 +58,7 @@ def test_mistakes_end_with_one_line(files: Path, capsys: pytest.CaptureFixture) 
     html, ply = ("--html", files / "page.html"), files / "scene.ply"
     cases: list[tuple[tuple[Path | str, ...], str]] = [
         ((files / "absent.ply", *html), "absent.ply"),
-        ((files / "cameras.json", *html), "expected a scene of Gaussians, .ply or .splat"),
+        ((files / "cameras.json", *html), "expected a scene of Gaussians, .ply"),
         ((files / "broken.ply", *html), "broken.ply"),
         ((files / "empty.ply", *html), "empty.ply holds no Gaussians"),
         ((ply, *html, "--port", "9000"), "leave out --host, --port and --share"),
