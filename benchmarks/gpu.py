@@ -145,6 +145,7 @@ def _step(setting: Setting, case: Any) -> Iterator[Result]:
     optimizer, batch = module.make_optimizer(parameter_groups(module.model)), batch.context
 
     def whole() -> None:
+        """One training step."""
         with run.trainer.precision_plugin.train_step_context():
             loss = step_loss(batch)
         with clock.stage("backward"):

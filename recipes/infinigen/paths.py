@@ -184,6 +184,7 @@ def _walk(space: Space, rng: np.random.Generator, count: int, field_of_view: flo
     """A straight walk with bobbing and a slow pan, in steps of 8 to 25 cm."""
 
     def draw() -> _Path:
+        """One try; empty if there is no space."""
         start, end = _stand(space, rng), _stand(space, rng)
         if start is None or end is None or np.linalg.norm(end - start) < 0.8:
             return []
@@ -207,6 +208,7 @@ def _turn(space: Space, rng: np.random.Generator, count: int, field_of_view: flo
     """A turn on the spot in steps of 10 to 35 degrees, the camera an arm's length from the axis."""
 
     def draw() -> _Path:
+        """One try; empty if there is no space."""
         stand = _stand(space, rng, 0.4)
         if stand is None:
             return []
@@ -228,6 +230,7 @@ def _orbit(near: bool, space: Space, rng: np.random.Generator, count: int, field
     """Around a thing in steps of 10 to 40 degrees, as far as there is space; places that are not free are skipped."""
 
     def draw() -> _Path:
+        """One try; empty if there is no space."""
         *center, size = space.objects[rng.integers(len(space.objects))]
         target = np.array(center)
         distance = size + (rng.uniform(0.35, 0.9) if near else rng.uniform(1.0, 2.5))
@@ -252,6 +255,7 @@ def _near(space: Space, rng: np.random.Generator, count: int, field_of_view: flo
     """Sideways past a thing, 30 to 70 cm in front of it."""
 
     def draw() -> _Path:
+        """One try; empty if there is no space."""
         *center, size = space.objects[rng.integers(len(space.objects))]
         target = np.array(center)
         away = _look(rng.uniform(0, 2 * np.pi), rng.uniform(0.0, 0.9))

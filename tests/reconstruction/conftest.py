@@ -10,6 +10,7 @@ from tests.data.sources.layout_rgbd import write_recording
 from tests.data.sources.layouts import pixels
 from tests.reconstruction.stand_in import PlaneAhead
 from tests.training_helpers import write_run
+from vg2gt.cli import reconstruct as reconstruct_command
 from vg2gt.data import SyntheticScenes
 from vg2gt.reconstruction.pipeline import reconstruct_with
 from vg2gt.reconstruction.scene import Scene
@@ -74,3 +75,9 @@ def scene(ready, recording) -> Scene:
 def run_folder(ready, tmp_path_factory) -> Path:
     """A training run's folder, its head known by a mark in one weight."""
     return write_run(tmp_path_factory.mktemp("outputs") / "quickstart", ready.model, mark=0.25)
+
+
+def run(*arguments: str | Path) -> None:
+    """``vg2gt reconstruct`` with a stand-in of a backbone."""
+    plain = [*STAND_IN, "--device", "cpu", "--quiet"]
+    reconstruct_command.main([*map(str, arguments), *plain])

@@ -230,16 +230,23 @@ class _Fields:
         self.content = content
 
     def wrong(self, name: str, value: Any, expected: str) -> FormatError:
+        """The error of a field that is missing or not as expected."""
         found = "is missing" if name not in self.content else f"is {short(value)}"
         return FormatError(f"{self.path}: {self.prefix}{name} {found}, expected {expected}")
 
     def get(self, name: str, kind: type, expected: str) -> Any:
+        """A field of one kind, None if it is missing.
+
+        Raises:
+            FormatError: if it is of another kind.
+        """
         value = self.content.get(name)
         if value is not None and not isinstance(value, kind):
             raise self.wrong(name, value, expected)
         return value
 
     def text(self, name: str) -> str | None:
+        """A text, None if it is missing."""
         return self.get(name, str, "a file name")
 
     def number(self, name: str, low: float = -math.inf, high: float = math.inf) -> float | None:
@@ -254,6 +261,7 @@ class _Fields:
         return number
 
     def pixels(self, name: str) -> int | None:
+        """A whole number of pixels, None if it is missing."""
         value = self.number(name, 0, MAX_SIZE)
         if value is None:
             return None

@@ -69,19 +69,23 @@ class _View:
 
     @property
     def across(self) -> int:
+        """Tiles in a row."""
         return -(-self.size[1] // tiles.TILE)
 
     @property
     def tiles(self) -> int:
+        """Tiles of the image."""
         return self.across * -(-self.size[0] // tiles.TILE)
 
     @property
     def tile_ranges(self) -> list[tuple[int, int]]:
+        """First and last tile (exclusive) of every piece of work."""
         starts = range(0, self.tiles, TILES_PER_ITEM)
         return [(start, min(start + TILES_PER_ITEM, self.tiles)) for start in starts]
 
     @property
     def blocks(self) -> range:
+        """Numbers of the blocks of ``BLOCK`` Gaussians."""
         return range(-(-len(self.means) // BLOCK))
 
 

@@ -71,6 +71,7 @@ def start_server(scene: ViewerScene, host: str = LOOPBACK, port: int = PORT, sha
         """Publishes only what may be published."""
 
         def request_share_url(self, verbose: bool = True) -> str | None:
+            """The public address, None unless ``share``."""
             return super().request_share_url(verbose) if share else None
 
     with _refusing_other_pages(share):

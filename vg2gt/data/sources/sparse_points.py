@@ -82,6 +82,7 @@ class _Points:
 
     @staticmethod
     def of(model: Reconstruction, images: Sequence[Image]) -> _Points:
+        """The points of a model and what each of ``images`` observed of them."""
         points = model.points3D
         row_of = {number: row for row, number in enumerate(points)}
         rows, views, features = [], [], []

@@ -1,0 +1,155 @@
+"""The frame and unit of what is written, and cameras that people bring."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from tests.reconstruction.conftest import SIZE, run
+from tests.reconstruction.test_given_cameras import put_cameras, put_colmap, put_transforms
+from vg2gt import io
+from vg2gt.geometry.cameras import project
+from vg2gt.reconstruction import sfm
+from vg2gt.reconstruction.frame import upright_rotation
+from vg2gt.reconstruction.given_cameras import given_pictures
+from vg2gt.reconstruction.pipeline import reconstruct_with
+from vg2gt.reconstruction.saved import read_scene
+from vg2gt.rendering import Renderer
+from vg2gt.runs.load import load_model
+
+
+@pytest.mark.parametrize("put", [put_colmap, put_transforms, put_cameras])
+def test_given_cameras_keep_their_frame_and_unit(folder: Path, frames, put, tmp_path: Path) -> None:
+    """Item 9."""
+    put(folder, frames)
+    given = {picture.name: picture.pose for picture in given_pictures(folder) or []}
+    run(folder, "--out", tmp_path / "out", "--save", "cameras.json,scene.ply,report.json,views.npz")
+    cameras = io.read_cameras_json(tmp_path / "out" / "cameras.json")
+    for camera in cameras:
+        pose = given[Path(camera.name).stem]
+        np.testing.assert_allclose(camera.world_to_camera, pose, atol=1e-6)
+        np.testing.assert_allclose(camera.similarity, np.eye(4), atol=1e-5)
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["frame"] == "given"
+    assert report["similarity_to_cameras"]["scale"] == pytest.approx(1, abs=1e-5)
+    scene = read_scene(tmp_path / "out", Renderer())
+    assert scene.frame.name == "given"
+    seen = scene.depth[scene.depth > 0].median()
+    assert seen == pytest.approx(float(frames.depth[frames.depth > 0].median()), rel=0.6)  # the stand-in's plane
+    # Gaussians project to where the decoded depth is: means, cameras and depth moved together.
+    pixels, depth = project(scene.gaussians.means[None, None], scene.cameras.select(slice(0, 1)))
+    inside = (depth[0, 0] > 0) & (pixels[0, 0] >= 0).all(-1) & (pixels[0, 0] < torch.tensor(SIZE[::-1])).all(-1)
+    assert inside.float().mean() > 0.2
+
+
+def test_frames_that_can_be_chosen_go_into_one_another(folder: Path, frames, model, tmp_path: Path) -> None:
+    """Item 9: the similarity in report.json takes any of them to the given one."""
+    put_colmap(folder, frames)
+    scenes = {name: reconstruct_with(model, folder, frame=name) for name in ("given", "first", "upright")}
+    given = scenes["given"]
+    for name, scene in scenes.items():
+        to_given = torch.from_numpy(scene.frame.to_source).float()
+        means = scene.gaussians.means @ to_given[:3, :3].T + to_given[:3, 3]
+        torch.testing.assert_close(means, given.gaussians.means, atol=2e-4, rtol=0)
+        scale = float(torch.linalg.det(to_given[:3, :3]) ** (1 / 3))
+        torch.testing.assert_close(scene.gaussians.scales * scale, given.gaussians.scales, atol=1e-6, rtol=1e-3)
+        torch.testing.assert_close(scene.depth * scale, given.depth, atol=1e-5, rtol=1e-4)
+        one, other = next(scene.render()), next(given.render())
+        assert (one.color - other.color).abs().mean() < 2e-3, name
+    assert torch.allclose(scenes["first"].cameras.world_to_camera[0, 0], torch.eye(4), atol=1e-5)
+    down = scenes["upright"].cameras.world_to_camera[0, :, 1, :3].mean(0)
+    assert down[1] / down.norm() > 0.9
+    assert scenes["upright"].metres_per_unit is None
+
+
+def test_metric_cameras_give_metres(recording: Path, ready) -> None:
+    """Item 9: metres_per_unit was null."""
+    scene = reconstruct_with(ready.model, recording)
+    assert scene.metres_per_unit == pytest.approx(1)
+    first = reconstruct_with(ready.model, recording, frame="first")
+    assert first.metres_per_unit == pytest.approx(first.frame.scale)
+    assert first.metres_per_unit != pytest.approx(1, abs=0.01)
+
+
+def test_map_coordinates_keep_their_digits(folder: Path, frames, model, caplog) -> None:
+    """Item 9: GPS. The shift is left out of what single precision has to hold, and said."""
+    shift = np.array([4_400_000.0, 600_000.0, 300.0])
+    poses = frames.world_to_camera.double().clone()
+    poses[:, :3, 3] -= poses[:, :3, :3] @ torch.from_numpy(shift)
+    put_cameras(folder, replace(frames, world_to_camera=poses))
+    scene = reconstruct_with(model, folder)
+    assert "the scene is written shifted by" in caplog.text
+    assert scene.gaussians.means.abs().max() < 1000
+    np.testing.assert_allclose(scene.frame.to_source[:3, 3], shift, atol=20)
+    for camera, pose in zip(scene.named_cameras(), poses.numpy(), strict=True):
+        np.testing.assert_allclose(camera.world_to_camera @ np.linalg.inv(scene.frame.to_source), pose, atol=2e-6 * 4e6)
+
+
+def test_there_is_no_given_frame_without_given_cameras(photos: Path) -> None:
+    images_alone = load_model(backend="da3_tiny", device="cpu").model
+    with pytest.raises(ValueError, match="no cameras are given, so --frame given is not possible"):
+        reconstruct_with(images_alone, photos, frame="given")
+    scene = reconstruct_with(images_alone, photos)
+    assert scene.frame.name == "upright"
+
+
+def test_gravity_is_across_the_cameras_even_if_they_look_down() -> None:
+    poses = []
+    for angle in np.linspace(0, 2, 9):  # part of an orbit, looking down by 40 degrees
+        turn = np.array([[np.cos(angle), 0, -np.sin(angle)], [0, 1, 0], [np.sin(angle), 0, np.cos(angle)]])
+        pitch, c, s = np.eye(3), np.cos(0.7), np.sin(0.7)
+        pitch[1:, 1:] = [[c, s], [-s, c]]
+        pose = np.eye(4)
+        pose[:3, :3] = pitch @ turn
+        poses.append(pose)
+    tilt = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+    tilt *= np.sign(np.linalg.det(tilt))
+    tilted = np.stack(poses)
+    tilted[:, :3, :3] = tilted[:, :3, :3] @ tilt.T
+    down = upright_rotation(tilted) @ tilt @ [0, 1, 0]
+    assert down[1] > 0.999
+
+
+def test_output_in_the_photographs_folder_does_not_become_input(folder: Path, frames, monkeypatch) -> None:
+    """Item 5: cameras of undistorted images were taken for the distorted originals."""
+    put_colmap(folder, frames)
+    found = [
+        replace(picture, source="structure from motion, 4 of 4 images", lens="unknown")
+        for picture in given_pictures(folder) or []
+    ]
+    shutil.rmtree(folder / "sparse")
+    asked = []
+    monkeypatch.setattr("vg2gt.reconstruction.cameras.find_cameras", lambda *_: asked.append(1) or found)
+    monkeypatch.setattr(sfm, "require_pycolmap", lambda: None)
+    images = folder / "images"
+    for number in (1, 2):
+        run(images, "--out", images, "--save", "cameras.json,report.json", "--overwrite")
+        assert len(asked) == number
+        assert json.loads((images / "report.json").read_text())["cameras"].startswith("structure from motion")
+
+
+def test_own_cameras_serve_the_original_photographs(folder: Path, frames, tmp_path: Path) -> None:
+    """Item 23: of whole photographs, also where the working size cut them."""
+    put_colmap(folder, frames)
+    run(folder, "--out", tmp_path / "out", "--save", "cameras.json", "--size", "70x70")
+    shutil.rmtree(folder / "sparse")
+    shutil.copy(tmp_path / "out" / "cameras.json", folder)
+    pictures = given_pictures(folder)
+    loaded = pictures[2].read(SIZE)
+    assert loaded.images.shape[-2:] == SIZE
+    assert torch.allclose(loaded.intrinsics[0], frames.intrinsics[2], atol=1e-3)
+    assert torch.allclose(loaded.world_to_camera[0], frames.world_to_camera[2], atol=1e-6)
+
+
+def test_a_tilde_is_the_home_folder(folder: Path, frames, tmp_path: Path, monkeypatch) -> None:
+    """Item 12."""
+    put_colmap(folder, frames)
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.chdir(tmp_path)
+    run(folder, "--out", "~/x", "--save", "cameras.json")
+    assert (tmp_path / "home" / "x" / "cameras.json").is_file()
+    assert not (tmp_path / "~").exists()
