@@ -30,17 +30,19 @@ def main(config: DictConfig) -> None:
     lightning.seed_everything(config.seed)
     out = Path(config.out)
     out.mkdir(parents=True, exist_ok=True)
-    files = []
-    for number, path in enumerate(make_scenes(config.scenes.folder, config.scenes.count, config.scenes.first_seed), 1):
+    files, scenes = [], config.scenes
+    made = make_scenes(scenes.folder, scenes.count, scenes.first_seed, tuple(scenes.size), scenes.workers)
+    for number, path in enumerate(made, 1):
         files.append(path)
-        if number % 50 == 0 or number == config.scenes.count:
-            print(f"scenes: {number} of {config.scenes.count}", flush=True)
+        if number % 50 == 0 or number == scenes.count:
+            print(f"scenes: {number} of {scenes.count}", flush=True)
     checkpoint = newest_checkpoint(out) if config.resume == "auto" else config.resume
     training: SweepTraining = hydra.utils.instantiate(config.training)
     first = start_step(checkpoint) if checkpoint else 0
-    per_step = config.processes
+    per_step = config.processes * config.nodes
     rooms = read_infinigen(config.infinigen.folder, config.scenes.folder) if config.infinigen.folder else []
-    every = TrainingSamples(files, training.steps * per_step, config.seed, rooms, config.infinigen.share)
+    count, drawn = training.steps * per_step, config.samples
+    every = TrainingSamples(files, count, config.seed, rooms, config.infinigen.share, drawn.views, drawn.sizes)
     samples = Subset(every, range(first * per_step, len(every)))
     if config.begin and not checkpoint:
         begin_with(training, Path(config.begin))
@@ -50,9 +52,11 @@ def main(config: DictConfig) -> None:
         out, "step-{step:06d}", every_n_train_steps=config.save_every, save_top_k=-1, auto_insert_metric_name=False
     )
     trainer = lightning.Trainer(
-        accelerator="cpu",
+        accelerator=config.accelerator,
         devices=config.processes,
-        strategy="auto" if config.processes == 1 else DDPStrategy(gradient_as_bucket_view=True),
+        num_nodes=config.nodes,
+        # gloo, because NCCL wants a GPU for each process
+        strategy="auto" if per_step == 1 else DDPStrategy(gradient_as_bucket_view=True, process_group_backend="gloo"),
         precision="bf16-mixed",
         max_steps=training.steps,
         callbacks=[keep, RichProgressBar()],
@@ -60,7 +64,8 @@ def main(config: DictConfig) -> None:
         log_every_n_steps=50,
         enable_model_summary=False,
     )
-    trainer.fit(training, DataLoader(samples, batch_size=None), ckpt_path=checkpoint, weights_only=True)
+    workers = {"num_workers": config.workers, "pin_memory": config.accelerator == "gpu"}
+    trainer.fit(training, DataLoader(samples, batch_size=None, **workers), ckpt_path=checkpoint, weights_only=True)
     if trainer.is_global_zero:
         print(write_weights(training, out / "sweep.safetensors", config))
 

@@ -16,17 +16,18 @@ from torch import Tensor
 from torch.nn import functional as F
 from torch.utils.data import Dataset
 
-from recipes.sweep.scenes import SceneFrames, read_scene
+from recipes.sweep.scenes import SceneFrames, is_room, read_scene
 from vg2gt.geometry.cameras import crop_intrinsics, project, resize_intrinsics, rigid_motions, unproject
 from vg2gt.types import Cameras
 
-_SIZES = ((80, 160), (112, 224), (112, 144), (144, 192))
-_SIZE_SHARES = (0.6, 0.15, 0.15, 0.1)
 _UPRIGHT_SHARE = 0.3  # of samples turned by 90 degrees, as upright photographs are
 _CUT_SHARE = 0.25  # of samples whose planes end before the scene does
+_CUT, _CUT_INDOORS = (
+    (0.5, 0.98),
+    (0.85, 0.98),
+)  # quantiles where they end: walls of rooms are near
 _LEAST_OVERLAP = 0.15
 _WALK_FRAMES, _WALK_STEP = 14, math.radians(9)  # paths of more frames, or larger turns between them, are no walks
-_VIEWS = 4
 _PLANES = (32, 48)  # few sizes: CPUs compile their convolutions for each
 _SOURCES, _SOURCE_SHARES = (2, 3), (0.7, 0.3)
 _POSE_SHARE, _TURN, _SHIFT = 0.5, 0.0015, 0.002  # share of samples with pose noise; rad; depths
@@ -63,15 +64,27 @@ class TrainingSamples(Dataset[Sample]):
         files: cached scenes.
         count: number of samples.
         seed: of all draws.
-        more: scenes of a second kind, such as rooms of Infinigen.
+        more: scenes of a second kind, rooms of Infinigen.
         share: of the samples that come from ``more``, if there are any.
+        views: of a sample.
+        sizes: height and width of its images and how often they are drawn, ``((height, width, share), ...)``.
     """
 
     def __init__(
-        self, files: Sequence[Path], count: int, seed: int, more: Sequence[Path] = (), share: float = 0.25
+        self,
+        files: Sequence[Path],
+        count: int,
+        seed: int,
+        more: Sequence[Path] = (),
+        share: float = 0.25,
+        views: int = 4,
+        sizes: Sequence[Sequence[float]] = ((80, 160, 1.0),),
     ) -> None:
         self.files, self.count, self.seed = list(files), count, seed
         self.more, self.share = list(more), share if more else 0.0
+        self.views, self.sizes = views, [(int(height), int(width)) for height, width, _ in sizes]
+        shares = np.array([share for *_, share in sizes])
+        self.shares = shares / shares.sum()
 
     def __len__(self) -> int:
         return self.count
@@ -80,11 +93,12 @@ class TrainingSamples(Dataset[Sample]):
         rng = np.random.default_rng((self.seed, index))
         while True:
             files = self.more if self.share and rng.random() < self.share else self.files
-            scene = read_scene(files[rng.integers(len(files))])
-            views = _upright(_crop(_choose_views(scene, rng), rng), rng)
+            path = files[rng.integers(len(files))]
+            views = _choose_views(read_scene(path), self.views, rng)
+            views = _upright(_crop(views, self.sizes[rng.choice(len(self.sizes), p=self.shares)], rng), rng)
             valid = views.depth[(views.depth > 0) & views.depth.isfinite()]
             if len(valid) >= _LEAST_PIXELS:
-                return _finish(views, valid, rng)
+                return _finish(views, valid, _CUT_INDOORS if is_room(path) else _CUT, rng)
 
 
 class _Crop(NamedTuple):
@@ -94,10 +108,10 @@ class _Crop(NamedTuple):
     intrinsics: Tensor  # [V, 3, 3]
 
 
-def _choose_views(scene: SceneFrames, rng: Generator) -> _Crop:
+def _choose_views(scene: SceneFrames, count: int, rng: Generator) -> _Crop:
     """Views that overlap: a stretch of a walk, or of other paths what sees the same as a view drawn at random."""
     rotations = scene.world_to_camera[:, :3, :3]
-    frames, count = len(scene.images), _VIEWS
+    frames = len(scene.images)
     step = np.median([_angle(*pair) for pair in pairwise(rotations)])
     if frames <= _WALK_FRAMES and step < _WALK_STEP:
         field = 2 * math.atan(0.5 * scene.images.shape[2] / float(scene.intrinsics[0, 0, 0]))
@@ -138,10 +152,9 @@ def _angle(first: Tensor, second: Tensor) -> float:
     return math.acos(max(-1.0, min(1.0, cosine)))
 
 
-def _crop(views: _Crop, rng: Generator) -> _Crop:
-    """One random window of all views, resized to one of the training sizes; half of them mirrored."""
+def _crop(views: _Crop, target: tuple[int, int], rng: Generator) -> _Crop:
+    """One random window of all views, resized to ``target`` (height, width); half of them mirrored."""
     height, width = views.depth.shape[-2:]
-    target = _SIZES[rng.choice(len(_SIZES), p=_SIZE_SHARES)]
     most = min(height / target[0], width / target[1])
     zoom = math.exp(rng.uniform(math.log(min(0.8, most)), math.log(most)))
     rows, columns = int(target[0] * zoom), int(target[1] * zoom)
@@ -176,8 +189,11 @@ def _upright(views: _Crop, rng: Generator) -> _Crop:
     return _Crop(images.contiguous(), depth.contiguous(), poses, intrinsics)
 
 
-def _finish(views: _Crop, valid: Tensor, rng: Generator) -> Sample:
-    """Draws the unit, the planes' range around the true one, the noise of the poses and the look."""
+def _finish(views: _Crop, valid: Tensor, cut: tuple[float, float], rng: Generator) -> Sample:
+    """Draws the unit, the planes' range around the true one, the noise of the poses and the look.
+
+    In some samples the planes end at a quantile of the depth between those of ``cut``.
+    """
     unit = math.exp(rng.normal(0, 0.5))  # the world's unit is nothing to go by
     poses, depth = views.world_to_camera.clone(), views.depth * unit
     poses[:, :3, 3] *= unit
@@ -185,7 +201,7 @@ def _finish(views: _Crop, valid: Tensor, rng: Generator) -> Sample:
         float(unit * torch.quantile(valid[:: max(len(valid) // 4000, 1)], q)) for q in (0.01, 0.5, 0.99)
     )
     if rng.random() < _CUT_SHARE:  # as structure from motion does that found no point in the background
-        high = float(unit * torch.quantile(valid[:: max(len(valid) // 4000, 1)], rng.uniform(0.5, 0.98)))
+        high = float(unit * torch.quantile(valid[:: max(len(valid) // 4000, 1)], rng.uniform(*cut)))
     near = low * math.exp(-(rng.uniform(0.02, 0.5) if rng.random() < 0.75 else rng.uniform(0, 1.8)))
     far = high * math.exp(rng.uniform(0, 0.6) if rng.random() < 0.75 else rng.uniform(0, 2.5))
     if rng.random() < _POSE_SHARE:

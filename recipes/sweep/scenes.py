@@ -5,7 +5,9 @@ from __future__ import annotations
 import io
 import os
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
 from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 from typing import NamedTuple
 
@@ -48,9 +50,15 @@ class SceneFrames(NamedTuple):
     intrinsics: Tensor
 
 
-def scene_file(folder: Path, seed: int) -> Path:
+def scene_file(folder: Path, seed: int, size: tuple[int, int] = SIZE) -> Path:
     """Where the frames of a seed are kept."""
-    return folder / f"{seed:08d}.npz"
+    return folder / f"{seed:08d}-{size[0]}x{size[1]}.npz"
+
+
+def is_room(path: Path) -> bool:
+    """True if a cached scene is the inside of a room."""
+    first = path.stem.split("-")[0]
+    return first == "infinigen" or _KINDS[int(first) % len(_KINDS)] in ("room", "wide")
 
 
 def read_scene(path: Path) -> SceneFrames:
@@ -59,7 +67,7 @@ def read_scene(path: Path) -> SceneFrames:
     return SceneFrames(*(torch.from_numpy(arrays[name]) for name in SceneFrames._fields))
 
 
-def render_scene(seed: int, threads: int = 1) -> dict[str, NDArray]:
+def render_scene(seed: int, size: tuple[int, int] = SIZE, threads: int = 1) -> dict[str, NDArray]:
     """Renders one training scene: a room, an object, a landmark or a street, the kinds of ``_KINDS`` taking turns.
 
     The world is that of :mod:`vg2gt.data.synthetic`; focal length, roll, shake, highlights and the look of the images
@@ -69,10 +77,10 @@ def render_scene(seed: int, threads: int = 1) -> dict[str, NDArray]:
     kind = _KINDS[seed % len(_KINDS)]
     path = int(rng.choice(_PATH_LENGTHS)) if kind in _WALKS else FRAMES
     shine = (False, True, LOBES)[rng.choice(3, p=(0.5, 0.3, 0.2))]
-    scene = VARIANTS[kind](seed, path, SIZE, shine)
-    focal = 0.5 * SIZE[1] / np.tan(rng.uniform(0.75, 1.5) / 2)
+    scene = VARIANTS[kind](seed, path, size, shine)
+    focal = 0.5 * size[1] / np.tan(rng.uniform(0.75, 1.5) / 2)
     if kind in _WALKS or kind == "wide":
-        scene.intrinsics = np.array([[focal, 0, (SIZE[1] - 1) / 2], [0, focal, (SIZE[0] - 1) / 2], [0, 0, 1]])
+        scene.intrinsics = np.array([[focal, 0, (size[1] - 1) / 2], [0, focal, (size[0] - 1) / 2], [0, 0, 1]])
     first = int(rng.integers(0, path - FRAMES + 1))
     frames = np.arange(first, first + FRAMES)
     reach = 1.0 if kind == "room" else float(np.linalg.norm(scene.world_to_camera[:, :3, 3], axis=1).mean()) / 2
@@ -112,14 +120,38 @@ def _shake(scene: SyntheticScene, rng: np.random.Generator, metres: float) -> ND
     return np.asarray(motion @ scene.world_to_camera, np.float64)
 
 
-def make_scenes(folder: str | os.PathLike[str], count: int, first_seed: int = FIRST_SEED) -> Iterator[Path]:
-    """Renders ``count`` scenes into ``folder``, those that are there already left out; yields every file."""
+def make_scenes(
+    folder: str | os.PathLike[str],
+    count: int,
+    first_seed: int = FIRST_SEED,
+    size: tuple[int, int] = SIZE,
+    workers: int = 1,
+) -> Iterator[Path]:
+    """Renders ``count`` scenes into ``folder``, those that are there already left out; yields every file.
+
+    Args:
+        folder: created if missing.
+        count: number of scenes.
+        first_seed: of the first scene, the others follow.
+        size: height and width of the frames.
+        workers: processes that render; 1 renders in this one.
+    """
     root = Path(folder).expanduser()
-    for seed in range(first_seed, first_seed + count):
-        path = scene_file(root, seed)
-        if not path.is_file():
-            _write(path, render_scene(seed), root)
-        yield path
+    seeds = range(first_seed, first_seed + count)
+    make = partial(_make_scene, root, tuple(size))
+    if workers == 1:
+        yield from map(make, seeds)
+        return
+    yield make(first_seed)  # compiles the kernels, which the others then find
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        yield from pool.map(make, seeds[1:], chunksize=4)
+
+
+def _make_scene(root: Path, size: tuple[int, int], seed: int) -> Path:
+    path = scene_file(root, seed, size)
+    if not path.is_file():
+        _write(path, render_scene(seed, size), root)
+    return path
 
 
 def read_infinigen(folder: str | os.PathLike[str], cache: str | os.PathLike[str]) -> list[Path]:

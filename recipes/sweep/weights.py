@@ -43,6 +43,7 @@ def write_weights(training: SweepTraining, path: Path, config: DictConfig) -> Pa
         "seed": str(config.seed),
         "begun_with": Path(config.begin).name if config.begin else "random weights",
         "core_hours": f"{training.core_seconds / 3600:.2f}",
+        "device": torch.cuda.get_device_name() if config.accelerator == "gpu" else "cpu",
     }
     write_bytes(path, save(tensors, metadata=made_of))
     return path

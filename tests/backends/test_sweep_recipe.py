@@ -15,7 +15,7 @@ from backends.sweep.network import Sweep, SweepEncoding
 from backends.sweep.volume import from_inverse
 from recipes.sweep.objective import cell_inverse, objective
 from recipes.sweep.samples import Sample, TrainingSamples, _choose_views, _crop, recolour
-from recipes.sweep.scenes import make_scenes, read_infinigen, read_scene
+from recipes.sweep.scenes import is_room, make_scenes, read_infinigen, read_scene
 from recipes.sweep.weights import newest_checkpoint
 from tests.commands import ROOT
 from tests.data.sources import layout_infinigen
@@ -33,6 +33,29 @@ def test_scenes_are_made_once(scenes: list[Path]) -> None:
     before = [path.stat().st_mtime_ns for path in scenes]
     assert list(make_scenes(scenes[0].parent, 4)) == scenes
     assert [path.stat().st_mtime_ns for path in scenes] == before
+
+
+def test_scenes_of_several_processes_are_the_same(scenes: list[Path], tmp_path: Path) -> None:
+    made = list(make_scenes(tmp_path, 3, size=(48, 96), workers=2))
+    alone = list(make_scenes(tmp_path / "alone", 3, size=(48, 96)))
+    assert [path.name for path in made] == [path.name for path in alone]
+    for path, other in zip(made, alone, strict=True):
+        assert all(torch.equal(a, b) for a, b in zip(read_scene(path), read_scene(other), strict=True))
+
+
+def test_planes_reach_the_walls_of_rooms(scenes: list[Path]) -> None:
+    """In rooms at most a seventh of the pixels is beyond the planes, of objects up to half."""
+    assert [is_room(path) for path in scenes] == [True, False, True, True]
+    assert is_room(Path("infinigen-room_0001.npz"))
+
+    def most_beyond(path: Path) -> float:
+        samples = (TrainingSamples([path], 40, seed=0)[index] for index in range(40))
+        return max(
+            float((sample.depth > sample.depth_range[1]).float().sum() / (sample.depth > 0).float().sum())
+            for sample in samples
+        )
+
+    assert most_beyond(scenes[0]) < 0.17
 
 
 def test_views_of_a_sample_see_the_same_points(scenes: list[Path]) -> None:
@@ -64,16 +87,15 @@ class _Draws:
 
     def __init__(self, mirrored: bool) -> None:
         self.random = lambda: 0.1 if mirrored else 0.9
-        self.choice = lambda count, p: 0
         self.uniform = lambda low, high: low
         self.integers = lambda low, high: low
 
 
 def test_mirrored_windows_show_the_mirrored_world(scenes: list[Path]) -> None:
-    views = _choose_views(read_scene(scenes[0]), np.random.default_rng(0))
+    views = _choose_views(read_scene(scenes[0]), 4, np.random.default_rng(0))
     points = []
     for mirrored in (False, True):
-        crop = _crop(views, _Draws(mirrored))  # pyright: ignore[reportArgumentType]
+        crop = _crop(views, (80, 160), _Draws(mirrored))  # pyright: ignore[reportArgumentType]
         size = (crop.depth.shape[-2], crop.depth.shape[-1])
         cameras = Cameras(crop.world_to_camera[None], crop.intrinsics[None], size)
         points.append(unproject(crop.depth[None], cameras)[0])  # [V, H, W, 3]
