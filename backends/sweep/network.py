@@ -19,6 +19,7 @@ from backends.sweep.volume import (
     VolumeNet,
     agreement,
     expectation,
+    near_and_far,
     to_inverse,
 )
 from vg2gt.geometry.cameras import resize_intrinsics
@@ -34,17 +35,19 @@ WIDE_PLANES = 64  # of the sweep that finds the range
 
 
 class PosedViews(NamedTuple):
-    """V views of one scene.
+    """V views of one scene, or of several with equally many views each (training).
 
     Attributes:
         images: ``[V, 3, H, W]`` in [0, 1], H and W multiples of 8.
         world_to_camera: ``[V, 4, 4]``.
         intrinsics: ``[V, 3, 3]`` in pixels, integer pixel centres.
+        scenes: number of scenes; views of one scene follow one another.
     """
 
     images: Tensor
     world_to_camera: Tensor
     intrinsics: Tensor
+    scenes: int = 1
 
     @property
     def size(self) -> tuple[int, int]:
@@ -134,8 +137,8 @@ class SweepNet(nn.Module):
 
         Args:
             features: of ``views.images``.
-            views: of one scene.
-            depth_range: ``[2]`` near and far of the planes.
+            views: of one scene or several.
+            depth_range: ``[2]`` near and far of the planes, or ``[V, 2]`` where scenes differ.
             sources: ``[V, n]`` indices of the views that each is compared with.
             planes: of the first sweep.
         """
@@ -146,7 +149,7 @@ class SweepNet(nn.Module):
         refined = first.t + 0.25 * found[:, :1]
         center = convex_upsample(refined, found[:, 1:])  # a bilinear one would search between the two sides of an edge
         second = self._narrow(features.fine, center.detach(), views, depth_range, sources, planes)
-        inverse = to_inverse(second.t, depth_range).clamp_min(1 / (_FARTHEST * depth_range[1]))
+        inverse = to_inverse(second.t, depth_range).clamp_min(1 / (_FARTHEST * near_and_far(depth_range)[1]))
         swept = torch.cat((-inverse.log(), second.mass), 1)
         grid = (views.size[0] // PATCH, views.size[1] // PATCH)
         cells = torch.cat((features.context, 4 * refined, first.mass, agreeing), 1)
@@ -154,8 +157,9 @@ class SweepNet(nn.Module):
         patches = torch.cat((*parts, F.avg_pool2d(bins, 2)), 1).flatten(2).mT  # [V, P, .]
         depth = F.avg_pool2d(-swept[:, :1], 4).exp().flatten(1).reciprocal()
         with full_precision(depth):
-            place = patch_places(depth.detach(), views.world_to_camera, views.intrinsics, depth_range, grid)
-        taps = self.tokens(patches, place, grid)
+            cameras = (views.world_to_camera, views.intrinsics)
+            place = patch_places(depth.detach(), *cameras, depth_range, grid, views.scenes)
+        taps = self.tokens(patches, place, grid, views.scenes)
         return SweepEncoding(taps, features.context, features.context_fine, swept, first, refined, center, second)
 
     def _narrow(
@@ -166,7 +170,8 @@ class SweepNet(nn.Module):
         reach = _FINE_REACH / (planes - 1)
         offsets = torch.linspace(-reach, reach, _FINE_PLANES, device=fine.device).view(1, -1, 1, 1)
         position = center + offsets  # [V, D, 2 h, 2 w]
-        inverse = to_inverse(position, depth_range).clamp_min(1 / (_FARTHEST * depth_range[1])).flatten(2)
+        least = 1 / (_FARTHEST * near_and_far(depth_range)[1])
+        inverse = to_inverse(position, depth_range).clamp_min(least).flatten(2)
         logits = _match(self.sweep_fine, self.volume_fine, fine, inverse, warp)
         t, mass = expectation(logits, position)
         return Sweep(logits, position, t, mass)

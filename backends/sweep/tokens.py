@@ -35,14 +35,14 @@ class TokenBlock(nn.Module):
         self.query, self.key_value, self.out = nn.Linear(dim, dim), nn.Linear(dim, 2 * dim), nn.Linear(dim, dim)
         self.mlp = nn.Sequential(nn.Linear(dim, 3 * dim), nn.GELU(), nn.Linear(3 * dim, dim))
 
-    def forward(self, x: Tensor, position: Tensor, grid: tuple[int, int]) -> Tensor:
+    def forward(self, x: Tensor, position: Tensor, grid: tuple[int, int], scenes: int = 1) -> Tensor:
         """Maps tokens ``[V, P, dim]`` to the same shape; ``position`` likewise, ``grid`` the patches per axis."""
         views, patches, dim = x.shape
         placed = self.norm(x) + position
         query = self.query(placed)
         keys = F.avg_pool2d(placed.mT.unflatten(-1, grid), 2, ceil_mode=True).flatten(2).mT  # [V, P/4, dim]
         if self.across:
-            query, keys = query.reshape(1, views * patches, dim), keys.reshape(1, -1, dim)
+            query, keys = query.reshape(scenes, -1, dim), keys.reshape(scenes, -1, dim)
         parts = (query, *self.key_value(keys).chunk(2, -1))
         split = [part.unflatten(-1, (self.heads, -1)).transpose(1, 2) for part in parts]  # [., heads, P, dim/heads]
         attended = F.scaled_dot_product_attention(*split).transpose(1, 2).flatten(2).reshape(views, patches, dim)
@@ -64,31 +64,38 @@ class TokenNet(nn.Module):
         self.position = nn.Linear(POSITION_CHANNELS, DIM)
         self.blocks = nn.ModuleList(TokenBlock(DIM, 4, across=i % 2 == 1) for i in range(blocks))
 
-    def forward(self, patches: Tensor, place: Tensor, grid: tuple[int, int]) -> tuple[Tensor, ...]:
+    def forward(self, patches: Tensor, place: Tensor, grid: tuple[int, int], scenes: int = 1) -> tuple[Tensor, ...]:
         """Maps ``patches [V, P, inputs]`` at ``place [V, P, POSITION_CHANNELS]`` to the taps ``[V, P, DIM]``."""
         tokens, position = self.embed(patches), self.position(place)
         taps = []
         for block in self.blocks:
-            tokens = block(tokens, position, grid)
+            tokens = block(tokens, position, grid, scenes)
             taps.append(tokens)
         return tuple(tap.float() for tap in taps[-TAPS:])
 
 
 def patch_places(
-    depth: Tensor, world_to_camera: Tensor, intrinsics: Tensor, depth_range: Tensor, size: tuple[int, int]
+    depth: Tensor,
+    world_to_camera: Tensor,
+    intrinsics: Tensor,
+    depth_range: Tensor,
+    size: tuple[int, int],
+    scenes: int = 1,
 ) -> Tensor:
-    """Where patches are, ``[V, P, POSITION_CHANNELS]``: point and ray in view 0's frame, and place in the image.
+    """Where patches are, ``[V, P, POSITION_CHANNELS]``: point and ray in the first view's frame, place in the image.
 
     Args:
         depth: ``[V, P]`` of the patches.
         world_to_camera: ``[V, 4, 4]``.
         intrinsics: ``[V, 3, 3]`` of the images.
-        depth_range: ``[2]`` near and far; their geometric mean is the unit.
+        depth_range: ``[2]`` or ``[V, 2]`` near and far; their geometric mean is the unit.
         size: patches per axis.
+        scenes: that the views belong to.
     """
-    pose = world_to_camera[:1] @ torch.linalg.inv(world_to_camera)
+    views = len(world_to_camera) // scenes
+    pose = world_to_camera[::views].repeat_interleave(views, 0) @ torch.linalg.inv(world_to_camera)
     ray = rays(resize_intrinsics(intrinsics, 1 / PATCH, 1 / PATCH), size)  # [V, 3, P]
-    unit = depth_range.prod().sqrt()
+    unit = depth_range.prod(-1).sqrt().view(-1, 1, 1)
     point = (pose[:, :3, :3] @ (ray * depth[:, None]) + pose[:, :3, 3:]) / unit
     direction = F.normalize(pose[:, :3, :3] @ ray, dim=1)
     waves = [wave(point * number) for number in _WAVENUMBERS for wave in (torch.sin, torch.cos)]

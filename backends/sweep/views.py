@@ -35,7 +35,7 @@ def choose_sources(
     size: tuple[int, int],
     depth_range: Tensor,
     count: int,
-    jitter: float = 0.0,
+    noise: Tensor | None = None,
 ) -> Tensor:
     """Indices ``[V, n]`` of the views that every view is compared with, the best first.
 
@@ -49,7 +49,7 @@ def choose_sources(
         size: image ``(height, width)``.
         depth_range: ``[2]`` near and far.
         count: sources per view, at most V - 1 are returned.
-        jitter: deviation of log-normal noise on the scores (training).
+        noise: ``[V, V]`` added to the logarithms of the scores (training).
     """
     views = len(world_to_camera)
     scaled = resize_intrinsics(intrinsics, _GRID[1] / size[1], _GRID[0] / size[0])
@@ -66,8 +66,8 @@ def choose_sources(
     inside = (z > 0) & (u > -0.5) & (u < _GRID[1] - 0.5) & (v > -0.5) & (v < _GRID[0] - 0.5)
     parallax = poses[..., :3, 3].norm(dim=-1) / depths[_DEPTHS // 2]
     reward = parallax / (parallax + _LEAST_PARALLAX) / (1 + (parallax / _MOST_PARALLAX) ** 2)
-    if jitter:
-        reward = reward * torch.exp(jitter * torch.randn_like(reward))
+    if noise is not None:
+        reward = reward * torch.exp(noise)
     seen = inside.flatten(2).float()  # [V, s, z p]
     left = torch.ones_like(seen[:, 0])  # [V, z p] what another look at a point is worth
     reward = reward.masked_fill(torch.eye(views, dtype=torch.bool, device=reward.device), -torch.inf)

@@ -12,15 +12,21 @@ _WINDOW = 2  # planes on either side of the best one that are averaged
 _AGREEMENT_WIDTH = 0.03  # relative difference of depths at which agreement falls to 1/e
 
 
+def near_and_far(depth_range: Tensor) -> tuple[Tensor, Tensor]:
+    """The two depths of ``[2]``, or of ``[V, 2]`` as ``[V, 1, 1, 1]``."""
+    near, far = depth_range.unbind(-1)
+    return (near, far) if near.dim() == 0 else (near.view(-1, 1, 1, 1), far.view(-1, 1, 1, 1))
+
+
 def to_inverse(t: Tensor, depth_range: Tensor) -> Tensor:
-    """Inverse depth of ``t``: 0 at far, 1 at near, linear in between."""
-    near, far = depth_range.unbind()
+    """Inverse depth of ``t [V, ., h, w]``: 0 at far, 1 at near, linear in between."""
+    near, far = near_and_far(depth_range)
     return 1 / far + t * (1 / near - 1 / far)
 
 
 def from_inverse(inverse: Tensor, depth_range: Tensor) -> Tensor:
     """``t`` of an inverse depth."""
-    near, far = depth_range.unbind()
+    near, far = near_and_far(depth_range)
     return (inverse - 1 / far) / (1 / near - 1 / far)
 
 

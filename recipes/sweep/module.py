@@ -12,17 +12,15 @@ from torch import Tensor
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from backends.sweep.network import PosedViews, SweepEncoding, SweepNet
-from backends.sweep.views import choose_sources
 from recipes.sweep.objective import objective
 from recipes.sweep.samples import Sample
 from vg2gt.geometry.precision import full_precision
 
 _LARGEST_GRADIENT = 1.0
-_SOURCE_JITTER = 0.4  # of the scores of sources, so that not only the best pairs are trained on
 
 
 class SweepTraining(lightning.LightningModule):
-    """One scene per step; the shipped weights are the exponential average of the trained ones.
+    """The training of the network; the shipped weights are the exponential average of the trained ones.
 
     The rate rises over ``warmup`` steps, stays, and falls to 2 % by a half cosine over the last ``cooldown`` share of
     ``steps``. A checkpoint from before the fall goes on with more steps as if they had been asked for at once.
@@ -70,12 +68,8 @@ class SweepTraining(lightning.LightningModule):
 
     def _predict(self, sample: Sample) -> tuple[SweepEncoding, Tensor, Tensor]:
         images = sample.images.contiguous(memory_format=torch.channels_last)
-        views = PosedViews(images, sample.world_to_camera, sample.intrinsics)
-        with torch.no_grad(), full_precision(images):
-            sources = choose_sources(
-                views.world_to_camera, views.intrinsics, views.size, sample.depth_range, sample.sources, _SOURCE_JITTER
-            )
-        encoding = self.net.encode(self.net.features(images), views, sample.depth_range, sources, sample.planes)
+        views = PosedViews(images, sample.world_to_camera, sample.intrinsics, sample.scenes)
+        encoding = self.net.encode(self.net.features(images), views, sample.depth_range, sample.sources, sample.planes)
         taps = encoding.taps
         if self.token_noise and self.global_step % 2:
             taps = tuple(tap + self.token_noise * torch.randn_like(tap) for tap in taps)

@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from backends.sweep.network import Sweep, SweepEncoding
-from backends.sweep.volume import from_inverse
+from backends.sweep.volume import from_inverse, near_and_far
 from recipes.sweep.samples import Sample
 
 _CLAMP = 2.0  # log-depth errors beyond it do not count more
@@ -28,7 +28,8 @@ def objective(
         log_scale: ``[V, H, W]`` of its relative error.
         sample: the truth (0 = unknown, infinite in the sky) and the planes' range.
     """
-    farthest = _BEYOND * sample.depth_range[1]
+    beyond_planes = _BEYOND * near_and_far(sample.depth_range)[1]  # [S V, 1, 1, 1]
+    farthest = beyond_planes[..., 0]
     beyond = sample.depth > farthest
     seen = (sample.depth > 0).float()
     valid = seen * ~beyond
@@ -45,8 +46,8 @@ def objective(
     planes, positions = [], []
     for sweep, cell in ((encoding.first, 4), (encoding.second, 2)):
         inverse, known = cell_inverse(sample.depth, cell)
-        finite = known * (inverse > 1 / farthest)
-        inverse = inverse.clamp_min(1 / farthest)
+        finite = known * (inverse > 1 / beyond_planes)
+        inverse = inverse.clamp_min(1 / beyond_planes)
         t = from_inverse(inverse, sample.depth_range)
         planes.append(_cross_entropy(sweep, t, known))
         positions.append(_mean((sweep.t - t).abs().clamp_max(0.3), known))

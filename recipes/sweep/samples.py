@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.nn import functional as F
 from torch.utils.data import Dataset
 
+from backends.sweep.views import choose_sources
 from recipes.sweep.scenes import SceneFrames, is_room, read_scene
 from vg2gt.geometry.cameras import crop_intrinsics, project, resize_intrinsics, rigid_motions, unproject
 from vg2gt.types import Cameras
@@ -30,22 +31,24 @@ _LEAST_OVERLAP = 0.15
 _WALK_FRAMES, _WALK_STEP = 14, math.radians(9)  # paths of more frames, or larger turns between them, are no walks
 _PLANES = (32, 48)  # few sizes: CPUs compile their convolutions for each
 _SOURCES, _SOURCE_SHARES = (2, 3), (0.7, 0.3)
+_SOURCE_NOISE = 0.4  # of log-scores, so that not only the best pairs are trained on
 _POSE_SHARE, _TURN, _SHIFT = 0.5, 0.0015, 0.002  # share of samples with pose noise; rad; depths
 _LEAST_PIXELS = 5000  # with depth; samples with fewer are drawn again
 _GREY_SHARE = 0.2
 
 
 class Sample(NamedTuple):
-    """V views of one scene and the sweep they are to be matched with.
+    """V views of a few scenes and the sweep they are to be matched with.
 
     Attributes:
         images: ``[V, 3, H, W]`` in [0, 1].
         depth: ``[V, H, W]``, 0 = unknown, infinite in the sky.
         world_to_camera: ``[V, 4, 4]``, as exact as poses are in practice.
         intrinsics: ``[V, 3, 3]`` in pixels.
-        depth_range: ``[2]`` near and far of the planes.
+        depth_range: ``[V, 2]`` near and far of the planes.
+        sources: ``[V, n]`` the views that each is compared with.
         planes: their number.
-        sources: number of sources per view.
+        scenes: that the views belong to, equally many each.
     """
 
     images: Tensor
@@ -53,6 +56,23 @@ class Sample(NamedTuple):
     world_to_camera: Tensor
     intrinsics: Tensor
     depth_range: Tensor
+    sources: Tensor
+    planes: int
+    scenes: int = 1
+
+
+class Layout(NamedTuple):
+    """What the scenes of one sample have in common, so that they fit into the same tensors.
+
+    Attributes:
+        size: height and width of the images before they are turned.
+        turns: by 90 degrees.
+        planes: their number.
+        sources: number of sources per view.
+    """
+
+    size: tuple[int, int]
+    turns: int
     planes: int
     sources: int
 
@@ -66,7 +86,8 @@ class TrainingSamples(Dataset[Sample]):
         seed: of all draws.
         more: scenes of a second kind, rooms of Infinigen.
         share: of the samples that come from ``more``, if there are any.
-        views: of a sample.
+        scenes: of a sample.
+        views: of a scene.
         sizes: height and width of its images and how often they are drawn, ``((height, width, share), ...)``.
     """
 
@@ -77,12 +98,14 @@ class TrainingSamples(Dataset[Sample]):
         seed: int,
         more: Sequence[Path] = (),
         share: float = 0.25,
+        scenes: int = 1,
         views: int = 4,
         sizes: Sequence[Sequence[float]] = ((80, 160, 1.0),),
     ) -> None:
         self.files, self.count, self.seed = list(files), count, seed
         self.more, self.share = list(more), share if more else 0.0
-        self.views, self.sizes = views, [(int(height), int(width)) for height, width, _ in sizes]
+        self.scenes, self.views = scenes, views
+        self.sizes = [(int(height), int(width)) for height, width, _ in sizes]
         shares = np.array([share for *_, share in sizes])
         self.shares = shares / shares.sum()
 
@@ -91,14 +114,26 @@ class TrainingSamples(Dataset[Sample]):
 
     def __getitem__(self, index: int) -> Sample:
         rng = np.random.default_rng((self.seed, index))
+        layout = Layout(
+            self.sizes[rng.choice(len(self.sizes), p=self.shares)],
+            int(rng.choice(4, p=(1 - _UPRIGHT_SHARE, _UPRIGHT_SHARE / 2, 0, _UPRIGHT_SHARE / 2))),
+            int(rng.choice(_PLANES)),
+            int(rng.choice(_SOURCES, p=_SOURCE_SHARES)),
+        )
+        parts = [self._scene(layout, rng) for _ in range(self.scenes)]
+        images, depth, poses, intrinsics, depth_range = (torch.cat([part[n] for part in parts]) for n in range(5))
+        sources = torch.cat([part.sources + n * self.views for n, part in enumerate(parts)])
+        return Sample(images, depth, poses, intrinsics, depth_range, sources, layout.planes, self.scenes)
+
+    def _scene(self, layout: Layout, rng: Generator) -> Sample:
         while True:
             files = self.more if self.share and rng.random() < self.share else self.files
             path = files[rng.integers(len(files))]
             views = _choose_views(read_scene(path), self.views, rng)
-            views = _upright(_crop(views, self.sizes[rng.choice(len(self.sizes), p=self.shares)], rng), rng)
+            views = _turn(_crop(views, layout.size, rng), layout.turns)
             valid = views.depth[(views.depth > 0) & views.depth.isfinite()]
             if len(valid) >= _LEAST_PIXELS:
-                return _finish(views, valid, _CUT_INDOORS if is_room(path) else _CUT, rng)
+                return _finish(views, valid, _CUT_INDOORS if is_room(path) else _CUT, layout, rng)
 
 
 class _Crop(NamedTuple):
@@ -173,14 +208,11 @@ def _crop(views: _Crop, target: tuple[int, int], rng: Generator) -> _Crop:
     return _Crop(images.clamp(0, 1), depth, poses.clone(), intrinsics)
 
 
-def _upright(views: _Crop, rng: Generator) -> _Crop:
-    """Turns all views by 90 degrees to the left, in a share of the draws, half of them to the right."""
-    draw = rng.random()
-    if draw >= _UPRIGHT_SHARE:
-        return views
+def _turn(views: _Crop, turns: int) -> _Crop:
+    """Turns all views by 90 degrees to the left, ``turns`` times, as upright photographs are."""
     images, depth, poses, intrinsics = views
     turn = torch.tensor([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-    for _ in range(1 if draw < _UPRIGHT_SHARE / 2 else 3):
+    for _ in range(turns):
         turned = torch.zeros_like(intrinsics)  # a pixel (x, y) comes to (y, W - 1 - x)
         turned[:, 0, 0], turned[:, 1, 1], turned[:, 2, 2] = intrinsics[:, 1, 1], intrinsics[:, 0, 0], 1.0
         turned[:, 0, 2], turned[:, 1, 2] = intrinsics[:, 1, 2], images.shape[-1] - 1 - intrinsics[:, 0, 2]
@@ -189,7 +221,7 @@ def _upright(views: _Crop, rng: Generator) -> _Crop:
     return _Crop(images.contiguous(), depth.contiguous(), poses, intrinsics)
 
 
-def _finish(views: _Crop, valid: Tensor, cut: tuple[float, float], rng: Generator) -> Sample:
+def _finish(views: _Crop, valid: Tensor, cut: tuple[float, float], layout: Layout, rng: Generator) -> Sample:
     """Draws the unit, the planes' range around the true one, the noise of the poses and the look.
 
     In some samples the planes end at a quantile of the depth between those of ``cut``.
@@ -206,10 +238,11 @@ def _finish(views: _Crop, valid: Tensor, cut: tuple[float, float], rng: Generato
     far = high * math.exp(rng.uniform(0, 0.6) if rng.random() < 0.75 else rng.uniform(0, 2.5))
     if rng.random() < _POSE_SHARE:
         poses = _pose_noise(len(poses), min(middle, 3 * low), rng) @ poses
-    planes = int(rng.choice(_PLANES))
-    sources = int(rng.choice(_SOURCES, p=_SOURCE_SHARES))
+    depth_range, size = torch.tensor([near, far]), (depth.shape[-2], depth.shape[-1])
+    noise = torch.from_numpy(rng.normal(0, _SOURCE_NOISE, (len(poses), len(poses)))).float()
+    sources = choose_sources(poses, views.intrinsics, size, depth_range, layout.sources, noise)
     look = recolour(views.images, rng)
-    return Sample(look, depth, poses, views.intrinsics, torch.tensor([near, far]), planes, sources)
+    return Sample(look, depth, poses, views.intrinsics, depth_range.expand(len(poses), 2), sources, layout.planes)
 
 
 def _pose_noise(views: int, depth: float, rng: Generator) -> Tensor:

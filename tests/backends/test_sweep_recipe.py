@@ -11,7 +11,7 @@ from safetensors import safe_open
 from torch.nn import functional as F
 
 from backends.sweep.backend import SHIPPED, SweepBackend
-from backends.sweep.network import Sweep, SweepEncoding
+from backends.sweep.network import PosedViews, Sweep, SweepEncoding
 from backends.sweep.volume import from_inverse
 from recipes.sweep.objective import cell_inverse, objective
 from recipes.sweep.samples import Sample, TrainingSamples, _choose_views, _crop, recolour
@@ -51,7 +51,7 @@ def test_planes_reach_the_walls_of_rooms(scenes: list[Path]) -> None:
     def most_beyond(path: Path) -> float:
         samples = (TrainingSamples([path], 40, seed=0)[index] for index in range(40))
         return max(
-            float((sample.depth > sample.depth_range[1]).float().sum() / (sample.depth > 0).float().sum())
+            float((sample.depth > sample.depth_range[0, 1]).float().sum() / (sample.depth > 0).float().sum())
             for sample in samples
         )
 
@@ -108,7 +108,34 @@ def test_samples_depend_on_their_number_alone(scenes: list[Path]) -> None:
     a, b, other = first[7], again[7], first[8]
     assert all(torch.equal(x, y) for x, y in zip(a[:5], b[:5], strict=True))
     assert a.images.shape != other.images.shape or not torch.equal(a.images, other.images)
-    assert 0 < float(a.depth_range[0]) < float(a.depth_range[1])
+    assert (a.depth_range[:, 0] > 0).all()
+    assert (a.depth_range[:, 0] < a.depth_range[:, 1]).all()
+
+
+def test_scenes_of_a_sample_are_encoded_as_if_alone(scenes: list[Path]) -> None:
+    sample = next(s for s in TrainingSamples(scenes, 9, seed=1, scenes=2, sizes=[(48, 96, 1)]) if s.planes == 32)
+    assert len(sample.images) == 8
+    assert (sample.sources[4:] >= 4).all()
+    assert (sample.sources[:4] < 4).all()
+    assert not torch.equal(sample.depth_range[0], sample.depth_range[4])
+    net = SweepBackend().network
+
+    def encode(rows: slice, count: int) -> SweepEncoding:
+        images = sample.images[rows]
+        views = PosedViews(images, sample.world_to_camera[rows], sample.intrinsics[rows], count)
+        sources = sample.sources[rows] - rows.start
+        return net.encode(net.features(images), views, sample.depth_range[rows], sources, 32)
+
+    with torch.no_grad():
+        both = encode(slice(0, 8), 2)
+        alone = [encode(slice(0, 4), 1), encode(slice(4, 8), 1)]
+        one = alone[1].taps[-1]
+        views = PosedViews(sample.images[4:], sample.world_to_camera[4:], sample.intrinsics[4:])
+        features = net.features(views.images)
+        as_used = net.encode(features, views, sample.depth_range[4], sample.sources[4:] - 4, 32).taps[-1]
+    torch.testing.assert_close(as_used, one, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(both.taps[-1], torch.cat([part.taps[-1] for part in alone]), rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(both.swept, torch.cat([part.swept for part in alone]), rtol=1e-3, atol=1e-3)
 
 
 def test_recolouring_keeps_range_and_shape() -> None:
@@ -142,8 +169,9 @@ def slope() -> tuple[Sample, SweepEncoding, torch.Tensor]:
     inverse = (0.2 + 0.01 * torch.arange(16.0).view(1, 1, 16) + 0.02 * torch.arange(16.0).view(1, 16, 1)).expand(
         2, -1, -1
     )
-    depth_range = torch.tensor([1.0, 10.0])
-    sample = Sample(torch.zeros(2, 3, 16, 16), 1 / inverse, torch.eye(4), torch.eye(3), depth_range, 16, 1)
+    depth_range = torch.tensor([1.0, 10.0]).expand(2, 2)
+    cameras, sources = (torch.eye(4), torch.eye(3)), torch.tensor([[1], [0]])
+    sample = Sample(torch.zeros(2, 3, 16, 16), 1 / inverse, *cameras, depth_range, sources, 16)
     sweeps = []
     for cell, planes in ((4, 16), (2, 12)):
         t = from_inverse(cell_inverse(sample.depth, cell)[0], depth_range)
