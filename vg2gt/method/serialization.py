@@ -35,7 +35,12 @@ def relative_grid(grid: Tensor, batch: Tensor, scenes: int) -> Tensor:
 
 
 def serial_keys(
-    grid: Tensor, batch: Tensor, voxel_size: Tensor, orders: Sequence[Order], min_bits: int = 1
+    grid: Tensor,
+    batch: Tensor,
+    voxel_size: Tensor,
+    orders: Sequence[Order],
+    min_bits: int = 1,
+    extent: int | None = None,
 ) -> list[Tensor]:
     """Sort keys ``scene << 3 bits | code``, one ``[M]`` tensor per order.
 
@@ -45,11 +50,12 @@ def serial_keys(
         voxel_size: ``[B]`` edge lengths; how many says B, what they are only the error's message.
         orders: the wanted orders.
         min_bits: bits per axis at least, so that keys can be shifted to parents this many times.
+        extent: cells along the longest axis where that is known; to find it out, the host waits for a GPU.
 
     Raises:
         ValueError: if code and scene index do not fit into 63 bits, or an axis not into 21.
     """
-    extent, scenes = int(grid.max()) + 1, len(voxel_size)
+    extent, scenes = int(grid.max()) + 1 if extent is None else extent, len(voxel_size)
     bits = max(min_bits, (extent - 1).bit_length())
     if bits > MAX_BITS or 3 * bits + (scenes - 1).bit_length() > 63:
         sizes = ", ".join(f"{size:g}" for size in voxel_size.tolist())
