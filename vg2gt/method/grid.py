@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from vg2gt.geometry.cameras import focal_lengths
 from vg2gt.types import Geometry
 
 log = logging.getLogger(__name__)
@@ -274,7 +275,7 @@ def scene_voxel_size(
         valid = depth[(depth > 0) & torch.isfinite(depth)]
         size = torch.full((), voxel_size, dtype=torch.float32, device=depth.device)
         if valid.numel():
-            focal = intrinsics[..., [0, 1], [0, 1]].mean()
+            focal = focal_lengths(intrinsics).mean()
             size = torch.maximum(size, (factor * min_footprint * valid.median() / focal).float())
         sizes.append(size)
     return torch.stack(sizes)

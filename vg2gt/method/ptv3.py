@@ -50,6 +50,7 @@ class Level:
         self.order = order
         count = len(keys)
         self.sequence = torch.randperm(count, generator=generator).tolist() if generator else list(range(count))
+        self._cuts: dict[int, Windows] = {}  # of places along any curve
         self._windows: dict[tuple[int, int], Windows] = {}
         self.pairs: dict[int, Pairs | NeighborTable] = {}
 
@@ -57,8 +58,10 @@ class Level:
         """Attention windows along the curve that block number ``order`` uses."""
         which = self.sequence[order % len(self.sequence)]
         if (which, length) not in self._windows:
-            curve = torch.argsort(self.keys[which])
-            self._windows[which, length] = make_windows(curve, self.counts, length)
+            if length not in self._cuts:
+                places = torch.arange(len(self.batch), device=self.batch.device)
+                self._cuts[length] = make_windows(places, self.counts, length)
+            self._windows[which, length] = self._cuts[length].along(torch.argsort(self.keys[which]))
         return self._windows[which, length]
 
 

@@ -23,7 +23,8 @@ def serial_codes(grid: Tensor, bits: int, order: Order) -> Tensor:
     three makes a cell's code independent of ``bits``, and so of the other scenes in a batch.
     """
     if order.endswith("-trans"):
-        grid = grid[:, [1, 0, 2]]
+        x, y, z = grid.unbind(-1)
+        grid = torch.stack((y, x, z), -1)
     return z_codes(grid) if order.startswith("z") else hilbert_codes(grid, -(-bits // 3) * 3)
 
 
@@ -94,6 +95,11 @@ class Windows:
 
     groups: tuple[WindowGroup, ...]
     owner: Tensor
+
+    def along(self, order: Tensor) -> Windows:
+        """Windows of voxels ``order [M]`` along a curve, where these are of places along it."""
+        groups = tuple(WindowGroup(order[group.rows], group.counts) for group in self.groups)
+        return Windows(groups, torch.empty_like(order).scatter_(0, order, self.owner))
 
 
 def make_windows(order: Tensor, counts: list[int], length: int, shift: int = 0, few_sizes: bool = False) -> Windows:

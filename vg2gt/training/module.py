@@ -15,6 +15,7 @@ from torch.optim.lr_scheduler import LambdaLR
 
 from vg2gt.evaluation.in_training import evaluate_scene
 from vg2gt.evaluation.protocols import training_cameras
+from vg2gt.geometry.cameras import focal_lengths
 from vg2gt.losses import LossReport
 from vg2gt.memory import dropped_by
 from vg2gt.model import VG2GT, Reconstructor
@@ -137,7 +138,7 @@ class VG2GTModule(lightning.LightningModule):
 
     def _losses(self, batch: Batch) -> LossReport | None:
         """The training losses; None, with the cause noted, where the model or the renderer cannot go on."""
-        focal = batch.cameras.intrinsics[..., [0, 1], [0, 1]]
+        focal = focal_lengths(batch.cameras.intrinsics)
         if not finite(batch.images, batch.depth, batch.cameras.world_to_camera, batch.cameras.intrinsics, focal.log()):
             self._cause = "images, depth or cameras of the batch"
             return None
