@@ -83,6 +83,7 @@ def tests(setting: Setting) -> Iterator[Result]:
     """The suite's tests of a GPU; in the small form they are only collected."""
     files = [str(path) for path in sorted((ROOT / "tests").rglob("test_*.py")) if "mark.gpu" in path.read_text()]
     options = ["-o", "addopts=", "--import-mode=importlib", "-p", "no:cacheprovider", "-q", "-m", "gpu and not slow"]
+    options += ["--continue-on-collection-errors"]  # a file that needs a package which is not there
     options += ["--collect-only"] if setting.small else ["--durations=5", "--tb=short"]
     command = [sys.executable, "-m", "pytest", *options, *files]
     ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
