@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from backends.dpt import DPT
 from vg2gt.evaluation.tables import print_table
 from vg2gt.method import DenseHead, GaussianHead, PointMLP, PTv3
-from vg2gt.method.ptv3 import Level
+from vg2gt.method.ptv3 import make_levels
 from vg2gt.method.serialization import ORDERS, relative_grid, serial_keys
 from vg2gt.types import Tokens, Voxels
 
@@ -85,7 +85,7 @@ def _ptv3_block() -> Case:
     grid, batch = _voxels()
     local = relative_grid(grid, batch, len(COUNTS))
     keys = serial_keys(local, batch, torch.ones(len(COUNTS)), ORDERS)
-    level = Level(local, batch, len(COUNTS), keys, None)
+    (level,) = make_levels(local, batch, len(COUNTS), keys, (8, 8, 8), [[3]], None)
     block = _ptv3().get_submodule("enc.enc0.block0")
     features = torch.randn(sum(COUNTS), 16)
     block(features, level)  # lists windows and neighbours, whose numbers depend on the data

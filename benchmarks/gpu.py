@@ -15,10 +15,13 @@ import subprocess
 import sys
 import tempfile
 import time
+import warnings
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import torch
 from common import MEGABYTE, dated, machine, parser
@@ -80,6 +83,7 @@ def tests(setting: Setting) -> Iterator[Result]:
     """The suite's tests of a GPU; in the small form they are only collected."""
     files = [str(path) for path in sorted((ROOT / "tests").rglob("test_*.py")) if "mark.gpu" in path.read_text()]
     options = ["-o", "addopts=", "--import-mode=importlib", "-p", "no:cacheprovider", "-q", "-m", "gpu and not slow"]
+    options += ["--continue-on-collection-errors"]  # a file that needs a package which is not there
     options += ["--collect-only"] if setting.small else ["--durations=5", "--tb=short"]
     command = [sys.executable, "-m", "pytest", *options, *files]
     ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
@@ -166,6 +170,7 @@ def _step(setting: Setting, case: Any) -> Iterator[Result]:
         "stage_peak_mb": {stage: passes.memory for stage, passes in clock.stages.items()},
     }
     yield {"profile": _profile(device, whole)}
+    yield {"waits": _waits(device, whole)}
 
 
 def _profile(device: torch.device, act: Callable[[], None]) -> Result:
@@ -180,6 +185,7 @@ def _profile(device: torch.device, act: Callable[[], None]) -> Result:
         wall = 1e3 * (now(device) - begin)
     rows = found.key_averages()
     of_device = [row for row in rows if str(row.device_type).endswith("CUDA")] if on_gpu else list(rows)
+    of_device = [row for row in of_device if not row.key.startswith(("vg2gt/", "Optimizer."))]  # spans of others
 
     def taken(row: Any) -> float:
         return (row.self_device_time_total if on_gpu else row.self_cpu_time_total) / 1e3
@@ -192,6 +198,30 @@ def _profile(device: torch.device, act: Callable[[], None]) -> Result:
         "waits": waits,
         "most": [[row.key[:90], row.count, taken(row)] for row in sorted(of_device, key=taken)[: -LINES - 1 : -1]],
     }
+
+
+def _waits(device: torch.device, act: Callable[[], None]) -> Result:
+    """How often the host waits for the device in one pass, copies to it included, by the function that asked."""
+    from gpu_waits import Waits, place
+
+    if device.type != "cuda":
+        with Waits() as waits:
+            act()
+        return {"all": waits.total, "places": dict(waits.places.most_common())}
+    places: Counter[str] = Counter()
+
+    def note(message: Any, *_: Any, **__: Any) -> None:
+        if "synchroniz" in str(message):
+            places[place(sys._getframe(1))] += 1
+
+    with warnings.catch_warnings(), mock.patch.object(warnings, "showwarning", note):
+        warnings.simplefilter("always")
+        torch.cuda.set_sync_debug_mode("warn")
+        try:
+            act()
+        finally:
+            torch.cuda.set_sync_debug_mode("default")
+    return {"all": places.total(), "places": dict(places.most_common())}
 
 
 def knn(setting: Setting) -> Iterator[Result]:

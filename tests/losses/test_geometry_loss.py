@@ -10,7 +10,13 @@ from torch import Tensor
 from vg2gt.geometry.cameras import unproject
 from vg2gt.geometry.rotations import quat_to_matrix
 from vg2gt.losses import GeometryLoss
-from vg2gt.losses.geometry import camera_errors, depth_gradient_loss, trusted_pixels
+from vg2gt.losses.geometry import (
+    camera_errors,
+    depth_gradient_loss,
+    order_statistic,
+    sorted_order_statistic,
+    trusted_pixels,
+)
 from vg2gt.losses.point_normals import point_normal_loss, point_normal_reference
 from vg2gt.losses.truth import normalize_truth
 from vg2gt.types import Cameras
@@ -107,6 +113,17 @@ def test_one_set_of_pixels_is_kept_below_the_quantile() -> None:
     few = valid & (torch.arange(40) < 10)
     assert int(few.sum()) <= 1000
     assert torch.equal(trusted_pixels(error, few, 0.5), few)
+
+
+def test_a_gpu_sorts_for_the_same_order_statistic_without_a_wait(benchmark_script) -> None:
+    values = torch.rand(5000, generator=torch.Generator().manual_seed(0))
+    values[3000:] = torch.inf
+    for count in (0, 1, 2, 2999, 3000):
+        for quantile in (0.5, 0.98, 1.0):
+            with benchmark_script("gpu_waits").Waits() as waits:
+                found = sorted_order_statistic(values, torch.tensor(count), quantile)
+            assert torch.equal(found, order_statistic(values, torch.tensor(count), quantile))
+            assert waits.total == 0
 
 
 def test_an_outlier_has_no_gradient_and_errors_stop_at_100(sample) -> None:

@@ -3,7 +3,12 @@ import torch
 from torch.nn import functional as F
 
 from vg2gt.method import sparse_conv
-from vg2gt.method.sparse_conv import SubmanifoldConv3d, neighbor_pairs, neighbor_table
+from vg2gt.method.sparse_conv import Cells, SubmanifoldConv3d, neighbor_pairs, neighbor_tables
+
+
+def neighbor_table(grid, batch, kernel_size):
+    (table,) = neighbor_tables([Cells(grid, batch, kernel_size)])
+    return table
 
 
 @pytest.fixture(params=[neighbor_pairs, neighbor_table])

@@ -62,13 +62,13 @@ def fit_depth_scale(predicted: Tensor, reference: Tensor, valid: Tensor, per_vie
 
 def _nearest_valid_pixels(valid: Tensor) -> Tensor:
     """Flat indices ``[B, V, cells]`` of the valid pixel nearest to each cell's centre (any pixel if none is valid)."""
-    table = _cell_pixels(valid.shape[-2], valid.shape[-1]).to(valid.device)
+    table = _cell_pixels(valid.shape[-2], valid.shape[-1], valid.device)
     first = valid.flatten(2)[:, :, table].to(torch.uint8).argmax(-1, keepdim=True)
     return torch.gather(table.expand(*valid.shape[:2], -1, -1), 3, first)[..., 0]
 
 
 @lru_cache(maxsize=8)
-def _cell_pixels(height: int, width: int) -> Tensor:
+def _cell_pixels(height: int, width: int, device: torch.device) -> Tensor:
     """Pixels of every subsampling cell, nearest to its centre first: ``[cells, most pixels in a cell]``, padded."""
     rows, columns = min(height, SUBSAMPLE), min(width, SUBSAMPLE)
     y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
@@ -82,7 +82,7 @@ def _cell_pixels(height: int, width: int) -> Tensor:
     count = torch.bincount(cell, minlength=rows * columns)
     start = count.cumsum(0) - count
     slot = torch.minimum(torch.arange(int(count.max())), count[:, None] - 1)
-    return order[start[:, None] + slot]
+    return order[start[:, None] + slot].to(device)
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,11 @@ def pixel_grid(height: int, width: int, like: Tensor) -> Tensor:
     return torch.stack((x, y), -1)
 
 
+def focal_lengths(intrinsics: Tensor) -> Tensor:
+    """``[..., 2]`` (fx, fy) of ``[..., 3, 3]``; lists as indices would be copied to a GPU while the host waits."""
+    return torch.stack((intrinsics[..., 0, 0], intrinsics[..., 1, 1]), -1)
+
+
 def ray_directions(intrinsics: Tensor, size: tuple[int, int]) -> Tensor:
     """Returns camera-frame ray directions with unit z.
 
@@ -29,8 +34,7 @@ def ray_directions(intrinsics: Tensor, size: tuple[int, int]) -> Tensor:
         ``[..., H, W, 3]``; multiplied by z-depth they are camera-frame points.
     """
     pixels = pixel_grid(*size, like=intrinsics)
-    focal = intrinsics[..., [0, 1], [0, 1]][..., None, None, :]
-    center = intrinsics[..., [0, 1], [2, 2]][..., None, None, :]
+    focal, center = focal_lengths(intrinsics)[..., None, None, :], intrinsics[..., None, None, :2, 2]
     xy = (pixels - center) / focal
     return torch.cat((xy, torch.ones_like(xy[..., :1])), -1)
 
@@ -105,8 +109,8 @@ def project(points: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
     local = transform_points(cameras.world_to_camera, points)
     depth = local[..., 2]
     shape = cameras.intrinsics.shape[:2] + (1,) * (points.dim() - 3)
-    focal = cameras.intrinsics[..., [0, 1], [0, 1]].reshape(*shape, 2)
-    center = cameras.intrinsics[..., [0, 1], [2, 2]].reshape(*shape, 2)
+    focal = focal_lengths(cameras.intrinsics).reshape(*shape, 2)
+    center = cameras.intrinsics[..., :2, 2].reshape(*shape, 2)
     return local[..., :2] / depth[..., None] * focal + center, depth
 
 

@@ -82,9 +82,7 @@ class GeometryLoss:
         Returns:
             The depth task's and the point-map task's losses.
         """
-        if not bool(truth.known[0]):
-            nothing = _zero_with_graph(depth, depth_conf)
-            return TaskLoss(nothing, nothing, nothing), TaskLoss(nothing, nothing, nothing)
+        valid = valid & truth.known[:, None, None, None]
         # Where nothing is compared the prediction becomes the truth: no infinity or hole reaches the gradients.
         depth = torch.where(valid, depth, truth.depth)[0]
         conf = torch.where(valid, depth_conf, 1.0)[0]
@@ -106,13 +104,25 @@ class GeometryLoss:
 
 def trusted_pixels(error: Tensor, valid: Tensor, quantile: float) -> Tensor:
     """Marks the valid pixels whose error, clamped to 100, is at or below its quantile; all if they are at most 1000."""
-    count = int(valid.sum())
-    if count <= QUANTILE_PIXELS:
-        return valid
     clamped = error.detach().clamp(max=MAX_ERROR)
-    # An order statistic keeps the same pixels as an interpolated quantile, and has no limit on their number.
-    rank = math.floor(quantile * (count - 1)) + 1
-    return valid & (clamped <= torch.where(valid, clamped, torch.inf).flatten().kthvalue(rank).values)
+    candidates = torch.where(valid, clamped, torch.inf).flatten()
+    count = valid.sum()
+    statistic = order_statistic if error.device.type == "cpu" else sorted_order_statistic
+    return valid & ((clamped <= statistic(candidates, count, quantile)) | (count <= QUANTILE_PIXELS))
+
+
+def order_statistic(values: Tensor, count: Tensor, quantile: float) -> Tensor:
+    """The quantile of the ``count`` smallest of ``values [N]``: of ranks, the last at or below ``quantile``.
+
+    It keeps the same pixels as an interpolated quantile, and has no limit on their number.
+    """
+    return values.kthvalue(math.floor(quantile * max(int(count) - 1, 0)) + 1).values
+
+
+def sorted_order_statistic(values: Tensor, count: Tensor, quantile: float) -> Tensor:
+    """:func:`order_statistic` for GPUs, where sorting is many times faster than ``kthvalue``; without a wait."""
+    rank = (quantile * (count - 1).clamp(min=0).double()).floor().long()
+    return values.sort().values.gather(0, rank[None])[0]
 
 
 def depth_gradient_loss(error: Tensor, valid: Tensor) -> Tensor:
@@ -174,8 +184,3 @@ def _field_of_view(cameras: Cameras) -> Tensor:
     height, width = cameras.size
     fx, fy = cameras.intrinsics[..., 0, 0], cameras.intrinsics[..., 1, 1]
     return 2 * torch.stack((torch.atan(height / (2 * fy)), torch.atan(width / (2 * fx))), -1)
-
-
-def _zero_with_graph(*tensors: Tensor) -> Tensor:
-    """A zero that belongs to the graph of the tensors: sums of nothing, so that no value in them can spoil it."""
-    return torch.stack([tensor.flatten()[:0].sum() for tensor in tensors]).sum()

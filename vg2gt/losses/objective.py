@@ -32,7 +32,7 @@ class LossReport:
     total: Tensor
     terms: dict[str, Tensor]
     scale: Tensor
-    skipped: int
+    skipped: Tensor
     by_scene: tuple[dict[str, Tensor], ...]
 
 
@@ -141,7 +141,7 @@ class VG2GTLoss(nn.Module):
             total = torch.stack([scene.total for scene in scenes]).mean()
             by_scene = tuple({name: term.detach() for name, term in scene.terms.items()} for scene in scenes)
             terms = {name: torch.stack([scene[name] for scene in by_scene]).mean() for name in by_scene[0]}
-        return LossReport(total, terms, scales.scene, int((~truth.known).sum()), by_scene)
+        return LossReport(total, terms, scales.scene, (~truth.known).sum(), by_scene)
 
     def _geometry_terms(self, before: Geometry, after: Geometry, truth: Truth, valid: Tensor) -> SceneLoss:
         """Geometry and enhancement losses of one scene, everything in the truth's unit."""

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import torch
 from torch import Tensor
 
@@ -13,7 +11,6 @@ from vg2gt.losses.truth import Truth
 from vg2gt.types import Cameras
 
 POINT_STRIDES = (1, 2, 4)
-CORNERS = ((1, 1), (1, -1), (-1, 1), (-1, -1))
 
 
 def point_normal_loss(depth: Tensor, cameras: Cameras, truth: Truth, valid: Tensor) -> Tensor:
@@ -40,54 +37,40 @@ def point_normal_reference(depth: Tensor, cameras: Cameras, truth: Truth, valid:
     turn = _turn(cameras, truth)
     total = depth.new_zeros(())
     for stride in POINT_STRIDES:
-        mask = valid[:, ::stride, ::stride]
         predicted = _corner_normals(depth, cameras.intrinsics[0], stride)
-        expected = _corner_normals(truth.depth[0], truth.cameras.intrinsics[0], stride)
-        disagreement, count = depth.new_zeros(()), mask.new_zeros((), dtype=torch.long)
-        for corner, (x, y, z), n in zip(CORNERS, predicted, expected, strict=True):
-            n = turn @ torch.stack(n, 1).flatten(2)
-            n = (n / n.square().sum(1, keepdim=True).sqrt()).unflatten(2, x.shape[1:])
-            cosine = (x * n[:, 0] + y * n[:, 1] + z * n[:, 2]) / (x * x + y * y + z * z).sqrt()
-            both = _corner_mask(mask, corner)
-            disagreement = disagreement + ((1 - cosine) * both).sum()
-            count = count + both.sum()
-        total = total + disagreement / count.clamp(min=1)
+        true = _corner_normals(truth.depth[0], truth.cameras.intrinsics[0], stride)
+        true = (turn @ true.flatten(4)).view_as(true)
+        lengths = (predicted.square().sum(3) * true.square().sum(3)).sqrt()
+        cosine = (predicted * true).sum(3) / lengths  # [2, 2, V, h - 1, w - 1]
+        mask = valid[:, ::stride, ::stride]
+        across, down = mask[..., 1:] & mask[..., :-1], mask[:, 1:] & mask[:, :-1]
+        both = _at_corners(across, -2)[None] & _at_corners(down, -1)[:, None]
+        total = total + ((1 - cosine) * both).sum() / both.sum().clamp(min=1)
     return total / len(POINT_STRIDES)
 
 
-def _corner(image: Tensor, corner: tuple[int, int]) -> Tensor:
-    """The pixels of an image ``[..., H, W]`` that have neighbours on the corner's sides (right/left, down/up)."""
-    across, down = corner
-    rows = slice(None, -1) if down > 0 else slice(1, None)
-    columns = slice(None, -1) if across > 0 else slice(1, None)
-    return image[..., rows, columns]
+def _at_corners(between: Tensor, dim: int) -> Tensor:
+    """What lies between neighbours along one axis, at a corner's pixel of two along the other one: ``[2, ...]``."""
+    count = between.shape[dim] - 1
+    return torch.stack((between.narrow(dim, 0, count), between.narrow(dim, 1, count)))
 
 
-def _corner_mask(valid: Tensor, corner: tuple[int, int]) -> Tensor:
-    across, down = corner
-    horizontal = _corner(valid, (-across, down))
-    vertical = _corner(valid, (across, -down))
-    return _corner(valid, corner) & horizontal & vertical
+def _corner_normals(depth: Tensor, intrinsics: Tensor, stride: int) -> Tensor:
+    """Camera-frame normals ``[2, 2, V, 3, h - 1, w - 1]`` of the strided depth ``[V, H, W]`` at its squares' corners.
 
-
-def _corner_normals(depth: Tensor, intrinsics: Tensor, stride: int) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """Camera-frame normals of the strided depth ``[V, H, W]``, components ``[V, h - 1, w - 1]``, corner by corner.
-
-    The differences to the neighbours, ``(d1 - d) r + d1 / fx e_x`` and its like, have the cross product derived in
-    :mod:`vg2gt.geometry.normals` with ``gx = fx (d1 - d) / d1``. Not of unit length.
+    The first two axes say whether the pixel's neighbours are to its right or left, and below or above it: all four
+    corners in the same operations. The differences to the neighbours, ``(d1 - d) r + d1 / fx e_x`` and its like, have
+    the cross product derived in :mod:`vg2gt.geometry.normals` with ``gx = fx (d1 - d) / d1``. Not of unit length.
     """
     u, v = ray_slopes(intrinsics, (depth.shape[-2], depth.shape[-1]))
     u, v = u[..., ::stride], v[..., ::stride, :]
     depth = depth[:, ::stride, ::stride]
     fx, fy = intrinsics[:, 0, 0, None, None] / stride, intrinsics[:, 1, 1, None, None] / stride
-    difference_x, difference_y = fx * (depth[..., 1:] - depth[..., :-1]), fy * (depth[:, 1:] - depth[:, :-1])
-    slope_x = {1: difference_x / depth[..., 1:], -1: difference_x / depth[..., :-1]}
-    slope_y = {1: difference_y / depth[:, 1:], -1: difference_y / depth[:, :-1]}
-    for across, down in CORNERS:
-        rows = slice(None, -1) if down > 0 else slice(1, None)
-        columns = slice(None, -1) if across > 0 else slice(1, None)
-        gx, gy = slope_x[across][:, rows], slope_y[down][..., columns]
-        yield gx, gy, -1 - u[..., columns] * gx - v[..., rows, :] * gy
+    x = fx * depth.diff(dim=2) / torch.stack((depth[..., 1:], depth[..., :-1]))  # [2, V, h, w - 1]
+    y = fy * depth.diff(dim=1) / torch.stack((depth[:, 1:], depth[:, :-1]))  # [2, V, h - 1, w]
+    x, y = torch.stack((x[:, :, :-1], x[:, :, 1:]), 1), torch.stack((y[..., :-1], y[..., 1:]))
+    z = -1 - _at_corners(u, -1)[:, None] * x - _at_corners(v, -2) * y
+    return torch.stack((x, y, z), 3)
 
 
 def _turn(cameras: Cameras, truth: Truth) -> Tensor:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from vg2gt.geometry.cameras import camera_centers, unproject
+from vg2gt.geometry.cameras import camera_centers, focal_lengths, unproject
 from vg2gt.geometry.symmetric import UPPER
 from vg2gt.memory import Cap, check_limit, note_sizes
 from vg2gt.method.additions.point_moments import pool_point_moments
@@ -152,7 +152,7 @@ class FineModule(nn.Module):
     ) -> VoxelMoments:
         """How the points of every voxel lie about the means ``[M, 6]`` of their places and colours ``[N, 6]``."""
         centers = camera_centers(geometry.cameras).float()  # [B, V, 3]
-        focal = geometry.cameras.intrinsics[..., [0, 1], [0, 1]].mean(-1).float()  # [B, V]
+        focal = focal_lengths(geometry.cameras.intrinsics).mean(-1).float()  # [B, V]
         views = torch.cat((centers, (focal * size[:, None])[..., None]), -1).flatten(0, 1)  # [B V, 4]
         depth, chunk = geometry.depth.float().flatten(), self.dense_head.views_per_chunk
         spread, cross, eye, pixel = pool_point_moments(values, depth, confidence, views, means, plan, chunk)

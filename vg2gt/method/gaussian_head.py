@@ -105,8 +105,10 @@ class GaussianHead(nn.Module):
         size = voxels.voxel_size[voxels.batch][:, None, None]
         anchor = voxels.centroid if self.anchor == "centroid" else voxels.centers
         offset = self.max_offset * torch.tanh(offset)
-        quats = F.normalize(rotation + rotation.new_tensor([1.0, 0.0, 0.0, 0.0]), dim=-1)
-        start_scale, colors = scale.new_tensor(PLAIN_SCALE), voxels.colors[:, None]
+        # numbers are filled in on the device: the host would wait for copies
+        identity = torch.eye(4, dtype=rotation.dtype, device=rotation.device)[0]
+        quats = F.normalize(rotation + identity, dim=-1)
+        start_scale, colors = scale.new_full((), PLAIN_SCALE), voxels.colors[:, None]
         if self.start == "surfel":
             start = self._surfels(voxels)
             offset = start.offsets + torch.einsum("mij,mkj->mki", start.frame, offset)

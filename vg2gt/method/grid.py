@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from vg2gt.geometry.cameras import focal_lengths
 from vg2gt.types import Geometry
 
 log = logging.getLogger(__name__)
@@ -61,13 +62,17 @@ class VoxelPlan:
         )
 
 
-def mixed_radix_keys(grid: Tensor, batch: Tensor, margin: int = 0) -> tuple[Tensor, tuple[int, int, int]]:
+def mixed_radix_keys(
+    grid: Tensor, batch: Tensor, margin: int = 0, spans: Sequence[int] | None = None
+) -> tuple[Tensor, tuple[int, int, int]]:
     """One collision-free int64 key per cell, ordered like (scene, x, y, z).
 
     Args:
         grid: ``[M, 3]`` int64 cells, any sign.
         batch: ``[M]`` int64 scene index >= 0.
         margin: cells to leave free on every side, so that keys of neighbours up to ``margin`` away never wrap.
+        spans: cells along x, y and z of a grid that begins at 0, and the number of scenes, where they are known; to
+            find them out, the host waits for a GPU.
 
     Returns:
         The keys ``[M]`` and the key differences of one step along x, y and z.
@@ -77,17 +82,20 @@ def mixed_radix_keys(grid: Tensor, batch: Tensor, margin: int = 0) -> tuple[Tens
     """
     if not len(grid):
         return batch, (1, 1, 1)
-    low = grid.amin(0)
-    # the host waits for a GPU once, not once a number
-    spans = torch.cat((grid.amax(0) - low + 1 + 2 * margin, batch.max()[None] + 1))
-    *extent, scenes = spans.tolist()
+    if spans is None:
+        low = grid.amin(0)
+        grid = grid - low
+        # the host waits for a GPU once, not once a number
+        spans = torch.cat((grid.amax(0) + 1, batch.max()[None] + 1)).tolist()
+    *extent, scenes = spans
+    extent = [cells + 2 * margin for cells in extent]
     if scenes * extent[0] * extent[1] * extent[2] >= 1 << 63:
         raise ValueError(
             f"{scenes} scenes of {extent[0]} x {extent[1]} x {extent[2]} voxels cannot be numbered in 63 bits; "
             "raise the voxel size or leave far points out"
         )
     steps = (extent[1] * extent[2], extent[2], 1)
-    x, y, z = (grid - low + margin).unbind(-1)
+    x, y, z = (grid + margin if margin else grid).unbind(-1)
     return ((batch * extent[0] + x) * extent[1] + y) * extent[2] + z, steps
 
 
@@ -267,7 +275,7 @@ def scene_voxel_size(
         valid = depth[(depth > 0) & torch.isfinite(depth)]
         size = torch.full((), voxel_size, dtype=torch.float32, device=depth.device)
         if valid.numel():
-            focal = intrinsics[..., [0, 1], [0, 1]].mean()
+            focal = focal_lengths(intrinsics).mean()
             size = torch.maximum(size, (factor * min_footprint * valid.median() / focal).float())
         sizes.append(size)
     return torch.stack(sizes)

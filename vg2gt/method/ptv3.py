@@ -13,9 +13,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from vg2gt.method.grid import scene_counts
 from vg2gt.method.serialization import ORDERS, Order, Windows, make_windows, relative_grid, serial_keys
-from vg2gt.method.sparse_conv import NeighborTable, Pairs, SubmanifoldConv3d, neighbors
+from vg2gt.method.sparse_conv import Cells, NeighborTable, Pairs, SubmanifoldConv3d, neighbors
 
 Norm = Literal["layer", "group", "batch"]
 
@@ -26,36 +25,91 @@ class Level:
     Args:
         grid: ``[M, 3]`` int64 cells.
         batch: ``[M]`` scene index, sorted.
-        scenes: B.
+        counts: voxels of each scene.
         keys: sort keys of every order.
         generator: shuffles the orders, so that blocks meet them in random sequence; None keeps them.
+        parent_of: ``[M]`` voxel of the next level that each belongs to, its own at the last one.
+        order: ``[M]`` voxels by parent; None: they are in that order.
     """
 
     def __init__(
-        self, grid: Tensor, batch: Tensor, scenes: int, keys: list[Tensor], generator: torch.Generator | None
+        self,
+        grid: Tensor,
+        batch: Tensor,
+        counts: list[int],
+        keys: list[Tensor],
+        generator: torch.Generator | None,
+        parent_of: Tensor,
+        order: Tensor | None = None,
     ) -> None:
         self.grid = grid
         self.batch = batch
         self.keys = keys
-        self.counts: list[int] = scene_counts(batch, scenes).tolist()
+        self.counts = counts
+        self.parent_of = parent_of
+        self.order = order
         count = len(keys)
         self.sequence = torch.randperm(count, generator=generator).tolist() if generator else list(range(count))
+        self._cuts: dict[int, Windows] = {}  # of places along any curve
         self._windows: dict[tuple[int, int], Windows] = {}
-        self._pairs: dict[int, Pairs | NeighborTable] = {}
+        self.pairs: dict[int, Pairs | NeighborTable] = {}
 
     def windows(self, order: int, length: int) -> Windows:
         """Attention windows along the curve that block number ``order`` uses."""
         which = self.sequence[order % len(self.sequence)]
         if (which, length) not in self._windows:
-            curve = torch.argsort(self.keys[which])
-            self._windows[which, length] = make_windows(curve, self.counts, length)
+            if length not in self._cuts:
+                places = torch.arange(len(self.batch), device=self.batch.device)
+                self._cuts[length] = make_windows(places, self.counts, length)
+            self._windows[which, length] = self._cuts[length].along(torch.argsort(self.keys[which]))
         return self._windows[which, length]
 
-    def pairs(self, kernel_size: int) -> Pairs | NeighborTable:
-        """Neighbour pairs for a convolution."""
-        if kernel_size not in self._pairs:
-            self._pairs[kernel_size] = neighbors(self.grid, self.batch, kernel_size)
-        return self._pairs[kernel_size]
+
+def make_levels(
+    grid: Tensor,
+    batch: Tensor,
+    scenes: int,
+    keys: list[Tensor],
+    extent: Sequence[int],
+    kernels: Sequence[Sequence[int]],
+    generator: torch.Generator | None,
+) -> list[Level]:
+    """All resolutions of a network; the host waits twice for a GPU, whatever their number.
+
+    Args:
+        grid: ``[M, 3]`` int64 cells relative to their scene's smallest.
+        batch: ``[M]`` scene index, sorted.
+        scenes: B.
+        keys: sort keys of every order, of the finest level.
+        extent: cells along each axis.
+        kernels: edge lengths of the kernels that convolve at each level, finest first.
+        generator: shuffles every level's orders.
+    """
+    depth, device = len(kernels), grid.device
+    curve, order = torch.sort(keys[0])
+    codes = curve >> 3 * torch.arange(depth, device=device)[:, None]  # [S, M], of the cells that hold the voxels
+    begins = F.pad(codes[:, 1:] != codes[:, :-1], (1, 0), value=True)
+    before = F.pad(begins.cumsum(1), (1, 0))  # [S, M + 1] cells before each voxel
+    bounds = torch.searchsorted(batch, torch.arange(scenes + 1, device=device))
+    counts: list[list[int]] = before[:, bounds].diff().tolist()
+    in_cell = before[:, 1:] - 1  # [S, M] cell of every voxel along the curve
+    levels = []
+    for s in range(depth):
+        below = in_cell[min(s + 1, depth - 1)]
+        if s:  # one voxel of every cell; cells are in the order of the curve
+            place = torch.searchsorted(in_cell[s], torch.arange(sum(counts[s]), device=device))
+            first = order[place]
+            rows = (grid[first] >> s, batch[first], counts[s], [key[first] >> 3 * s for key in keys])
+            levels.append(Level(*rows, generator, below[place]))
+        else:
+            parent_of = torch.empty_like(order).scatter_(0, order, below)
+            levels.append(Level(grid, batch, counts[s], keys, generator, parent_of, order))
+    wanted = [(level, size) for level, sizes in zip(levels, kernels, strict=True) for size in sizes]
+    spans = {level: [*((cells - 1 >> s) + 1 for cells in extent), scenes] for s, level in enumerate(levels)}
+    found = neighbors([Cells(level.grid, level.batch, size, spans[level]) for level, size in wanted])
+    for (level, size), pairs in zip(wanted, found, strict=True):
+        level.pairs[size] = pairs
+    return levels
 
 
 class SerializedAttention(nn.Module):
@@ -130,7 +184,7 @@ class PTv3Block(nn.Module):
     def forward(self, features: Tensor, level: Level, conv_input: Tensor | None = None) -> Tensor:
         """Maps ``[M, C]`` to ``[M, C]``; ``conv_input`` replaces what the xCPE sees (legacy)."""
         conv, linear, norm = self.cpe
-        x = conv(features if conv_input is None else conv_input, level.pairs(3))
+        x = conv(features if conv_input is None else conv_input, level.pairs[3])
         features = features + norm(linear(x))
         features = features + self._drop(self.attn(self.norm1[0](features), level))
         return features + self._drop(self.mlp[0](self.norm2[0](features)))
@@ -150,20 +204,15 @@ class GridPool(nn.Module):
         self.proj = nn.Linear(in_channels, out_channels)
         self.norm = nn.ModuleList([_make_norm(norm, out_channels)])
 
-    def forward(
-        self, features: Tensor, level: Level, generator: torch.Generator | None
-    ) -> tuple[Tensor, Level, Tensor]:
-        """Returns pooled features ``[M', C']``, their level and every voxel's parent ``[M]``."""
-        parents, order = torch.sort(level.keys[0] >> 3, stable=True)  # [M]
-        _, inverse, counts = torch.unique_consecutive(parents, return_inverse=True, return_counts=True)
-        parent_of = torch.empty_like(inverse)
-        parent_of[order] = inverse
-        first = order[counts.cumsum(0) - counts]
-        projected = self.proj(features).to(features.dtype).index_select(0, order)  # [M, C']
-        pooled = torch.segment_reduce(projected, "max", lengths=counts, unsafe=True)  # [M', C']
-        keys = [key[first] >> 3 for key in level.keys]
-        coarse = Level(level.grid[first] >> 1, level.batch[first], len(level.counts), keys, generator)
-        return F.gelu(self.norm[0](pooled)), coarse, parent_of
+    def forward(self, features: Tensor, level: Level, coarse: Level) -> Tensor:
+        """Returns pooled features ``[M', C']`` of the next level."""
+        projected = self.proj(features).to(features.dtype)  # [M, C']
+        parent_of = level.parent_of
+        if level.order is not None:
+            projected, parent_of = projected.index_select(0, level.order), parent_of[level.order]
+        bounds = torch.searchsorted(parent_of, torch.arange(len(coarse.grid) + 1, device=parent_of.device))
+        pooled = torch.segment_reduce(projected, "max", lengths=bounds.diff(), unsafe=True)  # [M', C']
+        return F.gelu(self.norm[0](pooled))
 
 
 class GridUnpool(nn.Module):
@@ -290,23 +339,25 @@ class PTv3(nn.Module):
         generator = generator if self.training else None
         # S of eqn ptvzengqiang; S^-1 is Windows.owner, with which attention returns to the voxels' own order.
         local = relative_grid(grid, batch, len(voxel_size))
+        extent: list[int] = (local.amax(0) + 1).tolist()
         # One bit of the keys goes at every pooling.
-        keys = serial_keys(local, batch, voxel_size, self.orders, min_bits=max(1, len(self.enc) - 1))
-        level = Level(local, batch, len(voxel_size), keys, generator)
-        stem = self.embedding["stem"]
-        features = F.gelu(stem["norm"](stem["conv"](features, level.pairs(self.stem_kernel))))  # pyright: ignore
+        bits = max(1, len(self.enc) - 1)
+        keys = serial_keys(local, batch, voxel_size, self.orders, bits, max(extent))
+        kernels = [{self.stem_kernel, 3}, *[{3}] * (len(self.enc) - 1)]
+        levels = make_levels(local, batch, len(voxel_size), keys, extent, [[*sizes] for sizes in kernels], generator)
+        stem, level = self.embedding["stem"], levels[0]
+        features = F.gelu(stem["norm"](stem["conv"](features, level.pairs[self.stem_kernel])))  # pyright: ignore
         skips = []
-        for stage in self.enc.values():
+        for stage, level in zip(self.enc.values(), levels, strict=True):
             for name, module in stage.items():  # pyright: ignore
                 if name == "down":
-                    pooled, coarse, parent_of = module(features, level, generator)
-                    skips.append((features, level, parent_of))
-                    features, level = pooled, coarse
+                    skips.append((features, levels[len(skips)]))
+                    features = module(features, skips[-1][1], level)
                 else:
                     features = module(features, level)
         for stage in self.dec.values():
-            skip, level, parent_of = skips.pop()
-            features, skip = stage["up"](features, skip, parent_of)  # pyright: ignore
+            skip, level = skips.pop()
+            features, skip = stage["up"](features, skip, level.parent_of)  # pyright: ignore
             conv_input = skip if self.legacy else None
             for name, block in stage.items():  # pyright: ignore
                 if name != "up":

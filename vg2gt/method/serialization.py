@@ -23,7 +23,8 @@ def serial_codes(grid: Tensor, bits: int, order: Order) -> Tensor:
     three makes a cell's code independent of ``bits``, and so of the other scenes in a batch.
     """
     if order.endswith("-trans"):
-        grid = grid[:, [1, 0, 2]]
+        x, y, z = grid.unbind(-1)
+        grid = torch.stack((y, x, z), -1)
     return z_codes(grid) if order.startswith("z") else hilbert_codes(grid, -(-bits // 3) * 3)
 
 
@@ -35,7 +36,12 @@ def relative_grid(grid: Tensor, batch: Tensor, scenes: int) -> Tensor:
 
 
 def serial_keys(
-    grid: Tensor, batch: Tensor, voxel_size: Tensor, orders: Sequence[Order], min_bits: int = 1
+    grid: Tensor,
+    batch: Tensor,
+    voxel_size: Tensor,
+    orders: Sequence[Order],
+    min_bits: int = 1,
+    extent: int | None = None,
 ) -> list[Tensor]:
     """Sort keys ``scene << 3 bits | code``, one ``[M]`` tensor per order.
 
@@ -45,11 +51,12 @@ def serial_keys(
         voxel_size: ``[B]`` edge lengths; how many says B, what they are only the error's message.
         orders: the wanted orders.
         min_bits: bits per axis at least, so that keys can be shifted to parents this many times.
+        extent: cells along the longest axis where that is known; to find it out, the host waits for a GPU.
 
     Raises:
         ValueError: if code and scene index do not fit into 63 bits, or an axis not into 21.
     """
-    extent, scenes = int(grid.max()) + 1, len(voxel_size)
+    extent, scenes = int(grid.max()) + 1 if extent is None else extent, len(voxel_size)
     bits = max(min_bits, (extent - 1).bit_length())
     if bits > MAX_BITS or 3 * bits + (scenes - 1).bit_length() > 63:
         sizes = ", ".join(f"{size:g}" for size in voxel_size.tolist())
@@ -88,6 +95,11 @@ class Windows:
 
     groups: tuple[WindowGroup, ...]
     owner: Tensor
+
+    def along(self, order: Tensor) -> Windows:
+        """Windows of voxels ``order [M]`` along a curve, where these are of places along it."""
+        groups = tuple(WindowGroup(order[group.rows], group.counts) for group in self.groups)
+        return Windows(groups, torch.empty_like(order).scatter_(0, order, self.owner))
 
 
 def make_windows(order: Tensor, counts: list[int], length: int, shift: int = 0, few_sizes: bool = False) -> Windows:

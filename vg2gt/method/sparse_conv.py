@@ -7,10 +7,9 @@ Both are deterministic.
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -22,6 +21,18 @@ from vg2gt.method.grid import mixed_radix_keys
 Pairs = list[tuple[Tensor, Tensor]]
 CHUNK = 1 << 22  # cells times offsets looked up at once
 HELD = 1 << 28  # numbers of gathered rows and products held at once, off the CPU
+
+
+class Cells(NamedTuple):
+    """Cells ``grid [M, 3]`` int64, all distinct, of scenes ``batch [M]``, with an odd edge length of a cubic kernel.
+
+    ``spans`` are those of :func:`vg2gt.method.grid.mixed_radix_keys`, where known.
+    """
+
+    grid: Tensor
+    batch: Tensor
+    kernel_size: int
+    spans: Sequence[int] | None = None
 
 
 @dataclass(frozen=True)
@@ -45,10 +56,11 @@ class NeighborTable:
         return (slice(begin, min(begin + some, offsets)) for begin in range(0, offsets, some))
 
 
-def neighbors(grid: Tensor, batch: Tensor, kernel_size: int) -> Pairs | NeighborTable:
-    """What a convolution needs to know of ``[M, 3]`` distinct cells: pairs on a CPU, a table elsewhere."""
-    find = neighbor_pairs if one_by_one(grid.device) else neighbor_table
-    return find(grid, batch, kernel_size)
+def neighbors(cells: Sequence[Cells]) -> list[Pairs] | list[NeighborTable]:
+    """What convolutions need to know of their cells: pairs on a CPU, tables elsewhere."""
+    if one_by_one(cells[0].grid.device):
+        return [neighbor_pairs(*each) for each in cells]
+    return neighbor_tables(cells)
 
 
 def one_by_one(device: torch.device) -> bool:
@@ -56,42 +68,54 @@ def one_by_one(device: torch.device) -> bool:
     return device.type == "cpu"
 
 
-def neighbor_table(grid: Tensor, batch: Tensor, kernel_size: int) -> NeighborTable:
-    """All neighbours; the host waits for the cells' extent and for the largest number of pairs at an offset."""
-    keys, order, moves = _sorted_cells(grid, batch, kernel_size)
+def neighbor_tables(cells: Sequence[Cells]) -> list[NeighborTable]:
+    """All neighbours; the host waits once, for the largest numbers of pairs at an offset."""
+    found = [_neighbor_rows(*each) for each in cells]
+    most = torch.stack([there.sum(1).amax() if there.numel() else there.new_zeros((), dtype=torch.int64)
+                        for there in (rows < rows.shape[1] for rows in found)])  # fmt: skip
+    return [_tabulate(rows, most) for rows, most in zip(found, most.tolist(), strict=True)]
+
+
+def _neighbor_rows(grid: Tensor, batch: Tensor, kernel_size: int, spans: Sequence[int] | None = None) -> Tensor:
+    """Row ``[T, M]`` of every voxel's neighbour at every offset; M where there is none."""
+    keys, order, moves = _sorted_cells(grid, batch, kernel_size, spans)
     count, half = len(keys), len(moves)
-    rows = torch.arange(count, device=keys.device)
-    place = torch.searchsorted(keys, keys + moves[:, None]).clamp_(max=count - 1)  # [T / 2, M]
-    found = keys[place] == keys + moves[:, None]
+    wanted = keys + moves[:, None]  # [T / 2, M]
+    place = torch.searchsorted(keys, wanted).clamp_(max=count - 1)
     before = torch.empty_like(place)
-    before[:, order] = torch.where(found, order[place], count)
+    before[:, order] = torch.where(keys[place] == wanted, order[place], count)
     # whose neighbour at an offset is j is j's neighbour at the opposite one; the last column is nobody's
-    after = before.new_full((half, count + 1), count).scatter_(1, before, rows.expand(half, -1))[:, :-1]
-    table = torch.cat((before, after.flip(0)))  # [T, M]
-    there = table < count
-    rank = there.cumsum(1) - 1
-    most = int(rank[:, -1].max()) + 1 if half and count else 0
-    column = torch.where(there, rank, most)
-    sources, targets = (table.new_full((2 * half, most + 1), count) for _ in range(2))
-    sources.scatter_(1, column, table)
-    targets.scatter_(1, column, torch.where(there, rows, count))
-    slots = column + (most + 1) * torch.arange(2 * half, device=keys.device)[:, None]
+    rows = torch.arange(count, device=keys.device).expand(half, -1)
+    after = before.new_full((half, count + 1), count).scatter_(1, before, rows)[:, :-1]
+    return torch.cat((before, after.flip(0)))
+
+
+def _tabulate(rows: Tensor, most: int) -> NeighborTable:
+    """The table of neighbours ``[T, M]``, of which at most ``most`` are there at an offset."""
+    offsets, count = rows.shape
+    there = rows < count
+    column = torch.where(there, there.cumsum(1) - 1, most)
+    sources, targets = (rows.new_full((offsets, most + 1), count) for _ in range(2))
+    sources.scatter_(1, column, rows)
+    targets.scatter_(1, column, torch.where(there, torch.arange(count, device=rows.device), count))
+    slots = column + (most + 1) * torch.arange(offsets, device=rows.device)[:, None]
     return NeighborTable(sources, targets, slots.t().contiguous())
 
 
-def neighbor_pairs(grid: Tensor, batch: Tensor, kernel_size: int) -> Pairs:
+def neighbor_pairs(grid: Tensor, batch: Tensor, kernel_size: int, spans: Sequence[int] | None = None) -> Pairs:
     """Pairs of occupied cells at each offset of the first half of a cubic kernel; the other half mirrors them.
 
     Args:
         grid: ``[M, 3]`` int64 distinct cells.
         batch: ``[M]`` scene index.
         kernel_size: odd edge length of the kernel.
+        spans: of :func:`vg2gt.method.grid.mixed_radix_keys`, where known.
 
     Returns:
         For offset number t (x slowest) of the ``kernel_size^3 // 2`` before the centre, the rows ``(i, j)`` with
         ``grid[j] = grid[i] + offset``.
     """
-    keys, order, moves = _sorted_cells(grid, batch, kernel_size)
+    keys, order, moves = _sorted_cells(grid, batch, kernel_size, spans)
     counts, rows, neighbors = [], [], []
     # many offsets at a time: how many pairs there are is a shape, for which the host waits
     for some in moves.split(max(1, CHUNK // max(1, len(keys)))):
@@ -106,14 +130,17 @@ def neighbor_pairs(grid: Tensor, batch: Tensor, kernel_size: int) -> Pairs:
     return list(zip(torch.cat(rows).split(lengths), torch.cat(neighbors).split(lengths), strict=True))
 
 
-def _sorted_cells(grid: Tensor, batch: Tensor, kernel_size: int) -> tuple[Tensor, Tensor, Tensor]:
+def _sorted_cells(
+    grid: Tensor, batch: Tensor, kernel_size: int, spans: Sequence[int] | None
+) -> tuple[Tensor, Tensor, Tensor]:
     """Sorted keys ``[M]``, row of each, and what the offsets before the kernel's centre add to a key."""
     radius = kernel_size // 2
-    keys, steps = mixed_radix_keys(grid, batch, margin=radius)
+    keys, steps = mixed_radix_keys(grid, batch, radius, spans)
     keys, order = torch.sort(keys)
-    offsets = itertools.islice(itertools.product(range(-radius, radius + 1), repeat=3), kernel_size**3 // 2)
-    moves = keys.new_tensor([sum(o * s for o, s in zip(offset, steps, strict=True)) for offset in offsets])
-    return keys, order, moves
+    # made of ranges, as a list would be copied to a GPU while the host waits
+    axes = [torch.arange(-radius, radius + 1, device=keys.device) * step for step in steps]
+    moves = axes[0][:, None, None] + axes[1][:, None] + axes[2]
+    return keys, order, moves.flatten()[: kernel_size**3 // 2]
 
 
 class _BatchedConvolution(torch.autograd.Function):
@@ -158,7 +185,7 @@ def _sum_products(features: Tensor, taps: Tensor, center: Tensor, table: Neighbo
     padded = F.pad(features, (0, 0, 0, 1))
     for some in table.parts(taps.shape[1] + taps.shape[2]):
         products = (padded[table.sources[some]] @ taps[some]).flatten(0, 1)  # [t (P + 1), out]
-        slots = table.slots[:, some] - some.start * table.sources.shape[1]
+        slots = table.slots[:, some] - some.start * table.sources.shape[1] if some.start else table.slots[:, some]
         out += F.embedding_bag(slots, products, mode="sum")
     return out
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Mapping
-from functools import partial
 from typing import Any, Literal, get_args
 
 import lightning
@@ -16,6 +15,7 @@ from torch.optim.lr_scheduler import LambdaLR
 
 from vg2gt.evaluation.in_training import evaluate_scene
 from vg2gt.evaluation.protocols import training_cameras
+from vg2gt.geometry.cameras import focal_lengths
 from vg2gt.losses import LossReport
 from vg2gt.memory import dropped_by
 from vg2gt.model import VG2GT, Reconstructor
@@ -138,7 +138,7 @@ class VG2GTModule(lightning.LightningModule):
 
     def _losses(self, batch: Batch) -> LossReport | None:
         """The training losses; None, with the cause noted, where the model or the renderer cannot go on."""
-        focal = batch.cameras.intrinsics[..., [0, 1], [0, 1]]
+        focal = focal_lengths(batch.cameras.intrinsics)
         if not finite(batch.images, batch.depth, batch.cameras.world_to_camera, batch.cameras.intrinsics, focal.log()):
             self._cause = "images, depth or cameras of the batch"
             return None
@@ -156,16 +156,14 @@ class VG2GTModule(lightning.LightningModule):
         """All losses: of the context views' geometry and of some rendered views."""
         prediction = self.model(batch.context.images, batch.context.hints, self.generator)
         gaussians = prediction.gaussians
-        if not finite(gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh):
-            self._cause = "Gaussians"
-            return None
         views = self._draw_views(batch)
         cameras = training_cameras(self.model, batch, prediction).select(views.to(self.device))
         try:
             with stage("render"):
                 rendered = self.renderer(gaussians, cameras)
         except UnrenderableError as error:
-            self._cause = f"nothing to render: {error}"
+            values = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
+            self._cause = f"nothing to render: {error}" if finite(*values) else "Gaussians"
             return None
         self._figures = self._scene_figures(batch, prediction)
         with stage("loss"):
@@ -188,16 +186,21 @@ class VG2GTModule(lightning.LightningModule):
         figures: dict[str, Tensor | float] = {"loss": report.total.detach()}
         figures |= {f"train/{name}": value for name, value in report.terms.items()}
         figures |= {f"train/{what}_dropped": float(count) for what, count in dropped_by(self.model).items()}
-        figures["train/scenes_without_depth"] = float(report.skipped * world_size())
-        as_tensor = partial(torch.as_tensor, dtype=torch.float32, device=report.total.device)
-        return {name: as_tensor(value) for name, value in figures.items()}
+        figures["train/scenes_without_depth"] = report.skipped * world_size()
+        return {name: self._figure(value) for name, value in figures.items()}
 
     def _scene_figures(self, batch: Batch, prediction: Prediction) -> dict[str, Tensor]:
         """How many Gaussians and voxels a step's scenes have."""
         figures = {"train/gaussians_per_view": len(prediction.gaussians) / (len(batch.scene) * batch.num_context)}
         if prediction.voxels is not None:
             figures["train/voxels_per_pixel"] = len(prediction.voxels.grid) / batch.context.depth.numel()
-        return {name: torch.tensor(value, device=self.device) for name, value in figures.items()}
+        return {name: self._figure(value) for name, value in figures.items()}
+
+    def _figure(self, value: Tensor | float) -> Tensor:
+        """A float32 scalar; a number is filled in on the device, as copying it there would make the host wait."""
+        if isinstance(value, Tensor):
+            return value.to(torch.float32)
+        return torch.full((), value, dtype=torch.float32, device=self.device)
 
     def _log_step(self, average: bool) -> None:
         """Logs the step's figures: means over ranks, or this rank's own of a step that was dropped."""
@@ -220,9 +223,9 @@ class VG2GTModule(lightning.LightningModule):
             raise ValueError(f"trainer.gradient_clip_algorithm={gradient_clip_algorithm} is not supported; use norm")
         limit = float(gradient_clip_val) if gradient_clip_val and gradient_clip_val > 0 else float("inf")
         norm = nn.utils.clip_grad_norm_(self.model.trained_parameters(), limit)
-        bad = self._cause is not None or not bool(torch.isfinite(norm))
-        # All ranks see the sum, so all of them skip the step or none does.
-        bad_ranks = float(self.trainer.strategy.reduce(norm.new_tensor(float(bad)), reduce_op="sum"))
+        bad = torch.ones_like(norm) if self._cause is not None else (~norm.isfinite()).to(norm.dtype)
+        # All ranks see the sum, so all of them skip the step or none does; here the host waits.
+        bad_ranks = float(self.trainer.strategy.reduce(bad, reduce_op="sum"))
         if bad_ranks:
             # Without gradients the optimiser leaves parameters and moments as they are.
             optimizer.zero_grad(set_to_none=True)
