@@ -2,7 +2,7 @@
 
 Cameras are given, nothing else: both sweeps get the same depth range, found by the network from the cameras alone (and,
 for the record, the classical one also the true range). Rooms that neither the backbone nor anything else was trained
-on, and, with ``--shared FOLDER``, real recordings. Depth is compared after one median scale per set of views, because
+on, and, with ``--shared FOLDER``, real recordings, with ``--infinigen FOLDER``, rooms of Infinigen. Depth is compared after one median scale per set of views, because
 that is how reconstructions are used; ``raw`` has none. Prints a table and writes a dated JSON file.
 """
 
@@ -40,6 +40,7 @@ SETS = {
     "HoloLens office": "data=rgbd data.root={shared}/hololens_office_a data.image_size=[112,224]",
     "7-Scenes kitchen": "data=rgbd data.root={shared}/seven_scenes_redkitchen_a_registered data.image_size=[112,224]"
     " data.eval_window=10",
+    "Infinigen rooms": "data=infinigen data.root={infinigen} data.image_size=[112,224] data.eval_window=10",
 }
 _WINDOW = 7  # pixels of the classical matching cost, at half resolution
 _PLANES = 64
@@ -164,6 +165,7 @@ def main() -> None:
     """Measures all sets."""
     arguments = parser(__doc__, threads=1)
     arguments.add_argument("--shared", type=Path, help="folder with the real recordings")
+    arguments.add_argument("--infinigen", type=Path, help="folder with rooms made by recipes/infinigen")
     arguments.add_argument("--weights", help="safetensors file instead of the shipped weights")
     arguments.add_argument("--scenes", type=int, default=16, help="rooms")
     arguments.add_argument("--seed", type=int, default=1_000_000, help="of the first room")
@@ -176,9 +178,10 @@ def main() -> None:
     backend = SweepBackend(path=options.weights)
     table: dict[str, dict[str, dict[str, float]]] = {}
     for name, overrides in SETS.items():
-        if "{shared}" in overrides and options.shared is None:
+        given = vars(options)
+        if any(f"{{{place}}}" in overrides and given[place] is None for place in ("shared", "infinigen")):
             continue
-        place = overrides.format(shared=options.shared, seed=options.seed, scenes=options.scenes)
+        place = overrides.format(**given)
         rows = [measure(backend, batch, not options.only_network) for batch in batches(place)]
         table[name] = {method: average([row[method] for row in rows]) for method in rows[0]}
         if options.found_poses and "{shared}" in overrides:
