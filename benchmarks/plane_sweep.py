@@ -2,8 +2,9 @@
 
 Cameras are given, nothing else: both sweeps get the same depth range, found by the network from the cameras alone (and,
 for the record, the classical one also the true range). Rooms that neither the backbone nor anything else was trained
-on, and, with ``--shared FOLDER``, real recordings, with ``--infinigen FOLDER``, rooms of Infinigen. Depth is compared after one median scale per set of views, because
-that is how reconstructions are used; ``raw`` has none. Prints a table and writes a dated JSON file.
+on; with ``--shared FOLDER`` real recordings; with ``--infinigen FOLDER`` rooms of Infinigen. Depth is compared after
+one median scale per set of views, because that is how reconstructions are used; ``raw`` has none. Prints a table and
+writes a dated JSON file.
 """
 
 from __future__ import annotations
