@@ -7,8 +7,10 @@ import pytest
 import torch
 
 from tests.refinement.conftest import VIEWS, Start
+from vg2gt.geometry.rotations import quat_to_matrix
 from vg2gt.refinement import Progress, Refined, RefinedScene, RefineLoss, RefineOptions, RefineRates, refine
-from vg2gt.refinement.density import supported
+from vg2gt.refinement.density import GROWTH, merged, supported
+from vg2gt.types import Gaussians
 
 COLOUR = RefineLoss(depth_consistency=0, normal_render=0, normal_decoded=0)
 
@@ -110,6 +112,44 @@ def test_what_few_views_support_is_left_out_at_the_start(start: Start) -> None:
     assert 0.3 * len(start.gaussians) < len(kept) < len(more)
     found = run(replace(start, gaussians=more), RefineOptions(steps=2, check_every=2, min_views=2, fill=0, loss=COLOUR))
     assert len(found.start.gaussians) == len(kept)
+
+
+def test_what_two_views_support_starts_coarse(start: Start) -> None:
+    """Few wide Gaussians take the place of the many that only two views agree on; the others are untouched."""
+    gaussians, cameras, depth = start.gaussians, start.cameras, start.seen.depth
+    strong, weak = (supported(gaussians, cameras, depth, views) for views in (3, 2))
+    found = supported(gaussians, cameras, depth, 3, merge_cells=8.0)
+    assert torch.equal(found.means[: len(strong)], strong.means)
+    coarse = found.select(torch.arange(len(strong), len(found)))
+    assert 0 < len(coarse) < 0.5 * (len(weak) - len(strong))
+    assert coarse.scales.max(-1).values.median() > 2 * strong.scales.max(-1).values.median()
+    options = RefineOptions(steps=2, check_every=2, min_views=3, merge_cells=8.0, fill=0, loss=COLOUR)
+    assert torch.equal(run(start, options).start.gaussians.means, found.means)
+
+
+def test_merged_gaussians_have_the_moments_of_their_mixture() -> None:
+    """Against weighted moments of points drawn from the mixture; the cell beside is on its own."""
+    generator = torch.Generator().manual_seed(0)
+    means = torch.tensor([[0.2, 0.3, 0.4], [0.8, 0.6, 0.5], [1.5, 0.5, 0.5]])
+    quats = torch.nn.functional.normalize(torch.randn(3, 4, generator=generator), dim=-1)
+    scales = torch.tensor([[0.05, 0.1, 0.01], [0.2, 0.05, 0.02], [0.1, 0.05, 0.02]])
+    opacities, sh = (
+        torch.tensor([0.3, 0.9, 0.6]),
+        torch.tensor([[[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]], [[0.0, 0.0, 1.0]]]),
+    )
+    found = merged(Gaussians(means, quats, scales, opacities, sh, torch.zeros(3, dtype=torch.int64)), 1.0)
+    assert len(found) == 2
+    noise = torch.randn(2, 200_000, 3, generator=generator) * scales[:2, None]
+    points = means[:2, None] + noise @ quat_to_matrix(quats[:2]).mT
+    share = opacities[:2] / opacities[:2].sum()
+    mean = (share[:, None] * points.mean(1)).sum(0)
+    covariance = (share[:, None, None] * ((points - mean).mT @ (points - mean))).sum(0) / noise.shape[1]
+    axes = quat_to_matrix(found.quats) * found.scales[:, None] / GROWTH
+    torch.testing.assert_close(found.means[0], mean, atol=1e-3, rtol=0)
+    torch.testing.assert_close((axes @ axes.mT)[0], covariance, atol=1e-3, rtol=0)
+    torch.testing.assert_close(found.sh[0, 0], torch.tensor([0.25, 0.75, 0.0]))
+    alone = quat_to_matrix(quats[2]) * scales[2]
+    torch.testing.assert_close((axes @ axes.mT)[1], alone @ alone.T)
 
 
 def test_the_guard_compares_the_same_views(start: Start) -> None:

@@ -5,29 +5,78 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from vg2gt.geometry.rotations import quat_to_matrix
+from vg2gt.geometry.rotations import matrix_to_quat, quat_to_matrix
 from vg2gt.method.additions.far_shell import is_far
 from vg2gt.method.additions.surfel import ALONE, layout
 from vg2gt.method.additions.visibility import count_points
+from vg2gt.method.grid import plan_voxels, point_cells, pool_mean
 from vg2gt.refinement.parameters import Parameters
 from vg2gt.types import Cameras, Gaussians
 
 TOLERANCE, MARGIN = 0.03, 0.05  # relative differences of depth at which a view agrees with a Gaussian, or looks through
+FEWEST = 2  # views that agree with what is merged
+GROWTH = 2.0  # of merged standard deviations: neighbours overlap, and detail has to be earned
+OPACITY = 0.5  # of what is merged
 
 
-def supported(gaussians: Gaussians, cameras: Cameras, depth: Tensor, views: int) -> Gaussians:
+def supported(gaussians: Gaussians, cameras: Cameras, depth: Tensor, views: int, merge_cells: float = 0.0) -> Gaussians:
     """The Gaussians where at least so many views see a surface, and not more look through; all if there are none.
+
+    Depth without texture is invented, and with many views some inventions agree by chance. Refined as they are, such
+    small Gaussians fit the views they were made from and are debris in all others; merged, they become smooth.
 
     Args:
         gaussians: the scene (B = 1).
         cameras: of its V views (B = 1).
         depth: ``[V, H, W]`` what they see, 0 = unknown.
         views: least number of views that agree; at most half of V is asked for.
+        merge_cells: where fewer views agree, but two do, Gaussians are merged in cells so many times as wide as what
+            the median Gaussian covers; 0: they are left out.
     """
     agree, through = count_points(gaussians.means, depth, cameras, TOLERANCE, MARGIN)
-    keep = (agree >= min(views, len(depth) // 2)) & (through <= agree)
-    keep |= is_far(gaussians, depth, cameras)  # the shell behind everything
-    return gaussians.select(keep) if keep.any() else gaussians
+    far = is_far(gaussians, depth, cameras)  # the shell behind everything
+    keep = (agree >= min(views, len(depth) // 2)) & (through <= agree) | far
+    weak = (agree >= min(FEWEST, len(depth) // 2)) & (through <= agree) & ~keep
+    if not keep.any():
+        return gaussians
+    kept = gaussians.select(keep)
+    if not merge_cells or not weak.any():
+        return kept
+    sizes = gaussians.scales[~far].max(-1).values
+    return kept.joined(merged(gaussians.select(weak), merge_cells * float(sizes.median()) / ALONE))
+
+
+def merged(gaussians: Gaussians, cell: float) -> Gaussians:
+    """One Gaussian for all of each cell: mean and covariance of their mixture, weighted by opacity, and wider.
+
+    The moments are those of Kerbl et al., A Hierarchical 3D Gaussian Representation (2024).
+
+    Args:
+        gaussians: one scene (B = 1).
+        cell: side of the cells in scene units.
+    """
+    cells = point_cells(gaussians.means, gaussians.batch, gaussians.means.new_tensor([cell]))
+    plan = plan_voxels(cells, gaussians.batch, torch.ones_like(gaussians.batch, dtype=torch.bool))
+
+    def mean(values: Tensor) -> Tensor:
+        return pool_mean(values.flatten(1), gaussians.opacities, plan).unflatten(1, values.shape[1:])
+
+    means = mean(gaussians.means)
+    axes = quat_to_matrix(gaussians.quats) * gaussians.scales[:, None]
+    away = (gaussians.means - means[plan.voxel_of])[:, :, None]
+    variances, turn = torch.linalg.eigh(mean((axes @ axes.mT + away @ away.mT) / cell**2).double())
+    turn = turn * torch.linalg.det(turn).sign()[:, None, None]  # eigenvectors may be a reflection
+    smallest = gaussians.scales.min() / cell  # rounding can make a flat one's variance negative
+    scales = GROWTH * cell * variances.clamp(min=float(smallest) ** 2).sqrt()
+    return Gaussians(
+        means,
+        matrix_to_quat(turn).to(means.dtype),
+        scales.to(means.dtype),
+        torch.full_like(means[:, 0], OPACITY),
+        mean(gaussians.sh),
+        plan.batch,
+        gaussians.background,
+    )
 
 
 def prune(parameters: Parameters, min_opacity: float) -> int:

@@ -60,6 +60,8 @@ class RefineOptions:
         fill: side in pixels of the blocks that get a Gaussian where the scene has none; 0: they stay empty.
         min_views: Gaussians that fewer views' depth agrees with, or more views look through than agree with, are left
             out at the start: what a single view supports overfits it. 0: all stay.
+        merge_cells: those that two views agree with, but not ``min_views``, are merged at the start, in cells so many
+            times as wide as what the median Gaussian covers. 0: they are left out.
         prune_opacity: Gaussians less opaque are removed.
         split_share: share of the Gaussians that a check splits, those whose positions are pulled the most.
         max_growth: the scene has at most this many times its Gaussians.
@@ -80,6 +82,7 @@ class RefineOptions:
     sh_degree: int | None = None
     fill: int = 4
     min_views: int = 0
+    merge_cells: float = 0.0
     prune_opacity: float = 0.02
     split_share: float = 0.0
     max_growth: float = 1.5
@@ -98,6 +101,7 @@ class RefineOptions:
             ("sh_degree", self.sh_degree is None or 0 <= self.sh_degree <= MAX_DEGREE, f"0 to {MAX_DEGREE}, or null"),
             ("fill", self.fill >= 0, "at least 0"),
             ("min_views", self.min_views >= 0, "at least 0"),
+            ("merge_cells", self.merge_cells >= 0, "at least 0"),
             ("prune_opacity", 0 <= self.prune_opacity < 1, "at least 0 and below 1"),
             ("split_share", 0 <= self.split_share <= 1, "between 0 and 1"),
             ("max_growth", self.max_growth >= 1, "at least 1"),

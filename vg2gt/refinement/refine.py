@@ -147,7 +147,7 @@ class _Refinement:
         self.trained = self.order.trained.to(seen.images.device)
         self.options = options.of(len(self.order.trained))
         if options.min_views:
-            gaussians = supported(gaussians, cameras, seen.depth, options.min_views)
+            gaussians = supported(gaussians, cameras, seen.depth, options.min_views, options.merge_cells)
         self.limit = int(options.max_growth * len(gaussians))
         self.depth = _median_depth(gaussians, cameras, seen)
         self.pixel = 1 / float(cameras.intrinsics[..., [0, 1], [0, 1]].mean())
