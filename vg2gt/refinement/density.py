@@ -58,8 +58,10 @@ def merged(gaussians: Gaussians, cell: float) -> Gaussians:
     cells = point_cells(gaussians.means, gaussians.batch, gaussians.means.new_tensor([cell]))
     plan = plan_voxels(cells, gaussians.batch, torch.ones_like(gaussians.batch, dtype=torch.bool))
 
+    weights = gaussians.opacities.clamp(min=1e-6)  # a cell may hold only transparent ones
+
     def mean(values: Tensor) -> Tensor:
-        return pool_mean(values.flatten(1), gaussians.opacities, plan).unflatten(1, values.shape[1:])
+        return pool_mean(values.flatten(1), weights, plan).unflatten(1, values.shape[1:])
 
     means = mean(gaussians.means)
     axes = quat_to_matrix(gaussians.quats) * gaussians.scales[:, None]
