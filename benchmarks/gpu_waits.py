@@ -107,7 +107,7 @@ def place(frame: FrameType | None) -> str:
 
 
 class Operations(TorchDispatchMode):
-    """Counts torch operations inside its block as ``gpu_step.py`` does: all but views, by place and by name.
+    """Counts torch operations inside its block, all but views, by place.
 
     Args:
         muted: whether what happens now is left out.
@@ -156,13 +156,13 @@ def as_on_a_gpu() -> Iterator[None]:
         yield
 
 
-RENDER = Counter({"the renderer's operations and kernels (gpu_step.py)": 33})
+RENDER = Counter({"the renderer's operations and kernels": 33})
 
 
 def count_step(run: Any, batch: Any) -> tuple[Counter[str], Counter[str]]:
     """Operations and waits of a whole training step on a GPU: forward, backward, clipping, optimiser.
 
-    The renderer counts with what ``gpu_step.py`` finds and its one wait, Hilbert codes with one kernel each.
+    The renderer counts with ``RENDER`` and its one wait, Hilbert codes with one kernel each.
     """
     from common import training_step
 

@@ -2,7 +2,7 @@
 
 All implementations are measured in one process, in turns, and compared by ratio; times are the best of several
 passes: core-milliseconds on a CPU (one thread unless the table says otherwise), milliseconds on a GPU. Prints tables
-and writes a dated JSON file to ``benchmarks/results``, and a plot of the scaling beside it if matplotlib is there.
+and writes a dated JSON file to ``benchmarks/results``.
 """
 
 from __future__ import annotations
@@ -246,30 +246,6 @@ def print_case_table(title: str, cases: list[Case], timings: list[Timing], unit:
     print_table(head, rows, title=f"{title} ({unit})", text_columns=7, width=120)
 
 
-def plot_scaling(results: dict[str, tuple[list[Case], list[Timing]]], path: Path) -> Path | None:
-    """Writes the scaling with Gaussians, views and threads as a picture; None without matplotlib."""
-    try:
-        from matplotlib import pyplot  # pyright: ignore[reportMissingImports]
-    except ImportError:
-        return None
-    axes: dict[str, Callable[[Case], int]] = {
-        "Gaussians": lambda case: case.gaussians,
-        "views": lambda case: case.views,
-        "threads": lambda case: case.threads,
-    }
-    chosen = [name for name in axes if name in results]
-    figure, panels = pyplot.subplots(1, len(chosen), figsize=(4 * len(chosen), 3), squeeze=False)
-    for panel, name in zip(panels[0], chosen, strict=True):
-        cases, timings = results[name]
-        for part in ("forward", "backward"):
-            panel.plot([axes[name](case) for case in cases], [getattr(t, part) for t in timings], "o-", label=part)
-        panel.set(xlabel=name, ylabel="core-milliseconds", ylim=(0, None))
-        panel.legend()
-    figure.tight_layout()
-    figure.savefig(path)
-    return path
-
-
 def main() -> None:
     """Measures, prints and writes."""
     options = parser(__doc__, device=True, passes=3)
@@ -305,9 +281,7 @@ def main() -> None:
     }
     content = {"machine": where, "unit": unit, "passes": arguments.passes, "tables": tables, "peak_memory_mb": memory}
     name = "render-opensplat" if arguments.opensplat else f"render-{device.type}"
-    path = write_results(arguments.out, name, content)
-    if not arguments.opensplat and (plot := plot_scaling(results, path.with_suffix(".png"))):
-        print(plot)
+    write_results(arguments.out, name, content)
 
 
 if __name__ == "__main__":
