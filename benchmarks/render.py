@@ -1,4 +1,4 @@
-"""Speed of the renderer's implementations, on a GPU memory too: ``python benchmarks/render.py [--quick] [--device cuda]``.
+"""Speed of the renderer's implementations (on a GPU memory, too): ``python benchmarks/render.py [--device cuda]``.
 
 All implementations are measured in one process, in turns, and compared by ratio; times are the best of several
 passes: core-milliseconds on a CPU (one thread unless the table says otherwise), milliseconds on a GPU. Prints tables
