@@ -159,9 +159,6 @@ class Transforms:
 def read_transforms(path: str | Path) -> Transforms:
     """Reads a ``transforms.json``.
 
-    Args:
-        path: the file.
-
     Returns:
         Its frames in our conventions; fields that are not among the records' are ignored.
 
@@ -189,9 +186,6 @@ def write_transforms(path: str | Path, transforms: Transforms) -> Path:
     Args:
         path: the file.
         transforms: what to write; not changed.
-
-    Returns:
-        The path.
 
     Raises:
         ValueError: if a pose is not finite.
