@@ -99,12 +99,7 @@ class Backend(nn.Module, ABC):
 
     @torch.no_grad()
     def predict_cameras(self, images: Tensor, hints: Hints | None = None) -> Cameras:
-        """The raw cameras that these views decode to, to the bit, where nothing else of them is needed.
-
-        Args:
-            images: as :meth:`encode` takes them.
-            hints: likewise.
-        """
+        """The raw cameras that these views decode to, to the bit, where nothing else of them is needed."""
         return self.decode_cameras(self.encode(images, hints))
 
     def freeze(self) -> None:

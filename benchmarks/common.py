@@ -9,6 +9,7 @@ import platform
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from datetime import date
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from torch import Tensor
 from vg2gt.config import compose
 from vg2gt.io.files import write_json
 from vg2gt.training.loop import Run
+from vg2gt.training.schedule import parameter_groups
 from vg2gt.types import Batch
 
 # Real scenes that nothing here was trained on, as trainings evaluate theirs: 8 input views at the given poses.
@@ -176,3 +178,24 @@ def training_step(run: Run) -> Callable[[Batch], Tensor]:
     module.trainer = run.trainer
     module.log = lambda *args, **kwargs: None  # type: ignore[method-assign]
     return lambda batch: module.training_step(batch, 0)
+
+
+def whole_step(
+    run: Run, stage: Callable[[str], AbstractContextManager[Any]] = nullcontext
+) -> Callable[[Batch], Tensor]:
+    """:func:`training_step` with backward pass, clipping and optimiser, the latter two in stages of their own."""
+    step_loss, module = training_step(run), run.module
+    optimizer = module.make_optimizer(parameter_groups(module.model))
+
+    def step(batch: Batch) -> Tensor:
+        with run.trainer.precision_plugin.train_step_context():
+            loss = step_loss(batch)
+        with stage("backward"):
+            loss.backward()
+        with stage("optimizer"):
+            torch.nn.utils.clip_grad_norm_(module.model.trained_parameters(), 1.0)
+            optimizer.step()
+            optimizer.zero_grad(set_to_none=True)
+        return loss.detach()
+
+    return step

@@ -1,9 +1,7 @@
-"""Graph breaks of the networks under ``torch.compile``: ``python benchmarks/compile_breaks.py [--inductor NAME ...]``.
+"""Graph breaks of the networks under ``torch.compile``: ``python benchmarks/compile_breaks.py``.
 
 Traces each module at small sizes, with the inputs that a reconstruction gives it, and lists how many graphs it takes
-and what parts them. Breaks are a matter of the code, not of the device. ``--inductor`` compiles the modules named for
-the CPU besides, as a stand-in for a GPU, and says how far their results are from the uncompiled ones. Writes a dated
-JSON file.
+and what parts them. Breaks are a matter of the code, not of the device. Writes a dated JSON file.
 """
 
 from __future__ import annotations
@@ -138,29 +136,15 @@ def _place(reason: Any) -> str:
     return f"{Path(frame.filename).name} {frame.name}: {str(reason.reason).splitlines()[0]}"
 
 
-def compiled_error(name: str) -> float:
-    """Largest difference between the module's results compiled by inductor and not, over the largest result."""
-    case = cases()[name]()
-    torch._dynamo.reset()
-    with torch.no_grad():
-        plain = case.module.eval()(*case.arguments)
-        made = torch.compile(case.module)(*case.arguments)
-    return float((made - plain).abs().max() / plain.abs().max())
-
-
 def main() -> None:
     """Traces, prints and writes."""
-    options = parser(__doc__)
-    options.add_argument("--inductor", nargs="*", default=[], choices=list(cases()), metavar="NAME")
-    arguments = options.parse_args()
+    arguments = parser(__doc__).parse_args()
     logging.getLogger("torch._dynamo").setLevel(logging.ERROR)
     torch.manual_seed(0)
     found = [explain(name, make()) for name, make in cases().items()]
     rows = [[each.name, str(each.graphs), str(len(each.reasons)), "; ".join(each.reasons) or "-"] for each in found]
     print_table(["module", "graphs", "breaks", "why"], rows, text_columns=1, width=160)
-    errors = {name: compiled_error(name) for name in arguments.inductor}
-    print(errors)
-    content = {"machine": machine(), "modules": [asdict(each) for each in found], "inductor": errors}
+    content = {"machine": machine(), "modules": [asdict(each) for each in found]}
     write_results(arguments.out, "compile-breaks", content)
 
 

@@ -19,6 +19,7 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -135,30 +136,16 @@ def step(setting: Setting) -> Iterator[Result]:
 
 
 def _step(setting: Setting, case: Any) -> Iterator[Result]:
-    from common import training_step
+    from common import whole_step
     from stage_clock import StageClock
     from stages import prepare
-
-    from vg2gt.training.schedule import parameter_groups
 
     device = setting.device
     setting.forget_peak()
     with tempfile.TemporaryDirectory() as folder:
         run, batch = prepare(case, device, folder)
-    module, step_loss, clock = run.module, training_step(run), StageClock(device)
-    optimizer, batch = module.make_optimizer(parameter_groups(module.model)), batch.context
-
-    def whole() -> None:
-        """One training step."""
-        with run.trainer.precision_plugin.train_step_context():
-            loss = step_loss(batch)
-        with clock.stage("backward"):
-            loss.backward()
-        with clock.stage("optimizer"):
-            torch.nn.utils.clip_grad_norm_(module.model.trained_parameters(), 1.0)
-            optimizer.step()
-            optimizer.zero_grad(set_to_none=True)
-
+    clock = StageClock(device)
+    whole = partial(whole_step(run, clock.stage), batch.context)
     milliseconds = setting.timed(whole)
     reserved = torch.cuda.max_memory_reserved(device) / MEGABYTE if device.type == "cuda" else 0.0
     yield {"step_ms": milliseconds, "peak_mb": setting.peak_mb(), "peak_reserved_mb": reserved}
@@ -173,7 +160,7 @@ def _step(setting: Setting, case: Any) -> Iterator[Result]:
     yield {"waits": _waits(device, whole)}
 
 
-def _profile(device: torch.device, act: Callable[[], None]) -> Result:
+def _profile(device: torch.device, act: Callable[[], Any]) -> Result:
     """Operations or kernels of one pass, what they took, and which took most."""
     from torch.profiler import ProfilerActivity, profile
 
@@ -200,7 +187,7 @@ def _profile(device: torch.device, act: Callable[[], None]) -> Result:
     }
 
 
-def _waits(device: torch.device, act: Callable[[], None]) -> Result:
+def _waits(device: torch.device, act: Callable[[], Any]) -> Result:
     """How often the host waits for the device in one pass, copies to it included, by the function that asked."""
     from gpu_waits import Waits, place
 

@@ -184,14 +184,6 @@ def compile_for(launch: Launch, target: str) -> Compiled:
     return Compiled(launch.variant, target, warps, registers, made.metadata.shared, spills, _count(made.asm["cubin"]))
 
 
-def assembly(launch: Launch, target: str) -> str:
-    """Machine code of a recorded launch for an Nvidia GPU, as text."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        made = triton.compile(_source(launch), target=TARGETS[target], options={"num_warps": 4, **launch.options})
-    return _tool("nvdisasm", made.asm["cubin"])
-
-
 def _source(launch: Launch) -> Any:
     signature = launch.signature
     aligned = {

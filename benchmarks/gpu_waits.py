@@ -107,7 +107,7 @@ def place(frame: FrameType | None) -> str:
 
 
 class Operations(TorchDispatchMode):
-    """Counts torch operations inside its block as ``gpu_step.py`` does: all but views, by place and by name.
+    """Counts torch operations inside its block, all but views, by place.
 
     Args:
         muted: whether what happens now is left out.
@@ -156,19 +156,18 @@ def as_on_a_gpu() -> Iterator[None]:
         yield
 
 
-RENDER = Counter({"the renderer's operations and kernels (gpu_step.py)": 33})
+RENDER = Counter({"the renderer's operations and kernels": 33})
 
 
 def count_step(run: Any, batch: Any) -> tuple[Counter[str], Counter[str]]:
     """Operations and waits of a whole training step on a GPU: forward, backward, clipping, optimiser.
 
-    The renderer counts with what ``gpu_step.py`` finds and its one wait, Hilbert codes with one kernel each.
+    The renderer counts with ``RENDER`` and its one wait, Hilbert codes with one kernel each.
     """
-    from common import training_step
+    from common import whole_step
 
     from vg2gt.kernels import curve_codes
     from vg2gt.profiling import listening
-    from vg2gt.training.schedule import parameter_groups
 
     quiet = [0]
     hilbert = curve_codes.hilbert_reference
@@ -185,26 +184,15 @@ def count_step(run: Any, batch: Any) -> tuple[Counter[str], Counter[str]]:
         with rendering("render"):
             return hilbert(*args)
 
-    step, module = training_step(run), run.module
-    optimizer = module.make_optimizer(parameter_groups(module.model))
-    operations, waits = Operations(lambda: quiet[0] > 0), Waits()
-
-    def whole() -> None:
-        with run.trainer.precision_plugin.train_step_context():
-            loss = step(batch)
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(module.model.trained_parameters(), 1.0)
-        optimizer.step()
-        optimizer.zero_grad(set_to_none=True)
-
+    whole, operations, waits = whole_step(run), Operations(lambda: quiet[0] > 0), Waits()
     with as_on_a_gpu(), mock.patch.object(curve_codes, "hilbert_reference", in_one_kernel), listening(rendering):
-        whole()  # what a first step warns of is not looked at again
+        whole(batch)  # what a first step warns of is not looked at again
         codes.clear()
         with operations:
-            whole()
+            whole(batch)
         found = operations.places + codes + RENDER
         with waits:
-            whole()
+            whole(batch)
     # Shuffled orders are drawn on the CPU; nothing is waited for.
     asked = {
         where: n for where, n in waits.places.items() if not where.startswith(("rendering/", "types.py Gaussians"))

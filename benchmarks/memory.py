@@ -6,8 +6,8 @@ paper's modules at their sizes on a small backbone with random weights (``backen
 Views are varied alone, then voxels by ``model.fine.max_voxels`` and Gaussians by ``model.gaussians.splits``.
 
 On a CPU (Linux) every point is measured in a process of its own, as the largest resident set (VmHWM): before the
-pass, at its peak, and the difference. On a GPU it is ``torch.cuda.max_memory_allocated``. Writes a dated JSON file and
-a Markdown table to ``benchmarks/results``.
+pass, at its peak, and the difference. On a GPU it is ``torch.cuda.max_memory_allocated``. Prints a table and
+writes a dated JSON file to ``benchmarks/results``.
 """
 
 from __future__ import annotations
@@ -26,7 +26,6 @@ from common import PeakMemory, machine, parser, training_step, write_results
 from stages import Case, prepare
 
 from vg2gt.evaluation.tables import markdown_table
-from vg2gt.io.files import write_text
 from vg2gt.training.loop import Run
 from vg2gt.types import Batch, Prediction
 
@@ -174,8 +173,7 @@ def main() -> None:
             rows.append(row)
             print(row, flush=True)
             content = {"machine": where, "unit": "MiB", "threads": 1, "points": rows}
-            path = write_results(arguments.out, f"memory-{device.type}", content)
-            write_text(path.with_suffix(".md"), markdown(rows, where))
+            write_results(arguments.out, f"memory-{device.type}", content)
     print(markdown(rows, where))
 
 

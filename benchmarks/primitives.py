@@ -5,7 +5,7 @@ Gaussians merged by voxels, on procedural rooms or, with ``data=rgbd data.root=F
 on the number of primitives and the time of the decoding head). Nothing is trained: counts follow from the backbone's
 geometry, here the simulated one's, whose noise is printed. Training changes those of VG²GT: its enhanced depth agrees
 better among views, so they fall. Times are the best of several passes: core-seconds on a CPU, CUDA events on a GPU.
-Prints a table, writes a dated JSON file to ``benchmarks/results`` and a plot to ``docs/figures``.
+Prints a table and writes a dated JSON file to ``benchmarks/results``.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from common import RESULTS, machine, parser, write_results
+from common import machine, parser, write_results
 from hydra.utils import instantiate
 from stage_clock import StageClock
 
@@ -33,7 +33,6 @@ LABELS = {
     "tiny": "VG²GT",
     "vg2gt": "VG²GT (large)",
 }
-FIGURES = RESULTS.parents[1] / "docs" / "figures"
 
 
 @dataclass(frozen=True)
@@ -136,28 +135,6 @@ def print_rows(title: str, rows: list[Row], pixels: int) -> None:
     print_table(head, cells, title=title, width=120)
 
 
-def plot(rows: list[Row], title: str, unit: str, path: Path) -> Path | None:
-    """Writes primitives and decoding time against views as a picture; None without matplotlib."""
-    try:
-        from matplotlib import pyplot  # pyright: ignore[reportMissingImports]
-    except ImportError:
-        return None
-    figure, panels = pyplot.subplots(1, 2, figsize=(10, 3.6))
-    for label in dict.fromkeys(row.method for row in rows):
-        mine = [row for row in rows if row.method == label]
-        views = [row.views for row in mine]
-        panels[0].plot(views, [row.primitives / 1e3 for row in mine], "o-", label=label)
-        panels[1].plot(views, [row.head_seconds for row in mine], "o-", label=label)
-    panels[0].set(xlabel="views", ylabel="primitives [thousands]", ylim=(0, None))
-    panels[1].set(xlabel="views", ylabel=f"decoding head [{unit}]", ylim=(0, None))
-    panels[0].legend(fontsize=8)
-    figure.suptitle(title, fontsize=9)
-    figure.tight_layout()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
-    return path
-
-
 def describe(overrides: list[str], batch: Batch) -> dict[str, Any]:
     """The data, the backbone and its noise."""
     with tempfile.TemporaryDirectory() as folder:
@@ -180,8 +157,7 @@ def main() -> None:
     options.add_argument("--model", default="tiny", choices=("tiny", "vg2gt"))
     options.add_argument("--reference", default="pixel_aligned", choices=("pixel_aligned", "da3_gs"))
     options.add_argument("--scenes", type=int, default=1)
-    options.add_argument("--name", default="rooms", help="part of the files' names, and of the plot's title")
-    options.add_argument("--figures", type=Path, default=FIGURES)
+    options.add_argument("--name", default="rooms", help="part of the file's name, and of the table's title")
     arguments = options.parse_args()
     torch.set_num_threads(1)
     device = torch.device(arguments.device)
@@ -219,8 +195,6 @@ def main() -> None:
         "rows": [asdict(row) for row in rows],
     }
     write_results(arguments.out, f"primitives-{arguments.name}-{device.type}", content)
-    if picture := plot(rows, title, unit, arguments.figures / f"primitives-{arguments.name}.png"):
-        print(picture)
 
 
 if __name__ == "__main__":

@@ -1,17 +1,14 @@
-"""Speed and memory of the renderer's implementations: ``python benchmarks/render.py [--quick] [--device cuda]``.
+"""Speed of the renderer's implementations (on a GPU memory, too): ``python benchmarks/render.py [--device cuda]``.
 
 All implementations are measured in one process, in turns, and compared by ratio; times are the best of several
 passes: core-milliseconds on a CPU (one thread unless the table says otherwise), milliseconds on a GPU. Prints tables
-and writes a dated JSON file to ``benchmarks/results``, and a plot of the scaling beside it if matplotlib is there.
+and writes a dated JSON file to ``benchmarks/results``.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
@@ -19,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from common import MEGABYTE, PeakMemory, machine, parser, used_seconds, write_results
+from common import MEGABYTE, machine, parser, used_seconds, write_results
 from opensplat import rasterize
 from render_scene import room_cameras, room_gaussians
 from torch import Tensor
@@ -212,22 +209,6 @@ def gpu_suites(quick: bool) -> dict[str, list[Case]]:
     }
 
 
-def peak_memory(gaussians: int, views: int) -> float:
-    """Resident memory in MB a forward and backward pass adds to its inputs, measured in a process of its own."""
-    command = [sys.executable, __file__, "--memory-case", str(gaussians), str(views)]
-    return float(subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()[-1])
-
-
-def _memory_case(gaussians: int, views: int) -> None:
-    small = Case("cpu", 200, size=(16, 16))
-    measure_once(small, *build(small, torch.device("cpu")))
-    case = Case("cpu", gaussians, views=views)
-    scene = build(case, torch.device("cpu"))
-    memory = PeakMemory(torch.device("cpu"))
-    measure_once(case, *scene)
-    print(memory.megabytes)
-
-
 def print_case_table(title: str, cases: list[Case], timings: list[Timing], unit: str) -> None:
     """One row per case, with its ratio to the first case of the same scene."""
     head = ["implementation", "mode", "outputs", "Gaussians", "size", "views", "threads"]
@@ -246,41 +227,12 @@ def print_case_table(title: str, cases: list[Case], timings: list[Timing], unit:
     print_table(head, rows, title=f"{title} ({unit})", text_columns=7, width=120)
 
 
-def plot_scaling(results: dict[str, tuple[list[Case], list[Timing]]], path: Path) -> Path | None:
-    """Writes the scaling with Gaussians, views and threads as a picture; None without matplotlib."""
-    try:
-        from matplotlib import pyplot  # pyright: ignore[reportMissingImports]
-    except ImportError:
-        return None
-    axes: dict[str, Callable[[Case], int]] = {
-        "Gaussians": lambda case: case.gaussians,
-        "views": lambda case: case.views,
-        "threads": lambda case: case.threads,
-    }
-    chosen = [name for name in axes if name in results]
-    figure, panels = pyplot.subplots(1, len(chosen), figsize=(4 * len(chosen), 3), squeeze=False)
-    for panel, name in zip(panels[0], chosen, strict=True):
-        cases, timings = results[name]
-        for part in ("forward", "backward"):
-            panel.plot([axes[name](case) for case in cases], [getattr(t, part) for t in timings], "o-", label=part)
-        panel.set(xlabel=name, ylabel="core-milliseconds", ylim=(0, None))
-        panel.legend()
-    figure.tight_layout()
-    figure.savefig(path)
-    return path
-
-
 def main() -> None:
     """Measures, prints and writes."""
     options = parser(__doc__, device=True, passes=3)
     options.add_argument("--quick", action="store_true", help="the small tables only")
     options.add_argument("--opensplat", type=Path, help="a checkout of OpenSplat: one table beside its CPU rasteriser")
-    options.add_argument("--memory-case", type=int, nargs=2, help=argparse.SUPPRESS)
     arguments = options.parse_args()
-    if arguments.memory_case:
-        gaussians, views = arguments.memory_case
-        _memory_case(gaussians, views)
-        return
     device = torch.device("cpu" if arguments.opensplat else arguments.device)
     where = machine(device)
     print(json.dumps(where))
@@ -294,20 +246,13 @@ def main() -> None:
     for title, cases in suites.items():
         results[title] = cases, compare(cases, device, arguments.passes)
         print_case_table(title, *results[title], unit)
-    memory = {}
-    if device.type == "cpu" and not arguments.opensplat and Path("/proc/self/clear_refs").exists():
-        for gaussians, views in ((100_000, 1),) if arguments.quick else ((100_000, 1), (300_000, 8)):
-            memory[f"{gaussians} Gaussians, {views} views"] = peak_memory(gaussians, views)
-        print("peak memory above inputs, MB:", memory)
     tables = {
         title: [asdict(case) | asdict(timing) for case, timing in zip(*result, strict=True)]
         for title, result in results.items()
     }
-    content = {"machine": where, "unit": unit, "passes": arguments.passes, "tables": tables, "peak_memory_mb": memory}
+    content = {"machine": where, "unit": unit, "passes": arguments.passes, "tables": tables}
     name = "render-opensplat" if arguments.opensplat else f"render-{device.type}"
-    path = write_results(arguments.out, name, content)
-    if not arguments.opensplat and (plot := plot_scaling(results, path.with_suffix(".png"))):
-        print(plot)
+    write_results(arguments.out, name, content)
 
 
 if __name__ == "__main__":

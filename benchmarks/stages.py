@@ -21,14 +21,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from common import machine, parser, training_step, write_results
+from common import machine, parser, whole_step, write_results
 from stage_clock import StageClock
 
 from vg2gt.evaluation.paper import tables
 from vg2gt.evaluation.tables import print_table
 from vg2gt.studies.study import compose_run
 from vg2gt.training.loop import Run, build
-from vg2gt.training.schedule import parameter_groups
 from vg2gt.types import Batch
 
 STAGES = {
@@ -101,18 +100,12 @@ def measure_training(run: Run, batch: Batch, passes: int, device: torch.device) 
 
     Data loading is not in it.
     """
-    module, step_loss, clock = run.module, training_step(run), StageClock(device)
-    optimizer = module.make_optimizer(parameter_groups(module.model))
+    step, clock = whole_step(run), StageClock(device)
     for _ in range(passes + 1):
         with clock.stage("training step"):
-            with run.trainer.precision_plugin.train_step_context():
-                loss = step_loss(batch)
-            if not bool(torch.isfinite(loss)):
-                raise FloatingPointError("the loss is not finite: such a step is dropped, its time says nothing")
-            loss.backward()
-            torch.nn.utils.clip_grad_norm_(module.model.trained_parameters(), 1.0)
-            optimizer.step()
-            optimizer.zero_grad(set_to_none=True)
+            loss = step(batch)
+        if not bool(torch.isfinite(loss)):
+            raise FloatingPointError("the loss is not finite: such a step is dropped, its time says nothing")
     return min(clock.stages["training step"].seconds[1:])
 
 

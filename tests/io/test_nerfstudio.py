@@ -80,16 +80,6 @@ def test_field_of_view_and_missing_size(tmp_path: Path) -> None:
         lens.intrinsics()
 
 
-def test_applied_transform_can_be_taken_back(tmp_path: Path) -> None:
-    rng = np.random.default_rng(3)
-    original, applied = random_pose(rng), random_pose(rng)
-    moved = np.linalg.inv(applied @ np.linalg.inv(original))
-    lens = Lens.from_intrinsics(np.diag([10.0, 10.0, 1.0]), (4, 4))
-    back = Transforms((TransformsFrame("a", moved, lens),), applied[:3]).before_applied_transform()
-    np.testing.assert_allclose(back.frames[0].world_to_camera, original, atol=1e-12)
-    assert back.applied_transform is None
-
-
 def test_real_file(shared: Path, tmp_path: Path) -> None:
     fox = read_transforms(shared / "data" / "ingp_fox" / "transforms.json")
     assert len(fox.frames) == 67

@@ -54,20 +54,11 @@ def test_a_bad_value_in_the_data_drops_the_step(run: Run, caplog: pytest.LogCapt
 Change = Callable[[Any], Any]
 
 
-def _depth(value: float, everywhere: bool) -> Change:
+def _pixels(part: str, value: float, everywhere: bool) -> Change:
     def change(geometry: Any) -> Any:
-        depth = geometry.depth.clone()
-        (depth if everywhere else depth[..., 3, 5])[...] = value
-        return replace(geometry, depth=depth)
-
-    return change
-
-
-def _confidence(value: float, everywhere: bool) -> Change:
-    def change(geometry: Any) -> Any:
-        confidence = geometry.depth_conf.clone()
-        (confidence if everywhere else confidence[..., 3, 5])[...] = value
-        return replace(geometry, depth_conf=confidence)
+        pixels = getattr(geometry, part).clone()
+        (pixels if everywhere else pixels[..., 3, 5])[...] = value
+        return replace(geometry, **{part: pixels})
 
     return change
 
@@ -94,8 +85,8 @@ def _tokens(part: str, value: float) -> Change:
 
 # what is changed, how, whether the step must be dropped (None: either way)
 BACKBONE: list[tuple[str, Change, bool | None]] = []
-BACKBONE += [("decode", _depth(value, everywhere), None) for value in VALUES for everywhere in (False, True)]
-BACKBONE += [("decode", _confidence(value, everywhere), None) for value in VALUES for everywhere in (False, True)]
+for part in ("depth", "depth_conf"):
+    BACKBONE += [("decode", _pixels(part, value, all_), None) for value in VALUES for all_ in (False, True)]
 BACKBONE += [("decode", _cameras(part, value), True) for part in ("world_to_camera", "intrinsics") for value in VALUES]
 BACKBONE += [("encode", _tokens(part, value), True) for part in ("first", "last") for value in VALUES]
 BACKBONE += [("encode", _tokens("camera", value), None) for value in VALUES]

@@ -11,32 +11,6 @@ def features_of(grid, channels=8):
     return torch.randn(len(grid), channels, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
 
 
-def test_permuting_voxels_permutes_the_result(random_voxels, make_ptv3):
-    grid, batch = random_voxels()
-    features, net = features_of(grid), make_ptv3().double().eval()
-    order = torch.cat((torch.randperm(90), 90 + torch.randperm(60)))
-    out = net(features, grid, batch, SIZE)
-    torch.testing.assert_close(net(features[order], grid[order], batch[order], SIZE), out[order], atol=1e-6, rtol=0)
-
-
-def test_shifting_scenes_by_whole_voxels_changes_nothing(random_voxels, make_ptv3):
-    grid, batch = random_voxels()
-    features, net = features_of(grid), make_ptv3().double().eval()
-    shift = torch.tensor([[7, -11, 300], [-5, 0, 64]])[batch]
-    assert torch.equal(net(features, grid + shift, batch, SIZE), net(features, grid, batch, SIZE))
-
-
-def test_a_batch_equals_separate_runs(random_voxels, make_ptv3):
-    grid, batch = random_voxels((90, 5))
-    grid = grid * torch.where(batch == 1, 9, 1)[:, None]  # extents of different bit lengths
-    features, net = features_of(grid), make_ptv3().double().eval()
-    together = net(features, grid, batch, SIZE)
-    for scene in (0, 1):
-        rows = batch == scene
-        alone = net(features[rows], grid[rows], torch.zeros_like(batch[rows]), SIZE[:1])
-        torch.testing.assert_close(together[rows], alone, atol=1e-10, rtol=0)
-
-
 def test_orders_are_shuffled_in_training_only_and_from_the_generator(random_voxels, make_ptv3):
     grid, batch = random_voxels()
     features, net = features_of(grid), make_ptv3().double()

@@ -73,9 +73,6 @@ def usable_pixels(geometry: Geometry, images: Tensor) -> Pixels:
     Args:
         geometry: depth, confidence and cameras in scene units.
         images: ``[B, V, 3, H, W]`` in [0, 1].
-
-    Returns:
-        The pixels, in float32.
     """
     depth, confidence = geometry.depth.float(), geometry.depth_conf.float()
     usable = torch.isfinite(depth) & (depth > 0) & torch.isfinite(confidence) & (confidence > 0)

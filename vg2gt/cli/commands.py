@@ -106,10 +106,6 @@ DATA_COMMANDS = {
 def dispatch(program: str, commands: Mapping[str, Command]) -> None:
     """Runs ``program COMMAND [arguments]``; lists the commands if none is named.
 
-    Args:
-        program: its name, for messages.
-        commands: by name.
-
     Raises:
         SystemExit: if there is no such command, naming the nearest.
     """

@@ -49,9 +49,6 @@ def evaluate(config: DictConfig) -> dict[str, Any]:
     Writes into the output folder: the resolved configuration, one file per scene as it is done, ``metrics.json``,
     ``metrics.md`` and pictures. Scenes that the folder holds already are not evaluated again.
 
-    Args:
-        config: ``configs/evaluate.yaml``.
-
     Returns:
         The content of ``metrics.json``: ``settings``, and for every number of views ``mean`` and ``scenes``.
 

@@ -138,9 +138,6 @@ def write_cameras_json(path: str | Path, cameras: Sequence[NamedCamera]) -> Path
         path: the file.
         cameras: what to write; not changed.
 
-    Returns:
-        The path.
-
     Raises:
         ValueError: if one is no camera: a wrong shape, a value that is not finite, no rotation, no focal length.
     """

@@ -122,9 +122,6 @@ def write_colmap(folder: str | Path, model: Reconstruction, *, text: bool = Fals
         model: what to write; not changed.
         text: True writes ``.txt``, False ``.bin``.
 
-    Returns:
-        The folder.
-
     Raises:
         FileExistsError: if the folder holds a model of the other kind.
     """

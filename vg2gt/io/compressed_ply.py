@@ -37,9 +37,6 @@ def write_compressed_ply(path: str | Path, gaussians: Gaussians) -> Path:
         path: the file, by custom ``NAME.compressed.ply``.
         gaussians: one scene; not changed.
 
-    Returns:
-        The path.
-
     Raises:
         ValueError: on more than one scene and on values that cannot be written.
     """

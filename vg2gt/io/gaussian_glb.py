@@ -35,9 +35,6 @@ def write_gaussian_glb(path: str | Path, gaussians: Gaussians) -> Path:
         path: the file.
         gaussians: one scene, not empty; not changed. Quaternions are normalised.
 
-    Returns:
-        The path.
-
     Raises:
         ValueError: on none or more than one scene and on values that cannot be written.
     """

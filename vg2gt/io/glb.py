@@ -50,9 +50,6 @@ def write_glb(
         frustum_depth: distance from a camera's centre to its drawn image, in scene units; None is a twentieth of the
             extent of points and cameras.
 
-    Returns:
-        The path.
-
     Raises:
         ValueError: if shapes or types are others, or a value is not finite, or there is nothing to write.
     """

@@ -155,9 +155,6 @@ def write_mesh(path: str | Path, mesh: Mesh) -> Path:
         path: a file ending in ``.ply``, ``.glb``, ``.obj``, ``.stl`` or ``.off``.
         mesh: what to write; not changed.
 
-    Returns:
-        The path.
-
     Raises:
         ValueError: on another ending, or a mesh without triangles.
     """

@@ -155,23 +155,9 @@ class Transforms:
     applied_transform: NDArray[np.floating] | None = None
     ply_file_path: str | None = None
 
-    def before_applied_transform(self) -> Transforms:
-        """The same frames in the world before ``applied_transform``; unchanged where there was none.
-
-        The point cloud is left behind, because it belongs to the other world.
-        """
-        if self.applied_transform is None:
-            return self
-        applied = np.vstack((self.applied_transform, [0, 0, 0, 1]))
-        frames = tuple(replace(frame, world_to_camera=frame.world_to_camera @ applied) for frame in self.frames)
-        return Transforms(frames)
-
 
 def read_transforms(path: str | Path) -> Transforms:
     """Reads a ``transforms.json``.
-
-    Args:
-        path: the file.
 
     Returns:
         Its frames in our conventions; fields that are not among the records' are ignored.
@@ -200,9 +186,6 @@ def write_transforms(path: str | Path, transforms: Transforms) -> Path:
     Args:
         path: the file.
         transforms: what to write; not changed.
-
-    Returns:
-        The path.
 
     Raises:
         ValueError: if a pose is not finite.

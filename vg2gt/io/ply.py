@@ -66,9 +66,6 @@ def write_gaussian_ply(path: str | Path, gaussians: Gaussians, *, full_sh: bool 
         full_sh: True writes 45 ``f_rest`` even for colours that do not depend on the view, which the original 3DGS
             viewer insists on. Degrees 1 and 2 are always filled up with zeros to 45.
 
-    Returns:
-        The path.
-
     Raises:
         ValueError: on more than one scene and on values that cannot be written.
     """
@@ -149,9 +146,6 @@ def write_point_ply(path: str | Path, positions: ArrayLike, colors: ArrayLike | 
         path: the file.
         positions: ``[N, 3]``.
         colors: ``[N, 3]`` uint8, or None.
-
-    Returns:
-        The path.
 
     Raises:
         ValueError: if the shapes or types are others.

@@ -35,13 +35,6 @@ _ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("q
 def write_splat(path: str | Path, gaussians: Gaussians) -> Path:
     """Writes one scene's Gaussians in their order, atomically; the module says what is lost.
 
-    Args:
-        path: the file.
-        gaussians: one scene; not changed.
-
-    Returns:
-        The path.
-
     Raises:
         ValueError: on more than one scene and on values that cannot be written.
     """

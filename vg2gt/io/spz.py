@@ -42,13 +42,6 @@ _COLOR = 0.15  # a byte holds 0.5 + 0.15 times the constant coefficient
 def write_spz(path: str | Path, gaussians: Gaussians) -> Path:
     """Writes one scene's Gaussians in their order, version 3, atomically; the module says what is lost.
 
-    Args:
-        path: the file.
-        gaussians: one scene; not changed.
-
-    Returns:
-        The path.
-
     Raises:
         ValueError: on more than one scene and on values that cannot be written.
     """
@@ -78,9 +71,6 @@ def write_spz(path: str | Path, gaussians: Gaussians) -> Path:
 
 def read_spz(path: str | Path) -> Gaussians:
     """Reads a ``.spz`` file of version 2 or 3.
-
-    Args:
-        path: the file.
 
     Returns:
         The Gaussians as scene 0, float32.

@@ -135,9 +135,6 @@ def write_video(path: str | Path, frames: Sequence[NDArray[np.uint8]], fps: floa
         frames: ``[H, W, 3]`` each, all of one size; not changed. MP4 needs even sizes: an odd row or column is cut.
         fps: frames per second; GIF knows hundredths of a second only.
 
-    Returns:
-        The path.
-
     Raises:
         ValueError: if there are no frames, sizes differ, or the suffix is another.
         MissingDecoderError: if it is an MP4 and there is no PyAV.

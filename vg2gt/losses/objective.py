@@ -26,14 +26,12 @@ class LossReport:
             pixels that have a depth.
         scale: ``[B]`` ground-truth unit of the losses per scene unit.
         skipped: scenes with fewer than 100 valid depth pixels, whose depth terms are 0.
-        by_scene: the terms of every scene.
     """
 
     total: Tensor
     terms: dict[str, Tensor]
     scale: Tensor
     skipped: Tensor
-    by_scene: tuple[dict[str, Tensor], ...]
 
 
 @dataclass(frozen=True)
@@ -139,9 +137,8 @@ class VG2GTLoss(nn.Module):
                     for i, scene in enumerate(scenes)
                 ]
             total = torch.stack([scene.total for scene in scenes]).mean()
-            by_scene = tuple({name: term.detach() for name, term in scene.terms.items()} for scene in scenes)
-            terms = {name: torch.stack([scene[name] for scene in by_scene]).mean() for name in by_scene[0]}
-        return LossReport(total, terms, scales.scene, (~truth.known).sum(), by_scene)
+            terms = {name: torch.stack([s.terms[name].detach() for s in scenes]).mean() for name in scenes[0].terms}
+        return LossReport(total, terms, scales.scene, (~truth.known).sum())
 
     def _geometry_terms(self, before: Geometry, after: Geometry, truth: Truth, valid: Tensor) -> SceneLoss:
         """Geometry and enhancement losses of one scene, everything in the truth's unit."""

@@ -115,9 +115,6 @@ def write_outputs(
         figures: what ``report.json`` and ``report.html`` say in addition to the scene's own figures.
         monitor: shows and times the stages.
 
-    Returns:
-        The folder.
-
     Raises:
         FileExistsError: if an output exists.
         PermissionError: if the folder cannot be written to.

@@ -56,12 +56,7 @@ def digest(picture: Picture) -> str:
 
 
 def name_damaged(pictures: Sequence[Picture], error: Exception) -> DataError:
-    """The error that names all pictures that cannot be read, after one could not.
-
-    Args:
-        pictures: all of them.
-        error: of the one.
-    """
+    """The error that names all pictures that cannot be read, after one could not."""
     errors = []
     for picture in pictures:
         try:

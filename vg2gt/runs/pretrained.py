@@ -48,9 +48,6 @@ def save_pretrained(ckpt: str | Path, folder: str | Path) -> Path:
     Args:
         ckpt: a run's folder or checkpoint.
         folder: made if needed.
-
-    Returns:
-        The folder.
     """
     folder = Path(folder).expanduser()
     folder.mkdir(parents=True, exist_ok=True)

@@ -50,9 +50,6 @@ def run_once(overrides: Sequence[str], folder: Path, scored: bool = True) -> Met
         folder: the run's own.
         scored: whether a run of no steps is evaluated, for which its data is needed.
 
-    Returns:
-        The metrics after training.
-
     Raises:
         ValueError: if the folder holds the run of another configuration, or one that started from other weights.
         SystemExit: if the training was asked to stop (SIGTERM); the same call goes on with it.
@@ -154,9 +151,6 @@ def write_part(start: Path, path: Path, keep: Callable[[str], bool]) -> Path:
         start: checkpoint whose ``state_dict`` is taken; optimiser state and step are not.
         path: the new checkpoint, replaced if it is there.
         keep: says of a tensor's name, such as ``model.coarse.out.weight``, whether it is kept.
-
-    Returns:
-        ``path``.
     """
     state = read_checkpoint(start)["state_dict"]
     write_checkpoint({"state_dict": {name: tensor for name, tensor in state.items() if keep(name)}}, path)

@@ -165,9 +165,6 @@ def train(config: DictConfig) -> dict[str, Any]:
     Writes into ``outputs/<name>``: the resolved configuration, checkpoints, ``metrics.json``, ``metrics.md`` and
     ``preview.png``.
 
-    Args:
-        config: of the training.
-
     Returns:
         The content of ``metrics.json``.
 

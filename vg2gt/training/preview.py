@@ -23,9 +23,6 @@ def write_preview(module: VG2GTModule, datamodule: LightningDataModule, path: st
         datamodule: its evaluation scenes are shown, the middle held-out view of each.
         path: the PNG file.
         scenes: number of rows.
-
-    Returns:
-        The path.
     """
     module.eval()
     rows = []

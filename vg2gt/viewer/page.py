@@ -35,9 +35,6 @@ def write_viewer_html(path: str | Path, scene: ViewerScene) -> Path:
         path: the file.
         scene: what to show; not changed. Pictures are stored as JPEG, Gaussians as :mod:`vg2gt.viewer.packing` says.
 
-    Returns:
-        The path.
-
     Raises:
         ValueError: if the Gaussians are of more than one scene or have values that cannot be shown.
     """

@@ -58,9 +58,6 @@ def start_server(scene: ViewerScene, host: str = LOOPBACK, port: int = PORT, sha
         port: the first port to try; if it is taken, a later free one is used (``get_port()``). 0: any.
         share: whether the scene may be published; ``request_share_url()`` does it.
 
-    Returns:
-        The running server.
-
     Raises:
         MissingViserError: without the package viser, naming the extra that brings it.
     """

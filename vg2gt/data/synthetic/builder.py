@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from vg2gt.data.synthetic.raycast import AXES, BOX, CYLINDER, ELLIPSOID, GROUP_COLUMNS, HALF, KIND
+from vg2gt.data.synthetic.raycast import AXES, BOX, CYLINDER, ELLIPSOID, GROUP_COLUMNS, HALF, KIND, PART_COLUMNS
 from vg2gt.data.synthetic.textures import INDOOR, Pattern
 
 Vector = Sequence[float]  # x, y, z
@@ -117,3 +117,12 @@ class Builder:
             radius = np.linalg.norm(corners - middle, axis=1).max() + 1e-6
             rows.append([*middle, radius, first, last])
         return np.array(rows, np.float64).reshape(-1, GROUP_COLUMNS)
+
+    def arrays(self) -> dict[str, NDArray]:
+        """Parts, groups and materials as :class:`vg2gt.data.synthetic.renderer.World` takes them."""
+        return {
+            "parts": np.array(self.parts).reshape(-1, PART_COLUMNS),
+            "part_materials": np.array(self.part_materials, np.int64),
+            "groups": self.groups(),
+            "materials": np.array(self.materials),
+        }

@@ -12,7 +12,6 @@ from vg2gt.data.synthetic import street
 from vg2gt.data.synthetic.builder import Builder
 from vg2gt.data.synthetic.furniture import MAKERS
 from vg2gt.data.synthetic.outdoor import GROUND_COLORS, draw_daylight
-from vg2gt.data.synthetic.raycast import PART_COLUMNS
 from vg2gt.data.synthetic.renderer import World
 from vg2gt.data.synthetic.rooms import draw_lamps
 from vg2gt.data.synthetic.synthetic_scene import SyntheticScene, draw_highlights, level_poses
@@ -223,20 +222,11 @@ def _fill_room(builder: Builder, extent: NDArray[np.float64], free: float) -> No
     builder.end_group()
 
 
-def _parts(builder: Builder) -> dict[str, NDArray]:
-    return {
-        "parts": np.array(builder.parts).reshape(-1, PART_COLUMNS),
-        "part_materials": np.array(builder.part_materials, np.int64),
-        "groups": builder.groups(),
-        "materials": np.array(builder.materials),
-    }
-
-
 def _open_world(builder: Builder, ground: int) -> World:
     lights, ambient, sky = draw_daylight(builder.rng)
     walls = np.array([[-_HORIZON, -_HORIZON, 0.0], [_HORIZON, _HORIZON, 200.0]])
     materials = np.full(6, ground)
-    return World(walls=walls, wall_materials=materials, lights=lights, ambient=ambient, sky=sky, **_parts(builder))
+    return World(walls=walls, wall_materials=materials, lights=lights, ambient=ambient, sky=sky, **builder.arrays())
 
 
 def _closed_world(builder: Builder, extent: NDArray[np.float64], floor: int) -> World:
@@ -250,5 +240,5 @@ def _closed_world(builder: Builder, extent: NDArray[np.float64], floor: int) -> 
         wall_materials=np.array([*walls, floor, own[4]]),
         lights=lights,
         ambient=ambient,
-        **_parts(builder),
+        **builder.arrays(),
     )

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from vg2gt.data.synthetic import street
 from vg2gt.data.synthetic.builder import Builder
-from vg2gt.data.synthetic.raycast import PART_COLUMNS
 from vg2gt.data.synthetic.renderer import World
 from vg2gt.data.synthetic.sky import draw_sky
 from vg2gt.data.synthetic.synthetic_scene import SyntheticScene, draw_highlights, level_poses
@@ -192,13 +191,10 @@ def _finish(builder: Builder, ground: int) -> World:
     return World(
         walls=_BOUNDS,
         wall_materials=np.full(6, ground),
-        parts=np.array(builder.parts).reshape(-1, PART_COLUMNS),
-        part_materials=np.array(builder.part_materials, np.int64),
-        groups=builder.groups(),
-        materials=np.array(builder.materials),
         lights=lights,
         ambient=ambient,
         sky=sky,
+        **builder.arrays(),
     )
 
 

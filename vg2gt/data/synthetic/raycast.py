@@ -194,9 +194,6 @@ def parts_in_cone(apex, axis, spread, reach, parts, groups, visible, near):
         groups: ``[g, GROUP_COLUMNS]``; those that miss the cone are passed over as a whole.
         visible: ``[n]`` receives the parts.
         near: ``[n]`` receives the least distance of each one's group.
-
-    Returns:
-        How many there are.
     """
     count = 0
     for g in range(groups.shape[0]):

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from vg2gt.data.synthetic.builder import Builder
 from vg2gt.data.synthetic.furniture import MAKERS
-from vg2gt.data.synthetic.raycast import PART_COLUMNS
 from vg2gt.data.synthetic.renderer import World
 from vg2gt.data.synthetic.synthetic_scene import SyntheticScene, draw_highlights, level_poses
 from vg2gt.data.synthetic.textures import INDOOR, Pattern
@@ -137,12 +136,9 @@ def _finish(builder: Builder, extent: NDArray[np.float64], shell: NDArray[np.int
     return World(
         walls=np.array([[-half[0], -half[1], 0.0], [half[0], half[1], extent[2]]]),
         wall_materials=shell,
-        parts=np.array(builder.parts).reshape(-1, PART_COLUMNS),
-        part_materials=np.array(builder.part_materials, np.int64),
-        groups=builder.groups(),
-        materials=np.array(builder.materials),
         lights=lights,
         ambient=ambient,
+        **builder.arrays(),
     )
 
 
