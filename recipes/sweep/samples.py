@@ -121,9 +121,16 @@ class TrainingSamples(Dataset[Sample]):
             int(rng.choice(_SOURCES, p=_SOURCE_SHARES)),
         )
         parts = [self._scene(layout, rng) for _ in range(self.scenes)]
-        images, depth, poses, intrinsics, depth_range = (torch.cat([part[n] for part in parts]) for n in range(5))
-        sources = torch.cat([part.sources + n * self.views for n, part in enumerate(parts)])
-        return Sample(images, depth, poses, intrinsics, depth_range, sources, layout.planes, self.scenes)
+        return Sample(
+            torch.cat([part.images for part in parts]),
+            torch.cat([part.depth for part in parts]),
+            torch.cat([part.world_to_camera for part in parts]),
+            torch.cat([part.intrinsics for part in parts]),
+            torch.cat([part.depth_range for part in parts]),
+            torch.cat([part.sources + n * self.views for n, part in enumerate(parts)]),
+            layout.planes,
+            self.scenes,
+        )
 
     def _scene(self, layout: Layout, rng: Generator) -> Sample:
         while True:

@@ -138,7 +138,7 @@ def make_scenes(
     """
     root = Path(folder).expanduser()
     seeds = range(first_seed, first_seed + count)
-    make = partial(_make_scene, root, tuple(size))
+    make = partial(_make_scene, root, (size[0], size[1]))
     if workers == 1:
         yield from map(make, seeds)
         return
