@@ -101,7 +101,7 @@ def test_photographs_are_refined_unless_asked_not_to(scene: Scene) -> None:
     """Cameras from bundle adjustment stay, predicted ones move; recordings are refined on demand, as before."""
     photographs = replace(scene, cameras_from="structure from motion, 4 of 4 images")
     by_default = _refinement(photographs, None)
-    assert (by_default.steps, by_default.rates.cameras, by_default.min_views) == (400, 0.0, 2)
+    assert (by_default.steps, by_default.rates.cameras, by_default.min_views) == (400, 0.0, 3)
     assert _refinement(photographs, 0) is None
     predicted = _refinement(replace(scene, cameras_from=""), 7)
     assert (predicted.steps, predicted.rates.cameras) == (7, RefineRates().cameras)
