@@ -188,6 +188,7 @@ def whole_step(
     optimizer = module.make_optimizer(parameter_groups(module.model))
 
     def step(batch: Batch) -> Tensor:
+        """The loss of one training step."""
         with run.trainer.precision_plugin.train_step_context():
             loss = step_loss(batch)
         with stage("backward"):

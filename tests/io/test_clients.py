@@ -18,7 +18,7 @@ pytestmark = pytest.mark.slow
 def splat_transform(*arguments: Path | str) -> None:
     program = shutil.which("splat-transform")
     if program is None:
-        pytest.skip("needs splat-transform: npm install -g @playcanvas/splat-transform")
+        pytest.skip("needs splat-transform: npm install -g @playcanvas/splat-transform@3.7.0")
     done = subprocess.run([program, "-w", *map(str, arguments)], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
 

@@ -42,6 +42,7 @@ def _on_team(team: Callable[..., None], threads: int, items: Sequence[Item], fun
     waiting, failures, begun = iter(items), [], []
 
     def body(_: int | None) -> None:
+        """What one thread does."""
         try:
             begun.append(threading.get_ident())
             for item in waiting:  # a sequence's iterator hands out every item once, under the interpreter's lock

@@ -99,6 +99,7 @@ def _writer(scene: Scene, view: int, whole: bool) -> Callable[[Path], None]:
     picture = scene.pictures[view] if whole else None
 
     def write(path: Path) -> None:
+        """Writes the view's image."""
         image = scene.images[view]
         if picture is not None:
             same = picture.path is not None and not picture.lens and picture.path.suffix.lower() == path.suffix.lower()

@@ -97,6 +97,8 @@ def recording_pictures(source: FileSource) -> list[Picture]:
     metric = source.is_metric or (isinstance(source, RGBDFolder) and (index.folder / "depth").is_dir())
 
     def picture(frame: int) -> Picture:
+        """The frame as a picture that is read when it is needed."""
+
         def read(size: tuple[int, int]) -> Frames:
             return source.load_whole(scene, frame)
 
@@ -251,6 +253,7 @@ def _photo(path: Path, camera: NamedCamera, cameras: Path) -> Picture:
     pose = torch.from_numpy(camera.world_to_camera)
 
     def read(wanted: tuple[int, int]) -> Frames:
+        """The photograph without distortion, its mask and its camera at the wanted size."""
         pixels = read_color(path, path.parent.name, upright=upright)
         mask = mask_for(path, upright)
         if undistortion is None:

@@ -237,6 +237,7 @@ def _forward(view: _View, lists: _Lists, options: RenderOptions, *outputs: np.nd
     steps = 2 * options.bisections + options.newton_steps if newton else options.bisections
 
     def run(tile_range: tuple[int, int]) -> None:
+        """Renders tiles from the first to before the last, with buffers of its own."""
         scratch = _scratch(view.means.dtype)
         hits, (first, last) = scratch.hits, tile_range
         while first < last:
