@@ -39,11 +39,10 @@ def main(config: DictConfig) -> None:
     checkpoint = newest_checkpoint(out) if config.resume == "auto" else config.resume
     training: SweepTraining = hydra.utils.instantiate(config.training)
     first = start_step(checkpoint) if checkpoint else 0
-    per_step = config.processes
     rooms = read_infinigen(config.infinigen.folder, config.scenes.folder) if config.infinigen.folder else []
-    count = training.steps * per_step
+    count = training.steps * config.processes
     every = TrainingSamples(files, count, config.seed, rooms, config.infinigen.share, **config.samples)
-    samples = Subset(every, range(first * per_step, len(every)))
+    samples = Subset(every, range(first * config.processes, len(every)))
     if config.begin and not checkpoint:
         begin_with(training, Path(config.begin))
     if checkpoint:
@@ -54,7 +53,7 @@ def main(config: DictConfig) -> None:
     trainer = lightning.Trainer(
         accelerator=config.accelerator,
         devices=config.processes,
-        strategy="auto" if per_step == 1 else DDPStrategy(gradient_as_bucket_view=True),
+        strategy="auto" if config.processes == 1 else DDPStrategy(gradient_as_bucket_view=True),
         precision="bf16-mixed",
         max_steps=training.steps,
         callbacks=[keep, RichProgressBar()],
