@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 from omegaconf import OmegaConf
 
 from tests.commands import ROOT
@@ -13,41 +14,44 @@ from vg2gt.config import compose
 
 PAPER = ROOT.parent / "shared" / "paper" / "vg2gt.tex"
 TABLE = ROOT / "docs" / "concepts" / "deviations.md"
-# key: its value, and words of the paper that give it
-STATED: dict[str, tuple[Any, str]] = {
-    "backend.repo": ("depth-anything/DA3-GIANT-1.1", "DA3-GIANT-1.1 (1.15B)"),
-    "model.scale.source": ("focal", r"d_{\text{metric}} = \frac{f \cdot d_{\text{net}}}{300}"),
-    "model.coarse.neighbors": (16, "16 nearest voxel centers"),
-    "model.fine.voxel_size": (0.002, "voxel size to $0.002$ meters"),
-    "model.gaussians.splits": (2, "split each voxel feature into two Gaussian primitives"),
-    "model.gaussians.anchor": ("center", "initial Gaussian center is set to the voxel center"),
-    "model.gaussians.start": ("plain", "initial color of each voxel is computed as a weighted average of image colors"),
-    "data.image_size": ([224, 448], r"image resolution of $224\times448$"),
-    "data.min_views": (3, "randomly sample 3-18 images"),
-    "data.max_views": (18, "randomly sample 3-18 images"),
-    "data.max_images": (18, "randomly sample 3-18 images"),
-    "data.expand_ratio": (4.0, "sampling strategy similar to the official VGGT implementation"),
-    "data.target_views": (0, r"to rendered images $\left\{\mathbf{I}_{i}^\mathbf{G}\right\}_{i=1}^{N}$"),
-    "loss.gaussian.color_l1": (1.0, r"\mathcal{L}_\mathbf{G} &= \mathcal{L}_1^c"),
-    "loss.gaussian.ssim": (1.0, r"+ \mathcal{L}_\text{SSIM}^c"),
-    "loss.gaussian.depth_consistency": (1.0, r"\mathcal{L}_1(\mathbf{D},\mathbf{D}_\mathbf{G})"),
-    "loss.gaussian.depth_gt": (1.0, r"\mathcal{L}_1(\mathbf{D}_\text{gt},\mathbf{D}_\mathbf{G})"),
-    "loss.gaussian.normal": (1.0, r"+ \mathcal{L}_n"),
-    "loss.gaussian.weight": (1.0, r"\mathcal{L}_\mathbf{G} &="),
-    "loss.align.per_view": (False, r"scale factor $s = \operatorname{wmed}"),
-    "renderer.mode": ("solid", "continuous stochastic solids and render them along camera rays"),
-    "renderer.depth": ("median", "we define the depth map as the median depth"),
-    "renderer.bisections": (12, "fixed number of bisection iterations"),
-    "renderer.geometry": (True, "we render normal maps directly from Gaussian primitives"),
-    "optimizer.lr": (3e-6, r"initial learning rate is set to $3\times10^{-6}$"),
-    "training.final_lr": (1e-8, r"decayed to $1\times10^{-8}$"),
-    "training.warmup_steps": (0, "cosine annealing schedule"),
-    "backend.freeze": (True, "the DA3 backbone and all original decoders are kept frozen"),
-    "training.part": ("all", "train only the proposed differentiable multi-scale voxel module"),
-    "training.render_views": (None, "rendered RGB images"),
-    "training.rasterized_depth": (False, "we replace standard 3DGS rasterization"),
-    "trainer.devices": (2, "two NVIDIA RTX PRO 6000 GPUs"),
-    "trainer.max_steps": (420000, "420K iterations"),
+# key: its value, and the line and words of the paper that give it
+STATED: dict[str, tuple[Any, int, str]] = {
+    "backend.repo": ("depth-anything/DA3-GIANT-1.1", 655, "DA3-GIANT-1.1 (1.15B)"),
+    "model.scale.source": ("focal", 655, r"d_{\text{metric}} = \frac{f \cdot d_{\text{net}}}{300}"),
+    "model.coarse.neighbors": (16, 200, "16 nearest voxel centers"),
+    "model.fine.voxel_size": (0.002, 295, "voxel size to $0.002$ meters"),
+    "model.gaussians.splits": (2, 295, "split each voxel feature into two Gaussian primitives"),
+    "model.gaussians.anchor": ("center", 213, "initial Gaussian center is set to the voxel center"),
+    "model.gaussians.start": (
+        "plain",
+        213,
+        "initial color of each voxel is computed as a weighted average of image colors",
+    ),
+    "data.image_size": ([224, 448], 295, r"image resolution of $224\times448$"),
+    "data.min_views": (3, 295, "randomly sample 3-18 images"),
+    "data.max_views": (18, 295, "randomly sample 3-18 images"),
+    "data.max_images": (18, 295, "randomly sample 3-18 images"),
+    "data.expand_ratio": (4.0, 657, "sampling strategy similar to the official VGGT implementation"),
+    "data.target_views": (0, 257, r"to rendered images $\left\{\mathbf{I}_{i}^\mathbf{G}\right\}_{i=1}^{N}$"),
+    "loss.gaussian.color_l1": (1.0, 288, r"\mathcal{L}_\mathbf{G} &= \mathcal{L}_1^c"),
+    "loss.gaussian.ssim": (1.0, 288, r"+ \mathcal{L}_\text{SSIM}^c"),
+    "loss.gaussian.depth_consistency": (1.0, 288, r"\mathcal{L}_1(\mathbf{D},\mathbf{D}_\mathbf{G})"),
+    "loss.gaussian.depth_gt": (1.0, 288, r"\mathcal{L}_1(\mathbf{D}_\text{gt},\mathbf{D}_\mathbf{G})"),
+    "loss.gaussian.normal": (1.0, 288, r"+ \mathcal{L}_n"),
+    "loss.gaussian.weight": (1.0, 288, r"\mathcal{L}_\mathbf{G} &="),
+    "loss.align.per_view": (False, 659, r"scale factor $s = \operatorname{wmed}"),
+    "renderer.mode": ("solid", 218, "continuous stochastic solids and render them along camera rays"),
+    "renderer.depth": ("median", 250, "we define the depth map as the median depth"),
+    "renderer.geometry": (True, 292, "we render normal maps directly from Gaussian primitives"),
+    "optimizer.lr": (3e-6, 295, r"initial learning rate is set to $3\times10^{-6}$"),
+    "training.final_lr": (1e-8, 295, r"decayed to $1\times10^{-8}$"),
+    "training.warmup_steps": (0, 295, "cosine annealing schedule"),
+    "backend.freeze": (True, 267, "the DA3 backbone and all original decoders are kept frozen"),
+    "training.part": ("all", 267, "train only the proposed differentiable multi-scale voxel module"),
+    "training.render_views": (None, 284, "rendered RGB images"),
+    "training.rasterized_depth": (False, 218, "we replace standard 3DGS rasterization"),
+    "trainer.devices": (2, 295, "two NVIDIA RTX PRO 6000 GPUs"),
+    "trainer.max_steps": (420000, 295, "420K iterations"),
 }
 # The official code and weights of DA3 and VGGT give these: the networks' shapes, and the weights of VGGT's losses.
 OFFICIAL = ("backend.", "loss.geometry.")
@@ -55,10 +59,10 @@ OFFICIAL = ("backend.", "loss.geometry.")
 BOOKKEEPING = (
     "name", "output_dir", "seed", "ckpt", "init_from", "overwrite", "token_cache.", "callbacks.", "logger.",
     "data.workers", "data.memory_mb", "data.seed", "data.steps_per_epoch", "data.index_cache", "data.eval_",
-    "data.train.", "data.val.", "data.train_scenes", "data.view_sets", "data.fit", "data.aspect", "data.crop",
-    "data.zoom", "data.size_multiple", "data.infinigen_root", "data.kitti_root", "data.kitti_depth_root",
-    "data.scannet_root", "model.fine.dense_head.views_per_chunk", "model.fine.point_mlp.checkpoint",
-    "model.scale.median_depth", "renderer.implementation", "renderer.near", "optimizer.fused", "training.max_skipped",
+    "data.train.", "data.val.", "data.train_scenes", "data.view_sets", "data.size_multiple", "data.infinigen_root",
+    "data.kitti_root", "data.kitti_depth_root", "data.scannet_root",
+    "model.fine.dense_head.views_per_chunk", "model.fine.point_mlp.checkpoint",
+    "model.scale.median_depth", "renderer.implementation", "optimizer.fused", "training.max_skipped",
     "training.backend_lr_factor",
     "trainer.accelerator", "trainer.strategy", "trainer.max_epochs", "trainer.deterministic", "trainer.log_every",
     "trainer.check_val", "trainer.val_check", "trainer.num_sanity", "trainer.limit_val", "trainer.fast_dev_run",
@@ -94,10 +98,20 @@ def test_every_setting_has_a_source() -> None:
     assert not unexplained, f"neither the paper nor {TABLE.name} explains {unexplained}"
     gone = [key for key in STATED if key not in settings]
     assert not gone
-    assert {key: settings[key] for key in STATED} == {key: value for key, (value, _) in STATED.items()}
+    assert {key: settings[key] for key in STATED} == {key: value for key, (value, _, _) in STATED.items()}
+
+
+def test_the_table_names_what_there_is() -> None:
+    """No option in it is gone, and ``experiment=paper`` takes the paper's side of every key marked ``*``."""
+    settings, text = _settings(), TABLE.read_text()
+    options = re.findall(r"`((?:backend|model|data|loss|renderer|optimizer|training|trainer)\.[a-z0-9_.]+)`", text)
+    assert not [row for row in options if not any(key.startswith(row) for key in settings)]
+    marked = dict(re.findall(r"`([a-z0-9_.]+)`\* \(`([^`]+)`\)", text))
+    assert len(marked) > 10
+    assert {key: settings[key] for key in marked} == {key: yaml.safe_load(value) for key, value in marked.items()}
 
 
 @pytest.mark.skipif(not PAPER.is_file(), reason=f"needs {PAPER.name}")
 def test_the_paper_says_what_is_cited() -> None:
-    text = Path(PAPER).read_text()
-    assert not [key for key, (_, words) in STATED.items() if words not in text]
+    lines = Path(PAPER).read_text().splitlines()
+    assert not [key for key, (_, line, words) in STATED.items() if words not in lines[line - 1]]

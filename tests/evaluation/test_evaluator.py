@@ -47,6 +47,19 @@ def test_every_protocol_and_mode_has_every_figure(result: SceneResult) -> None:
     assert not any(name.endswith("lpips") for name in scores)
 
 
+def test_rasterized_depth_can_be_the_expected_one(evaluator: SceneEvaluator, result: SceneResult, batch: Batch) -> None:
+    """Eq. A1 instead of the median, in the rasterised rows alone."""
+    renderer = replace(evaluator.renderer, mode="rasterized", depth="expected")
+    found = replace(evaluator, renderer=renderer)(batch)
+    solid, rasterized = (f"rendered/gt_pose/{mode}/abs_rel" for mode in MODES)
+    assert found.metrics[solid] == result.metrics[solid]
+    assert found.metrics[rasterized] != result.metrics[rasterized]
+    truth = batch.target
+    cameras = ground_truth_target_cameras(batch, found.prediction)
+    render = renderer(found.prediction.gaussians, cameras)
+    assert found.metrics[rasterized] == depth_metrics(render.depth[0], truth.depth[0])["abs_rel"]
+
+
 def test_refined_scenes_have_figures_of_their_own(evaluator: SceneEvaluator, result: SceneResult, batch: Batch) -> None:
     found = replace(evaluator, refinement=RefineOptions(steps=12, check_every=6))(batch).metrics
     again = {name: value for name, value in found.items() if not name.startswith("refined/")}
