@@ -236,7 +236,7 @@ def main() -> None:
     torch.set_num_threads(given.threads)
     changes = [f"refine.{change}" for change in given.refine]
     refinement: RefineOptions = instantiate(compose(None, "+refine=photographs", *changes).refine)
-    loaded = load_model(given.ckpt, overrides=[f"model.{change}" for change in given.model], device="cpu")
+    loaded = load_model(given.ckpt, overrides=[_of_model(change) for change in given.model], device="cpu")
     lpips = lpips_or_none()
     for item in given.folders:
         name, _, folder = item.rpartition("=")
@@ -250,7 +250,7 @@ def main() -> None:
         if not given.only_peer:
             warm_up(loaded, photos, refinement)
             size = [f"working-size={given.working_size}"] if given.working_size else []
-            settings = _settings([*size, *(f"model.{change}" for change in given.model), *changes])
+            settings = _settings([*size, *map(_of_model, given.model), *changes])
             found = ours(loaded, scores, refinement, given.budgets, given.working_size)
             rows += [{**common, "program": OURS, "settings": settings, **row} for row in found]
         if given.opensplat:
@@ -271,6 +271,11 @@ def lpips_or_none() -> LPIPS | None:
         return load_lpips()
     except WeightsNotFoundError:
         return None
+
+
+def _of_model(change: str) -> str:
+    """The override of a change of the model; a plus adds a key that the weights' own configuration lacks."""
+    return ("+" if change.startswith("+") else "") + f"model.{change.removeprefix('+')}"
 
 
 def _settings(changes: Sequence[str]) -> str:

@@ -165,12 +165,12 @@ class Reconstructor(nn.Module, ABC):
                 return self.token_cache.cameras(self.backend, images, hints)
             return self.backend.predict_cameras(images, hints)
 
-    def support(self, geometry: Geometry) -> Support | None:
+    def support(self, geometry: Geometry, hints: Hints | None) -> Support | None:
         """What the views say of each other's depth; None where nothing is checked."""
         if self.visibility is None:
             return None
         with stage("visibility"):
-            return self.visibility(geometry)
+            return self.visibility(geometry, None if hints is None else hints.frame_ids)
 
     def with_background(self, gaussians: Gaussians, images: Tensor, depth: Tensor) -> Gaussians:
         """Sets what rays see that meet none of the Gaussians.
@@ -286,7 +286,7 @@ class VG2GT(Reconstructor):
             Geometry before and after enhancement, voxels and Gaussians, in scene units and in the frame of view 0.
         """
         tokens, decoded = self.enhance(images, hints, generator)
-        support = self.support(decoded.geometry)
+        support = self.support(decoded.geometry, hints)
         keep, coarsen = (None, None) if support is None else (support.keep, support.coarsen)
         with stage("fine"):
             voxels: Voxels = self.fine(tokens, decoded.geometry.where(keep), images, coarsen)

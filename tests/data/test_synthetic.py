@@ -180,7 +180,7 @@ def test_variants_take_turns(tmp_path):
         ({"num_scenes": 0}, "num_scenes >= 1"),
         ({"num_frames": 0}, "num_scenes >= 1"),
         ({"first_seed": -1}, "num_scenes >= 1"),
-        ({"variant": "orbit"}, "variant must be one of room, outdoor, wide, object, landmark"),
+        ({"variant": "orbit"}, "variant must be one of room, outdoor, wide, object, landmark, moving"),
         ({"variant": []}, "variant must be one of"),
         ({"highlights": "bright"}, "highlights must be true, false or lobes; got 'bright'"),
         ({"exposure": -1}, "exposure is a standard deviation in stops, at least 0; got -1"),

@@ -24,7 +24,8 @@ def test_photographs_of_all_sizes_come_upright_in_the_order_of_their_numbers(pho
     for i in (1, 2):  # JPEG, resized or turned
         assert (views.images[i] - frames.images[i]).abs().mean() < 0.03
     assert views.kept == pytest.approx((1, 1, 1, 0.5))
-    assert views.hints is None
+    assert views.hints.cameras is None
+    assert views.hints.frame_ids.tolist() == [list(range(len(views.names)))]
 
 
 def test_order_and_mixture_of_arguments_are_kept(photos: Path, frames) -> None:

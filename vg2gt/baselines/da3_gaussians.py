@@ -67,7 +67,7 @@ class DA3Gaussians(Reconstructor):
     ) -> Prediction:
         """Reconstructs B scenes; see :meth:`vg2gt.model.Reconstructor.forward`. Nothing is random here."""
         tokens, geometry, unit = self.read_views(images, hints)
-        support = self.support(geometry)
+        support = self.support(geometry, hints)
         keep = None if support is None else support.keep
         with stage("fine"):
             raw = self.head.predict(tokens, images, self.backend.head_chunk).flatten(0, 3)

@@ -133,7 +133,7 @@ class PixelReconstructor(Reconstructor):
     ) -> Prediction:
         """Reconstructs B scenes; see :meth:`vg2gt.model.Reconstructor.forward`. Nothing is random here."""
         tokens, geometry, unit = self.read_views(images, hints)
-        support = self.support(geometry)
+        support = self.support(geometry, hints)
         keep = None if support is None else support.keep
         with stage("fine"):
             dense = self.dense_head(tokens, images).permute(0, 2, 3, 1).flatten(0, 2)

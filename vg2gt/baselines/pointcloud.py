@@ -60,7 +60,7 @@ class PointCloud(Reconstructor):
     ) -> Prediction:
         """Reconstructs B scenes; see :meth:`vg2gt.model.Reconstructor.forward`. Nothing is random here."""
         _, geometry, unit = self.read_views(images, hints)
-        support = self.support(geometry)
+        support = self.support(geometry, hints)
         keep = None if support is None else support.keep
         with stage("gaussians"), torch.autocast(images.device.type, enabled=False):
             pixels = usable_pixels(geometry.where(keep), images)

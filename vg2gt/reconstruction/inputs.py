@@ -36,7 +36,7 @@ class Views:
         images: ``[V, 3, H, W]`` float32 in [0, 1], on the CPU.
         names: one per view, unique.
         kept: share of each picture's area that is in its image; the rest was cropped.
-        hints: what the data know, on the CPU; None where they know nothing.
+        hints: what the data know, on the CPU: the order of the pictures at least.
         mask: ``[V, H, W]`` float32 in [0, 1], how much each pixel counts (alpha, mask images); None: all count.
         pictures: where the images come from, one per view.
     """
@@ -44,7 +44,7 @@ class Views:
     images: Tensor
     names: tuple[str, ...]
     kept: tuple[float, ...]
-    hints: Hints | None
+    hints: Hints
     mask: Tensor | None = None
     pictures: tuple[Picture, ...] = ()
 
@@ -103,10 +103,8 @@ def load_views(pictures: Sequence[Picture], size: tuple[int, int], monitor: Moni
             len(much), len(pictures), size[0], size[1], much[0],
         )  # fmt: skip
     joined = Frames.concatenate(frames)
-    hints = _hints(pictures, joined, size)
-    if hints is not None or joined.mask is not None:
-        mask = None if joined.mask is None else joined.mask[None]
-        hints = replace(hints or Hints(), mask=mask)
+    mask = None if joined.mask is None else joined.mask[None]
+    hints = replace(_hints(pictures, joined, size), mask=mask)
     names = tuple(picture.name for picture in pictures)
     return Views(joined.images, names, kept, hints, joined.mask, tuple(pictures))
 
@@ -130,21 +128,21 @@ def _kept(size: tuple[int, int], window: tuple[int, int]) -> float:
     return min(ratio, 1 / ratio)
 
 
-def _hints(pictures: Sequence[Picture], frames: Frames, size: tuple[int, int]) -> Hints | None:
-    """What recordings know; None if any picture is not from one.
+def _hints(pictures: Sequence[Picture], frames: Frames, size: tuple[int, int]) -> Hints:
+    """The order of the pictures, and what a recording knows if all are from one.
 
     Raises:
         ValueError: if they come from several recordings, whose worlds have nothing to do with each other.
     """
-    sources = {picture.source for picture in pictures}
+    sources, order = {picture.source for picture in pictures}, torch.arange(len(pictures))[None]
     if "" in sources:
-        return None
+        return Hints(frame_ids=order)
     if len(sources) > 1:
         raise ValueError(f"cameras of several recordings cannot be mixed: {', '.join(sorted(sources))}; give one")
     has_depth = all(picture.has_depth for picture in pictures)
     cameras = Cameras(_given_poses(pictures, frames)[None], frames.intrinsics[None], size)
     depth = frames.depth[None] if has_depth else None
-    return Hints(depth, cameras, tuple(sources), torch.arange(len(pictures))[None], depth_range(pictures))
+    return Hints(depth, cameras, tuple(sources), order, depth_range(pictures))
 
 
 def _given_poses(pictures: Sequence[Picture], frames: Frames) -> Tensor:

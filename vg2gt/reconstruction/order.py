@@ -31,15 +31,13 @@ def working_order(images: Tensor) -> list[int]:
     return [order[reference], *(view for place, view in enumerate(order) if place != reference)]
 
 
-def in_order(views: Views, order: Sequence[int]) -> tuple[Tensor, Hints | None]:
+def in_order(views: Views, order: Sequence[int]) -> tuple[Tensor, Hints]:
     """Images ``[V, 3, H, W]`` and hints of views in another order."""
     hints = views.hints
-    if hints is not None:
-        cameras = None if hints.cameras is None else hints.cameras.select(torch.tensor(order))
-        parts = {name: getattr(hints, name) for name in ("depth", "frame_ids", "mask")}
-        chosen = {name: None if value is None else value[:, list(order)] for name, value in parts.items()}
-        hints = replace(hints, cameras=cameras, **chosen)
-    return views.images[list(order)], hints
+    cameras = None if hints.cameras is None else hints.cameras.select(torch.tensor(order))
+    parts = {name: getattr(hints, name) for name in ("depth", "frame_ids", "mask")}
+    chosen = {name: None if value is None else value[:, list(order)] for name, value in parts.items()}
+    return views.images[list(order)], replace(hints, cameras=cameras, **chosen)
 
 
 def as_given(geometry: Geometry, order: Sequence[int]) -> Geometry:

@@ -108,8 +108,7 @@ def _forward(
     model: Reconstructor, views: Views, order: Sequence[int], device: torch.device, monitor: Monitor
 ) -> Prediction:
     ordered, hints = in_order(views, order)
-    hints = None if hints is None else hints.to(device)
-    images = ordered[None].to(device)
+    images, hints = ordered[None].to(device), hints.to(device)
     with monitor.stage("reconstruct"), monitor.watching(), half_precision_on_gpu(images):
         return model(images, hints)
 

@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from vg2gt.data.base import Frames, SceneSource
+from vg2gt.data.synthetic.moving import SyntheticMovingRoom
 from vg2gt.data.synthetic.orbits import SyntheticLandmark, SyntheticObject
 from vg2gt.data.synthetic.outdoor import SyntheticOutdoor
 from vg2gt.data.synthetic.photograph import Photograph
@@ -32,6 +33,7 @@ VARIANTS: dict[str, type[SyntheticRoom] | type[SyntheticOutdoor] | type[Syntheti
     "wide": SyntheticWideRoom,
     "object": SyntheticObject,
     "landmark": SyntheticLandmark,
+    "moving": SyntheticMovingRoom,
 }
 
 
@@ -47,8 +49,9 @@ class SyntheticScenes(SceneSource):
         num_frames: frames on a scene's camera path.
         size: image ``(height, width)``; best the size that is trained on. Upright images are upright photographs: the
             field of view is along the longer side.
-        variant: ``room``, ``outdoor``, ``wide`` (rooms from all around), ``object`` (orbits) or ``landmark`` (far
-            backgrounds), or a list: seeds take turns, ``[room, room, outdoor]`` is one third outdoor.
+        variant: ``room``, ``outdoor``, ``wide`` (rooms from all around), ``object`` (orbits), ``landmark`` (far
+            backgrounds) or ``moving`` (a room with a chair that moves), or a list: seeds take turns,
+            ``[room, room, outdoor]`` is one third outdoor.
         highlights: whether surfaces shine, with colours that depend on the view; geometry and textures stay the same.
             ``lobes``: strongly.
         cache_dir: folder for the rendered frames (``~`` is the home folder); None keeps nothing on disk.

@@ -42,11 +42,15 @@ class SyntheticScene:
         focal = 0.5 * max(size) / np.tan(field_of_view / 2)
         self.intrinsics = np.array([[focal, 0, (size[1] - 1) / 2], [0, focal, (size[0] - 1) / 2], [0, 0, 1]])
 
+    def world_at(self, frame: int) -> World:
+        """What is seen in a frame: the same in all, unless something moves."""
+        return self.world
+
     def render(self, frames: Sequence[int], threads: int, samples: int = SAMPLES) -> list[RenderedFrame]:
         """Renders the given frames of the path, ``threads`` at a time, with ``samples`` ** 2 colour samples a pixel."""
 
         def render(frame: int) -> RenderedFrame:
-            made = render_frame(self.world, self.world_to_camera[frame], self.intrinsics, self.size, samples)
+            made = render_frame(self.world_at(frame), self.world_to_camera[frame], self.intrinsics, self.size, samples)
             return replace(made, image=self.develop(made.image, frame)) if self.develop else made
 
         if threads == 1:

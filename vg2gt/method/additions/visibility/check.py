@@ -15,6 +15,7 @@ from torch import Tensor
 
 from vg2gt.method.additions.visibility.counts import count_views
 from vg2gt.method.additions.visibility.disagreement import disagreement
+from vg2gt.method.additions.visibility.moved import LEAST, moved
 from vg2gt.method.additions.visibility.partners import choose_partners
 from vg2gt.types import Cameras, Geometry, TensorRecord
 
@@ -47,6 +48,9 @@ class ViewCheck:
         fine_below: median disagreement of views in pixels up to which voxels are as fine as configured; above, the
             smallest voxel grows in proportion.
         coarsest: largest factor by which it grows.
+        moment: frames of a moment. What is gone at another moment moves, and is dropped wherever it is seen
+            (:mod:`vg2gt.method.additions.visibility.moved`); None takes everything for static.
+        moved_margin: relative difference from which on a view tells that something is gone.
 
     Raises:
         ValueError: naming an option that is out of range.
@@ -58,6 +62,8 @@ class ViewCheck:
     partners: int = 24
     fine_below: float = 1.4
     coarsest: float = 2.0
+    moment: int | None = None
+    moved_margin: float = 0.08
 
     def __post_init__(self) -> None:
         for name, good, expected in (
@@ -67,17 +73,26 @@ class ViewCheck:
             ("partners", self.partners >= 1, "at least 1"),
             ("fine_below", self.fine_below > 0, "positive"),
             ("coarsest", self.coarsest >= 1, "at least 1"),
+            ("moment", self.moment is None or self.moment >= LEAST, f"at least {LEAST}, or null"),
+            ("moved_margin", self.tolerance <= self.moved_margin < 1, "at least the tolerance and below 1"),
         ):
             if not good:
                 raise ValueError(f"model.visibility.{name} must be {expected}, got {getattr(self, name)}")
 
     @torch.no_grad()
-    def __call__(self, geometry: Geometry) -> Support:
-        """Checks the depth of B scenes; ``keep`` is false where there is none."""
-        scenes = [self._check(*_scene(geometry, index)) for index in range(len(geometry.depth))]
+    def __call__(self, geometry: Geometry, frames: Tensor | None = None) -> Support:
+        """Checks the depth of B scenes; ``keep`` is false where there is none.
+
+        Args:
+            geometry: of B scenes.
+            frames: ``[B, V]`` numbers of the frames in the order of time; None: nothing is known of time, so nothing is
+                taken to move.
+        """
+        times = [None] * len(geometry.depth) if frames is None else frames.to(geometry.depth.device)
+        scenes = [self._check(*_scene(geometry, index), time) for index, time in enumerate(times)]
         return Support(*(torch.stack(parts) for parts in zip(*scenes, strict=True)))
 
-    def _check(self, depth: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
+    def _check(self, depth: Tensor, cameras: Cameras, frames: Tensor | None) -> tuple[Tensor, Tensor]:
         keep = depth > 0
         partners = choose_partners(depth, cameras, self.partners)
         coarsen = (disagreement(depth, cameras, partners) / self.fine_below).clamp(1, self.coarsest)
@@ -85,6 +100,9 @@ class ViewCheck:
             left = torch.where(keep, depth, 0.0)
             counts = count_views(left, cameras, partners, self.tolerance, self.margin)
             keep = keep & (counts.through <= counts.agree)
+        if self.moment is not None and frames is not None:
+            left = torch.where(keep, depth, 0.0)
+            keep = keep & ~moved(left, cameras, partners, frames, self.moment, self.tolerance, self.moved_margin)
         return keep, coarsen
 
 
