@@ -19,7 +19,7 @@ TIME = torch.arange(7)[None]
 
 def leaving(views: int = 7, stays: int = 5) -> tuple[Geometry, torch.Tensor]:
     """A box before a wall in the first views, gone in the others; and its pixels."""
-    cameras = sideways(*(0.02 * view for view in range(views)))
+    cameras = sideways(*(0.14 * view / views for view in range(views)))
     depth = torch.full((views, *SIZE), 2.0)
     for view in range(stays):
         depth[view, 8:12, 12:17] = 1.5
@@ -44,6 +44,13 @@ def test_what_stays_is_kept_and_so_is_all_where_nothing_is_known_of_time() -> No
 def test_a_single_view_that_looks_through_is_no_moment() -> None:
     found, box = leaving(stays=6)
     assert ViewCheck(moment=2)(found, TIME).keep[box].float().mean() > 0.8
+
+
+def test_moments_are_longer_where_each_view_is_compared_with_few_others() -> None:
+    found, box = leaving(views=100, stays=60)
+    keep = ViewCheck(moment=3)(found, torch.arange(100)[None]).keep
+    assert keep[box].float().mean() < 0.05
+    assert keep[~box].all()
 
 
 def test_views_come_in_any_order() -> None:

@@ -27,12 +27,14 @@ def moved(
         cameras: of the views (B = 1), in the unit of the depth.
         partners: ``[V, K]`` int64 views that each view is compared with; -1 = none.
         frames: ``[V]`` numbers of the frames in the order of time.
-        moment: least number of consecutive frames of a moment; fewer than twice as many views are one moment.
+        moment: least number of consecutive frames of a moment, and of partners in it; fewer than twice as many views
+            are one moment.
         tolerance: relative difference of depth up to which views agree.
         margin: relative difference of depth from which on a view looks through a point.
     """
-    views = len(depth)
-    moments = max(views // moment, 1)
+    views, most = len(depth), partners.shape[1]
+    compared = views if most == views - 1 else most // 2  # of more views, only half of the partners are spread evenly
+    moments = max(min(views, compared) // moment, 1)
     when = frames.argsort(stable=True).argsort() * moments // views  # [V]
     gone = torch.zeros_like(depth, dtype=torch.bool)
     for one in range(moments):
