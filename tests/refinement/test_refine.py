@@ -2,6 +2,7 @@
 
 import logging
 from dataclasses import fields, replace
+from importlib import import_module
 
 import pytest
 import torch
@@ -160,6 +161,21 @@ def test_the_guard_compares_the_same_views(start: Start) -> None:
     hard = replace(start, seen=replace(start.seen, images=images))
     found = run(hard, RefineOptions(steps=40, check_every=4, loss=COLOUR))
     assert found.retreats == 0
+
+
+@pytest.mark.parametrize(("last", "retreats"), [(0.7, 0), (2.5, 1)])
+def test_worse_than_the_best_state_is_no_divergence(
+    start: Start, last: float, retreats: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A poor start is soon far behind: a check that is worse than the best state, but better than the start, goes on."""
+    losses = iter([1.0, 0.3, 0.3, last, 0.3, 0.3, 0.3, 0.3])  # of the start, checks, and the best state or the end
+
+    def score(self, scene: RefinedScene, views: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        loss = torch.full((len(views),), next(losses))
+        return loss, loss
+
+    monkeypatch.setattr(import_module("vg2gt.refinement.refine")._Refinement, "_score", score)
+    assert run(start, RefineOptions(steps=12, check_every=3, loss=COLOUR)).retreats == retreats
 
 
 def test_what_lies_behind_the_scene_stays(start: Start) -> None:

@@ -24,7 +24,7 @@ from vg2gt.types import Cameras, Gaussians
 
 log = logging.getLogger(__name__)
 
-WORSE = 2.0  # left-out views whose loss is so many times that of the best state show a divergence
+WORSE = 2.0  # left-out views whose loss is so many times that of the start, and of the best state, show a divergence
 RETREATS = 4  # with each the rates are halved
 SMOOTH = 3  # checks whose scores are averaged: each is of other views
 
@@ -261,7 +261,7 @@ class _Refinement:
         score = float((loss / self.start_loss[views]).mean())
         if not math.isfinite(score):
             return "the loss is not finite"
-        if score > WORSE * min(1.0, self.best_score):  # of other views, perhaps: compare the same ones
+        if score > WORSE:
             best, _ = self._score(self.best, views)
             if score > WORSE * float((best / self.start_loss[views]).mean()):
                 return f"views that were left out have {score:.1f} times the loss of the start"
