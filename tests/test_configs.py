@@ -2,7 +2,9 @@
 
 import importlib.util
 import inspect
+import os
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, get_args
 
@@ -10,6 +12,7 @@ import lightning
 import pytest
 import torch
 from hydra.utils import get_class, instantiate
+from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.strategies import DDPStrategy, SingleDeviceStrategy
 from omegaconf import DictConfig, OmegaConf
 from torch import nn
@@ -20,7 +23,7 @@ from vg2gt.config import compose, config_dir, group_options
 from vg2gt.geometry.precision import trainer_precision
 from vg2gt.losses import VG2GTLoss
 from vg2gt.refinement import RefineOptions
-from vg2gt.training.loop import build
+from vg2gt.training.loop import ALLOCATOR, build
 
 OPTIONAL_PACKAGES = {"wandb": "wandb", "tensorboard": "tensorboard"}
 
@@ -86,6 +89,18 @@ def test_devices_and_several_loggers(tmp_path: Path) -> None:
     assert build(composed(tmp_path, "trainer=cpu")).trainer.accelerator.__class__.__name__ == "CPUAccelerator"
     with pytest.raises(ValueError, match=r"MPS has no float64.*trainer=cpu"):
         build(composed(tmp_path, "trainer.accelerator=mps"))
+
+
+@pytest.mark.parametrize("own", [None, "max_split_size_mb:128"])
+def test_a_gpus_allocator_grows_its_segments(tmp_path: Path, own: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Unless the environment says otherwise, and whether or not there is a GPU."""
+    name, value = ALLOCATOR
+    monkeypatch.delenv(name, raising=False)
+    if own:
+        monkeypatch.setenv(name, own)
+    with suppress(MisconfigurationException):
+        build(composed(tmp_path, "trainer.accelerator=gpu"))
+    assert os.environ[name] == (own or value)
     trainer = build(composed(tmp_path, "logger=[csv,tensorboard]", "trainer=cpu")).trainer
     assert [type(logger).__name__ for logger in trainer.loggers] == ["CSVLogger", "TensorBoardLogger"]
 

@@ -167,7 +167,7 @@ def test_the_guard_compares_the_same_views(start: Start) -> None:
 def test_worse_than_the_best_state_is_no_divergence(
     start: Start, last: float, retreats: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A poor start is soon far behind: a check that is worse than the best state, but better than the start, goes on."""
+    """A check that is worse than the best state, but better than a poor start, is no reason to fall back."""
     losses = iter([1.0, 0.3, 0.3, last, 0.3, 0.3, 0.3, 0.3])  # of the start, checks, and the best state or the end
 
     def score(self, scene: RefinedScene, views: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import logging
+import os
 import warnings
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -49,6 +50,9 @@ EXPECTED_WARNINGS = (
 
 FEW_WORKERS = r"The '\w+_dataloader' does not have many workers"  # expected on a CPU, whose cores compute
 
+# Sizes differ from step to step, which fragments the GPU's memory otherwise; read when CUDA starts.
+ALLOCATOR = (f"PYTORCH_{'' if torch.__version__ >= '2.9' else 'CUDA_'}ALLOC_CONF", "expandable_segments:True")
+
 LOGGER_PACKAGES = {"TensorBoardLogger": "tensorboard", "WandbLogger": "wandb"}
 PRECISIONS = ("auto", "32-true", "bf16-mixed", "32", "bf16")  # the last two are Lightning's short names
 
@@ -78,6 +82,8 @@ def build(config: DictConfig) -> Run:
     _check_loggers(config)
     lightning.seed_everything(config.seed, workers=True, verbose=False)
     accelerator = _accelerator(config.trainer.accelerator)
+    if accelerator == "gpu":
+        os.environ.setdefault(*ALLOCATOR)
     for message in EXPECTED_WARNINGS if accelerator == "gpu" else (*EXPECTED_WARNINGS, FEW_WORKERS):
         warnings.filterwarnings("ignore", message=message)
     _quieten_lightning()
