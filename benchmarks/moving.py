@@ -91,6 +91,7 @@ def main() -> None:
     options.add_argument("--size", type=int, nargs=2, default=(112, 168), metavar=("HEIGHT", "WIDTH"))
     options.add_argument("--scenes", type=int, default=4)
     options.add_argument("--moment", type=int, default=3)
+    options.add_argument("--name", default="moving", help="of the file of results")
     given = options.parse_args()
     torch.set_num_threads(given.threads)
     loaded = load_model(overrides=given.overrides, device="cpu")
@@ -103,7 +104,7 @@ def main() -> None:
     names = list(table[0])
     print(markdown_table(names, [[f"{row[name]:.3f}" for name in names] for row in table]))
     settings = {name: getattr(given, name) for name in ("views", "size", "scenes", "moment", "overrides")}
-    write_results(given.out, "moving", {**settings, "rows": table})
+    write_results(given.out, given.name, {**settings, "rows": table})
 
 
 if __name__ == "__main__":
