@@ -10,14 +10,11 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import torch
 from common import MEGABYTE, machine, parser, used_seconds, write_results
-from opensplat import rasterize
 from render_scene import room_cameras, room_gaussians
 from torch import Tensor
 
@@ -89,8 +86,8 @@ def measure_once(case: Case, gaussians: Gaussians, cameras: Cameras) -> Timing:
 
 
 def _run(case: Case, gaussians: Gaussians, cameras: Cameras) -> list[Tensor]:
-    if case.implementation in PEERS:
-        return PEERS[case.implementation](gaussians, cameras)
+    if case.implementation == "gsplat":
+        return _run_gsplat(gaussians, cameras)
     out = render(
         gaussians,
         cameras,
@@ -120,9 +117,6 @@ def _run_gsplat(gaussians: Gaussians, cameras: Cameras) -> list[Tensor]:
         render_mode="RGB+ED",
     )
     return [colors, alphas]
-
-
-PEERS: dict[str, Callable[[Gaussians, Cameras], list[Tensor]]] = {"gsplat": _run_gsplat}
 
 
 def compare(cases: list[Case], device: torch.device, passes: int) -> list[Timing]:
@@ -176,16 +170,6 @@ def cpu_suites(quick: bool) -> dict[str, list[Case]]:
     return suites
 
 
-def peer_suite() -> dict[str, list[Case]]:
-    """Cases beside OpenSplat's CPU rasteriser, which has colour alone."""
-    suite = []
-    for count in (20_000, 100_000, 300_000):
-        base = Case("cpu", count, sigma=2.0 if count == 20_000 else 1.0)
-        peer = replace(base, implementation="opensplat", mode="rasterized", geometry=False)
-        suite += [peer, replace(peer, implementation="cpu"), replace(base, geometry=False), base]
-    return {"beside OpenSplat": suite}
-
-
 def gpu_suites(quick: bool) -> dict[str, list[Case]]:
     """Cases on a GPU by table; gsplat takes part where it is installed."""
     try:
@@ -231,16 +215,11 @@ def main() -> None:
     """Measures, prints and writes."""
     options = parser(__doc__, device=True, passes=3)
     options.add_argument("--quick", action="store_true", help="the small tables only")
-    options.add_argument("--opensplat", type=Path, help="a checkout of OpenSplat: one table beside its CPU rasteriser")
     arguments = options.parse_args()
-    device = torch.device("cpu" if arguments.opensplat else arguments.device)
+    device = torch.device(arguments.device)
     where = machine(device)
     print(json.dumps(where))
-    if arguments.opensplat:
-        PEERS["opensplat"] = lambda gaussians, cameras: [rasterize(arguments.opensplat, gaussians, cameras)]
-        suites = peer_suite()
-    else:
-        suites = (gpu_suites if device.type == "cuda" else cpu_suites)(arguments.quick)
+    suites = (gpu_suites if device.type == "cuda" else cpu_suites)(arguments.quick)
     unit = "milliseconds" if device.type == "cuda" else "core-milliseconds"
     results: dict[str, tuple[list[Case], list[Timing]]] = {}
     for title, cases in suites.items():
@@ -251,8 +230,7 @@ def main() -> None:
         for title, result in results.items()
     }
     content = {"machine": where, "unit": unit, "passes": arguments.passes, "tables": tables}
-    name = "render-opensplat" if arguments.opensplat else f"render-{device.type}"
-    write_results(arguments.out, name, content)
+    write_results(arguments.out, f"render-{device.type}", content)
 
 
 if __name__ == "__main__":

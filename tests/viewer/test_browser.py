@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.viewer_scene import voxel_room
 from tests.viewer.chromium import Page, chromium
 from tests.viewer.test_page import HOSTILE, pictured_scene
 from vg2gt.io import named_cameras
@@ -53,10 +52,10 @@ def compare(page: Page, path: Path, gaussians: Gaussians, cameras: Cameras) -> l
     return figures
 
 
-@pytest.mark.parametrize(("size", "voxel_size"), [((240, 320), 0.05), ((480, 640), 0.02)])
-def test_screenshot_is_our_rasterized_image_of_a_room(page, tmp_path, size, voxel_size):
-    gaussians, cameras, _ = voxel_room(size=size, voxel_size=voxel_size)
-    assert len(gaussians) > 20_000
+@pytest.mark.parametrize(("size", "count"), [((240, 320), 25_000), ((480, 640), 140_000)])
+def test_screenshot_is_our_rasterized_image_of_a_room(page, tmp_path, size, count, benchmark_script):
+    room = benchmark_script("render_scene")
+    gaussians, cameras = room.room_gaussians(count, size, sigma=2.0), room.room_cameras(12, size)
     path = tmp_path / f"room-{len(gaussians)}.html"
     figures = compare(page, path, gaussians, cameras.select(slice(0, 12, 4)))
     seconds = page.run("vg2gtViewer.loadSeconds")
