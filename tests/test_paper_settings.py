@@ -39,7 +39,6 @@ STATED: dict[str, tuple[Any, int, str]] = {
     "loss.gaussian.depth_gt": (1.0, 288, r"\mathcal{L}_1(\mathbf{D}_\text{gt},\mathbf{D}_\mathbf{G})"),
     "loss.gaussian.normal": (1.0, 288, r"+ \mathcal{L}_n"),
     "loss.gaussian.weight": (1.0, 288, r"\mathcal{L}_\mathbf{G} &="),
-    "loss.align.per_view": (False, 659, r"scale factor $s = \operatorname{wmed}"),
     "renderer.mode": ("solid", 218, "continuous stochastic solids and render them along camera rays"),
     "renderer.depth": ("median", 250, "we define the depth map as the median depth"),
     "renderer.geometry": (True, 292, "we render normal maps directly from Gaussian primitives"),

@@ -1,6 +1,6 @@
 """Depth Anything 3 behind the backend interface."""
 
 from backends.da3.backend import DA3Backend
-from backends.da3.metric import DA3MetricBackend, DA3MonoBackend, DA3NestedBackend
+from backends.da3.metric import DA3MetricBackend, DA3NestedBackend
 
-__all__ = ["DA3Backend", "DA3MetricBackend", "DA3MonoBackend", "DA3NestedBackend"]
+__all__ = ["DA3Backend", "DA3MetricBackend", "DA3NestedBackend"]

@@ -28,7 +28,7 @@ class Backbone(nn.Module):
         num_heads: attention heads.
         ffn: feed-forward layer.
         multiview_from: first block with rotary positions and normalised queries and keys, and from which odd blocks
-            attend over all views; None for a single-view network (metric, mono).
+            attend over all views; None for a single-view network (metric).
         image_size: native image edge, which fixes the position embedding.
         patch_size: in pixels.
     """

@@ -1,11 +1,9 @@
-"""Depth Anything 3's single-view depth networks: metric and relative (mono), and metric as a yardstick (nested)."""
+"""Depth Anything 3's metric network, alone and as the scale of the relative one (nested)."""
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -18,7 +16,6 @@ from backends.dpt import DPT, in_chunks
 from backends.network import NetworkBackend
 from backends.normalization import normalize_images
 from backends.weights import Weights
-from vg2gt.geometry.alignment import fit_depth_scale
 from vg2gt.geometry.precision import full_precision, half_precision_on_gpu
 from vg2gt.types import Cameras, Geometry, Hints, Tokens
 
@@ -41,16 +38,14 @@ class DA3MetricNetwork(nn.Module):
         self.head = head
 
 
-class DA3SingleViewBackend(NetworkBackend):
-    """One of DA3's networks that see one view at a time: cameras come from the data, confidence is 1.
+class DA3MetricBackend(NetworkBackend):
+    """DA3's metric network: single views, confidence 1, cameras of the data; metres if their translations are.
 
-    Depth is the network's output times one factor per view, which the subclass knows; sky gets the scene's far end.
-    Arguments: see :class:`NetworkBackend`; ``depth`` is the number of blocks.
+    Depth is the network's output times the mean focal length (pixels at network resolution) / 300; sky gets the
+    scene's far end. Arguments: see :class:`NetworkBackend`; ``depth`` is the number of blocks.
     """
 
     network: DA3MetricNetwork
-    metric: ClassVar[bool]
-    hint_names: ClassVar[tuple[str, ...]]
 
     def __init__(
         self,
@@ -72,7 +67,7 @@ class DA3SingleViewBackend(NetworkBackend):
         seed: int = 0,
         head_chunk: int | None = 8,
     ) -> None:
-        super().__init__(name, patch_size, (dim,) * len(taps), licence, is_metric=self.metric, needs_hints=True)
+        super().__init__(name, patch_size, (dim,) * len(taps), licence, is_metric=True, needs_hints=True)
 
         def make() -> DA3MetricNetwork:
             backbone = Backbone(dim, depth, num_heads, "mlp", None, image_size, patch_size)
@@ -87,15 +82,12 @@ class DA3SingleViewBackend(NetworkBackend):
     def encode(self, images: Tensor, hints: Hints | None = None) -> Tokens:
         """See :meth:`Backend.encode`; fixes the factors once, so that token changes do not move the unit."""
         self.check_images(images)
-        hints = self.require_hints(images, hints, *self.hint_names)
+        hints = self.require_hints(images, hints, "cameras")
+        assert hints.cameras is not None
         with half_precision_on_gpu(images):
             patch, camera = self.network.backbone.pretrained(normalize_images(images), self.taps)
         tokens = self.as_tokens(images, patch, camera)
-        return replace(tokens, state={"cameras": hints.cameras, "factor": self.factor(tokens, hints)})
-
-    @abstractmethod
-    def factor(self, tokens: Tokens, hints: Hints) -> Tensor:
-        """Units of the cameras' translations per unit of the network's output, ``[B, V]``."""
+        return replace(tokens, state={"cameras": hints.cameras, "factor": metres(hints.cameras)})
 
     def decode_raw(self, tokens: Tokens) -> tuple[Tensor, Tensor]:
         """Returns the network's depth, sky not filled, and its sky score, both ``[B, V, H, W]``."""
@@ -111,41 +103,6 @@ class DA3SingleViewBackend(NetworkBackend):
     def decode_cameras(self, tokens: Tokens) -> Cameras:
         """See :meth:`Backend.decode_cameras`."""
         return tokens.state["cameras"]
-
-
-class DA3MetricBackend(DA3SingleViewBackend):
-    """DA3's metric network: metres, if the translations of the data's cameras are in metres.
-
-    The factor is the mean focal length (pixels at network resolution) / 300. Arguments: see
-    :class:`DA3SingleViewBackend`.
-    """
-
-    metric = True
-    hint_names = ("cameras",)
-
-    def factor(self, tokens: Tokens, hints: Hints) -> Tensor:
-        """See :meth:`DA3SingleViewBackend.factor`."""
-        assert hints.cameras is not None
-        return metres(hints.cameras)
-
-
-class DA3MonoBackend(DA3SingleViewBackend):
-    """DA3's relative network: every view's depth has a unit of its own, which is fitted to the data's depth.
-
-    The fit is the weighted median of all valid pixels of the view that are not sky. A view without any gets the median
-    factor of its scene; a scene without any gets 1. Arguments: see :class:`DA3SingleViewBackend`.
-    """
-
-    metric = False
-    hint_names = ("cameras", "depth")
-
-    def factor(self, tokens: Tokens, hints: Hints) -> Tensor:
-        """See :meth:`DA3SingleViewBackend.factor`."""
-        assert hints.depth is not None
-        depth, sky = self.decode_raw(tokens)
-        factor = fit_depth_scale(depth, hints.depth, sky < SKY_THRESHOLD, per_view=True)
-        scene = factor.nanmedian(1, keepdim=True).values.nan_to_num(1.0)
-        return torch.where(factor.isnan(), scene, factor)
 
 
 def metres(cameras: Cameras) -> Tensor:

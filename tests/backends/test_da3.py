@@ -109,28 +109,6 @@ def test_metric_depth_grows_with_the_focal_length(make_backend, make_scene) -> N
     assert torch.equal(one.depth_conf, torch.ones_like(one.depth))
 
 
-def test_relative_depth_takes_its_unit_from_the_data_view_by_view(make_backend, make_scene) -> None:
-    images, hints = make_scene(2, 3, SIZE)
-    backend = make_backend("da3_mono_large", *TINY_METRIC)
-    assert not backend.is_metric
-    with pytest.raises(ValueError, match="depth"):
-        backend.encode(images, Hints(cameras=hints.cameras))
-    raw, _ = backend.decode_raw(backend.encode(images, hints))
-    unit = torch.tensor([[2.0, 3, 5], [7, 11, 13]])
-    depth = raw * unit[..., None, None]
-    depth[0, 1] = 0  # no depth in this view: it goes by the other two
-    depth[1, 0, 3:] = 0
-    tokens = backend.encode(images, Hints(depth, hints.cameras))
-    unit[0, 1] = 2
-    geometry = backend.decode(tokens)
-    torch.testing.assert_close(geometry.depth, raw * unit[..., None, None])
-    assert torch.equal(geometry.cameras.world_to_camera, hints.cameras.world_to_camera)
-    torch.testing.assert_close(backend.decode(backend.encode(images, Hints(depth * 0, hints.cameras))).depth, raw)
-    changed = tokens.with_patch(tuple(patch + 0.1 for patch in tokens.patch))
-    torch.testing.assert_close(changed.state["factor"], unit)
-    assert not torch.allclose(backend.decode(changed).depth, geometry.depth)
-
-
 def test_sky_is_far() -> None:
     depth = torch.linspace(1, 2, 800).reshape(1, 2, 20, 20)
     sky = torch.zeros_like(depth)

@@ -16,7 +16,6 @@ CASES = {
     "da3_large": ("da3-large", ("given_poses=true",)),
     "da3_giant": ("da3-giant", ("given_poses=true",)),
     "da3_metric_large": ("da3metric-large", ()),
-    "da3_mono_large": ("da3mono-large", ()),
     "da3_nested": ("da3nested-giant-large", ("relative.given_poses=true",)),
 }
 
@@ -45,7 +44,7 @@ def test_names_and_shapes(make_backend, name: str) -> None:
     assert ours == published
 
 
-@pytest.mark.parametrize("name", ["vggt_1b", "da3_small", "da3_large", "da3_giant", "da3_mono_large"])
+@pytest.mark.parametrize("name", ["vggt_1b", "da3_small", "da3_large", "da3_giant"])
 def test_a_published_file_would_load(make_backend, load_config, name: str) -> None:
     """Without the camera encoder, exactly as the YAML says: every leftover of the file is known."""
     manifest = read_json("manifests")[CASES[name][0]]

@@ -103,7 +103,6 @@ MISTAKES = {
     "train data=rgbd data.root=not_here": "the data folder not_here .* does not exist: set data.root=",
     "reconstruct . --out x backend=da3_smal": "Could not find 'backend/da3_smal' Available options .*da3_small",
     "reconstruct . --out x foo=1": "option 'foo=1': expected key=value of backend, model, renderer",
-    "curves nowhere": "nowhere|matplotlib",
     "render scene.ply --cameras no.json --out x": r"^FileNotFoundError: no cameras at no\.json",
     "reconstruct . --out x --every 0": "^ValueError: every must be at least 1, got 0",
     "export backend=oracle --out bundle": "backend oracle cannot be exported",
@@ -141,7 +140,6 @@ def test_hydra_says_what_is_wrong_with_an_override_and_what_is_near(words: str, 
 
 WITHOUT_EXTRAS = {
     "view scene.ply": "view",
-    "curves run": "eval",
     "train logger=tensorboard": "log",
     "train logger=wandb": "log",
     "train backend=da3_small": "hub",
@@ -153,7 +151,7 @@ WITHOUT_EXTRAS = {
 
 @pytest.mark.parametrize("words", WITHOUT_EXTRAS)
 def test_a_missing_optional_package_is_one_line_before_any_work(words, said, tmp_path, monkeypatch):
-    for package in ("viser", "matplotlib", "tensorboard", "wandb", "huggingface_hub", "av", "onnx", "onnxscript"):
+    for package in ("viser", "tensorboard", "wandb", "huggingface_hub", "av", "onnx", "onnxscript"):
         monkeypatch.setitem(sys.modules, package, None)
     (tmp_path / "clip.mp4").touch()  # neither it nor scene.ply, which is not there, is looked at
     line, _ = said(*words.split())

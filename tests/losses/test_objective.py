@@ -48,7 +48,7 @@ def test_an_exact_prediction_in_any_unit_costs_only_confidence(sample) -> None:
     assert (float(report.terms["rendered"]), report.skipped) == (1, 0)
 
 
-@pytest.mark.parametrize("align", [ScaleAlignment(), ScaleAlignment("rendered"), ScaleAlignment(per_view=True)])
+@pytest.mark.parametrize("align", [ScaleAlignment(), ScaleAlignment("rendered")])
 def test_the_predictions_unit_does_not_matter(sample, align: ScaleAlignment) -> None:
     made = noisy(sample(scenes=2))
     loss = VG2GTLoss(align=align)
@@ -93,28 +93,6 @@ def test_rendered_source_without_a_surface_falls_back_to_the_enhanced_depth(samp
     torch.testing.assert_close(report.scale, VG2GTLoss()(*made.inputs).scale)
 
 
-@pytest.mark.parametrize("source", ["enhanced", "rendered"])
-def test_per_view_scales_forgive_what_one_scale_does_not(sample, source: str) -> None:
-    made = sample(rendered=(0, 1, 2))
-    factors = torch.tensor([1.0, 1.2, 0.9], dtype=torch.float64)[:, None, None]
-    made = made.with_depth(made.prediction.geometry.depth * factors)
-    made = made.with_render(depth=made.rendered.depth * factors)
-    one = VG2GTLoss(align=ScaleAlignment(source))(*made.inputs)
-    each = VG2GTLoss(align=ScaleAlignment(source, per_view=True))(*made.inputs)
-    assert float(each.terms["depth_consistency"]) < 1e-9  # decoded and rendered depth share every view's scale
-    for name in ("depth_reg", "depth_gt"):
-        assert float(each.terms[name]) < 1e-9
-        assert float(one.terms[name]) > 0.05
-
-
-def test_held_out_views_keep_the_scenes_scale(sample) -> None:
-    made = sample(rendered=(3,))
-    factors = torch.tensor([1.3, 1, 1], dtype=torch.float64)[:, None, None]
-    made = made.with_depth(made.prediction.geometry.depth * factors)
-    report = VG2GTLoss(align=ScaleAlignment(per_view=True))(*made.inputs)
-    assert float(report.terms["depth_gt"]) < 1e-9
-
-
 def test_scales_are_constants(sample) -> None:
     made = noisy(sample())
     depth = made.prediction.geometry.depth.clone().requires_grad_()
@@ -125,7 +103,7 @@ def test_scales_are_constants(sample) -> None:
     assert abs(float((gradient * depth.detach()).sum())) > 1e-4
 
 
-@pytest.mark.parametrize("align", [ScaleAlignment(), ScaleAlignment("rendered", per_view=True)])
+@pytest.mark.parametrize("align", [ScaleAlignment(), ScaleAlignment("rendered")])
 def test_a_scene_without_depth_still_trains_its_colours(sample, align: ScaleAlignment) -> None:
     made = noisy(sample(scenes=2))
     missing = made.batch.depth.clone()

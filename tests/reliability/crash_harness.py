@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import importlib
 import os
 import signal
@@ -20,7 +21,6 @@ from tests.commands import ROOT, become, warm_process
 from tests.training_helpers import SMALL
 from vg2gt.io.files import read_json
 from vg2gt.runs.checkpoints import read_checkpoint
-from vg2gt.studies.curves import read_curves
 
 PATIENCE = 600.0  # seconds until a process that does not end is taken to hang
 STEPS = 6
@@ -223,6 +223,17 @@ def assert_same(whole: Path, resumed: Path) -> None:
         if name.startswith("train/"):
             assert curve.items() <= expected[name].items(), name
     assert not list(resumed.rglob("*.tmp"))
+
+
+def read_curves(run: Path) -> dict[str, dict[int, str]]:
+    """What a run logged by metric and step; rows that a killed process did not finish have no line break."""
+    curves: dict[str, dict[int, str]] = {}
+    for path in sorted(run.glob("logs/version_*/metrics.csv"), key=lambda path: int(path.parent.name.split("_")[1])):
+        for row in csv.DictReader(path.read_text().rpartition("\n")[0].splitlines()):
+            for name, value in row.items():
+                if value:
+                    curves.setdefault(name, {})[int(row["step"])] = value
+    return curves
 
 
 def assert_equal(expected: Any, found: Any, name: str) -> None:

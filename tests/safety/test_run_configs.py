@@ -32,7 +32,7 @@ ATTACKS: dict[str, Attack] = {
     "not recursive": lambda c: {
         "_target_": "vg2gt.model.SceneScale", "_recursive_": False, "x": {"_target_": "os.mkdir", "path": c},
     },
-    "through a module of ours": lambda c: {"_target_": "vg2gt.cli.sweeps.subprocess.run", "args": ["touch", c]},
+    "through a module of ours": lambda c: {"_target_": "vg2gt.kernels.threads.os.mkdir", "path": c},
     "a function of ours": lambda c: {"_target_": "vg2gt.io.files.write_text", "path": c, "content": ""},
     "training": lambda c: {"_target_": "vg2gt.training.loop.train", "config": {"output_dir": c}},
     "a method of ours": lambda c: {"_target_": "backends.bundle.Description.write", "folder": c},

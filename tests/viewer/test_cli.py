@@ -7,9 +7,10 @@ import pytest
 from PIL import Image
 
 from tests.io.gaussian_scenes import scene, views
+from tests.viewer.reading import read_viewer_html
 from vg2gt.cli import view
 from vg2gt.io import named_cameras, write_cameras_json, write_gaussian_ply, write_splat
-from vg2gt.viewer import read_viewer_html, server
+from vg2gt.viewer import server
 
 
 @pytest.fixture

@@ -72,15 +72,10 @@ COMMANDS = {
         "makes scenes, splits and lists of views",
         "vg2gt data synthetic --out rooms --scenes 100",
     ),
-    "curves": Command(
-        "vg2gt.cli.curves:main",
-        "draws training curves of one or several runs",
-        "vg2gt curves outputs/quickstart",
-    ),
     "doctor": Command(
         "vg2gt.cli.doctor:main",
-        "checks this machine: packages, devices, renderer, correctness and speed of the kernels",
-        "vg2gt doctor --no-speed",
+        "checks this machine: packages, devices, renderer, correctness of the kernels",
+        "vg2gt doctor",
     ),
 }
 

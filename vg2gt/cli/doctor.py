@@ -1,13 +1,11 @@
-"""``vg2gt doctor``: what this machine has, which renderer it gets, whether its kernels are right and how fast."""
+"""``vg2gt doctor``: what this machine has, which renderer it gets, whether its kernels are right."""
 
 from __future__ import annotations
 
-import argparse
 import importlib.metadata
 import os
 import platform
 import re
-import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,26 +19,17 @@ if TYPE_CHECKING:
     import torch
 
 NEEDED = ("torch", "lightning", "numba", "numpy")
-BENCHMARK = {"cpu": (20_000, 1), "cuda": (100_000, 8)}  # Gaussians, views of 224 x 448
-SECONDS = 10.0
-
-
-def parser() -> argparse.ArgumentParser:
-    """The command's arguments."""
-    arguments = flag_parser("doctor", COMMANDS["doctor"])
-    arguments.add_argument("--no-speed", action="store_true", help="do not time the renderer (about 10 s a device)")
-    return arguments
 
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Prints one line a finding as it is found."""
-    options = parser().parse_args(argv)
+    flag_parser("doctor", COMMANDS["doctor"]).parse_args(argv)
     with errors_in_one_line():
-        for what, found in findings(timed=not options.no_speed):
+        for what, found in findings():
             print(f"{what:<12} {found}", flush=True)
 
 
-def findings(timed: bool) -> Iterator[tuple[str, str]]:
+def findings() -> Iterator[tuple[str, str]]:
     """What was looked at and what was found."""
     yield "vg2gt", f"{vg2gt.__version__} ({vg2gt.source()}), Python {platform.python_version()}, {platform.platform()}"
     yield "packages", ", ".join(f"{name} {_version(name)}" for name in NEEDED)
@@ -49,14 +38,14 @@ def findings(timed: bool) -> Iterator[tuple[str, str]]:
     import torch
 
     yield "cpu", f"{os.cpu_count()} cores, torch uses {torch.get_num_threads()} threads"
-    yield from _renderer(torch.device("cpu"), timed)
+    yield from _renderer(torch.device("cpu"))
     if not torch.cuda.is_available():
         yield "gpu", f"none that torch {torch.__version__} can use"
     for index in range(torch.cuda.device_count() if torch.cuda.is_available() else 0):
         device = torch.device("cuda", index)
         found = torch.cuda.get_device_properties(device)
         yield f"gpu {index}", f"{found.name}, {found.total_memory / 2**30:.0f} GiB"
-        yield from _renderer(device, timed)
+        yield from _renderer(device)
 
 
 def _version(package: str) -> str:
@@ -99,8 +88,8 @@ def _size(folder: Path) -> str:
     return f"{sum(path.stat().st_size for path in folder.rglob('*') if path.is_file()) / 1e6:.0f} MB"
 
 
-def _renderer(device: torch.device, timed: bool) -> Iterator[tuple[str, str]]:
-    """Which renderer ``auto`` is there, how far the kernels are off (measured again), and how long it takes."""
+def _renderer(device: torch.device) -> Iterator[tuple[str, str]]:
+    """Which renderer ``auto`` is there, and how far the kernels are off (measured again)."""
     from vg2gt.rendering.renderer import automatic
     from vg2gt.rendering.selfcheck import KernelsRefusedError, compare, identity
 
@@ -108,45 +97,10 @@ def _renderer(device: torch.device, timed: bool) -> Iterator[tuple[str, str]]:
     try:
         chosen = f"auto is '{automatic(device)}'{where}"
     except KernelsRefusedError as error:
-        chosen, timed = str(error), False
+        chosen = str(error)
     yield "renderer", chosen
     if device.type != "cpu" and _version("triton") != "missing":
         try:
             yield "kernels", f"'triton': {compare(device)}"
         except Exception as error:  # the report is what this command is for
             yield "kernels", f"'triton' does not run: {type(error).__name__}: {' '.join(str(error).split())[:300]}"
-    if timed:
-        count, views = BENCHMARK[device.type]
-        milliseconds = _milliseconds(device, count, views)
-        yield "speed", f"{milliseconds:.1f} ms for {count:,} Gaussians, {views} views of 224x448, forward and backward"
-
-
-def _milliseconds(device: torch.device, count: int, views: int) -> float:
-    """Best time of some passes by the clock, within ten seconds."""
-    import torch
-
-    from vg2gt.profiling import now
-    from vg2gt.rendering import render
-    from vg2gt.types import Cameras, Gaussians
-
-    generator = torch.Generator().manual_seed(0)
-    depth = 2 + 2 * torch.rand(count, generator=generator)
-    sides = torch.rand(count, 2, generator=generator) - 0.5
-    means = torch.cat((sides * torch.tensor([2.0, 1.0]) * depth[:, None], depth[:, None]), -1)
-    quats = torch.randn(count, 4, generator=generator)
-    scales = 0.01 * torch.exp(0.3 * torch.randn(count, 3, generator=generator))
-    opacities, sh = torch.rand(count, generator=generator), torch.randn(count, 1, 3, generator=generator)
-    gaussians = Gaussians(means, quats, scales, opacities, sh, torch.zeros(count, dtype=torch.int64)).to(device)
-    leaves = [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh]
-    for tensor in leaves:
-        tensor.requires_grad_()
-    intrinsics = torch.tensor([[220.0, 0, 224], [0, 220, 112], [0, 0, 1]], device=device).expand(1, views, 3, 3)
-    poses = torch.eye(4, device=device).repeat(1, views, 1, 1)
-    poses[0, :, 0, 3] = torch.linspace(-0.2, 0.2, views, device=device)
-    best, begin = float("inf"), time.perf_counter()
-    while time.perf_counter() - begin < SECONDS:
-        start = now(device)
-        out = render(gaussians, Cameras(poses, intrinsics, (224, 448)))
-        torch.autograd.grad(out.color.sum() + out.depth.sum(), leaves)
-        best = min(best, now(device) - start)
-    return 1e3 * best

@@ -45,6 +45,16 @@ def errors_in_one_line() -> Iterator[None]:
         sys.exit(f"{type(cause).__name__}: {' '.join(said.split())} ({TRACEBACK}=1 shows where)")
 
 
+def refuse_ranks_in_a_sweep(devices: str) -> None:
+    """Refuses jobs of a sweep that would start ranks, by repeating the command line: here the whole sweep.
+
+    Raises:
+        ValueError: saying what to do instead.
+    """
+    if in_a_sweep() and devices != "1" and "LOCAL_RANK" not in os.environ and "SLURM_PROCID" not in os.environ:
+        raise ValueError(f"trainer.devices={devices} in a sweep (-m): run its jobs one by one, or with one device each")
+
+
 def in_a_sweep() -> bool:
     """Whether this is a job of a sweep (``-m``)."""
     return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN

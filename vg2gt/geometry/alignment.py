@@ -34,7 +34,7 @@ def weighted_median(values: Tensor, weights: Tensor) -> Tensor:
     return torch.where(total > 0, torch.gather(ordered, -1, index), torch.nan)[..., 0]
 
 
-def fit_depth_scale(predicted: Tensor, reference: Tensor, valid: Tensor, per_view: bool = False) -> Tensor:
+def fit_depth_scale(predicted: Tensor, reference: Tensor, valid: Tensor) -> Tensor:
     """The scale ``argmin_s sum w |s d_hat - d|``, ``w = 1 / max(d, 0.01)``, of each scene (paper, appendix, wmed).
 
     Its exact solution is the median of ``d / d_hat`` under the weights ``w d_hat``. Every view is first subsampled to
@@ -44,10 +44,9 @@ def fit_depth_scale(predicted: Tensor, reference: Tensor, valid: Tensor, per_vie
         predicted: ``[B, V, H, W]`` depth in its own unit.
         reference: ``[B, V, H, W]`` depth in the unit wanted.
         valid: ``[B, V, H, W]`` bool; pixels where either depth is not positive are left out as well.
-        per_view: fit every view on its own.
 
     Returns:
-        ``[B]``, or ``[B, V]`` if per view, without a graph; NaN where no pixel is valid.
+        ``[B]``, without a graph; NaN where no pixel is valid.
     """
     predicted, reference = predicted.detach(), reference.detach()
     valid = valid & (predicted > 0) & (reference > 0) & predicted.isfinite() & reference.isfinite()
@@ -55,9 +54,7 @@ def fit_depth_scale(predicted: Tensor, reference: Tensor, valid: Tensor, per_vie
     predicted, reference, valid = (torch.gather(x.flatten(2), 2, pixels) for x in (predicted, reference, valid))
     weights = torch.where(valid, predicted / reference.clamp(min=MIN_DEPTH), 0.0)
     ratios = reference / torch.where(valid, predicted, 1.0)
-    if not per_view:
-        ratios, weights = ratios.flatten(1), weights.flatten(1)
-    return weighted_median(ratios, weights)
+    return weighted_median(ratios.flatten(1), weights.flatten(1))
 
 
 def _nearest_valid_pixels(valid: Tensor) -> Tensor:

@@ -93,14 +93,14 @@ class GaussianLoss:
             rendered: R views of the scene (B = 1), depth in scene units.
             cameras: the cameras they were rendered with (B = 1).
             targets: what they should show.
-            scale: ``[R]`` losses' unit per scene unit, a constant.
+            scale: scalar, losses' unit per scene unit, a constant.
 
         Returns:
             Scalars with graph, named like the weights.
         """
         color, hits = where_it_counts(rendered.color[0], targets.images, targets.mask), self.hits(rendered)[0]
         depth = torch.where(hits, rendered.depth[0], 1.0)
-        scaled = depth * scale[:, None, None]
+        scaled = depth * scale
         decoded, trust = targets.decoded.detach(), targets.decoded_conf.detach()
         trust = trust if self.confidence_weighted else torch.ones_like(trust)
         near_decoded = hits & targets.decoded_valid & targets.comparable

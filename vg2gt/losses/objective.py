@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from vg2gt.losses.enhancement import EnhancementLoss
 from vg2gt.losses.gaussian import GaussianLoss, RenderTargets
 from vg2gt.losses.geometry import GeometryLoss, camera_errors
-from vg2gt.losses.scale import ScaleAlignment
+from vg2gt.losses.scale import ScaleAlignment, to_unit
 from vg2gt.losses.truth import Truth, normalize_truth
 from vg2gt.types import Batch, Cameras, Decoded, Geometry, Render, TensorRecord
 
@@ -117,28 +117,27 @@ class VG2GTLoss(nn.Module):
         with torch.autocast(batch.images.device.type, enabled=False):
             truth = normalize_truth(batch.map(_full_precision))
             initial, enhanced = (g.map(_full_precision) for g in (prediction.initial, prediction.geometry))
-            initial_scales = self.align.fit(initial, truth)
-            scales = initial_scales if self.align.source == "initial" else self.align.fit(enhanced, truth)
+            initial_scale = self.align.fit(initial, truth)
+            scale = initial_scale if self.align.source == "initial" else self.align.fit(enhanced, truth)
             if shown is not None:
                 hits = self.gaussian.hits(shown.render)
-                scales = self.align.fit_rendered(shown.render.depth, hits, shown.views, truth, scales)
+                scale = self.align.fit_rendered(shown.render.depth, hits, shown.views, truth, scale)
             context = truth.views(slice(0, batch.num_context))
             valid = context.valid & (initial.depth > 0) & (enhanced.depth > 0)
-            before, after = initial_scales.apply(initial), scales.apply(enhanced)
+            before, after = to_unit(initial, initial_scale), to_unit(enhanced, scale)
             scenes = [
                 self._geometry_terms(_one(before, i), _one(after, i), context.scene(i), valid[i : i + 1])
                 for i in range(len(batch.scene))
             ]
             if shown is not None:
                 targets = _render_targets(batch, after, truth, shown.views)
-                scale = scales.of_views(shown.views)
                 scenes = [
                     scene + self._gaussian_terms(*shown.scene(i), targets.scene(i), scale[i])
                     for i, scene in enumerate(scenes)
                 ]
             total = torch.stack([scene.total for scene in scenes]).mean()
             terms = {name: torch.stack([s.terms[name].detach() for s in scenes]).mean() for name in scenes[0].terms}
-        return LossReport(total, terms, scales.scene, (~truth.known).sum())
+        return LossReport(total, terms, scale, (~truth.known).sum())
 
     def _geometry_terms(self, before: Geometry, after: Geometry, truth: Truth, valid: Tensor) -> SceneLoss:
         """Geometry and enhancement losses of one scene, everything in the truth's unit."""

@@ -90,7 +90,7 @@ def check_targets(config: Any, source: str | Path) -> None:
             found = get_object(target)
         except Exception as error:  # Hydra's, or whatever importing a trusted package raises
             raise UntrustedError(f"{said}, which cannot be imported ({' '.join(str(error).split())[:200]})") from error
-        # a name may lead through a module to what it has imported itself: vg2gt.cli.sweeps.subprocess.run
+        # a name may lead through a module to what it has imported itself: vg2gt.kernels.threads.os.mkdir
         home = str(getattr(found, "__module__", None))
         if home.partition(".")[0] != package:
             raise UntrustedError(f"{said}, which is defined in {home}, not in {package} ({ENVIRONMENT}=PACKAGE)")

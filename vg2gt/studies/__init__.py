@@ -1,1 +1,1 @@
-"""Several trainings that belong together: ablations, comparisons, curves."""
+"""Several trainings that belong together: ablations, comparisons."""

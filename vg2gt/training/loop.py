@@ -292,7 +292,7 @@ def _where_curves_are(run: Run) -> str:
         return f"tensorboard --logdir {run.folder}"
     if any(isinstance(logger, WandbLogger) for logger in run.trainer.loggers):
         return f"{run.folder / 'wandb'} (offline runs: wandb sync)"
-    return f"vg2gt curves {run.folder} (or logger=tensorboard, logger=wandb for a run)"
+    return f"{run.folder / 'logs'} (as pictures with logger=tensorboard or logger=wandb)"
 
 
 def _check_loggers(config: DictConfig) -> None:

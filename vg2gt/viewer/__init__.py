@@ -1,14 +1,13 @@
 """Looking at a scene: a self-contained page, or a server with viser."""
 
 from vg2gt.viewer.content import ViewerScene, load_pictures
-from vg2gt.viewer.page import read_viewer_html, write_viewer_html
+from vg2gt.viewer.page import write_viewer_html
 from vg2gt.viewer.server import MissingViserError, start_server
 
 __all__ = [
     "MissingViserError",
     "ViewerScene",
     "load_pictures",
-    "read_viewer_html",
     "start_server",
     "write_viewer_html",
 ]

@@ -7,25 +7,29 @@ anything else in the file can run code or reach a network.
 from __future__ import annotations
 
 import base64
+import gzip
 import hashlib
 import html
 import json
+import math
 import re
 from pathlib import Path
 from typing import Any
 
-from vg2gt.io.errors import FormatError
+import numpy as np
+
 from vg2gt.io.files import write_text
+from vg2gt.io.gaussian_arrays import to_arrays
 from vg2gt.io.images import encode_image
 from vg2gt.kernels.constants import ALPHA_MIN, JACOBIAN_CLAMP
 from vg2gt.rendering.options import RenderOptions
 from vg2gt.types import Gaussians
 from vg2gt.viewer.content import ViewerScene
-from vg2gt.viewer.packing import PackedGaussians, pack, unpack
 
 STATIC = Path(__file__).with_name("static")
 SCRIPTS = ("shaders.js", "decode.js", "sorting.js", "camera.js", "controls.js", "renderer.js", "main.js")
-_JPEG_QUALITY = 85
+JPEG_QUALITY = 85
+UNSIGNED, SIGNED = 2**16 - 1, 2**15 - 1  # of what is stored as 16 bits
 
 
 def write_viewer_html(path: str | Path, scene: ViewerScene) -> Path:
@@ -33,12 +37,12 @@ def write_viewer_html(path: str | Path, scene: ViewerScene) -> Path:
 
     Args:
         path: the file.
-        scene: what to show; not changed. Pictures are stored as JPEG, Gaussians as :mod:`vg2gt.viewer.packing` says.
+        scene: what to show; not changed. Pictures are stored as JPEG, Gaussians as :func:`pack` says.
 
     Raises:
         ValueError: if the Gaussians are of more than one scene or have values that cannot be shown.
     """
-    packed = pack(scene.gaussians)
+    header, packed = pack(scene.gaussians)
     script = '(() => {\n"use strict";\n' + "\n".join(_static(name) for name in SCRIPTS) + "})();\n"
     style = _static("style.css")
     policy = (
@@ -49,8 +53,8 @@ def write_viewer_html(path: str | Path, scene: ViewerScene) -> Path:
         "policy": policy,
         "title": html.escape(scene.title),
         "style": style,
-        "scene": _json_in_html(_content(scene, packed)),
-        "gaussians": base64.b64encode(packed.content).decode(),
+        "scene": _json_in_html(_content(scene, header)),
+        "gaussians": base64.b64encode(packed).decode(),
         "script": script,
     }
     # one pass, so that nothing inside a part is taken for a place
@@ -58,31 +62,49 @@ def write_viewer_html(path: str | Path, scene: ViewerScene) -> Path:
     return write_text(path, page)
 
 
-def read_viewer_html(path: str | Path) -> Gaussians:
-    """The Gaussians inside a page, as it shows them.
+def pack(gaussians: Gaussians) -> tuple[dict[str, float], bytes]:
+    """One scene as the page's script reads it; bands of colour that are zero throughout are left out.
+
+    Returns:
+        What the script needs to know, and the columns, little endian and compressed by gzip: float32 means, float16
+        colour coefficients, 16-bit logarithms of the standard deviations between the scene's smallest and largest,
+        16-bit components of unit quaternions, 16-bit opacities.
 
     Raises:
-        FormatError: if the file is no such page or damaged.
+        ValueError: if there is no Gaussian, more than one scene, or a value that is not finite or out of range.
     """
-    path = Path(path)
-    try:
-        page = path.read_text()
-        content, data = (re.search(rf'id="{name}">([^<]*)<', page) for name in ("scene", "gaussians"))
-        if content is None or data is None:
-            raise ValueError("it holds no scene")
-        header = json.loads(content[1])["gaussians"]
-        return unpack(PackedGaussians(**header, content=base64.b64decode(data[1], validate=True)))
-    except (ValueError, KeyError, TypeError, EOFError, OverflowError) as error:
-        raise FormatError(f"{path} is not a whole page of `vg2gt view --html`: {error}; write it again") from error
+    if not len(gaussians):
+        raise ValueError("there are no Gaussians to show")
+    arrays = to_arrays(gaussians)
+    if np.abs(arrays.means).max() > np.finfo(np.float32).max:
+        raise ValueError("means must fit into float32")
+    length = np.linalg.norm(arrays.quats, axis=-1, keepdims=True)
+    if (length == 0).any():
+        raise ValueError("quats must not be zero: a rotation has no direction then")
+    sh, half_max = arrays.sh, float(np.finfo(np.float16).max)
+    while sh.shape[1] > 1 and not sh[:, (math.isqrt(sh.shape[1]) - 1) ** 2 :].any():
+        sh = sh[:, : (math.isqrt(sh.shape[1]) - 1) ** 2]
+    logs = np.log(arrays.scales)
+    low, high = float(logs.min()), float(logs.max())
+    columns = (
+        arrays.means.astype("<f4"),
+        sh.clip(-half_max, half_max).astype("<f2"),
+        np.rint((logs - low) / max(high - low, 1e-12) * UNSIGNED).astype("<u2"),
+        np.rint(arrays.quats / length * SIGNED).astype("<i2"),
+        np.rint(arrays.opacities * UNSIGNED).astype("<u2"),
+    )
+    content = gzip.compress(b"".join(column.tobytes() for column in columns), compresslevel=6, mtime=0)
+    degree = math.isqrt(sh.shape[1]) - 1
+    return {"count": len(sh), "degree": degree, "log_scale_min": low, "log_scale_max": high}, content
 
 
-def _content(scene: ViewerScene, packed: PackedGaussians) -> dict[str, Any]:
+def _content(scene: ViewerScene, header: dict[str, float]) -> dict[str, Any]:
     """What the script finds in the page besides the Gaussians."""
     options = RenderOptions(mode="rasterized")
     cameras = [{**camera.fields(), "picture": _jpeg(scene, index)} for index, camera in enumerate(scene.cameras)]
     behind = scene.gaussians.background
     return {
-        "gaussians": packed.header(),
+        "gaussians": header,
         "cameras": cameras,
         "initial": scene.initial().fields(),
         "frustum_depth": scene.frustum_depth(),
@@ -101,7 +123,7 @@ def _jpeg(scene: ViewerScene, index: int) -> str | None:
     picture = scene.picture(index)
     if picture is None:
         return None
-    return base64.b64encode(encode_image(picture, "JPEG", quality=_JPEG_QUALITY)).decode()
+    return base64.b64encode(encode_image(picture, "JPEG", quality=JPEG_QUALITY)).decode()
 
 
 def _json_in_html(content: Any) -> str:

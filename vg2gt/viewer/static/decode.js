@@ -1,4 +1,4 @@
-// Reads the scene from the page: base64, gzip, then one block a column (vg2gt/viewer/packing.py writes them).
+// Reads the scene from the page: base64, gzip, then one block a column (vg2gt/viewer/page.py writes them).
 
 async function inflate(base64) {
   const text = atob(base64);
