@@ -50,11 +50,7 @@ _register_plugins()
 
 
 def config_dir() -> str:
-    """Returns the absolute path of the configuration folder: in the installed package, or next to it in a checkout.
-
-    Raises:
-        FileNotFoundError: if neither the package nor the checkout holds it.
-    """
+    """Absolute path of the configuration folder: in the installed package, or next to it in a checkout."""
     for folder in (_PACKAGE / "configs", _PACKAGE.parent / "configs"):
         if (folder / "train.yaml").is_file():
             return str(folder)
@@ -94,12 +90,7 @@ def compose_groups(*overrides: str) -> DictConfig:
 
 
 def near_keys(name: str, overrides: Sequence[str]) -> str:
-    """A line that says what unknown keys of a command line may have meant; empty if there is nothing alike.
-
-    Args:
-        name: of the configuration that was composed.
-        overrides: the command line's.
-    """
+    """A line that says what unknown keys of a command line may have meant; empty if there is nothing alike."""
     keys = {each.partition("=")[0] for each in overrides if "=" in each and each[0] not in "+~-"}
     groups = [each for each in overrides if (Path(config_dir()) / each.partition("=")[0]).is_dir()]
     try:

@@ -71,12 +71,7 @@ def memory_advice(advice: str) -> Iterator[None]:
 
 
 def note_sizes(sizes: Mapping[str, int], first: bool = False) -> None:
-    """Notes how large a pass is, for the message should it fail.
-
-    Args:
-        sizes: how many of what, in the words of the message.
-        first: a new pass begins: what was noted of the one before is forgotten.
-    """
+    """Notes how many of what a pass has, for the message should it fail; ``first`` forgets those of the pass before."""
     noted = None if torch.compiler.is_compiling() else _sizes.get()
     if noted is None:
         return
@@ -90,7 +85,7 @@ def _is_full(error: Exception) -> bool:
 
 
 class Cap:
-    """The most of something that each scene may have: what ranks lowest is dropped, logged and counted.
+    """The most of something that each scene may have: what ranks lowest is dropped, counted and logged.
 
     The warning comes in the first pass that drops something, then in the second, fourth, eighth, ... of them.
 
@@ -111,16 +106,7 @@ class Cap:
         self._passes = 0
 
     def __call__(self, limit: int | None, ranks: Tensor, batch: Tensor) -> Tensor | None:
-        """Chooses what to keep.
-
-        Args:
-            limit: the most per scene; None: no limit.
-            ranks: ``[M]``; of equal ones the later are kept.
-            batch: ``[M]`` scene index, sorted.
-
-        Returns:
-            ``[M]`` bool, or None where everything is kept.
-        """
+        """Which of ``[M]`` to keep (None: all): the ``limit`` highest of every scene of ``batch [M]``, sorted."""
         self.dropped = 0
         if limit is None or len(batch) <= limit:
             return None
@@ -138,11 +124,7 @@ class Cap:
 
 
 def check_limit(option: str, limit: int | None) -> int | None:
-    """Returns the limit.
-
-    Raises:
-        ValueError: if it is below 1.
-    """
+    """Returns the limit; ValueError if it is below 1."""
     if limit is not None and limit < 1:
         raise ValueError(f"{option} must be at least 1, or null for no limit, got {limit}")
     return limit

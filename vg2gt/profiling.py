@@ -41,12 +41,7 @@ def listening(listener: Listener) -> Iterator[None]:
 
 @dataclass
 class Clock:
-    """Wall time of parts of a reconstruction, in seconds.
-
-    Attributes:
-        total: the whole pass.
-        before_head: the backbone, its decoding and the coarse enhancement.
-    """
+    """Wall time of a reconstruction in seconds: ``total``, and ``before_head``, up to the coarse enhancement."""
 
     total: float = 0.0
     before_head: float = 0.0
@@ -89,10 +84,7 @@ def reset_peak_memory(device: torch.device) -> None:
 
 
 def peak_memory_mib(device: torch.device) -> float:
-    """Peak memory in MiB: allocated on the GPU since the last reset, or resident in the process since its start.
-
-    0 where the system does not tell it (Windows).
-    """
+    """Peak MiB allocated on the GPU since the reset, or resident in the process; 0 where it is not known (Windows)."""
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device) / MIB
     try:

@@ -54,7 +54,7 @@ def test_a_shell_finds_the_installed_command(tmp_path: Path) -> None:
 @pytest.mark.parametrize("words", ALL, ids=" ".join)
 def test_help_shows_an_example_and_imports_little(words: tuple[str, ...], helps: dict[str, str]) -> None:
     assert ALL[words].example in helps[" ".join(words)]
-    assert ALL[words].example.startswith(f"vg2gt {' '.join(words)} ")
+    assert f"{ALL[words].example} ".startswith(f"vg2gt {' '.join(words)} ")
 
 
 @pytest.mark.parametrize("name", ["train", "ablate"])

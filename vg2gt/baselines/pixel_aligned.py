@@ -22,8 +22,8 @@ INITIAL_OPACITY = 0.9
 class PixelHead(nn.Module):
     """Two-layer MLP from a pixel's feature to one Gaussian.
 
-    Before training every Gaussian lies on its unprojected pixel, is round, half a pixel wide at its depth (standard
-    deviation), nearly opaque and has the pixel's colour, so that coloured points render without holes.
+    Before training every Gaussian lies on its unprojected pixel, is round, half a pixel wide (standard deviation),
+    nearly opaque and has the pixel's colour.
 
     Args:
         in_channels: width of the pixel features.
@@ -66,16 +66,9 @@ class PixelHead(nn.Module):
     def forward(
         self, features: Tensor, pixels: Pixels, min_footprint: Tensor | None = None
     ) -> tuple[Gaussians, Tensor]:
-        """Turns pixels into Gaussians.
+        """Turns N pixels with features ``[N, C]`` into Gaussians, in their order, and positive confidences ``[N]``.
 
-        Args:
-            features: ``[N, C]``.
-            pixels: the same N pixels.
-            min_footprint: ``[N]`` in scene units; scales are relative to it where it is larger than the pixel. None: 0.
-
-        Returns:
-            One Gaussian per pixel, in the order of the pixels, and positive confidences ``[N]`` that are those of the
-            depth before training.
+        Scales are relative to ``min_footprint`` ``[N]`` (scene units) where that is larger than the pixel.
         """
         raw = self.out(F.gelu(self.hidden(self.norm(features)))).float()
         shift, residual, scale, rotation, opacity, color, trust = raw.split(self.parts, -1)

@@ -68,12 +68,7 @@ class Pixels(TensorRecord):
 
 
 def usable_pixels(geometry: Geometry, images: Tensor) -> Pixels:
-    """Lists the pixels whose depth and confidence are finite and positive.
-
-    Args:
-        geometry: depth, confidence and cameras in scene units.
-        images: ``[B, V, 3, H, W]`` in [0, 1].
-    """
+    """Lists the pixels whose depth and confidence are finite and positive; geometry is in scene units."""
     depth, confidence = geometry.depth.float(), geometry.depth_conf.float()
     usable = torch.isfinite(depth) & (depth > 0) & torch.isfinite(confidence) & (confidence > 0)
     rows = usable.flatten().nonzero()[:, 0]
@@ -106,13 +101,9 @@ def harmonic_gains(degree: int) -> Tensor:
 class PixelReconstructor(Reconstructor):
     """Features of a dense head at every pixel, and Gaussians made of them; the geometry is the backbone's own.
 
-    Args:
-        backend: the frozen visual foundation model.
-        scale: fixes the scene unit.
+    Args (the others: see :class:`vg2gt.model.Reconstructor`):
         dense_head: makes the dense head from ``token_dims`` and ``patch_size``.
         gaussians: makes the pixel head from ``in_channels``.
-        background: see :class:`vg2gt.model.Reconstructor`.
-        visibility: see :class:`vg2gt.model.Reconstructor`.
     """
 
     def __init__(

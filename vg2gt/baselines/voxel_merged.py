@@ -20,18 +20,12 @@ from vg2gt.types import Gaussians, Geometry
 class VoxelMerged(PixelReconstructor):
     """One Gaussian per pixel first; then all Gaussians of a voxel become their confidence-weighted mean.
 
-    What is merged are finished parameters, not features: nothing looks at a voxel as a whole, and a voxel holds one
-    Gaussian. Scales are relative to the voxel, where that is larger than the pixel, so that the merged Gaussians leave
-    no holes before training.
+    What is merged are finished parameters, not features. Scales are relative to the voxel, where that is larger than
+    the pixel, so that the merged Gaussians leave no holes before training.
 
-    Args:
-        backend: the frozen visual foundation model.
-        scale: fixes the scene unit.
-        dense_head: makes the dense head from ``token_dims`` and ``patch_size``.
-        gaussians: makes the pixel head from ``in_channels``.
+    Args (the others: see :class:`vg2gt.baselines.pixels.PixelReconstructor`):
         voxel_size: edge length in scene units.
         min_footprint: smallest edge in pixels at the scene's median depth; 0 switches the guard off.
-        background: see :class:`vg2gt.model.Reconstructor`.
     """
 
     def __init__(
@@ -57,16 +51,10 @@ class VoxelMerged(PixelReconstructor):
 
 
 def merge_by_voxel(gaussians: Gaussians, confidence: Tensor, voxel_size: Tensor) -> Gaussians:
-    """Replaces the Gaussians of every voxel by their confidence-weighted mean.
+    """Replaces the Gaussians of every voxel by their mean, weighted by ``confidence`` ``[N]`` > 0.
 
-    Args:
-        gaussians: N Gaussians of B scenes.
-        confidence: ``[N]`` > 0.
-        voxel_size: ``[B]`` edge length in scene units.
-
-    Returns:
-        One Gaussian per occupied voxel; those too far away to be numbered are left out. Differentiable in parameters
-        and confidence, not in which Gaussian lies where.
+    Voxels have edges ``voxel_size`` ``[B]`` in scene units; Gaussians too far away to be numbered are left out.
+    Differentiable in parameters and confidence, not in which Gaussian lies where.
     """
     cells = point_cells(gaussians.means, gaussians.batch, voxel_size)
     plan = plan_voxels(cells, gaussians.batch, in_range(cells.detach()))
@@ -88,10 +76,7 @@ def merge_by_voxel(gaussians: Gaussians, confidence: Tensor, voxel_size: Tensor)
 
 
 def _same_signs(quats: Tensor, confidence: Tensor, plan: VoxelPlan) -> Tensor:
-    """Quaternions ``[N, 4]`` or their negatives, which turn alike, so that those of a voxel do not cancel.
-
-    The component that is largest in a voxel decides: near a half turn, where w passes through 0, w would not do.
-    """
+    """Quaternions ``[N, 4]``, with signs chosen by a voxel's largest component so that they do not cancel."""
     decisive = pool_mean(quats.detach().square(), confidence.detach(), plan).argmax(-1)
     own = quats.detach().gather(1, decisive[plan.voxel_of.clamp(min=0), None]) if len(plan) else quats[:, :1]
     return torch.where(own < 0, -quats, quats)

@@ -26,12 +26,7 @@ OVERRIDES = "\nmodel, backend and renderer are chosen by key=value: backend=da3_
 
 
 def hydra_command(command: Command, config_name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], None]]:
-    """Makes a command of a function of a configuration, with sweeps and a folder for the run.
-
-    Args:
-        command: what its help says first.
-        config_name: of the configuration that the arguments change.
-    """
+    """Makes a command of a function of a configuration, with sweeps and a folder for the run."""
 
     def decorate(run: Callable[[DictConfig], None]) -> Callable[[], None]:
         """The command that runs this function."""

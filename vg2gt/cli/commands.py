@@ -13,13 +13,7 @@ import vg2gt
 
 @dataclass(frozen=True)
 class Command:
-    """A command of the command line.
-
-    Attributes:
-        entry: ``module:function``; the function takes its arguments from ``sys.argv``.
-        does: one line of what it does.
-        example: a command line.
-    """
+    """A command: its ``module:function``, one line of what it does, an example."""
 
     entry: str
     does: str
@@ -99,11 +93,7 @@ DATA_COMMANDS = {
 
 
 def dispatch(program: str, commands: Mapping[str, Command]) -> None:
-    """Runs ``program COMMAND [arguments]``; lists the commands if none is named.
-
-    Raises:
-        SystemExit: if there is no such command, naming the nearest.
-    """
+    """Runs ``program COMMAND [arguments]``; lists the commands if none is named, the nearest if there is none."""
     asked = sys.argv[1] if len(sys.argv) > 1 else ""
     if asked in ("", "-h", "--help"):
         print(listing(program, commands))

@@ -68,12 +68,7 @@ def synthetic(argv: Sequence[str] | None = None) -> None:
 
 
 def write_synthetic(out: Path, scenes: int, first_seed: int, settings: SceneSettings, workers: int) -> None:
-    """Writes those of the scenes that are missing in ``out``.
-
-    Raises:
-        ValueError: if a setting is wrong.
-        OSError: if a process was killed.
-    """
+    """Writes those of the scenes that are missing in ``out``; OSError if a process was killed."""
     from rich.progress import track
 
     from vg2gt.data.synthetic.export import missing_scenes, write_scenes
@@ -128,12 +123,7 @@ def views(argv: Sequence[str] | None = None) -> None:
 
 
 def write_views(out: str, overrides: Sequence[str]) -> Path:
-    """Writes the index that the overrides of ``vg2gt evaluate`` ask for; returns its path.
-
-    Raises:
-        ValueError: if ``out`` is no JSON file or an override is wrong.
-        DataError: if a scene has too few frames.
-    """
+    """Writes the index that the overrides of ``vg2gt evaluate`` ask for; returns its path."""
     from hydra.utils import instantiate
 
     from vg2gt.data.views.drawn import make_index

@@ -19,10 +19,7 @@ TRACEBACK = "HYDRA_FULL_ERROR"
 
 @contextmanager
 def errors_in_one_line() -> Iterator[None]:
-    """Ends the process with the message of an error; ``HYDRA_FULL_ERROR=1`` shows the traceback.
-
-    In a sweep errors are left to Hydra, which runs the other jobs first.
-    """
+    """Ends the process with the message of an error; ``HYDRA_FULL_ERROR=1`` shows the traceback. Sweeps go on."""
     try:
         yield
     except KeyboardInterrupt:
@@ -46,11 +43,7 @@ def errors_in_one_line() -> Iterator[None]:
 
 
 def refuse_ranks_in_a_sweep(devices: str) -> None:
-    """Refuses jobs of a sweep that would start ranks, by repeating the command line: here the whole sweep.
-
-    Raises:
-        ValueError: saying what to do instead.
-    """
+    """Refuses a sweep's jobs that would start ranks, which is done by repeating the command line: the sweep."""
     if in_a_sweep() and devices != "1" and "LOCAL_RANK" not in os.environ and "SLURM_PROCID" not in os.environ:
         raise ValueError(f"trainer.devices={devices} in a sweep (-m): run its jobs one by one, or with one device each")
 

@@ -22,10 +22,10 @@ def register() -> None:
 
 
 def run_folder(_root_: DictConfig) -> str:
-    """Folder of a training inside ``outputs``: ``name``, or what was chosen and a number if that is taken.
+    """Folder of a training inside ``outputs``: ``name``, or what was chosen, with a number if that is taken.
 
-    Where a run is to go on (``ckpt=last``, ``ckpt=auto``) or to be replaced (``overwrite=true``), and where several
-    processes are started at once, the name has no number. Trials (``fast_dev_run``) are kept apart.
+    It has no number where a run goes on (``ckpt=last``, ``auto``) or is replaced (``overwrite=true``), and where
+    several processes are started at once. Trials (``fast_dev_run``) are kept apart.
     """
     config = _root_
     sweep = str(config.hydra.mode).endswith("MULTIRUN")
@@ -64,11 +64,7 @@ def _holds_jobs(name: str) -> bool:
 
 
 def inside(name: str) -> str:
-    """The name, which must stay in the folder it is a name in.
-
-    Raises:
-        ValueError: if it leads out of it.
-    """
+    """The name; ValueError if it leads out of the folder it is a name in."""
     parts = PureWindowsPath(name).parts  # knows both kinds of slashes
     if not parts or PureWindowsPath(name).drive or name.startswith(("/", "\\")) or ".." in parts:
         raise ValueError(f"name={name}: a name inside outputs, such as mine or paper/first; it may not lead out of it")

@@ -86,7 +86,7 @@ def options_for(
 ) -> RefineOptions:
     """Options for a scene: those that suit its cameras, changed by ``overrides`` and then by the other arguments.
 
-    Predicted cameras, which nothing has adjusted, are refined unless the overrides choose a ``refine=NAME``.
+    Predicted cameras, which nothing has adjusted, are refined unless there are overrides.
     """
     from vg2gt.reconstruction.refined import refinement_of
     from vg2gt.refinement import RefineRates
@@ -102,11 +102,7 @@ def options_for(
 
 
 def refine_options(name: str, overrides: Sequence[str]) -> RefineOptions:
-    """Options of ``refine=NAME refine.key=value``; ``name`` where the overrides choose none.
-
-    Raises:
-        ValueError: if a name is unknown or a value out of range.
-    """
+    """Options of ``refine=NAME refine.key=value``; ``name`` where the overrides choose none."""
     from hydra.errors import InstantiationException
     from hydra.utils import instantiate
 

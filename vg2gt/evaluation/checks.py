@@ -25,11 +25,10 @@ RESUMED_IN_PLACE = (None, "last", "auto")
 
 
 def refuse_training_views(checkpoint: Path | None, source: SceneSource, views: Sequence[SceneSample]) -> None:
-    """Refuses to score what the run was trained on, whatever kinds of source training and evaluation read.
+    """Refuses to score what the run, or a run from whose weights it was started, was trained on.
 
-    So it does for the runs from whose weights the run was started. Every scene in a run's training data counts as
-    trained on, also those that it left out as too short: to find these, all scenes would have to be indexed. If the
-    training data, or a run's configuration, is no longer there, that is said in the log.
+    Every scene of the training data counts, also those left out as too short. Where the training data or a run's
+    configuration is gone, the log says that it cannot be checked.
 
     Raises:
         DataError: naming the first scene.
@@ -68,11 +67,7 @@ def _ancestry(checkpoint: Path | None) -> Iterator[tuple[Path, DictConfig]]:
 
 
 def refuse_without_hints(model: Reconstructor, source: SceneSource) -> None:
-    """Refuses data without depth or cameras for a backbone that needs them.
-
-    Raises:
-        DataError: saying what is lacking.
-    """
+    """Raises DataError if the data lacks the depth or cameras that a backbone needs."""
     backend = model.backend
     needed = {"depth": backend.needs_depth, "cameras": backend.needs_hints}
     there = {"depth": source.has_depth and source.dense_depth, "cameras": source.has_cameras}

@@ -40,7 +40,7 @@ class SceneResult:
     """What the complete evaluation of a scene gives.
 
     Attributes:
-        metrics: figures by their path, such as ``rendered/gt_pose/solid/psnr``; None where there is none.
+        metrics: figures by path, such as ``rendered/gt_pose/solid/psnr``; None where there is none.
         prediction: the reconstruction.
         renders: solid renders by protocol.
     """
@@ -55,10 +55,10 @@ class SceneEvaluator:
     """Scores scenes completely: rendered in every protocol and mode, decoded, cameras, points, uniformity, cost.
 
     Attributes:
-        model: the model, in eval mode, on its device.
+        model: in eval mode, on its device.
         renderer: its options are used in both modes.
         options: what is compared and how.
-        lpips: the network, on the model's device; None where there is none.
+        lpips: on the model's device; None: no LPIPS.
         refinement: how scenes are refined and scored once more, under ``refined/``; None: not at all.
     """
 
@@ -70,15 +70,7 @@ class SceneEvaluator:
 
     @torch.no_grad()
     def __call__(self, batch: Batch, has_cameras: bool = True) -> SceneResult:
-        """Evaluates one scene.
-
-        Args:
-            batch: one scene (B = 1) on the model's device, with or without held-out views.
-            has_cameras: whether the batch's cameras are true; otherwise all that needs them is left out.
-
-        Raises:
-            ValueError: if the batch holds several scenes.
-        """
+        """Evaluates one scene (B = 1) on the model's device; figures that need true cameras only if it has them."""
         if len(batch.scene) != 1:
             raise ValueError(f"evaluation takes one scene at a time, got {', '.join(batch.scene)}")
         prediction, cost = self._reconstruct(batch)

@@ -29,19 +29,17 @@ CV_QUERIES = 20_000
 def evaluate_scene(
     model: Reconstructor, renderer: Renderer, batch: Batch, rasterized: bool = False
 ) -> dict[str, float]:
-    """Reconstructs a scene from its context views and metrics it on its held-out views, as training runs do.
+    """Reconstructs one scene (B = 1) from its context views and scores its held-out views, as training runs do.
 
     Args:
-        model: the model, in any mode; it is not changed.
+        model: in any mode; it is not changed.
         renderer: its options are used in both modes.
-        batch: one scene (B = 1) with held-out views.
-        rasterized: score the depth of 3DGS rasterisation as well.
+        batch: one scene with held-out views.
+        rasterized: score the depth of 3DGS rasterisation as well (``abs_rel_rasterized``).
 
     Returns:
-        ``psnr``, ``ssim``, ``rmse``, ``abs_rel``, ``delta_1.25``, ``delta_1.05``, ``coverage``, ``normal_mean`` on
-        held-out views at ground-truth poses, rendered as solids whatever the training renders; with ``rasterized``
-        ``abs_rel_rasterized``, of the same views rasterised as in 3DGS; ``decoded_abs_rel_before`` and
-        ``decoded_abs_rel`` on the context views; ``gaussians``, ``cv``. Depth is aligned by one median scale per scene.
+        Figures of held-out views at true poses, rendered as solids (``psnr``, ``abs_rel``, ...), of the context views'
+        decoded depth before and after enhancement, ``gaussians``, ``cv``. Depth is aligned by one scale a scene.
 
     Raises:
         ValueError: if the batch holds several scenes or no held-out view.
@@ -82,10 +80,7 @@ def _scene_figures(prediction: Prediction, renderer: Renderer, batch: Batch, ras
 
 
 def render_or_nan(renderer: Renderer, gaussians: Gaussians, cameras: Cameras, mode: Any) -> Render:
-    """Renders; where Gaussians or cameras cannot be rendered, says so in the log and returns views of NaN.
-
-    Figures of such views are NaN, which reports show as n/a: one scene does not end an evaluation.
-    """
+    """Renders; where that fails, says so in the log and returns views of NaN, whose figures reports show as n/a."""
     try:
         return renderer(gaussians, cameras, mode=mode)
     except UnrenderableError as error:

@@ -11,15 +11,12 @@ from vg2gt.metrics.depth import ALIGNMENTS
 
 @dataclass(frozen=True)
 class PointOptions:
-    """How point clouds are compared; lengths in the data's unit.
+    """How point clouds are compared; positive lengths in the data's unit.
 
     Args:
         threshold: distance below which a point is right.
         downsample: one point is kept in every cell of this edge; None keeps all.
         cap: distances from here on are left out of the means; None: none.
-
-    Raises:
-        ValueError: if a length is not positive.
     """
 
     threshold: float = 0.05

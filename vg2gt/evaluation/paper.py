@@ -41,7 +41,7 @@ def obstacle(
     depth_range: Sequence[float | None],
     told: bool,
 ) -> str | None:
-    """Why figures cannot be compared with the paper's rows on a data set; None if nothing does.
+    """Why figures cannot be compared with the paper's rows on a data set; None if nothing prevents it.
 
     Args:
         dataset: as in the tables, such as ``replica``.
@@ -50,7 +50,7 @@ def obstacle(
         fit: how they were brought to it, ``cover`` or ``pad``.
         alignment: of depth.
         depth_range: true depths that count.
-        told: whether the backbone is told the data's depth or cameras, which the paper's are not.
+        told: whether the backbone is told the data's depth or cameras.
     """
     if source not in SOURCES.get(dataset, ()):
         return f"the data is read by {source}, which is not the paper's {dataset}"

@@ -16,16 +16,13 @@ PANELS = "input | rendered | truth | rendered depth | true depth | depth error |
 
 
 def scene_picture(batch: Batch, rendered: Render, truth: Batch, alignment: str) -> Tensor:
-    """One row per view, evenly spread, at most three: the panels of :data:`PANELS`.
+    """One row per view, evenly spread, at most three: the panels of :data:`PANELS`, ``[3, H, W]`` in [0, 1].
 
     Args:
         batch: the scene; the input view shown is the one taken nearest to the rendered view.
         rendered: views of the scene.
         truth: the same views.
         alignment: brings the rendered depth into the true unit, image by image; ``scene`` as ``median``.
-
-    Returns:
-        ``[3, H, W]`` in [0, 1].
     """
     count = truth.images.shape[1]
     views = torch.linspace(0, count - 1, min(count, ROWS)).round().long().tolist()
@@ -52,15 +49,7 @@ def scene_picture(batch: Batch, rendered: Render, truth: Batch, alignment: str) 
 
 
 def colorize_error(depth: Tensor, reference: Tensor) -> Tensor:
-    """Colours the relative error of depth ``[H, W]``: white 0, red 5 %, black 10 % and more, a hole blue, unknown grey.
-
-    Args:
-        depth: aligned depth, 0 = hole.
-        reference: true depth, 0 = unknown.
-
-    Returns:
-        ``[3, H, W]``.
-    """
+    """Colours relative errors ``[H, W]`` of aligned depth: white 0, red 5 %, black 10 %, a hole blue, unknown grey."""
     known = reference > 0
     error = (depth - reference).abs() / torch.where(known, reference, 1.0) / LARGEST_ERROR
     red = (2 - 2 * error).clamp(0, 1)

@@ -1,7 +1,7 @@
-"""Where held-out views are rendered: cameras for training and evaluation that never look at their images' content.
+"""Cameras of held-out views for training and evaluation; the Gaussians come from the context views alone.
 
-The Gaussians always come from a pass over the context views alone. The cameras of held-out views come either from a
-second, joint pass of the frozen backbone, brought into the first pass's frame by a similarity, or from the data.
+They come either from a second, joint pass of the frozen backbone, brought into the first pass's frame by a similarity,
+or from the data.
 """
 
 from __future__ import annotations
@@ -24,11 +24,10 @@ def training_cameras(model: Reconstructor, batch: Batch, prediction: Prediction)
 
 @torch.no_grad()
 def joint_target_cameras(model: Reconstructor, batch: Batch, prediction: Prediction) -> Cameras:
-    """Predicted cameras of the held-out views (protocol ``novel``).
+    """Predicted cameras of the held-out views (protocol ``novel``), from a joint pass over context and held-out views.
 
-    The backbone sees context and held-out views together; a similarity between its context cameras and those of the
-    context-only pass brings the held-out cameras into the Gaussians' frame. Where the context cameras do not move, as a
-    single one does, its scale comes from the depth that both passes decode of the context views.
+    A similarity between its context cameras and those of the context-only pass brings them into the Gaussians' frame;
+    where the context cameras do not move, its scale comes from the depth that both passes decode.
     """
     if not model.backend.predicts_cameras:  # they are the data's: no pass is needed to know them
         cameras = scale_translations(relative_to_first(batch.cameras), prediction.unit)
@@ -47,10 +46,7 @@ def joint_target_cameras(model: Reconstructor, batch: Batch, prediction: Predict
 
 
 def ground_truth_target_cameras(batch: Batch, prediction: Prediction) -> Cameras:
-    """Ground-truth cameras of the held-out views in the Gaussians' frame (protocol ``gt_pose``).
-
-    The similarity comes from the context cameras; where they do not move, its scale comes from the depth.
-    """
+    """True cameras of the held-out views in the Gaussians' frame (protocol ``gt_pose``), by the context cameras."""
     context = batch.context
     depth = prediction.geometry.depth
 

@@ -46,8 +46,8 @@ REFINEMENT = ("refine.", "evaluation.refine")  # decide nothing where nothing is
 def evaluate(config: DictConfig) -> dict[str, Any]:
     """Evaluates a model on the scenes of a data set, for every number of input views asked.
 
-    Writes into the output folder: the resolved configuration, one file per scene as it is done, ``metrics.json``,
-    ``metrics.md`` and pictures. Scenes that the folder holds already are not evaluated again.
+    Writes the resolved configuration, one file a scene as it is done, ``metrics.json``, ``metrics.md`` and pictures.
+    Scenes that the folder holds already are not evaluated again.
 
     Returns:
         The content of ``metrics.json``: ``settings``, and for every number of views ``mean`` and ``scenes``.
@@ -115,11 +115,7 @@ def mean_metrics(scenes: Mapping[str, Mapping[str, float | None]]) -> dict[str, 
 
 
 def view_counts(views: Any) -> list[int]:
-    """The numbers of input views that ``views`` asks for, in order.
-
-    Raises:
-        ValueError: if it is no number or list of numbers.
-    """
+    """The numbers of input views that ``views`` asks for, in order; ValueError if it is no number or list."""
     counts = list(views) if isinstance(views, Sequence) else [views]
     if not counts or not all(type(count) is int and count > 0 for count in counts):
         raise ValueError(f"views={views}: give numbers of input views, such as 'views=[3,10,20]'")

@@ -28,8 +28,7 @@ def image_metrics(rendered: Render, truth: Batch, lpips: LPIPS | None = None) ->
 def rendered_normal_metrics(rendered: Render, truth: Batch) -> dict[str, float]:
     """Errors of the rendered normals of one scene, names with ``normal_`` in front.
 
-    Pixels count where the true depth has a normal, which takes a valid pixel, four valid neighbours and no depth edge
-    between them, and where a depth was rendered.
+    Pixels count where a depth was rendered and the true depth has a normal (valid neighbours, no depth edge).
     """
     normals, valid = normals_from_depth(truth.depth, truth.cameras.intrinsics)
     found = normal_metrics(rendered.normal[0], normals[0], valid[0] & (rendered.depth[0] > 0))
@@ -37,10 +36,7 @@ def rendered_normal_metrics(rendered: Render, truth: Batch) -> dict[str, float]:
 
 
 def edge_metrics(rendered: Render, truth: Batch, alignment: str) -> dict[str, float]:
-    """``edge_psnr`` and ``edge_abs_rel`` of one scene: only pixels within 3 pixels of an edge of the true depth.
-
-    NaN where there is no such pixel. Depth is aligned by all pixels.
-    """
+    """``edge_psnr`` and ``edge_abs_rel`` of one scene, within 3 pixels of true depth edges; NaN without any."""
     region = near_depth_edges(truth.depth)
     depth = depth_metrics(rendered.depth[0], truth.depth[0], alignment, region=region[0])
     error = (rendered.color.clamp(0, 1) - truth.images.clamp(0, 1)).double().square().mean(2)[0]  # [V, H, W]
@@ -50,11 +46,7 @@ def edge_metrics(rendered: Render, truth: Batch, alignment: str) -> dict[str, fl
 
 
 def depth_to_camera_scale(geometry: Geometry, truth: Batch) -> float:
-    """Size of decoded depth over that of the cameras' translations, 1 where both fit together; one scene.
-
-    Either is measured against the truth: depth by the factor of least relative L1 error, cameras by the similarity onto
-    the true ones. NaN without depth or with cameras that do not move.
-    """
+    """Size of decoded depth over that of the cameras' translations, 1 where both fit; NaN if unknown."""
     depth = fit_depth_scale(geometry.depth, truth.depth, truth.depth > 0)
     unknown = torch.full_like(depth, torch.nan)
     return float(align_cameras(geometry.cameras, truth.cameras, lambda: unknown).scale / depth)
@@ -63,9 +55,7 @@ def depth_to_camera_scale(geometry: Geometry, truth: Batch) -> float:
 def point_cloud_metrics(
     depth: Tensor, cameras: Cameras, truth: Batch, similarity: Similarity, **options: float | None
 ) -> dict[str, float]:
-    """Compares the points of predicted depth maps with those of the true ones.
-
-    Pixels whose true depth is unknown are left out of both clouds: there is nothing to compare their points with.
+    """Compares the points of predicted depth maps with the true ones, at pixels whose true depth is known.
 
     Args:
         depth: ``[1, V, H, W]``.
@@ -84,8 +74,7 @@ def point_cloud_metrics(
 def align_geometry(geometry: Geometry, truth: Batch) -> Similarity | None:
     """The similarity that brings decoded points onto the true points of the same pixels; None without any.
 
-    Taken from points instead of cameras, because a point cloud is to be judged by its shape: the scale that a short
-    baseline gives would move all of it.
+    From points, not cameras: the scale that a short baseline gives would move the whole cloud.
     """
     valid = (geometry.depth > 0) & geometry.depth.isfinite() & (truth.depth > 0)
     if int(valid.sum()) < 3:

@@ -48,11 +48,7 @@ Rows = list[tuple[list[str], Figures]]
 
 
 def report_markdown(report: Mapping[str, Any]) -> str:
-    """The report: how it was measured, one table per kind of figure, then the scenes.
-
-    Args:
-        report: the content of ``metrics.json`` (:func:`vg2gt.evaluation.run.evaluate`).
-    """
+    """The content of ``metrics.json`` as Markdown: how it was measured, a table per kind of figure, then the scenes."""
     settings, by_views = report["settings"], sorted(report["views"].items(), key=lambda item: int(item[0]))
     dataset, images = settings["paper"], IMAGES
     if settings["lpips"].startswith("n/a"):  # LPIPS without weights says so in its heading

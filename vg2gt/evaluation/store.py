@@ -21,13 +21,12 @@ class ResultStore:
 
     Args:
         folder: the evaluation's folder.
-        identity: flat settings that decide the figures (weights, data, options). Another evaluation in the same folder
-            must have the same.
-        overwrite: throw away what the folder holds of another evaluation, or of this one.
+        identity: flat settings that decide the figures; another evaluation in the same folder must have the same.
+        overwrite: remove what the folder holds of another evaluation, or of this one.
 
     Raises:
-        FileExistsError: if the folder holds an evaluation with other settings, naming the first that differ; or files
-            of something else, such as a training run's, which are never replaced.
+        FileExistsError: if the folder holds an evaluation with other settings, naming the first that differ, or files
+            of something else, which are never replaced.
     """
 
     def __init__(self, folder: Path, identity: Mapping[str, Any], overwrite: bool = False) -> None:

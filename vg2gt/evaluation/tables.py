@@ -13,13 +13,7 @@ from rich.table import Table
 
 @dataclass(frozen=True)
 class Metric:
-    """A metric as tables show it.
-
-    Attributes:
-        label: with its unit.
-        decimals: digits after the point.
-        larger_is_better: None: neither.
-    """
+    """A metric as tables show it: label with unit, digits after the point, what is better (None: neither)."""
 
     label: str
     decimals: int
@@ -92,13 +86,7 @@ def number(value: float | None, decimals: int, sign: bool = False) -> str:
 
 
 def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]], text_columns: int = 1) -> str:
-    """A table in Markdown, padded so that it can be read in a terminal as well.
-
-    Args:
-        head: the headings.
-        rows: as many cells each.
-        text_columns: the first so many columns are left-aligned, the others right-aligned.
-    """
+    """A table in Markdown, readable in a terminal; the first ``text_columns`` are left-aligned, others right."""
     widths = [max(map(len, cells)) for cells in zip(head, *rows, strict=True)]
     left = [True] * text_columns + [False] * (len(head) - text_columns)
     rule = ["-" * width if text else "-" * (width - 1) + ":" for width, text in zip(widths, left, strict=True)]

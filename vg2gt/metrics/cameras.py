@@ -14,17 +14,16 @@ STILL = 1e-6  # a shorter baseline, in distances from the world's origin, is flo
 
 
 def relative_pose_errors(predicted: Cameras, reference: Cameras) -> tuple[Tensor, Tensor]:
-    """Errors of the relative pose of every pair of views.
+    """Errors of the relative pose of every pair of views, in degrees.
 
     Args:
         predicted: B scenes, V views.
         reference: the same views, in any world frame and unit.
 
     Returns:
-        Rotation errors ``[B, V (V - 1) / 2]`` and errors of the direction of translation, both in degrees. As in the
-        field's evaluations a direction and its opposite count as equal, so the latter are at most 90. A pair whose
-        reference does not move has no direction and translation error 0; one of which only the prediction does not
-        move has translation error 90.
+        Rotation errors ``[B, V (V - 1) / 2]`` and errors of the direction of translation, at most 90: a direction and
+        its opposite count as equal. The latter is 0 where the reference does not move, 90 where only the prediction
+        does not.
     """
     first, second = torch.triu_indices(*(predicted.world_to_camera.shape[1],) * 2, offset=1)
     relative, still = [], []
@@ -48,11 +47,7 @@ def relative_pose_errors(predicted: Cameras, reference: Cameras) -> tuple[Tensor
 
 
 def camera_metrics(predicted: Cameras, reference: Cameras) -> dict[str, float]:
-    """Scores the cameras of one or more scenes over all pairs of views.
-
-    Args:
-        predicted: B scenes, V >= 2 views.
-        reference: the same views.
+    """Scores the cameras of one or more scenes over all pairs of V >= 2 views.
 
     Returns:
         ``rra_T`` and ``rta_T``: shares of pairs whose rotation, translation error is below T = 5, 15, 30 degrees;

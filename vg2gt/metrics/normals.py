@@ -21,7 +21,7 @@ def normal_metrics(predicted: Tensor, reference: Tensor, valid: Tensor) -> dict[
 
     Returns:
         ``mean`` and ``median`` angle in degrees, ``acc_10`` and ``acc_30`` (shares of pixels below that many degrees),
-        ``cosine``. Images without valid pixels are left out; NaN if that leaves none.
+        ``cosine``; NaN without valid pixels.
 
     Raises:
         ValueError: if the shapes do not fit.

@@ -19,22 +19,19 @@ def point_metrics(
     downsample: float | None = None,
     cap: float | None = None,
 ) -> dict[str, float]:
-    """Compares two point clouds in one frame and unit.
-
-    DTU's figures take millimetres, ``downsample=0.2`` and ``cap=20``.
+    """Compares two point clouds ``[N, 3]`` and ``[M, 3]`` in one frame and unit.
 
     Args:
         predicted: ``[N, 3]``.
         reference: ``[M, 3]``.
         threshold: distance below which a point counts as right.
-        downsample: keep one point in every cell of this edge, in both clouds; None keeps all.
-        cap: distances from here on are left out of the means (they still fail precision and recall); None: none.
+        downsample: keep one point in every cell of this edge, in both clouds; None keeps all. DTU: 0.2 mm.
+        cap: distances from here on are left out of the means; None: none. DTU: 20 mm.
 
     Returns:
-        ``accuracy`` (mean distance from a predicted point to the reference), ``completeness`` (from a reference point
-        to the prediction), ``chamfer`` (the mean of both), ``precision``, ``recall`` (shares of those distances below
-        the threshold) and ``f_score``, their harmonic mean. All are NaN if a cloud is empty; a mean is NaN if the cap
-        leaves it nothing.
+        ``accuracy`` (mean distance from a predicted point to the reference), ``completeness`` (the other way round),
+        ``chamfer`` (the mean of both), ``precision``, ``recall`` (shares of those distances below the threshold) and
+        ``f_score``, their harmonic mean; NaN if a cloud is empty or the cap leaves nothing.
 
     Raises:
         ValueError: if a cloud is not ``[N, 3]`` or a length is not positive.

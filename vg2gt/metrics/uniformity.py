@@ -18,7 +18,7 @@ def cv(points: Tensor, k: int = 8, max_queries: int | None = None, seed: int = 0
         seed: of that draw.
 
     Returns:
-        The coefficient; NaN with k points or fewer, if all points coincide, or if one is not finite.
+        NaN with k points or fewer, if all points coincide, or if one is not finite.
     """
     cloud = points.detach().cpu().double().numpy()
     if len(cloud) <= k or not np.isfinite(cloud).all():

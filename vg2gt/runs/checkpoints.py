@@ -73,14 +73,14 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
 
 
 def write_slim(checkpoint: str | Path, path: str | Path) -> Path:
-    """Writes what others need of a checkpoint as safetensors: the trained part, and in the header all that names it.
+    """Writes what others need of a checkpoint as safetensors: the trained part, and in the header what it was made of.
 
     Args:
-        checkpoint: of a run; optimiser and loop are left out, so training cannot go on from the result.
+        checkpoint: of a run; training cannot go on from the result.
         path: ends with ``.safetensors``; every command takes it as a checkpoint.
 
     Raises:
-        ValueError: if ``path`` has another ending, or the checkpoint is of a version that knew no configuration.
+        ValueError: if ``path`` has another ending, or the checkpoint holds no configuration.
     """
     content = read_checkpoint(checkpoint)
     if Path(path).suffix != SLIM or MADE_OF not in content:
@@ -116,11 +116,7 @@ def model_state(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def refuse_not_finite(state: Mapping[str, Tensor], path: str | Path) -> None:
-    """Refuses the weights of a training that has diverged.
-
-    Raises:
-        ValueError: naming the file and the first tensor with NaN or infinity.
-    """
+    """Refuses the weights of a training that has diverged, naming the file and the first bad tensor."""
     bad = next((name for name, value in state.items() if not bool(torch.isfinite(value).all())), None)
     if bad is not None:
         raise ValueError(f"checkpoint {path} holds weights that are not finite ({bad}): take an earlier one of its run")
@@ -135,11 +131,7 @@ def _verify_checksums(path: Path) -> None:
 
 
 def newest_valid(folder: str | Path) -> Path:
-    """Returns the newest readable checkpoint of a run, passing over damaged ones with a warning.
-
-    Raises:
-        FileNotFoundError: if the folder holds none.
-    """
+    """The newest readable checkpoint of a run; FileNotFoundError if there is none. Damaged ones are logged."""
     folder = Path(folder)
     candidates = by_age(folder)
     for path in candidates:
@@ -166,11 +158,7 @@ def _step_of(path: Path) -> int:
 
 
 def initialize_from(module: nn.Module, path: str | Path) -> None:
-    """Starts a new run from trained weights; layers that don't fit keep their fresh initialisation and are logged.
-
-    Args:
-        module: the Lightning module.
-        path: checkpoint whose ``state_dict`` is used; optimiser state and step are not.
+    """Starts a Lightning module's run from trained weights; layers that do not fit stay fresh and are logged.
 
     Raises:
         ValueError: if nothing in the checkpoint fits the module, or something in it is not finite.
@@ -192,11 +180,7 @@ def initialize_from(module: nn.Module, path: str | Path) -> None:
 
 
 def checkpoint_path(ckpt: str | Path | None) -> Path | None:
-    """The checkpoint file that ``ckpt`` means: itself, or the newest valid one of a run's folder.
-
-    Raises:
-        FileNotFoundError: if there is none.
-    """
+    """The file that ``ckpt`` means: itself, or the newest valid one of a run's folder; else FileNotFoundError."""
     if ckpt is None:
         return None
     path = Path(ckpt)

@@ -41,13 +41,7 @@ TOKENS = ("taps", "reference_view", "given_poses")
 
 @dataclass(frozen=True)
 class TrainedWeights:
-    """Where a model's weights come from.
-
-    Attributes:
-        path: the checkpoint; None for the untrained head.
-        step: its training step.
-        digest: sha256 of the file.
-    """
+    """Where a model's weights come from: the checkpoint (None: untrained), its step, sha256 of the file."""
 
     path: Path | None
     step: int
@@ -59,13 +53,7 @@ class TrainedWeights:
 
 @dataclass(frozen=True)
 class LoadedModel:
-    """A model with what belongs to it.
-
-    Attributes:
-        model: in eval mode, on its device.
-        renderer: the run's options; renders solids unless asked otherwise.
-        weights: where the trained part comes from.
-    """
+    """A model in eval mode on its device, its run's renderer (solids unless asked otherwise), its weights' origin."""
 
     model: Reconstructor
     renderer: Renderer
@@ -110,12 +98,7 @@ def load_model(
 
 
 def model_parts(ckpt: str | Path | None, overrides: Sequence[str]) -> tuple[Path | None, dict[str, DictConfig]]:
-    """The checkpoint and the configurations of backend, model and renderer that :func:`load_model` builds.
-
-    Raises:
-        FileNotFoundError: if there is no such checkpoint, or its run's ``config.yaml`` is missing.
-        ValueError: if a name or an option is unknown.
-    """
+    """The checkpoint and the configurations of backend, model and renderer that :func:`load_model` builds."""
     keys = [override.partition("=")[0].lstrip("+~") for override in overrides]
     for override, key in zip(overrides, keys, strict=True):
         if "=" not in override or key.partition(".")[0] not in PARTS:
@@ -133,12 +116,7 @@ def model_parts(ckpt: str | Path | None, overrides: Sequence[str]) -> tuple[Path
 
 
 def backend_class(ckpt: str | Path | None, overrides: Sequence[str]) -> type:
-    """Class of the backend that :func:`load_model` would build; ``object`` where the class cannot be found.
-
-    Raises:
-        FileNotFoundError: as :func:`model_parts`.
-        ValueError: as :func:`model_parts`.
-    """
+    """Class of the backend that :func:`load_model` would build; ``object`` where it cannot be imported."""
     try:
         return get_class(model_parts(ckpt, overrides)[1]["backend"]["_target_"])
     except ImportError:
@@ -168,7 +146,7 @@ def resolve_parts(config: DictConfig, checkpoint: Path | None) -> dict[str, Dict
     Raises:
         FileNotFoundError: if the run's ``config.yaml`` is needed and missing.
         ValueError: if it lacks a part, or is not what the checkpoint was trained with.
-        UntrustedError: if what is needed of it is not data only, or names what is not ours (:mod:`vg2gt.runs.trust`).
+        UntrustedError: if it is not data only, or names what is not ours (:mod:`vg2gt.runs.trust`).
     """
     given: dict[str, Any] = {part: config.get(part) for part in PARTS}
     parts = {part: value for part, value in given.items() if value is not None and "_target_" in value}
@@ -182,17 +160,9 @@ def resolve_parts(config: DictConfig, checkpoint: Path | None) -> dict[str, Dict
 
 
 def refuse_other_tokens(backend: Any, checkpoint: Mapping[str, Any], path: Path) -> None:
-    """Refuses a backend that makes other tokens of images than the one a checkpoint was trained with.
+    """Refuses a backend that makes other tokens of images than a checkpoint was trained with, naming the key.
 
-    Its weights' hash says nothing of :data:`TOKENS`. Old checkpoints, which keep no configuration, pass.
-
-    Args:
-        backend: the backend's configuration.
-        checkpoint: the checkpoint's content.
-        path: the checkpoint's file, for the message.
-
-    Raises:
-        ValueError: naming the first key that differs.
+    Its weights' hash says nothing of :data:`TOKENS`. Checkpoints that keep no configuration pass.
     """
     text = checkpoint.get(MADE_OF)
     if not isinstance(text, str):
@@ -261,11 +231,7 @@ def build_model(parts: dict[str, DictConfig], seed: int, device: torch.device) -
 
 
 def load_weights(model: Reconstructor, path: Path | None) -> TrainedWeights:
-    """Loads the trained part into a model; nothing without a path.
-
-    Raises:
-        ValueError: if it was trained on another backbone, does not fit the model, or is not finite.
-    """
+    """Loads the trained part into a model; ValueError if it does not fit, or is not finite. Nothing without a path."""
     if path is None:
         return TrainedWeights(None, 0, None)
     checkpoint = read_checkpoint(path)
@@ -275,11 +241,7 @@ def load_weights(model: Reconstructor, path: Path | None) -> TrainedWeights:
 
 
 def choose_device(asked: str) -> torch.device:
-    """``auto`` is the GPU where there is one.
-
-    Raises:
-        ValueError: if there is no such device.
-    """
+    """``auto`` is the GPU where there is one; ValueError if there is no such device."""
     there = torch.cuda.is_available()
     try:
         device = torch.device(("cuda" if there else "cpu") if asked == "auto" else asked)

@@ -13,14 +13,7 @@ NAME = ".lock"
 
 @contextmanager
 def only_process_in(folder: str | Path) -> Iterator[None]:
-    """Holds a folder for this process; the lock ends with the process, however it ends.
-
-    Args:
-        folder: made if needed, and then removed at the end if nothing was written to it.
-
-    Raises:
-        BlockingIOError: if another process holds the folder.
-    """
+    """Holds a folder for this process, or raises BlockingIOError; removes it at the end if it is new and empty."""
     folder = Path(folder)
     new = not folder.exists()
     folder.mkdir(parents=True, exist_ok=True)

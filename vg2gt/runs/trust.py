@@ -1,10 +1,8 @@
 """What is built from a configuration that may come from anywhere.
 
-Hydra calls whatever a configuration names. The project's own YAML and the command line are the user's word; the
-``config.yaml`` in a run's folder is not: a run may be downloaded together with its checkpoint. From such a file only
-the project's own networks, backends, renderers and datasets are built, and the classes that installed packages declare
-(:func:`vg2gt.config.plugin_targets`). A package of one's own is named in the environment:
-``VG2GT_TRUST=my_pkg,other_pkg``.
+Hydra calls whatever a configuration names. From the ``config.yaml`` of a run, which may be downloaded, only the
+project's own networks, backends, renderers and data sets are built, the classes that installed packages declare
+(:func:`vg2gt.config.plugin_targets`), and those of packages named in ``VG2GT_TRUST=my_pkg,other_pkg``.
 """
 
 from __future__ import annotations
@@ -37,12 +35,7 @@ class UntrustedError(ValueError):
 
 
 def read_run_config(path: str | Path) -> DictConfig:
-    """Reads a run's ``config.yaml``, which is plain: it is written with everything resolved.
-
-    Raises:
-        FileNotFoundError: if there is none.
-        ValueError: if it is not YAML of plain values, or no mapping.
-    """
+    """Reads a run's ``config.yaml``; ValueError if it is not YAML of plain values, or no mapping."""
     try:
         text = regular(path).read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
@@ -71,7 +64,7 @@ def check_targets(config: Any, source: str | Path) -> None:
         source: the file it was read from and the part's name, for the message.
 
     Raises:
-        UntrustedError: naming the first that is neither one of ours nor of a package in ``VG2GT_TRUST``.
+        UntrustedError: naming the first that is neither ours nor of a package in ``VG2GT_TRUST``.
     """
     trusted = [name.strip() for name in os.environ.get(ENVIRONMENT, "").split(",") if name.strip()]
     plain = OmegaConf.to_container(config, resolve=False) if OmegaConf.is_config(config) else config

@@ -1,14 +1,9 @@
 """The paper's ablations on our data: ``vg2gt ablate [seeds=N] [steps=N] [any override of train.yaml ...]``.
 
-As in the paper (appendix, Model Evaluation) no variant is trained from scratch. For every seed one full model is
-trained, from scratch or from ``init_from``; each variant starts from it and goes on for ``steps`` steps, and so does
-the full model itself, so that nobody is ahead by training longer. All continuations of a seed see the same batches and
-are evaluated on the same held-out views, so differences to the full model are taken seed by seed. Only the last layer
-is new where the number of splits changes; a control continues the full model with a new last layer as well.
-
-Finished runs are never repeated, interrupted ones go on; a run that diverges is named and the others are run all the
-same. With ``protocol=PRESET`` the figures are those of ``vg2gt evaluate evaluation=PRESET``, LPIPS among them. Writes
-``metrics.json`` and ``metrics.md`` into ``outputs/<name>``, after every run.
+As in the paper (appendix, Model Evaluation) no variant is trained from scratch: for every seed each variant, and the
+full model itself, continues one full model for ``steps`` steps on the same batches. Only the last layer is new where
+the number of splits changes; a control continues the full model with a new last layer as well. Finished runs are not
+repeated, interrupted ones go on. ``protocol=PRESET`` scores as ``vg2gt evaluate evaluation=PRESET``.
 """
 
 from __future__ import annotations
@@ -79,13 +74,7 @@ PATHS = {
 
 @dataclass(frozen=True)
 class Continuation:
-    """One run that starts from the full model.
-
-    Attributes:
-        name: of its folder and of its row.
-        overrides: what it changes.
-        new_last_layer: the Gaussian head's last layer is initialised again although it would fit.
-    """
+    """One run that starts from the full model: its name, overrides, and whether its last layer is initialised again."""
 
     name: str
     overrides: tuple[str, ...] = ()
@@ -116,10 +105,9 @@ class Ablation:
         lr: initial learning rate of every continuation.
         variants: options of the group ``ablation``.
         splits: numbers of Gaussians per voxel.
-        init_from: weights that the full models begin with; what they lack is initialised with every seed.
-        protocol: preset of the group ``evaluation`` on which every run is scored; None: on the training's own scenes.
+        init_from: weights that the full models begin with.
+        protocol: preset of the group ``evaluation`` on which runs are scored; None: on the training's own scenes.
         protocol_overrides: of ``evaluate.yaml``, for the protocol; one number of views.
-        results: metrics by run and seed.
         diverged: the continuations without a result.
 
     Raises:
@@ -152,11 +140,7 @@ class Ablation:
         self.results: dict[str, dict[int, Metrics]] = {run.name: {} for run in self.runs}
 
     def run(self) -> None:
-        """Runs whatever is not finished; the tables are rewritten after every run.
-
-        Raises:
-            FloatingPointError: if a full model diverges; a continuation that does is noted in ``diverged``.
-        """
+        """Runs whatever is not finished; FloatingPointError if a full model diverges, others are noted."""
         total, number = self.seeds * (1 + len(self.runs)), 0
         for seed in range(self.seeds):
             home = self.folder / f"seed-{seed}"
@@ -320,11 +304,7 @@ def _verdict(change: Estimate, metric: Metric) -> str:
 
 
 def common_overrides(overrides: Sequence[str]) -> list[str]:
-    """The command line's overrides that go to every training.
-
-    Raises:
-        ValueError: if one sets what the study itself decides.
-    """
+    """The overrides that go to every training; ValueError if one sets what the study itself decides."""
     kept = []
     for override in overrides:
         key = override.split("=")[0].lstrip("+~")
@@ -336,11 +316,7 @@ def common_overrides(overrides: Sequence[str]) -> list[str]:
 
 
 def run_study(config: DictConfig) -> None:
-    """Runs the study of ``ablate.yaml`` inside a command and prints its tables.
-
-    Raises:
-        SystemExit: if a continuation diverged.
-    """
+    """Runs the study of ``ablate.yaml`` and prints its tables; SystemExit if a continuation diverged."""
     study = _study(config)
     study.run()
     print(study.report())

@@ -41,12 +41,10 @@ def compose_run(overrides: Sequence[str], folder: Path) -> DictConfig:
 
 
 def run_once(overrides: Sequence[str], folder: Path, scored: bool = True) -> Metrics:
-    """Trains and evaluates one run unless ``folder`` already holds its result.
-
-    A run that was interrupted goes on from its newest checkpoint; a run of no steps is only evaluated.
+    """Trains and evaluates one run unless ``folder`` already holds its result; an interrupted one goes on.
 
     Args:
-        overrides: of ``train.yaml``.
+        overrides: of ``train.yaml``; a run of no steps is only evaluated.
         folder: the run's own.
         scored: whether a run of no steps is evaluated, for which its data is needed.
 
@@ -128,12 +126,7 @@ def weights_digest(state: Mapping[str, Tensor]) -> str:
 
 
 def final_checkpoint(folder: Path, steps: int) -> Path:
-    """The checkpoint that a finished run of ``steps`` steps ended with.
-
-    Raises:
-        FileNotFoundError: if no checkpoint of the run is valid.
-        ValueError: if the newest valid one is of an earlier step.
-    """
+    """The checkpoint that a finished run of ``steps`` steps ended with; ValueError if the newest is earlier."""
     path = newest_valid(folder / "checkpoints")
     reached = read_checkpoint(path)["global_step"]
     if reached != steps:
@@ -145,13 +138,7 @@ def final_checkpoint(folder: Path, steps: int) -> Path:
 
 
 def write_part(start: Path, path: Path, keep: Callable[[str], bool]) -> Path:
-    """Writes a checkpoint of some tensors for ``init_from``: a model that begins with it initialises all others.
-
-    Args:
-        start: checkpoint whose ``state_dict`` is taken; optimiser state and step are not.
-        path: the new checkpoint, replaced if it is there.
-        keep: says of a tensor's name, such as ``model.coarse.out.weight``, whether it is kept.
-    """
+    """Writes a checkpoint of the tensors whose names ``keep`` accepts, for ``init_from``; replaces ``path``."""
     state = read_checkpoint(start)["state_dict"]
     write_checkpoint({"state_dict": {name: tensor for name, tensor in state.items() if keep(name)}}, path)
     return path
@@ -159,12 +146,7 @@ def write_part(start: Path, path: Path, keep: Callable[[str], bool]) -> Path:
 
 @dataclass(frozen=True)
 class Estimate:
-    """A mean over seeds.
-
-    Attributes:
-        mean: the mean.
-        margin: half the width of its 95 % confidence interval (Student's t); NaN for a single value.
-    """
+    """A mean over seeds, and half the width of its 95 % confidence interval (Student's t); NaN for a single value."""
 
     mean: float
     margin: float
@@ -197,10 +179,7 @@ def paired_difference(runs: Mapping[int, Metrics], reference: Mapping[int, Metri
 
 
 def summarize(results: Mapping[str, Mapping[int, Metrics]], reference: str) -> dict[str, dict[str, dict[str, float]]]:
-    """Everything the tables show, as plain numbers: ``{run: {metric: {mean, ci95, difference, difference_ci95}}}``.
-
-    Runs without a result are left out, and so is what is not finite.
-    """
+    """What the tables show, as finite numbers: ``{run: {metric: {mean, ci95, difference, difference_ci95}}}``."""
     summary: dict[str, dict[str, dict[str, float]]] = {}
     for name, runs in results.items():
         for metric in sorted(set.intersection(*map(set, runs.values()))) if runs else ():

@@ -28,10 +28,9 @@ class AtomicCheckpointIO(TorchCheckpointIO):
 
 
 class NewestCheckpoints(ModelCheckpoint):
-    """Saves ``step-<number>.ckpt`` every few steps and keeps the newest in the folder, whoever saved them.
+    """Saves ``step-<number>.ckpt`` every few steps and keeps the newest in the folder, whichever run saved them.
 
-    Lightning's own choice by ``monitor="step"`` skips the last step of an epoch and never deletes the checkpoint that a
-    run was resumed from: a job that is requeued often would fill the disk.
+    Lightning's ``monitor="step"`` skips the last step of an epoch and keeps what a run was resumed from forever.
 
     Args:
         dirpath: the folder.
@@ -77,11 +76,7 @@ class NewestCheckpoints(ModelCheckpoint):
                 path.unlink(missing_ok=True)
 
     def on_validation_end(self, trainer: lightning.Trainer, *args: Any) -> None:
-        """Keeps the best state by the watched metric of an evaluation while training.
-
-        Raises:
-            ValueError: if there is no such metric, naming those there are.
-        """
+        """Keeps the best state by the watched metric; a ValueError names those there are if it is not one."""
         super().on_validation_end(trainer, *args)
         if self.watched is None or trainer.state.fn != TrainerFn.FITTING or getattr(trainer, "fast_dev_run", False):
             return

@@ -36,10 +36,7 @@ def all_gather_object(value: Value) -> list[Value]:
 
 
 def interleave(parts: Sequence[Mapping[Key, Value]]) -> dict[Key, Value]:
-    """Joins the parts of ranks that took turns: the first of every rank, then the second of every rank.
-
-    A key that several ranks hold keeps its first place and value.
-    """
+    """Joins mappings of ranks that took turns, first entries first; a repeated key keeps its first value."""
     joined: dict[Key, Value] = {}
     for row in zip_longest(*parts):
         for key, part in zip(row, parts, strict=True):
@@ -50,9 +47,7 @@ def interleave(parts: Sequence[Mapping[Key, Value]]) -> dict[Key, Value]:
 
 @contextmanager
 def ending_together(trainer: lightning.Trainer) -> Iterator[None]:
-    """Ends the ranks that this process started if it fails itself: they would wait for ever.
-
-    The other way round Lightning watches them, and whoever starts ranks on several machines watches all.
+    """Ends the ranks that this process started if it fails itself: they would wait forever.
 
     Raises:
         ChildProcessError: if this process failed because another one of the run has ended: a rank, or one that loads

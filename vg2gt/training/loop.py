@@ -138,11 +138,7 @@ def _callbacks(config: DictConfig) -> list[lightning.Callback]:
 
 
 def _accelerator(asked: str) -> str:
-    """``auto`` means CUDA or the CPU.
-
-    Raises:
-        ValueError: for Apple's MPS.
-    """
+    """``auto`` means CUDA or the CPU; Apple's MPS is refused."""
     if asked == "mps":
         raise ValueError("trainer.accelerator=mps: MPS has no float64, which the geometry needs; use trainer=cpu")
     return asked if asked != "auto" else "gpu" if torch.cuda.is_available() else "cpu"
@@ -166,10 +162,8 @@ def _check_trainer(config: DictConfig) -> None:
 def train(config: DictConfig) -> dict[str, Any]:
     """Runs the configuration from beginning to end.
 
-    A refused start changes nothing of a run that the folder holds, and a trial (``fast_dev_run``) writes nothing.
-
-    Writes into ``outputs/<name>``: the resolved configuration, checkpoints, ``metrics.json``, ``metrics.md`` and
-    ``preview.png``.
+    A refused start changes nothing in the folder, and a trial (``fast_dev_run``) writes nothing. Writes into
+    ``outputs/<name>``: the resolved configuration, checkpoints, ``metrics.json``, ``metrics.md``, ``preview.png``.
 
     Returns:
         The content of ``metrics.json``.
@@ -199,12 +193,7 @@ def train(config: DictConfig) -> dict[str, Any]:
 
 
 def check_run(run: Run) -> None:
-    """Checks data and model before anything is measured or written.
-
-    Raises:
-        DataError: if the data lacks what the model needs.
-        ValueError: if the model has no trained part.
-    """
+    """Raises DataError or ValueError if the data lacks what the model needs, or the model has no trained part."""
     if isinstance(run.datamodule, SceneDataModule):
         run.datamodule.setup("fit")
         for source in run.datamodule.sources:
@@ -296,11 +285,7 @@ def _where_curves_are(run: Run) -> str:
 
 
 def _check_loggers(config: DictConfig) -> None:
-    """Refuses a logger whose package is not there, before anything is built.
-
-    Raises:
-        ImportError: naming the extra that brings it.
-    """
+    """Refuses a logger whose package is missing, naming the extra that brings it."""
     for logger in config.logger.values():
         target = str(logger.get("_target_", "")) if logger else ""
         for ending, package in LOGGER_PACKAGES.items():

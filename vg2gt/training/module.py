@@ -44,23 +44,20 @@ class VG2GTModule(lightning.LightningModule):
         optimizer: makes the optimiser from parameter groups (Hydra partial); its ``lr`` is the initial rate.
         final_lr: learning rate at the end of the cosine schedule.
         warmup_steps: steps of linear warm-up.
-        coarse_lr_factor: the coarse module's learning rate over the optimiser's, from beginning to end; > 0, of no
-            effect on a model without that module.
+        coarse_lr_factor: the coarse module's learning rate over the optimiser's; > 0.
         backend_lr_factor: the backbone's learning rate over the optimiser's, where it is trained; > 0.
-        part: what is trained: ``all``, or the ``coarse`` module alone, on the geometry and enhancement losses; nothing
-            is rendered then and all other parameters stay as they are.
+        part: what is trained: ``all``, or the ``coarse`` module alone, on the geometry and enhancement losses, without
+            rendering.
         pose_noise: share of training scenes whose camera hints are slightly wrong; with ``part="coarse"`` only, as
             views that are rendered need cameras that fit.
         render_views: most views rendered in a training step, held-out views first; None renders all.
-        rasterized_depth: evaluations score the depth of 3DGS rasterisation as well (``abs_rel_rasterized``), whose
-            kernels take seconds to compile on a new machine.
+        rasterized_depth: evaluations score the depth of 3DGS rasterisation as well (``abs_rel_rasterized``).
         max_skipped: stop after this many steps in a row whose loss or gradient was not finite.
         seed: seeds every random draw of a step, together with the step's number, so that a resumed run draws what the
-            uninterrupted one would have drawn; the rank enters only where scenes draw apart (drop-path).
+            uninterrupted one would have drawn.
 
     Raises:
-        ValueError: if a factor of the learning rate is not a positive number, ``part`` is unknown or not in the model,
-            or ``pose_noise`` is no share, or not 0 where views are rendered.
+        ValueError: naming the option that is out of range or does not fit the model.
     """
 
     def __init__(
@@ -121,10 +118,7 @@ class VG2GTModule(lightning.LightningModule):
         torch.manual_seed(step_seed + self.global_rank)  # drop-path
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        """Reconstructs the context views, renders some views and returns the training loss.
-
-        Where something is not finite, the loss is NaN: the step is then skipped on all ranks.
-        """
+        """Returns the training loss; NaN where something is not finite: the step is then skipped on all ranks."""
         self._scenes, self._figures, self._cause = batch.scene, {}, None
         report = self._losses(batch)
         if report is not None:
@@ -170,10 +164,7 @@ class VG2GTModule(lightning.LightningModule):
             return self.loss(prediction, batch, rendered, views, cameras)
 
     def _draw_views(self, batch: Batch) -> Tensor:
-        """Indices of the views to render: held-out views first, but at least one context view, drawn at random.
-
-        Only context views have a decoded depth that the rendered depth can be compared with.
-        """
+        """Views to render: held-out ones first, but at least one context view, whose decoded depth counts."""
         total = batch.images.shape[1]
         context = torch.randperm(batch.num_context, generator=self.generator)
         held_out = batch.num_context + torch.randperm(total - batch.num_context, generator=self.generator)
@@ -270,10 +261,7 @@ class VG2GTModule(lightning.LightningModule):
             self._metrics[sample] = metrics
 
     def on_validation_epoch_end(self) -> None:
-        """Logs every number as ``eval/<name>``: means over the scenes that have it, each counted once on all ranks.
-
-        The ranks' scenes are joined in the order of one process, so their number does not change a bit of the means.
-        """
+        """Logs means over all ranks' scenes, joined in the order of one process, as ``eval/<name>``."""
         for metrics in interleave(all_gather_object(self._metrics)).values():
             for name, value in metrics.items():
                 if math.isfinite(value):  # a scene without ground-truth depth has no depth error
@@ -300,11 +288,7 @@ class VG2GTModule(lightning.LightningModule):
 
 
 def _leave_only_coarse(model: Reconstructor) -> None:
-    """Freezes all but the coarse module.
-
-    Raises:
-        ValueError: if the model has none.
-    """
+    """Freezes all but the coarse module."""
     if not isinstance(model, VG2GT) or model.coarse is None:
         raise ValueError(
             "training.part=coarse trains the coarse module, which this model does not have: choose model=tiny or "
@@ -315,11 +299,7 @@ def _leave_only_coarse(model: Reconstructor) -> None:
 
 
 def _check_part(part: str, pose_noise: float) -> None:
-    """Refuses what cannot be trained.
-
-    Raises:
-        ValueError: naming the option.
-    """
+    """Refuses what cannot be trained."""
     if part not in get_args(Part):
         raise ValueError(f"training.part={part} is unknown: choose one of {', '.join(get_args(Part))}")
     if not 0 <= pose_noise <= 1:

@@ -18,12 +18,11 @@ class MuonAdamW(torch.optim.AdamW):
     """Updates matrices by their orthogonalised momentum, all else as AdamW does.
 
     A matrix W ``[a, b]`` (of a convolution: outputs by all else) moves by ``-lr * 0.2 sqrt(max(a, b)) O``, where O is
-    the orthogonal factor of the Nesterov momentum of its gradient: every direction moves alike, however seldom the
-    gradients point there. Muon is due to Jordan et al. (2024); the factor, with which updates are as large as AdamW's,
-    and the decay of weights to Liu et al. (2025, Muon is Scalable for LLM Training).
+    the orthogonal factor of the Nesterov momentum of its gradient. Muon: Jordan et al. (2024); the factor, with which
+    updates are as large as AdamW's, and the weight decay: Liu et al. (2025, Muon is Scalable for LLM Training).
 
     Args:
-        params: parameters or groups of them, as of every optimiser; named where ``adamw`` is to find them.
+        params: parameters or groups of them; named where ``adamw`` is to find them.
         lr: learning rate of both; a group may have its own.
         momentum: of Muon, in [0, 1).
         adamw: the first parts of names, such as ``coarse``, of parameters that AdamW updates whatever their shape.
@@ -97,13 +96,9 @@ def _is_matrix(parameter: Tensor) -> bool:
 
 
 def orthogonalized(matrices: Sequence[Tensor], steps: int = 5) -> list[Tensor]:
-    """Nearly the orthogonal factors ``U V^T`` of matrices ``U S V^T``, by steps of a quintic iteration.
+    """Nearly the orthogonal factors ``U V^T`` of matrices ``[a, b]`` ``U S V^T``, by ``steps`` of a quintic iteration.
 
-    Matrices of the same shape are taken together. Singular values far below the largest are not lifted to 1 in full.
-
-    Args:
-        matrices: ``[a, b]`` each, float32 or float64; what is not finite stays so.
-        steps: of the iteration.
+    Singular values far below the largest are not lifted to 1 in full; what is not finite stays so.
     """
     places = defaultdict(list)
     for place, matrix in enumerate(matrices):

@@ -18,13 +18,9 @@ AMOUNTS = (0.2, 1.5)
 
 
 def with_pose_noise(batch: Batch, share: float) -> Hints:
-    """The hints of a batch, a share of whose scenes have cameras that are turned and moved a little, each view apart.
+    """The hints of a batch; a ``share`` (0 to 1) of its scenes has cameras turned and moved a little, each view apart.
 
     The same views of a scene are always wrong in the same way, so that a token cache finds them again.
-
-    Args:
-        batch: the views that the backbone is to see, with true cameras.
-        share: of the scenes whose cameras are wrong, 0 to 1.
     """
     hints = batch.hints
     if not share or hints.cameras is None:

@@ -16,14 +16,7 @@ from vg2gt.types import Batch
 
 @torch.no_grad()
 def write_preview(module: VG2GTModule, datamodule: LightningDataModule, path: str | Path, scenes: int = 3) -> Path:
-    """Writes one row per scene: input | rendered colour | rendered depth | rendered normals | ground truth.
-
-    Args:
-        module: the trained module.
-        datamodule: its evaluation scenes are shown, the middle held-out view of each.
-        path: the PNG file.
-        scenes: number of rows.
-    """
+    """Writes one row a scene: input | rendered colour | depth | normals | truth, of the middle held-out view."""
     module.eval()
     rows = []
     for batch in datamodule.val_dataloader():

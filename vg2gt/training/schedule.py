@@ -26,10 +26,7 @@ def cosine_with_warmup(steps: int, warmup_steps: int, final_factor: float) -> Ca
 def parameter_groups(module: nn.Module, factors: Mapping[str, float] | None = None) -> list[dict[str, Any]]:
     """Splits the trainable parameters, by name: matrices decay; biases, norms, gains and other vectors do not.
 
-    Args:
-        module: whose parameters they are.
-        factors: of the learning rate, by the names of children; groups of their own, behind the others, hold their
-            parameters and say the factor as ``lr_factor``. A child that the module does not have is passed over.
+    ``factors`` of the learning rate by children's names make groups of their own, which say theirs as ``lr_factor``.
     """
     apart = {name: factor for name, factor in (factors or {}).items() if factor != 1}
     parameters = [(name, parameter) for name, parameter in module.named_parameters() if parameter.requires_grad]

@@ -1,7 +1,6 @@
-"""Steps that are skipped because something in them is not finite.
+"""Steps that are skipped because something in them is not finite: no weight or moment changes, on any rank.
 
-A skipped step changes neither weights nor optimiser moments, on any rank. It still counts as a step: data, random draws
-and learning rate go on, so that a resumed run meets the same steps.
+A skipped step still counts: data, random draws and learning rate go on, so that a resumed run meets the same steps.
 """
 
 from __future__ import annotations
@@ -17,14 +16,7 @@ KEPT = 20  # faults in the report of a run
 
 @dataclass(frozen=True)
 class Fault:
-    """What a rank found wrong with a step.
-
-    Attributes:
-        scenes: scenes of the rank's batch.
-        cause: what is not finite.
-        step: number of the optimiser's step.
-        rank: the process.
-    """
+    """What a rank found wrong with a step: the scenes of its batch, what is not finite, the step's number, the rank."""
 
     scenes: tuple[str, ...]
     cause: str
@@ -42,18 +34,12 @@ def finite(*tensors: Tensor) -> bool:
 
 
 class SkippedSteps:
-    """Counts skipped steps.
-
-    Args:
-        limit: the run ends after this many skipped steps in a row.
+    """Counts skipped steps; the run ends after ``limit`` of them in a row.
 
     Attributes:
         total: steps skipped since the run began.
         in_a_row: steps skipped since the last good one.
         faults: the first faults of the run, at most :data:`KEPT`.
-
-    Raises:
-        ValueError: if the limit is below 1.
     """
 
     def __init__(self, limit: int) -> None:
@@ -65,11 +51,7 @@ class SkippedSteps:
         self.faults: list[Fault] = []
 
     def add(self, faults: list[Fault]) -> None:
-        """Counts a skipped step.
-
-        Raises:
-            FloatingPointError: if it is one too many in a row.
-        """
+        """Counts a skipped step; raises FloatingPointError if it is one too many in a row."""
         self.total += 1
         self.in_a_row += 1
         self.faults = (self.faults + faults)[:KEPT]

@@ -83,12 +83,7 @@ def load_start(module: VG2GTModule, config: DictConfig, checkpoint: Path | None)
 
 
 def prepare_folder(config: DictConfig, checkpoint: Path | None) -> None:
-    """Removes half-written files and the run that is overwritten, renames damaged checkpoints, writes ``config.yaml``.
-
-    Args:
-        config: of the training.
-        checkpoint: the one to continue from; newer ones of the folder are damaged.
-    """
+    """Removes half-written files and an overwritten run, renames damaged checkpoints, writes ``config.yaml``."""
     folder = Path(config.output_dir)
     for path in [*folder.glob(".*.tmp"), *(folder / "checkpoints").glob("*.tmp")]:
         path.unlink()
@@ -107,11 +102,7 @@ def prepare_folder(config: DictConfig, checkpoint: Path | None) -> None:
 
 
 def name_differences(config: DictConfig) -> None:
-    """Says in the log what a resumed run does otherwise than the interrupted one.
-
-    Raises:
-        ValueError: if it has another optimiser, to which the moments of the checkpoint mean nothing.
-    """
+    """Says in the log what a resumed run does otherwise than before; raises ValueError for another optimiser."""
     path = Path(config.output_dir) / "config.yaml"
     if not path.is_file():
         return

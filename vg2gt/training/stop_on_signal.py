@@ -18,10 +18,9 @@ SIGNALS = (signal.SIGTERM, signal.SIGINT, *((signal.SIGUSR1,) if hasattr(signal,
 
 
 class StopOnSignal(lightning.Callback):
-    """On SIGTERM, Ctrl-C or SIGUSR1: finishes the step, writes a checkpoint and ends normally.
+    """On SIGTERM, Ctrl-C or SIGUSR1 (SLURM's notice): finishes the step, saves a checkpoint and ends normally.
 
-    SLURM announces the end of a job's time by SIGUSR1. A second Ctrl-C ends at once. ``ckpt=last`` continues the run.
-    Signals outside the training, as in the evaluation before it, end the process as usual.
+    A second Ctrl-C ends at once. Signals outside the training end the process as usual.
 
     Args:
         folder: where the checkpoint is written, that of the checkpoint callback.

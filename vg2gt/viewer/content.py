@@ -31,9 +31,6 @@ class ViewerScene:
         cameras: the cameras to draw; the first is the initial view.
         pictures: ``[H, W, 3]`` uint8 or None, one per camera; empty: no pictures.
         title: of the page.
-
-    Raises:
-        ValueError: if there are no Gaussians, or pictures and cameras disagree in number.
     """
 
     gaussians: Gaussians
@@ -69,10 +66,10 @@ def camera_to_world(camera: NamedCamera) -> NDArray[np.float64]:
 
 
 def default_camera(gaussians: Gaussians) -> NamedCamera:
-    """A view of a scene nobody gave cameras for.
+    """A view of a scene without cameras.
 
-    The world's own frame, which is the first camera's in our scenes, if a tenth of the Gaussians are in view there;
-    otherwise from in front of the scene, far enough to see its middle nine tenths.
+    The world's own frame if a tenth of the Gaussians are in view there; otherwise from in front of the scene, far
+    enough to see its middle nine tenths.
     """
     width, height = _DEFAULT_SIZE
     focal = 0.8 * width
@@ -90,11 +87,7 @@ def default_camera(gaussians: Gaussians) -> NamedCamera:
 
 
 def load_pictures(cameras: Sequence[NamedCamera], folder: str | Path) -> list[NDArray[np.uint8] | None]:
-    """Small upright pictures of the cameras' images, ``folder / name`` each.
-
-    Returns:
-        One per camera, the longer side ``PICTURE_SIDE`` pixels at most; None where there is no such file inside the
-        folder (names that lead out of it count as absent).
+    """Small upright pictures of the cameras' images, ``folder / name`` each; None if not inside the folder.
 
     Raises:
         ValueError: if a file is there and cannot be read, naming it.

@@ -1,7 +1,6 @@
 """A scene as one HTML file: Gaussians, cameras, pictures and the viewer's own script, nothing fetched from anywhere.
 
-The page's security policy names its script by hash and allows no connection, so that neither a name in a scene nor
-anything else in the file can run code or reach a network.
+Its security policy names the script by hash and allows no connection: nothing in a scene can run code.
 """
 
 from __future__ import annotations
@@ -34,10 +33,6 @@ UNSIGNED, SIGNED = 2**16 - 1, 2**15 - 1  # of what is stored as 16 bits
 
 def write_viewer_html(path: str | Path, scene: ViewerScene) -> Path:
     """Writes the page, atomically; it opens from the disk in any browser with WebGL 2.
-
-    Args:
-        path: the file.
-        scene: what to show; not changed. Pictures are stored as JPEG, Gaussians as :func:`pack` says.
 
     Raises:
         ValueError: if the Gaussians are of more than one scene or have values that cannot be shown.

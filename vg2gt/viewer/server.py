@@ -33,11 +33,7 @@ class MissingViserError(ImportError):
 
 
 def require_viser() -> None:
-    """Checks early that there is viser.
-
-    Raises:
-        MissingViserError: if there is none, naming the remedy.
-    """
+    """Raises MissingViserError, naming the remedy, if there is no viser."""
     if importlib.util.find_spec("viser") is None:
         raise MissingViserError(
             "the live viewer needs viser: pip install 'vg2gt[view]', or write a page with --html, which needs nothing"
@@ -45,12 +41,11 @@ def require_viser() -> None:
 
 
 def start_server(scene: ViewerScene, host: str = LOOPBACK, port: int = PORT, share: bool = False) -> viser.ViserServer:
-    """Serves the scene until ``stop()`` of what it returns.
+    """Serves the scene until ``stop()`` of what it returns; colours are those of degree 0.
 
-    Colours are those of degree 0: viser's splats do not depend on the view. Its page has a button that publishes the
-    scene through an outside server; here it does nothing unless ``share`` is true, whoever asks. Unless it is shared,
-    only the page itself may ask: other pages in the same browser are refused, also under a name of their own that
-    leads to this machine.
+    Viser's page has a button that publishes the scene through an outside server; here it does nothing unless ``share``
+    is true. Unless it is shared, other pages in the same browser are refused, also under a name of their own that leads
+    to this machine.
 
     Args:
         scene: what to show; not changed.
@@ -85,9 +80,9 @@ def is_own_request(hosts: list[str], origins: list[str]) -> bool:
     """Whether a request comes from the served page, or from its user.
 
     Args:
-        hosts: the request's ``Host`` headers. An attacker's name may lead to this machine (DNS rebinding), so the host
-            must be an address, ``localhost`` or this machine's name.
-        origins: its ``Origin`` headers, which browsers send with a page's requests; the page's own host, or none.
+        hosts: the ``Host`` headers; an address, ``localhost`` or this machine's name, because an attacker's name may
+            lead to this machine (DNS rebinding).
+        origins: the ``Origin`` headers, which browsers send with a page's requests; the page's own host, or none.
     """
     if len(hosts) != 1 or len(origins) > 1:
         return False
