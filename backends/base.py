@@ -86,11 +86,7 @@ class Backend(nn.Module, ABC):
     def decode(self, tokens: Tokens) -> Geometry:
         """Runs the frozen heads in float32; equal tokens give bit-equal geometry.
 
-        Args:
-            tokens: from ``encode``, the patch tokens possibly changed.
-
-        Returns:
-            Depth and confidence (differentiable in ``tokens.patch`` where ``supports_gradient``) and raw cameras.
+        Depth and confidence are differentiable in ``tokens.patch`` where ``supports_gradient``; the cameras are raw.
         """
 
     def decode_cameras(self, tokens: Tokens) -> Cameras:
@@ -103,10 +99,7 @@ class Backend(nn.Module, ABC):
         return self.decode_cameras(self.encode(images, hints))
 
     def freeze(self) -> None:
-        """Takes every parameter out of training and puts every module into eval mode, for good.
-
-        One that is not ``frozen`` keeps its parameters in training, and the identity of the weights it begins with.
-        """
+        """Takes every parameter out of training and puts every module into eval mode, unless not ``frozen``."""
         self.requires_grad_(not self.frozen)
         self.eval()
         if not self.frozen:
@@ -153,13 +146,7 @@ class Backend(nn.Module, ABC):
             )
 
     def as_tokens(self, images: Tensor, patch: Sequence[Tensor], camera: Tensor) -> Tokens:
-        """Returns, in float32, the tokens that a backbone made of ``images``.
-
-        Args:
-            images: ``[B, V, 3, H, W]``.
-            patch: ``[B, V, P, D]`` of every tapped layer.
-            camera: ``[B, V, Dc]``.
-        """
+        """The float32 tokens of ``images``: ``patch [B, V, P, D]`` of every tapped layer, ``camera [B, V, Dc]``."""
         size = (images.shape[-2], images.shape[-1])
         grid = (size[0] // self.patch_size, size[1] // self.patch_size)
         return Tokens(tuple(tap.float() for tap in patch), camera.float(), grid, size)

@@ -1,7 +1,6 @@
 """The ONNX bundle: a folder with a frozen network cut into encoder and decoder, described by ``backend.json``.
 
-``encoder.onnx``, ``decoder.onnx`` and ``decoder.safetensors``. The decoder's weights come with the name and the numbers
-of its class, so that it can be rebuilt as a torch module.
+The decoder's weights come with the name and the numbers of its class, so that it can be rebuilt as a torch module.
 """
 
 from __future__ import annotations

@@ -31,9 +31,7 @@ class TokenCache:
     """Keeps tokens and initially decoded geometry per set of views, exactly; of held-out views' sets the cameras alone.
 
     The key is a hash of the images and hints themselves, the backend's identity (its weights), options and source, the
-    kind of device and torch's version, so whatever changes is computed again. It pays where view sets come again
-    (``data.view_sets``, evaluation before and after training) and the backbone costs more than reading a file.
-    Several processes may share the folder.
+    kind of device and torch's version. Several processes may share the folder.
 
     Args:
         folder: of the files, made when needed (``~`` is the home folder).

@@ -1,7 +1,4 @@
-"""Dense prediction head: four token maps fused coarse to fine into one map at image size.
-
-Module names follow the published weight files, hence ``scratch`` and ``resConfUnit1``.
-"""
+"""Dense prediction head: four token maps fused coarse to fine into one map at image size."""
 
 from __future__ import annotations
 
@@ -19,12 +16,7 @@ HIDDEN = 32
 
 
 class ResidualUnit(nn.Module):
-    """Two 3x3 convolutions with ReLU before each, added to the input.
-
-    Args:
-        channels: in and out.
-        rectified_skip: whether the skip carries ``relu(x)`` (VGGT, whose in-place ReLU overwrites x) or x (DA3).
-    """
+    """Two 3x3 convolutions with ReLU before each, added to x, or to ``relu(x)`` with ``rectified_skip`` (VGGT)."""
 
     def __init__(self, channels: int, rectified_skip: bool) -> None:
         super().__init__()

@@ -170,10 +170,7 @@ def export_graph(
 
 
 def _attention(query: Any, key: Any, value: Any) -> Any:
-    """Attention ``[B, heads, N, head_dim]`` as onnxruntime's own operator, which never holds the ``N x N`` weights.
-
-    The standard's ``Attention`` holds them, and the products and softmax that torch exports by itself as well.
-    """
+    """Attention ``[B, heads, N, head_dim]`` as onnxruntime's own operator, which never holds the ``N x N`` weights."""
     from onnx.defs import OpSchema
     from onnxscript import opset18
     from onnxscript.values import Op, Opset

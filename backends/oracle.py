@@ -1,9 +1,8 @@
 """A simulated foundation model: the data's depth and cameras, made worse; no weights to download.
 
-What it keeps of a real one: depth errs smoothly in the image plane, differently in every view, with a confidence that
-knows about it; the tokens carry what the network believes (image content, predicted depth and place of the patch),
-never the truth; a change of the tokens changes the decoded depth smoothly through fixed weights. So the errors can be
-found where views disagree in space, and token enhancement can be trained and measured.
+As in a real one, depth errs smoothly in the image plane, differently in every view, with a confidence that knows about
+it; the tokens carry what the network believes, never the truth; and a change of the tokens changes the decoded depth
+smoothly. So token enhancement can be trained and measured.
 """
 
 from __future__ import annotations
@@ -231,8 +230,8 @@ def _bleed(depth: Tensor) -> Tensor:
 def _describe_patches(depth: Tensor, confidence: Tensor, cameras: Cameras, grid: tuple[int, int]) -> Tensor:
     """What the simulated network believes of every patch, ``[B, V, P, 32]``, channels of order one.
 
-    Log-depth of 2x2 cells and log-confidence, the patch's place and ray direction, the camera's place; lengths in
-    median depths; the place also as sines and cosines, so that small distances can be told apart.
+    Log-depth of 2x2 cells and log-confidence, the patch's place (also as sines and cosines) and ray direction, the
+    camera's place; lengths in median depths.
     """
     unit = _median_depth(depth)[:, None, None, None]
     cells = (grid[0] * CELLS, grid[1] * CELLS)

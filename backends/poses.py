@@ -21,7 +21,7 @@ def encode_pose(transform: Tensor, intrinsics: Tensor, size: tuple[int, int]) ->
 def decode_pose(encoding: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """Decodes ``[..., 9]`` into a rigid transform ``[..., 4, 4]`` and intrinsics ``[..., 3, 3]`` in pixels.
 
-    The principal point is (W/2, H/2) in integer pixel coordinates, as the published networks have it.
+    The principal point is (W/2, H/2) in integer pixel coordinates, as published.
     """
     rotation = quat_to_matrix(encoding[..., [6, 3, 4, 5]])
     top = torch.cat((rotation, encoding[..., :3, None]), -1)

@@ -71,16 +71,10 @@ def _clamped_weights(centers: Tensor, offset: Tensor, side: int) -> Tensor:
 
 
 def uv_embedding(channels: int, size: tuple[int, int], image_size: tuple[int, int], like: Tensor) -> Tensor:
-    """Sine-cosine embedding ``[channels, h, w]`` of normalised image coordinates.
+    """Sine-cosine embedding ``[channels, h, w]`` of normalised image coordinates, half of the channels for each axis.
 
-    Coordinates are those of pixel centres in an image whose half diagonal is 1; half of the channels encode x, half y,
-    at wavelengths growing geometrically to 100 times the shortest.
-
-    Args:
-        channels: a multiple of 4.
-        size: ``(h, w)`` of the feature map.
-        image_size: ``(height, width)`` of the image; only its proportions matter.
-        like: gives dtype and device.
+    Coordinates are those of pixel centres in an image of ``image_size`` whose half diagonal is 1; wavelengths grow
+    geometrically to 100 times the shortest. ``channels`` is a multiple of 4.
     """
     extent = size_tensor(image_size, like).double()
     y_extent, x_extent = (extent / extent.norm()).unbind()

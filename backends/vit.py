@@ -1,7 +1,4 @@
-"""Transformer parts that the frozen networks share: attention, feed-forward layers, blocks.
-
-Module names follow the published weight files.
-"""
+"""Transformer parts that the frozen networks share: attention, feed-forward layers, blocks."""
 
 from __future__ import annotations
 
@@ -82,13 +79,8 @@ class LayerScale(nn.Module):
 class ViTBlock(nn.Module):
     """Pre-norm transformer block: attention, then feed-forward, each scaled and added.
 
-    Args:
-        dim: channels.
-        num_heads: attention heads.
-        qk_norm: whether queries and keys are normalised.
-        ffn: feed-forward layer, four times as wide as ``dim`` (before the SwiGLU's two thirds).
-        layer_scale: initial layer scale.
-        eps: of the two block norms (norms of queries and keys always have 1e-5).
+    ``ffn`` is four times as wide as ``dim`` (before the SwiGLU's two thirds), ``layer_scale`` the initial one, and
+    ``eps`` that of the two block norms (norms of queries and keys always have 1e-5).
     """
 
     def __init__(

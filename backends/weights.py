@@ -72,7 +72,7 @@ class Weights:
 
 
 def find_weights(name: str, repo: str | None, revision: str | None, path: str | None) -> Path:
-    """Returns the weight file: ``path`` if given, else from the hub's cache or the hub.
+    """The weight file: ``path`` if given, else from the hub's cache or the hub.
 
     Raises:
         FileNotFoundError: naming the file, the repository and the way out.

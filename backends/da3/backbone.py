@@ -1,6 +1,6 @@
 """Depth Anything 3's backbone: one ViT whose later blocks alternate between single views and all views.
 
-Module names follow the published weight files (``model.backbone.pretrained`` there).
+Names of modules follow the published weight files, here and in all networks of this folder.
 """
 
 from __future__ import annotations
@@ -22,15 +22,8 @@ MIN_VIEWS_TO_CHOOSE = 3
 class Backbone(nn.Module):
     """ViT with a class token that becomes the camera token where the views begin to see each other.
 
-    Args:
-        dim: channels C.
-        depth: blocks.
-        num_heads: attention heads.
-        ffn: feed-forward layer.
-        multiview_from: first block with rotary positions and normalised queries and keys, and from which odd blocks
-            attend over all views; None for a single-view network (metric).
-        image_size: native image edge, which fixes the position embedding.
-        patch_size: in pixels.
+    From block ``multiview_from`` on (None: a single-view network) positions are rotary, queries and keys normalised,
+    and odd blocks attend over all views; ``image_size`` is the native edge, which fixes the position embedding.
     """
 
     def __init__(
@@ -75,8 +68,7 @@ class Backbone(nn.Module):
 
         Returns:
             Patch tokens of every tap and the last tap's camera token ``[B, V, D]``. Multi-view networks: D = 2C, the
-            last single-view output next to the current one, whose patch tokens alone are normalised. Single-view
-            networks: D = C.
+            last single-view output next to the current one, whose patch tokens alone are normalised; else D = C.
         """
         batch, views = images.shape[:2]
         grid = (images.shape[-2] // self.patch_size, images.shape[-1] // self.patch_size)
@@ -143,8 +135,8 @@ class PretrainedBackbone(nn.Module):
 def select_reference(tokens: Tensor, strategy: ReferenceView) -> Tensor:
     """Chooses one view per scene from class tokens ``[B, V, C]``; returns int64 ``[B]``, 0 for fewer than three.
 
-    ``saddle_balanced`` takes the view nearest to the middle of three ranges, each scaled to [0, 1] over the views: mean
-    cosine similarity to the others, token norm, and variance of the normalised token.
+    ``saddle_balanced`` takes the view nearest to the middle of mean cosine similarity to the others, token norm, and
+    variance of the normalised token, each scaled to [0, 1] over the views.
     """
     batch, views = tokens.shape[:2]
     if strategy == "first":

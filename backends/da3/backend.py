@@ -31,14 +31,7 @@ NESTED_PARTS = ("model.da3.", "model.da3_metric.")  # a nested file holds two ne
 
 
 class DA3Decoder(nn.Module):
-    """What follows the tokens: depth head and camera decoder; names and shapes as published.
-
-    Args:
-        token_dim: channels of the tokens.
-        features: DPT width.
-        out_channels: DPT channels of the four taps.
-        patch_size: in pixels.
-    """
+    """What follows the tokens: depth head and camera decoder; names and shapes as published."""
 
     def __init__(self, token_dim: int, features: int, out_channels: Sequence[int], patch_size: int) -> None:
         super().__init__()
@@ -66,14 +59,7 @@ class DA3Decoder(nn.Module):
 
 
 class DA3Network(DA3Decoder):
-    """The decoder with its backbone and, if wanted, camera encoder; names and shapes as published.
-
-    Args:
-        backbone: images to tokens.
-        cam_enc: known cameras to camera tokens.
-        features: DPT width.
-        out_channels: DPT channels of the four taps.
-    """
+    """The decoder with its backbone (images to tokens) and, if wanted, camera encoder; names as published."""
 
     def __init__(
         self, backbone: Backbone, cam_enc: CameraEncoder | None, features: int, out_channels: Sequence[int]
@@ -162,11 +148,7 @@ class DA3Backend(NetworkBackend):
         self._build(make, weights, taps, head_chunk, compile, freeze)
 
     def gaussian_head(self) -> GaussianHead:
-        """DA3's own Gaussian head, frozen, from the same file.
-
-        Raises:
-            ValueError: if the file holds none: only GIANT's does.
-        """
+        """DA3's own Gaussian head, frozen, from the same file; ValueError if that holds none: only GIANT's does."""
         weights = replace(self.weights, prefix=f"{self.weights.prefix}gs_head.", ignorable=("",))
         try:
             return weights.build(lambda: GaussianHead(**self.network.arguments)).requires_grad_(False)

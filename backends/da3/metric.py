@@ -113,8 +113,7 @@ def metres(cameras: Cameras) -> Tensor:
 def fill_sky(depth: Tensor, sky: Tensor) -> Tensor:
     """Gives sky pixels the far end of their scene: the 0.99 quantile of the other pixels' depth ``[B, V, H, W]``.
 
-    The published code takes the quantile over the whole batch, so that a scene's sky would depend on its neighbours;
-    of one scene at a time both are the same.
+    The published code takes the quantile over the whole batch; of one scene at a time both are the same.
     """
     is_sky = sky >= SKY_THRESHOLD
     filled = []
@@ -134,9 +133,8 @@ def quantile(values: Tensor, q: float) -> Tensor:
 class DA3NestedBackend(Backend):
     """DA3's relative network with a metric scale: one factor per scene, fitted to the metric network's depth.
 
-    Geometry stays the relative network's; ``Geometry.scale`` turns it into metres. As in the published code sky, which
-    the metric network knows, gets the far end of its scene, at most 200 m away, and confidence 1. Both are fixed when
-    images are encoded: changed tokens move neither, and no gradient comes from the sky.
+    ``Geometry.scale`` turns the relative network's geometry into metres. As in the published code sky gets the far end
+    of its scene, at most 200 m away, and confidence 1, both fixed when images are encoded.
 
     Args:
         relative: predicts geometry.
@@ -188,12 +186,7 @@ class DA3NestedBackend(Backend):
 def far_ends(depth: Tensor, sky: Tensor, scale: Tensor) -> Tensor:
     """Where every scene's sky goes, ``[B]`` in the unit of ``depth``: its other pixels' 0.99 quantile, or 200 m.
 
-    A scene with no more than ten pixels that are not sky has no far end: infinity.
-
-    Args:
-        depth: ``[B, V, H, W]``.
-        sky: ``[B, V, H, W]`` score of the metric network.
-        scale: ``[B]`` metres per unit.
+    With no more than ten pixels that are not ``sky [B, V, H, W]`` it is infinity; ``scale [B]`` is metres per unit.
     """
     ends = []
     for scene, score, metres_per_unit in zip(depth, sky, scale, strict=True):
@@ -207,9 +200,8 @@ def far_ends(depth: Tensor, sky: Tensor, scale: Tensor) -> Tensor:
 def fit_scale(metric_depth: Tensor, sky: Tensor, geometry: Geometry) -> Tensor:
     """Least-squares factor ``[B]`` from relative to metric depth over confident pixels that are not sky.
 
-    As in the published code pixels next to the camera do not count (depth up to 1e-3, metric depth up to 1e-2).
-    Confident means at least the median confidence of the scene's pixels that are not sky. A scene with no more than ten
-    such pixels gets 1.
+    As published, pixels next to the camera do not count (depth up to 1e-3, metric depth up to 1e-2), and confident
+    means at least the scene's median. A scene with no more than ten such pixels gets 1.
     """
     factors = []
     ground = sky < SKY_THRESHOLD

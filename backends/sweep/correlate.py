@@ -1,8 +1,7 @@
 """Similarity of views with their sources at hypothetical depths: a plain torch reference and compiled CPU kernels.
 
-The reference warps every channel of a source onto every plane and multiplies afterwards; the kernels project, sample
-and multiply point by point, so nothing of the size of planes x channels is ever in memory. Depths and cameras get no
-gradient: planes are hypotheses.
+The kernels project, sample and multiply point by point, so nothing of the size of planes x channels is ever in memory.
+Depths and cameras get no gradient: planes are hypotheses.
 """
 
 from __future__ import annotations
@@ -23,14 +22,7 @@ BEHIND = 1e-3  # depth in a source, per depth here, below which a point does not
 
 
 class SourceWarp:
-    """Where points of every view fall in its sources.
-
-    Args:
-        world_to_camera: ``[V, 4, 4]``.
-        intrinsics: ``[V, 3, 3]`` of the feature maps.
-        sources: ``[V, n]`` indices.
-        size: ``(h, w)`` of the feature maps.
-    """
+    """Where points of every view fall in its ``sources [V, n]``; intrinsics and size are the feature maps'."""
 
     def __init__(self, world_to_camera: Tensor, intrinsics: Tensor, sources: Tensor, size: tuple[int, int]) -> None:
         poses = relative_poses(world_to_camera, sources)

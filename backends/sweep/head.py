@@ -19,8 +19,8 @@ _UNSURE = -2.5  # log of the scale of relative errors before training
 class DepthHead(nn.Module):
     """Reads log-depth as that of the sweep plus a correction.
 
-    The first four channels of the last tap are the correction of 2x2 cells of the patch, in units of ``RESPONSE``: they
-    pass through linearly, so a change of the tokens changes depth smoothly. Convolutions add what both taps say.
+    The first four channels of the last tap are the correction of 2x2 cells of the patch, in units of ``RESPONSE``:
+    linear, so that a change of the tokens changes depth smoothly. Convolutions add what both taps say.
     """
 
     def __init__(self) -> None:
@@ -38,7 +38,7 @@ class DepthHead(nn.Module):
     def forward(
         self, taps: tuple[Tensor, ...], grid: tuple[int, int], context: Tensor, context_fine: Tensor, swept: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Decodes.
+        """Decodes log-depth and log-scale of its error, each ``[V, 4 h, 4 w]``.
 
         Args:
             taps: ``[V, P, DIM]`` each.
@@ -46,9 +46,6 @@ class DepthHead(nn.Module):
             context: ``[V, CONTEXT_COARSE, h, w]``, a quarter of the image.
             context_fine: ``[V, CONTEXT_FINE, 2 h, 2 w]``.
             swept: ``[V, 2, 2 h, 2 w]`` log-depth of the sweep and its probability.
-
-        Returns:
-            Log-depth and log-scale of its error, each ``[V, 4 h, 4 w]``.
         """
         said = torch.cat([norm(tap) for norm, tap in zip(self.norms, taps, strict=True)], -1)
         said = F.pixel_shuffle(self.spread(said).mT.unflatten(-1, grid), CELLS)  # [V, C, h, w]

@@ -28,13 +28,7 @@ class PlainBlock(nn.Module):
 
 
 class RefineNet(nn.Module):
-    """U-Net on 1/4, 1/8 and 1/16 of the image.
-
-    Args:
-        inputs: channels of what is known of every cell.
-        outputs: channels of what is said; zero before training.
-        channels: at the three resolutions.
-    """
+    """U-Net on 1/4, 1/8 and 1/16 of the image, of ``channels`` there; its outputs are zero before training."""
 
     def __init__(self, inputs: int, outputs: int, channels: tuple[int, int, int] = (64, 96, 128)) -> None:
         super().__init__()

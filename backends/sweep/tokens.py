@@ -20,13 +20,7 @@ POSITION_CHANNELS = 3 + 3 + 6 * len(_WAVENUMBERS) + 4 * _IMAGE_WAVES
 
 
 class TokenBlock(nn.Module):
-    """Pre-norm transformer block whose keys are 2x2-pooled tokens, of the own view or of all views.
-
-    Args:
-        dim: channels.
-        heads: of the attention.
-        across: whether it attends to all views.
-    """
+    """Pre-norm transformer block whose keys are 2x2-pooled tokens, of the own view or of all views (``across``)."""
 
     def __init__(self, dim: int, heads: int, across: bool) -> None:
         super().__init__()
@@ -51,12 +45,7 @@ class TokenBlock(nn.Module):
 
 
 class TokenNet(nn.Module):
-    """Embeds patches and runs the blocks, views and all views in turns.
-
-    Args:
-        inputs: channels of what is known of a patch.
-        blocks: number of transformer blocks.
-    """
+    """Embeds patches, ``inputs`` numbers each, and runs the blocks, views and all views in turns."""
 
     def __init__(self, inputs: int, blocks: int = 4) -> None:
         super().__init__()

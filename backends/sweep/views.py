@@ -39,9 +39,8 @@ def choose_sources(
 ) -> Tensor:
     """Indices ``[V, n]`` of the views that every view is compared with, the best first.
 
-    A source is good if it sees what the view sees, at depths between near and far, from a little aside: the score is
-    the overlap times a reward for parallax that falls again for wide baselines. What the sources chosen before see
-    already counts less, so that together they cover the view.
+    A source's score is the overlap of what it sees between near and far, times a reward for parallax that falls again
+    for wide baselines; what sources chosen before see already counts less.
 
     Args:
         world_to_camera: ``[V, 4, 4]``.
@@ -94,15 +93,9 @@ def wide_range(world_to_camera: Tensor) -> Tensor:
 
 
 def agreed_range(depth: Tensor, agreement: Tensor, fallback: Tensor, share: float = 0.5) -> Tensor:
-    """Near and far ``[2]`` around the depths on which views agree.
+    """Near and far ``[2]`` around depths whose :func:`agreement` is ``share`` or more; ``fallback`` if hardly any.
 
     Agreement, not confidence, chooses the pixels: a network is sure of itself on near, well textured things.
-
-    Args:
-        depth: any shape.
-        agreement: of the same shape, in [0, 1]; see ``volume.agreement``.
-        fallback: the range to keep where almost nothing agrees.
-        share: agreement from which on a pixel counts.
     """
     agreed = depth[agreement > share].sort().values
     if len(agreed) < 0.01 * depth.numel():

@@ -38,15 +38,12 @@ class PlaneSweep(nn.Module):
         self.weigh = nn.Sequential(nn.Conv2d(GROUPS, 16, 1), nn.ReLU(inplace=True), nn.Conv2d(16, 1, 1))
 
     def forward(self, features: Tensor, inverse: Tensor, warp: SourceWarp) -> Tensor:
-        """Compares views.
+        """Compares views: mean similarity per group and the sources' weight, ``[V D, GROUPS + 1, h, w]``.
 
         Args:
             features: ``[N, C, h, w]`` of unit length per group, of all views.
             inverse: ``[V, D, h w]`` inverse depths of the planes, or ``[V, D, 1]``.
             warp: of all views or some.
-
-        Returns:
-            ``[V D, GROUPS + 1, h, w]``, channels-last: mean similarity per group and the sources' weight.
         """
         size = (features.shape[-2], features.shape[-1])
         views, sources = warp.sources.shape
@@ -86,11 +83,7 @@ class PlaneBlock(nn.Module):
 
 
 class VolumeNet(nn.Module):
-    """Light 2.5D regularisation of a volume: similarities to one logit per plane.
-
-    Args:
-        channels: at full and at half resolution.
-    """
+    """Light 2.5D regularisation of a volume, with ``channels`` at full and half resolution: one logit per plane."""
 
     def __init__(self, channels: tuple[int, int] = (16, 32)) -> None:
         super().__init__()
@@ -117,14 +110,9 @@ class VolumeNet(nn.Module):
 
 
 def expectation(logits: Tensor, positions: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean of the planes' positions about the most likely plane, and the probability there.
+    """Mean of the planes' positions about the most likely plane, and the probability there, each ``[V, 1, h, w]``.
 
-    Args:
-        logits: ``[V, D, h, w]``.
-        positions: ``[V, D, h, w]``, or with 1 in place of V, h and w.
-
-    Returns:
-        Position and probability, each ``[V, 1, h, w]``.
+    Logits are ``[V, D, h, w]``, positions also with 1 in place of V, h and w.
     """
     probability = logits.softmax(1)
     best = probability.argmax(1, keepdim=True)
@@ -137,15 +125,9 @@ def expectation(logits: Tensor, positions: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def agreement(inverse: Tensor, warp: SourceWarp) -> Tensor:
-    """How well the sources' own depths agree with a view's, ``[V, 3, h, w]``.
+    """Mean and largest agreement in [0, 1] of the sources' own depths, and the signed difference: ``[V, 3, h, w]``.
 
-    Args:
-        inverse: ``[V, 1, h, w]`` inverse depth.
-        warp: of these views.
-
-    Returns:
-        Mean and largest agreement over the sources, in [0, 1], and the signed difference (positive: the source sees
-        something nearer).
+    Of inverse depth ``[V, 1, h, w]``; the difference is positive where the source sees something nearer.
     """
     views, _, height, width = inverse.shape
     agreements, differences = [], []

@@ -13,13 +13,7 @@ POSE_DIM = 9
 
 
 class CameraHead(nn.Module):
-    """Camera tokens to pose encodings.
-
-    Args:
-        dim: channels of the camera token.
-        depth: blocks of the trunk.
-        num_heads: attention heads.
-    """
+    """Camera tokens of ``dim`` channels to pose encodings, by a trunk of ``depth`` blocks."""
 
     def __init__(self, dim: int, depth: int, num_heads: int) -> None:
         super().__init__()

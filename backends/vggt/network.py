@@ -1,6 +1,6 @@
 """VGGT: a DINOv2 encoder per view, then alternating attention within and across views.
 
-Module names follow the published weight file (``facebook/VGGT-1B``).
+Names of modules follow the published weight file (``facebook/VGGT-1B``).
 """
 
 from __future__ import annotations
@@ -62,11 +62,7 @@ class Aggregator(nn.Module):
         self.global_blocks = nn.ModuleList(_alternating_block(dim, num_heads) for _ in range(depth))
 
     def forward(self, images: Tensor, taps: Sequence[int]) -> tuple[list[Tensor], Tensor]:
-        """Aggregates views.
-
-        Args:
-            images: ``[B, V, 3, H, W]`` in [0, 1].
-            taps: indices of block pairs.
+        """Aggregates views ``[B, V, 3, H, W]`` in [0, 1]; ``taps`` are indices of block pairs.
 
         Returns:
             Patch tokens ``[B, V, P, 2C]`` of every tap and the last camera token ``[B, V, 2C]``.
@@ -102,16 +98,7 @@ def _alternating_block(dim: int, num_heads: int) -> ViTBlock:
 
 
 class VGGTDecoder(nn.Module):
-    """What follows the tokens: camera and depth head; names and shapes as published.
-
-    Args:
-        token_dim: channels of the tokens.
-        features: DPT width.
-        out_channels: DPT channels of the four taps.
-        patch_size: in pixels.
-        camera_depth: blocks of the camera head.
-        camera_heads: attention heads of the camera head.
-    """
+    """What follows the tokens: camera and depth head; names and shapes as published."""
 
     def __init__(
         self,
@@ -149,15 +136,7 @@ class VGGTDecoder(nn.Module):
 
 
 class VGGTNetwork(VGGTDecoder):
-    """The decoder with its aggregator; names and shapes as published.
-
-    Args:
-        aggregator: images to tokens.
-        features: DPT width.
-        out_channels: DPT channels of the four taps.
-        camera_depth: blocks of the camera head.
-        camera_heads: attention heads of the camera head.
-    """
+    """The decoder with its aggregator (images to tokens); names and shapes as published."""
 
     def __init__(
         self, aggregator: Aggregator, features: int, out_channels: Sequence[int], camera_depth: int, camera_heads: int

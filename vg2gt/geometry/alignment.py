@@ -17,15 +17,9 @@ MIN_DEPTH = 0.01
 
 
 def weighted_median(values: Tensor, weights: Tensor) -> Tensor:
-    """Lower weighted median along the last axis.
+    """Lower weighted median ``[...]`` along the last axis of ``[..., N]``; NaN where all weights are 0.
 
-    Args:
-        values: ``[..., N]``; entries of weight 0 may be anything.
-        weights: ``[..., N]``, not negative.
-
-    Returns:
-        ``[...]``: the smallest value up to which half of the weight lies, a minimiser of ``sum w |m - x|``; NaN where
-        all weights are 0.
+    The smallest value up to which half of the weight lies, a minimiser of ``sum w |m - x|``.
     """
     ordered, order = torch.where(weights > 0, values, torch.inf).sort(-1)
     cumulative = torch.gather(weights, -1, order).double().cumsum(-1)
@@ -37,8 +31,8 @@ def weighted_median(values: Tensor, weights: Tensor) -> Tensor:
 def fit_depth_scale(predicted: Tensor, reference: Tensor, valid: Tensor) -> Tensor:
     """The scale ``argmin_s sum w |s d_hat - d|``, ``w = 1 / max(d, 0.01)``, of each scene (paper, appendix, wmed).
 
-    Its exact solution is the median of ``d / d_hat`` under the weights ``w d_hat``. Every view is first subsampled to
-    at most 64 x 64 pixels, taking in each cell the valid pixel nearest to its centre.
+    Its exact solution is the median of ``d / d_hat`` under the weights ``w d_hat``, of at most 64 x 64 pixels a view:
+    in each cell the valid one nearest to its centre.
 
     Args:
         predicted: ``[B, V, H, W]`` depth in its own unit.
@@ -84,13 +78,7 @@ def _cell_pixels(height: int, width: int, device: torch.device) -> Tensor:
 
 @dataclass(frozen=True)
 class Similarity(TensorRecord):
-    """Similarities ``x -> scale * rotation @ x + translation`` of B scenes.
-
-    Attributes:
-        scale: ``[B]`` > 0.
-        rotation: ``[B, 3, 3]``.
-        translation: ``[B, 3]``.
-    """
+    """Similarities ``x -> scale * rotation @ x + translation`` of B scenes, ``[B]``, ``[B, 3, 3]`` and ``[B, 3]``."""
 
     scale: Tensor
     rotation: Tensor
@@ -115,15 +103,14 @@ def align_cameras(
 ) -> Similarity:
     """The similarity that brings predicted cameras onto reference cameras of the same views.
 
-    The rotation is the mean of the cameras' relative orientations (orthogonal Procrustes); given it, scale and
-    translation are Umeyama's least-squares solution for the centres. Taking the rotation from the centres as well would
-    leave it undetermined for one camera, two cameras or cameras on a line, and to noise for short baselines.
+    The rotation is the mean of the cameras' relative orientations (orthogonal Procrustes), which centres alone leave
+    undetermined for cameras on a line; given it, scale and translation are Umeyama's for the centres.
 
     Args:
         predicted: B scenes, V views.
         reference: the same views in another frame and unit.
-        still_scale: gives the ``[B]`` scale of scenes whose cameras do not move in either frame, which say nothing of
-            it; only called where there is one. None means 1.
+        still_scale: gives the ``[B]`` scale of scenes whose cameras do not move in either frame; only called where
+            there is one. None means 1.
 
     Returns:
         ``[B]`` similarities from the predicted to the reference frame, computed in float64, in the input's dtype.
@@ -137,15 +124,9 @@ def align_cameras(
 
 
 def align_points(points: Tensor, reference: Tensor) -> Similarity:
-    """The least-squares similarity between corresponding points (Umeyama 1991).
+    """The least-squares similarity from points ``[B, N, 3]`` to reference points (Umeyama 1991), computed in float64.
 
-    Args:
-        points: ``[B, N, 3]``.
-        reference: ``[B, N, 3]``, the same points in another frame and unit.
-
-    Returns:
-        ``[B]`` similarities from the points' frame to the reference's, computed in float64, in the input's dtype. Of
-        points that coincide the scale is 1.
+    Of points that coincide the scale is 1.
     """
     source, target = points.double(), reference.double()
     centered, centered_target = source - source.mean(1)[:, None], target - target.mean(1)[:, None]
@@ -161,10 +142,7 @@ def _umeyama(
     still_scale: Callable[[], Tensor] | None,
     dtype: torch.dtype,
 ) -> Similarity:
-    """Least-squares scale and translation of points ``[B, N, 3]`` once turned (Umeyama 1991, eqn 41 and 42).
-
-    Scenes that do not move ``[B]``, or move against their target, take the scale ``still_scale()``.
-    """
+    """Least-squares scale (or ``still_scale()``) and translation of points once turned (Umeyama 1991, eqn 41, 42)."""
     source_mean, target_mean = source.mean(1), target.mean(1)
     turned = (source - source_mean[:, None]) @ rotation.transpose(-1, -2)
     agreement = (turned * (target - target_mean[:, None])).sum((1, 2))

@@ -2,9 +2,8 @@
 
 A pixel's ray is ``r = (u, v, 1)`` and its point ``d r``. The chord between the points of its left and right neighbours,
 of depths d0 and d1, is ``(d1 - d0) r + (d1 + d0) / fx e_x``; with the chord of the column, the cross product is
-proportional to ``(gx, gy, -1 - u gx - v gy)``, ``gx = fx (d1 - d0) / (d1 + d0)`` and gy likewise. It depends on depth
-ratios only, never vanishes, and always faces the camera. kornia's ``depth_to_normals`` knows neither holes nor depth
-edges, faces away from the camera and takes 3.7 times as long on a CPU.
+proportional to ``(gx, gy, -1 - u gx - v gy)``, ``gx = fx (d1 - d0) / (d1 + d0)`` and gy likewise: it never vanishes and
+always faces the camera. kornia's ``depth_to_normals`` knows neither holes nor depth edges.
 """
 
 from __future__ import annotations
@@ -15,12 +14,7 @@ from torch.nn import functional as F
 
 
 def ray_slopes(intrinsics: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """Returns u ``[..., 1, W]`` and v ``[..., H, 1]`` of the rays ``(u, v, 1)`` of all pixels.
-
-    Args:
-        intrinsics: ``[..., 3, 3]`` in pixels, integer pixel centres.
-        size: image ``(height, width)``.
-    """
+    """Slopes u ``[..., 1, W]`` and v ``[..., H, 1]`` of the rays ``(u, v, 1)`` of all pixels of ``(height, width)``."""
     height, width = size
     x = torch.arange(width, dtype=intrinsics.dtype, device=intrinsics.device)
     y = torch.arange(height, dtype=intrinsics.dtype, device=intrinsics.device)[:, None]
@@ -39,8 +33,7 @@ def normals_from_depth(depth: Tensor, intrinsics: Tensor, edge_threshold: float 
 
     Returns:
         Unit normals ``[..., 3, H, W]`` facing the camera (0 where invalid), differentiable in the depth with finite
-        gradients, and their validity ``[..., H, W]``: interior pixels that are valid with their four neighbours and do
-        not touch a depth edge.
+        gradients, and their validity ``[..., H, W]``.
     """
     present = depth > 0
     filled = torch.where(present, depth, 1.0)

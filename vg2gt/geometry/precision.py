@@ -1,8 +1,6 @@
 """One policy of precision, of training, evaluation and reconstruction: networks in bfloat16 on a GPU, all else float32.
 
-A training switches autocast on for its steps (``trainer.precision``: ``auto`` is this policy), evaluation and
-reconstruction do so for the model; inside, geometry, pooling, rendering and losses switch it off. TF32 stays off: it is
-one switch for the whole process, and would round the products of matrices that geometry is made of.
+TF32 stays off: it is one switch for the whole process, and would round the matrices that geometry is made of.
 """
 
 from __future__ import annotations

@@ -1,8 +1,4 @@
-"""Quaternions (wxyz) and rotation matrices.
-
-Not kornia's: its gradients of :func:`quat_to_matrix` and values of :func:`matrix_to_quat` differ in the last bits, and
-training must stay equal to the bit; times are alike.
-"""
+"""Quaternions (wxyz) and rotation matrices; kornia's differ in the last bits, which would change every training."""
 
 from __future__ import annotations
 
@@ -23,10 +19,7 @@ def quat_to_matrix(quats: Tensor) -> Tensor:
 
 
 def matrix_to_quat(matrix: Tensor) -> Tensor:
-    """Unit quaternions ``[..., 4]`` (wxyz, w >= 0) of rotation matrices ``[..., 3, 3]``.
-
-    Each of the four components is the largest somewhere; the row built on the largest one is numerically safe.
-    """
+    """Unit quaternions ``[..., 4]`` (wxyz, w >= 0) of rotation matrices ``[..., 3, 3]``."""
     m = matrix
     diagonal = torch.stack((m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]), -1)
     trace = diagonal.sum(-1, keepdim=True)

@@ -50,7 +50,7 @@ class _Curve:
 def nearest_by_cells(
     queries: Tensor, query_batch: Tensor, points: Tensor, point_batch: Tensor, neighbors: int, scenes: int
 ) -> tuple[Tensor, Tensor]:
-    """Nearest points of a query's own scene, nearest first.
+    """Nearest points of a query's own scene, nearest first; of equal distances (in float64) any may be found.
 
     Args:
         queries: ``[N, 3]``.
@@ -61,8 +61,7 @@ def nearest_by_cells(
         scenes: B.
 
     Returns:
-        Rows of ``points`` ``[N, k]`` int64 and whether there are so many ``[N, k]`` bool; row 0 where not. Distances
-        are those of float64; among equal ones any may be found.
+        Rows of ``points`` ``[N, k]`` int64 and whether there are so many ``[N, k]`` bool; row 0 where not.
     """
     low = points.amin(0).double()
     extent = (points.amax(0).double() - low).amax().clamp(min=torch.finfo(torch.float32).tiny)

@@ -27,10 +27,7 @@ def _float32_of_bits(typing_context, bits):
 
 
 def exp(x: Any) -> Any:
-    """Exponential of what is not positive: in float32 vectorising (relative error 2e-7), and never below e^-40.
-
-    In float64 it is the library's.
-    """
+    """Exponential of what is not positive: in float32 vectorising (relative error 2e-7) and never below e^-40."""
     raise NotImplementedError("compiled code only")
 
 

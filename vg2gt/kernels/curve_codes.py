@@ -40,8 +40,7 @@ def hilbert_codes(grid: Tensor, bits: int) -> Tensor:
         bits: bits per axis, 1 to 21.
 
     Returns:
-        ``[M]`` int64 < 2^(3 bits); cells with consecutive codes share a face, and dropping the last three bits
-        gives the code of the parent cell.
+        ``[M]`` int64 < 2^(3 bits); dropping the last three bits gives the code of the parent cell.
     """
     if has_kernel(grid.device):
         from vg2gt.kernels.hilbert import hilbert_in_one_kernel

@@ -50,10 +50,7 @@ def _pinholes(intrinsics: Tensor) -> np.ndarray:
 
 
 def _count_corners(valid: Tensor, stride: int) -> int:
-    """Corners of ``valid`` ``[V, H, W]`` at a stride whose pixel and both neighbours are valid.
-
-    Every square of four neighbours has four corners; one of them is left where one pixel is not valid, none otherwise.
-    """
+    """Corners of ``valid`` ``[V, H, W]`` at a stride: four a square of valid pixels, one where one is not valid."""
     pixels = valid[:, ::stride, ::stride].to(torch.uint8)
     pairs = pixels[:, 1:] + pixels[:, :-1]
     squares = pairs[..., 1:] + pairs[..., :-1]
@@ -64,11 +61,9 @@ def _count_corners(valid: Tensor, stride: int) -> int:
 def _disagreement(view, depth, true, valid, pinholes, true_pinholes, turn, strides, weights, tables, gradient, totals):
     """``sum weight (1 - cos)`` of one view's corners at all strides; its derivative is added to ``gradient``.
 
-    ``depth``, ``true``, ``valid``, ``gradient`` are ``[V, H, W]``, the pinholes ``[V, 4]`` (fx, fy, cx, cy in pixels),
-    ``turn`` is ``[V, 3, 3]``, ``weights`` one a stride, ``totals`` ``[V]``. Rows are worked on in pieces that are first
-    copied into the view's own of the ``tables`` ``[V, LINES PITCH]``, whose lines the compiler knows to be apart: so it
-    makes vector instructions. Invalid pixels, and the columns next to the image, are copied as depth one that does not
-    count.
+    Rows are worked on in pieces that are first copied into the view's own of the ``tables`` ``[V, LINES PITCH]``, whose
+    lines the compiler knows to be apart, so that it makes vector instructions. Invalid pixels are copied as depth one
+    that does not count.
     """
     height, width = valid.shape[1:]
     table = tables[view]

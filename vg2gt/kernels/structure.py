@@ -46,11 +46,7 @@ class Structure(torch.autograd.Function):
 
 @lru_cache(maxsize=16)
 def _bands(size: int) -> Bands:
-    """The window along an axis as a matrix ``[n, n]`` with reflected borders, and its transpose, by their diagonals.
-
-    Returns:
-        Twice ``[11, n]``: what the value ``k - 5`` places further contributes to each place.
-    """
+    """The window along an axis as a matrix with reflected borders, and its transpose, by diagonals ``[11, n]``."""
     weights = np.exp(-(np.arange(-HALF, HALF + 1) ** 2) / (2 * SIGMA**2))
     matrix = np.zeros((size, size))
     for place in range(size):

@@ -63,7 +63,7 @@ def _on_team(team: Callable[..., None], threads: int, items: Sequence[Item], fun
 def _openmp_team() -> Callable[..., None] | None:
     """OpenMP's entry point for a parallel region in the library that torch uses, or None where it has none.
 
-    Torch's own threads wait for its next operation by spinning: threads of ours would share the cores with them.
+    Torch's own threads wait by spinning: threads of ours would share the cores with them.
     """
     if sys.platform != "linux":
         return None

@@ -18,15 +18,7 @@ def count_compiled(
     tolerance: float,
     margin: float,
 ) -> list[NDArray[np.float32]]:
-    """Views that agree, look through and are hidden, ``[V, H, W]`` each.
-
-    Args:
-        depth: ``[V, H, W]`` z-depth, 0 = none.
-        partners: ``[V, K]`` views that each view is compared with; -1 = none.
-        matrix: ``[V, K, 3, 4]`` takes ``depth * (x, y, 1)`` into a partner's image.
-        tolerance: relative difference of depth up to which views agree.
-        margin: relative difference of depth from which on a view looks through a point.
-    """
+    """Views that agree, look through and are hidden, ``[V, H, W]`` each; ``matrix [V, K, 3, 4]`` leads to partners."""
     sums = [np.zeros(depth.shape, np.float32) for _ in range(3)]
     parallel_for(
         range(len(depth)),

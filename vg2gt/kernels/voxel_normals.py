@@ -27,8 +27,7 @@ def facing_compiled(spread: Tensor, facing: Tensor, prior: float) -> Tensor:
 def _face(spread, facing, normal, prior, first, last):
     """Normals of voxels ``first`` to ``last``, by the steps of ``smallest_eigenvector`` and in float64 like it.
 
-    The least root of the characteristic cubic needs no cosine here: it lies ``1 + t`` radii below the mean, where
-    ``t^2 (t + 3)`` is known, and Newton's method finds ``t``. The arrays are flat, which lets the loop be vectorised.
+    The least root of the cubic lies ``1 + t`` radii below the mean, ``t^2 (t + 3)`` is known, and Newton finds ``t``.
     """
     for voxel in range(np.uintp(first), np.uintp(last)):
         row, cell = I3 * voxel, I9 * voxel
@@ -77,16 +76,9 @@ def _face(spread, facing, normal, prior, first, last):
 def spread_around(
     keys: Tensor, columns: Tensor, counts: Tensor, spread: Tensor, normal: Tensor, offset: Tensor, same_surface: float
 ) -> Tensor:
-    """Covariances ``[M, 3, 3]`` of the points of every voxel and of the 26 around it.
+    """Covariances ``[M, 3, 3]`` of the points of every voxel and of the 26 around it, as the method's reference.
 
-    Args:
-        keys: ``[M]`` of the voxels' cells, ascending.
-        columns: ``[9]`` what leads from a voxel's key to that of a column's first cell.
-        counts: ``[M]`` points in each voxel.
-        spread: ``[M, 3, 3]`` covariances of their positions, in cells^2.
-        normal: ``[M, 3]`` of the tangent planes.
-        offset: ``[M, 3]`` mean positions from the cells' centres, in cells.
-        same_surface: cells off the tangent plane at which a neighbour's points count e^-1/2.
+    ``keys [M]`` are the cells', ascending, and ``columns [9]`` lead from one to those of its columns' first cells.
     """
     above = keys.new_full((1,), torch.iinfo(keys.dtype).max)  # all cells: a walk along the keys stops there
     around = torch.empty_like(spread, memory_format=torch.contiguous_format)
@@ -101,8 +93,7 @@ def spread_around(
 def _spread_around(keys, columns, counts, spread, normal, offset, around, starts, sharpness, first, last):
     """:func:`spread_around` of voxels ``first`` to ``last``; ``keys`` ``[M + 1]`` end with a number above all.
 
-    Cells of a column have keys in a row, and with the voxels' keys those of their columns ascend. ``starts`` ``[9]`` is
-    overwritten; ``sharpness`` is one over the cells off the tangent plane at which points count 1 / e.
+    Cells of a column have keys in a row, and with the voxels' keys those of their columns ascend.
     """
     one = np.float32(1)
     for column in range(9):

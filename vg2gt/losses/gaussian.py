@@ -49,9 +49,8 @@ class RenderTargets(TensorRecord):
 class GaussianLoss:
     """Losses of the rendered views of one scene.
 
-    Depth terms count pixels that have a rendered depth and enough opacity: a hole is not a surface at depth 0. Decoded
-    depth and confidence are constants here; otherwise the backbone's enhancement would lower its own confidence to
-    escape the loss.
+    Depth terms count pixels with a rendered depth and enough opacity. Decoded depth and confidence are constants here;
+    otherwise the backbone's enhancement would lower its own confidence to escape the loss.
 
     Args:
         weight: of the whole group.
@@ -87,16 +86,13 @@ class GaussianLoss:
         return (rendered.depth > 0) & (rendered.alpha > self.min_alpha)
 
     def __call__(self, rendered: Render, cameras: Cameras, targets: RenderTargets, scale: Tensor) -> dict[str, Tensor]:
-        """Computes the unweighted terms of one scene.
+        """The unweighted terms of one scene, scalars with graph, named like the weights.
 
         Args:
             rendered: R views of the scene (B = 1), depth in scene units.
             cameras: the cameras they were rendered with (B = 1).
             targets: what they should show.
             scale: scalar, losses' unit per scene unit, a constant.
-
-        Returns:
-            Scalars with graph, named like the weights.
         """
         color, hits = where_it_counts(rendered.color[0], targets.images, targets.mask), self.hits(rendered)[0]
         depth = torch.where(hits, rendered.depth[0], 1.0)

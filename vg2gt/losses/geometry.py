@@ -1,7 +1,6 @@
 """VGGT's training losses for depth and point map (paper, Training).
 
-The predicted point map is the unprojected predicted depth, so both tasks are computed in the predicted cameras' frames:
-distances and angles do not change under a common rotation, and the ground truth can be brought there without a graph.
+Both are computed in the predicted cameras' frames, so that the ground truth can be brought there without a graph.
 """
 
 from __future__ import annotations
@@ -27,13 +26,7 @@ DEPTH_STRIDES = (1, 2, 4, 8)
 
 @dataclass(frozen=True)
 class TaskLoss:
-    """The three parts of one task's loss, scalars with graph.
-
-    Attributes:
-        conf: confidence-weighted error.
-        reg: plain error.
-        grad: error of differences between neighbours.
-    """
+    """One task's confidence-weighted error, plain error and error of neighbours' differences, scalars with graph."""
 
     conf: Tensor
     reg: Tensor
@@ -70,7 +63,7 @@ class GeometryLoss:
     def __call__(
         self, depth: Tensor, depth_conf: Tensor, cameras: Cameras, truth: Truth, valid: Tensor
     ) -> tuple[TaskLoss, TaskLoss]:
-        """Computes both tasks of one scene.
+        """The depth task's and the point-map task's losses of one scene.
 
         Args:
             depth: ``[1, V, H, W]`` predicted depth in the truth's unit.
@@ -78,9 +71,6 @@ class GeometryLoss:
             cameras: predicted cameras in the frame of view 0, translations in the truth's unit.
             truth: ground truth of the same scene and views.
             valid: ``[1, V, H, W]`` bool, the pixels to compare.
-
-        Returns:
-            The depth task's and the point-map task's losses.
         """
         valid = valid & truth.known[:, None, None, None]
         # Where nothing is compared the prediction becomes the truth: no infinity or hole reaches the gradients.
@@ -112,10 +102,7 @@ def trusted_pixels(error: Tensor, valid: Tensor, quantile: float) -> Tensor:
 
 
 def order_statistic(values: Tensor, count: Tensor, quantile: float) -> Tensor:
-    """The quantile of the ``count`` smallest of ``values [N]``: of ranks, the last at or below ``quantile``.
-
-    It keeps the same pixels as an interpolated quantile, and has no limit on their number.
-    """
+    """The quantile of the ``count`` smallest of ``values [N]``, without interpolation and of any number."""
     return values.kthvalue(math.floor(quantile * max(int(count) - 1, 0)) + 1).values
 
 
@@ -137,13 +124,7 @@ def depth_gradient_loss(error: Tensor, valid: Tensor) -> Tensor:
 
 
 def point_errors(depth: Tensor, cameras: Cameras, truth: Truth) -> Tensor:
-    """Distance ``[V, H, W]`` between predicted and true points, measured in each predicted camera's frame.
-
-    Args:
-        depth: ``[V, H, W]`` predicted, in the truth's unit.
-        cameras: predicted (B = 1), translations in the truth's unit.
-        truth: one scene.
-    """
+    """Distance ``[V, H, W]`` between a scene's predicted and true points, measured in each predicted camera's frame."""
     size = (depth.shape[-2], depth.shape[-1])
     to_predicted = (cameras.world_to_camera @ invert_rigid(truth.cameras.world_to_camera))[0]
     u, v = ray_slopes(truth.cameras.intrinsics[0], size)
@@ -159,11 +140,7 @@ def point_errors(depth: Tensor, cameras: Cameras, truth: Truth) -> Tensor:
 
 @torch.no_grad()
 def camera_errors(cameras: Cameras, truth: Cameras) -> dict[str, Tensor]:
-    """Mean absolute errors of translation, quaternion and field of view (VGGT's pose encoding), to log only.
-
-    Args:
-        cameras: predicted cameras in the frame of view 0, translations in the truth's unit.
-        truth: ground truth of the same views.
+    """Mean absolute errors of VGGT's pose encoding, to log only.
 
     Returns:
         Scalars ``camera_T``, ``camera_R`` (of the nearer quaternion sign) and ``camera_F`` (radians).

@@ -21,9 +21,8 @@ class LossReport:
 
     Attributes:
         total: scalar with graph, the mean over scenes of the weighted sum of the terms.
-        terms: unweighted terms, means over scenes, scalars without graph. ``initial_depth`` and ``initial_point`` are
-            what the enhancement loss compares with; ``camera_*`` are logged only; ``rendered`` is the share of rendered
-            pixels that have a depth.
+        terms: unweighted terms, means over scenes, without graph. ``initial_depth`` and ``initial_point`` are what the
+            enhancement loss compares with; ``rendered`` is the share of rendered pixels that have a depth.
         scale: ``[B]`` ground-truth unit of the losses per scene unit.
         skipped: scenes with fewer than 100 valid depth pixels, whose depth terms are 0.
     """
@@ -47,13 +46,7 @@ class SceneLoss:
 
 @dataclass(frozen=True)
 class RenderedViews(TensorRecord):
-    """Renders of R of the batch's views.
-
-    Attributes:
-        render: colour, depth, normals and opacity.
-        cameras: the cameras used for rendering.
-        views: ``[R]`` int64 indices into the batch's views.
-    """
+    """Renders of R of the batch's views with ``cameras``; ``views [R]`` int64 are their indices in the batch."""
 
     render: Render
     cameras: Cameras
@@ -105,13 +98,11 @@ class VG2GTLoss(nn.Module):
             prediction: geometry of the context views, in the frame of context view 0 and in scene units.
             batch: ground truth of context and held-out views.
             rendered: renders of some views of the batch, or None for the geometry losses only.
-            views: ``[R]`` int64, which of the batch's views were rendered; indices below ``num_context`` are context
-                views, the others have no decoded depth to be compared with.
+            views: ``[R]`` int64, which of the batch's views these are; the first ``num_context`` have decoded depth.
             render_cameras: the R cameras used for rendering.
 
         Raises:
-            ValueError: if the geometry does not cover the context views, or renders, views and cameras do not go
-                together.
+            ValueError: if geometry, renders, views and cameras do not go together.
         """
         shown = _checked(prediction, batch, rendered, views, render_cameras)
         with torch.autocast(batch.images.device.type, enabled=False):

@@ -58,9 +58,8 @@ def _at_corners(between: Tensor, dim: int) -> Tensor:
 def _corner_normals(depth: Tensor, intrinsics: Tensor, stride: int) -> Tensor:
     """Camera-frame normals ``[2, 2, V, 3, h - 1, w - 1]`` of the strided depth ``[V, H, W]`` at its squares' corners.
 
-    The first two axes say whether the pixel's neighbours are to its right or left, and below or above it: all four
-    corners in the same operations. The differences to the neighbours, ``(d1 - d) r + d1 / fx e_x`` and its like, have
-    the cross product derived in :mod:`vg2gt.geometry.normals` with ``gx = fx (d1 - d) / d1``. Not of unit length.
+    The first two axes say whether the pixel's neighbours are to its right or left, below or above it. As in
+    :mod:`vg2gt.geometry.normals`, with ``gx = fx (d1 - d) / d1``; not of unit length.
     """
     u, v = ray_slopes(intrinsics, (depth.shape[-2], depth.shape[-1]))
     u, v = u[..., ::stride], v[..., ::stride, :]

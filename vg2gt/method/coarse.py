@@ -1,8 +1,4 @@
-"""Coarse-level feature enhancement: patch tokens gain what voxels shared by all views know (paper, Coarse-level).
-
-With ``surface_evidence=False embedding_skip=False fuse_kernel=1 gate=False`` (``model=vg2gt``) it is the paper's; what
-the four switches add is ours; the first and the last are in :mod:`vg2gt.method.additions.surface_evidence`.
-"""
+"""Coarse-level feature enhancement: patch tokens gain what voxels shared by all views know (paper, Coarse-level)."""
 
 from __future__ import annotations
 
@@ -44,8 +40,8 @@ Inject = Literal["last", "all"]
 class CoarseModule(nn.Module):
     """Enhances patch tokens by PTv3 over coarse voxels, fused through a zero-initialised projection.
 
-    Positions are detached: the module reads the frozen backbone's geometry, it does not move it. A patch without a
-    valid point keeps its tokens.
+    It reads the frozen backbone's geometry and does not move it. A patch without a valid point keeps its tokens. With
+    ``surface_evidence=False embedding_skip=False fuse_kernel=1 gate=False`` (``model=vg2gt``) it is the paper's.
 
     Args:
         token_dims: width of each tapped layer, shallow to deep.
@@ -58,17 +54,15 @@ class CoarseModule(nn.Module):
         neighbors: nearest voxels a point's feature is interpolated from.
         inject: ``all`` changes every tap, ``last`` the last one only.
         upsample: points per patch along each axis.
-        surface_evidence: not in the paper: the voxels' centroids enter PTv3, and how far every point is from the
-            surface that the views agree on enters the fusion.
-        embedding_skip: not in the paper: the patches' own embedding enters the fusion next to the voxels' features.
-        fuse_kernel: edge length of the fusing convolutions: 1 fuses every patch by itself (paper), 3 reads its
-            neighbours.
-        gate: not in the paper: evidence counts away from silhouettes only, and all changes are scaled by how much the
-            views disagree, so that depth on which they agree stays as it is. Needs ``surface_evidence``.
+        surface_evidence: ours: the voxels' centroids enter PTv3, and how far every point is from the surface that the
+            views agree on enters the fusion.
+        embedding_skip: ours: the patches' own embedding enters the fusion next to the voxels' features.
+        fuse_kernel: edge length of the fusing convolutions: 1 (paper), or 3, which reads a patch's neighbours.
+        gate: ours: evidence counts away from silhouettes only, and all changes are scaled by how much the views
+            disagree. Needs ``surface_evidence``.
 
     Raises:
-        ValueError: if ``inject`` or ``fuse_kernel`` is not one of these, ``upsample`` does not divide the patch, or
-            ``gate`` has no evidence.
+        ValueError: naming an option that is not one of these, or does not fit another.
     """
 
     def __init__(
@@ -165,10 +159,7 @@ class CoarseModule(nn.Module):
     def _enhance(
         self, embedded: Tensor, points: PatchPoints, generator: torch.Generator | None
     ) -> tuple[Tensor, Tensor]:
-        """PTv3 over the voxels, read back at the points: ``[N, C]``; surface evidence adds ``SURFACE_CHANNELS``.
-
-        Also the gate on changes, ``[B, 1, 1, 1]``; 1 without one.
-        """
+        """PTv3 over the voxels, read back at the points with the evidence ``[N, C]``; the gate ``[B, 1, 1, 1]``."""
         with full_precision(embedded):
             plan = plan_voxels(points.cells, points.batch, torch.ones_like(points.batch, dtype=torch.bool))
             if points.views > 1:
@@ -223,9 +214,8 @@ class CoarseModule(nn.Module):
 class PatchPoints:
     """The points of the upsampled patch grid that have a valid depth, packed.
 
-    Depth is taken at the central pixel of every cell, never averaged across an edge; confidence is the smallest of
-    the cell. Where nothing at all is valid one placeholder point is used, so that the network's parameters stay in
-    the autograd graph; its features are discarded.
+    Depth is that of a cell's central pixel, confidence the cell's smallest. Where nothing is valid there is one
+    placeholder point, which keeps the network's parameters in the autograd graph; its features are discarded.
 
     Args:
         geometry: B scenes of V views, in scene units.
@@ -238,9 +228,6 @@ class PatchPoints:
         batch: ``[N]`` scene index, sorted.
         cells: ``[N, 3]`` float64 positions in voxel units.
         confidence: ``[N]`` > 0.
-        placeholder: whether the only point is the placeholder.
-        voxel_size: ``[B]``.
-        views: V.
         depth: ``[B, V, h, w]`` of the grid, scene units, 0 = invalid.
         cameras: whose pixels are the grid's.
         clear: ``[N]`` bool, whether no pixel of the cell is next to a silhouette; None where nobody asked.

@@ -185,15 +185,7 @@ def _pixel_rows(dense: Tensor) -> Tensor:
 
 
 class _Points:
-    """All pixels as points, invalid ones replaced by finite placeholders that no voxel uses.
-
-    Attributes:
-        batch: ``[N]`` scene index.
-        valid: ``[N]`` bool.
-        confidence: ``[N]`` > 0.
-        cells: ``[N, 3]`` float64 positions in voxel units.
-        offset: ``[N, 3]`` positions within the cell, from its centre, in [-1/2, 1/2]; differentiable.
-    """
+    """All pixels as points as :func:`plan_voxels` takes them, invalid ones finite placeholders that no voxel uses."""
 
     def __init__(self, geometry: Geometry, voxel_size: Tensor, drop_fringes: bool) -> None:
         depth, confidence = geometry.depth.float(), geometry.depth_conf.float()

@@ -28,10 +28,10 @@ SURFEL_ALPHA = 0.88  # of each Gaussian of the surfel start
 class GaussianHead(nn.Module):
     """Two-layer MLP from a voxel's feature to K sets of Gaussian parameters.
 
-    With the ``plain`` start (the paper's parametrisation) an untrained voxel's Gaussians lie near its anchor with half
-    a voxel's standard deviation, the voxel's colour and a joint opacity of 0.95, so that coloured voxels render without
-    holes. With the ``surfel`` start they lie on the voxel's surface, along its colour gradient
-    (:mod:`vg2gt.method.additions.surfel`), and what the network says is a residual in that surface's frame.
+    With the ``plain`` start (the paper's) an untrained voxel's Gaussians lie near its anchor with half a voxel's
+    standard deviation, the voxel's colour and a joint opacity of 0.95. With the ``surfel`` start they lie on the
+    voxel's surface, along its colour gradient (:mod:`vg2gt.method.additions.surfel`), and the network's output is a
+    residual in its frame.
 
     Args:
         in_channels: width of the voxel features.
@@ -43,10 +43,6 @@ class GaussianHead(nn.Module):
         hidden: width of the hidden layer; None takes ``in_channels``.
         max_gaussians: most Gaussians a scene; beyond it the least opaque are dropped, with a warning in the log and the
             metric ``train/gaussians_dropped``. None keeps all.
-
-    Attributes:
-        out: the last layer, whose width depends on ``splits`` and ``sh_degree``.
-        cap: counts what ``max_gaussians`` drops.
     """
 
     def __init__(
@@ -91,10 +87,7 @@ class GaussianHead(nn.Module):
         self.register_buffer("sh_gain", gains[:, None], persistent=False)
 
     def forward(self, voxels: Voxels) -> Gaussians:
-        """Splits every voxel.
-
-        Args:
-            voxels: refined voxels of B scenes.
+        """Splits every voxel of B scenes.
 
         Returns:
             ``M * splits`` Gaussians (fewer beyond ``max_gaussians``), those of a voxel adjacent: scales in (0, 2 v),

@@ -65,11 +65,11 @@ class VoxelPlan:
 def mixed_radix_keys(
     grid: Tensor, batch: Tensor, margin: int = 0, spans: Sequence[int] | None = None
 ) -> tuple[Tensor, tuple[int, int, int]]:
-    """One collision-free int64 key per cell, ordered like (scene, x, y, z).
+    """One collision-free int64 key per cell ``[M, 3]`` and scene ``[M]``, ordered like (scene, x, y, z).
 
     Args:
-        grid: ``[M, 3]`` int64 cells, any sign.
-        batch: ``[M]`` int64 scene index >= 0.
+        grid: cells, any sign.
+        batch: scene index >= 0.
         margin: cells to leave free on every side, so that keys of neighbours up to ``margin`` away never wrap.
         spans: cells along x, y and z of a grid that begins at 0, and the number of scenes, where they are known; to
             find them out, the host waits for a GPU.
@@ -105,15 +105,9 @@ def scene_counts(batch: Tensor, scenes: int) -> Tensor:
 
 
 def point_cells(points: Tensor, batch: Tensor, voxel_size: Tensor) -> Tensor:
-    """Positions in units of voxels.
+    """Positions ``[N, 3]``, float32 or better, in units of their scene's ``voxel_size [B]``: ``[N, 3]`` float64.
 
-    Args:
-        points: ``[N, 3]``, float32 or better (bfloat16 puts most points into another 2 mm cell).
-        batch: ``[N]`` scene index.
-        voxel_size: ``[B]`` edge length in scene units.
-
-    Returns:
-        ``[N, 3]`` float64. Division, not multiplication by 1/v, so that points on faces fall as the definition says.
+    Division, not multiplication by 1/v, so that points on faces fall as the definition says.
     """
     sizes = voxel_size.double() if len(voxel_size) == 1 else voxel_size.double()[batch, None]
     return points.double() / sizes
@@ -125,15 +119,12 @@ def in_range(cells: Tensor) -> Tensor:
 
 
 def plan_voxels(cells: Tensor, batch: Tensor, valid: Tensor) -> VoxelPlan:
-    """Groups points by cell.
+    """Groups points by cell; deterministic, and independent of the points' order up to the order within a voxel.
 
     Args:
         cells: ``[N, 3]`` positions in units of voxels; rows that are not valid may hold anything.
         batch: ``[N]`` int64 scene index.
         valid: ``[N]`` bool, the points to use; they must be finite.
-
-    Returns:
-        The plan; deterministic, and independent of the order of points up to the order within a voxel.
 
     Raises:
         ValueError: if the points span more cells than int64 can number.
@@ -153,13 +144,7 @@ def plan_voxels(cells: Tensor, batch: Tensor, valid: Tensor) -> VoxelPlan:
 
 
 def warn_if_sparse(plan: VoxelPlan, scenes: int, module: str) -> None:
-    """Says in the log, once per module and process, that a scene's voxels hold hardly more than one point each.
-
-    Args:
-        plan: the voxels of B scenes.
-        scenes: B.
-        module: whose options to name, ``coarse`` or ``fine``.
-    """
+    """Says once per ``module`` (``coarse``, ``fine``) and process that voxels hold hardly more than one point each."""
     if module in _warned_of_sparse or not len(plan):
         return
     voxels = scene_counts(plan.batch, scenes)
@@ -209,15 +194,10 @@ class _WeightedMean(torch.autograd.Function):
 
 
 def pool_mean(values: Tensor, weights: Tensor, plan: VoxelPlan) -> Tensor:
-    """Confidence-weighted mean over every voxel (paper, eqn voxelfeature, first line).
+    """Confidence-weighted mean ``[M, C]`` over every voxel (paper, eqn voxelfeature, first line).
 
-    Args:
-        values: ``[N, C]``; points that the plan left out must be finite too.
-        weights: ``[N]`` confidence > 0, finite.
-        plan: the voxels.
-
-    Returns:
-        ``[M, C]``, float32 or better, differentiable in values and weights.
+    Values ``[N, C]`` and weights ``[N]`` > 0 must be finite, also of points that the plan left out; the result is
+    float32 or better.
     """
     if not len(plan):  # nothing to pool; the sum keeps the autograd graph
         return values[:0].to(torch.promote_types(values.dtype, torch.float32)) * weights[:0, None]
@@ -225,10 +205,7 @@ def pool_mean(values: Tensor, weights: Tensor, plan: VoxelPlan) -> Tensor:
 
 
 def pool_mean_of_chunks(chunks: Iterable[Tensor], weights: Tensor, plan: VoxelPlan) -> Tensor:
-    """:func:`pool_mean` of values that come in consecutive chunks of rows, so that nobody holds them all.
-
-    Without gradient; sums of voxels that several chunks meet in are associated otherwise.
-    """
+    """:func:`pool_mean`, without gradient, of consecutive chunks of rows, so that nobody holds all values."""
     dtype = torch.promote_types(weights.dtype, torch.float32)
     ordered = weights.to(dtype)[plan.order]
     voxel = plan.voxel_of[plan.order]

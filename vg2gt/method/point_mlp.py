@@ -35,11 +35,8 @@ class GeometricStage(nn.Module):
     """One stage: geometric affine, residual MLP, max over the window, residual MLP, residual update.
 
     The affine ``alpha (x - m) / s + beta`` of features and positions, m a window's mean and s one standard deviation a
-    scene, enters a linear layer together with the features themselves, ``W1 [affine] + W2 x``. Nothing lies between, so
-    the layer is applied as ``(W1 alpha / s + W2) (x - m)`` and ``W2 m``, the latter once a window.
-
-    Args:
-        channels: feature width C.
+    scene, enters a linear layer with the features themselves, ``W1 [affine] + W2 x``: applied as ``(W1 alpha / s + W2)
+    (x - m)`` and, once a window, ``W2 m``.
     """
 
     def __init__(self, channels: int) -> None:
@@ -71,10 +68,7 @@ class GeometricStage(nn.Module):
         return torch.addcmul(features, self.gamma, update.index_select(0, windows.owner))
 
     def _first_layer(self, local: Tensor, place: Tensor, windows: int) -> Tensor:
-        """Affine and linear layer of one scene's windows: features ``[W, K, C]``, positions ``[W, K, 3]``.
-
-        Of those, ``windows`` count; others hold one voxel, which deviates from itself by nothing.
-        """
+        """Affine and linear layer of a scene's windows ``[W, K, C]`` and ``[W, K, 3]``, of which ``windows`` count."""
         channels = local.shape[-1]
         of_affine, of_place, of_local = self.inner.weight.split((channels, 3, channels), 1)
         mean = local.mean(1)  # [W, C]
@@ -140,19 +134,10 @@ class PointMLP(nn.Module):
         self.stages = nn.ModuleList(GeometricStage(channels) for _ in range(stages))
 
     def forward(self, features: Tensor, grid: Tensor, batch: Tensor, voxel_size: Tensor) -> Tensor:
-        """Refines features.
-
-        Args:
-            features: ``[M, in_channels]``.
-            grid: ``[M, 3]`` int64 cells.
-            batch: ``[M]`` scene index, sorted.
-            voxel_size: ``[B]`` edge lengths, named in errors.
-
-        Returns:
-            ``[M, channels]``.
+        """Refines features ``[M, in_channels]`` of cells ``[M, 3]`` of scenes ``[M]`` (sorted) to ``[M, channels]``.
 
         Raises:
-            ValueError: if a scene spans too many voxels to be serialised.
+            ValueError: if a scene spans too many voxels to be serialised, naming its ``voxel_size [B]``.
         """
         features = self.embed(features)
         if not len(features):

@@ -113,14 +113,7 @@ def make_levels(
 
 
 class SerializedAttention(nn.Module):
-    """Multi-head attention within windows of consecutive voxels.
-
-    Args:
-        channels: width.
-        heads: number of heads.
-        window: voxels per window.
-        order: number of the curve in the level's sequence.
-    """
+    """Multi-head attention within windows of consecutive voxels along the level's curve number ``order``."""
 
     def __init__(self, channels: int, heads: int, window: int, order: int) -> None:
         super().__init__()
@@ -159,16 +152,7 @@ class MLP(nn.Module):
 
 
 class PTv3Block(nn.Module):
-    """Conditional positional encoding by sparse convolution (xCPE), attention and MLP, each residual.
-
-    Args:
-        channels: width.
-        heads: attention heads.
-        window: voxels per attention window.
-        order: number of the curve.
-        mlp_ratio: hidden width of the MLP over ``channels``.
-        drop_path: probability that a voxel skips a residual branch while training.
-    """
+    """Conditional positional encoding by sparse convolution (xCPE), attention and MLP, each residual."""
 
     def __init__(self, channels: int, heads: int, window: int, order: int, mlp_ratio: float, drop_path: float) -> None:
         super().__init__()
@@ -321,17 +305,14 @@ class PTv3(nn.Module):
         voxel_size: Tensor,
         generator: torch.Generator | None = None,
     ) -> Tensor:
-        """Enhances voxel features.
+        """Enhances voxel features ``[M, in_channels]``, M >= 1, to ``[M, out_channels]``.
 
         Args:
-            features: ``[M, in_channels]``, M >= 1.
+            features: as said.
             grid: ``[M, 3]`` int64 distinct cells.
             batch: ``[M]`` scene index, sorted.
             voxel_size: ``[B]`` edge lengths, named in errors.
             generator: while training, shuffles the sequence of orders at every resolution (on the CPU).
-
-        Returns:
-            ``[M, out_channels]``.
 
         Raises:
             ValueError: if a scene spans too many voxels to be serialised.

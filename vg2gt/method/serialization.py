@@ -48,7 +48,7 @@ def serial_keys(
     Args:
         grid: ``[M, 3]`` cells relative to their scene's smallest.
         batch: ``[M]`` scene index.
-        voxel_size: ``[B]`` edge lengths; how many says B, what they are only the error's message.
+        voxel_size: ``[B]`` edge lengths, named in the error.
         orders: the wanted orders.
         min_bits: bits per axis at least, so that keys can be shifted to parents this many times.
         extent: cells along the longest axis where that is known; to find it out, the host waits for a GPU.

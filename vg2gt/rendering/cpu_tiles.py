@@ -1,7 +1,6 @@
 """Drives the compiled kernels over views and blocks of work, and joins them to autograd.
 
-Deterministic to the bit for any number of threads: tiles write pixels and gradient rows of their own, blocks of
-Gaussians sum their rows in list order, blocks' camera gradients are summed in block order.
+Deterministic to the bit for any number of threads: all sums have a fixed order.
 """
 
 from __future__ import annotations

@@ -33,10 +33,7 @@ def _render_view(scene: SceneViews, options: RenderOptions) -> Images:
 def _render_pixels(
     splats: Splats, pixels: Tensor, background: Tensor, options: RenderOptions
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Blends P pixels front to back (paper, eqn 3dgs_render_preliminary).
-
-    Eqn gggs_color with ``G(t*) = alpha`` for every Gaussian.
-    """
+    """Blends P pixels front to back (paper, eqn 3dgs_render_preliminary; eqn gggs_color with ``G(t*) = alpha``)."""
     response, peak, precision = respond(splats, pixels[:, None])  # [P, N]
     alpha = response.clamp(max=options.alpha_max)
     alpha = torch.where(response.detach() >= ALPHA_MIN, alpha, torch.zeros_like(alpha))

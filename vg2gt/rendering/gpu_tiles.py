@@ -2,8 +2,7 @@
 
 Forward: project every Gaussian into every view of its scene, count its tiles, read the counts (the only time that the
 host waits), write one entry a (tile, Gaussian), sort the entries by view, tile and depth, blend the tiles. Backward:
-visit the tiles again, write one gradient row an entry, sum and chain the rows of every Gaussian. Deterministic: tiles
-write pixels and rows of their own; a Gaussian's rows adjoin and are summed in order by its own lane.
+visit the tiles again, write one gradient row an entry, sum and chain the rows of every Gaussian in order.
 """
 
 from __future__ import annotations

@@ -104,7 +104,7 @@ def screen_box(splats: Splats) -> tuple[Tensor, Tensor]:
 
     Returns:
         Box ``[N, 4]`` as (x0, y0, x1, y1), both ends inside, and ``[N]`` bool: False where there is no such pixel or
-        the region is unbounded, that is where the Gaussian straddles the camera plane.
+        the Gaussian straddles the camera plane.
     """
     cutoff = 2 * torch.log(splats.opacity / ALPHA_MIN)
     q0, q1 = splats.tilt.unbind(-1)
@@ -125,7 +125,7 @@ def screen_box(splats: Splats) -> tuple[Tensor, Tensor]:
 def visible_splats(scene: SceneViews, options: RenderOptions) -> tuple[Splats, Tensor]:
     """Splats that reach the image, front to back by the depth of their means, and their boxes ``[N, 4]`` (no gradient).
 
-    Selecting before the differentiable projection keeps the undefined derivatives of hidden Gaussians out of the graph.
+    Selecting first keeps the undefined derivatives of hidden Gaussians out of the graph.
     """
     height, width = scene.size
     with torch.no_grad():
@@ -148,14 +148,9 @@ def pixel_boxes(box: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
 
 
 def list_cells(first: Tensor, extent: Tensor) -> tuple[Tensor, Tensor]:
-    """Lists the cells of rectangles, row by row, in the rectangles' order.
+    """Lists the cells of rectangles, row by row: rectangle ``[M]`` and cell ``[M, 2]``.
 
-    Args:
-        first: ``[N, 2]`` least cell as (x, y).
-        extent: ``[N, 2]`` cells in x and in y, at least 0.
-
-    Returns:
-        Rectangle ``[M]`` and cell ``[M, 2]``.
+    ``first [N, 2]`` is the least cell as (x, y), ``extent [N, 2]`` the numbers of cells.
     """
     area = extent.prod(-1)
     index = torch.repeat_interleave(area)
@@ -165,11 +160,7 @@ def list_cells(first: Tensor, extent: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def respond(splats: Splats, pixels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Closed-form response of splats at pixels (module docstring).
-
-    Args:
-        splats: N splats, or splats whose leading axis broadcasts against the pixels'.
-        pixels: ``[..., 2]`` as (x, y).
+    """Closed-form response of splats at pixels ``[..., 2]`` (module docstring); splats broadcast against them.
 
     Returns:
         ``o exp(-D^2 / 2)`` before the alpha cap, the peak's depth ``t*`` and its precision ``lambda``; a response

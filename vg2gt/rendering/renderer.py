@@ -113,11 +113,7 @@ def render(
 
 
 def _render_triton(gaussians: Gaussians, cameras: Cameras, background: Tensor, options: RenderOptions) -> Render:
-    """Imports Triton only when it is asked for: torch's CPU builds come without it.
-
-    Its kernels notice values that cannot be rendered; only then is it found out which. ``background`` is ``[1, 3]``, of
-    all scenes, or ``[B, 3]``.
-    """
+    """Imports Triton, which torch's CPU builds lack, only when asked; ``background`` is ``[1, 3]`` or ``[B, 3]``."""
     if importlib.util.find_spec("triton") is None:
         raise ValueError(
             "implementation 'triton' needs the package triton; install a CUDA build of torch or use 'torch'"

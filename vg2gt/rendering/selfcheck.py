@@ -1,8 +1,7 @@
 """Whether a device's compiled kernels compute what the reference does: found out once, before they are relied on.
 
-Two small fixed scenes are rendered by the kernels on the device and by the dense reference in float64 on the CPU,
-values and gradients. What was found is kept for the same device, driver, versions and kernels. The check does not
-depend on where the first render happens: it switches gradients on and inference mode and autocast off.
+Two small fixed scenes are rendered by the kernels on the device and by the dense reference in float64 on the CPU. What
+was found is kept for the same device, driver, versions and kernels.
 """
 
 from __future__ import annotations
@@ -72,10 +71,7 @@ class Agreement:
 
 
 def require_trusted(device: torch.device) -> None:
-    """Checks once that the Triton kernels may render on a device.
-
-    Args:
-        device: a CUDA or ROCm device.
+    """Checks once that the Triton kernels may render on a CUDA or ROCm device.
 
     Raises:
         KernelsRefusedError: if they disagree with the reference, do not run, or Triton is not installed; the message
@@ -139,12 +135,7 @@ def _file() -> Path:
 
 
 def compare(device: torch.device, modes: tuple[Mode, ...] = MODES) -> Agreement:
-    """Renders the fixed scenes with the kernels on ``device`` and with the reference; how far they are apart.
-
-    Args:
-        device: where the kernels run; a CPU if Triton interprets them.
-        modes: how they render.
-    """
+    """Renders the fixed scenes with the kernels on ``device`` and with the reference; how far they are apart."""
     from vg2gt.rendering.gpu_tiles import render_triton
 
     def kernels(gaussians: Gaussians, cameras: Cameras, mode: Mode, background: Tensor) -> Render:
@@ -187,10 +178,7 @@ def as_scene(inputs: Sequence[Tensor]) -> tuple[Gaussians, Cameras]:
 
 
 def fixed_scene() -> tuple[Tensor, ...]:
-    """Means, quats, scales, opacities, sh, poses, intrinsics, background in float64: Gaussians of all kinds.
-
-    Gaussians of both scenes are packed; there are as many views of each.
-    """
+    """Means, quats, scales, opacities, sh, poses, intrinsics and background of two scenes of all kinds, in float64."""
     (height, width), total = SIZE, SCENES * COUNT
     depth = 2.5 + 1.2 * _numbers(total, STREAM)
     sides = torch.stack((0.45 * _numbers(total, STREAM + 1), 0.3 * _numbers(total, STREAM + 2)), -1) * depth[:, None]

@@ -1,7 +1,6 @@
 """Compiled backward pass over tiles: the forward visit again, each (tile, Gaussian) leaving one row of gradients.
 
-Gradients of the screen parameters are polynomials in the pixel's offset (dx, dy) with per-pixel factors: every lane
-sums its terms over the blocks of 4 x 4 pixels that a Gaussian touches, and the lanes are summed at the end.
+Gradients are polynomials in the pixel's offset (dx, dy) with per-pixel factors, summed a lane over blocks of 4 x 4.
 """
 
 # Written for the compiler: flat bodies, short names from rendering/projection.py's formulas.

@@ -44,10 +44,7 @@ def count_tiles(boxes, across, counts, offsets, starts):
 
 @kernel(error_model="numpy", nogil=True)
 def fill_tiles(boxes, visible, across, offsets, ends, members, places):
-    """Writes the tiles' lists, front to back, and the place of each entry among its Gaussian's, from its offset on.
-
-    ``ends`` holds the lists' starts, and afterwards their ends.
-    """
+    """Writes the tiles' lists, front to back, and entries' places among their Gaussian's; ``ends`` begin at starts."""
     for i in visible:
         place = offsets[i]
         x0, x1 = boxes[i, 0] >> TILE_BITS, (boxes[i, 1] - 1) >> TILE_BITS

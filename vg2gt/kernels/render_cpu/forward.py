@@ -1,11 +1,10 @@
 """Compiled forward pass over tiles of 16 x 16 pixels.
 
 A tile's Gaussians are visited front to back; each touches some of the tile's blocks of 4 x 4 pixels, and a block is one
-vector operation: the innermost loops have a fixed length and no branch, so that they vectorise. All state of a tile
-lies in planes of one flat scratch array, whose offsets are constants: with several arrays the compiler would have to
-guard every loop against overlap. Rays are stopped by the sign of their transmittance. For the median depth every block
-keeps the hits of its rays, a hit for all 16 at once, with opacity 0 where a ray is not touched. Kernels are generic in
-the dtype: constants exact in float32 do not change the type they meet, others come in as an array.
+vector operation. All state of a tile lies in planes of one flat scratch array, whose constant offsets let the compiler
+vectorise. Rays are stopped by the sign of their transmittance. For the median depth every block keeps the hits of its
+rays, a hit for all 16 at once, with opacity 0 where a ray is not touched. Kernels are generic in the dtype: constants
+exact in float32 do not change the type they meet, others come in as an array.
 """
 
 # Written for the compiler: flat bodies, short names from rendering/projection.py's formulas.
@@ -150,11 +149,7 @@ def _transmit(state, hits, first, count, base):
 
 @kernel_part(fastmath=FAST, error_model="numpy")
 def _bracket(state, hits, first, count, base, median_max, near, newton):
-    """Begins the search in a block: LO and HI on both sides of the median, MEDIAN a guess, MOVING where one is sought.
-
-    In front of LO every hit is more than four standard deviations away. HI lies behind the peaks of hits that together
-    pass at most a quarter, or four standard deviations behind all. The guess is the peak where blending fell to half.
-    """
+    """Begins a block's search: LO and HI on both sides of the median, MEDIAN a guess, MOVING where one is sought."""
     cut = ZERO * near
     for lane in range(LANES):
         k = base + np.uintp(lane)
@@ -184,11 +179,7 @@ def _bracket(state, hits, first, count, base, median_max, near, newton):
 
 @kernel_part(fastmath=FAST, error_model="numpy")
 def _solve(state, hits, block, count, parameters, steps, newton):
-    """Median depth of a block's rays into plane MEDIAN (0: none), its slope S into plane MEAN.
-
-    Every step halves the bracket or, where that goes faster and stays inside of it, is one of Newton's; without
-    ``newton`` all halve it. The search of a block ends where none of its rays moves any more.
-    """
+    """Median depth of a block's rays into plane MEDIAN (0: none), its slope S into MEAN; ends where nothing moves."""
     tolerance = parameters[5]
     base, first = np.uintp(block * LANES), block * (len(hits) // (BLOCKS * HIT_SIZE))
     _bracket(state, hits, first, count, base, parameters[2], parameters[3], newton)
@@ -239,11 +230,7 @@ def _make_forward_tiles(geometry: bool, solid: bool) -> Callable[..., int]:
         records, boxes, colors, members, starts, tiles, expected, steps, newton, parameters, background,
         state, hits, counts, staged, spans, color, normal, depth, slope, transmittance,
     ):  # fmt: skip
-        """Renders the tiles ``tiles[0] .. tiles[1] - 1`` of one view into the images.
-
-        Returns ``tiles[1]``, or the first tile that there were too few ``hits`` for; ``counts`` holds how many its
-        blocks have.
-        """
+        """Renders tiles ``tiles[0]`` to ``tiles[1]`` of one view; returns the first for which ``hits`` were too few."""
         height, width = depth.shape
         across = -(-width // TILE)
         for tile in range(tiles[0], tiles[1]):

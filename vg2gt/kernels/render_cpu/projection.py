@@ -1,7 +1,4 @@
-"""Compiled projection of Gaussians into one view (formulas: vg2gt/rendering/projection.py).
-
-Everything is computed in float64, whatever the dtype of the arrays.
-"""
+"""Compiled projection of Gaussians into one view, in float64 (formulas: vg2gt/rendering/projection.py)."""
 
 # The kernels are written for the compiler: scalars instead of small arrays.
 

@@ -1,7 +1,6 @@
-"""Compiled backward pass of the projection: gradients of a view's screen parameters chained to Gaussians and camera.
+"""Compiled backward pass of the projection, in float64: a view's screen gradients chained to Gaussians and camera.
 
-Everything is computed in float64, whatever the dtype of the arrays. Gaussians are taken some at a time: their
-parameters and summed gradient rows are laid side by side, so that the long chain of formulas is one vector loop.
+Gaussians' parameters and summed gradient rows are laid side by side, so that the chain is one vector loop.
 """
 
 # The kernels are written for the compiler: scalars instead of small arrays.
@@ -40,10 +39,7 @@ def _axis_gradient(b0, b1, b2, scale, fx, fy, u, v, us, vs, iz, jx, jy, h, s_xx,
 
 @kernel_part(fastmath=FAST, error_model="numpy")
 def _gather(begin, end, means, quats, scales, counts, offsets, rows, total, work, indices):
-    """Sums the gradient rows of some Gaussians, in order, and lays those with any side by side; returns how many.
-
-    ``total`` ``[16]`` is overwritten.
-    """
+    """Sums the gradient rows of some Gaussians, in order, and lays those with any side by side; returns how many."""
     found = 0
     for i in range(begin, end):
         if counts[i] == 0:
@@ -217,8 +213,7 @@ def project_backward_block(
 ):  # fmt: skip
     """Sums every Gaussian's gradient rows, in order, and chains them to the 3D parameters (added to) and the camera.
 
-    ``grad_cameras[block]`` receives the gradient of the pose's upper three rows and of fx, fy, cx, cy. ``pose`` is
-    float64; ``total`` ``[16]``, ``work`` ``[FIELDS CHUNK]`` (float64) and ``indices`` ``[CHUNK]`` are overwritten.
+    ``grad_cameras[block]`` receives the gradient of the pose's upper three rows and of fx, fy, cx, cy.
     """
     fx, fy = np.float64(intrinsics[0, 0]), np.float64(intrinsics[1, 1])
     # without bounds, whatever the field of view, the Jacobian of a solid is not clamped

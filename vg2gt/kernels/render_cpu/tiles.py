@@ -66,11 +66,7 @@ def place_of(y, x):
 
 @kernel_part(fastmath=FAST, error_model="numpy")
 def stage(records, colors, boxes, members, x_tile, y_tile, staged, spans):
-    """Copies the next Gaussians of a tile side by side, so that their cache misses overlap.
-
-    ``staged`` receives the record and, from column RECORD on, the colour; ``spans`` the tile's blocks that the box
-    touches: columns first and last, rows first and last (ends excluded).
-    """
+    """Copies a tile's next Gaussians side by side, so that cache misses overlap: record, colour, blocks touched."""
     for j in range(len(members)):
         i = np.uintp(members[j])
         for k in range(RECORD):
@@ -91,10 +87,7 @@ def start_rays(state, columns, rows):
 
 @kernel_part(fastmath=FAST, error_model="numpy", forceinline=True)
 def respond(dx, before, g, s_row, e_row, f_row):
-    """A Gaussian's response along a ray (rendering/projection.py): E, 1 + s, r, and whether it counts.
-
-    ``g`` holds what the formula needs of the Gaussian: Q_xx, q_x, eps, cutoff; the rest depends on the row alone.
-    """
+    """A Gaussian's response along a ray (rendering/projection.py): E, 1 + s, r, and whether it counts."""
     qa, q0, eps, cutoff = g
     e = (qa * dx + f_row) * dx + e_row
     s = q0 * dx + s_row

@@ -1,4 +1,1 @@
-"""Triton kernels of the tile renderer for CUDA devices, driven by :mod:`vg2gt.rendering.gpu_tiles`.
-
-They need the package ``triton``, which comes with torch's CUDA builds.
-"""
+"""Triton kernels of the tile renderer for CUDA devices, driven by :mod:`vg2gt.rendering.gpu_tiles`."""

@@ -54,10 +54,7 @@ def _term(p, grad, value, scale, there):
 
 @triton.jit
 def shade_backward(p, grad, g, x, y, z, there, degree: tl.constexpr):
-    """Adds a channel's gradient ``g`` to those of its coefficients; returns the gradient of the direction.
-
-    A program owns the Gaussians that it adds to: nothing is atomic.
-    """
+    """Adds a channel's gradient ``g`` to those of its coefficients; returns the gradient of the direction."""
     tl.store(grad, tl.load(grad, mask=there, other=0.0) + _C0 * g, mask=there)
     gx, gy, gz = g * 0, g * 0, g * 0
     if degree >= 1:

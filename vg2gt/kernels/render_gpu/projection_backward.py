@@ -1,7 +1,6 @@
 """Triton kernel that takes gradients of views back to Gaussians and cameras: the transpose of ``projection.py``.
 
-A lane is a Gaussian, as there. It goes through the Gaussian's views and adds up in registers: nothing is atomic, and
-sums have a fixed order.
+A lane is a Gaussian and adds up its views in registers: nothing is atomic, and sums have a fixed order.
 """
 
 # pyright: reportGeneralTypeIssues=false, reportOperatorIssue=false

@@ -1,12 +1,10 @@
 """Triton kernels that visit tiles: blend with median depth, and the backward visit.
 
 One program is one warp and one tile of 8 x 8 pixels of one view, a vector of 64 rays. Gaussians are read one at a time,
-front to back, as scalars; one that no ray of the tile hits costs a comparison. Rays are stopped by the sign of their
-transmittance. Nothing is kept per hit: the solver visits the tile's Gaussians again, eight depths at a time, as far as
-they can matter to the median. Formulas: vg2gt/rendering/projection.py, vg2gt/rendering/median.py.
-
-Options are compile-time constants, so that float64 (for tests) keeps their digits. Loops are ``while`` loops because
-the interpreter cannot iterate over a tensor's range.
+front to back, as scalars. Rays are stopped by the sign of their transmittance. Nothing is kept per hit: the solver
+visits the tile's Gaussians again, eight depths at a time, as far as they can matter to the median. Options are
+compile-time constants, so that float64 (for tests) keeps their digits; loops are ``while`` loops because the
+interpreter cannot iterate over a tensor's range.
 """
 
 # pyright: reportGeneralTypeIssues=false, reportOperatorIssue=false, reportArgumentType=false
@@ -150,10 +148,7 @@ def _median(
     records, members, begin, last, px, py, solvable, lo, hi,
     alpha_max: tl.constexpr, stop: tl.constexpr, sections: tl.constexpr, newton_steps: tl.constexpr,
 ):  # fmt: skip
-    """Median depth between ``lo`` and ``hi`` by sections and Newton steps (0: none), and ``-2 d ln T / dt`` there.
-
-    A section evaluates the transmittance at the seven depths that part the bracket into eight: three bisections.
-    """
+    """Median depth between ``lo`` and ``hi`` by sections in eight and Newton (0: none); ``-2 d ln T / dt`` there."""
     lo, hi = tl.where(solvable, lo, 1.0), tl.where(solvable, hi, 1.0)
     section = 0
     live = tl.max(solvable.to(tl.int32), 0) > 0
@@ -193,10 +188,7 @@ def _meet(records, members, place, before, px, py, alpha_max: tl.constexpr, stop
 
 @triton.jit
 def _part(records, members, place, last, px, py, solvable, lo, step, alpha_max: tl.constexpr, stop: tl.constexpr):
-    """How many of the seven depths ``lo + k step`` lie in front of the median, and whether ``lo`` does.
-
-    The squared transmittance at each depth is a quotient, ``n / d``.
-    """
+    """How many of the seven depths ``lo + k step`` lie in front of the median, and whether ``lo`` does."""
     before = tl.where(solvable, 1.0, -1.0).to(px.dtype)
     one = px * 0 + 1.0
     n0, n1, n2, n3, n4, n5, n6, n7 = one, one, one, one, one, one, one, one

@@ -1,8 +1,7 @@
 """What nobody can place: a far shell of Gaussians in the colours of the pixels whose depth no view supports.
 
-The sky, what lies beyond the searched range and distant walls without texture have no depth that views agree on. A
-shell around all cameras shows their colours by direction, blurred: it is behind everything, so it never hangs in space
-that a view looks through, and any viewer shows it.
+Sky, what lies beyond the searched range and distant walls without texture have no depth that views agree on. A shell
+around all cameras shows their blurred colours by direction, behind everything else.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ LEAST = 0.005  # share of pixels without support below which there is no shell
 def far_shell(
     images: Tensor, depth: Tensor, cameras: Cameras, mask: Tensor | None = None, count: int = COUNT
 ) -> Gaussians | None:
-    """The shell of one scene.
+    """The shell of one scene, flat Gaussians that face the cameras.
 
     Args:
         images: ``[V, 3, H, W]`` in [0, 1].
@@ -44,7 +43,7 @@ def far_shell(
         count: Gaussians of the whole sphere.
 
     Returns:
-        ``count`` flat Gaussians that face the cameras, or None where nearly every pixel has a depth, or none has.
+        The shell, or None where nearly every pixel has a depth, or none has.
     """
     missing = depth <= 0 if mask is None else (depth <= 0) & (mask > 0.5)
     if missing.float().mean() < LEAST or not (depth > 0).any():

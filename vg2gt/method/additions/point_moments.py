@@ -1,8 +1,6 @@
 """Second moments of the points in every voxel, plain and in one compiled pass (ours).
 
-How the points lie in their cell, how colour changes among them, where the cameras are that saw them and how large
-their pixels are: confidence-weighted means of 19 products. Written as separate operations, those of all points come and
-go a few views at a time; the compiled pass keeps none.
+How the points lie in their cell, how colour changes among them, which cameras saw them and how large their pixels are.
 """
 
 from __future__ import annotations
@@ -29,18 +27,17 @@ def pool_point_moments(
     """Confidence-weighted second moments in every voxel, without gradient; compiled for float32 on a CPU.
 
     Args:
-        values: ``[N, 6]`` places of the points in their cells, in cells, and their colours; N / V points a view, in the
-            order of the views.
-        depth: ``[N]`` their depths in scene units, > 0 where a voxel uses them.
+        values: ``[N, 6]`` places of the points in their cells and their colours; N / V points a view, in views' order.
+        depth: ``[N]`` scene units, > 0 where a voxel uses them.
         confidence: ``[N]`` > 0.
-        views: ``[V, 4]`` a view's camera centre in scene units, and the edge in pixels of a voxel at depth 1.
-        means: ``[M, 6]`` of the values in every voxel (:func:`vg2gt.method.grid.pool_mean`).
+        views: ``[V, 4]`` camera centre in scene units, and the edge in pixels of a voxel at depth 1.
+        means: ``[M, 6]`` of the values in every voxel.
         plan: the voxels.
-        views_per_chunk: whose products are there at a time where the pass is not compiled; it bounds the memory.
+        views_per_chunk: views at a time where the pass is not compiled; bounds the memory.
 
     Returns:
-        ``[M, 3, 3]`` covariance of the places; ``[M, 3 (place), 3 (colour)]`` covariance of place and colour;
-        ``[M, 3]`` mean camera centre; ``[M]`` mean side of a pixel at the points' depth, in cells.
+        Covariances ``[M, 3, 3]`` of the places and ``[M, 3 (place), 3 (colour)]`` of place and colour, mean camera
+        centre ``[M, 3]``, and mean side ``[M]`` of a pixel at the points' depth, in cells.
     """
     if compilable(values, depth, confidence, views, means):
         return moments_compiled(values, depth, confidence, views, means, plan.order, plan.starts, plan.counts)

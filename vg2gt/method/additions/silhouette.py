@@ -1,8 +1,7 @@
 """Points between foreground and background, which lie on no surface (our addition to both levels of the paper).
 
-Decoded depth does not break off at a silhouette, it runs from the foreground to the background within a few pixels.
-Unprojected and put into voxels those pixels become the fringe of splinters that surrounds every object. Next to them
-the coarse level cannot tell a view's error from the step of the silhouette itself.
+Decoded depth runs from the foreground to the background within a few pixels; in voxels they become a fringe of
+splinters around every object.
 """
 
 from __future__ import annotations
@@ -21,18 +20,11 @@ STEP_REACH = 3  # pixels to every side
 
 
 def on_surface(depth: Tensor) -> Tensor:
-    """Tells the pixels of a surface from those between foreground and background.
+    """Tells the pixels ``[..., H, W]`` of a surface; invalid ones, of z-depth 0, mean nothing.
 
     Inverse depth is linear in the image of a plane, so a surface's pixel lies on the line through its two neighbours to
-    the left or on that through those to the right, and likewise up or down. A pixel that fails this along either axis,
-    or whose depth changes too fast on both sides, and that lies strictly within the depth range of its 5 x 5 window
-    where that range is large, is on no surface. Noise and fine relief without a silhouette are left alone.
-
-    Args:
-        depth: ``[..., H, W]`` z-depth in any unit, 0 = invalid.
-
-    Returns:
-        ``[..., H, W]`` bool; what it says of invalid pixels means nothing.
+    one side, along either axis. A pixel that fails this, or whose depth changes too fast on both sides, and that lies
+    strictly within the large depth range of its 5 x 5 window, is on no surface.
     """
     valid = depth > 0
     inverse = torch.where(valid, 1 / torch.where(valid, depth, 1.0), 0.0)
@@ -49,14 +41,7 @@ def on_surface(depth: Tensor) -> Tensor:
 
 
 def near_silhouettes(depth: Tensor) -> Tensor:
-    """Tells the pixels on no surface, and those on a surface that breaks off within a few pixels.
-
-    Args:
-        depth: ``[..., H, W]`` z-depth in any unit, 0 = invalid.
-
-    Returns:
-        ``[..., H, W]`` bool; false where the depth is invalid.
-    """
+    """Pixels ``[..., H, W]`` on no surface or on one that breaks off within a few pixels; False where depth is 0."""
     near, far = _depth_range(depth, STEP_REACH)
     return (depth > 0) & ((far >= (1 + STEP) * near) | ~on_surface(depth))
 

@@ -1,12 +1,8 @@
 """Our addition to the paper's coarse module: how far each view is from the surface that all views agree on.
 
-The paper reads enhanced voxel features back at the points and nothing else. But a view's depth error along its ray is
-to be seen in the frozen geometry itself: the voxels around a point hold the other views' points. ``SURFACE_CHANNELS``
-numbers a point tell it to the network; the centroids that they are taken from are ``CENTROID_CHANNELS`` more inputs of
-the voxels. ``model.coarse.surface_evidence`` switches both (docs/concepts/deviations.md).
-
-Where views agree already there is nothing to gain and much to spoil, and next to silhouettes this evidence says
-nothing: ``model.coarse.gate`` scales what the module changes by how much the views disagree (:func:`disagreement`).
+The voxels around a point hold the other views' points, so a view's depth error along its ray shows in the frozen
+geometry itself: ``SURFACE_CHANNELS`` numbers a point, and ``CENTROID_CHANNELS`` more inputs of the voxels. Where views
+agree, ``model.coarse.gate`` keeps the module from changing anything (docs/concepts/deviations.md).
 """
 
 from __future__ import annotations
@@ -38,12 +34,6 @@ class PointFrames:
         depth: ``[B, V, h, w]`` scene units, 0 = invalid.
         cameras: of these pixels.
         rows: ``[N]`` the packed points' places in the flattened ``[B, V, h, w]`` grid.
-
-    Attributes:
-        depth: ``[N]`` scene units; 1 for a placeholder.
-        ray: ``[N, 3]`` the point's ray in its camera's axes, z = 1.
-        normal: ``[N, 3]`` the surface normal there, facing the camera; where it is unknown, the camera's axis.
-        rotation: ``[N, 3, 3]`` world-to-camera rotation of the point's view.
     """
 
     def __init__(self, depth: Tensor, cameras: Cameras, rows: Tensor) -> None:
@@ -56,18 +46,10 @@ class PointFrames:
         self.rotation = cameras.world_to_camera[..., :3, :3].flatten(0, 1)[rows // (height * width)]
 
     def in_camera(self, to_surface: Tensor, voxel_size: Tensor) -> Tensor:
-        """The vectors to the surface in the cameras' axes (voxels), and as changes of depth.
+        """Vectors to the surface ``[N, 3]`` (world, voxels) in the cameras' axes, and as changes of depth: ``[N, 4]``.
 
-        The change of depth takes the point along its ray onto the tangent plane through the vector's end, so that
-        where on the surface the neighbours happen to lie drops out: what remains is how far the views disagree.
-
-        Args:
-            to_surface: ``[N, 3]`` in world axes and voxels.
-            voxel_size: ``[N]`` scene units per voxel.
-
-        Returns:
-            ``[N, 4]``; the change is positive for a surface behind the point, in units of ``DEPTH_CHANGE_UNIT`` of the
-            depth, at most ``MAX_DEPTH_CHANGE`` of them, and 0 where the ray grazes the surface.
+        The change takes a point along its ray onto the tangent plane at the vector's end, positive for a surface behind
+        the point, in units of ``DEPTH_CHANGE_UNIT`` of the depth, at most ``MAX_DEPTH_CHANGE``, 0 at grazing rays.
         """
         local = (self.rotation @ to_surface[..., None])[..., 0]
         facing = (self.normal * self.ray).sum(-1)
@@ -85,8 +67,7 @@ class PointFrames:
             to_surface: ``[N, 3]`` in world axes and voxels.
             voxel_size: ``[B]`` scene units per voxel.
             batch: ``[N]`` scene index, sorted.
-            clear: ``[N]`` bool, which points lie away from silhouettes; the evidence of others is 0. None: there is no
-                gate, and all count.
+            clear: ``[N]`` bool, points away from silhouettes; others have evidence 0. None: no gate, and all count.
         """
         seen = self.in_camera(to_surface, voxel_size[batch])
         if clear is None:
@@ -96,14 +77,7 @@ class PointFrames:
 
 
 def disagreement(change: Tensor, usable: Tensor, batch: Tensor, scenes: int) -> Tensor:
-    """Median size ``[B]`` of the changes of depth ``[N]`` towards the agreed surface, of the usable points; 0 of none.
-
-    Args:
-        change: ``[N]`` in units of ``DEPTH_CHANGE_UNIT``, as :meth:`PointFrames.in_camera` gives it.
-        usable: ``[N]`` bool.
-        batch: ``[N]`` scene index, sorted.
-        scenes: B.
-    """
+    """Median size ``[B]`` of the changes of depth ``[N]`` of the usable points of each of B scenes; 0 of none."""
     rows = usable.nonzero()[:, 0]
     parts = change[rows].abs().split(scene_counts(batch[rows], scenes).tolist())
     return torch.stack([part.median() if len(part) else change.new_zeros(()) for part in parts])
@@ -112,20 +86,13 @@ def disagreement(change: Tensor, usable: Tensor, batch: Tensor, scenes: int) -> 
 def gate(disagreement: Tensor) -> Tensor:
     """Factor ``[B]`` on what is changed: next to nothing where views agree, so that clean depth stays clean.
 
-    The power lets what is left on clean depth vanish faster than the disagreement that silhouettes, relief and sensors
-    leave there; its two constants were chosen on six rooms and two recordings with 0 to 5 % noise (docs/results.md).
+    Its constants were chosen on six rooms and two recordings with 0 to 5 % noise (docs/results.md).
     """
     return (disagreement / GATE_OPEN).pow(GATE_POWER).clamp(max=GATE_MOST)
 
 
 def cell_centroids(cells: Tensor, confidence: Tensor, plan: VoxelPlan) -> Tensor:
-    """Confidence-weighted mean ``[M, 3]`` of the points' places in their cell, from its centre, in [-1/2, 1/2].
-
-    Args:
-        cells: ``[N, 3]`` float64 positions in voxels.
-        confidence: ``[N]`` > 0.
-        plan: the voxels.
-    """
+    """Confidence-weighted mean ``[M, 3]`` of the points' places in their cell, from its centre, in [-1/2, 1/2]."""
     return pool_mean((cells - cells.floor() - 0.5).float(), confidence, plan)
 
 
@@ -135,16 +102,10 @@ def voxel_evidence(confidence: Tensor, plan: VoxelPlan) -> Tensor:
 
 
 def vectors_to_surface(queries: Tensor, centroids: Tensor, evidence: Tensor, index: Tensor) -> Tensor:
-    """From every point to the surface that all views agree on around it, ``[N, 3]`` in voxels.
+    """From every point ``[N, 3]`` to the surface that all views agree on around it, ``[N, 3]``, all in voxels.
 
-    The features' inverse-square weights would return the point's own voxel; a Gaussian of the distance keeps several,
-    and confident points, of which the square of the confidence is the evidence, outweigh the others.
-
-    Args:
-        queries: ``[N, 3]`` the points, in voxels.
-        centroids: ``[M, 3]`` positions of the voxels' centroids, in voxels.
-        evidence: ``[N, k]`` of the neighbours, 0 where there is none.
-        index: ``[N, k]`` the neighbours' rows of ``centroids``.
+    A Gaussian of the distance keeps several of the k voxels ``index [N, k]``, and confident points outweigh the others:
+    ``evidence [N, k]`` is 0 where there is no neighbour.
     """
     offset = centroids[index] - queries[:, None]  # [N, k, 3]
     weights = evidence * torch.exp(offset.square().sum(-1) / (-2 * SURFACE_WIDTH**2))  # [N, k]

@@ -1,9 +1,7 @@
 """The surfel start: a voxel's Gaussians laid along its surface, in closed form (our addition to the paper's head).
 
-A mean colour and a mean position say nothing of how the surface runs through a cell and how colour changes across it.
-The second moments of its points do: their spread, and that of the cells around, has the normal as the direction of
-least variance, and their covariance with colour over that spread is the colour's gradient along the surface, as in
-linear regression.
+The spread of a voxel's points has the surface's normal as its direction of least variance, and their covariance with
+colour over that spread is the colour's gradient along the surface, as in linear regression.
 """
 
 from __future__ import annotations
@@ -50,13 +48,9 @@ class SurfelStart(TensorRecord):
 
 @torch.no_grad()
 def surfel_start(moments: VoxelMoments, splits: int) -> SurfelStart:
-    """Lays K Gaussians out on every voxel's surface.
+    """Lays K = ``splits`` Gaussians out on every voxel's surface.
 
     Defined for every input: one point, points in a line or in one place leave a disc that faces the cameras.
-
-    Args:
-        moments: second moments of M voxels.
-        splits: K >= 1.
     """
     frame, gradient, reach = surface_frame(moments)
     grid, scales = layout(splits, moments.spread.new_zeros(()))
@@ -72,9 +66,9 @@ def surface_frame(moments: VoxelMoments) -> tuple[Tensor, Tensor, Tensor]:
     """How the surface and the colour on it run through every voxel.
 
     Returns:
-        The frame ``[M, 3, 3]`` as in :class:`SurfelStart`, turned so that its first axis leads to the brighter side and
-        its third to the cameras; the colour gradient ``[M, 3 (place), 3 (colour)]`` in the tangent plane, per cell;
-        and the points' extent ``[M, 2]`` along the first two axes, 1 for a full cell, at most 1.2.
+        The frame ``[M, 3, 3]`` as in :class:`SurfelStart`, its first axis to the brighter side, its third to the
+        cameras; the colour gradient ``[M, 3 (place), 3 (colour)]`` in the tangent plane, per cell; and the points'
+        extent ``[M, 2]`` along the first two axes, 1 for a full cell, at most 1.2.
     """
     spread, cross, facing, normal = moments.spread, moments.cross, moments.facing, moments.normal
     tangent = _orthogonal(normal)
@@ -102,11 +96,7 @@ def surface_frame(moments: VoxelMoments) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def layout(splits: int, like: Tensor) -> tuple[Tensor, Tensor]:
-    """Places ``[K, 2]`` of K Gaussians in a cell of unit extent, and their scales ``[K, 3]``.
-
-    Rows across the direction of the colour gradient's axis, as square as K allows: 2 lie in a line along it, 4 in a
-    square, 3 as two and one.
-    """
+    """Places ``[K, 2]`` of K Gaussians in a cell of unit extent, in rows, and their scales ``[K, 3]``."""
     rows = max(1, round(math.sqrt(splits)))
     places, scales = [], []
     for row in range(rows):

@@ -1,7 +1,7 @@
 """Normals of the surface through each voxel, from its own points or from those of the cells around it (ours).
 
-A cell of a few pixels holds pieces of the surfaces that several views saw, one above the other by what their depths
-differ, so the spread of its own points says little of how the surface runs. Over three cells it shows.
+A cell of a few pixels holds pieces of the surfaces of several views, one above the other; over three cells the surface
+shows.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ COLUMNS = tuple(itertools.product((-1, 0, 1), repeat=2))  # steps along x and y 
 
 @torch.no_grad()
 def surface_normals(spread: Tensor, facing: Tensor, offset: Tensor, plan: VoxelPlan, kernel: int) -> Tensor:
-    """Normals of the surface through every voxel, on the side of the cameras.
+    """Normals ``[M, 3]`` of the surface through every voxel, on the side of the cameras; compiled for float32 on a CPU.
 
     With a kernel of 3 a normal is that of all points in 27 cells, weighted by how near their cell's mean lies to the
     voxel's own tangent plane: a plane fitted to one surface, so that edges stay.
@@ -34,9 +34,6 @@ def surface_normals(spread: Tensor, facing: Tensor, offset: Tensor, plan: VoxelP
         offset: ``[M, 3]`` mean positions from the cells' centres, in cells.
         plan: which cells they are.
         kernel: cells a side that count, 1 or 3.
-
-    Returns:
-        ``[M, 3]`` unit vectors; compiled for float32 on a CPU.
     """
     own = facing_normals(spread, facing)
     if kernel == 1 or not len(plan):
@@ -46,15 +43,7 @@ def surface_normals(spread: Tensor, facing: Tensor, offset: Tensor, plan: VoxelP
 
 
 def facing_normals(spread: Tensor, facing: Tensor) -> Tensor:
-    """Directions of least spread, on the side of the cameras.
-
-    Args:
-        spread: ``[M, 3, 3]`` covariances of positions, in cells^2.
-        facing: ``[M, 3]`` unit vectors towards the cameras; the normal where the spread knows none.
-
-    Returns:
-        ``[M, 3]`` unit vectors; compiled for float32 on a CPU.
-    """
+    """Directions ``[M, 3]`` of least spread, on the cameras' side; ``facing [M, 3]`` where the spread knows none."""
     if compilable(spread, facing):
         return facing_compiled(spread, facing, FACING_PRIOR)
     return facing_reference(spread, facing)
@@ -70,16 +59,10 @@ def facing_reference(spread: Tensor, facing: Tensor) -> Tensor:
 
 
 def around_reference(spread: Tensor, normal: Tensor, offset: Tensor, plan: VoxelPlan) -> Tensor:
-    """Covariances of the points of every voxel and of the 26 around it, in plain torch.
+    """Covariances ``[M, 3, 3]`` of the points of every voxel and of the 26 around it, in plain torch.
 
-    Args:
-        spread: ``[M, 3, 3]`` covariances of the points' positions, in cells^2.
-        normal: ``[M, 3]`` of each voxel's own tangent plane.
-        offset: ``[M, 3]`` mean positions from the cells' centres, in cells.
-        plan: which cells they are.
-
-    Returns:
-        ``[M, 3, 3]``, weighted by the number of a cell's points and by how near the tangent plane their mean lies.
+    Weighted by the number of a cell's points and by how near the tangent plane their mean lies; arguments as for
+    :func:`surface_normals`, with ``normal`` of each voxel's own plane.
     """
     voxel, other, shift, lengths = _pairs(plan)
     x, y, z = (offset.index_select(0, other) - offset.index_select(0, voxel) + shift.to(offset.dtype)).unbind(-1)  # [P]

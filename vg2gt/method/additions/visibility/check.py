@@ -1,9 +1,7 @@
 """Which pixels' depth the other views support, and how fine voxels may be: our addition to the paper.
 
-A view's depth is right where there is something to match, and a guess elsewhere: on bare walls, in the sky, beyond the
-range that was searched. Around an object such guesses hang in the air in front of the cameras on the other side. Other
-views tell them apart (:mod:`vg2gt.method.additions.visibility.counts`): they see through a guess, and they see a
-surface at the same place where the depth is right.
+Depth is a guess on bare walls, in the sky and beyond the searched range; in voxels such guesses hang in the air. Other
+views see through a guess, and see a surface at the same place where the depth is right.
 """
 
 from __future__ import annotations
@@ -37,8 +35,7 @@ class Support(TensorRecord):
 class ViewCheck:
     """Decides which pixels' depth enters the scene, and how fine its voxels may be.
 
-    A pixel is dropped where more views look through its point than agree with it. Pixels that are dropped say nothing
-    in the next round. A pixel that no view agrees with and none contradicts stays.
+    A pixel is dropped where more views look through its point than agree with it, and says nothing in the next round.
 
     Args:
         tolerance: relative difference of depth up to which two views agree.

@@ -1,9 +1,8 @@
 """How many other views agree with the depth of a pixel, and how many look through its point.
 
-The point of a pixel is projected into another view. With ``r`` the point's depth there over that view's own depth, the
-view *agrees* where ``|r - 1| < tolerance``, looks *through* the point where ``r < 1 - margin`` (it sees something
-behind), and the point is *hidden* from it where ``r`` is larger. A view without depth at that pixel says nothing.
-The four pixels around the projection are read: one that agrees is enough, and all four must look through.
+With ``r`` the depth of a pixel's point in another view over that view's own depth, the view *agrees* where ``|r - 1| <
+tolerance``, looks *through* the point where ``r < 1 - margin``, and the point is *hidden* from it where ``r`` is
+larger. Of the four pixels around the projection one that agrees is enough, and all four must look through.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ class ViewCounts(TensorRecord):
 
 @torch.no_grad()
 def count_views(depth: Tensor, cameras: Cameras, partners: Tensor, tolerance: float, margin: float) -> ViewCounts:
-    """Counts what the partners of each view say of its pixels, for one scene.
+    """Counts what the partners of each view say of its pixels, for one scene; 0 for pixels without depth.
 
     Args:
         depth: ``[V, H, W]`` z-depth, 0 = none.
@@ -43,9 +42,6 @@ def count_views(depth: Tensor, cameras: Cameras, partners: Tensor, tolerance: fl
         partners: ``[V, K]`` int64 views that each view is compared with; -1 = none.
         tolerance: relative difference of depth up to which views agree.
         margin: relative difference of depth from which on a view looks through a point.
-
-    Returns:
-        The numbers; 0 for pixels without depth.
     """
     if depth.device.type == "cpu":
         return _count_compiled(depth, cameras, partners, tolerance, margin)
@@ -108,17 +104,14 @@ def _count_compiled(depth: Tensor, cameras: Cameras, partners: Tensor, tolerance
 def count_points(
     points: Tensor, depth: Tensor, cameras: Cameras, tolerance: float, margin: float
 ) -> tuple[Tensor, Tensor]:
-    """How many views agree with points in space, and how many look through them.
+    """How many views agree with points in space, and how many look through them, ``[N]`` int64 each.
 
     Args:
         points: ``[N, 3]`` in the world of the cameras.
         depth: ``[V, H, W]`` z-depth of the views, 0 = none.
         cameras: of the views (B = 1).
-        tolerance: relative difference of depth up to which a view agrees.
-        margin: relative difference of depth from which on a view looks through a point.
-
-    Returns:
-        Views that agree and views that look through, ``[N]`` int64 each.
+        tolerance: as for :func:`count_views`.
+        margin: as for :func:`count_views`.
     """
     agree, through = (torch.zeros(len(points), dtype=torch.int64, device=points.device) for _ in range(2))
     for view in range(len(depth)):
@@ -131,12 +124,12 @@ def count_points(
 
 
 def depth_ratio(points: Tensor, depth: Tensor, to_camera: Tensor, intrinsics: Tensor) -> tuple[Tensor, Tensor]:
-    """Depth of points in views over the views' own depth at the nearest pixel.
+    """Depth of points ``[V, P, 3]`` in views over the views' own depth at the nearest pixel.
 
     Args:
-        points: ``[V, P, 3]``.
+        points: in frames that ``to_camera`` ``[V, 4, 4]`` takes into the views'.
         depth: ``[V, H, W]`` z-depth of the views, 0 = none.
-        to_camera: ``[V, 4, 4]`` from the points' frames into the views'.
+        to_camera: as said.
         intrinsics: ``[V, 3, 3]`` in pixels.
 
     Returns:

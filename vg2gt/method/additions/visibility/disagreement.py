@@ -15,15 +15,10 @@ NEIGHBORS = 8  # partners of a view that are looked at
 
 @torch.no_grad()
 def disagreement(depth: Tensor, cameras: Cameras, partners: Tensor) -> Tensor:
-    """Median relative difference between a point's depth in another view and that view's own, times the focal length.
+    """Median relative difference of a point's depth in another view and that view's own, in pixels (times the focal).
 
-    Args:
-        depth: ``[V, H, W]`` of one scene, 0 = none.
-        cameras: of the views (B = 1).
-        partners: ``[V, K]`` views that each view is compared with, nearest first; -1 = none.
-
-    Returns:
-        A scalar in pixels; 0 where no two views see the same.
+    Of one scene's ``depth [V, H, W]`` (0 = none) and ``partners [V, K]``, nearest first (-1 = none); 0 where no two
+    views see the same.
     """
     pose, intrinsics = cameras.world_to_camera[0].to(depth), cameras.intrinsics[0].to(depth)
     sampled = depth[:, STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE]

@@ -14,18 +14,10 @@ LEAST = 0.02  # share of a view's samples that a partner has in its image
 
 @torch.no_grad()
 def choose_partners(depth: Tensor, cameras: Cameras, most: int) -> Tensor:
-    """The views that look where a view's points are, whatever they see there.
+    """The views that look where a view's points are, ``[V, min(most, V - 1)]`` int64, -1 where a view has fewer.
 
-    Of more than ``most`` of them every one up to half that number that is nearest by direction and place is taken, and
-    the others evenly: near views agree with a surface, and views from the other side contradict what hangs in the air.
-
-    Args:
-        depth: ``[V, H, W]`` of one scene, 0 = none.
-        cameras: of the views (B = 1).
-        most: partners a view.
-
-    Returns:
-        ``[V, min(most, V - 1)]`` int64, -1 where a view has fewer.
+    Of more than ``most``, half are the nearest by direction and place, and the others are taken evenly: near views
+    agree with a surface, and views from the other side contradict what hangs in the air.
     """
     views, height, width = depth.shape
     count = min(most, views - 1)
