@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from backends.rope import Rotary, rotate
+from backends.positions import Rotary, rotate
 
 FeedForward = Literal["mlp", "swiglu"]
 

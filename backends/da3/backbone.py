@@ -11,8 +11,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from backends.positions import resize_position_embedding
-from backends.rope import Rotary, grid_positions, rotary_2d
+from backends.positions import Rotary, grid_positions, resize_position_embedding, rotary_2d
 from backends.vit import FeedForward, PatchEmbed, ViTBlock, first_and_others
 
 ReferenceView = Literal["first", "middle", "saddle_balanced"]

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from backends.dpt import DPT
-from backends.normalization import normalize_images
+from backends.network import normalize_images
 from vg2gt.geometry.precision import full_precision
 from vg2gt.types import Tokens
 

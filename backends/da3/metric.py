@@ -13,8 +13,7 @@ from backends.base import Backend
 from backends.da3.backbone import Backbone, PretrainedBackbone
 from backends.da3.backend import NESTED_PARTS, DA3Backend
 from backends.dpt import DPT, in_chunks
-from backends.network import NetworkBackend
-from backends.normalization import normalize_images
+from backends.network import NetworkBackend, normalize_images
 from backends.weights import Weights
 from vg2gt.geometry.precision import full_precision, half_precision_on_gpu
 from vg2gt.types import Cameras, Geometry, Hints, Tokens

@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from torch import Tensor
 
 from backends.network import NetworkBackend, predict
-from backends.vggt.camera_head import ITERATIONS
-from backends.vggt.network import Aggregator, VGGTNetwork
+from backends.vggt.network import ITERATIONS, Aggregator, VGGTNetwork
 from backends.weights import Weights
 from vg2gt.geometry.precision import half_precision_on_gpu
 from vg2gt.types import Hints, Tokens

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from backends.da3.backbone import reference_first, select_reference
-from backends.da3.camera import normalize_cameras
+from backends.da3.backend import normalize_cameras
 from backends.da3.metric import fill_sky, fit_scale
 from vg2gt.geometry.cameras import invert_rigid, relative_to_first
 from vg2gt.types import Cameras, Geometry, Hints

@@ -4,9 +4,8 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from backends.poses import decode_pose, encode_pose
-from backends.positions import Resampling, resize_position_embedding, uv_embedding
-from backends.rope import grid_positions, rotary_2d, rotate
+from backends.network import decode_pose, encode_pose
+from backends.positions import Resampling, grid_positions, resize_position_embedding, rotary_2d, rotate, uv_embedding
 from vg2gt.geometry.rotations import quat_to_matrix
 
 GRIDS = [(16, 32), (37, 37), (37, 30), (5, 7), (60, 80), (1, 2)]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from vg2gt.kernels.render_cpu.binning import depth_order
+from vg2gt.kernels.render_cpu.tiles import depth_order
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

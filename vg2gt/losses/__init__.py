@@ -1,9 +1,8 @@
 """Training losses; :class:`VG2GTLoss` puts them together."""
 
-from vg2gt.losses.enhancement import EnhancementLoss
 from vg2gt.losses.gaussian import GaussianLoss
 from vg2gt.losses.geometry import GeometryLoss
-from vg2gt.losses.objective import LossReport, VG2GTLoss
-from vg2gt.losses.scale import ScaleAlignment
+from vg2gt.losses.objective import EnhancementLoss, LossReport, VG2GTLoss
+from vg2gt.losses.truth import ScaleAlignment
 
 __all__ = ["EnhancementLoss", "GaussianLoss", "GeometryLoss", "LossReport", "ScaleAlignment", "VG2GTLoss"]

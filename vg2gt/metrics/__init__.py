@@ -1,13 +1,11 @@
 """Evaluation metrics: small pure functions."""
 
 from vg2gt.metrics.cameras import camera_metrics, relative_pose_errors
-from vg2gt.metrics.depth import depth_metrics
-from vg2gt.metrics.edges import near_depth_edges
+from vg2gt.metrics.depth import depth_metrics, near_depth_edges
 from vg2gt.metrics.images import psnr, ssim
 from vg2gt.metrics.lpips import LPIPS, WeightsNotFoundError, load_lpips
 from vg2gt.metrics.normals import normal_metrics
-from vg2gt.metrics.points import point_metrics
-from vg2gt.metrics.uniformity import cv
+from vg2gt.metrics.points import cv, point_metrics
 
 __all__ = [
     "LPIPS",

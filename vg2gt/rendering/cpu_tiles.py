@@ -16,10 +16,10 @@ from torch import Tensor
 from vg2gt.kernels.constants import MEDIAN_MAX_TRANSMITTANCE, TRANSMITTANCE_STOP
 from vg2gt.kernels.render_cpu import tiles
 from vg2gt.kernels.render_cpu.backward import backward_color, backward_rasterized, backward_solid
-from vg2gt.kernels.render_cpu.binning import count_tiles, depth_order, fill_tiles
 from vg2gt.kernels.render_cpu.forward import forward_color, forward_rasterized, forward_solid
 from vg2gt.kernels.render_cpu.projection import BLOCK, project_block
 from vg2gt.kernels.render_cpu.projection_backward import CHUNK, FIELDS, project_backward_block
+from vg2gt.kernels.render_cpu.tiles import count_tiles, depth_order, fill_tiles
 from vg2gt.kernels.threads import parallel_for
 from vg2gt.rendering.median import depth_factors
 from vg2gt.rendering.options import Images, RenderOptions, SceneViews
