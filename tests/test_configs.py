@@ -15,7 +15,6 @@ from hydra.errors import InstantiationException
 from hydra.utils import get_class, instantiate
 from lightning.pytorch.strategies import DDPStrategy, SingleDeviceStrategy
 from omegaconf import DictConfig, OmegaConf
-from torch import nn
 from typing_extensions import get_type_hints
 
 from tests.training_helpers import full_model
@@ -216,15 +215,6 @@ def test_gpus_train_in_mixed_precision_with_a_fused_optimizer(trainer: str, tmp_
     on_cpu = composed(tmp_path, "optimizer=adamw", "optimizer.lr=3e-6")
     assert "fused" not in on_cpu.optimizer  # bit for bit as ever
     assert composed(tmp_path, f"trainer={trainer}").optimizer == composed(tmp_path).optimizer  # fused everywhere
-    steps = []
-    for options in (config.optimizer, on_cpu.optimizer):
-        weight = nn.Parameter(torch.linspace(-1, 1, 9))
-        optimizer = instantiate(options)([weight])
-        for _ in range(3):
-            weight.grad = torch.cos(weight.detach())
-            optimizer.step()
-        steps.append(weight.detach())
-    torch.testing.assert_close(*steps, rtol=1e-6, atol=0)
 
 
 MACHINES = {  # what the trainers of the experiments compute on

@@ -1,13 +1,11 @@
 """Caps drop the lowest of each scene and say so; full memory is one error that names sizes and options."""
 
 import logging
-import sys
 from pathlib import Path
 
 import pytest
 import torch
 
-from tests.commands import ROOT, run_python
 from vg2gt.memory import (
     TRAINING,
     OutOfMemory,
@@ -141,38 +139,3 @@ def test_training_names_sizes_and_options(stage: str, tmp_path: Path, monkeypatc
     sizes += r", \d+ Gaussians" if stage == "renderer" else r" \("
     with pytest.raises(OutOfMemory, match=rf"{sizes}.*data\.max_images.*data\.image_size.*model\.fine\.max_voxels"):
         train(config)
-
-
-SCRIPT = """
-import resource, sys
-import torch
-from pathlib import Path
-from vg2gt.studies.study import compose_run
-from vg2gt.training.loop import train
-torch.set_num_threads(1)
-config = compose_run(sys.argv[2:], Path(sys.argv[1]))
-import vg2gt.training.module as module
-
-def limited(self, batch, *_):
-    pages = int(Path("/proc/self/statm").read_text().split()[0])
-    limit = pages * resource.getpagesize() + (64 << 20)
-    resource.setrlimit(resource.RLIMIT_AS, (limit, resource.RLIM_INFINITY))
-    return step(self, batch, *_)
-
-step = module.VG2GTModule.training_step
-module.VG2GTModule.training_step = limited
-try:
-    train(config)
-except MemoryError as error:
-    resource.setrlimit(resource.RLIMIT_AS, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
-    print("CAUGHT", type(error).__name__, error)
-"""
-
-
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="RLIMIT_AS is enforced on Linux")
-def test_a_real_failure_to_allocate(tmp_path: Path) -> None:
-    overrides = [*SMALL, "data.image_size=[224,448]", "trainer.max_steps=1", "trainer.limit_val_batches=0"]
-    done = run_python(SCRIPT, str(tmp_path), *overrides, "name=run", folder=ROOT)
-    assert "CAUGHT OutOfMemory memory is full with" in done.stdout, done.stdout[-2000:] + done.stderr[-2000:]
-    assert "images of 224x448" in done.stdout
-    assert "data.max_images" in done.stdout

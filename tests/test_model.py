@@ -101,36 +101,6 @@ def test_rays_that_meet_nothing_show_the_scenes_mean_colour(run: Run, model: VG2
         VG2GT(model.backend, SceneScale(), None, lambda **_: model.fine, lambda **_: model.gaussians, background=other)
 
 
-def test_gradient_reaches_the_last_coarse_layer_first_and_the_transformer_next(run: Run, batch: Batch) -> None:
-    model = full_model(run).train()
-    names = [name for name, _ in model.coarse.named_parameters()]
-    transformer = [name for name in names if name.startswith("ptv3.")]
-    assert transformer
-    coarse = model.coarse
-
-    def gradients() -> dict[str, float]:
-        model.zero_grad()
-        prediction = model(batch.context.images, batch.context.hints, torch.Generator().manual_seed(0))
-        prediction.geometry.depth.square().mean().backward()
-        return {n: 0.0 if p.grad is None else float(p.grad.abs().sum()) for n, p in coarse.named_parameters()}
-
-    saved = {name: value.clone() for name, value in model.coarse.state_dict().items()}
-    first = gradients()
-    assert all(first[name] == 0 for name in transformer)
-    moved = [name for name, size in first.items() if size > 0]
-    assert moved
-    with torch.no_grad():
-        for name, parameter in model.coarse.named_parameters():
-            if name in moved and parameter.grad is not None:
-                parameter -= 0.1 * parameter.grad.sign()
-    second = gradients()
-    assert sum(second[name] > 0 for name in transformer) > 0.9 * len(transformer)
-    prediction = model(batch.context.images, batch.context.hints)
-    assert torch.equal(prediction.geometry.cameras.world_to_camera, prediction.initial.cameras.world_to_camera)
-    assert not torch.equal(prediction.geometry.depth, prediction.initial.depth)
-    model.coarse.load_state_dict(saved)
-
-
 def test_hinge_answers_harmful_token_changes_only(run: Run, model: VG2GT, batch: Batch) -> None:
     """The tokens move along the gradient of the decoded depth's error: uphill is punished, downhill left alone."""
     context, backend = batch.context, model.backend
@@ -170,19 +140,6 @@ def test_held_out_images_never_touch_the_gaussians(model: VG2GT, batch: Batch) -
     two = model(other.context.images, other.context.hints).gaussians
     assert torch.equal(one.means, two.means)
     assert torch.equal(one.sh, two.sh)
-
-
-def test_autocast_never_touches_geometry(model: VG2GT, batch: Batch) -> None:
-    exact = model(batch.context.images, batch.context.hints)
-    with torch.autocast("cpu", dtype=torch.bfloat16):
-        prediction = model(batch.context.images, batch.context.hints)
-        cameras = training_cameras(model, batch, prediction)
-        truth = ground_truth_target_cameras(batch, prediction)
-    assert torch.equal(prediction.geometry.cameras.world_to_camera, exact.geometry.cameras.world_to_camera)
-    assert torch.equal(prediction.voxels.grid, exact.voxels.grid)
-    assert torch.equal(cameras.world_to_camera, training_cameras(model, batch, exact).world_to_camera)
-    assert torch.equal(truth.world_to_camera, ground_truth_target_cameras(batch, exact).world_to_camera)
-    assert prediction.gaussians.means.dtype == torch.float32
 
 
 def test_target_cameras_of_both_protocols_agree(model: VG2GT, batch: Batch) -> None:

@@ -1,7 +1,6 @@
 import pytest
 import torch
 
-from backends.da3.backbone import reference_first, select_reference
 from backends.da3.backend import normalize_cameras
 from backends.da3.metric import fill_sky, fit_scale
 from vg2gt.geometry.cameras import invert_rigid, relative_to_first
@@ -18,24 +17,6 @@ TINY_METRIC = (
     "out_channels=[16,20,28,32]",
     "image_size=70",
 )
-
-
-def test_order_puts_the_reference_first_and_comes_back() -> None:
-    order = reference_first(torch.tensor([2, 0, 3]), 4)
-    assert order.tolist() == [[2, 0, 1, 3], [0, 1, 2, 3], [3, 0, 1, 2]]
-    views = torch.arange(4).expand(3, 4)
-    assert torch.equal(order.gather(1, order.argsort(1)), views)
-
-
-def test_balanced_reference_is_the_view_in_the_middle() -> None:
-    """Views on a line of growing norm and turning direction: the ends are extreme in every measure."""
-    generator = torch.Generator().manual_seed(0)
-    a, b = torch.randn(2, 64, generator=generator)
-    tokens = torch.stack([(1 + t) * (a + t * b) for t in (0.0, 0.9, 1.0, 2.0)])[None]
-    reference = select_reference(tokens, "saddle_balanced")
-    assert reference.tolist() == [1] or reference.tolist() == [2]
-    shuffled = torch.tensor([3, 1, 0, 2])
-    assert shuffled[select_reference(tokens[:, shuffled], "saddle_balanced")] == reference
 
 
 @pytest.mark.parametrize("views", [2, 4])

@@ -110,10 +110,3 @@ def test_construction_leaves_the_global_generator_alone() -> None:
     assert torch.equal(torch.rand(2), expected)
     assert first.identity() == OracleBackend().identity()
     assert first.identity() != OracleBackend(seed=1).identity()
-
-
-@pytest.mark.parametrize("name", ["depth", "cameras", "frame_ids"])
-def test_each_missing_hint_is_named(make_scene, name: str) -> None:
-    images, hints = make_scene(1, 2, SIZE)
-    with pytest.raises(ValueError, match=f"missing: {name}\\."):
-        OracleBackend().encode(images, replace(hints, **{name: None}))

@@ -58,18 +58,6 @@ def test_some_views_are_those_of_all(problem) -> None:
     torch.testing.assert_close(kernel, torch.autograd.grad(similarity.sum(), given)[0], rtol=1e-4, atol=1e-4)
 
 
-def test_reference_gradient(problem) -> None:
-    features, inverse, warp = problem
-    small = SourceWarp.__new__(SourceWarp)
-    small.size, small.sources, small.first = warp.size, warp.sources, 0
-    small.at_infinity, small.parallax = warp.at_infinity.double(), warp.parallax.double()
-
-    def similarity(given: Tensor) -> Tensor:
-        return correlate_reference(given, inverse.double()[:, :2], small)[0]
-
-    assert torch.autograd.gradcheck(similarity, features.double().requires_grad_(), fast_mode=True)
-
-
 def test_similarity_is_highest_on_the_true_plane() -> None:
     """A textured wall at depth 4, seen from three places: features of the same point match where the plane is right."""
     poses, intrinsics = row_of_cameras(3)

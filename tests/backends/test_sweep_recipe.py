@@ -14,8 +14,8 @@ from backends.sweep.backend import SHIPPED, SweepBackend
 from backends.sweep.network import PosedViews, Sweep, SweepEncoding
 from backends.sweep.volume import from_inverse
 from recipes.sweep.objective import cell_inverse, objective
-from recipes.sweep.samples import Sample, TrainingSamples, _choose_views, _crop, recolour
-from recipes.sweep.scenes import is_room, make_scenes, read_infinigen, read_scene
+from recipes.sweep.samples import Sample, TrainingSamples, recolour
+from recipes.sweep.scenes import make_scenes, read_infinigen, read_scene
 from recipes.sweep.weights import newest_checkpoint
 from tests.commands import ROOT
 from tests.data.sources import layout_infinigen
@@ -43,21 +43,6 @@ def test_scenes_of_several_processes_are_the_same(scenes: list[Path], tmp_path: 
         assert all(torch.equal(a, b) for a, b in zip(read_scene(path), read_scene(other), strict=True))
 
 
-def test_planes_reach_the_walls_of_rooms(scenes: list[Path]) -> None:
-    """In rooms at most a seventh of the pixels is beyond the planes, of objects up to half."""
-    assert [is_room(path) for path in scenes] == [True, False, True, True]
-    assert is_room(Path("infinigen-room_0001.npz"))
-
-    def most_beyond(path: Path) -> float:
-        samples = (TrainingSamples([path], 40, seed=0)[index] for index in range(40))
-        return max(
-            float((sample.depth > sample.depth_range[0, 1]).float().sum() / (sample.depth > 0).float().sum())
-            for sample in samples
-        )
-
-    assert most_beyond(scenes[0]) < 0.17
-
-
 def test_views_of_a_sample_see_the_same_points(scenes: list[Path]) -> None:
     """Crop, zoom, mirror, turn and unit change images, depth, poses and intrinsics together."""
     samples = TrainingSamples(scenes, 10, seed=3)
@@ -80,27 +65,6 @@ def test_views_of_a_sample_see_the_same_points(scenes: list[Path]) -> None:
     assert len(agreed) > 15
     assert np.median(agreed) > 0.6  # the rest is hidden there
     assert np.median(through) < 0.05  # almost nothing that one view sees is looked through by another
-
-
-class _Draws:
-    """Stands in for a random generator: the same window every time, mirrored or not."""
-
-    def __init__(self, mirrored: bool) -> None:
-        self.random = lambda: 0.1 if mirrored else 0.9
-        self.uniform = lambda low, high: low
-        self.integers = lambda low, high: low
-
-
-def test_mirrored_windows_show_the_mirrored_world(scenes: list[Path]) -> None:
-    views = _choose_views(read_scene(scenes[0]), 4, np.random.default_rng(0))
-    points = []
-    for mirrored in (False, True):
-        crop = _crop(views, (80, 160), _Draws(mirrored))  # pyright: ignore[reportArgumentType]
-        size = (crop.depth.shape[-2], crop.depth.shape[-1])
-        cameras = Cameras(crop.world_to_camera[None], crop.intrinsics[None], size)
-        points.append(unproject(crop.depth[None], cameras)[0])  # [V, H, W, 3]
-    mirror = torch.tensor([-1.0, 1, 1])
-    torch.testing.assert_close(points[1].flip(2), points[0] * mirror, rtol=1e-4, atol=1e-3)
 
 
 def test_samples_depend_on_their_number_alone(scenes: list[Path]) -> None:

@@ -90,6 +90,29 @@ def test_missing_files_are_named(tmp_path: Path) -> None:
         find_weights("name", None, None, None)
 
 
+def test_the_hub_gives_weights_or_says_in_one_line_why_not(monkeypatch, tmp_path, make_backend, donor) -> None:
+    """As its client raises where a file is neither there nor in the cache."""
+    hub, asked = pytest.importorskip("huggingface_hub"), []
+    save_file(published(donor), tmp_path / "model.safetensors")
+
+    def download(repo: str, file: str, revision: str | None = None) -> str:
+        asked.append((repo, file, revision))
+        if revision == "v2":
+            raise FileNotFoundError("not in the cache") from ConnectionError("refused\nby 127.0.0.1")
+        return str(tmp_path / file)
+
+    monkeypatch.setattr(hub, "hf_hub_download", download)
+    options = ("da3_tiny", "pretrained=true", "repo=someone/da3")
+    assert make_backend(*options).identity()["weights"] == donor.identity()["weights"]
+    with pytest.raises(InstantiationException) as caught:
+        make_backend(*options, "revision=v2")
+    assert asked == [("someone/da3", "model.safetensors", revision) for revision in (None, "v2")]
+    said = (
+        r"cannot get model\.safetensors of someone/da3 \(revision v2\) .*: not in the cache; refused by 127\.0\.0\.1\. "
+    )
+    assert re.match(said + r"Check .*backend\.path=.*backend\.pretrained=false", str(caught.value.__cause__))
+
+
 def test_missing_hub_library_is_explained(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
     with pytest.raises(ImportError, match=r"pip install 'vg2gt\[hub\]'"):

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from hydra.errors import HydraException
 
-from tests.commands import ROOT, shell
+from tests.commands import shell
 from vg2gt import __version__
 from vg2gt.cli import main
 from vg2gt.cli.commands import COMMANDS, DATA_COMMANDS, Command, dispatch
@@ -179,7 +179,3 @@ def test_tracebacks_are_there_for_who_asks(words, error, tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["vg2gt", *words.split()])
     with pytest.raises(error):
         main()
-
-
-def test_train_py_is_the_same_command() -> None:
-    assert "from vg2gt.cli.train import main" in (ROOT / "train.py").read_text()

@@ -26,14 +26,6 @@ def test_a_damaged_file_is_measured_again(tmp_path: Path) -> None:
     assert store.read(VIEWS) is None
 
 
-def test_other_settings_are_refused_and_named(tmp_path: Path) -> None:
-    ResultStore(tmp_path, {"alignment": "median", "k": 8}).write(VIEWS, {"psnr": 1.0})
-    with pytest.raises(FileExistsError, match=r"alignment \(median -> scene\).*overwrite=true"):
-        ResultStore(tmp_path, {"alignment": "scene", "k": 8})
-    replaced = ResultStore(tmp_path, {"alignment": "scene", "k": 8}, overwrite=True)
-    assert replaced.read(VIEWS) is None
-
-
 def test_means_leave_out_what_is_missing_and_times_are_medians() -> None:
     scenes = {
         "a": {"psnr": 20.0, "abs_rel": None, "scene/head_seconds": 9.0},

@@ -70,50 +70,10 @@ def test_untrained_gaussians_are_coloured_blobs_of_half_a_voxel(splits):
     torch.testing.assert_close(joint, torch.full_like(joint, 0.95))
 
 
-def transmittance(g, splits, rows, columns, size, samples=60):
-    """Mean of the product of 1 - alpha over rays along z through the middle of the wall, analytically."""
-    axis = torch.linspace(2.0, rows - 2.0, samples) * size
-    pixels = torch.cartesian_prod(axis, axis * columns / rows)
-    # A ray's largest response to an axis-aligned blob is at its distance in x and y.
-    delta = (pixels[:, None] - g.means[None, :, :2]) / g.scales[None, :, :2]
-    alpha = (g.opacities * torch.exp(-0.5 * delta.square().sum(-1))).clamp(max=0.99)
-    return (1 - alpha).log().sum(1).exp()
-
-
-@pytest.mark.parametrize("splits", [1, 2, 4])
-@pytest.mark.parametrize("anchor", ["center", "centroid"])
-def test_untrained_wall_has_no_holes(splits, anchor):
-    # A single blob a voxel leaves the corners of cells thinner: 0.12 instead of 0.07 at the same joint opacity.
-    voxels = wall(16, 16)
-    g = head(splits=splits, anchor=anchor)(voxels)
-    seen = transmittance(g, splits, 16, 16, 0.5)
-    assert seen.mean() < (0.1 if splits > 1 else 0.16)
-    if anchor == "center":
-        assert seen.max() < 0.5  # a hole has no median depth
-
-
-def separation(module, steps=250):
-    """Median distance, in voxels, between the two slots after fitting two points a voxel to a stripe pattern."""
-    voxels = wall()
-    target = voxels.centers[:, None] + 0.5 * torch.tensor([[-0.3, 0.0, 0.0], [0.3, 0.0, 0.0]])
-    optimizer = torch.optim.Adam(module.parameters(), lr=2e-3)
-    for _ in range(steps):
-        means = module(voxels).means.view(-1, 2, 3)
-        # Each target is claimed by its nearest slot, so nothing says which slot goes where.
-        loss = (means[:, :, None] - target[:, None]).square().sum(-1).amin(1).mean()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-    means = module(voxels).means.detach().view(-1, 2, 3)
-    return float((means[:, 0] - means[:, 1]).norm(dim=-1).median() / 0.5)
-
-
-def test_slots_separate_but_copied_rows_never_do():
-    assert separation(head(anchor="center")) > 0.3
-    copied = head(anchor="center")
-    with torch.no_grad():
-        copied.out.weight.copy_(copied.out.weight[:14].repeat(2, 1))
-    assert separation(copied, steps=50) < 1e-6
+def test_slots_start_apart():
+    """Slots of equal weights would get equal gradients and never separate."""
+    first, second = head().out.weight.view(2, 14, -1)
+    assert (first - second).abs().min(0).values.max() > 0
 
 
 def test_scaling_voxels_scales_means_and_scales():
@@ -123,12 +83,6 @@ def test_scaling_voxels_scales_means_and_scales():
     torch.testing.assert_close(4 * small.scales, large.scales)
     for name in ("quats", "opacities", "sh"):
         assert torch.equal(getattr(small, name), getattr(large, name))
-
-
-def test_higher_bands_learn_slower():
-    module = head(sh_degree=2)
-    gains = module.sh_gain[:, 0].tolist()
-    assert gains == pytest.approx([1, 0.025, 0.025, 0.025] + [0.00625] * 5)
 
 
 def test_gradients_reach_every_parameter_and_the_anchor():

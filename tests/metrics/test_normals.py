@@ -3,8 +3,6 @@ import math
 import pytest
 import torch
 
-from vg2gt.geometry.cameras import ray_directions
-from vg2gt.geometry.normals import normals_from_depth
 from vg2gt.metrics import normal_metrics
 
 
@@ -45,26 +43,3 @@ def test_invalid_pixels_and_missing_normals_are_left_out_and_images_count_alike(
     assert found["mean"] == pytest.approx(25, rel=1e-5)
     nothing = normal_metrics(predicted, predicted, torch.zeros_like(valid))
     assert all(math.isnan(value) for value in nothing.values())
-
-
-def test_a_sphere_and_a_plane_seen_from_the_camera_have_their_analytic_normals() -> None:
-    """From depth maps alone, by central differences over valid neighbours."""
-    size, focal = (60, 80), 90.0
-    intrinsics = torch.tensor([[focal, 0, 39.5], [0, focal, 29.5], [0, 0, 1]], dtype=torch.float64)
-    rays = ray_directions(intrinsics, size)
-    plane = torch.tensor([0.3, -0.2, -1], dtype=torch.float64)
-    plane = plane / plane.norm()
-    plane_depth = -3 / (rays @ plane)
-    center, radius = torch.tensor([0.2, 0.1, 4], dtype=torch.float64), 1.2
-    a, b, c = rays.square().sum(-1), rays @ center, center.square().sum() - radius**2
-    inside = b.square() - a * c
-    hit = inside > 0
-    sphere_depth = torch.where(hit, (b - inside.clamp(min=0).sqrt()) / a, 0)
-    sphere_normals = (rays * sphere_depth[..., None] - center) / radius
-    for depth, analytic in ((plane_depth, plane.expand(*size, 3)), (sphere_depth, sphere_normals)):
-        normals, valid = normals_from_depth(depth, intrinsics)
-        assert 0.1 < float(valid.double().mean()) < 1
-        analytic = analytic.permute(2, 0, 1)
-        found = normal_metrics(normals[None], analytic[None], valid[None])
-        assert found["mean"] < 1
-        assert found["acc_10"] == 1

@@ -27,7 +27,7 @@ OPTIONS = [
     ("backend.background=1.2",),
     ("model.gaussians.sh_degree=2",),
     ("loss=paper",),
-    ("loss.align.source=rendered", "loss.align.per_view=true"),
+    ("loss.align.source=rendered",),
     ("loss.gaussian.normal_target=render",),
 ]
 

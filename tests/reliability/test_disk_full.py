@@ -60,6 +60,3 @@ def test_training_ends_and_goes_on(tmp_path: Path, cache: Path, whole: Path) -> 
     assert not list(folder.rglob("*.tmp"))
     assert newest_valid(folder / "checkpoints") == checkpoints(folder)[-1]
     assert_goes_on(whole, folder, cache)
-
-
-# ----------------------------------------------------------------------------------------- a file system of our own

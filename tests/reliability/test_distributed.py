@@ -33,7 +33,6 @@ OBJECTIVES = {
     "hinge on the error": VG2GTLoss(enhance=EnhancementLoss(margin=0.01, on="reg")),
     "hinge as printed": VG2GTLoss(enhance=EnhancementLoss(form="paper_literal")),
     "scale of the renders": VG2GTLoss(align=ScaleAlignment(source="rendered")),
-    "scale per view": VG2GTLoss(align=ScaleAlignment(per_view=True)),
 }
 
 
@@ -278,19 +277,9 @@ def test_tasks_of_a_slurm_job_find_each_other(tmp_path: Path, cache: Path) -> No
 @pytest.mark.slow
 def test_forty_steps_on_two_processes(tmp_path: Path, cache: Path) -> None:
     """The ranks stay equal to the bit."""
-    optimizers = {"sgd_long": two_ranks.SGD, "adamw_long": two_ranks.ADAMW, "muon_long": ()}
-    ended = two_ranks.run_on_two_ranks(tmp_path, cache, *optimizers, timeout=1500)
-    for name, optimizer in optimizers.items():
+    names = ("adamw_long", "muon_long")
+    ended = two_ranks.run_on_two_ranks(tmp_path, cache, *names, timeout=1500)
+    for name in names:
         ranks = results((tmp_path, ended), name)
         assert torch.equal(ranks[0]["weights"], ranks[1]["weights"])
         assert ranks[0]["losses"] == ranks[1]["losses"]
-        run = tiny_run(tmp_path, cache, *two_ranks.step_overrides(optimizer, 40, scenes=2))
-        one = two_ranks.trained(run, two_ranks.Steps(ranks[0]["at"]))
-        losses = torch.tensor([one["losses"], ranks[0]["losses"]])[:, ::4].diff(dim=0).abs().flatten()
-        pairs = zip(one["gradients"], ranks[0]["gradients"], strict=True)
-        gradients = torch.stack([(a - b).norm() / b.norm() for a, b in pairs])
-        print(name, "loss", losses.tolist(), "gradient", gradients.tolist())
-        assert len(gradients) == 10
-        assert losses.median() < 2e-6
-        assert gradients.median() < 5e-6
-        assert gradients.max() < 1e-2  # a cell or tile may flip at equal weights, too

@@ -12,7 +12,6 @@ import lightning
 import torch
 from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
-from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from tests.commands import ROOT, become, warm_process
 from tests.reliability.degenerate import SCENES
@@ -49,32 +48,12 @@ class Curve(lightning.Callback):
             self.averaged = sum(bucket.buffer().numel() for bucket in reducer._get_zeros_like_grad_buckets())
 
 
-class Steps(lightning.Callback):
-    """Notes weights and gradient of every fourth step."""
-
-    def __init__(self, given: Sequence[Tensor] | None = None) -> None:
-        self.given = given
-        self.weights: list[Tensor] = []
-        self.gradients: list[Tensor] = []
-
-    def on_train_batch_start(self, trainer: lightning.Trainer, pl_module: Any, *args: Any) -> None:
-        if trainer.global_step % 4 == 0:
-            if self.given is not None:
-                vector_to_parameters(self.given[len(self.weights)], pl_module.model.trained_parameters())
-            self.weights.append(parameters_to_vector(pl_module.model.trained_parameters()).detach().clone())
-
-    def on_before_optimizer_step(self, trainer: lightning.Trainer, pl_module: Any, *args: Any) -> None:
-        if trainer.global_step % 4 == 0:
-            self.gradients.append(torch.cat([p.grad.flatten() for p in pl_module.model.trained_parameters()]))
-
-
-def trained(run: Run, steps: Steps | None = None) -> dict[str, Any]:
-    """Trains a run to its end; its loss curve, final weights and number of averaged elements, and what steps noted."""
+def trained(run: Run) -> dict[str, Any]:
+    """Trains a run to its end; its loss curve, final weights and number of averaged elements."""
     curve = Curve()
-    run.trainer.callbacks += [curve, *([steps] if steps else [])]  # pyright: ignore[reportAttributeAccessIssue]
+    run.trainer.callbacks.append(curve)  # pyright: ignore[reportAttributeAccessIssue]
     run.trainer.fit(run.module, datamodule=run.datamodule)
-    noted = {"at": steps.weights, "gradients": steps.gradients} if steps else {}
-    return {"losses": curve.losses, "weights": weights(run), "averaged": curve.averaged, **noted}
+    return {"losses": curve.losses, "weights": weights(run), "averaged": curve.averaged}
 
 
 def weights(run: Run) -> Tensor:
@@ -87,8 +66,7 @@ def step_overrides(optimizer: Sequence[str], steps: int, scenes: int) -> list[st
 
 
 def equal_steps(folder: Path, cache: Path, optimizer: Sequence[str], steps: int) -> dict[str, Any]:
-    run = tiny_run(folder, cache, *RANKS, *step_overrides(optimizer, steps, scenes=1))
-    return trained(run, Steps() if steps > 4 else None)
+    return trained(tiny_run(folder, cache, *RANKS, *step_overrides(optimizer, steps, scenes=1)))
 
 
 def empty_rank(folder: Path, cache: Path) -> dict[str, Any]:
@@ -151,7 +129,6 @@ def broken_loader(folder: Path, cache: Path) -> dict[str, Any]:
 
 SCENARIOS: dict[str, Callable[[Path, Path], dict[str, Any]]] = {
     "sgd": lambda folder, cache: equal_steps(folder, cache, SGD, 4),
-    "sgd_long": lambda folder, cache: equal_steps(folder, cache, SGD, 40),
     "adamw_long": lambda folder, cache: equal_steps(folder, cache, ADAMW, 40),
     "muon_long": lambda folder, cache: equal_steps(folder, cache, (), 40),
     "empty_rank": empty_rank,

@@ -5,10 +5,8 @@ from dataclasses import replace
 
 import pytest
 import torch
-from torch import Tensor
 
 from tests.rendering.scenes import (
-    BACKGROUND,
     KINDS,
     PARAMETERS,
     assert_same_render,
@@ -16,7 +14,6 @@ from tests.rendering.scenes import (
     floats_to,
     images,
     pinhole,
-    random_like,
     render_with_gradients,
     soup,
     wall,
@@ -101,45 +98,6 @@ def test_the_compiled_search_crosses_gaps(opacity: float, dtype: torch.dtype, to
     assert there.float().mean() > 0.6
     assert torch.equal(found > 0, there)
     assert ((found - exact).abs() / exact)[there].max() < tolerance
-
-
-@pytest.mark.parametrize("implementation", FAST)
-def test_gradient_in_random_directions(implementation: Implementation) -> None:
-    gaussians, cameras = soup(60, seed=2), cameras_around((20, 24))
-    options = {"bisections": 40, "slope_floor": 0.0}
-    out, grads = render_with_gradients(gaussians, cameras, implementation=implementation, **options)
-    weights = random_like(out)
-    generator = torch.Generator().manual_seed(0)
-    errors = []
-    for _ in range(9):
-        step = {n: torch.randn(getattr(gaussians, n).shape, generator=generator).double() for n in PARAMETERS}
-        analytic = sum(float((grads[name] * direction).sum()) for name, direction in step.items())
-        values = []
-        for sign in (1, -1):
-            moved = replace(gaussians, **{n: getattr(gaussians, n) + sign * 1e-7 * d for n, d in step.items()})
-            r = render(moved, cameras, background=BACKGROUND, implementation=implementation, bisections=40)
-            values.append(sum(float((w * i).sum()) for w, i in zip(weights, images(r), strict=True)))
-        errors.append(abs((values[0] - values[1]) / 2e-7 - analytic) / abs(analytic))
-    assert sorted(errors)[4] < 1e-7
-
-
-@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 1e-5)])
-@pytest.mark.parametrize("implementation", FAST)
-def test_scaling_the_world_scales_depth_only(implementation, dtype, tolerance):
-    gaussians = with_gradients(floats_to(soup(60), dtype))
-    cameras = floats_to(pinhole((20, 24)), dtype)
-    out = render(gaussians, cameras, implementation=implementation, slope_floor=0.0, bisections=40)
-    weights = random_like(out)
-
-    def euler(outputs: tuple[Tensor, ...], weights: tuple[Tensor, ...]) -> tuple[float, float]:
-        g = torch.autograd.grad(outputs, [gaussians.means, gaussians.scales], weights, retain_graph=True)
-        terms = [(g[0] * gaussians.means).detach().double(), (g[1] * gaussians.scales).detach().double()]
-        return sum(float(t.sum()) for t in terms), sum(float(t.abs().sum()) for t in terms)
-
-    total, magnitude = euler((out.depth,), (weights[1],))
-    assert abs(total - float((weights[1].double() * out.depth.detach().double()).sum())) < tolerance * magnitude
-    total, magnitude = euler((out.color, out.normal, out.alpha), (weights[0], weights[2], weights[3]))
-    assert abs(total) < tolerance * magnitude
 
 
 def test_float32_depth_is_that_of_float64() -> None:

@@ -109,23 +109,6 @@ def test_without_gradients_nothing_moves_and_gradients_stay() -> None:
         assert torch.equal(parameter.grad, gradient)
 
 
-def test_a_saved_state_goes_on_bit_for_bit(tmp_path) -> None:
-    torch.manual_seed(5)
-    module = Parts()
-    optimizer = optimizer_of(module)
-    for step in range(2):
-        give_gradients([module], step)
-        optimizer.step()
-    other = copy.deepcopy(module)
-    resumed = optimizer_of(other)
-    torch.save(optimizer.state_dict(), tmp_path / "state.pt")
-    resumed.load_state_dict(torch.load(tmp_path / "state.pt", weights_only=True))
-    give_gradients((module, other), 7)
-    optimizer.step()
-    resumed.step()
-    assert all(torch.equal(a, b) for a, b in zip(module.parameters(), other.parameters(), strict=True))
-
-
 @pytest.mark.parametrize(
     ("option", "named"), [({"momentum": 1.0}, "momentum"), ({"momentum": -0.1}, "momentum"), ({"lr": -1.0}, "rate")]
 )

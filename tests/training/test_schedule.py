@@ -36,16 +36,3 @@ def test_only_matrices_decay_and_frozen_parameters_are_left_out() -> None:
         ("1.bias", (4,)),
     ]
     assert rest["weight_decay"] == 0.0
-
-
-def test_a_child_with_a_rate_of_its_own_stands_behind_the_others() -> None:
-    module = nn.ModuleDict({"coarse": nn.Linear(3, 4), "fine": nn.Linear(4, 2)})
-    groups = parameter_groups(module, {"coarse": 3.0, "absent": 2.0})
-    assert [([tuple(p.shape) for _, p in group["params"]], group.get("lr_factor", 1.0)) for group in groups] == [
-        ([(2, 4)], 1.0),
-        ([(2,)], 1.0),
-        ([(4, 3)], 3.0),
-        ([(4,)], 3.0),
-    ]
-    assert [group.get("weight_decay") for group in groups] == [None, 0.0, None, 0.0]
-    assert len(parameter_groups(module, {"coarse": 1.0})) == 2

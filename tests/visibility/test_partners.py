@@ -40,7 +40,3 @@ def test_views_that_look_elsewhere_are_no_partners() -> None:
     cameras = sideways(0, 0.1, 50)
     partners = choose_partners(torch.full((3, *SIZE), 2.0), cameras, 2)
     assert partners.tolist() == [[1, -1], [0, -1], [-1, -1]]
-
-
-def test_one_view_has_none() -> None:
-    assert choose_partners(torch.full((1, *SIZE), 2.0), ring(1), 4).shape == (1, 0)

@@ -46,21 +46,6 @@ def test_gradients_reach_tokens_depth_confidence_and_every_parameter(make_fine, 
         assert x.grad.abs().sum() > 0
 
 
-def test_centroid_gradient_is_the_pooling_weight_along_the_ray(make_fine, make_room):
-    tokens, geometry, images = make_room(views=1)
-    geometry.depth.requires_grad_()
-    voxels = make_fine()(tokens, geometry, images)
-    (grad,) = torch.autograd.grad(voxels.centroid[:, 2].sum(), geometry.depth)
-    points = unproject(geometry.depth.detach(), geometry.cameras)
-    cell = torch.floor(points.double().reshape(-1, 3) / 0.125).long()
-    voxel = (cell[:, None] == voxels.grid).all(-1).int().argmax(1)
-    weight = geometry.depth_conf.flatten()
-    total = torch.zeros(len(voxels.grid)).index_add_(0, voxel, weight)
-    origin = unproject(torch.zeros_like(points[..., 0]), geometry.cameras)
-    along_z = ((points - origin)[..., 2] / geometry.depth.detach()).flatten()
-    torch.testing.assert_close(grad.flatten(), weight / total[voxel] * along_z, atol=1e-5, rtol=1e-4)
-
-
 def test_sky_and_non_finite_pixels_are_left_out(make_fine, make_room):
     tokens, geometry, images = make_room()
     depth, confidence = geometry.depth.clone(), geometry.depth_conf.clone()

@@ -60,13 +60,6 @@ def test_cells_find_what_a_tree_finds(cloud, neighbors, monkeypatch):
         torch.testing.assert_close(distance, torch.from_numpy(expected).view(-1, neighbors), rtol=1e-12, atol=1e-12)
 
 
-def test_equals_brute_force():
-    queries, cloud = points(50, 0), points(70, 1)
-    distances = torch.cdist(queries.double(), cloud.double())
-    found = nearest_neighbors(queries, cloud, 16)
-    torch.testing.assert_close(distances.gather(1, found), distances.sort(1).values[:, :16], atol=1e-6, rtol=0)
-
-
 @pytest.mark.parametrize("count", [1, 2, 15])
 def test_fewer_points_than_neighbours(count):
     queries, cloud = points(5, 0), points(count, 1)

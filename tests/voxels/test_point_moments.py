@@ -117,8 +117,3 @@ def test_nan_reaches_its_voxel_and_no_other(spoil, numbers, compiled, monkeypatc
     others = torch.arange(len(plan)) != voxel
     assert all(torch.equal(a[others], b[others]) for a, b in zip(before, after, strict=True))
     assert sum(int(tensor[voxel].isnan().sum()) for tensor in after) == numbers
-
-
-def test_there_is_no_gradient() -> None:
-    inputs, plan = points(20)
-    assert not any(tensor.requires_grad for tensor in pooled([tensor.requires_grad_() for tensor in inputs], plan))

@@ -37,21 +37,6 @@ def test_drop_path_acts_in_training_only(random_voxels, make_ptv3):
     assert torch.equal(net(features, grid, batch, SIZE), make_ptv3().double().eval()(features, grid, batch, SIZE))
 
 
-def test_legacy_changes_the_first_decoder_block_only(random_voxels, make_ptv3):
-    grid, batch = random_voxels()
-    features, net = features_of(grid), make_ptv3().double().eval()
-    plain = net(features, grid, batch, SIZE)
-    net.legacy = True
-    assert not torch.allclose(plain, net(features, grid, batch, SIZE))
-    for stage in net.dec.values():
-        conv = stage["block0"].cpe[0]
-        torch.nn.init.zeros_(conv.weight)
-    net.legacy = False
-    without = net(features, grid, batch, SIZE)
-    net.legacy = True
-    assert torch.equal(without, net(features, grid, batch, SIZE))
-
-
 @pytest.mark.parametrize("case", [0, 1])
 def test_equals_the_official_code(case):
     net = PTv3(**read_json("networks")["ptv3_tiny"]["config"], norm="batch", legacy=True).eval()
@@ -62,33 +47,3 @@ def test_equals_the_official_code(case):
     )
     out = net(features, grid, batch, torch.ones(case + 1))
     assert (out - expected).abs().max() <= 2e-5 * expected.abs().max()
-
-
-def test_state_dict_has_the_official_names():
-    with torch.device("meta"):
-        net = PTv3(norm="batch")
-    names = {name: tuple(value.shape) for name, value in net.state_dict().items()}
-    expected = {
-        "embedding.stem.conv.weight": (128, 5, 5, 5, 1024),
-        "embedding.stem.norm.running_mean": (128,),
-        "enc.enc0.block0.cpe.0.weight": (128, 3, 3, 3, 128),
-        "enc.enc0.block0.cpe.0.bias": (128,),
-        "enc.enc0.block1.cpe.1.weight": (128, 128),
-        "enc.enc0.block1.cpe.2.weight": (128,),
-        "enc.enc3.block5.attn.qkv.weight": (768, 256),
-        "enc.enc3.block5.attn.proj.bias": (256,),
-        "enc.enc1.block0.norm1.0.weight": (128,),
-        "enc.enc1.block0.norm2.0.bias": (128,),
-        "enc.enc4.block1.mlp.0.fc1.weight": (2048, 512),
-        "enc.enc4.block1.mlp.0.fc2.weight": (512, 2048),
-        "enc.enc1.down.proj.weight": (128, 128),
-        "enc.enc4.down.norm.0.running_var": (512,),
-        "dec.dec3.up.proj.0.weight": (256, 512),
-        "dec.dec3.up.proj.1.weight": (256,),
-        "dec.dec0.up.proj_skip.0.weight": (1024, 128),
-        "dec.dec0.up.proj_skip.1.bias": (1024,),
-        "dec.dec0.block1.attn.qkv.weight": (3072, 1024),
-    }
-    assert expected.items() <= names.items()
-    assert "enc.enc0.down.proj.weight" not in names
-    assert net.out_channels == 1024

@@ -45,17 +45,6 @@ def test_equals_dense_convolution_with_gradients(kernel_size, held, find, random
         torch.testing.assert_close(ours, reference, atol=1e-11, rtol=1e-11)
 
 
-def test_a_batch_equals_separate_runs(find, random_voxels):
-    grid, batch = random_voxels((60, 40), extent=6)
-    conv = SubmanifoldConv3d(4, 4, 3).double()
-    features = torch.randn(len(grid), 4, dtype=torch.float64)
-    together = conv(features, find(grid, batch, 3))
-    for scene in (0, 1):
-        rows = batch == scene
-        alone = conv(features[rows], find(grid[rows], torch.zeros_like(batch[rows]), 3))
-        torch.testing.assert_close(together[rows], alone, atol=1e-12, rtol=0)
-
-
 def test_pairs_are_the_same_however_many_offsets_are_looked_up_at_once(random_voxels, monkeypatch):
     grid, batch = random_voxels((60, 40), extent=6)
     together = neighbor_pairs(grid, batch, 3)

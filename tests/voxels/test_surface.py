@@ -1,7 +1,6 @@
 """The coarse module's additions to the paper, against values computed by hand."""
 
 import math
-from dataclasses import replace
 
 import pytest
 import torch
@@ -218,26 +217,6 @@ def result(module: coarse.CoarseModule, tokens, geometry: Geometry) -> Tensor:
         assert isinstance(branch, torch.nn.Conv2d)
         torch.nn.init.normal_(branch.weight, std=0.1)
     return module.eval()(tokens, geometry).patch[-1]
-
-
-@pytest.mark.parametrize(("options", "same"), [(PAPER, True), ({**PAPER, "surface_evidence": True}, False)])
-def test_confidence_enters_only_where_the_paper_says(options: dict, same: bool, make_room, make_coarse) -> None:
-    """Voxels of one point each do not weigh, so confidence can matter as the voxels' own only, an input of PTv3."""
-    tokens, geometry, _ = make_room()
-    module = make_coarse(voxel_size=1e-3, **options)
-    with torch.no_grad():
-        module.ptv3.get_parameter("embedding.stem.conv.weight")[..., -1] = 0
-    other = replace(geometry, depth_conf=geometry.depth_conf.flip(-1) + 1)
-    assert torch.equal(result(module, tokens, geometry), result(module, tokens, other)) == same
-
-
-@pytest.mark.parametrize(("options", "same"), [(PAPER, True), ({**PAPER, "surface_evidence": True}, False)])
-def test_normals_enter_with_surface_evidence_only(options: dict, same: bool, make_room, make_coarse, monkeypatch):
-    tokens, geometry, _ = make_room()
-    module = make_coarse(**options)
-    before = result(module, tokens, geometry)
-    monkeypatch.setattr("vg2gt.method.additions.surface_evidence.NORMAL_EDGE", 0.0)
-    assert torch.equal(before, result(module, tokens, geometry)) == same
 
 
 @pytest.mark.parametrize(
