@@ -71,7 +71,7 @@ class Cameras(TensorRecord):
 
     def scene(self, index: int) -> Cameras:
         """Returns the cameras of one scene, keeping the B axis (B = 1)."""
-        return Cameras(self.world_to_camera[index : index + 1], self.intrinsics[index : index + 1], self.size)
+        return self.map(lambda tensor: tensor[index : index + 1])
 
 
 @dataclass(frozen=True)
@@ -122,31 +122,14 @@ class Batch(TensorRecord):
 
     def views(self, views: slice) -> Batch:
         """Returns the batch restricted to a slice of its views, all of them counted as context."""
-        images = self.images[:, views]
-        return Batch(
-            images,
-            self.depth[:, views],
-            self.cameras.select(views),
-            self.is_metric,
-            self.frame_ids[:, views],
-            self.scene,
-            images.shape[1],
-            None if self.mask is None else self.mask[:, views],
-        )
+        every = {name: getattr(self, name) for name in ("images", "depth", "frame_ids", "mask")}
+        some = {name: value[:, views] for name, value in every.items() if value is not None}
+        return replace(self, **some, cameras=self.cameras.select(views), num_context=some["images"].shape[1])
 
     def single(self, index: int) -> Batch:
         """Returns one scene of the batch (B = 1)."""
         rows = slice(index, index + 1)
-        return Batch(
-            self.images[rows],
-            self.depth[rows],
-            self.cameras.scene(index),
-            self.is_metric[rows],
-            self.frame_ids[rows],
-            self.scene[rows],
-            self.num_context,
-            None if self.mask is None else self.mask[rows],
-        )
+        return replace(self.map(lambda tensor: tensor[rows]), scene=self.scene[rows])
 
     @property
     def context(self) -> Batch:
@@ -284,8 +267,8 @@ class Gaussians(TensorRecord):
     def __len__(self) -> int:
         return self.means.shape[0]
 
-    def select(self, rows: Tensor) -> Gaussians:
-        """Returns some of them: ``rows`` are sorted indices or ``[G]`` bool."""
+    def select(self, rows: Tensor | slice) -> Gaussians:
+        """Returns some of them: ``rows`` are sorted indices, a slice or ``[G]`` bool."""
         names = [each.name for each in fields(self) if each.name != "background"]
         return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
@@ -299,16 +282,9 @@ class Gaussians(TensorRecord):
     def scene(self, index: int) -> Gaussians:
         """Returns one scene's Gaussians, its ``batch`` set to 0."""
         bounds = torch.searchsorted(self.batch, torch.tensor([index, index + 1], device=self.batch.device))
-        rows = slice(int(bounds[0]), int(bounds[1]))
-        return Gaussians(
-            self.means[rows],
-            self.quats[rows],
-            self.scales[rows],
-            self.opacities[rows],
-            self.sh[rows],
-            torch.zeros_like(self.batch[rows]),
-            None if self.background is None else self.background[index : index + 1],
-        )
+        own = self.select(slice(int(bounds[0]), int(bounds[1])))
+        background = None if self.background is None else self.background[index : index + 1]
+        return replace(own, batch=torch.zeros_like(own.batch), background=background)
 
 
 @dataclass(frozen=True)

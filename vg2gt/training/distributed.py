@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import signal
-import subprocess
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import zip_longest
@@ -12,8 +10,6 @@ from typing import Any, TypeVar
 
 import lightning
 import torch.distributed
-
-_CONNECTION_LOST = ("onnection closed by peer", "onnection reset by peer", "Broken pipe", "NCCL", "Gloo", "gloo")
 
 Key = TypeVar("Key")
 Value = TypeVar("Value")
@@ -50,39 +46,16 @@ def ending_together(trainer: lightning.Trainer) -> Iterator[None]:
     """Ends the ranks that this process started if it fails itself: they would wait forever.
 
     Raises:
-        ChildProcessError: if this process failed because another one of the run has ended: a rank, or one that loads
-            data.
+        ChildProcessError: if a process that loads data was killed.
     """
     try:
         yield
     except BaseException as error:
-        launcher = trainer.strategy.launcher
-        lost = _lost_process(error, trainer.world_size, getattr(launcher, "procs", ()))
-        if launcher is not None:
-            launcher.kill(signal.SIGKILL)
-        if lost:
-            raise ChildProcessError(f"{lost}; start the same command with ckpt=last to go on") from error
+        if trainer.strategy.launcher is not None:
+            trainer.strategy.launcher.kill(signal.SIGKILL)
+        if isinstance(error, RuntimeError) and "DataLoader worker" in str(error):
+            raise ChildProcessError(
+                "a process that loads data was killed, often because memory is full (fewer data.workers, less "
+                f"data.memory_mb): {str(error).splitlines()[0]}; start the same command with ckpt=last to go on"
+            ) from error
         raise
-
-
-def _lost_process(error: BaseException, ranks: int, started: Sequence[subprocess.Popen[bytes]]) -> str | None:
-    """Which process of the run has ended, if that is what an error says."""
-    if not isinstance(error, RuntimeError):
-        return None
-    if "DataLoader worker" in str(error):
-        return (
-            "a process that loads data was killed, often because memory is full (fewer data.workers, less "
-            f"data.memory_mb): {str(error).splitlines()[0]}"
-        )
-    if ranks == 1 or not any(said in str(error) for said in _CONNECTION_LOST):
-        return None
-    ended = [f"rank {rank} has ended with status {code}" for rank, code in _statuses(started) if code is not None]
-    return ", ".join(ended) or f"another of the {ranks} processes of this run has ended"
-
-
-def _statuses(started: Sequence[subprocess.Popen[bytes]]) -> Iterator[tuple[int, int | None]]:
-    """Local ranks that this process started, and how they ended; their death may be a moment old."""
-    deadline = time.monotonic() + 2
-    while time.monotonic() < deadline and started and all(process.poll() is None for process in started):
-        time.sleep(0.05)
-    return ((number + 1, process.poll()) for number, process in enumerate(started))
