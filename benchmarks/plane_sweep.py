@@ -47,29 +47,13 @@ _WINDOW = 7  # pixels of the classical matching cost, at half resolution
 _PLANES = 64
 
 
-def batches(overrides: str, new_poses: bool = False) -> Iterator[Batch]:
-    """The input views of the evaluation of a data configuration: 8 per scene or window.
-
-    Args:
-        overrides: of the configuration.
-        new_poses: with poses found anew from the images; prints by how much they differ from the recording's.
-    """
+def batches(overrides: str) -> Iterator[Batch]:
+    """The input views of the evaluation of a data configuration: 8 per scene or window."""
     config = compose("train", *overrides.split(), "data.eval_target=1", "data.eval_context=8")
     data = instantiate(config.data)
     data.setup("validate")
-    poses: dict[str, dict[int, Tensor]] = {}
     for batch in data.val_dataloader():
-        context = batch.context
-        if new_poses:
-            from found_poses import found_poses, pose_changes, with_poses  # needs pycolmap
-
-            scene = context.scene[0]
-            if scene not in poses:
-                poses[scene] = found_poses(instantiate(config.data.val)(**data.common), scene)
-            context = with_poses(context, poses[scene])
-            angle, moved = pose_changes(batch.context.cameras, context.cameras)
-            print(f"{context.scene[0]}: poses differ by up to {angle:.2f} degrees, {moved:.3f} of the extent")
-        yield context
+        yield batch.context
 
 
 def scores(depth: Tensor, truth: Tensor, confidence: Tensor | None) -> dict[str, float]:
@@ -171,9 +155,6 @@ def main() -> None:
     arguments.add_argument("--scenes", type=int, default=16, help="rooms")
     arguments.add_argument("--seed", type=int, default=1_000_000, help="of the first room")
     arguments.add_argument("--only-network", action="store_true")
-    arguments.add_argument(
-        "--found-poses", action="store_true", help="also with the recordings' poses found anew; needs pycolmap"
-    )
     options = arguments.parse_args()
     torch.set_num_threads(options.threads)
     backend = SweepBackend(path=options.weights)
@@ -182,12 +163,8 @@ def main() -> None:
         given = vars(options)
         if any(f"{{{place}}}" in overrides and given[place] is None for place in ("shared", "infinigen")):
             continue
-        place = overrides.format(**given)
-        rows = [measure(backend, batch, not options.only_network) for batch in batches(place)]
+        rows = [measure(backend, batch, not options.only_network) for batch in batches(overrides.format(**given))]
         table[name] = {method: average([row[method] for row in rows]) for method in rows[0]}
-        if options.found_poses and "{shared}" in overrides:
-            rows = [measure(backend, batch, False)["network"] for batch in batches(place, new_poses=True)]
-            table[name]["poses found"] = average(rows)
         for method, figures in table[name].items():
             print(
                 f"{name:18} {method:16}", " ".join(f"{key} {value:.4f}" for key, value in figures.items()), flush=True

@@ -8,5 +8,5 @@ BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 
 def test_every_script_is_in_the_table() -> None:
     scripts = {path.name for path in BENCHMARKS.glob("*.py")} - {"common.py", "stage_clock.py"}
-    helpers = {"found_poses.py", "opensplat.py", "photo_sets.py", "render_scene.py"}
+    helpers = {"opensplat.py", "photo_sets.py", "render_scene.py"}
     assert set(re.findall(r"`(\w+\.py)`", (BENCHMARKS / "README.md").read_text())) - {"train.py"} == scripts - helpers
