@@ -1,5 +1,5 @@
 """VGGT behind the backend interface."""
 
-from backends.vggt.backend import VGGTBackend
+from backends.vggt.network import VGGTBackend
 
 __all__ = ["VGGTBackend"]

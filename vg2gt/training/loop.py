@@ -34,8 +34,7 @@ from vg2gt.runs.lock import only_process_in
 from vg2gt.training.checkpointing import AtomicCheckpointIO
 from vg2gt.training.distributed import ending_together
 from vg2gt.training.module import VG2GTModule
-from vg2gt.training.preview import write_preview
-from vg2gt.training.report import comparison_table, print_comparison
+from vg2gt.training.report import comparison_table, print_comparison, write_preview
 from vg2gt.training.start import checkpoint_to_resume, load_start, prepare_folder
 
 log = logging.getLogger(__name__)
