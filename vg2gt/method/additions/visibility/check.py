@@ -139,7 +139,7 @@ def disagreement(depth: Tensor, cameras: Cameras, partners: Tensor) -> Tensor:
 
 
 SAMPLES = 12  # pixels a side of the grid that overlap is measured on
-LEAST = 0.02  # share of a view's samples that a partner has in its image
+LEAST_OVERLAP = 0.02  # share of a view's samples that a partner has in its image
 
 
 @torch.no_grad()
@@ -172,9 +172,9 @@ def choose_partners(depth: Tensor, cameras: Cameras, most: int) -> Tensor:
         share[:, other] = inside.sum(1) / known.sum(1).clamp(min=1)
     share.fill_diagonal_(0)
     turn = torch.einsum("vij,wij->vw", pose[:, :3, :3], pose[:, :3, :3])  # 1 + 2 cos of the angle between views
-    score = torch.where(share >= LEAST, share * (turn + 2), -1.0)
+    score = torch.where(share >= LEAST_OVERLAP, share * (turn + 2), -1.0)
     ranked = score.argsort(dim=1, descending=True, stable=True)
-    usable = (share >= LEAST).sum(1)
+    usable = (share >= LEAST_OVERLAP).sum(1)
     return torch.stack([_spread(order, int(n), count) for order, n in zip(ranked, usable.tolist(), strict=True)])
 
 
