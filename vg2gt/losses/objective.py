@@ -19,7 +19,7 @@ COMPARED = ("total", "reg")
 
 @dataclass(frozen=True)
 class EnhancementLoss:
-    """A hinge on one task's loss before and after enhancement, for one scene.
+    """A hinge on one task's loss before and after enhancement, for one scene (paper, eqn enhance_loss).
 
     The paper prints ``max(0, L_before - L_after)``, which punishes improvement; its text means the opposite.
 
