@@ -18,7 +18,7 @@ from torch.nn import functional as F
 
 from backends.base import Backend, seeded_initialisation
 from backends.vit import PatchEmbed, ViTBlock
-from vg2gt.geometry.cameras import invert_rigid, relative_to_first, unproject
+from vg2gt.geometry.cameras import invert_rigid, relative_to_first, scale_translations, unproject
 from vg2gt.geometry.precision import full_precision
 from vg2gt.geometry.rotations import quat_to_matrix
 from vg2gt.types import Cameras, Geometry, Hints, Tokens
@@ -39,7 +39,8 @@ class OracleBackend(Backend):
     deviation) and one normal value c per view, then bleeds over depth edges as decoded depth does. Confidence is
     ``1 + 4 exp(-|relative error| / max(depth_noise, 0.01))`` times log-normal noise. Camera rotations err by
     ``0.5 * pose_noise`` rad and positions by ``pose_noise`` median depths of their view, per axis; view 0 is exact.
-    All noise is seeded by (seed, scene, frame), whatever the order or number of views.
+    All noise is seeded by (seed, scene, frame), whatever the order or number of views. With ``drift`` the unit of views
+    that are given together is off by up to this share, one factor for depth and positions, seeded by all their frames.
 
     Tokens mix, by a fixed rotation of the channels, the image features of a small frozen random ViT and the predicted
     geometry of the patch. ``decode`` multiplies the depth by ``exp(response * u)``, u the bicubically upsampled mean
@@ -53,6 +54,7 @@ class OracleBackend(Backend):
         depth_noise: standard deviation of the relative depth error.
         pose_noise: see above; None means ``0.1 * depth_noise``.
         response: log-depth answer to a unit change of the tokens.
+        drift: see above.
         background: depth given to pixels without depth, such as the sky, in multiples of their scene's deepest, with
             the least confidence; None leaves them without.
         seed: of the noise and of the frozen weights.
@@ -71,6 +73,7 @@ class OracleBackend(Backend):
         depth_noise: float = 0.02,
         pose_noise: float | None = None,
         response: float = 0.02,
+        drift: float = 0.0,
         background: float | None = None,
         seed: int = 0,
     ) -> None:
@@ -79,11 +82,14 @@ class OracleBackend(Backend):
             raise ValueError(f"backend.dim must be a multiple of 4 and at least {2 * GEOMETRY_CHANNELS}, got {dim}")
         if depth_noise < 0 or pose_noise < 0:
             raise ValueError(f"noise must not be negative: depth_noise {depth_noise}, pose_noise {pose_noise}")
+        if not 0 <= drift < 1:
+            raise ValueError(f"backend.drift must be at least 0 and below 1, got {drift}")
         if background is not None and background < 1:
             raise ValueError(f"backend.background must be at least 1 (deepest depths) or null, got {background}")
         super().__init__("oracle", patch_size, (dim,) * taps, licence="Apache-2.0 (no weights)", needs_hints=True)
         self.depth_noise = depth_noise
         self.pose_noise = pose_noise
+        self.drift = drift
         self.response = response
         self.background = background
         self.seed = seed
@@ -112,8 +118,10 @@ class OracleBackend(Backend):
         grid = (height // self.patch_size, width // self.patch_size)
         with full_precision(images):
             images, depth = images.float(), hints.depth.float()
+            unit = self._unit(hints, depth)
+            depth = depth * unit[:, None, None, None]
             noise = self._draw(hints, (height, width), depth)
-            cameras = self._predict_cameras(hints.cameras, depth, noise.pose)
+            cameras = self._predict_cameras(scale_translations(hints.cameras, unit), depth, noise.pose)
             predicted = _bleed(depth * (1 + self.depth_noise * noise.relative))
             confidence = self._predict_confidence(predicted, depth, noise)
             if self.background is not None:
@@ -147,9 +155,19 @@ class OracleBackend(Backend):
         assert hints.depth is not None
         assert hints.cameras is not None
         with full_precision(images):
-            depth = hints.depth.float()
+            unit = self._unit(hints, hints.depth.float())
+            depth = hints.depth.float() * unit[:, None, None, None]
             poses = self._draw_parts(hints, 3, (0, 0), depth)[2]
-            return self._predict_cameras(hints.cameras, depth, poses)
+            return self._predict_cameras(scale_translations(hints.cameras, unit), depth, poses)
+
+    def _unit(self, hints: Hints, like: Tensor) -> Tensor:
+        """The factor ``[B]`` of ``drift``; exactly 1 without."""
+        assert hints.frame_ids is not None
+        factors = []
+        for scene, frames in zip(hints.scene_key, hints.frame_ids.tolist(), strict=True):
+            key = hashlib.sha256(f"drift {self.seed}/{scene}/{frames}".encode()).digest()
+            factors.append(1 + self.drift * np.random.default_rng(int.from_bytes(key, "big")).uniform(-1, 1))
+        return like.new_tensor(factors)
 
     def _draw(self, hints: Hints, size: tuple[int, int], like: Tensor) -> _Noise:
         """Draws the noise of every view from its own generator."""

@@ -123,13 +123,18 @@ class Reconstructor(nn.Module, ABC):
             Geometry and Gaussians in scene units and in the frame of view 0.
         """
 
-    def read_views(self, images: Tensor, hints: Hints | None) -> tuple[Tokens, Geometry, Tensor]:
-        """Runs the frozen backbone (eqn preliminary_vggt): tokens, geometry in the scene frame, unit ``[B]``."""
+    def read_views(
+        self, images: Tensor, hints: Hints | None, unit: Tensor | None = None
+    ) -> tuple[Tokens, Geometry, Tensor]:
+        """Runs the frozen backbone (eqn preliminary_vggt): tokens, geometry in the scene frame, unit ``[B]``.
+
+        A given ``unit`` takes the place of the model's own.
+        """
         scenes, views, _, height, width = images.shape
         note_sizes({f"images of {height}x{width} in {scenes} scene{'s' * (scenes > 1)}": scenes * views}, first=True)
         tokens, raw = self.run_backbone(images, hints)
         raw = masked(raw, hints)
-        unit = self.scale(raw, hints)
+        unit = self.scale(raw, hints) if unit is None else unit
         return tokens, _to_scene_frame(raw, unit), unit
 
     def run_backbone(self, images: Tensor, hints: Hints | None) -> tuple[Tokens, Geometry]:
@@ -166,9 +171,8 @@ class Reconstructor(nn.Module, ABC):
         """
         if self.background == "black":
             return gaussians
-        weight = torch.where(depth > 0, SEEN_WEIGHT, 1.0)[:, :, None]  # [B, V, 1, H, W]
-        total = (weight * images.detach().float()).sum((1, 3, 4))  # [B, 3]
-        return replace(gaussians, background=total / weight.sum((1, 3, 4)))
+        total, weight = background_sums(images, depth)
+        return replace(gaussians, background=total / weight)
 
     def trained_parameters(self) -> list[nn.Parameter]:
         """The parameters that training changes: everything but a frozen backbone."""
@@ -256,10 +260,14 @@ class VG2GT(Reconstructor):
         return Prediction(decoded.initial, decoded.geometry, decoded.unit, voxels, gaussians, keep)
 
     def enhance(
-        self, images: Tensor, hints: Hints | None = None, generator: torch.Generator | None = None
+        self,
+        images: Tensor,
+        hints: Hints | None = None,
+        generator: torch.Generator | None = None,
+        unit: Tensor | None = None,
     ) -> tuple[Tokens, Decoded]:
-        """Enhanced tokens, and geometry before and after enhancement (paper, Coarse-level)."""
-        tokens, initial, unit = self.read_views(images, hints)
+        """Enhanced tokens, and geometry before and after enhancement (paper, Coarse-level), see :meth:`read_views`."""
+        tokens, initial, unit = self.read_views(images, hints, unit)
         if self.coarse is None:
             return tokens, Decoded(initial, initial, unit)
         with stage("coarse"):
@@ -270,6 +278,12 @@ class VG2GT(Reconstructor):
         depth = again.depth * unit[:, None, None, None]
         depth = depth if not self.keep_scale else with_scale_of(initial, depth)
         return tokens, Decoded(initial, replace(initial, depth=depth, depth_conf=again.depth_conf), unit)
+
+
+def background_sums(images: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]:
+    """Weighted sum of the colours ``[B, 3]`` that a scene's background is the mean of, and the weights' ``[B, 1]``."""
+    weight = torch.where(depth > 0, SEEN_WEIGHT, 1.0)[:, :, None]  # [B, V, 1, H, W]
+    return (weight * images.detach().float()).sum((1, 3, 4)), weight.sum((1, 3, 4))
 
 
 def masked(geometry: Geometry, hints: Hints | None) -> Geometry:

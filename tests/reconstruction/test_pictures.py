@@ -6,7 +6,8 @@ import pytest
 import torch
 from PIL import Image
 
-from vg2gt.io import write_video
+from vg2gt.io import read_video, video, write_video
+from vg2gt.reconstruction import pictures
 from vg2gt.reconstruction.given_cameras import given_pictures
 from vg2gt.reconstruction.inputs import load_views, working_size
 from vg2gt.reconstruction.monitor import Monitor
@@ -104,3 +105,18 @@ def test_what_cannot_be_read_is_named(tmp_path: Path, monkeypatch) -> None:
 def test_what_is_no_image(item, said: str) -> None:
     with pytest.raises(ValueError, match=said):
         find_pictures([item])
+
+
+def test_a_long_video_is_decoded_when_it_is_read(tmp_path: Path, monkeypatch) -> None:
+    pytest.importorskip("av")
+    frames = [np.full((32, 48, 3), 7 * i, np.uint8) for i in range(30)]
+    path = write_video(tmp_path / "walk.mp4", frames)
+    whole = find_pictures(path, every=2)
+    monkeypatch.setattr(pictures, "IN_MEMORY", 10)
+    reads = []
+    monkeypatch.setattr(video, "read_video", lambda *inputs: reads.append(inputs) or read_video(*inputs))
+    lazy = find_pictures(path, every=2)
+    assert [(p.name, p.size) for p in lazy] == [(p.name, p.size) for p in whole]
+    for i in (0, 1, 5, 14, 3):
+        assert torch.equal(lazy[i].read((32, 48)).images, whole[i].read((32, 48)).images)
+    assert len(reads) == 2  # once in order, once again for the frame before

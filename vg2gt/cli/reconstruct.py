@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import logging
+import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +14,17 @@ from vg2gt.cli.arguments import OVERRIDES, add_common_flags, flag_parser, listin
 from vg2gt.cli.commands import COMMANDS
 from vg2gt.cli.errors import errors_in_one_line
 from vg2gt.cli.refine import options_for, print_refinement
-from vg2gt.reconstruction.output_names import DEFAULT, ORBIT_FRAMES, OUTPUTS, PREDICTED, REFINED, SFM
+from vg2gt.reconstruction.output_names import (
+    DEFAULT,
+    LARGE,
+    ORBIT_FRAMES,
+    OUTPUTS,
+    PREDICTED,
+    REFINED,
+    SFM,
+    TILES,
+    WINDOWS,
+)
 
 POSES = (
     "cameras from files next to the images, from structure from motion (kept in DIR/sfm), or the backbone's own; auto: "
@@ -23,6 +34,11 @@ POSES = (
 FRAME = (
     "frame and unit of what is written: of the given cameras, of the first image's camera, or upright (y down); auto: "
     "given if cameras are given, else upright"
+)
+
+WINDOW = (
+    "work on N images and their neighbours at a time, which bounds the memory; 0: all at once; default: 24 where there "
+    "are more than 100 images (kept in DIR/windows until the end, so that an interrupted command goes on)"
 )
 
 REFINE = "steps of refinement on the images; default: 400 for photographs, 0 for RGB-D recordings; 0: feed-forward"
@@ -38,13 +54,18 @@ def parser() -> argparse.ArgumentParser:
     arguments = flag_parser("reconstruct", COMMANDS["reconstruct"], OVERRIDES + listing(OUTPUTS))
     add = arguments.add_argument
     add("images", nargs="+", help="image files, a folder of them, a video, or a recording with known cameras")
-    add("--out", required=True, metavar="DIR", help="where to write")
+    place = arguments.add_mutually_exclusive_group(required=True).add_argument
+    place("--out", metavar="DIR", help="where to write")
+    place("--add", metavar="DIR", help="add the images, with given cameras, to the scene of --keep-windows in DIR")
+    place("--take-out", metavar="DIR", help="take the images of one --add out of the scene in DIR")
     add("--ckpt", metavar="PATH", help="a checkpoint or a run's folder; without it the head is untrained")
     add("--poses", choices=("auto", "given", "sfm", "backbone"), default="auto", help=POSES)
     add("--frame", choices=("auto", "given", "first", "upright"), default="auto", help=FRAME)
     add("--size", type=_size, metavar="N|HxW", help="longer side, or height x width, in pixels; default 518, CPU 280")
     add("--every", type=int, default=1, metavar="N", help="take every N-th image or frame only")
     add("--max-images", type=int, metavar="N", help="take at most N, evenly spread; of a video 32 by default")
+    add("--window", type=int, metavar="N", help=WINDOW)
+    add("--keep-windows", action="store_true", help="keep what --add and --take-out need in DIR/windows")
     add("--refine", type=_steps, metavar="N", help=REFINE)
     add("--frames", type=int, default=ORBIT_FRAMES, metavar="N", help=f"length of the orbit, default {ORBIT_FRAMES}")
     add("--mesh-voxel", type=float, metavar="X", help="edge of the mesh's voxels in scene units")
@@ -74,17 +95,24 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     from vg2gt.io.video import require_pyav
     from vg2gt.memory import RECONSTRUCTION, memory_advice
     from vg2gt.reconstruction.cameras import check_depth, check_pycolmap
+    from vg2gt.reconstruction.changes import add_images, take_out
     from vg2gt.reconstruction.monitor import Monitor
     from vg2gt.reconstruction.outputs import check_folder, check_outputs, cost_figures, write_outputs
     from vg2gt.reconstruction.pictures import check_choice, check_pictures, existing_path
     from vg2gt.reconstruction.pipeline import reconstruct_with
     from vg2gt.reconstruction.refined import refine_scene
+    from vg2gt.reconstruction.windows.capture import window_size
+    from vg2gt.reconstruction.windows.run import window_model
+    from vg2gt.reconstruction.windows.sets import tidy
     from vg2gt.runs.load import backend_class, choose_device, load_model
 
-    options.out = str(Path(options.out).expanduser())
+    changed = options.add or options.take_out
+    options.out = str(Path(changed or options.out).expanduser())
+    options.overwrite |= changed is not None
     check_outputs(options.save)
     check_folder(options.out, [*options.save, REFINED], options.overwrite)
     check_choice(options.every, options.max_images)
+    window_size(options.window, 0)
     for item in options.images:  # before weights are downloaded
         existing_path(item)
     kind = backend_class(options.ckpt, overrides)
@@ -98,22 +126,33 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     with Monitor(show=not options.quiet, device=choose_device(options.device)) as monitor:
         with monitor.stage("load model"):
             ready = load_model(options.ckpt, overrides=overrides, device=options.device)
-        scene = reconstruct_with(
-            ready.model,
-            options.images,
-            every=options.every,
-            max_images=options.max_images,
-            size=options.size,
-            renderer=replace(ready.renderer, mode=options.mode),
-            monitor=monitor,
-            poses=options.poses,
-            sfm_folder=Path(options.out) / SFM,
-            frame=options.frame,
-            skip_damaged=options.skip_damaged,
-        )
+        renderer = replace(ready.renderer, mode=options.mode)
+        if changed:
+            change = add_images if options.add else take_out
+            place = (Path(options.out), options.images)
+            scene = change(window_model(ready.model), *place, renderer, monitor, options.window)
+        else:
+            scene = reconstruct_with(
+                ready.model,
+                options.images,
+                every=options.every,
+                max_images=options.max_images,
+                size=options.size,
+                renderer=renderer,
+                monitor=monitor,
+                poses=options.poses,
+                sfm_folder=Path(options.out) / SFM,
+                frame=options.frame,
+                skip_damaged=options.skip_damaged,
+                window=options.window,
+                window_folder=Path(options.out) / WINDOWS,
+                keep_windows=options.keep_windows,
+            )
         how = _refinement(scene, options.refine)
         if how is not None:
             scene = refine_scene(scene, how, monitor)
+        if len(scene.gaussians) > LARGE and TILES not in options.save:
+            options.save.append(TILES)
         figures = _figures(ready)
         with memory_advice(RECONSTRUCTION):
             folder = write_outputs(
@@ -126,6 +165,10 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
                 figures=figures,
                 monitor=monitor,
             )
+    if changed or options.keep_windows:
+        tidy(folder / WINDOWS)
+    else:
+        shutil.rmtree(folder / WINDOWS, ignore_errors=True)
     cost = cost_figures(monitor)
     times = ", ".join(f"{name} {seconds:.1f}" for name, seconds in cost["seconds"].items())
     height, width = scene.cameras.size
@@ -139,10 +182,12 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
 
 
 def _refinement(scene: Scene, steps: int | None) -> RefineOptions | None:
-    """How a scene is refined: photographs unless ``steps`` is 0, recordings only where it is given."""
+    """How a scene is refined: photographs unless ``steps`` is 0, recordings and long captures only if it is given."""
     from vg2gt.reconstruction.refined import refinement_of
+    from vg2gt.reconstruction.windows.capture import AUTOMATIC
 
-    if steps == 0 or (steps is None and refinement_of(scene) == "default"):
+    many = len(scene.names) > AUTOMATIC  # refinement has all images in memory
+    if steps == 0 or (steps is None and (many or refinement_of(scene) == "default")):
         return None
     how = options_for(scene, steps=steps)
     if steps is None:

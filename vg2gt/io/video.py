@@ -90,6 +90,30 @@ def read_video(path: str | Path, every: int = 1) -> Iterator[tuple[int, NDArray[
             raise FormatError(f"{path}: no frame of it can be decoded; it is truncated or damaged")
 
 
+class VideoFrames:
+    """Every so many-th frame of a video, decoded when it is read; read in their order, each is decoded once."""
+
+    def __init__(self, path: str | Path, every: int = 1) -> None:
+        self._path, self._every = path, every
+        self._rest, self._number = read_video(path, every), -1
+        self._pixels = np.zeros((0, 0, 3), np.uint8)
+
+    def read(self, number: int) -> NDArray[np.uint8]:
+        """The pixels ``[H, W, 3]`` of one of them.
+
+        Raises:
+            FormatError: if it cannot be decoded.
+        """
+        if number < self._number:
+            self._rest, self._number = read_video(self._path, self._every), -1
+        while self._number < number:
+            found = next(self._rest, None)
+            if found is None:
+                raise FormatError(f"{self._path}: frame {number} cannot be decoded; the file is damaged")
+            self._number, self._pixels = found
+        return self._pixels
+
+
 def read_frame(path: str | Path, number: int) -> NDArray[np.uint8]:
     """Decodes one frame ``[H, W, 3]`` of a video, from the last key frame before it.
 

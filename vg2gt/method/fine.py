@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from vg2gt.geometry.cameras import camera_centers, focal_lengths, unproject
+from vg2gt.geometry.precision import full_precision
 from vg2gt.geometry.symmetric import UPPER
+from vg2gt.kernels.point_moments import Moments
 from vg2gt.memory import Cap, check_limit, note_sizes
 from vg2gt.method.additions.point_moments import pool_point_moments
 from vg2gt.method.additions.silhouette import on_surface
@@ -29,6 +32,7 @@ from vg2gt.method.grid import (
 )
 from vg2gt.method.point_features import pool_point_features, pool_point_features_of_chunks
 from vg2gt.method.point_mlp import PointMLP
+from vg2gt.method.pooled import MOMENTS, PooledVoxels
 from vg2gt.types import Geometry, Tokens, VoxelMoments, Voxels
 
 log = logging.getLogger(__name__)
@@ -112,19 +116,66 @@ class FineModule(nn.Module):
         Raises:
             ValueError: if a scene spans too many voxels to be numbered.
         """
-        with torch.autocast(images.device.type, enabled=False):
+        with full_precision(images):
             size = scene_voxel_size(geometry, self.voxel_size, self.min_footprint, coarsen)
+        return self._refine(self._measure(tokens, geometry, images, size, self.max_voxels), size)
+
+    @torch.no_grad()
+    def pool(self, tokens: Tokens, geometry: Geometry, images: Tensor, size: Tensor) -> PooledVoxels:
+        """The part of :meth:`forward` that looks at pixels, for some views of one scene (B = 1), to be merged.
+
+        Args:
+            tokens: as for :meth:`forward`.
+            geometry: as for :meth:`forward`, in the frame of the whole scene.
+            images: as for :meth:`forward`.
+            size: ``[1]`` edge of the whole scene's voxels.
+        """
+        plan, features, means, confidence, moments, weights = self._measure(tokens, geometry, images, size, None)
+        ordered = weights[plan.order].double()
+        weight = torch.segment_reduce(ordered, "sum", lengths=plan.counts, unsafe=True) if len(plan) else ordered
+        columns = None if moments is None else torch.cat([each.reshape(len(plan), -1) for each in moments], 1)
+        return PooledVoxels(plan.grid, plan.counts, weight, confidence, features, means, columns)
+
+    @torch.no_grad()
+    def refine(self, pooled: PooledVoxels, size: Tensor) -> Voxels:
+        """The rest of :meth:`forward`: refines the voxels of a whole scene that :meth:`pool` gave and that were merged.
+
+        Args:
+            pooled: the merged voxels.
+            size: ``[1]`` their edge.
+        """
+        if self.max_voxels is not None:
+            keep = self.cap(self.max_voxels, pooled.confidence, torch.zeros_like(pooled.count))
+            pooled = pooled if keep is None else pooled.rows(keep)
+        note_sizes({"voxels": len(pooled)})
+        moments = None
+        if pooled.moments is not None:
+            spread, cross, eye, pixel = pooled.moments.split(MOMENTS, 1)
+            moments = spread.unflatten(-1, (3, 3)), cross.unflatten(-1, (3, 3)), eye, pixel[:, 0]
+        parts = (pooled.features, pooled.means, pooled.confidence, moments, pooled.weight)
+        return self._refine(_Measured(pooled.plan(), *parts), size)
+
+    def _measure(
+        self, tokens: Tokens, geometry: Geometry, images: Tensor, size: Tensor, max_voxels: int | None
+    ) -> _Measured:
+        with full_precision(images):
             points = _Points(geometry, size, self.drop_fringes)
-            plan = self._plan(points)
+            plan = self._plan(points, max_voxels)
             if images.shape[1] > 1:
                 warn_if_sparse(plan, len(size), "fine")
         pooled = self._pool_features(tokens, images, points, plan)
-        with torch.autocast(images.device.type, enabled=False):
+        with full_precision(images):
             pixels = images.float().permute(0, 1, 3, 4, 2).reshape(-1, 3)  # [B V H W, 3]
             values = torch.cat((points.offset, pixels), -1)  # [B V H W, 6]
             means = pool_mean(values, points.confidence, plan)
-            offset, colors = means.split(3, -1)
             confidence = pool_min(points.confidence, plan)
+            moments = self._pool_moments(geometry, size, values, points.confidence, means, plan)
+        return _Measured(plan, pooled, means, confidence, moments, points.confidence)
+
+    def _refine(self, measured: _Measured, size: Tensor) -> Voxels:
+        plan, pooled, means, confidence, found, _ = measured
+        with full_precision(pooled):
+            offset, colors = means.split(3, -1)
             count = plan.counts.to(pooled.dtype)
             density = torch.log(count / _scene_medians(count, plan.batch, len(size)))
             extra = [2 * colors - 1, 2 * offset, density[:, None], confidence.log()[:, None]]
@@ -132,8 +183,8 @@ class FineModule(nn.Module):
             centroid = (plan.grid + 0.5 + offset.double()) * size.double()[plan.batch, None]
             centroid = centroid.to(pooled.dtype)
             moments = None
-            if self.moments:
-                moments = self._pool_moments(geometry, size, values, points.confidence, means, centroid, plan)
+            if found is not None:
+                moments = self._moments(found, means, centroid, plan)
                 spread = [moments.spread[:, i, j] for i, j in zip(*UPPER, strict=True)]
                 extra += [SPREAD_SCALE * torch.stack(spread, -1), CROSS_SCALE * moments.cross.flatten(1)]
         refined = self.point_mlp(torch.cat((pooled, *extra), -1), plan.grid, plan.batch, size)
@@ -141,21 +192,20 @@ class FineModule(nn.Module):
 
     @torch.no_grad()
     def _pool_moments(
-        self,
-        geometry: Geometry,
-        size: Tensor,
-        values: Tensor,
-        confidence: Tensor,
-        means: Tensor,
-        centroid: Tensor,
-        plan: VoxelPlan,
-    ) -> VoxelMoments:
+        self, geometry: Geometry, size: Tensor, values: Tensor, confidence: Tensor, means: Tensor, plan: VoxelPlan
+    ) -> Moments | None:
         """How the points of every voxel lie about the means ``[M, 6]`` of their places and colours ``[N, 6]``."""
+        if not self.moments:
+            return None
         centers = camera_centers(geometry.cameras).float()  # [B, V, 3]
         focal = focal_lengths(geometry.cameras.intrinsics).mean(-1).float()  # [B, V]
         views = torch.cat((centers, (focal * size[:, None])[..., None]), -1).flatten(0, 1)  # [B V, 4]
         depth, chunk = geometry.depth.float().flatten(), self.dense_head.views_per_chunk
-        spread, cross, eye, pixel = pool_point_moments(values, depth, confidence, views, means, plan, chunk)
+        return pool_point_moments(values, depth, confidence, views, means, plan, chunk)
+
+    @torch.no_grad()
+    def _moments(self, measured: Moments, means: Tensor, centroid: Tensor, plan: VoxelPlan) -> VoxelMoments:
+        spread, cross, eye, pixel = measured
         facing = F.normalize(eye - centroid, dim=-1)
         normal = surface_normals(spread, facing, means[:, :3], plan, self.normal_kernel)
         return VoxelMoments(spread, cross, facing, pixel, normal)
@@ -170,13 +220,24 @@ class FineModule(nn.Module):
             return pool_point_features(next(chunks), *others)
         return pool_point_features_of_chunks(chunks, *others)
 
-    def _plan(self, points: _Points) -> VoxelPlan:
+    def _plan(self, points: _Points, max_voxels: int | None) -> VoxelPlan:
         plan = plan_voxels(points.cells, points.batch, points.valid)
         note_sizes({"voxels": len(plan)})
-        if self.max_voxels is None:
+        if max_voxels is None:
             return plan
-        keep = self.cap(self.max_voxels, pool_min(points.confidence.detach(), plan), plan.batch)
+        keep = self.cap(max_voxels, pool_min(points.confidence.detach(), plan), plan.batch)
         return plan if keep is None else plan.select(keep)
+
+
+class _Measured(NamedTuple):
+    """What pixels say of their voxels."""
+
+    plan: VoxelPlan
+    features: Tensor  # [M, C]
+    means: Tensor  # [M, 6] place in the cell, colour
+    confidence: Tensor  # [M]
+    moments: Moments | None
+    weights: Tensor  # [N] of the points
 
 
 def _pixel_rows(dense: Tensor) -> Tensor:

@@ -106,7 +106,7 @@ def move_to_target(frame: SceneFrame, cameras: Cameras, depth: float) -> tuple[S
         move = cameras.world_to_camera[0, 0].detach().cpu().double().numpy()
     elif frame.target == "upright":
         move[:3, :3] = upright_rotation(cameras.world_to_camera[0].detach().cpu().double().numpy())
-    return replace(frame, name=frame.target, to_source=frame.to_source @ np.linalg.inv(move)), _similarity(move)
+    return replace(frame, name=frame.target, to_source=frame.to_source @ np.linalg.inv(move)), similarity_of(move)
 
 
 def upright_rotation(poses: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -183,7 +183,8 @@ def _matrix(similarity: Similarity) -> NDArray[np.float64]:
     return matrix
 
 
-def _similarity(matrix: NDArray[np.float64]) -> Similarity:
+def similarity_of(matrix: NDArray[np.float64]) -> Similarity:
+    """The similarity (B = 1) of a matrix ``[4, 4]``."""
     linear, shift = torch.from_numpy(matrix[:3, :3].copy()), torch.from_numpy(matrix[:3, 3].copy())
     scale = torch.linalg.det(linear) ** (1 / 3)
     return Similarity(scale[None], (linear / scale)[None], shift[None])

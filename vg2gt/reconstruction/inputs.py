@@ -129,27 +129,33 @@ def _kept(size: tuple[int, int], window: tuple[int, int]) -> float:
 
 
 def _hints(pictures: Sequence[Picture], frames: Frames, size: tuple[int, int]) -> Hints:
-    """The order of the pictures, and what a recording knows if all are from one.
+    """The order of the pictures, and what a recording knows if all are from one."""
+    source, order = source_of(pictures), torch.arange(len(pictures))[None]
+    if not source:
+        return Hints(frame_ids=order)
+    has_depth = all(picture.has_depth for picture in pictures)
+    cameras = Cameras(given_poses(pictures)[None], frames.intrinsics[None], size)
+    depth = frames.depth[None] if has_depth else None
+    return Hints(depth, cameras, (source,), order, depth_range(pictures))
+
+
+def source_of(pictures: Sequence[Picture]) -> str:
+    """Where all pictures' cameras come from; empty if any has none.
 
     Raises:
         ValueError: if they come from several recordings, whose worlds have nothing to do with each other.
     """
-    sources, order = {picture.source for picture in pictures}, torch.arange(len(pictures))[None]
+    sources = {picture.source for picture in pictures}
     if "" in sources:
-        return Hints(frame_ids=order)
+        return ""
     if len(sources) > 1:
         raise ValueError(f"cameras of several recordings cannot be mixed: {', '.join(sorted(sources))}; give one")
-    has_depth = all(picture.has_depth for picture in pictures)
-    cameras = Cameras(_given_poses(pictures, frames)[None], frames.intrinsics[None], size)
-    depth = frames.depth[None] if has_depth else None
-    return Hints(depth, cameras, tuple(sources), order, depth_range(pictures))
+    return sources.pop()
 
 
-def _given_poses(pictures: Sequence[Picture], frames: Frames) -> Tensor:
-    """Poses ``[V, 4, 4]`` about the first camera's place: map coordinates would lose their digits in float32."""
-    if any(picture.pose is None for picture in pictures):
-        return frames.world_to_camera
-    poses = np.stack([picture.pose for picture in pictures if picture.pose is not None])
+def given_poses(pictures: Sequence[Picture]) -> Tensor:
+    """Given poses ``[V, 4, 4]`` about the first camera's place if they are map coordinates, too long for float32."""
+    poses = np.stack([np.eye(4) if picture.pose is None else picture.pose for picture in pictures])
     shift = np.eye(4)
     shift[:3, 3] = -poses[0, :3, :3].T @ poses[0, :3, 3]
     far = np.abs(poses[:, :3, 3]).max() > 1e3 * np.abs((poses @ shift)[:, :3, 3]).max()

@@ -25,7 +25,8 @@ def working_order(images: Tensor) -> list[int]:
     """
     contents = [hashlib.sha256(to_bytes(image).numpy().tobytes()).hexdigest() for image in images]
     order = sorted(range(len(contents)), key=lambda view: contents[view])
-    small = F.interpolate(images[order].mean(1, keepdim=True), (_THUMBNAIL, _THUMBNAIL), mode="area").flatten(1)
+    gray = (images[view, None].mean(1, keepdim=True) for view in order)  # one by one, which bounds the memory
+    small = torch.cat([F.interpolate(image, (_THUMBNAIL, _THUMBNAIL), mode="area").flatten(1) for image in gray])
     unit = F.normalize(small.double() - small.double().mean(1, keepdim=True), dim=1)
     reference = int((unit @ unit.mean(0)).argmax())
     return [order[reference], *(view for place, view in enumerate(order) if place != reference)]

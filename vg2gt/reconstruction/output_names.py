@@ -2,6 +2,7 @@
 
 ORBIT_FRAMES, FPS = 72, 24.0
 SFM = "sfm"  # folder of the cameras that structure from motion found, in the output folder
+WINDOWS = "windows"  # folder of an unfinished reconstruction in windows, in the output folder
 
 MAPS = {
     "color.png": "rendered colour, a PNG per view in color/",
@@ -17,6 +18,7 @@ OUTPUTS = {
     "scene.spz": "the same, about 16 bytes each (Niantic's SPZ, version 3)",
     "scene.compressed.ply": "the same, about 16 bytes each, as SuperSplat compresses them",
     "scene.glb": "the same as glTF, KHR_gaussian_splatting",
+    "tiles": "the same in regions, SPZ files and index.json in tiles/; of over a million Gaussians by default",
     "cameras.json": "the cameras of the views",
     "points.ply": "coloured points of the decoded depth",
     "points.glb": "the same points and the cameras, for any 3D viewer",
@@ -36,6 +38,7 @@ OUTPUTS = {
     "report.html": "the same of all views, with the run's figures",
     "report.json": "the run's figures: backend, weights, sizes, time per stage, peak memory",
 }
+TILES, LARGE = "tiles", 1_000_000  # the command adds them where there are more Gaussians
 DEFAULT = ("scene.ply", "cameras.json", "views.npz", "report.png", "report.json")
 PREDICTED = "predicted by the backbone"  # what a report says of such cameras
 REFINED = "refine.png"  # written of every refined scene: views before and after

@@ -29,6 +29,7 @@ from vg2gt.io import (
 )
 from vg2gt.io.files import write_bytes, write_json
 from vg2gt.io.images import to_pixels, write_png
+from vg2gt.io.tiles import write_tiles
 from vg2gt.io.video import require_pyav
 from vg2gt.reconstruction.camera_paths import orbit
 from vg2gt.reconstruction.export import exported_views
@@ -36,7 +37,7 @@ from vg2gt.reconstruction.maps import AddView, animation, feed, map_sinks, whole
 from vg2gt.reconstruction.monitor import Monitor
 from vg2gt.reconstruction.output_names import DEFAULT, FPS, MAPS, ORBIT_FRAMES, OUTPUTS, PREDICTED, REFINED
 from vg2gt.reconstruction.refined import before_and_after, refinement_figures
-from vg2gt.reconstruction.report import html_rows, png_report, write_html_report
+from vg2gt.reconstruction.report import html_rows, pictured, png_report, write_html_report
 
 if TYPE_CHECKING:
     from vg2gt.reconstruction.scene import Scene
@@ -144,8 +145,11 @@ def write_outputs(
     if "report.html" in outputs:
         sinks.append(html_rows(scene, rows))
     if sinks:
-        with monitor.stage("render views", len(scene.names)) as advance:
-            feed(scene.render(), sinks, advance)
+        cameras = scene.named_cameras()
+        if "report.png" in outputs and len(sinks) == 1:
+            cameras = [cameras[view] for view in pictured(scene)]
+        with monitor.stage("render views", len(cameras)) as advance:
+            feed(scene.render(cameras), sinks, advance)
     if orbits := [folder / output for output in outputs if output.startswith("orbit")]:
         path = orbit(scene.named_cameras(), float(scene.depth[scene.depth > 0].median()), frames)
         with monitor.stage("render orbit", len(path)) as advance:
@@ -256,6 +260,11 @@ def _nerfstudio(scene: Scene, target: Path, whole: bool = True) -> None:
         write_transforms(folder / "transforms.json", Transforms(tuple(frames), ply_file_path="points.ply"))
 
 
+def _tiles(scene: Scene, target: Path) -> None:
+    with whole_folder(target) as folder:
+        write_tiles(folder, scene.gaussians)
+
+
 def _points_ply(scene: Scene, path: Path) -> None:
     points = scene.points()
     write_point_ply(path, points.positions, points.colors)
@@ -276,6 +285,7 @@ _WRITERS: dict[str, Callable[[Scene, Path], Any]] = {
         (name for name in OUTPUTS if name.startswith("scene.")),
         lambda scene, path: write_gaussians(path, scene.gaussians),
     ),
+    "tiles": _tiles,
     "cameras.json": lambda scene, path: write_cameras_json(path, scene.named_cameras()),
     "points.ply": _points_ply,
     "views.npz": _views,

@@ -27,7 +27,7 @@ from vg2gt.io.files import by_number
 from vg2gt.io.image_files import focal_length, image_size, is_panorama, read_color, read_mask
 from vg2gt.io.images import color_image, has_alpha
 from vg2gt.io.record3d import R3D, is_archive, read_recorded, recorded_files
-from vg2gt.io.video import VIDEO_SUFFIXES, count_frames, read_video, require_pyav
+from vg2gt.io.video import VIDEO_SUFFIXES, VideoFrames, count_frames, read_video, require_pyav, video_size
 
 log = logging.getLogger(__name__)
 
@@ -36,6 +36,7 @@ ImagesLike: TypeAlias = "str | Path | Image.Image | NDArray[Any] | Tensor | Sequ
 HEIC_SUFFIXES = (".heic", ".heif")
 _HOLDS_PICTURES = (*IMAGE_SUFFIXES, *HEIC_SUFFIXES, R3D)
 VIDEO_FRAMES = 32  # frames taken from a video by default
+IN_MEMORY = 100  # frames of a video that are kept in memory; more are decoded when they are needed
 IMAGE_FOLDERS = ("images", "color", "rgb", "image", "input")
 _NO_PHOTOGRAPHS = ("masks", "depth", "depths", "color", "normals", "sfm", "sparse", "colmap", "nerfstudio")
 SKIP_DAMAGED = " (--skip-damaged skips what cannot be read)"
@@ -316,9 +317,17 @@ def _is_video(item: Any) -> bool:
 
 def _video(path: Path, every: int, max_images: int | None) -> list[Picture]:
     limit = max_images or (VIDEO_FRAMES if every == 1 else None)
+    count = count_frames(path)
     if limit is not None:
-        every = max(every, math.ceil(count_frames(path) / limit))
+        every = max(every, math.ceil(count / limit))
+    if count > IN_MEMORY * every and path.suffix.lower() != ".gif":
+        size, frames = video_size(path), VideoFrames(path, every)
+        return [_frame_of_video(frames, f"{path.stem}-{n:06d}", n, size) for n in range(0, count, every)]
     return [_in_memory(f"{path.stem}-{number:06d}", pixels) for number, pixels in read_video(path, every)]
+
+
+def _frame_of_video(frames: VideoFrames, name: str, number: int, size: tuple[int, int]) -> Picture:
+    return Picture(name, size, lambda wanted: frame_of(shrunk(frames.read(number), wanted)))
 
 
 def _in_memory(name: str, pixels: NDArray[np.uint8], mask: NDArray[np.float32] | None = None) -> Picture:

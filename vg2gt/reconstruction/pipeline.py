@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,14 +17,17 @@ from vg2gt.method.additions.far_shell import far_shell
 from vg2gt.model import Reconstructor
 from vg2gt.reconstruction.cameras import Poses, pictures_for
 from vg2gt.reconstruction.frame import FrameName, check_frame, first_frame
-from vg2gt.reconstruction.inputs import Views, load_views, working_size
+from vg2gt.reconstruction.inputs import Views, load_views, source_of, working_size
 from vg2gt.reconstruction.monitor import Monitor
 from vg2gt.reconstruction.order import as_given, in_order, working_order
-from vg2gt.reconstruction.pictures import SFM_SOURCE, ImagesLike
+from vg2gt.reconstruction.pictures import SFM_SOURCE, ImagesLike, spread
 from vg2gt.reconstruction.scene import Scene
+from vg2gt.reconstruction.windows.capture import AUTOMATIC, window_size
+from vg2gt.reconstruction.windows.run import WindowRun, window_model
+from vg2gt.reconstruction.windows.sets import Anchor
 from vg2gt.rendering import Renderer
 from vg2gt.runs.load import load_model
-from vg2gt.types import Prediction
+from vg2gt.types import Gaussians, Geometry, Prediction
 
 
 def reconstruct(
@@ -33,11 +38,13 @@ def reconstruct(
     every: int = 1,
     max_images: int | None = None,
     size: int | tuple[int, int] | None = None,
+    window: int | None = None,
     device: str = "auto",
 ) -> Scene:
     """Builds a model and reconstructs a scene: :func:`load_model`, then :func:`reconstruct_with`."""
     ready = load_model(ckpt, backend, device=device)
-    return reconstruct_with(ready.model, images, every=every, max_images=max_images, size=size, renderer=ready.renderer)
+    choice = {"every": every, "max_images": max_images, "size": size, "window": window}
+    return reconstruct_with(ready.model, images, renderer=ready.renderer, **choice)
 
 
 @torch.no_grad()
@@ -54,6 +61,10 @@ def reconstruct_with(
     sfm_folder: str | Path | None = None,
     frame: FrameName = "auto",
     skip_damaged: bool = False,
+    window: int | None = None,
+    window_folder: str | Path | None = None,
+    keep_windows: bool = False,
+    anchor: Anchor | None = None,
 ) -> Scene:
     """Reconstructs a scene from any number of images.
 
@@ -70,9 +81,16 @@ def reconstruct_with(
         frame: the scene's frame and unit (:class:`vg2gt.reconstruction.frame.SceneFrame`): ``given`` cameras',
             ``first`` camera's, ``upright``, or ``auto``.
         skip_damaged: skip images that cannot be read, with a warning; otherwise they are an error.
+        window: work on so many images and their neighbours at a time, which bounds the memory
+            (:mod:`vg2gt.reconstruction.windows`); 0: all at once; None: 24 of more than 100, else all.
+        window_folder: keeps what windows have done, so that an interrupted reconstruction goes on; None: a temporary
+            one.
+        keep_windows: work in windows whatever the number of images: their voxels are wanted.
+        anchor: of the scene that the images are added to (:mod:`vg2gt.reconstruction.windows.sets`).
 
     Returns:
-        The scene, in the frame that was asked for; its Gaussians stay on the model's device.
+        The scene, in the frame that was asked for; its Gaussians stay on the model's device. Of a scene made in windows
+        images and depth are mapped from files.
 
     Raises:
         FileNotFoundError: if a path does not exist.
@@ -94,13 +112,26 @@ def reconstruct_with(
         skip_damaged=skip_damaged,
     )
     with memory_advice(RECONSTRUCTION), chosen as pictures:
-        target = working_size([p.size for p in pictures], model.backend.patch_size, device.type, size)
+        sizes = [picture.size for picture in pictures]
+        target = anchor.size if anchor else working_size(sizes, model.backend.patch_size, device.type, size)
         note_sizes({f"images of {target[0]}x{target[1]}": len(pictures)})
-        views = load_views(pictures, target, monitor)
-        order = working_order(views.images)
-        prediction = _forward(model.eval(), views, order, device, monitor)
-    scene = _scene(prediction, views, order, renderer or Renderer(), model.backend.is_metric, frame)
-    scene = scene if model.visibility is None else _with_far_shell(scene)
+        size_of_windows, to_source = window_size(window, len(pictures), keep_windows or anchor is not None), None
+        if size_of_windows:
+            with _folder(window_folder) as kept:
+                run = WindowRun(window_model(model.eval()), pictures, target, size_of_windows, kept, monitor, anchor)
+                geometry, gaussians, unit = run.geometry_and_gaussians()
+                views = run.views()
+                to_source = run.anchor.to_source if run.anchor and source_of(pictures) else None
+        else:
+            views = load_views(pictures, target, monitor)
+            order = working_order(views.images)
+            prediction = _forward(model.eval(), views, order, device, monitor)
+            geometry, gaussians = as_given(prediction.surface.detach(), order), prediction.gaussians
+            unit = prediction.unit
+    scene = _scene(geometry, gaussians, float(unit), views, renderer or Renderer(), model.backend.is_metric, frame)
+    if to_source is not None and scene.frame is not None:  # the same for all sets of images, to the last digit
+        scene = replace(scene, frame=replace(scene.frame, to_source=to_source))
+    scene = scene if model.visibility is None or anchor else with_far_shell(scene)
     return scene.placed()
 
 
@@ -113,35 +144,48 @@ def _forward(
         return model(images, hints)
 
 
-def _with_far_shell(scene: Scene) -> Scene:
+@contextmanager
+def _folder(given: str | Path | None) -> Iterator[Path]:
+    """The folder, or a temporary one; what is mapped from its files stays readable after their removal."""
+    if given is not None:
+        yield Path(given)
+        return
+    with tempfile.TemporaryDirectory(prefix="vg2gt-windows-", ignore_cleanup_errors=True) as temporary:
+        yield Path(temporary)
+
+
+def with_far_shell(scene: Scene) -> Scene:
     """The scene with a far shell for pixels that no view can place."""
-    shell = far_shell(scene.images, scene.depth, scene.cameras.to("cpu"), scene.mask)
+    some = torch.arange(len(scene.names))
+    if len(some) > AUTOMATIC:
+        some = torch.tensor(list(spread(len(some), AUTOMATIC)))
+    mask = None if scene.mask is None else scene.mask[some]
+    shell = far_shell(scene.images[some], scene.depth[some], scene.cameras.to("cpu").select(some), mask)
     if shell is None:
         return scene
     return replace(scene, gaussians=scene.gaussians.joined(shell.to(scene.gaussians.means.device)))
 
 
 def _scene(
-    prediction: Prediction,
+    geometry: Geometry,
+    gaussians: Gaussians,
+    unit: float,
     views: Views,
-    order: Sequence[int],
     renderer: Renderer,
     is_metric: bool,
     wanted: FrameName,
 ) -> Scene:
-    geometry = as_given(prediction.surface.detach(), order)
     source = views.pictures[0].source
     kind = "predicted" if not source else "found" if source.startswith(SFM_SOURCE) else "given"
     check_frame(wanted, kind)
     known = [picture.pose for picture in views.pictures if picture.pose is not None]
     poses = np.stack(known) if kind != "predicted" and len(known) == len(views.names) else None
-    unit = float(prediction.unit)
     frame = first_frame(geometry.cameras, unit, poses, kind, wanted)
     metres = float(geometry.scale) if is_metric else frame.scale if views.pictures[0].is_metric else None
-    if not len(prediction.gaussians):
+    if not len(gaussians):
         raise ValueError("the backend found no depth in any image, so there is nothing to reconstruct")
     return Scene(
-        gaussians=prediction.gaussians.detach(),
+        gaussians=gaussians.detach(),
         cameras=geometry.cameras,
         images=views.images,
         depth=geometry.depth[0].cpu(),

@@ -31,16 +31,20 @@ table { border-collapse: collapse } td, th { padding: 2px 12px 2px 0; text-align
 """
 
 
+def pictured(scene: Scene) -> list[int]:
+    """The views that ``report.png`` shows."""
+    return list(spread(len(scene.names), min(len(scene.names), ROWS)))
+
+
 @contextmanager
 def png_report(scene: Scene, path: Path) -> Iterator[AddView]:
     """Writes one picture with a row per view, of at most 12 views, evenly spread."""
-    count, depth_range = len(scene.names), _depth_range(scene)
-    numbers, wanted = iter(range(count)), spread(count, min(count, ROWS))
+    depth_range, wanted = _depth_range(scene), {f"{scene.names[view]}.png": view for view in pictured(scene)}
     rows: list[list[Tensor]] = []
 
     def add(view: RenderedView) -> None:
-        number = next(numbers)
-        if number in wanted:
+        number = wanted.get(view.camera.name)
+        if number is not None:
             rows.append(_panels(scene.images[number], view, depth_range))
 
     yield add

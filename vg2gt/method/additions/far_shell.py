@@ -59,9 +59,11 @@ def far_shell(
     for ray, color in zip(rays.split(4096), colors.split(4096), strict=True):
         weight = torch.exp((ray @ directions.T - 1) / (BLUR * spacing) ** 2)
         total += weight.T @ F.pad(color, (0, 1), value=1.0)
-    radius = RADIUS * depth[depth > 0].median()
+    centers, median = camera_centers(cameras)[0], depth[depth > 0].median()
+    extent = (centers - centers.mean(0)).norm(dim=1).max()
+    radius = torch.maximum(RADIUS * median, extent + 1.25 * FAR * median)  # behind all of a long walk
     return Gaussians(
-        means=camera_centers(cameras)[0].mean(0) + radius * directions,
+        means=centers.mean(0) + radius * directions,
         quats=_facing(directions),
         scales=radius * spacing * WIDTH * directions.new_tensor([1.0, 1.0, THIN]).repeat(count, 1),
         opacities=directions.new_full((count,), OPACITY),

@@ -139,18 +139,22 @@ def disagreement(depth: Tensor, cameras: Cameras, partners: Tensor) -> Tensor:
 
 
 SAMPLES = 12  # pixels a side of the grid that overlap is measured on
+MANY, MORE = 100, 4  # views beyond which partners must see a point and are more, and how many times
+BEHIND = 1.1  # of a view's depth: what lies farther is hidden from it
 LEAST_OVERLAP = 0.02  # share of a view's samples that a partner has in its image
 
 
 @torch.no_grad()
 def choose_partners(depth: Tensor, cameras: Cameras, most: int) -> Tensor:
-    """The views that look where a view's points are, ``[V, min(most, V - 1)]`` int64, -1 where a view has fewer.
+    """The views that look where a view's points are, ``[V, K]`` int64, -1 where a view has fewer.
 
     Of more than ``most``, half are the nearest by direction and place, and the others are taken evenly: near views
-    agree with a surface, and views from the other side contradict what hangs in the air.
+    agree with a surface, and views from the other side contradict what hangs in the air. Many views look at a room from
+    several others, most of them through walls: there, points behind what a view sees do not count, and partners are
+    four times as many.
     """
     views, height, width = depth.shape
-    count = min(most, views - 1)
+    count = min(most * (MORE if views > MANY else 1), views - 1)
     if count < 1:
         return torch.empty(views, 0, dtype=torch.int64, device=depth.device)
     step = (max(height // SAMPLES, 1), max(width // SAMPLES, 1))
@@ -169,6 +173,9 @@ def choose_partners(depth: Tensor, cameras: Cameras, most: int) -> Tensor:
         z = pixel[..., 2]
         u, v = pixel[..., 0] / z, pixel[..., 1] / z
         inside = known & (z > 0) & (u > -0.5) & (u < width - 0.5) & (v > -0.5) & (v < height - 0.5)
+        if views > MANY:
+            column, row = (x.nan_to_num().clamp(0, side - 1).round().long() for x, side in ((u, width), (v, height)))
+            inside &= z < BEHIND * depth[other][row, column]
         share[:, other] = inside.sum(1) / known.sum(1).clamp(min=1)
     share.fill_diagonal_(0)
     turn = torch.einsum("vij,wij->vw", pose[:, :3, :3], pose[:, :3, :3])  # 1 + 2 cos of the angle between views

@@ -1,0 +1,110 @@
+"""Images are added to a scene and taken out again; what is left is what a scene that never saw them has."""
+
+import hashlib
+import random
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.data.sources.layout_rgbd import write_recording
+from tests.reconstruction.test_windows import BY_ITSELF, built
+from vg2gt.cli import reconstruct as command
+from vg2gt.data import SyntheticScenes
+from vg2gt.io import read_cameras_json, read_gaussian_ply
+from vg2gt.reconstruction.changes import add_images, take_out
+from vg2gt.reconstruction.monitor import Monitor
+from vg2gt.reconstruction.windows.run import gaussians_of
+from vg2gt.reconstruction.windows.sets import finished_sets, read_anchor
+from vg2gt.rendering import Renderer
+
+SETS = 4
+
+
+@pytest.fixture(scope="module")
+def parts(tmp_path_factory) -> list[Path]:
+    """Recordings of one room, from frames that take turns."""
+    source = SyntheticScenes(1, first_seed=5, num_frames=4 * SETS, size=(56, 84))
+    folder = tmp_path_factory.mktemp("parts")
+    found = []
+    for part in range(SETS):
+        frames = source.load(source.scenes[0], range(part, 4 * SETS, SETS))
+        found.append(write_recording(folder, frames, f"part{part}", first=100 * part, digits=3))
+    return found
+
+
+@pytest.fixture(scope="module")
+def model():
+    return built("surfel")
+
+
+def start(parts, folder: Path, *more: str) -> None:
+    plain = ["--keep-windows", "--window", "4", "--refine", "0", "--quiet", "--device", "cpu"]
+    command.main([str(parts[0]), "--out", str(folder), *plain, *more, *BY_ITSELF, "model.coarse=null"])
+
+
+def fingerprint(gaussians) -> str:
+    values = [value for value in vars(gaussians).values() if value is not None]
+    return hashlib.sha256(b"".join(value.contiguous().numpy().tobytes() for value in values)).hexdigest()
+
+
+def test_any_order_of_adding_and_taking_out_gives_the_same_scene(parts, model, tmp_path) -> None:
+    """Issue 49's bar: 20 random orders, equal to the bit."""
+    start(parts, tmp_path / "scene")
+    kept, rng = tmp_path / "scene" / "windows", random.Random(0)
+    seen: dict[frozenset, str] = {}
+    there: set[int] = set()
+    revisited = 0
+    for _ in range(20):
+        part = rng.randrange(1, SETS)
+        change = take_out if part in there else add_images
+        scene = change(model, tmp_path / "scene", parts[part], Renderer(), Monitor(), 4)
+        scene.save(tmp_path / "next", ("scene.ply", "cameras.json", "views.npz"))
+        for file in (tmp_path / "next").iterdir():
+            shutil.move(file, tmp_path / "scene" / file.name)
+        there ^= {part}
+        assert len(scene.names) == 4 * (1 + len(there))
+        assert len(finished_sets(kept)) == 1 + len(there)
+        found = fingerprint(gaussians_of(model, kept, read_anchor(kept), Monitor()))
+        revisited += frozenset(there) in seen
+        assert seen.setdefault(frozenset(there), found) == found
+    assert revisited >= 10
+    assert len(set(seen.values())) == len(seen)
+
+
+def test_the_scene_without_them_is_the_scene_that_never_saw_them(parts, tmp_path) -> None:
+    arguments = ["--quiet", "--device", "cpu", "--window", "4", "--refine", "0", *BY_ITSELF]
+    arguments += ["model.coarse=null", "model.visibility=null"]
+    start(parts, tmp_path / "scene", "model.visibility=null")
+    before = (tmp_path / "scene" / "scene.ply").read_bytes()
+    command.main(["--add", str(tmp_path / "scene"), str(parts[1]), *arguments])
+    assert len(read_cameras_json(tmp_path / "scene" / "cameras.json")) == 8
+    assert len(read_gaussian_ply(tmp_path / "scene" / "scene.ply")) > len(before) // 100
+    assert (tmp_path / "scene" / "scene.ply").read_bytes() != before
+    command.main(["--take-out", str(tmp_path / "scene"), str(parts[1]), *arguments])
+    assert (tmp_path / "scene" / "scene.ply").read_bytes() == before
+    assert len(read_cameras_json(tmp_path / "scene" / "cameras.json")) == 4
+
+
+def test_what_cannot_be_changed_says_why(parts, model, tmp_path) -> None:
+    start(parts, tmp_path / "scene")
+    here = (Renderer(), Monitor(), 4)
+    with pytest.raises(ValueError, match="names already: 000"):
+        add_images(model, tmp_path / "scene", parts[0], *here)
+    with pytest.raises(ValueError, match="not added by one command"):
+        take_out(model, tmp_path / "scene", parts[1], *here)
+    with pytest.raises(ValueError, match="another model"):
+        add_images(built("plain"), tmp_path / "scene", parts[1], *here)
+    shutil.rmtree(tmp_path / "scene" / "windows")
+    with pytest.raises(FileNotFoundError, match="--keep-windows"):
+        add_images(model, tmp_path / "scene", parts[1], *here)
+
+
+def test_an_added_set_fills_what_the_first_did_not_see(parts, model, tmp_path) -> None:
+    start(parts, tmp_path / "scene")
+    first = read_gaussian_ply(tmp_path / "scene" / "scene.ply")
+    scene = add_images(model, tmp_path / "scene", parts[2], Renderer(), Monitor(), 4)
+    assert len(scene.gaussians) > len(first)
+    assert scene.names == tuple(sorted(scene.names))
+    assert np.isfinite(scene.gaussians.means.numpy()).all()

@@ -1,0 +1,108 @@
+"""What was pooled in voxels, such that parts of a scene merge: windows of views in a long capture."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+
+from vg2gt.method.grid import VoxelPlan, mixed_radix_keys
+from vg2gt.types import TensorRecord
+
+MOMENTS = (9, 9, 3, 1)  # columns: spread, covariance with colour, camera centre, side of a pixel
+
+
+@dataclass(frozen=True)
+class PooledVoxels(TensorRecord):
+    """Confidence-weighted means of the points in M voxels of one scene, sorted by cell (x, y, z).
+
+    Attributes:
+        grid: ``[M, 3]`` int64 cells.
+        count: ``[M]`` int64 points.
+        weight: ``[M]`` float64 sum of the points' confidences.
+        confidence: ``[M]`` the smallest of them.
+        features: ``[M, C]`` mean feature.
+        means: ``[M, 6]`` mean place in the cell, from its centre in cells, and mean colour.
+        moments: ``[M, 22]`` second moments about these means (:data:`MOMENTS`); None where nobody asked.
+    """
+
+    grid: Tensor
+    count: Tensor
+    weight: Tensor
+    confidence: Tensor
+    features: Tensor
+    means: Tensor
+    moments: Tensor | None
+
+    def __len__(self) -> int:
+        return len(self.grid)
+
+    def rows(self, rows: Tensor | slice) -> PooledVoxels:
+        """Some of the voxels; ``rows`` must keep their order."""
+        return self.map(lambda tensor: tensor[rows])
+
+    def plan(self) -> VoxelPlan:
+        """The voxels without the points that lie in them."""
+        none = self.grid.new_zeros(0)
+        return VoxelPlan(self.grid, torch.zeros_like(self.count), none, none, self.count, none)
+
+
+def merge(parts: Sequence[PooledVoxels]) -> PooledVoxels:
+    """The voxels of all parts: as if the points of all had been pooled at once, up to rounding.
+
+    Sums are taken in float64 in the order of the parts, so the same parts in the same order give the same bits, and a
+    voxel that only one part has stays as it is.
+
+    Args:
+        parts: at least one; all with the same features, with or without moments.
+    """
+    joined = concatenate(parts)
+    keys, order = torch.sort(mixed_radix_keys(joined.grid, torch.zeros_like(joined.count))[0], stable=True)
+    lengths = torch.unique_consecutive(keys, return_counts=True)[1]
+    first = order[lengths.cumsum(0) - lengths]
+    if len(first) == len(joined):
+        return joined.rows(order)
+
+    def reduced(values: Tensor, how: str = "sum") -> Tensor:
+        return torch.segment_reduce(values[order].contiguous(), how, lengths=lengths, unsafe=True)
+
+    total = reduced(joined.weight)
+
+    def mean(values: Tensor) -> Tensor:
+        return reduced(joined.weight[:, None] * values.double()) / total[:, None]
+
+    means = mean(joined.means)
+    moments = joined.moments
+    if moments is not None:  # about the merged means: raw moments less products of means
+        raw = torch.cat((moments[:, :18].double() + _products(joined.means.double()), moments[:, 18:].double()), 1)
+        raw = mean(raw)
+        moments = torch.cat((raw[:, :18] - _products(means), raw[:, 18:]), 1).to(moments.dtype)
+    merged = PooledVoxels(
+        grid=joined.grid[first],
+        count=reduced(joined.count.double()).long(),
+        weight=total,
+        confidence=reduced(joined.confidence, "min"),
+        features=mean(joined.features).to(joined.features.dtype),
+        means=means.to(joined.means.dtype),
+        moments=moments,
+    )
+    alone = lengths == 1
+    kept = joined.rows(first[alone])
+    for each in fields(PooledVoxels):
+        if getattr(merged, each.name) is not None:
+            getattr(merged, each.name)[alone] = getattr(kept, each.name)
+    return merged
+
+
+def concatenate(parts: Sequence[PooledVoxels]) -> PooledVoxels:
+    """The voxels of all parts, one after the other."""
+    columns = ([getattr(part, each.name) for part in parts] for each in fields(PooledVoxels))
+    return PooledVoxels(*(None if values[0] is None else torch.cat(values) for values in columns))  # pyright: ignore
+
+
+def _products(means: Tensor) -> Tensor:
+    """``[M, 18]``: place times place, place times colour."""
+    place, color = means.split(3, -1)
+    return torch.cat([(place[:, :, None] * other[:, None]).flatten(1) for other in (place, color)], -1)

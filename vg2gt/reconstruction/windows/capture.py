@@ -1,0 +1,134 @@
+"""The views of a long capture: decoded once, kept in files, and read a window at a time."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from vg2gt.reconstruction.inputs import depth_range, given_poses, load_views, source_of
+from vg2gt.reconstruction.monitor import Monitor
+from vg2gt.reconstruction.pictures import Picture
+from vg2gt.reconstruction.windows.store import WindowStore
+from vg2gt.types import Cameras, Hints
+
+AUTOMATIC = 100  # views beyond which a capture is worked on in windows
+SIZE = 24  # views of a window of its own
+MARGIN = 6  # neighbours before and after them, at least; of large windows a sixth
+_AT_ONCE = 16  # pictures decoded before their progress is noted
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """Views that go through the model together.
+
+    Attributes:
+        views: ``[n]`` all of them, ascending.
+        own: those that enter the scene from this window; the others are their neighbours.
+    """
+
+    views: Tensor
+    own: slice
+
+    @property
+    def inner(self) -> slice:
+        """Places of ``own`` among ``views``."""
+        first = int(torch.searchsorted(self.views, self.own.start))
+        return slice(first, first + self.own.stop - self.own.start)
+
+
+def window_size(asked: int | None, views: int, kept: bool = False) -> int:
+    """Views of a window of its own; 0: all at once.
+
+    Args:
+        asked: by the user; None: automatic.
+        views: how many there are.
+        kept: there must be a window, since its voxels are wanted.
+
+    Raises:
+        ValueError: if fewer than 4 are asked for.
+    """
+    if asked is not None and asked != 0 and asked < 4:
+        raise ValueError(f"window must be at least 4 views, or 0 for all views at once, got {asked}")
+    if kept:
+        return min(asked or SIZE, views)
+    size = asked if asked is not None else SIZE if views > AUTOMATIC else 0
+    return size if 0 < size < views else 0
+
+
+def cut(count: int, size: int) -> list[Window]:
+    """Windows that own ``size`` consecutive views at most, so that each view is owned once, and their neighbours."""
+    blocks = -(-count // size)
+    total = min(size + 2 * max(size // 6, MARGIN), count) if blocks > 1 else count
+    windows = []
+    for begin, end in itertools.pairwise(count * block // blocks for block in range(blocks + 1)):
+        first = min(max(begin - (total - (end - begin)) // 2, 0), count - total)
+        windows.append(Window(torch.arange(first, first + total), slice(begin, end)))
+    return windows
+
+
+class Capture:
+    """All views of a long capture.
+
+    Args:
+        store: keeps them.
+        pictures: where they come from.
+        size: ``(height, width)`` of the images.
+        monitor: shows the progress.
+
+    Attributes:
+        pictures: see above.
+        size: see above.
+        images: ``[V, 3, H, W]``, mapped from a file.
+        mask: ``[V, H, W]``, mapped from a file; None: all pixels count.
+        given: the given cameras ``[1, V]``; None where there are none.
+
+    Raises:
+        ValueError: if a picture cannot be read.
+    """
+
+    def __init__(self, store: WindowStore, pictures: Sequence[Picture], size: tuple[int, int], monitor: Monitor):
+        self.pictures, self.store, self.size, count = pictures, store, size, len(pictures)
+        self._source = source_of(pictures)
+        self.images = store.array("images", (count, 3, *size))
+        intrinsics = []
+        with monitor.measure("load images") as show:
+            for first in range(0, count, _AT_ONCE):
+                name = f"loaded-{first:06d}"
+                found = store.load(name)
+                if found is None:
+                    found = self._read(slice(first, min(first + _AT_ONCE, count)), size)
+                    store.save(name, found)
+                intrinsics.append(found["intrinsics"])
+                show(min(first + _AT_ONCE, count) / count, f"{min(first + _AT_ONCE, count)} of {count}")
+        self.mask = store.array("mask") if store.has("mask") else None
+        self._depth = store.array("given_depth") if store.has("given_depth") else None
+        self.given: Cameras | None = None
+        if self._source:
+            self.given = Cameras(given_poses(pictures)[None], torch.cat(intrinsics)[None], size)
+
+    def _read(self, rows: slice, size: tuple[int, int]) -> dict[str, Tensor]:
+        views = load_views(self.pictures[rows], size, Monitor())
+        shape = (len(self.pictures), *size)
+        self.images[rows] = views.images
+        if views.mask is not None:
+            self.store.array("mask", shape, fill=1)[rows] = views.mask
+        hints = views.hints
+        if hints.cameras is None:
+            return {"intrinsics": torch.eye(3).repeat(len(views.images), 1, 1)}
+        if hints.depth is not None:
+            self.store.array("given_depth", shape)[rows] = hints.depth[0]
+        return {"intrinsics": hints.cameras.intrinsics[0]}
+
+    def views(self, rows: Tensor) -> tuple[Tensor, Hints]:
+        """Images ``[1, n, 3, H, W]`` and what is known of some views, ``rows`` ``[n]``."""
+        mask = None if self.mask is None else self.mask[None, rows]
+        if self.given is None:
+            return self.images[None, rows], Hints(frame_ids=rows[None], mask=mask)
+        depth = None if self._depth is None else self._depth[None, rows]
+        near_far = depth_range([self.pictures[row] for row in rows.tolist()])
+        hints = Hints(depth, self.given.select(rows), (self._source,), rows[None], near_far, mask)
+        return self.images[None, rows], hints

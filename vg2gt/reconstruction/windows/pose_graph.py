@@ -1,0 +1,196 @@
+"""One frame for windows whose backbone predicts cameras: similarities on shared views, loops closed by a pose graph."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TypeAlias
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from vg2gt.geometry.alignment import Similarity, align_cameras, fit_depth_scale, weighted_median
+from vg2gt.geometry.cameras import camera_centers
+from vg2gt.method.additions.visibility.counts import count_views
+from vg2gt.types import Cameras
+
+PARAMETERS = 7  # of a window: logarithm of its scale, rotation vector, translation
+OUTLIER = 0.02  # residuals (relative, rad, window depths) beyond which an edge counts less
+CONTRADICTS = 0.1  # largest residual with which a loop is taken
+AGREE = 0.1  # share of one part's pixels with which the other must agree, for a loop to count
+TOLERANCE, MARGIN = 0.05, 0.1  # of depth, in that check
+ROUNDS = 50  # of the pose graph's solver
+APART = 2  # windows between those that a loop joins
+
+
+Edge: TypeAlias = "tuple[int, int, NDArray[np.float64], int]"
+"""Windows a and b, the similarity from a's frame to b's, and how many views they share."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a backbone predicts of some views, in a frame and unit of its own.
+
+    Attributes:
+        views: ``[n]`` int64 which they are.
+        cameras: ``[1, n]``; their size is that of the depth.
+        depth: ``[n, h, w]`` reduced, 0 = none.
+        intrinsics: ``[1, n, 3, 3]`` of the images.
+    """
+
+    views: Tensor
+    cameras: Cameras
+    depth: Tensor
+    intrinsics: Tensor
+
+    def exact(self, views: Tensor) -> tuple[Cameras, Tensor]:
+        """Cameras in float64, and depth, of some of the views."""
+        rows = (self.views[None] == views[:, None]).int().argmax(1)
+        chosen = self.cameras.select(rows)
+        return replace(chosen, world_to_camera=chosen.world_to_camera.double()), self.depth[rows]
+
+
+def place_windows(windows: Sequence[Found], loops: Sequence[Found] = ()) -> Similarity:
+    """Similarities ``[n]`` (float64) of windows into the frame and unit of the first.
+
+    Args:
+        windows: in order, each sharing views with the next.
+        loops: share views with windows far apart, the most trusted first. One that contradicts the others is left out.
+
+    Raises:
+        ValueError: if a window shares no views with the others.
+    """
+    nodes, edges = [], []
+    for window in windows:
+        edges += _edges(nodes, window)
+        nodes.append(window)
+    poses = _chained(edges, np.zeros((1, PARAMETERS)), len(nodes))
+    if len(edges) >= len(nodes):  # otherwise the chain fits every edge
+        poses, _ = _solved(nodes, edges, poses)
+    for loop in loops:
+        more = [*edges, *_edges(nodes, loop)]
+        tried, largest = _solved([*nodes, loop], more, _chained(more, poses, len(nodes) + 1))
+        if largest < CONTRADICTS:
+            poses, edges = tried, more
+            nodes.append(loop)
+    poses = poses[: len(windows)]
+    rotation = Rotation.from_rotvec(poses[:, 1:4]).as_matrix()
+    return Similarity(*(torch.from_numpy(part) for part in (np.exp(poses[:, 0]), rotation, poses[:, 4:].copy())))
+
+
+def _solved(
+    found: Sequence[Found], edges: Sequence[Edge], start: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], float]:
+    """Parameters ``[n, 7]`` of all windows that fit the edges best, the first one's kept, and the largest misfit."""
+    depths = [float(each.depth[each.depth > 0].median()) if (each.depth > 0).any() else 1.0 for each in found]
+    a, b = np.array([edge[:2] for edge in edges]).T
+    measured = np.stack([edge[2] for edge in edges])
+    weight = np.sqrt([edge[3] for edge in edges])[:, None] / OUTLIER
+    lengths = (np.exp(start[:, 0]) * depths)[a, None]  # in the first window's unit
+
+    def misfits(flat: NDArray[np.float64]) -> NDArray[np.float64]:
+        poses = np.concatenate((start[:1], flat.reshape(-1, PARAMETERS)))
+        wanted = _compose(poses[b], measured)
+        turn = (Rotation.from_rotvec(poses[a, 1:4]).inv() * Rotation.from_rotvec(wanted[:, 1:4])).as_rotvec()
+        return np.column_stack((wanted[:, 0] - poses[a, 0], turn, (wanted[:, 4:] - poses[a, 4:]) / lengths))
+
+    result = least_squares(
+        lambda flat: (weight * misfits(flat)).ravel(),
+        start[1:].ravel(),
+        loss="soft_l1",
+        x_scale="jac",
+        max_nfev=ROUNDS,
+    )
+    return np.concatenate((start[:1], result.x.reshape(-1, PARAMETERS))), float(np.abs(misfits(result.x)).max())
+
+
+def loop_candidates(descriptors: Tensor, blocks: Sequence[slice], most: int) -> list[tuple[int, int]]:
+    """Pairs of views, of windows far apart in the order, that look alike; the most alike first.
+
+    Args:
+        descriptors: ``[V, D]`` one a view, from the backbone's tokens.
+        blocks: each window's views.
+        most: pairs, at most; of two neighbouring windows only one pair each.
+    """
+    unit = torch.nn.functional.normalize(descriptors - descriptors.mean(0), dim=1)
+    pairs = []
+    for i, j in itertools.combinations(range(len(blocks)), 2):
+        if j - i > APART:
+            alike = unit[blocks[i]] @ unit[blocks[j]].T
+            best = int(alike.argmax())
+            u, v = divmod(best, alike.shape[1])
+            pairs.append((float(alike.flatten()[best]), i, j, blocks[i].start + u, blocks[j].start + v))
+    chosen: list[tuple[int, int, int, int]] = []
+    for _, i, j, u, v in sorted(pairs, reverse=True):
+        if len(chosen) < most and all(abs(i - k) > 1 or abs(j - m) > 1 for k, m, _, _ in chosen):
+            chosen.append((i, j, u, v))
+    return [(u, v) for _, _, u, v in chosen]
+
+
+def closes(loop: Found, parts: tuple[Tensor, Tensor]) -> bool:
+    """Whether the two parts of a loop's views see the same surfaces, as the backbone places them.
+
+    Args:
+        loop: all its views.
+        parts: ``[m]`` rows of either part.
+    """
+    partners = torch.full((len(loop.views), max(map(len, parts))), -1, dtype=torch.int64)
+    for own, other in (parts, parts[::-1]):
+        partners[own, : len(other)] = other
+    counts = count_views(loop.depth, loop.cameras, partners, TOLERANCE, MARGIN)
+    known, agree = loop.depth > 0, counts.agree > 0
+    against = (counts.through > counts.agree).sum()
+    return bool(agree.sum() > AGREE * known.sum()) and bool(agree.sum() > against)
+
+
+def _edges(found: Sequence[Found], last: Found) -> list[Edge]:
+    """Edges between windows and a further one with at least two views that both have."""
+    edges = []
+    for number, each in enumerate(found):
+        shared = each.views[torch.isin(each.views, last.views)]
+        if len(shared) >= 2:
+            edges.append((number, len(found), _between(each.exact(shared), last.exact(shared)), len(shared)))
+    return edges
+
+
+def _between(a: tuple[Cameras, Tensor], b: tuple[Cameras, Tensor]) -> NDArray[np.float64]:
+    """The similarity from one frame to another: its scale from the views' depth, the rest from their cameras."""
+    depths = a[1][:, None], b[1][:, None]  # each view's own scale
+    scale = fit_depth_scale(*depths, depths[0] > 0)
+    scale = scale[torch.isfinite(scale)]
+    move = align_cameras(a[0], b[0])
+    size = float(scale.double().median()) if len(scale) else float(move.scale)
+    turned = size * camera_centers(a[0])[0] @ move.rotation[0].T
+    shift = weighted_median((camera_centers(b[0])[0] - turned).T, torch.ones(3, len(turned), dtype=torch.float64))
+    turn = Rotation.from_matrix(move.rotation[0].numpy()).as_rotvec()
+    return np.concatenate(([np.log(size)], turn, shift.numpy()))
+
+
+def _chained(edges: Sequence[Edge], known: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+    """Parameters ``[n, 7]`` of all windows: the first ones' known, every other placed by its edge to the one before."""
+    poses = list(known)
+    for node in range(len(known), count):
+        found = [edge for edge in edges if edge[1] == node]
+        if not found:
+            raise ValueError(f"window {node} shares no views with those before: take larger windows")
+        other, _, move, _ = found[-1]
+        poses.append(_compose(poses[other][None], _inverse(move))[0])
+    return np.stack(poses)
+
+
+def _compose(outer: NDArray[np.float64], inner: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Parameters ``[n, 7]`` of ``x -> outer(inner(x))``."""
+    turn = Rotation.from_rotvec(outer[:, 1:4])
+    shift = np.exp(outer[:, :1]) * turn.apply(inner[:, 4:]) + outer[:, 4:]
+    turned = (turn * Rotation.from_rotvec(inner[:, 1:4])).as_rotvec()
+    return np.column_stack((outer[:, 0] + inner[:, 0], turned, shift))
+
+
+def _inverse(move: NDArray[np.float64]) -> NDArray[np.float64]:
+    turn = Rotation.from_rotvec(move[1:4]).inv()
+    return np.concatenate(([-move[0]], turn.as_rotvec(), -np.exp(-move[0]) * turn.apply(move[4:])))[None]

@@ -1,0 +1,322 @@
+"""A scene from a long capture: every window goes through the model, voxels are what the windows have in common."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import cast
+
+import torch
+from torch import Tensor
+
+from vg2gt.geometry.cameras import crop_intrinsics, scale_translations
+from vg2gt.geometry.precision import half_precision_on_gpu
+from vg2gt.io.tensors import read_tensors
+from vg2gt.memory import note_sizes
+from vg2gt.method.additions.visibility.blocks import check_blocks, coarsening
+from vg2gt.method.additions.visibility.check import choose_partners
+from vg2gt.method.fine import FineModule
+from vg2gt.method.grid import scene_voxel_size
+from vg2gt.model import VG2GT, Reconstructor, background_sums
+from vg2gt.reconstruction.inputs import Views
+from vg2gt.reconstruction.monitor import Monitor
+from vg2gt.reconstruction.order import working_order
+from vg2gt.reconstruction.pictures import Picture
+from vg2gt.reconstruction.windows.capture import Capture, Window, cut
+from vg2gt.reconstruction.windows.merging import as_tensors, merge_windows
+from vg2gt.reconstruction.windows.placement import Placement, moves_onto, place_found
+from vg2gt.reconstruction.windows.pose_graph import Found, closes, loop_candidates, place_windows
+from vg2gt.reconstruction.windows.sets import Anchor, finished_sets
+from vg2gt.reconstruction.windows.store import WindowStore, key_of
+from vg2gt.types import Cameras, Gaussians, Geometry, Hints, Tokens
+
+TOKEN_BYTES = 4e9  # of tokens on the disk; if all windows' have more, the backbone runs a second time instead
+REDUCED = 4  # pixels between the depths by which windows are placed
+MEDIAN_OF = 1 << 24  # depths, at most, that a median is taken of
+
+
+def window_model(model: Reconstructor) -> VG2GT:
+    """The model, if it can work in windows.
+
+    Raises:
+        ValueError: if it cannot, with the remedy.
+    """
+    if model.visibility is not None and model.visibility.moment is not None:
+        raise ValueError("what moves is found among all views at once: add --window 0, or model.visibility.moment=null")
+    if isinstance(model, VG2GT) and isinstance(model.fine, FineModule):
+        return model
+    raise ValueError(f"{type(model).__name__} reconstructs all views at once: add --window 0, or take fewer views")
+
+
+class WindowRun:
+    """One reconstruction in windows.
+
+    Args:
+        model: in eval mode.
+        pictures: of the views, in order.
+        size: ``(height, width)`` of the images.
+        window: views of a window.
+        folder: keeps what is done.
+        monitor: shows the progress.
+        anchor: of the scene that the pictures are added to; None: they make a new one.
+    """
+
+    def __init__(
+        self,
+        model: VG2GT,
+        pictures: Sequence[Picture],
+        size: tuple[int, int],
+        window: int,
+        folder: Path,
+        monitor: Monitor,
+        anchor: Anchor | None = None,
+    ) -> None:
+        self.model, self.monitor, self.count, self.folder = model, monitor, len(pictures), folder
+        self.anchor = anchor
+        self.fine = cast(FineModule, model.fine)
+        self.device = next((parameter.device for parameter in model.parameters()), torch.device("cpu"))
+        self.store = WindowStore(folder, set_key(model, pictures, size, window, anchor))
+        self.capture = Capture(self.store, pictures, size, monitor)
+        self.windows = cut(len(pictures), window)
+        shape = (self.count, *size)
+        self.raw, self.conf = (self.store.array(name, shape) for name in ("raw_depth", "depth_conf"))
+        self.depth = self.store.array("depth", shape)
+
+    def geometry_and_gaussians(self) -> tuple[Geometry, Gaussians, Tensor]:
+        """Geometry of all views with depth where the scene is made of it, the Gaussians, and the scene's unit."""
+        surveyed, anchor = self.survey(), self.anchor
+        placement = self._placement(surveyed)
+        metres = torch.cat([each["scale"] for each in surveyed]) / placement.scales[self._firsts()]
+        for rows in self._blocks():
+            self.depth[rows] = self.raw[rows] * placement.scales[rows, None, None]
+        if anchor is None:
+            reference = placement.cameras.world_to_camera[0, working_order(self.capture.images)[0]]
+        else:
+            reference = torch.from_numpy(anchor.reference)
+        geometry = Geometry(self.depth[None], self.conf[None], placement.seen_from(reference), metres.median()[None])
+        unit = self.model.scale(_sampled(geometry), None) if anchor is None else torch.tensor([anchor.unit])
+        for rows in self._blocks():
+            self.depth[rows] *= unit
+        geometry = replace(geometry, cameras=scale_translations(geometry.cameras, unit), scale=geometry.scale / unit)
+        size = self._check(geometry)
+        if anchor is None:
+            anchor = Anchor(reference.double().numpy(), float(unit), float(size), self.capture.size, key_of(self.model))
+            for other in finished_sets(self.folder):
+                if other != self.store.folder:
+                    shutil.rmtree(other)
+            anchor.write(self.folder)
+        self.anchor = anchor
+        self._pool(geometry, torch.tensor([anchor.voxel_size]))
+        self.store.finish()
+        geometry = replace(geometry, cameras=geometry.cameras.to(self.device))
+        return geometry, gaussians_of(self.model, self.folder, anchor, self.monitor), unit
+
+    def views(self) -> Views:
+        """The input, mapped from files."""
+        capture = self.capture
+        names = tuple(picture.name for picture in capture.pictures)
+        hints = Hints(frame_ids=torch.arange(self.count)[None])
+        return Views(capture.images, names, (), hints, capture.mask, tuple(capture.pictures))
+
+    def _blocks(self) -> list[slice]:
+        return [window.own for window in self.windows]
+
+    def _firsts(self) -> list[int]:
+        return [window.own.start for window in self.windows]
+
+    def survey(self) -> list[dict[str, Tensor]]:
+        """Depth of all views, in their windows' units; of every window what is needed to place it."""
+        with self.monitor.measure("windows") as show:
+            found = []
+            for number, window in enumerate(self.windows):
+                name = f"window-{number:06d}"
+                known = self.store.load(name)
+                if known is None:
+                    tokens, geometry = self._enhanced(window.views)
+                    depth = geometry.depth[0, window.inner].nan_to_num(0.0, 0.0, 0.0)
+                    self.raw[window.own] = depth.cpu()
+                    self.conf[window.own] = geometry.depth_conf[0, window.inner].cpu()
+                    self._keep_tokens(number, window, tokens)
+                    known = _summary(window.views, tokens, geometry)
+                    self.store.save(name, known)
+                found.append(known)
+                show((number + 1) / len(self.windows), f"{number + 1} of {len(self.windows)}")
+        return found
+
+    def loops(self, surveyed: Sequence[dict[str, Tensor]]) -> list[Found]:
+        """Windows of views that were taken at different times and look alike, where the backbone places both."""
+        rows = [each["descriptors"][w.inner] for each, w in zip(surveyed, self.windows, strict=True)]
+        pairs = loop_candidates(torch.cat(rows), self._blocks(), most=len(self.windows) // 2)
+        half, found = len(self.windows[0].views) // 2, []
+        with self.monitor.measure("close loops") as show:
+            for number, pair in enumerate(pairs):
+                firsts = [min(max(view - half // 2, 0), self.count - half) for view in pair]
+                views = torch.cat([torch.arange(first, first + half) for first in firsts])
+                known = self.store.load(f"loop-{number:06d}")
+                if known is None:
+                    known = _summary(views, *self._enhanced(views))
+                    self.store.save(f"loop-{number:06d}", known)
+                loop = found_of(known)
+                if closes(loop, (torch.arange(half), torch.arange(half, 2 * half))):
+                    found.append(loop)
+                show((number + 1) / len(pairs), f"{number + 1} of {len(pairs)}")
+        return found
+
+    def _enhanced(self, views: Tensor) -> tuple[Tokens, Geometry]:
+        """Tokens and geometry of some views in the unit of the backbone."""
+        images, hints = self.capture.views(views)
+        images, hints = images.to(self.device), hints.to(self.device)
+        # Without enhancement nothing depends on the unit, and depth keeps its last digit.
+        one = None if self.model.coarse is not None else torch.ones(1, device=self.device)
+        with half_precision_on_gpu(images):
+            tokens, decoded = self.model.enhance(images, hints, unit=one)
+        geometry, unit = decoded.geometry, decoded.unit
+        if one is None:
+            geometry = replace(
+                geometry,
+                depth=geometry.depth / unit,
+                cameras=scale_translations(geometry.cameras, 1 / unit),
+                scale=geometry.scale * unit,
+            )
+        return tokens, geometry
+
+    def _keep_tokens(self, number: int, window: Window, tokens: Tokens) -> None:
+        own = {f"{tap:03d}": patch[:, window.inner].clone() for tap, patch in enumerate(tokens.patch)}
+        if sum(patch[:, 0].nbytes for patch in own.values()) * self.count <= TOKEN_BYTES:
+            self.store.save(f"tokens-{number:06d}", own)
+
+    def _tokens(self, number: int, window: Window) -> Tokens:
+        """What the fine level needs of a window's own views."""
+        found = self.store.load(f"tokens-{number:06d}")
+        if found is None:
+            patch = tuple(tap[:, window.inner] for tap in self._enhanced(window.views)[0].patch)
+        else:
+            patch = tuple(found[name].to(self.device) for name in sorted(found))
+        height, width = self.capture.size
+        grid = (height // self.model.backend.patch_size, width // self.model.backend.patch_size)
+        return Tokens(patch, patch[-1][:, :, 0], grid, self.capture.size)
+
+    def _placement(self, surveyed: list[dict[str, Tensor]]) -> Placement:
+        given = self.capture.given
+        if given is not None and not self.model.backend.predicts_cameras:
+            return Placement(given, torch.ones(self.count))
+        found = [found_of(each) for each in surveyed]
+        moves = place_windows(found, self.loops(surveyed)) if given is None else moves_onto(found, given)
+        return place_found(found, moves, self.windows, self.capture.size)
+
+    def _check(self, geometry: Geometry) -> Tensor:
+        """Takes depth away that other views contradict; the edge of the fine voxels ``[1]``."""
+        check, coarsen, fine = self.model.visibility, None, self.fine
+        if check is not None:
+            masks = (self.store.array("kept", self.depth.shape), self.store.array("kept_next", self.depth.shape))
+            steps = check.rounds * len(self.windows)
+            with self.monitor.measure("views check views") as show:
+                partners = choose_partners(self.depth, geometry.cameras, check.partners)
+                coarsen = coarsening(check, self.depth, geometry.cameras, partners)
+                blocks = check_blocks(check, self.depth, geometry.cameras, partners, self._blocks(), masks)
+                for step, _ in enumerate(blocks):
+                    show((step + 1) / steps, f"{step + 1} of {steps}")
+            for rows in self._blocks():
+                self.depth[rows] *= masks[0][rows]
+        return scene_voxel_size(_sampled(geometry), fine.voxel_size, fine.min_footprint, coarsen)
+
+    def _pool(self, geometry: Geometry, size: Tensor) -> None:
+        sums = [background_sums(self.capture.images[None, rows], self.raw[None, rows]) for rows in self._blocks()]
+        total, weight = (torch.stack(parts).sum(0) for parts in zip(*sums, strict=True))
+        self.store.save("background", {"total": total, "weight": weight})
+        with self.monitor.measure("fine voxels") as show:
+            for number, window in enumerate(self.windows):
+                name = f"voxels-{number:06d}"
+                if not self.store.has(name):
+                    part = Geometry(
+                        geometry.depth[:, window.own].to(self.device),
+                        geometry.depth_conf[:, window.own].to(self.device),
+                        geometry.cameras.select(window.own).to(self.device),
+                        geometry.scale.to(self.device),
+                    )
+                    images = self.capture.images[None, window.own].to(self.device)
+                    with half_precision_on_gpu(images):
+                        pooled = self.fine.pool(self._tokens(number, window), part, images, size.to(self.device))
+                    self.store.save(name, as_tensors(pooled))
+                show((number + 1) / len(self.windows), f"{number + 1} of {len(self.windows)}")
+
+
+@torch.no_grad()
+def gaussians_of(
+    model: VG2GT, folder: Path, anchor: Anchor, monitor: Monitor, left_out: Path | None = None
+) -> Gaussians:
+    """Gaussians of all finished sets of a folder; the same sets give the same bits, whatever was there in between.
+
+    Args:
+        model: that pooled them.
+        folder: of the sets.
+        anchor: what they share.
+        monitor: shows the progress.
+        left_out: folder of a set that does not count.
+
+    Raises:
+        ValueError: if there is no voxel.
+    """
+    sets = [place for place in finished_sets(folder) if place != left_out]
+    files = [file for place in sets for file in sorted(place.glob("voxels-*"))]
+    with monitor.measure("merge voxels") as show:
+        pooled = merge_windows(files, lambda done: show(done, "of all windows"))
+    device = next((parameter.device for parameter in model.parameters()), torch.device("cpu"))
+    note_sizes({"voxels": len(pooled)})
+    with monitor.stage("Gaussians"), half_precision_on_gpu(torch.empty(0, device=device)):
+        voxels = cast(FineModule, model.fine).refine(
+            pooled.to(device), torch.tensor([anchor.voxel_size], device=device)
+        )
+        gaussians = model.gaussians(voxels)
+    if model.background == "black":
+        return gaussians
+    sums = [read_tensors(place / "background.safetensors") for place in sets]
+    total, weight = (torch.stack([each[name] for each in sums]).sum(0) for name in ("total", "weight"))
+    return replace(gaussians, background=(total / weight).to(device))
+
+
+def set_key(
+    model: VG2GT, pictures: Sequence[Picture], size: tuple[int, int], window: int, anchor: Anchor | None = None
+) -> str:
+    """Names a set of pictures as this model works on them, for a scene of this anchor."""
+    files = [[p.name, p.size, p.source, *_state(p)] for p in pictures]
+    return key_of(model, files, size, window, None if anchor is None else anchor.plain())
+
+
+def _summary(views: Tensor, tokens: Tokens, geometry: Geometry) -> dict[str, Tensor]:
+    """What places a window: cameras, reduced depth, metres per unit, and a descriptor of each view."""
+    shallow, cameras = tokens.patch[0][0].float(), geometry.cameras
+    reduced = geometry.depth[0, :, REDUCED // 2 :: REDUCED, REDUCED // 2 :: REDUCED]
+    found = {
+        "views": views,
+        "poses": cameras.world_to_camera,
+        "intrinsics": cameras.intrinsics,
+        "depth": reduced.nan_to_num(0.0, 0.0, 0.0),
+        "scale": geometry.scale,
+        "descriptors": torch.cat((shallow.mean(1), shallow.std(1)), -1),
+    }
+    return {name: tensor.cpu() for name, tensor in found.items()}
+
+
+def found_of(known: dict[str, Tensor]) -> Found:
+    """A window's cameras and reduced depth, as its survey kept them."""
+    size = (known["depth"].shape[1], known["depth"].shape[2])
+    shifted = crop_intrinsics(known["intrinsics"], REDUCED // 2, REDUCED // 2)
+    sampled = torch.cat((shifted[..., :2, :] / REDUCED, shifted[..., 2:, :]), -2)
+    return Found(known["views"], Cameras(known["poses"], sampled, size), known["depth"], known["intrinsics"])
+
+
+def _state(picture: Picture) -> list[int]:
+    """Changes with the picture's file."""
+    state = None if picture.path is None else picture.path.stat()
+    return [] if state is None else [state.st_size, state.st_mtime_ns]
+
+
+def _sampled(geometry: Geometry) -> Geometry:
+    """Geometry with few enough depths for a median, evenly spread; all of them where there are few."""
+    step = 1
+    while geometry.depth.numel() // step**2 > MEDIAN_OF:
+        step += 1
+    return replace(geometry, depth=geometry.depth[..., step // 2 :: step, step // 2 :: step])

@@ -1,0 +1,132 @@
+"""Scenes of several sets of images: one set a command, added and taken out again by the voxels that each pooled."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from vg2gt.io.files import by_number, read_json, write_json
+from vg2gt.reconstruction.scene import Scene
+from vg2gt.reconstruction.windows.store import SET
+from vg2gt.types import Cameras
+
+_ANCHOR = "scene.json"
+_KEPT = ("voxels-", "background", SET)  # how the files begin that a finished set needs
+
+
+@dataclass(frozen=True)
+class Anchor:
+    """What all sets of a scene share; made by the first.
+
+    Attributes:
+        reference: ``[4, 4]`` float64 given pose of the camera whose frame the voxels are in.
+        unit: scene units per unit of the given cameras.
+        voxel_size: edge of the fine voxels in scene units.
+        size: ``(height, width)`` of the images.
+        model: key of the model.
+    """
+
+    reference: NDArray[np.float64]
+    unit: float
+    voxel_size: float
+    size: tuple[int, int]
+    model: str
+
+    @property
+    def to_source(self) -> NDArray[np.float64]:
+        """``[4, 4]`` similarity from the frame and unit of the voxels to those of the given cameras."""
+        matrix = np.linalg.inv(self.reference) @ np.diag([1 / self.unit, 1 / self.unit, 1 / self.unit, 1.0])
+        return matrix.astype(np.float64)
+
+    def plain(self) -> dict[str, Any]:
+        """The attributes as JSON has them."""
+        return vars(self) | {"reference": self.reference.tolist()}
+
+    def write(self, folder: Path) -> None:
+        """Writes it into the folder of the sets."""
+        write_json(folder / _ANCHOR, self.plain())
+
+
+def read_anchor(folder: Path) -> Anchor:
+    """The anchor of a scene.
+
+    Raises:
+        FileNotFoundError: if there is none, with the remedy.
+    """
+    if not (folder / _ANCHOR).is_file():
+        raise FileNotFoundError(
+            f"{folder} keeps no voxels of a scene: reconstruct it with --window N --keep-windows and given cameras"
+        )
+    found: dict[str, Any] = read_json(folder / _ANCHOR)
+    return Anchor(**found | {"reference": np.array(found["reference"]), "size": tuple(found["size"])})
+
+
+def finished_sets(folder: Path) -> list[Path]:
+    """Folders of the sets whose voxels are all there, in the order in which sums are taken: that of their keys."""
+    return sorted(path.parent for path in folder.glob(f"*/{SET}") if read_json(path).get("finished"))
+
+
+def tidy(folder: Path) -> None:
+    """Leaves what is needed to add sets and to take them out; removes the rest, such as unfinished sets."""
+    done = finished_sets(folder)
+    for place in (file.parent for file in folder.glob(f"*/{SET}")):
+        if place not in done:
+            shutil.rmtree(place)
+    for file in (file for place in done for file in place.iterdir()):
+        if not file.name.startswith(_KEPT):
+            file.unlink()
+
+
+def joined(old: Scene, new: Scene) -> Scene:
+    """The views of two scenes in one frame, in the order of their names, with the Gaussians of the second."""
+    names = (*old.names, *new.names)
+    order = torch.tensor(sorted(range(len(names)), key=lambda view: by_number(names[view])))
+    masks = [torch.ones_like(each.depth) if each.mask is None else each.mask for each in (old, new)]
+
+    def both(one: Tensor, other: Tensor) -> Tensor:
+        return torch.cat((one.cpu(), other.cpu()))[order]
+
+    poses, intrinsics = (
+        both(getattr(old.cameras, name)[0], getattr(new.cameras, name)[0])[None]
+        for name in ("world_to_camera", "intrinsics")
+    )
+    return replace(
+        new,
+        cameras=Cameras(poses, intrinsics, new.cameras.size).to(new.cameras.world_to_camera.device),
+        images=both(old.images, new.images),
+        depth=both(old.depth, new.depth),
+        depth_conf=both(old.depth_conf, new.depth_conf),
+        mask=None if old.mask is None and new.mask is None else both(*masks),
+        names=tuple(names[view] for view in order.tolist()),
+        pictures=(),
+        poses=None if old.poses is None or new.poses is None else both(old.poses, new.poses),
+    )
+
+
+def without(scene: Scene, names: set[str]) -> Scene:
+    """The scene without the views of these names; its Gaussians stay.
+
+    Raises:
+        ValueError: if no view is left.
+    """
+    rows = torch.tensor([view for view, name in enumerate(scene.names) if name not in names])
+    if not len(rows):
+        raise ValueError("no image would be left in the scene")
+    return replace(
+        scene,
+        cameras=scene.cameras.select(rows.to(scene.cameras.world_to_camera.device)),
+        images=scene.images[rows],
+        depth=scene.depth[rows],
+        depth_conf=scene.depth_conf[rows],
+        mask=None if scene.mask is None else scene.mask[rows],
+        names=tuple(scene.names[view] for view in rows.tolist()),
+        pictures=(),
+        poses=None if scene.poses is None else scene.poses[rows],
+    )

@@ -1,0 +1,99 @@
+"""Files of a reconstruction in windows: arrays of all views that are mapped into memory, and finished steps."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.lib.format import open_memmap
+from safetensors import safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from vg2gt.io.errors import FormatError
+from vg2gt.io.files import replacing, write_json
+from vg2gt.io.tensors import read_tensors
+from vg2gt.model import Reconstructor
+
+FORMAT = 1
+"""Of the folder; raise it when it is written otherwise."""
+SET = "set.json"  # what a folder is of
+_PLAIN = (bool, int, float, str, tuple, type(None))
+
+
+class WindowStore:
+    """The folder of one set of images. What is in it survives an interruption.
+
+    Args:
+        folder: of all sets of images; the set has a folder in it, made if it is not there.
+        key: of the set: its images, model and sizes.
+    """
+
+    def __init__(self, folder: Path, key: str) -> None:
+        self.folder = folder / key[:12]
+        if not (self.folder / SET).is_file():
+            write_json(self.folder / SET, {"finished": False})
+
+    def finish(self) -> None:
+        """Notes that all steps are done."""
+        write_json(self.folder / SET, {"finished": True})
+
+    def array(self, name: str, shape: Sequence[int] | None = None, fill: float = 0) -> Tensor:
+        """A float32 array of the folder, mapped into memory: what is written to the tensor is in the file.
+
+        Args:
+            name: of its file.
+            shape: makes it, of ``fill``, where it is not there.
+            fill: see ``shape``.
+        """
+        path = self.folder / f"{name}.npy"
+        if shape is not None and not path.is_file():
+            with replacing(path) as temporary:
+                made = open_memmap(temporary, "w+", np.float32, tuple(shape))
+                if fill:
+                    made[:] = fill
+                del made
+        return torch.from_numpy(open_memmap(path, "r+"))
+
+    def has(self, name: str) -> bool:
+        """Whether there is an array, or a finished step of this name."""
+        return (self.folder / f"{name}.npy").is_file() or self.step(name).is_file()
+
+    def step(self, name: str) -> Path:
+        """The file of a finished step."""
+        return self.folder / f"{name}.safetensors"
+
+    def save(self, name: str, tensors: Mapping[str, Tensor]) -> None:
+        """Writes what a step found, whole or not at all."""
+        with replacing(self.step(name)) as temporary:
+            save_file({key: value.detach().cpu().contiguous() for key, value in tensors.items()}, temporary)
+
+    def load(self, name: str) -> dict[str, Tensor] | None:
+        """What a step found; None where it is not finished."""
+        try:
+            return read_tensors(self.step(name))
+        except (FileNotFoundError, FormatError):
+            return None
+
+
+def read_rows(file: Path, rows: slice) -> dict[str, Tensor]:
+    """Some rows of all tensors of a finished step's file."""
+    with safe_open(file, "pt") as opened:
+        return {key: opened.get_slice(key)[rows] for key in opened.keys()}  # noqa: SIM118
+
+
+def key_of(model: Reconstructor, *facts: object) -> str:
+    """Changes with a model's weights and options, and with the facts (JSON)."""
+    digest = hashlib.sha256(json.dumps([FORMAT, model.backend.identity(), facts]).encode())
+    for name, module in model.named_modules():
+        options = {key: value for key, value in vars(module).items() if isinstance(value, _PLAIN) and key[0] != "_"}
+        digest.update(f"{name} {sorted(options.items())}".encode())
+    digest.update(f"{model.visibility} {vars(model.scale)}".encode())
+    for name, tensor in sorted(model.trained_state().items()):
+        digest.update(name.encode())
+        digest.update(tensor.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().tobytes())
+    return digest.hexdigest()
