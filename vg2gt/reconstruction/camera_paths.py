@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -41,7 +42,7 @@ def orbit(cameras: Sequence[NamedCamera], distance: float, frames: int = 72) -> 
         local = np.eye(4)
         local[:3, :3] = _facing(np.array([0, 0, distance]) - place)
         local[:3, 3] = place
-        path.append(_moved(middle, invert_pose(to_world @ local), len(path)))
+        path.append(replace(middle, name=f"orbit-{len(path):04d}", world_to_camera=invert_pose(to_world @ local)))
     return path
 
 
@@ -94,10 +95,6 @@ def interpolate(cameras: Sequence[NamedCamera], between: int) -> list[NamedCamer
 def view_stem(name: str) -> str:
     """A view's name without the ending of an image file; other dots are part of the name."""
     return name[: -len(suffix)] if (suffix := Path(name).suffix).lower() in IMAGE_SUFFIXES else name
-
-
-def _moved(camera: NamedCamera, world_to_camera: NDArray[np.float64], number: int) -> NamedCamera:
-    return NamedCamera(f"orbit-{number:04d}", camera.width, camera.height, camera.intrinsics, world_to_camera)
 
 
 def _facing(direction: NDArray[np.float64]) -> NDArray[np.float64]:

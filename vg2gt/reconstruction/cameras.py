@@ -15,9 +15,9 @@ from vg2gt.io.files import by_number
 from vg2gt.model import Reconstructor
 from vg2gt.reconstruction.given_cameras import LAYOUTS, describe, given_pictures
 from vg2gt.reconstruction.monitor import Monitor
-from vg2gt.reconstruction.pictures import ImagesLike, Picture, find_pictures
+from vg2gt.reconstruction.pictures import ImagesLike, Picture, find_pictures, report_damaged, undamaged
 from vg2gt.reconstruction.sfm import find_cameras, require_pycolmap
-from vg2gt.reconstruction.sound import readable, without_copies
+from vg2gt.reconstruction.sound import without_copies
 
 log = logging.getLogger(__name__)
 
@@ -73,7 +73,10 @@ def pictures_for(
                 raise
             log.warning("camera files are not used, structure from motion runs instead: %s", error)
     if given is not None:
-        yield without_copies(readable(given) if skip_damaged else given)
+        damaged: list[str] = []
+        given = undamaged(given, damaged) if skip_damaged else given
+        report_damaged(damaged, skip=True)
+        yield without_copies(given)
         return
     if backend.needs_depth:
         raise ValueError(_no_depth(backend.name, images))

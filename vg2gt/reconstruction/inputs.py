@@ -11,13 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from vg2gt.data.base import DataError, Frames
+from vg2gt.data.base import Frames
 from vg2gt.data.transforms import resize_to_cover
 from vg2gt.geometry.cameras import crop_intrinsics, resize_intrinsics
 from vg2gt.io.cameras_json import NamedCamera, Photo
 from vg2gt.reconstruction.monitor import Monitor
-from vg2gt.reconstruction.pictures import Picture
-from vg2gt.reconstruction.sound import name_damaged
+from vg2gt.reconstruction.pictures import Picture, decoded
 from vg2gt.types import Cameras, Hints
 
 log = logging.getLogger(__name__)
@@ -88,11 +87,8 @@ def load_views(pictures: Sequence[Picture], size: tuple[int, int], monitor: Moni
     """
     frames: list[Frames] = []
     with monitor.stage("load images", len(pictures)) as advance:
-        for picture in pictures:
-            try:
-                frames.append(resize_to_cover(picture.read(size), size))
-            except DataError as error:
-                raise name_damaged(pictures, error) from error
+        for number in range(len(pictures)):
+            frames.append(resize_to_cover(decoded(pictures, number, size), size))
             advance()
     kept = tuple(_kept(picture.size, size) for picture in pictures)
     much = [picture.name for picture, share in zip(pictures, kept, strict=True) if share < 1 - _MUCH_LOST]

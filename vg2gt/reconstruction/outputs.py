@@ -215,14 +215,10 @@ def mesh_fusion(scene: Scene, paths: Sequence[Path], voxel_size: float | None) -
         write_mesh(path, mesh)
 
 
-def _write_images(scene: Scene, folder: Path) -> None:
-    for name, image in zip(scene.names, scene.images, strict=True):
-        write_png(folder / f"{name}.png", image)
-
-
 def _images(scene: Scene, target: Path) -> None:
     with whole_folder(target) as folder:
-        _write_images(scene, folder)
+        for name, image in zip(scene.names, scene.images, strict=True):
+            write_png(folder / f"{name}.png", image)
 
 
 def _views(scene: Scene, path: Path) -> None:

@@ -39,7 +39,6 @@ VIDEO_FRAMES = 32  # frames taken from a video by default
 IN_MEMORY = 100  # frames of a video that are kept in memory; more are decoded when they are needed
 IMAGE_FOLDERS = ("images", "color", "rgb", "image", "input")
 _NO_PHOTOGRAPHS = ("masks", "depth", "depths", "color", "normals", "sfm", "sparse", "colmap", "nerfstudio")
-SKIP_DAMAGED = " (--skip-damaged skips what cannot be read)"
 SFM_SOURCE = "structure from motion"  # how the source of cameras found by it begins
 UNKNOWN_LENS = "unknown"  # of images that structure from motion has undistorted
 
@@ -100,17 +99,13 @@ def find_pictures(
     damaged: list[str] = []
     stills = 0
     for item in as_items(images):
-        try:
-            found = _pictures(item, every, max_images, skip_damaged)
-        except DataError as error:
-            damaged.append(str(error).removesuffix(SKIP_DAMAGED))
-            continue
+        found = _pictures(item, every, max_images, damaged)
+        found = undamaged(found, damaged) if skip_damaged else found
         if not _is_video(item):  # of a video every so many-th frame was decoded
             stills += len(found)
             found = [picture for i, picture in enumerate(found, stills - len(found)) if i % every == 0]
         chosen += found
-    if damaged:
-        raise DataError("; ".join(damaged) + SKIP_DAMAGED)
+    report_damaged(damaged, skip_damaged)
     if not chosen:
         raise ValueError("there are no images to reconstruct; give image files, a folder of them, or a video")
     return with_unique_names(evenly(chosen, max_images))
@@ -133,14 +128,49 @@ def check_pictures(images: ImagesLike, skip_damaged: bool = False) -> None:
             if path.suffix.lower() != ".gif":
                 require_pyav(f"reading {path}")
         elif path.is_file():
-            try:
-                _pictures(path, 1, 1, skip_damaged)
-            except DataError as error:
-                damaged.append(str(error).removesuffix(SKIP_DAMAGED))
+            _pictures(path, 1, 1, damaged)
         elif not any(file.suffix.lower() in _HOLDS_PICTURES for file in path.rglob("*")):
             image_files(path)
+    report_damaged(damaged, skip_damaged)
+
+
+def undamaged(pictures: Iterable[Picture], damaged: list[str]) -> list[Picture]:
+    """The pictures that can be decoded; the errors of the others are added to ``damaged``."""
+    found = []
+    for picture in pictures:
+        try:
+            picture.read((64, 64))
+            found.append(picture)
+        except DataError as error:
+            damaged.append(str(error))
+    return found
+
+
+def decoded(pictures: Sequence[Picture], number: int, size: tuple[int, int]) -> Frames:
+    """One of the pictures as a frame of about the size given.
+
+    Raises:
+        DataError: if it cannot be read, naming all of the pictures that cannot.
+    """
+    try:
+        return pictures[number].read(size)
+    except DataError as error:
+        damaged: list[str] = []
+        undamaged(pictures, damaged)
+        report_damaged(damaged or [str(error)], skip=False)
+        raise
+
+
+def report_damaged(damaged: Sequence[str], skip: bool) -> None:
+    """Warns of pictures that are left out, or raises one error that names them all.
+
+    Raises:
+        DataError: if there are any and they must not be skipped.
+    """
+    if damaged and not skip:
+        raise DataError("; ".join(damaged) + " (--skip-damaged skips what cannot be read)")
     if damaged:
-        raise DataError("; ".join(damaged) + SKIP_DAMAGED)
+        log.warning("%d images cannot be read and are left out: %s", len(damaged), "; ".join(damaged))
 
 
 def as_items(images: ImagesLike) -> list[Any]:
@@ -205,36 +235,28 @@ def mask_for(path: Path, upright: bool = True, content: bytes | None = None) -> 
     return joined_masks(parts)
 
 
-def _pictures(item: Any, every: int, max_images: int | None, skip_damaged: bool = False) -> list[Picture]:
+def _pictures(item: Any, every: int, max_images: int | None, damaged: list[str]) -> list[Picture]:
+    """The pictures of one item; errors of files that are no images are added to ``damaged``."""
     if not isinstance(item, (str, Path)):
         return _from_memory(item)
     path = existing_path(item)
     if path.is_dir():
-        return _photos(image_files(path), skip_damaged)
+        return _photos(image_files(path), damaged)
     if is_archive(path):
         files = recorded_files(path, ".jpg")
         if not files:
             raise ValueError(f"{path} holds no images (rgbd/0.jpg and so on): is it a recording of Record3D?")
         return [_photo(file, read_recorded) for file in files.values()]
-    return _video(path, every, max_images) if _is_video(path) else _photos([path], skip_damaged)
+    return _video(path, every, max_images) if _is_video(path) else _photos([path], damaged)
 
 
-def _photos(files: Sequence[Path], skip_damaged: bool) -> list[Picture]:
-    """Photographs; those whose files are damaged are named all at once, or left out."""
+def _photos(files: Sequence[Path], damaged: list[str]) -> list[Picture]:
     found: list[Picture] = []
-    errors: dict[str, Exception] = {}
     for file in files:
         try:
-            picture = _photo(file)
-            if skip_damaged:
-                picture.read((64, 64))
-            found.append(picture)
+            found.append(_photo(file))
         except DataError as error:
-            errors[file.name] = error
-    if errors and not skip_damaged:
-        raise DataError("; ".join(str(error) for error in errors.values()) + SKIP_DAMAGED)
-    if errors:
-        log.warning("%d images cannot be read and are left out: %s", len(errors), ", ".join(errors))
+            damaged.append(str(error))
     return found
 
 
@@ -292,13 +314,13 @@ def _photo(path: Path, content_of: Callable[[Path], bytes | None] = lambda _: No
 
     content = content_of(path)
     size = image_size(path, "", upright=True, content=content)
-    if content is None and is_panorama(path, size):
+    if content is not None:
+        return Picture(path.stem, size, read)
+    if is_panorama(path, size):
         raise ValueError(
             f"{path} is a 360 degree panorama (equirectangular), which no pinhole camera takes: cut it into the faces "
             "of a cube and give these"
         )
-    if content is not None:
-        return Picture(path.stem, size, read)
     return Picture(path.stem, size, read, focal=focal_length(path, size), path=path)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -41,6 +42,7 @@ def read_scene(folder: str | Path, renderer: Renderer, device: torch.device | st
     for name in ("scene.ply", "cameras.json"):
         if not (folder / name).is_file():
             raise FileNotFoundError(f"{folder} has no {name}: give a folder that vg2gt reconstruct has written")
+    report = read_json(folder / "report.json") if (folder / "report.json").is_file() else {}
     gaussians = read_gaussian_ply(folder / "scene.ply").to(device)
     named = read_cameras_json(folder / "cameras.json")
     cameras = _cameras(folder, named).to(device)
@@ -50,6 +52,7 @@ def read_scene(folder: str | Path, renderer: Renderer, device: torch.device | st
         images, mask = _read_images(folder / "images", named), None
         depth = _rendered_depth(renderer, gaussians, cameras)
         conf = torch.ones_like(depth)
+    cameras_from, metres = str(report.get("cameras", PREDICTED)), named[0].metres_per_unit
     return Scene(
         gaussians=gaussians,
         cameras=cameras,
@@ -58,36 +61,21 @@ def read_scene(folder: str | Path, renderer: Renderer, device: torch.device | st
         depth_conf=conf,
         names=tuple(view_stem(camera.name) for camera in named),
         renderer=renderer,
-        metres_per_unit=_metres_per_unit(folder, named[0]),
-        cameras_from=_cameras_from(folder),
-        frame=_frame(folder, named),
+        metres_per_unit=report.get("metres_per_unit") if metres is None else metres,
+        cameras_from="" if cameras_from == PREDICTED else cameras_from,
+        frame=_frame(report, named[0]),
         mask=mask,
         poses=torch.from_numpy(np.stack([camera.world_to_camera for camera in named])),
     )
 
 
-def _cameras_from(folder: Path) -> str:
-    """Where the cameras came from as the report says; empty if the backbone predicted them or it is unknown."""
-    report = folder / "report.json"
-    known = str(read_json(report).get("cameras", PREDICTED)) if report.is_file() else PREDICTED
-    return "" if known == PREDICTED else known
-
-
-def _metres_per_unit(folder: Path, camera: NamedCamera) -> float | None:
-    report = folder / "report.json"
-    if camera.metres_per_unit is not None or not report.is_file():
-        return camera.metres_per_unit
-    return read_json(report).get("metres_per_unit")
-
-
-def _frame(folder: Path, named: list[NamedCamera]) -> SceneFrame | None:
+def _frame(report: dict[str, Any], camera: NamedCamera) -> SceneFrame | None:
     """The frame that the scene was written in; it is kept."""
-    if named[0].similarity is None:
+    if camera.similarity is None:
         return None
-    report = folder / "report.json"
-    name = str(read_json(report).get("frame", "given")) if report.is_file() else "given"
+    name = report.get("frame")
     name = name if name in ("given", "first", "upright") else "given"
-    return SceneFrame(name, named[0].similarity, None, "given", name)  # pyright: ignore[reportArgumentType]
+    return SceneFrame(name, camera.similarity, None, "given", name)
 
 
 def _cameras(folder: Path, named: list[NamedCamera]) -> Cameras:

@@ -143,9 +143,10 @@ class Scene:
         views, height, width = self.depth.shape
         step = max(1, int(np.ceil(np.sqrt(views * height * width / limit))))
         grid = (slice(None), slice(step // 2, None, step), slice(step // 2, None, step))
-        world = unproject(self.depth[None].double(), self.cameras.to("cpu").map(_double))[0]
+        world = unproject(self.depth[None].double(), self.cameras.to("cpu").map(Tensor.double))[0]
         keep = self.depth[grid] > 0
-        view, row, column = (index[grid][keep] for index in _indices(self.depth.shape))
+        indices = torch.meshgrid(*(torch.arange(side) for side in self.depth.shape), indexing="ij")
+        view, row, column = (index[grid][keep] for index in indices)
         colors = (self.images.permute(0, 2, 3, 1)[grid][keep] * 255 + 0.5).to(torch.uint8)
         pixels = torch.stack((column, row), -1)
         return ScenePoints(world[grid][keep].numpy(), colors.numpy(), view.numpy(), pixels.numpy())
@@ -185,11 +186,3 @@ def render_views(renderer: Renderer, gaussians: Gaussians, cameras: Sequence[Nam
         yield RenderedView(
             camera, image.color[0, 0].clamp(0, 1), image.depth[0, 0], image.normal[0, 0], image.alpha[0, 0]
         )
-
-
-def _indices(shape: torch.Size) -> tuple[Tensor, ...]:
-    return torch.meshgrid(*(torch.arange(side) for side in shape), indexing="ij")
-
-
-def _double(tensor: Tensor) -> Tensor:
-    return tensor.double()

@@ -27,7 +27,6 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from vg2gt.data.base import DataError
 from vg2gt.data.sources.colmap_model import COLMAP, model_folder_of
 from vg2gt.data.transforms import reduce_to_fit, to_bytes
 from vg2gt.io.colmap import EXTRA, quiet_colmap
@@ -37,10 +36,10 @@ from vg2gt.io.json_checks import load_json
 from vg2gt.reconstruction.given_cameras import LAYOUTS, recording_pictures
 from vg2gt.reconstruction.maps import whole_folder
 from vg2gt.reconstruction.monitor import Monitor
-from vg2gt.reconstruction.pictures import SFM_SOURCE, UNKNOWN_LENS, Picture, mask_file
+from vg2gt.reconstruction.pictures import SFM_SOURCE, UNKNOWN_LENS, Picture, decoded, mask_file
 from vg2gt.reconstruction.sfm_models import FEWEST_POINTS, map_cameras, other_parts, placed_images, sound_models
 from vg2gt.reconstruction.sfm_pairs import ALL_PAIRS, likely_pairs
-from vg2gt.reconstruction.sound import digest, name_damaged, without_copies
+from vg2gt.reconstruction.sound import digest, without_copies
 
 if TYPE_CHECKING:
     from pycolmap import Reconstruction  # pyright: ignore[reportMissingImports]
@@ -211,10 +210,7 @@ def _stage(pictures: Sequence[Picture], work: Path, advance: Any) -> dict[tuple[
     for number, picture in enumerate(pictures):
         shrink = min(1.0, IMAGE_SIDE / max(picture.size))
         target = (round(picture.size[0] * shrink), round(picture.size[1] * shrink))
-        try:
-            frames = reduce_to_fit(picture.read(target), (IMAGE_SIDE, IMAGE_SIDE))
-        except DataError as error:
-            raise name_damaged(pictures, error) from error
+        frames = reduce_to_fit(decoded(pictures, number, target), (IMAGE_SIDE, IMAGE_SIDE))
         pixels = to_bytes(frames.images[0]).permute(1, 2, 0).numpy()
         name = f"{number:06d}.jpg"
         Image.fromarray(pixels).save(work / "images" / name, quality=_QUALITY, subsampling=0)

@@ -1,4 +1,4 @@
-"""Leaves out pictures that cannot be read, and copies."""
+"""Leaves out pictures that are copies of others."""
 
 from __future__ import annotations
 
@@ -6,24 +6,11 @@ import hashlib
 import logging
 from collections.abc import Sequence
 
-from vg2gt.data.base import DataError
 from vg2gt.data.sources.parsing import IMAGE_SUFFIXES
 from vg2gt.data.transforms import to_bytes
-from vg2gt.reconstruction.pictures import HEIC_SUFFIXES, SKIP_DAMAGED, Picture
+from vg2gt.reconstruction.pictures import HEIC_SUFFIXES, Picture
 
 log = logging.getLogger(__name__)
-
-
-def readable(pictures: Sequence[Picture]) -> list[Picture]:
-    """Those that can be decoded; the others are named in a warning."""
-    found = []
-    for picture in pictures:
-        try:
-            picture.read((64, 64))
-            found.append(picture)
-        except DataError as error:
-            log.warning("left out: %s", error)
-    return found
 
 
 def without_copies(pictures: Sequence[Picture], decode: bool = False) -> list[Picture]:
@@ -53,14 +40,3 @@ def digest(picture: Picture) -> str:
     if picture.path is not None:
         return hashlib.sha256(picture.path.read_bytes()).hexdigest()
     return hashlib.sha256(to_bytes(picture.read(picture.size).images).numpy().tobytes()).hexdigest()
-
-
-def name_damaged(pictures: Sequence[Picture], error: Exception) -> DataError:
-    """The error that names all pictures that cannot be read, after one could not."""
-    errors = []
-    for picture in pictures:
-        try:
-            picture.read((64, 64))
-        except ValueError as other:
-            errors.append(str(other))
-    return DataError("; ".join(errors or [str(error)]) + SKIP_DAMAGED)
