@@ -128,12 +128,11 @@ def composes(config: str, words: list[str], line: str) -> None:
 @pytest.mark.parametrize("page", PAGES, ids=named)
 def test_options_of_groups_exist(page: Path) -> None:
     text = page.read_text()
-    examples = {path.stem for path in ROOT.glob("examples/**/configs/data/*.yaml")}
-    examples |= {path.stem for path in ROOT.glob("examples/configs/data/*.yaml")}
+    examples = {(path.parent.name, path.stem) for path in ROOT.glob("examples/**/configs/*/*.yaml")}
     for group in (path.name for path in Path(config_dir()).iterdir() if path.is_dir() and path.name != "hydra"):
         for option in re.findall(rf"(?<![\w.=+/-]){group}=([a-z]\w*)(?![\w.*/])", text):
-            found = {*group_options(group), *(examples if group == "data" else ())}
-            assert option in found or option == "null", f"{named(page)}: {group}={option}"
+            found = option in group_options(group) or (group, option) in examples
+            assert found or option == "null", f"{named(page)}: {group}={option}"
 
 
 def test_code_names_pages_that_exist() -> None:

@@ -28,6 +28,8 @@ def test_composes(command: str, tmp_path: Path) -> None:
     program, name, *arguments = shlex.split(command)
     own = own_keys(name) if program == "python" else set()
     overrides = [argument for argument in arguments if "=" in argument and argument.split("=")[0] not in own]
+    folders = [arguments[i + 1] for i, argument in enumerate(arguments) if argument == "--config-dir"]
+    overrides += [f"hydra.searchpath=[{ROOT / folder}]" for folder in folders]
     settled = ["name=x", f"output_dir={tmp_path}"]
     if program == "python":
         assert (ROOT / name).is_file()
@@ -44,10 +46,11 @@ def test_composes(command: str, tmp_path: Path) -> None:
 
 
 def test_vggt_is_evaluated_at_the_papers_size() -> None:
-    shown = [shlex.split(command)[2:] for command in COMMANDS if "vggt_1b" in command]
+    shown = [shlex.split(command) for command in COMMANDS if "vggt_1b" in command]
     assert len(shown) == 5
     for overrides in shown:
-        config = compose("evaluate", *overrides, "name=x", "output_dir=x")
+        plugin = f"hydra.searchpath=[{ROOT / 'examples/data_sets/configs'}]"
+        config = compose("evaluate", plugin, *(o for o in overrides if "=" in o), "name=x", "output_dir=x")
         assert list(config.data.image_size) == [518, 518]
         assert config.model._target_.endswith("PointCloud")
 

@@ -93,6 +93,7 @@ def near_keys(name: str, overrides: Sequence[str]) -> str:
     """A line that says what unknown keys of a command line may have meant; empty if there is nothing alike."""
     keys = {each.partition("=")[0] for each in overrides if "=" in each and each[0] not in "+~-"}
     groups = [each for each in overrides if (Path(config_dir()) / each.partition("=")[0]).is_dir()]
+    groups += [each for each in overrides if each.startswith("hydra.searchpath=")]
     try:
         config = compose(name, *groups, "output_dir=.")
     except ValueError:

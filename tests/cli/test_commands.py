@@ -121,10 +121,11 @@ def test_mistakes_are_one_line(words: str, said: Said, tmp_path: Path) -> None:
     assert not list(tmp_path.rglob("config.yaml"))
 
 
+PLUGINS = f"hydra.searchpath=[{ROOT}/examples/data_sets/configs]"
 OVERRIDES = {
     "train model.gausians.splits=4": "there is no option model.gausians.splits, did you mean model.gaussians.splits",
     "train foo.x=1": "Could not override 'foo.x'",
-    "evaluate evaluation=dtu data.root=FOLDER": "no option data.root, did you mean data.train.root or data.val.root",
+    f"evaluate {PLUGINS} evaluation=dtu data.root=X": "no option data.root, did you mean data.train.root or data.val",
     "train backend=da3_smal": r"Could not find 'backend/da3_smal'\s+Available options",
     "train lr=.1": "there is no option lr, did you mean optimizer.lr",
 }

@@ -4,17 +4,21 @@ import pytest
 from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig
 
+from tests.commands import ROOT
 from vg2gt.config import compose, group_options
 from vg2gt.data.views.drawn import index_path
 from vg2gt.evaluation import paper
 from vg2gt.evaluation.options import EvaluationOptions
 
-PRESETS = group_options("evaluation")
+EXAMPLES = ROOT / "examples" / "data_sets" / "configs"
+PLUGINS = sorted(path.stem for path in (EXAMPLES / "evaluation").iterdir())
+PRESETS = [*group_options("evaluation"), *PLUGINS]
 
 
 def composed(preset: str) -> DictConfig:
     root = {"synthetic": [], "dtu": ["data.val.root=somewhere"]}.get(preset, ["data.root=somewhere"])
-    return compose("evaluate", f"evaluation={preset}", "name=x", "output_dir=x", *root)
+    plugin = [f"hydra.searchpath=[{EXAMPLES}]"] if preset in PLUGINS else []
+    return compose("evaluate", *plugin, f"evaluation={preset}", "name=x", "output_dir=x", *root)
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -28,7 +32,7 @@ def test_presets_instantiate(preset: str) -> None:
         assert any(options.table in table for table in paper.tables().values())
 
 
-@pytest.mark.parametrize("preset", sorted({"replica", "dtu", "tat", "scannet"} & set(PRESETS)))
+@pytest.mark.parametrize("preset", sorted({"replica", "scannet", *PLUGINS}))
 def test_the_papers_presets_are_the_papers(preset: str) -> None:
     config = composed(preset)
     options: EvaluationOptions = instantiate(config.evaluation, _convert_="all")

@@ -22,8 +22,6 @@ from vg2gt.io.cameras_json import NamedCamera
 from vg2gt.io.image_files import image_size, read_color, read_depth
 from vg2gt.io.images import open_image
 from vg2gt.io.npz import load_npz
-from vg2gt.io.pfm import read_pfm
-from vg2gt.io.sens import scan_sens
 from vg2gt.io.tensors import read_tensors
 from vg2gt.runs.checkpoints import read_checkpoint
 from vg2gt.runs.trust import read_run_config
@@ -204,10 +202,8 @@ PIPES: dict[str, Callable[[Path], object]] = {
     "photo.png": lambda path: read_color(path, "room"),
     "depth.png": lambda path: read_depth(path, "room"),
     "size.png": lambda path: image_size(path, "room"),
-    "depth.pfm": lambda path: read_pfm(path, "room"),
     "poses.txt": lambda path: read_numbers(path, "room"),
     "depth.npz": lambda path: load_npz(path, "room", ["depth"]),
-    "scan.sens": lambda path: scan_sens(path, "room"),
     "scene.ply": formats.read_gaussian_ply,
     "scene.splat": formats.read_splat,
     "scene.spz": formats.read_spz,

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
+from examples.data_sets.dtu import DTU, DTUTraining
 from vg2gt.data import Frames
-from vg2gt.data.sources import DTU, DTUTraining
 
 from .layouts import SIZE, Layout, pixels, save
 

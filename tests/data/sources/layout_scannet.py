@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from examples.data_sets.scannet_sens import ScanNetSens
 from vg2gt.data import Frames
-from vg2gt.data.sources import ScanNet, ScanNetSens
+from vg2gt.data.sources import ScanNet
 
 from .layouts import Layout, camera_to_world, millimetres, pixels, save
 

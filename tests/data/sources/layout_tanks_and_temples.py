@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from examples.data_sets.tanks_and_temples import TanksAndTemples
 from vg2gt.data import Frames
-from vg2gt.data.sources import TanksAndTemples
 from vg2gt.io import colmap_from_views, write_colmap
 from vg2gt.types import Cameras
 

@@ -7,9 +7,16 @@ import pytest
 import torch
 from PIL import Image
 
+from examples.data_sets.dtu import (
+    DTU,
+    EVALUATION_SCANS,
+    SPARSE_VIEWS,
+    DTUTraining,
+    _from_full,
+    _from_quarter,
+    _registered,
+)
 from vg2gt.data import DataError
-from vg2gt.data.sources import DTU, DTUTraining
-from vg2gt.data.sources.dtu import EVALUATION_SCANS, SPARSE_VIEWS, _from_full, _from_quarter, _registered
 from vg2gt.data.transforms import resize
 
 from .layout_dtu import write_test, write_training

@@ -6,9 +6,10 @@ from functools import partial
 import numpy as np
 import pytest
 
+from examples.data_sets.dtu import DTU
+from examples.data_sets.scan_depth import ScanDepth, render_points
+from examples.data_sets.tanks_and_temples import TanksAndTemples
 from vg2gt.data import DataError, Frames
-from vg2gt.data.sources import DTU, TanksAndTemples
-from vg2gt.data.sources.scan_depth import ScanDepth, render_points
 from vg2gt.geometry.cameras import unproject
 from vg2gt.io.ply_container import ply_content
 from vg2gt.types import Cameras

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+from examples.data_sets.scannet_sens import ScanNetSens
 from vg2gt.data import DataError, RGBDFolder
-from vg2gt.data.sources import ScanNet, ScanNetSens
+from vg2gt.data.sources import ScanNet
 
 from .layout_scannet import sens_frame, sens_header, write_export, write_sens
 from .layouts import millimetres, pixels, room

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
+from examples.data_sets.tanks_and_temples import TanksAndTemples, moved
 from vg2gt.data import DataError
-from vg2gt.data.sources import TanksAndTemples
-from vg2gt.data.sources.tanks_and_temples import moved
 from vg2gt.io import read_colmap, write_colmap
 
 from .layout_tanks_and_temples import TO_SCAN, read, write

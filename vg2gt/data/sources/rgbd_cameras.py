@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from vg2gt.data.base import DataError
-from vg2gt.data.sources.parsing import errors_name, pinhole, read_matrix, read_numbers
-from vg2gt.data.sources.tanks_and_temples import read_log
+from vg2gt.data.sources.parsing import errors_name, pinhole, read_matrix, read_numbers, read_text_lines
 from vg2gt.io.errors import FormatError
 from vg2gt.io.json_checks import load_json
 
@@ -54,6 +53,32 @@ def read_pose_list(path: Path, scene: str, frames: Sequence[int]) -> dict[int, N
             f"{len(frames)} images; it has {len(rows)} lines of {rows.shape[1]}"
         )
     return dict(zip(frames, pose_matrices(rows), strict=True))
+
+
+def read_log(path: Path, scene: str) -> list[NDArray[np.float64] | None]:
+    """Reads a trajectory: for each image a line of three whole numbers and a 4x4 camera-to-world matrix.
+
+    Returns:
+        The matrices in the order of the file; None for images that were not registered (second number -1).
+
+    Raises:
+        DataError: if the file is missing, truncated or damaged.
+    """
+    rows = [line.split() for line in read_text_lines(path, scene)]
+    if not rows or len(rows) % 5:
+        raise DataError(f"{path} of scene {scene} has {len(rows)} lines; expected five for each image")
+    poses: list[NDArray[np.float64] | None] = []
+    for start in range(0, len(rows), 5):
+        header, matrix = rows[start], rows[start + 1 : start + 5]
+        try:
+            numbers = [int(word) for word in header]
+            values = np.array([[float(word) for word in row] for row in matrix])
+        except ValueError as error:
+            raise DataError(f"{path} of scene {scene}, image {start // 5}: {error}") from error
+        if len(numbers) != 3 or values.shape != (4, 4):
+            raise DataError(f"{path} of scene {scene}, image {start // 5}: expected 3 numbers and a 4x4 matrix")
+        poses.append(None if numbers[1] < 0 else values)
+    return poses
 
 
 def read_camera(path: Path, scene: str) -> tuple[NDArray[np.float64], bool]:

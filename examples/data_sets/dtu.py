@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import Unpack
 
+from examples.data_sets.scan_depth import VERSION, ScanDepth
 from vg2gt.data.base import DataError
 from vg2gt.data.sources.files import FileSource, HoldoutOptions
 from vg2gt.data.sources.index import SceneIndex, check_found, first_size, make_index
@@ -24,9 +25,8 @@ from vg2gt.data.sources.parsing import (
     read_text_lines,
     to_world,
 )
-from vg2gt.data.sources.scan_depth import VERSION, ScanDepth
 from vg2gt.io.image_files import Size, read_depth
-from vg2gt.io.pfm import read_pfm
+from vg2gt.io.images import open_image
 
 EVALUATION_SCANS = (24, 37, 40, 55, 63, 65, 69, 83, 97, 105, 106, 110, 114, 118, 122)
 """The fifteen scans on which surface reconstruction is compared."""
@@ -259,7 +259,15 @@ def _scaled(intrinsics: NDArray[np.float64], scale: float, shift: tuple[float, f
 
 def _masked_depth(path: Path, scene: str) -> NDArray[np.float32]:
     """Depth in metres, 0 where the mask next to it says that there is none."""
-    depth = read_pfm(path, scene)
+    try:
+        with open_image(path) as image:
+            depth = np.array(image)
+    except (OSError, ValueError) as error:
+        raise DataError(
+            f"cannot read {path} of scene {scene}: {error}; restore the file or remove the frame"
+        ) from error
+    if depth.dtype != np.float32 or depth.ndim != 2:
+        raise DataError(f"{path} of scene {scene} is not a one-channel PFM image: it has {depth.dtype} {depth.shape}")
     mask = read_depth(path.with_name(path.stem.replace("depth_map", "depth_visual") + ".png"), scene, depth.shape)
     valid = (mask > MASK_THRESHOLD) & np.isfinite(depth) & (depth > 0)
     return np.where(valid, depth, 0) * np.float32(MILLIMETRE)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import Unpack
 
+from examples.data_sets.scan_depth import VERSION, ScanDepth
 from vg2gt.data.base import DataError
 from vg2gt.data.sources.colmap_model import model_folder_of
 from vg2gt.data.sources.files import FileSource, HoldoutOptions
@@ -20,10 +21,9 @@ from vg2gt.data.sources.parsing import (
     numbered,
     pinhole,
     read_matrix,
-    read_text_lines,
 )
 from vg2gt.data.sources.posed import posed_image, size_on_disk
-from vg2gt.data.sources.scan_depth import VERSION, ScanDepth
+from vg2gt.data.sources.rgbd_cameras import read_log
 from vg2gt.data.sources.undistortion import is_pinhole
 from vg2gt.io import colmap_images, read_colmap
 from vg2gt.io.colmap import Camera
@@ -138,32 +138,6 @@ def _matrix(camera: Camera, path: Path, scene: str) -> NDArray[np.float64]:
     expected = (camera.height, camera.width)
     size, _ = size_on_disk(path, scene, expected, f"the model of scene {scene}")
     return posed_image(camera, expected, size, False, None, str(path)).intrinsics
-
-
-def read_log(path: Path, scene: str) -> list[NDArray[np.float64] | None]:
-    """Reads a trajectory: for each image a line of three whole numbers and a 4x4 camera-to-world matrix.
-
-    Returns:
-        The matrices in the order of the file; None for images that were not registered (second number -1).
-
-    Raises:
-        DataError: if the file is missing, truncated or damaged.
-    """
-    rows = [line.split() for line in read_text_lines(path, scene)]
-    if not rows or len(rows) % 5:
-        raise DataError(f"{path} of scene {scene} has {len(rows)} lines; expected five for each image")
-    poses: list[NDArray[np.float64] | None] = []
-    for start in range(0, len(rows), 5):
-        header, matrix = rows[start], rows[start + 1 : start + 5]
-        try:
-            numbers = [int(word) for word in header]
-            values = np.array([[float(word) for word in row] for row in matrix])
-        except ValueError as error:
-            raise DataError(f"{path} of scene {scene}, image {start // 5}: {error}") from error
-        if len(numbers) != 3 or values.shape != (4, 4):
-            raise DataError(f"{path} of scene {scene}, image {start // 5}: expected 3 numbers and a 4x4 matrix")
-        poses.append(None if numbers[1] < 0 else values)
-    return poses
 
 
 def moved(similarity: NDArray[np.float64], pose: NDArray[np.float64]) -> NDArray[np.float64]:
