@@ -30,11 +30,12 @@ from vg2gt.config import compose
 from vg2gt.geometry.cameras import resize_intrinsics
 from vg2gt.types import Batch, Hints
 
+WORLDS = f"hydra.searchpath=[{Path(__file__).parents[1] / 'examples/worlds/configs'}] "
 SETS = {
     "rooms": "data=synthetic data.eval_scenes={scenes} data.val.first_seed={seed} data.image_size=[112,224]",
-    "outdoors": "data=synthetic data.eval_scenes={scenes} data.val.first_seed={seed} data.image_size=[112,224]"
+    "outdoors": WORLDS + "data=worlds data.eval_scenes={scenes} data.val.first_seed={seed} data.image_size=[112,224]"
     " data.variant=outdoor",
-    "objects": "data=synthetic data.eval_scenes={scenes} data.val.first_seed={seed} data.image_size=[112,224]"
+    "objects": WORLDS + "data=worlds data.eval_scenes={scenes} data.val.first_seed={seed} data.image_size=[112,224]"
     " data.variant=object",
     "wide rooms": "data=synthetic data.eval_scenes={scenes} data.val.first_seed={seed} data.image_size=[112,224]"
     " data.variant=wide",

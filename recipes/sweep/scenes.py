@@ -16,9 +16,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from examples.worlds import Worlds
+from examples.worlds.photograph import Photograph
 from vg2gt.data.sources.infinigen import Infinigen
-from vg2gt.data.synthetic.photograph import Photograph
-from vg2gt.data.synthetic.source import VARIANTS
 from vg2gt.data.synthetic.synthetic_scene import LOBES, SyntheticScene
 from vg2gt.geometry.cameras import rigid_motions
 from vg2gt.io.files import write_cached
@@ -70,14 +70,14 @@ def read_scene(path: Path) -> SceneFrames:
 def render_scene(seed: int, size: tuple[int, int] = SIZE, threads: int = 1) -> dict[str, NDArray]:
     """Renders one training scene: a room, an object, a landmark or a street, the kinds of ``_KINDS`` taking turns.
 
-    The world is that of :mod:`vg2gt.data.synthetic`; focal length, roll, shake, highlights and the look of the images
+    The world is that of :mod:`examples.worlds`; focal length, roll, shake, highlights and the look of the images
     are drawn here, because photographs have them and matching must not depend on level cameras of one field of view.
     """
     rng = np.random.default_rng((_STREAM, seed))
     kind = _KINDS[seed % len(_KINDS)]
     path = int(rng.choice(_PATH_LENGTHS)) if kind in _WALKS else FRAMES
     shine = (False, True, LOBES)[rng.choice(3, p=(0.5, 0.3, 0.2))]
-    scene = VARIANTS[kind](seed, path, size, shine)
+    scene = Worlds.variants[kind](seed, path, size, shine)
     focal = 0.5 * size[1] / np.tan(rng.uniform(0.75, 1.5) / 2)
     if kind in _WALKS or kind == "wide":
         scene.intrinsics = np.array([[focal, 0, (size[1] - 1) / 2], [0, focal, (size[0] - 1) / 2], [0, 0, 1]])

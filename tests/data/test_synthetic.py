@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 import torch
 
+from examples.worlds import Worlds
+from tests.commands import ROOT
 from tests.training_helpers import small_config
 from vg2gt.data import SyntheticScenes
 from vg2gt.data.synthetic.renderer import render_frame
 from vg2gt.data.synthetic.rooms import SyntheticRoom
-from vg2gt.data.synthetic.source import VARIANTS
 from vg2gt.geometry.cameras import invert_rigid, project, ray_directions, unproject
 from vg2gt.training.loop import train
 from vg2gt.types import Cameras
@@ -22,9 +23,9 @@ from .warping import depth_differences
 LARGE = (56, 112)
 
 
-def one(seed: int = 0, **options) -> SyntheticScenes:
+def one(seed: int = 0, **options) -> Worlds:
     """A source of one scene of two small frames."""
-    return SyntheticScenes(1, seed, **{"num_frames": 2, "size": SIZE, **options})
+    return Worlds(1, first_seed=seed, **{"num_frames": 2, "size": SIZE, **options})
 
 
 def test_frames_follow_the_conventions(rooms):
@@ -66,9 +67,9 @@ def test_points_of_one_frame_are_where_another_frame_sees_them():
     assert max(errors) < 0.02
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("variant", Worlds.variants)
 def test_depth_of_one_frame_predicts_the_next(variant):
-    source = SyntheticScenes(1, 2, 16, LARGE, variant=variant)
+    source = Worlds(1, first_seed=2, num_frames=16, size=LARGE, variant=variant)
     frames = source.load(source.scenes[0], range(4))
     differences, overlap = depth_differences(frames, 2, 3)
     assert overlap > 0.15
@@ -111,7 +112,9 @@ def test_a_room_keeps_its_pixels():
 
 
 def test_training_copes_with_the_sky(tmp_path):
-    overrides = ["debug=fast_dev_run", "data.variant=outdoor", "data.highlights=true", "backend.background=1.2"]
+    plugin = f"hydra.searchpath=[{ROOT / 'examples/worlds/configs'}]"
+    overrides = [plugin, "debug=fast_dev_run", "data=worlds", "data.variant=outdoor", "data.highlights=true"]
+    overrides += ["backend.background=1.2"]
     for with_background in (overrides[:-1], overrides):
         report = train(small_config(tmp_path / str(len(with_background)), tmp_path / "cache", *with_background))
         assert np.isfinite(list(report["trained"].values())).all()
@@ -144,20 +147,21 @@ def test_a_damaged_cache_file_is_made_again(tmp_path, caplog, monkeypatch):
 def test_what_decides_the_pixels_decides_the_key(tmp_path, monkeypatch):
     """Names without options stay as they were: caches and published figures hang on them."""
     cache = str(tmp_path)
-    source = one(3, size=(28, 56), cache_dir=cache)
+    source = SyntheticScenes(1, 3, 2, (28, 56), cache_dir=cache)
     assert source.identity("room-000003") == '["SyntheticScenes", "room-000003", 1, [28, 56], 2, false]'
     assert source.cache_file("room-000003") == tmp_path / "rooms-v1-28x56x2" / "room-000003.npz"
-    shiny = one(3, size=(28, 56), cache_dir=cache, highlights=True)
+    shiny = SyntheticScenes(1, 3, 2, (28, 56), highlights=True, cache_dir=cache)
     assert shiny.identity("room-000003") == '["SyntheticScenes", "room-000003", 1, [28, 56], 2, true]'
     assert shiny.cache_file("room-000003") == tmp_path / "rooms-highlights-v1-28x56x2" / "room-000003.npz"
     (frame,) = SyntheticRoom(3, 2, (28, 56)).render([1], 1)
     assert np.array_equal((255 * source.load("room-000003", [1]).images[0]).round().permute(1, 2, 0), frame.image)
-    options = [{}, {"num_frames": 3}, {"size": (32, 24)}, {"exposure": 1.0}, {"jpeg": (30, 90)}]
+    options = [{"size": (28, 56)}, {"num_frames": 3}, {"size": (32, 24)}, {"exposure": 1.0}, {"jpeg": (30, 90)}]
     sources = [one(3, **{"cache_dir": cache, **changed}) for changed in options]
     for name in ("identity", "cache_file"):
         assert len({getattr(each, name)("room-000003") for each in sources}) == len(sources)
     before = source.identity("room-000003")
-    assert before == one(3, size=(28, 56), cache_dir="elsewhere").identity("room-000003")
+    assert before == SyntheticScenes(1, 3, 2, (28, 56), cache_dir="elsewhere").identity("room-000003")
+    assert source.cache_file("room-000003") == sources[0].cache_file("room-000003")
     monkeypatch.setattr(SyntheticRoom, "version", SyntheticRoom.version + 1)
     assert source.identity("room-000003") != before
 
@@ -166,12 +170,15 @@ def test_what_decides_the_pixels_decides_the_key(tmp_path, monkeypatch):
 
 
 def test_variants_take_turns(tmp_path):
-    source = SyntheticScenes(5, 1, 2, SIZE, variant=["room", "room", "outdoor"], cache_dir=str(tmp_path))
+    mixed = ["room", "room", "outdoor"]
+    source = Worlds(5, first_seed=1, num_frames=2, size=SIZE, variant=mixed, cache_dir=str(tmp_path))
     assert list(source.scenes) == ["room-000001", "outdoor-000002", "room-000003", "room-000004", "outdoor-000005"]
     assert (source.load("outdoor-000002", [0, 1]).depth == 0).any()
     assert (source.load("room-000003", [0, 1]).depth > 0).all()
     assert len({str(source.cache_file(scene).parent) for scene in source.scenes}) == 2  # pyright: ignore
-    assert {type(one(variant=name).scene(f"{name}-000000")) for name in VARIANTS} == set(VARIANTS.values())
+    assert {type(one(variant=name).scene(f"{name}-000000")) for name in Worlds.variants} == set(
+        Worlds.variants.values()
+    )
 
 
 @pytest.mark.parametrize(
@@ -180,7 +187,7 @@ def test_variants_take_turns(tmp_path):
         ({"num_scenes": 0}, "num_scenes >= 1"),
         ({"num_frames": 0}, "num_scenes >= 1"),
         ({"first_seed": -1}, "num_scenes >= 1"),
-        ({"variant": "orbit"}, "variant must be one of room, outdoor, wide, object, landmark, moving"),
+        ({"variant": "orbit"}, "variant must be one of room, wide, outdoor, object, landmark, moving"),
         ({"variant": []}, "variant must be one of"),
         ({"highlights": "bright"}, "highlights must be true, false or lobes; got 'bright'"),
         ({"exposure": -1}, "exposure is a standard deviation in stops, at least 0; got -1"),
@@ -191,7 +198,7 @@ def test_variants_take_turns(tmp_path):
 )
 def test_impossible_options_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
-        SyntheticScenes(**options)
+        Worlds(**options)
 
 
 def test_upright_images_have_their_field_of_view_upright():

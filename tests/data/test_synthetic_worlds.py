@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from examples.worlds import Worlds
+from examples.worlds.orbits import SyntheticLandmark, SyntheticObject
+from examples.worlds.outdoor import SyntheticOutdoor
 from vg2gt.data.synthetic.builder import Builder
-from vg2gt.data.synthetic.orbits import SyntheticLandmark, SyntheticObject
-from vg2gt.data.synthetic.outdoor import SyntheticOutdoor
 from vg2gt.data.synthetic.raycast import AXES, HALF, KIND, PART_COLUMNS
 from vg2gt.data.synthetic.renderer import World, render_frame
 from vg2gt.data.synthetic.rooms import SyntheticRoom, SyntheticWideRoom
-from vg2gt.data.synthetic.source import VARIANTS
 from vg2gt.data.synthetic.synthetic_scene import level_poses
 
 SIZE = (28, 56)
@@ -33,7 +33,7 @@ def turned(scene) -> float:
     return float(np.degrees(abs(angles[-1] - angles[0])))
 
 
-@pytest.mark.parametrize("kind", VARIANTS.values())
+@pytest.mark.parametrize("kind", Worlds.variants.values())
 def test_the_seed_decides_the_world_and_highlights_its_colour_alone(kind):
     scene, again, other = kind(3, 4, SIZE), kind(3, 4, SIZE), kind(4, 4, SIZE)
     a, b = scene.render([2], 1)[0], again.render([2], 1)[0]

@@ -63,8 +63,8 @@ COMMANDS = {
     ),
     "data": Command(
         "vg2gt.cli.data:main",
-        "makes scenes, splits and lists of views",
-        "vg2gt data synthetic --out rooms --scenes 100",
+        "makes splits and lists of views",
+        "vg2gt data splits data=rgbd data.root=RECORDINGS --out lists",
     ),
     "doctor": Command(
         "vg2gt.cli.doctor:main",
@@ -74,11 +74,6 @@ COMMANDS = {
 }
 
 DATA_COMMANDS = {
-    "synthetic": Command(
-        "vg2gt.cli.data:synthetic",
-        "writes procedural rooms and streets as RGB-D recordings",
-        "vg2gt data synthetic --out rooms --scenes 100",
-    ),
     "splits": Command(
         "vg2gt.cli.data:splits",
         "divides a dataset's scenes into training and evaluation lists",

@@ -1,4 +1,4 @@
-"""Procedural scenes: rooms and streets from a seed, rendered with exact depth, normals and poses."""
+"""Procedural rooms from a seed, rendered with exact depth, normals and poses."""
 
 from vg2gt.data.synthetic.source import SyntheticScenes
 

@@ -6,18 +6,14 @@ import io
 import json
 import logging
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from vg2gt.data.base import Frames, SceneSource
-from vg2gt.data.synthetic.moving import SyntheticMovingRoom
-from vg2gt.data.synthetic.orbits import SyntheticLandmark, SyntheticObject
-from vg2gt.data.synthetic.outdoor import SyntheticOutdoor
-from vg2gt.data.synthetic.photograph import Photograph
 from vg2gt.data.synthetic.rooms import SyntheticRoom, SyntheticWideRoom
 from vg2gt.data.synthetic.synthetic_scene import LOBES, SyntheticScene
 from vg2gt.data.transforms import from_bytes
@@ -27,21 +23,12 @@ from vg2gt.io.npz import read_npz
 
 log = logging.getLogger(__name__)
 
-VARIANTS: dict[str, type[SyntheticRoom] | type[SyntheticOutdoor] | type[SyntheticObject] | type[SyntheticLandmark]] = {
-    "room": SyntheticRoom,
-    "outdoor": SyntheticOutdoor,
-    "wide": SyntheticWideRoom,
-    "object": SyntheticObject,
-    "landmark": SyntheticLandmark,
-    "moving": SyntheticMovingRoom,
-}
-
 
 class SyntheticScenes(SceneSource):
-    """Rooms, outdoor scenes and objects with exact depth and poses.
+    """Furnished rooms with exact depth and poses.
 
     Scene k of a source has the seed ``first_seed + k`` and the name ``<variant>-<seed>``, so sources whose seed ranges
-    do not overlap share no scene. The sky of outdoor scenes has no depth.
+    do not overlap share no scene. ``examples/worlds`` has more variants: streets, objects, landmarks.
 
     Args:
         num_scenes: scenes in this source.
@@ -49,18 +36,18 @@ class SyntheticScenes(SceneSource):
         num_frames: frames on a scene's camera path.
         size: image ``(height, width)``; best the size that is trained on. Upright images are upright photographs: the
             field of view is along the longer side.
-        variant: ``room``, ``outdoor``, ``wide`` (rooms from all around), ``object`` (orbits), ``landmark`` (far
-            backgrounds) or ``moving`` (a room with a chair that moves), or a list: seeds take turns,
-            ``[room, room, outdoor]`` is one third outdoor.
+        variant: ``room`` or ``wide`` (rooms from all around), or a list: seeds take turns, ``[room, room, wide]`` is
+            one third wide.
         highlights: whether surfaces shine, with colours that depend on the view; geometry and textures stay the same.
             ``lobes``: strongly.
         cache_dir: folder for the rendered frames (``~`` is the home folder); None keeps nothing on disk.
-        exposure: scenes are too dark or too bright by this many stops (standard deviation), with noise; 0: none is.
-        jpeg: range of qualities, such as ``[30, 95]``, at which images are compressed; None: they are not.
 
     Raises:
         ValueError: if a number is out of range or a variant unknown.
     """
+
+    variants: ClassVar[dict[str, Any]] = {"room": SyntheticRoom, "wide": SyntheticWideRoom}
+    """Classes of scenes, like :class:`SyntheticRoom`, by their name."""
 
     def __init__(
         self,
@@ -71,8 +58,6 @@ class SyntheticScenes(SceneSource):
         variant: str | Sequence[str] = "room",
         highlights: bool | str = False,
         cache_dir: str | None = None,
-        exposure: float = 0.0,
-        jpeg: Sequence[int] | None = None,
     ) -> None:
         if num_scenes < 1 or num_frames < 1 or first_seed < 0:
             raise ValueError(
@@ -80,14 +65,16 @@ class SyntheticScenes(SceneSource):
                 f"got {num_scenes}, {num_frames} and {first_seed}"
             )
         variants = [variant] if isinstance(variant, str) else list(variant)
-        if not variants or not set(variants) <= set(VARIANTS):
-            raise ValueError(f"variant must be one of {', '.join(VARIANTS)}, or a list of them; got {variant!r}")
+        if not variants or not set(variants) <= set(self.variants):
+            raise ValueError(
+                f"variant must be one of {', '.join(self.variants)}, or a list of them; got {variant!r} (streets, "
+                "objects and landmarks: --config-dir examples/worlds/configs data=worlds)"
+            )
         if highlights not in (True, False, LOBES):
             raise ValueError(f"highlights must be true, false or {LOBES}; got {highlights!r}")
         self.num_frames = num_frames
         self.size = (int(size[0]), int(size[1]))
         self.highlights = highlights
-        self._photograph = Photograph.of(exposure, jpeg)
         self.cache_dir = Path(cache_dir).expanduser() if cache_dir else None
         self._seeds: dict[str, tuple[str, int]] = {}
         for seed in range(first_seed, first_seed + num_scenes):
@@ -127,24 +114,21 @@ class SyntheticScenes(SceneSource):
     def scene(self, scene: str) -> SyntheticScene:
         """Makes a scene, ready to be rendered."""
         kind, seed = self._seeds[scene]
-        made = VARIANTS[kind](seed, self.num_frames, self.size, self.highlights)
-        made.develop = partial(self._photograph.develop, seed) if self._photograph else None
-        return made
+        return self.variants[kind](seed, self.num_frames, self.size, self.highlights)
 
     def identity(self, scene: str) -> str:
         """What decides the pixels, with the version of the generator."""
-        kind = self._seeds[scene][0]
-        version = VARIANTS[kind].version
-        look = self._look[1:]
+        version = self.variants[self._seeds[scene][0]].version
+        look = self.look[1:]
         more = [look] if look not in ("", "highlights") else []
         return json.dumps([type(self).__qualname__, scene, version, self.size, self.num_frames, self.highlights, *more])
 
     @property
-    def _look(self) -> str:
+    def look(self) -> str:
         """What decides the pixels apart from scene and size, as part of file names."""
         highlights = {True: "-highlights", False: ""}.get(self.highlights, f"-{self.highlights}")  # pyright: ignore
         upright = "-upright" if self.size[0] > self.size[1] else ""  # where the field of view was once horizontal
-        return highlights + upright + (self._photograph.name if self._photograph else "")
+        return highlights + upright
 
     def _render(self, scene: str) -> dict[str, NDArray]:
         made = self.scene(scene)
@@ -162,7 +146,7 @@ class SyntheticScenes(SceneSource):
             return None
         kind = self._seeds[scene][0]
         size = f"{self.size[0]}x{self.size[1]}x{self.num_frames}"
-        folder = f"{kind}s{self._look}-v{VARIANTS[kind].version}-{size}"
+        folder = f"{kind}s{self.look}-v{self.variants[kind].version}-{size}"
         return self.cache_dir / folder / f"{scene}.npz"
 
     def _read_cache(self, scene: str) -> dict[str, NDArray] | None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vg2gt.data.synthetic import street
+from examples.worlds import street
 from vg2gt.data.synthetic.builder import Builder
 from vg2gt.data.synthetic.renderer import World
 from vg2gt.data.synthetic.sky import draw_sky

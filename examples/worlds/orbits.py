@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vg2gt.data.synthetic import street
+from examples.worlds import street
+from examples.worlds.outdoor import GROUND_COLORS, draw_daylight
 from vg2gt.data.synthetic.builder import Builder
 from vg2gt.data.synthetic.furniture import MAKERS
-from vg2gt.data.synthetic.outdoor import GROUND_COLORS, draw_daylight
 from vg2gt.data.synthetic.renderer import World
 from vg2gt.data.synthetic.rooms import draw_lamps
 from vg2gt.data.synthetic.synthetic_scene import SyntheticScene, draw_highlights, level_poses
