@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
+from examples.data_sets.image_folder import ImageFolder
 from vg2gt.data import Frames
-from vg2gt.data.sources import ImageFolder
 
 from .layouts import Layout, pixels, save
 

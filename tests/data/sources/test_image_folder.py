@@ -9,9 +9,10 @@ import torch
 from hydra.utils import instantiate
 from PIL import Image
 
+from examples.data_sets.image_folder import ImageFolder
+from tests.commands import ROOT
 from vg2gt.config import compose
 from vg2gt.data import DataError
-from vg2gt.data.sources import ImageFolder
 
 # Rows of an upright image with its top in red and its left in dark, for every EXIF orientation (standard table).
 _STORED = {
@@ -76,7 +77,14 @@ def test_training_is_refused(tmp_path):
     for i in range(12):
         _save(tmp_path / "train" / f"{i}.png", _photo(i))
     copytree(tmp_path / "train", tmp_path / "val")
-    overrides = ["data=image_folder", f"data.root={tmp_path}", "data.train.scenes=[train]", "data.val.scenes=[val]"]
+    plugin = f"hydra.searchpath=[{ROOT / 'examples/data_sets/configs'}]"
+    overrides = [
+        plugin,
+        "data=image_folder",
+        f"data.root={tmp_path}",
+        "data.train.scenes=[train]",
+        "data.val.scenes=[val]",
+    ]
     module = instantiate(compose("train", *overrides, "data.index_cache=null").data)
     with pytest.raises(DataError, match="ImageFolder has no depth and no cameras"):
         module.train_dataloader()

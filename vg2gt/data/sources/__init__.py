@@ -1,7 +1,6 @@
 """Datasets on disk, one file a layout; all are a ``FileSource``."""
 
 from vg2gt.data.sources.colmap_model import COLMAP
-from vg2gt.data.sources.image_folder import ImageFolder
 from vg2gt.data.sources.infinigen import Infinigen
 from vg2gt.data.sources.kitti import KITTI
 from vg2gt.data.sources.nerfstudio import Nerfstudio
@@ -11,7 +10,6 @@ from vg2gt.data.sources.scannet import ScanNet
 __all__ = [
     "COLMAP",
     "KITTI",
-    "ImageFolder",
     "Infinigen",
     "Nerfstudio",
     "Replica",
