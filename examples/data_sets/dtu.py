@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import Unpack
 
-from examples.data_sets.scan_depth import VERSION, ScanDepth
+from examples.data_sets.scan_depth import ScanDepth
 from vg2gt.data.base import DataError
 from vg2gt.data.sources.files import FileSource, HoldoutOptions
 from vg2gt.data.sources.index import SceneIndex, check_found, first_size, make_index
@@ -160,10 +160,6 @@ class DTU(FileSource):
     def watched(self, scene: str, folder: Path) -> Sequence[Path | None]:
         """Also the depth."""
         return folder, self._depth_place(scene) if self.depth else None
-
-    def state(self, scene: str, folder: Path) -> str:
-        """Also the version of the rendered depth."""
-        return f"scan depth {VERSION} {super().state(scene, folder)}"
 
     def index(self, scene: str, folder: Path) -> SceneIndex:
         """Lists the images and reads their cameras."""

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import Unpack
 
-from examples.data_sets.scan_depth import VERSION, ScanDepth
+from examples.data_sets.scan_depth import ScanDepth
 from vg2gt.data.base import DataError
 from vg2gt.data.sources.colmap_model import model_folder_of
 from vg2gt.data.sources.files import FileSource, HoldoutOptions
@@ -77,10 +77,6 @@ class TanksAndTemples(FileSource):
     def watched(self, scene: str, folder: Path) -> Sequence[Path | None]:
         """Also the COLMAP model."""
         return folder, model_folder_of(folder)
-
-    def state(self, scene: str, folder: Path) -> str:
-        """Also the version of the rendered depth."""
-        return f"scan depth {VERSION} {super().state(scene, folder)}"
 
     def index(self, scene: str, folder: Path) -> SceneIndex:
         """Reads log, transform and intrinsics."""

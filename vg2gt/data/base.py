@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -99,14 +98,6 @@ class SceneSource(ABC):
     def part(self, scene: str) -> str:
         """The group among ``parts`` to which a scene belongs."""
         return ""
-
-    def identity(self, scene: str) -> str:
-        """Differs between scenes whose decoded frames may differ; decides whether a copy on disk is still good.
-
-        By default the class, its public attributes and the scene's name.
-        """
-        options = {name: repr(value) for name, value in sorted(vars(self).items()) if not name.startswith("_")}
-        return json.dumps([type(self).__qualname__, scene, options])
 
     @abstractmethod
     def load(self, scene: str, frame_ids: Sequence[int]) -> Frames:

@@ -70,11 +70,6 @@ class Mixture(SceneSource):
         source, name = self._find(scene)
         return source.scene_is_metric(name)
 
-    def identity(self, scene: str) -> str:
-        """As the part has it."""
-        source, name = self._find(scene)
-        return source.identity(name)
-
     def parts(self) -> Mapping[str, float]:
         """The weights."""
         return self.weights

@@ -189,16 +189,11 @@ class FileSource(SceneSource):
         return undistortion.depth(depth) if undistortion else depth
 
     def watched(self, scene: str, folder: Path) -> Sequence[Path | None]:
-        """Folders and files that decide a scene's index, as far as they exist; by default the scene's folder."""
+        """Folders and files that decide a scene's index, as far as they exist; by default the scene's folder.
+
+        The cached index is made again when one of them changes.
+        """
         return (folder,)
-
-    def state(self, scene: str, folder: Path) -> str:
-        """Changes when files of a scene do (``watched``), so that its cached index is made again."""
-        return " ".join(folder_state(place) for place in self.watched(scene, folder) if place and place.exists())
-
-    def options(self) -> Mapping[str, object]:
-        """What decides an index, besides the folder; part of the cache's key. By default the ``index_options``."""
-        return {name: getattr(self, name) for name in self.index_options}
 
     @property
     def scenes(self) -> Sequence[str]:
@@ -232,14 +227,6 @@ class FileSource(SceneSource):
         """
         index = self.scene_index(scene)
         return self._load_frame(index, index.row(frame), whole=True)
-
-    def identity(self, scene: str) -> str:
-        """Also the version of the loader and the state of the scene's files; not which frames are chosen."""
-        choice = ("holdout", "every", "index_cache")
-        options = {k: repr(v) for k, v in sorted(vars(self).items()) if not k.startswith("_") and k not in choice}
-        folder = self._folders[scene]
-        state = (self.index_version, str(folder.resolve()), self.state(scene, folder))
-        return json.dumps([type(self).__qualname__, scene, options, state])
 
     def scene_index(self, scene: str) -> SceneIndex:
         """The index of a scene, from memory, from the cache, or from the dataset."""
@@ -307,11 +294,12 @@ class FileSource(SceneSource):
     def _recall_index(self, scene: str, folder: Path) -> SceneIndex:
         if self.index_cache is None:
             return self.index(scene, folder)
+        options = {name: getattr(self, name) for name in self.index_options}
         version = (FORMAT, self.index_version)
-        key = json.dumps([type(self).__qualname__, version, str(folder.resolve()), scene, self.options()], default=str)
+        key = json.dumps([type(self).__qualname__, version, str(folder.resolve()), scene, options], default=str)
         digest = hashlib.sha256(key.encode()).hexdigest()[:24]
         path = self.index_cache / "index" / f"{digest}.npz"
-        state = self.state(scene, folder)
+        state = " ".join(folder_state(place) for place in self.watched(scene, folder) if place and place.exists())
         index = read_index(path, scene, folder, state)
         if index is None:
             if not self._indexes:

@@ -22,9 +22,9 @@ from vg2gt.io.npz import load_npz
 
 log = logging.getLogger(__name__)
 
-
-FORMAT = 2
+FORMAT = 3
 """Of the files that keep an index; raise it when they are written otherwise."""
+_SIZES = ("size", "color_size", "depth_size")
 
 
 @dataclass(frozen=True)
@@ -245,73 +245,52 @@ def _folders_in(folder: Path) -> list[Path]:
 
 
 def index_to_bytes(index: SceneIndex, state: str) -> bytes:
-    """An ``.npz`` file of an index and of the state of the folder it was made from.
-
-    Thousands of scenes are kept: names of files are kept without the scene's folder, and intrinsics that all frames
-    share only once.
-    """
+    """An ``.npz`` file of an index and of the state of the folder it was made from."""
+    facts = {"state": state, "dropped": dict(index.dropped), "extra": list(index.extra)}
+    facts |= {name: getattr(index, name) for name in _SIZES}
     shared = (index.intrinsics == index.intrinsics[:1]).all()
     buffer = io.BytesIO()
-    np.savez(
+    np.savez_compressed(
         buffer,
-        state=np.array(state),
+        facts=np.array(json.dumps(facts)),
         frame_ids=np.array(index.frame_ids, np.int64),
         color=_names(index.color, index.folder),
         depth=_names(index.depth, index.folder),
         world_to_camera=index.world_to_camera,
         intrinsics=index.intrinsics[:1] if shared else index.intrinsics,
-        sizes=np.array([size or (0, 0) for size in (index.size, index.color_size, index.depth_size)], np.int64),
-        dropped=np.array(json.dumps(index.dropped)),
-        extra=np.array(json.dumps(list(index.extra))),
         **{f"extra_{name}": array for name, array in index.extra.items()},  # pyright: ignore[reportArgumentType]
     )
     return buffer.getvalue()
-
-
-def _names(paths: Sequence[Path], folder: Path) -> NDArray[np.uint8]:
-    """Names of files as bytes, with zeros between them; those outside the folder by their whole path."""
-    inside, start = str(folder) + os.sep, len(str(folder)) + 1
-
-    def name(text: str) -> str:
-        if text == str(folder):
-            return "."
-        return text[start:] if text.startswith(inside) else os.path.abspath(text)
-
-    texts = [name(str(path)) for path in paths]
-    return np.frombuffer("\0".join(texts).encode(errors="surrogateescape"), np.uint8)
-
-
-def _paths(names: NDArray[np.uint8], folder: Path) -> tuple[Path, ...]:
-    content = names.tobytes().decode(errors="surrogateescape")
-    return tuple(folder / text for text in content.split("\0")) if content else ()
 
 
 def read_index(path: Path, scene: str, folder: Path, state: str) -> SceneIndex | None:
     """Reads an index back; None where there is none, it is damaged, or the folder's state is another."""
     if not path.is_file():
         return None
-    names = ("state", "frame_ids", "color", "depth", "world_to_camera", "intrinsics", "sizes", "dropped", "extra")
     try:
-        arrays = load_npz(path, scene, names)
-        kept = json.loads(str(arrays["extra"]))
-        extra = load_npz(path, scene, [f"extra_{name}" for name in kept]) if kept else {}
-    except DataError as error:
+        facts = json.loads(str(load_npz(path, scene, ["facts"])["facts"]))
+        extra = [f"extra_{name}" for name in facts["extra"]]
+        arrays = load_npz(path, scene, ["frame_ids", "color", "depth", "world_to_camera", "intrinsics", *extra])
+    except (DataError, ValueError) as error:
         log.warning("the cached index is damaged and is made again: %s", error)
         return None
-    if str(arrays["state"]) != state:
+    if facts["state"] != state:
         return None
-    size, color_size, depth_size = ((height, width) for height, width in arrays["sizes"].tolist())
     return SceneIndex(
         name=scene,
         folder=folder,
         frame_ids=tuple(arrays["frame_ids"].tolist()),
-        color=_paths(arrays["color"], folder),
-        depth=_paths(arrays["depth"], folder),
+        color=tuple(folder / name for name in arrays["color"].tolist()),
+        depth=tuple(folder / name for name in arrays["depth"].tolist()),
         world_to_camera=arrays["world_to_camera"],
         intrinsics=np.broadcast_to(arrays["intrinsics"], (len(arrays["frame_ids"]), 3, 3)).copy(),
-        size=size,
-        color_size=color_size if all(color_size) else None,
-        depth_size=depth_size if all(depth_size) else None,
-        dropped=json.loads(str(arrays["dropped"])),
-        extra={name: extra[f"extra_{name}"] for name in kept},
+        dropped=facts["dropped"],
+        extra={name: arrays[f"extra_{name}"] for name in facts["extra"]},
+        **{name: facts[name] and tuple(facts[name]) for name in _SIZES},
     )
+
+
+def _names(paths: Sequence[Path], folder: Path) -> NDArray[np.str_]:
+    """Names of files relative to the scene's folder; those outside it by their whole path."""
+    inside = (path.relative_to(folder) if path.is_relative_to(folder) else path.resolve() for path in paths)
+    return np.array([str(path) for path in inside], np.str_)

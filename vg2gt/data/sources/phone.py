@@ -26,34 +26,37 @@ from numpy.typing import NDArray
 from vg2gt.data.sources.parsing import CORNER_TO_CENTER, errors_name, numbered, pinhole
 from vg2gt.data.sources.rgbd_cameras import pose_file_of, pose_matrices
 from vg2gt.io.errors import FormatError
-from vg2gt.io.exr import read_exr
-from vg2gt.io.image_files import Size, image_size, read_color
+from vg2gt.io.files import regular
+from vg2gt.io.image_files import Size, check_size, image_size, read_color
 from vg2gt.io.json_checks import load_json
 from vg2gt.io.record3d import is_archive, read_recorded, recorded_files, unpack_lzfse
 from vg2gt.io.video import video_size
 
-EXR = ".exr"
-PACKED = ".depth"
+METRES = (".exr", ".depth")
+"""Endings of depth files that hold floats."""
+EXR, PACKED = METRES
 VIDEO = "rgb.mp4"
-RECORD3D, R3D, POLYCAM, STRAY = "Record3D", "Record3D (.r3d)", "Polycam", "Stray Scanner"
+RECORD3D, R3D, POLYCAM, STRAY = (
+    f"export of {app}" for app in ("Record3D", "Record3D (.r3d)", "Polycam", "Stray Scanner")
+)
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # camera axes of ARKit to OpenCV's
 
 
 @dataclass(frozen=True)
-class PhoneExport:
-    """What an export consists of, by frame number.
+class Recording:
+    """What a recording consists of, by frame number.
 
     Attributes:
-        app: that wrote it.
+        layout: what it is, for messages.
         color: colour image files; of Stray Scanner always the video.
         depth: depth files.
         poses: ``[4, 4]`` camera-to-world, OpenCV, metres.
         intrinsics: ``[3, 3]`` of the colour images, integer pixel centres.
         color_size: ``(height, width)``.
-        recorded: ``(height, width)`` of the depth where the app tells it.
+        recorded: ``(height, width)`` of the depth where it is known.
     """
 
-    app: str
+    layout: str
     color: Mapping[int, Path]
     depth: Mapping[int, Path]
     poses: Mapping[int, NDArray[np.float64]]
@@ -74,7 +77,7 @@ class PhoneExport:
         if path.suffix.lower() != EXR:
             return image_size(path, scene)
         with errors_name(scene):
-            height, width = read_exr(path).shape
+            height, width = _read_exr(path).shape
         return height, width
 
 
@@ -90,7 +93,7 @@ def app_of(folder: Path) -> str | None:
     return STRAY if (folder / "odometry.csv").is_file() and (folder / VIDEO).is_file() else None
 
 
-def read_export(folder: Path, scene: str) -> PhoneExport | None:
+def read_export(folder: Path, scene: str) -> Recording | None:
     """Lists an export's files and reads its cameras; None if the folder is no export of an app.
 
     Raises:
@@ -120,17 +123,37 @@ def read_color_file(path: Path, scene: str, size: Size | None) -> NDArray[np.uin
     return read_color(path, scene, size, content)
 
 
-def read_packed_depth(path: Path, size: Size) -> NDArray[np.float32]:
-    """Reads a ``.depth`` file ``[H, W]`` in metres, 0 where the ``.conf`` next to it, if there is one, has none (0).
+def read_metres(path: Path, scene: str, size: Size) -> NDArray[np.float32]:
+    """Reads depth ``[H, W]`` of one of the ``METRES``, 0 where there is none or the ``.conf`` next to it says 0.
 
     Raises:
-        FormatError: if it is damaged or not of this size.
-        ImportError: if the package ``lzfse`` is not installed.
+        DataError: if it is missing, damaged or of another size.
+        ImportError: if the package that reads it is not installed.
     """
-    depth = _unpacked(path, np.dtype("<f4"), size)
-    with suppress(FileNotFoundError):
-        return np.where(_unpacked(path.with_suffix(".conf"), np.dtype(np.uint8), size) > 0, depth, 0)
-    return depth
+    with errors_name(scene):
+        depth = _read_exr(path) if path.suffix.lower() == EXR else _unpacked(path, np.dtype("<f4"), size)
+        if path.suffix.lower() == PACKED:
+            with suppress(FileNotFoundError):
+                depth = np.where(_unpacked(path.with_suffix(".conf"), np.dtype(np.uint8), size) > 0, depth, 0)
+    check_size(path, scene, depth.shape, size)
+    return np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
+
+
+def _read_exr(path: Path) -> NDArray[np.float32]:
+    """The only channel, or the first by name, of an EXR image ``[H, W]``."""
+    try:
+        import OpenEXR  # pyright: ignore[reportMissingImports]: optional
+    except ImportError as error:
+        raise ImportError(f"{path.name} is read with OpenEXR: pip install 'vg2gt[phone]'") from error
+    try:
+        with OpenEXR.File(str(regular(path)), separate_channels=True) as file:
+            channels = {name: channel.pixels for name, channel in file.channels().items()}
+    except (RuntimeError, ValueError) as error:  # what its C++ side makes of damaged bytes
+        raise FormatError(f"{path}: not an OpenEXR image ({error}); the file is truncated or damaged") from error
+    floats = [pixels for _, pixels in sorted(channels.items()) if pixels.ndim == 2 and pixels.dtype.kind == "f"]
+    if not floats:
+        raise FormatError(f"{path}: expected a channel of floats, found {', '.join(channels) or 'none'}")
+    return np.asarray(floats[0], np.float32)
 
 
 def _unpacked(path: Path, kind: np.dtype[Any], size: Size) -> NDArray[Any]:
@@ -141,7 +164,7 @@ def _unpacked(path: Path, kind: np.dtype[Any], size: Size) -> NDArray[Any]:
     return np.frombuffer(content, kind).reshape(size)
 
 
-def _read_record3d(folder: Path, scene: str) -> PhoneExport:
+def _read_record3d(folder: Path, scene: str) -> Recording:
     """Separate files."""
     path = folder / "metadata.json"
     color, depth = numbered(folder / "rgb", scene), numbered(folder / "depth", scene, suffixes=(EXR,))
@@ -149,7 +172,7 @@ def _read_record3d(folder: Path, scene: str) -> PhoneExport:
     return _of_metadata(RECORD3D, path, load_json(path), color, depth, size)
 
 
-def _read_r3d(recording: Path, scene: str) -> PhoneExport:
+def _read_r3d(recording: Path, scene: str) -> Recording:
     """Newer files tell the depth's size; in older ones it has the images' shape."""
     path = recording / "metadata"
     content = load_json(path, read_recorded(path))
@@ -171,7 +194,7 @@ def _read_r3d(recording: Path, scene: str) -> PhoneExport:
 
 def _of_metadata(
     app: str, path: Path, content: Any, color: dict[int, Path], depth: dict[int, Path], size: Size
-) -> PhoneExport:
+) -> Recording:
     """``poses`` are lists of qx qy qz qw x y z; ``K`` goes column by column; newer files have one for every frame."""
     height, width = _numbers(path, content, "h", "w")
     if color and not np.isclose(height * size[1], width * size[0], rtol=0.02):
@@ -185,7 +208,7 @@ def _of_metadata(
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise FormatError(f"{path}: expected poses and intrinsics as Record3D writes them ({error})") from error
     scale = np.diag([size[1] / width, size[0] / height, 1.0])
-    return PhoneExport(
+    return Recording(
         app,
         color,
         depth,
@@ -195,7 +218,7 @@ def _of_metadata(
     )
 
 
-def _read_polycam(folder: Path, scene: str) -> PhoneExport:
+def _read_polycam(folder: Path, scene: str) -> Recording:
     """A file for every camera: ``fx fy cx cy width height`` and the rows of its pose, ``t_00`` to ``t_23``."""
     inside = folder / "keyframes"
     corrected = (inside / "corrected_cameras").is_dir() and (inside / "corrected_images").is_dir()
@@ -208,10 +231,10 @@ def _read_polycam(folder: Path, scene: str) -> PhoneExport:
         poses[frame] = np.vstack((rows.reshape(3, 4), [0, 0, 0, 1])) @ _OPENGL
         intrinsics[frame] = pinhole(*_numbers(path, content, "fx", "fy", "cx", "cy")) - CORNER_TO_CENTER
     size = image_size(next(iter(color.values())), scene) if color else (0, 0)
-    return PhoneExport(POLYCAM, color, depth, poses, intrinsics, size)
+    return Recording(POLYCAM, color, depth, poses, intrinsics, size)
 
 
-def _read_stray(folder: Path, scene: str) -> PhoneExport:
+def _read_stray(folder: Path, scene: str) -> Recording:
     """``odometry.csv``: a header, then timestamp, frame, x, y, z, qx, qy, qz, qw of cameras with OpenCV's axes."""
     path = folder / "odometry.csv"
     try:
@@ -222,7 +245,7 @@ def _read_stray(folder: Path, scene: str) -> PhoneExport:
     if not len(rows) or not (np.abs(rows[:, 0]) < 2**31).all():
         raise FormatError(f"{path} has no frames, or numbers of frames that are none")
     frames = rows[:, 0].astype(int).tolist()
-    return PhoneExport(
+    return Recording(
         STRAY,
         dict.fromkeys(frames, folder / VIDEO),
         numbered(folder / "depth", scene),

@@ -17,7 +17,6 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
@@ -39,15 +38,14 @@ from vg2gt.data.sources.parsing import (
     read_poses,
 )
 from vg2gt.data.sources.phone import (
-    EXR,
-    PACKED,
+    METRES,
     VIDEO,
-    PhoneExport,
+    Recording,
     app_of,
     confidence_of,
     read_color_file,
     read_export,
-    read_packed_depth,
+    read_metres,
 )
 from vg2gt.data.sources.rgbd_cameras import (
     INTRINSICS_FILES,
@@ -59,7 +57,6 @@ from vg2gt.data.sources.rgbd_cameras import (
 )
 from vg2gt.data.sources.scannet import room_of_scan
 from vg2gt.geometry.cameras import resize_intrinsics
-from vg2gt.io.exr import read_exr
 from vg2gt.io.image_files import Size, check_size, read_depth
 from vg2gt.io.record3d import R3D
 from vg2gt.io.video import read_frame
@@ -69,17 +66,6 @@ log = logging.getLogger(__name__)
 _COLOR_FOLDERS = ("images", "color", "rgb", "image")
 _POSE_FOLDERS = ("pose", "poses")
 _OFF_CENTRE = 0.15  # most of an image's width or height that a principal point may lie from its middle
-
-
-@dataclass(frozen=True)
-class _Files:
-    """What a recording consists of."""
-
-    layout: str
-    color: dict[int, Path]
-    depth: dict[int, Path]
-    poses: dict[int, Path] | Path | None
-    intrinsics: tuple[Path, ...]
 
 
 class RGBDFolder(FileSource):
@@ -145,37 +131,19 @@ class RGBDFolder(FileSource):
         return folder, *_exported_intrinsics(folder), *_beside(folder.parent), folder / "keyframes"
 
     def index(self, scene: str, folder: Path) -> SceneIndex:
-        """Lists a recording's files and reads its poses and intrinsics."""
-        export = read_export(folder, scene)
-        if export is not None:
-            return self._index_of_export(export, folder, scene)
-        in_folders = (folder / "depth").is_dir() or not self.has_depth
-        files = _files_in_folders(folder, scene) if in_folders else _files_of_seven_scenes(folder, scene)
-        check_found(scene, folder, {"colour images": files.color})
-        depth = files.depth if self.has_depth else None
-        if depth is not None:
-            check_found(scene, folder, {"depth images": depth})
-        color_size = first_size(files.color, scene)
-        depth_size = color_size if depth is None else first_size(depth, scene)
-        poses = _read_poses(files, folder, scene)
-        intrinsics, upwards = self._depth_intrinsics(files.intrinsics, folder, scene, color_size, depth_size)
-        poses = mirrored(poses) if upwards else poses
+        """Lists a recording's files and reads its poses and intrinsics; frames have the depth's size."""
+        found = read_export(folder, scene) or self._read_folder(folder, scene)
+        depth = found.depth if self.has_depth else None
+        check_found(scene, folder, {"colour images": found.color, "depth images": [True] if depth is None else depth})
+        size = found.color_size if depth is None else found.depth_size(scene)
+        matrices = found.intrinsics
+        if self.intrinsics is not None:
+            matrices = dict.fromkeys(found.color, pinhole(*self.intrinsics))
+        matrices = {frame: _resized(matrix, found.color_size, size) for frame, matrix in matrices.items()}
         index = make_index(
-            scene,
-            folder,
-            files.color,
-            depth,
-            poses,
-            intrinsics,
-            color_size,
-            size=depth_size,
-            depth_size=depth_size,
+            scene, folder, found.color, depth, found.poses, matrices, found.color_size, size=size, depth_size=size
         )
-        size = f"{depth_size[1]}x{depth_size[0]}"
-        _say(f"scene {scene}: {files.layout}, {len(index.frame_ids)} frames of {size} in {folder}")
-        if color_size[0] > depth_size[0]:
-            larger = f"{color_size[1]}x{color_size[0]}"
-            _say(f"scene {scene}: colour of {larger} is reduced to the depth's {size}", logging.WARNING)
+        _say(f"scene {scene}: {found.layout}, {len(index.frame_ids)} frames of {size[1]}x{size[0]} in {folder}")
         return index
 
     def read_color(self, index: SceneIndex, row: int) -> NDArray[np.uint8]:
@@ -191,51 +159,71 @@ class RGBDFolder(FileSource):
     def read_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
         """Decodes depth; of floats in metres, of whole numbers in ``depth_scale``, without what has no confidence."""
         path = index.depth[row]
-        if path.suffix.lower() in (EXR, PACKED):
-            with errors_name(index.name):
-                depth = read_exr(path) if path.suffix.lower() == EXR else read_packed_depth(path, size)
-            check_size(path, index.name, depth.shape, size)
-            return np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
+        if path.suffix.lower() in METRES:
+            return read_metres(path, index.name, size)
         depth = super().read_depth(index, row, size)
         confidence = confidence_of(path)
         return depth if confidence is None else depth * (read_depth(confidence, index.name, size) > 0)
 
-    def _index_of_export(self, export: PhoneExport, folder: Path, scene: str) -> SceneIndex:
-        """The index of what an app has exported; frames have the depth's size."""
-        check_found(scene, folder, {"colour images": export.color})
-        depth = export.depth if self.has_depth else None
-        if depth is not None:
-            check_found(scene, folder, {"depth images": depth})
-        size = export.color_size if depth is None else export.depth_size(scene)
-        scale = (size[1] / export.color_size[1], size[0] / export.color_size[0])
-        intrinsics = export.intrinsics
-        if self.intrinsics is not None:
-            intrinsics = dict.fromkeys(export.color, pinhole(*self.intrinsics))
-        resized = {i: resize_intrinsics(torch.from_numpy(m), *scale).numpy() for i, m in intrinsics.items()}
-        _say(f"scene {scene}: export of {export.app} in {folder}, {len(export.color)} frames of {size[1]}x{size[0]}")
-        return make_index(
-            scene, folder, export.color, depth, export.poses, resized, export.color_size, size=size, depth_size=size
-        )
-
-    def _depth_intrinsics(
-        self, files: Sequence[Path], folder: Path, scene: str, color: Size, depth: Size
-    ) -> tuple[NDArray[np.float64], bool]:
-        """Intrinsics of the depth images, and whether y points up: their own file, or the colour images' resized."""
-        own = [path for path in files if path.name == "intrinsic_depth.txt"]
-        upwards = False
-        if self.intrinsics is not None:
-            matrix = pinhole(*self.intrinsics)
-        elif files:
-            path = (own or files)[0]
-            matrix, upwards = read_camera(path, scene)
-            _check_resolution(matrix, f"{path} of scene {scene}", depth if own else color)
+    def _read_folder(self, folder: Path, scene: str) -> Recording:
+        """A recording in folders, or in the layout of 7-Scenes."""
+        if (folder / "depth").is_dir() or not self.has_depth:
+            images = next((folder / name for name in _COLOR_FOLDERS if (folder / name).is_dir()), folder)
+            color, depth = numbered(images, scene), numbered(folder / "depth", scene)
+            pose_folder = next((folder / name for name in _POSE_FOLDERS if (folder / name).is_dir()), None)
+            poses = numbered(pose_folder, scene, suffixes=(".txt",)) if pose_folder else pose_file_of(folder)
+            cameras = [*_exported_intrinsics(folder), *_beside(folder)]
+            layout = f"folders {images.name}/ and depth/" if depth else f"images in {images.name}/"
         else:
-            raise DataError(
-                f"scene {scene} in {folder} has no intrinsics: add K.txt (3x3), or set data.intrinsics=[fx,fy,cx,cy]"
+            _say(
+                f"scene {scene}: raw 7-Scenes streams are not registered; colour and depth do not match",
+                logging.WARNING,
             )
-        if own and self.intrinsics is None:
-            return matrix, upwards
-        return resize_intrinsics(torch.from_numpy(matrix), depth[1] / color[1], depth[0] / color[0]).numpy(), upwards
+            color, depth = (numbered(folder, scene, f"frame-*.{kind}.*") for kind in ("color", "depth"))
+            poses = numbered(folder, scene, "frame-*.pose.txt", suffixes=(".txt",))
+            cameras = [*_beside(folder), *_beside(folder.parent)]  # next to the frames or to the sequences
+            layout = "7-Scenes layout"
+        check_found(scene, folder, {"colour images": color, "depth images": depth if self.has_depth else color})
+        color_size = first_size(color, scene)
+        depth_size = first_size(depth, scene) if self.has_depth else color_size
+        if poses is None:
+            raise DataError(
+                f"scene {scene} in {folder} has {len(color)} colour and {len(depth)} depth images but no poses: add "
+                "poses.txt (a line of 16 numbers, 4x4 camera-to-world, for each image), or one of "
+                f"{', '.join(POSE_FILES[1:])}"
+            )
+        read = read_poses(poses, scene) if isinstance(poses, dict) else read_pose_list(poses, scene, list(color))
+        intrinsics, upwards = np.eye(3), False
+        if self.intrinsics is None:
+            known = [path for path in cameras if path.is_file()]
+            intrinsics, upwards = _read_intrinsics(known, folder, scene, color_size, depth_size)
+        if color_size[0] > depth_size[0]:
+            larger, smaller = (f"{size[1]}x{size[0]}" for size in (color_size, depth_size))
+            _say(f"scene {scene}: colour of {larger} is reduced to the depth's {smaller}", logging.WARNING)
+        read = mirrored(read) if upwards else read
+        return Recording(layout, color, depth, read, dict.fromkeys(color, intrinsics), color_size, depth_size)
+
+
+def _read_intrinsics(
+    files: Sequence[Path], folder: Path, scene: str, color: Size, depth: Size
+) -> tuple[NDArray[np.float64], bool]:
+    """Intrinsics of the colour images, best by the file of the depth images, and whether y points up."""
+    if not files:
+        raise DataError(
+            f"scene {scene} in {folder} has no intrinsics: add K.txt (3x3), or set data.intrinsics=[fx,fy,cx,cy]"
+        )
+    path = next((path for path in files if path.name == "intrinsic_depth.txt"), files[0])
+    size = depth if path.name == "intrinsic_depth.txt" else color
+    matrix, upwards = read_camera(path, scene)
+    _check_resolution(matrix, f"{path} of scene {scene}", size)
+    return _resized(matrix, size, color), upwards
+
+
+def _resized(matrix: NDArray[np.float64], size: Size, target: Size) -> NDArray[np.float64]:
+    """Intrinsics of images of ``size`` as those of images of ``target``."""
+    if size == target:
+        return matrix
+    return resize_intrinsics(torch.from_numpy(matrix), target[1] / size[1], target[0] / size[0]).numpy()
 
 
 def _check_resolution(matrix: NDArray[np.float64], where: str, size: Size) -> None:
@@ -256,49 +244,9 @@ def _say(message: str, level: int = logging.INFO) -> None:
     log.log(level, message)
 
 
-def _files_in_folders(folder: Path, scene: str) -> _Files:
-    color = next((folder / name for name in _COLOR_FOLDERS if (folder / name).is_dir()), folder)
-    pose_folder = next((folder / name for name in _POSE_FOLDERS if (folder / name).is_dir()), None)
-    poses = numbered(pose_folder, scene, suffixes=(".txt",)) if pose_folder else pose_file_of(folder)
-    single = [path for path in _beside(folder) if path.is_file()][:1]
-    return _Files(
-        layout=f"folders {color.name}/ and depth/" if (folder / "depth").is_dir() else f"images in {color.name}/",
-        color=numbered(color, scene),
-        depth=numbered(folder / "depth", scene),
-        poses=poses,
-        intrinsics=tuple(path for path in _exported_intrinsics(folder) if path.is_file()) or tuple(single),
-    )
-
-
-def _files_of_seven_scenes(folder: Path, scene: str) -> _Files:
-    _say(f"scene {scene}: raw 7-Scenes streams are not registered; colour and depth do not match", logging.WARNING)
-    # The intrinsics are next to the frames, or next to the sequences of a scene.
-    candidates = [*_beside(folder), *_beside(folder.parent)]
-    return _Files(
-        layout="7-Scenes layout",
-        color=numbered(folder, scene, "frame-*.color.*"),
-        depth=numbered(folder, scene, "frame-*.depth.*"),
-        poses=numbered(folder, scene, "frame-*.pose.txt", suffixes=(".txt",)),
-        intrinsics=tuple(path for path in candidates if path.is_file())[:1],
-    )
-
-
 def _exported_intrinsics(folder: Path) -> list[Path]:
     return [folder / "intrinsic" / f"intrinsic_{kind}.txt" for kind in ("color", "depth")]
 
 
 def _beside(folder: Path) -> list[Path]:
     return [folder / name for name in INTRINSICS_FILES]
-
-
-def _read_poses(files: _Files, folder: Path, scene: str) -> dict[int, NDArray[np.float64]]:
-    """Camera-to-world poses by frame number."""
-    if files.poses is None:
-        raise DataError(
-            f"scene {scene} in {folder} has {len(files.color)} colour and {len(files.depth)} depth images but no "
-            f"poses: add poses.txt (a line of 16 numbers, 4x4 camera-to-world, for each image), or one of "
-            f"{', '.join(POSE_FILES[1:])}"
-        )
-    if isinstance(files.poses, dict):
-        return read_poses(files.poses, scene)
-    return read_pose_list(files.poses, scene, list(files.color))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import logging
 from collections.abc import Sequence
 from pathlib import Path
@@ -115,13 +114,6 @@ class SyntheticScenes(SceneSource):
         """Makes a scene, ready to be rendered."""
         kind, seed = self._seeds[scene]
         return self.variants[kind](seed, self.num_frames, self.size, self.highlights)
-
-    def identity(self, scene: str) -> str:
-        """What decides the pixels, with the version of the generator."""
-        version = self.variants[self._seeds[scene][0]].version
-        look = self.look[1:]
-        more = [look] if look not in ("", "highlights") else []
-        return json.dumps([type(self).__qualname__, scene, version, self.size, self.num_frames, self.highlights, *more])
 
     @property
     def look(self) -> str:
