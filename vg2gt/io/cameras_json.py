@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 
 from vg2gt.io.errors import FormatError
 from vg2gt.io.files import write_json
-from vg2gt.io.json_checks import MAX_SIZE, check_rigid, load_json, short
+from vg2gt.io.json_checks import Fields, check_rigid, load_json
 from vg2gt.types import Cameras
 
 MOST_PIXELS = 1 << 28  # of an image to be rendered: the largest photographs have fewer
@@ -162,57 +162,44 @@ def read_cameras_json(path: str | Path) -> list[NamedCamera]:
 
 def _camera(place: str, entry: Any) -> NamedCamera:
     """Checks one entry; ``place`` is where it is, for messages."""
-    if not isinstance(entry, dict):
-        raise FormatError(f"{place} is {type(entry).__name__}, expected an object")
-    name = entry.get("name")
-    if not isinstance(name, str) or not name:
-        raise FormatError(f"{place}.name is {short(name)}, expected the view's name")
-    pose = _matrix(place, entry, "world_to_camera", 4)
+    fields = Fields(f"{place}.", entry)
+    name = fields.get("name", str, "the view's name")
+    if not name:
+        raise fields.wrong("name", "the view's name")
+    pose = _matrix(fields, "world_to_camera", 4)
     check_rigid(f"{place}.world_to_camera", pose, _ROTATION_TOLERANCE)
-    (width, height), intrinsics = _optics(place, entry)
+    width, height, intrinsics = _optics(fields)
     photo = entry.get("photo")
     if photo is not None:
-        if not isinstance(photo, dict) or not all(isinstance(photo.get(key), str) for key in ("name", "lens")):
-            raise FormatError(f"{place}.photo is {short(photo)}, expected an object with name and lens")
-        (photo_width, photo_height), matrix = _optics(f"{place}.photo", photo)
-        photo = Photo(photo["name"], photo_width, photo_height, matrix, photo["lens"])
-    similarity = None if entry.get("similarity") is None else _matrix(place, entry, "similarity", 4)
-    metres = entry.get("metres_per_unit")
-    if metres is not None and (
-        isinstance(metres, bool) or not isinstance(metres, (int, float)) or not 0 < metres < 1e30
-    ):
-        raise FormatError(f"{place}.metres_per_unit is {short(metres)}, expected a positive number or null")
+        inside = Fields(f"{place}.photo.", photo)
+        names = [inside.get(key, str, "a text") for key in ("name", "lens")]
+        if None in names:
+            raise inside.wrong("name" if names[0] is None else "lens", "a text")
+        photo = Photo(names[0], *_optics(inside), names[1])
+    similarity = None if entry.get("similarity") is None else _matrix(fields, "similarity", 4)
+    metres = fields.number("metres_per_unit", 0, 1e30)
     return NamedCamera(name, width, height, intrinsics, pose, photo, similarity, metres)
 
 
-def _optics(place: str, entry: dict[str, Any]) -> tuple[tuple[int, int], NDArray[np.float64]]:
-    """(width, height) and intrinsics of an entry."""
-    intrinsics = _matrix(place, entry, "intrinsics", 3)
+def _optics(fields: Fields) -> tuple[int, int, NDArray[np.float64]]:
+    """Width, height and intrinsics of an entry."""
+    intrinsics = _matrix(fields, "intrinsics", 3)
     focal = intrinsics[[0, 1], [0, 1]]
     if (focal <= 0).any() or np.abs(intrinsics[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]] - [0, 0, 0, 0, 1]).max() > 1e-9:
         raise FormatError(
-            f"{place}.intrinsics is {intrinsics.tolist()}, expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with "
+            f"{fields.place}intrinsics is {intrinsics.tolist()}, expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with "
             "positive focal lengths and no skew; undistort the images"
         )
-    width, height = _pixels(place, entry, "width"), _pixels(place, entry, "height")
+    width, height = fields.pixels("width"), fields.pixels("height")
+    if width is None or height is None:
+        raise fields.wrong("width" if width is None else "height", "a whole number of pixels")
     if width * height > MOST_PIXELS:
-        raise FormatError(f"{place} has {width}x{height} pixels, more than {MOST_PIXELS} in all")
-    return (width, height), intrinsics
+        raise FormatError(f"{fields.place[:-1]} has {width}x{height} pixels, more than {MOST_PIXELS} in all")
+    return width, height, intrinsics
 
 
-def _pixels(place: str, entry: dict[str, Any], field: str) -> int:
-    value = entry.get(field)
-    if isinstance(value, bool) or not isinstance(value, int) or not 0 < value < MAX_SIZE:
-        raise FormatError(f"{place}.{field} is {short(value)}, expected a whole number of pixels above 0")
-    return value
-
-
-def _matrix(place: str, entry: dict[str, Any], field: str, size: int) -> NDArray[np.float64]:
-    rows = entry.get(field)
-    try:
-        matrix = np.array(rows, np.float64)
-    except (TypeError, ValueError, OverflowError):
-        matrix = np.empty(0)
-    if matrix.shape != (size, size) or not np.isfinite(matrix).all():
-        raise FormatError(f"{place}.{field} is {short(rows)}, expected {size} rows of {size} finite numbers")
+def _matrix(fields: Fields, name: str, size: int) -> NDArray[np.float64]:
+    matrix = fields.matrix(name, (size,), size)
+    if not np.isfinite(matrix).all():
+        raise fields.wrong(name, f"{size} rows of {size} finite numbers")
     return matrix

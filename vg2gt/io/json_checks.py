@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,59 @@ def load_json(path: Path, content: bytes | None = None) -> Any:
         return read_json(path) if content is None else json.loads(content)
     except (ValueError, RecursionError) as error:
         raise FormatError(f"{path}: not valid JSON ({error}); the file is truncated or damaged") from error
+
+
+class Fields:
+    """The fields of one JSON object; every error (``FormatError``) names the place and the field.
+
+    Args:
+        place: what stands before a field's name in messages, such as ``cameras.json: [1].``.
+        content: the object.
+    """
+
+    def __init__(self, place: str, content: Any) -> None:
+        if not isinstance(content, dict):
+            raise FormatError(f"{place.rstrip('.: ')} should be an object, got {short(content)}")
+        self.place, self.content = place, content
+
+    def wrong(self, name: str, expected: str) -> FormatError:
+        """The error of a field that is missing or not as expected."""
+        return FormatError(f"{self.place}{name} is {short(self.content.get(name))}, expected {expected}")
+
+    def get(self, name: str, kind: type, expected: str) -> Any:
+        """A field of one kind, None if it is missing."""
+        value = self.content.get(name)
+        if value is not None and not isinstance(value, kind):
+            raise self.wrong(name, expected)
+        return value
+
+    def number(self, name: str, low: float = -math.inf, high: float = math.inf) -> float | None:
+        """A finite number strictly between ``low`` and ``high``, None if it is missing."""
+        value = self.content.get(name)
+        if value is None:
+            return None
+        if type(value) not in (int, float) or abs(value) > 1e300 or not low < value < high:
+            limits = "" if low == -math.inf else f" greater than {low:g}" + (f" and below {high:g}" * (high < math.inf))
+            raise self.wrong(name, f"a finite number{limits}")
+        return float(value)
+
+    def pixels(self, name: str) -> int | None:
+        """A whole number of pixels, None if it is missing."""
+        value = self.number(name, 0, MAX_SIZE)
+        if value is not None and value != round(value):
+            raise self.wrong(name, "a whole number of pixels")
+        return None if value is None else round(value)
+
+    def matrix(self, name: str, rows: Sequence[int], columns: int) -> NDArray[np.float64]:
+        """A matrix of one of some numbers of rows; its values may be anything but text."""
+        value = self.content.get(name)
+        lists = value if isinstance(value, list) and len(value) in rows else [None]
+        try:
+            if all(isinstance(row, list) and all(type(number) in (int, float) for number in row) for row in lists):
+                return np.array(lists, np.float64).reshape(len(lists), columns)
+        except (ValueError, OverflowError):
+            pass
+        raise self.wrong(name, f"{' or '.join(map(str, rows))} rows of {columns} finite numbers")
 
 
 def check_rigid(place: str, matrix: NDArray[np.float64], tolerance: float) -> None:

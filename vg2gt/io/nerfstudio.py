@@ -1,8 +1,8 @@
 """nerfstudio's and instant-ngp's ``transforms.json``: posed frames with intrinsics, shared or per frame.
 
 In the file poses are camera-to-world with OpenGL axes (x right, y up, z backward) and the centre of the first pixel is
-at (1/2, 1/2). The records hold our conventions; the change happens in ``_world_to_camera`` and ``_camera_to_world``
-and in :meth:`Lens.intrinsics` and :meth:`Lens.from_intrinsics`, and nowhere else.
+at (1/2, 1/2). The records hold our conventions; the change happens where frames are read and written and in
+:meth:`Lens.intrinsics` and :meth:`Lens.from_intrinsics`.
 
 Example:
     >>> import numpy as np, tempfile
@@ -28,9 +28,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vg2gt.io.errors import FormatError
 from vg2gt.io.files import write_json
-from vg2gt.io.json_checks import MAX_SIZE, check_rigid, load_json, short
+from vg2gt.io.json_checks import Fields, check_rigid, load_json
 
 PIXEL_CENTER = 0.5  # where the file has the centre of the first pixel; ours is at 0
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
@@ -147,12 +146,10 @@ class Transforms:
 
     Attributes:
         frames: the frames in the file's order; images listed but absent are the caller's business.
-        applied_transform: ``[3, 4]`` float64 by which an earlier tool moved its world to the one of the poses, or None.
         ply_file_path: point cloud of the scene in the world of the poses, or None.
     """
 
     frames: tuple[TransformsFrame, ...]
-    applied_transform: NDArray[np.floating] | None = None
     ply_file_path: str | None = None
 
 
@@ -166,18 +163,13 @@ def read_transforms(path: str | Path) -> Transforms:
         FormatError: if it is not JSON or of another shape, naming the file and the field.
     """
     path = Path(path)
-    content = load_json(path)
-    top = _Fields(path, "", content)
+    top = Fields(f"{path}: ", load_json(path))
     shared = _read_lens(top, Lens())
     frames = top.get("frames", list, "a list of frames")
     if frames is None:
-        raise top.wrong("frames", None, "a list of frames")
-    applied = content.get("applied_transform")
-    return Transforms(
-        tuple(_read_frame(_Fields(path, f"frames[{i}].", frame), shared) for i, frame in enumerate(frames)),
-        None if applied is None else _rigid(top, "applied_transform")[:3],
-        top.text("ply_file_path"),
-    )
+        raise top.wrong("frames", "a list of frames")
+    read = [_read_frame(Fields(f"{path}: frames[{i}].", frame), shared) for i, frame in enumerate(frames)]
+    return Transforms(tuple(read), top.get("ply_file_path", str, "a file name"))
 
 
 def write_transforms(path: str | Path, transforms: Transforms) -> Path:
@@ -194,76 +186,13 @@ def write_transforms(path: str | Path, transforms: Transforms) -> Path:
     shared = bool(frames) and all(frame.lens == frames[0].lens for frame in frames)
     if shared:
         content.update(_lens_fields(frames[0].lens))
-    if transforms.applied_transform is not None:
-        content["applied_transform"] = np.asarray(transforms.applied_transform).tolist()
     if transforms.ply_file_path is not None:
         content["ply_file_path"] = transforms.ply_file_path
     content["frames"] = [_frame_fields(frame, with_lens=not shared) for frame in frames]
     return write_json(path, content)
 
 
-class _Fields:
-    """The fields of one JSON object; every error names the file and the field."""
-
-    def __init__(self, path: Path, prefix: str, content: Any) -> None:
-        self.path, self.prefix = path, prefix
-        if not isinstance(content, dict):
-            name = prefix.rstrip(".") or "the file's content"
-            raise FormatError(f"{path}: {name} should be an object, got {short(content)}")
-        self.content = content
-
-    def wrong(self, name: str, value: Any, expected: str) -> FormatError:
-        """The error of a field that is missing or not as expected."""
-        found = "is missing" if name not in self.content else f"is {short(value)}"
-        return FormatError(f"{self.path}: {self.prefix}{name} {found}, expected {expected}")
-
-    def get(self, name: str, kind: type, expected: str) -> Any:
-        """A field of one kind, None if it is missing.
-
-        Raises:
-            FormatError: if it is of another kind.
-        """
-        value = self.content.get(name)
-        if value is not None and not isinstance(value, kind):
-            raise self.wrong(name, value, expected)
-        return value
-
-    def text(self, name: str) -> str | None:
-        """A text, None if it is missing."""
-        return self.get(name, str, "a file name")
-
-    def number(self, name: str, low: float = -math.inf, high: float = math.inf) -> float | None:
-        """A finite number strictly between ``low`` and ``high``."""
-        value = self.content.get(name)
-        if value is None:
-            return None
-        number = _float(value)
-        if number is None or not math.isfinite(number) or not low < number < high:
-            limits = "" if low == -math.inf else f" greater than {low:g}" + (f" and below {high:g}" * (high < math.inf))
-            raise self.wrong(name, value, f"a finite number{limits}")
-        return number
-
-    def pixels(self, name: str) -> int | None:
-        """A whole number of pixels, None if it is missing."""
-        value = self.number(name, 0, MAX_SIZE)
-        if value is None:
-            return None
-        if value != round(value):
-            raise self.wrong(name, value, "a whole number of pixels")
-        return round(value)
-
-
-def _float(value: Any) -> float | None:
-    """A JSON number as a float, or None; true and false are no numbers."""
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return None
-    try:
-        return float(value)
-    except OverflowError:
-        return math.inf
-
-
-def _read_lens(fields: _Fields, shared: Lens) -> Lens:
+def _read_lens(fields: Fields, shared: Lens) -> Lens:
     """The lens of one object; what it does not say is taken from ``shared``."""
     own = {
         "width": fields.pixels("w"),
@@ -282,53 +211,30 @@ def _read_lens(fields: _Fields, shared: Lens) -> Lens:
     )
 
 
-def _read_frame(fields: _Fields, shared: Lens) -> TransformsFrame:
-    file_path = (fields.text("file_path") or "").replace("\\", "/")  # as written on Windows
+def _read_frame(fields: Fields, shared: Lens) -> TransformsFrame:
+    file_path, depth, mask = (fields.get(f"{kind}_path", str, "a file name") for kind in ("file", "depth_file", "mask"))
     if not file_path:
-        raise fields.wrong("file_path", file_path, "the name of an image file")
+        raise fields.wrong("file_path", "the name of an image file")
     lens = _read_lens(fields, shared)
     if lens.fl_x is None and lens.camera_angle_x is None:
-        raise fields.wrong("fl_x", None, "fl_x or camera_angle_x, here or at the top of the file")
-    camera_to_world = _rigid(fields, "transform_matrix")
-    return TransformsFrame(
-        file_path, _world_to_camera(camera_to_world), lens, fields.text("depth_file_path"), fields.text("mask_path")
-    )
-
-
-def _rigid(fields: _Fields, name: str) -> NDArray[np.floating]:
-    """A rigid ``[4, 4]`` transform from 3 or 4 rows of 4 numbers; all NaN if one of its numbers is not finite."""
-    rows = fields.content.get(name)
-    expected = "3 or 4 rows of 4 numbers"
-    if not isinstance(rows, list) or len(rows) not in (3, 4):
-        raise fields.wrong(name, rows, expected)
-    matrix = np.eye(4)
-    for i, row in enumerate(rows):
-        values = [_float(value) for value in row] if isinstance(row, list) else []
-        if len(values) != 4 or None in values:
-            raise fields.wrong(f"{name}", rows, f"{expected}; row {i} is {short(row)}")
-        matrix[i] = values
-    if not np.isfinite(matrix).all():
-        return np.full((4, 4), np.nan)
-    check_rigid(f"{fields.path}: {fields.prefix}{name}", matrix, _ROTATION_TOLERANCE)
-    return matrix
-
-
-def _world_to_camera(camera_to_world: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Our pose of the file's: inverse, with the camera's y and z axes turned around."""
-    if not np.isfinite(camera_to_world).all():
-        return camera_to_world
-    return np.linalg.inv(camera_to_world @ _OPENGL)
-
-
-def _camera_to_world(world_to_camera: NDArray[np.floating]) -> NDArray[np.floating]:
-    return np.linalg.inv(world_to_camera) @ _OPENGL
+        raise fields.wrong("fl_x", "fl_x or camera_angle_x, here or at the top of the file")
+    pose = np.vstack((fields.matrix("transform_matrix", (3, 4), 4), [0, 0, 0, 1]))[:4]
+    if np.isfinite(pose).all():
+        check_rigid(f"{fields.place}transform_matrix", pose, _ROTATION_TOLERANCE)
+        pose = np.linalg.inv(pose @ _OPENGL)
+    else:
+        pose = np.full((4, 4), np.nan)
+    return TransformsFrame(file_path.replace("\\", "/"), pose, lens, depth, mask)  # some are written on Windows
 
 
 def _frame_fields(frame: TransformsFrame, with_lens: bool) -> dict[str, Any]:
     pose = np.asarray(frame.world_to_camera, np.float64)
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
         raise ValueError(f"{frame.file_path}: world_to_camera must be finite [4, 4], got {pose.tolist()}")
-    content: dict[str, Any] = {"file_path": frame.file_path, "transform_matrix": _camera_to_world(pose).tolist()}
+    content: dict[str, Any] = {
+        "file_path": frame.file_path,
+        "transform_matrix": (np.linalg.inv(pose) @ _OPENGL).tolist(),
+    }
     for name in ("depth_file_path", "mask_path"):
         if getattr(frame, name) is not None:
             content[name] = getattr(frame, name)
