@@ -14,9 +14,9 @@ from scipy.ndimage import minimum_filter
 
 from vg2gt.data.base import DataError
 from vg2gt.data.sources.parsing import errors_name
+from vg2gt.io.arrays import load_npz
 from vg2gt.io.files import write_cached
 from vg2gt.io.image_files import Size
-from vg2gt.io.npz import load_npz
 from vg2gt.io.ply import read_point_ply
 
 VERSION = 1

@@ -11,8 +11,7 @@ from vg2gt.data.base import DataError
 from vg2gt.data.sources.files import FileSource
 from vg2gt.data.sources.index import SceneIndex, check_found, make_index
 from vg2gt.data.sources.parsing import CORNER_TO_CENTER, numbered
-from vg2gt.io.arrays import load_matrices
-from vg2gt.io.npz import load_npz
+from vg2gt.io.arrays import load_matrices, load_npz
 
 METADATA = "scene_iphone_metadata.npz"
 """The file of a scene's cameras."""

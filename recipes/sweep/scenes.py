@@ -21,8 +21,8 @@ from examples.worlds.photograph import Photograph
 from vg2gt.data.sources.infinigen import Infinigen
 from vg2gt.data.synthetic.synthetic_scene import LOBES, SyntheticScene
 from vg2gt.geometry.cameras import rigid_motions
+from vg2gt.io.arrays import read_npz
 from vg2gt.io.files import write_cached
-from vg2gt.io.npz import read_npz
 
 FIRST_SEED = 5_000_000  # far from the seeds that VG²GT is trained (0 ...) and evaluated (1,000,000 ...) on
 SIZE = (144, 288)

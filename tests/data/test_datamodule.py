@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from vg2gt.data import DataError, SceneDataModule, SyntheticScenes
-from vg2gt.data.frame_cache import FrameCache
+from vg2gt.data.batches import FrameCache
 from vg2gt.data.framing import Framing
 from vg2gt.data.views.even import EvaluationViews
 

@@ -8,8 +8,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from vg2gt.data import SceneDataModule, SyntheticScenes, workers
-from vg2gt.data.workers import MOST, automatic_workers
+from vg2gt.data import SceneDataModule, SyntheticScenes, datamodule
+from vg2gt.data.datamodule import MOST, automatic_workers
 
 Usage = namedtuple("Usage", "free")
 
@@ -21,7 +21,7 @@ def machine(monkeypatch):
     def make(cores=64, memory=512.0, shared=256.0):
         monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(cores)), raising=False)
         monkeypatch.setattr(os, "sysconf", lambda name: int(memory * 1e9) if name == "SC_PHYS_PAGES" else 1)
-        monkeypatch.setattr(workers.shutil, "disk_usage", lambda path: Usage(int(shared * 1e9)))
+        monkeypatch.setattr(datamodule.shutil, "disk_usage", lambda path: Usage(int(shared * 1e9)))
 
     return make
 

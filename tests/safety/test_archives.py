@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from vg2gt.data import DataError
-from vg2gt.io.arrays import load_npy
-from vg2gt.io.npz import load_npz
+from vg2gt.io.arrays import load_npy, load_npz
 
 
 def npy_header(shape: tuple[int, ...], kind: str = "<f4") -> bytes:

@@ -18,10 +18,10 @@ from vg2gt import io as formats
 from vg2gt.data import DataError
 from vg2gt.data.sources import COLMAP, Nerfstudio
 from vg2gt.data.sources.parsing import read_numbers
+from vg2gt.io.arrays import load_npz
 from vg2gt.io.cameras_json import NamedCamera
 from vg2gt.io.image_files import image_size, read_color, read_depth
 from vg2gt.io.images import open_image
-from vg2gt.io.npz import load_npz
 from vg2gt.io.tensors import read_tensors
 from vg2gt.runs.checkpoints import read_checkpoint
 from vg2gt.runs.trust import read_run_config

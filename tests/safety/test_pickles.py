@@ -15,9 +15,8 @@ from backends.weights import find_weights
 from tests.data.sources.layout_rgbd import write_recording
 from tests.safety.conftest import Armed
 from vg2gt.data import DataError, RGBDFolder
-from vg2gt.io.arrays import load_matrices, load_npy
+from vg2gt.io.arrays import load_matrices, load_npy, load_npz, read_npz
 from vg2gt.io.errors import FormatError
-from vg2gt.io.npz import load_npz, read_npz
 from vg2gt.io.tensors import read_tensors
 from vg2gt.metrics.lpips import load_lpips
 from vg2gt.runs.checkpoints import initialize_from, read_checkpoint

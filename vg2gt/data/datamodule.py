@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 import signal
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -16,10 +19,14 @@ from vg2gt.data.framing import Crop, Fit, FramingSampler
 from vg2gt.data.overlap import refuse_overlap, refuse_untrainable
 from vg2gt.data.views.even import EvaluationViews
 from vg2gt.data.views.sampling import StepSampler, ViewSampler, usable_scenes
-from vg2gt.data.workers import automatic_workers
 from vg2gt.types import Batch
 
 PIXEL_BYTES = 4 * (3 + 1 + 1)  # colour and depth, and as much as one of them for what some datasets add
+
+MOST = 16  # more wait for the disk
+PREFETCHED = 2  # batches that a process has ready: torch's default
+PROCESS_MB = 600  # of a loader process, without its decoded frames
+SHARED_MEMORY = Path("/dev/shm")  # through which batches reach the trainer
 
 
 class SceneDataModule(LightningDataModule):
@@ -244,3 +251,22 @@ def _size(image_size: Sequence[int]) -> tuple[int, int]:
 def _leave_interrupts_to_the_trainer(worker: int) -> None:
     """Ctrl-C reaches all processes of a terminal: the trainer ends its step with these still loading."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def automatic_workers(ranks: int, memory_mb: int, batch_mb: float) -> int:
+    """Loader processes of each of this machine's ranks: a core each but one, as far as memory goes.
+
+    Args:
+        ranks: processes that train on this machine.
+        memory_mb: decoded frames that each loader process keeps.
+        batch_mb: the size of a batch.
+    """
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    limits = [MOST, cores // ranks - 1]
+    if hasattr(os, "sysconf"):
+        half = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 2e6
+        limits.append(int(half / ranks / (memory_mb + PROCESS_MB + PREFETCHED * batch_mb)))
+    if SHARED_MEMORY.is_dir():  # small in containers: beyond it a process ends by a bus error
+        free = shutil.disk_usage(SHARED_MEMORY).free / 1e6
+        limits.append(int(free / ranks / (2 * PREFETCHED * batch_mb)))  # half of it: for training and for evaluation
+    return max(0, min(limits))

@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from vg2gt.io import read_cameras_json, read_gaussian_ply
+from vg2gt.io.arrays import npz_names, read_npz
 from vg2gt.io.cameras_json import NamedCamera
 from vg2gt.io.errors import FormatError
 from vg2gt.io.files import read_json
 from vg2gt.io.images import open_image
-from vg2gt.io.npz import npz_names, read_npz
 from vg2gt.reconstruction.camera_paths import view_stem
 from vg2gt.reconstruction.frame import SceneFrame
 from vg2gt.reconstruction.output_names import PREDICTED

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from vg2gt.data.base import DataError
 from vg2gt.data.sources.parsing import check_intrinsics, inverse, rigid
+from vg2gt.io.arrays import load_npz
 from vg2gt.io.image_files import Size, image_size, typical_size
-from vg2gt.io.npz import load_npz
 
 log = logging.getLogger(__name__)
 

@@ -16,9 +16,9 @@ from vg2gt.data.base import Frames, SceneSource
 from vg2gt.data.synthetic.rooms import SyntheticRoom, SyntheticWideRoom
 from vg2gt.data.synthetic.synthetic_scene import LOBES, SyntheticScene
 from vg2gt.data.transforms import from_bytes
+from vg2gt.io.arrays import read_npz
 from vg2gt.io.errors import FormatError
 from vg2gt.io.files import write_cached
-from vg2gt.io.npz import read_npz
 
 log = logging.getLogger(__name__)
 

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from vg2gt.data.base import DataError, SceneSource
-from vg2gt.data.views.sample import SceneSample
+from vg2gt.data.views import SceneSample
 from vg2gt.io.files import read_json
 
 log = logging.getLogger(__name__)

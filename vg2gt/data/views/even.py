@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vg2gt.data.base import DataError, SceneSource
-from vg2gt.data.views.sample import SceneSample
+from vg2gt.data.views import SceneSample
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from torch.utils.data import Sampler
 
 from vg2gt.data.base import DataError, SceneSource, training_frames
 from vg2gt.data.framing import FramingSampler
-from vg2gt.data.views.sample import SceneSample
+from vg2gt.data.views import SceneSample
 
 log = logging.getLogger(__name__)
 
