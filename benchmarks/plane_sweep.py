@@ -37,7 +37,7 @@ SETS = {
     " data.variant=outdoor",
     "objects": WORLDS + "data=worlds data.eval_scenes={scenes} data.val.first_seed={seed} data.image_size=[112,224]"
     " data.variant=object",
-    "wide rooms": "data=synthetic data.eval_scenes={scenes} data.val.first_seed={seed} data.image_size=[112,224]"
+    "wide rooms": WORLDS + "data=worlds data.eval_scenes={scenes} data.val.first_seed={seed} data.image_size=[112,224]"
     " data.variant=wide",
     "HoloLens office": "data=rgbd data.root={shared}/hololens_office_a data.image_size=[112,224]",
     "7-Scenes kitchen": "data=rgbd data.root={shared}/seven_scenes_redkitchen_a_registered data.image_size=[112,224]"

@@ -10,6 +10,7 @@ from examples.worlds.moving import SyntheticMovingRoom
 from examples.worlds.orbits import SyntheticLandmark, SyntheticObject
 from examples.worlds.outdoor import SyntheticOutdoor
 from examples.worlds.photograph import Photograph
+from examples.worlds.wide import SyntheticWideRoom
 from vg2gt.data.synthetic.source import SyntheticScenes
 from vg2gt.data.synthetic.synthetic_scene import SyntheticScene
 
@@ -21,8 +22,9 @@ class Worlds(SyntheticScenes):
         num_scenes: scenes in this source.
         exposure: scenes are too dark or too bright by this many stops (standard deviation), with noise; 0: none is.
         jpeg: range of qualities, such as ``[30, 95]``, at which images are compressed; None: they are not.
-        shared: see :class:`vg2gt.data.SyntheticScenes`; ``variant`` may also be ``outdoor``, ``object`` (orbits),
-            ``landmark`` (far backgrounds) and ``moving`` (a room with a chair that moves).
+        shared: see :class:`vg2gt.data.SyntheticScenes`; ``variant`` may also be ``wide`` (rooms from all around),
+            ``outdoor``, ``object`` (orbits), ``landmark`` (far backgrounds) or ``moving`` (a chair that moves), or a
+            list of them: seeds take turns.
 
     Raises:
         ValueError: if a number is out of range or a variant unknown.
@@ -30,6 +32,7 @@ class Worlds(SyntheticScenes):
 
     variants: ClassVar[dict[str, Any]] = {
         **SyntheticScenes.variants,
+        "wide": SyntheticWideRoom,
         "outdoor": SyntheticOutdoor,
         "object": SyntheticObject,
         "landmark": SyntheticLandmark,

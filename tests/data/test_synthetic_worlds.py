@@ -8,10 +8,11 @@ import pytest
 from examples.worlds import Worlds
 from examples.worlds.orbits import SyntheticLandmark, SyntheticObject
 from examples.worlds.outdoor import SyntheticOutdoor
+from examples.worlds.wide import SyntheticWideRoom
 from vg2gt.data.synthetic.builder import Builder
 from vg2gt.data.synthetic.raycast import AXES, HALF, KIND, PART_COLUMNS
 from vg2gt.data.synthetic.renderer import World, render_frame
-from vg2gt.data.synthetic.rooms import SyntheticRoom, SyntheticWideRoom
+from vg2gt.data.synthetic.rooms import SyntheticRoom
 from vg2gt.data.synthetic.synthetic_scene import level_poses
 
 SIZE = (28, 56)

@@ -136,7 +136,7 @@ def test_index_caches(rooms, tmp_path, pickled_array, armed, caplog):
     (path,) = cache.rglob("*.npz")
     with np.load(path) as stored:
         good = dict(stored)
-    for name in ("state", "extra", "color", "frame_ids"):
+    for name in ("facts", "color", "frame_ids"):
         caplog.clear()
         np.savez(path, **{**good, name: pickled_array})  # pyright: ignore[reportArgumentType]
         assert frames() == [10, 11]

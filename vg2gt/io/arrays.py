@@ -1,4 +1,7 @@
-"""NumPy files from anywhere: no pickles, and shapes are checked before anything is made of them."""
+"""NumPy files from anywhere: no pickles, and shapes are checked before anything is made of them.
+
+What is missing or damaged, or has another shape, is a ``DataError`` that names the file and the scene.
+"""
 
 from __future__ import annotations
 
@@ -54,11 +57,7 @@ def npz_names(path: Path) -> tuple[str, ...]:
 
 
 def load_npz(path: Path, scene: str, names: Sequence[str]) -> dict[str, NDArray]:
-    """Reads named arrays of an ``.npz`` file without executing anything in it.
-
-    Raises:
-        DataError: if the file is missing or damaged, or lacks one of the arrays.
-    """
+    """Reads named arrays of an ``.npz`` file without executing anything in it."""
     try:
         return read_npz(path, names)
     except KeyError as error:
@@ -76,9 +75,6 @@ def load_matrices(
         path: the file.
         scene: the scene it belongs to, for messages.
         shapes: the shape that each array must have; None: any length.
-
-    Raises:
-        DataError: if the file is missing or damaged, lacks an array, or one has another shape or holds no numbers.
     """
     arrays = load_npz(path, scene, tuple(shapes))
     for name, shape in shapes.items():
@@ -96,20 +92,12 @@ def load_matrices(
 
 
 def npy_size(path: Path, scene: str) -> Size:
-    """The ``(height, width)`` of a float image in an ``.npy`` file, without reading its values.
-
-    Raises:
-        DataError: if the file is missing or damaged, or no image of floats.
-    """
+    """The ``(height, width)`` of a float image in an ``.npy`` file, without reading its values."""
     return _map_npy(path, scene).shape
 
 
 def load_npy(path: Path, scene: str, size: Size) -> NDArray[np.float32]:
-    """Reads a float image ``[h, w]`` of an ``.npy`` file.
-
-    Raises:
-        DataError: if the file is missing or damaged, no image of floats, or of another size.
-    """
+    """Reads a float image ``[h, w]`` of an ``.npy`` file."""
     mapped = _map_npy(path, scene)
     check_size(path, scene, mapped.shape, size)
     return np.asarray(mapped, dtype=np.float32)

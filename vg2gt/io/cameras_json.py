@@ -5,18 +5,6 @@ The file is a list of objects ``name``, ``width``, ``height``, ``intrinsics`` (3
 ``similarity`` (4 rows of 4: from this file's world to that of the cameras as they were given or found) and
 ``metres_per_unit`` (null: unknown). Other fields are ignored. (3D Gaussian Splatting writes a file of the
 same name with other fields; it is refused, naming the missing one.)
-
-Example:
-    >>> import tempfile, torch
-    >>> from vg2gt.io import named_cameras, read_cameras_json, write_cameras_json
-    >>> from vg2gt.types import Cameras
-    >>> intrinsics = torch.tensor([[50.0, 0, 31.5], [0, 50, 23.5], [0, 0, 1]])
-    >>> cameras = Cameras(torch.eye(4)[None, None], intrinsics[None, None], (48, 64))
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     path = write_cameras_json(folder + "/cameras.json", named_cameras(cameras, ["left.png"]))
-    ...     back = read_cameras_json(path)
-    >>> back[0].name, back[0].width, back[0].cameras().size
-    ('left.png', 64, (48, 64))
 """
 
 from __future__ import annotations

@@ -4,18 +4,6 @@ A model is a ``pycolmap.Reconstruction``, in COLMAP's conventions. Ours come in 
 :func:`colmap_intrinsics` and :func:`colmap_from_views` move the principal point by half a pixel (COLMAP has the centre
 of the first pixel at (1/2, 1/2), we at (0, 0)), :func:`colmap_pose` and :func:`colmap_from_views` turn COLMAP's pose
 into our ``world_to_camera`` and back (both are OpenCV cameras).
-
-Example:
-    >>> import tempfile, torch
-    >>> from vg2gt.io import colmap_from_views, colmap_images, colmap_intrinsics, read_colmap, write_colmap
-    >>> from vg2gt.types import Cameras
-    >>> intrinsics = torch.tensor([[500.0, 0, 319.5], [0, 500.0, 239.5], [0, 0, 1]])
-    >>> cameras = Cameras(torch.eye(4)[None, None], intrinsics[None, None], (480, 640))
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     model = read_colmap(write_colmap(folder, colmap_from_views(cameras, ["room/0001.png"])))
-    >>> (image,) = colmap_images(model)
-    >>> image.name, image.camera.params.tolist(), colmap_intrinsics(image.camera)[0].tolist()
-    ('room/0001.png', [500.0, 500.0, 320.0, 240.0], [500.0, 0.0, 319.5])
 """
 
 from __future__ import annotations

@@ -2,15 +2,6 @@
 
 glTF has y up and cameras looking along -z, our world is OpenCV's (y down, z forward): the file's root turns the scene
 by half a turn about x, so that it is upright. Colours are written as they are, in sRGB.
-
-Example:
-    >>> import tempfile, torch
-    >>> from vg2gt.io import write_glb
-    >>> from vg2gt.types import Cameras
-    >>> cameras = Cameras(torch.eye(4)[None, None], torch.diag(torch.tensor([50.0, 50, 1]))[None, None], (48, 64))
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     write_glb(folder + "/scene.glb", torch.rand(10, 3), cameras=cameras).read_bytes()[:4]
-    b'glTF'
 """
 
 from __future__ import annotations

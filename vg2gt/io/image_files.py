@@ -1,4 +1,8 @@
-"""Decoding of colour and depth image files, with errors that name the file and the scene."""
+"""Decoding of colour and depth image files.
+
+All of them raise ``DataError`` where a file is missing or damaged, or holds something else,
+naming the file and the scene.
+"""
 
 from __future__ import annotations
 
@@ -47,9 +51,6 @@ def image_size(path: Path, scene: str, upright: bool = False, content: bytes | N
         scene: the scene it belongs to, for messages; empty for a photograph of none.
         upright: of a photograph turned upright as its EXIF data says.
         content: the encoded image where it is a part of the file; None: it is the file.
-
-    Raises:
-        DataError: if the file is missing or not an image.
     """
     with _opened(path if content is None else io.BytesIO(content), path, scene) as image:
         turned = upright and _orientation(image) in _QUARTER_TURNS
@@ -100,9 +101,6 @@ def read_color(
         size: the ``(height, width)`` it must have; None: any.
         content: the encoded image where it is a part of the file; None: it is the file.
         upright: turn a photograph upright as its EXIF data says.
-
-    Raises:
-        DataError: if the file is missing, damaged or of another size.
     """
     with _opened(path if content is None else io.BytesIO(content), path, scene) as image:
         turned = upright and _orientation(image) in _QUARTER_TURNS
@@ -128,9 +126,6 @@ def read_mask(
 
     Returns:
         None where everything counts, as in a photograph in colour that has no transparency.
-
-    Raises:
-        DataError: if the file is missing or damaged.
     """
     with _opened(path if content is None else io.BytesIO(content), path, scene) as image:
         grey = image.mode in ("1", "L", "I", "I;16") and "transparency" not in image.info
@@ -146,21 +141,13 @@ def read_mask(
 
 
 def orientation(path: Path, scene: str) -> int:
-    """EXIF orientation of an image, 1 (upright) where it says none.
-
-    Raises:
-        DataError: if the file is missing or not an image.
-    """
+    """EXIF orientation of an image, 1 (upright) where it says none."""
     with _opened(path, path, scene) as image:
         return _orientation(image)
 
 
 def read_depth(path: Path, scene: str, size: Size | None = None) -> NDArray[np.int64]:
-    """Reads a one-channel integer depth image ``[H, W]`` as stored (16-bit PNG, PGM or TIFF).
-
-    Raises:
-        DataError: if the file is missing, damaged, not a one-channel integer image, or of another size than ``size``.
-    """
+    """Reads a one-channel integer depth image ``[H, W]`` as stored (16-bit PNG, PGM or TIFF)."""
     with _opened(path, path, scene) as image:
         channels = len(image.getbands())
         if channels == 1:
@@ -175,11 +162,7 @@ def read_depth(path: Path, scene: str, size: Size | None = None) -> NDArray[np.i
 
 
 def check_size(path: Path, scene: str, found: tuple[int, ...], expected: Size | None) -> None:
-    """Refuses an image of another ``(height, width)`` than expected; None: any will do.
-
-    Raises:
-        DataError: naming both sizes.
-    """
+    """Refuses an image of another ``(height, width)`` than expected; None: any will do."""
     if expected is not None and tuple(found) != tuple(expected):
         raise DataError(
             f"{path} of scene {scene} is {found[1]}x{found[0]} pixels, but the recording's first one is "

@@ -1,18 +1,4 @@
-"""Triangle meshes from depth maps: TSDF fusion, surface extraction, writing.
-
-Example:
-    >>> import tempfile, torch
-    >>> from vg2gt.io import fuse_depth, write_mesh
-    >>> from vg2gt.types import Cameras
-    >>> wall = torch.full((1, 24, 32), 2.0)
-    >>> intrinsics = torch.tensor([[30.0, 0, 15.5], [0, 30, 11.5], [0, 0, 1]])
-    >>> mesh = fuse_depth(wall, Cameras(torch.eye(4)[None, None], intrinsics[None, None], (24, 32)), voxel_size=0.1)
-    >>> bool(abs(mesh.vertices[:, 2] - 2).max() < 1e-3)
-    True
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     write_mesh(folder + "/wall.ply", mesh).name
-    'wall.ply'
-"""
+"""Triangle meshes from depth maps: TSDF fusion, surface extraction, writing."""
 
 from __future__ import annotations
 

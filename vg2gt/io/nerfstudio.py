@@ -3,18 +3,6 @@
 In the file poses are camera-to-world with OpenGL axes (x right, y up, z backward) and the centre of the first pixel is
 at (1/2, 1/2). The records hold our conventions; the change happens where frames are read and written and in
 :meth:`Lens.intrinsics` and :meth:`Lens.from_intrinsics`.
-
-Example:
-    >>> import numpy as np, tempfile
-    >>> from vg2gt.io import Lens, Transforms, TransformsFrame, read_transforms, write_transforms
-    >>> lens = Lens.from_intrinsics([[500, 0, 319.5], [0, 500, 239.5], [0, 0, 1]], size=(480, 640))
-    >>> frames = (TransformsFrame("images/0001.png", np.eye(4), lens),)
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     back = read_transforms(write_transforms(folder + "/transforms.json", Transforms(frames)))
-    >>> back.frames[0].file_path, back.frames[0].lens.cx
-    ('images/0001.png', 320.0)
-    >>> back.frames[0].lens.intrinsics()[0].tolist()
-    [500.0, 0.0, 319.5]
 """
 
 from __future__ import annotations

@@ -4,18 +4,6 @@ A Gaussian file has one ``vertex`` element of floats, in this order: ``x y z``, 
 ``f_rest_*`` (none or 45, all of red before green before blue), ``opacity`` (logit), ``scale_0..2`` (logarithms),
 ``rot_0..3`` (wxyz). The colour behind a scene is in a comment, ``background R G B`` in [0, 1], which other programs
 ignore.
-
-Example:
-    >>> import tempfile, torch
-    >>> from vg2gt.io import read_gaussian_ply, write_gaussian_ply
-    >>> from vg2gt.types import Gaussians
-    >>> means, quats, scales = torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), 0.02)
-    >>> sh, batch = torch.zeros(1, 1, 3), torch.zeros(1, dtype=torch.int64)
-    >>> one = Gaussians(means, quats, scales, torch.tensor([0.5]), sh, batch)
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     back = read_gaussian_ply(write_gaussian_ply(folder + "/scene.ply", one))
-    >>> len(back), back.opacities.item(), round(back.scales[0, 0].item(), 6)
-    (1, 0.5, 0.02)
 """
 
 from __future__ import annotations
@@ -149,14 +137,6 @@ def write_point_ply(path: str | Path, positions: ArrayLike, colors: ArrayLike | 
 
     Raises:
         ValueError: if the shapes or types are others.
-
-    Example:
-        >>> import numpy as np, tempfile
-        >>> from vg2gt.io import read_point_ply, write_point_ply
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     path = write_point_ply(folder + "/points.ply", [[1, 2, 3]], np.array([[255, 0, 0]], np.uint8))
-        ...     read_point_ply(path).positions.tolist()
-        [[1.0, 2.0, 3.0]]
     """
     xyz = np.asarray(positions, np.float64)
     if xyz.ndim != 2 or xyz.shape[1] != 3:

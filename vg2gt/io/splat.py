@@ -3,18 +3,6 @@
 Float32 position, float32 standard deviations, 8-bit red green blue and opacity, 8-bit wxyz. What is lost against a PLY
 file: everything of the colour that depends on the view, colours outside [0, 1], and precision of colour and opacity
 (1/510) and of the rotation (1/256 in each component, about half a degree).
-
-Example:
-    >>> import tempfile, torch
-    >>> from vg2gt.io import read_splat, write_splat
-    >>> from vg2gt.types import Gaussians
-    >>> means, quats, scales = torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), 0.02)
-    >>> sh, batch = torch.zeros(1, 1, 3), torch.zeros(1, dtype=torch.int64)
-    >>> one = Gaussians(means, quats, scales, torch.tensor([0.2]), sh, batch)
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     path = write_splat(folder + "/scene.splat", one)
-    ...     path.stat().st_size, round(read_splat(path).opacities.item(), 6)
-    (32, 0.2)
 """
 
 from __future__ import annotations

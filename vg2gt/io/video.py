@@ -2,15 +2,6 @@
 
 GIF goes through Pillow and always works. Everything else goes through PyAV, FFmpeg's libraries, which the extra
 ``video`` brings (``pip install vg2gt[video]``).
-
-Example:
-    >>> import numpy as np, tempfile
-    >>> from vg2gt.io import read_video, write_video
-    >>> frames = [np.full((16, 24, 3), shade, np.uint8) for shade in (0, 128, 255)]
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     path = write_video(folder + "/shades.gif", frames, fps=10)
-    ...     [(number, frame.shape) for number, frame in read_video(path, every=2)]
-    [(0, (16, 24, 3)), (2, (16, 24, 3))]
 """
 
 from __future__ import annotations

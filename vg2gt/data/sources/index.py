@@ -62,11 +62,7 @@ class SceneIndex:
     extra: Mapping[str, NDArray] = field(default_factory=dict)
 
     def row(self, frame: int) -> int:
-        """Position of a frame.
-
-        Raises:
-            DataError: if the scene has no such frame.
-        """
+        """Position of a frame."""
         place = int(np.searchsorted(self.frame_ids, frame))
         if place == len(self.frame_ids) or self.frame_ids[place] != frame:
             raise DataError(f"scene {self.name} in {self.folder} has no usable frame {frame}")
@@ -116,11 +112,7 @@ def first_size(files: Mapping[int, Path], scene: str) -> Size:
 
 
 def check_found(scene: str, folder: Path, found: Mapping[str, Sized]) -> None:
-    """Refuses a scene that lacks a kind of files altogether.
-
-    Raises:
-        DataError: naming the first of the kinds (the keys of ``found``) that has none.
-    """
+    """Refuses a scene that lacks a kind of files altogether."""
     for kind, files in found.items():
         if not files:
             raise DataError(f"scene {scene} has no {kind} in {folder}")
@@ -151,9 +143,6 @@ def make_index(
         size: of decoded frames; None: that of the colour files, or the median where they differ.
         depth_size: of the depth files; None: each has its colour image's.
         posed: what is known of each image by frame number, in place of ``intrinsics`` and ``color_size``.
-
-    Raises:
-        DataError: if no frame is left, a pose is not rigid, or intrinsics are not usable.
     """
     if posed is not None:
         intrinsics = {i: image.intrinsics for i, image in posed.items()}

@@ -1,4 +1,8 @@
-"""Small readers that all loaders share; every error names the file and the scene."""
+"""Small readers and checks that all loaders share.
+
+All of them raise ``DataError`` where a file is missing or damaged, or holds something else,
+naming the file and the scene.
+"""
 
 from __future__ import annotations
 
@@ -33,11 +37,7 @@ _LARGEST = float(np.finfo(np.float32).max)
 
 
 def read_numbers(path: Path, scene: str, skip_lines: int = 0) -> NDArray[np.float64]:
-    """Reads a table of numbers, at least one row; ``#`` begins a comment.
-
-    Raises:
-        DataError: if the file is missing, empty, or not a table of numbers.
-    """
+    """Reads a table of numbers, at least one row; ``#`` begins a comment."""
     rows = [line.split("#")[0].split() for line in _read_lines(path, scene)[skip_lines:]]
     try:
         table = np.array([[float(word) for word in row] for row in rows if row], dtype=np.float64)
@@ -49,11 +49,7 @@ def read_numbers(path: Path, scene: str, skip_lines: int = 0) -> NDArray[np.floa
 
 
 def read_matrix(path: Path, scene: str, shapes: Sequence[tuple[int, int]]) -> NDArray[np.float64]:
-    """Reads a matrix of one of the given shapes.
-
-    Raises:
-        DataError: if the file is missing, damaged, or holds a matrix of another shape.
-    """
+    """Reads a matrix of one of the given shapes."""
     matrix = read_numbers(path, scene)
     if matrix.shape not in tuple(shapes):
         expected = " or ".join(f"{rows}x{columns}" for rows, columns in shapes)
@@ -64,11 +60,7 @@ def read_matrix(path: Path, scene: str, shapes: Sequence[tuple[int, int]]) -> ND
 
 
 def read_poses(files: Mapping[int, Path], scene: str) -> dict[int, NDArray[np.float64]]:
-    """Reads 4x4 matrices, one per file, several files at a time: on a network's disk a file takes milliseconds to open.
-
-    Raises:
-        DataError: as ``read_matrix``.
-    """
+    """Reads 4x4 matrices, one per file, several files at a time: on a network's disk a file takes milliseconds to open."""
     numbers = list(files)
 
     def read(part: Sequence[int]) -> dict[int, NDArray[np.float64]]:
@@ -81,11 +73,7 @@ def read_poses(files: Mapping[int, Path], scene: str) -> dict[int, NDArray[np.fl
 
 
 def read_text_lines(path: Path, scene: str) -> list[str]:
-    """Reads the lines of a text file without blank and ``#`` lines.
-
-    Raises:
-        DataError: if the file is missing or not text.
-    """
+    """Reads the lines of a text file without blank and ``#`` lines."""
     lines = [line.strip() for line in _read_lines(path, scene)]
     return [line for line in lines if line and not line.startswith("#")]
 
@@ -106,9 +94,6 @@ def named_file(folder: Path, name: str, where: str) -> Path:
         folder: the scene's folder.
         name: relative to it, or absolute.
         where: the file that names it and the scene, for the message.
-
-    Raises:
-        DataError: if the name leads out of the folder.
     """
     root = os.path.abspath(folder)
     path = os.path.normpath(os.path.join(root, name))
@@ -159,9 +144,6 @@ def numbered(folder: Path, scene: str, pattern: str = "*", suffixes: Sequence[st
     """Files of a folder by the last number in their name (before the first dot), in the order of the numbers.
 
     Hidden files and files with other suffixes are passed over; so is a folder that does not exist.
-
-    Raises:
-        DataError: if a name has no number or two files have the same.
     """
     files: dict[int, Path] = {}
     for path in sorted(folder.glob(pattern)):
@@ -184,9 +166,6 @@ def rigid(poses: NDArray[np.float64], frames: Sequence[int], where: str) -> NDAr
         poses: ``[n, 4, 4]`` finite transforms.
         frames: their frame ids, for the message.
         where: the file or folder and the scene, for the message.
-
-    Raises:
-        DataError: naming the first pose that is not a rigid transform to within 2 %.
     """
     rotations = poses[:, :3, :3]
     error = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max((1, 2), initial=0)
@@ -221,9 +200,6 @@ def to_world(world_to_camera: NDArray[np.float64], where: str | None = None, fra
         world_to_camera: the pose.
         where: the file or folder and the scene: the pose is made exactly rigid first (``rigid``); None: it is rigid.
         frame: its frame id, for the message.
-
-    Raises:
-        DataError: if it is to be made rigid and is far from it.
     """
     if not (np.abs(world_to_camera) < 1e30).all():
         return np.full((4, 4), np.nan)
@@ -241,10 +217,6 @@ def check_intrinsics(intrinsics: NDArray[np.float64], where: str) -> NDArray[np.
     Args:
         intrinsics: the matrices.
         where: the file or folder and the scene, for the message.
-
-    Raises:
-        DataError: if a value is not finite (in float32, in which it is handed on), a focal length not positive, a
-            matrix not that of a pinhole camera without skew, or a principal point far outside any image.
     """
     focal, lower = intrinsics[..., [0, 1], [0, 1]], intrinsics[..., [1, 2, 2], [0, 0, 1]]
     if not ((np.abs(intrinsics) < _LARGEST).all() and (focal > 0).all()):

@@ -113,11 +113,7 @@ def confidence_of(depth: Path) -> Path | None:
 
 
 def read_color_file(path: Path, scene: str, size: Size | None) -> NDArray[np.uint8]:
-    """Decodes a colour image ``[H, W, 3]``, which may lie in an archive.
-
-    Raises:
-        DataError: if it is missing, damaged or of another size.
-    """
+    """Decodes a colour image ``[H, W, 3]``, which may lie in an archive."""
     with errors_name(scene):
         content = read_recorded(path) if is_archive(path.parent.parent) else None
     return read_color(path, scene, size, content)

@@ -1,4 +1,7 @@
-"""One image with a given camera: which way up its file is, its size on disk, and how it becomes a pinhole's image."""
+"""One image with a given camera: which way up its file is, its size on disk, and how it becomes a pinhole's image.
+
+A file or camera that does not fit is a ``DataError``.
+"""
 
 from __future__ import annotations
 
@@ -31,9 +34,6 @@ def size_on_disk(
         expected: ``(height, width)`` of its camera; the image may be a reduced one.
         where: what the camera is from, for the message.
         is_stored: called where both shapes fit; True if the camera belongs to the image as stored.
-
-    Raises:
-        DataError: if the file cannot be read, or neither has the camera's shape.
     """
     turned = orientation(path, scene)
     stored = image_size(path, scene)
@@ -62,9 +62,6 @@ def posed_image(
         upright: see :func:`size_on_disk`.
         mask: its mask file.
         where: what the camera is from, for the message.
-
-    Raises:
-        DataError: if the image cannot be undistorted.
     """
     kept = "" if mask is None else str(mask.resolve())
     try:

@@ -1,4 +1,7 @@
-"""Cameras of people's own recordings: lists of poses and files of intrinsics in the forms that are about."""
+"""Cameras of people's own recordings: lists of poses and files of intrinsics in the usual forms.
+
+A damaged file, or one that does not fit the images, is a ``DataError``.
+"""
 
 from __future__ import annotations
 
@@ -36,9 +39,6 @@ def read_pose_list(path: Path, scene: str, frames: Sequence[int]) -> dict[int, N
 
     A line has a 4x4 or 3x4 matrix, or a position and a quaternion (x y z w), with or without a time before; a ``.log``
     has five lines for each image, as Open3D, Redwood and Tanks and Temples write them.
-
-    Raises:
-        DataError: if the file is damaged or does not go with the images.
     """
     if path.suffix == ".log":
         found = [np.full((4, 4), np.nan) if pose is None else pose for pose in read_log(path, scene)]
@@ -60,9 +60,6 @@ def read_log(path: Path, scene: str) -> list[NDArray[np.float64] | None]:
 
     Returns:
         The matrices in the order of the file; None for images that were not registered (second number -1).
-
-    Raises:
-        DataError: if the file is missing, truncated or damaged.
     """
     rows = [line.split() for line in read_text_lines(path, scene)]
     if not rows or len(rows) % 5:
@@ -85,9 +82,6 @@ def read_camera(path: Path, scene: str) -> tuple[NDArray[np.float64], bool]:
     """Intrinsics ``[3, 3]`` and whether their y axis points up, as a negative fy says (ICL-NUIM).
 
     The file holds a 3x3 or 4x4 matrix, one line ``fx fy cx cy``, or is Open3D's ``camera_intrinsic.json``.
-
-    Raises:
-        DataError: if it holds something else.
     """
     if path.suffix == ".json":
         with errors_name(scene):

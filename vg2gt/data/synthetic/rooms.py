@@ -17,7 +17,7 @@ _FLOOR_PATTERNS = (Pattern.CHECKS, Pattern.BRICKS, Pattern.CLOUDS, Pattern.WOOD,
 _CEILING_PATTERNS = (Pattern.PLAIN, Pattern.CLOUDS, Pattern.BRICKS)
 _PICTURE_PATTERNS = tuple(pattern for pattern in INDOOR if pattern not in (Pattern.PLAIN, Pattern.BRICKS))
 _WALL_GAP = 0.55  # metres from a wall to the middle of the furniture along it
-_TRIES = 200
+TRIES = 200
 
 
 class SyntheticRoom(SyntheticScene):
@@ -56,29 +56,6 @@ class SyntheticRoom(SyntheticScene):
         pan = rng.uniform(0, 2 * np.pi) + rng.choice((-1, 1)) * rng.uniform(1.2, 2.4) * s + 0.1 * np.sin(7 * s)
         nod = -rng.uniform(0, 0.35) + 0.15 * np.sin(s * np.pi * rng.uniform(0.6, 2) + rng.uniform(0, 6))
         return level_poses(np.column_stack((floor, height)), pan, nod)
-
-
-class SyntheticWideRoom(SyntheticRoom):
-    """The room of the same seed, photographed across from free places all around: wide baselines."""
-
-    def _path(
-        self, rng: np.random.Generator, extent: NDArray[np.float64], occupied: NDArray[np.float64], count: int
-    ) -> NDArray[np.float64]:
-        """Camera-to-world poses ``[count, 4, 4]``, in the order of their angle around the room's middle."""
-        draws = rng.uniform(-0.5, 0.5, (max(_TRIES, 20 * count), 2)) * (extent[:2] - 0.7)
-        gaps = np.linalg.norm(draws[:, None] - occupied[None, :, :2], axis=-1) - occupied[None, :, 2]
-        free = np.argsort(-np.minimum(gaps.min(1, initial=np.inf), 0.2), kind="stable")
-        places = draws[free[: 3 * count]]
-        chosen = [0]  # every next one as far as possible from all before
-        while len(chosen) < count:
-            apart = np.linalg.norm(places[:, None] - places[None, chosen], axis=-1).min(1)
-            chosen.append(int(np.argmax(apart)))
-        places = places[chosen]
-        places = places[np.argsort(np.arctan2(places[:, 1], places[:, 0]))]
-        ahead = rng.normal(0, 0.1, (count, 2)) * extent[:2] - places
-        height = np.minimum(rng.uniform(0.9, 1.8, count), extent[2] - 0.4)
-        pan = np.arctan2(ahead[:, 1], ahead[:, 0]) + rng.normal(0, 0.25, count)
-        return level_poses(np.column_stack((places, height)), pan, rng.uniform(-0.4, 0.05, count))
 
 
 def _shell_materials(builder: Builder) -> NDArray[np.int64]:
@@ -156,7 +133,7 @@ def _free_arc(
 ) -> NDArray[np.float64]:
     """Points ``[len(s), 2]`` of a circular arc, the freest of many draws: off the walls and off the furniture."""
     best, best_clearance = np.zeros((len(s), 2)), -np.inf
-    for _ in range(_TRIES):
+    for _ in range(TRIES):
         middle = rng.uniform(-0.25, 0.25, 2) * extent[:2]
         angle = rng.uniform(0, 2 * np.pi) + rng.choice((-1, 1)) * rng.uniform(1.0, 2.2) * s
         arc = middle + rng.uniform(0.3, 0.9) * np.stack((np.cos(angle), np.sin(angle)), 1)

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from vg2gt.data.base import Frames, SceneSource
-from vg2gt.data.synthetic.rooms import SyntheticRoom, SyntheticWideRoom
+from vg2gt.data.synthetic.rooms import SyntheticRoom
 from vg2gt.data.synthetic.synthetic_scene import LOBES, SyntheticScene
 from vg2gt.data.transforms import from_bytes
 from vg2gt.io.arrays import read_npz
@@ -27,7 +27,7 @@ class SyntheticScenes(SceneSource):
     """Furnished rooms with exact depth and poses.
 
     Scene k of a source has the seed ``first_seed + k`` and the name ``<variant>-<seed>``, so sources whose seed ranges
-    do not overlap share no scene. ``examples/worlds`` has more variants: streets, objects, landmarks.
+    do not overlap share no scene.
 
     Args:
         num_scenes: scenes in this source.
@@ -35,8 +35,7 @@ class SyntheticScenes(SceneSource):
         num_frames: frames on a scene's camera path.
         size: image ``(height, width)``; best the size that is trained on. Upright images are upright photographs: the
             field of view is along the longer side.
-        variant: ``room`` or ``wide`` (rooms from all around), or a list: seeds take turns, ``[room, room, wide]`` is
-            one third wide.
+        variant: ``room``; ``examples/worlds`` has more, also as a list: of ``[room, room, outdoor]`` seeds take turns.
         highlights: whether surfaces shine, with colours that depend on the view; geometry and textures stay the same.
             ``lobes``: strongly.
         cache_dir: folder for the rendered frames (``~`` is the home folder); None keeps nothing on disk.
@@ -45,7 +44,7 @@ class SyntheticScenes(SceneSource):
         ValueError: if a number is out of range or a variant unknown.
     """
 
-    variants: ClassVar[dict[str, Any]] = {"room": SyntheticRoom, "wide": SyntheticWideRoom}
+    variants: ClassVar[dict[str, Any]] = {"room": SyntheticRoom}
     """Classes of scenes, like :class:`SyntheticRoom`, by their name."""
 
     def __init__(
