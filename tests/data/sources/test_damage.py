@@ -176,47 +176,27 @@ CAMERA, LOG, VIEW = "00000001_cam.txt", "Barn_COLMAP_SfM.log", "Depth_0_0_0048_0
 NAMED: dict[str, list[tuple[str, Callable[[Path], Any], str]]] = {
     "dtu": [
         (CAMERA, swap("intrinsic", "intrinsics"), f"{CAMERA} of scene scan65.*not a camera of MVSNet"),
-        (CAMERA, swap("extrinsic\n", "extrinsic\n2.0 "), "not a camera of MVSNet"),
         (CAMERA, swap("0.0 0.0 0.0 1.0", "0.0 0.0 0.5 1.0"), f"{CAMERA}.*not a rigid transform"),
-        (CAMERA, put(""), "not a camera of MVSNet"),
     ],
     "tanks_and_temples": [
         ("Barn_trans.txt", put("1 0 0 0\n0 1 0 0\n0 0 -1 0\n0 0 0 1\n"), SIMILARITY),
-        ("Barn_trans.txt", put("1 0 0 0\n0 2 0 0\n0 0 1 0\n0 0 0 1\n"), SIMILARITY),
-        ("Barn_trans.txt", put("nan 0 0 0\n0 2 0 0\n0 0 1 0\n0 0 0 1\n"), SIMILARITY),
         (LOG, put("0 0 0\n1 0 0 0\n"), f"{LOG} of scene Barn.*has 2 lines; expected five for each image"),
         (LOG, put("0 0\n" + "1 0 0 0\n" * 4), "image 0: expected 3 numbers"),
-        (LOG, put("0 x 0\n" + "1 0 0 0\n" * 4), "image 0: invalid literal"),
     ],
     "tum": [
         ("groundtruth.txt", gone, "scene rgbd_dataset_freiburg1_desk in .* has no groundtruth.txt"),
-        ("depth.txt", gone, r"cannot read .*depth\.txt of scene"),
-        ("depth.txt", put("# nothing\n"), r"depth\.txt of scene .* lists no file"),
-        ("rgb.txt", put("1305031102.0\n"), f"{TIMES}, not '1305031102.0'"),
         ("rgb.txt", put("nan rgb/a.png\n"), TIMES),
         ("rgb.txt", put("1.5 rgb/a.png\n1.50 rgb/b.png\n"), r"lists 1\.50 twice"),
-        ("groundtruth.txt", put("0 " * 13), "lines of 'timestamp tx ty tz qx qy qz qw', not 13 numbers"),
         ("groundtruth.txt", put(POSE.replace(" 1\n", " 0\n")), "1 frames whose pose is not finite"),
     ],
     "virtual_kitti": [
         ("extrinsic.txt", lines(lambda rows: [*rows, rows[1]]), "has frame 0 of camera 0 twice"),
-        ("intrinsic.txt", lines(lambda rows: [row[: row.rindex(" ")] for row in rows]), "not of 5"),
-        ("extrinsic.txt", lines(lambda rows: [*rows, rows[1].replace("0 0 ", "0.5 0 ", 1)]), "no whole numbers"),
-        (
-            "extrinsic.txt",
-            lines(lambda rows: [rows[0], "0 0 " + "2 " * 16, *rows[2:]]),
-            "pose of frame 0 .*not a rigid transform",
-        ),
         ("intrinsic.txt", lines(lambda rows: [r for r in rows if r.split()[1] != "0"]), "6 frames without a pose"),
     ],
     "scannetpp_iphone": [
         ("*.npz", arrays(trajectories=np.eye(4)[None]), "trajectories in .* must hold 7x4x4 numbers"),
-        ("*.npz", arrays(intrinsics=None), "has no array"),
-        ("*.npz", arrays(images=np.arange(7)), "must be a list of file names"),
-        ("*.npz", arrays(images=np.array(["a"] * 7, object)), "cannot read .*metadata.npz of scene"),
         ("*.npz", arrays(images=np.array([f"DSC0{i}.JPG" for i in range(7)])), r"names an image 'DSC00.JPG'"),
         ("*.npz", arrays(images=np.array(["frame_000010.jpg"] * 7)), "names frame 10 twice"),
-        ("*.npz", arrays(images=np.array([f"frame_{i}.jpg" for i in range(1, 8)])), "no images of iPhone frames"),
     ],
     "infinigen": [
         (VIEW, renamed("Depth_x.npy"), "is not named Depth_RIG"),
@@ -241,15 +221,11 @@ NAMED: dict[str, list[tuple[str, Callable[[Path], Any], str]]] = {
     ],
     "scannet_sens": [
         ("*.sens", at(0, b"\5"), r"cannot read .*\.sens of scene scene0707_00: .*version 5 of the format, expected 4"),
-        ("*.sens", at(4, HUGE), "sensor's name of 2305843009213693952 bytes"),
         ("*.sens", at(SENS - 24, b"\2"), "colour of type 2 and depth of type 2"),
         ("*.sens", at(SENS - 20, b"\xff\xff\xff\xff"), "images of 4294967295x30"),
-        ("*.sens", at(SENS - 4, bytes(4)), "0.0 depth units per metre"),
         ("*.sens", at(SENS, HUGE), "it ends .*within"),
         ("*.sens", at(SENS, bytes(8)), "it holds no frame"),
         ("*.sens", at(SENS + 8 + 64 + 16, HUGE), "it ends within frame 0 of 6"),
-        ("*.sens", at(SENS + 8 + 64 + 16, b"\xff" * 8), "it ends within frame 0 of 6"),
-        ("*.sens", cut(0.75), "it ends .*within"),
         ("*.sens", lambda path: path.write_bytes(path.read_bytes()[:100]), "it ends after 100 bytes, within a header"),
     ],
     "rgbd": [

@@ -1,24 +1,13 @@
 """Tanks and Temples: a real trajectory file, the way to the scan, unregistered images, intrinsics."""
 
-import numpy as np
 import pytest
 
-from examples.data_sets.tanks_and_temples import TanksAndTemples, moved
+from examples.data_sets.tanks_and_temples import TanksAndTemples
 from vg2gt.data import DataError
 from vg2gt.io import read_colmap, write_colmap
 
-from .layout_tanks_and_temples import TO_SCAN, read, write
+from .layout_tanks_and_temples import read, write
 from .layouts import room
-
-
-def test_a_similarity_moves_the_camera_and_keeps_its_rotation():
-    pose = np.eye(4)
-    pose[:3, 3] = [1, 2, 3]
-    result = moved(TO_SCAN, pose)
-    np.testing.assert_allclose(result[:3, :3] @ result[:3, :3].T, np.eye(3), atol=1e-12)
-    np.testing.assert_allclose(result[:3, 3], TO_SCAN[:3] @ [1, 2, 3, 1])
-    # A point 2 units ahead of the camera is 5 m ahead of the moved one.
-    np.testing.assert_allclose(np.linalg.inv(result) @ (TO_SCAN @ [1, 2, 5, 1]), [0, 0, 5, 1], atol=1e-12)
 
 
 def test_unregistered_images_are_counted(tmp_path):

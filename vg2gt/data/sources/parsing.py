@@ -60,7 +60,7 @@ def read_matrix(path: Path, scene: str, shapes: Sequence[tuple[int, int]]) -> ND
 
 
 def read_poses(files: Mapping[int, Path], scene: str) -> dict[int, NDArray[np.float64]]:
-    """Reads 4x4 matrices, one per file, several files at a time: on a network's disk a file takes milliseconds to open."""
+    """Reads 4x4 matrices, one per file, several at a time: on a network's disk opening one takes milliseconds."""
     numbers = list(files)
 
     def read(part: Sequence[int]) -> dict[int, NDArray[np.float64]]:
