@@ -8,7 +8,7 @@ import torch
 from PIL import Image
 
 from vg2gt.io.errors import DataError
-from vg2gt.io.image_files import read_color
+from vg2gt.io.image_files import image_size, read_color
 from vg2gt.io.images import colorize_depth, grid, write_png
 
 
@@ -29,6 +29,28 @@ def test_grid_places_panels(tmp_path: Path) -> None:
     assert (picture[0, 6, 0], picture[0, 4, 0]) == (0.4, 1)
     written = np.asarray(Image.open(write_png(tmp_path / "grid.png", picture)))
     assert (written.shape, written[0, 8, 0]) == ((10, 14, 3), 51)
+
+
+# Rows of an upright image as they are stored, by EXIF orientation (standard table).
+STORED = {
+    2: np.fliplr,
+    3: lambda upright: np.rot90(upright, 2),
+    4: np.flipud,
+    5: lambda upright: np.swapaxes(upright, 0, 1),
+    6: lambda upright: np.rot90(upright, 1),
+    7: lambda upright: np.swapaxes(np.rot90(upright, 2), 0, 1),
+    8: lambda upright: np.rot90(upright, -1),
+}
+
+
+@pytest.mark.parametrize("orientation", STORED)
+def test_photographs_are_turned_upright(tmp_path: Path, orientation: int) -> None:
+    upright = np.random.default_rng(0).integers(0, 256, (20, 30, 3), np.uint8)
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    Image.fromarray(np.ascontiguousarray(STORED[orientation](upright))).save(tmp_path / "a.png", exif=exif)
+    assert image_size(tmp_path / "a.png", "room", upright=True) == (20, 30)
+    assert np.array_equal(read_color(tmp_path / "a.png", "room", (20, 30), upright=True), upright)
 
 
 RAMP = np.linspace(0, 65535, 24 * 32).reshape(24, 32)

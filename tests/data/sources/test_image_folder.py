@@ -1,55 +1,22 @@
-"""Folders of photographs: orientation, mixed sizes, order, and that nothing trains on them."""
+"""Folders of photographs: mixed sizes, order, and that nothing trains on them."""
 
-from pathlib import Path
 from shutil import copytree
 
 import numpy as np
 import pytest
 import torch
 from hydra.utils import instantiate
-from PIL import Image
 
 from examples.data_sets.image_folder import ImageFolder
 from tests.commands import ROOT
 from vg2gt.config import compose
 from vg2gt.data import DataError
 
-# Rows of an upright image with its top in red and its left in dark, for every EXIF orientation (standard table).
-_STORED = {
-    1: lambda upright: upright,
-    2: np.fliplr,
-    3: lambda upright: np.rot90(upright, 2),
-    4: np.flipud,
-    5: lambda upright: np.swapaxes(upright, 0, 1),
-    6: lambda upright: np.rot90(upright, 1),
-    7: lambda upright: np.swapaxes(np.rot90(upright, 2), 0, 1),
-    8: lambda upright: np.rot90(upright, -1),
-}
-
-
-def _save(path: Path, pixels: np.ndarray, orientation: int | None = None) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    image = Image.fromarray(np.ascontiguousarray(pixels))
-    exif = Image.Exif()
-    if orientation is not None:
-        exif[0x0112] = orientation
-    image.save(path, exif=exif)
+from .layouts import save
 
 
 def _photo(seed: int = 0, size: tuple[int, int] = (20, 30)) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 256, (*size, 3), np.uint8)
-
-
-@pytest.mark.parametrize("orientation", _STORED)
-def test_photos_are_turned_upright(tmp_path, orientation):
-    upright = _photo()
-    _save(tmp_path / "a.png", upright)
-    _save(tmp_path / "b.png", _STORED[orientation](upright), orientation)
-    source = ImageFolder(str(tmp_path))
-    (scene,) = source.scenes
-    assert source.scene_index(scene).color_size == (20, 30)
-    frames = source.load(scene, [0, 1])
-    assert torch.equal(frames.images[0], frames.images[1])
 
 
 def test_order_sizes_and_placeholders(tmp_path):
@@ -57,7 +24,7 @@ def test_order_sizes_and_placeholders(tmp_path):
         if name.endswith("txt"):
             (tmp_path / "trip" / name).write_text("no image")
         else:
-            _save(tmp_path / "trip" / name, _photo(i, (20, 30) if i else (40, 50)))
+            save(tmp_path / "trip" / name, _photo(i, (20, 30) if i else (40, 50)))
     source = ImageFolder(str(tmp_path))
     assert source.scenes == ("trip",)
     index = source.scene_index("trip")
@@ -75,7 +42,7 @@ def test_order_sizes_and_placeholders(tmp_path):
 
 def test_training_is_refused(tmp_path):
     for i in range(12):
-        _save(tmp_path / "train" / f"{i}.png", _photo(i))
+        save(tmp_path / "train" / f"{i}.png", _photo(i))
     copytree(tmp_path / "train", tmp_path / "val")
     plugin = f"hydra.searchpath=[{ROOT / 'examples/data_sets/configs'}]"
     overrides = [

@@ -1,6 +1,7 @@
 """Captures with a transforms.json: a real one by geometry, distortion, absent files, cameras that are refused."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -71,9 +72,9 @@ def test_frames_are_ordered_as_people_count(tmp_path):
     assert [path.name for path in index.color] == ["1.png", "2.png", "10.png", "11.png"]
 
 
-@pytest.mark.parametrize("folder", ["images", "images_2"])
-def test_images_made_smaller_since_have_smaller_intrinsics(tmp_path, folder):
-    """Item 19."""
+@pytest.mark.parametrize(("folder", "named"), [("images", True), ("images_2", True), ("images_4", False)])
+def test_images_made_smaller_since_have_smaller_intrinsics(tmp_path, folder, named):
+    """Item 19; DL3DV comes with reduced images alone, and names the full ones."""
     write(tmp_path, room(2))
     full = Nerfstudio(str(tmp_path)).scene_index("desk").intrinsics[0]
     (tmp_path / "desk" / folder).mkdir(exist_ok=True)
@@ -81,7 +82,10 @@ def test_images_made_smaller_since_have_smaller_intrinsics(tmp_path, folder):
         with Image.open(path) as image:
             image.reduce(2).save(tmp_path / "desk" / folder / path.name)
     path = tmp_path / "desk" / "transforms.json"
-    path.write_text(path.read_text().replace("images/", f"{folder}/"))
+    if named:
+        path.write_text(path.read_text().replace("images/", f"{folder}/"))
+    else:
+        shutil.rmtree(tmp_path / "desk" / "images")
     index = Nerfstudio(str(tmp_path)).scene_index("desk")
     assert index.size == (15, 20)
     expected = [full[0, 0] / 2, 0, (full[0, 2] + 0.5) / 2 - 0.5]

@@ -1,4 +1,4 @@
-"""Chunks of pixelSplat (RealEstate10K, ACID), its evaluation indices, and DL3DV's transforms.json; as documented."""
+"""Chunks of pixelSplat (RealEstate10K, ACID) and its evaluation indices; as documented."""
 
 import io
 import json
@@ -6,17 +6,14 @@ import pickle
 import shutil
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from PIL import Image
 
 from examples.data_sets.re10k import PixelSplatChunks
-from tests.data.sources.layouts import camera_to_world, pixels, room, save
+from tests.data.sources.layouts import pixels, room
 from vg2gt.data import DataError, Frames
-from vg2gt.data.sources import Nerfstudio
 from vg2gt.data.views.drawn import ViewSelection
-from vg2gt.geometry.cameras import invert_rigid
 
 
 def write_chunks(root: Path, frames: Frames, split: str = "test") -> None:
@@ -95,29 +92,3 @@ def test_their_evaluation_index_chooses_the_views(tmp_path: Path) -> None:
     source = PixelSplatChunks(str(tmp_path), "test")
     (views,) = ViewSelection(str(index)).choose(source, ["0a1b"], 2)
     assert (views.context, views.target) == ((0, 5), (1, 2, 4))
-
-
-def test_dl3dv_is_read_from_its_reduced_images(tmp_path: Path) -> None:
-    """``HASH/{transforms.json,images_4/}``: names and intrinsics are of the full images, which few people download."""
-    frames = room()
-    height, width = frames.depth.shape[-2:]
-    scene = tmp_path / "1K" / ("0" * 64)
-    fx, fy = (4 * float(frames.intrinsics[0, i, i]) for i in (0, 1))
-    cx, cy = (4 * (float(frames.intrinsics[0, i, 2]) + 0.5) for i in (0, 1))
-    content = {"w": 4 * width, "h": 4 * height, "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "camera_model": "OPENCV"}
-    content["frames"] = []
-    for number, (image, pose) in enumerate(zip(pixels(frames), camera_to_world(frames), strict=True)):
-        name = f"frame_{number + 1:05d}.png"
-        save(scene / "images_4" / name, image)
-        opengl = pose @ np.diag([1.0, -1, -1, 1])
-        content["frames"].append({"file_path": f"images/{name}", "transform_matrix": opengl.tolist()})
-    (scene / "transforms.json").write_text(json.dumps(content))
-    source = Nerfstudio(str(tmp_path / "1K"), holdout=None)
-    (name,) = source.scenes
-    read = source.load(name, source.frames(name))
-    torch.testing.assert_close(read.intrinsics, frames.intrinsics, rtol=0, atol=1e-3)
-    relative = read.world_to_camera @ invert_rigid(read.world_to_camera[:1])
-    torch.testing.assert_close(
-        relative, frames.world_to_camera @ invert_rigid(frames.world_to_camera[:1]), rtol=0, atol=1e-4
-    )
-    assert torch.equal(read.images, frames.images) or (read.images - frames.images).abs().max() < 1 / 250

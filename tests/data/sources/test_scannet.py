@@ -77,12 +77,3 @@ def test_depth_that_expands_without_end_is_refused(tmp_path, frames):
     assert depth_length != len(packed)
     with pytest.raises(DataError, match=rf"frame 0 in .*{SCENE}\.sens of scene {SCENE} is not of 40x30 pixels"):
         ScanNetSens(str(tmp_path)).load(SCENE, [0])
-
-
-def test_a_stream_that_shrinks_after_it_was_indexed_is_an_error(tmp_path, frames):
-    path = write_sens(tmp_path, frames)
-    source = ScanNetSens(str(tmp_path))
-    source.frames(SCENE)
-    path.write_bytes(path.read_bytes()[:2000])
-    with pytest.raises(DataError, match=r"scene0707_00\.sens of scene scene0707_00 has become shorter"):
-        source.load(SCENE, [3])
