@@ -12,7 +12,6 @@ from tests.io.test_cameras_json import mixed
 from tests.io.test_colmap import small_model
 from tests.io.test_nerfstudio import random_transforms
 from tests.io.test_ply import header
-from tests.io.test_splat import displayable
 from vg2gt import io
 from vg2gt.io.colmap import FILES
 
@@ -30,7 +29,7 @@ CASES: dict[str, tuple[Callable[[Path], object], Callable[[Path], object]]] = {
         io.read_point_ply,
     ),
     "ascii.ply": (ascii_points, io.read_point_ply),
-    "scene.splat": (lambda path: io.write_splat(path, displayable(12)), io.read_splat),
+    "scene.splat": (lambda path: io.write_splat(path, scene(12)), io.read_splat),
     "scene.spz": (lambda path: io.write_spz(path, scene(12, 1)), io.read_spz),
     "scene.glb": (lambda path: io.write_gaussian_glb(path, scene(12, 1)), io.read_gaussian_glb),
     "scene.compressed.ply": (lambda path: io.write_compressed_ply(path, scene(12, 1)), io.read_gaussian_ply),

@@ -1,4 +1,4 @@
-"""The compressed formats of Gaussians and GLB: layout, stated losses, what cannot be written or read."""
+"""Formats of Gaussians other than PLY: layout, stated losses, what cannot be written or read."""
 
 import gzip
 import json
@@ -21,6 +21,7 @@ LOSSES = {
     "spz": (2e-6, 1 / 31, 1 / 509, 1 / 134, 1 / 350, 1 / 255),
     "compressed.ply": (2e-3, 8e-3, 1 / 509, 1 / 100, 1 / 350, 1 / 63),
     "glb": (0, 1e-6, 0, 0, 1e-6, 0),
+    "splat": (0, 0, 1 / 509, 1 / 509, 1 / 120, 0),  # of degree 0, colours in [0, 1]
 }
 
 
@@ -37,10 +38,13 @@ def ordered(gaussians: Gaussians, like: Gaussians) -> Gaussians:
     return gaussians.select(rows)
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-@pytest.mark.parametrize("suffix", LOSSES)
+@pytest.mark.parametrize(
+    ("suffix", "degree"), [(suffix, degree) for suffix in LOSSES for degree in range(1 if suffix == "splat" else 4)]
+)
 def test_round_trip_within_the_stated_losses(tmp_path: Path, suffix: str, degree: int) -> None:
     before = mild(700, degree)
+    if suffix == "splat":
+        before = replace(before, sh=(before.sh / 2) / DC)
     path = write_gaussians(tmp_path / f"scene.{suffix}", before)
     after = ordered(read_gaussians(path), before)
     position, scales, opacity, color, rotation, rest = LOSSES[suffix]
@@ -92,6 +96,31 @@ def test_spz_by_its_published_layout(tmp_path: Path) -> None:
     assert [word >> shift & 511 for shift in (20, 10, 0)] in ([0, 0, 511], [0, 511, 0])
     assert [word >> shift & 512 for shift in (20, 10, 0)].count(512) == 0
     assert list(data[36:]) == [192, 128, 128, 128, 160, 128, 128, 128, 0]
+
+
+def test_splat_by_its_layout(tmp_path: Path) -> None:
+    one = replace(
+        scene(1),
+        quats=torch.tensor([[0.0, 0, -2, 0]]),
+        opacities=torch.tensor([1.0]),
+        sh=torch.tensor([[[(1 - 0.5) / DC, (0.2 - 0.5) / DC, -9.0]]]),
+    )
+    content = write_gaussians(tmp_path / "scene.splat", one).read_bytes()
+    assert struct.unpack("<6f", content[:24]) == (*one.means[0].tolist(), *one.scales[0].tolist())
+    assert list(content[24:]) == [255, 51, 0, 255, 128, 128, 0, 128]
+
+
+def test_damage_of_splat_is_named(tmp_path: Path) -> None:
+    path = write_gaussians(tmp_path / "scene.splat", scene(3))
+    content = path.read_bytes()
+    path.write_bytes(content[:-1])
+    with pytest.raises(FormatError, match=r"scene\.splat: 95 bytes are not a multiple of 32"):
+        read_gaussians(path)
+    path.write_bytes(content[:44] + struct.pack("<f", -1.0) + content[48:])
+    with pytest.raises(FormatError, match=r"byte 32: scales .* are negative"):
+        read_gaussians(path)
+    with pytest.raises(ValueError, match="quats must not be zero"):
+        write_gaussians(path, replace(scene(3), quats=torch.zeros(3, 4)))
 
 
 def test_colours_turn_with_the_axes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
