@@ -96,10 +96,12 @@ class NamedCamera:
 
 
 def invert_pose(pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Inverse of a rigid transform ``[4, 4]``, whose rotation stays one to the last digit."""
-    inverse = np.eye(4)
-    inverse[:3, :3] = pose[:3, :3].T
-    inverse[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
+    """Inverses of rigid transforms ``[..., 4, 4]``, whose rotations stay rotations to the last digit."""
+    inverse = np.zeros_like(pose)
+    rotation = pose[..., :3, :3].swapaxes(-1, -2)
+    inverse[..., :3, :3] = rotation
+    inverse[..., :3, 3:] = -rotation @ pose[..., :3, 3:]
+    inverse[..., 3, 3] = 1
     return inverse
 
 

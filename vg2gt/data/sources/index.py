@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vg2gt.data.base import DataError
-from vg2gt.data.sources.parsing import check_intrinsics, inverse, rigid
+from vg2gt.data.sources.parsing import check_intrinsics, rigid
 from vg2gt.io.arrays import load_npz
+from vg2gt.io.cameras_json import invert_pose
 from vg2gt.io.image_files import Size, image_size, typical_size
 
 log = logging.getLogger(__name__)
@@ -198,7 +199,7 @@ def make_index(
         frame_ids=tuple(kept),
         color=tuple(color[number] for number in kept),
         depth=tuple(depth[number] for number in kept) if depth is not None else (),
-        world_to_camera=inverse(poses),
+        world_to_camera=invert_pose(poses),
         intrinsics=check_intrinsics(matrices, where),
         size=size,
         color_size=color_size,

@@ -12,7 +12,8 @@ from typing_extensions import Unpack
 from vg2gt.data.base import DataError
 from vg2gt.data.sources.files import FileSource, HoldoutOptions
 from vg2gt.data.sources.index import SceneIndex, make_index
-from vg2gt.data.sources.parsing import existing_depth_root, inverse, numbered, read_numbers, read_text_lines, rigid
+from vg2gt.data.sources.parsing import existing_depth_root, numbered, read_numbers, read_text_lines, rigid
+from vg2gt.io.cameras_json import invert_pose
 
 EARTH_RADIUS = 6378137.0
 """Metres, at the equator, as KITTI's own tools have it."""
@@ -84,7 +85,7 @@ class KITTI(FileSource):
         intrinsics, camera_from_imu = read_calibration(folder.parent, scene, self.camera)
         packets = numbered(folder / "oxts" / "data", scene, suffixes=(".txt",))
         imu = imu_to_world({number: _read_packet(path, scene) for number, path in packets.items()})
-        poses = {i: pose @ inverse(camera_from_imu) for i, pose in imu.items() if i in numbers}
+        poses = {i: pose @ invert_pose(camera_from_imu) for i, pose in imu.items() if i in numbers}
         return make_index(scene, folder, color, depth, poses, intrinsics)
 
     @property

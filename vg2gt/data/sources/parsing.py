@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vg2gt.data.base import DataError
+from vg2gt.io.cameras_json import invert_pose
 from vg2gt.io.errors import FormatError
 from vg2gt.io.files import regular
 
@@ -183,16 +184,6 @@ def rigid(poses: NDArray[np.float64], frames: Sequence[int], where: str) -> NDAr
     return exact
 
 
-def inverse(poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Inverts rigid 4x4 transforms ``[..., 4, 4]``."""
-    out = np.zeros_like(poses)
-    rotation = poses[..., :3, :3].swapaxes(-1, -2)
-    out[..., :3, :3] = rotation
-    out[..., :3, 3:] = -rotation @ poses[..., :3, 3:]
-    out[..., 3, 3] = 1
-    return out
-
-
 def to_world(world_to_camera: NDArray[np.float64], where: str | None = None, frame: int = 0) -> NDArray[np.float64]:
     """Inverts a pose ``[4, 4]``; one that is not finite stays so, and drops its frame.
 
@@ -203,7 +194,7 @@ def to_world(world_to_camera: NDArray[np.float64], where: str | None = None, fra
     """
     if not (np.abs(world_to_camera) < 1e30).all():
         return np.full((4, 4), np.nan)
-    return inverse(rigid(world_to_camera[None], [frame], where)[0] if where else world_to_camera)
+    return invert_pose(rigid(world_to_camera[None], [frame], where)[0] if where else world_to_camera)
 
 
 def pinhole(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.float64]:

@@ -244,6 +244,7 @@ def _nothing_usable(
     )
 
 
+@dataclass(eq=False)
 class StepSampler(Sampler[tuple[SceneSample, ...]]):
     """Yields, step after step, the views of one device's batch, and how they are framed.
 
@@ -259,25 +260,17 @@ class StepSampler(Sampler[tuple[SceneSample, ...]]):
         framing: draws sizes and crops; None: nothing is drawn.
     """
 
-    def __init__(
-        self,
-        source: SceneSource,
-        scenes: Sequence[str],
-        views: ViewSampler,
-        steps: int,
-        start_step: Callable[[], int] = lambda: 0,
-        rank: int = 0,
-        world_size: int = 1,
-        framing: FramingSampler | None = None,
-    ) -> None:
-        self.source = source
-        self.pool = scene_pool(source, scenes, views.seed)
-        self.views = views
-        self.framing = framing
-        self.steps = steps
-        self.start_step = start_step
-        self.rank = rank
-        self.world_size = world_size
+    source: SceneSource
+    scenes: Sequence[str]
+    views: ViewSampler
+    steps: int
+    start_step: Callable[[], int] = lambda: 0
+    rank: int = 0
+    world_size: int = 1
+    framing: FramingSampler | None = None
+
+    def __post_init__(self) -> None:
+        self.pool = scene_pool(self.source, self.scenes, self.views.seed)
 
     def __len__(self) -> int:
         return self.steps
