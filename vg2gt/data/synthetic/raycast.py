@@ -131,20 +131,9 @@ def leave_walls(walls, ox, oy, oz, dx, dy, dz):
 
 @part
 def nearest_hit(visible, near, count, parts, walls, ox, oy, oz, dx, dy, dz):
-    """Nearest hit of a ray from inside the room: distance, and the part or ``-1 - wall``.
+    """Nearest hit of a ray from inside the room ``walls [2, 3]``: distance, and the part or ``-1 - wall``.
 
-    Args:
-        visible: the parts to try.
-        near: a distance from the ray's origin that each is at least away, the least one first.
-        count: how many of ``visible`` count.
-        parts: ``[n, PART_COLUMNS]``.
-        walls: ``[2, 3]`` corners of the room.
-        ox: the ray's origin, x.
-        oy: y.
-        oz: z.
-        dx: its unit direction, x.
-        dy: y.
-        dz: z.
+    The first ``count`` of the ``visible`` parts are tried; ``near`` holds the least distance of each, in rising order.
     """
     best, wall = leave_walls(walls, ox, oy, oz, dx, dy, dz)
     hit = -1 - wall
@@ -183,17 +172,10 @@ def _enters_cone(x, y, z, radius, axis, spread, reach):
 
 @part
 def parts_in_cone(apex, axis, spread, reach, parts, groups, visible, near):
-    """Finds the parts whose sphere meets a cone, those of the nearest group first, a group's own in their order.
+    """Writes to ``visible [n]`` the parts whose sphere meets a cone, the nearest group's first; returns how many.
 
-    Args:
-        apex: ``[3]`` tip of the cone.
-        axis: ``[3]`` unit direction.
-        spread: half opening angle (rad).
-        reach: length of the cone, less than ``FAR``.
-        parts: ``[n, PART_COLUMNS]``.
-        groups: ``[g, GROUP_COLUMNS]``; those that miss the cone are passed over as a whole.
-        visible: ``[n]`` receives the parts.
-        near: ``[n]`` receives the least distance of each one's group.
+    ``near [n]`` receives the least distance of each one's group. The cone has a tip, a unit axis, half an opening angle
+    (rad) and a length less than ``FAR``.
     """
     count = 0
     for g in range(groups.shape[0]):

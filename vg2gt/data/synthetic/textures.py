@@ -135,15 +135,9 @@ def _grain(x, y, frequency, footprint, seed):
 
 @part
 def pattern_value(kind, x, y, frequency, footprint, seed):
-    """Mixing weight in [0, 1] between a material's two colours.
+    """Mixing weight in [0, 1] between a material's two colours: a ``Pattern`` at a place of the surface.
 
-    Args:
-        kind: one of ``Pattern``.
-        x: first surface coordinate in metres.
-        y: second surface coordinate in metres.
-        frequency: pattern periods a metre.
-        footprint: width of the pixel on the surface in metres.
-        seed: chooses the random cells and noise.
+    Coordinates and the pixel's footprint are in metres, the frequency in periods a metre.
     """
     width = footprint * frequency
     u = x * frequency
