@@ -75,8 +75,8 @@ class COLMAP(FileSource):
         return model_folder_of(folder) is not None
 
     def watched(self, scene: str, folder: Path) -> Sequence[Path | None]:
-        """Also the model's folder and the masks."""
-        return folder, model_folder_of(folder), folder / MASKS
+        """Also the model's folder."""
+        return folder, model_folder_of(folder)
 
     def index(self, scene: str, folder: Path) -> SceneIndex:
         """Reads the model and the sizes of its images."""

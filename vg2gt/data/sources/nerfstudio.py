@@ -78,10 +78,6 @@ class Nerfstudio(FileSource):
         """Whether it holds one of the files."""
         return bool(transforms_files(folder))
 
-    def watched(self, scene: str, folder: Path) -> Sequence[Path | None]:
-        """Also the masks."""
-        return folder, folder / MASKS
-
     def held_out(self, scene: str) -> Sequence[int]:
         """Blender's test frames where there are any, else by ``holdout``."""
         first_test = self._records(scene, self._folders[scene])[1]
