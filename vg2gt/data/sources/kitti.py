@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 from typing_extensions import Unpack
 
 from vg2gt.data.base import DataError
@@ -120,7 +121,7 @@ def imu_to_world(packets: Mapping[int, NDArray[np.float64]]) -> dict[int, NDArra
         north = scale * EARTH_RADIUS * np.log(np.tan(np.deg2rad(90 + latitude) / 2))
         position = np.stack((east, north, altitude), -1)
         poses = np.tile(np.eye(4), (len(values), 1, 1))
-        poses[:, :3, :3] = _about("z", yaw) @ _about("y", pitch) @ _about("x", roll)
+        poses[:, :3, :3] = Rotation.from_euler("xyz", np.stack((roll, pitch, yaw), -1)).as_matrix()
         poses[:, :3, 3] = position - position[first]
     return dict(zip(packets, poses, strict=True))
 
@@ -144,16 +145,6 @@ def read_calibration(folder: Path, scene: str, camera: int) -> tuple[NDArray[np.
     steps = np.stack((rectify, _transform(velodyne, where), _transform(imu, where)))
     rectify, camera_from_velodyne, velodyne_from_imu = rigid(steps, range(3), f"the calibration files of {where}")
     return intrinsics, shift @ rectify @ camera_from_velodyne @ velodyne_from_imu
-
-
-def _about(axis: str, angles: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rotations ``[n, 3, 3]`` about an axis, counter-clockwise seen against it."""
-    i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
-    out = np.tile(np.eye(3), (len(angles), 1, 1))
-    out[:, i, i] = out[:, j, j] = np.cos(angles)
-    out[:, j, i] = np.sin(angles)
-    out[:, i, j] = -out[:, j, i]
-    return out
 
 
 def _read_packet(path: Path, scene: str) -> NDArray[np.float64]:
