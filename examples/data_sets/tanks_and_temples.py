@@ -22,9 +22,8 @@ from vg2gt.data.sources.parsing import (
     pinhole,
     read_matrix,
 )
-from vg2gt.data.sources.posed import posed_image, size_on_disk
 from vg2gt.data.sources.rgbd_cameras import read_log
-from vg2gt.data.sources.undistortion import is_pinhole
+from vg2gt.data.sources.undistortion import is_pinhole, posed_image, size_on_disk
 from vg2gt.io import colmap_images, read_colmap
 from vg2gt.io.colmap import Camera
 from vg2gt.io.image_files import Size

@@ -15,9 +15,8 @@ from vg2gt.data.sources.colmap_model import COLMAP, model_folder_of
 from vg2gt.data.sources.files import FileSource
 from vg2gt.data.sources.nerfstudio import Nerfstudio, transforms_files
 from vg2gt.data.sources.phone import app_of
-from vg2gt.data.sources.posed import size_on_disk
 from vg2gt.data.sources.rgbd import RGBDFolder
-from vg2gt.data.sources.undistortion import undistortion_of
+from vg2gt.data.sources.undistortion import size_on_disk, undistortion_of
 from vg2gt.geometry.cameras import resize_intrinsics
 from vg2gt.io.cameras_json import NamedCamera, Photo, read_cameras_json
 from vg2gt.io.image_files import read_color

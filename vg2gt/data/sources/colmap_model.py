@@ -17,8 +17,8 @@ from vg2gt.data.sources.index import PosedImage, SceneIndex, make_index
 from vg2gt.data.sources.masks import FOLDER as MASKS
 from vg2gt.data.sources.masks import find_masks
 from vg2gt.data.sources.parsing import IMAGE_SUFFIXES, errors_name, existing_image, named_file, to_world
-from vg2gt.data.sources.posed import posed_image, size_on_disk
 from vg2gt.data.sources.sparse_points import SparsePoints
+from vg2gt.data.sources.undistortion import posed_image, size_on_disk
 from vg2gt.io import colmap_images, colmap_pose, read_colmap
 from vg2gt.io.colmap import Image, Reconstruction, colmap_files
 from vg2gt.io.files import regular

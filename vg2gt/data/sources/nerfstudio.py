@@ -24,7 +24,7 @@ from vg2gt.data.sources.parsing import (
     positive,
     to_world,
 )
-from vg2gt.data.sources.posed import posed_image, size_on_disk
+from vg2gt.data.sources.undistortion import posed_image, size_on_disk
 from vg2gt.io import Lens, TransformsFrame, read_transforms
 from vg2gt.io.colmap import PIXEL_CENTER, Camera, require_pycolmap
 from vg2gt.io.files import by_number
