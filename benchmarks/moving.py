@@ -1,6 +1,6 @@
 """PSNR of what does not move, with and without the check for what does: ``python benchmarks/moving.py [overrides]``.
 
-A chair moves across procedural rooms (``examples/worlds``, ``data.variant=moving``) by ``--distances`` metres between the moments
+A chair moves across procedural rooms (``examples/worlds``) by ``--distances`` metres between the moments
 ``--during``, the first frame's being 0 and the last one's 1. Every second frame is an input view, some of the others
 are held out. Scored are the pixels of held-out views that do not show the chair; ``chair left`` is the share of its
 pixels that enter the scene, ``static lost`` the share of all other pixels that the check drops. Overrides are those

@@ -7,10 +7,10 @@ import pytest
 import torch
 from hydra.utils import instantiate
 
+from examples.worlds.moving import SyntheticMovingRoom
 from tests.visibility.test_check import geometry, wall
 from tests.visibility.test_counts import SIZE, sideways
 from vg2gt.config import compose
-from examples.worlds.moving import SyntheticMovingRoom
 from vg2gt.method.additions.visibility import ViewCheck
 from vg2gt.types import Cameras, Geometry, Hints
 
