@@ -11,14 +11,8 @@ import pytest
 
 import vg2gt.cli
 from tests.commands import ROOT
-from vg2gt.cli import reconstruct as reconstruct_command
-from vg2gt.cli import render as render_command
-from vg2gt.cli.arguments import separate
 from vg2gt.io import read_cameras_json
 from vg2gt.io.video import has_pyav
-
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
-PARSERS = {"reconstruct": reconstruct_command.parser, "render": render_command.parser}
 
 
 @pytest.fixture
@@ -40,13 +34,6 @@ def _commands(path: Path, *names: str) -> list[list[str]]:
 def _run(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "argv", words)
     vg2gt.cli.main()
-
-
-@pytest.mark.parametrize("page", [page for page in PAGES if _commands(page, *PARSERS)], ids=lambda page: page.name)
-def test_commands_are_understood(page: Path) -> None:
-    for words in _commands(page, *PARSERS):
-        given, _ = separate(words[2:])
-        PARSERS[words[1]]().parse_args(given)
 
 
 def test_a_recording_is_reconstructed_and_rendered(workplace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
