@@ -19,10 +19,10 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image
+from vg2gt.data.synthetic.export import store_depth
 
 from vg2gt.data.sources.rgbd import RGBDFolder
 from vg2gt.data.synthetic.builder import Builder
-from vg2gt.data.synthetic.export import store_depth
 from vg2gt.data.synthetic.furniture import MAKERS
 from vg2gt.data.synthetic.renderer import World
 from vg2gt.data.synthetic.synthetic_scene import SyntheticScene, level_poses
