@@ -19,8 +19,8 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image
-from vg2gt.data.synthetic.export import store_depth
 
+from examples.write_recordings import stored_depth
 from vg2gt.data.sources.rgbd import RGBDFolder
 from vg2gt.data.synthetic.builder import Builder
 from vg2gt.data.synthetic.furniture import MAKERS
@@ -93,7 +93,7 @@ def make(folder: Path, rooms: int, frames: int, size: tuple[int, int]) -> None:
             if not path.is_file():
                 (frame,) = scene.render([number], 1)
                 Image.fromarray(frame.image).save(folder / name / "images" / f"{number:05d}.png")
-                Image.fromarray(store_depth(frame.depth, 1000)).save(path)
+                Image.fromarray(stored_depth(frame.depth)).save(path)
 
 
 class Clock(Monitor):

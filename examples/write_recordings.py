@@ -26,15 +26,19 @@ def write_recording(folder: Path, frames: Frames) -> None:
     for kind in ("images", "depth"):
         (staged / kind).mkdir(parents=True)
     pixels = (frames.images.permute(0, 2, 3, 1).numpy() * 255 + 0.5).astype(np.uint8)
-    millimetres = np.rint(frames.depth.double().numpy() * 1000)
-    millimetres = np.where(millimetres < 65535, millimetres, 0).astype(np.uint16)  # 65535 often means none
-    for i, (image, depth) in enumerate(zip(pixels, millimetres, strict=True)):
+    for i, (image, depth) in enumerate(zip(pixels, stored_depth(frames.depth.numpy()), strict=True)):
         Image.fromarray(image).save(staged / "images" / f"{i:05d}.png")
         Image.fromarray(depth).save(staged / "depth" / f"{i:05d}.png")
     np.savetxt(staged / "poses.txt", np.linalg.inv(frames.world_to_camera.double().numpy()).reshape(-1, 16))
     np.savetxt(staged / "K.txt", frames.intrinsics[0].double().numpy())
     staged.rename(folder)
     shutil.rmtree(folder.parent / ".unfinished")
+
+
+def stored_depth(depth: np.ndarray) -> np.ndarray:
+    """Depth in metres as 16-bit millimetres, 0 where there is none or too much of it."""
+    millimetres = np.rint(depth.astype(np.float64) * 1000)
+    return np.where(millimetres < 65535, millimetres, 0).astype(np.uint16)  # 65535 often means none
 
 
 def main() -> None:

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from backends.oracle import OracleBackend
+from examples.worlds import Worlds
 from tests.data.sources.layout_rgbd import write_recording
-from vg2gt.data import SyntheticScenes
 from vg2gt.geometry.alignment import align_cameras, align_points
 from vg2gt.geometry.cameras import camera_centers, invert_rigid, rigid_motions
 from vg2gt.reconstruction.given_cameras import given_pictures
@@ -114,7 +114,7 @@ def test_a_loop_closes_where_its_parts_see_the_same() -> None:
 @pytest.mark.slow
 def test_the_simulated_backbone_with_drift_closes_a_loop_of_200_frames(tmp_path) -> None:
     """Issue 49's bar: each window's unit off by up to 10 %, error after closing at most 1 % of the way's length."""
-    source = SyntheticScenes(1, first_seed=11, num_frames=100, size=(56, 84), variant="object")
+    source = Worlds(1, first_seed=11, num_frames=100, size=(56, 84), variant="object")
     frames = source.load(source.scenes[0], [*range(100), *range(100)])
     folder = write_recording(tmp_path, frames, "loop", first=0, digits=3)
     model = load_model(overrides=["backend=oracle", "model.coarse=null"], device="cpu").model
