@@ -1,4 +1,4 @@
-"""What the JSON formats of cameras check alike."""
+"""What the JSON formats of cameras check alike; what does not hold is a ``FormatError`` that names the place."""
 
 from __future__ import annotations
 
@@ -18,11 +18,7 @@ MAX_SIZE = 1 << 20  # pixels along an image's side
 
 
 def load_json(path: Path, content: bytes | None = None) -> Any:
-    """Reads a file, or what was read of it.
-
-    Raises:
-        FormatError: if it is not JSON, naming the file.
-    """
+    """Reads a file, or what was read of it."""
     try:
         return read_json(path) if content is None else json.loads(content)
     except (ValueError, RecursionError) as error:
@@ -83,11 +79,7 @@ class Fields:
 
 
 def check_rigid(place: str, matrix: NDArray[np.float64], tolerance: float) -> None:
-    """Checks that a finite ``[4, 4]`` matrix is a rotation, orthonormal to the tolerance, and a translation.
-
-    Raises:
-        FormatError: if it is not, naming the place.
-    """
+    """Checks that a finite ``[4, 4]`` matrix is a rotation, orthonormal to the tolerance, and a translation."""
     rotation = matrix[:3, :3]
     error = np.abs(rotation.T @ rotation - np.eye(3)).max() if np.abs(rotation).max() < 2 else math.inf
     if error > tolerance or np.linalg.det(rotation) < 0 or np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:

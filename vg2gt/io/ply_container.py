@@ -1,4 +1,4 @@
-"""The PLY container: header, and the table of its ``vertex`` element."""
+"""The PLY container: header, and the table of its ``vertex`` element. Damaged files are a ``FormatError``."""
 
 from __future__ import annotations
 
@@ -46,20 +46,12 @@ def ply_content(elements: Mapping[str, NDArray], comments: Sequence[str] = ()) -
 
 
 def read_vertices(path: Path) -> NDArray:
-    """The ``vertex`` element as a structured array; what follows it in the file is ignored.
-
-    Raises:
-        FormatError: if the file is damaged or has no vertices.
-    """
+    """The ``vertex`` element as a structured array; what follows it in the file is ignored."""
     return read_elements(path, "vertex")["vertex"]
 
 
 def read_elements(path: Path, *wanted: str) -> dict[str, NDArray]:
-    """Elements of a file as structured arrays in little endian, by name; those that it does not have are left out.
-
-    Raises:
-        FormatError: if the file is damaged or has no vertices.
-    """
+    """Elements of a file as structured arrays in little endian, by name; those that it does not have are left out."""
     data = regular(path).read_bytes()
     encoding, elements, start = _header(path, data)
     names = [element.name for element in elements]

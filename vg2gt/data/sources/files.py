@@ -47,6 +47,8 @@ class HoldoutOptions(FileOptions, total=False):
 class FileSource(SceneSource):
     """A dataset on disk. A loader says where scenes are (``find``), what is in one (``index``) and how depth is stored.
 
+    Where something is missing or damaged, all methods raise ``DataError``, naming the file and the scene.
+
     The arguments, and what they raise, are those of every loader.
 
     Args:
@@ -113,11 +115,7 @@ class FileSource(SceneSource):
         return all((folder / mark).exists() for mark in self.scene_marks)
 
     def find(self, root: Path) -> Mapping[str, Path]:
-        """Scenes by name, with their folders (or ``scene_files``), unread: ``root`` itself, or up to ``levels`` below.
-
-        Raises:
-            DataError: if two scenes get one name.
-        """
+        """Scenes by name with folders (or ``scene_files``), unread: ``root`` itself, or up to ``levels`` below."""
         if self.is_scene(root):
             return {root.resolve().name: root}
         found: dict[str, Path] = {}
@@ -131,18 +129,10 @@ class FileSource(SceneSource):
 
     @abstractmethod
     def index(self, scene: str, folder: Path) -> SceneIndex:
-        """Reads file lists, poses and intrinsics of a scene.
-
-        Raises:
-            DataError: if the scene is missing something or damaged.
-        """
+        """Reads file lists, poses and intrinsics of a scene."""
 
     def read_color(self, index: SceneIndex, row: int) -> NDArray[np.uint8]:
-        """Decodes the colour image ``[h, w, 3]`` of a row of the index.
-
-        Raises:
-            DataError: if it is missing, damaged, or of another size than the index says.
-        """
+        """Decodes the colour image ``[h, w, 3]`` of a row of the index."""
         lens, upright = index.lens(row), index.upright(row)
         if not lens:
             return read_color(index.color[row], index.name, index.color_size, upright=upright)
@@ -150,11 +140,7 @@ class FileSource(SceneSource):
         return undistortion.color(read_color(index.color[row], index.name, undistortion.lens_size, upright=upright))
 
     def read_mask(self, index: SceneIndex, row: int) -> NDArray[np.float32] | None:
-        """How much each pixel of a colour image counts ``[h, w]``, by its mask file and its alpha; None: all do.
-
-        Raises:
-            DataError: if a file is missing or damaged.
-        """
+        """How much each pixel of a colour image counts ``[h, w]``, by its mask file and its alpha; None: all do."""
         if not self.reads_masks:
             return None
         path, upright = index.mask(row), index.upright(row)
@@ -176,9 +162,6 @@ class FileSource(SceneSource):
             index: the scene.
             row: which frame.
             size: the ``(height, width)`` it must have.
-
-        Raises:
-            DataError: if it is missing, damaged, or of another size.
         """
         undistortion = undistortion_of(index.lens(row)) if index.lens(row) else None
         stored = read_depth(index.depth[row], index.name, undistortion.lens_size if undistortion else size)
@@ -211,20 +194,12 @@ class FileSource(SceneSource):
         return self.frames(scene)[self.holdout // 2 :: self.holdout] if self.holdout else ()
 
     def load(self, scene: str, frame_ids: Sequence[int]) -> Frames:
-        """Decodes frames at the scene's size; images of another size are brought to it.
-
-        Raises:
-            DataError: naming the file and the scene, if one is missing or damaged, or depth is valid nowhere.
-        """
+        """Decodes frames at the scene's size; images of another size are brought to it."""
         index = self.scene_index(scene)
         return Frames.concatenate([self._load_frame(index, index.row(frame)) for frame in frame_ids])
 
     def load_whole(self, scene: str, frame: int) -> Frames:
-        """Decodes one frame at its own size (``SceneIndex.own_size``), uncut.
-
-        Raises:
-            DataError: as ``load``.
-        """
+        """Decodes one frame at its own size (``SceneIndex.own_size``), uncut."""
         index = self.scene_index(scene)
         return self._load_frame(index, index.row(frame), whole=True)
 
