@@ -1,16 +1,17 @@
 """Windows whose backbone predicts cameras, in units that drift, are placed in one frame."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
 from backends.oracle import OracleBackend
-from examples.worlds import Worlds
 from tests.data.sources.layout_rgbd import write_recording
-from vg2gt.geometry.alignment import align_cameras, align_points
-from vg2gt.geometry.cameras import camera_centers, invert_rigid, rigid_motions
+from vg2gt.data.base import Frames
+from vg2gt.geometry.alignment import align_points
+from vg2gt.geometry.cameras import camera_centers, invert_rigid, ray_directions, rigid_motions
 from vg2gt.reconstruction.given_cameras import given_pictures
 from vg2gt.reconstruction.monitor import Monitor
 from vg2gt.reconstruction.windows.placement import place_found
@@ -111,15 +112,39 @@ def test_a_loop_closes_where_its_parts_see_the_same() -> None:
     assert not closes(far, parts)
 
 
+def tower(count: int) -> Frames:
+    """A round wall of radius 5, seen from inside by cameras on a circle; the last four see what the first four saw."""
+    cameras = ring(count - 4)
+    poses = torch.cat((cameras.world_to_camera[0], cameras.world_to_camera[0, :4]))
+    intrinsics = torch.tensor([[60.0, 0, 41.5], [0, 60.0, 27.5], [0, 0, 1]]).repeat(count, 1, 1)
+    to_world = invert_rigid(poses)
+    rays = ray_directions(intrinsics, (56, 84)) @ to_world[:, None, :3, :3].mT
+    eye, flat = to_world[:, None, None, :3, 3], torch.tensor([1.0, 0, 1])
+    a, b, c = ((x * y * flat).sum(-1) for x, y in ((rays, rays), (rays, eye), (eye, eye)))
+    depth = (-b + (b * b - a * (c - 25)).sqrt()) / a
+    points = eye + depth[..., None] * rays
+    angle, height = torch.atan2(points[..., 0], points[..., 2]), points[..., 1]
+    waves = [torch.sin(k * angle + k) * torch.cos((k % 3 + 1) * height) for k in (5, 9, 14)]
+    return Frames(0.5 + 0.5 * torch.stack(waves, 1), depth, poses, intrinsics)
+
+
+class Bent(OracleBackend):
+    """Cameras of views given together turn away from the first one's frame, the more the farther they are from it."""
+
+    def _predict_cameras(self, cameras: Cameras, depth: torch.Tensor, pose_noise: torch.Tensor) -> Cameras:
+        found = super()._predict_cameras(cameras, depth, pose_noise)
+        turns = torch.zeros(depth.shape[1], 3)
+        turns[:, 1] = 0.03 * camera_centers(found)[0].norm(dim=1)
+        return replace(found, world_to_camera=rigid_motions(turns, 0 * turns) @ found.world_to_camera)
+
+
 @pytest.mark.slow
 def test_the_simulated_backbone_with_drift_closes_a_loop_of_200_frames(tmp_path) -> None:
     """Issue 49's bar: each window's unit off by up to 10 %, error after closing at most 1 % of the way's length."""
-    source = Worlds(1, first_seed=11, num_frames=100, size=(56, 84), variant="object")
-    frames = source.load(source.scenes[0], [*range(100), *range(100)])
-    folder = write_recording(tmp_path, frames, "loop", first=0, digits=3)
+    folder = write_recording(tmp_path, tower(204), "loop", first=0, digits=3)
     model = load_model(overrides=["backend=oracle", "model.coarse=null"], device="cpu").model
-    model.backend = OracleBackend(drift=0.1, depth_noise=0.02, pose_noise=0.01)
-    run = WindowRun(model.eval(), given_pictures(folder, depth=True), (56, 84), 32, tmp_path / "windows", Monitor())
+    model.backend = Bent(drift=0.1, depth_noise=0.02, pose_noise=0.005)
+    run = WindowRun(model.eval(), given_pictures(folder, depth=True), (56, 84), 24, tmp_path / "windows", Monitor())
     surveyed = run.survey()
     found = [found_of(each) for each in surveyed]
     loops = run.loops(surveyed)
@@ -129,9 +154,9 @@ def test_the_simulated_backbone_with_drift_closes_a_loop_of_200_frames(tmp_path)
     errors = []
     for closing in ([], loops):
         placed = place_found(found, place_windows(found, closing), run.windows, run.capture.size).cameras
-        placed = placed.map(torch.Tensor.float)
-        moved = align_cameras(placed, true).apply_cameras(placed)
-        errors.append(float((camera_centers(moved) - camera_centers(true)).norm(dim=-1).max()) / length)
+        centers, there = camera_centers(placed).float(), camera_centers(true)
+        apart = (align_points(centers, there).apply(centers) - there).norm(dim=-1)
+        errors.append(float(apart.square().mean().sqrt()) / length)
     print(f"error over length: open {errors[0]:.4f}, closed {errors[1]:.4f}")
-    assert errors[1] < errors[0]
+    assert errors[0] > 0.01
     assert errors[1] < 0.01

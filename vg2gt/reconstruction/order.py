@@ -25,11 +25,16 @@ def working_order(images: Tensor) -> list[int]:
     """
     contents = [hashlib.sha256(to_bytes(image).numpy().tobytes()).hexdigest() for image in images]
     order = sorted(range(len(contents)), key=lambda view: contents[view])
-    gray = (images[view, None].mean(1, keepdim=True) for view in order)  # one by one, which bounds the memory
-    small = torch.cat([F.interpolate(image, (_THUMBNAIL, _THUMBNAIL), mode="area").flatten(1) for image in gray])
-    unit = F.normalize(small.double() - small.double().mean(1, keepdim=True), dim=1)
+    unit = thumbnails(images)[order]
     reference = int((unit @ unit.mean(0)).argmax())
     return [order[reference], *(view for place, view in enumerate(order) if place != reference)]
+
+
+def thumbnails(images: Tensor) -> Tensor:
+    """Small grey images ``[V, 576]`` of zero mean and unit length, float64: their products are correlations."""
+    gray = (image[None].mean(1, keepdim=True) for image in images)  # one by one, which bounds the memory
+    small = torch.cat([F.interpolate(image, (_THUMBNAIL, _THUMBNAIL), mode="area").flatten(1) for image in gray])
+    return F.normalize(small.double() - small.double().mean(1, keepdim=True), dim=1)
 
 
 def in_order(views: Views, order: Sequence[int]) -> tuple[Tensor, Hints]:

@@ -20,8 +20,8 @@ from vg2gt.method.additions.visibility.counts import count_views
 from vg2gt.types import Cameras
 
 PARAMETERS = 7  # of a window: logarithm of its scale, rotation vector, translation
-OUTLIER = 0.02  # residuals (relative, rad, window depths) beyond which an edge counts less
-CONTRADICTS = 0.1  # largest residual with which a loop is taken
+OUTLIER = 0.1  # residuals (relative, rad, window depths) beyond which an edge counts less
+CONTRADICTS = 0.25  # largest residual with which a loop is taken
 AGREE = 0.1  # share of one part's pixels with which the other must agree, for a loop to count
 TOLERANCE, MARGIN = 0.05, 0.1  # of depth, in that check
 ROUNDS = 50  # of the pose graph's solver
@@ -90,7 +90,7 @@ def _solved(
     depths = [float(each.depth[each.depth > 0].median()) if (each.depth > 0).any() else 1.0 for each in found]
     a, b = np.array([edge[:2] for edge in edges]).T
     measured = np.stack([edge[2] for edge in edges])
-    weight = np.sqrt([edge[3] for edge in edges])[:, None] / OUTLIER
+    weight = np.full((len(edges), 1), 1 / OUTLIER)
     lengths = (np.exp(start[:, 0]) * depths)[a, None]  # in the first window's unit
 
     def misfits(flat: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -113,7 +113,7 @@ def loop_candidates(descriptors: Tensor, blocks: Sequence[slice], most: int) -> 
     """Pairs of views, of windows far apart in the order, that look alike; the most alike first.
 
     Args:
-        descriptors: ``[V, D]`` one a view, from the backbone's tokens.
+        descriptors: ``[V, D]`` one a view.
         blocks: each window's views.
         most: pairs, at most; of two neighbouring windows only one pair each.
     """

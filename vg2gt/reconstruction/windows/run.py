@@ -22,7 +22,7 @@ from vg2gt.method.grid import scene_voxel_size
 from vg2gt.model import VG2GT, Reconstructor, background_sums
 from vg2gt.reconstruction.inputs import Views
 from vg2gt.reconstruction.monitor import Monitor
-from vg2gt.reconstruction.order import working_order
+from vg2gt.reconstruction.order import thumbnails, working_order
 from vg2gt.reconstruction.pictures import Picture
 from vg2gt.reconstruction.windows.capture import Capture, Window, cut
 from vg2gt.reconstruction.windows.merging import as_tensors, merge_windows
@@ -148,7 +148,9 @@ class WindowRun:
     def loops(self, surveyed: Sequence[dict[str, Tensor]]) -> list[Found]:
         """Windows of views that were taken at different times and look alike, where the backbone places both."""
         rows = [each["descriptors"][w.inner] for each, w in zip(surveyed, self.windows, strict=True)]
-        pairs = loop_candidates(torch.cat(rows), self._blocks(), most=len(self.windows) // 2)
+        each = len(self.windows) // 4 + 1  # tokens know what is seen, thumbnails do not change with a window's frame
+        alike = (thumbnails(self.capture.images), torch.cat(rows))
+        pairs = list(dict.fromkeys(p for described in alike for p in loop_candidates(described, self._blocks(), each)))
         half, found = len(self.windows[0].views) // 2, []
         with self.monitor.measure("close loops") as show:
             for number, pair in enumerate(pairs):
