@@ -91,6 +91,7 @@ def key_of(model: Reconstructor, *facts: object) -> str:
     digest = hashlib.sha256(json.dumps([FORMAT, model.backend.identity(), facts]).encode())
     for name, module in model.named_modules():
         options = {key: value for key, value in vars(module).items() if isinstance(value, _PLAIN) and key[0] != "_"}
+        options.pop("training", None)
         digest.update(f"{name} {sorted(options.items())}".encode())
     digest.update(f"{model.visibility} {vars(model.scale)}".encode())
     for name, tensor in sorted(model.trained_state().items()):
