@@ -168,12 +168,14 @@ def test_windows_are_for_many_views() -> None:
         window_size(3, 100)
 
 
-def test_the_command_makes_windows_and_clears_up(walk, tmp_path, capsys) -> None:
+def test_the_command_makes_windows_and_tiles_and_clears_up(walk, tmp_path, monkeypatch) -> None:
     out = tmp_path / "out"
+    monkeypatch.setattr(command, "LARGE", 100)
     command.main([str(walk), "--out", str(out), "--window", "6", "--quiet", "--device", "cpu", *BY_ITSELF])
     assert not (out / "windows").exists()
     report = json.loads((out / "report.json").read_text())
     assert report["views"] == VIEWS
+    assert json.loads((out / "tiles" / "index.json").read_text())["gaussians"] == report["gaussians"]
     assert "windows" in report["seconds"]
 
 
