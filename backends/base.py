@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -11,6 +10,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
+from vg2gt.io.tensors import tensors_digest
 from vg2gt.types import Cameras, Geometry, Hints, Tokens
 
 
@@ -116,11 +116,7 @@ class Backend(nn.Module, ABC):
     def identity(self) -> dict[str, str]:
         """Name and sha256 of the weights (names, shapes, values, in sorted order); computed once."""
         if self._identity is None:
-            digest = hashlib.sha256()
-            for key, value in sorted(self.state_dict().items()):
-                digest.update(f"{key} {tuple(value.shape)} {value.dtype}".encode())
-                digest.update(value.detach().cpu().contiguous().flatten().view(torch.uint8).numpy())
-            self._identity = {"name": self.name, "weights": digest.hexdigest()}
+            self._identity = {"name": self.name, "weights": tensors_digest(self.state_dict())}
         return self._identity
 
     def check_images(self, images: Tensor) -> None:

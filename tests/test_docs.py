@@ -24,7 +24,7 @@ PAGES = [
     *sorted(ROOT.glob("*/README.md")),
     *sorted(ROOT.glob("recipes/*/README.md")),
 ]
-HYDRA = {"train.py": "train", "train": "train", "evaluate": "evaluate", "ablate": "ablate"}
+HYDRA = {"train.py": "train", "train": "train", "evaluate": "evaluate", "calibrate": "calibrate", "ablate": "ablate"}
 SOURCES = ("vg2gt", "backends", "configs", "recipes", "examples", "benchmarks", "tests")
 
 
@@ -120,7 +120,7 @@ def composes(config: str, words: list[str], line: str) -> None:
     overrides = [word for word in words if "=" in word and not word.startswith("-")]
     path = [f"hydra.searchpath=[{ROOT / folder}]" for folder in folders]
     try:
-        compose(config, "output_dir=unused", *path, *overrides)
+        compose(config, "++output_dir=unused", *path, *overrides)
     except Exception as error:
         raise AssertionError(f"{line}: {error}") from error
 

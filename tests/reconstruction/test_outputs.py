@@ -131,13 +131,13 @@ def test_points_and_meshes_lie_on_the_surfaces(written: Path, scene: Scene) -> N
 def test_animation_and_reports(written: Path, scene: Scene) -> None:
     frames = [frame for _, frame in io.read_video(written / "orbit.gif")]
     assert [frame.shape for frame in frames] == [(84, 112, 3)] * 4
-    assert Image.open(written / "report.png").size == (4 * 112 + 12, 4 * 84 + 12)
+    assert Image.open(written / "report.png").size == (5 * 112 + 16, 4 * 84 + 12)
     figures = json.loads((written / "report.json").read_text())
     assert (figures["views"], figures["gaussians"]) == (4, len(scene.gaussians))
     assert set(figures["seconds"]) >= {"write files", "render views", "render orbit"}
     assert figures["peak_memory_mib"] > 100
     page = (written / "report.html").read_text()
-    assert (page.count("data:image/jpeg;base64,"), page.count("data:image/gif;base64,")) == (16, 1)
+    assert (page.count("data:image/jpeg;base64,"), page.count("data:image/gif;base64,")) == (20, 1)
     assert "&lt;none&gt;" in page
     assert "http" not in re.sub(r"base64,[\w+/=]*", "", page)
 

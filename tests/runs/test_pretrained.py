@@ -18,7 +18,11 @@ def test_the_shipped_model_has_a_name() -> None:
 
 def test_a_folder_and_a_name_on_the_hub_give_the_same_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = vg2gt.save_pretrained(SHIPPED, tmp_path / "mine")
-    assert sorted(path.name for path in folder.iterdir()) == ["model.safetensors", "model.yaml"]
+    assert sorted(path.name for path in folder.iterdir()) == [
+        "model.calibration.json",
+        "model.safetensors",
+        "model.yaml",
+    ]
     asked = []
 
     def download(repo: str, name: str, revision: str | None = None) -> str:
@@ -27,9 +31,13 @@ def test_a_folder_and_a_name_on_the_hub_give_the_same_model(tmp_path: Path, monk
         return str(shutil.copy(folder / name, tmp_path / "cache" / name))
 
     monkeypatch.setattr("huggingface_hub.hf_hub_download", download)
-    one = vg2gt.from_pretrained(folder, device="cpu").model
-    other = vg2gt.from_pretrained("somebody/rooms", revision="v1", device="cpu").model
-    assert asked == [("somebody/rooms", "model.safetensors", "v1")]
+    found = (
+        vg2gt.from_pretrained(folder, device="cpu"),
+        vg2gt.from_pretrained("somebody/rooms", revision="v1", device="cpu"),
+    )
+    assert all(each.calibration is not None for each in found)
+    one, other = (each.model for each in found)
+    assert asked == [("somebody/rooms", name, "v1") for name in ("model.calibration.json", "model.safetensors")]
     shipped = vg2gt.load_model(device="cpu").model.trained_state()
     for state in (one.trained_state(), other.trained_state()):
         assert state.keys() == shipped.keys()
@@ -49,7 +57,10 @@ def test_what_is_uploaded_is_data_only(tmp_path: Path, monkeypatch: pytest.Monke
 
     monkeypatch.setattr("huggingface_hub.HfApi", Api)
     assert vg2gt.push_to_hub(SHIPPED, "me/rooms", tmp_path / "mine") == "commit"
-    assert calls == [("me/rooms", False, True), ("me/rooms", ["model.safetensors", "model.yaml"])]
+    assert calls == [
+        ("me/rooms", False, True),
+        ("me/rooms", ["model.calibration.json", "model.safetensors", "model.yaml"]),
+    ]
 
 
 def test_no_such_model() -> None:

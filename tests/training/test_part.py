@@ -8,9 +8,9 @@ from torch import Tensor
 
 from tests.training_helpers import full_model, small_config
 from vg2gt.geometry.cameras import invert_rigid
+from vg2gt.geometry.pose_noise import with_pose_noise
 from vg2gt.rendering import Renderer
 from vg2gt.training.loop import Run, build, train
-from vg2gt.training.pose_noise import with_pose_noise
 
 
 class NothingIsRendered(Renderer):

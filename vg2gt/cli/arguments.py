@@ -24,6 +24,8 @@ folders.register()
 OVERRIDE = re.compile(r"(\+\+?|~)?[A-Za-z_][\w./]*=")
 OVERRIDES = "\nmodel, backend and renderer are chosen by key=value: backend=da3_small model.fine.max_voxels=500000"
 
+DROP = "leave out what is guessed, contradicted, single (seen by one view), unseen: a list of these"
+
 
 def hydra_command(command: Command, config_name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], None]]:
     """Makes a command of a function of a configuration, with sweeps and a folder for the run."""
@@ -72,6 +74,13 @@ def add_common_flags(parser: argparse.ArgumentParser, saved: Sequence[str]) -> N
     add("--device", default="auto", help="auto, cpu, cuda, cuda:N")
     add("--overwrite", action="store_true", help="replace existing outputs")
     add("--quiet", action="store_true", help="no progress bars")
+
+
+def add_trust_flags(parser: argparse.ArgumentParser) -> None:
+    """Adds what filters a scene by what it knows of itself."""
+    add = parser.add_argument
+    add("--min-confidence", type=float, metavar="C", help="leave out what may be more than 1 - C of its depth off")
+    add("--drop", type=list_of_names, default=[], metavar="LIST", help=DROP)
 
 
 def separate(argv: Sequence[str] | None) -> tuple[list[str], list[str]]:

@@ -31,6 +31,11 @@ COMMANDS = {
         "measures a checkpoint on a data set",
         "vg2gt evaluate ckpt=outputs/quickstart data=synthetic 'views=[3,10,20]'",
     ),
+    "calibrate": Command(
+        "vg2gt.cli.calibrate:main",
+        "measures how far a checkpoint's depth is off, so that scenes state their errors",
+        "vg2gt calibrate ckpt=outputs/quickstart data=synthetic data.eval_scenes=48",
+    ),
     "ablate": Command(
         "vg2gt.cli.ablate:main",
         "trains and compares the paper's ablations over seeds",

@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vg2gt.cli.arguments import OVERRIDES, add_common_flags, flag_parser, listing, separate
+from vg2gt.cli.arguments import OVERRIDES, add_common_flags, add_trust_flags, flag_parser, listing, separate
 from vg2gt.cli.commands import COMMANDS
 from vg2gt.cli.errors import errors_in_one_line
 from vg2gt.cli.refine import options_for, print_refinement
@@ -69,7 +69,9 @@ def parser() -> argparse.ArgumentParser:
     add("--refine", type=_steps, metavar="N", help=REFINE)
     add("--frames", type=int, default=ORBIT_FRAMES, metavar="N", help=f"length of the orbit, default {ORBIT_FRAMES}")
     add("--mesh-voxel", type=float, metavar="X", help="edge of the mesh's voxels in scene units")
+    add("--calibration", metavar="FILE", help="of the model's errors; default: next to the checkpoint")
     add("--skip-damaged", action="store_true", help="skip images that cannot be read")
+    add_trust_flags(arguments)
     add_common_flags(arguments, DEFAULT)
     return arguments
 
@@ -101,10 +103,11 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     from vg2gt.reconstruction.pictures import check_choice, check_pictures, existing_path
     from vg2gt.reconstruction.pipeline import reconstruct_with
     from vg2gt.reconstruction.refined import refine_scene
+    from vg2gt.reconstruction.trust import check_trust, trust_line, trusted
     from vg2gt.reconstruction.windows.capture import window_size
     from vg2gt.reconstruction.windows.run import window_model
     from vg2gt.reconstruction.windows.sets import tidy
-    from vg2gt.runs.load import backend_class, choose_device, load_model
+    from vg2gt.runs.load import backend_class, choose_device, find_calibration, load_model
 
     changed = options.add or options.take_out
     options.out = str(Path(changed or options.out).expanduser())
@@ -113,6 +116,7 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     check_folder(options.out, [*options.save, REFINED], options.overwrite)
     check_choice(options.every, options.max_images)
     window_size(options.window, 0)
+    check_trust(options.min_confidence, options.drop)
     for item in options.images:  # before weights are downloaded
         existing_path(item)
     kind = backend_class(options.ckpt, overrides)
@@ -126,6 +130,9 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     with Monitor(show=not options.quiet, device=choose_device(options.device)) as monitor:
         with monitor.stage("load model"):
             ready = load_model(options.ckpt, overrides=overrides, device=options.device)
+            calibration = ready.calibration
+            if options.calibration is not None:
+                calibration = find_calibration(ready.model, ready.weights, options.calibration)
         renderer = replace(ready.renderer, mode=options.mode)
         if changed:
             change = add_images if options.add else take_out
@@ -147,10 +154,12 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
                 window=options.window,
                 window_folder=Path(options.out) / WINDOWS,
                 keep_windows=options.keep_windows,
+                calibration=calibration,
             )
         how = _refinement(scene, options.refine)
         if how is not None:
             scene = refine_scene(scene, how, monitor)
+        scene = trusted(scene, options.min_confidence, options.drop)
         if len(scene.gaussians) > LARGE and TILES not in options.save:
             options.save.append(TILES)
         figures = _figures(ready)
@@ -175,6 +184,7 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     print(f"{len(scene.names)} images of {height}x{width}: {len(scene.gaussians)} Gaussians")
     if scene.refined is not None:
         print_refinement(scene)
+    print(trust_line(scene))
     print(f"weights: {figures['weights']}; cameras: {scene.cameras_from or PREDICTED}")
     print(f"seconds: {times}; peak memory {cost['peak_memory_mib']} MiB")
     more = [] if how is None else [REFINED]

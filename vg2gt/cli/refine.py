@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vg2gt.cli.arguments import add_common_flags, flag_parser, listing, separate
+from vg2gt.cli.arguments import add_common_flags, add_trust_flags, flag_parser, listing, separate
 from vg2gt.cli.commands import COMMANDS
 from vg2gt.cli.errors import errors_in_one_line
 from vg2gt.reconstruction.output_names import DEFAULT, OUTPUTS, REFINED
@@ -31,6 +31,7 @@ def parser() -> argparse.ArgumentParser:
     add("--steps", type=int, metavar="N", help="default: 12 per view, 400 for photos")
     add("--seconds", type=float, metavar="S", help="stop after S seconds, or after --steps if that comes first")
     add("--holdout", type=int, metavar="N", help="exclude every N-th view and print its PSNR before and after")
+    add_trust_flags(arguments)
     add_common_flags(arguments, DEFAULT)
     return arguments
 
@@ -51,10 +52,12 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     from vg2gt.reconstruction.outputs import check_folder, check_outputs, write_outputs
     from vg2gt.reconstruction.refined import refine_scene
     from vg2gt.reconstruction.saved import read_scene
+    from vg2gt.reconstruction.trust import check_trust, trusted
     from vg2gt.rendering import Renderer
     from vg2gt.runs.load import choose_device
 
     check_outputs(options.save)
+    check_trust(options.min_confidence, options.drop)
     out = Path(options.out or Path(options.scene) / "refined")
     check_folder(out, [*options.save, REFINED], options.overwrite)
     refine_options("default", overrides)  # says what is wrong before anything is read
@@ -64,6 +67,7 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
             scene = read_scene(options.scene, Renderer(mode=options.mode), device)
         how = options_for(scene, overrides, options.steps, options.seconds, options.holdout)
         scene = refine_scene(scene, how, monitor)
+        scene = trusted(scene, options.min_confidence, options.drop)
         folder = write_outputs(scene, out, options.save, overwrite=options.overwrite, monitor=monitor)
     print_refinement(scene)
     print(f"written: {', '.join(str(folder / name) for name in (*options.save, REFINED))}")

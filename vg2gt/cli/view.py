@@ -6,6 +6,7 @@ import argparse
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from vg2gt.io.cameras_json import NamedCamera
+    from vg2gt.types import Gaussians
     from vg2gt.viewer import ViewerScene
 
 IMAGE_FOLDER = "images"  # next to cameras.json, as `vg2gt reconstruct --save images` writes it
@@ -52,6 +54,7 @@ def _parser() -> argparse.ArgumentParser:
     add("scene", type=Path, help="scene.ply, .spz, .splat or .glb")
     add("--cameras", type=Path, help="cameras.json of the scene; the first one is the initial view")
     add("--images", type=Path, help="folder of the cameras' images; default: that of cameras.json, or images/ in it")
+    add("--color", choices=("trust",), help="trust: colours by stated error and status, of a scene.ply of vg2gt")
     add("--html", type=Path, help="write one self-contained page to this file instead of serving")
     add("--title", help="of the page; default: the scene's file name")
     add("--host", help="address to listen on; default: 127.0.0.1, this machine only")
@@ -74,6 +77,8 @@ def _scene(arguments: argparse.Namespace) -> ViewerScene:
     gaussians = read_gaussians(arguments.scene)
     if not len(gaussians):
         raise ValueError(f"{arguments.scene} holds no Gaussians")
+    if arguments.color is not None:
+        gaussians = _by_trust(arguments.scene, gaussians)
     title = arguments.title or arguments.scene.name
     if arguments.cameras is None:
         return ViewerScene(gaussians, title=title)
@@ -81,6 +86,22 @@ def _scene(arguments: argparse.Namespace) -> ViewerScene:
     near = arguments.cameras.parent
     folders = [arguments.images] if arguments.images is not None else [near, near / IMAGE_FOLDER]
     return ViewerScene(gaussians, cameras, _pictures(cameras, folders), title)
+
+
+def _by_trust(path: Path, gaussians: Gaussians) -> Gaussians:
+    """The same Gaussians in the colours of a report's stated errors."""
+    import torch
+
+    from vg2gt.geometry.spherical_harmonics import rgb_to_sh
+    from vg2gt.io.ply import read_properties
+    from vg2gt.reconstruction.trust import trust_picture
+
+    found = read_properties(path, "error", "support") if path.suffix == ".ply" else {}
+    if len(found.get("support", ())) != len(gaussians):
+        raise ValueError(f"{path} does not say what is known of its Gaussians: give a scene.ply of vg2gt reconstruct")
+    values = {name: torch.from_numpy(column).float() for name, column in found.items()}
+    colors = trust_picture(values.get("error"), values["support"])  # [3, G]
+    return replace(gaussians, sh=rgb_to_sh(colors.T)[:, None])
 
 
 def _pictures(cameras: Sequence[NamedCamera], folders: Sequence[Path]) -> list[NDArray[np.uint8] | None]:

@@ -19,6 +19,7 @@ from vg2gt.evaluation.scene_metrics import (
     present,
     rendered_normal_metrics,
 )
+from vg2gt.evaluation.stated import stated_metrics
 from vg2gt.geometry.precision import half_precision_on_gpu
 from vg2gt.metrics import LPIPS, camera_metrics, cv, depth_metrics
 from vg2gt.model import Reconstructor
@@ -26,6 +27,7 @@ from vg2gt.profiling import clocked, now, peak_memory_mib, reset_peak_memory
 from vg2gt.refinement import Observations, RefineOptions, refine
 from vg2gt.rendering import Renderer
 from vg2gt.types import Batch, Cameras, Prediction, Render
+from vg2gt.uncertainty import Calibration
 
 log = logging.getLogger(__name__)
 
@@ -60,6 +62,7 @@ class SceneEvaluator:
         options: what is compared and how.
         lpips: on the model's device; None: no LPIPS.
         refinement: how scenes are refined and scored once more, under ``refined/``; None: not at all.
+        calibration: states errors of the decoded depth, which are scored under ``stated/``; None: none are stated.
     """
 
     model: Reconstructor
@@ -67,6 +70,7 @@ class SceneEvaluator:
     options: EvaluationOptions
     lpips: LPIPS | None = None
     refinement: RefineOptions | None = None
+    calibration: Calibration | None = None
 
     @torch.no_grad()
     def __call__(self, batch: Batch, has_cameras: bool = True) -> SceneResult:
@@ -79,7 +83,9 @@ class SceneEvaluator:
             refined, cost = self._refine(batch, prediction, self.refinement)
             scores, _ = self._score(batch, refined, cost, has_cameras)
             # What was decoded is not refined.
-            metrics |= {f"refined/{name}": value for name, value in scores.items() if not name.startswith("decoded")}
+            metrics |= {
+                f"refined/{name}": value for name, value in scores.items() if not name.startswith(("decoded", "stated"))
+            }
         return SceneResult(present(metrics), prediction, renders)
 
     def _score(
@@ -99,6 +105,7 @@ class SceneEvaluator:
                     cost["render_seconds"] = seconds
         metrics |= _under("decoded/before", self._depth_metrics(prediction.initial.depth, known.context))
         metrics |= _under("decoded/after", self._depth_metrics(prediction.geometry.depth, known.context))
+        metrics |= self._stated_metrics(known.context, prediction)
         if has_cameras:
             metrics |= self._pose_and_point_cloud_metrics(known.context, prediction, renders["context"])
         cost["cv"] = cv(prediction.gaussians.means, self.options.neighbors, CV_QUERIES)
@@ -161,6 +168,12 @@ class SceneEvaluator:
 
     def _depth_metrics(self, depth: torch.Tensor, truth: Batch) -> dict[str, float]:
         return depth_metrics(depth[0], truth.depth[0], self.options.alignment)
+
+    def _stated_metrics(self, truth: Batch, prediction: Prediction) -> dict[str, float]:
+        if self.calibration is None:
+            return {}
+        predicts = self.model.backend.predicts_cameras
+        return _under("stated", stated_metrics(self.calibration, prediction, prediction.supported, truth, predicts))
 
     def _pose_and_point_cloud_metrics(self, truth: Batch, prediction: Prediction, rendered: Render) -> dict[str, float]:
         metrics: dict[str, float] = {}

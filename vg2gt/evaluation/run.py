@@ -31,7 +31,7 @@ from vg2gt.memory import EVALUATION, memory_advice
 from vg2gt.metrics import LPIPS, WeightsNotFoundError, load_lpips
 from vg2gt.model import Reconstructor
 from vg2gt.runs.checkpoints import checkpoint_path
-from vg2gt.runs.load import TrainedWeights, build_model, choose_device, load_weights, resolve_parts
+from vg2gt.runs.load import TrainedWeights, build_model, choose_device, find_calibration, load_weights, resolve_parts
 from vg2gt.runs.lock import only_process_in
 
 log = logging.getLogger(__name__)
@@ -79,11 +79,15 @@ def _evaluate(config: DictConfig, folder: Path) -> dict[str, Any]:
     weights = load_weights(model, checkpoint)
     lpips, lpips_label = _lpips(options.lpips, device)
     resolved = OmegaConf.merge(OmegaConf.to_container(config, resolve=True), parts)
-    store = ResultStore(folder, _identity(resolved, weights, lpips is not None, model, device), config.overwrite)
+    calibration = find_calibration(model, weights)
+    identity = _identity(resolved, weights, lpips is not None, model, device)
+    if calibration is not None:
+        identity["calibration.sha256"] = calibration.digest
+    store = ResultStore(folder, identity, config.overwrite)
     write_text(folder / "config.yaml", OmegaConf.to_yaml(resolved, resolve=True))
 
     refinement = replace(instantiate(config.refine), steps=options.refine, seconds=None) if options.refine else None
-    evaluator = SceneEvaluator(model, instantiate(parts["renderer"]), options, lpips, refinement)
+    evaluator = SceneEvaluator(model, instantiate(parts["renderer"]), options, lpips, refinement, calibration)
     results = {count: _evaluate_all(evaluator, data, views, store, device) for count, views in samples.items()}
     settings = _settings(config, options, model, weights, data.source, samples, lpips_label, device)
     report = {

@@ -19,6 +19,7 @@ NORMALS = columns(
 )
 CAMERAS = columns(*(name for name in METRICS if name.startswith(("rra_", "rta_", "auc_"))))
 POINTS = columns("accuracy", "completeness", "chamfer", "precision", "recall", "f_score")
+STATED = columns(*(f"{name}_{level}" for name in ("held", "width") for level in (50, 80, 90, 95)), "ause")
 COST = columns(
     *("cv", "gaussians", "gaussians_per_pixel", "reconstruct_seconds", "head_seconds", "render_seconds"),
     "peak_memory_mib",
@@ -88,6 +89,7 @@ def report_markdown(report: Mapping[str, Any]) -> str:
             + papers_row(paper.DECODED, "-", f"before (DA3): {decoded}", method="DA3")
             + papers_row(paper.DECODED, "-", f"after: {decoded}"),
         ),
+        _section("Stated errors of the decoded depth", ("views",), STATED, rows({"stated": ()})),
         _section("Cameras of the input views", ("views",), CAMERAS, rows({"cameras": ()})),
         _section("Points of the input views", ("views", "depth"), POINTS, rows(POINT_CLOUDS)),
         _section("Uniformity and cost", ("views",), COST, rows({"scene": ()}) + papers_row(paper.UNIFORMITY, cost)),

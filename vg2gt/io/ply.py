@@ -2,12 +2,13 @@
 
 A Gaussian file has one ``vertex`` element of floats, in this order: ``x y z``, ``nx ny nz`` (zeros), ``f_dc_0..2``,
 ``f_rest_*`` (none or 45, all of red before green before blue), ``opacity`` (logit), ``scale_0..2`` (logarithms),
-``rot_0..3`` (wxyz). The colour behind a scene is in a comment, ``background R G B`` in [0, 1], which other programs
-ignore.
+``rot_0..3`` (wxyz). Our scenes add ``error`` and ``support`` (:mod:`vg2gt.uncertainty`). The colour behind a scene is
+in a comment, ``background R G B`` in [0, 1], which other programs ignore.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -45,7 +46,9 @@ class ColoredPoints:
     colors: NDArray[np.uint8] | None = None
 
 
-def write_gaussian_ply(path: str | Path, gaussians: Gaussians, *, full_sh: bool = False) -> Path:
+def write_gaussian_ply(
+    path: str | Path, gaussians: Gaussians, *, full_sh: bool = False, extra: Mapping[str, NDArray] | None = None
+) -> Path:
     """Writes one scene's Gaussians as a 3DGS file (binary, little endian), atomically.
 
     Args:
@@ -53,6 +56,7 @@ def write_gaussian_ply(path: str | Path, gaussians: Gaussians, *, full_sh: bool 
         gaussians: one scene; not changed. Opacities are kept 6e-8 away from 0 and 1, whose logits are infinite.
         full_sh: True writes 45 ``f_rest`` even for colours that do not depend on the view, which the original 3DGS
             viewer insists on. Degrees 1 and 2 are always filled up with zeros to 45.
+        extra: further properties ``[G]`` by name, written as floats behind all others; viewers ignore them.
 
     Raises:
         ValueError: on more than one scene and on values that cannot be written.
@@ -65,6 +69,8 @@ def write_gaussian_ply(path: str | Path, gaussians: Gaussians, *, full_sh: bool 
     opacities = arrays.opacities.clip(OPACITY_MARGIN, 1 - OPACITY_MARGIN)
     logits = np.log(opacities) - np.log1p(-opacities)
     names = (*POSITION, *NORMAL, *_DC, *(f"f_rest_{i}" for i in range(rest.shape[1])), "opacity", *_SCALE, *_ROTATION)
+    extra = extra or {}
+    names = (*names, *extra)
     columns = (
         arrays.means,
         np.zeros((count, 3)),
@@ -73,6 +79,7 @@ def write_gaussian_ply(path: str | Path, gaussians: Gaussians, *, full_sh: bool 
         logits[:, None],
         np.log(arrays.scales),
         arrays.quats,
+        *(values[:, None] for values in extra.values()),
     )
     table = np.concatenate(columns, 1).astype("<f4").view([(name, "<f4") for name in names])[:, 0]
     comments = []
@@ -125,6 +132,16 @@ def read_gaussian_ply(path: str | Path) -> Gaussians:
     means, quats = _columns(path, table, POSITION), _columns(path, table, _ROTATION)
     gaussians = to_gaussians(path, GaussianArrays(means, quats, scales, opacities, sh))
     return replace(gaussians, background=_background(path))
+
+
+def read_properties(path: str | Path, *names: str) -> dict[str, NDArray[np.float64]]:
+    """Properties ``[N]`` of the vertices, such as ``error`` and ``support`` of our scenes; absent ones are left out.
+
+    Raises:
+        FormatError: if the file is damaged.
+    """
+    table = read_vertices(Path(path))
+    return {name: table[name].astype(np.float64) for name in names if name in (table.dtype.names or ())}
 
 
 def write_point_ply(path: str | Path, positions: ArrayLike, colors: ArrayLike | None = None) -> Path:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Mapping
 from pathlib import Path
 
 import torch
@@ -11,6 +13,15 @@ from torch import Tensor
 
 from vg2gt.io.errors import FormatError
 from vg2gt.io.files import regular
+
+
+def tensors_digest(state: Mapping[str, Tensor]) -> str:
+    """sha256 of names, shapes, types and values, in sorted order."""
+    digest = hashlib.sha256()
+    for key, value in sorted(state.items()):
+        digest.update(f"{key} {tuple(value.shape)} {value.dtype}".encode())
+        digest.update(value.detach().cpu().contiguous().flatten().view(torch.uint8).numpy())
+    return digest.hexdigest()
 
 
 def read_tensors(path: str | Path) -> dict[str, Tensor]:

@@ -6,10 +6,12 @@ from vg2gt.metrics.images import psnr, ssim
 from vg2gt.metrics.lpips import LPIPS, WeightsNotFoundError, load_lpips
 from vg2gt.metrics.normals import normal_metrics
 from vg2gt.metrics.points import cv, point_metrics
+from vg2gt.metrics.stated import ause, stated_error_metrics
 
 __all__ = [
     "LPIPS",
     "WeightsNotFoundError",
+    "ause",
     "camera_metrics",
     "cv",
     "depth_metrics",
@@ -20,4 +22,5 @@ __all__ = [
     "psnr",
     "relative_pose_errors",
     "ssim",
+    "stated_error_metrics",
 ]

@@ -13,7 +13,7 @@ MAPS = {
 }
 
 OUTPUTS = {
-    "scene.ply": "the Gaussians, as 3D Gaussian Splatting writes them",
+    "scene.ply": "the Gaussians, as 3D Gaussian Splatting writes them, with error and support",
     "scene.splat": "the same, 32 bytes each, for web viewers; no colour that depends on the view",
     "scene.spz": "the same, about 16 bytes each (Niantic's SPZ, version 3)",
     "scene.compressed.ply": "the same, about 16 bytes each, as SuperSplat compresses them",
@@ -22,7 +22,7 @@ OUTPUTS = {
     "cameras.json": "the cameras of the views",
     "points.ply": "coloured points of the decoded depth",
     "points.glb": "the same points and the cameras, for any 3D viewer",
-    "views.npz": "input images at the working size, decoded depth and its confidence: what vg2gt refine needs",
+    "views.npz": "input images at the working size, decoded depth, confidence, error, support: what vg2gt refine needs",
     "images": "the input images at the working size, PNGs in images/",
     **MAPS,
     "mesh.ply": "a mesh fused from rendered depth",
@@ -34,7 +34,7 @@ OUTPUTS = {
     "colmap-small": "the same with the images at the working size, in colmap-small/",
     "nerfstudio": "transforms.json, points and images in nerfstudio/, as for colmap",
     "nerfstudio-small": "the same with the images at the working size, in nerfstudio-small/",
-    "report.png": "input, colour, depth and normals of up to 12 views",
+    "report.png": "input, colour, depth, normals and stated error of up to 12 views",
     "report.html": "the same of all views, with the run's figures",
     "report.json": "the run's figures: backend, weights, sizes, time per stage, peak memory",
 }

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from vg2gt.geometry.cameras import unproject
 from vg2gt.io import (
     Lens,
     Transforms,
@@ -21,6 +22,7 @@ from vg2gt.io import (
     fuse_depth,
     write_cameras_json,
     write_colmap,
+    write_gaussian_ply,
     write_gaussians,
     write_glb,
     write_mesh,
@@ -38,6 +40,8 @@ from vg2gt.reconstruction.monitor import Monitor
 from vg2gt.reconstruction.output_names import DEFAULT, FPS, MAPS, ORBIT_FRAMES, OUTPUTS, PREDICTED, REFINED
 from vg2gt.reconstruction.refined import before_and_after, refinement_figures
 from vg2gt.reconstruction.report import html_rows, pictured, png_report, write_html_report
+from vg2gt.reconstruction.trust import trust_figures
+from vg2gt.uncertainty import Status, point_support
 
 if TYPE_CHECKING:
     from vg2gt.reconstruction.scene import Scene
@@ -174,6 +178,7 @@ def scene_figures(scene: Scene) -> dict[str, Any]:
         "metres_per_unit": scene.metres_per_unit,
         "mode": scene.renderer.mode,
         **refinement_figures(scene),
+        **trust_figures(scene),
         "cameras": scene.cameras_from or PREDICTED,
         **frame_figures(scene),
     }
@@ -199,6 +204,8 @@ def cost_figures(monitor: Monitor) -> dict[str, Any]:
 def mesh_fusion(scene: Scene, paths: Sequence[Path], voxel_size: float | None) -> Iterator[AddView]:
     """Keeps the rendered depth and colour of the views, fuses them into a mesh and writes it to the paths.
 
+    Rendered surfaces that no view has measured are left open.
+
     Raises:
         ValueError: if no view has rendered depth.
     """
@@ -209,10 +216,20 @@ def mesh_fusion(scene: Scene, paths: Sequence[Path], voxel_size: float | None) -
         raise ValueError("no view has rendered depth, so there is no mesh; leave mesh out of the outputs")
     median = float(depth[depth > 0].median())
     depth = torch.where(depth < _MESH_DEPTHS * median, depth, 0)
+    if scene.support is not None:
+        depth = torch.where(_measured(scene, depth), depth, 0)
     focal = float(scene.cameras.intrinsics[..., [0, 1], [0, 1]].mean())
     mesh = fuse_depth(depth, scene.cameras, colors, voxel_size=voxel_size or MESH_PIXELS * median / focal)
     for path in paths:
         write_mesh(path, mesh)
+
+
+def _measured(scene: Scene, depth: Tensor) -> Tensor:
+    """Where rendered depth ``[V, H, W]`` shows what a view has measured, not background or a guess."""
+    cameras = scene.cameras.to("cpu")
+    points = unproject(depth[None], cameras)[0]
+    status = torch.stack([point_support(view.flatten(0, 1), scene.depth, cameras)[0] for view in points])
+    return status.view_as(depth) >= Status.SINGLE
 
 
 def _images(scene: Scene, target: Path) -> None:
@@ -222,12 +239,16 @@ def _images(scene: Scene, target: Path) -> None:
 
 
 def _views(scene: Scene, path: Path) -> None:
-    """``images [V, H, W, 3]`` uint8; ``depth``, ``depth_conf`` and, where there is one, ``mask [V, H, W]`` float32."""
+    """``images [V, H, W, 3]`` uint8; ``depth``, ``depth_conf`` and, where known, ``mask``, ``error [V, H, W]`` float32.
+
+    ``support [V, H, W]`` is uint8.
+    """
     buffer = io.BytesIO()
     images = np.stack([to_pixels(image) for image in scene.images])
     arrays = {"images": images, "depth": scene.depth.numpy(), "depth_conf": scene.depth_conf.numpy()}
-    if scene.mask is not None:
-        arrays["mask"] = scene.mask.numpy()
+    for name in ("mask", "error", "support"):
+        if (values := getattr(scene, name)) is not None:
+            arrays[name] = values.numpy()
     np.savez_compressed(buffer, **arrays)  # pyright: ignore[reportArgumentType]
     write_bytes(path, buffer.getvalue())
 
@@ -261,6 +282,12 @@ def _tiles(scene: Scene, target: Path) -> None:
         write_tiles(folder, scene.gaussians)
 
 
+def _scene_ply(scene: Scene, path: Path) -> None:
+    """The Gaussians with what is known of them: ``support`` and, where it is stated, ``error``."""
+    known = {name: values.numpy() for name, values in (scene.gaussian_trust or {}).items()}
+    write_gaussian_ply(path, scene.gaussians, extra=known)
+
+
 def _points_ply(scene: Scene, path: Path) -> None:
     points = scene.points()
     write_point_ply(path, points.positions, points.colors)
@@ -282,6 +309,7 @@ _WRITERS: dict[str, Callable[[Scene, Path], Any]] = {
         lambda scene, path: write_gaussians(path, scene.gaussians),
     ),
     "tiles": _tiles,
+    "scene.ply": _scene_ply,
     "cameras.json": lambda scene, path: write_cameras_json(path, scene.named_cameras()),
     "points.ply": _points_ply,
     "views.npz": _views,

@@ -22,12 +22,14 @@ from vg2gt.reconstruction.monitor import Monitor
 from vg2gt.reconstruction.order import as_given, in_order, working_order
 from vg2gt.reconstruction.pictures import SFM_SOURCE, ImagesLike, spread
 from vg2gt.reconstruction.scene import Scene
+from vg2gt.reconstruction.trust import pixel_trust
 from vg2gt.reconstruction.windows.capture import AUTOMATIC, window_size
 from vg2gt.reconstruction.windows.run import WindowRun, window_model
 from vg2gt.reconstruction.windows.sets import Anchor
 from vg2gt.rendering import Renderer
 from vg2gt.runs.load import load_model
 from vg2gt.types import Gaussians, Geometry, Prediction
+from vg2gt.uncertainty import Calibration
 
 
 def reconstruct(
@@ -44,7 +46,7 @@ def reconstruct(
     """Builds a model and reconstructs a scene: :func:`load_model`, then :func:`reconstruct_with`."""
     ready = load_model(ckpt, backend, device=device)
     choice = {"every": every, "max_images": max_images, "size": size, "window": window}
-    return reconstruct_with(ready.model, images, renderer=ready.renderer, **choice)
+    return reconstruct_with(ready.model, images, renderer=ready.renderer, calibration=ready.calibration, **choice)
 
 
 @torch.no_grad()
@@ -65,6 +67,7 @@ def reconstruct_with(
     window_folder: str | Path | None = None,
     keep_windows: bool = False,
     anchor: Anchor | None = None,
+    calibration: Calibration | None = None,
 ) -> Scene:
     """Reconstructs a scene from any number of images.
 
@@ -87,6 +90,7 @@ def reconstruct_with(
             one.
         keep_windows: work in windows whatever the number of images: their voxels are wanted.
         anchor: of the scene that the images are added to (:mod:`vg2gt.reconstruction.windows.sets`).
+        calibration: of the model, by which errors are stated; None, or in windows: none are.
 
     Returns:
         The scene, in the frame that was asked for; its Gaussians stay on the model's device. Of a scene made in windows
@@ -116,6 +120,7 @@ def reconstruct_with(
         target = anchor.size if anchor else working_size(sizes, model.backend.patch_size, device.type, size)
         note_sizes({f"images of {target[0]}x{target[1]}": len(pictures)})
         size_of_windows, to_source = window_size(window, len(pictures), keep_windows or anchor is not None), None
+        error, support = None, None
         if size_of_windows:
             with _folder(window_folder) as kept:
                 run = WindowRun(window_model(model.eval()), pictures, target, size_of_windows, kept, monitor, anchor)
@@ -128,7 +133,9 @@ def reconstruct_with(
             prediction = _forward(model.eval(), views, order, device, monitor)
             geometry, gaussians = as_given(prediction.surface.detach(), order), prediction.gaussians
             unit = prediction.unit
+            error, support = pixel_trust(prediction, order, views.mask, calibration)
     scene = _scene(geometry, gaussians, float(unit), views, renderer or Renderer(), model.backend.is_metric, frame)
+    scene = replace(scene, error=error, support=support)
     if to_source is not None and scene.frame is not None:  # the same for all sets of images, to the last digit
         scene = replace(scene, frame=replace(scene.frame, to_source=to_source))
     scene = scene if model.visibility is None or anchor else with_far_shell(scene)

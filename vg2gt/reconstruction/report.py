@@ -17,16 +17,18 @@ from vg2gt.io.files import write_text
 from vg2gt.io.images import colorize_depth, colorize_normals, encode_image, grid, to_pixels, write_png
 from vg2gt.reconstruction.maps import AddView
 from vg2gt.reconstruction.pictures import spread
+from vg2gt.reconstruction.trust import trust_picture
 
 if TYPE_CHECKING:
     from vg2gt.reconstruction.scene import RenderedView, Scene
 
-PANELS = ("input", "rendered colour", "rendered depth", "rendered normals")
+PANELS = ("input", "rendered colour", "rendered depth", "rendered normals", "stated error")
+LEGEND = " (0.3 % blue to 30 % red; purple: contradicted, grey: guessed, black: unseen)"
 ROWS = 12
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 1280px; padding: 0 1rem; color: #222 }
 table { border-collapse: collapse } td, th { padding: 2px 12px 2px 0; text-align: left; vertical-align: top }
-.view { display: grid; grid-template-columns: repeat(4, 1fr); gap: 4px; margin-bottom: 1rem }
+.view { display: grid; grid-template-columns: repeat(5, 1fr); gap: 4px; margin-bottom: 1rem }
 .view img { width: 100% } h3 { margin: 0; font-size: 1rem; grid-column: 1 / -1 }
 """
 
@@ -45,7 +47,7 @@ def png_report(scene: Scene, path: Path) -> Iterator[AddView]:
     def add(view: RenderedView) -> None:
         number = wanted.get(view.camera.name)
         if number is not None:
-            rows.append(_panels(scene.images[number], view, depth_range))
+            rows.append(_panels(scene, number, view, depth_range))
 
     yield add
     write_png(path, grid(rows))
@@ -57,11 +59,11 @@ def html_rows(scene: Scene, rows: list[str]) -> Iterator[AddView]:
     depth_range = _depth_range(scene)
 
     def add(view: RenderedView) -> None:
-        panels = _panels(scene.images[len(rows)], view, depth_range)
+        panels = _panels(scene, len(rows), view, depth_range)
         images = "".join(
             f'<img src="{_data("image/jpeg", encode_image(to_pixels(panel), "JPEG", quality=88))}" '
             f'alt="{name}" title="{name}">'
-            for name, panel in zip(PANELS, panels, strict=True)
+            for name, panel in zip(PANELS, panels, strict=False)
         )
         rows.append(f'<div class="view"><h3>{html.escape(scene.names[len(rows)])}</h3>{images}</div>')
 
@@ -91,12 +93,16 @@ def write_html_report(
     write_text(
         path,
         f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title><style>{_STYLE}</style>'
-        f"<h1>{title}</h1><table>{table}</table>{moving}<p>{' | '.join(PANELS)}</p>{''.join(rows)}</html>\n",
+        f"<h1>{title}</h1><table>{table}</table>{moving}<p>{' | '.join(PANELS)}{LEGEND}</p>{''.join(rows)}</html>\n",
     )
 
 
-def _panels(image: Tensor, view: RenderedView, depth_range: tuple[float, float]) -> list[Tensor]:
-    return [image, view.color, colorize_depth(view.depth, *depth_range), colorize_normals(view.normal)]
+def _panels(scene: Scene, number: int, view: RenderedView, depth_range: tuple[float, float]) -> list[Tensor]:
+    depth, normals = colorize_depth(view.depth, *depth_range), colorize_normals(view.normal)
+    panels = [scene.images[number], view.color, depth, normals]
+    if scene.support is not None:
+        panels.append(trust_picture(None if scene.error is None else scene.error[number], scene.support[number]))
+    return panels
 
 
 def _depth_range(scene: Scene) -> tuple[float, float]:

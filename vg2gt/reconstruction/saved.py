@@ -65,6 +65,7 @@ def read_scene(folder: str | Path, renderer: Renderer, device: torch.device | st
         cameras_from="" if cameras_from == PREDICTED else cameras_from,
         frame=_frame(report, named[0]),
         mask=mask,
+        **_trust(folder / "views.npz", tuple(depth.shape)),
         poses=torch.from_numpy(np.stack([camera.world_to_camera for camera in named])),
     )
 
@@ -110,6 +111,16 @@ def _read_views(path: Path, views: int, size: tuple[int, int]) -> tuple[Tensor, 
     if mask is not None and mask.shape != depth.shape:
         raise FormatError(f"{path}: mask {tuple(mask.shape)} does not belong to depth {tuple(depth.shape)}")
     return images, depth.nan_to_num(0.0, 0.0, 0.0).clamp(min=0), conf.nan_to_num(0.0, 0.0, 0.0).clamp(min=0), mask
+
+
+def _trust(path: Path, shape: tuple[int, ...]) -> dict[str, Tensor]:
+    """``error`` and ``support`` of the pixels, as far as they are there."""
+    names = [name for name in ("error", "support") if path.is_file() and name in npz_names(path)]
+    arrays = read_npz(path, names) if names else {}
+    for name, array in arrays.items():
+        if array.shape != shape:
+            raise FormatError(f"{path}: {name} {array.shape} does not belong to depth {shape}")
+    return {name: torch.from_numpy(array) for name, array in arrays.items()}
 
 
 def _read_images(folder: Path, named: list[NamedCamera]) -> Tensor:

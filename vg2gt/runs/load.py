@@ -16,6 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from vg2gt.config import compose, compose_groups, flatten
+from vg2gt.io.tensors import tensors_digest
 from vg2gt.model import Reconstructor
 from vg2gt.rendering import Renderer
 from vg2gt.runs.checkpoints import (
@@ -27,6 +28,7 @@ from vg2gt.runs.checkpoints import (
     run_config_path,
 )
 from vg2gt.runs.trust import check_targets, parse_run_config, read_run_config
+from vg2gt.uncertainty import Calibration, read_calibration
 
 log = logging.getLogger(__name__)
 
@@ -53,11 +55,15 @@ class TrainedWeights:
 
 @dataclass(frozen=True)
 class LoadedModel:
-    """A model in eval mode on its device, its run's renderer (solids unless asked otherwise), its weights' origin."""
+    """A model in eval mode on its device, its run's renderer (solids unless asked otherwise), its weights' origin.
+
+    ``calibration`` bounds the errors of its depth; None: nobody has measured them (``vg2gt calibrate``).
+    """
 
     model: Reconstructor
     renderer: Renderer
     weights: TrainedWeights
+    calibration: Calibration | None = None
 
 
 def load_model(
@@ -94,7 +100,8 @@ def load_model(
     weights = load_weights(built, checkpoint)
     if checkpoint is None and built.trained_parameters():
         log.warning("no checkpoint: the head is untrained and makes coloured voxels (give ckpt for a trained one)")
-    return LoadedModel(built, replace(renderer, mode="solid", depth="median"), weights)
+    known = find_calibration(built, weights)
+    return LoadedModel(built, replace(renderer, mode="solid", depth="median"), weights, known)
 
 
 def model_parts(ckpt: str | Path | None, overrides: Sequence[str]) -> tuple[Path | None, dict[str, DictConfig]]:
@@ -238,6 +245,42 @@ def load_weights(model: Reconstructor, path: Path | None) -> TrainedWeights:
     refuse_not_finite(checkpoint["state_dict"], path)
     model.load_trained(model_state(checkpoint["state_dict"]), checkpoint.get("backend"))
     return TrainedWeights(path, int(checkpoint["global_step"]), hashlib.sha256(path.read_bytes()).hexdigest())
+
+
+def made_for(model: Reconstructor) -> str:
+    """What a calibration holds for: the trained part, in whatever file, or the backbone where nothing is trained."""
+    state = model.trained_state()
+    return tensors_digest(state) if state else model.backend.identity()["weights"]
+
+
+def calibration_path(checkpoint: Path) -> Path:
+    """Where the calibration of a checkpoint is: next to it, ``NAME.calibration.json``."""
+    return checkpoint.with_suffix(".calibration.json")
+
+
+def find_calibration(
+    model: Reconstructor, weights: TrainedWeights, path: str | Path | None = None
+) -> Calibration | None:
+    """The calibration of a model: the file that is named, else the one next to its checkpoint; None without one.
+
+    Raises:
+        FileNotFoundError: if the named file is not there.
+        ValueError: if a file is damaged, or the named one was made for other weights; one next to a checkpoint that was
+            is ignored with a warning.
+    """
+    named = path is not None
+    if path is None:
+        path = None if weights.path is None else calibration_path(weights.path)
+        if path is None or not path.is_file():
+            return None
+    found = read_calibration(path)
+    if found.made_for == made_for(model):
+        return found
+    message = f"{path} was made for other weights: make it again by vg2gt calibrate"
+    if named:
+        raise ValueError(message)
+    log.warning("%s; errors are not stated", message)
+    return None
 
 
 def choose_device(asked: str) -> torch.device:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import re
+from contextlib import suppress
 from pathlib import Path
 
-from vg2gt.io.files import write_text
+from vg2gt.io.files import write_bytes, write_text
 from vg2gt.runs.checkpoints import MADE_OF, checkpoint_path, read_checkpoint, write_slim
-from vg2gt.runs.load import SHIPPED, LoadedModel, load_model
+from vg2gt.runs.load import SHIPPED, LoadedModel, calibration_path, load_model
 
 WEIGHTS, CONFIG = "model.safetensors", "model.yaml"
+CALIBRATION = calibration_path(Path(WEIGHTS)).name
 MODELS = {"sweep-tiny": SHIPPED}
 """Names of the models in the package; their backbone's weights are in it too."""
 
@@ -40,12 +42,14 @@ def from_pretrained(
 
 
 def save_pretrained(ckpt: str | Path, folder: str | Path) -> Path:
-    """Writes the weights of a run's folder or checkpoint, and the configuration as YAML, into a folder."""
+    """Writes a checkpoint's weights, its configuration as YAML, and its calibration if there is one, into a folder."""
     folder = Path(folder).expanduser()
     folder.mkdir(parents=True, exist_ok=True)
     checkpoint = checkpoint_path(ckpt)
     assert checkpoint is not None
     write_slim(checkpoint, folder / WEIGHTS)
+    if (known := calibration_path(checkpoint)).is_file():
+        write_bytes(folder / CALIBRATION, known.read_bytes())
     write_text(folder / CONFIG, str(read_checkpoint(checkpoint)[MADE_OF]))
     return folder
 
@@ -69,7 +73,7 @@ def push_to_hub(ckpt: str | Path, repo: str, folder: str | Path, private: bool =
     saved = save_pretrained(ckpt, folder)
     api = HfApi()
     api.create_repo(repo, private=private, exist_ok=True)
-    return str(api.upload_folder(repo_id=repo, folder_path=str(saved), allow_patterns=[WEIGHTS, CONFIG]))
+    return str(api.upload_folder(repo_id=repo, folder_path=str(saved), allow_patterns=[WEIGHTS, CONFIG, CALIBRATION]))
 
 
 def _weights(name: str | Path, revision: str | None) -> Path:
@@ -84,8 +88,11 @@ def _weights(name: str | Path, revision: str | None) -> Path:
         return found
     try:
         from huggingface_hub import hf_hub_download  # pyright: ignore[reportMissingImports]
+        from huggingface_hub.errors import EntryNotFoundError  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise ImportError(
             f"{name} is no folder here; a model on the hub needs huggingface_hub: pip install 'vg2gt[hub]'"
         ) from error
+    with suppress(EntryNotFoundError):  # a model that nobody has calibrated
+        hf_hub_download(str(name), CALIBRATION, revision=revision)
     return Path(hf_hub_download(str(name), WEIGHTS, revision=revision))

@@ -16,6 +16,7 @@ from torch.optim.lr_scheduler import LambdaLR
 from vg2gt.evaluation.in_training import evaluate_scene
 from vg2gt.evaluation.protocols import training_cameras
 from vg2gt.geometry.cameras import focal_lengths
+from vg2gt.geometry.pose_noise import with_pose_noise
 from vg2gt.losses import LossReport
 from vg2gt.memory import dropped_by
 from vg2gt.model import VG2GT, Reconstructor
@@ -23,7 +24,6 @@ from vg2gt.profiling import stage
 from vg2gt.rendering import Renderer, UnrenderableError
 from vg2gt.runs.checkpoints import MADE_OF, MODEL_PREFIX, model_state
 from vg2gt.training.distributed import all_gather_object, interleave, world_size
-from vg2gt.training.pose_noise import with_pose_noise
 from vg2gt.training.schedule import cosine_with_warmup, parameter_groups
 from vg2gt.training.skipped import Fault, SkippedSteps, finite
 from vg2gt.types import Batch, Prediction

@@ -1,0 +1,171 @@
+"""What a scene says of itself: in files and pictures, and what is left when the worst is dropped."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from tests.reconstruction.conftest import run
+from vg2gt.cli import view as view_command
+from vg2gt.geometry.cameras import unproject
+from vg2gt.io import read_gaussian_ply, write_gaussian_ply
+from vg2gt.io.arrays import read_npz
+from vg2gt.io.ply import read_properties
+from vg2gt.reconstruction.outputs import write_outputs
+from vg2gt.reconstruction.pipeline import reconstruct_with
+from vg2gt.reconstruction.saved import read_scene
+from vg2gt.reconstruction.scene import Scene
+from vg2gt.reconstruction.trust import pixel_trust, trust_line, trust_picture, trusted
+from vg2gt.rendering import Renderer
+from vg2gt.runs import load
+from vg2gt.types import Cameras, Geometry, Prediction
+from vg2gt.uncertainty import LEVELS, Calibration, Status
+from vg2gt.uncertainty.calibration import GROUPS, Curve
+from vg2gt.uncertainty.evidence import EVIDENCE
+
+
+@pytest.fixture(scope="module")
+def calibration(ready) -> Calibration:
+    """The error is 1 % where depth steps by little, 20 % at edges, whatever else is known."""
+    knots = tuple(torch.tensor([-3.0, -2.0]) if name == "step" else torch.zeros(1) for name in EVIDENCE)
+    values = tuple(torch.tensor([0.0, 1.0]) if name == "step" else torch.zeros(1) for name in EVIDENCE)
+    bounds = torch.tensor([[0.01, 0.2]]) * torch.tensor(LEVELS)[:, None] / 0.9
+    curve = Curve(knots, values, torch.tensor([0.0, 1.0]), bounds)
+    return Calibration(dict.fromkeys(GROUPS, curve), ready.model.backend.identity()["weights"], 4)
+
+
+@pytest.fixture(scope="module")
+def stated(ready, recording, calibration) -> Scene:
+    return reconstruct_with(ready.model, recording, renderer=ready.renderer, calibration=calibration)
+
+
+@pytest.fixture(scope="module")
+def written(stated: Scene, tmp_path_factory) -> Path:
+    return write_outputs(
+        stated, tmp_path_factory.mktemp("out"), ["scene.ply", "cameras.json", "views.npz", "report.json", "report.html"]
+    )
+
+
+def test_pixels_know_what_supports_them(stated: Scene, scene: Scene) -> None:
+    assert stated.support.shape == stated.error.shape == stated.depth.shape
+    assert (stated.support == Status.AGREED).float().mean() > 0.6
+    assert scene.error is None  # without a calibration
+    assert torch.equal(scene.support, stated.support)
+
+
+def test_it_is_of_the_views_as_they_were_given() -> None:
+    depth = torch.full((1, 3, 8, 8), 2.0)
+    depth[0, 1, 2, 3] = 0  # the second view that is worked on is the first that was given
+    cameras = Cameras(torch.eye(4).repeat(1, 3, 1, 1), torch.eye(3).repeat(1, 3, 1, 1), (8, 8))
+    geometry = Geometry(depth, torch.ones_like(depth), cameras, torch.ones(1))
+    mask = torch.ones(3, 8, 8)
+    mask[2, 7, 7] = 0
+    prediction = Prediction(geometry, geometry, torch.ones(1), None, None)
+    _, status = pixel_trust(prediction, [2, 0, 1], mask, None)
+    assert (status == Status.GUESSED).nonzero().tolist() == [[0, 2, 3]]
+    assert (status == Status.UNSEEN).nonzero().tolist() == [[2, 7, 7]]
+
+
+def test_files_carry_it(written: Path, stated: Scene) -> None:
+    found = read_properties(written / "scene.ply", "error", "support", "nothing")
+    error, status = stated.gaussian_trust["error"], stated.gaussian_trust["support"]
+    assert set(found) == {"error", "support"}
+    np.testing.assert_allclose(found["error"], error.numpy(), rtol=1e-6)
+    np.testing.assert_array_equal(found["support"], status.numpy())
+    assert (status == Status.AGREED).float().mean() > 0.3
+    arrays = read_npz(written / "views.npz", ["error", "support"])
+    np.testing.assert_array_equal(arrays["error"], stated.error.numpy())
+    np.testing.assert_array_equal(arrays["support"], stated.support.numpy())
+
+
+def test_both_kinds_of_scenes_are_read(written: Path, stated: Scene, tmp_path: Path) -> None:
+    plain = read_gaussian_ply(write_gaussian_ply(tmp_path / "plain.ply", stated.gaussians))
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        assert torch.equal(getattr(read_gaussian_ply(written / "scene.ply"), name), getattr(plain, name))
+    assert read_properties(tmp_path / "plain.ply", "error") == {}
+
+
+def test_a_folder_brings_it_back(written: Path, stated: Scene, scene: Scene, tmp_path: Path) -> None:
+    back = read_scene(written, Renderer())
+    assert torch.equal(back.error, stated.error)
+    assert torch.equal(back.support, stated.support)
+    write_outputs(replace(scene, support=None), tmp_path, ["scene.ply", "cameras.json", "views.npz"])
+    assert read_scene(tmp_path, Renderer()).support is None  # of an earlier version
+
+
+def test_reports_say_it(written: Path, stated: Scene, scene: Scene) -> None:
+    trust = json.loads((written / "report.json").read_text())["trust"]
+    assert sum(trust["pixels"].values()) == pytest.approx(1, abs=1e-3)
+    assert trust["gaussians"]["agreed"] > 0.3
+    assert trust["level"] == 0.9
+    assert trust["error_of_pixels"] == pytest.approx(0.01, rel=1e-3)
+    assert (written / "report.html").read_text().count('alt="stated error"') == len(stated.names)
+    assert "within 1 % (90 % sure)" in trust_line(stated)
+    assert "no calibration" in trust_line(scene)
+
+
+def test_pictures_tell_errors_and_states_apart() -> None:
+    support = torch.tensor([Status.AGREED, Status.AGREED, Status.GUESSED, Status.CONTRADICTED, Status.UNSEEN])
+    small, large, *unknown = trust_picture(torch.tensor([0.003, 0.3, 1, 1, 1]), support).T
+    assert small[2] > small[0]  # blue
+    assert large[0] > large[2]  # red
+    assert len({tuple(color.tolist()) for color in unknown}) == 3
+
+
+def test_what_is_not_trusted_is_left_out(stated: Scene) -> None:
+    kept = trusted(stated, 0.95)
+    error = kept.gaussian_trust["error"]
+    assert len(error) == len(kept.gaussians) < len(stated.gaussians)
+    assert error.max() <= 0.05
+    assert (kept.depth > 0).sum() < (stated.depth > 0).sum()
+    agreed = trusted(stated, drop=["single", "guessed", "contradicted", "unseen"])
+    assert (agreed.gaussian_trust["support"] == Status.AGREED).all()
+    assert torch.equal(agreed.depth > 0, stated.support == Status.AGREED)
+    assert trusted(stated) is stated
+
+
+def test_impossible_wishes_are_refused(stated: Scene, scene: Scene) -> None:
+    with pytest.raises(ValueError, match="unknown; choose from unseen, guessed"):
+        trusted(stated, drop=["bad"])
+    with pytest.raises(ValueError, match=r"--min-confidence 2"):
+        trusted(stated, 2)
+    with pytest.raises(ValueError, match="vg2gt calibrate"):
+        trusted(scene, 0.9)
+    with pytest.raises(ValueError, match="no Gaussian is left"):
+        trusted(stated, 1)
+
+
+def test_meshes_leave_open_what_no_view_has_measured(stated: Scene, tmp_path: Path) -> None:
+    points = unproject(stated.depth[None], stated.cameras)[0]
+    center = points[0, 42, 56]
+    hole = (points - center).norm(dim=-1) < 0.3
+    unknown = replace(stated, depth=torch.where(hole, 0.0, stated.depth))  # its Gaussians are still there
+    inside = []
+    for name, scene in (("known", stated), ("unknown", unknown)):
+        write_outputs(scene, tmp_path / name, ["mesh.ply"])
+        vertices = torch.from_numpy(np.array(trimesh.load_mesh(tmp_path / name / "mesh.ply").vertices)).float()
+        inside.append(int(((vertices - center).norm(dim=-1) < 0.2).sum()))
+    assert inside[0] > 20
+    assert inside[1] == 0
+
+
+def test_the_command_filters_and_the_viewer_colours(recording, calibration, tmp_path, capsys, monkeypatch) -> None:
+    monkeypatch.setattr(load, "made_for", lambda *_: calibration.made_for)
+    path = calibration.write(tmp_path / "c.json")
+    run(
+        *(recording, "--out", tmp_path / "out", "--save", "scene.ply", "--refine", "0", "--calibration", path),
+        *("--drop", "contradicted,unseen", "--min-confidence", "0.95"),
+    )
+    assert "Gaussians: " in capsys.readouterr().out
+    assert read_properties(tmp_path / "out" / "scene.ply", "error")["error"].max() <= 0.05
+    view_command.main([str(tmp_path / "out" / "scene.ply"), "--color", "trust", "--html", str(tmp_path / "page.html")])
+    assert (tmp_path / "page.html").is_file()
+    plain = write_gaussian_ply(tmp_path / "plain.ply", read_gaussian_ply(tmp_path / "out" / "scene.ply"))
+    with pytest.raises(SystemExit, match="does not say what is known"):
+        view_command.main([str(plain), "--color", "trust", "--html", str(tmp_path / "page.html")])
+    with pytest.raises(SystemExit, match="choose from unseen"):
+        run(recording, "--out", tmp_path / "o", "--drop", "bad")

@@ -1,0 +1,111 @@
+"""Bounds hold as often as they say, whatever the backbone's confidence is worth."""
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+
+from vg2gt.io.errors import FormatError
+from vg2gt.metrics import ause
+from vg2gt.uncertainty import LEVELS, Calibration, Samples, Status, calibrate, read_calibration
+from vg2gt.uncertainty.calibration import MEASURED, SHAKY
+from vg2gt.uncertainty.evidence import EVIDENCE
+
+
+def pixels(seed: int, scenes: int = 20, each: int = 8000, useful: bool = True) -> Samples:
+    """Errors whose spread depends on the first two kinds of evidence and the status, or on nothing that is known."""
+    generator = torch.Generator().manual_seed(seed)
+    count = scenes * each
+    evidence = torch.randn(count, len(EVIDENCE), generator=generator)
+    evidence[:, 3] = 0.0  # never varies, as views that look through where none does
+    shaky = torch.arange(scenes) % 4 == 0  # views agree closely in few places, and errors are five times as large
+    evidence[:, -1] = torch.where(shaky, 0.4, 0.8).repeat_interleave(each)
+    status = torch.tensor(MEASURED)[torch.randint(3, (count,), generator=generator)]
+    hidden = torch.randn(count, 2, generator=generator)
+    cause = evidence[:, :2] if useful else hidden
+    spread = (
+        torch.where(evidence[:, -1] < SHAKY, 0.1, 0.02)
+        * torch.exp(0.8 * cause[:, 0] - 0.5 * cause[:, 1].abs())
+        * (6 - status)
+        / 2
+    )
+    error = (spread * torch.randn(count, generator=generator)).abs()
+    return Samples(evidence, status, error, torch.arange(count) // each)
+
+
+@pytest.fixture(scope="module")
+def made() -> Calibration:
+    return calibrate(pixels(0), "weights")
+
+
+@pytest.mark.parametrize("useful", [True, False], ids=["evidence tells", "evidence tells nothing"])
+def test_bounds_hold_as_often_as_they_say(useful: bool) -> None:
+    made, fresh = calibrate(pixels(0, useful=useful), "weights"), pixels(1, useful=useful)
+    bounds = made.bounds(fresh.evidence, fresh.status)
+    for level, bound in zip(LEVELS, bounds, strict=True):
+        for kind in MEASURED:
+            held = (fresh.error <= bound)[fresh.status == kind].float().mean()
+            assert held == pytest.approx(level, abs=0.02)
+        for shaky in (fresh.evidence[:, -1] < SHAKY, fresh.evidence[:, -1] >= SHAKY):
+            assert (fresh.error <= bound)[shaky].float().mean() == pytest.approx(level, abs=0.02)
+    assert (bounds.diff(dim=0) >= 0).all()
+
+
+def test_bounds_are_wide_where_errors_are_large(made: Calibration) -> None:
+    fresh = pixels(1)
+    bound = made.error(fresh.evidence, fresh.status)
+    for part in (fresh.evidence[:, 0] > 1, fresh.evidence[:, 0] < -1):
+        assert (fresh.error <= bound)[part].float().mean() == pytest.approx(0.9, abs=0.02)
+    assert ause(fresh.error, bound) < 0.5 * ause(fresh.error, torch.rand(len(bound)))
+
+
+def test_what_has_no_depth_is_unknown(made: Calibration) -> None:
+    status = torch.tensor([[Status.GUESSED, Status.UNSEEN, Status.AGREED]])
+    error = made.error(torch.zeros(1, 3, len(EVIDENCE)), status)
+    assert error.shape == (1, 3)
+    assert error[0, :2].tolist() == [1.0, 1.0]
+    assert error[0, 2] < 1
+
+
+def test_it_is_the_same_from_a_file(made: Calibration, tmp_path: Path) -> None:
+    back, fresh = read_calibration(made.write(tmp_path / "made.json")), pixels(2, each=100)
+    assert (back.made_for, back.scenes) == ("weights", 20)
+    torch.testing.assert_close(
+        back.bounds(fresh.evidence, fresh.status), made.bounds(fresh.evidence, fresh.status), rtol=1e-3, atol=1e-6
+    )
+
+
+@pytest.mark.parametrize(
+    ("old", "new"), [('"agreed"', '"agree"'), ('"confidence"', '"trust"'), ('"bounds"', '"bound"'), ("{", "[")]
+)
+def test_damaged_files_are_refused(made: Calibration, tmp_path: Path, old: str, new: str) -> None:
+    path = made.write(tmp_path / "made.json")
+    path.write_text(path.read_text().replace(old, new, 1))
+    with pytest.raises(FormatError, match=r"made.json is no calibration.*vg2gt calibrate"):
+        read_calibration(path)
+
+
+def test_values_that_are_not_finite_are_refused(made: Calibration, tmp_path: Path) -> None:
+    curves = dict(made.curves)
+    kind = (Status.AGREED, False)
+    curves[kind] = curves[kind].__class__(
+        curves[kind].knots, curves[kind].values, curves[kind].scores, curves[kind].bounds * math.nan
+    )
+    path = Calibration(curves, "weights", 4).write(tmp_path / "made.json")
+    with pytest.raises(FormatError, match="not finite"):
+        read_calibration(path)
+
+
+def test_few_scenes_or_pixels_are_refused() -> None:
+    with pytest.raises(ValueError, match="3 scenes"):
+        calibrate(pixels(0, scenes=3), "weights")
+    with pytest.raises(ValueError, match="400 pixels"):
+        calibrate(pixels(0, each=20), "weights")
+
+
+def test_a_status_without_pixels_takes_the_curve_of_all() -> None:
+    samples = pixels(0)
+    made = calibrate(samples.select(samples.status == Status.AGREED), "weights")
+    rare = torch.full((2,), int(Status.SINGLE), dtype=torch.uint8)
+    assert (made.error(samples.evidence[:2], rare) < 1).all()

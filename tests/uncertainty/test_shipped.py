@@ -1,0 +1,64 @@
+"""The calibration in the package: it belongs to the weights in the package, and holds on rooms that nobody has seen."""
+
+import pytest
+import torch
+
+from vg2gt.data import SyntheticScenes
+from vg2gt.evaluation.calibrate import decode
+from vg2gt.evaluation.stated import pixels_with_errors
+from vg2gt.runs.load import LoadedModel, load_model, made_for
+from vg2gt.types import Batch, Cameras
+from vg2gt.uncertainty import LEVELS, Samples
+
+SIZE = (112, 224)
+FIRST_SEED = 7_000_000  # far from the rooms of training, evaluation and calibration
+
+
+@pytest.fixture(scope="module")
+def shipped() -> LoadedModel:
+    return load_model(device="cpu")
+
+
+def room(number: int, views: int) -> Batch:
+    """Views of a fresh room, every other frame of its path."""
+    source = SyntheticScenes(1, FIRST_SEED + number, 2 * views, SIZE)
+    frames = source.load(source.scenes[0], range(0, 2 * views, 2))
+    cameras = Cameras(frames.world_to_camera[None], frames.intrinsics[None], SIZE)
+    ids = torch.arange(views)[None]
+    return Batch(frames.images[None], frames.depth[None], cameras, torch.tensor([True]), ids, source.scenes, views)
+
+
+def measured(model: LoadedModel, rooms: int, views: int) -> dict[str, float]:
+    """How much of all pixels is within the stated bounds, by level."""
+    parts = []
+    for number in range(rooms):
+        batch = room(number, views)
+        parts.append(pixels_with_errors(*decode(model.model, batch, batch.hints), batch, predicts_cameras=False))
+    pixels = Samples.joined(parts)
+    assert model.calibration is not None
+    bounds = model.calibration.bounds(pixels.evidence, pixels.status)
+    held = {
+        f"{level:.0%}": float((pixels.error <= bound).double().mean())
+        for level, bound in zip(LEVELS, bounds, strict=True)
+    }
+    return held | {"width": float(bounds[2].double().mean()), "median": float(pixels.error.median())}
+
+
+def test_it_belongs_to_the_shipped_weights(shipped: LoadedModel) -> None:
+    """Weights that are trained further need a new one: docs/guides/photos.md names the command."""
+    assert shipped.calibration is not None
+    assert shipped.calibration.made_for == made_for(shipped.model)
+    assert shipped.calibration.scenes >= 48
+
+
+def test_it_holds_on_a_few_rooms(shipped: LoadedModel) -> None:
+    found = measured(shipped, rooms=6, views=3)
+    assert found["90%"] == pytest.approx(0.9, abs=0.06), found
+    assert found["50%"] == pytest.approx(0.5, abs=0.15), found
+    assert found["width"] < 0.25, found
+
+
+@pytest.mark.slow
+def test_it_holds_on_a_thousand_views(shipped: LoadedModel) -> None:
+    found = measured(shipped, rooms=200, views=5)
+    assert found["90%"] == pytest.approx(0.9, abs=0.02), found

@@ -1,0 +1,16 @@
+"""``vg2gt calibrate``: the calibration of a checkpoint's stated errors."""
+
+from __future__ import annotations
+
+from omegaconf import DictConfig
+
+from vg2gt.cli.arguments import hydra_command
+from vg2gt.cli.commands import COMMANDS
+
+
+@hydra_command(COMMANDS["calibrate"], "calibrate")
+def main(config: DictConfig) -> None:
+    """Makes the calibration that the configuration describes."""
+    from vg2gt.evaluation.stated import make_calibration
+
+    make_calibration(config)

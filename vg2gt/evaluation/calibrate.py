@@ -1,0 +1,87 @@
+"""The calibration of a model's stated errors, from its configuration and the scenes of a data set."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import torch
+from hydra.utils import instantiate
+from omegaconf import DictConfig
+from torch import Tensor
+
+from vg2gt.data.datamodule import SceneDataModule
+from vg2gt.data.views.drawn import ViewSelection
+from vg2gt.evaluation.checks import refuse_training_views, refuse_without_hints
+from vg2gt.evaluation.run import view_counts
+from vg2gt.evaluation.stated import pixels_with_errors
+from vg2gt.geometry.pose_noise import with_pose_noise
+from vg2gt.geometry.precision import half_precision_on_gpu
+from vg2gt.model import VG2GT, Reconstructor
+from vg2gt.runs.checkpoints import checkpoint_path
+from vg2gt.runs.load import build_model, calibration_path, choose_device, load_weights, made_for, resolve_parts
+from vg2gt.types import Batch, Decoded, Hints
+from vg2gt.uncertainty import Samples, calibrate
+
+log = logging.getLogger(__name__)
+
+
+def make_calibration(config: DictConfig) -> Path:
+    """Makes the calibration of a model on the scenes of a data set and writes it next to the checkpoint.
+
+    Scenes take turns with the numbers of views that are asked for.
+
+    Raises:
+        FileNotFoundError: if the checkpoint, its configuration or the data is missing.
+        ValueError: if an option is wrong, the data has no dense depth, or there are too few scenes.
+    """
+    counts, checkpoint = view_counts(config.views), checkpoint_path(config.ckpt)
+    if config.out is None and checkpoint is None:
+        raise ValueError("without a checkpoint there is no place for the calibration: give out=FILE.json")
+    selection: ViewSelection = instantiate(config.selection, _convert_="all")
+    parts = resolve_parts(config, checkpoint)
+    datamodule: SceneDataModule = instantiate(config.data)
+    data = datamodule.evaluation_data()
+    scenes = list(data.source.scenes)[: datamodule.eval_scenes]
+    if not data.source.has_depth or not data.source.dense_depth:
+        raise ValueError(f"{type(data.source).__name__} has no dense depth to calibrate on; choose other data=")
+    chosen = [
+        sample
+        for place, count in enumerate(counts)
+        for sample in selection.choose(data.source, scenes[place :: len(counts)], count)
+    ]
+    refuse_training_views(checkpoint, data.source, chosen)
+    device = choose_device(config.device)
+    model = build_model(parts, config.seed, device)
+    refuse_without_hints(model, data.source)
+    load_weights(model, checkpoint)
+    found = []
+    for number, sample in enumerate(chosen):
+        batch = data[(sample,)].to(device)
+        decoded, keep = decode(model, batch, with_pose_noise(batch, config.pose_noise))
+        pixels = pixels_with_errors(decoded, keep, batch, model.backend.predicts_cameras, number)
+        found.append(_thinned(pixels, config.pixels, number))
+        log.info("scene %d of %d: %s, %d views", number + 1, len(chosen), sample.scene, len(sample.context))
+    path = Path(config.out) if config.out is not None else calibration_path(checkpoint)  # pyright: ignore
+    made = calibrate(Samples.joined(found), made_for(model))
+    made.write(path)
+    print(f"{path}: from {made.scenes} scenes, {sum(len(each.error) for each in found)} pixels")
+    return path
+
+
+@torch.no_grad()
+def decode(model: Reconstructor, batch: Batch, hints: Hints) -> tuple[Decoded, Tensor | None]:
+    """The decoded geometry, and which pixels a scene would be made of; without the scene where that saves time."""
+    with half_precision_on_gpu(batch.images):
+        if not isinstance(model, VG2GT):
+            prediction = model(batch.images, hints)
+            return prediction, prediction.supported
+        decoded = model.enhance(batch.images, hints)[1]
+        support = model.support(decoded.geometry, hints)
+    return decoded, None if support is None else support.keep
+
+
+def _thinned(pixels: Samples, most: int, seed: int) -> Samples:
+    """At most so many pixels, drawn at random."""
+    drawn = torch.randperm(len(pixels.error), generator=torch.Generator().manual_seed(seed))
+    return pixels.select(drawn[:most].sort().values)

@@ -1,0 +1,147 @@
+"""What a scene knows of itself: status and stated error of its pixels and Gaussians, and scenes without the worst."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from vg2gt.types import Prediction
+from vg2gt.uncertainty import STATED, Calibration, Status, pixel_evidence
+
+if TYPE_CHECKING:
+    from vg2gt.reconstruction.scene import Scene
+
+NAMES = {kind.name.lower(): kind for kind in Status}
+_COLORS = torch.tensor([[0.15, 0.15, 0.15], [0.45, 0.45, 0.45], [0.75, 0.1, 0.55]])  # of what has no stated depth
+_RAMP = torch.tensor([[0.1, 0.3, 0.75], [0.2, 0.7, 0.5], [0.95, 0.85, 0.2], [0.85, 0.2, 0.1]])
+_RAMP_ENDS = (0.003, 0.3)  # errors at its ends, spread by their logarithm
+
+
+def pixel_trust(
+    prediction: Prediction, order: Sequence[int], mask: Tensor | None, calibration: Calibration | None
+) -> tuple[Tensor | None, Tensor]:
+    """Stated error and status of the pixels of one scene, ``[V, H, W]`` each, of the views as they were given.
+
+    Args:
+        prediction: of the views in working order.
+        order: that order.
+        mask: ``[V, H, W]`` of the views as they were given; None: all pixels count.
+        calibration: of the model; None: no errors are stated.
+    """
+    evidence, status = pixel_evidence(prediction.geometry, prediction.supported)
+    error = None if calibration is None else calibration.error(evidence, status)
+    back = torch.tensor(order).argsort()
+    status = status.cpu()[back]
+    if mask is not None:
+        status[mask <= 0.5] = Status.UNSEEN
+    return None if error is None else error.cpu()[back], status
+
+
+def trusted(scene: Scene, min_confidence: float | None = None, drop: Sequence[str] = ()) -> Scene:
+    """The scene without Gaussians and depth that are not to be trusted.
+
+    Args:
+        scene: any.
+        min_confidence: one minus the largest stated error that stays, in [0, 1]; None: any stays.
+        drop: names of :class:`Status` to leave out, such as ``guessed``.
+
+    Raises:
+        ValueError: if a name is unknown, the number out of range, no errors are stated, or nothing would be left.
+    """
+    check_trust(min_confidence, drop)
+    if min_confidence is None and not drop:
+        return scene
+    if min_confidence is not None and scene.error is None:
+        raise ValueError(
+            "--min-confidence needs stated errors, and there is no calibration of this model: make one by vg2gt "
+            "calibrate, or use --drop"
+        )
+    unwanted = torch.tensor([NAMES[name] for name in drop])
+
+    def stays(error: Tensor | None, status: Tensor) -> Tensor:
+        good = ~torch.isin(status, unwanted)
+        return good if error is None or min_confidence is None else good & (error <= 1 - min_confidence)
+
+    known = scene.gaussian_trust
+    if known is None or scene.support is None:
+        raise ValueError("nothing is known of what supports this scene (it was made in windows): leave out --drop")
+    kept = stays(known.get("error"), known["support"])
+    if not kept.any():
+        raise ValueError("no Gaussian is left: lower --min-confidence or drop less")
+    gaussians = scene.gaussians.select(kept.to(scene.gaussians.means.device))
+    depth = torch.where(stays(scene.error, scene.support), scene.depth, 0.0)
+    left = replace(scene, gaussians=gaussians, depth=depth)
+    # What is known of the Gaussians that stay is what all depth said, also that which has gone.
+    left.__dict__["gaussian_trust"] = {name: values[kept] for name, values in known.items()}
+    return left
+
+
+def check_trust(min_confidence: float | None, drop: Sequence[str]) -> None:
+    """Checks the options of :func:`trusted`.
+
+    Raises:
+        ValueError: if a name is unknown or the number out of range.
+    """
+    if min_confidence is not None and not 0 <= min_confidence <= 1:
+        raise ValueError(f"--min-confidence {min_confidence}: give a number from 0 to 1, such as 0.95")
+    for name in drop:
+        if name not in NAMES:
+            raise ValueError(f"--drop {name}: unknown; choose from {', '.join(NAMES)}")
+
+
+def trust_figures(scene: Scene) -> dict[str, Any]:
+    """The figures of a report: shares of pixels and Gaussians by status, and the errors that are stated, if known."""
+    known = scene.gaussian_trust
+    if known is None or scene.support is None:
+        return {}
+    error, status = known.get("error"), known["support"]
+    figures: dict[str, Any] = {"pixels": _shares(scene.support), "gaussians": _shares(status)}
+    if scene.error is not None and (scene.depth > 0).any():
+        stated = scene.error[scene.depth > 0]
+        figures["level"] = STATED
+        figures["error_of_pixels"] = _median(stated)
+    if error is not None and (measured := status >= Status.SINGLE).any():
+        figures["error_of_gaussians"] = _median(error[measured])
+    return {"trust": figures}
+
+
+def trust_line(scene: Scene) -> str:
+    """What is known in one line, for a terminal."""
+    figures = trust_figures(scene).get("trust")
+    if figures is None:
+        return "what supports the Gaussians is not known in windows"
+    shares = ", ".join(f"{100 * share:.0f} % {name}" for name, share in figures["gaussians"].items() if share >= 0.005)
+    if "error_of_pixels" not in figures:
+        return f"Gaussians: {shares}; errors are not stated (no calibration of this model)"
+    error = 100 * figures["error_of_pixels"]
+    return f"Gaussians: {shares}; depth of the median pixel within {error:.2g} % ({100 * STATED:.0f} % sure)"
+
+
+def trust_picture(error: Tensor | None, support: Tensor) -> Tensor:
+    """Colours ``[3, ...]`` of stated errors and status ``[...]``: from blue (0.3 %) to red (30 % and more).
+
+    What is not known is dark grey (unseen), grey (guessed) and purple (contradicted). Without errors, blue is what
+    several views agree on and yellow what one view has measured.
+    """
+    if error is None:
+        place = torch.where(support == Status.AGREED, 0.0, 2 / 3)
+    else:
+        low, high = torch.tensor(_RAMP_ENDS).log()
+        place = ((error.clamp(min=1e-6).log() - low) / (high - low)).clamp(0, 1)
+    at = place * (len(_RAMP) - 1)
+    left = at.long().clamp(max=len(_RAMP) - 2)
+    color = torch.lerp(_RAMP[left], _RAMP[left + 1], (at - left)[..., None])
+    flat = _COLORS[support.long().clamp(max=len(_COLORS) - 1)]
+    return torch.where((support <= Status.CONTRADICTED)[..., None], flat, color).movedim(-1, 0)
+
+
+def _shares(status: Tensor) -> dict[str, float]:
+    return {kind.name.lower(): round(float((status == kind).float().mean()), 4) for kind in reversed(Status)}
+
+
+def _median(error: Tensor) -> float:
+    return float(f"{float(error.median()):.3g}")

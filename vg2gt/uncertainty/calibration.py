@@ -1,0 +1,266 @@
+"""From evidence to a bound of the relative error of depth that holds as often as it says (split conformal prediction).
+
+Pixels are taken in groups: by status, and by whether the views of their scene seldom agree closely, as with wrong
+poses. Of the rooms that a calibration is made of, one half orders the pixels of a group: the logarithm of the error is
+fitted by a sum of piecewise linear functions of the evidence. The other half says what that order means: pixels are
+binned by the fitted value, and the bounds of a bin are the quantiles of its errors (Lei et al., Distribution-Free
+Predictive Inference for Regression, 2018, in bins as in Mondrian conformal prediction). A bound therefore holds on
+average over rooms like these, whatever the backbone's confidence is worth.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from vg2gt.io.errors import FormatError
+from vg2gt.io.files import read_json, write_json
+from vg2gt.types import TensorRecord
+from vg2gt.uncertainty.evidence import EVIDENCE, Status
+
+LEVELS = (0.5, 0.8, 0.9, 0.95)
+STATED = 0.9  # the level of the bound that is called ``error``
+UNKNOWN = 1.0  # bound where nothing is known, and the largest that is stated
+MEASURED = (Status.CONTRADICTED, Status.SINGLE, Status.AGREED)  # what has a depth
+GROUPS = tuple((kind, shaky) for kind in MEASURED for shaky in (False, True))
+KNOTS, BINS = 8, 24
+SCENE_KNOTS = 2  # of evidence that a whole scene has in common, of which there are few values
+SHAKY = 0.57  # share of close agreement in a scene below which its poses are likely to be wrong: curves of its own
+FEWEST = 4  # scenes
+SMALLEST = 1e-4  # errors below are taken to be as large
+RIDGE = 1e-3  # per sample: evidence that never varies gets no weight
+LEAST = 50 * BINS  # pixels of a status that are enough
+
+
+@dataclass(frozen=True)
+class Samples(TensorRecord):
+    """Pixels with a known error.
+
+    Attributes:
+        evidence: ``[N, F]`` of :data:`vg2gt.uncertainty.evidence.EVIDENCE`.
+        status: ``[N]``, see :class:`vg2gt.uncertainty.evidence.Status`.
+        error: ``[N]`` relative to the decoded depth.
+        scene: ``[N]`` int64, which scene a pixel is of.
+    """
+
+    evidence: Tensor
+    status: Tensor
+    error: Tensor
+    scene: Tensor
+
+    def select(self, rows: Tensor) -> Samples:
+        """Some of the pixels."""
+        return self.map(lambda column: column[rows])
+
+    @staticmethod
+    def joined(parts: Sequence[Samples]) -> Samples:
+        """The pixels of several scenes."""
+        return Samples(*(torch.cat([getattr(part, each.name) for part in parts]) for each in fields(Samples)))
+
+
+@dataclass(frozen=True)
+class Curve:
+    """How evidence becomes bounds for the pixels of one status.
+
+    Attributes:
+        knots: for every kind of evidence, increasing places ...
+        values: ... and what is added to the logarithm of the error there.
+        scores: ``[K]`` increasing sums of the values.
+        bounds: ``[L, K]`` of the relative error there, at each of :data:`LEVELS`.
+    """
+
+    knots: tuple[Tensor, ...]
+    values: tuple[Tensor, ...]
+    scores: Tensor
+    bounds: Tensor
+
+    def score(self, evidence: Tensor) -> Tensor:
+        """Fitted logarithm of the error ``[N]`` up to a constant, of evidence ``[N, F]``."""
+        parts = zip(evidence.unbind(-1), self.knots, self.values, strict=True)
+        return torch.stack([_interpolate(column, knots, values) for column, knots, values in parts]).sum(0)
+
+    def __call__(self, evidence: Tensor) -> Tensor:
+        """Bounds ``[L, N]``."""
+        score = self.score(evidence)
+        return torch.stack([_interpolate(score, self.scores, bound.log()).exp() for bound in self.bounds])
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Bounds of the relative error of depth for one model.
+
+    Attributes:
+        curves: by status, and whether the scene is :data:`SHAKY`.
+        made_for: digest of the trained weights, or of the backbone's where nothing is trained.
+        scenes: number of scenes it was made of.
+    """
+
+    curves: Mapping[tuple[Status, bool], Curve]
+    made_for: str
+    scenes: int
+
+    def bounds(self, evidence: Tensor, status: Tensor) -> Tensor:
+        """Bounds ``[L, ...]`` at :data:`LEVELS` of evidence ``[..., F]``; 1 where no depth is measured."""
+        flat, statuses = evidence.flatten(0, -2), status.flatten()
+        found = torch.full((len(LEVELS), len(flat)), UNKNOWN, device=evidence.device)
+        for (kind, shaky), curve in self.curves.items():
+            rows = ((statuses == kind) & (_shaky(flat) == shaky)).nonzero()[:, 0]
+            found[:, rows] = curve(flat[rows]).clamp(max=UNKNOWN)
+        return found.unflatten(1, status.shape)
+
+    def error(self, evidence: Tensor, status: Tensor) -> Tensor:
+        """The bound ``[...]`` that nine of ten pixels stay below."""
+        return self.bounds(evidence, status)[LEVELS.index(STATED)]
+
+    @property
+    def digest(self) -> str:
+        """sha256 of what is written."""
+        return hashlib.sha256(json.dumps(self._content(), sort_keys=True).encode()).hexdigest()
+
+    def write(self, path: str | Path) -> Path:
+        """Writes it as JSON."""
+        return write_json(path, self._content())
+
+    def _content(self) -> dict[str, Any]:
+        curves = {
+            kind.name.lower() + "/shaky" * shaky: {
+                "knots": [_list(knots) for knots in curve.knots],
+                "values": [_list(values) for values in curve.values],
+                "scores": _list(curve.scores),
+                "bounds": [_list(bound) for bound in curve.bounds],
+            }
+            for (kind, shaky), curve in self.curves.items()
+        }
+        facts = {"evidence": list(EVIDENCE), "levels": list(LEVELS)}
+        return {"made_for": self.made_for, "scenes": self.scenes, **facts, "curves": curves}
+
+
+def read_calibration(path: str | Path) -> Calibration:
+    """Reads what :meth:`Calibration.write` has written.
+
+    Raises:
+        FileNotFoundError: if there is none.
+        FormatError: if it is damaged, or of a version with other evidence.
+    """
+    try:
+        content = read_json(path)
+        if content["evidence"] != list(EVIDENCE) or content["levels"] != list(LEVELS):
+            raise ValueError(f"it is made of {content['evidence']} at {content['levels']}")
+        curves = {
+            (Status[name.partition("/")[0].upper()], name.endswith("/shaky")): _curve(curve)
+            for name, curve in content["curves"].items()
+        }
+        if set(curves) != set(GROUPS):
+            raise ValueError("a status is missing")
+        return Calibration(curves, str(content["made_for"]), int(content["scenes"]))
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise FormatError(f"{path} is no calibration of this version ({error}): make it by vg2gt calibrate") from error
+
+
+def calibrate(samples: Samples, made_for: str) -> Calibration:
+    """Makes a calibration of pixels of many scenes; see the module.
+
+    A group with few scenes or pixels takes the curve of all.
+
+    Raises:
+        ValueError: if there are fewer than 4 scenes or too few pixels.
+    """
+    scenes = samples.scene.unique()
+    if len(scenes) < FEWEST or len(samples.error) < 2 * LEAST:
+        raise ValueError(
+            f"{len(scenes)} scenes with {len(samples.error)} pixels of known depth are too few for a calibration: give "
+            f"at least {FEWEST} scenes and {2 * LEAST} pixels"
+        )
+    whole, curves = _fit(*_halves(samples)), {}
+    for kind, shaky in GROUPS:
+        group = samples.select(_shaky(samples.evidence) == shaky)
+        halves = [half.select(half.status == kind) for half in _halves(group)]
+        enough = len(group.scene.unique()) >= FEWEST and min(len(half.error) for half in halves) >= LEAST
+        curves[kind, shaky] = _fit(*halves) if enough else whole
+    return Calibration(curves, made_for, len(scenes))
+
+
+def _halves(samples: Samples) -> tuple[Samples, Samples]:
+    """The pixels of every other scene, and the rest."""
+    first = torch.isin(samples.scene, samples.scene.unique()[::2])
+    return samples.select(first), samples.select(~first)
+
+
+def _shaky(evidence: Tensor) -> Tensor:
+    return evidence[..., EVIDENCE.index("scene")] < SHAKY
+
+
+def _fit(order: Samples, meaning: Samples) -> Curve:
+    """The curve that one half of the pixels orders and the other gives its meaning."""
+    knots = tuple(_knots(column, name) for column, name in zip(_thin(order.evidence).unbind(-1), EVIDENCE, strict=True))
+    basis = torch.cat(
+        [_hats(column.double(), k) for column, k in zip(order.evidence.unbind(-1), knots, strict=True)], 1
+    )
+    target = order.error.double().clamp(min=SMALLEST).log()
+    normal = basis.T @ basis + RIDGE * len(basis) * torch.eye(basis.shape[1], dtype=torch.float64)
+    solved = torch.linalg.solve(normal, basis.T @ (target - target.mean()))
+    values = solved.split([len(k) for k in knots])
+    curve = Curve(tuple(k.float() for k in knots), tuple(v.float() for v in values), torch.zeros(1), torch.ones(1, 1))
+    score = curve.score(meaning.evidence)
+    by_score = score.argsort(stable=True)
+    scores, bounds = [], []
+    for rows in by_score.tensor_split(BINS):
+        error = meaning.error[rows].clamp(min=SMALLEST).sort().values
+        ranks = [min(math.ceil((len(rows) + 1) * level), len(rows)) - 1 for level in LEVELS]
+        scores.append(score[rows].mean())
+        bounds.append(error[ranks])
+    return Curve(curve.knots, curve.values, torch.stack(scores), _increasing(torch.stack(bounds, 1)))
+
+
+def _knots(column: Tensor, name: str) -> Tensor:
+    """Quantiles ``[K]`` of one kind of evidence, increasing."""
+    steps = torch.linspace(0, 1, SCENE_KNOTS if name == "scene" else KNOTS, dtype=torch.float64)
+    return column.double().quantile(steps).unique()
+
+
+def _increasing(values: Tensor) -> Tensor:
+    """``values [L, K]`` made to increase along K, from below and from above alike: bins next to another are noisy."""
+    return (values.cummax(1).values + values.flip(1).cummin(1).values.flip(1)) / 2
+
+
+def _hats(column: Tensor, knots: Tensor) -> Tensor:
+    """Weights ``[N, K]`` of linear interpolation between knots."""
+    return torch.stack([_interpolate(column, knots, unit) for unit in torch.eye(len(knots)).to(knots)], 1)
+
+
+def _interpolate(places: Tensor, knots: Tensor, values: Tensor) -> Tensor:
+    """Piecewise linear through ``values [K]`` at ``knots [K]``, constant beyond them."""
+    knots, values = knots.to(places), values.to(places)
+    if len(knots) == 1:
+        return values.expand_as(places)
+    right = torch.bucketize(places.contiguous(), knots).clamp(1, len(knots) - 1)
+    share = ((places - knots[right - 1]) / (knots[right] - knots[right - 1]).clamp(min=1e-12)).clamp(0, 1)
+    return torch.lerp(values[right - 1], values[right], share)
+
+
+def _thin(rows: Tensor, most: int = 1_000_000) -> Tensor:
+    """At most so many rows, as :func:`torch.quantile` takes."""
+    return rows[:: max(1, -(-len(rows) // most))]
+
+
+def _list(values: Tensor) -> list[float]:
+    return [float(f"{value:.6g}") for value in values.tolist()]
+
+
+def _curve(content: Mapping[str, Any]) -> Curve:
+    knots, values = (tuple(torch.tensor(part) for part in content[name]) for name in ("knots", "values"))
+    scores, bounds = (torch.tensor(content[name]) for name in ("scores", "bounds"))
+    shapes = [part.shape for part in values] == [part.shape for part in knots]
+    if len(knots) != len(EVIDENCE) or not shapes or bounds.shape != (len(LEVELS), len(scores)):
+        raise ValueError("its arrays do not fit together")
+    if not all(part.isfinite().all() for part in (*knots, *values, scores, bounds)) or not (bounds > 0).all():
+        raise ValueError("it holds values that are not finite and positive")
+    return Curve(knots, values, scores, bounds)
