@@ -55,7 +55,7 @@ def test_it_holds_on_a_few_rooms(shipped: LoadedModel) -> None:
     found = measured(shipped, rooms=6, views=3)
     assert found["90%"] == pytest.approx(0.9, abs=0.06), found
     assert found["50%"] == pytest.approx(0.5, abs=0.15), found
-    assert found["width"] < 0.25, found
+    assert found["width"] < 0.35, found
 
 
 @pytest.mark.slow
