@@ -65,7 +65,7 @@ def read_scene(folder: str | Path, renderer: Renderer, device: torch.device | st
         cameras_from="" if cameras_from == PREDICTED else cameras_from,
         frame=_frame(report, named[0]),
         mask=mask,
-        **_trust(folder / "views.npz", tuple(depth.shape)),
+        **_trust(folder / "views.npz", tuple(depth.shape)),  # pyright: ignore[reportArgumentType]
         poses=torch.from_numpy(np.stack([camera.world_to_camera for camera in named])),
     )
 
