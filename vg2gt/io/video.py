@@ -268,7 +268,9 @@ def _write_mp4(path: Path, frames: Sequence[NDArray[np.uint8]], fps: float) -> P
     with replacing(path) as temporary:
         try:
             with av.open(f"file:{temporary}", "w", format="mp4", options={"movflags": "+faststart"}) as container:
-                stream = container.add_stream("libx264", Fraction(f"{fps:g}"), {"crf": _QUALITY})
+                # With its macroblock tree x264 gives other bytes for the same frames from time to time, even on one thread.
+                options = {"crf": _QUALITY, "x264-params": "mbtree=0"}
+                stream = container.add_stream("libx264", Fraction(f"{fps:g}"), options)
                 stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
                 stream.codec_context.thread_count = 1  # with more, the same frames give other bytes each time
                 for pixels in frames:
