@@ -268,7 +268,7 @@ def _write_mp4(path: Path, frames: Sequence[NDArray[np.uint8]], fps: float) -> P
     with replacing(path) as temporary:
         try:
             with av.open(f"file:{temporary}", "w", format="mp4", options={"movflags": "+faststart"}) as container:
-                # With its macroblock tree x264 gives other bytes for the same frames from time to time, even on one thread.
+                # With its macroblock tree x264 may give other bytes for the same frames, even on one thread.
                 options = {"crf": _QUALITY, "x264-params": "mbtree=0"}
                 stream = container.add_stream("libx264", Fraction(f"{fps:g}"), options)
                 stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
