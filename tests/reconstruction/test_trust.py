@@ -137,6 +137,9 @@ def test_impossible_wishes_are_refused(stated: Scene, scene: Scene) -> None:
         trusted(scene, 0.9)
     with pytest.raises(ValueError, match="no Gaussian is left"):
         trusted(stated, 1)
+    for wish in ({"min_confidence": 0.9}, {"drop": ["guessed"]}):
+        with pytest.raises(ValueError, match="made in windows"):
+            trusted(replace(stated, support=None, error=None), **wish)
 
 
 def test_meshes_leave_open_what_no_view_has_measured(stated: Scene, tmp_path: Path) -> None:

@@ -11,6 +11,6 @@ from vg2gt.cli.commands import COMMANDS
 @hydra_command(COMMANDS["calibrate"], "calibrate")
 def main(config: DictConfig) -> None:
     """Makes the calibration that the configuration describes."""
-    from vg2gt.evaluation.stated import make_calibration
+    from vg2gt.evaluation.calibrate import make_calibration
 
     make_calibration(config)

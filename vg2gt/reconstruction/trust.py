@@ -55,6 +55,12 @@ def trusted(scene: Scene, min_confidence: float | None = None, drop: Sequence[st
     check_trust(min_confidence, drop)
     if min_confidence is None and not drop:
         return scene
+    known = scene.gaussian_trust
+    if known is None or scene.support is None:
+        raise ValueError(
+            "nothing is known of what supports this scene (it was made in windows): leave out --drop and "
+            "--min-confidence, or take all images at once (--window 0)"
+        )
     if min_confidence is not None and scene.error is None:
         raise ValueError(
             "--min-confidence needs stated errors, and there is no calibration of this model: make one by vg2gt "
@@ -66,9 +72,6 @@ def trusted(scene: Scene, min_confidence: float | None = None, drop: Sequence[st
         good = ~torch.isin(status, unwanted)
         return good if error is None or min_confidence is None else good & (error <= 1 - min_confidence)
 
-    known = scene.gaussian_trust
-    if known is None or scene.support is None:
-        raise ValueError("nothing is known of what supports this scene (it was made in windows): leave out --drop")
     kept = stays(known.get("error"), known["support"])
     if not kept.any():
         raise ValueError("no Gaussian is left: lower --min-confidence or drop less")
