@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +13,7 @@ from vg2gt.data.synthetic.builder import Builder
 from vg2gt.data.synthetic.furniture import MAKERS
 from vg2gt.data.synthetic.renderer import World
 from vg2gt.data.synthetic.rooms import draw_lamps
-from vg2gt.data.synthetic.synthetic_scene import SyntheticScene, draw_highlights, level_poses
+from vg2gt.data.synthetic.synthetic_scene import SyntheticScene, level_poses
 from vg2gt.data.synthetic.textures import INDOOR, Pattern
 
 _STREAM = 3  # tells the random streams of these scenes from those of other variants with the same seed
@@ -67,10 +66,8 @@ class SyntheticObject(SyntheticScene):
             if rng.random() < 0.6:
                 _fill_room(builder, extent, farthest)
             world = _closed_world(builder, extent, floor)
-        if highlights:
-            world = replace(world, highlights=draw_highlights(stream, len(world.materials), highlights))
         poses = _aim(rng, position, target, 0.15 * max(radius, height / 2))
-        super().__init__(world, poses, field_of_view, size)
+        super().__init__(world, poses, field_of_view, size, stream, highlights)
 
 
 class SyntheticLandmark(SyntheticScene):
@@ -103,10 +100,8 @@ class SyntheticLandmark(SyntheticScene):
         position = np.stack((away * np.cos(along), away * np.sin(along), height), 1)
         _fill_open(builder, float(away.max()) + 8, 0.6 * _HORIZON)
         world = _open_world(builder, ground)
-        if highlights:
-            world = replace(world, highlights=draw_highlights(stream, len(world.materials), highlights))
         poses = _aim(rng, position, np.array([0.0, 0.0, rng.uniform(-1, 3)]), 0.3 * place)
-        super().__init__(world, poses, rng.uniform(0.9, 1.4), size)
+        super().__init__(world, poses, rng.uniform(0.9, 1.4), size, stream, highlights)
 
 
 def _bare_material(builder: Builder) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,7 @@ from examples.worlds import street
 from vg2gt.data.synthetic.builder import Builder
 from vg2gt.data.synthetic.renderer import World
 from vg2gt.data.synthetic.sky import draw_sky
-from vg2gt.data.synthetic.synthetic_scene import SyntheticScene, draw_highlights, level_poses
+from vg2gt.data.synthetic.synthetic_scene import SyntheticScene, level_poses
 from vg2gt.data.synthetic.textures import Pattern
 
 _STREAM = 2  # tells the random stream of outdoor scenes from that of rooms with the same seed
@@ -72,9 +72,7 @@ class SyntheticOutdoor(SyntheticScene):
         _scatter(builder, plan)
         builder.end_group()
         world = _finish(builder, ground)
-        if highlights:
-            world = replace(world, highlights=draw_highlights(stream, len(world.materials), highlights))
-        super().__init__(world, _camera_path(rng, num_frames), rng.uniform(1.1, 1.5), size)
+        super().__init__(world, _camera_path(rng, num_frames), rng.uniform(1.1, 1.5), size, stream, highlights)
 
 
 def _draw_plan(rng: np.random.Generator) -> _Plan:

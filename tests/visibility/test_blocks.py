@@ -35,7 +35,7 @@ def test_a_neighbourhood_counts_partners_among_its_views() -> None:
 def test_of_many_views_those_beyond_a_wall_are_no_partners(monkeypatch) -> None:
     _, geometry, _ = room(views=6)
     depth = geometry.depth[0].clone()
-    depth[4:] *= 0.3  # a wall stands before what these look at
+    depth[4:] *= 0.3  # a wall in front of what these look at
     before = choose_partners(depth, geometry.cameras, 2)
     assert torch.isin(torch.tensor([4, 5]), before[:4]).any()
     monkeypatch.setattr(check, "MANY", 5)

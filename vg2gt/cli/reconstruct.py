@@ -44,6 +44,7 @@ WINDOW = (
 REFINE = "steps of refinement on the images; default: 400 for photographs, 0 for RGB-D recordings; 0: feed-forward"
 
 if TYPE_CHECKING:
+    from vg2gt.reconstruction.monitor import Monitor
     from vg2gt.reconstruction.scene import Scene
     from vg2gt.refinement import RefineOptions
     from vg2gt.runs.load import LoadedModel
@@ -94,68 +95,22 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     """Reconstructs and writes."""
-    from vg2gt.io.video import require_pyav
     from vg2gt.memory import RECONSTRUCTION, memory_advice
-    from vg2gt.reconstruction.cameras import check_depth, check_pycolmap
-    from vg2gt.reconstruction.changes import add_images, take_out
     from vg2gt.reconstruction.monitor import Monitor
-    from vg2gt.reconstruction.outputs import check_folder, check_outputs, cost_figures, write_outputs
-    from vg2gt.reconstruction.pictures import check_choice, check_pictures, existing_path
-    from vg2gt.reconstruction.pipeline import reconstruct_with
+    from vg2gt.reconstruction.outputs import cost_figures, write_outputs
     from vg2gt.reconstruction.refined import refine_scene
-    from vg2gt.reconstruction.trust import check_trust, trust_line, trusted
-    from vg2gt.reconstruction.windows.capture import window_size
-    from vg2gt.reconstruction.windows.run import window_model
+    from vg2gt.reconstruction.trust import trust_line, trusted
     from vg2gt.reconstruction.windows.sets import tidy
-    from vg2gt.runs.load import backend_class, choose_device, find_calibration, load_model
+    from vg2gt.runs.load import choose_device, load_model
 
     changed = options.add or options.take_out
     options.out = str(Path(changed or options.out).expanduser())
     options.overwrite |= changed is not None
-    check_outputs(options.save)
-    check_folder(options.out, [*options.save, REFINED], options.overwrite)
-    check_choice(options.every, options.max_images)
-    window_size(options.window, 0)
-    check_trust(options.min_confidence, options.drop)
-    for item in options.images:  # before weights are downloaded
-        existing_path(item)
-    kind = backend_class(options.ckpt, overrides)
-    if getattr(kind, "needs_depth", False):
-        check_depth(kind.__name__, options.images)
-    check_pictures(options.images, options.skip_damaged)
-    if options.poses == "sfm" or (options.poses != "backbone" and getattr(kind, "needs_cameras", False)):
-        check_pycolmap(options.images, options.poses)
-    if "orbit.mp4" in options.save:
-        require_pyav("writing orbit.mp4")
+    _check(options, overrides)
     with Monitor(show=not options.quiet, device=choose_device(options.device)) as monitor:
         with monitor.stage("load model"):
             ready = load_model(options.ckpt, overrides=overrides, device=options.device)
-            calibration = ready.calibration
-            if options.calibration is not None:
-                calibration = find_calibration(ready.model, ready.weights, options.calibration)
-        renderer = replace(ready.renderer, mode=options.mode)
-        if changed:
-            change = add_images if options.add else take_out
-            place = (Path(options.out), options.images)
-            scene = change(window_model(ready.model), *place, renderer, monitor, options.window)
-        else:
-            scene = reconstruct_with(
-                ready.model,
-                options.images,
-                every=options.every,
-                max_images=options.max_images,
-                size=options.size,
-                renderer=renderer,
-                monitor=monitor,
-                poses=options.poses,
-                sfm_folder=Path(options.out) / SFM,
-                frame=options.frame,
-                skip_damaged=options.skip_damaged,
-                window=options.window,
-                window_folder=Path(options.out) / WINDOWS,
-                keep_windows=options.keep_windows,
-                calibration=calibration,
-            )
+        scene = _scene(options, ready, monitor)
         how = _refinement(scene, options.refine)
         if how is not None:
             scene = refine_scene(scene, how, monitor)
@@ -191,6 +146,65 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     print(f"written: {', '.join(str(folder / name) for name in (*options.save, *more))}")
 
 
+def _check(options: argparse.Namespace, overrides: Sequence[str]) -> None:
+    """Refuses what cannot work before weights are downloaded or any work is done."""
+    from vg2gt.io.video import require_pyav
+    from vg2gt.reconstruction.cameras import check_depth, check_pycolmap
+    from vg2gt.reconstruction.outputs import check_folder, check_outputs
+    from vg2gt.reconstruction.pictures import check_choice, check_pictures, existing_path
+    from vg2gt.reconstruction.trust import check_trust
+    from vg2gt.reconstruction.windows.capture import window_size
+    from vg2gt.runs.load import backend_class
+
+    check_outputs(options.save)
+    check_folder(options.out, [*options.save, REFINED], options.overwrite)
+    check_choice(options.every, options.max_images)
+    window_size(options.window, 0)
+    check_trust(options.min_confidence, options.drop)
+    for item in options.images:
+        existing_path(item)
+    kind = backend_class(options.ckpt, overrides)
+    if getattr(kind, "needs_depth", False):
+        check_depth(kind.__name__, options.images)
+    check_pictures(options.images, options.skip_damaged)
+    if options.poses == "sfm" or (options.poses != "backbone" and getattr(kind, "needs_cameras", False)):
+        check_pycolmap(options.images, options.poses)
+    if "orbit.mp4" in options.save:
+        require_pyav("writing orbit.mp4")
+
+
+def _scene(options: argparse.Namespace, ready: LoadedModel, monitor: Monitor) -> Scene:
+    """A new scene, or the one in the folder with images added or taken out."""
+    from vg2gt.reconstruction.changes import add_images, take_out
+    from vg2gt.reconstruction.pipeline import reconstruct_with
+    from vg2gt.reconstruction.windows.run import window_model
+    from vg2gt.runs.load import find_calibration
+
+    calibration, renderer, out = ready.calibration, replace(ready.renderer, mode=options.mode), Path(options.out)
+    if options.calibration is not None:
+        calibration = find_calibration(ready.model, ready.weights, options.calibration)
+    if options.add or options.take_out:
+        change = add_images if options.add else take_out
+        return change(window_model(ready.model), out, options.images, renderer, monitor, options.window)
+    return reconstruct_with(
+        ready.model,
+        options.images,
+        every=options.every,
+        max_images=options.max_images,
+        size=options.size,
+        renderer=renderer,
+        monitor=monitor,
+        poses=options.poses,
+        sfm_folder=out / SFM,
+        frame=options.frame,
+        skip_damaged=options.skip_damaged,
+        window=options.window,
+        window_folder=out / WINDOWS,
+        keep_windows=options.keep_windows,
+        calibration=calibration,
+    )
+
+
 def _refinement(scene: Scene, steps: int | None) -> RefineOptions | None:
     """How a scene is refined: photographs unless ``steps`` is 0, recordings and long captures only if it is given."""
     from vg2gt.reconstruction.refined import refinement_of
@@ -201,7 +215,7 @@ def _refinement(scene: Scene, steps: int | None) -> RefineOptions | None:
         return None
     how = options_for(scene, steps=steps)
     if steps is None:
-        print(f"refining for {how.steps} steps, about 30 s on two cores; --refine 0 gives the feed-forward scene")
+        print(f"refining for {how.steps} steps, up to a minute on two cores; --refine 0 gives the feed-forward scene")
     return how
 
 

@@ -2,8 +2,8 @@
 
 A pixel's ray is ``r = (u, v, 1)`` and its point ``d r``. The chord between the points of its left and right neighbours,
 of depths d0 and d1, is ``(d1 - d0) r + (d1 + d0) / fx e_x``; with the chord of the column, the cross product is
-proportional to ``(gx, gy, -1 - u gx - v gy)``, ``gx = fx (d1 - d0) / (d1 + d0)`` and gy likewise: it never vanishes and
-always faces the camera. kornia's ``depth_to_normals`` knows neither holes nor depth edges.
+proportional to ``(gx, gy, -1 - u gx - v gy)``, ``gx = fx (d1 - d0) / (d1 + d0)`` and the same for ``gy``: it never
+vanishes and always faces the camera. kornia's ``depth_to_normals`` knows neither holes nor depth edges.
 """
 
 from __future__ import annotations

@@ -25,12 +25,7 @@ from vg2gt.rendering import Renderer
 
 
 def add_images(
-    model: VG2GT,
-    folder: Path,
-    images: ImagesLike,
-    renderer: Renderer,
-    monitor: Monitor,
-    window: int | None = None,
+    model: VG2GT, folder: Path, images: ImagesLike, renderer: Renderer, monitor: Monitor, window: int | None = None
 ) -> Scene:
     """The scene in a folder with more images, whose cameras are given in the same frame; writes no outputs.
 
@@ -67,12 +62,7 @@ def add_images(
 
 
 def take_out(
-    model: VG2GT,
-    folder: Path,
-    images: ImagesLike,
-    renderer: Renderer,
-    monitor: Monitor,
-    window: int | None = None,
+    model: VG2GT, folder: Path, images: ImagesLike, renderer: Renderer, monitor: Monitor, window: int | None = None
 ) -> Scene:
     """The scene in a folder without images that one command has added; arguments as for :func:`add_images`.
 

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
 from vg2gt.data.synthetic.builder import Builder
 from vg2gt.data.synthetic.furniture import MAKERS
 from vg2gt.data.synthetic.renderer import World
-from vg2gt.data.synthetic.synthetic_scene import SyntheticScene, draw_highlights, level_poses
+from vg2gt.data.synthetic.synthetic_scene import SyntheticScene, level_poses
 from vg2gt.data.synthetic.textures import INDOOR, Pattern
 
 _FLOOR_PATTERNS = (Pattern.CHECKS, Pattern.BRICKS, Pattern.CLOUDS, Pattern.WOOD, Pattern.MOSAIC, Pattern.PLANKS)
@@ -33,17 +31,16 @@ class SyntheticRoom(SyntheticScene):
     version = 1  # raise it whenever the same seed would give other pixels
 
     def __init__(self, seed: int, num_frames: int, size: tuple[int, int], highlights: bool | str = False) -> None:
-        rng = np.random.default_rng((self.version, seed))
+        stream = (self.version, seed)
+        rng = np.random.default_rng(stream)
         extent = rng.uniform((3.5, 3.5, 2.4), (7.0, 7.0, 3.3))
         builder = Builder(rng)
         shell = _shell_materials(builder)
         _hang_pictures(builder, extent)
         occupied = _furnish(builder, extent)
         world = _finish(builder, extent, shell)
-        if highlights:
-            world = replace(world, highlights=draw_highlights((self.version, seed), len(world.materials), highlights))
         poses = self._path(rng, extent, occupied, num_frames)
-        super().__init__(world, poses, rng.uniform(1.2, 1.55), size)
+        super().__init__(world, poses, rng.uniform(1.2, 1.55), size, stream, highlights)
 
     def _path(
         self, rng: np.random.Generator, extent: NDArray[np.float64], occupied: NDArray[np.float64], count: int

@@ -25,6 +25,8 @@ class SyntheticScene:
         camera_to_world: ``[n, 4, 4]`` OpenCV.
         field_of_view: along the longer side of the image, rad.
         size: image ``(height, width)``.
+        stream: names the random stream of the scene.
+        highlights: as in :func:`draw_highlights`; nothing but the colour changes.
 
     Attributes:
         world_to_camera: ``[n, 4, 4]`` float64.
@@ -33,8 +35,16 @@ class SyntheticScene:
     """
 
     def __init__(
-        self, world: World, camera_to_world: NDArray[np.float64], field_of_view: float, size: tuple[int, int]
+        self,
+        world: World,
+        camera_to_world: NDArray[np.float64],
+        field_of_view: float,
+        size: tuple[int, int],
+        stream: tuple[int, ...] = (),
+        highlights: bool | str = False,
     ) -> None:
+        if highlights:
+            world = replace(world, highlights=draw_highlights(stream, len(world.materials), highlights))
         self.world = world
         self.size = size
         self.develop: Callable[[NDArray[np.uint8], int], NDArray[np.uint8]] | None = None

@@ -27,9 +27,8 @@ TOLERANCE, MARGIN = 0.05, 0.1  # of depth, in that check
 ROUNDS = 50  # of the pose graph's solver
 APART = 2  # windows between those that a loop joins
 
-
-Edge: TypeAlias = "tuple[int, int, NDArray[np.float64], int]"
-"""Windows a and b, the similarity from a's frame to b's, and how many views they share."""
+Edge: TypeAlias = "tuple[int, int, NDArray[np.float64]]"
+"""Windows a and b, and the similarity from a's frame to b's."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +89,6 @@ def _solved(
     depths = [float(each.depth[each.depth > 0].median()) if (each.depth > 0).any() else 1.0 for each in found]
     a, b = np.array([edge[:2] for edge in edges]).T
     measured = np.stack([edge[2] for edge in edges])
-    weight = np.full((len(edges), 1), 1 / OUTLIER)
     lengths = (np.exp(start[:, 0]) * depths)[a, None]  # in the first window's unit
 
     def misfits(flat: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -100,7 +98,7 @@ def _solved(
         return np.column_stack((wanted[:, 0] - poses[a, 0], turn, (wanted[:, 4:] - poses[a, 4:]) / lengths))
 
     result = least_squares(
-        lambda flat: (weight * misfits(flat)).ravel(),
+        lambda flat: misfits(flat).ravel() / OUTLIER,
         start[1:].ravel(),
         loss="soft_l1",
         x_scale="jac",
@@ -154,7 +152,7 @@ def _edges(found: Sequence[Found], last: Found) -> list[Edge]:
     for number, each in enumerate(found):
         shared = each.views[torch.isin(each.views, last.views)]
         if len(shared) >= 2:
-            edges.append((number, len(found), _between(each.exact(shared), last.exact(shared)), len(shared)))
+            edges.append((number, len(found), _between(each.exact(shared), last.exact(shared))))
     return edges
 
 
@@ -178,7 +176,7 @@ def _chained(edges: Sequence[Edge], known: NDArray[np.float64], count: int) -> N
         found = [edge for edge in edges if edge[1] == node]
         if not found:
             raise ValueError(f"window {node} shares no views with those before: take larger windows")
-        other, _, move, _ = found[-1]
+        other, _, move = found[-1]
         poses.append(_compose(poses[other][None], _inverse(move))[0])
     return np.stack(poses)
 

@@ -16,6 +16,13 @@ from vg2gt.method.additions.visibility.counts import count_views, depth_ratio
 from vg2gt.method.additions.visibility.moved import LEAST, moved
 from vg2gt.types import Cameras, Geometry, TensorRecord
 
+STRIDE = 4  # pixels between those whose disagreement is measured, along each axis
+NEIGHBORS = 8  # partners of a view whose disagreement is measured
+SAMPLES = 12  # pixels a side of the grid that overlap is measured on
+MANY, MORE = 100, 4  # views beyond which partners must see a point and are more, and how many times
+BEHIND = 1.1  # of a view's depth: what lies farther is hidden from it
+LEAST_OVERLAP = 0.02  # share of a view's samples that a partner has in its image
+
 
 @dataclass(frozen=True)
 class Support(TensorRecord):
@@ -109,10 +116,6 @@ def _scene(geometry: Geometry, index: int) -> tuple[Tensor, Cameras]:
     return depth, Cameras(cameras.world_to_camera[one], cameras.intrinsics[one], cameras.size)
 
 
-STRIDE = 4  # pixels between those that are looked at, along each axis
-NEIGHBORS = 8  # partners of a view that are looked at
-
-
 @torch.no_grad()
 def disagreement(depth: Tensor, cameras: Cameras, partners: Tensor) -> Tensor:
     """Median relative difference of a point's depth in another view and that view's own, in pixels (times the focal).
@@ -136,12 +139,6 @@ def disagreement(depth: Tensor, cameras: Cameras, partners: Tensor) -> Tensor:
         ratios.append((ratio - 1).abs()[known])
     every = torch.cat(ratios) if ratios else depth.new_zeros(0)
     return every.median() * intrinsics[:, [0, 1], [0, 1]].mean() if len(every) else depth.new_zeros(())
-
-
-SAMPLES = 12  # pixels a side of the grid that overlap is measured on
-MANY, MORE = 100, 4  # views beyond which partners must see a point and are more, and how many times
-BEHIND = 1.1  # of a view's depth: what lies farther is hidden from it
-LEAST_OVERLAP = 0.02  # share of a view's samples that a partner has in its image
 
 
 @torch.no_grad()
