@@ -115,7 +115,7 @@ def _pictures(cameras: Sequence[NamedCamera], folders: Sequence[Path]) -> list[N
             print(f"{found} of {len(cameras)} cameras have their image in {folder}")
             return pictures
     looked = " or ".join(str(folder) for folder in folders)
-    print(f"0 of {len(cameras)} cameras have their image in {looked}; --images names another folder")
+    print(f"photographs are not shown: none in {looked} (reconstruct with --save images, or --images DIR)")
     return []
 
 
