@@ -86,7 +86,11 @@ class Backend(nn.Module, ABC):
     def decode(self, tokens: Tokens) -> Geometry:
         """Runs the frozen heads in float32; equal tokens give bit-equal geometry.
 
-        Depth and confidence are differentiable in ``tokens.patch`` where ``supports_gradient``; the cameras are raw.
+        Args:
+            tokens: from ``encode``, the patch tokens possibly changed.
+
+        Returns:
+            Depth and confidence (differentiable in ``tokens.patch`` where ``supports_gradient``) and raw cameras.
         """
 
     def decode_cameras(self, tokens: Tokens) -> Cameras:
@@ -142,7 +146,13 @@ class Backend(nn.Module, ABC):
             )
 
     def as_tokens(self, images: Tensor, patch: Sequence[Tensor], camera: Tensor) -> Tokens:
-        """The float32 tokens of ``images``: ``patch [B, V, P, D]`` of every tapped layer, ``camera [B, V, Dc]``."""
+        """Returns, in float32, the tokens that a backbone made of ``images``.
+
+        Args:
+            images: ``[B, V, 3, H, W]``.
+            patch: ``[B, V, P, D]`` of every tapped layer.
+            camera: ``[B, V, Dc]``.
+        """
         size = (images.shape[-2], images.shape[-1])
         grid = (size[0] // self.patch_size, size[1] // self.patch_size)
         return Tokens(tuple(tap.float() for tap in patch), camera.float(), grid, size)

@@ -45,6 +45,9 @@ class SceneScale:
             ``normalize`` (the median depth of the scene becomes ``median_depth``) or ``groundtruth`` (training only:
             the weighted-median alignment to the depth in the hints).
         median_depth: the median depth after ``normalize``, in scene units.
+
+    Raises:
+        ValueError: if the source is unknown.
     """
 
     def __init__(self, source: ScaleSource = "normalize", median_depth: float = 1.0) -> None:
@@ -126,9 +129,15 @@ class Reconstructor(nn.Module, ABC):
     def read_views(
         self, images: Tensor, hints: Hints | None, unit: Tensor | None = None
     ) -> tuple[Tokens, Geometry, Tensor]:
-        """Runs the frozen backbone (eqn preliminary_vggt): tokens, geometry in the scene frame, unit ``[B]``.
+        """Runs the frozen backbone (paper, eqn preliminary_vggt).
 
-        A given ``unit`` takes the place of the model's own.
+        Args:
+            images: ``[B, V, 3, H, W]`` in [0, 1].
+            hints: what the data knows of these views.
+            unit: ``[B]`` scene units per unit of the backbone; None: the model's own.
+
+        Returns:
+            Its tokens, its geometry in scene units and in the frame of view 0, and the unit ``[B]``.
         """
         scenes, views, _, height, width = images.shape
         note_sizes({f"images of {height}x{width} in {scenes} scene{'s' * (scenes > 1)}": scenes * views}, first=True)
@@ -138,7 +147,12 @@ class Reconstructor(nn.Module, ABC):
         return tokens, _to_scene_frame(raw, unit), unit
 
     def run_backbone(self, images: Tensor, hints: Hints | None) -> tuple[Tokens, Geometry]:
-        """Tokens of images ``[B, V, 3, H, W]`` and the geometry they decode to; from the cache if there is one."""
+        """The backbone's tokens and the geometry that its heads decode of them; from the cache where there is one.
+
+        Args:
+            images: ``[B, V, 3, H, W]`` in [0, 1].
+            hints: what the data knows of these views.
+        """
         if self.token_cache is not None and self.backend.frozen:
             with stage("encode"):
                 return self.token_cache.read(self.backend, images, hints)
@@ -148,7 +162,12 @@ class Reconstructor(nn.Module, ABC):
             return tokens, self.backend.decode(tokens)
 
     def predict_cameras(self, images: Tensor, hints: Hints | None) -> Cameras:
-        """The raw cameras of images ``[B, V, 3, H, W]`` alone; from the cache if there is one."""
+        """The backbone's raw cameras alone, from the cache where there is one.
+
+        Args:
+            images: ``[B, V, 3, H, W]`` in [0, 1].
+            hints: what the data knows of these views.
+        """
         with stage("cameras"):
             if self.token_cache is not None and self.backend.frozen:
                 return self.token_cache.cameras(self.backend, images, hints)
@@ -208,7 +227,11 @@ class Reconstructor(nn.Module, ABC):
         self.load_state_dict(state, strict=False)
 
     def check_backend(self, stored: Mapping[str, Any] | None) -> None:
-        """Refuses weights that were trained on another backbone, naming both."""
+        """Refuses weights that were trained on another backbone.
+
+        Raises:
+            ValueError: naming both.
+        """
         present = dict(self.backend.identity())
         if stored != present:
             raise ValueError(
@@ -220,12 +243,19 @@ class Reconstructor(nn.Module, ABC):
 class VG2GT(Reconstructor):
     """Feed-forward Gaussian reconstruction on a frozen backbone (paper, eqn propose).
 
-    Args (the others: see :class:`Reconstructor`; ``visibility`` checks the enhanced geometry before the fine level):
+    Args:
+        backend: the frozen visual foundation model.
+        scale: fixes the scene unit.
         coarse: makes the coarse-level feature enhancement from ``token_dims`` and ``patch_size``; None leaves it out
             (ablation w/o Coarse): the geometry is then the backbone's.
         fine: makes the fine-level voxel module from ``token_dims`` and ``patch_size``.
         gaussians: makes the self-splitting Gaussian head from ``in_channels``.
         keep_scale: the enhanced depth keeps the scale of the backbone's, see :func:`with_scale_of`.
+        background: see :class:`Reconstructor`.
+        visibility: see :class:`Reconstructor`; it checks the enhanced geometry before the fine level.
+
+    Raises:
+        ValueError: if the scale is to be metric and the backend is not, or the background is unknown.
     """
 
     def __init__(
@@ -249,7 +279,16 @@ class VG2GT(Reconstructor):
     def forward(
         self, images: Tensor, hints: Hints | None = None, generator: torch.Generator | None = None
     ) -> Prediction:
-        """See :meth:`Reconstructor.forward`; the generator draws the serialisation order of the coarse module."""
+        """Reconstructs B scenes.
+
+        Args:
+            images: ``[B, V, 3, H, W]`` in [0, 1]; H and W multiples of the backend's patch size.
+            hints: what the data knows, for backends that need it.
+            generator: draws the serialisation order of the coarse module while training.
+
+        Returns:
+            Geometry before and after enhancement, voxels and Gaussians, in scene units and in the frame of view 0.
+        """
         tokens, decoded = self.enhance(images, hints, generator)
         support = self.support(decoded.geometry, hints)
         keep, coarsen = (None, None) if support is None else (support.keep, support.coarsen)
@@ -266,7 +305,17 @@ class VG2GT(Reconstructor):
         generator: torch.Generator | None = None,
         unit: Tensor | None = None,
     ) -> tuple[Tokens, Decoded]:
-        """Enhanced tokens, and geometry before and after enhancement (paper, Coarse-level), see :meth:`read_views`."""
+        """The part of the method up to the enhanced geometry (paper, Coarse-level).
+
+        Args:
+            images: as for :meth:`forward`.
+            hints: as for :meth:`forward`.
+            generator: as for :meth:`forward`.
+            unit: ``[B]`` scene units per unit of the backbone; None: the model's own.
+
+        Returns:
+            The enhanced tokens, and geometry before and after enhancement.
+        """
         tokens, initial, unit = self.read_views(images, hints, unit)
         if self.coarse is None:
             return tokens, Decoded(initial, initial, unit)
@@ -295,11 +344,15 @@ def masked(geometry: Geometry, hints: Hints | None) -> Geometry:
 
 
 def with_scale_of(initial: Geometry, depth: Tensor) -> Tensor:
-    """Takes the one factor per scene between enhanced and initial depth ``[B, V, H, W]`` out of it, differentiably.
+    """Takes the one factor per scene between enhanced and initial depth out of the enhanced depth, differentiably.
 
-    The cameras stay the backbone's, so the scale of depth against their translations must as well: losses that align
-    depth by a free factor do not see it drift, but every view would unproject to another place. The factor is the
-    exponential of the mean log-ratio, weighted by the backbone's confidence.
+    The cameras stay the backbone's, so the scale of all views' depth against their translations must as well: losses
+    that align depth by a free factor do not see it drift, but every view would unproject to another place. The factor
+    is the exponential of the mean log-ratio, weighted by the backbone's confidence.
+
+    Args:
+        initial: the backbone's geometry.
+        depth: ``[B, V, H, W]`` enhanced depth of the same pixels.
     """
     reference = initial.depth.detach()
     valid = (reference > 0) & (depth > 0)

@@ -192,7 +192,11 @@ class DA3Backend(NetworkBackend):
         self._build(make, weights, taps, head_chunk, compile, freeze)
 
     def gaussian_head(self) -> GaussianHead:
-        """DA3's own Gaussian head, frozen, from the same file; ValueError if that holds none: only GIANT's does."""
+        """DA3's own Gaussian head, frozen, from the same file.
+
+        Raises:
+            ValueError: if the file holds none: only GIANT's does.
+        """
         weights = replace(self.weights, prefix=f"{self.weights.prefix}gs_head.", ignorable=("",))
         try:
             return weights.build(lambda: GaussianHead(**self.network.arguments)).requires_grad_(False)

@@ -17,7 +17,14 @@ PARTS = (2, 3, 4, 3 * (SH_DEGREE + 1) ** 2, 1, 1)
 
 
 class GaussianHead(DPT):
-    """A DPT whose fused map also sees the image; names and shapes as published (``gs_head``)."""
+    """A DPT whose fused map also sees the image; names and shapes as published (``gs_head``).
+
+    Args:
+        token_dim: channels of the tokens.
+        features: DPT width.
+        out_channels: DPT channels of the four taps.
+        patch_size: in pixels.
+    """
 
     def __init__(self, token_dim: int, features: int, out_channels: Sequence[int], patch_size: int) -> None:
         super().__init__(token_dim, features, out_channels, sum(PARTS), patch_size, normalize=False)
@@ -29,7 +36,12 @@ class GaussianHead(DPT):
 
     @torch.no_grad()
     def predict(self, tokens: Tokens, images: Tensor, chunk: int | None) -> Tensor:
-        """Predicts raw Gaussians of images ``[B, V, 3, H, W]`` in [0, 1], ``chunk`` views at a time (None: all).
+        """Predicts raw Gaussians, at most ``chunk`` views at a time.
+
+        Args:
+            tokens: of the backbone that the head was trained with.
+            images: ``[B, V, 3, H, W]`` in [0, 1].
+            chunk: None takes all views at once.
 
         Returns:
             ``[B, V, H, W, sum(PARTS)]``: per pixel an offset in pixels, log-odds of the scales, a quaternion (xyzw, in

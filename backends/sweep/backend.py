@@ -63,7 +63,11 @@ class SweepBackend(Backend):
 
     @torch.no_grad()
     def encode(self, images: Tensor, hints: Hints | None = None) -> Tokens:
-        """Sweeps; see :meth:`Backend.encode`. The world is view 0's; ValueError also if views have no parallax."""
+        """Sweeps; see :meth:`Backend.encode`. The world frame is view 0's, the unit that of the cameras.
+
+        Raises:
+            ValueError: also if the views have no parallax (one view, or all from one place).
+        """
         self.check_images(images)
         hints = self.require_hints(images, hints, "cameras")
         assert hints.cameras is not None

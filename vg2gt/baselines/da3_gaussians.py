@@ -26,8 +26,16 @@ class DA3Gaussians(Reconstructor):
     """The Gaussians of DA3's ``gs_head``, whose weights the backend's file holds.
 
     They are defined for cameras whose principal point is the image's centre, half a pixel from where DA3 has it for
-    depth; :meth:`run_backbone` and :meth:`predict_cameras` give those. Arguments: see :class:`Reconstructor`; the
-    backend is DA3 with a Gaussian head (GIANT, or random weights), else ValueError.
+    depth; :meth:`run_backbone` and :meth:`predict_cameras` give those.
+
+    Args:
+        backend: DA3 with a Gaussian head: GIANT, or random weights.
+        scale: fixes the scene unit.
+        background: see :class:`vg2gt.model.Reconstructor`.
+        visibility: see :class:`vg2gt.model.Reconstructor`.
+
+    Raises:
+        ValueError: if the backend has no Gaussian head.
     """
 
     backend: DA3Backend

@@ -66,9 +66,16 @@ class PixelHead(nn.Module):
     def forward(
         self, features: Tensor, pixels: Pixels, min_footprint: Tensor | None = None
     ) -> tuple[Gaussians, Tensor]:
-        """Turns N pixels with features ``[N, C]`` into Gaussians, in their order, and positive confidences ``[N]``.
+        """Turns pixels into Gaussians.
 
-        Scales are relative to ``min_footprint`` ``[N]`` (scene units) where that is larger than the pixel.
+        Args:
+            features: ``[N, C]``.
+            pixels: the same N pixels.
+            min_footprint: ``[N]`` in scene units; scales are relative to it where it is larger than the pixel. None: 0.
+
+        Returns:
+            One Gaussian per pixel, in the order of the pixels, and positive confidences ``[N]`` that are those of the
+            depth before training.
         """
         raw = self.out(F.gelu(self.hidden(self.norm(features)))).float()
         shift, residual, scale, rotation, opacity, color, trust = raw.split(self.parts, -1)

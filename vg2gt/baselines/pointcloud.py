@@ -23,11 +23,18 @@ NEIGHBORS = 3
 class PointCloud(Reconstructor):
     """One round Gaussian per pixel, as wide as the points lie apart.
 
-    Args (the others: see :class:`vg2gt.model.Reconstructor`):
+    Args:
+        backend: the frozen visual foundation model.
+        scale: fixes the scene unit.
         spacing: ``pixel``: the size of the pixel at its depth; ``neighbors``: the root mean square distance to the
             three nearest points, which with ``opacity=0.1`` is how 3DGS starts from a point cloud.
         width: standard deviation over the spacing.
         opacity: of every Gaussian, in (0, 1).
+        background: see :class:`vg2gt.model.Reconstructor`.
+        visibility: see :class:`vg2gt.model.Reconstructor`.
+
+    Raises:
+        ValueError: if the spacing is unknown.
     """
 
     def __init__(

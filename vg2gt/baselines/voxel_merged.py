@@ -20,12 +20,18 @@ from vg2gt.types import Gaussians, Geometry
 class VoxelMerged(PixelReconstructor):
     """One Gaussian per pixel first; then all Gaussians of a voxel become their confidence-weighted mean.
 
-    What is merged are finished parameters, not features. Scales are relative to the voxel, where that is larger than
-    the pixel, so that the merged Gaussians leave no holes before training.
+    What is merged are finished parameters, not features: nothing looks at a voxel as a whole, and a voxel holds one
+    Gaussian. Scales are relative to the voxel, where that is larger than the pixel, so that the merged Gaussians leave
+    no holes before training.
 
-    Args (the others: see :class:`vg2gt.baselines.pixels.PixelReconstructor`):
+    Args:
+        backend: the frozen visual foundation model.
+        scale: fixes the scene unit.
+        dense_head: makes the dense head from ``token_dims`` and ``patch_size``.
+        gaussians: makes the pixel head from ``in_channels``.
         voxel_size: edge length in scene units.
         min_footprint: smallest edge in pixels at the scene's median depth; 0 switches the guard off.
+        background: see :class:`vg2gt.model.Reconstructor`.
     """
 
     def __init__(

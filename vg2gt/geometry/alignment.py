@@ -17,9 +17,15 @@ MIN_DEPTH = 0.01
 
 
 def weighted_median(values: Tensor, weights: Tensor) -> Tensor:
-    """Lower weighted median ``[...]`` along the last axis of ``[..., N]``; NaN where all weights are 0.
+    """Lower weighted median along the last axis.
 
-    The smallest value up to which half of the weight lies, a minimiser of ``sum w |m - x|``.
+    Args:
+        values: ``[..., N]``; entries of weight 0 may be anything.
+        weights: ``[..., N]``, not negative.
+
+    Returns:
+        ``[...]``: the smallest value up to which half of the weight lies, a minimiser of ``sum w |m - x|``; NaN where
+        all weights are 0.
     """
     ordered, order = torch.where(weights > 0, values, torch.inf).sort(-1)
     cumulative = torch.gather(weights, -1, order).double().cumsum(-1)
@@ -124,9 +130,15 @@ def align_cameras(
 
 
 def align_points(points: Tensor, reference: Tensor) -> Similarity:
-    """The least-squares similarity from points ``[B, N, 3]`` to reference points (Umeyama 1991), computed in float64.
+    """The least-squares similarity between corresponding points (Umeyama 1991).
 
-    Of points that coincide the scale is 1.
+    Args:
+        points: ``[B, N, 3]``.
+        reference: ``[B, N, 3]``, the same points in another frame and unit.
+
+    Returns:
+        ``[B]`` similarities from the points' frame to the reference's, computed in float64, in the input's dtype. Of
+        points that coincide the scale is 1.
     """
     source, target = points.double(), reference.double()
     centered, centered_target = source - source.mean(1)[:, None], target - target.mean(1)[:, None]

@@ -24,9 +24,14 @@ def focal_lengths(intrinsics: Tensor) -> Tensor:
 
 
 def ray_directions(intrinsics: Tensor, size: tuple[int, int]) -> Tensor:
-    """Camera-frame ray directions ``[..., H, W, 3]`` with unit z; multiplied by z-depth they are points.
+    """Returns camera-frame ray directions with unit z.
 
-    Intrinsics ``[..., 3, 3]`` are in pixels, integer pixel centres, the size is ``(height, width)``.
+    Args:
+        intrinsics: ``[..., 3, 3]`` in pixels, integer pixel centres.
+        size: image ``(height, width)``.
+
+    Returns:
+        ``[..., H, W, 3]``; multiplied by z-depth they are camera-frame points.
     """
     pixels = pixel_grid(*size, like=intrinsics)
     focal, center = focal_lengths(intrinsics)[..., None, None, :], intrinsics[..., None, None, :2, 2]
@@ -47,7 +52,15 @@ def invert_rigid(transform: Tensor) -> Tensor:
 
 
 def rigid_motions(turns: Tensor, shifts: Tensor) -> Tensor:
-    """Rotation vectors ``[..., 3]`` (rad) and translations ``[..., 3]`` after them as matrices ``[..., 4, 4]``."""
+    """Rotation by vectors and translation as matrices.
+
+    Args:
+        turns: ``[..., 3]`` rotation vectors, rad.
+        shifts: ``[..., 3]`` translations after the rotation.
+
+    Returns:
+        ``[..., 4, 4]``.
+    """
     skew = turns.new_zeros(*turns.shape[:-1], 3, 3)
     for axis, (i, j) in enumerate(((2, 1), (0, 2), (1, 0))):
         skew[..., i, j], skew[..., j, i] = turns[..., axis], -turns[..., axis]
@@ -70,16 +83,29 @@ def transform_points(transform: Tensor, points: Tensor) -> Tensor:
 
 
 def unproject(depth: Tensor, cameras: Cameras) -> Tensor:
-    """Lifts z-depth ``[B, V, H, W]`` to points ``[B, V, H, W, 3]`` in the cameras' world.
+    """Lifts z-depth to world points.
 
-    Pixels with depth 0 land on the camera centre, so mask them.
+    Args:
+        depth: ``[B, V, H, W]``; pixels with depth 0 land on the camera centre, so mask them.
+        cameras: cameras of the same views; their size is the depth's.
+
+    Returns:
+        ``[B, V, H, W, 3]`` in the cameras' world frame.
     """
     rays = ray_directions(cameras.intrinsics, (depth.shape[-2], depth.shape[-1]))
     return transform_points(invert_rigid(cameras.world_to_camera), rays * depth[..., None])
 
 
 def project(points: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
-    """World points ``[B, V, ..., 3]``, a set per view: pixels ``[B, V, ..., 2]`` (x, y), z-depth ``[B, V, ...]``."""
+    """Projects world points into every view.
+
+    Args:
+        points: ``[B, V, ..., 3]`` world points, one set per view.
+        cameras: the views.
+
+    Returns:
+        Pixels ``[B, V, ..., 2]`` as (x, y) and z-depth ``[B, V, ...]``.
+    """
     local = transform_points(cameras.world_to_camera, points)
     depth = local[..., 2]
     shape = cameras.intrinsics.shape[:2] + (1,) * (points.dim() - 3)

@@ -14,7 +14,12 @@ from torch.nn import functional as F
 
 
 def ray_slopes(intrinsics: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """Slopes u ``[..., 1, W]`` and v ``[..., H, 1]`` of the rays ``(u, v, 1)`` of all pixels of ``(height, width)``."""
+    """Returns u ``[..., 1, W]`` and v ``[..., H, 1]`` of the rays ``(u, v, 1)`` of all pixels.
+
+    Args:
+        intrinsics: ``[..., 3, 3]`` in pixels, integer pixel centres.
+        size: image ``(height, width)``.
+    """
     height, width = size
     x = torch.arange(width, dtype=intrinsics.dtype, device=intrinsics.device)
     y = torch.arange(height, dtype=intrinsics.dtype, device=intrinsics.device)[:, None]

@@ -11,7 +11,18 @@ DC = 0.28209479177387814  # 1 / (2 sqrt(pi))
 
 
 def basis(directions: Tensor, degree: int) -> Tensor:
-    """The basis ``[..., (L + 1)^2]`` along unit vectors ``[..., 3]``; ValueError if the degree L is not 0 to 3."""
+    """Evaluates the basis.
+
+    Args:
+        directions: ``[..., 3]`` unit vectors.
+        degree: highest degree L, 0 to 3.
+
+    Returns:
+        ``[..., (L + 1)^2]``.
+
+    Raises:
+        ValueError: if the degree is out of range.
+    """
     if not 0 <= degree <= MAX_DEGREE:
         raise ValueError(f"spherical-harmonic degree must be 0 to {MAX_DEGREE}, got {degree}")
     x, y, z = directions.unbind(-1)
@@ -38,9 +49,18 @@ def basis(directions: Tensor, degree: int) -> Tensor:
 
 
 def rotation_of_coefficients(rotation: Tensor, degree: int) -> Tensor:
-    """Matrices ``[..., (L + 1)^2, (L + 1)^2]`` that turn a function on the sphere by turning its coefficients.
+    """Matrices that turn a function on the sphere by turning its coefficients.
 
-    The coefficients ``M c`` give along ``rotation @ d`` what ``c`` gives along ``d``; the degree L is 0 to 3.
+    Args:
+        rotation: ``[..., 3, 3]``, such as camera to world.
+        degree: highest degree L, 0 to 3.
+
+    Returns:
+        ``[..., (L + 1)^2, (L + 1)^2]``: the coefficients ``M c`` give along ``rotation @ d`` what ``c`` gives along
+        ``d``.
+
+    Raises:
+        ValueError: if the degree is out of range.
     """
     # Each degree is closed under rotations, so values along enough directions determine the turned coefficients.
     axis = torch.arange(-1, 2, dtype=torch.float64, device=rotation.device)
@@ -56,6 +76,14 @@ def rgb_to_sh(rgb: Tensor) -> Tensor:
 
 
 def sh_to_rgb(sh: Tensor, directions: Tensor) -> Tensor:
-    """Colours ``[..., 3]``, clamped at 0, of ``[..., (L + 1)^2, 3]`` along unit directions from camera to point."""
+    """Colours seen along viewing directions.
+
+    Args:
+        sh: ``[..., (L + 1)^2, 3]``.
+        directions: ``[..., 3]`` unit vectors from the camera centre to the point.
+
+    Returns:
+        ``[..., 3]``, clamped at 0 from below as in 3DGS.
+    """
     degree = round(sh.shape[-2] ** 0.5) - 1
     return ((basis(directions, degree)[..., None] * sh).sum(-2) + 0.5).clamp(min=0)

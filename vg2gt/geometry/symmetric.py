@@ -13,13 +13,18 @@ FULL = (0, 1, 2, 1, 3, 4, 2, 4, 5)  # where its nine entries are among those six
 
 
 def smallest_eigenvector(matrix: Tensor, fallback: Tensor) -> Tensor:
-    """Unit eigenvector ``[..., 3]`` of the smallest eigenvalue of symmetric 3x3 matrices, of arbitrary sign.
+    """Unit eigenvector of the smallest eigenvalue of symmetric 3x3 matrices.
 
-    By the trigonometric root of the characteristic cubic, in float64 whatever the dtype.
+    The eigenvalue is the trigonometric root of the characteristic cubic, the eigenvector the longest cross product of
+    two rows of ``A - lambda I``. Computed in float64, so that float32 input keeps its precision.
 
     Args:
         matrix: ``[..., 3, 3]`` symmetric, finite, of any magnitude.
-        fallback: ``[..., 3]`` unit vectors returned where the smallest eigenvalue is not a single one.
+        fallback: ``[..., 3]`` unit vectors returned where the smallest eigenvalue is not a single one (isotropic, zero
+            or line-like matrices), because then every direction of a plane would do.
+
+    Returns:
+        ``[..., 3]`` in the input's dtype; the sign is arbitrary.
     """
     a = matrix.double()
     size = a.abs().amax((-2, -1), keepdim=True)
@@ -42,9 +47,16 @@ def smallest_eigenvector(matrix: Tensor, fallback: Tensor) -> Tensor:
 
 
 def principal_direction(a: Tensor, b: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
-    """Unit eigenvector ``[..., 2]`` of the largest eigenvalue of ``((a, b), (b, c))``, and the eigenvalue ``[...]``.
+    """Direction and largest eigenvalue of symmetric 2x2 matrices ``((a, b), (b, c))``.
 
-    The sign is arbitrary, and the vector ``(1, 0)`` where both eigenvalues are equal.
+    Args:
+        a: ``[...]``.
+        b: ``[...]``.
+        c: ``[...]``.
+
+    Returns:
+        The unit eigenvector ``[..., 2]`` of the largest eigenvalue, of arbitrary sign, ``(1, 0)`` where both are equal;
+        and the eigenvalue ``[...]``.
     """
     angle = 0.5 * torch.atan2(2 * b, a - c)
     largest = 0.5 * (a + c + torch.hypot(a - c, 2 * b))

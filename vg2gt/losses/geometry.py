@@ -124,7 +124,13 @@ def depth_gradient_loss(error: Tensor, valid: Tensor) -> Tensor:
 
 
 def point_errors(depth: Tensor, cameras: Cameras, truth: Truth) -> Tensor:
-    """Distance ``[V, H, W]`` between a scene's predicted and true points, measured in each predicted camera's frame."""
+    """Distance ``[V, H, W]`` between predicted and true points, measured in each predicted camera's frame.
+
+    Args:
+        depth: ``[V, H, W]`` predicted, in the truth's unit.
+        cameras: predicted (B = 1), translations in the truth's unit.
+        truth: one scene.
+    """
     size = (depth.shape[-2], depth.shape[-1])
     to_predicted = (cameras.world_to_camera @ invert_rigid(truth.cameras.world_to_camera))[0]
     u, v = ray_slopes(truth.cameras.intrinsics[0], size)
@@ -140,7 +146,11 @@ def point_errors(depth: Tensor, cameras: Cameras, truth: Truth) -> Tensor:
 
 @torch.no_grad()
 def camera_errors(cameras: Cameras, truth: Cameras) -> dict[str, Tensor]:
-    """Mean absolute errors of VGGT's pose encoding, to log only.
+    """Mean absolute errors of translation, quaternion and field of view (VGGT's pose encoding), to log only.
+
+    Args:
+        cameras: predicted cameras in the frame of view 0, translations in the truth's unit.
+        truth: ground truth of the same views.
 
     Returns:
         Scalars ``camera_T``, ``camera_R`` (of the nearer quaternion sign) and ``camera_F`` (radians).

@@ -12,8 +12,12 @@ from vg2gt.kernels.structure import HALF, WINDOW, Structure
 def structure_loss(images: Tensor, reference: Tensor) -> Tensor:
     """Mean of ``1 - SSIM`` over all pixels (paper, eqn gsloss): Gaussian window 11 x 11, sigma 1.5, borders reflected.
 
-    Images and reference are ``[R, C, H, W]`` of one dtype, at least 6 pixels high and wide; compiled where both are
-    float32 on a CPU and the reference is fixed.
+    Args:
+        images: ``[R, C, H, W]``, at least 6 pixels high and wide.
+        reference: ``[R, C, H, W]``, of the same dtype.
+
+    Returns:
+        A scalar, differentiable in the images; compiled where both are float32 on a CPU and the reference is fixed.
     """
     on_cpu = all(tensor.device.type == "cpu" and tensor.dtype == torch.float32 for tensor in (images, reference))
     if on_cpu and not reference.requires_grad and min(images.shape[-2:]) > HALF:

@@ -25,7 +25,14 @@ class ResidualConvUnit(nn.Module):
 
 
 class Reassemble(nn.Module):
-    """Tokens of one tap to a feature map of ``channels`` at ``factor`` (4, 2, 1 or 0.5) times the patch grid."""
+    """Tokens of one tap to a feature map at a multiple of the patch grid's resolution.
+
+    Args:
+        token_dim: token width.
+        tap_channels: width after the projection.
+        channels: width of the map.
+        factor: 4, 2, 1 or 0.5 times the patch grid.
+    """
 
     def __init__(self, token_dim: int, tap_channels: int, channels: int, factor: float) -> None:
         super().__init__()
@@ -99,7 +106,11 @@ class DenseHead(nn.Module):
         self.merge = nn.Conv2d(merge_channels, out_channels, 3, padding=1)
 
     def forward(self, tokens: Tokens, images: Tensor) -> Tensor:
-        """Decodes tokens, ``[B, V, P, D]`` a tap, and images ``[B, V, 3, H, W]`` in [0, 1].
+        """Decodes features.
+
+        Args:
+            tokens: ``[B, V, P, D]`` a tap.
+            images: ``[B, V, 3, H, W]`` in [0, 1].
 
         Returns:
             ``[B * V, out_channels, H, W]``, laid out channels-last in memory.

@@ -87,7 +87,10 @@ class GaussianHead(nn.Module):
         self.register_buffer("sh_gain", gains[:, None], persistent=False)
 
     def forward(self, voxels: Voxels) -> Gaussians:
-        """Splits every voxel of B scenes.
+        """Splits every voxel.
+
+        Args:
+            voxels: refined voxels of B scenes.
 
         Returns:
             ``M * splits`` Gaussians (fewer beyond ``max_gaussians``), those of a voxel adjacent: scales in (0, 2 v),

@@ -105,9 +105,15 @@ def scene_counts(batch: Tensor, scenes: int) -> Tensor:
 
 
 def point_cells(points: Tensor, batch: Tensor, voxel_size: Tensor) -> Tensor:
-    """Positions ``[N, 3]``, float32 or better, in units of their scene's ``voxel_size [B]``: ``[N, 3]`` float64.
+    """Positions in units of voxels.
 
-    Division, not multiplication by 1/v, so that points on faces fall as the definition says.
+    Args:
+        points: ``[N, 3]``, float32 or better (bfloat16 puts most points into another 2 mm cell).
+        batch: ``[N]`` scene index.
+        voxel_size: ``[B]`` edge length in scene units.
+
+    Returns:
+        ``[N, 3]`` float64. Division, not multiplication by 1/v, so that points on faces fall as the definition says.
     """
     sizes = voxel_size.double() if len(voxel_size) == 1 else voxel_size.double()[batch, None]
     return points.double() / sizes
@@ -119,12 +125,15 @@ def in_range(cells: Tensor) -> Tensor:
 
 
 def plan_voxels(cells: Tensor, batch: Tensor, valid: Tensor) -> VoxelPlan:
-    """Groups points by cell; deterministic, and independent of the points' order up to the order within a voxel.
+    """Groups points by cell.
 
     Args:
         cells: ``[N, 3]`` positions in units of voxels; rows that are not valid may hold anything.
         batch: ``[N]`` int64 scene index.
         valid: ``[N]`` bool, the points to use; they must be finite.
+
+    Returns:
+        The plan; deterministic, and independent of the order of points up to the order within a voxel.
 
     Raises:
         ValueError: if the points span more cells than int64 can number.
@@ -144,7 +153,13 @@ def plan_voxels(cells: Tensor, batch: Tensor, valid: Tensor) -> VoxelPlan:
 
 
 def warn_if_sparse(plan: VoxelPlan, scenes: int, module: str) -> None:
-    """Says once per ``module`` (``coarse``, ``fine``) and process that voxels hold hardly more than one point each."""
+    """Says in the log, once per module and process, that a scene's voxels hold hardly more than one point each.
+
+    Args:
+        plan: the voxels of B scenes.
+        scenes: B.
+        module: whose options to name, ``coarse`` or ``fine``.
+    """
     if module in _warned_of_sparse or not len(plan):
         return
     voxels = scene_counts(plan.batch, scenes)
@@ -194,10 +209,15 @@ class _WeightedMean(torch.autograd.Function):
 
 
 def pool_mean(values: Tensor, weights: Tensor, plan: VoxelPlan) -> Tensor:
-    """Confidence-weighted mean ``[M, C]`` over every voxel (paper, eqn voxelfeature, first line).
+    """Confidence-weighted mean over every voxel (paper, eqn voxelfeature, first line).
 
-    Values ``[N, C]`` and weights ``[N]`` > 0 must be finite, also of points that the plan left out; the result is
-    float32 or better.
+    Args:
+        values: ``[N, C]``; points that the plan left out must be finite too.
+        weights: ``[N]`` confidence > 0, finite.
+        plan: the voxels.
+
+    Returns:
+        ``[M, C]``, float32 or better, differentiable in values and weights.
     """
     if not len(plan):  # nothing to pool; the sum keeps the autograd graph
         return values[:0].to(torch.promote_types(values.dtype, torch.float32)) * weights[:0, None]

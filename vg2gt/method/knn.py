@@ -18,7 +18,16 @@ QUERIES_AT_ONCE = 256  # by one thread
 
 
 def nearest_neighbors(queries: Tensor, points: Tensor, neighbors: int) -> Tensor:
-    """Rows ``[N, min(neighbors, M)]`` int64 of the ``points [M, 3]`` nearest to each of ``queries [N, 3]``; exact."""
+    """Indices of the nearest points, nearest first; exact.
+
+    Args:
+        queries: ``[N, 3]``.
+        points: ``[M, 3]``, M >= 1.
+        neighbors: how many; at most M are found.
+
+    Returns:
+        ``[N, min(neighbors, M)]`` int64.
+    """
     batches = (torch.zeros(len(rows), dtype=torch.int64, device=rows.device) for rows in (queries, points))
     query_batch, point_batch = batches
     count = min(neighbors, len(points))
@@ -73,7 +82,13 @@ def interpolation_weights(
 ) -> tuple[Tensor, Tensor]:
     """Neighbours within each scene and their weights ``1 / (d^2 + 1e-6)``, normalised to sum 1 (paper: 16 nearest).
 
-    Arguments as for :func:`nearest_in_scenes`, in voxel units; a scene with fewer points uses them all.
+    Args:
+        queries: ``[N, 3]`` in voxel units, the unit of d.
+        query_batch: ``[N]`` scene index, sorted.
+        points: ``[M, 3]`` in voxel units.
+        point_batch: ``[M]`` scene index, sorted; every scene with queries has at least one point.
+        neighbors: how many per query; a scene with fewer points uses them all.
+        scenes: B.
 
     Returns:
         Rows of ``points`` ``[N, neighbors]`` (row 0 with weight 0 where there is none) and weights ``[N, neighbors]``,

@@ -18,7 +18,7 @@ from vg2gt.method.grid import VoxelPlan, pool_mean, pool_mean_of_chunks
 
 
 def pool_point_features(dense: Tensor, offset: Tensor, weight: Tensor, confidence: Tensor, plan: VoxelPlan) -> Tensor:
-    """Confidence-weighted mean ``[M, C]`` of the points' features in every voxel; compiled for float32 on a CPU.
+    """Confidence-weighted mean of the points' features in every voxel.
 
     Args:
         dense: ``[N, C]`` dense features of the pixels.
@@ -26,6 +26,9 @@ def pool_point_features(dense: Tensor, offset: Tensor, weight: Tensor, confidenc
         weight: ``[C, 3]`` what a place adds to a feature.
         confidence: ``[N]`` > 0.
         plan: the voxels.
+
+    Returns:
+        ``[M, C]``, differentiable in all tensors; compiled where they are float32 on a CPU.
     """
     if len(plan) and compilable(dense, offset, weight, confidence):
         places = (plan.order, plan.starts, plan.counts, plan.voxel_of)

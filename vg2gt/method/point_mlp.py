@@ -35,8 +35,11 @@ class GeometricStage(nn.Module):
     """One stage: geometric affine, residual MLP, max over the window, residual MLP, residual update.
 
     The affine ``alpha (x - m) / s + beta`` of features and positions, m a window's mean and s one standard deviation a
-    scene, enters a linear layer with the features themselves, ``W1 [affine] + W2 x``: applied as ``(W1 alpha / s + W2)
-    (x - m)`` and, once a window, ``W2 m``.
+    scene, enters a linear layer together with the features themselves, ``W1 [affine] + W2 x``. Nothing lies between, so
+    the layer is applied as ``(W1 alpha / s + W2) (x - m)`` and ``W2 m``, the latter once a window.
+
+    Args:
+        channels: feature width C.
     """
 
     def __init__(self, channels: int) -> None:
@@ -134,10 +137,19 @@ class PointMLP(nn.Module):
         self.stages = nn.ModuleList(GeometricStage(channels) for _ in range(stages))
 
     def forward(self, features: Tensor, grid: Tensor, batch: Tensor, voxel_size: Tensor) -> Tensor:
-        """Refines features ``[M, in_channels]`` of cells ``[M, 3]`` of scenes ``[M]`` (sorted) to ``[M, channels]``.
+        """Refines features.
+
+        Args:
+            features: ``[M, in_channels]``.
+            grid: ``[M, 3]`` int64 cells.
+            batch: ``[M]`` scene index, sorted.
+            voxel_size: ``[B]`` edge lengths, named in errors.
+
+        Returns:
+            ``[M, channels]``.
 
         Raises:
-            ValueError: if a scene spans too many voxels to be serialised, naming its ``voxel_size [B]``.
+            ValueError: if a scene spans too many voxels to be serialised.
         """
         features = self.embed(features)
         if not len(features):

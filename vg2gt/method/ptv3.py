@@ -113,7 +113,14 @@ def make_levels(
 
 
 class SerializedAttention(nn.Module):
-    """Multi-head attention within windows of consecutive voxels along the level's curve number ``order``."""
+    """Multi-head attention within windows of consecutive voxels.
+
+    Args:
+        channels: width.
+        heads: number of heads.
+        window: voxels per window.
+        order: number of the curve in the level's sequence.
+    """
 
     def __init__(self, channels: int, heads: int, window: int, order: int) -> None:
         super().__init__()
@@ -152,7 +159,16 @@ class MLP(nn.Module):
 
 
 class PTv3Block(nn.Module):
-    """Conditional positional encoding by sparse convolution (xCPE), attention and MLP, each residual."""
+    """Conditional positional encoding by sparse convolution (xCPE), attention and MLP, each residual.
+
+    Args:
+        channels: width.
+        heads: attention heads.
+        window: voxels per attention window.
+        order: number of the curve.
+        mlp_ratio: hidden width of the MLP over ``channels``.
+        drop_path: probability that a voxel skips a residual branch while training.
+    """
 
     def __init__(self, channels: int, heads: int, window: int, order: int, mlp_ratio: float, drop_path: float) -> None:
         super().__init__()
@@ -305,14 +321,17 @@ class PTv3(nn.Module):
         voxel_size: Tensor,
         generator: torch.Generator | None = None,
     ) -> Tensor:
-        """Enhances voxel features ``[M, in_channels]``, M >= 1, to ``[M, out_channels]``.
+        """Enhances voxel features.
 
         Args:
-            features: as said.
+            features: ``[M, in_channels]``, M >= 1.
             grid: ``[M, 3]`` int64 distinct cells.
             batch: ``[M]`` scene index, sorted.
             voxel_size: ``[B]`` edge lengths, named in errors.
             generator: while training, shuffles the sequence of orders at every resolution (on the CPU).
+
+        Returns:
+            ``[M, out_channels]``.
 
         Raises:
             ValueError: if a scene spans too many voxels to be serialised.

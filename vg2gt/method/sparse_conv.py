@@ -104,6 +104,12 @@ def _tabulate(rows: Tensor, most: int) -> NeighborTable:
 def neighbor_pairs(grid: Tensor, batch: Tensor, kernel_size: int, spans: Sequence[int] | None = None) -> Pairs:
     """Pairs of occupied cells at each offset of the first half of a cubic kernel; the other half mirrors them.
 
+    Args:
+        grid: ``[M, 3]`` int64 distinct cells.
+        batch: ``[M]`` scene index.
+        kernel_size: odd edge length of the kernel.
+        spans: of :func:`vg2gt.method.grid.mixed_radix_keys`, where known.
+
     Returns:
         For offset number t (x slowest) of the ``kernel_size^3 // 2`` before the centre, the rows ``(i, j)`` with
         ``grid[j] = grid[i] + offset``.
@@ -220,7 +226,14 @@ class _SubmanifoldConvolution(torch.autograd.Function):
 class SubmanifoldConv3d(nn.Module):
     """Convolution over occupied voxels; equals a dense ``conv3d`` with zeros elsewhere, read at the occupied cells.
 
-    ``weight`` is ``[out, k, k, k, in]`` with axes x, y, z, k the odd ``kernel_size``.
+    Args:
+        in_channels: input channels.
+        out_channels: output channels.
+        kernel_size: odd edge length of the cubic kernel.
+        bias: adds a bias.
+
+    Attributes:
+        weight: ``[out, k, k, k, in]``, axes x, y, z.
     """
 
     def __init__(self, in_channels: int, out_channels: int, kernel_size: int, bias: bool = True) -> None:
@@ -232,9 +245,14 @@ class SubmanifoldConv3d(nn.Module):
         self.bias = nn.Parameter(torch.zeros(out_channels)) if bias else None
 
     def forward(self, features: Tensor, pairs: Pairs | NeighborTable) -> Tensor:
-        """Convolves ``[M, in]`` features with the :func:`neighbors` for this kernel size to ``[M, out]``.
+        """Convolves ``[M, in]`` features.
 
-        Under autocast products are of its type, and their sums float32.
+        Args:
+            features: ``[M, in]``.
+            pairs: :func:`neighbors` for this kernel size.
+
+        Returns:
+            ``[M, out]``; under autocast products are of its type, and their sums float32.
         """
         weight = self.weight
         if torch.is_autocast_enabled(features.device.type):

@@ -47,7 +47,11 @@ def relative_pose_errors(predicted: Cameras, reference: Cameras) -> tuple[Tensor
 
 
 def camera_metrics(predicted: Cameras, reference: Cameras) -> dict[str, float]:
-    """Scores the cameras of one or more scenes over all pairs of V >= 2 views.
+    """Scores the cameras of one or more scenes over all pairs of views.
+
+    Args:
+        predicted: B scenes, V >= 2 views.
+        reference: the same views.
 
     Returns:
         ``rra_T`` and ``rta_T``: shares of pairs whose rotation, translation error is below T = 5, 15, 30 degrees;

@@ -96,9 +96,15 @@ NEAR = 3  # pixels
 
 
 def near_depth_edges(depth: Tensor, step: float = EDGE, near: int = NEAR) -> Tensor:
-    """Pixels ``[..., H, W]`` at most ``near`` pixels (along either axis) from a depth edge.
+    """Pixels at most ``near`` pixels (along either axis) from a depth edge.
 
-    An edge is a relative step of z-depth ``[..., H, W]`` above ``step`` between valid (> 0) neighbours.
+    Args:
+        depth: ``[..., H, W]`` z-depth, 0 = invalid; a step to an invalid pixel is none.
+        step: relative difference of neighbours above which there is an edge between them.
+        near: in pixels.
+
+    Returns:
+        ``[..., H, W]`` bool.
     """
     valid = depth > 0
     edges = torch.zeros_like(valid)

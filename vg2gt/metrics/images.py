@@ -9,15 +9,28 @@ SSIM_WINDOW = 11  # kornia's Gaussian window has a standard deviation of 1.5 pix
 
 
 def psnr(predicted: Tensor, reference: Tensor) -> Tensor:
-    """PSNR in dB ``[...]`` of images ``[..., 3, H, W]``, colours clamped to [0, 1]; infinite for identical ones."""
+    """Peak signal-to-noise ratio in dB of each image, colours clamped to [0, 1].
+
+    Args:
+        predicted: ``[..., 3, H, W]``.
+        reference: ``[..., 3, H, W]``.
+
+    Returns:
+        ``[...]``; infinite for identical images.
+    """
     difference = predicted.double().clamp(0, 1) - reference.double().clamp(0, 1)
     return -10 * difference.square().mean((-3, -2, -1)).log10()
 
 
 def ssim(predicted: Tensor, reference: Tensor) -> Tensor:
-    """SSIM ``[...]`` of images ``[..., 3, H, W]`` clamped to [0, 1], at least 11 pixels high and wide.
+    """Structural similarity of each image (Gaussian window 11 x 11, sigma 1.5, range 1, no padding), clamped to [0, 1].
 
-    Gaussian window 11 x 11, sigma 1.5, range 1, no padding.
+    Args:
+        predicted: ``[..., 3, H, W]``, at least 11 pixels high and wide.
+        reference: ``[..., 3, H, W]``.
+
+    Returns:
+        ``[...]``.
     """
     size = predicted.shape[-3:]
     first, second = (image.float().clamp(0, 1).reshape(-1, *size) for image in (predicted, reference))

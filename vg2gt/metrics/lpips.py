@@ -66,7 +66,14 @@ class LPIPS(nn.Module):
 
     @torch.no_grad()
     def forward(self, predicted: Tensor, reference: Tensor) -> Tensor:
-        """Distance ``[...]`` of images ``[..., 3, H, W]``, at least 16 pixels high and wide, colours clamped to [0, 1].
+        """Distance of each image, colours clamped to [0, 1].
+
+        Args:
+            predicted: ``[..., 3, H, W]``, at least 16 pixels high and wide.
+            reference: ``[..., 3, H, W]``.
+
+        Returns:
+            ``[...]``, 0 for identical images.
 
         Raises:
             ValueError: if the shapes differ or the images are too small.

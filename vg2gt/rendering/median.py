@@ -59,9 +59,19 @@ class MedianDepth(torch.autograd.Function):
     def forward(
         ctx: Any, alpha: Tensor, peak: Tensor, precision: Tensor, before: Tensor, rays: Rays, options: RenderOptions
     ) -> Tensor:
-        """Solves ``T(d) = 1/2`` for every ray; 0 where over 0.45 is transmitted or d is in front of the near plane.
+        """Solves ``T(d) = 1/2`` for every ray.
 
-        Arguments as for :func:`ray_depth`.
+        Args:
+            ctx: autograd context.
+            alpha: opacity of every hit, 0 where a dense matrix has none.
+            peak: peak depth of every hit.
+            precision: inverse variance of every hit along its ray.
+            before: transmittance in front of every hit in blending order, without gradient.
+            rays: how hits belong to rays.
+            options: near plane, iterations, slope floor.
+
+        Returns:
+            Depth of every ray, 0 where more than 0.45 is transmitted or the median lies in front of the near plane.
         """
 
         def residual(t: Tensor) -> Tensor:

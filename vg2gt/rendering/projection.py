@@ -148,9 +148,14 @@ def pixel_boxes(box: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
 
 
 def list_cells(first: Tensor, extent: Tensor) -> tuple[Tensor, Tensor]:
-    """Lists the cells of rectangles, row by row: rectangle ``[M]`` and cell ``[M, 2]``.
+    """Lists the cells of rectangles, row by row, in the rectangles' order.
 
-    ``first [N, 2]`` is the least cell as (x, y), ``extent [N, 2]`` the numbers of cells.
+    Args:
+        first: ``[N, 2]`` least cell as (x, y).
+        extent: ``[N, 2]`` cells in x and in y, at least 0.
+
+    Returns:
+        Rectangle ``[M]`` and cell ``[M, 2]``.
     """
     area = extent.prod(-1)
     index = torch.repeat_interleave(area)
@@ -160,7 +165,11 @@ def list_cells(first: Tensor, extent: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def respond(splats: Splats, pixels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Closed-form response of splats at pixels ``[..., 2]`` (module docstring); splats broadcast against them.
+    """Closed-form response of splats at pixels (module docstring).
+
+    Args:
+        splats: N splats, or splats whose leading axis broadcasts against the pixels'.
+        pixels: ``[..., 2]`` as (x, y).
 
     Returns:
         ``o exp(-D^2 / 2)`` before the alpha cap, the peak's depth ``t*`` and its precision ``lambda``; a response

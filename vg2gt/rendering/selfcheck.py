@@ -71,7 +71,10 @@ class Agreement:
 
 
 def require_trusted(device: torch.device) -> None:
-    """Checks once that the Triton kernels may render on a CUDA or ROCm device.
+    """Checks once that the Triton kernels may render on a device.
+
+    Args:
+        device: a CUDA or ROCm device.
 
     Raises:
         KernelsRefusedError: if they disagree with the reference, do not run, or Triton is not installed; the message
@@ -135,7 +138,12 @@ def _file() -> Path:
 
 
 def compare(device: torch.device, modes: tuple[Mode, ...] = MODES) -> Agreement:
-    """Renders the fixed scenes with the kernels on ``device`` and with the reference; how far they are apart."""
+    """Renders the fixed scenes with the kernels on ``device`` and with the reference; how far they are apart.
+
+    Args:
+        device: where the kernels run; a CPU if Triton interprets them.
+        modes: how they render.
+    """
     from vg2gt.rendering.gpu_tiles import render_triton
 
     def kernels(gaussians: Gaussians, cameras: Cameras, mode: Mode, background: Tensor) -> Render:

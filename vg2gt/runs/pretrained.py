@@ -29,9 +29,12 @@ def from_pretrained(
     Args:
         name: one of :func:`list_models`, a folder that :func:`save_pretrained` wrote, a run's folder or checkpoint, or
             ``OWNER/NAME`` of a model on the hub.
-        backend: see :func:`vg2gt.load_model`.
+        backend: see :func:`vg2gt.load_model`, such as the path of the backbone's weights.
         revision: of a model on the hub.
         device: ``auto``, ``cpu``, ``cuda`` or ``cuda:N``.
+
+    Returns:
+        The model in eval mode, with its renderer and where its weights come from.
 
     Raises:
         FileNotFoundError: if there is no such model.
@@ -42,7 +45,12 @@ def from_pretrained(
 
 
 def save_pretrained(ckpt: str | Path, folder: str | Path) -> Path:
-    """Writes a checkpoint's weights, its configuration as YAML, and its calibration if there is one, into a folder."""
+    """Writes what others need of a trained model: weights, configuration as YAML, and calibration if there is one.
+
+    Args:
+        ckpt: a run's folder or checkpoint.
+        folder: made if needed.
+    """
     folder = Path(folder).expanduser()
     folder.mkdir(parents=True, exist_ok=True)
     checkpoint = checkpoint_path(ckpt)
@@ -55,13 +63,16 @@ def save_pretrained(ckpt: str | Path, folder: str | Path) -> Path:
 
 
 def push_to_hub(ckpt: str | Path, repo: str, folder: str | Path, private: bool = False) -> str:
-    """Saves a model into a folder and uploads it; returns the commit's address.
+    """Saves a model into a folder and uploads it.
 
     Args:
         ckpt: a run's folder or checkpoint.
         repo: ``OWNER/NAME``; made if needed, with the account that ``hf auth login`` knows.
         folder: where :func:`save_pretrained` writes first.
         private: of a new repository.
+
+    Returns:
+        The commit's address.
 
     Raises:
         ImportError: if huggingface_hub is not installed.

@@ -31,6 +31,9 @@ class ViewerScene:
         cameras: the cameras to draw; the first is the initial view.
         pictures: ``[H, W, 3]`` uint8 or None, one per camera; empty: no pictures.
         title: of the page.
+
+    Raises:
+        ValueError: if there are no Gaussians, or pictures and cameras disagree in number.
     """
 
     gaussians: Gaussians
@@ -87,7 +90,11 @@ def default_camera(gaussians: Gaussians) -> NamedCamera:
 
 
 def load_pictures(cameras: Sequence[NamedCamera], folder: str | Path) -> list[NDArray[np.uint8] | None]:
-    """Small upright pictures of the cameras' images, ``folder / name`` each; None if not inside the folder.
+    """Small upright pictures of the cameras' images, ``folder / name`` each.
+
+    Returns:
+        One per camera, the longer side ``PICTURE_SIDE`` pixels at most; None where there is no such file inside the
+        folder (names that lead out of it count as absent).
 
     Raises:
         ValueError: if a file is there and cannot be read, naming it.

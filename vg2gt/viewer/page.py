@@ -34,6 +34,10 @@ UNSIGNED, SIGNED = 2**16 - 1, 2**15 - 1  # of what is stored as 16 bits
 def write_viewer_html(path: str | Path, scene: ViewerScene) -> Path:
     """Writes the page, atomically; it opens from the disk in any browser with WebGL 2.
 
+    Args:
+        path: the file.
+        scene: what to show; not changed. Pictures are stored as JPEG, Gaussians as :func:`pack` says.
+
     Raises:
         ValueError: if the Gaussians are of more than one scene or have values that cannot be shown.
     """

@@ -127,7 +127,11 @@ def imu_to_world(packets: Mapping[int, NDArray[np.float64]]) -> dict[int, NDArra
 
 
 def read_calibration(folder: Path, scene: str, camera: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Intrinsics ``[3, 3]`` of a rectified camera and its ``[4, 4]`` pose ``camera <- imu``."""
+    """Intrinsics ``[3, 3]`` of a rectified camera and its ``[4, 4]`` pose ``camera <- imu``.
+
+    Raises:
+        DataError: if a calibration file of the date is missing, damaged, or not a calibration.
+    """
     cameras, velodyne, imu = (_read_fields(folder / name, scene) for name in _CALIBRATION)
     where = f"{folder} (calibration of scene {scene})"
     projection = _field(cameras, f"P_rect_0{camera}", (3, 4), where)

@@ -20,11 +20,18 @@ STEP_REACH = 3  # pixels to every side
 
 
 def on_surface(depth: Tensor) -> Tensor:
-    """Tells the pixels ``[..., H, W]`` of a surface; invalid ones, of z-depth 0, mean nothing.
+    """Tells the pixels of a surface from those between foreground and background.
 
     Inverse depth is linear in the image of a plane, so a surface's pixel lies on the line through its two neighbours to
-    one side, along either axis. A pixel that fails this, or whose depth changes too fast on both sides, and that lies
-    strictly within the large depth range of its 5 x 5 window, is on no surface.
+    the left or on that through those to the right, or up and down. A pixel that fails this along either axis,
+    or whose depth changes too fast on both sides, and that lies strictly within the depth range of its 5 x 5 window
+    where that range is large, is on no surface. Noise and fine relief without a silhouette are left alone.
+
+    Args:
+        depth: ``[..., H, W]`` z-depth in any unit, 0 = invalid.
+
+    Returns:
+        ``[..., H, W]`` bool; what it says of invalid pixels means nothing.
     """
     valid = depth > 0
     inverse = torch.where(valid, 1 / torch.where(valid, depth, 1.0), 0.0)
@@ -41,7 +48,14 @@ def on_surface(depth: Tensor) -> Tensor:
 
 
 def near_silhouettes(depth: Tensor) -> Tensor:
-    """Pixels ``[..., H, W]`` on no surface or on one that breaks off within a few pixels; False where depth is 0."""
+    """Tells the pixels on no surface, and those on a surface that breaks off within a few pixels.
+
+    Args:
+        depth: ``[..., H, W]`` z-depth in any unit, 0 = invalid.
+
+    Returns:
+        ``[..., H, W]`` bool; false where the depth is invalid.
+    """
     near, far = _depth_range(depth, STEP_REACH)
     return (depth > 0) & ((far >= (1 + STEP) * near) | ~on_surface(depth))
 

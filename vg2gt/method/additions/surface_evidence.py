@@ -46,10 +46,18 @@ class PointFrames:
         self.rotation = cameras.world_to_camera[..., :3, :3].flatten(0, 1)[rows // (height * width)]
 
     def in_camera(self, to_surface: Tensor, voxel_size: Tensor) -> Tensor:
-        """Vectors to the surface ``[N, 3]`` (world, voxels) in the cameras' axes, and as changes of depth: ``[N, 4]``.
+        """The vectors to the surface in the cameras' axes (voxels), and as changes of depth.
 
-        The change takes a point along its ray onto the tangent plane at the vector's end, positive for a surface behind
-        the point, in units of ``DEPTH_CHANGE_UNIT`` of the depth, at most ``MAX_DEPTH_CHANGE``, 0 at grazing rays.
+        The change of depth takes the point along its ray onto the tangent plane through the vector's end, so that
+        where on the surface the neighbours happen to lie drops out: what remains is how far the views disagree.
+
+        Args:
+            to_surface: ``[N, 3]`` in world axes and voxels.
+            voxel_size: ``[N]`` scene units per voxel.
+
+        Returns:
+            ``[N, 4]``; the change is positive for a surface behind the point, in units of ``DEPTH_CHANGE_UNIT`` of the
+            depth, at most ``MAX_DEPTH_CHANGE`` of them, and 0 where the ray grazes the surface.
         """
         local = (self.rotation @ to_surface[..., None])[..., 0]
         facing = (self.normal * self.ray).sum(-1)
@@ -77,7 +85,14 @@ class PointFrames:
 
 
 def disagreement(change: Tensor, usable: Tensor, batch: Tensor, scenes: int) -> Tensor:
-    """Median size ``[B]`` of the changes of depth ``[N]`` of the usable points of each of B scenes; 0 of none."""
+    """Median size ``[B]`` of the changes of depth ``[N]`` towards the agreed surface, of the usable points; 0 of none.
+
+    Args:
+        change: ``[N]`` in units of ``DEPTH_CHANGE_UNIT``, as :meth:`PointFrames.in_camera` gives it.
+        usable: ``[N]`` bool.
+        batch: ``[N]`` scene index, sorted.
+        scenes: B.
+    """
     rows = usable.nonzero()[:, 0]
     parts = change[rows].abs().split(scene_counts(batch[rows], scenes).tolist())
     return torch.stack([part.median() if len(part) else change.new_zeros(()) for part in parts])
@@ -92,7 +107,13 @@ def gate(disagreement: Tensor) -> Tensor:
 
 
 def cell_centroids(cells: Tensor, confidence: Tensor, plan: VoxelPlan) -> Tensor:
-    """Confidence-weighted mean ``[M, 3]`` of the points' places in their cell, from its centre, in [-1/2, 1/2]."""
+    """Confidence-weighted mean ``[M, 3]`` of the points' places in their cell, from its centre, in [-1/2, 1/2].
+
+    Args:
+        cells: ``[N, 3]`` float64 positions in voxels.
+        confidence: ``[N]`` > 0.
+        plan: the voxels.
+    """
     return pool_mean((cells - cells.floor() - 0.5).float(), confidence, plan)
 
 
@@ -102,10 +123,16 @@ def voxel_evidence(confidence: Tensor, plan: VoxelPlan) -> Tensor:
 
 
 def vectors_to_surface(queries: Tensor, centroids: Tensor, evidence: Tensor, index: Tensor) -> Tensor:
-    """From every point ``[N, 3]`` to the surface that all views agree on around it, ``[N, 3]``, all in voxels.
+    """From every point to the surface that all views agree on around it, ``[N, 3]`` in voxels.
 
-    A Gaussian of the distance keeps several of the k voxels ``index [N, k]``, and confident points outweigh the others:
-    ``evidence [N, k]`` is 0 where there is no neighbour.
+    The features' inverse-square weights would return the point's own voxel; a Gaussian of the distance keeps several,
+    and confident points, of which the square of the confidence is the evidence, outweigh the others.
+
+    Args:
+        queries: ``[N, 3]`` the points, in voxels.
+        centroids: ``[M, 3]`` positions of the voxels' centroids, in voxels.
+        evidence: ``[N, k]`` of the neighbours, 0 where there is none.
+        index: ``[N, k]`` the neighbours' rows of ``centroids``.
     """
     offset = centroids[index] - queries[:, None]  # [N, k, 3]
     weights = evidence * torch.exp(offset.square().sum(-1) / (-2 * SURFACE_WIDTH**2))  # [N, k]

@@ -48,9 +48,13 @@ class SurfelStart(TensorRecord):
 
 @torch.no_grad()
 def surfel_start(moments: VoxelMoments, splits: int) -> SurfelStart:
-    """Lays K = ``splits`` Gaussians out on every voxel's surface.
+    """Lays K Gaussians out on every voxel's surface.
 
     Defined for every input: one point, points in a line or in one place leave a disc that faces the cameras.
+
+    Args:
+        moments: second moments of M voxels.
+        splits: K >= 1.
     """
     frame, gradient, reach = surface_frame(moments)
     grid, scales = layout(splits, moments.spread.new_zeros(()))

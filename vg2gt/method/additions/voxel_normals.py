@@ -23,7 +23,7 @@ COLUMNS = tuple(itertools.product((-1, 0, 1), repeat=2))  # steps along x and y 
 
 @torch.no_grad()
 def surface_normals(spread: Tensor, facing: Tensor, offset: Tensor, plan: VoxelPlan, kernel: int) -> Tensor:
-    """Normals ``[M, 3]`` of the surface through every voxel, on the side of the cameras; compiled for float32 on a CPU.
+    """Normals of the surface through every voxel, on the side of the cameras.
 
     With a kernel of 3 a normal is that of all points in 27 cells, weighted by how near their cell's mean lies to the
     voxel's own tangent plane: a plane fitted to one surface, so that edges stay.
@@ -34,6 +34,9 @@ def surface_normals(spread: Tensor, facing: Tensor, offset: Tensor, plan: VoxelP
         offset: ``[M, 3]`` mean positions from the cells' centres, in cells.
         plan: which cells they are.
         kernel: cells a side that count, 1 or 3.
+
+    Returns:
+        ``[M, 3]`` unit vectors; compiled for float32 on a CPU.
     """
     own = facing_normals(spread, facing)
     if kernel == 1 or not len(plan):
@@ -43,7 +46,15 @@ def surface_normals(spread: Tensor, facing: Tensor, offset: Tensor, plan: VoxelP
 
 
 def facing_normals(spread: Tensor, facing: Tensor) -> Tensor:
-    """Directions ``[M, 3]`` of least spread, on the cameras' side; ``facing [M, 3]`` where the spread knows none."""
+    """Directions of least spread, on the side of the cameras.
+
+    Args:
+        spread: ``[M, 3, 3]`` covariances of positions, in cells^2.
+        facing: ``[M, 3]`` unit vectors towards the cameras; the normal where the spread knows none.
+
+    Returns:
+        ``[M, 3]`` unit vectors; compiled for float32 on a CPU.
+    """
     if compilable(spread, facing):
         return facing_compiled(spread, facing, FACING_PRIOR)
     return facing_reference(spread, facing)
@@ -59,10 +70,16 @@ def facing_reference(spread: Tensor, facing: Tensor) -> Tensor:
 
 
 def around_reference(spread: Tensor, normal: Tensor, offset: Tensor, plan: VoxelPlan) -> Tensor:
-    """Covariances ``[M, 3, 3]`` of the points of every voxel and of the 26 around it, in plain torch.
+    """Covariances of the points of every voxel and of the 26 around it, in plain torch.
 
-    Weighted by the number of a cell's points and by how near the tangent plane their mean lies; arguments as for
-    :func:`surface_normals`, with ``normal`` of each voxel's own plane.
+    Args:
+        spread: ``[M, 3, 3]`` covariances of the points' positions, in cells^2.
+        normal: ``[M, 3]`` of each voxel's own tangent plane.
+        offset: ``[M, 3]`` mean positions from the cells' centres, in cells.
+        plan: which cells they are.
+
+    Returns:
+        ``[M, 3, 3]``, weighted by the number of a cell's points and by how near the tangent plane their mean lies.
     """
     voxel, other, shift, lengths = _pairs(plan)
     x, y, z = (offset.index_select(0, other) - offset.index_select(0, voxel) + shift.to(offset.dtype)).unbind(-1)  # [P]

@@ -118,10 +118,15 @@ def _scene(geometry: Geometry, index: int) -> tuple[Tensor, Cameras]:
 
 @torch.no_grad()
 def disagreement(depth: Tensor, cameras: Cameras, partners: Tensor) -> Tensor:
-    """Median relative difference of a point's depth in another view and that view's own, in pixels (times the focal).
+    """Median relative difference of a point's depth in another view and that view's own depth there.
 
-    Of one scene's ``depth [V, H, W]`` (0 = none) and ``partners [V, K]``, nearest first (-1 = none); 0 where no two
-    views see the same.
+    Args:
+        depth: ``[V, H, W]`` z-depth of one scene, 0 = none.
+        cameras: of the views (B = 1), in the unit of the depth.
+        partners: ``[V, K]`` int64, nearest first; -1 = none.
+
+    Returns:
+        A scalar in pixels (times the focal length); 0 where no two views see the same.
     """
     pose, intrinsics = cameras.world_to_camera[0].to(depth), cameras.intrinsics[0].to(depth)
     sampled = depth[:, STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE]
@@ -143,12 +148,20 @@ def disagreement(depth: Tensor, cameras: Cameras, partners: Tensor) -> Tensor:
 
 @torch.no_grad()
 def choose_partners(depth: Tensor, cameras: Cameras, most: int) -> Tensor:
-    """The views that look where a view's points are, ``[V, K]`` int64, -1 where a view has fewer.
+    """The views that look where a view's points are.
 
     Of more than ``most``, half are the nearest by direction and place, and the others are taken evenly: near views
     agree with a surface, and views from the other side contradict what hangs in the air. Many views look at a room from
     several others, most of them through walls: there, points behind what a view sees do not count, and partners are
     four times as many.
+
+    Args:
+        depth: ``[V, H, W]`` z-depth, 0 = none.
+        cameras: of the views (B = 1), in the unit of the depth.
+        most: partners of a view, at most; four times as many of more than 100 views.
+
+    Returns:
+        ``[V, K]`` int64, nearest first; -1 where a view has fewer.
     """
     views, height, width = depth.shape
     count = min(most * (MORE if views > MANY else 1), views - 1)

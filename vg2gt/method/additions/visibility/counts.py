@@ -34,7 +34,7 @@ class ViewCounts(TensorRecord):
 
 @torch.no_grad()
 def count_views(depth: Tensor, cameras: Cameras, partners: Tensor, tolerance: float, margin: float) -> ViewCounts:
-    """Counts what the partners of each view say of its pixels, for one scene; 0 for pixels without depth.
+    """Counts what the partners of each view say of its pixels, for one scene.
 
     Args:
         depth: ``[V, H, W]`` z-depth, 0 = none.
@@ -42,6 +42,9 @@ def count_views(depth: Tensor, cameras: Cameras, partners: Tensor, tolerance: fl
         partners: ``[V, K]`` int64 views that each view is compared with; -1 = none.
         tolerance: relative difference of depth up to which views agree.
         margin: relative difference of depth from which on a view looks through a point.
+
+    Returns:
+        The numbers; 0 for pixels without depth.
     """
     if depth.device.type == "cpu":
         return _count_compiled(depth, cameras, partners, tolerance, margin)
@@ -104,14 +107,17 @@ def _count_compiled(depth: Tensor, cameras: Cameras, partners: Tensor, tolerance
 def count_points(
     points: Tensor, depth: Tensor, cameras: Cameras, tolerance: float, margin: float
 ) -> tuple[Tensor, Tensor]:
-    """How many views agree with points in space, and how many look through them, ``[N]`` int64 each.
+    """How many views agree with points in space, and how many look through them.
 
     Args:
         points: ``[N, 3]`` in the world of the cameras.
         depth: ``[V, H, W]`` z-depth of the views, 0 = none.
         cameras: of the views (B = 1).
-        tolerance: as for :func:`count_views`.
-        margin: as for :func:`count_views`.
+        tolerance: relative difference of depth up to which a view agrees.
+        margin: relative difference of depth from which on a view looks through a point.
+
+    Returns:
+        Views that agree and views that look through, ``[N]`` int64 each.
     """
     agree, through = (torch.zeros(len(points), dtype=torch.int64, device=points.device) for _ in range(2))
     for view in range(len(depth)):
