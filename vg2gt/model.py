@@ -289,11 +289,15 @@ class VG2GT(Reconstructor):
         Returns:
             Geometry before and after enhancement, voxels and Gaussians, in scene units and in the frame of view 0.
         """
+        # coarse level: images [B, V, 3, H, W] to enhanced tokens [B, V, P, D] and depth [B, V, H, W]
         tokens, decoded = self.enhance(images, hints, generator)
+        # ours: pixels that other views do not contradict [B, V, H, W]
         support = self.support(decoded.geometry, hints)
         keep, coarsen = (None, None) if support is None else (support.keep, support.coarsen)
+        # fine level: pixels to M voxels with features [M, C]
         with stage("fine"):
             voxels: Voxels = self.fine(tokens, decoded.geometry.where(keep), images, coarsen)
+        # every voxel splits into K Gaussians: [M * K]
         with stage("gaussians"):
             gaussians = self.with_background(self.gaussians(voxels), images, decoded.initial.depth)
         return Prediction(decoded.initial, decoded.geometry, decoded.unit, voxels, gaussians, keep)
@@ -316,9 +320,11 @@ class VG2GT(Reconstructor):
         Returns:
             The enhanced tokens, and geometry before and after enhancement.
         """
+        # frozen backbone: tokens [B, V, P, D], depth and cameras
         tokens, initial, unit = self.read_views(images, hints, unit)
         if self.coarse is None:
             return tokens, Decoded(initial, initial, unit)
+        # points to voxels, PTv3, back to tokens, which the same frozen heads decode again
         with stage("coarse"):
             tokens = self.coarse(tokens, initial, generator=generator)
         with stage("decode_again"):
