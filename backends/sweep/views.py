@@ -14,7 +14,8 @@ _LEAST_PARALLAX, _MOST_PARALLAX = (
     0.5,
 )  # baseline over depth: below it little is gained, above it views look unlike
 _SEEN_AGAIN = 0.4  # worth of a point in one more source, relative to one source fewer
-_WIDE = (0.2, 40.0)  # the first sweep's range in units of the cameras' largest distance
+_WIDE = (0.1, 40.0)  # the first sweep's range in units of the cameras' largest distance
+_NEAREST = 0.01  # of it at least, where cameras stand close together
 
 
 def rays(intrinsics: Tensor, size: tuple[int, int]) -> Tensor:
@@ -87,9 +88,17 @@ def camera_extent(world_to_camera: Tensor) -> Tensor:
 
 
 def wide_range(world_to_camera: Tensor) -> Tensor:
-    """Near and far ``[2]`` of a first sweep, from the cameras alone."""
-    extent = camera_extent(world_to_camera)
-    return torch.stack((_WIDE[0] * extent, _WIDE[1] * extent))
+    """Near and far ``[2]`` of a first sweep, from the cameras ``[V, 4, 4]`` alone.
+
+    Near is at most the median distance of a camera to its nearest neighbour: on a long walk the largest distance says
+    little about how near things are, and people take views in steps that suit the distance of what they look at.
+    """
+    centers = torch.linalg.inv(world_to_camera)[:, :3, 3]
+    distances = torch.cdist(centers, centers, compute_mode="donot_use_mm_for_euclid_dist")
+    extent = distances.max()
+    step = distances.fill_diagonal_(torch.inf).min(1).values.median()
+    near = torch.minimum(_WIDE[0] * extent, step.clamp_min(_NEAREST * extent))
+    return torch.stack((near, _WIDE[1] * extent))
 
 
 def agreed_range(depth: Tensor, agreement: Tensor, fallback: Tensor, share: float = 0.5) -> Tensor:
@@ -100,5 +109,5 @@ def agreed_range(depth: Tensor, agreement: Tensor, fallback: Tensor, share: floa
     agreed = depth[agreement > share].sort().values
     if len(agreed) < 0.01 * depth.numel():
         return fallback
-    low, high = agreed[int(0.02 * len(agreed))], agreed[min(int(0.98 * len(agreed)), len(agreed) - 1)]
+    low, high = agreed[int(0.01 * len(agreed))], agreed[int(0.99 * len(agreed))]
     return torch.stack((low * 0.8, high * 1.4))
