@@ -30,8 +30,8 @@ _NO_PARALLAX = (
 class SweepBackend(Backend):
     """Plane-sweep multi-view stereo (needs cameras).
 
-    Every view is compared with the views that overlap it best, on planes between a near and a far depth: those that
-    the hints give, or those that a first, wide sweep finds from the cameras alone. Depth is metric as far as the
+    Every view is compared with the views that overlap it best, on planes between a near and a far depth that a first,
+    wide sweep finds: from the cameras alone, or around the range that the hints give. Depth is metric as far as the
     cameras are. ``depth_conf`` is one over the expected relative error of depth.
 
     Args:
@@ -78,9 +78,8 @@ class SweepBackend(Backend):
                 views = PosedViews(pictures, cameras.world_to_camera[scene], cameras.intrinsics[scene])
                 self._check_parallax(views)
                 features = self.network.features(pictures)
-                depth_range = self._range(hints, scene)
-                if depth_range is None:
-                    depth_range = self.network.find_range(features, views, self.sources)
+                told = None if hints.depth_range is None else hints.depth_range[scene].float()
+                depth_range = self.network.find_range(features, views, self.sources, told)
                 sources = choose_sources(views.world_to_camera, views.intrinsics, views.size, depth_range, self.sources)
                 encoded.append(self.network.encode(features, views, depth_range, sources, self.planes))
         taps = [torch.stack([each.taps[tap] for each in encoded]) for tap in range(TAPS)]
@@ -103,10 +102,6 @@ class SweepBackend(Backend):
             confidence = torch.exp(-log_scale).clamp(*_CONFIDENCE)
         depth, confidence = (each.unflatten(0, (scenes, views)) for each in (depth, confidence))
         return Geometry(depth, confidence, state["cameras"], torch.ones_like(depth[:, 0, 0, 0]))
-
-    def _range(self, hints: Hints, scene: int) -> Tensor | None:
-        depth_range = getattr(hints, "depth_range", None)
-        return None if depth_range is None else depth_range[scene].float()
 
     def _check_parallax(self, views: PosedViews) -> None:
         if len(views.images) < self.min_views:

@@ -32,6 +32,7 @@ _VIEWS_AT_A_TIME = 4
 _FARTHEST = 4.0  # decoded depth at most, in multiples of the farthest plane
 _LOG_DEPTH = 20.0  # of decoded depth at most either way: finite whatever the tokens are
 WIDE_PLANES = 64  # of the sweep that finds the range
+_BEYOND = (0.5, 3.0)  # of near and far that are told: how far it looks beyond them
 
 
 class PosedViews(NamedTuple):
@@ -122,13 +123,25 @@ class SweepNet(nn.Module):
         agreeing = agreement(to_inverse(t.detach(), depth_range), warp)
         return Sweep(logits, position, t, mass), agreeing
 
-    def find_range(self, features: Features, views: PosedViews, sources: int) -> Tensor:
-        """Near and far ``[2]`` from the cameras alone: a wide sweep, then the depths on which views agree."""
-        wide = wide_range(views.world_to_camera)
+    def find_range(self, features: Features, views: PosedViews, sources: int, told: Tensor | None = None) -> Tensor:
+        """Near and far ``[2]`` of the depths on which views agree in a wide sweep.
+
+        Args:
+            features: of ``views.images``.
+            views: of one scene.
+            sources: views that each is compared with.
+            told: ``[2]`` near and far of what is known to be seen. The sweep looks beyond them, because sparse points
+                lie where there is texture and miss what is near in few views; the result holds them. None: the sweep's
+                range comes from the cameras alone.
+        """
+        wide = wide_range(views.world_to_camera) if told is None else told * told.new_tensor(_BEYOND)
         chosen = choose_sources(views.world_to_camera, views.intrinsics, views.size, wide, sources)
         sweep, agreeing = self.coarse(features, views, wide, chosen, WIDE_PLANES)
         depth = 1 / to_inverse(sweep.t, wide)
-        return agreed_range(depth, agreeing[:, 1:2] * (sweep.mass > 0.4), wide)
+        found = agreed_range(depth, agreeing[:, 1:2] * (sweep.mass > 0.4), wide if told is None else told)
+        if told is not None:
+            found = torch.stack((torch.minimum(found[0], told[0]), torch.maximum(found[1], told[1])))
+        return found
 
     def encode(
         self, features: Features, views: PosedViews, depth_range: Tensor, sources: Tensor, planes: int

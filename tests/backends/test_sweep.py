@@ -5,6 +5,7 @@ import torch
 from torch import Tensor
 
 from backends.sweep.backend import SweepBackend
+from backends.sweep.network import PosedViews
 from backends.sweep.correlate import GROUPS, SourceWarp, correlate, correlate_reference
 from backends.sweep.views import agreed_range, choose_sources, wide_range
 from backends.sweep.volume import agreement
@@ -167,10 +168,15 @@ def test_shipped_weights_measure_depth(unseen_room: Batch) -> None:
     assert error[order[: len(order) // 2]].mean() < 0.6 * error.mean()
 
 
-def test_a_given_range_is_used(unseen_room: Batch) -> None:
-    """Structure from motion knows how near and far things are: nothing is searched beyond."""
-    backend = SweepBackend()
-    near_far = torch.tensor([[0.2, 1.0]])
-    hints = Hints(cameras=unseen_room.cameras.select(slice(0, 3)), depth_range=near_far)
-    tokens = backend.encode(unseen_room.images[:, :3], hints)
-    assert float(tokens.state["swept"][:, :, 0].exp().median()) < 1.5
+def test_a_given_range_is_searched_beyond(unseen_room: Batch) -> None:
+    """Sparse points miss what is near in few views; told too little, the sweep finds the rest."""
+    network = SweepBackend().network
+    cameras, images = unseen_room.cameras, unseen_room.images[0]
+    views = PosedViews(images, cameras.world_to_camera[0], cameras.intrinsics[0])
+    features = network.features(images)
+    low, middle, high = (float(unseen_room.depth.quantile(q)) for q in (0.05, 0.5, 0.95))
+    with torch.no_grad():
+        near, far = network.find_range(features, views, 3, torch.tensor([0.9 * middle, 1.1 * middle])).tolist()
+        wide = network.find_range(features, views, 3, torch.tensor([0.5 * low, 2 * high])).tolist()
+    assert 0.45 * middle * 0.8 <= near < max(low, 0.6 * middle) and min(high, 1.4 * middle) < far < 3.3 * middle * 1.4
+    assert wide[0] <= 0.5 * low and wide[1] >= 2 * high
