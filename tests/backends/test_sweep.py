@@ -5,8 +5,8 @@ import torch
 from torch import Tensor
 
 from backends.sweep.backend import SweepBackend
-from backends.sweep.network import PosedViews
 from backends.sweep.correlate import GROUPS, SourceWarp, correlate, correlate_reference
+from backends.sweep.network import PosedViews
 from backends.sweep.views import agreed_range, choose_sources, wide_range
 from backends.sweep.volume import agreement
 from vg2gt.data import SyntheticScenes
@@ -178,5 +178,7 @@ def test_a_given_range_is_searched_beyond(unseen_room: Batch) -> None:
     with torch.no_grad():
         near, far = network.find_range(features, views, 3, torch.tensor([0.9 * middle, 1.1 * middle])).tolist()
         wide = network.find_range(features, views, 3, torch.tensor([0.5 * low, 2 * high])).tolist()
-    assert 0.45 * middle * 0.8 <= near < max(low, 0.6 * middle) and min(high, 1.4 * middle) < far < 3.3 * middle * 1.4
-    assert wide[0] <= 0.5 * low and wide[1] >= 2 * high
+    assert 0.45 * middle * 0.8 <= near < max(low, 0.6 * middle)
+    assert min(high, 1.4 * middle) < far < 3.3 * middle * 1.4
+    assert wide[0] <= 0.5 * low
+    assert wide[1] >= 2 * high
