@@ -33,6 +33,7 @@ _FARTHEST = 4.0  # decoded depth at most, in multiples of the farthest plane
 _LOG_DEPTH = 20.0  # of decoded depth at most either way: finite whatever the tokens are
 WIDE_PLANES = 64  # of the sweep that finds the range
 _BEYOND = (0.5, 3.0)  # of near and far that are told: how far it looks beyond them
+_NEARER = 0.6  # of the near that the first wide sweep found: where the second begins
 
 
 class PosedViews(NamedTuple):
@@ -132,16 +133,36 @@ class SweepNet(nn.Module):
             sources: views that each is compared with.
             told: ``[2]`` near and far of what is known to be seen. The sweep looks beyond them, because sparse points
                 lie where there is texture and miss what is near in few views; the result holds them. None: the sweep's
-                range comes from the cameras alone.
+                range comes from the cameras alone, and a second sweep from the near that was found measures far.
         """
-        wide = wide_range(views.world_to_camera) if told is None else told * told.new_tensor(_BEYOND)
+        if told is not None:
+            found = self._agreed(features, views, sources, told * told.new_tensor(_BEYOND), told)
+            return torch.stack((torch.minimum(found[0], told[0]), torch.maximum(found[1], told[1])))
+        wide = wide_range(views.world_to_camera)
+        first = self._agreed(features, views, sources, wide, wide)
+        second = torch.stack((_NEARER * first[0], wide[1]))
+        return self._agreed(features, views, sources, second, first, farthest_step=False)
+
+    def _agreed(
+        self,
+        features: Features,
+        views: PosedViews,
+        sources: int,
+        wide: Tensor,
+        fallback: Tensor,
+        farthest_step: bool = True,
+    ) -> Tensor:
+        """The range of depths on which views agree in a sweep of the range ``wide``.
+
+        Without ``farthest_step``, what lies between the last two planes does not count: the sky and windows, which
+        agree at any large depth.
+        """
         chosen = choose_sources(views.world_to_camera, views.intrinsics, views.size, wide, sources)
         sweep, agreeing = self.coarse(features, views, wide, chosen, WIDE_PLANES)
-        depth = 1 / to_inverse(sweep.t, wide)
-        found = agreed_range(depth, agreeing[:, 1:2] * (sweep.mass > 0.4), wide if told is None else told)
-        if told is not None:
-            found = torch.stack((torch.minimum(found[0], told[0]), torch.maximum(found[1], told[1])))
-        return found
+        counts = sweep.mass > 0.4
+        if not farthest_step:
+            counts = counts & (sweep.t > 1 / (WIDE_PLANES - 1))
+        return agreed_range(1 / to_inverse(sweep.t, wide), agreeing[:, 1:2] * counts, fallback)
 
     def encode(
         self, features: Features, views: PosedViews, depth_range: Tensor, sources: Tensor, planes: int

@@ -15,7 +15,7 @@ _LEAST_PARALLAX, _MOST_PARALLAX = (
 )  # baseline over depth: below it little is gained, above it views look unlike
 _SEEN_AGAIN = 0.4  # worth of a point in one more source, relative to one source fewer
 _WIDE = (0.1, 40.0)  # the first sweep's range in units of the cameras' largest distance
-_NEAREST = 0.01  # of it at least, where cameras stand close together
+_NEAREST = 0.03  # of it at least, where cameras stand close together
 
 
 def rays(intrinsics: Tensor, size: tuple[int, int]) -> Tensor:
