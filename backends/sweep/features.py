@@ -93,8 +93,8 @@ class FeaturePyramid(nn.Module):
         quarter = self.merge(quarter + _upsample(self.from_eighth(eighth), quarter))
         half = self.merge_half(half + _upsample(self.from_quarter(quarter), half))
         return Features(
-            _unit_groups(self.coarse(quarter)),
-            _unit_groups(self.fine(half)),
+            unit_groups(self.coarse(quarter)),
+            unit_groups(self.fine(half)),
             self.context(quarter),
             self.context_fine(half),
         )
@@ -109,7 +109,7 @@ def _upsample(x: Tensor, like: Tensor) -> Tensor:
     return F.interpolate(x, size=like.shape[-2:], mode="bilinear", align_corners=False)
 
 
-def _unit_groups(x: Tensor) -> Tensor:
+def unit_groups(x: Tensor) -> Tensor:
     """Makes every group of channels (those of equal c % GROUPS) of ``[N, C, h, w]`` a unit vector, in float32."""
     grouped = x.float().permute(0, 2, 3, 1).unflatten(-1, (-1, GROUPS))  # [N, h, w, C / GROUPS, GROUPS]
     length = grouped.square().sum(-2, keepdim=True).clamp_min(1e-6).sqrt()

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from backends.sweep.correlate import SourceWarp
-from backends.sweep.features import CONTEXT_COARSE, FeaturePyramid, Features
+from backends.sweep.features import CONTEXT_COARSE, FeaturePyramid, Features, unit_groups
 from backends.sweep.head import DepthHead
 from backends.sweep.refine import RefineNet, convex_upsample, slices
 from backends.sweep.tokens import PATCH, TokenNet, patch_places
@@ -33,6 +33,7 @@ _FARTHEST = 4.0  # decoded depth at most, in multiples of the farthest plane
 _LOG_DEPTH = 20.0  # of decoded depth at most either way: finite whatever the tokens are
 WIDE_PLANES = 64  # of the sweep that finds the range
 _BEYOND = (0.5, 3.0)  # of near and far that are told: how far it looks beyond them
+_RANGE_CELLS = 2000  # of a view's map at most where only the range is wanted: a quarter of the time
 _NEARER = 0.6  # of the near that the first wide sweep found: where the second begins
 
 
@@ -113,13 +114,13 @@ class SweepNet(nn.Module):
         self.head = DepthHead()
 
     def coarse(
-        self, features: Features, views: PosedViews, depth_range: Tensor, sources: Tensor, planes: int
+        self, maps: Tensor, views: PosedViews, depth_range: Tensor, sources: Tensor, planes: int, stride: int = 4
     ) -> tuple[Sweep, Tensor]:
-        """The first sweep over ``[near, far]`` and the agreement of its depths ``[V, 3, h, w]``."""
-        warp = _warp(features.coarse, views, sources, 4)
+        """A sweep of ``maps [V, C, h, w]`` over ``[near, far]`` and the agreement of its depths ``[V, 3, h, w]``."""
+        warp = _warp(maps, views, sources, stride)
         position = torch.linspace(0, 1, planes, device=depth_range.device).view(1, -1, 1, 1)
         inverse = to_inverse(position, depth_range)[..., 0].expand(len(views.images), -1, -1)  # [V, D, 1]
-        logits = _match(self.sweep, self.volume, features.coarse, inverse, warp)
+        logits = _match(self.sweep, self.volume, maps, inverse, warp)
         t, mass = expectation(logits, position)
         agreeing = agreement(to_inverse(t.detach(), depth_range), warp)
         return Sweep(logits, position, t, mass), agreeing
@@ -158,7 +159,10 @@ class SweepNet(nn.Module):
         agree at any large depth.
         """
         chosen = choose_sources(views.world_to_camera, views.intrinsics, views.size, wide, sources)
-        sweep, agreeing = self.coarse(features, views, wide, chosen, WIDE_PLANES)
+        maps, stride = features.coarse, 4
+        while maps.shape[-2] * maps.shape[-1] > _RANGE_CELLS:
+            maps, stride = unit_groups(F.avg_pool2d(maps, 2)), 2 * stride
+        sweep, agreeing = self.coarse(maps, views, wide, chosen, WIDE_PLANES, stride)
         counts = sweep.mass > 0.4
         if not farthest_step:
             counts = counts & (sweep.t > 1 / (WIDE_PLANES - 1))
@@ -176,7 +180,7 @@ class SweepNet(nn.Module):
             sources: ``[V, n]`` indices of the views that each is compared with.
             planes: of the first sweep.
         """
-        first, agreeing = self.coarse(features, views, depth_range, sources, planes)
+        first, agreeing = self.coarse(features.coarse, views, depth_range, sources, planes)
         bins = slices(first.logits.softmax(1), _BINS)
         known = torch.cat((features.context, 4 * first.t, first.mass, agreeing, bins), 1)
         found = self.refine(known)
