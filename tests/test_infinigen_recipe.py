@@ -186,3 +186,22 @@ def test_rooms_are_made_in_stages_that_resume(recipe, tmp_path):
     rows = list(csv.DictReader((out / "log.csv").open()))
     assert [row["result"] for row in rows if row["room"] == "room_0000"] == ["ok", "exit 1", "ok", "ok"]
     assert all(float(row["wall_seconds"]) >= 0 for row in rows)
+
+
+def test_every_path_becomes_a_scene(recipe, tmp_path):
+    split = recipe("split").split
+    frames = tmp_path / "train/room_0000/frames/Image/camera_0"
+    frames.mkdir(parents=True)
+    views = ["turn_0", "walk_0", "near_0", "walk_0", "near_1"]
+    (tmp_path / "train/room_0000/views.json").write_text(json.dumps([{"path": path} for path in views]))
+    for number in range(len(views)):
+        (frames / f"Image_0_0_{number:04d}_0.jpg").write_bytes(b"%d" % number)
+    assert [scene.name for scene in split(tmp_path)] == ["walk", "near"]
+    links = sorted((tmp_path / "paths/train/room_0000").glob("*/frames/Image/camera_0/*"))
+    assert [(link.parents[3].name, link.name, link.read_bytes()) for link in links] == [
+        ("near", "Image_0_0_0002_0.jpg", b"2"),
+        ("near", "Image_0_0_0004_0.jpg", b"4"),
+        ("walk", "Image_0_0_0001_0.jpg", b"1"),
+        ("walk", "Image_0_0_0003_0.jpg", b"3"),
+    ]
+    assert list(split(tmp_path)) == []  # kept

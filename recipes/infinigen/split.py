@@ -1,0 +1,43 @@
+"""Makes a scene of every path through the rooms: ``python split.py FOLDER``, the folder that ``make.py`` wrote.
+
+Views of different paths of a room hardly overlap, and loaders draw neighbouring frames. Scenes of links to the frames
+on paths of one kind go to ``FOLDER/paths/PART/ROOM/KIND``. Turns on the spot are left out: they have no parallax.
+Scenes that are there are kept. Standard library only.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+_FRAME = 3  # place of the frame's number in a name such as Image_0_0_0007_0
+
+
+def split(out: Path) -> Iterator[Path]:
+    """Links the frames of every room below ``out``; yields the scenes that were made."""
+    for room in sorted(room for part in ("train", "held_out") for room in (out / part).glob("room_*")):
+        kinds: dict[str, list[int]] = {}
+        for number, view in enumerate(json.loads((room / "views.json").read_text())):
+            kinds.setdefault(view["path"].rsplit("_", 1)[0], []).append(number)
+        kinds.pop("turn", None)
+        for kind, numbers in kinds.items():
+            scene = out / "paths" / room.parent.name / room.name / kind
+            if not scene.exists():
+                _link(room, scene, set(numbers))
+                yield scene
+
+
+def _link(room: Path, scene: Path, numbers: set[int]) -> None:
+    for path in sorted(room.glob("frames/*/camera_*/*")):
+        if int(path.stem.split("_")[_FRAME]) in numbers:
+            link = scene / path.relative_to(room)
+            link.parent.mkdir(parents=True, exist_ok=True)
+            link.symlink_to(os.path.relpath(path, link.parent))
+
+
+if __name__ == "__main__":
+    for made in split(Path(sys.argv[1])):
+        print(made)
