@@ -162,7 +162,7 @@ def depth_range(pictures: Sequence[Picture]) -> Tensor | None:
     """Near and far ``[1, 2]`` of what the pictures see, from their sparse points; None where there are too few.
 
     The range of all but 1 % of the observed points at either end, widened: points lie where there is texture, so that
-    floors before the camera and bare walls behind are missed (measured in ``docs/results.md``).
+    floors before the camera and bare walls behind are missed. The plane sweep searches beyond it.
     """
     known = [picture.point_depths for picture in pictures if picture.point_depths is not None]
     depths = np.concatenate(known) if known else np.zeros(0)
