@@ -168,6 +168,21 @@ def test_shipped_weights_measure_depth(unseen_room: Batch) -> None:
     assert error[order[: len(order) // 2]].mean() < 0.6 * error.mean()
 
 
+def test_the_range_comes_from_the_cameras(unseen_room: Batch) -> None:
+    """Neither is anything cut off, nor do planes stand where nothing is; also where one camera is far from the rest."""
+    network = SweepBackend().network
+    cameras, images = unseen_room.cameras, unseen_room.images[0]
+    low, high = (float(unseen_room.depth.quantile(q)) for q in (0.02, 0.98))
+    alone = cameras.world_to_camera[0].clone()
+    alone[-1, :3, 3] += alone[-1, :3, :3] @ torch.tensor([0.0, 8.0, 0.0])  # above the room: it sees nothing
+    for poses in (cameras.world_to_camera[0], alone):
+        views = PosedViews(images, poses, cameras.intrinsics[0])
+        with torch.no_grad():
+            near, far = network.find_range(network.features(images), views, 3).tolist()
+        assert 0.4 * low < near < 1.1 * low
+        assert 0.9 * high < far < 2.5 * high
+
+
 def test_a_given_range_is_searched_beyond(unseen_room: Batch) -> None:
     """Sparse points miss what is near in few views; told too little, the sweep finds the rest."""
     network = SweepBackend().network
