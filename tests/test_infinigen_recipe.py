@@ -205,3 +205,5 @@ def test_every_path_becomes_a_scene(recipe, tmp_path):
         ("walk", "Image_0_0_0003_0.jpg", b"3"),
     ]
     assert list(split(tmp_path)) == []  # kept
+    with pytest.raises(FileNotFoundError, match="no rooms in"):
+        list(split(tmp_path / "other"))

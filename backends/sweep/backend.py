@@ -12,7 +12,7 @@ from torch import Tensor
 from backends.base import Backend
 from backends.sweep.network import PosedViews, SweepNet
 from backends.sweep.tokens import DIM, PATCH, TAPS
-from backends.sweep.views import camera_extent, choose_sources
+from backends.sweep.views import camera_distances, choose_sources
 from backends.weights import Weights
 from vg2gt.geometry.cameras import relative_to_first
 from vg2gt.geometry.precision import full_precision
@@ -78,8 +78,8 @@ class SweepBackend(Backend):
                 views = PosedViews(pictures, cameras.world_to_camera[scene], cameras.intrinsics[scene])
                 self._check_parallax(views)
                 features = self.network.features(pictures)
-                told = None if hints.depth_range is None else hints.depth_range[scene].float()
-                depth_range = self.network.find_range(features, views, self.sources, told)
+                hint = None if hints.depth_range is None else hints.depth_range[scene].float()
+                depth_range = self.network.find_range(features, views, self.sources, hint)
                 sources = choose_sources(views.world_to_camera, views.intrinsics, views.size, depth_range, self.sources)
                 encoded.append(self.network.encode(features, views, depth_range, sources, self.planes))
         taps = [torch.stack([each.taps[tap] for each in encoded]) for tap in range(TAPS)]
@@ -106,5 +106,5 @@ class SweepBackend(Backend):
     def _check_parallax(self, views: PosedViews) -> None:
         if len(views.images) < self.min_views:
             raise ValueError(_NO_PARALLAX.format(name=self.name, why="was given one view"))
-        if not camera_extent(views.world_to_camera) > 0:
+        if not (camera_distances(views.world_to_camera) > 0).any():
             raise ValueError(_NO_PARALLAX.format(name=self.name, why="all cameras stand in one place"))

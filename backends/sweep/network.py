@@ -31,10 +31,10 @@ _FINE_REACH = 1.5  # of the second sweep on either side, in spacings of the firs
 _VIEWS_AT_A_TIME = 4
 _FARTHEST = 4.0  # decoded depth at most, in multiples of the farthest plane
 _LOG_DEPTH = 20.0  # of decoded depth at most either way: finite whatever the tokens are
-WIDE_PLANES = 64  # of the sweep that finds the range
-_BEYOND = (0.5, 3.0)  # of near and far that are told: how far it looks beyond them
-_RANGE_CELLS = 2000  # of a view's map at most where only the range is wanted: a quarter of the time
-_NEARER = 0.6  # of the near that the first wide sweep found: where the second begins
+WIDE_PLANES = 64  # of the sweeps that find the range
+_BEYOND = (0.5, 3.0)  # times near and far of a hint: the range that is searched
+_RANGE_CELLS = 2000  # of a view's map, at most, in these sweeps
+_NEARER = 0.6  # times near of the first of them: where the second begins
 
 
 class PosedViews(NamedTuple):
@@ -125,48 +125,40 @@ class SweepNet(nn.Module):
         agreeing = agreement(to_inverse(t.detach(), depth_range), warp)
         return Sweep(logits, position, t, mass), agreeing
 
-    def find_range(self, features: Features, views: PosedViews, sources: int, told: Tensor | None = None) -> Tensor:
-        """Near and far ``[2]`` of the depths on which views agree in a wide sweep.
+    def find_range(self, features: Features, views: PosedViews, sources: int, hint: Tensor | None = None) -> Tensor:
+        """Searches the range of depths on which views agree, in sweeps that are wide and coarse.
+
+        Sparse points lie where there is texture and miss what is near in few views, so a hint is searched beyond.
+        From the cameras alone, a first sweep finds near; a second one begins there, so that its planes resolve far.
 
         Args:
             features: of ``views.images``.
             views: of one scene.
             sources: views that each is compared with.
-            told: ``[2]`` near and far of what is known to be seen. The sweep looks beyond them, because sparse points
-                lie where there is texture and miss what is near in few views; the result holds them. None: the sweep's
-                range comes from the cameras alone, and a second sweep from the near that was found measures far.
-        """
-        if told is not None:
-            found = self._agreed(features, views, sources, told * told.new_tensor(_BEYOND), told)
-            return torch.stack((torch.minimum(found[0], told[0]), torch.maximum(found[1], told[1])))
-        wide = wide_range(views.world_to_camera)
-        first = self._agreed(features, views, sources, wide, wide)
-        second = torch.stack((_NEARER * first[0], wide[1]))
-        return self._agreed(features, views, sources, second, first, farthest_step=False)
+            hint: ``[2]`` near and far of what is known to be seen; None: the cameras alone say where to search.
 
-    def _agreed(
-        self,
-        features: Features,
-        views: PosedViews,
-        sources: int,
-        wide: Tensor,
-        fallback: Tensor,
-        farthest_step: bool = True,
-    ) -> Tensor:
-        """The range of depths on which views agree in a sweep of the range ``wide``.
-
-        Without ``farthest_step``, what lies between the last two planes does not count: the sky and windows, which
-        agree at any large depth.
+        Returns:
+            ``[2]`` near and far, around the hint if there is one; where hardly any depth agrees, the hint or the whole
+            range that was searched.
         """
-        chosen = choose_sources(views.world_to_camera, views.intrinsics, views.size, wide, sources)
         maps, stride = features.coarse, 4
         while maps.shape[-2] * maps.shape[-1] > _RANGE_CELLS:
             maps, stride = unit_groups(F.avg_pool2d(maps, 2)), 2 * stride
-        sweep, agreeing = self.coarse(maps, views, wide, chosen, WIDE_PLANES, stride)
-        counts = sweep.mass > 0.4
-        if not farthest_step:
-            counts = counts & (sweep.t > 1 / (WIDE_PLANES - 1))
-        return agreed_range(1 / to_inverse(sweep.t, wide), agreeing[:, 1:2] * counts, fallback)
+
+        def search(wide: Tensor, fallback: Tensor, least: float = 0.0) -> Tensor:
+            """The agreed range of one sweep; positions up to ``least`` (0 at far, 1 at near) do not count."""
+            chosen = choose_sources(views.world_to_camera, views.intrinsics, views.size, wide, sources)
+            sweep, agreeing = self.coarse(maps, views, wide, chosen, WIDE_PLANES, stride)
+            counts = (sweep.mass > 0.4) & (sweep.t >= least)
+            return agreed_range(1 / to_inverse(sweep.t, wide), agreeing[:, 1:2] * counts, fallback)
+
+        if hint is not None:
+            found = search(hint * hint.new_tensor(_BEYOND), hint)
+            return torch.stack((torch.minimum(found[0], hint[0]), torch.maximum(found[1], hint[1])))
+        wide = wide_range(views.world_to_camera)
+        first = search(wide, wide)
+        # The sky and windows agree at any large depth, between the last two planes.
+        return search(torch.stack((_NEARER * first[0], wide[1])), first, least=1 / (WIDE_PLANES - 1))
 
     def encode(
         self, features: Features, views: PosedViews, depth_range: Tensor, sources: Tensor, planes: int

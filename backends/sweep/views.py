@@ -81,10 +81,10 @@ def choose_sources(
     return torch.stack(chosen, 1)
 
 
-def camera_extent(world_to_camera: Tensor) -> Tensor:
-    """Largest distance between two camera centres of ``[V, 4, 4]``."""
+def camera_distances(world_to_camera: Tensor) -> Tensor:
+    """Distances ``[V, V]`` between the centres of cameras ``[V, 4, 4]``."""
     centers = torch.linalg.inv(world_to_camera)[:, :3, 3]
-    return torch.cdist(centers, centers).max()
+    return torch.cdist(centers, centers, compute_mode="donot_use_mm_for_euclid_dist")  # products lose small ones
 
 
 def wide_range(world_to_camera: Tensor) -> Tensor:
@@ -93,8 +93,7 @@ def wide_range(world_to_camera: Tensor) -> Tensor:
     Near is at most the median distance of a camera to its nearest neighbour: on a long walk the largest distance says
     little about how near things are, and people take views in steps that suit the distance of what they look at.
     """
-    centers = torch.linalg.inv(world_to_camera)[:, :3, 3]
-    distances = torch.cdist(centers, centers, compute_mode="donot_use_mm_for_euclid_dist")
+    distances = camera_distances(world_to_camera)
     extent = distances.max()
     step = distances.fill_diagonal_(torch.inf).min(1).values.median()
     near = torch.minimum(_WIDE[0] * extent, step.clamp_min(_NEAREST * extent))

@@ -64,7 +64,7 @@ def main(config: DictConfig) -> None:
     workers = {"num_workers": config.workers, "pin_memory": config.accelerator == "gpu"}
     trainer.fit(training, DataLoader(samples, batch_size=None, **workers), ckpt_path=checkpoint, weights_only=True)
     if trainer.is_global_zero:
-        print(write_weights(training, out / "sweep.safetensors", config))
+        print(write_weights(training, out / "sweep.safetensors", config, len(rooms)))
 
 
 if __name__ == "__main__":

@@ -33,13 +33,20 @@ def begin_with(training: SweepTraining, path: Path) -> None:
     training.count_from(3600 * hours)
 
 
-def write_weights(training: SweepTraining, path: Path, config: DictConfig) -> Path:
-    """Writes the averaged weights in half precision, with what made them in the header; returns ``path``."""
+def write_weights(training: SweepTraining, path: Path, config: DictConfig, rooms: int) -> Path:
+    """Writes the averaged weights in half precision, with what made them in the header; returns ``path``.
+
+    Args:
+        training: of which the average is written.
+        path: of the safetensors file.
+        config: of the training.
+        rooms: number of Infinigen rooms among its scenes.
+    """
     state = training.averaged.module.state_dict()
     tensors = {name: value.detach().half().contiguous() for name, value in sorted(state.items())}
     made_of = {
         "steps": str(training.global_step),
-        "scenes": f"{config.scenes.count} from seed {config.scenes.first_seed}",
+        "scenes": f"{config.scenes.count} from seed {config.scenes.first_seed}, {rooms} Infinigen rooms",
         "seed": str(config.seed),
         "begun_with": Path(config.begin).name if config.begin else "random weights",
         "core_hours": f"{training.core_seconds / 3600:.2f}",

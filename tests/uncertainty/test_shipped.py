@@ -59,7 +59,7 @@ def test_it_holds_on_a_few_rooms(shipped: LoadedModel) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(reason="too careful: 94.6 % hold where views are close together (2026-11-26)", strict=True)
+@pytest.mark.xfail(reason="too careful where views are close together: 92.9 % hold in the first 40 rooms", strict=True)
 def test_it_holds_on_a_thousand_views(shipped: LoadedModel) -> None:
     found = measured(shipped, rooms=200, views=5)
     assert found["90%"] == pytest.approx(0.9, abs=0.02), found

@@ -104,3 +104,19 @@ def test_scenes_are_split_and_batched(tmp_path, frames, name):
     for batch in (batches[0], next(iter(module.train_dataloader()))):
         assert batch.images.shape[-3:] == (3, 28, 42)
         assert bool((batch.depth > 0).flatten(2).any(2).all())
+
+
+def test_worlds_and_infinigen_rooms_are_mixed(tmp_path, frames):
+    """The mixture that the head in the package was trained on."""
+    for end in ("train", "val"):
+        _infinigen(tmp_path / end, frames)
+    (tmp_path / "val/a").rename(tmp_path / "val/b")
+    roots = [f"data.{end}.parts.infinigen.root={tmp_path / end}" for end in ("train", "val")]
+    small = ["image_size=[28,42]", "min_views=2", "max_views=2", "max_images=2", "eval_context=2", "train_scenes=4"]
+    where = [f"hydra.searchpath=[{ROOT / 'examples/worlds/configs'}]", "data=worlds_infinigen", *roots]
+    config = compose("train", *where, f"data.worlds_cache_dir={tmp_path}", *(f"data.{change}" for change in small))
+    module = instantiate(config.data)
+    scenes = module.train_source().scenes
+    assert "infinigen/a" in scenes
+    assert sum(scene.startswith("worlds/") for scene in scenes) >= 3
+    assert {batch.scene[0].split("/")[0] for batch in module.val_dataloader()} == {"worlds", "infinigen"}
