@@ -284,7 +284,7 @@ class VG2GT(Reconstructor):
         Args:
             images: ``[B, V, 3, H, W]`` in [0, 1]; H and W multiples of the backend's patch size.
             hints: what the data knows, for backends that need it.
-            generator: draws the serialisation order of the coarse module while training.
+            generator: draws the serialisation order of the coarse module, and voxel sizes, while training.
 
         Returns:
             Geometry before and after enhancement, voxels and Gaussians, in scene units and in the frame of view 0.
@@ -296,7 +296,7 @@ class VG2GT(Reconstructor):
         keep, coarsen = (None, None) if support is None else (support.keep, support.coarsen)
         # fine level: pixels to M voxels with features [M, C]
         with stage("fine"):
-            voxels: Voxels = self.fine(tokens, decoded.geometry.where(keep), images, coarsen)
+            voxels: Voxels = self.fine(tokens, decoded.geometry.where(keep), images, coarsen, generator)
         # every voxel splits into K Gaussians: [M * K]
         with stage("gaussians"):
             gaussians = self.with_background(self.gaussians(voxels), images, decoded.initial.depth)

@@ -56,6 +56,8 @@ class FineModule(nn.Module):
         point_mlp: makes the voxel network from ``in_channels``.
         voxel_size: edge length in scene units.
         min_footprint: smallest edge in pixels at the scene's median depth; 0 switches the guard off.
+        coarsest_drawn: in training that edge is multiplied by a factor drawn log-uniformly from 1 to this number, so
+            that one head serves several voxel sizes.
         max_voxels: most voxels a scene; beyond it the least confident are dropped, with a warning in the log and
             the metric ``train/voxels_dropped``. None keeps all.
         moments: second moments of the points are pooled too: further inputs of the voxel network, and what the
@@ -69,7 +71,7 @@ class FineModule(nn.Module):
         cap: counts what ``max_voxels`` drops.
 
     Raises:
-        ValueError: if ``max_voxels`` is below 1, or ``normal_kernel`` neither 1 nor 3.
+        ValueError: if ``max_voxels`` or ``coarsest_drawn`` is below 1, or ``normal_kernel`` neither 1 nor 3.
     """
 
     def __init__(
@@ -84,12 +86,16 @@ class FineModule(nn.Module):
         moments: bool = False,
         normal_kernel: int = 1,
         drop_fringes: bool = False,
+        coarsest_drawn: float = 1.0,
     ) -> None:
         super().__init__()
+        if not coarsest_drawn >= 1:
+            raise ValueError(f"model.fine.coarsest_drawn must be at least 1, got {coarsest_drawn}")
         if normal_kernel not in (1, 3):
             raise ValueError(f"model.fine.normal_kernel must be 1 or 3, got {normal_kernel}")
         self.voxel_size = voxel_size
         self.min_footprint = min_footprint
+        self.coarsest_drawn = coarsest_drawn
         self.max_voxels = check_limit("model.fine.max_voxels", max_voxels)
         self.cap = Cap("model.fine.max_voxels", "voxels", "least confident")
         self.dense_head = dense_head(token_dims=token_dims, patch_size=patch_size)
@@ -101,7 +107,14 @@ class FineModule(nn.Module):
         self.point_mlp = point_mlp(in_channels=width + EXTRA_CHANNELS + MOMENT_CHANNELS * moments)
         self.out_channels = self.point_mlp.out_channels
 
-    def forward(self, tokens: Tokens, geometry: Geometry, images: Tensor, coarsen: Tensor | None = None) -> Voxels:
+    def forward(
+        self,
+        tokens: Tokens,
+        geometry: Geometry,
+        images: Tensor,
+        coarsen: Tensor | None = None,
+        generator: torch.Generator | None = None,
+    ) -> Voxels:
         """Builds the fine voxels of B scenes.
 
         Args:
@@ -109,6 +122,7 @@ class FineModule(nn.Module):
             geometry: decoded depth, confidence and cameras, in scene units and the frame of context view 0.
             images: ``[B, V, 3, H, W]`` in [0, 1].
             coarsen: ``[B]`` factors of the smallest edge; None: 1.
+            generator: draws further factors while training.
 
         Returns:
             Refined voxels; differentiable in features, confidence and positions, not in which pixel lies where.
@@ -116,6 +130,9 @@ class FineModule(nn.Module):
         Raises:
             ValueError: if a scene spans too many voxels to be numbered.
         """
+        if self.training and self.coarsest_drawn > 1:
+            drawn = self.coarsest_drawn ** torch.rand(len(images), generator=generator)
+            coarsen = (1 if coarsen is None else coarsen) * drawn.to(images.device)
         with full_precision(images):
             size = scene_voxel_size(geometry, self.voxel_size, self.min_footprint, coarsen)
         return self._refine(self._measure(tokens, geometry, images, size, self.max_voxels), size)

@@ -65,7 +65,9 @@ class RefineOptions:
         prune_opacity: Gaussians less opaque are removed.
         split_share: share of the Gaussians that a check splits, those whose positions are pulled the most.
         max_growth: the scene has at most this many times its Gaussians.
-        seed: of the order of the views.
+        dropout: share of the Gaussians that a step at the end leaves out at random, growing from 0 (DropGaussian, Park
+            et al. 2025): with few views no Gaussian may matter for one of them alone.
+        seed: of the order of the views and of what is left out.
         rates: learning rates.
         loss: what is lowered.
 
@@ -86,6 +88,7 @@ class RefineOptions:
     prune_opacity: float = 0.02
     split_share: float = 0.0
     max_growth: float = 1.5
+    dropout: float = 0.0
     seed: int = 0
     rates: RefineRates = field(default_factory=RefineRates)
     loss: RefineLoss = field(default_factory=RefineLoss)
@@ -105,6 +108,7 @@ class RefineOptions:
             ("prune_opacity", 0 <= self.prune_opacity < 1, "at least 0 and below 1"),
             ("split_share", 0 <= self.split_share <= 1, "between 0 and 1"),
             ("max_growth", self.max_growth >= 1, "at least 1"),
+            ("dropout", 0 <= self.dropout < 1, "at least 0 and below 1"),
         ):
             if not good:
                 raise ValueError(f"refine.{name} must be {expected}, got {getattr(self, name)}")

@@ -26,6 +26,7 @@ log = logging.getLogger(__name__)
 
 WORSE = 2.0  # left-out views whose loss is so many times that of the start, and of the best state, show a divergence
 RETREATS = 4  # with each the rates are halved
+MOST_OPAQUE = 0.999  # of what remains while others are dropped
 SMOOTH = 3  # checks whose scores are averaged: each is of other views
 
 
@@ -146,6 +147,7 @@ class _Refinement:
         self.order = ViewOrder(len(seen.images), options.holdout, options.seed)
         self.trained = self.order.trained.to(seen.images.device)
         self.options = options.of(len(self.order.trained))
+        self.dropping = torch.Generator().manual_seed(options.seed)
         if options.min_views:
             gaussians = supported(gaussians, cameras, seen.depth, options.min_views, options.merge_cells)
         self.limit = int(options.max_growth * len(gaussians))
@@ -220,7 +222,9 @@ class _Refinement:
         """One step, with a check where one is due; says how it ended if it did."""
         views = self.order.deal(self.options.views_per_step).to(self.seen.images.device)
         scene = self.parameters.scene()
-        loss, images = self._loss(scene, views)
+        loss, images = self._loss(self._thinned(scene), views)
+        if terms := self.options.loss.of_gaussians(scene.gaussians, self.parameters.size):
+            loss = loss + self.options.loss.total(terms)
         self.recent.append(float(images.mean()))
         self.steps += 1
         rate = self.factor * self.options.final_rate ** self._done()
@@ -237,6 +241,16 @@ class _Refinement:
             return ""
         return "steps" if self.steps == self.options.steps else "seconds"
 
+    def _thinned(self, scene: RefinedScene) -> RefinedScene:
+        """The scene without what this step drops; what remains is more opaque, so that pixels stay covered."""
+        share = self.options.dropout * self._done()
+        if not share:
+            return scene
+        gaussians = scene.gaussians
+        keep = torch.rand(len(gaussians), generator=self.dropping) >= share
+        left = gaussians.select(keep.to(gaussians.means.device))
+        return replace(scene, gaussians=replace(left, opacities=(left.opacities / (1 - share)).clamp(max=MOST_OPAQUE)))
+
     def _loss(self, scene: RefinedScene, views: Tensor) -> tuple[Tensor, Tensor]:
         """The loss of some views, and their PSNR ``[R]``."""
         loss, cameras, seen = self.options.loss, scene.cameras.select(views), self.seen.views(views)
@@ -244,7 +258,6 @@ class _Refinement:
         color = where_it_counts(scene.exposed(rendered.color, views)[0], seen.images, seen.mask)
         rendered = replace(rendered, color=color[None])
         terms = loss.of_views(rendered, cameras, seen, self.depth)
-        terms |= loss.of_gaussians(scene.gaussians, self.parameters.size) if torch.is_grad_enabled() else {}
         return loss.total(terms), psnr(rendered.color[0].detach(), seen.images)
 
     @torch.no_grad()
