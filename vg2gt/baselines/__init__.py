@@ -1,4 +1,4 @@
-"""Models to compare with, on the same frozen backbone, losses and data (paper, Baselines)."""
+"""Baseline models on the same frozen backbone, losses and data (paper, Baselines)."""
 
 from vg2gt.baselines.da3_gaussians import DA3Gaussians
 from vg2gt.baselines.pixel_aligned import PixelAligned, PixelHead

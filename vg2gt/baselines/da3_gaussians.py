@@ -1,4 +1,4 @@
-"""Depth Anything 3's own Gaussians, one per pixel: nothing is trained (paper, Baselines, "DA3")."""
+"""Depth Anything 3's own Gaussians, one per pixel, without training (paper, Baselines, "DA3")."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ SCALE_UNIT = 0.1
 
 
 class DA3Gaussians(Reconstructor):
-    """The Gaussians of DA3's ``gs_head``, whose weights the backend's file holds.
+    """Gaussians of DA3's ``gs_head``, with the weights of the backend's checkpoint.
 
-    They are defined for cameras whose principal point is the image's centre, half a pixel from where DA3 has it for
-    depth; :meth:`run_backbone` and :meth:`predict_cameras` give those.
+    The head expects cameras with the principal point at the image centre, half a pixel from DA3's cameras for depth.
+    :meth:`run_backbone` and :meth:`predict_cameras` return such cameras.
 
     Args:
         backend: DA3 with a Gaussian head: GIANT, or random weights.
@@ -65,7 +65,7 @@ class DA3Gaussians(Reconstructor):
     def forward(
         self, images: Tensor, hints: Hints | None = None, generator: torch.Generator | None = None
     ) -> Prediction:
-        """Reconstructs B scenes; see :meth:`vg2gt.model.Reconstructor.forward`. Nothing is random here."""
+        """Reconstructs B scenes; see :meth:`vg2gt.model.Reconstructor.forward`. Deterministic."""
         tokens, geometry, unit = self.read_views(images, hints)
         support = self.support(geometry, hints)
         keep = None if support is None else support.keep
@@ -81,24 +81,24 @@ class DA3Gaussians(Reconstructor):
 
 
 def place(raw: Tensor, pixels: Pixels, unit: Tensor, own: Tensor, frame: Tensor) -> Gaussians:
-    """Turns raw Gaussians into Gaussians of the scene.
+    """Converts raw head outputs to Gaussians of the scene.
 
     Args:
         raw: ``[N, sum(PARTS)]``, see :meth:`backends.da3.gaussians.GaussianHead.predict`.
         pixels: the same N pixels.
         unit: ``[B]`` scene units per unit of the network.
-        own: ``[B * V, 4]`` quaternions of camera to world as the network predicts it.
-        frame: ``[B * V, 4]`` quaternions of the network's world to the scene.
+        own: ``[B * V, 4]`` camera-to-world quaternions predicted by the network.
+        frame: ``[B * V, 4]`` quaternions from the network's world to the scene.
     """
     shift, scale, rotation, color, change, opacity = raw.float().split(PARTS, -1)
     depth = pixels.depth + unit[pixels.batch] * change[:, 0]
     pixel = pixels.footprint / pixels.depth[:, None]  # sides at depth 1
     rays = pixels.rays + F.pad(shift * pixel, (0, 1))
-    # Unlike everywhere else the depth counts along the ray.
+    # Unlike elsewhere, depth is the distance along the ray.
     means = pixels.to_world(F.normalize(rays, dim=-1) * depth[:, None])
     sides = MIN_SCALE + (MAX_SCALE - MIN_SCALE) * torch.sigmoid(scale)
     scales = SCALE_UNIT * (depth * pixel.sum(-1))[:, None].abs() * sides
-    # Like the official code: (z, w, x, y) of what it calls xyzw, turned in its own world, then xyzw rendered as wxyz.
+    # As in the official code: read (z, w, x, y) of its xyzw as wxyz, rotate to its world, render the xyzw as wxyz.
     quats = multiply_quats(own[pixels.view], F.normalize(rotation, dim=-1).roll(2, -1)).roll(-1, -1)
     quats = multiply_quats(frame[pixels.view], quats)
     sh = harmonic_gains(SH_DEGREE).to(color) * color.unflatten(-1, (3, -1)).mT
@@ -113,6 +113,6 @@ def place(raw: Tensor, pixels: Pixels, unit: Tensor, own: Tensor, frame: Tensor)
 
 
 def _centred(cameras: Cameras) -> Cameras:
-    """Cameras whose principal point is half a pixel nearer to the origin."""
+    """Moves the principal point by half a pixel towards the origin."""
     half = cameras.intrinsics.new_tensor([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
     return replace(cameras, intrinsics=cameras.intrinsics - half)

@@ -22,8 +22,8 @@ INITIAL_OPACITY = 0.9
 class PixelHead(nn.Module):
     """Two-layer MLP from a pixel's feature to one Gaussian.
 
-    Before training every Gaussian lies on its unprojected pixel, is round, half a pixel wide (standard deviation),
-    nearly opaque and has the pixel's colour.
+    Before training, each Gaussian approximately lies on its unprojected pixel, is isotropic with a standard deviation
+    of half a pixel, nearly opaque, and has the pixel's colour.
 
     Args:
         in_channels: width of the pixel features.
@@ -33,7 +33,7 @@ class PixelHead(nn.Module):
         hidden: width of the hidden layer; None takes ``in_channels``.
 
     Attributes:
-        out: the last layer; its last output per pixel is the logit of a confidence, which ``VoxelMerged`` uses.
+        out: last layer; its last output per pixel is a raw confidence for ``VoxelMerged``.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class PixelHead(nn.Module):
         self.max_depth_residual = max_depth_residual
         bands = (sh_degree + 1) ** 2
         self.parts = (2, 1, 3, 4, 1, 3 * bands, 1)
-        # An untrained dense head's features hardly differ from pixel to pixel; VG²GT's point network has norms too.
+        # Features of an untrained dense head hardly differ between pixels; VG²GT's point network has norms, too.
         self.norm = nn.LayerNorm(in_channels)
         self.hidden = nn.Linear(in_channels, hidden or in_channels)
         self.out = nn.Linear(hidden or in_channels, sum(self.parts))
@@ -66,7 +66,7 @@ class PixelHead(nn.Module):
     def forward(
         self, features: Tensor, pixels: Pixels, min_footprint: Tensor | None = None
     ) -> tuple[Gaussians, Tensor]:
-        """Turns pixels into Gaussians.
+        """Predicts one Gaussian per pixel.
 
         Args:
             features: ``[N, C]``.
@@ -74,8 +74,8 @@ class PixelHead(nn.Module):
             min_footprint: ``[N]`` in scene units; scales are relative to it where it is larger than the pixel. None: 0.
 
         Returns:
-            One Gaussian per pixel, in the order of the pixels, and positive confidences ``[N]`` that are those of the
-            depth before training.
+            Gaussians in the order of the pixels, and positive confidences ``[N]``, which are close to the depth
+            confidences before training.
         """
         raw = self.out(F.gelu(self.hidden(self.norm(features)))).float()
         shift, residual, scale, rotation, opacity, color, trust = raw.split(self.parts, -1)
@@ -85,7 +85,7 @@ class PixelHead(nn.Module):
         footprint = pixels.footprint.mean(-1)
         unit = footprint if min_footprint is None else torch.maximum(footprint, min_footprint)
         scales = unit[:, None] * (MAX_SCALE * torch.sigmoid(scale + self.scale_bias)).clamp(min=MIN_SCALE)
-        # In camera axes, as the harmonics: a head that sees images cannot know the world's.
+        # In camera axes, like the harmonics: a head that sees images cannot know the world axes.
         quats = F.normalize(rotation + rotation.new_tensor([1.0, 0.0, 0.0, 0.0]), dim=-1)
         quats = multiply_quats(matrix_to_quat(pixels.rotation), quats)
         base = F.pad(rgb_to_sh(pixels.colors)[:, None], (0, 0, 0, len(self.sh_gain) - 1))
@@ -98,7 +98,7 @@ class PixelHead(nn.Module):
             sh=base + change,
             batch=pixels.batch,
         )
-        # softplus(ln(e - 1)) = 1: the confidence of the depth, until training knows better.
+        # softplus(ln(e - 1)) = 1: training starts from the depth confidence.
         return gaussians, pixels.confidence * F.softplus(trust[:, 0] + math.log(math.e - 1)).clamp(min=1e-6)
 
 

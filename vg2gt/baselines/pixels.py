@@ -1,4 +1,4 @@
-"""The usable pixels of all views as one packed list, and models that begin with a Gaussian per pixel."""
+"""Usable pixels of all views as one packed list, and a base class for models with per-pixel Gaussians."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from vg2gt.model import Background, Reconstructor, SceneScale
 from vg2gt.profiling import stage
 from vg2gt.types import Gaussians, Geometry, Hints, Prediction, TensorRecord
 
-SMALLEST_FOOTPRINT = 1e-7  # scene units; a hundredth of it is still a scale that renders
+SMALLEST_FOOTPRINT = 1e-7  # scene units; a hundredth of it is still a valid scale for the renderer
 
 
 @dataclass(frozen=True)
@@ -52,23 +52,23 @@ class Pixels(TensorRecord):
     center: Tensor
 
     def to_world(self, local: Tensor) -> Tensor:
-        """Moves camera-frame points ``[N, 3]``, one per pixel, into the world; elementwise: no autocast rounds it."""
+        """Transforms camera-frame points ``[N, 3]``, one per pixel, to the world; elementwise to avoid autocast."""
         return (self.rotation * local[:, None, :]).sum(-1) + self.center
 
     def turn_to_world(self, sh: Tensor) -> Tensor:
-        """Coefficients ``[N, (L + 1)^2, 3]`` in camera axes to those of the same colours in world axes."""
+        """Rotates SH coefficients ``[N, (L + 1)^2, 3]`` from camera axes to world axes."""
         degree = math.isqrt(sh.shape[1]) - 1
         if degree == 0:
             return sh
         counts = torch.bincount(self.view)
-        last = counts.cumsum(0) - 1  # a view without pixels takes its neighbour's, and turns nothing
+        last = counts.cumsum(0) - 1  # a view without pixels gets a neighbour's rotation, for no rows
         turns = rotation_of_coefficients(self.rotation[last.clamp(min=0)], degree)
         parts = sh.split(counts.tolist())
         return torch.cat([turn @ part for turn, part in zip(turns, parts, strict=True)]) if parts else sh
 
 
 def usable_pixels(geometry: Geometry, images: Tensor) -> Pixels:
-    """Lists the pixels whose depth and confidence are finite and positive; geometry is in scene units."""
+    """Packs the pixels whose depth and confidence are finite and positive; geometry is in scene units."""
     depth, confidence = geometry.depth.float(), geometry.depth_conf.float()
     usable = torch.isfinite(depth) & (depth > 0) & torch.isfinite(confidence) & (confidence > 0)
     rows = usable.flatten().nonzero()[:, 0]
@@ -93,15 +93,17 @@ def usable_pixels(geometry: Geometry, images: Tensor) -> Pixels:
 
 
 def harmonic_gains(degree: int) -> Tensor:
-    """Factors ``[(degree + 1)^2, 1]`` with which predicted SH coefficients begin small in higher degrees."""
+    """Returns factors ``[(degree + 1)^2, 1]`` that make predicted SH coefficients of higher degrees start small."""
     degrees = [each for each in range(degree + 1) for _ in range(2 * each + 1)]
     return torch.tensor([0.1 * 0.25**each if each else 1.0 for each in degrees])[:, None]
 
 
 class PixelReconstructor(Reconstructor):
-    """Features of a dense head at every pixel, and Gaussians made of them; the geometry is the backbone's own.
+    """Base class that decodes Gaussians from a dense head's features at every pixel; geometry is the backbone's own.
 
-    Args (the others: see :class:`vg2gt.model.Reconstructor`):
+    See :class:`vg2gt.model.Reconstructor` for the other arguments.
+
+    Args:
         dense_head: makes the dense head from ``token_dims`` and ``patch_size``.
         gaussians: makes the pixel head from ``in_channels``.
     """
@@ -122,7 +124,7 @@ class PixelReconstructor(Reconstructor):
     def forward(
         self, images: Tensor, hints: Hints | None = None, generator: torch.Generator | None = None
     ) -> Prediction:
-        """Reconstructs B scenes; see :meth:`vg2gt.model.Reconstructor.forward`. Nothing is random here."""
+        """Reconstructs B scenes; see :meth:`vg2gt.model.Reconstructor.forward`. Deterministic."""
         tokens, geometry, unit = self.read_views(images, hints)
         support = self.support(geometry, hints)
         keep = None if support is None else support.keep
@@ -136,4 +138,4 @@ class PixelReconstructor(Reconstructor):
 
     @abstractmethod
     def make_gaussians(self, features: Tensor, pixels: Pixels, geometry: Geometry) -> Gaussians:
-        """Turns the features ``[N, C]`` of the N usable pixels of B scenes into their Gaussians."""
+        """Returns the Gaussians of B scenes from the features ``[N, C]`` of their N usable pixels."""

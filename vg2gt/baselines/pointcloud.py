@@ -1,4 +1,4 @@
-"""The backbone's coloured points as Gaussians: nothing is trained (paper, Baselines, "coloured point clouds")."""
+"""The backbone's coloured points as Gaussians, without training (paper, Baselines, "coloured point clouds")."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ NEIGHBORS = 3
 
 
 class PointCloud(Reconstructor):
-    """One round Gaussian per pixel, as wide as the points lie apart.
+    """One isotropic Gaussian per pixel, as wide as the spacing of the points.
 
     Args:
         backend: the frozen visual foundation model.
         scale: fixes the scene unit.
-        spacing: ``pixel``: the size of the pixel at its depth; ``neighbors``: the root mean square distance to the
-            three nearest points, which with ``opacity=0.1`` is how 3DGS starts from a point cloud.
-        width: standard deviation over the spacing.
-        opacity: of every Gaussian, in (0, 1).
+        spacing: ``pixel``: size of the pixel at its depth. ``neighbors``: root mean square distance to the three
+            nearest points; with ``opacity=0.1`` this is the 3DGS initialisation from a point cloud.
+        width: standard deviation relative to the spacing.
+        opacity: opacity of every Gaussian, in (0, 1).
         background: see :class:`vg2gt.model.Reconstructor`.
         visibility: see :class:`vg2gt.model.Reconstructor`.
 
@@ -58,7 +58,7 @@ class PointCloud(Reconstructor):
     def forward(
         self, images: Tensor, hints: Hints | None = None, generator: torch.Generator | None = None
     ) -> Prediction:
-        """Reconstructs B scenes; see :meth:`vg2gt.model.Reconstructor.forward`. Nothing is random here."""
+        """Reconstructs B scenes; see :meth:`vg2gt.model.Reconstructor.forward`. Deterministic."""
         _, geometry, unit = self.read_views(images, hints)
         support = self.support(geometry, hints)
         keep = None if support is None else support.keep
@@ -79,7 +79,7 @@ class PointCloud(Reconstructor):
 
 
 def _distance_to_neighbors(means: Tensor, pixels: Pixels) -> Tensor:
-    """Root mean square distance ``[N]`` of every point to its nearest others in the scene, at least 1 % of a pixel."""
+    """Returns each point's RMS distance ``[N]`` to its nearest neighbours in the scene, at least 1 % of a pixel."""
     parts = []
     for points in means.split(torch.bincount(pixels.batch).tolist()):
         index = nearest_neighbors(points, points, NEIGHBORS + 1)[:, 1:]  # the nearest is the point itself

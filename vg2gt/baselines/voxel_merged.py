@@ -18,11 +18,11 @@ from vg2gt.types import Gaussians, Geometry
 
 
 class VoxelMerged(PixelReconstructor):
-    """One Gaussian per pixel first; then all Gaussians of a voxel become their confidence-weighted mean.
+    """Predicts one Gaussian per pixel, then merges all Gaussians of a voxel into their confidence-weighted mean.
 
-    What is merged are finished parameters, not features: nothing looks at a voxel as a whole, and a voxel holds one
-    Gaussian. Scales are relative to the voxel, where that is larger than the pixel, so that the merged Gaussians leave
-    no holes before training.
+    Merges decoded parameters, not features: no network sees a voxel as a whole, and each voxel holds one Gaussian.
+    Scales are relative to the voxel where it is larger than the pixel, so that merged Gaussians leave no holes before
+    training.
 
     Args:
         backend: the frozen visual foundation model.
@@ -30,8 +30,9 @@ class VoxelMerged(PixelReconstructor):
         dense_head: makes the dense head from ``token_dims`` and ``patch_size``.
         gaussians: makes the pixel head from ``in_channels``.
         voxel_size: edge length in scene units.
-        min_footprint: smallest edge in pixels at the scene's median depth; 0 switches the guard off.
+        min_footprint: smallest edge in pixels at the scene's median depth; 0: no limit.
         background: see :class:`vg2gt.model.Reconstructor`.
+        visibility: see :class:`vg2gt.model.Reconstructor`.
     """
 
     def __init__(
@@ -50,7 +51,7 @@ class VoxelMerged(PixelReconstructor):
         self.min_footprint = min_footprint
 
     def make_gaussians(self, features: Tensor, pixels: Pixels, geometry: Geometry) -> Gaussians:
-        """One Gaussian per occupied voxel."""
+        """Returns one Gaussian per occupied voxel."""
         size = scene_voxel_size(geometry, self.voxel_size, self.min_footprint)
         single, confidence = self.gaussians(features, pixels, min_footprint=size[pixels.batch])
         return merge_by_voxel(single, confidence, size)
@@ -59,8 +60,8 @@ class VoxelMerged(PixelReconstructor):
 def merge_by_voxel(gaussians: Gaussians, confidence: Tensor, voxel_size: Tensor) -> Gaussians:
     """Replaces the Gaussians of every voxel by their mean, weighted by ``confidence`` ``[N]`` > 0.
 
-    Voxels have edges ``voxel_size`` ``[B]`` in scene units; Gaussians too far away to be numbered are left out.
-    Differentiable in parameters and confidence, not in which Gaussian lies where.
+    Voxels have edge ``voxel_size`` ``[B]`` in scene units; Gaussians outside the range of cell indices are dropped.
+    Differentiable in parameters and confidence, but not in the assignment to voxels.
     """
     cells = point_cells(gaussians.means, gaussians.batch, voxel_size)
     plan = plan_voxels(cells, gaussians.batch, in_range(cells.detach()))
@@ -82,7 +83,7 @@ def merge_by_voxel(gaussians: Gaussians, confidence: Tensor, voxel_size: Tensor)
 
 
 def _same_signs(quats: Tensor, confidence: Tensor, plan: VoxelPlan) -> Tensor:
-    """Quaternions ``[N, 4]``, with signs chosen by a voxel's largest component so that they do not cancel."""
+    """Aligns the signs of quaternions ``[N, 4]`` by their voxel's largest component, so that they do not cancel."""
     decisive = pool_mean(quats.detach().square(), confidence.detach(), plan).argmax(-1)
     own = quats.detach().gather(1, decisive[plan.voxel_of.clamp(min=0), None]) if len(plan) else quats[:, :1]
     return torch.where(own < 0, -quats, quats)

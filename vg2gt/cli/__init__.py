@@ -4,5 +4,5 @@ from vg2gt.cli.commands import COMMANDS, dispatch
 
 
 def main() -> None:
-    """Runs ``vg2gt COMMAND [arguments]``; the arguments are the command's own (Hydra overrides where it trains)."""
+    """Runs ``vg2gt COMMAND [arguments]``; each command parses its own arguments."""
     dispatch("vg2gt", COMMANDS)

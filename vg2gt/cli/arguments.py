@@ -1,4 +1,4 @@
-"""Arguments of all commands: their own are flags, those of model, backend, renderer and data Hydra's ``key=value``."""
+"""Command-line arguments: flags of the commands, and Hydra's ``key=value`` for model, backend, renderer and data."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ DROP = "leave out what is guessed, contradicted, single (seen by one view), unse
 
 
 def hydra_command(command: Command, config_name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], None]]:
-    """Makes a command of a function of a configuration, with sweeps and a folder for the run."""
+    """Decorator that turns a function of a configuration into a Hydra command, with sweeps and a run folder."""
 
     def decorate(run: Callable[[DictConfig], None]) -> Callable[[], None]:
-        """The command that runs this function."""
+        """Returns the command that runs the function."""
 
         @wraps(run)
         def job(config: DictConfig) -> None:
@@ -40,7 +40,7 @@ def hydra_command(command: Command, config_name: str) -> Callable[[Callable[[Dic
 
         @wraps(run)
         def main() -> None:
-            """The command: Hydra composes the configuration and says what is wrong with an argument."""
+            """Composes the configuration with Hydra, which also reports wrong arguments, and runs the job."""
             if {"-h", "--help"} & set(sys.argv):
                 print(f"{command.does}\n\nexample: {command.example}\n")
             try:
@@ -57,7 +57,7 @@ def hydra_command(command: Command, config_name: str) -> Callable[[Callable[[Dic
 
 
 def flag_parser(name: str, command: Command, details: str = "") -> argparse.ArgumentParser:
-    """The parser of a command with flags; its help ends with the example and ``details``."""
+    """Creates the parser of a command with flags; its help ends with the example and ``details``."""
     return argparse.ArgumentParser(
         f"vg2gt {name}",
         description=f"{command.does[0].upper()}{command.does[1:]}.",
@@ -77,24 +77,24 @@ def add_common_flags(parser: argparse.ArgumentParser, saved: Sequence[str]) -> N
 
 
 def add_trust_flags(parser: argparse.ArgumentParser) -> None:
-    """Adds what filters a scene by what it knows of itself."""
+    """Adds the flags that filter Gaussians by their error bound and status."""
     add = parser.add_argument
     add("--min-confidence", type=float, metavar="C", help="leave out what may be more than 1 - C of its depth off")
     add("--drop", type=list_of_names, default=[], metavar="LIST", help=DROP)
 
 
 def separate(argv: Sequence[str] | None) -> tuple[list[str], list[str]]:
-    """A command line's own arguments, and its ``key=value`` overrides: what has that form and is no file."""
+    """Splits a command line into flags and ``key=value`` overrides; existing files of that form are no overrides."""
     given = sys.argv[1:] if argv is None else list(argv)
     overrides = [argument for argument in given if OVERRIDE.match(argument) and not Path(argument).exists()]
     return [argument for argument in given if argument not in overrides], overrides
 
 
 def list_of_names(text: str) -> list[str]:
-    """Reads ``a,b,c``."""
+    """Splits ``a,b,c``."""
     return [name.strip() for name in text.split(",") if name.strip()]
 
 
 def listing(outputs: dict[str, Any]) -> str:
-    """What ``--save`` takes, one name per line."""
+    """Lists the outputs that ``--save`` accepts, one per line."""
     return "\n".join(["", "outputs of --save:", *(f"  {name:<13} {text}" for name, text in outputs.items())])

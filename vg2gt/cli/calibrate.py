@@ -1,4 +1,4 @@
-"""``vg2gt calibrate``: the calibration of a checkpoint's stated errors."""
+"""``vg2gt calibrate``: calibrates the error bounds of a checkpoint."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from vg2gt.cli.commands import COMMANDS
 
 @hydra_command(COMMANDS["calibrate"], "calibrate")
 def main(config: DictConfig) -> None:
-    """Makes the calibration that the configuration describes."""
+    """Runs the calibration that the configuration describes."""
     from vg2gt.evaluation.calibrate import make_calibration
 
     make_calibration(config)

@@ -1,4 +1,4 @@
-"""All commands of ``vg2gt``: what each does, an example, where it is. Imports none of them: help comes at once."""
+"""All commands of ``vg2gt``: entry points, descriptions and examples. Imports none of them, to keep help fast."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import vg2gt
 
 @dataclass(frozen=True)
 class Command:
-    """A command: its ``module:function``, one line of what it does, an example."""
+    """A command: its ``module:function``, a one-line description and an example."""
 
     entry: str
     does: str
@@ -93,7 +93,7 @@ DATA_COMMANDS = {
 
 
 def dispatch(program: str, commands: Mapping[str, Command]) -> None:
-    """Runs ``program COMMAND [arguments]``; lists the commands if none is named, the nearest if there is none."""
+    """Runs ``program COMMAND [arguments]``; lists all commands if none is given, suggests one if it is unknown."""
     asked = sys.argv[1] if len(sys.argv) > 1 else ""
     if asked in ("", "-h", "--help"):
         print(listing(program, commands))
@@ -108,13 +108,13 @@ def dispatch(program: str, commands: Mapping[str, Command]) -> None:
         sys.exit(2)
     module, _, function = commands[asked].entry.partition(":")
     command = importlib.import_module(module)
-    # Further processes (DDP) are started as argv says: by the command's own file, without the command's name.
+    # DDP starts further processes from argv: argv[0] must be the command's own file, and its name must not follow
     sys.argv[:2] = [str(command.__file__)]
     getattr(command, function)()
 
 
 def listing(program: str, commands: Mapping[str, Command]) -> str:
-    """One line and an example for each command."""
+    """Lists the commands, each with a description and an example."""
     lines = [f"usage: {program} COMMAND [arguments]", ""]
     for name, command in commands.items():
         lines += [f"  {name:<12} {command.does}", f"  {'':<12}   {command.example}"]

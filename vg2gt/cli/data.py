@@ -1,4 +1,4 @@
-"""``vg2gt data splits | views``: what is made of data before training or evaluating."""
+"""``vg2gt data splits | views``: prepares lists of scenes and views for training and evaluation."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def splits(argv: Sequence[str] | None = None) -> None:
 
 
 def views(argv: Sequence[str] | None = None) -> None:
-    """Writes an index of views: which views of which scenes an evaluation takes."""
+    """Writes an index of the scenes and views that an evaluation uses."""
     given, overrides = separate(argv)
     parser = flag_parser("data views", DATA_COMMANDS["views"], VIEWS)
     parser.add_argument("--out", required=True, metavar="FILE.json", help="the index to write")
@@ -60,7 +60,7 @@ def views(argv: Sequence[str] | None = None) -> None:
 
 
 def write_views(out: str, overrides: Sequence[str]) -> Path:
-    """Writes the index that the overrides of ``vg2gt evaluate`` ask for; returns its path."""
+    """Writes the index of views for overrides of ``vg2gt evaluate``; returns its path."""
     from hydra.utils import instantiate
 
     from vg2gt.data.views.drawn import make_index
@@ -75,6 +75,6 @@ def write_views(out: str, overrides: Sequence[str]) -> Path:
     source = datamodule.evaluation_data().source
     scenes = list(source.scenes)[: datamodule.eval_scenes]
     index = make_index(evaluation.selection, source, scenes, view_counts(config.views))
-    # One line per list of frames: readable, and a change of one draw is a change of one line.
+    # one line per list of frames, for readable diffs
     text = re.sub(r"\[[^\[\]{}]*\]", lambda found: re.sub(r"\s+", " ", found[0]), json.dumps(index, indent=1))
     return write_text(out, text.replace("[ ", "[").replace(" ]", "]") + "\n")

@@ -1,4 +1,4 @@
-"""``vg2gt doctor``: what this machine has, which renderer it gets, whether its kernels are right."""
+"""``vg2gt doctor``: reports packages, devices, the selected renderer and the correctness of its kernels."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ NEEDED = ("torch", "lightning", "numba", "numpy")
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Prints one line a finding as it is found."""
+    """Prints each finding on one line, as soon as it is known."""
     flag_parser("doctor", COMMANDS["doctor"]).parse_args(argv)
     with errors_in_one_line():
         for what, found in findings():
@@ -30,7 +30,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def findings() -> Iterator[tuple[str, str]]:
-    """What was looked at and what was found."""
+    """Yields what is checked and the result."""
     yield "vg2gt", f"{vg2gt.__version__} ({vg2gt.source()}), Python {platform.python_version()}, {platform.platform()}"
     yield "packages", ", ".join(f"{name} {_version(name)}" for name in NEEDED)
     yield from _optional()
@@ -56,7 +56,7 @@ def _version(package: str) -> str:
 
 
 def _optional() -> Iterator[tuple[str, str]]:
-    """The extras' packages, by extra; those for tests apart."""
+    """Versions of the optional packages by extra, except those for tests."""
     extras: dict[str, list[str]] = {}
     for line in importlib.metadata.requires("vg2gt") or [] if _version("vg2gt") != "missing" else []:
         name = re.match(r"[\w.-]+", line)
@@ -68,7 +68,7 @@ def _optional() -> Iterator[tuple[str, str]]:
 
 
 def _folders() -> Iterator[tuple[str, str]]:
-    """Where data and what was computed are kept, and how much."""
+    """Cache folders of data and compiled kernels, with their sizes."""
     from vg2gt.kernels.compiled import cache_folder
 
     data = Path(os.environ.get("VG2GT_CACHE", "~/.cache/vg2gt")).expanduser()
@@ -89,7 +89,7 @@ def _size(folder: Path) -> str:
 
 
 def _renderer(device: torch.device) -> Iterator[tuple[str, str]]:
-    """Which renderer ``auto`` is there, and how far the kernels are off (measured again)."""
+    """The renderer that ``auto`` selects on a device, and the newly measured error of the kernels."""
     from vg2gt.rendering.renderer import automatic
     from vg2gt.rendering.selfcheck import KernelsRefusedError, compare, identity
 
@@ -102,5 +102,5 @@ def _renderer(device: torch.device) -> Iterator[tuple[str, str]]:
     if device.type != "cpu" and _version("triton") != "missing":
         try:
             yield "kernels", f"'triton': {compare(device)}"
-        except Exception as error:  # the report is what this command is for
+        except Exception as error:  # any failure is part of the report
             yield "kernels", f"'triton' does not run: {type(error).__name__}: {' '.join(str(error).split())[:300]}"

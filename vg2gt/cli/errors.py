@@ -1,4 +1,4 @@
-"""Errors that the user can mend end a command with one line instead of a traceback."""
+"""One-line messages instead of tracebacks for errors that the user can fix."""
 
 from __future__ import annotations
 
@@ -19,7 +19,10 @@ TRACEBACK = "HYDRA_FULL_ERROR"
 
 @contextmanager
 def errors_in_one_line() -> Iterator[None]:
-    """Ends the process with the message of an error; ``HYDRA_FULL_ERROR=1`` shows the traceback. Sweeps go on."""
+    """Ends the process with the message of a user error; ``HYDRA_FULL_ERROR=1`` shows the traceback.
+
+    In a sweep, errors are raised instead, so that the sweep continues.
+    """
     try:
         yield
     except KeyboardInterrupt:
@@ -30,7 +33,7 @@ def errors_in_one_line() -> Iterator[None]:
     except Exception as error:
         if os.environ.get(TRACEBACK) or in_a_sweep() or not isinstance(error, USER_ERRORS):
             raise
-        # A constructor's own error is the cause of Hydra's.
+        # Hydra wraps errors of constructors: show the original one
         cause = error.__cause__ or error if isinstance(error, InstantiationException) else error
         said = str(cause)
         if isinstance(cause, OSError) and cause.strerror:
@@ -43,7 +46,7 @@ def errors_in_one_line() -> Iterator[None]:
 
 
 def refuse_ranks_in_a_sweep(devices: str) -> None:
-    """Refuses a sweep's jobs that would start ranks, which is done by repeating the command line: the sweep."""
+    """Refuses several devices in a sweep: ranks repeat the command line, which would start the whole sweep."""
     if in_a_sweep() and devices != "1" and "LOCAL_RANK" not in os.environ and "SLURM_PROCID" not in os.environ:
         raise ValueError(f"trainer.devices={devices} in a sweep (-m): run its jobs one by one, or with one device each")
 

@@ -1,4 +1,4 @@
-"""``vg2gt evaluate``: a checkpoint's figures on a data set."""
+"""``vg2gt evaluate``: measures a checkpoint on a data set."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from vg2gt.cli.commands import COMMANDS
 
 
 def run_name(ckpt: str | None) -> str:
-    """Name of the run to which a checkpoint belongs, for the evaluation's folder; ``untrained`` without one."""
+    """Returns the name of a checkpoint's run, for the evaluation's folder; ``untrained`` without a checkpoint."""
     if not ckpt:
         return "untrained"
     parts = [part for part in Path(ckpt).parts if part not in ("outputs", "checkpoints", "/", "..", ".")]

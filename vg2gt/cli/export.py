@@ -1,4 +1,4 @@
-"""``vg2gt export``: a frozen network as an ONNX bundle."""
+"""``vg2gt export``: exports a frozen network as an ONNX bundle."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Numbers of scenes, views, rows and columns stay free."""
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Writes the bundle; ends with one line on what is wrong where something is."""
+    """Writes the bundle; errors are reported in one line."""
     given, overrides = separate(argv)
     parser = flag_parser("export", COMMANDS["export"], DETAILS)
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder")

@@ -1,4 +1,4 @@
-"""Names of runs' folders, as resolvers for the configurations of commands."""
+"""Names of run folders, as OmegaConf resolvers for the configurations of commands."""
 
 from __future__ import annotations
 
@@ -9,23 +9,24 @@ from pathlib import Path, PureWindowsPath
 from omegaconf import DictConfig, OmegaConf
 
 FIRST = "quickstart"
-NAMING = {"data": "synthetic", "backend": "oracle", "model": "tiny"}  # the defaults, whose run is FIRST
+NAMING = {"data": "synthetic", "backend": "oracle", "model": "tiny"}  # a run with these defaults is named FIRST
 ADDED = ("experiment", "ablation")
 STARTED_BY_OTHERS = ("LOCAL_RANK", "RANK", "SLURM_PROCID")
 OF_A_RUN = ("config.yaml", "checkpoints", ".lock")
 
 
 def register() -> None:
-    """Makes ``${run_folder:}`` and ``${inside:NAME}`` known to OmegaConf."""
+    """Registers the resolvers ``${run_folder:}`` and ``${inside:NAME}`` with OmegaConf."""
     OmegaConf.register_new_resolver("run_folder", run_folder, replace=True)
     OmegaConf.register_new_resolver("inside", inside, replace=True)
 
 
 def run_folder(_root_: DictConfig) -> str:
-    """Folder of a training inside ``outputs``: ``name``, or what was chosen, with a number if that is taken.
+    """Returns a training's folder inside ``outputs``: ``name``, or one made of the chosen options.
 
-    It has no number where a run goes on (``ckpt=last``, ``auto``) or is replaced (``overwrite=true``), and where
-    several processes are started at once. Trials (``fast_dev_run``) are kept apart.
+    A name made of the options gets a number if it is taken, but not if a run is resumed (``ckpt=last``, ``auto``) or
+    replaced (``overwrite=true``), or if several processes start at once. Sweeps are named ``sweep``. Trials
+    (``fast_dev_run``) go to ``trials/``.
     """
     config = _root_
     sweep = str(config.hydra.mode).endswith("MULTIRUN")
@@ -40,7 +41,7 @@ def run_folder(_root_: DictConfig) -> str:
 
 
 def chosen(choices: DictConfig) -> str:
-    """``rgbd-oracle-tiny`` of the groups' options; ``quickstart`` for the defaults."""
+    """Joins the options of the groups, such as ``rgbd-oracle-tiny``; ``quickstart`` for the defaults."""
     names = [choices.get(group) for group in NAMING]
     added = [choices.get(group) for group in ADDED]
     if names == list(NAMING.values()) and not any(added):
@@ -50,7 +51,7 @@ def chosen(choices: DictConfig) -> str:
 
 @lru_cache
 def free(name: str) -> str:
-    """The name, or the first with a number after it whose folder has no run; the same for all jobs of a sweep."""
+    """Returns ``name``, or the first ``name-N`` without a run; cached, so it is the same for all jobs of a sweep."""
     number, candidate = 1, name
     while any((Path("outputs", candidate) / part).exists() for part in OF_A_RUN) or _holds_jobs(candidate):
         number += 1
@@ -59,13 +60,13 @@ def free(name: str) -> str:
 
 
 def _holds_jobs(name: str) -> bool:
-    """Whether a sweep has run there: its jobs' folders are numbers."""
+    """Whether the folder holds jobs of a sweep, whose folders are numbers."""
     return any(path.name.isdecimal() for path in Path("outputs", name).glob("[0-9]*"))
 
 
 def inside(name: str) -> str:
-    """The name; ValueError if it leads out of the folder it is a name in."""
-    parts = PureWindowsPath(name).parts  # knows both kinds of slashes
+    """Returns ``name``; ValueError if it points outside its parent folder."""
+    parts = PureWindowsPath(name).parts  # splits at both kinds of slashes
     if not parts or PureWindowsPath(name).drive or name.startswith(("/", "\\")) or ".." in parts:
         raise ValueError(f"name={name}: a name inside outputs, such as mine or paper/first; it may not lead out of it")
     return name

@@ -1,4 +1,4 @@
-"""``vg2gt reconstruct``: images, a folder of them or a video to a scene."""
+"""``vg2gt reconstruct``: makes a scene from images, a folder of them or a video."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Runs the command; an error is one line."""
+    """Runs the command; errors are reported in one line."""
     from rich.console import Console
     from rich.logging import RichHandler
 
@@ -94,7 +94,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
-    """Reconstructs and writes."""
+    """Reconstructs a scene and writes the outputs."""
     from vg2gt.memory import RECONSTRUCTION, memory_advice
     from vg2gt.reconstruction.monitor import Monitor
     from vg2gt.reconstruction.outputs import cost_figures, write_outputs
@@ -147,7 +147,7 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
 
 
 def _check(options: argparse.Namespace, overrides: Sequence[str]) -> None:
-    """Refuses what cannot work before weights are downloaded or any work is done."""
+    """Checks all arguments before weights are downloaded or any work is done."""
     from vg2gt.io.video import require_pyav
     from vg2gt.reconstruction.cameras import check_depth, check_pycolmap
     from vg2gt.reconstruction.outputs import check_folder, check_outputs
@@ -174,7 +174,7 @@ def _check(options: argparse.Namespace, overrides: Sequence[str]) -> None:
 
 
 def _scene(options: argparse.Namespace, ready: LoadedModel, monitor: Monitor) -> Scene:
-    """A new scene, or the one in the folder with images added or taken out."""
+    """Makes a new scene, or adds images to the one in the folder, or removes some."""
     from vg2gt.reconstruction.changes import add_images, take_out
     from vg2gt.reconstruction.pipeline import reconstruct_with
     from vg2gt.reconstruction.windows.run import window_model
@@ -206,11 +206,11 @@ def _scene(options: argparse.Namespace, ready: LoadedModel, monitor: Monitor) ->
 
 
 def _refinement(scene: Scene, steps: int | None) -> RefineOptions | None:
-    """How a scene is refined: photographs unless ``steps`` is 0, recordings and long captures only if it is given."""
+    """Refinement options; None without refinement: ``steps`` is 0, or not given for recordings and long captures."""
     from vg2gt.reconstruction.refined import refinement_of
     from vg2gt.reconstruction.windows.capture import AUTOMATIC
 
-    many = len(scene.names) > AUTOMATIC  # refinement has all images in memory
+    many = len(scene.names) > AUTOMATIC  # refinement holds all images in memory
     if steps == 0 or (steps is None and (many or refinement_of(scene) == "default")):
         return None
     how = options_for(scene, steps=steps)

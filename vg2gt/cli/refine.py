@@ -1,4 +1,4 @@
-"""``vg2gt refine``: a reconstructed scene optimised on its own images."""
+"""``vg2gt refine``: optimises a reconstructed scene on its own images."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Runs the command; an error is one line."""
+    """Runs the command; errors are reported in one line."""
     given, overrides = separate(argv)
     options = parser().parse_args(given)
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
@@ -46,7 +46,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
-    """Refines and writes."""
+    """Refines a scene and writes the outputs."""
     from vg2gt.memory import memory_advice
     from vg2gt.reconstruction.monitor import Monitor
     from vg2gt.reconstruction.outputs import check_folder, check_outputs, write_outputs
@@ -60,7 +60,7 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     check_trust(options.min_confidence, options.drop)
     out = Path(options.out or Path(options.scene) / "refined")
     check_folder(out, [*options.save, REFINED], options.overwrite)
-    refine_options("default", overrides)  # says what is wrong before anything is read
+    refine_options("default", overrides)  # reports wrong options before anything is read
     device = choose_device(options.device)
     with Monitor(show=not options.quiet, device=device) as monitor, memory_advice(ADVICE):
         with monitor.stage("read scene"):
@@ -88,9 +88,10 @@ def options_for(
     seconds: float | None = None,
     holdout: int | None = None,
 ) -> RefineOptions:
-    """Options for a scene: those that suit its cameras, changed by ``overrides`` and then by the other arguments.
+    """Returns the refinement options of a scene.
 
-    Predicted cameras, which nothing has adjusted, are refined unless there are overrides.
+    The defaults depend on the scene's cameras; ``overrides`` change them, then the other arguments. Predicted cameras
+    are refined unless there are overrides.
     """
     from vg2gt.reconstruction.refined import refinement_of
     from vg2gt.refinement import RefineRates
@@ -106,7 +107,7 @@ def options_for(
 
 
 def refine_options(name: str, overrides: Sequence[str]) -> RefineOptions:
-    """Options of ``refine=NAME refine.key=value``; ``name`` where the overrides choose none."""
+    """Builds the options of ``refine=NAME refine.key=value``; ``name`` is used if the overrides choose none."""
     from hydra.errors import InstantiationException
     from hydra.utils import instantiate
 

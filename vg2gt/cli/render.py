@@ -1,4 +1,4 @@
-"""``vg2gt render``: a scene's file seen from given cameras: colour, depth, normals, an animation."""
+"""``vg2gt render``: renders a scene file from given cameras: colour, depth, normals, an animation."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Runs the command; an error is one line."""
+    """Runs the command; errors are reported in one line."""
     options = parser().parse_args(argv)
     with errors_in_one_line():
         run(options)
 
 
 def run(options: argparse.Namespace) -> None:
-    """Renders and writes."""
+    """Renders the views and writes the outputs."""
     from vg2gt.io import read_gaussians
     from vg2gt.io.video import require_pyav
     from vg2gt.reconstruction.camera_files import read_cameras

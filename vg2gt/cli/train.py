@@ -1,4 +1,4 @@
-"""``vg2gt train``, or ``python -m vg2gt.cli.train``: ``python train.py`` of a checkout, from any folder."""
+"""``vg2gt train`` or ``python -m vg2gt.cli.train``: the same as a checkout's ``python train.py``, from any folder."""
 
 from omegaconf import DictConfig
 

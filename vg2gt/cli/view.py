@@ -1,4 +1,4 @@
-"""``vg2gt view SCENE``: a scene in the browser, live or as one self-contained page (docs/guides/view.md)."""
+"""``vg2gt view SCENE``: shows a scene in the browser, live or as one self-contained page (docs/guides/view.md)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ IMAGE_FOLDER = "images"  # next to cameras.json, as `vg2gt reconstruct --save im
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Reads the arguments and shows the scene; what is wrong with them or the files ends it with one line."""
+    """Shows the scene; wrong arguments or files are reported in one line."""
     parser = _parser()
     arguments = parser.parse_args(argv)
     if arguments.html is not None and (arguments.host, arguments.port, arguments.share) != (None, None, False):
@@ -66,7 +66,7 @@ def _parser() -> argparse.ArgumentParser:
 def _port(text: str) -> int:
     port = int(text)
     if not 0 <= port < 65536:
-        raise ValueError(text)  # argparse words the error
+        raise ValueError(text)  # argparse writes the message
     return port
 
 
@@ -89,7 +89,7 @@ def _scene(arguments: argparse.Namespace) -> ViewerScene:
 
 
 def _by_trust(path: Path, gaussians: Gaussians) -> Gaussians:
-    """The same Gaussians in the colours of a report's stated errors."""
+    """Colours the Gaussians by error bound and status, as reports do."""
     import torch
 
     from vg2gt.geometry.spherical_harmonics import rgb_to_sh
@@ -105,7 +105,7 @@ def _by_trust(path: Path, gaussians: Gaussians) -> Gaussians:
 
 
 def _pictures(cameras: Sequence[NamedCamera], folders: Sequence[Path]) -> list[NDArray[np.uint8] | None]:
-    """The cameras' pictures from the first of the folders that has any; says where they are from."""
+    """Loads the cameras' images from the first folder that has any, and prints which."""
     from vg2gt.viewer import load_pictures
 
     for folder in folders:

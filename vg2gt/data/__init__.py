@@ -1,4 +1,4 @@
-"""Datasets: one interface (``SceneSource``), its loaders, view sampling and the data module."""
+"""Datasets: the ``SceneSource`` interface, its loaders, view sampling and the data module."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +22,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Imports the data module when it is asked for: it alone needs Lightning, which takes seconds."""
+    """Imports the data module lazily: only it needs Lightning, which takes seconds to import."""
     if name != "SceneDataModule":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from vg2gt.data.datamodule import SceneDataModule

@@ -1,4 +1,4 @@
-"""What a dataset is: scenes of posed frames with depth. Every loader implements ``SceneSource`` and nothing else."""
+"""Dataset interface: scenes of posed frames with depth. Every loader implements ``SceneSource``."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ __all__ = ["DataError", "Frames", "SceneSource", "SourceMaker", "training_frames
 
 @dataclass(frozen=True)
 class Frames(TensorRecord):
-    """Some frames of one scene, all of one size.
+    """Frames of one scene, all of the same size.
 
     Attributes:
         images: ``[V, 3, H, W]`` float32 in [0, 1].
-        depth: ``[V, H, W]`` float32 z-depth in the dataset's unit, 0 = invalid; the same pixels as ``images``.
+        depth: ``[V, H, W]`` float32 z-depth in the dataset's unit, 0 = invalid; pixel-aligned with ``images``.
         world_to_camera: ``[V, 4, 4]`` float32 rigid OpenCV poses.
         intrinsics: ``[V, 3, 3]`` float32 in pixels, integer pixel centres.
-        sparse_depth: depth is at single pixels only (laser, triangulated points): resizing moves points instead of
-            looking up the nearest pixel.
-        mask: ``[V, H, W]`` float32 in [0, 1], how much each pixel counts (alpha, mask images); None: all count.
+        sparse_depth: whether depth is known at single pixels only (LiDAR, triangulated points). Resizing then moves
+            each point instead of looking up the nearest pixel.
+        mask: ``[V, H, W]`` float32 in [0, 1], weight of each pixel (from alpha or mask images); None: all count fully.
     """
 
     images: Tensor
@@ -38,7 +38,7 @@ class Frames(TensorRecord):
 
     @staticmethod
     def concatenate(parts: Sequence[Frames]) -> Frames:
-        """Joins frames of one scene and size along the views."""
+        """Concatenates frames of one scene and size along the view axis."""
         names = ("images", "depth", "world_to_camera", "intrinsics")
         mask = None
         if any(part.mask is not None for part in parts):
@@ -50,16 +50,16 @@ class Frames(TensorRecord):
 class SceneSource(ABC):
     """Scenes of a dataset, in the framework's conventions (``docs/concepts/conventions.md``).
 
-    A source says which scenes and frames there are without decoding them, and decodes frames when asked. It neither
-    resizes nor caches decoded frames: the data module does that for all sources. It must be picklable, and what it
-    returns must depend on its arguments only, so that worker processes agree.
+    A source lists scenes and frames without decoding them, and decodes frames on request. It does not resize or cache
+    decoded frames: the data module does that for all sources. It must be picklable, and its results must depend only
+    on its arguments, so that all worker processes agree.
 
     Attributes:
-        is_metric: whether the unit of depth and poses is the metre, in all scenes.
-        has_depth: whether frames have depth; without it a source serves reconstruction and novel views, not training.
-        dense_depth: whether depth, where there is any, covers images as a depth camera's does.
-        has_cameras: whether poses and intrinsics are known; without them they are placeholders, for reconstruction
-            only, which makes its own.
+        is_metric: whether depth and poses are in metres in all scenes.
+        has_depth: whether frames have depth. Without it, the loss terms that need ground-truth depth are zero.
+        dense_depth: whether depth, if there is any, covers the whole image like that of a depth camera.
+        has_cameras: whether poses and intrinsics are known. If not, they are placeholders, and the source serves
+            reconstruction only, which estimates the cameras.
     """
 
     is_metric: bool = True
@@ -70,33 +70,34 @@ class SceneSource(ABC):
     @property
     @abstractmethod
     def scenes(self) -> Sequence[str]:
-        """Names of the scenes, unique and in a fixed order."""
+        """Unique scene names, in a fixed order."""
 
     @abstractmethod
     def frames(self, scene: str) -> Sequence[int]:
-        """Ids of the scene's usable frames, in the order in which they were taken."""
+        """Ids of the scene's usable frames, in capture order."""
 
     def held_out(self, scene: str) -> Sequence[int]:
-        """Ids among ``frames`` that training never sees, kept as evaluation targets; none by default."""
+        """Ids among ``frames`` that are excluded from training and kept as evaluation targets; none by default."""
         return ()
 
     def place(self, scene: str) -> str:
-        """Name of what the scene shows: two recordings of one place must not be split between training and evaluation.
+        """Name of the place that the scene shows.
 
-        The scene itself, unless the dataset records places several times.
+        Recordings of the same place must not be split between training and evaluation. The default is the scene's own
+        name; datasets that record a place several times override it.
         """
         return scene
 
     def scene_is_metric(self, scene: str) -> bool:
-        """Whether one scene's unit is the metre."""
+        """Whether this scene is in metres."""
         return self.is_metric
 
     def parts(self) -> Mapping[str, float]:
-        """Groups of scenes (``part``) with the weights by which training draws from them; one group by default."""
+        """Sampling weight in training of every group of scenes (``part``); a single group by default."""
         return {"": 1.0}
 
     def part(self, scene: str) -> str:
-        """The group among ``parts`` to which a scene belongs."""
+        """Returns the group among ``parts`` that a scene belongs to."""
         return ""
 
     @abstractmethod
@@ -104,7 +105,7 @@ class SceneSource(ABC):
         """Decodes frames, in the order of ``frame_ids``.
 
         Raises:
-            DataError: if a file is missing or damaged, naming the file and the scene.
+            DataError: if a file is missing or damaged; the message names the file and the scene.
         """
 
 
@@ -113,6 +114,6 @@ SourceMaker = Callable[..., SceneSource]
 
 
 def training_frames(source: SceneSource, scene: str) -> list[int]:
-    """Frame ids of a scene that training may see: all but the held-out ones."""
+    """Returns the frame ids of a scene that training may use: all but the held-out ones."""
     held_out = set(source.held_out(scene))
     return [frame for frame in source.frames(scene) if frame not in held_out]

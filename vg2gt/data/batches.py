@@ -1,4 +1,4 @@
-"""From the views of a step to a batch: decoded frames kept in memory, and frames that cannot be read."""
+"""Turns the views of a step into a batch: caches decoded frames in memory and replaces unreadable ones."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ log = logging.getLogger(__name__)
 
 
 class FrameCache:
-    """Loads prepared frames; colour is kept as uint8, depth and cameras as they are.
+    """LRU cache of decoded and resized frames. Colour is stored as uint8, depth and cameras as they are.
 
     Args:
-        source: where frames come from.
-        prepare: resizes decoded frames, all of a scene to one size, before they are kept.
-        capacity: bytes kept.
+        source: dataset that frames are loaded from.
+        prepare: resizes decoded frames before they are cached; all frames of a scene to one size.
+        capacity: size of the cache in bytes.
     """
 
     def __init__(self, source: SceneSource, prepare: Callable[[Frames], Frames], capacity: int) -> None:
@@ -35,7 +35,7 @@ class FrameCache:
         self._used = 0
 
     def load(self, scene: str, frame_ids: Sequence[int]) -> Frames:
-        """Returns frames of a scene in the given order, decoding those that are not in memory."""
+        """Returns frames of a scene in the given order; decodes those that are not cached."""
         missing = [frame for frame in frame_ids if (scene, frame) not in self._frames]
         fresh = self._decode(scene, missing) if missing else {}
         chosen = [fresh[frame] if frame in fresh else self._recall(scene, frame) for frame in frame_ids]
@@ -70,15 +70,14 @@ def _size(frames: Frames) -> int:
 
 
 class BatchDataset(Dataset[Batch]):
-    """Turns the views of a step into a batch; indexed by what ``StepSampler`` yields.
+    """Dataset of batches, indexed by the tuples of views that ``StepSampler`` yields.
 
     Args:
         source: the scenes.
-        prepare: resizes decoded frames before they are kept in memory; to their final size, where views bring no
-            framing of their own.
-        memory_mb: decoded frames kept in memory, in each process.
-        replace_damaged: for training: the nearest readable frame takes the place of one that cannot be read, with a
-            warning; otherwise that is an error.
+        prepare: resizes decoded frames before they are cached; to their final size if the views have no ``framing``.
+        memory_mb: size of the cache of decoded frames in each process, in MB.
+        replace_damaged: replace an unreadable frame by the nearest readable one, with a warning (training); False
+            raises an error (evaluation).
     """
 
     def __init__(
@@ -115,9 +114,9 @@ class BatchDataset(Dataset[Batch]):
         )
 
     def _load(self, view: SceneSample) -> tuple[Frames, Sequence[int]]:
-        """The frames of a scene and their ids, those that cannot be read replaced.
+        """Loads the frames of a scene with their ids, unreadable ones replaced.
 
-        The result depends on the files alone, not on what was read before.
+        The result depends only on the files, not on what was read before.
         """
         ids = view.frames
         if not self.replace_damaged:
@@ -126,7 +125,7 @@ class BatchDataset(Dataset[Batch]):
             try:
                 return self.cache.load(view.scene, ids), ids
             except DataError:
-                pass  # which frame it was is found out one by one
+                pass  # _replace finds the damaged frame by reading one at a time
         ids = self._replace(view.scene, ids)
         return self.cache.load(view.scene, ids), ids
 

@@ -1,4 +1,4 @@
-"""Scenes in, batches out: training steps and evaluation samples as Lightning takes them."""
+"""Lightning data module: training and evaluation batches from scene sources."""
 
 from __future__ import annotations
 
@@ -21,48 +21,48 @@ from vg2gt.data.views.even import EvaluationViews
 from vg2gt.data.views.sampling import StepSampler, ViewSampler, usable_scenes
 from vg2gt.types import Batch
 
-PIXEL_BYTES = 4 * (3 + 1 + 1)  # colour and depth, and as much as one of them for what some datasets add
+PIXEL_BYTES = 4 * (3 + 1 + 1)  # float32 colour, depth and the mask of some datasets
 
-MOST = 16  # more wait for the disk
-PREFETCHED = 2  # batches that a process has ready: torch's default
-PROCESS_MB = 600  # of a loader process, without its decoded frames
-SHARED_MEMORY = Path("/dev/shm")  # through which batches reach the trainer
+MOST = 16  # worker limit: more would wait for the disk
+PREFETCHED = 2  # batches prefetched by each worker: torch's default
+PROCESS_MB = 600  # memory of a worker without its decoded frames
+SHARED_MEMORY = Path("/dev/shm")  # workers pass batches to the trainer through it
 
 
 class SceneDataModule(LightningDataModule):
-    """Training and evaluation batches from any two scene sources.
+    """Training and evaluation batches from two scene sources.
 
-    A training batch depends on the seed and on the number of the step alone, so a resumed run sees what the
-    uninterrupted one would have seen, with any number of workers.
+    A training batch depends only on the seed and the step number. A resumed run therefore sees the same batches as an
+    uninterrupted one, with any number of workers.
 
     Args:
-        train: training scenes, or what makes them (``_partial_: true``): then called with ``common``.
-        val: evaluation scenes, likewise.
-        image_size: ``(height, width)`` of every image, best a multiple of the backbone's patch size.
+        train: training scenes, or a factory (``_partial_: true``), which is called with ``common``.
+        val: evaluation scenes, or a factory.
+        image_size: ``(height, width)`` of every image, preferably multiples of the backbone's patch size.
         train_scenes: use at most this many training scenes; None: all.
         eval_scenes: use at most this many evaluation scenes; None: all.
-        min_views: fewest context views of a training step.
-        max_views: most context views of a training step.
-        max_images: context images of a step on one device; a step with N views holds ``max_images // N`` scenes.
+        min_views: minimum number of context views in a training step.
+        max_views: maximum number of context views in a training step.
+        max_images: context images per step and device; a step with N views holds ``max_images // N`` scenes.
         expand_ratio: the N views are drawn from a window of ``expand_ratio * N`` frames.
-        target_views: held-out views added to every training scene.
-        view_sets: every scene has this many fixed draws of views instead of new ones at every step; None: new ones.
-        eval_context: positions, or number, of the evaluation's input views (``EvaluationViews``).
-        eval_target: positions, or number, of the evaluation's held-out views.
-        eval_window: evaluate long scenes in stretches of this many frames; None: whole.
-        steps_per_epoch: training steps in an epoch.
-        seed: seeds the choice of scenes and views.
-        workers: loader processes; 0 decodes in the training process; None: as many as cores and memory allow where a
-            GPU trains, else 0.
-        memory_mb: decoded frames kept in memory by each process.
-        fit: ``cover``: frames are resized until they cover ``image_size`` and cropped; ``pad``: until they fit into it,
-            with black around them that has no depth.
-        aspect: draw the shape of a training step's images from this range of height / width, at about the area of
-            ``image_size`` (``FramingSampler``); None: all of ``image_size``. Evaluation is never drawn.
-        size_multiple: drawn sizes are multiples of this; the backbone's patch size.
-        crop: training crops at the ``center`` or at ``random``.
-        zoom: range from which a training scene's zoom is drawn.
-        common: arguments that ``train`` and ``val`` share, such as the dataset's ``root``.
+        target_views: number of held-out views added to every training scene.
+        view_sets: number of fixed view draws per scene; None: new draws at every step.
+        eval_context: positions or number of the evaluation's input views (``EvaluationViews``).
+        eval_target: positions or number of the evaluation's held-out views.
+        eval_window: evaluate long scenes in stretches of this many frames; None: the whole scene at once.
+        steps_per_epoch: training steps per epoch.
+        seed: seeds the sampling of scenes and views.
+        workers: loader processes; 0 decodes in the training process; None: as many as cores and memory allow when
+            training on a GPU, else 0.
+        memory_mb: size of the cache of decoded frames in each process, in MB.
+        fit: ``cover`` resizes frames until they cover ``image_size`` and crops; ``pad`` resizes them to fit into it and
+            pads with black, which has no depth.
+        aspect: range of height / width from which the image shape of a training step is drawn, at roughly the area of
+            ``image_size`` (``FramingSampler``); None: always ``image_size``. Evaluation always uses ``image_size``.
+        size_multiple: drawn sizes are multiples of this, the backbone's patch size.
+        crop: position of training crops: ``center`` or ``random``.
+        zoom: range from which the zoom of a training scene is drawn.
+        common: arguments shared by ``train`` and ``val``, such as the dataset's ``root``.
 
     Raises:
         ValueError: if an option is out of range.
@@ -117,13 +117,13 @@ class SceneDataModule(LightningDataModule):
         self._val: BatchDataset | None = None
 
     def setup(self, stage: str | None = None) -> None:
-        """Indexes the scenes and refuses evaluation targets that training would see.
+        """Indexes the scenes and checks that training never sees the evaluation targets.
 
-        Training scenes that cannot be read or are too short are left out with a warning; an evaluation scene with
-        either fault is an error, because figures must not change silently.
+        Training scenes that are unreadable or too short are skipped with a warning. For an evaluation scene this is an
+        error, because metrics must not change silently.
 
         Raises:
-            DataError: if the data is missing, unusable, or shared by training and evaluation; for ``stage="fit"`` also
+            DataError: if data is missing, unusable, or shared by training and evaluation; with ``stage="fit"`` also
                 if the training scenes have no cameras.
         """
         if self._train is not None and self._val is not None:
@@ -136,29 +136,29 @@ class SceneDataModule(LightningDataModule):
         names = list(val.scenes)[: self.eval_scenes]
         self._val_views = [views for name in names for views in self.eval_views.choose(val, name)]
         refuse_overlap(train, self._train_names, val, self._val_views)
-        # Of a training frame is kept its final size, or as much as any framing can need.
+        # Cache training frames at their final size, or at the largest size that any drawn framing needs.
         prepare = self.framing.reduce if self.framing.moves else self.framing.still.apply
         self._train = BatchDataset(train, prepare, self.memory_mb, replace_damaged=True)
         self._val = BatchDataset(val, self.framing.still.apply, self.memory_mb)
 
     @property
     def sources(self) -> tuple[SceneSource, SceneSource]:
-        """The training and the evaluation scenes, indexed."""
+        """The training and the evaluation source, after ``setup``."""
         self.setup()
         assert self._train is not None
         assert self._val is not None
         return self._train.source, self._val.source
 
     def train_source(self) -> SceneSource:
-        """The training scenes as they are on disk."""
+        """Returns the training source, without checks or limits."""
         return self._source(self._make_train)
 
     def val_source(self) -> SceneSource:
-        """The evaluation scenes as they are on disk."""
+        """Returns the evaluation source, without checks or limits."""
         return self._source(self._make_val)
 
     def train_dataloader(self) -> DataLoader[Batch]:
-        """Batches from the trainer's current step on; one item of the loader is one batch.
+        """Returns batches from the trainer's current step on; one item of the loader is one batch.
 
         Raises:
             DataError: if the training scenes have no cameras.
@@ -181,9 +181,10 @@ class SceneDataModule(LightningDataModule):
         return self._loader(self._train, sampler)
 
     def val_dataloader(self) -> DataLoader[Batch]:
-        """One batch (B = 1) per sample: context views, then held-out target views. Devices take the samples in turns.
+        """Returns one batch (B = 1) per sample: context views first, then held-out target views.
 
-        A device for which none is left repeats the first one, as every device has to take part in an evaluation.
+        Samples are distributed over the devices in turn. A device without a sample repeats the first one, because
+        every device must take part in the evaluation.
         """
         self.setup()
         assert self._val is not None
@@ -192,15 +193,15 @@ class SceneDataModule(LightningDataModule):
         return self._loader(self._val, [(views,) for views in own or self._val_views[:1]])
 
     def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
-        """Copies a batch from page-locked memory while the device still computes."""
+        """Copies a batch to the device, asynchronously from pinned memory on CUDA."""
         return batch.to(device, non_blocking=device.type == "cuda")
 
     def test_dataloader(self) -> DataLoader[Batch]:
-        """The evaluation batches."""
+        """Returns the evaluation batches (``val_dataloader``)."""
         return self.val_dataloader()
 
     def evaluation_data(self) -> BatchDataset:
-        """The evaluation scenes alone, for any views of them: indexed by a tuple of ``SceneSample``."""
+        """Returns the evaluation scenes as a dataset that is indexed by tuples of ``SceneSample``, for any views."""
         return BatchDataset(self._source(self._make_val), self.framing.still.apply, self.memory_mb)
 
     def _source(self, make: SceneSource | SourceMaker) -> SceneSource:
@@ -209,7 +210,7 @@ class SceneDataModule(LightningDataModule):
         try:
             return make(**self.common)
         except TypeError as error:
-            if "argument" not in str(error):  # Python's own words about a call
+            if "argument" not in str(error):  # not Python's message about an unknown or missing argument
                 raise
             raise DataError(
                 f"the dataset's loader {error} (data.*): leave the option out; if a preset (evaluation=synthetic) sets "
@@ -218,12 +219,12 @@ class SceneDataModule(LightningDataModule):
 
     @property
     def loader_processes(self) -> int:
-        """Loader processes of this rank, with ``workers`` chosen."""
+        """Number of loader processes of this rank; resolves ``workers=None``."""
         trainer = self.trainer
         if self.workers is not None:
             return self.workers
         if trainer is None or trainer.strategy.root_device.type != "cuda":
-            return 0  # its cores compute
+            return 0  # the cores are busy with training
         height, width = self.framing.largest
         views = self.sampler.max_images * (1 + self.sampler.target_views / self.sampler.min_views)
         return automatic_workers(trainer.num_devices, self.memory_mb, views * height * width * PIXEL_BYTES / 1e6)
@@ -249,24 +250,24 @@ def _size(image_size: Sequence[int]) -> tuple[int, int]:
 
 
 def _leave_interrupts_to_the_trainer(worker: int) -> None:
-    """Ctrl-C reaches all processes of a terminal: the trainer ends its step with these still loading."""
+    """Ignores Ctrl-C in a worker, so that the trainer can finish its step while the workers keep loading."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def automatic_workers(ranks: int, memory_mb: int, batch_mb: float) -> int:
-    """Loader processes of each of this machine's ranks: a core each but one, as far as memory goes.
+    """Returns the number of loader processes per rank: one per core except one, limited by memory.
 
     Args:
-        ranks: processes that train on this machine.
-        memory_mb: decoded frames that each loader process keeps.
-        batch_mb: the size of a batch.
+        ranks: training processes on this machine.
+        memory_mb: size of the frame cache of each loader process, in MB.
+        batch_mb: size of a batch in MB.
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     limits = [MOST, cores // ranks - 1]
     if hasattr(os, "sysconf"):
         half = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 2e6
         limits.append(int(half / ranks / (memory_mb + PROCESS_MB + PREFETCHED * batch_mb)))
-    if SHARED_MEMORY.is_dir():  # small in containers: beyond it a process ends by a bus error
+    if SHARED_MEMORY.is_dir():  # small in containers; a process that exceeds it dies with a bus error
         free = shutil.disk_usage(SHARED_MEMORY).free / 1e6
-        limits.append(int(free / ranks / (2 * PREFETCHED * batch_mb)))  # half of it: for training and for evaluation
+        limits.append(int(free / ranks / (2 * PREFETCHED * batch_mb)))  # half each for training and evaluation
     return max(0, min(limits))

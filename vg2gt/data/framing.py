@@ -1,4 +1,4 @@
-"""How frames are brought to the size of a batch: whole or cut, in the middle or at random, always with intrinsics."""
+"""Framing: resizes, crops or pads frames to the size of a batch and updates their intrinsics."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from vg2gt.data.base import Frames
 from vg2gt.data.transforms import reduce_to_cover, reduce_to_fit, resize_to_cover, resize_to_fit
 
-_SIZE, _WINDOW = 4, 5  # random streams, apart from those of the view sampler
+_SIZE, _WINDOW = 4, 5  # random streams; the view sampler uses others
 
 Fit = Literal["cover", "pad"]
 Crop = Literal["center", "random"]
@@ -20,13 +20,13 @@ Crop = Literal["center", "random"]
 
 @dataclass(frozen=True)
 class Framing:
-    """The framing of one scene's frames.
+    """Framing of the frames of one scene.
 
     Attributes:
-        size: ``(height, width)`` of the result.
-        fit: ``cover`` resizes until the size is covered and crops, ``pad`` until the whole frame fits and pads.
-        zoom: at least 1; frames are resized by this factor more before they are cropped.
-        place: the cropped window's place in the room it has, (down, right) in [0, 1); None: the middle.
+        size: output ``(height, width)``.
+        fit: ``cover`` resizes until the size is covered and crops; ``pad`` resizes to fit and pads.
+        zoom: additional scale factor before cropping, at least 1.
+        place: relative position of the crop window in its range, (down, right) in [0, 1); None: centred.
     """
 
     size: tuple[int, int]
@@ -35,7 +35,7 @@ class Framing:
     place: tuple[float, float] | None = None
 
     def apply(self, frames: Frames) -> Frames:
-        """Returns frames of ``size`` with their intrinsics."""
+        """Returns frames of ``size`` with updated intrinsics."""
         if self.fit == "pad":
             return resize_to_fit(frames, self.size)
         return resize_to_cover(frames, self.size, self.zoom, self.place)
@@ -43,23 +43,23 @@ class Framing:
 
 @dataclass(frozen=True)
 class FramingSampler:
-    """Draws the framing of training scenes: a pure function of seed, step and scene, like all sampling.
+    """Samples the framing of training scenes, as a pure function of seed, step and slot.
 
-    The size is drawn once per step, the same on every device. Zoom and window are drawn once per scene, so that views
-    which shared intrinsics still do and overlap as before. ``crop="random"`` moves the principal point off the middle;
-    only for backbones that are told intrinsics or predict the principal point. Colours are never changed.
+    The size is drawn once per step, the same on every device. Zoom and crop window are drawn once per scene, so that
+    its views keep shared intrinsics and their overlap. ``crop="random"`` shifts the principal point; use it only with
+    backbones that take intrinsics as input or predict the principal point. Colours are never changed.
 
     Args:
-        image_size: ``(height, width)``, kept where ``aspect`` is None; otherwise its area is kept about.
-        aspect: range of height / width from which a step's shape is drawn, evenly in its logarithm; None: fixed.
-        size_multiple: drawn sizes are multiples of this (the backbone's patch size).
+        image_size: ``(height, width)``; with ``aspect``, only its area is kept, roughly.
+        aspect: range of height / width from which a step's image shape is drawn, log-uniform; None: fixed.
+        size_multiple: drawn sizes are multiples of this, the backbone's patch size.
         fit: see ``Framing``; ``pad`` keeps the whole frame and allows neither zoom nor random crops.
-        crop: where the window lies: ``center`` or ``random``.
-        zoom: range of the zoom, evenly in its logarithm.
+        crop: position of the crop window: ``center`` or ``random``.
+        zoom: range of the zoom, log-uniform.
         seed: seeds every draw.
 
     Raises:
-        ValueError: if a range or choice is impossible.
+        ValueError: if an option or range is invalid.
     """
 
     image_size: tuple[int, int]
@@ -85,38 +85,38 @@ class FramingSampler:
 
     @property
     def still(self) -> Framing:
-        """The framing of evaluation: never drawn."""
+        """The fixed framing used in evaluation."""
         return Framing(self.image_size, self.fit)
 
     @property
     def moves(self) -> bool:
-        """Whether anything is drawn at all."""
+        """Whether anything is drawn."""
         return self.aspect is not None or self.crop == "random" or tuple(self.zoom) != (1, 1)
 
     @property
     def largest(self) -> tuple[int, int]:
-        """``(height, width)`` that covers every size and zoom that can be drawn (no zoom with ``fit="pad"``)."""
+        """``(height, width)`` that covers every size and zoom that can be drawn."""
         shapes = self.aspect or (self.image_size[0] / self.image_size[1],)
         sizes = [self._size(shape) for shape in shapes]
         zoom = self.zoom[1]
         return math.ceil(max(size[0] for size in sizes) * zoom), math.ceil(max(size[1] for size in sizes) * zoom)
 
     def reduce(self, frames: Frames) -> Frames:
-        """Makes frames smaller, as far as no framing that can be drawn needs more of them."""
+        """Shrinks frames to the smallest size that is enough for every framing that can be drawn."""
         return (reduce_to_fit if self.fit == "pad" else reduce_to_cover)(frames, self.largest)
 
     def size(self, step: int) -> tuple[int, int]:
-        """``(height, width)`` of a step's images on all devices."""
+        """Returns ``(height, width)`` of a step's images, the same on all devices."""
         if self.aspect is None:
             return self.image_size
         return self._size(_between(self.aspect, np.random.default_rng((self.seed, _SIZE, step)).random()))
 
     def draw(self, step: int, slot: int) -> Framing | None:
-        """The framing of one scene; None where nothing is drawn.
+        """Draws the framing of one scene; None if nothing is drawn.
 
         Args:
-            step: number of the training step.
-            slot: number of the scene in the step over all devices.
+            step: training step.
+            slot: index of the scene within the step, over all devices.
         """
         if not self.moves:
             return None
@@ -126,7 +126,7 @@ class FramingSampler:
         return Framing(self.size(step), self.fit, _between(self.zoom, zoom), place)
 
     def _size(self, shape: float) -> tuple[int, int]:
-        """About the area of ``image_size`` in another shape (height / width)."""
+        """Returns the size of about the area of ``image_size`` with the given height / width."""
         if self.aspect is None:
             return self.image_size
         area, unit = self.image_size[0] * self.image_size[1], self.size_multiple

@@ -1,4 +1,4 @@
-"""Several datasets as one, drawn from in stated proportions."""
+"""Mixture of several datasets with sampling weights."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from vg2gt.data.sources.files import read_split
 
 
 class Mixture(SceneSource):
-    """Named datasets with weights (paper, Datasets: Infinigen, KITTI and ScanNet).
+    """Weighted mixture of named datasets (paper, Datasets: Infinigen, KITTI and ScanNet).
 
-    A scene is called ``<part>/<scene>``. Training draws scenes in the proportions of the weights, however many scenes a
-    part has, and the scenes of a part equally often (``ScenePool``): exactly where the number of views is fixed, in
-    expectation where it varies (``ViewSampler.slots``).
+    Scenes are named ``<part>/<scene>``. Training draws parts in proportion to their weights, whatever their number of
+    scenes, and the scenes of a part equally often (``ScenePool``). The proportions are exact if the number of views is
+    fixed, and hold in expectation if it varies (``ViewSampler.slots``).
 
     Args:
-        parts: the datasets by name, or what makes them (``_partial_: true``).
-        weights: the weight of every part, any positive scale; a part of weight 0 is left out and needs no data.
+        parts: datasets by name, or factories of them (``_partial_: true``).
+        weights: sampling weight of every part, on any positive scale; a part of weight 0 is skipped and needs no data.
         scenes: names of the scenes to use, or a text file with one per line; None: all.
-        common: arguments of the parts' makers: ``<part>_<argument>`` goes to one part, any other to all.
+        common: arguments of the factories: ``<part>_<argument>`` goes to one part, any other to all parts.
 
     Raises:
-        ValueError: if parts and weights do not fit together.
+        ValueError: if parts and weights do not match.
         FileNotFoundError: if a part's root is not given or does not exist.
         DataError: if a part has no scene, or a named scene does not exist.
     """
@@ -47,35 +47,35 @@ class Mixture(SceneSource):
 
     @property
     def scenes(self) -> Sequence[str]:
-        """Names of the scenes, the parts taking turns, so that the first few are of all parts."""
+        """Scene names, interleaved so that the first few come from all parts."""
         return self._scenes
 
     def frames(self, scene: str) -> Sequence[int]:
-        """Ids of a scene's usable frames."""
+        """Returns the ids of a scene's usable frames."""
         source, name = self._find(scene)
         return source.frames(name)
 
     def held_out(self, scene: str) -> Sequence[int]:
-        """Ids of a scene's held-out frames."""
+        """Returns the ids of a scene's held-out frames."""
         source, name = self._find(scene)
         return source.held_out(name)
 
     def place(self, scene: str) -> str:
-        """The part and the place within it."""
+        """Returns ``<part>/<place>``."""
         source, name = self._find(scene)
         return f"{self.part(scene)}/{source.place(name)}"
 
     def scene_is_metric(self, scene: str) -> bool:
-        """Whether the scene's part is in metres."""
+        """Whether this scene is in metres."""
         source, name = self._find(scene)
         return source.scene_is_metric(name)
 
     def parts(self) -> Mapping[str, float]:
-        """The weights."""
+        """Returns the weights of the parts."""
         return self.weights
 
     def part(self, scene: str) -> str:
-        """The part a scene belongs to."""
+        """Returns the part that a scene belongs to."""
         return scene.partition("/")[0]
 
     def load(self, scene: str, frame_ids: Sequence[int]) -> Frames:
@@ -102,7 +102,7 @@ def _check(parts: Mapping[str, object], weights: Mapping[str, float]) -> None:
 
 
 def _make(name: str, part: SceneSource | SourceMaker, names: Sequence[str], common: Mapping[str, Any]) -> SceneSource:
-    """A part from its maker, with the arguments that are meant for it."""
+    """Makes a part with the arguments that apply to it."""
     if isinstance(part, SceneSource):
         return part
     owners = {key: _owner(key, names) for key in common}
@@ -119,7 +119,7 @@ def _make(name: str, part: SceneSource | SourceMaker, names: Sequence[str], comm
 
 
 def _owner(key: str, names: Sequence[str]) -> str | None:
-    """The part that an argument ``<part>_<argument>`` is for; None: for all."""
+    """Returns the part of an argument ``<part>_<argument>``; None: it applies to all parts."""
     return max((name for name in names if key.startswith(f"{name}_")), key=len, default=None)
 
 

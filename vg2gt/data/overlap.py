@@ -12,10 +12,10 @@ log = logging.getLogger(__name__)
 
 
 def refuse_untrainable(source: SceneSource) -> None:
-    """Refuses to train on scenes without cameras; those without depth are trained on by their colours.
+    """Raises if the training scenes have no cameras. Scenes without depth are allowed and train on colours only.
 
     Raises:
-        DataError: saying what the source lacks.
+        DataError: if the source has no cameras.
     """
     if not source.has_cameras:
         lacking = "cameras" if source.has_depth else "depth and no cameras"
@@ -34,23 +34,23 @@ def refuse_untrainable(source: SceneSource) -> None:
 def refuse_overlap(
     train: SceneSource, scenes: Sequence[str], val: SceneSource, evaluation: Sequence[SceneSample]
 ) -> None:
-    """Refuses evaluation targets that are not held out of training, and evaluation of places that are trained on.
+    """Raises if evaluation targets are not held out of training, or if an evaluated place is also trained on.
 
-    Scenes should differ altogether. Where one recording serves both ends, its targets must be frames held out of
-    training, which is said in the log.
+    Training and evaluation scenes should be disjoint. If a scene is used for both, its evaluation targets must be
+    held out of training; the number of such scenes is logged.
 
-    The two sources may be of any kinds: scenes and places are known by their names. A part of a mixture is compared
-    with the part of that name; where the training data has none, with all of it.
+    Scenes and places are compared by name, so the two sources may be of different types. A part of a mixture is
+    compared with the training part of the same name, or with all training data if there is none.
 
     Args:
         train: the training source.
-        scenes: names of its scenes that are trained on.
+        scenes: names of the scenes that are trained on.
         val: the evaluation source.
         evaluation: the evaluation samples.
 
     Raises:
-        DataError: naming the first scene with targets (whole scene, without targets) that training does not hold out,
-            or whose place is shown by a training scene.
+        DataError: if an evaluation scene has targets (or, without targets, context views) that training does not hold
+            out, or shows the same place as a training scene; the message names the first such scene.
     """
     targets: dict[str, set[int]] = {}
     for views in evaluation:
@@ -77,7 +77,7 @@ def refuse_overlap(
 def _named(
     source: SceneSource, scenes: Sequence[str], name: Callable[[str], str]
 ) -> Mapping[tuple[str | None, str], list[str]]:
-    """Scenes by what ``name`` gives for them, within their part and within no part (None)."""
+    """Groups scenes by ``name(scene)``, under their part and under None, which stands for all parts."""
     found: dict[tuple[str | None, str], list[str]] = {}
     for scene in scenes:
         for part in (source.part(scene), None):
@@ -86,7 +86,7 @@ def _named(
 
 
 def _without_part(source: SceneSource, scene: str, name: str) -> str:
-    """The name of a scene or a place as its own dataset has it, without the part that a mixture puts before it."""
+    """Removes the prefix ``<part>/`` that a mixture adds to the name of a scene or place."""
     part = source.part(scene)
     return name.removeprefix(f"{part}/") if part else name
 

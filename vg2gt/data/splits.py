@@ -1,4 +1,4 @@
-"""Divides the scenes of a dataset into training and evaluation lists; recordings of one place stay together."""
+"""Splits the scenes of a dataset into training and evaluation lists; recordings of one place stay together."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ log = logging.getLogger(__name__)
 
 
 def split_scenes(source: SceneSource, fraction: float, seed: int = 0) -> tuple[list[str], list[str]]:
-    """Divides scenes at random, place by place, and every part of a mixture by itself.
+    """Splits scenes at random by place, separately for every part of a mixture.
 
     Args:
         source: the scenes.
-        fraction: share of the places of each part that goes to evaluation, but at least one place of it and not all;
-            a part with a single place is for training.
-        seed: the division is a function of it and of the places' names.
+        fraction: fraction of each part's places that is used for evaluation, at least one place and never all; a part
+            with a single place is used for training only.
+        seed: random seed; the split depends only on it and on the names of parts and places.
 
     Returns:
-        Names of the training and of the evaluation scenes, in the source's order.
+        Names of the training scenes and of the evaluation scenes, in the source's order.
 
     Raises:
-        ValueError: if ``fraction`` is not within (0, 1).
-        DataError: if no part has two places.
+        ValueError: if ``fraction`` is not in (0, 1).
+        DataError: if every part has a single place.
     """
     if not 0 < fraction < 1:
         raise ValueError(f"fraction must be within (0, 1), got {fraction}")
@@ -55,7 +55,7 @@ def write_splits(out: Path, source: SceneSource, fraction: float, seed: int) -> 
     """Writes ``train.txt`` and ``val.txt``.
 
     Raises:
-        FileExistsError: if one of them exists with other contents.
+        FileExistsError: if one of them exists with different contents.
     """
     paths = (out / "train.txt", out / "val.txt")
     both = split_scenes(source, fraction, seed)

@@ -1,4 +1,4 @@
-"""Resizing and cropping of frames together with their intrinsics."""
+"""Resizing, cropping and padding of frames together with their intrinsics."""
 
 from __future__ import annotations
 
@@ -17,8 +17,9 @@ from vg2gt.geometry.cameras import crop_intrinsics, resize_intrinsics
 def resize(frames: Frames, size: tuple[int, int]) -> Frames:
     """Resizes frames to exactly ``size`` (height, width).
 
-    Colour is antialiased (triangle filter as wide as a target pixel); depth takes the nearest pixel, because a mean
-    across an edge is a point in mid-air. Sparse depth moves point by point, and the nearest point to the camera wins.
+    Colour is antialiased (triangle filter as wide as a target pixel). Dense depth uses the nearest pixel, because a
+    mean across an edge would be a point in mid-air. Sparse depth is moved point by point; if several points fall into
+    a pixel, the one nearest to the camera is kept.
     """
     height, width = frames.depth.shape[-2:]
     if (height, width) == tuple(size):
@@ -40,14 +41,14 @@ def resize_images(images: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def resize_depth(depth: Tensor, size: tuple[int, int], sparse: bool = False) -> Tensor:
-    """Resizes depth ``[V, H, W]``: the nearest pixel, or, where it is sparse, every point to the pixel it falls in."""
+    """Resizes depth ``[V, H, W]`` by nearest pixel, or, if sparse, moves every point to the pixel it falls in."""
     views, height, width = depth.shape
     if (height, width) == tuple(size):
         return depth
     if not sparse:
         return interpolate(depth[:, None], size, mode="nearest-exact")[:, 0]  # [V, H', W']
     view, y, x = depth.nonzero(as_tuple=True)  # [P] each
-    # A pixel's centre c lies in the new pixel floor((c + 1/2) scale).
+    # A pixel with centre c falls into the new pixel floor((c + 1/2) scale).
     row = ((y + 0.5) * (size[0] / height)).long().clamp(max=size[0] - 1)
     column = ((x + 0.5) * (size[1] / width)).long().clamp(max=size[1] - 1)
     nearest = depth.new_full((views * size[0] * size[1],), torch.inf)  # [V H' W']
@@ -56,7 +57,7 @@ def resize_depth(depth: Tensor, size: tuple[int, int], sparse: bool = False) -> 
 
 
 def crop(frames: Frames, top: int, left: int, size: tuple[int, int]) -> Frames:
-    """Cuts the window of ``size`` (height, width) whose first pixel is (``top``, ``left``)."""
+    """Crops the window of ``size`` (height, width) whose first pixel is (``top``, ``left``)."""
 
     def window(image: Tensor) -> Tensor:
         return image[..., top : top + size[0], left : left + size[1]].contiguous()
@@ -71,9 +72,9 @@ def crop(frames: Frames, top: int, left: int, size: tuple[int, int]) -> Frames:
 
 
 def pad(frames: Frames, top: int, left: int, size: tuple[int, int]) -> Frames:
-    """Puts frames into black images of ``size`` (height, width), their first pixel at (``top``, ``left``).
+    """Pads frames with black to ``size`` (height, width), their first pixel at (``top``, ``left``).
 
-    What is added has no depth, and does not count where there is a mask.
+    The padding has depth 0, and mask 0 if there is a mask.
     """
     height, width = frames.depth.shape[-2:]
     margins = (left, size[1] - left - width, top, size[0] - top - height)
@@ -89,17 +90,17 @@ def pad(frames: Frames, top: int, left: int, size: tuple[int, int]) -> Frames:
 def resize_to_cover(
     frames: Frames, size: tuple[int, int], zoom: float = 1.0, place: tuple[float, float] | None = None
 ) -> Frames:
-    """Resizes frames, keeping their shape, until they cover ``size`` (height, width), and crops.
+    """Resizes frames until they cover ``size``, keeping their aspect ratio, and crops.
 
     Args:
         frames: frames of any size.
-        size: of the result.
-        zoom: resizes by this factor more; at least 1.
-        place: of the window in the room it has, (down, right) in [0, 1); None: the middle.
+        size: output (height, width).
+        zoom: additional scale factor before cropping, at least 1.
+        place: relative position of the crop window in its range, (down, right) in [0, 1); None: centred.
     """
     height, width = frames.depth.shape[-2:]
     scale = max(size[0] / height, size[1] / width) * zoom
-    # Rounding to whole pixels changes the two scales a little; the intrinsics follow the true ones.
+    # Rounding to whole pixels changes the two scales slightly; resize() applies the actual ones to the intrinsics.
     covering = tuple(max(least, _whole(side * scale)) for least, side in zip(size, (height, width), strict=True))
     room = (covering[0] - size[0], covering[1] - size[1])
     resized = resize(frames, (covering[0], covering[1]))
@@ -109,13 +110,13 @@ def resize_to_cover(
 
 
 def resize_to_fit(frames: Frames, size: tuple[int, int]) -> Frames:
-    """Resizes frames, keeping their shape, until they fit into ``size`` (height, width), and pads around them."""
+    """Resizes frames to fit into ``size`` (height, width), keeping their aspect ratio, and pads around them."""
     inner = _fitting(frames, size)
     return pad(resize(frames, inner), (size[0] - inner[0]) // 2, (size[1] - inner[1]) // 2, size)
 
 
 def reduce_to_cover(frames: Frames, size: tuple[int, int]) -> Frames:
-    """Makes frames smaller, keeping their shape, until they just cover ``size``; smaller frames stay as they are."""
+    """Shrinks frames until they just cover ``size``, keeping their aspect ratio; smaller frames are unchanged."""
     height, width = frames.depth.shape[-2:]
     scale = max(size[0] / height, size[1] / width)
     if scale >= 1:
@@ -124,7 +125,7 @@ def reduce_to_cover(frames: Frames, size: tuple[int, int]) -> Frames:
 
 
 def reduce_to_fit(frames: Frames, size: tuple[int, int]) -> Frames:
-    """Makes frames smaller, keeping their shape, until they just fit into ``size``; smaller frames stay as they are."""
+    """Shrinks frames until they just fit into ``size``, keeping their aspect ratio; smaller frames are unchanged."""
     height, width = frames.depth.shape[-2:]
     if height <= size[0] and width <= size[1]:
         return frames
@@ -132,7 +133,7 @@ def reduce_to_fit(frames: Frames, size: tuple[int, int]) -> Frames:
 
 
 def _fitting(frames: Frames, size: tuple[int, int]) -> tuple[int, int]:
-    """``(height, width)`` of the largest frames of this shape that fit into ``size``."""
+    """Returns ``(height, width)`` of the largest frames of this aspect ratio that fit into ``size``."""
     height, width = frames.depth.shape[-2:]
     scale = min(size[0] / height, size[1] / width)
     return min(size[0], max(1, _whole(height * scale))), min(size[1], max(1, _whole(width * scale)))
@@ -143,10 +144,10 @@ def _whole(length: float) -> int:
 
 
 def to_bytes(images: Tensor) -> Tensor:
-    """Images in [0, 1] as uint8, rounded."""
+    """Converts images in [0, 1] to uint8, rounded."""
     return (images * 255 + 0.5).to(torch.uint8)
 
 
 def from_bytes(images: Tensor) -> Tensor:
-    """uint8 images as float32 in [0, 1]."""
+    """Converts uint8 images to float32 in [0, 1]."""
     return images.to(torch.float32) / 255

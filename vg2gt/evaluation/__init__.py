@@ -1,1 +1,1 @@
-"""Evaluation: figures of one scene, of data sets, and their report."""
+"""Evaluation: metrics of single scenes and of data sets, and their report."""

@@ -1,4 +1,4 @@
-"""The calibration of a model's stated errors, from its configuration and the scenes of a data set."""
+"""Calibrates a model's error bounds on the scenes of a data set."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ log = logging.getLogger(__name__)
 
 
 def make_calibration(config: DictConfig) -> Path:
-    """Makes the calibration of a model on the scenes of a data set and writes it next to the checkpoint.
+    """Calibrates a model's error bounds on a data set and writes them to ``out``, by default next to the checkpoint.
 
-    Scenes take turns with the numbers of views that are asked for.
+    The scenes are divided evenly among the requested numbers of views.
 
     Raises:
         FileNotFoundError: if the checkpoint, its configuration or the data is missing.
@@ -71,7 +71,11 @@ def make_calibration(config: DictConfig) -> Path:
 
 @torch.no_grad()
 def decode(model: Reconstructor, batch: Batch, hints: Hints) -> tuple[Decoded, Tensor | None]:
-    """The decoded geometry, and which pixels a scene would be made of; without the scene where that saves time."""
+    """Decodes the geometry of a batch; VG2GT does so without building the Gaussians.
+
+    Returns:
+        The decoded geometry, and ``[B, V, H, W]`` bool, the pixels that the scene is made of; None: all with a depth.
+    """
     with half_precision_on_gpu(batch.images):
         if not isinstance(model, VG2GT):
             prediction = model(batch.images, hints)
@@ -82,6 +86,6 @@ def decode(model: Reconstructor, batch: Batch, hints: Hints) -> tuple[Decoded, T
 
 
 def _thinned(pixels: Samples, most: int, seed: int) -> Samples:
-    """At most so many pixels, drawn at random."""
+    """At most ``most`` pixels, drawn at random."""
     drawn = torch.randperm(len(pixels.error), generator=torch.Generator().manual_seed(seed))
     return pixels.select(drawn[:most].sort().values)

@@ -1,4 +1,4 @@
-"""What an evaluation refuses before it begins: scenes that the weights have seen, data that lacks what is needed."""
+"""Checks before an evaluation: overlap with the training data, and missing depth or cameras."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ RESUMED_IN_PLACE = (None, "last", "auto")
 
 
 def refuse_training_views(checkpoint: Path | None, source: SceneSource, views: Sequence[SceneSample]) -> None:
-    """Refuses to score what the run, or a run from whose weights it was started, was trained on.
+    """Refuses views that overlap with the training data of the checkpoint's run or of a run it was initialised from.
 
-    Every scene of the training data counts, also those left out as too short. Where the training data or a run's
-    configuration is gone, the log says that it cannot be checked.
+    All scenes of the training data count, including those left out as too short. If the training data or a run's
+    configuration is missing, logs a warning that the overlap cannot be checked.
 
     Raises:
-        DataError: naming the first scene.
+        DataError: if there is overlap, naming the first scene.
     """
     for path, run in _ancestry(checkpoint):
         try:
@@ -47,7 +47,7 @@ def refuse_training_views(checkpoint: Path | None, source: SceneSource, views: S
 
 
 def _ancestry(checkpoint: Path | None) -> Iterator[tuple[Path, DictConfig]]:
-    """Configurations of the run of a checkpoint and of the runs that its weights come from, the newest first."""
+    """Yields the configurations of a checkpoint's run and of the runs that it was initialised from, newest first."""
     seen = set()
     while checkpoint is not None and (path := run_config_path(checkpoint)) not in seen:
         seen.add(path)

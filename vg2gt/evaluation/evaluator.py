@@ -1,4 +1,4 @@
-"""One scene reconstructed and scored by the evaluate command."""
+"""Reconstruction and scoring of one scene for ``vg2gt evaluate``."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ Metrics = dict[str, float | None]
 
 @dataclass(frozen=True)
 class SceneResult:
-    """What the complete evaluation of a scene gives.
+    """Result of the evaluation of one scene.
 
     Attributes:
-        metrics: figures by path, such as ``rendered/gt_pose/solid/psnr``; None where there is none.
+        metrics: values by path, such as ``rendered/gt_pose/solid/psnr``; None where a value is not available.
         prediction: the reconstruction.
         renders: solid renders by protocol.
     """
@@ -54,15 +54,15 @@ class SceneResult:
 
 @dataclass(frozen=True)
 class SceneEvaluator:
-    """Scores scenes completely: rendered in every protocol and mode, decoded, cameras, points, uniformity, cost.
+    """Scores scenes: views rendered in every protocol and mode, decoded depth, cameras, points, uniformity and cost.
 
     Attributes:
         model: in eval mode, on its device.
-        renderer: its options are used in both modes.
+        renderer: renderer whose options apply to both modes.
         options: what is compared and how.
-        lpips: on the model's device; None: no LPIPS.
-        refinement: how scenes are refined and scored once more, under ``refined/``; None: not at all.
-        calibration: states errors of the decoded depth, which are scored under ``stated/``; None: none are stated.
+        lpips: LPIPS network on the model's device; None: no LPIPS.
+        refinement: options of a refinement whose result is scored as well, under ``refined/``; None: no refinement.
+        calibration: gives error bounds of the decoded depth, scored under ``stated/``; None: no error bounds.
     """
 
     model: Reconstructor
@@ -74,7 +74,15 @@ class SceneEvaluator:
 
     @torch.no_grad()
     def __call__(self, batch: Batch, has_cameras: bool = True) -> SceneResult:
-        """Evaluates one scene (B = 1) on the model's device; figures that need true cameras only if it has them."""
+        """Evaluates one scene.
+
+        Args:
+            batch: one scene (B = 1) on the model's device.
+            has_cameras: whether the true cameras are known; metrics that need them are left out otherwise.
+
+        Raises:
+            ValueError: if the batch holds several scenes.
+        """
         if len(batch.scene) != 1:
             raise ValueError(f"evaluation takes one scene at a time, got {', '.join(batch.scene)}")
         prediction, cost = self._reconstruct(batch)
@@ -82,7 +90,7 @@ class SceneEvaluator:
         if self.refinement is not None:
             refined, cost = self._refine(batch, prediction, self.refinement)
             scores, _ = self._score(batch, refined, cost, has_cameras)
-            # What was decoded is not refined.
+            # refinement does not change the decoded depth
             metrics |= {
                 f"refined/{name}": value for name, value in scores.items() if not name.startswith(("decoded", "stated"))
             }
@@ -91,7 +99,7 @@ class SceneEvaluator:
     def _score(
         self, batch: Batch, prediction: Prediction, cost: dict[str, float], has_cameras: bool
     ) -> tuple[dict[str, float], dict[str, Render]]:
-        """All figures of one prediction, and its solid renders by protocol."""
+        """All metrics of one prediction, and its solid renders by protocol."""
         known = self._known(batch)
         metrics: dict[str, float] = {}
         renders: dict[str, Render] = {}
@@ -114,7 +122,7 @@ class SceneEvaluator:
     def _refine(
         self, batch: Batch, prediction: Prediction, options: RefineOptions
     ) -> tuple[Prediction, dict[str, float]]:
-        """The prediction with Gaussians and cameras optimised on the input views."""
+        """The prediction with Gaussians and cameras optimised on the input views, and the cost."""
         device, geometry = batch.images.device, prediction.geometry
         reset_peak_memory(device)
         began = now(device)
@@ -151,14 +159,14 @@ class SceneEvaluator:
         return cameras
 
     def _render(self, prediction: Prediction, cameras: Cameras, mode: Any) -> tuple[Render, float]:
-        """Renders views; also seconds per view."""
+        """The rendered views, and seconds per view."""
         device = prediction.gaussians.means.device
         begin = now(device)
         rendered = render_or_nan(self.renderer, prediction.gaussians, cameras, mode)
         return rendered, (now(device) - begin) / cameras.world_to_camera.shape[1]
 
     def _known(self, batch: Batch) -> Batch:
-        """The batch whose true depths out of range are unknown."""
+        """The batch with true depths outside ``depth_range`` set to 0 (unknown)."""
         inside = (batch.depth >= self.options.nearest) & (batch.depth <= self.options.farthest)
         return replace(batch, depth=torch.where(inside, batch.depth, 0.0))
 

@@ -1,4 +1,4 @@
-"""Evaluation of one scene while training."""
+"""Evaluation of one scene during training."""
 
 from __future__ import annotations
 
@@ -29,17 +29,18 @@ CV_QUERIES = 20_000
 def evaluate_scene(
     model: Reconstructor, renderer: Renderer, batch: Batch, rasterized: bool = False
 ) -> dict[str, float]:
-    """Reconstructs one scene (B = 1) from its context views and scores its held-out views, as training runs do.
+    """Reconstructs one scene (B = 1) from its context views and scores its held-out views.
 
     Args:
-        model: in any mode; it is not changed.
-        renderer: its options are used in both modes.
+        model: in any mode; not changed.
+        renderer: renderer whose options apply to both modes.
         batch: one scene with held-out views.
-        rasterized: score the depth of 3DGS rasterisation as well (``abs_rel_rasterized``).
+        rasterized: also score the depth of 3DGS rasterisation (``abs_rel_rasterized``).
 
     Returns:
-        Figures of held-out views at true poses, rendered as solids (``psnr``, ``abs_rel``, ...), of the context views'
-        decoded depth before and after enhancement, ``gaussians``, ``cv``. Depth is aligned by one scale a scene.
+        Metrics of the held-out views at true poses, rendered as stochastic solids (``psnr``, ``abs_rel``, ...), and of
+        the context views' decoded depth before and after enhancement; ``gaussians`` and ``cv``. Depth is aligned by
+        one scale per scene.
 
     Raises:
         ValueError: if the batch holds several scenes or no held-out view.
@@ -80,7 +81,7 @@ def _scene_figures(prediction: Prediction, renderer: Renderer, batch: Batch, ras
 
 
 def render_or_nan(renderer: Renderer, gaussians: Gaussians, cameras: Cameras, mode: Any) -> Render:
-    """Renders; where that fails, says so in the log and returns views of NaN, whose figures reports show as n/a."""
+    """Renders views; if nothing can be rendered, logs a warning and returns NaN views, which reports show as n/a."""
     try:
         return renderer(gaussians, cameras, mode=mode)
     except UnrenderableError as error:

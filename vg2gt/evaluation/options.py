@@ -1,4 +1,4 @@
-"""What an evaluation compares, and how: every option is in its configuration and its report."""
+"""Options of an evaluation; its configuration and its report contain all of them."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from vg2gt.metrics.depth import ALIGNMENTS
 
 @dataclass(frozen=True)
 class PointOptions:
-    """How point clouds are compared; positive lengths in the data's unit.
+    """Options of the point-cloud comparison; lengths are positive, in the data's unit.
 
     Args:
-        threshold: distance below which a point is right.
-        downsample: one point is kept in every cell of this edge; None keeps all.
-        cap: distances from here on are left out of the means; None: none.
+        threshold: distance below which a point counts as correct.
+        downsample: edge length of the cells in which one point is kept; None keeps all points.
+        cap: distances of at least this length are left out of the means; None: no cap.
     """
 
     threshold: float = 0.05
@@ -32,22 +32,22 @@ class PointOptions:
 
 @dataclass(frozen=True)
 class EvaluationOptions:
-    """What an evaluation compares.
+    """Options of an evaluation.
 
     Args:
-        selection: which views of a scene.
-        alignment: of depth, see :func:`vg2gt.metrics.depth_metrics`; the paper's is ``median``.
-        depth_range: true depths outside it count as unknown, for depth, normals and points alike, ``(nearest,
-            farthest)`` in the data's unit; None: no bound.
-        neighbors: k of the uniformity CV.
-        points: how point clouds are compared.
+        selection: selects the views of a scene.
+        alignment: alignment of depth, see :func:`vg2gt.metrics.depth_metrics`; the paper uses ``median``.
+        depth_range: ``(nearest, farthest)`` in the data's unit; true depths outside count as unknown, for depth,
+            normals and points. None: no bound.
+        neighbors: number of neighbours k of the uniformity CV.
+        points: options of the point-cloud comparison.
         lpips: ``auto`` (weights in torch hub's cache), ``download``, the weights' path, or None: no LPIPS.
-        pictures: number of scenes of which pictures are written, for every number of views.
-        refine: steps of refinement whose result is scored as well, in rows of its own; 0: none.
-        table: name of the data set in the paper's tables, whose rows are printed below ours; None: none of them.
+        pictures: number of scenes, for each number of views, of which pictures are written.
+        refine: number of refinement steps; the refined scene is scored in separate rows. 0: no refinement.
+        table: data set in the paper's tables whose rows are printed below ours; None: no rows of the paper.
 
     Raises:
-        ValueError: if the alignment is unknown or a number out of range.
+        ValueError: if the alignment is unknown or a number is out of range.
     """
 
     selection: ViewSelection = field(default_factory=ViewSelection)

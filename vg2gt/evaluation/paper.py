@@ -1,4 +1,4 @@
-"""The paper's tables (``paper_tables.json``), printed next to our figures and used for nothing else."""
+"""The paper's tables (``paper_tables.json``), used only to print them next to our results."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from vg2gt.io.files import read_json
 
 TABLES = Path(__file__).resolve().parent / "paper_tables.json"
 OURS = "VG2GT"
-MODES = {OURS: "solid", f"{OURS}(3DGS)": "rasterized"}  # the paper's rows and how they are rendered
+MODES = {OURS: "solid", f"{OURS}(3DGS)": "rasterized"}  # rows of the paper -> rendering mode
 RESOLUTION = (518, 518)
 ALIGNMENT = "median"
-SOURCES = {  # the paper's data sets and what reads them
+SOURCES = {  # data sets of the paper -> classes that read them
     "replica": ("Replica",),
     "dtu": ("DTU",),
     "tat": ("TanksAndTemples",),
@@ -27,7 +27,7 @@ NORMALS, UNIFORMITY = "tbl_camera_orientation", "tbl_point_uniformity"
 
 @lru_cache(maxsize=1)
 def tables() -> Mapping[str, Any]:
-    """Table (its LaTeX label) -> data set -> method -> figures, in some tables by number of views."""
+    """The tables as ``{LaTeX label: {data set: {method: metrics}}}``; some have metrics per number of views."""
     return read_json(TABLES)
 
 
@@ -41,16 +41,16 @@ def obstacle(
     depth_range: Sequence[float | None],
     told: bool,
 ) -> str | None:
-    """Why figures cannot be compared with the paper's rows on a data set; None if nothing prevents it.
+    """Returns why results cannot be compared with the paper's rows on a data set; None if they can.
 
     Args:
-        dataset: as in the tables, such as ``replica``.
-        source: class that reads the evaluated data.
+        dataset: name in the tables, such as ``replica``.
+        source: name of the class that reads the evaluated data.
         size: ``(height, width)`` of the images.
-        fit: how they were brought to it, ``cover`` or ``pad``.
-        alignment: of depth.
-        depth_range: true depths that count.
-        told: whether the backbone is told the data's depth or cameras.
+        fit: how images were brought to this size, ``cover`` or ``pad``.
+        alignment: alignment of depth.
+        depth_range: range of true depths that count.
+        told: whether the backbone is given the data's depth or cameras.
     """
     if source not in SOURCES.get(dataset, ()):
         return f"the data is read by {source}, which is not the paper's {dataset}"
@@ -64,7 +64,7 @@ def obstacle(
 
 
 def rows_by_views(table: str, dataset: str | None, views: int) -> Iterator[tuple[str, Mapping[str, float]]]:
-    """The paper's own rows for a number of views: rendering mode and figures; none without a data set."""
+    """Yields rendering mode and metrics of the paper's method for a number of views; nothing without a data set."""
     methods = tables()[table].get(dataset, {})
     for method, mode in MODES.items():
         if str(views) in methods.get(method, {}):
@@ -72,5 +72,5 @@ def rows_by_views(table: str, dataset: str | None, views: int) -> Iterator[tuple
 
 
 def row(table: str, dataset: str | None, method: str = OURS) -> Mapping[str, float] | None:
-    """A method's row of a table without numbers of views; None if there is no data set or it is not in the table."""
+    """A method's row in a table without numbers of views; None if the table lacks the data set or the method."""
     return tables()[table].get(dataset, {}).get(method)

@@ -1,4 +1,4 @@
-"""Qualitative grids: what went in, what was rendered, what is true, and where depth errs."""
+"""Qualitative grids of inputs, renders, ground truth and depth errors."""
 
 from __future__ import annotations
 
@@ -16,13 +16,16 @@ PANELS = "input | rendered | truth | rendered depth | true depth | depth error |
 
 
 def scene_picture(batch: Batch, rendered: Render, truth: Batch, alignment: str) -> Tensor:
-    """One row per view, evenly spread, at most three: the panels of :data:`PANELS`, ``[3, H, W]`` in [0, 1].
+    """Draws the panels of :data:`PANELS`, one row for each of at most three evenly spaced views.
 
     Args:
-        batch: the scene; the input view shown is the one taken nearest to the rendered view.
-        rendered: views of the scene.
-        truth: the same views.
-        alignment: brings the rendered depth into the true unit, image by image; ``scene`` as ``median``.
+        batch: the scene; each row shows the input view with the frame number nearest to the rendered view's.
+        rendered: rendered views of the scene.
+        truth: the same views of the data.
+        alignment: alignment of the rendered depth, per image; ``scene`` is treated as ``median``.
+
+    Returns:
+        The picture, ``[3, H, W]`` in [0, 1].
     """
     count = truth.images.shape[1]
     views = torch.linspace(0, count - 1, min(count, ROWS)).round().long().tolist()
@@ -49,7 +52,7 @@ def scene_picture(batch: Batch, rendered: Render, truth: Batch, alignment: str) 
 
 
 def colorize_error(depth: Tensor, reference: Tensor) -> Tensor:
-    """Colours relative errors ``[H, W]`` of aligned depth: white 0, red 5 %, black 10 %, a hole blue, unknown grey."""
+    """Colours relative errors ``[H, W]`` of aligned depth: 0 white, 5 % red, 10 % black; holes blue, unknown grey."""
     known = reference > 0
     error = (depth - reference).abs() / torch.where(known, reference, 1.0) / LARGEST_ERROR
     red = (2 - 2 * error).clamp(0, 1)

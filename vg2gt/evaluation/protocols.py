@@ -1,7 +1,7 @@
-"""Cameras of held-out views for training and evaluation; the Gaussians come from the context views alone.
+"""Cameras of held-out views for training and evaluation; the Gaussians are made from the context views only.
 
-They come either from a second, joint pass of the frozen backbone, brought into the first pass's frame by a similarity,
-or from the data.
+The cameras come from a second, joint pass of the frozen backbone, or from the data. A similarity transform brings them
+into the frame of the first pass.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ def training_cameras(model: Reconstructor, batch: Batch, prediction: Prediction)
 def joint_target_cameras(model: Reconstructor, batch: Batch, prediction: Prediction) -> Cameras:
     """Predicted cameras of the held-out views (protocol ``novel``), from a joint pass over context and held-out views.
 
-    A similarity between its context cameras and those of the context-only pass brings them into the Gaussians' frame;
-    where the context cameras do not move, its scale comes from the depth that both passes decode.
+    A similarity transform between the context cameras of both passes brings them into the Gaussians' frame. If the
+    context cameras do not move, the scale comes from the depth that both passes decode.
     """
-    if not model.backend.predicts_cameras:  # they are the data's: no pass is needed to know them
+    if not model.backend.predicts_cameras:  # given by the data: no pass is needed
         cameras = scale_translations(relative_to_first(batch.cameras), prediction.unit)
         return cameras.select(slice(batch.num_context, None))
     cameras = model.predict_cameras(batch.images, batch.hints)
@@ -46,7 +46,7 @@ def joint_target_cameras(model: Reconstructor, batch: Batch, prediction: Predict
 
 
 def ground_truth_target_cameras(batch: Batch, prediction: Prediction) -> Cameras:
-    """True cameras of the held-out views in the Gaussians' frame (protocol ``gt_pose``), by the context cameras."""
+    """True cameras of the held-out views in the Gaussians' frame (protocol ``gt_pose``), aligned by context cameras."""
     context = batch.context
     depth = prediction.geometry.depth
 

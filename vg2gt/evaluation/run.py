@@ -1,4 +1,4 @@
-"""An evaluation from its configuration to its report."""
+"""Runs an evaluation, from its configuration to its report."""
 
 from __future__ import annotations
 
@@ -36,24 +36,24 @@ from vg2gt.runs.lock import only_process_in
 
 log = logging.getLogger(__name__)
 
-# Settings that choose samples, pictures or places; all others decide figures and must be the same in a folder.
+# Settings of samples, pictures and folders. All others affect the metrics and must be the same within a folder.
 FREE = ("views", "name", "output_dir", "overwrite", "ckpt", "device", "evaluation.pictures", "data.eval_scenes")
 FREE += ("data.workers", "data.memory_mb", "data.steps_per_epoch")
-REFINEMENT = ("refine.", "evaluation.refine")  # decide nothing where nothing is refined
+REFINEMENT = ("refine.", "evaluation.refine")  # have no effect without refinement
 
 
 @memory_advice(EVALUATION)
 def evaluate(config: DictConfig) -> dict[str, Any]:
-    """Evaluates a model on the scenes of a data set, for every number of input views asked.
+    """Evaluates a model on the scenes of a data set, for each requested number of input views.
 
-    Writes the resolved configuration, one file a scene as it is done, ``metrics.json``, ``metrics.md`` and pictures.
-    Scenes that the folder holds already are not evaluated again.
+    Writes the resolved configuration, one file per finished scene, ``metrics.json``, ``metrics.md`` and pictures.
+    Scenes already in the folder are not evaluated again.
 
     Returns:
-        The content of ``metrics.json``: ``settings``, and for every number of views ``mean`` and ``scenes``.
+        The content of ``metrics.json``: ``settings``, and ``views`` with ``mean`` and ``scenes`` per number of views.
 
     Raises:
-        BlockingIOError: if another process works in the folder.
+        BlockingIOError: if another process uses the folder.
         FileExistsError: if the folder holds another evaluation.
         FileNotFoundError: if the checkpoint, its configuration or the data is missing.
         ValueError: if an option is wrong or the checkpoint does not fit.
@@ -63,7 +63,7 @@ def evaluate(config: DictConfig) -> dict[str, Any]:
 
 
 def _evaluate(config: DictConfig, folder: Path) -> dict[str, Any]:
-    """:func:`evaluate` in a folder that is this process's own."""
+    """Runs :func:`evaluate` in a folder that this process has locked."""
     counts = view_counts(config.views)
     options: EvaluationOptions = instantiate(config.evaluation, _convert_="all")
     checkpoint = checkpoint_path(config.ckpt)
@@ -108,7 +108,10 @@ def _evaluate(config: DictConfig, folder: Path) -> dict[str, Any]:
 
 
 def mean_metrics(scenes: Mapping[str, Mapping[str, float | None]]) -> dict[str, float | None]:
-    """Mean over the scenes that have a figure; of times and memory the lower median: the first scene also compiles."""
+    """Averages each metric over the scenes that have it.
+
+    Times and memory use the lower median, because the first scene includes compilation.
+    """
     names = dict.fromkeys(name for metrics in scenes.values() for name in metrics)
     means: dict[str, float | None] = {}
     for name in names:
@@ -119,7 +122,7 @@ def mean_metrics(scenes: Mapping[str, Mapping[str, float | None]]) -> dict[str, 
 
 
 def view_counts(views: Any) -> list[int]:
-    """The numbers of input views that ``views`` asks for, in order; ValueError if it is no number or list."""
+    """Returns the requested numbers of input views, sorted and unique; ValueError if one is not a positive integer."""
     counts = list(views) if isinstance(views, Sequence) else [views]
     if not counts or not all(type(count) is int and count > 0 for count in counts):
         raise ValueError(f"views={views}: give numbers of input views, such as 'views=[3,10,20]'")
@@ -138,7 +141,7 @@ def _samples(
 
 
 def _lpips(source: str | None, device: torch.device) -> tuple[LPIPS | None, str]:
-    """The network and what the report says of it; weights that were named must be there."""
+    """The network and its description in the report; raises only if weights given by path are missing."""
     if source is None:
         return None, "n/a (evaluation.lpips=null)"
     try:
@@ -153,7 +156,7 @@ def _lpips(source: str | None, device: torch.device) -> tuple[LPIPS | None, str]
 def _identity(
     config: Any, weights: TrainedWeights, has_lpips: bool, model: Reconstructor, device: torch.device
 ) -> dict[str, Any]:
-    """All that decides the figures of a sample, flat; the machine's kind decides the times."""
+    """All settings that affect the metrics of a sample, flattened; the device affects times."""
     settings = flatten(OmegaConf.to_container(config, resolve=True))
     free = FREE if config.evaluation.refine else (*FREE, *REFINEMENT)
     kept = {key: value for key, value in settings.items() if not key.startswith(free)}
@@ -169,7 +172,7 @@ def _evaluate_all(
     store: ResultStore,
     device: torch.device,
 ) -> dict[str, dict[str, float | None]]:
-    """Metrics per scene; those in the store are taken from there, unless their picture is wanted and missing."""
+    """Metrics per scene; stored ones are reused unless a requested picture is missing."""
     results = {}
     for number, views in enumerate(samples):
         wanted = number < evaluator.options.pictures

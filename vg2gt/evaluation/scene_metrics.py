@@ -1,4 +1,4 @@
-"""Figures of rendered and decoded views against the truth."""
+"""Metrics of rendered and decoded views against ground truth."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vg2gt.types import Batch, Cameras, Geometry, Render
 
 
 def image_metrics(rendered: Render, truth: Batch, lpips: LPIPS | None = None) -> dict[str, float]:
-    """``psnr``, ``ssim`` and, with a network, ``lpips`` of one scene's views, averaged over images."""
+    """``psnr``, ``ssim`` and, if a network is given, ``lpips`` of one scene, averaged over its views."""
     found = {
         "psnr": float(psnr(rendered.color[0], truth.images[0]).mean()),
         "ssim": float(ssim(rendered.color[0], truth.images[0]).mean()),
@@ -26,7 +26,7 @@ def image_metrics(rendered: Render, truth: Batch, lpips: LPIPS | None = None) ->
 
 
 def rendered_normal_metrics(rendered: Render, truth: Batch) -> dict[str, float]:
-    """Errors of the rendered normals of one scene, names with ``normal_`` in front.
+    """Errors of the rendered normals of one scene; the names have the prefix ``normal_``.
 
     Pixels count where a depth was rendered and the true depth has a normal (valid neighbours, no depth edge).
     """
@@ -36,7 +36,7 @@ def rendered_normal_metrics(rendered: Render, truth: Batch) -> dict[str, float]:
 
 
 def edge_metrics(rendered: Render, truth: Batch, alignment: str) -> dict[str, float]:
-    """``edge_psnr`` and ``edge_abs_rel`` of one scene, within 3 pixels of true depth edges; NaN without any."""
+    """``edge_psnr`` and ``edge_abs_rel`` of one scene, within 3 pixels of true depth edges; NaN if there are none."""
     region = near_depth_edges(truth.depth)
     depth = depth_metrics(rendered.depth[0], truth.depth[0], alignment, region=region[0])
     error = (rendered.color.clamp(0, 1) - truth.images.clamp(0, 1)).double().square().mean(2)[0]  # [V, H, W]
@@ -46,7 +46,7 @@ def edge_metrics(rendered: Render, truth: Batch, alignment: str) -> dict[str, fl
 
 
 def depth_to_camera_scale(geometry: Geometry, truth: Batch) -> float:
-    """Size of decoded depth over that of the cameras' translations, 1 where both fit; NaN if unknown."""
+    """Ratio of the scale of decoded depth to that of camera translations; 1 if consistent, NaN if unknown."""
     depth = fit_depth_scale(geometry.depth, truth.depth, truth.depth > 0)
     unknown = torch.full_like(depth, torch.nan)
     return float(align_cameras(geometry.cameras, truth.cameras, lambda: unknown).scale / depth)
@@ -55,14 +55,14 @@ def depth_to_camera_scale(geometry: Geometry, truth: Batch) -> float:
 def point_cloud_metrics(
     depth: Tensor, cameras: Cameras, truth: Batch, similarity: Similarity, **options: float | None
 ) -> dict[str, float]:
-    """Compares the points of predicted depth maps with the true ones, at pixels whose true depth is known.
+    """Compares the points of predicted depth maps with the true points, at pixels with known true depth.
 
     Args:
         depth: ``[1, V, H, W]``.
         cameras: predicted cameras of the same views.
         truth: the same views.
-        similarity: from the predicted to the true world frame.
-        options: of :func:`vg2gt.metrics.point_metrics`.
+        similarity: transform from the predicted to the true world frame.
+        options: keyword arguments of :func:`vg2gt.metrics.point_metrics`.
     """
     known = truth.depth > 0
     predicted = similarity.apply(unproject(depth, cameras))[known & (depth > 0) & depth.isfinite()]
@@ -72,9 +72,9 @@ def point_cloud_metrics(
 
 
 def align_geometry(geometry: Geometry, truth: Batch) -> Similarity | None:
-    """The similarity that brings decoded points onto the true points of the same pixels; None without any.
+    """Fits a similarity transform from decoded to true points of the same pixels; None with fewer than 3 points.
 
-    From points, not cameras: the scale that a short baseline gives would move the whole cloud.
+    Points are used instead of cameras: a scale estimated from a short baseline would displace the whole cloud.
     """
     valid = (geometry.depth > 0) & geometry.depth.isfinite() & (truth.depth > 0)
     if int(valid.sum()) < 3:
@@ -84,5 +84,5 @@ def align_geometry(geometry: Geometry, truth: Batch) -> Similarity | None:
 
 
 def present(values: dict[str, float]) -> dict[str, float | None]:
-    """The same figures with None where there is none, as JSON has no NaN; infinity is none either."""
+    """Replaces NaN and infinity, which JSON lacks, by None."""
     return {name: value if math.isfinite(value) else None for name, value in values.items()}

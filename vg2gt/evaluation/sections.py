@@ -37,7 +37,7 @@ SCENE = columns(
     decimals={f"{_HELD_OUT}/normal_mean": 2},
 )
 
-# Where the figures of a section are, and what its rows are called after the number of views.
+# Paths of a section's metrics -> labels of their rows, after the number of views.
 Paths = Mapping[str, Sequence[str]]
 RENDERED = {f"rendered/{protocol}/{mode}": (protocol, mode) for protocol in PROTOCOLS for mode in MODES}
 REFINED = {f"refined/{path}": (protocol, f"{mode}, refined") for path, (protocol, mode) in RENDERED.items()}
@@ -49,14 +49,14 @@ Rows = list[tuple[list[str], Figures]]
 
 
 def report_markdown(report: Mapping[str, Any]) -> str:
-    """The content of ``metrics.json`` as Markdown: how it was measured, a table per kind of figure, then the scenes."""
+    """Formats the content of ``metrics.json`` as Markdown: settings, a table per kind of metric, then the scenes."""
     settings, by_views = report["settings"], sorted(report["views"].items(), key=lambda item: int(item[0]))
     dataset, images = settings["paper"], IMAGES
-    if settings["lpips"].startswith("n/a"):  # LPIPS without weights says so in its heading
+    if settings["lpips"].startswith("n/a"):  # missing weights are noted in the heading
         images = images | {"lpips": replace(images["lpips"], label=f"LPIPS {settings['lpips']}")}
 
     def rows(paths: Paths, table: str | None = None) -> Rows:
-        """For every number of views our rows, then the paper's of the same number."""
+        """For each number of views our rows, followed by the paper's."""
         found: Rows = []
         for views, result in by_views:
             found += [([views, *key], _below(result["mean"], path)) for path, key in paths.items()]
@@ -153,7 +153,7 @@ def _range(bounds: Sequence[float | None]) -> str:
 
 
 def _section(title: str, keys: Sequence[str], shown: Mapping[str, Metric], rows: Rows) -> str:
-    """A table of the rows that have a figure; ``n/a`` where none has."""
+    """A table of the rows that have any of the metrics; ``n/a`` if there are none."""
     body = [
         [*key, *(number(figures.get(name), metric.decimals) for name, metric in shown.items())]
         for key, figures in rows

@@ -1,4 +1,4 @@
-"""Stated errors of decoded depth against true ones."""
+"""Calibrated error bounds of decoded depth, compared with the true errors."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from vg2gt.uncertainty import LEVELS, Calibration, Samples, pixel_evidence
 def stated_metrics(
     calibration: Calibration, decoded: Decoded, keep: Tensor | None, truth: Batch, predicts_cameras: bool
 ) -> dict[str, float]:
-    """Scores what a calibration states of the decoded depth of one scene (:func:`vg2gt.metrics.stated_error_metrics`).
+    """Scores the error bounds of one scene's decoded depth (:func:`vg2gt.metrics.stated_error_metrics`).
 
     Args:
-        calibration: of the model.
-        decoded: of one scene (B = 1).
-        keep: ``[1, V, H, W]`` bool, pixels that the scene is made of; None: all that have a depth.
-        truth: its context views.
+        calibration: calibration of the model.
+        decoded: decoded geometry of one scene (B = 1).
+        keep: ``[1, V, H, W]`` bool, pixels that the scene is made of; None: all with a depth.
+        truth: context views of the scene.
         predicts_cameras: see :func:`pixels_with_errors`.
     """
     pixels = pixels_with_errors(decoded, keep, truth, predicts_cameras)
@@ -29,15 +29,15 @@ def stated_metrics(
 def pixels_with_errors(
     decoded: Decoded, keep: Tensor | None, truth: Batch, predicts_cameras: bool, scene: int = 0
 ) -> Samples:
-    """The pixels of one scene whose depth is decoded and known, with evidence and true error.
+    """Collects the pixels of one scene that have decoded and true depth, with their evidence and true error.
 
     Args:
-        decoded: of one scene (B = 1).
-        keep: ``[1, V, H, W]`` bool, pixels that the scene is made of; None: all that have a depth.
-        truth: its context views.
-        predicts_cameras: whether the unit is the backbone's own, so that one factor (the median) is taken out of the
-            scene's depth first; cameras that are given fix it.
-        scene: what the samples say they are of.
+        decoded: decoded geometry of one scene (B = 1).
+        keep: ``[1, V, H, W]`` bool, pixels that the scene is made of; None: all with a depth.
+        truth: context views of the scene.
+        predicts_cameras: whether the backbone predicts the cameras and thus the unit. If so, the median ratio to the
+            true depth is divided out first; given cameras fix the unit.
+        scene: scene number stored in the samples.
     """
     depth, true = decoded.geometry.depth[0].float(), truth.depth[0].float()
     evidence, status = pixel_evidence(decoded.geometry, keep)

@@ -1,4 +1,4 @@
-"""Results of single scenes on disk: written as they come, so that an interrupted evaluation goes on where it was."""
+"""Results of single scenes on disk, written as they are computed, so that an interrupted evaluation can resume."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ WRITTEN = (*FOLDERS, *REPORTS, "config.yaml")
 
 
 class ResultStore:
-    """The scenes of one evaluation, one JSON file each.
+    """Results of one evaluation, one JSON file per scene.
 
     Args:
         folder: the evaluation's folder.
-        identity: flat settings that decide the figures; another evaluation in the same folder must have the same.
-        overwrite: remove what the folder holds of another evaluation, or of this one.
+        identity: flat settings that affect the metrics; an evaluation already in the folder must have the same.
+        overwrite: remove the results that the folder holds, of this or another evaluation.
 
     Raises:
         FileExistsError: if the folder holds an evaluation with other settings, naming the first that differ, or files
-            of something else, which are never replaced.
+            that do not belong to an evaluation, which are never replaced.
     """
 
     def __init__(self, folder: Path, identity: Mapping[str, Any], overwrite: bool = False) -> None:
@@ -39,7 +39,7 @@ class ResultStore:
                     "choose another output_dir= or name="
                 )
         elif overwrite:
-            # The report first: an interruption must not leave it with other settings.
+            # the report first: an interruption must not leave it next to other settings
             for name in REPORTS:
                 (folder / name).unlink(missing_ok=True)
             for name in FOLDERS:
@@ -57,14 +57,14 @@ class ResultStore:
         write_json(folder / IDENTITY, dict(identity))
 
     def read(self, views: SceneSample) -> dict[str, float | None] | None:
-        """The metrics of a sample that was evaluated before; None if it was not, or with other frames."""
+        """Stored metrics of a sample; None if it was not evaluated, or with other frames."""
         path = self._path(views)
         if not path.is_file():
             return None
         try:
             stored = read_json(path)
         except ValueError:
-            return None  # measured again
+            return None  # damaged: the sample is evaluated again
         same = stored["context"] == list(views.context) and stored["target"] == list(views.target)
         return stored["scores"] if same else None
 
@@ -79,7 +79,7 @@ class ResultStore:
         write_json(self._path(views), content)
 
     def picture(self, views: SceneSample) -> Path:
-        """Where the picture of a sample is."""
+        """Path of a sample's picture."""
         return self.folder / "pictures" / f"{file_name(views.scene)}-{len(views.context)}.png"
 
     def _path(self, views: SceneSample) -> Path:
@@ -87,5 +87,5 @@ class ResultStore:
 
 
 def file_name(scene: str) -> str:
-    """A scene's name as a file name: one folder deep, and different for different scenes."""
+    """Encodes a scene's name as a file name without slashes, unique per scene."""
     return scene.replace("%", "%25").replace("/", "%2F")

@@ -1,4 +1,4 @@
-"""How metrics are shown: one specification of labels, decimals and directions, one writer of tables."""
+"""Display of metrics: their labels, decimals and directions, and tables."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rich.table import Table
 
 @dataclass(frozen=True)
 class Metric:
-    """A metric as tables show it: label with unit, digits after the point, what is better (None: neither)."""
+    """How tables show a metric: label with unit, decimals, and whether larger is better (None: neither)."""
 
     label: str
     decimals: int
@@ -66,12 +66,12 @@ METRICS = {
 def columns(
     *names: str, labels: Mapping[str, str] | None = None, decimals: Mapping[str, int] | None = None
 ) -> dict[str, Metric]:
-    """The columns of a table, by name.
+    """Returns the columns of a table, by name.
 
     Args:
-        names: of :data:`METRICS`, or paths that end in one of them, such as ``rendered/gt_pose/solid/psnr``.
-        labels: where the table calls a metric otherwise.
-        decimals: where it shows more or fewer of them.
+        names: names in :data:`METRICS`, or paths that end in one of them, such as ``rendered/gt_pose/solid/psnr``.
+        labels: labels that replace the default ones.
+        decimals: decimals that replace the default ones.
     """
     chosen = {name: METRICS[name.rpartition("/")[2]] for name in names}
     for name, label in (labels or {}).items():
@@ -82,14 +82,14 @@ def columns(
 
 
 def number(value: float | None, decimals: int, sign: bool = False) -> str:
-    """A number of a table; ``n/a`` where there is none."""
+    """Formats a number for a table; ``n/a`` if it is missing or not finite."""
     if value is None or not math.isfinite(value):
         return "n/a"
     return f"{value:{'+' if sign else ''}.{decimals}f}"
 
 
 def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]], text_columns: int = 1) -> str:
-    """A table in Markdown, readable in a terminal; the first ``text_columns`` are left-aligned, others right."""
+    """Formats a Markdown table, readable in a terminal; the first ``text_columns`` are left-aligned, others right."""
     widths = [max(map(len, cells)) for cells in zip(head, *rows, strict=True)]
     left = [True] * text_columns + [False] * (len(head) - text_columns)
     rule = ["-" * width if text else "-" * (width - 1) + ":" for width, text in zip(widths, left, strict=True)]
@@ -109,7 +109,7 @@ def print_table(
     text_columns: int = 1,
     width: int = 110,
 ) -> None:
-    """Prints a table ``width`` characters wide at most; the other arguments are those of :func:`markdown_table`."""
+    """Prints a table at most ``width`` characters wide; cells and alignment as in :func:`markdown_table`."""
     table = Table(title=title, caption=caption)
     for index, heading in enumerate(head):
         table.add_column(heading, justify="left" if index < text_columns else "right")

@@ -1,4 +1,4 @@
-"""Readers and writers, one file per format."""
+"""Readers and writers, one module per format."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ _HOMES = {name: file for file, names in _FILES.items() for name in names}
 
 
 def __getattr__(name: str) -> Any:
-    """Imports a format only when it is asked for."""
+    """Imports a format's module on first use."""
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(_HOMES[name]), name)

@@ -1,6 +1,7 @@
-"""NumPy files from anywhere: no pickles, and shapes are checked before anything is made of them.
+"""Reading of untrusted NumPy files: pickles are refused, and shapes are checked first.
 
-What is missing or damaged, or has another shape, is a ``DataError`` that names the file and the scene.
+Functions that take a scene raise ``DataError``, naming file and scene, if a file is missing, damaged or has the wrong
+shape.
 """
 
 from __future__ import annotations
@@ -23,11 +24,11 @@ def read_npz(file: str | Path | BinaryIO, names: Sequence[str]) -> dict[str, NDA
 
     Args:
         file: a path, or an open file.
-        names: the arrays to read; others are left alone.
+        names: names of the arrays to read.
 
     Raises:
-        KeyError: naming an array that is not there.
-        FormatError: if the file is no archive, damaged, or holds Python objects.
+        KeyError: if an array is missing, naming it.
+        FormatError: if the file is not an archive, is damaged, or holds Python objects.
         OSError: if it cannot be opened.
     """
     try:
@@ -39,15 +40,15 @@ def read_npz(file: str | Path | BinaryIO, names: Sequence[str]) -> dict[str, NDA
             return {name: stored[name] for name in names}
     except (OSError, KeyError, FormatError):
         raise
-    except Exception as error:  # damage raises whatever zipfile, zlib and the header's parser raise; sizes MemoryError
+    except Exception as error:  # damaged files raise various errors of zipfile, zlib and parser, or MemoryError
         raise FormatError(f"no readable archive of plain arrays: {error or type(error).__name__}") from error
 
 
 def npz_names(path: Path) -> tuple[str, ...]:
-    """Names of the arrays in an ``.npz`` file.
+    """Returns the names of the arrays in an ``.npz`` file.
 
     Raises:
-        FormatError: if it is no archive.
+        FormatError: if it is not an archive.
     """
     try:
         with zipfile.ZipFile(regular(path)) as archive:
@@ -74,7 +75,7 @@ def load_matrices(
     Args:
         path: the file.
         scene: the scene it belongs to, for messages.
-        shapes: the shape that each array must have; None: any length.
+        shapes: required shape of each array; None: any length.
     """
     arrays = load_npz(path, scene, tuple(shapes))
     for name, shape in shapes.items():
@@ -92,22 +93,22 @@ def load_matrices(
 
 
 def npy_size(path: Path, scene: str) -> Size:
-    """The ``(height, width)`` of a float image in an ``.npy`` file, without reading its values."""
+    """Returns the ``(height, width)`` of a float image in an ``.npy`` file without reading its values."""
     return _map_npy(path, scene).shape
 
 
 def load_npy(path: Path, scene: str, size: Size) -> NDArray[np.float32]:
-    """Reads a float image ``[h, w]`` of an ``.npy`` file."""
+    """Reads a float image ``[H, W]`` from an ``.npy`` file."""
     mapped = _map_npy(path, scene)
     check_size(path, scene, mapped.shape, size)
     return np.asarray(mapped, dtype=np.float32)
 
 
 def _map_npy(path: Path, scene: str) -> NDArray[np.floating]:
-    """Maps the file, so that a damaged header cannot ask for more memory than the file has bytes."""
+    """Memory-maps the file, so that a damaged header cannot allocate more memory than the file's size."""
     try:
         mapped = np.load(path, mmap_mode="r", allow_pickle=False)
-    except Exception as error:  # a damaged header raises whatever its parser, tokenizer and mmap raise
+    except Exception as error:  # damaged headers raise various errors of parser, tokenizer and mmap
         raise DataError(f"cannot read {path} of scene {scene}: {error}; restore it or remove the frame") from error
     if not isinstance(mapped, np.ndarray) or mapped.ndim != 2 or mapped.dtype.kind != "f":
         raise DataError(f"{path} of scene {scene} is not a depth image: expected a two-dimensional array of floats")

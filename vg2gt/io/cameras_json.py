@@ -2,9 +2,9 @@
 
 The file is a list of objects ``name``, ``width``, ``height``, ``intrinsics`` (3 rows of 3, integer pixel centres) and
 ``world_to_camera`` (4 rows of 4, OpenCV axes). A reconstruction adds ``photo`` (the whole photograph's camera),
-``similarity`` (4 rows of 4: from this file's world to that of the cameras as they were given or found) and
-``metres_per_unit`` (null: unknown). Other fields are ignored. (3D Gaussian Splatting writes a file of the
-same name with other fields; it is refused, naming the missing one.)
+``similarity`` (4 rows of 4, transform from this file's world to that of the given or estimated cameras) and
+``metres_per_unit`` (null: unknown). Other fields are ignored. The file of the same name from 3D Gaussian Splatting has
+other fields; it is refused, naming the missing one.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ from vg2gt.io.files import write_json
 from vg2gt.io.json_checks import Fields, check_rigid, load_json
 from vg2gt.types import Cameras
 
-MOST_PIXELS = 1 << 28  # of an image to be rendered: the largest photographs have fewer
+MOST_PIXELS = 1 << 28  # per image to render; the largest photographs have fewer
 _ROTATION_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class Photo:
-    """The camera of a whole photograph, of which a view may be a reduced and cropped part.
+    """The camera of a whole photograph; a view may be a resized crop of it.
 
     Attributes:
-        name: of the file.
-        width: in pixels, upright and undistorted.
-        height: in pixels.
-        intrinsics: ``[3, 3]`` float64, integer pixel centres.
-        lens: what the file must be undistorted from (``vg2gt.data.sources.undistortion.lens_text``); empty: nothing.
+        name: file name.
+        width: image width in pixels, upright and undistorted.
+        height: image height in pixels, upright and undistorted.
+        intrinsics: ``[3, 3]`` float64 in pixels, integer pixel centres.
+        lens: distortion of the file (``vg2gt.data.sources.undistortion.lens_text``); empty: none.
     """
 
     name: str
@@ -51,13 +51,13 @@ class NamedCamera:
     """One pinhole camera.
 
     Attributes:
-        name: of the view, usually its image file relative to the folder of the images; not empty.
-        width: of the image in pixels.
-        height: of the image in pixels.
+        name: name of the view, usually its image file relative to the image folder; not empty.
+        width: image width in pixels.
+        height: image height in pixels.
         intrinsics: ``[3, 3]`` float64 in pixels, integer pixel centres.
         world_to_camera: ``[4, 4]`` float64, OpenCV axes, scene units.
         photo: the whole photograph's camera, if known.
-        similarity: ``[4, 4]`` from this world to that of the cameras as they were given or found, if known.
+        similarity: ``[4, 4]`` transform from this world to that of the given or estimated cameras, if known.
         metres_per_unit: metres per scene unit, if known.
     """
 
@@ -71,12 +71,12 @@ class NamedCamera:
     metres_per_unit: float | None = None
 
     def cameras(self) -> Cameras:
-        """This camera as the renderer takes it: one scene, one view, float32."""
+        """Returns the camera as input of the renderer: one scene, one view, float32."""
         pose, intrinsics = (torch.from_numpy(m).float()[None, None] for m in (self.world_to_camera, self.intrinsics))
         return Cameras(pose, intrinsics, (self.height, self.width))
 
     def fields(self) -> dict[str, Any]:
-        """This camera as plain values, as it is in a file."""
+        """Returns the camera as the plain values of its JSON object."""
         fields: dict[str, Any] = {
             "name": self.name,
             "width": int(self.width),
@@ -96,7 +96,7 @@ class NamedCamera:
 
 
 def invert_pose(pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Inverses of rigid transforms ``[..., 4, 4]``, whose rotations stay rotations to the last digit."""
+    """Inverts rigid transforms ``[..., 4, 4]``; rotations are transposed, which adds no rounding error."""
     inverse = np.zeros_like(pose)
     rotation = pose[..., :3, :3].swapaxes(-1, -2)
     inverse[..., :3, :3] = rotation
@@ -106,7 +106,7 @@ def invert_pose(pose: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def named_cameras(cameras: Cameras, names: Sequence[str]) -> list[NamedCamera]:
-    """The views of one scene with a name each.
+    """Returns one named camera per view of a scene.
 
     Raises:
         ValueError: if there is more than one scene, or not one name per view.
@@ -122,14 +122,10 @@ def named_cameras(cameras: Cameras, names: Sequence[str]) -> list[NamedCamera]:
 
 
 def write_cameras_json(path: str | Path, cameras: Sequence[NamedCamera]) -> Path:
-    """Writes cameras in their order, atomically; every float64 comes back as it was.
-
-    Args:
-        path: the file.
-        cameras: what to write; not changed.
+    """Writes cameras in order, atomically and without loss of float64 precision.
 
     Raises:
-        ValueError: if one is no camera: a wrong shape, a value that is not finite, no rotation, no focal length.
+        ValueError: if a camera is invalid: wrong shape, a value that is not finite, no valid rotation or focal length.
     """
     content = [camera.fields() for camera in cameras]
     for index, entry in enumerate(content):
@@ -138,10 +134,10 @@ def write_cameras_json(path: str | Path, cameras: Sequence[NamedCamera]) -> Path
 
 
 def read_cameras_json(path: str | Path) -> list[NamedCamera]:
-    """Reads the cameras of a file in their order.
+    """Reads the cameras of a file, in order.
 
     Raises:
-        FormatError: if it is not JSON or of another shape, naming the file, the entry and the field.
+        FormatError: if the file is not JSON or a field is wrong, naming the file, the entry and the field.
     """
     path = Path(path)
     content = load_json(path)
@@ -151,7 +147,7 @@ def read_cameras_json(path: str | Path) -> list[NamedCamera]:
 
 
 def _camera(place: str, entry: Any) -> NamedCamera:
-    """Checks one entry; ``place`` is where it is, for messages."""
+    """Checks and converts one entry; ``place`` locates it in messages."""
     fields = Fields(f"{place}.", entry)
     name = fields.get("name", str, "the view's name")
     if not name:

@@ -1,9 +1,9 @@
-"""COLMAP models, text and binary, by pycolmap (``pip install 'vg2gt[colmap]'``): cameras, posed images, sparse points.
+"""COLMAP models, text and binary, with pycolmap (``pip install 'vg2gt[colmap]'``).
 
-A model is a ``pycolmap.Reconstruction``, in COLMAP's conventions. Ours come in at four places only:
-:func:`colmap_intrinsics` and :func:`colmap_from_views` move the principal point by half a pixel (COLMAP has the centre
-of the first pixel at (1/2, 1/2), we at (0, 0)), :func:`colmap_pose` and :func:`colmap_from_views` turn COLMAP's pose
-into our ``world_to_camera`` and back (both are OpenCV cameras).
+A model holds cameras, posed images and sparse points. It is a ``pycolmap.Reconstruction`` in COLMAP's conventions.
+:func:`colmap_intrinsics` and :func:`colmap_from_views` shift the principal point by half a pixel: the centre of the
+first pixel is (1/2, 1/2) in COLMAP and (0, 0) here. :func:`colmap_pose` and :func:`colmap_from_views` convert between
+COLMAP's poses and ``world_to_camera``; both are OpenCV cameras.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
-import PIL.Image  # noqa: F401  first: the other way round, the two mix up their copies of zlib
+import PIL.Image  # noqa: F401  before pycolmap: in the other order their copies of zlib conflict
 from numpy.typing import ArrayLike, NDArray
 
 from vg2gt.io.errors import FormatError
 from vg2gt.io.files import by_number, regular
 from vg2gt.types import Cameras
 
-# Of pycolmap, which is imported only where it is needed.
+# Types of pycolmap, which is imported only where it is needed.
 Reconstruction: TypeAlias = Any
 Image: TypeAlias = Any
 Camera: TypeAlias = Any
 
-PIXEL_CENTER = 0.5  # where COLMAP has the centre of the first pixel; ours is at 0
+PIXEL_CENTER = 0.5  # centre of the first pixel in COLMAP; ours is at 0
 FILES = ("cameras", "images", "points3D")
 _NOT_FINITE = re.compile(r"[+-]?(nan(\(.*\))?|inf(inity)?|1\.#\w+)", re.IGNORECASE)
 _FAR = 1e30
@@ -42,19 +42,19 @@ def require_pycolmap(purpose: str) -> None:
     """Checks early that pycolmap is installed.
 
     Args:
-        purpose: what needs it, the start of the message.
+        purpose: what needs it; the error message starts with it.
 
     Raises:
-        ImportError: if it is not, with the command that installs it.
+        ImportError: if it is not installed; the message has the command that installs it.
     """
     if importlib.util.find_spec("pycolmap") is None:
         raise ImportError(f"{purpose} needs pycolmap: {EXTRA}")
 
 
 def colmap_files(folder: Path) -> dict[str, Path]:
-    """The model's files by ``FILES``; empty if the folder holds no model.
+    """Finds the model's files, by the names in ``FILES``; empty if the folder holds no model.
 
-    ``.bin`` goes before ``.txt``. Upper and lower case are the same, and ``points3D`` may be missing.
+    ``.bin`` takes precedence over ``.txt``. Case is ignored, and ``points3D`` may be missing.
     """
     found = {path.name.lower(): path for path in sorted(folder.iterdir())} if folder.is_dir() else {}
     for ending in (".bin", ".txt"):
@@ -65,15 +65,16 @@ def colmap_files(folder: Path) -> dict[str, Path]:
 
 
 def read_colmap(folder: str | Path) -> Reconstruction:
-    """Reads a model of any camera models.
+    """Reads a model; cameras may have any camera model.
 
     Args:
         folder: the folder with ``cameras``, ``images`` and usually ``points3D``, such as ``sparse/0``. ``rigs`` and
             ``frames`` of newer versions repeat the poses and are not read.
 
     Returns:
-        The model. Poses and points may be NaN if the files hold NaN, see :func:`colmap_pose`; the parameters of a
-        camera of which one is not finite are all 0, see :func:`colmap_intrinsics`.
+        The model. Poses and points that are not finite in the files are NaN or at least 1e30, see
+        :func:`colmap_pose`. If a parameter of a camera is not finite, all its parameters are 0, see
+        :func:`colmap_intrinsics`.
 
     Raises:
         FormatError: if there is no model, or a file is damaged, naming the file.
@@ -103,11 +104,11 @@ def read_colmap(folder: str | Path) -> Reconstruction:
 
 
 def write_colmap(folder: str | Path, model: Reconstruction, *, text: bool = False) -> Path:
-    """Writes a model, each file whole or not at all.
+    """Writes a model, each file atomically.
 
     Args:
-        folder: made if needed. Files of the other kind already there would be read instead: they are refused.
-        model: what to write; not changed.
+        folder: output folder, created if needed. Files of the other kind, which may be read instead, are refused.
+        model: model to write; not changed.
         text: True writes ``.txt``, False ``.bin``.
 
     Raises:
@@ -126,14 +127,14 @@ def write_colmap(folder: str | Path, model: Reconstruction, *, text: bool = Fals
 
 
 def colmap_images(model: Reconstruction) -> list[Image]:
-    """A model's images in the order of their names, numbers in names by their value (``2.jpg`` before ``10.jpg``)."""
+    """Returns a model's images sorted by name; numbers in names sort by value (``2.jpg`` before ``10.jpg``)."""
     return sorted(model.images.values(), key=lambda image: by_number(image.name))
 
 
 def colmap_intrinsics(camera: Camera) -> NDArray[np.float64]:
-    """Pinhole part of a camera ``[3, 3]`` in pixels, with our integer pixel centres; distortion is left out.
+    """Returns a camera's pinhole intrinsics ``[3, 3]`` in pixels, with our integer pixel centres, without distortion.
 
-    All NaN where the file's parameters are not finite.
+    All NaN if a parameter in the file is not finite.
 
     Raises:
         ValueError: if the camera model has no focal length (EQUIRECTANGULAR).
@@ -148,7 +149,7 @@ def colmap_intrinsics(camera: Camera) -> NDArray[np.float64]:
 
 
 def colmap_pose(image: Image) -> NDArray[np.float64]:
-    """``world_to_camera`` ``[4, 4]`` of an image; all NaN where it has none or anything in it is not finite."""
+    """Returns ``world_to_camera`` ``[4, 4]`` of an image; all NaN if it has no pose or a value is not finite."""
     pose = np.full((4, 4), np.nan)
     if image.has_pose:
         rigid = np.asarray(image.cam_from_world().matrix(), np.float64)
@@ -166,16 +167,16 @@ def colmap_from_views(
     sources: tuple[ArrayLike, ArrayLike, ArrayLike] | None = None,
     sizes: Sequence[tuple[int, int]] | None = None,
 ) -> Reconstruction:
-    """Model of one scene's views, one PINHOLE camera each, numbered from 1, and points seen in them.
+    """Builds a model from one scene's views, with one PINHOLE camera per view, numbered from 1, and points.
 
     Args:
         cameras: one scene (B = 1) with V views.
         names: V file names relative to the image folder.
-        positions: ``[N, 3]`` world positions; None for no points.
-        colors: ``[N, 3]`` uint8; None is mid grey.
-        sources: observations: the point ``[T]``, the view ``[T]`` and the pixel ``[T, 2]`` as (x, y), integer centres.
-            None leaves points without observations.
-        sizes: the images' ``(height, width)`` where each view has its own; None: that of the cameras.
+        positions: ``[N, 3]`` world positions; None: no points.
+        colors: ``[N, 3]`` uint8; None: mid grey.
+        sources: T observations as point index ``[T]``, view index ``[T]`` and pixel ``[T, 2]``, (x, y) with integer
+            centres; None: points have no observations.
+        sizes: ``(height, width)`` of each image; None: that of the cameras.
 
     Raises:
         ImportError: if pycolmap is not installed.
@@ -218,7 +219,7 @@ def colmap_from_views(
 
 @contextmanager
 def quiet_colmap() -> Iterator[None]:
-    """Keeps COLMAP's own log off the console."""
+    """Silences COLMAP's log."""
     import pycolmap  # pyright: ignore[reportMissingImports]
 
     before = pycolmap.logging.minloglevel
@@ -244,7 +245,7 @@ def _observations(sources: Any, points: int, views: int) -> tuple[NDArray[np.int
 
 
 def _stage(name: str, path: Path | None, folder: Path, ending: str) -> None:
-    """Puts one file where pycolmap finds it, checked or cleaned."""
+    """Checks one file and puts it, cleaned if needed, into the folder that pycolmap reads."""
     target = folder / f"{name}{ending}"
     if path is None:  # a model without points
         target.write_bytes(bytes(8) if ending == ".bin" else b"")
@@ -265,9 +266,9 @@ def _stage(name: str, path: Path | None, folder: Path, ending: str) -> None:
 
 
 def _clean_line(name: str, line: str) -> str:
-    """A line as pycolmap reads it: camera models in upper case, and something finite in place of what is not.
+    """Makes a line readable by pycolmap: camera models in upper case, placeholders for values that are not finite.
 
-    Of a camera all parameters become 0; an image and a point go so far away that they count as unknown.
+    All parameters of such a camera become 0. Such images and points are moved so far away that they count as unknown.
     """
     fields = line.split(" ") if name == "images" else line.split()
     if not fields or fields[0].startswith("#"):
@@ -277,7 +278,7 @@ def _clean_line(name: str, line: str) -> str:
         fields[1] = fields[1].upper()
         fields[4:] = ["0"] * len(fields[4:]) if any(spoilt[4:]) else fields[4:]
     elif name == "images" and any(spoilt):
-        pose = len(fields) > 9 and re.search("[A-Za-z]", fields[9])  # the line before an image's features
+        pose = len(fields) > 9 and re.search("[A-Za-z]", fields[9])  # the pose line, before the line of features
         fields = (
             [fields[0], "1", "0", "0", "0", *(["1e300"] * 3), *fields[8:]] if pose else _replaced(fields, spoilt, "0")
         )
@@ -291,13 +292,13 @@ def _replaced(fields: list[str], spoilt: list[bool], by: str) -> list[str]:
 
 
 def _checked(name: str, path: Path) -> bytes | bytearray:
-    """Walks over a binary file's records: pycolmap believes any count, and fills the memory with what is not there.
+    """Checks the record counts of a binary file, since pycolmap allocates memory for any count.
 
     Returns:
-        The content, the parameters of cameras that are not finite all set to 0.
+        The content; all parameters of a camera are set to 0 if one is not finite.
 
     Raises:
-        FormatError: if the file ends early, or goes on after its last record.
+        FormatError: if the file ends early, or continues after its last record.
     """
     data = regular(path).read_bytes()
     if name == "cameras":
@@ -334,7 +335,7 @@ def _count(data: bytes | bytearray, place: int, path: Path, what: str) -> int:
 
 
 def _parameters(data: bytes | bytearray, place: int, path: Path) -> int:
-    """How many parameters a camera's model has."""
+    """Number of parameters of a camera's model."""
     import pycolmap  # pyright: ignore[reportMissingImports]
 
     try:

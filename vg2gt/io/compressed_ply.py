@@ -1,9 +1,9 @@
-"""SuperSplat's compressed PLY: Gaussians packed into 16 bytes each, in chunks of 256 with bounds of their own.
+"""SuperSplat's compressed PLY: 16 bytes per Gaussian, in chunks of 256 with separate bounds.
 
-A chunk's element gives least and largest position, logarithm of the scale and, in newer files, colour. A vertex holds
+The element ``chunk`` holds minimum and maximum of position, log-scale and, in newer files, colour. A vertex holds
 ``packed_position`` and ``packed_scale`` (11, 10 and 11 bits between the chunk's bounds), ``packed_rotation`` (2 bits
-name the largest of w x y z, which is left out; 10 bits for each of the others) and ``packed_color`` (8 bits for red,
-green, blue and opacity). Higher spherical harmonics are bytes of their own element ``sh``, from -4 to 4.
+for the index of the largest of w x y z, which is left out; 10 bits for each of the others) and ``packed_color`` (8 bits
+each for red, green, blue and opacity). Higher spherical harmonics are bytes in a separate element ``sh``, from -4 to 4.
 """
 
 from __future__ import annotations
@@ -23,22 +23,23 @@ from vg2gt.types import Gaussians
 
 CHUNK = 256
 _SH_RANGE = 8.0
-_LOG_SCALE = 20.0  # viewers clamp logarithms of scales to this
+_LOG_SCALE = 20.0  # viewers clamp log-scales to this
 _PARTS = {"": "xyz", "scale_": "xyz", "color": "rgb"}
 
 
 def write_compressed_ply(path: str | Path, gaussians: Gaussians) -> Path:
     """Writes one scene's Gaussians in spatial order, atomically.
 
-    What is lost: about 1/2000 of a chunk's extent in positions, 1/1000 of its range of log-scales, 1/255 of its range
-    of colours, 1/255 of opacities, 1/700 of rotations, 1/60 of higher spherical harmonics, clipped to [-4, 4].
+    Precision: about 1/2000 of a chunk's extent for positions, 1/1000 of its range for log-scales, 1/255 of its range
+    for colours, 1/255 for opacities, 1/700 for rotations, and 1/60 for higher spherical harmonics, which are clipped to
+    [-4, 4].
 
     Args:
-        path: the file, by custom ``NAME.compressed.ply``.
+        path: output file, by convention ``NAME.compressed.ply``.
         gaussians: one scene; not changed.
 
     Raises:
-        ValueError: on more than one scene and on values that cannot be written.
+        ValueError: if there is more than one scene or a value cannot be written.
     """
     arrays = to_arrays(gaussians)
     order = spatial_order(arrays.means)
@@ -77,7 +78,7 @@ def _table(columns: Mapping[str, NDArray], kind: str) -> NDArray:
 
 
 def _pack(shares: NDArray[np.floating], bits: tuple[int, ...]) -> NDArray[np.uint32]:
-    """Columns in [0, 1] in as many bits each, the first ones highest."""
+    """Packs columns in [0, 1] into words, with the given bits each, the first column highest."""
     word = np.zeros(len(shares), np.uint32)
     for column, count in zip(shares.T, bits, strict=True):
         word = word << np.uint32(count) | np.rint(column * ((1 << count) - 1)).astype(np.uint32)
@@ -85,14 +86,14 @@ def _pack(shares: NDArray[np.floating], bits: tuple[int, ...]) -> NDArray[np.uin
 
 
 def unpacked(path: Path, elements: Mapping[str, NDArray]) -> GaussianArrays:
-    """The Gaussians of a file.
+    """Decodes the Gaussians of a file.
 
     Args:
         path: the file, for messages.
         elements: ``vertex``, ``chunk`` and, if there are higher spherical harmonics, ``sh``.
 
     Raises:
-        FormatError: if a part is missing or does not fit.
+        FormatError: if an element or property is missing or has the wrong size.
     """
     vertex, chunk = elements["vertex"], elements.get("chunk")
     packed = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
@@ -119,7 +120,7 @@ def unpacked(path: Path, elements: Mapping[str, NDArray]) -> GaussianArrays:
     sh = ((rgb - 0.5) / DC)[:, None]
     if "sh" in elements:
         sh = np.concatenate((sh, _higher(path, elements["sh"], len(vertex))), 1)
-    with np.errstate(over="ignore"):  # an infinite result is found and counted
+    with np.errstate(over="ignore"):  # infinite results are counted and dropped later
         scales = np.exp(between(_three(scale), axes, "scale_"))
     return GaussianArrays(between(_three(position), axes), _rotations(rotation), scales, rgba[:, 3], sh)
 
@@ -131,18 +132,18 @@ def _column(path: Path, table: NDArray, name: str) -> NDArray[np.float64]:
 
 
 def _three(packed: NDArray[np.uint32]) -> NDArray[np.float64]:
-    """``[N, 3]`` in [0, 1] of 11, 10 and 11 bits."""
+    """Unpacks 11, 10 and 11 bits to ``[N, 3]`` in [0, 1]."""
     return np.stack(((packed >> 21) / 2047, (packed >> 11 & 1023) / 1023, (packed & 2047) / 2047), 1)
 
 
 def _rotations(packed: NDArray[np.uint32]) -> NDArray[np.float64]:
-    """Unit quaternions ``[N, 4]`` wxyz."""
+    """Unpacks unit quaternions ``[N, 4]`` wxyz."""
     small = np.stack([((packed >> shift & 1023) / 1023 - 0.5) * np.sqrt(2) for shift in (20, 10, 0)], 1)
     return from_smallest_three(packed >> 30, small)
 
 
 def _higher(path: Path, table: NDArray, count: int) -> NDArray[np.float64]:
-    """Higher spherical harmonics ``[N, 3, 8 or 15, 3]``: coefficients before colours."""
+    """Decodes higher spherical harmonics ``[N, K, 3]``, K = 3, 8 or 15 coefficients."""
     names = [name for name in (table.dtype.names or ()) if name.startswith("f_rest_")]
     if len(table) != count or len(names) not in (9, 24, 45):
         raise FormatError(f"{path}: {len(table)} rows of {len(names)} f_rest for {count} vertices; it is damaged")

@@ -1,4 +1,4 @@
-"""Small files, written to a temporary name and renamed so that a reader never sees half of one."""
+"""Small files, written under a temporary name and renamed, so that readers never see a partial file."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ _unwritable: set[Path] = set()
 
 @contextmanager
 def replacing(path: str | Path, durable: bool = False) -> Iterator[Path]:
-    """A temporary name to write to, which takes the place of ``path`` at the end of the block or vanishes on an error.
+    """Yields a temporary path that replaces ``path`` at the end of the block, or is deleted on an error.
 
     Args:
-        path: the file; its folder is made if needed.
-        durable: return only when the content would survive a power failure.
+        path: the file; its folder is created if needed.
+        durable: flush the file to disk, so that its content survives a power failure.
 
     Raises:
-        OSError: if it cannot be written (a full disk), naming the file; what it held before is still there.
+        OSError: if the file cannot be written (a full disk), naming it; its previous content is kept.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -44,12 +44,12 @@ def replacing(path: str | Path, durable: bool = False) -> Iterator[Path]:
     except OSError as error:
         raise OSError(error.errno, f"{path} could not be written: {error.strerror or error}") from error
     finally:
-        with suppress(OSError):  # of a disk that fails; the error on its way says more
+        with suppress(OSError):  # on a failing disk; the first error says more
             temporary.unlink(missing_ok=True)
 
 
 def temporary_name(path: Path) -> Path:
-    """A name next to ``path`` that no other process takes: containers may have equal process ids."""
+    """Returns a random name next to ``path``; process ids are not unique across containers."""
     return path.with_name(f".{path.name}.{secrets.token_hex(8)}.tmp")
 
 
@@ -61,13 +61,13 @@ def write_bytes(path: str | Path, content: bytes, durable: bool = False) -> Path
 
 
 def flush_to_disk(file: IO[bytes]) -> None:
-    """Returns when the content of an open file would survive a power failure."""
+    """Flushes an open file to disk, so that its content survives a power failure."""
     file.flush()
     os.fsync(file.fileno())
 
 
 def flush_folder(folder: Path) -> None:
-    """The same for the names in a folder, after a rename; not every file system can."""
+    """Flushes the names in a folder to disk, after a rename, if the file system can."""
     if not hasattr(os, "O_DIRECTORY"):
         return
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
@@ -79,14 +79,14 @@ def flush_folder(folder: Path) -> None:
 
 
 def write_cached(path: str | Path, content: bytes, cache: str | Path) -> None:
-    """Writes a file that can be made again: where its folder cannot be written to, the work goes on without it.
+    """Writes a cache file; if that fails, continues without it.
 
-    A full or read-only disk is told once a process and folder; nothing more is then written there.
+    A full or read-only disk is logged once per process and folder, and nothing more is written there.
 
     Args:
         path: the file.
-        content: what it holds.
-        cache: the folder above it that the user chose, for the message.
+        content: content of the file.
+        cache: the cache folder above it that the user chose, for the message.
     """
     cache = Path(cache)
     if cache in _unwritable:
@@ -99,7 +99,7 @@ def write_cached(path: str | Path, content: bytes, cache: str | Path) -> None:
 
 
 def write_text(path: str | Path, content: str) -> Path:
-    """Writes UTF-8 text atomically and to the disk itself; returns the path. Errors as in :func:`write_bytes`."""
+    """Writes UTF-8 text atomically and flushes it to disk; returns the path. Errors as in :func:`write_bytes`."""
     return write_bytes(path, content.encode(), durable=True)
 
 
@@ -109,11 +109,11 @@ def write_json(path: str | Path, content: Any) -> Path:
 
 
 def regular(path: str | Path) -> Path:
-    """The path of a file that may be opened: a named pipe would keep its reader waiting, a device may have no end.
+    """Returns the path if it is safe to open: a named pipe may block its reader, a device may be endless.
 
     Raises:
-        FileNotFoundError: if there is none.
-        OSError: if it is a pipe, a socket or a device; a folder is left to the reader's own message.
+        FileNotFoundError: if there is no such file.
+        OSError: if it is a pipe, a socket or a device. A folder passes; its reader reports it.
     """
     path = Path(path)
     mode = path.stat().st_mode
@@ -135,6 +135,6 @@ def read_json(path: str | Path) -> Any:
 
 
 def by_number(name: str) -> tuple[list[str | int], str]:
-    """Sorting key of a name: runs of digits count by their value, so that ``IMG_9`` comes before ``IMG_10``."""
-    parts = re.split(r"(\d+)", name)  # digits are at the odd places
+    """Sort key of a name: numbers in it sort by value, so that ``IMG_9`` comes before ``IMG_10``."""
+    parts = re.split(r"(\d+)", name)  # odd entries are digits
     return [int(part) if i % 2 else part for i, part in enumerate(parts)], name

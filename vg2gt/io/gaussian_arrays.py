@@ -1,4 +1,4 @@
-"""Between one scene's Gaussians and the plain arrays of the Gaussian file formats."""
+"""Conversion between one scene's Gaussians and the plain arrays of the Gaussian file formats."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from vg2gt.types import Gaussians
 log = logging.getLogger(__name__)
 
 MIN_SCALE = 1e-10  # smaller standard deviations overflow the renderers' inverse covariance
-OPACITY_MARGIN = 2.0**-24  # opacities are written between this and one minus this, so that their logits are finite
+OPACITY_MARGIN = 2.0**-24  # opacities are clipped to [this, 1 - this], so that their logits are finite
 _FLOAT_MAX = float(np.finfo(np.float32).max)
-_UPRIGHT = np.array([1.0, -1, -1])  # half a turn about x, of positions ...
+_UPRIGHT = np.array([1.0, -1, -1])  # rotation by 180 degrees about x, of positions ...
 _UPRIGHT_SH = np.array([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1])  # ... and of spherical harmonics
 
 
 @dataclass(frozen=True, eq=False)
 class GaussianArrays:
-    """Gaussians of one scene with the meaning of :class:`vg2gt.types.Gaussians`, float64, n rows each."""
+    """Gaussians of one scene as float64 arrays of N rows; fields as in :class:`vg2gt.types.Gaussians`."""
 
     means: NDArray[np.floating]
     quats: NDArray[np.floating]
@@ -33,10 +33,10 @@ class GaussianArrays:
 
 
 def to_arrays(gaussians: Gaussians) -> GaussianArrays:
-    """Arrays of one scene's Gaussians.
+    """Converts one scene's Gaussians to arrays.
 
     Raises:
-        ValueError: if there is more than one scene, or a value could not be written.
+        ValueError: if there is more than one scene, or a value cannot be written.
     """
     if len(gaussians) and int(gaussians.batch[0]) != int(gaussians.batch[-1]):
         raise ValueError(
@@ -58,14 +58,14 @@ def to_arrays(gaussians: Gaussians) -> GaussianArrays:
 
 
 def upright(arrays: GaussianArrays) -> GaussianArrays:
-    """Half a turn about x: from our axes (y down, z forward) to those of OpenGL (y up, z backward), or back."""
+    """Rotates by 180 degrees about x: from our axes (y down, z forward) to OpenGL's (y up, z backward), or back."""
     turned = arrays.sh * _UPRIGHT_SH[: arrays.sh.shape[1], None]
     quats = arrays.quats * np.array([1.0, *_UPRIGHT])
     return replace(arrays, means=arrays.means * _UPRIGHT, quats=quats, sh=turned)
 
 
 def spatial_order(means: NDArray[np.floating]) -> NDArray[np.int64]:
-    """An order ``[N]`` in which neighbours in space are neighbours in the file (Morton's), by ranks on each axis."""
+    """Returns the Morton order ``[N]`` of positions, from their ranks on each axis; keeps neighbours close."""
     cells = np.argsort(np.argsort(means, axis=0, kind="stable"), axis=0) * 1024 // max(len(means), 1)
     code = np.zeros(len(means), np.int64)
     for bit in range(10):
@@ -75,7 +75,11 @@ def spatial_order(means: NDArray[np.floating]) -> NDArray[np.int64]:
 
 
 def smallest_three(quats: NDArray[np.floating]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Place ``[N]`` of the largest component of each quaternion, and the other three ``[N, 3]`` with that one positive.
+    """Encodes the rotations of quaternions by their three smallest components.
+
+    Returns:
+        The index ``[N]`` of the largest component, and the other three ``[N, 3]`` of the unit quaternion whose largest
+        component is positive.
 
     Raises:
         ValueError: if a quaternion is zero.
@@ -89,7 +93,7 @@ def smallest_three(quats: NDArray[np.floating]) -> tuple[NDArray[np.int64], NDAr
 
 
 def from_smallest_three(place: NDArray[np.integer], others: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Unit quaternions ``[N, 4]``, the reverse of :func:`smallest_three`."""
+    """Decodes unit quaternions ``[N, 4]``, the inverse of :func:`smallest_three`."""
     largest = np.arange(4) == place[:, None]
     quats = np.empty(largest.shape)
     quats[~largest] = others.ravel()
@@ -98,10 +102,10 @@ def from_smallest_three(place: NDArray[np.integer], others: NDArray[np.floating]
 
 
 def to_gaussians(path: Path, arrays: GaussianArrays) -> Gaussians:
-    """Gaussians (float32, scene 0) of what a file holds.
+    """Converts the arrays of a file to Gaussians (float32, scene 0).
 
-    Rows that are no Gaussians, with a value that is not finite or a quaternion of zero, are left out and counted in the
-    log; scales below ``MIN_SCALE`` are raised to it.
+    Rows with a value that is not finite or a zero quaternion are dropped with a warning. Scales are clamped to at least
+    ``MIN_SCALE``.
     """
     good = (arrays.quats != 0).any(-1)
     for values in (arrays.means, arrays.quats, arrays.scales, arrays.opacities, arrays.sh):

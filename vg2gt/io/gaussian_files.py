@@ -1,4 +1,4 @@
-"""Scenes of Gaussians by the name of their file."""
+"""Scenes of Gaussians in any supported format, by file suffix."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ WRITERS = {
 
 
 def read_gaussians(path: str | Path) -> Gaussians:
-    """Reads a scene by its suffix, one of :data:`READERS`.
+    """Reads a scene; the suffix selects one of :data:`READERS`.
 
     Raises:
-        FileNotFoundError: if there is none.
-        ValueError: if it cannot be read or has another suffix.
+        FileNotFoundError: if the file does not exist.
+        ValueError: if it cannot be read or the suffix is unknown.
     """
     path = Path(path)
     reader = READERS.get(path.suffix.lower())
@@ -38,10 +38,10 @@ def read_gaussians(path: str | Path) -> Gaussians:
 
 
 def write_gaussians(path: str | Path, gaussians: Gaussians) -> Path:
-    """Writes one scene's Gaussians by the end of the file's name, one of :data:`WRITERS`, atomically.
+    """Writes one scene's Gaussians atomically; the suffix selects one of :data:`WRITERS`.
 
     Raises:
-        ValueError: if the name ends otherwise, or something cannot be written.
+        ValueError: if the suffix is unknown, or a value cannot be written.
     """
     for suffix, write in WRITERS.items():
         if str(path).lower().endswith(suffix):

@@ -1,7 +1,7 @@
 """GLB with Gaussians: glTF's extension ``KHR_gaussian_splatting``, kernel ``ellipse``, all values float32.
 
-Programs without the extension show coloured points. glTF has y up and z backward: reading and writing turn positions,
-rotations and spherical harmonics from and to our axes. Specification:
+Programs without the extension show coloured points. glTF has y up and z backward; positions, rotations and spherical
+harmonics are converted from and to our axes. Specification:
 https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos/KHR_gaussian_splatting
 """
 
@@ -29,21 +29,21 @@ _JSON, _BIN = 0x4E4F534A, 0x004E4942
 
 
 def write_gaussian_glb(path: str | Path, gaussians: Gaussians) -> Path:
-    """Writes one scene's Gaussians in their order, without loss beyond float32, atomically.
+    """Writes one scene's Gaussians in order, as float32, atomically.
 
     Args:
         path: the file.
         gaussians: one scene, not empty; not changed. Quaternions are normalised.
 
     Raises:
-        ValueError: on none or more than one scene and on values that cannot be written.
+        ValueError: if there are no Gaussians, more than one scene, or values that cannot be written.
     """
     arrays = upright(to_arrays(gaussians))
     length = np.linalg.norm(arrays.quats, axis=1, keepdims=True)
     if not len(length) or (length == 0).any():
         raise ValueError("glTF holds no scene without Gaussians" if not len(length) else "quats must not be zero")
     shown = (arrays.sh[:, 0] * DC + 0.5).clip(0, 1)
-    linear = np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)  # what COLOR_0 is
+    linear = np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)  # COLOR_0 is linear
     own = {
         "ROTATION": np.roll(arrays.quats / length, -1, 1),
         "SCALE": arrays.scales,
@@ -88,7 +88,7 @@ def _accessor(view: int, part: NDArray) -> dict[str, Any]:
 
 
 def read_gaussian_glb(path: str | Path) -> Gaussians:
-    """Reads the first primitive with Gaussians; its node must not be moved, turned or scaled.
+    """Reads the first primitive with Gaussians; its node must have no transformation.
 
     Args:
         path: the file, with one binary chunk.
@@ -97,7 +97,7 @@ def read_gaussian_glb(path: str | Path) -> Gaussians:
         The Gaussians as scene 0, float32.
 
     Raises:
-        FormatError: if the file is damaged or holds none.
+        FormatError: if the file is damaged, holds no Gaussians, or a node transforms them.
     """
     path = Path(path)
     content = regular(path).read_bytes()
@@ -143,6 +143,6 @@ def _column(gltf: dict[str, Any], body: memoryview, index: int) -> NDArray[np.fl
     kind, width = np.dtype(_KINDS[accessor["componentType"]]), _WIDTHS[accessor["type"]]
     start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
     step = view.get("byteStride", kind.itemsize * width)
-    with np.errstate(invalid="ignore"):  # a signalling NaN of a damaged file becomes an ordinary one
+    with np.errstate(invalid="ignore"):  # signalling NaNs of damaged files become quiet NaNs
         values = np.ndarray((accessor["count"], width), kind, body, start, (step, kind.itemsize)).astype(np.float64)
     return values / np.iinfo(kind).max if accessor.get("normalized") else values

@@ -1,7 +1,7 @@
 """GLB (binary glTF 2.0): points and camera frusta for any 3D viewer.
 
-glTF has y up and cameras looking along -z, our world is OpenCV's (y down, z forward): the file's root turns the scene
-by half a turn about x, so that it is upright. Colours are written as they are, in sRGB.
+glTF has y up and cameras looking along -z; our world is OpenCV's (y down, z forward). The file's root rotates the scene
+by 180 degrees about x, so that it is upright. Colours are written unchanged, as sRGB.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from vg2gt.types import Cameras
 
 TO_GLTF = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenCV world to glTF world
 POINTS, FRUSTA = "points", "cameras"  # names of the two objects in the file
-_FRUSTUM_SHARE = 0.05  # of the scene's extent, the depth of a frustum nobody gave a size
-_MIDDLE = 0.9  # share of the points that count for the extent: far outliers must not blow up the frusta
-# apex to the four corners, around the image, and a mark above its upper edge
+_FRUSTUM_SHARE = 0.05  # default depth of a frustum, relative to the scene's extent
+_MIDDLE = 0.9  # share of the points that defines the extent; far outliers would enlarge the frusta
+# apex to the four corners, border of the image, and a mark above its upper edge
 _EDGES = ((0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1), (1, 5), (5, 2))
 
 
@@ -36,15 +36,15 @@ def write_glb(
     Args:
         path: the file.
         positions: ``[N, 3]`` world positions, stored as float32.
-        colors: ``[N, 3]`` uint8; None is mid grey.
-        cameras: one scene (B = 1), or None for points only.
-        frustum_depth: distance from a camera's centre to its drawn image, in scene units; None is a twentieth of the
-            extent of points and cameras.
+        colors: ``[N, 3]`` uint8; None: mid grey.
+        cameras: one scene (B = 1); None: points only.
+        frustum_depth: distance from a camera's centre to its drawn image, in scene units; None: 1/20 of the extent of
+            points and cameras.
 
     Raises:
-        ValueError: if shapes or types are others, or a value is not finite, or there is nothing to write.
+        ValueError: if shapes or types are wrong, a value is not finite, or there is nothing to write.
     """
-    import trimesh  # a second of import time that other formats do without
+    import trimesh  # imported here, because it takes a second
 
     xyz = np.asarray(positions, np.float64)
     rgb = np.full(xyz.shape, 128, np.uint8) if colors is None else np.asarray(colors)
@@ -96,7 +96,7 @@ def frusta(cameras: Cameras, depth: float) -> NDArray[np.float64]:
 
 
 def scene_extent(xyz: NDArray[np.float64], centers: NDArray[np.float64]) -> float:
-    """Diagonal of the box of camera centres ``[V, 3]`` and the middle of the points ``[N, 3]``; 1 where that is 0."""
+    """Diagonal of the box around camera centres ``[V, 3]`` and the central points of ``[N, 3]``; 1 if it is 0."""
     tail = (1 - _MIDDLE) / 2
     middle = np.quantile(xyz, [tail, 1 - tail], axis=0) if len(xyz) else centers[:1]
     corners = np.concatenate((middle, centers))

@@ -1,7 +1,7 @@
 """Decoding of colour and depth image files.
 
-All of them raise ``DataError`` where a file is missing or damaged, or holds something else,
-naming the file and the scene.
+Functions that take a scene raise ``DataError``, naming file and scene, if a file is missing, damaged or of the wrong
+kind.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from PIL import ExifTags, Image
 from vg2gt.io.errors import DataError
 from vg2gt.io.images import color_image, has_alpha, open_image
 
-# What Pillow raises for files that are damaged in one way or another.
+# Errors that Pillow raises for damaged files.
 _DAMAGED = (OSError, SyntaxError, ValueError, EOFError, zlib.error, struct.error, Image.DecompressionBombError)
 
 Size = tuple[int, int]
 """Height and width in pixels."""
 
 _ORIENTATION_TAG = 0x0112
-# What turns an image upright, by its EXIF orientation.
+# Transpositions that turn an image upright, by EXIF orientation.
 _TURNS = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
     3: Image.Transpose.ROTATE_180,
@@ -48,9 +48,9 @@ def image_size(path: Path, scene: str, upright: bool = False, content: bytes | N
 
     Args:
         path: the file.
-        scene: the scene it belongs to, for messages; empty for a photograph of none.
-        upright: of a photograph turned upright as its EXIF data says.
-        content: the encoded image where it is a part of the file; None: it is the file.
+        scene: the scene it belongs to, for messages; empty: none.
+        upright: size after turning a photograph upright by its EXIF orientation.
+        content: the encoded image if it is a part of the file; None: the whole file.
     """
     with _opened(path if content is None else io.BytesIO(content), path, scene) as image:
         turned = upright and _orientation(image) in _QUARTER_TURNS
@@ -58,25 +58,25 @@ def image_size(path: Path, scene: str, upright: bool = False, content: bytes | N
 
 
 def focal_length(path: Path, size: Size) -> float | None:
-    """Focal length of a photograph in pixels, from what its EXIF data give in the terms of 35 mm film.
+    """Returns the focal length of a photograph in pixels, from the 35 mm equivalent in its EXIF data.
 
     Args:
         path: the file.
-        size: the image's ``(height, width)``; it is taken for the whole of what the camera saw.
+        size: ``(height, width)`` of the image, which must not be cropped.
 
     Returns:
-        None where the data say nothing, or nothing sensible.
+        The focal length; None if it is missing or not plausible.
     """
     try:
         with open_image(path) as image:
             film = float(image.getexif().get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.FocalLengthIn35mmFilm, 0))
-    except Exception:  # the EXIF parser raises whatever the bytes lead it to
+    except Exception:  # damaged EXIF data raise various errors
         return None
     return film * math.hypot(*size) / _FILM_DIAGONAL if 4 <= film <= 2000 else None
 
 
 def is_panorama(path: Path, size: Size) -> bool:
-    """Whether an image of ``(height, width)`` says in its metadata that it is equirectangular (XMP GPano)."""
+    """Whether an image of ``(height, width)`` is equirectangular: twice as wide as high, with XMP GPano metadata."""
     if size[1] != 2 * size[0]:
         return False
     with path.open("rb") as file:
@@ -85,7 +85,7 @@ def is_panorama(path: Path, size: Size) -> bool:
 
 
 def typical_size(sizes: Iterable[Size]) -> Size:
-    """The common ``(height, width)`` to which images of several sizes are brought: the median of each."""
+    """Returns a common ``(height, width)`` for images of several sizes: the lower median of each."""
     heights, widths = zip(*sizes, strict=True)
     return statistics.median_low(heights), statistics.median_low(widths)
 
@@ -97,10 +97,10 @@ def read_color(
 
     Args:
         path: the file.
-        scene: the scene it belongs to, for messages; empty for a photograph of none.
-        size: the ``(height, width)`` it must have; None: any.
-        content: the encoded image where it is a part of the file; None: it is the file.
-        upright: turn a photograph upright as its EXIF data says.
+        scene: the scene it belongs to, for messages; empty: none.
+        size: required ``(height, width)``; None: any.
+        content: the encoded image if it is a part of the file; None: the whole file.
+        upright: turn a photograph upright by its EXIF orientation.
     """
     with _opened(path if content is None else io.BytesIO(content), path, scene) as image:
         turned = upright and _orientation(image) in _QUARTER_TURNS
@@ -115,17 +115,17 @@ def read_color(
 def read_mask(
     path: Path, scene: str, content: bytes | None = None, upright: bool = False, is_mask: bool = False
 ) -> NDArray[np.float32] | None:
-    """What counts of an image: its alpha, or the brightness of a grey or mask image without; ``[H, W]`` in [0, 1].
+    """Reads a mask ``[H, W]`` in [0, 1]: an image's alpha, or the brightness of a grey or mask image without alpha.
 
     Args:
         path: the file.
-        scene: the scene it belongs to, for messages; empty for a photograph of none.
-        content: the encoded image where it is a part of the file; None: it is the file.
-        upright: turn a photograph upright as its EXIF data says.
-        is_mask: the file is a mask, of which the brightness counts also if it is stored in colour.
+        scene: the scene it belongs to, for messages; empty: none.
+        content: the encoded image if it is a part of the file; None: the whole file.
+        upright: turn a photograph upright by its EXIF orientation.
+        is_mask: the file is a mask: use its brightness even if it is stored in colour.
 
     Returns:
-        None where everything counts, as in a photograph in colour that has no transparency.
+        The mask; None if all pixels count, as in a colour photograph without transparency.
     """
     with _opened(path if content is None else io.BytesIO(content), path, scene) as image:
         grey = image.mode in ("1", "L", "I", "I;16") and "transparency" not in image.info
@@ -141,7 +141,7 @@ def read_mask(
 
 
 def orientation(path: Path, scene: str) -> int:
-    """EXIF orientation of an image, 1 (upright) where it says none."""
+    """Returns the EXIF orientation of an image; 1 (upright) if it has none."""
     with _opened(path, path, scene) as image:
         return _orientation(image)
 
@@ -162,7 +162,7 @@ def read_depth(path: Path, scene: str, size: Size | None = None) -> NDArray[np.i
 
 
 def check_size(path: Path, scene: str, found: tuple[int, ...], expected: Size | None) -> None:
-    """Refuses an image of another ``(height, width)`` than expected; None: any will do."""
+    """Raises ``DataError`` if an image's ``(height, width)`` is not the expected one; None: any."""
     if expected is not None and tuple(found) != tuple(expected):
         raise DataError(
             f"{path} of scene {scene} is {found[1]}x{found[0]} pixels, but the recording's first one is "
@@ -172,7 +172,7 @@ def check_size(path: Path, scene: str, found: tuple[int, ...], expected: Size | 
 
 @contextmanager
 def _opened(file: Path | io.BytesIO, path: Path, scene: str) -> Iterator[Image.Image]:
-    """An open image; what is raised while it is read names the file, the scene and the remedy."""
+    """Opens an image; errors while it is read become ``DataError`` with the file, the scene and a remedy."""
     try:
         with open_image(file) as image:
             yield image
@@ -184,8 +184,8 @@ def _opened(file: Path | io.BytesIO, path: Path, scene: str) -> Iterator[Image.I
 
 
 def _orientation(image: Image.Image) -> int:
-    """EXIF orientation of an image, 1 (upright) where there is none or the EXIF data are damaged."""
+    """EXIF orientation of an image; 1 (upright) if it is missing or damaged."""
     try:
         return int(image.getexif().get(_ORIENTATION_TAG, 1))
-    except Exception:  # the EXIF parser raises whatever the bytes lead it to
+    except Exception:  # damaged EXIF data raise various errors
         return 1

@@ -1,4 +1,4 @@
-"""Pictures: PNG files, colours for depth and normals, grids of panels."""
+"""Images: reading, colours for depth and normals, grids of panels, PNG files."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from vg2gt.io.files import regular, write_bytes
 
-# Anchors of a perceptually ordered map, near (bright) to far (dark); interpolated linearly.
+# Anchors of a perceptually ordered colour map, near (bright) to far (dark); interpolated linearly.
 _DEPTH_ANCHORS = torch.tensor(
     [
         [0.99, 0.91, 0.55],
@@ -30,15 +30,15 @@ _DEPTH_ANCHORS = torch.tensor(
 
 BACKGROUND = (255, 255, 255, 255)  # behind transparent pixels
 
-# Pillow tries every format it knows, whatever a file is called; some of them run other programs (EPS: Ghostscript).
+# Pillow tries all formats, whatever the suffix, and some of them run other programs (EPS: Ghostscript).
 _FORMATS = ("PNG", "JPEG", "MPO", "PPM", "TIFF", "WEBP", "BMP", "GIF", "HEIF")
 
 
 def open_image(file: str | Path | IO[bytes]) -> Image.Image:
-    """Opens an image file lazily as Pillow does, if it is in one of the formats of photographs and depth images.
+    """Opens an image file lazily with Pillow, restricted to formats of photographs and depth images.
 
     Raises:
-        OSError: if the file is missing, no regular one, or in no such format.
+        OSError: if the file is missing, not a regular file, or of another format.
     """
     if isinstance(file, (str, Path)):
         regular(file)
@@ -52,13 +52,13 @@ def has_alpha(image: Image.Image) -> bool:
 
 
 def color_image(image: Image.Image) -> Image.Image:
-    """A photograph in 8-bit colour; 16-bit grey is scaled, where Pillow's own conversion would cut it off at 255.
+    """Converts a photograph to 8-bit RGB.
 
-    Transparency is composited over white, as the field does with synthetic sets: what lies hidden under alpha 0 is no
-    part of the picture.
+    16-bit grey is scaled; Pillow's own conversion would clip it at 255. Transparency is composited over white, as is
+    usual for synthetic datasets.
 
     Raises:
-        OSError: if its values have no known range: 32-bit integers and floats.
+        OSError: if the range of values is unknown: 32-bit integers and floats.
     """
     grey = image.mode.startswith("I;16") or (image.mode == "I" and image.format in ("PNG", "PPM"))
     if grey:
@@ -73,7 +73,7 @@ def color_image(image: Image.Image) -> Image.Image:
 
 
 def colorize_depth(depth: Tensor, near: float, far: float) -> Tensor:
-    """Colours z-depth ``[H, W]`` between ``near`` (bright) and ``far`` (dark); holes (0) are grey. ``[3, H, W]``."""
+    """Colours z-depth ``[H, W]`` between ``near`` (bright) and ``far`` (dark), ``[3, H, W]``; holes (0) are grey."""
     position = ((depth - near) / max(far - near, 1e-9)).clamp(0, 1) * (len(_DEPTH_ANCHORS) - 1)
     index = position.long().clamp(max=len(_DEPTH_ANCHORS) - 2)
     anchors = _DEPTH_ANCHORS.to(depth.device)
@@ -83,14 +83,14 @@ def colorize_depth(depth: Tensor, near: float, far: float) -> Tensor:
 
 
 def colorize_normals(normals: Tensor) -> Tensor:
-    """Colours camera-frame normals ``[3, H, W]`` (x right, y down, z forward) the usual way; zero normals are grey."""
+    """Colours camera-frame normals ``[3, H, W]`` (x right, y down, z forward) in OpenGL axes; zero normals are grey."""
     unit = torch.nn.functional.normalize(normals, dim=0)
     flipped = unit * unit.new_tensor([1.0, -1.0, -1.0])[:, None, None]
     return (flipped + 1) / 2
 
 
 def grid(rows: Sequence[Sequence[Tensor]], gap: int = 4) -> Tensor:
-    """Arranges equally large panels ``[3, H, W]`` in rows, with white gaps; ``[3, H', W']``."""
+    """Arranges panels ``[3, H, W]`` of equal size in rows with white gaps; returns ``[3, H', W']``."""
     lines = []
     for row in rows:
         padded = [torch.nn.functional.pad(panel, (0, gap, 0, gap), value=1.0) for panel in row]
@@ -99,12 +99,12 @@ def grid(rows: Sequence[Sequence[Tensor]], gap: int = 4) -> Tensor:
 
 
 def to_pixels(image: Tensor) -> NDArray[np.uint8]:
-    """An image ``[3, H, W]`` in [0, 1] as ``[H, W, 3]`` uint8."""
+    """Converts an image ``[3, H, W]`` in [0, 1] to ``[H, W, 3]`` uint8."""
     return (image.detach().cpu().clamp(0, 1).permute(1, 2, 0).numpy() * 255 + 0.5).astype(np.uint8)
 
 
 def encode_image(pixels: NDArray[np.generic], kind: str = "PNG", **options: Any) -> bytes:
-    """An 8-bit colour ``[H, W, 3]`` or 16-bit grey ``[H, W]`` image as a file's content; Pillow's options."""
+    """Encodes an 8-bit colour ``[H, W, 3]`` or 16-bit grey ``[H, W]`` image; ``options`` are Pillow's."""
     buffer = io.BytesIO()
     Image.fromarray(pixels).save(buffer, kind, **options)
     return buffer.getvalue()

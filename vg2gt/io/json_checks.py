@@ -1,4 +1,4 @@
-"""What the JSON formats of cameras check alike; what does not hold is a ``FormatError`` that names the place."""
+"""Checks shared by the JSON formats of cameras; violations raise ``FormatError``, naming the place in the file."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MAX_SIZE = 1 << 20  # pixels along an image's side
 
 
 def load_json(path: Path, content: bytes | None = None) -> Any:
-    """Reads a file, or what was read of it."""
+    """Parses a JSON file, or its ``content`` if it was read already."""
     try:
         return read_json(path) if content is None else json.loads(content)
     except (ValueError, RecursionError) as error:
@@ -29,8 +29,8 @@ class Fields:
     """The fields of one JSON object; every error (``FormatError``) names the place and the field.
 
     Args:
-        place: what stands before a field's name in messages, such as ``cameras.json: [1].``.
-        content: the object.
+        place: prefix of field names in messages, such as ``cameras.json: [1].``.
+        content: the parsed object.
     """
 
     def __init__(self, place: str, content: Any) -> None:
@@ -39,18 +39,18 @@ class Fields:
         self.place, self.content = place, content
 
     def wrong(self, name: str, expected: str) -> FormatError:
-        """The error of a field that is missing or not as expected."""
+        """Returns the error for a field that is missing or not as expected."""
         return FormatError(f"{self.place}{name} is {short(self.content.get(name))}, expected {expected}")
 
     def get(self, name: str, kind: type, expected: str) -> Any:
-        """A field of one kind, None if it is missing."""
+        """Returns a field of type ``kind``; None if it is missing."""
         value = self.content.get(name)
         if value is not None and not isinstance(value, kind):
             raise self.wrong(name, expected)
         return value
 
     def number(self, name: str, low: float = -math.inf, high: float = math.inf) -> float | None:
-        """A finite number strictly between ``low`` and ``high``, None if it is missing."""
+        """Returns a finite number strictly between ``low`` and ``high``; None if it is missing."""
         value = self.content.get(name)
         if value is None:
             return None
@@ -60,14 +60,14 @@ class Fields:
         return float(value)
 
     def pixels(self, name: str) -> int | None:
-        """A whole number of pixels, None if it is missing."""
+        """Returns a whole number of pixels; None if it is missing."""
         value = self.number(name, 0, MAX_SIZE)
         if value is not None and value != round(value):
             raise self.wrong(name, "a whole number of pixels")
         return None if value is None else round(value)
 
     def matrix(self, name: str, rows: Sequence[int], columns: int) -> NDArray[np.float64]:
-        """A matrix of one of some numbers of rows; its values may be anything but text."""
+        """Returns a matrix whose number of rows is one of ``rows``; its values may be NaN or infinite."""
         value = self.content.get(name)
         lists = value if isinstance(value, list) and len(value) in rows else [None]
         try:
@@ -79,7 +79,7 @@ class Fields:
 
 
 def check_rigid(place: str, matrix: NDArray[np.float64], tolerance: float) -> None:
-    """Checks that a finite ``[4, 4]`` matrix is a rotation, orthonormal to the tolerance, and a translation."""
+    """Checks that a finite ``[4, 4]`` matrix is a rotation, orthonormal within ``tolerance``, and a translation."""
     rotation = matrix[:3, :3]
     error = np.abs(rotation.T @ rotation - np.eye(3)).max() if np.abs(rotation).max() < 2 else math.inf
     if error > tolerance or np.linalg.det(rotation) < 0 or np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
@@ -90,6 +90,6 @@ def check_rigid(place: str, matrix: NDArray[np.float64], tolerance: float) -> No
 
 
 def short(value: Any) -> str:
-    """A value in a message, 80 characters at most."""
+    """Formats a value for a message, in at most 80 characters."""
     text = type(value).__name__ if isinstance(value, dict | list) else "missing" if value is None else repr(value)
     return text if len(text) <= 80 else text[:77] + "..."

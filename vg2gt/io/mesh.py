@@ -23,7 +23,7 @@ class Mesh:
 
     Attributes:
         vertices: ``[N, 3]`` float32.
-        faces: ``[F, 3]`` int64 vertex numbers, counter-clockwise seen from free space.
+        faces: ``[F, 3]`` int64 vertex indices, counter-clockwise seen from free space.
         colors: ``[N, 3]`` uint8, or None.
     """
 
@@ -43,24 +43,24 @@ def fuse_depth(
 ) -> Mesh:
     """Fuses depth maps of one scene into a mesh.
 
-    A truncated signed distance along the optical axis is averaged over the views at the voxels near surfaces; the mesh
-    is its zero set, one vertex in every cell that the surface crosses (surface nets). Memory is about 50 bytes per
-    voxel at its peak, in proportion to the surface, not to the scene's box.
+    Averages a truncated signed distance along the optical axis over the views, at voxels near surfaces. The mesh is its
+    zero level set, with one vertex in each cell that the surface crosses (surface nets). Peak memory is about 50 bytes
+    per voxel; it grows with the surface, not with the scene's bounding box.
 
     Args:
-        depth: ``[V, H, W]`` z-depth, 0 = invalid. Set what is too far to 0.
-        cameras: the V views of one scene (B = 1), of the depth maps' size.
+        depth: ``[V, H, W]`` z-depth, 0 = invalid. Set depth that is too far to 0.
+        cameras: cameras of the V views of one scene (B = 1), of the depth maps' size.
         colors: ``[V, 3, H, W]`` in [0, 1], or None.
-        voxel_size: edge length of a voxel in scene units; details below it are lost.
-        truncation: distance at which free space begins, in scene units; None is four voxels. Less than two voxels
-            tears holes; walls thinner than it are lost.
-        max_voxels: bound of the memory, at 50 bytes each (3 GB).
+        voxel_size: edge length of a voxel in scene units; smaller details are lost.
+        truncation: distance from a surface at which free space begins, in scene units, at least two voxels; None: four
+            voxels. Thinner walls are lost.
+        max_voxels: maximum number of voxels, which bounds the memory at about 50 bytes each (3 GB).
 
     Returns:
-        The mesh, empty where there is no valid depth.
+        The mesh; empty if there is no valid depth.
 
     Raises:
-        ValueError: if shapes disagree, a value is not finite, sizes are not positive, or the memory bound is passed.
+        ValueError: if shapes disagree, a value is not finite, a size is out of range, or ``max_voxels`` is exceeded.
     """
     truncation = 4 * voxel_size if truncation is None else truncation
     _check(depth, cameras, colors, voxel_size, truncation)
@@ -71,13 +71,13 @@ def fuse_depth(
 
 
 def extract_surface(volume: Volume) -> Mesh:
-    """Zero set of a volume by surface nets.
+    """Extracts the zero level set of a volume with surface nets.
 
-    Every voxel edge whose ends differ in sign is crossed by the surface. A cell's vertex is the mean of the crossings
-    on its edges, and every crossed edge makes a quad of the vertices of its four cells.
+    The surface crosses every voxel edge whose ends differ in sign. The vertex of a cell is the mean of the crossings on
+    its edges. Each crossed edge makes a quad of the vertices of its four cells.
     """
-    # Free space beyond the truncation says nothing about where a surface is: next to a depth edge it would close the
-    # gap between the front and what lies behind it.
+    # Voxels in free space beyond the truncation do not locate a surface. Next to a depth edge they would close the gap
+    # between foreground and background.
     seen = ((volume.weight > 0) & (volume.distance < 1)).reshape(-1)
     inside = torch.stack(torch.meshgrid(*3 * [torch.arange(BLOCK)], indexing="ij"), -1).reshape(-1, 3)
     keys = pack((volume.blocks[:, None] * BLOCK + inside).reshape(-1, 3)[seen])
@@ -104,7 +104,7 @@ def extract_surface(volume: Volume) -> Mesh:
 
 
 def _crossings(keys: Tensor, values: Tensor, axis: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Crossed edges along one axis.
+    """Finds the crossed edges along one axis.
 
     Returns:
         Crossing points ``[E, 3]`` in voxel indices (float64), colours ``[E, 3]`` or ``[E, 0]``, keys of the four cells
@@ -126,7 +126,7 @@ def _crossings(keys: Tensor, values: Tensor, axis: int) -> tuple[Tensor, Tensor,
 
 
 def _triangles(vertices: NDArray[np.float32], corner: Tensor, outward: Tensor) -> NDArray[np.int64]:
-    """Two triangles of each quad, cut along its shorter diagonal and facing free space."""
+    """Cuts each quad along its shorter diagonal into two triangles that face free space."""
     quads = torch.where(outward[:, None], corner, corner.flip(-1)).numpy()
     a, b, c, d = (vertices[quads[:, i]] for i in range(4))
     shorter = np.linalg.norm(a - c, axis=-1) <= np.linalg.norm(b - d, axis=-1)
@@ -135,16 +135,16 @@ def _triangles(vertices: NDArray[np.float32], corner: Tensor, outward: Tensor) -
 
 
 def write_mesh(path: str | Path, mesh: Mesh) -> Path:
-    """Writes a mesh through trimesh, atomically, in our world frame; the ending says the format.
+    """Writes a mesh with trimesh, atomically, in our world frame; the suffix selects the format.
 
     Args:
         path: a file ending in ``.ply``, ``.glb``, ``.obj``, ``.stl`` or ``.off``.
-        mesh: what to write; not changed.
+        mesh: mesh to write; not changed.
 
     Raises:
-        ValueError: on another ending, or a mesh without triangles.
+        ValueError: if the suffix is unknown, or the mesh has no triangles.
     """
-    import trimesh  # a second of import time that other formats do without
+    import trimesh  # imported here, because it takes a second
 
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:
@@ -153,7 +153,7 @@ def write_mesh(path: str | Path, mesh: Mesh) -> Path:
         raise ValueError("the mesh is empty: no valid depth, or voxels larger than what is seen; check depth and size")
     body = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=mesh.colors, process=False)
     content = body.export(file_type=path.suffix[1:].lower())
-    assert not isinstance(content, dict)  # only formats of several files have one
+    assert not isinstance(content, dict)  # only formats with several files give a dict
     return write_bytes(path, content.encode() if isinstance(content, str) else content)
 
 

@@ -1,8 +1,8 @@
 """nerfstudio's and instant-ngp's ``transforms.json``: posed frames with intrinsics, shared or per frame.
 
-In the file poses are camera-to-world with OpenGL axes (x right, y up, z backward) and the centre of the first pixel is
-at (1/2, 1/2). The records hold our conventions; the change happens where frames are read and written and in
-:meth:`Lens.intrinsics` and :meth:`Lens.from_intrinsics`.
+In the file, poses are camera-to-world with OpenGL axes (x right, y up, z backward), and the centre of the first pixel
+is at (1/2, 1/2). Frames hold poses in our conventions. A :class:`Lens` holds the file's values;
+:meth:`Lens.intrinsics` and :meth:`Lens.from_intrinsics` convert them.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from vg2gt.io.files import write_json
 from vg2gt.io.json_checks import Fields, check_rigid, load_json
 
-PIXEL_CENTER = 0.5  # where the file has the centre of the first pixel; ours is at 0
+PIXEL_CENTER = 0.5  # centre of the first pixel in the file; ours is at 0
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 
 _ANY, _POSITIVE, _ANGLE = (-math.inf, math.inf), (0, math.inf), (0, math.pi)
@@ -34,19 +34,19 @@ _ROTATION_TOLERANCE = 0.02  # recorded poses are orthonormal to about 1e-3
 
 @dataclass(frozen=True)
 class Lens:
-    """What a file says about the optics of its frames; None where it is silent.
+    """Intrinsics of frames as given in a file; None for missing values.
 
     Attributes:
         width: image width in pixels.
         height: image height in pixels.
-        fl_x: focal length in pixels.
+        fl_x: horizontal focal length in pixels.
         fl_y: vertical focal length in pixels.
-        cx: principal point in pixels, the centre of the first pixel at 1/2.
-        cy: the same, vertically.
-        camera_angle_x: full horizontal field of view in radians; ``fl_x`` goes before it.
-        camera_angle_y: full vertical field of view in radians; ``fl_y`` goes before it.
-        camera_model: such as ``OPENCV`` or ``OPENCV_FISHEYE``.
-        distortion: OpenCV coefficients among ``k1 k2 k3 k4 p1 p2``.
+        cx: horizontal principal point in pixels, with the centre of the first pixel at 1/2.
+        cy: vertical principal point in pixels, with the centre of the first pixel at 1/2.
+        camera_angle_x: full horizontal field of view in radians; ``fl_x`` takes precedence.
+        camera_angle_y: full vertical field of view in radians; ``fl_y`` takes precedence.
+        camera_model: name of the camera model, such as ``OPENCV`` or ``OPENCV_FISHEYE``.
+        distortion: OpenCV coefficients by name, among ``k1 k2 k3 k4 p1 p2``.
     """
 
     width: int | None = None
@@ -62,27 +62,27 @@ class Lens:
 
     @property
     def is_distorted(self) -> bool:
-        """Whether the images are not those of a pinhole camera."""
+        """Whether the images are not those of a pinhole camera: distorted or fisheye."""
         return any(value != 0 for value in self.distortion.values()) or "FISHEYE" in (self.camera_model or "").upper()
 
     @staticmethod
     def from_intrinsics(
         intrinsics: ArrayLike, size: tuple[int, int], distortion: Mapping[str, float] | None = None
     ) -> Lens:
-        """Lens of our intrinsics ``[3, 3]`` (integer pixel centres) and image ``(height, width)``."""
+        """Creates a lens from our intrinsics ``[3, 3]`` (integer pixel centres) and image ``(height, width)``."""
         k = np.asarray(intrinsics, np.float64)
         cx, cy = (float(k[axis, 2]) + PIXEL_CENTER for axis in (0, 1))
         width, height, distortion = int(size[1]), int(size[0]), dict(distortion or {})
         return Lens(width, height, float(k[0, 0]), float(k[1, 1]), cx, cy, camera_model="OPENCV", distortion=distortion)
 
     def intrinsics(self, size: tuple[int, int] | None = None) -> NDArray[np.floating]:
-        """Pinhole part ``[3, 3]`` in pixels of the file's image size, with our integer pixel centres.
+        """Returns pinhole intrinsics ``[3, 3]`` in pixels of the file's image size, with our integer pixel centres.
 
-        A missing ``fl_x`` follows from ``camera_angle_x``, a missing ``fl_y`` from ``camera_angle_y`` or else equals
-        ``fl_x``, a missing principal point is the middle of the image.
+        A missing ``fl_x`` is computed from ``camera_angle_x``. A missing ``fl_y`` is computed from ``camera_angle_y``,
+        or else equals ``fl_x``. A missing principal point is the image centre.
 
         Args:
-            size: the images' ``(height, width)``, used where the file does not give its own.
+            size: ``(height, width)`` of the images, used if the file gives none.
 
         Raises:
             ValueError: if the size is needed and not known, or there is no focal length.
@@ -114,9 +114,9 @@ class TransformsFrame:
     """One frame.
 
     Attributes:
-        file_path: the image as the file names it, relative to the file's folder; it need not exist.
+        file_path: image path as given in the file, relative to the file's folder; it may not exist.
         world_to_camera: ``[4, 4]`` float64, OpenCV; all NaN where the file's pose is not finite.
-        lens: the frame's own intrinsics, the file's shared ones filled in.
+        lens: the frame's intrinsics; missing values are filled with the file's shared ones.
         depth_file_path: depth image, or None.
         mask_path: mask image, or None.
     """
@@ -130,11 +130,11 @@ class TransformsFrame:
 
 @dataclass(frozen=True, eq=False)
 class Transforms:
-    """A whole file.
+    """Content of a ``transforms.json``.
 
     Attributes:
-        frames: the frames in the file's order; images listed but absent are the caller's business.
-        ply_file_path: point cloud of the scene in the world of the poses, or None.
+        frames: frames in the file's order, including those whose image does not exist.
+        ply_file_path: point cloud of the scene in the world frame of the poses, or None.
     """
 
     frames: tuple[TransformsFrame, ...]
@@ -145,10 +145,10 @@ def read_transforms(path: str | Path) -> Transforms:
     """Reads a ``transforms.json``.
 
     Returns:
-        Its frames in our conventions; fields that are not among the records' are ignored.
+        The frames in our conventions; unknown fields are ignored.
 
     Raises:
-        FormatError: if it is not JSON or of another shape, naming the file and the field.
+        FormatError: if the file is not JSON or a field is wrong, naming the file and the field.
     """
     path = Path(path)
     top = Fields(f"{path}: ", load_json(path))
@@ -162,10 +162,6 @@ def read_transforms(path: str | Path) -> Transforms:
 
 def write_transforms(path: str | Path, transforms: Transforms) -> Path:
     """Writes a ``transforms.json``, atomically; intrinsics are at the top if all frames share them.
-
-    Args:
-        path: the file.
-        transforms: what to write; not changed.
 
     Raises:
         ValueError: if a pose is not finite.
@@ -181,14 +177,14 @@ def write_transforms(path: str | Path, transforms: Transforms) -> Path:
 
 
 def _read_lens(fields: Fields, shared: Lens) -> Lens:
-    """The lens of one object; what it does not say is taken from ``shared``."""
+    """Reads the lens of one object; missing values are taken from ``shared``."""
     own = {
         "width": fields.pixels("w"),
         "height": fields.pixels("h"),
         **{name: fields.number(name, *limits) for name, limits in _LIMITS.items()},
         "camera_model": fields.get("camera_model", str, "a camera model's name"),
     }
-    if fields.content.get("is_fisheye") is True:  # instant-ngp's way to say it
+    if fields.content.get("is_fisheye") is True:  # instant-ngp's flag
         own["camera_model"] = "OPENCV_FISHEYE"
     coefficients = {name: fields.number(name) for name in DISTORTION}
     given = {name: value for name, value in coefficients.items() if value is not None}
@@ -212,7 +208,7 @@ def _read_frame(fields: Fields, shared: Lens) -> TransformsFrame:
         pose = np.linalg.inv(pose @ _OPENGL)
     else:
         pose = np.full((4, 4), np.nan)
-    return TransformsFrame(file_path.replace("\\", "/"), pose, lens, depth, mask)  # some are written on Windows
+    return TransformsFrame(file_path.replace("\\", "/"), pose, lens, depth, mask)  # paths may be from Windows
 
 
 def _frame_fields(frame: TransformsFrame, with_lens: bool) -> dict[str, Any]:

@@ -2,8 +2,8 @@
 
 A Gaussian file has one ``vertex`` element of floats, in this order: ``x y z``, ``nx ny nz`` (zeros), ``f_dc_0..2``,
 ``f_rest_*`` (none or 45, all of red before green before blue), ``opacity`` (logit), ``scale_0..2`` (logarithms),
-``rot_0..3`` (wxyz). Our scenes add ``error`` and ``support`` (:mod:`vg2gt.uncertainty`). The colour behind a scene is
-in a comment, ``background R G B`` in [0, 1], which other programs ignore.
+``rot_0..3`` (wxyz). Our scenes add ``error`` and ``support`` (:mod:`vg2gt.uncertainty`). The background colour is in a
+comment, ``background R G B`` in [0, 1], which other programs ignore.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from vg2gt.types import Gaussians
 POSITION = ("x", "y", "z")
 NORMAL = ("nx", "ny", "nz")
 COLOR = ("red", "green", "blue")
-FLATNESS = 0.01  # thickness of 2DGS's Gaussians, which have none, over their smaller side
-FULL_REST = 45  # spherical harmonics of degree 3 without the constant one
+FLATNESS = 0.01  # thickness of 2DGS Gaussians, which have none, relative to their smaller side
+FULL_REST = 45  # spherical harmonics up to degree 3 without the constant ones
 _DC = tuple(f"f_dc_{i}" for i in range(3))
 _SCALE = tuple(f"scale_{i}" for i in range(3))
 _ROTATION = tuple(f"rot_{i}" for i in range(4))
@@ -54,12 +54,12 @@ def write_gaussian_ply(
     Args:
         path: the file.
         gaussians: one scene; not changed. Opacities are kept 6e-8 away from 0 and 1, whose logits are infinite.
-        full_sh: True writes 45 ``f_rest`` even for colours that do not depend on the view, which the original 3DGS
-            viewer insists on. Degrees 1 and 2 are always filled up with zeros to 45.
-        extra: further properties ``[G]`` by name, written as floats behind all others; viewers ignore them.
+        full_sh: write 45 ``f_rest`` even for view-independent colours, as the original 3DGS viewer requires. Degrees 1
+            and 2 are always padded with zeros to 45.
+        extra: further properties ``[G]`` by name, written as floats after all others; viewers ignore them.
 
     Raises:
-        ValueError: on more than one scene and on values that cannot be written.
+        ValueError: if there is more than one scene or a value cannot be written.
     """
     arrays = to_arrays(gaussians)
     count, coefficients = arrays.sh.shape[:2]
@@ -89,16 +89,15 @@ def write_gaussian_ply(
 
 
 def read_gaussian_ply(path: str | Path) -> Gaussians:
-    """Reads a 3DGS file.
+    """Reads a 3DGS file, or SuperSplat's compressed PLY (:mod:`vg2gt.io.compressed_ply`).
 
-    Args:
-        path: the file. Normals may be missing, there may be 0, 9, 24 or 45 ``f_rest``, and other properties are
-            ignored. Without ``scale_2`` (2DGS) Gaussians are flat. SuperSplat's compressed PLY is read too
-            (:mod:`vg2gt.io.compressed_ply`). Rows with values that are not finite or a zero quaternion are left out
-            with a warning.
+    Normals may be missing, there may be 0, 9, 24 or 45 ``f_rest``, and other properties are ignored. Without
+    ``scale_2`` (2DGS), Gaussians are flat. Rows with values that are not finite or a zero quaternion are dropped with a
+    warning.
 
     Returns:
-        The Gaussians as scene 0, float32, in our activations: standard deviations, opacities, quaternions as they are.
+        The Gaussians as scene 0, float32, with activations applied: standard deviations and opacities. Quaternions are
+        not normalised.
 
     Raises:
         FormatError: if the file is damaged or holds something else.
@@ -123,7 +122,7 @@ def read_gaussian_ply(path: str | Path) -> Gaussians:
         ),
         1,
     )
-    with np.errstate(over="ignore"):  # an infinite result is found and counted
+    with np.errstate(over="ignore"):  # infinite results are counted and dropped later
         opacities = 1 / (1 + np.exp(-_columns(path, table, ("opacity",))[:, 0]))
         sides = _SCALE if _SCALE[2] in found or _SCALE[0] not in found else _SCALE[:2]
         scales = np.exp(_columns(path, table, sides))
@@ -135,7 +134,7 @@ def read_gaussian_ply(path: str | Path) -> Gaussians:
 
 
 def read_properties(path: str | Path, *names: str) -> dict[str, NDArray[np.float64]]:
-    """Properties ``[N]`` of the vertices, such as ``error`` and ``support`` of our scenes; absent ones are left out.
+    """Reads vertex properties ``[N]``, such as ``error`` and ``support`` of our scenes; missing ones are left out.
 
     Raises:
         FormatError: if the file is damaged.
@@ -153,7 +152,7 @@ def write_point_ply(path: str | Path, positions: ArrayLike, colors: ArrayLike | 
         colors: ``[N, 3]`` uint8, or None.
 
     Raises:
-        ValueError: if the shapes or types are others.
+        ValueError: if shapes or types are wrong.
     """
     xyz = np.asarray(positions, np.float64)
     if xyz.ndim != 2 or xyz.shape[1] != 3:
@@ -181,7 +180,7 @@ def read_point_ply(path: str | Path) -> ColoredPoints:
         path: the file, binary or ASCII.
 
     Returns:
-        Positions (float64 where the file has doubles), and colours where it has uchar ``red green blue``.
+        Positions (float64 if the file has doubles), and colours if it has uchar ``red green blue``.
 
     Raises:
         FormatError: if the file is damaged or has no ``x y z``.
@@ -195,7 +194,7 @@ def read_point_ply(path: str | Path) -> ColoredPoints:
 
 
 def _background(path: Path) -> torch.Tensor | None:
-    """The colour behind the scene ``[1, 3]`` that a comment names; None without one, or where it is none."""
+    """Background colour ``[1, 3]`` from the comments; None if missing or invalid."""
     for comment in read_comments(path):
         word, _, values = comment.partition(" ")
         try:
@@ -208,7 +207,7 @@ def _background(path: Path) -> torch.Tensor | None:
 
 
 def _columns(path: Path, table: NDArray, names: tuple[str, ...]) -> NDArray[np.float64]:
-    """Some properties side by side ``[N, len(names)]``, float64."""
+    """Stacks properties to ``[N, len(names)]``, float64."""
     missing = [name for name in names if name not in (table.dtype.names or ())]
     if missing:
         raise FormatError(
@@ -216,7 +215,7 @@ def _columns(path: Path, table: NDArray, names: tuple[str, ...]) -> NDArray[np.f
             "expected x y z for points and x y z f_dc_* opacity scale_* rot_* for Gaussians (not a compressed PLY)"
         )
     values = np.empty((len(table), len(names)))
-    with np.errstate(invalid="ignore"):  # a signalling NaN of a damaged file becomes an ordinary one
+    with np.errstate(invalid="ignore"):  # signalling NaNs of damaged files become quiet NaNs
         for i, name in enumerate(names):
             values[:, i] = table[name]
     return values

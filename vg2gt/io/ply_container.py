@@ -1,4 +1,4 @@
-"""The PLY container: header, and the table of its ``vertex`` element. Damaged files are a ``FormatError``."""
+"""The PLY container: header and tables of elements. Damaged files raise ``FormatError``."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class _Element:
 
 
 def ply_content(elements: Mapping[str, NDArray], comments: Sequence[str] = ()) -> bytes:
-    """A binary little-endian file of structured arrays, elements and their fields in their order."""
+    """Encodes structured arrays as a binary little-endian file, in the order of elements and fields."""
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]
     for element, table in elements.items():
         lines += [f"element {element} {len(table)}"]
@@ -46,12 +46,12 @@ def ply_content(elements: Mapping[str, NDArray], comments: Sequence[str] = ()) -
 
 
 def read_vertices(path: Path) -> NDArray:
-    """The ``vertex`` element as a structured array; what follows it in the file is ignored."""
+    """Reads the ``vertex`` element as a structured array; later elements are ignored."""
     return read_elements(path, "vertex")["vertex"]
 
 
 def read_elements(path: Path, *wanted: str) -> dict[str, NDArray]:
-    """Elements of a file as structured arrays in little endian, by name; those that it does not have are left out."""
+    """Reads elements of a file as little-endian structured arrays, by name; missing ones are left out."""
     data = regular(path).read_bytes()
     encoding, elements, start = _header(path, data)
     names = [element.name for element in elements]
@@ -83,7 +83,7 @@ def _read_element(path: Path, data: bytes, start: int, encoding: str, elements: 
 
 
 def read_comments(path: Path) -> list[str]:
-    """The header's comments, without the word."""
+    """Reads the header's comments, without the keyword."""
     with regular(path).open("rb") as file:
         head = file.read(_HEADER_LIMIT)
     lines = head[: max(0, head.find(_END))].decode("latin-1").splitlines()

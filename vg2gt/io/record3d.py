@@ -1,6 +1,6 @@
 """Files of Record3D recordings: an ``.r3d`` archive (a ZIP) or the folder it was unpacked to.
 
-A file in an archive is named as if the archive were a folder: ``capture.r3d/rgbd/0.jpg``.
+Paths of files in an archive treat it as a folder: ``capture.r3d/rgbd/0.jpg``.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from vg2gt.io.errors import FormatError
 from vg2gt.io.files import regular
 
 R3D = ".r3d"
-_FRAME = re.compile(r"rgbd/([0-9]{1,9})(\.[a-z]+)")  # and no other name, such as one that leads out of the folder
+_FRAME = re.compile(r"rgbd/([0-9]{1,9})(\.[a-z]+)")  # other names are ignored, such as paths out of the folder
 
 
 def is_archive(path: Path) -> bool:
@@ -24,11 +24,11 @@ def is_archive(path: Path) -> bool:
 
 
 def recorded_files(recording: Path, suffix: str) -> dict[int, Path]:
-    """The files ``rgbd/N`` with an ending (``.jpg``) of a recording by their number, in its order.
+    """Returns a recording's files ``rgbd/N`` with a suffix (such as ``.jpg``), sorted by number.
 
     Raises:
-        FormatError: if an archive is damaged.
-        OSError: if it cannot be opened.
+        FormatError: if an archive cannot be read.
+        OSError: if a folder cannot be read.
     """
     if is_archive(recording):
         names = _archive(recording).namelist()
@@ -42,7 +42,7 @@ def read_recorded(path: Path) -> bytes:
     """Reads a file of a recording.
 
     Raises:
-        FileNotFoundError: if there is none.
+        FileNotFoundError: if there is no such file.
         FormatError: if the archive is damaged.
     """
     place = next((folder for folder in list(path.parents)[:2] if is_archive(folder)), None)
@@ -52,7 +52,7 @@ def read_recorded(path: Path) -> bytes:
         return _archive(place).read(path.relative_to(place).as_posix())
     except KeyError as error:
         raise FileNotFoundError(f"{path} is not in the recording") from error
-    except Exception as error:  # whatever zipfile and zlib raise over damaged bytes
+    except Exception as error:  # damaged bytes raise various errors of zipfile and zlib
         raise FormatError(f"{path}: cannot be read ({error}); the recording is damaged, export it again") from error
 
 
@@ -77,11 +77,11 @@ def unpack_lzfse(path: Path) -> bytes:
 def _archive(path: Path) -> zipfile.ZipFile:
     try:
         return _open(str(regular(path)), path.stat().st_mtime_ns, os.getpid())
-    except Exception as error:  # whatever zipfile raises of a damaged archive
+    except Exception as error:  # damaged archives raise various errors of zipfile
         raise FormatError(f"{path}: no readable archive ({error}); export the recording again") from error
 
 
 @lru_cache(maxsize=4)
 def _open(path: str, changed: int, process: int) -> zipfile.ZipFile:
-    """Open archives; a forked process opens its own, as an open file has one position."""
+    """Opens an archive, cached per process: forked processes would share the position in an open file."""
     return zipfile.ZipFile(path)

@@ -1,8 +1,8 @@
 """The ``.splat`` format of the first web viewers: 32 bytes per Gaussian, no header.
 
-Float32 position, float32 standard deviations, 8-bit red green blue and opacity, 8-bit wxyz. What is lost against a PLY
-file: everything of the colour that depends on the view, colours outside [0, 1], and precision of colour and opacity
-(1/510) and of the rotation (1/256 in each component, about half a degree).
+Float32 position, float32 standard deviations, 8-bit red green blue and opacity, 8-bit wxyz. Losses compared with a PLY
+file: view-dependent colour, colours outside [0, 1], and precision of colour and opacity (1/510) and of rotation (1/256
+per component, about half a degree).
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ _ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("q
 
 
 def write_splat(path: str | Path, gaussians: Gaussians) -> Path:
-    """Writes one scene's Gaussians in their order, atomically; the module says what is lost.
+    """Writes one scene's Gaussians in order, atomically; the module lists the losses.
 
     Raises:
-        ValueError: on more than one scene and on values that cannot be written.
+        ValueError: if there is more than one scene or a value cannot be written.
     """
     arrays = to_arrays(gaussians)
     rgba = np.concatenate((0.5 + DC * arrays.sh[:, 0], arrays.opacities[:, None]), 1)
@@ -41,9 +41,8 @@ def write_splat(path: str | Path, gaussians: Gaussians) -> Path:
 def read_splat(path: str | Path) -> Gaussians:
     """Reads a ``.splat`` file.
 
-    Args:
-        path: the file. The format has nothing by which damage could be told: rows with values that are not finite or a
-            zero quaternion are left out with a warning.
+    Most damage cannot be detected in this format. Rows with values that are not finite or a zero quaternion are dropped
+    with a warning.
 
     Returns:
         The Gaussians as scene 0, float32, colours of degree 0.
@@ -58,7 +57,7 @@ def read_splat(path: str | Path) -> Gaussians:
             f"{path}: {len(data)} bytes are not a multiple of {_ROW.itemsize}; the file is truncated or not a .splat"
         )
     table = np.frombuffer(data, _ROW)
-    with np.errstate(invalid="ignore"):  # a signalling NaN of a damaged file becomes an ordinary one
+    with np.errstate(invalid="ignore"):  # signalling NaNs of damaged files become quiet NaNs
         means, scales = table["mean"].astype(np.float64), table["scale"].astype(np.float64)
     negative = np.flatnonzero((scales < 0).any(-1))
     if len(negative):

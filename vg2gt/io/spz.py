@@ -1,12 +1,12 @@
-"""``.spz``, Niantic's compressed Gaussians: a gzip stream of columns, about a tenth of a PLY.
+"""``.spz``, Niantic's compressed Gaussians: a gzip stream of columns, about a tenth of the size of a PLY.
 
 A header of 16 bytes (magic, version, number of Gaussians, degree, fractional bits, flags), then all positions (24-bit
 fixed point), opacities, colours, log-scales (a byte each), rotations (version 3: the smallest three of x y z w in 32
 bits; version 2: x y z in a byte each) and higher spherical harmonics (a byte each). Axes are those of the PLY, as
-Niantic's converter and SuperSplat write them; the format itself names none. Format: https://github.com/nianticlabs/spz
+Niantic's converter and SuperSplat write them; the format defines none. Format: https://github.com/nianticlabs/spz
 
-What is lost against a PLY file: positions are exact to 2^-21 of the scene's extent or 2^-20 units, scales to 3.2 % and
-clipped to [4.5e-5, 380], opacities to 1/510, colours to 1/270 and clipped to [-0.44, 1.44], rotations to 1/700,
+Losses compared with a PLY file: positions are rounded to 2^-21 of the scene's extent or 2^-20 units, scales to 3.2 %
+and clipped to [4.5e-5, 380], opacities to 1/510, colours to 1/270 and clipped to [-0.44, 1.44], rotations to 1/700,
 higher spherical harmonics to 1/256 and clipped to [-1, 1].
 """
 
@@ -35,15 +35,15 @@ from vg2gt.types import Gaussians
 _HEADER = struct.Struct("<4sIIBBBB")
 _MAGIC = b"NGSP"
 _DEGREES = {1: 0, 4: 1, 9: 2, 16: 3}  # by number of coefficients
-_MOST_BITS = 20  # of a position's fraction
+_MOST_BITS = 20  # fractional bits of a position
 _COLOR = 0.15  # a byte holds 0.5 + 0.15 times the constant coefficient
 
 
 def write_spz(path: str | Path, gaussians: Gaussians) -> Path:
-    """Writes one scene's Gaussians in their order, version 3, atomically; the module says what is lost.
+    """Writes one scene's Gaussians in order, as version 3, atomically; the module lists the losses.
 
     Raises:
-        ValueError: on more than one scene and on values that cannot be written.
+        ValueError: if there is more than one scene or a value cannot be written.
     """
     arrays = to_arrays(gaussians)
     extent = float(np.abs(arrays.means).max(initial=1e-6))
@@ -124,7 +124,7 @@ def _bytes(values: NDArray[np.floating]) -> NDArray[np.uint8]:
 
 
 def _rotations(packed: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """Unit quaternions ``[N, 4]`` xyzw of either version's bytes."""
+    """Decodes the bytes of version 2 or 3 to unit quaternions ``[N, 4]`` xyzw."""
     if packed.shape[1] == 3:
         axis = packed / 127.5 - 1
         return np.concatenate((axis, np.sqrt(np.maximum(1 - (axis**2).sum(1, keepdims=True), 0))), 1)

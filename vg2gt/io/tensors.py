@@ -1,4 +1,4 @@
-"""Files of tensors from anywhere: nothing in them is executed."""
+"""Reading of untrusted tensor files, without executing code in them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from vg2gt.io.files import regular
 
 
 def tensors_digest(state: Mapping[str, Tensor]) -> str:
-    """sha256 of names, shapes, types and values, in sorted order."""
+    """SHA-256 of names, shapes, types and values of tensors, sorted by name."""
     digest = hashlib.sha256()
     for key, value in sorted(state.items()):
         digest.update(f"{key} {tuple(value.shape)} {value.dtype}".encode())
@@ -25,23 +25,23 @@ def tensors_digest(state: Mapping[str, Tensor]) -> str:
 
 
 def read_tensors(path: str | Path) -> dict[str, Tensor]:
-    """Reads named tensors: ``.safetensors``, or any other name for a file of ``torch.save``.
+    """Reads named tensors from ``.safetensors``, or from a file of ``torch.save`` with any other suffix.
 
     Raises:
-        FileNotFoundError: if there is none.
+        FileNotFoundError: if the file does not exist.
         FormatError: if it is damaged or not a mapping of names to tensors.
     """
     path = Path(path)
     try:
         if path.suffix == ".safetensors":
-            # Copies: the file would stay mapped, and whoever writes to it would change a network that runs.
+            # clones: the file would stay mapped, and writing to it would change a loaded network
             return {name: tensor.clone() for name, tensor in load_file(regular(path)).items()}
         state = torch.load(regular(path), map_location="cpu", weights_only=True)
     except FileNotFoundError:
         raise
     except SafetensorError as error:
         raise FormatError(f"{path} is damaged or no safetensors file: {error}") from error
-    except Exception as error:  # damage raises whatever the unpickler, zip reader and allocator raise
+    except Exception as error:  # damage raises various errors of unpickler, zip reader, allocator
         reason = str(error).strip().splitlines() or [type(error).__name__]
         raise FormatError(f"{path} is damaged or holds more than tensors and plain values: {reason[0]}") from error
     if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):

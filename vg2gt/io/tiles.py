@@ -1,7 +1,8 @@
-"""A large scene as tiles for viewers: a file a region of space, and ``index.json``, which says where each is.
+"""A large scene as tiles for viewers: one file per region of space, and ``index.json`` with their bounds.
 
-``index.json`` has ``format`` (1), ``gaussians`` (number of all), ``background`` (colour or null) and ``tiles``: of each
-its ``file``, number of ``gaussians`` and the corners ``low`` and ``high`` of the box around their means, scene units.
+``index.json`` has ``format`` (1), ``gaussians`` (total number), ``background`` (colour or null) and ``tiles``. Each
+tile has a ``file``, its number of ``gaussians``, and the corners ``low`` and ``high`` of the bounding box of their
+means, in scene units.
 """
 
 from __future__ import annotations
@@ -16,19 +17,19 @@ from vg2gt.io.files import read_json, write_json
 from vg2gt.io.gaussian_files import read_gaussians, write_gaussians
 from vg2gt.types import Gaussians
 
-MOST = 500_000  # Gaussians of a tile
+MOST = 500_000  # Gaussians per tile
 INDEX = "index.json"
 _FORMAT = 1
 
 
 def write_tiles(folder: str | Path, gaussians: Gaussians, suffix: str = ".spz", most: int = MOST) -> Path:
-    """Writes one scene's Gaussians as tiles; space is halved along its longest side until no part has too many.
+    """Writes one scene's Gaussians as tiles; regions are halved along their longest side until they are small enough.
 
     Args:
-        folder: made if it is not there.
-        gaussians: of one scene.
-        suffix: of the files: any format of :func:`vg2gt.io.write_gaussians`.
-        most: Gaussians of a tile, at most.
+        folder: output folder, created if needed.
+        gaussians: Gaussians of one scene.
+        suffix: suffix of the files: any format of :func:`vg2gt.io.write_gaussians`.
+        most: maximum number of Gaussians per tile.
     """
     folder, tiles = Path(folder), []
     for number, rows in enumerate(_parts(gaussians.means.detach().cpu(), most)):
@@ -43,10 +44,10 @@ def write_tiles(folder: str | Path, gaussians: Gaussians, suffix: str = ".spz", 
 
 
 def read_tiles(folder: str | Path) -> Gaussians:
-    """All tiles of a folder that :func:`write_tiles` wrote, as one scene.
+    """Reads all tiles in a folder of :func:`write_tiles` as one scene.
 
     Raises:
-        FormatError: if a tile does not hold what the index says.
+        FormatError: if a tile's number of Gaussians differs from the index.
     """
     folder, found = Path(folder), []
     index = read_json(folder / INDEX)
@@ -61,7 +62,7 @@ def read_tiles(folder: str | Path) -> Gaussians:
 
 
 def _parts(means: Tensor, most: int) -> list[Tensor]:
-    """Sorted rows of every tile."""
+    """Row indices of each tile, sorted."""
     waiting, done = [torch.arange(len(means))], []
     while waiting:
         rows = waiting.pop()

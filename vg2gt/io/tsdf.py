@@ -1,7 +1,7 @@
-"""Fusion of depth maps into a truncated signed distance, on blocks of voxels near surfaces only.
+"""TSDF fusion: fuses depth maps into a truncated signed distance, only on blocks of voxels near surfaces.
 
-A view measures the difference in z between a surface and a voxel, which overstates the distance where it looks at a
-slant and would pull the mean outwards. The squared cosine between ray and normal, its weight, keeps that small.
+A view measures the difference in z between a surface and a voxel. At grazing angles this overestimates the distance and
+would bias the mean outwards. Observations are therefore weighted by the squared cosine between ray and normal.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from vg2gt.types import Cameras
 BLOCK = 8  # voxels along a block's edge
 KEY_BITS = 20  # voxel indices lie in [-2^20, 2^20)
 _BLOCKS_PER_CHUNK = 2048
-_EDGE_WEIGHT = 0.05  # of pixels without a normal, next to an edge or among sparse depth: better than no observation
+_EDGE_WEIGHT = 0.05  # of pixels without a normal (at edges, in sparse depth): better than no observation
 _MIN_WEIGHT = 1e-3
 
 
@@ -28,9 +28,9 @@ class Volume:
     """A truncated signed distance sampled at voxel centres of N blocks.
 
     Attributes:
-        blocks: ``[N, 3]`` int64 block indices, unique; a block begins at voxel ``BLOCK * index``.
+        blocks: ``[N, 3]`` int64 block indices, unique; a block starts at voxel ``BLOCK * index``.
         distance: ``[N, BLOCK^3]`` float32 mean signed distance over the truncation, in [-1, 1], positive in free space.
-        weight: ``[N, BLOCK^3]`` float32 summed weight of the observations; 0 = never seen.
+        weight: ``[N, BLOCK^3]`` float32 summed weight of the observations; 0 = never observed.
         colors: ``[N, BLOCK^3, 3]`` float32 mean colour in [0, 1], or None.
         voxel_size: edge length of a voxel; the centre of voxel i is at ``(i + 1/2) * voxel_size``.
     """
@@ -62,10 +62,10 @@ def fuse(
 
 
 def _surface_blocks(depth: Tensor, cameras: Cameras, voxel_size: float, truncation: float, max_voxels: int) -> Tensor:
-    """Blocks that hold a point within the truncation before or behind a depth sample, sorted, unique."""
+    """Blocks with a point within the truncation in front of or behind a depth sample, sorted, unique."""
     steps = int(np.ceil(2 * truncation / (BLOCK * voxel_size / 2))) + 1
     offsets = torch.linspace(-truncation, truncation, steps, dtype=torch.float64).tolist()
-    # a voxel's neighbours too: the surface may pass between two blocks
+    # includes neighbouring voxels: the surface may pass between two blocks
     around = torch.stack(torch.meshgrid(*3 * [torch.tensor([-1, 1])], indexing="ij"), -1).reshape(-1, 3)
     limit = (1 << KEY_BITS) - BLOCK
     blocks = torch.zeros(0, dtype=torch.int64)
@@ -141,7 +141,7 @@ def _integrate(
 
 
 def _sample_depth(depth: Tensor, x: Tensor, y: Tensor, truncation: float) -> Tensor:
-    """Bilinear where the four neighbours belong to one surface, else nearest: an edge must not be blurred."""
+    """Samples depth bilinearly if the four neighbours are on one surface, else nearest, so that edges stay sharp."""
     height, width = depth.shape
     left, top = x.floor().long().clamp(0, width - 2), y.floor().long().clamp(0, height - 2)
     fx, fy = (x - left).clamp(0, 1), (y - top).clamp(0, 1)
@@ -153,7 +153,7 @@ def _sample_depth(depth: Tensor, x: Tensor, y: Tensor, truncation: float) -> Ten
 
 
 def pack(index: Tensor) -> Tensor:
-    """One int64 key of each index ``[..., 3]``, in lexicographic order."""
+    """Packs indices ``[..., 3]`` into int64 keys ``[...]`` that sort lexicographically."""
     shifted = index + (1 << KEY_BITS)
     x, y, z = shifted.unbind(-1)
     return (x << (2 * KEY_BITS + 2)) | (y << (KEY_BITS + 1)) | z

@@ -1,7 +1,7 @@
-"""Moving pictures: frames of videos, and animations of rendered views.
+"""Frames of videos, and animations of rendered views.
 
-GIF goes through Pillow and always works. Everything else goes through PyAV, FFmpeg's libraries, which the extra
-``video`` brings (``pip install vg2gt[video]``).
+GIF uses Pillow and always works. All other formats use PyAV (FFmpeg's libraries), which the extra ``video`` installs
+(``pip install vg2gt[video]``).
 """
 
 from __future__ import annotations
@@ -28,45 +28,45 @@ if TYPE_CHECKING:
     from av.container import InputContainer
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".gif")
-_QUALITY = "18"  # constant rate factor of H.264: 0 is lossless, 23 the program's default
+_QUALITY = "18"  # constant rate factor of H.264: 0 is lossless, 23 is x264's default
 _PALETTE = 255
-# Files that hold all their frames. FFmpeg goes by a file's content, and lists and playlists under any name would make
-# it open other files of this machine.
+# Containers that hold all their frames. FFmpeg detects formats by content: a playlist under any name would make it open
+# other files of this machine.
 _CONTAINERS = "mov,matroska,avi,mpegts,mpeg,flv,asf,ogg"
 
 
 class MissingDecoderError(ImportError):
-    """There is no PyAV; the message says how to get it."""
+    """PyAV is not installed; the message says how to install it."""
 
 
 def count_frames(path: str | Path) -> int:
-    """Number of frames of a video, without decoding them.
+    """Returns the number of frames of a video without decoding them.
 
     Raises:
         FormatError: if the file cannot be read.
-        MissingDecoderError: if it is no GIF and there is no PyAV.
+        MissingDecoderError: if it is not a GIF and PyAV is not installed.
     """
     path = _existing(path)
     if path.suffix.lower() == ".gif":
         with _open_gif(path) as image:
             return getattr(image, "n_frames", 1)
     with _opened(path) as container:
-        return sum(packet.size > 0 for packet in container.demux(video=0))  # the last one is empty
+        return sum(packet.size > 0 for packet in container.demux(video=0))  # the last packet is empty
 
 
 def read_video(path: str | Path, every: int = 1) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-    """Decodes every so many frames of a video, turned upright as the file says.
+    """Decodes every N-th frame of a video, turned upright by its display matrix.
 
     Args:
         path: the file.
-        every: 1 for every frame.
+        every: N; 1 for all frames.
 
     Yields:
-        The frame's number, from 0, and its pixels ``[H, W, 3]``.
+        The frame number, from 0, and the pixels ``[H, W, 3]``.
 
     Raises:
         FormatError: if the file cannot be read.
-        MissingDecoderError: if it is no GIF and there is no PyAV.
+        MissingDecoderError: if it is not a GIF and PyAV is not installed.
     """
     path = _existing(path)
     if path.suffix.lower() == ".gif":
@@ -82,7 +82,7 @@ def read_video(path: str | Path, every: int = 1) -> Iterator[tuple[int, NDArray[
 
 
 class VideoFrames:
-    """Every so many-th frame of a video, decoded when it is read; read in their order, each is decoded once."""
+    """Every N-th frame (N is ``every``) of a video, decoded on demand; reading in order decodes each frame once."""
 
     def __init__(self, path: str | Path, every: int = 1) -> None:
         self._path, self._every = path, every
@@ -90,7 +90,7 @@ class VideoFrames:
         self._pixels = np.zeros((0, 0, 3), np.uint8)
 
     def read(self, number: int) -> NDArray[np.uint8]:
-        """The pixels ``[H, W, 3]`` of one of them.
+        """Returns the pixels ``[H, W, 3]`` of frame ``number``, a multiple of N.
 
         Raises:
             FormatError: if it cannot be decoded.
@@ -106,11 +106,11 @@ class VideoFrames:
 
 
 def read_frame(path: str | Path, number: int) -> NDArray[np.uint8]:
-    """Decodes one frame ``[H, W, 3]`` of a video, from the last key frame before it.
+    """Decodes one frame ``[H, W, 3]`` of a video, starting at the last key frame before it.
 
     Raises:
         FormatError: if the file cannot be read or has no such frame.
-        MissingDecoderError: if there is no PyAV.
+        MissingDecoderError: if PyAV is not installed.
     """
     path = _existing(path)
     times = _frame_times(path, path.stat().st_mtime_ns)
@@ -125,11 +125,11 @@ def read_frame(path: str | Path, number: int) -> NDArray[np.uint8]:
 
 
 def video_size(path: str | Path) -> tuple[int, int]:
-    """``(height, width)`` of a video's first frame, turned upright as the file says.
+    """Returns ``(height, width)`` of a video's first frame, turned upright by its display matrix.
 
     Raises:
         FormatError: if the file cannot be read.
-        MissingDecoderError: if there is no PyAV.
+        MissingDecoderError: if PyAV is not installed.
     """
     height, width = read_frame(path, 0).shape[:2]
     return height, width
@@ -137,22 +137,23 @@ def video_size(path: str | Path) -> tuple[int, int]:
 
 @lru_cache(maxsize=8)
 def _frame_times(path: Path, state: int) -> list[int]:
-    """Presentation times of all frames in their order; ``state`` changes when the file does."""
+    """Sorted presentation times of all frames; a new ``state`` invalidates the cache when the file changes."""
     with _opened(path) as container:
         return sorted(packet.pts for packet in container.demux(video=0) if packet.size and packet.pts is not None)
 
 
 def write_video(path: str | Path, frames: Sequence[NDArray[np.uint8]], fps: float = 24.0) -> Path:
-    """Writes an animation that a browser plays, atomically: GIF (endless), or H.264 in MP4.
+    """Writes an animation for browsers, atomically: a looping GIF, or H.264 in MP4.
 
     Args:
         path: the file, ``.gif`` or ``.mp4``.
-        frames: ``[H, W, 3]`` each, all of one size; not changed. MP4 needs even sizes: an odd row or column is cut.
-        fps: frames per second; GIF knows hundredths of a second only.
+        frames: uint8 ``[H, W, 3]`` each, all of one size; not changed. MP4 needs even sizes: an odd last row or column
+            is cropped.
+        fps: frames per second; GIF rounds frame durations to 1/100 s, at least 1/50 s.
 
     Raises:
-        ValueError: if there are no frames, sizes differ, or the suffix is another.
-        MissingDecoderError: if it is an MP4 and there is no PyAV.
+        ValueError: if there are no frames, sizes differ, ``fps`` is not positive, or the suffix is unknown.
+        MissingDecoderError: if it is an MP4 and PyAV is not installed.
     """
     path = Path(path)
     if not len(frames) or any(f.shape != frames[0].shape or f.dtype != np.uint8 for f in frames):
@@ -167,15 +168,15 @@ def write_video(path: str | Path, frames: Sequence[NDArray[np.uint8]], fps: floa
 
 
 def has_pyav() -> bool:
-    """Whether anything but GIF can be read and written."""
+    """Whether PyAV is installed, which all formats except GIF need."""
     return importlib.util.find_spec("av") is not None
 
 
 def require_pyav(purpose: str) -> None:
-    """Checks early that there is PyAV.
+    """Checks early that PyAV is installed.
 
     Raises:
-        MissingDecoderError: if there is none, naming the purpose and the remedy.
+        MissingDecoderError: if it is not, naming the purpose and the remedy.
     """
     if not has_pyav():
         raise MissingDecoderError(f"{purpose} needs PyAV: pip install 'vg2gt[video]' (GIF works without)")
@@ -190,7 +191,7 @@ def _existing(path: str | Path) -> Path:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[InputContainer]:
-    """A video file, and nothing that it names."""
+    """Opens a video file, but no other files that it refers to."""
     require_pyav("a video other than GIF")
     import av
     from av.error import FFmpegError
@@ -205,7 +206,7 @@ def _opened(path: Path) -> Iterator[InputContainer]:
 
 
 def _decoded(container: InputContainer) -> Iterator[VideoFrame]:
-    """The frames of a file's first video; what is damaged is left out."""
+    """Decodes the frames of the first video stream; damaged packets are skipped."""
     from av.error import InvalidDataError
 
     container.streams.video[0].thread_type = "AUTO"
@@ -218,12 +219,12 @@ def _decoded(container: InputContainer) -> Iterator[VideoFrame]:
 
 
 def _upright(frame: VideoFrame) -> NDArray[np.uint8]:
-    """Pixels ``[H, W, 3]`` of a frame of any depth and colour space, turned and mirrored as its display matrix says."""
+    """Converts a frame of any colour format to RGB ``[H, W, 3]``, rotated and mirrored by its display matrix."""
     pixels = frame.reformat(format="rgb24", interpolation="BICUBIC").to_ndarray().astype(np.uint8, copy=False)
     matrix = frame.side_data.get("DISPLAYMATRIX")
     if matrix is None:
         return pixels
-    # x right, y down: shown at (a x + c y, b x + d y)
+    # pixel (x right, y down) is shown at (a x + c y, b x + d y)
     a, b, _, c, d = np.frombuffer(matrix, np.int32)[:5].tolist()
     if abs(b) > abs(a):
         pixels, a, d = pixels.swapaxes(0, 1), c, b
@@ -233,7 +234,7 @@ def _upright(frame: VideoFrame) -> NDArray[np.uint8]:
 def _open_gif(path: Path) -> Image.Image:
     try:
         return open_image(path)
-    except Exception as error:  # Pillow raises whatever the bytes lead it to
+    except Exception as error:  # Pillow raises various errors on damaged files
         raise FormatError(f"{path}: not a GIF ({error})") from error
 
 
@@ -243,12 +244,12 @@ def _read_gif(path: Path, every: int) -> Iterator[tuple[int, NDArray[np.uint8]]]
             try:
                 image.seek(number)
                 yield number, np.array(image.convert("RGB"))
-            except Exception as error:  # Pillow raises whatever the bytes lead it to
+            except Exception as error:  # Pillow raises various errors on damaged files
                 raise FormatError(f"{path}: frame {number} is damaged ({error})") from error
 
 
 def _gif(frames: Sequence[NDArray[np.uint8]], fps: float) -> bytes:
-    """One palette for all frames, from the whole animation, so that colours do not flicker."""
+    """Encodes a GIF with one palette from the whole animation, so that colours do not flicker."""
     step = max(1, len(frames) // 8)
     sample = np.concatenate([frame[::2, ::2] for frame in frames[::step]])
     palette = Image.fromarray(np.ascontiguousarray(sample)).quantize(_PALETTE, Image.Quantize.MEDIANCUT)
@@ -268,11 +269,11 @@ def _write_mp4(path: Path, frames: Sequence[NDArray[np.uint8]], fps: float) -> P
     with replacing(path) as temporary:
         try:
             with av.open(f"file:{temporary}", "w", format="mp4", options={"movflags": "+faststart"}) as container:
-                # With its macroblock tree x264 may give other bytes for the same frames, even on one thread.
+                # x264's macroblock tree is not deterministic, even on one thread
                 options = {"crf": _QUALITY, "x264-params": "mbtree=0"}
                 stream = container.add_stream("libx264", Fraction(f"{fps:g}"), options)
                 stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-                stream.codec_context.thread_count = 1  # with more, the same frames give other bytes each time
+                stream.codec_context.thread_count = 1  # several threads are not deterministic
                 for pixels in frames:
                     even = np.ascontiguousarray(pixels[:height, :width])
                     container.mux(stream.encode(av.VideoFrame.from_ndarray(even, "rgb24")))

@@ -1,4 +1,4 @@
-"""Everything compiled: numba kernels for CPUs, Triton kernels for CUDA devices, and what drives them.
+"""Compiled code: numba kernels for CPUs, Triton kernels for CUDA devices, and the functions that launch them.
 
-The references that each is tested against are plain torch in the rooms that call it.
+Each kernel is tested against a plain torch reference in the package that calls it.
 """

@@ -1,8 +1,8 @@
-"""Exact nearest neighbours on any device by searching sorted cells: work linear in the points, a few waits.
+"""Exact k-nearest-neighbour search on any device, over points sorted by grid cell.
 
-Points are sorted along a Morton curve, on which the cells of every size are ranges. Those next to a query on the curve
-bound the distance to its k-th neighbour; the neighbours lie in the at most 27 cells, of a size to match, that the ball
-of that radius meets.
+Points are sorted along a Morton curve, on which a cell of any size is a contiguous range. The points next to a query on
+the curve bound the distance to its k-th neighbour. The neighbours lie in the cells that the ball of that radius meets:
+at most 27 cells of a matching size. Work is linear in the points, with few host-device synchronisations.
 """
 
 from __future__ import annotations
@@ -14,22 +14,22 @@ from torch import Tensor
 
 from vg2gt.kernels.curve_codes import z_codes
 
-BITS = 19  # cells along an axis as a power of two, fewer where many scenes must be told apart
-QUERIES = 1 << 18  # bounded at a time
-CANDIDATES = 1 << 23  # distances held at once, some 60 bytes each
-SHIFT = 0.37  # of the second curve, in extents: where one curve leaps, the other seldom does
-SLACK = 1e-9  # by which rounding may shorten a distance; relative
+BITS = 19  # bits per axis of the finest cells, fewer if the key must hold many scenes
+QUERIES = 1 << 18  # queries per chunk
+CANDIDATES = 1 << 23  # distances held at once, about 60 bytes each
+SHIFT = 0.37  # offset of the second curve, in extents: the two curves rarely jump at the same place
+SLACK = 1e-9  # relative margin for the rounding of distances
 
 
 class _Curve:
-    """Points along a Morton curve through all scenes.
+    """Points sorted along a Morton curve through all scenes.
 
     Attributes:
-        bits: of a cell along an axis.
-        shift: added to positions before they are coded.
+        bits: bits per axis of a cell.
+        shift: offset added to positions before they are encoded.
         keys: ``[M]`` sorted ``scene << 3 bits | code``.
-        order: ``[M]`` row of each.
-        points: ``[M, 3]`` float64 in that order, in extents.
+        order: ``[M]`` original row of each sorted point.
+        points: ``[M, 3]`` float64 sorted points, in extents.
     """
 
     def __init__(self, points: Tensor, batch: Tensor, shift: float, bits: int) -> None:
@@ -38,30 +38,30 @@ class _Curve:
         self.points = points[self.order]
 
     def cells(self, positions: Tensor) -> Tensor:
-        """Smallest cells ``[N, 3]`` of positions in extents; monotone along every axis, those outside at the border."""
+        """Returns the finest cells ``[N, 3]`` of positions in extents, clamped to the grid; monotone on every axis."""
         cells = ((positions + self.shift) / (1 + SHIFT) * (1 << self.bits)).floor()
         return cells.clamp(0, (1 << self.bits) - 1).long()
 
     def key(self, cells: Tensor, batch: Tensor) -> Tensor:
-        """Place of cells ``[..., 3]`` of the scenes ``[...]`` on the curve."""
+        """Returns the curve keys of cells ``[..., 3]`` of scenes ``[...]``."""
         return batch << 3 * self.bits | z_codes(cells)
 
 
 def nearest_by_cells(
     queries: Tensor, query_batch: Tensor, points: Tensor, point_batch: Tensor, neighbors: int, scenes: int
 ) -> tuple[Tensor, Tensor]:
-    """Nearest points of a query's own scene, nearest first; of equal distances (in float64) any may be found.
+    """Returns the k nearest points in each query's own scene, nearest first; ties (in float64) are broken arbitrarily.
 
     Args:
-        queries: ``[N, 3]``.
+        queries: ``[N, 3]`` query points.
         query_batch: ``[N]`` scene index.
-        points: ``[M, 3]``, M >= 1.
+        points: ``[M, 3]`` points to search, M >= 1.
         point_batch: ``[M]`` scene index, sorted.
-        neighbors: k.
-        scenes: B.
+        neighbors: number of neighbours k.
+        scenes: number of scenes.
 
     Returns:
-        Rows of ``points`` ``[N, k]`` int64 and whether there are so many ``[N, k]`` bool; row 0 where not.
+        Rows of ``points`` ``[N, k]`` int64, and ``[N, k]`` bool that is False (row 0) where the scene has fewer points.
     """
     low = points.amin(0).double()
     extent = (points.amax(0).double() - low).amax().clamp(min=torch.finfo(torch.float32).tiny)
@@ -80,10 +80,10 @@ def nearest_by_cells(
 
 
 def _bound(queries: Tensor, batch: Tensor, curve: _Curve, first: Tensor, neighbors: int) -> Tensor:
-    """Distance ``[N]`` within which k points lie: the k-th of the 2 k next to the query on a curve, or infinity."""
+    """Bounds the k-th distance ``[N]`` by that among the 2 k points next to each query on a curve, or by infinity."""
     width = min(2 * neighbors, len(curve.keys))
     place = torch.searchsorted(curve.keys, curve.key(curve.cells(queries), batch)) - width // 2
-    begin, end = first[batch], first[batch + 1]  # a scene's points adjoin on the curve
+    begin, end = first[batch], first[batch + 1]  # a scene's points are contiguous on the curve
     place = torch.minimum(torch.maximum(place, begin), torch.maximum(end - width, begin))
     rows = place[:, None] + torch.arange(width, device=place.device)  # [N, 2 k]
     squared = (queries[:, None] - curve.points[rows.clamp(max=len(curve.keys) - 1)]).square().sum(-1)
@@ -94,12 +94,12 @@ def _bound(queries: Tensor, batch: Tensor, curve: _Curve, first: Tensor, neighbo
 
 
 def _search(queries: Tensor, batch: Tensor, radius: Tensor, curve: _Curve, index: Tensor, found: Tensor) -> None:
-    """Writes into ``index`` and ``found`` the nearest of all points within the radius of every query."""
+    """Writes the nearest points within the radius of each query into ``index`` and ``found``."""
     starts, counts = _ranges(queries, batch, radius * (1 + SLACK) + SLACK / (1 << curve.bits), curve)
     ends = counts.sum(1).cumsum(0)  # [N]
     total = int(ends[-1]) if len(ends) else 0
     cuts = torch.arange(1, -(-total // CANDIDATES), device=ends.device) * CANDIDATES
-    last = torch.searchsorted(ends, cuts) + 1  # [parts - 1]: queries before and at each cut
+    last = torch.searchsorted(ends, cuts) + 1  # [parts - 1]: number of queries up to and including each cut
     taken = ends[last - 1]
     bounds = [(0, 0), *torch.stack((last, taken), -1).tolist(), (len(queries), total)]
     for (begin, before), (end, after) in itertools.pairwise(bounds):
@@ -111,9 +111,9 @@ def _search(queries: Tensor, batch: Tensor, radius: Tensor, curve: _Curve, index
 
 
 def _ranges(queries: Tensor, batch: Tensor, radius: Tensor, curve: _Curve) -> tuple[Tensor, Tensor]:
-    """Where the cells that a ball meets begin on the curve, and how many points each holds: ``[N, 27]`` both."""
+    """Returns the start on the curve and the number of points of each cell that a ball meets, ``[N, 27]`` each."""
     low, high = curve.cells(queries - radius[:, None]), curve.cells(queries + radius[:, None])
-    # the smallest cells of which three a side are enough
+    # the finest level at which three cells per axis cover the ball
     level = (torch.frexp((high - low).amax(-1).double())[1].long() - 1).clamp(min=0)[:, None]  # [N, 1]
     low, high = low >> level, high >> level
     steps = torch.cartesian_prod(*[torch.arange(3, device=low.device)] * 3)  # [27, 3]
@@ -134,7 +134,7 @@ def _nearest(
     index: Tensor,
     found: Tensor,
 ) -> None:
-    """The nearest of the points in the ranges ``[N, 27]`` of every query, ``total`` of all."""
+    """Writes the nearest points in the ranges ``[N, 27]`` of each query; the ranges hold ``total`` points in all."""
     sizes = counts.flatten()
     owner = torch.arange(len(sizes), device=sizes.device).repeat_interleave(sizes, output_size=total)  # [total]
     place = torch.arange(total, device=sizes.device) + (starts.flatten() - sizes.cumsum(0) + sizes)[owner]
@@ -146,7 +146,7 @@ def _nearest(
     order = order[torch.argsort(query[order], stable=True)]
     query, place = query[order], place[order]
     rank = torch.arange(len(query), device=query.device) - torch.searchsorted(query, query)
-    # those beyond the k-th go to a column that is thrown away: leaving them out would need their number
+    # points beyond the k-th go to an extra column that is dropped: filtering them would need their number
     column = rank.clamp(max=index.shape[1])
     rows = query.new_zeros(len(queries), index.shape[1] + 1).index_put_((query, column), curve.order[place])
     there = torch.zeros_like(rows, dtype=torch.bool).index_put_((query, column), torch.ones_like(query).bool())

@@ -1,7 +1,7 @@
-"""Compiled kernels, kept on disk by numba.
+"""numba kernels, cached on disk.
 
-numba looks for changes in the file that defines a kernel only, while constants and functions may come from other files.
-Kernels are therefore kept in a folder named by a hash of all sources they can be made of, and of the versions.
+numba detects changes only in the file that defines a kernel, but constants and functions may come from other files. The
+cache folder is therefore named by a hash of the versions and of all sources that a kernel can be made of.
 """
 
 from __future__ import annotations
@@ -35,23 +35,23 @@ VARIABLE = "NUMBA_CACHE_DIR"
 config: Any = numba.config  # pyright: ignore[reportPrivateImportUsage]
 
 
-# LLVM uses half of a 512-bit vector on Intel; processors with VBMI2 compute with all of it at full speed.
+# LLVM prefers 256-bit vectors on Intel; processors with VBMI2 run 512-bit vectors at full speed.
 if config.CPU_NAME is None and config.CPU_FEATURES is None:
-    with suppress(RuntimeError):  # LLVM cannot tell everywhere
+    with suppress(RuntimeError):  # LLVM does not know the features of every host
         if llvmlite.binding.get_host_cpu_features().get("avx512vbmi2"):
             config.CPU_FEATURES = codegen.get_host_cpu_features() + ",-prefer-256-bit"
 
 
 def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """``numba.njit(**options)``, compiled at the first call and then kept in :func:`cache_folder`.
+    """Decorator like ``numba.njit(**options)``: compiles at the first call and caches in :func:`cache_folder`.
 
-    A kernel made inside a function must take other kernels from their modules: numba identifies compiled code by the
-    values in the closure, and a kernel is another value in every process.
+    A kernel defined inside a function must refer to other kernels as module globals. numba's cache key contains the
+    values in the closure, and a kernel is a different value in every process.
     """
     options["no_cfunc_wrapper"] = True  # never called as a C function; saves compile time
 
     def compile_later(function: Callable[..., Any]) -> Any:
-        """The kernel, compiled when it is first called."""
+        """Returns the kernel, compiled at its first call."""
         made: Any = numba.njit(**options)(function)
         source = Path(function.__code__.co_filename).resolve().relative_to(PACKAGES)
         folder = _folder(PACKAGES.joinpath(*source.parts[:2]))
@@ -67,20 +67,20 @@ def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
 
 def kernel_part(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """For functions that kernels call: compiled and kept with them; called from Python they are interpreted."""
+    """Decorator for functions that kernels call: compiled and cached with them, interpreted if called from Python."""
     return register_jitable(no_cfunc_wrapper=True, **options)
 
 
 class _Cache(FunctionCache):
-    """numba's cache, but a full disk or a damaged file costs a compilation and not the run."""
+    """numba's cache, but a full disk or a damaged file leads to another compilation instead of an error."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)
-        # numba counts files: two processes could give two signatures one name, and one would run the other's code
+        # numba numbers its files: two processes could use one name for two signatures and run each other's code
         self._cache_file._data_name_pattern = f"{self._impl.filename_base}.{{number:d}}-{secrets.token_hex(8)}.nbc"
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """The kernel for these arguments, or None."""
+        """Returns the cached kernel for these arguments, or None."""
         try:
             return super().load_overload(sig, target_context)
         except Exception as error:  # whatever unpickling raises
@@ -90,25 +90,25 @@ class _Cache(FunctionCache):
             return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Keeps the kernel for these arguments, if the disk has room."""
+        """Saves the kernel for these arguments, if the disk has room."""
         with suppress(OSError):
             super().save_overload(sig, data)
 
 
 class _Announcement(event.Listener):
-    """Says once that kernels are compiled, which takes a while."""
+    """Logs once that kernels are being compiled, which takes a while."""
 
     _said = False
 
     def on_start(self, event: event.Event) -> None:
-        """Says it at the first compilation."""
+        """Logs at the first compilation."""
         if not self._said:
             log.info("compiling kernels, once on this machine and version (about 20 s in all)")
-            gc.freeze()  # else the collector walks through all of torch again and again meanwhile
+            gc.freeze()  # otherwise garbage collection keeps scanning all of torch during compilation
         self._said = True
 
     def on_end(self, event: event.Event) -> None:
-        """Nothing."""
+        """Does nothing."""
 
 
 event.register("numba:compile", _Announcement())
@@ -116,7 +116,7 @@ event.register("numba:compile", _Announcement())
 
 @lru_cache
 def _folder(package: Path) -> Path | None:
-    """Where kernels of a package are kept; None where nothing can be written."""
+    """Returns the cache folder for a package's kernels, or None if it is not writable."""
     base = cache_folder()
     if base is None:
         log.warning("compiled kernels cannot be kept, every process compiles them again: set %s", VARIABLE)
@@ -130,7 +130,7 @@ def _folder(package: Path) -> Path | None:
 
 
 def cache_folder() -> Path | None:
-    """Where kernels and what was measured about this machine are kept; None if it cannot be written to."""
+    """Returns the folder for compiled kernels and this machine's self-check results, or None if it is not writable."""
     given = os.environ.get(VARIABLE)
     try:
         home = Path(given) if given else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
@@ -138,5 +138,5 @@ def cache_folder() -> Path | None:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             return folder
-    except (OSError, RuntimeError):  # RuntimeError: a user without a home
+    except (OSError, RuntimeError):  # RuntimeError: no home directory
         return None

@@ -1,4 +1,4 @@
-"""Functions that compiled kernels of several folders use, vectorising where the library's would not."""
+"""Math functions shared by the compiled kernels of several packages; they vectorise where the standard ones do not."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ HALF, ONE, ZERO = (np.float32(value) for value in (0.5, 1, 0))
 LOG2E = np.float32(1.4426950408889634)
 LN2_HIGH, LN2_LOW = np.float32(0.693359375), np.float32(-2.12194440e-4)
 EXP2_BIAS, EXP2_SHIFT = np.int32(127), np.int32(23)
-LEAST = np.float32(-40)  # exponent: products with e^-87 are denormal, a hundred times as slow on Intel's processors
+LEAST = np.float32(-40)  # smallest exponent: products with e^-87 are denormal, a hundred times slower on Intel CPUs
 E6, E5, E4, E3, E2 = (np.float32(1 / math.factorial(n)) for n in (6, 5, 4, 3, 2))
 
 
@@ -27,7 +27,7 @@ def _float32_of_bits(typing_context, bits):
 
 
 def exp(x: Any) -> Any:
-    """Exponential of what is not positive: in float32 vectorising (relative error 2e-7) and never below e^-40."""
+    """Returns ``e^x`` for x <= 0; in float32 it vectorises (relative error 2e-7) and is at least e^-40."""
     raise NotImplementedError("compiled code only")
 
 
@@ -47,8 +47,8 @@ def _exp_overload(x):
     return exp32
 
 
-# 1 - Phi(z) = t p(t) exp(-z^2 / 2) for z >= 0, t = 1 / (1 + TAIL z). Chosen for the least largest error of gelu and of
-# its slope, 8e-9 before rounding to float32.
+# 1 - Phi(z) = t p(t) exp(-z^2 / 2) for z >= 0, t = 1 / (1 + TAIL z). The coefficients minimise the maximum error of
+# gelu and of its derivative: 8e-9 before rounding to float32.
 TAIL = np.float32(0.28)
 T1, T2, T3, T4, T5, T6 = (
     np.float32(value) for value in (0.11683751, 0.06554693, 0.27367689, -0.24277995, 0.39336311, -0.10664452)
@@ -58,7 +58,7 @@ BELL = np.float32(1 / math.sqrt(2 * math.pi))
 
 @njit(fastmath={"contract", "nsz", "arcp"}, error_model="numpy", inline="always")
 def gelu(x):
-    """``x Phi(x)`` of a float32 and its derivative ``Phi(x) + x phi(x)``, absolute error 4e-7; NaN of NaN."""
+    """Returns ``x Phi(x)`` of a float32 and its derivative ``Phi(x) + x phi(x)``, absolute error 4e-7; NaN for NaN."""
     t = ONE / (ONE + TAIL * np.abs(x))
     bell = exp(-HALF * x * x)
     above = ((((((T6 * t + T5) * t + T4) * t + T3) * t + T2) * t + T1) * t) * bell

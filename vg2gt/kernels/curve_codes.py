@@ -1,4 +1,4 @@
-"""Codes of cells along space-filling curves: Morton, and Hilbert in plain torch, compiled for CPUs and with Triton."""
+"""Codes of cells on space-filling curves: Morton in torch; Hilbert in torch, numba (CPUs) and Triton (CUDA devices)."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ def _spread_bits(values: Tensor) -> Tensor:
 
 
 def z_codes(grid: Tensor) -> Tensor:
-    """Morton codes ``[M]`` of cells ``[M, 3]`` with 0 <= coordinate < 2^21; x holds the highest bit of each triple."""
-    x, y, z = _spread_bits(grid).unbind(-1)  # of all three axes in the same operations
+    """Morton codes ``[...]`` of cells ``[..., 3]``, 0 <= coordinate < 2^21; x holds the highest bit of each triple."""
+    x, y, z = _spread_bits(grid).unbind(-1)  # all three axes at once
     return x << 2 | y << 1 | z
 
 
 def hilbert_codes(grid: Tensor, bits: int) -> Tensor:
-    """Hilbert codes of cells (J. Skilling, "Programming the Hilbert curve", 2004); compiled on a CPU and with Triton.
+    """Hilbert codes of cells (J. Skilling, "Programming the Hilbert curve", 2004), by a compiled kernel if possible.
 
     Args:
         grid: ``[M, 3]`` int64 with 0 <= coordinate < 2^bits.
@@ -54,14 +54,14 @@ def hilbert_codes(grid: Tensor, bits: int) -> Tensor:
 
 
 def has_kernel(device: torch.device) -> bool:
-    """Whether Hilbert codes are a Triton kernel there."""
+    """Whether a Triton kernel computes Hilbert codes on this device."""
     cuda = device.type == "cuda" and not torch.compiler.is_compiling()
     return cuda and importlib.util.find_spec("triton") is not None
 
 
 @kernel(nogil=True)
 def _hilbert(grid: NDArray[np.int64], bits: int, axes: NDArray[np.int64], codes: NDArray[np.int64]) -> None:
-    """:func:`hilbert_reference`, one cell after the other; ``axes`` ``[3]`` is overwritten."""
+    """:func:`hilbert_reference`, one cell at a time; ``axes`` ``[3]`` is scratch memory."""
     for m in range(len(grid)):
         axes[0], axes[1], axes[2] = grid[m, 0], grid[m, 1], grid[m, 2]
         for level in range(bits - 1, 0, -1):

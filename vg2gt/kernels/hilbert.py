@@ -1,7 +1,7 @@
-"""Hilbert codes of cells in one Triton kernel: in plain torch they are some four hundred launches."""
+"""Hilbert codes of cells in one Triton kernel; plain torch needs about 400 launches."""
 
 # pyright: reportGeneralTypeIssues=false, reportOperatorIssue=false, reportIndexIssue=false
-# (inside a kernel the operators and ranges are Triton's language, which its type hints do not describe)
+# (Triton's type hints do not cover the operators and ranges used inside kernels)
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ import triton  # pyright: ignore[reportMissingImports]
 import triton.language as tl  # pyright: ignore[reportMissingImports]
 from torch import Tensor
 
-CELLS = 256  # a program
+CELLS = 256  # cells per program
 
 _CELLS = tl.constexpr(CELLS)
 
 
 @triton.jit(do_not_specialize=("count", "bits"))
 def hilbert_kernel(grid, codes, count, bits):
-    """:func:`vg2gt.kernels.curve_codes.hilbert_reference`, a lane a cell."""
+    """:func:`vg2gt.kernels.curve_codes.hilbert_reference`, one lane per cell."""
     m = tl.program_id(0).to(tl.int64) * _CELLS + tl.arange(0, _CELLS)
     there = m < count
     x = tl.load(grid + 3 * m, mask=there, other=0)
@@ -51,11 +51,11 @@ def hilbert_kernel(grid, codes, count, bits):
 
 
 def hilbert_in_one_kernel(grid: Tensor, bits: int) -> Tensor:
-    """Codes ``[M]`` of cells ``[M, 3]`` on a GPU, as :func:`vg2gt.kernels.curve_codes.hilbert_codes`."""
+    """Codes ``[M]`` of cells ``[M, 3]`` on a GPU; see :func:`vg2gt.kernels.curve_codes.hilbert_codes`."""
     grid = grid.contiguous()
     codes = grid.new_empty(len(grid))
     if len(grid):
         with torch.cuda.device_of(grid):
-            kernel: Any = hilbert_kernel  # which Triton makes an object that takes a grid
+            kernel: Any = hilbert_kernel  # Triton kernels are launched as kernel[grid](...)
             kernel[(-(-len(grid) // CELLS),)](grid, codes, len(grid), bits, num_warps=4)
     return codes

@@ -12,18 +12,18 @@ from vg2gt.kernels.compiled import kernel
 from vg2gt.kernels.compiled_math import gelu
 from vg2gt.kernels.threads import over_voxels, parallel_for
 
-PARTS = 16  # of the voxels; their sums over all points are added in this order, whatever the number of threads
+PARTS = 16  # parts of the voxels; weight gradients are summed per part, in the same order for any number of threads
 
 
 class PooledFeatures(torch.autograd.Function):
-    """The compiled pass; the features are made again for the gradient instead of being kept."""
+    """Compiled pooling; the backward pass recomputes the features instead of keeping them."""
 
     @staticmethod
     def forward(
         ctx: Any, dense: Tensor, offset: Tensor, weight: Tensor, confidence: Tensor,
         order: Tensor, starts: Tensor, counts: Tensor, voxel_of: Tensor,
     ) -> Tensor:  # fmt: skip
-        """Means ``[M, C]`` over the points of the voxels, which :class:`vg2gt.method.grid.VoxelPlan` lists."""
+        """Returns means ``[M, C]`` over each voxel's points, as listed by a :class:`vg2gt.method.grid.VoxelPlan`."""
         inputs = [tensor.detach().contiguous() for tensor in (dense, offset, weight.t(), confidence)]
         voxels, ends = len(starts), starts + counts
         mean, total = dense.new_empty(voxels, dense.shape[1]), dense.new_empty(voxels)
@@ -35,7 +35,7 @@ class PooledFeatures(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore
-        """Gradients of the dense features, places, weight and confidence."""
+        """Returns gradients of the dense features, offsets, weight and confidence."""
         dense, offset, weight, confidence, mean, total = ctx.saved_tensors
         order, starts, ends, voxel_of = ctx.plan
         grad = grad_outputs[0].contiguous()
@@ -54,14 +54,14 @@ class PooledFeatures(torch.autograd.Function):
 
 
 def _parts(voxels: int) -> list[tuple[int, int, int]]:
-    """Number, first voxel and end of every part."""
+    """Returns index, first voxel and end of every part."""
     bounds = [voxels * part // PARTS for part in range(PARTS + 1)]
     return list(zip(range(PARTS), bounds[:-1], bounds[1:], strict=True))
 
 
 @kernel(fastmath={"contract", "nsz", "arcp"}, error_model="numpy", nogil=True)
 def _pool(dense, offset, weight, confidence, order, starts, ends, mean, total, first, last):
-    """Means of voxels ``first`` to ``last`` and the sums of their points' confidences; ``weight`` is ``[3, C]``."""
+    """Writes means and summed confidences of voxels ``first .. last - 1``; ``weight`` is ``[3, C]``."""
     channels = dense.shape[1]
     for voxel in range(first, last):
         for c in range(channels):
@@ -84,7 +84,7 @@ def _pool_backward(
     dense, offset, weight, confidence, order, starts, ends, total,
     grad, along_mean, of_dense, of_offset, of_confidence, of_weight, part, first, last,
 ):  # fmt: skip
-    """Gradients at the points of voxels ``first`` to ``last``, and that of the weight, summed over them."""
+    """Writes the gradients at the points of voxels ``first .. last - 1``; sums that of the weight per part."""
     channels = dense.shape[1]
     for voxel in range(first, last):
         inverse = np.float32(1) / total[voxel]

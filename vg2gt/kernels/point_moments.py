@@ -15,7 +15,7 @@ def moments_compiled(
     values: Tensor, depth: Tensor, confidence: Tensor, views: Tensor, means: Tensor,
     order: Tensor, starts: Tensor, counts: Tensor,
 ) -> Moments:  # fmt: skip
-    """Means of products of what differs from the means."""
+    """Returns second moments about the means; see :func:`vg2gt.method.additions.point_moments.pool_point_moments`."""
     inputs = [tensor.detach().contiguous() for tensor in (values, depth, confidence, views, means)]
     voxels = len(starts)
     found = tuple(values.new_empty(voxels, *shape) for shape in ((3, 3), (3, 3), (3,), ()))
@@ -28,7 +28,7 @@ def moments_compiled(
 
 @kernel(fastmath={"contract", "nsz", "arcp"}, error_model="numpy", nogil=True)
 def _pool(values, depth, confidence, views, means, order, starts, ends, spread, cross, eye, pixel, first, last):
-    """Moments of voxels ``first`` to ``last``; x, y, z are places, r, g, b colours from the means."""
+    """Writes the moments of voxels ``first .. last - 1``; x, y, z and r, g, b are differences from the means."""
     views_a_point = len(views) / max(len(values), 1)
     for voxel in range(np.uintp(first), np.uintp(last)):
         mean_x, mean_y, mean_z = means[voxel, 0], means[voxel, 1], means[voxel, 2]
@@ -38,7 +38,7 @@ def _pool(values, depth, confidence, views, means, order, starts, ends, spread, 
         xr = xg = xb = yr = yg = yb = zr = zg = zb = np.float32(0)
         for place in range(np.uintp(starts[voxel]), np.uintp(ends[voxel])):
             point = np.uintp(order[place])
-            view = np.uintp((point + 0.5) * views_a_point)  # a division of integers takes longer
+            view = np.uintp((point + 0.5) * views_a_point)  # faster than an integer division
             n = confidence[point]
             total += n
             eye_x += n * views[view, 0]

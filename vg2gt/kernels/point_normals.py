@@ -1,4 +1,4 @@
-"""The loss of surface normals with its gradient in one pass (:mod:`vg2gt.losses.point_normals`)."""
+"""The surface normal loss and its gradient in one compiled pass (:mod:`vg2gt.losses.point_normals`)."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from torch import Tensor
 from vg2gt.kernels.compiled import kernel, kernel_part
 from vg2gt.kernels.threads import parallel_for
 
-PITCH, LINES = 256, 16  # of the compiled rows' table: depth, truth and validity of three rows, slopes, derivatives
+PITCH, LINES = 256, 16  # a view's table: depth, truth and validity of three rows each, ray slopes, derivatives
 OWN, LEFT, RIGHT, ABOVE, BELOW = (PITCH * line for line in range(11, LINES))
 ONE, ZERO = np.float32(1), np.float32(0)
 
 
 class PointNormals(torch.autograd.Function):
-    """The kernels as one operation: value and gradient of the depth come out of one pass."""
+    """Autograd function whose forward pass computes the loss and its gradient with respect to depth."""
 
     @staticmethod
     def forward(
         ctx: Any, depth: Tensor, true: Tensor, valid: Tensor, intrinsics: Tensor, true_intrinsics: Tensor, turn: Tensor,
         strides: tuple[int, ...],
     ) -> Tensor:  # fmt: skip
-        """The loss of depth ``[V, H, W]``; ``turn`` ``[V, 3, 3]`` leads from the true cameras' frames."""
+        """Returns the loss of depth ``[V, H, W]``; ``turn`` ``[V, 3, 3]`` rotates true to predicted camera frames."""
         maps = [values.detach().contiguous().numpy() for values in (depth, true.to(depth), valid)]
         pinholes = [_pinholes(matrix.to(depth)) for matrix in (intrinsics, true_intrinsics)]
         turn = turn.detach().to(depth).contiguous()
@@ -39,18 +39,18 @@ class PointNormals(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
-        """Gradient of the depth."""
+        """Returns the gradient of the depth."""
         return ctx.gradient * gradients[0], *[None] * 6
 
 
 def _pinholes(intrinsics: Tensor) -> np.ndarray:
-    """``[V, 4]`` focal lengths and principal points."""
+    """Returns ``[V, 4]`` focal lengths and principal points (fx, fy, cx, cy)."""
     columns = [intrinsics[:, row, column] for row, column in ((0, 0), (1, 1), (0, 2), (1, 2))]
     return torch.stack(columns, -1).detach().numpy()
 
 
 def _count_corners(valid: Tensor, stride: int) -> int:
-    """Corners of ``valid`` ``[V, H, W]`` at a stride: four a square of valid pixels, one where one is not valid."""
+    """Counts corners of ``valid`` ``[V, H, W]`` at a stride: four per square of valid pixels, one if one is invalid."""
     pixels = valid[:, ::stride, ::stride].to(torch.uint8)
     pairs = pixels[:, 1:] + pixels[:, :-1]
     squares = pairs[..., 1:] + pairs[..., :-1]
@@ -59,11 +59,11 @@ def _count_corners(valid: Tensor, stride: int) -> int:
 
 @kernel(fastmath={"contract", "nsz", "arcp", "reassoc"}, error_model="numpy", nogil=True)
 def _disagreement(view, depth, true, valid, pinholes, true_pinholes, turn, strides, weights, tables, gradient, totals):
-    """``sum weight (1 - cos)`` of one view's corners at all strides; its derivative is added to ``gradient``.
+    """Adds one view's ``sum weight (1 - cos)`` over corners and strides to ``totals``, its derivative to ``gradient``.
 
-    Rows are worked on in pieces that are first copied into the view's own of the ``tables`` ``[V, LINES PITCH]``, whose
-    lines the compiler knows to be apart, so that it makes vector instructions. Invalid pixels are copied as depth one
-    that does not count.
+    Rows are processed in pieces, which are first copied into the view's row of ``tables`` ``[V, LINES PITCH]``. The
+    compiler knows that the lines of a table do not overlap, so it vectorises. Invalid pixels are copied as depth one
+    with validity zero.
     """
     height, width = valid.shape[1:]
     table = tables[view]
@@ -109,7 +109,7 @@ def _disagreement(view, depth, true, valid, pinholes, true_pinholes, turn, strid
 
 @kernel_part(fastmath={"contract", "nsz", "arcp", "reassoc"}, error_model="numpy")
 def _row(table, columns, v, w, sx, sy, tx, ty, r):
-    """``sum 1 - cos`` over a row's corners; writes their derivatives into the table's last five lines.
+    """Returns ``sum 1 - cos`` over a row's corners; writes their derivatives into the table's last five lines.
 
     The normals are those of ``vg2gt.losses.point_normals._corner_normals``: x, y, z predicted, ex, ey, ez true.
     """
@@ -144,7 +144,7 @@ def _row(table, columns, v, w, sx, sy, tx, ty, r):
 
 @kernel_part(fastmath={"contract", "nsz", "arcp", "reassoc"}, error_model="numpy", forceinline=True)
 def _turn_of_corner(x, y, ex, ey, u, v, q, w, r, counts):
-    """``1 - cos`` of one corner and minus its derivatives by ``x`` and ``y``, all times ``counts``."""
+    """Returns ``1 - cos`` of one corner and its negated derivatives by ``x`` and ``y``, all times ``counts``."""
     z = -ONE - u * x - v * y
     ez = -ONE - q * ex - w * ey
     nx = r[0, 0] * ex + r[0, 1] * ey + r[0, 2] * ez

@@ -1,4 +1,4 @@
-"""``1 - SSIM`` with its gradient in one pass (:func:`vg2gt.losses.structure.structure_loss`)."""
+"""``1 - SSIM`` and its gradient in one compiled pass (:func:`vg2gt.losses.structure.structure_loss`)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor
 from vg2gt.kernels.compiled import kernel
 from vg2gt.kernels.threads import parallel_for
 
-WINDOW, SIGMA = 11, 1.5  # kornia's Gaussian has this standard deviation whatever the window
+WINDOW, SIGMA = 11, 1.5  # kornia's Gaussian has this standard deviation for every window size
 HALF = WINDOW // 2
 C1, C2 = np.float32(0.01**2), np.float32(0.03**2)
 Bands = tuple[np.ndarray, np.ndarray]
@@ -20,11 +20,11 @@ ONE, TWO, ZERO = np.float32(1), np.float32(2), np.float32(0)
 
 
 class Structure(torch.autograd.Function):
-    """The kernel as one operation: value and gradient of the images come out of one pass."""
+    """Autograd function whose forward pass computes the loss and its gradient with respect to the images."""
 
     @staticmethod
     def forward(ctx: Any, images: Tensor, reference: Tensor) -> Tensor:
-        """The loss."""
+        """Returns the loss."""
         planes = [tensor.detach().flatten(0, 1).contiguous().numpy() for tensor in (images, reference)]
         gradient = np.empty_like(planes[0])
         totals = np.empty(len(gradient))
@@ -40,13 +40,13 @@ class Structure(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:  # type: ignore[override]
-        """Gradient of the images."""
+        """Returns the gradient of the images."""
         return ctx.gradient * gradients[0], None
 
 
 @lru_cache(maxsize=16)
 def _bands(size: int) -> Bands:
-    """The window along an axis as a matrix with reflected borders, and its transpose, by diagonals ``[11, n]``."""
+    """Returns diagonals ``[11, n]`` of the window's matrix along an axis (borders reflected) and of its transpose."""
     weights = np.exp(-(np.arange(-HALF, HALF + 1) ** 2) / (2 * SIGMA**2))
     matrix = np.zeros((size, size))
     for place in range(size):
@@ -60,7 +60,7 @@ def _bands(size: int) -> Bands:
 
 
 def _similarity(x: np.ndarray, y: np.ndarray, rows: Bands, columns: Bands, gradient: np.ndarray) -> float:
-    """The sum of one plane's SSIM; its derivative by ``x`` ``[H, W]`` goes into ``gradient``."""
+    """Returns the sum of one plane's SSIM; writes its derivative by ``x`` ``[H, W]`` into ``gradient``."""
     means = [_window(values, rows[0], columns[0]) for values in (x, y, x * x, y * y, x * y)]
     total = _combine(*(mean.ravel() for mean in means))
     of_mean, of_square, of_product = (_window(means[part], rows[1], columns[1]) for part in (0, 2, 4))
@@ -79,10 +79,10 @@ def _window(values: np.ndarray, down: np.ndarray, across: np.ndarray) -> np.ndar
 
 @kernel(fastmath={"contract", "nsz", "arcp"}, error_model="numpy", nogil=True)
 def _combine(a, b, p, q, r):
-    """The sum of SSIM from windowed means of image, reference, their squares and product, ``[H W]`` each.
+    """Returns the sum of SSIM from windowed means of image, reference, their squares and product, ``[H W]`` each.
 
     ``SSIM = (2 a b + C1) (2 (r - a b) + C2) / ((a^2 + b^2 + C1) (p - a^2 + q - b^2 + C2))``. Its derivatives by a, p
-    (twice, for x^2 has the derivative 2 x) and r take the places of a, p and r.
+    (doubled, because x^2 has the derivative 2 x) and r overwrite a, p and r.
     """
     total = 0.0
     for pixel in range(len(a)):
@@ -100,7 +100,7 @@ def _combine(a, b, p, q, r):
 
 @kernel(fastmath={"contract", "nsz", "arcp"}, error_model="numpy", nogil=True)
 def _blur(source, down, across, line, out):
-    """The window over ``source`` ``[H, W]`` into ``out``; ``line`` ``[W + 10]`` keeps its zeros at both ends."""
+    """Filters ``source`` ``[H, W]`` into ``out``; ``line`` ``[W + 10]`` is scratch memory with zeros at both ends."""
     height, width = source.shape
     for i in range(height):
         for j in range(width):

@@ -1,4 +1,4 @@
-"""Parallel loops over compiled kernels that release the interpreter's lock, on as many threads as torch uses."""
+"""Parallel loops over compiled kernels that release the GIL, on as many threads as torch uses."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ import torch
 from torch import Tensor
 
 Item = TypeVar("Item")
-VOXELS_AT_ONCE = 2048  # by one thread
+VOXELS_AT_ONCE = 2048  # voxels per work item
 _Body = ctypes.CFUNCTYPE(None, ctypes.c_void_p)
 
 
 def parallel_for(items: Sequence[Item], function: Callable[[Item], None]) -> None:
-    """Calls ``function(item)`` for every item; which thread takes which is left open.
+    """Calls ``function(item)`` for every item, in any order and on any thread.
 
     Raises:
-        Exception: the first one that ``function`` raised; items that no thread had begun are left out.
+        Exception: the first one raised by ``function``; items that have not started are skipped.
     """
     threads = min(torch.get_num_threads(), len(items))
     team = _openmp_team()
@@ -38,38 +38,38 @@ def parallel_for(items: Sequence[Item], function: Callable[[Item], None]) -> Non
 
 
 def _on_team(team: Callable[..., None], threads: int, items: Sequence[Item], function: Callable[[Item], None]) -> None:
-    """Every thread of the team takes the next item until none is left."""
+    """Runs the loop on an OpenMP team: every thread takes the next item until none is left."""
     waiting, failures, begun = iter(items), [], []
 
     def body(_: int | None) -> None:
-        """What one thread does."""
+        """Runs on each thread of the team."""
         try:
             begun.append(threading.get_ident())
-            for item in waiting:  # a sequence's iterator hands out every item once, under the interpreter's lock
+            for item in waiting:  # under the GIL a sequence's iterator yields every item once
                 if failures:
                     return
                 function(item)
-        except BaseException as error:  # must not pass through OpenMP
+        except BaseException as error:  # must not propagate through OpenMP
             failures.append(error)
 
     team(_Body(body), None, threads, 0)
     if failures:
         raise failures[0]
-    if threading.get_ident() not in begun:  # an interruption came as ``body`` began here, and ctypes only reports it
+    if threading.get_ident() not in begun:  # Ctrl-C arrived here before ``body`` began, and ctypes only prints it
         raise KeyboardInterrupt
 
 
 @lru_cache(maxsize=1)
 def _openmp_team() -> Callable[..., None] | None:
-    """OpenMP's entry point for a parallel region in the library that torch uses, or None where it has none.
+    """Returns ``GOMP_parallel`` of the OpenMP library that torch uses, or None if it has none.
 
-    Torch's own threads wait by spinning: threads of ours would share the cores with them.
+    torch's threads spin while they wait: separate threads would compete with them for the cores.
     """
     if sys.platform != "linux":
         return None
     library = Path(torch.__file__).parent / "lib" / "libtorch_cpu.so"
     try:
-        parallel = ctypes.CDLL(str(library)).GOMP_parallel  # looked up in the libraries that this one needs
+        parallel = ctypes.CDLL(str(library)).GOMP_parallel  # resolved in the library's dependencies
     except (OSError, AttributeError):
         return None
     parallel.argtypes, parallel.restype = [_Body, ctypes.c_void_p, ctypes.c_uint, ctypes.c_uint], None
@@ -77,17 +77,17 @@ def _openmp_team() -> Callable[..., None] | None:
 
 
 @lru_cache(maxsize=4)
-def _pool(threads: int, process: int) -> ThreadPoolExecutor:  # by process: a forked child must not use its parent's
+def _pool(threads: int, process: int) -> ThreadPoolExecutor:  # per process: a forked child must not use its parent's
     return ThreadPoolExecutor(threads, thread_name_prefix=f"vg2gt-{process}")
 
 
 def compilable(*tensors: Tensor, dtype: torch.dtype = torch.float32) -> bool:
-    """Whether all are of that type on a CPU, and ``torch.compile``, which cannot read kernels, is not tracing."""
+    """Whether all tensors are ``dtype`` on a CPU and ``torch.compile``, which cannot trace kernels, is not active."""
     suits = all(tensor.device.type == "cpu" and tensor.dtype == dtype for tensor in tensors)
     return suits and not torch.compiler.is_compiling()
 
 
 def over_voxels(voxels: int, run: Callable[[int, int], None]) -> None:
-    """Calls ``run(first, last)`` for ranges that cover the voxels once, the same for any number of threads."""
+    """Calls ``run(first, last)`` for ranges that cover all voxels once and do not depend on the number of threads."""
     firsts = range(0, voxels, VOXELS_AT_ONCE)
     parallel_for(firsts, lambda first: run(first, min(first + VOXELS_AT_ONCE, voxels)))

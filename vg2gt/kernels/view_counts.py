@@ -18,7 +18,7 @@ def count_compiled(
     tolerance: float,
     margin: float,
 ) -> list[NDArray[np.float32]]:
-    """Views that agree, look through and are hidden, ``[V, H, W]`` each; ``matrix [V, K, 3, 4]`` leads to partners."""
+    """Counts views that agree, look through and are hidden, ``[V, H, W]`` each; ``matrix``: see :func:`_count_view`."""
     sums = [np.zeros(depth.shape, np.float32) for _ in range(3)]
     parallel_for(
         range(len(depth)),
@@ -29,7 +29,7 @@ def count_compiled(
 
 @kernel(fastmath={"contract", "nsz", "arcp"}, error_model="numpy", nogil=True)
 def _count_view(view, depth, partners, matrix, tolerance, margin, agree, through, hidden):
-    """Counts of one view; ``matrix [V, K, 3, 4]`` takes ``depth * (x, y, 1)`` into a partner's image."""
+    """Counts for one view's pixels; ``matrix`` ``[V, K, 3, 4]`` maps ``depth * (x, y, 1)`` to a partner's image."""
     height, width = depth.shape[1:]
     one, half = np.float32(1), np.float32(0.5)
     most = one - margin

@@ -12,11 +12,11 @@ from vg2gt.kernels.compiled import kernel
 from vg2gt.kernels.compiled_math import exp
 from vg2gt.kernels.threads import over_voxels
 
-I1, I2, I3, I4, I5, I8, I9 = (np.uintp(number) for number in (1, 2, 3, 4, 5, 8, 9))  # unsigned: no index from the end
+I1, I2, I3, I4, I5, I8, I9 = (np.uintp(number) for number in (1, 2, 3, 4, 5, 8, 9))  # unsigned: no negative indices
 
 
 def facing_compiled(spread: Tensor, facing: Tensor, prior: float) -> Tensor:
-    """Directions ``[M, 3]`` of least spread ``[M, 3, 3]``, on the side of ``facing`` ``[M, 3]``."""
+    """Returns directions ``[M, 3]`` of least variance in ``spread`` ``[M, 3, 3]``, towards ``facing`` ``[M, 3]``."""
     normal = facing.new_empty(facing.shape)
     arrays = [values.detach().flatten().numpy() for values in (spread, facing, normal)]
     over_voxels(len(normal), lambda first, last: _face(*arrays, prior, first, last))
@@ -25,9 +25,9 @@ def facing_compiled(spread: Tensor, facing: Tensor, prior: float) -> Tensor:
 
 @kernel(fastmath={"contract", "nsz", "arcp"}, error_model="numpy", nogil=True)
 def _face(spread, facing, normal, prior, first, last):
-    """Normals of voxels ``first`` to ``last``, by the steps of ``smallest_eigenvector`` and in float64 like it.
+    """Writes the normals of voxels ``first .. last - 1``, by the steps of ``smallest_eigenvector`` in float64.
 
-    The least root of the cubic lies ``1 + t`` radii below the mean, ``t^2 (t + 3)`` is known, and Newton finds ``t``.
+    The smallest eigenvalue is ``mean - (1 + t) radius``. ``t^2 (t + 3)`` is known; Newton's method finds ``t``.
     """
     for voxel in range(np.uintp(first), np.uintp(last)):
         row, cell = I3 * voxel, I9 * voxel
@@ -48,7 +48,7 @@ def _face(spread, facing, normal, prior, first, last):
         determinant = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
         known = min(max(2.0 - determinant / max(square * radius, 1e-300), 0.0), 4.0)  # t^2 (t + 3)
         root = math.sqrt(known / 3.0)
-        part = 1.0 + root * (0.034 * root - 0.154)  # t / root, within 0.0012; two steps leave 3e-13
+        part = 1.0 + root * (0.034 * root - 0.154)  # t / root, error 0.0012; after two steps 3e-13
         for _ in range(2):
             part -= ((root * part + 3.0) * part * part - 3.0) / (3.0 * part * (root * part + 2.0))
         below = radius * (1.0 + root * part)
@@ -76,11 +76,12 @@ def _face(spread, facing, normal, prior, first, last):
 def spread_around(
     keys: Tensor, columns: Tensor, counts: Tensor, spread: Tensor, normal: Tensor, offset: Tensor, same_surface: float
 ) -> Tensor:
-    """Covariances ``[M, 3, 3]`` of the points of every voxel and of the 26 around it, as the method's reference.
+    """Returns covariances ``[M, 3, 3]`` of the points in every voxel and its 26 neighbours; see the method's reference.
 
-    ``keys [M]`` are the cells', ascending, and ``columns [9]`` lead from one to those of its columns' first cells.
+    ``keys`` ``[M]`` are the cells' keys, ascending. ``columns`` ``[9]`` are the offsets from a cell's key to those of
+    the first cells of the nine columns around it.
     """
-    above = keys.new_full((1,), torch.iinfo(keys.dtype).max)  # all cells: a walk along the keys stops there
+    above = keys.new_full((1,), torch.iinfo(keys.dtype).max)  # a sentinel that ends the scan of the keys
     around = torch.empty_like(spread, memory_format=torch.contiguous_format)
     inputs = (torch.cat((keys, above)), columns, counts, spread, normal, offset, around)
     arrays = [values.detach().contiguous().numpy() for values in inputs]
@@ -91,9 +92,9 @@ def spread_around(
 
 @kernel(fastmath={"contract", "nsz", "arcp"}, error_model="numpy", nogil=True)
 def _spread_around(keys, columns, counts, spread, normal, offset, around, starts, sharpness, first, last):
-    """:func:`spread_around` of voxels ``first`` to ``last``; ``keys`` ``[M + 1]`` end with a number above all.
+    """:func:`spread_around` of voxels ``first .. last - 1``; ``keys`` ``[M + 1]`` end with a sentinel.
 
-    Cells of a column have keys in a row, and with the voxels' keys those of their columns ascend.
+    The cells of a column have consecutive keys. As the voxels' keys ascend, so do those of each column.
     """
     one = np.float32(1)
     for column in range(9):

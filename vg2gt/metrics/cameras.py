@@ -10,20 +10,20 @@ from vg2gt.types import Cameras
 
 ACCURACIES = (5, 15, 30)
 AREAS = (3, 5, 15, 30)
-STILL = 1e-6  # a shorter baseline, in distances from the world's origin, is float32's rounding
+STILL = 1e-6  # shorter baselines, relative to the distance from the world's origin, are float32 rounding
 
 
 def relative_pose_errors(predicted: Cameras, reference: Cameras) -> tuple[Tensor, Tensor]:
     """Errors of the relative pose of every pair of views, in degrees.
 
     Args:
-        predicted: B scenes, V views.
+        predicted: cameras of B scenes with V views.
         reference: the same views, in any world frame and unit.
 
     Returns:
-        Rotation errors ``[B, V (V - 1) / 2]`` and errors of the direction of translation, at most 90: a direction and
-        its opposite count as equal. The latter is 0 where the reference does not move, 90 where only the prediction
-        does not.
+        Rotation errors and errors of the translation direction, ``[B, V (V - 1) / 2]`` each. The latter are at most
+        90, because opposite directions count as equal. They are 0 where the reference does not move, and 90 where only
+        the prediction does not.
     """
     first, second = torch.triu_indices(*(predicted.world_to_camera.shape[1],) * 2, offset=1)
     relative, still = [], []
@@ -31,7 +31,7 @@ def relative_pose_errors(predicted: Cameras, reference: Cameras) -> tuple[Tensor
         poses = cameras.world_to_camera.double()
         pairs = poses[:, second] @ invert_rigid(poses[:, first])
         relative.append(pairs)
-        # Equal centres far from the origin leave float32's rounding, which has a direction.
+        # The difference of equal centres far from the origin is float32 rounding, which has a direction.
         distance = torch.maximum(poses[:, first, :3, 3].norm(dim=-1), poses[:, second, :3, 3].norm(dim=-1))
         still.append(pairs[..., :3, 3].norm(dim=-1) <= STILL * distance)
     difference = relative[0][..., :3, :3].transpose(-1, -2) @ relative[1][..., :3, :3]
@@ -50,16 +50,16 @@ def camera_metrics(predicted: Cameras, reference: Cameras) -> dict[str, float]:
     """Scores the cameras of one or more scenes over all pairs of views.
 
     Args:
-        predicted: B scenes, V >= 2 views.
+        predicted: cameras of B scenes with V >= 2 views.
         reference: the same views.
 
     Returns:
-        ``rra_T`` and ``rta_T``: shares of pairs whose rotation, translation error is below T = 5, 15, 30 degrees;
+        ``rra_T`` and ``rta_T``: shares of pairs with a rotation or translation error below T = 5, 15, 30 degrees;
         ``auc_T``, T = 3, 5, 15, 30: area under the accuracy curve of the larger of both errors up to T degrees, in
         steps of one degree.
 
     Raises:
-        ValueError: if there is no pair.
+        ValueError: if there are fewer than two views.
     """
     if predicted.world_to_camera.shape[1] < 2:
         raise ValueError("camera metrics need at least 2 views per scene, got 1")

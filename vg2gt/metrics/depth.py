@@ -1,4 +1,4 @@
-"""Depth errors after alignment (paper, eq_delta_n), and where depth breaks off."""
+"""Depth errors after alignment (paper, eq_delta_n), and depth edges."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ def depth_metrics(
         reference: ``[V, H, W]`` true z-depth, 0 = invalid.
         alignment: ``median``: one median ratio per image; ``scene``: one median ratio per scene; ``wmed``: the ratio
             per image that minimises the relative L1 error; ``scale_shift``: least squares per image; ``none``.
-        region: ``[V, H, W]`` bool, the pixels that are scored; all of them decide the alignment. None scores all.
+        region: ``[V, H, W]`` bool, pixels to score; the alignment uses all pixels regardless. None scores all.
 
     Returns:
         ``abs_rel``, ``mae``, ``rmse`` (in the reference's unit), ``delta_1.25``, ``delta_1.05``, ``delta_1.03`` over
         the pixels that count; ``coverage``, the share of usable reference pixels that have a depth; ``delta_*_holes``,
-        where a hole fails the test. Images without any usable pixel are left out; NaN if that leaves none.
+        in which holes count as failures. Images without usable pixels are left out; NaN if none remain.
 
     Raises:
         ValueError: if the shapes differ or the alignment is unknown.
@@ -62,7 +62,7 @@ def depth_metrics(
 
 
 def align_depth(predicted: Tensor, reference: Tensor, alignment: str) -> Tensor:
-    """Brings the depths ``[N]`` of one image onto their references ``[N]``; see :func:`depth_metrics`."""
+    """Aligns the depths ``[N]`` of one image to their references ``[N]``; see :func:`depth_metrics`."""
     if alignment == "none" or predicted.numel() == 0:
         return predicted
     if alignment == "median":
@@ -96,12 +96,12 @@ NEAR = 3  # pixels
 
 
 def near_depth_edges(depth: Tensor, step: float = EDGE, near: int = NEAR) -> Tensor:
-    """Pixels at most ``near`` pixels (along either axis) from a depth edge.
+    """Marks pixels at most ``near`` pixels (along either axis) from a depth edge.
 
     Args:
-        depth: ``[..., H, W]`` z-depth, 0 = invalid; a step to an invalid pixel is none.
-        step: relative difference of neighbours above which there is an edge between them.
-        near: in pixels.
+        depth: ``[..., H, W]`` z-depth, 0 = invalid; steps to invalid pixels are not edges.
+        step: relative difference between neighbours above which there is an edge.
+        near: distance in pixels.
 
     Returns:
         ``[..., H, W]`` bool.

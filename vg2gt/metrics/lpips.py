@@ -18,7 +18,7 @@ HOW_TO_GET = "evaluation.lpips=download or evaluation.lpips=PATH"
 
 # Convolutions of each stage up to the activation that is compared; max pooling between the stages.
 STAGES = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512))
-# Mean and deviation of ImageNet's colours, for images in [-1, 1].
+# Mean and standard deviation of ImageNet colours, for images in [-1, 1].
 SHIFT = (-0.030, -0.088, -0.188)
 SCALE = (0.458, 0.448, 0.450)
 SMALLEST_IMAGE = 2 ** (len(STAGES) - 1)
@@ -26,18 +26,18 @@ EPSILON = 1e-10
 
 
 class WeightsNotFoundError(FileNotFoundError):
-    """LPIPS has no weights here (``vgg16-397923af.pth``, 528 MB); the message says how to get them."""
+    """Raised if the LPIPS weights (``vgg16-397923af.pth``, 528 MB) are missing; the message says how to get them."""
 
 
 class LPIPS(nn.Module):
     """Distance of unit-length VGG-16 features, weighted by channel, averaged over the image, summed over five stages.
 
     Args:
-        state: ``features.N.weight`` and ``features.N.bias`` of VGG-16 (torchvision's names; others are left alone) and
-            ``linK.model.1.weight``, K = 0 .. 4, the channel weights (the names of LPIPS' own file).
+        state: ``features.N.weight`` and ``features.N.bias`` of VGG-16 (torchvision's names), and the channel weights
+            ``linK.model.1.weight``, K = 0 .. 4 (names of the official LPIPS file). Other entries are ignored.
 
     Raises:
-        ValueError: naming the first tensor that is missing or has another shape.
+        ValueError: if a tensor is missing or has the wrong shape; the message names the first.
     """
 
     shift: Tensor
@@ -88,7 +88,7 @@ class LPIPS(nn.Module):
         return torch.stack([self._distance(*pair) for pair in pairs]).reshape(predicted.shape[:-3])
 
     def _distance(self, predicted: Tensor, reference: Tensor) -> Tensor:
-        """One pair ``[3, H, W]`` at a time: the first stage holds 128 floats for every pixel of both images."""
+        """Compares one pair ``[3, H, W]``; pairs are not batched, as the first stage holds 128 floats per pixel."""
         features = (torch.stack((predicted, reference)).float().clamp(0, 1) * 2 - 1 - self.shift) / self.scale
         distance = features.new_zeros(())
         for stage, (convolutions, weights) in enumerate(zip(self.stages, self.channel_weights, strict=True)):
@@ -102,23 +102,23 @@ class LPIPS(nn.Module):
 
 
 def load_lpips(source: str = "auto") -> LPIPS:
-    """Builds LPIPS from weights on this machine; only tensors are read, never code.
+    """Builds LPIPS from its weights; reads tensors only, never code.
 
     Args:
-        source: ``auto``: VGG-16 as torch hub has it in its cache; ``download``: fetched into that cache if needed; or
-            the path of a ``.pth`` or ``.safetensors`` file, or of a folder of them. Channel weights that are not there
-            come from torchmetrics' installation.
+        source: ``auto``: VGG-16 from torch hub's cache. ``download``: the same, downloaded into the cache if needed.
+            Otherwise the path of a ``.pth`` or ``.safetensors`` file, or of a folder of such files. Missing channel
+            weights are read from the installed torchmetrics.
 
     Raises:
-        WeightsNotFoundError: if there are no weights, saying how to get them.
-        ValueError: if the files hold something else.
+        WeightsNotFoundError: if there are no weights; the message says how to get them.
+        ValueError: if the files do not contain the expected tensors.
     """
     if source == "download":
         try:
             features = torch.hub.load_state_dict_from_url(
                 WEIGHTS_URL, map_location="cpu", check_hash=True, weights_only=True
             )
-        except OSError as error:  # urllib's errors are
+        except OSError as error:  # urllib raises subclasses of it
             raise WeightsNotFoundError(f"weights not found: {WEIGHTS_URL} cannot be fetched ({error})") from error
         return LPIPS({**_installed_channel_weights(), **features})
     path = Path(torch.hub.get_dir()) / "checkpoints" / WEIGHTS_FILE if source == "auto" else Path(source)
@@ -134,7 +134,7 @@ def load_lpips(source: str = "auto") -> LPIPS:
 
 
 def _installed_channel_weights() -> dict[str, Tensor]:
-    """The five small tensors, which torchmetrics (a dependency of Lightning) brings along; empty if it does not."""
+    """Returns the channel weights installed with torchmetrics (a dependency of Lightning); empty if not found."""
     package = importlib.util.find_spec("torchmetrics")
     folders = list(package.submodule_search_locations or ()) if package else []
     files = [Path(folder, "functional", "image", "lpips_models", "vgg.pth") for folder in folders]

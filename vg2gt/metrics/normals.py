@@ -24,7 +24,7 @@ def normal_metrics(predicted: Tensor, reference: Tensor, valid: Tensor) -> dict[
         ``cosine``; NaN without valid pixels.
 
     Raises:
-        ValueError: if the shapes do not fit.
+        ValueError: if the shapes do not match.
     """
     if predicted.shape != reference.shape or predicted.shape[:1] + predicted.shape[2:] != valid.shape:
         raise ValueError(

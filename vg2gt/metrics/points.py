@@ -1,4 +1,4 @@
-"""Distances between point clouds, and the uniformity of one (paper, eqn junyun_cv)."""
+"""Distances between point clouds, and uniformity of a point cloud (paper, eqn junyun_cv)."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ def point_metrics(
     Args:
         predicted: ``[N, 3]``.
         reference: ``[M, 3]``.
-        threshold: distance below which a point counts as right.
-        downsample: keep one point in every cell of this edge, in both clouds; None keeps all. DTU: 0.2 mm.
-        cap: distances from here on are left out of the means; None: none. DTU: 20 mm.
+        threshold: distance below which a point counts as correct.
+        downsample: edge of the cells that keep one point each, in both clouds; None keeps all points. DTU: 0.2 mm.
+        cap: distances of this or more are left out of the means; None: no cap. DTU: 20 mm.
 
     Returns:
         ``accuracy`` (mean distance from a predicted point to the reference), ``completeness`` (the other way round),
@@ -60,7 +60,7 @@ def point_metrics(
 
 
 def thin(points: NDArray[np.float64], edge: float | None) -> NDArray[np.float64]:
-    """Keeps, in every cubic cell of this edge, the first of the points ``[N, 3]``; all of them if ``edge`` is None."""
+    """Keeps the first of the points ``[N, 3]`` in each cubic cell of edge ``edge``; all points if it is None."""
     if edge is None or not len(points):
         return points
     cells = np.floor((points - points.min(0)) / edge)
@@ -83,7 +83,7 @@ def cv(points: Tensor, k: int = 8, max_queries: int | None = None, seed: int = 0
         k: neighbours, the point itself not counted.
         max_queries: measure at most this many points, drawn without replacement; their neighbours are still searched
             among all points.
-        seed: of that draw.
+        seed: seed of the draw.
 
     Returns:
         NaN with k points or fewer, if all points coincide, or if one is not finite.

@@ -1,4 +1,4 @@
-"""How honest stated errors are: coverage and width of their intervals, and whether large ones are where errors are."""
+"""Calibration of stated errors: coverage and width of their bounds, and how well they rank the true errors."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-SHARES = 20  # steps in which pixels are left out
+SHARES = 20  # steps of the sparsification curve
 
 
 def stated_error_metrics(error: Tensor, bounds: Tensor, levels: Sequence[float]) -> dict[str, float]:
-    """Scores the bounds that were stated of relative errors.
+    """Scores stated bounds on relative errors.
 
     Args:
         error: ``[N]`` relative errors >= 0.
-        bounds: ``[L, N]`` what they were said to stay below, at each level.
-        levels: how often, such as 0.9.
+        bounds: ``[L, N]`` stated upper bounds of the errors, for each level.
+        levels: nominal coverage of each level, such as 0.9.
 
     Returns:
-        For each level ``held_90``, the share of errors within the bound, and ``width_90``, the mean bound; and
-        :func:`ause` by the last level's bound. NaN without pixels.
+        For each level, ``held_90``, the share of errors within the bound, and ``width_90``, the mean bound; and
+        ``ause``, :func:`ause` of the last level's bound. NaN without pixels.
     """
     scores: dict[str, float] = {}
     for level, bound in zip(levels, bounds, strict=True):
@@ -33,19 +33,19 @@ def stated_error_metrics(error: Tensor, bounds: Tensor, levels: Sequence[float])
 def ause(error: Tensor, stated: Tensor) -> float:
     """Area under the sparsification error (Ilg et al., Uncertainty Estimates for Optical Flow, 2018).
 
-    Ever more pixels are left out, those with the largest stated or the largest true error first. The area between the
-    mean errors of what is left is given in mean errors of all; 0: the stated errors have the right order.
+    Removes pixels step by step, once by largest stated and once by largest true error. The area between the two curves
+    of the remaining mean error is given relative to the mean error of all pixels; 0 means a perfect ranking.
 
     Args:
         error: ``[N]`` true errors >= 0.
-        stated: ``[N]`` what orders them.
+        stated: ``[N]`` stated errors, which rank the pixels.
     """
     if not len(error):
         return float("nan")
     left = [max(1, round(len(error) * (1 - step / SHARES))) for step in range(SHARES)]
 
     def curve(order: Tensor) -> Tensor:
-        """Mean error of the first so many."""
+        """Returns the mean error of the first ``left`` pixels, relative to that of all."""
         return (error[order].double().cumsum(0)[torch.tensor(left) - 1] / torch.tensor(left)) / mean
 
     mean = error.double().mean().clamp(min=1e-12)

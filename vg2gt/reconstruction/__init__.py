@@ -1,1 +1,1 @@
-"""From images to a scene, and from a scene to files."""
+"""Reconstruction of scenes from images, and their export to files."""

@@ -1,4 +1,4 @@
-"""Cameras to render, from the files that people have: our cameras.json, 3DGS's, transforms.json, a COLMAP model."""
+"""Reads cameras to render from common files: our cameras.json, that of 3DGS, transforms.json, a COLMAP model."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from vg2gt.io.json_checks import load_json
 
 
 def read_cameras(path: str | Path) -> list[NamedCamera]:
-    """Reads cameras of any of these kinds; lens distortion is left out.
+    """Reads cameras from a file of any of these kinds; lens distortion is ignored.
 
     Args:
         path: a ``cameras.json`` of ours or of 3D Gaussian Splatting, a ``transforms.json``, or the folder of a COLMAP
             model or of a scene with one in ``sparse/0`` or ``sparse``.
 
     Raises:
-        FileNotFoundError: if there is no such file.
-        FormatError: if it is damaged or of no such kind.
-        ImportError: if a COLMAP model is to be read and pycolmap is not installed.
+        FileNotFoundError: if the file does not exist.
+        FormatError: if it is damaged or of another kind.
+        ImportError: if it is a COLMAP model and pycolmap is not installed.
     """
     path = Path(path).expanduser()
     if path.is_dir():
@@ -66,7 +66,10 @@ def _of_transforms(path: Path) -> list[NamedCamera]:
 
 
 def _of_3dgs(place: str, entry: Any) -> NamedCamera:
-    """An entry of 3DGS's ``cameras.json``: centre and camera-to-world rotation, focal lengths, no principal point."""
+    """Converts an entry of 3DGS's ``cameras.json``: centre, camera-to-world rotation, focal lengths.
+
+    It has no principal point; the image centre is used.
+    """
     try:
         to_world = np.eye(4)
         to_world[:3, :3] = np.asarray(entry["rotation"], np.float64)

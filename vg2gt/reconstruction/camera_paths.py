@@ -1,4 +1,4 @@
-"""Camera paths for videos: an orbit around what the views look at, and smooth ways between given cameras."""
+"""Camera paths for videos: an orbit around the point the views look at, and smooth paths through given cameras."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from scipy.spatial.transform import Rotation, RotationSpline
 from vg2gt.data.sources.parsing import IMAGE_SUFFIXES
 from vg2gt.io.cameras_json import NamedCamera, invert_pose
 
-WIDTH, HEIGHT = 0.15, 0.06  # half axes of the orbit, in distances to what is looked at
+WIDTH, HEIGHT = 0.15, 0.06  # half axes of the orbit, as fractions of the distance to the look-at point
 
 
 def orbit(cameras: Sequence[NamedCamera], distance: float, frames: int = 72) -> list[NamedCamera]:
-    """One round of an ellipse about the most central camera, always facing the point in front of it.
+    """Returns an elliptical path around the most central camera, always facing the point in front of it.
 
-    Where few images were taken from one side, wide orbits would look behind the scene; this one stays in front.
+    With few images from one side, a wide orbit would look behind the scene; this one stays in front.
 
     Args:
-        cameras: the views.
-        distance: to the point that is looked at, along the central camera's axis, in scene units.
-        frames: length of the path.
+        cameras: cameras of the views.
+        distance: to the look-at point, along the central camera's axis, in scene units.
+        frames: number of cameras on the path.
 
     Raises:
         ValueError: if there are no cameras or the numbers are not positive.
@@ -46,22 +46,22 @@ def orbit(cameras: Sequence[NamedCamera], distance: float, frames: int = 72) -> 
     return path
 
 
-LONGEST = 100_000  # cameras on a path: an hour of film
+LONGEST = 100_000  # maximum number of cameras on a path: about an hour of video
 
 
 def interpolate(cameras: Sequence[NamedCamera], between: int) -> list[NamedCamera]:
-    """A smooth way through given cameras: splines of position and rotation, linear intrinsics.
+    """Returns a smooth path through given cameras: splines of position and rotation, linear intrinsics.
 
     Args:
         cameras: at least two, of one image size; all are on the path.
-        between: new cameras between each two.
+        between: number of new cameras between neighbouring ones.
 
     Returns:
         The path, ``(n - 1) * (between + 1) + 1`` cameras.
 
     Raises:
-        ValueError: if there are fewer than two cameras, their sizes differ, ``between`` is negative, or the path longer
-            than :data:`LONGEST`.
+        ValueError: if there are fewer than two cameras, their sizes differ, ``between`` is negative, or the path is
+            longer than :data:`LONGEST`.
     """
     if len(cameras) < 2 or between < 0:
         raise ValueError(f"a path needs at least two cameras and 0 or more between them, got {len(cameras)}, {between}")
@@ -78,7 +78,7 @@ def interpolate(cameras: Sequence[NamedCamera], between: int) -> list[NamedCamer
     path = []
     for number in range((len(cameras) - 1) * (between + 1) + 1):
         left, step = divmod(number, between + 1)
-        if step == 0:  # exactly the given one, whatever the splines' rounding
+        if step == 0:  # exactly the given camera, free of spline rounding
             path.append(cameras[left])
             continue
         time = left + step / (between + 1)
@@ -93,12 +93,12 @@ def interpolate(cameras: Sequence[NamedCamera], between: int) -> list[NamedCamer
 
 
 def view_stem(name: str) -> str:
-    """A view's name without the ending of an image file; other dots are part of the name."""
+    """Returns a view's name without an image file extension; other dots are part of the name."""
     return name[: -len(suffix)] if (suffix := Path(name).suffix).lower() in IMAGE_SUFFIXES else name
 
 
 def _facing(direction: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Camera-to-world rotation that looks along a direction with its x axis level (y down)."""
+    """Returns the camera-to-world rotation that looks along a direction with a level x axis (y down)."""
     forward = direction / np.linalg.norm(direction)
     right = np.cross([0.0, 1.0, 0.0], forward)
     right /= np.linalg.norm(right)

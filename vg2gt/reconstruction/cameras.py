@@ -1,4 +1,4 @@
-"""Where the cameras of a reconstruction come from: files next to the images, structure from motion, or the backbone."""
+"""Sources of a reconstruction's cameras: files next to the images, structure from motion, or the backbone."""
 
 from __future__ import annotations
 
@@ -36,28 +36,28 @@ def pictures_for(
     monitor: Monitor | None = None,
     skip_damaged: bool = False,
 ) -> Iterator[list[Picture]]:
-    """The pictures to reconstruct, with cameras if the backbone takes any; they can be read inside the block.
+    """Yields the pictures to reconstruct, with cameras if the backbone takes any; they can be read inside the block.
 
     Args:
-        model: whose backbone looks at them.
+        model: model that will reconstruct them.
         images: see :func:`vg2gt.reconstruction.pictures.find_pictures`.
         poses: ``auto``: a backbone that needs cameras gets those next to the images
             (:func:`~vg2gt.reconstruction.given_cameras.given_pictures`), else those of structure from motion
-            (:func:`~vg2gt.reconstruction.sfm.find_cameras`); others predict their own. ``given``, ``sfm`` and
-            ``backbone`` allow one of these alone.
-        every: take every this many-th picture only.
-        max_images: take at most so many, evenly spread.
-        sfm_folder: where structure from motion keeps its result; None: it is thrown away.
+            (:func:`~vg2gt.reconstruction.sfm.find_cameras`); other backbones predict their own. ``given``, ``sfm``
+            and ``backbone`` allow only that source.
+        every: take only every N-th picture.
+        max_images: maximum number of pictures, evenly spread.
+        sfm_folder: folder for the result of structure from motion; None: a temporary one.
         monitor: shows and times the stages.
-        skip_damaged: leave out photographs that cannot be read, named in a warning.
+        skip_damaged: skip photographs that cannot be read, with a warning that names them.
 
     Yields:
-        The pictures; of equal files the first one only.
+        The pictures; of identical files, only the first.
 
     Raises:
         FileNotFoundError: if a path does not exist.
-        ImportError: if structure from motion needs pycolmap and there is none.
-        ValueError: if there are no pictures, the cameras asked for are not to be had, or the backbone takes none.
+        ImportError: if structure from motion needs pycolmap and it is not installed.
+        ValueError: if there are no pictures, the requested cameras are not available, or the backbone takes none.
     """
     backend = model.backend
     _check(model, poses)
@@ -90,7 +90,7 @@ def pictures_for(
 
 
 def _found(pictures: list[Picture], folder: Path, monitor: Monitor) -> list[Picture]:
-    """Pictures with found cameras; files are taken in the order of their names, so that any order gives the same."""
+    """Finds cameras by structure from motion; files are sorted by name, so that the input order does not matter."""
     if any(picture.path is None for picture in pictures):
         return find_cameras(pictures, folder, monitor)
     ordered = sorted(pictures, key=lambda picture: by_number(str(picture.path)))
@@ -99,11 +99,11 @@ def _found(pictures: list[Picture], folder: Path, monitor: Monitor) -> list[Pict
 
 
 def check_depth(backend: str, images: ImagesLike) -> None:
-    """Refuses images without depth, before anything is built, for a backend that needs it.
+    """Checks, before anything is built, that images have the depth that a backend needs.
 
     Args:
-        backend: its name, for the message.
-        images: what is to be reconstructed.
+        backend: name of the backend, for the message.
+        images: input of the reconstruction.
 
     Raises:
         FileNotFoundError: if a path does not exist.
@@ -114,14 +114,14 @@ def check_depth(backend: str, images: ImagesLike) -> None:
 
 
 def check_pycolmap(images: ImagesLike, poses: Poses) -> None:
-    """Refuses images whose cameras only pycolmap reads or finds, where it is not installed, before anything is built.
+    """Checks, before anything is built, that pycolmap is installed if finding the images' cameras needs it.
 
     Args:
-        images: what is to be reconstructed.
+        images: input of the reconstruction.
         poses: see :func:`pictures_for`.
 
     Raises:
-        ImportError: naming what needs it, and the command that installs it.
+        ImportError: if it is not installed; the message says what needs it and how to install it.
     """
     if importlib.util.find_spec("pycolmap") is None and (poses == "sfm" or given_pictures(images) is None):
         require_pycolmap()

@@ -1,4 +1,4 @@
-"""Adds images to a scene that was made in windows, and takes them out again."""
+"""Adds images to a scene that was made in windows, and removes them again."""
 
 from __future__ import annotations
 
@@ -27,19 +27,22 @@ from vg2gt.rendering import Renderer
 def add_images(
     model: VG2GT, folder: Path, images: ImagesLike, renderer: Renderer, monitor: Monitor, window: int | None = None
 ) -> Scene:
-    """The scene in a folder with more images, whose cameras are given in the same frame; writes no outputs.
+    """Adds images, whose cameras are given in the same frame, to the scene in a folder; writes no outputs.
 
     Args:
-        model: that made the scene.
-        folder: that ``vg2gt reconstruct --keep-windows`` wrote.
+        model: model that made the scene.
+        folder: output folder of ``vg2gt reconstruct --keep-windows``.
         images: see :func:`vg2gt.reconstruction.pictures.find_pictures`.
-        renderer: how the scene is rendered.
+        renderer: renderer of the scene.
         monitor: shows and times the stages.
-        window: as for :func:`vg2gt.reconstruction.pipeline.reconstruct_with`.
+        window: see :func:`vg2gt.reconstruction.pipeline.reconstruct_with`.
+
+    Returns:
+        The scene with the images.
 
     Raises:
         FileNotFoundError: if the folder keeps no voxels.
-        ValueError: if another model made them, or the images are in the scene already.
+        ValueError: if another model made the scene, or it already has images of the same names.
     """
     old, anchor = read_scene(folder, renderer, _device(model)), _anchor(model, folder)
     with pictures_for(model, images, "given") as pictures:
@@ -64,11 +67,11 @@ def add_images(
 def take_out(
     model: VG2GT, folder: Path, images: ImagesLike, renderer: Renderer, monitor: Monitor, window: int | None = None
 ) -> Scene:
-    """The scene in a folder without images that one command has added; arguments as for :func:`add_images`.
+    """Removes images that one command added from the scene in a folder; arguments as for :func:`add_images`.
 
     Raises:
         FileNotFoundError: if the folder keeps no voxels.
-        ValueError: if these very images were not added together.
+        ValueError: if another model made the scene, or exactly these images were not added together.
     """
     old, anchor, kept = read_scene(folder, renderer, _device(model)), _anchor(model, folder), folder / WINDOWS
     with pictures_for(model, images, "given") as pictures:

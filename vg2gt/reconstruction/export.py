@@ -1,4 +1,4 @@
-"""Views as other programs take them: whole photographs with their own names, points with the views that see them."""
+"""Views for export to other programs: whole photographs under their own names, and points with their observations."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from vg2gt.types import Cameras
 if TYPE_CHECKING:
     from vg2gt.reconstruction.scene import Scene
 
-AGREE = 0.05  # relative difference of depths up to which a view is taken to see a point
-_VIEWS_A_POINT = 12  # observations of a point, at most
-_QUALITY = 95  # of JPEGs that are written again
+AGREE = 0.05  # maximum relative depth difference at which a view is taken to see a point
+_VIEWS_A_POINT = 12  # maximum number of observations of a point
+_QUALITY = 95  # of re-encoded JPEGs
 
 
 @dataclass(frozen=True)
@@ -33,8 +33,8 @@ class ExportedViews:
     Attributes:
         cameras: ``[1, V]`` float64; ``size`` is that of the first view.
         sizes: ``(height, width)`` of each view.
-        names: file names, unique.
-        writers: write the image of a view to a path.
+        names: unique file names.
+        writers: functions that write the image of a view to a path.
     """
 
     cameras: Cameras
@@ -49,9 +49,10 @@ class ExportedViews:
             write(folder / name)
 
     def observations(self, scene: Scene) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-        """Which views see the scene's points, and where: points ``[T]``, views ``[T]``, pixels ``[T, 2]``.
+        """Returns which views see the scene's points, and where: points ``[T]``, views ``[T]``, pixels ``[T, 2]``.
 
-        A view sees a point if its decoded depth agrees with the point's; the view that a point comes from always does.
+        A view sees a point if its decoded depth agrees with the point's depth. The view that a point comes from always
+        sees it. At most 12 observations of a point are kept.
         """
         points = scene.points()
         small = scene.cameras.to("cpu").map(torch.Tensor.double)
@@ -73,14 +74,14 @@ class ExportedViews:
         return owner[kept], view[kept], pixel[kept]
 
     def _in_image(self, pixels: NDArray[np.float64], view: int, small: Cameras) -> NDArray[np.float64]:
-        """Pixels of the working size as pixels of the exported image."""
+        """Converts pixels of the working size to pixels of the exported image."""
         before, after = small.intrinsics[0, view].numpy(), self.cameras.intrinsics[0, view].numpy()
         directions = (pixels - before[:2, 2]) / before[[0, 1], [0, 1]]
         return directions * after[[0, 1], [0, 1]] + after[:2, 2]
 
 
 def exported_views(scene: Scene, whole: bool) -> ExportedViews:
-    """The views with the whole photographs where they are known and wanted, else with the images of working size."""
+    """Returns the views with whole photographs if known and wanted, else with the images at the working size."""
     named = scene.named_cameras()
     poses = torch.from_numpy(np.stack([camera.world_to_camera for camera in named]))
     small = [(camera.height, camera.width) for camera in named]
@@ -88,7 +89,7 @@ def exported_views(scene: Scene, whole: bool) -> ExportedViews:
     sizes = tuple((p.height, p.width) if p is not None else s for p, s in zip(photos, small, strict=True))
     matrices = np.stack([c.intrinsics if p is None else p.intrinsics for c, p in zip(named, photos, strict=True)])
     names = [camera.name if photo is None else photo.name for camera, photo in zip(named, photos, strict=True)]
-    if len({name.lower() for name in names}) < len(names):  # of several folders
+    if len({name.lower() for name in names}) < len(names):  # photographs of several folders
         names = [f"{camera.name[:-4]}{Path(name).suffix}" for camera, name in zip(named, names, strict=True)]
     cameras = Cameras(poses[None], torch.from_numpy(matrices)[None], sizes[0])
     writers = tuple(_writer(scene, view, photos[view] is not None) for view in range(len(named)))
@@ -124,7 +125,7 @@ def _is_upright(path: Path) -> bool:
 
 
 def _fewer(owner: NDArray[np.int64], own: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Rows of at most ``_VIEWS_A_POINT`` observations of each point, that of the view it comes from first."""
+    """Returns rows of at most ``_VIEWS_A_POINT`` observations per point, always with that of its own view."""
     order = np.lexsort((~own, owner))
     start = np.searchsorted(owner[order], owner[order])
     return np.sort(order[np.arange(len(order)) - start < _VIEWS_A_POINT])

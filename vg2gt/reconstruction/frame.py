@@ -19,23 +19,23 @@ from vg2gt.types import Cameras, Gaussians
 log = logging.getLogger(__name__)
 
 FrameName = Literal["auto", "given", "first", "upright"]
-FAR = 1e4  # units of depth from the origin at which float32 has about a thousandth of one left
-SAME = 1e-4  # of the extent: cameras that differ by less from the given ones are the given ones
-_LEVEL = 0.2  # shortest mean of the cameras' down vectors that still tells where down is
+FAR = 1e4  # distance from the origin, in depths, at which float32 resolves about a thousandth of a depth
+SAME = 1e-4  # of the extent: cameras that differ less from the given ones are replaced by them
+_LEVEL = 0.2  # minimum length of the cameras' mean down vector for it to define gravity
 
 
 @dataclass(frozen=True, eq=False)
 class SceneFrame:
-    """Where a scene's world is in the world of the cameras that it was made of.
+    """Placement of a scene's world in the world of its source cameras.
 
     Attributes:
-        name: ``reference`` (camera of the view that the model took for its first, median depth about 1), ``first``
-            (that of the first image), ``upright`` (the reference's, turned until y points along gravity) or ``given``.
-        to_source: ``[4, 4]`` float64 similarity from the scene's world to that of the cameras as they were given, found
-            or predicted; its scale is source units per scene unit.
-        poses: ``[V, 4, 4]`` float64 ``world_to_camera`` as given or found; None where the backbone predicted them.
+        name: ``reference`` (camera of the view that the model processed first, median depth about 1), ``first``
+            (camera of the first image), ``upright`` (reference rotated until y points along gravity) or ``given``.
+        to_source: ``[4, 4]`` float64 similarity from the scene's world to that of the cameras as given, found or
+            predicted; its scale is source units per scene unit.
+        poses: ``[V, 4, 4]`` float64 ``world_to_camera`` as given or found; None if the backbone predicted them.
         source: ``given``, ``found`` or ``predicted``.
-        wanted: the frame in which it is to be written; ``auto``: the given one if there is one, else upright.
+        wanted: frame to write the scene in; ``auto``: ``given`` if cameras were given, else ``upright``.
     """
 
     name: str
@@ -51,17 +51,17 @@ class SceneFrame:
 
     @property
     def target(self) -> str:
-        """The frame in which the scene is to be written."""
+        """The frame to write the scene in, with ``auto`` resolved."""
         if self.wanted != "auto":
             return self.wanted
         return "given" if self.source == "given" else "upright"
 
 
 def check_frame(wanted: str, source: str | None = None) -> None:
-    """Checks the name of a frame, and that there is a given one where it is asked for.
+    """Checks the name of a frame, and that cameras are given if ``given`` is wanted.
 
     Raises:
-        ValueError: naming the choices, or what is missing.
+        ValueError: if the name is unknown, or no cameras are given.
     """
     if wanted not in get_args(FrameName):
         raise ValueError(f"frame is {wanted!r}; choose one of {', '.join(get_args(FrameName))}")
@@ -72,12 +72,12 @@ def check_frame(wanted: str, source: str | None = None) -> None:
 def first_frame(
     cameras: Cameras, unit: float, poses: NDArray[np.float64] | None, source: str, wanted: FrameName
 ) -> SceneFrame:
-    """The frame of a new scene, whose world is the camera of one of its views.
+    """Returns the frame of a new scene, whose world is the camera of one of its views.
 
     Args:
-        cameras: the scene's (B = 1).
-        unit: scene units per source unit, where the cameras do not move and say nothing of it.
-        poses: ``[V, 4, 4]`` of the cameras as they were given or found.
+        cameras: cameras of the scene (B = 1).
+        unit: scene units per source unit; used if ``poses`` is None or the cameras do not move.
+        poses: ``[V, 4, 4]`` poses of the cameras as given or found; None if predicted.
         source: ``given``, ``found`` or ``predicted``.
         wanted: see :class:`SceneFrame`.
     """
@@ -92,11 +92,11 @@ def first_frame(
 
 
 def move_to_target(frame: SceneFrame, cameras: Cameras, depth: float) -> tuple[SceneFrame, Similarity]:
-    """The frame in which a scene is to be written, and the similarity that takes it there (float64, B = 1).
+    """Returns the frame to write a scene in, and the similarity that moves the scene there (float64, B = 1).
 
     Args:
-        frame: where the scene is.
-        cameras: its views (B = 1).
+        frame: current frame of the scene.
+        cameras: cameras of its views (B = 1).
         depth: its median depth in scene units.
     """
     move = np.eye(4)
@@ -110,10 +110,10 @@ def move_to_target(frame: SceneFrame, cameras: Cameras, depth: float) -> tuple[S
 
 
 def upright_rotation(poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The smallest rotation ``[3, 3]`` that brings gravity to +y, as the cameras ``[V, 4, 4]`` tell it.
+    """Returns the smallest rotation ``[3, 3]`` that brings gravity, estimated from poses ``[V, 4, 4]``, to +y.
 
-    People hold cameras level: gravity is at right angles to the cameras' x axes as far as these point in different
-    directions, and is their mean down vector otherwise. Cameras that hang in all directions leave the world as it is.
+    People hold cameras level: gravity is perpendicular to the cameras' x axes if these span different directions, else
+    it is the mean down vector. If the cameras have no common down direction, the rotation is the identity.
     """
     down = poses[:, 1, :3].mean(0)
     if np.linalg.norm(down) < _LEVEL:
@@ -132,7 +132,7 @@ def upright_rotation(poses: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def moved_gaussians(gaussians: Gaussians, move: Similarity) -> Gaussians:
-    """One scene's Gaussians moved by a similarity (B = 1), computed in float64."""
+    """Moves one scene's Gaussians by a similarity (B = 1), computed in float64."""
     move = move.to(gaussians.means.device)
     turn, dtype = move.rotation[0], gaussians.means.dtype
     degree = round(gaussians.sh.shape[1] ** 0.5) - 1
@@ -146,14 +146,14 @@ def moved_gaussians(gaussians: Gaussians, move: Similarity) -> Gaussians:
 
 
 def moved_cameras(cameras: Cameras, move: Similarity, frame: SceneFrame) -> tuple[Cameras, Tensor]:
-    """Cameras moved by a similarity (B = 1), and their poses ``[V, 4, 4]`` in float64.
+    """Moves cameras by a similarity (B = 1); also returns their poses ``[V, 4, 4]`` in float64.
 
-    In the given frame the poses are the given ones, to the last digit, unless they were changed.
+    Poses that match the given ones are replaced by them, so that in the given frame they are exact.
     """
     own = replace(cameras, world_to_camera=cameras.world_to_camera.detach().cpu().double())
     poses = move.to("cpu").apply_cameras(own).world_to_camera[0]
     if frame.poses is not None and len(frame.poses) == len(poses):
-        given = torch.from_numpy(frame.poses @ frame.to_source)  # seen from the frame's world, not yet rigid
+        given = torch.from_numpy(frame.poses @ frame.to_source)  # from the frame's world, not yet rigid
         given[:, :3] /= frame.scale
         extent = max(float(given[:, :3, 3].abs().max()), 1e-12)
         if (given - poses).abs().max() < SAME * max(extent, 1.0):
@@ -163,7 +163,7 @@ def moved_cameras(cameras: Cameras, move: Similarity, frame: SceneFrame) -> tupl
 
 
 def _near_origin(move: NDArray[np.float64], depth: float) -> NDArray[np.float64]:
-    """Leaves out a shift that float32 could not hold, such as map coordinates, and says so."""
+    """Removes a shift that float32 cannot hold, such as map coordinates, with a warning."""
     far = float(np.linalg.norm(move[:3, 3]))
     if far > FAR * depth:
         offset = move[:3, 3].round()
@@ -184,7 +184,7 @@ def _matrix(similarity: Similarity) -> NDArray[np.float64]:
 
 
 def similarity_of(matrix: NDArray[np.float64]) -> Similarity:
-    """The similarity (B = 1) of a matrix ``[4, 4]``."""
+    """Returns the similarity (B = 1) of a matrix ``[4, 4]``."""
     linear, shift = torch.from_numpy(matrix[:3, :3].copy()), torch.from_numpy(matrix[:3, 3].copy())
     scale = torch.linalg.det(linear) ** (1 / 3)
     return Similarity(scale[None], (linear / scale)[None], shift[None])

@@ -1,4 +1,4 @@
-"""Pictures with the cameras that are next to them: cameras.json, transforms.json, a COLMAP model, a list of poses."""
+"""Pictures with cameras from files next to them: cameras.json, transforms.json, a COLMAP model, a list of poses."""
 
 from __future__ import annotations
 
@@ -50,18 +50,18 @@ def given_pictures(
 ) -> list[Picture] | None:
     """Lists the pictures whose cameras are in files next to them.
 
-    Looked for are, in this order: ``cameras.json``, ``transforms.json`` (or Blender's ``transforms_train.json``), a
-    COLMAP model, a recording with poses (with depth or without); in the folder of the images, in the folder above it,
-    and in ``dense/`` of a COLMAP workspace whose images are only there.
+    The search order is ``cameras.json``, ``transforms.json`` (or Blender's ``transforms_train.json``), a COLMAP model,
+    a recording with poses (with or without depth). The search covers the folder of the images, the folder above it,
+    and ``dense/`` of a COLMAP workspace whose images are only there.
 
     Args:
-        images: a folder, image files, or an ``.r3d`` file, or a sequence of such.
-        every: take every this many-th picture only.
-        max_images: take at most so many, evenly spread; None: all.
-        depth: depth is needed as well: what has none is passed over.
+        images: a folder, image files, an ``.r3d`` file, or a sequence of these.
+        every: take only every N-th picture.
+        max_images: maximum number of pictures, evenly spread; None: all.
+        depth: require depth too, and ignore cameras without it.
 
     Returns:
-        The pictures in order, their names unique; None if any of what was given has no cameras.
+        The pictures in order, with unique names; None if any input has no cameras.
 
     Raises:
         FileNotFoundError: if a path does not exist.
@@ -83,7 +83,7 @@ def given_pictures(
 
 
 def recording_pictures(source: FileSource) -> list[Picture]:
-    """The pictures of a source's only scene, with their cameras and depth, each of its own size.
+    """Returns the pictures of a source's only scene, with their cameras and depth, each at its own size.
 
     Raises:
         ValueError: if the source has several scenes.
@@ -96,7 +96,7 @@ def recording_pictures(source: FileSource) -> list[Picture]:
     metric = source.is_metric or (isinstance(source, RGBDFolder) and (index.folder / "depth").is_dir())
 
     def picture(frame: int) -> Picture:
-        """The frame as a picture that is read when it is needed."""
+        """Returns a frame as a picture that is read on demand."""
 
         def read(size: tuple[int, int]) -> Frames:
             return source.load_whole(scene, frame)
@@ -120,7 +120,7 @@ def recording_pictures(source: FileSource) -> list[Picture]:
 
 
 def _by_folder(paths: Sequence[Path]) -> Iterator[tuple[Path, list[Path] | None]]:
-    """What was given by folder: a folder or recording as a whole (None), single images together by their folder."""
+    """Groups inputs by folder: a folder or recording as a whole (None), single images by their folder."""
     files: dict[Path, list[Path]] = {}
     for path in paths:
         if path.is_file() and app_of(path) is None:
@@ -133,7 +133,7 @@ def _by_folder(paths: Sequence[Path]) -> Iterator[tuple[Path, list[Path] | None]
 
 
 def _only(pictures: list[Picture], files: list[Path], folder: Path) -> list[Picture]:
-    """Those of the named files, in their order."""
+    """Returns the pictures of the named files, in the order of the files."""
     by_path = {picture.path.resolve(): picture for picture in pictures if picture.path is not None}
     found = [by_path[file.resolve()] for file in dict.fromkeys(files) if file.resolve() in by_path]
     _name_left_out([file.name for file in files if file.resolve() not in by_path], f"the cameras with {folder}")
@@ -158,7 +158,7 @@ def _given(folder: Path, depth: bool) -> list[Picture] | None:
 
 
 def _places(folder: Path) -> Iterator[tuple[Path, str, bool]]:
-    """Folders where the cameras of a folder's images may be, the images as seen from there, whether they must fit."""
+    """Yields folders that may hold a folder's cameras, the path of the images from there, and whether they must fit."""
     inside = image_folders(folder) if folder.is_dir() else []
     if (folder / "dense" / "images").is_dir() and not inside:  # a workspace without its distorted originals
         yield folder / "dense", "images", True
@@ -178,7 +178,7 @@ def _pictures_of(place: Path, images: str, depth: bool) -> list[Picture] | None:
 
 
 def _source(folder: Path, images: str, depth: bool) -> FileSource | None:
-    """The recording that a folder holds, with depth where it is needed; None for mere photographs."""
+    """Returns the recording in a folder, with depth if needed; None for plain photographs."""
     if files := transforms_files(folder):
         with_depth = depth and any(frame.depth_file_path for frame in read_transforms(files[0]).frames)
         if with_depth or not depth:
@@ -186,7 +186,7 @@ def _source(folder: Path, images: str, depth: bool) -> FileSource | None:
     if not depth and model_folder_of(folder) is not None:
         return COLMAP(str(folder), images=images)
     if app_of(folder) is not None or any(folder.glob(f"*{R3D}")):
-        # Colour at its full size where depth is not needed: a phone's is coarse.
+        # Without depth, colour keeps its full size: a phone's depth is coarse.
         return RGBDFolder(str(folder), holdout=None, depth=depth)
     if (folder / "depth").is_dir() or any(folder.glob("frame-*.color.*")):
         return RGBDFolder(str(folder), holdout=None)
@@ -196,7 +196,7 @@ def _source(folder: Path, images: str, depth: bool) -> FileSource | None:
 
 
 def _name_missing(pictures: list[Picture], folder: Path) -> None:
-    """Says which images of a folder have no camera."""
+    """Warns about images of a folder that have no camera."""
     known = {picture.path.resolve() for picture in pictures if picture.path is not None}
     if not folder.is_dir() or not all(path.suffix.lower() != ".r3d" for path in known):
         return
@@ -215,13 +215,13 @@ def _name_left_out(names: Sequence[str], where: str) -> None:
 
 
 def _from_cameras_json(path: Path, folder: Path) -> list[Picture] | None:
-    """Pictures of a folder whose cameras a ``cameras.json`` names, by the file's name with or without its ending.
+    """Returns pictures of a folder with cameras from ``cameras.json``, matched by file name or stem.
 
     Returns:
-        None if they are of undistorted images and the folder has the photographs that these were made of.
+        None if the cameras are of undistorted images and the folder has the original photographs.
 
     Raises:
-        ValueError: if it names none of them.
+        ValueError: if the file names none of the images.
     """
     named = read_cameras_json(path)
     cameras = {Path(camera.name).name: camera for camera in named}
@@ -241,7 +241,7 @@ def _from_cameras_json(path: Path, folder: Path) -> list[Picture] | None:
 
 
 def _photo(path: Path, camera: NamedCamera, cameras: Path) -> Picture:
-    """A photograph with its camera: that of the whole photograph where the file knows it."""
+    """Returns a photograph with its camera, that of the whole photograph if the file has it."""
     photo = camera.photo
     if photo is None or photo.name != path.name:
         photo = Photo(path.name, camera.width, camera.height, camera.intrinsics)
@@ -252,7 +252,7 @@ def _photo(path: Path, camera: NamedCamera, cameras: Path) -> Picture:
     pose = torch.from_numpy(camera.world_to_camera)
 
     def read(wanted: tuple[int, int]) -> Frames:
-        """The photograph without distortion, its mask and its camera at the wanted size."""
+        """Reads the undistorted photograph with its mask and camera, reduced to about the wanted size."""
         pixels = read_color(path, path.parent.name, upright=upright)
         mask = mask_for(path, upright)
         if undistortion is None:
@@ -276,6 +276,6 @@ def _photo(path: Path, camera: NamedCamera, cameras: Path) -> Picture:
 
 
 def describe(images: Any) -> str:
-    """What was given, in a few words, for messages."""
+    """Describes the input in a few words, for messages."""
     items = [str(item) if isinstance(item, (str, Path)) else type(item).__name__ for item in as_items(images)]
     return ", ".join(items[:3]) + (f" and {len(items) - 3} more" if len(items) > 3 else "")

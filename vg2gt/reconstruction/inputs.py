@@ -1,4 +1,4 @@
-"""Pictures of any size brought to one working size, with what is known of their cameras."""
+"""Loads pictures of any size at one working size, with what is known about their cameras."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ log = logging.getLogger(__name__)
 
 LONGER_SIDE = {"cuda": 518, "cpu": 280}  # pixels, by device; foundation models are trained at about 518
 _MUCH_LOST = 0.25
-_FEWEST_POINTS = 20  # observations of sparse points from which a range is told
-_OUTLIERS, _NEARER, _FARTHER = 1, 0.8, 1.4  # percent left out at either end, widening
+_FEWEST_POINTS = 20  # minimum observations of sparse points for a depth range
+_OUTLIERS, _NEARER, _FARTHER = 1, 0.8, 1.4  # percent cut at either end, widening factors
 
 
 @dataclass(frozen=True)
@@ -34,10 +34,10 @@ class Views:
     Attributes:
         images: ``[V, 3, H, W]`` float32 in [0, 1], on the CPU.
         names: one per view, unique.
-        kept: share of each picture's area that is in its image; the rest was cropped.
-        hints: what the data know, on the CPU: the order of the pictures at least.
-        mask: ``[V, H, W]`` float32 in [0, 1], how much each pixel counts (alpha, mask images); None: all count.
-        pictures: where the images come from, one per view.
+        kept: share of each picture's area that is left after cropping.
+        hints: known inputs, on the CPU: at least the order of the pictures.
+        mask: ``[V, H, W]`` float32 in [0, 1], pixel weights (alpha, mask images); None: all pixels count.
+        pictures: source pictures, one per view.
     """
 
     images: Tensor
@@ -51,16 +51,16 @@ class Views:
 def working_size(
     sizes: Sequence[tuple[int, int]], patch: int, device: str, size: int | tuple[int, int] | None = None
 ) -> tuple[int, int]:
-    """The ``(height, width)`` to which all pictures are brought, in multiples of the patch size.
+    """Returns the common ``(height, width)`` of all images, in multiples of the patch size.
 
-    The shape is the geometric mean of the pictures' shapes, which crops mixed ones the least.
+    The aspect ratio is the geometric mean of the pictures' ratios, which crops mixed shapes the least.
 
     Args:
-        sizes: the pictures' ``(height, width)``.
-        patch: the backend's patch size.
-        device: type of the device that computes; decides the default.
-        size: the longer side in pixels (rounded down to patches), or exactly (height, width); None: 518 on a GPU, 280
-            on a CPU, but not more than the pictures have.
+        sizes: ``(height, width)`` of the pictures.
+        patch: patch size of the backend.
+        device: type of the compute device; decides the default.
+        size: longer side in pixels (rounded down to patches), or exact (height, width); None: 518 on a GPU, 280 on a
+            CPU, but at most the median longer side of the pictures.
 
     Raises:
         ValueError: if the size is smaller than a patch, or given exactly and not a multiple of the patch.
@@ -80,7 +80,7 @@ def working_size(
 
 
 def load_views(pictures: Sequence[Picture], size: tuple[int, int], monitor: Monitor) -> Views:
-    """Decodes pictures one by one; each is resized to cover the working size and cropped at its centre.
+    """Decodes pictures one by one; each is resized to cover the working size and centre-cropped.
 
     Raises:
         ValueError: if a picture cannot be read, naming it.
@@ -106,7 +106,7 @@ def load_views(pictures: Sequence[Picture], size: tuple[int, int], monitor: Moni
 
 
 def photo_of(camera: NamedCamera, picture: Picture) -> Photo:
-    """The camera of a view's whole photograph, from that of the view (the reverse of ``resize_to_cover``)."""
+    """Returns the camera of a view's whole photograph from the view's camera (inverse of ``resize_to_cover``)."""
     name = camera.name if picture.path is None else picture.path.name
     height, width = picture.size
     scale = max(camera.height / height, camera.width / width)
@@ -125,7 +125,7 @@ def _kept(size: tuple[int, int], window: tuple[int, int]) -> float:
 
 
 def _hints(pictures: Sequence[Picture], frames: Frames, size: tuple[int, int]) -> Hints:
-    """The order of the pictures, and what a recording knows if all are from one."""
+    """Returns the order of the pictures and, if all are from one recording, its cameras and depth."""
     source, order = source_of(pictures), torch.arange(len(pictures))[None]
     if not source:
         return Hints(frame_ids=order)
@@ -136,10 +136,10 @@ def _hints(pictures: Sequence[Picture], frames: Frames, size: tuple[int, int]) -
 
 
 def source_of(pictures: Sequence[Picture]) -> str:
-    """Where all pictures' cameras come from; empty if any has none.
+    """Returns the source of all pictures' cameras; empty if any has none.
 
     Raises:
-        ValueError: if they come from several recordings, whose worlds have nothing to do with each other.
+        ValueError: if they come from several recordings, whose world frames are unrelated.
     """
     sources = {picture.source for picture in pictures}
     if "" in sources:
@@ -150,7 +150,7 @@ def source_of(pictures: Sequence[Picture]) -> str:
 
 
 def given_poses(pictures: Sequence[Picture]) -> Tensor:
-    """Given poses ``[V, 4, 4]`` about the first camera's place if they are map coordinates, too long for float32."""
+    """Returns given poses ``[V, 4, 4]``; map coordinates too large for float32 are shifted to the first camera."""
     poses = np.stack([np.eye(4) if picture.pose is None else picture.pose for picture in pictures])
     shift = np.eye(4)
     shift[:3, 3] = -poses[0, :3, :3].T @ poses[0, :3, 3]
@@ -159,10 +159,10 @@ def given_poses(pictures: Sequence[Picture]) -> Tensor:
 
 
 def depth_range(pictures: Sequence[Picture]) -> Tensor | None:
-    """Near and far ``[1, 2]`` of what the pictures see, from their sparse points; None where there are too few.
+    """Returns near and far ``[1, 2]`` of the pictures' sparse points; None if there are too few.
 
-    The range of all but 1 % of the observed points at either end, widened: points lie where there is texture, so that
-    floors before the camera and bare walls behind are missed. The plane sweep searches beyond it.
+    The range leaves out 1 % of the observed points at either end and is then widened: points lie on texture, so floors
+    in front of the camera and bare walls behind have none. The plane sweep also searches beyond this range.
     """
     known = [picture.point_depths for picture in pictures if picture.point_depths is not None]
     depths = np.concatenate(known) if known else np.zeros(0)

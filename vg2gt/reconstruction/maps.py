@@ -1,4 +1,4 @@
-"""Rendered views as files: a folder of maps of each kind, an animation."""
+"""Writes rendered views: a folder per kind of map, or an animation."""
 
 from __future__ import annotations
 
@@ -36,18 +36,18 @@ Sink: TypeAlias = AbstractContextManager[AddView]
 
 @contextmanager
 def map_folder(folder: Path, kind: str, suffixes: Sequence[str]) -> Iterator[AddView]:
-    """Writes one kind of map of every view into a folder, which appears whole when all are there.
+    """Writes one kind of map of every view into a folder, which appears once it is complete.
 
     Args:
-        folder: the output folder; the maps are in a folder of the kind's name in it.
+        folder: output folder; the maps go into a subfolder named after the kind.
         kind: ``color``, ``depth`` or ``normals``.
         suffixes: ``.png``, ``.npy`` or both.
 
     Yields:
-        What writes a view's map.
+        A function that writes a view's map.
 
     Raises:
-        ValueError: if a view's name leads out of the folder, or another view has it.
+        ValueError: if a view's name leads out of the folder or occurs twice.
     """
     too_deep = 0
     with whole_folder(folder / kind) as staged:
@@ -93,10 +93,10 @@ def _npy(values: Tensor) -> bytes:
 
 @contextmanager
 def animation(path: Path, fps: float) -> Iterator[AddView]:
-    """Collects the colour of the views and writes them as an animation, ``.gif`` or ``.mp4``, ``fps`` per second.
+    """Collects the colour of the views and writes an animation, ``.gif`` or ``.mp4``, at ``fps`` frames per second.
 
     Raises:
-        MissingDecoderError: if it is no GIF and there is no PyAV.
+        MissingDecoderError: if it is not a GIF and PyAV is not installed.
     """
     frames: list[NDArray[np.uint8]] = []
     yield lambda view: frames.append(to_pixels(view.color))
@@ -104,7 +104,7 @@ def animation(path: Path, fps: float) -> Iterator[AddView]:
 
 
 def map_sinks(folder: Path, outputs: Sequence[str]) -> list[Sink]:
-    """One sink for every kind of map among the outputs."""
+    """Returns one sink per kind of map among the outputs."""
     kinds: dict[str, list[str]] = {}
     for output in outputs:
         if output in MAPS:
@@ -114,9 +114,9 @@ def map_sinks(folder: Path, outputs: Sequence[str]) -> list[Sink]:
 
 
 def feed(views: Iterable[RenderedView], sinks: Sequence[Sink], advance: Callable[[], None]) -> None:
-    """Gives every view to every sink, then ends them in their order; on an error no half-written folder stays."""
+    """Passes every view to every sink, then closes the sinks in order; on an error, no half-written folder remains."""
     with ExitStack() as stack:
-        takers = [stack.enter_context(sink) for sink in reversed(sinks)]  # the last one entered ends first
+        takers = [stack.enter_context(sink) for sink in reversed(sinks)]  # the last one entered closes first
         for view in views:
             for add in reversed(takers):
                 add(view)
@@ -125,7 +125,7 @@ def feed(views: Iterable[RenderedView], sinks: Sequence[Sink], advance: Callable
 
 @contextmanager
 def whole_folder(target: Path) -> Iterator[Path]:
-    """A folder to write into that takes the place of ``target`` at the end of the block, or vanishes on an error."""
+    """Yields a folder to write into, which replaces ``target`` at the end of the block; on an error it is removed."""
     staged = temporary_name(target)
     shutil.rmtree(staged, ignore_errors=True)
     staged.mkdir(parents=True)

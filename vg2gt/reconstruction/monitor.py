@@ -22,15 +22,15 @@ _LABELS = {
 
 
 class Monitor:
-    """Measures stages; shows them as progress bars where asked.
+    """Measures stages and optionally shows them as progress bars.
 
     Args:
         show: draw progress bars on the standard error stream.
-        device: whose work is waited for and whose memory is measured.
+        device: device to synchronise with and to measure the memory of.
 
     Attributes:
-        seconds: wall time by stage, in the order in which they began; a stage that comes twice adds up. Time of a
-            stage inside another one counts for the inner one only.
+        seconds: wall time by stage, in the order of their first start. Repeated stages add up; the time of a nested
+            stage counts for the inner stage only.
     """
 
     def __init__(self, show: bool = False, device: torch.device | str = "cpu") -> None:
@@ -62,13 +62,16 @@ class Monitor:
 
     @contextmanager
     def stage(self, name: str, total: int = 1) -> Iterator[Callable[[], None]]:
-        """Measures the block; yields what to call after each of ``total`` steps (the end of the block completes it)."""
+        """Measures the block; yields a function to call after each of ``total`` steps.
+
+        Leaving the block completes the progress bar.
+        """
         with self._running_as(name, total) as task:
             yield lambda: self._progress.update(task, advance=1)
 
     @contextmanager
     def measure(self, name: str) -> Iterator[Callable[[float, str], None]]:
-        """Measures the block; yields what takes the share that is done and a note, shown with the time that is left."""
+        """Measures the block; yields a function that takes the share done and a note, shown with the time left."""
         with self._running_as(name, 100) as task:
             began = now(self.device)
 
@@ -93,7 +96,7 @@ class Monitor:
             self._running.pop()
 
     def _settle(self) -> None:
-        """Gives the time since the last change of stages to the stage that was running."""
+        """Adds the time since the last change of stage to the stage that was running."""
         moment = now(self.device)
         if self._running:
             self.seconds[self._running[-1]] += moment - self._since
@@ -101,7 +104,7 @@ class Monitor:
 
     @contextmanager
     def watching(self) -> Iterator[None]:
-        """Inside the block the stages that a model marks report as stages of their own."""
+        """Reports the stages that a model marks inside the block as stages of this monitor."""
         with listening(lambda name: self._labelled(_LABELS.get(name, name))):
             yield
 

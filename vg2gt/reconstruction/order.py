@@ -1,4 +1,4 @@
-"""The order in which views are worked on: the same for the same images, in whatever order they are given."""
+"""Processing order of the views: the same for the same images, in whatever order they are given."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from vg2gt.data.transforms import to_bytes
 from vg2gt.reconstruction.inputs import Views
 from vg2gt.types import Cameras, Geometry, Hints
 
-_THUMBNAIL = 24  # pixels a side
+_THUMBNAIL = 24  # pixels per side
 
 
 def working_order(images: Tensor) -> list[int]:
-    """Positions of views ``[V, 3, H, W]`` in the order in which they are worked on.
+    """Returns the indices of views ``[V, 3, H, W]`` in processing order.
 
-    The first one gives the scene its frame: the view that looks most like the others, by the correlation of
-    thumbnails. The others follow in an order of their contents.
+    The first view defines the scene's frame: it is the one that looks most like the others, by the correlation of
+    thumbnails. The others are sorted by a hash of their contents.
     """
     contents = [hashlib.sha256(to_bytes(image).numpy().tobytes()).hexdigest() for image in images]
     order = sorted(range(len(contents)), key=lambda view: contents[view])
@@ -31,14 +31,14 @@ def working_order(images: Tensor) -> list[int]:
 
 
 def thumbnails(images: Tensor) -> Tensor:
-    """Small grey images ``[V, 576]`` of zero mean and unit length, float64: their products are correlations."""
-    gray = (image[None].mean(1, keepdim=True) for image in images)  # one by one, which bounds the memory
+    """Returns small grey images ``[V, 576]`` of zero mean and unit length, float64: their products are correlations."""
+    gray = (image[None].mean(1, keepdim=True) for image in images)  # one by one, to bound memory
     small = torch.cat([F.interpolate(image, (_THUMBNAIL, _THUMBNAIL), mode="area").flatten(1) for image in gray])
     return F.normalize(small.double() - small.double().mean(1, keepdim=True), dim=1)
 
 
 def in_order(views: Views, order: Sequence[int]) -> tuple[Tensor, Hints]:
-    """Images ``[V, 3, H, W]`` and hints of views in another order."""
+    """Returns images ``[V, 3, H, W]`` and hints of the views in another order."""
     hints = views.hints
     cameras = None if hints.cameras is None else hints.cameras.select(torch.tensor(order))
     parts = {name: getattr(hints, name) for name in ("depth", "frame_ids", "mask")}
@@ -47,7 +47,7 @@ def in_order(views: Views, order: Sequence[int]) -> tuple[Tensor, Hints]:
 
 
 def as_given(geometry: Geometry, order: Sequence[int]) -> Geometry:
-    """Geometry of views in working order as of the views as they were given."""
+    """Reorders geometry from processing order to the order in which the views were given."""
     back = torch.tensor(order).argsort()
     cameras: Cameras = geometry.cameras.select(back.to(geometry.depth.device))
     return replace(geometry, depth=geometry.depth[:, back], depth_conf=geometry.depth_conf[:, back], cameras=cameras)

@@ -1,8 +1,8 @@
 """Names of the outputs of a scene. Imports nothing, so that a command's help is fast."""
 
 ORBIT_FRAMES, FPS = 72, 24.0
-SFM = "sfm"  # folder of the cameras that structure from motion found, in the output folder
-WINDOWS = "windows"  # folder of an unfinished reconstruction in windows, in the output folder
+SFM = "sfm"  # subfolder of the output folder for cameras found by structure from motion
+WINDOWS = "windows"  # subfolder of the output folder for a reconstruction in windows
 
 MAPS = {
     "color.png": "rendered colour, a PNG per view in color/",
@@ -38,7 +38,7 @@ OUTPUTS = {
     "report.html": "the same of all views, with the run's figures",
     "report.json": "the run's figures: backend, weights, sizes, time per stage, peak memory",
 }
-TILES, LARGE = "tiles", 1_000_000  # the command adds them where there are more Gaussians
+TILES, LARGE = "tiles", 1_000_000  # the command adds tiles if there are more Gaussians
 DEFAULT = ("scene.ply", "cameras.json", "views.npz", "report.png", "report.json")
-PREDICTED = "predicted by the backbone"  # what a report says of such cameras
-REFINED = "refine.png"  # written of every refined scene: views before and after
+PREDICTED = "predicted by the backbone"  # entry for such cameras in a report
+REFINED = "refine.png"  # written for every refined scene: views before and after

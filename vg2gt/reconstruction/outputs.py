@@ -1,4 +1,4 @@
-"""Writes the outputs of a scene, by name."""
+"""Writes the named outputs of a scene."""
 
 from __future__ import annotations
 
@@ -46,15 +46,15 @@ from vg2gt.uncertainty import Status, point_support
 if TYPE_CHECKING:
     from vg2gt.reconstruction.scene import Scene
 
-MESH_PIXELS = 2.0  # edge of a mesh's voxel, in pixels at the median depth
-_MESH_DEPTHS = 10.0  # in median depths: what is farther is left out of the mesh
+MESH_PIXELS = 2.0  # edge of a mesh voxel, in pixels at the median depth
+_MESH_DEPTHS = 10.0  # maximum depth of the mesh, in median depths
 
 
 def check_outputs(outputs: Sequence[str], known: Mapping[str, str] = OUTPUTS) -> None:
     """Checks names of outputs.
 
     Raises:
-        ValueError: if one is unknown or the list is empty; lists the known ones.
+        ValueError: if a name is unknown or the list is empty; the message lists the known names.
     """
     for output in outputs or [""]:
         if output not in known:
@@ -62,11 +62,11 @@ def check_outputs(outputs: Sequence[str], known: Mapping[str, str] = OUTPUTS) ->
 
 
 def check_folder(folder: str | Path, outputs: Sequence[str], overwrite: bool) -> Path:
-    """Checks that the outputs can be written into a folder, which need not be there; makes nothing.
+    """Checks that the outputs can be written into a folder, which need not exist; creates nothing.
 
     Raises:
-        FileExistsError: if an output exists and must not be overwritten.
-        PermissionError: if the folder cannot be made or written to.
+        FileExistsError: if an output exists and ``overwrite`` is false.
+        PermissionError: if the folder cannot be created or written to.
     """
     folder = Path(folder).expanduser()
     place = next(place for place in (folder, *folder.parents) if place.exists())
@@ -81,11 +81,11 @@ def check_folder(folder: str | Path, outputs: Sequence[str], overwrite: bool) ->
 
 
 def prepare_folder(folder: str | Path, outputs: Sequence[str], overwrite: bool) -> Path:
-    """Makes the output folder after :func:`check_folder`.
+    """Creates the output folder after :func:`check_folder`.
 
     Raises:
-        FileExistsError: if an output exists and must not be overwritten.
-        PermissionError: if the folder cannot be made or written to.
+        FileExistsError: if an output exists and ``overwrite`` is false.
+        PermissionError: if the folder cannot be created or written to.
     """
     folder = check_folder(folder, outputs, overwrite)
     try:
@@ -108,22 +108,22 @@ def write_outputs(
     figures: Mapping[str, Any] | None = None,
     monitor: Monitor | None = None,
 ) -> Path:
-    """Writes outputs of a scene, each file or folder whole or not at all.
+    """Writes outputs of a scene, each file or folder completely or not at all.
 
     Args:
-        scene: what to write.
-        folder: where; made if it is not there.
-        outputs: among :data:`OUTPUTS`.
-        overwrite: replace what is there.
-        frames: length of the orbit.
-        mesh_voxel: edge of the mesh's voxels in scene units; None: two pixels at the median depth.
-        figures: what ``report.json`` and ``report.html`` say in addition to the scene's own figures.
+        scene: scene to write.
+        folder: output folder, created if missing.
+        outputs: names from :data:`OUTPUTS`.
+        overwrite: replace existing outputs.
+        frames: number of frames of the orbit.
+        mesh_voxel: edge of the mesh voxels in scene units; None: two pixels at the median depth.
+        figures: entries of ``report.json`` and ``report.html`` in addition to those of the scene.
         monitor: shows and times the stages.
 
     Raises:
-        FileExistsError: if an output exists.
+        FileExistsError: if an output exists and ``overwrite`` is false.
         PermissionError: if the folder cannot be written to.
-        MissingDecoderError: if an animation needs PyAV and there is none.
+        MissingDecoderError: if an animation needs PyAV and it is not installed.
         ValueError: if an output is unknown.
     """
     check_outputs(outputs)
@@ -169,7 +169,7 @@ def write_outputs(
 
 
 def scene_figures(scene: Scene) -> dict[str, Any]:
-    """The figures of a scene's report."""
+    """Returns the report entries of a scene."""
     height, width = scene.cameras.size
     return {
         "views": len(scene.names),
@@ -185,7 +185,7 @@ def scene_figures(scene: Scene) -> dict[str, Any]:
 
 
 def frame_figures(scene: Scene) -> dict[str, Any]:
-    """The frame and unit of a scene: which, and the similarity from it to the cameras as they were given or found."""
+    """Returns the frame and unit of a scene, and the similarity from it to the cameras as given or found."""
     if scene.frame is None:
         return {}
     matrix, scale = scene.frame.to_source, scene.frame.scale
@@ -195,16 +195,16 @@ def frame_figures(scene: Scene) -> dict[str, Any]:
 
 
 def cost_figures(monitor: Monitor) -> dict[str, Any]:
-    """Time by stage and peak memory."""
+    """Returns time by stage, peak memory and device."""
     seconds = {name: round(value, 3) for name, value in monitor.seconds.items()}
     return {"seconds": seconds, "peak_memory_mib": round(monitor.peak_memory_mib), "device": str(monitor.device)}
 
 
 @contextmanager
 def mesh_fusion(scene: Scene, paths: Sequence[Path], voxel_size: float | None) -> Iterator[AddView]:
-    """Keeps the rendered depth and colour of the views, fuses them into a mesh and writes it to the paths.
+    """Collects the rendered depth and colour of the views, fuses them into a mesh and writes it to the paths.
 
-    Rendered surfaces that no view has measured are left open.
+    Rendered surfaces that no view has measured are left out.
 
     Raises:
         ValueError: if no view has rendered depth.
@@ -225,7 +225,7 @@ def mesh_fusion(scene: Scene, paths: Sequence[Path], voxel_size: float | None) -
 
 
 def _measured(scene: Scene, depth: Tensor) -> Tensor:
-    """Where rendered depth ``[V, H, W]`` shows what a view has measured, not background or a guess."""
+    """Returns where rendered depth ``[V, H, W]`` was measured by a view, rather than background or a guess."""
     cameras = scene.cameras.to("cpu")
     points = unproject(depth[None], cameras)[0]
     status = torch.stack([point_support(view.flatten(0, 1), scene.depth, cameras)[0] for view in points])
@@ -239,9 +239,10 @@ def _images(scene: Scene, target: Path) -> None:
 
 
 def _views(scene: Scene, path: Path) -> None:
-    """``images [V, H, W, 3]`` uint8; ``depth``, ``depth_conf`` and, where known, ``mask``, ``error [V, H, W]`` float32.
+    """Writes the arrays of the views.
 
-    ``support [V, H, W]`` is uint8.
+    ``images [V, H, W, 3]`` is uint8; ``depth``, ``depth_conf`` and, if known, ``mask`` and ``error`` are float32
+    ``[V, H, W]``; ``support [V, H, W]``, if known, is uint8.
     """
     buffer = io.BytesIO()
     images = np.stack([to_pixels(image) for image in scene.images])
@@ -283,7 +284,7 @@ def _tiles(scene: Scene, target: Path) -> None:
 
 
 def _scene_ply(scene: Scene, path: Path) -> None:
-    """The Gaussians with what is known of them: ``support`` and, where it is stated, ``error``."""
+    """Writes the Gaussians with ``support`` and ``error``, as far as known."""
     known = {name: values.numpy() for name, values in (scene.gaussian_trust or {}).items()}
     write_gaussian_ply(path, scene.gaussians, extra=known)
 
@@ -299,7 +300,7 @@ def _points_glb(scene: Scene, path: Path) -> None:
 
 
 def _target(output: str) -> str:
-    """The file or folder of an output."""
+    """Returns the file or folder name of an output."""
     return os.path.splitext(output)[0] if output in MAPS else output
 
 

@@ -36,30 +36,30 @@ ImagesLike: TypeAlias = "str | Path | Image.Image | NDArray[Any] | Tensor | Sequ
 HEIC_SUFFIXES = (".heic", ".heif")
 _HOLDS_PICTURES = (*IMAGE_SUFFIXES, *HEIC_SUFFIXES, R3D)
 VIDEO_FRAMES = 32  # frames taken from a video by default
-IN_MEMORY = 100  # frames of a video that are kept in memory; more are decoded when they are needed
+IN_MEMORY = 100  # maximum number of video frames kept in memory; with more, each is decoded on demand
 IMAGE_FOLDERS = ("images", "color", "rgb", "image", "input")
 _NO_PHOTOGRAPHS = ("masks", "depth", "depths", "color", "normals", "sfm", "sparse", "colmap", "nerfstudio")
-SFM_SOURCE = "structure from motion"  # how the source of cameras found by it begins
-UNKNOWN_LENS = "unknown"  # of images that structure from motion has undistorted
+SFM_SOURCE = "structure from motion"  # prefix of the source of cameras found by it
+UNKNOWN_LENS = "unknown"  # lens of images that structure from motion has undistorted
 
 
 @dataclass(frozen=True)
 class Picture:
-    """One picture, decoded when it is asked for.
+    """One picture, decoded on demand.
 
     Attributes:
-        name: of its file without the ending.
+        name: file name without extension.
         size: upright ``(height, width)`` in pixels.
-        read: decodes it as one frame, at least about as large as the ``(height, width)`` given; pictures without known
-            cameras have the identity and a guessed focal length.
-        source: where its camera (and depth, where ``has_depth``) comes from; empty where there is none.
+        read: decodes it as one frame, at least about as large as the given ``(height, width)``. Without a known
+            camera, the frame has identity pose and intrinsics.
+        source: origin of its camera (and depth, if ``has_depth``); empty if it has no camera.
         has_depth: whether its frame has depth.
-        point_depths: ``[n]`` z-depth of the sparse points that it sees; None where there are none.
-        focal: focal length in pixels that a photograph's EXIF data tell; None where they do not.
-        path: its file; None if it has none of its own.
-        pose: ``[4, 4]`` float64 given ``world_to_camera``; None where there is none.
-        is_metric: whether the unit of its camera (and depth) is the metre.
-        lens: what its file was undistorted from (``undistortion.lens_text``); empty for a pinhole's image.
+        point_depths: ``[n]`` z-depth of the sparse points that it sees; None if there are none.
+        focal: focal length in pixels from EXIF; None if unknown.
+        path: its file; None if it has no file of its own.
+        pose: ``[4, 4]`` float64 given ``world_to_camera``; None if there is none.
+        is_metric: whether its camera (and depth) is in metres.
+        lens: lens that its file was undistorted from (``undistortion.lens_text``); empty for a pinhole image.
     """
 
     name: str
@@ -83,16 +83,17 @@ def find_pictures(
     Args:
         images: a file, folder or video, a Pillow image, an array ``[H, W, 3]`` or ``[V, H, W, 3]`` (uint8), a tensor
             ``[3, H, W]`` or ``[V, 3, H, W]`` in [0, 1], or a sequence of these, in any mixture.
-        every: take every this many-th picture (of videos: frame) only.
-        max_images: take at most so many, evenly spread; None: all, of a video 32 frames unless ``every`` is given.
-        skip_damaged: leave out photographs that cannot be read, named in a warning.
+        every: take only every N-th picture (of videos: frame).
+        max_images: maximum number of pictures, evenly spread; None: all, but 32 frames of a video unless ``every`` is
+            given.
+        skip_damaged: skip photographs that cannot be read, with a warning that names them.
 
     Returns:
-        The pictures in order, their names unique.
+        The pictures in order, with unique names.
 
     Raises:
         FileNotFoundError: if a path does not exist.
-        ValueError: if there is no picture, naming what was looked at, or a file cannot be read.
+        ValueError: if there is no picture (the message names where was searched), or a file cannot be read.
     """
     check_choice(every, max_images)
     chosen: list[Picture] = []
@@ -101,7 +102,7 @@ def find_pictures(
     for item in as_items(images):
         found = _pictures(item, every, max_images, damaged)
         found = undamaged(found, damaged) if skip_damaged else found
-        if not _is_video(item):  # of a video every so many-th frame was decoded
+        if not _is_video(item):  # videos are already reduced to every N-th frame
             stills += len(found)
             found = [picture for i, picture in enumerate(found, stills - len(found)) if i % every == 0]
         chosen += found
@@ -112,12 +113,12 @@ def find_pictures(
 
 
 def check_pictures(images: ImagesLike, skip_damaged: bool = False) -> None:
-    """Refuses files and folders that hold no picture, without decoding any: before weights are downloaded.
+    """Checks that files and folders hold pictures, without decoding any, before weights are downloaded.
 
     Raises:
         FileNotFoundError: if a path does not exist.
         ImportError: if a video needs a package that is not installed.
-        ValueError: if there is no picture, or a file is none.
+        ValueError: if there is no picture, or a file is not a picture.
     """
     damaged: list[str] = []
     for item in as_items(images):
@@ -135,7 +136,7 @@ def check_pictures(images: ImagesLike, skip_damaged: bool = False) -> None:
 
 
 def undamaged(pictures: Iterable[Picture], damaged: list[str]) -> list[Picture]:
-    """The pictures that can be decoded; the errors of the others are added to ``damaged``."""
+    """Returns the pictures that can be decoded; adds the errors of the others to ``damaged``."""
     found = []
     for picture in pictures:
         try:
@@ -147,10 +148,10 @@ def undamaged(pictures: Iterable[Picture], damaged: list[str]) -> list[Picture]:
 
 
 def decoded(pictures: Sequence[Picture], number: int, size: tuple[int, int]) -> Frames:
-    """One of the pictures as a frame of about the size given.
+    """Decodes one of the pictures as a frame of about the given size.
 
     Raises:
-        DataError: if it cannot be read, naming all of the pictures that cannot.
+        DataError: if it cannot be read; the message names all pictures that cannot.
     """
     try:
         return pictures[number].read(size)
@@ -162,10 +163,10 @@ def decoded(pictures: Sequence[Picture], number: int, size: tuple[int, int]) -> 
 
 
 def report_damaged(damaged: Sequence[str], skip: bool) -> None:
-    """Warns of pictures that are left out, or raises one error that names them all.
+    """Warns about skipped pictures, or raises one error that names them all.
 
     Raises:
-        DataError: if there are any and they must not be skipped.
+        DataError: if there are damaged pictures and ``skip`` is false.
     """
     if damaged and not skip:
         raise DataError("; ".join(damaged) + " (--skip-damaged skips what cannot be read)")
@@ -174,12 +175,12 @@ def report_damaged(damaged: Sequence[str], skip: bool) -> None:
 
 
 def as_items(images: ImagesLike) -> list[Any]:
-    """What was given as a list."""
+    """Returns the input as a list."""
     return list(images) if isinstance(images, (list, tuple)) else [images]
 
 
 def check_choice(every: int, max_images: int | None) -> None:
-    """Checks which images are asked for.
+    """Checks ``every`` and ``max_images``.
 
     Raises:
         ValueError: if a number is below 1.
@@ -190,12 +191,12 @@ def check_choice(every: int, max_images: int | None) -> None:
 
 
 def evenly(pictures: list[Picture], limit: int | None) -> list[Picture]:
-    """At most ``limit`` of the pictures, evenly spread; None: all."""
+    """Returns at most ``limit`` of the pictures, evenly spread; None: all."""
     return pictures if limit is None or len(pictures) <= limit else [pictures[i] for i in spread(len(pictures), limit)]
 
 
 def existing_path(item: str | Path) -> Path:
-    """The path of a file or folder, its ``~`` expanded.
+    """Returns the path of a file or folder with ``~`` expanded.
 
     Raises:
         FileNotFoundError: if it does not exist.
@@ -207,13 +208,13 @@ def existing_path(item: str | Path) -> Path:
 
 
 def shrunk(pixels: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
-    """Averages blocks of pixels of an image ``[H, W, 3]`` that is more than twice as large as ``size`` both ways."""
+    """Averages blocks of an image ``[H, W, 3]`` of at least 4 times ``size``, to no less than twice ``size``."""
     factor = min(pixels.shape[0] // size[0], pixels.shape[1] // size[1]) // 2
     return pixels if factor < 2 else np.array(Image.fromarray(pixels).reduce(factor))
 
 
 def frame_of(pixels: NDArray[np.uint8], mask: NDArray[np.float32] | None = None) -> Frames:
-    """Frame of one image ``[H, W, 3]`` of which nothing else is known but a mask ``[h, w]`` of it."""
+    """Returns the frame of one image ``[H, W, 3]`` without camera or depth, with its mask ``[h, w]`` if given."""
     images = from_bytes(torch.from_numpy(np.ascontiguousarray(pixels))).permute(2, 0, 1)[None]
     poses, intrinsics = torch.eye(4)[None], torch.eye(3)[None]
     counts = None if mask is None else torch.from_numpy(resized_mask(mask, (images.shape[-2], images.shape[-1])))[None]
@@ -221,13 +222,13 @@ def frame_of(pixels: NDArray[np.uint8], mask: NDArray[np.float32] | None = None)
 
 
 def mask_file(path: Path) -> Path | None:
-    """The mask of a photograph in ``masks/`` in its folder or one folder up."""
+    """Returns the mask file of a photograph, from ``masks/`` in its folder or one folder up; None if there is none."""
     files = [mask_of(place / MASKS, path.name) for place in (path.parent, path.parent.parent)]
     return next((file for file in files if file is not None), None)
 
 
 def mask_for(path: Path, upright: bool = True, content: bytes | None = None) -> NDArray[np.float32] | None:
-    """How much each pixel of a photograph counts: its alpha, and its mask in ``masks/`` there or one folder up."""
+    """Returns the pixel weights of a photograph: the product of its alpha and its mask file (:func:`mask_file`)."""
     parts = [read_mask(path, "", content=content, upright=upright)]
     file = mask_file(path)
     if content is None and file is not None:
@@ -236,7 +237,7 @@ def mask_for(path: Path, upright: bool = True, content: bytes | None = None) -> 
 
 
 def _pictures(item: Any, every: int, max_images: int | None, damaged: list[str]) -> list[Picture]:
-    """The pictures of one item; errors of files that are no images are added to ``damaged``."""
+    """Returns the pictures of one item; adds errors of files that are not images to ``damaged``."""
     if not isinstance(item, (str, Path)):
         return _from_memory(item)
     path = existing_path(item)
@@ -261,16 +262,16 @@ def _photos(files: Sequence[Path], damaged: list[str]) -> list[Picture]:
 
 
 def image_files(folder: Path) -> list[Path]:
-    """Images of a folder, or of its folder of images if that has more; in the order of the numbers in their names.
+    """Lists the images of a folder, or of its image subfolder if that has more, sorted by the numbers in their names.
 
-    What is passed over is said in a warning.
+    Ignored images are named in a warning.
 
     Raises:
         ValueError: if there are none.
     """
     places = [folder, *image_folders(folder)]
     found = {place: [file for file in place.iterdir() if _is_image(file) and file.is_file()] for place in places}
-    taken = max(places, key=lambda place: len(found[place]))  # of equal ones the first
+    taken = max(places, key=lambda place: len(found[place]))  # the first of equals
     if not found[taken]:
         videos = sorted(file.name for file in folder.iterdir() if file.suffix.lower() in VIDEO_SUFFIXES)
         hint = f"; it has videos, name one: {folder / videos[0]}" if videos else ""
@@ -287,14 +288,14 @@ def image_files(folder: Path) -> list[Path]:
 
 
 def image_folders(folder: Path) -> list[Path]:
-    """Folders of images in a folder, without regard to case; reduced ones (``images_4``) last."""
+    """Lists the image subfolders of a folder, ignoring case; reduced ones (``images_4``) come last."""
     found = [path for path in folder.iterdir() if path.is_dir() and is_image_folder(path.name)]
     order = {name: number for number, name in enumerate(IMAGE_FOLDERS)}
     return sorted(found, key=lambda path: (order.get(path.name.lower(), len(order)), by_number(path.name)))
 
 
 def is_image_folder(name: str) -> bool:
-    """Whether a folder of this name usually holds a scene's images."""
+    """Returns whether a folder of this name usually holds a scene's images."""
     return name.lower() in IMAGE_FOLDERS or re.fullmatch(r"images_\d+", name.lower()) is not None
 
 
@@ -303,7 +304,7 @@ def _is_image(path: Path) -> bool:
 
 
 def _photo(path: Path, content_of: Callable[[Path], bytes | None] = lambda _: None) -> Picture:
-    """A photograph; ``content_of`` reads what lies in an archive."""
+    """Returns a photograph; ``content_of`` reads files inside an archive."""
     if path.suffix.lower() in HEIC_SUFFIXES:
         _open_heic(path)
 
@@ -325,7 +326,7 @@ def _photo(path: Path, content_of: Callable[[Path], bytes | None] = lambda _: No
 
 
 def _open_heic(path: Path) -> None:
-    """Lets Pillow read HEIC files, for which it needs help."""
+    """Registers pillow-heif, with which Pillow reads HEIC files."""
     if importlib.util.find_spec("pillow_heif") is None:
         raise ValueError(f"{path} is HEIC, which needs pip install pillow-heif; or save the photos as JPEG")
     from pillow_heif import register_heif_opener  # pyright: ignore[reportMissingImports]
@@ -381,12 +382,12 @@ def _from_memory(item: Any) -> list[Picture]:
 
 
 def spread(count: int, limit: int) -> Iterable[int]:
-    """``limit`` of ``count`` positions, evenly spread, the first and the last among them."""
+    """Returns ``limit`` of ``count`` positions, evenly spread, including the first and the last."""
     return [round(i * (count - 1) / max(limit - 1, 1)) for i in range(limit)]
 
 
 def with_unique_names(pictures: Sequence[Picture]) -> list[Picture]:
-    """Numbers pictures of equal names."""
+    """Returns the pictures with a number appended to names that occur more than once."""
     counts = Counter(picture.name for picture in pictures)
     taken, result = {name for name, count in counts.items() if count == 1}, []
     number: Counter[str] = Counter()

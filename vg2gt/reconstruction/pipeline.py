@@ -74,32 +74,32 @@ def reconstruct_with(
     Args:
         model: the model; it is put into eval mode.
         images: see :func:`vg2gt.reconstruction.pictures.find_pictures`.
-        every: take every this many-th image only.
-        max_images: take at most so many, evenly spread.
-        size: see :func:`vg2gt.reconstruction.working_size`.
-        renderer: how the scene will be rendered; None: as solids, with the default options.
+        every: take only every N-th image.
+        max_images: maximum number of images, evenly spread.
+        size: see :func:`vg2gt.reconstruction.inputs.working_size`.
+        renderer: renderer of the scene; None: solids, with the default options.
         monitor: shows and times the stages.
-        poses: where cameras come from, see :func:`vg2gt.reconstruction.cameras.pictures_for`.
-        sfm_folder: where cameras that structure from motion finds are kept, and found again; None: they are not.
+        poses: source of the cameras, see :func:`vg2gt.reconstruction.cameras.pictures_for`.
+        sfm_folder: folder where cameras found by structure from motion are kept and reused; None: they are not kept.
         frame: the scene's frame and unit (:class:`vg2gt.reconstruction.frame.SceneFrame`): ``given`` cameras',
             ``first`` camera's, ``upright``, or ``auto``.
         skip_damaged: skip images that cannot be read, with a warning; otherwise they are an error.
-        window: work on so many images and their neighbours at a time, which bounds the memory
-            (:mod:`vg2gt.reconstruction.windows`); 0: all at once; None: 24 of more than 100, else all.
-        window_folder: keeps what windows have done, so that an interrupted reconstruction goes on; None: a temporary
+        window: process this many images and their neighbours at a time, which bounds memory
+            (:mod:`vg2gt.reconstruction.windows`); 0: all at once; None: 24 if there are more than 100, else all.
+        window_folder: folder for finished windows, from which an interrupted reconstruction resumes; None: a temporary
             one.
-        keep_windows: work in windows whatever the number of images: their voxels are wanted.
-        anchor: of the scene that the images are added to (:mod:`vg2gt.reconstruction.windows.sets`).
-        calibration: of the model, by which errors are stated; None, or in windows: none are.
+        keep_windows: always process in windows, because their voxels are kept.
+        anchor: anchor of the scene to add the images to (:mod:`vg2gt.reconstruction.windows.sets`).
+        calibration: calibration of the model, from which errors are stated; None, or in windows: no stated errors.
 
     Returns:
-        The scene, in the frame that was asked for; its Gaussians stay on the model's device. Of a scene made in windows
-        images and depth are mapped from files.
+        The scene in the requested frame; its Gaussians stay on the model's device. For a scene made in windows, images
+        and depth are memory-mapped.
 
     Raises:
         FileNotFoundError: if a path does not exist.
-        ImportError: if cameras must be found and there is no pycolmap.
-        ValueError: if there are no images, one cannot be read, or the backend needs what they do not have.
+        ImportError: if cameras must be found and pycolmap is not installed.
+        ValueError: if there are no images, one cannot be read, or they lack what the backend needs.
         OutOfMemory: if the device's memory is full.
     """
     check_frame(frame)
@@ -136,7 +136,7 @@ def reconstruct_with(
             error, support = pixel_trust(prediction, order, views.mask, calibration)
     scene = _scene(geometry, gaussians, float(unit), views, renderer or Renderer(), model.backend.is_metric, frame)
     scene = replace(scene, error=error, support=support)
-    if to_source is not None and scene.frame is not None:  # the same for all sets of images, to the last digit
+    if to_source is not None and scene.frame is not None:  # exactly the same for all image sets
         scene = replace(scene, frame=replace(scene.frame, to_source=to_source))
     scene = scene if model.visibility is None or anchor else with_far_shell(scene)
     return scene.placed()
@@ -153,7 +153,7 @@ def _forward(
 
 @contextmanager
 def _folder(given: str | Path | None) -> Iterator[Path]:
-    """The folder, or a temporary one; what is mapped from its files stays readable after their removal."""
+    """Yields the folder, or a temporary one; memory-mapped files stay readable after their removal."""
     if given is not None:
         yield Path(given)
         return
@@ -162,7 +162,7 @@ def _folder(given: str | Path | None) -> Iterator[Path]:
 
 
 def with_far_shell(scene: Scene) -> Scene:
-    """The scene with a far shell for pixels that no view can place."""
+    """Returns the scene with a far shell for pixels that no view can place."""
     some = torch.arange(len(scene.names))
     if len(some) > AUTOMATIC:
         some = torch.tensor(list(spread(len(some), AUTOMATIC)))

@@ -1,4 +1,4 @@
-"""A scene refined on its own images, and what is reported about it."""
+"""Refinement of a scene on its own images, and its report."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ if TYPE_CHECKING:
     from vg2gt.reconstruction.scene import Scene
 
 ROWS = 4
-RECORDINGS = ("RGBDFolder", "TUM")  # whose poses were measured, and fit their depth better than bundle adjustment
+RECORDINGS = ("RGBDFolder", "TUM")  # their measured poses fit their depth better than bundle adjustment does
 
 
 def refinement_of(scene: Scene) -> str:
-    """The options in ``configs/refine`` that suit a scene: ``photographs``, or ``default`` for RGB-D recordings."""
+    """Returns the configuration in ``configs/refine`` for a scene: ``default`` for RGB-D, else ``photographs``."""
     return "default" if scene.cameras_from.startswith(RECORDINGS) else "photographs"
 
 
@@ -36,13 +36,13 @@ def refine_scene(
     """Optimises a scene's Gaussians and cameras on its images (:func:`vg2gt.refinement.refine`).
 
     Args:
-        scene: the start; it is not changed.
-        options: how long and how.
-        monitor: shows PSNR and the time that is left.
-        clock: what the options' seconds are; ``time.process_time`` counts those of all cores.
+        scene: scene to start from; it is not changed.
+        options: options of the refinement.
+        monitor: shows PSNR and the time left.
+        clock: measures the options' seconds; ``time.process_time`` counts those of all cores.
 
     Returns:
-        The refined scene; its images, decoded depth and names are the old ones.
+        The refined scene, with the same images, decoded depth and names.
     """
     device = scene.gaussians.means.device
     seen = Observations(scene.images, scene.depth, scene.depth_conf, scene.mask).to(device)
@@ -56,7 +56,7 @@ def refine_scene(
 
 
 def refinement_figures(scene: Scene) -> dict[str, Any]:
-    """The figures of a scene's refinement; empty if it was not refined."""
+    """Returns the report entries of a scene's refinement; empty if it was not refined."""
     refined = scene.refined
     if refined is None:
         return {}
@@ -77,7 +77,7 @@ def refinement_figures(scene: Scene) -> dict[str, Any]:
 
 
 def refinement_lines(refined: Refined) -> list[str]:
-    """A short table: views, PSNR before and after, Gaussians."""
+    """Returns the lines of a short table: views, PSNR before and after, Gaussians."""
     lines = []
     for name, views in (("trained on", refined.trained), ("held out", refined.held_out)):
         if len(views):
@@ -91,7 +91,7 @@ def refinement_lines(refined: Refined) -> list[str]:
 
 @torch.no_grad()
 def before_and_after(scene: Scene) -> Tensor:
-    """A picture ``[3, H', W']`` of up to 4 views, held-out ones first.
+    """Renders an image ``[3, H', W']`` of up to 4 views, held-out ones first.
 
     Columns: image, rendered colour before and after, normals before and after.
     """

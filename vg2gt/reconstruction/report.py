@@ -1,4 +1,4 @@
-"""Pictures of a reconstruction: input, colour, depth and normals of the views."""
+"""Report images of a reconstruction: input, colour, depth, normals and stated error of the views."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ table { border-collapse: collapse } td, th { padding: 2px 12px 2px 0; text-align
 
 
 def pictured(scene: Scene) -> list[int]:
-    """The views that ``report.png`` shows."""
+    """Returns the views that ``report.png`` shows."""
     return list(spread(len(scene.names), min(len(scene.names), ROWS)))
 
 
 @contextmanager
 def png_report(scene: Scene, path: Path) -> Iterator[AddView]:
-    """Writes one picture with a row per view, of at most 12 views, evenly spread."""
+    """Writes one image with a row per view, for at most 12 evenly spread views."""
     depth_range, wanted = _depth_range(scene), {f"{scene.names[view]}.png": view for view in pictured(scene)}
     rows: list[list[Tensor]] = []
 
@@ -55,7 +55,7 @@ def png_report(scene: Scene, path: Path) -> Iterator[AddView]:
 
 @contextmanager
 def html_rows(scene: Scene, rows: list[str]) -> Iterator[AddView]:
-    """Appends a row per view, with all its pictures, for :func:`write_html_report`."""
+    """Appends an HTML row per view with all its images, for :func:`write_html_report`."""
     depth_range = _depth_range(scene)
 
     def add(view: RenderedView) -> None:
@@ -73,12 +73,12 @@ def html_rows(scene: Scene, rows: list[str]) -> Iterator[AddView]:
 def write_html_report(
     path: Path, rows: Sequence[str], figures: Mapping[str, Any], orbit: Path | None, refined: Path | None = None
 ) -> None:
-    """Writes a page that holds all its pictures.
+    """Writes a page with all its images embedded.
 
     Args:
-        path: the file.
+        path: file to write.
         rows: one per view, from :func:`html_rows`.
-        figures: the table at the top.
+        figures: entries of the table at the top.
         orbit: a GIF to show, or None.
         refined: a PNG of views before and after refinement, or None.
     """
@@ -106,7 +106,7 @@ def _panels(scene: Scene, number: int, view: RenderedView, depth_range: tuple[fl
 
 
 def _depth_range(scene: Scene) -> tuple[float, float]:
-    """Depths that colours span: the middle 96 % of the decoded depth."""
+    """Returns the depth range of the colour map: the middle 96 % of the decoded depth."""
     visible = scene.depth[scene.depth > 0]
     visible = visible[:: max(1, len(visible) // 1_000_000)]
     low, high = torch.quantile(visible, torch.tensor([0.02, 0.98])).tolist()

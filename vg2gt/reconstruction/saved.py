@@ -1,4 +1,4 @@
-"""The scene back from a reconstruction's folder."""
+"""Reads a scene from a reconstruction's folder."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ def read_scene(folder: str | Path, renderer: Renderer, device: torch.device | st
     """Reads a scene that was saved with its cameras and views.
 
     Args:
-        folder: holds ``scene.ply``, ``cameras.json`` and ``views.npz``. Without ``views.npz``, images are read from
-            ``images/``, where cameras.json names them, and the scene's own rendered depth replaces the decoded one.
-        renderer: how the scene is rendered.
-        device: where the Gaussians go.
+        folder: folder with ``scene.ply``, ``cameras.json`` and ``views.npz``. Without ``views.npz``, the images that
+            cameras.json names are read from ``images/``, and the scene's rendered depth replaces the decoded depth.
+        renderer: renderer of the scene.
+        device: device of the Gaussians and cameras.
 
     Raises:
-        FileNotFoundError: naming the file that is missing, and how to get it.
-        ValueError: if the files do not go together.
+        FileNotFoundError: if a file is missing; the message says how to get it.
+        ValueError: if the files do not match.
     """
     folder = Path(folder)
     for name in ("scene.ply", "cameras.json"):
@@ -71,7 +71,7 @@ def read_scene(folder: str | Path, renderer: Renderer, device: torch.device | st
 
 
 def _frame(report: dict[str, Any], camera: NamedCamera) -> SceneFrame | None:
-    """The frame that the scene was written in; it is kept."""
+    """Returns the frame that the scene was written in, as its target frame too."""
     if camera.similarity is None:
         return None
     name = report.get("frame")
@@ -114,7 +114,7 @@ def _read_views(path: Path, views: int, size: tuple[int, int]) -> tuple[Tensor, 
 
 
 def _trust(path: Path, shape: tuple[int, ...]) -> dict[str, Tensor]:
-    """``error`` and ``support`` of the pixels, as far as they are there."""
+    """Reads ``error`` and ``support`` of the pixels, if saved."""
     names = [name for name in ("error", "support") if path.is_file() and name in npz_names(path)]
     arrays = read_npz(path, names) if names else {}
     for name, array in arrays.items():

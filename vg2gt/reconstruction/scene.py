@@ -1,4 +1,4 @@
-"""A reconstructed scene: Gaussians, the cameras they were seen from, and the images."""
+"""A reconstructed scene: Gaussians, the cameras of the views, and the images."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ class RenderedView:
     """One rendered view on the CPU.
 
     Attributes:
-        camera: where it was rendered.
-        color: ``[3, H, W]`` in [0, 1], black behind the scene.
+        camera: camera it was rendered with.
+        color: ``[3, H, W]`` in [0, 1], over the scene's background.
         depth: ``[H, W]`` z-depth in scene units, 0 = none.
         normal: ``[3, H, W]`` in the camera's frame, not unit length.
         alpha: ``[H, W]`` opacity in [0, 1].
@@ -66,26 +66,26 @@ class ScenePoints:
 class Scene:
     """The result of :func:`vg2gt.reconstruct`.
 
-    The world is that of ``frame``: the given cameras' world and unit, or the first image's camera turned upright (x
-    right, y down, z forward) in a unit in which the median depth is about 1.
+    The world frame and unit are those of ``frame``: by default those of the given cameras, or else the reference camera
+    (:mod:`vg2gt.reconstruction.order`) turned upright (x right, y down, z forward), with a median depth of about 1.
 
     Attributes:
-        gaussians: the scene, on the device it was made on.
-        cameras: the views' cameras ``[1, V]``, of images of the working size.
+        gaussians: Gaussians of the scene, on the device where it was made.
+        cameras: ``[1, V]`` cameras of the views, for images of the working size.
         images: ``[V, 3, H, W]`` in [0, 1]: the input at the working size.
         depth: ``[V, H, W]`` decoded z-depth in scene units, 0 = none.
         depth_conf: ``[V, H, W]`` its confidence, larger is better.
         names: one per view.
-        renderer: how it is rendered.
+        renderer: renderer of the scene.
         metres_per_unit: metres per scene unit; None if unknown.
-        refined: how it was refined; None where it was not.
-        cameras_from: where the backbone was given cameras from; empty if it predicted them.
-        frame: where the world is in that of the given or found cameras; None if unknown.
-        mask: ``[V, H, W]`` in [0, 1], how much each input pixel counts; None: all count.
-        pictures: where the images come from, one per view; empty for a scene read from files.
+        refined: result of the refinement; None if not refined.
+        cameras_from: source of the cameras given to the backbone; empty if it predicted them.
+        frame: placement of the world in that of the given or found cameras; None if unknown.
+        mask: ``[V, H, W]`` in [0, 1], weights of the input pixels; None: all count.
+        pictures: source pictures, one per view; empty for a scene read from files.
         error: ``[V, H, W]`` relative error that the decoded depth stays below in 9 of 10 pixels; None: not stated.
-        support: ``[V, H, W]`` uint8, what is known of each pixel (:class:`vg2gt.uncertainty.Status`); None: unknown.
-        poses: ``[V, 4, 4]`` float64 ``world_to_camera`` where they are known better than ``cameras`` has them.
+        support: ``[V, H, W]`` uint8 :class:`vg2gt.uncertainty.Status` of each pixel; None: unknown.
+        poses: ``[V, 4, 4]`` float64 ``world_to_camera``, if known more precisely than in ``cameras``.
     """
 
     gaussians: Gaussians
@@ -107,9 +107,9 @@ class Scene:
 
     @cached_property
     def gaussian_trust(self) -> dict[str, Tensor] | None:
-        """``support`` (:class:`vg2gt.uncertainty.Status`) and, where it is stated, ``error`` of the Gaussians, ``[G]``.
+        """``support`` (:class:`vg2gt.uncertainty.Status`) and, if stated, ``error`` of the Gaussians, ``[G]`` each.
 
-        None where nothing is known of the pixels, as in windows.
+        None if the support of the pixels is unknown, as for scenes made in windows.
         """
         if self.support is None:
             return None
@@ -120,7 +120,7 @@ class Scene:
         return known if error is None else {"error": bound.cpu(), **known}
 
     def named_cameras(self) -> list[NamedCamera]:
-        """The views' cameras, named like the image files that :meth:`save` writes."""
+        """Returns the views' cameras, named like the image files that :meth:`save` writes."""
         named = named_cameras(self.cameras, [f"{name}.png" for name in self.names])
         if self.poses is not None and torch.equal(self.poses.float(), self.cameras.world_to_camera[0].cpu().float()):
             named = [
@@ -136,7 +136,7 @@ class Scene:
         return [replace(c, photo=photo_of(c, picture)) for c, picture in zip(found, self.pictures, strict=True)]
 
     def placed(self) -> Scene:
-        """The scene in the frame and unit that are wanted of it: ``frame.target``."""
+        """Returns the scene in its target frame and unit (``frame.target``)."""
         if self.frame is None or self.frame.name == self.frame.target:
             return self
         depth = self.depth[self.depth > 0]
@@ -155,11 +155,11 @@ class Scene:
         )
 
     def render(self, cameras: Sequence[NamedCamera] | None = None) -> Iterator[RenderedView]:
-        """Renders views one by one, so that memory does not grow with their number; None: the input views."""
+        """Renders views one by one, to bound memory; None: the input views."""
         return render_views(self.renderer, self.gaussians, self.named_cameras() if cameras is None else cameras)
 
     def points(self, limit: int = POINTS) -> ScenePoints:
-        """Points of the decoded depth on a regular grid of pixels, at most ``limit``."""
+        """Returns points of the decoded depth on a regular grid of pixels, at most about ``limit``."""
         views, height, width = self.depth.shape
         step = max(1, int(np.ceil(np.sqrt(views * height * width / limit))))
         grid = (slice(None), slice(step // 2, None, step), slice(step // 2, None, step))
@@ -175,8 +175,8 @@ class Scene:
         """Optimises Gaussians and cameras on the scene's own images (:func:`vg2gt.refinement.refine`).
 
         Args:
-            options: how; default :class:`vg2gt.refinement.RefineOptions`.
-            **changes: options that differ, such as ``steps=50`` or ``holdout=8``.
+            options: options of the refinement; default :class:`vg2gt.refinement.RefineOptions`.
+            **changes: options to override, such as ``steps=50`` or ``holdout=8``.
 
         Returns:
             The refined scene; this one is not changed.
@@ -186,10 +186,10 @@ class Scene:
         return refine_scene(self, replace(options or RefineOptions(), **changes))
 
     def save(self, folder: str | Path, outputs: Sequence[str] = ("scene.ply", "cameras.json", "report.png")) -> None:
-        """Writes files into a folder; :data:`vg2gt.reconstruction.output_names.OUTPUTS` lists them.
+        """Writes outputs into a folder; :data:`vg2gt.reconstruction.output_names.OUTPUTS` lists them.
 
         Raises:
-            FileExistsError: if one exists.
+            FileExistsError: if an output exists.
             ValueError: if an output is unknown.
         """
         from vg2gt.reconstruction.outputs import write_outputs

@@ -1,12 +1,12 @@
-"""Cameras of photographs by structure from motion: COLMAP's incremental mapper, from pycolmap (``vg2gt[colmap]``).
+"""Camera estimation by structure from motion: COLMAP's incremental mapper from pycolmap (``vg2gt[colmap]``).
 
-Of up to 60 photographs every pair is compared; of more, likely pairs are (:mod:`vg2gt.reconstruction.sfm_pairs`), with
-fewer features.
+All pairs of up to 60 photographs are matched. With more, only likely pairs are
+(:mod:`vg2gt.reconstruction.sfm_pairs`), with fewer features per image.
 
-What is found is kept as a folder that every command reads as a COLMAP recording: undistorted ``images/``, ``masks/``
-if there are masks, a model of PINHOLE cameras in ``sparse/``, and ``sfm.json``, which says of which pictures it was
-made. COLMAP's own lens model with one radial coefficient is fitted and the images are undistorted with it: a pinhole
-fitted to a distorted lens errs in its focal length.
+The result is kept in a folder that every command reads as a COLMAP recording: undistorted ``images/``, ``masks/`` if
+there are masks, a model of PINHOLE cameras in ``sparse/``, and ``sfm.json``, which identifies the input pictures.
+COLMAP's SIMPLE_RADIAL lens model (one radial coefficient) is fitted and the images are undistorted with it, because a
+pinhole model fitted to a distorted lens gets a wrong focal length.
 """
 
 from __future__ import annotations
@@ -48,13 +48,13 @@ log = logging.getLogger(__name__)
 
 FORMAT = 1
 """Of the folder; raise it when it is written otherwise."""
-IMAGE_SIDE = 1600  # pixels of the kept images' longer side, at most
-FEATURE_SIDE, FEATURES = 1280, 4096  # features are looked for in images of this longer side, so many at most
-MANY_SIDE, MANY_FEATURES = 1024, 2048  # where there are more photographs than every pair is compared of
+IMAGE_SIDE = 1600  # maximum longer side of the kept images, in pixels
+FEATURE_SIDE, FEATURES = 1280, 4096  # longer side of the images for feature extraction, maximum number of features
+MANY_SIDE, MANY_FEATURES = 1024, 2048  # the same for more than ALL_PAIRS photographs
 SEED = 0
 _MODEL = "SIMPLE_RADIAL"
-_QUALITY = 95  # of the kept JPEGs
-_AT_ONCE = 4  # images whose features are looked for at the same time, which bounds the memory
+_QUALITY = 95  # JPEG quality of the kept images
+_AT_ONCE = 4  # images per batch of feature extraction, to bound memory
 _STATE = "sfm.json"
 _MASKS = "masks"
 
@@ -66,10 +66,10 @@ ADVICE = (
 
 
 def require_pycolmap() -> None:
-    """Checks early that there is pycolmap.
+    """Checks early that pycolmap is installed.
 
     Raises:
-        ImportError: if there is none, naming the remedies.
+        ImportError: if it is not; the message names the remedies.
     """
     if importlib.util.find_spec("pycolmap") is None:
         raise ImportError(
@@ -79,23 +79,23 @@ def require_pycolmap() -> None:
 
 
 def find_cameras(pictures: Sequence[Picture], folder: Path, monitor: Monitor) -> list[Picture]:
-    """The pictures for which structure from motion finds a camera, undistorted, with the depths of its sparse points.
+    """Returns the pictures for which structure from motion finds a camera: undistorted, with sparse point depths.
 
-    Pictures of one size and EXIF focal length share one lens. The world is one of COLMAP's making; the unit is such
-    that the points' median depth over all views is 1. The same pictures give the same cameras.
+    Pictures with the same size and EXIF focal length share one lens. The world frame is COLMAP's, scaled so that the
+    median depth of the points over all views is 1. The same pictures give the same cameras.
 
     Args:
-        pictures: in order; their cameras, if any, are not used.
-        folder: where the result is kept; if it holds that of the very same pictures, nothing is computed.
+        pictures: in order; their cameras, if any, are ignored.
+        folder: folder of the result; if it already holds the result for the same pictures, nothing is computed.
         monitor: shows and times the stages.
 
     Returns:
-        The placed pictures in the same order and of the same names; the others are named in a warning.
+        The placed pictures in the same order and with the same names; the others are named in a warning.
 
     Raises:
-        ImportError: if pycolmap is needed and missing.
-        FileExistsError: if the folder holds something else.
-        ValueError: if no model of the scene is found, with what to try.
+        ImportError: if pycolmap is needed and not installed.
+        FileExistsError: if the folder contains other files.
+        ValueError: if no model of the scene is found; the message says what to try.
     """
     pictures = without_copies(pictures, decode=True)
     key = _key(pictures)
@@ -117,7 +117,7 @@ def find_cameras(pictures: Sequence[Picture], folder: Path, monitor: Monitor) ->
 
 
 def _tell_left_out(state: dict[str, Any], count: int) -> None:
-    """Names the images without cameras, and those of other parts."""
+    """Warns about images without cameras and images of other parts of the scene."""
     if state["left_out"]:
         log.warning(
             "%d of %d images overlap too little with the others; they have no cameras and are left out: %s",
@@ -132,7 +132,7 @@ def _tell_left_out(state: dict[str, Any], count: int) -> None:
 
 
 def _key(pictures: Sequence[Picture]) -> str:
-    """Changes with the content, the names or the order of the pictures, and with how they are worked on."""
+    """Returns a hash of the pictures' contents, masks, names and order, and of the processing settings."""
     settings = [FORMAT, IMAGE_SIDE, *_feature_settings(len(pictures)), SEED, _MODEL, _QUALITY]
     masks = [None if picture.path is None else mask_file(picture.path) for picture in pictures]
     hashes = [None if mask is None else hashlib.sha256(mask.read_bytes()).hexdigest() for mask in masks]
@@ -144,7 +144,7 @@ def _key(pictures: Sequence[Picture]) -> str:
 
 
 def _read_state(folder: Path) -> dict[str, Any] | None:
-    """What a folder says of its content; None where there is none, or a part is missing or damaged."""
+    """Reads the state of a result folder; None if it is missing, incomplete or damaged."""
     try:
         state = load_json(folder / _STATE)
     except (FormatError, OSError):
@@ -157,7 +157,7 @@ def _read_state(folder: Path) -> dict[str, Any] | None:
 
 
 def _check_ours(folder: Path) -> None:
-    """Refuses to replace a folder that is not of our making."""
+    """Refuses to replace a folder that holds anything but an earlier result."""
     empty = not folder.exists() or (folder.is_dir() and not any(folder.iterdir()))
     if not empty and not (folder / _STATE).is_file():
         raise FileExistsError(f"{folder} already exists and contains other files; move it or choose another --out")
@@ -200,9 +200,9 @@ def _solve(pictures: Sequence[Picture], folder: Path, key: str, monitor: Monitor
 
 
 def _stage(pictures: Sequence[Picture], work: Path, advance: Any) -> dict[tuple[int, int, float], list[str]]:
-    """Writes the pictures as numbered upright JPEGs; their names by (height, width, focal length or 0).
+    """Writes the pictures as numbered upright JPEGs; returns their names by (height, width, focal length or 0).
 
-    If one has a mask, masks of all are written, in ``masks/`` as COLMAP wants them and in ``mask-images/``.
+    If any picture has a mask, masks are written for all: to ``masks/`` with COLMAP's names and to ``mask-images/``.
     """
     lenses: dict[tuple[int, int, float], list[str]] = {}
     masks: dict[str, NDArray[np.uint8]] = {}
@@ -230,7 +230,7 @@ def _stage(pictures: Sequence[Picture], work: Path, advance: Any) -> dict[tuple[
 
 
 def _feature_settings(count: int) -> tuple[int, int]:
-    """Longer side of the images in which features are looked for, and how many at most."""
+    """Returns the longer side of the images for feature extraction, and the maximum number of features."""
     return (FEATURE_SIDE, FEATURES) if count <= ALL_PAIRS else (MANY_SIDE, MANY_FEATURES)
 
 
@@ -272,7 +272,7 @@ def _find_features(
 
 
 def _match(work: Path, names: Sequence[str], monitor: Monitor) -> None:
-    """Matches every image with all before it, or of many with those that are likely to show the same."""
+    """Matches each image with all earlier ones, or, if there are many images, likely pairs only."""
     import pycolmap  # pyright: ignore[reportMissingImports]
 
     database = work / "database.db"
@@ -313,7 +313,7 @@ def _descriptors(database: Path, names: Sequence[str]) -> list[NDArray[np.uint8]
 
 
 def _write(model: Reconstruction, work: Path) -> None:
-    """Brings the points' median depth to 1 and writes undistorted images and their model to ``work/undistorted``."""
+    """Scales the points' median depth to 1 and writes undistorted images and their model to ``work/undistorted``."""
     import pycolmap  # pyright: ignore[reportMissingImports]
 
     depths = []
@@ -333,5 +333,5 @@ def _write(model: Reconstruction, work: Path) -> None:
 
 
 def _threads() -> int:
-    """More than are images at once are of no use to features; matching goes the same way."""
+    """Returns the number of threads, at most one per image of a feature extraction batch; matching uses the same."""
     return min(_AT_ONCE, torch.get_num_threads())

@@ -1,4 +1,4 @@
-"""Models of a scene from matched features: COLMAP's incremental mapper, and which models are sound."""
+"""Models of a scene from matched features: COLMAP's incremental mapper, and selection of sound models."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ if TYPE_CHECKING:
         Reconstruction,
     )
 
-FEWEST_POINTS = 20  # of a model that is one: a camera that only turned gives none
+FEWEST_POINTS = 20  # minimum number of points of a sound model: a camera that only rotates yields none
 
 
 def map_cameras(work: Path, count: int, seed: int, monitor: Monitor) -> list[Reconstruction]:
-    """Models of the scene, or of its parts, by the incremental mapper.
+    """Returns models of the scene, or of its parts, from the incremental mapper.
 
-    The global mapper (``pycolmap.global_mapping``) was tried: of the fox's 24 photographs it places all, with a small
-    reprojection error, a quarter of the path away from where they are, with calibrated focal lengths as well.
+    The global mapper (``pycolmap.global_mapping``) is not used: on the fox scene it places all 24 photographs with a
+    small reprojection error, but a quarter of the path away from their positions, even with calibrated focal lengths.
 
     Args:
-        work: folder with ``database.db``, in which features are matched, and ``images/``.
-        count: how many images there are.
-        seed: the same seed gives the same models.
+        work: folder with ``images/`` and ``database.db``, which holds the matched features.
+        count: number of images.
+        seed: random seed; the same seed gives the same models.
         monitor: shows and times the stage.
     """
     import pycolmap  # pyright: ignore[reportMissingImports]
@@ -47,13 +47,13 @@ def map_cameras(work: Path, count: int, seed: int, monitor: Monitor) -> list[Rec
 
 
 def sound_models(models: Sequence[Reconstruction]) -> list[Reconstruction]:
-    """Those with points, the one of most images first."""
+    """Returns the models with enough points, the one with most images first."""
     sound = [model for model in models if model.num_points3D() >= FEWEST_POINTS]
     return sorted(sound, key=lambda model: (model.num_reg_images(), model.num_points3D()), reverse=True)
 
 
 def other_parts(models: Sequence[Reconstruction], taken: AbstractSet[str]) -> list[list[str]]:
-    """Images of each model that are in none before it, nor among those taken."""
+    """Returns the images of each model that are in no earlier model and not in ``taken``, without empty lists."""
     parts, known = [], set(taken)
     for model in models:
         parts.append(sorted(placed_images(model) - known))
@@ -62,7 +62,7 @@ def other_parts(models: Sequence[Reconstruction], taken: AbstractSet[str]) -> li
 
 
 def placed_images(model: Reconstruction) -> set[str]:
-    """Names of the images that have a camera."""
+    """Returns the names of the images that have a camera."""
     return {image.name for image in model.images.values() if image.has_pose}
 
 
@@ -70,6 +70,6 @@ def _options(seed: int) -> IncrementalPipelineOptions:
     import pycolmap  # pyright: ignore[reportMissingImports]
 
     options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads = options.mapper.num_threads = 1  # sums in a fixed order: the same images, the same cameras
+    options.num_threads = options.mapper.num_threads = 1  # fixed order of sums: reproducible cameras
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
     return options

@@ -1,8 +1,8 @@
-"""Which photographs structure from motion compares: all pairs of few, likely pairs of many.
+"""Selection of likely photograph pairs for structure from motion, if there are too many to match them all.
 
-Of many, each is compared with some before it in the order given, at distances that double (a walk has little baseline
-between neighbours), and with those that look alike. How alike two are is told by VLAD (Jegou et al. 2010) of their SIFT
-features, whose words are found in these very photographs: no vocabulary needs to be fetched.
+Each photograph is paired with some earlier ones in the given order, at doubling distances (neighbours on a walk have
+little baseline), and with those that look alike. Similarity is that of VLAD vectors (Jegou et al. 2010) of SIFT
+features. Their vocabulary is built from the photographs themselves, so that none has to be downloaded.
 """
 
 from __future__ import annotations
@@ -12,20 +12,20 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-ALL_PAIRS = 60  # photographs of which every pair is compared
-DISTANCES = (1, 2, 4, 8, 16)  # in the order given
-ALIKE = 10  # photographs that look alike, for each
-APART = 3  # of those, none is so near in the order to another: frames of a video would all be neighbours
-WORDS, ROUNDS, SAMPLE = 64, 10, 20_000  # of k-means
+ALL_PAIRS = 60  # number of photographs up to which all pairs are matched
+DISTANCES = (1, 2, 4, 8, 16)  # to the paired photographs in the given order
+ALIKE = 10  # similar photographs per photograph
+APART = 3  # they are more than this far apart in the order: frames of a video would all be neighbours
+WORDS, ROUNDS, SAMPLE = 64, 10, 20_000  # clusters, iterations and sampled features of k-means
 LEAST = 1e-9
 
 
 def likely_pairs(descriptors: Sequence[NDArray[np.uint8]], seed: int = 0) -> list[tuple[int, int]]:
-    """Pairs (earlier, later) of many photographs that probably show the same things.
+    """Returns pairs (earlier, later) of photographs that probably show the same things.
 
     Args:
-        descriptors: ``[n, 128]`` SIFT of each photograph, in order; ``n`` may be 0.
-        seed: of the words.
+        descriptors: ``[n, 128]`` SIFT descriptors of each photograph, in order; ``n`` may be 0.
+        seed: random seed of the vocabulary.
 
     Returns:
         Each pair once, sorted by the later photograph.
@@ -46,7 +46,7 @@ def likely_pairs(descriptors: Sequence[NDArray[np.uint8]], seed: int = 0) -> lis
 
 
 def _vlad(descriptors: Sequence[NDArray[np.uint8]], seed: int) -> NDArray[np.float32]:
-    """One unit vector ``[N, words * 128]`` a photograph: summed differences of its features to their nearest words."""
+    """Returns a unit vector per photograph, ``[N, words * 128]``: summed residuals of features to their words."""
     rng = np.random.default_rng(seed)
     everything = np.concatenate([np.zeros((0, 128), np.uint8), *descriptors])
     if not len(everything):
@@ -64,7 +64,7 @@ def _vlad(descriptors: Sequence[NDArray[np.uint8]], seed: int) -> NDArray[np.flo
         features = own.astype(np.float32)
         nearest = _nearest(features, words)
         np.add.at(found[row], nearest, features - words[nearest])
-    # First every word's part, so that none outweighs the others.
+    # Normalise the part of each word first, so that none dominates.
     return _unit(_unit(found).reshape(len(found), -1))
 
 

@@ -1,4 +1,4 @@
-"""Leaves out pictures that are copies of others."""
+"""Detection of pictures that are copies of others."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ log = logging.getLogger(__name__)
 
 
 def without_copies(pictures: Sequence[Picture], decode: bool = False) -> list[Picture]:
-    """Pictures without those whose file is equal to an earlier one's, byte for byte; they are named in a warning.
+    """Returns the pictures without byte-identical copies of earlier files, which are named in a warning.
 
     Args:
         pictures: in order.
-        decode: compare the pixels of pictures that have no file of their own; otherwise these are all kept.
+        decode: also compare the pixels of pictures without a file of their own; otherwise these are all kept.
     """
     first: dict[str, str] = {}
     found, copies = [], []
@@ -36,7 +36,7 @@ def without_copies(pictures: Sequence[Picture], decode: bool = False) -> list[Pi
 
 
 def digest(picture: Picture) -> str:
-    """Hash of a picture's file, or of its pixels where it has none."""
+    """Returns the hash of a picture's file, or of its pixels if it has none."""
     if picture.path is not None:
         return hashlib.sha256(picture.path.read_bytes()).hexdigest()
     return hashlib.sha256(to_bytes(picture.read(picture.size).images).numpy().tobytes()).hexdigest()

@@ -1,4 +1,4 @@
-"""What a scene knows of itself: status and stated error of its pixels and Gaussians, and scenes without the worst."""
+"""Status and stated error of a scene's pixels and Gaussians, and removal of the untrusted ones."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ if TYPE_CHECKING:
     from vg2gt.reconstruction.scene import Scene
 
 NAMES = {kind.name.lower(): kind for kind in Status}
-_COLORS = torch.tensor([[0.15, 0.15, 0.15], [0.45, 0.45, 0.45], [0.75, 0.1, 0.55]])  # of what has no stated depth
+_COLORS = torch.tensor([[0.15, 0.15, 0.15], [0.45, 0.45, 0.45], [0.75, 0.1, 0.55]])  # unseen, guessed, contradicted
 _RAMP = torch.tensor([[0.1, 0.3, 0.75], [0.2, 0.7, 0.5], [0.95, 0.85, 0.2], [0.85, 0.2, 0.1]])
-_RAMP_ENDS = (0.003, 0.3)  # errors at its ends, spread by their logarithm
+_RAMP_ENDS = (0.003, 0.3)  # errors at its ends, logarithmic in between
 
 
 def pixel_trust(
     prediction: Prediction, order: Sequence[int], mask: Tensor | None, calibration: Calibration | None
 ) -> tuple[Tensor | None, Tensor]:
-    """Stated error and status of the pixels of one scene, ``[V, H, W]`` each, of the views as they were given.
+    """Returns stated error and status of one scene's pixels, ``[V, H, W]`` each, in the given order of the views.
 
     Args:
-        prediction: of the views in working order.
-        order: that order.
-        mask: ``[V, H, W]`` of the views as they were given; None: all pixels count.
-        calibration: of the model; None: no errors are stated.
+        prediction: prediction for the views in processing order.
+        order: indices of the views in processing order.
+        mask: ``[V, H, W]`` in the given order; None: all pixels count.
+        calibration: calibration of the model; None: no errors are stated.
     """
     evidence, status = pixel_evidence(prediction.geometry, prediction.supported)
     error = None if calibration is None else calibration.error(evidence, status)
@@ -42,15 +42,16 @@ def pixel_trust(
 
 
 def trusted(scene: Scene, min_confidence: float | None = None, drop: Sequence[str] = ()) -> Scene:
-    """The scene without Gaussians and depth that are not to be trusted.
+    """Returns the scene without untrusted Gaussians and depth.
 
     Args:
-        scene: any.
-        min_confidence: one minus the largest stated error that stays, in [0, 1]; None: any stays.
-        drop: names of :class:`Status` to leave out, such as ``guessed``.
+        scene: scene to filter; it is not changed.
+        min_confidence: one minus the largest stated error to keep, in [0, 1]; None: keep all.
+        drop: names of :class:`Status` values to remove, such as ``guessed``.
 
     Raises:
-        ValueError: if a name is unknown, the number out of range, no errors are stated, or nothing would be left.
+        ValueError: if a name is unknown, the number is out of range, support or errors are unknown, or no Gaussian
+            would be left.
     """
     check_trust(min_confidence, drop)
     if min_confidence is None and not drop:
@@ -78,7 +79,7 @@ def trusted(scene: Scene, min_confidence: float | None = None, drop: Sequence[st
     gaussians = scene.gaussians.select(kept.to(scene.gaussians.means.device))
     depth = torch.where(stays(scene.error, scene.support), scene.depth, 0.0)
     left = replace(scene, gaussians=gaussians, depth=depth)
-    # What is known of the Gaussians that stay is what all depth said, also that which has gone.
+    # Keep the support that the Gaussians got from all depth, including the removed depth.
     left.__dict__["gaussian_trust"] = {name: values[kept] for name, values in known.items()}
     return left
 
@@ -87,7 +88,7 @@ def check_trust(min_confidence: float | None, drop: Sequence[str]) -> None:
     """Checks the options of :func:`trusted`.
 
     Raises:
-        ValueError: if a name is unknown or the number out of range.
+        ValueError: if a name is unknown or the number is out of range.
     """
     if min_confidence is not None and not 0 <= min_confidence <= 1:
         raise ValueError(f"--min-confidence {min_confidence}: give a number from 0 to 1, such as 0.95")
@@ -97,7 +98,7 @@ def check_trust(min_confidence: float | None, drop: Sequence[str]) -> None:
 
 
 def trust_figures(scene: Scene) -> dict[str, Any]:
-    """The figures of a report: shares of pixels and Gaussians by status, and the errors that are stated, if known."""
+    """Returns report entries: shares of pixels and Gaussians by status, and median stated errors; empty if unknown."""
     known = scene.gaussian_trust
     if known is None or scene.support is None:
         return {}
@@ -113,7 +114,7 @@ def trust_figures(scene: Scene) -> dict[str, Any]:
 
 
 def trust_line(scene: Scene) -> str:
-    """What is known in one line, for a terminal."""
+    """Returns a one-line summary for a terminal."""
     figures = trust_figures(scene).get("trust")
     if figures is None:
         return "what supports the Gaussians is not known in windows"
@@ -125,10 +126,10 @@ def trust_line(scene: Scene) -> str:
 
 
 def trust_picture(error: Tensor | None, support: Tensor) -> Tensor:
-    """Colours ``[3, ...]`` of stated errors and status ``[...]``: from blue (0.3 %) to red (30 % and more).
+    """Returns colours ``[3, ...]`` of stated errors and status ``[...]``: from blue (0.3 %) to red (30 % and more).
 
-    What is not known is dark grey (unseen), grey (guessed) and purple (contradicted). Without errors, blue is what
-    several views agree on and yellow what one view has measured.
+    Unseen is dark grey, guessed grey and contradicted purple. Without errors, blue means that several views agree, and
+    yellow that a single view measured the depth.
     """
     if error is None:
         place = torch.where(support == Status.AGREED, 0.0, 2 / 3)

@@ -1,4 +1,4 @@
-"""Per-scene optimisation from a feed-forward start: sharper colour, geometry held in place."""
+"""Per-scene optimisation of a feed-forward scene: sharper colour, with geometry held in place."""
 
 from vg2gt.refinement.loss import Observations, RefineLoss
 from vg2gt.refinement.options import RefineOptions, RefineRates

@@ -1,4 +1,4 @@
-"""Fewer Gaussians where they are not seen, more where one is not enough."""
+"""Density control: fewer Gaussians where views do not support them, more where one is not enough."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ from vg2gt.method.grid import plan_voxels, point_cells, pool_mean
 from vg2gt.refinement.parameters import Parameters
 from vg2gt.types import Cameras, Gaussians
 
-TOLERANCE, MARGIN = 0.03, 0.05  # relative differences of depth at which a view agrees with a Gaussian, or looks through
-FEWEST = 2  # views that agree with what is merged
-GROWTH = 2.0  # of merged standard deviations: neighbours overlap, and detail has to be earned
-OPACITY = 0.5  # of what is merged
+TOLERANCE, MARGIN = 0.03, 0.05  # relative depth differences at which a view agrees with a Gaussian, or looks through it
+FEWEST = 2  # minimum number of views that agree with Gaussians to merge
+GROWTH = 2.0  # factor on merged standard deviations: neighbours overlap, and refinement has to add the detail
+OPACITY = 0.5  # of merged Gaussians
 
 
 def supported(gaussians: Gaussians, cameras: Cameras, depth: Tensor, views: int, merge_cells: float = 0.0) -> Gaussians:
-    """The Gaussians where at least so many views see a surface, and not more look through; all if there are none.
+    """Returns the Gaussians that enough views agree with and no more look through; all if there are none.
 
-    Depth without texture is invented, and with many views some inventions agree by chance. Refined as they are, such
-    small Gaussians fit the views they were made from and are debris in all others; merged, they become smooth.
+    Depth without texture is unreliable, and with many views some of its errors agree by chance. Refined as they are,
+    such small Gaussians fit their source views and become floaters in all others; merged, they become smooth.
 
     Args:
         gaussians: the scene (B = 1).
-        cameras: of its V views (B = 1).
-        depth: ``[V, H, W]`` what they see, 0 = unknown.
-        views: least number of views that agree; at most half of V is asked for.
-        merge_cells: where fewer views agree, but two do, Gaussians are merged in cells so many times as wide as what
-            the median Gaussian covers; 0: they are left out.
+        cameras: cameras of its V views (B = 1).
+        depth: ``[V, H, W]`` depth of the views, 0 = unknown.
+        views: minimum number of views that agree, capped at half of V.
+        merge_cells: merge Gaussians that fewer, but at least two views agree with, in cells this many times as wide as
+            what the median Gaussian covers; 0: remove them.
     """
     agree, through = count_points(gaussians.means, depth, cameras, TOLERANCE, MARGIN)
-    far = is_far(gaussians, depth, cameras)  # the shell behind everything
+    far = is_far(gaussians, depth, cameras)  # the far shell behind everything stays
     keep = (agree >= min(views, len(depth) // 2)) & (through <= agree) | far
     weak = (agree >= min(FEWEST, len(depth) // 2)) & (through <= agree) & ~keep
     if not keep.any():
@@ -47,18 +47,18 @@ def supported(gaussians: Gaussians, cameras: Cameras, depth: Tensor, views: int,
 
 
 def merged(gaussians: Gaussians, cell: float) -> Gaussians:
-    """One Gaussian for all of each cell: mean and covariance of their mixture, weighted by opacity, and wider.
+    """Merges the Gaussians of each cell into one: mean and covariance of their mixture, weighted by opacity, widened.
 
     The moments are those of Kerbl et al., A Hierarchical 3D Gaussian Representation (2024).
 
     Args:
         gaussians: one scene (B = 1).
-        cell: side of the cells in scene units.
+        cell: edge of the cells in scene units.
     """
     cells = point_cells(gaussians.means, gaussians.batch, gaussians.means.new_tensor([cell]))
     plan = plan_voxels(cells, gaussians.batch, torch.ones_like(gaussians.batch, dtype=torch.bool))
 
-    weights = gaussians.opacities.clamp(min=1e-6)  # a cell may hold only transparent ones
+    weights = gaussians.opacities.clamp(min=1e-6)  # a cell may hold only transparent Gaussians
 
     def mean(values: Tensor) -> Tensor:
         return pool_mean(values.flatten(1), weights, plan).unflatten(1, values.shape[1:])
@@ -68,7 +68,7 @@ def merged(gaussians: Gaussians, cell: float) -> Gaussians:
     away = (gaussians.means - means[plan.voxel_of])[:, :, None]
     variances, turn = torch.linalg.eigh(mean((axes @ axes.mT + away @ away.mT) / cell**2).double())
     turn = turn * torch.linalg.det(turn).sign()[:, None, None]  # eigenvectors may be a reflection
-    smallest = gaussians.scales.min() / cell  # rounding can make a flat one's variance negative
+    smallest = gaussians.scales.min() / cell  # rounding can make a flat Gaussian's variance negative
     scales = GROWTH * cell * variances.clamp(min=float(smallest) ** 2).sqrt()
     return Gaussians(
         means,
@@ -82,7 +82,7 @@ def merged(gaussians: Gaussians, cell: float) -> Gaussians:
 
 
 def prune(parameters: Parameters, min_opacity: float) -> int:
-    """Removes Gaussians that have become transparent; returns how many. The last one stays."""
+    """Removes Gaussians below ``min_opacity``, unless all are; returns their number."""
     opacities = torch.sigmoid(parameters.values["opacities"].detach())
     keep = opacities >= min_opacity
     if keep.all() or not keep.any():
@@ -93,10 +93,10 @@ def prune(parameters: Parameters, min_opacity: float) -> int:
 
 @torch.no_grad()
 def split(parameters: Parameters, count: int) -> int:
-    """Splits the ``count`` Gaussians whose positions are pulled the most in two; returns how many were.
+    """Splits the ``count`` Gaussians with the largest position gradients in two; returns the number of splits.
 
-    Each is laid out along its longest axis as a voxel's Gaussians are along its surface (self-split, K = 2): half a
-    cell to either side and half as long, a cell being what one Gaussian that is alone covers.
+    The halves are laid out along the longest axis like the Gaussians of a voxel (self-split, K = 2): 0.3 cells to
+    either side and 0.7 times as long. A cell is what a single Gaussian covers.
     """
     pull = parameters.pull()
     chosen = pull.topk(min(count, len(pull))).indices
@@ -116,7 +116,7 @@ def split(parameters: Parameters, count: int) -> int:
 
 
 def _along_longest(parameters: Parameters, rows: Tensor) -> tuple[Tensor, Tensor]:
-    """Which axis is the longest, ``[N, 3]`` one-hot, and its cell, ``[N, 3]`` in the units of the positions."""
+    """Returns the longest axis, ``[N, 3]`` one-hot, and the cell along it, ``[N, 3]`` in the units of the positions."""
     scales = parameters.values["scales"].detach()[rows].exp()
     length, axis = scales.max(-1)
     longest = torch.nn.functional.one_hot(axis, 3).to(scales.dtype)

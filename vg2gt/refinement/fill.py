@@ -1,4 +1,4 @@
-"""Gaussians where the images show something and the scene has nothing."""
+"""Fills holes of a scene, where the images show something and no Gaussian does."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from vg2gt.refinement.loss import Observations
 from vg2gt.rendering import Renderer
 from vg2gt.types import Cameras, Gaussians
 
-COVERED = 0.5  # accumulated opacity of a pixel that shows the scene
-OPACITY = 0.9  # of a new Gaussian: high enough to cover its block, low enough to go where it is wrong
+COVERED = 0.5  # minimum accumulated opacity of a covered pixel
+OPACITY = 0.9  # of a new Gaussian: high enough to cover its block, low enough to be pruned if it is wrong
 
 
 @torch.no_grad()
@@ -29,23 +29,23 @@ def fill_holes(
     side: int,
     room: int,
 ) -> Gaussians:
-    """Adds round Gaussians along rays that meet none, at depths spread from around each hole.
+    """Adds round Gaussians along uncovered rays, at depths spread from around each hole.
 
-    A backbone has no depth of glass, of what is beyond a sensor's range, or of the sky, so a feed-forward scene shows
-    its background there. View by view the blocks of pixels that are mostly uncovered get a Gaussian each; what one view
-    has filled is covered for the next. Their depth is a guess for refinement to mend.
+    A backbone has no depth for glass, beyond a sensor's range, or for the sky, so a feed-forward scene shows its
+    background there. View by view, each block of mostly uncovered pixels gets one Gaussian, and is covered for the
+    next view. The depth is a guess that refinement has to correct.
 
     Args:
         gaussians: the scene (B = 1).
-        cameras: of its V views (B = 1).
-        seen: what they show.
-        renderer: that tells what is covered.
-        views: ``[N]`` those that are filled.
-        side: of a block, in pixels.
-        room: most Gaussians that may be added; blocks grow where there would be more.
+        cameras: cameras of its V views (B = 1).
+        seen: observations of the views.
+        renderer: renderer that decides what is covered.
+        views: ``[N]`` views to fill.
+        side: side of a block in pixels.
+        room: maximum number of Gaussians to add; if there would be more, blocks are larger.
 
     Returns:
-        The scene with the new Gaussians behind its own.
+        The scene with the new Gaussians after its own.
     """
     found = renderer(gaussians, cameras.select(views))
     holes = int((found.alpha < COVERED).sum())
@@ -64,13 +64,13 @@ def fill_holes(
 
 
 def spread(depth: Tensor) -> Tensor:
-    """``[V, H, W]`` depth with what is 0 filled from around it: means of the logarithm over ever larger blocks."""
+    """Fills zeros of depth ``[V, H, W]`` from around them, with means of the logarithm over ever larger blocks."""
     known = (depth > 0).to(depth.dtype)[:, None]
     return _pushed(torch.where(known > 0, depth[:, None].clamp(min=1e-12).log(), 0.0), known)[:, 0].exp()
 
 
 def _pushed(values: Tensor, known: Tensor) -> Tensor:
-    """``values [V, 1, H, W]`` where they are ``known``, elsewhere smoothly what is known nearby."""
+    """Returns ``values [V, 1, H, W]``, interpolated smoothly from nearby where they are not ``known``."""
     if known.bool().all() or max(values.shape[-2:]) == 1:
         return values
     share = F.avg_pool2d(known, 2, ceil_mode=True)
@@ -80,9 +80,9 @@ def _pushed(values: Tensor, known: Tensor) -> Tensor:
 
 
 def _blocks(images: Tensor, hole: Tensor, depth: Tensor, camera: Cameras, pixels: int) -> Gaussians:
-    """A Gaussian for each block of one view that is mostly ``hole [1, 1, H, W]``."""
+    """Returns a Gaussian for each block of one view that is mostly ``hole [1, 1, H, W]``."""
 
-    def mean(values: Tensor) -> Tensor:  # over the block's pixels of the hole; [N, C]
+    def mean(values: Tensor) -> Tensor:  # over the hole's pixels in each block: [N, C]
         pooled = F.avg_pool2d(values * hole, pixels, ceil_mode=True) / share.clamp(min=1e-6)
         return pooled[0].flatten(1).T[chosen]
 

@@ -1,4 +1,4 @@
-"""What refinement lowers: the rendered part of the training objective, without any truth but the images."""
+"""Loss of a refinement: the rendered part of the training objective, with no ground truth but the images."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from vg2gt.types import Cameras, Gaussians, Render, TensorRecord
 
 @dataclass(frozen=True)
 class Observations(TensorRecord):
-    """What V views of one scene are known to show.
+    """Observations of V views of one scene.
 
     Attributes:
         images: ``[V, 3, H, W]`` in [0, 1].
         depth: ``[V, H, W]`` decoded z-depth in scene units, 0 = none.
-        depth_conf: ``[V, H, W]`` its confidence > 0.
-        mask: ``[V, H, W]`` in [0, 1], how much each pixel counts; None: all count.
+        depth_conf: ``[V, H, W]`` its confidence, > 0.
+        mask: ``[V, H, W]`` in [0, 1], pixel weights; None: all pixels count.
     """
 
     images: Tensor
@@ -30,7 +30,7 @@ class Observations(TensorRecord):
     mask: Tensor | None = None
 
     def views(self, views: Tensor) -> Observations:
-        """Returns those of some views."""
+        """Returns the observations of some views."""
         return self.map(lambda tensor: tensor[views])
 
 
@@ -38,8 +38,8 @@ class Observations(TensorRecord):
 class RefineLoss:
     """Loss of rendered views and of the Gaussians themselves.
 
-    Colour alone roughens surfaces: what a pixel shows can be explained by Gaussians in front of and behind it. The
-    geometry terms hold them where the decoded depth says, and turn them along the surface that they form together.
+    Colour alone roughens surfaces: Gaussians in front of and behind a surface explain a pixel as well. The geometry
+    terms hold Gaussians at the decoded depth and orient them along the surface that they form.
 
     Args:
         color_l1: weight of the L1 colour error.
@@ -47,13 +47,13 @@ class RefineLoss:
         depth_consistency: weight of the L1 distance to the decoded depth, in median depths of the scene.
         normal_render: weight of ``1 - cos`` between rendered normals and the normals of the rendered depth.
         normal_decoded: weight of ``1 - cos`` between rendered normals and the normals of the decoded depth.
-        opacity: weight of the mean opacity; what no image needs becomes transparent.
-        scale: weight of the mean growth of a Gaussian's largest side, in sides it started with.
-        confidence_weighted: weight pixels compared with the decoded depth by its confidence.
-        min_alpha: smallest accumulated opacity of a pixel that counts in depth and normal terms.
+        opacity: weight of the mean opacity, which makes Gaussians that no image needs transparent.
+        scale: weight of the mean growth of each Gaussian's largest side, relative to its initial length.
+        confidence_weighted: weight comparisons with the decoded depth by its confidence.
+        min_alpha: minimum accumulated opacity of a pixel in the depth and normal terms.
 
     Raises:
-        ValueError: naming a weight that is negative.
+        ValueError: if a weight is negative.
     """
 
     color_l1: float = 1.0
@@ -73,17 +73,17 @@ class RefineLoss:
 
     @property
     def needs_geometry(self) -> bool:
-        """Whether rendered depth or normals are compared with anything."""
+        """Whether any term uses rendered depth or normals."""
         return bool(self.depth_consistency or self.normal_render or self.normal_decoded)
 
     def of_views(self, rendered: Render, cameras: Cameras, seen: Observations, unit: float) -> dict[str, Tensor]:
-        """Unweighted terms of R rendered views that have a weight; scalars with graph.
+        """Returns the unweighted terms of R rendered views whose weight is not 0, as scalars with autograd graph.
 
         Args:
-            rendered: the views (B = 1).
-            cameras: the cameras they were rendered with (B = 1).
-            seen: what they should show.
-            unit: the scene's median depth.
+            rendered: rendered views (B = 1).
+            cameras: cameras they were rendered with (B = 1).
+            seen: observations of the views.
+            unit: median depth of the scene.
         """
         color, depth, normal = rendered.color[0], rendered.depth[0], rendered.normal[0]
         terms: dict[str, Tensor] = {}
@@ -107,7 +107,7 @@ class RefineLoss:
         return terms
 
     def of_gaussians(self, gaussians: Gaussians, size: Tensor) -> dict[str, Tensor]:
-        """Unweighted terms of the Gaussians that have a weight; ``size [G]`` is the largest side each started with."""
+        """Returns the unweighted terms of the Gaussians whose weight is not 0; ``size [G]``: initial largest sides."""
         terms: dict[str, Tensor] = {}
         if self.opacity:
             terms["opacity"] = gaussians.opacities.mean()
@@ -116,5 +116,5 @@ class RefineLoss:
         return terms
 
     def total(self, terms: dict[str, Tensor]) -> Tensor:
-        """The weighted sum of the terms."""
+        """Returns the weighted sum of the terms."""
         return torch.stack([getattr(self, name) * value for name, value in terms.items()]).sum()

@@ -1,4 +1,4 @@
-"""How a scene is refined: every option stands in its configuration (``configs/refine``)."""
+"""Options of a refinement; the configurations in ``configs/refine`` list all of them."""
 
 from __future__ import annotations
 
@@ -7,25 +7,26 @@ from dataclasses import asdict, dataclass, field, replace
 from vg2gt.geometry.spherical_harmonics import MAX_DEGREE
 from vg2gt.refinement.loss import RefineLoss
 
-RENDERINGS = 12  # of each view, where nobody says how long
+RENDERINGS = 12  # of each view, if neither steps nor seconds are set
 
 
 @dataclass(frozen=True)
 class RefineRates:
-    """Learning rates of Adam, which are about the change of each step; 0 keeps a thing as it is.
+    """Learning rates of Adam, roughly the change per step; 0 keeps a parameter fixed.
 
     Args:
-        means: in middle standard deviations of each Gaussian.
-        quats: of unit quaternions.
+        means: of the positions, in middle standard deviations of each Gaussian.
+        quats: of the unit quaternions.
         scales: of the logarithm of the standard deviations.
-        opacities: of the logit.
-        sh: of the constant colour coefficient; the others change a twentieth as fast (3DGS).
-        cameras: turns and shifts, in pixels: a turn by one pixel, and a shift that moves the median depth by one.
+        opacities: of the logit of the opacities.
+        sh: of the constant colour coefficient; the higher bands have a twentieth of it (as in 3DGS).
+        cameras: of rotations and shifts, in pixels: a rotation by one pixel, or a shift that moves points at the median
+            depth by one pixel.
         focal: of the logarithm of one factor for all focal lengths.
-        exposure: of each view's gain (its logarithm) and bias, a colour each.
+        exposure: of each view's log gain and bias, one per colour channel.
 
     Raises:
-        ValueError: naming a rate that is negative.
+        ValueError: if a rate is negative.
     """
 
     means: float = 0.2
@@ -45,34 +46,34 @@ class RefineRates:
 
 @dataclass(frozen=True)
 class RefineOptions:
-    """How long and how a scene is refined.
+    """Options of a refinement.
 
     Args:
-        steps: most steps; None: only ``seconds`` ends it, or, without these, 12 renderings of each view.
-        seconds: most seconds by the clock; None: only ``steps`` ends it. The same number of steps gives the same scene
-            on a CPU, the same number of seconds does not.
-        views_per_step: views rendered in a step.
-        final_rate: rates fall to this share of theirs, exponentially.
-        check_every: steps from one check to the next. Between two checks some views are left out, in turns; at the
-            check they are scored, what has become transparent is pruned and what is wrong is split.
-        holdout: every this many-th view is never trained on, but scored before and after; None: none.
-        sh_degree: of the colours, if it is higher than the scene's; None: the scene's.
-        fill: side in pixels of the blocks that get a Gaussian where the scene has none; 0: they stay empty.
-        min_views: Gaussians that fewer views' depth agrees with, or more views look through than agree with, are left
-            out at the start: what a single view supports overfits it. 0: all stay.
-        merge_cells: those that two views agree with, but not ``min_views``, are merged at the start, in cells so many
-            times as wide as what the median Gaussian covers. 0: they are left out.
-        prune_opacity: Gaussians less opaque are removed.
-        split_share: share of the Gaussians that a check splits, those whose positions are pulled the most.
-        max_growth: the scene has at most this many times its Gaussians.
-        dropout: share of the Gaussians that a step at the end leaves out at random, growing from 0 (DropGaussian, Park
-            et al. 2025): with few views no Gaussian may matter for one of them alone.
-        seed: of the order of the views and of what is left out.
+        steps: maximum number of steps; None: end by ``seconds`` or, if that is None too, after 12 renderings of each
+            view.
+        seconds: maximum time; None: end by ``steps``. On a CPU, a number of steps is reproducible, a time is not.
+        views_per_step: number of views rendered per step.
+        final_rate: factor to which rates decay exponentially.
+        check_every: number of steps between checks. In between, some views are left out, in rotation. A check scores
+            them, prunes transparent Gaussians and, in the first half, splits those with large position gradients.
+        holdout: never train on every N-th view, but score it before and after; None: train on all.
+        sh_degree: degree of the colours, if higher than the scene's; None: the scene's.
+        fill: side in pixels of the blocks that get a Gaussian where the scene has none; 0: keep holes.
+        min_views: remove Gaussians at the start if fewer views' depth agrees with them, or more views look through them
+            than agree: Gaussians that a single view supports overfit it. 0: keep all.
+        merge_cells: merge Gaussians at the start if at least two, but fewer than ``min_views``, views agree with them,
+            in cells this many times as wide as what the median Gaussian covers. 0: remove them.
+        prune_opacity: opacity below which Gaussians are removed.
+        split_share: share of the Gaussians to split at a check, those with the largest position gradients.
+        max_growth: maximum number of Gaussians, as a multiple of the initial number.
+        dropout: share of the Gaussians that a step drops at random, growing from 0 to this at the end (DropGaussian,
+            Park et al. 2025): with few views, no Gaussian should serve only one of them.
+        seed: random seed of the view order and of dropout.
         rates: learning rates.
-        loss: what is lowered.
+        loss: loss to minimise.
 
     Raises:
-        ValueError: naming an option that is out of range.
+        ValueError: if an option is out of range.
     """
 
     steps: int | None = None
@@ -114,13 +115,13 @@ class RefineOptions:
                 raise ValueError(f"refine.{name} must be {expected}, got {getattr(self, name)}")
 
     def of(self, views: int) -> RefineOptions:
-        """The same options for so many trained views, with an end."""
+        """Returns the options for this number of trained views, with ``steps`` set if they have no end."""
         if self.steps is not None or self.seconds is not None:
             return self
         return replace(self, steps=-(-RENDERINGS * views // self.views_per_step))
 
     def done(self, step: int, seconds: float) -> float:
-        """Share of the refinement that is done after so many steps and seconds, at most 1."""
+        """Returns the share of the refinement that is done after ``step`` steps and ``seconds``, at most 1."""
         shares = [0.0]
         if self.steps is not None:
             shares.append(step / self.steps)

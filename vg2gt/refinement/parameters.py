@@ -1,4 +1,4 @@
-"""What refinement changes: one scene's Gaussians, its views' cameras and exposures, as Adam sees them."""
+"""Parameters of a refinement: one scene's Gaussians, and the cameras and exposures of its views."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from vg2gt.refinement.options import RefineRates
 from vg2gt.types import Cameras, Gaussians, TensorRecord
 
 BETAS = (0.9, 0.99)
-HIGHER_BANDS = 0.05  # rate of the higher spherical harmonics over that of the constant one
+HIGHER_BANDS = 0.05  # rate of the higher spherical harmonics relative to that of the constant one
 LOGIT_MARGIN = 1e-4
 OF_GAUSSIANS = ("means", "quats", "scales", "opacities", "sh", "sh_rest")
 
 
 @dataclass(frozen=True)
 class RefinedScene(TensorRecord):
-    """A state of a refinement.
+    """State of a refinement.
 
     Attributes:
         gaussians: the scene (B = 1).
-        cameras: of its V views (B = 1).
-        gain: ``[V, 3]`` factors that turn rendered colours into those of the view's image.
-        bias: ``[V, 3]`` what is then added.
+        cameras: cameras of its V views (B = 1).
+        gain: ``[V, 3]`` factors from rendered colours to those of a view's image.
+        bias: ``[V, 3]`` offsets added after the gain.
     """
 
     gaussians: Gaussians
@@ -37,7 +37,7 @@ class RefinedScene(TensorRecord):
     bias: Tensor
 
     def seen_from(self, first: Tensor) -> RefinedScene:
-        """The same scene and pictures in the world frame in which view 0 has the pose ``first [4, 4]``."""
+        """Returns the same scene, with the same renderings, in the world where view 0 has the pose ``first [4, 4]``."""
         found, gaussians = self.cameras.world_to_camera[0], self.gaussians
         back = compose(invert_rigid(found[0]), first)  # from the new world to the old one
         move = invert_rigid(back)
@@ -53,25 +53,25 @@ class RefinedScene(TensorRecord):
         return replace(self, gaussians=moved, cameras=replace(self.cameras, world_to_camera=poses[None]))
 
     def exposed(self, color: Tensor, views: Tensor) -> Tensor:
-        """Rendered colours ``[1, R, 3, H, W]`` with the exposure of their views ``[R]``."""
+        """Applies the exposure of the views ``[R]`` to rendered colours ``[1, R, 3, H, W]``."""
         return color * self.gain[views, :, None, None] + self.bias[views, :, None, None]
 
 
 class Parameters:
-    """The scene as free numbers with an optimiser of their own.
+    """Unconstrained parameters of a scene, with their optimiser.
 
     Positions are offsets in units of each Gaussian's middle standard deviation, so that one rate fits small and large
-    ones and every scene's unit. Cameras are turned and shifted in their own frames; the one of view 0 too, because what
-    is wrong about it alone would otherwise have to be mended by all others and every Gaussian
-    (:meth:`RefinedScene.seen_from` brings it back).
+    Gaussians and every scene's unit. Cameras rotate and shift in their own frames. View 0 is optimised too: otherwise
+    an error of its pose would have to be compensated by all other views and Gaussians
+    (:meth:`RefinedScene.seen_from` restores its pose).
 
     Args:
-        start: where to begin.
+        start: initial state.
         rates: learning rates.
-        pixel: size of a pixel at the scene's median depth over that depth: the unit of turns, and of shifts times
-            ``depth``.
+        pixel: size of a pixel at the scene's median depth relative to that depth: the unit of rotations and, times
+            ``depth``, of shifts.
         depth: median depth in scene units.
-        trained: ``[N]`` the views that are trained on; exposures of the others stay as they are.
+        trained: ``[N]`` views to train on; exposures of the others stay fixed.
     """
 
     def __init__(self, start: RefinedScene, rates: RefineRates, pixel: float, depth: float, trained: Tensor) -> None:
@@ -109,7 +109,7 @@ class Parameters:
         self.optimizer = torch.optim.Adam(groups, betas=BETAS)
 
     def scene(self) -> RefinedScene:
-        """The scene with graph."""
+        """Returns the current scene with autograd graph."""
         values, start = self.values, self.start
         gaussians = Gaussians(
             self.origin + self.unit[:, None] * values["means"],
@@ -124,7 +124,7 @@ class Parameters:
         return RefinedScene(gaussians, self._cameras(start.cameras), gain, bias)
 
     def _centred(self, exposure: Tensor) -> Tensor:
-        """Exposures ``[V, 3]`` without what all trained views share: that is in the scene's colours."""
+        """Returns exposures ``[V, 3]`` minus the mean of the trained views, which the scene's colours represent."""
         trained = exposure[self.trained]
         return exposure.index_copy(0, self.trained, trained - trained.mean(0))
 
@@ -142,7 +142,7 @@ class Parameters:
         return Cameras(poses, intrinsics, cameras.size)
 
     def step(self, loss: Tensor, share: float) -> bool:
-        """One step of Adam with rates at ``share`` of theirs; False, without a step, if a gradient is not finite."""
+        """Runs an Adam step with rates scaled by ``share``; returns False, without it, if a gradient is not finite."""
         self.optimizer.zero_grad()
         loss.backward()
         for group in self.optimizer.param_groups:
@@ -154,7 +154,7 @@ class Parameters:
         return True
 
     def pull(self) -> Tensor:
-        """``[G]`` how strongly positions are pulled: root mean square gradient in units of each Gaussian's size."""
+        """Returns the root mean square position gradients ``[G]``, in units of each Gaussian's size."""
         state = self.optimizer.state.get(self.values["means"], {})
         if "exp_avg_sq" not in state:
             return torch.zeros_like(self.unit)
@@ -162,7 +162,7 @@ class Parameters:
 
     @torch.no_grad()
     def take(self, rows: Tensor) -> None:
-        """Keeps the Gaussians ``rows`` in that order, which may name one several times, and what Adam knows of them."""
+        """Keeps the Gaussians ``rows``, in that order and possibly repeated, with their Adam state."""
         self.origin, self.unit, self.size = self.origin[rows], self.unit[rows], self.size[rows]
         groups = {group["name"]: group for group in self.optimizer.param_groups}
         for name in OF_GAUSSIANS:

@@ -24,22 +24,22 @@ from vg2gt.types import Cameras, Gaussians
 
 log = logging.getLogger(__name__)
 
-WORSE = 2.0  # left-out views whose loss is so many times that of the start, and of the best state, show a divergence
-RETREATS = 4  # with each the rates are halved
-MOST_OPAQUE = 0.999  # of what remains while others are dropped
-SMOOTH = 3  # checks whose scores are averaged: each is of other views
+WORSE = 2.0  # loss of left-out views, relative to the start and to the best state, that counts as divergence
+RETREATS = 4  # maximum number of retreats; each halves the rates
+MOST_OPAQUE = 0.999  # maximum opacity of Gaussians that remain under dropout
+SMOOTH = 3  # number of checks to average, since each scores other views
 
 
 @dataclass(frozen=True)
 class Check:
-    """One look at how a refinement goes.
+    """Progress report of a refinement.
 
     Attributes:
         step: steps so far.
-        seconds: by the refinement's clock.
-        score: loss of views that were left out before, over theirs at the start; the mean of the last checks.
-        psnr: of the views rendered since the last check, before each was trained on, in dB.
-        gaussians: how many there are.
+        seconds: elapsed on the refinement's clock.
+        score: loss of left-out views relative to their loss at the start; mean of the last checks.
+        psnr: mean in dB of the views rendered since the last check, each before the step that trained on it.
+        gaussians: number of Gaussians.
     """
 
     step: int
@@ -51,14 +51,14 @@ class Check:
 
 @dataclass(frozen=True)
 class Progress:
-    """What an observer is told after every step.
+    """State passed to the observer after every step.
 
     Attributes:
         step: steps so far.
         done: share of the refinement that is done.
-        psnr: mean of the last steps, in dB.
-        gaussians: how many there are.
-        scene: makes the present state.
+        psnr: mean of the last 20 steps, in dB.
+        gaussians: number of Gaussians.
+        scene: returns the current state.
     """
 
     step: int
@@ -70,20 +70,20 @@ class Progress:
 
 @dataclass(frozen=True)
 class Refined:
-    """What a refinement gives.
+    """Result of a refinement.
 
     Attributes:
-        start: the state before.
-        scene: the best state, in the frame in which the camera of view 0 is where it was.
-        step: the step at which it was reached.
-        steps: steps that were made.
-        seconds: by the refinement's clock.
+        start: initial state.
+        scene: best state, in the frame in which the camera of view 0 has its initial pose.
+        step: step at which it was reached.
+        steps: number of steps made.
+        seconds: elapsed on the refinement's clock.
         ended: ``steps``, ``seconds``, ``interrupted`` or ``diverged``.
-        psnr: of every view before and after, ``[2, V]`` in dB.
-        trained: ``[N]`` the views that were trained on.
-        held_out: ``[V - N]`` the others.
-        checks: how it went.
-        retreats: how often it fell back to the best state.
+        psnr: ``[2, V]`` PSNR of every view before and after, in dB.
+        trained: ``[N]`` views that were trained on.
+        held_out: ``[V - N]`` the other views.
+        checks: progress reports.
+        retreats: number of returns to the best state.
     """
 
     start: RefinedScene
@@ -110,20 +110,20 @@ def refine(
 ) -> Refined:
     """Optimises one scene on the images of its views.
 
-    Ctrl-C ends it; the best state so far is returned. If the loss is not finite or grows, it goes on from the best
-    state with half the rates, which the log says.
+    Ctrl-C ends it and returns the best state so far. If the loss is not finite or diverges, refinement resumes from the
+    best state with half the rates and logs a warning.
 
     Args:
         gaussians: the scene (B = 1).
-        cameras: of its V views (B = 1).
-        seen: what they show, on the same device.
-        renderer: how the scene is rendered, here and later.
-        options: how long and how; default :class:`RefineOptions`.
+        cameras: cameras of its V views (B = 1).
+        seen: observations of the views, on the same device.
+        renderer: renderer of the scene, here and later.
+        options: options of the refinement; default :class:`RefineOptions`.
         observe: called after every step.
-        clock: what seconds are.
+        clock: returns the time in seconds.
 
     Raises:
-        ValueError: if there are no Gaussians, or images and cameras do not go together.
+        ValueError: if there are no Gaussians, or images and cameras do not match.
     """
     options = options or RefineOptions()
     _check(gaussians, cameras, seen)
@@ -165,7 +165,7 @@ class _Refinement:
         self.parameters = self._parameters(self._filled())
 
     def run(self, observe: Callable[[Progress], None] | None) -> Refined:
-        """Steps and checks until it is done."""
+        """Runs steps and checks until the refinement ends."""
         ended = ""
         try:
             while not ended:
@@ -176,7 +176,7 @@ class _Refinement:
             ended = "interrupted"
         loss, after = self._score(self.best, torch.arange(len(self.seen.images)))
         trained = self.order.trained
-        if not loss[trained].mean() <= self.start_loss[trained].mean():  # few views can be better by chance
+        if not loss[trained].mean() <= self.start_loss[trained].mean():  # left-out views can improve by chance
             self.best, self.best_step, after = self.start, 0, self.start_psnr
         elif self.options.rates.cameras:
             self.best = self.best.seen_from(self.start.cameras.world_to_camera[0, 0])
@@ -195,7 +195,7 @@ class _Refinement:
         )
 
     def _filled(self) -> RefinedScene:
-        """The start with Gaussians in its holes."""
+        """Returns the initial state with its holes filled."""
         if not self.options.fill:
             return self.start
         start, side, room = self.start, self.options.fill, self.limit - len(self.start.gaussians)
@@ -219,7 +219,7 @@ class _Refinement:
         )
 
     def _step(self) -> str:
-        """One step, with a check where one is due; says how it ended if it did."""
+        """Runs one step, and a check if one is due; returns how the refinement ended, or an empty string."""
         views = self.order.deal(self.options.views_per_step).to(self.seen.images.device)
         scene = self.parameters.scene()
         loss, images = self._loss(self._thinned(scene), views)
@@ -242,7 +242,7 @@ class _Refinement:
         return "steps" if self.steps == self.options.steps else "seconds"
 
     def _thinned(self, scene: RefinedScene) -> RefinedScene:
-        """The scene without what this step drops; what remains is more opaque, so that pixels stay covered."""
+        """Drops random Gaussians for this step; the others become more opaque, so that pixels stay covered."""
         share = self.options.dropout * self._done()
         if not share:
             return scene
@@ -252,7 +252,7 @@ class _Refinement:
         return replace(scene, gaussians=replace(left, opacities=(left.opacities / (1 - share)).clamp(max=MOST_OPAQUE)))
 
     def _loss(self, scene: RefinedScene, views: Tensor) -> tuple[Tensor, Tensor]:
-        """The loss of some views, and their PSNR ``[R]``."""
+        """Returns the loss of some views, and their PSNR ``[R]``."""
         loss, cameras, seen = self.options.loss, scene.cameras.select(views), self.seen.views(views)
         rendered = self.trainer(scene.gaussians, cameras)
         color = where_it_counts(scene.exposed(rendered.color, views)[0], seen.images, seen.mask)
@@ -262,12 +262,12 @@ class _Refinement:
 
     @torch.no_grad()
     def _score(self, scene: RefinedScene, views: Tensor) -> tuple[Tensor, Tensor]:
-        """Loss and PSNR ``[R]`` of views, each on its own."""
+        """Returns loss and PSNR ``[R]`` of views, each rendered on its own."""
         found = [self._loss(scene, view) for view in views.to(self.seen.images.device).split(1)]
         return torch.stack([loss for loss, _ in found]).cpu(), torch.cat([image for _, image in found]).cpu()
 
     def _check(self) -> str:
-        """Scores the present state, keeps it if it is the best; says what is wrong if it diverges."""
+        """Scores the current state and keeps it if it is the best; returns what is wrong if it diverges."""
         scene = self.parameters.scene().detach()
         views = self.order.left_out if len(self.order.left_out) else self.order.trained
         loss, _ = self._score(scene, views)
@@ -296,7 +296,7 @@ class _Refinement:
             split(self.parameters, count)
 
     def _retreat(self, trouble: str) -> str:
-        """Back to the best state with half the rates, unless that was tried often."""
+        """Returns to the best state with half the rates, or ends the refinement after too many retreats."""
         self.retreats += 1
         if self.retreats > RETREATS or self._done() >= 1:
             return "diverged"

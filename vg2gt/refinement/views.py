@@ -1,4 +1,4 @@
-"""Which views a step renders, and which are left out."""
+"""Order of the views: which a step renders, and which are left out."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-FEWEST = 4  # with fewer views none can be left out
-LEFT_OUT = 8  # one view in so many is left out at a time
+FEWEST = 4  # with fewer views, none is left out
+LEFT_OUT = 8  # one view in this many is left out at a time
 
 
 class ViewOrder:
-    """Deals out views: all in random order, then all again; some are left out, in turns.
+    """Deals views in random order, each once before any repeats; some are left out, in rotation.
 
     Args:
         views: number of views.
-        holdout: every this many-th view is never dealt; None: none.
-        seed: of the order.
+        holdout: never deal every N-th view; None: deal all.
+        seed: random seed of the order.
 
     Attributes:
-        trained: ``[N]`` the views that are dealt.
-        held_out: ``[V - N]`` those that never are.
+        trained: ``[N]`` views that are dealt.
+        held_out: ``[V - N]`` views that are never dealt.
     """
 
     def __init__(self, views: int, holdout: int | None, seed: int) -> None:
@@ -34,11 +34,11 @@ class ViewOrder:
         self.next_round()
 
     def next_round(self) -> None:
-        """Leaves out the next views."""
+        """Moves on to the next views to leave out."""
         self.left_out = next(self._left_out)
 
     def deal(self, count: int) -> Tensor:
-        """The next views, at most ``count`` different ones, sorted."""
+        """Returns the next views, at most ``count`` different ones, sorted."""
         hidden = set(self.left_out.tolist())
         count = min(count, len(self.trained) - len(hidden))
         dealt: list[int] = []

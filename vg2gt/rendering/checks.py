@@ -1,4 +1,4 @@
-"""Checks at the renderer's public boundary; each error names the argument, what was expected and the remedy."""
+"""Input checks of the renderer; each error names the argument, what was expected and the remedy."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ MIN_SCALE = 1e-10  # smaller ones overflow the inverse covariance in float32
 
 
 class UnrenderableError(ValueError):
-    """Values that cannot be rendered: NaN, infinite or out of range. Shapes that disagree are plain ValueErrors."""
+    """Raised for values that are NaN, infinite or out of range; mismatched shapes raise a plain ValueError."""
 
 
 def check_shapes(gaussians: Gaussians, cameras: Cameras) -> None:
-    """Raises ValueError, naming the argument, unless shapes and devices agree and the size is not empty."""
+    """Raises ValueError, naming the argument, if shapes or devices do not match or the image size is empty."""
     poses, intrinsics = cameras.world_to_camera, cameras.intrinsics
     if poses.dim() != 4 or poses.shape[-2:] != (4, 4):
         raise ValueError(f"world_to_camera must be [B, V, 4, 4], got {list(poses.shape)}")
@@ -49,7 +49,7 @@ def check_shapes(gaussians: Gaussians, cameras: Cameras) -> None:
 
 
 def check_values(gaussians: Gaussians, cameras: Cameras) -> None:
-    """Raises ValueError unless values are finite and in range, and the Gaussians sorted by scene."""
+    """Raises ValueError unless all values are finite and in range and the Gaussians are sorted by scene."""
     check_finite("world_to_camera", cameras.world_to_camera)
     check_finite("intrinsics", cameras.intrinsics)
     focal = cameras.intrinsics[..., [0, 1], [0, 1]]
@@ -84,7 +84,7 @@ def check_finite(name: str, tensor: Tensor) -> None:
 def background_colors(
     background: Tensor | Sequence[float] | None, gaussians: Gaussians, scenes: int, dtype: torch.dtype
 ) -> Tensor:
-    """The background of every scene ``[B, 3]``: one colour ``[3]`` for all, else the Gaussians' own, else black."""
+    """Returns every scene's background ``[B, 3]``: the given colour ``[3]``, else the Gaussians' own, else black."""
     device = gaussians.means.device
     if background is not None:
         color = torch.as_tensor(background, dtype=dtype, device=device)

@@ -1,6 +1,6 @@
-"""Drives the compiled kernels over views and blocks of work, and joins them to autograd.
+"""Runs the compiled kernels over views and work items, as an autograd function.
 
-Deterministic to the bit for any number of threads: all sums have a fixed order.
+Bitwise deterministic for any number of threads: all sums have a fixed order.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from vg2gt.rendering.median import depth_factors
 from vg2gt.rendering.options import Images, RenderOptions, SceneViews
 
 TILES_PER_ITEM = 8
-HIT_CAPACITY = 192  # hits that a block of rays keeps for the depth solver before its tile is given more room
+HIT_CAPACITY = 192  # hits per block of rays for the depth solver; a tile with more gets a larger buffer
 CACHE_LINE = 64  # bytes
-CONVERGED = 4  # relative changes of the median, in units of rounding, at which its search ends
-NEGLIGIBLE = {np.dtype(np.float32): 30.0, np.dtype(np.float64): 90.0}  # squared sigmas at which a profile vanishes
+CONVERGED = 4  # relative change of the median, in machine epsilons, at which its search stops
+NEGLIGIBLE = {np.dtype(np.float32): 30.0, np.dtype(np.float64): 90.0}  # squared sigmas beyond which a profile is 0
 
 _local = threading.local()
 
@@ -68,23 +68,23 @@ class _View:
 
     @property
     def across(self) -> int:
-        """Tiles in a row."""
+        """Tiles per image row."""
         return -(-self.size[1] // tiles.TILE)
 
     @property
     def tiles(self) -> int:
-        """Tiles of the image."""
+        """Tiles per image."""
         return self.across * -(-self.size[0] // tiles.TILE)
 
     @property
     def tile_ranges(self) -> list[tuple[int, int]]:
-        """First and last tile (exclusive) of every piece of work."""
+        """First and last tile (exclusive) of every work item."""
         starts = range(0, self.tiles, TILES_PER_ITEM)
         return [(start, min(start + TILES_PER_ITEM, self.tiles)) for start in starts]
 
     @property
     def blocks(self) -> range:
-        """Numbers of the blocks of ``BLOCK`` Gaussians."""
+        """Indices of the blocks of ``BLOCK`` Gaussians."""
         return range(-(-len(self.means) // BLOCK))
 
 
@@ -93,7 +93,7 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Colour ``[V, H, W, 3]``, normals alike, depth ``[V, H, W]`` and accumulated opacity of V views."""
+        """Returns colour and normals ``[V, H, W, 3]``, depth and accumulated opacity ``[V, H, W]``."""
         tensors, (size, options) = inputs[:8], inputs[8:]
         arrays = [_array(tensor) for tensor in tensors]
         count, (height, width), dtype = len(arrays[5]), size, arrays[0].dtype
@@ -114,7 +114,7 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor | None) -> tuple[Tensor | None, ...]:
-        """Gradients of the Gaussians, the cameras and the background; those of the median depth are implicit."""
+        """Returns gradients of Gaussians, cameras and background; the median depth is differentiated implicitly."""
         color, normal, depth, _, slope, transmittance = ctx.saved_tensors[8:]
         options: RenderOptions = ctx.options
         geometry = options.geometry and (grad_outputs[1] is not None or grad_outputs[2] is not None)
@@ -187,7 +187,7 @@ def _parameters(options: RenderOptions, dtype: np.dtype) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Scratch:
-    """One thread's working memory (names as in the kernels)."""
+    """One thread's scratch memory (names as in the kernels)."""
 
     state: np.ndarray
     sums: np.ndarray
@@ -201,7 +201,7 @@ class _Scratch:
 
 
 def _scratch(dtype: np.dtype) -> _Scratch:
-    """This thread's working memory, kept between calls."""
+    """Returns this thread's scratch memory, kept between calls."""
     buffers = _local.__dict__.setdefault("buffers", {})
     if dtype not in buffers:
         buffers[dtype] = _Scratch(
@@ -219,7 +219,7 @@ def _scratch(dtype: np.dtype) -> _Scratch:
 
 
 def _aligned(count: int, dtype: np.dtype) -> np.ndarray:
-    """Values that begin at a cache line: a block of rays then lies in one, and no vector operation touches two."""
+    """Allocates an array that begins at a cache line, so that no vector operation on a block of rays touches two."""
     memory = np.empty(count * dtype.itemsize + CACHE_LINE, np.uint8)
     start = -memory.ctypes.data % CACHE_LINE
     return memory[start : start + count * dtype.itemsize].view(dtype)
@@ -232,11 +232,11 @@ def _forward(view: _View, lists: _Lists, options: RenderOptions, *outputs: np.nd
         render_tiles = forward_solid if options.mode == "solid" else forward_rasterized
 
     newton = options.newton_steps > 0
-    # one of Newton's may gain nothing: with twice as many steps the bracket shrinks as much as by bisection alone
+    # a Newton step may gain nothing: twice as many steps shrink the bracket at least as much as bisection alone
     steps = 2 * options.bisections + options.newton_steps if newton else options.bisections
 
     def run(tile_range: tuple[int, int]) -> None:
-        """Renders tiles from the first to before the last, with buffers of its own."""
+        """Renders a range of tiles with this thread's buffers."""
         scratch = _scratch(view.means.dtype)
         hits, (first, last) = scratch.hits, tile_range
         while first < last:

@@ -1,4 +1,4 @@
-"""The reference: every pixel against every Gaussian; the oracle the other implementations are held to."""
+"""Reference renderer: every pixel against every Gaussian. All other implementations are tested against it."""
 
 from __future__ import annotations
 

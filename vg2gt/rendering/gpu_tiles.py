@@ -1,8 +1,8 @@
-"""Drives the Triton kernels for all views of all scenes at once, and joins them to autograd.
+"""Runs the Triton kernels for all views of all scenes at once, as an autograd function.
 
-Forward: project every Gaussian into every view of its scene, count its tiles, read the counts (the only time that the
-host waits), write one entry a (tile, Gaussian), sort the entries by view, tile and depth, blend the tiles. Backward:
-visit the tiles again, write one gradient row an entry, sum and chain the rows of every Gaussian in order.
+Forward: project every Gaussian into every view of its scene, count its tiles, read the counts (the only host-device
+synchronisation), write one entry per (tile, Gaussian), sort the entries by view, tile and depth, blend the tiles.
+Backward: visit the tiles again, write one gradient row per entry, sum and chain the rows of every Gaussian in order.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from vg2gt.kernels.render_gpu.tiles import RECORD, TILE
 from vg2gt.rendering.options import RenderOptions
 from vg2gt.types import Cameras, Gaussians, Render
 
-kernels: Any = launchable  # Triton makes its functions objects that take a grid: kernel[grid](...)
+kernels: Any = launchable  # Triton kernels are launched as kernel[grid](...), which type checkers do not know
 
-NEGLIGIBLE = {torch.float32: 30.0, torch.float64: 90.0}  # squared sigmas at which a profile vanishes
-BISECTIONS = 3  # that one visit of a tile's Gaussians amounts to
-ROW_SHARE = 64  # one part in so many of a GPU's memory is for gradient rows
-ROWS = 3_000_000  # gradient rows held at once where there is no GPU
-SLOT_SHARE, SLOT_BYTES = 8, 256  # one part in so many is for views rendered at once; a Gaussian in one, with entries
+NEGLIGIBLE = {torch.float32: 30.0, torch.float64: 90.0}  # squared sigmas beyond which a profile is 0
+BISECTIONS = 3  # bisection steps that one visit of a tile's Gaussians replaces
+ROW_SHARE = 64  # gradient rows take 1 / ROW_SHARE of a GPU's memory
+ROWS = 3_000_000  # gradient rows held at once without a GPU
+SLOT_SHARE, SLOT_BYTES = 8, 256  # slots take 1 / SLOT_SHARE of a GPU's memory; bytes per slot, with its entries
 
 
 class RefusedError(ValueError):
-    """The kernels met a value that cannot be rendered; which one is for the caller to say."""
+    """Raised if the kernels meet a value that cannot be rendered; the caller must find out which one."""
 
 
 def render_triton(
@@ -41,15 +41,16 @@ def render_triton(
     """Renders every view of every scene; differentiable in every floating-point tensor.
 
     Args:
-        gaussians: of all scenes, sorted by scene; shapes were checked.
-        cameras: the views.
+        gaussians: Gaussians of all scenes, sorted by scene, with checked shapes.
+        cameras: views to render.
         background: ``[3]``.
-        options: the number of bisections is rounded up to a multiple of 3.
-        rows: gradient rows held at once, of one view at least; None: by the device's memory.
+        options: render options; the number of bisections is rounded up to a multiple of 3.
+        rows: maximum number of gradient rows held at once, at least those of one view; None: by the device's memory.
 
     Raises:
-        RefusedError: if a value is not finite or out of range (as :mod:`vg2gt.rendering.checks` has it).
-        ValueError: if there are more Gaussians and views than can be numbered.
+        RefusedError: if a value is not finite or out of range (see :mod:`vg2gt.rendering.checks`), or the Gaussians
+            cover too many tiles.
+        ValueError: if Gaussians times views exceed ``SLOTS``.
     """
     tensors = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
     tensors = (*tensors, cameras.world_to_camera, cameras.intrinsics, background)
@@ -65,13 +66,13 @@ def render_triton(
 
 @dataclass(frozen=True)
 class _Lists:
-    """Entries of all tiles.
+    """Tile entries of all views.
 
     Attributes:
         records: ``[V, G, 16]``, see ``tiles.RECORD``; only those of visible Gaussians are written.
-        ends: ``[V * G]`` entries up to and with a slot's own.
+        ends: ``[V * G]`` inclusive prefix sum of the entries per slot.
         members: slot of every sorted entry.
-        places: the sorted entry's place among those in slots' order, which is that of its gradient row.
+        places: gradient row of every sorted entry: its index before sorting, in the order of slots.
         starts: first sorted entry of every tile of every view, and the end.
         chunks: views whose gradient rows are held at once: first view, number of views, first entry, end.
     """
@@ -89,7 +90,7 @@ class _Render(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Colour ``[B, V, 3, H, W]``, normals alike, depth ``[B, V, H, W]`` and accumulated opacity."""
+        """Returns colour and normals ``[B, V, 3, H, W]``, depth and accumulated opacity ``[B, V, H, W]``."""
         tensors = tuple(tensor.contiguous() for tensor in inputs[:9])
         (height, width), options, rows = inputs[9:]
         poses, background = tensors[5], tensors[7]
@@ -118,7 +119,7 @@ class _Render(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor | None) -> tuple[Tensor | None, ...]:
-        """Gradients of the Gaussians, the cameras and the background."""
+        """Returns gradients of Gaussians, cameras and background."""
         saved = ctx.saved_tensors
         means, quats, scales, opacities, sh, poses, intrinsics, _, batch = saved[:9]
         records, ends, members, places, starts = saved[9:14]
@@ -156,7 +157,7 @@ class _Render(torch.autograd.Function):
                 *grads, grad_cameras, total, views, scenes, height, width, first, some, begin,
                 lowpass=options.lowpass, solid=solid, degree=degree, cameras=of_cameras, num_warps=BLOCK // 32,
             )  # fmt: skip
-            del rows  # before those of the next views are made
+            del rows  # frees them before the next chunk's are allocated
         grad_poses = grad_intrinsics = grad_background = None
         if of_cameras:
             summed = grad_cameras.sum(0)
@@ -168,7 +169,7 @@ class _Render(torch.autograd.Function):
 
 
 def _tiles(height: int, width: int) -> tuple[int, int]:
-    """Tiles in an image row, and of a view."""
+    """Returns tiles per image row and tiles per view."""
     across = -(-width // TILE)
     return across, across * -(-height // TILE)
 
@@ -182,21 +183,21 @@ def _join_views(images: tuple[Tensor, ...]) -> Tensor:
 
 
 def _slots_at_once(device: torch.device) -> int:
-    """Gaussians times views that are rendered at once: views beyond wait, so that sorting does not fill the memory."""
+    """Returns how many slots (Gaussians times views) are rendered at once, which bounds the memory of sorting."""
     if device.type != "cuda":
         return SLOTS
     return torch.cuda.get_device_properties(device).total_memory // (SLOT_SHARE * SLOT_BYTES)
 
 
 def _rows_at_once(device: torch.device) -> int:
-    """Rows of float32 in a share of a GPU's whole memory: of what is free, results would depend on what else runs."""
+    """Returns float32 gradient rows held at once; by total GPU memory, as free memory would make results vary."""
     if device.type != "cuda":
         return ROWS
     return torch.cuda.get_device_properties(device).total_memory // (ROW_SHARE * 4 * RECORD)
 
 
 def _list(tensors: tuple[Tensor, ...], size: tuple[int, int], options: RenderOptions, rows: int) -> _Lists:
-    """Projects and lists all Gaussians."""
+    """Projects all Gaussians and builds the sorted tile lists."""
     means, quats, scales, opacities, sh, poses, intrinsics, background, batch = tensors
     (scenes, views), (height, width), total = poses.shape[:2], size, len(means)
     across, tiles = _tiles(height, width)
@@ -214,7 +215,7 @@ def _list(tensors: tuple[Tensor, ...], size: tuple[int, int], options: RenderOpt
             num_warps=BLOCK // 32,
         )  # fmt: skip
         ends = torch.cumsum(ends, 0)
-        per_view = ends[total - 1 :: total].tolist()  # the host waits here, and nowhere else
+        per_view = ends[total - 1 :: total].tolist()  # the only host-device synchronisation
     entries = per_view[-1]
     if entries >= REFUSED:
         raise RefusedError(
@@ -240,7 +241,7 @@ def _list(tensors: tuple[Tensor, ...], size: tuple[int, int], options: RenderOpt
 
 
 def _chunks(ends: list[int], rows: int) -> tuple[tuple[int, int, int, int], ...]:
-    """Parts views so that each part has at most ``rows`` entries or one view: first view, views, first entry, end."""
+    """Splits views into chunks of at most ``rows`` entries or one view: (first view, views, first entry, end)."""
     chunks: list[tuple[int, int, int, int]] = []
     first, begin = 0, 0
     for view in range(1, len(ends) + 1):

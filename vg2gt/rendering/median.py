@@ -1,9 +1,9 @@
-"""Depth of rays; above all the median depth through stochastic solids, with its implicit gradient.
+"""Depth of rays, in particular the median depth through stochastic solids, with its implicit gradient.
 
 A Gaussian of opacity alpha whose response peaks at ``t*`` with precision ``lambda`` is the solid of vacancy
-``v(t) = sqrt(1 - g)``, ``g = alpha exp(-lambda (t - t*)^2 / 2)`` (paper, eqn vacancy). A ray has passed it unhit with
-probability ``sqrt(1 - g)`` up to the peak and ``(1 - alpha) / sqrt(1 - g)`` behind it; transmittance T(t) is the
-product over the ray's Gaussians, whatever their order, and the median depth d solves ``T(d) = 1/2``.
+``v(t) = sqrt(1 - g)``, ``g = alpha exp(-lambda (t - t*)^2 / 2)`` (paper, eqn vacancy). Its transmittance is
+``sqrt(1 - g)`` up to the peak and ``(1 - alpha) / sqrt(1 - g)`` behind it. The transmittance T(t) of a ray is the
+product over its Gaussians, in any order. The median depth d solves ``T(d) = 1/2``.
 """
 
 from __future__ import annotations
@@ -21,33 +21,33 @@ LOG_HALF = math.log(0.5)
 
 
 class Rays:
-    """How hits belong to rays; this is the dense matrix ``[P, N]``: rows are rays, columns their hits."""
+    """Mapping between hits and rays; this one is a dense matrix ``[P, N]``: rows are rays, columns their hits."""
 
     def sum(self, hits: Tensor) -> Tensor:
-        """Sum over every ray's hits."""
+        """Sums over each ray's hits."""
         return hits.sum(-1)
 
     def amin(self, hits: Tensor) -> Tensor:
-        """Minimum over every ray's hits, inf without any."""
+        """Minimum over each ray's hits; inf for rays without hits."""
         return hits.amin(-1)
 
     def amax(self, hits: Tensor) -> Tensor:
-        """Maximum over every ray's hits, -inf without any."""
+        """Maximum over each ray's hits; -inf for rays without hits."""
         return hits.amax(-1)
 
     def expand(self, rays: Tensor) -> Tensor:
-        """One value per ray, repeated for every hit."""
+        """Repeats one value per ray for each of its hits."""
         return rays[:, None]
 
 
 def log_transmittance(t: Tensor, alpha: Tensor, peak: Tensor, precision: Tensor) -> Tensor:
-    """Every hit's share of ``ln T(t)`` (paper, eqns volume_render and vacancy); all of one value per hit."""
+    """Returns each hit's term of ``ln T(t)`` (paper, eqns volume_render and vacancy); one value per hit throughout."""
     occupied = torch.log1p(-alpha * torch.exp(-0.5 * precision * (t - peak) ** 2))
     return torch.where(t <= peak, 0.5 * occupied, torch.log1p(-alpha) - 0.5 * occupied)
 
 
 def slope(t: Tensor, alpha: Tensor, peak: Tensor, precision: Tensor) -> Tensor:
-    """Every hit's share of ``S = -d ln T / dt >= 0`` (paper, eqn sup_attenuation_coefficient)."""
+    """Returns each hit's term of ``S = -d ln T / dt >= 0`` (paper, eqn sup_attenuation_coefficient)."""
     g = alpha * torch.exp(-0.5 * precision * (t - peak) ** 2)
     return 0.5 * g * precision * (t - peak).abs() / (1 - g)
 
@@ -67,11 +67,11 @@ class MedianDepth(torch.autograd.Function):
             peak: peak depth of every hit.
             precision: inverse variance of every hit along its ray.
             before: transmittance in front of every hit in blending order, without gradient.
-            rays: how hits belong to rays.
+            rays: mapping between hits and rays.
             options: near plane, iterations, slope floor.
 
         Returns:
-            Depth of every ray, 0 where more than 0.45 is transmitted or the median lies in front of the near plane.
+            Depth of every ray; 0 where the final transmittance is 0.45 or more, or the median is nearer than ``near``.
         """
 
         def residual(t: Tensor) -> Tensor:
@@ -81,7 +81,7 @@ class MedianDepth(torch.autograd.Function):
         hit = alpha > 0
         inf = torch.full_like(peak, torch.inf)
         lo = rays.amin(torch.where(hit, peak - reach, inf)).clamp(min=options.near)
-        # behind the peaks of hits that together pass at most a quarter, T is at most one half
+        # if the hits up to here blend to at most 1/4, T is at most sqrt(1/4) = 1/2 behind their peaks
         near_hits = rays.amax(torch.where(hit & (before > 0.25), peak, -inf))
         all_hits = rays.amax(torch.where(hit, peak + reach, -inf))
         final = rays.sum(torch.log1p(-alpha)).exp()
@@ -135,7 +135,7 @@ def ray_depth(
     rays: Rays,
     options: RenderOptions,
 ) -> Tensor:
-    """Depth of every ray in the mode and of the kind that the options say; 0 where a ray has none.
+    """Returns the depth of every ray, as ``options.mode`` and ``options.depth`` select; 0 where a ray has none.
 
     Rasterised expected depth is the paper's eqn sup_gs_depth_render.
 
@@ -146,7 +146,7 @@ def ray_depth(
         final: transmittance of every ray.
         peak: peak depth of every hit.
         precision: inverse variance of every hit along its ray.
-        rays: how hits belong to rays.
+        rays: mapping between hits and rays.
         options: mode, kind of depth, and the solver's settings.
     """
     if options.mode == "solid":
@@ -164,11 +164,11 @@ def ray_depth(
 def depth_factors(
     grad_depth: Tensor, grad_alpha: Tensor, depth: Tensor, slope: Tensor, transmittance: Tensor, options: RenderOptions
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Splits the gradient of the images ``[V, H, W]`` of depth into what the compiled backward kernels take.
+    """Converts the gradient of depth images ``[V, H, W]`` into the inputs of the compiled backward kernels.
 
     Returns:
-        Incoming gradient over S (solid, paper, eqn tmed_grad), over alpha (expected), at the crossing (rasterized
-        median), each 0 in the other cases; and the gradient of alpha.
+        Depth gradient divided by S (solid; paper, eqn tmed_grad), divided by alpha (expected), and at the crossing
+        (rasterized median), each 0 in the other cases; and the gradient of alpha.
     """
     zero, valid = torch.zeros_like(depth), depth > 0
     if options.mode == "solid":

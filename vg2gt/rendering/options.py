@@ -1,4 +1,4 @@
-"""What a rasteriser is given: its options and one scene with its views."""
+"""Inputs and output of a rasteriser: options, one scene with its views, and images."""
 
 from __future__ import annotations
 
@@ -20,20 +20,21 @@ class RenderOptions:
         mode: ``solid`` treats Gaussians as continuous stochastic solids (paper, Sec. Continuous Stochastic Solids
             Volume Rendering): exact ray maximum, median depth of the continuous transmittance. ``rasterized`` is
             classic 3DGS: affine splats, Jacobian clamped off-screen, piecewise constant transmittance.
-        depth: ``median``: where transmittance falls to one half; rasterized, that is the z of the Gaussian at which it
-            happens, with gradient to that Gaussian's mean only. ``expected`` (rasterized only): blended z over alpha.
-        near: Gaussians whose mean is nearer are dropped; solid depth is never in front of it. Scene units.
+        depth: ``median``: where transmittance falls to one half. In rasterized mode this is the z of the Gaussian at
+            which it happens, with a gradient to that Gaussian's mean only. ``expected`` (rasterized only): blended z
+            divided by alpha.
+        near: near plane in scene units. Gaussians with a nearer mean are dropped; solid depth is never nearer.
         lowpass: variance in px^2 added to every screen footprint.
-        alpha_max: cap of the opacity at a pixel; no gradient passes where it acts.
-        slope_floor: lower bound of ``-d ln T / dd``, in units of 1 / depth, used in the median depth's gradient so that
-            plateaus of transmittance near one half do not dominate; 0 gives the exact gradient.
+        alpha_max: upper bound of the opacity at a pixel; no gradient flows where it is reached.
+        slope_floor: lower bound of ``-d ln T / dd`` in the median depth's gradient, in units of 1 / depth. It keeps
+            plateaus of transmittance near one half from dominating; 0 gives the exact gradient.
         bisections: bisection steps of the solid median depth.
-        newton_steps: Newton steps after the bisections; 0: bisections alone. The compiled renderer mixes both kinds
-            and ends where nothing moves, with at least the accuracy that the two numbers give.
+        newton_steps: Newton steps after the bisections; 0: bisections alone. The compiled CPU renderer mixes both and
+            stops at convergence; it is at least as accurate as these numbers give.
         geometry: False renders colour and alpha only; depth and normal are zero.
 
     Raises:
-        ValueError: naming an option that is unknown or out of range.
+        ValueError: if an option is unknown or out of range; the message names it.
     """
 
     mode: Mode = "solid"
@@ -64,7 +65,7 @@ class RenderOptions:
 
 
 def check_choice(name: str, value: object, literal: Any) -> None:
-    """Raises ValueError, naming the choices, unless ``value`` is one of a ``Literal`` type's."""
+    """Raises ValueError, naming the choices, unless ``value`` is one of the values of a ``Literal`` type."""
     choices = get_args(literal)
     if value not in choices:
         raise ValueError(f"{name} must be one of {', '.join(choices)}, got {value!r}")
@@ -76,7 +77,7 @@ class SceneViews:
 
     Attributes:
         means: ``[G, 3]`` world positions.
-        quats: ``[G, 4]`` wxyz, any length.
+        quats: ``[G, 4]`` wxyz, any norm.
         scales: ``[G, 3]`` standard deviations.
         opacities: ``[G]``.
         colors: ``[V, G, 3]``, or ``[1, G, 3]`` where the colour does not depend on the view.
@@ -121,7 +122,7 @@ class SceneViews:
 
 @dataclass(frozen=True)
 class Images:
-    """What a rasteriser returns: V views, channels last.
+    """Output of a rasteriser: V views, channels last.
 
     Attributes:
         color: ``[V, H, W, 3]``, background blended in.
@@ -137,5 +138,5 @@ class Images:
 
     @staticmethod
     def stack(views: list[Images]) -> Images:
-        """Joins renders of single views along V."""
+        """Concatenates renders of single views along V."""
         return Images(*(torch.cat([getattr(view, field.name) for view in views]) for field in fields(Images)))

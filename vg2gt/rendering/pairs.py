@@ -1,4 +1,4 @@
-"""Sparse (pixel, Gaussian) pairs in plain torch: any device, no further packages."""
+"""Renderer over sparse (pixel, Gaussian) pairs in plain torch: any device, no other packages."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from vg2gt.rendering.projection import Splats, list_cells, pixel_boxes, respond,
 
 @dataclass(frozen=True)
 class PairRays(Rays):
-    """Hits in one list ``[N]``; ``pixel`` names the ray of each.
+    """Hits in one list ``[N]``.
 
     Attributes:
-        pixel: ``[N]`` int64, sorted.
+        pixel: ``[N]`` int64 ray index of each hit, sorted.
         count: number of rays.
     """
 
@@ -43,7 +43,7 @@ class PairRays(Rays):
         return rays[self.pixel]
 
     def running_sum(self, hits: Tensor) -> Tensor:
-        """Inclusive sum within every ray, in float64 because the rays are summed in one pass."""
+        """Inclusive cumulative sum within each ray, in float64 because one pass sums all rays."""
         total = torch.cumsum(hits.double(), 0)
         starts = torch.searchsorted(self.pixel, self.pixel)
         return total - torch.where(starts > 0, total[(starts - 1).clamp(min=0)], 0.0)

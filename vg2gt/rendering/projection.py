@@ -28,7 +28,7 @@ from vg2gt.rendering.options import RenderOptions, SceneViews
 
 @dataclass(frozen=True)
 class Splats:
-    """N Gaussians as one view sees them, front to back.
+    """N Gaussians projected into one view.
 
     Attributes:
         center: ``[N, 2]`` projected mean in pixels.
@@ -57,7 +57,7 @@ class Splats:
 
 
 def project(scene: SceneViews, options: RenderOptions) -> Splats:
-    """Projects all Gaussians of a one-view scene, whether visible or not (the z of hidden ones is replaced by 1)."""
+    """Projects all Gaussians of a one-view scene, visible or not; z is set to 1 where it is not beyond ``near``."""
     rotation, translation = scene.world_to_camera[0, :3, :3], scene.world_to_camera[0, :3, 3]
     focal = scene.intrinsics[0, [0, 1], [0, 1]]
     principal = scene.intrinsics[0, [0, 1], [2, 2]]
@@ -100,11 +100,11 @@ def project(scene: SceneViews, options: RenderOptions) -> Splats:
 
 
 def screen_box(splats: Splats) -> tuple[Tensor, Tensor]:
-    """Smallest screen box of the pixels with alpha >= 1/255, in closed form.
+    """Returns the bounding box of the pixels with alpha >= 1/255, in closed form.
 
     Returns:
-        Box ``[N, 4]`` as (x0, y0, x1, y1), both ends inside, and ``[N]`` bool: False where there is no such pixel or
-        the Gaussian straddles the camera plane.
+        Box ``[N, 4]`` as (x0, y0, x1, y1), ends included, and ``[N]`` bool: False where there is no such pixel or the
+        Gaussian straddles the camera plane.
     """
     cutoff = 2 * torch.log(splats.opacity / ALPHA_MIN)
     q0, q1 = splats.tilt.unbind(-1)
@@ -123,7 +123,7 @@ def screen_box(splats: Splats) -> tuple[Tensor, Tensor]:
 
 
 def visible_splats(scene: SceneViews, options: RenderOptions) -> tuple[Splats, Tensor]:
-    """Splats that reach the image, front to back by the depth of their means, and their boxes ``[N, 4]`` (no gradient).
+    """Returns splats in the image, front to back by the depth of their means, and their boxes ``[N, 4]`` (no gradient).
 
     Selecting first keeps the undefined derivatives of hidden Gaussians out of the graph.
     """
@@ -141,7 +141,7 @@ def visible_splats(scene: SceneViews, options: RenderOptions) -> tuple[Splats, T
 
 
 def pixel_boxes(box: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """First and last pixel ``[N, 2]`` as (x, y) of screen boxes, cut at the image; last < first where it holds none."""
+    """Returns first and last pixel ``[N, 2]`` as (x, y) of boxes, clipped to the image; last < first if it has none."""
     height, width = size
     limit = torch.tensor([width - 1, height - 1], device=box.device)
     return box[:, :2].ceil().clamp(min=0).long(), torch.minimum(box[:, 2:].floor().clamp(min=-1).long(), limit)
@@ -151,11 +151,11 @@ def list_cells(first: Tensor, extent: Tensor) -> tuple[Tensor, Tensor]:
     """Lists the cells of rectangles, row by row, in the rectangles' order.
 
     Args:
-        first: ``[N, 2]`` least cell as (x, y).
-        extent: ``[N, 2]`` cells in x and in y, at least 0.
+        first: ``[N, 2]`` lowest cell as (x, y).
+        extent: ``[N, 2]`` number of cells in x and in y, at least 0.
 
     Returns:
-        Rectangle ``[M]`` and cell ``[M, 2]``.
+        Rectangle index ``[M]`` and cell ``[M, 2]``.
     """
     area = extent.prod(-1)
     index = torch.repeat_interleave(area)

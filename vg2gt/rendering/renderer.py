@@ -1,4 +1,4 @@
-"""The renderer's public surface: one function, and a class that holds its options."""
+"""Public interface of the renderer: one function, and a class that holds its options."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ class Renderer(RenderOptions):
     """A renderer with its options fixed; calling it renders.
 
     Attributes:
-        implementation: ``cpu`` compiled tile renderer; ``triton`` the same for CUDA devices; ``torch`` sparse pairs on
-            any device; ``dense`` the slow reference; ``auto`` chooses ``cpu`` on CPU, ``triton`` on CUDA devices, where
-            it must agree with the reference (:mod:`vg2gt.rendering.selfcheck`), ``torch`` elsewhere.
+        implementation: ``cpu``: compiled tile renderer. ``triton``: the same for CUDA devices. ``torch``: sparse pairs
+            on any device. ``dense``: the slow reference. ``auto``: ``cpu`` on CPUs; ``triton`` on CUDA devices, after a
+            check against the reference (:mod:`vg2gt.rendering.selfcheck`); ``torch`` elsewhere.
     """
 
     implementation: Implementation = "auto"
@@ -56,7 +56,7 @@ class Renderer(RenderOptions):
     ) -> Render:
         """Renders ``gaussians`` into ``cameras`` (see :func:`render`); ``mode`` overrides the renderer's own.
 
-        An overriding mode ``solid`` always has median depth, the only one it knows.
+        If ``mode`` is ``solid``, depth is always the median.
         """
         options = self
         if mode is not None:
@@ -90,30 +90,30 @@ def render(
 ) -> Render:
     """Renders the Gaussians of B scenes into V views each.
 
-    Differentiable in means, quats, scales, opacities, sh, world_to_camera, intrinsics and background. Everything is
-    computed in the Gaussians' dtype, in float32 at least, whatever the autocast dtype.
+    Differentiable in means, quats, scales, opacities, sh, world_to_camera, intrinsics and background. Computes in the
+    Gaussians' dtype, at least float32, regardless of autocast.
 
     Args:
         gaussians: G Gaussians, packed over the B scenes and sorted by scene.
-        cameras: the views ``[B, V]``; skew and distortion are not modelled.
+        cameras: views ``[B, V]`` to render; skew and distortion are not modelled.
         mode: ``solid`` or ``rasterized``.
-        background: one colour ``[3]``; None is the Gaussians' own, or black.
-        near: near plane.
-        **options: ``implementation`` (:class:`Renderer`) and the others of :class:`RenderOptions`.
+        background: one colour ``[3]``; None: the Gaussians' own background, or black.
+        near: near plane in scene units.
+        **options: ``implementation`` (:class:`Renderer`) and the other fields of :class:`RenderOptions`.
 
     Returns:
-        Views ``[B, V, ...]`` in the Gaussians' dtype (float32 at least). Solid depth is 0 where a ray's final
-        transmittance is 0.45 or more or its median lies in front of ``near``; rasterized median depth where it never
-        falls to 0.5; expected depth where alpha is 0.
+        Views ``[B, V, ...]`` in the Gaussians' dtype (at least float32). Solid depth is 0 where a ray's final
+        transmittance is 0.45 or more or its median is nearer than ``near``. Rasterized median depth is 0 where
+        transmittance never falls to 0.5, expected depth where alpha is 0.
 
     Raises:
-        ValueError: on shapes that disagree, NaN or infinite values, scales that are not positive, unknown options.
+        ValueError: if shapes do not match, values are NaN, infinite or out of range, or an option is unknown.
     """
     return Renderer(mode=mode, near=near, **options)(gaussians, cameras, background)
 
 
 def _render_triton(gaussians: Gaussians, cameras: Cameras, background: Tensor, options: RenderOptions) -> Render:
-    """Imports Triton, which torch's CPU builds lack, only when asked; ``background`` is ``[1, 3]`` or ``[B, 3]``."""
+    """Renders with Triton, imported only here because CPU builds of torch lack it; ``background``: ``[1 or B, 3]``."""
     if importlib.util.find_spec("triton") is None:
         raise ValueError(
             "implementation 'triton' needs the package triton; install a CUDA build of torch or use 'torch'"
@@ -129,7 +129,7 @@ def _render_triton(gaussians: Gaussians, cameras: Cameras, background: Tensor, o
         check_values(gaussians, cameras)
         check_finite("background", background)
         raise
-    # The kernels know one background for all scenes.
+    # The kernels take one background for all scenes.
     behind = (1 - render.alpha)[:, :, None] * background[:, None, :, None, None]
     return replace(render, color=render.color + behind)
 
@@ -145,10 +145,10 @@ def _resolve(implementation: Implementation, device: torch.device) -> str:
 
 
 def automatic(device: torch.device) -> str:
-    """The implementation that ``auto`` chooses on a device; on a CUDA device the kernels are checked once.
+    """Returns the implementation that ``auto`` selects for a device; the kernels of a CUDA device are checked once.
 
     Raises:
-        KernelsRefusedError: if the kernels of a CUDA device cannot be relied on.
+        KernelsRefusedError: if the kernels fail the check on a CUDA device.
     """
     if device.type == "cuda":
         require_trusted(device)

@@ -1,4 +1,4 @@
-"""Renders scenes one by one with a rasteriser that knows one scene at a time."""
+"""Renders several scenes with a rasteriser for a single scene."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ def render_scenes(
 
 
 def _scene_views(gaussians: Gaussians, cameras: Cameras, scene: int, background: Tensor) -> SceneViews:
-    """One scene with its colours seen from every view (one copy where they do not depend on it)."""
+    """Returns one scene with its colours in every view (a single copy if they do not depend on the view)."""
     poses = cameras.world_to_camera[scene]
     if gaussians.sh.shape[1] == 1:
-        directions = gaussians.means[None]  # a constant colour does not look at them
+        directions = gaussians.means[None]  # not used: the colour is constant
     else:
         centers = invert_rigid(poses)[:, None, :3, 3]
         directions = F.normalize(gaussians.means - centers, dim=-1)

@@ -1,7 +1,7 @@
-"""Whether a device's compiled kernels compute what the reference does: found out once, before they are relied on.
+"""Self-check of a device's compiled kernels against the reference, run once before their first use.
 
-Two small fixed scenes are rendered by the kernels on the device and by the dense reference in float64 on the CPU. What
-was found is kept for the same device, driver, versions and kernels.
+Two small fixed scenes are rendered by the kernels on the device and by the dense reference in float64 on the CPU. The
+result is cached per device, driver, versions and kernel sources.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from vg2gt.types import Cameras, Gaussians, Render
 
 RenderFunction = Callable[..., Render]
 
-VALUES = 5e-5  # the largest error that an image may have; float32 makes errors of about 2e-6
-GRADIENTS = 5e-4  # the largest error of a gradient as a share of its norm; float32: about 1e-6
+VALUES = 5e-5  # largest allowed error of an image; float32 rounding gives about 2e-6
+GRADIENTS = 5e-4  # largest allowed error of a gradient, relative to its norm; float32 rounding: about 1e-6
 MODES: tuple[Mode, ...] = ("solid", "rasterized")
-SCENES, COUNT, SIZE, VIEWS, DEGREE = 2, 7, (9, 11), 2, 2  # COUNT: Gaussians a scene; DEGREE: of model=vg2gt
-STREAM = 44  # first of the scenes' numbers; with these three quarters of the rays have a depth, well conditioned
-ROWS = 8  # gradient rows held at once: fewer than a view has, so that views are taken one by one
+SCENES, COUNT, SIZE, VIEWS, DEGREE = 2, 7, (9, 11), 2, 2  # COUNT: Gaussians per scene; DEGREE: as in model=vg2gt
+STREAM = 44  # seed of the scenes, with which three quarters of the rays have a well-conditioned depth
+ROWS = 8  # gradient rows held at once: fewer than a view has, so that views are processed one by one
 _VG2GT = Path(__file__).resolve().parents[1]
 SOURCES = (
     Path(__file__).resolve(), _VG2GT / "rendering" / "gpu_tiles.py",
@@ -46,16 +46,16 @@ ADVICE = (
 
 
 class KernelsRefusedError(ValueError):
-    """A GPU whose kernels are wrong, do not run or are missing: rendering without them is for the user to choose."""
+    """Raised if a GPU's kernels are wrong, do not run or are missing; the user must choose to render without them."""
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """How far kernels are from the reference.
+    """Errors of kernels against the reference.
 
     Attributes:
-        values: the largest absolute error of an image (depth in scene units, about 3 deep).
-        gradients: the largest error of an input's gradient over the gradient's norm.
+        values: largest absolute error of an image (depth in scene units; the scenes are about 3 deep).
+        gradients: largest error of an input's gradient, relative to the gradient's norm.
     """
 
     values: float
@@ -63,7 +63,7 @@ class Agreement:
 
     @property
     def good(self) -> bool:
-        """Whether the kernels can be relied on; NaN cannot."""
+        """Whether both errors are within their bounds; False for NaN."""
         return self.values <= VALUES and self.gradients <= GRADIENTS
 
     def __str__(self) -> str:
@@ -71,7 +71,7 @@ class Agreement:
 
 
 def require_trusted(device: torch.device) -> None:
-    """Checks once that the Triton kernels may render on a device.
+    """Checks once that the Triton kernels agree with the reference on a device.
 
     Args:
         device: a CUDA or ROCm device.
@@ -89,7 +89,7 @@ def require_trusted(device: torch.device) -> None:
 
 @lru_cache
 def _refusal(found_on: str, device: str) -> str:
-    """What is wrong with the kernels; empty if they can be relied on."""
+    """Returns what is wrong with the kernels; empty if nothing is."""
     agreement = known(found_on)
     if agreement is None:
         try:
@@ -102,7 +102,7 @@ def _refusal(found_on: str, device: str) -> str:
 
 
 def identity(device: torch.device) -> str:
-    """What an agreement holds for: device, driver, versions of torch and Triton, and the kernels' sources."""
+    """Returns the cache key of a result: device, driver, versions of torch and Triton, hash of the kernel sources."""
     name, driver = device.type, ""
     if device.type == "cuda":
         name = torch.cuda.get_device_name(device)
@@ -115,14 +115,14 @@ def identity(device: torch.device) -> str:
 
 
 def known(found_on: str) -> Agreement | None:
-    """What was found before; None if nothing was."""
+    """Returns the cached result, or None."""
     with suppress(OSError, ValueError, TypeError, KeyError):
         return Agreement(**read_json(_file())[found_on])
     return None
 
 
 def remember(found_on: str, agreement: Agreement) -> None:
-    """Keeps what was found, where a folder can be written to."""
+    """Caches a result, if the cache folder is writable."""
     with suppress(OSError, TypeError):
         before = {}
         with suppress(OSError, ValueError):
@@ -138,11 +138,11 @@ def _file() -> Path:
 
 
 def compare(device: torch.device, modes: tuple[Mode, ...] = MODES) -> Agreement:
-    """Renders the fixed scenes with the kernels on ``device`` and with the reference; how far they are apart.
+    """Renders the fixed scenes with the kernels on ``device`` and with the reference, and returns the errors.
 
     Args:
-        device: where the kernels run; a CPU if Triton interprets them.
-        modes: how they render.
+        device: device that runs the kernels; a CPU if Triton interprets them.
+        modes: render modes to compare.
     """
     from vg2gt.rendering.gpu_tiles import render_triton
 
@@ -150,7 +150,7 @@ def compare(device: torch.device, modes: tuple[Mode, ...] = MODES) -> Agreement:
         return render_triton(gaussians, cameras, background, RenderOptions(mode=mode), rows=ROWS)
 
     worst = torch.zeros(2, dtype=torch.float64)
-    # Whoever renders first may be evaluating: without gradients there would be nothing to compare.
+    # The first render may be part of an evaluation without gradients; the comparison needs them.
     with torch.inference_mode(False), torch.enable_grad(), torch.autocast(device.type, enabled=False):
         for mode in modes:
             expected, expected_grads = _run(_reference, mode, torch.device("cpu"), torch.float64)
@@ -168,7 +168,7 @@ def _reference(gaussians: Gaussians, cameras: Cameras, mode: Mode, background: T
 def _run(
     render: RenderFunction, mode: Mode, device: torch.device, dtype: torch.dtype
 ) -> tuple[list[Tensor], list[Tensor]]:
-    """All images and the gradients of a weighted sum of them in every input, in float64 on the CPU."""
+    """Returns all images, and the gradient of a weighted sum of them for every input, in float64 on the CPU."""
     inputs = [tensor.to(device, dtype).requires_grad_() for tensor in fixed_scene()]
     gaussians, cameras = as_scene(inputs)
     out = render(gaussians, cameras, mode, inputs[-1])
@@ -179,21 +179,21 @@ def _run(
 
 
 def as_scene(inputs: Sequence[Tensor]) -> tuple[Gaussians, Cameras]:
-    """Gaussians and cameras of what :func:`fixed_scene` gave, in any precision, on any device."""
+    """Builds Gaussians and cameras from the tensors of :func:`fixed_scene`, in any precision and on any device."""
     means, quats, scales, opacities, sh, poses, intrinsics, _ = inputs
     batch = torch.arange(SCENES, device=means.device).repeat_interleave(COUNT)
     return Gaussians(means, quats, scales, opacities, sh, batch), Cameras(poses, intrinsics, SIZE)
 
 
 def fixed_scene() -> tuple[Tensor, ...]:
-    """Means, quats, scales, opacities, sh, poses, intrinsics and background of two scenes of all kinds, in float64."""
+    """Returns means, quats, scales, opacities, sh, poses, intrinsics and background of the two scenes, in float64."""
     (height, width), total = SIZE, SCENES * COUNT
     depth = 2.5 + 1.2 * _numbers(total, STREAM)
     sides = torch.stack((0.45 * _numbers(total, STREAM + 1), 0.3 * _numbers(total, STREAM + 2)), -1) * depth[:, None]
     poses = torch.eye(4, dtype=torch.float64).repeat(SCENES, VIEWS, 1, 1)
     poses[:, 1, :3, :3] = quat_to_matrix(torch.tensor([1.0, 0.04, -0.05, 0.03], dtype=torch.float64))
     poses[:, 1, :3, 3] = torch.tensor([0.25, -0.15, 0.2])
-    poses[1, :, 0, 3] += 0.1  # what is seen of one scene is not what the other's cameras would see
+    poses[1, :, 0, 3] += 0.1  # the two scenes have different cameras
     focal = torch.tensor([[20.0, 0, width / 2], [0, 19.0, height / 2], [0, 0, 1]], dtype=torch.float64)
     return (
         torch.cat((sides, depth[:, None]), -1),
@@ -208,6 +208,6 @@ def fixed_scene() -> tuple[Tensor, ...]:
 
 
 def _numbers(count: int, stream: int) -> Tensor:
-    """Numbers in [-1, 1) that look random and are the same everywhere, whatever torch's generators do."""
+    """Returns pseudo-random numbers in [-1, 1) that are the same everywhere, independent of torch's generators."""
     steps = torch.arange(1, count + 1, dtype=torch.float64) + 1000 * stream
     return 2 * torch.frac(steps * 0.6180339887498949 + torch.frac(steps * steps * 0.4142135623730951)) - 1

@@ -1,1 +1,1 @@
-"""Several trainings that belong together: ablations, comparisons."""
+"""Studies of several trainings: ablations and comparisons."""

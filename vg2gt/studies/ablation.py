@@ -1,9 +1,9 @@
 """The paper's ablations on our data: ``vg2gt ablate [seeds=N] [steps=N] [any override of train.yaml ...]``.
 
-As in the paper (appendix, Model Evaluation) no variant is trained from scratch: for every seed each variant, and the
-full model itself, continues one full model for ``steps`` steps on the same batches. Only the last layer is new where
-the number of splits changes; a control continues the full model with a new last layer as well. Finished runs are not
-repeated, interrupted ones go on. ``protocol=PRESET`` scores as ``vg2gt evaluate evaluation=PRESET``.
+As in the paper (appendix, Model Evaluation), no variant is trained from scratch. For every seed, each variant and the
+full model itself continue one full model for ``steps`` steps on the same batches. If the number of splits changes, the
+last layer is reinitialised; a control also continues the full model with a reinitialised last layer. Finished runs are
+not repeated, interrupted ones resume. ``protocol=PRESET`` scores like ``vg2gt evaluate evaluation=PRESET``.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ log = logging.getLogger(__name__)
 OWN_KEYS = ("name", "seeds", "full_steps", "steps", "lr", "variants", "splits", "init_from")
 OWN_KEYS += ("protocol", "protocol_overrides")
 SETTLED_KEYS = ("seed", "ckpt", "overwrite", "output_dir", "ablation", "trainer.max_steps")
-CONTINUATION_SEED = 1000  # the continuation's batches are not the first ones of the full model's training
+CONTINUATION_SEED = 1000  # added to the seed: continuations do not repeat the full model's first batches
 FULL, CONTROL = "full", "new_last_layer"
 LAST_LAYER = "model.gaussians.out."
 
@@ -60,10 +60,10 @@ PAPER_COLUMNS = columns(
     decimals={"delta_1.25": 4, "delta_1.05": 4},
 )
 OUR_COLUMNS = columns("abs_rel_rasterized", "decoded_abs_rel", "normal_mean", "cv", "gaussians")
-# The rows of the paper's tables of the same meaning (Replica).
+# The paper's tables and rows that correspond to ours (Replica).
 PAPER_ABLATION, PAPER_SPLIT, PAPER_DATA = "tbl_ablation", "tbl_split", "replica"
 PAPER_FULL = "VG2GT (full)"
-# Where an evaluation keeps the figures that are not under GT_POSE.
+# Paths of metrics in an evaluation: GT_POSE, except those in PATHS.
 GT_POSE = "rendered/gt_pose/solid/"
 PATHS = {
     "abs_rel_rasterized": "rendered/gt_pose/rasterized/abs_rel",
@@ -74,7 +74,7 @@ PATHS = {
 
 @dataclass(frozen=True)
 class Continuation:
-    """One run that starts from the full model: its name, overrides, and whether its last layer is initialised again."""
+    """A run that continues the full model: its name, overrides, and whether its last layer is reinitialised."""
 
     name: str
     overrides: tuple[str, ...] = ()
@@ -82,7 +82,7 @@ class Continuation:
 
 
 def continuations(variants: Sequence[str], splits: Sequence[int], full_splits: int) -> list[Continuation]:
-    """The runs of both tables, each once: splits=1 is w/o Split, and the full model's own number is the full model."""
+    """Returns the runs of both tables, each once: ``splits=1`` is w/o Split, ``full_splits`` is the full model."""
     runs = [Continuation(FULL), *(Continuation(name, (f"ablation={name}",)) for name in variants)]
     for count in splits:
         if count != full_splits and not (count == 1 and "wo_split" in variants):
@@ -97,21 +97,21 @@ class Ablation:
     """Runs the study and writes its tables.
 
     Attributes:
-        folder: holds everything.
-        overrides: of ``train.yaml``, common to all runs.
-        seeds: repetitions.
-        full_steps: training of the full model.
-        steps: of every continuation.
-        lr: initial learning rate of every continuation.
+        folder: output folder of all runs and tables.
+        overrides: overrides of ``train.yaml`` for all runs.
+        seeds: number of seeds.
+        full_steps: training steps of the full model.
+        steps: training steps of each continuation.
+        lr: initial learning rate of each continuation.
         variants: options of the group ``ablation``.
-        splits: numbers of Gaussians per voxel.
-        init_from: weights that the full models begin with.
-        protocol: preset of the group ``evaluation`` on which runs are scored; None: on the training's own scenes.
-        protocol_overrides: of ``evaluate.yaml``, for the protocol; one number of views.
-        diverged: the continuations without a result.
+        splits: numbers of Gaussians per voxel to compare.
+        init_from: initial weights of the full models.
+        protocol: preset of the group ``evaluation`` on which runs are scored; None: by the training's own evaluation.
+        protocol_overrides: overrides of ``evaluate.yaml`` for the protocol; one number of views.
+        diverged: continuations without a result.
 
     Raises:
-        ValueError: naming a number that is not one, or too small.
+        ValueError: if a count is not an integer or too small, or the protocol has several numbers of views.
     """
 
     folder: Path
@@ -140,7 +140,7 @@ class Ablation:
         self.results: dict[str, dict[int, Metrics]] = {run.name: {} for run in self.runs}
 
     def run(self) -> None:
-        """Runs whatever is not finished; FloatingPointError if a full model diverges, others are noted."""
+        """Runs all unfinished runs; FloatingPointError if a full model diverges. Other divergences are recorded."""
         total, number = self.seeds * (1 + len(self.runs)), 0
         for seed in range(self.seeds):
             home = self.folder / f"seed-{seed}"
@@ -171,7 +171,7 @@ class Ablation:
         return metrics if self.protocol is None else _figures(evaluate(self._on_protocol(folder)))
 
     def _on_protocol(self, folder: Path) -> DictConfig:
-        """The evaluation of the run in ``folder`` on the protocol."""
+        """Composes the configuration that evaluates the run in ``folder`` on the protocol."""
         settled = ("name=protocol", f"ckpt={quoted(folder)}", f"output_dir={quoted(folder / str(self.protocol))}")
         config = compose("evaluate", f"evaluation={self.protocol}", "views=10", *self.protocol_overrides, *settled)
         if len(view_counts(config.views)) > 1:
@@ -221,7 +221,7 @@ class Ablation:
         return "\n\n".join(parts) + "\n"
 
     def _new_layers(self) -> list[str]:
-        """The runs that began with a new last layer."""
+        """Names of the runs that start with a reinitialised last layer."""
         return [CONTROL, *(name for name in self.results if name == "wo_split" or name.startswith("splits="))]
 
     def _row_of(self, count: int) -> str:
@@ -252,7 +252,7 @@ class Ablation:
 
 
 def _figures(report: Mapping[str, Any]) -> Metrics:
-    """What the tables show of an evaluation's report, by the names that a training's figures have."""
+    """The metrics of an evaluation's report that the tables show, by their names in training."""
     ((_, views),) = report["views"].items()
     found = {name: views["mean"].get(PATHS.get(name, GT_POSE + name)) for name in (*PAPER_COLUMNS, *OUR_COLUMNS)}
     return {name: value for name, value in found.items() if value is not None}
@@ -263,7 +263,7 @@ def _label(name: str) -> str:
 
 
 def _paper_row(name: str) -> Mapping[str, float] | None:
-    """What the paper reports in a row of the same meaning; None where it has none."""
+    """The paper's row that corresponds to a run; None if there is none."""
     if name.startswith("splits="):
         row = "w/o split" if name == "splits=1" else name.replace("splits", "split")
         return tables()[PAPER_SPLIT][PAPER_DATA].get(row)
@@ -271,7 +271,7 @@ def _paper_row(name: str) -> Mapping[str, float] | None:
 
 
 def _beside_paper(results: Mapping[str, Mapping[int, Metrics]], rows: Mapping[str, str]) -> str:
-    """Ours and the paper's; ``rows`` maps what the paper calls a row to the run that corresponds to it."""
+    """Our rows, each followed by the paper's; ``rows`` maps names of rows to names of runs."""
     lines = []
     for name, run in rows.items():
         lines.append([_label(name), *seeds_row(results[run], PAPER_COLUMNS)])
@@ -281,7 +281,7 @@ def _beside_paper(results: Mapping[str, Mapping[int, Metrics]], rows: Mapping[st
 
 
 def _differences(results: Mapping[str, Mapping[int, Metrics]], reference: str) -> str:
-    """Each run less the reference, of the metrics that all have; says whether the interval leaves out zero."""
+    """Each run minus the reference, for metrics that all runs have; says whether the interval excludes zero."""
     every = [metrics for runs in results.values() for metrics in runs.values()]
     shown = {name: m for name, m in (PAPER_COLUMNS | OUR_COLUMNS).items() if all(name in metrics for metrics in every)}
     rows = [
@@ -304,7 +304,7 @@ def _verdict(change: Estimate, metric: Metric) -> str:
 
 
 def common_overrides(overrides: Sequence[str]) -> list[str]:
-    """The overrides that go to every training; ValueError if one sets what the study itself decides."""
+    """Returns the overrides that apply to every training; ValueError if one sets a key that the study decides."""
     kept = []
     for override in overrides:
         key = override.split("=")[0].lstrip("+~")

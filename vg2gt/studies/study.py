@@ -1,4 +1,4 @@
-"""Several trainings that belong together: each run once, resumed where it was interrupted, compared over seeds."""
+"""Runs of a study: each is trained once, resumed if interrupted, and compared over seeds."""
 
 from __future__ import annotations
 
@@ -29,28 +29,28 @@ log = logging.getLogger(__name__)
 Metrics = dict[str, float]
 INTERRUPTED = 143
 START = "start.json"
-# What makes two runs the same; where they live and how they are shown may differ.
+# Settings that must be equal for two runs to be the same; folders and logging may differ.
 COMPARED = ("backend", "model", "data", "loss", "renderer", "optimizer", "training", "seed")
 COMPARED_KEYS = ("trainer.max_steps", "trainer.precision", "trainer.gradient_clip_val")
 NOT_COMPARED = ("data.workers", "data.memory_mb", "data.cache_dir")
 
 
 def compose_run(overrides: Sequence[str], folder: Path) -> DictConfig:
-    """Composes the configuration of one training whose folder is ``folder``."""
+    """Composes the configuration of a training in ``folder``."""
     return compose("train", *overrides, f"output_dir={quoted(folder)}")
 
 
 def run_once(overrides: Sequence[str], folder: Path, scored: bool = True) -> Metrics:
-    """Trains and evaluates one run unless ``folder`` already holds its result; an interrupted one goes on.
+    """Trains and evaluates one run unless ``folder`` already holds its result; an interrupted run resumes.
 
     Args:
-        overrides: of ``train.yaml``; a run of no steps is only evaluated.
-        folder: the run's own.
-        scored: whether a run of no steps is evaluated, for which its data is needed.
+        overrides: overrides of ``train.yaml``; a run of 0 steps is only evaluated.
+        folder: folder of this run.
+        scored: whether a run of 0 steps is evaluated, which needs its data.
 
     Raises:
         ValueError: if the folder holds the run of another configuration, or one that started from other weights.
-        SystemExit: if the training was asked to stop (SIGTERM); the same call goes on with it.
+        SystemExit: if the training was asked to stop (SIGTERM); the same call resumes it.
     """
     config = compose_run(overrides, folder)
     config.training.rasterized_depth = True  # studies report it
@@ -61,7 +61,7 @@ def run_once(overrides: Sequence[str], folder: Path, scored: bool = True) -> Met
         return read_json(result)["trained"]
     config.ckpt = "auto"
     report = train(config) if config.trainer.max_steps else _without_steps(config, folder, scored)
-    gc.collect()  # trainer, module and data refer to each other: without it every run's frames stay until much later
+    gc.collect()  # trainer, module and data are in reference cycles that keep a run's frames in memory
     if not report:
         log.warning("interrupted in %s; the same command goes on from there", folder)
         raise SystemExit(INTERRUPTED)
@@ -69,7 +69,7 @@ def run_once(overrides: Sequence[str], folder: Path, scored: bool = True) -> Met
 
 
 def _without_steps(config: DictConfig, folder: Path, scored: bool) -> dict[str, Any]:
-    """The result of a run of no steps: the model as it begins, and its checkpoint if it has a trained part."""
+    """Writes the result of a run of 0 steps: the initial model's metrics, and a checkpoint if it has trained parts."""
     write_text(folder / "config.yaml", OmegaConf.to_yaml(config, resolve=True))
     run = build(config)
     load_start(run.module, config, None)
@@ -102,7 +102,7 @@ def _refuse_other_run(config: DictConfig, folder: Path) -> None:
 
 
 def _refuse_other_start(config: DictConfig, folder: Path) -> None:
-    """Notes the weights a new run starts from; by their content, for a folder may be moved, or filled again."""
+    """Records the digest of a new run's initial weights; ValueError if the folder's run started from others."""
     if not config.init_from:
         return
     path, weights = folder / START, weights_digest(read_checkpoint(config.init_from)["state_dict"])
@@ -126,7 +126,7 @@ def weights_digest(state: Mapping[str, Tensor]) -> str:
 
 
 def final_checkpoint(folder: Path, steps: int) -> Path:
-    """The checkpoint that a finished run of ``steps`` steps ended with; ValueError if the newest is earlier."""
+    """Returns the last checkpoint of a finished run of ``steps`` steps; ValueError if the newest is of another step."""
     path = newest_valid(folder / "checkpoints")
     reached = read_checkpoint(path)["global_step"]
     if reached != steps:
@@ -138,7 +138,7 @@ def final_checkpoint(folder: Path, steps: int) -> Path:
 
 
 def write_part(start: Path, path: Path, keep: Callable[[str], bool]) -> Path:
-    """Writes a checkpoint of the tensors whose names ``keep`` accepts, for ``init_from``; replaces ``path``."""
+    """Writes a checkpoint for ``init_from`` with the tensors whose names ``keep`` accepts; replaces ``path``."""
     state = read_checkpoint(start)["state_dict"]
     write_checkpoint({"state_dict": {name: tensor for name, tensor in state.items() if keep(name)}}, path)
     return path
@@ -152,13 +152,13 @@ class Estimate:
     margin: float
 
     def shown(self, decimals: int, sign: bool = False) -> str:
-        """``mean ± margin``; the margin is left out where there is none."""
+        """``mean ± margin``; the margin is left out if it is not finite."""
         text = number(self.mean, decimals, sign)
         return f"{text} ± {self.margin:.{decimals}f}" if math.isfinite(self.margin) else text
 
 
 def estimate(values: Sequence[float]) -> Estimate:
-    """Mean and 95 % confidence interval of independent values; NaN for none."""
+    """Mean and 95 % confidence interval of independent values; NaN without values."""
     count = len(values)
     mean = sum(values) / count if count else math.nan
     if count < 2:
@@ -168,18 +168,18 @@ def estimate(values: Sequence[float]) -> Estimate:
 
 
 def over_seeds(runs: Mapping[int, Metrics], metric: str) -> Estimate:
-    """One metric over the seeds; not available if any of the runs lacks it."""
+    """Estimates one metric over the seeds; NaN if any run lacks it."""
     return estimate([run[metric] for run in runs.values()] if all(metric in run for run in runs.values()) else [])
 
 
 def paired_difference(runs: Mapping[int, Metrics], reference: Mapping[int, Metrics], metric: str) -> Estimate:
-    """``runs - reference`` of one metric, seed by seed: what the seeds share cancels."""
+    """Estimates ``runs - reference`` of one metric, paired by seed, so that effects of the seed cancel."""
     seeds = [s for s in runs if s in reference and metric in runs[s] and metric in reference[s]]
     return estimate([runs[s][metric] - reference[s][metric] for s in seeds])
 
 
 def summarize(results: Mapping[str, Mapping[int, Metrics]], reference: str) -> dict[str, dict[str, dict[str, float]]]:
-    """What the tables show, as finite numbers: ``{run: {metric: {mean, ci95, difference, difference_ci95}}}``."""
+    """Returns the finite values of the tables: ``{run: {metric: {mean, ci95, difference, difference_ci95}}}``."""
     summary: dict[str, dict[str, dict[str, float]]] = {}
     for name, runs in results.items():
         for metric in sorted(set.intersection(*map(set, runs.values()))) if runs else ():
@@ -192,7 +192,7 @@ def summarize(results: Mapping[str, Mapping[int, Metrics]], reference: str) -> d
 
 
 def seeds_table(results: Mapping[str, Mapping[int, Metrics]], shown: Mapping[str, Metric]) -> str:
-    """One row per run, its means over the seeds, as Markdown."""
+    """Formats a Markdown table of means over the seeds, one row per run."""
     return markdown_table(
         ["", *(metric.label for metric in shown.values())],
         [[name, *seeds_row(runs, shown)] for name, runs in results.items()],
@@ -200,10 +200,10 @@ def seeds_table(results: Mapping[str, Mapping[int, Metrics]], shown: Mapping[str
 
 
 def seeds_row(runs: Mapping[int, Metrics], shown: Mapping[str, Metric]) -> list[str]:
-    """Means of one run over its seeds, as cells of a table."""
+    """Formats the means of one run over its seeds as table cells."""
     return [over_seeds(runs, name).shown(metric.decimals) for name, metric in shown.items()]
 
 
 def quoted(path: Path) -> str:
-    """The path as a value in an override, whatever signs of Hydra's grammar are in it."""
+    """Quotes a path as a value in a Hydra override."""
     return "'" + str(path).replace("'", "\\'") + "'"

@@ -1,11 +1,11 @@
-"""From evidence to a bound of the relative error of depth that holds as often as it says (split conformal prediction).
+"""Calibrated bounds of the relative depth error from evidence (split conformal prediction).
 
-Pixels are taken in groups: by status, and by whether the views of their scene seldom agree closely, as with wrong
-poses. Of the rooms that a calibration is made of, one half orders the pixels of a group: the logarithm of the error is
-fitted by a sum of piecewise linear functions of the evidence. The other half says what that order means: pixels are
+Pixels are grouped by status, and by whether the views of their scene rarely agree closely, as with wrong poses. The
+calibration scenes are split in two halves. The first half ranks the pixels of a group: a sum of piecewise linear
+functions of the evidence is fitted to the logarithm of the error. The second half calibrates the ranking: pixels are
 binned by the fitted value, and the bounds of a bin are the quantiles of its errors (Lei et al., Distribution-Free
-Predictive Inference for Regression, 2018, in bins as in Mondrian conformal prediction). A bound therefore holds on
-average over rooms like these, whatever the backbone's confidence is worth.
+Predictive Inference for Regression, 2018, in bins as in Mondrian conformal prediction). The bounds therefore hold on
+average over scenes like these, even if the backbone's confidence is unreliable.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ from vg2gt.types import TensorRecord
 from vg2gt.uncertainty.evidence import EVIDENCE, Status
 
 LEVELS = (0.5, 0.8, 0.9, 0.95)
-STATED = 0.9  # the level of the bound that is called ``error``
-UNKNOWN = 1.0  # bound where nothing is known, and the largest that is stated
-MEASURED = (Status.CONTRADICTED, Status.SINGLE, Status.AGREED)  # what has a depth
+STATED = 0.9  # level of the bound called ``error``
+UNKNOWN = 1.0  # bound where nothing is known, and largest stated bound
+MEASURED = (Status.CONTRADICTED, Status.SINGLE, Status.AGREED)  # statuses with a depth
 GROUPS = tuple((kind, shaky) for kind in MEASURED for shaky in (False, True))
 KNOTS, BINS = 8, 24
-SCENE_KNOTS = 2  # of evidence that a whole scene has in common, of which there are few values
-SHAKY = 0.57  # share of close agreement in a scene below which its poses are likely to be wrong: curves of its own
-FEWEST = 4  # scenes
-SMALLEST = 1e-4  # errors below are taken to be as large
-RIDGE = 1e-3  # per sample: evidence that never varies gets no weight
-LEAST = 50 * BINS  # pixels of a status that are enough
+SCENE_KNOTS = 2  # for evidence shared by a whole scene, which has few distinct values
+SHAKY = 0.57  # share of close agreement below which a scene's poses are likely wrong; such scenes have own curves
+FEWEST = 4  # minimum number of scenes
+SMALLEST = 1e-4  # smaller errors are clamped to this
+RIDGE = 1e-3  # per sample, so that constant evidence gets no weight
+LEAST = 50 * BINS  # minimum number of pixels of a status
 
 
 @dataclass(frozen=True)
@@ -47,8 +47,8 @@ class Samples(TensorRecord):
     Attributes:
         evidence: ``[N, F]`` of :data:`vg2gt.uncertainty.evidence.EVIDENCE`.
         status: ``[N]``, see :class:`vg2gt.uncertainty.evidence.Status`.
-        error: ``[N]`` relative to the decoded depth.
-        scene: ``[N]`` int64, which scene a pixel is of.
+        error: ``[N]`` error relative to the decoded depth.
+        scene: ``[N]`` int64 scene index of each pixel.
     """
 
     evidence: Tensor
@@ -57,24 +57,24 @@ class Samples(TensorRecord):
     scene: Tensor
 
     def select(self, rows: Tensor) -> Samples:
-        """Some of the pixels."""
+        """Returns some of the pixels."""
         return self.map(lambda column: column[rows])
 
     @staticmethod
     def joined(parts: Sequence[Samples]) -> Samples:
-        """The pixels of several scenes."""
+        """Joins the pixels of several scenes."""
         return Samples(*(torch.cat([getattr(part, each.name) for part in parts]) for each in fields(Samples)))
 
 
 @dataclass(frozen=True)
 class Curve:
-    """How evidence becomes bounds for the pixels of one status.
+    """Map from evidence to error bounds, for the pixels of one group.
 
     Attributes:
-        knots: for every kind of evidence, increasing places ...
-        values: ... and what is added to the logarithm of the error there.
-        scores: ``[K]`` increasing sums of the values.
-        bounds: ``[L, K]`` of the relative error there, at each of :data:`LEVELS`.
+        knots: increasing positions, for each kind of evidence.
+        values: contribution to the logarithm of the error at each knot.
+        scores: ``[K]`` increasing sums of contributions.
+        bounds: ``[L, K]`` bounds of the relative error at these scores, for each of :data:`LEVELS`.
     """
 
     knots: tuple[Tensor, ...]
@@ -83,24 +83,24 @@ class Curve:
     bounds: Tensor
 
     def score(self, evidence: Tensor) -> Tensor:
-        """Fitted logarithm of the error ``[N]`` up to a constant, of evidence ``[N, F]``."""
+        """Returns the fitted logarithm of the error ``[N]``, up to a constant, for evidence ``[N, F]``."""
         parts = zip(evidence.unbind(-1), self.knots, self.values, strict=True)
         return torch.stack([_interpolate(column, knots, values) for column, knots, values in parts]).sum(0)
 
     def __call__(self, evidence: Tensor) -> Tensor:
-        """Bounds ``[L, N]``."""
+        """Returns the bounds ``[L, N]`` for evidence ``[N, F]``."""
         score = self.score(evidence)
         return torch.stack([_interpolate(score, self.scores, bound.log()).exp() for bound in self.bounds])
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """Bounds of the relative error of depth for one model.
+    """Bounds of the relative depth error for one model.
 
     Attributes:
-        curves: by status, and whether the scene is :data:`SHAKY`.
-        made_for: digest of the trained weights, or of the backbone's where nothing is trained.
-        scenes: number of scenes it was made of.
+        curves: by status, and whether the scene is below :data:`SHAKY`.
+        made_for: digest of the trained weights, or of the backbone's if nothing is trained.
+        scenes: number of scenes it was made from.
     """
 
     curves: Mapping[tuple[Status, bool], Curve]
@@ -108,7 +108,7 @@ class Calibration:
     scenes: int
 
     def bounds(self, evidence: Tensor, status: Tensor) -> Tensor:
-        """Bounds ``[L, ...]`` at :data:`LEVELS` of evidence ``[..., F]``; 1 where no depth is measured."""
+        """Returns bounds ``[L, ...]`` at :data:`LEVELS` for evidence ``[..., F]``; 1 where no depth is measured."""
         flat, statuses = evidence.flatten(0, -2), status.flatten()
         found = torch.full((len(LEVELS), len(flat)), UNKNOWN, device=evidence.device)
         for (kind, shaky), curve in self.curves.items():
@@ -117,16 +117,16 @@ class Calibration:
         return found.unflatten(1, status.shape)
 
     def error(self, evidence: Tensor, status: Tensor) -> Tensor:
-        """The bound ``[...]`` that nine of ten pixels stay below."""
+        """Returns the bound ``[...]`` that nine of ten pixels stay below."""
         return self.bounds(evidence, status)[LEVELS.index(STATED)]
 
     @property
     def digest(self) -> str:
-        """sha256 of what is written."""
+        """SHA-256 of the written content."""
         return hashlib.sha256(json.dumps(self._content(), sort_keys=True).encode()).hexdigest()
 
     def write(self, path: str | Path) -> Path:
-        """Writes it as JSON."""
+        """Writes the calibration as JSON."""
         return write_json(path, self._content())
 
     def _content(self) -> dict[str, Any]:
@@ -144,11 +144,11 @@ class Calibration:
 
 
 def read_calibration(path: str | Path) -> Calibration:
-    """Reads what :meth:`Calibration.write` has written.
+    """Reads a calibration written by :meth:`Calibration.write`.
 
     Raises:
-        FileNotFoundError: if there is none.
-        FormatError: if it is damaged, or of a version with other evidence.
+        FileNotFoundError: if the file does not exist.
+        FormatError: if it is damaged, or from a version with other evidence or levels.
     """
     try:
         content = read_json(path)
@@ -166,9 +166,9 @@ def read_calibration(path: str | Path) -> Calibration:
 
 
 def calibrate(samples: Samples, made_for: str) -> Calibration:
-    """Makes a calibration of pixels of many scenes; see the module.
+    """Makes a calibration from pixels of many scenes (see the module docstring).
 
-    A group with few scenes or pixels takes the curve of all.
+    A group with too few scenes or pixels uses the curve of all pixels.
 
     Raises:
         ValueError: if there are fewer than 4 scenes or too few pixels.
@@ -189,7 +189,7 @@ def calibrate(samples: Samples, made_for: str) -> Calibration:
 
 
 def _halves(samples: Samples) -> tuple[Samples, Samples]:
-    """The pixels of every other scene, and the rest."""
+    """Returns the pixels of every other scene, and the rest."""
     first = torch.isin(samples.scene, samples.scene.unique()[::2])
     return samples.select(first), samples.select(~first)
 
@@ -199,7 +199,7 @@ def _shaky(evidence: Tensor) -> Tensor:
 
 
 def _fit(order: Samples, meaning: Samples) -> Curve:
-    """The curve that one half of the pixels orders and the other gives its meaning."""
+    """Fits a curve: one half of the pixels ranks the evidence, the other calibrates the bounds."""
     knots = tuple(_knots(column, name) for column, name in zip(_thin(order.evidence).unbind(-1), EVIDENCE, strict=True))
     basis = torch.cat(
         [_hats(column.double(), k) for column, k in zip(order.evidence.unbind(-1), knots, strict=True)], 1
@@ -221,23 +221,23 @@ def _fit(order: Samples, meaning: Samples) -> Curve:
 
 
 def _knots(column: Tensor, name: str) -> Tensor:
-    """Quantiles ``[K]`` of one kind of evidence, increasing."""
+    """Returns increasing quantiles ``[K]`` of one kind of evidence."""
     steps = torch.linspace(0, 1, SCENE_KNOTS if name == "scene" else KNOTS, dtype=torch.float64)
     return column.double().quantile(steps).unique()
 
 
 def _increasing(values: Tensor) -> Tensor:
-    """``values [L, K]`` made to increase along K, from below and from above alike: bins next to another are noisy."""
+    """Makes noisy ``values [L, K]`` increase along K: mean of the tightest increasing bounds from above and below."""
     return (values.cummax(1).values + values.flip(1).cummin(1).values.flip(1)) / 2
 
 
 def _hats(column: Tensor, knots: Tensor) -> Tensor:
-    """Weights ``[N, K]`` of linear interpolation between knots."""
+    """Returns weights ``[N, K]`` of linear interpolation between knots."""
     return torch.stack([_interpolate(column, knots, unit) for unit in torch.eye(len(knots)).to(knots)], 1)
 
 
 def _interpolate(places: Tensor, knots: Tensor, values: Tensor) -> Tensor:
-    """Piecewise linear through ``values [K]`` at ``knots [K]``, constant beyond them."""
+    """Interpolates linearly between ``values [K]`` at ``knots [K]``; constant beyond them."""
     knots, values = knots.to(places), values.to(places)
     if len(knots) == 1:
         return values.expand_as(places)
@@ -247,7 +247,7 @@ def _interpolate(places: Tensor, knots: Tensor, values: Tensor) -> Tensor:
 
 
 def _thin(rows: Tensor, most: int = 1_000_000) -> Tensor:
-    """At most so many rows, as :func:`torch.quantile` takes."""
+    """Returns at most ``most`` rows, evenly spread: :func:`torch.quantile` has a limit."""
     return rows[:: max(1, -(-len(rows) // most))]
 
 

@@ -1,4 +1,4 @@
-"""What speaks for and against the depth of every pixel and the place of every Gaussian."""
+"""Evidence for and against the depth of every pixel and the position of every Gaussian."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from vg2gt.geometry.cameras import camera_centers, focal_lengths, project
 from vg2gt.method.additions.visibility import choose_partners, count_views
 from vg2gt.types import Cameras, Geometry
 
-TOLERANCE, MARGIN = 0.02, 0.04  # relative differences of depth at which views agree, or look through
-CLOSE = 0.005  # at which they agree closely
-POINT_TOLERANCE, POINT_MARGIN = 0.03, 0.05  # the same of points, which lie on a voxel's mean surface
-PARTNERS = 24  # views that each view is compared with, at most
+TOLERANCE, MARGIN = 0.02, 0.04  # relative depth differences at which views agree, or look through
+CLOSE = 0.005  # relative depth difference at which views agree closely
+POINT_TOLERANCE, POINT_MARGIN = 0.03, 0.05  # the same for points, which lie on a voxel's mean surface
+PARTNERS = 24  # maximum number of views that each view is compared with
 EVIDENCE = ("confidence", "views", "closely", "against", "step", "parallax", "scene")
 
 
 class Status(IntEnum):
-    """What is known of a pixel or a Gaussian; larger is better.
+    """Support of a pixel or a Gaussian; larger is better.
 
     Attributes:
-        UNSEEN: no view sees it, or a mask leaves it out.
-        GUESSED: views look there without finding a depth: background, the far shell, holes that refinement fills.
+        UNSEEN: no view sees it, or a mask excludes it.
+        GUESSED: views look there but have no depth: background, the far shell, holes that refinement fills.
         CONTRADICTED: more views look through it than agree with it.
-        SINGLE: one view alone measures it.
-        AGREED: two views or more do, within 2 % of their depth.
+        SINGLE: only one view measures it.
+        AGREED: two or more views do, within 2 % of their depth (Gaussians: 3 %).
     """
 
     UNSEEN = 0
@@ -39,19 +39,19 @@ class Status(IntEnum):
 
 @torch.no_grad()
 def pixel_evidence(geometry: Geometry, keep: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """What is known of the decoded depth of one scene.
+    """Returns evidence and status of the decoded depth of one scene.
 
     Args:
-        geometry: of one scene (B = 1).
-        keep: ``[1, V, H, W]`` bool, pixels that the scene is made of (:class:`vg2gt.method.additions.visibility`);
+        geometry: geometry of one scene (B = 1).
+        keep: ``[1, V, H, W]`` bool, pixels that the scene is made of (:mod:`vg2gt.method.additions.visibility`);
             others count as contradicted. None: all that have a depth.
 
     Returns:
         :data:`EVIDENCE` as ``[V, H, W, F]`` float32, finite, 0 without depth, and :class:`Status`, ``[V, H, W]`` uint8.
-        The evidence is the logarithm of the backbone's confidence, that (base 2) of one more than the number of views
-        that agree, the share of them that agree closely, the share of views that look through, the logarithms of the
-        largest step of depth to a neighbour and of the depth over what one pixel of parallax resolves, and the share
-        of close agreement in the whole scene.
+        The evidence is, in order: the logarithm of the backbone's confidence; log2 of one plus the number of views
+        that agree; the share of these that agree closely; the share of views that look through; the logarithm of the
+        largest relative depth step to a neighbour; the logarithm of depth over focal length times baseline, which is
+        the relative depth change per pixel of parallax; the share of close agreement in the whole scene.
     """
     depth = geometry.depth[0].float().nan_to_num(0.0, 0.0, 0.0).clamp(min=0)
     cameras, known = geometry.cameras, depth > 0
@@ -86,17 +86,18 @@ def pixel_evidence(geometry: Geometry, keep: Tensor | None = None) -> tuple[Tens
 def point_support(
     points: Tensor, depth: Tensor, cameras: Cameras, error: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """What views know of points in space, such as the centres of Gaussians.
+    """Returns status and error bound of points in space, such as the centres of Gaussians.
 
     Args:
-        points: ``[N, 3]`` in the world of the cameras.
+        points: ``[N, 3]`` in the world frame of the cameras.
         depth: ``[V, H, W]`` z-depth that the scene is made of, 0 = none.
-        cameras: of the views (B = 1).
+        cameras: cameras of the views (B = 1).
         error: ``[V, H, W]`` bound of the relative error of the depth; None: it is exact.
 
     Returns:
-        :class:`Status` as ``[N]`` uint8, and a bound of the relative error of a point's depth ``[N]``: the smallest,
-        over the views that agree, of the pixel's bound and the distance from it; 1 where no view agrees.
+        :class:`Status` as ``[N]`` uint8, and a bound ``[N]`` of the relative error of a point's depth: the pixel's
+        bound plus the relative distance of the point to the pixel's depth, minimised over the views that agree; 1
+        where no view agrees.
     """
     count, height, width = len(points), *depth.shape[1:]
     agree, through, blank = (torch.zeros(count, device=points.device) for _ in range(3))
@@ -124,7 +125,7 @@ def point_support(
 
 
 def _baselines(cameras: Cameras, partners: Tensor) -> Tensor:
-    """Mean distance ``[V]`` of every view from its partners; from all views where it has none."""
+    """Returns the mean distance ``[V]`` of each view to its partners, or to all views if it has none."""
     centers = camera_centers(cameras)[0].float()
     distance = torch.cdist(centers, centers)
     chosen = torch.zeros_like(distance).scatter_add_(1, partners.clamp(min=0), (partners >= 0).to(distance))
@@ -133,7 +134,7 @@ def _baselines(cameras: Cameras, partners: Tensor) -> Tensor:
 
 
 def _steps(depth: Tensor) -> Tensor:
-    """Largest relative difference ``[V, H, W]`` of depth to one of the eight neighbours."""
+    """Returns the largest relative depth difference ``[V, H, W]`` to the eight neighbours."""
     far = F.max_pool2d(depth[:, None], 3, 1, 1)[:, 0]
     near = -F.max_pool2d(-depth[:, None], 3, 1, 1)[:, 0]
     return torch.maximum(far - depth, depth - near) / depth.clamp(min=1e-12)

@@ -1,4 +1,4 @@
-"""Looking at a scene: a self-contained page, or a server with viser."""
+"""Viewers of a scene: a self-contained HTML page, or a viser server."""
 
 from vg2gt.viewer.content import ViewerScene, load_pictures
 from vg2gt.viewer.page import write_viewer_html

@@ -1,4 +1,4 @@
-"""What the viewers show: Gaussians, cameras, small pictures of their images, where to start."""
+"""Content of the viewers: Gaussians, cameras, thumbnails of their images, and the initial view."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from vg2gt.io.glb import scene_extent
 from vg2gt.io.images import color_image, open_image
 from vg2gt.types import Gaussians
 
-FRUSTUM_SHARE = 0.02  # of the scene's extent, the depth of a drawn frustum
+FRUSTUM_SHARE = 0.02  # depth of a drawn frustum, relative to the scene's extent
 PICTURE_SIDE = 320  # longer side of an image shown in its frustum, in pixels
-_DEFAULT_SIZE = (960, 720)  # of the view of a scene without cameras
-_INSIDE_SHARE = 0.1  # of the Gaussians that the first camera's frame must have in view to start there
+_DEFAULT_SIZE = (960, 720)  # width and height of the default view
+_INSIDE_SHARE = 0.1  # minimum share of Gaussians in view for the default view to be the world frame
 
 
 @dataclass(frozen=True)
@@ -30,10 +30,10 @@ class ViewerScene:
         gaussians: one scene, at least one Gaussian.
         cameras: the cameras to draw; the first is the initial view.
         pictures: ``[H, W, 3]`` uint8 or None, one per camera; empty: no pictures.
-        title: of the page.
+        title: title of the page.
 
     Raises:
-        ValueError: if there are no Gaussians, or pictures and cameras disagree in number.
+        ValueError: if there are no Gaussians, or the numbers of pictures and cameras differ.
     """
 
     gaussians: Gaussians
@@ -50,29 +50,29 @@ class ViewerScene:
             )
 
     def picture(self, index: int) -> NDArray[np.uint8] | None:
-        """The picture of a camera, None without."""
+        """Returns the picture of a camera, or None."""
         return self.pictures[index] if self.pictures else None
 
     def initial(self) -> NamedCamera:
-        """Where to start: the first camera, else :func:`default_camera`."""
+        """Returns the initial view: the first camera, else :func:`default_camera`."""
         return self.cameras[0] if self.cameras else default_camera(self.gaussians)
 
     def frustum_depth(self) -> float:
-        """Distance from a camera's centre to its drawn image, scene units."""
+        """Returns the distance from a camera's centre to its drawn image, in scene units."""
         centers = np.stack([camera_to_world(camera)[:3, 3] for camera in self.cameras or [self.initial()]])
         return FRUSTUM_SHARE * scene_extent(self.gaussians.means.detach().cpu().double().numpy(), centers)
 
 
 def camera_to_world(camera: NamedCamera) -> NDArray[np.float64]:
-    """Pose ``[4, 4]`` of a camera in the world."""
+    """Returns the camera-to-world pose ``[4, 4]``."""
     return invert_pose(camera.world_to_camera)
 
 
 def default_camera(gaussians: Gaussians) -> NamedCamera:
-    """A view of a scene without cameras.
+    """Returns a view of a scene without cameras.
 
-    The world's own frame if a tenth of the Gaussians are in view there; otherwise from in front of the scene, far
-    enough to see its middle nine tenths.
+    This is the world frame if at least a tenth of the Gaussians are in view there. Otherwise the camera is placed in
+    front of the scene, far enough to see its middle 90 %.
     """
     width, height = _DEFAULT_SIZE
     focal = 0.8 * width
@@ -90,14 +90,14 @@ def default_camera(gaussians: Gaussians) -> NamedCamera:
 
 
 def load_pictures(cameras: Sequence[NamedCamera], folder: str | Path) -> list[NDArray[np.uint8] | None]:
-    """Small upright pictures of the cameras' images, ``folder / name`` each.
+    """Loads upright thumbnails of the cameras' images, ``folder / name`` each.
 
     Returns:
-        One per camera, the longer side ``PICTURE_SIDE`` pixels at most; None where there is no such file inside the
-        folder (names that lead out of it count as absent).
+        One per camera, the longer side at most ``PICTURE_SIDE`` pixels; None if the folder has no such file (names that
+        lead out of it count as missing).
 
     Raises:
-        ValueError: if a file is there and cannot be read, naming it.
+        ValueError: if an existing file cannot be read; the message names it.
     """
     root = Path(folder).resolve()
     pictures: list[NDArray[np.uint8] | None] = []
@@ -114,5 +114,5 @@ def _small_picture(path: Path) -> NDArray[np.uint8]:
             picture = color_image(image) if image.mode.startswith(("I", "F")) else image
             picture.thumbnail((PICTURE_SIDE, PICTURE_SIDE))
             return np.array((ImageOps.exif_transpose(picture) or picture).convert("RGB"))
-    except Exception as error:  # image libraries raise whatever the bytes lead them to
+    except Exception as error:  # image libraries raise many kinds of errors
         raise ValueError(f"cannot read {path}: {error}; restore or remove the image") from error

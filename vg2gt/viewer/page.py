@@ -1,6 +1,7 @@
-"""A scene as one HTML file: Gaussians, cameras, pictures and the viewer's own script, nothing fetched from anywhere.
+"""A scene as one self-contained HTML file: Gaussians, cameras, pictures and the viewer's script.
 
-Its security policy names the script by hash and allows no connection: nothing in a scene can run code.
+The page loads nothing from the network. Its content security policy allows only the script with the given hash and no
+connections, so that nothing in a scene can run code.
 """
 
 from __future__ import annotations
@@ -28,15 +29,15 @@ from vg2gt.viewer.content import ViewerScene
 STATIC = Path(__file__).with_name("static")
 SCRIPTS = ("shaders.js", "decode.js", "sorting.js", "camera.js", "controls.js", "renderer.js", "main.js")
 JPEG_QUALITY = 85
-UNSIGNED, SIGNED = 2**16 - 1, 2**15 - 1  # of what is stored as 16 bits
+UNSIGNED, SIGNED = 2**16 - 1, 2**15 - 1  # largest values stored in 16 bits
 
 
 def write_viewer_html(path: str | Path, scene: ViewerScene) -> Path:
-    """Writes the page, atomically; it opens from the disk in any browser with WebGL 2.
+    """Writes the page atomically; it opens from disk in any browser with WebGL 2.
 
     Args:
-        path: the file.
-        scene: what to show; not changed. Pictures are stored as JPEG, Gaussians as :func:`pack` says.
+        path: output file.
+        scene: scene to show; not changed. Pictures are stored as JPEG, Gaussians as described in :func:`pack`.
 
     Raises:
         ValueError: if the Gaussians are of more than one scene or have values that cannot be shown.
@@ -56,18 +57,18 @@ def write_viewer_html(path: str | Path, scene: ViewerScene) -> Path:
         "gaussians": base64.b64encode(packed).decode(),
         "script": script,
     }
-    # one pass, so that nothing inside a part is taken for a place
+    # one pass, so that no text inside a part is taken for a placeholder
     page = re.sub(r"\{\{(\w+)\}\}", lambda place: parts[place[1]], _static("page.html"))
     return write_text(path, page)
 
 
 def pack(gaussians: Gaussians) -> tuple[dict[str, float], bytes]:
-    """One scene as the page's script reads it; bands of colour that are zero throughout are left out.
+    """Encodes one scene for the page's script; the highest SH degrees are left out if they are all zero.
 
     Returns:
-        What the script needs to know, and the columns, little endian and compressed by gzip: float32 means, float16
-        colour coefficients, 16-bit logarithms of the standard deviations between the scene's smallest and largest,
-        16-bit components of unit quaternions, 16-bit opacities.
+        Header for the script, and the columns, little endian and gzip-compressed: float32 means, float16 SH
+        coefficients, 16-bit logarithms of the standard deviations between the scene's smallest and largest, 16-bit
+        components of unit quaternions, 16-bit opacities.
 
     Raises:
         ValueError: if there is no Gaussian, more than one scene, or a value that is not finite or out of range.
@@ -98,7 +99,7 @@ def pack(gaussians: Gaussians) -> tuple[dict[str, float], bytes]:
 
 
 def _content(scene: ViewerScene, header: dict[str, float]) -> dict[str, Any]:
-    """What the script finds in the page besides the Gaussians."""
+    """Returns the page's JSON content, without the packed Gaussians."""
     options = RenderOptions(mode="rasterized")
     cameras = [{**camera.fields(), "picture": _jpeg(scene, index)} for index, camera in enumerate(scene.cameras)]
     behind = scene.gaussians.background
@@ -126,13 +127,13 @@ def _jpeg(scene: ViewerScene, index: int) -> str | None:
 
 
 def _json_in_html(content: Any) -> str:
-    """JSON that cannot end the element it is in, whatever its strings hold."""
+    """Returns JSON that cannot close the HTML element around it, whatever its strings contain."""
     text = json.dumps(content, allow_nan=False)  # everything beyond ASCII is escaped
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
 def _hash(text: str) -> str:
-    """A security policy's name of an inline script or style."""
+    """Returns the content security policy's hash of an inline script or style."""
     return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
 
 

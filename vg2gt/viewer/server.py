@@ -1,4 +1,4 @@
-"""A scene in a browser by a viser server on this machine."""
+"""Serves a scene to the browser with a viser server on this machine."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ if TYPE_CHECKING:
 
 LOOPBACK = "127.0.0.1"
 PORT = 8080
-_LOOK_DEPTHS = 25.0  # frustum depths ahead of a camera, the point to turn around
+_LOOK_DEPTHS = 25.0  # distance from a camera to the point to orbit around, in frustum depths
 
 
 class MissingViserError(ImportError):
-    """The package viser is not installed."""
+    """Raised if the package viser is not installed."""
 
 
 def require_viser() -> None:
-    """Raises MissingViserError, naming the remedy, if there is no viser."""
+    """Raises MissingViserError, naming the remedy, if viser is not installed."""
     if importlib.util.find_spec("viser") is None:
         raise MissingViserError(
             "the live viewer needs viser: pip install 'vg2gt[view]', or write a page with --html, which needs nothing"
@@ -41,29 +41,29 @@ def require_viser() -> None:
 
 
 def start_server(scene: ViewerScene, host: str = LOOPBACK, port: int = PORT, share: bool = False) -> viser.ViserServer:
-    """Serves the scene until ``stop()`` of what it returns; colours are those of degree 0.
+    """Serves the scene until ``stop()`` is called on the returned server; colours are limited to SH degree 0.
 
-    Viser's page has a button that publishes the scene through an outside server; here it does nothing unless ``share``
-    is true. Unless it is shared, other pages in the same browser are refused, also under a name of their own that leads
-    to this machine.
+    viser's page has a button that publishes the scene through an external server. It does nothing unless ``share`` is
+    True. Without ``share``, requests from other pages in the same browser are refused, even if their host name
+    resolves to this machine.
 
     Args:
-        scene: what to show; not changed.
+        scene: scene to show; not changed.
         host: address to listen on; the default can be reached from this machine only.
         port: the first port to try; if it is taken, a later free one is used (``get_port()``). 0: any.
-        share: whether the scene may be published; ``request_share_url()`` does it.
+        share: whether the scene may be published with ``request_share_url()``.
 
     Raises:
-        MissingViserError: without the package viser, naming the extra that brings it.
+        MissingViserError: if viser is not installed; the message names the extra to install.
     """
     require_viser()
     import viser  # pyright: ignore[reportMissingImports]  # optional
 
     class Server(viser.ViserServer):
-        """Publishes only what may be published."""
+        """Server that publishes the scene only with ``share``."""
 
         def request_share_url(self, verbose: bool = True) -> str | None:
-            """The public address, None unless ``share``."""
+            """Returns the public address, or None without ``share``."""
             return super().request_share_url(verbose) if share else None
 
     with _refusing_other_pages(share):
@@ -77,12 +77,13 @@ def start_server(scene: ViewerScene, host: str = LOOPBACK, port: int = PORT, sha
 
 
 def is_own_request(hosts: list[str], origins: list[str]) -> bool:
-    """Whether a request comes from the served page, or from its user.
+    """Whether a request comes from the served page, or directly from its user.
 
     Args:
-        hosts: the ``Host`` headers; an address, ``localhost`` or this machine's name, because an attacker's name may
-            lead to this machine (DNS rebinding).
-        origins: the ``Origin`` headers, which browsers send with a page's requests; the page's own host, or none.
+        hosts: the ``Host`` headers. An IP address, ``localhost`` or this machine's name is accepted; other names may be
+            an attacker's that resolve to this machine (DNS rebinding).
+        origins: the ``Origin`` headers, which browsers send with a page's requests. The page's own host, or no header,
+            is accepted.
     """
     if len(hosts) != 1 or len(origins) > 1:
         return False
@@ -100,7 +101,7 @@ def is_own_request(hosts: list[str], origins: list[str]) -> bool:
 
 @contextmanager
 def _refusing_other_pages(share: bool) -> Iterator[None]:
-    """Servers that viser begins inside the block answer :func:`is_own_request` only; viser itself asks nobody."""
+    """Makes viser servers started inside the block refuse requests that fail :func:`is_own_request`."""
     from websockets.asyncio import server  # pyright: ignore[reportMissingImports]  # viser's
 
     serve = server.serve
@@ -135,7 +136,7 @@ def _fill(server: viser.ViserServer, scene: ViewerScene) -> None:
 
 
 def _add_cameras(server: viser.ViserServer, scene: ViewerScene, ahead: float) -> None:
-    """Frusta with their images, boxes that hide either, and a list of cameras to look through."""
+    """Adds frusta with their images, checkboxes that hide either, and a dropdown of cameras to look through."""
     frusta = [_add_frustum(server, scene, index) for index in range(len(scene.cameras))]
     pictured = any(scene.picture(index) is not None for index in range(len(frusta)))
     names = [f"{index}: {camera.name}" for index, camera in enumerate(scene.cameras)]
@@ -168,7 +169,7 @@ def _add_cameras(server: viser.ViserServer, scene: ViewerScene, ahead: float) ->
 def _add_frustum(server: viser.ViserServer, scene: ViewerScene, index: int) -> viser.CameraFrustumHandle:
     camera, pose = scene.cameras[index], camera_to_world(scene.cameras[index])
     return server.scene.add_camera_frustum(
-        f"/cameras/{index}",  # not the name: a slash in it would mean a parent
+        f"/cameras/{index}",  # not the name: a slash in it would make a parent node
         fov=_field_of_view(camera),
         aspect=camera.width / camera.height,
         scale=scene.frustum_depth(),
@@ -180,7 +181,7 @@ def _add_frustum(server: viser.ViserServer, scene: ViewerScene, index: int) -> v
 
 
 def _field_of_view(camera: NamedCamera) -> float:
-    """Vertical, in radians; viser puts the principal point into the middle."""
+    """Returns the vertical field of view in radians; viser assumes a centred principal point."""
     return 2 * math.atan(camera.height / 2 / float(camera.intrinsics[1, 1]))
 
 

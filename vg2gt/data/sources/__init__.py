@@ -1,4 +1,4 @@
-"""Datasets on disk, one file a layout; all are a ``FileSource``."""
+"""Loaders of datasets on disk, one module per layout; all are subclasses of ``FileSource``."""
 
 from vg2gt.data.sources.colmap_model import COLMAP
 from vg2gt.data.sources.infinigen import Infinigen

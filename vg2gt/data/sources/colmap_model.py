@@ -1,4 +1,4 @@
-"""COLMAP models with their images; depth, if wanted, at the model's own points."""
+"""COLMAP models with their images; optionally with sparse depth at the model's points."""
 
 from __future__ import annotations
 
@@ -28,22 +28,23 @@ log = logging.getLogger(__name__)
 
 _MODELS = ("sparse", "colmap/sparse", ".")
 _SCENES_IN_MEMORY = 16
-_CLEARLY = 0.7  # of the difference of colours: the other orientation is right
+_CLEARLY = 0.7  # the stored orientation is used if its colour difference is below this fraction of the upright one's
 
 
 class COLMAP(FileSource):
-    """Scenes of ``images/`` with a COLMAP model in ``sparse/0`` or ``sparse``, text or binary; the scale is arbitrary.
+    """Scenes with ``images/`` and a text or binary COLMAP model in ``sparse/0`` or ``sparse``, of arbitrary scale.
 
-    Frames are numbered 0, 1, ... in the order of the model's image names (numbers by their value), also where an image
-    is absent (left out and counted). Images of any camera model but EQUIRECTANGULAR are undistorted when they are read.
-    Images of several sizes are resized to cover the median size and cropped. Alpha and ``masks/`` say what counts.
+    Frames are numbered 0, 1, ... in natural order of the model's image names. Missing images keep their number, but
+    are left out and counted. Images are undistorted when they are read; all camera models except EQUIRECTANGULAR are
+    supported. Images of different sizes are resized to cover the median size and cropped. Pixel weights come from
+    alpha and ``masks/``.
 
     Args:
         root: a scene, a folder of scenes (one or two levels deep), or a list of such folders.
-        images: name of the image folder. Images of another size than the cameras' are taken for resized ones, such as
-            ``images_4``, and the intrinsics are resized with them.
-        depth: ``points``: depth at the model's points in the views that saw them, without likely outliers
-            (``SparsePoints``); null: none.
+        images: name of the image folder. Images of another size than their camera's, such as ``images_4``, are
+            treated as resized: the intrinsics are scaled accordingly.
+        depth: ``points``: depth of the model's points in the views that observe them, without likely outliers
+            (``SparsePoints``); None: no depth.
         shared: see ``FileSource``.
     """
 
@@ -71,11 +72,11 @@ class COLMAP(FileSource):
         super().__init__(root, **shared)
 
     def is_scene(self, folder: Path) -> bool:
-        """Whether it holds a model."""
+        """Returns whether a folder contains a COLMAP model."""
         return model_folder_of(folder) is not None
 
     def watched(self, scene: str, folder: Path) -> Sequence[Path | None]:
-        """Also the model's folder."""
+        """Returns the scene's folder and the model's folder."""
         return folder, model_folder_of(folder)
 
     def index(self, scene: str, folder: Path) -> SceneIndex:
@@ -107,7 +108,7 @@ class COLMAP(FileSource):
         return make_index(scene, folder, color, depth, poses, {}, posed=usable)
 
     def read_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
-        """Depth of the points a view saw, at the pixels where it saw them; the nearest wins a pixel."""
+        """Returns depth at the pixels of the points that a view observes; the nearest point wins a pixel."""
         points, frame = self._scene_points(index.name, index.folder), index.frame_ids[row]
         extent = np.array((size[1], size[0]))
         pixels = np.floor(points.places(frame) * extent).astype(np.int64).clip(max=extent - 1)
@@ -116,7 +117,7 @@ class COLMAP(FileSource):
         return np.where(np.isfinite(depth), depth, 0)
 
     def point_depths(self, scene: str, frame: int) -> NDArray[np.float32]:
-        """``[n]`` positive z-depth of all points that a frame's image saw, however many others did."""
+        """Returns the positive z-depth ``[n]`` of all points that a frame observes, including likely outliers."""
         return self._scene_points(scene, self._folders[scene], sound=False).depth(frame)
 
     def _posed(
@@ -151,7 +152,7 @@ class COLMAP(FileSource):
 
 
 def models_of(folder: Path) -> list[tuple[Path, int]]:
-    """The models of a scene with their number of images, the largest first; those of one place only."""
+    """Returns the models at the first location that has any, with their number of images, largest first."""
     for name in _MODELS:
         place = folder / name
         if not place.is_dir() or (name == "." and not _has_images(place)):
@@ -164,7 +165,7 @@ def models_of(folder: Path) -> list[tuple[Path, int]]:
 
 
 def model_folder_of(folder: Path) -> Path | None:
-    """The folder of a scene's model, if it has one: of several the one with the most images."""
+    """Returns the folder of a scene's largest model; None if there is none."""
     return next((place for place, _ in models_of(folder)), None)
 
 
@@ -173,7 +174,7 @@ def _has_images(folder: Path) -> bool:
 
 
 def _count_images(folder: Path) -> int:
-    """About how many images a model has; the file is not read whole."""
+    """Returns the approximate number of images of a model, without parsing it."""
     path = colmap_files(folder)["images"]
     if path.suffix.lower() == ".bin":
         with regular(path).open("rb") as file:
@@ -183,7 +184,7 @@ def _count_images(folder: Path) -> int:
 
 
 def _is_stored(model: Reconstruction, record: Image, path: Path) -> bool:
-    """Whether the colours of a model's points speak for an image as stored, against the same turned upright."""
+    """Returns whether the model's point colours match an image clearly better as stored than rotated upright."""
     camera, differences = record.camera, []
     features = [feature for feature in record.points2D if feature.point3D_id in model.points3D]
     if not features:

@@ -1,4 +1,4 @@
-"""What the loaders of datasets on disk share: scenes found in folders, an index of each, decoding, splits, caching."""
+"""Base class of the loaders of datasets on disk: finds scenes, indexes them, decodes frames and caches indices."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _INDICES_IN_MEMORY = 64
 
 
 class FileOptions(TypedDict, total=False):
-    """Arguments of every ``FileSource``, which a loader with some of its own takes as ``**shared`` and hands on."""
+    """Arguments of every ``FileSource``, passed on as ``**shared`` by loaders with arguments of their own."""
 
     scenes: Sequence[str] | str | None
     every: int
@@ -39,31 +39,31 @@ class FileOptions(TypedDict, total=False):
 
 
 class HoldoutOptions(FileOptions, total=False):
-    """The same with ``holdout``, for loaders that hold nothing out unless told to."""
+    """``FileOptions`` with ``holdout``, for loaders that hold nothing out by default."""
 
     holdout: int | None
 
 
 class FileSource(SceneSource):
-    """A dataset on disk. A loader says where scenes are (``find``), what is in one (``index``) and how depth is stored.
+    """Base class of datasets on disk.
 
-    Where something is missing or damaged, all methods raise ``DataError``, naming the file and the scene.
-
-    The arguments, and what they raise, are those of every loader.
+    A loader implements ``index`` and, if the defaults do not fit, ``find`` and ``read_depth``. All methods raise
+    ``DataError`` if a file is missing or damaged; the message names the file and the scene. All loaders share the
+    arguments and errors below.
 
     Args:
         root: the dataset's folder, or several.
-        scenes: names of the scenes to use, patterns of names (``Scene20/*``), or a text file with one per line, of
-            which those that are not there are counted and left out; None: all.
-        holdout: hold out every this many-th frame as an evaluation target; None: none.
-        every: use every this many-th frame only.
-        index_cache: folder for the indices (file lists, poses, intrinsics), so that they are read from the dataset
-            only once; None: every process reads them again. An index is made again when the scene's folder
-            changes; a pose file edited in place inside a folder of pose files is not noticed.
+        scenes: names of the scenes to use, patterns of names (``Scene20/*``), or a text file with one per line; names
+            in a file that do not exist are skipped with a warning. None: all.
+        holdout: hold out every ``holdout``-th frame as an evaluation target; None: none.
+        every: use only every ``every``-th frame.
+        index_cache: folder that caches the indices (file lists, poses, intrinsics); None: every process reads them from
+            the dataset. An index is rebuilt when the scene's folder changes, but an in-place edit of a pose file inside
+            a folder of pose files is not detected.
 
     Raises:
         FileNotFoundError: if a root does not exist.
-        DataError: if there is no scene, or not one that was named.
+        DataError: if there is no scene, or a named scene does not exist.
     """
 
     layout: ClassVar[str]
@@ -111,11 +111,11 @@ class FileSource(SceneSource):
         self._indexes = False
 
     def is_scene(self, folder: Path) -> bool:
-        """Whether a folder is a scene: it holds the ``scene_marks``, unless a loader knows better."""
+        """Returns whether a folder is a scene; by default, whether it contains all ``scene_marks``."""
         return all((folder / mark).exists() for mark in self.scene_marks)
 
     def find(self, root: Path) -> Mapping[str, Path]:
-        """Scenes by name with folders (or ``scene_files``), unread: ``root`` itself, or up to ``levels`` below."""
+        """Finds scenes by name, with their folder or file: ``root`` itself, or folders up to ``levels`` below it."""
         if self.is_scene(root):
             return {root.resolve().name: root}
         found: dict[str, Path] = {}
@@ -129,10 +129,10 @@ class FileSource(SceneSource):
 
     @abstractmethod
     def index(self, scene: str, folder: Path) -> SceneIndex:
-        """Reads file lists, poses and intrinsics of a scene."""
+        """Reads the file lists, poses and intrinsics of a scene."""
 
     def read_color(self, index: SceneIndex, row: int) -> NDArray[np.uint8]:
-        """Decodes the colour image ``[h, w, 3]`` of a row of the index."""
+        """Decodes the colour image ``[h, w, 3]`` of a row of the index, undistorted."""
         lens, upright = index.lens(row), index.upright(row)
         if not lens:
             return read_color(index.color[row], index.name, index.color_size, upright=upright)
@@ -140,7 +140,7 @@ class FileSource(SceneSource):
         return undistortion.color(read_color(index.color[row], index.name, undistortion.lens_size, upright=upright))
 
     def read_mask(self, index: SceneIndex, row: int) -> NDArray[np.float32] | None:
-        """How much each pixel of a colour image counts ``[h, w]``, by its mask file and its alpha; None: all do."""
+        """Reads the pixel weights ``[h, w]`` in [0, 1] of a colour image from its mask file and alpha; None: all 1."""
         if not self.reads_masks:
             return None
         path, upright = index.mask(row), index.upright(row)
@@ -156,12 +156,12 @@ class FileSource(SceneSource):
     def read_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
         """Decodes the depth ``[h, w]`` of a row of the index: z-depth in the dataset's unit, 0 = invalid.
 
-        By default from an image of whole numbers, in units of ``depth_scale`` and with ``invalid`` ones.
+        By default reads an integer image and applies ``depth_scale`` and ``invalid``.
 
         Args:
             index: the scene.
-            row: which frame.
-            size: the ``(height, width)`` it must have.
+            row: row of the frame in the index.
+            size: expected ``(height, width)``.
         """
         undistortion = undistortion_of(index.lens(row)) if index.lens(row) else None
         stored = read_depth(index.depth[row], index.name, undistortion.lens_size if undistortion else size)
@@ -172,9 +172,9 @@ class FileSource(SceneSource):
         return undistortion.depth(depth) if undistortion else depth
 
     def watched(self, scene: str, folder: Path) -> Sequence[Path | None]:
-        """Folders and files that decide a scene's index, as far as they exist; by default the scene's folder.
+        """Returns the folders and files that a scene's index depends on; by default the scene's folder.
 
-        The cached index is made again when one of them changes.
+        The cached index is rebuilt when one of them changes. They need not exist.
         """
         return (folder,)
 
@@ -184,32 +184,32 @@ class FileSource(SceneSource):
         return tuple(self._folders)
 
     def frames(self, scene: str) -> Sequence[int]:
-        """Numbers of the usable frames, in order."""
+        """Returns the numbers of the usable frames, in increasing order."""
         if scene not in self._frame_ids:
             self._frame_ids[scene] = np.array(self.scene_index(scene).frame_ids[:: self.every])
         return tuple(self._frame_ids[scene].tolist())
 
     def held_out(self, scene: str) -> Sequence[int]:
-        """Every ``holdout``-th frame, from the middle of the first stretch on."""
+        """Returns every ``holdout``-th frame, starting at frame ``holdout // 2``."""
         return self.frames(scene)[self.holdout // 2 :: self.holdout] if self.holdout else ()
 
     def load(self, scene: str, frame_ids: Sequence[int]) -> Frames:
-        """Decodes frames at the scene's size; images of another size are brought to it."""
+        """Decodes frames at the scene's size; resizes images of other sizes to it."""
         index = self.scene_index(scene)
         return Frames.concatenate([self._load_frame(index, index.row(frame)) for frame in frame_ids])
 
     def load_whole(self, scene: str, frame: int) -> Frames:
-        """Decodes one frame at its own size (``SceneIndex.own_size``), uncut."""
+        """Decodes one frame at its own size (``SceneIndex.own_size``), without cropping."""
         index = self.scene_index(scene)
         return self._load_frame(index, index.row(frame), whole=True)
 
     def scene_index(self, scene: str) -> SceneIndex:
-        """The index of a scene, from memory, from the cache, or from the dataset."""
+        """Returns the index of a scene, from memory, the cache, or the dataset."""
         if scene not in self._folders:
             raise DataError(f"there is no scene {scene}; found are: {_some(self._folders)}")
         if scene not in self._indices:
             self._indices[scene] = self._recall_index(scene, self._folders[scene])
-            # A dataset of a thousand long videos would fill gigabytes; from the cache they are quickly read again.
+            # Indices of a thousand long videos would take gigabytes; evicted ones are quickly read from the cache.
             if self.index_cache is not None and len(self._indices) > _INDICES_IN_MEMORY:
                 self._indices.popitem(last=False)
         self._indices.move_to_end(scene)
@@ -258,7 +258,7 @@ class FileSource(SceneSource):
         names = read_split(scenes) if isinstance(scenes, str) else list(scenes)
         chosen = {name: fnmatch.filter(found, name) if "*" in name else [name] for name in names}
         unknown = [name for name, fitting in chosen.items() if not fitting or fitting[0] not in found]
-        # A list in a file is of the whole dataset, of which people often have a part.
+        # A list file covers the whole dataset, but often only a part of it is on disk.
         if unknown and (not isinstance(scenes, str) or len(unknown) == len(chosen)):
             raise DataError(f"there is no scene {_some(unknown)}; found are: {_some(found)}")
         if unknown:
@@ -287,11 +287,11 @@ class FileSource(SceneSource):
 
 
 def read_split(path: str) -> list[str]:
-    """Reads scene names from a text file, one per line; ``#`` begins a comment.
+    """Reads scene names from a text file, one per line; ``#`` starts a comment.
 
     Raises:
-        FileNotFoundError: if there is no such file.
-        DataError: if it names no scene, or one twice.
+        FileNotFoundError: if the file does not exist.
+        DataError: if it names no scene, or a scene twice.
     """
     file = Path(path).expanduser()
     if not file.is_file():

@@ -1,4 +1,4 @@
-"""The index of a scene: file lists, poses and intrinsics, checked once, and how it is kept on disk."""
+"""Scene index: checked file lists, poses and intrinsics of a scene, and its cache file."""
 
 from __future__ import annotations
 
@@ -30,23 +30,23 @@ _SIZES = ("size", "color_size", "depth_size")
 
 @dataclass(frozen=True)
 class SceneIndex:
-    """All of a scene but its pixels; row i of everything belongs to frame ``frame_ids[i]``.
+    """Everything about a scene except its pixels; row i of each field belongs to frame ``frame_ids[i]``.
 
     Attributes:
         name: the scene's name.
-        folder: where it is.
-        frame_ids: increasing numbers of the frames.
+        folder: the scene's folder.
+        frame_ids: frame numbers, increasing.
         color: colour image files.
-        depth: depth files; empty where the scene has none.
+        depth: depth files; empty if the scene has none.
         world_to_camera: ``[n, 4, 4]`` float64 rigid OpenCV poses.
-        intrinsics: ``[n, 3, 3]`` float64, integer pixel centres; of frames of ``size``, or, where ``color_size`` is
-            None, of each colour image as it is.
+        intrinsics: ``[n, 3, 3]`` float64, integer pixel centres; for frames of ``size`` or, if ``color_size`` is None,
+            for each colour image at its own size.
         size: ``(height, width)`` of decoded frames.
-        color_size: of the colour files; None: each has its own, and is resized to cover ``size`` and cropped.
-        depth_size: of the depth files; None: each has its colour image's.
-        dropped: frames left out, by reason.
-        extra: what else a loader keeps of a scene, as arrays; ``sizes [n, 2]``, ``lens``, ``upright`` and ``mask`` of
-            the frames are known to all (``make_index``).
+        color_size: size of the colour files; None: sizes differ, and each is resized to cover ``size`` and cropped.
+        depth_size: size of the depth files; None: each has the size of its colour image.
+        dropped: number of frames left out, by reason.
+        extra: further arrays per frame; ``sizes [n, 2]``, ``lens``, ``upright`` and ``mask`` are common to all loaders
+            (``make_index``).
     """
 
     name: str
@@ -63,41 +63,41 @@ class SceneIndex:
     extra: Mapping[str, NDArray] = field(default_factory=dict)
 
     def row(self, frame: int) -> int:
-        """Position of a frame."""
+        """Returns the row of a frame."""
         place = int(np.searchsorted(self.frame_ids, frame))
         if place == len(self.frame_ids) or self.frame_ids[place] != frame:
             raise DataError(f"scene {self.name} in {self.folder} has no usable frame {frame}")
         return place
 
     def own_size(self, row: int) -> Size:
-        """``(height, width)`` of a frame before it is brought to ``size``."""
+        """Returns ``(height, width)`` of a frame before it is resized to ``size``."""
         height, width = self.extra["sizes"][row].tolist() if "sizes" in self.extra else self.size
         return height, width
 
     def lens(self, row: int) -> str:
-        """The lens of a frame's files as ``undistortion.lens_text`` writes it; empty for a pinhole."""
+        """Returns the lens of a frame in the format of ``undistortion.lens_text``; empty for a pinhole."""
         return str(self.extra["lens"][row]) if "lens" in self.extra else ""
 
     def upright(self, row: int) -> bool:
-        """Whether a frame's file is turned upright as its EXIF data says."""
+        """Returns whether a frame's image is rotated upright according to its EXIF data."""
         return bool(self.extra["upright"][row]) if "upright" in self.extra else False
 
     def mask(self, row: int) -> Path | None:
-        """The mask file of a frame, if it has one."""
+        """Returns the mask file of a frame, if it has one."""
         name = str(self.extra["mask"][row]) if "mask" in self.extra else ""
         return Path(name) if name else None
 
 
 @dataclass(frozen=True)
 class PosedImage:
-    """What is known of one image with a camera.
+    """Metadata of one image with a camera.
 
     Attributes:
-        size: ``(height, width)`` upright and undistorted.
-        intrinsics: ``[3, 3]`` of an image of that size, integer pixel centres.
+        size: ``(height, width)`` of the image, upright and undistorted.
+        intrinsics: ``[3, 3]`` for an image of that size, integer pixel centres.
         lens: see ``SceneIndex.lens``.
         upright: see ``SceneIndex.upright``.
-        mask: path of its mask file, or empty.
+        mask: path of the mask file, or empty.
     """
 
     size: Size
@@ -108,12 +108,12 @@ class PosedImage:
 
 
 def first_size(files: Mapping[int, Path], scene: str) -> Size:
-    """``(height, width)`` of the first of some images."""
+    """Returns ``(height, width)`` of the first image."""
     return image_size(next(iter(files.values())), scene)
 
 
 def check_found(scene: str, folder: Path, found: Mapping[str, Sized]) -> None:
-    """Refuses a scene that lacks a kind of files altogether."""
+    """Raises ``DataError`` if a scene has no files of some kind."""
     for kind, files in found.items():
         if not files:
             raise DataError(f"scene {scene} has no {kind} in {folder}")
@@ -131,19 +131,19 @@ def make_index(
     depth_size: Size | None = None,
     posed: Mapping[int, PosedImage] | None = None,
 ) -> SceneIndex:
-    """Joins what a layout holds of each frame; frames that lack something are left out and counted.
+    """Makes the index of a scene. Frames without a colour image, pose or depth file are dropped with a warning.
 
     Args:
         name: the scene's name.
-        folder: where it is.
+        folder: the scene's folder.
         color: colour image files by frame number.
-        depth: depth files by frame number; None where the layout has none.
+        depth: depth files by frame number; None if the scene has no depth.
         camera_to_world: 4x4 OpenCV poses by frame number; a pose that is not finite drops its frame.
-        intrinsics: one ``[3, 3]`` for all frames, or by frame number; of which size is said at ``SceneIndex``.
-        color_size: ``(height, width)`` of the colour files, or of each by frame number; None: the first one's.
-        size: of decoded frames; None: that of the colour files, or the median where they differ.
-        depth_size: of the depth files; None: each has its colour image's.
-        posed: what is known of each image by frame number, in place of ``intrinsics`` and ``color_size``.
+        intrinsics: one ``[3, 3]`` for all frames, or one per frame number; image size as in ``SceneIndex``.
+        color_size: ``(height, width)`` of the colour files, or of each by frame number; None: size of the first file.
+        size: size of decoded frames; None: that of the colour files, or their median if they differ.
+        depth_size: size of the depth files; None: each has the size of its colour image.
+        posed: image metadata by frame number, in place of ``intrinsics`` and ``color_size``.
     """
     if posed is not None:
         intrinsics = {i: image.intrinsics for i, image in posed.items()}
@@ -164,7 +164,7 @@ def make_index(
         pose = camera_to_world.get(number)
         if pose is None:
             dropped["without a pose"] += 1
-        elif not (np.abs(pose) < np.finfo(np.float32).max).all():  # poses are handed on in float32
+        elif not (np.abs(pose) < np.finfo(np.float32).max).all():  # poses are used in float32
             dropped["whose pose is not finite"] += 1
         elif depth is not None and number not in depth:
             dropped["without a depth file"] += 1
@@ -218,7 +218,10 @@ def _check_registered(where: str, color: Size | None, depth: Size | None) -> Non
 
 
 def folder_state(folder: Path) -> str:
-    """Changes when files are added to or removed from a folder, or one directly in it is edited; or when a file is."""
+    """Returns a fingerprint of a file or folder.
+
+    That of a folder changes when files are added or removed, or when a file directly in it is edited.
+    """
     if not folder.is_dir():
         stat = folder.stat()
         return json.dumps([str(folder), stat.st_mtime_ns, stat.st_size])
@@ -229,13 +232,13 @@ def folder_state(folder: Path) -> str:
 
 
 def _folders_in(folder: Path) -> list[Path]:
-    """Folders directly in another, without asking the disk about each of its files."""
+    """Lists the direct subfolders of a folder without a ``stat`` of every file."""
     with os.scandir(folder) as entries:
         return sorted(Path(entry.path) for entry in entries if entry.is_dir())
 
 
 def index_to_bytes(index: SceneIndex, state: str) -> bytes:
-    """An ``.npz`` file of an index and of the state of the folder it was made from."""
+    """Serialises an index and the state of its folder as an ``.npz`` file."""
     facts = {"state": state, "dropped": dict(index.dropped), "extra": list(index.extra)}
     facts |= {name: getattr(index, name) for name in _SIZES}
     shared = (index.intrinsics == index.intrinsics[:1]).all()
@@ -254,7 +257,7 @@ def index_to_bytes(index: SceneIndex, state: str) -> bytes:
 
 
 def read_index(path: Path, scene: str, folder: Path, state: str) -> SceneIndex | None:
-    """Reads an index back; None where there is none, it is damaged, or the folder's state is another."""
+    """Reads a cached index; None if it is missing or damaged, or if the folder's state has changed."""
     if not path.is_file():
         return None
     try:
@@ -281,6 +284,6 @@ def read_index(path: Path, scene: str, folder: Path, state: str) -> SceneIndex |
 
 
 def _names(paths: Sequence[Path], folder: Path) -> NDArray[np.str_]:
-    """Names of files relative to the scene's folder; those outside it by their whole path."""
+    """Returns file names relative to the scene's folder, or absolute for files outside it."""
     inside = (path.relative_to(folder) if path.is_relative_to(folder) else path.resolve() for path in paths)
     return np.array([str(path) for path in inside], np.str_)

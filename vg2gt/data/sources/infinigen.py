@@ -1,4 +1,4 @@
-"""Infinigen: procedural scenes as its renderer leaves them, and as InsScene-15K exports them."""
+"""Infinigen: procedural scenes as rendered by Infinigen or exported by InsScene-15K."""
 
 from __future__ import annotations
 
@@ -29,23 +29,27 @@ class Infinigen(FileSource):
     """Scenes rendered by Infinigen: a scene is a folder with ``frames/{Image,Depth,camview}/camera_0``.
 
     Files are ``{Image,Depth,camview}_{rig}_{resample}_{frame:04d}_{camera}.{png,npy,npz}``; images may be JPEG
-    (``.jpg``). A scene with one rig is a video and its frame ids are frame numbers; in the export of InsScene-15K one
-    frame is seen by many rigs and the ids are rig numbers; with several of both the id is ``100000 rig + frame``.
-    Resamples show the same view in other materials: the first is taken. Infinigen's rigs have two cameras, 7.5 cm
-    apart, in folders ``camera_0`` and ``camera_1``: the ids of camera c are ``10^9 c`` higher.
+    (``.jpg``). Resamples show the same view with other materials; the first one is used. Frame ids depend on the scene:
 
-    The camview files hold ``T``, camera-to-world in OpenCV axes, and ``K``, whose principal point is W/2, H/2 as
-    Blender counts: 1/2 is subtracted. Depth is z-depth in metres (checked on what Infinigen 1.15.5 writes), of the
-    images' size or twice that (the OpenGL annotations), then reduced to every second pixel. The centre of an image
-    pixel lies between four depth pixels; of these equally near ones the lower right is taken, 1/4 of an image pixel
-    away, because their mean would be a point in mid-air at edges.
+    * one rig (a video): the frame number;
+    * one frame seen by many rigs (InsScene-15K): the rig number;
+    * several of both: ``100000 rig + frame``.
+
+    A rig of Infinigen has two cameras, 7.5 cm apart, in ``camera_0`` and ``camera_1``. The ids of camera c are offset
+    by ``10^9 c``.
+
+    The camview files hold ``T``, camera-to-world in OpenCV axes, and ``K``, whose principal point is (W/2, H/2) in
+    Blender's convention: 1/2 is subtracted. Depth is z-depth in metres (verified with Infinigen 1.15.5), at the size of
+    the images or twice that (the OpenGL annotations), and then reduced to every second pixel. The centre of an image
+    pixel lies between four depth pixels. The lower right one is used, 1/4 of an image pixel away, because their mean
+    would be a point in mid-air at edges.
 
     Args:
-        root: a scene, or a folder of scenes (up to two levels deep; those in one folder below it count as one place,
-            see ``place``), or a list of such.
-        max_depth: farther points (metres), and the sky, which is infinite or huge, have no depth. A frame that shows
-            nothing nearer is one without valid depth: training replaces it, evaluation refuses it.
-        cameras: which cameras of a rig are used. ``holdout`` holds out the same frames of all of them.
+        root: a scene, a folder of scenes up to two levels deep, or a list of these. Scenes in the same subfolder of
+            ``root`` count as one place, see ``place``.
+        max_depth: points farther than this (metres) have no depth, nor has the sky, whose depth is infinite or huge. A
+            frame without any nearer point has no valid depth: training replaces it, evaluation raises an error.
+        cameras: cameras of a rig to use. ``holdout`` holds out the same frames of all of them.
         shared: see ``FileSource``.
     """
 
@@ -69,19 +73,19 @@ class Infinigen(FileSource):
         super().__init__(root, **shared)
 
     def find(self, root: Path) -> Mapping[str, Path]:
-        """The ``frames`` of scenes, by the scenes' paths."""
+        """Finds the ``frames`` folders of scenes, by the path of the scene."""
         return {name: folder / "frames" for name, folder in super().find(root).items()}
 
     def place(self, scene: str) -> str:
-        """The first folder of the path: InsScene-15K has several parts of one scene below it.
+        """Returns the first folder of the path, because InsScene-15K stores several parts of a scene in one folder.
 
-        Infinigen's own renderer leaves ``JOB/SEED/frames``, where every seed is a world of its own: give the folders of
-        the jobs as ``root``.
+        Infinigen's renderer writes ``JOB/SEED/frames``, where every seed is a separate world. Pass the job folders as
+        ``root``, so that every seed counts as a place.
         """
         return scene.split("/")[0]
 
     def index(self, scene: str, folder: Path) -> SceneIndex:
-        """Lists a scene's files and reads its cameras."""
+        """Lists the files of a scene and reads its cameras."""
         color, depth, cameras = (
             {
                 view: path
@@ -104,7 +108,7 @@ class Infinigen(FileSource):
         )
 
     def held_out(self, scene: str) -> Sequence[int]:
-        """Every ``holdout``-th frame, as seen by all cameras."""
+        """Returns every ``holdout``-th frame, for all cameras."""
         if not self.holdout:
             return ()
         shown = sorted({frame % _CAMERA_STEP for frame in self.frames(scene)})
@@ -112,13 +116,13 @@ class Infinigen(FileSource):
         return tuple(frame for frame in self.frames(scene) if frame % _CAMERA_STEP in chosen)
 
     def read_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
-        """Reads depth; what is farther than ``max_depth`` or not a number is none."""
+        """Reads depth; values beyond ``max_depth`` or NaN become 0."""
         depth = load_npy(index.depth[row], index.name, size)
         return np.where((depth > 0) & (depth <= self.max_depth), depth, np.float32(0))
 
 
 def _views(folder: Path, kind: str, suffixes: tuple[str, ...], camera: int, scene: str) -> Iterator[tuple[_View, Path]]:
-    """Files of one kind and one camera with the camera, rig and frame, in this order; the first resample of each."""
+    """Yields (camera, rig, frame) and file of one kind and camera, sorted; only the first resample of each view."""
     found: dict[tuple[int, ...], Path] = {}
     for path in sorted((folder / f"camera_{camera}").glob(f"{kind}_*")):
         if path.suffix not in suffixes:

@@ -1,4 +1,4 @@
-"""KITTI: raw drives with the annotated depth of the depth benchmark; poses from the GPS/IMU unit (OXTS)."""
+"""KITTI raw drives with the annotated depth of the depth benchmark and poses from the GPS/IMU unit (OXTS)."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ _SPLITS = ("train", "val")
 class KITTI(FileSource):
     """Drives of KITTI raw that have annotated depth; a scene is a drive.
 
-    Images are ``<root>/<date>/<drive>_sync/image_02/data/%010d.png``, calibration lies in ``<root>/<date>``, depth is
-    ``<depth_root>/{train,val}/<drive>_sync/proj_depth/groundtruth/image_02/%010d.png`` (uint16, 256 units per metre,
-    0 = none). The first and the last five frames of a drive have no depth and are no frames of the scene.
+    Images are ``<root>/<date>/<drive>_sync/image_02/data/%010d.png``, calibration files are in ``<root>/<date>``, and
+    depth is ``<depth_root>/{train,val}/<drive>_sync/proj_depth/groundtruth/image_02/%010d.png`` (uint16, 256 units per
+    metre, 0 = none). The first and the last five frames of a drive have no depth and are not used.
 
-    Poses come from OXTS packets in a Mercator projection at the drive's first latitude; the world is the first packet's
-    position with axes east, north, up. ``camera <- imu = [I | K^-1 p] R_rect_00 T_velo_to_cam T_imu_to_velo`` with
-    ``P_rect = [K | p]``, so that ``P_rect`` is met exactly.
+    Poses are computed from OXTS packets with a Mercator projection at the drive's first latitude. The world origin is
+    the position of the first packet, with axes east, north, up. ``camera <- imu = [I | K^-1 p] R_rect_00 T_velo_to_cam
+    T_imu_to_velo`` with ``P_rect = [K | p]``, which reproduces ``P_rect`` exactly.
 
     Args:
-        root: KITTI raw, the folder of the dates.
-        depth_root: the annotated depth, the folder of ``train`` and ``val``; None: the same as ``root``.
-        split: the benchmark's drives for ``train`` or for ``val``; None: both.
+        root: KITTI raw, the folder that contains the dates.
+        depth_root: the annotated depth, the folder that contains ``train`` and ``val``; None: the same as ``root``.
+        split: the benchmark's ``train`` or ``val`` drives; None: both.
         camera: 2 for the left colour camera, 3 for the right one.
-        shared: see ``FileSource``; the cameras take ten frames per second.
+        shared: see ``FileSource``; the frame rate is 10 frames per second.
     """
 
     layout = "KITTI raw: DATE/DRIVE_sync/image_02/data, with depth for it in {train,val}/DRIVE_sync/proj_depth"
@@ -65,16 +65,16 @@ class KITTI(FileSource):
         super().__init__(root, **shared)
 
     def find(self, root: Path) -> Mapping[str, Path]:
-        """Drives with images of the camera and a depth folder."""
+        """Finds the drives that have images of the camera and a depth folder."""
         drives = {path.name: path for path in sorted(root.glob("*/*_sync")) if (path / self._images).is_dir()}
         return {name: folder for name, folder in drives.items() if self._depth_folder(folder) is not None}
 
     def watched(self, scene: str, folder: Path) -> Sequence[Path | None]:
-        """Also the depth folder and the calibration."""
+        """Returns the drive's folder, its depth folder and the calibration files."""
         return folder, self._depth_folder(folder), *(folder.parent / name for name in _CALIBRATION)
 
     def index(self, scene: str, folder: Path) -> SceneIndex:
-        """Lists a drive's files and computes its poses."""
+        """Lists the files of a drive and computes its poses."""
         depth_folder = self._depth_folder(folder)
         depth = numbered(depth_folder, scene) if depth_folder else {}
         if not depth:
@@ -100,15 +100,15 @@ class KITTI(FileSource):
 
 
 def imu_to_world(packets: Mapping[int, NDArray[np.float64]]) -> dict[int, NDArray[np.float64]]:
-    """Poses of the IMU from OXTS packets.
+    """Computes the poses of the IMU from OXTS packets.
 
     Args:
-        packets: numbers of each packet by frame: latitude and longitude in degrees, altitude in metres, roll, pitch and
-            yaw in radians, and others.
+        packets: values of each packet by frame number, starting with latitude and longitude in degrees, altitude in
+            metres, and roll, pitch and yaw in radians.
 
     Returns:
-        4x4 IMU-to-world poses in metres by frame number, the origin at the first packet (as coordinates of the whole
-        Earth, 10^6 m, float32 would hold them to 0.1 m only); not finite where the packet is not usable.
+        4x4 IMU-to-world poses in metres by frame number, not finite for unusable packets. The origin is at the first
+        usable packet: float32 would resolve absolute coordinates (10^6 m) to 0.1 m only.
     """
     if not packets:
         return {}
@@ -116,7 +116,7 @@ def imu_to_world(packets: Mapping[int, NDArray[np.float64]]) -> dict[int, NDArra
     latitude, longitude, altitude, roll, pitch, yaw = values.T
     first = int((np.isfinite(values).all(1) & (np.abs(latitude) < 90)).argmax())
     scale = np.cos(np.deg2rad(latitude[first]))
-    with np.errstate(all="ignore"):  # a broken packet becomes NaN and its frame is dropped
+    with np.errstate(all="ignore"):  # a broken packet gives NaN, which drops its frame
         east = scale * EARTH_RADIUS * np.deg2rad(longitude)
         north = scale * EARTH_RADIUS * np.log(np.tan(np.deg2rad(90 + latitude) / 2))
         position = np.stack((east, north, altitude), -1)
@@ -127,10 +127,10 @@ def imu_to_world(packets: Mapping[int, NDArray[np.float64]]) -> dict[int, NDArra
 
 
 def read_calibration(folder: Path, scene: str, camera: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Intrinsics ``[3, 3]`` of a rectified camera and its ``[4, 4]`` pose ``camera <- imu``.
+    """Reads the intrinsics ``[3, 3]`` of a rectified camera and the transform ``camera <- imu`` ``[4, 4]``.
 
     Raises:
-        DataError: if a calibration file of the date is missing, damaged, or not a calibration.
+        DataError: if a calibration file of the date is missing or invalid.
     """
     cameras, velodyne, imu = (_read_fields(folder / name, scene) for name in _CALIBRATION)
     where = f"{folder} (calibration of scene {scene})"

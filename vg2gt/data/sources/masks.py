@@ -1,4 +1,4 @@
-"""Masks next to images: which file belongs to which image, and how masks are joined."""
+"""Mask files: finds the mask of an image, and combines and resizes masks."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ _ENDINGS = (".png", ".jpg", ".jpeg", ".bmp")
 
 
 def mask_of(folder: Path, name: str) -> Path | None:
-    """The mask of an image in a folder of masks: the image's name, ``NAME.png`` (COLMAP), or another ending.
+    """Finds the mask of an image: ``NAME.png`` as in COLMAP, the name with another suffix, or the same name.
 
     Args:
-        folder: the masks.
-        name: the image's, relative to the folder of images.
+        folder: folder of masks.
+        name: name of the image, relative to the image folder.
     """
     stem = folder / name
     candidates = [Path(f"{stem}.png"), *(stem.with_suffix(ending) for ending in _ENDINGS), stem]
@@ -31,11 +31,11 @@ def mask_of(folder: Path, name: str) -> Path | None:
 
 
 def find_masks(folder: Path, names: Mapping[int, str], where: str) -> dict[int, Path]:
-    """Masks of images by frame number; images without one are named in a warning if others have one.
+    """Finds the masks of images by frame number. If the folder exists, warns about images without a mask.
 
     Args:
-        folder: the masks; it need not exist.
-        names: the images, relative to the folder of images.
+        folder: folder of masks; need not exist.
+        names: image names by frame number, relative to the image folder.
         where: the scene, for the message.
     """
     if not folder.is_dir():
@@ -51,7 +51,7 @@ def find_masks(folder: Path, names: Mapping[int, str], where: str) -> dict[int, 
 
 
 def joined_masks(masks: Sequence[NDArray[np.float32] | None]) -> NDArray[np.float32] | None:
-    """The product of masks of one image, at the size of the first; None where everything counts."""
+    """Multiplies the masks of an image, at the size of the first; None if there are none."""
     known = [mask for mask in masks if mask is not None]
     if not known:
         return None
@@ -60,7 +60,7 @@ def joined_masks(masks: Sequence[NDArray[np.float32] | None]) -> NDArray[np.floa
 
 
 def resized_mask(mask: NDArray[np.float32], size: Size) -> NDArray[np.float32]:
-    """A mask ``[h, w]`` at another ``(height, width)``."""
+    """Resizes a mask ``[h, w]`` to ``(height, width)``, bilinearly."""
     if mask.shape == tuple(size):
         return mask
     return np.array(Image.fromarray(mask).resize((size[1], size[0]), Image.Resampling.BILINEAR))

@@ -1,4 +1,4 @@
-"""Captures with a ``transforms.json``, as nerfstudio, instant-ngp, Blender scripts and many capture apps write it."""
+"""Captures with a ``transforms.json``, as written by nerfstudio, instant-ngp, Blender scripts and capture apps."""
 
 from __future__ import annotations
 
@@ -39,19 +39,19 @@ _MODELS = (None, "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV
 
 
 class Nerfstudio(FileSource):
-    """Scenes with a ``transforms.json`` (camera-to-world, OpenGL axes); the scale is arbitrary.
+    """Scenes with a ``transforms.json`` (camera-to-world, OpenGL axes), of arbitrary scale.
 
-    Also Blender's synthetic sets of ``transforms_train.json``, ``_val`` and ``_test``: frames of the last are held out,
-    whatever ``holdout`` says.
+    Also reads Blender's synthetic sets with ``transforms_train.json``, ``_val`` and ``_test``. Their test frames are
+    held out, whatever ``holdout`` is.
 
-    Frames are numbered 0, 1, ... in the order of their file names (numbers by their value), also where an image is
-    absent (left out and counted). Distorted images are undistorted when they are read (``Undistortion``). Images of
-    several sizes are resized to cover the median size and cropped. Alpha, ``mask_path`` and ``masks/`` say what counts.
+    Frames are numbered 0, 1, ... in natural order of their file names. Missing images keep their number, but are left
+    out and counted. Distorted images are undistorted when they are read (``Undistortion``). Images of different sizes
+    are resized to cover the median size and cropped. Pixel weights come from alpha, ``mask_path`` and ``masks/``.
 
     Args:
         root: a scene, a folder of scenes (one or two levels deep), or a list of such folders.
-        depth: read the depth images that frames name as ``depth_file_path``; frames without are left out.
-        depth_scale: stored depth units for one unit of the poses: 1000 for millimetres and metres.
+        depth: read the depth images given by ``depth_file_path``; frames without one are left out.
+        depth_scale: stored depth units per unit of the poses: 1000 for depth in millimetres and poses in metres.
         shared: see ``FileSource``.
     """
 
@@ -75,16 +75,16 @@ class Nerfstudio(FileSource):
         super().__init__(root, **shared)
 
     def is_scene(self, folder: Path) -> bool:
-        """Whether it holds one of the files."""
+        """Returns whether a folder contains one of the files."""
         return bool(transforms_files(folder))
 
     def held_out(self, scene: str) -> Sequence[int]:
-        """Blender's test frames where there are any, else by ``holdout``."""
+        """Returns Blender's test frames if there are any, otherwise every ``holdout``-th frame."""
         first_test = self._records(scene, self._folders[scene])[1]
         return [frame for frame in self.frames(scene) if frame >= first_test] or super().held_out(scene)
 
     def index(self, scene: str, folder: Path) -> SceneIndex:
-        """Reads the file and the sizes of its images."""
+        """Reads the transforms and the sizes of the images."""
         records = self._records(scene, folder)[0]
         where = f"{transforms_files(folder)[0]} of scene {scene}"
         with errors_name(scene):
@@ -114,7 +114,7 @@ class Nerfstudio(FileSource):
         return found if named else find_masks(folder / MASKS, rest, f"scene {scene}")
 
     def _records(self, scene: str, folder: Path) -> tuple[list[TransformsFrame], int]:
-        """The frames in their order, and the number of the first that is Blender's test frame."""
+        """Returns the frames in order, and the number of the first Blender test frame."""
         if scene not in self._frames:
             if len(self._frames) >= _SCENES_IN_MEMORY:
                 self._frames.clear()
@@ -129,7 +129,7 @@ class Nerfstudio(FileSource):
 
 
 def transforms_files(folder: Path) -> list[Path]:
-    """``transforms.json`` of a folder, or Blender's files."""
+    """Returns the ``transforms.json`` of a folder, or Blender's files."""
     if (folder / FILE).is_file():
         return [folder / FILE]
     return [folder / name for name in BLENDER if (folder / name).is_file()]
@@ -141,13 +141,13 @@ def _named_files(folder: Path, records: Sequence[TransformsFrame], field: str, w
 
 
 def _named_image(folder: Path, name: str, where: str) -> Path:
-    """The image of a name; ``../images/a.png`` of a file that was moved up is looked for as ``images/a.png``."""
+    """Finds a named image; for ``../images/a.png``, left by a file that was moved up, tries ``images/a.png`` first."""
     inside = folder / re.sub(r"^(\.\./)+", "", name)
     return inside if name.startswith("../") and existing_image(inside) else named_file(folder, name, where)
 
 
 def _posed(scene: str, where: str, lens: Lens, path: Path, mask: Path | None) -> PosedImage:
-    """What is known of an image; it may be smaller than the file says."""
+    """Makes the index entry of an image, which may be smaller than the file says."""
     where = f"{where}, for {path}"
     if (lens.camera_model or "PINHOLE").upper() not in _MODELS:
         names = ", ".join(name for name in _MODELS if name)
@@ -164,7 +164,7 @@ def _posed(scene: str, where: str, lens: Lens, path: Path, mask: Path | None) ->
 
 
 def _distorted(lens: Lens, matrix: NDArray[np.float64], size: Size, where: str) -> Camera:
-    """The lens as COLMAP's camera: OPENCV_FISHEYE, or FULL_OPENCV, which has all other coefficients but k4."""
+    """Returns the lens as a COLMAP camera: OPENCV_FISHEYE, or FULL_OPENCV, which covers all but a radial k4."""
     require_pycolmap(f"undistorting the images of {where}")
     import pycolmap  # pyright: ignore[reportMissingImports]
 

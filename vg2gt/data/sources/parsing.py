@@ -1,7 +1,7 @@
-"""Small readers and checks that all loaders share.
+"""Readers and checks shared by all loaders.
 
-All of them raise ``DataError`` where a file is missing or damaged, or holds something else,
-naming the file and the scene.
+They raise ``DataError`` if a file is missing, damaged or has unexpected contents; the message names the file and the
+scene.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ CORNER_TO_CENTER = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
 
 _THREADS = 8
 _ROTATION_TOLERANCE = 0.02
-_FAR_OFF = 50.0  # focal lengths
-_NO_SKEW = 1e-3  # of the focal length: half a pixel at the border of an image
+_FAR_OFF = 50.0  # limit of the principal point, in focal lengths
+_NO_SKEW = 1e-3  # tolerance, as a fraction of the focal length: half a pixel at the border of an image
 _LARGEST = float(np.finfo(np.float32).max)
 
 
 def read_numbers(path: Path, scene: str, skip_lines: int = 0) -> NDArray[np.float64]:
-    """Reads a table of numbers, at least one row; ``#`` begins a comment."""
+    """Reads a table of numbers with at least one row; ``#`` starts a comment."""
     rows = [line.split("#")[0].split() for line in _read_lines(path, scene)[skip_lines:]]
     try:
         table = np.array([[float(word) for word in row] for row in rows if row], dtype=np.float64)
@@ -61,7 +61,7 @@ def read_matrix(path: Path, scene: str, shapes: Sequence[tuple[int, int]]) -> ND
 
 
 def read_poses(files: Mapping[int, Path], scene: str) -> dict[int, NDArray[np.float64]]:
-    """Reads 4x4 matrices, one per file, several at a time: on a network's disk opening one takes milliseconds."""
+    """Reads one 4x4 matrix per file, in parallel, because opening a file on a network disk takes milliseconds."""
     numbers = list(files)
 
     def read(part: Sequence[int]) -> dict[int, NDArray[np.float64]]:
@@ -74,7 +74,7 @@ def read_poses(files: Mapping[int, Path], scene: str) -> dict[int, NDArray[np.fl
 
 
 def read_text_lines(path: Path, scene: str) -> list[str]:
-    """Reads the lines of a text file without blank and ``#`` lines."""
+    """Reads the lines of a text file; skips blank and ``#`` lines."""
     lines = [line.strip() for line in _read_lines(path, scene)]
     return [line for line in lines if line and not line.startswith("#")]
 
@@ -87,14 +87,14 @@ def _read_lines(path: Path, scene: str) -> list[str]:
 
 
 def named_file(folder: Path, name: str, where: str) -> Path:
-    """The file that a dataset's own file names, which must lie in the dataset's folder.
+    """Resolves a file name found in a dataset file; it must lie inside the scene's folder.
 
-    The name alone is looked at: folders that are links to other disks are the user's own doing.
+    Only the name is checked: symbolic links to other disks are allowed.
 
     Args:
         folder: the scene's folder.
-        name: relative to it, or absolute.
-        where: the file that names it and the scene, for the message.
+        name: file name, relative to the folder or absolute.
+        where: the file that contains the name and the scene, for the message.
     """
     root = os.path.abspath(folder)
     path = os.path.normpath(os.path.join(root, name))
@@ -107,10 +107,10 @@ def named_file(folder: Path, name: str, where: str) -> Path:
 
 
 def existing_image(path: Path) -> Path | None:
-    """A named image, or the one in its folder that differs in its ending or in upper and lower case; None: none.
+    """Finds an image by its path, or one in the same folder with a different suffix or case; None if there is none.
 
-    Models and lists often name files as they were before somebody converted them. Where the folder is missing, the
-    largest reduced one is taken (``images_4`` of ``images_4`` and ``images_8``, as DL3DV comes).
+    Models and lists often contain file names from before a conversion. If the folder is missing, the least downsampled
+    copy of it is used (``images_4`` rather than ``images_8``, as in DL3DV).
     """
     if path.is_file():
         return path
@@ -128,13 +128,13 @@ def existing_image(path: Path) -> Path | None:
 
 @lru_cache(maxsize=16)
 def _images_by_name(folder: Path, state: int) -> dict[str, Path]:
-    """Images of a folder by their names in lower case; ``state`` is the folder's time of change."""
+    """Returns the images of a folder by lower-case name; ``state``, the folder's mtime, is part of the cache key."""
     return {path.name.lower(): path for path in sorted(folder.iterdir()) if path.suffix.lower() in IMAGE_SUFFIXES}
 
 
 @contextmanager
 def errors_name(scene: str) -> Iterator[None]:
-    """Turns the errors of readers in ``vg2gt.io`` into ``DataError`` that also names the scene."""
+    """Converts the errors of readers in ``vg2gt.io`` to ``DataError`` with the scene's name."""
     try:
         yield
     except (FormatError, OSError) as error:
@@ -142,9 +142,9 @@ def errors_name(scene: str) -> Iterator[None]:
 
 
 def numbered(folder: Path, scene: str, pattern: str = "*", suffixes: Sequence[str] = IMAGE_SUFFIXES) -> dict[int, Path]:
-    """Files of a folder by the last number in their name (before the first dot), in the order of the numbers.
+    """Returns the files of a folder by the last number in their name (before the first dot), in increasing order.
 
-    Hidden files and files with other suffixes are passed over; so is a folder that does not exist.
+    Hidden files and files with other suffixes are skipped. A missing folder gives an empty result.
     """
     files: dict[int, Path] = {}
     for path in sorted(folder.glob(pattern)):
@@ -161,11 +161,11 @@ def numbered(folder: Path, scene: str, pattern: str = "*", suffixes: Sequence[st
 
 
 def rigid(poses: NDArray[np.float64], frames: Sequence[int], where: str) -> NDArray[np.float64]:
-    """Replaces the rotations of 4x4 poses, which recordings give to a few digits, by the nearest exact ones.
+    """Projects the rotations of 4x4 poses, which files store with few digits, to the nearest exact rotations.
 
     Args:
         poses: ``[n, 4, 4]`` finite transforms.
-        frames: their frame ids, for the message.
+        frames: frame ids of the poses, for the message.
         where: the file or folder and the scene, for the message.
     """
     rotations = poses[:, :3, :3]
@@ -185,12 +185,13 @@ def rigid(poses: NDArray[np.float64], frames: Sequence[int], where: str) -> NDAr
 
 
 def to_world(world_to_camera: NDArray[np.float64], where: str | None = None, frame: int = 0) -> NDArray[np.float64]:
-    """Inverts a pose ``[4, 4]``; one that is not finite stays so, and drops its frame.
+    """Inverts a pose ``[4, 4]``; returns NaN, which drops the frame, if the pose is not finite.
 
     Args:
         world_to_camera: the pose.
-        where: the file or folder and the scene: the pose is made exactly rigid first (``rigid``); None: it is rigid.
-        frame: its frame id, for the message.
+        where: the file or folder and the scene, for the message; the pose is made exactly rigid first (``rigid``).
+            None: the pose is known to be rigid.
+        frame: frame id of the pose, for the message.
     """
     if not (np.abs(world_to_camera) < 1e30).all():
         return np.full((4, 4), np.nan)
@@ -198,15 +199,15 @@ def to_world(world_to_camera: NDArray[np.float64], where: str | None = None, fra
 
 
 def pinhole(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.float64]:
-    """Intrinsics ``[3, 3]`` from focal lengths and principal point in pixels (integer pixel centres)."""
+    """Returns intrinsics ``[3, 3]`` from focal lengths and principal point in pixels (integer pixel centres)."""
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
 def check_intrinsics(intrinsics: NDArray[np.float64], where: str) -> NDArray[np.float64]:
-    """Returns ``[..., 3, 3]`` intrinsics as they are.
+    """Checks that intrinsics are finite pinhole matrices without skew and returns them unchanged.
 
     Args:
-        intrinsics: the matrices.
+        intrinsics: ``[..., 3, 3]`` matrices.
         where: the file or folder and the scene, for the message.
     """
     focal, lower = intrinsics[..., [0, 1], [0, 1]], intrinsics[..., [1, 2, 2], [0, 0, 1]]
@@ -230,10 +231,10 @@ def _first(matrices: NDArray[np.float64]) -> list[list[float]]:
 
 
 def four_intrinsics(intrinsics: Sequence[float] | None) -> tuple[float, ...] | None:
-    """Checks the argument (fx, fy, cx, cy) of a loader; None stays None.
+    """Checks the argument (fx, fy, cx, cy) of a loader; returns None for None.
 
     Raises:
-        ValueError: if it has another number of values.
+        ValueError: if it does not have four values.
     """
     if intrinsics is not None and len(intrinsics) != 4:
         raise ValueError(f"intrinsics must be [fx, fy, cx, cy], got {list(intrinsics)}")
@@ -241,10 +242,10 @@ def four_intrinsics(intrinsics: Sequence[float] | None) -> tuple[float, ...] | N
 
 
 def positive(name: str, value: float, unit: str) -> float:
-    """Checks an argument of a loader that must be above 0.
+    """Checks that an argument of a loader is above 0.
 
     Raises:
-        ValueError: if it is not, naming it and its unit.
+        ValueError: if it is not; the message names the argument and its unit.
     """
     if not value > 0:
         raise ValueError(f"{name} must be positive ({unit}), got {value}")
@@ -252,15 +253,15 @@ def positive(name: str, value: float, unit: str) -> float:
 
 
 def expanded(path: str | None) -> Path | None:
-    """A folder that the user names, where ``~`` is the home folder."""
+    """Returns a path with ``~`` expanded; None for an empty one."""
     return Path(path).expanduser() if path else None
 
 
 def existing_depth_root(path: str | None) -> Path | None:
-    """The folder of depth next to a dataset.
+    """Returns the separate depth folder of a dataset; None if none is given.
 
     Raises:
-        FileNotFoundError: if it is named but does not exist.
+        FileNotFoundError: if it is given but does not exist.
     """
     folder = expanded(path)
     if folder is not None and not folder.is_dir():

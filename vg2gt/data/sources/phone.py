@@ -1,15 +1,15 @@
-"""What capture apps of iPhones and iPads export: Record3D, Polycam, Stray Scanner.
+"""Exports of iPhone and iPad capture apps: Record3D, Polycam, Stray Scanner.
 
-Told apart by what is there:
+The app is detected from the files present:
 
 * Record3D, exported as *EXR + JPG*: ``metadata.json``, ``rgb/N.jpg``, ``depth/N.exr`` (metres);
 * Record3D's own ``.r3d``, packed or unpacked: ``metadata``, ``rgbd/N.jpg``, ``rgbd/N.depth`` (metres), ``rgbd/N.conf``;
-* Polycam, *raw data*: ``keyframes/images/N.jpg``, ``keyframes/cameras/N.json``, ``keyframes/depth/N.png`` (mm); where
-  it has optimised its cameras, ``corrected_images/`` and ``corrected_cameras/``;
+* Polycam, *raw data*: ``keyframes/images/N.jpg``, ``keyframes/cameras/N.json``, ``keyframes/depth/N.png`` (mm); with
+  optimised cameras, ``corrected_images/`` and ``corrected_cameras/``;
 * Stray Scanner: ``rgb.mp4``, ``depth/N.png`` (mm), ``odometry.csv``, ``camera_matrix.csv``.
 
-All are metric. Depth is coarser than colour; ``confidence/N.png`` or ``N.conf`` says where it is not to be trusted (0).
-Principal points count from the images' corner, as ARKit's do.
+All are metric. Depth has a lower resolution than colour; ``confidence/N.png`` or ``N.conf`` is 0 where depth is
+unreliable. Principal points are measured from the image corner, as in ARKit.
 """
 
 from __future__ import annotations
@@ -39,21 +39,21 @@ VIDEO = "rgb.mp4"
 RECORD3D, R3D, POLYCAM, STRAY = (
     f"export of {app}" for app in ("Record3D", "Record3D (.r3d)", "Polycam", "Stray Scanner")
 )
-_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # camera axes of ARKit to OpenCV's
+_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # from ARKit's camera axes to OpenCV's
 
 
 @dataclass(frozen=True)
 class Recording:
-    """What a recording consists of, by frame number.
+    """Files and cameras of a recording, by frame number.
 
     Attributes:
-        layout: what it is, for messages.
-        color: colour image files; of Stray Scanner always the video.
+        layout: name of the layout, for messages.
+        color: colour image files; for Stray Scanner always the video.
         depth: depth files.
         poses: ``[4, 4]`` camera-to-world, OpenCV, metres.
         intrinsics: ``[3, 3]`` of the colour images, integer pixel centres.
-        color_size: ``(height, width)``.
-        recorded: ``(height, width)`` of the depth where it is known.
+        color_size: ``(height, width)`` of the colour images.
+        recorded: ``(height, width)`` of the depth, if known from the metadata.
     """
 
     layout: str
@@ -65,11 +65,11 @@ class Recording:
     recorded: Size | None = None
 
     def depth_size(self, scene: str) -> Size:
-        """``(height, width)`` of the depth, by default of the first file.
+        """Returns ``(height, width)`` of the depth: ``recorded``, or that of the first file.
 
         Raises:
-            DataError: if it cannot be read.
-            ImportError: if it takes a package that is not installed.
+            DataError: if the file cannot be read.
+            ImportError: if a required package is not installed.
         """
         if self.recorded is not None:
             return self.recorded
@@ -82,7 +82,7 @@ class Recording:
 
 
 def app_of(folder: Path) -> str | None:
-    """The app whose export a folder or an archive is; None if of none."""
+    """Detects the app that exported a folder or archive; None if it is no such export."""
     own_poses = pose_file_of(folder) is not None or (folder / "pose").is_dir() or (folder / "poses").is_dir()
     if (folder / "metadata.json").is_file() and (folder / "rgb").is_dir() and not own_poses:
         return RECORD3D
@@ -94,11 +94,11 @@ def app_of(folder: Path) -> str | None:
 
 
 def read_export(folder: Path, scene: str) -> Recording | None:
-    """Lists an export's files and reads its cameras; None if the folder is no export of an app.
+    """Lists the files of an export and reads its cameras; None if the folder is no export of an app.
 
     Raises:
         DataError: if it is damaged.
-        ImportError: if a video is read and PyAV is not installed.
+        ImportError: if a required package is not installed, such as PyAV for videos.
     """
     readers = {RECORD3D: _read_record3d, R3D: _read_r3d, POLYCAM: _read_polycam, STRAY: _read_stray}
     app = app_of(folder)
@@ -107,24 +107,24 @@ def read_export(folder: Path, scene: str) -> Recording | None:
 
 
 def confidence_of(depth: Path) -> Path | None:
-    """The confidence next to a depth image, if there is any."""
+    """Returns the confidence file of a depth image, if there is one."""
     path = depth.parent.parent / "confidence" / depth.name
     return path if path.is_file() else None
 
 
 def read_color_file(path: Path, scene: str, size: Size | None) -> NDArray[np.uint8]:
-    """Decodes a colour image ``[H, W, 3]``, which may lie in an archive."""
+    """Decodes a colour image ``[H, W, 3]``, which may be in an archive."""
     with errors_name(scene):
         content = read_recorded(path) if is_archive(path.parent.parent) else None
     return read_color(path, scene, size, content)
 
 
 def read_metres(path: Path, scene: str, size: Size) -> NDArray[np.float32]:
-    """Reads depth ``[H, W]`` of one of the ``METRES``, 0 where there is none or the ``.conf`` next to it says 0.
+    """Reads a depth file ``[H, W]`` in one of the ``METRES`` formats; 0 where depth is invalid or its ``.conf`` is 0.
 
     Raises:
-        DataError: if it is missing, damaged or of another size.
-        ImportError: if the package that reads it is not installed.
+        DataError: if the file is missing, damaged or of another size.
+        ImportError: if a required package is not installed.
     """
     with errors_name(scene):
         depth = _read_exr(path) if path.suffix.lower() == EXR else _unpacked(path, np.dtype("<f4"), size)
@@ -136,7 +136,7 @@ def read_metres(path: Path, scene: str, size: Size) -> NDArray[np.float32]:
 
 
 def _read_exr(path: Path) -> NDArray[np.float32]:
-    """The only channel, or the first by name, of an EXR image ``[H, W]``."""
+    """Reads the first float channel by name of an EXR image ``[H, W]``."""
     try:
         import OpenEXR  # pyright: ignore[reportMissingImports]: optional
     except ImportError as error:
@@ -144,7 +144,7 @@ def _read_exr(path: Path) -> NDArray[np.float32]:
     try:
         with OpenEXR.File(str(regular(path)), separate_channels=True) as file:
             channels = {name: channel.pixels for name, channel in file.channels().items()}
-    except (RuntimeError, ValueError) as error:  # what its C++ side makes of damaged bytes
+    except (RuntimeError, ValueError) as error:  # raised by its C++ side for damaged files
         raise FormatError(f"{path}: not an OpenEXR image ({error}); the file is truncated or damaged") from error
     floats = [pixels for _, pixels in sorted(channels.items()) if pixels.ndim == 2 and pixels.dtype.kind == "f"]
     if not floats:
@@ -161,7 +161,7 @@ def _unpacked(path: Path, kind: np.dtype[Any], size: Size) -> NDArray[Any]:
 
 
 def _read_record3d(folder: Path, scene: str) -> Recording:
-    """Separate files."""
+    """Reads a Record3D export with separate files."""
     path = folder / "metadata.json"
     color, depth = numbered(folder / "rgb", scene), numbered(folder / "depth", scene, suffixes=(EXR,))
     size = image_size(next(iter(color.values())), scene) if color else (0, 0)
@@ -169,7 +169,7 @@ def _read_record3d(folder: Path, scene: str) -> Recording:
 
 
 def _read_r3d(recording: Path, scene: str) -> Recording:
-    """Newer files tell the depth's size; in older ones it has the images' shape."""
+    """Reads a ``.r3d``; older files lack the depth size, which is then derived from the images' aspect ratio."""
     path = recording / "metadata"
     content = load_json(path, read_recorded(path))
     color, depth = recorded_files(recording, ".jpg"), recorded_files(recording, PACKED)
@@ -191,7 +191,7 @@ def _read_r3d(recording: Path, scene: str) -> Recording:
 def _of_metadata(
     app: str, path: Path, content: Any, color: dict[int, Path], depth: dict[int, Path], size: Size
 ) -> Recording:
-    """``poses`` are lists of qx qy qz qw x y z; ``K`` goes column by column; newer files have one for every frame."""
+    """Parses Record3D metadata: ``poses`` as qx qy qz qw x y z; column-major ``K``, or coefficients per frame."""
     height, width = _numbers(path, content, "h", "w")
     if color and not np.isclose(height * size[1], width * size[0], rtol=0.02):
         raise FormatError(f"{path} says {width:g}x{height:g} pixels, but the images are {size[1]}x{size[0]}")
@@ -215,7 +215,7 @@ def _of_metadata(
 
 
 def _read_polycam(folder: Path, scene: str) -> Recording:
-    """A file for every camera: ``fx fy cx cy width height`` and the rows of its pose, ``t_00`` to ``t_23``."""
+    """Reads one file per camera, with ``fx fy cx cy width height`` and the pose rows ``t_00`` to ``t_23``."""
     inside = folder / "keyframes"
     corrected = (inside / "corrected_cameras").is_dir() and (inside / "corrected_images").is_dir()
     before = "corrected_" if corrected else ""
@@ -231,12 +231,12 @@ def _read_polycam(folder: Path, scene: str) -> Recording:
 
 
 def _read_stray(folder: Path, scene: str) -> Recording:
-    """``odometry.csv``: a header, then timestamp, frame, x, y, z, qx, qy, qz, qw of cameras with OpenCV's axes."""
+    """Reads ``odometry.csv``: a header, then timestamp, frame, x, y, z, qx, qy, qz, qw of OpenCV cameras."""
     path = folder / "odometry.csv"
     try:
         rows = np.loadtxt(path, delimiter=",", skiprows=1, usecols=range(1, 9), ndmin=2)
         matrix = np.loadtxt(folder / "camera_matrix.csv", delimiter=",").reshape(3, 3)
-    except (ValueError, IndexError) as error:  # a text that is none is a ValueError, too
+    except (ValueError, IndexError) as error:  # UnicodeDecodeError is a ValueError
         raise FormatError(f"{path} or camera_matrix.csv next to it is damaged: {error}") from error
     if not len(rows) or not (np.abs(rows[:, 0]) < 2**31).all():
         raise FormatError(f"{path} has no frames, or numbers of frames that are none")
@@ -252,7 +252,7 @@ def _read_stray(folder: Path, scene: str) -> Recording:
 
 
 def _numbers(path: Path, content: Any, *names: str) -> NDArray[np.float64]:
-    """The finite numbers that a JSON object has under some names; sizes must be above 0."""
+    """Returns the finite numbers of a JSON object under the given names; two names are a size, at least 1."""
     found = [content.get(name) if isinstance(content, dict) else None for name in names]
     numbers = [float(value) for value in found if isinstance(value, (int, float)) and abs(value) < 1e9]
     if len(numbers) < len(names) or (len(names) == 2 and min(numbers) < 1):

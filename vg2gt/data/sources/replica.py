@@ -1,4 +1,4 @@
-"""Replica, as it was rendered for NICE-SLAM."""
+"""Replica, as rendered for NICE-SLAM."""
 
 from __future__ import annotations
 
@@ -23,16 +23,17 @@ _LARGEST_STRETCH = 0.01
 
 
 class Replica(FileSource):
-    """The eight rooms and offices of Replica with a video in each; a scene is a folder such as ``office0``.
+    """The eight rooms and offices of Replica, one video each; a scene is a folder such as ``office0``.
 
-    ``results/frameNNNNNN.jpg`` and ``results/depthNNNNNN.png`` (6553.5 per metre, 0 = none); line N of ``traj.txt``
-    holds the 16 numbers of frame N's camera-to-world matrix (OpenCV, metres). Images are 1200x680 with a focal length
-    of 600 and the principal point in the middle, (599.5, 339.5); reduced copies have the same camera in larger pixels.
+    A scene has ``results/frameNNNNNN.jpg`` and ``results/depthNNNNNN.png`` (6553.5 units per metre, 0 = none). Line N
+    of ``traj.txt`` holds the 16 numbers of the camera-to-world matrix of frame N (OpenCV, metres). Images are 1200x680
+    with a focal length of 600 and the principal point in the centre, (599.5, 339.5); the intrinsics of downsampled
+    copies are scaled.
 
     Args:
-        root: the folder of the scenes, or a scene, or a list of such.
-        intrinsics: (fx, fy, cx, cy) in pixels of the images, if another camera rendered them; None: Replica's.
-        shared: see ``FileSource``; a video has 2000 close frames.
+        root: the folder of the scenes, a single scene, or a list of these.
+        intrinsics: (fx, fy, cx, cy) in pixels of the images, if rendered with another camera; None: Replica's.
+        shared: see ``FileSource``; a video has 2000 closely spaced frames.
     """
 
     layout = "SCENE/traj.txt and SCENE/results/{frame,depth}*, there or one folder deeper"
@@ -51,7 +52,7 @@ class Replica(FileSource):
         super().__init__(root, **shared)
 
     def index(self, scene: str, folder: Path) -> SceneIndex:
-        """Lists a scene's files and reads its poses."""
+        """Lists the files of a scene and reads its poses."""
         color, depth = (numbered(folder / "results", scene, f"{kind}*") for kind in ("frame", "depth"))
         check_found(scene, folder / "results", {"frame images": color, "depth images": depth})
         poses = _read_trajectory(folder / "traj.txt", scene, max(color))
@@ -71,7 +72,7 @@ class Replica(FileSource):
 
 
 def _read_trajectory(path: Path, scene: str, last: int) -> dict[int, NDArray[np.float64]]:
-    """Camera-to-world poses by frame number, which is the number of the line."""
+    """Reads camera-to-world poses by frame number, which is the line number."""
     rows = read_numbers(path, scene)
     if rows.shape[1] != 16 or len(rows) <= last:
         raise DataError(

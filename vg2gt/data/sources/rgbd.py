@@ -1,15 +1,15 @@
-"""Folders of RGB-D frames with poses: people's own recordings, 7-Scenes sequences.
+"""Folders of RGB-D frames with poses: custom recordings and 7-Scenes sequences.
 
-Layouts, told apart by what is there:
+The layout is detected from the files present:
 
-* folders: colour in ``images/``, ``color/``, ``rgb/`` or ``image/``, depth in ``depth/``, poses in ``poses.txt`` (16
-  numbers per line, in the order of the images; others: ``rgbd_cameras``) or one text file per frame in ``pose/`` or
-  ``poses/``, intrinsics in ``K.txt`` (3x3) or in ``intrinsic/intrinsic_{color,depth}.txt`` (4x4, as ScanNet is
-  exported); so also recordings of Open3D and Redwood (``trajectory.log``, ``camera_intrinsic.json``) and ICL-NUIM;
+* folders: colour in ``images/``, ``color/``, ``rgb/`` or ``image/``, depth in ``depth/``. Poses are in ``poses.txt``
+  (16 numbers per line, in image order; other formats: ``rgbd_cameras``), or in one text file per frame in ``pose/`` or
+  ``poses/``. Intrinsics are in ``K.txt`` (3x3) or in ``intrinsic/intrinsic_{color,depth}.txt`` (4x4, as exported from
+  ScanNet). This covers recordings of Open3D and Redwood (``trajectory.log``, ``camera_intrinsic.json``) and ICL-NUIM;
 * exports of Record3D, Polycam and Stray Scanner: see ``phone``;
 * 7-Scenes: ``frame-NNNNNN.{color.png|jpg,depth.png,pose.txt}`` in one folder, intrinsics in ``camera-intrinsics.txt``.
 
-Poses are camera-to-world, OpenCV, metres. Without depth the unit may be any.
+Poses are camera-to-world, OpenCV, in metres; in any unit if depth is not read.
 """
 
 from __future__ import annotations
@@ -65,22 +65,23 @@ log = logging.getLogger(__name__)
 
 _COLOR_FOLDERS = ("images", "color", "rgb", "image")
 _POSE_FOLDERS = ("pose", "poses")
-_OFF_CENTRE = 0.15  # most of an image's width or height that a principal point may lie from its middle
+_OFF_CENTRE = 0.15  # maximum offset of the principal point from the centre, as a fraction of width or height
 
 
 class RGBDFolder(FileSource):
     """Recordings with registered colour and depth images and a pose for every frame.
 
-    One recording cannot be split by scenes, so every ``holdout``-th frame is held out: training never sees it and
-    evaluation scores it. Give ``scenes`` to split a folder of many recordings by scenes instead.
+    A single recording cannot be split by scenes, so every ``holdout``-th frame is held out of training and used as an
+    evaluation target. To split a folder of many recordings by scenes instead, set ``scenes``.
 
     Args:
         root: a recording, a folder of recordings (one or two levels deep), or a list of such folders.
         depth_scale: stored depth units per metre: 1000 for millimetres, 5000 for TUM.
         invalid: stored values that mean "no depth".
-        holdout: hold out every this many-th frame; None: none.
-        intrinsics: (fx, fy, cx, cy) in pixels of the colour images, where the folder has no intrinsics or wrong ones.
-        depth: read depth; False: posed images alone, which may also be next to ``poses.txt`` and ``K.txt``.
+        holdout: hold out every ``holdout``-th frame; None: none.
+        intrinsics: (fx, fy, cx, cy) in pixels of the colour images; overrides the intrinsics in the folder.
+        depth: read depth; False: posed images only, which may also be in the same folder as ``poses.txt`` and
+            ``K.txt``.
         shared: see ``FileSource``.
     """
 
@@ -111,7 +112,7 @@ class RGBDFolder(FileSource):
         super().__init__(root, holdout=holdout, **shared)
 
     def is_scene(self, folder: Path) -> bool:
-        """Whether it has colour and depth in one of the layouts, or, where depth is not asked for, poses."""
+        """Returns whether a folder has colour and depth in one of the layouts; without ``has_depth``, poses suffice."""
         if app_of(folder) is not None:
             return True
         if not self.has_depth:
@@ -120,18 +121,18 @@ class RGBDFolder(FileSource):
         return in_folders or any(folder.glob("frame-*.color.*"))
 
     def place(self, scene: str) -> str:
-        """What several recordings show: the folder of 7-Scenes' ``seq-NN``, the room of ScanNet's ``sceneNNNN_NN``."""
+        """Returns the parent folder of 7-Scenes' ``seq-NN``, the room of ScanNet's ``sceneNNNN_NN``, else the scene."""
         folder = self._folders[scene].resolve()
         if re.fullmatch(r"seq-\d+", folder.name):
             return folder.parent.name
         return room_of_scan(folder.name) if re.fullmatch(r"scene\d{4}_\d\d", folder.name) else scene
 
     def watched(self, scene: str, folder: Path) -> Sequence[Path | None]:
-        """Also the intrinsics, which are in a folder of it or next to it."""
+        """Returns the folder, the possible intrinsics files in it and in its parent, and Polycam's ``keyframes``."""
         return folder, *_exported_intrinsics(folder), *_beside(folder.parent), folder / "keyframes"
 
     def index(self, scene: str, folder: Path) -> SceneIndex:
-        """Lists a recording's files and reads its poses and intrinsics; frames have the depth's size."""
+        """Lists the files of a recording and reads its cameras; frames have the size of the depth images."""
         found = read_export(folder, scene) or self._read_folder(folder, scene)
         depth = found.depth if self.has_depth else None
         check_found(scene, folder, {"colour images": found.color, "depth images": [True] if depth is None else depth})
@@ -157,7 +158,7 @@ class RGBDFolder(FileSource):
         return pixels
 
     def read_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
-        """Decodes depth; of floats in metres, of whole numbers in ``depth_scale``, without what has no confidence."""
+        """Decodes depth: floats in metres, or integers in units of ``depth_scale``; 0 where the confidence is 0."""
         path = index.depth[row]
         if path.suffix.lower() in METRES:
             return read_metres(path, index.name, size)
@@ -166,7 +167,7 @@ class RGBDFolder(FileSource):
         return depth if confidence is None else depth * (read_depth(confidence, index.name, size) > 0)
 
     def _read_folder(self, folder: Path, scene: str) -> Recording:
-        """A recording in folders, or in the layout of 7-Scenes."""
+        """Lists a recording in folders or in the layout of 7-Scenes, and reads its cameras."""
         if (folder / "depth").is_dir() or not self.has_depth:
             images = next((folder / name for name in _COLOR_FOLDERS if (folder / name).is_dir()), folder)
             color, depth = numbered(images, scene), numbered(folder / "depth", scene)
@@ -181,7 +182,7 @@ class RGBDFolder(FileSource):
             )
             color, depth = (numbered(folder, scene, f"frame-*.{kind}.*") for kind in ("color", "depth"))
             poses = numbered(folder, scene, "frame-*.pose.txt", suffixes=(".txt",))
-            cameras = [*_beside(folder), *_beside(folder.parent)]  # next to the frames or to the sequences
+            cameras = [*_beside(folder), *_beside(folder.parent)]  # in the folder of the frames or of the sequences
             layout = "7-Scenes layout"
         check_found(scene, folder, {"colour images": color, "depth images": depth if self.has_depth else color})
         color_size = first_size(color, scene)
@@ -207,7 +208,7 @@ class RGBDFolder(FileSource):
 def _read_intrinsics(
     files: Sequence[Path], folder: Path, scene: str, color: Size, depth: Size
 ) -> tuple[NDArray[np.float64], bool]:
-    """Intrinsics of the colour images, best by the file of the depth images, and whether y points up."""
+    """Returns the intrinsics of the colour images, preferably from ``intrinsic_depth.txt``, and whether y points up."""
     if not files:
         raise DataError(
             f"scene {scene} in {folder} has no intrinsics: add K.txt (3x3), or set data.intrinsics=[fx,fy,cx,cy]"
@@ -220,14 +221,14 @@ def _read_intrinsics(
 
 
 def _resized(matrix: NDArray[np.float64], size: Size, target: Size) -> NDArray[np.float64]:
-    """Intrinsics of images of ``size`` as those of images of ``target``."""
+    """Rescales intrinsics from images of ``size`` to images of ``target``."""
     if size == target:
         return matrix
     return resize_intrinsics(torch.from_numpy(matrix), target[1] / size[1], target[0] / size[0]).numpy()
 
 
 def _check_resolution(matrix: NDArray[np.float64], where: str, size: Size) -> None:
-    """Refuses intrinsics of other images: those of another resolution have their principal point off the middle."""
+    """Raises if the principal point is far off centre, which means intrinsics of another image resolution."""
     check_intrinsics(matrix, where)
     x, y = matrix[0, 2], matrix[1, 2]
     if abs(x / size[1] - 0.5) > _OFF_CENTRE or abs(y / size[0] - 0.5) > _OFF_CENTRE:
@@ -240,7 +241,7 @@ def _check_resolution(matrix: NDArray[np.float64], where: str, size: Size) -> No
 
 @lru_cache
 def _say(message: str, level: int = logging.INFO) -> None:
-    """Logs a message once, although training and evaluation both read the recording."""
+    """Logs a message once, even if both training and evaluation read the recording."""
     log.log(level, message)
 
 

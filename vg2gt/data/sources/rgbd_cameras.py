@@ -1,6 +1,6 @@
-"""Cameras of people's own recordings: lists of poses and files of intrinsics in the usual forms.
+"""Pose lists and intrinsics files of custom recordings, in the common formats.
 
-A damaged file, or one that does not fit the images, is a ``DataError``.
+A damaged file, or one that does not match the images, raises ``DataError``.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ _MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 
 
 def pose_file_of(folder: Path) -> Path | None:
-    """The list of poses in a recording's folder, if there is one."""
+    """Returns the pose list in a recording's folder, if there is one."""
     return next((folder / name for name in POSE_FILES if (folder / name).is_file()), None)
 
 
 def read_pose_list(path: Path, scene: str, frames: Sequence[int]) -> dict[int, NDArray[np.float64]]:
-    """Camera-to-world poses ``[4, 4]`` by frame number, from a file with one for each image in their order.
+    """Reads camera-to-world poses ``[4, 4]`` by frame number from a file with one pose per image, in image order.
 
-    A line has a 4x4 or 3x4 matrix, or a position and a quaternion (x y z w), with or without a time before; a ``.log``
-    has five lines for each image, as Open3D, Redwood and Tanks and Temples write them.
+    A line holds a 4x4 or 3x4 matrix, or a position and a quaternion (x y z w) with or without a preceding timestamp. A
+    ``.log`` file has five lines per image, as in Open3D, Redwood and Tanks and Temples.
     """
     if path.suffix == ".log":
         found = [np.full((4, 4), np.nan) if pose is None else pose for pose in read_log(path, scene)]
@@ -56,10 +56,10 @@ def read_pose_list(path: Path, scene: str, frames: Sequence[int]) -> dict[int, N
 
 
 def read_log(path: Path, scene: str) -> list[NDArray[np.float64] | None]:
-    """Reads a trajectory: for each image a line of three whole numbers and a 4x4 camera-to-world matrix.
+    """Reads a ``.log`` trajectory: per image, a line of three integers and a 4x4 camera-to-world matrix.
 
     Returns:
-        The matrices in the order of the file; None for images that were not registered (second number -1).
+        The matrices in file order; None for images that are not registered (negative second integer).
     """
     rows = [line.split() for line in read_text_lines(path, scene)]
     if not rows or len(rows) % 5:
@@ -79,9 +79,9 @@ def read_log(path: Path, scene: str) -> list[NDArray[np.float64] | None]:
 
 
 def read_camera(path: Path, scene: str) -> tuple[NDArray[np.float64], bool]:
-    """Intrinsics ``[3, 3]`` and whether their y axis points up, as a negative fy says (ICL-NUIM).
+    """Reads intrinsics ``[3, 3]`` with positive fy, and whether the y axis points up (negative fy, as in ICL-NUIM).
 
-    The file holds a 3x3 or 4x4 matrix, one line ``fx fy cx cy``, or is Open3D's ``camera_intrinsic.json``.
+    The file holds a 3x3 or 4x4 matrix or one line ``fx fy cx cy``, or is Open3D's ``camera_intrinsic.json``.
     """
     if path.suffix == ".json":
         with errors_name(scene):
@@ -95,14 +95,14 @@ def read_camera(path: Path, scene: str) -> tuple[NDArray[np.float64], bool]:
 
 
 def mirrored(poses: dict[int, NDArray[np.float64]]) -> dict[int, NDArray[np.float64]]:
-    """Poses of cameras and of a world whose y axes are turned round; rotations stay rotations."""
+    """Flips the y axes of both camera and world; rotations remain rotations."""
     return {frame: _MIRROR @ pose @ _MIRROR for frame, pose in poses.items()}
 
 
 def pose_matrices(rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Poses ``[n, 4, 4]`` of rows: a 4x4 or 3x4 matrix, or x y z qx qy qz qw, perhaps after a time.
+    """Converts rows to poses ``[n, 4, 4]``: a 4x4 or 3x4 matrix, or x y z qx qy qz qw, optionally after a timestamp.
 
-    A quaternion that is none gives a pose that is not finite.
+    An invalid quaternion gives a pose of NaN.
     """
     count = rows.shape[1]
     if count == 16:
@@ -120,7 +120,7 @@ def pose_matrices(rows: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _open3d_matrix(path: Path) -> NDArray[np.float64]:
-    """``intrinsic_matrix``: nine numbers, column by column."""
+    """Reads ``intrinsic_matrix``: nine numbers in column-major order."""
     content = load_json(path)
     numbers = content.get("intrinsic_matrix") if isinstance(content, dict) else None
     if not isinstance(numbers, list) or len(numbers) != 9 or not all(type(n) in (int, float) for n in numbers):

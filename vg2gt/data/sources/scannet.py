@@ -16,28 +16,28 @@ INTRINSICS = "intrinsic/intrinsic_depth.txt"
 class ScanNet(FileSource):
     """Scans exported from ScanNet's ``.sens`` files; a scene is a scan such as ``scene0000_00``.
 
-    ``color/N.jpg`` (1296x968), ``depth/N.png`` (640x480, millimetres, 0 = none), ``pose/N.txt`` (4x4 camera-to-world)
-    and ``intrinsic/intrinsic_depth.txt`` (4x4). Numbers are not padded. Frames at which tracking was lost have a pose
-    of -inf and are left out. Colour is resized to the depth images, which it is registered to, and the intrinsics are
-    those of the depth images; extrinsics between the two cameras are the identity and not read.
+    A scan has ``color/N.jpg`` (1296x968), ``depth/N.png`` (640x480, millimetres, 0 = none), ``pose/N.txt`` (4x4
+    camera-to-world) and ``intrinsic/intrinsic_depth.txt`` (4x4). Numbers are not padded. Frames with lost tracking have
+    a pose of -inf and are left out. Colour is registered to depth: it is resized to the depth images, whose intrinsics
+    are used. The extrinsics between the two cameras are the identity and are not read.
 
-    The arguments are those of ``FileSource``. ``root`` is ScanNet's folder, or its ``scans``, or a scan, or a list of
-    such; a list of scenes may be the official ``scannetv2_train.txt``; the camera takes 30 frames per second.
+    The arguments are those of ``FileSource``. ``root`` is ScanNet's folder, its ``scans``, a single scan, or a list of
+    these. ``scenes`` may be the official ``scannetv2_train.txt``. The frame rate is 30 frames per second.
     """
 
     scene_marks = ("color", "depth", "pose")
     layout = "sceneNNNN_NN/{color,depth,pose,intrinsic}, there or up to two folders deeper"
 
     def place(self, scene: str) -> str:
-        """The room: ``scene0000`` of ``scene0000_00`` and ``scene0000_01``."""
+        """Returns the room: ``scene0000`` for ``scene0000_00`` and ``scene0000_01``."""
         return room_of_scan(scene)
 
     def watched(self, scene: str, folder: Path) -> Sequence[Path | None]:
-        """Also the intrinsics."""
+        """Returns the scan's folder and its file of intrinsics."""
         return folder, folder / INTRINSICS
 
     def index(self, scene: str, folder: Path) -> SceneIndex:
-        """Lists a scan's files and reads its poses and intrinsics."""
+        """Lists the files of a scan and reads its poses and intrinsics."""
         color, depth = numbered(folder / "color", scene), numbered(folder / "depth", scene)
         check_found(scene, folder, {"colour images": color, "depth images": depth})
         poses = read_poses(numbered(folder / "pose", scene, suffixes=(".txt",)), scene)
@@ -47,5 +47,5 @@ class ScanNet(FileSource):
 
 
 def room_of_scan(scene: str) -> str:
-    """What a scan shows: the same room was scanned several times, as ``scene0000_00``, ``scene0000_01``, ..."""
+    """Returns the room of a scan; rooms are scanned several times, as ``scene0000_00``, ``scene0000_01``, ..."""
     return scene.split("_")[0]

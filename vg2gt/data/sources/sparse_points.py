@@ -1,4 +1,4 @@
-"""Depth at the points of a structure-from-motion model, without those that are likely to be wrong."""
+"""Sparse depth at the points of a structure-from-motion model, without likely outliers."""
 
 from __future__ import annotations
 
@@ -26,12 +26,16 @@ _FAR = 1e30
 
 
 class SparsePoints:
-    """The points that each view saw, by frame number: where in the image, as a part of its size, and how deep.
+    """Image positions and depths of the points observed by each view.
+
+    Positions are in the undistorted images, as a fraction of the image size. Frames are numbered in the order of the
+    model's image names.
 
     Args:
-        model: frames are numbered in the order of its images' names. Places are those of the undistorted images.
-        sound: leave out what is likely to be wrong: points of few views, of nearly parallel rays, alone in space or
-            that half of the images saw elsewhere, and observations that a point does not project to.
+        model: the structure-from-motion model.
+        sound: leave out likely outliers: points with fewer than ``MIN_TRACK`` views or nearly parallel rays, isolated
+            points, points whose reprojection error is too large in more than half of their views, and single
+            observations with too large an error.
     """
 
     def __init__(self, model: Reconstruction, sound: bool = True) -> None:
@@ -43,8 +47,8 @@ class SparsePoints:
             used &= np.bincount(scene.owner, minlength=len(used)) >= MIN_TRACK
             used = used & (_ray_angles(scene, poses) >= MIN_ANGLE)
             used[used] = _near_others(scene, poses, used)
-        observed = np.zeros(len(used), np.int64)  # in images
-        agreeing = np.zeros(len(used), np.int64)  # and where the point projects to
+        observed = np.zeros(len(used), np.int64)  # observations per point
+        agreeing = np.zeros(len(used), np.int64)  # of these, with a small reprojection error
         views = []
         for view, (image, pose) in enumerate(zip(images, poses, strict=True)):
             own = (scene.view == view) & used[scene.owner]
@@ -63,17 +67,17 @@ class SparsePoints:
         self._views = [(place[agreed[rows]], depth[agreed[rows]]) for rows, place, depth in views]
 
     def places(self, frame: int) -> NDArray[np.float64]:
-        """``[n, 2]`` (x, y) in [0, 1)."""
+        """Returns the positions ``[n, 2]`` (x, y) of a frame's points, in [0, 1)."""
         return self._views[frame][0]
 
     def depth(self, frame: int) -> NDArray[np.float32]:
-        """``[n]`` positive z-depth."""
+        """Returns the positive z-depths ``[n]`` of a frame's points."""
         return self._views[frame][1]
 
 
 @dataclass(frozen=True)
 class _Points:
-    """``positions [N, 3]``, and every observation: its point's row, its view, and the feature in pixels ``[T, 2]``."""
+    """Point positions ``[N, 3]``; point row, view and feature position in pixels ``[T, 2]`` of every observation."""
 
     positions: NDArray[np.float64]
     owner: NDArray[np.int64]
@@ -82,13 +86,13 @@ class _Points:
 
     @staticmethod
     def of(model: Reconstruction, images: Sequence[Image]) -> _Points:
-        """The points of a model and what each of ``images`` observed of them."""
+        """Collects the points of a model and their observations in ``images``."""
         points = model.points3D
         row_of = {number: row for row, number in enumerate(points)}
         rows, views, features = [], [], []
         for view, image in enumerate(images):
             for feature in image.get_observation_points2D():
-                if feature.point3D_id not in row_of:  # a model without its file of points
+                if feature.point3D_id not in row_of:  # the model's file of points is missing
                     continue
                 rows.append(row_of[feature.point3D_id])
                 views.append(view)
@@ -99,20 +103,20 @@ class _Points:
 
 
 def _undistorted(features: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
-    """Places ``[n, 2]`` of features in the undistorted image, as a part of its size."""
+    """Returns positions ``[n, 2]`` of features in the undistorted image, as a fraction of its size."""
     target = pinhole_camera(camera)
     rays = camera.cam_from_img(np.ascontiguousarray(features))
     return target.img_from_cam(np.concatenate((rays, np.ones((len(rays), 1))), 1)) / (target.width, target.height)
 
 
 def _rays(scene: _Points, poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """From the points to the cameras that saw them ``[T, 3]``; NaN where a pose is unknown."""
+    """Returns the vectors ``[T, 3]`` from the points to the cameras that observe them; NaN if a pose is unknown."""
     centers = -(poses[:, :3, :3].swapaxes(1, 2) @ poses[:, :3, 3:])[..., 0]
     return centers[scene.view] - scene.positions[scene.owner]
 
 
 def _ray_angles(scene: _Points, poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Twice the largest angle in degrees of a point's rays to their mean ``[N]``: of two rays, that between them."""
+    """Returns twice the largest angle (degrees) of a point's rays to their mean ``[N]``; for two rays, their angle."""
     owner, count = scene.owner, len(scene.positions)
     with np.errstate(all="ignore"):
         rays = _rays(scene, poses)
@@ -124,11 +128,11 @@ def _ray_angles(scene: _Points, poses: NDArray[np.float64]) -> NDArray[np.float6
         cosine = (rays * mean[owner]).sum(1).clip(-1, 1)
         angles = np.zeros(count)
         np.maximum.at(angles, owner[known], 2 * np.degrees(np.arccos(cosine[known])))
-    return np.nan_to_num(angles, nan=180.0)  # rays from all sides have no mean
+    return np.nan_to_num(angles, nan=180.0)  # opposite rays have no mean direction
 
 
 def _near_others(scene: _Points, poses: NDArray[np.float64], used: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Of the used points, which have others near by; all of them where there are too few to tell."""
+    """Returns which of the used points have close neighbours; all of them if there are too few to decide."""
     positions = scene.positions[used]
     if len(positions) <= 10 * _NEIGHBOURS:
         return np.ones(len(positions), bool)

@@ -1,7 +1,7 @@
-"""Images with given cameras: which way up a file is, its size on disk, and how it becomes a pinhole camera's image.
+"""Images with given cameras: orientation and size on disk, and undistortion to a pinhole camera.
 
-Camera models and the choice of the pinhole camera are pycolmap's; looking pixels up is ours, because depth and masks
-are undistorted with the same map as colours. A file or camera that does not fit is a ``DataError``.
+pycolmap provides the camera models and the target pinhole camera. Pixels are looked up here, because depth and masks
+are undistorted with the same map as colours. A file or camera that does not match raises ``DataError``.
 """
 
 from __future__ import annotations
@@ -22,18 +22,19 @@ from vg2gt.geometry.cameras import resize_intrinsics
 from vg2gt.io.colmap import PIXEL_CENTER, Camera, colmap_intrinsics, require_pycolmap
 from vg2gt.io.image_files import Size, image_size, orientation
 
-_STEP, _FEWEST = 8, 256  # pixels between those whose place is computed, and how many a side; others: to 0.01 pixels
-_SMALLEST = 0.3  # share of the lens's width and height that an undistorted image must keep
-_OUTSIDE = 1.0  # pixels by which the pinhole camera's border may lie outside the lens's image
+# The lookup map is computed on a coarse grid, every 8 pixels but at least 256 a side, and interpolated to 0.01 pixels.
+_STEP, _FEWEST = 8, 256
+_SMALLEST = 0.3  # minimum size of an undistorted image, as a fraction of the distorted width and height
+_OUTSIDE = 1.0  # pixels by which the border of the pinhole image may lie outside the distorted image
 
 
 def is_pinhole(camera: Camera) -> bool:
-    """Whether a camera has no distortion: by its model, or because its coefficients are 0."""
+    """Returns whether a camera has no distortion, because of its model or because its coefficients are 0."""
     return "FISHEYE" not in camera.model_name and camera.is_undistorted() and len(camera.focal_length_idxs()) > 0
 
 
 def pinhole_camera(camera: Camera) -> Camera:
-    """The pinhole camera without blank pixels that takes a lens's place, by COLMAP's rule; a pinhole stays itself."""
+    """Returns COLMAP's undistorted pinhole camera, without blank pixels; a pinhole camera is returned unchanged."""
     import pycolmap  # pyright: ignore[reportMissingImports]
 
     return camera if is_pinhole(camera) else pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
@@ -41,13 +42,13 @@ def pinhole_camera(camera: Camera) -> Camera:
 
 @dataclass(frozen=True, eq=False)
 class Undistortion:
-    """A lens's image looked up from a pinhole camera.
+    """Map from the pixels of a pinhole camera to those of a distorted image.
 
     Attributes:
-        lens_size: ``(height, width)`` of the lens's images.
-        size: ``(height, width)`` of the undistorted ones.
-        intrinsics: ``[3, 3]`` of the undistorted ones, integer pixel centres.
-        places: ``[h, w, 2]`` float32 pixel (x, y) in the lens's image of each undistorted pixel.
+        lens_size: ``(height, width)`` of the distorted images.
+        size: ``(height, width)`` of the undistorted images.
+        intrinsics: ``[3, 3]`` of the undistorted images, integer pixel centres.
+        places: ``[h, w, 2]`` float32 position (x, y) in the distorted image of each undistorted pixel.
     """
 
     lens_size: Size
@@ -57,12 +58,12 @@ class Undistortion:
 
     @staticmethod
     def of(camera: Camera) -> Undistortion:
-        """Computes it.
+        """Computes the undistortion of a camera.
 
         Raises:
-            ValueError: if the lens has no pinhole part, or its coefficients cannot be those of the images' camera.
+            ValueError: if the camera model has no focal length (EQUIRECTANGULAR), or if its distortion is implausible.
         """
-        intrinsics = colmap_intrinsics(camera)  # refuses what has no pinhole part
+        intrinsics = colmap_intrinsics(camera)  # raises if there is no focal length
         target = pinhole_camera(camera)
         size, lens_size = (target.height, target.width), (camera.height, camera.width)
         if min(size[0] / lens_size[0], size[1] / lens_size[1]) < _SMALLEST:
@@ -70,17 +71,17 @@ class Undistortion:
         intrinsics = colmap_intrinsics(target)
         places = _places(camera, intrinsics, size)
         inside = (places >= -0.5 - _OUTSIDE) & (places <= np.array(lens_size[::-1]) - 0.5 + _OUTSIDE)
-        if not inside.all():  # also where one is NaN
+        if not inside.all():  # also if one is NaN
             raise ValueError(_senseless(camera))
         return Undistortion(lens_size, size, intrinsics, places)
 
     def color(self, pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Undistorts an image ``[h, w, C]``, bilinearly."""
+        """Undistorts an image ``[h, w, C]`` by bilinear lookup."""
         sampled = self._sample(torch.from_numpy(pixels).permute(2, 0, 1).float(), "bilinear")  # [C, h, w]
         return (sampled + 0.5).clamp(0, 255).byte().permute(1, 2, 0).contiguous().numpy()
 
     def depth(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Undistorts z-depth ``[h, w]``: the nearest pixel's, because a mean across an edge is a point in mid-air."""
+        """Undistorts z-depth ``[h, w]`` by nearest lookup, because a mean across an edge is a point in mid-air."""
         return self._sample(torch.from_numpy(depth)[None], "nearest")[0].numpy()
 
     def _sample(self, image: torch.Tensor, mode: str) -> torch.Tensor:
@@ -90,10 +91,10 @@ class Undistortion:
 
 @lru_cache(maxsize=4)
 def undistortion_of(lens: str) -> Undistortion:
-    """The undistortion of a lens by its text, see :func:`lens_text`; those last used are kept.
+    """Returns the undistortion of a lens in the format of :func:`lens_text`; the last four are cached.
 
     Raises:
-        ValueError: as :meth:`Undistortion.of`.
+        ValueError: see :meth:`Undistortion.of`.
     """
     require_pycolmap("undistorting images")
     import pycolmap  # pyright: ignore[reportMissingImports]
@@ -104,7 +105,7 @@ def undistortion_of(lens: str) -> Undistortion:
 
 
 def lens_text(camera: Camera, size: Size) -> str:
-    """A camera, resized to images of ``(height, width)``, as text: the model, width, height, parameters."""
+    """Serialises a camera, resized to images of ``(height, width)``, as ``MODEL WIDTH HEIGHT PARAMETERS``."""
     resized = type(camera)(camera.todict())
     resized.rescale(size[1], size[0])
     params = " ".join(repr(float(value)) for value in resized.params)
@@ -132,17 +133,20 @@ def _senseless(camera: Camera) -> str:
 def size_on_disk(
     path: Path, scene: str, expected: Size, where: str, is_stored: Callable[[], bool] | None = None
 ) -> tuple[Size, bool]:
-    """An image's ``(height, width)`` on disk, and whether it is turned upright as its EXIF data says.
+    """Returns an image's ``(height, width)``, and whether it must be rotated upright according to its EXIF data.
 
-    Cameras may have been made for the image as stored or for the upright one: the shape tells, and where both fit the
-    upright one is taken.
+    The camera may belong to the image as stored or to the upright one. The aspect ratio decides; if both match, the
+    upright one is used unless ``is_stored`` says otherwise.
 
     Args:
         path: the image.
         scene: its scene, for messages.
-        expected: ``(height, width)`` of its camera; the image may be a reduced one.
-        where: what the camera is from, for the message.
-        is_stored: called where both shapes fit; True if the camera belongs to the image as stored.
+        expected: ``(height, width)`` of its camera; the image may be resized.
+        where: source of the camera, for the message.
+        is_stored: called if both orientations match; returns True if the camera belongs to the image as stored.
+
+    Raises:
+        DataError: if neither orientation has the camera's aspect ratio.
     """
     turned = orientation(path, scene)
     stored = image_size(path, scene)
@@ -162,15 +166,15 @@ def size_on_disk(
 def posed_image(
     camera: Camera | NDArray[np.float64], camera_size: Size, size: Size, upright: bool, mask: Path | None, where: str
 ) -> PosedImage:
-    """What an index keeps of an image with a camera.
+    """Makes the index entry of an image with a camera.
 
     Args:
         camera: a COLMAP camera, or the intrinsics ``[3, 3]`` of a pinhole (integer pixel centres).
-        camera_size: ``(height, width)`` that the camera is of.
-        size: of the image on disk.
+        camera_size: ``(height, width)`` that the camera was made for.
+        size: ``(height, width)`` of the image.
         upright: see :func:`size_on_disk`.
-        mask: its mask file.
-        where: what the camera is from, for the message.
+        mask: mask file of the image; None: none.
+        where: source of the camera, for the message.
     """
     kept = "" if mask is None else str(mask.resolve())
     try:
@@ -187,5 +191,5 @@ def posed_image(
 
 
 def _has_shape(size: Size, camera: Size) -> bool:
-    # Sizes are whole pixels, so that both directions of a reduced image may be off by one.
+    # Sizes are rounded to whole pixels, so both sides of a resized image may be off by one.
     return abs(size[0] * camera[1] / (size[1] * camera[0]) - 1) <= 2 / min(size)

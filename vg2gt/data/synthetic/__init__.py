@@ -1,4 +1,4 @@
-"""Procedural rooms from a seed, rendered with exact depth, normals and poses."""
+"""Procedural rooms generated from a seed, with exact depth, normals and poses."""
 
 from vg2gt.data.synthetic.source import SyntheticScenes
 

@@ -1,4 +1,4 @@
-"""Collects the parts of a procedural world: boxes, cylinders and ellipsoids with materials, in groups."""
+"""Builder of procedural worlds: groups of boxes, cylinders and ellipsoids with materials."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ _CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1
 
 
 def yaw_rotation(angle: float) -> NDArray[np.float64]:
-    """Rotation by ``angle`` (rad) about the vertical, 3x3."""
+    """Returns the 3x3 rotation by ``angle`` (rad) about the vertical."""
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def _tilt_rotation(angle: float) -> NDArray[np.float64]:
-    """Rotation by ``angle`` (rad) about the x axis, 3x3."""
+    """Returns the 3x3 rotation by ``angle`` (rad) about the x axis."""
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
 
 
 class Builder:
-    """Collects parts, their groups and materials while a scene is filled.
+    """Collects the parts, groups and materials of a scene.
 
     Args:
-        rng: source of every random choice.
+        rng: random generator of all choices.
     """
 
     def __init__(self, rng: np.random.Generator) -> None:
@@ -44,13 +44,13 @@ class Builder:
         self._rotation = np.eye(3)
 
     def place(self, position: NDArray[np.float64], yaw: float) -> None:
-        """Sets the frame in which the following parts are given, and begins a new group."""
+        """Sets the coordinate frame of the following parts and starts a new group."""
         self.end_group()
         self._origin = position
         self._rotation = yaw_rotation(yaw)
 
     def end_group(self) -> None:
-        """Closes the current group, if it has parts; parts of a group should be close to each other."""
+        """Closes the current group if it has parts. The parts of a group should be close together."""
         if len(self.parts) > self._group_start[-1]:
             self._group_start.append(len(self.parts))
 
@@ -69,7 +69,7 @@ class Builder:
         return len(self.materials) - 1
 
     def box(self, center: Vector, size: Vector, material: int, turn: float = 0.0, tilt: float = 0.0) -> None:
-        """Adds a box of full edge lengths ``size``, turned about the vertical and tilted about its x axis (rad)."""
+        """Adds a box with edge lengths ``size``, turned about the vertical and tilted about its x axis (rad)."""
         self._add(BOX, center, np.array(size) / 2, material, yaw_rotation(turn) @ _tilt_rotation(tilt))
 
     def tinted_material(
@@ -79,7 +79,7 @@ class Builder:
         frequency: tuple[float, float],
         other: Vector | None = None,
     ) -> int:
-        """Draws a material about one colour (linear RGB), its second colour about ``other`` or a shade of the first."""
+        """Draws a material near ``color`` (linear RGB); its second colour is near ``other`` or a shade of the first."""
         material = self.new_material(kinds, frequency)
         first = np.array(color) * self.rng.uniform(0.75, 1.3) * self.rng.uniform(0.9, 1.1, 3)
         shade = self.rng.uniform(0.5, 0.8) if self.rng.random() < 0.5 else self.rng.uniform(1.25, 1.6)
@@ -104,12 +104,12 @@ class Builder:
         self.part_materials.append(material)
 
     def corners(self, first: int, last: int | None = None) -> NDArray[np.float64]:
-        """Corners ``[8 n, 3]`` of the boxes around the parts from ``first`` up to ``last``."""
+        """Returns the corners ``[8 n, 3]`` of the boxes around the parts from ``first`` to ``last`` (exclusive)."""
         rows = self.parts[first:last]
         return np.concatenate([row[:3] + (_CORNERS * row[HALF:KIND]) @ row[AXES:HALF].reshape(3, 3) for row in rows])
 
     def groups(self) -> NDArray[np.float64]:
-        """Groups ``[g, GROUP_COLUMNS]`` of the parts, with spheres that hold the boxes around their parts."""
+        """Returns the groups ``[g, GROUP_COLUMNS]``, with bounding spheres of the boxes around their parts."""
         rows = []
         for first, last in zip(self._group_start[:-1], self._group_start[1:], strict=True):
             corners = self.corners(first, last)
@@ -119,7 +119,7 @@ class Builder:
         return np.array(rows, np.float64).reshape(-1, GROUP_COLUMNS)
 
     def arrays(self) -> dict[str, NDArray]:
-        """Parts, groups and materials as :class:`vg2gt.data.synthetic.renderer.World` takes them."""
+        """Returns parts, groups and materials as arguments of :class:`vg2gt.data.synthetic.renderer.World`."""
         return {
             "parts": np.array(self.parts).reshape(-1, PART_COLUMNS),
             "part_materials": np.array(self.part_materials, np.int64),

@@ -1,7 +1,7 @@
 """Furniture composed of boxes, cylinders and ellipsoids, with random proportions and materials.
 
 Every maker draws from the builder's random generator, places parts in its own frame (x is the front, z up, the floor at
-z = 0) and returns the radius of the free floor it needs. Lengths in metres.
+z = 0) and returns the radius of the floor area it occupies. Lengths are in metres.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ def _legs(b: Builder, x: float, y: float, height: float, thickness: float, mater
 
 
 def crates(b: Builder) -> float:
-    """One box or two on top of each other."""
+    """One box, or two stacked boxes."""
     size = b.rng.uniform(0.3, 0.9, 3)
     b.box((0, 0, size[2] / 2), tuple(size), b.new_material())
     if b.rng.random() < 0.5:
@@ -45,7 +45,7 @@ def ball(b: Builder) -> float:
 
 
 def table(b: Builder) -> float:
-    """A table with things on it."""
+    """A table with objects on it."""
     rng = b.rng
     length, depth, height = rng.uniform(0.7, 1.4), rng.uniform(0.6, 0.9), rng.uniform(0.6, 0.8)
     b.box((0, 0, height), (length, depth, 0.05), b.new_material())
@@ -72,7 +72,7 @@ def chair(b: Builder) -> float:
 
 
 def shelf(b: Builder) -> float:
-    """A shelf with books; every board is a group of its own."""
+    """A shelf with books; every board is a separate group."""
     rng = b.rng
     width, height, boards = rng.uniform(0.7, 1.3), rng.uniform(0.9, 2.0), int(rng.integers(2, 5))
     material, gap = b.new_material(), height / boards

@@ -1,7 +1,7 @@
 """Analytic ray casting of boxes, cylinders and ellipsoids inside a box-shaped room.
 
-Parts (primitives) belong to groups. A group's and a part's bounding sphere are tested before the part itself, and the
-caller gives the groups that a bundle of rays can meet at all (``groups_in_cone``). Rays have unit directions.
+Parts (primitives) belong to groups. The bounding spheres of groups and parts are tested before the parts themselves,
+and only parts that a bundle of rays can hit are considered (``parts_in_cone``). Rays have unit directions.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from vg2gt.kernels.compiled import kernel, kernel_part
 
 BOX, CYLINDER, ELLIPSOID = 0, 1, 2
 
-# Columns of a part: centre, squared bounding radius, 3x3 own axes (rows, row major), half extents along them, kind.
+# Columns of a part: centre, squared bounding radius, 3x3 axes (rows, row-major), half extents along them, kind.
 CENTER, RADIUS2, AXES, HALF, KIND, PART_COLUMNS = 0, 3, 4, 13, 16, 17
-# Columns of a group: centre and radius of its bounding sphere (CENTER, RADIUS), its parts from FIRST up to LAST.
+# Columns of a group: centre and radius of its bounding sphere (CENTER, RADIUS), parts FIRST to LAST (exclusive).
 RADIUS, FIRST, LAST, GROUP_COLUMNS = 3, 4, 5, 6
 
 FAR = 1e9
 _EPSILON = 1e-9
-_FLAGS = {"reassoc", "contract", "arcp", "nsz"}  # not the flags that forbid infinities
+_FLAGS = {"reassoc", "contract", "arcp", "nsz"}  # without the flags that exclude infinities
 
 jit = kernel(nogil=True, error_model="numpy", fastmath=_FLAGS)
 part = kernel_part(error_model="numpy", fastmath=_FLAGS)
@@ -43,10 +43,10 @@ def _without_owner(context: Any, builder: Any, kind: Any, value: Any) -> Any:
 
 
 def _unowned(context: Any, value: Any) -> Any:
-    """The same array, or tuple of arrays and other things, without owners, who must outlive it.
+    """Returns an array, or a tuple with arrays, without owner references. The owners must outlive it.
 
-    Compiled code counts the references to an array's owner with atomic operations wherever it passes the array on: in
-    the inner loops that took as long as the ray casting itself.
+    Compiled code counts references to an array's owner with atomic operations whenever it passes the array on. In the
+    inner loops this took as long as the ray casting itself.
     """
     return value(value), lambda context, builder, signature, arguments: _without_owner(
         context, builder, signature.args[0], arguments[0]
@@ -63,7 +63,7 @@ def _inverse(x):
 
 @part
 def intersect_part(i, parts, ox, oy, oz, dx, dy, dz):
-    """Distance at which a ray from outside enters part ``i``; ``FAR`` if it does not."""
+    """Returns the distance at which a ray from outside enters part ``i``; ``FAR`` if it misses."""
     x, y, z = parts[i, 0] - ox, parts[i, 1] - oy, parts[i, 2] - oz
     along = x * dx + y * dy + z * dz
     squared = x * x + y * y + z * z
@@ -72,7 +72,7 @@ def intersect_part(i, parts, ox, oy, oz, dx, dy, dz):
         return FAR
     kind = parts[i, KIND]
     hx, hy, hz = parts[i, HALF], parts[i, HALF + 1], parts[i, HALF + 2]
-    # The ray in the part's own frame.
+    # Transform the ray to the part's frame.
     px = -(parts[i, AXES] * x + parts[i, AXES + 1] * y + parts[i, AXES + 2] * z)
     py = -(parts[i, AXES + 3] * x + parts[i, AXES + 4] * y + parts[i, AXES + 5] * z)
     pz = -(parts[i, AXES + 6] * x + parts[i, AXES + 7] * y + parts[i, AXES + 8] * z)
@@ -113,9 +113,9 @@ def intersect_part(i, parts, ox, oy, oz, dx, dy, dz):
 
 @part
 def leave_walls(walls, ox, oy, oz, dx, dy, dz):
-    """Distance to the wall of the room along a ray from inside, and the wall: 0..5 for x-, x+, y-, y+, floor, ceiling.
+    """Returns the distance along a ray from inside the room to a wall, and the wall.
 
-    ``walls`` ``[2, 3]`` holds the room's lower and upper corner.
+    Walls are 0..5 for x-, x+, y-, y+, floor, ceiling. ``walls`` ``[2, 3]`` holds the room's lower and upper corner.
     """
     ix, iy, iz = _inverse(dx), _inverse(dy), _inverse(dz)
     sx, sy, sz = (1 if dx > 0 else 0), (1 if dy > 0 else 0), (1 if dz > 0 else 0)
@@ -131,9 +131,9 @@ def leave_walls(walls, ox, oy, oz, dx, dy, dz):
 
 @part
 def nearest_hit(visible, near, count, parts, walls, ox, oy, oz, dx, dy, dz):
-    """Nearest hit of a ray from inside the room ``walls [2, 3]``: distance, and the part or ``-1 - wall``.
+    """Returns the nearest hit of a ray from inside the room ``walls [2, 3]``: distance, and the part or ``-1 - wall``.
 
-    The first ``count`` of the ``visible`` parts are tried; ``near`` holds the least distance of each, in rising order.
+    Tests the first ``count`` of the ``visible`` parts; ``near`` holds their minimum distances, in increasing order.
     """
     best, wall = leave_walls(walls, ox, oy, oz, dx, dy, dz)
     hit = -1 - wall
@@ -148,7 +148,7 @@ def nearest_hit(visible, near, count, parts, walls, ox, oy, oz, dx, dy, dz):
 
 @part
 def find_occluder(visible, count, parts, ox, oy, oz, dx, dy, dz, distance, guess):
-    """A part that a ray meets within ``distance``, -1 if none; part ``guess`` (unless -1) is tried first."""
+    """Returns a part that a ray hits within ``distance``, or -1; tests part ``guess`` (unless -1) first."""
     if guess >= 0 and intersect_part(guess, parts, ox, oy, oz, dx, dy, dz) < distance:
         return guess
     for k in range(count):
@@ -159,7 +159,7 @@ def find_occluder(visible, count, parts, ox, oy, oz, dx, dy, dz, distance, guess
 
 @part
 def _enters_cone(x, y, z, radius, axis, spread, reach):
-    """Least distance between a cone's tip and a sphere around (x, y, z), seen from the tip; FAR where they miss."""
+    """Returns the distance from a cone's tip to a sphere at (x, y, z) relative to the tip; FAR if they are disjoint."""
     distance = math.sqrt(x * x + y * y + z * z)
     if distance - radius > reach:
         return FAR
@@ -172,10 +172,10 @@ def _enters_cone(x, y, z, radius, axis, spread, reach):
 
 @part
 def parts_in_cone(apex, axis, spread, reach, parts, groups, visible, near):
-    """Writes to ``visible [n]`` the parts whose sphere meets a cone, the nearest group's first; returns how many.
+    """Writes the parts whose bounding sphere meets a cone to ``visible [n]``, nearest group first; returns the count.
 
-    ``near [n]`` receives the least distance of each one's group. The cone has a tip, a unit axis, half an opening angle
-    (rad) and a length less than ``FAR``.
+    ``near [n]`` receives the minimum distance of each part's group. The cone has tip ``apex``, unit ``axis``, half
+    opening angle ``spread`` (rad) and length ``reach``, less than ``FAR``.
     """
     count = 0
     for g in range(groups.shape[0]):
@@ -198,7 +198,7 @@ def parts_in_cone(apex, axis, spread, reach, parts, groups, visible, near):
 
 @part
 def surface(hit, parts, px, py, pz):
-    """Outward world normal (3) and surface coordinates in metres (2) of a point on a part or on a wall."""
+    """Returns the outward world normal (3) and surface coordinates in metres (2) of a point on a part or wall."""
     if hit < 0:
         axis = (-1 - hit) // 2
         sign = 1.0 if (-1 - hit) % 2 == 0 else -1.0  # walls face inward

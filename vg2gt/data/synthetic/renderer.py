@@ -1,8 +1,8 @@
 """Renders a world of textured parts with point lights and shadows: colour, exact z-depth and normals.
 
-One numba kernel renders a frame and releases the interpreter's lock, so frames are rendered by threads. The image is
-worked on in tiles: all rays of a tile are cast first, then shaded with the parts that can throw a shadow on what the
-tile sees. Highlights and the sky are compiled in only where a world has them (``None`` is a type to numba).
+A numba kernel renders a frame and releases the GIL, so frames can be rendered in parallel threads. The image is
+processed in tiles: all rays of a tile are cast first, then shaded with the parts that can cast a shadow on the tile's
+hits. Highlights and the sky are compiled in only if a world has them (``None`` is a type to numba).
 """
 
 from __future__ import annotations
@@ -20,27 +20,27 @@ from vg2gt.data.synthetic.textures import fractal_noise, pattern_value
 _TILE = 8
 SAMPLES = 2  # colour samples per axis and pixel
 _LIFT = 1e-4  # metres by which a shadow ray starts above its surface
-_SHADOW = 0.2  # share of a light that reaches a point in its shadow, standing in for bounced light
+_SHADOW = 0.2  # fraction of a light that reaches points in its shadow; approximates indirect light
 GAMMA = 1 / 1.8
 
 
 @dataclass(frozen=True)
 class World:
-    """Geometry, materials and lights of one scene. Metres, z up.
+    """Geometry, materials and lights of a scene, in metres, z up.
 
     Attributes:
-        walls: ``[2, 3]`` lower and upper corner of the room that holds everything; under an open sky, of the
-            part of the ground that is seen.
+        walls: ``[2, 3]`` lower and upper corner of the room that contains everything; in an open world, of the visible
+            part of the ground.
         wall_materials: ``[6]`` materials of the walls x-, x+, y-, y+, floor, ceiling.
         parts: ``[n, PART_COLUMNS]`` boxes, cylinders and ellipsoids (columns: ``raycast.py``).
-        part_materials: ``[n]``.
-        groups: ``[g, GROUP_COLUMNS]`` bounding spheres of runs of parts.
+        part_materials: ``[n]`` material of every part.
+        groups: ``[g, GROUP_COLUMNS]`` bounding spheres of consecutive parts.
         materials: ``[m, 13]`` pattern, frequency, seed, colour a (3), colour b (3), and strength and frequency of a
             slow and of a fine tonal variation.
         lights: ``[l, 6]`` position and colour.
-        ambient: light from everywhere.
-        highlights: ``[m, 2]`` strength and Blinn-Phong exponent of the materials; None: nothing shines.
-        sky: ``[SKY_COLUMNS]`` (columns: ``sky.py``), in place of the ceiling and the four walls; None: a closed world.
+        ambient: intensity of the ambient light.
+        highlights: ``[m, 2]`` strength and Blinn-Phong exponent of the materials; None: no highlights.
+        sky: ``[SKY_COLUMNS]`` (columns: ``sky.py``), replaces the ceiling and the four walls; None: a closed world.
     """
 
     walls: NDArray[np.float64]
@@ -62,7 +62,8 @@ class RenderedFrame:
     Attributes:
         image: ``[H, W, 3]`` uint8.
         depth: ``[H, W]`` float32 z-depth in metres at the exact pixel centres, 0 in the sky.
-        normal: ``[H, W, 3]`` float32 unit camera-frame normals there, facing the camera; 0 in the sky.
+        normal: ``[H, W, 3]`` float32 unit normals in the camera frame at the pixel centres, facing the camera; 0 in
+            the sky.
     """
 
     image: NDArray[np.uint8]
@@ -80,11 +81,11 @@ def render_frame(
     """Renders one camera.
 
     Args:
-        world: what is seen.
-        world_to_camera: ``[4, 4]`` OpenCV; the camera must stand inside the walls and outside of its parts.
+        world: the world to render.
+        world_to_camera: ``[4, 4]`` OpenCV pose; the camera must be inside the walls and outside all parts.
         intrinsics: ``[3, 3]`` in pixels, integer pixel centres, no skew.
         size: image ``(height, width)``.
-        samples: colour samples per axis and pixel; 1 costs a third of 2 and leaves edges jagged.
+        samples: colour samples per axis and pixel; 1 takes a third of the time of 2, but leaves jagged edges.
     """
     frame = RenderedFrame(np.empty((*size, 3), np.uint8), np.empty(size, np.float32), np.empty((*size, 3), np.float32))
     rotation = np.ascontiguousarray(world_to_camera[:3, :3])
@@ -107,7 +108,7 @@ def render_frame(
 
 
 def _workspace(world: World, samples: int) -> tuple[tuple[NDArray, ...], ...]:
-    """Memory of the kernel: it works on arrays without owners (``unowned``), so Python has to own them."""
+    """Allocates the kernel's buffers. Python must own them, because the kernel uses ``unowned`` arrays."""
     rays, lights, parts = _TILE * _TILE * samples**2, len(world.lights), len(world.parts)
     hits = (np.empty((rays, 3)), np.empty((rays, 3)), np.empty(rays), np.empty(rays, np.int64))
     seen = (np.empty(parts, np.int64), np.empty(parts))
@@ -117,7 +118,7 @@ def _workspace(world: World, samples: int) -> tuple[tuple[NDArray, ...], ...]:
 
 @part
 def _ray(x, y, rotation, camera, d):
-    """Writes the unit world direction through image position (x, y) into ``d``; returns its camera-frame z."""
+    """Writes the unit world direction through image position (x, y) to ``d``; returns its camera-frame z."""
     cx = (x - camera[2]) / camera[0]
     cy = (y - camera[3]) / camera[1]
     z = 1.0 / math.sqrt(cx * cx + cy * cy + 1.0)
@@ -128,7 +129,7 @@ def _ray(x, y, rotation, camera, d):
 
 @part
 def _tile_cone(y0, x0, y1, x1, rotation, camera, corner, axis):
-    """Writes the axis of a cone around a tile's rays; returns its half opening angle. ``corner`` is overwritten."""
+    """Writes the axis of a cone around a tile's rays; returns its half opening angle. Overwrites ``corner``."""
     _ray(0.5 * (x0 + x1 - 1), 0.5 * (y0 + y1 - 1), rotation, camera, axis)
     cosine = 1.0
     for x in (x0 - 0.5, x1 - 0.5):
@@ -158,7 +159,7 @@ def _light_cone(light, points, count, axis):
 
 @part
 def _leave_out_sky(hits, points, count, origin):
-    """Moves points in the sky, on which nothing throws a shadow, onto another point of the tile."""
+    """Moves points in the sky, which receive no shadows, to another point of the tile or the camera."""
     x, y, z = origin[0], origin[1], origin[2]
     for k in range(count):
         if hits[k] < 0 and hits[k] != GROUND:
@@ -169,14 +170,14 @@ def _leave_out_sky(hits, points, count, origin):
 
 @part
 def _shade(hit, t, p, d, footprint, parts, look, highlights, sky, shadowing, counts, guesses, color):
-    """Adds the linear colour of one ray's hit to ``color``; ``shadowing`` lists the parts to ask for every light."""
+    """Adds the linear colour of one ray's hit to ``color``; ``shadowing`` lists possible occluders for every light."""
     part_materials, wall_materials, materials, lights, ambient = look
     shallow = 0.15
     if sky is not None:
         if hit < 0 and hit != GROUND:
             add_sky(sky, d, footprint, color)
             return
-        shallow = 0.03  # the far ground would flicker
+        shallow = 0.03  # otherwise the far ground would flicker
     nx, ny, nz, u, v = surface(hit, parts, p[0], p[1], p[2])
     m = part_materials[hit] if hit >= 0 else wall_materials[-1 - hit]
     cosine = abs(nx * d[0] + ny * d[1] + nz * d[2])
@@ -215,7 +216,7 @@ def _shade(hit, t, p, d, footprint, parts, look, highlights, sky, shadowing, cou
 
 @part
 def _cast_centers(tile, origin, rotation, camera, geometry, sky, seen, d, out):
-    """Depth and normals of a tile at its pixels' centres; ``d`` is overwritten."""
+    """Writes depth and normals of a tile at the pixel centres; overwrites ``d``."""
     parts, _, walls = geometry
     visible, near, count = seen
     _, depth, normal = out
@@ -238,7 +239,7 @@ def _cast_centers(tile, origin, rotation, camera, geometry, sky, seen, d, out):
 
 @part
 def _cast_samples(tile, samples, origin, rotation, camera, geometry, seen, rays):
-    """Hits of a tile's colour samples, one pixel's after the other's; returns how many samples there are."""
+    """Writes the hits of a tile's colour samples, pixel by pixel; returns the number of samples."""
     parts, _, walls = geometry
     visible, near, count = seen
     points, directions, distances, hits = rays

@@ -1,4 +1,4 @@
-"""Procedural rooms: a furnished room, a camera path through it and the rendered frames, all from one seed."""
+"""Procedural rooms: furniture, lamps and a camera path, all drawn from one seed."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from vg2gt.data.synthetic.textures import INDOOR, Pattern
 _FLOOR_PATTERNS = (Pattern.CHECKS, Pattern.BRICKS, Pattern.CLOUDS, Pattern.WOOD, Pattern.MOSAIC, Pattern.PLANKS)
 _CEILING_PATTERNS = (Pattern.PLAIN, Pattern.CLOUDS, Pattern.BRICKS)
 _PICTURE_PATTERNS = tuple(pattern for pattern in INDOOR if pattern not in (Pattern.PLAIN, Pattern.BRICKS))
-_WALL_GAP = 0.55  # metres from a wall to the middle of the furniture along it
+_WALL_GAP = 0.55  # metres from a wall to the centre of the furniture along it
 TRIES = 200
 
 
 class SyntheticRoom(SyntheticScene):
-    """One furnished room with a camera path. The world frame has its origin at the middle of the floor.
+    """A furnished room with a camera path. The world origin is at the centre of the floor.
 
     Args:
-        seed: decides everything, together with the number of frames.
-        num_frames: cameras on the path, at least 1.
+        seed: random seed; it and the number of frames determine the scene.
+        num_frames: number of cameras on the path, at least 1.
         size: image ``(height, width)``.
-        highlights: as in ``draw_highlights``; nothing but the colour changes.
+        highlights: see ``draw_highlights``; changes only colours.
     """
 
-    version = 1  # raise it whenever the same seed would give other pixels
+    version = 1  # increase it when the same seed gives different pixels
 
     def __init__(self, seed: int, num_frames: int, size: tuple[int, int], highlights: bool | str = False) -> None:
         stream = (self.version, seed)
@@ -45,7 +45,7 @@ class SyntheticRoom(SyntheticScene):
     def _path(
         self, rng: np.random.Generator, extent: NDArray[np.float64], occupied: NDArray[np.float64], count: int
     ) -> NDArray[np.float64]:
-        """Camera-to-world poses ``[count, 4, 4]``: an arc around free floor while the view pans and nods smoothly."""
+        """Returns camera-to-world poses ``[count, 4, 4]`` on an arc over free floor, with smooth pan and nod."""
         s = np.linspace(0, 1, count)
         floor = _free_arc(rng, extent, occupied, s)
         height = rng.uniform(1.0, 1.7) + 0.15 * np.sin(s * np.pi * rng.uniform(0.5, 2) + rng.uniform(0, 6))
@@ -56,7 +56,7 @@ class SyntheticRoom(SyntheticScene):
 
 
 def _shell_materials(builder: Builder) -> NDArray[np.int64]:
-    """Materials of the four walls, the floor and the ceiling; in half of the rooms all walls share one."""
+    """Draws materials of the four walls, the floor and the ceiling; in half of the rooms all walls share one."""
     own = builder.rng.random() < 0.5
     walls = [builder.new_material() for _ in range(4)] if own else [builder.new_material()] * 4
     return np.array([*walls, builder.new_material(_FLOOR_PATTERNS), builder.new_material(_CEILING_PATTERNS)])
@@ -92,7 +92,7 @@ def _furnish(builder: Builder, extent: NDArray[np.float64]) -> NDArray[np.float6
 
 
 def _candidate_place(rng: np.random.Generator, extent: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """A place along a wall, facing the room (60 %), or anywhere in its middle."""
+    """Draws a position and yaw: along a wall, facing the room (60 %), or anywhere in its middle."""
     position = np.zeros(3)
     if rng.random() < 0.6:
         side, axis = rng.choice((-1, 1)), int(rng.integers(2))
@@ -128,7 +128,7 @@ def draw_lamps(rng: np.random.Generator, extent: NDArray[np.float64]) -> tuple[N
 def _free_arc(
     rng: np.random.Generator, extent: NDArray[np.float64], occupied: NDArray[np.float64], s: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Points ``[len(s), 2]`` of a circular arc, the freest of many draws: off the walls and off the furniture."""
+    """Draws a circular arc ``[len(s), 2]`` clear of walls and furniture; after ``TRIES`` draws, the clearest one."""
     best, best_clearance = np.zeros((len(s), 2)), -np.inf
     for _ in range(TRIES):
         middle = rng.uniform(-0.25, 0.25, 2) * extent[:2]

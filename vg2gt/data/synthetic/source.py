@@ -1,4 +1,4 @@
-"""Procedural scenes as a dataset: made from a seed when first asked for, then read from a cache folder."""
+"""Dataset of procedural scenes: rendered from a seed on first use, then read from a cache folder."""
 
 from __future__ import annotations
 
@@ -24,24 +24,25 @@ log = logging.getLogger(__name__)
 
 
 class SyntheticScenes(SceneSource):
-    """Furnished rooms with exact depth and poses.
+    """Procedural furnished rooms with exact depth and poses.
 
-    Scene k of a source has the seed ``first_seed + k`` and the name ``<variant>-<seed>``, so sources whose seed ranges
-    do not overlap share no scene.
+    Scene k has the seed ``first_seed + k`` and the name ``<variant>-<seed>``. Sources with disjoint seed ranges
+    therefore share no scene.
 
     Args:
-        num_scenes: scenes in this source.
+        num_scenes: number of scenes.
         first_seed: seed of the first scene.
-        num_frames: frames on a scene's camera path.
-        size: image ``(height, width)``; best the size that is trained on. Upright images are upright photographs: the
-            field of view is along the longer side.
-        variant: ``room``; ``examples/worlds`` has more, also as a list: of ``[room, room, outdoor]`` seeds take turns.
-        highlights: whether surfaces shine, with colours that depend on the view; geometry and textures stay the same.
-            ``lobes``: strongly.
-        cache_dir: folder for the rendered frames (``~`` is the home folder); None keeps nothing on disk.
+        num_frames: number of frames on a scene's camera path.
+        size: image ``(height, width)``, preferably the training size. The field of view is measured along the longer
+            side, so tall images are like portrait photographs.
+        variant: ``room``, or one of the variants of ``examples/worlds``. A list such as ``[room, room, outdoor]`` is
+            cycled through by seed.
+        highlights: add specular highlights, which make colours view-dependent; geometry and textures do not change.
+            ``lobes``: strong highlights.
+        cache_dir: folder of the rendered frames (``~`` is expanded); None: no cache on disk.
 
     Raises:
-        ValueError: if a number is out of range or a variant unknown.
+        ValueError: if a number is out of range or a variant is unknown.
     """
 
     variants: ClassVar[dict[str, Any]] = {"room": SyntheticRoom}
@@ -82,15 +83,15 @@ class SyntheticScenes(SceneSource):
 
     @property
     def scenes(self) -> Sequence[str]:
-        """Names of the scenes."""
+        """Scene names."""
         return self._names
 
     def frames(self, scene: str) -> Sequence[int]:
-        """Frame numbers along the camera path."""
+        """Returns the frame numbers along the camera path."""
         return range(self.num_frames)
 
     def load(self, scene: str, frame_ids: Sequence[int]) -> Frames:
-        """Returns frames of a scene, rendering the scene if the cache does not hold it."""
+        """Returns frames of a scene; renders the scene if it is not cached."""
         arrays = self._read_cache(scene)
         if arrays is None:
             arrays = self._render(scene)
@@ -105,20 +106,20 @@ class SyntheticScenes(SceneSource):
         )
 
     def normals(self, scene: str, frame_ids: Sequence[int]) -> torch.Tensor:
-        """Renders the exact camera-frame unit normals ``[V, 3, H, W]`` of frames, 0 in the sky; they are not cached."""
+        """Renders exact unit normals ``[V, 3, H, W]`` in the camera frame, 0 in the sky. They are not cached."""
         frames = self.scene(scene).render(frame_ids, _threads())
         return torch.from_numpy(np.stack([frame.normal for frame in frames])).permute(0, 3, 1, 2).contiguous()
 
     def scene(self, scene: str) -> SyntheticScene:
-        """Makes a scene, ready to be rendered."""
+        """Builds a scene, ready for rendering."""
         kind, seed = self._seeds[scene]
         return self.variants[kind](seed, self.num_frames, self.size, self.highlights)
 
     @property
     def look(self) -> str:
-        """What decides the pixels apart from scene and size, as part of file names."""
+        """Suffix of cache folders for options that change the pixels, apart from scene and size."""
         highlights = {True: "-highlights", False: ""}.get(self.highlights, f"-{self.highlights}")  # pyright: ignore
-        upright = "-upright" if self.size[0] > self.size[1] else ""  # where the field of view was once horizontal
+        upright = "-upright" if self.size[0] > self.size[1] else ""  # older caches have a horizontal field of view
         return highlights + upright
 
     def _render(self, scene: str) -> dict[str, NDArray]:
@@ -132,7 +133,7 @@ class SyntheticScenes(SceneSource):
         }
 
     def cache_file(self, scene: str) -> Path | None:
-        """Where a scene's frames are kept; the name holds everything that decides the pixels."""
+        """Returns the cache file of a scene; its path encodes everything that determines the pixels."""
         if self.cache_dir is None:
             return None
         kind = self._seeds[scene][0]
@@ -141,7 +142,7 @@ class SyntheticScenes(SceneSource):
         return self.cache_dir / folder / f"{scene}.npz"
 
     def _read_cache(self, scene: str) -> dict[str, NDArray] | None:
-        """Reads a scene from the cache; None, with a warning, where the file is damaged (its checksums do not fit)."""
+        """Reads a scene from the cache; None if it is missing or, with a warning, damaged or of another shape."""
         path = self.cache_file(scene)
         if path is None or not path.is_file():
             return None
@@ -166,5 +167,5 @@ class SyntheticScenes(SceneSource):
 
 
 def _threads() -> int:
-    """Rendering threads: all cores of this process, or one in a loader's worker, which has siblings."""
+    """Returns the number of rendering threads: 1 in a loader worker, otherwise all threads of this process."""
     return 1 if torch.utils.data.get_worker_info() is not None else torch.get_num_threads()

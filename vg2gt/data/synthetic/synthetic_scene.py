@@ -1,4 +1,4 @@
-"""What every procedural scene has: a world, a camera path through it and a way to render it."""
+"""Base class of procedural scenes: a world, a camera path through it, and rendering."""
 
 from __future__ import annotations
 
@@ -11,27 +11,27 @@ from numpy.typing import NDArray
 
 from vg2gt.data.synthetic.renderer import SAMPLES, RenderedFrame, World, render_frame
 
-_HIGHLIGHTS = 1  # tells the random stream of the highlights from that of the scene
+_HIGHLIGHTS = 1  # separates the random stream of the highlights from that of the scene
 _MATT_SHARE = 0.3
 LOBES = "lobes"
 """Value of ``highlights`` for strong ones."""
 
 
 class SyntheticScene:
-    """A world and cameras on a path through it, in metres, z up.
+    """A world and a camera path through it, in metres, z up.
 
     Args:
-        world: what is seen.
-        camera_to_world: ``[n, 4, 4]`` OpenCV.
-        field_of_view: along the longer side of the image, rad.
+        world: the rendered world.
+        camera_to_world: ``[n, 4, 4]`` OpenCV poses.
+        field_of_view: angle along the longer side of the image (rad).
         size: image ``(height, width)``.
-        stream: names the random stream of the scene.
-        highlights: as in :func:`draw_highlights`; nothing but the colour changes.
+        stream: seed of the scene's random stream.
+        highlights: see :func:`draw_highlights`; changes only colours.
 
     Attributes:
         world_to_camera: ``[n, 4, 4]`` float64.
         intrinsics: ``[3, 3]`` float64 in pixels, integer pixel centres.
-        develop: what is done to the image of a frame, given the frame's number; None: nothing.
+        develop: post-processing of rendered images, called with the image and the frame number; None: none.
     """
 
     def __init__(
@@ -53,11 +53,11 @@ class SyntheticScene:
         self.intrinsics = np.array([[focal, 0, (size[1] - 1) / 2], [0, focal, (size[0] - 1) / 2], [0, 0, 1]])
 
     def world_at(self, frame: int) -> World:
-        """What is seen in a frame: the same in all, unless something moves."""
+        """Returns the world of a frame; by default the same for all frames. Override it for moving objects."""
         return self.world
 
     def render(self, frames: Sequence[int], threads: int, samples: int = SAMPLES) -> list[RenderedFrame]:
-        """Renders the given frames of the path, ``threads`` at a time, with ``samples`` ** 2 colour samples a pixel."""
+        """Renders frames of the path, ``threads`` at a time, with ``samples ** 2`` colour samples per pixel."""
 
         def render(frame: int) -> RenderedFrame:
             made = render_frame(self.world_at(frame), self.world_to_camera[frame], self.intrinsics, self.size, samples)
@@ -72,12 +72,12 @@ class SyntheticScene:
 def level_poses(
     position: NDArray[np.float64], pan: NDArray[np.float64], nod: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Camera-to-world poses ``[n, 4, 4]`` of cameras that are not rolled.
+    """Returns camera-to-world poses ``[n, 4, 4]`` of cameras without roll.
 
     Args:
-        position: ``[n, 3]``.
-        pan: ``[n]`` turn about the vertical (rad), 0 looks along x.
-        nod: ``[n]`` upward (rad).
+        position: ``[n, 3]`` camera centres.
+        pan: ``[n]`` angle about the vertical (rad); 0 looks along x.
+        nod: ``[n]`` upward angle (rad).
     """
     forward = np.stack((np.cos(pan) * np.cos(nod), np.sin(pan) * np.cos(nod), np.sin(nod)), 1)
     right = np.cross(forward, (0.0, 0.0, 1.0))
@@ -91,16 +91,16 @@ def level_poses(
 
 
 def draw_highlights(seed: tuple[int, ...], materials: int, kind: bool | str = True) -> NDArray[np.float64]:
-    """Strength and Blinn-Phong exponent ``[m, 2]`` of every material; a third of the materials stays matt.
+    """Draws the strength and Blinn-Phong exponent ``[m, 2]`` of every material; 30 % of the materials stay matt.
 
-    Drawn from a random stream of its own, so that nothing else of the scene changes. The exponent is that of a surface
-    whose microfacets have slopes of ``roughness`` standard deviation, ``2 / roughness^2 - 2``.
+    Uses a separate random stream, so that nothing else in the scene changes. The exponent is ``2 / roughness^2 - 2``,
+    where ``roughness`` is the standard deviation of microfacet slopes.
 
     Args:
-        seed: of the scene's random stream.
-        materials: how many there are.
-        kind: True, or ``lobes``: up to three times stronger, and from sharp to broad, as lacquer, metal and windows
-            seen in a floor are.
+        seed: seed of the scene's random stream.
+        materials: number of materials.
+        kind: True, or ``lobes`` for highlights up to three times stronger and from sharp to broad, like those of
+            lacquer, metal and windows reflected in a floor.
     """
     rng = np.random.default_rng((*seed, _HIGHLIGHTS))
     strong = kind == LOBES

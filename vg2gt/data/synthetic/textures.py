@@ -1,8 +1,8 @@
-"""Procedural surface patterns, low-passed to the footprint of a pixel so that all views of a surface agree.
+"""Procedural surface patterns, low-pass filtered to the footprint of a pixel so that all views of a surface agree.
 
-Every pattern is a function of surface coordinates in metres and of a filter width in the pattern's own periods.
+Every pattern is a function of surface coordinates in metres and a filter width in periods of the pattern.
 Piecewise constant patterns are convolved with a box of that width in closed form (difference of their integral at
-both ends); noise loses the octaves that the width cannot resolve.
+both ends); noise drops the octaves that the width cannot resolve.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from vg2gt.data.synthetic.raycast import part
 
 
 class Pattern(IntEnum):
-    """Kinds of pattern, as stored in a material."""
+    """Pattern types, as stored in a material."""
 
     PLAIN = 0
     STRIPES = 1
@@ -37,7 +37,7 @@ _MIN_WIDTH = 1e-4  # filter width below which a pattern counts as unfiltered
 
 @part
 def hash_cell(x, y, seed):
-    """Pseudo-random number in [0, 1) of an integer lattice cell."""
+    """Returns a pseudo-random number in [0, 1) for an integer lattice cell."""
     h = (x * 0x27D4EB2D + y * 0x165667B1 + seed * 0x9E3779B1) & 0xFFFFFFFF
     h = ((h ^ (h >> 15)) * 0x2C1B3C6D) & 0xFFFFFFFF
     h = ((h ^ (h >> 12)) * 0x297A2D39) & 0xFFFFFFFF
@@ -46,7 +46,7 @@ def hash_cell(x, y, seed):
 
 @part
 def _blend_cells(x, y, seed, width):
-    """Random value per unit cell, box-filtered: cells are constant, their borders ``width`` cells wide."""
+    """Returns a box-filtered random value per unit cell: constant cells with borders ``width`` cells wide."""
     width = min(max(width, _MIN_WIDTH), 1.0)
     x -= 0.5
     y -= 0.5
@@ -63,7 +63,7 @@ def _blend_cells(x, y, seed, width):
 
 @part
 def value_noise(x, y, seed):
-    """Smooth noise in [-1, 1] with unit lattice spacing."""
+    """Returns smooth noise in [-1, 1] with unit lattice spacing."""
     ix = math.floor(x)
     iy = math.floor(y)
     u = x - ix
@@ -79,7 +79,7 @@ def value_noise(x, y, seed):
 
 @part
 def fractal_noise(x, y, frequency, octaves, footprint, seed):
-    """Sum of noise octaves, each damped by ``exp(-(frequency * footprint)^2)`` and dropped below 3 %."""
+    """Returns a sum of noise octaves, each damped by ``exp(-(frequency * footprint)^2)``; stops below 3 %."""
     total = 0.0
     amplitude = 1.0
     for octave in range(octaves):
@@ -95,7 +95,7 @@ def fractal_noise(x, y, frequency, octaves, footprint, seed):
 
 @part
 def square_wave(x, width):
-    """Box-filtered wave of period 1: 1 on the first half, 0 on the second."""
+    """Returns a box-filtered square wave of period 1: 1 on the first half, 0 on the second."""
     width = max(width, _MIN_WIDTH)
     right = x + 0.5 * width
     left = x - 0.5 * width
@@ -106,7 +106,7 @@ def square_wave(x, width):
 
 @part
 def pulse_train(x, duty, width):
-    """Box-filtered train of period 1: 1 on a ``duty`` long interval centred at integers, 0 elsewhere."""
+    """Returns a box-filtered pulse train of period 1: 1 on intervals of length ``duty`` centred at integers, else 0."""
     width = max(width, _MIN_WIDTH)
     right = x + 0.5 * (duty + width)
     left = x + 0.5 * (duty - width)
@@ -126,7 +126,7 @@ def _dots(x, y, width):
 
 @part
 def _grain(x, y, frequency, footprint, seed):
-    """Wood grain along x: lines bent by noise that is stretched along them."""
+    """Returns wood grain along x: lines bent by noise that is stretched along x."""
     bend = fractal_noise(x * 0.3, y * 2.0, frequency, 3, 2.0 * footprint, seed)
     width = 4.0 * frequency * footprint
     lines = math.sin(6.2832 * (2.0 * frequency * y + 0.6 * bend)) * math.exp(-width * width)
@@ -135,9 +135,9 @@ def _grain(x, y, frequency, footprint, seed):
 
 @part
 def pattern_value(kind, x, y, frequency, footprint, seed):
-    """Mixing weight in [0, 1] between a material's two colours: a ``Pattern`` at a place of the surface.
+    """Evaluates a ``Pattern`` at a surface point: the mixing weight in [0, 1] of a material's two colours.
 
-    Coordinates and the pixel's footprint are in metres, the frequency in periods a metre.
+    Coordinates and the pixel's footprint are in metres, the frequency is in periods per metre.
     """
     width = footprint * frequency
     u = x * frequency

@@ -1,7 +1,8 @@
-"""Which views of a scene are taken: one record (``SceneSample``), three ways to choose.
+"""View selection: the views of a scene (``SceneSample``) and three ways to choose them.
 
-``sampling`` draws for training, ``even`` spreads for evaluation during training (``data.eval_*``), ``drawn`` draws or
-reads an index for ``vg2gt evaluate`` (``evaluation.selection``).
+``sampling`` draws training views, ``even`` chooses evenly spaced views for evaluation during training
+(``data.eval_*``), and ``drawn`` draws views or reads them from an index for ``vg2gt evaluate``
+(``evaluation.selection``).
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ class SceneSample:
         scene: the scene's name.
         context: frame ids of the input views; the first is the anchor, whose camera becomes the world frame.
         target: frame ids of the held-out views, disjoint from ``context``.
-        framing: size, zoom and window drawn for the scene; None: as in evaluation.
+        framing: size, zoom and crop window drawn for the scene; None: the fixed framing of evaluation.
     """
 
     scene: str
@@ -29,5 +30,5 @@ class SceneSample:
 
     @property
     def frames(self) -> tuple[int, ...]:
-        """All frame ids, in the order in which a batch holds them."""
+        """All frame ids, in the order of the batch."""
         return (*self.context, *self.target)

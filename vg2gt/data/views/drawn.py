@@ -1,9 +1,9 @@
-"""Which views of a scene an evaluation takes: drawn from a seed, or read from a committed index.
+"""Evaluation views, drawn from a seed or read from an index file.
 
-All data sets of the paper are sequences, so views are drawn from a limited range of consecutive frames (paper, appendix
-A.2); DTU's three views are fixed. What is drawn depends on the seed, the scene's name, its frames and the number of
-views alone. An index is a JSON file with the frame ids that a draw gave, so that figures can be reproduced whatever
-becomes of the draw.
+All datasets of the paper are sequences, so views are drawn from a limited range of consecutive frames (paper, appendix
+A.2); the three views of DTU are fixed. A draw depends only on the seed, the scene's name, its frames and the number of
+views. An index is a JSON file with the frame ids of a draw, so that results stay reproducible if the sampling code
+changes.
 """
 
 from __future__ import annotations
@@ -28,18 +28,19 @@ INDICES = Path(__file__).resolve().parent / "indices"
 
 @dataclass(frozen=True)
 class ViewSelection:
-    """Chooses the input and the held-out views of evaluation scenes.
+    """Selects input and held-out views of evaluation scenes.
 
     Args:
-        index: name of a committed index, or a JSON file; scenes and numbers of views that it lacks are drawn. None:
-            all are drawn.
-        targets: held-out views of a sample, as many as there are at most.
+        index: name of a packaged index, or path of a JSON file. Scenes and view counts that it lacks are drawn. None:
+            draw all.
+        targets: maximum number of held-out views per sample.
         spread: N input views and their targets are drawn from ``spread * N`` consecutive frames.
-        seed: of the draw.
-        fixed: frame ids of the input views for some numbers of views, such as ``{3: [23, 24, 33]}``.
+        seed: random seed of the draw.
+        fixed: frame ids of the input views by number of views, such as ``{3: [23, 24, 33]}``.
 
     Raises:
-        ValueError: if a number is out of range or a fixed choice has another number of frames than it says.
+        ValueError: if a number is out of range, or if an entry of ``fixed`` does not list as many distinct frames as
+            its key says.
     """
 
     index: str | None = None
@@ -59,11 +60,11 @@ class ViewSelection:
                 raise ValueError(f"evaluation.selection.fixed names {list(frames)} for {count} views")
 
     def choose(self, source: SceneSource, scenes: Sequence[str], count: int) -> list[SceneSample]:
-        """The samples of ``count`` input views, one per scene.
+        """Returns one sample of ``count`` input views per scene.
 
         Raises:
-            DataError: if a scene has too few frames, lacks one that the index or ``fixed`` names, or if the index names
-                another number of input views, a frame twice or an input view as target.
+            DataError: if a scene has too few frames or lacks a frame of the index or ``fixed``, or if an entry of the
+                index has a different number of input views or a repeated frame.
         """
         stored = read_index(self.index)
         chosen = [_stored_views(stored, scene, count) or self.draw(source, scene, count) for scene in scenes]
@@ -78,10 +79,10 @@ class ViewSelection:
         return chosen
 
     def draw(self, source: SceneSource, scene: str, count: int) -> SceneSample:
-        """Draws the views of a scene, in the order in which they were taken.
+        """Draws the views of a scene, in capture order.
 
-        The range begins anywhere in the scene. Targets are frames that the source holds out, or, if it holds none out,
-        any that are left; both between the first and the last input view where there are some.
+        The range of frames starts at a random position. Targets are drawn from the frames that the source holds out or,
+        if there are none, from the remaining frames; preferably between the first and the last input view.
 
         Raises:
             DataError: if the scene has fewer than ``count`` frames that are not held out.
@@ -106,7 +107,7 @@ class ViewSelection:
     def _window(
         self, frames: list[int], held_out: set[int], scene: str, count: int, rng: np.random.Generator
     ) -> list[int]:
-        """Consecutive frames, ``spread * count`` of them or as many more as the views and one held-out frame need."""
+        """Returns ``spread * count`` consecutive frames, or more if the inputs and one held-out frame need it."""
         available = [frame for frame in frames if frame not in held_out]
         if len(available) < count:
             raise DataError(
@@ -128,17 +129,17 @@ class ViewSelection:
 
 
 def index_path(name: str) -> Path:
-    """The file of an index: one of the package's by name, or any by its path."""
+    """Returns the file of an index, given the name of a packaged index or a path ending in ``.json``."""
     return Path(name).expanduser() if name.endswith(".json") else INDICES / f"{name}.json"
 
 
 def read_index(name: str | None) -> Mapping[str, Mapping[str, Any]]:
-    """The scenes of an index: scene -> number of views -> ``context`` and ``target`` frame ids; empty for None.
+    """Reads an index: scene -> number of views -> ``context`` and ``target`` frame ids; empty if ``name`` is None.
 
-    Indices of pixelSplat and its successors (scene -> ``context``, ``target``, or null) are read too.
+    Also reads the indices of pixelSplat and its successors (scene -> ``context`` and ``target``, or null).
 
     Raises:
-        FileNotFoundError: if there is no such index, naming those there are.
+        FileNotFoundError: if the index does not exist; the message lists the packaged ones.
         ValueError: if the file is not an index.
     """
     if name is None:
@@ -160,7 +161,7 @@ def read_index(name: str | None) -> Mapping[str, Mapping[str, Any]]:
 
 
 def make_index(selection: ViewSelection, source: SceneSource, scenes: Sequence[str], counts: Sequence[int]) -> dict:
-    """The content of an index file: what ``selection`` draws for some scenes and numbers of views."""
+    """Returns the content of an index file: the views that ``selection`` draws for each scene and number of views."""
     drawn = {scene: {count: selection.draw(source, scene, count) for count in sorted(counts)} for scene in scenes}
     return {
         "seed": selection.seed,

@@ -1,4 +1,4 @@
-"""Which views of a scene are the input and which are scored in evaluation. No randomness: always the same views."""
+"""Evenly spaced input and target views for evaluation during training. Deterministic."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ class EvaluationViews:
     """Chooses context and target views of evaluation scenes.
 
     Args:
-        context: positions of the input frames in the scene, or their number: then spread evenly over the frames that
-            are not held out.
-        target: positions of the scored frames, or their number: then spread evenly over the source's held-out frames
-            (over all frames between the context views where the source holds none out).
-        window: cut long scenes into stretches of this many consecutive frames, each evaluated on its own; None: the
-            whole scene at once. Only with numbers, not with positions.
+        context: positions of the input frames in the scene, or their number. A number of frames is spread evenly over
+            the frames that are not held out.
+        target: positions of the target frames, or their number. A number of frames is spread evenly over the source's
+            held-out frames, or over all frames that are not context views if it holds none out.
+        window: split long scenes into windows of about this many consecutive frames and evaluate each separately;
+            None: the whole scene at once. Requires numbers, not positions, in ``context`` and ``target``.
     """
 
     context: int | Sequence[int] = 8
@@ -36,7 +36,8 @@ class EvaluationViews:
         """Returns the evaluation samples of one scene.
 
         Raises:
-            DataError: if the scene lacks a frame that was named, or has no frame for the context.
+            DataError: if a position is out of range, no frame is left for the context, or a frame is both context and
+                target.
         """
         frames, held_out = list(source.frames(scene)), set(source.held_out(scene))
         if self.window is None:
@@ -66,7 +67,7 @@ class EvaluationViews:
 
 
 def _spread(frames: list[int], count: int) -> list[int]:
-    """``count`` frames evenly spread over ``frames`` (all of them if there are fewer), both ends included."""
+    """Returns ``count`` evenly spaced frames, both ends included; all of them if there are fewer."""
     if count >= len(frames):
         return frames
     if count == 0:

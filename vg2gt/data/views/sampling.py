@@ -1,7 +1,7 @@
-"""Which scenes and frames a training step sees: a pure function of the seed and the step's number.
+"""Sampling of training scenes and frames, as a pure function of the seed and the step number.
 
-Nothing is remembered between steps, so a resumed run goes on with the samples that the uninterrupted run would have
-seen, and the number of loader workers or their prefetching changes nothing.
+No state is kept between steps. A resumed run therefore continues with the same samples as an uninterrupted one, and
+the number of loader workers and their prefetching do not matter.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ class ViewSampler:
     """Draws the scenes and views of a training step (paper, Implementation Details: 3 to 18 views).
 
     Args:
-        min_views: fewest context views.
-        max_views: most context views.
-        max_images: context images in a step and on one device: a step with N views holds ``max_images // N`` scenes;
-            at least ``max_views``.
+        min_views: minimum number of context views.
+        max_views: maximum number of context views.
+        max_images: context images per step and device, at least ``max_views``; a step with N views holds
+            ``max_images // N`` scenes.
         expand_ratio: the views are drawn from a window of ``expand_ratio * N`` consecutive frames.
-        target_views: held-out views drawn from the same window, in addition.
+        target_views: number of held-out views drawn from the same window, in addition.
         seed: seeds every draw.
-        view_sets: every scene's views come from this many fixed draws, so that what a frozen backbone makes of them
-            can be kept (``backends.cache``); None draws again at every step.
+        view_sets: number of fixed view draws per scene, so that the outputs of a frozen backbone can be cached
+            (``backends.cache``); None: new draws at every step.
     """
 
     min_views: int = 3
@@ -68,23 +68,23 @@ class ViewSampler:
 
     @property
     def frames_needed(self) -> int:
-        """Frames a scene must have for every step to be able to use it."""
+        """Minimum number of frames of a scene: enough for the largest step."""
         return self.max_views + self.target_views
 
     def num_views(self, step: int) -> int:
-        """Context views of a step, the same on every device."""
+        """Returns the number of context views of a step, the same on every device."""
         return int(self._rng(_VIEWS, step).integers(self.min_views, self.max_views + 1))
 
     def num_scenes(self, step: int) -> int:
-        """Scenes of a step on one device."""
+        """Returns the number of scenes per device in a step."""
         return self.max_images // self.num_views(step)
 
     def slots(self, step: int, rank: int = 0, world_size: int = 1) -> range:
-        """A step's places in the endless row of scenes (``ScenePool.scene``), one for each of its scenes.
+        """Returns the places of a step's scenes in the infinite scene sequence (``ScenePool.scene``).
 
-        Every step and device owns a fixed stretch of the row, long enough for a step of ``min_views``; one of more
-        views leaves the rest of its stretch out. So where the number of views is fixed, all scenes come equally often;
-        where it varies, they do in expectation.
+        Every step and device owns a fixed stretch of the sequence, long enough for a step with ``min_views`` views. A
+        step with more views has fewer scenes and skips the rest of its stretch. All scenes are therefore drawn equally
+        often if the number of views is fixed, and in expectation if it varies.
         """
         reserved = self.max_images // self.min_views
         first = (step * world_size + rank) * reserved
@@ -94,10 +94,10 @@ class ViewSampler:
         """Draws the views of one scene: an anchor, then distinct frames from a window around it.
 
         Args:
-            step: number of the training step.
+            step: training step.
             scene: the scene's name.
-            frames: ids of its frames in the order in which they were taken, at least ``frames_needed``.
-            slot: number of the scene in the step over all devices.
+            frames: ids of its frames in capture order, at least ``frames_needed``.
+            slot: index of the scene within the step, over all devices.
         """
         rng = self._rng(_FRAMES, step, slot)
         if self.view_sets is not None:
@@ -118,16 +118,16 @@ class ViewSampler:
 
 @dataclass(frozen=True)
 class ScenePool:
-    """An endless row of scenes from one or several parts; what is at a place is a function of seed and place.
+    """Infinite shuffled sequence of scenes from one or several parts, with random access by place.
 
-    The row is cut into blocks of ``sum(shares)`` places. Every block holds ``shares[k]`` scenes of part k in an order
-    of its own, so any stretch of whole blocks holds the parts exactly in their shares. The scenes of a part come in
-    shuffled passes, each scene once in a pass.
+    The sequence consists of blocks of ``sum(shares)`` places. Every block holds ``shares[k]`` scenes of part k, in its
+    own random order, so that whole blocks hold the parts in exactly these proportions. The scenes of a part come in
+    shuffled passes, each scene once per pass.
 
     Attributes:
         parts: scene names of every part.
-        shares: places of every part in a block.
-        seed: seeds both orders.
+        shares: number of places of every part in a block.
+        seed: seeds the order of blocks and passes.
     """
 
     parts: tuple[tuple[str, ...], ...]
@@ -135,7 +135,7 @@ class ScenePool:
     seed: int = 0
 
     def scene(self, place: int) -> str:
-        """The scene at a place of the row."""
+        """Returns the scene at a place of the sequence."""
         block, inside = divmod(place, sum(self.shares))
         order = _block(self.seed, block, self.shares)
         part = int(order[inside])
@@ -157,12 +157,12 @@ def _block(seed: int, block: int, shares: tuple[int, ...]) -> np.ndarray:
 
 
 def scene_pool(source: SceneSource, scenes: Sequence[str], seed: int = 0) -> ScenePool:
-    """The row from which training draws: one part, or a mixture's parts in proportion to their weights.
+    """Returns the scene sequence of training, with the parts of a mixture in proportion to their weights.
 
     Args:
-        source: the training scenes; says which parts there are and what they weigh.
-        scenes: names of those that are used; parts without any have no place in the row.
-        seed: seeds the row.
+        source: the training scenes, which define the parts and their weights.
+        scenes: names of the scenes to use; parts without any are left out.
+        seed: seeds the sequence.
     """
     grouped: dict[str, list[str]] = {part: [] for part in source.parts()}
     for scene in scenes:
@@ -175,10 +175,10 @@ def scene_pool(source: SceneSource, scenes: Sequence[str], seed: int = 0) -> Sce
 
 
 def shares(weights: Mapping[str, float]) -> tuple[int, ...]:
-    """The smallest whole numbers in exactly the proportions of positive decimal weights.
+    """Returns the smallest integers in the exact proportions of positive decimal weights.
 
     Raises:
-        ValueError: if the weights have so many digits that the numbers become huge.
+        ValueError: if the weights have too many digits, so that the integers sum to more than 100 000.
     """
     exact = [Fraction(str(weight)) for weight in weights.values()]
     scale = lcm(*(weight.denominator for weight in exact))
@@ -190,17 +190,17 @@ def shares(weights: Mapping[str, float]) -> tuple[int, ...]:
 
 
 def usable_scenes(source: SceneSource, sampler: ViewSampler, limit: int | None) -> list[str]:
-    """Training scenes with enough frames for every step; the others are counted in a log line.
+    """Returns the training scenes that have enough frames for every step.
 
-    A scene that cannot be indexed is left out with a warning that names it.
+    Logs how many scenes are too short, and warns about every scene that cannot be indexed.
 
     Args:
         source: the training scenes.
-        sampler: says how many frames are enough.
+        sampler: defines the required number of frames.
         limit: use at most this many of the source's first scenes; None: all.
 
     Raises:
-        DataError: if none is left, or none of a mixture's part.
+        DataError: if no scene is left, or none of some part of a mixture.
     """
     scenes = list(source.scenes)[:limit]
     lengths: dict[str, int] = {}
@@ -246,17 +246,17 @@ def _nothing_usable(
 
 @dataclass(eq=False)
 class StepSampler(Sampler[tuple[SceneSample, ...]]):
-    """Yields, step after step, the views of one device's batch, and how they are framed.
+    """Yields the views of one device's batch, with their framing, step by step.
 
     Args:
         source: the training scenes.
-        scenes: names of those that are used.
+        scenes: names of the scenes to use.
         views: draws the views.
-        steps: steps in an epoch.
-        start_step: returns the number of the first step, asked whenever an iteration begins; the iteration ends with
-            the epoch that holds this step.
-        rank: number of this device.
-        world_size: devices.
+        steps: steps per epoch.
+        start_step: returns the number of the first step; called at the start of every iteration, which ends with the
+            epoch that contains this step.
+        rank: index of this device.
+        world_size: number of devices.
         framing: draws sizes and crops; None: nothing is drawn.
     """
 
@@ -281,7 +281,7 @@ class StepSampler(Sampler[tuple[SceneSample, ...]]):
             yield self.step(step)
 
     def step(self, step: int) -> tuple[SceneSample, ...]:
-        """The views of one step, one entry per scene, all with equally many views."""
+        """Returns the views of one step: one entry per scene, all with the same number of views."""
         places = self.views.slots(step, self.rank, self.world_size)
         scenes = [self.pool.scene(place) for place in places]
         first = self.rank * len(scenes)

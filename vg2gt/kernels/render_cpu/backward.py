@@ -1,9 +1,9 @@
-"""Compiled backward pass over tiles: the forward visit again, each (tile, Gaussian) leaving one row of gradients.
+"""Compiled backward pass over tiles: repeats the forward traversal and writes one gradient row per (tile, Gaussian).
 
-Gradients are polynomials in the pixel's offset (dx, dy) with per-pixel factors, summed a lane over blocks of 4 x 4.
+Gradients are polynomials in the pixel's offset (dx, dy) with per-pixel factors, summed per lane over 4 x 4 blocks.
 """
 
-# Written for the compiler: flat bodies, short names from rendering/projection.py's formulas.
+# Written for the compiler: flat bodies; short names follow the formulas in rendering/projection.py.
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def _load_gradients(
     state, x_tile, y_tile, columns, rows, geometry, color, normal, depth, transmittance,
     grad_color, grad_normal, grad_alpha, grad_solid, grad_expected, grad_crossing,
 ):  # fmt: skip
-    """Fills the planes of the incoming gradients; REST is their product with everything a ray has yet to meet."""
+    """Loads the incoming gradients; REST is their product with all contributions still ahead on the ray."""
     for y in range(rows):
         for x in range(columns):
             k = place_of(y, x)
@@ -62,7 +62,7 @@ def _load_gradients(
 
 @kernel_part(fastmath=SUMS, error_model="numpy")
 def _reduce_color(sums, g, row):
-    """Sums the lanes of one (tile, Gaussian) into its gradient row, the part that colour and alpha need."""
+    """Sums the lanes of one (tile, Gaussian) into its gradient row: the terms of colour and alpha."""
     gx = gxx = gxy = gy = gyy = gs = gsx = gsy = gr = go = k0 = k1 = k2 = ZERO * g[0]
     for lane in range(LANES):
         v = np.uintp(lane)
@@ -90,7 +90,7 @@ def _reduce_color(sums, g, row):
 
 @kernel_part(fastmath=SUMS, error_model="numpy")
 def _reduce_geometry(sums, row):
-    """Adds what depth and normal need to a gradient row."""
+    """Adds the terms of depth and normal to a gradient row."""
     gz = gp = m0 = m1 = m2 = ZERO * row[0]
     for lane in range(LANES):
         v = np.uintp(lane)
@@ -105,13 +105,13 @@ def _reduce_geometry(sums, row):
 
 
 def _make_backward_tile(geometry: bool, solid: bool) -> Callable[..., None]:
-    """Compiles the visit of a tile with or without what depth and normals need: within it these are constants."""
+    """Compiles the backward pass of one tile; ``geometry`` (depth and normals) and ``solid`` are constants in it."""
 
     @kernel_part(fastmath=FAST, error_model="numpy")
     def backward_tile(
         records, colors, boxes, members, places, x_tile, y_tile, parameters, state, sums, staged, spans, rows
     ):
-        """Visits a tile's Gaussians front to back again and writes one gradient row for each, at its place."""
+        """Visits a tile's Gaussians front to back again and writes the gradient row of each, at its ``places``."""
         alpha_max, stop = parameters[0], parameters[1]
         alive = 0
         visited = len(members)
@@ -123,7 +123,7 @@ def _make_backward_tile(geometry: bool, solid: bool) -> Callable[..., None]:
                     visited = p
                     break
                 stage(records, colors, boxes, members[p : p + STAGED], x_tile, y_tile, staged, spans)
-                for q in range(p, min(p + STAGED, len(members))):  # brings their rows near, all at once
+                for q in range(p, min(p + STAGED, len(members))):  # zeroes their rows, which also prefetches them
                     row = rows[places[q]]
                     for i in range(ROW):
                         row[i] = ZERO
@@ -144,6 +144,7 @@ def _make_backward_tile(geometry: bool, solid: bool) -> Callable[..., None]:
                     for lane in range(LANES):
                         v = np.uintp(lane)
                         k = base + v
+                        # response and alpha, as in the forward pass
                         dx = left + np.float32(np.int32(lane) & COLUMN)
                         dy = top + np.float32(np.int32(lane) >> ROW_BITS)
                         before = state[k]
@@ -155,6 +156,7 @@ def _make_backward_tile(geometry: bool, solid: bool) -> Callable[..., None]:
                         alpha, after, state[k] = attenuate(exponent, on, before, opacity, alpha_max, stop)
                         kept = alpha > ZERO
                         weight = alpha * before
+                        # gradient of alpha: this Gaussian's value against everything behind it
                         g0, g1, g2 = state[k + planes.G0], state[k + planes.G1], state[k + planes.G2]
                         value = g0 * c0 + g1 * c1 + g2 * c2
                         if geometry:
@@ -186,6 +188,7 @@ def _make_backward_tile(geometry: bool, solid: bool) -> Callable[..., None]:
                             crossing = (before > HALF) & (after <= HALF)
                             gt = weight * toward + (state[k + planes.GM] if crossing else ZERO)
                             gt = gt if kept else ZERO
+                        # chain rule to the response, then sums over the block
                         ga = slack * alpha if (kept & (alpha < alpha_max)) else ZERO
                         gd = -HALF * ga
                         gr = -gd * e * inverse * inverse
@@ -226,14 +229,14 @@ def _make_backward_tile(geometry: bool, solid: bool) -> Callable[..., None]:
     return backward_tile
 
 
-# By these names, not through a closure: numba could not find again what a closure with a kernel in it was compiled to.
+# Module globals, not closure variables: numba's cache never finds a kernel whose closure holds another kernel.
 _backward_color = _make_backward_tile(False, False)
 _backward_rasterized = _make_backward_tile(True, False)
 _backward_solid = _make_backward_tile(True, True)
 
 
 def _make_backward_tiles(geometry: bool, solid: bool) -> Callable[..., None]:
-    """Compiles the backward pass over tiles for what :mod:`vg2gt.kernels.render_cpu.forward` rendered."""
+    """Compiles the backward pass over tiles of :mod:`vg2gt.kernels.render_cpu.forward`."""
 
     @kernel(fastmath=FAST, error_model="numpy", nogil=True)
     def backward_tiles(
@@ -241,7 +244,7 @@ def _make_backward_tiles(geometry: bool, solid: bool) -> Callable[..., None]:
         color, normal, depth, transmittance,
         grad_color, grad_normal, grad_alpha, grad_solid, grad_expected, grad_crossing, rows,
     ):  # fmt: skip
-        """Gradient rows of the tiles ``tiles[0] .. tiles[1] - 1`` of one view."""
+        """Writes the gradient rows of tiles ``tiles[0] .. tiles[1] - 1`` of one view."""
         height, width = transmittance.shape
         across = -(-width // TILE)
         for tile in range(tiles[0], tiles[1]):

@@ -1,13 +1,13 @@
 """Compiled forward pass over tiles of 16 x 16 pixels.
 
-A tile's Gaussians are visited front to back; each touches some of the tile's blocks of 4 x 4 pixels, and a block is one
-vector operation. All state of a tile lies in planes of one flat scratch array, whose constant offsets let the compiler
-vectorise. Rays are stopped by the sign of their transmittance. For the median depth every block keeps the hits of its
-rays, a hit for all 16 at once, with opacity 0 where a ray is not touched. Kernels are generic in the dtype: constants
-exact in float32 do not change the type they meet, others come in as an array.
+A tile's Gaussians are visited front to back. Each touches some of the tile's blocks of 4 x 4 pixels; a block is one
+vector operation. The state of a tile lies in planes of one flat scratch array, whose constant offsets let the compiler
+vectorise. A stopped ray has a negative transmittance. For the median depth, every block stores the hits of its rays:
+one entry for all 16 rays, with opacity 0 for those that are not hit. Kernels are generic in the dtype: constants that
+are exact in float32 do not change the dtype of results; all others are passed in an array.
 """
 
-# Written for the compiler: flat bodies, short names from rendering/projection.py's formulas.
+# Written for the compiler: flat bodies; short names follow the formulas in rendering/projection.py.
 
 from __future__ import annotations
 
@@ -43,11 +43,11 @@ from vg2gt.kernels.render_cpu.tiles import (
 
 
 def _make_blend_tile(geometry: bool, solid: bool) -> Callable[..., Any]:
-    """Compiles the blending of a tile with or without depth and normals: within it these are constants."""
+    """Compiles the blending of one tile; ``geometry`` (depth and normals) and ``solid`` are constants in it."""
 
     @kernel_part(fastmath=FAST, error_model="numpy")
     def blend_tile(records, colors, boxes, members, x_tile, y_tile, parameters, state, hits, counts, staged, spans):
-        """Blends one tile front to back; leaves the numbers of hits that the blocks had for the depth solver."""
+        """Blends one tile front to back; ``counts`` receives each block's number of hits for the depth solver."""
         alpha_max, stop, negligible = parameters[0], parameters[1], parameters[4]
         capacity = len(hits) // (BLOCKS * HIT_SIZE)
         alive = 0
@@ -104,7 +104,7 @@ def _make_blend_tile(geometry: bool, solid: bool) -> Callable[..., Any]:
                                 lo, thin = state[k + planes.LO], state[k + planes.THIN]
                                 state[k + planes.LO] = min(lo, peak if alpha > ZERO else BIG)
                                 state[k + planes.THIN] = min(thin, precision if alpha > ZERO else BIG)
-                                # the median is in front of HI: a hit that begins far behind does not matter to it
+                                # the median is in front of HI: a hit that begins far behind HI does not affect it
                                 early = before > QUARTER
                                 hi = state[k + planes.HI]
                                 hi = max(hi, peak if early & (alpha > ZERO) else ZERO)
@@ -112,7 +112,7 @@ def _make_blend_tile(geometry: bool, solid: bool) -> Callable[..., Any]:
                                 beyond = peak - hi
                                 near_enough = (beyond <= ZERO) | (precision * beyond * beyond <= negligible)
                                 matters = (alpha > ZERO) & (early | near_enough)
-                                # what does not matter is overwritten by the next hit
+                                # an entry that does not matter is overwritten by the next hit
                                 to = place + np.uintp(lane)
                                 hits[to] = alpha if matters else ZERO
                                 hits[to + planes.HIT_PEAK] = peak
@@ -127,7 +127,7 @@ def _make_blend_tile(geometry: bool, solid: bool) -> Callable[..., Any]:
 
 @kernel_part(fastmath=FAST, error_model="numpy")
 def _transmit(state, hits, first, count, base):
-    """At the depths in plane MEDIAN squared transmittance, NUM / DEN, and its slope ``-d ln T^2 / dt``, into MEAN."""
+    """Computes T^2 = NUM / DEN at the depths in plane MEDIAN; its slope ``-d ln T^2 / dt`` goes to plane MEAN."""
     for lane in range(LANES):
         k = base + np.uintp(lane)
         state[k + planes.NUM] = ONE
@@ -149,7 +149,7 @@ def _transmit(state, hits, first, count, base):
 
 @kernel_part(fastmath=FAST, error_model="numpy")
 def _bracket(state, hits, first, count, base, median_max, near, newton):
-    """Begins a block's search: LO and HI on both sides of the median, MEDIAN a guess, MOVING where one is sought."""
+    """Initialises a block's search: the bracket LO to HI, the guess MEDIAN, and MOVING = 1 where a median is sought."""
     cut = ZERO * near
     for lane in range(LANES):
         k = base + np.uintp(lane)
@@ -166,7 +166,7 @@ def _bracket(state, hits, first, count, base, median_max, near, newton):
         state[k + planes.MOVING] = ONE if wanted else ZERO
     if cut == ZERO:
         return
-    for lane in range(LANES):  # something begins in front of the near plane: half of the ray may end there
+    for lane in range(LANES):  # the near plane cuts a bracket: drop rays whose median lies in front of it
         k = base + np.uintp(lane)
         state[k + planes.LAST], state[k + planes.MEDIAN] = state[k + planes.MEDIAN], state[k + planes.LO]
     _transmit(state, hits, first, count, base)
@@ -179,7 +179,7 @@ def _bracket(state, hits, first, count, base, median_max, near, newton):
 
 @kernel_part(fastmath=FAST, error_model="numpy")
 def _solve(state, hits, block, count, parameters, steps, newton):
-    """Median depth of a block's rays into plane MEDIAN (0: none), its slope S into MEAN; ends where nothing moves."""
+    """Writes the median depth of a block's rays (0: none) to plane MEDIAN, its slope S to MEAN; stops if converged."""
     tolerance = parameters[5]
     base, first = np.uintp(block * LANES), block * (len(hits) // (BLOCKS * HIT_SIZE))
     _bracket(state, hits, first, count, base, parameters[2], parameters[3], newton)
@@ -195,7 +195,7 @@ def _solve(state, hits, block, count, parameters, steps, newton):
             num, den, slope = FOUR * state[k + planes.NUM], state[k + planes.DEN], state[k + planes.MEAN]
             lo, middle, hi = state[k + planes.LO], state[k + planes.MEDIAN], state[k + planes.HI]
             lo, hi = (middle, hi) if num > den else (lo, middle)
-            # Newton's step for ln T^2, whose logarithm 2 (num - den) / (num + den) equals to the third order
+            # Newton step; ln(num / den) is 2 (num - den) / (num + den) up to third-order terms
             aim = middle + TWO * (num - den) / ((num + den) * (slope if slope > ZERO else ONE))
             good = newton & (slope > ZERO) & (aim >= lo) & (aim <= hi)
             good &= abs(aim - middle) <= HALF * state[k + planes.LAST]
@@ -216,21 +216,24 @@ def _solve(state, hits, block, count, parameters, steps, newton):
         state[k + planes.MEAN] = slope if sought else ZERO
 
 
-# By these names, not through a closure: numba could not find again what a closure with a kernel in it was compiled to.
+# Module globals, not closure variables: numba's cache never finds a kernel whose closure holds another kernel.
 _blend_color = _make_blend_tile(False, False)
 _blend_rasterized = _make_blend_tile(True, False)
 _blend_solid = _make_blend_tile(True, True)
 
 
 def _make_forward_tiles(geometry: bool, solid: bool) -> Callable[..., int]:
-    """Compiles the rendering of tiles, for colour alone, or with normals and the one or the other depth."""
+    """Compiles the forward pass over tiles; ``geometry`` (depth and normals) and ``solid`` are constants in it."""
 
     @kernel(fastmath=FAST, error_model="numpy", nogil=True)
     def forward_tiles(
         records, boxes, colors, members, starts, tiles, expected, steps, newton, parameters, background,
         state, hits, counts, staged, spans, color, normal, depth, slope, transmittance,
     ):  # fmt: skip
-        """Renders tiles ``tiles[0]`` to ``tiles[1]`` of one view; returns the first for which ``hits`` were too few."""
+        """Renders tiles ``tiles[0] .. tiles[1] - 1`` of one view.
+
+        Stops at a tile that overflows ``hits``; returns that tile, or ``tiles[1]``.
+        """
         height, width = depth.shape
         across = -(-width // TILE)
         for tile in range(tiles[0], tiles[1]):
@@ -254,7 +257,7 @@ def _make_forward_tiles(geometry: bool, solid: bool) -> Callable[..., int]:
                 most = 0
                 for block in range(BLOCKS):
                     most = max(most, counts[block])
-                if (most + 1) * HIT_SIZE * BLOCKS > len(hits):  # what does not matter takes the place behind the last
+                if (most + 1) * HIT_SIZE * BLOCKS > len(hits):  # one spare entry for hits that do not matter
                     return tile
                 for block in range(BLOCKS):
                     _solve(state, hits, block, counts[block], parameters, steps, newton)

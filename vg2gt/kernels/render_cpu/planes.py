@@ -1,4 +1,4 @@
-"""Where things lie in a tile's flat scratch arrays: constants, so that the compiler knows that they do not overlap."""
+"""Offsets into a tile's flat scratch arrays: constants, so that the compiler knows that planes do not overlap."""
 
 import numpy as np
 

@@ -11,7 +11,7 @@ import numpy as np
 from vg2gt.kernels.compiled import kernel, kernel_part
 from vg2gt.kernels.constants import ALPHA_MIN, FAST, JACOBIAN_CLAMP
 
-BLOCK = 2048  # Gaussians a work item; fixed, because camera gradients are summed block by block
+BLOCK = 2048  # Gaussians per work item; fixed, because camera gradients are summed block by block
 
 
 @kernel_part(fastmath=FAST, error_model="numpy", forceinline=True)
@@ -49,6 +49,7 @@ def project_block(
         us, vs = u, v
         if not solid:
             us, vs = min(max(u, -x_limit), x_limit), min(max(v, -y_limit), y_limit)
+        # screen covariance, inverse variance a0 along the ray, and L m, axis by axis
         xx, xy, yy = lowpass, 0.0, lowpass
         a0 = l0 = l1 = l2 = 0.0
         for k in range(3):
@@ -80,6 +81,7 @@ def project_block(
         if solid:
             q0, q1, eps = l0 / (fx * a0), l1 / (fy * a0), 1 / (z * z * a0)
         cutoff = 2 * math.log(opacity / ALPHA_MIN)
+        # bounding box of the pixels with alpha >= 1/255
         k = 1 - cutoff * eps
         box_xx, box_xy, box_yy = k * qa - cutoff * q0 * q0, k * qb - cutoff * q0 * q1, k * qc - cutoff * q1 * q1
         box_det = box_xx * box_yy - box_xy * box_xy
@@ -105,5 +107,5 @@ def project_block(
 
 @kernel_part(fastmath=FAST, error_model="numpy", forceinline=True)
 def whiten(b0, b1, b2, scale, fx, fy, u, v, us, vs, iz):
-    """One axis of a Gaussian: its Jacobian row pair, and its component of the ray in units of the axis's length."""
+    """Returns two Jacobian entries of one axis of a Gaussian, and the ray's component along it in axis lengths."""
     return scale * fx * (b0 - us * b2) * iz, scale * fy * (b1 - vs * b2) * iz, (b0 * u + b1 * v + b2) / scale

@@ -1,6 +1,6 @@
-"""Compiled backward pass of the projection, in float64: a view's screen gradients chained to Gaussians and camera.
+"""Compiled backward pass of the projection, in float64: chains a view's screen gradients to Gaussians and camera.
 
-Gaussians' parameters and summed gradient rows are laid side by side, so that the chain is one vector loop.
+Parameters and summed gradient rows are stored as a structure of arrays, so that the chain is one vector loop.
 """
 
 # The kernels are written for the compiler: scalars instead of small arrays.
@@ -15,16 +15,16 @@ from vg2gt.kernels.compiled import kernel, kernel_part
 from vg2gt.kernels.constants import FAST, JACOBIAN_CLAMP
 from vg2gt.kernels.render_cpu.projection import BLOCK, rotation, whiten
 
-CHUNK = 64  # Gaussians taken at a time
-FIELDS = 52  # of CHUNK values: what the chain reads and what it writes
+CHUNK = 64  # Gaussians processed at a time
+FIELDS = 52  # arrays of CHUNK values that the chain reads and writes
 MEAN, QUAT, SCALE, ROW = (np.uintp(j * CHUNK) for j in (0, 3, 7, 10))
 GRAD_MEAN, GRAD_QUAT, GRAD_SCALE, CAMERA = (np.uintp(j * CHUNK) for j in (26, 29, 33, 36))
-VECTOR = 8  # the chain's loop is as long as a multiple of this, so that nothing of it remains for a scalar loop
+VECTOR = 8  # the chain's loop length is a multiple of this, so that no scalar remainder loop is left
 
 
 @kernel_part(fastmath=FAST, error_model="numpy", forceinline=True)
 def _axis_gradient(b0, b1, b2, scale, fx, fy, u, v, us, vs, iz, jx, jy, h, s_xx, s_xy, s_yy, gl0, gl1, gl2, ga0):
-    """Gradients through one axis: camera-frame axis (3), scale, the Jacobian's products (2) and slopes (2), u, v."""
+    """Returns gradients of one axis: camera-frame axis (3), scale, Jacobian products (2) and slopes (2), u, v."""
     inverse = 1 / scale
     gjx, gjy = 2 * (s_xx * jx + s_xy * jy), 2 * (s_xy * jx + s_yy * jy)
     px, py = gjx * scale * fx * iz, gjy * scale * fy * iz
@@ -39,7 +39,7 @@ def _axis_gradient(b0, b1, b2, scale, fx, fy, u, v, us, vs, iz, jx, jy, h, s_xx,
 
 @kernel_part(fastmath=FAST, error_model="numpy")
 def _gather(begin, end, means, quats, scales, counts, offsets, rows, total, work, indices):
-    """Sums the gradient rows of some Gaussians, in order, and lays those with any side by side; returns how many."""
+    """Sums the gradient rows per Gaussian, in order; packs Gaussians with nonzero sums, and returns their number."""
     found = 0
     for i in range(begin, end):
         if counts[i] == 0:
@@ -69,7 +69,7 @@ def _gather(begin, end, means, quats, scales, counts, offsets, rows, total, work
 
 @kernel_part(fastmath=FAST, error_model="numpy")
 def _chain(work, count, pose, fx, fy, x_limit, y_limit, lowpass, solid):
-    """Gradients of means, quaternions, scales and camera, each Gaussian's; ``solid`` is 1 or 0."""
+    """Writes gradients of means, quaternions, scales and camera, per Gaussian; ``solid`` is 1 or 0."""
     w00, w01, w02, t0 = pose[0, 0], pose[0, 1], pose[0, 2], pose[0, 3]
     w10, w11, w12, t1 = pose[1, 0], pose[1, 1], pose[1, 2], pose[1, 3]
     w20, w21, w22, t2 = pose[2, 0], pose[2, 1], pose[2, 2], pose[2, 3]
@@ -116,12 +116,13 @@ def _chain(work, count, pose, fx, fy, x_limit, y_limit, lowpass, solid):
         s_xx, s_xy, s_yy = -(m00 * qa + m01 * qb), -(m00 * qb + m01 * qc), -(m10 * qb + m11 * qc)
         gu, gv, gz = fx * row0, fy * row1, row7
         gfx, gfy = u * row0, v * row1
-        # only solids tilt with the ray
+        # tilt and a0: only solids depend on them
         ia0 = solid / a0
         gl0, gl1, gl2 = row5 * ifx * ia0, row6 * ify * ia0, 0.0
         ga0 = solid * row8 - (gl0 * l0 + gl1 * l1) * ia0
         gfx -= gl0 * l0 * ifx
         gfy -= gl1 * l1 * ify
+        # normal -L m / |L m|
         length = 1 / math.sqrt(l0 * l0 + l1 * l1 + l2 * l2)
         n0, n1, n2 = -l0 * length, -l1 * length, -l2 * length
         along = row13 * n0 + row14 * n1 + row15 * n2
@@ -191,7 +192,7 @@ def _chain(work, count, pose, fx, fy, x_limit, y_limit, lowpass, solid):
 def _scatter(
     work, indices, count, color_view, grad_means, grad_quats, grad_scales, grad_opacities, grad_colors, camera
 ):
-    """Adds what was chained to the Gaussians' gradients and, in their order, to the camera's."""
+    """Adds the chained gradients to those of the Gaussians and, in the Gaussians' order, of the camera."""
     for found in range(count):
         c, i = np.uintp(found), indices[found]
         for j in range(3):
@@ -211,12 +212,12 @@ def project_backward_block(
     counts, offsets, rows, color_view, total, work, indices,
     grad_means, grad_quats, grad_scales, grad_opacities, grad_colors, grad_cameras,
 ):  # fmt: skip
-    """Sums every Gaussian's gradient rows, in order, and chains them to the 3D parameters (added to) and the camera.
+    """Sums each Gaussian's gradient rows, in order, and chains them to the 3D parameters (accumulated) and the camera.
 
     ``grad_cameras[block]`` receives the gradient of the pose's upper three rows and of fx, fy, cx, cy.
     """
     fx, fy = np.float64(intrinsics[0, 0]), np.float64(intrinsics[1, 1])
-    # without bounds, whatever the field of view, the Jacobian of a solid is not clamped
+    # the Jacobian of a solid is not clamped
     x_limit = math.inf if solid else JACOBIAN_CLAMP * 0.5 * width / fx
     y_limit = math.inf if solid else JACOBIAN_CLAMP * 0.5 * height / fy
     camera = grad_cameras[block]

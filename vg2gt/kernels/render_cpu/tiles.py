@@ -1,4 +1,4 @@
-"""What the compiled tile kernels share: sizes and layout of a tile's memory, and the lists of Gaussians by tile."""
+"""Shared parts of the compiled tile kernels: memory layout of a tile, and lists of Gaussians per tile."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ SIDE = 4  # a block of SIDE x SIDE rays is one vector operation
 BLOCKS_ACROSS = TILE // SIDE
 BLOCKS = BLOCKS_ACROSS**2
 LANES = SIDE**2
-COLUMN, ROW_BITS = np.int32(SIDE - 1), np.int32(SIDE.bit_length() - 1)  # a lane's: lane & COLUMN, lane >> ROW_BITS
+COLUMN, ROW_BITS = np.int32(SIDE - 1), np.int32(SIDE.bit_length() - 1)  # x: lane & COLUMN, y: lane >> ROW_BITS
 PLANE = TILE * TILE
-PLANES = 17  # of PLANE values: the state of a tile
-SUMS_ROWS = 18  # of LANES values: the sums of one Gaussian
+PLANES = 17  # planes of a tile's state
+SUMS_ROWS = 18  # gradient sums of one Gaussian, LANES values each
 HIT_SIZE = 3 * LANES  # one hit of a block's rays: alpha, peak, precision
 STAGED = 16  # Gaussians copied at a time, with their colours
 RECORD = 16  # projected Gaussian: centre 2, conic 3, tilt 2, z, a0, eps, opacity, cutoff, normal 3, unused
@@ -31,7 +31,7 @@ ROW = 16  # gradient of one (tile, Gaussian): centre 2, conic 3, tilt 2, z, a0, 
 
 @intrinsic
 def any_positive(typing_context, values, first):
-    """Whether one of a block's values is positive: one comparison, where the compiler would go through them singly."""
+    """Whether any of a block's values is positive, in one vector comparison; the compiler would use a scalar loop."""
 
     def codegen(context, builder, signature, args):
         array, item = signature.args[0], context.get_data_type(signature.args[0].dtype)
@@ -47,7 +47,7 @@ def any_positive(typing_context, values, first):
 
 @kernel_part(fastmath=FAST, error_model="numpy")
 def alive_blocks(state):
-    """The blocks of which a ray still meets Gaussians, a bit each."""
+    """Returns a bit mask of the blocks in which a ray has not stopped."""
     alive = 0
     for block in range(BLOCKS):
         alive |= np.int64(any_positive(state, np.uintp(block * LANES))) << block  # pyright: ignore[reportCallIssue]
@@ -56,19 +56,19 @@ def alive_blocks(state):
 
 @kernel_part(fastmath=FAST, error_model="numpy")
 def _touched(first, last):
-    """Blocks that pixels ``first .. last - 1`` of a tile's row or column touch, the part beyond the tile left out."""
+    """Returns the range of blocks that pixels ``first .. last - 1`` along one axis touch, clipped to the tile."""
     return max(first, 0) // SIDE, (min(last, TILE) + SIDE - 1) // SIDE
 
 
 @kernel_part(fastmath=FAST, error_model="numpy")
 def place_of(y, x):
-    """Where the ray of a tile's pixel lies in a plane: blocks one after the other, rows of a block likewise."""
+    """Returns the index in a plane of a pixel's ray: block by block, row by row within a block."""
     return np.uintp((y // SIDE * BLOCKS_ACROSS + x // SIDE) * LANES + y % SIDE * SIDE + x % SIDE)
 
 
 @kernel_part(fastmath=FAST, error_model="numpy")
 def stage(records, colors, boxes, members, x_tile, y_tile, staged, spans):
-    """Copies a tile's next Gaussians side by side, so that cache misses overlap: record, colour, blocks touched."""
+    """Copies record, colour and touched blocks of a tile's next Gaussians, so that cache misses overlap."""
     for j in range(len(members)):
         i = np.uintp(members[j])
         for k in range(RECORD):
@@ -81,7 +81,7 @@ def stage(records, colors, boxes, members, x_tile, y_tile, staged, spans):
 
 @kernel_part(fastmath=FAST, error_model="numpy")
 def start_rays(state, columns, rows):
-    """Transmittance 1 in the image's pixels, stopped rays beyond its border."""
+    """Sets transmittance 1 inside the image; rays beyond its border start as stopped."""
     for y in range(TILE):
         for x in range(TILE):
             state[place_of(y, x)] = ONE if (y < rows and x < columns) else -ONE
@@ -89,7 +89,7 @@ def start_rays(state, columns, rows):
 
 @kernel_part(fastmath=FAST, error_model="numpy", forceinline=True)
 def respond(dx, before, g, s_row, e_row, f_row):
-    """A Gaussian's response along a ray (rendering/projection.py): E, 1 + s, r, and whether it counts."""
+    """Returns a Gaussian's response along a ray (rendering/projection.py): E, 1 + s, r, and whether it is a hit."""
     qa, q0, eps, cutoff = g
     e = (qa * dx + f_row) * dx + e_row
     s = q0 * dx + s_row
@@ -99,7 +99,7 @@ def respond(dx, before, g, s_row, e_row, f_row):
 
 @kernel_part(fastmath=FAST, error_model="numpy", forceinline=True)
 def attenuate(exponent, on, before, opacity, alpha_max, stop):
-    """Opacity at the pixel, 0 where the hit does not count or stops the ray; transmittance behind; its next state."""
+    """Returns alpha (0 for no hit, or one that stops the ray), transmittance behind it, and the ray's next state."""
     full = min(opacity * exp(exponent), alpha_max)
     full = full if on else ZERO
     after = before * (ONE - full)
@@ -108,10 +108,10 @@ def attenuate(exponent, on, before, opacity, alpha_max, stop):
 
 
 def depth_order(depths: NDArray) -> NDArray:
-    """Order ``[N]`` of positive depths, front to back, equal ones as they came."""
+    """Returns the stable front-to-back order ``[N]`` of positive depths."""
     if depths.dtype != np.float32:
         return np.argsort(depths, kind="stable")
-    # Bits of positive numbers ascend as they do; with the place below them all keys differ, and any sort is stable.
+    # Bits of positive floats sort like the floats. With the index in the low bits all keys differ: any sort is stable.
     keys = depths.view(np.uint32).astype(np.uint64) << np.uint64(32)
     keys |= np.arange(len(keys), dtype=np.uint64)
     keys.sort()
@@ -120,7 +120,7 @@ def depth_order(depths: NDArray) -> NDArray:
 
 @kernel(error_model="numpy", nogil=True)
 def count_tiles(boxes, across, counts, offsets, starts):
-    """Counts tiles per Gaussian (as offsets in their order) and Gaussians per tile (as list starts)."""
+    """Counts tiles per Gaussian (and prefix sums in ``offsets``) and Gaussians per tile (prefix sums in ``starts``)."""
     for k in range(len(starts)):
         starts[k] = 0
     total = 0
@@ -141,7 +141,7 @@ def count_tiles(boxes, across, counts, offsets, starts):
 
 @kernel(error_model="numpy", nogil=True)
 def fill_tiles(boxes, visible, across, offsets, ends, members, places):
-    """Writes the tiles' lists, front to back, and entries' places among their Gaussian's; ``ends`` begin at starts."""
+    """Writes the tile lists, front to back, and the gradient row of each entry; ``ends`` begin as a copy of starts."""
     for i in visible:
         place = offsets[i]
         x0, x1 = boxes[i, 0] >> TILE_BITS, (boxes[i, 1] - 1) >> TILE_BITS

@@ -1,7 +1,7 @@
-"""Triton kernels that list Gaussians by tile: one entry a (tile, Gaussian), sorted by view, tile and depth."""
+"""Triton kernels that list Gaussians by tile: one entry per (tile, Gaussian), sorted by view, tile and depth."""
 
 # pyright: reportGeneralTypeIssues=false, reportOperatorIssue=false
-# (inside a kernel the operators and ranges are Triton's language, which its type hints do not describe)
+# (Triton's type hints do not cover the operators and ranges used inside kernels)
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import triton.language as tl  # pyright: ignore[reportMissingImports]
 
 from vg2gt.kernels.render_gpu.tiles import RECORD
 
-ENTRIES = 256  # a program
+ENTRIES = 256  # entries per program
 
 _ENTRIES = tl.constexpr(ENTRIES)
 _RECORD = tl.constexpr(RECORD)
@@ -20,9 +20,10 @@ _RECORD = tl.constexpr(RECORD)
 def emit_kernel(
     records, rects, ends, batch, keys, owners, total, views, tiles, across, entries, steps,
 ):  # fmt: skip
-    """Writes every entry's key (view | tile | depth) and slot: a lane an entry, so large Gaussians delay none."""
+    """Writes the key (view | tile | depth) and slot of each entry. One lane per entry: large Gaussians delay none."""
     e = tl.program_id(0) * _ENTRIES + tl.arange(0, _ENTRIES)
     there = e < entries
+    # binary search for the entry's slot
     lo, hi = e * 0, e * 0 + total * views - 1
     step = 0
     while step < steps:
@@ -37,7 +38,7 @@ def emit_kernel(
     columns = tl.load(rects + 2 * slot + 1, mask=there, other=1)
     tile = (tl.load(batch + lo % total) * views + lo // total) * tiles
     tile += first + number // columns * across + number % columns
-    # bits of a positive float32 are ordered as it is
+    # bits of positive float32 values sort like the values
     depth = tl.load(records + slot * _RECORD + 7, mask=there, other=1.0).to(tl.float32).to(tl.int32, bitcast=True)
     tl.store(keys + e, (tile << 32) | depth.to(tl.int64), mask=there)
     tl.store(owners + e, lo, mask=there)
@@ -45,12 +46,13 @@ def emit_kernel(
 
 @triton.jit(do_not_specialize=("entries", "tiles", "steps"))
 def list_kernel(keys, order, owners, members, places, starts, entries, tiles, steps):
-    """Writes every sorted entry's slot and place of its gradient row, and the first entry of each of all tiles."""
+    """Writes the slot and gradient row of each sorted entry, and the first entry of each tile."""
     e = tl.program_id(0) * _ENTRIES + tl.arange(0, _ENTRIES)
     there = e < entries
     place = tl.load(order + e, mask=there, other=0)
     tl.store(places + e, place.to(tl.int32), mask=there)
     tl.store(members + e, tl.load(owners + place, mask=there, other=0), mask=there)
+    # binary search for the first entry of tile e
     if tl.program_id(0) * _ENTRIES <= tiles:
         lo, hi = e * 0, e * 0 + entries
         step = 0

@@ -1,7 +1,7 @@
 """Spherical harmonics inside Triton kernels (values: vg2gt/geometry/spherical_harmonics.py)."""
 
 # pyright: reportGeneralTypeIssues=false, reportOperatorIssue=false
-# (inside a kernel the operators are Triton's language, which its type hints do not describe)
+# (Triton's type hints do not cover the operators used inside kernels)
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _E = tl.constexpr(1.445305721320277)
 
 @triton.jit
 def shade(p, x, y, z, there, degree: tl.constexpr):
-    """One colour channel along unit vectors; ``p`` points to its coefficients, three apart."""
+    """Returns one colour channel along unit vectors; ``p`` points to its coefficients, with stride 3."""
     value = 0.5 + _C0 * tl.load(p, mask=there, other=0.0)
     if degree >= 1:
         value -= _C1 * y * tl.load(p + 3, mask=there, other=0.0)

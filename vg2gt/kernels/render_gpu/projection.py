@@ -1,10 +1,10 @@
-"""Triton kernel that takes Gaussians to views: closed forms of vg2gt/rendering/projection.py.
+"""Triton kernel that projects Gaussians into views (formulas: vg2gt/rendering/projection.py).
 
-A lane is a Gaussian. ``slot = v * total + i`` is Gaussian i in the v-th view of its own scene.
+One lane per Gaussian. ``slot = v * total + i`` is Gaussian i in the v-th view of its own scene.
 """
 
 # pyright: reportGeneralTypeIssues=false, reportOperatorIssue=false
-# (inside a kernel the operators and ranges are Triton's language, which its type hints do not describe)
+# (Triton's type hints do not cover the operators and ranges used inside kernels)
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from vg2gt.kernels.render_gpu.harmonics import shade
 from vg2gt.kernels.render_gpu.tiles import RECORD, TILE
 
 BLOCK = 128
-TINY = 1e-24  # a squared quaternion is taken as this at least, as F.normalize does
-CLAMP = 0.65  # half of options.JACOBIAN_CLAMP
-SLOTS = 1 << 30  # Gaussians times views: their places are int32, and sums of two places must be, too
-# Tiles that a Gaussian counts for which cannot be rendered: the total tells it. No fewer than there can be entries,
-# whose places are int32 up to the end of a block, and few enough that all slots together do not overflow int64.
+TINY = 1e-24  # lower bound of a quaternion's squared norm, as in F.normalize
+CLAMP = 0.65  # half of constants.JACOBIAN_CLAMP
+SLOTS = 1 << 30  # maximum of Gaussians times views: slots are int32, and so are sums of two (binary search)
+# Tile count of a Gaussian that cannot be rendered, which shows in the total. Entries are int32 up to the end of a
+# block, so there are fewer than this. The sum over all slots still fits into int64.
 REFUSED = (1 << 31) - (1 << 10)
 
 _BLOCK = tl.constexpr(BLOCK)
@@ -44,7 +44,7 @@ def rotation(w, x, y, z):
 
 @triton.jit
 def load_pose(p):
-    """Rotation, row by row, and translation of the view whose matrix ``p`` points to."""
+    """Loads rotation, row by row, and translation of the pose matrix that ``p`` points to."""
     return (
         tl.load(p), tl.load(p + 1), tl.load(p + 2), tl.load(p + 4), tl.load(p + 5), tl.load(p + 6),
         tl.load(p + 8), tl.load(p + 9), tl.load(p + 10), tl.load(p + 3), tl.load(p + 7), tl.load(p + 11),
@@ -53,7 +53,7 @@ def load_pose(p):
 
 @triton.jit
 def along_axis(w00, w01, w02, w10, w11, w12, w20, w21, w22, e0, e1, e2, scale, fx, fy, u, v, us, vs, iz):
-    """One axis of a Gaussian in the camera's frame, its row pair of the Jacobian, and the ray along it, whitened."""
+    """Returns one axis of a Gaussian in the camera frame, two Jacobian entries, and the whitened ray component."""
     b0, b1, b2 = w00 * e0 + w01 * e1 + w02 * e2, w10 * e0 + w11 * e1 + w12 * e2, w20 * e0 + w21 * e1 + w22 * e2
     jx, jy = scale * fx * (b0 - us * b2) * iz, scale * fy * (b1 - vs * b2) * iz
     return b0, b1, b2, jx, jy, (b0 * u + b1 * v + b2) / scale
@@ -65,7 +65,7 @@ def project_kernel(
     total, views, scenes, height, width, across,
     near: tl.constexpr, lowpass: tl.constexpr, solid: tl.constexpr, degree: tl.constexpr,
 ):  # fmt: skip
-    """Writes record, first tile and columns, and number of tiles of a block of Gaussians in one view of each scene."""
+    """Writes records, first tiles and columns, and tile counts of a block of Gaussians in one view of each scene."""
     i = tl.program_id(0) * _BLOCK + tl.arange(0, _BLOCK)
     there = i < total
     i = tl.where(there, i, 0).to(tl.int64)
@@ -103,6 +103,7 @@ def project_kernel(
     if not solid:
         x_limit, y_limit = _CLAMP * (width / fx), _CLAMP * (height / fy)
         us, vs = tl.minimum(tl.maximum(u, -x_limit), x_limit), tl.minimum(tl.maximum(v, -y_limit), y_limit)
+    # axes in the camera frame, screen covariance and its inverse
     norm = 1.0 / tl.sqrt(tl.maximum(square, _TINY))
     s0, s1, s2 = tl.where(seen, s0, 1.0), tl.where(seen, s1, 1.0), tl.where(seen, s2, 1.0)
     r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation(qw * norm, qx * norm, qy * norm, qz * norm)
@@ -121,6 +122,7 @@ def project_kernel(
     seen &= det > 0
     idet = 1.0 / tl.where(seen, det, 1.0)
     qa, qb, qc = yy * idet, -xy * idet, xx * idet
+    # inverse variance a0 along the ray, p = L m / a0, tilt
     a0 = h0 * h0 + h1 * h1 + h2 * h2
     ia0 = 1.0 / tl.where(seen, a0, 1.0)
     h0, h1, h2 = h0 / s0 * ia0, h1 / s1 * ia0, h2 / s2 * ia0
@@ -130,7 +132,7 @@ def project_kernel(
         q0, q1, eps = p0 / fx, p1 / fy, iz * iz * ia0
     cutoff = 2.0 * tl.log(tl.where(seen, opacity, 1.0) / _ALPHA_MIN)
 
-    # the box of alpha >= 1/255, unbounded where that reaches the camera plane
+    # bounding box of the pixels with alpha >= 1/255; unbounded if they reach the camera plane
     near_plane = 1.0 - cutoff * eps
     box_xx, box_xy = near_plane * qa - cutoff * q0 * q0, near_plane * qb - cutoff * q0 * q1
     box_yy = near_plane * qc - cutoff * q1 * q1

@@ -1,10 +1,10 @@
-"""Triton kernel that takes gradients of views back to Gaussians and cameras: the transpose of ``projection.py``.
+"""Triton kernel that chains gradients of views to Gaussians and cameras: the backward pass of ``projection.py``.
 
-A lane is a Gaussian and adds up its views in registers: nothing is atomic, and sums have a fixed order.
+One lane per Gaussian sums over its views in registers: there are no atomics, and sums have a fixed order.
 """
 
 # pyright: reportGeneralTypeIssues=false, reportOperatorIssue=false
-# (inside a kernel the operators and ranges are Triton's language, which its type hints do not describe)
+# (Triton's type hints do not cover the operators and ranges used inside kernels)
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _CLAMP = tl.constexpr(CLAMP)
 
 @triton.jit
 def _axis_backward(b0, b1, b2, scale, fx, fy, u, v, us, vs, iz, jx, jy, h, s_xx, s_xy, s_yy, l0, l1, l2, ga0):
-    """Gradients through one axis: camera-frame axis (3), scale, the Jacobian's products (2) and slopes (2), u, v."""
+    """Returns gradients of one axis: camera-frame axis (3), scale, Jacobian products (2) and slopes (2), u, v."""
     inverse = 1.0 / scale
     gjx, gjy = 2.0 * (s_xx * jx + s_xy * jy), 2.0 * (s_xy * jx + s_yy * jy)
     px, py = gjx * scale * fx * iz, gjy * scale * fy * iz
@@ -52,10 +52,10 @@ def project_backward_kernel(
     total, views, scenes, height, width, first_view, some_views, base,
     lowpass: tl.constexpr, solid: tl.constexpr, degree: tl.constexpr, cameras: tl.constexpr,
 ):  # fmt: skip
-    """Sums the rows of a block of Gaussians over tiles and views, and chains them on; adds to the gradients.
+    """Sums the gradient rows of a block of Gaussians over tiles and views, and adds the chained gradients.
 
-    The views are ``first_view`` and the next, ``some_views`` of each scene's; their rows begin at ``base``. With
-    ``cameras`` each (block, view) writes its sum of the gradients of that view's pose and intrinsics.
+    Covers ``some_views`` views of each scene, from ``first_view`` on; their rows begin at ``base``. With ``cameras``,
+    each (block, view) writes its sum of the gradients of that view's pose and intrinsics.
     """
     first = tl.program_id(0) * _BLOCK
     i = first + tl.arange(0, _BLOCK)
@@ -84,6 +84,7 @@ def project_backward_kernel(
             most = tl.max(count, 0)
             if most > 0:
                 row = rows + (place - base) * _RECORD
+                # sum over tiles
                 a0, a1, a2, a3, a4, a5, a6, a7 = zero, zero, zero, zero, zero, zero, zero, zero
                 a8, a9, a10, a11, a12, a13, a14, a15 = zero, zero, zero, zero, zero, zero, zero, zero
                 k = 0
@@ -107,6 +108,7 @@ def project_backward_kernel(
                     a15 += tl.load(row + 15, mask=on, other=0.0)
                     row += _RECORD
                     k += 1
+                # recompute the projection
                 act = count > 0
                 view = current * views + v
                 w00, w01, w02, w10, w11, w12, w20, w21, w22, t0, t1, t2 = load_pose(poses + view * 16)
@@ -196,7 +198,7 @@ def project_backward_kernel(
                 d20 += w02 * a00 + w12 * a10_ + w22 * a20
                 d21 += w02 * a01 + w12 * a11_ + w22 * a21
                 d22 += w02 * a02 + w12 * a12_ + w22 * a22
-                # colour: where it was cut at 0 nothing passes
+                # colour: no gradient where it was clamped at 0
                 tint = records + slot * _RECORD + 13
                 a13 = tl.where(tl.load(tint, mask=act, other=0.0) > 0, a13, 0.0)
                 a14 = tl.where(tl.load(tint + 1, mask=act, other=0.0) > 0, a14, 0.0)
@@ -233,9 +235,10 @@ def project_backward_kernel(
                     tl.store(to + 18, tl.sum(a0, 0))
                     tl.store(to + 20, tl.sum(gfy, 0))
                     tl.store(to + 21, tl.sum(a1, 0))
-                tl.debug_barrier()  # the coefficients' gradients are added to by the next view
+                tl.debug_barrier()  # the next view adds to the coefficients' gradients
             v += 1
         current += 1
+    # rotation matrix -> quaternion -> unnormalised quaternion
     gqw = 2.0 * (qx * (d21 - d12) + qy * (d02 - d20) + qz * (d10 - d01))
     gqx = 2.0 * (qy * (d01 + d10) + qz * (d02 + d20) - 2.0 * qx * (d11 + d22) + qw * (d21 - d12))
     gqy = 2.0 * (qx * (d01 + d10) + qz * (d12 + d21) - 2.0 * qy * (d00 + d22) + qw * (d02 - d20))

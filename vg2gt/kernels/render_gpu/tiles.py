@@ -1,14 +1,14 @@
-"""Triton kernels that visit tiles: blend with median depth, and the backward visit.
+"""Triton kernels over tiles: blending with median depth, and its backward pass.
 
-One program is one warp and one tile of 8 x 8 pixels of one view, a vector of 64 rays. Gaussians are read one at a time,
-front to back, as scalars. Rays are stopped by the sign of their transmittance. Nothing is kept per hit: the solver
-visits the tile's Gaussians again, eight depths at a time, as far as they can matter to the median. Options are
-compile-time constants, so that float64 (for tests) keeps their digits; loops are ``while`` loops because the
+One program is one warp and one tile of 8 x 8 pixels of one view: a vector of 64 rays. Gaussians are read one at a time,
+front to back, as scalars. A stopped ray has a negative transmittance. Nothing is kept per hit: the depth solver visits
+the tile's Gaussians again, up to the last that can affect the median, and evaluates eight depths per visit. Options are
+compile-time constants, so that float64 (for tests) keeps their digits. Loops are ``while`` loops because the
 interpreter cannot iterate over a tensor's range.
 """
 
 # pyright: reportGeneralTypeIssues=false, reportOperatorIssue=false, reportArgumentType=false
-# (inside a kernel the operators and ranges are Triton's language, which its type hints do not describe)
+# (Triton's type hints do not cover the operators and ranges used inside kernels)
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ SIZES = ("height", "width", "across", "tiles")
 
 @triton.jit
 def _rays(tile, across, height, width):
-    """Pixel coordinates of a tile's rays, and whether they lie in the image."""
+    """Returns pixel coordinates of a tile's rays, and whether they lie in the image."""
     lane = tl.arange(0, _RAYS)
     x = (tile % across) * _TILE + lane % _TILE
     y = (tile // across) * _TILE + lane // _TILE
@@ -41,7 +41,7 @@ def _rays(tile, across, height, width):
 
 @triton.jit
 def _respond(g, x, y, alpha_max: tl.constexpr, solid: tl.constexpr):
-    """A Gaussian's response along rays: offsets, E, 1 + s, r, its inverse, eps, whether it counts, and alpha."""
+    """Returns a Gaussian's response along rays: offsets, E, 1 + s, r, 1 / r, eps, whether it is a hit, and alpha."""
     dx, dy = x - tl.load(g), y - tl.load(g + 1)
     e = (tl.load(g + 2) * dx + 2 * tl.load(g + 3) * dy) * dx + tl.load(g + 4) * dy * dy
     s, r, inverse, eps = dx * 0 + 1.0, dx * 0 + 1.0, dx * 0 + 1.0, tl.load(g + 9) * 0
@@ -68,7 +68,7 @@ def blend_kernel(
     median_max: tl.constexpr, sigmas: tl.constexpr, sections: tl.constexpr, newton_steps: tl.constexpr,
     solid: tl.constexpr, geometry: tl.constexpr, mean: tl.constexpr,
 ):  # fmt: skip
-    """Blends a tile front to back and finds its rays' depth: median, or the mean where ``mean`` (not solid) says so."""
+    """Blends a tile front to back and computes its depth: median, or expected with ``mean`` (rasterized only)."""
     dtype = records.dtype.element_ty
     view = (tl.program_id(0) // tiles).to(tl.int64)
     x, y, inside = _rays(tl.program_id(0) % tiles, across, height, width)
@@ -148,7 +148,7 @@ def _median(
     records, members, begin, last, px, py, solvable, lo, hi,
     alpha_max: tl.constexpr, stop: tl.constexpr, sections: tl.constexpr, newton_steps: tl.constexpr,
 ):  # fmt: skip
-    """Median depth between ``lo`` and ``hi`` by sections in eight and Newton (0: none); ``-2 d ln T / dt`` there."""
+    """Returns the median depth in ``lo .. hi`` (0: none) by 8-section and Newton steps; ``-2 d ln T / dt`` there."""
     lo, hi = tl.where(solvable, lo, 1.0), tl.where(solvable, hi, 1.0)
     section = 0
     live = tl.max(solvable.to(tl.int32), 0) > 0
@@ -172,10 +172,9 @@ def _median(
 
 @triton.jit
 def _meet(records, members, place, before, px, py, alpha_max: tl.constexpr, stop: tl.constexpr):
-    """The next Gaussian on the rays: its record and response, its alpha where it counts, what is transmitted behind it.
+    """Returns the next Gaussian's record, response, alpha (0: no hit), transmittance behind it, and if any ray hits it.
 
-    ``before`` is the transmittance in front of it, negative where the ray has ended; the last value says whether any
-    ray meets it.
+    ``before`` is the transmittance in front of it, negative where the ray has stopped.
     """
     g = records + tl.load(members + place).to(tl.int64) * _RECORD
     _, _, _, s, r, inverse, _, on, alpha = _respond(g, px, py, alpha_max, True)
@@ -188,7 +187,7 @@ def _meet(records, members, place, before, px, py, alpha_max: tl.constexpr, stop
 
 @triton.jit
 def _part(records, members, place, last, px, py, solvable, lo, step, alpha_max: tl.constexpr, stop: tl.constexpr):
-    """How many of the seven depths ``lo + k step`` lie in front of the median, and whether ``lo`` does."""
+    """Counts the depths ``lo + k step``, k = 1 .. 7, in front of the median; also returns whether ``lo`` is."""
     before = tl.where(solvable, 1.0, -1.0).to(px.dtype)
     one = px * 0 + 1.0
     n0, n1, n2, n3, n4, n5, n6, n7 = one, one, one, one, one, one, one, one
@@ -225,14 +224,14 @@ def _part(records, members, place, last, px, py, solvable, lo, step, alpha_max: 
 
 @triton.jit
 def _behind(numerator, denominator, t, alpha, sharp, passed):
-    """Multiplies the squared transmittance, a quotient, by that of a Gaussian at an offset ``t`` from its peak."""
+    """Multiplies squared transmittance (numerator / denominator) by a Gaussian's, at offset ``t`` from its peak."""
     free = 1.0 - alpha * tl.exp2(sharp * t * t)
     return numerator * tl.where(t <= 0, free, passed), denominator * tl.where(t <= 0, 1.0, free)
 
 
 @triton.jit
 def _transmit(records, members, place, last, px, py, solvable, t, alpha_max: tl.constexpr, stop: tl.constexpr):
-    """Squared transmittance at depths ``t``, and ``-2 d ln T / dt``."""
+    """Returns squared transmittance at depths ``t``, and ``-2 d ln T / dt``."""
     before = tl.where(solvable, 1.0, -1.0).to(px.dtype)
     numerator, denominator, steep = px * 0 + 1.0, px * 0 + 1.0, px * 0
     live = place < last
@@ -259,9 +258,9 @@ def backward_kernel(
     alpha_max: tl.constexpr, stop: tl.constexpr, slope_floor: tl.constexpr, tiny: tl.constexpr,
     solid: tl.constexpr, geometry: tl.constexpr, mean: tl.constexpr,
 ):  # fmt: skip
-    """Visits a tile's Gaussians front to back again and writes one gradient row for each (rows start at zero).
+    """Visits a tile's Gaussians front to back again and writes the gradient row of each (rows start at zero).
 
-    The views are ``first_view`` and the next, ``some_views`` of each scene's ``views``; their rows begin at ``base``.
+    Covers ``some_views`` of each scene's ``views``, from ``first_view`` on; their rows begin at ``base``.
     """
     dtype = records.dtype.element_ty
     number = tl.program_id(0) // tiles
@@ -277,7 +276,7 @@ def backward_kernel(
     g0 = tl.load(grad_color + channel, mask=inside, other=0.0)
     g1 = tl.load(grad_color + channel + plane, mask=inside, other=0.0)
     g2 = tl.load(grad_color + channel + 2 * plane, mask=inside, other=0.0)
-    # what lies behind weighs on the gradient of alpha: all at first, less and less on the way
+    # rest: incoming gradients times all contributions still ahead on the ray, for the gradient of alpha
     rest = g0 * tl.load(color + channel, mask=inside, other=0.0)
     rest += g1 * tl.load(color + channel + plane, mask=inside, other=0.0)
     rest += g2 * tl.load(color + channel + 2 * plane, mask=inside, other=0.0)
@@ -299,7 +298,7 @@ def backward_kernel(
             kd = incoming / tl.maximum(steep, tiny)
         elif mean:
             toward = incoming / tl.where(median > 0, 1.0 - final, 1.0)
-            rest += toward * median  # of the quotient's numerator and of its denominator, (1 - T) + T
+            rest += toward * median  # quotient rule: numerator and denominator, (1 - T) + T
         else:
             to_crossing = incoming
     place, end = tl.load(starts + view * tiles + tile), tl.load(starts + view * tiles + tile + 1)
@@ -342,6 +341,7 @@ def backward_kernel(
                     gp = tl.where(kept, -0.5 * pull * d, 0.0)
                 else:
                     gt = weight * toward + tl.where(kept & (before > 0.5) & (after <= 0.5), to_crossing, 0.0)
+            # chain rule to the response
             ga = tl.where(kept & (alpha < alpha_max), slack * alpha, 0.0)
             ge = -0.5 * ga * inverse
             z_gradient = tl.sum(gt * s * inverse, 0)
@@ -351,7 +351,7 @@ def backward_kernel(
                 ge += gr * eps
                 gs = gt * z * inverse + 2.0 * gr * s
                 tilted = tl.sum(gs, 0)
-                curved = tl.sum(gr * e, 0) * eps  # eps = 1 / (z^2 a0) is no input of its own
+                curved = tl.sum(gr * e, 0) * eps  # eps = 1 / (z^2 a0) is not an independent input
                 sx, sy = tl.sum(ge * dx, 0), tl.sum(ge * dy, 0)
                 tl.store(row, -2.0 * (tl.load(g + 2) * sx + qb * sy) - tilted * tl.load(g + 5))
                 tl.store(row + 1, -2.0 * (qb * sx + tl.load(g + 4) * sy) - tilted * tl.load(g + 6))

@@ -1,1 +1,1 @@
-"""Long captures: views in windows, so that memory does not grow with their number (``docs/guides/long.md``)."""
+"""Long captures: views are processed in windows, to bound memory (``docs/guides/long.md``)."""

@@ -1,4 +1,4 @@
-"""The views of a long capture: decoded once, kept in files, and read a window at a time."""
+"""The views of a long capture: decoded once, kept in files, and read one window at a time."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from vg2gt.reconstruction.pictures import Picture
 from vg2gt.reconstruction.windows.store import WindowStore
 from vg2gt.types import Cameras, Hints
 
-AUTOMATIC = 100  # views beyond which a capture is worked on in windows
-SIZE = 24  # views of a window of its own
-MARGIN = 6  # neighbours before and after them, at least; of large windows a sixth
-_AT_ONCE = 16  # pictures decoded before their progress is noted
+AUTOMATIC = 100  # number of views above which a capture is processed in windows
+SIZE = 24  # own views per window
+MARGIN = 6  # minimum number of neighbours before and after them; a sixth of large windows
+_AT_ONCE = 16  # pictures decoded per finished step
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,8 +26,8 @@ class Window:
     """Views that go through the model together.
 
     Attributes:
-        views: ``[n]`` all of them, ascending.
-        own: those that enter the scene from this window; the others are their neighbours.
+        views: ``[n]`` indices of all its views, ascending.
+        own: range of the views that enter the scene from this window; the others are their neighbours.
     """
 
     views: Tensor
@@ -35,21 +35,21 @@ class Window:
 
     @property
     def inner(self) -> slice:
-        """Places of ``own`` among ``views``."""
+        """Positions of ``own`` in ``views``."""
         first = int(torch.searchsorted(self.views, self.own.start))
         return slice(first, first + self.own.stop - self.own.start)
 
 
 def window_size(asked: int | None, views: int, kept: bool = False) -> int:
-    """Views of a window of its own; 0: all at once.
+    """Returns the number of own views per window; 0: all views at once.
 
     Args:
-        asked: by the user; None: automatic.
-        views: how many there are.
-        kept: there must be a window, since its voxels are wanted.
+        asked: requested number; None: automatic.
+        views: number of views.
+        kept: always use windows, because their voxels are kept.
 
     Raises:
-        ValueError: if fewer than 4 are asked for.
+        ValueError: if ``asked`` is below 4 and not 0.
     """
     if asked is not None and asked != 0 and asked < 4:
         raise ValueError(f"window must be at least 4 views, or 0 for all views at once, got {asked}")
@@ -60,7 +60,7 @@ def window_size(asked: int | None, views: int, kept: bool = False) -> int:
 
 
 def cut(count: int, size: int) -> list[Window]:
-    """Windows that own ``size`` consecutive views at most, so that each view is owned once, and their neighbours."""
+    """Returns windows of at most ``size`` consecutive own views and their neighbours; each view is owned once."""
     blocks = -(-count // size)
     total = min(size + 2 * max(size // 6, MARGIN), count) if blocks > 1 else count
     windows = []
@@ -74,17 +74,17 @@ class Capture:
     """All views of a long capture.
 
     Args:
-        store: keeps them.
-        pictures: where they come from.
+        store: store of the decoded views.
+        pictures: source pictures, one per view.
         size: ``(height, width)`` of the images.
         monitor: shows the progress.
 
     Attributes:
         pictures: see above.
         size: see above.
-        images: ``[V, 3, H, W]``, mapped from a file.
-        mask: ``[V, H, W]``, mapped from a file; None: all pixels count.
-        given: the given cameras ``[1, V]``; None where there are none.
+        images: ``[V, 3, H, W]``, memory-mapped.
+        mask: ``[V, H, W]``, memory-mapped; None: all pixels count.
+        given: given cameras ``[1, V]``; None if there are none.
 
     Raises:
         ValueError: if a picture cannot be read.
@@ -124,7 +124,7 @@ class Capture:
         return {"intrinsics": hints.cameras.intrinsics[0]}
 
     def views(self, rows: Tensor) -> tuple[Tensor, Hints]:
-        """Images ``[1, n, 3, H, W]`` and what is known of some views, ``rows`` ``[n]``."""
+        """Returns images ``[1, n, 3, H, W]`` and hints of the views ``rows [n]``."""
         mask = None if self.mask is None else self.mask[None, rows]
         if self.given is None:
             return self.images[None, rows], Hints(frame_ids=rows[None], mask=mask)

@@ -1,4 +1,4 @@
-"""Voxels of all windows merged, a slab of space at a time."""
+"""Merges the voxels of all windows, one slab of space at a time."""
 
 from __future__ import annotations
 
@@ -11,23 +11,26 @@ import torch
 from vg2gt.method.pooled import PooledVoxels, concatenate, merge
 from vg2gt.reconstruction.windows.store import read_rows
 
-ROWS = 400_000  # voxels that are merged at a time
+ROWS = 400_000  # voxels merged at a time
 
 
 def as_tensors(pooled: PooledVoxels) -> dict[str, torch.Tensor]:
-    """What is kept of a window."""
+    """Returns the tensors of a window's voxels, to be stored."""
     return {each: value for each, value in vars(pooled).items() if value is not None}
 
 
 def merge_windows(files: Sequence[Path], show: Callable[[float], None], limit: int = ROWS) -> PooledVoxels:
-    """The voxels of a scene.
+    """Merges the voxels of all windows of a scene.
 
-    The windows' voxels are sorted by x, so that a slab of space is some rows of each of them.
+    The voxels of each window are sorted by x, so that a slab of space is a range of rows in each file.
 
     Args:
-        files: the windows', in the order in which sums are taken.
-        show: takes the share that is done.
-        limit: voxels that are merged at a time.
+        files: voxel files of the windows, in the order of summation.
+        show: called with the share done.
+        limit: approximate number of voxels merged at a time.
+
+    Raises:
+        ValueError: if there are no voxels.
     """
     columns = [read_rows(file, slice(None))["grid"][:, 0].contiguous() for file in files]
     slabs = _slabs(columns, limit)
@@ -46,7 +49,7 @@ def merge_windows(files: Sequence[Path], show: Callable[[float], None], limit: i
 
 
 def _slabs(columns: Sequence[torch.Tensor], limit: int) -> list[tuple[int, int]]:
-    """Ranges of x with about ``limit`` of the sorted columns' entries each."""
+    """Returns ranges of x that hold about ``limit`` entries of the sorted columns each."""
     places, counts = torch.cat(list(columns)).unique(return_counts=True)
     slab = (counts.cumsum(0) - counts) // limit
     starts = torch.cat((torch.ones(1, dtype=torch.bool), slab.diff() > 0)).nonzero()[:, 0] if len(places) else []

@@ -1,4 +1,4 @@
-"""Where windows are: one frame and unit for the cameras and the depth of all views."""
+"""Placement of windows: one frame and unit for the cameras and the depth of all views."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ class Placement:
 
     Attributes:
         cameras: ``[1, V]``.
-        scales: ``[V]`` float32, what turns a view's depth as its window has it into the cameras' unit.
+        scales: ``[V]`` float32 factors from the unit of a view's window to that of the cameras.
     """
 
     cameras: Cameras
     scales: Tensor
 
     def seen_from(self, reference: Tensor) -> Cameras:
-        """The cameras in the frame of one with the pose ``[4, 4]``, float32.
+        """Returns the cameras in the frame of a camera with the pose ``[4, 4]``, float32.
 
-        As exact as a backbone's that takes them relative to the reference, which becomes the identity.
+        They are computed in float64 first; the reference itself becomes exactly the identity.
         """
         poses = self.cameras.world_to_camera
         reference = reference.to(poses)
@@ -41,7 +41,7 @@ class Placement:
 
 
 def moves_onto(found: Sequence[Found], given: Cameras) -> Similarity:
-    """The similarities ``[n]`` (float64) that bring every window's cameras onto the given ones of all views."""
+    """Returns the similarities ``[n]`` (float64) that align each window's cameras with the given ones."""
     moves = []
     for window in found:
         there = given.select(window.views)
@@ -55,11 +55,11 @@ def moves_onto(found: Sequence[Found], given: Cameras) -> Similarity:
 def place_found(
     found: Sequence[Found], moves: Similarity, windows: Sequence[Window], size: tuple[int, int]
 ) -> Placement:
-    """The placement of windows whose backbone predicts cameras.
+    """Places windows whose backbone predicts cameras.
 
     Args:
-        found: of every window, what it predicts.
-        moves: the similarity of each into one frame.
+        found: prediction for each window.
+        moves: similarity of each window into one frame.
         windows: the windows.
         size: ``(height, width)`` of the images.
     """

@@ -1,4 +1,4 @@
-"""One frame for windows whose backbone predicts cameras: similarities on shared views, loops closed by a pose graph."""
+"""Brings windows with predicted cameras into one frame: similarities on shared views, and a pose graph for loops."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from vg2gt.geometry.cameras import camera_centers
 from vg2gt.method.additions.visibility.counts import count_views
 from vg2gt.types import Cameras
 
-PARAMETERS = 7  # of a window: logarithm of its scale, rotation vector, translation
-OUTLIER = 0.1  # residuals (relative, rad, window depths) beyond which an edge counts less
-CONTRADICTS = 0.25  # largest residual with which a loop is taken
-AGREE = 0.1  # share of one part's pixels with which the other must agree, for a loop to count
-TOLERANCE, MARGIN = 0.05, 0.1  # of depth, in that check
-ROUNDS = 50  # of the pose graph's solver
-APART = 2  # windows between those that a loop joins
+PARAMETERS = 7  # per window: log scale, rotation vector, translation
+OUTLIER = 0.1  # residual (relative, rad, window depths) beyond which an edge is down-weighted
+CONTRADICTS = 0.25  # residual from which a loop is rejected
+AGREE = 0.1  # share of a loop's pixels that must agree with its other part
+TOLERANCE, MARGIN = 0.05, 0.1  # relative depth differences of that check: agreement, looking through
+ROUNDS = 50  # maximum function evaluations of the pose graph's solver
+APART = 2  # minimum number of windows between those that a loop joins
 
 Edge: TypeAlias = "tuple[int, int, NDArray[np.float64]]"
 """Windows a and b, and the similarity from a's frame to b's."""
@@ -33,13 +33,13 @@ Edge: TypeAlias = "tuple[int, int, NDArray[np.float64]]"
 
 @dataclass(frozen=True)
 class Found:
-    """What a backbone predicts of some views, in a frame and unit of its own.
+    """A backbone's prediction for some views, in a frame and unit of its own.
 
     Attributes:
-        views: ``[n]`` int64 which they are.
-        cameras: ``[1, n]``; their size is that of the depth.
-        depth: ``[n, h, w]`` reduced, 0 = none.
-        intrinsics: ``[1, n, 3, 3]`` of the images.
+        views: ``[n]`` int64 indices of the views.
+        cameras: ``[1, n]`` cameras at the size of ``depth``.
+        depth: ``[n, h, w]`` reduced depth, 0 = none.
+        intrinsics: ``[1, n, 3, 3]`` intrinsics of the full images.
     """
 
     views: Tensor
@@ -48,18 +48,19 @@ class Found:
     intrinsics: Tensor
 
     def exact(self, views: Tensor) -> tuple[Cameras, Tensor]:
-        """Cameras in float64, and depth, of some of the views."""
+        """Returns cameras in float64, and depth, of some of the views."""
         rows = (self.views[None] == views[:, None]).int().argmax(1)
         chosen = self.cameras.select(rows)
         return replace(chosen, world_to_camera=chosen.world_to_camera.double()), self.depth[rows]
 
 
 def place_windows(windows: Sequence[Found], loops: Sequence[Found] = ()) -> Similarity:
-    """Similarities ``[n]`` (float64) of windows into the frame and unit of the first.
+    """Returns similarities ``[n]`` (float64) from the windows to the frame and unit of the first.
 
     Args:
         windows: in order, each sharing views with the next.
-        loops: share views with windows far apart, the most trusted first. One that contradicts the others is left out.
+        loops: predictions that share views with distant windows, the most trusted first. A loop that contradicts the
+            others is left out.
 
     Raises:
         ValueError: if a window shares no views with the others.
@@ -69,7 +70,7 @@ def place_windows(windows: Sequence[Found], loops: Sequence[Found] = ()) -> Simi
         edges += _edges(nodes, window)
         nodes.append(window)
     poses = _chained(edges, np.zeros((1, PARAMETERS)), len(nodes))
-    if len(edges) >= len(nodes):  # otherwise the chain fits every edge
+    if len(edges) >= len(nodes):  # otherwise the chain satisfies every edge
         poses, _ = _solved(nodes, edges, poses)
     for loop in loops:
         more = [*edges, *_edges(nodes, loop)]
@@ -85,7 +86,7 @@ def place_windows(windows: Sequence[Found], loops: Sequence[Found] = ()) -> Simi
 def _solved(
     found: Sequence[Found], edges: Sequence[Edge], start: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], float]:
-    """Parameters ``[n, 7]`` of all windows that fit the edges best, the first one's kept, and the largest misfit."""
+    """Returns the parameters ``[n, 7]`` that fit the edges best, with the first fixed, and the largest residual."""
     depths = [float(each.depth[each.depth > 0].median()) if (each.depth > 0).any() else 1.0 for each in found]
     a, b = np.array([edge[:2] for edge in edges]).T
     measured = np.stack([edge[2] for edge in edges])
@@ -108,12 +109,12 @@ def _solved(
 
 
 def loop_candidates(descriptors: Tensor, blocks: Sequence[slice], most: int) -> list[tuple[int, int]]:
-    """Pairs of views, of windows far apart in the order, that look alike; the most alike first.
+    """Returns pairs of similar views from windows far apart in the order, the most similar first.
 
     Args:
-        descriptors: ``[V, D]`` one a view.
-        blocks: each window's views.
-        most: pairs, at most; of two neighbouring windows only one pair each.
+        descriptors: ``[V, D]``, one per view.
+        blocks: own views of each window.
+        most: maximum number of pairs; a pair is skipped if both its windows neighbour those of a better pair.
     """
     unit = torch.nn.functional.normalize(descriptors - descriptors.mean(0), dim=1)
     pairs = []
@@ -131,11 +132,11 @@ def loop_candidates(descriptors: Tensor, blocks: Sequence[slice], most: int) -> 
 
 
 def closes(loop: Found, parts: tuple[Tensor, Tensor]) -> bool:
-    """Whether the two parts of a loop's views see the same surfaces, as the backbone places them.
+    """Returns whether the two parts of a loop see the same surfaces, as the backbone places them.
 
     Args:
-        loop: all its views.
-        parts: ``[m]`` rows of either part.
+        loop: prediction for the views of both parts.
+        parts: ``[m]`` rows of each part.
     """
     partners = torch.full((len(loop.views), max(map(len, parts))), -1, dtype=torch.int64)
     for own, other in (parts, parts[::-1]):
@@ -147,7 +148,7 @@ def closes(loop: Found, parts: tuple[Tensor, Tensor]) -> bool:
 
 
 def _edges(found: Sequence[Found], last: Found) -> list[Edge]:
-    """Edges between windows and a further one with at least two views that both have."""
+    """Returns edges from windows to a further one, where they share at least two views."""
     edges = []
     for number, each in enumerate(found):
         shared = each.views[torch.isin(each.views, last.views)]
@@ -157,8 +158,8 @@ def _edges(found: Sequence[Found], last: Found) -> list[Edge]:
 
 
 def _between(a: tuple[Cameras, Tensor], b: tuple[Cameras, Tensor]) -> NDArray[np.float64]:
-    """The similarity from one frame to another: its scale from the views' depth, the rest from their cameras."""
-    depths = a[1][:, None], b[1][:, None]  # each view's own scale
+    """Returns the similarity from frame a to frame b: scale from the views' depth, the rest from their cameras."""
+    depths = a[1][:, None], b[1][:, None]  # one scale per view
     scale = fit_depth_scale(*depths, depths[0] > 0)
     scale = scale[torch.isfinite(scale)]
     move = align_cameras(a[0], b[0])
@@ -170,7 +171,7 @@ def _between(a: tuple[Cameras, Tensor], b: tuple[Cameras, Tensor]) -> NDArray[np
 
 
 def _chained(edges: Sequence[Edge], known: NDArray[np.float64], count: int) -> NDArray[np.float64]:
-    """Parameters ``[n, 7]`` of all windows: the first ones' known, every other placed by its edge to the one before."""
+    """Returns the parameters ``[n, 7]`` of all windows; those not ``known`` follow from an edge to an earlier one."""
     poses = list(known)
     for node in range(len(known), count):
         found = [edge for edge in edges if edge[1] == node]
@@ -182,7 +183,7 @@ def _chained(edges: Sequence[Edge], known: NDArray[np.float64], count: int) -> N
 
 
 def _compose(outer: NDArray[np.float64], inner: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Parameters ``[n, 7]`` of ``x -> outer(inner(x))``."""
+    """Returns the parameters ``[n, 7]`` of ``x -> outer(inner(x))``."""
     turn = Rotation.from_rotvec(outer[:, 1:4])
     shift = np.exp(outer[:, :1]) * turn.apply(inner[:, 4:]) + outer[:, 4:]
     turned = (turn * Rotation.from_rotvec(inner[:, 1:4])).as_rotvec()

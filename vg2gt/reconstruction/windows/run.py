@@ -1,4 +1,4 @@
-"""A scene from a long capture: every window goes through the model, voxels are what the windows have in common."""
+"""Reconstruction of a long capture: each window goes through the model, then the voxels of all windows are merged."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ from vg2gt.reconstruction.windows.sets import Anchor, finished_sets
 from vg2gt.reconstruction.windows.store import WindowStore, key_of
 from vg2gt.types import Cameras, Gaussians, Geometry, Hints, Tokens
 
-TOKEN_BYTES = 4e9  # of tokens on the disk; if all windows' have more, the backbone runs a second time instead
-REDUCED = 4  # pixels between the depths by which windows are placed
-MEDIAN_OF = 1 << 24  # depths, at most, that a median is taken of
+TOKEN_BYTES = 4e9  # maximum size of all windows' tokens on disk; if larger, the backbone runs a second time instead
+REDUCED = 4  # pixel stride of the depth that places windows
+MEDIAN_OF = 1 << 24  # maximum number of depths in a median
 
 
 def window_model(model: Reconstructor) -> VG2GT:
-    """The model, if it can work in windows.
+    """Returns the model if it supports windows.
 
     Raises:
-        ValueError: if it cannot, with the remedy.
+        ValueError: if it does not; the message names the remedy.
     """
     if model.visibility is not None and model.visibility.moment is not None:
         raise ValueError("what moves is found among all views at once: add --window 0, or model.visibility.moment=null")
@@ -55,12 +55,12 @@ class WindowRun:
 
     Args:
         model: in eval mode.
-        pictures: of the views, in order.
+        pictures: pictures of the views, in order.
         size: ``(height, width)`` of the images.
-        window: views of a window.
-        folder: keeps what is done.
+        window: maximum number of own views per window.
+        folder: folder for finished steps, from which an interrupted run resumes.
         monitor: shows the progress.
-        anchor: of the scene that the pictures are added to; None: they make a new one.
+        anchor: anchor of the scene to add the pictures to; None: make a new scene.
     """
 
     def __init__(
@@ -85,9 +85,10 @@ class WindowRun:
         self.depth = self.store.array("depth", shape)
 
     def geometry_and_gaussians(self) -> tuple[Geometry, Gaussians, Tensor]:
-        """Geometry of all views with depth where the scene is made of it, the Gaussians, and the scene's unit."""
+        """Returns the geometry of all views, with depth only where the scene uses it, the Gaussians, and the unit."""
         surveyed, anchor = self.survey(), self.anchor
         placement = self._placement(surveyed)
+        # windows' units to the placement's unit: [V, H, W]
         metres = torch.cat([each["scale"] for each in surveyed]) / placement.scales[self._firsts()]
         for rows in self._blocks():
             self.depth[rows] = self.raw[rows] * placement.scales[rows, None, None]
@@ -95,11 +96,13 @@ class WindowRun:
             reference = placement.cameras.world_to_camera[0, working_order(self.capture.images)[0]]
         else:
             reference = torch.from_numpy(anchor.reference)
+        # placement's frame and unit to the scene's
         geometry = Geometry(self.depth[None], self.conf[None], placement.seen_from(reference), metres.median()[None])
         unit = self.model.scale(_sampled(geometry), None) if anchor is None else torch.tensor([anchor.unit])
         for rows in self._blocks():
             self.depth[rows] *= unit
         geometry = replace(geometry, cameras=scale_translations(geometry.cameras, unit), scale=geometry.scale / unit)
+        # visibility check, fine voxels of each window, Gaussians of all windows
         size = self._check(geometry)
         if anchor is None:
             anchor = Anchor(reference.double().numpy(), float(unit), float(size), self.capture.size, key_of(self.model))
@@ -114,7 +117,7 @@ class WindowRun:
         return geometry, gaussians_of(self.model, self.folder, anchor, self.monitor), unit
 
     def views(self) -> Views:
-        """The input, mapped from files."""
+        """Returns the input, memory-mapped from files."""
         capture = self.capture
         names = tuple(picture.name for picture in capture.pictures)
         hints = Hints(frame_ids=torch.arange(self.count)[None])
@@ -127,7 +130,7 @@ class WindowRun:
         return [window.own.start for window in self.windows]
 
     def survey(self) -> list[dict[str, Tensor]]:
-        """Depth of all views, in their windows' units; of every window what is needed to place it."""
+        """Computes the depth of all views in their windows' units; returns what is needed to place each window."""
         with self.monitor.measure("windows") as show:
             found = []
             for number, window in enumerate(self.windows):
@@ -146,9 +149,9 @@ class WindowRun:
         return found
 
     def loops(self, surveyed: Sequence[dict[str, Tensor]]) -> list[Found]:
-        """Windows of views that were taken at different times and look alike, where the backbone places both."""
+        """Returns predictions for similar views taken at different times, if they see the same surfaces."""
         rows = [each["descriptors"][w.inner] for each, w in zip(surveyed, self.windows, strict=True)]
-        each = len(self.windows) // 4 + 1  # tokens know what is seen, thumbnails do not change with a window's frame
+        each = len(self.windows) // 4 + 1  # tokens capture content; thumbnails do not depend on a window's frame
         alike = (thumbnails(self.capture.images), torch.cat(rows))
         pairs = list(dict.fromkeys(p for described in alike for p in loop_candidates(described, self._blocks(), each)))
         half, found = len(self.windows[0].views) // 2, []
@@ -167,10 +170,10 @@ class WindowRun:
         return found
 
     def _enhanced(self, views: Tensor) -> tuple[Tokens, Geometry]:
-        """Tokens and geometry of some views in the unit of the backbone."""
+        """Returns tokens and geometry of some views in the unit of the backbone."""
         images, hints = self.capture.views(views)
         images, hints = images.to(self.device), hints.to(self.device)
-        # Without enhancement nothing depends on the unit, and depth keeps its last digit.
+        # Without enhancement nothing depends on the unit, and a unit of 1 keeps depth exact.
         one = None if self.model.coarse is not None else torch.ones(1, device=self.device)
         with half_precision_on_gpu(images):
             tokens, decoded = self.model.enhance(images, hints, unit=one)
@@ -190,7 +193,7 @@ class WindowRun:
             self.store.save(f"tokens-{number:06d}", own)
 
     def _tokens(self, number: int, window: Window) -> Tokens:
-        """What the fine level needs of a window's own views."""
+        """Returns the tokens of a window's own views for the fine level."""
         found = self.store.load(f"tokens-{number:06d}")
         if found is None:
             patch = tuple(tap[:, window.inner] for tap in self._enhanced(window.views)[0].patch)
@@ -209,7 +212,7 @@ class WindowRun:
         return place_found(found, moves, self.windows, self.capture.size)
 
     def _check(self, geometry: Geometry) -> Tensor:
-        """Takes depth away that other views contradict; the edge of the fine voxels ``[1]``."""
+        """Removes depth that other views contradict; returns the edge of the fine voxels ``[1]``."""
         check, coarsen, fine = self.model.visibility, None, self.fine
         if check is not None:
             masks = (self.store.array("kept", self.depth.shape), self.store.array("kept_next", self.depth.shape))
@@ -249,17 +252,19 @@ class WindowRun:
 def gaussians_of(
     model: VG2GT, folder: Path, anchor: Anchor, monitor: Monitor, left_out: Path | None = None
 ) -> Gaussians:
-    """Gaussians of all finished sets of a folder; the same sets give the same bits, whatever was there in between.
+    """Returns the Gaussians of all finished sets in a folder.
+
+    The same sets give bit-identical Gaussians, even if others were added and removed in between.
 
     Args:
-        model: that pooled them.
-        folder: of the sets.
-        anchor: what they share.
+        model: model that pooled the voxels.
+        folder: parent folder of the sets.
+        anchor: anchor of the scene.
         monitor: shows the progress.
-        left_out: folder of a set that does not count.
+        left_out: folder of a set to leave out.
 
     Raises:
-        ValueError: if there is no voxel.
+        ValueError: if there are no voxels.
     """
     sets = [place for place in finished_sets(folder) if place != left_out]
     files = [file for place in sets for file in sorted(place.glob("voxels-*"))]
@@ -282,13 +287,13 @@ def gaussians_of(
 def set_key(
     model: VG2GT, pictures: Sequence[Picture], size: tuple[int, int], window: int, anchor: Anchor | None = None
 ) -> str:
-    """Names a set of pictures as this model works on them, for a scene of this anchor."""
+    """Returns the key of a set of pictures for this model, working and window size, and anchor of a scene."""
     files = [[p.name, p.size, p.source, *_state(p)] for p in pictures]
     return key_of(model, files, size, window, None if anchor is None else anchor.plain())
 
 
 def _summary(views: Tensor, tokens: Tokens, geometry: Geometry) -> dict[str, Tensor]:
-    """What places a window: cameras, reduced depth, metres per unit, and a descriptor of each view."""
+    """Returns what places a window: cameras, reduced depth, metres per unit, and a descriptor of each view."""
     shallow, cameras = tokens.patch[0][0].float(), geometry.cameras
     reduced = geometry.depth[0, :, REDUCED // 2 :: REDUCED, REDUCED // 2 :: REDUCED]
     found = {
@@ -303,7 +308,7 @@ def _summary(views: Tensor, tokens: Tokens, geometry: Geometry) -> dict[str, Ten
 
 
 def found_of(known: dict[str, Tensor]) -> Found:
-    """A window's cameras and reduced depth, as its survey kept them."""
+    """Returns a window's cameras and reduced depth from its summary."""
     size = (known["depth"].shape[1], known["depth"].shape[2])
     shifted = crop_intrinsics(known["intrinsics"], REDUCED // 2, REDUCED // 2)
     sampled = torch.cat((shifted[..., :2, :] / REDUCED, shifted[..., 2:, :]), -2)
@@ -311,13 +316,13 @@ def found_of(known: dict[str, Tensor]) -> Found:
 
 
 def _state(picture: Picture) -> list[int]:
-    """Changes with the picture's file."""
+    """Returns size and modification time of the picture's file; empty if it has none."""
     state = None if picture.path is None else picture.path.stat()
     return [] if state is None else [state.st_size, state.st_mtime_ns]
 
 
 def _sampled(geometry: Geometry) -> Geometry:
-    """Geometry with few enough depths for a median, evenly spread; all of them where there are few."""
+    """Subsamples geometry evenly, if it has too many depths for a median."""
     step = 1
     while geometry.depth.numel() // step**2 > MEDIAN_OF:
         step += 1

@@ -1,4 +1,4 @@
-"""Scenes of several sets of images: one set a command, added and taken out again by the voxels that each pooled."""
+"""Scenes of several image sets: each command adds or removes one set through the voxels that it pooled."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from vg2gt.reconstruction.windows.store import SET
 from vg2gt.types import Cameras
 
 _ANCHOR = "scene.json"
-_KEPT = ("voxels-", "background", SET)  # how the files begin that a finished set needs
+_KEPT = ("voxels-", "background", SET)  # prefixes of the files that a finished set needs
 
 
 @dataclass(frozen=True)
 class Anchor:
-    """What all sets of a scene share; made by the first.
+    """Data shared by all sets of a scene; created with the first set.
 
     Attributes:
-        reference: ``[4, 4]`` float64 given pose of the camera whose frame the voxels are in.
+        reference: ``[4, 4]`` float64 given pose of the camera that is the frame of the voxels.
         unit: scene units per unit of the given cameras.
         voxel_size: edge of the fine voxels in scene units.
         size: ``(height, width)`` of the images.
@@ -46,19 +46,19 @@ class Anchor:
         return matrix.astype(np.float64)
 
     def plain(self) -> dict[str, Any]:
-        """The attributes as JSON has them."""
+        """Returns the attributes as JSON values."""
         return vars(self) | {"reference": self.reference.tolist()}
 
     def write(self, folder: Path) -> None:
-        """Writes it into the folder of the sets."""
+        """Writes the anchor into the folder of the sets."""
         write_json(folder / _ANCHOR, self.plain())
 
 
 def read_anchor(folder: Path) -> Anchor:
-    """The anchor of a scene.
+    """Reads the anchor of a scene.
 
     Raises:
-        FileNotFoundError: if there is none, with the remedy.
+        FileNotFoundError: if there is none; the message names the remedy.
     """
     if not (folder / _ANCHOR).is_file():
         raise FileNotFoundError(
@@ -69,12 +69,12 @@ def read_anchor(folder: Path) -> Anchor:
 
 
 def finished_sets(folder: Path) -> list[Path]:
-    """Folders of the sets whose voxels are all there, in the order in which sums are taken: that of their keys."""
+    """Returns the folders of the complete sets, sorted by key, which is the order of summation."""
     return sorted(path.parent for path in folder.glob(f"*/{SET}") if read_json(path).get("finished"))
 
 
 def tidy(folder: Path) -> None:
-    """Leaves what is needed to add sets and to take them out; removes the rest, such as unfinished sets."""
+    """Removes unfinished sets and all files that are not needed to add or remove sets."""
     done = finished_sets(folder)
     for place in (file.parent for file in folder.glob(f"*/{SET}")):
         if place not in done:
@@ -85,7 +85,7 @@ def tidy(folder: Path) -> None:
 
 
 def joined(old: Scene, new: Scene) -> Scene:
-    """The views of two scenes in one frame, in the order of their names, with the Gaussians of the second."""
+    """Joins the views of two scenes in one frame, sorted by name, with the Gaussians of the second."""
     names = (*old.names, *new.names)
     order = torch.tensor(sorted(range(len(names)), key=lambda view: by_number(names[view])))
     masks = [torch.ones_like(each.depth) if each.mask is None else each.mask for each in (old, new)]
@@ -111,7 +111,7 @@ def joined(old: Scene, new: Scene) -> Scene:
 
 
 def without(scene: Scene, names: set[str]) -> Scene:
-    """The scene without the views of these names; its Gaussians stay.
+    """Returns the scene without the named views; its Gaussians stay.
 
     Raises:
         ValueError: if no view is left.

@@ -1,4 +1,4 @@
-"""Files of a reconstruction in windows: arrays of all views that are mapped into memory, and finished steps."""
+"""Files of a reconstruction in windows: memory-mapped arrays of all views, and results of finished steps."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from vg2gt.model import Reconstructor
 
 FORMAT = 1
 """Of the folder; raise it when it is written otherwise."""
-SET = "set.json"  # what a folder is of
+SET = "set.json"  # marks the folder of a set; says whether it is finished
 _PLAIN = (bool, int, float, str, tuple, type(None))
 
 
 class WindowStore:
-    """The folder of one set of images. What is in it survives an interruption.
+    """The folder of one image set; its content survives an interruption.
 
     Args:
-        folder: of all sets of images; the set has a folder in it, made if it is not there.
-        key: of the set: its images, model and sizes.
+        folder: parent folder of all sets; the folder of this set is created in it if missing.
+        key: hash of the images, model and sizes of the set.
     """
 
     def __init__(self, folder: Path, key: str) -> None:
@@ -39,16 +39,16 @@ class WindowStore:
             write_json(self.folder / SET, {"finished": False})
 
     def finish(self) -> None:
-        """Notes that all steps are done."""
+        """Marks the set as finished."""
         write_json(self.folder / SET, {"finished": True})
 
     def array(self, name: str, shape: Sequence[int] | None = None, fill: float = 0) -> Tensor:
-        """A float32 array of the folder, mapped into memory: what is written to the tensor is in the file.
+        """Returns a memory-mapped float32 array of the folder; writing to the tensor writes to the file.
 
         Args:
-            name: of its file.
-            shape: makes it, of ``fill``, where it is not there.
-            fill: see ``shape``.
+            name: file name without extension.
+            shape: shape to create the array with if it does not exist.
+            fill: initial value of a new array.
         """
         path = self.folder / f"{name}.npy"
         if shape is not None and not path.is_file():
@@ -60,20 +60,20 @@ class WindowStore:
         return torch.from_numpy(open_memmap(path, "r+"))
 
     def has(self, name: str) -> bool:
-        """Whether there is an array, or a finished step of this name."""
+        """Returns whether an array or a finished step of this name exists."""
         return (self.folder / f"{name}.npy").is_file() or self.step(name).is_file()
 
     def step(self, name: str) -> Path:
-        """The file of a finished step."""
+        """Returns the file of a finished step."""
         return self.folder / f"{name}.safetensors"
 
     def save(self, name: str, tensors: Mapping[str, Tensor]) -> None:
-        """Writes what a step found, whole or not at all."""
+        """Writes the result of a step, completely or not at all."""
         with replacing(self.step(name)) as temporary:
             save_file({key: value.detach().cpu().contiguous() for key, value in tensors.items()}, temporary)
 
     def load(self, name: str) -> dict[str, Tensor] | None:
-        """What a step found; None where it is not finished."""
+        """Reads the result of a step; None if it is not finished."""
         try:
             return read_tensors(self.step(name))
         except (FileNotFoundError, FormatError):
@@ -81,13 +81,13 @@ class WindowStore:
 
 
 def read_rows(file: Path, rows: slice) -> dict[str, Tensor]:
-    """Some rows of all tensors of a finished step's file."""
+    """Reads some rows of all tensors in a finished step's file."""
     with safe_open(file, "pt") as opened:
         return {key: opened.get_slice(key)[rows] for key in opened.keys()}  # noqa: SIM118
 
 
 def key_of(model: Reconstructor, *facts: object) -> str:
-    """Changes with a model's weights and options, and with the facts (JSON)."""
+    """Returns a hash of a model's weights and options, and of further facts (JSON values)."""
     digest = hashlib.sha256(json.dumps([FORMAT, model.backend.identity(), facts]).encode())
     for name, module in model.named_modules():
         options = {key: value for key, value in vars(module).items() if isinstance(value, _PLAIN) and key[0] != "_"}
