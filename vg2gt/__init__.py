@@ -38,7 +38,7 @@ _HOMES = {
 
 
 def source() -> str:
-    """Where this copy comes from: ``git describe`` of the checkout, or of that which the wheel was built from."""
+    """Returns ``git describe`` of this checkout or of the one the wheel was built from; ``unknown`` without either."""
     stored = Path(__file__).with_name("SOURCE")
     if stored.is_file():
         return stored.read_text().strip()
@@ -50,7 +50,7 @@ def source() -> str:
 
 
 def __getattr__(name: str) -> Any:
-    """Imports what is asked for only then: torch and Hydra take seconds."""
+    """Imports public names on first use: torch and Hydra take seconds."""
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(_HOMES[name]), name)

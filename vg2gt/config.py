@@ -1,4 +1,4 @@
-"""Configurations: where the groups are, and how all commands, studies and tests compose them."""
+"""Finds the configuration groups and composes them, for all commands, studies and tests."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ ENTRY_POINTS = {"backend": "vg2gt.backends", "data": "vg2gt.datasets"}
 
 
 def plugin_targets() -> dict[str, dict[str, str]]:
-    """Classes of installed packages by group and name; none is imported.
+    """Returns the plug-in classes of installed packages by group and name, without importing them.
 
-    A package adds ``backend=NAME`` by an entry point ``NAME = "module:Class"`` in ``vg2gt.backends``, and ``data=NAME``
-    by one in ``vg2gt.datasets``, where the class is a :class:`~vg2gt.data.sources.files.FileSource`.
+    A package adds ``backend=NAME`` with an entry point ``NAME = "module:Class"`` in ``vg2gt.backends``, and
+    ``data=NAME`` with one in ``vg2gt.datasets``, whose class is a :class:`~vg2gt.data.sources.files.FileSource`.
     """
     return {
         group: {entry.name: entry.value.replace(":", ".") for entry in importlib.metadata.entry_points(group=points)}
@@ -36,7 +36,7 @@ def plugin_targets() -> dict[str, dict[str, str]]:
 
 
 def _register_plugins() -> None:
-    """Makes options of the plug-ins; a file of the same name in ``configs/`` goes before."""
+    """Registers plug-ins as options; a file of the same name in ``configs/`` takes precedence."""
     store = ConfigStore.instance()
     for name, target in plugin_targets()["backend"].items():
         store.store(name, {"_target_": target}, group="backend")
@@ -50,7 +50,7 @@ _register_plugins()
 
 
 def config_dir() -> str:
-    """Absolute path of the configuration folder: in the installed package, or next to it in a checkout."""
+    """Returns the absolute path of the configuration folder: in the installed package, or next to it in a checkout."""
     for folder in (_PACKAGE / "configs", _PACKAGE.parent / "configs"):
         if (folder / "train.yaml").is_file():
             return str(folder)
@@ -58,23 +58,23 @@ def config_dir() -> str:
 
 
 def group_options(group: str) -> list[str]:
-    """The names that ``group=`` takes, sorted."""
+    """Returns the options that ``group=`` accepts, sorted."""
     plugins = plugin_targets().get(group, {})
     return sorted({*plugins, *(path.stem for path in Path(config_dir(), group).glob("*.yaml"))})
 
 
 def compose(name: str | None, *overrides: str) -> DictConfig:
-    """Composes a configuration as the commands do, inside a command as well.
+    """Composes a configuration as the commands do; also works inside a command.
 
     Args:
-        name: ``train``, ``evaluate``, ``ablate``, or one option such as ``loss/quickstart``; None: nothing but what
+        name: ``train``, ``evaluate``, ``ablate``, or one option such as ``loss/quickstart``; None: only what
             ``+group=option`` adds.
-        overrides: as on the command line.
+        overrides: Hydra overrides, as on the command line.
 
     Raises:
-        ValueError: if an override is wrong, with Hydra's reason.
+        ValueError: if an override is invalid, with Hydra's reason.
     """
-    # Inside a command Hydra is initialised already, with the same folder.
+    # inside a command, Hydra is already initialised with the same folder
     inside = GlobalHydra.instance().is_initialized()
     try:
         with nullcontext() if inside else hydra.initialize_config_dir(config_dir(), version_base="1.3"):
@@ -85,12 +85,12 @@ def compose(name: str | None, *overrides: str) -> DictConfig:
 
 
 def compose_groups(*overrides: str) -> DictConfig:
-    """Composes nothing but the groups that ``group=option`` names, changed by ``group.key=value``."""
+    """Composes only the groups named by ``group=option``, modified by ``group.key=value``."""
     return compose(None, *(each if "." in each.partition("=")[0] else f"+{each.lstrip('+')}" for each in overrides))
 
 
 def near_keys(name: str, overrides: Sequence[str]) -> str:
-    """A line that says what unknown keys of a command line may have meant; empty if there is nothing alike."""
+    """Returns suggestions for unknown keys of a command line, one line per key; empty if no key is similar."""
     keys = {each.partition("=")[0] for each in overrides if "=" in each and each[0] not in "+~-"}
     groups = [each for each in overrides if (Path(config_dir()) / each.partition("=")[0]).is_dir()]
     groups += [each for each in overrides if each.startswith("hydra.searchpath=")]
@@ -110,7 +110,7 @@ def near_keys(name: str, overrides: Sequence[str]) -> str:
 
 
 def flatten(node: Any, prefix: str = "") -> dict[str, Any]:
-    """Names the leaves of nested dictionaries by dotted keys."""
+    """Flattens nested dictionaries into one with dotted keys."""
     if not isinstance(node, dict):
         return {prefix: node}
     return {

@@ -1,4 +1,4 @@
-"""Memory: caps on what a scene may have, and what to change when the memory was not enough."""
+"""Limits on the number of elements per scene, and advice when memory runs out."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ RECONSTRUCTION = (
     "model.fine.dense_head.views_per_chunk=2)"
 )
 
-# Parts of the messages of torch's allocators and of CUDA's, where the error has no class of its own.
-# The last is what oneDNN says on some processors when it finds no memory for a convolution's scratch.
+# Parts of out-of-memory messages of torch's allocators and of CUDA that have no exception class of their own.
+# The last is oneDNN's on some processors when it cannot allocate the scratch space of a convolution.
 _SAID = (
     "allocate memory",
     "not enough memory",
@@ -42,19 +42,19 @@ _sizes: ContextVar[dict[str, int] | None] = ContextVar("sizes", default=None)
 
 
 class OutOfMemory(MemoryError):
-    """The device's memory is full; the message says with what sizes, and what to change."""
+    """The device's memory is full; the message names the sizes in use and what to change."""
 
 
 @contextmanager
 def memory_advice(advice: str) -> Iterator[None]:
-    """Turns what Python, torch or CUDA say when memory is full into one error; also a decorator.
+    """Converts out-of-memory errors of Python, torch and CUDA into :class:`OutOfMemory`; also a decorator.
 
     Args:
-        advice: names the options that the caller's user has: :data:`TRAINING`, :data:`EVALUATION` or
+        advice: the options that reduce memory in the caller's command: :data:`TRAINING`, :data:`EVALUATION` or
             :data:`RECONSTRUCTION`.
 
     Raises:
-        OutOfMemory: with the sizes that were noted inside (:func:`note_sizes`) and the advice.
+        OutOfMemory: with the sizes recorded inside the block (:func:`note_sizes`) and the advice.
     """
     sizes: dict[str, int] = {}
     token = _sizes.set(sizes)
@@ -71,7 +71,7 @@ def memory_advice(advice: str) -> Iterator[None]:
 
 
 def note_sizes(sizes: Mapping[str, int], first: bool = False) -> None:
-    """Notes how many of what a pass has, for the message should it fail; ``first`` forgets those of the pass before."""
+    """Records element counts of a pass for the error message; ``first`` clears those of the previous pass."""
     noted = None if torch.compiler.is_compiling() else _sizes.get()
     if noted is None:
         return
@@ -85,17 +85,17 @@ def _is_full(error: Exception) -> bool:
 
 
 class Cap:
-    """The most of something that each scene may have: what ranks lowest is dropped, counted and logged.
+    """Limits the number of elements per scene: the lowest-ranked ones are dropped, counted and logged.
 
-    The warning comes in the first pass that drops something, then in the second, fourth, eighth, ... of them.
+    The warning is logged in the first, second, fourth, eighth, ... pass that drops elements.
 
     Args:
-        option: the configuration's name of the limit, for the log.
-        what: what is dropped, for the log and the metric.
-        rank: how the dropped ones are called, such as ``least confident``.
+        option: configuration key of the limit, for the log.
+        what: name of the elements, for the log and the metric.
+        rank: name of the lowest rank, such as ``least confident``, for the log.
 
     Attributes:
-        dropped: how many the last pass dropped, over all of its scenes.
+        dropped: number of elements dropped in the last pass, over all scenes.
     """
 
     def __init__(self, option: str, what: str, rank: str) -> None:
@@ -106,7 +106,7 @@ class Cap:
         self._passes = 0
 
     def __call__(self, limit: int | None, ranks: Tensor, batch: Tensor) -> Tensor | None:
-        """Which of ``[M]`` to keep (None: all): the ``limit`` highest of every scene of ``batch [M]``, sorted."""
+        """Returns a ``[M]`` mask of the ``limit`` highest ranks per scene (None: keep all); ``batch [M]`` is sorted."""
         self.dropped = 0
         if limit is None or len(batch) <= limit:
             return None
@@ -124,14 +124,14 @@ class Cap:
 
 
 def check_limit(option: str, limit: int | None) -> int | None:
-    """Returns the limit; ValueError if it is below 1."""
+    """Returns the limit; raises ValueError if it is below 1."""
     if limit is not None and limit < 1:
         raise ValueError(f"{option} must be at least 1, or null for no limit, got {limit}")
     return limit
 
 
 def dropped_by(model: nn.Module) -> dict[str, int]:
-    """What the limits of a model's parts dropped in its last pass, by what it was; only parts that have a limit."""
+    """Returns how many elements a model dropped in its last pass, by name; only for parts with a limit."""
     found: dict[str, int] = {}
     for module in model.modules():
         cap = getattr(module, "cap", None)
@@ -141,7 +141,7 @@ def dropped_by(model: nn.Module) -> dict[str, int]:
 
 
 def _highest(ranks: Tensor, batch: Tensor, limit: int) -> Tensor:
-    """``[M]`` bool: the ``limit`` highest of every scene."""
+    """Returns ``[M]`` bool, true for the ``limit`` highest ranks of every scene."""
     keep = torch.ones_like(batch, dtype=torch.bool)
     begin = 0
     for count in torch.bincount(batch).tolist():

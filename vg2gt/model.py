@@ -33,17 +33,17 @@ from vg2gt.types import Cameras, Decoded, Gaussians, Geometry, Hints, Prediction
 Background = Literal["mean", "black"]
 ScaleSource = Literal["metric", "focal", "normalize", "groundtruth"]
 BACKBONE_PREFIX = "backend."
-SEEN_WEIGHT = 0.01  # in the background's colour, of a pixel with a depth against one without
+SEEN_WEIGHT = 0.01  # weight of pixels with depth in the background colour; pixels without depth have weight 1
 CANONICAL_FOCAL = 300.0  # appendix A.1: d_metric = f * d_net / 300
 
 
 class SceneScale:
-    """Fixes the unit of a scene before anything is voxelised (paper, appendix A.1): one factor a scene.
+    """Fixes the scene unit before voxelisation, with one factor per scene (paper, appendix A.1).
 
     Args:
-        source: ``metric`` (the backend knows metres), ``focal`` (mean focal length / 300, as the paper does with DA3),
-            ``normalize`` (the median depth of the scene becomes ``median_depth``) or ``groundtruth`` (training only:
-            the weighted-median alignment to the depth in the hints).
+        source: ``metric`` (metres, as the backend predicts them), ``focal`` (mean focal length / 300, as the paper does
+            with DA3), ``normalize`` (the median depth of the scene becomes ``median_depth``) or ``groundtruth``
+            (training only: weighted-median alignment to the depth in the hints).
         median_depth: the median depth after ``normalize``, in scene units.
 
     Raises:
@@ -57,7 +57,7 @@ class SceneScale:
         self.median_depth = median_depth
 
     def __call__(self, geometry: Geometry, hints: Hints | None) -> Tensor:
-        """Returns scene units per unit of ``geometry``, ``[B]``, detached."""
+        """Returns scene units per unit of ``geometry``: ``[B]``, detached."""
         if self.source == "metric":
             return geometry.scale.detach()
         if self.source == "focal":
@@ -75,18 +75,19 @@ class SceneScale:
 
 
 class Reconstructor(nn.Module, ABC):
-    """What training, evaluation and commands know of a model: images in, a Gaussian scene out, on a frozen backbone.
+    """Base class of models that reconstruct a Gaussian scene from images on a frozen backbone.
+
+    Training, evaluation and commands use only this interface.
 
     Args:
         backend: the frozen visual foundation model.
         scale: fixes the scene unit.
-        background: what rays see that meet no Gaussian: the ``mean`` colour of the pixels without a depth, or of all
-            where there are none, or ``black``.
-        visibility: not in the paper: decides by what other views see which pixels' depth the scene is made of; None
-            takes all.
+        background: colour of rays that hit no Gaussian: ``mean`` (of the pixels without depth, or of all pixels if all
+            have depth) or ``black``.
+        visibility: selects the pixels whose depth the other views support (not in the paper); None uses all.
 
     Raises:
-        ValueError: if the scale is to be metric and the backend is not, or the background is unknown.
+        ValueError: if the scale is metric but the backend is not, or the background is unknown.
     """
 
     def __init__(
@@ -104,12 +105,12 @@ class Reconstructor(nn.Module, ABC):
                 f"model.scale.source=metric needs a backend that knows metres, {backend.name} does not: "
                 "use model.scale.source=normalize or focal"
             )
-        backend.freeze()  # a subclass may have added layers after its parent's constructor froze those before
+        backend.freeze()  # again: a subclass may have added layers after its parent's constructor froze the backend
         self.backend = backend
         self.scale = scale
         self.background: Background = background
         self.visibility = visibility
-        self.token_cache: TokenCache | None = None  # set where view sets come again
+        self.token_cache: TokenCache | None = None  # set by callers that see the same views repeatedly
 
     @abstractmethod
     def forward(
@@ -119,11 +120,11 @@ class Reconstructor(nn.Module, ABC):
 
         Args:
             images: ``[B, V, 3, H, W]`` in [0, 1]; H and W multiples of the backend's patch size.
-            hints: what the data knows, for backends that need it.
-            generator: draws whatever is random while training.
+            hints: data about the views, for backends that need it.
+            generator: random generator for training.
 
         Returns:
-            Geometry and Gaussians in scene units and in the frame of view 0.
+            Geometry and Gaussians, in scene units and the frame of view 0.
         """
 
     def read_views(
@@ -133,11 +134,11 @@ class Reconstructor(nn.Module, ABC):
 
         Args:
             images: ``[B, V, 3, H, W]`` in [0, 1].
-            hints: what the data knows of these views.
-            unit: ``[B]`` scene units per unit of the backbone; None: the model's own.
+            hints: data about the views.
+            unit: ``[B]`` scene units per unit of the backbone; None: from ``self.scale``.
 
         Returns:
-            Its tokens, its geometry in scene units and in the frame of view 0, and the unit ``[B]``.
+            The tokens, the geometry in scene units and the frame of view 0, and the unit ``[B]``.
         """
         scenes, views, _, height, width = images.shape
         note_sizes({f"images of {height}x{width} in {scenes} scene{'s' * (scenes > 1)}": scenes * views}, first=True)
@@ -147,11 +148,11 @@ class Reconstructor(nn.Module, ABC):
         return tokens, _to_scene_frame(raw, unit), unit
 
     def run_backbone(self, images: Tensor, hints: Hints | None) -> tuple[Tokens, Geometry]:
-        """The backbone's tokens and the geometry that its heads decode of them; from the cache where there is one.
+        """Returns the backbone's tokens and decoded geometry, from the cache if there is one.
 
         Args:
             images: ``[B, V, 3, H, W]`` in [0, 1].
-            hints: what the data knows of these views.
+            hints: data about the views.
         """
         if self.token_cache is not None and self.backend.frozen:
             with stage("encode"):
@@ -162,11 +163,11 @@ class Reconstructor(nn.Module, ABC):
             return tokens, self.backend.decode(tokens)
 
     def predict_cameras(self, images: Tensor, hints: Hints | None) -> Cameras:
-        """The backbone's raw cameras alone, from the cache where there is one.
+        """Returns only the backbone's raw cameras, from the cache if there is one.
 
         Args:
             images: ``[B, V, 3, H, W]`` in [0, 1].
-            hints: what the data knows of these views.
+            hints: data about the views.
         """
         with stage("cameras"):
             if self.token_cache is not None and self.backend.frozen:
@@ -174,19 +175,19 @@ class Reconstructor(nn.Module, ABC):
             return self.backend.predict_cameras(images, hints)
 
     def support(self, geometry: Geometry, hints: Hints | None) -> Support | None:
-        """What the views say of each other's depth; None where nothing is checked."""
+        """Checks each view's depth against the other views; None without a visibility check."""
         if self.visibility is None:
             return None
         with stage("visibility"):
             return self.visibility(geometry, None if hints is None else hints.frame_ids)
 
     def with_background(self, gaussians: Gaussians, images: Tensor, depth: Tensor) -> Gaussians:
-        """Sets what rays see that meet no Gaussian: the colour of pixels without depth (the sky), else the mean colour.
+        """Sets the background to the mean colour of pixels without depth (the sky), else of all, unless it is black.
 
         Args:
-            gaussians: of B scenes.
-            images: ``[B, V, 3, H, W]`` that they were made of.
-            depth: ``[B, V, H, W]`` the backbone's, 0 = invalid.
+            gaussians: Gaussians of B scenes.
+            images: ``[B, V, 3, H, W]`` input images.
+            depth: ``[B, V, H, W]`` the backbone's depth, 0 = invalid.
         """
         if self.background == "black":
             return gaussians
@@ -194,25 +195,25 @@ class Reconstructor(nn.Module, ABC):
         return replace(gaussians, background=total / weight)
 
     def trained_parameters(self) -> list[nn.Parameter]:
-        """The parameters that training changes: everything but a frozen backbone."""
+        """Returns the trainable parameters: all but those of a frozen backbone."""
         return [parameter for parameter in self.parameters() if parameter.requires_grad]
 
     def trained_state(self) -> dict[str, Tensor]:
-        """What a checkpoint holds of the model: the state of everything but a frozen backbone."""
+        """Returns the state that a checkpoint stores: everything but a frozen backbone."""
         return {name: value for name, value in self.state_dict().items() if self._stored(name)}
 
     def _stored(self, name: str) -> bool:
         return not (self.backend.frozen and name.startswith(BACKBONE_PREFIX))
 
     def load_trained(self, state: Mapping[str, Tensor], backend: Mapping[str, Any] | None) -> None:
-        """Loads the trained part, which must be whole; a backbone that was frozen in training is not in it.
+        """Loads the trained part, which must be complete and does not contain a frozen backbone.
 
         Args:
-            state: as :meth:`trained_state` gave it.
+            state: result of :meth:`trained_state`.
             backend: identity of the backbone it was trained on.
 
         Raises:
-            ValueError: if it was trained on another backbone, or does not fit this model; nothing is loaded then.
+            ValueError: if it was trained on another backbone or does not fit this model; nothing is loaded then.
         """
         self.check_backend(backend)
         present = {name: value.shape for name, value in self.trained_state().items()}
@@ -227,10 +228,10 @@ class Reconstructor(nn.Module, ABC):
         self.load_state_dict(state, strict=False)
 
     def check_backend(self, stored: Mapping[str, Any] | None) -> None:
-        """Refuses weights that were trained on another backbone.
+        """Checks that weights were trained on this model's backbone.
 
         Raises:
-            ValueError: naming both.
+            ValueError: if they were trained on another one; names both.
         """
         present = dict(self.backend.identity())
         if stored != present:
@@ -246,16 +247,16 @@ class VG2GT(Reconstructor):
     Args:
         backend: the frozen visual foundation model.
         scale: fixes the scene unit.
-        coarse: makes the coarse-level feature enhancement from ``token_dims`` and ``patch_size``; None leaves it out
-            (ablation w/o Coarse): the geometry is then the backbone's.
-        fine: makes the fine-level voxel module from ``token_dims`` and ``patch_size``.
-        gaussians: makes the self-splitting Gaussian head from ``in_channels``.
-        keep_scale: the enhanced depth keeps the scale of the backbone's, see :func:`with_scale_of`.
+        coarse: factory of the coarse-level feature enhancement, called with ``token_dims`` and ``patch_size``; None
+            (ablation w/o Coarse) uses the backbone's geometry.
+        fine: factory of the fine-level voxel module, called with ``token_dims`` and ``patch_size``.
+        gaussians: factory of the self-splitting Gaussian head, called with ``in_channels``.
+        keep_scale: rescales the enhanced depth to the scale of the backbone's, see :func:`with_scale_of`.
         background: see :class:`Reconstructor`.
-        visibility: see :class:`Reconstructor`; it checks the enhanced geometry before the fine level.
+        visibility: see :class:`Reconstructor`; applied to the enhanced geometry before the fine level.
 
     Raises:
-        ValueError: if the scale is to be metric and the backend is not, or the background is unknown.
+        ValueError: if the scale is metric but the backend is not, or the background is unknown.
     """
 
     def __init__(
@@ -283,15 +284,15 @@ class VG2GT(Reconstructor):
 
         Args:
             images: ``[B, V, 3, H, W]`` in [0, 1]; H and W multiples of the backend's patch size.
-            hints: what the data knows, for backends that need it.
-            generator: draws the serialisation order of the coarse module, and voxel sizes, while training.
+            hints: data about the views, for backends that need it.
+            generator: while training, draws serialisation orders of the coarse module and voxel sizes.
 
         Returns:
-            Geometry before and after enhancement, voxels and Gaussians, in scene units and in the frame of view 0.
+            Geometry before and after enhancement, voxels and Gaussians, in scene units and the frame of view 0.
         """
         # coarse level: images [B, V, 3, H, W] to enhanced tokens [B, V, P, D] and depth [B, V, H, W]
         tokens, decoded = self.enhance(images, hints, generator)
-        # ours: pixels that other views do not contradict [B, V, H, W]
+        # ours: mask of pixels that other views do not contradict [B, V, H, W]
         support = self.support(decoded.geometry, hints)
         keep, coarsen = (None, None) if support is None else (support.keep, support.coarsen)
         # fine level: pixels to M voxels with features [M, C]
@@ -309,40 +310,40 @@ class VG2GT(Reconstructor):
         generator: torch.Generator | None = None,
         unit: Tensor | None = None,
     ) -> tuple[Tokens, Decoded]:
-        """The part of the method up to the enhanced geometry (paper, Coarse-level).
+        """Runs the method up to the enhanced geometry (paper, Coarse-level).
 
         Args:
             images: as for :meth:`forward`.
             hints: as for :meth:`forward`.
             generator: as for :meth:`forward`.
-            unit: ``[B]`` scene units per unit of the backbone; None: the model's own.
+            unit: ``[B]`` scene units per unit of the backbone; None: from ``self.scale``.
 
         Returns:
-            The enhanced tokens, and geometry before and after enhancement.
+            The enhanced tokens, and the geometry before and after enhancement.
         """
         # frozen backbone: tokens [B, V, P, D], depth and cameras
         tokens, initial, unit = self.read_views(images, hints, unit)
         if self.coarse is None:
             return tokens, Decoded(initial, initial, unit)
-        # points to voxels, PTv3, back to tokens, which the same frozen heads decode again
+        # points to coarse voxels, PTv3, back to tokens; the same frozen heads decode them again
         with stage("coarse"):
             tokens = self.coarse(tokens, initial, generator=generator)
         with stage("decode_again"):
             again = masked(self.backend.decode(tokens), hints)
-        # The camera token is untouched, so the cameras are the backbone's: decoded once, used throughout.
+        # the camera token is unchanged, so the cameras of the first decoding stay valid
         depth = again.depth * unit[:, None, None, None]
         depth = depth if not self.keep_scale else with_scale_of(initial, depth)
         return tokens, Decoded(initial, replace(initial, depth=depth, depth_conf=again.depth_conf), unit)
 
 
 def background_sums(images: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]:
-    """Weighted sum of the colours ``[B, 3]`` that a scene's background is the mean of, and the weights' ``[B, 1]``."""
+    """Returns the weighted colour sum ``[B, 3]`` and the weight sum ``[B, 1]``; their ratio is the background."""
     weight = torch.where(depth > 0, SEEN_WEIGHT, 1.0)[:, :, None]  # [B, V, 1, H, W]
     return (weight * images.detach().float()).sum((1, 3, 4)), weight.sum((1, 3, 4))
 
 
 def masked(geometry: Geometry, hints: Hints | None) -> Geometry:
-    """Takes depth away where a mask says that pixels do not count, and confidence as far as they count less."""
+    """Removes depth where the mask is at most 0.5, and multiplies the confidence by the mask."""
     if hints is None or hints.mask is None:
         return geometry
     kept = geometry.where(hints.mask > 0.5)
@@ -350,11 +351,11 @@ def masked(geometry: Geometry, hints: Hints | None) -> Geometry:
 
 
 def with_scale_of(initial: Geometry, depth: Tensor) -> Tensor:
-    """Takes the one factor per scene between enhanced and initial depth out of the enhanced depth, differentiably.
+    """Rescales the enhanced depth to the scale of the initial depth, with one differentiable factor per scene.
 
-    The cameras stay the backbone's, so the scale of all views' depth against their translations must as well: losses
-    that align depth by a free factor do not see it drift, but every view would unproject to another place. The factor
-    is the exponential of the mean log-ratio, weighted by the backbone's confidence.
+    The cameras stay the backbone's, so the depth must keep its scale relative to their translations. Losses that align
+    depth by a free factor do not notice a drift, but every view would unproject to a different place. The factor is the
+    exponential of the mean log-ratio, weighted by the backbone's confidence.
 
     Args:
         initial: the backbone's geometry.
@@ -369,7 +370,7 @@ def with_scale_of(initial: Geometry, depth: Tensor) -> Tensor:
 
 
 def _to_scene_frame(geometry: Geometry, unit: Tensor) -> Geometry:
-    """Scales geometry to scene units and moves the world into context view 0, which becomes exactly the identity."""
+    """Scales geometry to scene units and makes view 0 the world frame, with exactly the identity as its pose."""
     cameras = scale_translations(relative_to_first(geometry.cameras), unit)
     return replace(
         geometry, depth=geometry.depth * unit[:, None, None, None], cameras=cameras, scale=geometry.scale / unit

@@ -1,4 +1,4 @@
-"""Marks of a model's stages, for torch's profiler and for whoever listens; wall time and peak memory."""
+"""Stage markers for torch's profiler and for listeners; wall time and peak memory."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _listeners: ContextVar[tuple[Listener, ...]] = ContextVar("listeners", default=(
 
 @contextmanager
 def stage(name: str) -> Iterator[None]:
-    """Marks a stage: torch's profiler shows it as ``vg2gt/<name>``, listeners run around it."""
+    """Marks a stage: torch's profiler shows it as ``vg2gt/<name>``, and listeners run around it."""
     with ExitStack() as stack:
         stack.enter_context(record_function(f"vg2gt/{name}"))
         for listener in _listeners.get():
@@ -31,7 +31,7 @@ def stage(name: str) -> Iterator[None]:
 
 @contextmanager
 def listening(listener: Listener) -> Iterator[None]:
-    """Inside the block every stage runs inside ``listener(name)``."""
+    """Wraps every stage inside the block in ``listener(name)``."""
     token = _listeners.set((*_listeners.get(), listener))
     try:
         yield
@@ -41,20 +41,20 @@ def listening(listener: Listener) -> Iterator[None]:
 
 @dataclass
 class Clock:
-    """Wall time of a reconstruction in seconds: ``total``, and ``before_head``, up to the coarse enhancement."""
+    """Wall time of a reconstruction in seconds: ``total``, and ``before_head`` for the stages in ``BEFORE_HEAD``."""
 
     total: float = 0.0
     before_head: float = 0.0
 
     @property
     def head(self) -> float:
-        """What makes Gaussians of tokens and geometry: the paper's decoding-head time."""
+        """Time from tokens and geometry to Gaussians, the paper's decoding-head time."""
         return self.total - self.before_head
 
 
 @contextmanager
 def clocked(device: torch.device) -> Iterator[Clock]:
-    """Measures one pass of a model inside the block, waiting for the device at the ends of every stage."""
+    """Times one forward pass inside the block; synchronises with the device at both ends of every stage."""
     clock = Clock()
 
     @contextmanager
@@ -71,20 +71,20 @@ def clocked(device: torch.device) -> Iterator[Clock]:
 
 
 def now(device: torch.device) -> float:
-    """Seconds on a steady clock, once the device has done what it was given."""
+    """Returns seconds on a monotonic clock, after synchronising with the device."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     return time.perf_counter()
 
 
 def reset_peak_memory(device: torch.device) -> None:
-    """Begins a new measurement on a GPU; a process's own peak cannot be reset."""
+    """Resets the peak on a GPU; the peak of a process cannot be reset."""
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
 
 
 def peak_memory_mib(device: torch.device) -> float:
-    """Peak MiB allocated on the GPU since the reset, or resident in the process; 0 where it is not known (Windows)."""
+    """Returns peak MiB: allocated on the GPU since the reset, or resident in the process; 0 if unknown (Windows)."""
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device) / MIB
     try:

@@ -1,4 +1,4 @@
-"""The frozen records that pass between the parts of VG²GT.
+"""Frozen dataclasses passed between the parts of VG²GT.
 
 Conventions (``docs/concepts/conventions.md``): OpenCV cameras (x right, y down, z forward), ``world_to_camera`` 4x4,
 intrinsics in pixels with integer pixel centres (the centre of pixel (0, 0) is at (0, 0)), z-depth with 0 where invalid.
@@ -20,22 +20,22 @@ Record = TypeVar("Record", bound="TensorRecord")
 
 @dataclass(frozen=True)
 class TensorRecord:
-    """Base of all records: maps a function over every tensor, nested records, tuples and mappings included."""
+    """Base class of all records: maps functions over all tensors, including nested records, tuples and mappings."""
 
     def map(self: Record, function: Callable[[Tensor], Tensor]) -> Record:
         """Returns a copy whose tensors are ``function(tensor)``; everything else is kept."""
         return replace(self, **{f.name: _map_value(getattr(self, f.name), function) for f in fields(self)})
 
     def to(self: Record, device: torch.device | str, non_blocking: bool = False) -> Record:
-        """Returns a copy on ``device``; without blocking, page-locked memory is copied while the host goes on."""
+        """Returns a copy on ``device``; with ``non_blocking``, copies from page-locked memory do not block the host."""
         return self.map(lambda tensor: tensor.to(device, non_blocking=non_blocking))
 
     def pin_memory(self: Record) -> Record:
-        """Returns a copy in page-locked memory, from where copies to a GPU are faster."""
+        """Returns a copy in page-locked memory, which is faster to copy to a GPU."""
         return self.map(Tensor.pin_memory)
 
     def detach(self: Record) -> Record:
-        """Returns a copy cut from the autograd graph."""
+        """Returns a copy detached from the autograd graph."""
         return self.map(Tensor.detach)
 
 
@@ -66,7 +66,7 @@ class Cameras(TensorRecord):
     size: tuple[int, int]
 
     def select(self, views: Tensor | slice) -> Cameras:
-        """Returns the cameras of some views, ``views`` indexing the V axis."""
+        """Returns the cameras of some views; ``views`` indexes the V axis."""
         return Cameras(self.world_to_camera[:, views], self.intrinsics[:, views], self.size)
 
     def scene(self, index: int) -> Cameras:
@@ -76,16 +76,16 @@ class Cameras(TensorRecord):
 
 @dataclass(frozen=True)
 class Hints(TensorRecord):
-    """What the data knows and a backend may use (the oracle needs it, DA3 may take the cameras).
+    """Data about the views that a backend can use besides the images (the oracle needs it, DA3 can use the cameras).
 
     Attributes:
         depth: ``[B, V, H, W]`` z-depth in the data's unit, 0 = invalid; None if unknown.
         cameras: cameras in any world frame; None if unknown.
-        scene_key: one name a scene; seeds simulated noise.
+        scene_key: one name per scene; seeds simulated noise.
         frame_ids: ``[B, V]`` int64 frame numbers; seed simulated noise.
-        depth_range: ``[B, 2]`` z-depth (near, far) between which nearly all of what the views see lies, such as sparse
-            points of structure from motion tell, in the unit of the cameras' translations; None if unknown.
-        mask: ``[B, V, H, W]`` in [0, 1], how much each pixel counts (alpha, mask images); None: all count.
+        depth_range: ``[B, 2]`` z-depth (near, far) that contains nearly everything the views see, for example from
+            sparse structure-from-motion points, in the unit of the cameras' translations; None if unknown.
+        mask: ``[B, V, H, W]`` in [0, 1], weight of each pixel (alpha, mask images); None: all 1.
     """
 
     depth: Tensor | None = None
@@ -106,9 +106,9 @@ class Batch(TensorRecord):
         cameras: ground-truth cameras, world frame of the data.
         is_metric: ``[B]`` bool, True where the data's unit is the metre.
         frame_ids: ``[B, V]`` int64.
-        scene: one name a scene.
+        scene: one name per scene.
         num_context: number of input views, 1 <= num_context <= V.
-        mask: ``[B, V, H, W]`` in [0, 1], how much each pixel counts (alpha, mask images); None: all count.
+        mask: ``[B, V, H, W]`` in [0, 1], weight of each pixel (alpha, mask images); None: all 1.
     """
 
     images: Tensor
@@ -121,7 +121,7 @@ class Batch(TensorRecord):
     mask: Tensor | None = None
 
     def views(self, views: slice) -> Batch:
-        """Returns the batch restricted to a slice of its views, all of them counted as context."""
+        """Returns the batch restricted to a slice of its views, all as context."""
         every = {name: getattr(self, name) for name in ("images", "depth", "frame_ids", "mask")}
         some = {name: value[:, views] for name, value in every.items() if value is not None}
         return replace(self, **some, cameras=self.cameras.select(views), num_context=some["images"].shape[1])
@@ -143,20 +143,20 @@ class Batch(TensorRecord):
 
     @property
     def hints(self) -> Hints:
-        """What a backend may be told about all views of this batch."""
+        """The data about all views of this batch that a backend can use."""
         return Hints(self.depth, self.cameras, self.scene, self.frame_ids, mask=self.mask)
 
 
 @dataclass(frozen=True)
 class Tokens(TensorRecord):
-    """The frozen backbone's output, exactly as its heads take it.
+    """Output of the frozen backbone, in the form its heads expect.
 
     Attributes:
-        patch: one ``[B, V, P, D]`` tensor a tapped layer, in tap order; P = grid[0] * grid[1], row major.
+        patch: one ``[B, V, P, D]`` tensor per tapped layer, in tap order; P = grid[0] * grid[1], row major.
         camera: ``[B, V, Dc]`` camera token of the last tap.
-        grid: patches ``(rows, columns)``.
+        grid: size of the patch grid ``(rows, columns)``.
         size: image ``(height, width)`` in pixels.
-        state: whatever else the backend's own ``decode`` needs; opaque to everyone else.
+        state: anything else the backend's ``decode`` needs; opaque to all other code.
     """
 
     patch: tuple[Tensor, ...]
@@ -166,7 +166,7 @@ class Tokens(TensorRecord):
     state: Mapping[str, Any] = field(default_factory=dict)
 
     def with_patch(self, patch: tuple[Tensor, ...]) -> Tokens:
-        """Returns the same tokens with other patch tokens; the camera token is never changed."""
+        """Returns a copy with other patch tokens; the camera token never changes."""
         return replace(self, patch=patch)
 
 
@@ -178,7 +178,7 @@ class Geometry(TensorRecord):
         depth: ``[B, V, H, W]`` z-depth, 0 = invalid, in the unit of the cameras' translations.
         depth_conf: ``[B, V, H, W]`` confidence > 0 (larger is better).
         cameras: predicted cameras.
-        scale: ``[B]`` factor that turns the unit into metres where the backend knows it, else 1.
+        scale: ``[B]`` metres per unit where the backend predicts them, else 1.
     """
 
     depth: Tensor
@@ -187,20 +187,20 @@ class Geometry(TensorRecord):
     scale: Tensor
 
     def where(self, keep: Tensor | None) -> Geometry:
-        """The geometry without depth (0) where ``keep`` ``[B, V, H, W]`` is false; None keeps all."""
+        """Returns the geometry with depth set to 0 where ``keep`` ``[B, V, H, W]`` is false; None keeps all depth."""
         return self if keep is None else replace(self, depth=torch.where(keep, self.depth, 0.0))
 
 
 @dataclass(frozen=True)
 class VoxelMoments(TensorRecord):
-    """How the points of M voxels lie and how colour changes among them; constants, lengths in cells.
+    """Second moments of the points in M voxels, without gradient; lengths in cells.
 
     Attributes:
         spread: ``[M, 3, 3]`` covariance of the points' positions.
         cross: ``[M, 3 (position), 3 (colour)]`` covariance of position and colour.
-        facing: ``[M, 3]`` unit vectors towards the cameras that saw the points.
-        pixel: ``[M]`` side of a pixel at the points' depth.
-        normal: ``[M, 3]`` of the surface through the cell, on the cameras' side.
+        facing: ``[M, 3]`` unit vector towards the mean centre of the cameras that saw the points.
+        pixel: ``[M]`` mean side of a pixel at the points' depth.
+        normal: ``[M, 3]`` unit normal of the surface through the cell, facing the cameras.
     """
 
     spread: Tensor
@@ -220,10 +220,10 @@ class Voxels(TensorRecord):
         grid: ``[M, 3]`` int64 world-anchored cell index, ``floor(x / voxel_size)``.
         batch: ``[M]`` int64 scene index, sorted.
         confidence: ``[M]`` smallest point confidence inside (paper, eqn voxelfeature).
-        count: ``[M]`` points inside, as a float.
+        count: ``[M]`` number of points inside, as a float.
         centroid: ``[M, 3]`` confidence-weighted mean position.
         voxel_size: ``[B]`` edge length in scene units.
-        moments: how the points lie in their cells; None where nobody asked.
+        moments: second moments of the points; None unless requested.
     """
 
     features: Tensor
@@ -253,7 +253,7 @@ class Gaussians(TensorRecord):
         opacities: ``[G]`` in (0, 1).
         sh: ``[G, (L + 1)^2, 3]`` real spherical-harmonic colour coefficients, world frame; colour = 1/2 + sum.
         batch: ``[G]`` int64 scene index, sorted.
-        background: ``[B, 3]`` colour in [0, 1] of rays that meet no Gaussian; None is black.
+        background: ``[B, 3]`` colour in [0, 1] of rays that hit no Gaussian; None is black.
     """
 
     means: Tensor
@@ -268,19 +268,19 @@ class Gaussians(TensorRecord):
         return self.means.shape[0]
 
     def select(self, rows: Tensor | slice) -> Gaussians:
-        """Returns some of them: ``rows`` are sorted indices, a slice or ``[G]`` bool."""
+        """Returns some of the Gaussians; ``rows`` are sorted indices, a slice or a ``[G]`` bool mask."""
         names = [each.name for each in fields(self) if each.name != "background"]
         return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
     def joined(self, more: Gaussians) -> Gaussians:
-        """Returns one scene's Gaussians followed by others of at most its degree; its own background stays."""
+        """Returns one scene's Gaussians followed by ``more``, of equal or lower SH degree; keeps its background."""
         padded = torch.nn.functional.pad(more.sh, (0, 0, 0, self.sh.shape[1] - more.sh.shape[1]))
         more = replace(more, sh=padded)
         names = [each.name for each in fields(self) if each.name != "background"]
         return replace(self, **{name: torch.cat((getattr(self, name), getattr(more, name))) for name in names})
 
     def scene(self, index: int) -> Gaussians:
-        """Returns one scene's Gaussians, its ``batch`` set to 0."""
+        """Returns one scene's Gaussians, with ``batch`` set to 0."""
         bounds = torch.searchsorted(self.batch, torch.tensor([index, index + 1], device=self.batch.device))
         own = self.select(slice(int(bounds[0]), int(bounds[1])))
         background = None if self.background is None else self.background[index : index + 1]
@@ -306,11 +306,11 @@ class Render(TensorRecord):
 
 @dataclass(frozen=True)
 class Decoded(TensorRecord):
-    """The geometry of the context views, in the scene unit and the frame of view 0.
+    """Geometry of the context views, in scene units and the frame of view 0.
 
     Attributes:
         initial: the frozen backbone's geometry, before enhancement.
-        geometry: geometry decoded again from the enhanced tokens; ``initial`` where nothing enhances them.
+        geometry: geometry decoded again from the enhanced tokens; ``initial`` if there is no enhancement.
         unit: ``[B]`` scene units per unit of the backend's raw output (1 where nothing was rescaled).
     """
 
@@ -321,12 +321,12 @@ class Decoded(TensorRecord):
 
 @dataclass(frozen=True)
 class Prediction(Decoded):
-    """Everything one forward pass yields.
+    """Output of one forward pass.
 
     Attributes:
-        voxels: refined fine voxels; None for models that split no voxels.
+        voxels: refined fine voxels; None for models without voxels.
         gaussians: the Gaussian scene.
-        supported: ``[B, V, H, W]`` bool, pixels whose depth the scene is made of; None: all that have one.
+        supported: ``[B, V, H, W]`` bool, pixels whose depth enters the scene; None: all pixels with depth.
     """
 
     voxels: Voxels | None
@@ -335,5 +335,5 @@ class Prediction(Decoded):
 
     @property
     def surface(self) -> Geometry:
-        """The geometry with depth only where the scene is made of it."""
+        """The geometry with only the depth that enters the scene."""
         return self.geometry.where(self.supported)

@@ -82,7 +82,8 @@ def test_dropout_leaves_out_what_it_says_and_repeats(start: Start, monkeypatch: 
     options = RefineOptions(steps=10, check_every=5, fill=0, prune_opacity=0, dropout=0.5, loss=COLOUR)
     found = run(start, options)
     count = len(start.gaussians)
-    assert set(scores) == {count} and len(found.scene.gaussians) == count
+    assert set(scores) == {count}
+    assert len(found.scene.gaussians) == count
     left = torch.tensor(steps) / count
     torch.testing.assert_close(left, 1 - 0.05 * torch.arange(10), atol=0.02, rtol=0)
     assert same(run(start, options).scene, found.scene)

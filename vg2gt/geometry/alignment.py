@@ -1,4 +1,4 @@
-"""Bringing a prediction into another unit or frame: one scale from depth, one similarity from cameras."""
+"""Alignment of predictions to a reference: one scale from depth, one similarity from cameras or points."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ MIN_DEPTH = 0.01
 
 
 def weighted_median(values: Tensor, weights: Tensor) -> Tensor:
-    """Lower weighted median along the last axis.
+    """Returns the lower weighted median along the last axis.
 
     Args:
         values: ``[..., N]``; entries of weight 0 may be anything.
-        weights: ``[..., N]``, not negative.
+        weights: ``[..., N]`` >= 0.
 
     Returns:
-        ``[...]``: the smallest value up to which half of the weight lies, a minimiser of ``sum w |m - x|``; NaN where
-        all weights are 0.
+        ``[...]``: the smallest value with at least half of the weight at or below it, a minimiser of
+        ``sum w |m - x|``; NaN where all weights are 0.
     """
     ordered, order = torch.where(weights > 0, values, torch.inf).sort(-1)
     cumulative = torch.gather(weights, -1, order).double().cumsum(-1)
@@ -35,18 +35,18 @@ def weighted_median(values: Tensor, weights: Tensor) -> Tensor:
 
 
 def fit_depth_scale(predicted: Tensor, reference: Tensor, valid: Tensor) -> Tensor:
-    """The scale ``argmin_s sum w |s d_hat - d|``, ``w = 1 / max(d, 0.01)``, of each scene (paper, appendix, wmed).
+    """Fits ``argmin_s sum w |s d_hat - d|`` with ``w = 1 / max(d, 0.01)`` for each scene (paper, appendix, wmed).
 
-    Its exact solution is the median of ``d / d_hat`` under the weights ``w d_hat``, of at most 64 x 64 pixels a view:
-    in each cell the valid one nearest to its centre.
+    The exact solution is the median of ``d / d_hat`` with weights ``w d_hat``. It uses at most 64 x 64 pixels per view:
+    in each cell of a grid, the valid pixel nearest to its centre.
 
     Args:
         predicted: ``[B, V, H, W]`` depth in its own unit.
-        reference: ``[B, V, H, W]`` depth in the unit wanted.
-        valid: ``[B, V, H, W]`` bool; pixels where either depth is not positive are left out as well.
+        reference: ``[B, V, H, W]`` depth in the target unit.
+        valid: ``[B, V, H, W]`` bool; pixels where either depth is not finite and positive are also left out.
 
     Returns:
-        ``[B]``, without a graph; NaN where no pixel is valid.
+        ``[B]``, detached; NaN where no pixel is valid.
     """
     predicted, reference = predicted.detach(), reference.detach()
     valid = valid & (predicted > 0) & (reference > 0) & predicted.isfinite() & reference.isfinite()
@@ -58,7 +58,7 @@ def fit_depth_scale(predicted: Tensor, reference: Tensor, valid: Tensor) -> Tens
 
 
 def _nearest_valid_pixels(valid: Tensor) -> Tensor:
-    """Flat indices ``[B, V, cells]`` of the valid pixel nearest to each cell's centre (any pixel if none is valid)."""
+    """Returns flat indices ``[B, V, cells]`` of the valid pixel nearest to each cell's centre; any if none is valid."""
     table = _cell_pixels(valid.shape[-2], valid.shape[-1], valid.device)
     first = valid.flatten(2)[:, :, table].to(torch.uint8).argmax(-1, keepdim=True)
     return torch.gather(table.expand(*valid.shape[:2], -1, -1), 3, first)[..., 0]
@@ -66,7 +66,7 @@ def _nearest_valid_pixels(valid: Tensor) -> Tensor:
 
 @lru_cache(maxsize=8)
 def _cell_pixels(height: int, width: int, device: torch.device) -> Tensor:
-    """Pixels of every subsampling cell, nearest to its centre first: ``[cells, most pixels in a cell]``, padded."""
+    """Returns the pixels of every cell, nearest to its centre first: ``[cells, most pixels in a cell]``, padded."""
     rows, columns = min(height, SUBSAMPLE), min(width, SUBSAMPLE)
     y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     row, column = y * rows // height, x * columns // width
@@ -96,7 +96,7 @@ class Similarity(TensorRecord):
         return (self.scale[:, None, None] * flat + self.translation[:, None]).reshape(points.shape)
 
     def apply_cameras(self, cameras: Cameras) -> Cameras:
-        """Moves cameras into the target frame: centres like points, orientations turned, intrinsics kept."""
+        """Moves cameras to the target frame: transforms centres, rotates orientations, keeps intrinsics."""
         rotation = compose(cameras.world_to_camera[..., :3, :3], self.rotation[:, None].transpose(-1, -2))
         translation = -compose(rotation, self.apply(camera_centers(cameras))[..., None])
         top = torch.cat((rotation, translation), -1)
@@ -107,16 +107,16 @@ class Similarity(TensorRecord):
 def align_cameras(
     predicted: Cameras, reference: Cameras, still_scale: Callable[[], Tensor] | None = None
 ) -> Similarity:
-    """The similarity that brings predicted cameras onto reference cameras of the same views.
+    """Returns the similarity that maps predicted cameras to reference cameras of the same views.
 
-    The rotation is the mean of the cameras' relative orientations (orthogonal Procrustes), which centres alone leave
-    undetermined for cameras on a line; given it, scale and translation are Umeyama's for the centres.
+    The rotation is the mean of the cameras' relative orientations (orthogonal Procrustes), since centres on a line do
+    not determine it. Given the rotation, scale and translation are Umeyama's solution for the centres.
 
     Args:
         predicted: B scenes, V views.
         reference: the same views in another frame and unit.
-        still_scale: gives the ``[B]`` scale of scenes whose cameras do not move in either frame; only called where
-            there is one. None means 1.
+        still_scale: returns the ``[B]`` scale for scenes whose cameras do not determine it, for example because they do
+            not move in one of the frames; only called if there is such a scene. None means 1.
 
     Returns:
         ``[B]`` similarities from the predicted to the reference frame, computed in float64, in the input's dtype.
@@ -130,15 +130,15 @@ def align_cameras(
 
 
 def align_points(points: Tensor, reference: Tensor) -> Similarity:
-    """The least-squares similarity between corresponding points (Umeyama 1991).
+    """Returns the least-squares similarity between corresponding points (Umeyama 1991).
 
     Args:
         points: ``[B, N, 3]``.
         reference: ``[B, N, 3]``, the same points in another frame and unit.
 
     Returns:
-        ``[B]`` similarities from the points' frame to the reference's, computed in float64, in the input's dtype. Of
-        points that coincide the scale is 1.
+        ``[B]`` similarities from the points' frame to the reference's, computed in float64, in the input's dtype. The
+        scale is 1 if all points coincide.
     """
     source, target = points.double(), reference.double()
     centered, centered_target = source - source.mean(1)[:, None], target - target.mean(1)[:, None]
@@ -154,7 +154,7 @@ def _umeyama(
     still_scale: Callable[[], Tensor] | None,
     dtype: torch.dtype,
 ) -> Similarity:
-    """Least-squares scale (or ``still_scale()``) and translation of points once turned (Umeyama 1991, eqn 41, 42)."""
+    """Adds the least-squares scale (or ``still_scale()``) and translation to a rotation (Umeyama 1991, eqn 41, 42)."""
     source_mean, target_mean = source.mean(1), target.mean(1)
     turned = (source - source_mean[:, None]) @ rotation.transpose(-1, -2)
     agreement = (turned * (target - target_mean[:, None])).sum((1, 2))
@@ -166,15 +166,15 @@ def _umeyama(
 
 
 def _moves(centers: Tensor) -> Tensor:
-    """Whether the points ``[B, N, 3]`` of a scene differ by more than float32's rounding."""
+    """Returns ``[B]`` bool: whether the points ``[B, N, 3]`` of a scene differ by more than float32 rounding."""
     spread = (centers - centers.mean(1, keepdim=True)).norm(dim=-1).amax(1)
     return spread > 1e-6 * centers.norm(dim=-1).amax(1)
 
 
 def _nearest_rotation(matrix: Tensor) -> Tensor:
-    """The rotation R that maximises ``trace(R^T M)`` for each ``[B, 3, 3]``; NaN where M is not finite."""
+    """Returns the rotation R that maximises ``trace(R^T M)`` for each M ``[B, 3, 3]``; NaN where M is not finite."""
     finite = matrix.isfinite().all(-1).all(-1)[:, None, None]
-    u, _, vh = torch.linalg.svd(torch.where(finite, matrix, 0.0))  # which would raise an error
+    u, _, vh = torch.linalg.svd(torch.where(finite, matrix, 0.0))  # raises on input that is not finite
     sign = torch.ones_like(matrix[:, 0])
     sign[:, 2] = torch.linalg.det(u @ vh).sign()
     return torch.where(finite, (u * sign[:, None]) @ vh, torch.nan)

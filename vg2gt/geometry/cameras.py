@@ -19,7 +19,7 @@ def pixel_grid(height: int, width: int, like: Tensor) -> Tensor:
 
 
 def focal_lengths(intrinsics: Tensor) -> Tensor:
-    """``[..., 2]`` (fx, fy) of ``[..., 3, 3]``; lists as indices would be copied to a GPU while the host waits."""
+    """Returns ``[..., 2]`` (fx, fy) of ``[..., 3, 3]``; unlike indexing with lists, never synchronises with a GPU."""
     return torch.stack((intrinsics[..., 0, 0], intrinsics[..., 1, 1]), -1)
 
 
@@ -31,7 +31,7 @@ def ray_directions(intrinsics: Tensor, size: tuple[int, int]) -> Tensor:
         size: image ``(height, width)``.
 
     Returns:
-        ``[..., H, W, 3]``; multiplied by z-depth they are camera-frame points.
+        ``[..., H, W, 3]``; multiply by z-depth to get camera-frame points.
     """
     pixels = pixel_grid(*size, like=intrinsics)
     focal, center = focal_lengths(intrinsics)[..., None, None, :], intrinsics[..., None, None, :2, 2]
@@ -40,7 +40,7 @@ def ray_directions(intrinsics: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def compose(first: Tensor, second: Tensor) -> Tensor:
-    """Product of small matrices ``[..., I, J]`` and ``[..., J, K]``, elementwise, so that no autocast can round it."""
+    """Multiplies small matrices ``[..., I, J]`` and ``[..., J, K]`` elementwise, so that autocast cannot round them."""
     return (first[..., :, :, None] * second[..., None, :, :]).sum(-2)
 
 
@@ -52,11 +52,11 @@ def invert_rigid(transform: Tensor) -> Tensor:
 
 
 def rigid_motions(turns: Tensor, shifts: Tensor) -> Tensor:
-    """Rotation by vectors and translation as matrices.
+    """Returns the matrices of rigid motions.
 
     Args:
-        turns: ``[..., 3]`` rotation vectors, rad.
-        shifts: ``[..., 3]`` translations after the rotation.
+        turns: ``[..., 3]`` rotation vectors in rad.
+        shifts: ``[..., 3]`` translations, applied after the rotation.
 
     Returns:
         ``[..., 4, 4]``.
@@ -73,7 +73,7 @@ def rigid_motions(turns: Tensor, shifts: Tensor) -> Tensor:
 def transform_points(transform: Tensor, points: Tensor) -> Tensor:
     """Applies rigid transforms ``[B, V, 4, 4]`` to points ``[B, V, ..., 3]``.
 
-    Elementwise, so that neither autocast nor TF32 can round positions (2 mm voxels need all of float32).
+    Elementwise, so that neither autocast nor TF32 can round positions (2 mm voxels need full float32 precision).
     """
     shape = transform.shape[:-2] + (1,) * (points.dim() - transform.dim() + 1)
     columns = transform[..., :3, :].unbind(-1)
@@ -87,7 +87,7 @@ def unproject(depth: Tensor, cameras: Cameras) -> Tensor:
 
     Args:
         depth: ``[B, V, H, W]``; pixels with depth 0 land on the camera centre, so mask them.
-        cameras: cameras of the same views; their size is the depth's.
+        cameras: cameras of the same views and size.
 
     Returns:
         ``[B, V, H, W, 3]`` in the cameras' world frame.
@@ -115,7 +115,7 @@ def project(points: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
 
 
 def relative_to_first(cameras: Cameras) -> Cameras:
-    """Moves the world frame into view 0 of every scene, whose pose becomes exactly the identity."""
+    """Makes view 0 of every scene the world frame; its pose becomes exactly the identity."""
     first = invert_rigid(cameras.world_to_camera[:, :1])
     poses = compose(cameras.world_to_camera, first)
     identity = torch.eye(4, dtype=poses.dtype, device=poses.device).expand_as(poses[:, :1])
@@ -131,7 +131,7 @@ def scale_translations(cameras: Cameras, scale: Tensor) -> Cameras:
 
 
 def resize_intrinsics(intrinsics: Tensor, scale_x: float, scale_y: float) -> Tensor:
-    """Intrinsics ``[..., 3, 3]`` of an image resized by the given factors (integer pixel centres).
+    """Returns the intrinsics ``[..., 3, 3]`` of an image resized by the given factors (integer pixel centres).
 
     A point at c moves to ``s * (c + 1/2) - 1/2``, because resizing maps pixel areas, not pixel centres.
     """
@@ -143,7 +143,7 @@ def resize_intrinsics(intrinsics: Tensor, scale_x: float, scale_y: float) -> Ten
 
 
 def crop_intrinsics(intrinsics: Tensor, left: int, top: int) -> Tensor:
-    """Intrinsics ``[..., 3, 3]`` of an image cropped so that pixel (left, top) becomes (0, 0)."""
+    """Returns the intrinsics ``[..., 3, 3]`` of an image cropped so that pixel (left, top) becomes (0, 0)."""
     out = intrinsics.clone()
     out[..., 0, 2] -= left
     out[..., 1, 2] -= top
@@ -151,6 +151,6 @@ def crop_intrinsics(intrinsics: Tensor, left: int, top: int) -> Tensor:
 
 
 def camera_centers(cameras: Cameras) -> Tensor:
-    """Camera centres ``[B, V, 3]`` in the world frame."""
+    """Returns camera centres ``[B, V, 3]`` in the world frame."""
     pose = cameras.world_to_camera
     return -compose(pose[..., :3, :3].transpose(-1, -2), pose[..., :3, 3:])[..., 0]

@@ -1,9 +1,9 @@
-"""Surface normals of depth maps, without forming points.
+"""Surface normals of depth maps, without computing points.
 
 A pixel's ray is ``r = (u, v, 1)`` and its point ``d r``. The chord between the points of its left and right neighbours,
-of depths d0 and d1, is ``(d1 - d0) r + (d1 + d0) / fx e_x``; with the chord of the column, the cross product is
-proportional to ``(gx, gy, -1 - u gx - v gy)``, ``gx = fx (d1 - d0) / (d1 + d0)`` and the same for ``gy``: it never
-vanishes and always faces the camera. kornia's ``depth_to_normals`` knows neither holes nor depth edges.
+with depths d0 and d1, is ``(d1 - d0) r + (d1 + d0) / fx e_x``. Its cross product with the chord of the column is
+proportional to ``(gx, gy, -1 - u gx - v gy)``, with ``gx = fx (d1 - d0) / (d1 + d0)`` and the same for ``gy``. It never
+vanishes and always faces the camera. kornia's ``depth_to_normals`` handles neither holes nor depth edges.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ def ray_slopes(intrinsics: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tenso
 
 
 def normals_from_depth(depth: Tensor, intrinsics: Tensor, edge_threshold: float = 0.05) -> tuple[Tensor, Tensor]:
-    """Camera-frame normals by central differences of unprojected points.
+    """Returns camera-frame normals from central differences of unprojected points.
 
     Args:
         depth: ``[..., H, W]`` z-depth in any unit, 0 = invalid.
         intrinsics: ``[..., 3, 3]`` in pixels, integer pixel centres.
-        edge_threshold: largest relative depth difference between a pixel and one of its four neighbours; beyond it lies
-            a depth edge, across which no surface has a normal.
+        edge_threshold: largest relative depth difference between a pixel and its four neighbours; pixels above it are
+            at a depth edge and have no normal.
 
     Returns:
         Unit normals ``[..., 3, H, W]`` facing the camera (0 where invalid), differentiable in the depth with finite

@@ -1,4 +1,4 @@
-"""Slightly wrong camera hints, so that what is trained does not trust poses more than recordings deserve."""
+"""Noise on camera hints, so that training does not rely on poses more accurate than those of real recordings."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from torch import Tensor
 from vg2gt.geometry.cameras import compose, rigid_motions
 from vg2gt.types import Batch, Hints
 
-TURN, SHIFT = 0.004, 0.006  # deviations at amount 1: rad; median depths
-AMOUNTS = (0.2, 1.5)
+TURN, SHIFT = 0.004, 0.006  # standard deviations at amount 1, in rad and in median depths
+AMOUNTS = (0.2, 1.5)  # range of the amount, drawn per scene
 
 
 def with_pose_noise(batch: Batch, share: float) -> Hints:
-    """The hints of a batch; a ``share`` (0 to 1) of its scenes has cameras turned and moved a little, each view apart.
+    """Returns the hints of a batch with pose noise, independent per view, in a ``share`` (0 to 1) of its scenes.
 
-    The same views of a scene are always wrong in the same way, so that a token cache finds them again.
+    The same views of a scene always get the same noise, so that a token cache finds them again.
     """
     hints = batch.hints
     if not share or hints.cameras is None:
@@ -31,7 +31,7 @@ def with_pose_noise(batch: Batch, share: float) -> Hints:
 
 
 def _motions(scene: Batch, share: float) -> Tensor:
-    """What one scene's views ``[V, 4, 4]`` are moved by."""
+    """Returns the random motions ``[V, 4, 4]`` of one scene's views."""
     rng = _rng(scene)
     views = scene.images.shape[1]
     amount = rng.uniform(*AMOUNTS) * (rng.random() < share)

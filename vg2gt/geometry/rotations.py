@@ -1,4 +1,4 @@
-"""Quaternions (wxyz) and rotation matrices; kornia's differ in the last bits, which would change every training."""
+"""Quaternions (wxyz) and rotation matrices; kornia's differ in the last bits, which would change every training run."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from torch.nn import functional as F
 
 
 def quat_to_matrix(quats: Tensor) -> Tensor:
-    """Rotation matrices ``[..., 3, 3]`` of quaternions ``[..., 4]`` (wxyz), which are normalised first."""
+    """Returns rotation matrices ``[..., 3, 3]`` of quaternions ``[..., 4]`` (wxyz), which are normalised first."""
     w, x, y, z = F.normalize(quats, dim=-1).unbind(-1)
     rows = (
         (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
@@ -19,7 +19,7 @@ def quat_to_matrix(quats: Tensor) -> Tensor:
 
 
 def matrix_to_quat(matrix: Tensor) -> Tensor:
-    """Unit quaternions ``[..., 4]`` (wxyz, w >= 0) of rotation matrices ``[..., 3, 3]``."""
+    """Returns unit quaternions ``[..., 4]`` (wxyz, w >= 0) of rotation matrices ``[..., 3, 3]``."""
     m = matrix
     diagonal = torch.stack((m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]), -1)
     trace = diagonal.sum(-1, keepdim=True)
@@ -36,7 +36,7 @@ def matrix_to_quat(matrix: Tensor) -> Tensor:
 
 
 def multiply_quats(first: Tensor, second: Tensor) -> Tensor:
-    """Hamilton product of quaternions ``[..., 4]`` (wxyz): the rotation ``second`` followed by ``first``."""
+    """Returns the Hamilton product of quaternions ``[..., 4]`` (wxyz): rotation ``second``, followed by ``first``."""
     w, v = first[..., :1], first[..., 1:]
     other_w, other_v = second[..., :1], second[..., 1:]
     scalar = w * other_w - (v * other_v).sum(-1, keepdim=True)

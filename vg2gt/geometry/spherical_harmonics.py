@@ -49,20 +49,20 @@ def basis(directions: Tensor, degree: int) -> Tensor:
 
 
 def rotation_of_coefficients(rotation: Tensor, degree: int) -> Tensor:
-    """Matrices that turn a function on the sphere by turning its coefficients.
+    """Returns matrices that rotate functions on the sphere by transforming their coefficients.
 
     Args:
         rotation: ``[..., 3, 3]``, such as camera to world.
         degree: highest degree L, 0 to 3.
 
     Returns:
-        ``[..., (L + 1)^2, (L + 1)^2]``: the coefficients ``M c`` give along ``rotation @ d`` what ``c`` gives along
+        ``[..., (L + 1)^2, (L + 1)^2]``: the value of coefficients ``M c`` along ``rotation @ d`` is that of ``c`` along
         ``d``.
 
     Raises:
         ValueError: if the degree is out of range.
     """
-    # Each degree is closed under rotations, so values along enough directions determine the turned coefficients.
+    # each degree is closed under rotation, so values along enough directions determine the rotated coefficients
     axis = torch.arange(-1, 2, dtype=torch.float64, device=rotation.device)
     directions = torch.cartesian_prod(axis, axis, axis)
     directions = F.normalize(directions[directions.any(-1)], dim=-1)
@@ -71,19 +71,19 @@ def rotation_of_coefficients(rotation: Tensor, degree: int) -> Tensor:
 
 
 def rgb_to_sh(rgb: Tensor) -> Tensor:
-    """Degree-0 coefficient of a colour in [0, 1]."""
+    """Returns the degree-0 coefficient of a colour in [0, 1]."""
     return (rgb - 0.5) / DC
 
 
 def sh_to_rgb(sh: Tensor, directions: Tensor) -> Tensor:
-    """Colours seen along viewing directions.
+    """Returns the colours seen along viewing directions.
 
     Args:
         sh: ``[..., (L + 1)^2, 3]``.
         directions: ``[..., 3]`` unit vectors from the camera centre to the point.
 
     Returns:
-        ``[..., 3]``, clamped at 0 from below as in 3DGS.
+        ``[..., 3]``, clamped to >= 0 as in 3DGS.
     """
     degree = round(sh.shape[-2] ** 0.5) - 1
     return ((basis(directions, degree)[..., None] * sh).sum(-2) + 0.5).clamp(min=0)

@@ -1,4 +1,4 @@
-"""Eigenvectors of small symmetric matrices in closed form, many at once."""
+"""Closed-form eigenvectors of batches of small symmetric matrices."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from torch import Tensor
 from torch.nn import functional as F
 
 UPPER = ((0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2))  # rows and columns of a symmetric 3x3 matrix's upper triangle
-FULL = (0, 1, 2, 1, 3, 4, 2, 4, 5)  # where its nine entries are among those six
+FULL = (0, 1, 2, 1, 3, 4, 2, 4, 5)  # index of each of its nine entries among those six
 
 
 def smallest_eigenvector(matrix: Tensor, fallback: Tensor) -> Tensor:
-    """Unit eigenvector of the smallest eigenvalue of symmetric 3x3 matrices.
+    """Returns the unit eigenvector of the smallest eigenvalue of symmetric 3x3 matrices.
 
     The eigenvalue is the trigonometric root of the characteristic cubic, the eigenvector the longest cross product of
     two rows of ``A - lambda I``. Computed in float64, so that float32 input keeps its precision.
 
     Args:
         matrix: ``[..., 3, 3]`` symmetric, finite, of any magnitude.
-        fallback: ``[..., 3]`` unit vectors returned where the smallest eigenvalue is not a single one (isotropic, zero
-            or line-like matrices), because then every direction of a plane would do.
+        fallback: ``[..., 3]`` unit vectors, returned where the smallest eigenvalue is not simple (isotropic, zero or
+            line-like matrices) and the eigenvector is not unique.
 
     Returns:
         ``[..., 3]`` in the input's dtype; the sign is arbitrary.
@@ -41,13 +41,13 @@ def smallest_eigenvector(matrix: Tensor, fallback: Tensor) -> Tensor:
     lengths = candidates.norm(dim=-1)  # [..., 3]
     best = lengths.argmax(-1, keepdim=True)
     vector = candidates.take_along_dim(best[..., None], -2)[..., 0, :]
-    # The longest product is the product of the two other eigenvalues' distances: small if one of them is as small.
+    # its length is the product of the distances to the two other eigenvalues: small if one of them is as small
     single = lengths.take_along_dim(best, -1) > 1e-6
     return torch.where(single, F.normalize(vector, dim=-1, eps=1e-300), fallback.double()).to(matrix.dtype)
 
 
 def principal_direction(a: Tensor, b: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
-    """Direction and largest eigenvalue of symmetric 2x2 matrices ``((a, b), (b, c))``.
+    """Returns the principal direction and largest eigenvalue of symmetric 2x2 matrices ``((a, b), (b, c))``.
 
     Args:
         a: ``[...]``.
@@ -55,8 +55,8 @@ def principal_direction(a: Tensor, b: Tensor, c: Tensor) -> tuple[Tensor, Tensor
         c: ``[...]``.
 
     Returns:
-        The unit eigenvector ``[..., 2]`` of the largest eigenvalue, of arbitrary sign, ``(1, 0)`` where both are equal;
-        and the eigenvalue ``[...]``.
+        The unit eigenvector ``[..., 2]`` of the largest eigenvalue, with arbitrary sign, ``(1, 0)`` if both eigenvalues
+        are equal; and the eigenvalue ``[...]``.
     """
     angle = 0.5 * torch.atan2(2 * b, a - c)
     largest = 0.5 * (a + c + torch.hypot(a - c, 2 * b))

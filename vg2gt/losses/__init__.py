@@ -1,4 +1,4 @@
-"""Training losses; :class:`VG2GTLoss` puts them together."""
+"""Training losses, combined by :class:`VG2GTLoss`."""
 
 from vg2gt.losses.gaussian import GaussianLoss
 from vg2gt.losses.geometry import GeometryLoss

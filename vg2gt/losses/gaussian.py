@@ -16,18 +16,18 @@ NORMAL_TARGETS = ("render", "decoded", "gt")
 
 @dataclass(frozen=True)
 class RenderTargets(TensorRecord):
-    """What R rendered views of one scene are compared with; with an axis B in front, of B scenes.
+    """Targets of R rendered views of one scene, or of B scenes with a leading axis B.
 
     Attributes:
         images: ``[R, 3, H, W]`` in [0, 1].
         depth: ``[R, H, W]`` true depth in the losses' unit.
-        valid: ``[R, H, W]`` bool, where the true depth is to be used.
+        valid: ``[R, H, W]`` bool, where the true depth is used.
         intrinsics: ``[R, 3, 3]`` true intrinsics.
         decoded: ``[R, H, W]`` decoded depth in the losses' unit.
         decoded_conf: ``[R, H, W]`` its confidence.
         decoded_valid: ``[R, H, W]`` bool, False for views without decoded depth (held-out ones).
-        comparable: ``[1, 1, 1]`` bool, whether decoded and rendered depth are in one unit.
-        mask: ``[R, H, W]`` in [0, 1], how much each pixel's colour counts; None: all count.
+        comparable: ``[1, 1, 1]`` bool, whether decoded and rendered depth have the same unit.
+        mask: ``[R, H, W]`` in [0, 1], weight of each pixel's colour; None: all 1.
     """
 
     images: Tensor
@@ -41,7 +41,7 @@ class RenderTargets(TensorRecord):
     mask: Tensor | None = None
 
     def scene(self, index: int) -> RenderTargets:
-        """Returns one scene of B."""
+        """Returns the targets of one of B scenes."""
         return self.map(lambda tensor: tensor[index])
 
 
@@ -49,19 +49,19 @@ class RenderTargets(TensorRecord):
 class GaussianLoss:
     """Losses of the rendered views of one scene.
 
-    Depth terms count pixels with a rendered depth and enough opacity. Decoded depth and confidence are constants here;
-    otherwise the backbone's enhancement would lower its own confidence to escape the loss.
+    Depth terms use pixels with rendered depth and enough opacity. Decoded depth and confidence are detached; otherwise
+    the coarse enhancement would reduce its own confidence to escape the loss.
 
     Args:
-        weight: of the whole group.
+        weight: weight of the whole group.
         color_l1: weight of the L1 colour error.
         ssim: weight of ``1 - SSIM`` (11 x 11 window, sigma 1.5).
         depth_consistency: weight of the L1 distance to the decoded depth.
         depth_gt: weight of the L1 distance to the true depth.
         normal: weight of ``1 - cos`` between rendered normals and normals of a depth map, in the camera frame.
-        normal_target: the depth map whose normals are meant: ``render``, ``decoded`` or ``gt``.
-        confidence_weighted: weight pixels compared with the decoded depth by its confidence.
-        min_alpha: smallest accumulated opacity of a pixel that counts in depth and normal terms.
+        normal_target: depth map from which the target normals are computed: ``render``, ``decoded`` or ``gt``.
+        confidence_weighted: whether to weight comparisons with the decoded depth by its confidence.
+        min_alpha: accumulated opacity above which a pixel counts in depth and normal terms.
 
     Raises:
         ValueError: if ``normal_target`` is not one of these.
@@ -82,17 +82,17 @@ class GaussianLoss:
             raise ValueError(f"loss.gaussian.normal_target must be one of {NORMAL_TARGETS}, got {self.normal_target!r}")
 
     def hits(self, rendered: Render) -> Tensor:
-        """Pixels ``[B, R, H, W]`` that show a surface."""
+        """Returns ``[B, R, H, W]`` bool: which pixels show a surface."""
         return (rendered.depth > 0) & (rendered.alpha > self.min_alpha)
 
     def __call__(self, rendered: Render, cameras: Cameras, targets: RenderTargets, scale: Tensor) -> dict[str, Tensor]:
-        """The unweighted terms of one scene, scalars with graph, named like the weights.
+        """Returns the unweighted terms of one scene: scalars with gradient, named like the weights.
 
         Args:
             rendered: R views of the scene (B = 1), depth in scene units.
-            cameras: the cameras they were rendered with (B = 1).
-            targets: what they should show.
-            scale: scalar, losses' unit per scene unit, a constant.
+            cameras: cameras of the renders (B = 1).
+            targets: targets of the same views.
+            scale: scalar factor from scene units to the losses' unit, without gradient.
         """
         color, hits = where_it_counts(rendered.color[0], targets.images, targets.mask), self.hits(rendered)[0]
         depth = torch.where(hits, rendered.depth[0], 1.0)
@@ -109,7 +109,7 @@ class GaussianLoss:
         }
 
     def total(self, terms: dict[str, Tensor]) -> Tensor:
-        """The weighted sum of the terms."""
+        """Returns the weighted sum of the terms."""
         return self.weight * torch.stack([getattr(self, name) * value for name, value in terms.items()]).sum()
 
     def _normal(
@@ -127,18 +127,18 @@ class GaussianLoss:
 
 
 def where_it_counts(color: Tensor, images: Tensor, mask: Tensor | None) -> Tensor:
-    """Rendered colours ``[R, 3, H, W]`` with those of the images as far as pixels do not count (``mask [R, H, W]``)."""
+    """Replaces rendered colours ``[R, 3, H, W]`` by those of the images, in proportion to ``1 - mask [R, H, W]``."""
     return color if mask is None else torch.lerp(images, color, mask[:, None].to(color.dtype))
 
 
 def normal_error(normals: Tensor, expected: Tensor, weights: Tensor, mask: Tensor) -> Tensor:
-    """Mean of ``1 - cos`` between normals ``[R, 3, H, W]`` of any length and unit ones, weighted, where the mask is."""
+    """Returns the masked, weighted mean of ``1 - cos`` between normals ``[R, 3, H, W]`` of any length and unit ones."""
     length = (normals.square().sum(1) + 1e-12).sqrt()
     cosine = (normals * expected).sum(1) / length
     return weighted_mean(1 - cosine, weights, mask)
 
 
 def weighted_mean(values: Tensor, weights: Tensor, mask: Tensor) -> Tensor:
-    """Mean of the masked values under positive weights; a zero with graph where the mask is empty."""
+    """Returns the weighted mean of the masked values; a zero with gradient if the mask is empty."""
     weights = torch.where(mask, weights, 0.0)
     return (torch.where(mask, values, 0.0) * weights).sum() / weights.sum().clamp(min=torch.finfo(weights.dtype).tiny)

@@ -1,6 +1,6 @@
 """VGGT's training losses for depth and point map (paper, Training).
 
-Both are computed in the predicted cameras' frames, so that the ground truth can be brought there without a graph.
+Both are computed in the frames of the predicted cameras, where the ground truth is transformed without gradient.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ DEPTH_STRIDES = (1, 2, 4, 8)
 
 @dataclass(frozen=True)
 class TaskLoss:
-    """One task's confidence-weighted error, plain error and error of neighbours' differences, scalars with graph."""
+    """One task's confidence-weighted error, plain error and error of neighbour differences: scalars with gradient."""
 
     conf: Tensor
     reg: Tensor
@@ -43,15 +43,15 @@ class GeometryLoss:
     """Depth and point-map losses of one scene.
 
     For the error ``l = |y_hat - y|`` (not squared) and confidence c: ``conf = mean_q(gamma c l - alpha log c)`` and
-    ``reg = mean_q(l)`` over one set of pixels, those whose l is at or below its ``quantile``, values clamped to 100;
-    ``grad`` compares neighbours at several strides. Scenes with fewer than 100 valid pixels give a zero with graph.
+    ``reg = mean_q(l)``, with values clamped to 100. Both are over the pixels whose l is at or below its ``quantile``.
+    ``grad`` compares neighbours at several strides. Scenes with fewer than 100 valid pixels give a zero with gradient.
 
     Args:
         depth: weight of the depth task.
         point: weight of the point-map task.
         gamma: weight of the confidence-weighted error.
-        alpha: weight of the confidence's logarithm.
-        quantile: share of the pixels kept; up to 1000 pixels all are.
+        alpha: weight of the log-confidence.
+        quantile: share of pixels kept; all of them if there are at most 1000.
     """
 
     depth: float = 1.0
@@ -63,7 +63,7 @@ class GeometryLoss:
     def __call__(
         self, depth: Tensor, depth_conf: Tensor, cameras: Cameras, truth: Truth, valid: Tensor
     ) -> tuple[TaskLoss, TaskLoss]:
-        """The depth task's and the point-map task's losses of one scene.
+        """Returns the losses of the depth task and the point-map task for one scene.
 
         Args:
             depth: ``[1, V, H, W]`` predicted depth in the truth's unit.
@@ -73,7 +73,7 @@ class GeometryLoss:
             valid: ``[1, V, H, W]`` bool, the pixels to compare.
         """
         valid = valid & truth.known[:, None, None, None]
-        # Where nothing is compared the prediction becomes the truth: no infinity or hole reaches the gradients.
+        # replace the prediction by the truth at invalid pixels, so that no infinity or hole reaches the gradients
         depth = torch.where(valid, depth, truth.depth)[0]
         conf = torch.where(valid, depth_conf, 1.0)[0]
         reference, mask = truth.depth[0], valid[0]
@@ -93,7 +93,7 @@ class GeometryLoss:
 
 
 def trusted_pixels(error: Tensor, valid: Tensor, quantile: float) -> Tensor:
-    """Marks the valid pixels whose error, clamped to 100, is at or below its quantile; all if they are at most 1000."""
+    """Marks valid pixels whose error, clamped to 100, is at or below its quantile; all if there are at most 1000."""
     clamped = error.detach().clamp(max=MAX_ERROR)
     candidates = torch.where(valid, clamped, torch.inf).flatten()
     count = valid.sum()
@@ -102,18 +102,18 @@ def trusted_pixels(error: Tensor, valid: Tensor, quantile: float) -> Tensor:
 
 
 def order_statistic(values: Tensor, count: Tensor, quantile: float) -> Tensor:
-    """The quantile of the ``count`` smallest of ``values [N]``, without interpolation and of any number."""
+    """Returns the quantile of the ``count`` smallest of ``values [N]``, without interpolation, for any N."""
     return values.kthvalue(math.floor(quantile * max(int(count) - 1, 0)) + 1).values
 
 
 def sorted_order_statistic(values: Tensor, count: Tensor, quantile: float) -> Tensor:
-    """:func:`order_statistic` for GPUs, where sorting is many times faster than ``kthvalue``; without a wait."""
+    """:func:`order_statistic` for GPUs, where sorting is many times faster than ``kthvalue``; never synchronises."""
     rank = (quantile * (count - 1).clamp(min=0).double()).floor().long()
     return values.sort().values.gather(0, rank[None])[0]
 
 
 def depth_gradient_loss(error: Tensor, valid: Tensor) -> Tensor:
-    """Differences of the depth error ``[V, H, W]`` between valid neighbours, a valid pixel, averaged over strides."""
+    """Sums differences of the depth error ``[V, H, W]`` between valid neighbours per valid pixel; averages strides."""
     total = error.new_zeros(())
     for stride in DEPTH_STRIDES:
         e, m = error[:, ::stride, ::stride], valid[:, ::stride, ::stride]
@@ -124,12 +124,12 @@ def depth_gradient_loss(error: Tensor, valid: Tensor) -> Tensor:
 
 
 def point_errors(depth: Tensor, cameras: Cameras, truth: Truth) -> Tensor:
-    """Distance ``[V, H, W]`` between predicted and true points, measured in each predicted camera's frame.
+    """Returns the distance ``[V, H, W]`` between predicted and true points, in each predicted camera's frame.
 
     Args:
-        depth: ``[V, H, W]`` predicted, in the truth's unit.
-        cameras: predicted (B = 1), translations in the truth's unit.
-        truth: one scene.
+        depth: ``[V, H, W]`` predicted depth, in the truth's unit.
+        cameras: predicted cameras (B = 1), translations in the truth's unit.
+        truth: ground truth of one scene.
     """
     size = (depth.shape[-2], depth.shape[-1])
     to_predicted = (cameras.world_to_camera @ invert_rigid(truth.cameras.world_to_camera))[0]
@@ -146,14 +146,14 @@ def point_errors(depth: Tensor, cameras: Cameras, truth: Truth) -> Tensor:
 
 @torch.no_grad()
 def camera_errors(cameras: Cameras, truth: Cameras) -> dict[str, Tensor]:
-    """Mean absolute errors of translation, quaternion and field of view (VGGT's pose encoding), to log only.
+    """Returns mean absolute errors of translation, quaternion and field of view (VGGT's pose encoding), for logging.
 
     Args:
         cameras: predicted cameras in the frame of view 0, translations in the truth's unit.
         truth: ground truth of the same views.
 
     Returns:
-        Scalars ``camera_T``, ``camera_R`` (of the nearer quaternion sign) and ``camera_F`` (radians).
+        Scalars ``camera_T``, ``camera_R`` (with the closer quaternion sign) and ``camera_F`` (radians).
     """
     translation = (cameras.world_to_camera[..., :3, 3] - truth.world_to_camera[..., :3, 3]).abs()
     quats, true_quats = (matrix_to_quat(c.world_to_camera[..., :3, :3]) for c in (cameras, truth))
@@ -167,7 +167,7 @@ def camera_errors(cameras: Cameras, truth: Cameras) -> dict[str, Tensor]:
 
 
 def _field_of_view(cameras: Cameras) -> Tensor:
-    """Vertical and horizontal field of view ``[B, V, 2]`` in radians."""
+    """Returns the vertical and horizontal field of view ``[B, V, 2]`` in radians."""
     height, width = cameras.size
     fx, fy = cameras.intrinsics[..., 0, 0], cameras.intrinsics[..., 1, 1]
     return 2 * torch.stack((torch.atan(height / (2 * fy)), torch.atan(width / (2 * fx))), -1)

@@ -1,4 +1,4 @@
-"""The training objective: geometry, enhancement and Gaussian losses with one scale a scene (paper, Training)."""
+"""Training objective: geometry, enhancement and Gaussian losses with one scale per scene (paper, Training)."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ COMPARED = ("total", "reg")
 
 @dataclass(frozen=True)
 class EnhancementLoss:
-    """A hinge on one task's loss before and after enhancement, for one scene (paper, eqn enhance_loss).
+    """Hinge on one task's loss before and after enhancement, for one scene (paper, eqn enhance_loss).
 
-    The paper prints ``max(0, L_before - L_after)``, which punishes improvement; its text means the opposite.
+    The paper prints ``max(0, L_before - L_after)``, which penalises improvement; its text means the opposite.
 
     Args:
-        weight: lambda of both tasks.
-        margin: by how much the loss must fall for the hinge to be at rest.
+        weight: lambda, the same for both tasks.
+        margin: reduction of the loss at which the hinge becomes 0.
         form: ``improve``: ``max(0, L_after - L_before + margin)``; ``paper_literal``: as printed.
-        on: ``total`` compares the task's whole loss, ``reg`` its plain error.
+        on: ``total`` compares the task's total loss, ``reg`` its plain error.
 
     Raises:
         ValueError: if ``form`` or ``on`` is not one of these.
@@ -45,27 +45,27 @@ class EnhancementLoss:
             raise ValueError(f"loss.enhance.on must be one of {COMPARED}, got {self.on!r}")
 
     def __call__(self, before: TaskLoss, after: TaskLoss) -> Tensor:
-        """Returns the unweighted hinge, a scalar with the graph of ``after`` only."""
+        """Returns the unweighted hinge, a scalar with gradient for ``after`` only."""
         reference, value = self.compared(before).detach(), self.compared(after)
         if self.form == "paper_literal":
             return F.relu(reference - value)
         return F.relu(value - reference + self.margin)
 
     def compared(self, task: TaskLoss) -> Tensor:
-        """The part of a task's loss that is compared."""
+        """Returns the part of a task's loss that is compared."""
         return task.total if self.on == "total" else task.reg
 
 
 @dataclass(frozen=True)
 class LossReport:
-    """What a training step learns from the objective.
+    """Result of the objective for one training step.
 
     Attributes:
-        total: scalar with graph, the mean over scenes of the weighted sum of the terms.
-        terms: unweighted terms, means over scenes, without graph. ``initial_depth`` and ``initial_point`` are what the
-            enhancement loss compares with; ``rendered`` is the share of rendered pixels that have a depth.
-        scale: ``[B]`` ground-truth unit of the losses per scene unit.
-        skipped: scenes with fewer than 100 valid depth pixels, whose depth terms are 0.
+        total: scalar with gradient, mean over scenes of the weighted sum of the terms.
+        terms: unweighted terms, means over scenes, detached. ``initial_depth`` and ``initial_point`` are the reference
+            values of the enhancement loss; ``rendered`` is the share of rendered pixels that show a surface.
+        scale: ``[B]`` factor from scene units to the losses' unit.
+        skipped: number of scenes with fewer than 100 valid depth pixels, whose depth terms are 0.
     """
 
     total: Tensor
@@ -76,7 +76,7 @@ class LossReport:
 
 @dataclass(frozen=True)
 class SceneLoss:
-    """One scene's weighted sum and its unweighted terms, with graph."""
+    """One scene's weighted sum and unweighted terms, with gradient."""
 
     total: Tensor
     terms: dict[str, Tensor]
@@ -87,7 +87,7 @@ class SceneLoss:
 
 @dataclass(frozen=True)
 class RenderedViews(TensorRecord):
-    """Renders of R of the batch's views with ``cameras``; ``views [R]`` int64 are their indices in the batch."""
+    """Renders of R views of the batch with ``cameras``; ``views [R]`` int64 are their indices in the batch."""
 
     render: Render
     cameras: Cameras
@@ -99,16 +99,17 @@ class RenderedViews(TensorRecord):
 
 
 class VG2GTLoss(nn.Module):
-    """The objective of VG²GT.
+    """Training objective of VG²GT.
 
-    Per scene: depth and point-map losses of the enhanced geometry, the hinge against the backbone's own, and the
-    losses of the rendered views; scenes count alike. Ground truth is divided by the scene's mean distance from the
-    first camera; one constant scale a scene brings depth, translations, points and rendered depth into that unit.
+    The loss of a scene is the sum of depth and point-map losses of the enhanced geometry, the hinge against the
+    backbone's geometry, and the losses of the rendered views. All scenes have equal weight. Ground truth is divided by
+    the scene's mean distance from the first camera. One scale per scene, without gradient, converts depth,
+    translations, points and rendered depth to that unit.
 
     Args:
-        geometry: depth and point-map losses; default as in VGGT.
-        enhance: enhancement hinge; default the improving form.
-        gaussian: losses of rendered views; default the paper's weights.
+        geometry: depth and point-map losses; defaults to those of VGGT.
+        enhance: enhancement hinge; defaults to ``form="improve"``.
+        gaussian: losses of rendered views; defaults to the paper's weights.
         align: scale fit.
     """
 
@@ -133,20 +134,22 @@ class VG2GTLoss(nn.Module):
         views: Tensor | None = None,
         render_cameras: Cameras | None = None,
     ) -> LossReport:
-        """Computes the objective in float32 (float64 stays float64), whatever the autocast.
+        """Computes the objective in float32 (float64 stays float64) under any autocast.
 
         Args:
             prediction: geometry of the context views, in the frame of context view 0 and in scene units.
             batch: ground truth of context and held-out views.
             rendered: renders of some views of the batch, or None for the geometry losses only.
-            views: ``[R]`` int64, which of the batch's views these are; the first ``num_context`` have decoded depth.
+            views: ``[R]`` int64, indices of the rendered views in the batch; the first ``num_context`` of the batch
+                have decoded depth.
             render_cameras: the R cameras used for rendering.
 
         Raises:
-            ValueError: if geometry, renders, views and cameras do not go together.
+            ValueError: if geometry, renders, views and cameras do not match.
         """
         shown = _checked(prediction, batch, rendered, views, render_cameras)
         with torch.autocast(batch.images.device.type, enabled=False):
+            # one scale per scene from the prediction to the ground truth's unit: [B]
             truth = normalize_truth(batch.map(_full_precision))
             initial, enhanced = (g.map(_full_precision) for g in (prediction.initial, prediction.geometry))
             initial_scale = self.align.fit(initial, truth)
@@ -154,6 +157,7 @@ class VG2GTLoss(nn.Module):
             if shown is not None:
                 hits = self.gaussian.hits(shown.render)
                 scale = self.align.fit_rendered(shown.render.depth, hits, shown.views, truth, scale)
+            # geometry and enhancement losses of the context views
             context = truth.views(slice(0, batch.num_context))
             valid = context.valid & (initial.depth > 0) & (enhanced.depth > 0)
             before, after = to_unit(initial, initial_scale), to_unit(enhanced, scale)
@@ -161,18 +165,20 @@ class VG2GTLoss(nn.Module):
                 self._geometry_terms(_one(before, i), _one(after, i), context.scene(i), valid[i : i + 1])
                 for i in range(len(batch.scene))
             ]
+            # losses of the R rendered views
             if shown is not None:
                 targets = _render_targets(batch, after, truth, shown.views)
                 scenes = [
                     scene + self._gaussian_terms(*shown.scene(i), targets.scene(i), scale[i])
                     for i, scene in enumerate(scenes)
                 ]
+            # means over scenes
             total = torch.stack([scene.total for scene in scenes]).mean()
             terms = {name: torch.stack([s.terms[name].detach() for s in scenes]).mean() for name in scenes[0].terms}
         return LossReport(total, terms, scale, (~truth.known).sum())
 
     def _geometry_terms(self, before: Geometry, after: Geometry, truth: Truth, valid: Tensor) -> SceneLoss:
-        """Geometry and enhancement losses of one scene, everything in the truth's unit."""
+        """Returns the geometry and enhancement losses of one scene, all in the truth's unit."""
         with torch.no_grad():
             depth_before, point_before = self.geometry(before.depth, before.depth_conf, before.cameras, truth, valid)
         depth, point = self.geometry(after.depth, after.depth_conf, after.cameras, truth, valid)
@@ -187,19 +193,19 @@ class VG2GTLoss(nn.Module):
         return SceneLoss(total + self.enhance.weight * (hinge_depth + hinge_point), terms)
 
     def _gaussian_terms(self, render: Render, cameras: Cameras, targets: RenderTargets, scale: Tensor) -> SceneLoss:
-        """Losses of one scene's rendered views."""
+        """Returns the losses of one scene's rendered views."""
         terms = self.gaussian(render, cameras, targets, scale)
         share = self.gaussian.hits(render).to(scale.dtype).mean()
         return SceneLoss(self.gaussian.total(terms), terms | {"rendered": share})
 
 
 def _one(geometry: Geometry, index: int) -> Geometry:
-    """One scene's geometry (B = 1)."""
+    """Returns one scene's geometry (B = 1)."""
     return geometry.map(lambda tensor: tensor[index : index + 1])
 
 
 def _render_targets(batch: Batch, geometry: Geometry, truth: Truth, views: Tensor) -> RenderTargets:
-    """What the rendered views should show, ``[B, R, ...]``; ``geometry`` is in the losses' unit."""
+    """Builds the targets ``[B, R, ...]`` of the rendered views; ``geometry`` is in the losses' unit."""
     is_context = views < batch.num_context
     source = torch.where(is_context, views, 0)
     shown = truth.views(views)
@@ -213,7 +219,7 @@ def _render_targets(batch: Batch, geometry: Geometry, truth: Truth, views: Tenso
         decoded=decoded,
         decoded_conf=geometry.depth_conf[:, source],
         decoded_valid=(decoded > 0) & is_context[:, None, None],
-        comparable=torch.ones_like(known),  # of a scene without depth both are in scene units
+        comparable=torch.ones_like(known),  # without true depth, both are in scene units
         mask=None if batch.mask is None else _full_precision(batch.mask[:, views]),
     )
 
@@ -225,7 +231,7 @@ def _full_precision(tensor: Tensor) -> Tensor:
 def _checked(
     prediction: Decoded, batch: Batch, rendered: Render | None, views: Tensor | None, cameras: Cameras | None
 ) -> RenderedViews | None:
-    """Checks that all inputs belong together; returns the rendered views in full precision, if there are any."""
+    """Checks that all inputs match; returns the rendered views in full precision, if there are any."""
     expected = (len(batch.scene), batch.num_context, *batch.images.shape[-2:])
     for name, geometry in (("initial", prediction.initial), ("geometry", prediction.geometry)):
         if tuple(geometry.depth.shape) != expected:

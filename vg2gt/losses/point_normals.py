@@ -1,4 +1,4 @@
-"""The point-map task's normals (VGGT's loss of point gradients; paper, Training): plain, and compiled for CPUs."""
+"""Normal loss of the point-map task (VGGT's point-gradient loss; paper, Training): plain, and compiled for CPUs."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ POINT_STRIDES = (1, 2, 4)
 
 
 def point_normal_loss(depth: Tensor, cameras: Cameras, truth: Truth, valid: Tensor) -> Tensor:
-    """``mean(1 - cos)`` between predicted and true surface normals at every stride, averaged over strides.
+    """Returns ``mean(1 - cos)`` between predicted and true surface normals, averaged over strides.
 
     Each pixel has four normals, one for each pair of a horizontal and a vertical neighbour (VGGT's cross products of
-    the point map's differences), counted where the pixel and both neighbours are valid.
+    point-map differences). A normal counts if the pixel and both neighbours are valid.
 
     Args:
-        depth: ``[V, H, W]`` predicted, in the truth's unit.
-        cameras: predicted (B = 1); where they have a gradient, or depth is not on a CPU, plain torch computes the loss.
-        truth: one scene.
+        depth: ``[V, H, W]`` predicted depth, in the truth's unit.
+        cameras: predicted cameras (B = 1). If they require a gradient, or depth is not on a CPU, plain torch is used.
+        truth: ground truth of one scene.
         valid: ``[V, H, W]`` bool.
     """
     fixed = not (cameras.world_to_camera.requires_grad or cameras.intrinsics.requires_grad)
@@ -33,7 +33,7 @@ def point_normal_loss(depth: Tensor, cameras: Cameras, truth: Truth, valid: Tens
 
 
 def point_normal_reference(depth: Tensor, cameras: Cameras, truth: Truth, valid: Tensor) -> Tensor:
-    """:func:`point_normal_loss` in plain torch, for any device and with gradients of the cameras as well."""
+    """:func:`point_normal_loss` in plain torch, for any device; also differentiable in the cameras."""
     turn = _turn(cameras, truth)
     total = depth.new_zeros(())
     for stride in POINT_STRIDES:
@@ -50,15 +50,15 @@ def point_normal_reference(depth: Tensor, cameras: Cameras, truth: Truth, valid:
 
 
 def _at_corners(between: Tensor, dim: int) -> Tensor:
-    """What lies between neighbours along one axis, at a corner's pixel of two along the other one: ``[2, ...]``."""
+    """Stacks the values at positions i and i + 1 along ``dim``: ``[2, ...]``."""
     count = between.shape[dim] - 1
     return torch.stack((between.narrow(dim, 0, count), between.narrow(dim, 1, count)))
 
 
 def _corner_normals(depth: Tensor, intrinsics: Tensor, stride: int) -> Tensor:
-    """Camera-frame normals ``[2, 2, V, 3, h - 1, w - 1]`` of the strided depth ``[V, H, W]`` at its squares' corners.
+    """Returns camera-frame normals ``[2, 2, V, 3, h - 1, w - 1]`` at the corners of 2x2 squares of the strided depth.
 
-    The first two axes say whether the pixel's neighbours are to its right or left, below or above it. As in
+    The first two axes select the corner whose neighbours are to the right or left, and below or above. Computed as in
     :mod:`vg2gt.geometry.normals`, with ``gx = fx (d1 - d) / d1``; not of unit length.
     """
     u, v = ray_slopes(intrinsics, (depth.shape[-2], depth.shape[-1]))
@@ -73,5 +73,5 @@ def _corner_normals(depth: Tensor, intrinsics: Tensor, stride: int) -> Tensor:
 
 
 def _turn(cameras: Cameras, truth: Truth) -> Tensor:
-    """Rotations ``[V, 3, 3]`` from the true cameras' frames into the predicted ones'."""
+    """Returns rotations ``[V, 3, 3]`` from the true cameras' frames to the predicted ones'."""
     return cameras.world_to_camera[0, :, :3, :3] @ truth.cameras.world_to_camera[0, :, :3, :3].transpose(-1, -2)

@@ -1,4 +1,4 @@
-"""Ground truth as the losses see it, in the frame of context view 0 and the scene's own unit, and scales to it."""
+"""Ground truth for the losses, in the frame of context view 0 and a unit per scene, and the scales to that unit."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ class Truth(TensorRecord):
     """Ground truth of all views of B scenes, divided by the scene's mean distance ``a`` from the first camera.
 
     Attributes:
-        depth: ``[B, V, H, W]`` z-depth in units of ``a``; 1 where invalid, so that nothing has to divide by 0.
+        depth: ``[B, V, H, W]`` z-depth in units of ``a``; 1 where invalid, to avoid division by 0.
         valid: ``[B, V, H, W]`` bool.
         cameras: in the frame of view 0, translations in units of ``a``.
         unit: ``[B]`` the divisor ``a``, 1 where the depth is unknown.
-        known: ``[B]`` bool, whether the context views have at least 100 valid pixels.
+        known: ``[B]`` bool, whether the context views have at least 100 valid pixels together.
     """
 
     depth: Tensor
@@ -44,7 +44,7 @@ class Truth(TensorRecord):
 
 
 def normalize_truth(batch: Batch) -> Truth:
-    """Brings a batch's depth and cameras into the losses' frame and unit.
+    """Converts a batch's depth and cameras to the losses' frame and unit.
 
     ``a = clamp(sum M |X| / (sum M + 1e-3), 1e-6, 1e6)`` over the context views, X in the frame of view 0 (VGGT).
     """
@@ -63,7 +63,7 @@ def normalize_truth(batch: Batch) -> Truth:
 
 
 def _distance_from_first(depth: Tensor, cameras: Cameras) -> Tensor:
-    """Distance ``[B, V, H, W]`` of every pixel's point from the world origin, which lies at t in the camera frame."""
+    """Returns the distance ``[B, V, H, W]`` of every pixel's point from the world origin, t in the camera frame."""
     u, v = ray_slopes(cameras.intrinsics, (depth.shape[-2], depth.shape[-1]))
     x, y, z = (cameras.world_to_camera[..., i, 3, None, None] for i in range(3))
     return ((depth * u - x).square() + (depth * v - y).square() + (depth - z).square()).sqrt()
@@ -74,12 +74,12 @@ SCALE_SOURCES = ("initial", "enhanced", "rendered")
 
 @dataclass(frozen=True)
 class ScaleAlignment:
-    """How the prediction is brought into the ground truth's unit before the losses compare them.
+    """Fits the scale that converts a prediction to the ground truth's unit before the losses compare them.
 
     Args:
-        source: ``initial`` fits the scale on the backbone's own depth, so that no loss is blind to a change of the
-            enhanced depth's scale; ``enhanced`` on the enhanced depth; ``rendered`` on the rendered depth, as the
-            paper's appendix says, which holes and early training make unstable.
+        source: ``initial`` fits the backbone's own depth, so that losses notice a change of the enhanced depth's scale;
+            ``enhanced`` fits the enhanced depth; ``rendered`` fits the rendered depth as in the paper's appendix, which
+            is unstable with holes and early in training.
 
     Raises:
         ValueError: if ``source`` is not one of these.
@@ -92,19 +92,19 @@ class ScaleAlignment:
             raise ValueError(f"loss.align.source must be one of {SCALE_SOURCES}, got {self.source!r}")
 
     def fit(self, geometry: Geometry, truth: Truth) -> Tensor:
-        """Scales ``[B]`` fitted on the context views' decoded depth; 1 in scenes without known depth."""
+        """Returns scales ``[B]`` fitted to the context views' decoded depth; 1 in scenes without known depth."""
         shown = truth.views(slice(0, geometry.depth.shape[1]))
         return _fit(geometry.depth, shown, shown.valid, torch.ones_like(truth.unit))
 
     def fit_rendered(self, depth: Tensor, hits: Tensor, views: Tensor, truth: Truth, decoded: Tensor) -> Tensor:
-        """Scales ``[B]`` fitted on rendered depth if that is the source, else those of the decoded depth.
+        """Returns scales ``[B]`` fitted to the rendered depth if that is the source, else ``decoded``.
 
         Args:
             depth: ``[B, R, H, W]`` rendered depth.
-            hits: ``[B, R, H, W]`` bool, where it shows a surface.
-            views: ``[R]`` which views of the batch these are.
+            hits: ``[B, R, H, W]`` bool, which pixels show a surface.
+            views: ``[R]`` indices of the views in the batch.
             truth: ground truth of all views.
-            decoded: ``[B]`` scales of the decoded depth, kept for scenes where nothing was rendered.
+            decoded: ``[B]`` scales of the decoded depth, also used for scenes where the fit has no pixels.
         """
         if self.source != "rendered":
             return decoded
@@ -113,7 +113,7 @@ class ScaleAlignment:
 
 
 def to_unit(geometry: Geometry, scale: Tensor) -> Geometry:
-    """Geometry in another unit, ``scale`` ``[B]`` of which are one of its own."""
+    """Converts geometry to another unit, with ``scale`` ``[B]`` new units per old unit."""
     cameras = scale_translations(geometry.cameras, scale)
     return replace(geometry, depth=geometry.depth * scale[:, None, None, None], cameras=cameras)
 

@@ -1,6 +1,6 @@
 """The paper's method: coarse enhancement, fine voxels and the self-splitting Gaussian head.
 
-Our additions to it are in :mod:`vg2gt.method.additions`.
+Our additions are in :mod:`vg2gt.method.additions`.
 """
 
 from vg2gt.method.coarse import CoarseModule

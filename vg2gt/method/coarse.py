@@ -1,4 +1,4 @@
-"""Coarse-level feature enhancement: patch tokens gain what voxels shared by all views know (paper, Coarse-level)."""
+"""Coarse-level feature enhancement of patch tokens with voxels shared by all views (paper, Coarse-level)."""
 
 from __future__ import annotations
 
@@ -38,31 +38,32 @@ Inject = Literal["last", "all"]
 
 
 class CoarseModule(nn.Module):
-    """Enhances patch tokens by PTv3 over coarse voxels, fused through a zero-initialised projection.
+    """Enhances patch tokens with PTv3 over coarse voxels, fused through a zero-initialised projection.
 
-    It reads the frozen backbone's geometry and does not move it. A patch without a valid point keeps its tokens. With
-    ``surface_evidence=False embedding_skip=False fuse_kernel=1 gate=False`` (``model=vg2gt``) it is the paper's.
+    The points come from the frozen backbone's geometry, without gradient. Patches without a valid point keep their
+    tokens. ``surface_evidence=False embedding_skip=False fuse_kernel=1 gate=False`` (``model=vg2gt``) is the paper's
+    module.
 
     Args:
         token_dims: width of each tapped layer, shallow to deep.
         patch_size: pixels per patch side, a multiple of ``upsample``.
-        ptv3: makes the voxel network from ``in_channels``.
+        ptv3: factory of the voxel network, called with ``in_channels``.
         voxel_size: edge length in scene units.
-        min_footprint: smallest edge in pixels at the scene's median depth; 0 switches the guard off.
+        min_footprint: smallest edge in pixels at the scene's median depth; 0 disables this bound.
         hidden: widths of the MLP from tokens to voxel features.
         fuse_channels: width of the fusing convolutions on the patch grid.
-        neighbors: nearest voxels a point's feature is interpolated from.
-        inject: ``all`` changes every tap, ``last`` the last one only.
+        neighbors: number of nearest voxels that are interpolated at a point.
+        inject: taps to change: ``all``, or only the ``last``.
         upsample: points per patch along each axis.
-        surface_evidence: ours: the voxels' centroids enter PTv3, and how far every point is from the surface that the
-            views agree on enters the fusion.
-        embedding_skip: ours: the patches' own embedding enters the fusion next to the voxels' features.
-        fuse_kernel: edge length of the fusing convolutions: 1 (paper), or 3, which reads a patch's neighbours.
-        gate: ours: evidence counts away from silhouettes only, and all changes are scaled by how much the views
-            disagree. Needs ``surface_evidence``.
+        surface_evidence: ours: adds the voxels' centroids to the input of PTv3, and each point's distance from the
+            surface that the views agree on to the input of the fusion.
+        embedding_skip: ours: adds the patches' own embedding to the input of the fusion.
+        fuse_kernel: edge length of the fusing convolutions: 1 (paper), or 3 to include neighbouring patches.
+        gate: ours: ignores evidence near silhouettes, and scales all changes by how much the views disagree. Needs
+            ``surface_evidence``.
 
     Raises:
-        ValueError: naming an option that is not one of these, or does not fit another.
+        ValueError: if an option is invalid or conflicts with another; the message names it.
     """
 
     def __init__(
@@ -123,25 +124,28 @@ class CoarseModule(nn.Module):
         Args:
             tokens: the frozen backbone's tokens.
             geometry: geometry decoded from them, in scene units and the frame of context view 0.
-            generator: while training, shuffles the serialisation orders.
+            generator: shuffles the serialisation orders while training.
 
         Returns:
-            The tokens with enhanced patches; bit-equal to the input before training. The camera token is untouched.
+            The tokens with enhanced patches; before training bit-equal to the input. The camera token is unchanged.
 
         Raises:
-            ValueError: if a scene spans too many voxels to be numbered.
+            ValueError: if a scene spans too many voxels to index.
         """
+        # pixels to packed points of the upsampled patch grid: N points
         with full_precision(geometry.depth):
             size = scene_voxel_size(geometry, self.voxel_size, self.min_footprint)
             points = PatchPoints(geometry, self.cell, size, away_from_silhouettes=self.gate)
         embedded = self._embed(tokens)[points.rows].float()  # f(p): [N, C]
+        # points to voxels, PTv3, back to points: [N, C]
         enhanced, gain = self._enhance(embedded, points, generator)
         if self.embedding_skip:
             enhanced = torch.cat((enhanced, embedded), -1)
+        # points to patches: [B, V, P, C]
         patches, seen = self._to_patches(enhanced, points, tokens)
         maps = patches.flatten(0, 1).transpose(1, 2).unflatten(-1, tokens.grid)  # [B V, C, rows, columns]
         fused = self.fuse(maps)
-        # Zero convolution: what it adds to each of the taps' tokens, nothing before training.
+        # zero convolution: the update of each tap's tokens, 0 before training
         updates = [gain * _to_patch_rows(branch(fused), seen) for branch in self.zero]  # [B, V, P, D] each
         untouched = tokens.patch[: len(tokens.patch) - len(updates)]
         changed = tokens.patch[len(untouched) :]
@@ -159,7 +163,7 @@ class CoarseModule(nn.Module):
     def _enhance(
         self, embedded: Tensor, points: PatchPoints, generator: torch.Generator | None
     ) -> tuple[Tensor, Tensor]:
-        """PTv3 over the voxels, read back at the points with the evidence ``[N, C]``; the gate ``[B, 1, 1, 1]``."""
+        """Pools to voxels, runs PTv3, interpolates at the points: features ``[N, C]`` and gate ``[B, 1, 1, 1]``."""
         with full_precision(embedded):
             plan = plan_voxels(points.cells, points.batch, torch.ones_like(points.batch, dtype=torch.bool))
             if points.views > 1:
@@ -168,7 +172,7 @@ class CoarseModule(nn.Module):
             least = pool_min(points.confidence, plan)  # n_m^v, eqn voxelfeature: [M]
             centroid = cell_centroids(points.cells, points.confidence, plan) if self.surface_evidence else None
         inputs = (pooled, least.log()[:, None]) if centroid is None else (pooled, 2 * centroid, least.log()[:, None])
-        # S, T and S^-1 of eqn ptvzengqiang: PTv3 serialises, enhances and returns the voxels in the order given.
+        # S, T and S^-1 of eqn ptvzengqiang: PTv3 serialises, enhances and returns the voxels in input order
         voxels = self.ptv3(torch.cat(inputs, -1), plan.grid, plan.batch, points.voxel_size, generator=generator)
         with full_precision(embedded):
             return self._read_back(voxels.float(), plan, centroid, points)
@@ -176,13 +180,13 @@ class CoarseModule(nn.Module):
     def _read_back(
         self, voxels: Tensor, plan: VoxelPlan, centroid: Tensor | None, points: PatchPoints
     ) -> tuple[Tensor, Tensor]:
-        """What the points read from the enhanced voxels ``[M, C]``, and the gate on changes, as :meth:`_enhance`."""
-        # Cells relative to their scene's first one: differences, and so the weights, keep their precision in float32.
+        """Interpolates the enhanced voxels ``[M, C]`` at the points; returns the same as :meth:`_enhance`."""
+        # positions relative to the scene's first cell, so that their differences are precise in float32
         first = torch.searchsorted(plan.batch, torch.arange(len(points.voxel_size), device=plan.batch.device))
         origin = plan.grid[first.clamp(max=len(plan) - 1)]
         queries = (points.cells - origin[points.batch]).float()
         centers = (plan.grid - origin[plan.batch]).float() + 0.5
-        # Paper, after eqn ptvzengqiang: distance-weighted over the 16 nearest voxel centres.
+        # paper, after eqn ptvzengqiang: distance-weighted over the 16 nearest voxel centres
         index, weights = interpolation_weights(
             queries, points.batch, centers, plan.batch, self.neighbors, len(points.voxel_size)
         )  # [N, k]
@@ -197,7 +201,7 @@ class CoarseModule(nn.Module):
         return enhanced, gain[:, None, None, None]
 
     def _to_patches(self, features: Tensor, points: PatchPoints, tokens: Tokens) -> tuple[Tensor, Tensor]:
-        """Averages the valid points of every patch: ``[B, V, P, C]`` and whether there were any ``[B, V, P, 1]``."""
+        """Averages the valid points of every patch: ``[B, V, P, C]``, and whether it has any: ``[B, V, P, 1]``."""
         views = tokens.patch[-1].shape[:2]
         rows, columns = tokens.grid
         total = views.numel() * rows * columns * self.upsample**2
@@ -212,25 +216,25 @@ class CoarseModule(nn.Module):
 
 
 class PatchPoints:
-    """The points of the upsampled patch grid that have a valid depth, packed.
+    """Packed points of the upsampled patch grid that have a valid depth.
 
-    Depth is that of a cell's central pixel, confidence the cell's smallest. Where nothing is valid there is one
-    placeholder point, which keeps the network's parameters in the autograd graph; its features are discarded.
+    A cell's depth is that of its central pixel, its confidence the smallest of its pixels. If no point is valid, one
+    placeholder point keeps the network's parameters in the autograd graph; its features are discarded.
 
     Args:
         geometry: B scenes of V views, in scene units.
         cell: pixels per cell side.
-        voxel_size: ``[B]``.
-        away_from_silhouettes: find out which points are.
+        voxel_size: ``[B]`` edge length in scene units.
+        away_from_silhouettes: whether to compute ``clear``.
 
     Attributes:
-        rows: ``[N]`` place in the flattened ``[B, V, h, w]`` grid.
+        rows: ``[N]`` index in the flattened ``[B, V, h, w]`` grid.
         batch: ``[N]`` scene index, sorted.
         cells: ``[N, 3]`` float64 positions in voxel units.
         confidence: ``[N]`` > 0.
-        depth: ``[B, V, h, w]`` of the grid, scene units, 0 = invalid.
-        cameras: whose pixels are the grid's.
-        clear: ``[N]`` bool, whether no pixel of the cell is next to a silhouette; None where nobody asked.
+        depth: ``[B, V, h, w]`` depth of the grid in scene units, 0 = invalid.
+        cameras: cameras whose pixels are the grid's cells.
+        clear: ``[N]`` bool, true if no pixel of the cell is next to a silhouette; None unless requested.
     """
 
     def __init__(self, geometry: Geometry, cell: int, voxel_size: Tensor, away_from_silhouettes: bool = False) -> None:
@@ -260,13 +264,13 @@ class PatchPoints:
 
 
 def _to_patch_rows(maps: Tensor, seen: Tensor) -> Tensor:
-    """Maps ``[B V, C, rows, columns]`` as patch rows ``[B, V, P, C]``, 0 where not ``seen`` ``[B, V, P, 1]``."""
+    """Maps ``[B V, C, rows, columns]`` to patch rows ``[B, V, P, C]``, 0 where not ``seen`` ``[B, V, P, 1]``."""
     rows = maps.flatten(2).transpose(1, 2).unflatten(0, seen.shape[:2])  # [B, V, P, C]
     return torch.where(seen, rows, 0)
 
 
 def _sampled_cameras(cameras: Cameras, cell: int, size: tuple[int, int]) -> Cameras:
-    """Cameras whose pixels are the central pixels of the cells (sampled, so pixel centres scale, not areas)."""
+    """Returns cameras whose pixels are the cells' central pixels (sampling scales pixel centres, not areas)."""
     intrinsics = crop_intrinsics(cameras.intrinsics.detach().float(), cell // 2, cell // 2)
     intrinsics = torch.cat((intrinsics[..., :2, :] / cell, intrinsics[..., 2:, :]), -2)
     return Cameras(cameras.world_to_camera.detach().float(), intrinsics, size)

@@ -1,4 +1,4 @@
-"""Trainable dense prediction transformer: tapped patch tokens and the image to features at every pixel."""
+"""Trainable dense prediction transformer (DPT): patch tokens and images to per-pixel features."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ class ResidualConvUnit(nn.Module):
 
 
 class Reassemble(nn.Module):
-    """Tokens of one tap to a feature map at a multiple of the patch grid's resolution.
+    """Converts the tokens of one tapped layer to a feature map at a multiple of the patch grid's resolution.
 
     Args:
         token_dim: token width.
         tap_channels: width after the projection.
-        channels: width of the map.
-        factor: 4, 2, 1 or 0.5 times the patch grid.
+        channels: width of the feature map.
+        factor: resolution relative to the patch grid: 4, 2, 1 or 0.5.
     """
 
     def __init__(self, token_dim: int, tap_channels: int, channels: int, factor: float) -> None:
@@ -48,27 +48,28 @@ class Reassemble(nn.Module):
         self.smooth = nn.Conv2d(tap_channels, channels, 3, padding=1, bias=False)
 
     def forward(self, tokens: Tensor, grid: tuple[int, int]) -> Tensor:
-        """Maps ``[N, P, D]`` tokens on a ``(rows, columns)`` grid to ``[N, C, factor rows, factor columns]``."""
-        # Rows of pixels in memory order: the permuted view is already channels-last, the convolutions' fast layout.
+        """Maps ``[N, P, D]`` tokens on a ``(rows, columns)`` grid to ``[N, C, factor * rows, factor * columns]``."""
+        # the permuted view is already channels-last, the fast memory format of convolutions
         features = self.project(self.norm(tokens)).unflatten(1, grid).permute(0, 3, 1, 2)
         return self.smooth(self.resize(features))
 
 
 class DenseHead(nn.Module):
-    """DPT over the tapped layers with a small image merger (paper, Fine-level Gaussian Scene Decoding).
+    """DPT over the tapped layers, merged with image features (paper, Fine-level Gaussian Scene Decoding).
 
-    The tokens' pyramid is fused from coarse to fine as in the depth head; its finest level, brought to full
-    resolution bilinearly, meets a shallow convolution of the image, which alone carries detail below a patch.
+    The token pyramid is fused from coarse to fine, as in the depth head. Its finest level is upsampled bilinearly to
+    full resolution and added to a shallow convolution of the image, the only source of detail below the patch size.
 
     Args:
         token_dims: width of each tapped layer, shallow to deep.
-        patch_size: pixels a patch.
+        patch_size: pixels per patch side.
         features: width of the pyramid.
         out_channels: width of the result.
-        merge_channels: width at full resolution before the last convolution; None takes ``out_channels``.
+        merge_channels: width at full resolution before the last convolution; None uses ``out_channels``.
         tap_channels: width of every tap before fusion; None uses ``features`` for all.
-        finest: resolution of the shallowest tap over the patch grid, 4, 2 or 1; each next tap has half, down to 0.5.
-        views_per_chunk: views decoded at a time, which bounds the peak memory of inference.
+        finest: resolution of the shallowest tap relative to the patch grid: 4, 2 or 1. Each next tap has half of it,
+            down to 0.5.
+        views_per_chunk: views decoded at a time; bounds the peak memory at inference.
     """
 
     def __init__(
@@ -109,17 +110,17 @@ class DenseHead(nn.Module):
         """Decodes features.
 
         Args:
-            tokens: ``[B, V, P, D]`` a tap.
+            tokens: ``[B, V, P, D]`` per tap.
             images: ``[B, V, 3, H, W]`` in [0, 1].
 
         Returns:
-            ``[B * V, out_channels, H, W]``, laid out channels-last in memory.
+            ``[B * V, out_channels, H, W]``, channels-last in memory.
         """
         chunks = list(self.chunks(tokens, images))
         return chunks[0] if len(chunks) == 1 else torch.cat(chunks)
 
     def chunks(self, tokens: Tokens, images: Tensor) -> Iterator[Tensor]:
-        """Decodes features ``views_per_chunk`` views at a time; joined they are what the head returns."""
+        """Decodes features ``views_per_chunk`` views at a time; concatenated, they equal :meth:`forward`."""
         taps = [tap.flatten(0, 1) for tap in tokens.patch]
         pictures = images.flatten(0, 1)
         for begin in range(0, len(pictures), self.views_per_chunk):

@@ -37,41 +37,42 @@ from vg2gt.types import Geometry, Tokens, VoxelMoments, Voxels
 
 log = logging.getLogger(__name__)
 
-EXTRA_CHANNELS = 8  # colour (3), position of the centroid in the cell (3), number of points, confidence
+EXTRA_CHANNELS = 8  # colour (3), position of the centroid in the cell (3), number of points (1), confidence (1)
 MOMENT_CHANNELS = 15  # spread (6), covariance with colour (9)
-# What brings inputs of the voxel network to about [-1, 1]: a cell evenly filled has a spread of 1 / 12.
+# Scale inputs of the voxel network to about [-1, 1]; the spread of a uniformly filled cell is 1 / 12.
 SPREAD_SCALE, CROSS_SCALE = 12, 20
 
 
 class FineModule(nn.Module):
     """Pools the dense features, colours and positions of all pixels into voxels and refines them.
 
-    A pixel's place within its cell enters its feature before pooling, so that the pooled feature can tell how the
-    surface runs through the cell.
+    A pixel's position within its cell is added to its feature before pooling, so that the pooled feature encodes how
+    the surface passes through the cell.
 
     Args:
         token_dims: width of each tapped layer.
-        patch_size: pixels a patch.
-        dense_head: makes the dense head from ``token_dims`` and ``patch_size``.
-        point_mlp: makes the voxel network from ``in_channels``.
+        patch_size: pixels per patch side.
+        dense_head: factory of the dense head, called with ``token_dims`` and ``patch_size``.
+        point_mlp: factory of the voxel network, called with ``in_channels``.
         voxel_size: edge length in scene units.
-        min_footprint: smallest edge in pixels at the scene's median depth; 0 switches the guard off.
-        coarsest_drawn: in training that edge is multiplied by a factor drawn log-uniformly from 1 to this number, so
-            that one head serves several voxel sizes.
-        max_voxels: most voxels a scene; beyond it the least confident are dropped, with a warning in the log and
-            the metric ``train/voxels_dropped``. None keeps all.
-        moments: second moments of the points are pooled too: further inputs of the voxel network, and what the
-            Gaussian head's surfel start is made of.
-        normal_kernel: cells a side, 1 or 3, whose points say how the surface runs through a voxel
+        min_footprint: smallest edge in pixels at the scene's median depth; 0 disables this bound.
+        coarsest_drawn: training multiplies the smallest edge by a factor drawn log-uniformly from 1 to this value, so
+            that one head supports several voxel sizes.
+        max_voxels: largest number of voxels per scene; above it the least confident are dropped, with a warning in the
+            log and the metric ``train/voxels_dropped``. None keeps all.
+        moments: whether to pool second moments of the points too, as further inputs of the voxel network and for the
+            surfel start of the Gaussian head.
+        normal_kernel: edge length in cells, 1 or 3, of the neighbourhood whose points determine a voxel's normal
             (:mod:`vg2gt.method.additions.voxel_normals`).
-        drop_fringes: pixels between foreground and background (:mod:`vg2gt.method.additions.silhouette`) are left out.
+        drop_fringes: whether to leave out pixels between foreground and background
+            (:mod:`vg2gt.method.additions.silhouette`).
 
     Attributes:
         out_channels: width of the refined features.
-        cap: counts what ``max_voxels`` drops.
+        cap: counts the voxels that ``max_voxels`` drops.
 
     Raises:
-        ValueError: if ``max_voxels`` or ``coarsest_drawn`` is below 1, or ``normal_kernel`` neither 1 nor 3.
+        ValueError: if ``max_voxels`` or ``coarsest_drawn`` is below 1, or ``normal_kernel`` is neither 1 nor 3.
     """
 
     def __init__(
@@ -121,14 +122,14 @@ class FineModule(nn.Module):
             tokens: enhanced tokens.
             geometry: decoded depth, confidence and cameras, in scene units and the frame of context view 0.
             images: ``[B, V, 3, H, W]`` in [0, 1].
-            coarsen: ``[B]`` factors of the smallest edge; None: 1.
-            generator: draws further factors while training.
+            coarsen: ``[B]`` factors on the smallest edge; None: 1.
+            generator: draws the factors of ``coarsest_drawn`` while training.
 
         Returns:
-            Refined voxels; differentiable in features, confidence and positions, not in which pixel lies where.
+            Refined voxels; differentiable in features, confidence and positions, but not in the assignment of pixels.
 
         Raises:
-            ValueError: if a scene spans too many voxels to be numbered.
+            ValueError: if a scene spans too many voxels to index.
         """
         if self.training and self.coarsest_drawn > 1:
             drawn = self.coarsest_drawn ** torch.rand(len(images), generator=generator)
@@ -139,13 +140,13 @@ class FineModule(nn.Module):
 
     @torch.no_grad()
     def pool(self, tokens: Tokens, geometry: Geometry, images: Tensor, size: Tensor) -> PooledVoxels:
-        """The part of :meth:`forward` that looks at pixels, for some views of one scene (B = 1), to be merged.
+        """Runs the per-pixel part of :meth:`forward` for some views of one scene (B = 1); the results can be merged.
 
         Args:
             tokens: as for :meth:`forward`.
             geometry: as for :meth:`forward`, in the frame of the whole scene.
             images: as for :meth:`forward`.
-            size: ``[1]`` edge of the whole scene's voxels.
+            size: ``[1]`` voxel edge length of the whole scene.
         """
         plan, features, means, confidence, moments, weights = self._measure(tokens, geometry, images, size, None)
         ordered = weights[plan.order].double()
@@ -155,11 +156,11 @@ class FineModule(nn.Module):
 
     @torch.no_grad()
     def refine(self, pooled: PooledVoxels, size: Tensor) -> Voxels:
-        """The rest of :meth:`forward`: refines the voxels of a whole scene that :meth:`pool` gave and that were merged.
+        """Runs the rest of :meth:`forward`: refines the voxels of a whole scene.
 
         Args:
-            pooled: the merged voxels.
-            size: ``[1]`` their edge.
+            pooled: merged results of :meth:`pool`.
+            size: ``[1]`` voxel edge length of the whole scene.
         """
         if self.max_voxels is not None:
             keep = self.cap(self.max_voxels, pooled.confidence, torch.zeros_like(pooled.count))
@@ -175,12 +176,15 @@ class FineModule(nn.Module):
     def _measure(
         self, tokens: Tokens, geometry: Geometry, images: Tensor, size: Tensor, max_voxels: int | None
     ) -> _Measured:
+        # pixels to points and their cells
         with full_precision(images):
             points = _Points(geometry, size, self.drop_fringes)
             plan = self._plan(points, max_voxels)
             if images.shape[1] > 1:
                 warn_if_sparse(plan, len(size), "fine")
+        # dense features to voxels: [M, C]
         pooled = self._pool_features(tokens, images, points, plan)
+        # position, colour, confidence and second moments of the points in every voxel
         with full_precision(images):
             pixels = images.float().permute(0, 1, 3, 4, 2).reshape(-1, 3)  # [B V H W, 3]
             values = torch.cat((points.offset, pixels), -1)  # [B V H W, 6]
@@ -196,7 +200,7 @@ class FineModule(nn.Module):
             count = plan.counts.to(pooled.dtype)
             density = torch.log(count / _scene_medians(count, plan.batch, len(size)))
             extra = [2 * colors - 1, 2 * offset, density[:, None], confidence.log()[:, None]]
-            # Not grid * size + ...: centre plus offset keeps the centroid inside its cell in float32.
+            # adding before scaling keeps the centroid inside its cell in float32
             centroid = (plan.grid + 0.5 + offset.double()) * size.double()[plan.batch, None]
             centroid = centroid.to(pooled.dtype)
             moments = None
@@ -211,7 +215,7 @@ class FineModule(nn.Module):
     def _pool_moments(
         self, geometry: Geometry, size: Tensor, values: Tensor, confidence: Tensor, means: Tensor, plan: VoxelPlan
     ) -> Moments | None:
-        """How the points of every voxel lie about the means ``[M, 6]`` of their places and colours ``[N, 6]``."""
+        """Returns second moments of the points' positions and colours ``[N, 6]`` about their means ``[M, 6]``."""
         if not self.moments:
             return None
         centers = camera_centers(geometry.cameras).float()  # [B, V, 3]
@@ -228,7 +232,7 @@ class FineModule(nn.Module):
         return VoxelMoments(spread, cross, facing, pixel, normal)
 
     def _pool_features(self, tokens: Tokens, images: Tensor, points: _Points, plan: VoxelPlan) -> Tensor:
-        """``[M, C]``; without gradient the features of a few views are there at a time, which bounds the memory."""
+        """Pools dense features to ``[M, C]``; without gradient, a few views at a time, which bounds the memory."""
         others = (points.offset, self.point_offset.weight, points.confidence, plan)
         with_gradient = torch.is_grad_enabled() or not len(plan)
         maps = [self.dense_head(tokens, images)] if with_gradient else self.dense_head.chunks(tokens, images)
@@ -247,23 +251,23 @@ class FineModule(nn.Module):
 
 
 class _Measured(NamedTuple):
-    """What pixels say of their voxels."""
+    """Voxels with everything pooled from pixels."""
 
     plan: VoxelPlan
     features: Tensor  # [M, C]
-    means: Tensor  # [M, 6] place in the cell, colour
+    means: Tensor  # [M, 6] position in the cell, colour
     confidence: Tensor  # [M]
     moments: Moments | None
-    weights: Tensor  # [N] of the points
+    weights: Tensor  # [N] confidence of the points, or [M] summed per voxel
 
 
 def _pixel_rows(dense: Tensor) -> Tensor:
-    """Maps ``[n, C, H, W]`` as float32 rows ``[n H W, C]``."""
+    """Maps ``[n, C, H, W]`` to float32 rows ``[n H W, C]``."""
     return dense.permute(0, 2, 3, 1).flatten(0, 2).float()
 
 
 class _Points:
-    """All pixels as points as :func:`plan_voxels` takes them, invalid ones finite placeholders that no voxel uses."""
+    """All pixels as points for :func:`plan_voxels`; invalid ones are finite placeholders that no voxel uses."""
 
     def __init__(self, geometry: Geometry, voxel_size: Tensor, drop_fringes: bool) -> None:
         depth, confidence = geometry.depth.float(), geometry.depth_conf.float()
@@ -284,6 +288,6 @@ class _Points:
 
 
 def _scene_medians(values: Tensor, batch: Tensor, scenes: int) -> Tensor:
-    """The median of ``[M]`` values within each voxel's scene, ``[M]``."""
+    """Returns for every voxel the median of the ``[M]`` values in its scene: ``[M]``."""
     parts = values.split(scene_counts(batch, scenes).tolist())
     return torch.stack([part.median() if len(part) else part.new_ones(()) for part in parts])[batch]

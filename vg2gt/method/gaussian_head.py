@@ -18,31 +18,31 @@ from vg2gt.types import Gaussians, Voxels
 
 Anchor = Literal["centroid", "center"]
 Start = Literal["plain", "surfel"]
-MAX_SCALE = 2.0  # voxels: the paper's bound
-PLAIN_SCALE = 0.5  # voxels
-MIN_SCALE = 1e-3  # voxels: renderers need a finite inverse
-INITIAL_ALPHA = 0.95  # of a voxel's K Gaussians together, before training (plain start)
-SURFEL_ALPHA = 0.88  # of each Gaussian of the surfel start
+MAX_SCALE = 2.0  # voxels; the paper's upper bound
+PLAIN_SCALE = 0.5  # voxels; initial scale of the plain start
+MIN_SCALE = 1e-3  # voxels; renderers need a finite inverse
+INITIAL_ALPHA = 0.95  # initial joint opacity of a voxel's K Gaussians (plain start)
+SURFEL_ALPHA = 0.88  # initial opacity of each Gaussian (surfel start)
 
 
 class GaussianHead(nn.Module):
     """Two-layer MLP from a voxel's feature to K sets of Gaussian parameters.
 
-    With the ``plain`` start (the paper's) an untrained voxel's Gaussians lie near its anchor with half a voxel's
-    standard deviation, the voxel's colour and a joint opacity of 0.95. With the ``surfel`` start they lie on the
-    voxel's surface, along its colour gradient (:mod:`vg2gt.method.additions.surfel`), and the network's output is a
-    residual in its frame.
+    With the ``plain`` start (the paper's), the Gaussians of an untrained head are near the voxel's anchor and have a
+    standard deviation of half a voxel, the voxel's colour and a joint opacity of 0.95. With the ``surfel`` start, they
+    are on the voxel's surface along its colour gradient (:mod:`vg2gt.method.additions.surfel`), and the network
+    predicts residuals in that frame.
 
     Args:
         in_channels: width of the voxel features.
-        splits: K Gaussians a voxel.
+        splits: K, Gaussians per voxel.
         sh_degree: degree L of the spherical harmonics, 0 to 3.
         anchor: means are offsets from the voxel's ``centroid`` or, as in the paper, from its ``center``.
         start: ``plain``, or ``surfel``, which needs voxels with moments.
-        max_offset: rho, largest offset along an axis in voxels.
-        hidden: width of the hidden layer; None takes ``in_channels``.
-        max_gaussians: most Gaussians a scene; beyond it the least opaque are dropped, with a warning in the log and the
-            metric ``train/gaussians_dropped``. None keeps all.
+        max_offset: rho, largest predicted offset along an axis in voxels.
+        hidden: width of the hidden layer; None uses ``in_channels``.
+        max_gaussians: largest number of Gaussians per scene; above it the least opaque are dropped, with a warning in
+            the log and the metric ``train/gaussians_dropped``. None keeps all.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class GaussianHead(nn.Module):
         self.parts = (3, 3, 4, 1, 3 * bands)
         self.hidden = nn.Linear(in_channels, hidden or in_channels)
         self.out = nn.Linear(hidden or in_channels, splits * sum(self.parts))
-        # Small random weights: with zeros the K splits would stay identical for ever.
+        # small random weights: with zeros, the K splits would stay identical
         nn.init.normal_(self.out.weight, std=0.02)
         nn.init.zeros_(self.out.bias)
         plain = 1 - (1 - INITIAL_ALPHA) ** (1 / splits)
@@ -93,29 +93,34 @@ class GaussianHead(nn.Module):
             voxels: refined voxels of B scenes.
 
         Returns:
-            ``M * splits`` Gaussians (fewer beyond ``max_gaussians``), those of a voxel adjacent: scales in (0, 2 v),
-            means within ``max_offset`` v of the anchor along each axis, unit quaternions.
+            ``M * splits`` Gaussians (fewer if ``max_gaussians`` drops some), those of a voxel adjacent, with scales in
+            (0, 2 v) and unit quaternions. With the plain start, means are within ``max_offset`` v of the anchor along
+            each axis.
         """
+        # features [M, C] to K sets of raw parameters: [M, K, ...]
         raw = self.out(F.gelu(self.hidden(voxels.features))).float().unflatten(-1, (self.splits, -1))
         offset, scale, rotation, opacity, color = raw.split(self.parts, -1)
         size = voxels.voxel_size[voxels.batch][:, None, None]
         anchor = voxels.centroid if self.anchor == "centroid" else voxels.centers
         offset = self.max_offset * torch.tanh(offset)
-        # numbers are filled in on the device: the host would wait for copies
+        # created on the device: a copy from the host would synchronise
         identity = torch.eye(4, dtype=rotation.dtype, device=rotation.device)[0]
         quats = F.normalize(rotation + identity, dim=-1)
         start_scale, colors = scale.new_full((), PLAIN_SCALE), voxels.colors[:, None]
+        # ours: the parameters are residuals to the surfel start
         if self.start == "surfel":
             start = self._surfels(voxels)
             offset = start.offsets + torch.einsum("mij,mkj->mki", start.frame, offset)
             quats = multiply_quats(matrix_to_quat(start.frame)[:, None], quats)
             start_scale, colors = start.scales, (colors + start.colors).clamp(0, 1)
+        # residual positions and colours, bounded scales and opacities: [M, K, ...]
         means = anchor[:, None] + size * offset
         scale = MAX_SCALE * torch.sigmoid(scale + torch.logit(start_scale / MAX_SCALE))
         scales = size * scale.clamp(min=MIN_SCALE)
         opacities = torch.sigmoid(opacity[..., 0] + self.opacity_bias)
         base = F.pad(rgb_to_sh(colors)[:, :, None], (0, 0, 0, len(self.sh_gain) - 1))
         sh = base + self.sh_gain * color.unflatten(-1, (-1, 3))
+        # pack: [M * K]
         batch = voxels.batch.repeat_interleave(self.splits)
         note_sizes({"Gaussians": len(batch)})
         parts = Gaussians(*(part.flatten(0, 1) for part in (means, quats, scales, opacities, sh)), batch=batch)

@@ -1,4 +1,4 @@
-"""World-anchored voxels: which point lies in which cell, and confidence-weighted pooling (paper, eqn voxelfeature)."""
+"""World-anchored voxels: assigns points to cells and pools them by confidence (paper, eqn voxelfeature)."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from vg2gt.types import Geometry
 
 log = logging.getLogger(__name__)
 
-MAX_CELLS = 1 << 18  # cells either side of the origin: 19 bits per axis leave 6 of a code's 63 for the scene
-# Below, hardly any voxel fuses what several views see. Coarse points are a patch's few, and their voxels share features
-# through PTv3 and 16 neighbours besides.
+MAX_CELLS = 1 << 18  # cells on either side of the origin: 19 bits per axis leave 6 of a code's 63 for the scene
+# Below these values, hardly any voxel fuses several views. The coarse level has only a few points per patch, and its
+# voxels also share features through PTv3 and the interpolation over 16 neighbours.
 MIN_POINTS_PER_VOXEL = {"coarse": 1.1, "fine": 1.2}
 
 _warned_of_sparse: set[str] = set()
@@ -26,15 +26,15 @@ _warned_of_sparse: set[str] = set()
 
 @dataclass(frozen=True)
 class VoxelPlan:
-    """Membership of N points in M voxels. Voxels are sorted by (scene, x, y, z).
+    """Assignment of N points to M voxels, which are sorted by (scene, x, y, z).
 
     Attributes:
         grid: ``[M, 3]`` int64 cell index, ``floor(x / voxel_size)``.
         batch: ``[M]`` int64 scene index, sorted.
         order: rows of the points that lie in a voxel, sorted by voxel, ties in input order.
-        starts: ``[M]`` where each voxel begins in ``order``.
-        counts: ``[M]`` int64 points in each voxel.
-        voxel_of: ``[N]`` voxel of every point, -1 for points that were left out.
+        starts: ``[M]`` first position of each voxel in ``order``.
+        counts: ``[M]`` int64 number of points in each voxel.
+        voxel_of: ``[N]`` voxel of every point, -1 for points in no voxel.
     """
 
     grid: Tensor
@@ -48,7 +48,7 @@ class VoxelPlan:
         return self.grid.shape[0]
 
     def select(self, keep: Tensor) -> VoxelPlan:
-        """Returns the plan of the voxels where ``keep`` ``[M]`` bool is true; points of the others are left out."""
+        """Returns the plan of the voxels where ``keep`` ``[M]`` bool is true; other voxels' points are left out."""
         new_index = torch.where(keep, keep.cumsum(0) - 1, -1)
         new_index = torch.cat((new_index, new_index.new_tensor([-1])))  # -1 stays -1
         counts = self.counts[keep]
@@ -65,27 +65,27 @@ class VoxelPlan:
 def mixed_radix_keys(
     grid: Tensor, batch: Tensor, margin: int = 0, spans: Sequence[int] | None = None
 ) -> tuple[Tensor, tuple[int, int, int]]:
-    """One collision-free int64 key per cell ``[M, 3]`` and scene ``[M]``, ordered like (scene, x, y, z).
+    """Returns one collision-free int64 key per cell ``[M, 3]`` and scene ``[M]``, ordered like (scene, x, y, z).
 
     Args:
         grid: cells, any sign.
         batch: scene index >= 0.
         margin: cells to leave free on every side, so that keys of neighbours up to ``margin`` away never wrap.
-        spans: cells along x, y and z of a grid that begins at 0, and the number of scenes, where they are known; to
-            find them out, the host waits for a GPU.
+        spans: number of cells along x, y and z of a grid that begins at 0, and number of scenes; None computes them,
+            which synchronises with a GPU.
 
     Returns:
-        The keys ``[M]`` and the key differences of one step along x, y and z.
+        The keys ``[M]`` and the key increments of one step along x, y and z.
 
     Raises:
-        ValueError: if the cells span more than int64 can number.
+        ValueError: if the keys do not fit into 63 bits.
     """
     if not len(grid):
         return batch, (1, 1, 1)
     if spans is None:
         low = grid.amin(0)
         grid = grid - low
-        # the host waits for a GPU once, not once a number
+        # one transfer from the GPU instead of one per number
         spans = torch.cat((grid.amax(0) + 1, batch.max()[None] + 1)).tolist()
     *extent, scenes = spans
     extent = [cells + 2 * margin for cells in extent]
@@ -100,27 +100,27 @@ def mixed_radix_keys(
 
 
 def scene_counts(batch: Tensor, scenes: int) -> Tensor:
-    """Rows ``[B]`` of each scene where ``batch`` ``[M]`` is sorted; unlike ``bincount`` it makes no host wait."""
+    """Counts the rows ``[B]`` of each scene in sorted ``batch`` ``[M]``; unlike ``bincount``, it never synchronises."""
     return torch.searchsorted(batch, torch.arange(scenes + 1, device=batch.device)).diff()
 
 
 def point_cells(points: Tensor, batch: Tensor, voxel_size: Tensor) -> Tensor:
-    """Positions in units of voxels.
+    """Returns positions in units of voxels.
 
     Args:
-        points: ``[N, 3]``, float32 or better (bfloat16 puts most points into another 2 mm cell).
+        points: ``[N, 3]``, float32 or better (bfloat16 would move most points to another 2 mm cell).
         batch: ``[N]`` scene index.
         voxel_size: ``[B]`` edge length in scene units.
 
     Returns:
-        ``[N, 3]`` float64. Division, not multiplication by 1/v, so that points on faces fall as the definition says.
+        ``[N, 3]`` float64. Divides instead of multiplying by 1/v, so that points on cell faces follow the definition.
     """
     sizes = voxel_size.double() if len(voxel_size) == 1 else voxel_size.double()[batch, None]
     return points.double() / sizes
 
 
 def in_range(cells: Tensor) -> Tensor:
-    """``[N]`` bool: finite cells ``[N, 3]`` close enough to the origin to be numbered."""
+    """Returns ``[N]`` bool: whether cells ``[N, 3]`` are finite and close enough to the origin to be indexed."""
     return (cells.abs() < MAX_CELLS).all(-1)
 
 
@@ -128,15 +128,15 @@ def plan_voxels(cells: Tensor, batch: Tensor, valid: Tensor) -> VoxelPlan:
     """Groups points by cell.
 
     Args:
-        cells: ``[N, 3]`` positions in units of voxels; rows that are not valid may hold anything.
+        cells: ``[N, 3]`` positions in units of voxels; invalid rows may hold anything.
         batch: ``[N]`` int64 scene index.
         valid: ``[N]`` bool, the points to use; they must be finite.
 
     Returns:
-        The plan; deterministic, and independent of the order of points up to the order within a voxel.
+        The plan. It is deterministic, and only the order within a voxel depends on the order of points.
 
     Raises:
-        ValueError: if the points span more cells than int64 can number.
+        ValueError: if the points span more cells than 63 bits can index.
     """
     valid_rows = valid.nonzero()[:, 0]
     rows = None if len(valid_rows) == len(valid) else valid_rows
@@ -153,12 +153,12 @@ def plan_voxels(cells: Tensor, batch: Tensor, valid: Tensor) -> VoxelPlan:
 
 
 def warn_if_sparse(plan: VoxelPlan, scenes: int, module: str) -> None:
-    """Says in the log, once per module and process, that a scene's voxels hold hardly more than one point each.
+    """Logs a warning, once per module and process, if a scene's voxels have hardly more than one point each.
 
     Args:
         plan: the voxels of B scenes.
         scenes: B.
-        module: whose options to name, ``coarse`` or ``fine``.
+        module: module whose options are named, ``coarse`` or ``fine``.
     """
     if module in _warned_of_sparse or not len(plan):
         return
@@ -179,7 +179,7 @@ class _WeightedMean(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, values: Tensor, weights: Tensor, plan: VoxelPlan) -> Tensor:
-        """``[M, C]`` means of ``values [N, C]`` in each voxel, weighted by ``weights [N]``."""
+        """Returns the means ``[M, C]`` of ``values [N, C]`` in each voxel, weighted by ``weights [N]``."""
         dtype = torch.promote_types(values.dtype, torch.float32)
         ordered = weights.to(dtype)[plan.order]
         total = torch.segment_reduce(ordered, "sum", lengths=plan.counts, unsafe=True)
@@ -191,7 +191,7 @@ class _WeightedMean(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, Tensor | None, None]:  # pyright: ignore
-        """Gradients of the values and of the weights."""
+        """Returns the gradients of the values and the weights."""
         (grad,) = grad_outputs
         values, weights, total, mean = ctx.saved_tensors
         plan: VoxelPlan = ctx.plan
@@ -209,23 +209,23 @@ class _WeightedMean(torch.autograd.Function):
 
 
 def pool_mean(values: Tensor, weights: Tensor, plan: VoxelPlan) -> Tensor:
-    """Confidence-weighted mean over every voxel (paper, eqn voxelfeature, first line).
+    """Returns the confidence-weighted mean of every voxel (paper, eqn voxelfeature, first line).
 
     Args:
-        values: ``[N, C]``; points that the plan left out must be finite too.
+        values: ``[N, C]``; must be finite, also for points in no voxel.
         weights: ``[N]`` confidence > 0, finite.
         plan: the voxels.
 
     Returns:
         ``[M, C]``, float32 or better, differentiable in values and weights.
     """
-    if not len(plan):  # nothing to pool; the sum keeps the autograd graph
+    if not len(plan):  # nothing to pool; the product keeps the autograd graph
         return values[:0].to(torch.promote_types(values.dtype, torch.float32)) * weights[:0, None]
     return _WeightedMean.apply(values, weights, plan)  # pyright: ignore[reportReturnType]
 
 
 def pool_mean_of_chunks(chunks: Iterable[Tensor], weights: Tensor, plan: VoxelPlan) -> Tensor:
-    """:func:`pool_mean`, without gradient, of consecutive chunks of rows, so that nobody holds all values."""
+    """Computes :func:`pool_mean` without gradient from consecutive chunks of rows, which bounds the memory."""
     dtype = torch.promote_types(weights.dtype, torch.float32)
     ordered = weights.to(dtype)[plan.order]
     voxel = plan.voxel_of[plan.order]
@@ -244,7 +244,7 @@ def pool_mean_of_chunks(chunks: Iterable[Tensor], weights: Tensor, plan: VoxelPl
 
 
 def pool_min(values: Tensor, plan: VoxelPlan) -> Tensor:
-    """Smallest value ``[M]`` of the points' ``[N]`` in every voxel (paper, eqn voxelfeature, second line)."""
+    """Returns the minimum ``[M]`` of the points' ``[N]`` values in every voxel (paper, eqn voxelfeature, line 2)."""
     ordered = values[plan.order]
     return torch.segment_reduce(ordered, "min", lengths=plan.counts, unsafe=True) if len(plan) else ordered
 
@@ -252,13 +252,13 @@ def pool_min(values: Tensor, plan: VoxelPlan) -> Tensor:
 def scene_voxel_size(
     geometry: Geometry, voxel_size: float, min_footprint: float, coarsen: Tensor | None = None
 ) -> Tensor:
-    """Edge length of a scene's voxels: the configured one, but never below a number of pixels at the median depth.
+    """Returns each scene's voxel edge length: the configured one, but at least some pixels at the median depth.
 
     Args:
         geometry: depth and cameras in scene units.
         voxel_size: edge length in scene units.
-        min_footprint: smallest edge in pixels, ``min_footprint * median(depth) / focal``; 0 switches it off.
-        coarsen: ``[B]`` factors of the smallest edge; None: 1.
+        min_footprint: smallest edge in pixels, ``min_footprint * median(depth) / focal`` in scene units; 0 disables it.
+        coarsen: ``[B]`` factors on the smallest edge; None: 1.
 
     Returns:
         ``[B]`` float32, detached.

@@ -14,16 +14,16 @@ from torch.nn import functional as F
 from vg2gt.kernels.cell_search import nearest_by_cells
 from vg2gt.kernels.threads import compilable, parallel_for
 
-QUERIES_AT_ONCE = 256  # by one thread
+QUERIES_AT_ONCE = 256  # per thread
 
 
 def nearest_neighbors(queries: Tensor, points: Tensor, neighbors: int) -> Tensor:
-    """Indices of the nearest points, nearest first; exact.
+    """Returns the indices of the nearest points, nearest first; exact.
 
     Args:
         queries: ``[N, 3]``.
         points: ``[M, 3]``, M >= 1.
-        neighbors: how many; at most M are found.
+        neighbors: number of neighbours; at most M are returned.
 
     Returns:
         ``[N, min(neighbors, M)]`` int64.
@@ -37,18 +37,20 @@ def nearest_neighbors(queries: Tensor, points: Tensor, neighbors: int) -> Tensor
 def nearest_in_scenes(
     queries: Tensor, query_batch: Tensor, points: Tensor, point_batch: Tensor, neighbors: int, scenes: int
 ) -> tuple[Tensor, Tensor]:
-    """Nearest points of a query's own scene, nearest first; exact: k-d trees on the CPU, sorted cells elsewhere.
+    """Finds the nearest points in each query's scene, nearest first; exact.
+
+    Uses k-d trees on the CPU and sorted cells elsewhere.
 
     Args:
         queries: ``[N, 3]``.
         query_batch: ``[N]`` scene index, sorted.
         points: ``[M, 3]``.
         point_batch: ``[M]`` scene index, sorted; every scene with queries has at least one point.
-        neighbors: k.
+        neighbors: number of neighbours k.
         scenes: B.
 
     Returns:
-        Rows of ``points`` ``[N, k]`` int64 and whether there are so many ``[N, k]`` bool; row 0 where not.
+        Rows of ``points`` ``[N, k]`` int64, and ``[N, k]`` bool: false, with row 0, where the scene has too few points.
     """
     queries, points = queries.detach(), points.detach()
     if not compilable(queries, points):
@@ -80,14 +82,14 @@ def _by_tree(queries: NDArray, tree: KDTree, count: int) -> Tensor:
 def interpolation_weights(
     queries: Tensor, query_batch: Tensor, points: Tensor, point_batch: Tensor, neighbors: int, scenes: int
 ) -> tuple[Tensor, Tensor]:
-    """Neighbours within each scene and their weights ``1 / (d^2 + 1e-6)``, normalised to sum 1 (paper: 16 nearest).
+    """Returns neighbours in each scene and weights ``1 / (d^2 + 1e-6)``, normalised to sum 1 (paper: 16 nearest).
 
     Args:
         queries: ``[N, 3]`` in voxel units, the unit of d.
         query_batch: ``[N]`` scene index, sorted.
         points: ``[M, 3]`` in voxel units.
         point_batch: ``[M]`` scene index, sorted; every scene with queries has at least one point.
-        neighbors: how many per query; a scene with fewer points uses them all.
+        neighbors: number per query; a scene with fewer points uses all of them.
         scenes: B.
 
     Returns:
@@ -101,5 +103,5 @@ def interpolation_weights(
 
 
 def interpolate(features: Tensor, index: Tensor, weights: Tensor) -> Tensor:
-    """Weighted sums of neighbours' features: ``[M, C]`` with ``[N, k]`` index and weights gives ``[N, C]``."""
+    """Returns the weighted sums ``[N, C]`` of neighbours' features ``[M, C]``; index and weights are ``[N, k]``."""
     return F.embedding_bag(index, features, mode="sum", per_sample_weights=weights)

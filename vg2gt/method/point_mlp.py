@@ -1,4 +1,4 @@
-"""PointMLP over windows of serialised voxels, linear in their number (paper, eqn pointmlp)."""
+"""PointMLP over windows of serialised voxels, linear in the number of voxels (paper, eqn pointmlp)."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ class ResidualPointBlock(nn.Module):
 class GeometricStage(nn.Module):
     """One stage: geometric affine, residual MLP, max over the window, residual MLP, residual update.
 
-    The affine ``alpha (x - m) / s + beta`` of features and positions, m a window's mean and s one standard deviation a
-    scene, enters a linear layer together with the features themselves, ``W1 [affine] + W2 x``. Nothing lies between, so
-    the layer is applied as ``(W1 alpha / s + W2) (x - m)`` and ``W2 m``, the latter once a window.
+    The affine ``alpha (x - m) / s + beta`` of features and positions (m is a window's mean, s one standard deviation
+    per scene) enters a linear layer together with the features themselves: ``W1 [affine] + W2 x``. Both are linear, so
+    they are applied as ``(W1 alpha / s + W2) (x - m)`` plus constants per window, such as ``W2 m``.
 
     Args:
         channels: feature width C.
@@ -57,13 +57,14 @@ class GeometricStage(nn.Module):
         updates = []
         for group in windows.groups:
             rows = group.rows.flatten()
-            sizes = (*group.counts[:-1], len(group.rows) - sum(group.counts[:-1]))  # the last with what nobody owns
+            # windows per scene; the last scene includes those that own no voxels
+            sizes = (*group.counts[:-1], len(group.rows) - sum(group.counts[:-1]))
             local = features.index_select(0, rows).unflatten(0, group.rows.shape).split(sizes)
             place = positions.index_select(0, rows).unflatten(0, group.rows.shape).split(sizes)
             first = [self._first_layer(*scene) for scene in zip(local, place, group.counts, strict=True)]
             hidden = self.before(first[0] if len(first) == 1 else torch.cat(first))
             context = self.after(window_max(hidden))
-            # W_o [h | g], the window's half computed once a window
+            # W_o [h | g], where g is the same for all voxels of a window
             weight_hidden, weight_context = self.out.weight.chunk(2, 1)
             update = linear_rows(hidden, weight_hidden, self.out.bias) + F.linear(context, weight_context)[:, None]
             updates.append(update.flatten(0, 1))
@@ -71,7 +72,7 @@ class GeometricStage(nn.Module):
         return torch.addcmul(features, self.gamma, update.index_select(0, windows.owner))
 
     def _first_layer(self, local: Tensor, place: Tensor, windows: int) -> Tensor:
-        """Affine and linear layer of a scene's windows ``[W, K, C]`` and ``[W, K, 3]``, of which ``windows`` count."""
+        """Affine and linear layer of a scene's windows ``[W, K, C]`` and ``[W, K, 3]``; ``windows`` own voxels."""
         channels = local.shape[-1]
         of_affine, of_place, of_local = self.inner.weight.split((channels, 3, channels), 1)
         mean = local.mean(1)  # [W, C]
@@ -85,23 +86,23 @@ class GeometricStage(nn.Module):
 
 
 def window_max(x: Tensor) -> Tensor:
-    """``x.amax(1)`` of ``[W, K, C]``; its gradient, shared among equal maxima as well, in a quarter of the time."""
+    """Returns ``x.amax(1)`` of ``[W, K, C]``; equal maxima share the gradient, in a quarter of torch's time."""
     return _WindowMax.apply(x)  # pyright: ignore[reportReturnType]
 
 
 class _WindowMax(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, x: Tensor) -> Tensor:
-        """``[W, C]``."""
+        """Returns ``[W, C]``."""
         largest = x.amax(1)
         ctx.save_for_backward(x, largest)
         return largest
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """``[W, K, C]``."""
+        """Returns ``[W, K, C]``."""
         x, largest = ctx.saved_tensors
-        # Written as 0 and 1 of x's type: torch's own way over booleans converts them twice.
+        # 0 and 1 directly in x's dtype: torch's own implementation converts booleans twice
         share = torch.eq(x, largest[:, None], out=torch.empty_like(x))
         return share.mul_((grad_outputs[0] / share.sum(1))[:, None])
 
@@ -115,15 +116,15 @@ def _root_mean_square(deviation: Tensor, windows: int) -> Tensor:
 class PointMLP(nn.Module):
     """Refines voxel features with their neighbours along space-filling curves.
 
-    The original's farthest-point sampling and nearest neighbours are quadratic; here a local group is a window of
-    consecutive voxels of a curve, another curve every stage, odd stages shifted by half a window.
+    The farthest-point sampling and nearest neighbours of the original are quadratic. Here, a local group is a window of
+    consecutive voxels along a curve. Stages alternate between curves, and odd stages shift by half a window.
 
     Args:
         in_channels: channels of the pooled features.
         channels: width C.
         stages: number of stages.
-        window: voxels a local group.
-        checkpoint: recomputes each stage in the backward pass to save memory.
+        window: voxels per local group.
+        checkpoint: whether to recompute each stage in the backward pass to save memory.
     """
 
     def __init__(
@@ -143,7 +144,7 @@ class PointMLP(nn.Module):
             features: ``[M, in_channels]``.
             grid: ``[M, 3]`` int64 cells.
             batch: ``[M]`` scene index, sorted.
-            voxel_size: ``[B]`` edge lengths, named in errors.
+            voxel_size: ``[B]`` edge lengths, for error messages.
 
         Returns:
             ``[M, channels]``.
@@ -153,7 +154,7 @@ class PointMLP(nn.Module):
         """
         features = self.embed(features)
         if not len(features):
-            # The stages have nothing to do, but every rank's parameters must be in the graph: the others would wait.
+            # no voxels, but all parameters must be in the graph: other ranks would wait for their gradients
             return features + 0 * sum(parameter.sum() for parameter in self.stages.parameters())
         local = relative_grid(grid, batch, len(voxel_size))
         positions = local.float()
@@ -168,7 +169,7 @@ class PointMLP(nn.Module):
         orders = STAGE_ORDERS[: len(self.stages)]
         counts = scene_counts(batch, len(voxel_size)).tolist()
         curves = [torch.argsort(key) for key in serial_keys(grid, batch, voxel_size, orders)]
-        few_sizes = has_onednn(grid.device)  # which compiles a convolution for every new size
+        few_sizes = has_onednn(grid.device)  # oneDNN compiles a convolution for every new size
         return [
             make_windows(curves[i % len(curves)], counts, self.window, self.window // 2 * (i % 2), few_sizes)
             for i in range(len(self.stages))

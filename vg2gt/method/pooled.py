@@ -1,4 +1,4 @@
-"""What was pooled in voxels, such that parts of a scene merge: windows of views in a long capture."""
+"""Voxel statistics that can be merged over parts of a scene, such as windows of views in a long capture."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 from vg2gt.method.grid import VoxelPlan, mixed_radix_keys
 from vg2gt.types import TensorRecord
 
-MOMENTS = (9, 9, 3, 1)  # columns: spread, covariance with colour, camera centre, side of a pixel
+MOMENTS = (9, 9, 3, 1)  # numbers of columns: spread, covariance with colour, camera centre, side of a pixel
 
 
 @dataclass(frozen=True)
@@ -20,12 +20,12 @@ class PooledVoxels(TensorRecord):
 
     Attributes:
         grid: ``[M, 3]`` int64 cells.
-        count: ``[M]`` int64 points.
+        count: ``[M]`` int64 number of points.
         weight: ``[M]`` float64 sum of the points' confidences.
         confidence: ``[M]`` the smallest of them.
         features: ``[M, C]`` mean feature.
-        means: ``[M, 6]`` mean place in the cell, from its centre in cells, and mean colour.
-        moments: ``[M, 22]`` second moments about these means (:data:`MOMENTS`); None where nobody asked.
+        means: ``[M, 6]`` mean position relative to the cell centre, in cells, and mean colour.
+        moments: ``[M, 22]`` second moments about these means (:data:`MOMENTS`); None unless requested.
     """
 
     grid: Tensor
@@ -40,23 +40,23 @@ class PooledVoxels(TensorRecord):
         return len(self.grid)
 
     def rows(self, rows: Tensor | slice) -> PooledVoxels:
-        """Some of the voxels; ``rows`` must keep their order."""
+        """Returns some of the voxels; ``rows`` must keep their order."""
         return self.map(lambda tensor: tensor[rows])
 
     def plan(self) -> VoxelPlan:
-        """The voxels without the points that lie in them."""
+        """Returns the voxels as a plan without points."""
         none = self.grid.new_zeros(0)
         return VoxelPlan(self.grid, torch.zeros_like(self.count), none, none, self.count, none)
 
 
 def merge(parts: Sequence[PooledVoxels]) -> PooledVoxels:
-    """The voxels of all parts: as if the points of all had been pooled at once, up to rounding.
+    """Merges the voxels of all parts; up to rounding, as if all points had been pooled at once.
 
-    Sums are taken in float64 in the order of the parts, so the same parts in the same order give the same bits, and a
-    voxel that only one part has stays as it is.
+    Sums are in float64 and in the order of the parts, so the same parts in the same order give the same bits. A voxel
+    of a single part is unchanged.
 
     Args:
-        parts: at least one; all with the same features, with or without moments.
+        parts: at least one; all with the same feature width, and either all or none with moments.
     """
     joined = concatenate(parts)
     keys, order = torch.sort(mixed_radix_keys(joined.grid, torch.zeros_like(joined.count))[0], stable=True)
@@ -75,7 +75,7 @@ def merge(parts: Sequence[PooledVoxels]) -> PooledVoxels:
 
     means = mean(joined.means)
     moments = joined.moments
-    if moments is not None:  # about the merged means: raw moments less products of means
+    if moments is not None:  # about the merged means: raw moments minus products of means
         raw = torch.cat((moments[:, :18].double() + _products(joined.means.double()), moments[:, 18:].double()), 1)
         raw = mean(raw)
         moments = torch.cat((raw[:, :18] - _products(means), raw[:, 18:]), 1).to(moments.dtype)
@@ -97,12 +97,12 @@ def merge(parts: Sequence[PooledVoxels]) -> PooledVoxels:
 
 
 def concatenate(parts: Sequence[PooledVoxels]) -> PooledVoxels:
-    """The voxels of all parts, one after the other."""
+    """Concatenates the voxels of all parts."""
     columns = ([getattr(part, each.name) for part in parts] for each in fields(PooledVoxels))
     return PooledVoxels(*(None if values[0] is None else torch.cat(values) for values in columns))  # pyright: ignore
 
 
 def _products(means: Tensor) -> Tensor:
-    """``[M, 18]``: place times place, place times colour."""
+    """Returns ``[M, 18]``: position times position, and position times colour."""
     place, color = means.split(3, -1)
     return torch.cat([(place[:, :, None] * other[:, None]).flatten(1) for other in (place, color)], -1)

@@ -1,6 +1,6 @@
 """Point Transformer V3 in plain torch (Wu et al., CVPR 2024), for packed voxels.
 
-Parameter names are those of the official implementation, so that its state dicts load.
+Parameter names match the official implementation, so that its state dicts load.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ Norm = Literal["layer", "group", "batch"]
 
 
 class Level:
-    """The voxels of one resolution: their curves, windows and neighbours, computed once each. No features.
+    """Voxels of one resolution without features: their curves, windows and neighbours, each computed once.
 
     Args:
         grid: ``[M, 3]`` int64 cells.
         batch: ``[M]`` scene index, sorted.
-        counts: voxels of each scene.
-        keys: sort keys of every order.
-        generator: shuffles the orders, so that blocks meet them in random sequence; None keeps them.
-        parent_of: ``[M]`` voxel of the next level that each belongs to, its own at the last one.
-        order: ``[M]`` voxels by parent; None: they are in that order.
+        counts: number of voxels per scene.
+        keys: sort keys of every serialisation order.
+        generator: shuffles the orders, so that blocks use them in random sequence; None keeps the sequence.
+        parent_of: ``[M]`` parent of each voxel in the next level; at the last level, the voxel itself.
+        order: ``[M]`` voxels sorted by parent; None if they are already sorted.
     """
 
     def __init__(
@@ -50,12 +50,12 @@ class Level:
         self.order = order
         count = len(keys)
         self.sequence = torch.randperm(count, generator=generator).tolist() if generator else list(range(count))
-        self._cuts: dict[int, Windows] = {}  # of places along any curve
+        self._cuts: dict[int, Windows] = {}  # by length: windows of positions along any curve
         self._windows: dict[tuple[int, int], Windows] = {}
         self.pairs: dict[int, Pairs | NeighborTable] = {}
 
     def windows(self, order: int, length: int) -> Windows:
-        """Attention windows along the curve that block number ``order`` uses."""
+        """Returns the attention windows along the curve of block number ``order``."""
         which = self.sequence[order % len(self.sequence)]
         if (which, length) not in self._windows:
             if length not in self._cuts:
@@ -74,29 +74,29 @@ def make_levels(
     kernels: Sequence[Sequence[int]],
     generator: torch.Generator | None,
 ) -> list[Level]:
-    """All resolutions of a network; the host waits twice for a GPU, whatever their number.
+    """Builds all levels of a network; synchronises with a GPU twice, whatever their number.
 
     Args:
         grid: ``[M, 3]`` int64 cells relative to their scene's smallest.
         batch: ``[M]`` scene index, sorted.
         scenes: B.
-        keys: sort keys of every order, of the finest level.
+        keys: sort keys of every order at the finest level.
         extent: cells along each axis.
-        kernels: edge lengths of the kernels that convolve at each level, finest first.
+        kernels: kernel edge lengths of the convolutions at each level, finest first.
         generator: shuffles every level's orders.
     """
     depth, device = len(kernels), grid.device
     curve, order = torch.sort(keys[0])
-    codes = curve >> 3 * torch.arange(depth, device=device)[:, None]  # [S, M], of the cells that hold the voxels
+    codes = curve >> 3 * torch.arange(depth, device=device)[:, None]  # [S, M] cell of every voxel at S levels
     begins = F.pad(codes[:, 1:] != codes[:, :-1], (1, 0), value=True)
-    before = F.pad(begins.cumsum(1), (1, 0))  # [S, M + 1] cells before each voxel
+    before = F.pad(begins.cumsum(1), (1, 0))  # [S, M + 1] number of cells before each voxel
     bounds = torch.searchsorted(batch, torch.arange(scenes + 1, device=device))
     counts: list[list[int]] = before[:, bounds].diff().tolist()
-    in_cell = before[:, 1:] - 1  # [S, M] cell of every voxel along the curve
+    in_cell = before[:, 1:] - 1  # [S, M] row of every voxel's cell
     levels = []
     for s in range(depth):
         below = in_cell[min(s + 1, depth - 1)]
-        if s:  # one voxel of every cell; cells are in the order of the curve
+        if s:  # one voxel per cell; cells are sorted along the curve
             place = torch.searchsorted(in_cell[s], torch.arange(sum(counts[s]), device=device))
             first = order[place]
             rows = (grid[first] >> s, batch[first], counts[s], [key[first] >> 3 * s for key in keys])
@@ -119,7 +119,7 @@ class SerializedAttention(nn.Module):
         channels: width.
         heads: number of heads.
         window: voxels per window.
-        order: number of the curve in the level's sequence.
+        order: index of the curve in the level's sequence.
     """
 
     def __init__(self, channels: int, heads: int, window: int, order: int) -> None:
@@ -146,7 +146,7 @@ class SerializedAttention(nn.Module):
 
 
 class MLP(nn.Module):
-    """Two linear layers with a GELU between."""
+    """Two linear layers with a GELU in between."""
 
     def __init__(self, channels: int, ratio: float) -> None:
         super().__init__()
@@ -165,8 +165,8 @@ class PTv3Block(nn.Module):
         channels: width.
         heads: attention heads.
         window: voxels per attention window.
-        order: number of the curve.
-        mlp_ratio: hidden width of the MLP over ``channels``.
+        order: index of the curve.
+        mlp_ratio: hidden width of the MLP relative to ``channels``.
         drop_path: probability that a voxel skips a residual branch while training.
     """
 
@@ -182,7 +182,7 @@ class PTv3Block(nn.Module):
         self.mlp = nn.ModuleList([MLP(channels, mlp_ratio)])
 
     def forward(self, features: Tensor, level: Level, conv_input: Tensor | None = None) -> Tensor:
-        """Maps ``[M, C]`` to ``[M, C]``; ``conv_input`` replaces what the xCPE sees (legacy)."""
+        """Maps ``[M, C]`` to ``[M, C]``; ``conv_input`` replaces the input of the xCPE (legacy)."""
         conv, linear, norm = self.cpe
         x = conv(features if conv_input is None else conv_input, level.pairs[3])
         features = features + norm(linear(x))
@@ -205,7 +205,7 @@ class GridPool(nn.Module):
         self.norm = nn.ModuleList([_make_norm(norm, out_channels)])
 
     def forward(self, features: Tensor, level: Level, coarse: Level) -> Tensor:
-        """Returns pooled features ``[M', C']`` of the next level."""
+        """Returns the features ``[M', C']`` of the next level."""
         projected = self.proj(features).to(features.dtype)  # [M, C']
         parent_of = level.parent_of
         if level.order is not None:
@@ -216,7 +216,7 @@ class GridPool(nn.Module):
 
 
 class GridUnpool(nn.Module):
-    """Brings parents' features back to their voxels and adds the skip connection, both projected."""
+    """Copies parents' features to their voxels and adds the skip connection, both projected."""
 
     def __init__(self, in_channels: int, skip_channels: int, out_channels: int, norm: Norm) -> None:
         super().__init__()
@@ -233,27 +233,27 @@ class GridUnpool(nn.Module):
 class PTv3(nn.Module):
     """U-shaped transformer over voxels (paper, eqn ptvzengqiang).
 
-    The defaults of widths, depths and heads are AMB3R's, as the paper uses them.
+    The default widths, depths and heads are those of AMB3R, which the paper uses.
 
     Args:
         in_channels: width of the input features.
-        enc_channels: widths of the encoder's stages, finest first; each next stage halves the resolution.
-        enc_depths: blocks of the encoder's stages.
-        enc_heads: attention heads of the encoder's stages.
-        dec_channels: widths of the decoder's stages, finest first, one fewer than the encoder's.
-        dec_depths: blocks of the decoder's stages.
-        dec_heads: attention heads of the decoder's stages.
+        enc_channels: widths of the encoder stages, finest first; each stage halves the resolution of the previous one.
+        enc_depths: number of blocks in the encoder stages.
+        enc_heads: attention heads of the encoder stages.
+        dec_channels: widths of the decoder stages, finest first, one fewer than the encoder's.
+        dec_depths: number of blocks in the decoder stages.
+        dec_heads: attention heads of the decoder stages.
         window: voxels per attention window.
         stem_kernel: edge length of the first convolution.
-        mlp_ratio: hidden width of the MLPs over their width.
+        mlp_ratio: hidden width of the MLPs relative to their input.
         drop_path: largest probability of skipping a residual branch; it grows linearly with depth.
         norm: normalisation in stem, pooling and unpooling; blocks always use layer normalisation.
         orders: serialisation orders; successive blocks use successive ones.
-        legacy: feeds the convolution of each decoder stage's first block with the skip connection only, as the
-            official code does; needed for results equal to the official ones.
+        legacy: passes only the skip connection to the convolution of each decoder stage's first block, as the official
+            code does; needed to reproduce its results.
 
     Attributes:
-        out_channels: width of the result, ``dec_channels[0]``.
+        out_channels: width of the result: ``dec_channels[0]``, or ``enc_channels[0]`` with a single stage.
     """
 
     def __init__(
@@ -327,8 +327,8 @@ class PTv3(nn.Module):
             features: ``[M, in_channels]``, M >= 1.
             grid: ``[M, 3]`` int64 distinct cells.
             batch: ``[M]`` scene index, sorted.
-            voxel_size: ``[B]`` edge lengths, named in errors.
-            generator: while training, shuffles the sequence of orders at every resolution (on the CPU).
+            voxel_size: ``[B]`` edge lengths, for error messages.
+            generator: CPU generator that shuffles the sequence of orders at every level while training.
 
         Returns:
             ``[M, out_channels]``.
@@ -337,16 +337,18 @@ class PTv3(nn.Module):
             ValueError: if a scene spans too many voxels to be serialised.
         """
         generator = generator if self.training else None
-        # S of eqn ptvzengqiang; S^-1 is Windows.owner, with which attention returns to the voxels' own order.
+        # S of eqn ptvzengqiang; S^-1 is Windows.owner, which restores the voxels' order after attention
         local = relative_grid(grid, batch, len(voxel_size))
         extent: list[int] = (local.amax(0) + 1).tolist()
-        # One bit of the keys goes at every pooling.
+        # every pooling removes one bit per axis from the keys
         bits = max(1, len(self.enc) - 1)
         keys = serial_keys(local, batch, voxel_size, self.orders, bits, max(extent))
         kernels = [{self.stem_kernel, 3}, *[{3}] * (len(self.enc) - 1)]
         levels = make_levels(local, batch, len(voxel_size), keys, extent, [[*sizes] for sizes in kernels], generator)
+        # stem: [M, in_channels] to [M, enc_channels[0]]
         stem, level = self.embedding["stem"], levels[0]
         features = F.gelu(stem["norm"](stem["conv"](features, level.pairs[self.stem_kernel])))  # pyright: ignore
+        # encoder: pool from level to level and keep the skip connections
         skips = []
         for stage, level in zip(self.enc.values(), levels, strict=True):
             for name, module in stage.items():  # pyright: ignore
@@ -355,6 +357,7 @@ class PTv3(nn.Module):
                     features = module(features, skips[-1][1], level)
                 else:
                     features = module(features, level)
+        # decoder: unpool back to the finest level, [M, out_channels]
         for stage in self.dec.values():
             skip, level = skips.pop()
             features, skip = stage["up"](features, skip, level.parent_of)  # pyright: ignore
@@ -366,7 +369,7 @@ class PTv3(nn.Module):
 
 
 def _ramp(largest: float, depths: Sequence[int]) -> list[list[float]]:
-    """Rates from 0 to ``largest`` over all blocks, split by stage."""
+    """Returns rates from 0 to ``largest`` over all blocks, split by stage."""
     step = largest / max(1, sum(depths) - 1)
     starts = itertools.accumulate(depths, initial=0)
     return [[step * (start + i) for i in range(depth)] for start, depth in zip(starts, depths, strict=False)]

@@ -13,14 +13,14 @@ from vg2gt.kernels.curve_codes import hilbert_codes, z_codes
 
 Order = Literal["z", "z-trans", "hilbert", "hilbert-trans"]
 ORDERS: tuple[Order, ...] = get_args(Order)
-MAX_BITS = 21  # a code takes three times as many bits of an int64
+MAX_BITS = 21  # per axis; a code has three times as many bits of an int64
 
 
 def serial_codes(grid: Tensor, bits: int, order: Order) -> Tensor:
-    """Codes ``[M]`` of cells ``[M, 3]`` in one of the orders; the transposed ones exchange x and y.
+    """Returns the codes ``[M]`` of cells ``[M, 3]`` in one of the orders; the transposed orders exchange x and y.
 
-    Unused leading bits turn a Hilbert curve by a third of a full turn each; rounding their number up to a multiple of
-    three makes a cell's code independent of ``bits``, and so of the other scenes in a batch.
+    Each unused leading bit rotates a Hilbert curve by a third of a full turn. Rounding the number of bits up to a
+    multiple of three makes a cell's code independent of ``bits``, and so of the other scenes in a batch.
     """
     if order.endswith("-trans"):
         x, y, z = grid.unbind(-1)
@@ -29,7 +29,7 @@ def serial_codes(grid: Tensor, bits: int, order: Order) -> Tensor:
 
 
 def relative_grid(grid: Tensor, batch: Tensor, scenes: int) -> Tensor:
-    """Cells ``[M, 3]`` relative to their own scene's smallest, so that a code depends on no other scene."""
+    """Returns cells ``[M, 3]`` relative to their own scene's smallest, so that codes depend on no other scene."""
     low = grid.new_zeros(scenes, 3)
     low.scatter_reduce_(0, batch[:, None].expand_as(grid), grid, "amin", include_self=False)
     return grid - low[batch]
@@ -43,18 +43,18 @@ def serial_keys(
     min_bits: int = 1,
     extent: int | None = None,
 ) -> list[Tensor]:
-    """Sort keys ``scene << 3 bits | code``, one ``[M]`` tensor per order.
+    """Returns sort keys ``scene << (3 * bits) | code``, one ``[M]`` tensor per order.
 
     Args:
         grid: ``[M, 3]`` cells relative to their scene's smallest.
         batch: ``[M]`` scene index.
-        voxel_size: ``[B]`` edge lengths, named in the error.
-        orders: the wanted orders.
-        min_bits: bits per axis at least, so that keys can be shifted to parents this many times.
-        extent: cells along the longest axis where that is known; to find it out, the host waits for a GPU.
+        voxel_size: ``[B]`` edge lengths, for the error message.
+        orders: serialisation orders.
+        min_bits: smallest number of bits per axis, so that keys can be shifted to parents this many times.
+        extent: cells along the longest axis; None computes it, which synchronises with a GPU.
 
     Raises:
-        ValueError: if code and scene index do not fit into 63 bits, or an axis not into 21.
+        ValueError: if code and scene index do not fit into 63 bits, or an axis needs more than 21.
     """
     extent, scenes = int(grid.max()) + 1 if extent is None else extent, len(voxel_size)
     bits = max(min_bits, (extent - 1).bit_length())
@@ -70,11 +70,11 @@ def serial_keys(
 
 @dataclass(frozen=True)
 class WindowGroup:
-    """Windows of one length. Scenes shorter than the wanted length make a group of their own.
+    """Windows of one length. Scenes with fewer voxels than the requested length are in groups of their own.
 
     Attributes:
-        rows: ``[W, K]`` voxels of every window, scene after scene; windows at the end that nobody owns hold one voxel.
-        counts: windows of each scene that has some here, without those.
+        rows: ``[W, K]`` voxels of every window, scene after scene. Windows at the end that own no voxels repeat one.
+        counts: number of windows per scene of this group, without those that own no voxels.
     """
 
     rows: Tensor
@@ -83,21 +83,21 @@ class WindowGroup:
 
 @dataclass(frozen=True)
 class Windows:
-    """Windows of consecutive voxels along a curve, never across scenes; every voxel is owned by exactly one.
+    """Windows of consecutive voxels along a curve, never across scenes; every voxel is owned by exactly one window.
 
-    A window that would stick out at an end of its scene slides inwards and overlaps its neighbour, so no padding and
-    no mask is ever needed; of the overlap it owns nothing.
+    A window that would extend beyond its scene is shifted inwards and overlaps its neighbour, so that neither padding
+    nor a mask is needed. The neighbour owns the voxels in the overlap.
 
     Attributes:
         groups: the windows, grouped by length.
-        owner: ``[M]`` for every voxel its place in the concatenation of all groups' ``rows.flatten()``.
+        owner: ``[M]`` position of every voxel in the concatenation of all groups' ``rows.flatten()``.
     """
 
     groups: tuple[WindowGroup, ...]
     owner: Tensor
 
     def along(self, order: Tensor) -> Windows:
-        """Windows of voxels ``order [M]`` along a curve, where these are of places along it."""
+        """Converts windows of curve positions to windows of the voxels ``order [M]`` along that curve."""
         groups = tuple(WindowGroup(order[group.rows], group.counts) for group in self.groups)
         return Windows(groups, torch.empty_like(order).scatter_(0, order, self.owner))
 
@@ -107,10 +107,11 @@ def make_windows(order: Tensor, counts: list[int], length: int, shift: int = 0, 
 
     Args:
         order: ``[M]`` voxels along the curve, scene after scene.
-        counts: voxels of each scene.
-        length: voxels per window; a scene with fewer makes one window of what it has.
-        shift: the first window starts this many voxels before the scene does, 0 <= shift < length.
-        few_sizes: adds windows that nobody owns, at most an eighth, so that groups have few different sizes.
+        counts: number of voxels per scene.
+        length: voxels per window; a scene with fewer voxels is a single window.
+        shift: the first window starts this many voxels before the scene, 0 <= shift < length.
+        few_sizes: whether to add windows that own no voxels, at most an eighth, so that groups have few different
+            sizes.
     """
     by_length: dict[int, list[tuple[int, int]]] = {}
     begin = 0

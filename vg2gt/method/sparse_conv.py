@@ -1,7 +1,6 @@
-"""Submanifold sparse convolution in plain torch: outputs exist exactly where inputs do; deterministic.
+"""Submanifold sparse convolution in plain torch: outputs exist only at the input cells; deterministic.
 
-On a CPU one kernel offset is gathered, multiplied and added after the other; elsewhere as many as memory allows go
-together.
+On a CPU, kernel offsets are processed one at a time; on other devices, as many at once as memory allows.
 """
 
 from __future__ import annotations
@@ -18,14 +17,14 @@ from vg2gt.geometry.precision import autocast_dtype
 from vg2gt.method.grid import mixed_radix_keys
 
 Pairs = list[tuple[Tensor, Tensor]]
-CHUNK = 1 << 22  # cells times offsets looked up at once
-HELD = 1 << 28  # numbers of gathered rows and products held at once, off the CPU
+CHUNK = 1 << 22  # cells times offsets per lookup
+HELD = 1 << 28  # elements of gathered rows and products held at once, on devices other than the CPU
 
 
 class Cells(NamedTuple):
-    """Cells ``grid [M, 3]`` int64, all distinct, of scenes ``batch [M]``, with an odd edge length of a cubic kernel.
+    """Distinct cells ``grid [M, 3]`` int64 of scenes ``batch [M]``, and the odd edge length of a cubic kernel.
 
-    ``spans`` are those of :func:`vg2gt.method.grid.mixed_radix_keys`, where known.
+    ``spans`` is the argument of :func:`vg2gt.method.grid.mixed_radix_keys`; None if unknown.
     """
 
     grid: Tensor
@@ -36,12 +35,14 @@ class Cells(NamedTuple):
 
 @dataclass(frozen=True)
 class NeighborTable:
-    """Neighbours at all T = k^3 - 1 offsets but the centre's, x slowest; offset T - 1 - t mirrors t.
+    """Neighbours at the T = k^3 - 1 kernel offsets without the centre, x slowest; offset T - 1 - t mirrors t.
+
+    P is the largest number of neighbours at one offset.
 
     Attributes:
-        sources: ``[T, P + 1]`` rows of the neighbours of those voxels that have one; else M, as in the last column.
-        targets: ``[T, P + 1]`` rows of these voxels; else M.
-        slots: ``[M, T]`` place of a voxel's neighbour in ``sources.flatten()``; where it has none, the last of a row.
+        sources: ``[T, P + 1]`` rows of the neighbours, padded with M; the last column is always padding.
+        targets: ``[T, P + 1]`` rows of the voxels that have these neighbours, padded with M.
+        slots: ``[M, T]`` index of a voxel's neighbour in ``sources.flatten()``; without one, the last of its row.
     """
 
     sources: Tensor
@@ -49,26 +50,26 @@ class NeighborTable:
     slots: Tensor
 
     def parts(self, width: int) -> Iterator[slice]:
-        """Offsets whose rows of ``width`` numbers may be held together."""
+        """Returns slices of offsets whose rows of ``width`` elements may be held together."""
         offsets, rows = self.sources.shape
         some = max(1, HELD // (rows * width))
         return (slice(begin, min(begin + some, offsets)) for begin in range(0, offsets, some))
 
 
 def neighbors(cells: Sequence[Cells]) -> list[Pairs] | list[NeighborTable]:
-    """What convolutions need to know of their cells: pairs on a CPU, tables elsewhere."""
+    """Returns the neighbours in each set of cells: pairs on a CPU, tables on other devices."""
     if one_by_one(cells[0].grid.device):
         return [neighbor_pairs(*each) for each in cells]
     return neighbor_tables(cells)
 
 
 def one_by_one(device: torch.device) -> bool:
-    """Whether offsets are convolved one after the other there."""
+    """Whether kernel offsets are processed one at a time on this device."""
     return device.type == "cpu"
 
 
 def neighbor_tables(cells: Sequence[Cells]) -> list[NeighborTable]:
-    """All neighbours; the host waits once, for the largest numbers of pairs at an offset."""
+    """Returns one table per set of cells; synchronises once, for the largest number of pairs at an offset."""
     found = [_neighbor_rows(*each) for each in cells]
     most = torch.stack([there.sum(1).amax() if there.numel() else there.new_zeros((), dtype=torch.int64)
                         for there in (rows < rows.shape[1] for rows in found)])  # fmt: skip
@@ -76,21 +77,21 @@ def neighbor_tables(cells: Sequence[Cells]) -> list[NeighborTable]:
 
 
 def _neighbor_rows(grid: Tensor, batch: Tensor, kernel_size: int, spans: Sequence[int] | None = None) -> Tensor:
-    """Row ``[T, M]`` of every voxel's neighbour at every offset; M where there is none."""
+    """Returns the row ``[T, M]`` of every voxel's neighbour at every offset; M where there is none."""
     keys, order, moves = _sorted_cells(grid, batch, kernel_size, spans)
     count, half = len(keys), len(moves)
     wanted = keys + moves[:, None]  # [T / 2, M]
     place = torch.searchsorted(keys, wanted).clamp_(max=count - 1)
     before = torch.empty_like(place)
     before[:, order] = torch.where(keys[place] == wanted, order[place], count)
-    # whose neighbour at an offset is j is j's neighbour at the opposite one; the last column is nobody's
+    # if j is the neighbour of i at an offset, i is that of j at the opposite one; the last column takes the misses
     rows = torch.arange(count, device=keys.device).expand(half, -1)
     after = before.new_full((half, count + 1), count).scatter_(1, before, rows)[:, :-1]
     return torch.cat((before, after.flip(0)))
 
 
 def _tabulate(rows: Tensor, most: int) -> NeighborTable:
-    """The table of neighbours ``[T, M]``, of which at most ``most`` are there at an offset."""
+    """Builds the table from neighbour rows ``[T, M]``, with at most ``most`` neighbours per offset."""
     offsets, count = rows.shape
     there = rows < count
     column = torch.where(there, there.cumsum(1) - 1, most)
@@ -102,21 +103,21 @@ def _tabulate(rows: Tensor, most: int) -> NeighborTable:
 
 
 def neighbor_pairs(grid: Tensor, batch: Tensor, kernel_size: int, spans: Sequence[int] | None = None) -> Pairs:
-    """Pairs of occupied cells at each offset of the first half of a cubic kernel; the other half mirrors them.
+    """Returns the pairs of occupied cells at the first half of a cubic kernel's offsets; the other half mirrors them.
 
     Args:
         grid: ``[M, 3]`` int64 distinct cells.
         batch: ``[M]`` scene index.
         kernel_size: odd edge length of the kernel.
-        spans: of :func:`vg2gt.method.grid.mixed_radix_keys`, where known.
+        spans: argument of :func:`vg2gt.method.grid.mixed_radix_keys`; None if unknown.
 
     Returns:
-        For offset number t (x slowest) of the ``kernel_size^3 // 2`` before the centre, the rows ``(i, j)`` with
+        For each of the ``kernel_size^3 // 2`` offsets before the centre (x slowest), the rows ``(i, j)`` with
         ``grid[j] = grid[i] + offset``.
     """
     keys, order, moves = _sorted_cells(grid, batch, kernel_size, spans)
     counts, rows, neighbors = [], [], []
-    # many offsets at a time: how many pairs there are is a shape, for which the host waits
+    # many offsets at a time, as each nonzero() synchronises
     for some in moves.split(max(1, CHUNK // max(1, len(keys)))):
         wanted = keys + some[:, None]
         place = torch.searchsorted(keys, wanted).clamp_(max=len(keys) - 1)
@@ -132,11 +133,11 @@ def neighbor_pairs(grid: Tensor, batch: Tensor, kernel_size: int, spans: Sequenc
 def _sorted_cells(
     grid: Tensor, batch: Tensor, kernel_size: int, spans: Sequence[int] | None
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Sorted keys ``[M]``, row of each, and what the offsets before the kernel's centre add to a key."""
+    """Returns sorted keys ``[M]``, their rows ``[M]``, and the key increments of the offsets before the centre."""
     radius = kernel_size // 2
     keys, steps = mixed_radix_keys(grid, batch, radius, spans)
     keys, order = torch.sort(keys)
-    # made of ranges, as a list would be copied to a GPU while the host waits
+    # built from ranges: copying a list to a GPU would synchronise
     axes = [torch.arange(-radius, radius + 1, device=keys.device) * step for step in steps]
     moves = axes[0][:, None, None] + axes[1][:, None] + axes[2]
     return keys, order, moves.flatten()[: kernel_size**3 // 2]
@@ -147,7 +148,7 @@ class _BatchedConvolution(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, features: Tensor, weight: Tensor, table: NeighborTable) -> Tensor:
-        """``[M, out]`` of ``features [M, in]`` and ``weight [out, k, k, k, in]``, summed over neighbouring voxels."""
+        """Returns ``[M, out]`` for ``features [M, in]`` and ``weight [out, k, k, k, in]``."""
         taps, center = _taps(weight)
         ctx.save_for_backward(features, weight)
         ctx.table = table
@@ -155,7 +156,7 @@ class _BatchedConvolution(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, Tensor, None]:  # pyright: ignore
-        """Gradients of the features and the weight."""
+        """Returns the gradients of the features and the weight."""
         features, weight = ctx.saved_tensors
         table: NeighborTable = ctx.table
         grad = grad_outputs[0].to(features.dtype)
@@ -172,14 +173,14 @@ class _BatchedConvolution(torch.autograd.Function):
 
 
 def _taps(weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Matrices ``[T, in, out]`` of all offsets but the centre's, and that one's."""
+    """Returns the matrices ``[T, in, out]`` of all offsets without the centre, and the centre's ``[in, out]``."""
     taps = weight.flatten(1, 3).permute(1, 2, 0)
     half = len(taps) // 2
     return torch.cat((taps[:half], taps[half + 1 :])), taps[half]
 
 
 def _sum_products(features: Tensor, taps: Tensor, center: Tensor, table: NeighborTable) -> Tensor:
-    """``[M, out]`` in float32 at least: every voxel's own product and those of its neighbours."""
+    """Returns ``[M, out]`` in float32 or better: the sum of every voxel's own product and its neighbours' products."""
     out = (features @ center).to(torch.promote_types(features.dtype, torch.float32))
     padded = F.pad(features, (0, 0, 0, 1))
     for some in table.parts(taps.shape[1] + taps.shape[2]):
@@ -190,11 +191,11 @@ def _sum_products(features: Tensor, taps: Tensor, center: Tensor, table: Neighbo
 
 
 class _SubmanifoldConvolution(torch.autograd.Function):
-    """Gathers, multiplies and adds one kernel offset after the other; the backward pass gathers again."""
+    """Gathers, multiplies and adds one kernel offset at a time; the backward pass gathers again."""
 
     @staticmethod
     def forward(ctx: Any, features: Tensor, weight: Tensor, pairs: Pairs) -> Tensor:
-        """``[M, out]`` of ``features [M, in]`` and ``weight [out, k, k, k, in]``, summed over neighbouring voxels."""
+        """Returns ``[M, out]`` for ``features [M, in]`` and ``weight [out, k, k, k, in]``."""
         taps = weight.flatten(1, 3).unbind(1)  # k^3 times [out, in]
         out = (features @ taps[len(pairs)].t()).to(torch.promote_types(features.dtype, torch.float32))
         for t, (i, j) in enumerate(pairs):
@@ -206,7 +207,7 @@ class _SubmanifoldConvolution(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, Tensor, None]:  # pyright: ignore
-        """Gradients of the features and the weight; the products of the forward pass are computed again."""
+        """Returns the gradients of the features and the weight."""
         features, weight = ctx.saved_tensors
         grad = grad_outputs[0].to(features.dtype)
         pairs: Pairs = ctx.pairs
@@ -224,13 +225,13 @@ class _SubmanifoldConvolution(torch.autograd.Function):
 
 
 class SubmanifoldConv3d(nn.Module):
-    """Convolution over occupied voxels; equals a dense ``conv3d`` with zeros elsewhere, read at the occupied cells.
+    """Convolution over occupied voxels: equals a dense ``conv3d``, zero-filled elsewhere and read at occupied cells.
 
     Args:
         in_channels: input channels.
         out_channels: output channels.
         kernel_size: odd edge length of the cubic kernel.
-        bias: adds a bias.
+        bias: whether to add a bias.
 
     Attributes:
         weight: ``[out, k, k, k, in]``, axes x, y, z.
@@ -249,10 +250,10 @@ class SubmanifoldConv3d(nn.Module):
 
         Args:
             features: ``[M, in]``.
-            pairs: :func:`neighbors` for this kernel size.
+            pairs: result of :func:`neighbors` for this kernel size.
 
         Returns:
-            ``[M, out]``; under autocast products are of its type, and their sums float32.
+            ``[M, out]``. Under autocast, products have its dtype and sums are float32.
         """
         weight = self.weight
         if torch.is_autocast_enabled(features.device.type):

@@ -1,1 +1,1 @@
-"""What this project adds to the paper's method; each can be switched off (docs/concepts/method.md lists them)."""
+"""This project's additions to the paper's method; each can be switched off (docs/concepts/method.md lists them)."""

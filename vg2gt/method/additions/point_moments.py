@@ -1,6 +1,6 @@
-"""Second moments of the points in every voxel, plain and in one compiled pass (ours).
+"""Second moments of the points in every voxel, in plain torch and in one compiled pass (ours).
 
-How the points lie in their cell, how colour changes among them, which cameras saw them and how large their pixels are.
+They describe the shape of the points in their cell, the change of colour among them, their cameras and pixel size.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ def pool_point_moments(
     """Confidence-weighted second moments in every voxel, without gradient; compiled for float32 on a CPU.
 
     Args:
-        values: ``[N, 6]`` places of the points in their cells and their colours; N / V points a view, in views' order.
+        values: ``[N, 6]`` positions of the points in their cells, and colours; N / V points per view, in view order.
         depth: ``[N]`` scene units, > 0 where a voxel uses them.
         confidence: ``[N]`` > 0.
-        views: ``[V, 4]`` camera centre in scene units, and the edge in pixels of a voxel at depth 1.
-        means: ``[M, 6]`` of the values in every voxel.
+        views: ``[V, 4]`` camera centre in scene units, and edge of a voxel in pixels at depth 1.
+        means: ``[M, 6]`` means of ``values`` in every voxel.
         plan: the voxels.
-        views_per_chunk: views at a time where the pass is not compiled; bounds the memory.
+        views_per_chunk: views at a time if the pass is not compiled; bounds the memory.
 
     Returns:
-        Covariances ``[M, 3, 3]`` of the places and ``[M, 3 (place), 3 (colour)]`` of place and colour, mean camera
+        Covariances ``[M, 3, 3]`` of position and ``[M, 3 (position), 3 (colour)]`` of position and colour, mean camera
         centre ``[M, 3]``, and mean side ``[M]`` of a pixel at the points' depth, in cells.
     """
     if compilable(values, depth, confidence, views, means):
@@ -53,7 +53,7 @@ def moments_reference(
     plan: VoxelPlan,
     views_per_chunk: int,
 ) -> Moments:
-    """:func:`pool_point_moments` in plain torch: means of products less products of means."""
+    """:func:`pool_point_moments` in plain torch: means of products minus products of means."""
     per_view = len(values) // len(views)
     upper = torch.tensor(UPPER, device=values.device)
 

@@ -1,7 +1,7 @@
-"""Points between foreground and background, which lie on no surface (our addition to both levels of the paper).
+"""Detects pixels between foreground and background, which lie on no surface (our addition to both levels of the paper).
 
-Decoded depth runs from the foreground to the background within a few pixels; in voxels they become a fringe of
-splinters around every object.
+Decoded depth changes from foreground to background over a few pixels. In voxels, these pixels form a fringe of
+floating fragments around every object.
 """
 
 from __future__ import annotations
@@ -10,28 +10,31 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-TOLERANCE = 0.015  # relative, of a pixel's depth to the plane through two neighbours on the same side
-STEEPEST = 0.12  # relative change of depth from pixel to pixel beyond which even a plane says nothing
-CONTRAST = 0.08  # relative range of depth in a window without which there is no silhouette
-INSIDE = 0.05  # share of that range by which a pixel lies behind the front and before the back
-REACH = 2  # pixels to every side in which the range of depth is taken
-STEP = 0.15  # relative range of depth around a pixel from which on it is next to a silhouette
-STEP_REACH = 3  # pixels to every side
+TOLERANCE = 0.015  # largest relative distance of a pixel from the plane through two neighbours on the same side
+STEEPEST = 0.12  # relative change of depth per pixel above which not even a plane counts as a surface
+CONTRAST = 0.08  # relative depth range of a window below which there is no silhouette
+INSIDE = 0.05  # share of that range by which a pixel must lie behind the front and before the back
+REACH = 2  # pixels to each side, window of the depth range
+STEP = 0.15  # relative depth range around a pixel from which on it is next to a silhouette
+STEP_REACH = 3  # pixels to each side, window of STEP
 
 
 def on_surface(depth: Tensor) -> Tensor:
-    """Tells the pixels of a surface from those between foreground and background.
+    """Returns which pixels lie on a surface, as opposed to between foreground and background.
 
-    Inverse depth is linear in the image of a plane, so a surface's pixel lies on the line through its two neighbours to
-    the left or on that through those to the right, or up and down. A pixel that fails this along either axis,
-    or whose depth changes too fast on both sides, and that lies strictly within the depth range of its 5 x 5 window
-    where that range is large, is on no surface. Noise and fine relief without a silhouette are left alone.
+    Inverse depth is linear in the image of a plane, so along each axis a pixel of a surface lies on the line through
+    the two neighbours of at least one side. A pixel is on no surface if both conditions hold:
+
+    - It violates this along an axis, or its depth changes too fast on both sides.
+    - It lies strictly within the depth range of its 5 x 5 window, and that range is large.
+
+    Noise and fine relief without a silhouette are therefore kept.
 
     Args:
         depth: ``[..., H, W]`` z-depth in any unit, 0 = invalid.
 
     Returns:
-        ``[..., H, W]`` bool; what it says of invalid pixels means nothing.
+        ``[..., H, W]`` bool, undefined at invalid pixels.
     """
     valid = depth > 0
     inverse = torch.where(valid, 1 / torch.where(valid, depth, 1.0), 0.0)
@@ -48,7 +51,7 @@ def on_surface(depth: Tensor) -> Tensor:
 
 
 def near_silhouettes(depth: Tensor) -> Tensor:
-    """Tells the pixels on no surface, and those on a surface that breaks off within a few pixels.
+    """Returns which pixels lie on no surface, or on a surface that ends within a few pixels.
 
     Args:
         depth: ``[..., H, W]`` z-depth in any unit, 0 = invalid.
@@ -61,16 +64,16 @@ def near_silhouettes(depth: Tensor) -> Tensor:
 
 
 def _depth_range(depth: Tensor, reach: int) -> tuple[Tensor, Tensor]:
-    """Least and largest valid depth within ``reach`` pixels to every side, as ``depth``."""
+    """Returns the smallest and largest valid depth within ``reach`` pixels to each side, in the shape of ``depth``."""
     return -_largest(-torch.where(depth > 0, depth, torch.inf), reach), _largest(depth, reach)
 
 
 def _largest(values: Tensor, reach: int) -> Tensor:
-    """Largest value within ``reach`` pixels to every side; on CPUs many times as fast as ``max_pool2d``."""
+    """Returns the largest value within ``reach`` pixels to each side; on CPUs many times faster than ``max_pool2d``."""
     for axis in (values.dim() - 1, values.dim() - 2):
         border = [0, 0] * (values.dim() - 1 - axis) + [reach, reach]
         values, width, window = F.pad(values, border, value=-torch.inf), 1, 2 * reach + 1
-        while width < window:  # largest of twice as many neighbours each time
+        while width < window:  # doubles the window each time
             by = min(width, window - width)
             length = values.shape[axis] - by
             values, width = torch.maximum(values.narrow(axis, 0, length), values.narrow(axis, by, length)), width + by
@@ -78,7 +81,7 @@ def _largest(values: Tensor, reach: int) -> Tensor:
 
 
 def _shifted(values: Tensor, axis: int, by: int) -> Tensor:
-    """``values[i + by]`` at ``i``; beyond the border the outermost value."""
+    """Returns ``values[i + by]`` at ``i``, with indices clamped at the borders."""
     length = values.shape[axis]
     index = (torch.arange(length, device=values.device) + by).clamp(0, length - 1)
     return values.index_select(axis, index)

@@ -1,8 +1,8 @@
-"""Our addition to the paper's coarse module: how far each view is from the surface that all views agree on.
+"""Our addition to the paper's coarse module: distance of each point from the surface that all views agree on.
 
-The voxels around a point hold the other views' points, so a view's depth error along its ray shows in the frozen
-geometry itself: ``SURFACE_CHANNELS`` numbers a point, and ``CENTROID_CHANNELS`` more inputs of the voxels. Where views
-agree, ``model.coarse.gate`` keeps the module from changing anything (docs/concepts/deviations.md).
+The voxels around a point contain the points of other views, so the frozen geometry itself reveals a view's depth error
+along its rays. It is passed as ``SURFACE_CHANNELS`` inputs per point and ``CENTROID_CHANNELS`` inputs per voxel. With
+``model.coarse.gate`` the module changes nothing where views agree (docs/concepts/deviations.md).
 """
 
 from __future__ import annotations
@@ -15,25 +15,25 @@ from vg2gt.geometry.normals import normals_from_depth
 from vg2gt.method.grid import VoxelPlan, pool_mean, scene_counts
 from vg2gt.types import Cameras
 
-CENTROID_CHANNELS = 3  # of a voxel: its points' centroid in the cell
-SURFACE_CHANNELS = 5  # of a point: a vector to the surface in camera axes (3), a change of depth; confidence
-SURFACE_WIDTH = 2.0  # voxels, of the Gaussian that weighs the voxels around a point
-DEPTH_CHANGE_UNIT = 0.02  # relative
-MAX_DEPTH_CHANGE = 3.0  # units
-GRAZING = 0.2  # product of normal and ray below which the change of depth says nothing
-NORMAL_EDGE = 0.2  # relative depth step across which no normal is taken
-GATE_OPEN = 0.4  # units of disagreement at which changes are taken as they are
+CENTROID_CHANNELS = 3  # per voxel: centroid of its points in the cell
+SURFACE_CHANNELS = 5  # per point: vector to the surface in camera axes (3), change of depth (1), confidence (1)
+SURFACE_WIDTH = 2.0  # voxels; standard deviation of the Gaussian weights of the voxels around a point
+DEPTH_CHANGE_UNIT = 0.02  # relative to the depth
+MAX_DEPTH_CHANGE = 3.0  # in DEPTH_CHANGE_UNIT
+GRAZING = 0.2  # product of normal and ray below which the change of depth is unreliable
+NORMAL_EDGE = 0.2  # relative depth step across which no normal is computed
+GATE_OPEN = 0.4  # disagreement in DEPTH_CHANGE_UNIT at which the gate is 1
 GATE_POWER = 3.0
-GATE_MOST = 1.5
+GATE_MOST = 1.5  # largest gate
 
 
 class PointFrames:
-    """How packed points lie in the views that see them.
+    """Depth, ray, surface normal and camera rotation of packed points, each in the view it comes from.
 
     Args:
-        depth: ``[B, V, h, w]`` scene units, 0 = invalid.
-        cameras: of these pixels.
-        rows: ``[N]`` the packed points' places in the flattened ``[B, V, h, w]`` grid.
+        depth: ``[B, V, h, w]`` in scene units, 0 = invalid.
+        cameras: cameras of these pixels.
+        rows: ``[N]`` index of each point in the flattened ``[B, V, h, w]`` grid.
     """
 
     def __init__(self, depth: Tensor, cameras: Cameras, rows: Tensor) -> None:
@@ -46,18 +46,18 @@ class PointFrames:
         self.rotation = cameras.world_to_camera[..., :3, :3].flatten(0, 1)[rows // (height * width)]
 
     def in_camera(self, to_surface: Tensor, voxel_size: Tensor) -> Tensor:
-        """The vectors to the surface in the cameras' axes (voxels), and as changes of depth.
+        """Returns the vectors to the surface in camera axes (voxels), and as changes of depth.
 
-        The change of depth takes the point along its ray onto the tangent plane through the vector's end, so that
-        where on the surface the neighbours happen to lie drops out: what remains is how far the views disagree.
+        The change of depth moves a point along its ray to the tangent plane at the end of its vector. It measures only
+        how far the views disagree, and does not depend on where on the surface the neighbours lie.
 
         Args:
             to_surface: ``[N, 3]`` in world axes and voxels.
             voxel_size: ``[N]`` scene units per voxel.
 
         Returns:
-            ``[N, 4]``; the change is positive for a surface behind the point, in units of ``DEPTH_CHANGE_UNIT`` of the
-            depth, at most ``MAX_DEPTH_CHANGE`` of them, and 0 where the ray grazes the surface.
+            ``[N, 4]``. The change is positive for a surface behind the point, in units of ``DEPTH_CHANGE_UNIT`` of the
+            depth, clamped to ``MAX_DEPTH_CHANGE`` of them, and 0 where the ray grazes the surface.
         """
         local = (self.rotation @ to_surface[..., None])[..., 0]
         facing = (self.normal * self.ray).sum(-1)
@@ -69,13 +69,13 @@ class PointFrames:
     def evidence(
         self, to_surface: Tensor, voxel_size: Tensor, batch: Tensor, clear: Tensor | None
     ) -> tuple[Tensor, Tensor]:
-        """What :meth:`in_camera` gives ``[N, 4]``, and the gate ``[B]`` on what the network changes.
+        """Returns the result of :meth:`in_camera` ``[N, 4]``, and the gate ``[B]`` on the network's changes.
 
         Args:
             to_surface: ``[N, 3]`` in world axes and voxels.
             voxel_size: ``[B]`` scene units per voxel.
             batch: ``[N]`` scene index, sorted.
-            clear: ``[N]`` bool, points away from silhouettes; others have evidence 0. None: no gate, and all count.
+            clear: ``[N]`` bool, points away from silhouettes; the evidence of others is 0. None: no gate, all count.
         """
         seen = self.in_camera(to_surface, voxel_size[batch])
         if clear is None:
@@ -85,7 +85,7 @@ class PointFrames:
 
 
 def disagreement(change: Tensor, usable: Tensor, batch: Tensor, scenes: int) -> Tensor:
-    """Median size ``[B]`` of the changes of depth ``[N]`` towards the agreed surface, of the usable points; 0 of none.
+    """Returns the median absolute change of depth ``[B]`` over the usable points of each scene; 0 if there are none.
 
     Args:
         change: ``[N]`` in units of ``DEPTH_CHANGE_UNIT``, as :meth:`PointFrames.in_camera` gives it.
@@ -99,7 +99,7 @@ def disagreement(change: Tensor, usable: Tensor, batch: Tensor, scenes: int) -> 
 
 
 def gate(disagreement: Tensor) -> Tensor:
-    """Factor ``[B]`` on what is changed: next to nothing where views agree, so that clean depth stays clean.
+    """Returns the factor ``[B]`` on changes: close to 0 where views agree, so that accurate depth is preserved.
 
     Its constants were chosen on six rooms and two recordings with 0 to 5 % noise (docs/results.md).
     """
@@ -107,7 +107,7 @@ def gate(disagreement: Tensor) -> Tensor:
 
 
 def cell_centroids(cells: Tensor, confidence: Tensor, plan: VoxelPlan) -> Tensor:
-    """Confidence-weighted mean ``[M, 3]`` of the points' places in their cell, from its centre, in [-1/2, 1/2].
+    """Returns the confidence-weighted mean position ``[M, 3]`` of points relative to the cell centre, in [-1/2, 1/2].
 
     Args:
         cells: ``[N, 3]`` float64 positions in voxels.
@@ -118,21 +118,21 @@ def cell_centroids(cells: Tensor, confidence: Tensor, plan: VoxelPlan) -> Tensor
 
 
 def voxel_evidence(confidence: Tensor, plan: VoxelPlan) -> Tensor:
-    """How much the points of a voxel know together: the sum ``[M]`` of their squared confidences ``[N]``."""
+    """Returns the evidence of every voxel: the sum ``[M]`` of its points' squared confidences ``[N]``."""
     return confidence.new_zeros(len(plan)).index_add_(0, plan.voxel_of, confidence.square())
 
 
 def vectors_to_surface(queries: Tensor, centroids: Tensor, evidence: Tensor, index: Tensor) -> Tensor:
-    """From every point to the surface that all views agree on around it, ``[N, 3]`` in voxels.
+    """Returns the vector ``[N, 3]``, in voxels, from every point to the surface that all views agree on around it.
 
-    The features' inverse-square weights would return the point's own voxel; a Gaussian of the distance keeps several,
-    and confident points, of which the square of the confidence is the evidence, outweigh the others.
+    The inverse-square weights used for features would select the point's own voxel. Gaussian weights average several
+    voxels, and squared confidences as evidence let confident points dominate.
 
     Args:
-        queries: ``[N, 3]`` the points, in voxels.
+        queries: ``[N, 3]`` positions of the points, in voxels.
         centroids: ``[M, 3]`` positions of the voxels' centroids, in voxels.
-        evidence: ``[N, k]`` of the neighbours, 0 where there is none.
-        index: ``[N, k]`` the neighbours' rows of ``centroids``.
+        evidence: ``[N, k]`` evidence of the neighbours, 0 where there is none.
+        index: ``[N, k]`` the neighbours' rows in ``centroids``.
     """
     offset = centroids[index] - queries[:, None]  # [N, k, 3]
     weights = evidence * torch.exp(offset.square().sum(-1) / (-2 * SURFACE_WIDTH**2))  # [N, k]

@@ -1,7 +1,7 @@
-"""The surfel start: a voxel's Gaussians laid along its surface, in closed form (our addition to the paper's head).
+"""Surfel start: initialises a voxel's Gaussians on its surface, in closed form (our addition to the paper's head).
 
-The spread of a voxel's points has the surface's normal as its direction of least variance, and their covariance with
-colour over that spread is the colour's gradient along the surface, as in linear regression.
+The surface normal is the direction of least variance of a voxel's points. The colour gradient along the surface is the
+covariance of position and colour divided by the spread of positions, as in linear regression.
 """
 
 from __future__ import annotations
@@ -16,28 +16,28 @@ from torch.nn import functional as F
 from vg2gt.geometry.symmetric import principal_direction
 from vg2gt.types import TensorRecord, VoxelMoments
 
-UNIFORM_VARIANCE = 1 / 12  # of points spread evenly over a cell, in cells^2
-GRADIENT_RIDGE = 0.01 / 12  # cells^2: a colour gradient needs points that far apart
-MIN_GRADIENT = 1e-4  # squared colour per squared cell; below it the longest axis is the direction
-SPACING = 1.2  # cells, of n Gaussians side by side: SPACING / n
-ALONE = 0.41  # cells, standard deviation of a Gaussian that is alone in its row
-SHARED = 0.58  # cells, n in a row have SHARED / n each
-GRAZING = 0.2  # cosine of the steepest angle at which a pixel covers a surface
-LARGEST_REACH = 1.2  # of a full cell
-MIN_REACH = 0.3  # of a full cell: where a surface only touches a cell, its Gaussians are smaller, but not points
-THICKNESS = 0.06  # cells, standard deviation along the normal
-COLOR_GAIN = 1.4  # Gaussians overlap, which blurs their colours: their difference starts that much larger
+UNIFORM_VARIANCE = 1 / 12  # cells^2; variance of points spread uniformly over a cell
+GRADIENT_RIDGE = 0.01 / 12  # cells^2; suppresses colour gradients of points that are closer together
+MIN_GRADIENT = 1e-4  # squared colour per squared cell; below it, the longest axis is the first axis of the frame
+SPACING = 1.2  # cells; n Gaussians in a row are SPACING / n apart
+ALONE = 0.41  # cells; standard deviation of a single Gaussian in a row
+SHARED = 0.58  # cells; n Gaussians in a row have the standard deviation SHARED / n
+GRAZING = 0.2  # smallest cosine between line of sight and normal in the footprint of a pixel on the surface
+LARGEST_REACH = 1.2  # largest extent of the points, relative to a full cell
+MIN_REACH = 0.3  # smallest extent of the Gaussians, relative to a full cell, where a surface only touches the cell
+THICKNESS = 0.06  # cells; standard deviation along the normal
+COLOR_GAIN = 1.4  # factor on initial colour differences, since overlapping Gaussians blur their colours
 
 
 @dataclass(frozen=True)
 class SurfelStart(TensorRecord):
-    """What K Gaussians of M voxels start with; lengths in cells, constants of the autograd graph.
+    """Initial parameters of K Gaussians in M voxels, without gradient; lengths in cells.
 
     Attributes:
         frame: ``[M, 3, 3]`` rotations, columns (direction of the colour gradient, normal x direction, normal).
-        offsets: ``[M, K, 3]`` from the points' mean position, world axes.
+        offsets: ``[M, K, 3]`` offsets from the points' mean position, in world axes.
         scales: ``[M, K, 3]`` standard deviations along the frame's axes.
-        colors: ``[M, K, 3]`` change of the mean colour.
+        colors: ``[M, K, 3]`` differences from the mean colour.
     """
 
     frame: Tensor
@@ -48,13 +48,13 @@ class SurfelStart(TensorRecord):
 
 @torch.no_grad()
 def surfel_start(moments: VoxelMoments, splits: int) -> SurfelStart:
-    """Lays K Gaussians out on every voxel's surface.
+    """Places K Gaussians on every voxel's surface.
 
-    Defined for every input: one point, points in a line or in one place leave a disc that faces the cameras.
+    Defined for every input: a single point, collinear points and coincident points give a disc facing the cameras.
 
     Args:
         moments: second moments of M voxels.
-        splits: K >= 1.
+        splits: Gaussians per voxel, K >= 1.
     """
     frame, gradient, reach = surface_frame(moments)
     grid, scales = layout(splits, moments.spread.new_zeros(()))
@@ -67,12 +67,12 @@ def surfel_start(moments: VoxelMoments, splits: int) -> SurfelStart:
 
 
 def surface_frame(moments: VoxelMoments) -> tuple[Tensor, Tensor, Tensor]:
-    """How the surface and the colour on it run through every voxel.
+    """Returns frame, colour gradient and extent of the surface in every voxel.
 
     Returns:
-        The frame ``[M, 3, 3]`` as in :class:`SurfelStart`, its first axis to the brighter side, its third to the
-        cameras; the colour gradient ``[M, 3 (place), 3 (colour)]`` in the tangent plane, per cell; and the points'
-        extent ``[M, 2]`` along the first two axes, 1 for a full cell, at most 1.2.
+        The frame ``[M, 3, 3]`` as in :class:`SurfelStart`, its first axis towards the brighter side, its third towards
+        the cameras; the colour gradient ``[M, 3 (position), 3 (colour)]`` in the tangent plane, per cell; and the
+        points' extent ``[M, 2]`` along the first two axes, 1 for a full cell, at most 1.2.
     """
     spread, cross, facing, normal = moments.spread, moments.cross, moments.facing, moments.normal
     tangent = _orthogonal(normal)
@@ -91,7 +91,7 @@ def surface_frame(moments: VoxelMoments) -> tuple[Tensor, Tensor, Tensor]:
     across = torch.stack((-along[:, 1], along[:, 0]), -1)
     axes = torch.stack((along, across), -1)  # [M, 2, 2], columns in the tangent plane
     frame = torch.cat((plane @ axes, normal[:, :, None]), -1)
-    # A point represents its pixel, which covers more of a surface the more it leans away from the line of sight.
+    # add the footprint of a point's pixel, which grows as the surface tilts away from the line of sight
     sight = (frame.transpose(1, 2) @ facing[:, :, None])[..., 0]  # [M, 3], of unit length
     lean = sight[:, :2].square() / sight[:, 2:].clamp(min=GRAZING).square()
     variance = (axes * (inside @ axes)).sum(1) + (1 + lean) * moments.pixel[:, None].square() * UNIFORM_VARIANCE
@@ -100,7 +100,7 @@ def surface_frame(moments: VoxelMoments) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def layout(splits: int, like: Tensor) -> tuple[Tensor, Tensor]:
-    """Places ``[K, 2]`` of K Gaussians in a cell of unit extent, in rows, and their scales ``[K, 3]``."""
+    """Returns positions ``[K, 2]`` of K Gaussians in a cell of unit extent, in rows, and their scales ``[K, 3]``."""
     rows = max(1, round(math.sqrt(splits)))
     places, scales = [], []
     for row in range(rows):
@@ -117,7 +117,7 @@ def _width(count: int) -> float:
 
 
 def _orthogonal(normal: Tensor) -> Tensor:
-    """A unit vector ``[M, 3]`` orthogonal to each unit vector."""
+    """Returns a unit vector ``[M, 3]`` orthogonal to each unit vector."""
     smallest = normal.abs().argmin(-1, keepdim=True)
     axis = torch.zeros_like(normal).scatter(-1, smallest, 1.0)
     return F.normalize(torch.linalg.cross(normal, axis), dim=-1)

@@ -1,7 +1,7 @@
-"""Normals of the surface through each voxel, from its own points or from those of the cells around it (ours).
+"""Surface normal of each voxel, from its own points or from those of the 3x3x3 cells around it (ours).
 
-A cell of a few pixels holds pieces of the surfaces of several views, one above the other; over three cells the surface
-shows.
+A cell a few pixels wide contains stacked fragments of the surfaces of several views. Their common surface only becomes
+visible over three cells.
 """
 
 from __future__ import annotations
@@ -16,27 +16,27 @@ from vg2gt.kernels.threads import compilable
 from vg2gt.kernels.voxel_normals import facing_compiled, spread_around
 from vg2gt.method.grid import VoxelPlan, mixed_radix_keys
 
-FACING_PRIOR = 1e-4  # cells^2: without evidence a surface faces its cameras
-SAME_SURFACE = 0.5  # cells off the tangent plane at which a neighbour's points count e^-1/2
+FACING_PRIOR = 1e-4  # cells^2; without evidence, a surface faces its cameras
+SAME_SURFACE = 0.5  # cells; distance from the tangent plane at which a neighbour's points have weight e^-1/2
 COLUMNS = tuple(itertools.product((-1, 0, 1), repeat=2))  # steps along x and y to the nine columns around a cell
 
 
 @torch.no_grad()
 def surface_normals(spread: Tensor, facing: Tensor, offset: Tensor, plan: VoxelPlan, kernel: int) -> Tensor:
-    """Normals of the surface through every voxel, on the side of the cameras.
+    """Computes the surface normal of every voxel, facing the cameras.
 
-    With a kernel of 3 a normal is that of all points in 27 cells, weighted by how near their cell's mean lies to the
-    voxel's own tangent plane: a plane fitted to one surface, so that edges stay.
+    With a kernel of 3, a normal is fitted to the points of 27 cells. Cells are weighted by the distance of their mean
+    from the voxel's own tangent plane, so that the fit follows one surface and edges are preserved.
 
     Args:
         spread: ``[M, 3, 3]`` covariances of the points' positions, in cells^2.
         facing: ``[M, 3]`` unit vectors towards the cameras.
-        offset: ``[M, 3]`` mean positions from the cells' centres, in cells.
-        plan: which cells they are.
-        kernel: cells a side that count, 1 or 3.
+        offset: ``[M, 3]`` mean positions relative to the cell centres, in cells.
+        plan: the voxels.
+        kernel: edge length of the neighbourhood in cells, 1 or 3.
 
     Returns:
-        ``[M, 3]`` unit vectors; compiled for float32 on a CPU.
+        ``[M, 3]`` unit vectors. Compiled for float32 on a CPU.
     """
     own = facing_normals(spread, facing)
     if kernel == 1 or not len(plan):
@@ -46,14 +46,14 @@ def surface_normals(spread: Tensor, facing: Tensor, offset: Tensor, plan: VoxelP
 
 
 def facing_normals(spread: Tensor, facing: Tensor) -> Tensor:
-    """Directions of least spread, on the side of the cameras.
+    """Returns the directions of least spread, facing the cameras.
 
     Args:
         spread: ``[M, 3, 3]`` covariances of positions, in cells^2.
-        facing: ``[M, 3]`` unit vectors towards the cameras; the normal where the spread knows none.
+        facing: ``[M, 3]`` unit vectors towards the cameras; used as the normal where the spread determines none.
 
     Returns:
-        ``[M, 3]`` unit vectors; compiled for float32 on a CPU.
+        ``[M, 3]`` unit vectors. Compiled for float32 on a CPU.
     """
     if compilable(spread, facing):
         return facing_compiled(spread, facing, FACING_PRIOR)
@@ -63,23 +63,24 @@ def facing_normals(spread: Tensor, facing: Tensor) -> Tensor:
 def facing_reference(spread: Tensor, facing: Tensor) -> Tensor:
     """:func:`facing_normals` in plain torch."""
     eye = torch.eye(3, dtype=spread.dtype, device=spread.device)
-    # A little variance everywhere but along the line of sight: with nothing else known, that line is the normal.
+    # a little variance perpendicular to the line of sight, which is then the normal where the spread determines none
     prior = FACING_PRIOR * (eye - facing[:, :, None] * facing[:, None])
     normal = smallest_eigenvector(spread + prior, facing)
     return torch.where((normal * facing).sum(-1, keepdim=True) < 0, -normal, normal)
 
 
 def around_reference(spread: Tensor, normal: Tensor, offset: Tensor, plan: VoxelPlan) -> Tensor:
-    """Covariances of the points of every voxel and of the 26 around it, in plain torch.
+    """Returns the covariances of the points in the 3x3x3 cells around every voxel, in plain torch.
 
     Args:
         spread: ``[M, 3, 3]`` covariances of the points' positions, in cells^2.
-        normal: ``[M, 3]`` of each voxel's own tangent plane.
-        offset: ``[M, 3]`` mean positions from the cells' centres, in cells.
-        plan: which cells they are.
+        normal: ``[M, 3]`` normal of each voxel's own tangent plane.
+        offset: ``[M, 3]`` mean positions relative to the cell centres, in cells.
+        plan: the voxels.
 
     Returns:
-        ``[M, 3, 3]``, weighted by the number of a cell's points and by how near the tangent plane their mean lies.
+        ``[M, 3, 3]``. Cells are weighted by their number of points and by the distance of their mean from the tangent
+        plane.
     """
     voxel, other, shift, lengths = _pairs(plan)
     x, y, z = (offset.index_select(0, other) - offset.index_select(0, voxel) + shift.to(offset.dtype)).unbind(-1)  # [P]
@@ -95,18 +96,18 @@ def around_reference(spread: Tensor, normal: Tensor, offset: Tensor, plan: Voxel
 
 
 def around_compiled(spread: Tensor, normal: Tensor, offset: Tensor, plan: VoxelPlan) -> Tensor:
-    """:func:`around_reference` on a CPU, without a list of pairs."""
-    keys, (step_x, step_y, _) = mixed_radix_keys(plan.grid, plan.batch, margin=1)  # ascending, as the plan's voxels are
+    """:func:`around_reference` compiled for the CPU, without storing the pairs."""
+    keys, (step_x, step_y, _) = mixed_radix_keys(plan.grid, plan.batch, margin=1)  # ascending, like the plan's voxels
     columns = torch.tensor([i * step_x + j * step_y - 1 for i, j in COLUMNS])
     return spread_around(keys, columns, plan.counts, spread, normal, offset, SAME_SURFACE)
 
 
 def _pairs(plan: VoxelPlan) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Rows ``[P]`` of voxels, sorted, those of a cell of their 3x3x3 each, its shift ``[P, 3]``, and pairs a voxel."""
-    keys, (step_x, step_y, _) = mixed_radix_keys(plan.grid, plan.batch, margin=1)  # ascending, as the plan's voxels are
+    """Pairs each voxel with its 3x3x3 cells: both rows ``[P]``, shifts ``[P, 3]``, and pairs per voxel ``[M]``."""
+    keys, (step_x, step_y, _) = mixed_radix_keys(plan.grid, plan.batch, margin=1)  # ascending, like the plan's voxels
     columns = keys.new_tensor(COLUMNS)  # [9, 2]
     lowest = keys[:, None] + columns @ keys.new_tensor([step_x, step_y]) - 1  # [M, 9]: the column's first cell
-    # The cells of a column have keys in a row, so its voxels do.
+    # the three cells of a column have consecutive keys, so their voxels have consecutive rows
     row = torch.searchsorted(keys, lowest)[..., None] + torch.arange(3, device=keys.device)  # [M, 9, 3]
     row = row.clamp_(max=len(keys) - 1)
     above = keys[row] - lowest[..., None]

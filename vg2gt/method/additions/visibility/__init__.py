@@ -1,4 +1,4 @@
-"""Views that check each other's depth: our addition to the paper (docs/concepts/deviations.md)."""
+"""Cross-view depth checks: our addition to the paper (docs/concepts/deviations.md)."""
 
 from vg2gt.method.additions.visibility.check import Support, ViewCheck, choose_partners
 from vg2gt.method.additions.visibility.counts import ViewCounts, count_points, count_views

@@ -1,4 +1,4 @@
-"""The check of many views a block at a time: what :class:`ViewCheck` says of all, with a few views' depth in memory."""
+"""Checks many views one block at a time: same result as :class:`ViewCheck`, with only a few views' depth in memory."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from vg2gt.method.additions.visibility.check import NEIGHBORS, ViewCheck, disagr
 from vg2gt.method.additions.visibility.counts import count_views
 from vg2gt.types import Cameras
 
-LOOKED_AT, FEW = 32, 100  # views whose disagreement is measured, evenly spread; of up to FEW, all are
+LOOKED_AT, FEW = 32, 100  # evenly spaced views whose disagreement is measured; up to FEW views, all of them
 
 
 @torch.no_grad()
@@ -23,15 +23,15 @@ def check_blocks(
     blocks: Sequence[slice],
     masks: tuple[Tensor, Tensor],
 ) -> Iterator[None]:
-    """Checks the depth of one scene; equal to :meth:`ViewCheck.__call__`. Steps once a round and block.
+    """Checks the depth of one scene like :meth:`ViewCheck.__call__` without ``moment``; yields after each block.
 
     Args:
         check: the options.
-        depth: ``[V, H, W]``, 0 where there is none; may be mapped from a file.
-        cameras: of the views (B = 1).
+        depth: ``[V, H, W]`` z-depth, 0 = none; may be memory-mapped.
+        cameras: cameras of the views (B = 1).
         partners: ``[V, K]`` from :func:`choose_partners`.
-        blocks: views whose partners' depth is in memory together; all views between them.
-        masks: ``[V, H, W]`` each, written over: after the last step the first holds 1 for pixels that are kept.
+        blocks: slices of views whose partners' depth fits in memory; together they cover all views.
+        masks: two buffers ``[V, H, W]``, overwritten; at the end the first is 1 for pixels that are kept, else 0.
     """
     before, after = masks
     for rows in blocks:
@@ -49,19 +49,19 @@ def check_blocks(
 
 
 def neighbourhood(partners: Tensor, views: Tensor) -> tuple[Tensor, Tensor]:
-    """Some views and after them their partners ``[n]``, and all these views' partners ``[n, K]`` counted among them.
+    """Returns the given views followed by their partners ``[n]``, and the partners ``[n, K]`` as indices into them.
 
-    The partners themselves have none (-1).
+    The added views have no partners themselves (-1).
 
     Args:
-        partners: ``[V, K]`` of all views, -1 = none.
-        views: ``[m]`` the wanted ones.
+        partners: ``[V, K]`` partners of all views, -1 = none.
+        views: ``[m]`` indices of the given views.
     """
     named = partners[views].flatten()
     others = named[(named >= 0) & ~torch.isin(named, views)].unique()
     chosen = torch.cat((views, others))
     place = torch.full((len(partners) + 1,), -1, dtype=torch.int64)
-    place[chosen] = torch.arange(len(chosen))  # the last entry is -1's
+    place[chosen] = torch.arange(len(chosen))  # index -1 reads the last entry, which stays -1
     local = torch.full((len(chosen), partners.shape[1]), -1, dtype=torch.int64)
     local[: len(views)] = place[partners[views]]
     return chosen, local
@@ -69,7 +69,7 @@ def neighbourhood(partners: Tensor, views: Tensor) -> tuple[Tensor, Tensor]:
 
 @torch.no_grad()
 def coarsening(check: ViewCheck, depth: Tensor, cameras: Cameras, partners: Tensor) -> Tensor:
-    """The factor ``[1]`` of the smallest voxel; arguments as for :func:`check_blocks`."""
+    """Returns the factor ``[1]`` on the smallest voxel size; arguments as for :func:`check_blocks`."""
     chosen = torch.arange(len(depth))
     if len(depth) > FEW:
         chosen = torch.linspace(0, len(depth) - 1, LOOKED_AT).round().long()

@@ -1,7 +1,7 @@
-"""Which pixels' depth the other views support, and how fine voxels may be: our addition to the paper.
+"""Checks which pixels' depth the other views support, and how fine voxels may be: our addition to the paper.
 
-Depth is a guess on bare walls, in the sky and beyond the searched range; in voxels such guesses hang in the air. Other
-views see through a guess, and see a surface at the same place where the depth is right.
+Depth is unreliable on textureless walls, in the sky and beyond the searched range, and becomes floaters in voxels.
+Other views see through a floater, and see a surface at the same place where the depth is correct.
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ from vg2gt.method.additions.visibility.counts import count_views, depth_ratio
 from vg2gt.method.additions.visibility.moved import LEAST, moved
 from vg2gt.types import Cameras, Geometry, TensorRecord
 
-STRIDE = 4  # pixels between those whose disagreement is measured, along each axis
-NEIGHBORS = 8  # partners of a view whose disagreement is measured
-SAMPLES = 12  # pixels a side of the grid that overlap is measured on
-MANY, MORE = 100, 4  # views beyond which partners must see a point and are more, and how many times
-BEHIND = 1.1  # of a view's depth: what lies farther is hidden from it
-LEAST_OVERLAP = 0.02  # share of a view's samples that a partner has in its image
+STRIDE = 4  # pixels between samples of the disagreement, along each axis
+NEIGHBORS = 8  # partners per view for the disagreement
+SAMPLES = 12  # pixels per side of the grid on which overlap is measured
+MANY, MORE = 100, 4  # above MANY views, a view has MORE times as many partners, and hidden points do not count
+BEHIND = 1.1  # relative to a view's depth; points farther away are hidden from it
+LEAST_OVERLAP = 0.02  # smallest share of a view's samples in the image of a partner
 
 
 @dataclass(frozen=True)
 class Support(TensorRecord):
-    """What views say of each other's depth.
+    """Result of checking the views' depth against each other.
 
     Attributes:
-        keep: ``[B, V, H, W]`` bool, pixels that have a depth the scene is made of.
-        coarsen: ``[B]`` factor >= 1 of the smallest voxel.
+        keep: ``[B, V, H, W]`` bool, pixels whose depth enters the scene.
+        coarsen: ``[B]`` factor >= 1 on the smallest voxel size.
     """
 
     keep: Tensor
@@ -39,24 +39,25 @@ class Support(TensorRecord):
 
 @dataclass(frozen=True)
 class ViewCheck:
-    """Decides which pixels' depth enters the scene, and how fine its voxels may be.
+    """Selects the pixels whose depth enters the scene, and how fine its voxels may be.
 
-    A pixel is dropped where more views look through its point than agree with it, and says nothing in the next round.
+    A pixel is dropped if more views look through its point than agree with it; later rounds ignore its depth.
 
     Args:
-        tolerance: relative difference of depth up to which two views agree.
-        margin: relative difference from which on a view looks through a point.
-        rounds: how often the views are counted.
-        partners: most views that each view is compared with, which bounds the time.
-        fine_below: median disagreement of views in pixels up to which voxels are as fine as configured; above, the
+        tolerance: relative depth difference below which two views agree.
+        margin: relative depth difference above which a view looks through a point.
+        rounds: number of rounds.
+        partners: largest number of views each view is compared with, four times as many above 100 views; bounds the
+            time.
+        fine_below: median disagreement of views in pixels up to which voxels are as fine as configured; above it, the
             smallest voxel grows in proportion.
         coarsest: largest factor by which it grows.
-        moment: frames of a moment. What is gone at another moment moves, and is dropped wherever it is seen
-            (:mod:`vg2gt.method.additions.visibility.moved`); None takes everything for static.
-        moved_margin: relative difference from which on a view tells that something is gone.
+        moment: smallest number of frames in a moment. Pixels whose surface is gone at another moment show a moving
+            object and are dropped (:mod:`vg2gt.method.additions.visibility.moved`); None assumes a static scene.
+        moved_margin: relative depth difference above which a view shows that a surface is gone.
 
     Raises:
-        ValueError: naming an option that is out of range.
+        ValueError: if an option is out of range; the message names it.
     """
 
     tolerance: float = 0.02
@@ -84,12 +85,11 @@ class ViewCheck:
 
     @torch.no_grad()
     def __call__(self, geometry: Geometry, frames: Tensor | None = None) -> Support:
-        """Checks the depth of B scenes; ``keep`` is false where there is none.
+        """Checks the depth of B scenes; ``keep`` is false at pixels without depth.
 
         Args:
-            geometry: of B scenes.
-            frames: ``[B, V]`` numbers of the frames in the order of time; None: nothing is known of time, so nothing is
-                taken to move.
+            geometry: geometry of B scenes.
+            frames: ``[B, V]`` frame numbers in temporal order; None: unknown, so nothing is dropped as moving.
         """
         times = [None] * len(geometry.depth) if frames is None else frames.to(geometry.depth.device)
         scenes = [self._check(*_scene(geometry, index), time) for index, time in enumerate(times)]
@@ -110,7 +110,7 @@ class ViewCheck:
 
 
 def _scene(geometry: Geometry, index: int) -> tuple[Tensor, Cameras]:
-    """Depth ``[V, H, W]`` of one scene, 0 where not finite, and its cameras (B = 1)."""
+    """Returns the depth ``[V, H, W]`` of one scene, 0 where not finite, and its cameras (B = 1)."""
     depth = geometry.depth[index].float().nan_to_num(0.0, 0.0, 0.0)
     one, cameras = slice(index, index + 1), geometry.cameras
     return depth, Cameras(cameras.world_to_camera[one], cameras.intrinsics[one], cameras.size)
@@ -118,15 +118,15 @@ def _scene(geometry: Geometry, index: int) -> tuple[Tensor, Cameras]:
 
 @torch.no_grad()
 def disagreement(depth: Tensor, cameras: Cameras, partners: Tensor) -> Tensor:
-    """Median relative difference of a point's depth in another view and that view's own depth there.
+    """Returns the median relative difference between a point's depth in another view and that view's own depth.
 
     Args:
         depth: ``[V, H, W]`` z-depth of one scene, 0 = none.
-        cameras: of the views (B = 1), in the unit of the depth.
+        cameras: cameras of the views (B = 1), in the unit of the depth.
         partners: ``[V, K]`` int64, nearest first; -1 = none.
 
     Returns:
-        A scalar in pixels (times the focal length); 0 where no two views see the same.
+        A scalar in pixels (the relative difference times the focal length); 0 if no two views see the same points.
     """
     pose, intrinsics = cameras.world_to_camera[0].to(depth), cameras.intrinsics[0].to(depth)
     sampled = depth[:, STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE]
@@ -148,17 +148,17 @@ def disagreement(depth: Tensor, cameras: Cameras, partners: Tensor) -> Tensor:
 
 @torch.no_grad()
 def choose_partners(depth: Tensor, cameras: Cameras, most: int) -> Tensor:
-    """The views that look where a view's points are.
+    """Selects for each view the other views that see its points.
 
-    Of more than ``most``, half are the nearest by direction and place, and the others are taken evenly: near views
-    agree with a surface, and views from the other side contradict what hangs in the air. Many views look at a room from
-    several others, most of them through walls: there, points behind what a view sees do not count, and partners are
-    four times as many.
+    If more than ``most`` views qualify, half of the partners are the nearest by direction and overlap, and the others
+    are spread evenly over the rest: near views confirm a surface, and views from the other side contradict floaters.
+    More than 100 views often cover several rooms and would count points behind walls. Points hidden by a view's own
+    depth are then ignored, and there are four times as many partners.
 
     Args:
         depth: ``[V, H, W]`` z-depth, 0 = none.
-        cameras: of the views (B = 1), in the unit of the depth.
-        most: partners of a view, at most; four times as many of more than 100 views.
+        cameras: cameras of the views (B = 1), in the unit of the depth.
+        most: largest number of partners per view; four times as many above 100 views.
 
     Returns:
         ``[V, K]`` int64, nearest first; -1 where a view has fewer.
@@ -196,7 +196,7 @@ def choose_partners(depth: Tensor, cameras: Cameras, most: int) -> Tensor:
 
 
 def _spread(order: Tensor, usable: int, count: int) -> Tensor:
-    """``count`` of the first ``usable`` entries: the first half densely, the rest evenly; -1 where there are fewer."""
+    """Picks ``count`` of the first ``usable`` entries: half from the front, half spread evenly; pads with -1."""
     if usable <= count:
         return torch.cat((order[:usable], order.new_full((count - usable,), -1)))
     dense = count // 2

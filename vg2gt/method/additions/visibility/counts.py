@@ -1,8 +1,8 @@
-"""How many other views agree with the depth of a pixel, and how many look through its point.
+"""Counts the other views that agree with the depth of a pixel, and those that look through its point.
 
-With ``r`` the depth of a pixel's point in another view over that view's own depth, the view *agrees* where ``|r - 1| <
-tolerance``, looks *through* the point where ``r < 1 - margin``, and the point is *hidden* from it where ``r`` is
-larger. Of the four pixels around the projection one that agrees is enough, and all four must look through.
+Let ``r`` be the depth of a pixel's point in another view, divided by that view's own depth. The view *agrees* if
+``|r - 1| < tolerance`` and looks *through* the point if ``r < 1 - margin``; otherwise the point is *hidden* from it.
+Of the four pixels around the projection, one must agree, or all must look through.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from vg2gt.types import Cameras, TensorRecord
 
 @dataclass(frozen=True)
 class ViewCounts(TensorRecord):
-    """Numbers of other views, as floats.
+    """Numbers of other views per pixel, as floats.
 
     Attributes:
-        agree: ``[V, H, W]`` views that see a surface where the pixel's point is.
+        agree: ``[V, H, W]`` views that see a surface at the pixel's point.
         through: ``[V, H, W]`` views that look through the point at something behind it.
-        hidden: ``[V, H, W]`` views that see something in front of the point.
+        hidden: ``[V, H, W]`` views that do neither, mostly because something is in front of the point.
     """
 
     agree: Tensor
@@ -34,17 +34,17 @@ class ViewCounts(TensorRecord):
 
 @torch.no_grad()
 def count_views(depth: Tensor, cameras: Cameras, partners: Tensor, tolerance: float, margin: float) -> ViewCounts:
-    """Counts what the partners of each view say of its pixels, for one scene.
+    """Counts for each pixel the partners of its view that agree or look through, for one scene.
 
     Args:
         depth: ``[V, H, W]`` z-depth, 0 = none.
-        cameras: of the views (B = 1), in the unit of the depth.
-        partners: ``[V, K]`` int64 views that each view is compared with; -1 = none.
-        tolerance: relative difference of depth up to which views agree.
-        margin: relative difference of depth from which on a view looks through a point.
+        cameras: cameras of the views (B = 1), in the unit of the depth.
+        partners: ``[V, K]`` int64, views that each view is compared with; -1 = none.
+        tolerance: relative depth difference below which views agree.
+        margin: relative depth difference above which a view looks through a point.
 
     Returns:
-        The numbers; 0 for pixels without depth.
+        The counts; 0 for pixels without depth.
     """
     if depth.device.type == "cpu":
         return _count_compiled(depth, cameras, partners, tolerance, margin)
@@ -61,6 +61,7 @@ def count_views_reference(
     known = depth > 0
     sums = ViewCounts(*(torch.zeros_like(depth) for _ in range(3)))
     for other in partners.T:  # one partner of each view
+        # pixels to the partner's image: column and row [V, H, W], depth z [V, H, W]
         there = other.clamp(min=0)
         motion = compose(pose[there], invert_rigid(pose))  # [V, 4, 4]
         points = transform_points(motion[None], (rays * depth[..., None])[None])[0]
@@ -71,6 +72,7 @@ def count_views_reference(
         row = points[..., 1] / safe * seen[..., 1, 1] + seen[..., 1, 2]
         inside = known & (z > NEAREST) & (other >= 0)[:, None, None]
         inside &= (column > -0.5) & (column < width - 0.5) & (row > -0.5) & (row < height - 0.5)
+        # compare with the partner's depth at the four surrounding pixels
         left, top = column.floor(), row.floor()
         agree, through, says = torch.zeros_like(inside), inside.clone(), torch.zeros_like(inside)
         for down in (0, 1):
@@ -94,7 +96,7 @@ def _count_compiled(depth: Tensor, cameras: Cameras, partners: Tensor, tolerance
     intrinsics = cameras.intrinsics[0].double()
     there = partners.clamp(min=0)
     motion = compose(pose[there], invert_rigid(pose)[:, None])[..., :3, :]  # [V, K, 3, 4]
-    # From a pixel's homogeneous coordinates times depth to those in the partner's image, in one matrix.
+    # one matrix from homogeneous pixel coordinates times depth to those of the partner
     to_pixel = intrinsics[there] @ motion  # [V, K, 3, 4]
     back = torch.linalg.inv(intrinsics)[:, None]
     matrix = torch.cat((to_pixel[..., :3] @ back, to_pixel[..., 3:]), -1).float().contiguous().numpy()
@@ -107,17 +109,17 @@ def _count_compiled(depth: Tensor, cameras: Cameras, partners: Tensor, tolerance
 def count_points(
     points: Tensor, depth: Tensor, cameras: Cameras, tolerance: float, margin: float
 ) -> tuple[Tensor, Tensor]:
-    """How many views agree with points in space, and how many look through them.
+    """Counts the views that agree with world points, and the views that look through them.
 
     Args:
-        points: ``[N, 3]`` in the world of the cameras.
+        points: ``[N, 3]`` in the world frame of the cameras.
         depth: ``[V, H, W]`` z-depth of the views, 0 = none.
-        cameras: of the views (B = 1).
-        tolerance: relative difference of depth up to which a view agrees.
-        margin: relative difference of depth from which on a view looks through a point.
+        cameras: cameras of the views (B = 1).
+        tolerance: relative depth difference below which a view agrees.
+        margin: relative depth difference above which a view looks through a point.
 
     Returns:
-        Views that agree and views that look through, ``[N]`` int64 each.
+        Numbers of views that agree and that look through, ``[N]`` int64 each.
     """
     agree, through = (torch.zeros(len(points), dtype=torch.int64, device=points.device) for _ in range(2))
     for view in range(len(depth)):
@@ -130,16 +132,16 @@ def count_points(
 
 
 def depth_ratio(points: Tensor, depth: Tensor, to_camera: Tensor, intrinsics: Tensor) -> tuple[Tensor, Tensor]:
-    """Depth of points ``[V, P, 3]`` in views over the views' own depth at the nearest pixel.
+    """Returns the depth of points in each view, divided by the view's own depth at the nearest pixel.
 
     Args:
-        points: in frames that ``to_camera`` ``[V, 4, 4]`` takes into the views'.
+        points: ``[V, P, 3]``, in the source frame of ``to_camera``.
         depth: ``[V, H, W]`` z-depth of the views, 0 = none.
-        to_camera: as said.
+        to_camera: ``[V, 4, 4]`` rigid transforms to the views' camera frames.
         intrinsics: ``[V, 3, 3]`` in pixels.
 
     Returns:
-        The ratio ``[V, P]``, and whether the point is in the image where the view has a depth.
+        The ratio ``[V, P]``, and ``[V, P]`` bool: whether the point projects to a pixel with depth.
     """
     height, width = depth.shape[1:]
     seen = transform_points(to_camera[None], points[None])[0]
