@@ -1,1 +1,1 @@
-"""Frozen visual foundation models behind one interface."""
+"""Frozen visual foundation models with a common interface."""

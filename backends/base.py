@@ -1,4 +1,4 @@
-"""The interface of a frozen visual foundation model (VFM): images to tokens, tokens to geometry."""
+"""Interface of a frozen visual foundation model (VFM): images to tokens, tokens to geometry."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ from vg2gt.types import Cameras, Geometry, Hints, Tokens
 
 
 class Backend(nn.Module, ABC):
-    """A frozen network whose tokens can be changed and decoded again.
+    """A frozen network whose tokens can be modified and decoded again.
 
-    A subclass calls ``super().__init__`` with what is said of it below, builds its modules, and ends its constructor
-    with ``self.freeze()``. It implements ``encode`` and ``decode``; the two methods that give cameras alone may be made
-    cheaper.
+    A subclass calls ``super().__init__`` with the arguments below, builds its modules, and ends its constructor with
+    ``self.freeze()``. It implements ``encode`` and ``decode``, and may override ``decode_cameras`` and
+    ``predict_cameras`` with cheaper versions.
 
     Args:
-        name: used in checkpoints and messages.
+        name: name in checkpoints and messages.
         patch_size: edge of a patch in pixels; image sizes must be multiples of it.
         token_dims: channels of the patch tokens, one entry per tapped layer, in tap order.
         licence: licence of the weights, printed when they are loaded.
         is_metric: True if ``Geometry.scale`` turns the decoded depth into metres.
-        supports_gradient: True if ``decode`` is differentiable in ``tokens.patch``.
-        needs_hints: True if ``encode`` cannot work without what the data knows, the cameras at least.
-        min_views: fewest views that ``encode`` takes; it raises ValueError for fewer.
+        supports_gradient: True if ``decode`` is differentiable with respect to ``tokens.patch``.
+        needs_hints: True if ``encode`` requires hints, at least cameras.
+        min_views: minimum number of views; ``encode`` raises ValueError for fewer.
         predicts_cameras: False if its cameras are those of the hints.
 
     Attributes:
-        frozen: whether nothing in it is trained.
-        needs_cameras: of a class whose ``encode`` always needs cameras, given or found.
-        needs_depth: of a class whose ``encode`` also needs the data's depth: it can do nothing with photographs, which
-            commands say before they build it.
+        frozen: whether all weights are frozen.
+        needs_cameras: whether the class always needs cameras, either known or estimated beforehand.
+        needs_depth: whether ``encode`` also needs the data's depth. Such a backend cannot run on photographs; commands
+            refuse it before building it.
     """
 
     frozen = True
@@ -73,13 +73,13 @@ class Backend(nn.Module, ABC):
 
         Args:
             images: ``[B, V, 3, H, W]`` in [0, 1]; H and W multiples of ``patch_size``.
-            hints: what the data knows, of the same views; None if nothing.
+            hints: known cameras, depth and so on of the same views; None if nothing is known.
 
         Returns:
             The tokens exactly as the frozen heads take them.
 
         Raises:
-            ValueError: from :meth:`check_images` and, where hints are needed, :meth:`require_hints`.
+            ValueError: from :meth:`check_images` and, if hints are needed, :meth:`require_hints`.
         """
 
     @abstractmethod
@@ -87,47 +87,48 @@ class Backend(nn.Module, ABC):
         """Runs the frozen heads in float32; equal tokens give bit-equal geometry.
 
         Args:
-            tokens: from ``encode``, the patch tokens possibly changed.
+            tokens: output of ``encode``, whose patch tokens may be modified.
 
         Returns:
-            Depth and confidence (differentiable in ``tokens.patch`` where ``supports_gradient``) and raw cameras.
+            Depth, confidence and raw cameras. With ``supports_gradient``, depth and confidence are differentiable with
+            respect to ``tokens.patch``.
         """
 
     def decode_cameras(self, tokens: Tokens) -> Cameras:
-        """The raw cameras of :meth:`decode`, to the bit; cheaper where they have a head of their own."""
+        """Returns the raw cameras of :meth:`decode`, bit-equal; cheaper if the network has a camera head."""
         return self.decode(tokens).cameras
 
     @torch.no_grad()
     def predict_cameras(self, images: Tensor, hints: Hints | None = None) -> Cameras:
-        """The raw cameras that these views decode to, to the bit, where nothing else of them is needed."""
+        """Returns the raw cameras of ``decode(encode(images, hints))``, bit-equal; may skip all other work."""
         return self.decode_cameras(self.encode(images, hints))
 
     def freeze(self) -> None:
-        """Takes every parameter out of training and puts every module into eval mode, unless not ``frozen``."""
+        """Disables gradients of all parameters, unless not ``frozen``, and sets eval mode."""
         self.requires_grad_(not self.frozen)
         self.eval()
         if not self.frozen:
             self.identity()
 
     def gradients(self) -> torch.set_grad_enabled:
-        """A context without gradients where the network is frozen."""
+        """Returns a context that disables gradients if the network is frozen."""
         return torch.set_grad_enabled(torch.is_grad_enabled() and not self.frozen)
 
     def train(self, mode: bool = True) -> Backend:
-        """Stays in eval mode whatever ``mode`` says: its training behaviour is not wanted."""
+        """Stays in eval mode whatever ``mode`` is."""
         return super().train(False)
 
     def identity(self) -> dict[str, str]:
-        """Name and sha256 of the weights (names, shapes, values, in sorted order); computed once."""
+        """Returns the name and the sha256 of the weights (names, shapes, values, in sorted order); computed once."""
         if self._identity is None:
             self._identity = {"name": self.name, "weights": tensors_digest(self.state_dict())}
         return self._identity
 
     def check_images(self, images: Tensor) -> None:
-        """Checks what ``encode`` is given.
+        """Checks the images given to ``encode``.
 
         Raises:
-            ValueError: if the images have the wrong shape, size or range; it says what was expected and what to do.
+            ValueError: if they have the wrong shape, size or range.
         """
         if images.dim() != 5 or images.shape[2] != 3 or 0 in images.shape:
             raise ValueError(f"images must be [B, V, 3, H, W] with nothing empty, got {list(images.shape)}")
@@ -146,12 +147,12 @@ class Backend(nn.Module, ABC):
             )
 
     def as_tokens(self, images: Tensor, patch: Sequence[Tensor], camera: Tensor) -> Tokens:
-        """Returns, in float32, the tokens that a backbone made of ``images``.
+        """Packs the outputs of a backbone as float32 tokens.
 
         Args:
-            images: ``[B, V, 3, H, W]``.
-            patch: ``[B, V, P, D]`` of every tapped layer.
-            camera: ``[B, V, Dc]``.
+            images: encoded images ``[B, V, 3, H, W]``.
+            patch: patch tokens ``[B, V, P, D]`` of every tapped layer.
+            camera: camera tokens ``[B, V, Dc]``.
         """
         size = (images.shape[-2], images.shape[-1])
         grid = (size[0] // self.patch_size, size[1] // self.patch_size)
@@ -161,7 +162,7 @@ class Backend(nn.Module, ABC):
         """Returns ``hints`` if they hold the named fields for all views of ``images``.
 
         Raises:
-            ValueError: naming the missing fields or the wrong shape, and what to do.
+            ValueError: if a field is missing or has the wrong shape, or cameras are not valid.
         """
         batch, views, _, height, width = images.shape
         missing = [name for name in names if _is_missing(getattr(hints, name, None))]
@@ -188,7 +189,7 @@ class Backend(nn.Module, ABC):
         return hints
 
     def _check_cameras(self, cameras: Cameras) -> None:
-        """Refuses given cameras that would make everything NaN, or have no field of view."""
+        """Raises ValueError for cameras that are not finite or have no positive focal length."""
         values = torch.cat((cameras.world_to_camera[..., :3, :].flatten(-2), cameras.intrinsics.flatten(-2)), -1)
         bad = ~torch.isfinite(values).all(-1) | (cameras.intrinsics[..., [0, 1], [0, 1]] <= 0).any(-1)  # [B, V]
         if bad.any():
@@ -205,7 +206,7 @@ def _is_missing(value: object) -> bool:
 
 @contextmanager
 def seeded_initialisation(seed: int) -> Iterator[None]:
-    """Makes module initialisation inside the block depend on ``seed`` only and leaves the global generator alone."""
+    """Context in which module initialisation depends on ``seed`` only; the global generator is left unchanged."""
     with torch.random.fork_rng(devices=[]):
         torch.default_generator.manual_seed(seed)
         yield

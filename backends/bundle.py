@@ -1,6 +1,6 @@
-"""The ONNX bundle: a folder with a frozen network cut into encoder and decoder, described by ``backend.json``.
+"""ONNX bundle: a folder with a frozen network split into encoder and decoder, described by ``backend.json``.
 
-The decoder's weights come with the name and the numbers of its class, so that it can be rebuilt as a torch module.
+The description holds the class and the arguments of the decoder, so that it can be rebuilt as a torch module.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ REMEDY = "write it with vg2gt export backend=NAME --out FOLDER"
 Decoder = VGGTDecoder | DA3Decoder
 DECODERS: dict[str, type[VGGTDecoder] | type[DA3Decoder]] = {
     kind.__name__: kind for kind in (VGGTDecoder, DA3Decoder)
-}  # nothing else is ever built from a file
+}  # the only classes that are built from a file
 
 CONVENTIONS = {
     "images": "float32 [B, V, 3, H, W] in [0, 1]; H and W multiples of patch_size; B, V, H, W free",
@@ -42,19 +42,19 @@ CONVENTIONS = {
 
 @dataclass(frozen=True)
 class Description:
-    """What ``backend.json`` says.
+    """Content of ``backend.json``.
 
     Attributes:
-        name: of the exported backend.
-        licence: of its weights.
-        weights: sha256 of its weights (``Backend.identity``), so that checkpoints know the network again.
-        patch_size: in pixels.
+        name: name of the exported backend.
+        licence: licence of its weights.
+        weights: sha256 of its weights (``Backend.identity``), which checkpoints are matched with.
+        patch_size: edge of a patch in pixels.
         token_dims: channels of the patch tokens, in tap order.
-        taps: the tapped layers.
+        taps: indices of the tapped layers.
         needs_hints: whether the encoder also takes ``world_to_camera`` and ``intrinsics``.
-        decoder: ``class`` and ``arguments`` of the decoder, for its weights.
-        conventions: of the arrays, for readers.
-        max_difference: largest relative difference to torch when written, ``encoder`` and ``decoder``.
+        decoder: ``class`` and ``arguments`` to rebuild the decoder.
+        conventions: human-readable description of the arrays.
+        max_difference: largest relative difference to torch at export, of ``encoder`` and ``decoder``.
         format: version of this description.
     """
 
@@ -76,11 +76,11 @@ class Description:
 
 
 def read_bundle(folder: Path) -> Description:
-    """Reads a bundle's description; only the decoder's weights may be missing in the folder.
+    """Reads the description of a bundle; only the decoder's weights may be missing from the folder.
 
     Raises:
-        FileNotFoundError: naming what is missing.
-        ValueError: if the description is not one.
+        FileNotFoundError: if another file is missing.
+        ValueError: if the description is not valid.
     """
     for name in (DESCRIPTION, ENCODER, DECODER):
         if not (folder / name).is_file():
@@ -97,10 +97,14 @@ def read_bundle(folder: Path) -> Description:
 
 
 def load_decoder(folder: Path, decoder: Mapping[str, Any]) -> Decoder | None:
-    """Rebuilds the decoder with its weights; None where the folder has none.
+    """Rebuilds the decoder with its weights; returns None if the folder has no weights.
+
+    Args:
+        folder: folder of the bundle.
+        decoder: ``class`` and ``arguments`` from the description.
 
     Raises:
-        ValueError: if the class is not one of :data:`DECODERS`, or arguments or weights do not fit it.
+        ValueError: if the class is not one of :data:`DECODERS`, or the arguments or weights do not fit.
     """
     file = folder / DECODER_WEIGHTS
     if not file.is_file():
@@ -123,12 +127,12 @@ def load_decoder(folder: Path, decoder: Mapping[str, Any]) -> Decoder | None:
 
 
 def decoder_class(network: Decoder) -> type[VGGTDecoder] | type[DA3Decoder]:
-    """Which of :data:`DECODERS` a network is built on."""
+    """Returns the class in :data:`DECODERS` that a network is an instance of."""
     return next(kind for kind in DECODERS.values() if isinstance(network, kind))
 
 
 def decoder_weights(network: Decoder) -> dict[str, Tensor]:
-    """The part of a network's state that its decoder class has."""
+    """Returns the decoder's part of a network's state."""
     with torch.device("meta"):
         names = decoder_class(network)(**network.arguments).state_dict()
     state = network.state_dict()

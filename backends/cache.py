@@ -1,4 +1,4 @@
-"""What a frozen backbone made of a set of views, kept on disk: frozen means computed once."""
+"""Disk cache of a frozen backbone's outputs."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ log = logging.getLogger(__name__)
 
 Found = TypeVar("Found")
 
-_RECORDS = [Tokens, Geometry, Cameras]  # all that a file may hold besides tensors and plain values
+_RECORDS = [Tokens, Geometry, Cameras]  # classes that a file may hold besides tensors and plain values
 
 
 class TokenCache:
-    """Keeps tokens and initially decoded geometry per set of views, exactly; of held-out views' sets the cameras alone.
+    """Caches exact tokens and decoded geometry per set of views, or only their cameras.
 
-    The key is a hash of the images and hints themselves, the backend's identity (its weights), options and source, the
-    kind of device and torch's version. Several processes may share the folder.
+    The key is a hash of the images and hints, the backend's identity (its weights), options and source code, the device
+    type and the torch version. Several processes may share the folder.
 
     Args:
-        folder: of the files, made when needed (``~`` is the home folder).
-        max_gb: size that the folder may reach; the files used least recently go first.
+        folder: folder of the files, created when needed; ``~`` is the home folder.
+        max_gb: maximum size of the folder in GB; least recently used files are removed first.
 
     Raises:
         ValueError: if the size is not positive.
@@ -49,7 +49,7 @@ class TokenCache:
 
     @torch.no_grad()
     def read(self, backend: Backend, images: Tensor, hints: Hints | None) -> tuple[Tokens, Geometry]:
-        """Tokens of ``images`` and what they decode to, from the folder or from the backend."""
+        """Returns the tokens of ``images`` and their decoded geometry, from the cache or from the backend."""
 
         def make() -> tuple[Tokens, Geometry]:
             tokens = backend.encode(images, hints)
@@ -58,7 +58,7 @@ class TokenCache:
         return self._kept(cache_key(backend, images, hints), images.device, make)
 
     def cameras(self, backend: Backend, images: Tensor, hints: Hints | None) -> Cameras:
-        """The raw cameras of ``images`` alone, from the folder or from the backend."""
+        """Returns only the raw cameras of ``images``, from the cache or from the backend."""
         key = f"{cache_key(backend, images, hints)}-cameras"
         return self._kept(key, images.device, lambda: backend.predict_cameras(images, hints))
 
@@ -76,10 +76,10 @@ class TokenCache:
                 found = torch.load(path, map_location=device, weights_only=True)
         except FileNotFoundError:
             return None
-        except Exception as error:  # damaged files fail in many ways; all of them are mended by writing it again
+        except Exception as error:  # damaged files fail in many ways; all are fixed by writing the file again
             log.warning("%s cannot be read (%s): made again", path, error)
             return None
-        with suppress(OSError):  # a folder that may only be read
+        with suppress(OSError):  # read-only folder
             os.utime(path)
         return found
 
@@ -92,7 +92,7 @@ class TokenCache:
     def _remove_oldest(self) -> None:
         kept = []
         for file in self.folder.glob("*.pt"):
-            with suppress(OSError):  # another process has removed it
+            with suppress(OSError):  # removed by another process
                 found = file.stat()
                 kept.append((found.st_mtime, found.st_size, file))
         kept.sort()
@@ -106,7 +106,7 @@ class TokenCache:
 
 
 def cache_key(backend: Backend, images: Tensor, hints: Hints | None) -> str:
-    """Hash of everything that decides what the backend makes of these views."""
+    """Returns a hash of everything that determines the backend's output for these views."""
     source = _source(frozenset(base.__module__ for base in type(backend).__mro__))
     made_by = (backend.identity(), _options(backend), source, images.device.type, torch.__version__)
     digest = hashlib.sha256(repr(made_by).encode())
@@ -124,7 +124,7 @@ def cache_key(backend: Backend, images: Tensor, hints: Hints | None) -> str:
 
 
 def _options(backend: Backend) -> list[tuple[str, str, object]]:
-    """Plain attributes of the backend and of all modules in it, such as those of a backend within another."""
+    """Plain attributes of the backend and all its submodules, such as those of nested backends."""
     plain = (bool, int, float, str, tuple, type(None))
     return [
         (path, name, value)
@@ -136,11 +136,11 @@ def _options(backend: Backend) -> list[tuple[str, str, object]]:
 
 @lru_cache
 def _source(modules: frozenset[str]) -> str:
-    """Hash of this package's source, and of the modules that a backend's classes come from: somebody's own too."""
+    """Hash of the source of this package and of the given modules, which may be a user's own."""
     named = {getattr(sys.modules.get(module), "__file__", None) for module in modules}
     files = {*Path(__file__).parent.rglob("*.py"), *(Path(path) for path in named if path)}
     digest = hashlib.sha256()
     for path in sorted(files):
-        with suppress(OSError):  # classes made in a notebook have none
+        with suppress(OSError):  # classes defined in a notebook have no file
             digest.update(path.read_bytes())
     return digest.hexdigest()

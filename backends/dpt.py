@@ -1,4 +1,4 @@
-"""Dense prediction head: four token maps fused coarse to fine into one map at image size."""
+"""Dense prediction head (DPT): fuses four token maps, coarse to fine, into one map at image resolution."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class ResidualUnit(nn.Module):
 
 
 class Fusion(nn.Module):
-    """Adds a finer map to a coarser one, refines, and upsamples."""
+    """Adds a finer map to a coarser one, refines and upsamples the sum."""
 
     def __init__(self, channels: int, rectified_skip: bool, has_finer: bool = True) -> None:
         super().__init__()
@@ -42,35 +42,35 @@ class Fusion(nn.Module):
         self.out_conv = nn.Conv2d(channels, channels, 1)
 
     def forward(self, coarse: Tensor, finer: Tensor | None, size: tuple[int, int]) -> Tensor:
-        """Fuses ``[N, C, h, w]`` maps into one of the given size."""
+        """Fuses ``[N, C, h, w]`` maps, and resizes the result to ``size``."""
         if finer is not None:
             coarse = coarse + self.resConfUnit1(finer)
         return self.out_conv(upsample(self.resConfUnit2(coarse), size))
 
 
 def upsample(x: Tensor, size: tuple[int, int]) -> Tensor:
-    """Bilinear, corners aligned."""
+    """Resizes bilinearly, with aligned corners."""
     return F.interpolate(x, size, mode="bilinear", align_corners=True)
 
 
 def output_layers(channels: int, out: int) -> nn.Sequential:
-    """The last layers: 3x3, ReLU, 1x1."""
+    """Returns the output layers: 3x3 convolution, ReLU, 1x1 convolution."""
     return nn.Sequential(nn.Conv2d(channels, HIDDEN, 3, padding=1), nn.ReLU(), nn.Conv2d(HIDDEN, out, 1))
 
 
 class DPT(nn.Module):
-    """Token maps of four taps to an image-sized map.
+    """Decodes the token maps of four taps into a map at image resolution.
 
     Args:
         token_dim: channels of the tokens.
-        features: width of the fusion stages.
+        features: channels of the fusion stages.
         out_channels: channels of the four projected maps.
-        out: channels of the result.
-        patch_size: pixels per token.
+        out: channels of the output.
+        patch_size: edge of a patch in pixels.
         rectified_skip: see :class:`ResidualUnit`.
-        normalize: whether one LayerNorm, shared by the taps, comes first.
-        position_weight: weight of the sine-cosine coordinates added to the maps; 0 adds none.
-        sky: whether a second output predicts sky from the same fused map.
+        normalize: whether to apply a LayerNorm, shared by all taps, to the tokens first.
+        position_weight: weight of the sine-cosine position embedding added to the maps; 0 adds none.
+        sky: whether to predict sky as one more output channel, from the same fused map.
     """
 
     def __init__(
@@ -127,7 +127,7 @@ class DPT(nn.Module):
         return self._add_position(fused, image_size)
 
     def forward(self, tokens: Sequence[Tensor], grid: tuple[int, int]) -> Tensor:
-        """Maps four ``[N, P, D]`` token maps to ``[N, out, H, W]`` (sky as one channel more) without activation."""
+        """Maps four ``[N, P, D]`` token maps to ``[N, out, H, W]``, plus one channel with ``sky``; no activation."""
         fused = self.fuse(tokens, grid)
         return torch.cat([self.scratch.get_submodule(name)(fused) for name in self.outputs], 1)
 
@@ -138,9 +138,13 @@ class DPT(nn.Module):
 
 
 def in_chunks(head: nn.Module, tokens: Sequence[Tensor], grid: tuple[int, int], chunk: int | None) -> Tensor:
-    """Runs a head over ``[B, V, P, D]`` token maps, at most ``chunk`` views at a time, to ``[B, V, out, H, W]``.
+    """Runs a head over ``[B, V, P, D]`` token maps, at most ``chunk`` views at a time.
 
-    For gradients every chunk is computed again on the way back, so that one chunk's activations are held at a time.
+    With more than one chunk, activations are checkpointed: the backward pass recomputes each chunk, so that only one
+    chunk's activations are in memory at a time.
+
+    Returns:
+        ``[B, V, out, H, W]``.
     """
     flat = [tap.flatten(0, 1) for tap in tokens]
     count = flat[0].shape[0]

@@ -1,4 +1,4 @@
-"""Writes a frozen network as an ONNX bundle with free numbers of scenes, views, rows and columns."""
+"""Export of a frozen network to an ONNX bundle with dynamic numbers of scenes, views, rows and columns."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from vg2gt.types import Cameras, Hints, Tokens
 
 Exportable = VGGTBackend | DA3Backend
 
-TRACED = (2, 3, 4, 6)  # scenes, views, patch rows, patch columns: all different, none 1
+TRACED = (2, 3, 4, 6)  # traced scenes, views, patch rows, patch columns: all different, none 1
 CHECKED = ((1, 1, 3, 2), (1, 2, 2, 5), (2, 4, 3, 3))
-TOLERANCE = 1e-3  # relative; a wrong graph is off by far more, a right one by about 1e-6
+TOLERANCE = 1e-3  # relative error; a correct graph differs by about 1e-6, a wrong one by far more than 1e-3
 
 
 class EncoderGraph(nn.Module):
-    """Images, and cameras where the network takes given poses, to patch tokens ``[B, V, h, w, D]`` and camera token."""
+    """Encoder for export: images, and cameras if used, to patch tokens ``[B, V, h, w, D]`` and a camera token."""
 
     def __init__(self, backend: Exportable) -> None:
         super().__init__()
@@ -49,14 +49,14 @@ class EncoderGraph(nn.Module):
 
 
 class DecoderGraph(nn.Module):
-    """Patch tokens ``[B, V, h, w, D]`` and camera token to depth, confidence and cameras."""
+    """Decoder for export: patch tokens ``[B, V, h, w, D]`` and a camera token to depth, confidence and cameras."""
 
     def __init__(self, backend: Exportable) -> None:
         super().__init__()
         self.backend = backend
 
     def forward(self, *tokens: Tensor) -> tuple[Tensor, ...]:
-        """Decodes all views at once; the camera token comes last."""
+        """Decodes all views at once; the camera token is the last argument."""
         *patch, camera = tokens
         grid = (patch[0].shape[2], patch[0].shape[3])
         size = (grid[0] * self.backend.patch_size, grid[1] * self.backend.patch_size)
@@ -66,19 +66,21 @@ class DecoderGraph(nn.Module):
 
 
 def export(backend: Backend, out: Path) -> Description:
-    """Writes the bundle into a temporary folder, compares it with torch at other sizes, and renames it to ``out``.
+    """Exports a bundle, and verifies it against torch at sizes other than the traced one.
+
+    The bundle is written to a temporary folder, which is renamed to ``out`` at the end.
 
     Args:
-        backend: on the CPU.
-        out: a folder that does not exist yet, or is empty.
+        backend: backend to export, on the CPU.
+        out: output folder; must not exist or be empty.
 
     Returns:
-        What is in the folder's ``backend.json``.
+        The content of the folder's ``backend.json``.
 
     Raises:
-        ValueError: if the backend has no graph to export.
-        FileExistsError: if ``out`` holds something.
-        RuntimeError: if a size was fixed in the graph, or onnxruntime computes something else than torch.
+        ValueError: if the backend cannot be exported.
+        FileExistsError: if ``out`` is not empty.
+        RuntimeError: if a dynamic size was fixed in the graph, or onnxruntime's results differ from torch's.
         ImportError: if ``onnx`` or ``onnxscript`` is not installed.
     """
     if not isinstance(backend, VGGTBackend | DA3Backend):
@@ -124,7 +126,7 @@ def _write(backend: Exportable, folder: Path) -> Description:
 
 
 def example_inputs(backend: Exportable, scenes: int, views: int, rows: int, columns: int) -> tuple[Tensor, ...]:
-    """Random images of the given number of patches and, if the backend takes them, cameras on a line."""
+    """Returns random images with the given number of patches and, if the backend uses them, cameras on a line."""
     size = (rows * backend.patch_size, columns * backend.patch_size)
     images = torch.rand(scenes, views, 3, *size, generator=torch.Generator().manual_seed(0))
     if not backend.needs_hints:
@@ -138,7 +140,11 @@ def example_inputs(backend: Exportable, scenes: int, views: int, rows: int, colu
 def export_graph(
     graph: nn.Module, inputs: tuple[Tensor, ...], names: Sequence[str], results: Sequence[str], file: Path
 ) -> None:
-    """Exports with every axis free whose size differs from the weights' own: all but channels, poses, matrices."""
+    """Exports a graph to ``file``; all axes are dynamic except channels and the rows and columns of matrices.
+
+    Raises:
+        RuntimeError: if a dynamic axis was fixed in the graph.
+    """
     free = tuple(_free_axes(name) for name in names)
     from onnx_ir.passes.common import ClearMetadataAndDocStringPass
 
@@ -165,19 +171,19 @@ def export_graph(
             custom_translation_table={torch.ops.aten.scaled_dot_product_attention.default: _attention},
         )
     assert program is not None
-    ClearMetadataAndDocStringPass()(program.model)  # stack traces with the paths of this machine
+    ClearMetadataAndDocStringPass()(program.model)  # removes stack traces, which hold local paths
     program.save(file)
 
 
 def _attention(query: Any, key: Any, value: Any) -> Any:
-    """Attention ``[B, heads, N, head_dim]`` as onnxruntime's own operator, which never holds the ``N x N`` weights."""
+    """Attention on ``[B, heads, N, head_dim]`` as onnxruntime's operator, which never stores the ``N x N`` weights."""
     from onnx.defs import OpSchema
     from onnxscript import opset18
     from onnxscript.values import Op, Opset
 
-    op: Any = opset18  # its types know constants of every kind only
+    op: Any = opset18  # its type hints reject single constant attributes
     parameter, attribute = OpSchema.FormalParameter, OpSchema.Attribute
-    schema = OpSchema(  # what onnxruntime documents of it, as far as it is used
+    schema = OpSchema(  # the part of onnxruntime's documented schema that is used here
         "MultiHeadAttention",
         "com.microsoft",
         1,
@@ -206,7 +212,7 @@ def _free_axes(name: str) -> dict[int, object]:
 def _compare(
     encoder: EncoderGraph, decoder: DecoderGraph, names: Sequence[str], token_names: Sequence[str], folder: Path
 ) -> dict[str, float]:
-    """Largest max|diff| / max|torch| of every output at other sizes than the traced ones."""
+    """Largest :func:`relative_difference` to torch per part, over all outputs at sizes other than the traced one."""
     worst = {}
     runs = (
         ("encoder", encoder, ENCODER, names, token_names),
@@ -228,7 +234,7 @@ def _compare(
 
 
 def relative_difference(found: Tensor, expected: Tensor) -> float:
-    """max|found - expected| / max|expected|; infinite for other shapes."""
+    """Returns max|found - expected| / max|expected|; infinity if the shapes differ."""
     if found.shape != expected.shape:
         return float("inf")
     return float((found - expected).abs().max() / expected.abs().max())

@@ -1,4 +1,4 @@
-"""A backend around one published network: its weights, its taps, and decoding a few views at a time."""
+"""Base class of backends around one published network, and its pose encoding."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ IMAGENET_STD = (0.229, 0.224, 0.225)
 
 
 def normalize_images(images: Tensor) -> Tensor:
-    """Normalises images ``[..., 3, H, W]`` in [0, 1] by ImageNet's mean and deviation."""
+    """Normalises images ``[..., 3, H, W]`` in [0, 1] with the ImageNet mean and standard deviation."""
     mean, std = (images.new_tensor(values)[:, None, None] for values in (IMAGENET_MEAN, IMAGENET_STD))
     return (images - mean) / std
 
@@ -28,7 +28,10 @@ MIN_TANGENT = 1e-6  # a field of view of 0 would make the focal length infinite
 
 
 def encode_pose(transform: Tensor, intrinsics: Tensor, size: tuple[int, int]) -> Tensor:
-    """Encodes rigid transforms ``[..., 4, 4]`` and intrinsics ``[..., 3, 3]`` as ``[..., 9]``; w >= 0."""
+    """Encodes rigid transforms ``[..., 4, 4]`` and intrinsics ``[..., 3, 3]`` as ``[..., 9]``.
+
+    Channels: translation, quaternion (xyzw, w >= 0), vertical and horizontal field of view in rad.
+    """
     quats = matrix_to_quat(transform[..., :3, :3])
     fields = 2 * torch.atan(size_tensor(size, like=intrinsics) / 2 / intrinsics[..., [1, 0], [1, 0]])
     return torch.cat((transform[..., :3, 3], quats[..., [1, 2, 3, 0]], fields), -1)
@@ -53,33 +56,33 @@ def decode_pose(encoding: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor
 
 
 class NetworkBackend(Backend):
-    """What the networks of VGGT and DA3 share; their constructors take these arguments besides their own.
+    """Base class of the VGGT and DA3 backends, whose constructors share these arguments.
 
     Args:
-        name: used in checkpoints and messages.
-        licence: of the weights.
+        name: name in checkpoints and messages.
+        licence: licence of the weights.
         dim: channels C of the blocks.
         num_heads: attention heads.
-        taps: four blocks (VGGT: pairs of blocks) whose tokens feed the heads.
-        features: DPT width.
+        taps: indices of four blocks (VGGT: pairs of blocks) whose tokens feed the heads, ascending.
+        features: channels of the DPT's fusion stages.
         out_channels: DPT channels of the four taps.
         image_size: native image edge.
-        patch_size: in pixels.
-        pretrained: whether to load weights; random ones (by ``seed``) otherwise.
+        patch_size: edge of a patch in pixels.
+        pretrained: whether to load weights, otherwise random ones.
         repo: Hugging Face repository of the weights.
-        revision: its branch, tag or commit.
-        path: local weight file or folder instead.
-        prefix: of the names in the file.
-        seed: of random weights.
-        head_chunk: views decoded at a time; None decodes all at once.
+        revision: branch, tag or commit of the repository.
+        path: local weight file or folder, instead of the repository.
+        prefix: prefix of the names in the file.
+        seed: seed of random weights.
+        head_chunk: maximum number of views to decode at a time; None decodes all at once.
         compile: whether to ``torch.compile`` the backbone.
-        freeze: whether nothing of it is trained. Otherwise all but its cameras is, which stay constants, as does its
-            first geometry; checkpoints then hold it.
+        freeze: whether to freeze the network. Otherwise all of it except the camera head is trained, and checkpoints
+            include it. Cameras and initial geometry are treated as constants.
     """
 
     network: Any
-    backbone_name: str  # of the module that makes tokens
-    camera_name = ""  # of the module that makes cameras of them
+    backbone_name: str  # name of the submodule that computes tokens
+    camera_name = ""  # name of the submodule that decodes cameras
 
     def _build(
         self,
@@ -90,7 +93,7 @@ class NetworkBackend(Backend):
         compile: bool = False,
         freeze: bool = True,
     ) -> None:
-        """Ends the constructor: makes the network with its weights and freezes it."""
+        """Builds the network with its weights and freezes it; last call of the constructor."""
         if list(taps) != sorted(set(taps)):
             raise ValueError(f"backend.taps={list(taps)} must ascend: the heads take shallow layers first")
         self.taps = tuple(taps)
@@ -109,7 +112,7 @@ class NetworkBackend(Backend):
             self.network.get_submodule(self.camera_name).requires_grad_(False)
 
     def encode(self, images: Tensor, hints: Hints | None = None) -> Tokens:
-        """See :meth:`Backend.encode`; ``hints.cameras`` are needed, and used, where the network takes given poses."""
+        """See :meth:`Backend.encode`; ``hints.cameras`` are required and used if the network takes given poses."""
         self.check_images(images)
         if self.needs_hints:
             hints = self.require_hints(images, hints, "cameras")
@@ -117,7 +120,7 @@ class NetworkBackend(Backend):
             return self.encode_checked(images, hints)
 
     def encode_checked(self, images: Tensor, hints: Hints | None) -> Tokens:
-        """Encodes what :meth:`encode` has checked: tensor operations only, so that it can be exported."""
+        """Encodes inputs checked by :meth:`encode`, with tensor operations only so that it can be exported."""
         raise NotImplementedError
 
     def decode(self, tokens: Tokens) -> Geometry:
@@ -125,13 +128,13 @@ class NetworkBackend(Backend):
         return self.network.decode(tokens, self.head_chunk)
 
     def decode_cameras(self, tokens: Tokens) -> Cameras:
-        """See :meth:`Backend.decode_cameras`; the depth head stays idle."""
+        """See :meth:`Backend.decode_cameras`; does not run the depth head."""
         return self.network.decode_cameras(tokens)
 
 
 @torch.no_grad()
 def predict(layer: nn.Module, bias: Sequence[float]) -> None:
-    """Makes a last layer with random weights predict about ``bias``: so cameras look forward, with sensible fields."""
+    """Initialises an output layer to predict about ``bias``, such as forward cameras with sensible fields of view."""
     assert isinstance(layer, nn.Linear)
     layer.weight.mul_(0.1)
     layer.bias.copy_(layer.bias.new_tensor(bias))

@@ -1,4 +1,4 @@
-"""A backend from an ONNX bundle: the encoder runs in onnxruntime, the decoder is a torch module with gradients."""
+"""Backend from an ONNX bundle: the encoder runs in onnxruntime, the decoder is a differentiable torch module."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ CUDA, CPU = "CUDAExecutionProvider", "CPUExecutionProvider"
 
 
 class OnnxBackend(Backend):
-    """The network of a folder written by ``vg2gt export``.
+    """Network exported by ``vg2gt export``.
 
-    Name, licence and identity are those of the exported network, so checkpoints fit both. Without
-    ``decoder.safetensors`` in the folder, ``decode`` runs ``decoder.onnx`` and has no gradient.
+    Name, licence and identity are those of the exported network, so both accept the same checkpoints. If the folder has
+    no ``decoder.safetensors``, ``decode`` runs ``decoder.onnx`` and is not differentiable.
 
     Args:
-        path: the folder.
-        provider: where the encoder runs; ``auto`` takes the GPU if onnxruntime has the provider for it.
-        head_chunk: views decoded at a time by the torch decoder; None decodes all at once.
+        path: folder of the bundle.
+        provider: where to run the encoder; ``auto`` uses the GPU if onnxruntime has the CUDA provider.
+        head_chunk: maximum number of views that the torch decoder decodes at a time; None decodes all at once.
 
     Raises:
-        FileNotFoundError: if ``path`` is no bundle or lacks a file.
+        FileNotFoundError: if ``path`` is not a bundle or lacks a file.
         ValueError: if a file is damaged or does not fit, or the provider is unknown.
         RuntimeError: if the provider is not available.
     """
@@ -99,17 +99,17 @@ class OnnxBackend(Backend):
 
 
 def open_session(file: Path, provider: Provider) -> onnxruntime.InferenceSession:
-    """Opens an ONNX file on the GPU of this process or on the CPU, with torch's number of threads.
+    """Opens an ONNX file on this process's GPU or on the CPU, with torch's number of threads.
 
     Raises:
-        ValueError: if onnxruntime refuses the file.
-        RuntimeError: if ``cuda`` is wanted and not available.
+        ValueError: if onnxruntime cannot open the file.
+        RuntimeError: if ``provider`` is ``cuda`` and not available.
     """
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = torch.get_num_threads()
     providers: list[str | tuple[str, dict[str, str]]] = [CPU]
     if provider != "cpu" and CUDA in onnxruntime.get_available_providers():
-        # Float32 as torch has it, not TF32; under distributed training every process has its own GPU.
+        # Plain float32 as in torch, not TF32. In distributed training, every process has its own GPU.
         providers.insert(0, (CUDA, {"device_id": os.environ.get("LOCAL_RANK", "0"), "use_tf32": "0"}))
     try:
         session = onnxruntime.InferenceSession(str(file), options, providers=providers)
@@ -126,7 +126,7 @@ def open_session(file: Path, provider: Provider) -> onnxruntime.InferenceSession
 def run_session(
     session: onnxruntime.InferenceSession, inputs: Mapping[str, Tensor], outputs: Sequence[str]
 ) -> list[Tensor]:
-    """Runs a session on float32 tensors; the named outputs lie on the device of the inputs, without gradient."""
+    """Runs a session on tensors cast to float32; returns the named outputs on the inputs' device, without gradient."""
     device = next(iter(inputs.values())).device
     feeds = {name: value.detach().float().cpu().contiguous().numpy() for name, value in inputs.items()}
     return [torch.from_numpy(value).to(device) for value in session.run(list(outputs), feeds)]

@@ -1,8 +1,8 @@
-"""A simulated foundation model: the data's depth and cameras, made worse; no weights to download.
+"""Simulated foundation model: predicts ground-truth depth and cameras plus noise; needs no weights.
 
-As in a real one, depth errs smoothly in the image plane, differently in every view, with a confidence that knows about
-it; the tokens carry what the network believes, never the truth; and a change of the tokens changes the decoded depth
-smoothly. So token enhancement can be trained and measured.
+It behaves like a real model, so that token enhancement can be trained and measured. Depth errors are smooth in the
+image plane, differ between views and lower the confidence. Tokens encode the predicted geometry, never the ground
+truth, and the decoded depth changes smoothly with them.
 """
 
 from __future__ import annotations
@@ -28,39 +28,40 @@ SMOOTH_SHARE, VIEW_SHARE = 0.8, 0.6  # 0.8^2 + 0.6^2 = 1
 BLEED_THRESHOLD = 0.02
 INVALID_CONFIDENCE = 1e-3
 CELLS = 2  # the depth residual has CELLS x CELLS values per patch
-WAVELENGTHS = (1.0, 0.5, 0.25)  # of the encoded place of a patch, in median depths
+WAVELENGTHS = (1.0, 0.5, 0.25)  # of the position encoding of patches, in median depths
 GEOMETRY_CHANNELS = CELLS * CELLS + 1 + 3 + 3 + 3 + 6 * len(WAVELENGTHS)
 
 
 class OracleBackend(Backend):
     """Simulated VFM (needs hints).
 
-    Depth is ``gt * (1 + depth_noise * (0.8 s + 0.6 c))`` with a smooth field s (bicubic from 4x8 normal values, unit
-    deviation) and one normal value c per view, then bleeds over depth edges as decoded depth does. Confidence is
-    ``1 + 4 exp(-|relative error| / max(depth_noise, 0.01))`` times log-normal noise. Camera rotations err by
-    ``0.5 * pose_noise`` rad and positions by ``pose_noise`` median depths of their view, per axis; view 0 is exact.
-    All noise is seeded by (seed, scene, frame), whatever the order or number of views. With ``drift`` the unit of views
-    that are given together is off by up to this share, one factor for depth and positions, seeded by all their frames.
+    Depth is ``gt * (1 + depth_noise * (0.8 s + 0.6 c))``, where s is a smooth field of unit deviation (bicubic from 4x8
+    normal values) and c is one normal value per view. It is then blurred at depth edges, as in decoded depth.
+    Confidence is 1 plus ``4 exp(-|relative error| / max(depth_noise, 0.01))`` times log-normal noise. Standard
+    deviations of the camera errors, per axis, are ``0.5 * pose_noise`` rad for rotations and ``pose_noise`` median
+    depths of the view for positions; view 0 is exact. The noise of a view is seeded by (seed, scene, frame) and does
+    not depend on the order and number of views. ``drift`` scales depth and positions of all views given together by one
+    random factor in ``1 +- drift``, seeded by their frames.
 
-    Tokens mix, by a fixed rotation of the channels, the image features of a small frozen random ViT and the predicted
-    geometry of the patch. ``decode`` multiplies the depth by ``exp(response * u)``, u the bicubically upsampled mean
-    over the taps of a fixed random projection of the token change: a change of independent unit-variance channels
-    gives u about unit variance.
+    Tokens concatenate the image features of a small frozen random ViT with the predicted geometry of the patch, and mix
+    the channels by a fixed rotation. ``decode`` multiplies depth by ``exp(response * u)``, where u is a fixed random
+    projection of the token change, averaged over the taps and upsampled bicubically. A change with independent
+    unit-variance channels gives u about unit variance.
 
     Args:
-        patch_size: in pixels.
-        dim: channels of a token; at least twice the 32 geometry channels.
-        taps: tapped layers.
+        patch_size: edge of a patch in pixels.
+        dim: channels of a token; a multiple of 4 and at least twice the 32 geometry channels.
+        taps: number of tapped layers.
         depth_noise: standard deviation of the relative depth error.
         pose_noise: see above; None means ``0.1 * depth_noise``.
-        response: log-depth answer to a unit change of the tokens.
-        drift: see above.
-        background: depth given to pixels without depth, such as the sky, in multiples of their scene's deepest, with
-            the least confidence; None leaves them without.
-        seed: of the noise and of the frozen weights.
+        response: change of log-depth per unit change of the tokens.
+        drift: see above; in [0, 1).
+        background: depth of pixels without ground truth, such as sky, in multiples of the scene's largest depth; at
+            least 1. They get the lowest confidence. None leaves them without depth.
+        seed: seed of the noise and of the frozen weights.
 
     Raises:
-        ValueError: if ``dim`` is too small, a noise level is negative or the background not behind the scene.
+        ValueError: if ``dim`` does not fit, or a noise level, ``drift`` or ``background`` is out of range.
     """
 
     needs_depth: ClassVar[bool] = True
@@ -103,13 +104,13 @@ class OracleBackend(Backend):
         self.mixing = nn.Parameter(mixing)
         self.readout = nn.Parameter(readout)
         self.freeze()
-        # Not the weights' own digest: the last bits of a QR decomposition depend on the machine and its threads.
+        # Do not hash the weights: the last bits of a QR decomposition depend on the machine and number of threads.
         made_of = f"oracle {patch_size} {dim} {taps} {seed}"
         self._identity = {"name": self.name, "weights": hashlib.sha256(made_of.encode()).hexdigest()}
 
     @torch.no_grad()
     def encode(self, images: Tensor, hints: Hints | None = None) -> Tokens:
-        """Simulates the backbone; see :meth:`Backend.encode`. The world frame is view 0's, the unit the data's."""
+        """Simulates the backbone; see :meth:`Backend.encode`. The world frame is that of view 0, in the data's unit."""
         self.check_images(images)
         hints = self.require_hints(images, hints, "depth", "cameras", "scene_key", "frame_ids")
         assert hints.depth is not None
@@ -134,7 +135,7 @@ class OracleBackend(Backend):
         return Tokens(patch, camera, grid, (height, width), state)
 
     def decode(self, tokens: Tokens) -> Geometry:
-        """Answers token changes with a smooth log-depth residual; see :meth:`Backend.decode`."""
+        """Decodes token changes as a smooth log-depth residual; see :meth:`Backend.decode`."""
         depth, cameras = tokens.state["depth"], tokens.state["cameras"]
         rows, columns = tokens.grid
         with full_precision(depth):
@@ -149,7 +150,7 @@ class OracleBackend(Backend):
 
     @torch.no_grad()
     def predict_cameras(self, images: Tensor, hints: Hints | None = None) -> Cameras:
-        """See :meth:`Backend.predict_cameras`; no token and no depth is made."""
+        """See :meth:`Backend.predict_cameras`; computes no tokens and no depth."""
         self.check_images(images)
         hints = self.require_hints(images, hints, "depth", "cameras", "scene_key", "frame_ids")
         assert hints.depth is not None
@@ -161,7 +162,7 @@ class OracleBackend(Backend):
             return self._predict_cameras(scale_translations(hints.cameras, unit), depth, poses)
 
     def _unit(self, hints: Hints, like: Tensor) -> Tensor:
-        """The factor ``[B]`` of ``drift``; exactly 1 without."""
+        """Scale factor ``[B]`` from ``drift``; exactly 1 if it is 0."""
         assert hints.frame_ids is not None
         factors = []
         for scene, frames in zip(hints.scene_key, hints.frame_ids.tolist(), strict=True):
@@ -170,14 +171,14 @@ class OracleBackend(Backend):
         return like.new_tensor(factors)
 
     def _draw(self, hints: Hints, size: tuple[int, int], like: Tensor) -> _Noise:
-        """Draws the noise of every view from its own generator."""
+        """Draws the noise of every view from a generator of its own."""
         fields, constants, poses, confidences = self._draw_parts(hints, 4, size, like)
         smooth = F.interpolate(fields, size, mode="bicubic", align_corners=True)
         smooth = smooth / smooth.std((-2, -1), keepdim=True)
         return _Noise(SMOOTH_SHARE * smooth + VIEW_SHARE * constants, poses, confidences)
 
     def _draw_parts(self, hints: Hints, count: int, size: tuple[int, int], like: Tensor) -> list[Tensor]:
-        """The first ``count`` parts of all views' noise, each ``[B, V, ...]``."""
+        """First ``count`` parts of the noise of all views, each ``[B, V, ...]``."""
         assert hints.frame_ids is not None
         views = [
             [self._draw_view(scene, frame, size)[:count] for frame in frames]
@@ -193,11 +194,11 @@ class OracleBackend(Backend):
         return tuple(rng.standard_normal(shape, dtype=np.float32) for shape in shapes)
 
     def _predict_cameras(self, cameras: Cameras, depth: Tensor, pose_noise: Tensor) -> Cameras:
-        """Moves every camera but the first a little in its own frame, then the world into view 0's frame."""
+        """Perturbs every camera but the first in its own frame; the world frame becomes that of view 0."""
         turn = self.pose_noise * 0.5 * pose_noise[..., :3]
         shift = self.pose_noise * pose_noise[..., 3:] * _median_depth(depth, per_view=True)[..., None]
         half = turn / 2
-        quats = torch.cat((torch.ones_like(half[..., :1]), half), -1)  # the angle is small: tan is its argument
+        quats = torch.cat((torch.ones_like(half[..., :1]), half), -1)  # small angles: tan(x) = x
         error = torch.eye(4, dtype=depth.dtype, device=depth.device).repeat(*depth.shape[:2], 1, 1)
         error[..., :3, :3] = quat_to_matrix(quats)
         error[..., :3, 3] = shift
@@ -211,7 +212,7 @@ class OracleBackend(Backend):
         return torch.where(depth > 0, confidence, INVALID_CONFIDENCE)
 
     def _tokens(self, images: Tensor, geometry: Tensor) -> tuple[Tensor, ...]:
-        """Image features of every tapped block next to the geometry ``[B, V, P, 32]``, channels mixed."""
+        """Mixes the image features of every tapped block with the geometry ``[B, V, P, 32]``."""
         features = self.patch_embed((images.flatten(0, 1) - 0.5) * 4)
         tokens = []
         for block, mixing in zip(self.blocks, self.mixing, strict=True):
@@ -222,7 +223,7 @@ class OracleBackend(Backend):
 
 
 class _Noise(NamedTuple):
-    """Standard normal noise of B scenes with V views."""
+    """Noise of B scenes with V views, all of unit variance."""
 
     relative: Tensor  # [B, V, H, W]
     pose: Tensor  # [B, V, 6]
@@ -230,14 +231,14 @@ class _Noise(NamedTuple):
 
 
 def _median_depth(depth: Tensor, per_view: bool = False) -> Tensor:
-    """Median of the valid depth ``[B, V, H, W]`` of every scene ``[B]`` or view ``[B, V]``; 1 where none is valid."""
+    """Median of the valid depth ``[B, V, H, W]`` per scene ``[B]`` or view ``[B, V]``; 1 if none is valid."""
     flat = depth.flatten(2 if per_view else 1)
     median = torch.where(flat > 0, flat, torch.nan).nanmedian(-1).values
     return median.nan_to_num(1.0)
 
 
 def _bleed(depth: Tensor) -> Tensor:
-    """Moves depth ``[B, V, H, W]`` half way to its 3x3 mean where the two differ by more than 2 %: soft edges."""
+    """Blurs depth edges: averages ``[B, V, H, W]`` with its 3x3 mean where they differ by more than 2 %."""
     padded = F.pad(depth, (1, 1, 1, 1), mode="replicate")
     share = F.avg_pool2d((padded > 0).to(depth), 3, 1)
     mean = F.avg_pool2d(padded, 3, 1) / share.clamp_min(1e-6)
@@ -246,10 +247,10 @@ def _bleed(depth: Tensor) -> Tensor:
 
 
 def _describe_patches(depth: Tensor, confidence: Tensor, cameras: Cameras, grid: tuple[int, int]) -> Tensor:
-    """What the simulated network believes of every patch, ``[B, V, P, 32]``, channels of order one.
+    """Geometry that the simulated network predicts per patch, ``[B, V, P, 32]``, channels of order one.
 
-    Log-depth of 2x2 cells and log-confidence, the patch's place (also as sines and cosines) and ray direction, the
-    camera's place; lengths in median depths.
+    Channels: log-depth of 2x2 cells, log-confidence, position, ray direction and camera position of the patch, and
+    sines and cosines of its position. Lengths are in median depths of the scene.
     """
     unit = _median_depth(depth)[:, None, None, None]
     cells = (grid[0] * CELLS, grid[1] * CELLS)
@@ -274,7 +275,7 @@ def _describe_patches(depth: Tensor, confidence: Tensor, cameras: Cameras, grid:
 
 
 def _describe_cameras(cameras: Cameras, unit: Tensor) -> Tensor:
-    """Pose and intrinsics as ``[B, V, 20]`` numbers of order one."""
+    """Pose and intrinsics as ``[B, V, 20]``, channels of order one."""
     poses = cameras.world_to_camera.clone()
     poses[..., :3, 3] /= unit[:, None, None]
     intrinsics = cameras.intrinsics[..., :2, :] / max(cameras.size)

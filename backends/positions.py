@@ -1,4 +1,4 @@
-"""Position embeddings, also rotary ones, written as dense products so that sizes stay free under export."""
+"""Position embeddings, including rotary ones, as dense products so that sizes stay dynamic in an export."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ Resampling = Literal["size", "scale"]
 
 
 def resize_position_embedding(embedding: Tensor, grid: tuple[int, int], resampling: Resampling) -> Tensor:
-    """Bicubic resize of a square position embedding to another patch grid, as one matrix product per axis.
+    """Resizes a square position embedding bicubically to a patch grid, as one matrix product per axis.
 
     Args:
         embedding: ``[side * side, C]``, row major.
-        grid: wanted ``(rows, columns)``.
-        resampling: ``size`` samples by the ratio of the sizes with an antialiasing kernel (VGGT); ``scale`` samples by
-            the scale factor ``(n + 0.1) / side`` without antialiasing and leaves the native grid alone (DA3).
+        grid: target ``(rows, columns)``.
+        resampling: ``size`` resamples by the ratio of the sizes with antialiasing (VGGT). ``scale`` resamples by the
+            scale factor ``(n + 0.1) / side`` without antialiasing, and leaves the native grid unchanged (DA3).
 
     Returns:
         ``[rows * columns, C]``.
@@ -30,7 +30,7 @@ def resize_position_embedding(embedding: Tensor, grid: tuple[int, int], resampli
     if resampling == "size":
         weights = [_antialiased_weights(centers, side) for centers in (rows, columns)]
     else:
-        # Sizes as tensors: a Python comparison would fix them under export.
+        # Compare as tensors: a Python comparison would fix the sizes in an export.
         native = (rows[-1] + 0.5 == side) & (columns[-1] + 0.5 == side)
         offset = torch.where(native, 0.0, 0.1)
         weights = [_clamped_weights(centers, offset, side) for centers in (rows, columns)]
@@ -40,7 +40,7 @@ def resize_position_embedding(embedding: Tensor, grid: tuple[int, int], resampli
 
 
 def size_tensor(size: tuple[int, int], like: Tensor) -> Tensor:
-    """``size`` as a tensor ``[2]`` without reading the numbers, which would fix them under export."""
+    """Returns ``size`` as a tensor ``[2]`` without reading its values, which would fix them in an export."""
     return torch.stack([torch.full((), length, dtype=like.dtype, device=like.device) for length in size])
 
 
@@ -53,7 +53,7 @@ def _cubic(distance: Tensor, a: float) -> Tensor:
 
 
 def _antialiased_weights(centers: Tensor, side: int) -> Tensor:
-    """``[n, side]`` weights with a kernel (a = -1/2) that widens when shrinking and is cut at the border."""
+    """Weights ``[n, side]`` of a kernel (a = -1/2) that widens when downsampling and is truncated at the border."""
     scale = side / (centers[-1] + 0.5)
     sources = torch.arange(side, device=centers.device, dtype=centers.dtype) + 0.5
     weights = _cubic((sources - centers[:, None] * scale) / scale.clamp_min(1), a=-0.5)
@@ -61,7 +61,7 @@ def _antialiased_weights(centers: Tensor, side: int) -> Tensor:
 
 
 def _clamped_weights(centers: Tensor, offset: Tensor, side: int) -> Tensor:
-    """``[n, side]`` weights with a fixed kernel (a = -3/4) over a border-replicated source."""
+    """Weights ``[n, side]`` of a fixed kernel (a = -3/4) over a border-replicated source."""
     positions = centers * (side / (centers[-1] + 0.5 + offset)) - 0.5
     sources = torch.arange(-2, side + 2, device=centers.device, dtype=centers.dtype)
     weights = _cubic(sources - positions[:, None], a=-0.75)
@@ -71,10 +71,16 @@ def _clamped_weights(centers: Tensor, offset: Tensor, side: int) -> Tensor:
 
 
 def uv_embedding(channels: int, size: tuple[int, int], image_size: tuple[int, int], like: Tensor) -> Tensor:
-    """Sine-cosine embedding ``[channels, h, w]`` of normalised image coordinates, half of the channels for each axis.
+    """Returns a sine-cosine embedding ``[channels, h, w]`` of normalised image coordinates.
 
-    Coordinates are those of pixel centres in an image of ``image_size`` whose half diagonal is 1; wavelengths grow
-    geometrically to 100 times the shortest. ``channels`` is a multiple of 4.
+    Coordinates are those of pixel centres, normalised so that half the diagonal of ``image_size`` is 1. Wavelengths
+    grow geometrically up to nearly 100 times the shortest.
+
+    Args:
+        channels: number of channels, a multiple of 4; half of them for each axis.
+        size: size ``(h, w)`` of the embedding.
+        image_size: image ``(height, width)``.
+        like: tensor whose dtype and device to use.
     """
     extent = size_tensor(image_size, like).double()
     y_extent, x_extent = (extent / extent.norm()).unbind()
@@ -82,13 +88,13 @@ def uv_embedding(channels: int, size: tuple[int, int], image_size: tuple[int, in
     quarter = channels // 4
     omega = 100.0 ** (-torch.arange(quarter, device=like.device, dtype=torch.float64) / quarter)
     columns, rows = omega[:, None, None] * (x * x_extent), omega[:, None, None] * (y * y_extent)[:, None]
-    # A coordinate's waves are the same along the other axis: computed once, then repeated.
+    # Waves are constant along the other axis: compute them once, then expand.
     waves = [torch.cat((phase.sin(), phase.cos())).to(like.dtype) for phase in (columns, rows)]
     return torch.cat([wave.expand(-1, *size) for wave in waves])
 
 
 def _centered(length: int, device: torch.device) -> Tensor:
-    """Pixel centres from ``-(n - 1) / n`` to ``(n - 1) / n`` in float64."""
+    """Pixel centres from ``-(n - 1) / n`` to ``(n - 1) / n``, in float64."""
     return (2 * torch.arange(length, device=device, dtype=torch.float64) + 1) / length - 1
 
 
@@ -97,19 +103,19 @@ Rotary = tuple[Tensor, Tensor]
 
 
 def grid_positions(height: int, width: int, like: Tensor) -> Tensor:
-    """Integer patch positions ``[height * width, 2]`` as (y, x), row major, starting at 0."""
+    """Returns patch positions ``[height * width, 2]`` as (y, x), row major, starting at 0."""
     y = torch.arange(height, device=like.device, dtype=torch.float32)
     x = torch.arange(width, device=like.device, dtype=torch.float32)
     return torch.stack((y[:, None].expand(height, width), x[None].expand(height, width)), -1).flatten(0, 1)
 
 
 def rotary_2d(positions: Tensor, head_dim: int, base: float = 100.0) -> Rotary:
-    """Rotation tables of 2D positions: the first half of the channels turns with y, the second with x.
+    """Returns rotary embedding tables of 2D positions: the first half of the channels encodes y, the second x.
 
     Args:
         positions: ``[..., N, 2]`` as (y, x).
         head_dim: channels of one attention head, a multiple of 4.
-        base: wavelength base; channel pair i of each half turns by ``position * base ** (-4 i / head_dim)``.
+        base: base of the wavelengths; channel pair i of each half rotates by ``position * base ** (-4 i / head_dim)``.
 
     Returns:
         Cosines and sines ``[..., N, head_dim]`` in float32.

@@ -1,4 +1,4 @@
-"""Transformer parts that the frozen networks share: attention, feed-forward layers, blocks."""
+"""Transformer layers shared by the frozen networks: attention, feed-forward layers, blocks."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ FeedForward = Literal["mlp", "swiglu"]
 
 
 class Attention(nn.Module):
-    """Multi-head self-attention, optionally with normalised queries and keys and rotary positions."""
+    """Multi-head self-attention, optionally with normalised queries and keys and rotary position embedding."""
 
     def __init__(self, dim: int, num_heads: int, qk_norm: bool = False) -> None:
         super().__init__()
@@ -31,13 +31,13 @@ class Attention(nn.Module):
         query, key = self.q_norm(query), self.k_norm(key)
         if rotary is not None:
             query, key = rotate(query, rotary), rotate(key, rotary)
-        # Under autocast the normalised queries may stay float32: the three must agree.
+        # Under autocast, normalised queries and keys may stay float32, but the three dtypes must match.
         out = F.scaled_dot_product_attention(query.to(value.dtype), key.to(value.dtype), value)
         return self.proj(out.transpose(1, 2).flatten(2))
 
 
 class ViTMLP(nn.Module):
-    """Two linear layers with a GELU between."""
+    """Two linear layers with GELU in between."""
 
     def __init__(self, dim: int, hidden: int, out: int | None = None) -> None:
         super().__init__()
@@ -65,7 +65,7 @@ class SwiGLU(nn.Module):
 
 
 class LayerScale(nn.Module):
-    """One factor per channel."""
+    """Learned scale per channel."""
 
     def __init__(self, dim: int, value: float) -> None:
         super().__init__()
@@ -77,10 +77,18 @@ class LayerScale(nn.Module):
 
 
 class ViTBlock(nn.Module):
-    """Pre-norm transformer block: attention, then feed-forward, each scaled and added.
+    """Pre-norm transformer block: attention and feed-forward layer, each with LayerScale and a residual connection.
 
-    ``ffn`` is four times as wide as ``dim`` (before the SwiGLU's two thirds), ``layer_scale`` the initial one, and
-    ``eps`` that of the two block norms (norms of queries and keys always have 1e-5).
+    Args:
+        dim: channels of the tokens.
+        num_heads: attention heads.
+        qk_norm: whether to normalise queries and keys, with eps 1e-5.
+        ffn: feed-forward layer, with hidden width ``4 * dim`` (two thirds of that for SwiGLU).
+        layer_scale: initial value of LayerScale.
+        eps: eps of the two block norms.
+
+    Raises:
+        ValueError: if ``ffn`` is unknown.
     """
 
     def __init__(
@@ -121,5 +129,5 @@ class PatchEmbed(nn.Module):
 
 
 def first_and_others(tokens: Tensor, views: int) -> Tensor:
-    """Spreads two learned tokens ``[1, 2, ...]``, of the first and of every other view, to ``[1, V, ...]``."""
+    """Expands two learned tokens ``[1, 2, ...]``, for the first and for all other views, to ``[1, V, ...]``."""
     return tokens[:, (torch.arange(views, device=tokens.device) > 0).long()]

@@ -1,4 +1,4 @@
-"""Finding, reading and strictly loading published weights. Nothing is ever unpickled."""
+"""Finding, reading and strict loading of published weights. Never unpickles code."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ Network = TypeVar("Network", bound=nn.Module)
 
 @dataclass(frozen=True)
 class Weights:
-    """Where the weights of a network come from.
+    """Source of a network's weights.
 
     Attributes:
         name: backend name for messages.
-        licence: of the weights; printed when they are loaded.
-        pretrained: whether to load published weights, or make seeded random ones.
+        licence: licence of the weights, printed when they are loaded.
+        pretrained: whether to load published weights, otherwise seeded random ones.
         repo: Hugging Face repository.
-        revision: its branch, tag or commit; None for the newest.
-        path: a local file, or a folder with ``model.safetensors`` or ``model.pt``, instead of the repository.
-        seed: of random weights.
-        prefix: what the keys in the file begin with, before the network's own names.
-        ignorable: beginnings of keys that the file may have and the network does not need.
+        revision: branch, tag or commit of the repository; None for the newest.
+        path: local file, or folder with ``model.safetensors`` or ``model.pt``, instead of the repository.
+        seed: seed of random weights.
+        prefix: prefix of the keys in the file, before the network's own names.
+        ignorable: prefixes of keys that may be in the file but not in the network.
     """
 
     name: str
@@ -53,7 +53,8 @@ class Weights:
 
         Raises:
             FileNotFoundError: if the weights cannot be found.
-            ValueError: if they do not fit.
+            ImportError: if they must be downloaded and ``huggingface_hub`` is not installed.
+            ValueError: if they do not fit, or ``path`` is given without ``pretrained``.
         """
         if not self.pretrained:
             if self.path is not None:
@@ -72,11 +73,11 @@ class Weights:
 
 
 def find_weights(name: str, repo: str | None, revision: str | None, path: str | None) -> Path:
-    """The weight file: ``path`` if given, else from the hub's cache or the hub.
+    """Returns the weight file: ``path`` if given, else from the Hugging Face Hub or its local cache.
 
     Raises:
-        FileNotFoundError: naming the file, the repository and the way out.
-        ImportError: if the hub is needed and ``huggingface_hub`` is not installed.
+        FileNotFoundError: if it cannot be found or downloaded.
+        ImportError: if the Hub is needed and ``huggingface_hub`` is not installed.
     """
     remedy = f"give backend.path=FILE_OR_FOLDER, or backend.pretrained=false for random weights (repository: {repo})"
     if path is not None:
@@ -97,9 +98,9 @@ def find_weights(name: str, repo: str | None, revision: str | None, path: str | 
         ) from error
     print(f"{name}: looking for {repo} on the hub or in its cache", file=sys.stderr)
     try:
-        with _quiet("huggingface_hub"):  # every attempt would be told in several lines
+        with _quiet("huggingface_hub"):  # logs several lines per attempt
             return Path(hf_hub_download(repo, WEIGHT_FILES[0], revision=revision))
-    except Exception as error:  # the hub raises its own, requests' and httpx's errors
+    except Exception as error:  # raises its own errors and those of requests and httpx
         raise FileNotFoundError(
             f"cannot get {WEIGHT_FILES[0]} of {repo} (revision {revision or 'newest'}) for backend {name}: "
             f"{_reason(error)}. Check the network, the revision and the cache, or {remedy}"
@@ -108,7 +109,7 @@ def find_weights(name: str, repo: str | None, revision: str | None, path: str | 
 
 @contextmanager
 def _quiet(name: str) -> Iterator[None]:
-    """Leaves out a package's warnings: what is wrong is in the error."""
+    """Silences the warnings of a package, as the error says what is wrong."""
     logger = logging.getLogger(name)
     level = logger.level
     logger.setLevel(logging.ERROR)
@@ -119,7 +120,7 @@ def _quiet(name: str) -> Iterator[None]:
 
 
 def _reason(error: BaseException) -> str:
-    """What the hub's client says, in one line; of a file not in the cache, also why it could not be fetched."""
+    """The Hub client's message in one line; for a file not in the cache, also the reason why the download failed."""
     root = error
     while isinstance(error, FileNotFoundError) and root.__cause__ is not None:
         root = root.__cause__
@@ -134,17 +135,17 @@ def _has_bad_numbers(tensor: Tensor) -> bool:
 def load_strictly(
     network: nn.Module, state: Mapping[str, Tensor], prefix: str, ignorable: Sequence[str], source: str
 ) -> None:
-    """Loads ``state`` into ``network``: every tensor must fit, and only ignorable ones may be left over.
+    """Loads ``state`` into ``network``; every tensor must fit, and only ignorable ones may be left over.
 
     Args:
-        network: takes the tensors themselves, so it may be on the meta device.
+        network: network to load into. The tensors are assigned, so it may be on the meta device.
         state: tensors by name.
-        prefix: what the names in ``state`` begin with, before the network's own.
-        ignorable: beginnings of names in ``state`` that may be left over.
-        source: for messages.
+        prefix: prefix of the names in ``state``, before the network's own names.
+        ignorable: prefixes of names in ``state`` that may be left over.
+        source: name of the file, for messages.
 
     Raises:
-        ValueError: naming the first tensors that are missing, misshapen, unexpected or not finite.
+        ValueError: if tensors are missing, misshapen, unexpected or not finite; names the first of them.
     """
     wanted = {prefix + key: value for key, value in network.state_dict().items()}
     complaints = [f"missing {key} {list(value.shape)}" for key, value in wanted.items() if key not in state]

@@ -1,14 +1,16 @@
-"""VG²GT against the baselines: ``python benchmarks/baselines.py [steps=N] [seeds=N] [overrides of train.yaml]``.
+"""VG²GT compared with baselines: ``python benchmarks/baselines.py [steps=N] [seeds=N] [overrides of train.yaml]``.
 
-Every model is trained from scratch for the same number of steps on the same backbone, losses, batches and machine, and
-evaluated on the same held-out scenes: VG²GT, VG²GT with finer voxels (about 40 % of the pixel-aligned Gaussians), VG²GT
-without its coarse module (which separates the voxels' part from the enhanced geometry's), one Gaussian per pixel, pixel
-Gaussians merged by voxels, and the coloured points, which need no training. ``coarse=`` names a checkpoint whose coarse
-module, and nothing else, the models that have one begin with, at ``training.coarse_lr_factor=0.3``. ``models=`` takes
-only some, by the names of their folders, such as ``da3_gs``, DA3's own Gaussians, which need ``backend=da3_giant`` and
-are left out otherwise. With ``shared=``, the folder of the reference data, all are also evaluated on
-its recordings, which none was trained on. Finished trainings are not repeated, interrupted ones go on. Writes runs,
-``metrics.json``, ``metrics.md`` and ``models.png`` into ``outputs/<name>``; name=baselines.
+All models are trained from scratch for the same number of steps, with the same backbone, losses, batches and machine,
+and evaluated on the same held-out scenes: VG²GT, VG²GT with finer voxels (about 40 % of the pixel-aligned Gaussians),
+VG²GT without its coarse module (which separates the effect of voxels from that of enhanced geometry), one Gaussian per
+pixel, pixel Gaussians merged by voxels, and coloured points, which need no training. Finished trainings are not
+repeated; interrupted ones resume.
+
+``coarse=PATH`` initialises the coarse modules, and nothing else, from a checkpoint, with
+``training.coarse_lr_factor=0.3``. ``models=NAME,NAME`` selects models by the names of their folders; ``da3_gs`` (DA3's
+own Gaussians, needs ``backend=da3_giant``) only runs if named. ``shared=FOLDER`` also evaluates on the recordings of
+the reference data, on which no model was trained. Writes runs, ``metrics.json``, ``metrics.md`` and ``models.png`` to
+``outputs/<name>``; default: name=baselines.
 """
 
 from __future__ import annotations
@@ -44,7 +46,7 @@ from vg2gt.types import Batch
 DEFAULTS = {"name": "baselines", "steps": "400", "seeds": "1", "coarse": "", "models": "", "shared": ""}
 COARSE = "model.coarse."
 REFERENCE = "VG²GT"
-MAX_ERROR = 0.1  # relative depth error shown as white
+MAX_ERROR = 0.1  # relative depth error that is shown as white
 COLUMNS = columns(
     *("psnr", "ssim", "rmse", "abs_rel", "delta_1.05", "abs_rel_rasterized", "decoded_abs_rel", "normal_mean"),
     *("edge_abs_rel", "edge_psnr", "coverage", "cv", "gaussians"),
@@ -58,7 +60,15 @@ ON_RECORDINGS = columns("psnr", "ssim", "rmse", "abs_rel", "decoded_abs_rel", "n
 
 @dataclass(frozen=True)
 class Model:
-    """A row: its folder, its overrides, whether it is trained, has a coarse module, and is run only if named."""
+    """A row of the table.
+
+    Attributes:
+        folder: folder of its runs.
+        overrides: Hydra overrides.
+        trained: whether it is trained.
+        coarse: whether it has a coarse module.
+        asked: whether it runs only if named.
+    """
 
     folder: str
     overrides: tuple[str, ...] = ()
@@ -79,7 +89,7 @@ MODELS = {
 
 
 def restore(model: Model, overrides: list[str], steps: int, folder: Path) -> tuple[Run, Batch]:
-    """The trained module of a finished run, and the first evaluation scene."""
+    """Returns the run with its trained module in eval mode, and the first evaluation scene."""
     run = build(compose_run([*overrides, *model.overrides], folder))
     if model.trained:
         run.module.load_state_dict(read_checkpoint(final_checkpoint(folder, steps))["state_dict"])
@@ -90,7 +100,7 @@ def restore(model: Model, overrides: list[str], steps: int, folder: Path) -> tup
 
 @torch.no_grad()
 def costs(run: Run, batch: Batch, passes: int = 3) -> Metrics:
-    """Best seconds of a reconstruction and of rendering one view, all cores of a CPU or the GPU's."""
+    """Measures the best seconds of a reconstruction and of rendering one view; core-seconds on a CPU."""
     clock, context = StageClock(run.module.device), batch.context
     for _ in range(passes):
         with clock.listening():
@@ -105,7 +115,7 @@ def costs(run: Run, batch: Batch, passes: int = 3) -> Metrics:
 
 @torch.no_grad()
 def panels(run: Run, batch: Batch) -> list[torch.Tensor]:
-    """Rendered colour, depth, its relative error (black none, white 10 % and holes) and normals of a held-out view."""
+    """Renders a held-out view: colour, depth, relative depth error (black 0, white 10 % or no depth), and normals."""
     prediction = run.module.model(batch.context.images, batch.context.hints)
     cameras = ground_truth_target_cameras(batch, prediction).select(slice(0, 1))
     rendered, true = run.module.renderer(prediction.gaussians, cameras, mode="solid"), batch.target.depth[0, 0]
@@ -120,7 +130,7 @@ def panels(run: Run, batch: Batch) -> list[torch.Tensor]:
 
 
 def truth(batch: Batch) -> list[torch.Tensor]:
-    """The held-out view itself, in the columns of :func:`panels`."""
+    """Returns the ground truth of the held-out view, in the columns of :func:`panels`."""
     true = batch.target.depth[0, 0]
     near, far = (float(true[true > 0].quantile(q)) for q in (0.02, 0.98))
     normals, _ = normals_from_depth(true, batch.target.cameras.intrinsics[0, 0])
@@ -130,7 +140,7 @@ def truth(batch: Batch) -> list[torch.Tensor]:
 
 @torch.no_grad()
 def on_recordings(run: Run, shared: str) -> dict[str, Metrics]:
-    """A trained model's means over the windows of each recording."""
+    """Evaluates a trained model on each recording; returns means over its windows."""
     found: dict[str, Metrics] = {}
     for name, overrides in RECORDINGS.items() if shared else ():
         scenes = evaluation_scenes(overrides.format(shared=shared))
@@ -140,7 +150,7 @@ def on_recordings(run: Run, shared: str) -> dict[str, Metrics]:
 
 
 def chosen(names: str) -> dict[str, Model]:
-    """The models of ``models=``, or all that any backend can run."""
+    """Returns the models named by ``models=``, or all that run with any backend; raises SystemExit if unknown."""
     folders = [model.folder for model in MODELS.values()]
     if unknown := set(names.split(",")) - {*folders, ""}:
         raise SystemExit(f"models={names}: no model {', '.join(sorted(unknown))}; there are {', '.join(folders)}")
@@ -152,7 +162,11 @@ def chosen(names: str) -> dict[str, Model]:
 
 
 def coarse_start(path: str, home: Path) -> tuple[str, ...]:
-    """Overrides of a training that begins with the coarse module of a checkpoint; all else is anew for every seed."""
+    """Returns overrides that initialise the coarse module from a checkpoint; other weights depend on the seed.
+
+    Raises:
+        SystemExit: if the checkpoint has no coarse module.
+    """
     if not path:
         return ()
     home.mkdir(parents=True, exist_ok=True)
@@ -166,7 +180,7 @@ Results = dict[str, dict[int, Metrics]]  # by model and seed
 
 
 def report(results: Results, recordings: Mapping[str, Results], options: Mapping[str, str]) -> str:
-    """The tables as Markdown."""
+    """Returns the tables as Markdown."""
     trained_first = " after a coarse module trained first and alone" if options["coarse"] else ""
     protocol = (
         f"{options['steps']} training steps each, {options['seeds']} seed(s){trained_first} (mean ± 95 % confidence "
@@ -184,7 +198,7 @@ def _measured(results: Results) -> Results:
 
 
 def main() -> None:
-    """Trains whatever is not trained, measures and writes."""
+    """Trains models that are not trained yet, measures and writes."""
     options, overrides = settings(__doc__, DEFAULTS)
     home = Path("outputs").resolve() / options["name"]
     models, begin = chosen(options["models"]), coarse_start(options["coarse"], home)

@@ -1,4 +1,4 @@
-"""What the benchmarks share: options, the machine, clocks and peak memory, a training step, result files."""
+"""Shared code of the benchmarks: options, machine info, clocks, peak memory, training steps, result files."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from vg2gt.training.loop import Run
 from vg2gt.training.schedule import parameter_groups
 from vg2gt.types import Batch
 
-# Real scenes that nothing here was trained on, as trainings evaluate theirs: 8 input views at the given poses.
+# Real scenes that no model here was trained on, with the evaluation protocol of trainings: 8 input views, given poses.
 RECORDINGS = {
     "HoloLens office": "data=rgbd data.root={shared}/hololens_office_a data.image_size=[112,168]",
     "7-Scenes kitchen": "data=rgbd data.root={shared}/seven_scenes_redkitchen_a_registered data.image_size=[112,168]"
@@ -43,15 +43,15 @@ def parser(
     passes: int | None = None,
     overrides: str | None = None,
 ) -> argparse.ArgumentParser:
-    """A parser of the options that the benchmarks have in common.
+    """Returns a parser with the options that the benchmarks share.
 
     Args:
-        doc: the script's docstring.
-        out: default of ``--out``, where results are written.
-        device: whether there is ``--device``; its default is a GPU if there is one.
-        threads: default of ``--threads``; None: no such option.
-        passes: default of ``--passes``; None: no such option.
-        overrides: help of the Hydra overrides after all options; None: there are none.
+        doc: docstring of the script.
+        out: default of ``--out``, the folder of results.
+        device: whether to add ``--device``, which defaults to the GPU if there is one.
+        threads: default of ``--threads``; None adds no such option.
+        passes: default of ``--passes``; None adds no such option.
+        overrides: help text of Hydra overrides as positional arguments; None adds none.
     """
     made = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     made.add_argument("--out", type=Path, default=out)
@@ -66,10 +66,10 @@ def parser(
 
 
 def settings(doc: str | None, defaults: Mapping[str, str]) -> tuple[dict[str, str], list[str]]:
-    """The command line of a study: its own ``key=value`` pairs over their defaults, and all else, which is Hydra's.
+    """Splits the command line into the script's own ``key=value`` options, over ``defaults``, and Hydra overrides.
 
     Raises:
-        SystemExit: after printing ``doc`` where help is asked for.
+        SystemExit: after printing ``doc``, with ``-h`` or ``--help``.
     """
     own, overrides = dict(defaults), []
     for argument in sys.argv[1:]:
@@ -85,26 +85,26 @@ def settings(doc: str | None, defaults: Mapping[str, str]) -> tuple[dict[str, st
 
 
 def dated(folder: Path, name: str) -> Path:
-    """Where today's results of a name go."""
+    """Returns today's result file for a name."""
     return folder / f"{date.today().isoformat()}-{name}.json"
 
 
 def evaluation_scenes(overrides: str) -> Iterator[Batch]:
-    """The scenes, or windows of a recording, on which a data configuration is evaluated."""
+    """Yields the evaluation scenes, or windows of a recording, of a data configuration."""
     data = instantiate(compose("train", *overrides.split()).data)
     data.setup("validate")
     yield from data.val_dataloader()
 
 
 def write_results(folder: Path, name: str, content: Mapping[str, Any]) -> Path:
-    """Writes ``<date>-<name>.json`` and prints where; returns the path."""
+    """Writes ``<date>-<name>.json``; prints and returns its path."""
     path = write_json(dated(folder, name), dict(content))
     print(path)
     return path
 
 
 def machine(device: torch.device | str = "cpu") -> dict[str, Any]:
-    """Processor, cores and versions, and the GPU's name if ``device`` is one."""
+    """Returns processor, cores and versions, and the name of the GPU if ``device`` is one."""
     name = platform.processor() or platform.machine()
     info = Path("/proc/cpuinfo")
     if info.exists():
@@ -122,7 +122,7 @@ def machine(device: torch.device | str = "cpu") -> dict[str, Any]:
 
 
 def used_seconds(device: torch.device) -> float:
-    """Seconds of all cores on a CPU, which other processes hardly change; by the clock on a GPU that is done."""
+    """Returns CPU time of all cores, which other processes hardly affect; on a GPU, wall time after synchronising."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
         return time.perf_counter()
@@ -130,10 +130,10 @@ def used_seconds(device: torch.device) -> float:
 
 
 class PeakMemory:
-    """The most memory in use since ``restart``: allocated on a GPU, resident (VmHWM) in the process on a CPU.
+    """Peak memory since ``restart``: allocated memory on a GPU, resident set (VmHWM) of the process on a CPU.
 
     Attributes:
-        start: bytes in use when this was made.
+        start: bytes in use at construction.
     """
 
     def __init__(self, device: torch.device) -> None:
@@ -142,37 +142,37 @@ class PeakMemory:
             torch.cuda.empty_cache()
             self.start = torch.cuda.memory_allocated(device)
         else:
-            # What was freed goes back to the system, or what follows would be served from it unseen.
+            # Return freed memory to the system, otherwise later allocations would reuse it unnoticed.
             ctypes.CDLL(None).malloc_trim(0)
             self.start = status("VmRSS")
         self.restart()
 
     def restart(self) -> None:
-        """Forgets the peak so far."""
+        """Resets the peak."""
         if self.device.type == "cuda":
             torch.cuda.reset_peak_memory_stats(self.device)
         else:
-            Path("/proc/self/clear_refs").write_text("5")  # sets the high-water mark to what is resident now
+            Path("/proc/self/clear_refs").write_text("5")  # resets VmHWM to the current resident set
 
     @property
     def peak(self) -> int:
-        """Bytes in use at the peak."""
+        """Peak memory in bytes."""
         return torch.cuda.max_memory_allocated(self.device) if self.device.type == "cuda" else status("VmHWM")
 
     @property
     def megabytes(self) -> float:
-        """The peak above the start."""
+        """Peak minus start, in MB."""
         return (self.peak - self.start) / MEGABYTE
 
 
 def status(name: str) -> int:
-    """A figure of this process in bytes, by its name in ``/proc/self/status``."""
+    """Returns an entry of ``/proc/self/status`` in bytes."""
     lines = Path("/proc/self/status").read_text().splitlines()
     return next(int(line.split()[1]) * 1024 for line in lines if line.startswith(f"{name}:"))
 
 
 def training_step(run: Run) -> Callable[[Batch], Tensor]:
-    """The run's training step without its loop: a function from a batch to the loss; nothing is logged."""
+    """Returns the run's training step as a function from batch to loss, without trainer loop and logging."""
     module = run.module.train()
     run.trainer.strategy.connect(module)
     module.trainer = run.trainer
@@ -183,12 +183,12 @@ def training_step(run: Run) -> Callable[[Batch], Tensor]:
 def whole_step(
     run: Run, stage: Callable[[str], AbstractContextManager[Any]] = nullcontext
 ) -> Callable[[Batch], Tensor]:
-    """:func:`training_step` with backward pass, clipping and optimiser, the latter two in stages of their own."""
+    """:func:`training_step` with backward pass, clipping and optimiser, which are marked by ``stage``."""
     step_loss, module = training_step(run), run.module
     optimizer = module.make_optimizer(parameter_groups(module.model))
 
     def step(batch: Batch) -> Tensor:
-        """The loss of one training step."""
+        """Runs one training step; returns its loss."""
         with run.trainer.precision_plugin.train_step_context():
             loss = step_loss(batch)
         with stage("backward"):

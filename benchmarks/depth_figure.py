@@ -1,7 +1,7 @@
-"""Solid against rasterised depth of one scene: ``python benchmarks/depth_figure.py [--out PICTURE]``.
+"""Figure of solid and rasterised depth of a scene: ``python benchmarks/depth_figure.py [--out PICTURE]``.
 
-Upper row: colour, rasterised depth, solid depth; lower row: true depth and the error of each, bright where it is large.
-The colours agree; the rasterised depth jumps from Gaussian to Gaussian, the solid depth is continuous.
+Upper row: colour, rasterised depth, solid depth. Lower row: true depth, and the error of each (bright is large).
+Colours agree, but rasterised depth jumps between Gaussians, whereas solid depth is continuous.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ ERROR_SHOWN = 0.03  # metres at full brightness
 
 
 def main() -> None:
-    """Renders, prints the errors, writes the picture."""
+    """Renders, prints the errors and writes the picture."""
     options = parser(__doc__, out=Path("docs/figures/solid-against-rasterized.png"))
     options.add_argument("--gaussians", type=int, default=20_000)
     arguments = options.parse_args()

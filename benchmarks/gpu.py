@@ -1,11 +1,11 @@
-"""What there is to measure on a GPU, in at most eight minutes: ``python benchmarks/gpu.py [--parts NAME ...]``.
+"""All measurements on a GPU, in at most eight minutes: ``python benchmarks/gpu.py [--parts NAME ...]``.
 
-The one command for a day on which a GPU is at hand. In order of importance: do the kernels agree with the reference
-here (``selfcheck``), ``pytest -m gpu`` (``tests``), renderer forward and backward beside gsplat where that is installed
-(``render``), training steps of ``experiment=paper`` with random weights, by stage (``step``), nearest neighbours
-(``knn``), ``reconstruct`` of 50 images (``reconstruct``). Every part is a process of its own with a limit of its own,
-and writes ``<date>-gpu-<part>.json`` into ``--out`` (default: the variable OUT, or benchmarks/results) after every
-measurement: what fails or is stopped leaves what it had found. ``--small`` makes all sizes tiny, for a CPU as well.
+Parts, in order of importance: agreement of the kernels with the reference (``selfcheck``), ``pytest -m gpu``
+(``tests``), forward and backward pass of the renderer, and of gsplat if installed (``render``), training steps of
+``experiment=paper`` with random weights, by stage (``step``), nearest neighbours (``knn``), and ``reconstruct`` with 50
+images (``reconstruct``). Every part runs in a separate process with a time limit. After every measurement it writes
+``<date>-gpu-<part>.json`` to ``--out`` (default: the variable OUT, or benchmarks/results), so that partial results are
+kept. ``--small`` makes all sizes tiny, also for a CPU.
 """
 
 from __future__ import annotations
@@ -32,23 +32,23 @@ from vg2gt.profiling import now
 
 ROOT = Path(__file__).resolve().parents[1]
 Result = dict[str, Any]
-LINES = 25  # of what a part printed
+LINES = 25  # lines of output and profile to keep
 
 
 @dataclass(frozen=True)
 class Setting:
-    """Where and how large.
+    """Device and size of the measurements.
 
     Attributes:
-        device: a GPU, or a CPU.
-        small: sizes that measure nothing.
+        device: a GPU or a CPU.
+        small: whether to use tiny sizes, for testing only.
     """
 
     device: torch.device
     small: bool
 
     def timed(self, run: Callable[[], Any], passes: int = 3) -> float:
-        """Milliseconds of the fastest pass after one that warms up."""
+        """Returns the milliseconds of the fastest pass, after a warm-up."""
         run()
         taken = []
         for _ in range(1 if self.small else passes):
@@ -58,18 +58,18 @@ class Setting:
         return min(taken)
 
     def peak_mb(self) -> float:
-        """Most memory allocated on the GPU since :meth:`forget_peak`."""
+        """Returns peak memory allocated on the GPU since :meth:`forget_peak`, in MB; 0 on a CPU."""
         return torch.cuda.max_memory_allocated(self.device) / MEGABYTE if self.device.type == "cuda" else 0.0
 
     def forget_peak(self) -> None:
-        """Begins a new measurement, with what earlier ones left given back."""
+        """Resets peak memory, and frees cached memory of earlier measurements."""
         if self.device.type == "cuda":
             torch.cuda.empty_cache()
             torch.cuda.reset_peak_memory_stats(self.device)
 
 
 def selfcheck(setting: Setting) -> Iterator[Result]:
-    """How far the kernels are off, and how long they take to compile and check."""
+    """Differences of the kernels to the reference, and time to compile and check them."""
     from vg2gt.rendering.selfcheck import MODES, compare, identity
 
     yield {"identity": identity(setting.device)}
@@ -81,10 +81,10 @@ def selfcheck(setting: Setting) -> Iterator[Result]:
 
 
 def tests(setting: Setting) -> Iterator[Result]:
-    """The suite's tests of a GPU; in the small form they are only collected."""
+    """GPU tests of the test suite; with ``small``, they are only collected."""
     files = [str(path) for path in sorted((ROOT / "tests").rglob("test_*.py")) if "mark.gpu" in path.read_text()]
     options = ["-o", "addopts=", "--import-mode=importlib", "-p", "no:cacheprovider", "-q", "-m", "gpu and not slow"]
-    options += ["--continue-on-collection-errors"]  # a file that needs a package which is not there
+    options += ["--continue-on-collection-errors"]  # some files need packages that may be missing
     options += ["--collect-only"] if setting.small else ["--durations=5", "--tb=short"]
     command = [sys.executable, "-m", "pytest", *options, *files]
     ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
@@ -95,7 +95,7 @@ def tests(setting: Setting) -> Iterator[Result]:
 
 
 def render(setting: Setting) -> Iterator[Result]:
-    """Forward and backward pass of 8 views of 224x448, in turns with gsplat; colour and expected depth there."""
+    """Forward and backward pass of 8 views of 224x448, alternately with gsplat (which renders expected depth)."""
     from importlib.util import find_spec
 
     from render import Case, compare
@@ -117,7 +117,7 @@ def render(setting: Setting) -> Iterator[Result]:
 
 
 def step(setting: Setting) -> Iterator[Result]:
-    """Training steps of the paper's experiment: time, memory, stages, and what the device is asked to do."""
+    """Training steps of the paper's experiment: time, memory, stages, profile and waits."""
     from stages import Case
 
     if setting.small:
@@ -125,7 +125,7 @@ def step(setting: Setting) -> Iterator[Result]:
         cases = {"tiny": Case(2, (28, 56), ("experiment=paper", "trainer=gpu", "data=synthetic", *tiny))}
     else:
         paper = ("experiment=paper", "trainer=gpu", "data=synthetic", "backend.pretrained=false")
-        paper = (*paper, "renderer.implementation=triton")  # times are wanted even if the check refuses the kernels
+        paper = (*paper, "renderer.implementation=triton")  # measure even if the self-check rejects the kernels
         cases = {
             "da3_large, 8 views": Case(8, (224, 448), (*paper, "backend=da3_large")),
             "da3_giant, 15 views": Case(15, (224, 448), (*paper, "backend=da3_giant")),
@@ -161,7 +161,7 @@ def _step(setting: Setting, case: Any) -> Iterator[Result]:
 
 
 def _profile(device: torch.device, act: Callable[[], Any]) -> Result:
-    """Operations or kernels of one pass, what they took, and which took most."""
+    """Number and time of operations (CPU) or kernels (GPU) in one pass, and the slowest of them."""
     from torch.profiler import ProfilerActivity, profile
 
     on_gpu = device.type == "cuda"
@@ -172,7 +172,7 @@ def _profile(device: torch.device, act: Callable[[], Any]) -> Result:
         wall = 1e3 * (now(device) - begin)
     rows = found.key_averages()
     of_device = [row for row in rows if str(row.device_type).endswith("CUDA")] if on_gpu else list(rows)
-    of_device = [row for row in of_device if not row.key.startswith(("vg2gt/", "Optimizer."))]  # spans of others
+    of_device = [row for row in of_device if not row.key.startswith(("vg2gt/", "Optimizer."))]  # enclosing ranges
 
     def taken(row: Any) -> float:
         return (row.self_device_time_total if on_gpu else row.self_cpu_time_total) / 1e3
@@ -188,7 +188,7 @@ def _profile(device: torch.device, act: Callable[[], Any]) -> Result:
 
 
 def _waits(device: torch.device, act: Callable[[], Any]) -> Result:
-    """How often the host waits for the device in one pass, copies to it included, by the function that asked."""
+    """Counts waits of the host for the device in one pass, including copies to it, by calling function."""
     from gpu_waits import Waits, place
 
     if device.type != "cuda":
@@ -212,7 +212,7 @@ def _waits(device: torch.device, act: Callable[[], Any]) -> Result:
 
 
 def knn(setting: Setting) -> Iterator[Result]:
-    """Nearest neighbours: 16 voxels of every patch point, and 3 points of every pixel for the coloured points."""
+    """Nearest-neighbour search: 16 voxels for every patch point, and 4 points (with itself) for every pixel."""
     from vg2gt.kernels.cell_search import nearest_by_cells
 
     for name, views, step, neighbors in (("patch points", 18, 7, 16), ("pixels", 10, 1, 4)):
@@ -236,13 +236,13 @@ def knn(setting: Setting) -> Iterator[Result]:
 
 
 def reconstruct(setting: Setting) -> Iterator[Result]:
-    """The paper's model on 50 images, random weights; then all of its views rendered."""
+    """Reconstruction of 10 and 50 images with the paper's model and random weights, and rendering of all views."""
     from vg2gt.reconstruction.pipeline import reconstruct_with
     from vg2gt.runs.load import load_model
 
     backend, model, size = ("da3_tiny", "tiny", (28, 56)) if setting.small else ("da3_large", "vg2gt", (224, 448))
     ready = load_model(None, backend, ["backend.pretrained=false", f"model={model}"], str(setting.device))
-    implementation = "triton" if setting.device.type == "cuda" else "auto"  # whether or not the check refuses it
+    implementation = "triton" if setting.device.type == "cuda" else "auto"  # even if the self-check rejects it
     renderer = replace(ready.renderer, implementation=implementation)
     for count in (2,) if setting.small else (10, 50):
         generator = torch.Generator().manual_seed(0)
@@ -263,7 +263,7 @@ def reconstruct(setting: Setting) -> Iterator[Result]:
 
 @dataclass(frozen=True)
 class Part:
-    """One measurement and the seconds that it may take."""
+    """A measurement and its time limit in seconds."""
 
     measure: Callable[[Setting], Iterator[Result]]
     seconds: int
@@ -280,7 +280,7 @@ PARTS = {
 
 
 def measure(name: str, setting: Setting, path: Path) -> Result:
-    """Runs a part here, and writes what is known after every measurement; an error is a result, too."""
+    """Runs a part in this process; writes results after every measurement and also records errors."""
     content: Result = {"machine": machine(setting.device), "ended": "stopped", "results": {}}
     write_json(path, content)
     begin = time.perf_counter()
@@ -290,7 +290,7 @@ def measure(name: str, setting: Setting, path: Path) -> Result:
             content["seconds"] = time.perf_counter() - begin
             write_json(path, content)
         content["ended"] = "done"
-    except Exception as error:  # all that was found is kept
+    except Exception as error:  # keep all results so far
         content["ended"] = f"{type(error).__name__}: {' '.join(str(error).split())[:1000]}"
     content["seconds"] = time.perf_counter() - begin
     write_json(path, content)
@@ -298,7 +298,7 @@ def measure(name: str, setting: Setting, path: Path) -> Result:
 
 
 def measure_apart(name: str, arguments: Any, seconds: float) -> str:
-    """Runs a part in a process of its own; returns how it ended."""
+    """Runs a part in a separate process; returns how it ended."""
     path = dated(arguments.out, f"gpu-{name}")
     command = [sys.executable, __file__, "--here", name, "--device", arguments.device, "--out", str(arguments.out)]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join((str(ROOT), os.environ.get("PYTHONPATH", "")))}
@@ -318,14 +318,14 @@ def measure_apart(name: str, arguments: Any, seconds: float) -> str:
 
 
 def brief(value: Any) -> str:
-    """A result in few words."""
+    """Formats a result in a few words."""
     if isinstance(value, dict):
         return ", ".join(f"{key} {brief(item)}" for key, item in value.items() if not isinstance(item, (dict, list)))
     return f"{value:.4g}" if isinstance(value, float) else str(value)[:160]
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Measures and writes; prints a few lines a part."""
+    """Measures and writes; prints a few lines per part."""
     options = parser(__doc__, out=Path(os.environ.get("OUT") or ROOT / "benchmarks" / "results"), device=True)
     options.add_argument("--parts", nargs="+", choices=list(PARTS), default=list(PARTS), metavar="NAME")
     options.add_argument("--small", action="store_true", help="tiny sizes")

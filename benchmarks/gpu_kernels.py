@@ -1,8 +1,8 @@
-"""Compiles every Triton kernel of the renderer for GPUs that need not be there: ``python benchmarks/gpu_kernels.py``.
+"""Compiles every Triton kernel of the renderer, without a GPU: ``python benchmarks/gpu_kernels.py``.
 
-Renders small scenes with the kernels replaced by recorders, takes each launch's types and compile-time options from
-what was recorded, compiles it to machine code for the targets, and prints registers, shared memory, spills and the
-number of instructions. Triton's wheel carries the assembler; no GPU and no driver are needed. Writes a dated JSON file.
+Renders small scenes with the kernels replaced by recorders, and compiles each recorded launch, with its types and
+compile-time options, to machine code for several targets. Prints registers, shared memory, spills and the number of
+instructions. Needs no GPU and no driver, as Triton's wheel includes the assembler. Writes a dated JSON file.
 """
 
 from __future__ import annotations
@@ -51,13 +51,13 @@ Stub = Callable[..., Any]
 
 @dataclass(frozen=True)
 class Launch:
-    """A launch as it was asked for.
+    """A recorded kernel launch.
 
     Attributes:
-        kernel: name.
-        grid: programs.
-        arguments: by name, compile-time ones included; of tensors their types.
-        options: such as ``num_warps``.
+        kernel: name of the kernel.
+        grid: number of programs per axis.
+        arguments: arguments by name, including compile-time ones; dtypes in place of tensors.
+        options: launch options such as ``num_warps``.
     """
 
     kernel: str
@@ -67,7 +67,7 @@ class Launch:
 
     @property
     def signature(self) -> dict[str, str]:
-        """Types of the arguments as Triton takes them."""
+        """Types of the arguments in Triton's notation."""
         return {name: _type(name, value, self.constants) for name, value in self.arguments.items()}
 
     @property
@@ -78,7 +78,7 @@ class Launch:
 
     @property
     def variant(self) -> str:
-        """The kernel and those compile-time options that make another kernel of it."""
+        """Name of the kernel with the compile-time options that change its code."""
         chosen = [
             f"{name}={value}" for name, value in self.constants.items() if isinstance(value, bool) or name == "degree"
         ]
@@ -87,16 +87,16 @@ class Launch:
 
 @dataclass(frozen=True)
 class Compiled:
-    """What a kernel became.
+    """Resources of a compiled kernel.
 
     Attributes:
         variant: kernel and options.
-        target: such as ``sm_90``.
-        warps: per program.
-        registers: per thread.
-        shared: bytes per program.
-        spills: bytes of stores and loads of registers that did not fit, per thread.
-        instructions: of machine code, all paths.
+        target: target such as ``sm_90``.
+        warps: warps per program.
+        registers: registers per thread.
+        shared: bytes of shared memory per program.
+        spills: bytes of spilled registers per thread.
+        instructions: number of machine instructions, over all paths.
     """
 
     variant: str
@@ -118,11 +118,11 @@ def _type(name: str, value: Any, constants: dict[str, Any]) -> str:
 
 @contextmanager
 def recorded(stubs: dict[str, Stub] | None = None) -> Iterator[list[Launch]]:
-    """Inside the block kernels are not run but listed, and the renderer takes tensors on the CPU for them.
+    """Records kernel launches in the block instead of running them; the renderer then accepts CPU tensors.
 
     Args:
-        stubs: by kernel, what happens in its stead: called with the launch's arguments by name. Every Gaussian lies
-            in one tile unless a stub of ``project_kernel`` says otherwise.
+        stubs: functions to call in place of kernels, by kernel name, with the launch's arguments by name. By default,
+            ``project_kernel`` puts every Gaussian in one tile.
     """
     stubs = {"project_kernel": lambda counts, **_: counts.fill_(1), **(stubs or {})}
     launches: list[Launch] = []
@@ -135,7 +135,7 @@ def recorded(stubs: dict[str, Stub] | None = None) -> Iterator[list[Launch]]:
             def launch(*arguments: Any, **options: Any) -> None:
                 named = dict(zip(self.names, arguments, strict=False))
                 named |= {name: options.pop(name) for name in self.names if name in options}
-                # what is kept of a tensor is its type: memory is counted as if nobody looked
+                # keep only the dtypes of tensors, so that their memory is freed as usual
                 kept = {name: value.dtype if isinstance(value, Tensor) else value for name, value in named.items()}
                 launches.append(Launch(self.name, tuple(grid), kept, options))
                 if self.name in stubs:
@@ -151,7 +151,7 @@ def recorded(stubs: dict[str, Stub] | None = None) -> Iterator[list[Launch]]:
 
 
 def variants() -> dict[str, Launch]:
-    """Every kernel in every form that rendering and its backward pass ask for, by its name and options."""
+    """Returns launches of all kernel variants that rendering and its backward pass use, by name and options."""
     found: dict[str, Launch] = {}
     kinds = [("solid", "median", True), ("rasterized", "median", True), ("rasterized", "expected", True)]
     kinds += [(mode, "median", False) for mode in ("solid", "rasterized")]
@@ -171,12 +171,12 @@ def variants() -> dict[str, Launch]:
 
 
 def compile_for(launch: Launch, target: str) -> Compiled:
-    """Compiles a recorded launch to machine code and reads what it needs."""
+    """Compiles a recorded launch to machine code and reads its resources."""
     source = _source(launch)
     options = {"num_warps": 4, **launch.options}
     warps = options["num_warps"]
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # on defaults that will change with a later Triton
+        warnings.simplefilter("ignore")  # Triton warns of defaults that will change
         made = triton.compile(source, target=TARGETS[target], options=options)
     if TARGETS[target].backend == "hip":
         return _amd(launch, target, warps, made)
@@ -193,7 +193,7 @@ def _source(launch: Launch) -> Any:
 
 
 def _resources(cubin: bytes) -> tuple[int, int]:
-    """Registers and bytes of stack (which Triton's kernels have for spills only) of a program for Nvidia GPUs."""
+    """Registers, and bytes of stack (used only for spills by Triton's kernels), of an Nvidia program."""
     said = _tool("cuobjdump", cubin, "-res-usage")
     (registers,), (stack,), (local,) = (re.findall(rf"{word}:(\d+)", said) for word in ("REG", "STACK", "LOCAL"))
     return int(registers), int(stack) + int(local)

@@ -1,10 +1,10 @@
-"""Where the host would wait for a GPU, without one: ``python benchmarks/gpu_waits.py [--views N] [overrides]``.
+"""Counts GPU synchronisations without a GPU: ``python benchmarks/gpu_waits.py [--views N] [overrides]``.
 
-A wait is a value of the device that the host needs to go on: a number, or a shape that depends on data. Runs a
-reconstruction and a training step of whatever model the overrides name on the CPU and counts, by the function that
-asked, the torch operations that wait on CUDA; of a training step all operations, too. At least so often: an operation
-that waits twice inside (``bincount`` apart) counts once, and copies to the device are not seen. Prints tables and
-writes a dated JSON file.
+A wait is a synchronisation because the host needs a value from the device: a number, or a data-dependent shape. Runs a
+reconstruction and a training step on the CPU, with the model of the overrides. Counts the torch operations that would
+wait on CUDA, by calling function, and for the training step also all operations. The counts of waits are lower bounds:
+operations that wait twice internally count once (except ``bincount``), and copies to the device are not counted. Prints
+tables and writes a dated JSON file.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ WAITING = {
     "unique_consecutive": 1,
     "_unique2": 1,
     "unique_dim": 1,
-    "bincount": 2,  # the smallest and the largest value
+    "bincount": 2,  # minimum and maximum
 }
 PACKAGE = "vg2gt"
 
 
 class Waits(TorchDispatchMode):
-    """Counts what waits inside its block.
+    """Counts waits inside its block.
 
     Attributes:
-        places: how often, by the innermost function of the package that asked, such as ``method/grid.py plan_voxels``.
+        places: counts by the innermost calling function of the package, such as ``method/grid.py plan_voxels``.
     """
 
     def __init__(self) -> None:
@@ -49,7 +49,7 @@ class Waits(TorchDispatchMode):
 
     @property
     def total(self) -> int:
-        """All of them."""
+        """Total number of waits."""
         return self.places.total()
 
     def __enter__(self) -> Waits:
@@ -85,32 +85,32 @@ class Waits(TorchDispatchMode):
 def _waits(name: str, args: Any, kwargs: Any) -> int:
     if name in ("index", "index_put", "index_put_", "_index_put_impl_"):
         masks = sum(index is not None and index.dtype in (torch.bool, torch.uint8) for index in args[1])
-        # one value where a mask is true needs no list of places
+        # writing a single value at a mask needs no list of indices
         return 0 if name != "index" and args[2].numel() == 1 else masks
     if name == "repeat_interleave":  # the length of the result
         return int(kwargs.get("output_size") is None)
-    if name == "segment_reduce":  # whether the lengths are good
+    if name == "segment_reduce":  # checks of the lengths
         return 2 * (not kwargs.get("unsafe"))
     return WAITING.get(name, 0)
 
 
 def place(frame: FrameType | None) -> str:
-    """The innermost function of the package at or around a frame."""
+    """Returns the innermost function of the package in the call stack of a frame."""
     while frame is not None:
         parts = Path(frame.f_code.co_filename).parts
         if PACKAGE in parts:
             within = len(parts) - parts[::-1].index(PACKAGE)
-            name = getattr(frame.f_code, "co_qualname", frame.f_code.co_name)  # Python 3.10 knows the last part only
+            name = getattr(frame.f_code, "co_qualname", frame.f_code.co_name)  # Python 3.10 has no co_qualname
             return f"{'/'.join(parts[within:])} {name.replace('.<locals>', '')}"
         frame = frame.f_back
     return "elsewhere"
 
 
 class Operations(TorchDispatchMode):
-    """Counts torch operations inside its block, all but views, by place.
+    """Counts torch operations inside its block, except views, by calling function.
 
     Args:
-        muted: whether what happens now is left out.
+        muted: returns whether to ignore the current operation.
     """
 
     def __init__(self, muted: Callable[[], bool] = lambda: False) -> None:
@@ -120,7 +120,7 @@ class Operations(TorchDispatchMode):
 
     @property
     def total(self) -> int:
-        """All of them."""
+        """Total number of operations."""
         return self.places.total()
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
@@ -131,7 +131,7 @@ class Operations(TorchDispatchMode):
 
 @contextmanager
 def as_on_a_gpu() -> Iterator[None]:
-    """Inside the block a CPU runs what a GPU does, but for Triton's kernels."""
+    """Makes a CPU run the code paths of a GPU inside the block, except Triton kernels."""
     from vg2gt.kernels import curve_codes, row_products
     from vg2gt.losses import gaussian, geometry
     from vg2gt.losses.point_normals import point_normal_reference
@@ -160,9 +160,9 @@ RENDER = Counter({"the renderer's operations and kernels": 33})
 
 
 def count_step(run: Any, batch: Any) -> tuple[Counter[str], Counter[str]]:
-    """Operations and waits of a whole training step on a GPU: forward, backward, clipping, optimiser.
+    """Counts operations and waits of a whole training step on a GPU: forward, backward, clipping, optimiser.
 
-    The renderer counts with ``RENDER`` and its one wait, Hilbert codes with one kernel each.
+    The renderer counts as ``RENDER`` and one wait, and Hilbert codes as one kernel each.
     """
     from common import whole_step
 
@@ -186,14 +186,14 @@ def count_step(run: Any, batch: Any) -> tuple[Counter[str], Counter[str]]:
 
     whole, operations, waits = whole_step(run), Operations(lambda: quiet[0] > 0), Waits()
     with as_on_a_gpu(), mock.patch.object(curve_codes, "hilbert_reference", in_one_kernel), listening(rendering):
-        whole(batch)  # what a first step warns of is not looked at again
+        whole(batch)  # warm-up, as some checks run in the first step only
         codes.clear()
         with operations:
             whole(batch)
         found = operations.places + codes + RENDER
         with waits:
             whole(batch)
-    # Shuffled orders are drawn on the CPU; nothing is waited for.
+    # Shuffled orders are drawn on the CPU, without a wait.
     asked = {
         where: n for where, n in waits.places.items() if not where.startswith(("rendering/", "types.py Gaussians"))
     }

@@ -1,9 +1,9 @@
 """Long captures: ``python benchmarks/long_captures.py make|run|alone FOLDER``.
 
-``make`` renders a walk through a corridor of furnished rooms as an RGB-D recording; every twentieth frame is held out.
-It goes on where it was interrupted. ``run`` reconstructs the walk in windows in a process of its own and measures peak
-memory, the processor's seconds of every window, and PSNR of the held-out frames. ``alone`` reconstructs some rooms,
-each from its own frames all at once, and compares PSNR of the same held-out frames. Each prints JSON.
+``make`` renders a walk through a corridor of furnished rooms as an RGB-D recording, and holds out every twentieth
+frame. It can resume. ``run`` reconstructs the walk in windows, and measures peak memory, CPU time of every window, and
+PSNR on the held-out frames. ``alone`` reconstructs some rooms, each at once from its own frames, and compares PSNR on
+the same held-out frames; it needs the result of ``run``. Each prints JSON.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ from vg2gt.runs.load import load_model
 
 LENGTH, WIDTH, HEIGHT = 4.0, 5.0, 2.6  # metres of a room
 DOOR, LINTEL = 1.3, 2.1
-HELD_OUT = 20  # every so many-th frame
+HELD_OUT = 20  # hold out every 20th frame
 
 
 class Corridor(SyntheticScene):
-    """Rooms in a row with doors between them, and a walk through all of them that looks around in each.
+    """A row of rooms connected by doors, and a walk through all of them that looks around in each.
 
     Args:
-        rooms: how many.
-        frames: of the walk.
+        rooms: number of rooms.
+        frames: number of frames of the walk.
         size: image ``(height, width)``.
-        seed: decides the rest.
+        seed: random seed.
     """
 
     def __init__(self, rooms: int, frames: int, size: tuple[int, int], seed: int = 0) -> None:
@@ -54,7 +54,7 @@ class Corridor(SyntheticScene):
         for room in range(rooms):
             middle = np.array([(room + 0.5) * LENGTH, 0.0, 0.0])
             builder.place(middle, 0.0)
-            for y in (-1, 1):  # panels on the long walls, so that every room has its own
+            for y in (-1, 1):  # panels on the long walls give every room its own wall materials
                 builder.box((0, y * (WIDTH / 2 - 0.01), HEIGHT / 2), (LENGTH, 0.02, HEIGHT), builder.new_material())
             builder.box((0, 0, 0.005), (LENGTH, WIDTH, 0.01), builder.new_material())
             if room:
@@ -79,7 +79,7 @@ class Corridor(SyntheticScene):
 
 
 def make(folder: Path, rooms: int, frames: int, size: tuple[int, int]) -> None:
-    """Renders what is missing of the recording: ``walk`` with all but the held-out frames, ``held`` with those."""
+    """Renders missing frames of the recording; ``held`` has the held-out frames, ``walk`` all others."""
     scene = Corridor(rooms, frames, size)
     kept = {"held": [i for i in range(frames) if i % HELD_OUT == HELD_OUT // 2]}
     kept["walk"] = sorted(set(range(frames)) - set(kept["held"]))
@@ -97,7 +97,7 @@ def make(folder: Path, rooms: int, frames: int, size: tuple[int, int]) -> None:
 
 
 class Clock(Monitor):
-    """Keeps the processor's seconds of every step of every stage that says how far it is."""
+    """Records the CPU time of every step of every stage that reports progress."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -105,7 +105,7 @@ class Clock(Monitor):
 
     @contextmanager
     def measure(self, name: str) -> Iterator[Callable[[float, str], None]]:
-        """As :meth:`Monitor.measure`."""
+        """See :meth:`Monitor.measure`."""
         before = time.process_time()
 
         def show(done: float, note: str) -> None:
@@ -124,7 +124,7 @@ def _halves(times: list[float]) -> float:
 
 
 def score(scene: Scene, folder: Path, numbers: set[int] | None = None) -> dict[int, float]:
-    """PSNR of held-out frames; the scene must be in the recording's frame."""
+    """Returns the PSNR of held-out frames by number; the scene must be in the recording's world frame."""
     source = RGBDFolder(str(folder / "held"), holdout=None)
     name = source.scenes[0]
     found = {}
@@ -142,7 +142,7 @@ def score(scene: Scene, folder: Path, numbers: set[int] | None = None) -> dict[i
 
 
 def run(folder: Path, window: int, overrides: list[str]) -> None:
-    """Reconstructs the walk in windows; the work is kept in ``FOLDER/windows``, so that it goes on."""
+    """Reconstructs the walk in windows; keeps intermediate results in ``FOLDER/windows``, so that it can resume."""
     ready, clock = load_model(overrides=overrides, device="cpu"), Clock()
     begin = time.process_time()
     scene = reconstruct_with(
@@ -170,7 +170,7 @@ def run(folder: Path, window: int, overrides: list[str]) -> None:
 
 
 def alone(folder: Path, rooms: int, frames: int, chosen: list[int], overrides: list[str]) -> None:
-    """Reconstructs some rooms, each from the frames taken in it; compares held-out frames with those of ``run``."""
+    """Reconstructs some rooms, each from its own frames; compares PSNR on held-out frames with that of ``run``."""
     ready = load_model(overrides=overrides, device="cpu")
     whole = {int(number): value for number, value in json.loads((folder / "run.json").read_text())["scores"].items()}
     files = sorted((folder / "walk" / "images").iterdir())
@@ -189,7 +189,7 @@ def alone(folder: Path, rooms: int, frames: int, chosen: list[int], overrides: l
 
 
 def main() -> None:
-    """Reads the arguments."""
+    """Runs the command line."""
     arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     arguments.add_argument("what", choices=("make", "run", "alone"))
     arguments.add_argument("folder", type=Path)

@@ -1,13 +1,14 @@
-"""Peak memory against views, voxels and Gaussians: ``python benchmarks/memory.py [--models NAME ...] [--device cuda]``.
+"""Peak memory by views, voxels and Gaussians: ``python benchmarks/memory.py [--models NAME ...] [--device cuda]``.
 
-Forward only, and a whole training step (reconstruction, rendering, losses, backward pass, optimiser), of a procedural
-scene, for two configurations: ``tiny`` is the default one (``backend=oracle model=tiny``, 112x112), ``paper`` has the
-paper's modules at their sizes on a small backbone with random weights (``backend=da3_small model=vg2gt``, 112x224).
-Views are varied alone, then voxels by ``model.fine.max_voxels`` and Gaussians by ``model.gaussians.splits``.
+Measures the forward pass alone, and a whole training step (reconstruction, rendering, losses, backward pass,
+optimiser), on a procedural scene. There are two configurations: ``tiny`` is the default (``backend=oracle model=tiny``,
+112x112), ``paper`` has the paper's modules at full size on a small backbone with random weights (``backend=da3_small
+model=vg2gt``, 112x224). Varies the number of views, then voxels with ``model.fine.max_voxels`` and Gaussians with
+``model.gaussians.splits``.
 
-On a CPU (Linux) every point is measured in a process of its own, as the largest resident set (VmHWM): before the
-pass, at its peak, and the difference. On a GPU it is ``torch.cuda.max_memory_allocated``. Prints a table and
-writes a dated JSON file to ``benchmarks/results``.
+On a CPU (Linux), every point is measured in a separate process, as the resident set (VmHWM): before the pass, at its
+peak, and the difference. On a GPU, it is ``torch.cuda.max_memory_allocated``. Prints a table and writes a dated JSON
+file to ``benchmarks/results``.
 """
 
 from __future__ import annotations
@@ -35,12 +36,12 @@ MODES = ("forward", "training")
 
 @dataclass(frozen=True)
 class Model:
-    """A configuration and the points at which it is measured.
+    """A configuration and its measurement points.
 
     Attributes:
-        size: of the images, ``(height, width)``.
+        size: image ``(height, width)``.
         overrides: Hydra overrides.
-        views: numbers of views, measured alone; the last is also that of the other points.
+        views: numbers of views to measure; the last is used for all other points.
         voxels: values of ``model.fine.max_voxels``.
         splits: values of ``model.gaussians.splits``.
     """
@@ -52,7 +53,7 @@ class Model:
     splits: tuple[int, ...]
 
     def points(self) -> list[Point]:
-        """What is measured, in the order of the table."""
+        """Returns the measurement points, in the order of the table."""
         most = self.views[-1]
         points = [Point("views", views) for views in self.views]
         points += [Point("voxels", most, (f"model.fine.max_voxels={count}",)) for count in self.voxels]
@@ -61,7 +62,7 @@ class Model:
 
 @dataclass(frozen=True)
 class Point:
-    """One line of the table: what is varied, the number of views, overrides."""
+    """A row of the table: the varied quantity, number of views, overrides."""
 
     varied: str
     views: int
@@ -77,7 +78,7 @@ MODELS = {
 
 
 def measure(model: Model, point: Point, mode: str, device: torch.device) -> dict[str, Any]:
-    """Peak memory of one pass, MiB; on a CPU of this process, which should do nothing else."""
+    """Measures peak memory of one pass in MiB; on a CPU that of the whole process, which should do nothing else."""
     with tempfile.TemporaryDirectory() as folder:
         overrides = (*model.overrides, *point.overrides)
         run, batch = prepare(Case(point.views, model.size, overrides), device, folder)
@@ -111,7 +112,7 @@ def _sizes(prediction: Prediction) -> dict[str, int]:
 
 
 def in_a_child(model: Model, point: Point, mode: str, device: torch.device) -> dict[str, Any]:
-    """:func:`measure` in a forked process, so that no point finds what another one left in the allocator."""
+    """Runs :func:`measure` in a forked process, so that points do not share allocator state."""
     context = multiprocessing.get_context("fork")
     receive, send = context.Pipe(duplex=False)
 
@@ -131,7 +132,7 @@ def in_a_child(model: Model, point: Point, mode: str, device: torch.device) -> d
 
 
 def markdown(rows: Sequence[dict[str, Any]], where: dict[str, Any]) -> str:
-    """One table per configuration."""
+    """Returns one Markdown table per configuration."""
     head = ["varied", "views", "voxels", "Gaussians"]
     head += ["forward: peak", "of it the pass", "training: peak", "of it the step"]
     lines = [f"Peak memory in MiB; {where.get('gpu', where['processor'])}, torch {where['torch']}.", ""]
@@ -157,10 +158,10 @@ def main() -> None:
     options.add_argument("--device", default="cpu")
     arguments = options.parse_args()
     torch.set_num_threads(1)
-    logging.disable(logging.WARNING)  # the limits say what they drop
+    logging.disable(logging.WARNING)  # limits log what they drop
     device = torch.device(arguments.device)
     run = measure if device.type == "cuda" else in_a_child
-    if device.type == "cpu":  # what is imported and compiled once is no part of any point
+    if device.type == "cpu":  # warm-up: imports and compilation belong to no point
         for mode in arguments.modes:
             measure(MODELS["tiny"], Point("views", 2), mode, device)
     where, rows = machine(device), []

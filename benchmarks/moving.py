@@ -1,10 +1,10 @@
-"""PSNR of what does not move, with and without the check for what does: ``python benchmarks/moving.py [overrides]``.
+"""PSNR of static parts when an object moves, with and without motion check: ``python benchmarks/moving.py``.
 
-A chair moves across procedural rooms (``examples/worlds``) by ``--distances`` metres between the moments
-``--during``, the first frame's being 0 and the last one's 1. Every second frame is an input view, some of the others
-are held out. Scored are the pixels of held-out views that do not show the chair; ``chair left`` is the share of its
-pixels that enter the scene, ``static lost`` the share of all other pixels that the check drops. Overrides are those
-of ``vg2gt reconstruct``, such as ``backend=oracle model=tiny_ungated backend.depth_noise=0.005``.
+A chair moves across procedural rooms (``examples/worlds``) by ``--distances`` metres in the time interval ``--during``
+(0 is the first frame, 1 the last). Every second frame is an input view; some of the others are held out. PSNR is that
+of pixels in held-out views that do not show the chair. ``chair left`` is the fraction of the chair's input pixels that
+enter the scene, ``static lost`` the fraction of all other input pixels that the check drops. Overrides are those of
+``vg2gt reconstruct``, such as ``backend=oracle model=tiny_ungated backend.depth_noise=0.005``.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from vg2gt.runs.load import LoadedModel, load_model
 from vg2gt.types import Batch, Cameras
 
 TARGETS = 4
-SEEN = 0.01  # relative difference of depth from which on a pixel shows the chair
+SEEN = 0.01  # relative depth difference to the empty room above which a pixel shows the chair
 FIRST_SEED = 1_000_000
 Checks = dict[str, ViewCheck | None]
 
@@ -34,7 +34,7 @@ Checks = dict[str, ViewCheck | None]
 def scene(
     seed: int, views: int, size: tuple[int, int], distance: float, during: Sequence[float]
 ) -> tuple[Batch, Tensor]:
-    """One room, and ``[V, H, W]`` bool where its frames show the chair."""
+    """Renders a room; also returns where its frames show the chair, bool ``[V, H, W]``."""
     room = SyntheticMovingRoom(seed, 2 * views, size, distance=distance, during=(during[0], during[1]))
     order = [*range(0, 2 * views, 2), *torch.linspace(1, 2 * views - 1, TARGETS).round().int().tolist()]
     frames = room.render(order, 1)
@@ -51,7 +51,7 @@ def scene(
 
 @torch.no_grad()
 def score(loaded: LoadedModel, batch: Batch, chair: Tensor) -> dict[str, float]:
-    """Figures of one reconstruction; ``chair`` as of :func:`scene`."""
+    """Scores one reconstruction; ``chair`` is the mask from :func:`scene`."""
     prediction, truth = loaded.model(batch.context.images, batch.context.hints), batch.target
     cameras = ground_truth_target_cameras(batch, prediction)
     shown = loaded.renderer(prediction.gaussians, cameras).color[0]
@@ -66,7 +66,7 @@ def score(loaded: LoadedModel, batch: Batch, chair: Tensor) -> dict[str, float]:
 
 
 def rows(loaded: LoadedModel, checks: Checks, cases: Sequence[tuple], seeds: range) -> Iterator[dict[str, float]]:
-    """Means over rooms, of every case with every check."""
+    """Yields the means over rooms of every case, with every check."""
     for distance, during, views, size in cases:
         found: dict[str, list[dict[str, float]]] = {name: [] for name in checks}
         for seed in seeds:

@@ -1,7 +1,7 @@
-"""Trains scenes with OpenSplat's program on a CPU, as a peer (``photos.py --opensplat BINARY``).
+"""Trains scenes with OpenSplat on a CPU, for comparison (``photos.py --opensplat BINARY``).
 
-As published it blends Gaussians in a wrong order on a CPU (it reads their depths through a strided view) and leaves the
-principal point out: mend both in ``project_gaussians_forward_tensor_cpu`` before a comparison.
+The published CPU code blends Gaussians in the wrong order (it reads their depths through a strided view) and ignores
+the principal point. Fix both in ``project_gaussians_forward_tensor_cpu`` before a comparison.
 """
 
 from __future__ import annotations
@@ -12,21 +12,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-STEPS = 100  # of the first try, which tells how long a step takes
-NEAR_ENOUGH = 0.1  # of a budget
+STEPS = 100  # of the first run, which measures the time per step
+NEAR_ENOUGH = 0.1  # relative tolerance of the budget
 TRIES = 3
-BACKGROUND = (0.6130, 0.0101, 0.3984)  # its own, where nothing is opaque
+BACKGROUND = (0.6130, 0.0101, 0.3984)  # OpenSplat's background colour
 
 
 @dataclass(frozen=True)
 class Training:
-    """A scene that OpenSplat trained.
+    """A scene trained by OpenSplat.
 
     Attributes:
         scene: its PLY file, in the frame of the given cameras.
-        steps: how many were made.
-        core_seconds: processor time from the first step on: libraries and images were loaded before.
-        peak_memory: resident bytes at most.
+        steps: number of training steps.
+        core_seconds: CPU time from the first step on, without loading libraries and images.
+        peak_memory: maximum resident memory in bytes.
     """
 
     scene: Path
@@ -38,20 +38,21 @@ class Training:
 def train(
     binary: Path, photos: Path, scene: Path, budget: float, extra: Sequence[str] = (), pace: float | None = None
 ) -> Training:
-    """Trains on one thread for about so many core-seconds, which OpenSplat can only be told as a number of steps.
+    """Trains on one thread for about ``budget`` core-seconds.
 
-    A training that takes 10 % less or more than its budget is repeated with another number of steps.
+    OpenSplat only accepts a number of steps. A training that misses its budget by 10 % or more is repeated with a
+    corrected number of steps, in at most 3 runs.
 
     Args:
-        binary: the program.
+        binary: OpenSplat's program.
         photos: COLMAP scene.
-        scene: PLY file to write; its cameras are written to the same folder.
-        budget: core-seconds.
-        extra: options over those chosen here.
-        pace: core-seconds that a step is expected to take; None: this is tried first.
+        scene: PLY file to write; cameras are written to the same folder.
+        budget: budget in core-seconds.
+        extra: options that override those chosen here.
+        pace: expected core-seconds per step; None measures it first.
 
     Raises:
-        RuntimeError: if the program fails, with the end of what it said.
+        RuntimeError: if the program fails; includes the end of its output.
     """
     if pace is None:
         tried = _train(binary, photos, scene, STEPS, extra)
@@ -67,7 +68,7 @@ def train(
 
 
 def schedule(steps: int) -> list[str]:
-    """OpenSplat's options for a training of so many steps, few against the 30,000 that its own are made for."""
+    """Returns OpenSplat's options for a short training; its defaults are for 30,000 steps."""
     return [
         f"--num-iters={steps}",
         "--num-downscales=0",
@@ -97,6 +98,6 @@ def _train(binary: Path, photos: Path, scene: Path, steps: int, extra: Sequence[
 
 
 def _processor_seconds(process: int) -> float:
-    """Processor time of a running process so far."""
+    """CPU time of a running process so far."""
     fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")

@@ -1,8 +1,8 @@
-"""Sets of photographs prepared for comparison: cameras found once, every fourth view left out.
+"""Prepares sets of photographs for comparison: estimates cameras once and holds out every fourth view.
 
-What is left over is written as a COLMAP scene of the working size (``images/``, ``sparse/0``), which every program is
-given, so that all start from the same pixels, cameras and points. Points that fewer than two of its views saw are left
-out: the views that are scored have no part in it.
+The other views are written as a COLMAP scene at the working size (``images/``, ``sparse/0``), which is the input of all
+programs, so that all start from the same pixels, cameras and points. Points seen in fewer than two of these views are
+left out, so that held-out views do not contribute.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ from vg2gt.types import Cameras
 if TYPE_CHECKING:
     from pycolmap import Reconstruction  # pyright: ignore[reportMissingImports]
 
-EVERY = 4  # one view of so many is left out, the one in the middle
-FEWEST = 2  # views that must have seen a point
+EVERY = 4  # hold out one view of every 4, from the middle
+FEWEST = 2  # minimum number of input views that see a point
 
 
 @dataclass(frozen=True)
@@ -42,13 +42,13 @@ class PhotoSet:
     """Photographs with cameras at the working size.
 
     Attributes:
-        name: of the set.
-        folder: COLMAP scene of the views that programs are given.
-        images: ``[V, 3, H, W]`` of all views, in [0, 1].
-        cameras: of all views ``[1, V]``, in the scene's frame.
-        context: indices of the views in ``folder``.
-        held_out: indices of the others.
-        points: how many sparse points ``folder`` has.
+        name: name of the set.
+        folder: COLMAP scene of the input views.
+        images: all views ``[V, 3, H, W]`` in [0, 1].
+        cameras: cameras of all views ``[1, V]``, in the scene's frame.
+        context: indices of the input views.
+        held_out: indices of the held-out views.
+        points: number of sparse points in ``folder``.
     """
 
     name: str
@@ -66,25 +66,25 @@ class PhotoSet:
 
     @property
     def given(self) -> list[str]:
-        """Names of the views in ``folder``, without ending."""
+        """Names of the input views, without suffix."""
         return [view_name(index) for index in self.context]
 
 
 def view_name(index: int) -> str:
-    """How the files of a view are called."""
+    """Returns the file name of a view, without suffix."""
     return f"{index:06d}"
 
 
 def prepare(name: str, photos: Path, out: Path, size: int, patch: int, poses: str) -> PhotoSet:
-    """Finds the cameras of a folder of photographs, once, and writes the views that programs are given.
+    """Estimates the cameras of a folder of photographs once, and writes the input views.
 
     Args:
-        name: of the set.
-        photos: the folder.
-        out: where cameras and views are kept: ``sfm/`` and ``SIZE/``.
+        name: name of the set.
+        photos: folder of photographs.
+        out: output folder; cameras go to ``sfm/``, views to ``SIZE/``.
         size: longer side in pixels.
-        patch: of which the sides are multiples.
-        poses: ``sfm`` or ``given``: camera files next to the photographs.
+        patch: image sides are multiples of this.
+        poses: ``sfm``, or ``given`` to read camera files next to the photographs.
 
     Raises:
         ValueError: if there are no cameras, or too few views.
@@ -117,12 +117,12 @@ def prepare(name: str, photos: Path, out: Path, size: int, patch: int, poses: st
 
 @dataclass(frozen=True)
 class SparsePoints:
-    """Points of a model that two of the given views saw at least.
+    """Points of a COLMAP model that at least two input views see.
 
     Attributes:
         positions: ``[N, 3]``.
-        colors: ``[N, 3]`` uint8.
-        sees: ``[views, N]`` bool.
+        colors: ``[N, 3]``, uint8.
+        sees: whether a view sees a point ``[views, N]``, bool.
     """
 
     positions: NDArray[np.float64]
@@ -131,7 +131,7 @@ class SparsePoints:
 
 
 def _points(folder: Path | None, titles: dict[str, str], names: Sequence[str]) -> SparsePoints:
-    """The points that views of these names saw; ``titles`` are the names of the model's files where they differ."""
+    """Points seen by the named views; ``titles`` maps file names in the model to view names where they differ."""
     if folder is None:
         return SparsePoints(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros((len(names), 0), bool))
     model = read_colmap(folder)
@@ -152,7 +152,7 @@ def _points(folder: Path | None, titles: dict[str, str], names: Sequence[str]) -
 
 
 def _scene(cameras: Cameras, context: Sequence[int], points: SparsePoints) -> Reconstruction:
-    """The given views' cameras at the working size, with the points where they see them."""
+    """COLMAP model of the input views at the working size, with points and their observations."""
     view, point = np.nonzero(points.sees)
     seen = torch.from_numpy(points.positions).float().expand(1, len(context), -1, -1)
     pixels = project(seen, cameras)[0][0].double().numpy()[view, point]

@@ -1,12 +1,12 @@
-"""Photographs held out, feed-forward and refined: ``python benchmarks/photos.py FOLDER [FOLDER ...]``.
+"""Scores on held-out photographs, feed-forward and refined: ``python benchmarks/photos.py FOLDER [FOLDER ...]``.
 
-Cameras are found by structure from motion once and kept in ``--work``. Every fourth view is left out: no program sees
-it, nor points that only it saw. Scored are the feed-forward scene and scenes refined from it up to ``--budgets``
-core-seconds: of one thread, structure from motion not counted, the feed-forward pass counted. ``--model`` and
-``--refine`` change settings, so that they can be compared, such as ``--model fine.min_footprint=6.2`` or
-``--refine rates.cameras=0``. ``--opensplat BINARY`` trains OpenSplat on the same images, cameras and points for the
-same core-seconds. Rows of today's file are replaced where set, size, program, settings and budget agree; others of the
-newest file are kept. Writes JSON and a table to ``benchmarks/results`` and a picture of each set to ``--work``.
+Cameras are estimated once by structure from motion and kept in ``--work``. Every fourth view is held out: no program
+sees it, nor points that only it saw. Evaluates the feed-forward scene, and scenes refined from it for each of
+``--budgets``: core-seconds of one thread, including the feed-forward pass but not structure from motion. ``--model``
+and ``--refine`` change settings for comparison, such as ``--model fine.min_footprint=6.2`` or
+``--refine rates.cameras=0``. ``--opensplat BINARY`` trains OpenSplat on the same images, cameras and points with the
+same budgets. New rows replace those of the newest file with the same set, size, program, settings and budget; other
+rows are kept. Writes JSON and a table to ``benchmarks/results``, and a picture of each set to ``--work``.
 """
 
 from __future__ import annotations
@@ -44,19 +44,19 @@ from vg2gt.types import Cameras, Gaussians
 
 OURS, PEER = "VG²GT", "OpenSplat"
 FEED_FORWARD = "feed-forward"
-PICTURED = 4  # held-out views of a picture, evenly spread
+PICTURED = 4  # held-out views per picture, evenly spread
 KEY = ("set", "size", "program", "settings", "budget")
 Row = dict[str, Any]
 
 
 @dataclass
 class Scores:
-    """Scores scenes of one set.
+    """Scores scenes of one set of photographs.
 
     Attributes:
         photos: the set.
-        lpips: None where its weights are missing.
-        panels: of the picture: what was rendered of some held-out views, by label.
+        lpips: LPIPS metric; None if its weights are missing.
+        panels: renderings of some held-out views for the picture, by label.
     """
 
     photos: PhotoSet
@@ -68,13 +68,13 @@ class Scores:
 
     @torch.no_grad()
     def __call__(self, label: str, gaussians: Gaussians, cameras: Cameras, renderer: Renderer) -> Row:
-        """Figures of the given views and of those held out, whose cameras are brought into the scene's frame.
+        """Returns metrics on input views and held-out views; cameras of the latter are aligned with the scene.
 
         Args:
-            label: of the panels.
+            label: label of the panels.
             gaussians: the scene.
-            cameras: of the given views, in the scene's frame.
-            renderer: how it is rendered.
+            cameras: cameras of the input views, in the scene's frame.
+            renderer: renderer of the scene.
         """
         photos, plain = self.photos, replace(renderer, geometry=False)
         similarity = align_cameras(photos.cameras.select(torch.tensor(photos.context)), cameras)
@@ -97,12 +97,12 @@ class Scores:
         return [held_out[i * (len(held_out) - 1) // max(count - 1, 1)] for i in range(count)]
 
     def write_picture(self, path: Path) -> Path:
-        """One line for each of some held-out views: the photograph, then what was scored, in that order."""
+        """Writes one row per pictured held-out view: the photograph, then the scored scenes in order."""
         return write_png(path, grid(list(zip(*self.panels.values(), strict=True))))
 
 
 def given_cameras(scene: Scene, photos: PhotoSet) -> Cameras:
-    """The scene's cameras in the order of the views that it was given, for images of the size that is scored."""
+    """Returns the scene's cameras in the order of the input views, with intrinsics for the scored image size."""
     order = torch.tensor([scene.names.index(name) for name in photos.given])
     intrinsics = photos.cameras.intrinsics[:, list(photos.context)].to(scene.cameras.intrinsics)
     return Cameras(scene.cameras.world_to_camera[:, order], intrinsics, photos.size)
@@ -111,7 +111,15 @@ def given_cameras(scene: Scene, photos: PhotoSet) -> Cameras:
 def ours(
     loaded: LoadedModel, scores: Scores, refinement: RefineOptions, budgets: Sequence[float], size: int | None
 ) -> list[Row]:
-    """The feed-forward scene and those refined from it, each from the start; ``size``: longer side they work at."""
+    """Scores the feed-forward scene, and scenes refined from it independently for each budget.
+
+    Args:
+        loaded: the model.
+        scores: scores the scenes.
+        refinement: options of refinement, without a limit of time or steps.
+        budgets: core-seconds.
+        size: longer side of the images to reconstruct from; None uses the scored size.
+    """
     photos, memory = scores.photos, PeakMemory(torch.device("cpu"))
     began = time.process_time()
     scene = reconstruct_with(loaded.model, photos.folder, size=size or photos.size, renderer=loaded.renderer)
@@ -137,7 +145,11 @@ def ours(
 
 
 def peer(binary: Path, scores: Scores, extra: Sequence[str], budgets: Sequence[float]) -> list[Row]:
-    """OpenSplat's scenes, rendered as it renders them (agrees with its own pictures to 53 dB)."""
+    """Trains and scores OpenSplat's scenes, rendered in the same way (agrees with its own images to 53 dB).
+
+    Raises:
+        ValueError: if the set has no sparse points.
+    """
     photos, rows, pace = scores.photos, [], None
     if not photos.points:
         raise ValueError(f"{PEER} starts from sparse points, and {photos.folder} has none: take --poses sfm")
@@ -155,7 +167,7 @@ def peer(binary: Path, scores: Scores, extra: Sequence[str], budgets: Sequence[f
 
 
 def warm_up(loaded: LoadedModel, photos: PhotoSet, refinement: RefineOptions) -> None:
-    """Compiles and loads what is compiled and loaded once, on two small views."""
+    """Runs once on two small views, so that one-time compilation and loading are not measured."""
     patch = loaded.model.backend.patch_size
     size = (max(2, photos.size[0] // patch // 4) * patch, max(2, photos.size[1] // patch // 4) * patch)
     scene = reconstruct_with(loaded.model, photos.folder, size=size, max_images=2, renderer=loaded.renderer)
@@ -163,7 +175,7 @@ def warm_up(loaded: LoadedModel, photos: PhotoSet, refinement: RefineOptions) ->
 
 
 def merged(folder: Path, rows: Sequence[Row]) -> list[Row]:
-    """The newest file's rows with these in the place of those that have the same key."""
+    """Returns the rows of the newest file, with ``rows`` added or replacing rows with the same key."""
     newest = max(folder.glob("*-photos.json"), default=None)
     old = [] if newest is None else json.loads(newest.read_text())["rows"]
     by_key = {tuple(row[name] for name in KEY): row for row in [*old, *rows]}
@@ -176,7 +188,7 @@ def _order(row: Row) -> tuple[Any, ...]:
 
 
 def tables(rows: Sequence[Row]) -> str:
-    """Markdown: held-out PSNR and SSIM by size and budget, then all figures."""
+    """Returns Markdown tables: held-out PSNR and SSIM by size and budget, then all metrics."""
     parts = ["# Held-out photographs", "PSNR in dB and SSIM of every fourth view, by core-seconds of one thread."]
     for size in sorted({row["size"] for row in rows}):
         some = [row for row in rows if row["size"] == size]
@@ -213,7 +225,7 @@ def _short(row: Row | None) -> str:
 
 
 def arguments() -> argparse.Namespace:
-    """The command line."""
+    """Parses the command line."""
     options = parser(__doc__, threads=1)
     options.add_argument("folders", nargs="+", metavar="FOLDER", help="of photographs; NAME=FOLDER names the set")
     options.add_argument("--size", type=int, default=280, help="longer side in pixels")
@@ -231,7 +243,7 @@ def arguments() -> argparse.Namespace:
 
 
 def main() -> None:
-    """Measures, prints and writes after every set."""
+    """Measures every set; prints and writes after each."""
     given = arguments()
     torch.set_num_threads(given.threads)
     changes = [f"refine.{change}" for change in given.refine]
@@ -266,7 +278,7 @@ def main() -> None:
 
 
 def lpips_or_none() -> LPIPS | None:
-    """LPIPS, where there are weights."""
+    """Returns LPIPS, or None if its weights are missing."""
     try:
         return load_lpips()
     except WeightsNotFoundError:
@@ -274,7 +286,7 @@ def lpips_or_none() -> LPIPS | None:
 
 
 def _of_model(change: str) -> str:
-    """The override of a change of the model; a plus adds a key that the weights' own configuration lacks."""
+    """Override for a ``--model`` change; a leading plus adds a key that the checkpoint's configuration lacks."""
     return ("+" if change.startswith("+") else "") + f"model.{change.removeprefix('+')}"
 
 

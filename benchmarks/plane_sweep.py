@@ -1,10 +1,9 @@
-"""Depth of the learned plane sweep against a classical one and a constant: ``python benchmarks/plane_sweep.py``.
+"""Depth of the learned plane sweep compared with a classical one and a constant: ``python benchmarks/plane_sweep.py``.
 
-Cameras are given, nothing else: both sweeps get the same depth range, found by the network from the cameras alone (and,
-for the record, the classical one also the true range). Rooms that neither the backbone nor anything else was trained
-on; with ``--shared FOLDER`` real recordings; with ``--infinigen FOLDER`` rooms of Infinigen. Depth is compared after
-one median scale per set of views, because that is how reconstructions are used; ``raw`` has none. Prints a table and
-writes a dated JSON file.
+Only cameras are given. Both sweeps use the same depth range, which the network finds from the cameras alone; the
+classical sweep is also run with the true range. Scenes are procedural ones on which nothing was trained, with
+``--shared FOLDER`` also real recordings, and with ``--infinigen FOLDER`` rooms of Infinigen. Depth is compared after
+alignment by one median scale per set of views, except ``raw``. Prints a table and writes a dated JSON file.
 """
 
 from __future__ import annotations
@@ -44,12 +43,12 @@ SETS = {
     " data.eval_window=10",
     "Infinigen rooms": "data=infinigen data.root={infinigen} data.image_size=[112,224] data.eval_window=10",
 }
-_WINDOW = 7  # pixels of the classical matching cost, at half resolution
+_WINDOW = 7  # window of the classical matching cost, in pixels at half resolution
 _PLANES = 64
 
 
 def batches(overrides: str) -> Iterator[Batch]:
-    """The input views of the evaluation of a data configuration: 8 per scene or window."""
+    """Yields the 8 input views of every evaluation scene, or window, of a data configuration."""
     config = compose("train", *overrides.split(), "data.eval_target=1", "data.eval_context=8")
     data = instantiate(config.data)
     data.setup("validate")
@@ -58,11 +57,17 @@ def batches(overrides: str) -> Iterator[Batch]:
 
 
 def scores(depth: Tensor, truth: Tensor, confidence: Tensor | None) -> dict[str, float]:
-    """Errors of the depth of some views ``[V, H, W]`` where the truth is known.
+    """Computes depth errors over all pixels with known truth.
+
+    Args:
+        depth: ``[V, H, W]``.
+        truth: ``[V, H, W]``, 0 where unknown.
+        confidence: ``[V, H, W]``; None for no ``half`` and ``ause``.
 
     Returns:
-        ``raw`` and ``abs_rel`` (after one median scale), the share within 5 % (``d1.05``), the abs_rel of the more
-        confident half over all (``half``), and the area under the sparsification error over abs_rel (``ause``).
+        ``raw``: mean relative error without alignment. With one median scale: ``abs_rel`` and ``median``, the mean and
+        median relative error; ``d1.05``, the fraction of pixels within 5 %; ``half``, abs_rel of the more confident
+        half relative to that of all; ``ause``, area under the sparsification error relative to abs_rel.
     """
     valid = (truth > 0) & torch.isfinite(depth) & (depth > 0)
     depth, truth = depth[valid], truth[valid]
@@ -86,7 +91,7 @@ def scores(depth: Tensor, truth: Tensor, confidence: Tensor | None) -> dict[str,
 
 
 def classical(views: PosedViews, depth_range: Tensor) -> Tensor:
-    """Winner-take-all plane sweep ``[V, H, W]``: mean normalised cross-correlation over three sources, 7x7 windows."""
+    """Winner-take-all plane sweep ``[V, H, W]`` by normalised cross-correlation in 7x7 windows, mean of 3 sources."""
     sources = choose_sources(views.world_to_camera, views.intrinsics, views.size, depth_range, 3)
     grey = F.avg_pool2d(views.images.mean(1, keepdim=True), 2)
     size = (grey.shape[-2], grey.shape[-1])
@@ -123,7 +128,7 @@ def _moments(x: Tensor) -> tuple[Tensor, Tensor]:
 
 @torch.no_grad()
 def measure(backend: SweepBackend, batch: Batch, old: bool) -> dict[str, dict[str, float]]:
-    """Scores of every method on one batch of one scene; without ``old``, of the network alone."""
+    """Scores all methods on a batch of one scene; only the network unless ``old``."""
     truth = batch.depth[0]
     cameras = batch.cameras
     start = time.process_time()
@@ -143,7 +148,7 @@ def measure(backend: SweepBackend, batch: Batch, old: bool) -> dict[str, dict[st
 
 
 def average(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """The mean of every figure."""
+    """Returns the mean of every score."""
     return {name: math.fsum(row[name] for row in rows) / len(rows) for name in rows[0]}
 
 

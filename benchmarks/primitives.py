@@ -1,11 +1,11 @@
-"""Primitives and decoding time against the number of views: ``python benchmarks/primitives.py [--views N ...]``.
+"""Primitives and decoding time by number of views: ``python benchmarks/primitives.py [--views N ...]``.
 
-VG²GT (at several voxel sizes) against one Gaussian per pixel (``--reference da3_gs``: DA3's own) and against pixel
-Gaussians merged by voxels, on procedural rooms or, with ``data=rgbd data.root=FOLDER``, on a recording (paper, figure
-on the number of primitives and the time of the decoding head). Nothing is trained: counts follow from the backbone's
-geometry, here the simulated one's, whose noise is printed. Training changes those of VG²GT: its enhanced depth agrees
-better among views, so they fall. Times are the best of several passes: core-seconds on a CPU, CUDA events on a GPU.
-Prints a table and writes a dated JSON file to ``benchmarks/results``.
+Compares VG²GT at several voxel sizes with one Gaussian per pixel (``--reference da3_gs``: DA3's own Gaussians) and with
+pixel Gaussians merged by voxels, on procedural rooms or, with ``data=rgbd data.root=FOLDER``, on a recording (paper,
+figure on the number of primitives and the time of the decoding head). Models are untrained: counts follow from the
+geometry of the backbone, by default the simulated one, whose noise is printed. Training reduces the counts of VG²GT, as
+enhanced depth agrees better between views. Times are the best of several passes: core-seconds on a CPU, CUDA events on
+a GPU. Prints a table and writes a dated JSON file to ``benchmarks/results``.
 """
 
 from __future__ import annotations
@@ -37,35 +37,35 @@ LABELS = {
 
 @dataclass(frozen=True)
 class Method:
-    """A model and the smallest edge of its voxels in pixels; None where there are none."""
+    """A model and the minimum edge of its voxels in pixels; None for models without voxels."""
 
     model: str
     footprint: float | None
 
     @property
     def label(self) -> str:
-        """Name in tables and plots; with the voxels' edge."""
+        """Name in tables, with the edge of the voxels."""
         name = LABELS[self.model]
         return name if self.footprint is None else f"{name}, {self.footprint:g} px"
 
     @property
     def overrides(self) -> list[str]:
-        """What the configuration needs."""
+        """Hydra overrides for the method."""
         key = "model.fine.min_footprint" if self.model in ("tiny", "vg2gt") else "model.min_footprint"
         return [f"model={self.model}", *([] if self.footprint is None else [f"{key}={self.footprint}"])]
 
 
 @dataclass
 class Row:
-    """What one method gives for one number of views, means over scenes.
+    """Results of a method for one number of views, means over scenes.
 
     Attributes:
-        method: its label.
-        views: input views.
+        method: label of the method.
+        views: number of input views.
         primitives: Gaussians per scene.
-        head_seconds: from tokens and geometry to Gaussians (dense head included).
-        seconds: everything but the backbone and its first decoding.
-        voxel_size: edge in scene units (median depth 1); 0 without voxels.
+        head_seconds: time from tokens and geometry to Gaussians, including the dense head.
+        seconds: time of everything except the backbone and its first decode.
+        voxel_size: edge of voxels in scene units (median depth 1); 0 without voxels.
     """
 
     method: str
@@ -77,7 +77,7 @@ class Row:
 
 
 def load_scenes(overrides: list[str], views: int, scenes: int) -> list[Batch]:
-    """Evaluation scenes with the given number of input views, spread evenly over each."""
+    """Returns evaluation scenes with the given number of input views, evenly spread over each scene."""
     chosen = [f"data.eval_context={views}", "data.eval_target=0", f"data.eval_scenes={scenes}"]
     with tempfile.TemporaryDirectory() as folder:
         data = instantiate(compose_run([*overrides, *chosen], Path(folder)).data)
@@ -87,7 +87,7 @@ def load_scenes(overrides: list[str], views: int, scenes: int) -> list[Batch]:
 
 @torch.no_grad()
 def measure(method: Method, batches: list[Batch], overrides: list[str], passes: int, device: torch.device) -> Row:
-    """Reconstructs the scenes and takes means."""
+    """Reconstructs the scenes and averages the results."""
     with tempfile.TemporaryDirectory() as folder:
         config = compose_run([*overrides, *method.overrides], Path(folder))
     torch.manual_seed(0)
@@ -115,7 +115,7 @@ def measure(method: Method, batches: list[Batch], overrides: list[str], passes: 
 
 
 def print_rows(title: str, rows: list[Row], pixels: int) -> None:
-    """One row per method and number of views, with ratios to the first method."""
+    """Prints one row per method and number of views, with ratios to the first method."""
     first = rows[0].method
     head = ("method", "views", "primitives", "of pixels", f"of {first}", "head, s", f"of {first}", "all, s")
     reference = {row.views: row for row in rows if row.method == first}
@@ -136,7 +136,7 @@ def print_rows(title: str, rows: list[Row], pixels: int) -> None:
 
 
 def describe(overrides: list[str], batch: Batch) -> dict[str, Any]:
-    """The data, the backbone and its noise."""
+    """Describes the data, the backbone and its noise."""
     with tempfile.TemporaryDirectory() as folder:
         config = compose_run(overrides, Path(folder))
     return {
@@ -148,7 +148,7 @@ def describe(overrides: list[str], batch: Batch) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Measures, prints, writes and plots."""
+    """Measures, prints and writes."""
     options = parser(
         __doc__, device=True, passes=1, overrides="Hydra overrides; rooms have data.num_frames=64 unless they say so"
     )

@@ -1,8 +1,8 @@
-"""Speed of the renderer's implementations (on a GPU memory, too): ``python benchmarks/render.py [--device cuda]``.
+"""Speed, and on a GPU memory, of the renderer's implementations: ``python benchmarks/render.py [--device cuda]``.
 
-All implementations are measured in one process, in turns, and compared by ratio; times are the best of several
-passes: core-milliseconds on a CPU (one thread unless the table says otherwise), milliseconds on a GPU. Prints tables
-and writes a dated JSON file to ``benchmarks/results``.
+Measures all implementations alternately in one process and compares them by ratio. Times are the best of several
+passes: core-milliseconds on a CPU (with one thread unless the table says otherwise), milliseconds on a GPU. Prints
+tables and writes a dated JSON file to ``benchmarks/results``.
 """
 
 from __future__ import annotations
@@ -40,13 +40,13 @@ class Case:
 
     @property
     def scene(self) -> tuple[Any, ...]:
-        """What two cases must share to be compared."""
+        """Properties that cases must share to be compared."""
         return self.gaussians, self.size, self.views
 
 
 @dataclass
 class Timing:
-    """Best times of a case in milliseconds (``wall``: both passes by the clock), and the GPU's peak memory in MB."""
+    """Best times of a case in milliseconds (``wall`` is wall time of both passes), and peak GPU memory in MB."""
 
     forward: float = float("inf")
     backward: float = float("inf")
@@ -55,12 +55,12 @@ class Timing:
 
     @property
     def total(self) -> float:
-        """Forward and backward."""
+        """Sum of forward and backward."""
         return self.forward + self.backward
 
 
 def build(case: Case, device: torch.device) -> tuple[Gaussians, Cameras]:
-    """The case's scene on the device; parameters require gradients."""
+    """Returns the case's scene on the device; its parameters require gradients."""
     gaussians = room_gaussians(case.gaussians, case.size, case.sigma).to(device)
     gaussians = gaussians.map(lambda t: t.requires_grad_() if t.is_floating_point() else t)
     return gaussians, room_cameras(case.views, case.size).to(device)
@@ -99,7 +99,7 @@ def _run(case: Case, gaussians: Gaussians, cameras: Cameras) -> list[Tensor]:
 
 
 def _run_gsplat(gaussians: Gaussians, cameras: Cameras) -> list[Tensor]:
-    """The field's GPU rasteriser: colour and expected depth."""
+    """Renders colour and expected depth with gsplat's rasteriser."""
     from gsplat import rasterization  # pyright: ignore[reportMissingImports]
 
     height, width = cameras.size
@@ -120,7 +120,7 @@ def _run_gsplat(gaussians: Gaussians, cameras: Cameras) -> list[Tensor]:
 
 
 def compare(cases: list[Case], device: torch.device, passes: int) -> list[Timing]:
-    """Measures the cases in turns; the first pass warms up."""
+    """Measures the cases alternately; the first pass is a warm-up."""
     scenes = {}
     for case in cases:
         key = (case.gaussians, case.size, case.views, case.sigma)
@@ -142,7 +142,7 @@ def compare(cases: list[Case], device: torch.device, passes: int) -> list[Timing
 
 
 def cpu_suites(quick: bool) -> dict[str, list[Case]]:
-    """Cases on a CPU by table."""
+    """Returns the cases for a CPU, by table."""
     base = Case("cpu", 100_000)
     cores = os.cpu_count() or 1
     suites = {
@@ -171,7 +171,7 @@ def cpu_suites(quick: bool) -> dict[str, list[Case]]:
 
 
 def gpu_suites(quick: bool) -> dict[str, list[Case]]:
-    """Cases on a GPU by table; gsplat takes part where it is installed."""
+    """Returns the cases for a GPU, by table; includes gsplat if installed."""
     try:
         import gsplat  # noqa: F401  # pyright: ignore[reportMissingImports]
 
@@ -194,7 +194,7 @@ def gpu_suites(quick: bool) -> dict[str, list[Case]]:
 
 
 def print_case_table(title: str, cases: list[Case], timings: list[Timing], unit: str) -> None:
-    """One row per case, with its ratio to the first case of the same scene."""
+    """Prints one row per case, with its ratio to the first case of the same scene."""
     head = ["implementation", "mode", "outputs", "Gaussians", "size", "views", "threads"]
     head += ["forward", "backward", "total", "ratio", "wall"]
     if with_memory := any(timing.memory for timing in timings):

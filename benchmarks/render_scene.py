@@ -1,7 +1,7 @@
-"""The scene of the renderer's benchmarks: a box-shaped room covered by pixel-sized Gaussians, seen from inside.
+"""Scene of the renderer benchmarks: a box-shaped room covered with pixel-sized Gaussians, seen from inside.
 
-It imitates what a feed-forward model predicts: one flat Gaussian per source pixel, slightly off the surface, slightly
-misaligned, of varied size and opacity; every ray passes several of them. The true depth is known in closed form.
+It imitates the output of a feed-forward model: one flat Gaussian per source pixel, slightly off the surface, slightly
+misaligned, with varied size and opacity. Every ray passes through several of them. True depth has a closed form.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ SOURCES = 8
 
 
 def room_cameras(views: int, size: tuple[int, int]) -> Cameras:
-    """Views of the room's far corner from places along a line, ``[1, views]``."""
+    """Returns cameras ``[1, views]`` on a line that look at the room's far corner."""
     height, width = size
     poses = []
     for index in range(views):
@@ -38,13 +38,13 @@ def room_cameras(views: int, size: tuple[int, int]) -> Cameras:
 
 
 def true_depth(cameras: Cameras) -> Tensor:
-    """Depth of the room's walls, ``[1, V, H, W]``."""
+    """Returns the depth of the room's walls ``[1, V, H, W]``."""
     rays = ray_directions(cameras.intrinsics, cameras.size)
     return _wall(cameras, rays)[0]
 
 
 def _wall(cameras: Cameras, rays: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Depth ``[1, V, ...]``, point and inward normal ``[1, V, ..., 3]`` where camera rays leave the room."""
+    """Depth ``[1, V, ...]``, point and inward normal ``[1, V, ..., 3]`` where camera rays hit the walls."""
     to_world = invert_rigid(cameras.world_to_camera)
     extra = (1,) * (rays.dim() - 3)
     origin = to_world[..., :3, 3].reshape(*rays.shape[:2], *extra, 3)
@@ -57,7 +57,14 @@ def _wall(cameras: Cameras, rays: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def room_gaussians(count: int, size: tuple[int, int], sigma: float = 1.0, seed: int = 0) -> Gaussians:
-    """``count`` Gaussians from random pixels of 8 source views; ``sigma`` is their size in source pixels."""
+    """Returns Gaussians at random pixels of 8 source views.
+
+    Args:
+        count: number of Gaussians.
+        size: size of the source views ``(height, width)``.
+        sigma: mean scale in source pixels.
+        seed: random seed.
+    """
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> Tensor:

@@ -1,4 +1,4 @@
-"""Time and memory of the stages that a model marks in its forward pass."""
+"""Time and memory of the stages marked in a model's forward pass."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from vg2gt.profiling import listening
 
 @dataclass
 class Passes:
-    """What a stage took, one number per pass.
+    """Measurements of a stage, one number per pass.
 
     Attributes:
-        seconds: of all cores on a CPU (other processes hardly matter), of the device on a GPU.
-        peak_mb: allocated on the GPU above what was there when the stage began; 0 on a CPU.
+        seconds: CPU time of all cores, which other processes hardly affect; device time on a GPU.
+        peak_mb: peak memory allocated on the GPU, minus that at the start of the stage; 0 on a CPU.
     """
 
     seconds: list[float] = field(default_factory=list)
@@ -26,26 +26,26 @@ class Passes:
 
     @property
     def best(self) -> float:
-        """The fastest pass."""
+        """Seconds of the fastest pass."""
         return min(self.seconds)
 
     @property
     def memory(self) -> float:
-        """The largest peak."""
+        """Largest peak in MB."""
         return max(self.peak_mb)
 
 
 class StageClock:
-    """Collects stages by name; the model's marks report to it inside :meth:`listening`."""
+    """Collects measurements by stage name, from the stages of models that run inside :meth:`listening`."""
 
     def __init__(self, device: torch.device, now: Callable[[], float] = time.process_time) -> None:
         self.device = device
-        self.now = now  # on a CPU
+        self.now = now  # used on a CPU only
         self.stages: dict[str, Passes] = {}
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Measures what happens inside the block; on a GPU with events, after the device has done what came before."""
+        """Measures the block; on a GPU with CUDA events, after synchronising."""
         passes = self.stages.setdefault(name, Passes())
         if self.device.type != "cuda":
             begin = self.now()
@@ -66,5 +66,5 @@ class StageClock:
         passes.peak_mb.append((torch.cuda.max_memory_allocated(self.device) - before) / 1e6)
 
     def listening(self) -> AbstractContextManager[None]:
-        """Takes the marks of the models inside the block."""
+        """Context in which stages marked by models are measured."""
         return listening(self.stage)

@@ -1,14 +1,15 @@
 """Inference time by stage: ``python benchmarks/stages.py [--views N] [--size H W] [--device cuda] [overrides]``.
 
-Backbone, first decode, coarse voxels, second decode, fine voxels, Gaussian head and rendering of one view, on a
-procedural room, with whatever model and backend the overrides name (paper, Evaluation of Time Consumption:
-``backend=da3_giant model=vg2gt``, 10 views of 224x448 and 518x518). Times are the best of several passes:
-core-seconds on a CPU, CUDA events on a GPU, where each stage's peak memory stands beside; ``trainer.precision`` holds
-as it does in training. Weights need not be there (``backend.pretrained=false``), but then the depth is noise, and so is
-the number of voxels, which is printed. ``--training`` adds a training step and what a whole training of the paper's
-length would cost; the paper's steps have 15 images in the mean and render them all on each of two devices
-(``--views 15 experiment=paper data=synthetic trainer=gpu backend=... model=...``). Prints tables and writes a dated
-JSON file to ``benchmarks/results``.
+Measures backbone, first decode, coarse voxels, second decode, fine voxels, Gaussian head and rendering of one view, on
+a procedural room. Overrides choose model and backend; the paper (Evaluation of Time Consumption) has
+``backend=da3_giant model=vg2gt`` and 10 views of 224x448 and 518x518. Times are the best of several passes:
+core-seconds on a CPU, CUDA events on a GPU, with the peak memory of each stage. ``trainer.precision`` applies as in
+training. With random weights (``backend.pretrained=false``), depth is noise, and so is the number of voxels, which is
+printed.
+
+``--training`` also measures a training step and extrapolates to a training of the paper's length. The paper's steps
+have 15 images on average, all of them rendered, on each of two devices (``--views 15 experiment=paper data=synthetic
+trainer=gpu backend=... model=...``). Prints tables and writes a dated JSON file to ``benchmarks/results``.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ STAGES = {
     "render": "render one view",
 }
 RECONSTRUCTION = tuple(name for name in STAGES if name != "render")
-# Paper, Evaluation of Time Consumption: 10 images, DA3-GIANT, RTX PRO 6000; seconds. "whole" of DA3: its own network.
+# Seconds from the paper (Evaluation of Time Consumption): 10 images, DA3-GIANT, RTX PRO 6000.
 PAPER = {
     (224, 448): {"decode_again": 0.0852, "fine + head": 0.293, "whole": 1.122, "DA3 alone": 0.764},
     (518, 518): {"whole": 2.440, "DA3 alone": 2.180},
@@ -50,7 +51,7 @@ PAPER_STEPS, PAPER_DEVICES = 420_000, 2
 
 @dataclass(frozen=True)
 class Case:
-    """What is measured: a number of views at a size, with Hydra overrides."""
+    """A configuration to measure: number of views, image size, Hydra overrides."""
 
     views: int
     size: tuple[int, int]
@@ -58,7 +59,7 @@ class Case:
 
 
 def prepare(case: Case, device: torch.device, folder: str) -> tuple[Run, Batch]:
-    """Builds the run and one scene on the device."""
+    """Builds the run and loads one scene, both on the device."""
     height, width = case.size
     accelerator = "gpu" if device.type == "cuda" else "cpu"
     scene = [f"data.image_size=[{height},{width}]", "data.eval_scenes=1", "data.train_scenes=1", "data.eval_target=1"]
@@ -74,7 +75,7 @@ def prepare(case: Case, device: torch.device, folder: str) -> tuple[Run, Batch]:
 
 @torch.no_grad()
 def measure_inference(run: Run, batch: Batch, passes: int, device: torch.device) -> dict[str, Any]:
-    """Best seconds and largest peaks of every stage; the first pass warms up."""
+    """Measures the best time and largest peak memory of every stage; the first pass is a warm-up."""
     model, clock = run.module.model.eval(), StageClock(device)
     context = batch.context
     for number in range(passes + 1):
@@ -96,9 +97,10 @@ def measure_inference(run: Run, batch: Batch, passes: int, device: torch.device)
 
 
 def measure_training(run: Run, batch: Batch, passes: int, device: torch.device) -> float:
-    """Best seconds of a training step: reconstruction, rendering, losses, backward pass, clipping, optimiser.
+    """Measures the best seconds of a training step, without data loading.
 
-    Data loading is not in it.
+    Raises:
+        FloatingPointError: if the loss is not finite.
     """
     step, clock = whole_step(run), StageClock(device)
     for _ in range(passes + 1):
@@ -110,7 +112,7 @@ def measure_training(run: Run, batch: Batch, passes: int, device: torch.device) 
 
 
 def print_stages(case: Case, result: dict[str, Any], on_gpu: bool) -> None:
-    """One row per stage, the paper's seconds beside."""
+    """Prints one row per stage, with the paper's seconds."""
     title = f"{case.views} views of {case.size[0]}x{case.size[1]}, {result['gaussians']:,} Gaussians"
     if result["voxels_per_pixel"] is not None:
         title += f", {result['voxels_per_pixel']:.2f} voxels per pixel"
@@ -134,12 +136,12 @@ def print_stages(case: Case, result: dict[str, Any], on_gpu: bool) -> None:
 
 
 def paper_training_hours(step_seconds: float) -> float:
-    """Device hours of a training as long and on as many devices as the paper's, every device with a step of its own."""
+    """Returns the device hours of a training with the paper's numbers of steps and devices."""
     return step_seconds * PAPER_STEPS * PAPER_DEVICES / 3600
 
 
 def print_training(run: Run, case: Case, step_seconds: float, where: str) -> None:
-    """Hours of a whole training of the paper's length on this machine, beside the paper's table."""
+    """Prints the hours of a training of the paper's length on this machine, with the paper's table."""
     rendered = min(case.views, run.module.render_views or case.views)
     title = (
         f"training cost: {PAPER_STEPS:,} steps of {step_seconds:.3f} s on {PAPER_DEVICES} devices, each step "

@@ -1,1 +1,1 @@
-"""Plug-ins to start from; run from a checkout, not part of the installed package."""
+"""Example plug-ins and scripts; run from a checkout, not part of the installed package."""

@@ -1,4 +1,4 @@
-"""A backend of your own around any network that predicts depth; cameras come from the data."""
+"""Example of a custom backend around a network that predicts depth; cameras come from the data."""
 
 import torch
 from torch import Tensor, nn
@@ -13,15 +13,15 @@ class BrightIsNear(nn.Module):
     """A placeholder for your network."""
 
     def forward(self, images: Tensor) -> Tensor:
-        """Images ``[N, 3, H, W]`` to depth ``[N, 1, H, W]``."""
+        """Maps images ``[N, 3, H, W]`` to depth ``[N, 1, H, W]``."""
         return 2 - images.mean(1, keepdim=True)
 
 
 class LocalDepthBackend(Backend):
-    """Tokens are the pixels of a patch, colour and log-depth.
+    """Depth network as a backend; a token holds colour and log-depth of all pixels of a patch.
 
     Args:
-        network: images ``[N, 3, H, W]`` to depth ``[N, 1, H, W]``.
+        network: maps images ``[N, 3, H, W]`` to depth ``[N, 1, H, W]``; None uses the placeholder.
         patch_size: edge of a patch in pixels.
     """
 
@@ -32,7 +32,7 @@ class LocalDepthBackend(Backend):
 
     @torch.no_grad()
     def encode(self, images: Tensor, hints: Hints | None = None) -> Tokens:
-        """Images ``[B, V, 3, H, W]`` to tokens."""
+        """Encodes images ``[B, V, 3, H, W]`` as tokens."""
         self.check_images(images)
         hints = self.require_hints(images, hints, "cameras")
         height, width = images.shape[-2:]
@@ -43,7 +43,7 @@ class LocalDepthBackend(Backend):
         return Tokens((patch,), patch.mean(2), grid, (height, width), {"cameras": hints.cameras})
 
     def decode(self, tokens: Tokens) -> Geometry:
-        """Tokens to depth, confidence and cameras; differentiable in ``tokens.patch``."""
+        """Decodes tokens to depth, confidence and cameras; differentiable in ``tokens.patch``."""
         with full_precision(tokens.camera):
             cells = tokens.patch[0].float().flatten(0, 1).mT.unflatten(-1, tokens.grid)
             depth = F.pixel_shuffle(cells, self.patch_size)[:, 3].exp().unflatten(0, tokens.camera.shape[:2])

@@ -1,4 +1,4 @@
-"""A data set of your own: ``SCENE/rgb/N.png``, ``SCENE/depth/N.npy`` and ``SCENE/cameras.json``."""
+"""Example of a custom dataset: ``SCENE/rgb/N.png``, ``SCENE/depth/N.npy`` and ``SCENE/cameras.json``."""
 
 import json
 from pathlib import Path
@@ -12,16 +12,16 @@ from vg2gt.io.arrays import load_npy
 
 
 class Mine(FileSource):
-    """``cameras.json`` holds ``K`` (3x3, integer pixel centres) and camera-to-world poses by frame number."""
+    """RGB-D scenes; ``cameras.json`` has ``K`` (3x3, integer pixel centres) and camera-to-world ``poses`` by frame."""
 
-    layout = "SCENE/{rgb,depth,cameras.json}"  # for messages
+    layout = "SCENE/{rgb,depth,cameras.json}"  # shown in messages
 
     def find(self, root: Path) -> dict[str, Path]:
-        """Scenes by name."""
+        """Returns the scene folders by name."""
         return {path.parent.name: path.parent for path in sorted(root.glob("*/cameras.json"))}
 
     def index(self, scene: str, folder: Path) -> SceneIndex:
-        """The frames of a scene; nothing is decoded here."""
+        """Lists the frames of a scene; does not decode images."""
         try:
             cameras = json.loads((folder / "cameras.json").read_text())
             poses = {int(number): np.array(pose, np.float64) for number, pose in cameras["poses"].items()}
@@ -33,6 +33,6 @@ class Mine(FileSource):
         return make_index(scene, folder, color, depth, poses, intrinsics)
 
     def read_depth(self, index: SceneIndex, row: int, size: tuple[int, int]) -> np.ndarray:
-        """One frame's z-depth ``[height, width]`` in metres, 0 where there is none."""
+        """Reads the z-depth ``[height, width]`` of a frame in metres, 0 where unknown."""
         depth = load_npy(index.depth[row], index.name, size)
         return np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)

@@ -1,4 +1,4 @@
-"""From photos to a scene in Python, step by step: ``python examples/photos_to_scene.py PHOTOS OUT``."""
+"""Reconstructs a scene from photos in Python, step by step: ``python examples/photos_to_scene.py PHOTOS OUT``."""
 
 import sys
 
@@ -7,22 +7,22 @@ from vg2gt.refinement import RefineOptions, RefineRates
 
 photos, out = sys.argv[1:]
 
-# 1. A model: the plane sweep in the package and the head trained on it. load_model("outputs/RUN") loads your own run.
+# 1. Load a model: the shipped plane sweep and the head trained on it. load_model("outputs/RUN") loads your own run.
 loaded = load_model(backend="sweep")
 print(loaded.weights)
 
-# 2. A scene. Cameras are taken from files next to the photos, or found by structure from motion (vg2gt[colmap]).
+# 2. Reconstruct. Cameras come from files next to the photos, or from structure from motion (vg2gt[colmap]).
 scene = reconstruct_with(loaded.model, photos, size=280)
 print(f"{len(scene.gaussians)} Gaussians from {len(scene.names)} views of {scene.cameras.size}")
 
-# 3. What the views show: colour [3, H, W] in [0, 1], depth [H, W] in scene units (0 = none), normals in camera axes.
+# 3. Render: colour [3, H, W] in [0, 1], depth [H, W] in scene units (0 = none), normals in camera axes.
 for name, view in zip(scene.names, scene.render(), strict=True):
     known = view.depth > 0
     print(f"{name}: median depth {view.depth[known].median():.2f}" if known.any() else f"{name}: no depth")
 
-# 4. Refinement on the same photos: cameras stay, and only what two views agree on is kept at the start.
+# 4. Refine on the same photos, with fixed cameras. Initially keeps only surfaces that two views agree on.
 photographs = RefineOptions(steps=100, sh_degree=1, fill=0, min_views=2, rates=RefineRates(means=0.8, cameras=0))
 sharper = scene.refine(photographs)
 
-# 5. Files: Gaussians for any viewer, cameras, a picture.
+# 5. Save Gaussians for any viewer, cameras and a report image.
 sharper.save(out, ["scene.ply", "cameras.json", "report.png"])

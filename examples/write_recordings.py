@@ -1,9 +1,9 @@
-"""Writes the scenes of any data set as RGB-D recordings, which ``data=rgbd data.root=OUT`` reads.
+"""Writes the scenes of any dataset as RGB-D recordings, for ``data=rgbd data.root=OUT``.
 
 ``python examples/write_recordings.py OUT data=synthetic data.train.num_scenes=100 data.image_size=[224,448]``. A
-recording has ``images/``, ``depth/`` (16-bit millimetres, 0 = none, so nothing beyond 65 m), ``poses.txt``
-(camera-to-world, 16 numbers a line) and ``K.txt``. Run it again to continue; to use more cores, run it several times
-with other ``data.train.first_seed``.
+recording has ``images/``, ``depth/`` (16-bit millimetres, 0 = none, so at most 65 m), ``poses.txt`` (camera-to-world,
+16 numbers per line) and ``K.txt``. To resume, run the same command again. To use more cores, run several processes with
+different ``data.train.first_seed``.
 """
 
 import shutil
@@ -20,7 +20,7 @@ from vg2gt.data import Frames
 
 
 def write_recording(folder: Path, frames: Frames) -> None:
-    """Writes frames of one size and camera; the folder appears whole."""
+    """Writes frames that share size and intrinsics; the folder appears only when complete."""
     staged = folder.parent / ".unfinished" / folder.name / "scene"  # too deep for readers to find
     shutil.rmtree(staged, ignore_errors=True)
     for kind in ("images", "depth"):
@@ -36,13 +36,13 @@ def write_recording(folder: Path, frames: Frames) -> None:
 
 
 def stored_depth(depth: np.ndarray) -> np.ndarray:
-    """Depth in metres as 16-bit millimetres, 0 where there is none or too much of it."""
+    """Converts depth in metres to 16-bit millimetres; 0 where unknown or too large."""
     millimetres = np.rint(depth.astype(np.float64) * 1000)
-    return np.where(millimetres < 65535, millimetres, 0).astype(np.uint16)  # 65535 often means none
+    return np.where(millimetres < 65535, millimetres, 0).astype(np.uint16)  # 65535 often means unknown
 
 
 def main() -> None:
-    """Writes what the command line asks for."""
+    """Runs the command line."""
     out, overrides = Path(sys.argv[1]).expanduser(), sys.argv[2:]
     source = instantiate(compose("train", *overrides).data).train_source()
     for scene in track(source.scenes, "scenes"):

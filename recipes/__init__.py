@@ -1,1 +1,1 @@
-"""How shipped weights are made; run from a checkout, not part of the installed package."""
+"""Recipes for the shipped weights; run from a checkout, not part of the installed package."""

@@ -1,4 +1,4 @@
-"""Depth Anything 3 behind the backend interface."""
+"""Depth Anything 3 as a backend."""
 
 from backends.da3.backend import DA3Backend
 from backends.da3.metric import DA3MetricBackend, DA3NestedBackend

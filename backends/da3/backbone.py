@@ -1,6 +1,6 @@
-"""Depth Anything 3's backbone: one ViT whose later blocks alternate between single views and all views.
+"""Backbone of Depth Anything 3: a ViT whose later blocks alternate between single views and all views.
 
-Names of modules follow the published weight files, here and in all networks of this folder.
+Module names in this folder follow the published weight files.
 """
 
 from __future__ import annotations
@@ -19,10 +19,17 @@ MIN_VIEWS_TO_CHOOSE = 3
 
 
 class Backbone(nn.Module):
-    """ViT with a class token that becomes the camera token where the views begin to see each other.
+    """ViT whose class token is replaced by a camera token at the first multi-view block.
 
-    From block ``multiview_from`` on (None: a single-view network) positions are rotary, queries and keys normalised,
-    and odd blocks attend over all views; ``image_size`` is the native edge, which fixes the position embedding.
+    Args:
+        dim: channels C of the tokens.
+        depth: number of blocks.
+        num_heads: attention heads.
+        ffn: feed-forward layer.
+        multiview_from: first multi-view block. From it on, blocks use rotary position embedding and normalise queries
+            and keys, and odd blocks attend over all views. None makes a single-view network.
+        image_size: native image edge, which determines the size of the position embedding.
+        patch_size: edge of a patch in pixels.
     """
 
     def __init__(
@@ -59,15 +66,16 @@ class Backbone(nn.Module):
         """Runs the blocks.
 
         Args:
-            images: ``[B, V, 3, H, W]``, normalised.
-            taps: indices of blocks.
-            reference: how the view that defines the predicted world frame is chosen, from three views on; the first
-                where camera tokens are given.
-            camera_tokens: ``[B, V, C]`` from the camera encoder, instead of the learned ones.
+            images: normalised images ``[B, V, 3, H, W]``.
+            taps: indices of the tapped blocks.
+            reference: strategy to choose the view that defines the predicted world frame; the first view is used for
+                fewer than three views, or if camera tokens are given.
+            camera_tokens: ``[B, V, C]`` from the camera encoder, in place of the learned ones.
 
         Returns:
-            Patch tokens of every tap and the last tap's camera token ``[B, V, D]``. Multi-view networks: D = 2C, the
-            last single-view output next to the current one, whose patch tokens alone are normalised; else D = C.
+            Patch tokens ``[B, V, P, D]`` of every tap, and the camera token ``[B, V, D]`` of the last tap. Single-view
+            networks have D = C. Multi-view networks have D = 2C: the output of the last within-view block, concatenated
+            with the output of the tapped block (patch tokens of the latter are normalised).
         """
         batch, views = images.shape[:2]
         grid = (images.shape[-2] // self.patch_size, images.shape[-1] // self.patch_size)
@@ -77,12 +85,14 @@ class Backbone(nn.Module):
         order: Tensor | None = None
         local, tapped, camera = x, [], x[:, :, 0]
         for index, block in enumerate(self.blocks):
+            # move the reference view to the front, just before the multi-view blocks
             if choose and index == self.multiview_from - 1:
                 order = reference_first(select_reference(x[:, :, 0], reference), views)
                 x = _take_views(x, order)
                 local = _take_views(local, order)
             if index == self.multiview_from:
                 x = torch.cat((self._camera_tokens(x, camera_tokens), x[:, :, 1:]), 2)
+            # attend over all views: [B, V N, C], or within each: [B V, N, C]
             if index >= self.multiview_from and index % 2 == 1:
                 x = block(x.flatten(1, 2), global_rotary).unflatten(1, (views, -1))
             else:
@@ -102,7 +112,7 @@ class Backbone(nn.Module):
         return torch.cat((first.to(patches.dtype), patches), 1)
 
     def _rotary(self, grid: tuple[int, int], views: int, like: Tensor) -> tuple[Rotary, Rotary]:
-        """Tables within a view (true positions from 1) and across views (all patches at (1, 1)); class token at 0."""
+        """Tables within views (patch positions from 1) and across views (all patches at (1, 1)); class token at 0."""
         patches = grid_positions(*grid, like=like) + 1
         special = patches.new_zeros(1, 2)
         within = rotary_2d(torch.cat((special, patches)), self.head_dim)
@@ -124,7 +134,7 @@ class Backbone(nn.Module):
 
 
 class PretrainedBackbone(nn.Module):
-    """Holds a backbone under the name it has in the published files."""
+    """Wraps a backbone to match its name in the published files."""
 
     def __init__(self, pretrained: Backbone) -> None:
         super().__init__()
@@ -132,17 +142,24 @@ class PretrainedBackbone(nn.Module):
 
 
 def select_reference(tokens: Tensor, strategy: ReferenceView) -> Tensor:
-    """Chooses one view per scene from class tokens ``[B, V, C]``; returns int64 ``[B]``, 0 for fewer than three.
+    """Chooses the reference view of each scene.
 
-    ``saddle_balanced`` takes the view nearest to the middle of mean cosine similarity to the others, token norm, and
-    variance of the normalised token, each scaled to [0, 1] over the views.
+    ``saddle_balanced`` scales three measures to [0, 1] over the views, and chooses the view closest to 0.5 in all of
+    them: mean cosine similarity to the other views, token norm, and variance of the normalised token.
+
+    Args:
+        tokens: class tokens ``[B, V, C]``.
+        strategy: how to choose.
+
+    Returns:
+        Indices ``[B]``, int64; 0 for fewer than three views.
     """
     batch, views = tokens.shape[:2]
     if strategy == "first":
         return torch.zeros(batch, dtype=torch.int64, device=tokens.device)
     middle = torch.full((batch,), views // 2, dtype=torch.int64, device=tokens.device)
     chosen = _saddle_balanced(tokens) if strategy == "saddle_balanced" else middle
-    # The number of views as a tensor: a Python comparison would fix it under export.
+    # Compare as a tensor: a Python comparison would fix the number of views in an export.
     enough = torch.full((), views, device=tokens.device) >= MIN_VIEWS_TO_CHOOSE
     return torch.where(enough, chosen, 0)
 
@@ -159,7 +176,7 @@ def _saddle_balanced(tokens: Tensor) -> Tensor:
 
 
 def reference_first(reference: Tensor, views: int) -> Tensor:
-    """Order ``[B, V]`` of the views with the reference ``[B]`` first and the others as they were."""
+    """Returns the order ``[B, V]`` of the views that moves the reference ``[B]`` to the front."""
     index = torch.arange(views, device=reference.device)
     chosen = reference[:, None]
     return torch.where(index == 0, chosen, torch.where(index <= chosen, index - 1, index))

@@ -24,7 +24,7 @@ MIN_MEDIAN_DISTANCE = 0.1
 
 
 class CameraDecoder(nn.Module):
-    """Camera token ``[B, V, D]`` to pose encoding ``[B, V, 9]``, one shot."""
+    """Decodes a camera token ``[B, V, D]`` into a pose encoding ``[B, V, 9]``, without iterations."""
 
     def __init__(self, dim: int) -> None:
         super().__init__()
@@ -40,7 +40,7 @@ class CameraDecoder(nn.Module):
 
 
 class CameraEncoder(nn.Module):
-    """Known cameras to camera tokens ``[B, V, C]``."""
+    """Encodes known cameras as camera tokens ``[B, V, C]``."""
 
     def __init__(self, dim: int, depth: int, num_heads: int) -> None:
         super().__init__()
@@ -56,10 +56,10 @@ class CameraEncoder(nn.Module):
 
 
 def normalize_cameras(cameras: Cameras) -> Cameras:
-    """Moves the world into view 0 and divides translations by the median distance of the cameras (at least 0.1)."""
+    """Moves the world frame to view 0 and divides translations by the cameras' median distance to it (at least 0.1)."""
     relative = relative_to_first(cameras)
     distance = invert_rigid(relative.world_to_camera)[..., :3, 3].norm(dim=-1)
-    # The lower median by sorting: Tensor.median does not export.
+    # Lower median by sorting, as Tensor.median cannot be exported.
     unit = distance.sort(-1).values[:, (distance.shape[1] - 1) // 2].clamp_min(MIN_MEDIAN_DISTANCE)
     poses = relative.world_to_camera.clone()
     poses[..., :3, 3] /= unit[:, None, None]
@@ -75,7 +75,7 @@ NESTED_PARTS = ("model.da3.", "model.da3_metric.")  # a nested file holds two ne
 
 
 class DA3Decoder(nn.Module):
-    """What follows the tokens: depth head and camera decoder; names and shapes as published."""
+    """Depth head and camera decoder; names and shapes as published."""
 
     def __init__(self, token_dim: int, features: int, out_channels: Sequence[int], patch_size: int) -> None:
         super().__init__()
@@ -89,7 +89,7 @@ class DA3Decoder(nn.Module):
         self.cam_dec = CameraDecoder(token_dim)
 
     def decode(self, tokens: Tokens, chunk: int | None) -> Geometry:
-        """See :meth:`Backend.decode`; at most ``chunk`` views at a time go through the depth head."""
+        """See :meth:`Backend.decode`; the depth head runs on at most ``chunk`` views at a time."""
         with full_precision(tokens.camera):
             out = in_chunks(self.head, tokens.patch, tokens.grid, chunk)  # [B, V, 2, H, W]
         depth, confidence = out[:, :, 0].exp(), 1 + out[:, :, 1].exp()
@@ -103,7 +103,7 @@ class DA3Decoder(nn.Module):
 
 
 class DA3Network(DA3Decoder):
-    """The decoder with its backbone (images to tokens) and, if wanted, camera encoder; names as published."""
+    """Backbone, decoder and, unless None, camera encoder; names as published."""
 
     def __init__(
         self, backbone: Backbone, cam_enc: CameraEncoder | None, features: int, out_channels: Sequence[int]
@@ -117,14 +117,14 @@ class DA3Network(DA3Decoder):
 class DA3Backend(NetworkBackend):
     """Depth Anything 3 (Lin et al., 2025): relative geometry in the frame of a reference view.
 
-    Args (the others: see :class:`NetworkBackend`; tokens have 2C channels):
-        depth: blocks.
-        multiview_from: first block of the alternating part.
+    Args (for the others see :class:`NetworkBackend`; tokens have 2C channels):
+        depth: number of blocks.
+        multiview_from: first multi-view block.
         ffn: feed-forward layer.
-        camera_depth: blocks of the camera encoder.
+        camera_depth: number of blocks of the camera encoder.
         camera_heads: attention heads of the camera encoder.
-        reference_view: which view defines the predicted world frame.
-        given_poses: whether ``hints.cameras`` go through the camera encoder (then they are needed).
+        reference_view: strategy to choose the view that defines the predicted world frame.
+        given_poses: whether to pass ``hints.cameras`` to the camera encoder, which makes them required.
 
     Raises:
         ValueError: if the reference-view strategy is unknown.
@@ -170,14 +170,14 @@ class DA3Backend(NetworkBackend):
         self.given_poses = given_poses
 
         def make() -> DA3Network:
-            """The network without weights."""
+            """Builds the network without weights."""
             network = DA3Network(
                 Backbone(dim, depth, num_heads, ffn, multiview_from, image_size, patch_size),
                 CameraEncoder(dim, camera_depth, camera_heads) if given_poses else None,
                 features,
                 out_channels,
             )
-            decoder = network.cam_dec  # about the identity pose and fields of view of 1 rad
+            decoder = network.cam_dec  # predicts about the identity pose and fields of view of 1 rad
             for layer, bias in (
                 (decoder.fc_t, (0, 0, 0)),
                 (decoder.fc_qvec, (0, 0, 0, 1)),
@@ -192,10 +192,10 @@ class DA3Backend(NetworkBackend):
         self._build(make, weights, taps, head_chunk, compile, freeze)
 
     def gaussian_head(self) -> GaussianHead:
-        """DA3's own Gaussian head, frozen, from the same file.
+        """Loads DA3's own Gaussian head, frozen, from the same file.
 
         Raises:
-            ValueError: if the file holds none: only GIANT's does.
+            ValueError: if the file has none; only that of GIANT does.
         """
         weights = replace(self.weights, prefix=f"{self.weights.prefix}gs_head.", ignorable=("",))
         try:
@@ -212,7 +212,7 @@ class DA3Backend(NetworkBackend):
         return self.encode_with(images, given)
 
     def encode_with(self, images: Tensor, camera_tokens: Tensor | None) -> Tokens:
-        """Encodes checked images, with camera tokens ``[B, V, C]`` from the camera encoder if there are any."""
+        """Encodes checked images; ``camera_tokens [B, V, C]`` of the camera encoder replace the learned ones."""
         with half_precision_on_gpu(images):
             patch, camera = self.network.backbone.pretrained(
                 normalize_images(images), self.taps, self.reference_view, camera_tokens

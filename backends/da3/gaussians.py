@@ -1,4 +1,4 @@
-"""Depth Anything 3's own Gaussian head: the tokens of the frozen backbone and the images to raw Gaussians per pixel."""
+"""Gaussian head of Depth Anything 3: tokens of the frozen backbone and images to raw Gaussians per pixel."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ PARTS = (2, 3, 4, 3 * (SH_DEGREE + 1) ** 2, 1, 1)
 
 
 class GaussianHead(DPT):
-    """A DPT whose fused map also sees the image; names and shapes as published (``gs_head``).
+    """A DPT that adds image features to its fused map; names and shapes as published (``gs_head``).
 
     Args:
         token_dim: channels of the tokens.
-        features: DPT width.
+        features: channels of the DPT's fusion stages.
         out_channels: DPT channels of the four taps.
-        patch_size: in pixels.
+        patch_size: edge of a patch in pixels.
     """
 
     def __init__(self, token_dim: int, features: int, out_channels: Sequence[int], patch_size: int) -> None:
@@ -39,14 +39,13 @@ class GaussianHead(DPT):
         """Predicts raw Gaussians, at most ``chunk`` views at a time.
 
         Args:
-            tokens: of the backbone that the head was trained with.
+            tokens: tokens of the backbone that the head was trained with.
             images: ``[B, V, 3, H, W]`` in [0, 1].
-            chunk: None takes all views at once.
+            chunk: maximum number of views at a time; None predicts all at once.
 
         Returns:
-            ``[B, V, H, W, sum(PARTS)]``: per pixel an offset in pixels, log-odds of the scales, a quaternion (xyzw, in
-            camera axes), SH coefficients (colour by colour, in camera axes), an offset of the depth, and the log-odds
-            of the opacity.
+            ``[B, V, H, W, sum(PARTS)]``. Per pixel: offset in pixels, logits of the scales, quaternion (xyzw, in camera
+            axes), SH coefficients (channel by channel, in camera axes), depth offset, logit of the opacity.
         """
         taps = [tap.flatten(0, 1) for tap in tokens.patch]
         with full_precision(images):

@@ -1,4 +1,4 @@
-"""Depth Anything 3's metric network, alone and as the scale of the relative one (nested)."""
+"""Metric network of Depth Anything 3, alone and as the scale of the relative network (nested)."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ CANONICAL_FOCAL = 300.0  # pixels at network resolution
 SKY_THRESHOLD = 0.3
 FAR_QUANTILE = 0.99
 MIN_PIXELS = 10
-NEAREST, NEAREST_METRIC = 1e-3, 1e-2  # depth, metric depth: nearer pixels do not fit the scale
+NEAREST, NEAREST_METRIC = 1e-3, 1e-2  # minimum depth and metric depth for fitting the scale
 MAX_SAMPLES = 100_000  # for quantiles
 FARTHEST_SKY = 200.0  # metres
-SKY_CONFIDENCE = 1.0  # the least that DA3 gives: 1 + exp
+SKY_CONFIDENCE = 1.0  # lower bound of DA3's confidence, 1 + exp
 
 
 class DA3MetricNetwork(nn.Module):
-    """Single-view backbone and a head for depth and sky; names and shapes as published."""
+    """Single-view backbone and head for depth and sky; names and shapes as published."""
 
     def __init__(self, backbone: Backbone, head: DPT) -> None:
         super().__init__()
@@ -38,10 +38,11 @@ class DA3MetricNetwork(nn.Module):
 
 
 class DA3MetricBackend(NetworkBackend):
-    """DA3's metric network: single views, confidence 1, cameras of the data; metres if their translations are.
+    """DA3's metric network: predicts metric depth of single views; cameras are those of the data, confidence is 1.
 
-    Depth is the network's output times the mean focal length (pixels at network resolution) / 300; sky gets the
-    scene's far end. Arguments: see :class:`NetworkBackend`; ``depth`` is the number of blocks.
+    Depth is the network's output times the mean focal length (pixels at network resolution) / 300, in metres. It
+    matches the cameras only if their translations are in metres. Sky pixels get the depth of the scene's far end. For
+    the arguments see :class:`NetworkBackend`; ``depth`` is the number of blocks.
     """
 
     network: DA3MetricNetwork
@@ -79,7 +80,7 @@ class DA3MetricBackend(NetworkBackend):
 
     @torch.no_grad()
     def encode(self, images: Tensor, hints: Hints | None = None) -> Tokens:
-        """See :meth:`Backend.encode`; fixes the factors once, so that token changes do not move the unit."""
+        """See :meth:`Backend.encode`; computes the scale factors here, so that token changes do not affect them."""
         self.check_images(images)
         hints = self.require_hints(images, hints, "cameras")
         assert hints.cameras is not None
@@ -89,7 +90,7 @@ class DA3MetricBackend(NetworkBackend):
         return replace(tokens, state={"cameras": hints.cameras, "factor": metres(hints.cameras)})
 
     def decode_raw(self, tokens: Tokens) -> tuple[Tensor, Tensor]:
-        """Returns the network's depth, sky not filled, and its sky score, both ``[B, V, H, W]``."""
+        """Returns the network's depth, before filling the sky, and its sky score, both ``[B, V, H, W]``."""
         with full_precision(tokens.camera):
             out = in_chunks(self.network.head, tokens.patch, tokens.grid, self.head_chunk)
         return out[:, :, 0].exp(), F.relu(out[:, :, 1])
@@ -105,14 +106,19 @@ class DA3MetricBackend(NetworkBackend):
 
 
 def metres(cameras: Cameras) -> Tensor:
-    """Metres per unit of the metric network's output, ``[B, V]``."""
+    """Returns metres per unit of the metric network's output, ``[B, V]``."""
     return cameras.intrinsics[..., [0, 1], [0, 1]].mean(-1) / CANONICAL_FOCAL
 
 
 def fill_sky(depth: Tensor, sky: Tensor) -> Tensor:
-    """Gives sky pixels the far end of their scene: the 0.99 quantile of the other pixels' depth ``[B, V, H, W]``.
+    """Sets the depth of sky pixels to the 0.99 quantile of the scene's other pixels.
 
-    The published code takes the quantile over the whole batch; of one scene at a time both are the same.
+    Scenes with at most ten sky pixels, or at most ten others, are left unchanged. The published code takes the quantile
+    over the whole batch, which is the same for one scene at a time.
+
+    Args:
+        depth: ``[B, V, H, W]``.
+        sky: sky score ``[B, V, H, W]``; sky from 0.3 on.
     """
     is_sky = sky >= SKY_THRESHOLD
     filled = []
@@ -125,20 +131,20 @@ def fill_sky(depth: Tensor, sky: Tensor) -> Tensor:
 
 
 def quantile(values: Tensor, q: float) -> Tensor:
-    """Quantile of a flat tensor, from an even sample of at most 100k values."""
+    """Returns the quantile of a flat tensor, estimated from every n-th value so that at most 100k are used."""
     return values[:: -(-values.numel() // MAX_SAMPLES)].quantile(q)
 
 
 class DA3NestedBackend(Backend):
     """DA3's relative network with a metric scale: one factor per scene, fitted to the metric network's depth.
 
-    ``Geometry.scale`` turns the relative network's geometry into metres. As in the published code sky gets the far end
-    of its scene, at most 200 m away, and confidence 1, both fixed when images are encoded.
+    ``Geometry.scale`` turns the relative network's geometry into metres. As in the published code, sky pixels get the
+    depth of the scene's far end, at most 200 m, and confidence 1. Both are fixed when images are encoded.
 
     Args:
         relative: predicts geometry.
         metric: predicts metric depth.
-        name: used in checkpoints and messages.
+        name: name in checkpoints and messages.
     """
 
     def __init__(self, relative: DA3Backend, metric: DA3MetricBackend, name: str = "da3_nested") -> None:
@@ -151,7 +157,7 @@ class DA3NestedBackend(Backend):
 
     @torch.no_grad()
     def encode(self, images: Tensor, hints: Hints | None = None) -> Tokens:
-        """See :meth:`Backend.encode`; fits the scale once, so that token changes do not move the unit."""
+        """See :meth:`Backend.encode`; fits the scale here, so that token changes do not affect it."""
         tokens = self.relative.encode(images, hints)
         geometry = self.relative.decode(tokens)
         metric_tokens = self.metric.encode(images, Hints(cameras=geometry.cameras))
@@ -178,14 +184,20 @@ class DA3NestedBackend(Backend):
 
     @torch.no_grad()
     def predict_cameras(self, images: Tensor, hints: Hints | None = None) -> Cameras:
-        """See :meth:`Backend.predict_cameras`; the metric network stays idle."""
+        """See :meth:`Backend.predict_cameras`; does not run the metric network."""
         return self.relative.predict_cameras(images, hints)
 
 
 def far_ends(depth: Tensor, sky: Tensor, scale: Tensor) -> Tensor:
-    """Where every scene's sky goes, ``[B]`` in the unit of ``depth``: its other pixels' 0.99 quantile, or 200 m.
+    """Returns the depth of each scene's sky: the 0.99 quantile of its other pixels, at most 200 m.
 
-    With no more than ten pixels that are not ``sky [B, V, H, W]`` it is infinity; ``scale [B]`` is metres per unit.
+    Args:
+        depth: ``[B, V, H, W]``.
+        sky: sky score ``[B, V, H, W]``; sky from 0.3 on.
+        scale: metres per unit of ``depth``, ``[B]``.
+
+    Returns:
+        ``[B]``, in the unit of ``depth``; infinity for a scene with at most ten pixels that are not sky.
     """
     ends = []
     for scene, score, metres_per_unit in zip(depth, sky, scale, strict=True):
@@ -197,10 +209,18 @@ def far_ends(depth: Tensor, sky: Tensor, scale: Tensor) -> Tensor:
 
 
 def fit_scale(metric_depth: Tensor, sky: Tensor, geometry: Geometry) -> Tensor:
-    """Least-squares factor ``[B]`` from relative to metric depth over confident pixels that are not sky.
+    """Fits the factor from relative to metric depth, by least squares over confident pixels that are not sky.
 
-    As published, pixels next to the camera do not count (depth up to 1e-3, metric depth up to 1e-2), and confident
-    means at least the scene's median. A scene with no more than ten such pixels gets 1.
+    As in the published code, confident means at least the scene's median confidence, and near pixels are left out
+    (depth up to 1e-3 or metric depth up to 1e-2).
+
+    Args:
+        metric_depth: ``[B, V, H, W]``.
+        sky: sky score ``[B, V, H, W]``.
+        geometry: geometry of the relative network.
+
+    Returns:
+        ``[B]``; 1 for a scene with at most ten pixels that are not sky, or without pixels to fit.
     """
     factors = []
     ground = sky < SKY_THRESHOLD

@@ -1,4 +1,4 @@
-"""Learned plane-sweep multi-view stereo: a small frozen backbone whose weights are in the package."""
+"""Learned plane-sweep multi-view stereo: a small frozen backbone whose weights ship with the package."""
 
 from backends.sweep.backend import SweepBackend
 

@@ -1,4 +1,4 @@
-"""Learned plane-sweep multi-view stereo as a backend: small, trained by us, in the package."""
+"""Learned plane-sweep multi-view stereo as a backend."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ _NO_PARALLAX = (
 class SweepBackend(Backend):
     """Plane-sweep multi-view stereo (needs cameras).
 
-    Every view is compared with the views that overlap it best, on planes between a near and a far depth that a first,
-    wide sweep finds: from the cameras alone, or around the range that the hints give. Depth is metric as far as the
-    cameras are. ``depth_conf`` is one over the expected relative error of depth.
+    Every view is matched with the views that overlap it best, on planes between a near and a far depth. Preliminary
+    wide sweeps find this range, starting from the cameras alone or from the range in the hints. Depth has the unit of
+    the camera translations. ``depth_conf`` is one over the expected relative error of depth.
 
     Args:
-        pretrained: whether to load weights, the shipped ones unless ``path`` names others; otherwise random ones.
-        path: a safetensors file of other weights, for example one's own training.
-        planes: of the first of the two sweeps.
-        sources: views that each view is compared with.
-        seed: of random weights.
+        pretrained: whether to load weights, those shipped with the package unless ``path`` is given; otherwise random.
+        path: safetensors file with other weights, such as your own training.
+        planes: number of planes of the first of the two sweeps; at least 8.
+        sources: number of views that each view is matched with; at least 1.
+        seed: seed of random weights.
 
     Raises:
         FileNotFoundError: if the weights cannot be found.
@@ -63,10 +63,10 @@ class SweepBackend(Backend):
 
     @torch.no_grad()
     def encode(self, images: Tensor, hints: Hints | None = None) -> Tokens:
-        """Sweeps; see :meth:`Backend.encode`. The world frame is view 0's, the unit that of the cameras.
+        """Runs the sweeps; see :meth:`Backend.encode`. The world frame is that of view 0, in the cameras' unit.
 
         Raises:
-            ValueError: also if the views have no parallax (one view, or all from one place).
+            ValueError: also if the views have no parallax (one view, or all cameras at the same position).
         """
         self.check_images(images)
         hints = self.require_hints(images, hints, "cameras")
@@ -87,11 +87,11 @@ class SweepBackend(Backend):
             name: torch.stack([getattr(each, name) for each in encoded])
             for name in ("context", "context_fine", "swept")
         }
-        camera = taps[-1].mean(2)  # this network predicts no cameras: a summary of each view stands in for their token
+        camera = taps[-1].mean(2)  # no camera token, as the network predicts no cameras: use the mean patch token
         return replace(self.as_tokens(images, taps, camera), state=state | {"cameras": cameras})
 
     def decode(self, tokens: Tokens) -> Geometry:
-        """Reads depth and its expected error; see :meth:`Backend.decode`."""
+        """Decodes depth and its expected error; see :meth:`Backend.decode`."""
         state = tokens.state
         scenes, views = tokens.camera.shape[:2]
         with full_precision(tokens.camera):

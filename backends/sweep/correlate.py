@@ -1,7 +1,7 @@
-"""Similarity of views with their sources at hypothetical depths: a plain torch reference and compiled CPU kernels.
+"""Similarity of views with their sources at hypothetical depths: torch reference and compiled CPU kernels.
 
-The kernels project, sample and multiply point by point, so nothing of the size of planes x channels is ever in memory.
-Depths and cameras get no gradient: planes are hypotheses.
+The kernels project, sample and multiply point by point, so they never store a tensor of size planes x channels. Depths
+and cameras get no gradient, as planes are hypotheses.
 """
 
 from __future__ import annotations
@@ -18,11 +18,18 @@ from backends.sweep.views import rays, relative_poses
 from vg2gt.kernels.compiled import kernel
 
 GROUPS = 8  # similarities per point: dot products over the channels c with equal c % GROUPS
-BEHIND = 1e-3  # depth in a source, per depth here, below which a point does not count as seen
+BEHIND = 1e-3  # a point is not visible in a source below this ratio of its depth there to its depth here
 
 
 class SourceWarp:
-    """Where points of every view fall in its ``sources [V, n]``; intrinsics and size are the feature maps'."""
+    """Projection of the points of every view into its sources.
+
+    Args:
+        world_to_camera: ``[N, 4, 4]``.
+        intrinsics: ``[N, 3, 3]``, at the resolution of the feature maps.
+        sources: indices of the sources ``[V, n]``.
+        size: size of the feature maps ``(h, w)``.
+    """
 
     def __init__(self, world_to_camera: Tensor, intrinsics: Tensor, sources: Tensor, size: tuple[int, int]) -> None:
         poses = relative_poses(world_to_camera, sources)
@@ -34,7 +41,7 @@ class SourceWarp:
         self.first = 0
 
     def select(self, views: slice) -> SourceWarp:
-        """The same for some consecutive views, compared with sources among all."""
+        """Returns the warp of some consecutive views only; their sources may be any views."""
         part = copy(self)
         part.first = views.start
         part.at_infinity, part.parallax = self.at_infinity[views], self.parallax[views]
@@ -42,11 +49,15 @@ class SourceWarp:
         return part
 
     def __call__(self, source: int, inverse: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Projects inverse depths ``[V, D, h w]`` into source number ``source``.
+        """Projects points into source number ``source`` of each view.
+
+        Args:
+            source: index into the n sources.
+            inverse: inverse depths of the points ``[V, D, h w]``.
 
         Returns:
-            Sampling grid ``[V, D, h w, 2]`` in [-1, 1], whether it is inside the image ``[V, D, h w]``, and the depth
-            there times the inverse depth here ``[V, D, h w]``.
+            Sampling grid ``[V, D, h w, 2]``, in [-1, 1] inside the source; whether the point is visible there
+            ``[V, D, h w]``; and its depth in the source times its inverse depth here ``[V, D, h w]``.
         """
         height, width = self.size
         u, v, z = (
@@ -61,15 +72,15 @@ class SourceWarp:
 
 
 def correlate(features: Tensor, inverse: Tensor, warp: SourceWarp) -> tuple[Tensor, Tensor]:
-    """Compares every view with its sources.
+    """Computes the group-wise similarity of every view with its sources.
 
     Args:
-        features: ``[N, C, h, w]`` of all views, C a multiple of ``GROUPS``.
-        inverse: ``[V, D, h w]`` inverse depths of the views of ``warp``.
-        warp: of all views or some.
+        features: features of all views ``[N, C, h, w]``; C a multiple of ``GROUPS``.
+        inverse: inverse depths ``[V, D, h w]`` of the views of ``warp``.
+        warp: correspondences of all or some of the views.
 
     Returns:
-        Similarity ``[V, n, D, h w, GROUPS]``, 0 outside of the source, and whether it is inside ``[V, n, D, h w]``.
+        Similarity ``[V, n, D, h w, GROUPS]``, 0 outside the source, and whether points are inside ``[V, n, D, h w]``.
     """
     compiled = features.device.type == "cpu" and features.dtype == torch.float32
     if not compiled or torch.compiler.is_compiling():
@@ -78,7 +89,7 @@ def correlate(features: Tensor, inverse: Tensor, warp: SourceWarp) -> tuple[Tens
 
 
 def correlate_reference(features: Tensor, inverse: Tensor, warp: SourceWarp) -> tuple[Tensor, Tensor]:
-    """:func:`correlate` in plain torch, for every device and dtype."""
+    """:func:`correlate` in plain torch, for all devices and dtypes."""
     own = features[warp.first : warp.first + len(warp.sources)]
     here = own.unflatten(1, (-1, GROUPS)).flatten(-2).unsqueeze(3)  # [V, c, G, 1, h w]
     similarities, insides = [], []
@@ -93,11 +104,11 @@ def correlate_reference(features: Tensor, inverse: Tensor, warp: SourceWarp) -> 
 
 
 class _Correlate(torch.autograd.Function):
-    """The kernels as one operation; see :func:`correlate` for shapes."""
+    """The kernels as a differentiable operation; see :func:`correlate` for shapes."""
 
     @staticmethod
     def forward(ctx: Any, features: Tensor, inverse: Tensor, warp: SourceWarp) -> tuple[Tensor, Tensor]:
-        """Similarity and whether points are inside."""
+        """Returns similarity and whether points are inside."""
         maps = features.permute(0, 2, 3, 1).contiguous()  # [V, h, w, C]
         views, sources = warp.sources.shape
         shape = (views, sources, *inverse.shape[1:])
@@ -111,7 +122,7 @@ class _Correlate(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None]:  # type: ignore[override]
-        """Gradient of the features; hypotheses and cameras get none."""
+        """Returns the gradient of the features; depths and cameras get none."""
         maps = ctx.geometry[0]
         gradient = np.zeros_like(maps)
         _backward(ctx.geometry, ctx.first, gradients[0].contiguous().numpy(), gradient)
@@ -124,7 +135,7 @@ def _arrays(*tensors: Tensor) -> tuple[np.ndarray, ...]:
 
 @kernel(fastmath=True, error_model="numpy", nogil=True, inline="always")
 def _sample(at_infinity, parallax, p, inverse, height, width):
-    """Rows, columns and bilinear weights of the four pixels around a point in the source; whether it is inside."""
+    """Rows, columns and bilinear weights of the four pixels around a point in the source, and whether it is inside."""
     z = at_infinity[2, p] + parallax[2, 0] * inverse
     safe = max(z, np.float32(BEHIND))
     u = (at_infinity[0, p] + parallax[0, 0] * inverse) / safe

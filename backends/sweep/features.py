@@ -1,4 +1,4 @@
-"""Image features of the plane sweep: for matching (unit length per group) and for context, at two resolutions."""
+"""Image features of the plane sweep: matching features (unit length per group) and context, at two resolutions."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ CONTEXT_COARSE, CONTEXT_FINE = 48, 16
 
 
 class Features(NamedTuple):
-    """Features of N images; ``h, w`` is a quarter of the image.
+    """Features of N images; ``h, w`` is 1/4 of the image size.
 
     Attributes:
-        coarse: ``[N, MATCH_COARSE, h, w]``, every group of channels of unit length.
-        fine: ``[N, MATCH_FINE, 2 h, 2 w]``, likewise.
+        coarse: matching features ``[N, MATCH_COARSE, h, w]``, each group of channels of unit length.
+        fine: matching features ``[N, MATCH_FINE, 2 h, 2 w]``, each group of channels of unit length.
         context: ``[N, CONTEXT_COARSE, h, w]``.
         context_fine: ``[N, CONTEXT_FINE, 2 h, 2 w]``.
     """
@@ -31,7 +31,7 @@ class Features(NamedTuple):
 
 
 class InstanceNorm(nn.Module):
-    """Instance normalisation by elementary operations: torch's own is slow on channels-last CPU tensors."""
+    """Instance normalisation from elementary operations; torch's is slow on channels-last CPU tensors."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -47,13 +47,13 @@ class InstanceNorm(nn.Module):
 
 
 def conv_norm(inputs: int, outputs: int, stride: int = 1, kernel: int = 3) -> nn.Sequential:
-    """Convolution, instance normalisation, ReLU."""
+    """Returns convolution, instance normalisation and ReLU."""
     conv = nn.Conv2d(inputs, outputs, kernel, stride, kernel // 2, bias=False)
     return nn.Sequential(conv, InstanceNorm(outputs), nn.ReLU(inplace=True))
 
 
 class ResidualBlock(nn.Module):
-    """Two 3x3 convolutions around which the input is added."""
+    """Residual block of two 3x3 convolutions."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -66,7 +66,7 @@ class ResidualBlock(nn.Module):
 
 
 class FeaturePyramid(nn.Module):
-    """A small feature pyramid network over 1/2 to 1/16 of the image."""
+    """Small feature pyramid network from 1/2 to 1/16 of the image."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -85,7 +85,7 @@ class FeaturePyramid(nn.Module):
         self.context_fine = _conv_and_norm(32, CONTEXT_FINE)
 
     def forward(self, images: Tensor) -> Features:
-        """Maps images ``[N, 3, H, W]`` in [0, 1], H and W multiples of 8, to their features."""
+        """Extracts features of images ``[N, 3, H, W]`` in [0, 1]; H and W multiples of 8."""
         half = self.to_half((images - 0.5) * 3)
         quarter = self.to_quarter(half)
         eighth = self.to_eighth(quarter)
@@ -101,7 +101,7 @@ class FeaturePyramid(nn.Module):
 
 
 def _conv_and_norm(inputs: int, outputs: int) -> nn.Sequential:
-    """Without activation: a ReLU here can die in the first steps, and with it all that context would tell."""
+    """Convolution and normalisation without activation: a ReLU can die in the first steps, and the context with it."""
     return nn.Sequential(nn.Conv2d(inputs, outputs, 3, 1, 1, bias=False), InstanceNorm(outputs))
 
 
@@ -110,7 +110,7 @@ def _upsample(x: Tensor, like: Tensor) -> Tensor:
 
 
 def unit_groups(x: Tensor) -> Tensor:
-    """Makes every group of channels (those of equal c % GROUPS) of ``[N, C, h, w]`` a unit vector, in float32."""
+    """Normalises every group of channels (equal c % GROUPS) of ``[N, C, h, w]`` to unit length, in float32."""
     grouped = x.float().permute(0, 2, 3, 1).unflatten(-1, (-1, GROUPS))  # [N, h, w, C / GROUPS, GROUPS]
     length = grouped.square().sum(-2, keepdim=True).clamp_min(1e-6).sqrt()
     return (grouped / length).flatten(-2).permute(0, 3, 1, 2)

@@ -1,4 +1,4 @@
-"""The frozen head: tokens and the sweep's own depth to depth and its uncertainty, differentiable in the tokens."""
+"""Depth head of the plane sweep: refines the swept depth with the tokens; differentiable in the tokens."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from backends.sweep.features import CONTEXT_COARSE, CONTEXT_FINE
 from backends.sweep.refine import PlainBlock, activate, convex_upsample
 from backends.sweep.tokens import DIM, TAPS
 
-RESPONSE = 0.02  # log-depth per unit of the tokens' correction channels
+RESPONSE = 0.02  # change of log-depth per unit of the tokens' correction channels
 CELLS = 2  # the correction channels hold CELLS x CELLS values per patch
-_SPREAD = 48  # channels of a cell after the tokens are spread over it
-_UNSURE = -2.5  # log of the scale of relative errors before training
+_SPREAD = 48  # channels per cell after the tokens are spread over the cells
+_UNSURE = -2.5  # log-scale of the relative error before training
 
 
 class DepthHead(nn.Module):
-    """Reads log-depth as that of the sweep plus a correction.
+    """Predicts log-depth as that of the sweep plus two corrections.
 
-    The first four channels of the last tap are the correction of 2x2 cells of the patch, in units of ``RESPONSE``:
-    linear, so that a change of the tokens changes depth smoothly. Convolutions add what both taps say.
+    The first correction is linear: the first four channels of the last tap, one per 2x2 cell of the patch, times
+    ``RESPONSE``. It makes depth change smoothly with the tokens. The second is predicted from all taps by convolutions.
     """
 
     def __init__(self) -> None:
@@ -38,19 +38,21 @@ class DepthHead(nn.Module):
     def forward(
         self, taps: tuple[Tensor, ...], grid: tuple[int, int], context: Tensor, context_fine: Tensor, swept: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Decodes log-depth and log-scale of its error, each ``[V, 4 h, 4 w]``.
+        """Decodes log-depth and the log-scale of its error, each ``[V, 4 h, 4 w]``.
 
         Args:
-            taps: ``[V, P, DIM]`` each.
+            taps: tokens ``[V, P, DIM]`` of each tap.
             grid: patches per axis.
-            context: ``[V, CONTEXT_COARSE, h, w]``, a quarter of the image.
+            context: ``[V, CONTEXT_COARSE, h, w]``, at 1/4 of the image.
             context_fine: ``[V, CONTEXT_FINE, 2 h, 2 w]``.
-            swept: ``[V, 2, 2 h, 2 w]`` log-depth of the sweep and its probability.
+            swept: log-depth of the sweep and its probability, ``[V, 2, 2 h, 2 w]``.
         """
+        # tokens to cells of half a patch: [V, P, DIM] to [V, C, h, w]
         said = torch.cat([norm(tap) for norm, tap in zip(self.norms, taps, strict=True)], -1)
         said = F.pixel_shuffle(self.spread(said).mT.unflatten(-1, grid), CELLS)  # [V, C, h, w]
         correction = F.pixel_shuffle(taps[-1][..., : CELLS**2].mT.unflatten(-1, grid), CELLS)
         x = self.lift(activate(self.coarse(torch.cat((said, context), 1))))
+        # to the sweep's resolution: [V, ., 2 h, 2 w]
         size = swept.shape[-2:]
         x, correction = (
             F.interpolate(each, size=size, mode="bilinear", align_corners=False) for each in (x, correction)

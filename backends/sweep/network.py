@@ -1,4 +1,4 @@
-"""The plane-sweep multi-view stereo network: images and cameras to tokens, tokens to depth."""
+"""Plane-sweep multi-view stereo network: images and cameras to tokens, tokens to depth."""
 
 from __future__ import annotations
 
@@ -25,26 +25,26 @@ from backends.sweep.volume import (
 from vg2gt.geometry.cameras import resize_intrinsics
 from vg2gt.geometry.precision import full_precision
 
-_BINS = 16  # channels that the planes' probability is summed into
+_BINS = 16  # channels that hold the summed probability of the planes
 _FINE_PLANES = 12
-_FINE_REACH = 1.5  # of the second sweep on either side, in spacings of the first
+_FINE_REACH = 1.5  # reach of the second sweep on either side, in plane spacings of the first
 _VIEWS_AT_A_TIME = 4
-_FARTHEST = 4.0  # decoded depth at most, in multiples of the farthest plane
-_LOG_DEPTH = 20.0  # of decoded depth at most either way: finite whatever the tokens are
-WIDE_PLANES = 64  # of the sweeps that find the range
-_BEYOND = (0.5, 3.0)  # times near and far of a hint: the range that is searched
-_RANGE_CELLS = 2000  # of a view's map, at most, in these sweeps
-_NEARER = 0.6  # times near of the first of them: where the second begins
+_FARTHEST = 4.0  # maximum swept depth, in multiples of the farthest plane
+_LOG_DEPTH = 20.0  # maximum absolute log-depth: keeps depth finite for any tokens
+WIDE_PLANES = 64  # planes of the sweeps that find the range
+_BEYOND = (0.5, 3.0)  # factors on near and far of a hint: the range to search
+_RANGE_CELLS = 2000  # maximum cells per feature map in these sweeps
+_NEARER = 0.6  # near of the second of these sweeps, relative to the near that the first found
 
 
 class PosedViews(NamedTuple):
-    """V views of one scene, or of several with equally many views each (training).
+    """V views of one scene, or of several scenes with the same number of views each (training).
 
     Attributes:
         images: ``[V, 3, H, W]`` in [0, 1], H and W multiples of 8.
         world_to_camera: ``[V, 4, 4]``.
         intrinsics: ``[V, 3, 3]`` in pixels, integer pixel centres.
-        scenes: number of scenes; views of one scene follow one another.
+        scenes: number of scenes; views of one scene are consecutive.
     """
 
     images: Tensor
@@ -59,13 +59,13 @@ class PosedViews(NamedTuple):
 
 
 class Sweep(NamedTuple):
-    """What one sweep found.
+    """Result of one sweep.
 
     Attributes:
-        logits: ``[V, D, h, w]``.
-        position: ``[V, D, h, w]`` or broadcastable: places of the planes, 0 at far and 1 at near.
-        t: ``[V, 1, h, w]`` expected position.
-        mass: ``[V, 1, h, w]`` probability around it.
+        logits: logits of the planes ``[V, D, h, w]``.
+        position: positions of the planes, ``[V, D, h, w]`` or broadcastable; 0 is far, 1 is near.
+        t: expected position ``[V, 1, h, w]``.
+        mass: probability mass around it ``[V, 1, h, w]``.
     """
 
     logits: Tensor
@@ -75,17 +75,17 @@ class Sweep(NamedTuple):
 
 
 class SweepEncoding(NamedTuple):
-    """Everything between images and depth.
+    """Intermediate results between images and depth; ``h, w`` is 1/4 of the image size.
 
     Attributes:
         taps: patch tokens ``[V, P, DIM]`` of the last blocks.
-        context: ``[V, C, h, w]``, a quarter of the image.
+        context: ``[V, C, h, w]``.
         context_fine: ``[V, C, 2 h, 2 w]``.
-        swept: ``[V, 2, 2 h, 2 w]`` log-depth of the second sweep and its probability.
-        first: the first sweep.
-        refined: ``[V, 1, h, w]`` position after the U-Net.
-        center: ``[V, 1, 2 h, 2 w]`` the same at the second sweep's resolution: it searches around it.
-        second: the second sweep.
+        swept: log-depth of the second sweep and its probability, ``[V, 2, 2 h, 2 w]``.
+        first: first sweep.
+        refined: position after the U-Net ``[V, 1, h, w]``.
+        center: the same upsampled to ``[V, 1, 2 h, 2 w]``; the second sweep searches around it.
+        second: second sweep.
     """
 
     taps: tuple[Tensor, ...]
@@ -106,17 +106,29 @@ class SweepNet(nn.Module):
         self.features = FeaturePyramid()
         self.sweep = PlaneSweep()
         self.volume = VolumeNet()
-        self.refine = RefineNet(CONTEXT_COARSE + 1 + 1 + 3 + _BINS, 1 + 36)  # position, and how it is upsampled
+        self.refine = RefineNet(CONTEXT_COARSE + 1 + 1 + 3 + _BINS, 1 + 36)  # outputs position and upsampling mask
         self.sweep_fine = PlaneSweep()
         self.volume_fine = VolumeNet()
-        per_cell = CONTEXT_COARSE + 2 + 3  # context, refined position and first probability, agreement
+        per_cell = CONTEXT_COARSE + 2 + 3  # context, refined position and first sweep's mass, agreement
         self.tokens = TokenNet(4 * per_cell + 16 * 2 + _BINS)
         self.head = DepthHead()
 
     def coarse(
         self, maps: Tensor, views: PosedViews, depth_range: Tensor, sources: Tensor, planes: int, stride: int = 4
     ) -> tuple[Sweep, Tensor]:
-        """A sweep of ``maps [V, C, h, w]`` over ``[near, far]`` and the agreement of its depths ``[V, 3, h, w]``."""
+        """Sweeps feature maps over a depth range.
+
+        Args:
+            maps: matching features ``[V, C, h, w]``.
+            views: the views.
+            depth_range: near and far, ``[2]`` or ``[V, 2]``.
+            sources: indices of the sources ``[V, n]``.
+            planes: number of planes.
+            stride: image size over map size.
+
+        Returns:
+            The sweep, and the :func:`agreement` of its depths ``[V, 3, h, w]``.
+        """
         warp = _warp(maps, views, sources, stride)
         position = torch.linspace(0, 1, planes, device=depth_range.device).view(1, -1, 1, 1)
         inverse = to_inverse(position, depth_range)[..., 0].expand(len(views.images), -1, -1)  # [V, D, 1]
@@ -126,27 +138,27 @@ class SweepNet(nn.Module):
         return Sweep(logits, position, t, mass), agreeing
 
     def find_range(self, features: Features, views: PosedViews, sources: int, hint: Tensor | None = None) -> Tensor:
-        """Searches the range of depths on which views agree, in sweeps that are wide and coarse.
+        """Finds the range of depths on which the views agree, with wide sweeps at low resolution.
 
-        Sparse points lie where there is texture and miss what is near in few views, so a hint is searched beyond.
-        From the cameras alone, a first sweep finds near; a second one begins there, so that its planes resolve far.
+        A hint is searched beyond its limits, as sparse points lie on texture and miss near surfaces that few views see.
+        Without a hint, a first sweep finds near, and a second sweep starts there so that its planes resolve far.
 
         Args:
-            features: of ``views.images``.
-            views: of one scene.
-            sources: views that each is compared with.
-            hint: ``[2]`` near and far of what is known to be seen; None: the cameras alone say where to search.
+            features: features of ``views.images``.
+            views: views of one scene.
+            sources: number of views that each view is matched with.
+            hint: known near and far ``[2]``; None searches a range derived from the cameras.
 
         Returns:
-            ``[2]`` near and far, around the hint if there is one; where hardly any depth agrees, the hint or the whole
-            range that was searched.
+            Near and far ``[2]``, including the hint if there is one. If hardly any depth agrees, the hint or the
+            searched range.
         """
         maps, stride = features.coarse, 4
         while maps.shape[-2] * maps.shape[-1] > _RANGE_CELLS:
             maps, stride = unit_groups(F.avg_pool2d(maps, 2)), 2 * stride
 
         def search(wide: Tensor, fallback: Tensor, least: float = 0.0) -> Tensor:
-            """The agreed range of one sweep; positions up to ``least`` (0 at far, 1 at near) do not count."""
+            """Agreed range of one sweep; ignores positions below ``least`` (0 is far, 1 is near)."""
             chosen = choose_sources(views.world_to_camera, views.intrinsics, views.size, wide, sources)
             sweep, agreeing = self.coarse(maps, views, wide, chosen, WIDE_PLANES, stride)
             counts = (sweep.mass > 0.4) & (sweep.t >= least)
@@ -157,30 +169,33 @@ class SweepNet(nn.Module):
             return torch.stack((torch.minimum(found[0], hint[0]), torch.maximum(found[1], hint[1])))
         wide = wide_range(views.world_to_camera)
         first = search(wide, wide)
-        # The sky and windows agree at any large depth, between the last two planes.
+        # Sky and windows agree at any large depth, between the last two planes: ignore those.
         return search(torch.stack((_NEARER * first[0], wide[1])), first, least=1 / (WIDE_PLANES - 1))
 
     def encode(
         self, features: Features, views: PosedViews, depth_range: Tensor, sources: Tensor, planes: int
     ) -> SweepEncoding:
-        """Images to tokens.
+        """Encodes images as tokens.
 
         Args:
-            features: of ``views.images``.
-            views: of one scene or several.
-            depth_range: ``[2]`` near and far of the planes, or ``[V, 2]`` where scenes differ.
-            sources: ``[V, n]`` indices of the views that each is compared with.
-            planes: of the first sweep.
+            features: features of ``views.images``.
+            views: views of one or more scenes.
+            depth_range: near and far of the planes ``[2]``, or ``[V, 2]`` if scenes differ.
+            sources: indices of the sources of each view ``[V, n]``.
+            planes: number of planes of the first sweep.
         """
+        # first sweep at 1/4, refined by the U-Net: [V, 1, h, w]
         first, agreeing = self.coarse(features.coarse, views, depth_range, sources, planes)
         bins = slices(first.logits.softmax(1), _BINS)
         known = torch.cat((features.context, 4 * first.t, first.mass, agreeing, bins), 1)
         found = self.refine(known)
         refined = first.t + 0.25 * found[:, :1]
-        center = convex_upsample(refined, found[:, 1:])  # a bilinear one would search between the two sides of an edge
+        # second sweep at 1/2: [V, ., 2 h, 2 w]
+        center = convex_upsample(refined, found[:, 1:])  # bilinear would place it between the two sides of an edge
         second = self._narrow(features.fine, center.detach(), views, depth_range, sources, planes)
         inverse = to_inverse(second.t, depth_range).clamp_min(1 / (_FARTHEST * near_and_far(depth_range)[1]))
         swept = torch.cat((-inverse.log(), second.mass), 1)
+        # patch features and tokens: [V, P, .]
         grid = (views.size[0] // PATCH, views.size[1] // PATCH)
         cells = torch.cat((features.context, 4 * refined, first.mass, agreeing), 1)
         parts = (F.pixel_unshuffle(cells, 2), F.pixel_unshuffle(torch.cat((4 * second.t, second.mass), 1), 4))
@@ -195,7 +210,7 @@ class SweepNet(nn.Module):
     def _narrow(
         self, fine: Tensor, center: Tensor, views: PosedViews, depth_range: Tensor, sources: Tensor, planes: int
     ) -> Sweep:
-        """The second sweep, at half of the image, around the positions ``center [V, 1, 2 h, 2 w]``."""
+        """Second sweep, at 1/2 of the image, around the positions ``center [V, 1, 2 h, 2 w]``."""
         warp = _warp(fine, views, sources, 2)
         reach = _FINE_REACH / (planes - 1)
         offsets = torch.linspace(-reach, reach, _FINE_PLANES, device=fine.device).view(1, -1, 1, 1)
@@ -209,14 +224,14 @@ class SweepNet(nn.Module):
     def decode(
         self, taps: tuple[Tensor, ...], context: Tensor, context_fine: Tensor, swept: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Tokens to depth and log-scale of its relative error, each ``[V, H, W]``; see :class:`DepthHead`."""
+        """Decodes depth and the log-scale of its relative error, each ``[V, H, W]``; see :class:`DepthHead`."""
         grid = (context.shape[-2] // 2, context.shape[-1] // 2)
         log_depth, log_scale = self.head(taps, grid, context, context_fine, swept)
         return log_depth.clamp(-_LOG_DEPTH, _LOG_DEPTH).exp(), log_scale
 
 
 def _match(sweep: PlaneSweep, volume: VolumeNet, features: Tensor, inverse: Tensor, warp: SourceWarp) -> Tensor:
-    """Logits of planes ``[V, D, h, w]``; without gradient a few views at a time, because volumes are large."""
+    """Logits of the planes ``[V, D, h, w]``; without gradients, in chunks of a few views to save memory."""
     views, planes = inverse.shape[:2]
     step = views if torch.is_grad_enabled() else _VIEWS_AT_A_TIME
     parts = [slice(first, min(first + step, views)) for first in range(0, views, step)]
@@ -224,7 +239,7 @@ def _match(sweep: PlaneSweep, volume: VolumeNet, features: Tensor, inverse: Tens
 
 
 def _warp(maps: Tensor, views: PosedViews, sources: Tensor, stride: int) -> SourceWarp:
-    """Correspondences of feature maps at ``1 / stride`` of the images; half precision would move them by pixels."""
+    """Correspondences of feature maps at ``1 / stride`` of the images, in full precision (half is off by pixels)."""
     with full_precision(maps):
         intrinsics = resize_intrinsics(views.intrinsics, 1 / stride, 1 / stride)
         return SourceWarp(views.world_to_camera, intrinsics, sources, (maps.shape[-2], maps.shape[-1]))

@@ -1,4 +1,4 @@
-"""A small U-Net over the first sweep: fills what matching cannot see (bare walls, occlusions) from context."""
+"""Small U-Net that refines the first sweep: fills in depth where matching fails (bare walls, occlusions)."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from torch.nn import functional as F
 
 
 def activate(x: Tensor) -> Tensor:
-    """Leaky ReLU: sums of residuals without normalisation drift, and below zero a plain one never comes back."""
+    """Leaky ReLU; residual sums without normalisation drift, and a plain ReLU would die below zero."""
     return F.leaky_relu(x, 0.1)
 
 
 class PlainBlock(nn.Module):
-    """Two 3x3 convolutions around which the input is added, without normalisation: absolute values matter here."""
+    """Residual block of two 3x3 convolutions, without normalisation, as absolute values matter here."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -28,7 +28,7 @@ class PlainBlock(nn.Module):
 
 
 class RefineNet(nn.Module):
-    """U-Net on 1/4, 1/8 and 1/16 of the image, of ``channels`` there; its outputs are zero before training."""
+    """U-Net at 1/4, 1/8 and 1/16 of the image with the given ``channels``; its outputs are zero before training."""
 
     def __init__(self, inputs: int, outputs: int, channels: tuple[int, int, int] = (64, 96, 128)) -> None:
         super().__init__()
@@ -58,7 +58,15 @@ def _upsample(x: Tensor, like: Tensor) -> Tensor:
 
 
 def convex_upsample(x: Tensor, mask: Tensor) -> Tensor:
-    """Doubles ``[V, C, h, w]``: every new pixel is a convex mixture of its 3x3 neighbours, ``mask [V, 36, h, w]``."""
+    """Upsamples by two, each new pixel a convex combination of 3x3 neighbours (RAFT).
+
+    Args:
+        x: ``[V, C, h, w]``.
+        mask: logits of the weights ``[V, 36, h, w]``, 9 neighbours times 4 new pixels.
+
+    Returns:
+        ``[V, C, 2 h, 2 w]``.
+    """
     views, channels, height, width = x.shape
     weights = mask.unflatten(1, (9, 4)).softmax(1)  # [V, 9, 4, h, w]
     around = F.unfold(F.pad(x, (1, 1, 1, 1), mode="replicate"), 3).view(views, channels, 9, 1, height, width)
@@ -66,7 +74,7 @@ def convex_upsample(x: Tensor, mask: Tensor) -> Tensor:
 
 
 def slices(probability: Tensor, bins: int) -> Tensor:
-    """Probability ``[V, D, h, w]`` of the planes summed into ``bins`` channels, whatever their number."""
+    """Sums the probability of the planes ``[V, D, h, w]`` into ``bins`` channels, for any D."""
     flat = probability.flatten(2).transpose(1, 2)  # [V, h w, D]
     pooled = F.adaptive_avg_pool1d(flat, bins) * (probability.shape[1] / bins)
     return torch.unflatten(pooled.transpose(1, 2), 2, probability.shape[-2:])

@@ -1,4 +1,4 @@
-"""Patch tokens: what is known of an 8x8 patch, thought over within its view and across views."""
+"""Patch tokens of the plane sweep: embeds 8x8 patches and attends within and across views."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from vg2gt.geometry.cameras import resize_intrinsics
 
 PATCH = 8
 DIM = 128
-TAPS = 2  # the last two blocks' outputs
-_WAVENUMBERS = (1.5, 4.0, 10.0)  # of a patch's place, per geometric-mean depth
+TAPS = 2  # outputs of the last two blocks
+_WAVENUMBERS = (1.5, 4.0, 10.0)  # of 3D position encodings, in units of one over the geometric-mean depth
 _IMAGE_WAVES = 8
 POSITION_CHANNELS = 3 + 3 + 6 * len(_WAVENUMBERS) + 4 * _IMAGE_WAVES
 
 
 class TokenBlock(nn.Module):
-    """Pre-norm transformer block whose keys are 2x2-pooled tokens, of the own view or of all views (``across``)."""
+    """Pre-norm transformer block; keys and values are 2x2-pooled tokens of its own view, or of all (``across``)."""
 
     def __init__(self, dim: int, heads: int, across: bool) -> None:
         super().__init__()
@@ -30,7 +30,14 @@ class TokenBlock(nn.Module):
         self.mlp = nn.Sequential(nn.Linear(dim, 3 * dim), nn.GELU(), nn.Linear(3 * dim, dim))
 
     def forward(self, x: Tensor, position: Tensor, grid: tuple[int, int], scenes: int = 1) -> Tensor:
-        """Maps tokens ``[V, P, dim]`` to the same shape; ``position`` likewise, ``grid`` the patches per axis."""
+        """Maps tokens ``[V, P, dim]`` to the same shape.
+
+        Args:
+            x: tokens ``[V, P, dim]``.
+            position: position embeddings ``[V, P, dim]``.
+            grid: patches per axis.
+            scenes: number of scenes that the views belong to.
+        """
         views, patches, dim = x.shape
         placed = self.norm(x) + position
         query = self.query(placed)
@@ -45,7 +52,7 @@ class TokenBlock(nn.Module):
 
 
 class TokenNet(nn.Module):
-    """Embeds patches, ``inputs`` numbers each, and runs the blocks, views and all views in turns."""
+    """Embeds patches of ``inputs`` channels and runs blocks that alternate between single views and all views."""
 
     def __init__(self, inputs: int, blocks: int = 4) -> None:
         super().__init__()
@@ -54,7 +61,14 @@ class TokenNet(nn.Module):
         self.blocks = nn.ModuleList(TokenBlock(DIM, 4, across=i % 2 == 1) for i in range(blocks))
 
     def forward(self, patches: Tensor, place: Tensor, grid: tuple[int, int], scenes: int = 1) -> tuple[Tensor, ...]:
-        """Maps ``patches [V, P, inputs]`` at ``place [V, P, POSITION_CHANNELS]`` to the taps ``[V, P, DIM]``."""
+        """Maps patches to the taps ``[V, P, DIM]``, in float32.
+
+        Args:
+            patches: ``[V, P, inputs]``.
+            place: their position encodings ``[V, P, POSITION_CHANNELS]``, from :func:`patch_places`.
+            grid: patches per axis.
+            scenes: number of scenes that the views belong to.
+        """
         tokens, position = self.embed(patches), self.position(place)
         taps = []
         for block in self.blocks:
@@ -71,15 +85,18 @@ def patch_places(
     size: tuple[int, int],
     scenes: int = 1,
 ) -> Tensor:
-    """Where patches are, ``[V, P, POSITION_CHANNELS]``: point and ray in the first view's frame, place in the image.
+    """Encodes the positions of patches: 3D point and ray in the first view's frame, and position in the image.
 
     Args:
-        depth: ``[V, P]`` of the patches.
+        depth: depth of the patches ``[V, P]``.
         world_to_camera: ``[V, 4, 4]``.
-        intrinsics: ``[V, 3, 3]`` of the images.
-        depth_range: ``[2]`` or ``[V, 2]`` near and far; their geometric mean is the unit.
+        intrinsics: ``[V, 3, 3]``, at image resolution.
+        depth_range: near and far, ``[2]`` or ``[V, 2]``; their geometric mean is the unit of length.
         size: patches per axis.
-        scenes: that the views belong to.
+        scenes: number of scenes that the views belong to.
+
+    Returns:
+        ``[V, P, POSITION_CHANNELS]``.
     """
     views = len(world_to_camera) // scenes
     pose = world_to_camera[::views].repeat_interleave(views, 0) @ torch.linalg.inv(world_to_camera)

@@ -1,4 +1,4 @@
-"""What the cameras alone decide: which views are compared, and how near and far the planes stand."""
+"""Choice of source views and depth ranges from the cameras."""
 
 from __future__ import annotations
 
@@ -7,26 +7,31 @@ from torch import Tensor
 
 from vg2gt.geometry.cameras import pixel_grid, resize_intrinsics
 
-_GRID = (5, 9)  # rays of a view by which overlap is measured
-_DEPTHS = 5  # planes between near and far at which it is measured
+_GRID = (5, 9)  # rays per view for measuring overlap
+_DEPTHS = 5  # planes between near and far for measuring overlap
 _LEAST_PARALLAX, _MOST_PARALLAX = (
     0.08,
     0.5,
-)  # baseline over depth: below it little is gained, above it views look unlike
-_SEEN_AGAIN = 0.4  # worth of a point in one more source, relative to one source fewer
-_WIDE = (0.1, 40.0)  # the first sweep's range in units of the cameras' largest distance
-_NEAREST = 0.03  # of it at least, where cameras stand close together
+)  # baseline over depth: too little parallax below the first, too different views above the second
+_SEEN_AGAIN = 0.4  # factor on a point's score for every source that already sees it
+_WIDE = (0.1, 40.0)  # range of the first sweep, in units of the largest distance between cameras
+_NEAREST = 0.03  # minimum near of the first sweep, in the same unit
 
 
 def rays(intrinsics: Tensor, size: tuple[int, int]) -> Tensor:
-    """Unit-z rays ``[V, 3, h * w]`` through the pixel centres of cameras ``[V, 3, 3]`` of that size."""
+    """Returns unit-z rays ``[V, 3, h * w]`` through the pixel centres.
+
+    Args:
+        intrinsics: ``[V, 3, 3]``.
+        size: image ``(height, width)``.
+    """
     u, v = pixel_grid(*size, intrinsics).unbind(-1)
     pixels = torch.stack((u.flatten(), v.flatten(), torch.ones_like(u).flatten()))
     return torch.linalg.inv(intrinsics) @ pixels
 
 
 def relative_poses(world_to_camera: Tensor, sources: Tensor) -> Tensor:
-    """Transforms ``[V, n, 4, 4]`` from every view to its sources (``[V, n]`` indices)."""
+    """Returns the transforms ``[V, n, 4, 4]`` from every view to its sources (indices ``[V, n]``)."""
     return world_to_camera[sources] @ torch.linalg.inv(world_to_camera)[:, None]
 
 
@@ -38,24 +43,28 @@ def choose_sources(
     count: int,
     noise: Tensor | None = None,
 ) -> Tensor:
-    """Indices ``[V, n]`` of the views that every view is compared with, the best first.
+    """Chooses the source views that every view is matched with, greedily.
 
-    A source's score is the overlap of what it sees between near and far, times a reward for parallax that falls again
-    for wide baselines; what sources chosen before see already counts less.
+    The score of a source is its overlap with the view between near and far, times a reward for parallax that decreases
+    again for wide baselines. Points that already chosen sources see count less.
 
     Args:
         world_to_camera: ``[V, 4, 4]``.
         intrinsics: ``[V, 3, 3]`` in pixels.
         size: image ``(height, width)``.
-        depth_range: ``[2]`` near and far.
-        count: sources per view, at most V - 1 are returned.
-        noise: ``[V, V]`` added to the logarithms of the scores (training).
+        depth_range: near and far ``[2]``.
+        count: number of sources per view; at most V - 1 are returned.
+        noise: ``[V, V]``, added to the logarithms of the scores (training).
+
+    Returns:
+        Indices of the sources ``[V, n]``, best first.
     """
     views = len(world_to_camera)
     scaled = resize_intrinsics(intrinsics, _GRID[1] / size[1], _GRID[0] / size[0])
     near, far = depth_range.unbind()
     steps = torch.linspace(0, 1, _DEPTHS + 2, device=near.device)[1:-1]
     depths = 1 / (1 / far + steps * (1 / near - 1 / far))
+    # sample points of every view, projected into every possible source
     points = rays(scaled, _GRID)[:, None] * depths[None, :, None, None]  # [V, z, 3, p]
     everyone = torch.arange(views, device=near.device).expand(views, views)
     poses = relative_poses(world_to_camera, everyone)  # [V, s, 4, 4]
@@ -64,12 +73,13 @@ def choose_sources(
     z = pixels[..., 2, :]
     u, v = (pixels[..., axis, :] / z.clamp_min(1e-6) for axis in (0, 1))
     inside = (z > 0) & (u > -0.5) & (u < _GRID[1] - 0.5) & (v > -0.5) & (v < _GRID[0] - 0.5)
+    # reward for parallax: [V, s]
     parallax = poses[..., :3, 3].norm(dim=-1) / depths[_DEPTHS // 2]
     reward = parallax / (parallax + _LEAST_PARALLAX) / (1 + (parallax / _MOST_PARALLAX) ** 2)
     if noise is not None:
         reward = reward * torch.exp(noise)
     seen = inside.flatten(2).float()  # [V, s, z p]
-    left = torch.ones_like(seen[:, 0])  # [V, z p] what another look at a point is worth
+    left = torch.ones_like(seen[:, 0])  # [V, z p] weights of the points for the next source
     reward = reward.masked_fill(torch.eye(views, dtype=torch.bool, device=reward.device), -torch.inf)
     chosen = []
     for _ in range(min(count, views - 1)):
@@ -82,16 +92,16 @@ def choose_sources(
 
 
 def camera_distances(world_to_camera: Tensor) -> Tensor:
-    """Distances ``[V, V]`` between the centres of cameras ``[V, 4, 4]``."""
+    """Returns the distances ``[V, V]`` between the centres of cameras ``[V, 4, 4]``."""
     centers = torch.linalg.inv(world_to_camera)[:, :3, 3]
-    return torch.cdist(centers, centers, compute_mode="donot_use_mm_for_euclid_dist")  # products lose small ones
+    return torch.cdist(centers, centers, compute_mode="donot_use_mm_for_euclid_dist")  # mm loses small distances
 
 
 def wide_range(world_to_camera: Tensor) -> Tensor:
-    """Near and far ``[2]`` of a first sweep, from the cameras ``[V, 4, 4]`` alone.
+    """Returns near and far ``[2]`` of the first sweep, from the cameras ``[V, 4, 4]`` alone.
 
-    Near is at most the median distance of a camera to its nearest neighbour: on a long walk the largest distance says
-    little about how near things are, and people take views in steps that suit the distance of what they look at.
+    Near is at most the median distance of a camera to its nearest neighbour, but not below a minimum. In long captures
+    the largest distance says little about how near surfaces are, while the steps between views match their distance.
     """
     distances = camera_distances(world_to_camera)
     extent = distances.max()
@@ -101,9 +111,15 @@ def wide_range(world_to_camera: Tensor) -> Tensor:
 
 
 def agreed_range(depth: Tensor, agreement: Tensor, fallback: Tensor, share: float = 0.5) -> Tensor:
-    """Near and far ``[2]`` around depths whose :func:`agreement` is ``share`` or more; ``fallback`` if hardly any.
+    """Returns near and far ``[2]`` around the depths whose agreement is above ``share``.
 
-    Agreement, not confidence, chooses the pixels: a network is sure of itself on near, well textured things.
+    Pixels are selected by agreement, not confidence, which is biased towards near, well textured surfaces.
+
+    Args:
+        depth: depth of the pixels, of any shape.
+        agreement: their agreement with the sources in [0, 1], of the same shape.
+        fallback: range ``[2]`` to return if less than 1 % of the pixels agree.
+        share: threshold of agreement.
     """
     agreed = depth[agreement > share].sort().values
     if len(agreed) < 0.01 * depth.numel():

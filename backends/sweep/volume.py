@@ -1,4 +1,4 @@
-"""The sweep: features of other views warped onto planes, compared, regularised and read as depth."""
+"""Plane sweep: matches warped features on depth planes, regularises the volume and reads out depth."""
 
 from __future__ import annotations
 
@@ -8,42 +8,45 @@ from torch.nn import functional as F
 
 from backends.sweep.correlate import BEHIND, GROUPS, SourceWarp, correlate
 
-_WINDOW = 2  # planes on either side of the best one that are averaged
-_AGREEMENT_WIDTH = 0.03  # relative difference of depths at which agreement falls to 1/e
+_WINDOW = 2  # planes on either side of the most likely one to average over
+_AGREEMENT_WIDTH = 0.03  # relative depth difference at which agreement falls to 1/e
 
 
 def near_and_far(depth_range: Tensor) -> tuple[Tensor, Tensor]:
-    """The two depths of ``[2]``, or of ``[V, 2]`` as ``[V, 1, 1, 1]``."""
+    """Splits a depth range into near and far: scalars for ``[2]``, ``[V, 1, 1, 1]`` for ``[V, 2]``."""
     near, far = depth_range.unbind(-1)
     return (near, far) if near.dim() == 0 else (near.view(-1, 1, 1, 1), far.view(-1, 1, 1, 1))
 
 
 def to_inverse(t: Tensor, depth_range: Tensor) -> Tensor:
-    """Inverse depth of ``t [V, ., h, w]``: 0 at far, 1 at near, linear in between."""
+    """Converts plane positions ``t [V, ., h, w]`` to inverse depth, linearly: 0 is far, 1 is near."""
     near, far = near_and_far(depth_range)
     return 1 / far + t * (1 / near - 1 / far)
 
 
 def from_inverse(inverse: Tensor, depth_range: Tensor) -> Tensor:
-    """``t`` of an inverse depth."""
+    """Converts inverse depth to plane positions; inverse of :func:`to_inverse`."""
     near, far = near_and_far(depth_range)
     return (inverse - 1 / far) / (1 / near - 1 / far)
 
 
 class PlaneSweep(nn.Module):
-    """Group-wise similarity of every view with its sources on planes, sources weighted by what they show."""
+    """Group-wise similarity of every view with its sources on depth planes, averaged with learned source weights."""
 
     def __init__(self) -> None:
         super().__init__()
         self.weigh = nn.Sequential(nn.Conv2d(GROUPS, 16, 1), nn.ReLU(inplace=True), nn.Conv2d(16, 1, 1))
 
     def forward(self, features: Tensor, inverse: Tensor, warp: SourceWarp) -> Tensor:
-        """Compares views: mean similarity per group and the sources' weight, ``[V D, GROUPS + 1, h, w]``.
+        """Builds the cost volume.
 
         Args:
-            features: ``[N, C, h, w]`` of unit length per group, of all views.
-            inverse: ``[V, D, h w]`` inverse depths of the planes, or ``[V, D, 1]``.
-            warp: of all views or some.
+            features: features of all views ``[N, C, h, w]``, of unit length per group.
+            inverse: inverse depths of the planes, ``[V, D, h w]`` or ``[V, D, 1]``.
+            warp: correspondences of all or some of the views.
+
+        Returns:
+            Weighted mean similarity per group, and the mean weight of the sources: ``[V D, GROUPS + 1, h, w]``.
         """
         size = (features.shape[-2], features.shape[-1])
         views, sources = warp.sources.shape
@@ -58,14 +61,14 @@ class PlaneSweep(nn.Module):
 
 
 def to_planes(volume: Tensor, size: tuple[int, int]) -> Tensor:
-    """``[V, C, D, h w]`` as images of planes ``[V D, C, h, w]``, channels-last."""
+    """Reshapes a volume ``[V, C, D, h w]`` to one image per plane ``[V D, C, h, w]``, channels-last."""
     views, channels, planes, _ = volume.shape
     images = volume.permute(0, 2, 3, 1).reshape(views * planes, *size, channels)  # [V D, h, w, C]
     return images.permute(0, 3, 1, 2)
 
 
 class PlaneBlock(nn.Module):
-    """A residual of a volume: 3x3 in the image, then 5 along the planes, both as 2D convolutions (3D ones are slow)."""
+    """Residual block on a volume: 3x3 in the image, then 5 along the planes, as 2D convolutions (3D ones are slow)."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -73,17 +76,17 @@ class PlaneBlock(nn.Module):
         self.planes = nn.Conv2d(channels, channels, (5, 1), 1, (2, 0))
 
     def forward(self, x: Tensor, planes: int) -> Tensor:
-        """Maps images of planes ``[V D, C, h, w]``, channels-last, to the same shape."""
+        """Maps plane images ``[V D, C, h, w]``, channels-last, to the same shape."""
         size = x.shape[-2:]
         y = F.relu(self.image(x), inplace=True).permute(0, 2, 3, 1)  # [V D, h, w, C]
         y = y.reshape(-1, planes, size[0] * size[1], y.shape[-1]).permute(0, 3, 1, 2)  # [V, C, D, h w]
         return x + to_planes(
             self.planes(y), (size[0], size[1])
-        )  # in place on a view, gradients would lose channels-last
+        )  # not in place: on a view, the gradients would lose channels-last
 
 
 class VolumeNet(nn.Module):
-    """Light 2.5D regularisation of a volume, with ``channels`` at full and half resolution: one logit per plane."""
+    """Light 2.5D regularisation of a volume to one logit per plane; ``channels`` at full and half resolution."""
 
     def __init__(self, channels: tuple[int, int] = (16, 32)) -> None:
         super().__init__()
@@ -94,7 +97,7 @@ class VolumeNet(nn.Module):
         self.up = nn.Conv2d(channels[1], channels[0], 1)
         self.last = PlaneBlock(channels[0])
         self.end = nn.Conv2d(channels[0], 1, 1)
-        self.sharpness = nn.Parameter(torch.tensor(6.0))  # similarity itself is a logit, from the first step on
+        self.sharpness = nn.Parameter(torch.tensor(6.0))  # adds the similarity to the logits, also before training
 
     def forward(self, volume: Tensor, planes: int) -> Tensor:
         """Maps ``[V D, GROUPS + 1, h, w]`` to logits ``[V, D, h, w]`` in float32."""
@@ -110,9 +113,14 @@ class VolumeNet(nn.Module):
 
 
 def expectation(logits: Tensor, positions: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean of the planes' positions about the most likely plane, and the probability there, each ``[V, 1, h, w]``.
+    """Returns the expected plane position around the most likely plane, and the probability mass there.
 
-    Logits are ``[V, D, h, w]``, positions also with 1 in place of V, h and w.
+    Args:
+        logits: ``[V, D, h, w]``.
+        positions: positions of the planes ``[V, D, h, w]``, or with size 1 for V, h and w.
+
+    Returns:
+        Position and mass, each ``[V, 1, h, w]``.
     """
     probability = logits.softmax(1)
     best = probability.argmax(1, keepdim=True)
@@ -125,9 +133,15 @@ def expectation(logits: Tensor, positions: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def agreement(inverse: Tensor, warp: SourceWarp) -> Tensor:
-    """Mean and largest agreement in [0, 1] of the sources' own depths, and the signed difference: ``[V, 3, h, w]``.
+    """Compares each view's depth with the depth of its sources.
 
-    Of inverse depth ``[V, 1, h, w]``; the difference is positive where the source sees something nearer.
+    Args:
+        inverse: inverse depth of all views ``[V, 1, h, w]``.
+        warp: correspondences of all views.
+
+    Returns:
+        ``[V, 3, h, w]``: mean and maximum agreement over the sources, in [0, 1], and 3 times their mean relative
+        difference (clamped to 0.3), which is positive where a source sees a nearer surface.
     """
     views, _, height, width = inverse.shape
     agreements, differences = [], []

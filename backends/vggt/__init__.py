@@ -1,4 +1,4 @@
-"""VGGT behind the backend interface."""
+"""VGGT as a backend."""
 
 from backends.vggt.network import VGGTBackend
 

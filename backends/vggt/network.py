@@ -1,6 +1,6 @@
 """VGGT: a DINOv2 encoder per view, then alternating attention within and across views.
 
-Names of modules follow the published weight file (``facebook/VGGT-1B``).
+Module names follow the published weight file (``facebook/VGGT-1B``).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ POSE_DIM = 9
 
 
 class CameraHead(nn.Module):
-    """Camera tokens of ``dim`` channels to pose encodings, by a trunk of ``depth`` blocks."""
+    """Decodes camera tokens of ``dim`` channels into pose encodings, iteratively, with a trunk of ``depth`` blocks."""
 
     def __init__(self, dim: int, depth: int, num_heads: int) -> None:
         super().__init__()
@@ -42,7 +42,7 @@ class CameraHead(nn.Module):
         token = self.token_norm(camera)
         raw = torch.zeros_like(token[..., :POSE_DIM])
         for iteration in range(ITERATIONS):
-            # The running estimate is an input of the next round, not a path for gradients.
+            # The current estimate is an input of the next iteration, without gradient.
             current = self.empty_pose_tokens.expand_as(raw) if iteration == 0 else raw.detach()
             shift, scale, gate = self.poseLN_modulation(self.embed_pose(current)).chunk(3, -1)
             x = token + gate * (F.layer_norm(token, token.shape[-1:], eps=1e-6) * (1 + scale) + shift)
@@ -56,7 +56,7 @@ REGISTERS = 4
 
 
 class Encoder(nn.Module):
-    """DINOv2 with registers; only its patch tokens are used."""
+    """DINOv2 with registers; returns only patch tokens."""
 
     def __init__(self, dim: int, depth: int, num_heads: int, image_size: int, patch_size: int) -> None:
         super().__init__()
@@ -79,7 +79,7 @@ class Encoder(nn.Module):
 
 
 class Aggregator(nn.Module):
-    """Encoder, special tokens, and pairs of within-view and across-view blocks."""
+    """Encoder, special tokens, and alternating within-view (frame) and across-view (global) blocks."""
 
     def __init__(
         self, dim: int, depth: int, encoder_depth: int, num_heads: int, image_size: int, patch_size: int
@@ -94,11 +94,16 @@ class Aggregator(nn.Module):
         self.global_blocks = nn.ModuleList(_alternating_block(dim, num_heads) for _ in range(depth))
 
     def forward(self, images: Tensor, taps: Sequence[int]) -> tuple[list[Tensor], Tensor]:
-        """Aggregates views ``[B, V, 3, H, W]`` in [0, 1]; ``taps`` are indices of block pairs.
+        """Encodes views.
+
+        Args:
+            images: ``[B, V, 3, H, W]`` in [0, 1].
+            taps: indices of the tapped block pairs.
 
         Returns:
             Patch tokens ``[B, V, P, 2C]`` of every tap and the last camera token ``[B, V, 2C]``.
         """
+        # images to tokens, special ones first: [B V, N, C]
         batch, views = images.shape[:2]
         grid = (images.shape[-2] // self.patch_size, images.shape[-1] // self.patch_size)
         patches = self.patch_embed(normalize_images(images).flatten(0, 1), grid)
@@ -107,10 +112,12 @@ class Aggregator(nn.Module):
         x = torch.cat((special, patches), 1)
         count, start = x.shape[1], special.shape[1]
 
-        positions = grid_positions(*grid, like=x) + 1  # 0 is for the special tokens
+        # rotary tables
+        positions = grid_positions(*grid, like=x) + 1  # position 0 is for the special tokens
         positions = torch.cat((positions.new_zeros(start, 2), positions))
         frame_rotary = rotary_2d(positions, self.head_dim)
         global_rotary = tuple(table.repeat(views, 1) for table in frame_rotary)
+        # alternate between attention within views and across views
         tapped, camera = [], x
         last = len(self.frame_blocks) - 1
         for index, (frame_block, global_block) in enumerate(zip(self.frame_blocks, self.global_blocks, strict=True)):
@@ -130,7 +137,7 @@ def _alternating_block(dim: int, num_heads: int) -> ViTBlock:
 
 
 class VGGTDecoder(nn.Module):
-    """What follows the tokens: camera and depth head; names and shapes as published."""
+    """Camera and depth head; names and shapes as published."""
 
     def __init__(
         self,
@@ -154,7 +161,7 @@ class VGGTDecoder(nn.Module):
         self.depth_head = DPT(token_dim, features, out_channels, 2, patch_size, rectified_skip=True)
 
     def decode(self, tokens: Tokens, chunk: int | None) -> Geometry:
-        """See :meth:`Backend.decode`; at most ``chunk`` views at a time go through the depth head."""
+        """See :meth:`Backend.decode`; the depth head runs on at most ``chunk`` views at a time."""
         with full_precision(tokens.camera):
             out = in_chunks(self.depth_head, tokens.patch, tokens.grid, chunk)  # [B, V, 2, H, W]
         depth, confidence = out[:, :, 0].exp(), 1 + out[:, :, 1].exp()
@@ -168,7 +175,7 @@ class VGGTDecoder(nn.Module):
 
 
 class VGGTNetwork(VGGTDecoder):
-    """The decoder with its aggregator (images to tokens); names and shapes as published."""
+    """Aggregator (images to tokens) and decoder; names and shapes as published."""
 
     def __init__(
         self, aggregator: Aggregator, features: int, out_channels: Sequence[int], camera_depth: int, camera_heads: int
@@ -179,12 +186,12 @@ class VGGTNetwork(VGGTDecoder):
 
 
 class VGGTBackend(NetworkBackend):
-    """VGGT (Wang et al., 2025): relative geometry in the frame of the first view. Hints are not used.
+    """VGGT (Wang et al., 2025): relative geometry in the frame of the first view. Ignores hints.
 
-    Args (the others: see :class:`NetworkBackend`; tokens have 2C channels):
-        depth: pairs of alternating blocks.
-        encoder_depth: blocks of the per-view encoder.
-        camera_depth: blocks of the camera head.
+    Args (for the others see :class:`NetworkBackend`; tokens have 2C channels):
+        depth: number of pairs of alternating blocks.
+        encoder_depth: number of blocks of the per-view encoder.
+        camera_depth: number of blocks of the camera head.
         camera_heads: attention heads of the camera head.
     """
 
@@ -221,7 +228,7 @@ class VGGTBackend(NetworkBackend):
         def make() -> VGGTNetwork:
             aggregator = Aggregator(dim, depth, encoder_depth, num_heads, image_size, patch_size)
             network = VGGTNetwork(aggregator, features, out_channels, camera_depth, camera_heads)
-            # in every round a share of the identity pose and of fields of view of 1 rad
+            # iterations add up to about the identity pose and fields of view of 1 rad
             predict(network.camera_head.pose_branch.fc2, [value / ITERATIONS for value in (0, 0, 0, 0, 0, 0, 1, 1, 1)])
             return network
 

@@ -1,5 +1,5 @@
-"""Data sets as plug-ins: a loader and a YAML each, without a change to the package.
+"""Datasets as plug-ins: each is a loader and a YAML file; the package is not changed.
 
-``python train.py --config-dir examples/data_sets/configs data=tum data.root=FOLDER`` trains on TUM RGB-D. To add a data
-set, write a class like one of these in a module that Python finds, and a YAML that names it.
+``python train.py --config-dir examples/data_sets/configs data=tum data.root=FOLDER`` trains on TUM RGB-D. To add a
+dataset, write a class like these in an importable module, and a YAML file that names it.
 """

@@ -1,6 +1,6 @@
 """DTU in the two layouts of MVSNet: reduced images with depth for training, scans with full images for evaluation.
 
-Files are in millimetres; everything read is in metres.
+Files are in millimetres; loaded data is in metres.
 """
 
 from __future__ import annotations
@@ -42,19 +42,19 @@ _QUARTER = 4
 
 
 class DTUTraining(FileSource):
-    """MVSNet's training set: a scene is a scan, lit in seven ways, of 49 or 64 frames of 640x512.
+    """MVSNet's training set: a scene is a scan of 49 or 64 frames of 640x512, with seven lightings.
 
-    Images are ``Rectified/scanN_train/rect_{id+1:03d}_{light}_r5000.png``: the recorded 1600x1200 halved and cropped to
-    the middle. Depth is the first of ``Depths_raw/scanN`` (1600x1200), ``Depths/scanN_train`` and ``Depths/scanN``
-    (160x128, every fourth pixel) with ``depth_map_%04d.pfm`` in mm and ``depth_visual_%04d.png``, brighter than 10
-    where depth counts. Cameras are ``Cameras/train/%08d_cam.txt``, with the intrinsics of 160x128, or else
-    ``Cameras/%08d_cam.txt``, with those of 1600x1200; both are brought to the images.
+    Images are ``Rectified/scanN_train/rect_{id+1:03d}_{light}_r5000.png``: the recorded 1600x1200 images, halved and
+    centre-cropped. Depth is in the first folder that exists of ``Depths_raw/scanN`` (1600x1200), ``Depths/scanN_train``
+    and ``Depths/scanN`` (160x128, every fourth pixel): ``depth_map_%04d.pfm`` in mm, valid where
+    ``depth_visual_%04d.png`` is brighter than 10. Cameras are ``Cameras/train/%08d_cam.txt``, with intrinsics for
+    160x128, or else ``Cameras/%08d_cam.txt``, with intrinsics for 1600x1200; both are converted to the image size.
 
     Args:
-        root: the folder of ``Rectified``, ``Cameras`` and ``Depths``.
-        light: which of the seven lights, 0 to 6.
-        keep_evaluation_scans: also offer the scans of ``EVALUATION_SCANS``, which are left out otherwise.
-        shared: see ``FileSource``; a scene is called ``scan1``, ``scan2``, ...
+        root: folder of ``Rectified``, ``Cameras`` and ``Depths``.
+        light: which of the seven lightings, 0 to 6.
+        keep_evaluation_scans: whether to include the scans in ``EVALUATION_SCANS``.
+        shared: see ``FileSource``; scenes are called ``scan1``, ``scan2``, ...
     """
 
     layout = "MVSNet's DTU training set: Rectified/scanN_train, Cameras and Depths_raw or Depths"
@@ -74,7 +74,7 @@ class DTUTraining(FileSource):
         super().__init__(root, **shared)
 
     def find(self, root: Path) -> Mapping[str, Path]:
-        """Folders ``Rectified/scanN_train`` in the order of N."""
+        """Returns the folders ``Rectified/scanN_train``, ordered by N."""
         found = {}
         for folder in (root / "Rectified").glob("scan*_train"):
             match = re.fullmatch(r"scan(\d+)_train", folder.name)
@@ -84,12 +84,12 @@ class DTUTraining(FileSource):
         return {f"scan{number}": found[number] for number in kept}
 
     def watched(self, scene: str, folder: Path) -> Sequence[Path | None]:
-        """Also the depth and the cameras."""
+        """Returns the folders of images, cameras and depth."""
         root = folder.parents[1]
         return folder, root / "Cameras", *_training_depth(root, scene)
 
     def index(self, scene: str, folder: Path) -> SceneIndex:
-        """Lists the images of one light and reads their cameras."""
+        """Lists the images of one lighting and reads their cameras."""
         root = folder.parents[1]
         depth_folder = next((place for place in _training_depth(root, scene) if place.is_dir()), None)
         if depth_folder is None:
@@ -110,21 +110,21 @@ class DTUTraining(FileSource):
         return make_index(scene, folder, color, depth, poses, intrinsics)
 
     def read_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
-        """Decodes masked depth and registers it with the image."""
+        """Decodes masked depth and aligns it with the image."""
         return _registered(_masked_depth(index.depth[row], index.name), size, index.depth[row], index.name)
 
 
 class DTU(FileSource):
-    """Scans with ``images/``, ``cams/%08d_cam.txt`` and ``pair.txt`` (not needed), as MVSNet is tested on.
+    """MVSNet's test set: scans with ``images/``, ``cams/%08d_cam.txt`` and ``pair.txt`` (not needed).
 
-    The intrinsics are those of the images as they are. The layout has no depth; it can come from another folder.
+    Intrinsics must match the size of the images. The layout has no depth, but depth can come from another folder.
 
     Args:
-        root: a scan, a folder of scans, or a list.
-        depth: ``pfm``: ``depth_map_%04d.pfm`` with ``depth_visual_%04d.png`` in ``depth_root/scanN`` (``Depths_raw`` of
-            the training set, 1600x1200); ``scan``: rendered from ``depth_root/stlNNN_total.ply`` (``Points/stl`` of
-            DTU) and kept in ``depth_cache``; null: none.
-        depth_root: the folder of that depth.
+        root: a scan, a folder of scans, or a list of these.
+        depth: ``pfm`` reads ``depth_map_%04d.pfm`` and ``depth_visual_%04d.png`` from ``depth_root/scanN``
+            (``Depths_raw`` of the training set, 1600x1200). ``scan`` renders depth from
+            ``depth_root/stlNNN_total.ply`` (``Points/stl`` of DTU) and caches it in ``depth_cache``. null for none.
+        depth_root: folder of the depth files.
         depth_cache: see ``ScanDepth``.
         shared: see ``FileSource``.
     """
@@ -153,12 +153,12 @@ class DTU(FileSource):
         super().__init__(root, **shared)
 
     def place(self, scene: str) -> str:
-        """``scanN``, as in the training set, so that a scan cannot serve both."""
+        """Returns ``scanN`` as in the training set, so that a scan cannot be used in both sets."""
         number = _scan_number(scene)
         return scene if number is None else f"scan{number}"
 
     def watched(self, scene: str, folder: Path) -> Sequence[Path | None]:
-        """Also the depth."""
+        """Returns the folder of the scan and the place of its depth."""
         return folder, self._depth_place(scene) if self.depth else None
 
     def index(self, scene: str, folder: Path) -> SceneIndex:
@@ -184,7 +184,7 @@ class DTU(FileSource):
         return make_index(scene, folder, color, depth, poses, intrinsics)
 
     def read_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
-        """Decodes masked depth, or renders the scan."""
+        """Decodes masked depth, or renders depth from the scan."""
         path = index.depth[row]
         if self.depth == "pfm":
             return _registered(_masked_depth(path, index.name), size, path, index.name)
@@ -200,14 +200,14 @@ class DTU(FileSource):
 
 
 def read_camera(path: Path, scene: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Reads a camera of MVSNet: ``extrinsic``, 4x4 world-to-camera in mm, ``intrinsic``, 3x3, and a depth range.
+    """Reads an MVSNet camera file: ``extrinsic`` (4x4 world-to-camera in mm), ``intrinsic`` (3x3) and a depth range.
 
     Returns:
-        Camera-to-world ``[4, 4]`` in metres, and intrinsics ``[3, 3]`` as they are in the file, which are of the
-        image size that the file was made for.
+        Camera-to-world pose ``[4, 4]`` in metres, and intrinsics ``[3, 3]`` as stored, for the image size that the file
+        was made for.
 
     Raises:
-        DataError: if the file is missing or damaged, or its transform not rigid.
+        DataError: if the file is missing or damaged, or its transform is not rigid.
     """
     words = " ".join(read_text_lines(path, scene)).split()
     try:
@@ -225,23 +225,23 @@ def read_camera(path: Path, scene: str) -> tuple[NDArray[np.float64], NDArray[np
 def _read_cameras(
     folder: Path, scene: str, wanted: Container[int] | None = None
 ) -> tuple[dict[int, NDArray[np.float64]], dict[int, NDArray[np.float64]]]:
-    """Camera-to-world poses and intrinsics by frame number, of the wanted frames or of all."""
+    """Camera-to-world poses and intrinsics by frame number, for the wanted frames or all."""
     files = numbered(folder, scene, "*_cam.txt", (".txt",))
     cameras = {i: read_camera(path, scene) for i, path in files.items() if wanted is None or i in wanted}
     return {i: pose for i, (pose, _) in cameras.items()}, {i: matrix for i, (_, matrix) in cameras.items()}
 
 
 def _from_quarter(intrinsics: NDArray[np.float64], size: Size) -> NDArray[np.float64]:
-    """Intrinsics of MVSNet's 160x128 depth maps, brought to its 640x512 images.
+    """Converts intrinsics of MVSNet's 160x128 depth maps to its 640x512 images.
 
-    The file's principal point is ``(c / 2 - crop) / 4`` of the recorded image's c, without regard to where pixels have
-    their centres; the centre of a halved image's pixel lies 1/4 of its width away from c / 2.
+    The principal point in the file is ``(c / 2 - crop) / 4``, with c of the recorded image, which ignores pixel
+    centres: in the coordinates of the halved image, it must be shifted by -1/4 pixel.
     """
     return _scaled(intrinsics, _QUARTER, (-0.25, -0.25))
 
 
 def _from_full(intrinsics: NDArray[np.float64], size: Size) -> NDArray[np.float64]:
-    """Intrinsics of the recorded 1600x1200, brought to the images: halved, and cropped to the middle."""
+    """Converts intrinsics of the recorded 1600x1200 images to the images, which are halved and centre-cropped."""
     top, left = ((full // 2 - part) // 2 for full, part in zip(FULL_SIZE, size, strict=True))
     return _scaled(intrinsics, 0.5, (-0.25 - left, -0.25 - top))
 
@@ -254,7 +254,7 @@ def _scaled(intrinsics: NDArray[np.float64], scale: float, shift: tuple[float, f
 
 
 def _masked_depth(path: Path, scene: str) -> NDArray[np.float32]:
-    """Depth in metres, 0 where the mask next to it says that there is none."""
+    """Reads depth in metres, 0 where the mask file is dark."""
     try:
         with open_image(path) as image:
             depth = np.array(image)
@@ -270,12 +270,12 @@ def _masked_depth(path: Path, scene: str) -> NDArray[np.float32]:
 
 
 def _registered(depth: NDArray[np.float32], size: Size, path: Path, scene: str) -> NDArray[np.float32]:
-    """Depth at the image's pixels: as it is, from every fourth pixel, or halved and cropped to the middle."""
+    """Aligns depth with the image: unchanged, upsampled from every fourth pixel, or halved and centre-cropped."""
     height, width = size
     if depth.shape == (height, width):
         return depth
     if depth.shape == (height // _QUARTER, width // _QUARTER):
-        # Sample i was taken at pixel 4 i: the nearest sample of pixel u is floor((u + 2) / 4).
+        # Sample i was taken at pixel 4 i, so the nearest sample to pixel u is floor((u + 2) / 4).
         rows, columns = (np.minimum((np.arange(n) + 2) // _QUARTER, n // _QUARTER - 1) for n in size)
         return depth[rows[:, None], columns]
     half = depth[::2, ::2]

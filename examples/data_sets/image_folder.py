@@ -1,4 +1,4 @@
-"""Folders of photographs without cameras and without depth: for reconstruction, which finds its own cameras."""
+"""Folders of photographs without cameras and depth, for reconstruction with estimated cameras."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ FOCAL = 1.2
 
 
 class ImageFolder(FileSource):
-    """Photographs of a scene in a folder, turned upright as their EXIF data says.
+    """Photographs of a scene in a folder, rotated upright according to EXIF.
 
-    Frames are numbered 0, 1, ... in the order of their names, with numbers in names in the order of numbers
-    (``IMG_9`` before ``IMG_10``). Images of several sizes are resized to cover the median size and cropped.
+    Frames are numbered 0, 1, ... in natural order of the file names (``IMG_9`` before ``IMG_10``). Images of several
+    sizes are resized to cover the median size and cropped.
 
     There are no cameras: ``has_cameras`` and ``has_depth`` are False, every pose is the identity, and the intrinsics
-    are a guess (focal length 1.2 times the larger side, principal point in the middle). Training refuses such a source.
+    are a guess (focal length 1.2 times the larger side, principal point at the centre). Training rejects such a source.
 
     Args:
-        root: a folder of images, a folder of such folders (one or two levels deep), or a list.
+        root: a folder of images, a folder of such folders (one or two levels deep), or a list of these.
         scenes: see ``FileSource``.
-        every: use every this many-th image only.
+        every: use every N-th image only.
         index_cache: see ``FileSource``.
     """
 
@@ -50,7 +50,7 @@ class ImageFolder(FileSource):
         super().__init__(root, scenes, None, every, index_cache)
 
     def is_scene(self, folder: Path) -> bool:
-        """Whether it holds images."""
+        """Returns whether a folder has images."""
         return bool(_images(folder))
 
     def index(self, scene: str, folder: Path) -> SceneIndex:
@@ -61,7 +61,7 @@ class ImageFolder(FileSource):
         return make_index(scene, folder, color, None, dict.fromkeys(color, np.eye(4)), intrinsics, color_size=sizes)
 
     def read_color(self, index: SceneIndex, row: int) -> NDArray[np.uint8]:
-        """Decodes an image and turns it upright."""
+        """Decodes an image and rotates it upright."""
         return read_color(index.color[row], index.name, index.color_size, upright=True)
 
 

@@ -1,4 +1,4 @@
-"""RealEstate10K and ACID in the chunks of pixelSplat and its successors; DL3DV as DepthSplat converts it."""
+"""RealEstate10K and ACID in the chunk format of pixelSplat and its successors; DL3DV as converted by DepthSplat."""
 
 from __future__ import annotations
 
@@ -18,18 +18,21 @@ from vg2gt.io.image_files import read_color
 
 
 class PixelSplatChunks(SceneSource):
-    """Posed video frames without depth: ``SPLIT/index.json`` names the chunk ``SPLIT/NNNNNN.torch`` of each scene.
+    """Posed video frames without depth; ``SPLIT/index.json`` maps each scene to a chunk ``SPLIT/NNNNNN.torch``.
 
-    A chunk is a list of scenes: ``key``, ``images`` (encoded files as uint8 tensors) and ``cameras [V, 18]``: focal
-    lengths and principal point as shares of the image's sides, two zeros, and the rows of world-to-camera ``[3, 4]``.
-    A frame's id is its row. Chunks are read without running pickled code.
+    A chunk is a list of scenes with ``key``, ``images`` (encoded files as uint8 tensors) and ``cameras [V, 18]``: focal
+    lengths and principal point relative to the image size, two zeros, and the rows of world-to-camera ``[3, 4]``. The
+    id of a frame is its row. Chunks are loaded without running pickled code.
 
     Args:
-        root: the folder of the splits.
+        root: folder of the splits.
         split: ``train`` or ``test``.
-        scenes: keys, or a text file of them; None: all.
-        every: use every this many-th frame.
-        holdout: every this many-th frame is never trained on; None: none.
+        scenes: keys of scenes, or a text file of keys; None for all.
+        every: use every N-th frame.
+        holdout: hold out every N-th frame from training; None for none.
+
+    Raises:
+        DataError: if ``root`` is None, or the index or a named scene is missing.
     """
 
     is_metric = has_depth = dense_depth = False
@@ -57,19 +60,19 @@ class PixelSplatChunks(SceneSource):
 
     @property
     def scenes(self) -> Sequence[str]:
-        """Keys of the scenes."""
+        """Returns the keys of the scenes."""
         return self._scenes
 
     def frames(self, scene: str) -> Sequence[int]:
-        """Rows of the scene's frames."""
+        """Returns the ids of the scene's frames."""
         return range(0, len(self._entry(scene)["images"]), self.every)
 
     def held_out(self, scene: str) -> Sequence[int]:
-        """Every ``holdout``-th frame."""
+        """Returns every ``holdout``-th frame."""
         return [] if self.holdout is None else list(self.frames(scene))[:: self.holdout]
 
     def load(self, scene: str, frame_ids: Sequence[int]) -> Frames:
-        """Decodes frames."""
+        """Decodes frames; their depth is 0."""
         entry, path = self._entry(scene), self._chunks[scene]
         pixels = [read_color(path, scene, content=entry["images"][row].numpy().tobytes()) for row in frame_ids]
         if len({image.shape for image in pixels}) > 1:

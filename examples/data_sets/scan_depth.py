@@ -1,4 +1,4 @@
-"""Depth images of a laser scan: its points splatted into a camera, hidden ones removed. Done once and kept."""
+"""Depth images rendered from the points of a laser scan, without occluded points; cached."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from vg2gt.io.ply import read_point_ply
 
 VERSION = 1
 """Raise it when the same scan would give other depth: it is part of the cache's key."""
-_CHUNK = 1 << 20  # points projected at once
+_CHUNK = 1 << 20  # points projected at a time
 
 
 @dataclass(frozen=True)
 class ScanDepth:
-    """Depth images of scans, rendered when asked for the first time.
+    """Depth images of scans, rendered on first use.
 
     Args:
-        cache: folder for the rendered images; None: they are rendered whenever they are read.
-        occlusion: a point farther than this many times the nearest depth in the window around it is hidden, and
-            dropped.
-        window: side of that window in pixels, odd; larger than the gaps between a near surface's points.
+        cache: folder for the rendered images; None renders on every read.
+        occlusion: a point is occluded, and dropped, if its depth exceeds this many times the smallest depth in the
+            window around it.
+        window: side of the window in pixels, odd; should exceed the gaps between the points of a near surface.
     """
 
     cache: Path | None = None
@@ -49,15 +49,15 @@ class ScanDepth:
         size: Size,
         unit: float = 1.0,
     ) -> NDArray[np.float32]:
-        """Depth ``[H, W]`` of a scan in a view, 0 where no point is.
+        """Returns the depth ``[H, W]`` of a scan in a view, 0 without a point.
 
         Args:
-            scan: a PLY file of points.
-            scene: the scene it belongs to, for messages.
-            world_to_camera: ``[4, 4]`` of the view; the world is the scan's.
+            scan: PLY file of points.
+            scene: name of the scene, for messages.
+            world_to_camera: pose of the view ``[4, 4]``, in the world frame of the scan.
             intrinsics: ``[3, 3]`` of the view, integer pixel centres.
             size: ``(height, width)`` of the view.
-            unit: the scan's unit in that of the pose, such as 0.001 for millimetres and metres.
+            unit: unit of the scan in units of the pose, such as 0.001 for millimetres and metres.
 
         Raises:
             DataError: if the scan is missing, damaged or empty.
@@ -73,9 +73,9 @@ class ScanDepth:
             try:
                 return load_npz(stored, scene, ("depth",))["depth"]
             except DataError:
-                pass  # a damaged copy is made again
+                pass  # damaged: render again
         if (scan, unit) not in self._scans:
-            self._scans.clear()  # scans are large, and scenes come one after another
+            self._scans.clear()  # keep only one scan, as scans are large and scenes are read in sequence
             self._scans[scan, unit] = read_points(scan, scene) * np.float32(unit)
         points = self._scans[scan, unit]
         depth = render_points(points, world_to_camera, intrinsics, size, self.occlusion, self.window)
@@ -87,7 +87,7 @@ class ScanDepth:
 
 
 def read_points(path: Path, scene: str) -> NDArray[np.float32]:
-    """Finite positions ``[N, 3]`` of a PLY file's vertices.
+    """Reads the finite vertex positions ``[N, 3]`` of a PLY file.
 
     Raises:
         DataError: if the file is missing or damaged, or has no points.
@@ -108,9 +108,9 @@ def render_points(
     occlusion: float = 1.03,
     window: int = 7,
 ) -> NDArray[np.float32]:
-    """Depth ``[H, W]`` of points ``[N, 3]`` in a view: the nearest in each pixel, hidden ones dropped, 0 where none is.
+    """Renders the depth ``[H, W]`` of points ``[N, 3]``: the nearest one per pixel unless occluded, 0 without a point.
 
-    Every point fills the one pixel it falls in, so that depth is that of a point less than 0.71 pixels away.
+    Every point covers only the pixel it projects to, so that depth comes from a point less than 0.71 pixels away.
     """
     height, width = size
     nearest = np.full(height * width, np.inf, np.float32)

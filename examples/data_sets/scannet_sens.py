@@ -1,9 +1,9 @@
-"""ScanNet's raw ``.sens`` streams, read without exporting them.
+"""Reader of ScanNet's raw ``.sens`` streams, without exporting them.
 
 All numbers are little endian. Header: version (uint32, 4), sensor name (uint64 length, bytes), 4x4 float32 intrinsics
-and extrinsics of colour and then of depth, compression types (2 x int32), widths and heights of colour and of depth
-(4 x uint32), depth units per metre (float32), number of frames (uint64). A frame is its 4x4 float32 pose
-(camera-to-world), timestamps of colour and depth (2 x uint64), lengths of the two images (2 x uint64), and their bytes.
+and extrinsics of colour, then of depth, compression types (2 x int32), width and height of colour, then of depth
+(4 x uint32), depth units per metre (float32), number of frames (uint64). Frame: 4x4 float32 pose (camera-to-world),
+timestamps of colour and depth (2 x uint64), lengths of the two images (2 x uint64), bytes of the images.
 """
 
 from __future__ import annotations
@@ -33,18 +33,18 @@ _FRAME_HEADER = "<64s4Q"
 
 
 class ScanNetSens(ScanNet):
-    """Scans in ScanNet's raw ``.sens`` files; a scene is a file, its frames are numbered as in an export.
+    """Scans in ScanNet's raw ``.sens`` files; each file is a scene, and frames are numbered as in an export.
 
-    Frames, depth and intrinsics are those of ``ScanNet``. Images are decoded where they are in the file.
+    Frames, depth and intrinsics are those of ``ScanNet``. Images are decoded directly from the file.
 
-    The arguments are those of ``ScanNet``; without ``index_cache``, every process reads the headers of all frames of a
-    scan at first.
+    The arguments are those of ``ScanNet``. Without ``index_cache``, every process first reads the headers of all frames
+    of a scan.
     """
 
     layout = "sceneNNNN_NN.sens, there or up to two folders deeper"
 
     def find(self, root: Path) -> Mapping[str, Path]:
-        """``.sens`` files by their name."""
+        """Returns ``.sens`` files by name; raises DataError if two have the same name."""
         found: dict[str, Path] = {}
         for path in sorted(path for pattern in ("*", "*/*", "*/*/*") for path in root.glob(pattern + ".sens")):
             if path.stem in found:
@@ -53,14 +53,14 @@ class ScanNetSens(ScanNet):
         return found
 
     def watched(self, scene: str, folder: Path) -> Sequence[Path | None]:
-        """The file."""
+        """Returns the file of the scene."""
         return (folder,)
 
     def index(self, scene: str, folder: Path) -> SceneIndex:
         """Reads the headers of all frames.
 
         Raises:
-            DataError: if the file is missing, damaged or truncated, or compressed in a way that is not read.
+            DataError: if the file is missing, damaged or truncated, or has an unsupported compression.
         """
         try:
             with regular(folder).open("rb") as file:
@@ -100,7 +100,7 @@ class ScanNetSens(ScanNet):
 
 
 def _read_span(path: Path, scene: str, span: NDArray[np.int64]) -> bytes:
-    """The bytes of one image, from its first byte and length."""
+    """Reads the bytes of an image, given by first byte and length."""
     try:
         with regular(path).open("rb") as file:
             file.seek(int(span[0]))
@@ -113,7 +113,7 @@ def _read_span(path: Path, scene: str, span: NDArray[np.int64]) -> bytes:
 
 
 def _read_header(file: BinaryIO) -> tuple[NDArray[np.float64], Size, Size, NDArray[np.float64]]:
-    """Intrinsics of the depth, sizes of colour and depth; the depth's compression and scale, and the frames' number."""
+    """Depth intrinsics, sizes of colour and depth, and an array of depth compression, depth scale and frame count."""
     (version,) = _unpack(file, "<I")
     if version != _VERSION:
         raise ValueError(f"version {version} of the format, expected {_VERSION}")
@@ -140,7 +140,7 @@ def _read_header(file: BinaryIO) -> tuple[NDArray[np.float64], Size, Size, NDArr
 def _read_frames(
     file: BinaryIO, count: int, length: int
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
-    """Poses, and where the images are; nothing is sized by ``count``, which may be damaged."""
+    """Poses, and spans of the colour and depth images; allocates nothing by ``count``, which may be damaged."""
     poses, color, depth = [], [], []
     while len(poses) < count:
         pose, _, _, color_length, depth_length = _unpack(file, _FRAME_HEADER)

@@ -1,4 +1,4 @@
-"""ScanNet++: the iPhone frames, undistorted and with depth rendered from the laser scan."""
+"""ScanNet++: undistorted iPhone frames, with depth rendered from the laser scan."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ METADATA = "scene_iphone_metadata.npz"
 class ScanNetPPiPhone(FileSource):
     """Preprocessed scenes of ScanNet++, as in InsScene-15K's ``processed_scannetpp_v2``; iPhone frames only.
 
-    A scene has ``images/frame_NNNNNN.jpg``, ``depth/frame_NNNNNN.png`` (of the same size, millimetres, 0 = none) and
+    A scene has ``images/frame_NNNNNN.jpg``, ``depth/frame_NNNNNN.png`` (same size, millimetres, 0 = unknown) and
     ``scene_iphone_metadata.npz`` with ``images`` [N] (file names), ``trajectories`` [N, 4, 4] (camera-to-world, OpenCV)
-    and ``intrinsics`` [N, 3, 3], whose principal point counts pixels as COLMAP does: 1/2 is subtracted. The folders
-    hold DSLR frames too, which the file does not name; a frame's number is its id.
+    and ``intrinsics`` [N, 3, 3]. Principal points have COLMAP's pixel corners at integers, so 1/2 is subtracted. DSLR
+    frames in the same folders are ignored. The id of a frame is its number.
 
-    The arguments are those of ``FileSource``. ``root`` is the folder of the scenes, or of splits with scenes, or a
-    scene, or a list of such; a list of scenes may be the official ``nvs_sem_train.txt``.
+    The arguments are those of ``FileSource``. ``root`` is a scene, a folder of scenes, a folder of splits with scenes,
+    or a list of these. ``scenes`` may be the official ``nvs_sem_train.txt``.
     """
 
     scene_marks = (METADATA,)
@@ -56,7 +56,7 @@ class ScanNetPPiPhone(FileSource):
 
 
 def _frame_numbers(names: NDArray[np.str_], path: Path, scene: str) -> dict[int, int]:
-    """Rows of the file by frame number."""
+    """Rows of the metadata by frame number."""
     rows: dict[int, int] = {}
     for row, name in enumerate(names.tolist()):
         digits = PurePosixPath(name).stem.removeprefix("frame_")

@@ -1,4 +1,4 @@
-"""Tanks and Temples: images with the benchmark's reference poses, and depth from its laser scans."""
+"""Tanks and Temples: images with the benchmark's reference poses, and depth rendered from its laser scans."""
 
 from __future__ import annotations
 
@@ -34,18 +34,18 @@ _LOG = "_COLMAP_SfM.log"
 class TanksAndTemples(FileSource):
     """Scenes ``S`` with ``S_COLMAP_SfM.log``, ``S_trans.txt``, ``S.ply`` and images in ``images/`` or next to them.
 
-    The log has a camera-to-world pose for each image in the order of the images' names, in the arbitrary unit of
-    structure from motion; ``S_trans.txt`` takes that world to the scan's, which is in metres. Images that the log marks
-    as not registered (a second number of -1) are left out and counted. The crop volume ``S.json`` is not needed.
+    The log has a camera-to-world pose for each image, in the order of the image names and in the arbitrary unit of
+    structure from motion. ``S_trans.txt`` transforms its world to that of the scan, in metres. Images that the log
+    marks as not registered (second number -1) are left out and counted. The crop volume ``S.json`` is not needed.
 
-    The benchmark gives no calibration. Intrinsics are those of an undistorted COLMAP model of the same images in
-    ``sparse/0`` or ``sparse`` (its poses are not used), or ``intrinsics``. The focal length of 0.7 times the image
-    width that the benchmark recommends is a first guess, to be refined: refined ones are near 0.6.
+    The benchmark has no calibration. Intrinsics come from ``intrinsics``, or from an undistorted COLMAP model of the
+    same images in ``sparse/0`` or ``sparse`` (its poses are not used). The benchmark recommends a focal length of 0.7
+    times the image width, but only as an initial guess; refined focal lengths are near 0.6.
 
     Args:
-        root: a scene, a folder of scenes, or a list.
-        intrinsics: (fx, fy, cx, cy) in pixels of the images, integer pixel centres; null: those of the COLMAP model.
-        depth: ``scan``: rendered from ``S.ply`` and kept in ``depth_cache``; null: none.
+        root: a scene, a folder of scenes, or a list of these.
+        intrinsics: (fx, fy, cx, cy) in pixels of the images, integer pixel centres; null uses the COLMAP model.
+        depth: ``scan`` renders depth from ``S.ply`` and caches it in ``depth_cache``; null for no depth.
         depth_cache: see ``ScanDepth``.
         shared: see ``FileSource``.
     """
@@ -70,11 +70,11 @@ class TanksAndTemples(FileSource):
         super().__init__(root, **shared)
 
     def is_scene(self, folder: Path) -> bool:
-        """Whether it holds a trajectory."""
+        """Returns whether a folder has a trajectory."""
         return _log_file(folder) is not None
 
     def watched(self, scene: str, folder: Path) -> Sequence[Path | None]:
-        """Also the COLMAP model."""
+        """Returns the folder of the scene and of its COLMAP model."""
         return folder, model_folder_of(folder)
 
     def index(self, scene: str, folder: Path) -> SceneIndex:
@@ -103,7 +103,7 @@ class TanksAndTemples(FileSource):
         return make_index(scene, folder, color, depth, to_world, intrinsics)
 
     def read_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
-        """Renders the scan."""
+        """Renders depth from the scan."""
         pose, matrix = index.world_to_camera[row], index.intrinsics[row]
         return self._scan_depth.read(index.depth[row], index.name, pose, matrix, size)
 
@@ -119,7 +119,7 @@ class TanksAndTemples(FileSource):
         with errors_name(scene):
             model = read_colmap(model_folder)
         records = {Path(image.name).name: image for image in colmap_images(model)}
-        # The benchmark's images that the model lacks were not registered, and have no use.
+        # Images that are missing in the model were not registered and are left out.
         known = {number: (path, records[path.name]) for number, path in color.items() if path.name in records}
         return {number: _matrix(record.camera, path, scene) for number, (path, record) in known.items()}
 
@@ -136,7 +136,7 @@ def _matrix(camera: Camera, path: Path, scene: str) -> NDArray[np.float64]:
 
 
 def moved(similarity: NDArray[np.float64], pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A camera-to-world pose in a world moved by a 4x4 similarity; its rotation stays one, the scale moves it only."""
+    """Transforms a camera-to-world pose by a 4x4 similarity; the scale affects the position only."""
     if not np.isfinite(pose).all():
         return np.full((4, 4), np.nan)
     scale = np.cbrt(np.linalg.det(similarity[:3, :3]))

@@ -1,4 +1,4 @@
-"""TUM RGB-D: recordings of a Kinect with poses from motion capture."""
+"""TUM RGB-D: Kinect recordings with poses from motion capture."""
 
 from __future__ import annotations
 
@@ -39,24 +39,24 @@ _SHORTEST_QUATERNION = 0.5
 class TUM(FileSource):
     """Sequences of the TUM RGB-D benchmark, and recordings in its layout; a scene is a sequence.
 
-    ``rgb.txt`` and ``depth.txt`` list ``timestamp path``, ``groundtruth.txt`` ``timestamp tx ty tz qx qy qz qw``
-    (camera-to-world, OpenCV, metres). A colour image makes a frame with the depth image and the pose that differ from
-    it by at most ``max_difference`` in time; nearest pairs first, nothing is used twice. Frame ids are positions in
-    ``rgb.txt``, in order of time. Depth is registered to the colour camera, 5000 units per metre; 0 and 65535 mean
-    none. Listed files that do not exist are counted and left out.
+    ``rgb.txt`` and ``depth.txt`` have lines of ``timestamp path``, ``groundtruth.txt`` of ``timestamp tx ty tz qx qy qz
+    qw`` (camera-to-world, OpenCV, metres). Each colour image is associated with a depth image and a pose whose times
+    differ by at most ``max_difference``, closest pairs first, and each is used at most once. Frame ids are positions in
+    ``rgb.txt``, ordered by time. Depth is registered to the colour camera, 5000 units per metre; 0 and 65535 mean
+    unknown. Listed files that do not exist are left out and counted.
 
-    The intrinsics are those of the Kinect that the folder's name says (``freiburg1``, ``fr1``, ...). The images are
-    taken as a pinhole camera's. Those of freiburg3 are undistorted; those of freiburg1 and freiburg2 are not: by the
-    published coefficients half of their pixels are off by more than 5 pixels, a tenth by more than 8, and the corners
-    by 15 to 37. Undistort them beforehand where that matters.
+    By default, intrinsics are those of the Kinect in the folder's name (``freiburg1``, ``fr1``, ...). Images are
+    treated as those of a pinhole camera. Images of freiburg3 are undistorted. Those of freiburg1 and freiburg2 are not:
+    with the published coefficients, half of their pixels are off by more than 5 pixels, a tenth by more than 8, and the
+    corners by 15 to 37. Undistort them beforehand if that matters.
 
     Args:
-        root: a sequence, or a folder of sequences, or a list of such.
-        intrinsics: (fx, fy, cx, cy) in pixels of the colour images; None: those of ``K.txt`` beside the
-            lists, else by the folder's name.
-        max_difference: largest difference of times in a frame, in seconds.
-        holdout: hold out every this many-th frame as an evaluation target; None: none.
-        shared: see ``FileSource``; the camera takes 30 frames per second.
+        root: a sequence, a folder of sequences, or a list of these.
+        intrinsics: (fx, fy, cx, cy) in pixels of the colour images; None reads ``K.txt`` next to the lists, or else
+            uses the folder's name.
+        max_difference: maximum time difference within a frame, in seconds.
+        holdout: hold out every N-th frame as an evaluation target; None for none.
+        shared: see ``FileSource``; the camera records 30 frames per second.
     """
 
     layout = "rgb.txt, depth.txt and groundtruth.txt, there or one folder deeper"
@@ -79,7 +79,7 @@ class TUM(FileSource):
         super().__init__(root, holdout=holdout, **shared)
 
     def index(self, scene: str, folder: Path) -> SceneIndex:
-        """Reads the lists and joins them."""
+        """Reads the lists and associates their entries."""
         if not (folder / "groundtruth.txt").is_file():
             raise DataError(
                 f"scene {scene} in {folder} has no groundtruth.txt (lines of 'timestamp tx ty tz qx qy qz qw'), so its "
@@ -120,10 +120,10 @@ class TUM(FileSource):
 
 
 def associate(times: NDArray[np.float64], others: NDArray[np.float64], max_difference: float) -> dict[int, int]:
-    """Pairs two increasing lists of times: the nearest first, each at most once.
+    """Pairs the entries of two increasing lists of times, closest pairs first, each entry at most once.
 
     Returns:
-        Positions in ``others`` by positions in ``times``.
+        Indices into ``others`` by index into ``times``.
     """
     first = np.searchsorted(others, times - max_difference, "left")
     last = np.searchsorted(others, times + max_difference, "right")
@@ -138,7 +138,7 @@ def associate(times: NDArray[np.float64], others: NDArray[np.float64], max_diffe
 
 
 def _read_list(path: Path, scene: str) -> tuple[NDArray[np.float64], list[Path]]:
-    """Increasing times, and the files taken at them, which lie beside the list."""
+    """Increasing times and their files, whose paths are relative to the list."""
     entries: dict[float, str] = {}
     for line in read_text_lines(path, scene):
         words = line.split(maxsplit=1)
@@ -156,7 +156,7 @@ def _read_list(path: Path, scene: str) -> tuple[NDArray[np.float64], list[Path]]
 
 
 def _read_poses(path: Path, scene: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Increasing times and ``[n, 4, 4]`` camera-to-world poses; one without a unit quaternion is not finite."""
+    """Increasing times and camera-to-world poses ``[n, 4, 4]``; NaN for invalid numbers or a short quaternion."""
     rows = read_numbers(path, scene)
     if rows.shape[1] != 8:
         raise DataError(

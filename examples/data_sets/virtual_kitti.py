@@ -1,4 +1,4 @@
-"""Virtual KITTI 2: rendered drives."""
+"""Virtual KITTI 2: synthetic drives."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ _LARGEST_NUMBER = 1 << 31
 
 
 class VirtualKITTI2(FileSource):
-    """Five drives in ten variations (weather, light, direction) and two cameras; a scene is ``Scene01/clone/Camera_0``.
+    """Five drives in ten variations (weather, light, direction), two cameras each, such as ``Scene01/clone/Camera_0``.
 
-    ``SceneNN/VARIATION/frames/{rgb,depth}/Camera_K/{rgb_NNNNN.jpg,depth_NNNNN.png}``; depth is z-depth in centimetres,
-    and the sky holds the largest number, 655.35 m. ``extrinsic.txt`` and ``intrinsic.txt`` begin with a heading; then
-    come ``frame camera`` and the 16 numbers of a world-to-camera matrix (OpenCV, metres), or fx, fy, cx, cy in pixels.
-    The archives of colour, depth and text unpack into one folder. Other cars move.
+    Files are ``SceneNN/VARIATION/frames/{rgb,depth}/Camera_K/{rgb_NNNNN.jpg,depth_NNNNN.png}``. Depth is z-depth in
+    centimetres; sky has the largest value, 655.35 m. ``extrinsic.txt`` and ``intrinsic.txt`` have a header line, then
+    lines of ``frame camera`` followed by the 16 numbers of a world-to-camera matrix (OpenCV, metres), or by fx, fy, cx,
+    cy in pixels. Unpack the archives of colour, depth and text into one folder. Other cars in the scenes move.
 
     Args:
-        root: the folder of ``Scene01``, ``Scene02``, ...
-        max_depth: farther points (metres) have no depth.
-        shared: see ``FileSource``; the cameras take ten frames per second.
+        root: folder of ``Scene01``, ``Scene02``, ...
+        max_depth: points farther than this (metres) have no depth.
+        shared: see ``FileSource``; the cameras record ten frames per second.
     """
 
     layout = "SceneNN/VARIATION/frames/{rgb,depth}/Camera_K and SceneNN/VARIATION/{extrinsic,intrinsic}.txt"
@@ -46,7 +46,7 @@ class VirtualKITTI2(FileSource):
         super().__init__(root, **shared)
 
     def find(self, root: Path) -> Mapping[str, Path]:
-        """Cameras with colour images; the folder of a scene is that of the variation."""
+        """Returns scenes for all cameras with colour images; the folder of a scene is that of its variation."""
         cameras = [path for path in sorted(root.glob("Scene*/*/frames/rgb/Camera_[0-9]")) if path.is_dir()]
         variations = [camera.parents[2] for camera in cameras]
         return {
@@ -55,11 +55,11 @@ class VirtualKITTI2(FileSource):
         }
 
     def place(self, scene: str) -> str:
-        """The drive: variations and cameras show the same streets."""
+        """Returns the drive, as its variations and cameras show the same streets."""
         return scene.split("/")[0]
 
     def watched(self, scene: str, folder: Path) -> Sequence[Path | None]:
-        """Also the camera's images."""
+        """Returns the folder of the variation and the folders of the camera's images."""
         return folder, *(folder / "frames" / kind / _camera_folder(scene) for kind in ("rgb", "depth"))
 
     def index(self, scene: str, folder: Path) -> SceneIndex:
@@ -70,7 +70,7 @@ class VirtualKITTI2(FileSource):
         number = int(camera.removeprefix("Camera_"))
         extrinsics = _read_rows(folder / "extrinsic.txt", scene, number, 16)
         intrinsics = _read_rows(folder / "intrinsic.txt", scene, number, 4)
-        # A frame that lacks intrinsics is one without a camera.
+        # Frames without intrinsics have no camera.
         poses = {
             frame: to_world(row.reshape(4, 4), f"{folder} (scene {scene})", frame)
             for frame, row in extrinsics.items()
@@ -80,7 +80,7 @@ class VirtualKITTI2(FileSource):
         return make_index(scene, folder, color, depth, poses, matrices)
 
     def read_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
-        """Decodes a depth image in centimetres; what is farther than ``max_depth`` has none."""
+        """Decodes a depth image in centimetres to metres; sets depth beyond ``max_depth`` to 0."""
         depth = super().read_depth(index, row, size)
         return np.where(depth <= self.max_depth, depth, np.float32(0))
 
@@ -90,7 +90,7 @@ def _camera_folder(scene: str) -> str:
 
 
 def _read_rows(path: Path, scene: str, camera: int, count: int) -> dict[int, NDArray[np.float64]]:
-    """Rows of one camera by frame number, without the two numbers that say so."""
+    """Rows of one camera by frame number, without the frame and camera columns."""
     table = read_numbers(path, scene, skip_lines=1)
     if table.shape[1] != count + 2:
         raise DataError(

@@ -1,4 +1,4 @@
-"""A procedural room in which a chair moves while the camera does."""
+"""Procedural room with a chair that moves while the camera moves."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from vg2gt.data.synthetic.rooms import SyntheticRoom
 from vg2gt.data.synthetic.synthetic_scene import level_poses
 
 _DRAWS = 2000
-_LONGEST = 2.0  # metres of floor that are kept free for the chair
+_LONGEST = 2.0  # length of free floor for the chair in metres
 
 
 class SyntheticMovingRoom(SyntheticRoom):
-    """The room of the same seed with one more chair, which glides across the floor while cameras on an arc look at it.
+    """The room of the same seed with an extra chair that glides across the floor, seen from cameras on an arc.
 
     Args:
-        seed: decides everything, together with the number of frames.
-        num_frames: cameras on the path, at least 1.
+        seed: determines the scene, together with the number of frames.
+        num_frames: number of cameras on the path, at least 1.
         size: image ``(height, width)``.
-        highlights: as in ``draw_highlights``; the chair is matt.
-        distance: metres between the chair's first and last place, at most 2.
-        during: when it moves, from 0 (first frame) to 1 (last); where both are equal it jumps.
+        highlights: see ``draw_highlights``; the chair is matt.
+        distance: distance between the chair's first and last position in metres, at most 2.
+        during: start and end of the motion, from 0 (first frame) to 1 (last frame); if equal, the chair jumps.
 
     Attributes:
-        places: ``[n, 3]`` the chair's place in every frame.
+        places: position of the chair in every frame ``[n, 3]``.
     """
 
-    version = 1  # raise it whenever the same seed would give other pixels
+    version = 1  # increment whenever the same seed would give different pixels
 
     def __init__(
         self,
@@ -49,7 +49,7 @@ class SyntheticMovingRoom(SyntheticRoom):
         super().__init__(seed, num_frames, size, highlights)
 
     def world_at(self, frame: int) -> World:
-        """The room with the chair at its place in a frame."""
+        """Returns the room with the chair at its position in a frame."""
         builder = Builder(np.random.default_rng(self._look))
         builder.place(self.places[frame], self._yaw)
         chair(builder)
@@ -66,7 +66,8 @@ class SyntheticMovingRoom(SyntheticRoom):
     def _path(
         self, rng: np.random.Generator, extent: NDArray[np.float64], occupied: NDArray[np.float64], count: int
     ) -> NDArray[np.float64]:
-        """Camera-to-world poses ``[count, 4, 4]`` on an arc around the chair's way; both are the freest of many."""
+        """Camera-to-world poses ``[count, 4, 4]`` on an arc around the chair's path, chosen for most free space."""
+        # random candidates of camera arc and chair path
         half = extent[:2] / 2
         middle = rng.uniform(-0.6, 0.6, (_DRAWS, 1, 2)) * half
         around = rng.uniform(0, 2 * np.pi, (_DRAWS, 1)) + rng.uniform(0.6, 1.4, (_DRAWS, 1)) * np.linspace(-0.5, 0.5, 8)
@@ -75,6 +76,7 @@ class SyntheticMovingRoom(SyntheticRoom):
         turn = rng.uniform(0, np.pi, (_DRAWS, 1))
         along = np.stack((np.cos(turn), np.sin(turn)), -1)
         way = middle + np.linspace(-0.5, 0.5, 5)[:, None] * _LONGEST * along  # [draws, 5, 2]
+        # choose the one with the most space around arc, path and lines of sight
         sight = [way[:, None] + part * (arc[:, :, None] - way[:, None]) for part in (0.25, 0.5, 0.75)]
         free = [_free(points.reshape(_DRAWS, -1, 2), occupied) for points in (arc, way, *sight)]
         walls = [(half - np.abs(arc)).min((1, 2)) - 0.3, (half - np.abs(way)).min((1, 2)) - 0.3]
@@ -89,6 +91,6 @@ class SyntheticMovingRoom(SyntheticRoom):
 
 
 def _free(points: NDArray[np.float64], occupied: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Least gap ``[draws]`` in metres between points ``[draws, n, 2]`` and the occupied floor ``[m, 3]``."""
+    """Smallest gap ``[draws]`` in metres between points ``[draws, n, 2]`` and occupied discs ``[m, 3]`` (x, y, r)."""
     gaps = [np.linalg.norm(points - one[:2], axis=-1).min(1) - one[2] for one in occupied]
     return np.min(gaps, axis=0) if gaps else np.full(len(points), np.inf)

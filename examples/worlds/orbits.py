@@ -1,4 +1,4 @@
-"""What photographs often show: one thing from all around on a bare surface, and landmarks before a far background."""
+"""Object-centred scenes: an object on a bare surface from all around, and landmarks in front of a far background."""
 
 from __future__ import annotations
 
@@ -16,27 +16,26 @@ from vg2gt.data.synthetic.rooms import draw_lamps
 from vg2gt.data.synthetic.synthetic_scene import SyntheticScene, level_poses
 from vg2gt.data.synthetic.textures import INDOOR, Pattern
 
-_STREAM = 3  # tells the random streams of these scenes from those of other variants with the same seed
-_OPEN_SHARE = 0.4  # of objects in the open air
-_HORIZON = 500.0  # metres to where an open world ends
+_STREAM = 3  # separates the random streams of these scenes from those of other variants with the same seed
+_OPEN_SHARE = 0.4  # probability that an object is outdoors
+_HORIZON = 500.0  # half the extent of an open world in metres
 _BARE = (Pattern.PLAIN, Pattern.PLAIN, Pattern.CLOUDS, Pattern.WOOD)
 
 
 class SyntheticObject(SyntheticScene):
-    """One thing on a large, often bare surface, photographed from all around in steps of 10 to 40 degrees.
+    """An object on a large, often bare surface, photographed from all around in steps of 10 to 40 degrees.
 
-    The surface is a floor or a table, in a room that may be empty, or in the open air with a far background. After
-    each full turn the camera goes around again at another height and distance. The world frame has its origin on the
-    floor below the thing.
+    The surface is a floor or a table, in a room that may be empty, or outdoors with a far background. Each full orbit
+    has a different height and distance. The origin of the world frame is on the floor below the object.
 
     Args:
-        seed: decides everything, together with the number of frames.
-        num_frames: cameras on the path, at least 1.
+        seed: determines the scene, together with the number of frames.
+        num_frames: number of cameras on the path, at least 1.
         size: image ``(height, width)``.
-        highlights: as in ``draw_highlights``; nothing but the colour changes.
+        highlights: see ``draw_highlights``; affects only colours.
     """
 
-    version = 1  # raise it whenever the same seed would give other pixels
+    version = 1  # increment whenever the same seed would give different pixels
 
     def __init__(self, seed: int, num_frames: int, size: tuple[int, int], highlights: bool | str = False) -> None:
         stream = (self.version, seed, _STREAM)
@@ -71,19 +70,19 @@ class SyntheticObject(SyntheticScene):
 
 
 class SyntheticLandmark(SyntheticScene):
-    """Houses, trees and cars in an open place before hills and a sky, from wide apart: depth reaches 500 m.
+    """Houses, trees and cars in an open place with hills and sky behind, seen with wide baselines; depth up to 500 m.
 
-    The cameras stand on an arc of 60 to 220 degrees around the place, 6 to 40 m away from what is built, in uneven
-    steps. The world frame has its origin on the ground in the middle of the place.
+    The cameras are on an arc of 60 to 220 degrees around the place, 6 to 40 m away from it, in uneven steps. The origin
+    of the world frame is on the ground in the middle of the place.
 
     Args:
-        seed: decides everything, together with the number of frames.
-        num_frames: cameras on the path, at least 1.
+        seed: determines the scene, together with the number of frames.
+        num_frames: number of cameras on the path, at least 1.
         size: image ``(height, width)``.
-        highlights: as in ``draw_highlights``; nothing but the colour changes.
+        highlights: see ``draw_highlights``; affects only colours.
     """
 
-    version = 1  # raise it whenever the same seed would give other pixels
+    version = 1  # increment whenever the same seed would give different pixels
 
     def __init__(self, seed: int, num_frames: int, size: tuple[int, int], highlights: bool | str = False) -> None:
         stream = (self.version, seed, _STREAM + 1)
@@ -105,7 +104,7 @@ class SyntheticLandmark(SyntheticScene):
 
 
 def _bare_material(builder: Builder) -> int:
-    """A surface of large plain areas, half of the time with hardly any texture."""
+    """Material with large plain areas; half of the time almost without texture."""
     material = builder.new_material(_BARE, (0.3, 3))
     if builder.rng.random() < 0.5:
         row = builder.materials[material]
@@ -114,7 +113,7 @@ def _bare_material(builder: Builder) -> int:
 
 
 def _thing(builder: Builder, top: float) -> tuple[float, float]:
-    """Puts one thing at height ``top``; returns its radius and height."""
+    """Places an object at height ``top``; returns its radius and height."""
     rng, first = builder.rng, len(builder.parts)
     builder.place(np.array([0.0, 0.0, top]), rng.uniform(0, 2 * np.pi))
     if top == 0 and rng.random() < 0.6:
@@ -127,7 +126,7 @@ def _thing(builder: Builder, top: float) -> tuple[float, float]:
 
 
 def _pile(builder: Builder, size: float) -> None:
-    """A pile of boxes, cylinders and ellipsoids, as statues, toys and fruit are."""
+    """Builds a pile of boxes, cylinders and ellipsoids, similar to statues, toys or fruit."""
     rng, top = builder.rng, 0.0
     for level in range(rng.integers(2, 6)):
         x, y = rng.normal(0, 0.15, 2) * size * (level > 0)
@@ -145,7 +144,7 @@ def _pile(builder: Builder, size: float) -> None:
 def _orbit(
     rng: np.random.Generator, target: NDArray[np.float64], reach: float, count: int, step: float
 ) -> NDArray[np.float64]:
-    """Camera places ``[count, 3]`` around a target, each turn at another height and distance."""
+    """Camera positions ``[count, 3]`` around a target; each full orbit has a different height and distance."""
     angle = rng.uniform(0, 2 * np.pi) + rng.choice((-1, 1)) * step * (np.arange(count) + rng.uniform(-0.1, 0.1, count))
     turn = (step * np.arange(count) / (2 * np.pi)).astype(int)
     rise = np.radians(rng.uniform(5, 55, turn[-1] + 1))[turn] + rng.normal(0, 0.03, count)
@@ -157,7 +156,7 @@ def _orbit(
 def _aim(
     rng: np.random.Generator, position: NDArray[np.float64], target: NDArray[np.float64], error: float
 ) -> NDArray[np.float64]:
-    """Camera-to-world poses ``[n, 4, 4]`` that look at a target to ``error`` metres, half as much up and down."""
+    """Camera-to-world poses ``[n, 4, 4]`` that look at a target, with a random error in metres (half vertically)."""
     ahead = target + rng.normal(0, error, position.shape) * (1.0, 1.0, 0.5) - position
     return level_poses(
         position, np.arctan2(ahead[:, 1], ahead[:, 0]), np.arctan2(ahead[:, 2], np.hypot(*ahead[:, :2].T))
@@ -165,14 +164,14 @@ def _aim(
 
 
 def _around(rng: np.random.Generator, near: float, far: float, facing: bool) -> tuple[NDArray[np.float64], float]:
-    """A place between two distances from the origin (log-uniform), and a yaw; ``facing`` looks at the origin."""
+    """Random position between two distances from the origin (log-uniform), and yaw; ``facing`` faces the origin."""
     angle, distance = rng.uniform(0, 2 * np.pi), np.exp(rng.uniform(np.log(near), np.log(far)))
     yaw = angle + np.pi if facing else rng.uniform(0, 2 * np.pi)
     return distance * np.array([np.cos(angle), np.sin(angle), 0.0]), yaw
 
 
 def _fill_open(builder: Builder, near: float, far: float) -> None:
-    """Things, houses and hills beyond ``near``."""
+    """Places small objects, houses and hills farther than ``near``."""
     rng = builder.rng
     for _ in range(rng.integers(0, 16)):
         builder.place(*_around(rng, near + 2, max(far, near + 10), True))
@@ -191,7 +190,7 @@ def _fill_open(builder: Builder, near: float, far: float) -> None:
 
 
 def _build_place(builder: Builder, radius: float) -> None:
-    """What the cameras look at: one to three houses and things around them."""
+    """Builds what the cameras look at: one to three houses with objects around them."""
     rng = builder.rng
     for _ in range(rng.integers(1, 4)):
         width, depth = rng.uniform(3, 0.8 * radius + 1), rng.uniform(3, 6)
@@ -205,7 +204,7 @@ def _build_place(builder: Builder, radius: float) -> None:
 
 
 def _fill_room(builder: Builder, extent: NDArray[np.float64], free: float) -> None:
-    """Furniture beyond the camera's path, in the corners and along the walls."""
+    """Places furniture outside the camera path, in the corners and along the walls."""
     rng = builder.rng
     for _ in range(rng.integers(3, 12)):
         place = rng.uniform(-0.45, 0.45, 3) * extent

@@ -1,4 +1,4 @@
-"""Procedural streets and yards under an open sky: the scene, a forward-moving camera and the frames, from one seed."""
+"""Procedural streets and yards under an open sky, with a camera that moves forward; generated from a seed."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from vg2gt.data.synthetic.sky import draw_sky
 from vg2gt.data.synthetic.synthetic_scene import SyntheticScene, level_poses
 from vg2gt.data.synthetic.textures import Pattern
 
-_STREAM = 2  # tells the random stream of outdoor scenes from that of rooms with the same seed
-_BEGIN, _END = -25.0, 88.0  # metres along the street that are built; the camera starts at 0 and looks along x
-_BOUNDS = np.array([[-40.0, -60.0, 0.0], [90.0, 60.0, 60.0]])  # beyond it, even the ground is sky
-_FREE = 1.4  # metres either side of the camera's line that stay free
-_SUN_DISTANCE = 1e4  # so that shadows are parallel to half a degree
+_STREAM = 2  # separates the random stream of outdoor scenes from that of rooms with the same seed
+_BEGIN, _END = -25.0, 88.0  # built-up section of the street in metres; the camera starts at 0 and looks along x
+_BOUNDS = np.array([[-40.0, -60.0, 0.0], [90.0, 60.0, 60.0]])  # beyond these, everything is sky
+_FREE = 1.4  # free space on either side of the camera path in metres
+_SUN_DISTANCE = 1e4  # metres; makes shadows parallel to half a degree
 
 GROUND_COLORS = ((0.12, 0.22, 0.06), (0.22, 0.25, 0.1), (0.3, 0.26, 0.2), (0.26, 0.25, 0.24))
 _PAVING = (Pattern.CHECKS, Pattern.BRICKS, Pattern.MOSAIC, Pattern.PLANKS, Pattern.CLOUDS)
@@ -29,11 +29,11 @@ class _Plan:
     """Ground plan: a strip along x with buildings on both sides.
 
     Attributes:
-        road: half the width of the road; 0 in a yard, which has none.
-        front: distance of the gardens or fronts from the middle.
-        setback: how far houses stand behind it, at most.
-        end: where a building or trees close the view.
-        gap: probability that a plot is not built on.
+        road: half the width of the road; 0 in a yard, which has no road.
+        front: distance of the fronts or gardens from the middle.
+        setback: maximum distance of houses behind ``front``.
+        end: x at which a building or trees close the view.
+        gap: probability that a plot has no house.
     """
 
     road: float
@@ -44,18 +44,18 @@ class _Plan:
 
 
 class SyntheticOutdoor(SyntheticScene):
-    """A street or a yard with a sun, shadows and a sky without depth; the camera moves forward along x.
+    """A street or a yard with sun, shadows and a sky without depth; the camera moves forward along x.
 
-    The world frame has its origin on the ground where the camera starts. Depth reaches from about a metre to 90 m.
+    The origin of the world frame is on the ground where the camera starts. Depth ranges from about 1 m to 90 m.
 
     Args:
-        seed: decides everything, together with the number of frames.
-        num_frames: cameras on the path, at least 1.
+        seed: determines the scene, together with the number of frames.
+        num_frames: number of cameras on the path, at least 1.
         size: image ``(height, width)``.
-        highlights: as in ``draw_highlights``; nothing but the colour changes.
+        highlights: see ``draw_highlights``; affects only colours.
     """
 
-    version = 1  # raise it whenever the same seed would give other pixels
+    version = 1  # increment whenever the same seed would give different pixels
 
     def __init__(self, seed: int, num_frames: int, size: tuple[int, int], highlights: bool | str = False) -> None:
         stream = (self.version, seed, _STREAM)
@@ -84,7 +84,7 @@ def _draw_plan(rng: np.random.Generator) -> _Plan:
 
 
 def _pave(builder: Builder, plan: _Plan) -> None:
-    """Road, pavements and the line along the middle."""
+    """Builds the road, pavements and the centre line."""
     rng, length, middle = builder.rng, _END - _BEGIN, (_BEGIN + _END) / 2
     builder.place(np.zeros(3), 0.0)
     asphalt = builder.tinted_material((0.16, 0.16, 0.17), (Pattern.CLOUDS, Pattern.BRICKS, Pattern.PLAIN), (1, 8))
@@ -103,7 +103,7 @@ def _pave(builder: Builder, plan: _Plan) -> None:
 
 
 def _park(builder: Builder, plan: _Plan) -> None:
-    """Cars along the kerbs, where the road leaves the camera its lane."""
+    """Parks cars along the kerbs if the road is wide enough for the camera path."""
     rng = builder.rng
     if plan.road < _FREE + 2.0:
         return
@@ -117,9 +117,9 @@ def _park(builder: Builder, plan: _Plan) -> None:
 
 
 def _build_side(builder: Builder, plan: _Plan, side: int) -> None:
-    """Houses and, between them, gardens with trees, hedges and fences."""
+    """Builds houses and, between them, gardens with trees, hedges and fences."""
     rng, x = builder.rng, _BEGIN
-    facing = -side * np.pi / 2  # fronts look at the street
+    facing = -side * np.pi / 2  # fronts face the street
     tall = rng.uniform(4, 12)
     while x < _END - 6:
         width = rng.uniform(7, 16)
@@ -140,7 +140,7 @@ def _build_side(builder: Builder, plan: _Plan, side: int) -> None:
 
 
 def _close_view(builder: Builder, plan: _Plan) -> None:
-    """What the street leads to: a house, a row of trees, or nothing."""
+    """Closes the end of the street with a house, a row of trees, or nothing."""
     rng, kind = builder.rng, builder.rng.random()
     if kind < 0.5:
         builder.place(np.array([plan.end, rng.uniform(-3, 3), 0.0]), np.pi)
@@ -153,7 +153,7 @@ def _close_view(builder: Builder, plan: _Plan) -> None:
 
 
 def _scatter(builder: Builder, plan: _Plan) -> None:
-    """Trees and small things on the pavements, or anywhere in a yard, off the camera's line and off each other."""
+    """Scatters trees and small objects on the pavements or in the yard, away from the camera path and each other."""
     rng = builder.rng
     placed = np.zeros((0, 2))
     for _ in range(rng.integers(18, 36)):
@@ -175,11 +175,11 @@ def _scatter(builder: Builder, plan: _Plan) -> None:
 
 
 def draw_daylight(rng: np.random.Generator) -> tuple[NDArray[np.float64], float, NDArray[np.float64]]:
-    """Draws a sun: its light ``[1, 6]``, the ambient light and the sky around it ``[SKY_COLUMNS]``."""
+    """Draws the light of a sun ``[1, 6]``, the ambient light and the sky ``[SKY_COLUMNS]``."""
     height, turn = rng.uniform(0.4, 1.1), rng.uniform(0, 2 * np.pi)
     sun = np.array([np.cos(height) * np.cos(turn), np.cos(height) * np.sin(turn), np.sin(height)])
     color = rng.uniform(0.85, 1.25) * np.array([1.0, rng.uniform(0.88, 0.97), rng.uniform(0.7, 0.92)])
-    color *= 0.5 + 0.25 * _SUN_DISTANCE**2  # undoes the fall-off with distance
+    color *= 0.5 + 0.25 * _SUN_DISTANCE**2  # cancels the fall-off with distance
     light = np.concatenate((_SUN_DISTANCE * sun, color))[None]
     return light, float(rng.uniform(0.35, 0.55)), draw_sky(rng, sun)
 
@@ -197,7 +197,7 @@ def _finish(builder: Builder, ground: int) -> World:
 
 
 def _camera_path(rng: np.random.Generator, count: int) -> NDArray[np.float64]:
-    """Camera-to-world poses ``[count, 4, 4]``: forward along the free strip, looking about smoothly."""
+    """Camera-to-world poses ``[count, 4, 4]``: forward along the free strip, with smoothly changing direction."""
 
     def swing(size: float) -> NDArray[np.float64]:
         return size * np.sin(s * np.pi * rng.uniform(0.5, 2) + rng.uniform(0, 2 * np.pi))

@@ -1,4 +1,4 @@
-"""What a camera does to an image: exposure that misses, noise of dark images, JPEG."""
+"""Photographic flaws of images: wrong exposure, sensor noise, JPEG compression."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from PIL import Image
 
 from vg2gt.data.synthetic.renderer import GAMMA
 
-_STREAM = 4  # tells this random stream from those that make the scene
-_MOST = 3.0  # stops
-_NOISE = (0.002, 0.03)  # standard deviation at full brightness (linear)
+_STREAM = 4  # separates this random stream from those of the scene
+_MOST = 3.0  # maximum exposure error in stops
+_NOISE = (0.002, 0.03)  # range of the standard deviation at full brightness (linear)
 
 
 @dataclass(frozen=True)
 class Photograph:
-    """How the images of a scene are taken; geometry does not change.
+    """Photographic flaws of a scene's images; geometry does not change.
 
     Args:
-        exposure: standard deviation of the exposure of scenes (stops, at most 3 either way), frames of one scene
-            differ by an eighth of it; bright places clip, and noise comes in. 0: exposure is right, without noise.
-        jpeg: range that the JPEG quality of a scene is drawn from; None: no JPEG.
+        exposure: standard deviation of the exposure error of scenes in stops, clipped to 3 stops; frames of a scene
+            vary by an eighth of it. Highlights clip, and sensor noise is added. 0 disables all of this.
+        jpeg: range of the JPEG quality of a scene; None for no compression.
 
     Raises:
-        ValueError: if one is out of range.
+        ValueError: if an option is out of range.
     """
 
     exposure: float = 0.0
@@ -41,7 +41,7 @@ class Photograph:
 
     @classmethod
     def of(cls, exposure: float, jpeg: Sequence[int] | None) -> Photograph | None:
-        """The same from options; None where nothing is done."""
+        """Creates a ``Photograph`` from options; None if they change nothing."""
         made = cls(float(exposure), None if jpeg is None else tuple(int(quality) for quality in jpeg))  # pyright: ignore
         return None if made == cls() else made
 
@@ -52,12 +52,15 @@ class Photograph:
         return (f"-exposure{self.exposure:g}" if self.exposure else "") + jpeg
 
     def develop(self, seed: int, image: NDArray[np.uint8], frame: int) -> NDArray[np.uint8]:
-        """Returns an image ``[H, W, 3]`` as it would have been taken.
+        """Applies the flaws to an image.
 
         Args:
-            seed: of the scene.
-            image: well exposed.
-            frame: its number.
+            seed: seed of the scene.
+            image: well-exposed image ``[H, W, 3]``.
+            frame: frame number.
+
+        Returns:
+            The changed image ``[H, W, 3]``.
         """
         scene, own = np.random.default_rng((_STREAM, seed)), np.random.default_rng((_STREAM, seed, frame))
         stops, noise = scene.normal(0, 1), np.exp(scene.uniform(*np.log(_NOISE)))

@@ -1,4 +1,4 @@
-"""The data set of all procedural worlds."""
+"""Dataset of all procedural worlds."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ class Worlds(SyntheticScenes):
     """Rooms, outdoor scenes, objects and landmarks with exact depth and poses. The sky has no depth.
 
     Args:
-        num_scenes: scenes in this source.
-        exposure: scenes are too dark or too bright by this many stops (standard deviation), with noise; 0: none is.
-        jpeg: range of qualities, such as ``[30, 95]``, at which images are compressed; None: they are not.
-        shared: see :class:`vg2gt.data.SyntheticScenes`; ``variant`` may also be ``wide`` (rooms from all around),
+        num_scenes: number of scenes.
+        exposure: standard deviation of the exposure error of scenes in stops, with sensor noise; 0 for none.
+        jpeg: range of JPEG qualities for compression, such as ``[30, 95]``; None for no compression.
+        shared: see :class:`vg2gt.data.SyntheticScenes`. ``variant`` may also be ``wide`` (rooms with wide baselines),
             ``outdoor``, ``object`` (orbits), ``landmark`` (far backgrounds) or ``moving`` (a chair that moves), or a
-            list of them: seeds take turns.
+            list of variants, which alternate by seed.
 
     Raises:
-        ValueError: if a number is out of range or a variant unknown.
+        ValueError: if a number is out of range or a variant is unknown.
     """
 
     variants: ClassVar[dict[str, Any]] = {
@@ -47,11 +47,11 @@ class Worlds(SyntheticScenes):
 
     @property
     def look(self) -> str:
-        """What decides the pixels apart from scene and size, as part of file names."""
+        """Part of file names for all options that affect the pixels, other than scene and size."""
         return super().look + (self._photograph.name if self._photograph else "")
 
     def scene(self, scene: str) -> SyntheticScene:
-        """Makes a scene, ready to be rendered."""
+        """Creates a scene, ready to render."""
         made = super().scene(scene)
         made.develop = partial(self._photograph.develop, int(scene.rpartition("-")[2])) if self._photograph else None
         return made

@@ -1,7 +1,7 @@
-"""What stands along a street: buildings, trees, cars, lamp posts and smaller things, with random proportions.
+"""Objects along a street: buildings, trees, cars, lamp posts and smaller objects, with random proportions.
 
-Like furniture, everything is placed in the builder's frame: x is the front, z up, the ground at z = 0. Lengths in
-metres.
+Like furniture, objects are built in the builder's frame: x points to the front, z up, the ground is at z = 0. Lengths
+are in metres.
 """
 
 from __future__ import annotations
@@ -28,22 +28,22 @@ _PLAIN = (Pattern.PLAIN,)
 
 
 def pick(b: Builder, colors: tuple[Vector, ...]) -> Vector:
-    """One of some colours."""
+    """Draws one of the colours."""
     return colors[b.rng.integers(len(colors))]
 
 
 def building(b: Builder, width: float, depth: float, height: float) -> None:
-    """A house whose front, ``width`` long along y, stands at x = 0, and whose ``depth`` lies behind it."""
+    """Builds a house with its front at x = 0, ``width`` along y and ``depth`` along negative x."""
     rng = b.rng
     windows = b.tinted_material(pick(b, _WALLS), (Pattern.WINDOWS,), (0.22, 0.5), other=_GLASS)
     b.box((-depth / 2, 0, height / 2), (depth, width, height), windows)
     roof = b.tinted_material(pick(b, _ROOFS), (Pattern.BRICKS, Pattern.STRIPES, Pattern.CLOUDS), (1, 3))
     if height < 9 and rng.random() < 0.7:
-        # An attic: a beam on its edge, sunk into the house, under two slabs.
+        # gabled roof: a box standing on its edge, sunk into the house, under two slabs
         edge, slope = depth / np.sqrt(2), np.pi / 4
         b.box((-depth / 2, 0, height), (width, edge, edge), windows, turn=np.pi / 2, tilt=slope)
         for x, tilt in ((-depth / 4, slope), (-3 * depth / 4, -slope)):
-            out = np.copysign(0.28, tilt)  # half the overhang along the slope and half the thickness across it
+            out = np.copysign(0.28, tilt)  # half the overhang along the slope plus half the thickness across it
             b.box((x + out, 0, height + depth / 4 - 0.1), (width + 0.6, edge + 0.5, 0.2), roof, np.pi / 2, tilt)
         if rng.random() < 0.6:
             chimney = (-depth / 2 + rng.uniform(-1, 1), rng.uniform(-0.35, 0.35) * width, height + 0.45 * depth)
@@ -68,7 +68,7 @@ def _balconies(b: Builder, width: float, height: float) -> None:
 
 
 def tree(b: Builder) -> None:
-    """A tree with a round crown, or a conifer."""
+    """Builds a tree with a round crown, or a conifer."""
     rng = b.rng
     bark = b.tinted_material((0.16, 0.1, 0.06), (Pattern.WOOD, Pattern.CLOUDS, Pattern.STRIPES), (2, 8))
     leaves = b.tinted_material(pick(b, GREENS), _LEAVES, (2, 9))
@@ -90,7 +90,7 @@ def tree(b: Builder) -> None:
 
 
 def bush(b: Builder) -> None:
-    """A low group of leaves."""
+    """Builds a bush of one to four ellipsoids."""
     leaves = b.tinted_material(pick(b, GREENS), _LEAVES, (3, 12))
     for _ in range(b.rng.integers(1, 5)):
         x, y = b.rng.normal(0, 0.25, 2)
@@ -99,7 +99,7 @@ def bush(b: Builder) -> None:
 
 
 def car(b: Builder) -> None:
-    """A car or, one time in four, a van; its front points along x."""
+    """Builds a car, or a van with probability 1/4; the front points along x."""
     rng = b.rng
     length, width, van = rng.uniform(3.7, 4.7), rng.uniform(1.65, 1.8), rng.random() < 0.25
     hue = rng.uniform(0.03, 0.7, 3) if rng.random() < 0.5 else np.full(3, rng.uniform(0.03, 0.75))
@@ -126,7 +126,7 @@ def car(b: Builder) -> None:
 
 
 def lamp_post(b: Builder) -> None:
-    """A street lamp whose arm points along x."""
+    """Builds a street lamp whose arm points along x."""
     height, arm = b.rng.uniform(4, 6.5), b.rng.uniform(0.5, 1.4)
     metal = b.tinted_material((0.14, 0.15, 0.15), (Pattern.PLAIN, Pattern.STRIPES), (1, 4))
     b.cylinder((0, 0, height / 2), 0.07, height, metal)
@@ -136,14 +136,14 @@ def lamp_post(b: Builder) -> None:
 
 
 def sign(b: Builder) -> None:
-    """A plate on a pole, facing along x."""
+    """Builds a plate on a pole, facing along x."""
     height, plate = b.rng.uniform(1.9, 2.7), b.rng.uniform(0.35, 0.8, 2)
     b.cylinder((0, 0, height / 2), 0.035, height, b.tinted_material((0.4, 0.4, 0.4), _PLAIN, (1, 2)))
     b.box((0.05, 0, height - plate[1] / 2), (0.03, plate[0], plate[1]), b.new_material(INDOOR, (2, 9)))
 
 
 def bench(b: Builder) -> None:
-    """A bench of slats."""
+    """Builds a bench of slats."""
     wood = b.tinted_material((0.35, 0.2, 0.1), (Pattern.WOOD, Pattern.PLANKS), (2, 6))
     iron = b.tinted_material((0.08, 0.08, 0.08), _PLAIN, (1, 2))
     for x in (-0.18, -0.03, 0.12):
@@ -156,14 +156,14 @@ def bench(b: Builder) -> None:
 
 
 def bin(b: Builder) -> None:
-    """A litter bin with a lid."""
+    """Builds a litter bin with a lid."""
     radius, height = b.rng.uniform(0.2, 0.35), b.rng.uniform(0.7, 1.1)
     b.cylinder((0, 0, height / 2), radius, height, b.new_material(INDOOR, (2, 10)))
     b.ellipsoid((0, 0, height), (1.1 * radius, 1.1 * radius, 0.12), b.tinted_material((0.1, 0.1, 0.1), _PLAIN, (1, 2)))
 
 
 def hoarding(b: Builder) -> None:
-    """A poster on two posts, facing along x."""
+    """Builds a poster on two posts, facing along x."""
     width, height = b.rng.uniform(1.5, 3.0), b.rng.uniform(1.0, 1.8)
     post = b.tinted_material((0.25, 0.25, 0.25), _PLAIN, (1, 2))
     for side in (-1, 1):
@@ -172,13 +172,13 @@ def hoarding(b: Builder) -> None:
 
 
 def hedge(b: Builder, length: float) -> None:
-    """A clipped hedge along y."""
+    """Builds a clipped hedge along y."""
     height, leaves = b.rng.uniform(0.7, 1.8), b.tinted_material(pick(b, GREENS), _LEAVES, (3, 9))
     b.box((0, 0, height / 2), (0.6, length, height), leaves)
 
 
 def fence(b: Builder, length: float) -> None:
-    """Posts and rails along y."""
+    """Builds a fence of posts and rails along y."""
     height = b.rng.uniform(0.9, 1.5)
     wood = b.tinted_material((0.4, 0.3, 0.2), (Pattern.WOOD, Pattern.PLAIN), (2, 6))
     for y in np.linspace(-length / 2, length / 2, int(length / 1.8) + 2):

@@ -1,6 +1,6 @@
-"""Checks the views of a room: depth of every view against others by warping, pixels beyond windows.
+"""Checks the views of a room: consistency of depth between views, and the fraction of pixels beyond windows.
 
-``python check.py ROOM`` prints the figures of a folder that ``views.py`` wrote. NumPy only.
+``python check.py ROOM`` prints the results for a folder written by ``views.py``. Needs only NumPy.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 _TOLERANCE = 0.02  # relative difference of depth
-_LEAST_SHARED = 0.05  # share of a view's pixels that must fall into the other one
+_LEAST_SHARED = 0.05  # minimum fraction of a view's pixels that must be comparable in the other view
 _MOST_CONTRADICTIONS = 0.03
 _MOST_BEYOND = 0.5
 
@@ -25,19 +25,20 @@ Camera = tuple[NDArray[np.float64], NDArray[np.float64]]  # intrinsics [3, 3] of
 def warp(
     depth: NDArray[np.float64], camera: Camera, other_depth: NDArray[np.float64], other: Camera
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Compares one view's points with the depth of another view, at those that fall into it.
+    """Compares the points of one view with the depth of another view, where they project into it.
 
-    Depth between pixels is interpolated as its inverse, which is exact on planes; infinite depth has inverse 0. Points
-    whose four pixels differ by more than 10 % are left out: they lie at an edge.
+    Inverse depth is interpolated bilinearly, which is exact on planes; infinite depth has inverse 0. Points at edges,
+    whose four pixels differ by more than 10 %, are left out.
 
     Args:
-        depth: ``[h, w]`` z-depth of the view; points at infinity are left out.
-        camera: its camera.
-        other_depth: ``[h, w]`` of the other view.
-        other: its camera.
+        depth: z-depth of the view ``[h, w]``; points at infinity are left out.
+        camera: camera of the view.
+        other_depth: z-depth of the other view ``[h, w]``.
+        other: camera of the other view.
 
     Returns:
-        ``z / depth - 1`` with the other view's depth there, and with the nearest of the 4x4 pixels around.
+        ``z / depth - 1`` of each point, where ``z`` is its depth in the other view: once with the interpolated depth of
+        the other view, and once with the smallest depth of the 4x4 pixels around it.
     """
     height, width = depth.shape
     y, x = np.nonzero(np.isfinite(depth))
@@ -58,7 +59,7 @@ def warp(
 
 
 def read_views(room: Path) -> Iterator[tuple[str, Camera, NDArray[np.float64]]]:
-    """Path, camera and depth of a room's views, in order."""
+    """Yields path, camera and depth of a room's views, in order."""
     for index, view in enumerate(json.loads((room / "views.json").read_text())):
         stem = f"0_0_{index:04d}_0"
         with np.load(room / f"frames/camview/camera_0/camview_{stem}.npz", allow_pickle=False) as file:
@@ -68,13 +69,14 @@ def read_views(room: Path) -> Iterator[tuple[str, Camera, NDArray[np.float64]]]:
 
 
 def check_room(room: Path) -> dict[str, float | int | bool]:
-    """Figures of a room.
+    """Checks a room.
 
     Returns:
-        views; pairs: of consecutive views of a path with shared pixels; contradictions: mean share of warped points
-        that lie more than 2 % in front of all that the other view sees around there, which cannot be; agreeing: mean
-        share within 2 % (most others are hidden); difference: median relative difference of those; beyond: share of
-        pixels beyond windows; nearest and median depth; ok.
+        Results by name. ``views``: number of views. ``pairs``: number of consecutive views of a path that overlap.
+        ``contradictions``: mean fraction of warped points that lie more than 2 % in front of everything the other view
+        sees around them, which is impossible. ``agreeing``: mean fraction within 2 % (most others are occluded).
+        ``difference``: median relative difference of the agreeing points. ``beyond``: fraction of pixels beyond
+        windows. ``nearest``, ``median``: depth in metres. ``ok``: whether the room is accepted.
     """
     views = list(read_views(room))
     figures = []

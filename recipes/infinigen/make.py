@@ -1,12 +1,12 @@
 """Makes furnished rooms with Infinigen and renders views of them: ``python make.py --rooms 40 --out FOLDER``.
 
-One room after another, on one thread: about 15 core-minutes for a room and 5 for 60 views of 224x112. Run the same
-command again after an interruption: rooms, and views of a room, that are there are not made again. Standard library
-only; Infinigen and Blender come into an environment of their own, ``OUT/environment`` unless ``--env`` says otherwise.
+Makes one room after another on one thread: about 15 core-minutes for a room, and 5 for 60 views of 224x112. To resume
+after an interruption, run the same command again; finished rooms and views are kept. Needs only the standard library;
+Infinigen and Blender are installed into an environment of their own (``OUT/environment``, or ``--env``).
 
-Results: ``OUT/train/room_NNNN`` and ``OUT/held_out/room_NNNN``, folders for ``data=infinigen``; ``OUT/log.csv`` with
-the time of every stage. A room that fails leaves ``OUT/work/room_NNNN/failed.txt``, and is passed over from then on;
-one whose views contradict each other goes to ``OUT/rejected``.
+Results: ``OUT/train/room_NNNN`` and ``OUT/held_out/room_NNNN``, folders for ``data=infinigen``; ``OUT/log.csv``, the
+time of every stage. A room that fails leaves ``OUT/work/room_NNNN/failed.txt`` and is skipped from then on. A room that
+does not pass the check goes to ``OUT/rejected``.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from rooms import kind, name, part
 HERE = Path(__file__).resolve().parent
 INFINIGEN, BLENDER = "infinigen==1.15.5", "bpy==4.2.0"
 _THREADS = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "MKL", "OPENBLAS", "NUMBA")}
-# No landscape outside, fewer steps than in fast_solve.gin (100 and 40), and small things on four pieces of furniture
-# only: placing them takes most of the time.
+# No landscape outside, fewer steps than in fast_solve.gin (100 and 40), and small objects on only four pieces of
+# furniture, as placing them takes most of the time.
 _FASTER = (
     "compose_indoors.terrain_enabled=False",
     "compose_indoors.solve_steps_large=60", "compose_indoors.solve_steps_medium=25",
@@ -40,11 +40,15 @@ _COLUMNS = ("room", "seed", "kind", "stage", "result", "wall_seconds", "core_sec
 
 
 class StageError(Exception):
-    """A stage of a room ended with an error."""
+    """A stage of a room failed."""
 
 
 def make_environment(env: Path, python: str) -> Path:
-    """Installs Infinigen and Blender into ``env``, unless they are there; returns its interpreter."""
+    """Installs Infinigen and Blender into ``env`` unless installed; returns its interpreter.
+
+    Raises:
+        SystemExit: if ``python`` is not Python 3.11, or Blender cannot be imported.
+    """
     interpreter, done = env / "bin" / "python", env / "complete"
     if done.exists():
         return interpreter
@@ -66,7 +70,7 @@ def make_environment(env: Path, python: str) -> Path:
 
 
 def link_packages(interpreter: Path, folder: Path) -> None:
-    """Makes a working folder with links to Infinigen's packages: it looks for its settings there."""
+    """Creates a working folder with links to Infinigen's packages, where it looks for its settings."""
     folder.mkdir(parents=True, exist_ok=True)
     where = subprocess.run(
         [str(interpreter), "-c", "import sysconfig; print(sysconfig.get_paths()['purelib'])"],
@@ -83,9 +87,12 @@ class Rooms:
     """Makes rooms in a folder.
 
     Args:
-        out: the folder.
-        interpreter: of Infinigen's environment.
-        args: options of the command line.
+        out: output folder.
+        interpreter: Python interpreter of Infinigen's environment.
+        args: command-line options.
+
+    Raises:
+        SystemExit: if another process makes rooms in the folder.
     """
 
     def __init__(self, out: Path, interpreter: Path, args: argparse.Namespace) -> None:
@@ -101,7 +108,7 @@ class Rooms:
             ) from None
 
     def make(self, seed: int) -> None:
-        """Makes one room, unless it is there or has failed before."""
+        """Makes one room, unless it exists or failed before."""
         room = name(seed)
         work = self.out / "work" / room
         if any((self.out / place / room).exists() for place in (part(seed), "rejected")):
@@ -150,7 +157,7 @@ class Rooms:
             shutil.rmtree(work / "coarse")
 
     def _stage(self, seed: int, stage: str, command: Sequence[object], log: Path) -> None:
-        """Runs one stage in Infinigen's environment and adds a line to the log."""
+        """Runs one stage in Infinigen's environment and adds a row to ``log.csv``."""
         begun = time.monotonic()
         with log.open("w") as file:
             process = subprocess.Popen(
@@ -198,7 +205,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # the running stage ends, too
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # also ends the running stage
     try:
         main()
     except KeyboardInterrupt:

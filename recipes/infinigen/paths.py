@@ -1,6 +1,6 @@
-"""Camera paths through a room, as people move with a camera: walks, turns, orbits, near and far.
+"""Camera paths through a room that imitate handheld photography: walks, turns, orbits, near and far views.
 
-The paths ask a ``Space`` what is free and what is seen, so they need no Blender. World axes: z up, metres.
+Paths query a ``Space`` for free space and visibility, so they do not need Blender. World: z up, metres.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ Vector = NDArray[np.float64]
 
 _SIDES = np.array([[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z], np.float64)
 _SIDES /= np.linalg.norm(_SIDES, axis=1, keepdims=True)
-_MARGIN = 0.22  # metres around a camera that stay free
+_MARGIN = 0.22  # free space around a camera in metres
 _TRIES = 60
 SHARES = {"walk": 12, "turn": 8, "orbit_near": 12, "orbit_far": 12, "near": 8, "far": 8}
 """Views of every kind of path, of 60."""
 
 
 class Space(Protocol):
-    """What a room tells about itself.
+    """Geometry of a room.
 
     Attributes:
-        low: ``[3]`` lower corner of the box around the room; its z is the floor.
-        high: ``[3]`` upper corner; its z is the ceiling.
-        objects: ``[n, 4]`` centre and radius of things to look at.
+        low: lower corner of the room's bounding box ``[3]``; z is the floor.
+        high: upper corner ``[3]``; z is the ceiling.
+        objects: centre and radius of the objects to look at ``[n, 4]``.
     """
 
     low: Vector
@@ -37,24 +37,24 @@ class Space(Protocol):
     objects: Vector
 
     def inside(self, point: Vector) -> bool:
-        """Whether a point is above the room's own floor."""
+        """Returns whether a point is above the room's own floor."""
         ...
 
     def cast(self, origin: Vector, direction: Vector) -> tuple[float, bool]:
-        """Distance to the first surface along a unit direction (inf: none), and whether its back is seen."""
+        """Returns the distance to the first surface along a unit direction (inf: none), and whether its back is hit."""
         ...
 
 
 @dataclass(frozen=True)
 class View:
-    """One camera.
+    """A camera.
 
     Attributes:
-        path: kind of path and its number, such as ``walk_0``.
+        path: kind and number of its path, such as ``walk_0``.
         position: ``[3]``.
-        forward: ``[3]`` unit direction.
-        roll: turn about it (rad).
-        field_of_view: horizontal (rad).
+        forward: unit viewing direction ``[3]``.
+        roll: rotation about the viewing direction in rad.
+        field_of_view: horizontal field of view in rad.
     """
 
     path: str
@@ -64,7 +64,7 @@ class View:
     field_of_view: float
 
     def camera_to_world(self) -> NDArray[np.float64]:
-        """``[4, 4]`` pose in OpenCV axes (x right, y down, z forward)."""
+        """Returns the camera-to-world pose ``[4, 4]`` in OpenCV axes (x right, y down, z forward)."""
         right = np.cross(self.forward, (0.0, 0.0, 1.0))
         right /= np.linalg.norm(right)
         down = np.cross(self.forward, right)
@@ -76,10 +76,10 @@ class View:
 
 
 def plan(space: Space, rng: np.random.Generator, count: int) -> list[View]:
-    """Draws ``count`` views on paths of every kind; what the room has no space for goes to other kinds.
+    """Draws ``count`` views on paths of all kinds; if the room lacks space for a kind, other kinds get its views.
 
     Raises:
-        ValueError: if the room has no space for so many views.
+        ValueError: if the room has no space for ``count`` views.
     """
     quotas = {kind: round(count * share / sum(SHARES.values())) for kind, share in SHARES.items()}
     quotas["walk"] += count - sum(quotas.values())
@@ -94,13 +94,13 @@ def plan(space: Space, rng: np.random.Generator, count: int) -> list[View]:
 
 
 def _several(space: Space, rng: np.random.Generator, kind: str, quota: int, first: int = 0) -> list[View]:
-    """Paths of one kind, each the longest of some draws, until the quota is met or none is found."""
+    """Draws paths of one kind, each the longest of several tries, until the quota is met or no path is found."""
     views: list[View] = []
     number = first
     while len(views) < quota:
         field_of_view = np.radians(rng.uniform(55, 85))
         path = _PATHS[kind](space, rng, quota - len(views), field_of_view)
-        # A single view shows nothing twice, unless it is what is left of a quota.
+        # Very short paths have too little overlap; accept them only to fill the rest of a quota.
         if len(path) < min(3, quota - len(views)):
             break
         views += [
@@ -115,7 +115,7 @@ _Path = list[tuple[Vector, Vector]]
 
 
 def _free(space: Space, point: Vector, margin: float = _MARGIN) -> bool:
-    """Whether a camera fits: in the room, nothing near it, and not within a solid, whose walls show their backs."""
+    """Whether a camera fits: inside the room, with free space around it, and not inside a solid (many back hits)."""
     if not space.inside(point) or not space.low[2] + 0.15 < point[2] < space.high[2] - 0.15:
         return False
     backs = 0
@@ -128,10 +128,10 @@ def _free(space: Space, point: Vector, margin: float = _MARGIN) -> bool:
 
 
 def _looks_at_room(space: Space, position: Vector, forward: Vector, field_of_view: float, least: float) -> bool:
-    """Whether a view shows more than one thing from close by, asked by a grid of rays.
+    """Whether a view shows enough of the room, tested with a grid of rays.
 
-    Their middle distance is at least ``least``, and from 0.8 m on, the longest is 1.5 times the shortest: a bare wall
-    alone teaches little.
+    The median distance must be at least ``least``, and the smallest above 0.1 m. If ``least`` is 0.8 m or more, the
+    largest distance must also exceed 1.5 times the smallest, which excludes views of a bare wall.
     """
     right = np.cross(forward, (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right)
@@ -155,12 +155,12 @@ def _toward(position: Vector, target: Vector) -> Vector:
 
 
 def _sees(space: Space, position: Vector, target: Vector, radius: float) -> bool:
-    """Whether nothing hides a thing of some radius at ``target``."""
+    """Whether an object of some radius at ``target`` is not occluded."""
     return space.cast(position, _toward(position, target))[0] > np.linalg.norm(target - position) - 1.2 * radius - 0.1
 
 
 def _stand(space: Space, rng: np.random.Generator, margin: float = _MARGIN) -> Vector | None:
-    """A free place at the height of a camera in hand, from seated to raised."""
+    """Draws a free position at the height of a handheld camera, 1.1 to 1.75 m; None if none is found."""
     for _ in range(_TRIES):
         point = rng.uniform(space.low, space.high)
         point[2] = min(space.low[2] + rng.uniform(1.1, 1.75), space.high[2] - 0.4)
@@ -184,7 +184,7 @@ def _walk(space: Space, rng: np.random.Generator, count: int, field_of_view: flo
     """A straight walk with bobbing and a slow pan, in steps of 8 to 25 cm."""
 
     def draw() -> _Path:
-        """One try; empty if there is no space."""
+        """Tries once; empty if there is no space."""
         start, end = _stand(space, rng), _stand(space, rng)
         if start is None or end is None or np.linalg.norm(end - start) < 0.8:
             return []
@@ -205,10 +205,10 @@ def _walk(space: Space, rng: np.random.Generator, count: int, field_of_view: flo
 
 
 def _turn(space: Space, rng: np.random.Generator, count: int, field_of_view: float) -> _Path:
-    """A turn on the spot in steps of 10 to 35 degrees, the camera an arm's length from the axis."""
+    """A turn on the spot in steps of 10 to 35 degrees, with the camera 5 to 35 cm from the axis."""
 
     def draw() -> _Path:
-        """One try; empty if there is no space."""
+        """Tries once; empty if there is no space."""
         stand = _stand(space, rng, 0.4)
         if stand is None:
             return []
@@ -227,10 +227,10 @@ def _turn(space: Space, rng: np.random.Generator, count: int, field_of_view: flo
 
 
 def _orbit(near: bool, space: Space, rng: np.random.Generator, count: int, field_of_view: float) -> _Path:
-    """Around a thing in steps of 10 to 40 degrees, as far as there is space; places that are not free are skipped."""
+    """An orbit around an object in steps of 10 to 40 degrees; positions that are not free are skipped."""
 
     def draw() -> _Path:
-        """One try; empty if there is no space."""
+        """Tries once; empty if there is no space."""
         *center, size = space.objects[rng.integers(len(space.objects))]
         target = np.array(center)
         distance = size + (rng.uniform(0.35, 0.9) if near else rng.uniform(1.0, 2.5))
@@ -252,10 +252,10 @@ def _orbit(near: bool, space: Space, rng: np.random.Generator, count: int, field
 
 
 def _near(space: Space, rng: np.random.Generator, count: int, field_of_view: float) -> _Path:
-    """Sideways past a thing, 30 to 70 cm in front of it."""
+    """A sideways pass in front of an object, at 30 to 70 cm."""
 
     def draw() -> _Path:
-        """One try; empty if there is no space."""
+        """Tries once; empty if there is no space."""
         *center, size = space.objects[rng.integers(len(space.objects))]
         target = np.array(center)
         away = _look(rng.uniform(0, 2 * np.pi), rng.uniform(0.0, 0.9))
@@ -277,7 +277,7 @@ def _near(space: Space, rng: np.random.Generator, count: int, field_of_view: flo
 
 
 def _far(space: Space, rng: np.random.Generator, count: int, field_of_view: float) -> _Path:
-    """From places all around the room across it: wide baselines. The view is the farthest of some, near the middle."""
+    """Views across the room from random positions (wide baselines), towards the farthest of four directions."""
     middle = (space.low + space.high) / 2
     path: _Path = []
     for _ in range(4 * count):

@@ -1,8 +1,8 @@
-"""Which rooms there are: a seed decides the kind of room and whether it is held out of training."""
+"""Kind and split of rooms, as determined by their seeds."""
 
 from __future__ import annotations
 
-# Infinigen's name of a kind, and how the names of its floors begin.
+# Infinigen's name of a kind of room, and prefix of the names of its floors.
 KINDS = {
     "DiningRoom": "dining-room",
     "LivingRoom": "living-room",
@@ -15,15 +15,15 @@ HELD_OUT = (3, 7, 10, 14, 16, 20, 24, 28, 32, 36)
 
 
 def kind(seed: int) -> str:
-    """Infinigen's name of the kind of room that a seed makes; the kinds take turns."""
+    """Returns Infinigen's name of the kind of room for a seed; kinds alternate."""
     return list(KINDS)[seed % len(KINDS)]
 
 
 def name(seed: int) -> str:
-    """Folder of a room."""
+    """Returns the folder name of a room."""
     return f"room_{seed:04d}"
 
 
 def part(seed: int) -> str:
-    """Folder of a room's split."""
+    """Returns the folder name of a room's split."""
     return "held_out" if seed in HELD_OUT else "train"

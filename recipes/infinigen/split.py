@@ -1,8 +1,8 @@
-"""Makes a scene of every path through the rooms: ``python split.py FOLDER``, the folder that ``make.py`` wrote.
+"""Splits rooms into one scene per kind of camera path: ``python split.py FOLDER``, the output folder of ``make.py``.
 
-Views of different paths of a room hardly overlap, and loaders draw neighbouring frames. Scenes of links to the frames
-on paths of one kind go to ``FOLDER/paths/PART/ROOM/KIND``. Turns on the spot are left out: they have no parallax.
-Scenes that are there are kept. Standard library only.
+Loaders draw neighbouring frames, but views of different paths of a room hardly overlap. The new scenes are folders of
+links, ``FOLDER/paths/PART/ROOM/KIND``. Turns on the spot are left out, as they have no parallax. Existing scenes are
+kept. Needs only the standard library.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
-_FRAME = 3  # place of the frame's number in a name such as Image_0_0_0007_0
+_FRAME = 3  # position of the frame number in names such as Image_0_0_0007_0
 
 
 def split(out: Path) -> Iterator[Path]:
-    """Links the frames of every room below ``out``; yields the scenes that were made.
+    """Links the frames of every room in ``out``; yields the new scenes.
 
     Raises:
         FileNotFoundError: if there are no rooms.
@@ -39,7 +39,7 @@ def split(out: Path) -> Iterator[Path]:
 
 
 def _link(room: Path, scene: Path, numbers: set[int]) -> None:
-    new = scene.with_name(f"{scene.name}.new")  # an interruption leaves no scene with a part of its frames
+    new = scene.with_name(f"{scene.name}.new")  # renamed when complete
     shutil.rmtree(new, ignore_errors=True)
     for path in sorted(room.glob("frames/*/camera_*/*")):
         if int(path.stem.split("_")[_FRAME]) in numbers:

@@ -1,11 +1,11 @@
-"""Renders views of a room with cameras of our own: colour, depth, normals, cameras in Infinigen's layout.
+"""Renders views of a room: colour, depth, normals and cameras, in Infinigen's layout.
 
-Run by ``make.py`` in Infinigen's environment: ``views.py scene.blend OUT --seed 7 --kind LivingRoom``. A view that is
-there is not rendered again, so the same command goes on after an interruption.
+``make.py`` runs this script in Infinigen's environment: ``views.py scene.blend OUT --seed 7 --kind LivingRoom``. To
+resume after an interruption, run the same command again; finished views are kept.
 
-Colour is path traced with a few samples and a denoiser. Depth and normals are a second pass with one ray through the
-middle of every pixel: in the first one, Blender's depth is that of a random place within a pixel or next to it. Clear
-window panes are looked through; what lies beyond them is the sky, whose depth is infinite.
+Colour is path traced with a few samples and denoised. Depth and normals come from a second pass with one ray through
+the centre of every pixel, as Blender's depth in the first pass is that of a random point in or next to the pixel. Clear
+window panes are transparent; beyond them is sky, whose depth is infinite.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 _cores = os.sched_getaffinity(0)
-os.sched_setaffinity(0, {min(_cores)})  # Blender asks once, when it is imported, how many cores there are
+os.sched_setaffinity(0, {min(_cores)})  # Blender reads the number of cores once, on import
 import bpy  # noqa: E402
 
 os.sched_setaffinity(0, _cores)
@@ -31,18 +31,21 @@ from paths import View, plan  # noqa: E402
 from PIL import Image  # noqa: E402
 from rooms import KINDS  # noqa: E402
 
-_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # between the axes of Blender's cameras and OpenCV's
+_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # from OpenCV camera axes to Blender's
 _SKY = 1e4  # metres; Blender's depth of the sky is 1e10
-_THINGS = (0.08, 1.3)  # radii (metres) of what can be looked at
+_THINGS = (0.08, 1.3)  # minimum and maximum radius of objects to look at, in metres
 _FIXED = ("Window", "Door", "CeilingLight", "Skirting", "Curtain", "Rug", "Ceiling", "Wall", "Pillar")
-_GRAY = 0.22  # mean linear brightness that an exposure aims at
+_GRAY = 0.22  # target of the exposure: mean linear brightness
 
 
 class Room:
-    """A ``paths.Space`` of the opened Blender file.
+    """Room of the open Blender file, as a ``paths.Space``.
 
     Args:
-        kind: Infinigen's name of the kind of room; of several the best furnished one is taken.
+        kind: Infinigen's name of the kind of room; if there are several, the one with most objects is used.
+
+    Raises:
+        SystemExit: if there is no such room.
     """
 
     def __init__(self, kind: str) -> None:
@@ -60,7 +63,7 @@ class Room:
         self.objects = spheres[inside[self._floor.name]]
         corners = _corners(self._floor)
         self.low, self.high = corners.min(0), corners.max(0)
-        self.low[2] = self.high[2]  # of a thick floor, its top
+        self.low[2] = self.high[2]  # top of the floor, which may be thick
         middle = Vector((*((self.low + self.high)[:2] / 2), self.low[2] + 0.1))
         ceilings = [item for item in meshes if item.name == self._floor.name.replace(".floor", ".ceiling")]
         self.high[2] = _corners(ceilings[0])[:, 2].min() if ceilings else middle.z + 2.5
@@ -74,11 +77,11 @@ class Room:
         return bool(floor.ray_cast(start, down.normalized(), distance=10.0)[0])
 
     def inside(self, point: np.ndarray) -> bool:
-        """Whether a point is above the room's own floor."""
+        """Returns whether a point is above the room's own floor."""
         return self._is_above(self._floor, point)
 
     def cast(self, origin: np.ndarray, direction: np.ndarray) -> tuple[float, bool]:
-        """Distance to the first surface along a unit direction, and whether its back is seen."""
+        """Returns the distance to the first surface along a unit direction (inf: none), and whether its back is hit."""
         ray = Vector(direction)
         hit, place, normal, *_ = self._scene.ray_cast(self._graph, Vector(origin), ray)
         return ((place - Vector(origin)).length, normal.dot(ray) > 0) if hit else (math.inf, False)
@@ -89,14 +92,14 @@ def _corners(item: Any) -> np.ndarray:
 
 
 def _thing(item: Any) -> np.ndarray:
-    """Centre and radius of a sphere about the middle of an object's box."""
+    """Centre and radius of the sphere around an object's bounding box."""
     corners = _corners(item)
     low, high = corners.min(0), corners.max(0)
     return np.array([*(low + high) / 2, np.linalg.norm(high - low) / 2])
 
 
 def _show_what_is_rendered() -> None:
-    """Rays meet what is shown in the viewport: make that what is rendered."""
+    """Shows in the viewport exactly what is rendered, as ray casts hit viewport objects."""
     for item in bpy.data.objects:
         item.hide_viewport = item.hide_render
     for collection in bpy.data.collections:
@@ -105,11 +108,11 @@ def _show_what_is_rendered() -> None:
 
 
 class Renderer:
-    """Two passes of one camera.
+    """Renders views in two passes: colour, then depth and normals.
 
     Args:
         size: image ``(height, width)``.
-        samples: rays a pixel of the colours.
+        samples: samples per pixel of the colour pass.
     """
 
     def __init__(self, size: tuple[int, int], samples: int) -> None:
@@ -153,7 +156,7 @@ class Renderer:
         scene.render.resolution_y, scene.render.resolution_x = size
         scene.cycles.samples, scene.cycles.use_denoising = samples, samples > 1
         scene.cycles.max_bounces = 6 if samples > 1 else 0
-        # A filter as narrow as nothing sends the only ray through the middle of the pixel.
+        # A very narrow filter sends the only ray through the centre of the pixel.
         scene.cycles.pixel_filter_type, scene.cycles.filter_width = (
             ("BLACKMAN_HARRIS", 1.5) if samples > 1 else ("BOX", 0.01)
         )
@@ -165,7 +168,7 @@ class Renderer:
         bpy.ops.render.render(write_still=True)
 
     def exposure(self, views: list[View], drawn: float) -> float:
-        """Exposure (stops) for views of one path, from small renderings of some; ``drawn`` stops off the usual."""
+        """Returns the exposure of a path in stops: measured on small renderings of two views, plus ``drawn``."""
         path, levels = self._folder / "probe.exr", []
         for view in (views[0], views[len(views) // 2]):
             self._place(view, 0.0)
@@ -174,12 +177,12 @@ class Renderer:
         return float(np.clip(math.log2(_GRAY / max(float(np.mean(levels)), 1e-6)) + drawn, -6, 10))
 
     def color(self, view: View, exposure: float, path: Path) -> None:
-        """Writes the colours as JPEG."""
+        """Renders the colours and writes them as JPEG."""
         self._place(view, exposure)
         self._render(path, self.size, self.samples, "JPEG")
 
     def geometry(self, view: View) -> tuple[np.ndarray, np.ndarray]:
-        """Z-depth ``[h, w]`` (metres, infinite in the sky) and normals ``[h, w, 3]`` (OpenCV camera axes, 0 there)."""
+        """Renders z-depth ``[h, w]`` in metres and normals ``[h, w, 3]`` in OpenCV camera axes; sky is inf and 0."""
         self._place(view, 0.0)
         self._render(self._folder / "unused.exr", self.size, 1, "OPEN_EXR")
         number = f"{self._scene.frame_current:04d}.exr"
@@ -190,7 +193,7 @@ class Renderer:
 
 
 def _read(path: Path) -> np.ndarray:
-    """Pixels ``[h, w, 4]`` of an EXR file, the top row first."""
+    """Pixels ``[h, w, 4]`` of an EXR file, top row first."""
     image = bpy.data.images.load(str(path), check_existing=False)
     image.colorspace_settings.name = "Non-Color"
     width, height = image.size
@@ -201,7 +204,7 @@ def _read(path: Path) -> np.ndarray:
 
 
 def _planned(out: Path, kind: str, seed: int, count: int) -> list[View]:
-    """The views of a room, from the file that an interrupted run left, or drawn."""
+    """Reads the views of a room from ``views.json`` of an interrupted run, or draws and writes them."""
     path = out / "views.json"
     if path.exists():
         rows = json.loads(path.read_text())
@@ -227,7 +230,7 @@ def _by_path(views: list[View]) -> Iterator[list[tuple[int, View]]]:
 
 
 def _write_view(out: Path, index: int, view: View, renderer: Renderer, exposure: float) -> None:
-    """Writes one view; the camera last, so that a view with a camera is whole."""
+    """Writes one view. The camera comes last, so that a view with a camera is complete."""
     stem = f"0_0_{index:04d}_0"
     places = {kind: out / "frames" / kind / "camera_0" for kind in ("Image", "Depth", "SurfaceNormal", "camview")}
     for place in places.values():

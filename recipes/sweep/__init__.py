@@ -1,1 +1,1 @@
-"""How the shipped weights of the plane-sweep backbone are made: scenes, augmentation, objective, training, scores."""
+"""Recipe for the shipped weights of the plane-sweep backbone: scenes, augmentation, objective and training."""

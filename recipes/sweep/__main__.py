@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-# Convolutions are compiled per shape; the default of 1024 kept kernels is less than one step of each shape needs.
+# oneDNN compiles convolutions per shape; its default cache of 1024 is too small for one step of each shape.
 os.environ.setdefault("ONEDNN_PRIMITIVE_CACHE_CAPACITY", "20000")
 
 import hydra
@@ -25,7 +25,7 @@ from recipes.sweep.weights import begin_with, newest_checkpoint, start_step, wri
 
 @hydra.main(config_path=".", config_name="train", version_base="1.3")
 def main(config: DictConfig) -> None:
-    """Renders what is missing of the scenes, trains or goes on training, and writes the weights."""
+    """Renders missing scenes, trains or resumes training, and writes the weights."""
     torch.set_num_threads(config.threads)
     lightning.seed_everything(config.seed)
     out = Path(config.out)

@@ -1,4 +1,4 @@
-"""The training of the plane sweep as a Lightning module."""
+"""Lightning module that trains the plane sweep."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ _LARGEST_GRADIENT = 1.0
 
 
 class SweepTraining(lightning.LightningModule):
-    """The training of the network; the shipped weights are the exponential average of the trained ones.
+    """Trains the network; the shipped weights are an exponential moving average of the trained weights.
 
-    The rate rises over ``warmup`` steps, stays, and falls to 2 % by a half cosine over the last ``cooldown`` share of
-    ``steps``. A checkpoint from before the fall goes on with more steps as if they had been asked for at once.
+    The learning rate is warmed up linearly, stays constant, and decays to 2 % by a half cosine at the end. A checkpoint
+    from before the decay can resume with more ``steps``, as if they had been configured from the start.
 
     Args:
-        steps: of the whole training.
-        rate: of AdamW.
-        weight_decay: of matrices and kernels.
-        warmup: steps.
-        cooldown: share of the steps.
-        average: decay of the exponential average.
-        token_noise: deviation of noise on the tokens in half of the steps, so that decoded depth answers small changes
-            of tokens smoothly.
+        steps: total number of steps.
+        rate: learning rate of AdamW.
+        weight_decay: weight decay of matrices and convolution kernels.
+        warmup: steps of linear warm-up.
+        cooldown: fraction of the steps over which the learning rate decays.
+        average: decay of the exponential moving average.
+        token_noise: standard deviation of the noise added to the tokens in every second step, which makes the decoded
+            depth change smoothly with the tokens.
     """
 
     def __init__(
@@ -53,11 +53,11 @@ class SweepTraining(lightning.LightningModule):
         self.net.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
         self.averaged = AveragedModel(self.net, multi_avg_fn=get_ema_multi_avg_fn(average))
         self.averaged.requires_grad_(False)
-        self._core_seconds = 0.0  # of earlier processes, less what these had used when they began
+        self._core_seconds = 0.0  # of earlier processes, minus the time used by this one before training
         self._processes = 1
 
     def training_step(self, sample: Sample, index: int) -> Tensor:
-        """The objective of one sample."""
+        """Returns the objective of one sample; raises RuntimeError if it is not finite."""
         encoding, depth, log_scale = self._predict(sample)
         with full_precision(depth):
             loss, terms = objective(encoding, depth, log_scale, sample)
@@ -76,16 +76,16 @@ class SweepTraining(lightning.LightningModule):
         return encoding, *self.net.decode(taps, encoding.context, encoding.context_fine, encoding.swept)
 
     def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
-        """Clips the gradient, by hand as Lightning refuses to with a fused optimizer; stops where it is not finite."""
+        """Clips the gradient norm, as Lightning cannot with a fused optimizer; raises RuntimeError if not finite."""
         norm = torch.nn.utils.clip_grad_norm_(self.net.parameters(), _LARGEST_GRADIENT, error_if_nonfinite=True)
         self.log("train/gradient_norm", norm)
 
     def on_train_batch_end(self, *_: Any) -> None:
-        """Moves the average."""
+        """Updates the exponential moving average."""
         self.averaged.update_parameters(self.net)
 
     def configure_optimizers(self) -> Any:
-        """AdamW and the schedule described above."""
+        """Returns AdamW and the learning-rate schedule of the class docstring."""
         decayed = [p for p in self.net.parameters() if p.dim() > 1]
         rest = [p for p in self.net.parameters() if p.dim() <= 1]
         groups = [{"params": decayed, "weight_decay": self.weight_decay}, {"params": rest, "weight_decay": 0.0}]
@@ -95,24 +95,24 @@ class SweepTraining(lightning.LightningModule):
 
     @property
     def core_seconds(self) -> float:
-        """Processor time of the whole training, over all processes that it ran or went on in."""
+        """CPU time of the whole training in seconds, over all processes and resumed runs."""
         return self._core_seconds + self._processes * time.process_time()
 
     def count_from(self, core_seconds: float) -> None:
-        """Counts what weights that the training begins with have cost."""
+        """Sets the CPU time that the initial weights have cost."""
         self._core_seconds = core_seconds
 
     def on_train_start(self) -> None:
-        """Starts the clock."""
+        """Starts counting CPU time."""
         self._processes = self.trainer.world_size
         self._core_seconds -= self._processes * time.process_time()
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Keeps the processor time."""
+        """Stores the CPU time."""
         checkpoint["core_seconds"] = self.core_seconds
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Goes on counting."""
+        """Restores the CPU time."""
         self._core_seconds = float(checkpoint.get("core_seconds", 0.0))
 
     def _relative_rate(self, step: int) -> float:

@@ -1,4 +1,4 @@
-"""What the network is trained for: log-depth at every stage, the planes' cross-entropy, edges and uncertainty."""
+"""Training objective of the plane sweep: log-depth at every stage, cross-entropy of planes, edges and uncertainty."""
 
 from __future__ import annotations
 
@@ -10,24 +10,28 @@ from backends.sweep.network import Sweep, SweepEncoding
 from backends.sweep.volume import from_inverse, near_and_far
 from recipes.sweep.samples import Sample
 
-_CLAMP = 2.0  # log-depth errors beyond it do not count more
-_BEYOND = 1.5  # times the farthest plane: what is farther, or sky, only has to be said to be at least that far
-_ROOM = 1.0  # log-depth behind that at which it may be, so that it does not run away
-_BEYOND_ERROR = 0.7  # relative error that the uncertainty of such pixels should state at least
+_CLAMP = 2.0  # log-depth errors are clamped to this
+_BEYOND = 1.5  # times the farthest plane: for sky and farther surfaces, any depth from here on counts as correct
+_ROOM = 1.0  # up to this much log-depth farther, so that depth does not diverge
+_BEYOND_ERROR = 0.7  # minimum relative error that the uncertainty of such pixels is trained on
 WEIGHTS = {"depth": 2.0, "uncertainty": 0.15, "gradient": 1.0, "planes": 0.4, "position": 2.0, "swept": 1.0}
 
 
 def objective(
     encoding: SweepEncoding, depth: Tensor, log_scale: Tensor, sample: Sample
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """The weighted sum and its terms.
+    """Computes the training objective.
 
     Args:
-        encoding: of the sample's images.
-        depth: ``[V, H, W]`` decoded.
-        log_scale: ``[V, H, W]`` of its relative error.
-        sample: the truth (0 = unknown, infinite in the sky) and the planes' range.
+        encoding: encoding of the sample's images.
+        depth: decoded depth ``[V, H, W]``.
+        log_scale: log-scale of its relative error ``[V, H, W]``.
+        sample: ground-truth depth (0 is unknown, infinity is sky) and range of the planes.
+
+    Returns:
+        The weighted sum, and its unweighted terms.
     """
+    # decoded depth; pixels beyond the planes only need to be far enough
     beyond_planes = _BEYOND * near_and_far(sample.depth_range)[1]  # [S V, 1, 1, 1]
     farthest = beyond_planes[..., 0]
     beyond = sample.depth > farthest
@@ -43,6 +47,7 @@ def objective(
         "uncertainty": _mean(stated * torch.exp(-log_scale) + log_scale, seen),
         "gradient": sum((_gradient(error[:, ::k, ::k], valid[:, ::k, ::k]) for k in (1, 2, 4)), torch.zeros(())),
     }
+    # both sweeps, at 1/4 and 1/2 of the image
     planes, positions = [], []
     for sweep, cell in ((encoding.first, 4), (encoding.second, 2)):
         inverse, known = cell_inverse(sample.depth, cell)
@@ -62,9 +67,12 @@ def objective(
 
 
 def cell_inverse(depth: Tensor, cell: int) -> tuple[Tensor, Tensor]:
-    """Inverse depth at the middle of cells of ``cell`` pixels, ``[V, 1, h, w]``, and 1 where all of it is known.
+    """Downsamples depth ``[V, H, W]`` to cells of ``cell x cell`` pixels.
 
-    The middle lies between pixels; its inverse depth is the mean of the four around it, exact on planes.
+    The inverse depth at the centre of a cell is the mean of the four pixels around it, which is exact on planes.
+
+    Returns:
+        Inverse depth ``[V, 1, h, w]``, and a mask that is 1 where all four pixels are known.
     """
     at = (cell // 2 - 1, cell // 2)
     around = torch.stack([depth[:, i::cell, j::cell] for i in at for j in at], 1)
@@ -78,19 +86,19 @@ def _mean(values: Tensor, weights: Tensor) -> Tensor:
 
 
 def _gradient(error: Tensor, valid: Tensor) -> Tensor:
-    """Mean absolute difference of the errors of neighbours, zero where the shape is right whatever the scale."""
+    """Mean absolute difference between the errors of neighbouring pixels; invariant to the scale of depth."""
     down = (error[:, 1:] - error[:, :-1]).abs().clamp_max(1) * valid[:, 1:] * valid[:, :-1]
     right = (error[:, :, 1:] - error[:, :, :-1]).abs().clamp_max(1) * valid[:, :, 1:] * valid[:, :, :-1]
     return down.mean() + right.mean()
 
 
 def _cross_entropy(sweep: Sweep, t: Tensor, known: Tensor) -> Tensor:
-    """Cross-entropy of the planes, the truth ``t [V, 1, h, w]`` shared linearly between the two around it."""
+    """Cross-entropy of the planes; the target ``t [V, 1, h, w]`` is split linearly between its two nearest planes."""
     position = sweep.position.expand(len(t), -1, *t.shape[-2:]) if sweep.position.shape[0] == 1 else sweep.position
     count = position.shape[1]
     spacing = position[:, 1:2] - position[:, :1]
     place = (t - position[:, :1]) / spacing
-    if sweep.position.shape[-1] == 1:  # the first sweep: what is beyond its farthest plane belongs to that plane
+    if sweep.position.shape[-1] == 1:  # first sweep: surfaces beyond the farthest plane are assigned to it
         place = place.clamp_min(0)
     known = known * (place >= 0) * (place <= count - 1)
     low = place.floor().clamp(0, count - 2)

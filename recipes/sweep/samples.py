@@ -1,4 +1,4 @@
-"""Training samples: a few overlapping views of one scene, cropped, zoomed, recoloured, with slightly wrong poses."""
+"""Training samples: overlapping views of a scene, cropped, zoomed and recoloured, with slightly wrong poses."""
 
 from __future__ import annotations
 
@@ -21,34 +21,34 @@ from recipes.sweep.scenes import SceneFrames, is_room, read_scene
 from vg2gt.geometry.cameras import crop_intrinsics, project, resize_intrinsics, rigid_motions, unproject
 from vg2gt.types import Cameras
 
-_UPRIGHT_SHARE = 0.3  # of samples turned by 90 degrees, as upright photographs are
-_CUT_SHARE = 0.25  # of samples whose planes end before the scene does
+_UPRIGHT_SHARE = 0.3  # of samples rotated by 90 degrees to portrait format
+_CUT_SHARE = 0.25  # of samples whose planes do not cover the whole depth of the scene
 _CUT, _CUT_INDOORS = (
     (0.5, 0.98),
     (0.85, 0.98),
-)  # quantiles where they end: walls of rooms are near
+)  # range of the depth quantile at which they end; higher indoors, where walls are near
 _LEAST_OVERLAP = 0.15
-_WALK_FRAMES, _WALK_STEP = 14, math.radians(9)  # paths of more frames, or larger turns between them, are no walks
-_PLANES = (32, 48)  # few sizes: CPUs compile their convolutions for each
+_WALK_FRAMES, _WALK_STEP = 14, math.radians(9)  # maximum frames and median rotation between frames of a walk
+_PLANES = (32, 48)  # few sizes, as convolutions on CPUs are compiled for each
 _SOURCES, _SOURCE_SHARES = (2, 3), (0.7, 0.3)
-_SOURCE_NOISE = 0.4  # of log-scores, so that not only the best pairs are trained on
-_POSE_SHARE, _TURN, _SHIFT = 0.5, 0.0015, 0.002  # share of samples with pose noise; rad; depths
-_LEAST_PIXELS = 5000  # with depth; samples with fewer are drawn again
+_SOURCE_NOISE = 0.4  # on log-scores, so that training also sees pairs other than the best
+_POSE_SHARE, _TURN, _SHIFT = 0.5, 0.0015, 0.002  # share of samples with pose noise; rad; in depths
+_LEAST_PIXELS = 5000  # with known depth; samples with fewer are drawn again
 _GREY_SHARE = 0.2
 
 
 class Sample(NamedTuple):
-    """V views of a few scenes and the sweep they are to be matched with.
+    """V views of one or more scenes, with the configuration of the sweep.
 
     Attributes:
         images: ``[V, 3, H, W]`` in [0, 1].
-        depth: ``[V, H, W]``, 0 = unknown, infinite in the sky.
-        world_to_camera: ``[V, 4, 4]``, as exact as poses are in practice.
+        depth: ground-truth depth ``[V, H, W]``; 0 is unknown, infinity is sky.
+        world_to_camera: ``[V, 4, 4]``, with realistic noise in some samples.
         intrinsics: ``[V, 3, 3]`` in pixels.
-        depth_range: ``[V, 2]`` near and far of the planes.
-        sources: ``[V, n]`` the views that each is compared with.
-        planes: their number.
-        scenes: that the views belong to, equally many each.
+        depth_range: near and far of the planes ``[V, 2]``.
+        sources: indices of the source views of each view ``[V, n]``.
+        planes: number of planes.
+        scenes: number of scenes, with the same number of views each.
     """
 
     images: Tensor
@@ -62,12 +62,12 @@ class Sample(NamedTuple):
 
 
 class Layout(NamedTuple):
-    """What the scenes of one sample have in common, so that they fit into the same tensors.
+    """Properties that all scenes of a sample share, so that they can be concatenated.
 
     Attributes:
-        size: height and width of the images before they are turned.
-        turns: by 90 degrees.
-        planes: their number.
+        size: height and width of the images before rotation.
+        turns: number of rotations by 90 degrees.
+        planes: number of planes.
         sources: number of sources per view.
     """
 
@@ -78,17 +78,17 @@ class Layout(NamedTuple):
 
 
 class TrainingSamples(Dataset[Sample]):
-    """Sample n depends on ``(seed, n)`` only, so a resumed training goes on with what it would have seen.
+    """Random training samples. Sample n depends on ``(seed, n)`` only, so that training can resume.
 
     Args:
-        files: cached scenes.
+        files: files of cached scenes.
         count: number of samples.
-        seed: of all draws.
-        more: scenes of a second kind, rooms of Infinigen.
-        share: of the samples that come from ``more``, if there are any.
-        scenes: of a sample.
-        views: of a scene.
-        sizes: height and width of its images and how often they are drawn, ``((height, width, share), ...)``.
+        seed: seed of all random draws.
+        more: files of a second kind of scenes (rooms of Infinigen).
+        share: probability that a scene is drawn from ``more``, if it is not empty.
+        scenes: number of scenes per sample.
+        views: number of views per scene.
+        sizes: image sizes and their probabilities, ``((height, width, share), ...)``.
     """
 
     def __init__(
@@ -151,7 +151,7 @@ class _Crop(NamedTuple):
 
 
 def _choose_views(scene: SceneFrames, count: int, rng: Generator) -> _Crop:
-    """Views that overlap: a stretch of a walk, or of other paths what sees the same as a view drawn at random."""
+    """Draws overlapping views: from a section of a walk, or for other paths, by overlap with a random view."""
     rotations = scene.world_to_camera[:, :3, :3]
     frames = len(scene.images)
     step = np.median([_angle(*pair) for pair in pairwise(rotations)])
@@ -170,13 +170,15 @@ def _choose_views(scene: SceneFrames, count: int, rng: Generator) -> _Crop:
 
 
 def _overlapping(scene: SceneFrames, count: int, rng: Generator) -> NDArray[np.int64]:
-    """A view drawn at random and others, drawn by how much of it they see."""
+    """Draws a random view, and others with a probability that increases with their overlap."""
     first = int(rng.integers(len(scene.images)))
     height, width = scene.depth.shape[-2:]
     cameras = Cameras(scene.world_to_camera[None], scene.intrinsics[None], (height, width))
     depth = scene.depth[first].float()
+    # sample points of the first view: [P, 3]
     points = unproject(depth.nan_to_num(posinf=0)[None, None], cameras.select(slice(first, first + 1)))[0, 0]
     points = points[6::12, 6::12][(depth > 0)[6::12, 6::12] & depth.isfinite()[6::12, 6::12]]  # [P, 3]
+    # share of them that is visible in each view: [N]
     pixels, z = project(points[None, None].expand(1, len(scene.images), -1, -1), cameras)
     u, v, z = pixels[0, ..., 0].round().long(), pixels[0, ..., 1].round().long(), z[0]
     inside = (z > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
@@ -195,7 +197,7 @@ def _angle(first: Tensor, second: Tensor) -> float:
 
 
 def _crop(views: _Crop, target: tuple[int, int], rng: Generator) -> _Crop:
-    """One random window of all views, resized to ``target`` (height, width); half of them mirrored."""
+    """Crops all views to one random window and resizes them to ``target`` (height, width); mirrors half the samples."""
     height, width = views.depth.shape[-2:]
     most = min(height / target[0], width / target[1])
     zoom = math.exp(rng.uniform(math.log(min(0.8, most)), math.log(most)))
@@ -216,11 +218,11 @@ def _crop(views: _Crop, target: tuple[int, int], rng: Generator) -> _Crop:
 
 
 def _turn(views: _Crop, turns: int) -> _Crop:
-    """Turns all views by 90 degrees to the left, ``turns`` times, as upright photographs are."""
+    """Rotates all views by 90 degrees to the left, ``turns`` times."""
     images, depth, poses, intrinsics = views
     turn = torch.tensor([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
     for _ in range(turns):
-        turned = torch.zeros_like(intrinsics)  # a pixel (x, y) comes to (y, W - 1 - x)
+        turned = torch.zeros_like(intrinsics)  # pixel (x, y) moves to (y, W - 1 - x)
         turned[:, 0, 0], turned[:, 1, 1], turned[:, 2, 2] = intrinsics[:, 1, 1], intrinsics[:, 0, 0], 1.0
         turned[:, 0, 2], turned[:, 1, 2] = intrinsics[:, 1, 2], images.shape[-1] - 1 - intrinsics[:, 0, 2]
         images, depth = images.rot90(1, (-2, -1)), depth.rot90(1, (-2, -1))
@@ -229,17 +231,17 @@ def _turn(views: _Crop, turns: int) -> _Crop:
 
 
 def _finish(views: _Crop, valid: Tensor, cut: tuple[float, float], layout: Layout, rng: Generator) -> Sample:
-    """Draws the unit, the planes' range around the true one, the noise of the poses and the look.
+    """Draws the unit of length, the range of the planes, pose noise, sources and colours of a sample.
 
-    In some samples the planes end at a quantile of the depth between those of ``cut``.
+    The range contains the true one, except in some samples whose planes end at a depth quantile within ``cut``.
     """
-    unit = math.exp(rng.normal(0, 0.5))  # the world's unit is nothing to go by
+    unit = math.exp(rng.normal(0, 0.5))  # random unit, so that the network cannot rely on it
     poses, depth = views.world_to_camera.clone(), views.depth * unit
     poses[:, :3, 3] *= unit
     low, middle, high = (
         float(unit * torch.quantile(valid[:: max(len(valid) // 4000, 1)], q)) for q in (0.01, 0.5, 0.99)
     )
-    if rng.random() < _CUT_SHARE:  # as structure from motion does that found no point in the background
+    if rng.random() < _CUT_SHARE:  # as when structure from motion finds no points in the background
         high = float(unit * torch.quantile(valid[:: max(len(valid) // 4000, 1)], rng.uniform(*cut)))
     near = low * math.exp(-(rng.uniform(0.02, 0.5) if rng.random() < 0.75 else rng.uniform(0, 1.8)))
     far = high * math.exp(rng.uniform(0, 0.6) if rng.random() < 0.75 else rng.uniform(0, 2.5))
@@ -258,9 +260,9 @@ def _pose_noise(views: int, depth: float, rng: Generator) -> Tensor:
 
 
 def recolour(images: Tensor, rng: Generator) -> Tensor:
-    """Changes the look of views ``[V, 3, H, W]`` as cameras do: colour mixing, contrast, gamma, exposure, blur, noise.
+    """Augments views ``[V, 3, H, W]`` with colour mixing, contrast, gamma, exposure, white balance, blur and noise.
 
-    Most changes are common to all views; exposure, white balance and blur differ from view to view.
+    Exposure, white balance and blur differ between views; the other changes are common to all.
     """
     mixing = torch.eye(3)
     if rng.random() < 0.6:
@@ -282,7 +284,7 @@ def recolour(images: Tensor, rng: Generator) -> Tensor:
         images = torch.where(chosen[:, None, None, None], blurred, images)
     if rng.random() < 0.7:
         noise = torch.from_numpy(rng.standard_normal(tuple(images.shape), dtype=np.float32)) * rng.uniform(0, 0.025)
-        if rng.random() < 0.5:  # as left by a camera's own smoothing
+        if rng.random() < 0.5:  # correlated, as after denoising in a camera
             noise = 2 * F.avg_pool2d(noise, 3, 1, 1)
         images = images + noise
     return images.clamp(0, 1)

@@ -1,4 +1,4 @@
-"""Training scenes: procedural ones with free cameras (focal length, roll, shake), cached, and rooms of Infinigen."""
+"""Training scenes: procedural ones with varied cameras (focal length, roll, shake), and rooms of Infinigen; cached."""
 
 from __future__ import annotations
 
@@ -24,24 +24,24 @@ from vg2gt.geometry.cameras import rigid_motions
 from vg2gt.io.arrays import read_npz
 from vg2gt.io.files import write_cached
 
-FIRST_SEED = 5_000_000  # far from the seeds that VG²GT is trained (0 ...) and evaluated (1,000,000 ...) on
+FIRST_SEED = 5_000_000  # disjoint from the seeds for training (from 0) and evaluating (from 1,000,000) VG²GT
 SIZE = (144, 288)
 FRAMES = 14
-_STREAM = 77  # tells the random stream of the cameras from that of the scene
-_KINDS = ("room", "object", "room", "wide", "object", "room", "landmark", "object", "wide", "outdoor")  # take turns
+_STREAM = 77  # separates the random stream of the cameras from that of the scene
+_KINDS = ("room", "object", "room", "wide", "object", "room", "landmark", "object", "wide", "outdoor")  # in turn
 _WALKS = ("room", "outdoor")
-_EXPOSURE, _JPEG = 0.7, (40, 95)  # of two thirds of the scenes: stops, quality
-_PATH_LENGTHS = (14, 20, 32, 44)  # of the whole path, of which FRAMES consecutive ones are taken: fewer are wider apart
+_EXPOSURE, _JPEG = 0.7, (40, 95)  # stops (standard deviation) and quality, in two thirds of the scenes
+_PATH_LENGTHS = (14, 20, 32, 44)  # frames of a path, FRAMES of which are rendered; fewer are farther apart
 
 
 class SceneFrames(NamedTuple):
     """Frames of one scene.
 
     Attributes:
-        images: ``[N, H, W, 3]`` uint8.
-        depth: ``[N, H, W]`` z-depth in metres, float16, 0 where it is unknown, infinite in the sky.
-        world_to_camera: ``[N, 4, 4]`` float32.
-        intrinsics: ``[N, 3, 3]`` float32.
+        images: ``[N, H, W, 3]``, uint8.
+        depth: z-depth in metres ``[N, H, W]``, float16; 0 is unknown, infinity is sky.
+        world_to_camera: ``[N, 4, 4]``, float32.
+        intrinsics: ``[N, 3, 3]``, float32.
     """
 
     images: Tensor
@@ -51,12 +51,12 @@ class SceneFrames(NamedTuple):
 
 
 def scene_file(folder: Path, seed: int, size: tuple[int, int] = SIZE) -> Path:
-    """Where the frames of a seed are kept."""
+    """Returns the cache file of a seed."""
     return folder / f"{seed:08d}-{size[0]}x{size[1]}.npz"
 
 
 def is_room(path: Path) -> bool:
-    """True if a cached scene is the inside of a room."""
+    """Returns whether a cached scene is a room."""
     first = path.stem.split("-")[0]
     return first == "infinigen" or _KINDS[int(first) % len(_KINDS)] in ("room", "wide")
 
@@ -68,10 +68,18 @@ def read_scene(path: Path) -> SceneFrames:
 
 
 def render_scene(seed: int, size: tuple[int, int] = SIZE, threads: int = 1) -> dict[str, NDArray]:
-    """Renders one training scene: a room, an object, a landmark or a street, the kinds of ``_KINDS`` taking turns.
+    """Renders a training scene; the seed determines its kind.
 
-    The world is that of :mod:`examples.worlds`; focal length, roll, shake, highlights and the look of the images
-    are drawn here, because photographs have them and matching must not depend on level cameras of one field of view.
+    The scene is one of :mod:`examples.worlds`. Focal length, roll, camera shake, highlights and photographic flaws are
+    drawn here, so that matching does not depend on level cameras with a single field of view.
+
+    Args:
+        seed: seed of the scene.
+        size: height and width of the frames.
+        threads: number of threads that render.
+
+    Returns:
+        The fields of :class:`SceneFrames`, as arrays.
     """
     rng = np.random.default_rng((_STREAM, seed))
     kind = _KINDS[seed % len(_KINDS)]
@@ -99,7 +107,7 @@ def render_scene(seed: int, size: tuple[int, int] = SIZE, threads: int = 1) -> d
 
 
 def infinigen_scene(source: Infinigen, scene: str) -> dict[str, NDArray]:
-    """A room of ``recipes/infinigen`` as the same arrays: what its windows show is the sky."""
+    """Reads a room of ``recipes/infinigen`` as the same arrays; views through windows count as sky."""
     frames = source.load(scene, source.frames(scene))
     depth = frames.depth.numpy()
     return {
@@ -111,7 +119,7 @@ def infinigen_scene(source: Infinigen, scene: str) -> dict[str, NDArray]:
 
 
 def _shake(scene: SyntheticScene, rng: np.random.Generator, metres: float) -> NDArray[np.float64]:
-    """World-to-camera ``[N, 4, 4]`` turned by one roll for all frames and a little, and moved a little, for each."""
+    """World-to-camera poses ``[N, 4, 4]`` with a common roll, and small random motions of each frame."""
     count = len(scene.world_to_camera)
     turns = rng.normal(0, 0.03, (count, 3))
     turns[:, 2] += rng.normal(0, 0.12)
@@ -127,14 +135,14 @@ def make_scenes(
     size: tuple[int, int] = SIZE,
     workers: int = 1,
 ) -> Iterator[Path]:
-    """Renders ``count`` scenes into ``folder``, those that are there already left out; yields every file.
+    """Renders scenes into a folder, unless they exist; yields the file of each.
 
     Args:
-        folder: created if missing.
+        folder: output folder, created if needed.
         count: number of scenes.
-        first_seed: of the first scene, the others follow.
+        first_seed: seed of the first scene; the others have consecutive seeds.
         size: height and width of the frames.
-        workers: processes that render; 1 renders in this one.
+        workers: number of processes that render; 1 renders in this process.
     """
     root = Path(folder).expanduser()
     seeds = range(first_seed, first_seed + count)
@@ -142,7 +150,7 @@ def make_scenes(
     if workers == 1:
         yield from map(make, seeds)
         return
-    yield make(first_seed)  # compiles the kernels, which the others then find
+    yield make(first_seed)  # compiles the kernels, which the workers then load from the cache
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
         yield from pool.map(make, seeds[1:], chunksize=4)
 
@@ -155,7 +163,7 @@ def _make_scene(root: Path, size: tuple[int, int], seed: int) -> Path:
 
 
 def read_infinigen(folder: str | os.PathLike[str], cache: str | os.PathLike[str]) -> list[Path]:
-    """Copies the rooms that there are below ``folder`` into files that are quick to read; returns these."""
+    """Converts all rooms in ``folder`` to files in ``cache`` that load quickly; returns these files."""
     root, paths = Path(cache).expanduser(), []
     source = Infinigen(str(folder))
     for scene in source.scenes:

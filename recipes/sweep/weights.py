@@ -1,4 +1,4 @@
-"""From a checkpoint of the recipe to the file that ships."""
+"""Checkpoints of the recipe, and the weight file that ships."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from vg2gt.io.files import write_bytes
 
 
 def newest_checkpoint(folder: Path) -> Path | None:
-    """The checkpoint written last, None if there is none."""
+    """Returns the most recently written checkpoint; None if there is none."""
     return max(folder.glob("*.ckpt"), key=lambda path: path.stat().st_mtime, default=None)
 
 
 def start_step(checkpoint: str | Path) -> int:
-    """The step that a checkpoint of our own making goes on with."""
+    """Returns the step at which a checkpoint of this recipe resumes."""
     return int(torch.load(checkpoint, map_location="cpu", weights_only=True, mmap=True)["global_step"])
 
 
 def begin_with(training: SweepTraining, path: Path) -> None:
-    """Loads weights into the network and its average; the core-hours that made them count."""
+    """Loads initial weights into the network and its average, and adds their core-hours to the count."""
     with safe_open(path, "pt") as file:
         state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
         hours = float((file.metadata() or {}).get("core_hours", 0))
@@ -34,13 +34,16 @@ def begin_with(training: SweepTraining, path: Path) -> None:
 
 
 def write_weights(training: SweepTraining, path: Path, config: DictConfig, rooms: int) -> Path:
-    """Writes the averaged weights in half precision, with what made them in the header; returns ``path``.
+    """Writes the averaged weights in half precision, with a summary of the training in the header.
 
     Args:
-        training: of which the average is written.
-        path: of the safetensors file.
-        config: of the training.
+        training: training whose average to write.
+        path: output safetensors file.
+        config: configuration of the training.
         rooms: number of Infinigen rooms among its scenes.
+
+    Returns:
+        ``path``.
     """
     state = training.averaged.module.state_dict()
     tensors = {name: value.detach().half().contiguous() for name, value in sorted(state.items())}

@@ -1,1 +1,1 @@
-"""Runs on disk: found, trusted, loaded; their checkpoints."""
+"""Runs on disk: checkpoints, loading of models, checks of untrusted configurations."""

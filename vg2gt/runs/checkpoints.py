@@ -1,4 +1,4 @@
-"""Checkpoints on disk: written to a temporary name and renamed, read without executing anything."""
+"""Checkpoint files: atomic writes, and reading without executing code."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from vg2gt.io.files import flush_folder, flush_to_disk, write_bytes
 log = logging.getLogger(__name__)
 
 PATTERN = "step-*.ckpt"
-SLIM = ".safetensors"  # a checkpoint without what only training needs
-MADE_OF = "config"  # where a checkpoint keeps the configuration of backend, model and renderer, as YAML
-MODEL_PREFIX = "model."  # of the model's names in a checkpoint's state_dict, as the Lightning module names it
+SLIM = ".safetensors"  # a checkpoint without training state
+MADE_OF = "config"  # key of the configuration of backend, model and renderer, as YAML
+MODEL_PREFIX = "model."  # prefix of the model's names in a checkpoint's state_dict, from the Lightning module
 
 
 def write_checkpoint(checkpoint: Mapping[str, Any], path: str | Path) -> None:
-    """Saves to ``<path>.tmp``, flushes to the disk and renames; the file under ``path`` is never half-written.
+    """Writes to ``<path>.tmp``, flushes to disk and renames, so that ``path`` is never half-written.
 
     Raises:
-        OSError: if it cannot be written (a full disk); what is under ``path`` stays.
+        OSError: if it cannot be written (such as a full disk); an existing ``path`` is left intact.
     """
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
@@ -41,7 +41,7 @@ def write_checkpoint(checkpoint: Mapping[str, Any], path: str | Path) -> None:
             flush_to_disk(file)
         os.replace(temporary, target)
         flush_folder(target.parent)
-    except (OSError, RuntimeError) as error:  # torch's writer may make a RuntimeError of a full disk
+    except (OSError, RuntimeError) as error:  # torch's writer may raise RuntimeError for a full disk
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
         raise OSError(
@@ -51,7 +51,7 @@ def write_checkpoint(checkpoint: Mapping[str, Any], path: str | Path) -> None:
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
-    """Reads a checkpoint and verifies the checksums in it.
+    """Reads a checkpoint and verifies its checksums.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -67,20 +67,24 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
         content = torch.load(path, map_location="cpu", weights_only=True)
         if not isinstance(content, dict):
             raise ValueError(f"it holds a {type(content).__name__}")
-    except Exception as error:  # there is no end to what readers raise over damaged bytes
+    except Exception as error:  # damaged bytes make readers raise almost anything
         raise ValueError(f"checkpoint {path} is damaged or not a checkpoint of this project: {error}") from error
     return content
 
 
 def write_slim(checkpoint: str | Path, path: str | Path) -> Path:
-    """Writes what others need of a checkpoint as safetensors: the trained part, and in the header what it was made of.
+    """Writes a checkpoint for inference as safetensors: the trained weights, with the configuration in the header.
 
     Args:
-        checkpoint: of a run; training cannot go on from the result.
-        path: ends with ``.safetensors``; every command takes it as a checkpoint.
+        checkpoint: checkpoint of a run.
+        path: output file, must end with ``.safetensors``. All commands accept it as a checkpoint, but training cannot
+            resume from it.
+
+    Returns:
+        The path written.
 
     Raises:
-        ValueError: if ``path`` has another ending, or the checkpoint holds no configuration.
+        ValueError: if ``path`` has another suffix, or the checkpoint holds no configuration.
     """
     content = read_checkpoint(checkpoint)
     if Path(path).suffix != SLIM or MADE_OF not in content:
@@ -111,19 +115,19 @@ def _read_slim(path: Path) -> dict[str, Any]:
 
 
 def model_state(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The model's part of a checkpoint's ``state_dict``, by the model's own names."""
+    """Returns a checkpoint's ``state_dict`` with the model's own names (without :data:`MODEL_PREFIX`)."""
     return {name.removeprefix(MODEL_PREFIX): tensor for name, tensor in state.items()}
 
 
 def refuse_not_finite(state: Mapping[str, Tensor], path: str | Path) -> None:
-    """Refuses the weights of a training that has diverged, naming the file and the first bad tensor."""
+    """Raises ValueError if weights are not finite (training diverged), naming the file and the first bad tensor."""
     bad = next((name for name, value in state.items() if not bool(torch.isfinite(value).all())), None)
     if bad is not None:
         raise ValueError(f"checkpoint {path} holds weights that are not finite ({bad}): take an earlier one of its run")
 
 
 def _verify_checksums(path: Path) -> None:
-    """torch.load does not compare the checksums in its files: flipped bits would become weights."""
+    """Verifies the checksums, which torch.load does not do: flipped bits would become weights."""
     with zipfile.ZipFile(path) as archive:
         wrong = archive.testzip()
     if wrong is not None:
@@ -131,13 +135,17 @@ def _verify_checksums(path: Path) -> None:
 
 
 def newest_valid(folder: str | Path) -> Path:
-    """The newest readable checkpoint of a run; FileNotFoundError if there is none. Damaged ones are logged."""
+    """Returns the newest readable checkpoint in a folder, logging damaged ones.
+
+    Raises:
+        FileNotFoundError: if there is none.
+    """
     folder = Path(folder)
     candidates = by_age(folder)
     for path in candidates:
         try:
             read_checkpoint(path)
-        except (ValueError, FileNotFoundError) as error:  # not found: a folder of that name
+        except (ValueError, FileNotFoundError) as error:  # FileNotFoundError: a folder of that name
             log.warning("%s; trying the one before", error)
         else:
             return path
@@ -148,7 +156,7 @@ def newest_valid(folder: str | Path) -> Path:
 
 
 def by_age(folder: Path) -> list[Path]:
-    """A run's checkpoints, valid or not, the newest first."""
+    """Returns the checkpoints in a folder, valid or not, newest first."""
     return sorted(folder.glob(PATTERN), key=lambda path: (_step_of(path), path.name), reverse=True)
 
 
@@ -158,10 +166,10 @@ def _step_of(path: Path) -> int:
 
 
 def initialize_from(module: nn.Module, path: str | Path) -> None:
-    """Starts a Lightning module's run from trained weights; layers that do not fit stay fresh and are logged.
+    """Initialises a Lightning module from trained weights; layers that do not fit keep their values and are logged.
 
     Raises:
-        ValueError: if nothing in the checkpoint fits the module, or something in it is not finite.
+        ValueError: if no tensor of the checkpoint fits the module, or one is not finite.
     """
     stored: Mapping[str, Tensor] = read_checkpoint(path).get("state_dict", {})
     refuse_not_finite(stored, path)
@@ -180,7 +188,11 @@ def initialize_from(module: nn.Module, path: str | Path) -> None:
 
 
 def checkpoint_path(ckpt: str | Path | None) -> Path | None:
-    """The file that ``ckpt`` means: itself, or the newest valid one of a run's folder; else FileNotFoundError."""
+    """Returns ``ckpt`` if it is a file, or the newest valid checkpoint of a run's folder; None for None.
+
+    Raises:
+        FileNotFoundError: if there is no such file or folder, or the folder has no valid checkpoint.
+    """
     if ckpt is None:
         return None
     path = Path(ckpt)
@@ -202,5 +214,5 @@ def checkpoint_path(ckpt: str | Path | None) -> Path | None:
 
 
 def run_config_path(checkpoint: Path) -> Path:
-    """Where the configuration of a checkpoint's run is."""
+    """Returns the path of ``config.yaml`` of a checkpoint's run."""
     return checkpoint.resolve().parent.parent / "config.yaml"

@@ -1,4 +1,4 @@
-"""From names and files to a model with its trained part."""
+"""Loading of models with their trained weights, from names and files."""
 
 from __future__ import annotations
 
@@ -43,7 +43,13 @@ TOKENS = ("taps", "reference_view", "given_poses")
 
 @dataclass(frozen=True)
 class TrainedWeights:
-    """Where a model's weights come from: the checkpoint (None: untrained), its step, sha256 of the file."""
+    """Origin of a model's weights.
+
+    Attributes:
+        path: the checkpoint; None if untrained.
+        step: its training step.
+        digest: sha256 of the file.
+    """
 
     path: Path | None
     step: int
@@ -55,9 +61,13 @@ class TrainedWeights:
 
 @dataclass(frozen=True)
 class LoadedModel:
-    """A model in eval mode on its device, its run's renderer (solids unless asked otherwise), its weights' origin.
+    """A loaded model.
 
-    ``calibration`` bounds the errors of its depth; None: nobody has measured them (``vg2gt calibrate``).
+    Attributes:
+        model: the model, in eval mode on its device.
+        renderer: its run's renderer, set to stochastic solids with median depth.
+        weights: origin of the weights.
+        calibration: error bounds of its depth; None if they were not measured (``vg2gt calibrate``).
     """
 
     model: Reconstructor
@@ -73,16 +83,16 @@ def load_model(
     device: str = "auto",
     seed: int = 0,
 ) -> LoadedModel:
-    """Builds a model as its run was configured, and loads its trained part.
+    """Builds a model from the configuration of its run and loads the trained weights.
 
     Args:
-        ckpt: a checkpoint or a run's folder; None: what ships with the package (:data:`SHIPPED`), or with
-            another backend than ``sweep`` the untrained head, which makes coloured voxels.
-        backend: a name in ``configs/backend``, short for the override ``backend=NAME``; None: the run's own.
-        overrides: as on the command line: ``backend=NAME``, ``model=NAME`` and ``renderer=NAME`` replace the run's,
-            ``backend.key=value`` and the like change one key.
+        ckpt: a checkpoint or a run's folder. None loads the weights that ship with the package (:data:`SHIPPED`), or
+            with a backend other than ``sweep`` the untrained head, which predicts coloured voxels.
+        backend: a name in ``configs/backend``, short for the override ``backend=NAME``; None keeps the run's backend.
+        overrides: command-line overrides. ``backend=NAME``, ``model=NAME`` and ``renderer=NAME`` replace a part of the
+            run's configuration; ``backend.key=value`` and the like change one key.
         device: ``auto``, ``cpu``, ``cuda`` or ``cuda:N``.
-        seed: of the untrained head.
+        seed: seed of the untrained head.
 
     Raises:
         FileNotFoundError: if there is no such checkpoint, or its run's ``config.yaml`` or a weight file is missing.
@@ -93,7 +103,7 @@ def load_model(
         built = build_model(parts, seed, choose_device(device))
         renderer: Renderer = instantiate(parts["renderer"])
     except HydraException as error:
-        # What a constructor said; Hydra's own words around it name classes nobody asked about.
+        # Raise the constructor's own error: Hydra's message around it names internal classes.
         cause: Any = error.__cause__
         known = isinstance(cause, (ValueError, FileNotFoundError, ImportError))
         raise (cause if known else ValueError(str(error))) from error
@@ -105,7 +115,7 @@ def load_model(
 
 
 def model_parts(ckpt: str | Path | None, overrides: Sequence[str]) -> tuple[Path | None, dict[str, DictConfig]]:
-    """The checkpoint and the configurations of backend, model and renderer that :func:`load_model` builds."""
+    """Returns the checkpoint and the configurations of backend, model and renderer for :func:`load_model`."""
     keys = [override.partition("=")[0].lstrip("+~") for override in overrides]
     for override, key in zip(overrides, keys, strict=True):
         if "=" not in override or key.partition(".")[0] not in PARTS:
@@ -123,7 +133,7 @@ def model_parts(ckpt: str | Path | None, overrides: Sequence[str]) -> tuple[Path
 
 
 def backend_class(ckpt: str | Path | None, overrides: Sequence[str]) -> type:
-    """Class of the backend that :func:`load_model` would build; ``object`` where it cannot be imported."""
+    """Returns the class of the backend that :func:`load_model` would build; ``object`` if it cannot be imported."""
     try:
         return get_class(model_parts(ckpt, overrides)[1]["backend"]["_target_"])
     except ImportError:
@@ -131,7 +141,7 @@ def backend_class(ckpt: str | Path | None, overrides: Sequence[str]) -> type:
 
 
 def _changed(parts: dict[str, DictConfig], override: str) -> dict[str, DictConfig]:
-    """The parts of a run with one more ``key=value``; a new key needs a plus, as with Hydra."""
+    """The parts of a run with ``key=value`` applied; new keys need a leading plus, as in Hydra."""
     config = OmegaConf.create({part: OmegaConf.to_container(value) for part, value in parts.items()})
     OmegaConf.set_struct(config, not override.startswith("+"))
     try:
@@ -145,15 +155,15 @@ def _changed(parts: dict[str, DictConfig], override: str) -> dict[str, DictConfi
 
 
 def resolve_parts(config: DictConfig, checkpoint: Path | None) -> dict[str, DictConfig]:
-    """Configurations of backend, model and renderer: the run's own, changed by those that ``config`` names.
+    """Returns the configurations of backend, model and renderer: those of the run, with the overrides in ``config``.
 
-    ``model=tiny`` replaces the run's model, ``+model.fine.max_voxels=100000`` changes one key of it. Without a
-    checkpoint the training defaults are used.
+    ``model=tiny`` replaces the run's model; ``+model.fine.max_voxels=100000`` changes one key of it. Without a
+    checkpoint, the training defaults are used.
 
     Raises:
         FileNotFoundError: if the run's ``config.yaml`` is needed and missing.
-        ValueError: if it lacks a part, or is not what the checkpoint was trained with.
-        UntrustedError: if it is not data only, or names what is not ours (:mod:`vg2gt.runs.trust`).
+        ValueError: if it lacks a part, or differs from what the checkpoint was trained with.
+        UntrustedError: if it holds an interpolation or a target that is not allowed (:mod:`vg2gt.runs.trust`).
     """
     given: dict[str, Any] = {part: config.get(part) for part in PARTS}
     parts = {part: value for part, value in given.items() if value is not None and "_target_" in value}
@@ -167,9 +177,9 @@ def resolve_parts(config: DictConfig, checkpoint: Path | None) -> dict[str, Dict
 
 
 def refuse_other_tokens(backend: Any, checkpoint: Mapping[str, Any], path: Path) -> None:
-    """Refuses a backend that makes other tokens of images than a checkpoint was trained with, naming the key.
+    """Raises ValueError if a backend's :data:`TOKENS` differ from those that a checkpoint was trained with.
 
-    Its weights' hash says nothing of :data:`TOKENS`. Checkpoints that keep no configuration pass.
+    The hash of the weights does not cover these keys. Checkpoints without a configuration pass.
     """
     text = checkpoint.get(MADE_OF)
     if not isinstance(text, str):
@@ -177,7 +187,7 @@ def refuse_other_tokens(backend: Any, checkpoint: Mapping[str, Any], path: Path)
     stored = parse_run_config(text, f"{path}: {MADE_OF}").get("backend")
     here, there = (flatten(OmegaConf.to_container(OmegaConf.create(part or {}))) for part in (backend, stored))
     if here.get("_target_") != there.get("_target_"):
-        return  # another network, which the weights' hash tells; or the same one as an ONNX bundle
+        return  # another network, which the hash of the weights reveals, or the same network as an ONNX bundle
     for key in sorted(here.keys() & there.keys()):
         if key.rpartition(".")[2] in TOKENS and here[key] != there[key]:
             raise ValueError(
@@ -187,12 +197,12 @@ def refuse_other_tokens(backend: Any, checkpoint: Mapping[str, Any], path: Path)
 
 
 def made_of(config: DictConfig) -> str:
-    """What a run's checkpoints keep of its configuration: the parts that a model is built of, as YAML."""
+    """Returns the configurations of backend, model and renderer as YAML, for checkpoints."""
     return OmegaConf.to_yaml({part: OmegaConf.to_container(config[part], resolve=True) for part in PARTS})
 
 
 def _config_of(checkpoint: Path, parts: Sequence[str]) -> DictConfig:
-    """Configuration of a checkpoint's run: its file, which must agree with what the checkpoint knows, or the latter."""
+    """Configuration of a checkpoint's run: ``config.yaml``, which must agree with the checkpoint, else its own copy."""
     path = run_config_path(checkpoint)
     text = read_checkpoint(checkpoint).get(MADE_OF)  # missing in old checkpoints
     known = parse_run_config(text, f"{checkpoint}: {MADE_OF}") if isinstance(text, str) else None
@@ -215,7 +225,7 @@ def _config_of(checkpoint: Path, parts: Sequence[str]) -> DictConfig:
 
 
 def _refuse_differences(run: DictConfig, known: DictConfig, parts: Sequence[str], path: Path, checkpoint: Path) -> None:
-    """Refuses a run's file that would build another model than its checkpoint was trained with."""
+    """Raises ValueError if a run's file describes a different model than its checkpoint does."""
     plain = (OmegaConf.to_container(config) for config in (run, known))
     here, there = (flatten({part: config.get(part) for part in parts}) for config in plain)  # pyright: ignore
     different = [
@@ -231,14 +241,18 @@ def _refuse_differences(run: DictConfig, known: DictConfig, parts: Sequence[str]
 
 
 def build_model(parts: dict[str, DictConfig], seed: int, device: torch.device) -> Reconstructor:
-    """Instantiates the model in eval mode on its device; an untrained head is seeded."""
+    """Builds the model in eval mode on its device; ``seed`` determines an untrained head."""
     torch.manual_seed(seed)
     model = instantiate(parts["model"], backend=instantiate(parts["backend"]))
     return model.eval().to(device)
 
 
 def load_weights(model: Reconstructor, path: Path | None) -> TrainedWeights:
-    """Loads the trained part into a model; ValueError if it does not fit, or is not finite. Nothing without a path."""
+    """Loads trained weights into a model; does nothing if ``path`` is None.
+
+    Raises:
+        ValueError: if the weights do not fit or are not finite.
+    """
     if path is None:
         return TrainedWeights(None, 0, None)
     checkpoint = read_checkpoint(path)
@@ -248,25 +262,26 @@ def load_weights(model: Reconstructor, path: Path | None) -> TrainedWeights:
 
 
 def made_for(model: Reconstructor) -> str:
-    """What a calibration holds for: the trained part, in whatever file, or the backbone where nothing is trained."""
+    """Returns the hash of the weights that a calibration is valid for: the trained part, else the backbone."""
     state = model.trained_state()
     return tensors_digest(state) if state else model.backend.identity()["weights"]
 
 
 def calibration_path(checkpoint: Path) -> Path:
-    """Where the calibration of a checkpoint is: next to it, ``NAME.calibration.json``."""
+    """Returns the path of a checkpoint's calibration: ``NAME.calibration.json`` next to it."""
     return checkpoint.with_suffix(".calibration.json")
 
 
 def find_calibration(
     model: Reconstructor, weights: TrainedWeights, path: str | Path | None = None
 ) -> Calibration | None:
-    """The calibration of a model: the file that is named, else the one next to its checkpoint; None without one.
+    """Returns the calibration in ``path``, else the one next to the model's checkpoint; None if there is none.
+
+    A calibration next to the checkpoint that was made for other weights is ignored with a warning.
 
     Raises:
-        FileNotFoundError: if the named file is not there.
-        ValueError: if a file is damaged, or the named one was made for other weights; one next to a checkpoint that was
-            is ignored with a warning.
+        FileNotFoundError: if ``path`` does not exist.
+        ValueError: if a file is damaged, or ``path`` was made for other weights.
     """
     named = path is not None
     if path is None:
@@ -284,7 +299,7 @@ def find_calibration(
 
 
 def choose_device(asked: str) -> torch.device:
-    """``auto`` is the GPU where there is one; ValueError if there is no such device."""
+    """Returns the named device, for ``auto`` the GPU if there is one; raises ValueError if it is not available."""
     there = torch.cuda.is_available()
     try:
         device = torch.device(("cuda" if there else "cpu") if asked == "auto" else asked)

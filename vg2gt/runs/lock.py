@@ -1,4 +1,4 @@
-"""One process at a time in a folder."""
+"""Exclusive use of a folder by one process."""
 
 from __future__ import annotations
 
@@ -13,7 +13,11 @@ NAME = ".lock"
 
 @contextmanager
 def only_process_in(folder: str | Path) -> Iterator[None]:
-    """Holds a folder for this process, or raises BlockingIOError; removes it at the end if it is new and empty."""
+    """Locks a folder, creating it if needed; on exit, removes a folder it created if that is empty.
+
+    Raises:
+        BlockingIOError: if another process holds the lock.
+    """
     folder = Path(folder)
     new = not folder.exists()
     folder.mkdir(parents=True, exist_ok=True)
@@ -32,5 +36,5 @@ def only_process_in(folder: str | Path) -> Iterator[None]:
         (folder / NAME).unlink(missing_ok=True)
         lock.release()
         if new:
-            with suppress(OSError):  # it holds something
+            with suppress(OSError):  # not empty
                 folder.rmdir()

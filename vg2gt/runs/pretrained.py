@@ -1,4 +1,4 @@
-"""Models by name: shipped with the package, in a folder, or on the Hugging Face hub; safetensors only, no pickles."""
+"""Models by name: shipped with the package, in a folder, or on the Hugging Face Hub; safetensors only, no pickles."""
 
 from __future__ import annotations
 
@@ -17,39 +17,46 @@ MODELS = {"sweep-tiny": SHIPPED}
 
 
 def list_models() -> tuple[str, ...]:
-    """Names that :func:`from_pretrained` knows without a download."""
+    """Returns the names of the models that ship with the package, for :func:`from_pretrained`."""
     return tuple(MODELS)
 
 
 def from_pretrained(
     name: str | Path, *, backend: str | None = None, revision: str | None = None, device: str = "auto"
 ) -> LoadedModel:
-    """Builds a trained model by name.
+    """Loads a trained model by name.
 
     Args:
-        name: one of :func:`list_models`, a folder that :func:`save_pretrained` wrote, a run's folder or checkpoint, or
-            ``OWNER/NAME`` of a model on the hub.
-        backend: see :func:`vg2gt.load_model`, such as the path of the backbone's weights.
-        revision: of a model on the hub.
+        name: one of :func:`list_models`, a folder written by :func:`save_pretrained`, a run's folder or checkpoint, or
+            ``OWNER/NAME`` of a model on the Hub.
+        backend: name of a backend, see :func:`vg2gt.load_model`.
+        revision: revision of a model on the Hub.
         device: ``auto``, ``cpu``, ``cuda`` or ``cuda:N``.
 
     Returns:
-        The model in eval mode, with its renderer and where its weights come from.
+        The model in eval mode, its renderer and the origin of its weights.
 
     Raises:
         FileNotFoundError: if there is no such model.
-        ImportError: if it is on the hub and huggingface_hub is not installed.
+        ImportError: if it is on the Hub and huggingface_hub is not installed.
         ValueError: if it was trained on another backbone, or its files are damaged.
     """
     return load_model(_weights(name, revision), backend, device=device)
 
 
 def save_pretrained(ckpt: str | Path, folder: str | Path) -> Path:
-    """Writes what others need of a trained model: weights, configuration as YAML, and calibration if there is one.
+    """Writes a trained model for sharing: weights, configuration as YAML, and calibration if there is one.
 
     Args:
         ckpt: a run's folder or checkpoint.
-        folder: made if needed.
+        folder: output folder, created if needed.
+
+    Returns:
+        The output folder.
+
+    Raises:
+        FileNotFoundError: if there is no such run or checkpoint.
+        ValueError: if the checkpoint holds no configuration.
     """
     folder = Path(folder).expanduser()
     folder.mkdir(parents=True, exist_ok=True)
@@ -67,12 +74,12 @@ def push_to_hub(ckpt: str | Path, repo: str, folder: str | Path, private: bool =
 
     Args:
         ckpt: a run's folder or checkpoint.
-        repo: ``OWNER/NAME``; made if needed, with the account that ``hf auth login`` knows.
-        folder: where :func:`save_pretrained` writes first.
-        private: of a new repository.
+        repo: ``OWNER/NAME``; created if needed, with the account of ``hf auth login``.
+        folder: local folder for :func:`save_pretrained`.
+        private: whether to make a new repository private.
 
     Returns:
-        The commit's address.
+        The URL of the commit.
 
     Raises:
         ImportError: if huggingface_hub is not installed.
@@ -104,6 +111,6 @@ def _weights(name: str | Path, revision: str | None) -> Path:
         raise ImportError(
             f"{name} is no folder here; a model on the hub needs huggingface_hub: pip install 'vg2gt[hub]'"
         ) from error
-    with suppress(EntryNotFoundError):  # a model that nobody has calibrated
+    with suppress(EntryNotFoundError):  # the model is not calibrated
         hf_hub_download(str(name), CALIBRATION, revision=revision)
     return Path(hf_hub_download(str(name), WEIGHTS, revision=revision))

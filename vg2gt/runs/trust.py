@@ -1,8 +1,8 @@
-"""What is built from a configuration that may come from anywhere.
+"""Checks of untrusted configurations before anything in them is instantiated.
 
-Hydra calls whatever a configuration names. From the ``config.yaml`` of a run, which may be downloaded, only the
-project's own networks, backends, renderers and data sets are built, the classes that installed packages declare
-(:func:`vg2gt.config.plugin_targets`), and those of packages named in ``VG2GT_TRUST=my_pkg,other_pkg``.
+Hydra calls whatever a configuration names, and the ``config.yaml`` of a run may be downloaded. Only three kinds of
+target are allowed: the project's own networks, backends, renderers and datasets; classes that installed packages
+declare (:func:`vg2gt.config.plugin_targets`); and anything in packages named in ``VG2GT_TRUST=my_pkg,other_pkg``.
 """
 
 from __future__ import annotations
@@ -31,11 +31,16 @@ KINDS = (nn.Module, SceneSource, SceneScale, ViewCheck, Renderer)
 
 
 class UntrustedError(ValueError):
-    """A file from elsewhere asks for more than data."""
+    """An untrusted file asks for more than data."""
 
 
 def read_run_config(path: str | Path) -> DictConfig:
-    """Reads a run's ``config.yaml``; ValueError if it is not YAML of plain values, or no mapping."""
+    """Reads a run's ``config.yaml``.
+
+    Raises:
+        UntrustedError: if it holds an interpolation.
+        ValueError: if it is not a YAML mapping of plain values.
+    """
     try:
         text = regular(path).read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
@@ -44,8 +49,8 @@ def read_run_config(path: str | Path) -> DictConfig:
 
 
 def parse_run_config(text: str, source: str | Path) -> DictConfig:
-    """The configuration that a text from elsewhere holds; ``source`` names it in errors, which are the same."""
-    if "${" in text:  # it could read the environment
+    """Parses an untrusted configuration; ``source`` names it in errors, which are those of :func:`read_run_config`."""
+    if "${" in text:  # an interpolation could read the environment
         raise UntrustedError(f"{source} holds an interpolation; a run's configuration is written with its values")
     try:
         content = yaml.safe_load(text)
@@ -57,14 +62,14 @@ def parse_run_config(text: str, source: str | Path) -> DictConfig:
 
 
 def check_targets(config: Any, source: str | Path) -> None:
-    """Checks everything that instantiating a part of a configuration would call; instantiates nothing.
+    """Checks every target that instantiating a part of a configuration would call; instantiates nothing.
 
     Args:
-        config: the part, a mapping or a sequence.
-        source: the file it was read from and the part's name, for the message.
+        config: part of the configuration, a mapping or a sequence.
+        source: its file and the part's name, for messages.
 
     Raises:
-        UntrustedError: naming the first that is neither ours nor of a package in ``VG2GT_TRUST``.
+        UntrustedError: for the first target that is not allowed (see the module's docstring) or cannot be imported.
     """
     trusted = [name.strip() for name in os.environ.get(ENVIRONMENT, "").split(",") if name.strip()]
     plain = OmegaConf.to_container(config, resolve=False) if OmegaConf.is_config(config) else config
@@ -83,7 +88,7 @@ def check_targets(config: Any, source: str | Path) -> None:
             found = get_object(target)
         except Exception as error:  # Hydra's, or whatever importing a trusted package raises
             raise UntrustedError(f"{said}, which cannot be imported ({' '.join(str(error).split())[:200]})") from error
-        # a name may lead through a module to what it has imported itself: vg2gt.kernels.threads.os.mkdir
+        # a name may reach what a module has imported, such as vg2gt.kernels.threads.os.mkdir
         home = str(getattr(found, "__module__", None))
         if home.partition(".")[0] != package:
             raise UntrustedError(f"{said}, which is defined in {home}, not in {package} ({ENVIRONMENT}=PACKAGE)")
@@ -92,7 +97,7 @@ def check_targets(config: Any, source: str | Path) -> None:
 
 
 def _targets(node: Any, key: str) -> Iterator[tuple[str, Any]]:
-    """Every ``_target_`` of nested mappings and sequences, with the keys that lead to it."""
+    """Every ``_target_`` in nested mappings and sequences, with the path of keys to it."""
     if isinstance(node, Mapping):
         if "_target_" in node:
             yield key, node["_target_"]

@@ -1,1 +1,1 @@
-"""Training: the Lightning module, the run around it, callbacks."""
+"""Training: the Lightning module, the training run, callbacks."""

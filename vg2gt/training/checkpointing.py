@@ -1,4 +1,4 @@
-"""Lightning's checkpoints: written whole or not at all, the newest kept."""
+"""Lightning checkpoints: atomic writes, and a callback that keeps the newest ones."""
 
 from __future__ import annotations
 
@@ -16,29 +16,31 @@ BEST = "best.ckpt"
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
-    """Writes a checkpoint whole or not at all, and loads tensors and plain values only (no pickled code)."""
+    """Writes checkpoints atomically; loads only tensors and plain values (no pickled code)."""
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any | None = None) -> None:
-        """Saves by :func:`vg2gt.runs.checkpoints.write_checkpoint`."""
+        """Saves with :func:`vg2gt.runs.checkpoints.write_checkpoint`."""
         write_checkpoint(checkpoint, path)
 
     def load_checkpoint(self, path: Any, map_location: Any = "cpu", weights_only: bool | None = True) -> dict[str, Any]:
-        """Loads on the CPU with ``weights_only=True``, whatever is asked for."""
+        """Loads on the CPU with ``weights_only=True``; ignores ``map_location`` and ``weights_only``."""
         return read_checkpoint(path)
 
 
 class NewestCheckpoints(ModelCheckpoint):
-    """Saves ``step-<number>.ckpt`` every few steps and keeps the newest in the folder, whichever run saved them.
+    """Saves ``step-<number>.ckpt`` periodically and keeps the newest in the folder, including those of earlier runs.
 
-    Lightning's ``monitor="step"`` skips the last step of an epoch and keeps what a run was resumed from forever.
+    Lightning's ``monitor="step"`` skips the last step of an epoch and never deletes the checkpoint a run resumed from.
 
     Args:
-        dirpath: the folder.
-        every_n_train_steps: a checkpoint every this many steps.
-        save_top_k: how many are kept; -1: all.
-        monitor: metric of the evaluations while training, such as ``eval/psnr``, whose best state is kept as
-            ``best.ckpt``; None: no such file.
-        mode: ``max`` or ``min``, whichever is better.
+        dirpath: folder of the checkpoints.
+        every_n_train_steps: number of training steps between checkpoints; at least 1.
+        save_top_k: number of checkpoints to keep; -1 keeps all.
+        monitor: evaluation metric, such as ``eval/psnr``, whose best state is saved as ``best.ckpt``; None saves none.
+        mode: whether ``max`` or ``min`` of the metric is best.
+
+    Raises:
+        ValueError: if ``mode`` is unknown or a number is out of range.
     """
 
     def __init__(
@@ -69,14 +71,14 @@ class NewestCheckpoints(ModelCheckpoint):
         self.best: float | None = None
 
     def on_train_batch_end(self, trainer: lightning.Trainer, *args: Any, **more: Any) -> None:
-        """Saves when it is the step's turn, then deletes all but the newest."""
+        """Saves a checkpoint if one is due, then deletes all but the newest."""
         super().on_train_batch_end(trainer, *args, **more)
         if trainer.is_global_zero and self.kept > 0 and not getattr(trainer, "fast_dev_run", False):
             for path in by_age(Path(str(self.dirpath)))[self.kept :]:
                 path.unlink(missing_ok=True)
 
     def on_validation_end(self, trainer: lightning.Trainer, *args: Any) -> None:
-        """Keeps the best state by the watched metric; a ValueError names those there are if it is not one."""
+        """Saves the best state by the monitored metric; raises ValueError if no such metric was logged."""
         super().on_validation_end(trainer, *args)
         if self.watched is None or trainer.state.fn != TrainerFn.FITTING or getattr(trainer, "fast_dev_run", False):
             return
@@ -89,10 +91,10 @@ class NewestCheckpoints(ModelCheckpoint):
             trainer.save_checkpoint(Path(str(self.dirpath)) / BEST)
 
     def state_dict(self) -> dict[str, Any]:
-        """Lightning's, and the best value."""
+        """Returns Lightning's state and the best value."""
         return {**super().state_dict(), "best": self.best}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """As :meth:`state_dict` gave it; checkpoints of old have no best value."""
+        """Restores the state; old checkpoints have no best value."""
         self.best = state_dict.pop("best", None)
         super().load_state_dict(state_dict)

@@ -1,4 +1,4 @@
-"""What several processes of a run tell each other, besides gradients."""
+"""Communication between the processes of a run, other than gradients."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ Value = TypeVar("Value")
 
 
 def world_size() -> int:
-    """Number of processes that train together."""
+    """Returns the number of processes in the process group; 1 without one."""
     if not torch.distributed.is_available() or not torch.distributed.is_initialized():
         return 1
     return torch.distributed.get_world_size()
 
 
 def all_gather_object(value: Value) -> list[Value]:
-    """The value of every rank, in their order. Collective: every rank has to call it."""
+    """Returns the values of all ranks, in rank order. Collective: every rank must call it."""
     if world_size() == 1:
         return [value]
     found: list[Any] = [None] * world_size()
@@ -32,7 +32,7 @@ def all_gather_object(value: Value) -> list[Value]:
 
 
 def interleave(parts: Sequence[Mapping[Key, Value]]) -> dict[Key, Value]:
-    """Joins mappings of ranks that took turns, first entries first; a repeated key keeps its first value."""
+    """Merges the ranks' mappings in round-robin order; a repeated key keeps its first value."""
     joined: dict[Key, Value] = {}
     for row in zip_longest(*parts):
         for key, part in zip(row, parts, strict=True):
@@ -43,10 +43,10 @@ def interleave(parts: Sequence[Mapping[Key, Value]]) -> dict[Key, Value]:
 
 @contextmanager
 def ending_together(trainer: lightning.Trainer) -> Iterator[None]:
-    """Ends the ranks that this process started if it fails itself: they would wait forever.
+    """Kills the ranks that this process launched if the block raises, as they would wait forever.
 
     Raises:
-        ChildProcessError: if a process that loads data was killed.
+        ChildProcessError: if a data loading process was killed.
     """
     try:
         yield

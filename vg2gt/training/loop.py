@@ -1,4 +1,4 @@
-"""A training run: build from the configuration, evaluate the untrained head, train, evaluate again, report."""
+"""A training run: build from the configuration, evaluate the untrained head, train, evaluate, report."""
 
 from __future__ import annotations
 
@@ -41,15 +41,15 @@ log = logging.getLogger(__name__)
 
 EXPECTED_WARNINGS = (
     r"Found \d+ module\(s\) in eval mode",  # the frozen backbone
-    r"You're resuming from a checkpoint that ended before the epoch",  # batches are a function of the step's number
-    r"It is recommended to use `self.log\('eval/",  # all ranks log the same
-    r".*isinstance\(treespec, LeafSpec\)",  # inside Lightning
-    r"Checkpoint directory .* exists and is not empty",  # of a run that continues
+    r"You're resuming from a checkpoint that ended before the epoch",  # batches are a function of the step number
+    r"It is recommended to use `self.log\('eval/",  # all ranks log the same values
+    r".*isinstance\(treespec, LeafSpec\)",  # internal to Lightning
+    r"Checkpoint directory .* exists and is not empty",  # expected when a run resumes
 )
 
-FEW_WORKERS = r"The '\w+_dataloader' does not have many workers"  # expected on a CPU, whose cores compute
+FEW_WORKERS = r"The '\w+_dataloader' does not have many workers"  # expected on a CPU, whose cores are busy training
 
-# Sizes differ from step to step, which fragments the GPU's memory otherwise; read when CUDA starts.
+# Tensor sizes vary from step to step, which would fragment GPU memory. Read when CUDA initialises.
 ALLOCATOR = (f"PYTORCH_{'' if torch.__version__ >= '2.9' else 'CUDA_'}ALLOC_CONF", "expandable_segments:True")
 
 LOGGER_PACKAGES = {"TensorBoardLogger": "tensorboard", "WandbLogger": "wandb"}
@@ -58,14 +58,14 @@ PRECISIONS = ("auto", "32-true", "bf16-mixed", "32", "bf16")  # the last two are
 
 @dataclass(frozen=True)
 class Run:
-    """What a configuration describes.
+    """A training run, built from its configuration.
 
     Attributes:
         module: model, loss, renderer and optimiser.
         datamodule: training and evaluation scenes.
         trainer: Lightning's trainer.
-        folder: the run's own folder, ``outputs/<name>``.
-        trial: one step of everything (``fast_dev_run``): no reports, no checkpoints.
+        folder: output folder of the run, ``outputs/<name>``.
+        trial: whether this is a ``fast_dev_run``, which writes no reports and no checkpoints.
     """
 
     module: VG2GTModule
@@ -76,7 +76,7 @@ class Run:
 
 
 def build(config: DictConfig) -> Run:
-    """Instantiates everything the configuration names; each part's constructor is its schema."""
+    """Instantiates the module, data and trainer of a configuration; each constructor is the schema of its section."""
     _check_trainer(config)
     _check_loggers(config)
     lightning.seed_everything(config.seed, workers=True, verbose=False)
@@ -113,7 +113,7 @@ def build(config: DictConfig) -> Run:
 
 
 def _quieten_lightning() -> None:
-    """Lightning's warnings, once: only its warnings, and not twice."""
+    """Limits Lightning's log to warnings, and shows them once only."""
     logger = logging.getLogger("lightning.pytorch")
     logger.setLevel(logging.WARNING)
     if logging.getLogger().handlers:
@@ -121,7 +121,7 @@ def _quieten_lightning() -> None:
 
 
 def _optimizer(config: DictConfig) -> Callable[..., torch.optim.Optimizer]:
-    """What makes the optimiser, tried on one number: Lightning would ask for it after the first evaluation only."""
+    """Instantiates the optimiser's partial and tries it, as Lightning would only call it after the first evaluation."""
     make = instantiate(config)
     try:
         make([torch.nn.Parameter(torch.zeros(1))])
@@ -137,7 +137,7 @@ def _callbacks(config: DictConfig) -> list[lightning.Callback]:
 
 
 def _accelerator(asked: str) -> str:
-    """``auto`` means CUDA or the CPU; Apple's MPS is refused."""
+    """Resolves ``auto`` to CUDA or the CPU; raises ValueError for Apple's MPS."""
     if asked == "mps":
         raise ValueError("trainer.accelerator=mps: MPS has no float64, which the geometry needs; use trainer=cpu")
     return asked if asked != "auto" else "gpu" if torch.cuda.is_available() else "cpu"
@@ -159,20 +159,20 @@ def _check_trainer(config: DictConfig) -> None:
 
 @memory_advice(TRAINING)
 def train(config: DictConfig) -> dict[str, Any]:
-    """Runs the configuration from beginning to end.
+    """Trains and evaluates a model as configured.
 
-    A refused start changes nothing in the folder, and a trial (``fast_dev_run``) writes nothing. Writes into
-    ``outputs/<name>``: the resolved configuration, checkpoints, ``metrics.json``, ``metrics.md``, ``preview.png``.
+    Writes into ``outputs/<name>``: the resolved configuration, checkpoints, ``metrics.json``, ``metrics.md`` and
+    ``preview.png``. If the start is refused, the folder is left unchanged. A ``fast_dev_run`` writes nothing.
 
     Returns:
-        The content of ``metrics.json``.
+        The content of ``metrics.json``; empty if training was stopped early.
 
     Raises:
-        BlockingIOError: if another process works in the folder.
+        BlockingIOError: if another process uses the folder.
         FileExistsError: if the folder holds a run and neither ``ckpt`` nor ``overwrite`` says what to do with it.
         FileNotFoundError: if ``ckpt`` names no valid checkpoint.
-        ValueError: if the model has no trained part, or the run to go on with is further than ``trainer.max_steps``.
-        OutOfMemory: if a device's memory is full, naming the sizes and the options that reduce them.
+        ValueError: if the model has no trained part, or the checkpoint is beyond ``trainer.max_steps``.
+        OutOfMemory: if device memory runs out; names the sizes and the options that reduce them.
     """
     writes = rank_zero_only.rank == 0 and not config.trainer.get("fast_dev_run")
     with only_process_in(config.output_dir) if writes else nullcontext():
@@ -192,7 +192,12 @@ def train(config: DictConfig) -> dict[str, Any]:
 
 
 def check_run(run: Run) -> None:
-    """Raises DataError or ValueError if the data lacks what the model needs, or the model has no trained part."""
+    """Checks a run before training.
+
+    Raises:
+        DataError: if the data cannot be used, or lacks the depth or cameras that the backend needs.
+        ValueError: if the model has no trained part.
+    """
     if isinstance(run.datamodule, SceneDataModule):
         run.datamodule.setup("fit")
         for source in run.datamodule.sources:
@@ -205,11 +210,11 @@ def check_run(run: Run) -> None:
 
 
 def fit(run: Run, checkpoint: Path | None) -> bool:
-    """Trains from the beginning or a checkpoint and saves the final weights; False if it was stopped before its end."""
+    """Trains from scratch or from a checkpoint and saves the final weights; returns False if stopped early."""
     trainer = run.trainer
     trainer.fit(run.module, datamodule=run.datamodule, ckpt_path=checkpoint, weights_only=True)
     last = run.folder / "checkpoints" / f"step-{trainer.global_step}.ckpt"
-    # Rank 0 decides for all: saving is collective, and it makes the file appear.
+    # Rank 0 decides for all ranks: saving is collective and creates the file.
     if trainer.strategy.broadcast(not run.trial and not last.is_file()):
         trainer.save_checkpoint(last)
     if run.trial or trainer.global_step >= trainer.max_steps:
@@ -219,13 +224,13 @@ def fit(run: Run, checkpoint: Path | None) -> bool:
 
 
 def evaluate(run: Run) -> dict[str, float]:
-    """Evaluates the model as it is on the evaluation scenes; returns means over scenes."""
+    """Evaluates the current model on the evaluation scenes; returns means over scenes."""
     results = run.trainer.validate(run.module, datamodule=run.datamodule, verbose=False)
     return {key.removeprefix("eval/"): float(value) for key, value in results[0].items()} if results else {}
 
 
 def _untrained_metrics(run: Run, resumed: bool) -> dict[str, float]:
-    """Metrics of the head as initialised: measured once and kept in the run's folder for when it is resumed."""
+    """Metrics of the untrained head: measured once, and read from the run's folder when it resumes."""
     path = run.folder / "untrained.json"
     if resumed and path.is_file():
         return read_json(path)
@@ -249,7 +254,7 @@ def report(run: Run, untrained: dict[str, float], trained: dict[str, float]) -> 
         write_json(run.folder / "metrics.json", content)
         write_text(run.folder / "metrics.md", comparison_table(untrained, trained))
         print_comparison(untrained, trained)
-        run.module.to(run.trainer.strategy.root_device)  # the strategy's teardown has moved it to the CPU
+        run.module.to(run.trainer.strategy.root_device)  # the strategy's teardown moved it to the CPU
         preview = write_preview(run.module, run.datamodule, run.folder / "preview.png")
         newest = newest_valid(run.folder / "checkpoints")
         _log_picture(run, preview)
@@ -264,18 +269,18 @@ def report(run: Run, untrained: dict[str, float], trained: dict[str, float]) -> 
 
 
 def _log_picture(run: Run, picture: Path) -> None:
-    """Gives the preview to the loggers that show pictures: TensorBoard and Weights & Biases."""
+    """Logs the preview to TensorBoard and Weights & Biases."""
     for logger in run.trainer.loggers:
         if isinstance(logger, TensorBoardLogger):
             pixels = torch.from_numpy(read_color(picture, run.folder.name))
             logger.experiment.add_image("preview", pixels, run.trainer.global_step, dataformats="HWC")
-            logger.experiment.flush()  # training has ended and nothing else would write it out
+            logger.experiment.flush()  # training has ended, so nothing else flushes it
         elif isinstance(logger, WandbLogger):
             logger.log_image("preview", [str(picture)], run.trainer.global_step)
 
 
 def _where_curves_are(run: Run) -> str:
-    """How to look at the training curves, with the logger the run had."""
+    """Command or folder that shows the training curves of the run's logger."""
     if any(isinstance(logger, TensorBoardLogger) for logger in run.trainer.loggers):
         return f"tensorboard --logdir {run.folder}"
     if any(isinstance(logger, WandbLogger) for logger in run.trainer.loggers):
@@ -284,7 +289,7 @@ def _where_curves_are(run: Run) -> str:
 
 
 def _check_loggers(config: DictConfig) -> None:
-    """Refuses a logger whose package is missing, naming the extra that brings it."""
+    """Raises ImportError if a logger's package is missing, naming the extra that installs it."""
     for logger in config.logger.values():
         target = str(logger.get("_target_", "")) if logger else ""
         for ending, package in LOGGER_PACKAGES.items():

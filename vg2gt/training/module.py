@@ -1,4 +1,4 @@
-"""The training loop's view of VG²GT: steps, optimiser, logging, checkpoints of the trained part. No maths."""
+"""Lightning module of VG²GT: training and evaluation steps, optimiser, logging, checkpoints of the trained part."""
 
 from __future__ import annotations
 
@@ -35,29 +35,29 @@ IN_PROGRESS_BAR = ("loss", "train/color_l1", "train/depth_gt", "train/depth_reg"
 
 
 class VG2GTModule(lightning.LightningModule):
-    """Trains everything but the backbone (paper, Training).
+    """Trains the model's trainable parameters; by default everything except the backbone (paper, Training).
 
     Args:
-        model: the reconstruction model.
-        loss: the training objective.
+        model: reconstruction model.
+        loss: training objective.
         renderer: renders the training and evaluation views.
-        optimizer: makes the optimiser from parameter groups (Hydra partial); its ``lr`` is the initial rate.
+        optimizer: builds the optimiser from parameter groups (Hydra partial); its ``lr`` is the initial learning rate.
         final_lr: learning rate at the end of the cosine schedule.
         warmup_steps: steps of linear warm-up.
-        coarse_lr_factor: the coarse module's learning rate over the optimiser's; > 0.
-        backend_lr_factor: the backbone's learning rate over the optimiser's, where it is trained; > 0.
-        part: what is trained: ``all``, or the ``coarse`` module alone, on the geometry and enhancement losses, without
-            rendering.
-        pose_noise: share of training scenes whose camera hints are slightly wrong; with ``part="coarse"`` only, as
-            views that are rendered need cameras that fit.
-        render_views: most views rendered in a training step, held-out views first; None renders all.
-        rasterized_depth: evaluations score the depth of 3DGS rasterisation as well (``abs_rel_rasterized``).
-        max_skipped: stop after this many steps in a row whose loss or gradient was not finite.
-        seed: seeds every random draw of a step, together with the step's number, so that a resumed run draws what the
-            uninterrupted one would have drawn.
+        coarse_lr_factor: multiplies the learning rate of the coarse module; > 0.
+        backend_lr_factor: multiplies the learning rate of the backbone, if it is trained; > 0.
+        part: what to train: ``all``, or only the ``coarse`` module, with the geometry and enhancement losses and
+            without rendering.
+        pose_noise: fraction of training scenes whose camera hints are perturbed, 0 to 1. Requires ``part="coarse"``,
+            as rendered views need accurate cameras.
+        render_views: maximum number of views rendered per training step, held-out views first; None renders all.
+        rasterized_depth: also evaluate the depth of 3DGS rasterisation (``abs_rel_rasterized``).
+        max_skipped: stop after this many consecutive steps with a non-finite loss or gradient.
+        seed: combined with the step number to seed every random draw of a step, so that a resumed run makes the same
+            draws as an uninterrupted one.
 
     Raises:
-        ValueError: naming the option that is out of range or does not fit the model.
+        ValueError: if an option is out of range or does not fit the model.
     """
 
     def __init__(
@@ -80,7 +80,7 @@ class VG2GTModule(lightning.LightningModule):
         super().__init__()
         self.lr_factors = {"coarse": coarse_lr_factor, "backend": backend_lr_factor}
         for name, factor in self.lr_factors.items():
-            if not 0 < factor < math.inf:  # the optimiser checks its own rate only
+            if not 0 < factor < math.inf:  # the optimiser only checks its own learning rate
                 raise ValueError(
                     f"training.{name}_lr_factor={factor} must be a positive number; 1 is the optimiser's rate"
                 )
@@ -100,11 +100,11 @@ class VG2GTModule(lightning.LightningModule):
         self.seed = seed
         self.generator = torch.Generator()
         self.skipped = SkippedSteps(max_skipped)
-        self._cause: str | None = None  # of the step to be skipped
+        self._cause: str | None = None  # why the current step must be skipped
         self._scenes: tuple[str, ...] = ()
         self._figures: dict[str, Tensor] = {}
         self._metrics: dict[tuple[str | int, ...], dict[str, float]] = {}
-        self.made_of: str | None = None  # the configuration of the model's parts, for checkpoints
+        self.made_of: str | None = None  # configuration of the model's parts as YAML, stored in checkpoints
         self.strict_loading = (
             False  # weights of a frozen backbone are not stored; load_state_dict checks everything else
         )
@@ -112,13 +112,13 @@ class VG2GTModule(lightning.LightningModule):
     # ------------------------------------------------------------------------------------------------- training
 
     def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
-        """Seeds this step's randomness: what belongs to the step alike on all ranks, what belongs to scenes apart."""
+        """Seeds the random draws of this step: ``self.generator`` equally on all ranks, torch's generator per rank."""
         step_seed = (self.seed * 1_000_003 + self.global_step) * 1009
         self.generator.manual_seed(step_seed)  # curve orders, rendered views
-        torch.manual_seed(step_seed + self.global_rank)  # drop-path
+        torch.manual_seed(step_seed + self.global_rank)  # drop path
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        """Returns the training loss; NaN where something is not finite: the step is then skipped on all ranks."""
+        """Returns the training loss; NaN if the batch, prediction or loss is bad, and all ranks then skip the step."""
         self._scenes, self._figures, self._cause = batch.scene, {}, None
         report = self._losses(batch)
         if report is not None:
@@ -127,11 +127,11 @@ class VG2GTModule(lightning.LightningModule):
                 return report.total
             bad = [name for name, value in report.terms.items() if not finite(value)]
             self._cause = f"loss ({', '.join(bad) or 'finite terms, infinite sum'})"
-        # every parameter takes part, as DDP expects
+        # use every parameter, as DDP expects
         return torch.stack([parameter.sum() for parameter in self.model.trained_parameters()]).sum() * torch.nan
 
     def _losses(self, batch: Batch) -> LossReport | None:
-        """The training losses; None, with the cause noted, where the model or the renderer cannot go on."""
+        """Returns the training losses; None if the step cannot be computed (sets ``_cause``)."""
         focal = focal_lengths(batch.cameras.intrinsics)
         if not finite(batch.images, batch.depth, batch.cameras.world_to_camera, batch.cameras.intrinsics, focal.log()):
             self._cause = "images, depth or cameras of the batch"
@@ -139,7 +139,7 @@ class VG2GTModule(lightning.LightningModule):
         return self._losses_of_geometry(batch) if self.part == "coarse" else self._losses_of_scene(batch)
 
     def _losses_of_geometry(self, batch: Batch) -> LossReport:
-        """Geometry and enhancement losses of what the coarse module makes of the context views."""
+        """Geometry and enhancement losses on the context views decoded from enhanced tokens."""
         assert isinstance(self.model, VG2GT)
         hints = with_pose_noise(batch.context, self.pose_noise)
         _, decoded = self.model.enhance(batch.context.images, hints, self.generator)
@@ -147,7 +147,7 @@ class VG2GTModule(lightning.LightningModule):
             return self.loss(decoded, batch)
 
     def _losses_of_scene(self, batch: Batch) -> LossReport | None:
-        """All losses: of the context views' geometry and of some rendered views."""
+        """All losses: on the decoded geometry of the context views and on the rendered views."""
         prediction = self.model(batch.context.images, batch.context.hints, self.generator)
         gaussians = prediction.gaussians
         views = self._draw_views(batch)
@@ -164,7 +164,7 @@ class VG2GTModule(lightning.LightningModule):
             return self.loss(prediction, batch, rendered, views, cameras)
 
     def _draw_views(self, batch: Batch) -> Tensor:
-        """Views to render: held-out ones first, but at least one context view, whose decoded depth counts."""
+        """Draws the views to render: held-out views first, with at least one context view for the depth losses."""
         total = batch.images.shape[1]
         context = torch.randperm(batch.num_context, generator=self.generator)
         held_out = batch.num_context + torch.randperm(total - batch.num_context, generator=self.generator)
@@ -173,7 +173,7 @@ class VG2GTModule(lightning.LightningModule):
         return torch.cat((held_out, context))[: self.render_views]
 
     def _step_figures(self, report: LossReport) -> dict[str, Tensor]:
-        """What is logged of a step; the mean over ranks is what one process with all scenes would log."""
+        """Values to log; their mean over ranks equals what one process with all scenes would log."""
         figures: dict[str, Tensor | float] = {"loss": report.total.detach()}
         figures |= {f"train/{name}": value for name, value in report.terms.items()}
         figures |= {f"train/{what}_dropped": float(count) for what, count in dropped_by(self.model).items()}
@@ -181,20 +181,20 @@ class VG2GTModule(lightning.LightningModule):
         return {name: self._figure(value) for name, value in figures.items()}
 
     def _scene_figures(self, batch: Batch, prediction: Prediction) -> dict[str, Tensor]:
-        """How many Gaussians and voxels a step's scenes have."""
+        """Gaussians per context view and voxels per pixel."""
         figures = {"train/gaussians_per_view": len(prediction.gaussians) / (len(batch.scene) * batch.num_context)}
         if prediction.voxels is not None:
             figures["train/voxels_per_pixel"] = len(prediction.voxels.grid) / batch.context.depth.numel()
         return {name: self._figure(value) for name, value in figures.items()}
 
     def _figure(self, value: Tensor | float) -> Tensor:
-        """A float32 scalar; a number is filled in on the device, as copying it there would make the host wait."""
+        """Converts to a float32 scalar; numbers are created on the device, as a copy would make the host wait."""
         if isinstance(value, Tensor):
             return value.to(torch.float32)
         return torch.full((), value, dtype=torch.float32, device=self.device)
 
     def _log_step(self, average: bool) -> None:
-        """Logs the step's figures: means over ranks, or this rank's own of a step that was dropped."""
+        """Logs the step's values: means over ranks, or this rank's own values if the step was skipped."""
         if not self._figures:
             return
         values = torch.stack(list(self._figures.values()))
@@ -209,16 +209,20 @@ class VG2GTModule(lightning.LightningModule):
         gradient_clip_val: int | float | None = None,
         gradient_clip_algorithm: str | None = None,
     ) -> None:
-        """Clips the global gradient norm; skips the step on all ranks if a loss or gradient is not finite on any."""
+        """Clips the global gradient norm; skips the step on all ranks if a loss or gradient is non-finite on any.
+
+        Raises:
+            ValueError: if ``gradient_clip_algorithm`` is not ``norm``.
+        """
         if gradient_clip_algorithm not in (None, "norm"):
             raise ValueError(f"trainer.gradient_clip_algorithm={gradient_clip_algorithm} is not supported; use norm")
         limit = float(gradient_clip_val) if gradient_clip_val and gradient_clip_val > 0 else float("inf")
         norm = nn.utils.clip_grad_norm_(self.model.trained_parameters(), limit)
         bad = torch.ones_like(norm) if self._cause is not None else (~norm.isfinite()).to(norm.dtype)
-        # All ranks see the sum, so all of them skip the step or none does; here the host waits.
+        # All ranks see the same sum, so either all skip the step or none does. The host waits here.
         bad_ranks = float(self.trainer.strategy.reduce(bad, reduce_op="sum"))
         if bad_ranks:
-            # Without gradients the optimiser leaves parameters and moments as they are.
+            # Without gradients, the optimiser leaves parameters and moments unchanged.
             optimizer.zero_grad(set_to_none=True)
             self._skip_step()
         else:
@@ -228,8 +232,8 @@ class VG2GTModule(lightning.LightningModule):
         self.log("train/skipped_steps", float(self.skipped.total))
 
     def _skip_step(self) -> None:
-        """Counts a skipped step and names what every rank found."""
-        cause = self._cause or "gradient"  # after averaging, the gradient of all ranks
+        """Counts a skipped step and logs the fault of each rank."""
+        cause = self._cause or "gradient"  # averaged, so non-finite on all ranks
         found = all_gather_object(Fault(self._scenes, cause, self.global_step, self.global_rank))
         faults = [fault for fault in found if fault.cause != "gradient"] or found
         if self.trainer.is_global_zero:
@@ -237,7 +241,7 @@ class VG2GTModule(lightning.LightningModule):
         self.skipped.add(faults)
 
     def configure_optimizers(self) -> dict[str, Any]:
-        """Optimiser over the trained parameters and a per-step cosine schedule over the whole run."""
+        """Returns the optimiser of the trained parameters and a per-step cosine schedule over the whole run."""
         optimizer = self.make_optimizer(parameter_groups(self.model, self.lr_factors))
         initial_lr = optimizer.param_groups[0]["lr"]
         for group in optimizer.param_groups:
@@ -250,18 +254,18 @@ class VG2GTModule(lightning.LightningModule):
     # ----------------------------------------------------------------------------------------------- evaluation
 
     def on_validation_epoch_start(self) -> None:
-        """Forgets the metrics of the evaluation before."""
+        """Clears the metrics of the previous evaluation."""
         self._metrics = {}
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
-        """Evaluates one held-out scene batch."""
+        """Evaluates a batch of scenes on their held-out views."""
         for index, scene in enumerate(batch.scene):
             sample = (scene, *batch.frame_ids[index].tolist())
             metrics = evaluate_scene(self.model, self.renderer, batch.single(index), self.rasterized_depth)
             self._metrics[sample] = metrics
 
     def on_validation_epoch_end(self) -> None:
-        """Logs means over all ranks' scenes, joined in the order of one process, as ``eval/<name>``."""
+        """Logs means over the scenes of all ranks, in the order of a single process, as ``eval/<name>``."""
         for metrics in interleave(all_gather_object(self._metrics)).values():
             for name, value in metrics.items():
                 if math.isfinite(value):  # a scene without ground-truth depth has no depth error
@@ -270,7 +274,7 @@ class VG2GTModule(lightning.LightningModule):
     # ---------------------------------------------------------------------------------------------- checkpoints
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Keeps the trained part only, the identity of the backbone it began with, and how the model was configured."""
+        """Keeps only the trained part; adds the backbone's identity, skipped steps and the model's configuration."""
         checkpoint["state_dict"] = {MODEL_PREFIX + name: value for name, value in self.model.trained_state().items()}
         checkpoint["backend"] = dict(self.model.backend.identity())
         checkpoint["skipped_steps"] = self.skipped.state_dict()
@@ -278,7 +282,7 @@ class VG2GTModule(lightning.LightningModule):
             checkpoint[MADE_OF] = self.made_of
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Refuses a checkpoint that was trained on another backbone."""
+        """Restores the count of skipped steps; raises ValueError if the checkpoint has another backbone."""
         self.model.check_backend(checkpoint.get("backend"))
         self.skipped.load_state_dict(checkpoint["skipped_steps"])
 
@@ -299,7 +303,7 @@ def _leave_only_coarse(model: Reconstructor) -> None:
 
 
 def _check_part(part: str, pose_noise: float) -> None:
-    """Refuses what cannot be trained."""
+    """Raises ValueError for an unknown part or an invalid pose noise."""
     if part not in get_args(Part):
         raise ValueError(f"training.part={part} is unknown: choose one of {', '.join(get_args(Part))}")
     if not 0 <= pose_noise <= 1:

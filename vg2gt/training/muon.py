@@ -1,4 +1,4 @@
-"""The optimiser of the quick run: Muon for matrices, AdamW for all else."""
+"""Muon for matrices, AdamW for all other parameters; used by the quick run."""
 
 from __future__ import annotations
 
@@ -9,26 +9,27 @@ from typing import Any
 import torch
 from torch import Tensor
 
-QUINTIC = (3.4445, -4.7750, 2.0315)  # takes singular values to between .7 and 1.2 in five steps, small ones fastest
+QUINTIC = (3.4445, -4.7750, 2.0315)  # brings singular values to 0.7-1.2 in five steps; steepest at 0
 LIKE_ADAMW = 0.2  # root mean square of AdamW's updates
 TINY = 1e-7
 
 
 class MuonAdamW(torch.optim.AdamW):
-    """Updates matrices by their orthogonalised momentum, all else as AdamW does.
+    """Updates matrices with Muon (orthogonalised momentum) and all other parameters with AdamW.
 
-    A matrix W ``[a, b]`` (of a convolution: outputs by all else) moves by ``-lr * 0.2 sqrt(max(a, b)) O``, where O is
-    the orthogonal factor of the Nesterov momentum of its gradient. Muon: Jordan et al. (2024); the factor, with which
-    updates are as large as AdamW's, and the weight decay: Liu et al. (2025, Muon is Scalable for LLM Training).
+    A matrix ``[a, b]`` is updated by ``-lr * 0.2 sqrt(max(a, b)) O``, where O is the orthogonal factor of the Nesterov
+    momentum of its gradient. Convolution kernels are flattened to ``[out, rest]``. Muon follows Jordan et al. (2024).
+    The scale, which matches the size of AdamW's updates, and the weight decay follow Liu et al. (2025, Muon is Scalable
+    for LLM Training).
 
     Args:
-        params: parameters or groups of them; named where ``adamw`` is to find them.
-        lr: learning rate of both; a group may have its own.
-        momentum: of Muon, in [0, 1).
-        adamw: the first parts of names, such as ``coarse``, of parameters that AdamW updates whatever their shape.
-        betas: of AdamW.
-        weight_decay: of both, times the rate; a group may have its own.
-        fused: AdamW's step in one kernel.
+        params: parameters or parameter groups; must be named for ``adamw`` to match them.
+        lr: learning rate of both optimisers; groups may override it.
+        momentum: momentum of Muon, in [0, 1).
+        adamw: first components of parameter names, such as ``coarse``, that AdamW updates whatever their shape.
+        betas: AdamW's coefficients of the running averages.
+        weight_decay: decoupled weight decay of both optimisers, scaled by the learning rate; groups may override it.
+        fused: use AdamW's fused kernel.
 
     Raises:
         ValueError: if a number is out of range.
@@ -52,7 +53,7 @@ class MuonAdamW(torch.optim.AdamW):
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:
-        """Takes a step; returns the closure's loss. Parameters without a gradient stay as they are."""
+        """Takes a step; returns the closure's loss. Parameters without a gradient are unchanged."""
         loss = None
         if closure is not None:
             with torch.enable_grad():
@@ -64,14 +65,14 @@ class MuonAdamW(torch.optim.AdamW):
             size = LIKE_ADAMW * max(update.shape) ** 0.5
             matrix.mul_(1 - group["lr"] * group["weight_decay"])
             matrix.add_(update.view_as(matrix), alpha=-group["lr"] * size)
-            matrix.grad = None  # AdamW passes over what has none
+            matrix.grad = None  # AdamW skips parameters without a gradient
         super().step()
         for (_, matrix), gradient in zip(matrices, kept, strict=True):
             matrix.grad = gradient
         return loss
 
     def _matrices(self, group: dict[str, Any]) -> list[Tensor]:
-        """The parameters of a group that have a gradient and are Muon's."""
+        """Parameters of a group that have a gradient and are updated by Muon."""
         names = group.get("param_names") or [""] * len(group["params"])
         return [
             parameter
@@ -80,11 +81,11 @@ class MuonAdamW(torch.optim.AdamW):
         ]
 
     def _nesterov(self, matrix: Tensor) -> Tensor:
-        """Momentum of the gradient, looking ahead, as ``[outputs, all else]``."""
+        """Nesterov momentum of the gradient, as ``[out, rest]``."""
         assert matrix.grad is not None
         state = self.state[matrix]
         if not state:
-            state["step"] = torch.zeros(())  # AdamW expects it of whatever has a state
+            state["step"] = torch.zeros(())  # AdamW expects it in every state
             state["momentum"] = torch.zeros_like(matrix)
         state["step"] += 1
         state["momentum"].lerp_(matrix.grad, 1 - self.momentum)
@@ -96,9 +97,13 @@ def _is_matrix(parameter: Tensor) -> bool:
 
 
 def orthogonalized(matrices: Sequence[Tensor], steps: int = 5) -> list[Tensor]:
-    """Nearly the orthogonal factors ``U V^T`` of matrices ``[a, b]`` ``U S V^T``, by ``steps`` of a quintic iteration.
+    """Returns the approximate orthogonal factors ``U V^T`` of matrices ``U S V^T``, by a quintic iteration.
 
-    Singular values far below the largest are not lifted to 1 in full; what is not finite stays so.
+    Singular values far below the largest do not reach 1. Non-finite values stay non-finite.
+
+    Args:
+        matrices: matrices ``[a, b]``, of any sizes.
+        steps: number of iterations.
     """
     places = defaultdict(list)
     for place, matrix in enumerate(matrices):
@@ -111,7 +116,7 @@ def orthogonalized(matrices: Sequence[Tensor], steps: int = 5) -> list[Tensor]:
 
 
 def _orthogonalized(x: Tensor, steps: int) -> Tensor:
-    """:func:`orthogonalized` of ``[n, a, b]``; the products are as small as they can be on its wide side."""
+    """:func:`orthogonalized` for a stack ``[n, a, b]``; tall matrices are transposed so that products are smaller."""
     if x.shape[1] > x.shape[2]:
         return _orthogonalized(x.mT, steps).mT
     linear, cubic, quintic = QUINTIC

@@ -1,4 +1,4 @@
-"""The end of a run: a table, untrained head against trained head, and a picture."""
+"""Final report of a run: a table comparing the untrained with the trained head, and a preview image."""
 
 from __future__ import annotations
 
@@ -55,7 +55,17 @@ def comparison_table(untrained: dict[str, float], trained: dict[str, float]) -> 
 
 @torch.no_grad()
 def write_preview(module: VG2GTModule, datamodule: LightningDataModule, path: str | Path, scenes: int = 3) -> Path:
-    """Writes one row a scene: input | rendered colour | depth | normals | truth, of the middle held-out view."""
+    """Writes one row per scene: an input, then the middle held-out view's rendered colour, depth, normals, and truth.
+
+    Args:
+        module: the trained module.
+        datamodule: provides the evaluation scenes.
+        path: PNG file to write.
+        scenes: maximum number of scenes.
+
+    Returns:
+        The path written.
+    """
     module.eval()
     rows = []
     for batch in datamodule.val_dataloader():

@@ -12,7 +12,13 @@ Named = tuple[str, nn.Parameter]
 
 
 def cosine_with_warmup(steps: int, warmup_steps: int, final_factor: float) -> Callable[[int], float]:
-    """Returns the learning-rate factor of a step: linear warm-up to 1, then cosine to ``final_factor`` at ``steps``."""
+    """Returns a function from step to learning-rate factor: linear warm-up to 1, then cosine decay.
+
+    Args:
+        steps: total number of steps.
+        warmup_steps: steps of linear warm-up.
+        final_factor: factor at ``steps`` and after.
+    """
 
     def factor(step: int) -> float:
         if step < warmup_steps:
@@ -24,9 +30,15 @@ def cosine_with_warmup(steps: int, warmup_steps: int, final_factor: float) -> Ca
 
 
 def parameter_groups(module: nn.Module, factors: Mapping[str, float] | None = None) -> list[dict[str, Any]]:
-    """Splits the trainable parameters, by name: matrices decay; biases, norms, gains and other vectors do not.
+    """Splits the trainable parameters into optimiser groups; vectors (biases, norms, gains) get no weight decay.
 
-    ``factors`` of the learning rate by children's names make groups of their own, which say theirs as ``lr_factor``.
+    Args:
+        module: module whose parameters to split.
+        factors: learning-rate factor by name of the direct child module. Children with a factor other than 1 get groups
+            of their own, with the factor as ``lr_factor``.
+
+    Returns:
+        Groups with named parameters as ``params``.
     """
     apart = {name: factor for name, factor in (factors or {}).items() if factor != 1}
     parameters = [(name, parameter) for name, parameter in module.named_parameters() if parameter.requires_grad]

@@ -1,6 +1,6 @@
-"""Steps that are skipped because something in them is not finite: no weight or moment changes, on any rank.
+"""Skipping of training steps with non-finite values: weights and moments stay unchanged on all ranks.
 
-A skipped step still counts: data, random draws and learning rate go on, so that a resumed run meets the same steps.
+A skipped step still counts: data, random draws and learning rate advance, so that a resumed run sees the same steps.
 """
 
 from __future__ import annotations
@@ -11,12 +11,19 @@ from typing import Any
 import torch
 from torch import Tensor
 
-KEPT = 20  # faults in the report of a run
+KEPT = 20  # maximum number of faults in the report of a run
 
 
 @dataclass(frozen=True)
 class Fault:
-    """What a rank found wrong with a step: the scenes of its batch, what is not finite, the step's number, the rank."""
+    """Non-finite values that a rank found in a step.
+
+    Attributes:
+        scenes: scenes of the rank's batch.
+        cause: what is not finite.
+        step: step number.
+        rank: rank that found it.
+    """
 
     scenes: tuple[str, ...]
     cause: str
@@ -28,18 +35,21 @@ class Fault:
 
 
 def finite(*tensors: Tensor) -> bool:
-    """Whether every value is finite; a GPU is waited for once where it is."""
-    sums = torch.stack([tensor.detach().sum().float() for tensor in tensors])  # a bad value shows in the sum
+    """Returns whether all values are finite; synchronises with the GPU only once if they are."""
+    sums = torch.stack([tensor.detach().sum().float() for tensor in tensors])  # a non-finite value makes the sum so
     return bool(sums.isfinite().all()) or all(bool(tensor.detach().isfinite().all()) for tensor in tensors)
 
 
 class SkippedSteps:
-    """Counts skipped steps; the run ends after ``limit`` of them in a row.
+    """Counts skipped steps and stops the run after too many in a row.
+
+    Args:
+        limit: number of consecutive skipped steps that stops the run; at least 1.
 
     Attributes:
         total: steps skipped since the run began.
-        in_a_row: steps skipped since the last good one.
-        faults: the first faults of the run, at most :data:`KEPT`.
+        in_a_row: steps skipped since the last good step.
+        faults: first faults of the run, at most :data:`KEPT`.
     """
 
     def __init__(self, limit: int) -> None:
@@ -51,7 +61,7 @@ class SkippedSteps:
         self.faults: list[Fault] = []
 
     def add(self, faults: list[Fault]) -> None:
-        """Counts a skipped step; raises FloatingPointError if it is one too many in a row."""
+        """Counts a skipped step; raises FloatingPointError at ``limit`` in a row."""
         self.total += 1
         self.in_a_row += 1
         self.faults = (self.faults + faults)[:KEPT]
@@ -62,11 +72,11 @@ class SkippedSteps:
             )
 
     def state_dict(self) -> dict[str, Any]:
-        """Plain values, for a checkpoint and the report of a run."""
+        """Returns plain values, for checkpoints and the report of a run."""
         faults = [asdict(fault) | {"scenes": list(fault.scenes)} for fault in self.faults]
         return {"total": self.total, "in_a_row": self.in_a_row, "faults": faults}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continues the count of a checkpoint."""
+        """Restores the counts from a checkpoint."""
         self.total, self.in_a_row = state["total"], state["in_a_row"]
         self.faults = [Fault(**{**fault, "scenes": tuple(fault["scenes"])}) for fault in state["faults"]]

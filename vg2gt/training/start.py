@@ -1,4 +1,4 @@
-"""How a run begins: from scratch or from a checkpoint of its folder, never silently over another run."""
+"""Start of a run: from scratch or from a checkpoint, without silently overwriting another run."""
 
 from __future__ import annotations
 
@@ -29,12 +29,14 @@ log = logging.getLogger(__name__)
 
 
 def checkpoint_to_resume(config: DictConfig) -> Path | None:
-    """Resolves ``ckpt``; never restarts a run silently and never mixes two runs in one folder. Changes nothing.
+    """Returns the checkpoint that ``ckpt`` refers to, or None to start from scratch. Changes no files.
+
+    A run is never restarted silently, and a folder never mixes two runs.
 
     Raises:
         FileExistsError: if the folder holds another run.
         FileNotFoundError: if ``ckpt`` names no valid checkpoint.
-        ValueError: if the checkpoint is further than the run is asked to go.
+        ValueError: if the checkpoint's step is beyond ``trainer.max_steps``.
     """
     folder = Path(config.output_dir) / "checkpoints"
     old = sorted(folder.glob("*.ckpt"))
@@ -67,7 +69,7 @@ def checkpoint_to_resume(config: DictConfig) -> Path | None:
 
 
 def load_start(module: VG2GTModule, config: DictConfig, checkpoint: Path | None) -> None:
-    """Loads the weights that a run starts from: a checkpoint's, those of ``init_from``, or none. Writes nothing.
+    """Loads the initial weights: those of ``checkpoint``, else of ``init_from``, else none. Writes nothing.
 
     Raises:
         ValueError: if they are not finite or belong to another model, backbone or optimiser.
@@ -102,7 +104,7 @@ def prepare_folder(config: DictConfig, checkpoint: Path | None) -> None:
 
 
 def name_differences(config: DictConfig) -> None:
-    """Says in the log what a resumed run does otherwise than before; raises ValueError for another optimiser."""
+    """Logs how a resumed run's configuration differs from before; raises ValueError if the optimiser does."""
     path = Path(config.output_dir) / "config.yaml"
     if not path.is_file():
         return

@@ -1,4 +1,4 @@
-"""Saves and ends a training when the machine asks it to stop."""
+"""Callback that saves a checkpoint and ends training on a signal."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ SIGNALS = (signal.SIGTERM, signal.SIGINT, *((signal.SIGUSR1,) if hasattr(signal,
 
 
 class StopOnSignal(lightning.Callback):
-    """On SIGTERM, Ctrl-C or SIGUSR1 (SLURM's notice): finishes the step, saves a checkpoint and ends normally.
+    """On SIGTERM, Ctrl-C or SIGUSR1 (SLURM's notice), finishes the step, saves a checkpoint and ends normally.
 
-    A second Ctrl-C ends at once. Signals outside the training end the process as usual.
+    A second Ctrl-C ends at once. Outside training, signals end the process as usual.
 
     Args:
-        folder: where the checkpoint is written, that of the checkpoint callback.
+        folder: folder of the checkpoint; use that of the checkpoint callback.
     """
 
     def __init__(self, folder: str) -> None:
@@ -32,11 +32,11 @@ class StopOnSignal(lightning.Callback):
         self._previous: dict[signal.Signals, Any] = {}
 
     def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        """Takes over the signals for the time of the training."""
+        """Installs the signal handlers for the duration of training."""
         self._previous = {number: signal.signal(number, self._note) for number in SIGNALS}
 
     def on_validation_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        """Outside the training there is nothing to save: Lightning's handler would only take a note."""
+        """Restores the default SIGTERM outside training, where Lightning's handler would only record the signal."""
         if trainer.state.fn == TrainerFn.VALIDATING:
             signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
@@ -48,19 +48,19 @@ class StopOnSignal(lightning.Callback):
 
     def on_train_batch_end(self, trainer: lightning.Trainer, *args: Any) -> None:
         """Saves and stops at the end of the step in which a signal reached any rank."""
-        # Lightning's own handler only takes a note of a SIGTERM before the training starts.
+        # Before training starts, Lightning's own handler records a SIGTERM.
         asked = self.received or bool(getattr(trainer, "received_sigterm", False))
         if not trainer.strategy.reduce_boolean_decision(asked, all=False):
             return
         path = self.folder / f"step-{trainer.global_step}.ckpt"
         if not getattr(trainer, "fast_dev_run", False):
             trainer.save_checkpoint(path)
-        trainer.limit_val_batches = 0  # a trainer that is told to stop would evaluate once more
+        trainer.limit_val_batches = 0  # should_stop alone would evaluate once more
         trainer.should_stop = True
         log.warning("stopping as asked by a signal: saved %s, continue with ckpt=last", path)
 
     def teardown(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, stage: str) -> None:
-        """Gives back the signals that Lightning has not given back itself, after an error as well."""
+        """Restores the handlers that Lightning has not restored; also runs after an error."""
         for number, handler in self._previous.items():
             if signal.getsignal(number) == self._note:
                 signal.signal(number, handler)
