@@ -131,7 +131,7 @@ class Backend(nn.Module, ABC):
             ValueError: if they have the wrong shape, size or range.
         """
         if images.dim() != 5 or images.shape[2] != 3 or 0 in images.shape:
-            raise ValueError(f"images must be [B, V, 3, H, W] with nothing empty, got {list(images.shape)}")
+            raise ValueError(f"images must be [B, V, 3, H, W] with no empty dimension, got {list(images.shape)}")
         height, width = images.shape[-2:]
         if height % self.patch_size or width % self.patch_size:
             nearest = [max(round(size / self.patch_size), 1) * self.patch_size for size in (height, width)]

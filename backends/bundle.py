@@ -84,7 +84,9 @@ def read_bundle(folder: Path) -> Description:
     """
     for name in (DESCRIPTION, ENCODER, DECODER):
         if not (folder / name).is_file():
-            raise FileNotFoundError(f"{folder} is no ONNX bundle, it has no {name}: copy the whole folder, or {REMEDY}")
+            raise FileNotFoundError(
+                f"{folder} is not an ONNX bundle, {name} is missing: copy the whole folder, or {REMEDY}"
+            )
     file = folder / DESCRIPTION
     try:
         content = json.loads(file.read_text())
@@ -112,7 +114,7 @@ def load_decoder(folder: Path, decoder: Mapping[str, Any]) -> Decoder | None:
     kind = DECODERS.get(str(decoder.get("class")))
     if kind is None:
         raise ValueError(
-            f"{folder / DESCRIPTION} names the decoder {decoder.get('class')!r}; known are {', '.join(DECODERS)}. "
+            f"{folder / DESCRIPTION} names the unknown decoder {decoder.get('class')!r}, not {' or '.join(DECODERS)}. "
             f"Remove {DECODER_WEIGHTS} to decode without gradient, or {REMEDY}"
         )
     try:

@@ -77,7 +77,7 @@ class TokenCache:
         except FileNotFoundError:
             return None
         except Exception as error:  # damaged files fail in many ways; all are fixed by writing the file again
-            log.warning("%s cannot be read (%s): made again", path, error)
+            log.warning("cannot read %s (%s): computing it again", path, error)
             return None
         with suppress(OSError):  # read-only folder
             os.utime(path)

@@ -84,7 +84,7 @@ def export(backend: Backend, out: Path) -> Description:
         ImportError: if ``onnx`` or ``onnxscript`` is not installed.
     """
     if not isinstance(backend, VGGTBackend | DA3Backend):
-        raise ValueError(f"backend {backend.name} cannot be exported: VGGT and the relative DA3 networks can")
+        raise ValueError(f"backend {backend.name} cannot be exported, only VGGT and the relative DA3 networks")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise FileExistsError(f"{out} exists already: remove it or choose another out=FOLDER")
     if not all(importlib.util.find_spec(package) for package in ("onnx", "onnxscript")):
@@ -159,7 +159,7 @@ def export_graph(
             fixed = [axis for axis in axes if isinstance(shape[axis], int) or shape[axis].node.expr.is_number]
             if fixed:
                 raise RuntimeError(
-                    f"export fixed the axes {fixed} of {name}, now {list(shape)}: a Python number in code"
+                    f"the export fixed axes {fixed} of {name} (shape {list(shape)}): code uses them as Python numbers"
                 )
         program = torch.onnx.export(
             exported,

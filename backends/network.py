@@ -95,7 +95,7 @@ class NetworkBackend(Backend):
     ) -> None:
         """Builds the network with its weights and freezes it; last call of the constructor."""
         if list(taps) != sorted(set(taps)):
-            raise ValueError(f"backend.taps={list(taps)} must ascend: the heads take shallow layers first")
+            raise ValueError(f"backend.taps={list(taps)} must be ascending: the heads expect shallow layers first")
         self.taps = tuple(taps)
         self.head_chunk = head_chunk
         self.weights = weights

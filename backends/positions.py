@@ -99,7 +99,7 @@ def _centered(length: int, device: torch.device) -> Tensor:
 
 
 Rotary = tuple[Tensor, Tensor]
-"""Cosines and sines, each ``[..., N, head_dim]``."""
+"""Cosines and sines of a rotary embedding, each ``[..., N, head_dim]``."""
 
 
 def grid_positions(height: int, width: int, like: Tensor) -> Tensor:

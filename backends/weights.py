@@ -59,8 +59,8 @@ class Weights:
         if not self.pretrained:
             if self.path is not None:
                 raise ValueError(
-                    f"backend {self.name}: pretrained=false means random weights, path={self.path} names others: leave "
-                    "one of them out"
+                    f"backend {self.name}: pretrained=false requests random weights, but path={self.path} is set; "
+                    "remove one of them"
                 )
             with seeded_initialisation(self.seed):
                 return make()

@@ -153,7 +153,7 @@ def chosen(names: str) -> dict[str, Model]:
     """Returns the models named by ``models=``, or all that run with any backend; raises SystemExit if unknown."""
     folders = [model.folder for model in MODELS.values()]
     if unknown := set(names.split(",")) - {*folders, ""}:
-        raise SystemExit(f"models={names}: no model {', '.join(sorted(unknown))}; there are {', '.join(folders)}")
+        raise SystemExit(f"models={names}: unknown {', '.join(sorted(unknown))}; choose from {', '.join(folders)}")
     return {
         name: model
         for name, model in MODELS.items()
@@ -171,7 +171,7 @@ def coarse_start(path: str, home: Path) -> tuple[str, ...]:
         return ()
     home.mkdir(parents=True, exist_ok=True)
     if not any(name.startswith(COARSE) for name in read_checkpoint(path)["state_dict"]):
-        raise SystemExit(f"coarse={path}: this checkpoint has no coarse module; take one of experiment=sweep_coarse")
+        raise SystemExit(f"coarse={path}: this checkpoint has no coarse module; use one of experiment=sweep_coarse")
     start = write_part(Path(path), home / "coarse.ckpt", lambda name: name.startswith(COARSE))
     return f"init_from={quoted(start)}", "training.coarse_lr_factor=0.3"
 

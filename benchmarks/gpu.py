@@ -329,7 +329,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     options = parser(__doc__, out=Path(os.environ.get("OUT") or ROOT / "benchmarks" / "results"), device=True)
     options.add_argument("--parts", nargs="+", choices=list(PARTS), default=list(PARTS), metavar="NAME")
     options.add_argument("--small", action="store_true", help="tiny sizes")
-    options.add_argument("--minutes", type=float, default=8, help="that all parts together may take")
+    options.add_argument("--minutes", type=float, default=8, help="time limit for all parts, in minutes")
     options.add_argument("--here", choices=list(PARTS), help="run this part in this process")
     arguments = options.parse_args(argv)
     if arguments.device == "cpu" and not arguments.small:

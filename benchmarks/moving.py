@@ -84,14 +84,14 @@ def rows(loaded: LoadedModel, checks: Checks, cases: Sequence[tuple], seeds: ran
 
 def main() -> None:
     """Measures, prints and writes."""
-    options = parser(__doc__, threads=1, overrides="of backend, model and renderer")
+    options = parser(__doc__, threads=1, overrides="Hydra overrides of backend, model and renderer")
     options.add_argument("--distances", type=float, nargs="+", default=[0.0, 0.25, 0.5, 1.0, 2.0], metavar="METRES")
     options.add_argument("--during", type=float, nargs=2, action="append", metavar=("FROM", "TO"))
     options.add_argument("--views", type=int, default=12)
     options.add_argument("--size", type=int, nargs=2, default=(112, 168), metavar=("HEIGHT", "WIDTH"))
     options.add_argument("--scenes", type=int, default=4)
     options.add_argument("--moment", type=int, default=3)
-    options.add_argument("--name", default="moving", help="of the file of results")
+    options.add_argument("--name", default="moving", help="name of the result file")
     given = options.parse_args()
     torch.set_num_threads(given.threads)
     loaded = load_model(overrides=given.overrides, device="cpu")

@@ -92,7 +92,7 @@ def prepare(name: str, photos: Path, out: Path, size: int, patch: int, poses: st
     if poses == "given":
         pictures, model = given_pictures(photos), model_folder_of(photos)
         if pictures is None:
-            raise ValueError(f"{photos} has no cameras beside its images: expected {LAYOUTS}; or take --poses sfm")
+            raise ValueError(f"{photos} has no cameras next to its images: expected {LAYOUTS}; or use --poses sfm")
         titles: dict[str, str] = {}
     else:
         pictures = find_cameras(find_pictures(photos), out / "sfm", Monitor())
@@ -101,7 +101,7 @@ def prepare(name: str, photos: Path, out: Path, size: int, patch: int, poses: st
     held_out = tuple(i for i in range(len(pictures)) if i % EVERY == EVERY // 2)
     context = tuple(i for i in range(len(pictures)) if i not in held_out)
     if len(context) < FEWEST or not held_out:
-        raise ValueError(f"{photos}: {len(pictures)} photographs have cameras; {EVERY} are needed at least")
+        raise ValueError(f"{photos}: only {len(pictures)} photographs have cameras; at least {EVERY} are needed")
     assert views.hints is not None
     assert views.hints.cameras is not None
     folder = out / str(size)

@@ -132,7 +132,7 @@ def ours(
     rows = [{"budget": FEED_FORWARD, **scored(FEED_FORWARD, scene, taken, 0)}]
     for budget in budgets:
         if budget <= taken:
-            print(f"{photos.name}: {taken:.0f} core-seconds are over before refinement begins, {budget:g} left out")
+            print(f"{photos.name}: budget {budget:g} skipped, {taken:.0f} core-seconds passed before refinement")
             continue
         memory.restart()
         began = time.process_time()
@@ -152,7 +152,7 @@ def peer(binary: Path, scores: Scores, extra: Sequence[str], budgets: Sequence[f
     """
     photos, rows, pace = scores.photos, [], None
     if not photos.points:
-        raise ValueError(f"{PEER} starts from sparse points, and {photos.folder} has none: take --poses sfm")
+        raise ValueError(f"{PEER} requires sparse points, but {photos.folder} has none: use --poses sfm")
     renderer = Renderer(mode="rasterized", lowpass=0.3, alpha_max=0.999, geometry=False)
     cameras = photos.cameras.select(torch.tensor(photos.context))
     for budget in sorted(budgets):
@@ -227,18 +227,20 @@ def _short(row: Row | None) -> str:
 def arguments() -> argparse.Namespace:
     """Parses the command line."""
     options = parser(__doc__, threads=1)
-    options.add_argument("folders", nargs="+", metavar="FOLDER", help="of photographs; NAME=FOLDER names the set")
+    options.add_argument("folders", nargs="+", metavar="FOLDER", help="folder of photographs, or NAME=FOLDER")
     options.add_argument("--size", type=int, default=280, help="longer side in pixels")
-    options.add_argument("--working-size", type=int, help="longer side that ours works at; --size is scored")
+    options.add_argument("--working-size", type=int, help="longer side that VG²GT works at; scored at --size")
     options.add_argument("--budgets", type=float, nargs="*", default=[30.0, 100.0, 300.0], metavar="CORE_SECONDS")
     options.add_argument("--poses", choices=("sfm", "given"), default="sfm")
     options.add_argument("--ckpt", help="default: the weights in the package")
-    options.add_argument("--model", nargs="+", default=[], metavar="KEY=VALUE", help="of configs/model")
-    options.add_argument("--refine", nargs="+", default=[], metavar="KEY=VALUE", help="of configs/refine")
-    options.add_argument("--opensplat", type=Path, metavar="BINARY", help="run it as well")
+    options.add_argument("--model", nargs="+", default=[], metavar="KEY=VALUE", help="overrides of configs/model")
+    options.add_argument("--refine", nargs="+", default=[], metavar="KEY=VALUE", help="overrides of configs/refine")
+    options.add_argument("--opensplat", type=Path, metavar="BINARY", help="also train OpenSplat")
     options.add_argument("--peer", nargs="+", default=[], metavar="KEY=VALUE", help="options of OpenSplat")
-    options.add_argument("--only-peer", action="store_true", help="leave ours out")
-    options.add_argument("--work", type=Path, default=Path("outputs/photos"), help="cameras, views, pictures")
+    options.add_argument("--only-peer", action="store_true", help="skip VG²GT")
+    options.add_argument(
+        "--work", type=Path, default=Path("outputs/photos"), help="folder for cameras, views and pictures"
+    )
     return options.parse_args()
 
 

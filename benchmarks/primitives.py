@@ -149,15 +149,13 @@ def describe(overrides: list[str], batch: Batch) -> dict[str, Any]:
 
 def main() -> None:
     """Measures, prints and writes."""
-    options = parser(
-        __doc__, device=True, passes=1, overrides="Hydra overrides; rooms have data.num_frames=64 unless they say so"
-    )
+    options = parser(__doc__, device=True, passes=1, overrides="Hydra overrides; default for rooms: data.num_frames=64")
     options.add_argument("--views", type=int, nargs="+", default=[4, 10, 20, 50])
     options.add_argument("--footprints", type=float, nargs="+", default=[1.0, 2.0, 3.3], help="voxel edges in pixels")
     options.add_argument("--model", default="tiny", choices=("tiny", "vg2gt"))
     options.add_argument("--reference", default="pixel_aligned", choices=("pixel_aligned", "da3_gs"))
     options.add_argument("--scenes", type=int, default=1)
-    options.add_argument("--name", default="rooms", help="part of the file's name, and of the table's title")
+    options.add_argument("--name", default="rooms", help="used in the file name and the table's title")
     arguments = options.parse_args()
     torch.set_num_threads(1)
     device = torch.device(arguments.device)

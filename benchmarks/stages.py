@@ -107,7 +107,7 @@ def measure_training(run: Run, batch: Batch, passes: int, device: torch.device) 
         with clock.stage("training step"):
             loss = step(batch)
         if not bool(torch.isfinite(loss)):
-            raise FloatingPointError("the loss is not finite: such a step is dropped, its time says nothing")
+            raise FloatingPointError("the loss is not finite: training skips such steps, so they cannot be timed")
     return min(clock.stages["training step"].seconds[1:])
 
 

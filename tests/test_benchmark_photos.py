@@ -157,7 +157,7 @@ def test_the_peer_gets_the_same_core_seconds(command, photos: Path, room, tmp_pa
 
 def test_a_peer_that_cannot_be_run_is_an_error(command, photos: Path, room, tmp_path: Path) -> None:
     arguments = [str(photos), "--only-peer", "--opensplat", str(program(tmp_path, works=False)), "--budgets", "1"]
-    with pytest.raises(ValueError, match=r"OpenSplat starts from sparse points, and .* has none: take --poses sfm"):
+    with pytest.raises(ValueError, match=r"OpenSplat requires sparse points, but .* has none: use --poses sfm"):
         command(*arguments)
     add_points(photos, room)
     with pytest.raises(RuntimeError, match=r"splat.py .*--num-iters=100.* failed: (.|\n)*Step 100"):
@@ -168,8 +168,8 @@ def test_sets_that_cannot_be_scored_are_refused(photos: Path, tmp_path: Path, be
     prepare = benchmark_script("photo_sets").prepare
     for index in range(2, 7):
         (photos / f"IMG_{index}.png").unlink()
-    with pytest.raises(ValueError, match="room: 2 photographs have cameras; 4 are needed at least"):
+    with pytest.raises(ValueError, match="room: only 2 photographs have cameras; at least 4 are needed"):
         prepare("room", photos, tmp_path / "work", 80, 8, "given")
     (photos / "cameras.json").unlink()
-    with pytest.raises(ValueError, match=r"no cameras beside its images: expected cameras.json.*--poses sfm"):
+    with pytest.raises(ValueError, match=r"no cameras next to its images: expected cameras.json.*--poses sfm"):
         prepare("room", photos, tmp_path / "work", 80, 8, "given")

@@ -180,7 +180,7 @@ def test_rooms_are_made_in_stages_that_resume(recipe, tmp_path):
     run(2)
     assert (out / "rejected/room_0002").exists()
     held = make.Rooms(out, interpreter, args)
-    with pytest.raises(SystemExit, match="another process makes rooms in"):
+    with pytest.raises(SystemExit, match="another process is making rooms in"):
         make.Rooms(out, interpreter, args)
     del held
     rows = list(csv.DictReader((out / "log.csv").open()))

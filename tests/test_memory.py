@@ -120,7 +120,7 @@ def test_full_memory_is_one_error(error):
         note_sizes({"voxels": 7})
         raise error
 
-    said = r"memory is full with 4 images of 28x28, 7 voxels \(.+\)\. Take fewer"
+    said = r"out of memory with 4 images of 28x28, 7 voxels \(.+\)\. To reduce memory, use fewer"
     with pytest.raises(OutOfMemory, match=said) as caught:
         fail()
     assert caught.value.__cause__ is error
@@ -135,7 +135,7 @@ def test_training_names_sizes_and_options(stage: str, tmp_path: Path, monkeypatc
     place = "vg2gt.rendering.renderer.Renderer.__call__" if stage == "renderer" else "vg2gt.method.PointMLP.forward"
     monkeypatch.setattr(place, fail)
     config = compose_run([*SMALL, "trainer.max_steps=1", f"name={tmp_path.name}"], tmp_path)
-    sizes = r"memory is full with 2 images of 28x28 in 1 scene, \d+ voxels"
+    sizes = r"out of memory with 2 images of 28x28 in 1 scene, \d+ voxels"
     sizes += r", \d+ Gaussians" if stage == "renderer" else r" \("
     with pytest.raises(OutOfMemory, match=rf"{sizes}.*data\.max_images.*data\.image_size.*model\.fine\.max_voxels"):
         train(config)

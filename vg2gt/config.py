@@ -20,7 +20,7 @@ OmegaConf.register_new_resolver("last_part", lambda path: Path(str(path)).name, 
 
 _PACKAGE = Path(__file__).resolve().parent
 ENTRY_POINTS = {"backend": "vg2gt.backends", "data": "vg2gt.datasets"}
-"""By group of configurations, the entry points by which installed packages add options to it."""
+"""Entry-point group through which packages add options, by configuration group."""
 
 
 def plugin_targets() -> dict[str, dict[str, str]]:
@@ -54,7 +54,9 @@ def config_dir() -> str:
     for folder in (_PACKAGE / "configs", _PACKAGE.parent / "configs"):
         if (folder / "train.yaml").is_file():
             return str(folder)
-    raise FileNotFoundError(f"no configuration folder with train.yaml in or next to {_PACKAGE}; reinstall vg2gt")
+    raise FileNotFoundError(
+        f"configuration folder (with train.yaml) not found in or next to {_PACKAGE}; reinstall vg2gt"
+    )
 
 
 def group_options(group: str) -> list[str]:
@@ -105,7 +107,7 @@ def near_keys(name: str, overrides: Sequence[str]) -> str:
             room, _, last = key.rpartition(".")
             same = [each for each in known if each.startswith(room) and each.endswith(f".{last}")]
             near = same[:3] or get_close_matches(key, known, 3, 0.75)
-            lines += [f"there is no option {key}, did you mean {' or '.join(near)}?\n"] if near else []
+            lines += [f"unknown option {key}; did you mean {' or '.join(near)}?\n"] if near else []
     return "".join(lines)
 
 

@@ -65,7 +65,7 @@ def memory_advice(advice: str) -> Iterator[None]:
             raise
         at_hand = ", ".join(f"{count} {what}" for what, count in sizes.items()) or "nothing loaded yet"
         said = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        raise OutOfMemory(f"memory is full with {at_hand} ({said}). Take {advice}") from error
+        raise OutOfMemory(f"out of memory with {at_hand} ({said}). To reduce memory, use {advice}") from error
     finally:
         _sizes.reset(token)
 
@@ -117,7 +117,7 @@ class Cap:
         self._passes += 1
         if self._passes & (self._passes - 1) == 0:
             log.warning(
-                "%s=%d per scene: dropped the %d %s of %d %s (pass %d with losses; next said in pass %d)",
+                "%s=%d per scene: dropped the %d %s of %d %s (passes that dropped some: %d; next warning at %d)",
                 self.option, limit, self.dropped, self.rank, len(batch), self.what, self._passes, 2 * self._passes,
             )  # fmt: skip
         return keep

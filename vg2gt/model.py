@@ -65,7 +65,10 @@ class SceneScale:
             return focal.mean((1, 2)).detach() / CANONICAL_FOCAL
         if self.source == "groundtruth":
             if hints is None or hints.depth is None:
-                raise ValueError("model.scale.source=groundtruth needs the data's depth; use normalize without it")
+                raise ValueError(
+                    "model.scale.source=groundtruth requires ground-truth depth; without it, use "
+                    "model.scale.source=normalize"
+                )
             return fit_depth_scale(geometry.depth, hints.depth, hints.depth > 0).nan_to_num(1.0)
         return torch.stack([self._normalize(depth) for depth in geometry.depth.detach()])
 
@@ -102,7 +105,7 @@ class Reconstructor(nn.Module, ABC):
             raise ValueError(f"model.background is {background!r}; choose one of {', '.join(get_args(Background))}")
         if scale.source == "metric" and not backend.is_metric:
             raise ValueError(
-                f"model.scale.source=metric needs a backend that knows metres, {backend.name} does not: "
+                f"model.scale.source=metric requires a metric backend, but {backend.name} is not metric: "
                 "use model.scale.source=normalize or focal"
             )
         backend.freeze()  # again: a subclass may have added layers after its parent's constructor froze the backend
@@ -221,9 +224,9 @@ class Reconstructor(nn.Module, ABC):
         if stored != present:
             wrong = sorted(name for name in stored.keys() | present.keys() if stored.get(name) != present.get(name))
             raise ValueError(
-                f"the checkpoint does not fit this model, first in model.{wrong[0]} (stored {stored.get(wrong[0])}, "
-                f"here {present.get(wrong[0])}): use the model options it was trained with, or init_from= to start "
-                "from the weights that fit"
+                f"the checkpoint does not match this model; first mismatch: model.{wrong[0]} (checkpoint "
+                f"{stored.get(wrong[0])}, model {present.get(wrong[0])}). Use the model options it was trained with, "
+                "or init_from= to load only the matching weights"
             )
         self.load_state_dict(state, strict=False)
 

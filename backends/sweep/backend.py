@@ -22,8 +22,8 @@ SHIPPED = Path(__file__).parent / "weights" / "sweep.safetensors"
 LICENCE = "Apache-2.0"
 _CONFIDENCE = (0.37, 400.0)  # bounds of 1 / expected relative error
 _NO_PARALLAX = (
-    "backend {name} measures depth by parallax and {why}: take photos from different places, or choose a backend that "
-    "knows scenes from single images (backend=vggt_1b, backend=da3_small, ...)"
+    "backend {name} estimates depth from parallax, but {why}: take photos from different positions, or choose a "
+    "single-image backend (backend=vggt_1b, backend=da3_small, ...)"
 )
 
 
@@ -105,6 +105,6 @@ class SweepBackend(Backend):
 
     def _check_parallax(self, views: PosedViews) -> None:
         if len(views.images) < self.min_views:
-            raise ValueError(_NO_PARALLAX.format(name=self.name, why="was given one view"))
+            raise ValueError(_NO_PARALLAX.format(name=self.name, why="got a single view"))
         if not (camera_distances(views.world_to_camera) > 0).any():
-            raise ValueError(_NO_PARALLAX.format(name=self.name, why="all cameras stand in one place"))
+            raise ValueError(_NO_PARALLAX.format(name=self.name, why="all cameras are at the same position"))

@@ -29,14 +29,14 @@ from vg2gt.io.image_files import Size, read_depth
 from vg2gt.io.images import open_image
 
 EVALUATION_SCANS = (24, 37, 40, 55, 63, 65, 69, 83, 97, 105, 106, 110, 114, 118, 122)
-"""The fifteen scans on which surface reconstruction is compared."""
+"""The fifteen scans used to evaluate surface reconstruction."""
 SPARSE_VIEWS = (23, 24, 33)
-"""Frame ids of the protocol with three input views, in the numbering of the files (from 0)."""
+"""Frame ids of the three-view protocol, numbered from 0 as in the file names."""
 MILLIMETRE = 1e-3
 FULL_SIZE = (1200, 1600)
 """Height and width of the recorded images."""
 MASK_THRESHOLD = 10
-"""Pixels whose ``depth_visual`` is not brighter have no depth."""
+"""Pixels have depth only where ``depth_visual`` is brighter than this."""
 
 _QUARTER = 4
 
@@ -194,7 +194,7 @@ class DTU(FileSource):
     def _depth_place(self, scene: str) -> Path:
         number = _scan_number(scene)
         if number is None:
-            raise DataError(f"scene {scene} is not called scanN, so that its depth in {self.depth_root} is not known")
+            raise DataError(f"scene {scene} is not named scanN, so its depth in {self.depth_root} cannot be found")
         assert self.depth_root is not None
         return self.depth_root / (f"stl{number:03d}_total.ply" if self.depth == "scan" else f"scan{number}")
 

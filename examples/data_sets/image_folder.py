@@ -15,7 +15,7 @@ from vg2gt.io.files import by_number
 from vg2gt.io.image_files import Size, image_size, read_color
 
 FOCAL = 1.2
-"""Placeholder focal length, in the larger side of the image: the usual first guess of structure from motion."""
+"""Placeholder focal length in units of the larger image side; the usual first guess of structure from motion."""
 
 
 class ImageFolder(FileSource):

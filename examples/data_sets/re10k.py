@@ -101,4 +101,4 @@ def _chunk(path: Path) -> Mapping[str, Mapping[str, Any]]:
         content = torch.load(regular(path), map_location="cpu", weights_only=True, mmap=True)
         return {entry["key"]: {name: entry[name] for name in ("images", "cameras")} for entry in content}
     except (OSError, RuntimeError, KeyError, TypeError, ValueError, EOFError, pickle.UnpicklingError) as error:
-        raise DataError(f"{path} is no chunk of scenes, or damaged: {str(error).splitlines()[0]}") from error
+        raise DataError(f"{path} is damaged or not a chunk of scenes: {str(error).splitlines()[0]}") from error

@@ -20,7 +20,7 @@ from vg2gt.io.image_files import Size
 from vg2gt.io.ply import read_point_ply
 
 VERSION = 1
-"""Raise it when the same scan would give other depth: it is part of the cache's key."""
+"""Version of the depth computed from a scan, part of the cache key; increment it when the result changes."""
 _CHUNK = 1 << 20  # points projected at a time
 
 

@@ -14,7 +14,7 @@ from vg2gt.data.sources.parsing import CORNER_TO_CENTER, numbered
 from vg2gt.io.arrays import load_matrices, load_npz
 
 METADATA = "scene_iphone_metadata.npz"
-"""The file of a scene's cameras."""
+"""File with the cameras of a scene."""
 
 
 class ScanNetPPiPhone(FileSource):

@@ -89,8 +89,8 @@ class TanksAndTemples(FileSource):
         poses = read_log(log_file, scene)
         if len(poses) != len(color):
             raise DataError(
-                f"{log_file} of scene {scene} has {len(poses)} poses for {len(color)} images; they belong together by "
-                "their order, so that all images of the benchmark must be there"
+                f"{log_file} of scene {scene} has {len(poses)} poses for {len(color)} images; they are matched by "
+                "order, so all images of the benchmark are required"
             )
         to_scan = _read_similarity(folder / f"{name}_trans.txt", scene)
         scan = folder / f"{name}.ply"

@@ -30,7 +30,7 @@ INTRINSICS = {
     "freiburg2": (520.9, 521.0, 325.1, 249.7),
     "freiburg3": (535.4, 539.2, 320.1, 247.6),
 }
-"""Calibrated (fx, fy, cx, cy) of the colour images of the three Kinects, 640x480."""
+"""Calibrated (fx, fy, cx, cy) of the 640x480 colour images of the three Kinects."""
 
 _CAMERA = re.compile(r"(?:freiburg|fr)([123])(?!\d)")
 _SHORTEST_QUATERNION = 0.5

@@ -99,7 +99,7 @@ def _read_rows(path: Path, scene: str, camera: int, count: int) -> dict[int, NDA
         )
     numbers = table[:, :2]
     if not ((numbers == np.floor(numbers)) & (numbers >= 0) & (numbers < _LARGEST_NUMBER)).all():
-        raise DataError(f"{path} of scene {scene} has frames or cameras that are no whole numbers")
+        raise DataError(f"{path} of scene {scene} has frames or cameras that are not whole numbers")
     rows = table[table[:, 1] == camera]
     frames, counts = np.unique(rows[:, 0].astype(np.int64), return_counts=True)
     if (counts > 1).any():

@@ -104,7 +104,7 @@ class Rooms:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             raise SystemExit(
-                f"another process makes rooms in {out}: wait for it, end it, or give another --out"
+                f"another process is making rooms in {out}: wait for it, stop it, or use another --out"
             ) from None
 
     def make(self, seed: int) -> None:
@@ -186,11 +186,13 @@ class Rooms:
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rooms", type=int, default=40, help="seeds 0 to this many; ten of the first 40 are held out")
-    parser.add_argument("--out", type=Path, required=True, help="folder of the rooms")
-    parser.add_argument("--views", type=int, default=60, help="views a room")
+    parser.add_argument(
+        "--rooms", type=int, default=40, help="number of rooms, seeds 0 to N-1; ten of the first 40 are held out"
+    )
+    parser.add_argument("--out", type=Path, required=True, help="output folder")
+    parser.add_argument("--views", type=int, default=60, help="views per room")
     parser.add_argument("--size", type=int, nargs=2, default=(112, 224), metavar=("HEIGHT", "WIDTH"))
-    parser.add_argument("--samples", type=int, default=8, help="rays a pixel")
+    parser.add_argument("--samples", type=int, default=8, help="samples per pixel")
     parser.add_argument("--keep-blend", action="store_true", help="keep every room's scene.blend (400 to 500 MB)")
     parser.add_argument("--env", type=Path, help="folder of Infinigen's environment (3 GB)")
     parser.add_argument("--python", default="python3.11", help="interpreter that the environment is made with")
@@ -209,4 +211,4 @@ if __name__ == "__main__":
     try:
         main()
     except KeyboardInterrupt:
-        sys.exit("interrupted; run the same command to go on")
+        sys.exit("interrupted; run the same command to resume")

@@ -20,7 +20,7 @@ _SIDES /= np.linalg.norm(_SIDES, axis=1, keepdims=True)
 _MARGIN = 0.22  # free space around a camera in metres
 _TRIES = 60
 SHARES = {"walk": 12, "turn": 8, "orbit_near": 12, "orbit_far": 12, "near": 8, "far": 8}
-"""Views of every kind of path, of 60."""
+"""Number of views per kind of path, out of 60."""
 
 
 class Space(Protocol):

@@ -11,7 +11,7 @@ KINDS = {
     "Bathroom": "bathroom",
 }
 HELD_OUT = (3, 7, 10, 14, 16, 20, 24, 28, 32, 36)
-"""Seeds that no training may see: two rooms of each kind, among the first forty."""
+"""Seeds excluded from training: two rooms of each kind among the first forty."""
 
 
 def kind(seed: int) -> str:

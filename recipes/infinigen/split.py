@@ -51,7 +51,7 @@ def _link(room: Path, scene: Path, numbers: set[int]) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path, help="that make.py wrote")
+    parser.add_argument("folder", type=Path, help="output folder of make.py")
     try:
         for made in split(parser.parse_args().folder.resolve()):
             print(made)

@@ -46,7 +46,7 @@ def main(config: DictConfig) -> None:
     if config.begin and not checkpoint:
         begin_with(training, Path(config.begin))
     if checkpoint:
-        print(f"going on with {checkpoint} at step {first} of {training.steps}", flush=True)
+        print(f"resuming {checkpoint} at step {first} of {training.steps}", flush=True)
     keep = ModelCheckpoint(
         out, "step-{step:06d}", every_n_train_steps=config.save_every, save_top_k=-1, auto_insert_metric_name=False
     )

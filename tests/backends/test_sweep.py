@@ -134,7 +134,7 @@ def test_cameras_in_one_place_are_refused(make_scene) -> None:
     backend = SweepBackend(pretrained=False)
     images, hints = make_scene(1, 3, (32, 48))
     hints.cameras.world_to_camera[..., :3, 3] = 0
-    with pytest.raises(ValueError, match="parallax and all cameras stand in one place"):
+    with pytest.raises(ValueError, match="parallax, but all cameras are at the same position"):
         backend.encode(images, Hints(cameras=hints.cameras))
 
 

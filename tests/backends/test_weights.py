@@ -70,8 +70,8 @@ def test_weights_that_are_not_finite_are_refused() -> None:
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"path": "here"}, "pretrained=false means random weights, path=here names others"),
-        ({"taps": [3, 1, 0, 2]}, r"backend\.taps=\[3, 1, 0, 2\] must ascend"),
+        ({"path": "here"}, "pretrained=false requests random weights, but path=here is set"),
+        ({"taps": [3, 1, 0, 2]}, r"backend\.taps=\[3, 1, 0, 2\] must be ascending"),
         ({"ffn": "swiglue"}, "backend.ffn is 'swiglue'; choose one of mlp, swiglu"),
     ],
 )

@@ -212,7 +212,7 @@ def test_gaussians_of_da3(make, batch: Batch, tmp_path: Path, cache: Path) -> No
     scores = run_once([*SMALL, *given, "trainer.max_steps=0"], tmp_path)
     assert scores["gaussians"] == batch.context.depth.numel()
     assert all(math.isfinite(scores[name]) for name in ("psnr", "abs_rel", "cv"))
-    with pytest.raises(Exception, match="take backend=da3_giant, not oracle"):
+    with pytest.raises(Exception, match="requires backend=da3_giant, got oracle"):
         make("da3_gs")
 
 

@@ -98,11 +98,11 @@ def said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capture
 
 
 MISTAKES = {
-    "train trainer.max_steps=abc": "TypeError: .*; is a value of the wrong type.* were: trainer.max_steps=abc ",
-    "train name=../x": "InterpolationResolutionError: .* name=../x: a name inside outputs",
+    "train trainer.max_steps=abc": "TypeError: .*; is a value of the wrong type.*: trainer.max_steps=abc ",
+    "train name=../x": "InterpolationResolutionError: .* name=../x must be a path inside outputs",
     "train data=rgbd data.root=not_here": "the data folder not_here .* does not exist: set data.root=",
     "reconstruct . --out x backend=da3_smal": "Could not find 'backend/da3_smal' Available options .*da3_small",
-    "reconstruct . --out x foo=1": "option 'foo=1': expected key=value of backend, model, renderer",
+    "reconstruct . --out x foo=1": "option 'foo=1': expected key=value with a key of backend, model, renderer",
     "render scene.ply --cameras no.json --out x": r"^FileNotFoundError: no cameras at no\.json",
     "reconstruct . --out x --every 0": "^ValueError: every must be at least 1, got 0",
     "export backend=oracle --out bundle": "backend oracle cannot be exported",
@@ -124,11 +124,11 @@ def test_mistakes_are_one_line(words: str, said: Said, tmp_path: Path) -> None:
 
 PLUGINS = f"hydra.searchpath=[{ROOT}/examples/data_sets/configs]"
 OVERRIDES = {
-    "train model.gausians.splits=4": "there is no option model.gausians.splits, did you mean model.gaussians.splits",
+    "train model.gausians.splits=4": "unknown option model.gausians.splits; did you mean model.gaussians.splits",
     "train foo.x=1": "Could not override 'foo.x'",
-    f"evaluate {PLUGINS} evaluation=dtu data.root=X": "no option data.root, did you mean data.train.root or data.val",
+    f"evaluate {PLUGINS} evaluation=dtu data.root=X": "unknown option data.root; did you mean data.train.root or",
     "train backend=da3_smal": r"Could not find 'backend/da3_smal'\s+Available options",
-    "train lr=.1": "there is no option lr, did you mean optimizer.lr",
+    "train lr=.1": "unknown option lr; did you mean optimizer.lr",
 }
 
 

@@ -65,7 +65,7 @@ def test_a_taken_name_gets_a_number_unless_it_is_meant(monkeypatch: pytest.Monke
 def test_names_do_not_lead_out(name: str) -> None:
     with pytest.raises(OmegaConfBaseException) as caught:
         folder(name=name)
-    assert f"name={name}: a name inside outputs" in str(caught.value)
+    assert f"name={name} must be a path inside outputs" in str(caught.value)
 
 
 @pytest.mark.parametrize("name", ["mine", "paper/first", "ein Name", "名前", "..x", "12:30"])

@@ -40,7 +40,7 @@ def test_the_nearest_readable_frame_takes_the_place_of_a_damaged_one(write_recor
     assert len(warnings) == 2
     assert "frame 12 of scene office" in warnings[0]
     assert "00012.png" in warnings[0]
-    assert "number 2" in warnings[1]
+    assert "process: 2)" in warnings[1]
     assert "00013.png" in warnings[1]
     caplog.clear()
     assert dataset[views].frame_ids.tolist() == [[11, 10, 14, 15]]

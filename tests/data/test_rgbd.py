@@ -108,7 +108,7 @@ def test_a_folder_of_recordings_splits_by_scene(write_recording):
     )  # fmt: skip
     module.setup()
     assert next(iter(module.val_dataloader())).scene == ("b",)
-    with pytest.raises(DataError, match="no scene c; found are: a, b"):
+    with pytest.raises(DataError, match="no such scene: c; available: a, b"):
         RGBDFolder(str(root), scenes=["c"])
     with pytest.raises(DataError, match="two scenes are called a"):
         RGBDFolder([str(root / "a"), str(root / "a")])

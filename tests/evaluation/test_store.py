@@ -47,7 +47,7 @@ def test_what_is_not_an_evaluations_is_never_replaced(tmp_path: Path, name: str,
     own = tmp_path / "scenes" / "own" if name == "scenes" else tmp_path / name
     own.parent.mkdir(exist_ok=True)
     own.write_text("mine")
-    with pytest.raises(FileExistsError, match=f"holds {name} of something that is no evaluation"):
+    with pytest.raises(FileExistsError, match=f"holds {name}, which do not belong to an evaluation"):
         ResultStore(tmp_path, {"a": 1}, overwrite)
     assert own.read_text() == "mine"
     assert not (tmp_path / "identity.json").exists()

@@ -86,7 +86,7 @@ PAPERS = {
         ("fit", "pad", "518x518 \\(pad\\)"),
         ("alignment", "none", "aligned by none"),
         ("depth_range", [None, 10], r"within \[None, 10\]"),
-        ("told", True, "told true depth"),
+        ("told", True, "given true depth"),
     ],
 )
 def test_only_the_papers_protocol_may_stand_beside_the_paper(key: str, value: Any, told: str) -> None:

@@ -144,7 +144,7 @@ def test_what_the_head_says_is_a_residual_in_the_surface_frame():
 
 
 def test_the_surfel_start_needs_moments():
-    with pytest.raises(ValueError, match=r"start=surfel needs .* model\.fine\.moments=true"):
+    with pytest.raises(ValueError, match=r"start=surfel requires model\.fine\.moments=true"):
         head(start="surfel")(wall())
     with pytest.raises(ValueError, match=r"gaussians\.start is 'surfels'; choose one of plain, surfel"):
         head(start="surfels")

@@ -102,7 +102,7 @@ def test_wrong_arguments_are_named(tmp_path: Path) -> None:
     with pytest.raises(FileExistsError, match=r"cameras\.bin"):
         io.write_colmap(tmp_path, model, text=True)
     equirectangular = pycolmap.Camera(model="EQUIRECTANGULAR", width=64, height=32, params=[64, 32])
-    with pytest.raises(ValueError, match="EQUIRECTANGULAR has no pinhole part"):
+    with pytest.raises(ValueError, match="EQUIRECTANGULAR has no pinhole equivalent"):
         io.colmap_intrinsics(equirectangular)
 
 

@@ -210,7 +210,7 @@ def test_ascii_points_with_faces(tmp_path: Path) -> None:
         (header(0, ["x", "y"]), "vertices have no z, only x, y"),
         (header(3, ["x", "y", "z"]) + b"\0" * 35, "need 36 bytes, 35 are left"),
         (header(1, ["x", "y", "z"]).replace(b"binary_little_endian", b"ascii") + b"1 2\n", "vertex 0 has 2 numbers"),
-        (header(1, ["x", "y", "z"]).replace(b"binary_little_endian", b"ascii") + b"1 2 a\n", "else than numbers"),
+        (header(1, ["x", "y", "z"]).replace(b"binary_little_endian", b"ascii") + b"1 2 a\n", "not a number"),
     ],
 )
 def test_damage_is_named(tmp_path: Path, content: bytes, message: str) -> None:

@@ -187,9 +187,9 @@ def test_wrong_inputs_are_named(sample) -> None:
     made = sample()
     with pytest.raises(ValueError, match=r"prediction\.initial\.depth is \(1, 3, 24, 32\).*\(1, 2, 24, 32\)"):
         VG2GTLoss()(made.prediction, replace(made.batch, num_context=2))
-    with pytest.raises(ValueError, match="render exactly the named views"):
+    with pytest.raises(ValueError, match="render exactly the selected views"):
         VG2GTLoss()(made.prediction, made.batch, made.rendered, torch.tensor([0]), made.cameras)
-    with pytest.raises(ValueError, match="need views="):
+    with pytest.raises(ValueError, match="requires views="):
         VG2GTLoss()(made.prediction, made.batch, made.rendered)
     with pytest.raises(ValueError, match=r"loss\.align\.source.*'scene'"):
         ScaleAlignment("scene")

@@ -95,7 +95,7 @@ def test_missing_and_wrong_weights_are_named(features, channel_weights, tmp_path
     with pytest.raises(ValueError, match=r"features\.0\.weight.*missing"):
         LPIPS(channel_weights)
     wrong = {**features, **channel_weights, "features.5.bias": torch.zeros(3)}
-    with pytest.raises(ValueError, match=r"features\.5\.bias must be \(128,\), it is \(3,\)"):
+    with pytest.raises(ValueError, match=r"features\.5\.bias must have shape \(128,\), got \(3,\)"):
         LPIPS(wrong)
     (tmp_path / "damaged.pth").write_bytes(b"not a checkpoint")
     with pytest.raises(ValueError, match=r"damaged\.pth is damaged"):

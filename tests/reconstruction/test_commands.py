@@ -75,7 +75,7 @@ def test_path_between_cameras_of_mixed_sizes(scene: Scene, tmp_path: Path, capsy
 
 
 @pytest.mark.parametrize(
-    ("names", "said"), [(["a.png", "a.jpg"], "two views are called a;"), (["../a.png", "b.png"], "outside of")]
+    ("names", "said"), [(["a.png", "a.jpg"], "two views are called a;"), (["../a.png", "b.png"], "leads outside")]
 )
 def test_names_of_views_that_cannot_be_files(names, said: str, scene: Scene, tmp_path: Path) -> None:
     scene.save(tmp_path, ["scene.ply"])
@@ -95,7 +95,7 @@ def test_names_of_views_that_cannot_be_files(names, said: str, scene: Scene, tmp
         (["broken.png", *TINY], r"DataError: cannot read broken.png"),
         (["broken.png", "backend=dinosaur"], "Could not find 'backend/dinosaur' Available options"),
         (["broken.png", "--save", "scene.fbx", *TINY], r"unknown output 'scene.fbx'"),
-        (["broken.png", "backend=oracle"], "measured depth, and there is none with broken.png"),
+        (["broken.png", "backend=oracle"], "measured depth, but broken.png has none"),
     ],
 )
 def test_one_line_says_what_is_wrong(arguments, said: str, tmp_path: Path, monkeypatch) -> None:
@@ -116,9 +116,9 @@ def test_one_line_says_what_is_wrong(arguments, said: str, tmp_path: Path, monke
         ("nowhere", "nowhere does not exist"),
         ("empty", "no images in .*empty"),
         ("note.txt", r"cannot read \S*note\.txt: .*restore the file or leave it out"),
-        ("films", r"no images in .*films .*it has videos, name one: .*a\.mp4"),
+        ("films", r"no images in .*films .*it contains videos, pass one of them: .*a\.mp4"),
         ("bare.r3d", r"bare\.r3d holds no images"),
-        ("note.r3d", r"note\.r3d: no readable archive"),
+        ("note.r3d", r"note\.r3d: not a readable archive"),
     ],
 )
 def test_what_holds_no_images_is_told_before_the_weights_are_loaded(tmp_path: Path, name: str, said: str) -> None:

@@ -155,7 +155,7 @@ def test_who_gets_which_cameras(model, folder: Path, recording: Path, ready, mon
     for poses in ("auto", "backbone"):
         assert {p.source for p in choose(images_alone, folder, poses)} == {""}
     for poses in ("given", "sfm"):
-        with pytest.raises(ValueError, match="da3_tiny takes no cameras, it predicts its own"):
+        with pytest.raises(ValueError, match="da3_tiny predicts its own cameras and accepts none"):
             choose(images_alone, folder, poses)
     with pytest.raises(ValueError, match="works from the depth and poses of a recording"):
         choose(ready.model, recording, "sfm")
@@ -171,7 +171,7 @@ def test_photographs_for_the_oracle_are_refused_before_any_work(trained, photos,
     with pytest.raises(SystemExit) as stopped:
         reconstruct_command.main([str(photos), *chosen, "--out", str(tmp_path / "out"), "--quiet"])
     said = str(stopped.value)
-    assert "works from measured depth, and there is none with" in said
+    assert "needs measured depth, but" in said
     assert "backend=da3_small" in said
     assert "hints" not in said
     assert not (tmp_path / "out").exists()

@@ -57,7 +57,7 @@ def test_landscape_and_portrait_mixed_are_read_whole(folder: Path, frames, put, 
     size = working_size([picture.size for picture in pictures], 14, "cpu")
     assert size[0] / size[1] > 0.8  # as without cameras
     load_views(pictures, size, Monitor())
-    assert "images have another shape" in caplog.text
+    assert "images have a different aspect ratio" in caplog.text
 
 
 @pytest.mark.parametrize("layout", ["named", "reduced", "among", "other case", "any folder"])
@@ -98,7 +98,7 @@ def test_a_model_that_cannot_be_read_is_said_where_others_are_found(model, folde
     path.write_bytes(path.read_bytes()[:100])
     monkeypatch.setattr("vg2gt.reconstruction.cameras.find_cameras", lambda pictures, *_: pictures)
     with pictures_for(model, folder):
-        assert "camera files are not used, structure from motion runs instead:" in caplog.text
+        assert "cannot use the camera files, running structure from motion instead:" in caplog.text
         assert "images.bin" in caplog.text
     with pytest.raises(ValueError, match=r"images\.bin"), pictures_for(model, folder, "given"):
         pass
@@ -215,7 +215,7 @@ def test_panoramas_are_refused_in_one_line(tmp_path: Path) -> None:
     assert len(find_pictures(tmp_path)) == 1
     note = b'<x:xmpmeta><rdf:Description GPano:ProjectionType="equirectangular"/></x:xmpmeta>'
     Image.new("RGB", (200, 100)).save(tmp_path / "sphere.jpg", xmp=note)
-    with pytest.raises(ValueError, match=r"sphere\.jpg is a 360 degree panorama.*faces of a cube"):
+    with pytest.raises(ValueError, match=r"sphere\.jpg is a 360 degree panorama.*cube faces"):
         find_pictures(tmp_path)
 
 

@@ -90,7 +90,7 @@ def test_the_scene_without_them_is_the_scene_that_never_saw_them(parts, tmp_path
 def test_what_cannot_be_changed_says_why(parts, model, tmp_path) -> None:
     start(parts, tmp_path / "scene")
     here = (Renderer(), Monitor(), 4)
-    with pytest.raises(ValueError, match="names already: 000"):
+    with pytest.raises(ValueError, match="already has images with these names: 000"):
         add_images(model, tmp_path / "scene", parts[0], *here)
     with pytest.raises(ValueError, match="not added by one command"):
         take_out(model, tmp_path / "scene", parts[1], *here)

@@ -155,7 +155,7 @@ def test_command_keeps_the_cameras_beside_its_output(given: Path, solved: Path, 
 def test_images_without_a_model_are_refused_with_what_to_try(tmp_path: Path) -> None:
     pytest.importorskip("pycolmap")
     images = [np.full((60, 80, 3), 40 * i, np.uint8) for i in range(3)]
-    with pytest.raises(ValueError, match=r"cameras of these 3 images cannot be found.*20 or more.*da3_small"):
+    with pytest.raises(ValueError, match=r"cannot find the cameras of these 3 images.*20 or more.*da3_small"):
         sfm.find_cameras(find_pictures(images), tmp_path / "sfm", Monitor())
     with pytest.raises(ValueError, match=r"a single image"):
         sfm.find_cameras(find_pictures(images[:1]), tmp_path / "sfm", Monitor())

@@ -77,7 +77,7 @@ def test_a_camera_that_only_turns_is_refused_and_nothing_is_kept(shared: Path, t
         x, z = (column - 200) * np.cos(turn) + 400 * np.sin(turn), 400 * np.cos(turn) - (column - 200) * np.sin(turn)
         places = np.round((row - 150) / z * 400 + 360), np.round(x / z * 400 + 540)
         views.append(wide[places[0].clip(0, 719).astype(int), places[1].clip(0, 1079).astype(int)])
-    with pytest.raises(ValueError, match=r"cameras of these 8 images cannot be found.*rather than turning on the spot"):
+    with pytest.raises(ValueError, match=r"cannot find the cameras of these 8 images.*rather than turning on the spot"):
         sfm.find_cameras(find_pictures(views), tmp_path / "sfm", Monitor())
     assert not (tmp_path / "sfm").exists()
 
@@ -125,8 +125,8 @@ def test_copies_count_once_and_parts_are_named(kept: Path, photos: Path, tmp_pat
     sfm.find_cameras(find_pictures([photos, tmp_path / "more"]), kept, Monitor())
     assert "1 images are copies of others and are left out: same (as IMG_9)" in caplog.text
     assert "1 of 4 images overlap too little with the others" in caplog.text
-    assert "1 of them form another part, which nothing connects with the 3 images taken" in caplog.text
-    assert "reconstruct that part alone: IMG_11" in caplog.text
+    assert "1 of them form a separate part with no overlap with the 3 images used" in caplog.text
+    assert "reconstruct that part separately: IMG_11" in caplog.text
 
 
 def model(names: str, points: int) -> SimpleNamespace:
@@ -160,4 +160,4 @@ def test_the_larger_of_two_scenes_is_taken_and_the_other_named(shared: Path, tmp
     fox = sorted((shared / "data" / "ingp_fox" / "images").iterdir())[:10]
     pictures = sfm.find_cameras(find_pictures([*fox, *office_photos(shared, 14)]), tmp_path / "sfm", Monitor())
     assert [picture.name for picture in pictures] == [path.stem for path in office_photos(shared, 14)]
-    assert "10 of them form another part, which nothing connects with the 14 images taken" in caplog.text
+    assert "10 of them form a separate part with no overlap with the 14 images used" in caplog.text

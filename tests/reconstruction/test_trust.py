@@ -168,7 +168,7 @@ def test_the_command_filters_and_the_viewer_colours(recording, calibration, tmp_
     view_command.main([str(tmp_path / "out" / "scene.ply"), "--color", "trust", "--html", str(tmp_path / "page.html")])
     assert (tmp_path / "page.html").is_file()
     plain = write_gaussian_ply(tmp_path / "plain.ply", read_gaussian_ply(tmp_path / "out" / "scene.ply"))
-    with pytest.raises(SystemExit, match="does not say what is known"):
+    with pytest.raises(SystemExit, match="has no support per Gaussian"):
         view_command.main([str(plain), "--color", "trust", "--html", str(tmp_path / "page.html")])
     with pytest.raises(SystemExit, match="choose from unseen"):
         run(recording, "--out", tmp_path / "o", "--drop", "bad")

@@ -113,7 +113,7 @@ def test_a_divergence_goes_back_and_says_so(start: Start, trouble: str, caplog: 
     with caplog.at_level(logging.WARNING):
         found = run(start, options)
     assert found.retreats >= 1
-    assert "rates times 0.5" in caplog.messages[0]
+    assert "learning rates scaled by 0.5" in caplog.messages[0]
     assert all(getattr(found.scene.gaussians, f.name).isfinite().all() for f in fields(found.scene.gaussians))
     if trouble == "means":
         assert found.psnr[1].mean() >= found.psnr[0].mean()
@@ -251,7 +251,7 @@ def test_options_out_of_range(changes: dict, said: str) -> None:
 
 
 def test_what_does_not_go_together_is_named(start: Start) -> None:
-    with pytest.raises(ValueError, match="images, depth and cameras alike"):
+    with pytest.raises(ValueError, match="matching images, depth and cameras"):
         run(replace(start, cameras=start.cameras.select(slice(0, 3))), RefineOptions())
     with pytest.raises(ValueError, match="no Gaussians"):
         run(replace(start, gaussians=start.gaussians.map(lambda tensor: tensor[:0])), RefineOptions())

@@ -84,7 +84,7 @@ def test_a_damaged_last_checkpoint_is_set_aside(tmp_path: Path, cache: Path, who
     aside.unlink()
     harness.assert_same(whole, folder)
     said = folder.with_name("run.out").read_text()
-    assert "trying the one before" in said
+    assert "trying the previous checkpoint" in said
     assert "continuing from step-4.ckpt" in said
 
 

@@ -47,7 +47,7 @@ def test_a_bad_value_in_the_data_drops_the_step(run: Run, caplog: pytest.LogCapt
     audit.assert_sound()
     assert audit.skipped == [False, *([True] * len(bad)), False]
     for i in range(len(PARTS)):
-        assert f"step {i + 1} skipped, not finite: rank 0, room-{i}: images, depth or cameras" in caplog.text
+        assert f"skipped step {i + 1} with non-finite values: rank 0, room-{i}: images, depth or cameras" in caplog.text
     assert run.module.skipped.faults[0] == Fault(("room-0",), "images, depth or cameras of the batch", 1, 0)
 
 
@@ -137,7 +137,7 @@ def test_a_bad_gradient_of_one_parameter_skips_the_step(run: Run, caplog: pytest
     audit = fit(run, [good] * (len(names) + 1))
     audit.assert_sound()
     assert audit.skipped == [True] * len(names) + [False]
-    assert f"step 1 skipped, not finite: rank 0, {good.scene[0]}: gradient" in caplog.text
+    assert f"skipped step 1 with non-finite values: rank 0, {good.scene[0]}: gradient" in caplog.text
 
 
 def test_too_many_in_a_row_stop_the_run_with_their_causes(tmp_path: Path, cache: Path) -> None:

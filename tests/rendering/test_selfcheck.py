@@ -141,9 +141,9 @@ def test_agreement_makes_auto_triton_and_is_found_out_once(checks: list[str]) ->
 def test_disagreement_is_an_error_that_says_what_to_report_and_what_to_choose(checks, found, monkeypatch):
     monkeypatch.setattr(selfcheck, "compare", lambda *_: found)
     for again in (False, True):  # the next process knows it, too
-        with pytest.raises(KernelsRefusedError, match="disagree with the reference: values off by") as error:
+        with pytest.raises(KernelsRefusedError, match="disagree with the reference: max image error") as error:
             renderer.automatic(GPU)
-        assert "Please report this line: device cuda, triton 3. renderer.implementation=torch" in str(error.value)
+        assert "Please report this line: device cuda, triton 3. To render without these kernels" in str(error.value)
         if not again:
             selfcheck._refusal.cache_clear()
 
@@ -167,7 +167,7 @@ def test_kernels_that_do_not_run_are_an_error_and_are_tried_again_by_the_next_pr
 
 def test_a_gpu_without_triton_is_told_so(checks: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(KernelsRefusedError, match=r"triton.* is not installed\. renderer\.implementation=torch"):
+    with pytest.raises(KernelsRefusedError, match=r"triton.* is not installed\. .*renderer\.implementation=torch"):
         renderer.automatic(GPU)
     assert renderer._resolve("torch", GPU) == "torch"
 

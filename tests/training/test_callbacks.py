@@ -57,7 +57,7 @@ def test_the_best_by_a_metric_is_kept(tmp_path: Path, cache: Path) -> None:
     best = read_checkpoint(tmp_path / "checkpoints" / "best.ckpt")
     assert best["global_step"] == 1 + list(during.values()).index(max(during.values()))
     assert newest_valid(tmp_path / "checkpoints").name == "step-3.ckpt"
-    with pytest.raises(ValueError, match=r"monitor=eval/psrn: evaluations measure .*eval/psnr"):
+    with pytest.raises(ValueError, match=r"monitor=eval/psrn is not measured; choose one of .*eval/psnr"):
         train(small_config(tmp_path / "b", cache, *RUN, *watch, "callbacks.checkpoint.monitor=eval/psrn"))
     with pytest.raises(ValueError, match="choose max or min"):
         NewestCheckpoints("checkpoints", mode="best")  # pyright: ignore[reportArgumentType]
@@ -87,5 +87,5 @@ def test_a_killed_process_that_loads_data_is_one_error(tmp_path: Path, cache: Pa
     overrides = ["data.workers=1", "callbacks.checkpoint=null", "logger.csv=null", "trainer.max_steps=50"]
     run = build(small_config(tmp_path, cache, *RUN, *overrides))
     run.trainer.callbacks.append(HappensAt(2, kill))  # pyright: ignore[reportAttributeAccessIssue]
-    with pytest.raises(ChildProcessError, match="loads data was killed"), ending_together(run.trainer):
+    with pytest.raises(ChildProcessError, match="data loading process was killed"), ending_together(run.trainer):
         run.trainer.fit(run.module, datamodule=run.datamodule)

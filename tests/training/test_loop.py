@@ -101,7 +101,7 @@ def test_sigterm_saves_and_ends(tmp_path: Path, cache: Path) -> None:
     assert attempt.wait() == 0, attempt.said()[-2000:]
     saved = newest_valid(folder / "checkpoints")
     assert read_checkpoint(saved)["global_step"] >= 1
-    assert "continue with ckpt=last" in attempt.said()
+    assert "resume with ckpt=last" in attempt.said()
 
 
 def test_sigterm_ends_an_evaluation_at_once(tmp_path: Path, cache: Path) -> None:
@@ -137,13 +137,13 @@ REFUSED: list[tuple[list[str], str | None]] = [
     (["debug=fast_dev_run", "model.gaussians.max_offset=3"], None),
     (["debug=fast_dev_run", "ckpt=last", "backend.seed=1"], "trained on backbone"),
     (["ckpt=last", "backend.seed=1"], "trained on backbone"),
-    (["ckpt=last", "backend.taps=1"], r"step-4\.ckpt was trained with backend\.taps=4, here it is 1"),
-    (["ckpt=last", "model.gaussians.splits=4"], r"first in model\.gaussians\.out"),
+    (["ckpt=last", "backend.taps=1"], r"step-4\.ckpt was trained with backend\.taps=4, but this run uses 1"),
+    (["ckpt=last", "model.gaussians.splits=4"], r"first mismatch: model\.gaussians\.out"),
     (
         ["ckpt=last", "optimizer=adamw", "trainer.max_steps=6"],
-        r"trained with vg2gt\.training\.muon\.MuonAdamW and cannot go on with torch\.optim\.AdamW",
+        r"trained with vg2gt\.training\.muon\.MuonAdamW and cannot resume with torch\.optim\.AdamW",
     ),
-    (["ckpt=auto", "trainer.max_steps=3"], r"step-4\.ckpt is at step 4, further than trainer\.max_steps=3 asks"),
+    (["ckpt=auto", "trainer.max_steps=3"], r"step-4\.ckpt is at step 4, beyond trainer\.max_steps=3; nothing"),
     (["overwrite=true", "data.train_scenes=0"], r"data\.train_scenes=0 must be at least 1"),
     (["overwrite=true", "data.workers=-1"], r"data\.workers=-1 must be at least 0"),
     (["overwrite=true", "optimizer.lr=-1"], r"optimizer: Invalid learning rate: -1"),

@@ -82,7 +82,7 @@ def test_it_is_the_same_from_a_file(made: Calibration, tmp_path: Path) -> None:
 def test_damaged_files_are_refused(made: Calibration, tmp_path: Path, old: str, new: str) -> None:
     path = made.write(tmp_path / "made.json")
     path.write_text(path.read_text().replace(old, new, 1))
-    with pytest.raises(FormatError, match=r"made.json is no calibration.*vg2gt calibrate"):
+    with pytest.raises(FormatError, match=r"made.json is not a calibration.*vg2gt calibrate"):
         read_calibration(path)
 
 

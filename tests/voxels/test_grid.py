@@ -83,7 +83,7 @@ def test_shifting_by_whole_voxels_shifts_the_grid_only():
 def test_cells_too_far_apart_are_refused_by_name():
     far = torch.tensor([[0, 0, 0], [1 << 21, 1 << 21, 1 << 21]])
     batch = torch.tensor([0, 1])
-    with pytest.raises(ValueError, match="raise the voxel size"):
+    with pytest.raises(ValueError, match="increase voxel_size"):
         mixed_radix_keys(far, batch)
 
 

@@ -48,7 +48,7 @@ class DA3Gaussians(Reconstructor):
         visibility: ViewCheck | None = None,
     ) -> None:
         if not isinstance(backend, DA3Backend):
-            raise ValueError(f"model=da3_gs is Depth Anything 3 itself: take backend=da3_giant, not {backend.name}")
+            raise ValueError(f"model=da3_gs requires backend=da3_giant, got {backend.name}")
         super().__init__(backend, scale, background, visibility)
         self.head = backend.gaussian_head()
 

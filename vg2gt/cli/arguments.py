@@ -24,7 +24,7 @@ folders.register()
 OVERRIDE = re.compile(r"(\+\+?|~)?[A-Za-z_][\w./]*=")
 OVERRIDES = "\nmodel, backend and renderer are chosen by key=value: backend=da3_small model.fine.max_voxels=500000"
 
-DROP = "leave out what is guessed, contradicted, single (seen by one view), unseen: a list of these"
+DROP = "drop Gaussians by status, a list of: guessed, contradicted, single (seen by one view), unseen"
 
 
 def hydra_command(command: Command, config_name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], None]]:
@@ -79,7 +79,7 @@ def add_common_flags(parser: argparse.ArgumentParser, saved: Sequence[str]) -> N
 def add_trust_flags(parser: argparse.ArgumentParser) -> None:
     """Adds the flags that filter Gaussians by their error bound and status."""
     add = parser.add_argument
-    add("--min-confidence", type=float, metavar="C", help="leave out what may be more than 1 - C of its depth off")
+    add("--min-confidence", type=float, metavar="C", help="drop Gaussians whose depth error bound exceeds 1 - C")
     add("--drop", type=list_of_names, default=[], metavar="LIST", help=DROP)
 
 

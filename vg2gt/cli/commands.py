@@ -33,7 +33,7 @@ COMMANDS = {
     ),
     "calibrate": Command(
         "vg2gt.cli.calibrate:main",
-        "measures how far a checkpoint's depth is off, so that scenes state their errors",
+        "calibrates the depth error bounds of a checkpoint",
         "vg2gt calibrate ckpt=outputs/quickstart data=synthetic data.eval_scenes=48",
     ),
     "ablate": Command(
@@ -43,7 +43,7 @@ COMMANDS = {
     ),
     "reconstruct": Command(
         "vg2gt.cli.reconstruct:main",
-        "makes a scene of Gaussians from images, a folder or a video",
+        "reconstructs a scene of Gaussians from images, a folder or a video",
         "vg2gt reconstruct photos/ backend=da3_small --out outputs/photos",
     ),
     "refine": Command(
@@ -53,7 +53,7 @@ COMMANDS = {
     ),
     "render": Command(
         "vg2gt.cli.render:main",
-        "renders a scene into the cameras of a cameras.json",
+        "renders a scene from the cameras of a cameras.json",
         "vg2gt render scene.ply --cameras cameras.json --save color.png --out views",
     ),
     "view": Command(
@@ -81,7 +81,7 @@ COMMANDS = {
 DATA_COMMANDS = {
     "splits": Command(
         "vg2gt.cli.data:splits",
-        "divides a dataset's scenes into training and evaluation lists",
+        "splits a dataset's scenes into training and evaluation lists",
         "vg2gt data splits data=rgbd data.root=RECORDINGS --out lists",
     ),
     "views": Command(

@@ -17,12 +17,12 @@ if TYPE_CHECKING:
     from vg2gt.data.datamodule import SceneDataModule
 
 SPLITS = """
-key=value arguments choose the dataset as in vg2gt train; the scenes of data.train are divided, recordings of one place
+key=value arguments choose the dataset as in vg2gt train; the scenes of data.train are split; recordings of one place
 stay together. Use the lists with data.train.scenes=DIR/train.txt data.val.scenes=DIR/val.txt"""
 VIEWS = """
-key=value arguments are those of vg2gt evaluate: which data, which scenes (data.eval_scenes), which numbers of views and
-how they are drawn (evaluation.selection). Read the file with evaluation.selection.index=FILE.json. Equal arguments and
-data give equal files."""
+key=value arguments are those of vg2gt evaluate: the data, its scenes (data.eval_scenes), the numbers of views and how
+they are drawn (evaluation.selection). Use the file with evaluation.selection.index=FILE.json. The same arguments and
+data give the same file."""
 
 
 def main() -> None:
@@ -36,9 +36,9 @@ def splits(argv: Sequence[str] | None = None) -> None:
     parser = flag_parser("data splits", DATA_COMMANDS["splits"], SPLITS)
     add = parser.add_argument
     add("--out", type=Path, required=True, metavar="DIR", help="where train.txt and val.txt are written")
-    add("--fraction", type=float, default=0.1, metavar="X", help="share of the places for val.txt, default 0.1; of "
-        "every part of a mixture")  # fmt: skip
-    add("--seed", type=int, default=0, metavar="N", help="another seed, another division")
+    add("--fraction", type=float, default=0.1, metavar="X", help="fraction of the places for val.txt, default 0.1; "
+        "applies to every part of a mixture")  # fmt: skip
+    add("--seed", type=int, default=0, metavar="N", help="random seed of the split, default 0")
     options = parser.parse_args(given)
     with errors_in_one_line():
         from hydra.utils import instantiate
@@ -68,7 +68,7 @@ def write_views(out: str, overrides: Sequence[str]) -> Path:
     from vg2gt.io.files import write_text
 
     if not out.endswith(".json"):
-        raise ValueError(f"give the index file to write, --out FILE.json, got {out}")
+        raise ValueError(f"--out must be a .json file, got {out}")
     config = compose("evaluate", "output_dir=.", "name=index", *overrides)
     evaluation = instantiate(config.evaluation, _convert_="all")
     datamodule: SceneDataModule = instantiate(config.data)

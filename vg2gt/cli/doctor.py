@@ -72,11 +72,11 @@ def _folders() -> Iterator[tuple[str, str]]:
     from vg2gt.kernels.compiled import cache_folder
 
     data = Path(os.environ.get("VG2GT_CACHE", "~/.cache/vg2gt")).expanduser()
-    yield "data", f"{data} ({_size(data)}; the variable VG2GT_CACHE names another folder)"
+    yield "data", f"{data} ({_size(data)}; set VG2GT_CACHE to use another folder)"
     kernels = cache_folder()
     yield (
         "kernels",
-        "cannot be kept: every start compiles again" if kernels is None else f"{kernels} ({_size(kernels)})",
+        "no writable cache folder: every process recompiles" if kernels is None else f"{kernels} ({_size(kernels)})",
     )
     triton = Path(os.environ.get("TRITON_CACHE_DIR", "~/.triton/cache")).expanduser()
     yield "triton", f"{triton} ({_size(triton)})"
@@ -84,7 +84,7 @@ def _folders() -> Iterator[tuple[str, str]]:
 
 def _size(folder: Path) -> str:
     if not folder.is_dir():
-        return "not there yet"
+        return "does not exist yet"
     return f"{sum(path.stat().st_size for path in folder.rglob('*') if path.is_file()) / 1e6:.0f} MB"
 
 

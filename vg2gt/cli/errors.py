@@ -39,7 +39,7 @@ def errors_in_one_line() -> Iterator[None]:
         if isinstance(cause, OSError) and cause.strerror:
             said = f"{cause.filename}: {cause.strerror}" if cause.filename else cause.strerror
         if isinstance(cause, TypeError) and HydraConfig.initialized():
-            said += f"; is a value of the wrong type? Given were: {' '.join(HydraConfig.get().overrides.task)}"
+            said += f"; is a value of the wrong type? The overrides are: {' '.join(HydraConfig.get().overrides.task)}"
         if sys.stderr.isatty():
             print(file=sys.stderr)  # ends a progress bar that was interrupted
         sys.exit(f"{type(cause).__name__}: {' '.join(said.split())} ({TRACEBACK}=1 shows where)")

@@ -12,8 +12,8 @@ from vg2gt.cli.errors import errors_in_one_line
 from vg2gt.config import compose_groups
 
 DETAILS = """
-backend=NAME is a network of configs/backend, VGGT or a relative DA3 network, backend.key=value one of its options.
-Numbers of scenes, views, rows and columns stay free."""
+backend=NAME selects a network of configs/backend, VGGT or a relative DA3 network; backend.key=value sets its options.
+The numbers of scenes, views, rows and columns stay dynamic."""
 
 
 def main(argv: Sequence[str] | None = None) -> None:

@@ -68,5 +68,5 @@ def inside(name: str) -> str:
     """Returns ``name``; ValueError if it points outside its parent folder."""
     parts = PureWindowsPath(name).parts  # splits at both kinds of slashes
     if not parts or PureWindowsPath(name).drive or name.startswith(("/", "\\")) or ".." in parts:
-        raise ValueError(f"name={name}: a name inside outputs, such as mine or paper/first; it may not lead out of it")
+        raise ValueError(f"name={name} must be a path inside outputs, such as mine or paper/first")
     return name

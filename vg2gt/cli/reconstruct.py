@@ -28,7 +28,7 @@ from vg2gt.reconstruction.output_names import (
 
 POSES = (
     "cameras from files next to the images, from structure from motion (kept in DIR/sfm), or the backbone's own; auto: "
-    "the first of these that the backbone needs and that is there"
+    "the first of these that is available and that the backbone needs"
 )
 
 FRAME = (
@@ -37,8 +37,8 @@ FRAME = (
 )
 
 WINDOW = (
-    "work on N images and their neighbours at a time, which bounds the memory; 0: all at once; default: 24 where there "
-    "are more than 100 images (kept in DIR/windows until the end, so that an interrupted command goes on)"
+    "process N images and their neighbours at a time, which limits the memory; 0: all at once; default: 24 for more "
+    "than 100 images (kept in DIR/windows until the end, so that an interrupted command can resume)"
 )
 
 REFINE = "steps of refinement on the images; default: 400 for photographs, 0 for RGB-D recordings; 0: feed-forward"
@@ -57,20 +57,21 @@ def parser() -> argparse.ArgumentParser:
     add("images", nargs="+", help="image files, a folder of them, a video, or a recording with known cameras")
     place = arguments.add_mutually_exclusive_group(required=True).add_argument
     place("--out", metavar="DIR", help="where to write")
-    place("--add", metavar="DIR", help="add the images, with given cameras, to the scene of --keep-windows in DIR")
-    place("--take-out", metavar="DIR", help="take the images of one --add out of the scene in DIR")
-    add("--ckpt", metavar="PATH", help="a checkpoint or a run's folder; without it the head is untrained")
+    place("--add", metavar="DIR", help="add images with given cameras to the scene in DIR, made with --keep-windows")
+    place("--take-out", metavar="DIR", help="remove the images of one --add from the scene in DIR")
+    add("--ckpt", metavar="PATH", help="a checkpoint or a run's folder; default: the shipped weights for "
+        "backend=sweep, an untrained head for others")  # fmt: skip
     add("--poses", choices=("auto", "given", "sfm", "backbone"), default="auto", help=POSES)
     add("--frame", choices=("auto", "given", "first", "upright"), default="auto", help=FRAME)
     add("--size", type=_size, metavar="N|HxW", help="longer side, or height x width, in pixels; default 518, CPU 280")
     add("--every", type=int, default=1, metavar="N", help="take every N-th image or frame only")
-    add("--max-images", type=int, metavar="N", help="take at most N, evenly spread; of a video 32 by default")
+    add("--max-images", type=int, metavar="N", help="use at most N, evenly spaced; default: all, 32 of a video")
     add("--window", type=int, metavar="N", help=WINDOW)
     add("--keep-windows", action="store_true", help="keep what --add and --take-out need in DIR/windows")
     add("--refine", type=_steps, metavar="N", help=REFINE)
     add("--frames", type=int, default=ORBIT_FRAMES, metavar="N", help=f"length of the orbit, default {ORBIT_FRAMES}")
     add("--mesh-voxel", type=float, metavar="X", help="edge of the mesh's voxels in scene units")
-    add("--calibration", metavar="FILE", help="of the model's errors; default: next to the checkpoint")
+    add("--calibration", metavar="FILE", help="calibration file of the error bounds; default: next to the checkpoint")
     add("--skip-damaged", action="store_true", help="skip images that cannot be read")
     add_trust_flags(arguments)
     add_common_flags(arguments, DEFAULT)

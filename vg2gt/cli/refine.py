@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from vg2gt.reconstruction.scene import Scene
     from vg2gt.refinement import RefineOptions
 
-HOW = "\nrefine=NAME of configs/refine and refine.key=value say how; default: what suits the scene's cameras"
+HOW = "\nrefine=NAME (see configs/refine) and refine.key=value set the options; default: depends on the scene's cameras"
 ADVICE = "fewer or smaller images (vg2gt reconstruct --max-images, --size) or fewer Gaussians"
 
 
@@ -28,7 +28,7 @@ def parser() -> argparse.ArgumentParser:
     add = arguments.add_argument
     add("scene", metavar="DIR", help="a folder that vg2gt reconstruct has written")
     add("--out", metavar="DIR", help="where to write; default: refined/ in the scene's folder")
-    add("--steps", type=int, metavar="N", help="default: 12 per view, 400 for photos")
+    add("--steps", type=int, metavar="N", help="number of steps; default: 12 per view, 400 for photos")
     add("--seconds", type=float, metavar="S", help="stop after S seconds, or after --steps if that comes first")
     add("--holdout", type=int, metavar="N", help="exclude every N-th view and print its PSNR before and after")
     add_trust_flags(arguments)

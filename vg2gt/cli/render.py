@@ -26,9 +26,9 @@ def parser() -> argparse.ArgumentParser:
         help="cameras.json (ours or of 3DGS), transforms.json, or a COLMAP model's folder",
     )
     add("--out", required=True, metavar="DIR", help="where to write")
-    add("--depth", choices=("median", "expected"), default="median", help="expected: rasterized only")
-    add("--interpolate", type=int, metavar="N", help="go smoothly through the cameras with N new ones between each two")
-    add("--fps", type=float, default=FPS, help=f"of the animation, default {FPS:g}")
+    add("--depth", choices=("median", "expected"), default="median", help="expected requires --mode rasterized")
+    add("--interpolate", type=int, metavar="N", help="interpolate smoothly, with N new cameras between each pair")
+    add("--fps", type=float, default=FPS, help=f"frame rate of the animation, default {FPS:g}")
     add("--near", type=float, default=0.01, help="near plane in scene units")
     add_common_flags(arguments, DEFAULT)
     return arguments

@@ -30,9 +30,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser = _parser()
     arguments = parser.parse_args(argv)
     if arguments.html is not None and (arguments.host, arguments.port, arguments.share) != (None, None, False):
-        parser.error("--html writes a file and serves nothing; leave out --host, --port and --share")
+        parser.error("--html writes a file and starts no server; omit --host, --port and --share")
     if arguments.images is not None and arguments.cameras is None:
-        parser.error("--images needs --cameras, which names them")
+        parser.error("--images requires --cameras, which lists the image names")
     with errors_in_one_line():
         if arguments.html is None:
             from vg2gt.viewer.server import require_viser
@@ -54,9 +54,9 @@ def _parser() -> argparse.ArgumentParser:
     add("scene", type=Path, help="scene.ply, .spz, .splat or .glb")
     add("--cameras", type=Path, help="cameras.json of the scene; the first one is the initial view")
     add("--images", type=Path, help="folder of the cameras' images; default: that of cameras.json, or images/ in it")
-    add("--color", choices=("trust",), help="trust: colours by stated error and status, of a scene.ply of vg2gt")
+    add("--color", choices=("trust",), help="trust: colour by stated error and status of a scene.ply written by vg2gt")
     add("--html", type=Path, help="write one self-contained page to this file instead of serving")
-    add("--title", help="of the page; default: the scene's file name")
+    add("--title", help="title of the page; default: the scene's file name")
     add("--host", help="address to listen on; default: 127.0.0.1, this machine only")
     add("--port", type=_port, help="first port to try; default: 8080")
     add("--share", action="store_true", help="also publish the page through viser's public server")
@@ -98,7 +98,7 @@ def _by_trust(path: Path, gaussians: Gaussians) -> Gaussians:
 
     found = read_properties(path, "error", "support") if path.suffix == ".ply" else {}
     if len(found.get("support", ())) != len(gaussians):
-        raise ValueError(f"{path} does not say what is known of its Gaussians: give a scene.ply of vg2gt reconstruct")
+        raise ValueError(f"{path} has no support per Gaussian: use a scene.ply written by vg2gt reconstruct")
     values = {name: torch.from_numpy(column).float() for name, column in found.items()}
     colors = trust_picture(values.get("error"), values["support"])  # [3, G]
     return replace(gaussians, sh=rgb_to_sh(colors.T)[:, None])

@@ -110,7 +110,7 @@ class SceneSource(ABC):
 
 
 SourceMaker = Callable[..., SceneSource]
-"""What makes a source from keyword arguments, such as a Hydra partial."""
+"""Factory that creates a source from keyword arguments, such as a Hydra partial."""
 
 
 def training_frames(source: SceneSource, scene: str) -> list[int]:

@@ -154,8 +154,8 @@ class BatchDataset(Dataset[Batch]):
         except DataError as error:
             self.damaged.add((scene, frame))
             log.warning(
-                "frame %d of scene %s is left out of training, number %d to be so in this process; its neighbour takes "
-                "its place: %s",
+                "cannot read frame %d of scene %s; training uses its nearest readable neighbour instead (unreadable "
+                "frames in this process: %d): %s",
                 frame, scene, len(self.damaged), error,
             )  # fmt: skip
             return False

@@ -100,7 +100,8 @@ class SceneDataModule(LightningDataModule):
             raise ValueError(f"data.train_scenes={train_scenes} must be at least 1, or null for all")
         if workers is not None and workers < 0:
             raise ValueError(
-                f"data.workers={workers} must be at least 0, which decodes in the training process; null: by cores"
+                f"data.workers={workers} must be at least 0 (0: decode in the training process; null: choose by cores "
+                "and memory)"
             )
         self.sampler = ViewSampler(min_views, max_views, max_images, expand_ratio, target_views, seed, view_sets)
         self.eval_views = EvaluationViews(eval_context, eval_target, eval_window)
@@ -213,8 +214,8 @@ class SceneDataModule(LightningDataModule):
             if "argument" not in str(error):  # not Python's message about an unknown or missing argument
                 raise
             raise DataError(
-                f"the dataset's loader {error} (data.*): leave the option out; if a preset (evaluation=synthetic) sets "
-                "it, choose another preset or remove it with '~data.NAME'"
+                f"the dataset's loader does not accept these options (data.*): {error}; remove the option; if a preset "
+                "(evaluation=synthetic) sets it, choose another preset or remove it with '~data.NAME'"
             ) from error
 
     @property

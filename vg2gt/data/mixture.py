@@ -86,7 +86,7 @@ class Mixture(SceneSource):
     def _find(self, scene: str) -> tuple[SceneSource, str]:
         part, _, name = scene.partition("/")
         if part not in self.sources:
-            raise DataError(f"there is no scene {scene}: the mixture's parts are {', '.join(self.sources)}")
+            raise DataError(f"no such scene: {scene}; the mixture's parts are {', '.join(self.sources)}")
         return self.sources[part], name
 
 

@@ -20,13 +20,13 @@ def refuse_untrainable(source: SceneSource) -> None:
     if not source.has_cameras:
         lacking = "cameras" if source.has_depth else "depth and no cameras"
         raise DataError(
-            f"{type(source).__name__} has no {lacking}: it serves reconstruction and cannot be trained on; choose "
-            "another dataset for data.train, such as a COLMAP model of the same photographs (data=colmap)"
+            f"{type(source).__name__} has no {lacking}: it can be used for reconstruction, but not for training; "
+            "choose another dataset for data.train, such as a COLMAP model of the same photographs (data=colmap)"
         )
     if not source.has_depth:
         log.info(
-            "%s has no depth: colours of held-out views are trained on, and rendered depth against decoded depth; the "
-            "terms that compare with true depth are zero",
+            "%s has no depth: training uses the colours of held-out views and the consistency of rendered and decoded "
+            "depth; loss terms that need ground-truth depth are zero",
             type(source).__name__,
         )
 
@@ -71,7 +71,9 @@ def refuse_overlap(
                 "they are different places, rename one"
             )
     if shared:
-        log.info("%d scenes serve training and evaluation; scored are frames held out of training", shared)
+        log.info(
+            "%d scenes are used for both training and evaluation; only frames held out of training are scored", shared
+        )
 
 
 def _named(

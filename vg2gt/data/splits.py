@@ -36,7 +36,7 @@ def split_scenes(source: SceneSource, fraction: float, seed: int = 0) -> tuple[l
     for part in source.parts():
         places = sorted({source.place(scene) for scene in source.scenes if source.part(scene) == part})
         if len(places) < 2:
-            log.warning("%s shows a single place and is for training only", part or "the dataset")
+            log.warning("%s contains a single place; it is used for training only", part or "the dataset")
             continue
         order = np.random.default_rng((seed, zlib.crc32(part.encode()))).permutation(len(places))
         count = min(max(1, round(fraction * len(places))), len(places) - 1)
@@ -66,7 +66,7 @@ def write_splits(out: Path, source: SceneSource, fraction: float, seed: int) -> 
     ]
     for path, text in zip(paths, texts, strict=True):
         if path.exists() and path.read_text() != text:
-            raise FileExistsError(f"{path} exists and holds another split: remove it or choose another out=FOLDER")
+            raise FileExistsError(f"{path} exists and holds another split: remove it or choose another --out")
     for path, text in zip(paths, texts, strict=True):
         write_text(path, text)
     return paths

@@ -20,7 +20,7 @@ from vg2gt.runs.trust import check_targets, read_run_config
 
 log = logging.getLogger(__name__)
 
-UNCHECKED = "whether the evaluated scenes were trained on cannot be checked: %s"
+UNCHECKED = "cannot check whether the evaluated scenes were used for training: %s"
 RESUMED_IN_PLACE = (None, "last", "auto")
 
 

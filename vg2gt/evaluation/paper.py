@@ -59,7 +59,7 @@ def obstacle(
     if alignment != ALIGNMENT or any(bound is not None for bound in depth_range):
         return f"depth is aligned by {alignment} within {list(depth_range)}, the paper's by {ALIGNMENT} without bounds"
     if told:
-        return "the backbone is told true depth or cameras"
+        return "the backbone is given true depth or cameras"
     return None
 
 

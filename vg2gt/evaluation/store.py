@@ -35,7 +35,7 @@ class ResultStore:
             foreign = [name for name in WRITTEN if (folder / name).exists()]
             if foreign:
                 raise FileExistsError(
-                    f"{folder} holds {', '.join(foreign)} of something that is no evaluation (it has no {IDENTITY}): "
+                    f"{folder} holds {', '.join(foreign)}, which do not belong to an evaluation (no {IDENTITY}): "
                     "choose another output_dir= or name="
                 )
         elif overwrite:

@@ -56,7 +56,7 @@ METRICS = {
     "gaussians": Metric("Gaussians", 0),
     "gaussians_per_pixel": Metric("per input pixel", 3),
     "reconstruct_seconds": Metric("reconstruct [s]", 3, False),
-    "head_seconds": Metric("of it Gaussian head [s]", 3, False),
+    "head_seconds": Metric("Gaussian head [s]", 3, False),
     "refine_seconds": Metric("refine [s]", 1, False),
     "render_seconds": Metric("render [s/view]", 4, False),
     "peak_memory_mib": Metric("peak memory [MiB]", 0, False),

@@ -41,7 +41,7 @@ def read_npz(file: str | Path | BinaryIO, names: Sequence[str]) -> dict[str, NDA
     except (OSError, KeyError, FormatError):
         raise
     except Exception as error:  # damaged files raise various errors of zipfile, zlib and parser, or MemoryError
-        raise FormatError(f"no readable archive of plain arrays: {error or type(error).__name__}") from error
+        raise FormatError(f"not a readable archive of plain arrays: {error or type(error).__name__}") from error
 
 
 def npz_names(path: Path) -> tuple[str, ...]:
@@ -54,7 +54,7 @@ def npz_names(path: Path) -> tuple[str, ...]:
         with zipfile.ZipFile(regular(path)) as archive:
             return tuple(name.removesuffix(".npy") for name in archive.namelist())
     except zipfile.BadZipFile as error:
-        raise FormatError(f"no readable archive of plain arrays: {error}") from error
+        raise FormatError(f"not a readable archive of plain arrays: {error}") from error
 
 
 def load_npz(path: Path, scene: str, names: Sequence[str]) -> dict[str, NDArray]:

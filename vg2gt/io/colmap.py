@@ -140,7 +140,9 @@ def colmap_intrinsics(camera: Camera) -> NDArray[np.float64]:
         ValueError: if the camera model has no focal length (EQUIRECTANGULAR).
     """
     if not len(camera.focal_length_idxs()):
-        raise ValueError(f"camera {camera.camera_id}: {camera.model_name} has no pinhole part; cut it into cube faces")
+        raise ValueError(
+            f"camera {camera.camera_id}: {camera.model_name} has no pinhole equivalent; convert images to cube faces"
+        )
     if not np.any(camera.params):
         return np.full((3, 3), np.nan)
     matrix = np.array(camera.calibration_matrix(), np.float64)

@@ -95,7 +95,7 @@ def write_cached(path: str | Path, content: bytes, cache: str | Path) -> None:
         write_bytes(path, content)
     except OSError as error:
         _unwritable.add(cache)
-        log.warning("nothing more is kept in the cache folder %s, which cannot be written to: %s", cache, error)
+        log.warning("caching to %s is disabled, because the folder cannot be written to: %s", cache, error)
 
 
 def write_text(path: str | Path, content: str) -> Path:

@@ -86,7 +86,7 @@ def smallest_three(quats: NDArray[np.floating]) -> tuple[NDArray[np.int64], NDAr
     """
     length = np.linalg.norm(quats, axis=-1, keepdims=True)
     if (length == 0).any():
-        raise ValueError("quats must not be zero: a rotation has no direction then")
+        raise ValueError("quats must have nonzero norm")
     place = np.abs(quats).argmax(1)[:, None]
     unit = quats / (length * np.sign(np.take_along_axis(quats, place, 1)))
     return place[:, 0], unit[np.arange(4) != place].reshape(-1, 3)

@@ -41,7 +41,7 @@ def write_gaussian_glb(path: str | Path, gaussians: Gaussians) -> Path:
     arrays = upright(to_arrays(gaussians))
     length = np.linalg.norm(arrays.quats, axis=1, keepdims=True)
     if not len(length) or (length == 0).any():
-        raise ValueError("glTF holds no scene without Gaussians" if not len(length) else "quats must not be zero")
+        raise ValueError("a .glb needs at least one Gaussian" if not len(length) else "quats must have nonzero norm")
     shown = (arrays.sh[:, 0] * DC + 0.5).clip(0, 1)
     linear = np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)  # COLOR_0 is linear
     own = {

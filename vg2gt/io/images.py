@@ -65,7 +65,7 @@ def color_image(image: Image.Image) -> Image.Image:
         image = Image.fromarray((np.asarray(image, np.float32) / 257 + 0.5).astype(np.uint8))
     elif image.mode in ("I", "F"):
         kind = "32-bit integers" if image.mode == "I" else "floating-point numbers"
-        raise OSError(f"a photograph of {kind} has no known white: save it with 8 or 16 bits a channel")
+        raise OSError(f"the value range of a photograph of {kind} is unknown: save it with 8 or 16 bits per channel")
     if has_alpha(image):
         image = image.convert("RGBA")
         image = Image.alpha_composite(Image.new("RGBA", image.size, BACKGROUND), image)

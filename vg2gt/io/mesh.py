@@ -150,7 +150,7 @@ def write_mesh(path: str | Path, mesh: Mesh) -> Path:
     if path.suffix.lower() not in SUFFIXES:
         raise ValueError(f"{path}: a mesh is written as one of {', '.join(SUFFIXES)}")
     if not len(mesh.faces):
-        raise ValueError("the mesh is empty: no valid depth, or voxels larger than what is seen; check depth and size")
+        raise ValueError("the mesh is empty: no valid depth, or voxels larger than the surfaces; check both")
     body = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=mesh.colors, process=False)
     content = body.export(file_type=path.suffix[1:].lower())
     assert not isinstance(content, dict)  # only formats with several files give a dict

@@ -56,7 +56,7 @@ def read_elements(path: Path, *wanted: str) -> dict[str, NDArray]:
     encoding, elements, start = _header(path, data)
     names = [element.name for element in elements]
     if "vertex" not in names:
-        raise FormatError(f"{path}: no element vertex, only {', '.join(names) or 'none'}; this is no file of points")
+        raise FormatError(f"{path}: no element vertex, only {', '.join(names) or 'none'}; this is not a file of points")
     found = [name for name in wanted if name in names]
     return {name: _read_element(path, data, start, encoding, elements, names.index(name)) for name in found}
 
@@ -93,7 +93,9 @@ def read_comments(path: Path) -> list[str]:
 def _ascii_table(path: Path, body: bytes, before: list[_Element], vertex: _Element) -> NDArray:
     lines = body.split(b"\n")[sum(element.count for element in before) :]
     if vertex.count > len(lines):
-        raise FormatError(f"{path}: {vertex.count} vertices announced, {len(lines)} lines are left; it is truncated")
+        raise FormatError(
+            f"{path}: the header gives {vertex.count} vertices, but {len(lines)} lines follow; the file is truncated"
+        )
     table = np.empty(vertex.count, list(vertex.properties))
     columns = [line.split() for line in lines[: vertex.count]]
     width = len(vertex.properties)
@@ -104,7 +106,7 @@ def _ascii_table(path: Path, body: bytes, before: list[_Element], vertex: _Eleme
         for i, (name, _) in enumerate(vertex.properties):
             table[name] = np.array([column[i] for column in columns]).astype(table.dtype[name])
     except (ValueError, OverflowError) as error:
-        raise FormatError(f"{path}: a vertex has something else than numbers ({error}); it is damaged") from error
+        raise FormatError(f"{path}: a vertex has a value that is not a number ({error}); it is damaged") from error
     return table
 
 
@@ -123,7 +125,7 @@ def _header(path: Path, data: bytes) -> tuple[str, list[_Element], int]:
         if words[0] == "format" and len(words) == 3 and words[1] in _ENCODINGS:
             encoding = words[1]
         elif words[0] == "format":
-            raise FormatError(f"{place}: format {' '.join(words[1:])}, readable are {' and '.join(_ENCODINGS)}")
+            raise FormatError(f"{place}: unsupported format {' '.join(words[1:])}; supported: {', '.join(_ENCODINGS)}")
         elif words[0] == "element" and len(words) == 3 and words[2].isascii() and words[2].isdigit():
             if len(words[2]) > 18:
                 raise FormatError(f"{place}: {words[2][:20]}... elements; the file is damaged")

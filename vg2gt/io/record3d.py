@@ -78,7 +78,7 @@ def _archive(path: Path) -> zipfile.ZipFile:
     try:
         return _open(str(regular(path)), path.stat().st_mtime_ns, os.getpid())
     except Exception as error:  # damaged archives raise various errors of zipfile
-        raise FormatError(f"{path}: no readable archive ({error}); export the recording again") from error
+        raise FormatError(f"{path}: not a readable archive ({error}); export the recording again") from error
 
 
 @lru_cache(maxsize=4)

@@ -30,7 +30,7 @@ def write_splat(path: str | Path, gaussians: Gaussians) -> Path:
     rgba = np.concatenate((0.5 + DC * arrays.sh[:, 0], arrays.opacities[:, None]), 1)
     length = np.linalg.norm(arrays.quats, axis=-1, keepdims=True)
     if (length == 0).any():
-        raise ValueError("quats must not be zero: a rotation has no direction then")
+        raise ValueError("quats must have nonzero norm")
     table = np.empty(len(rgba), _ROW)
     table["mean"], table["scale"] = arrays.means, arrays.scales
     table["rgba"] = np.rint(rgba.clip(0, 1) * 255)

@@ -49,7 +49,9 @@ def write_spz(path: str | Path, gaussians: Gaussians) -> Path:
     extent = float(np.abs(arrays.means).max(initial=1e-6))
     bits = min(_MOST_BITS, int(np.floor(np.log2((2**23 - 1) / extent))))
     if bits < 0:
-        raise ValueError(f"positions reach {extent:.3g} units, .spz holds 8 million: write a PLY, or scale the scene")
+        raise ValueError(
+            f"positions reach {extent:.3g} units, but .spz holds at most 8 million: write a PLY, or scale the scene"
+        )
     fixed = np.rint(arrays.means * 2.0**bits).astype("<i4")
     place, others = smallest_three(np.roll(arrays.quats, -1, 1))
     rotation = place.astype("<u4")
@@ -82,7 +84,7 @@ def read_spz(path: str | Path) -> Gaussians:
     content = regular(path).read_bytes()
     if content.startswith(_MAGIC):
         raise FormatError(
-            f"{path}: a .spz of version 4; versions 2 and 3 can be read: splat-transform --spz-version 3 converts it"
+            f"{path}: .spz version 4 is not supported, only 2 and 3; convert it with splat-transform --spz-version 3"
         )
     try:
         with gzip.open(io.BytesIO(content)) as file:

@@ -40,7 +40,7 @@ def read_tensors(path: str | Path) -> dict[str, Tensor]:
     except FileNotFoundError:
         raise
     except SafetensorError as error:
-        raise FormatError(f"{path} is damaged or no safetensors file: {error}") from error
+        raise FormatError(f"{path} is damaged or not a safetensors file: {error}") from error
     except Exception as error:  # damage raises various errors of unpickler, zip reader, allocator
         reason = str(error).strip().splitlines() or [type(error).__name__]
         raise FormatError(f"{path} is damaged or holds more than tensors and plain values: {reason[0]}") from error

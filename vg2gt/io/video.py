@@ -115,7 +115,7 @@ def read_frame(path: str | Path, number: int) -> NDArray[np.uint8]:
     path = _existing(path)
     times = _frame_times(path, path.stat().st_mtime_ns)
     if not 0 <= number < len(times):
-        raise FormatError(f"{path} has {len(times)} frames, none of number {number}")
+        raise FormatError(f"{path} has {len(times)} frames, but frame {number} was requested")
     with _opened(path) as container:
         container.seek(times[number], stream=container.streams.video[0])
         for frame in _decoded(container):
@@ -199,10 +199,10 @@ def _opened(path: Path) -> Iterator[InputContainer]:
     try:
         with open(path, "rb") as file, av.open(file, container_options={"format_whitelist": _CONTAINERS}) as container:
             if not container.streams.video:
-                raise FormatError(f"{path}: there is no video in it; give a video's file")
+                raise FormatError(f"{path}: it contains no video stream; use a video file")
             yield container
     except (FFmpegError, OSError) as error:
-        raise FormatError(f"{path}: no video that can be read ({error.strerror}); it is damaged or a list") from error
+        raise FormatError(f"{path}: not a readable video ({error.strerror}); it is damaged or a playlist") from error
 
 
 def _decoded(container: InputContainer) -> Iterator[VideoFrame]:

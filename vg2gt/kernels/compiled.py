@@ -29,7 +29,7 @@ log = logging.getLogger(__name__)
 
 PACKAGES = Path(__file__).resolve().parents[2]
 SHARED = Path(__file__).with_name("compiled_math.py")
-"""Kernels take constants and functions from their own package (``vg2gt/kernels``) and from here; a test checks it."""
+"""The only module outside their own package (``vg2gt/kernels``) that kernels may import from; a test checks this."""
 VARIABLE = "NUMBA_CACHE_DIR"
 
 config: Any = numba.config  # pyright: ignore[reportPrivateImportUsage]
@@ -103,7 +103,7 @@ class _Announcement(event.Listener):
     def on_start(self, event: event.Event) -> None:
         """Logs at the first compilation."""
         if not self._said:
-            log.info("compiling kernels, once on this machine and version (about 20 s in all)")
+            log.info("compiling kernels (once per machine and version, about 20 s in all)")
             gc.freeze()  # otherwise garbage collection keeps scanning all of torch during compilation
         self._said = True
 
@@ -119,7 +119,9 @@ def _folder(package: Path) -> Path | None:
     """Returns the cache folder for a package's kernels, or None if it is not writable."""
     base = cache_folder()
     if base is None:
-        log.warning("compiled kernels cannot be kept, every process compiles them again: set %s", VARIABLE)
+        log.warning(
+            "cannot cache compiled kernels, so every process recompiles them; set %s to a writable folder", VARIABLE
+        )
         return None
     content = hashlib.sha256(f"{numba.__version__} {llvmlite.__version__} {platform.python_version()}".encode())
     for path in [Path(__file__), SHARED, *sorted(package.rglob("*.py"))]:

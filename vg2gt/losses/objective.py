@@ -242,11 +242,11 @@ def _checked(
     if rendered is None:
         return None
     if views is None or cameras is None:
-        raise ValueError("rendered views need views= (their indices in the batch) and render_cameras=")
+        raise ValueError("rendered= requires views= (indices of the rendered views in the batch) and render_cameras=")
     found = (tuple(rendered.color.shape[:2]), tuple(cameras.world_to_camera.shape[:2]))
     if found != ((len(batch.scene), len(views)),) * 2:
         raise ValueError(
-            f"views names {len(views)} views of {len(batch.scene)} scenes, but rendered and render_cameras have "
-            f"[B, R] = {found[0]} and {found[1]}: render exactly the named views"
+            f"views= selects {len(views)} views of {len(batch.scene)} scenes, but rendered and render_cameras have "
+            f"[B, R] = {found[0]} and {found[1]}: render exactly the selected views"
         )
     return RenderedViews(rendered, cameras, views.to(rendered.color.device)).map(_full_precision)

@@ -89,9 +89,9 @@ class CoarseModule(nn.Module):
         if fuse_kernel not in (1, 3):
             raise ValueError(f"coarse.fuse_kernel is {fuse_kernel!r}; choose 1 or 3")
         if gate and not surface_evidence:
-            raise ValueError("coarse.gate=true measures the views' disagreement by coarse.surface_evidence=true")
+            raise ValueError("coarse.gate=true requires coarse.surface_evidence=true")
         if patch_size % upsample:
-            raise ValueError(f"coarse.upsample={upsample} does not divide the backend's patch of {patch_size} pixels")
+            raise ValueError(f"coarse.upsample={upsample} must divide the backend's patch size ({patch_size} pixels)")
         self.cell = patch_size // upsample
         self.upsample = upsample
         self.voxel_size = voxel_size

@@ -284,7 +284,7 @@ class _Points:
         self.offset = (self.cells - self.cells.detach().floor() - 0.5).float()
         far = int((usable.flatten() & ~near).sum())
         if far:
-            log.warning("left out %d of %d points too far away to be numbered", far, usable.numel())
+            log.warning("ignored %d of %d points: too far from the origin for the voxel grid", far, usable.numel())
 
 
 def _scene_medians(values: Tensor, batch: Tensor, scenes: int) -> Tensor:

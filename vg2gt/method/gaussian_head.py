@@ -129,7 +129,7 @@ class GaussianHead(nn.Module):
 
     def _surfels(self, voxels: Voxels) -> SurfelStart:
         if voxels.moments is None:
-            raise ValueError("model.gaussians.start=surfel needs voxels with moments: model.fine.moments=true")
+            raise ValueError("model.gaussians.start=surfel requires model.fine.moments=true")
         start = surfel_start(voxels.moments, self.splits)
         if self.anchor == "centroid":
             return start

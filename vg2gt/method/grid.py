@@ -91,8 +91,8 @@ def mixed_radix_keys(
     extent = [cells + 2 * margin for cells in extent]
     if scenes * extent[0] * extent[1] * extent[2] >= 1 << 63:
         raise ValueError(
-            f"{scenes} scenes of {extent[0]} x {extent[1]} x {extent[2]} voxels cannot be numbered in 63 bits; "
-            "raise the voxel size or leave far points out"
+            f"{scenes} scenes of {extent[0]} x {extent[1]} x {extent[2]} voxels exceed 63-bit indices; "
+            "increase voxel_size or remove distant points"
         )
     steps = (extent[1] * extent[2], extent[2], 1)
     x, y, z = (grid + margin if margin else grid).unbind(-1)
@@ -168,8 +168,8 @@ def warn_if_sparse(plan: VoxelPlan, scenes: int, module: str) -> None:
     if fewest < MIN_POINTS_PER_VOXEL[module]:
         _warned_of_sparse.add(module)
         log.warning(
-            "the %s voxels of a scene hold %.2f points each: nearly nothing is fused across views. Where these see the "
-            "same surfaces, raise model.%s.voxel_size or model.%s.min_footprint (pixels per edge at the median depth)",
+            "the %s voxels of a scene contain only %.2f points each, so views are hardly fused. If the views overlap, "
+            "increase model.%s.voxel_size or model.%s.min_footprint (pixels per edge at the median depth)",
             *(module, fewest, module, module),
         )
 

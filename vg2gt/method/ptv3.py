@@ -278,9 +278,9 @@ class PTv3(nn.Module):
         lengths = [len(enc_depths), len(enc_heads), *(len(x) + 1 for x in (dec_channels, dec_depths, dec_heads))]
         if any(length != stages for length in lengths):
             raise ValueError(
-                f"ptv3: {stages} encoder widths need as many depths and heads and one fewer in the decoder, "
-                f"got encoder {len(enc_depths)}, {len(enc_heads)} and decoder "
-                f"{len(dec_channels)}, {len(dec_depths)}, {len(dec_heads)}"
+                f"ptv3: enc_depths and enc_heads must have {stages} entries like enc_channels, and dec_channels, "
+                f"dec_depths and dec_heads one fewer; got {len(enc_depths)} and {len(enc_heads)}, and "
+                f"{len(dec_channels)}, {len(dec_depths)} and {len(dec_heads)}"
             )
         self.out_channels = dec_channels[0] if stages > 1 else enc_channels[0]
         self.orders = tuple(orders)

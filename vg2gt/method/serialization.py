@@ -61,8 +61,8 @@ def serial_keys(
     if bits > MAX_BITS or 3 * bits + (scenes - 1).bit_length() > 63:
         sizes = ", ".join(f"{size:g}" for size in voxel_size.tolist())
         raise ValueError(
-            f"a scene spans {extent} voxels along an axis (voxel size {sizes}, {scenes} scenes); with "
-            f"the scene index that exceeds 63 bits of serial code; raise voxel_size or min_footprint"
+            f"a scene spans {extent} voxels along one axis (voxel size {sizes}, {scenes} scenes), too many for "
+            "63-bit serial codes; increase voxel_size or min_footprint"
         )
     scene = batch << (3 * bits)
     return [scene | serial_codes(grid, bits, order) for order in orders]

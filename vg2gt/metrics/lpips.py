@@ -80,7 +80,7 @@ class LPIPS(nn.Module):
         """
         if predicted.shape != reference.shape or min(predicted.shape[-2:]) < SMALLEST_IMAGE:
             raise ValueError(
-                f"LPIPS compares images of one shape [..., 3, H, W] with H, W >= {SMALLEST_IMAGE}, got "
+                f"LPIPS requires two images of the same shape [..., 3, H, W] with H, W >= {SMALLEST_IMAGE}, got "
                 f"{tuple(predicted.shape)} and {tuple(reference.shape)}"
             )
         size = predicted.shape[-3:]
@@ -119,7 +119,7 @@ def load_lpips(source: str = "auto") -> LPIPS:
                 WEIGHTS_URL, map_location="cpu", check_hash=True, weights_only=True
             )
         except OSError as error:  # urllib raises subclasses of it
-            raise WeightsNotFoundError(f"weights not found: {WEIGHTS_URL} cannot be fetched ({error})") from error
+            raise WeightsNotFoundError(f"cannot download LPIPS weights from {WEIGHTS_URL}: {error}") from error
         return LPIPS({**_installed_channel_weights(), **features})
     path = Path(torch.hub.get_dir()) / "checkpoints" / WEIGHTS_FILE if source == "auto" else Path(source)
     path = path.expanduser()
@@ -144,5 +144,5 @@ def _installed_channel_weights() -> dict[str, Tensor]:
 def _tensor(state: Mapping[str, Tensor], name: str, shape: tuple[int, ...]) -> Tensor:
     if name not in state or state[name].shape != shape:
         found = tuple(state[name].shape) if name in state else "missing"
-        raise ValueError(f"LPIPS needs VGG-16's weights: {name} must be {shape}, it is {found}; {HOW_TO_GET}")
+        raise ValueError(f"invalid LPIPS weights: {name} must have shape {shape}, got {found}; set {HOW_TO_GET}")
     return state[name].float()

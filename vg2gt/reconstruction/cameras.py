@@ -71,7 +71,7 @@ def pictures_for(
         except DataError as error:
             if poses == "given" or backend.needs_depth:
                 raise
-            log.warning("camera files are not used, structure from motion runs instead: %s", error)
+            log.warning("cannot use the camera files, running structure from motion instead: %s", error)
     if given is not None:
         damaged: list[str] = []
         given = undamaged(given, damaged) if skip_damaged else given
@@ -129,10 +129,9 @@ def check_pycolmap(images: ImagesLike, poses: Poses) -> None:
 
 def _no_depth(backend: str, images: ImagesLike) -> str:
     return (
-        f"backend {backend} works from measured depth, and there is none with {describe(images)}: it reconstructs "
-        "recordings only (depth/ next to images/, with poses.txt and K.txt). For photographs leave backend= and --ckpt "
-        "out (the plane sweep in the package is taken), or take backend=da3_small; a checkpoint fits the backend it "
-        "was trained on"
+        f"backend {backend} needs measured depth, but {describe(images)} has none: it reconstructs RGB-D recordings "
+        "only (depth/ next to images/, with poses.txt and K.txt). For photographs, omit backend= and --ckpt (uses the "
+        "built-in plane sweep), or use backend=da3_small; a checkpoint only works with the backend it was trained on"
     )
 
 
@@ -144,8 +143,8 @@ def _check(model: Reconstructor, poses: str) -> None:
         raise ValueError(f"backend {backend.name} predicts no cameras; take --poses auto, given or sfm")
     if poses in ("given", "sfm") and not backend.needs_hints:
         raise ValueError(
-            f"backend {backend.name} takes no cameras, it predicts its own: leave --poses out, or choose one that "
-            "takes them, such as backend=da3_small backend.given_poses=true"
+            f"backend {backend.name} predicts its own cameras and accepts none: omit --poses, or use a backend that "
+            "accepts them, such as backend=da3_small backend.given_poses=true"
         )
     if poses == "sfm" and backend.needs_depth:
         raise ValueError(f"backend {backend.name} works from the depth and poses of a recording; leave --poses out")

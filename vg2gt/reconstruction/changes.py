@@ -48,7 +48,7 @@ def add_images(
     with pictures_for(model, images, "given") as pictures:
         there = sorted({picture.name for picture in pictures} & set(old.names))
     if there:
-        raise ValueError(f"the scene has images of these names already: {', '.join(there[:10])}; rename them")
+        raise ValueError(f"the scene already has images with these names: {', '.join(there[:10])}; rename them")
     new = reconstruct_with(
         model,
         images,

@@ -168,8 +168,8 @@ def _near_origin(move: NDArray[np.float64], depth: float) -> NDArray[np.float64]
     if far > FAR * depth:
         offset = move[:3, 3].round()
         log.warning(
-            "the given cameras are %.3g depths from their origin, more than single precision holds: the scene is "
-            "written shifted by %s; report.json and cameras.json have the similarity to the given frame",
+            "the given cameras are %.3g scene depths from their origin, too far for single precision: the scene is "
+            "written shifted by %s; report.json and cameras.json contain the similarity transform to the given frame",
             far / depth, (-offset).tolist(),
         )  # fmt: skip
         move[:3, 3] -= offset

@@ -136,9 +136,9 @@ def _only(pictures: list[Picture], files: list[Path], folder: Path) -> list[Pict
     """Returns the pictures of the named files, in the order of the files."""
     by_path = {picture.path.resolve(): picture for picture in pictures if picture.path is not None}
     found = [by_path[file.resolve()] for file in dict.fromkeys(files) if file.resolve() in by_path]
-    _name_left_out([file.name for file in files if file.resolve() not in by_path], f"the cameras with {folder}")
+    _name_left_out([file.name for file in files if file.resolve() not in by_path], f"the folder {folder}")
     if not found:
-        raise DataError(f"the cameras with {folder} are not those of {files[0].name}")
+        raise DataError(f"the cameras in {folder} do not match {files[0].name}")
     return found
 
 

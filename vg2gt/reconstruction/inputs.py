@@ -94,8 +94,8 @@ def load_views(pictures: Sequence[Picture], size: tuple[int, int], monitor: Moni
     much = [picture.name for picture, share in zip(pictures, kept, strict=True) if share < 1 - _MUCH_LOST]
     if much:
         log.warning(
-            "%d of %d images have another shape than %dx%d and lose more than a quarter at their borders, the first is "
-            "%s; reconstruct images of one shape together, or choose another size",
+            "%d of %d images have a different aspect ratio than %dx%d and lose more than a quarter to cropping (first: "
+            "%s); reconstruct images of one shape together, or choose another size",
             len(much), len(pictures), size[0], size[1], much[0],
         )  # fmt: skip
     joined = Frames.concatenate(frames)

@@ -31,7 +31,7 @@ _LARGEST = 65535
 
 AddView: TypeAlias = "Callable[[RenderedView], None]"
 Sink: TypeAlias = AbstractContextManager[AddView]
-"""Gives what takes rendered views one by one; at the end of its block it writes what needs all of them."""
+"""Context manager that returns a consumer of rendered views; on exit it writes what needs all views."""
 
 
 @contextmanager
@@ -59,9 +59,7 @@ def map_folder(folder: Path, kind: str, suffixes: Sequence[str]) -> Iterator[Add
             name = view_stem(view.camera.name)
             stem = staged / name
             if not stem.resolve().is_relative_to(staged.resolve()):
-                raise ValueError(
-                    f"a view is called {view.camera.name!r}, which is outside of the output folder; rename it"
-                )
+                raise ValueError(f"view name {view.camera.name!r} leads outside the output folder; rename it")
             if stem in written:
                 raise ValueError(f"two views are called {name}; rename one of the cameras")
             written.add(stem)

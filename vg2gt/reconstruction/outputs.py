@@ -213,7 +213,7 @@ def mesh_fusion(scene: Scene, paths: Sequence[Path], voxel_size: float | None) -
     yield lambda view: kept.append((view.depth, view.color))
     depth, colors = (torch.stack(maps) for maps in zip(*kept, strict=True))
     if not (depth > 0).any():
-        raise ValueError("no view has rendered depth, so there is no mesh; leave mesh out of the outputs")
+        raise ValueError("cannot create a mesh: no view has rendered depth; remove mesh from the outputs (--save)")
     median = float(depth[depth > 0].median())
     depth = torch.where(depth < _MESH_DEPTHS * median, depth, 0)
     if scene.support is not None:

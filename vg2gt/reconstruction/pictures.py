@@ -203,7 +203,7 @@ def existing_path(item: str | Path) -> Path:
     """
     path = Path(item).expanduser()
     if not path.exists():
-        raise FileNotFoundError(f"{path} does not exist (seen from {Path.cwd()})")
+        raise FileNotFoundError(f"{path} does not exist (working directory: {Path.cwd()})")
     return path
 
 
@@ -274,7 +274,7 @@ def image_files(folder: Path) -> list[Path]:
     taken = max(places, key=lambda place: len(found[place]))  # the first of equals
     if not found[taken]:
         videos = sorted(file.name for file in folder.iterdir() if file.suffix.lower() in VIDEO_SUFFIXES)
-        hint = f"; it has videos, name one: {folder / videos[0]}" if videos else ""
+        hint = f"; it contains videos, pass one of them: {folder / videos[0]}" if videos else ""
         suffixes = ", ".join((*IMAGE_SUFFIXES, *HEIC_SUFFIXES))
         raise ValueError(f"no images in {folder} (looked for {suffixes}, there and in images/){hint}")
     if taken == folder:
@@ -319,8 +319,8 @@ def _photo(path: Path, content_of: Callable[[Path], bytes | None] = lambda _: No
         return Picture(path.stem, size, read)
     if is_panorama(path, size):
         raise ValueError(
-            f"{path} is a 360 degree panorama (equirectangular), which no pinhole camera takes: cut it into the faces "
-            "of a cube and give these"
+            f"{path} is a 360 degree panorama (equirectangular), which a pinhole camera cannot represent: convert it "
+            "to cube faces and use these"
         )
     return Picture(path.stem, size, read, focal=focal_length(path, size), path=path)
 
@@ -328,7 +328,7 @@ def _photo(path: Path, content_of: Callable[[Path], bytes | None] = lambda _: No
 def _open_heic(path: Path) -> None:
     """Registers pillow-heif, with which Pillow reads HEIC files."""
     if importlib.util.find_spec("pillow_heif") is None:
-        raise ValueError(f"{path} is HEIC, which needs pip install pillow-heif; or save the photos as JPEG")
+        raise ValueError(f"{path} is HEIC and requires pillow-heif: pip install pillow-heif, or save photos as JPEG")
     from pillow_heif import register_heif_opener  # pyright: ignore[reportMissingImports]
 
     register_heif_opener()

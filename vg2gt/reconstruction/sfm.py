@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 FORMAT = 1
-"""Of the folder; raise it when it is written otherwise."""
+"""Version of the folder's format; increment it when the format changes."""
 IMAGE_SIDE = 1600  # maximum longer side of the kept images, in pixels
 FEATURE_SIDE, FEATURES = 1280, 4096  # longer side of the images for feature extraction, maximum number of features
 MANY_SIDE, MANY_FEATURES = 1024, 2048  # the same for more than ALL_PAIRS photographs
@@ -59,9 +59,9 @@ _STATE = "sfm.json"
 _MASKS = "masks"
 
 ADVICE = (
-    "take more photographs, 20 or more, walking around the scene rather than turning on the spot, each showing two "
-    f"thirds of what the one before shows; or put their cameras next to them ({LAYOUTS}); or take a backend that works "
-    "from images alone, such as da3_small"
+    "take more photographs, 20 or more, walking around the scene rather than turning on the spot, each overlapping "
+    f"the previous one by two thirds; or put camera files next to them ({LAYOUTS}); or use a backend that needs no "
+    "cameras, such as da3_small"
 )
 
 
@@ -73,8 +73,8 @@ def require_pycolmap() -> None:
     """
     if importlib.util.find_spec("pycolmap") is None:
         raise ImportError(
-            f"finding the cameras of photographs needs pycolmap: {EXTRA}; or put their cameras next to "
-            f"them ({LAYOUTS}), or take a backend that works from images alone, such as da3_small"
+            f"finding the cameras of photographs needs pycolmap: {EXTRA}; or put camera files next to them "
+            f"({LAYOUTS}), or use a backend that needs no cameras, such as da3_small"
         )
 
 
@@ -104,7 +104,7 @@ def find_cameras(pictures: Sequence[Picture], folder: Path, monitor: Monitor) ->
         require_pycolmap()
         _check_ours(folder)
         if len(pictures) < 2:
-            raise ValueError(f"a single image tells nothing about depth or cameras: {ADVICE}")
+            raise ValueError(f"a single image is not enough to estimate depth or cameras: {ADVICE}")
         state = _solve(pictures, folder, key, monitor)
     else:
         log.info("cameras of the same images are reused from %s", folder)
@@ -125,8 +125,8 @@ def _tell_left_out(state: dict[str, Any], count: int) -> None:
         )  # fmt: skip
     for part in state.get("other_parts", []):
         log.warning(
-            "%d of them form another part, which nothing connects with the %d images taken; take photographs in "
-            "between, or reconstruct that part alone: %s",
+            "%d of them form a separate part with no overlap with the %d images used; take photographs in between, or "
+            "reconstruct that part separately: %s",
             len(part), len(state["images"]), ", ".join(part),
         )  # fmt: skip
 
@@ -174,8 +174,8 @@ def _solve(pictures: Sequence[Picture], folder: Path, key: str, monitor: Monitor
         models = sound_models(map_cameras(work, len(names), SEED, monitor))
         if not models:
             raise ValueError(
-                f"the cameras of these {len(pictures)} images cannot be found: too few of them overlap, seen "
-                f"from places that are near but different; {ADVICE}"
+                f"cannot find the cameras of these {len(pictures)} images: too few overlap, taken from nearby but "
+                f"different positions; {ADVICE}"
             )
         model, *others = models
         placed = placed_images(model)

@@ -59,13 +59,13 @@ def trusted(scene: Scene, min_confidence: float | None = None, drop: Sequence[st
     known = scene.gaussian_trust
     if known is None or scene.support is None:
         raise ValueError(
-            "nothing is known of what supports this scene (it was made in windows): leave out --drop and "
-            "--min-confidence, or take all images at once (--window 0)"
+            "the support of this scene is unknown (it was made in windows): omit --drop and --min-confidence, or "
+            "process all images at once (--window 0)"
         )
     if min_confidence is not None and scene.error is None:
         raise ValueError(
-            "--min-confidence needs stated errors, and there is no calibration of this model: make one by vg2gt "
-            "calibrate, or use --drop"
+            "--min-confidence needs stated errors, but this model has no calibration: create one with vg2gt calibrate, "
+            "or use --drop"
         )
     unwanted = torch.tensor([NAMES[name] for name in drop])
 
@@ -117,7 +117,7 @@ def trust_line(scene: Scene) -> str:
     """Returns a one-line summary for a terminal."""
     figures = trust_figures(scene).get("trust")
     if figures is None:
-        return "what supports the Gaussians is not known in windows"
+        return "support of the Gaussians is unknown for scenes made in windows"
     shares = ", ".join(f"{100 * share:.0f} % {name}" for name, share in figures["gaussians"].items() if share >= 0.005)
     if "error_of_pixels" not in figures:
         return f"Gaussians: {shares}; errors are not stated (no calibration of this model)"

@@ -277,7 +277,7 @@ class _Refinement:
         if score > WORSE:
             best, _ = self._score(self.best, views)
             if score > WORSE * float((best / self.start_loss[views]).mean()):
-                return f"views that were left out have {score:.1f} times the loss of the start"
+                return f"the loss of the left-out views is {score:.1f} times the initial one"
         self.scores = [*self.scores, score][-SMOOTH:]
         smooth = sum(self.scores) / len(self.scores)
         since = self.recent[-self.options.check_every :]
@@ -302,7 +302,7 @@ class _Refinement:
             return "diverged"
         self.factor /= 2
         log.warning(
-            "refinement, step %d: %s; it goes on from step %d with rates times %g",
+            "refinement, step %d: %s; resuming from step %d with learning rates scaled by %g",
             self.steps, trouble, self.best_step, self.factor,
         )  # fmt: skip
         self.parameters = self._parameters(self.best)
@@ -315,8 +315,8 @@ def _check(gaussians: Gaussians, cameras: Cameras, seen: Observations) -> None:
     found = (tuple(cameras.world_to_camera.shape[:2]), tuple(cameras.size), tuple(seen.images.shape))
     if found != ((1, views), (height, width), (views, 3, height, width)) or seen.depth_conf.shape != seen.depth.shape:
         raise ValueError(
-            f"refinement takes one scene whose views have images, depth and cameras alike, got cameras {found[0]} of "
-            f"{found[1]}, images {found[2]}, depth {tuple(seen.depth.shape)}, {tuple(seen.depth_conf.shape)}"
+            f"refinement needs one scene with matching images, depth and cameras, got cameras {found[0]} of size "
+            f"{found[1]}, images {found[2]}, depth {tuple(seen.depth.shape)}, confidence {tuple(seen.depth_conf.shape)}"
         )
     if not len(gaussians):
         raise ValueError("there are no Gaussians to refine")

@@ -45,7 +45,9 @@ def check_shapes(gaussians: Gaussians, cameras: Cameras) -> None:
         if tuple(tensor.shape) != shape:
             raise ValueError(f"{name} must be {list(shape)} for {count} Gaussians, got {list(tensor.shape)}")
     if poses.device != gaussians.means.device:
-        raise ValueError(f"cameras are on {poses.device}, the Gaussians on {gaussians.means.device}; move one of them")
+        raise ValueError(
+            f"cameras are on {poses.device} but Gaussians are on {gaussians.means.device}; move them to the same device"
+        )
 
 
 def check_values(gaussians: Gaussians, cameras: Cameras) -> None:
@@ -53,14 +55,14 @@ def check_values(gaussians: Gaussians, cameras: Cameras) -> None:
     check_finite("world_to_camera", cameras.world_to_camera)
     check_finite("intrinsics", cameras.intrinsics)
     focal = cameras.intrinsics[..., [0, 1], [0, 1]]
-    _require("intrinsics", focal > 0, "pinhole matrices with positive focal lengths")
+    _require("intrinsics", focal > 0, "be pinhole matrices with positive focal lengths")
     for name in ("means", "quats", "scales", "opacities", "sh"):
         check_finite(name, getattr(gaussians, name))
     if len(gaussians) == 0:
         return
-    _require("scales", gaussians.scales >= MIN_SCALE, f"at least {MIN_SCALE} (standard deviations in scene units)")
-    _require("opacities", (gaussians.opacities >= 0) & (gaussians.opacities <= 1), "in [0, 1]")
-    _require("quats", gaussians.quats.detach().abs().sum(-1) > 0, "rotations: a quaternion must not be zero")
+    _require("scales", gaussians.scales >= MIN_SCALE, f"be at least {MIN_SCALE} (standard deviations in scene units)")
+    _require("opacities", (gaussians.opacities >= 0) & (gaussians.opacities <= 1), "be in [0, 1]")
+    _require("quats", gaussians.quats.detach().abs().sum(-1) > 0, "have nonzero norm")
     batch, scenes = gaussians.batch, len(cameras.world_to_camera)
     if batch[0] < 0 or batch[-1] >= scenes or (batch[1:] < batch[:-1]).any():
         raise ValueError(
@@ -104,4 +106,4 @@ def background_colors(
 def _require(name: str, good: Tensor, expectation: str) -> None:
     if not good.all():
         where = torch.nonzero(~good)
-        raise UnrenderableError(f"{name} must be {expectation}; {len(where)} are not, the first at {where[0].tolist()}")
+        raise UnrenderableError(f"{name} must {expectation}; {len(where)} do not, the first at {where[0].tolist()}")

@@ -219,8 +219,8 @@ def _list(tensors: tuple[Tensor, ...], size: tuple[int, int], options: RenderOpt
     entries = per_view[-1]
     if entries >= REFUSED:
         raise RefusedError(
-            f"a Gaussian, a camera or the background cannot be rendered, or {total} Gaussians cover more than "
-            f"{REFUSED} tiles in {views} views: render fewer views at once"
+            f"the Gaussians, cameras or background contain invalid values, or {total} Gaussians cover more than "
+            f"{REFUSED} tiles in {views} views; render fewer views at once"
         )
     keys, owners = batch.new_empty(entries), batch.new_empty(entries, dtype=torch.int32)
     if entries:

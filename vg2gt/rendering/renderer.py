@@ -28,7 +28,7 @@ RASTERIZERS: dict[str, Rasterizer] = {
     "dense": rasterize_dense,
     "cpu": rasterize_cpu,
 }
-"""Those that render one scene at a time; Triton's renders all of them."""
+"""Rasterisers that render one scene per call. The Triton one renders all scenes at once and is not listed."""
 
 
 @dataclass(frozen=True)
@@ -138,9 +138,9 @@ def _resolve(implementation: Implementation, device: torch.device) -> str:
     if implementation == "auto":
         return automatic(device)
     if implementation == "cpu" and device.type != "cpu":
-        raise ValueError(f"implementation 'cpu' needs tensors on the CPU, these are on {device}; use 'auto' or 'torch'")
+        raise ValueError(f"implementation 'cpu' requires CPU tensors, got {device}; use 'auto' or 'torch'")
     if implementation == "triton" and device.type != "cuda" and os.environ.get("TRITON_INTERPRET") != "1":
-        raise ValueError(f"implementation 'triton' needs tensors on a CUDA device, these are on {device}; use 'auto'")
+        raise ValueError(f"implementation 'triton' requires CUDA tensors, got {device}; use 'auto'")
     return implementation
 
 

@@ -40,8 +40,8 @@ SOURCES = (
     *sorted((_VG2GT / "kernels" / "render_gpu").glob("*.py")),
 )  # fmt: skip
 ADVICE = (
-    "renderer.implementation=torch renders without these kernels, many times slower "
-    "(vg2gt reconstruct: renderer.implementation=torch; other commands: --device cpu)"
+    "To render without these kernels (many times slower), use renderer.implementation=torch (vg2gt reconstruct) "
+    "or --device cpu (other commands)"
 )
 
 
@@ -67,7 +67,10 @@ class Agreement:
         return self.values <= VALUES and self.gradients <= GRADIENTS
 
     def __str__(self) -> str:
-        return f"values off by {self.values:.1e} (bound {VALUES:g}), gradients by {self.gradients:.1e} ({GRADIENTS:g})"
+        return (
+            f"max image error {self.values:.1e} (limit {VALUES:g}), "
+            f"max relative gradient error {self.gradients:.1e} (limit {GRADIENTS:g})"
+        )
 
 
 def require_trusted(device: torch.device) -> None:
@@ -82,7 +85,7 @@ def require_trusted(device: torch.device) -> None:
     """
     found_on = identity(device)
     if importlib.util.find_spec("triton") is None:
-        raise KernelsRefusedError(f"the package triton, which renders on {found_on}, is not installed. {ADVICE}")
+        raise KernelsRefusedError(f"rendering on {found_on} requires triton, which is not installed. {ADVICE}")
     if why := _refusal(found_on, str(device)):
         raise KernelsRefusedError(f"the Triton kernels {why}. Please report this line: {found_on}. {ADVICE}")
 

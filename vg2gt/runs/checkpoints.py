@@ -46,7 +46,7 @@ def write_checkpoint(checkpoint: Mapping[str, Any], path: str | Path) -> None:
             temporary.unlink(missing_ok=True)
         raise OSError(
             f"checkpoint {target} could not be written ({error}; is the disk full?); earlier checkpoints are intact: "
-            "make room and continue with ckpt=last"
+            "free disk space and resume with ckpt=last"
         ) from error
 
 
@@ -88,7 +88,7 @@ def write_slim(checkpoint: str | Path, path: str | Path) -> Path:
     """
     content = read_checkpoint(checkpoint)
     if Path(path).suffix != SLIM or MADE_OF not in content:
-        raise ValueError(f"{path} must end with {SLIM}, and {checkpoint} must hold the configuration it was made with")
+        raise ValueError(f"{path} must end with {SLIM}, and {checkpoint} must contain its configuration")
     header = {
         "backend": json.dumps(content["backend"]),
         "step": str(content["global_step"]),
@@ -123,7 +123,7 @@ def refuse_not_finite(state: Mapping[str, Tensor], path: str | Path) -> None:
     """Raises ValueError if weights are not finite (training diverged), naming the file and the first bad tensor."""
     bad = next((name for name, value in state.items() if not bool(torch.isfinite(value).all())), None)
     if bad is not None:
-        raise ValueError(f"checkpoint {path} holds weights that are not finite ({bad}): take an earlier one of its run")
+        raise ValueError(f"checkpoint {path} has non-finite weights ({bad}): use an earlier checkpoint of its run")
 
 
 def _verify_checksums(path: Path) -> None:
@@ -146,12 +146,12 @@ def newest_valid(folder: str | Path) -> Path:
         try:
             read_checkpoint(path)
         except (ValueError, FileNotFoundError) as error:  # FileNotFoundError: a folder of that name
-            log.warning("%s; trying the one before", error)
+            log.warning("%s; trying the previous checkpoint", error)
         else:
             return path
     raise FileNotFoundError(
         f"no valid checkpoint in {folder} ({len(candidates)} damaged): name a file with ckpt=PATH, or start from the "
-        "beginning with ckpt=null overwrite=true (ckpt=auto starts by itself only where there are none)"
+        "beginning with ckpt=null overwrite=true (ckpt=auto does so only without any checkpoint)"
     )
 
 
@@ -176,7 +176,7 @@ def initialize_from(module: nn.Module, path: str | Path) -> None:
     present = {k: v for k, v in module.state_dict().items() if k in stored or not k.startswith("model.backend.")}
     fitting = {k: v for k, v in stored.items() if k in present and present[k].shape == v.shape}
     if not fitting:
-        raise ValueError(f"init_from={path}: none of its {len(stored)} tensors fits this model")
+        raise ValueError(f"init_from={path}: none of its {len(stored)} tensors matches this model")
     nn.Module.load_state_dict(module, fitting, strict=False)
     fresh = sorted({key.rpartition(".")[0] for key in present.keys() - fitting.keys()})
     unused = sorted({key.rpartition(".")[0] for key in stored.keys() - present.keys()})

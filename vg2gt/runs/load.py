@@ -33,12 +33,12 @@ from vg2gt.uncertainty import Calibration, read_calibration
 log = logging.getLogger(__name__)
 
 SHIPPED = Path(__file__).resolve().parents[1] / "weights" / "sweep-tiny.safetensors"
-"""A head trained on ``backend=sweep``, whose weights are in the package too: real photographs without a download."""
+"""Head trained on ``backend=sweep``; the package also contains that backend's weights, so no download is needed."""
 PARTS = ("backend", "model", "renderer")
 FREE = ("path", "pretrained", "revision", "head_chunk", "views_per_chunk")
-"""Keys that change nothing of what a network computes, or whose effect a checkpoint knows by the weights' hash."""
+"""Keys that do not change what a network computes, or whose effect is covered by the hash of the weights."""
 TOKENS = ("taps", "reference_view", "given_poses")
-"""Keys of a backend that decide what the same weights make of images: a trained part fits one choice only."""
+"""Backend keys that change its outputs for the same weights; a trained part is valid for one choice only."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ def load_model(
         raise (cause if known else ValueError(str(error))) from error
     weights = load_weights(built, checkpoint)
     if checkpoint is None and built.trained_parameters():
-        log.warning("no checkpoint: the head is untrained and makes coloured voxels (give ckpt for a trained one)")
+        log.warning("no checkpoint: the head is untrained and produces coloured voxels (set ckpt for a trained one)")
     known = find_calibration(built, weights)
     return LoadedModel(built, replace(renderer, mode="solid", depth="median"), weights, known)
 
@@ -119,7 +119,7 @@ def model_parts(ckpt: str | Path | None, overrides: Sequence[str]) -> tuple[Path
     keys = [override.partition("=")[0].lstrip("+~") for override in overrides]
     for override, key in zip(overrides, keys, strict=True):
         if "=" not in override or key.partition(".")[0] not in PARTS:
-            raise ValueError(f"option {override!r}: expected key=value of {', '.join(PARTS)}")
+            raise ValueError(f"option {override!r}: expected key=value with a key of {', '.join(PARTS)}")
     named = {key for key in keys if "." not in key}
     of_backend = [key.removeprefix("backend.") for key in keys if key.startswith("backend.")]
     suits = "backend" not in named or ("backend=sweep" in overrides and all(key in FREE for key in of_backend))
@@ -191,8 +191,8 @@ def refuse_other_tokens(backend: Any, checkpoint: Mapping[str, Any], path: Path)
     for key in sorted(here.keys() & there.keys()):
         if key.rpartition(".")[2] in TOKENS and here[key] != there[key]:
             raise ValueError(
-                f"{path} was trained with backend.{key}={there[key]}, here it is {here[key]}: choose the same, or "
-                "start a new run from these weights with init_from="
+                f"{path} was trained with backend.{key}={there[key]}, but this run uses {here[key]}: use the same "
+                "value, or start a new run from these weights with init_from="
             )
 
 
@@ -212,12 +212,12 @@ def _config_of(checkpoint: Path, parts: Sequence[str]) -> DictConfig:
         run, source = known, checkpoint
     else:
         raise FileNotFoundError(
-            f"{path} is missing: the run's configuration says which model and backend its checkpoint belongs to; "
-            "put it back, or name both with model= and backend= and renderer="
+            f"{path} is missing: it records the model, backend and renderer of the checkpoint; restore it, or set "
+            "model=, backend= and renderer="
         )
     for part in parts:
         if run.get(part) is None:
-            raise ValueError(f"{source} names no {part}: it is not the configuration of a run; name one with {part}=")
+            raise ValueError(f"{source} has no {part}, so it is not a run's configuration; set {part}=")
         check_targets(run[part], f"{source}: {part}")
     if known is not None:
         _refuse_differences(run, known, parts, path, checkpoint)
@@ -229,14 +229,14 @@ def _refuse_differences(run: DictConfig, known: DictConfig, parts: Sequence[str]
     plain = (OmegaConf.to_container(config) for config in (run, known))
     here, there = (flatten({part: config.get(part) for part in parts}) for config in plain)  # pyright: ignore
     different = [
-        f"{key} is {here.get(key)} there, {there.get(key)} in the checkpoint"
+        f"{key} is {here.get(key)} in the file, {there.get(key)} in the checkpoint"
         for key in sorted(here.keys() | there.keys())
         if here.get(key) != there.get(key) and key.rpartition(".")[2] not in FREE
     ]
     if different:
         raise ValueError(
-            f"{path} does not describe {checkpoint}: {'; '.join(different[:5])}. Put it right, or remove it: the "
-            "checkpoint knows what it was trained with"
+            f"{path} does not match {checkpoint}: {'; '.join(different[:5])}. Correct it, or delete it: the "
+            "checkpoint stores its own configuration"
         )
 
 
@@ -291,10 +291,10 @@ def find_calibration(
     found = read_calibration(path)
     if found.made_for == made_for(model):
         return found
-    message = f"{path} was made for other weights: make it again by vg2gt calibrate"
+    message = f"{path} was made for other weights: recreate it with vg2gt calibrate"
     if named:
         raise ValueError(message)
-    log.warning("%s; errors are not stated", message)
+    log.warning("%s; depth error bounds are not available", message)
     return None
 
 
@@ -305,8 +305,8 @@ def choose_device(asked: str) -> torch.device:
         device = torch.device(("cuda" if there else "cpu") if asked == "auto" else asked)
         torch.empty(0, device=device)
     except (RuntimeError, AssertionError, NotImplementedError) as error:
-        known = "a GPU (cuda) and a CPU" if there else "a CPU only"
+        known = "the GPU (cuda) and the CPU" if there else "the CPU"
         raise ValueError(
-            f"device={asked}: torch sees {known} here; device=auto takes the GPU if there is one"
+            f"device={asked} is not available to torch, only {known}; device=auto uses the GPU if there is one"
         ) from error
     return device

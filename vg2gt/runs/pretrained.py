@@ -13,7 +13,7 @@ from vg2gt.runs.load import SHIPPED, LoadedModel, calibration_path, load_model
 WEIGHTS, CONFIG = "model.safetensors", "model.yaml"
 CALIBRATION = calibration_path(Path(WEIGHTS)).name
 MODELS = {"sweep-tiny": SHIPPED}
-"""Names of the models in the package; their backbone's weights are in it too."""
+"""Checkpoints of the models that ship with the package, by name; it also contains their backbone's weights."""
 
 
 def list_models() -> tuple[str, ...]:
@@ -109,7 +109,7 @@ def _weights(name: str | Path, revision: str | None) -> Path:
         from huggingface_hub.errors import EntryNotFoundError  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise ImportError(
-            f"{name} is no folder here; a model on the hub needs huggingface_hub: pip install 'vg2gt[hub]'"
+            f"folder {name} does not exist; loading it from the hub needs huggingface_hub: pip install 'vg2gt[hub]'"
         ) from error
     with suppress(EntryNotFoundError):  # the model is not calibrated
         hf_hub_download(str(name), CALIBRATION, revision=revision)

@@ -27,7 +27,7 @@ from vg2gt.rendering import Renderer
 ENVIRONMENT = "VG2GT_TRUST"
 OWN = ("vg2gt", "backends")
 KINDS = (nn.Module, SceneSource, SceneScale, ViewCheck, Renderer)
-"""Of ours, what a run's file may name besides data modules: their constructors read files at most."""
+"""Classes of this project that a run's file may name, besides data modules; their constructors at most read files."""
 
 
 class UntrustedError(ValueError):
@@ -51,7 +51,7 @@ def read_run_config(path: str | Path) -> DictConfig:
 def parse_run_config(text: str, source: str | Path) -> DictConfig:
     """Parses an untrusted configuration; ``source`` names it in errors, which are those of :func:`read_run_config`."""
     if "${" in text:  # an interpolation could read the environment
-        raise UntrustedError(f"{source} holds an interpolation; a run's configuration is written with its values")
+        raise UntrustedError(f"{source} holds an interpolation; a run's configuration must contain plain values only")
     try:
         content = yaml.safe_load(text)
     except (yaml.YAMLError, RecursionError) as error:
@@ -81,8 +81,8 @@ def check_targets(config: Any, source: str | Path) -> None:
         package = str(target).partition(".")[0]
         if not isinstance(target, str) or package not in (*OWN, *trusted):
             raise UntrustedError(
-                f"{said}; from a run's file only models, backends, renderers and datasets of this project are built, "
-                f"and what lies in packages that you trust by {ENVIRONMENT}=PACKAGE"
+                f"{said}; a run's file may only name models, backends, renderers and datasets of this project, or "
+                f"packages trusted with {ENVIRONMENT}=PACKAGE"
             )
         try:
             found = get_object(target)
@@ -93,7 +93,7 @@ def check_targets(config: Any, source: str | Path) -> None:
         if home.partition(".")[0] != package:
             raise UntrustedError(f"{said}, which is defined in {home}, not in {package} ({ENVIRONMENT}=PACKAGE)")
         if package in OWN and not _is_ours_to_build(found):
-            raise UntrustedError(f"{said}, no model, backend, renderer or dataset ({ENVIRONMENT}=PACKAGE)")
+            raise UntrustedError(f"{said}, which is not a model, backend, renderer or dataset ({ENVIRONMENT}=PACKAGE)")
 
 
 def _targets(node: Any, key: str) -> Iterator[tuple[str, Any]]:

@@ -63,7 +63,7 @@ def run_once(overrides: Sequence[str], folder: Path, scored: bool = True) -> Met
     report = train(config) if config.trainer.max_steps else _without_steps(config, folder, scored)
     gc.collect()  # trainer, module and data are in reference cycles that keep a run's frames in memory
     if not report:
-        log.warning("interrupted in %s; the same command goes on from there", folder)
+        log.warning("interrupted in %s; run the same command again to resume", folder)
         raise SystemExit(INTERRUPTED)
     return report["trained"]
 

@@ -84,7 +84,7 @@ class NewestCheckpoints(ModelCheckpoint):
             return
         if self.watched not in trainer.callback_metrics:
             known = ", ".join(sorted(name for name in trainer.callback_metrics if name.startswith("eval/")))
-            raise ValueError(f"callbacks.checkpoint.monitor={self.watched}: evaluations measure {known}")
+            raise ValueError(f"callbacks.checkpoint.monitor={self.watched} is not measured; choose one of {known}")
         value = float(trainer.callback_metrics[self.watched])
         if value == value and (self.best is None or self.sign * (value - self.best) > 0):
             self.best = value

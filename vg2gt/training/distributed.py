@@ -55,7 +55,7 @@ def ending_together(trainer: lightning.Trainer) -> Iterator[None]:
             trainer.strategy.launcher.kill(signal.SIGKILL)
         if isinstance(error, RuntimeError) and "DataLoader worker" in str(error):
             raise ChildProcessError(
-                "a process that loads data was killed, often because memory is full (fewer data.workers, less "
-                f"data.memory_mb): {str(error).splitlines()[0]}; start the same command with ckpt=last to go on"
+                "a data loading process was killed, often because memory is full (reduce data.workers or "
+                f"data.memory_mb): {str(error).splitlines()[0]}; resume with the same command and ckpt=last"
             ) from error
         raise

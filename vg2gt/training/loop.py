@@ -147,13 +147,13 @@ def _check_trainer(config: DictConfig) -> None:
     if str(config.trainer.precision) not in PRECISIONS:
         raise ValueError(
             f"trainer.precision={config.trainer.precision} is not supported: geometry, voxels, rendering and losses "
-            "are float32, which half precision cannot hold and float64 does not improve; use bf16-mixed (networks in "
-            "bfloat16), 32-true, or auto, which is the former on a GPU"
+            "require float32 (half precision is too coarse, float64 brings no gain); use bf16-mixed (networks in "
+            "bfloat16), 32-true, or auto (bf16-mixed on a GPU, 32-true on a CPU)"
         )
     if config.trainer.get("accumulate_grad_batches", 1) != 1:
         raise ValueError(
-            "trainer.accumulate_grad_batches is not supported: a batch is a function of the optimiser's step; use "
-            "data.max_images for larger steps"
+            "trainer.accumulate_grad_batches is not supported: each batch is determined by the optimiser step; for "
+            "larger steps, raise data.max_images"
         )
 
 
@@ -182,7 +182,7 @@ def train(config: DictConfig) -> dict[str, Any]:
         load_start(run.module, config, checkpoint)
         if writes:
             prepare_folder(config, checkpoint)
-            log.info("the run's folder is %s; it computes on %s", run.folder, run.trainer.strategy.root_device)
+            log.info("run folder: %s; device: %s", run.folder, run.trainer.strategy.root_device)
         with ending_together(run.trainer):
             untrained = _untrained_metrics(run, resumed=checkpoint is not None)
             if not fit(run, checkpoint):
@@ -204,7 +204,7 @@ def check_run(run: Run) -> None:
             refuse_without_hints(run.module.model, source)
     if not run.module.model.trained_parameters():
         raise ValueError(
-            f"{type(run.module.model).__name__} has no trained part: evaluate it as it is (vg2gt evaluate), "
+            f"{type(run.module.model).__name__} has no trained part: evaluate it with vg2gt evaluate, "
             "or choose another model="
         )
 
@@ -236,7 +236,7 @@ def _untrained_metrics(run: Run, resumed: bool) -> dict[str, float]:
         return read_json(path)
     if resumed or run.trial:
         return {}
-    log.info("evaluating the untrained model first (the bar says Validation), to compare the trained one with")
+    log.info("evaluating the untrained model first, for comparison (progress bar: Validation)")
     metrics = evaluate(run)
     write_json(path, metrics)
     return metrics
@@ -285,7 +285,7 @@ def _where_curves_are(run: Run) -> str:
         return f"tensorboard --logdir {run.folder}"
     if any(isinstance(logger, WandbLogger) for logger in run.trainer.loggers):
         return f"{run.folder / 'wandb'} (offline runs: wandb sync)"
-    return f"{run.folder / 'logs'} (as pictures with logger=tensorboard or logger=wandb)"
+    return f"{run.folder / 'logs'} (as plots with logger=tensorboard or logger=wandb)"
 
 
 def _check_loggers(config: DictConfig) -> None:

@@ -237,7 +237,7 @@ class VG2GTModule(lightning.LightningModule):
         found = all_gather_object(Fault(self._scenes, cause, self.global_step, self.global_rank))
         faults = [fault for fault in found if fault.cause != "gradient"] or found
         if self.trainer.is_global_zero:
-            log.warning("step %d skipped, not finite: %s", self.global_step, "; ".join(map(str, faults)))
+            log.warning("skipped step %d with non-finite values: %s", self.global_step, "; ".join(map(str, faults)))
         self.skipped.add(faults)
 
     def configure_optimizers(self) -> dict[str, Any]:
@@ -295,8 +295,8 @@ def _leave_only_coarse(model: Reconstructor) -> None:
     """Freezes all but the coarse module."""
     if not isinstance(model, VG2GT) or model.coarse is None:
         raise ValueError(
-            "training.part=coarse trains the coarse module, which this model does not have: choose model=tiny or "
-            "another VG2GT without ablation=wo_coarse, or leave training.part=all"
+            "training.part=coarse requires a coarse module, which this model lacks: use model=tiny or another VG2GT "
+            "model without ablation=wo_coarse, or training.part=all"
         )
     for name, parameter in model.named_parameters():
         parameter.requires_grad_(parameter.requires_grad and name.startswith("coarse."))
@@ -307,9 +307,9 @@ def _check_part(part: str, pose_noise: float) -> None:
     if part not in get_args(Part):
         raise ValueError(f"training.part={part} is unknown: choose one of {', '.join(get_args(Part))}")
     if not 0 <= pose_noise <= 1:
-        raise ValueError(f"training.pose_noise={pose_noise} must be a share of the scenes, 0 to 1")
+        raise ValueError(f"training.pose_noise={pose_noise} must be a fraction of the scenes, from 0 to 1")
     if pose_noise and part == "all":
         raise ValueError(
-            f"training.pose_noise={pose_noise} needs training.part=coarse: views are rendered from the hints' cameras, "
-            "which would not show what the images do"
+            f"training.pose_noise={pose_noise} requires training.part=coarse: rendered views need accurate "
+            "cameras to match the images"
         )

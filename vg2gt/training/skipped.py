@@ -68,7 +68,7 @@ class SkippedSteps:
         if self.in_a_row >= self.limit:
             raise FloatingPointError(
                 f"{self.in_a_row} steps in a row had a non-finite loss or gradient, the last: "
-                f"{'; '.join(map(str, faults))}. Look at its scenes, lower optimizer.lr, or raise training.max_skipped"
+                f"{'; '.join(map(str, faults))}. Check its scenes, lower optimizer.lr, or raise training.max_skipped"
             )
 
     def state_dict(self) -> dict[str, Any]:

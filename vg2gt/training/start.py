@@ -49,7 +49,7 @@ def checkpoint_to_resume(config: DictConfig) -> Path | None:
         path = Path(config.ckpt)
     elif old and not config.trainer.get("fast_dev_run") and not config.overwrite:
         raise FileExistsError(
-            f"{folder} already holds a run ({len(old)} checkpoints): go on with ckpt=last, choose another name=, "
+            f"{folder} already holds a run ({len(old)} checkpoints): resume with ckpt=last, choose another name=, "
             "or replace it with overwrite=true"
         )
     else:
@@ -57,13 +57,13 @@ def checkpoint_to_resume(config: DictConfig) -> Path | None:
     step, most = read_checkpoint(path)["global_step"], config.trainer.max_steps
     if old and not (path.resolve().parent == folder.resolve() and path.name == newest_valid(folder).name):
         raise FileExistsError(
-            f"ckpt={path} (step {step}) is not the newest checkpoint of the run in {folder}: go on in a new folder "
-            "with name=, or with ckpt=last"
+            f"ckpt={path} (step {step}) is not the newest checkpoint of the run in {folder}: resume in a new folder "
+            "with name=, or use ckpt=last"
         )
     if 0 <= most < step:
         raise ValueError(
-            f"{path} is at step {step}, further than trainer.max_steps={most} asks: nothing was changed. Raise "
-            "trainer.max_steps to go on, or take another name= to start a new run"
+            f"{path} is at step {step}, beyond trainer.max_steps={most}; nothing was changed. Raise "
+            "trainer.max_steps to resume, or set another name= for a new run"
         )
     return path
 
@@ -93,7 +93,7 @@ def prepare_folder(config: DictConfig, checkpoint: Path | None) -> None:
     if checkpoint is not None:
         for path in old[: next((i for i, path in enumerate(old) if path.name == checkpoint.name), 0)]:
             path.rename(f"{path}.damaged")
-            log.warning("%s is damaged and renamed to *.damaged; continuing from %s", path, checkpoint.name)
+            log.warning("%s is damaged and was renamed to *.damaged; continuing from %s", path, checkpoint.name)
     elif old:
         for path in old:
             path.unlink()
@@ -111,8 +111,8 @@ def name_differences(config: DictConfig) -> None:
     before, now = (flatten(OmegaConf.to_container(c, resolve=True)) for c in (read_run_config(path), config))
     if before.get(OPTIMIZER, now.get(OPTIMIZER)) != now.get(OPTIMIZER):
         raise ValueError(
-            f"the run was trained with {before[OPTIMIZER]} and cannot go on with {now[OPTIMIZER]}: start a new one "
-            "from its weights, with another name= and init_from="
+            f"the run was trained with {before[OPTIMIZER]} and cannot resume with {now[OPTIMIZER]}: start a new run "
+            "from its weights with name= and init_from="
         )
     different = sorted(key for key in before.keys() | now.keys() if before.get(key) != now.get(key))
     different = [key for key in different if key not in ("ckpt", "output_dir", "overwrite")]

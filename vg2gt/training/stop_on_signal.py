@@ -44,7 +44,7 @@ class StopOnSignal(lightning.Callback):
         self.received = True
         if number == signal.SIGINT:
             signal.signal(number, signal.default_int_handler)
-            os.write(2, b"\nending after this step with a checkpoint; Ctrl-C again ends at once\n")
+            os.write(2, b"\nstopping after this step and saving a checkpoint; press Ctrl-C again to stop at once\n")
 
     def on_train_batch_end(self, trainer: lightning.Trainer, *args: Any) -> None:
         """Saves and stops at the end of the step in which a signal reached any rank."""
@@ -57,7 +57,7 @@ class StopOnSignal(lightning.Callback):
             trainer.save_checkpoint(path)
         trainer.limit_val_batches = 0  # should_stop alone would evaluate once more
         trainer.should_stop = True
-        log.warning("stopping as asked by a signal: saved %s, continue with ckpt=last", path)
+        log.warning("stopping after a signal: saved %s; resume with ckpt=last", path)
 
     def teardown(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, stage: str) -> None:
         """Restores the handlers that Lightning has not restored; also runs after an error."""

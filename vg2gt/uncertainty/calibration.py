@@ -153,7 +153,7 @@ def read_calibration(path: str | Path) -> Calibration:
     try:
         content = read_json(path)
         if content["evidence"] != list(EVIDENCE) or content["levels"] != list(LEVELS):
-            raise ValueError(f"it is made of {content['evidence']} at {content['levels']}")
+            raise ValueError(f"it uses evidence {content['evidence']} at levels {content['levels']}")
         curves = {
             (Status[name.partition("/")[0].upper()], name.endswith("/shaky")): _curve(curve)
             for name, curve in content["curves"].items()
@@ -162,7 +162,9 @@ def read_calibration(path: str | Path) -> Calibration:
             raise ValueError("a status is missing")
         return Calibration(curves, str(content["made_for"]), int(content["scenes"]))
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise FormatError(f"{path} is no calibration of this version ({error}): make it by vg2gt calibrate") from error
+        raise FormatError(
+            f"{path} is not a calibration for this version ({error}): create one with vg2gt calibrate"
+        ) from error
 
 
 def calibrate(samples: Samples, made_for: str) -> Calibration:
@@ -260,7 +262,7 @@ def _curve(content: Mapping[str, Any]) -> Curve:
     scores, bounds = (torch.tensor(content[name]) for name in ("scores", "bounds"))
     shapes = [part.shape for part in values] == [part.shape for part in knots]
     if len(knots) != len(EVIDENCE) or not shapes or bounds.shape != (len(LEVELS), len(scores)):
-        raise ValueError("its arrays do not fit together")
+        raise ValueError("its arrays have inconsistent shapes")
     if not all(part.isfinite().all() for part in (*knots, *values, scores, bounds)) or not (bounds > 0).all():
         raise ValueError("it holds values that are not finite and positive")
     return Curve(knots, values, scores, bounds)

@@ -80,7 +80,7 @@ def pack(gaussians: Gaussians) -> tuple[dict[str, float], bytes]:
         raise ValueError("means must fit into float32")
     length = np.linalg.norm(arrays.quats, axis=-1, keepdims=True)
     if (length == 0).any():
-        raise ValueError("quats must not be zero: a rotation has no direction then")
+        raise ValueError("quats must have nonzero norm")
     sh, half_max = arrays.sh, float(np.finfo(np.float16).max)
     while sh.shape[1] > 1 and not sh[:, (math.isqrt(sh.shape[1]) - 1) ** 2 :].any():
         sh = sh[:, : (math.isqrt(sh.shape[1]) - 1) ** 2]

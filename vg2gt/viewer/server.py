@@ -36,7 +36,7 @@ def require_viser() -> None:
     """Raises MissingViserError, naming the remedy, if viser is not installed."""
     if importlib.util.find_spec("viser") is None:
         raise MissingViserError(
-            "the live viewer needs viser: pip install 'vg2gt[view]', or write a page with --html, which needs nothing"
+            "the live viewer requires viser: pip install 'vg2gt[view]'; or use --html to write a standalone page"
         )
 
 
@@ -111,7 +111,7 @@ def _refusing_other_pages(share: bool) -> Iterator[None]:
             headers = request.headers
             if share or is_own_request(headers.get_all("Host"), headers.get_all("Origin")):
                 return process_request(connection, request)
-            return connection.respond(HTTPStatus.FORBIDDEN, "not from another page\n")
+            return connection.respond(HTTPStatus.FORBIDDEN, "forbidden: request from another page\n")
 
         return serve(*arguments, process_request=check, **options)
 

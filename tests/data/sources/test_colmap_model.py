@@ -126,7 +126,7 @@ def test_a_model_of_equirectangular_images_is_refused_in_one_line(tmp_path):
     with edited(tmp_path) as model:
         model.cameras[1].model = pycolmap.CameraModelId.EQUIRECTANGULAR
         model.cameras[1].params = [40.0, 30.0]
-    with pytest.raises(DataError, match="EQUIRECTANGULAR has no pinhole part; cut it into cube faces"):
+    with pytest.raises(DataError, match="EQUIRECTANGULAR has no pinhole equivalent; convert images to cube faces"):
         COLMAP(str(tmp_path)).scene_index("statue")
 
 
@@ -139,7 +139,7 @@ def test_the_larger_model_is_taken_and_the_other_named(tmp_path, caplog):
     cameras = Cameras(frames.world_to_camera[None, :2].double(), frames.intrinsics[None, :2].double(), SIZE)
     write_colmap(scene / "sparse" / "0", colmap_from_views(cameras, ["left/000.png", "left/009.png"]))
     assert len(COLMAP(str(tmp_path)).frames("statue")) == 4
-    assert "has 2 COLMAP models: sparse/1 with 4 images is taken; not taken: sparse/0 (2)" in caplog.text
+    assert "has 2 COLMAP models: using sparse/1 with 4 images, ignoring sparse/0 (2)" in caplog.text
 
 
 @pytest.mark.parametrize("orientation", [3, 6, 8])
@@ -179,7 +179,7 @@ def test_values_that_are_not_finite_leave_their_image_out_by_name(tmp_path, capl
     *before, last = path.read_text().splitlines()
     path.write_text("\n".join([*before, " ".join([*last.split()[:4], "-nan(ind)", *last.split()[5:]])]))
     assert len(COLMAP(str(tmp_path)).frames("statue")) == 3
-    assert "cameras whose values are not finite, their images are left out: left/" in caplog.text
+    assert "left out images whose camera parameters are not finite: left/" in caplog.text
 
 
 def test_masks_beside_images(tmp_path, caplog):

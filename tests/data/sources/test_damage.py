@@ -207,9 +207,9 @@ NAMED: dict[str, list[tuple[str, Callable[[Path], Any], str]]] = {
         (VIEW, array(60, 80, value=1e10), rf"{VIEW} of scene 1a2b3c has no valid depth .*data\.max_depth"),
     ],
     "nerfstudio": [
-        ("*.json", entries(lambda c: c.update(camera_model="EQUIRECTANGULAR")), "model EQUIRECTANGULAR; read are: PIN"),
+        ("*.json", entries(lambda c: c.update(camera_model="EQUIRECTANGULAR")), "EQUIRECTANGULAR; supported: PIN"),
         ("*.json", entries(lambda c: c.update(w=80, h=80)), "is 40x30 pixels, but its camera in .* 80x80"),
-        ("*.json", entries(lambda c: c.update(k1=1e6)), "scene desk.*takes the image's border out"),
+        ("*.json", entries(lambda c: c.update(k1=1e6)), "scene desk.*maps the image border outside"),
         ("*.json", entries(lambda c: c.update(frames=[])), "none of the 0 images"),
         ("*.json", entries(lambda c: c["frames"][0].update(transform_matrix=[[1]])), "scene desk.*transform_matrix"),
     ],
@@ -243,7 +243,7 @@ NAMED: dict[str, list[tuple[str, Callable[[Path], Any], str]]] = {
         (
             "K.txt",
             numbers(lambda k: np.diag([2, 2, 1]) @ k),
-            r"K\.txt of scene .* resolution \(about 78x58\)\? Scale it",
+            r"K\.txt of scene .* resolution \(about 78x58\): scale it",
         ),
         ("K.txt", numbers(lambda k: np.diag([0.25, 0.25, 1]) @ k), r"another resolution \(about 10x7\)"),
         ("K.txt", numbers(lambda k: 0 * k), "no positive focal lengths"),

@@ -56,7 +56,7 @@ def test_instant_ngps_fisheye_is_a_fisheye(tmp_path):
     assert torch.equal(found.images, right.images)
     assert torch.equal(found.intrinsics, right.intrinsics)
     _edit(tmp_path, lambda content: content.pop("is_fisheye"))
-    with pytest.raises(DataError, match="radial k4, which is read of fisheye cameras alone"):
+    with pytest.raises(DataError, match="radial k4, which is supported for fisheye cameras only"):
         Nerfstudio(str(tmp_path)).load("desk", [0])
 
 
@@ -163,7 +163,7 @@ def test_masks_that_are_named_and_one_that_is_missing(tmp_path, caplog):
     loaded = Nerfstudio(str(tmp_path)).load("desk", [0, 1])
     assert loaded.mask[0].sum() == 300
     assert loaded.mask[1].all()
-    assert "names masks that are not there, their images count as a whole" in caplog.text
+    assert "lists masks that do not exist; all pixels of their images are used" in caplog.text
     assert "m/1.png" in caplog.text
 
 

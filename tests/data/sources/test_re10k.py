@@ -76,11 +76,11 @@ def test_what_is_wrong_is_named(tmp_path: Path) -> None:
         shutil.rmtree(tmp_path / "bad", ignore_errors=True)
         shutil.copytree(tmp_path / "test", tmp_path / "bad")
         (tmp_path / "bad" / "000000.torch").write_bytes(content)
-        with pytest.raises(DataError, match=r"000000\.torch is no chunk"):
+        with pytest.raises(DataError, match=r"000000\.torch is damaged or not a chunk"):
             PixelSplatChunks(str(tmp_path), "bad").frames("0a1b")
     torch.save([Evil()], tmp_path / "bad" / "000001.torch")
     (tmp_path / "bad" / "index.json").write_text('{"0a1b": "000001.torch"}')
-    with pytest.raises(DataError, match=r"000001\.torch is no chunk"):
+    with pytest.raises(DataError, match=r"000001\.torch is damaged or not a chunk"):
         PixelSplatChunks(str(tmp_path), "bad").frames("0a1b")
     assert not (tmp_path / "ran").exists()
 

@@ -45,7 +45,7 @@ def test_scans_of_one_room_show_one_place(tmp_path, frames):
     (tmp_path / "train.txt").write_text(f"{SCENE}\n")
     assert ScanNet(str(tmp_path), scenes=str(tmp_path / "train.txt")).scenes == (SCENE,)
     assert ScanNet(str(tmp_path), scenes=["scene0707*"]).scenes == (SCENE, "scene0707_01")
-    with pytest.raises(DataError, match=r"there is no scene scene9\*; found are: scene0706_00"):
+    with pytest.raises(DataError, match=r"no such scene: scene9\*; available: scene0706_00"):
         ScanNet(str(tmp_path), scenes=["scene9*"])
     assert ScanNet(str(tmp_path / "scans" / SCENE)).scenes == (SCENE,)
     write_export(tmp_path / "scans", frames)

@@ -16,7 +16,7 @@ def test_unregistered_images_are_counted(tmp_path):
         assert tuple(source.frames("Barn")) == (1, 2, 3)
         assert source.scene_index("Barn").dropped == {"without a pose": 1}
     (tmp_path / "Barn" / "000002.png").unlink()
-    with pytest.raises(DataError, match="4 poses for 3 images; they belong together by their order"):
+    with pytest.raises(DataError, match="4 poses for 3 images; they are matched by order"):
         read(tmp_path).frames("Barn")
 
 

@@ -106,5 +106,5 @@ def test_depth_takes_one_pixel_and_holes_stay():
 
 @pytest.mark.parametrize("k", [{"k1": 3000.0}, {"k1": -30.0}, {"k2": 1e300}, {"p1": 5.0}])
 def test_senseless_coefficients_are_refused(k):
-    with pytest.raises(ValueError, match="takes the image's border out of the image"):
+    with pytest.raises(ValueError, match="maps the image border outside the image"):
         undistortion(k)

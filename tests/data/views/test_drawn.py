@@ -76,7 +76,7 @@ def test_a_window_grows_until_it_holds_a_held_out_frame(count: int) -> None:
 def test_an_index_that_mixes_input_and_target_or_miscounts_is_refused(tmp_path: Path, context, target) -> None:
     path = tmp_path / "mine.json"
     path.write_text(json.dumps({"scenes": {"a": {"2": {"context": context, "target": target}}}}))
-    with pytest.raises(DataError, match="views of scene a are not 2 input views and others"):
+    with pytest.raises(DataError, match="views of scene a must be 2 distinct input views and distinct held-out"):
         ViewSelection(index=str(path)).choose(Listed(range(40)), ["a"], 2)
 
 
@@ -84,7 +84,7 @@ def test_fixed_views() -> None:
     views = ViewSelection(fixed={3: [23, 24, 33]}).draw(Listed(range(49)), "a", 3)
     assert views.context == (23, 24, 33)
     assert all(24 < frame < 33 for frame in views.target)
-    with pytest.raises(ValueError, match=r"fixed names \[1, 2\] for 3"):
+    with pytest.raises(ValueError, match=r"fixed\[3\] must list 3 distinct frames, got \[1, 2\]"):
         ViewSelection(fixed={3: [1, 2]})
 
 
@@ -96,12 +96,12 @@ def test_an_index_overrides_the_draw_and_gaps_are_drawn_with_a_warning(tmp_path:
     source = Listed(range(40))
     first, second = selection.choose(source, ["a", "b"], 2)
     assert (first, second) == (SceneSample("a", (7, 5), (6,)), selection.draw(source, "b", 2))
-    assert "mine.json holds no 2 views of 1 of 2 scenes (the first is b)" in caplog.text
+    assert "mine.json has no entry with 2 views for 1 of 2 scenes (first: b)" in caplog.text
 
 
 def test_wrong_indices_and_too_few_frames_are_named(tmp_path: Path) -> None:
     source = Listed(range(10))
-    with pytest.raises(FileNotFoundError, match=r"Committed are .*synthetic"):
+    with pytest.raises(FileNotFoundError, match=r"available: .*synthetic"):
         read_index("nowhere")
     (tmp_path / "bad.json").write_text('{"scenes": {"a": {"2": [1, 2]}}}')
     with pytest.raises(ValueError, match="not an index"):

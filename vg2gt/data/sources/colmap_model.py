@@ -91,7 +91,7 @@ class COLMAP(FileSource):
             names = f"the first is {records[0].name}, expected at {named[0]}" if records else "it names none"
             raise DataError(
                 f"scene {scene}: none of the model's {len(records)} images is in {folder / self.images}; {names}. Copy "
-                "them there, or name their folder by data.images="
+                "them there, or set data.images to the name of their folder"
             )
         masks = find_masks(folder / MASKS, {i: records[i].name for i in color}, f"scene {scene}")
         poses = {i: to_world(colmap_pose(record)) for i, record in enumerate(records)}
@@ -99,7 +99,7 @@ class COLMAP(FileSource):
         usable = {i: image for i, image in posed.items() if np.isfinite(image.intrinsics).all()}
         if len(usable) < len(posed):
             names = ", ".join(records[i].name for i in posed if i not in usable)
-            log.warning("scene %s: cameras whose values are not finite, their images are left out: %s", scene, names)
+            log.warning("scene %s: left out images whose camera parameters are not finite: %s", scene, names)
             color = {i: path for i, path in color.items() if i in usable}
         depth = None
         if self.has_depth:
@@ -144,7 +144,7 @@ class COLMAP(FileSource):
         if len(models) > 1:
             others = ", ".join(f"{place.relative_to(folder)} ({count})" for place, count in models[1:])
             log.warning(
-                "scene %s has %d COLMAP models: %s with %d images is taken; not taken: %s",
+                "scene %s has %d COLMAP models: using %s with %d images, ignoring %s",
                 scene, len(models), models[0][0].relative_to(folder), models[0][1], others,
             )  # fmt: skip
         with errors_name(scene):

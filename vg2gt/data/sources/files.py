@@ -67,28 +67,29 @@ class FileSource(SceneSource):
     """
 
     layout: ClassVar[str]
-    """What is looked for in ``root``, for messages."""
+    """Expected layout of ``root``, for error messages."""
     scene_marks: ClassVar[tuple[str, ...]] = ()
-    """Files and folders that a folder must hold to be a scene."""
+    """Files and folders that a folder must contain to count as a scene."""
     scene_files: ClassVar[tuple[str, ...]] = ()
-    """Endings of files that are scenes by themselves."""
+    """Suffixes of single files that count as scenes."""
     levels: ClassVar[int] = 2
-    """How deep below ``root`` scenes lie, at most."""
+    """Maximum depth of scene folders below ``root``."""
     names_are_paths: ClassVar[bool] = False
-    """Scenes are called by their path below ``root``, not by their folder's name."""
+    """Whether a scene is named by its path relative to ``root`` instead of its folder name."""
     index_version: ClassVar[int] = 2
-    """Raise it when ``index`` would give another result for the same files."""
+    """Increment it when ``index`` changes its result for the same files; invalidates cached indices."""
     index_options: ClassVar[tuple[str, ...]] = ()
-    """Attributes that decide an index, besides the folder; part of the cache's key."""
+    """Names of the attributes that affect an index; part of its cache key, like the folder."""
     sparse_depth: ClassVar[bool] = False
+    """Whether depth is known at single pixels only; see :class:`~vg2gt.data.base.Frames`."""
     reads_masks: ClassVar[bool] = False
-    """Alpha and mask files decide how much a pixel counts; otherwise alpha is composited alone."""
+    """Whether alpha and mask files weight the pixels; if not, alpha is only composited over white."""
     depth_scale: float = 1000.0
-    """Stored depth units for one unit of the poses."""
+    """Stored depth units per unit of the poses."""
     invalid: tuple[int, ...] = ()
-    """Stored depth that means none, besides 0."""
+    """Stored depth values that are invalid, in addition to 0."""
     depth_remedy: ClassVar[str] = "correct the depth unit and the values that mean 'invalid'"
-    """What to do where a frame has no valid depth, for messages."""
+    """Remedy named in the error about a frame without valid depth."""
 
     def __init__(
         self,
@@ -206,7 +207,7 @@ class FileSource(SceneSource):
     def scene_index(self, scene: str) -> SceneIndex:
         """Returns the index of a scene, from memory, the cache, or the dataset."""
         if scene not in self._folders:
-            raise DataError(f"there is no scene {scene}; found are: {_some(self._folders)}")
+            raise DataError(f"no such scene: {scene}; available: {_some(self._folders)}")
         if scene not in self._indices:
             self._indices[scene] = self._recall_index(scene, self._folders[scene])
             # Indices of a thousand long videos would take gigabytes; evicted ones are quickly read from the cache.
@@ -260,9 +261,9 @@ class FileSource(SceneSource):
         unknown = [name for name, fitting in chosen.items() if not fitting or fitting[0] not in found]
         # A list file covers the whole dataset, but often only a part of it is on disk.
         if unknown and (not isinstance(scenes, str) or len(unknown) == len(chosen)):
-            raise DataError(f"there is no scene {_some(unknown)}; found are: {_some(found)}")
+            raise DataError(f"no such scene: {_some(unknown)}; available: {_some(found)}")
         if unknown:
-            log.warning("%d of the %d scenes that %s names are not there", len(unknown), len(chosen), scenes)
+            log.warning("skipped %d of the %d scenes listed in %s: not found", len(unknown), len(chosen), scenes)
             chosen = {name: fitting for name, fitting in chosen.items() if name not in unknown}
         return {scene: found[scene] for fitting in chosen.values() for scene in fitting}
 
@@ -279,7 +280,7 @@ class FileSource(SceneSource):
         if index is None:
             if not self._indexes:
                 self._indexes = True
-                message = "file lists, poses and intrinsics of up to %d scenes are read once and then kept in %s"
+                message = "reading file lists, poses and intrinsics of up to %d scenes; they are cached in %s"
                 log.info(message, len(self._folders), self.index_cache)
             index = self.index(scene, folder)
             write_cached(path, index_to_bytes(index, state), self.index_cache)
@@ -314,8 +315,8 @@ def _roots(root: str | Sequence[str] | None, layout: str, files: tuple[str, ...]
     for path in roots:
         if not (path.is_dir() or (path.is_file() and path.suffix.lower() in files)):
             raise FileNotFoundError(
-                f"the data folder {path} (seen from {Path.cwd()}) does not exist: set data.root=FOLDER to one that "
-                f"holds {layout}"
+                f"the data folder {path} (working directory: {Path.cwd()}) does not exist: set data.root=FOLDER to one "
+                f"that contains {layout}"
             )
     return roots
 

@@ -24,7 +24,7 @@ from vg2gt.io.image_files import Size, image_size, typical_size
 log = logging.getLogger(__name__)
 
 FORMAT = 3
-"""Of the files that keep an index; raise it when they are written otherwise."""
+"""Version of the index files; increment it when their format changes."""
 _SIZES = ("size", "color_size", "depth_size")
 
 
@@ -265,7 +265,7 @@ def read_index(path: Path, scene: str, folder: Path, state: str) -> SceneIndex |
         extra = [f"extra_{name}" for name in facts["extra"]]
         arrays = load_npz(path, scene, ["frame_ids", "color", "depth", "world_to_camera", "intrinsics", *extra])
     except (DataError, ValueError) as error:
-        log.warning("the cached index is damaged and is made again: %s", error)
+        log.warning("the cached index is damaged and will be rebuilt: %s", error)
         return None
     if facts["state"] != state:
         return None

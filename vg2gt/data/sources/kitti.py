@@ -17,7 +17,7 @@ from vg2gt.data.sources.parsing import existing_depth_root, numbered, read_numbe
 from vg2gt.io.cameras_json import invert_pose
 
 EARTH_RADIUS = 6378137.0
-"""Metres, at the equator, as KITTI's own tools have it."""
+"""Equatorial radius in metres, as in KITTI's own tools."""
 
 _CALIBRATION = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt", "calib_imu_to_velo.txt")
 _SPLITS = ("train", "val")

@@ -44,7 +44,7 @@ def find_masks(folder: Path, names: Mapping[int, str], where: str) -> dict[int, 
     lacking = [names[number] for number, path in found.items() if path is None]
     if lacking:
         log.warning(
-            "%s: %d of %d images have no mask in %s and count as a whole: %s",
+            "%s: %d of %d images have no mask in %s; all their pixels are used: %s",
             where, len(lacking), len(names), folder, ", ".join(lacking[:10]),
         )  # fmt: skip
     return {number: path for number, path in found.items() if path is not None}

@@ -70,7 +70,7 @@ class Nerfstudio(FileSource):
         **shared: Unpack[HoldoutOptions],
     ) -> None:
         self.has_depth = depth
-        self.depth_scale = positive("depth_scale", depth_scale, "stored units for one of the poses")
+        self.depth_scale = positive("depth_scale", depth_scale, "stored units per unit of the poses")
         self._frames: dict[str, tuple[list[TransformsFrame], int]] = {}
         super().__init__(root, **shared)
 
@@ -107,7 +107,7 @@ class Nerfstudio(FileSource):
         missing = [str(path) for path in named.values() if not path.is_file()]
         if missing:
             log.warning(
-                "%s names masks that are not there, their images count as a whole: %s", where, ", ".join(missing)
+                "%s lists masks that do not exist; all pixels of their images are used: %s", where, ", ".join(missing)
             )
         found = {i: path for i, path in named.items() if path.is_file()}
         rest = {i: path.name for i, path in color.items() if i not in named}
@@ -151,7 +151,7 @@ def _posed(scene: str, where: str, lens: Lens, path: Path, mask: Path | None) ->
     where = f"{where}, for {path}"
     if (lens.camera_model or "PINHOLE").upper() not in _MODELS:
         names = ", ".join(name for name in _MODELS if name)
-        raise DataError(f"{where} has a camera of model {lens.camera_model}; read are: {names}")
+        raise DataError(f"{where} has the unsupported camera model {lens.camera_model}; supported: {names}")
     if lens.width and lens.height:
         expected = (lens.height, lens.width)
         size, upright = size_on_disk(path, scene, expected, where)
@@ -172,7 +172,7 @@ def _distorted(lens: Lens, matrix: NDArray[np.float64], size: Size, where: str) 
     fisheye = "FISHEYE" in (lens.camera_model or "").upper()
     if not fisheye and k.get("k4"):
         raise DataError(
-            f"{where} has a radial k4, which is read of fisheye cameras alone: set camera_model or is_fisheye"
+            f"{where} has a radial k4, which is supported for fisheye cameras only: set camera_model or is_fisheye"
         )
     names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
     coefficients = [k.get(name, 0.0) for name in names] + ([] if fisheye else [0.0] * 3)

@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".tif", ".tiff", ".webp", ".bmp")
 
 CORNER_TO_CENTER = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
-"""Subtracted from intrinsics whose principal point counts from the corner of the first pixel, not from its centre."""
+"""Subtract it from intrinsics to move their origin from the corner of the first pixel to its centre."""
 
 _THREADS = 8
 _ROTATION_TOLERANCE = 0.02
@@ -265,5 +265,5 @@ def existing_depth_root(path: str | None) -> Path | None:
     """
     folder = expanded(path)
     if folder is not None and not folder.is_dir():
-        raise FileNotFoundError(f"the depth folder {folder} (seen from {Path.cwd()}) does not exist")
+        raise FileNotFoundError(f"the depth folder {folder} (working directory: {Path.cwd()}) does not exist")
     return folder

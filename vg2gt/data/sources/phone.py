@@ -33,7 +33,7 @@ from vg2gt.io.record3d import is_archive, read_recorded, recorded_files, unpack_
 from vg2gt.io.video import video_size
 
 METRES = (".exr", ".depth")
-"""Endings of depth files that hold floats."""
+"""Suffixes of depth files that store floats in metres."""
 EXR, PACKED = METRES
 VIDEO = "rgb.mp4"
 RECORD3D, R3D, POLYCAM, STRAY = (
@@ -194,7 +194,7 @@ def _of_metadata(
     """Parses Record3D metadata: ``poses`` as qx qy qz qw x y z; column-major ``K``, or coefficients per frame."""
     height, width = _numbers(path, content, "h", "w")
     if color and not np.isclose(height * size[1], width * size[0], rtol=0.02):
-        raise FormatError(f"{path} says {width:g}x{height:g} pixels, but the images are {size[1]}x{size[0]}")
+        raise FormatError(f"{path} gives a size of {width:g}x{height:g} pixels, but the images are {size[1]}x{size[0]}")
     try:
         rows = np.asarray(content["poses"], np.float64).reshape(-1, 7)
         if coefficients := content.get("perFrameIntrinsicCoeffs"):
@@ -239,7 +239,7 @@ def _read_stray(folder: Path, scene: str) -> Recording:
     except (ValueError, IndexError) as error:  # UnicodeDecodeError is a ValueError
         raise FormatError(f"{path} or camera_matrix.csv next to it is damaged: {error}") from error
     if not len(rows) or not (np.abs(rows[:, 0]) < 2**31).all():
-        raise FormatError(f"{path} has no frames, or numbers of frames that are none")
+        raise FormatError(f"{path} has no frames, or invalid frame numbers")
     frames = rows[:, 0].astype(int).tolist()
     return Recording(
         STRAY,

@@ -234,8 +234,8 @@ def _check_resolution(matrix: NDArray[np.float64], where: str, size: Size) -> No
     if abs(x / size[1] - 0.5) > _OFF_CENTRE or abs(y / size[0] - 0.5) > _OFF_CENTRE:
         raise DataError(
             f"{where} has its principal point at ({x:g}, {y:g}), far from the middle of the images of "
-            f"{size[1]}x{size[0]}: is it of another resolution (about {2 * x:.0f}x{2 * y:.0f})? Scale it to these "
-            "images, or set data.intrinsics=[fx,fy,cx,cy], which is taken as it is"
+            f"{size[1]}x{size[0]}; it seems to be for another resolution (about {2 * x:.0f}x{2 * y:.0f}): scale it to "
+            "these images, or set data.intrinsics=[fx,fy,cx,cy], which is used unchanged"
         )
 
 

@@ -10,7 +10,7 @@ from vg2gt.data.sources.index import SceneIndex, check_found, first_size, make_i
 from vg2gt.data.sources.parsing import numbered, read_matrix, read_poses
 
 INTRINSICS = "intrinsic/intrinsic_depth.txt"
-"""A scan's intrinsics, those of its depth images."""
+"""File with the intrinsics of a scan's depth images."""
 
 
 class ScanNet(FileSource):

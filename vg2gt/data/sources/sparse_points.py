@@ -14,13 +14,19 @@ from vg2gt.io import colmap_images, colmap_pose
 from vg2gt.io.colmap import Camera, Image, Reconstruction
 
 MIN_TRACK = 3
-"""Views that must see a point before its depth counts: two are not enough to notice a wrong match."""
+"""Minimum number of views that observe a point; two cannot reveal a wrong match."""
 MAX_REPROJECTION = 2.0
-"""Pixels of the model's images that a point may lie from where a view saw it."""
+"""Maximum reprojection error of an observation, in pixels of the model's images."""
 MIN_ANGLE = 2.0
-"""Degrees between a point's rays: with half a pixel of noise at a focal length of 1000, less leaves 1.5 % of depth."""
+"""Minimum angle between a point's rays, in degrees.
+
+Below it, half a pixel of noise at a focal length of 1000 gives a depth error of 1.5 %.
+"""
 MAX_GAP = 0.25
-"""Part of its distance from the cameras that a point's third neighbour may be away: others float alone."""
+"""Maximum distance to a point's third-nearest neighbour, as a fraction of its distance from the cameras.
+
+Points beyond it are isolated and count as outliers.
+"""
 _NEIGHBOURS = 3
 _FAR = 1e30
 

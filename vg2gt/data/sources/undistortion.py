@@ -125,8 +125,8 @@ def _places(camera: Camera, intrinsics: NDArray[np.float64], size: Size) -> NDAr
 
 def _senseless(camera: Camera) -> str:
     return (
-        f"the distortion of a {camera.model_name} camera ({camera.params_info}: {camera.params_to_string()}) takes the "
-        "image's border out of the image; it cannot be that of these images"
+        f"the distortion of a {camera.model_name} camera ({camera.params_info}: {camera.params_to_string()}) maps the "
+        "image border outside the image; it does not belong to these images"
     )
 
 
@@ -158,8 +158,8 @@ def size_on_disk(
         return stored, False
     exif = f" (EXIF orientation {turned}, upright {upright[1]}x{upright[0]})" if turned != 1 else ""
     raise DataError(
-        f"{path} is {stored[1]}x{stored[0]} pixels{exif}, but its camera in {where} {expected[1]}x{expected[0]}: it is "
-        "not the image the camera was made for, nor a reduced one"
+        f"{path} is {stored[1]}x{stored[0]} pixels{exif}, but its camera in {where} is {expected[1]}x{expected[0]}: "
+        "use the camera's own image or a resized copy with the same aspect ratio"
     )
 
 

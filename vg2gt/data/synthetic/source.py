@@ -46,7 +46,7 @@ class SyntheticScenes(SceneSource):
     """
 
     variants: ClassVar[dict[str, Any]] = {"room": SyntheticRoom}
-    """Classes of scenes, like :class:`SyntheticRoom`, by their name."""
+    """Scene classes by name, with the interface of :class:`SyntheticRoom`."""
 
     def __init__(
         self,
@@ -149,11 +149,11 @@ class SyntheticScenes(SceneSource):
         try:
             arrays = read_npz(path, ("images", "depth", "world_to_camera", "intrinsics"))
         except (FormatError, KeyError, OSError) as error:
-            log.warning("the cached scene %s is damaged (%s) and is made again", path, error)
+            log.warning("the cached scene %s is damaged (%s) and will be rendered again", path, error)
             return None
         shape = (self.num_frames, *self.size)
         if arrays["images"].shape != (*shape, 3) or arrays["depth"].shape != shape:
-            log.warning("the cached scene %s has another shape than %s and is made again", path, shape)
+            log.warning("the cached scene %s does not have shape %s and will be rendered again", path, shape)
             return None
         return arrays
 

@@ -14,7 +14,7 @@ from vg2gt.data.synthetic.renderer import SAMPLES, RenderedFrame, World, render_
 _HIGHLIGHTS = 1  # separates the random stream of the highlights from that of the scene
 _MATT_SHARE = 0.3
 LOBES = "lobes"
-"""Value of ``highlights`` for strong ones."""
+"""Value of ``highlights`` that selects strong highlights."""
 
 
 class SyntheticScene:

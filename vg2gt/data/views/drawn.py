@@ -57,7 +57,9 @@ class ViewSelection:
             )
         for count, frames in self.fixed.items():
             if len(set(frames)) != count:
-                raise ValueError(f"evaluation.selection.fixed names {list(frames)} for {count} views")
+                raise ValueError(
+                    f"evaluation.selection.fixed[{count}] must list {count} distinct frames, got {list(frames)}"
+                )
 
     def choose(self, source: SceneSource, scenes: Sequence[str], count: int) -> list[SceneSample]:
         """Returns one sample of ``count`` input views per scene.
@@ -71,7 +73,7 @@ class ViewSelection:
         drawn = [scene for scene in scenes if _stored_views(stored, scene, count) is None]
         if drawn and self.index is not None:
             log.warning(
-                "%s holds no %d views of %d of %d scenes (the first is %s): they are drawn with seed %d",
+                "%s has no entry with %d views for %d of %d scenes (first: %s): drawing them with seed %d",
                 index_path(self.index).name, count, len(drawn), len(scenes), drawn[0], self.seed,
             )  # fmt: skip
         for views in chosen:
@@ -148,7 +150,7 @@ def read_index(name: str | None) -> Mapping[str, Mapping[str, Any]]:
     if not path.is_file():
         known = ", ".join(sorted(p.stem for p in INDICES.glob("*.json")))
         raise FileNotFoundError(
-            f"evaluation.selection.index={name}: no file {path}. Committed are {known}; make others with "
+            f"evaluation.selection.index={name}: no file {path}; available: {known}; create others with "
             "`vg2gt data views`, or draw the views with evaluation.selection.index=null"
         )
     content = read_json(path)
@@ -189,13 +191,13 @@ def _stored_views(stored: Mapping[str, Mapping[str, Any]], scene: str, count: in
 def _check_frames(source: SceneSource, views: SceneSample, count: int) -> None:
     if len(views.context) != count or len(set(views.frames)) != len(views.frames):
         raise DataError(
-            f"the evaluation's views of scene {views.scene} are not {count} input views and others: input "
-            f"{list(views.context)}, held out {list(views.target)}; correct evaluation.selection (index, fixed), or "
-            "draw views with evaluation.selection.index=null"
+            f"the evaluation views of scene {views.scene} must be {count} distinct input views and distinct held-out "
+            f"views, got input {list(views.context)}, held out {list(views.target)}; correct evaluation.selection "
+            "(index, fixed), or draw views with evaluation.selection.index=null"
         )
     missing = sorted(set(views.frames) - set(source.frames(views.scene)))
     if missing:
         raise DataError(
-            f"the evaluation asks for frames {missing} of scene {views.scene}, which the data does not have: read it "
-            "with the options the index was made with (data.every), or draw views with evaluation.selection.index=null"
+            f"the evaluation needs frames {missing} of scene {views.scene}, which the data lacks: use the data options "
+            "that the index was created with (data.every), or draw views with evaluation.selection.index=null"
         )

@@ -17,9 +17,9 @@ import triton.language as tl  # pyright: ignore[reportMissingImports]
 
 TILE = 8
 RECORD = 16
-"""Values of a Gaussian in a view: centre 2, conic 3, tilt 2, z, a0, cutoff, normal 3, colour 3.
+"""Number of values per Gaussian and view: centre (2), conic (3), tilt (2), z, a0, cutoff, normal (3), colour (3).
 
-Its gradient row has the same places; that of the cutoff is the gradient of the opacity's logarithm.
+Gradients have the same layout; the entry of the cutoff holds the gradient of the log opacity.
 """
 
 _TILE = tl.constexpr(TILE)

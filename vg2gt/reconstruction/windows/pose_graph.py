@@ -28,7 +28,7 @@ ROUNDS = 50  # maximum function evaluations of the pose graph's solver
 APART = 2  # minimum number of windows between those that a loop joins
 
 Edge: TypeAlias = "tuple[int, int, NDArray[np.float64]]"
-"""Windows a and b, and the similarity from a's frame to b's."""
+"""Indices of two windows a and b, and the 4x4 similarity transform from the frame of a to that of b."""
 
 
 @dataclass(frozen=True)
@@ -176,7 +176,7 @@ def _chained(edges: Sequence[Edge], known: NDArray[np.float64], count: int) -> N
     for node in range(len(known), count):
         found = [edge for edge in edges if edge[1] == node]
         if not found:
-            raise ValueError(f"window {node} shares no views with those before: take larger windows")
+            raise ValueError(f"window {node} shares no views with earlier windows: use larger windows (--window)")
         other, _, move = found[-1]
         poses.append(_compose(poses[other][None], _inverse(move))[0])
     return np.stack(poses)

@@ -44,7 +44,7 @@ def window_model(model: Reconstructor) -> VG2GT:
         ValueError: if it does not; the message names the remedy.
     """
     if model.visibility is not None and model.visibility.moment is not None:
-        raise ValueError("what moves is found among all views at once: add --window 0, or model.visibility.moment=null")
+        raise ValueError("motion detection needs all views at once: add --window 0 or model.visibility.moment=null")
     if isinstance(model, VG2GT) and isinstance(model.fine, FineModule):
         return model
     raise ValueError(f"{type(model).__name__} reconstructs all views at once: add --window 0, or take fewer views")

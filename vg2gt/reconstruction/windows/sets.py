@@ -62,7 +62,7 @@ def read_anchor(folder: Path) -> Anchor:
     """
     if not (folder / _ANCHOR).is_file():
         raise FileNotFoundError(
-            f"{folder} keeps no voxels of a scene: reconstruct it with --window N --keep-windows and given cameras"
+            f"{folder} contains no voxels of a scene: reconstruct it with --window N --keep-windows and given cameras"
         )
     found: dict[str, Any] = read_json(folder / _ANCHOR)
     return Anchor(**found | {"reference": np.array(found["reference"]), "size": tuple(found["size"])})

@@ -20,7 +20,7 @@ from vg2gt.io.tensors import read_tensors
 from vg2gt.model import Reconstructor
 
 FORMAT = 1
-"""Of the folder; raise it when it is written otherwise."""
+"""Version of the folder's format; increment it when the format changes."""
 SET = "set.json"  # marks the folder of a set; says whether it is finished
 _PLAIN = (bool, int, float, str, tuple, type(None))
 
