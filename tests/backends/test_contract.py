@@ -176,7 +176,7 @@ def test_batch_of_two_equals_two_singles(backend: Backend, scene, geometry: Geom
 def test_any_number_of_views(backend: Backend, make_scene, views: int) -> None:
     size = (3 * backend.patch_size, 5 * backend.patch_size)
     if views < backend.min_views:
-        with pytest.raises(ValueError, match=rf"{backend.name}.*one view"):
+        with pytest.raises(ValueError, match=rf"{backend.name}.*a single view"):
             backend.encode(*make_scene(1, views, size))
         return
     geometry = backend.decode(backend.encode(*make_scene(1, views, size)))

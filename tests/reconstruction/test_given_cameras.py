@@ -110,7 +110,7 @@ def test_cameras_json_of_larger_images_and_without_some(folder: Path, frames, ca
     hints = views_of(pictures).hints
     assert torch.allclose(hints.cameras.intrinsics[0], frames.intrinsics[:3], atol=1e-3)
     put_cameras(folder, frames, size=(84, 84))
-    with pytest.raises(ValueError, match=r"008.png is 112x84 pixels, but its camera in .*cameras.json 84x84"):
+    with pytest.raises(ValueError, match=r"008.png is 112x84 pixels, but its camera in .*cameras.json is 84x84"):
         given_pictures(folder)
     put_cameras(folder, frames, ["a", "b"])
     with pytest.raises(ValueError, match=r"names none of the 4 images"):

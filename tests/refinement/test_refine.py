@@ -68,28 +68,6 @@ def test_it_splits_within_the_limit(refined: Refined, start: Start) -> None:
     assert len(capped.scene.gaussians) <= 1.1 * len(start.gaussians)
 
 
-def test_dropout_leaves_out_what_it_says_and_repeats(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
-    """More and more Gaussians are left out of a step, never of what is scored or returned."""
-    module = import_module("vg2gt.refinement.refine")
-    steps, scores = [], []
-
-    def counting(self, scene, views):
-        (steps if torch.is_grad_enabled() else scores).append(len(scene.gaussians))
-        return loss_of(self, scene, views)
-
-    loss_of = module._Refinement._loss
-    monkeypatch.setattr(module._Refinement, "_loss", counting)
-    options = RefineOptions(steps=10, check_every=5, fill=0, prune_opacity=0, dropout=0.5, loss=COLOUR)
-    found = run(start, options)
-    count = len(start.gaussians)
-    assert set(scores) == {count}
-    assert len(found.scene.gaussians) == count
-    left = torch.tensor(steps) / count
-    torch.testing.assert_close(left, 1 - 0.05 * torch.arange(10), atol=0.02, rtol=0)
-    assert same(run(start, options).scene, found.scene)
-    assert found.psnr[1].mean() > found.psnr[0].mean() + 1
-
-
 def test_an_interruption_keeps_the_best_state(start: Start) -> None:
     def interrupt(progress: Progress) -> None:
         if progress.step == 7:

@@ -66,9 +66,7 @@ class RefineOptions:
         prune_opacity: opacity below which Gaussians are removed.
         split_share: share of the Gaussians to split at a check, those with the largest position gradients.
         max_growth: maximum number of Gaussians, as a multiple of the initial number.
-        dropout: share of the Gaussians that a step drops at random, growing from 0 to this at the end (DropGaussian,
-            Park et al. 2025): with few views, no Gaussian should serve only one of them.
-        seed: random seed of the view order and of dropout.
+        seed: random seed of the view order.
         rates: learning rates.
         loss: loss to minimise.
 
@@ -89,7 +87,6 @@ class RefineOptions:
     prune_opacity: float = 0.02
     split_share: float = 0.0
     max_growth: float = 1.5
-    dropout: float = 0.0
     seed: int = 0
     rates: RefineRates = field(default_factory=RefineRates)
     loss: RefineLoss = field(default_factory=RefineLoss)
@@ -109,7 +106,6 @@ class RefineOptions:
             ("prune_opacity", 0 <= self.prune_opacity < 1, "at least 0 and below 1"),
             ("split_share", 0 <= self.split_share <= 1, "between 0 and 1"),
             ("max_growth", self.max_growth >= 1, "at least 1"),
-            ("dropout", 0 <= self.dropout < 1, "at least 0 and below 1"),
         ):
             if not good:
                 raise ValueError(f"refine.{name} must be {expected}, got {getattr(self, name)}")

@@ -26,7 +26,6 @@ log = logging.getLogger(__name__)
 
 WORSE = 2.0  # loss of left-out views, relative to the start and to the best state, that counts as divergence
 RETREATS = 4  # maximum number of retreats; each halves the rates
-MOST_OPAQUE = 0.999  # maximum opacity of Gaussians that remain under dropout
 SMOOTH = 3  # number of checks to average, since each scores other views
 
 
@@ -147,7 +146,6 @@ class _Refinement:
         self.order = ViewOrder(len(seen.images), options.holdout, options.seed)
         self.trained = self.order.trained.to(seen.images.device)
         self.options = options.of(len(self.order.trained))
-        self.dropping = torch.Generator().manual_seed(options.seed)
         if options.min_views:
             gaussians = supported(gaussians, cameras, seen.depth, options.min_views, options.merge_cells)
         self.limit = int(options.max_growth * len(gaussians))
@@ -222,7 +220,7 @@ class _Refinement:
         """Runs one step, and a check if one is due; returns how the refinement ended, or an empty string."""
         views = self.order.deal(self.options.views_per_step).to(self.seen.images.device)
         scene = self.parameters.scene()
-        loss, images = self._loss(self._thinned(scene), views)
+        loss, images = self._loss(scene, views)
         if terms := self.options.loss.of_gaussians(scene.gaussians, self.parameters.size):
             loss = loss + self.options.loss.total(terms)
         self.recent.append(float(images.mean()))
@@ -240,16 +238,6 @@ class _Refinement:
             self.order.next_round()
             return ""
         return "steps" if self.steps == self.options.steps else "seconds"
-
-    def _thinned(self, scene: RefinedScene) -> RefinedScene:
-        """Drops random Gaussians for this step; the others become more opaque, so that pixels stay covered."""
-        share = self.options.dropout * self._done()
-        if not share:
-            return scene
-        gaussians = scene.gaussians
-        keep = torch.rand(len(gaussians), generator=self.dropping) >= share
-        left = gaussians.select(keep.to(gaussians.means.device))
-        return replace(scene, gaussians=replace(left, opacities=(left.opacities / (1 - share)).clamp(max=MOST_OPAQUE)))
 
     def _loss(self, scene: RefinedScene, views: Tensor) -> tuple[Tensor, Tensor]:
         """Returns the loss of some views, and their PSNR ``[R]``."""
