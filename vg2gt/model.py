@@ -288,7 +288,7 @@ class VG2GT(Reconstructor):
         Args:
             images: ``[B, V, 3, H, W]`` in [0, 1]; H and W multiples of the backend's patch size.
             hints: data about the views, for backends that need it.
-            generator: while training, draws serialisation orders of the coarse module and voxel sizes.
+            generator: draws serialisation orders of the coarse module while training.
 
         Returns:
             Geometry before and after enhancement, voxels and Gaussians, in scene units and the frame of view 0.
@@ -300,7 +300,7 @@ class VG2GT(Reconstructor):
         keep, coarsen = (None, None) if support is None else (support.keep, support.coarsen)
         # fine level: pixels to M voxels with features [M, C]
         with stage("fine"):
-            voxels: Voxels = self.fine(tokens, decoded.geometry.where(keep), images, coarsen, generator)
+            voxels: Voxels = self.fine(tokens, decoded.geometry.where(keep), images, coarsen)
         # every voxel splits into K Gaussians: [M * K]
         with stage("gaussians"):
             gaussians = self.with_background(self.gaussians(voxels), images, decoded.initial.depth)

@@ -108,14 +108,7 @@ class FineModule(nn.Module):
         self.point_mlp = point_mlp(in_channels=width + EXTRA_CHANNELS + MOMENT_CHANNELS * moments)
         self.out_channels = self.point_mlp.out_channels
 
-    def forward(
-        self,
-        tokens: Tokens,
-        geometry: Geometry,
-        images: Tensor,
-        coarsen: Tensor | None = None,
-        generator: torch.Generator | None = None,
-    ) -> Voxels:
+    def forward(self, tokens: Tokens, geometry: Geometry, images: Tensor, coarsen: Tensor | None = None) -> Voxels:
         """Builds the fine voxels of B scenes.
 
         Args:
@@ -123,7 +116,6 @@ class FineModule(nn.Module):
             geometry: decoded depth, confidence and cameras, in scene units and the frame of context view 0.
             images: ``[B, V, 3, H, W]`` in [0, 1].
             coarsen: ``[B]`` factors on the smallest edge; None: 1.
-            generator: draws the factors of ``coarsest_drawn`` while training.
 
         Returns:
             Refined voxels; differentiable in features, confidence and positions, but not in the assignment of pixels.
@@ -132,8 +124,8 @@ class FineModule(nn.Module):
             ValueError: if a scene spans too many voxels to index.
         """
         if self.training and self.coarsest_drawn > 1:
-            drawn = self.coarsest_drawn ** torch.rand(len(images), generator=generator)
-            coarsen = (1 if coarsen is None else coarsen) * drawn.to(images.device)
+            drawn = self.coarsest_drawn ** torch.rand(len(images), device=images.device)
+            coarsen = drawn if coarsen is None else coarsen * drawn
         with full_precision(images):
             size = scene_voxel_size(geometry, self.voxel_size, self.min_footprint, coarsen)
         return self._refine(self._measure(tokens, geometry, images, size, self.max_voxels), size)
