@@ -1,14 +1,18 @@
 """The check in blocks is the check of all views at once."""
 
+import pytest
 import torch
 
 from tests.voxels.conftest import room
-from vg2gt.method.additions.visibility import ViewCheck, check
+from vg2gt.method.additions.visibility import ViewCheck
+from vg2gt.method.additions.visibility import check as check_module
 from vg2gt.method.additions.visibility.blocks import check_blocks, coarsening, neighbourhood
 from vg2gt.method.additions.visibility.check import choose_partners
 
 
-def test_blocks_keep_the_same_pixels() -> None:
+@pytest.mark.parametrize("many", [100, 5])
+def test_blocks_keep_the_same_pixels(many: int, monkeypatch) -> None:
+    monkeypatch.setattr(check_module, "MANY", many)
     _, geometry, _ = room(views=7)
     depth = geometry.depth.clone()
     depth[0, ::2, 5:15, 10:30] *= 0.7  # hangs in the air
@@ -38,7 +42,7 @@ def test_of_many_views_those_beyond_a_wall_are_no_partners(monkeypatch) -> None:
     depth[4:] *= 0.3  # a wall in front of what these look at
     before = choose_partners(depth, geometry.cameras, 2)
     assert torch.isin(torch.tensor([4, 5]), before[:4]).any()
-    monkeypatch.setattr(check, "MANY", 5)
+    monkeypatch.setattr(check_module, "MANY", 5)
     partners = choose_partners(depth, geometry.cameras, 2)
     assert partners.shape == (6, 5)  # four times as many
     assert not torch.isin(torch.tensor([4, 5]), partners[:4]).any()

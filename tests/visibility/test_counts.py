@@ -28,8 +28,9 @@ def everyone(views: int) -> Tensor:
     return torch.stack([torch.tensor([j for j in range(views) if j != i]) for i in range(views)])
 
 
+@pytest.mark.parametrize("weighted", [False, True])
 @pytest.mark.parametrize("seed", range(5))
-def test_compiled_pass_equals_the_reference(seed: int) -> None:
+def test_compiled_pass_equals_the_reference(seed: int, weighted: bool) -> None:
     random = torch.Generator().manual_seed(seed)
     views = 6
     depth = 2 + 0.3 * torch.rand(views, *SIZE, generator=random)
@@ -38,8 +39,8 @@ def test_compiled_pass_equals_the_reference(seed: int) -> None:
     several = cameras(rigid_motions(turns, shifts))
     partners = choose_partners(depth, several, 4)
     partners[0, -1] = -1
-    found = count_views(depth, several, partners, 0.03, 0.05)
-    expected = count_views_reference(depth.double(), several.map(Tensor.double), partners, 0.03, 0.05)
+    found = count_views(depth, several, partners, 0.03, 0.05, weighted)
+    expected = count_views_reference(depth.double(), several.map(Tensor.double), partners, 0.03, 0.05, weighted)
     for name in ("agree", "through", "hidden"):
         total = getattr(expected, name)
         assert total.mean() > 0.05, name
@@ -73,3 +74,16 @@ def test_a_view_without_depth_there_says_nothing() -> None:
     counts = count_views(depth, sideways(0, 0.02), everyone(2), 0.02, 0.04)
     for total in (counts.agree, counts.through, counts.hidden):
         assert total.max() == 0
+
+
+def test_the_weight_of_a_view_falls_with_its_distance_to_the_point() -> None:
+    poses = torch.eye(4).repeat(4, 1, 1)
+    poses[1:, 2, 3] = torch.tensor([-1.6, -1.0, 2.0])  # .4 and 1 unit from the plane, which is 2 away, and 4 units
+    depth = 2 + poses[:, 2, 3, None, None].expand(4, *SIZE)
+    counts = count_views(depth.contiguous(), cameras(poses), everyone(4), 0.02, 0.04, weighted=True)
+    middle = (slice(9, 11), slice(13, 15))
+    assert torch.allclose(
+        counts.agree[0][middle], torch.tensor(2 + 2 + 2 / 4)
+    )  # the nearest two reach the largest weight
+    assert torch.allclose(counts.agree[3][middle], torch.tensor(2.0 + 2 + 2))
+    assert counts.through.max() == 0

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import torch
 from torch import Tensor
 
-from vg2gt.method.additions.visibility.check import NEIGHBORS, ViewCheck, disagreement
+from vg2gt.method.additions.visibility.check import NEIGHBORS, ViewCheck, disagreement, weighted
 from vg2gt.method.additions.visibility.counts import count_views
 from vg2gt.types import Cameras
 
@@ -34,13 +34,14 @@ def check_blocks(
         masks: two buffers ``[V, H, W]``, overwritten; at the end the first is 1 for pixels that are kept, else 0.
     """
     before, after = masks
+    limits = check.tolerance, check.margin, weighted(len(depth))
     for rows in blocks:
         before[rows] = (depth[rows] > 0).to(before.dtype)
     for _ in range(check.rounds):
         for rows in blocks:
             views, local = neighbourhood(partners, torch.arange(rows.start, rows.stop))
             left = depth[views] * before[views]
-            counts = count_views(left, cameras.select(views), local, check.tolerance, check.margin)
+            counts = count_views(left, cameras.select(views), local, *limits)
             inside = slice(0, rows.stop - rows.start)
             kept = counts.through[inside] <= counts.agree[inside]
             after[rows] = before[rows] * kept.to(before.dtype)

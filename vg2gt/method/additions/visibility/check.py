@@ -19,7 +19,8 @@ from vg2gt.types import Cameras, Geometry, TensorRecord
 STRIDE = 4  # pixels between samples of the disagreement, along each axis
 NEIGHBORS = 8  # partners per view for the disagreement
 SAMPLES = 12  # pixels per side of the grid on which overlap is measured
-MANY, MORE = 100, 4  # above MANY views, a view has MORE times as many partners, and hidden points do not count
+# Above MANY views, a view has MORE times as many partners, hidden points do not count, and near views count more.
+MANY, MORE = 100, 4
 BEHIND = 1.1  # relative to a view's depth; points farther away are hidden from it
 LEAST_OVERLAP = 0.02  # smallest share of a view's samples in the image of a partner
 
@@ -41,7 +42,8 @@ class Support(TensorRecord):
 class ViewCheck:
     """Selects the pixels whose depth enters the scene, and how fine its voxels may be.
 
-    A pixel is dropped if more views look through its point than agree with it; later rounds ignore its depth.
+    A pixel is dropped if more views look through its point than agree with it; later rounds ignore its depth. Above 100
+    views, a view counts more the nearer it is to the point: depth from other rooms is less precise.
 
     Args:
         tolerance: relative depth difference below which two views agree.
@@ -101,12 +103,17 @@ class ViewCheck:
         coarsen = (disagreement(depth, cameras, partners) / self.fine_below).clamp(1, self.coarsest)
         for _ in range(self.rounds):
             left = torch.where(keep, depth, 0.0)
-            counts = count_views(left, cameras, partners, self.tolerance, self.margin)
+            counts = count_views(left, cameras, partners, self.tolerance, self.margin, weighted(len(depth)))
             keep = keep & (counts.through <= counts.agree)
         if self.moment is not None and frames is not None:
             left = torch.where(keep, depth, 0.0)
             keep = keep & ~moved(left, cameras, partners, frames, self.moment, self.tolerance, self.moved_margin)
         return keep, coarsen
+
+
+def weighted(views: int) -> bool:
+    """Returns whether near views count more in a scene with this many views (:func:`count_views`)."""
+    return views > MANY
 
 
 def _scene(geometry: Geometry, index: int) -> tuple[Tensor, Cameras]:

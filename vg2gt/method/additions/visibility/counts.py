@@ -13,13 +13,13 @@ import torch
 from torch import Tensor
 
 from vg2gt.geometry.cameras import compose, invert_rigid, ray_directions, transform_points
-from vg2gt.kernels.view_counts import NEAREST, count_compiled
+from vg2gt.kernels.view_counts import HEAVIEST, NEAREST, count_compiled
 from vg2gt.types import Cameras, TensorRecord
 
 
 @dataclass(frozen=True)
 class ViewCounts(TensorRecord):
-    """Numbers of other views per pixel, as floats.
+    """Numbers of other views per pixel, or sums of their weights, as floats.
 
     Attributes:
         agree: ``[V, H, W]`` views that see a surface at the pixel's point.
@@ -33,7 +33,9 @@ class ViewCounts(TensorRecord):
 
 
 @torch.no_grad()
-def count_views(depth: Tensor, cameras: Cameras, partners: Tensor, tolerance: float, margin: float) -> ViewCounts:
+def count_views(
+    depth: Tensor, cameras: Cameras, partners: Tensor, tolerance: float, margin: float, weighted: bool = False
+) -> ViewCounts:
     """Counts for each pixel the partners of its view that agree or look through, for one scene.
 
     Args:
@@ -42,17 +44,19 @@ def count_views(depth: Tensor, cameras: Cameras, partners: Tensor, tolerance: fl
         partners: ``[V, K]`` int64, views that each view is compared with; -1 = none.
         tolerance: relative depth difference below which views agree.
         margin: relative depth difference above which a view looks through a point.
+        weighted: weight a view by the pixel's depth divided by the point's depth in that view, at most 2: the error of
+            depth grows with the distance. False: every view counts 1.
 
     Returns:
         The counts; 0 for pixels without depth.
     """
     if depth.device.type == "cpu":
-        return _count_compiled(depth, cameras, partners, tolerance, margin)
-    return count_views_reference(depth, cameras, partners, tolerance, margin)
+        return _count_compiled(depth, cameras, partners, tolerance, margin, weighted)
+    return count_views_reference(depth, cameras, partners, tolerance, margin, weighted)
 
 
 def count_views_reference(
-    depth: Tensor, cameras: Cameras, partners: Tensor, tolerance: float, margin: float
+    depth: Tensor, cameras: Cameras, partners: Tensor, tolerance: float, margin: float, weighted: bool = False
 ) -> ViewCounts:
     """:func:`count_views` in plain torch, for any device and precision."""
     height, width = depth.shape[1:]
@@ -86,12 +90,15 @@ def count_views_reference(
                 through &= valid & (ratio < 1 - margin)
                 says |= valid
         hidden = says & ~agree & ~through
+        weight = (depth / safe).clamp(max=HEAVIEST) if weighted else 1.0
         for total, chosen in zip((sums.agree, sums.through, sums.hidden), (agree, through, hidden), strict=True):
-            total += chosen
+            total += chosen * weight
     return sums
 
 
-def _count_compiled(depth: Tensor, cameras: Cameras, partners: Tensor, tolerance: float, margin: float) -> ViewCounts:
+def _count_compiled(
+    depth: Tensor, cameras: Cameras, partners: Tensor, tolerance: float, margin: float, weighted: bool
+) -> ViewCounts:
     pose = cameras.world_to_camera[0].double()
     intrinsics = cameras.intrinsics[0].double()
     there = partners.clamp(min=0)
@@ -101,7 +108,7 @@ def _count_compiled(depth: Tensor, cameras: Cameras, partners: Tensor, tolerance
     back = torch.linalg.inv(intrinsics)[:, None]
     matrix = torch.cat((to_pixel[..., :3] @ back, to_pixel[..., 3:]), -1).float().contiguous().numpy()
     maps = depth.detach().float().contiguous().numpy()
-    sums = count_compiled(maps, partners.contiguous().numpy(), matrix, tolerance, margin)
+    sums = count_compiled(maps, partners.contiguous().numpy(), matrix, tolerance, margin, weighted)
     return ViewCounts(*(torch.from_numpy(total).to(depth.dtype) for total in sums))
 
 
