@@ -5,9 +5,9 @@ import torch
 from torch import Tensor
 
 from vg2gt.geometry.cameras import rigid_motions
-from vg2gt.method.additions.visibility import choose_partners, count_views
+from vg2gt.method.additions.visibility import ViewCheck, check, choose_partners, count_views
 from vg2gt.method.additions.visibility.counts import count_views_reference
-from vg2gt.types import Cameras
+from vg2gt.types import Cameras, Geometry
 
 SIZE = (20, 28)
 INTRINSICS = torch.tensor([[25.0, 0.0, 13.5], [0.0, 25.0, 9.5], [0.0, 0.0, 1.0]])
@@ -76,14 +76,23 @@ def test_a_view_without_depth_there_says_nothing() -> None:
         assert total.max() == 0
 
 
-def test_the_weight_of_a_view_falls_with_its_distance_to_the_point() -> None:
+def test_the_weight_of_a_view_is_the_ratio_of_distances_and_at_most_two() -> None:
     poses = torch.eye(4).repeat(4, 1, 1)
     poses[1:, 2, 3] = torch.tensor([-1.6, -1.0, 2.0])  # .4 and 1 unit from the plane, which is 2 away, and 4 units
     depth = 2 + poses[:, 2, 3, None, None].expand(4, *SIZE)
     counts = count_views(depth.contiguous(), cameras(poses), everyone(4), 0.02, 0.04, weighted=True)
     middle = (slice(9, 11), slice(13, 15))
-    assert torch.allclose(
-        counts.agree[0][middle], torch.tensor(2 + 2 + 2 / 4)
-    )  # the nearest two reach the largest weight
+    assert torch.allclose(counts.agree[0][middle], torch.tensor(2 + 2 + 2 / 4))
     assert torch.allclose(counts.agree[3][middle], torch.tensor(2.0 + 2 + 2))
     assert counts.through.max() == 0
+
+
+def test_of_many_views_a_near_one_outweighs_two_far_ones(monkeypatch) -> None:
+    poses = torch.eye(4).repeat(4, 1, 1)
+    poses[1:, 2, 3] = torch.tensor([-1.0, 2.0, 2.0])
+    depth = torch.tensor([2.0, 1.0, 9.0, 9.0])[:, None, None].repeat(1, *SIZE)  # the last two look through the plane
+    geometry = Geometry(depth[None], torch.ones_like(depth)[None], cameras(poses), torch.ones(1))
+    middle = (0, 0, slice(9, 11), slice(13, 15))
+    assert not ViewCheck(rounds=1)(geometry).keep[middle].any()
+    monkeypatch.setattr(check, "MANY", 3)
+    assert ViewCheck(rounds=1)(geometry).keep[middle].all()

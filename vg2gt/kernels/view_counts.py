@@ -20,7 +20,10 @@ def count_compiled(
     margin: float,
     weighted: bool,
 ) -> list[NDArray[np.float32]]:
-    """Counts views that agree, look through and are hidden, ``[V, H, W]`` each; ``matrix``: see :func:`_count_view`."""
+    """Counts views that agree, look through and are hidden, ``[V, H, W]`` each; ``matrix``: see :func:`_count_view`.
+
+    ``weighted`` counts a view by the pixel's depth over the point's depth in that view, at most :data:`HEAVIEST`.
+    """
     sums = [np.zeros(depth.shape, np.float32) for _ in range(3)]
     limits = np.float32(tolerance), np.float32(margin)
     parallel_for(range(len(depth)), lambda view: _count_view(view, depth, partners, matrix, *limits, weighted, *sums))
