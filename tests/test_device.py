@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from tests.reliability.steps import TINY, first_batches
-from tests.training_helpers import SMALL, small_config
+from tests.training_helpers import small_config
 from vg2gt.evaluation.in_training import evaluate_scene
 from vg2gt.kernels import curve_codes
 from vg2gt.method import knn, point_features, sparse_conv
@@ -177,13 +177,25 @@ def test_a_run_from_beginning_to_end(device: str, tmp_path: Path, cache: Path, a
     assert (tmp_path / "gpu_agreement.json").is_file()
 
 
+TWO = pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs")
+
+
 @pytest.mark.gpu
-@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs")
-def test_two_gpus(tmp_path: Path, cache: Path) -> None:
-    """By NCCL; one device's scenes are the other's neighbours."""
-    small = [option for option in SMALL if not option.startswith("trainer.accelerator")]
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["trainer=gpu"],
+        ["trainer=gpu", "experiment=sweep"],
+        ["trainer=ddp", "trainer.devices=1"],
+        pytest.param(["trainer=ddp", "trainer.devices=2"], marks=TWO),
+    ],
+    ids=" ".join,
+)
+def test_the_command(options: list[str], tmp_path: Path, cache: Path) -> None:
+    """As typed, with the default model; ``ddp`` communicates by NCCL."""
     places = [f"output_dir={tmp_path}", f"hydra.run.dir={tmp_path}", f"data.cache_dir={cache}"]
-    command = [sys.executable, "-m", "vg2gt.cli.train", *small, *places, "trainer=ddp", "trainer.max_steps=2"]
+    few = ["trainer.max_steps=2", "data.train_scenes=2", "data.eval_scenes=1"]
+    command = [sys.executable, "-m", "vg2gt.cli.train", *options, *few, *places]
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
     ended = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=environment, timeout=300)
     assert ended.returncode == 0, ended.stderr[-3000:]

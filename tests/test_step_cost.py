@@ -2,7 +2,9 @@
 
 from pathlib import Path
 
+import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 # At fe8e252, counted alike: 20,262 and a render of 8 views in plain torch, which every fresh run took there.
 BEFORE = 20_262 + 10_113
@@ -17,3 +19,33 @@ def test_operations_and_waits_of_a_training_step(benchmark_script, tmp_path: Pat
     operations, waits = benchmark_script("gpu_waits").count_step(run, batch.context)
     assert 0 < waits.total() <= WAITS, waits.most_common()
     assert 5_000 < operations.total() <= 8_500 < BEFORE / 3, operations.most_common(30)
+
+
+class FloatProducts(TorchDispatchMode):
+    """Refuses matrix products of integers, which CUDA does not have."""
+
+    NAMES = frozenset(("mm", "addmm", "bmm", "baddbmm", "mv", "addmv", "dot"))
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.products = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        if func.overloadpacket.__name__ in self.NAMES:
+            self.products += 1
+            assert args[0].is_floating_point(), f"{func}: CUDA has no matrix product of integers"
+        return func(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize(
+    ("options", "size"),
+    [((), (28, 56)), (("experiment=sweep",), (32, 64)), (("backend=da3_tiny", "model=vg2gt"), (28, 56))],
+)
+def test_a_step_on_a_gpu_multiplies_no_integer_matrices(options, size, benchmark_script, tmp_path: Path) -> None:
+    stages = benchmark_script("stages")
+    case = stages.Case(2, size, (*options, "data=synthetic"))
+    run, batch = stages.prepare(case, torch.device("cpu"), str(tmp_path))
+    with benchmark_script("gpu_waits").as_on_a_gpu(), FloatProducts() as mode:
+        whole_step = benchmark_script("common").whole_step(run)
+        whole_step(batch.context)
+    assert mode.products > 100

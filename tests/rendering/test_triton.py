@@ -29,6 +29,7 @@ from vg2gt.rendering.options import DepthKind, Mode
 
 if importlib.util.find_spec("triton") is None:
     pytest.skip("needs triton, which has wheels for Linux on x86-64 only", allow_module_level=True)
+FIELDS = (*PARAMETERS, "batch")
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
 runnable = pytest.mark.skipif(DEVICE == "cpu" and not INTERPRETED, reason="runs in test_in_the_interpreter's process")
@@ -73,8 +74,8 @@ def test_equals_the_reference(kind: tuple[Mode, DepthKind], degree: int, scenes:
 def test_color_only_and_rays_with_many_hits() -> None:
     gaussians, cameras = soup(60, size=0.6), pinhole((3, 4))
     gaussians = replace(gaussians, opacities=gaussians.opacities * 0.2)
-    expected = render_with_gradients(gaussians, cameras, implementation="dense", bisections=6)
-    out, grads = render_with_gradients(gaussians, cameras, DEVICE, implementation="triton", bisections=6)
+    expected = render_with_gradients(gaussians, cameras, implementation="dense", bisections=40)
+    out, grads = render_with_gradients(gaussians, cameras, DEVICE, implementation="triton", bisections=40)
     assert_same_render((out, grads), expected, atol=1e-11)
     leaves = with_gradients(gaussians.to(DEVICE))
     color = render(leaves, cameras.to(DEVICE), "solid", BACKGROUND, implementation="triton", geometry=False)
@@ -83,6 +84,40 @@ def test_color_only_and_rays_with_many_hits() -> None:
     assert not color.normal.any()
     (grad,) = torch.autograd.grad(color.color.sum(), leaves.sh)
     assert grad.any()
+
+
+@runnable
+@pytest.mark.parametrize("options", [{"near": 2.6}, {"newton_steps": 0}])
+def test_the_search_for_the_median_equals_the_reference(options: dict[str, float]) -> None:
+    """Where Gaussians reach through the near plane, and by bisections alone."""
+    gaussians, cameras = soup(20, seed=3, size=0.3), pinhole((5, 6))
+    expected, found = (
+        render_with_gradients(gaussians, cameras, device, implementation=name, bisections=45, **options)
+        for name, device in (("dense", "cpu"), ("triton", DEVICE))
+    )
+    depth = expected[0].depth
+    assert (depth > 0).float().mean() > 0.2
+    if "near" in options:
+        without = render(gaussians, cameras, implementation="dense", bisections=45)
+        assert ((depth == 0) & (without.depth > 0)).any()
+    assert_same_render(found, expected, atol=1e-10)
+
+
+@runnable
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 2e-6)])
+def test_the_search_crosses_gaps(dtype: torch.dtype, tolerance: float) -> None:
+    """Translucent Gaussians, and others forty times as far: between them nothing tells where the median is."""
+    near, cameras = soup(40, seed=5, size=0.4), pinhole((5, 6))
+    far = replace(near, means=40 * near.means, scales=near.scales * torch.tensor([40.0, 40.0, 1.0]))
+    both = replace(near, **{name: torch.cat((getattr(near, name), getattr(far, name))) for name in FIELDS})
+    both = replace(both, opacities=0.3 * both.opacities)
+    exact = render(both, cameras, implementation="torch", bisections=60).depth
+    on_device = floats_to(both, dtype).to(DEVICE), floats_to(cameras, dtype).to(DEVICE)
+    found = render(*on_device, implementation="triton").depth.cpu()
+    there = exact > 0
+    assert there.float().mean() > 0.3
+    assert torch.equal(found > 0, there)
+    assert ((found - exact).abs() / exact)[there].max() < tolerance
 
 
 @runnable

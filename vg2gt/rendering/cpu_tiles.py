@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from vg2gt.kernels.constants import MEDIAN_MAX_TRANSMITTANCE, TRANSMITTANCE_STOP
+from vg2gt.kernels.constants import CONVERGED, MEDIAN_MAX_TRANSMITTANCE, TRANSMITTANCE_STOP
 from vg2gt.kernels.render_cpu import tiles
 from vg2gt.kernels.render_cpu.backward import backward_color, backward_rasterized, backward_solid
 from vg2gt.kernels.render_cpu.forward import forward_color, forward_rasterized, forward_solid
@@ -27,7 +27,6 @@ from vg2gt.rendering.options import Images, RenderOptions, SceneViews
 TILES_PER_ITEM = 8
 HIT_CAPACITY = 192  # hits per block of rays for the depth solver; a tile with more gets a larger buffer
 CACHE_LINE = 64  # bytes
-CONVERGED = 4  # relative change of the median, in machine epsilons, at which its search stops
 NEGLIGIBLE = {np.dtype(np.float32): 30.0, np.dtype(np.float64): 90.0}  # squared sigmas beyond which a profile is 0
 
 _local = threading.local()
@@ -231,9 +230,7 @@ def _forward(view: _View, lists: _Lists, options: RenderOptions, *outputs: np.nd
     if options.geometry:
         render_tiles = forward_solid if options.mode == "solid" else forward_rasterized
 
-    newton = options.newton_steps > 0
-    # a Newton step may gain nothing: twice as many steps shrink the bracket at least as much as bisection alone
-    steps = 2 * options.bisections + options.newton_steps if newton else options.bisections
+    newton, steps = options.newton_steps > 0, options.search_steps
 
     def run(tile_range: tuple[int, int]) -> None:
         """Renders a range of tiles with this thread's buffers."""

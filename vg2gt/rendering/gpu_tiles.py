@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from vg2gt.kernels.constants import BRACKET_SIGMAS, MEDIAN_MAX_TRANSMITTANCE, TRANSMITTANCE_STOP
+from vg2gt.kernels.constants import BRACKET_SIGMAS, CONVERGED, MEDIAN_MAX_TRANSMITTANCE, TRANSMITTANCE_STOP
 from vg2gt.kernels.render_gpu import kernels as launchable
 from vg2gt.kernels.render_gpu.binning import ENTRIES
 from vg2gt.kernels.render_gpu.projection import BLOCK, REFUSED, SLOTS
@@ -25,7 +25,6 @@ from vg2gt.types import Cameras, Gaussians, Render
 kernels: Any = launchable  # Triton kernels are launched as kernel[grid](...), which type checkers do not know
 
 NEGLIGIBLE = {torch.float32: 30.0, torch.float64: 90.0}  # squared sigmas beyond which a profile is 0
-BISECTIONS = 3  # bisection steps that one visit of a tile's Gaussians replaces
 ROW_SHARE = 64  # gradient rows take 1 / ROW_SHARE of a GPU's memory
 ROWS = 3_000_000  # gradient rows held at once without a GPU
 SLOT_SHARE, SLOT_BYTES = 8, 256  # slots take 1 / SLOT_SHARE of a GPU's memory; bytes per slot, with its entries
@@ -44,7 +43,7 @@ def render_triton(
         gaussians: Gaussians of all scenes, sorted by scene, with checked shapes.
         cameras: views to render.
         background: ``[3]``.
-        options: render options; the number of bisections is rounded up to a multiple of 3.
+        options: render options.
         rows: maximum number of gradient rows held at once, at least those of one view; None: by the device's memory.
 
     Raises:
@@ -108,7 +107,8 @@ class _Render(torch.autograd.Function):
             height, width, across, tiles,
             near=options.near, alpha_max=options.alpha_max, stop=TRANSMITTANCE_STOP,
             negligible=NEGLIGIBLE[poses.dtype], median_max=MEDIAN_MAX_TRANSMITTANCE, sigmas=BRACKET_SIGMAS,
-            sections=-(-options.bisections // BISECTIONS), newton_steps=options.newton_steps,
+            steps=options.search_steps, newton=options.newton_steps > 0,
+            converged=CONVERGED * torch.finfo(poses.dtype).eps,
             solid=solid, geometry=options.geometry, mean=options.depth == "expected", num_warps=1,
         )  # fmt: skip
         listed = (lists.records, lists.ends, lists.members, lists.places, lists.starts)

@@ -29,8 +29,8 @@ class RenderOptions:
         slope_floor: lower bound of ``-d ln T / dd`` in the median depth's gradient, in units of 1 / depth. It keeps
             plateaus of transmittance near one half from dominating; 0 gives the exact gradient.
         bisections: bisection steps of the solid median depth.
-        newton_steps: Newton steps after the bisections; 0: bisections alone. The compiled CPU renderer mixes both and
-            stops at convergence; it is at least as accurate as these numbers give.
+        newton_steps: Newton steps after the bisections; 0: bisections alone. The compiled renderers (CPU and GPU) mix
+            both and stop at convergence; they are at least as accurate as these numbers give.
         geometry: False renders colour and alpha only; depth and normal are zero.
 
     Raises:
@@ -62,6 +62,12 @@ class RenderOptions:
         ):
             if not good:
                 raise ValueError(f"{name} must be {expected}, got {getattr(self, name)}")
+
+    @property
+    def search_steps(self) -> int:
+        """Largest number of steps of the compiled renderers' search for the median depth."""
+        # a Newton step may gain nothing: twice as many steps shrink the bracket at least as much as bisection alone
+        return 2 * self.bisections + self.newton_steps if self.newton_steps else self.bisections
 
 
 def check_choice(name: str, value: object, literal: Any) -> None:

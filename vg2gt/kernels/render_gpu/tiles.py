@@ -1,10 +1,10 @@
 """Triton kernels over tiles: blending with median depth, and its backward pass.
 
 One program is one warp and one tile of 8 x 8 pixels of one view: a vector of 64 rays. Gaussians are read one at a time,
-front to back, as scalars. A stopped ray has a negative transmittance. Nothing is kept per hit: the depth solver visits
-the tile's Gaussians again, up to the last that can affect the median, and evaluates eight depths per visit. Options are
-compile-time constants, so that float64 (for tests) keeps their digits. Loops are ``while`` loops because the
-interpreter cannot iterate over a tensor's range.
+front to back, as scalars. A stopped ray has a negative transmittance. Nothing is kept per hit: every step of the depth
+solver visits the tile's Gaussians again, up to the last that can affect the median. Options are compile-time constants,
+so that float64 (for tests) keeps their digits. Loops are ``while`` loops because the interpreter cannot iterate over a
+tensor's range.
 """
 
 # pyright: reportGeneralTypeIssues=false, reportOperatorIssue=false, reportArgumentType=false
@@ -65,8 +65,8 @@ def blend_kernel(
     records, members, starts, background, color, normal, depth, alphas, transmittance, slopes,
     height, width, across, tiles,
     near: tl.constexpr, alpha_max: tl.constexpr, stop: tl.constexpr, negligible: tl.constexpr,
-    median_max: tl.constexpr, sigmas: tl.constexpr, sections: tl.constexpr, newton_steps: tl.constexpr,
-    solid: tl.constexpr, geometry: tl.constexpr, mean: tl.constexpr,
+    median_max: tl.constexpr, sigmas: tl.constexpr, steps: tl.constexpr, newton: tl.constexpr,
+    converged: tl.constexpr, solid: tl.constexpr, geometry: tl.constexpr, mean: tl.constexpr,
 ):  # fmt: skip
     """Blends a tile front to back and computes its depth: median, or expected with ``mean`` (rasterized only)."""
     dtype = records.dtype.element_ty
@@ -108,7 +108,7 @@ def blend_kernel(
                     last = tl.where(tl.max(matters.to(tl.int32), 0) > 0, place + 1, last)
                 else:
                     expected += weight * peak
-                    crossing = tl.where(kept & (before > 0.5) & (after <= 0.5), peak, crossing)
+                crossing = tl.where(kept & (before > 0.5) & (after <= 0.5), peak, crossing)
             before = tl.where(kept, after, tl.where(on, -before, before))
         place += 1
         live = (place < end) & (tl.max(before, 0) > 0)
@@ -127,11 +127,10 @@ def blend_kernel(
         tl.store(normal + channel + 2 * plane, n2, mask=inside)
         if solid:
             solvable = inside & (final < median_max)
-            lo = tl.maximum(lo, near)
             hi = tl.where(final > 0.25, far, hi)
             d, steep = _median(
-                records, members, begin, last, px, py, solvable, lo, hi,
-                alpha_max, stop, sections, newton_steps,
+                records, members, begin, last, px, py, solvable, lo, hi, crossing,
+                near, alpha_max, stop, steps, newton, converged,
             )  # fmt: skip
             tl.store(depth + pixel, d, mask=inside)
             tl.store(slopes + pixel, 0.5 * steep, mask=inside)
@@ -145,28 +144,44 @@ def blend_kernel(
 
 @triton.jit
 def _median(
-    records, members, begin, last, px, py, solvable, lo, hi,
-    alpha_max: tl.constexpr, stop: tl.constexpr, sections: tl.constexpr, newton_steps: tl.constexpr,
+    records, members, begin, last, px, py, solvable, lo, hi, guess,
+    near: tl.constexpr, alpha_max: tl.constexpr, stop: tl.constexpr, steps: tl.constexpr, newton: tl.constexpr,
+    converged: tl.constexpr,
 ):  # fmt: skip
-    """Returns the median depth in ``lo .. hi`` (0: none) by 8-section and Newton steps; ``-2 d ln T / dt`` there."""
-    lo, hi = tl.where(solvable, lo, 1.0), tl.where(solvable, hi, 1.0)
-    section = 0
-    live = tl.max(solvable.to(tl.int32), 0) > 0
-    while live & (section < sections):
-        step = 0.125 * (hi - lo)
-        parts, opened = _part(records, members, begin, last, px, py, solvable, lo, step, alpha_max, stop)
-        solvable = solvable & (opened | (section > 0))  # the median must not lie in front of the bracket
-        lo += parts * step
-        hi = lo + step
-        section += 1
-    d, steep = 0.5 * (lo + hi), lo * 0
-    newton = 0
-    while live & (newton <= newton_steps):
-        ratio, steep = _transmit(records, members, begin, last, px, py, solvable, d, alpha_max, stop)
-        step = tl.log(4.0 * ratio) / tl.where(steep > 0, steep, 1.0)
-        moved = tl.minimum(tl.maximum(d + tl.where(steep > 0, step, 0.0), lo), hi)
-        d = tl.where(newton < newton_steps, moved, d)
-        newton += 1
+    """Returns the median depth in ``lo .. hi`` (0: none), and ``-2 d ln T / dt`` there.
+
+    Takes a Newton step where it stays within the bracket and is at most half the last step, else bisects; visits only
+    the hits of rays that still move. Begins at ``guess`` if it lies in the bracket.
+    """
+    cut = solvable & (lo < near)
+    lo, hi = tl.where(solvable, tl.maximum(lo, near), 1.0), tl.where(solvable, hi, 1.0)
+    hi = tl.maximum(hi, lo)
+    if tl.max(cut.to(tl.int32), 0) > 0:  # the near plane cuts the bracket: the median must not lie in front of it
+        numerator, denominator, _ = _transmit(records, members, begin, last, px, py, solvable, lo, alpha_max, stop)
+        solvable = solvable & (numerator > 0.25 * denominator)
+    d = 0.5 * (lo + hi)
+    if newton:
+        d = tl.where((guess > lo) & (guess < hi), guess, d)
+    moving, step, steep = solvable, lo * 0 + 1e30, lo * 0
+    number = 0
+    live = tl.max(moving.to(tl.int32), 0) > 0
+    while live & (number < steps):
+        numerator, denominator, slope = _transmit(records, members, begin, last, px, py, moving, d, alpha_max, stop)
+        nearer = 4.0 * numerator > denominator
+        lo, hi = tl.where(moving & nearer, d, lo), tl.where(moving & (nearer == 0), d, hi)
+        moved = 0.5 * (lo + hi)
+        if newton:
+            sloped = slope > 0
+            aim = d + tl.log(4.0 * numerator / denominator) / tl.where(sloped, slope, 1.0)
+            moved = tl.where(sloped & (aim >= lo) & (aim <= hi) & (tl.abs(aim - d) <= 0.5 * step), aim, moved)
+            steep = tl.where(moving, slope, steep)
+        step = tl.abs(moved - d)
+        d = tl.where(moving, moved, d)
+        moving = moving & (step > converged * moved)
+        number += 1
+        live = tl.max(moving.to(tl.int32), 0) > 0
+    if newton == 0:
+        _, _, steep = _transmit(records, members, begin, last, px, py, solvable, d, alpha_max, stop)
     return tl.where(solvable, d, 0.0), steep
 
 
@@ -186,53 +201,9 @@ def _meet(records, members, place, before, px, py, alpha_max: tl.constexpr, stop
 
 
 @triton.jit
-def _part(records, members, place, last, px, py, solvable, lo, step, alpha_max: tl.constexpr, stop: tl.constexpr):
-    """Counts the depths ``lo + k step``, k = 1 .. 7, in front of the median; also returns whether ``lo`` is."""
-    before = tl.where(solvable, 1.0, -1.0).to(px.dtype)
-    one = px * 0 + 1.0
-    n0, n1, n2, n3, n4, n5, n6, n7 = one, one, one, one, one, one, one, one
-    d0, d1, d2, d3, d4, d5, d6, d7 = one, one, one, one, one, one, one, one
-    live = place < last
-    while live:
-        g, s, r, inverse, alpha, before, met = _meet(records, members, place, before, px, py, alpha_max, stop)
-        if met:
-            passed = (1.0 - alpha) * (1.0 - alpha)
-            sharp = (-0.5 * _LOG2E) * tl.load(g + 8) * r
-            t = lo - tl.load(g + 7) * s * inverse
-            n0, d0 = _behind(n0, d0, t, alpha, sharp, passed)
-            t += step
-            n1, d1 = _behind(n1, d1, t, alpha, sharp, passed)
-            t += step
-            n2, d2 = _behind(n2, d2, t, alpha, sharp, passed)
-            t += step
-            n3, d3 = _behind(n3, d3, t, alpha, sharp, passed)
-            t += step
-            n4, d4 = _behind(n4, d4, t, alpha, sharp, passed)
-            t += step
-            n5, d5 = _behind(n5, d5, t, alpha, sharp, passed)
-            t += step
-            n6, d6 = _behind(n6, d6, t, alpha, sharp, passed)
-            t += step
-            n7, d7 = _behind(n7, d7, t, alpha, sharp, passed)
-        place += 1
-        live = (place < last) & (tl.max(before, 0) > 0)
-    parts = (n1 > 0.25 * d1).to(tl.int32) + (n2 > 0.25 * d2).to(tl.int32) + (n3 > 0.25 * d3).to(tl.int32)
-    parts += (n4 > 0.25 * d4).to(tl.int32) + (n5 > 0.25 * d5).to(tl.int32) + (n6 > 0.25 * d6).to(tl.int32)
-    parts += (n7 > 0.25 * d7).to(tl.int32)
-    return parts.to(px.dtype), n0 > 0.25 * d0
-
-
-@triton.jit
-def _behind(numerator, denominator, t, alpha, sharp, passed):
-    """Multiplies squared transmittance (numerator / denominator) by a Gaussian's, at offset ``t`` from its peak."""
-    free = 1.0 - alpha * tl.exp2(sharp * t * t)
-    return numerator * tl.where(t <= 0, free, passed), denominator * tl.where(t <= 0, 1.0, free)
-
-
-@triton.jit
-def _transmit(records, members, place, last, px, py, solvable, t, alpha_max: tl.constexpr, stop: tl.constexpr):
-    """Returns squared transmittance at depths ``t``, and ``-2 d ln T / dt``."""
-    before = tl.where(solvable, 1.0, -1.0).to(px.dtype)
+def _transmit(records, members, place, last, px, py, wanted, t, alpha_max: tl.constexpr, stop: tl.constexpr):
+    """Returns squared transmittance at depths ``t`` (numerator, denominator), and ``-2 d ln T / dt``."""
+    before = tl.where(wanted, 1.0, -1.0).to(px.dtype)
     numerator, denominator, steep = px * 0 + 1.0, px * 0 + 1.0, px * 0
     live = place < last
     while live:
@@ -247,7 +218,7 @@ def _transmit(records, members, place, last, px, py, solvable, t, alpha_max: tl.
             steep += bell * precision * tl.abs(offset) / free
         place += 1
         live = (place < last) & (tl.max(before, 0) > 0)
-    return numerator / denominator, steep
+    return numerator, denominator, steep
 
 
 @triton.jit(do_not_specialize=(*SIZES, "views", "first_view", "some_views", "base"))

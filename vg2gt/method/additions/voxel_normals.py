@@ -106,7 +106,8 @@ def _pairs(plan: VoxelPlan) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Pairs each voxel with its 3x3x3 cells: both rows ``[P]``, shifts ``[P, 3]``, and pairs per voxel ``[M]``."""
     keys, (step_x, step_y, _) = mixed_radix_keys(plan.grid, plan.batch, margin=1)  # ascending, like the plan's voxels
     columns = keys.new_tensor(COLUMNS)  # [9, 2]
-    lowest = keys[:, None] + columns @ keys.new_tensor([step_x, step_y]) - 1  # [M, 9]: the column's first cell
+    steps = (columns * keys.new_tensor([step_x, step_y])).sum(1)  # [9]; CUDA has no integer matrix product
+    lowest = keys[:, None] + steps - 1  # [M, 9]: the column's first cell
     # the three cells of a column have consecutive keys, so their voxels have consecutive rows
     row = torch.searchsorted(keys, lowest)[..., None] + torch.arange(3, device=keys.device)  # [M, 9, 3]
     row = row.clamp_(max=len(keys) - 1)
