@@ -21,7 +21,7 @@ SHORT = (
     "project solid=True degree=1",
     "emit",
     "list",
-    "blend solid=True geometry=True mean=False",
+    "blend newton=True solid=True geometry=True mean=False",
     "backward solid=True geometry=True mean=False",
 )
 
