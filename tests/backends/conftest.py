@@ -65,16 +65,11 @@ def plane_scene(batch: int, views: int, size: tuple[int, int], seed: int = 0) ->
     return images, Hints(depth, cameras, tuple(f"scene{seed}-{index}" for index in range(batch)), frames)
 
 
-@pytest.fixture(scope="session", name="make_scene")
-def make_scene_fixture():
-    return plane_scene
+def given(value: object, name: str) -> object:
+    """A fixture that is a function of this file."""
+    return pytest.fixture(lambda: value, scope="session", name=name)
 
 
-@pytest.fixture(scope="session", name="load_config")
-def load_config_fixture():
-    return load_config
-
-
-@pytest.fixture(scope="session", name="make_backend")
-def make_backend_fixture():
-    return make_backend
+scenes = given(plane_scene, "make_scene")
+configs = given(load_config, "load_config")
+backends = given(make_backend, "make_backend")

@@ -36,13 +36,13 @@ def pick(scene: tuple[Tensor, Hints], scenes: list[int], views: list[int]) -> tu
 
 def assert_same(result: Geometry, expected: Geometry, views: list[int] | None = None) -> None:
     order = views or list(range(expected.depth.shape[1]))
-    torch.testing.assert_close(result.depth, expected.depth[:, order], rtol=1e-4, atol=1e-5)
-    torch.testing.assert_close(result.depth_conf, expected.depth_conf[:, order], rtol=1e-4, atol=1e-5)
+    for name in ("depth", "depth_conf"):
+        torch.testing.assert_close(getattr(result, name), getattr(expected, name)[:, order], rtol=1e-4, atol=1e-5)
     poses = [relative_to_first(g.cameras).world_to_camera for g in (result, expected)]
     torch.testing.assert_close(poses[0], poses[1][:, order], rtol=1e-4, atol=1e-4)
 
 
-def test_shapes(backend: Backend, scene, tokens: Tokens, geometry: Geometry) -> None:
+def test_shapes_and_values(backend: Backend, scene, tokens: Tokens, geometry: Geometry) -> None:
     batch, views, _, height, width = scene[0].shape
     assert tokens.grid == (height // backend.patch_size, width // backend.patch_size)
     assert tokens.size == (height, width)
@@ -53,18 +53,17 @@ def test_shapes(backend: Backend, scene, tokens: Tokens, geometry: Geometry) -> 
     assert geometry.cameras.world_to_camera.shape == (batch, views, 4, 4)
     assert (geometry.cameras.intrinsics.shape, geometry.cameras.size) == ((batch, views, 3, 3), (height, width))
     assert geometry.scale.shape == (batch,)
-
-
-def test_values_are_usable(geometry: Geometry) -> None:
     assert geometry.depth.dtype == torch.float32
     assert torch.isfinite(geometry.depth).all()
     assert (geometry.depth >= 0).all()
     assert (geometry.depth_conf > 0).all()
     rotation = geometry.cameras.world_to_camera[..., :3, :3]
     torch.testing.assert_close(rotation @ rotation.mT, torch.eye(3).expand_as(rotation), rtol=0, atol=1e-4)
-    last = torch.tensor([0.0, 0.0, 0.0, 1.0]).expand_as(geometry.cameras.world_to_camera[..., 3, :])
-    assert torch.equal(geometry.cameras.world_to_camera[..., 3, :], last)
+    last = geometry.cameras.world_to_camera[..., 3, :]
+    assert torch.equal(last, torch.tensor([0.0, 0.0, 0.0, 1.0]).expand_as(last))
     assert (geometry.cameras.intrinsics[..., [0, 1], [0, 1]] > 0).all()
+    centre = geometry.cameras.intrinsics[..., :2, 2]  # in pixels
+    assert ((centre - torch.tensor([width / 2, height / 2])).abs() < torch.tensor([width / 4, height / 4])).all()
 
 
 def test_cameras_alone_are_those_of_all(backend: Backend, scene, tokens: Tokens, geometry: Geometry) -> None:
@@ -72,12 +71,6 @@ def test_cameras_alone_are_those_of_all(backend: Backend, scene, tokens: Tokens,
         assert torch.equal(cameras.world_to_camera, geometry.cameras.world_to_camera)
         assert torch.equal(cameras.intrinsics, geometry.cameras.intrinsics)
         assert cameras.size == geometry.cameras.size
-
-
-def test_intrinsics_are_in_pixels(geometry: Geometry) -> None:
-    width, height = geometry.cameras.size[::-1]
-    centre = geometry.cameras.intrinsics[..., :2, 2]
-    assert ((centre - torch.tensor([width / 2, height / 2])).abs() < torch.tensor([width / 4, height / 4])).all()
 
 
 def test_given_poses_keep_their_direction(backend: Backend, scene, geometry: Geometry) -> None:
@@ -94,30 +87,21 @@ def test_is_frozen(backend: Backend, tokens: Tokens) -> None:
     assert not any(tensor.requires_grad for tensor in (*tokens.patch, tokens.camera))
 
 
-def test_other_sizes_than_multiples_of_the_patch_are_refused(backend: Backend, make_scene) -> None:
-    size = (4 * backend.patch_size + 1, 6 * backend.patch_size)
+def test_images_of_other_sizes_and_out_of_range_are_refused(backend: Backend, scene, make_scene) -> None:
     with pytest.raises(ValueError, match=r"multiple of the patch size"):
-        backend.encode(*make_scene(1, 2, size))
-
-
-def test_images_out_of_range_are_refused(backend: Backend, scene) -> None:
+        backend.encode(*make_scene(1, 2, (4 * backend.patch_size + 1, 6 * backend.patch_size)))
     images, hints = scene
     for bad in (images * 255, images - 0.5, images * torch.nan):
         with pytest.raises(ValueError, match=r"in \[0, 1\]"):
             backend.encode(bad, hints)
 
 
-def test_missing_hints_are_named(backend: Backend, scene) -> None:
+def test_missing_hints_and_cameras_that_are_no_cameras_are_refused(backend: Backend, scene) -> None:
     if not backend.needs_hints:
         pytest.skip("this backend works from images alone")
-    with pytest.raises(ValueError, match="hints"):
-        backend.encode(scene[0])
-
-
-def test_cameras_that_are_no_cameras_are_refused(backend: Backend, scene) -> None:
-    if not backend.needs_hints:
-        pytest.skip("this backend finds its cameras itself")
     images, hints = scene
+    with pytest.raises(ValueError, match="hints"):
+        backend.encode(images)
     for part, value in (("world_to_camera", torch.nan), ("intrinsics", torch.inf), ("intrinsics", -1.0)):
         bad = getattr(hints.cameras, part).clone()
         bad[1, 2, 0, 0] = value
@@ -126,16 +110,15 @@ def test_cameras_that_are_no_cameras_are_refused(backend: Backend, scene) -> Non
             backend.encode(images, dataclasses.replace(hints, cameras=cameras))
 
 
-def test_decoding_again_is_bit_equal(backend: Backend, tokens: Tokens, geometry: Geometry) -> None:
+def test_decoding_again_is_bit_equal_and_cameras_ignore_patches(backend, tokens, geometry) -> None:
+    """Everything ``decode`` needs is in the record, moved and detached as one."""
     unchanged = tokens.with_patch(tuple(patch + torch.zeros_like(patch) for patch in tokens.patch))
-    for again in (backend.decode(tokens), backend.decode(unchanged)):
+    copy = dataclasses.replace(tokens.detach()).map(torch.clone)
+    for again in (backend.decode(tokens), backend.decode(unchanged), backend.decode(copy)):
         assert torch.equal(again.depth, geometry.depth)
         assert torch.equal(again.depth_conf, geometry.depth_conf)
         assert torch.equal(again.cameras.world_to_camera, geometry.cameras.world_to_camera)
         assert torch.equal(again.cameras.intrinsics, geometry.cameras.intrinsics)
-
-
-def test_cameras_ignore_patch_changes(backend: Backend, tokens: Tokens, geometry: Geometry) -> None:
     changed = backend.decode(tokens.with_patch(tuple(patch + 0.1 for patch in tokens.patch)))
     assert torch.equal(changed.cameras.world_to_camera, geometry.cameras.world_to_camera)
 
@@ -158,14 +141,10 @@ def test_gradient_survives_autocast(backend: Backend, tokens: Tokens, geometry: 
     torch.testing.assert_close(again.depth, geometry.depth, rtol=1e-6, atol=0)
 
 
-def test_view_order(backend: Backend, scene, geometry: Geometry) -> None:
-    """Permuting the views behind the first one permutes the result."""
+def test_order_of_views_and_batch_of_two(backend: Backend, scene, geometry: Geometry) -> None:
+    """Permuting the views behind the first one permutes the result; two scenes are two single ones."""
     order = [0, 2, 1]
-    result = backend.decode(backend.encode(*pick(scene, [0, 1], order)))
-    assert_same(result, geometry, order)
-
-
-def test_batch_of_two_equals_two_singles(backend: Backend, scene, geometry: Geometry) -> None:
+    assert_same(backend.decode(backend.encode(*pick(scene, [0, 1], order))), geometry, order)
     for index in (0, 1):
         single = backend.decode(backend.encode(*pick(scene, [index], [0, 1, 2])))
         expected = geometry.map(lambda tensor, index=index: tensor[index : index + 1])
@@ -174,17 +153,11 @@ def test_batch_of_two_equals_two_singles(backend: Backend, scene, geometry: Geom
 
 @pytest.mark.parametrize("views", [1, 2, 5])
 def test_any_number_of_views(backend: Backend, make_scene, views: int) -> None:
-    size = (3 * backend.patch_size, 5 * backend.patch_size)
+    few = make_scene(1, views, (3 * backend.patch_size, 5 * backend.patch_size))
     if views < backend.min_views:
         with pytest.raises(ValueError, match=rf"{backend.name}.*a single view"):
-            backend.encode(*make_scene(1, views, size))
+            backend.encode(*few)
         return
-    geometry = backend.decode(backend.encode(*make_scene(1, views, size)))
-    assert geometry.depth.shape == (1, views, *size)
-    assert torch.isfinite(geometry.depth).all()
-
-
-def test_tokens_survive_a_copy(backend: Backend, tokens: Tokens, geometry: Geometry) -> None:
-    """Everything ``decode`` needs is in the record, moved and detached as one."""
-    copy = dataclasses.replace(tokens.detach()).map(torch.clone)
-    assert torch.equal(backend.decode(copy).depth, geometry.depth)
+    depth = backend.decode(backend.encode(*few)).depth
+    assert depth.shape == few[1].depth.shape
+    assert torch.isfinite(depth).all()

@@ -11,10 +11,7 @@ from tests.references import read_json
 
 CASES = {
     "vggt_1b": ("vggt-1b", ()),
-    "da3_small": ("da3-small", ("given_poses=true",)),
-    "da3_base": ("da3-base", ("given_poses=true",)),
-    "da3_large": ("da3-large", ("given_poses=true",)),
-    "da3_giant": ("da3-giant", ("given_poses=true",)),
+    **{f"da3_{size}": (f"da3-{size}", ("given_poses=true",)) for size in ("small", "base", "large", "giant")},
     "da3_metric_large": ("da3metric-large", ()),
     "da3_nested": ("da3nested-giant-large", ("relative.given_poses=true",)),
 }
@@ -37,8 +34,7 @@ def test_names_and_shapes(make_backend, name: str) -> None:
     else:
         ours = tensors(backend.network, manifest["hub_prefix"])
     # Camera encoder and sky are named as not needed, but are part of our networks; the ray branch is not.
-    unused = [key for key in manifest["ignorable_prefixes"] if "cam_enc" not in key]
-    unused = [key for key in unused if "sky" not in key]
+    unused = [key for key in manifest["ignorable_prefixes"] if "cam_enc" not in key and "sky" not in key]
     unused += ["model.da3." + key for key in RAY_BRANCH] if nested else []
     published = {key: shape for key, shape in manifest["tensors"].items() if not key.startswith(tuple(unused))}
     assert ours == published

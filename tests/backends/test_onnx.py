@@ -5,6 +5,7 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -28,14 +29,8 @@ def hints_of(inputs: tuple[torch.Tensor, ...]) -> Hints | None:
     return Hints(cameras=Cameras(poses[0], poses[1], (images.shape[-2], images.shape[-1]))) if poses else None
 
 
-def worst_of(found: Geometry, expected: Geometry) -> float:
-    pairs = [
-        (found.depth, expected.depth),
-        (found.depth_conf, expected.depth_conf),
-        (found.cameras.world_to_camera, expected.cameras.world_to_camera),
-        (found.cameras.intrinsics, expected.cameras.intrinsics),
-    ]
-    return max(relative_difference(a, b) for a, b in pairs)
+def parts(geometry: Geometry) -> tuple[torch.Tensor, ...]:
+    return geometry.depth, geometry.depth_conf, geometry.cameras.world_to_camera, geometry.cameras.intrinsics
 
 
 def worst_difference(found: Backend, expected: Exportable) -> float:
@@ -46,10 +41,11 @@ def worst_difference(found: Backend, expected: Exportable) -> float:
         tokens = expected.encode(inputs[0], hints_of(inputs))
         again = found.encode(inputs[0], hints_of(inputs))
         assert (again.grid, again.size) == (tokens.grid, tokens.size)
-        pairs = zip((*again.patch, again.camera), (*tokens.patch, tokens.camera), strict=True)
-        worst = max(worst, *(relative_difference(a, b) for a, b in pairs))
         geometry = expected.decode(tokens)
-        worst = max(worst, worst_of(found.decode(tokens), geometry), worst_of(found.decode(again), geometry))
+        pairs = [*zip((*again.patch, again.camera), (*tokens.patch, tokens.camera), strict=True)]
+        for given in (tokens, again):
+            pairs += zip(parts(found.decode(given)), parts(geometry), strict=True)
+        worst = max(worst, *(relative_difference(a, b) for a, b in pairs))
     return worst
 
 
@@ -74,6 +70,7 @@ def edit(bundle: Path, change: Callable[[dict[str, Any]], Any]) -> None:
 def test_da3_equals_torch_at_other_sizes(onnx_bundle: Path, shallow_da3: Exportable) -> None:
     backend = OnnxBackend(str(onnx_bundle))
     assert backend.supports_gradient
+    assert backend.identity() == shallow_da3.identity()  # checkpoints fit the exported network
     assert worst_difference(backend, shallow_da3) <= LIMIT
 
 
@@ -100,10 +97,6 @@ def test_whole_networks_equal_torch(make_backend, tmp_path: Path, override: str)
     assert max(differences) <= LIMIT
 
 
-def test_checkpoints_fit_the_exported_network(onnx_bundle: Path, shallow_da3: Exportable) -> None:
-    assert OnnxBackend(str(onnx_bundle)).identity() == shallow_da3.identity()
-
-
 @pytest.mark.parametrize("name", ["encoder.onnx", "decoder.onnx"])
 def test_attention_never_holds_the_weights_of_all_pairs(onnx_bundle: Path, name: str) -> None:
     model = onnx.load(onnx_bundle / name, load_external_data=False)
@@ -112,21 +105,18 @@ def test_attention_never_holds_the_weights_of_all_pairs(onnx_bundle: Path, name:
     assert (("com.microsoft", "MultiHeadAttention") in kinds) == (name == "encoder.onnx")
 
 
-def test_missing_folder_and_files_are_named(copy: Path, tmp_path: Path) -> None:
+def test_missing_folder_and_files_and_what_is_not_onnx_are_named(copy: Path, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"backend\.path=FOLDER"):
         OnnxBackend()
     with pytest.raises(FileNotFoundError, match=r"nowhere is not an ONNX bundle.*vg2gt export"):
         OnnxBackend(str(tmp_path / "nowhere"))
-    (copy / "encoder.onnx").unlink()
-    with pytest.raises(FileNotFoundError, match=r"encoder\.onnx is missing"):
-        OnnxBackend(str(copy))
-
-
-def test_what_is_not_onnx_is_refused(copy: Path) -> None:
     for content in (b"no protocol buffer at all", b"\x08\x08", b"\xff" * 64):
         (copy / "encoder.onnx").write_bytes(content)
         with pytest.raises(ValueError, match=r"encoder\.onnx"):
             OnnxBackend(str(copy))
+    (copy / "encoder.onnx").unlink()
+    with pytest.raises(FileNotFoundError, match=r"encoder\.onnx is missing"):
+        OnnxBackend(str(copy))
 
 
 @pytest.mark.parametrize(
@@ -171,19 +161,14 @@ def test_cuda_provider_equals_torch(onnx_bundle: Path, shallow_da3: Exportable) 
     assert worst_difference(OnnxBackend(str(onnx_bundle), provider="cuda"), shallow_da3) <= LIMIT
 
 
-def test_export_refuses_what_it_cannot_do(make_backend, shallow_da3: Exportable, tmp_path: Path) -> None:
+def test_export_refuses_what_it_cannot_do_and_leaves_nothing(make_backend, shallow_da3, tmp_path, monkeypatch) -> None:
     with pytest.raises(ValueError, match="oracle cannot be exported"):
         export(make_backend("oracle"), tmp_path / "out")
     (tmp_path / "file").touch()
     with pytest.raises(FileExistsError, match="exists already"):
         export(shallow_da3, tmp_path)
-
-
-def test_a_failed_export_leaves_nothing(shallow_da3, tmp_path, monkeypatch):
-    def fail(*_: Any) -> None:
-        raise RuntimeError("no graph")
-
-    monkeypatch.setattr(exporting, "export_graph", fail)
+    (tmp_path / "file").unlink()
+    monkeypatch.setattr(exporting, "export_graph", Mock(side_effect=RuntimeError("no graph")))
     with pytest.raises(RuntimeError, match="no graph"):
         export(shallow_da3, tmp_path / "out")
     assert not list(tmp_path.iterdir())

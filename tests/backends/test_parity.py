@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -36,12 +37,6 @@ class Reference:
         prefix = f"{case}."
         self.tensors = {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
 
-    def __getitem__(self, key: str) -> Tensor:
-        return self.tensors[key]
-
-    def __contains__(self, key: str) -> bool:
-        return key in self.tensors
-
     def check(self, key: str, value: Tensor) -> None:
         expected = self.tensors[key]
         assert value.shape == expected.shape, key
@@ -50,7 +45,7 @@ class Reference:
 
     def check_tokens(self, tokens: Tokens) -> None:
         for tap, patch in enumerate(tokens.patch):
-            if f"patch.{tap}" in self:
+            if f"patch.{tap}" in self.tensors:
                 self.check(f"patch.{tap}", patch)
         self.check("camera", tokens.camera)
 
@@ -60,12 +55,11 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], str]:
     """Writes a network's weights into a folder, once."""
     root = tmp_path_factory.mktemp("weights")
 
+    @cache
     def folder(network: str) -> str:
-        path: Path = root / network
-        if not path.exists():
-            path.mkdir()
-            save_file(draw_weights(network), path / "model.safetensors")
-        return str(path)
+        (root / network).mkdir()
+        save_file(draw_weights(network), root / network / "model.safetensors")
+        return str(root / network)
 
     return folder
 
@@ -127,7 +121,7 @@ def test_multi_view(weights: Callable[[str], str], network: str, case: int) -> N
     if isinstance(backend, DA3Backend) and backend.given_poses:
         # The reference fed these cameras as they are; encode() would first normalise them.
         size = (images.shape[-2], images.shape[-1])
-        cameras = Cameras(reference["in_extrinsics_w2c"], reference["in_intrinsics"], size)
+        cameras = Cameras(reference.tensors["in_extrinsics_w2c"], reference.tensors["in_intrinsics"], size)
         given = backend.network.cam_enc(cameras)
         reference.check("given", given)
         tokens = backend.encode_with(images, given)
@@ -135,9 +129,9 @@ def test_multi_view(weights: Callable[[str], str], network: str, case: int) -> N
         tokens = backend.encode(images)
     reference.check_tokens(tokens)
     check_geometry(reference, backend, tokens, "")
-    if "redecode.depth" in reference:
-        patch = tuple(patch + reference[f"delta.{tap}"] for tap, patch in enumerate(tokens.patch))
-        changed = dataclasses.replace(tokens, patch=patch, camera=tokens.camera + reference["delta_camera"])
+    if "redecode.depth" in reference.tensors:
+        patch = tuple(patch + reference.tensors[f"delta.{tap}"] for tap, patch in enumerate(tokens.patch))
+        changed = dataclasses.replace(tokens, patch=patch, camera=tokens.camera + reference.tensors["delta_camera"])
         check_geometry(reference, backend, changed, "redecode.")
 
 
@@ -161,24 +155,21 @@ def test_gaussians(tmp_path: Path, case: int) -> None:
     model = DA3Gaussians(backend, SceneScale("normalize", median_depth=2.0))
     prediction = model(reference.images)
     found, scenes = prediction.gaussians, len(reference.images)
-    unit, frame = prediction.unit[found.batch], reference["extrinsics"][:, 0][found.batch]
+    unit, frame = prediction.unit[found.batch], reference.tensors["extrinsics"][:, 0][found.batch]
     rotation, translation = frame[..., :3], frame[..., 3]
     means = (found.means / unit[:, None] - translation)[:, None] @ rotation
     turned = rotation.mT @ quat_to_matrix(found.quats)
-    turns = rotation_of_coefficients(reference["extrinsics"][:, 0, :, :3].mT, 2)[found.batch]
+    turns = rotation_of_coefficients(reference.tensors["extrinsics"][:, 0, :, :3].mT, 2)[found.batch]
     gaussians.check("means", every(means[:, 0], scenes))
     gaussians.check("harmonics", every((turns @ found.sh).mT, scenes))
     gaussians.check("opacities", every(found.opacities, scenes))
-    scales, rotations = gaussians["scales"], gaussians["rotations"]  # signs of both mean nothing
+    scales, rotations = gaussians.tensors["scales"], gaussians.tensors["rotations"]  # signs of both mean nothing
     gaussians.tensors |= {"scales": scales.abs(), "rotations": quat_to_matrix(rotations)}
     gaussians.check("scales", every(found.scales / unit[:, None], scenes))
     gaussians.check("rotations", every(turned, scenes))
-    centers = [
-        cameras.intrinsics[0, 0, :2, 2].tolist()
-        for cameras in (prediction.geometry.cameras, model.predict_cameras(reference.images, None))
-    ]
     height, width = reference.images.shape[-2:]
-    assert centers == [[(width - 1) / 2, (height - 1) / 2]] * 2
+    for cameras in (prediction.geometry.cameras, model.predict_cameras(reference.images, None)):
+        assert cameras.intrinsics[0, 0, :2, 2].tolist() == [(width - 1) / 2, (height - 1) / 2]
 
 
 def every(rows: Tensor, scenes: int) -> Tensor:
@@ -197,7 +188,7 @@ def test_single_view(weights: Callable[[str], str], case: int) -> None:
     reference.check_tokens(tokens)
     depth, sky = backend.decode_raw(tokens)
     reference.check("depth", depth)
-    torch.testing.assert_close(sky, reference["sky"], rtol=TOLERANCE, atol=TOLERANCE)  # all zero in one case
+    torch.testing.assert_close(sky, reference.tensors["sky"], rtol=TOLERANCE, atol=TOLERANCE)  # all zero in one case
     reference.check("depth_after_sky", fill_sky(depth, sky))
     geometry = backend.decode(tokens)
     reference.check("depth_after_sky", geometry.depth)  # the mean focal length is 300

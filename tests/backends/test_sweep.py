@@ -36,27 +36,19 @@ def problem(make_scene) -> tuple[Tensor, Tensor, SourceWarp]:
 
 def test_kernels_equal_the_reference(problem) -> None:
     features, inverse, warp = problem
-    results = []
-    for function in (correlate, correlate_reference):
-        given = features.clone().requires_grad_()
-        similarity, inside = function(given, inverse, warp)
-        weight = torch.cos(torch.arange(similarity.numel()).float()).view_as(similarity)
-        (gradient,) = torch.autograd.grad((similarity * weight).sum(), given)
-        results.append((similarity.detach(), inside, gradient))
-    assert 0.2 < results[0][1].float().mean() < 0.95  # some points fall outside
-    for kernel, reference in zip(*results, strict=True):
-        torch.testing.assert_close(kernel, reference, rtol=1e-4, atol=1e-4)
-
-
-def test_some_views_are_those_of_all(problem) -> None:
-    features, inverse, warp = problem
-    for function in (correlate, correlate_reference):
-        every, some = function(features, inverse, warp), function(features, inverse[1:], warp.select(slice(1, 3)))
-        assert all(torch.equal(a[1:], b) for a, b in zip(every, some, strict=True))
-    similarity = correlate(given := features.clone().requires_grad_(), inverse[1:], warp.select(slice(1, 3)))[0]
-    (kernel,) = torch.autograd.grad(similarity.sum(), given)
-    similarity = correlate_reference(given, inverse[1:], warp.select(slice(1, 3)))[0]
-    torch.testing.assert_close(kernel, torch.autograd.grad(similarity.sum(), given)[0], rtol=1e-4, atol=1e-4)
+    given = features.requires_grad_()
+    for first in (0, 1):  # some views are those of all
+        results = []
+        for function in (correlate, correlate_reference):
+            similarity, inside = function(given, inverse[first:], warp.select(slice(first, 3)))
+            weight = torch.cos(torch.arange(similarity.numel()).float()).view_as(similarity)
+            (gradient,) = torch.autograd.grad((similarity * weight).sum(), given)
+            results.append((similarity.detach(), inside, gradient))
+            every = function(given, inverse, warp)
+            assert all(torch.equal(a[first:], b) for a, b in zip(every, (similarity, inside), strict=True))
+        assert 0.2 < results[0][1].float().mean() < 0.95  # some points fall outside
+        for kernel, reference in zip(*results, strict=True):
+            torch.testing.assert_close(kernel, reference, rtol=1e-4, atol=1e-4)
 
 
 def test_similarity_is_highest_on_the_true_plane() -> None:
@@ -117,9 +109,9 @@ def test_sources_together_cover_the_view() -> None:
 
 def test_ranges() -> None:
     poses, _ = row_of_cameras(4)
-    torch.testing.assert_close(wide_range(poses), torch.tensor([0.06, 24.0]), rtol=1e-4, atol=0)
     walk, _ = row_of_cameras(21)  # 4 long: something may stand as near as a step
-    torch.testing.assert_close(wide_range(walk), torch.tensor([0.2, 160.0]), rtol=1e-4, atol=0)
+    ranges = torch.stack((wide_range(poses), wide_range(walk)))
+    torch.testing.assert_close(ranges, torch.tensor([[0.06, 24.0], [0.2, 160.0]]), rtol=1e-4, atol=0)
     close, _ = row_of_cameras(4, step=1e-4)
     close[0, 0, 3] = 1.0  # and one camera far away
     torch.testing.assert_close(wide_range(close), torch.tensor([0.03, 40.0]), rtol=1e-3, atol=0)
@@ -130,22 +122,18 @@ def test_ranges() -> None:
     assert torch.equal(agreed_range(depth, 0 * agreeing, wide_range(poses)), wide_range(poses))
 
 
-def test_cameras_in_one_place_are_refused(make_scene) -> None:
-    backend = SweepBackend(pretrained=False)
-    images, hints = make_scene(1, 3, (32, 48))
-    hints.cameras.world_to_camera[..., :3, 3] = 0
-    with pytest.raises(ValueError, match="parallax, but all cameras are at the same position"):
-        backend.encode(images, Hints(cameras=hints.cameras))
-
-
-def test_depth_is_in_the_unit_of_the_cameras(make_scene) -> None:
+def test_depth_is_in_the_unit_of_the_cameras_and_those_in_one_place_are_refused(make_scene) -> None:
     """Metres or millimetres: the same network, the same depth in its unit."""
     backend = SweepBackend(pretrained=False)
     images, hints = make_scene(1, 3, (32, 48))
-    depth = backend.decode(backend.encode(images, Hints(cameras=hints.cameras))).depth
-    hints.cameras.world_to_camera[..., :3, 3] *= 1000
-    large = backend.decode(backend.encode(images, Hints(cameras=hints.cameras))).depth
+    given = Hints(cameras=hints.cameras)
+    depth = backend.decode(backend.encode(images, given)).depth
+    given.cameras.world_to_camera[..., :3, 3] *= 1000
+    large = backend.decode(backend.encode(images, given)).depth
     torch.testing.assert_close(large / 1000, depth, rtol=2e-2, atol=0)
+    given.cameras.world_to_camera[..., :3, 3] = 0
+    with pytest.raises(ValueError, match="parallax, but all cameras are at the same position"):
+        backend.encode(images, given)
 
 
 @pytest.fixture(scope="module")
@@ -168,31 +156,24 @@ def test_shipped_weights_measure_depth(unseen_room: Batch) -> None:
     assert error[order[: len(order) // 2]].mean() < 0.6 * error.mean()
 
 
-def test_the_range_comes_from_the_cameras(unseen_room: Batch) -> None:
+@torch.no_grad()
+def test_the_range_comes_from_the_cameras_and_a_given_one_is_searched_beyond(unseen_room: Batch) -> None:
     """Neither is anything cut off, nor do planes stand where nothing is; also where one camera is far from the rest."""
     network = SweepBackend().network
     cameras, images = unseen_room.cameras, unseen_room.images[0]
+    features = network.features(images)
     low, high = (float(unseen_room.depth.quantile(q)) for q in (0.02, 0.98))
     alone = cameras.world_to_camera[0].clone()
     alone[-1, :3, 3] += alone[-1, :3, :3] @ torch.tensor([0.0, 8.0, 0.0])  # above the room: it sees nothing
-    for poses in (cameras.world_to_camera[0], alone):
+    for poses in (alone, cameras.world_to_camera[0]):
         views = PosedViews(images, poses, cameras.intrinsics[0])
-        with torch.no_grad():
-            near, far = network.find_range(network.features(images), views, 3).tolist()
+        near, far = network.find_range(features, views, 3).tolist()
         assert 0.4 * low < near < 1.1 * low
         assert 0.9 * high < far < 2.5 * high
-
-
-def test_a_given_range_is_searched_beyond(unseen_room: Batch) -> None:
-    """Sparse points miss what is near in few views; told too little, the sweep finds the rest."""
-    network = SweepBackend().network
-    cameras, images = unseen_room.cameras, unseen_room.images[0]
-    views = PosedViews(images, cameras.world_to_camera[0], cameras.intrinsics[0])
-    features = network.features(images)
+    # Sparse points miss what is near in few views; told too little, the sweep finds the rest.
     low, middle, high = (float(unseen_room.depth.quantile(q)) for q in (0.05, 0.5, 0.95))
-    with torch.no_grad():
-        near, far = network.find_range(features, views, 3, torch.tensor([0.9 * middle, 1.1 * middle])).tolist()
-        wide = network.find_range(features, views, 3, torch.tensor([0.5 * low, 2 * high])).tolist()
+    near, far = network.find_range(features, views, 3, torch.tensor([0.9 * middle, 1.1 * middle])).tolist()
+    wide = network.find_range(features, views, 3, torch.tensor([0.5 * low, 2 * high])).tolist()
     assert 0.45 * middle * 0.8 <= near < max(low, 0.6 * middle)
     assert min(high, 1.4 * middle) < far < 3.3 * middle * 1.4
     assert wide[0] <= 0.5 * low

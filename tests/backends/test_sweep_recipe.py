@@ -29,13 +29,10 @@ def scenes(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     return list(make_scenes(tmp_path_factory.mktemp("scenes"), 4))  # two rooms, an object, a room from all around
 
 
-def test_scenes_are_made_once(scenes: list[Path]) -> None:
+def test_scenes_are_made_once_and_the_same_by_several_processes(scenes: list[Path], tmp_path: Path) -> None:
     before = [path.stat().st_mtime_ns for path in scenes]
     assert list(make_scenes(scenes[0].parent, 4)) == scenes
     assert [path.stat().st_mtime_ns for path in scenes] == before
-
-
-def test_scenes_of_several_processes_are_the_same(scenes: list[Path], tmp_path: Path) -> None:
     made = list(make_scenes(tmp_path, 3, size=(48, 96), workers=2))
     alone = list(make_scenes(tmp_path / "alone", 3, size=(48, 96)))
     assert [path.name for path in made] == [path.name for path in alone]
@@ -50,10 +47,10 @@ def test_views_of_a_sample_see_the_same_points(scenes: list[Path]) -> None:
     for sample in (samples[index] for index in range(10)):
         size = (sample.depth.shape[-2], sample.depth.shape[-1])
         cameras = Cameras(sample.world_to_camera[None], sample.intrinsics[None], size)
-        points = unproject(sample.depth[None], cameras)[0]  # [V, H, W, 3]
+        points = unproject(sample.depth[None], cameras)[0, 0].reshape(1, 1, -1, 3)
         known = ((sample.depth[0] > 0) & sample.depth[0].isfinite()).flatten()
         for other in range(1, len(sample.depth)):
-            pixels, depth = project(points[0].reshape(1, 1, -1, 3), cameras.select(slice(other, other + 1)))
+            pixels, depth = project(points, cameras.select(slice(other, other + 1)))
             u, v, z = pixels[0, 0, :, 0], pixels[0, 0, :, 1], depth[0, 0]
             inside = (z > 0) & (u > 0) & (v > 0) & (u < size[1] - 1) & (v < size[0] - 1) & known
             grid = torch.stack(((2 * u + 1) / size[1] - 1, (2 * v + 1) / size[0] - 1), -1)[None, None]
@@ -93,11 +90,10 @@ def test_scenes_of_a_sample_are_encoded_as_if_alone(scenes: list[Path]) -> None:
     with torch.no_grad():
         both = encode(slice(0, 8), 2)
         alone = [encode(slice(0, 4), 1), encode(slice(4, 8), 1)]
-        one = alone[1].taps[-1]
         views = PosedViews(sample.images[4:], sample.world_to_camera[4:], sample.intrinsics[4:])
         features = net.features(views.images)
         as_used = net.encode(features, views, sample.depth_range[4], sample.sources[4:] - 4, 32).taps[-1]
-    torch.testing.assert_close(as_used, one, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(as_used, alone[1].taps[-1], rtol=1e-4, atol=1e-4)
     torch.testing.assert_close(both.taps[-1], torch.cat([part.taps[-1] for part in alone]), rtol=1e-3, atol=1e-3)
     torch.testing.assert_close(both.swept, torch.cat([part.swept for part in alone]), rtol=1e-3, atol=1e-3)
 
@@ -111,16 +107,16 @@ def test_recolouring_keeps_range_and_shape() -> None:
         assert not torch.equal(changed, images)
 
 
+def slanted(rows: torch.Tensor, columns: torch.Tensor) -> torch.Tensor:
+    """Inverse depth of a plane, ``[1, H, W]``."""
+    return (0.2 + 0.01 * columns + 0.02 * rows[:, None])[None]
+
+
 def test_cells_know_their_middle() -> None:
     """On a slanted plane inverse depth is linear in the image, so the middle of a cell is known exactly."""
-    inverse = 0.2 + 0.01 * torch.arange(16.0).view(1, 1, 16) + 0.02 * torch.arange(8.0).view(1, 8, 1)
+    inverse = slanted(torch.arange(8.0), torch.arange(16.0))
     found, known = cell_inverse(1 / inverse, 4)
-    expected = (
-        0.2
-        + 0.01 * (4 * torch.arange(4.0) + 1.5).view(1, 1, 1, 4)
-        + 0.02 * (4 * torch.arange(2.0) + 1.5).view(1, 1, 2, 1)
-    )
-    torch.testing.assert_close(found, expected)
+    torch.testing.assert_close(found[0], slanted(4 * torch.arange(2.0) + 1.5, 4 * torch.arange(4.0) + 1.5))
     assert known.all()
     hole = (1 / inverse).clone()
     hole[0, 1, 1] = 0
@@ -130,9 +126,7 @@ def test_cells_know_their_middle() -> None:
 @pytest.fixture
 def slope() -> tuple[Sample, SweepEncoding, torch.Tensor]:
     """A slanted plane, the sweeps that find it exactly, and its depth."""
-    inverse = (0.2 + 0.01 * torch.arange(16.0).view(1, 1, 16) + 0.02 * torch.arange(16.0).view(1, 16, 1)).expand(
-        2, -1, -1
-    )
+    inverse = slanted(torch.arange(16.0), torch.arange(16.0)).expand(2, -1, -1)
     depth_range = torch.tensor([1.0, 10.0]).expand(2, 2)
     cameras, sources = (torch.eye(4), torch.eye(3)), torch.tensor([[1], [0]])
     sample = Sample(torch.zeros(2, 3, 16, 16), 1 / inverse, *cameras, depth_range, sources, 16)
@@ -206,22 +200,22 @@ def test_rooms_of_infinigen_are_read(tmp_path: Path) -> None:
     assert scene.depth[~shown].isinf().all()
 
 
+def train(scenes: list[Path], out: Path, steps: int, *options: str) -> str:
+    common = [f"scenes.folder={scenes[0].parent}", "scenes.count=2", f"out={out}", f"training.steps={steps}"]
+    command = [sys.executable, "-m", "recipes.sweep", *common, *options]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-3000:]
+    return done.stdout
+
+
 @pytest.mark.slow
 def test_training_resumes_and_writes_weights(scenes: list[Path], tmp_path: Path) -> None:
     """Two steps at once are two steps one after the other, and the file loads as a backend."""
-
-    def train(out: Path, *options: str) -> str:
-        common = [f"scenes.folder={scenes[0].parent}", "scenes.count=2", "save_every=1", f"out={out}"]
-        command = [sys.executable, "-m", "recipes.sweep", *common, *options]
-        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stderr[-3000:]
-        return done.stdout
-
-    train(tmp_path / "whole", "training.steps=2", "training.cooldown=0")
-    train(tmp_path / "parts", "training.steps=1", "training.cooldown=0")
-    newest = newest_checkpoint(tmp_path / "parts")
-    assert newest is not None
-    assert "at step 1 of 2" in train(tmp_path / "parts", "training.steps=2", "training.cooldown=0")
+    saving = ("save_every=1", "training.cooldown=0")
+    train(scenes, tmp_path / "whole", 2, *saving)
+    train(scenes, tmp_path / "parts", 1, *saving)
+    assert newest_checkpoint(tmp_path / "parts") is not None
+    assert "at step 1 of 2" in train(scenes, tmp_path / "parts", 2, *saving)
     nets = [SweepBackend(path=str(tmp_path / part / "sweep.safetensors")).network for part in ("whole", "parts")]
     for a, b in zip(nets[0].parameters(), nets[1].parameters(), strict=True):
         torch.testing.assert_close(a, b, rtol=1e-2, atol=1e-3)
@@ -230,10 +224,7 @@ def test_training_resumes_and_writes_weights(scenes: list[Path], tmp_path: Path)
 @pytest.mark.slow
 def test_two_processes_and_given_weights(scenes: list[Path], tmp_path: Path) -> None:
     """Both processes end on the same weights, which are near those that the training began with."""
-    common = [f"scenes.folder={scenes[0].parent}", "scenes.count=2", f"out={tmp_path}", "training.steps=1"]
-    command = [sys.executable, "-m", "recipes.sweep", *common, "processes=2", f"begin={SHIPPED}"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr[-3000:]
+    train(scenes, tmp_path, 1, "processes=2", f"begin={SHIPPED}")
     with safe_open(tmp_path / "sweep.safetensors", "pt") as made, safe_open(SHIPPED, "pt") as given:
         assert float(made.metadata()["core_hours"]) >= float(given.metadata()["core_hours"])
         assert made.metadata()["begun_with"] == SHIPPED.name

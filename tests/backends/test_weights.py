@@ -52,19 +52,12 @@ def test_offending_tensors_are_named() -> None:
     with pytest.raises(ValueError, match="does not fit Sequential") as caught:
         load_strictly(network, state, "model.", ("model.unused.",), "some.pt")
     message = str(caught.value)
-    assert "some.pt" in message
-    assert "missing model.1.bias [1]" in message
-    assert "model.0.weight is [3, 4], expected [3, 2]" in message
-    assert "unexpected model.2.weight" in message
+    for said in ("some.pt", "missing model.1.bias [1]", "model.0.weight is [3, 4], expected [3, 2]", "model.2.weight"):
+        assert said in message
     assert "unused" not in message
-
-
-def test_weights_that_are_not_finite_are_refused() -> None:
-    network = nn.Linear(2, 2)
-    state = {name: value.clone() for name, value in network.state_dict().items()}
-    state["bias"][1] = torch.nan
+    state = {"weight": torch.zeros(2, 2), "bias": torch.tensor([0, torch.nan])}
     with pytest.raises(ValueError, match=r"x does not fit Linear: bias is not finite"):
-        load_strictly(network, state, "", (), "x")
+        load_strictly(nn.Linear(2, 2), state, "", (), "x")
 
 
 @pytest.mark.parametrize(
@@ -83,11 +76,14 @@ def test_options_that_mean_nothing_are_refused(make_backend, options: dict[str, 
     assert re.search(said, str(caught.value.__cause__))
 
 
-def test_missing_files_are_named(tmp_path: Path) -> None:
+def test_missing_files_and_a_missing_hub_library_are_named(tmp_path: Path, monkeypatch) -> None:
     with pytest.raises(FileNotFoundError, match=r"model\.safetensors.*backend\.pretrained=false.*some/repo"):
         find_weights("name", "some/repo", None, str(tmp_path))
     with pytest.raises(FileNotFoundError, match="no published weights"):
         find_weights("name", None, None, None)
+    monkeypatch.setitem(sys.modules, "huggingface_hub", None)
+    with pytest.raises(ImportError, match=r"pip install 'vg2gt\[hub\]'"):
+        find_weights("name", "some/repo", None, None)
 
 
 def test_the_hub_gives_weights_or_says_in_one_line_why_not(monkeypatch, tmp_path, make_backend, donor) -> None:
@@ -111,9 +107,3 @@ def test_the_hub_gives_weights_or_says_in_one_line_why_not(monkeypatch, tmp_path
         r"cannot get model\.safetensors of someone/da3 \(revision v2\) .*: not in the cache; refused by 127\.0\.0\.1\. "
     )
     assert re.match(said + r"Check .*backend\.path=.*backend\.pretrained=false", str(caught.value.__cause__))
-
-
-def test_missing_hub_library_is_explained(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "huggingface_hub", None)
-    with pytest.raises(ImportError, match=r"pip install 'vg2gt\[hub\]'"):
-        find_weights("name", "some/repo", None, None)

@@ -1,5 +1,6 @@
 """Where a run's files go: named by what was chosen, never over another run, never outside ``outputs``."""
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -61,13 +62,9 @@ def test_a_taken_name_gets_a_number_unless_it_is_meant(monkeypatch: pytest.Monke
     assert folder({"data": "rgbd"}) == "rgbd-oracle-tiny"
 
 
-@pytest.mark.parametrize("name", ["../x", "a/../../x", "/x", "\\x", "C:\\x", "..", ""])
-def test_names_do_not_lead_out(name: str) -> None:
-    with pytest.raises(OmegaConfBaseException) as caught:
-        folder(name=name)
-    assert f"name={name} must be a path inside outputs" in str(caught.value)
-
-
-@pytest.mark.parametrize("name", ["mine", "paper/first", "ein Name", "名前", "..x", "12:30"])
-def test_other_names_are_taken_as_they_are(name: str) -> None:
-    assert folder(name=name) == name
+def test_names_are_taken_as_they_are_and_do_not_lead_out() -> None:
+    for name in ("mine", "paper/first", "ein Name", "名前", "..x", "12:30"):
+        assert folder(name=name) == name
+    for name in ("../x", "a/../../x", "/x", "\\x", "C:\\x", "..", ""):
+        with pytest.raises(OmegaConfBaseException, match=re.escape(f"name={name} must be a path inside outputs")):
+            folder(name=name)

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from vg2gt.data import SyntheticScenes
+from vg2gt.data import SceneDataModule, SyntheticScenes
 from vg2gt.types import Batch
 
 from .sources import layout_rgbd
@@ -21,6 +21,16 @@ def assert_same_batches(found: Iterable[Batch], expected: Iterable[Batch]) -> No
         for name in ("frame_ids", "images", "depth"):
             assert torch.equal(getattr(a, name), getattr(b, name))
         assert torch.equal(a.cameras.intrinsics, b.cameras.intrinsics)
+
+
+def module_of(rooms: SyntheticScenes, **options) -> SceneDataModule:
+    """Trains on the rooms and evaluates on two others, but for the options."""
+    val = SyntheticScenes(2, first_seed=100, num_frames=6, size=SIZE, cache_dir=str(rooms.cache_dir))
+    defaults = {
+        "image_size": SIZE, "min_views": 2, "max_views": 3, "max_images": 4, "eval_context": [0, 2, 4],
+        "eval_target": [1, 3], "steps_per_epoch": 4,
+    }  # fmt: skip
+    return SceneDataModule(**{"train": rooms, "val": val, **defaults, **options})
 
 
 @pytest.fixture(scope="session")

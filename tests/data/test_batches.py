@@ -6,12 +6,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from vg2gt.data import DataError, RGBDFolder, SceneDataModule
+from vg2gt.data import DataError, RGBDFolder
 from vg2gt.data.batches import BatchDataset
 from vg2gt.data.framing import Framing
 from vg2gt.data.views import SceneSample
 
-from .conftest import SIZE, assert_same_batches
+from .conftest import SIZE, assert_same_batches, module_of
 
 
 def _dataset(folder: Path, memory_mb: int = 10, **options) -> BatchDataset:
@@ -25,7 +25,7 @@ def _truncate(folder: Path, *names: str) -> None:
         path.write_bytes(path.read_bytes()[:-200])
 
 
-def test_the_nearest_readable_frame_takes_the_place_of_a_damaged_one(write_recording, caplog):
+def test_the_nearest_readable_frame_takes_the_place_of_a_damaged_one_in_training_only(write_recording, caplog):
     folder = write_recording(frames=6)  # frames 10 .. 15
     _truncate(folder, "images/00012.png", "depth/00013.png")
     views = (SceneSample("office", (12, 10, 13), (15,)),)
@@ -48,13 +48,8 @@ def test_the_nearest_readable_frame_takes_the_place_of_a_damaged_one(write_recor
     others = [_dataset(folder, 0, replace_damaged=True), dataset]
     others[0][(SceneSample("office", (13, 14)),)]  # another history
     assert all(other[views].frame_ids.tolist() == [[11, 10, 14, 15]] for other in others)
-
-
-def test_evaluation_never_replaces_frames(write_recording):
-    folder = write_recording(frames=6)
-    _truncate(folder, "images/00012.png")
     with pytest.raises(DataError, match=r"00012\.png of scene office"):
-        _dataset(folder)[(SceneSample("office", (12, 10)),)]
+        _dataset(folder)[views]  # evaluation
 
 
 def test_a_scene_that_runs_out_of_frames_is_named(write_recording):
@@ -74,17 +69,11 @@ def test_held_out_frames_never_step_in(write_recording):
     assert dataset[(SceneSample("office", (10,)),)].frame_ids.tolist() == [[12]]
 
 
-def test_a_damaged_recording_trains_in_workers_as_without(write_recording):
+def test_a_damaged_recording_trains_in_workers_as_without(rooms, write_recording):
     folder = write_recording(frames=6)
     _truncate(folder, "images/00012.png")
-    options = {
-        "image_size": SIZE, "min_views": 2, "max_views": 3, "max_images": 6, "steps_per_epoch": 8, "root": str(folder),
-        "holdout": 5, "eval_context": 2, "eval_target": 1,
-    }  # fmt: skip
-    runs = [
-        list(SceneDataModule(RGBDFolder, RGBDFolder, workers=workers, **options).train_dataloader())
-        for workers in (0, 1, 2)
-    ]
+    options = {"train": RGBDFolder(str(folder), holdout=5), "max_images": 6, "steps_per_epoch": 8}
+    runs = [list(module_of(rooms, workers=workers, **options).train_dataloader()) for workers in (0, 1, 2)]
     assert all(12 not in batch.frame_ids.flatten() for batch in runs[0])
     for other in runs[1:]:
         assert_same_batches(other, runs[0])

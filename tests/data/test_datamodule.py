@@ -11,20 +11,11 @@ from vg2gt.data.batches import FrameCache
 from vg2gt.data.framing import Framing
 from vg2gt.data.views.even import EvaluationViews
 
-from .conftest import SIZE
-
-
-def _module(rooms: SyntheticScenes, **options) -> SceneDataModule:
-    val = SyntheticScenes(2, first_seed=100, num_frames=6, size=SIZE, cache_dir=str(rooms.cache_dir))
-    defaults = {
-        "image_size": SIZE, "min_views": 2, "max_views": 3, "max_images": 4, "eval_context": [0, 2, 4],
-        "eval_target": [1, 3], "steps_per_epoch": 4,
-    }  # fmt: skip
-    return SceneDataModule(**{"train": rooms, "val": val, **defaults, **options})
+from .conftest import SIZE, module_of
 
 
 def test_training_batches(rooms):
-    module = _module(rooms, target_views=1)
+    module = module_of(rooms, target_views=1)
     batches = list(module.train_dataloader())
     assert len(batches) == 4
     for batch in batches:
@@ -41,7 +32,7 @@ def test_training_batches(rooms):
 
 
 def test_evaluation_batches_are_context_then_targets(rooms):
-    batches = list(_module(rooms).val_dataloader())
+    batches = list(module_of(rooms).val_dataloader())
     assert [batch.scene for batch in batches] == [("room-000100",), ("room-000101",)]
     assert (batches[0].frame_ids.tolist(), batches[0].num_context) == ([[0, 2, 4, 1, 3]], 3)
     assert batches[0].target.frame_ids.tolist() == [[1, 3]]
@@ -50,23 +41,21 @@ def test_evaluation_batches_are_context_then_targets(rooms):
 def test_training_and_evaluation_on_the_same_scenes_is_refused(rooms):
     same = SyntheticScenes(2, num_frames=6, size=SIZE, first_seed=3)
     with pytest.raises(DataError, match="room-000003 is used for training and for evaluation"):
-        _module(rooms, val=same).setup()
+        module_of(rooms, val=same).setup()
 
 
 def test_common_arguments_reach_both_sources(tmp_path):
-    module = SceneDataModule(
-        train=partial(SyntheticScenes, num_scenes=1),
-        val=partial(SyntheticScenes, num_scenes=1, first_seed=9),
-        image_size=SIZE, min_views=1, max_views=1, eval_context=[0], eval_target=[1], steps_per_epoch=1,
-        num_frames=2, size=SIZE, cache_dir=str(tmp_path),
-    )  # fmt: skip
+    sources = [partial(SyntheticScenes, 1, first_seed=seed) for seed in (0, 9)]
+    views = {"min_views": 1, "max_views": 1, "eval_context": [0], "eval_target": [1]}
+    shared = {"num_frames": 2, "size": SIZE, "cache_dir": str(tmp_path)}
+    module = SceneDataModule(*sources, image_size=SIZE, steps_per_epoch=1, **views, **shared)
     assert next(iter(module.train_dataloader())).frame_ids.shape[1] == 1
     assert next(iter(module.val_dataloader())).frame_ids.tolist() == [[0, 1]]
 
 
 def test_scenes_of_one_frame(tmp_path):
     one = partial(SyntheticScenes, 1, num_frames=1, size=SIZE, cache_dir=str(tmp_path))
-    module = _module(one(), train=one(), val=one(first_seed=7), min_views=1, max_views=1, eval_context=8, eval_target=3)
+    module = module_of(one(), val=one(first_seed=7), min_views=1, max_views=1, eval_context=8, eval_target=3)
     assert next(iter(module.train_dataloader())).images.shape[1] == 1
     batch = next(iter(module.val_dataloader()))
     assert batch.images.shape[1] == batch.num_context == 1
@@ -91,26 +80,24 @@ class _Recorder(lightning.LightningModule):
         return torch.optim.Adam(self.parameters(), lr=0.1)
 
 
-def _trainer(steps: int, **options) -> lightning.Trainer:
-    return lightning.Trainer(
-        max_steps=steps, max_epochs=-1, accelerator="cpu", logger=False, enable_checkpointing=False,
-        enable_progress_bar=False, enable_model_summary=False, use_distributed_sampler=False, **options,
-    )  # fmt: skip
-
-
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize(("stop", "workers"), [(2, 0), (4, 2), (6, 1)])
 def test_a_resumed_run_sees_the_batches_of_the_uninterrupted_one(rooms, tmp_path, stop, workers):
     """Stops within an epoch, at its end and within the next one (4 steps each); workers read ahead of the stop."""
     drawn = {"aspect": [0.5, 1.0], "size_multiple": 2, "crop": "random", "zoom": [1, 1.2]} if stop == 6 else {}
-    whole = _Recorder()
-    _trainer(10).fit(whole, datamodule=_module(rooms, workers=0, **drawn))
-    first = _Recorder()
-    trainer = _trainer(stop)
-    trainer.fit(first, datamodule=_module(rooms, workers=workers, **drawn))
-    trainer.save_checkpoint(tmp_path / "stop.ckpt")
-    second = _Recorder()
-    _trainer(10).fit(second, datamodule=_module(rooms, workers=workers, **drawn), ckpt_path=tmp_path / "stop.ckpt")
+
+    def run(steps: int, workers: int, **resume) -> _Recorder:
+        recorder = _Recorder()
+        trainer = lightning.Trainer(
+            max_steps=steps, max_epochs=-1, accelerator="cpu", logger=False, enable_checkpointing=False,
+            enable_progress_bar=False, enable_model_summary=False, use_distributed_sampler=False,
+        )  # fmt: skip
+        trainer.fit(recorder, datamodule=module_of(rooms, workers=workers, **drawn), **resume)
+        trainer.save_checkpoint(tmp_path / f"{steps}.ckpt")
+        return recorder
+
+    whole, first = run(10, 0), run(stop, workers)
+    second = run(10, workers, ckpt_path=tmp_path / f"{stop}.ckpt")
     assert first.seen + second.seen == whole.seen
     assert torch.equal(second.weight, whole.weight)
 
@@ -129,7 +116,7 @@ def test_the_memory_cache_forgets_the_oldest_frame(rooms, monkeypatch):
     assert torch.equal(again.depth, first.depth[[1, 2]])
 
 
-def test_evaluation_views_by_number_and_window(rooms):
+def test_evaluation_views_by_number_and_window_and_positions_are_checked(rooms):
     source = SyntheticScenes(1, num_frames=20)
     source.held_out = lambda scene: range(3, 20, 6)
     (views,) = EvaluationViews(context=4, target=2).choose(source, "room-000000")
@@ -139,12 +126,18 @@ def test_evaluation_views_by_number_and_window(rooms):
     assert windows[1].context[0] == 10
     for window in windows:
         assert not set(window.context) & set(window.target)
+    with pytest.raises(DataError, match=r"eval_target names positions \[6\], but scene room-000000 has 6 frames"):
+        EvaluationViews([0, 1], [2, 6]).choose(rooms, "room-000000")
+    with pytest.raises(DataError, match="both context and target"):
+        EvaluationViews([0, 1], [1]).choose(rooms, "room-000000")
+    with pytest.raises(ValueError, match="numbers of views"):
+        EvaluationViews([0, 1], [1], window=4)
 
 
 def test_data_that_cannot_be_trained_on_is_named_before_overlap_and_lengths(rooms, tmp_path):
     blind = SyntheticScenes(2, num_frames=1, size=SIZE, cache_dir=str(tmp_path))
     blind.has_cameras = False
-    module = _module(rooms, train=blind, val=blind, eval_context=1, eval_target=0)
+    module = module_of(rooms, train=blind, val=blind, eval_context=1, eval_target=0)
     with pytest.raises(DataError, match="has no cameras"):
         module.setup("fit")
     module.setup("validate")
@@ -155,12 +148,3 @@ def test_an_option_of_another_loader_is_named():
     module = SceneDataModule(partial(SyntheticScenes, 1), partial(SyntheticScenes, 1), every=2)
     with pytest.raises(DataError, match=r"\(data\.\*\): .*unexpected keyword argument 'every'; remove the option"):
         module.evaluation_data()
-
-
-def test_evaluation_positions_are_checked(rooms):
-    with pytest.raises(DataError, match=r"eval_target names positions \[6\], but scene room-000000 has 6 frames"):
-        EvaluationViews([0, 1], [2, 6]).choose(rooms, "room-000000")
-    with pytest.raises(DataError, match="both context and target"):
-        EvaluationViews([0, 1], [1]).choose(rooms, "room-000000")
-    with pytest.raises(ValueError, match="numbers of views"):
-        EvaluationViews([0, 1], [1], window=4)

@@ -8,32 +8,29 @@ from vg2gt.data.framing import Framing, FramingSampler
 from vg2gt.data.views.sampling import StepSampler, ViewSampler
 from vg2gt.geometry.cameras import ray_directions
 
-from .conftest import SIZE, assert_same_batches
+from .conftest import assert_same_batches, module_of
 
 
 def _rays(height: int = 60, width: int = 80, sparse: bool = False) -> Frames:
     """Frames whose colours are the rays' directions and whose depth is the ray's x: pixels tell where they are."""
     intrinsics = torch.tensor([[90.0, 0, 38.2], [0, 85.0, 30.9], [0, 0, 1]])[None]
     rays = ray_directions(intrinsics, (height, width))[0]
-    images = (
-        rays.permute(2, 0, 1)[None] * torch.tensor([1.0, 1.0, 0.5])[:, None, None]
-        + torch.tensor([0.5, 0.5, 0.0])[:, None, None]
-    )
+    images = (rays * torch.tensor([1.0, 1.0, 0.5]) + torch.tensor([0.5, 0.5, 0.0])).permute(2, 0, 1)[None]
     return Frames(images, rays[None, ..., 0] + 1, torch.eye(4)[None], intrinsics, sparse)
 
 
-FRAMINGS = [
-    Framing((28, 56)),
-    Framing((28, 56), zoom=1.3),
-    Framing((42, 28), zoom=1.2, place=(0.0, 0.99)),
-    Framing((42, 28), place=(0.4, 0.2)),
-    Framing((28, 56), fit="pad"),
-    Framing((70, 70), fit="pad"),
-    Framing((98, 126), zoom=1.1, place=(0.9, 0.1)),
-]
-
-
-@pytest.mark.parametrize("framing", FRAMINGS)
+@pytest.mark.parametrize(
+    "framing",
+    [
+        Framing((28, 56)),
+        Framing((28, 56), zoom=1.3),
+        Framing((42, 28), zoom=1.2, place=(0.0, 0.99)),
+        Framing((42, 28), place=(0.4, 0.2)),
+        Framing((28, 56), fit="pad"),
+        Framing((70, 70), fit="pad"),
+        Framing((98, 126), zoom=1.1, place=(0.9, 0.1)),
+    ],
+)
 def test_pixels_and_intrinsics_agree(framing):
     framed = framing.apply(_rays())
     assert framed.images.shape[-2:] == framed.depth.shape[-2:] == framing.size
@@ -107,28 +104,19 @@ def test_a_size_is_height_and_width(size):
 
 
 def _module(rooms: SyntheticScenes, **options) -> SceneDataModule:
-    val = SyntheticScenes(1, first_seed=100, num_frames=6, size=SIZE, cache_dir=str(rooms.cache_dir))
-    return SceneDataModule(
-        rooms, val, image_size=(14, 28), min_views=2, max_views=3, max_images=6, eval_context=[0, 2],
-        eval_target=[1], steps_per_epoch=6, **options,
-    )  # fmt: skip
+    return module_of(rooms, image_size=(14, 28), max_images=6, steps_per_epoch=6, **options)
 
 
 DRAWN = {"aspect": [0.4, 1.2], "size_multiple": 2, "crop": "random", "zoom": [1, 1.4]}
 
 
-def test_drawn_batches_are_the_same_with_any_workers_and_memory(rooms):
+def test_drawn_batches_are_the_same_with_any_workers_and_memory_and_evaluation_is_never_drawn(rooms):
     expected = list(_module(rooms, **DRAWN).train_dataloader())
     assert len({batch.images.shape[-2:] for batch in expected}) > 3
     assert len({batch.cameras.intrinsics[0, 0, 0, 0].item() for batch in expected}) == 6
     for options in ({"workers": 1}, {"workers": 2}, {"memory_mb": 0}):
         assert_same_batches(_module(rooms, **DRAWN, **options).train_dataloader(), expected)
-
-
-def test_evaluation_is_never_drawn(rooms):
-    plain, drawn = (next(iter(_module(rooms, **options).val_dataloader())) for options in ({}, DRAWN))
-    assert torch.equal(plain.images, drawn.images)
-    assert torch.equal(plain.cameras.intrinsics, drawn.cameras.intrinsics)
+    assert_same_batches(_module(rooms).val_dataloader(), _module(rooms, **DRAWN).val_dataloader())
 
 
 def test_padded_batches_hold_whole_frames(rooms):

@@ -5,10 +5,10 @@ from functools import partial
 
 import pytest
 
-from vg2gt.data import DataError, Mixture, RGBDFolder, SceneDataModule, SyntheticScenes
+from vg2gt.data import DataError, Mixture, RGBDFolder, SyntheticScenes
 from vg2gt.data.views.sampling import StepSampler, ViewSampler, usable_scenes
 
-from .conftest import SIZE
+from .conftest import SIZE, module_of
 
 
 class Unitless(SyntheticScenes):
@@ -39,10 +39,7 @@ def test_scenes_of_all_parts_take_turns():
 
 def test_batches_know_each_scenes_unit(rooms):
     mixture = _mixture(str(rooms.cache_dir))
-    module = SceneDataModule(
-        mixture, SyntheticScenes(1, first_seed=900, num_frames=6, size=SIZE, cache_dir=str(rooms.cache_dir)),
-        image_size=SIZE, min_views=2, max_views=2, max_images=8, eval_context=[0], eval_target=[1], steps_per_epoch=3,
-    )  # fmt: skip
+    module = module_of(rooms, train=mixture, max_views=2, max_images=8, steps_per_epoch=3)
     seen = Counter()
     for batch in module.train_dataloader():
         for name, metric in zip(batch.scene, batch.is_metric.tolist(), strict=True):
@@ -70,14 +67,9 @@ def test_scenes_can_be_named_or_listed_in_a_file(tmp_path):
         _mixture(scenes=["rooms/room-000099"])
 
 
-def test_a_part_of_weight_zero_needs_no_data():
-    parts = {"rooms": partial(SyntheticScenes, 2), "disk": RGBDFolder}
+def test_missing_roots_are_named_unless_their_weight_is_zero(tmp_path):
+    parts, weights = {"rooms": SyntheticScenes(2), "disk": RGBDFolder}, {"rooms": 1, "disk": 1}
     assert Mixture(parts, {"rooms": 1, "disk": 0}, disk_root=None).sources.keys() == {"rooms"}
-
-
-def test_missing_roots_are_named(tmp_path):
-    parts = {"rooms": SyntheticScenes(2), "disk": RGBDFolder}
-    weights = {"rooms": 1, "disk": 1}
     with pytest.raises(FileNotFoundError, match=r"data\.disk_root is not set.*data\.weights\.disk=0"):
         Mixture(parts, weights, disk_root=None)
     with pytest.raises(FileNotFoundError, match=r"part disk of the mixture \(data\.disk_root\).*nowhere"):

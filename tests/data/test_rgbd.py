@@ -9,9 +9,9 @@ import pytest
 import torch
 from PIL import Image
 
-from vg2gt.data import DataError, RGBDFolder, SceneDataModule
+from vg2gt.data import DataError, RGBDFolder
 
-from .conftest import SIZE
+from .conftest import SIZE, module_of
 from .sources.layout_rgbd import write_seven_scenes
 from .sources.layouts import room
 from .warping import depth_differences
@@ -73,43 +73,26 @@ def test_invalid_values_become_zero(write_recording):
     assert depth[0, 0, :4].tolist() == [0, 0, 0, 1]
 
 
-def test_held_out_frames_are_targets_and_never_trained_on(write_recording):
+def test_held_out_frames_are_targets_and_never_trained_on(rooms, write_recording):
     source = RGBDFolder(str(write_recording()), holdout=3)
     assert list(source.held_out("office")) == [11, 14]
-    module = SceneDataModule(
-        train=source,
-        val=source,
-        image_size=SIZE,
-        min_views=2,
-        max_views=4,
-        eval_context=3,
-        eval_target=5,
-        steps_per_epoch=40,
-    )
+    module = module_of(rooms, train=source, val=source, eval_context=3, eval_target=5, steps_per_epoch=40)
     trained = {frame for batch in module.train_dataloader() for frame in batch.frame_ids.flatten().tolist()}
     assert trained == {10, 12, 13, 15}
     (batch,) = module.val_dataloader()
     assert batch.target.frame_ids.tolist() == [[11, 14]]
     assert set(batch.context.frame_ids[0].tolist()) <= trained
-    without = RGBDFolder(str(source.scene_index("office").folder), holdout=None)
-    with pytest.raises(DataError, match="office is used for training and for evaluation"):
-        SceneDataModule(train=without, val=without, min_views=2, max_views=2, eval_context=2, eval_target=1).setup()
 
 
-def test_a_folder_of_recordings_splits_by_scene(write_recording):
+def test_a_folder_of_recordings_splits_by_scene(rooms, write_recording):
     root = write_recording("a").parent
     write_recording("b", scene=1)
     assert RGBDFolder(str(root)).scenes == ("a", "b")
     assert RGBDFolder([str(root / "b"), str(root / "a")]).scenes == ("b", "a")
-    module = SceneDataModule(
-        train=RGBDFolder(str(root), scenes=["a"], holdout=None),
-        val=RGBDFolder(str(root), scenes=["b"]),
-        image_size=SIZE, min_views=2, max_views=2, eval_context=2, eval_target=1,
-    )  # fmt: skip
+    train, val = RGBDFolder(str(root), scenes=["a"], holdout=None), RGBDFolder(str(root), scenes=["b"])
+    module = module_of(rooms, train=train, val=val)
     module.setup()
     assert next(iter(module.val_dataloader())).scene == ("b",)
-    with pytest.raises(DataError, match="no such scene: c; available: a, b"):
-        RGBDFolder(str(root), scenes=["c"])
     with pytest.raises(DataError, match="two scenes are called a"):
         RGBDFolder([str(root / "a"), str(root / "a")])
 

@@ -2,14 +2,15 @@
 
 import shutil
 from functools import partial
-from typing import Any
 
 import pytest
 
 from vg2gt.cli.data import splits as main
-from vg2gt.data import DataError, RGBDFolder, SceneDataModule, SyntheticScenes
+from vg2gt.data import DataError, RGBDFolder, SyntheticScenes
 from vg2gt.data.sources.files import read_split
 from vg2gt.data.splits import split_scenes
+
+from .conftest import module_of
 
 
 class Floors(SyntheticScenes):
@@ -19,23 +20,20 @@ class Floors(SyntheticScenes):
         return f"floor-{int(scene[-6:]) // 3}"
 
 
-def test_recordings_of_a_place_stay_together():
+def test_recordings_of_a_place_stay_together_and_one_place_cannot_be_divided():
     source = Floors(60)
     train, val = split_scenes(source, 0.25, seed=3)
     assert sorted(train + val) == list(source.scenes)
     assert not {source.place(scene) for scene in train} & {source.place(scene) for scene in val}
     assert (len(val), split_scenes(source, 0.25, seed=3)) == (15, (train, val))
     assert split_scenes(source, 0.25, seed=4) != (train, val)
-
-
-def test_one_place_cannot_be_divided():
     with pytest.raises(DataError, match="single place"):
         split_scenes(Floors(3), 0.5)
     with pytest.raises(ValueError, match="fraction"):
         split_scenes(Floors(30), 1.0)
 
 
-def test_the_command_writes_lists_that_the_data_module_takes(write_recording, tmp_path, capsys):
+def test_the_command_writes_lists_that_the_data_module_takes(rooms, write_recording, tmp_path, capsys):
     folder = write_recording("home/kitchen")
     for name in ("hall", "attic", "cellar"):
         shutil.copytree(folder, tmp_path / "home" / name)
@@ -45,16 +43,7 @@ def test_the_command_writes_lists_that_the_data_module_takes(write_recording, tm
     lists = [str(tmp_path / "lists" / name) for name in ("train.txt", "val.txt")]
     assert sorted(name for path in lists for name in read_split(path)) == ["attic", "cellar", "hall", "kitchen"]
     train, val = (partial(RGBDFolder, scenes=path, holdout=None) for path in lists)
-    options: dict[str, Any] = {
-        "root": str(tmp_path / "home"),
-        "min_views": 2,
-        "max_views": 2,
-        "eval_context": 2,
-        "eval_target": 1,
-    }
-    SceneDataModule(train, val, **options).setup()
-    with pytest.raises(DataError, match="used for training and for evaluation"):
-        SceneDataModule(train, train, **options).setup()
+    module_of(rooms, train=train, val=val, root=str(tmp_path / "home")).setup()
     main([*arguments, f"--out={tmp_path / 'lists'}"])  # the same again
     with pytest.raises(SystemExit, match="holds another split"):
         main([*arguments, f"--out={tmp_path / 'lists'}", "--seed=1"])

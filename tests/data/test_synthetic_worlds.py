@@ -18,20 +18,8 @@ from vg2gt.data.synthetic.synthetic_scene import level_poses
 SIZE = (28, 56)
 
 
-@pytest.fixture(scope="module")
-def streets() -> list[SyntheticOutdoor]:
-    return [SyntheticOutdoor(seed, 8, SIZE) for seed in range(12)]
-
-
 def places(scene) -> np.ndarray:
     return np.linalg.inv(scene.world_to_camera)[:, :3, 3]
-
-
-def turned(scene) -> float:
-    """Degrees from the first to the last camera, around the middle."""
-    position = places(scene)
-    angles = np.unwrap(np.arctan2(position[:, 1], position[:, 0]))
-    return float(np.degrees(abs(angles[-1] - angles[0])))
 
 
 @pytest.mark.parametrize("kind", Worlds.variants.values())
@@ -66,22 +54,21 @@ def test_cameras_are_outside_of_everything_and_inside_the_world(kind):
             assert (own.max(1) > 1).all()  # outside of the box around the part
 
 
-def test_streets_are_deep_and_their_sky_has_no_depth(streets):
-    skies, deepest = [], []
-    for scene in streets:
-        for frame in scene.render([0, 7], 1):
-            sky = frame.depth == 0
-            assert frame.depth[~sky].min() > 0.5  # nothing stands on the camera's line
-            skies.append(sky.mean())
-            deepest.append(frame.depth.max())
-    assert 0.03 < np.mean(skies) < 0.5
-    assert np.median(deepest) > 50
-    assert max(deepest) < 91
+@pytest.mark.parametrize(
+    ("kind", "last", "nearest", "sky", "far", "farthest"),
+    [(SyntheticOutdoor, 7, 0.5, (0.03, 0.5), 50, 91), (SyntheticLandmark, 5, 1, (0.2, 0.6), 150, 1000)],
+)
+def test_streets_and_landmarks_have_a_far_background_and_a_sky_without_depth(kind, last, nearest, sky, far, farthest):
+    depth = np.array([[frame.depth for frame in kind(seed, 8, SIZE).render([0, last], 1)] for seed in range(12)])
+    assert depth[depth > 0].min() > nearest  # nothing stands on the camera's line
+    assert sky[0] < (depth == 0).mean() < sky[1]
+    assert np.median(depth.max((2, 3))) > far
+    assert depth.max() < farthest
 
 
-def test_culling_and_the_sun_lose_no_hit(streets):
+def test_culling_and_the_sun_lose_no_hit():
     """Every part is hit, and shadowed, as if there were no bounding spheres."""
-    scene = streets[0]
+    scene = SyntheticOutdoor(0, 8, SIZE)
     everything = scene.world.groups.copy()
     everything[:, 3] = 1e6
     plain = replace(scene.world, groups=everything)
@@ -91,19 +78,11 @@ def test_culling_and_the_sun_lose_no_hit(streets):
     assert (culled.image != full.image).mean() < 1e-3  # a ray that grazes two parts
 
 
-def test_landmarks_have_a_sky_a_far_background_and_wide_baselines():
-    skies, deepest, around = [], [], []
-    for seed in range(12):
-        scene = SyntheticLandmark(seed, 8, SIZE)
-        around.append(turned(scene))
-        frames = scene.render([0, 5], 1)
-        skies.append(np.mean([frame.depth == 0 for frame in frames]))
-        deepest.append(max(frame.depth.max() for frame in frames))
-        assert min(frame.depth[frame.depth > 0].min() for frame in frames) > 1
-    assert 0.2 < np.mean(skies) < 0.6
-    assert np.median(deepest) > 150
-    assert max(deepest) < 1000
-    assert np.median(around) > 70
+def test_landmarks_are_seen_from_wide_baselines():
+    """Degrees from the first to the last camera, around the middle."""
+    position = np.array([places(SyntheticLandmark(seed, 8, SIZE)) for seed in range(12)])
+    angles = np.unwrap(np.arctan2(position[..., 1], position[..., 0]))
+    assert np.median(np.degrees(abs(angles[:, -1] - angles[:, 0]))) > 70
 
 
 def test_a_wide_room_is_the_room_of_its_seed_seen_from_all_around():

@@ -1,7 +1,6 @@
 """How many processes load data where nobody says it."""
 
 import os
-from collections import namedtuple
 from functools import partial
 from types import SimpleNamespace
 
@@ -11,8 +10,6 @@ import torch
 from vg2gt.data import SceneDataModule, SyntheticScenes, datamodule
 from vg2gt.data.datamodule import MOST, automatic_workers
 
-Usage = namedtuple("Usage", "free")
-
 
 @pytest.fixture
 def machine(monkeypatch):
@@ -21,7 +18,7 @@ def machine(monkeypatch):
     def make(cores=64, memory=512.0, shared=256.0):
         monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(cores)), raising=False)
         monkeypatch.setattr(os, "sysconf", lambda name: int(memory * 1e9) if name == "SC_PHYS_PAGES" else 1)
-        monkeypatch.setattr(datamodule.shutil, "disk_usage", lambda path: Usage(int(shared * 1e9)))
+        monkeypatch.setattr(datamodule.shutil, "disk_usage", lambda path: SimpleNamespace(free=int(shared * 1e9)))
 
     return make
 

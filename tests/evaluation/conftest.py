@@ -1,6 +1,7 @@
 """A small scene and a model on it."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -43,3 +44,8 @@ def evaluate_overrides(folder: Path, cache: Path, *overrides: str) -> list[str]:
     """Overrides of ``configs/evaluate.yaml`` for an evaluation of two rooms of 28x56."""
     small = ["data.image_size=[28,56]", "data.eval_scenes=2", "views=[2]", "device=cpu", "name=test"]
     return [*small, f"output_dir={folder}", f"data.cache_dir={cache}", *overrides]
+
+
+def without_cost(scores: dict[str, Any]) -> dict[str, Any]:
+    """Without times and memory."""
+    return {name: value for name, value in scores.items() if not name.endswith(("_seconds", "_mib"))}

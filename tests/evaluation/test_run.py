@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from omegaconf import OmegaConf
 
-from tests.evaluation.conftest import evaluate_overrides
+from tests.evaluation.conftest import evaluate_overrides, without_cost
 from tests.training_helpers import small_config
 from vg2gt.cli.evaluate import run_name
 from vg2gt.config import compose
@@ -50,10 +50,6 @@ def joined(tmp_path: Path, evaluated: Path) -> Path:
     return shutil.copytree(evaluated, tmp_path / "copy")
 
 
-def without_cost(scores: dict[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in scores.items() if not name.endswith(("_seconds", "_mib"))}
-
-
 def test_an_evaluation_writes_its_results(evaluated: Path, trained: Path) -> None:
     report = json.loads((evaluated / "metrics.json").read_text(), parse_constant=pytest.fail)
     result = report["views"]["2"]
@@ -71,22 +67,19 @@ def test_the_untrained_head_says_so_and_scores_otherwise(tmp_path: Path, cache: 
     report = run(tmp_path, cache)
     assert report["settings"]["weights"] == "none: the head is untrained"
     assert "weights: none: the head is untrained" in capsys.readouterr().out
-    other = json.loads((evaluated / "metrics.json").read_text())
-    name = "rendered/gt_pose/solid/psnr"
-    assert report["views"]["2"]["mean"][name] != other["views"]["2"]["mean"][name]
-    assert report["views"]["2"]["mean"]["decoded/before/abs_rel"] == pytest.approx(
-        other["views"]["2"]["mean"]["decoded/before/abs_rel"]
-    )
+    mean = report["views"]["2"]["mean"]
+    other = json.loads((evaluated / "metrics.json").read_text())["views"]["2"]["mean"]
+    assert mean["rendered/gt_pose/solid/psnr"] != other["rendered/gt_pose/solid/psnr"]
+    assert mean["decoded/before/abs_rel"] == pytest.approx(other["decoded/before/abs_rel"])
 
 
 def test_an_interrupted_evaluation_goes_on(tmp_path, cache, trained, evaluated, monkeypatch):
     original, seen = SceneEvaluator.__call__, []
 
     def counted(self, batch, has_cameras=True):
-        if len(seen) == 1:
-            seen.append("crash")
-            raise InterruptedError("simulated crash")
         seen.append(batch.scene[0])
+        if len(seen) == 2:
+            raise InterruptedError("simulated crash")
         return original(self, batch, has_cameras)
 
     monkeypatch.setattr(SceneEvaluator, "__call__", counted)
@@ -94,27 +87,27 @@ def test_an_interrupted_evaluation_goes_on(tmp_path, cache, trained, evaluated, 
         run(tmp_path, cache, f"ckpt={trained}")
     assert not (tmp_path / "metrics.json").exists()
     report = run(tmp_path, cache, f"ckpt={trained}")
-    assert seen == ["room-1000000", "crash", "room-1000001"]
+    assert seen == ["room-1000000", "room-1000001", "room-1000001"]
     whole = json.loads((evaluated / "metrics.json").read_text())
     for scene, scores in whole["views"]["2"]["scenes"].items():
         assert without_cost(report["views"]["2"]["scenes"][scene]) == without_cost(scores)
 
 
-def test_more_scenes_and_views_join_other_settings_do_not(cache: Path, trained: Path, joined: Path) -> None:
-    report = run(joined, cache, f"ckpt={trained}", "views=[1,2]", "data.eval_scenes=1")
+def test_more_scenes_views_and_pictures_join_other_settings_do_not(cache: Path, trained: Path, joined: Path) -> None:
+    report = run(joined, cache, f"ckpt={trained}", "views=[1,2]", "data.eval_scenes=1", "evaluation.pictures=1")
     assert set(report["views"]) == {"1", "2"}
+    assert sorted(p.name for p in (joined / "pictures").iterdir()) == ["room-1000000-1.png", "room-1000000-2.png"]
     assert "cameras/auc_5" not in report["views"]["1"]["mean"]
     with pytest.raises(FileExistsError, match=r"evaluation\.alignment \(median -> scene\)"):
         run(joined, cache, f"ckpt={trained}", "evaluation.alignment=scene")
     with pytest.raises(FileExistsError, match=r"checkpoint\.sha256"):
         run(joined, cache)
+    identity = json.loads((joined / "identity.json").read_text())
+    (joined / "identity.json").write_text(json.dumps(identity | {"device": "Some GPU"}))
+    with pytest.raises(FileExistsError, match=r"device \(Some GPU -> cpu\)"):
+        run(joined, cache, f"ckpt={trained}")
     run(joined, cache, f"ckpt={trained}", "data.eval_scenes=1", "overwrite=true")
     assert len(list((joined / "scenes" / "2").iterdir())) == 1
-
-
-def test_pictures_can_be_asked_for_later(cache: Path, trained: Path, joined: Path) -> None:
-    run(joined, cache, f"ckpt={trained}", "evaluation.pictures=1")
-    assert [path.name for path in (joined / "pictures").iterdir()] == ["room-1000000-2.png"]
 
 
 def test_refined_rows_stand_apart(tmp_path: Path, cache: Path, trained: Path, joined: Path) -> None:
@@ -134,8 +127,7 @@ def test_refined_rows_stand_apart(tmp_path: Path, cache: Path, trained: Path, jo
 
 def test_the_papers_rows_do_not_stand_beside_other_data(tmp_path: Path, cache: Path, trained: Path) -> None:
     chosen = ["evaluation.table=replica", "data.eval_scenes=1", "views=[3]"]
-    report = run(tmp_path, cache, f"ckpt={trained}", *chosen)
-    assert report["settings"]["paper"] is None
+    assert run(tmp_path, cache, f"ckpt={trained}", *chosen)["settings"]["paper"] is None
     text = (tmp_path / "metrics.md").read_text()
     assert "the paper's rows are left out: the data is read by SyntheticScenes" in text
     assert "tbl_" not in text
@@ -147,23 +139,21 @@ def test_a_model_without_a_trained_part(tmp_path: Path, cache: Path) -> None:
     assert report["views"]["2"]["mean"]["scene/gaussians_per_pixel"] == 1
 
 
-def test_scenes_of_the_training_are_refused(tmp_path: Path, cache: Path, trained: Path) -> None:
-    with pytest.raises(DataError, match="scene room-000000 is used for training and for evaluation"):
-        run(tmp_path, cache, f"ckpt={trained}", "data.val.first_seed=0")
+def test_what_the_weights_or_those_before_were_trained_on_is_refused(tmp_path, cache, trained, copied, caplog):
+    """Also a run on other rooms that began with ``init_from``, or went on in a new folder with ``ckpt``."""
 
-
-def test_what_the_weights_before_were_trained_on_is_refused(tmp_path, cache, trained, copied, caplog):
-    """A run on other rooms that began with ``init_from``, or went on in a new folder with ``ckpt``."""
-    for key, start in (("init_from", trained / "checkpoints" / "step-2.ckpt"), ("ckpt", trained)):
+    def trained_on(first_seed: int, **start: Path) -> None:
         config = read_run_config(trained / "config.yaml")
-        config.data.train.first_seed = 500
-        config[key] = str(start)
+        config.data.train.first_seed = first_seed
+        config.update({key: str(path) for key, path in start.items()})
         OmegaConf.save(config, copied / "config.yaml")
+
+    begun = trained / "checkpoints" / "step-2.ckpt"
+    for first_seed, start in ((0, {}), (500, {"init_from": begun}), (500, {"ckpt": trained})):
+        trained_on(first_seed, **start)
         with pytest.raises(DataError, match="scene room-000000 is used for training and for evaluation"):
             run(tmp_path / "out", cache, f"ckpt={copied}", "data.val.first_seed=0")
-    config = read_run_config(trained / "config.yaml")
-    config.ckpt = str(tmp_path / "gone.ckpt")
-    OmegaConf.save(config, copied / "config.yaml")
+    trained_on(500, ckpt=tmp_path / "gone.ckpt")
     run(tmp_path / "out", cache, f"ckpt={copied}", "data.eval_scenes=1")
     assert "cannot check whether" in caplog.text
     assert "gone.ckpt, which is not there" in caplog.text
@@ -223,33 +213,20 @@ def test_a_checkpoint_knows_what_it_was_trained_with(tmp_path: Path, cache: Path
     assert lone["views"]["2"]["mean"][name] == whole["views"]["2"]["mean"][name]
 
 
-def test_a_training_runs_folder_is_left_as_it_is(cache: Path, trained: Path, copied: Path) -> None:
+def test_what_is_not_an_evaluations_is_left_as_it_is(tmp_path, cache, trained, copied) -> None:
     for more in ([], ["overwrite=true"]):
         with pytest.raises(FileExistsError, match=r"holds metrics\.json, .*config\.yaml, which do not belong"):
             run(copied, cache, f"ckpt={copied}", "data.eval_scenes=1", *more)
     for name in ("config.yaml", "metrics.json", "metrics.md"):
         assert (copied / name).read_bytes() == (trained / name).read_bytes()
+    (tmp_path / "out" / "scenes" / "own").mkdir(parents=True)
+    with pytest.raises(FileExistsError, match="holds scenes, which do not belong"):
+        run(tmp_path / "out", cache, "data.eval_scenes=1", "overwrite=true")
+    assert [path.name for path in (tmp_path / "out").iterdir() if path.name != ".lock"] == ["scenes"]
 
 
-def test_times_of_another_device_do_not_join(tmp_path: Path, cache: Path, trained: Path) -> None:
-    run(tmp_path, cache, f"ckpt={trained}", "data.eval_scenes=1")
-    identity = json.loads((tmp_path / "identity.json").read_text())
-    assert identity["device"] == "cpu"
-    (tmp_path / "identity.json").write_text(json.dumps(identity | {"device": "Some GPU"}))
-    with pytest.raises(FileExistsError, match=r"device \(Some GPU -> cpu\)"):
-        run(tmp_path, cache, f"ckpt={trained}", "data.eval_scenes=1")
-
-
-@pytest.mark.parametrize(
-    ("ckpt", "name"),
-    [
-        (None, "untrained"),
-        ("outputs/quickstart", "quickstart"),
-        ("outputs/quickstart/checkpoints/step-400.ckpt", "quickstart"),
-        ("/data/outputs/wo_depth/", "wo_depth"),
-        ("../other/mine.ckpt", "other"),
-        ("mine.ckpt", "mine"),
-    ],
-)
-def test_the_folder_is_named_after_the_run(ckpt: str | None, name: str) -> None:
-    assert run_name(ckpt) == name
+def test_the_folder_is_named_after_the_run() -> None:
+    run_folder = "outputs/quickstart"
+    names = {None: "untrained", run_folder: "quickstart", f"{run_folder}/checkpoints/step-400.ckpt": "quickstart"}
+    names |= {"/data/outputs/wo_depth/": "wo_depth", "../other/mine.ckpt": "other", "mine.ckpt": "mine"}
+    assert {ckpt: run_name(ckpt) for ckpt in names} == names

@@ -15,14 +15,8 @@ from vg2gt.training.loop import train
 
 
 def overrides(cache: Path, *more: str) -> list[str]:
-    small = [
-        "data.image_size=[28,56]",
-        "data.eval_scenes=6",
-        "data.val.first_seed=2000000",
-        "views=[2,3]",
-        "device=cpu",
-    ]
-    return [*small, f"data.cache_dir={cache}", "data.num_frames=4", "pixels=1000000", *more]
+    small = ["data.image_size=[28,56]", "data.eval_scenes=6", "data.num_frames=4", "views=[2,3]", "device=cpu"]
+    return [*small, f"data.cache_dir={cache}", "data.val.first_seed=2000000", "pixels=1000000", *more]
 
 
 @pytest.fixture(scope="module")
@@ -59,6 +53,6 @@ def test_an_evaluation_scores_it(calibrated: Path, cache: Path, tmp_path: Path) 
 def test_it_needs_a_place_and_enough_scenes(cache: Path) -> None:
     with pytest.raises(ValueError, match=r"give out=FILE\.json"):
         make_calibration(compose("calibrate", *overrides(cache)))
-    few = [*overrides(cache), "data.eval_scenes=2", "backend=oracle", "model=tiny", "out=nowhere.json"]
+    few = ["data.eval_scenes=2", "backend=oracle", "model=tiny", "out=nowhere.json"]
     with pytest.raises(ValueError, match="2 scenes"):
-        make_calibration(compose("calibrate", *few))
+        make_calibration(compose("calibrate", *overrides(cache, *few)))

@@ -48,22 +48,17 @@ def test_scale_is_the_minimiser_of_the_weighted_l1_error() -> None:
     assert abs(scale - float((reference / predicted)[valid].median())) > 1e-3
 
 
-def test_scale_of_scenes() -> None:
+def test_scale_is_a_scenes_ignores_invalid_pixels_and_has_no_graph() -> None:
     predicted = 1 + rand(2, 3, 12, 10)
     factors = torch.tensor([[2.0, 2.0, 2.0], [0.5, 3.0, 0.5]], dtype=torch.float64)
-    everywhere = torch.ones_like(predicted, dtype=torch.bool)
-    scale = fit_depth_scale(predicted, predicted * factors[..., None, None], everywhere)
+    scale = fit_depth_scale(predicted, predicted * factors[..., None, None], predicted > 0)
     torch.testing.assert_close(scale, torch.tensor([2.0, 0.5], dtype=torch.float64))
-
-
-def test_scale_ignores_invalid_pixels_and_has_no_graph() -> None:
     predicted, reference = 1 + rand(1, 1, 8, 8), 2 + rand(1, 1, 8, 8, seed=1)
     good = torch.ones_like(predicted, dtype=torch.bool)
     good[0, 0, :3] = False
     reference_scale = fit_depth_scale(predicted, reference, good)
     predicted[0, 0, 0], predicted[0, 0, 1], reference[0, 0, 2] = 0, torch.inf, torch.nan
-    everywhere = torch.ones_like(good)
-    scale = fit_depth_scale(predicted.requires_grad_(), reference, everywhere)
+    scale = fit_depth_scale(predicted.requires_grad_(), reference, torch.ones_like(good))
     torch.testing.assert_close(scale, reference_scale)
     assert not scale.requires_grad
     assert fit_depth_scale(predicted, reference, torch.zeros_like(good)).isnan().all()
@@ -73,8 +68,7 @@ def test_subsampling_takes_one_pixel_near_the_centre_of_every_cell():
     # 128 x 192 pixels: cells of 2 x 3, whose middle column is nearest to the centre.
     ratio = torch.full((1, 1, 128, 192), 50.0, dtype=torch.float64)
     ratio[..., 1::3] = 2.0
-    everywhere = torch.ones_like(ratio, dtype=torch.bool)
-    assert float(fit_depth_scale(torch.ones_like(ratio), ratio, everywhere)[0]) == 2
+    assert float(fit_depth_scale(torch.ones_like(ratio), ratio, ratio > 0)[0]) == 2
 
 
 def test_alignment_of_cameras_on_a_line_and_of_cameras_that_only_turn() -> None:
@@ -129,15 +123,12 @@ def test_a_similarity_moves_points_and_cameras_together() -> None:
     torch.testing.assert_close(moved_depth, depth * similarity.scale[:, None, None])
 
 
-def test_points_are_aligned_exactly_whatever_the_similarity() -> None:
+def test_points_are_aligned_exactly_and_by_least_squares_if_noisy() -> None:
     points, truth = randn(3, 20, 3), random_similarity(3)
     found = align_points(points, truth.apply(points))
     for name in ("scale", "rotation", "translation"):
         torch.testing.assert_close(getattr(found, name), getattr(truth, name))
-
-
-def test_noisy_points_are_aligned_by_least_squares() -> None:
-    """Umeyama's closed form: singular values of the covariance over the variance."""
+    # Noisy ones by Umeyama's closed form: singular values of the covariance over the variance.
     points, truth = randn(1, 60, 3), random_similarity(1)
     reference = truth.apply(points) + 0.1 * randn(1, 60, 3, seed=4)
     found = align_points(points, reference)

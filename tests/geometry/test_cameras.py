@@ -1,5 +1,4 @@
 import numpy as np
-import pytest
 import torch
 from torch import Tensor
 
@@ -56,7 +55,7 @@ def test_rigid_inverse_and_points() -> None:
     torch.testing.assert_close(transform_points(poses, points[:, :, 0]), expected[:, :, 0])
 
 
-def test_relative_cameras_see_the_same_and_start_at_the_exact_identity() -> None:
+def test_relative_cameras_start_at_the_exact_identity_and_scaled_ones_scale_the_world() -> None:
     cameras, depth = random_cameras(), random_depth()
     relative = relative_to_first(cameras)
     assert torch.equal(relative.world_to_camera[:, 0], torch.eye(4, dtype=torch.float64).expand(2, 4, 4))
@@ -64,26 +63,19 @@ def test_relative_cameras_see_the_same_and_start_at_the_exact_identity() -> None
     first = cameras.world_to_camera[:, :1].expand(2, 3, 4, 4)
     torch.testing.assert_close(transform_points(first, points), moved)
     torch.testing.assert_close(project(moved, relative)[0], project(points, cameras)[0])
-
-
-def test_scaled_translations_scale_the_world() -> None:
-    cameras, depth = random_cameras(), random_depth()
     factor = torch.tensor([2.0, 0.5], dtype=torch.float64)
     shape = (2, 1, 1, 1)
     scaled = unproject(depth * factor.view(shape), scale_translations(cameras, factor))
-    torch.testing.assert_close(scaled, unproject(depth, cameras) * factor.view(*shape, 1))
+    torch.testing.assert_close(scaled, points * factor.view(*shape, 1))
 
 
-def test_resized_intrinsics_map_pixel_areas() -> None:
+def test_resized_intrinsics_map_pixel_areas_and_cropped_ones_keep_the_rays() -> None:
     intrinsics = torch.tensor([[7.0, 0, 3.5], [0, 6, 2.5], [0, 0, 1]])  # the centre of 8 x 6 pixels
     doubled = resize_intrinsics(intrinsics, 2, 2)
     torch.testing.assert_close(doubled, torch.tensor([[14.0, 0, 7.5], [0, 12, 5.5], [0, 0, 1]]))
     torch.testing.assert_close(resize_intrinsics(doubled, 0.5, 0.5), intrinsics)
     assert intrinsics[0, 2] == 3.5  # the argument is left alone
-
-
-@pytest.mark.parametrize(("left", "top"), [(0, 0), (3, 1)])
-def test_cropped_intrinsics_keep_the_rays(left: int, top: int) -> None:
     intrinsics = random_cameras().intrinsics
-    cropped = ray_directions(crop_intrinsics(intrinsics, left, top), (SIZE[0] - top, SIZE[1] - left))
-    torch.testing.assert_close(cropped, ray_directions(intrinsics, SIZE)[..., top:, left:, :])
+    for left, top in ((0, 0), (3, 1)):
+        cropped = ray_directions(crop_intrinsics(intrinsics, left, top), (SIZE[0] - top, SIZE[1] - left))
+        torch.testing.assert_close(cropped, ray_directions(intrinsics, SIZE)[..., top:, left:, :])

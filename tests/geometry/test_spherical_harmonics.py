@@ -36,16 +36,13 @@ def test_order_and_signs_are_those_of_gaussian_splatting() -> None:
     torch.testing.assert_close(values, torch.tensor(expected, dtype=torch.float64))
 
 
-def test_colours_come_back_and_are_not_negative() -> None:
+def test_colours_come_back_are_not_negative_and_of_degree_3_at_most() -> None:
     rgb = torch.rand(5, 3, generator=torch.Generator().manual_seed(0))
     directions = sphere(5).float()
     torch.testing.assert_close(sh_to_rgb(rgb_to_sh(rgb)[:, None], directions), rgb)
     sh = torch.zeros(5, 4, 3)
     sh[:, 0] = -10
     assert (sh_to_rgb(sh, directions) == 0).all()
-
-
-def test_degrees_out_of_range_are_refused() -> None:
     with pytest.raises(ValueError, match="0 to 3, got 4"):
         basis(torch.zeros(3), 4)
 

@@ -7,16 +7,16 @@ from vg2gt.geometry.rotations import quat_to_matrix
 from vg2gt.geometry.symmetric import principal_direction, smallest_eigenvector
 
 
-def _rotations(count: int) -> torch.Tensor:
-    return quat_to_matrix(torch.randn(count, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64))
+def _with_values(values: tuple[float, ...], count: int) -> torch.Tensor:
+    turns = quat_to_matrix(torch.randn(count, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64))
+    return turns @ torch.diag(torch.tensor(values, dtype=torch.float64)) @ turns.mT
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("size", [1e-12, 1.0, 1e12])
 @pytest.mark.parametrize("values", [(1.0, 2.0, 3.0), (0.0, 1.0, 1.0), (1e-5, 0.08, 0.09), (0.0, 1e-3, 1.0)])
 def test_the_eigenvector_of_the_smallest_value(dtype: torch.dtype, size: float, values: tuple[float, ...]) -> None:
-    frames = _rotations(200)
-    matrix = (size * frames @ torch.diag(torch.tensor(values, dtype=torch.float64)) @ frames.transpose(1, 2)).to(dtype)
+    matrix = (size * _with_values(values, 200)).to(dtype)
     found = smallest_eigenvector(matrix, torch.zeros(200, 3, dtype=dtype))
     expected = torch.linalg.eigh(matrix.double()).eigenvectors[..., 0]
     assert found.dtype == dtype
@@ -25,10 +25,8 @@ def test_the_eigenvector_of_the_smallest_value(dtype: torch.dtype, size: float, 
 
 @pytest.mark.parametrize("values", [(1.0, 1.0, 1.0), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (2.0, 2.0, 3.0)])
 def test_where_no_direction_is_the_smallest_the_fallback_is_returned(values: tuple[float, ...]) -> None:
-    frames = _rotations(50)
-    matrix = frames @ torch.diag(torch.tensor(values, dtype=torch.float64)) @ frames.transpose(1, 2)
     fallback = torch.nn.functional.normalize(torch.randn(50, 3, dtype=torch.float64), dim=-1)
-    torch.testing.assert_close(smallest_eigenvector(matrix, fallback), fallback)
+    torch.testing.assert_close(smallest_eigenvector(_with_values(values, 50), fallback), fallback)
 
 
 def test_principal_direction() -> None:

@@ -9,6 +9,7 @@ import re
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 
 def read_table(path: Path) -> dict[str, np.ndarray]:
@@ -46,26 +47,8 @@ def sh_basis(d: np.ndarray) -> np.ndarray:
     )
 
 
-def rotations(quats: np.ndarray) -> np.ndarray:
-    """``[n, 3, 3]`` of wxyz quaternions of any length."""
-    w, x, y, z = (quats / np.linalg.norm(quats, axis=-1, keepdims=True)).T
-    return np.stack(
-        [
-            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
-            np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
-            np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
-        ],
-        1,
-    )
-
-
 def render_ply(
-    path: Path,
-    world_to_camera: np.ndarray,
-    intrinsics: np.ndarray,
-    size: tuple[int, int],
-    alpha_max: float = 0.999,
-    near: float = 0.01,
+    path: Path, world_to_camera: np.ndarray, intrinsics: np.ndarray, size: tuple[int, int], alpha_max: float
 ) -> np.ndarray:
     """Image ``[H, W, 3]`` on black; ``intrinsics`` with pixel centres at half integers."""
     table = read_table(path)
@@ -74,7 +57,7 @@ def render_ply(
         return np.stack([table[name] for name in names], -1)
 
     means, opacity = stack("x", "y", "z"), 1 / (1 + np.exp(-table["opacity"]))
-    axes = rotations(stack("rot_0", "rot_1", "rot_2", "rot_3"))
+    axes = Rotation.from_quat(stack("rot_1", "rot_2", "rot_3", "rot_0")).as_matrix()  # scalar last
     sigma = np.exp(stack("scale_0", "scale_1", "scale_2"))
     rest = sum(name.startswith("f_rest_") for name in table) // 3
     channels = [stack(f"f_dc_{c}", *(f"f_rest_{c * rest + k}" for k in range(rest))) for c in range(3)]
@@ -85,7 +68,7 @@ def render_ply(
     color = np.maximum(color + 0.5, 0)
     camera = means @ rotation.T + translation
     order = np.argsort(camera[:, 2], kind="stable")
-    order = order[camera[order, 2] > near]
+    order = order[camera[order, 2] > 0.01]
     camera, axes, sigma, opacity, color = (v[order] for v in (camera, axes, sigma, opacity, color))
     fx, fy, cx, cy = intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]
     height, width = size

@@ -33,9 +33,8 @@ def views_model(points: int = 60):
     spread = torch.from_numpy(xyz).float()[None, None].expand(1, 3, -1, -1)
     pixels = project(spread, cameras)[0][0].numpy()[views, np.arange(points)]
     colors = rng.integers(0, 256, (points, 3)).astype(np.uint8)
-    return io.colmap_from_views(
-        cameras, ["a.png", "b.png", "c.png"], xyz, colors, (np.arange(points), views, pixels)
-    ), cameras
+    observed = np.arange(points), views, pixels
+    return io.colmap_from_views(cameras, ["a.png", "b.png", "c.png"], xyz, colors, observed), cameras
 
 
 def put_text(folder: Path, cameras: str, images: str, points: str | None = "") -> Path:
@@ -106,17 +105,12 @@ def test_wrong_arguments_are_named(tmp_path: Path) -> None:
         io.colmap_intrinsics(equirectangular)
 
 
-def test_folder_without_a_model(tmp_path: Path) -> None:
+def test_a_folder_without_a_model_and_a_missing_pycolmap_are_named(tmp_path: Path, monkeypatch) -> None:
     with pytest.raises(io.FormatError, match="no COLMAP model here"):
         io.read_colmap(tmp_path)
-
-
-def test_without_pycolmap_one_line_names_the_extra(tmp_path: Path, monkeypatch) -> None:
     io.write_colmap(tmp_path, small_model())
     monkeypatch.setattr("vg2gt.io.colmap.importlib.util.find_spec", lambda name: None)
-    with pytest.raises(
-        ImportError, match=r"^reading the COLMAP model \S+ needs pycolmap: pip install 'vg2gt\[colmap\]'$"
-    ):
+    with pytest.raises(ImportError, match=r"^reading .* needs pycolmap: pip install 'vg2gt\[colmap\]'$"):
         io.read_colmap(tmp_path)
 
 

@@ -21,6 +21,13 @@ from made.constants import LIMIT
 def limit():
     return LIMIT
 """
+ONE = """
+from vg2gt.kernels.compiled import kernel
+
+@kernel()
+def add_one(x):
+    return x + 1
+"""
 
 
 @pytest.fixture
@@ -64,15 +71,6 @@ def test_without_a_home_kernels_run(room, tmp_path, monkeypatch, caplog):
     monkeypatch.setenv("HOME", str(missing))
     assert value_with(3, room) == 3
     assert "NUMBA_CACHE_DIR" in caplog.text
-
-
-ONE = """
-from vg2gt.kernels.compiled import kernel
-
-@kernel()
-def add_one(x):
-    return x + 1
-"""
 
 
 @pytest.fixture
@@ -119,9 +117,9 @@ def test_kernels_take_what_they_need_from_their_own_room() -> None:
     wrong, kernels = [], 0
     shared = ".".join(compiled.SHARED.relative_to(ROOT).with_suffix("").parts)
     for path in (ROOT / "vg2gt").rglob("*.py"):
-        tree = ast.parse(path.read_text())
-        imported = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
         source = path.read_text()
+        tree = ast.parse(source)
+        imported = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
         if path.name != "compiled.py" and "cache=True" in source and "numba" in source:
             wrong.append(f"{path}: njit(cache=True)")
         if not any(name.name in ("kernel", "kernel_part", "jit", "part") for node in imported for name in node.names):

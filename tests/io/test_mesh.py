@@ -7,7 +7,7 @@ import pytest
 import torch
 import trimesh
 
-from vg2gt.geometry.cameras import invert_rigid, ray_directions
+from vg2gt.geometry.cameras import ray_directions
 from vg2gt.io import fuse_depth, write_mesh
 from vg2gt.types import Cameras
 
@@ -35,11 +35,9 @@ def looking_at_origin(views: int, distance: float, size: tuple[int, int]) -> Cam
 def sphere_depth(cameras: Cameras) -> torch.Tensor:
     """z-depth of a sphere about the origin, 0 beside it."""
     rays = ray_directions(cameras.intrinsics, cameras.size)[0]
-    poses = invert_rigid(cameras.world_to_camera)[0]
-    center = -(cameras.world_to_camera[0, :, :3, :3] @ poses[:, :3, 3:])[:, None, None, :, 0]  # camera to origin: -t
-    to_center = -center
-    a, b = (rays**2).sum(-1), (rays * -to_center).sum(-1)
-    root = b**2 - a * ((to_center**2).sum(-1) - RADIUS**2)
+    origin = cameras.world_to_camera[0, :, None, None, :3, 3]
+    a, b = (rays**2).sum(-1), (rays * origin).sum(-1)
+    root = b**2 - a * ((origin**2).sum(-1) - RADIUS**2)
     return torch.where(root > 0, (b - root.clamp(min=0).sqrt()) / a, 0.0)
 
 
@@ -87,18 +85,16 @@ def test_written_meshes_load(tmp_path: Path, sphere, suffix: str) -> None:
 def test_inputs_are_not_changed_and_errors_name_the_knob(tmp_path: Path, sphere) -> None:
     cameras, depth, colors, _ = sphere
     before = depth.clone()
-    with pytest.raises(ValueError, match="max_voxels=1000"):
-        fuse_depth(depth, cameras, voxel_size=VOXEL, max_voxels=1000)
-    with pytest.raises(ValueError, match="take larger voxels"):
-        fuse_depth(depth, cameras, voxel_size=1e-7)
-    with pytest.raises(ValueError, match="two voxels at least"):
-        fuse_depth(depth, cameras, voxel_size=VOXEL, truncation=VOXEL)
-    with pytest.raises(ValueError, match=r"depth must be \[V, 72, 72\]"):
-        fuse_depth(depth[:, :50], cameras, voxel_size=VOXEL)
-    with pytest.raises(ValueError, match="colors must be"):
-        fuse_depth(depth, cameras, colors[:1], voxel_size=VOXEL)
-    with pytest.raises(ValueError, match="depth has values that are not finite"):
-        fuse_depth(depth / 0, cameras, voxel_size=VOXEL)
+    for message, changes in {
+        "max_voxels=1000": {"max_voxels": 1000},
+        "take larger voxels": {"voxel_size": 1e-7},
+        "two voxels at least": {"truncation": VOXEL},
+        r"depth must be \[V, 72, 72\]": {"depth": depth[:, :50]},
+        "colors must be": {"colors": colors[:1]},
+        "depth has values that are not finite": {"depth": depth / 0},
+    }.items():
+        with pytest.raises(ValueError, match=message):
+            fuse_depth(**{"depth": depth, "cameras": cameras, "voxel_size": VOXEL, **changes})
     assert torch.equal(depth, before)
     empty = fuse_depth(depth * 0, cameras, voxel_size=VOXEL)
     assert empty.vertices.shape == (0, 3)

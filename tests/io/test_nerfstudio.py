@@ -11,6 +11,7 @@ from vg2gt.geometry.rotations import quat_to_matrix
 from vg2gt.io import FormatError, Lens, Transforms, TransformsFrame, read_transforms, write_transforms
 
 IDENTITY = np.eye(4).tolist()
+POSED = '{"fl_x": 1, "frames": [{"file_path": "a", "transform_matrix": %s}]}'
 
 
 def random_pose(rng: np.random.Generator) -> np.ndarray:
@@ -22,19 +23,14 @@ def random_pose(rng: np.random.Generator) -> np.ndarray:
 
 def random_transforms(shared_lens: bool, frames: int = 5) -> Transforms:
     rng = np.random.default_rng(0)
-    lenses = [
-        Lens.from_intrinsics(
-            [[500.0 + i, 0, 320.25], [0, 510.5, 239.5], [0, 0, 1]], (480, 640), {"k1": 0.1, "p2": -1e-3 * i}
-        )
-        for i in range(frames)
-    ]
-    return Transforms(
-        tuple(
-            TransformsFrame(f"images/{i}.png", random_pose(rng), lenses[0 if shared_lens else i], f"depth/{i}.png")
-            for i in range(frames)
-        ),
-        "points.ply",
-    )
+
+    def frame(i: int) -> TransformsFrame:
+        own = 0 if shared_lens else i
+        intrinsics = [[500.0 + own, 0, 320.25], [0, 510.5, 239.5], [0, 0, 1]]
+        lens = Lens.from_intrinsics(intrinsics, (480, 640), {"k1": 0.1, "p2": -1e-3 * own})
+        return TransformsFrame(f"images/{i}.png", random_pose(rng), lens, f"depth/{i}.png")
+
+    return Transforms(tuple(frame(i) for i in range(frames)), "points.ply")
 
 
 @pytest.mark.parametrize("shared_lens", [True, False])
@@ -56,10 +52,9 @@ def test_axes_and_pixel_centres(tmp_path: Path) -> None:
     """A camera at (0, 0, 5) with OpenGL identity axes looks down -z and sees the origin 5 in front."""
     pose = np.eye(4)
     pose[2, 3] = 5
-    frame = {"file_path": "a.png", "transform_matrix": pose.tolist()}
-    (tmp_path / "t.json").write_text(
-        json.dumps({"fl_x": 100.0, "cx": 32.0, "cy": 24.0, "w": 64.0, "h": 48.0, "frames": [frame]})
-    )
+    content = {"fl_x": 100.0, "cx": 32.0, "cy": 24.0, "w": 64.0, "h": 48.0}
+    content["frames"] = [{"file_path": "a.png", "transform_matrix": pose.tolist()}]
+    (tmp_path / "t.json").write_text(json.dumps(content))
     (read,) = read_transforms(tmp_path / "t.json").frames
     np.testing.assert_array_equal(read.world_to_camera @ [0, 0, 0, 1], [0, 0, 5, 1])
     np.testing.assert_array_equal(read.world_to_camera @ [0, 1, 0, 1], [0, -1, 5, 1])
@@ -88,9 +83,8 @@ def test_real_file(shared: Path, tmp_path: Path) -> None:
     np.testing.assert_allclose(lens.intrinsics(), [[1375.52, 0, 554.058], [0, 1374.49, 964.768], [0, 0, 1]])
     assert pytest.approx(lens.fl_x, rel=1e-5) == 1080 / 2 / np.tan(lens.camera_angle_x / 2)
     poses = np.stack([frame.world_to_camera for frame in fox.frames])
-    np.testing.assert_allclose(
-        poses[:, :3, :3] @ poses[:, :3, :3].swapaxes(1, 2), np.eye(3)[None].repeat(67, 0), atol=1e-5
-    )
+    turns = poses[:, :3, :3]
+    np.testing.assert_allclose(turns @ turns.swapaxes(1, 2), np.eye(3)[None].repeat(67, 0), atol=1e-5)
     # all cameras look at one place, in front of each of them
     centers, axes = np.linalg.inv(poses)[:, :3, 3], poses[:, 2, :3]
     off_axis = np.eye(3) - axes[:, :, None] * axes[:, None, :]
@@ -113,15 +107,9 @@ def test_real_file(shared: Path, tmp_path: Path) -> None:
         ('{"w": 10.5, "frames": []}', "whole number of pixels"),
         ('{"frames": [{"file_path": "a"}]}', r"frames\[0\]\.fl_x is missing"),
         ('{"fl_x": 1, "frames": [{"file_path": "a"}]}', r"frames\[0\]\.transform_matrix is missing"),
-        ('{"fl_x": 1, "frames": [{"file_path": "a", "transform_matrix": [[1], [2], [3]]}]}', "3 or 4 rows of 4"),
-        (
-            '{"fl_x": 1, "frames": [{"file_path": "a", "transform_matrix": [[2,0,0,0],[0,2,0,0],[0,0,2,0]]}]}',
-            "not a rotation and a translation",
-        ),
-        (
-            '{"fl_x": 1, "frames": [{"file_path": "a", "transform_matrix": [[1,0,0,0],[0,1,0,0],[0,0,-1,0]]}]}',
-            "not a rotation and a translation",
-        ),
+        (POSED % "[[1], [2], [3]]", "3 or 4 rows of 4"),
+        (POSED % "[[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0]]", "not a rotation and a translation"),
+        (POSED % "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 0]]", "not a rotation and a translation"),
     ],
 )
 def test_wrong_shapes_name_the_field(tmp_path: Path, content: str, message: str) -> None:
@@ -134,8 +122,7 @@ def test_wrong_shapes_name_the_field(tmp_path: Path, content: str, message: str)
 
 def test_pose_that_is_not_finite_is_kept_as_nan_and_not_written(tmp_path: Path) -> None:
     path = tmp_path / "transforms.json"
-    pose = [[1, 0, 0, float("nan")], [0, 1, 0, 0], [0, 0, 1, 0]]
-    path.write_text(json.dumps({"fl_x": 1, "frames": [{"file_path": "a", "transform_matrix": pose}]}))
+    path.write_text(POSED % "[[1, 0, 0, NaN], [0, 1, 0, 0], [0, 0, 1, 0]]")
     transforms = read_transforms(path)
     assert np.isnan(transforms.frames[0].world_to_camera).all()
     with pytest.raises(ValueError, match="finite"):

@@ -1,25 +1,18 @@
 """A scene as tiles."""
 
 import json
+from dataclasses import replace
 
 import pytest
 import torch
 
+from tests.io.gaussian_scenes import scene
 from vg2gt.io.tiles import read_tiles, write_tiles
-from vg2gt.types import Gaussians
-
-
-def scene(count: int) -> Gaussians:
-    generator = torch.Generator().manual_seed(0)
-    means = torch.rand(count, 3, generator=generator) * torch.tensor([8.0, 2.0, 3.0])
-    quats = torch.nn.functional.normalize(torch.randn(count, 4, generator=generator), dim=1)
-    scales = 0.01 + torch.rand(count, 3, generator=generator)
-    opacities, sh = torch.rand(count, generator=generator), torch.randn(count, 1, 3, generator=generator)
-    return Gaussians(means, quats, scales, opacities, sh, torch.zeros(count, dtype=torch.int64))
 
 
 def test_tiles_hold_every_gaussian_once_and_say_where(tmp_path) -> None:
-    whole = scene(1000)
+    means = torch.rand(1000, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([8.0, 2.0, 3.0])
+    whole = replace(scene(1000), means=means)
     write_tiles(tmp_path, whole, ".ply", most=130)
     index = json.loads((tmp_path / "index.json").read_text())
     assert index["gaussians"] == 1000 == sum(tile["gaussians"] for tile in index["tiles"])

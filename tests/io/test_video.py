@@ -11,13 +11,10 @@ from vg2gt.io.video import MissingDecoderError, count_frames
 def _frames(count: int = 6, size: tuple[int, int] = (32, 48)) -> list[np.ndarray]:
     """A white bar that moves to the right over a colour gradient."""
     y, x = np.mgrid[: size[0], : size[1]]
-    base = np.stack((x * 4, y * 6, 0 * x + 90), -1).astype(np.uint8)
-    frames = []
-    for i in range(count):
-        frame = base.copy()
+    frames = np.stack((x * 4, y * 6, 0 * x + 90), -1).astype(np.uint8)[None].repeat(count, 0)
+    for i, frame in enumerate(frames):
         frame[:, 6 * i : 6 * i + 4] = 255
-        frames.append(frame)
-    return frames
+    return list(frames)
 
 
 def test_gif_round_trip(tmp_path: Path) -> None:
@@ -81,10 +78,9 @@ def test_ten_bits_and_more_are_read_as_eight(tmp_path: Path, codec: str, pixels:
         container.mux(stream.encode(None))
     read = list(read_video(tmp_path / "deep.mkv"))
     assert len(read) == 6
+    grey = np.array([[0.299, 0.587, 0.114]]).T.repeat(3, 1)
     for number, frame in read:
-        expected = _frames()[number].astype(float)
-        if pixels.startswith("gray"):
-            expected = (expected @ [0.299, 0.587, 0.114])[..., None]
+        expected = _frames()[number] @ (grey if pixels.startswith("gray") else np.eye(3))
         assert frame.dtype == np.uint8
         assert np.abs(frame - expected).mean() < 12
 
@@ -122,14 +118,14 @@ def test_missing_decoder_names_the_remedy(tmp_path: Path, monkeypatch) -> None:
 
 
 def test_what_cannot_be_written_or_read(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="at least one frame"):
-        write_video(tmp_path / "none.gif", [])
-    with pytest.raises(ValueError, match="one size"):
-        write_video(tmp_path / "two.gif", [*_frames(1), *_frames(1, (16, 16))])
-    with pytest.raises(ValueError, match="fps"):
-        write_video(tmp_path / "still.gif", _frames(), fps=0)
-    with pytest.raises(ValueError, match=r"\.gif or \.mp4"):
-        write_video(tmp_path / "film.avi", _frames())
+    for said, name, frames, fps in (
+        ("at least one frame", "none.gif", [], 12),
+        ("one size", "two.gif", [*_frames(1), *_frames(1, (16, 16))], 12),
+        ("fps", "still.gif", _frames(), 0),
+        (r"\.gif or \.mp4", "film.avi", _frames(), 12),
+    ):
+        with pytest.raises(ValueError, match=said):
+            write_video(tmp_path / name, frames, fps=fps)
     (tmp_path / "text.gif").write_text("no picture")
     with pytest.raises(FormatError, match="not a GIF"):
         list(read_video(tmp_path / "text.gif"))

@@ -33,9 +33,8 @@ class Sample:
         """The same sample with another enhanced depth."""
         geometry = self.prediction.geometry
         conf = geometry.depth_conf if depth_conf is None else depth_conf
-        return replace(
-            self, prediction=replace(self.prediction, geometry=replace(geometry, depth=depth, depth_conf=conf))
-        )
+        geometry = replace(geometry, depth=depth, depth_conf=conf)
+        return replace(self, prediction=replace(self.prediction, geometry=geometry))
 
     def with_initial(self, depth: Tensor) -> Sample:
         """The same sample with another depth before enhancement."""
@@ -96,7 +95,10 @@ def make_sample(
     shown = torch.tensor(rendered)
     normals, _ = normals_from_depth(depth[:, shown], cameras.intrinsics[:, shown], edge_threshold=1e9)
     render = Render(images[:, shown], depth[:, shown] / unit, normals, torch.ones_like(depth[:, shown]))
-    prediction = Prediction(geometry, geometry, factor, _no_voxels(), _no_gaussians())
+    empty, index = torch.zeros(0), torch.zeros(0, dtype=torch.long)
+    voxels = Voxels(empty, empty, index, index, empty, empty, empty, empty)
+    gaussians = Gaussians(empty, empty, empty, empty, empty, index)
+    prediction = Prediction(geometry, geometry, factor, voxels, gaussians)
 
     def convert(tensor: Tensor) -> Tensor:
         return tensor.to(dtype) if tensor.is_floating_point() else tensor
@@ -104,17 +106,6 @@ def make_sample(
     return Sample(
         batch.map(convert), prediction.map(convert), render.map(convert), shown, predicted.select(shown).map(convert)
     )
-
-
-def _no_voxels() -> Voxels:
-    empty = torch.zeros(0)
-    index = torch.zeros(0, dtype=torch.long)
-    return Voxels(empty, empty, index, index, empty, empty, empty, empty)
-
-
-def _no_gaussians() -> Gaussians:
-    empty = torch.zeros(0)
-    return Gaussians(empty, empty, empty, empty, empty, torch.zeros(0, dtype=torch.long))
 
 
 @pytest.fixture(scope="session")

@@ -24,11 +24,7 @@ def task(conf: float, reg: float, grad: float) -> TaskLoss:
 def test_values_by_hand(options: dict, expected: float) -> None:
     before, after = task(1.0, 0.5, 0.2), task(1.6, 0.3, 0.3)  # totals 1.7 and 2.2
     assert float(EnhancementLoss(**options)(before, after).detach()) == pytest.approx(expected)
-
-
-def test_only_the_loss_after_enhancement_is_trained() -> None:
-    before, after = task(0.0, 1.0, 0.0), task(0.0, 2.0, 0.0)
-    EnhancementLoss()(before, after).backward()
+    EnhancementLoss()(before, after).backward()  # only the loss after enhancement is trained
     assert before.reg.grad is None
     assert after.reg.grad == 1
 

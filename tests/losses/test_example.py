@@ -12,13 +12,11 @@ from vg2gt.types import Cameras, Render
 
 def test_a_term_of_ones_own_is_weighted_summed_and_named() -> None:
     size = (14, 18)
-    rendered = Render(
-        torch.rand(1, 1, 3, *size), torch.ones(1, 1, *size), torch.ones(1, 1, 3, *size), torch.full((1, 1, *size), 0.75)
-    )
+    depth = torch.ones(1, *size)
+    rendered = Render(torch.rand(1, 1, 3, *size), depth[None], torch.ones(1, 1, 3, *size), 0.75 * depth[None])
     k = torch.tensor([[20.0, 0, 8.5], [0, 20, 6.5], [0, 0, 1]])
     cameras = Cameras(torch.eye(4)[None, None], k[None, None], size)
-    known = torch.ones(1, *size, dtype=torch.bool)
-    depth = torch.ones(1, *size)
+    known = depth > 0
     targets = RenderTargets(torch.rand(1, 3, *size), depth, known, k[None], depth, depth, known, known[:, :1, :1])
     config = ["loss.gaussian._target_=examples.loss.OpaqueGaussianLoss", "+loss.gaussian.opaque=0.5"]
     loss = instantiate(compose("train", "output_dir=unused", *config).loss).gaussian

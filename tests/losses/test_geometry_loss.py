@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from vg2gt.geometry.cameras import unproject
+from vg2gt.geometry.cameras import scale_translations, unproject
 from vg2gt.geometry.rotations import quat_to_matrix
 from vg2gt.losses import GeometryLoss
 from vg2gt.losses.geometry import (
@@ -53,15 +53,9 @@ def slow_depth_gradient(error: Tensor, valid: Tensor) -> Tensor:
     scales = []
     for stride in (1, 2, 4, 8):
         e, m = error[:, ::stride, ::stride], valid[:, ::stride, ::stride]
-        total = 0.0
-        for v in range(e.shape[0]):
-            for y in range(e.shape[1]):
-                for x in range(e.shape[2]):
-                    for yy, xx in ((y, x + 1), (y + 1, x)):
-                        if yy < e.shape[1] and xx < e.shape[2] and m[v, y, x] and m[v, yy, xx]:
-                            total += min(abs(float(e[v, yy, xx] - e[v, y, x])), 100.0)
-        scales.append(total / int(m.sum()))
-    return torch.tensor(sum(scales) / 4, dtype=torch.float64)
+        steps = [e.diff(dim=dim).abs().clamp(max=100)[m.unfold(dim, 2, 1).all(-1)].sum() for dim in (1, 2)]
+        scales.append(sum(steps) / m.sum())
+    return torch.stack(scales).mean()
 
 
 def slow_point_normals(points: Tensor, true_points: Tensor, valid: Tensor) -> Tensor:
@@ -69,39 +63,26 @@ def slow_point_normals(points: Tensor, true_points: Tensor, valid: Tensor) -> Te
     for stride in (1, 2, 4):
         p, q, m = (x[:, ::stride, ::stride] for x in (points, true_points, valid))
         values = []
-        for v in range(m.shape[0]):
-            for y in range(m.shape[1]):
-                for x in range(m.shape[2]):
-                    for dy, dx in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
-                        yy, xx = y + dy, x + dx
-                        if not (0 <= yy < m.shape[1] and 0 <= xx < m.shape[2]):
-                            continue
-                        if not (m[v, y, x] and m[v, y, xx] and m[v, yy, x]):
-                            continue
-                        normals = [
-                            torch.linalg.cross(c[v, y, xx] - c[v, y, x], c[v, yy, x] - c[v, y, x]) for c in (p, q)
-                        ]
-                        values.append(1 - torch.cosine_similarity(*normals, dim=0))
+        for v, y, x in m.nonzero().tolist():
+            for yy, xx in ((y + 1, x + 1), (y + 1, x - 1), (y - 1, x + 1), (y - 1, x - 1)):
+                if 0 <= yy < m.shape[1] and 0 <= xx < m.shape[2] and m[v, y, xx] and m[v, yy, x]:
+                    normals = (torch.linalg.cross(c[v, y, xx] - c[v, y, x], c[v, yy, x] - c[v, y, x]) for c in (p, q))
+                    values.append(1 - torch.cosine_similarity(*normals, dim=0))
         scales.append(torch.stack(values).mean())
     return torch.stack(scales).mean()
 
 
-def test_depth_task_matches_the_definition(sample) -> None:
-    truth, depth, conf, cameras, valid = disturbed(sample)
-    task, _ = GeometryLoss()(depth, conf, cameras, truth, valid)
+def test_tasks_match_their_definitions_on_depth_and_point_maps(sample) -> None:
+    truth, depth, conf, cameras, valid = disturbed(sample, size=(18, 20))
+    task, of_points = GeometryLoss()(depth, conf, cameras, truth, valid)
     error = depth[0] - truth.depth[0]
     expected = *slow_mean_terms(error.abs(), conf[0], valid[0]), slow_depth_gradient(error, valid[0])
     torch.testing.assert_close((task.conf, task.reg, task.grad), expected)
     torch.testing.assert_close(task.total, sum(expected))
-
-
-def test_point_task_matches_the_definition_on_point_maps(sample) -> None:
-    truth, depth, conf, cameras, valid = disturbed(sample, size=(18, 20))
-    _, task = GeometryLoss()(depth, conf, cameras, truth, valid)
     points, true_points = unproject(depth, cameras)[0], unproject(truth.depth, truth.cameras)[0]
     error = (points - true_points).norm(dim=-1)
     expected = *slow_mean_terms(error, conf[0], valid[0]), slow_point_normals(points, true_points, valid[0])
-    torch.testing.assert_close((task.conf, task.reg, task.grad), expected)
+    torch.testing.assert_close((of_points.conf, of_points.reg, of_points.grad), expected)
 
 
 def test_one_set_of_pixels_is_kept_below_the_quantile() -> None:
@@ -138,16 +119,14 @@ def test_an_outlier_has_no_gradient_and_errors_stop_at_100(sample) -> None:
     assert depth.grad[0, 1, 5, 6] != 0
     assert float(depth_gradient_loss(depth[0].detach() - truth.depth[0], everywhere[0])) < 2
     far, _ = GeometryLoss(quantile=1.0)(truth.depth + 500, torch.ones_like(conf), cameras, truth, everywhere)
-    torch.testing.assert_close(far.reg, torch.tensor(100.0, dtype=torch.float64))
-    torch.testing.assert_close(far.conf, torch.tensor(100.0, dtype=torch.float64))
+    torch.testing.assert_close(torch.stack((far.reg, far.conf)), torch.full((2,), 100.0, dtype=torch.float64))
 
 
 def test_holes_and_infinities_outside_the_mask_leave_gradients_finite(sample) -> None:
     truth, depth, conf, cameras, valid = disturbed(sample)
     depth, conf = depth.clone(), conf.clone()
-    depth[~valid] = torch.tensor([0.0, torch.inf, -1.0, torch.nan], dtype=torch.float64).repeat(1000)[
-        : int((~valid).sum())
-    ]
+    bad = torch.tensor([0.0, torch.inf, -1.0, torch.nan], dtype=torch.float64)
+    depth[~valid] = bad.repeat(1000)[: int((~valid).sum())]
     conf[~valid] = 0
     depth.requires_grad_()
     conf.requires_grad_()
@@ -192,37 +171,24 @@ def test_truth_is_divided_by_the_mean_distance_in_the_first_frame(sample) -> Non
         torch.testing.assert_close(truth.depth[scene, 3][5:], depth[scene, 3][5:] / expected)
     assert torch.equal(truth.cameras.world_to_camera[:, 0], torch.eye(4, dtype=torch.float64).expand(2, 4, 4))
     assert not truth.valid[:, :, :5].any()
-    larger = replace(
-        batch,
-        depth=depth * 7,
-        cameras=replace(batch.cameras, world_to_camera=with_scaled_translation(batch.cameras.world_to_camera, 7)),
-    )
-    again = normalize_truth(larger)
+    larger = scale_translations(batch.cameras, torch.full((2,), 7.0, dtype=torch.float64))
+    again = normalize_truth(replace(batch, depth=depth * 7, cameras=larger))
     torch.testing.assert_close(again.depth, truth.depth, rtol=1e-6, atol=1e-6)
     torch.testing.assert_close(again.cameras.world_to_camera, truth.cameras.world_to_camera, rtol=1e-6, atol=1e-6)
-
-
-def with_scaled_translation(poses: Tensor, factor: float) -> Tensor:
-    scaled = poses.clone()
-    scaled[..., :3, 3] *= factor
-    return scaled
 
 
 def test_camera_errors_by_hand() -> None:
     identity = torch.eye(4, dtype=torch.float64).repeat(1, 1, 1, 1)
     turned = identity.clone()
-    angle = 0.2
-    turned[..., :3, :3] = quat_to_matrix(
-        torch.tensor([math.cos(angle / 2), math.sin(angle / 2), 0, 0], dtype=torch.float64)
-    )
+    cosine, sine = math.cos(0.1), math.sin(0.1)
+    turned[..., :3, :3] = quat_to_matrix(torch.tensor([cosine, sine, 0, 0], dtype=torch.float64))
     turned[..., 0, 3] = 0.3
     intrinsics = torch.tensor([[50.0, 0, 20], [0, 25, 10], [0, 0, 1]], dtype=torch.float64).repeat(1, 1, 1, 1)
     wider = intrinsics.clone()
     wider[..., 0, 0] = 25
     errors = camera_errors(Cameras(turned, wider, (50, 100)), Cameras(identity, intrinsics, (50, 100)))
     assert math.isclose(float(errors["camera_T"]), 0.1, rel_tol=1e-9)
-    expected = (1 - math.cos(angle / 2) + math.sin(angle / 2)) / 4
-    assert math.isclose(float(errors["camera_R"]), expected, rel_tol=1e-6)
+    assert math.isclose(float(errors["camera_R"]), (1 - cosine + sine) / 4, rel_tol=1e-6)
     assert math.isclose(float(errors["camera_F"]), (math.atan(2) - math.atan(1)), rel_tol=1e-9)
 
 

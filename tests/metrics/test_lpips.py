@@ -45,9 +45,8 @@ def numpy_lpips(first: np.ndarray, second: np.ndarray, state: dict[str, torch.Te
         weight, bias = (state[f"features.{position}.{name}"].double().numpy() for name in ("weight", "bias"))
         for side in (0, 1):
             windows = sliding_window_view(np.pad(maps[side], ((0, 0), (1, 1), (1, 1))), (3, 3), axis=(1, 2))
-            maps[side] = np.maximum(
-                np.einsum("chwij,ocij->ohw", windows, weight, optimize=True) + bias[:, None, None], 0
-            )
+            convolved = np.einsum("chwij,ocij->ohw", windows, weight, optimize=True) + bias[:, None, None]
+            maps[side] = np.maximum(convolved, 0)
         if position in COMPARED_AFTER:
             unit = [m / np.linalg.norm(m, axis=0, keepdims=True) for m in maps]
             lin = state[f"lin{stage}.model.1.weight"].double().numpy()[0]
@@ -88,15 +87,13 @@ def test_weights_from_a_file_a_folder_and_the_hubs_cache(features, channel_weigh
 
 
 def test_missing_and_wrong_weights_are_named(features, channel_weights, tmp_path: Path) -> None:
-    with pytest.raises(WeightsNotFoundError, match="weights not found"):
-        load_lpips(str(tmp_path / "nowhere.pth"))
-    with pytest.raises(WeightsNotFoundError, match="weights not found"):
-        load_lpips(str(tmp_path))
+    for path in (tmp_path / "nowhere.pth", tmp_path):
+        with pytest.raises(WeightsNotFoundError, match="weights not found"):
+            load_lpips(str(path))
     with pytest.raises(ValueError, match=r"features\.0\.weight.*missing"):
         LPIPS(channel_weights)
-    wrong = {**features, **channel_weights, "features.5.bias": torch.zeros(3)}
     with pytest.raises(ValueError, match=r"features\.5\.bias must have shape \(128,\), got \(3,\)"):
-        LPIPS(wrong)
+        LPIPS({**features, **channel_weights, "features.5.bias": torch.zeros(3)})
     (tmp_path / "damaged.pth").write_bytes(b"not a checkpoint")
     with pytest.raises(ValueError, match=r"damaged\.pth is damaged"):
         load_lpips(str(tmp_path / "damaged.pth"))

@@ -10,9 +10,9 @@ def test_coverage_and_width() -> None:
     error = torch.tensor([0.01, 0.02, 0.03, 0.04])
     bounds = torch.tensor([[0.02] * 4, [0.02, 0.01, 0.05, 0.05]])
     found = stated_error_metrics(error, bounds, (0.5, 0.9))
-    assert found["held_50"] == 0.5
-    assert found["held_90"] == 0.75
+    assert (found["held_50"], found["held_90"]) == (0.5, 0.75)
     assert found["width_90"] == pytest.approx(0.0325)
+    assert math.isnan(stated_error_metrics(torch.zeros(0), torch.zeros(1, 0), (0.9,))["ause"])  # nothing to score
 
 
 def test_the_order_that_leaves_the_smallest_errors_has_no_area() -> None:
@@ -22,7 +22,3 @@ def test_the_order_that_leaves_the_smallest_errors_has_no_area() -> None:
     assert 0.2 < shuffled < ause(error, -error)
     # Uniform errors left out at random keep their mean, left out by size the largest goes down: 1 - (1 - mean(share)).
     assert shuffled == pytest.approx(0.475, abs=0.05)
-
-
-def test_nothing_to_score() -> None:
-    assert math.isnan(stated_error_metrics(torch.zeros(0), torch.zeros(1, 0), (0.9,))["ause"])

@@ -3,6 +3,7 @@
 import re
 import runpy
 import shlex
+import shutil
 import sys
 from pathlib import Path
 from typing import Any
@@ -26,8 +27,8 @@ def workplace(run_folder: Path, recording: Path, photos: Path, tmp_path: Path, m
     return tmp_path
 
 
-def _commands(path: Path, *names: str) -> list[list[str]]:
-    lines = re.findall(rf"^vg2gt (?:{'|'.join(names)}) [^#\n]*", path.read_text(), re.MULTILINE)
+def _commands(page: str, *names: str) -> list[list[str]]:
+    lines = re.findall(rf"^vg2gt (?:{'|'.join(names)}) [^#\n]*", (ROOT / page).read_text(), re.MULTILINE)
     return [shlex.split(line) for line in lines]
 
 
@@ -36,34 +37,50 @@ def _run(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     vg2gt.cli.main()
 
 
+def _examples(page: str) -> list[dict[str, Any]]:
+    """What the examples of a page leave behind."""
+    found: list[dict[str, Any]] = []
+    for example in re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(), re.DOTALL):
+        found.append({})
+        exec(compile(example, page, "exec"), found[-1])
+    return found
+
+
 def test_a_recording_is_reconstructed_and_rendered(workplace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    commands = _commands(ROOT / "docs/guides/photos.md", "reconstruct")
-    (words,) = [words for words in commands if "recording/" in words]
+    (words,) = [words for words in _commands("docs/guides/photos.md", "reconstruct") if "recording/" in words]
     _run(words, monkeypatch)
     room = workplace / "outputs" / "room"
     assert {p.name for p in room.iterdir()} == {"scene.ply", "cameras.json", "views.npz", "report.png", "report.json"}
-    for words in _commands(ROOT / "docs/guides/view.md", "render"):
+    for words in _commands("docs/guides/view.md", "render"):
         if "video.mp4" not in words or has_pyav():
             _run(words, monkeypatch)
     assert (room / "rasterized" / "depth" / "008.npy").is_file()
     assert (room / "video.gif").is_file()
 
 
-def test_python_of_the_readme(workplace: Path) -> None:
-    (example,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
-    found: dict[str, Any] = {}
-    exec(compile(example, "README.md", "exec"), found)
-    assert len(found["pictures"]) == len(read_cameras_json(workplace / "outputs" / "python" / "cameras.json"))
+def test_the_page_on_refinement(workplace: Path, monkeypatch, capsys: pytest.CaptureFixture) -> None:
+    commands = _commands("docs/guides/refine.md", "reconstruct", "refine")
+    assert {words[1] for words in commands} == {"reconstruct", "refine"}
+    for words in commands:
+        short = ["2" if before == "--seconds" else word for before, word in zip(["", *words], words, strict=False)]
+        _run([*short, "--quiet", "--device", "cpu"], monkeypatch)
+    assert (workplace / "outputs" / "start" / "refined" / "refine.png").is_file()
+    assert (workplace / "outputs" / "sharp" / "refine.png").is_file()
+    capsys.readouterr()
+    _examples("docs/guides/refine.md")
+    assert capsys.readouterr().out == "True 1\nTrue\n"
+
+
+def test_python_of_the_readme_and_the_reference(workplace: Path, capsys: pytest.CaptureFixture) -> None:
+    (found,) = _examples("README.md")
+    out = workplace / "outputs" / "python"
+    assert len(found["pictures"]) == len(read_cameras_json(out / "cameras.json"))
     assert all(picture.shape[0] == 3 and 0 <= picture.min() <= picture.max() <= 1 for picture in found["pictures"])
-
-
-def test_python_of_the_reference(workplace: Path, capsys: pytest.CaptureFixture) -> None:
-    examples = re.findall(r"```python\n(.*?)```", (ROOT / "docs/reference/python.md").read_text(), re.DOTALL)
-    assert len(examples) == 2
-    for example in examples:
-        exec(compile(example, "python.md", "exec"), {})
+    shutil.rmtree(out)
+    capsys.readouterr()
+    assert len(_examples("docs/reference/python.md")) == 2
     assert capsys.readouterr().out == "008 (4, 3, 84, 112) (84, 112)\nTrue True\n(1, 1, 3, 48, 64) 1.95\n"
-    assert len(read_cameras_json(workplace / "outputs" / "python" / "cameras.json")) == 4
+    assert len(read_cameras_json(out / "cameras.json")) == 4
 
 
 def test_the_script_from_photos_to_a_scene(workplace: Path, monkeypatch, capsys: pytest.CaptureFixture) -> None:

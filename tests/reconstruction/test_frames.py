@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from tests.reconstruction.conftest import SIZE, run
 from tests.reconstruction.test_given_cameras import put_cameras, put_colmap, put_transforms
@@ -24,14 +25,11 @@ from vg2gt.runs.load import load_model
 
 @pytest.mark.parametrize("put", [put_colmap, put_transforms, put_cameras])
 def test_given_cameras_keep_their_frame_and_unit(folder: Path, frames, put, tmp_path: Path) -> None:
-    """Item 9."""
     put(folder, frames)
     given = {picture.name: picture.pose for picture in given_pictures(folder) or []}
     run(folder, "--out", tmp_path / "out", "--save", "cameras.json,scene.ply,report.json,views.npz")
-    cameras = io.read_cameras_json(tmp_path / "out" / "cameras.json")
-    for camera in cameras:
-        pose = given[Path(camera.name).stem]
-        np.testing.assert_allclose(camera.world_to_camera, pose, atol=1e-6)
+    for camera in io.read_cameras_json(tmp_path / "out" / "cameras.json"):
+        np.testing.assert_allclose(camera.world_to_camera, given[Path(camera.name).stem], atol=1e-6)
         np.testing.assert_allclose(camera.similarity, np.eye(4), atol=1e-5)
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert report["frame"] == "given"
@@ -47,7 +45,7 @@ def test_given_cameras_keep_their_frame_and_unit(folder: Path, frames, put, tmp_
 
 
 def test_frames_that_can_be_chosen_go_into_one_another(folder: Path, frames, model, tmp_path: Path) -> None:
-    """Item 9: the similarity in report.json takes any of them to the given one."""
+    """The similarity in report.json takes any of them to the given one."""
     put_colmap(folder, frames)
     scenes = {name: reconstruct_with(model, folder, frame=name) for name in ("given", "first", "upright")}
     given = scenes["given"]
@@ -67,7 +65,6 @@ def test_frames_that_can_be_chosen_go_into_one_another(folder: Path, frames, mod
 
 
 def test_metric_cameras_give_metres(recording: Path, ready) -> None:
-    """Item 9: metres_per_unit was null."""
     scene = reconstruct_with(ready.model, recording)
     assert scene.metres_per_unit == pytest.approx(1)
     first = reconstruct_with(ready.model, recording, frame="first")
@@ -76,7 +73,7 @@ def test_metric_cameras_give_metres(recording: Path, ready) -> None:
 
 
 def test_map_coordinates_keep_their_digits(folder: Path, frames, model, caplog) -> None:
-    """Item 9: GPS. The shift is left out of what single precision has to hold, and said."""
+    """GPS. The shift is left out of what single precision has to hold, and said."""
     shift = np.array([4_400_000.0, 600_000.0, 300.0])
     poses = frames.world_to_camera.double().clone()
     poses[:, :3, 3] -= poses[:, :3, :3] @ torch.from_numpy(shift)
@@ -93,29 +90,19 @@ def test_there_is_no_given_frame_without_given_cameras(photos: Path) -> None:
     images_alone = load_model(backend="da3_tiny", device="cpu").model
     with pytest.raises(ValueError, match="no cameras are given, so --frame given is not possible"):
         reconstruct_with(images_alone, photos, frame="given")
-    scene = reconstruct_with(images_alone, photos)
-    assert scene.frame.name == "upright"
+    assert reconstruct_with(images_alone, photos).frame.name == "upright"
 
 
 def test_gravity_is_across_the_cameras_even_if_they_look_down() -> None:
-    poses = []
-    for angle in np.linspace(0, 2, 9):  # part of an orbit, looking down by 40 degrees
-        turn = np.array([[np.cos(angle), 0, -np.sin(angle)], [0, 1, 0], [np.sin(angle), 0, np.cos(angle)]])
-        pitch, c, s = np.eye(3), np.cos(0.7), np.sin(0.7)
-        pitch[1:, 1:] = [[c, s], [-s, c]]
-        pose = np.eye(4)
-        pose[:3, :3] = pitch @ turn
-        poses.append(pose)
-    tilt = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
-    tilt *= np.sign(np.linalg.det(tilt))
-    tilted = np.stack(poses)
-    tilted[:, :3, :3] = tilted[:, :3, :3] @ tilt.T
-    down = upright_rotation(tilted) @ tilt @ [0, 1, 0]
-    assert down[1] > 0.999
+    angles = np.linspace(0, 2, 9)  # part of an orbit, looking down by 40 degrees
+    tilt = Rotation.random(random_state=0)
+    poses = np.tile(np.eye(4), (9, 1, 1))
+    poses[:, :3, :3] = (Rotation.from_euler("yx", np.stack([-angles, 0 * angles - 0.7], 1)) * tilt.inv()).as_matrix()
+    assert (upright_rotation(poses) @ tilt.apply([0, 1, 0]))[1] > 0.999
 
 
 def test_output_in_the_photographs_folder_does_not_become_input(folder: Path, frames, monkeypatch) -> None:
-    """Item 5: cameras of undistorted images were taken for the distorted originals."""
+    """Cameras of undistorted images were taken for the distorted originals."""
     put_colmap(folder, frames)
     found = [
         replace(picture, source="structure from motion, 4 of 4 images", lens="unknown")
@@ -129,27 +116,19 @@ def test_output_in_the_photographs_folder_does_not_become_input(folder: Path, fr
     for number in (1, 2):
         run(images, "--out", images, "--save", "cameras.json,report.json", "--overwrite")
         assert len(asked) == number
-        assert json.loads((images / "report.json").read_text())["cameras"].startswith("structure from motion")
+    assert json.loads((images / "report.json").read_text())["cameras"].startswith("structure from motion")
 
 
-def test_own_cameras_serve_the_original_photographs(folder: Path, frames, tmp_path: Path) -> None:
-    """Item 23: of whole photographs, also where the working size cut them."""
-    put_colmap(folder, frames)
-    run(folder, "--out", tmp_path / "out", "--save", "cameras.json", "--size", "70x70")
-    shutil.rmtree(folder / "sparse")
-    shutil.copy(tmp_path / "out" / "cameras.json", folder)
-    pictures = given_pictures(folder)
-    loaded = pictures[2].read(SIZE)
-    assert loaded.images.shape[-2:] == SIZE
-    assert torch.allclose(loaded.intrinsics[0], frames.intrinsics[2], atol=1e-3)
-    assert torch.allclose(loaded.world_to_camera[0], frames.world_to_camera[2], atol=1e-6)
-
-
-def test_a_tilde_is_the_home_folder(folder: Path, frames, tmp_path: Path, monkeypatch) -> None:
-    """Item 12."""
+def test_own_cameras_serve_the_original_photographs(folder: Path, frames, tmp_path: Path, monkeypatch) -> None:
+    """Also where the working size cut them; a tilde in the output's path is the home folder."""
     put_colmap(folder, frames)
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     monkeypatch.chdir(tmp_path)
-    run(folder, "--out", "~/x", "--save", "cameras.json")
-    assert (tmp_path / "home" / "x" / "cameras.json").is_file()
+    run(folder, "--out", "~/x", "--save", "cameras.json", "--size", "70x70")
     assert not (tmp_path / "~").exists()
+    shutil.rmtree(folder / "sparse")
+    shutil.copy(tmp_path / "home" / "x" / "cameras.json", folder)
+    loaded = given_pictures(folder)[2].read(SIZE)
+    assert loaded.images.shape[-2:] == SIZE
+    assert torch.allclose(loaded.intrinsics[0], frames.intrinsics[2], atol=1e-3)
+    assert torch.allclose(loaded.world_to_camera[0], frames.world_to_camera[2], atol=1e-6)

@@ -18,7 +18,7 @@ from vg2gt.cli import reconstruct as reconstruct_command
 from vg2gt.geometry.cameras import resize_intrinsics, unproject
 from vg2gt.reconstruction.cameras import pictures_for
 from vg2gt.reconstruction.given_cameras import given_pictures
-from vg2gt.reconstruction.inputs import Views, depth_range, load_views
+from vg2gt.reconstruction.inputs import depth_range, load_views
 from vg2gt.reconstruction.monitor import Monitor
 from vg2gt.reconstruction.pictures import Picture
 from vg2gt.runs.load import load_model
@@ -56,13 +56,9 @@ def put_cameras(folder: Path, frames, names=NAMES, size=SIZE, intrinsics=None) -
     io.write_cameras_json(folder / "cameras.json", cameras)
 
 
-def views_of(pictures: list[Picture] | None) -> Views:
-    return load_views(pictures, SIZE, Monitor())
-
-
 def check_cameras(pictures: list[Picture] | None, frames, kind: str) -> None:
     assert {picture.source.split(" ")[0] for picture in pictures} == {kind}
-    views = views_of(pictures)
+    views = load_views(pictures, SIZE, Monitor())
     assert views.names == ("008", "009", "010", "011")
     assert torch.allclose(views.hints.cameras.world_to_camera[0], frames.world_to_camera, atol=1e-4)
     assert torch.allclose(views.hints.cameras.intrinsics[0], frames.intrinsics, atol=1e-3)
@@ -76,12 +72,9 @@ def test_cameras_are_looked_for_in_their_order(inside: bool, folder: Path, recor
     assert given_pictures(place) is None
     put_poses(folder, recording)
     check_cameras(given_pictures(place), frames, "RGBDFolder")
-    put_colmap(folder, frames)
-    check_cameras(given_pictures(place), frames, "COLMAP")
-    put_transforms(folder, frames)
-    check_cameras(given_pictures(place), frames, "Nerfstudio")
-    put_cameras(folder, frames)
-    check_cameras(given_pictures(place), frames, "cameras.json")
+    for put, kind in ((put_colmap, "COLMAP"), (put_transforms, "Nerfstudio"), (put_cameras, "cameras.json")):
+        put(folder, frames)
+        check_cameras(given_pictures(place), frames, kind)
 
 
 def test_depth_is_read_where_a_recording_has_it(recording: Path, tmp_path: Path, frames) -> None:
@@ -90,6 +83,9 @@ def test_depth_is_read_where_a_recording_has_it(recording: Path, tmp_path: Path,
     with_depth = given_pictures(tmp_path / "room", depth=True)
     check_cameras(with_depth, frames, "RGBDFolder")
     assert all(picture.has_depth for picture in with_depth or [])
+    hints = load_views(with_depth, (56, 84), Monitor()).hints
+    assert hints.depth.shape == (1, 4, 56, 84)
+    assert hints.cameras.intrinsics[0, 0, 0, 0].item() == pytest.approx(0.75 * frames.intrinsics[0, 0, 0])
     check_cameras(given_pictures(tmp_path / "room"), frames, "cameras.json")
 
 
@@ -107,14 +103,13 @@ def test_cameras_json_of_larger_images_and_without_some(folder: Path, frames, ca
     pictures = given_pictures(folder)
     assert [p.name for p in pictures or []] == ["008", "009", "010"]
     assert "left out: 011.png" in caplog.text
-    hints = views_of(pictures).hints
+    hints = load_views(pictures, SIZE, Monitor()).hints
     assert torch.allclose(hints.cameras.intrinsics[0], frames.intrinsics[:3], atol=1e-3)
-    put_cameras(folder, frames, size=(84, 84))
-    with pytest.raises(ValueError, match=r"008.png is 112x84 pixels, but its camera in .*cameras.json is 84x84"):
-        given_pictures(folder)
-    put_cameras(folder, frames, ["a", "b"])
-    with pytest.raises(ValueError, match=r"names none of the 4 images"):
-        given_pictures(folder)
+    mismatch = r"008.png is 112x84 pixels, but its camera in .*cameras.json is 84x84"
+    for names, size, said in ((NAMES, (84, 84), mismatch), (["a", "b"], SIZE, "names none of the 4 images")):
+        put_cameras(folder, frames, names, size)
+        with pytest.raises(ValueError, match=said):
+            given_pictures(folder)
 
 
 def test_range_of_depth_ignores_a_few_wild_points_and_needs_some() -> None:
@@ -168,12 +163,8 @@ def test_who_gets_which_cameras(model, folder: Path, recording: Path, ready, mon
 def test_photographs_for_the_oracle_are_refused_before_any_work(trained, photos, run_folder, tmp_path, monkeypatch):
     monkeypatch.setattr("vg2gt.runs.load.build_model", lambda *_: pytest.fail("built a model"))
     chosen = ["--ckpt", str(run_folder)] if trained else ["backend=oracle"]
-    with pytest.raises(SystemExit) as stopped:
+    with pytest.raises(SystemExit, match=r"^(?!.*hints).*needs measured depth, but.*backend=da3_small"):
         reconstruct_command.main([str(photos), *chosen, "--out", str(tmp_path / "out"), "--quiet"])
-    said = str(stopped.value)
-    assert "needs measured depth, but" in said
-    assert "backend=da3_small" in said
-    assert "hints" not in said
     assert not (tmp_path / "out").exists()
 
 

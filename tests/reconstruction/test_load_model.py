@@ -31,15 +31,9 @@ def test_options_change_parts(run_folder: Path) -> None:
 @pytest.mark.parametrize(
     ("overrides", "said"),
     [
-        (["backend=dinosaur"], "Could not find 'backend/dinosaur' Available options in 'backend': .*da3_tiny"),
         (["backend=oracle", "backend.noise=1"], r"Could not override 'backend\.noise'"),
         (["backend.noise=1"], r"option 'backend\.noise=1': .*not in struct; backend has .*planes"),
         (["backend=oracle", "backend.taps"], "expected key=value"),
-        (["backend=oracle", "model=huge"], "Could not find 'model/huge'"),
-        (
-            ["backend=oracle", "loss.x=1"],
-            "option 'loss.x=1': expected key=value with a key of backend, model, renderer",
-        ),
         (["backend=oracle", "backend.depth_noise=-1"], "noise must not be negative"),
     ],
 )
@@ -55,8 +49,8 @@ def test_a_slim_checkpoint_is_the_same_model(run_folder: Path, tmp_path: Path) -
     torch.save(known, tmp_path / "whole.ckpt")
     slim = write_slim(tmp_path / "whole.ckpt", tmp_path / "weights.safetensors")
     whole, loaded = load_model(run_folder, device="cpu"), load_model(slim, device="cpu")
-    for name, value in whole.model.trained_state().items():
-        assert torch.equal(loaded.model.trained_state()[name], value), name
+    state = loaded.model.trained_state()
+    assert all(torch.equal(state[name], value) for name, value in whole.model.trained_state().items())
     assert loaded.weights.step == whole.weights.step
     with pytest.raises(ValueError, match="trained on backbone"):
         load_model(slim, "da3_tiny", device="cpu")
@@ -78,8 +72,6 @@ def test_what_ships_needs_no_name() -> None:
 def test_another_backbone_is_refused(run_folder: Path) -> None:
     with pytest.raises(ValueError, match=r"trained on backbone .*oracle.*this run uses .*da3_tiny"):
         load_model(run_folder, "da3_tiny", device="cpu")
-    with pytest.raises(FileNotFoundError, match="nowhere"):
-        load_model("nowhere")
 
 
 @pytest.mark.parametrize(
@@ -122,7 +114,7 @@ def test_python_interface(run_folder: Path, recording: Path, tmp_path: Path) -> 
     again = vg2gt.reconstruct(recording, run_folder, size=56, max_images=2, device="cpu")
     assert torch.equal(again.gaussians.means, scene.gaussians.means)
     scene.save(tmp_path / "out", ["scene.ply"])
-    assert [path.name for path in (tmp_path / "out").iterdir()] == ["scene.ply"]
+    assert (tmp_path / "out" / "scene.ply").is_file()
 
 
 @pytest.mark.parametrize("error", [torch.OutOfMemoryError("CUDA out of memory"), MemoryError("no more")])

@@ -1,4 +1,3 @@
-import os
 from pathlib import Path
 
 import numpy as np
@@ -8,14 +7,13 @@ from PIL import Image
 
 from vg2gt.io import read_video, video, write_video
 from vg2gt.reconstruction import pictures
-from vg2gt.reconstruction.given_cameras import given_pictures
 from vg2gt.reconstruction.inputs import load_views, working_size
 from vg2gt.reconstruction.monitor import Monitor
 from vg2gt.reconstruction.pictures import find_pictures
 
 
-def _views(images, size=(84, 112), **options):
-    return load_views(find_pictures(images, **options), size, Monitor())
+def _views(images):
+    return load_views(find_pictures(images), (84, 112), Monitor())
 
 
 def test_photographs_of_all_sizes_come_upright_in_the_order_of_their_numbers(photos: Path, frames) -> None:
@@ -51,42 +49,26 @@ def test_frames_of_a_video(tmp_path: Path) -> None:
     assert [p.name for p in mixed] == ["image", "clip-000000", "clip-000030", "clip-000060"]
 
 
-def test_a_recording_gives_its_cameras_and_depth(recording: Path, frames) -> None:
-    pictures = given_pictures(recording, depth=True)
-    views = load_views(pictures, (56, 84), Monitor())
-    assert (views.names, views.hints.depth.shape) == (("008", "009", "010", "011"), (1, 4, 56, 84))
-    assert torch.allclose(views.hints.cameras.world_to_camera[0], frames.world_to_camera, atol=1e-5)
-    scale = 84 / 112
-    assert views.hints.cameras.intrinsics[0, 0, 0, 0].item() == pytest.approx(frames.intrinsics[0, 0, 0] * scale)
-    assert [p.name for p in find_pictures(recording)] == ["008", "009", "010", "011"]  # as mere photographs
+@pytest.mark.parametrize(
+    ("sizes", "device", "wanted", "expected"),
+    [
+        ([(600, 800)] * 3, "cpu", None, (210, 280)),
+        ([(600, 800)], "cpu", 140, (112, 140)),
+        ([(600, 800)], "cpu", (28, 56), (28, 56)),
+        ([(600, 800), (800, 600)], "cpu", None, (280, 280)),
+        ([(800, 600)], "cuda", None, (518, 392)),
+        ([(100, 3000)], "cpu", None, (14, 280)),
+        ([(60, 50)], "cpu", None, (56, 42)),  # not more than there is
+    ],
+)
+def test_working_size(sizes, device, wanted, expected) -> None:
+    assert working_size(sizes, 14, device, wanted) == expected
 
 
-@pytest.mark.parametrize(("size", "expected"), [(None, (210, 280)), (140, (112, 140)), ((28, 56), (28, 56))])
-def test_working_size(size, expected) -> None:
-    assert working_size([(600, 800)] * 3, 14, "cpu", size) == expected
-
-
-def test_working_size_of_mixed_and_extreme_shapes() -> None:
-    assert working_size([(600, 800), (800, 600)], 14, "cpu") == (280, 280)
-    assert working_size([(800, 600)], 14, "cuda") == (518, 392)
-    assert working_size([(100, 3000)], 14, "cpu") == (14, 280)
-    assert working_size([(60, 50)], 14, "cpu") == (56, 42)  # not more than there is
-    with pytest.raises(ValueError, match="try 28x56"):
-        working_size([(60, 50)], 14, "cpu", (30, 60))
-    with pytest.raises(ValueError, match="smaller than one patch"):
-        working_size([(60, 50)], 14, "cpu", 10)
-
-
-def test_what_cannot_be_read_is_named(tmp_path: Path, monkeypatch) -> None:
-    (tmp_path / "note.jpg").write_text("no picture")
-    with pytest.raises(ValueError, match=r"cannot read .*note.jpg"):
-        find_pictures(tmp_path)
-    Image.new("RGB", (40, 30)).save(tmp_path / "whole.png")
-    content = (tmp_path / "whole.png").read_bytes()
-    (tmp_path / "note.jpg").write_bytes(content[: len(content) // 2])
-    os.remove(tmp_path / "whole.png")
-    with pytest.raises(ValueError, match=r"cannot read .*note.jpg"):
-        _views(tmp_path, (14, 14))
+def test_sizes_and_files_that_cannot_be_used_are_refused(tmp_path: Path, monkeypatch) -> None:
+    for size, said in (((30, 60), "try 28x56"), (10, "smaller than one patch")):
+        with pytest.raises(ValueError, match=said):
+            working_size([(60, 50)], 14, "cpu", size)
     (tmp_path / "IMG.HEIC").touch()
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(ValueError, match="pip install pillow-heif"):

@@ -31,7 +31,7 @@ from vg2gt.types import Gaussians
 
 @pytest.mark.parametrize("put", [put_colmap, put_transforms, put_cameras])
 def test_landscape_and_portrait_mixed_are_read_whole(folder: Path, frames, put, caplog) -> None:
-    """Item 1: sizes were read after the images were cut to the median shape, and nobody heard of it."""
+    """Sizes were read after the images were cut to the median shape, and nobody heard of it."""
     put(folder, frames)
     turned = folder / "images" / NAMES[3]
     with Image.open(turned) as image:
@@ -62,7 +62,6 @@ def test_landscape_and_portrait_mixed_are_read_whole(folder: Path, frames, put, 
 
 @pytest.mark.parametrize("layout", ["named", "reduced", "among", "other case", "any folder"])
 def test_cameras_are_found_where_people_have_them(folder: Path, frames, layout: str) -> None:
-    """Item 4."""
     put_colmap(folder, frames)
     images, given = folder / "images", folder
     if layout == "named":
@@ -87,12 +86,11 @@ def test_cameras_are_found_where_people_have_them(folder: Path, frames, layout: 
     names = [Path(name).stem for name in NAMES]
     assert [picture.name for picture in pictures] == (names[::-1] if layout == "named" else names)
     assert all(picture.source.startswith("COLMAP") for picture in pictures)
-    poses = frames.world_to_camera[3] if layout == "named" else frames.world_to_camera[0]
-    assert torch.allclose(pictures[0].read(SIZE).world_to_camera[0], poses, atol=1e-5)
+    pose = frames.world_to_camera[3 if layout == "named" else 0]
+    assert torch.allclose(pictures[0].read(SIZE).world_to_camera[0], pose, atol=1e-5)
 
 
 def test_a_model_that_cannot_be_read_is_said_where_others_are_found(model, folder: Path, frames, caplog, monkeypatch):
-    """Item 4."""
     put_colmap(folder, frames)
     path = folder / "sparse" / "0" / "images.bin"
     path.write_bytes(path.read_bytes()[:100])
@@ -104,43 +102,27 @@ def test_a_model_that_cannot_be_read_is_said_where_others_are_found(model, folde
         pass
 
 
-def test_a_photograph_without_a_camera_is_named(folder: Path, frames, caplog) -> None:
-    """Item 8."""
-    put_colmap(folder, frames)
-    shutil.copy(folder / "images" / NAMES[0], folder / "images" / "extra.png")
-    assert len(given_pictures(folder) or []) == 4
-    assert "has no cameras for 1 images, which are left out: extra.png" in caplog.text
-
-
 def test_a_workspace_takes_what_fits(folder: Path, frames) -> None:
-    """Item 17: no originals, and the undistorted images in dense/."""
+    """No originals, and the undistorted images in dense/."""
     put_colmap(folder, frames)
     (folder / "dense").mkdir()
     shutil.move(folder / "images", folder / "dense" / "images")
     shutil.copytree(folder / "sparse" / "0", folder / "dense" / "sparse")
-    pictures = given_pictures(folder)
-    assert pictures[0].source == f"COLMAP {folder / 'dense'}"
-
-
-def transparent(folder: Path) -> None:
-    """The left half of every image hidden under alpha 0, with other colours below it."""
-    for path in (folder / "images").iterdir():
-        with Image.open(path) as image:
-            pixels = np.array(image.convert("RGBA"))
-        pixels[:, :56] = 255, 0, 255, 0
-        Image.fromarray(pixels).save(path)
+    assert given_pictures(folder)[0].source == f"COLMAP {folder / 'dense'}"
 
 
 @pytest.mark.parametrize("kind", ["alpha", "masks"])
 def test_what_is_hidden_is_no_part_of_the_scene(folder: Path, frames, model, kind: str, tmp_path: Path) -> None:
-    """Item 7: colours under alpha 0 became scene; masks likewise."""
+    """Colours under alpha 0 became scene; masks likewise."""
     put_colmap(folder, frames)
-    if kind == "alpha":
-        transparent(folder)
-    else:
-        (folder / "masks").mkdir()
-        half = np.where(np.arange(112) < 56, 0, 255).astype(np.uint8) * np.ones((84, 1), np.uint8)
-        for name in NAMES:
+    half = np.where(np.arange(112) < 56, 0, 255).astype(np.uint8) * np.ones((84, 1), np.uint8)
+    (folder / "masks").mkdir()
+    for name in NAMES:
+        path = folder / "images" / name
+        if kind == "alpha":
+            colours = np.array(Image.open(path)) * (half[..., None] > 0) + [255, 0, 255] * (half[..., None] == 0)
+            Image.fromarray(np.dstack((colours, half)).astype(np.uint8)).save(path)
+        else:
             Image.fromarray(half).save(folder / "masks" / name)
     scene = reconstruct_with(model, folder)
     assert torch.equal(scene.mask[0, 0], (torch.arange(112) >= 56).float())
@@ -156,15 +138,12 @@ def test_what_is_hidden_is_no_part_of_the_scene(folder: Path, frames, model, kin
 
 
 def test_masks_of_photographs_without_cameras(folder: Path) -> None:
-    """Item 7: also one folder up, and alpha of Pillow images."""
+    """Also one folder up, and alpha of Pillow images."""
     (folder / "masks").mkdir()
-    Image.new("L", (112, 84), 0).save(folder / "masks" / f"{NAMES[1]}.png")
-    views = load_views(find_pictures(folder / "images"), SIZE, Monitor())
-    assert views.mask.mean((1, 2)).tolist() == [1, 0, 1, 1]
-    Image.new("RGB", (112, 84), 0).save(folder / "masks" / f"{NAMES[1]}.png")  # stored in colour: had no effect
-    views = load_views(find_pictures(folder / "images"), SIZE, Monitor())
-    assert views.mask is not None
-    assert views.mask.mean((1, 2)).tolist() == [1, 0, 1, 1]
+    for mode in ("L", "RGB"):  # stored in colour: had no effect
+        Image.new(mode, (112, 84), 0).save(folder / "masks" / f"{NAMES[1]}.png")
+        views = load_views(find_pictures(folder / "images"), SIZE, Monitor())
+        assert views.mask.mean((1, 2)).tolist() == [1, 0, 1, 1]
     image = Image.new("RGBA", (112, 84), (255, 0, 255, 0))
     views = load_views(find_pictures([image]), SIZE, Monitor())
     assert not views.mask.any()
@@ -172,7 +151,6 @@ def test_masks_of_photographs_without_cameras(folder: Path) -> None:
 
 
 def test_photographs_come_back_with_their_names_and_sizes(folder: Path, frames, tmp_path: Path) -> None:
-    """Item 28."""
     put_colmap(folder, frames)
     save = "colmap,nerfstudio,colmap-small"
     run(folder, "--out", tmp_path / "out", "--save", save, "--size", "56x56")
@@ -190,11 +168,9 @@ def test_photographs_come_back_with_their_names_and_sizes(folder: Path, frames, 
 
 
 def test_damaged_photographs_are_named_together_and_may_be_skipped(photos: Path, tmp_path: Path, caplog) -> None:
-    """Item 24."""
     folder = Path(shutil.copytree(photos, tmp_path / "photos"))
-    for name in ("IMG_9.jpg", "IMG_11.png"):
-        path = folder / name
-        path.write_bytes(path.read_bytes()[: len(path.read_bytes()) // 2])
+    for path in (folder / "IMG_9.jpg", folder / "IMG_11.png"):
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     (folder / "IMG_12.jpg").write_text("no picture")
     with pytest.raises(ValueError, match=r"IMG_12.jpg.*--skip-damaged"):
         find_pictures(folder)
@@ -210,7 +186,6 @@ def test_damaged_photographs_are_named_together_and_may_be_skipped(photos: Path,
 
 
 def test_panoramas_are_refused_in_one_line(tmp_path: Path) -> None:
-    """Item 25."""
     Image.new("RGB", (200, 100)).save(tmp_path / "wide.jpg")
     assert len(find_pictures(tmp_path)) == 1
     note = b'<x:xmpmeta><rdf:Description GPano:ProjectionType="equirectangular"/></x:xmpmeta>'
@@ -220,7 +195,7 @@ def test_panoramas_are_refused_in_one_line(tmp_path: Path) -> None:
 
 
 def test_images_and_a_photograph_beside_their_folder(folder: Path, caplog) -> None:
-    """Item 26: the one beside images/ was taken alone; folders were passed over without a word."""
+    """The one beside images/ was taken alone; folders were passed over without a word."""
     shutil.copy(folder / "images" / NAMES[0], folder / "preview.png")
     assert len(find_pictures(folder)) == 4
     assert "ignored in the same folder: preview.png" in caplog.text
@@ -232,15 +207,13 @@ def test_images_and_a_photograph_beside_their_folder(folder: Path, caplog) -> No
 
 
 def test_the_order_of_photographs_decides_nothing_and_copies_count_once(folder: Path, frames, model, caplog) -> None:
-    """Item 27."""
     put_colmap(folder, frames)
     files = [folder / "images" / name for name in NAMES]
     one = reconstruct_with(model, files)
     other = reconstruct_with(model, [files[2], files[0], files[3], files[1]])
     assert other.names == ("010", "008", "011", "009")
     for view, same in zip(one.render(other.named_cameras()), other.render(), strict=True):
-        error = (view.color - same.color).square().mean()
-        assert -10 * torch.log10(error.clamp(min=1e-12)) > 50
+        assert (view.color - same.color).square().mean() < 1e-5
     shutil.copy(files[1], folder / "images" / "copy.png")
     (folder / "sparse").rename(folder / "elsewhere")
     images_alone = load_model(backend="da3_tiny", device="cpu").model
@@ -254,14 +227,13 @@ def test_the_reference_is_the_view_that_shows_what_the_others_show() -> None:
     images[1:] = 0.3 * images[1:] + 0.7 * images[1:2]
     order = working_order(images)
     assert order[0] != 0
-    shuffled = torch.tensor([3, 1, 4, 0, 2])
-    again = working_order(images[shuffled])
-    assert [int(shuffled[view]) for view in again] == order
+    shuffled = [3, 1, 4, 0, 2]
+    assert [shuffled[view] for view in working_order(images[shuffled])] == order
 
 
 @pytest.mark.parametrize("kind", ["empty", "not finite"])
 def test_render_refuses_a_scene_of_nothing(tmp_path: Path, frames, kind: str) -> None:
-    """Item 15: it ended with status 0 and a black picture."""
+    """It ended with status 0 and a black picture."""
     put_cameras(tmp_path, frames)
     count = 0 if kind == "empty" else 3
     ones, batch = torch.ones(count, 3), torch.zeros(count, dtype=torch.int64)
@@ -276,43 +248,27 @@ def test_render_refuses_a_scene_of_nothing(tmp_path: Path, frames, kind: str) ->
     assert not (tmp_path / "out").exists()
 
 
-def test_cameras_to_render_come_from_any_file(folder: Path, frames, tmp_path: Path) -> None:
-    """Item 23."""
+def test_cameras_to_render_come_from_any_file(folder: Path, frames) -> None:
     put_colmap(folder, frames)
     put_transforms(folder, frames)
     put_cameras(folder, frames)
     to_world = np.linalg.inv(frames.world_to_camera.double().numpy())
     k = frames.intrinsics.double().numpy()
     theirs = [
-        {
-            "id": i,
-            "img_name": name,
-            "width": 112,
-            "height": 84,
-            "position": to_world[i, :3, 3].tolist(),
-            "rotation": to_world[i, :3, :3].tolist(),
-            "fx": k[i, 0, 0],
-            "fy": k[i, 1, 1],
-        }
+        {"id": 0, "img_name": name, "width": 112, "height": 84, "fx": k[i, 0, 0], "fy": k[i, 1, 1]}
+        | {"position": to_world[i, :3, 3].tolist(), "rotation": to_world[i, :3, :3].tolist()}
         for i, name in enumerate(NAMES)
     ]
-    (tmp_path / "3dgs.json").write_text(json.dumps(theirs))
-    places = [
-        folder,
-        folder / "sparse" / "0",
-        folder / "transforms.json",
-        folder / "cameras.json",
-        tmp_path / "3dgs.json",
-    ]
-    for place in places:
-        cameras = read_cameras(place)
+    (folder / "3dgs.json").write_text(json.dumps(theirs))
+    for place in ("", "sparse/0", "transforms.json", "cameras.json", "3dgs.json"):
+        cameras = read_cameras(folder / place)
         assert [(camera.width, camera.height) for camera in cameras] == [(112, 84)] * 4
         for camera, pose, matrix in zip(cameras, frames.world_to_camera, k, strict=True):
             np.testing.assert_allclose(camera.world_to_camera, pose, atol=1e-5)
             np.testing.assert_allclose(camera.intrinsics, matrix, atol=1e-4)
-    (tmp_path / "3dgs.json").write_text(json.dumps([{"img_name": "a"}]))
+    (folder / "3dgs.json").write_text(json.dumps([{"img_name": "a"}]))
     with pytest.raises(ValueError, match="not a camera of 3D Gaussian Splatting"):
-        read_cameras(tmp_path / "3dgs.json")
+        read_cameras(folder / "3dgs.json")
 
 
 @pytest.mark.parametrize("given", [False, True])

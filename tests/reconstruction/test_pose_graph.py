@@ -32,9 +32,7 @@ def ring(count: int) -> Cameras:
     return Cameras(invert_rigid(to_world)[None].float(), intrinsics, SIZE)
 
 
-def window(
-    cameras: Cameras, views: list[int], scale: float, noise: float = 0.0, seed: int = 0, bend: float = 0.0
-) -> Found:
+def window(cameras: Cameras, views: list[int], scale: float, noise=0.0, seed=0, bend=0.0) -> Found:
     """Some views as a backbone would predict them: in the first one's frame, in another unit, bent, with noise."""
     rows = torch.tensor(views)
     poses = cameras.world_to_camera[:, rows].double()
@@ -104,12 +102,9 @@ def test_views_that_look_alike_are_found_far_apart_only() -> None:
 
 
 def test_a_loop_closes_where_its_parts_see_the_same() -> None:
-    cameras = ring(200)
-    near = window(cameras, [0, 1, 2, 199, 198, 197], 1.0)
-    parts = (torch.arange(3), torch.arange(3, 6))
-    assert closes(near, parts)
-    far = window(cameras, [0, 1, 2, 100, 101, 102], 1.0)
-    assert not closes(far, parts)
+    cameras, parts = ring(200), (torch.arange(3), torch.arange(3, 6))
+    assert closes(window(cameras, [0, 1, 2, 199, 198, 197], 1.0), parts)
+    assert not closes(window(cameras, [0, 1, 2, 100, 101, 102], 1.0), parts)
 
 
 def tower(count: int) -> Frames:

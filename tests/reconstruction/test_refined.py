@@ -34,7 +34,8 @@ def saved(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_saved_scene_comes_back(saved: Path, scene: Scene) -> None:
+def test_a_saved_scene_comes_back(saved: Path, scene: Scene, tmp_path: Path) -> None:
+    """Also without its views: by its images and the depth of its Gaussians."""
     back = read_scene(saved, scene.renderer)
     assert back.names == scene.names
     assert torch.equal(back.depth, scene.depth)
@@ -42,9 +43,6 @@ def test_a_saved_scene_comes_back(saved: Path, scene: Scene) -> None:
     assert (back.images - scene.images).abs().max() <= 0.5 / 255 + 1e-6
     torch.testing.assert_close(back.cameras.world_to_camera, scene.cameras.world_to_camera)
     torch.testing.assert_close(back.gaussians.means, scene.gaussians.means)
-
-
-def test_without_views_its_images_and_own_depth_serve(saved: Path, scene: Scene, tmp_path: Path) -> None:
     folder = shutil.copytree(saved, tmp_path / "copy")
     (folder / "views.npz").unlink()
     back = read_scene(folder, scene.renderer)

@@ -82,42 +82,16 @@ def test_a_camera_that_only_turns_is_refused_and_nothing_is_kept(shared: Path, t
     assert not (tmp_path / "sfm").exists()
 
 
-@pytest.fixture
-def kept(photos: Path, tmp_path: Path) -> Path:
-    """A finished folder of four photographs, one by one pixel images."""
-    folder = tmp_path / "sfm"
-    (folder / "sparse").mkdir(parents=True)
-    for part in ("cameras", "images", "points3D"):
-        (folder / "sparse" / f"{part}.bin").write_bytes(bytes(8))
-    (folder / "images").mkdir()
-    names = [picture.name for picture in find_pictures(photos)]
-    for number in range(3):
-        Image.new("RGB", (1, 1)).save(folder / "images" / f"{number:06d}.jpg")
-    state = {
-        "key": sfm._key(find_pictures(photos)),
-        "images": {f"{number:06d}.jpg": name for number, name in enumerate(names[:3])},
-        "left_out": names[3:],
-        "other_parts": [names[3:]],
-        "points": 100,
-    }
-    (folder / "sfm.json").write_text(json.dumps(state))
-    return folder
-
-
-def test_a_kept_model_without_points_is_computed_again(kept: Path, photos: Path, monkeypatch) -> None:
-    def solve(*_: object) -> None:
-        raise ValueError("computed again")
-
-    monkeypatch.setattr(sfm, "_solve", solve)
-    monkeypatch.setattr(sfm, "recording_pictures", lambda _: [])
-    assert sfm.find_cameras(find_pictures(photos), kept, Monitor()) == []
-    state = json.loads((kept / "sfm.json").read_text())
-    (kept / "sfm.json").write_text(json.dumps(state | {"points": 0}))
-    with pytest.raises(ValueError, match="computed again"):
-        sfm.find_cameras(find_pictures(photos), kept, Monitor())
-
-
-def test_copies_count_once_and_parts_are_named(kept: Path, photos: Path, tmp_path: Path, monkeypatch, caplog) -> None:
+def test_copies_count_once_and_parts_are_named(photos: Path, tmp_path: Path, monkeypatch, caplog) -> None:
+    """By a finished folder of four photographs, of which three were placed."""
+    kept, names = tmp_path / "sfm", [picture.name for picture in find_pictures(photos)]
+    images = {f"{number:06d}.jpg": name for number, name in enumerate(names[:3])}
+    model = [f"sparse/{part}.bin" for part in ("cameras", "images", "points3D")]
+    for file in (*model, *(f"images/{name}" for name in images)):
+        (kept / file).parent.mkdir(parents=True, exist_ok=True)
+        (kept / file).touch()
+    state = {"key": sfm._key(find_pictures(photos)), "images": images, "points": 100}
+    (kept / "sfm.json").write_text(json.dumps(state | {"left_out": names[3:], "other_parts": [names[3:]]}))
     monkeypatch.setattr(sfm, "_solve", lambda *_: pytest.fail("computed again"))
     monkeypatch.setattr(sfm, "recording_pictures", lambda _: [])
     (tmp_path / "more").mkdir()

@@ -13,7 +13,6 @@ from tests.reconstruction.conftest import run
 from vg2gt.cli import view as view_command
 from vg2gt.geometry.cameras import unproject
 from vg2gt.io import read_gaussian_ply, write_gaussian_ply
-from vg2gt.io.arrays import read_npz
 from vg2gt.io.ply import read_properties
 from vg2gt.reconstruction.outputs import write_outputs
 from vg2gt.reconstruction.pipeline import reconstruct_with
@@ -45,9 +44,8 @@ def stated(ready, recording, calibration) -> Scene:
 
 @pytest.fixture(scope="module")
 def written(stated: Scene, tmp_path_factory) -> Path:
-    return write_outputs(
-        stated, tmp_path_factory.mktemp("out"), ["scene.ply", "cameras.json", "views.npz", "report.json", "report.html"]
-    )
+    outputs = ["scene.ply", "cameras.json", "views.npz", "report.json", "report.html"]
+    return write_outputs(stated, tmp_path_factory.mktemp("out"), outputs)
 
 
 def test_pixels_know_what_supports_them(stated: Scene, scene: Scene) -> None:
@@ -70,31 +68,22 @@ def test_it_is_of_the_views_as_they_were_given() -> None:
     assert (status == Status.UNSEEN).nonzero().tolist() == [[2, 7, 7]]
 
 
-def test_files_carry_it(written: Path, stated: Scene) -> None:
+def test_files_carry_it_and_scenes_of_before_are_read(written: Path, stated: Scene, tmp_path: Path) -> None:
     found = read_properties(written / "scene.ply", "error", "support", "nothing")
     error, status = stated.gaussian_trust["error"], stated.gaussian_trust["support"]
     assert set(found) == {"error", "support"}
     np.testing.assert_allclose(found["error"], error.numpy(), rtol=1e-6)
     np.testing.assert_array_equal(found["support"], status.numpy())
     assert (status == Status.AGREED).float().mean() > 0.3
-    arrays = read_npz(written / "views.npz", ["error", "support"])
-    np.testing.assert_array_equal(arrays["error"], stated.error.numpy())
-    np.testing.assert_array_equal(arrays["support"], stated.support.numpy())
-
-
-def test_both_kinds_of_scenes_are_read(written: Path, stated: Scene, tmp_path: Path) -> None:
-    plain = read_gaussian_ply(write_gaussian_ply(tmp_path / "plain.ply", stated.gaussians))
-    for name in ("means", "quats", "scales", "opacities", "sh"):
-        assert torch.equal(getattr(read_gaussian_ply(written / "scene.ply"), name), getattr(plain, name))
-    assert read_properties(tmp_path / "plain.ply", "error") == {}
-
-
-def test_a_folder_brings_it_back(written: Path, stated: Scene, scene: Scene, tmp_path: Path) -> None:
     back = read_scene(written, Renderer())
     assert torch.equal(back.error, stated.error)
     assert torch.equal(back.support, stated.support)
-    write_outputs(replace(scene, support=None), tmp_path, ["scene.ply", "cameras.json", "views.npz"])
-    assert read_scene(tmp_path, Renderer()).support is None  # of an earlier version
+    write_outputs(replace(stated, support=None, error=None), tmp_path, ["scene.ply", "cameras.json", "views.npz"])
+    assert read_properties(tmp_path / "scene.ply", "error") == {}
+    old = read_scene(tmp_path, Renderer())
+    assert old.support is None
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        assert torch.equal(getattr(back.gaussians, name), getattr(old.gaussians, name))
 
 
 def test_reports_say_it(written: Path, stated: Scene, scene: Scene) -> None:
@@ -129,17 +118,16 @@ def test_what_is_not_trusted_is_left_out(stated: Scene) -> None:
 
 
 def test_impossible_wishes_are_refused(stated: Scene, scene: Scene) -> None:
-    with pytest.raises(ValueError, match="unknown; choose from unseen, guessed"):
-        trusted(stated, drop=["bad"])
-    with pytest.raises(ValueError, match=r"--min-confidence 2"):
-        trusted(stated, 2)
-    with pytest.raises(ValueError, match="vg2gt calibrate"):
-        trusted(scene, 0.9)
-    with pytest.raises(ValueError, match="no Gaussian is left"):
-        trusted(stated, 1)
-    for wish in ({"min_confidence": 0.9}, {"drop": ["guessed"]}):
-        with pytest.raises(ValueError, match="made in windows"):
-            trusted(replace(stated, support=None, error=None), **wish)
+    windowed = replace(stated, support=None, error=None)
+    for of, wish, said in (
+        (stated, {"min_confidence": 2}, "--min-confidence 2"),
+        (scene, {"min_confidence": 0.9}, "vg2gt calibrate"),
+        (stated, {"min_confidence": 1}, "no Gaussian is left"),
+        (windowed, {"min_confidence": 0.9}, "made in windows"),
+        (windowed, {"drop": ["guessed"]}, "made in windows"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            trusted(of, **wish)
 
 
 def test_meshes_leave_open_what_no_view_has_measured(stated: Scene, tmp_path: Path) -> None:
@@ -165,10 +153,11 @@ def test_the_command_filters_and_the_viewer_colours(recording, calibration, tmp_
     )
     assert "Gaussians: " in capsys.readouterr().out
     assert read_properties(tmp_path / "out" / "scene.ply", "error")["error"].max() <= 0.05
-    view_command.main([str(tmp_path / "out" / "scene.ply"), "--color", "trust", "--html", str(tmp_path / "page.html")])
+    coloured = ["--color", "trust", "--html", str(tmp_path / "page.html")]
+    view_command.main([str(tmp_path / "out" / "scene.ply"), *coloured])
     assert (tmp_path / "page.html").is_file()
     plain = write_gaussian_ply(tmp_path / "plain.ply", read_gaussian_ply(tmp_path / "out" / "scene.ply"))
     with pytest.raises(SystemExit, match="has no support per Gaussian"):
-        view_command.main([str(plain), "--color", "trust", "--html", str(tmp_path / "page.html")])
-    with pytest.raises(SystemExit, match="choose from unseen"):
+        view_command.main([str(plain), *coloured])
+    with pytest.raises(SystemExit, match="unknown; choose from unseen, guessed"):
         run(recording, "--out", tmp_path / "o", "--drop", "bad")

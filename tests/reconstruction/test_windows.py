@@ -143,12 +143,15 @@ def test_merging_in_slabs_changes_nothing(model, walk, tmp_path, monkeypatch) ->
         assert torch.equal(one, other)
 
 
-def test_every_view_is_owned_once_and_windows_overlap() -> None:
+def test_windows_are_for_many_views_overlap_and_own_every_view_once() -> None:
+    for wanted, views, size in ((None, 100, 0), (None, 101, 24), (0, 1000, 0), (8, 8, 0)):
+        assert window_size(wanted, views) == size
+    with pytest.raises(ValueError, match="at least 4"):
+        window_size(3, 100)
     for count in (5, 24, 25, 60, 131):
         for size in (4, 5, 8, 24, 59):
             windows = cut(count, size)
-            owned = [view for w in windows for view in range(w.own.start, w.own.stop)]
-            assert owned == list(range(count))
+            assert [view for w in windows for view in range(w.own.start, w.own.stop)] == list(range(count))
             for window in windows:
                 views = window.views.tolist()
                 assert views == list(range(views[0], views[-1] + 1))
@@ -157,15 +160,6 @@ def test_every_view_is_owned_once_and_windows_overlap() -> None:
                 assert views[window.inner] == list(range(window.own.start, window.own.stop))
             for before, after in itertools.pairwise(windows):
                 assert len(set(before.views.tolist()) & set(after.views.tolist())) >= min(capture.MARGIN, count)
-
-
-def test_windows_are_for_many_views() -> None:
-    assert window_size(None, 100) == 0
-    assert window_size(None, 101) == 24
-    assert window_size(0, 1000) == 0
-    assert window_size(8, 8) == 0
-    with pytest.raises(ValueError, match="at least 4"):
-        window_size(3, 100)
 
 
 def test_the_command_makes_windows_and_tiles_and_clears_up(walk, tmp_path, monkeypatch) -> None:

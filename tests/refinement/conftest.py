@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from vg2gt.data.synthetic import SyntheticScenes
-from vg2gt.refinement import Observations
+from vg2gt.refinement import Observations, Refined, RefineOptions, refine
 from vg2gt.rendering import Renderer
 from vg2gt.runs.load import load_model
 from vg2gt.types import Cameras, Gaussians, Hints
@@ -37,3 +37,7 @@ def start() -> Start:
     geometry = prediction.geometry
     seen = Observations(frames.images, geometry.depth[0], geometry.depth_conf[0])
     return Start(prediction.gaussians, geometry.cameras, seen, loaded.renderer)
+
+
+def run(start: Start, options: RefineOptions, **changes) -> Refined:
+    return refine(start.gaussians, start.cameras, start.seen, start.renderer, options, **changes)

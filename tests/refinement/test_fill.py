@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import pytest
 import torch
 
-from tests.refinement.conftest import VIEWS, Start
-from vg2gt.refinement import RefineOptions, refine
+from tests.refinement.conftest import VIEWS, Start, run
+from vg2gt.geometry.cameras import project
+from vg2gt.refinement import RefineOptions
 from vg2gt.refinement.fill import COVERED, fill_holes, spread
 from vg2gt.types import Gaussians
 
@@ -18,12 +19,9 @@ ROOM = 10_000
 @pytest.fixture(scope="module")
 def holed(start: Start) -> Start:
     """The scene as a backbone leaves it that has no depth of the left third of view 0, whatever view sees it."""
-    camera = start.cameras.world_to_camera[0, 0]
-    place = start.gaussians.means @ camera[:3, :3].T + camera[:3, 3]
-    fx, cx = start.cameras.intrinsics[0, 0, 0, [0, 2]]
-    left = (place[:, 2] > 0) & (fx * place[:, 0] / place[:, 2] + cx < start.cameras.size[1] / 3)
-    names = [field.name for field in fields(start.gaussians) if field.name != "background"]
-    kept = replace(start.gaussians, **{name: getattr(start.gaussians, name)[~left] for name in names})
+    pixels, depth = project(start.gaussians.means[None, None], start.cameras.select(slice(0, 1)))
+    left = (depth[0, 0] > 0) & (pixels[0, 0, :, 0] < start.cameras.size[1] / 3)
+    kept = start.gaussians.select(~left)
     uncovered = start.renderer(kept, start.cameras).alpha[0] < COVERED
     return replace(start, gaussians=kept, seen=replace(start.seen, depth=start.seen.depth * ~uncovered))
 
@@ -52,22 +50,14 @@ def test_holes_are_covered_in_the_images_colours(holed: Start) -> None:
     assert torch.equal(filled.background, holed.gaussians.background)  # pyright: ignore
 
 
-def test_what_one_view_filled_is_not_filled_again(holed: Start) -> None:
-    once = len(fill(holed)) - len(holed.gaussians)
+def test_what_was_filled_is_not_filled_again_and_blocks_grow_to_the_room_there_is(holed: Start) -> None:
+    filled = fill(holed)
+    once = len(filled) - len(holed.gaussians)
     covered = (holes(holed, holed.gaussians).sum() * holed.seen.depth[0].numel() / 16).round()
     assert 0 < once < 0.7 * float(covered)  # a Gaussian for each block of each view
-
-
-def test_blocks_grow_to_the_room_there_is(holed: Start) -> None:
-    few = len(fill(holed, room=40)) - len(holed.gaussians)
-    assert 0 < few <= 40
+    assert len(fill(replace(holed, gaussians=filled))) - len(filled) < 0.05 * once
+    assert 0 < len(fill(holed, room=40)) - len(holed.gaussians) <= 40
     assert fill(holed, room=0) is holed.gaussians
-
-
-def test_a_filled_scene_is_left_alone(holed: Start) -> None:
-    once = fill(holed)
-    twice = fill(replace(holed, gaussians=once))
-    assert len(twice) - len(once) < 0.05 * (len(once) - len(holed.gaussians))
 
 
 def test_depth_spreads_from_around_a_hole() -> None:
@@ -85,20 +75,6 @@ def test_depth_spreads_from_around_a_hole() -> None:
 
 
 def test_refinement_fills_unless_told_not_to(holed: Start) -> None:
-    with_fill, without = (
-        refine(
-            holed.gaussians,
-            holed.cameras,
-            holed.seen,
-            holed.renderer,
-            RefineOptions(steps=12, check_every=6, holdout=3, fill=side),
-        )
-        for side in (4, 0)
-    )
+    with_fill, without = (run(holed, RefineOptions(steps=12, check_every=6, holdout=3, fill=side)) for side in (4, 0))
     assert with_fill.psnr[1, with_fill.held_out].mean() > without.psnr[1, without.held_out].mean() + 1
     assert len(without.scene.gaussians) <= len(holed.gaussians)
-
-
-def test_a_negative_side_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"refine\.fill must be at least 0, got -1"):
-        RefineOptions(fill=-1)

@@ -58,18 +58,14 @@ def test_another_frame_is_the_same_scene(parameters: Parameters, start: Start) -
         assert difference.mean() < 1e-4, name
 
 
-def test_steps_are_in_units_of_each_gaussian(parameters: Parameters) -> None:
-    before = parameters.scene().gaussians.means.detach()
+def test_steps_are_in_units_of_each_gaussian_and_finite(parameters: Parameters) -> None:
     scene = parameters.scene().gaussians
+    before = scene.means.detach()
+    assert not parameters.step(parameters.scene().gaussians.means.sum() * torch.nan, share=1.0)
+    assert torch.equal(parameters.scene().gaussians.means, before)
     assert parameters.step((scene.means * torch.randn_like(scene.means)).sum(), share=0.5)
     moved = (parameters.scene().gaussians.means.detach() - before).abs() / parameters.unit[:, None]
     torch.testing.assert_close(moved, torch.full_like(moved, 0.5 * RefineRates().means), rtol=0.05, atol=1e-3)
-
-
-def test_a_gradient_that_is_not_finite_changes_nothing(parameters: Parameters) -> None:
-    before = parameters.scene().gaussians
-    assert not parameters.step(parameters.scene().gaussians.means.sum() * torch.nan, share=1.0)
-    assert torch.equal(parameters.scene().gaussians.means, before.means)
 
 
 def test_rows_keep_what_adam_knows(parameters: Parameters) -> None:
@@ -87,9 +83,8 @@ def test_rows_keep_what_adam_knows(parameters: Parameters) -> None:
 def test_prune_removes_what_is_transparent(parameters: Parameters) -> None:
     logits = parameters.values["opacities"].detach()
     logits[:10] = -6.0
-    before = len(logits)
     assert prune(parameters, 0.02) == 10
-    assert len(parameters.scene().gaussians) == before - 10
+    assert len(parameters.scene().gaussians) == len(logits) - 10
     parameters.values["opacities"].detach().fill_(-6.0)
     assert prune(parameters, 0.02) == 0
 

@@ -7,17 +7,13 @@ from importlib import import_module
 import pytest
 import torch
 
-from tests.refinement.conftest import VIEWS, Start
+from tests.refinement.conftest import VIEWS, Start, run
 from vg2gt.geometry.rotations import quat_to_matrix
-from vg2gt.refinement import Progress, Refined, RefinedScene, RefineLoss, RefineOptions, RefineRates, refine
+from vg2gt.refinement import Progress, Refined, RefinedScene, RefineLoss, RefineOptions, RefineRates
 from vg2gt.refinement.density import GROWTH, merged, supported
 from vg2gt.types import Gaussians
 
 COLOUR = RefineLoss(depth_consistency=0, normal_render=0, normal_decoded=0)
-
-
-def run(start: Start, options: RefineOptions, **changes) -> Refined:
-    return refine(start.gaussians, start.cameras, start.seen, start.renderer, options, **changes)
 
 
 def same(first: RefinedScene, second: RefinedScene) -> bool:
@@ -27,10 +23,12 @@ def same(first: RefinedScene, second: RefinedScene) -> bool:
     return all(torch.equal(a, b) for a, b in pairs)
 
 
+OPTIONS = RefineOptions(steps=24, check_every=8, holdout=3, split_share=0.05, rates=RefineRates(exposure=0.002))
+
+
 @pytest.fixture(scope="module")
 def refined(start: Start) -> Refined:
-    rates = RefineRates(exposure=0.002)
-    return run(start, RefineOptions(steps=24, check_every=8, holdout=3, split_share=0.05, rates=rates))
+    return run(start, OPTIONS)
 
 
 def test_held_out_views_become_sharper(refined: Refined) -> None:
@@ -43,21 +41,24 @@ def test_held_out_views_become_sharper(refined: Refined) -> None:
     assert refined.checks[-1].score < 0.9
 
 
-def test_the_first_camera_stays_and_the_others_move(refined: Refined, start: Start) -> None:
+def test_the_first_camera_stays_the_others_move_and_exposures_share_nothing(refined: Refined, start: Start) -> None:
     found, before = refined.scene.cameras, start.cameras
     moved = (found.world_to_camera - before.world_to_camera).abs().amax((0, 2, 3))
     assert moved[0] == 0
     assert (moved[refined.trained[1:]] > 0).all()
     rotation = found.world_to_camera[0, :, :3, :3]
     torch.testing.assert_close(rotation @ rotation.mT, torch.eye(3).expand(VIEWS, 3, 3), atol=1e-5, rtol=0)
+    gain = refined.scene.gain
+    assert gain[refined.trained].log().mean(0).abs().max() < 1e-6
+    assert (gain[refined.trained] != 1).any()
+    assert (gain[refined.held_out] == 1).all()
 
 
 def test_it_repeats_to_the_bit_and_never_looks_at_held_out_views(refined: Refined, start: Start) -> None:
     images = start.seen.images.clone()
     images[refined.held_out] = 1 - images[refined.held_out]
     other = replace(start, seen=replace(start.seen, images=images))
-    rates = RefineRates(exposure=0.002)
-    again = run(other, RefineOptions(steps=24, check_every=8, holdout=3, split_share=0.05, rates=rates))
+    again = run(other, OPTIONS)
     assert same(again.scene, refined.scene)
     assert not torch.equal(again.psnr[1, refined.held_out], refined.psnr[1, refined.held_out])
 
@@ -100,13 +101,8 @@ def test_a_divergence_goes_back_and_says_so(start: Start, trouble: str, caplog: 
 def test_what_few_views_support_is_left_out_at_the_start(start: Start) -> None:
     """A guess in the air before the cameras, which every view looks through, and one far away, which none can place."""
     depth = float(start.seen.depth.median())
-    middle = start.gaussians.select(torch.arange(2))
     means = torch.tensor([[0.0, 0.0, 0.3 * depth], [0.0, 0.0, 50 * depth]])
-    names = [field.name for field in fields(start.gaussians) if field.name != "background"]
-    added = replace(middle, means=means)
-    more = replace(
-        start.gaussians, **{name: torch.cat((getattr(start.gaussians, name), getattr(added, name))) for name in names}
-    )
+    more = start.gaussians.joined(replace(start.gaussians.select(slice(2)), means=means))
     kept = supported(more, start.cameras, start.seen.depth, 2)
     assert (kept.means == means[1]).all(-1).any()
     assert not (kept.means == means[0]).all(-1).any()
@@ -134,10 +130,7 @@ def test_merged_gaussians_have_the_moments_of_their_mixture() -> None:
     means = torch.tensor([[0.2, 0.3, 0.4], [0.8, 0.6, 0.5], [1.5, 0.5, 0.5]])
     quats = torch.nn.functional.normalize(torch.randn(3, 4, generator=generator), dim=-1)
     scales = torch.tensor([[0.05, 0.1, 0.01], [0.2, 0.05, 0.02], [0.1, 0.05, 0.02]])
-    opacities, sh = (
-        torch.tensor([0.3, 0.9, 0.6]),
-        torch.tensor([[[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]], [[0.0, 0.0, 1.0]]]),
-    )
+    opacities, sh = torch.tensor([0.3, 0.9, 0.6]), torch.eye(3)[:, None]
     found = merged(Gaussians(means, quats, scales, opacities, sh, torch.zeros(3, dtype=torch.int64)), 1.0)
     assert len(found) == 2
     noise = torch.randn(2, 200_000, 3, generator=generator) * scales[:2, None]
@@ -156,11 +149,9 @@ def test_merged_gaussians_have_the_moments_of_their_mixture() -> None:
 def test_the_guard_compares_the_same_views(start: Start) -> None:
     """One view is three times as hard as the others, and stays so: no reason to fall back."""
     images = start.seen.images.clone()
-    noise = torch.rand(images[2].shape, generator=torch.Generator().manual_seed(0))
-    images[2] = (images[2] + 0.02 * noise).clamp(0, 1)
-    hard = replace(start, seen=replace(start.seen, images=images))
-    found = run(hard, RefineOptions(steps=40, check_every=4, loss=COLOUR))
-    assert found.retreats == 0
+    images[2] += 0.02 * torch.rand(images[2].shape, generator=torch.Generator().manual_seed(0))
+    hard = replace(start, seen=replace(start.seen, images=images.clamp(0, 1)))
+    assert run(hard, RefineOptions(steps=40, check_every=4, loss=COLOUR)).retreats == 0
 
 
 @pytest.mark.parametrize(("last", "retreats"), [(0.7, 0), (2.5, 1)])
@@ -178,37 +169,23 @@ def test_worse_than_the_best_state_is_no_divergence(
     assert run(start, RefineOptions(steps=12, check_every=3, loss=COLOUR)).retreats == retreats
 
 
-def test_what_lies_behind_the_scene_stays(start: Start) -> None:
-    behind = torch.tensor([[0.9, 0.5, 0.1]])
-    begun = replace(start, gaussians=replace(start.gaussians, background=behind))
-    found = run(begun, RefineOptions(steps=2)).scene.gaussians.background
-    assert found is not None
-    assert torch.equal(found, behind)
-
-
-def test_seconds_end_it(start: Start) -> None:
+def test_seconds_end_it_and_without_an_end_every_view_is_rendered_twelve_times(start: Start) -> None:
     ticks = iter(range(1000))
     found = run(start, RefineOptions(steps=None, seconds=30, loss=COLOUR), clock=lambda: float(next(ticks)))
     assert found.ended == "seconds"
     assert 3 < found.steps < 30
-
-
-def test_without_an_end_every_view_is_rendered_twelve_times() -> None:
     assert RefineOptions().of(10).steps == 120
     assert RefineOptions(views_per_step=4).of(10).steps == 30
     assert RefineOptions(seconds=3).of(10).steps is None
 
 
-def test_colours_may_learn_to_depend_on_the_view(start: Start) -> None:
-    found = run(start, RefineOptions(steps=3, sh_degree=1, loss=COLOUR))
-    assert found.scene.gaussians.sh.shape[1] == 4
-    assert found.scene.gaussians.sh[:, 1:].abs().max() > 0
-
-
-def test_exposures_share_nothing(refined: Refined) -> None:
-    assert refined.scene.gain[refined.trained].log().mean(0).abs().max() < 1e-6
-    assert (refined.scene.gain[refined.trained] != 1).any()
-    assert (refined.scene.gain[refined.held_out] == 1).all()
+def test_colours_may_learn_to_depend_on_the_view_and_what_lies_behind_the_scene_stays(start: Start) -> None:
+    behind = torch.tensor([[0.9, 0.5, 0.1]])
+    begun = replace(start, gaussians=replace(start.gaussians, background=behind))
+    found = run(begun, RefineOptions(steps=3, sh_degree=1, loss=COLOUR)).scene.gaussians
+    assert found.sh.shape[1] == 4
+    assert found.sh[:, 1:].abs().max() > 0
+    assert torch.equal(found.background, behind)  # pyright: ignore
 
 
 @pytest.mark.parametrize(
@@ -217,6 +194,7 @@ def test_exposures_share_nothing(refined: Refined) -> None:
         ({"steps": 0}, "refine.steps must be at least 1, or null"),
         ({"holdout": 1}, "refine.holdout must be at least 2"),
         ({"max_growth": 0.5}, "refine.max_growth"),
+        ({"fill": -1}, "refine.fill must be at least 0, got -1"),
     ],
 )
 def test_options_out_of_range(changes: dict, said: str) -> None:

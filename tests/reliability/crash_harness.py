@@ -107,15 +107,9 @@ def start(module: str, arguments: Sequence[str], folder: Path, warm: bool = True
     if warm:
         process = warm_process(_run_main, module, list(arguments), str(output), str(folder.parent))
         return Attempt(folder, output, process, before)
+    command, environment = [sys.executable, "-m", module, *arguments], {**os.environ, "OMP_NUM_THREADS": "1"}
     with open(output, "ab") as file:
-        process = subprocess.Popen(
-            [sys.executable, "-m", module, *arguments],
-            stdout=file,
-            stderr=file,
-            cwd=ROOT,
-            start_new_session=True,
-            env={**os.environ, "OMP_NUM_THREADS": "1"},
-        )
+        process = subprocess.Popen(command, stdout=file, stderr=file, cwd=ROOT, start_new_session=True, env=environment)
     return Attempt(folder, output, process, before)
 
 

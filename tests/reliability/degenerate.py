@@ -66,12 +66,7 @@ def _identical_views(batch: Batch) -> Batch:
     def first(tensor: Tensor) -> Tensor:
         return tensor[:, :1].expand_as(tensor).clone()
 
-    cameras = replace(
-        batch.cameras,
-        world_to_camera=first(batch.cameras.world_to_camera),
-        intrinsics=first(batch.cameras.intrinsics),
-    )
-    return replace(batch, cameras=cameras, images=first(batch.images), depth=first(batch.depth))
+    return replace(batch, cameras=batch.cameras.map(first), images=first(batch.images), depth=first(batch.depth))
 
 
 def _back_to_back(poses: Tensor, _: int) -> None:
@@ -134,11 +129,8 @@ def beside(good: Batch, other: Batch) -> Batch:
     def both(name: str, one: Any = good, two: Any = other) -> Tensor:
         return torch.cat((getattr(one, name), getattr(two, name)))
 
-    cameras = Cameras(
-        both("world_to_camera", good.cameras, other.cameras),
-        both("intrinsics", good.cameras, other.cameras),
-        good.cameras.size,
-    )
+    both_cameras = [both(name, good.cameras, other.cameras) for name in ("world_to_camera", "intrinsics")]
+    cameras = Cameras(both_cameras[0], both_cameras[1], good.cameras.size)
     tensors = {name: both(name) for name in ("images", "depth", "is_metric", "frame_ids")}
     return Batch(**tensors, cameras=cameras, scene=(*good.scene, *other.scene), num_context=good.num_context)
 

@@ -61,15 +61,9 @@ class Audit(lightning.Callback):
 
 def state(trainer: lightning.Trainer, module: torch.nn.Module) -> Tensor:
     """Trained weights and the optimiser's tensors, copied into one row."""
-    optimizer = trainer.optimizers[0]
-    moments = [
-        value
-        for parameter in optimizer.state.values()
-        for _, value in sorted(parameter.items())
-        if isinstance(value, Tensor)
-    ]
+    moments = [each[name] for each in trainer.optimizers[0].state.values() for name in sorted(each)]
     weights = [parameter.detach() for parameter in module.parameters() if parameter.requires_grad]
-    return torch.cat([tensor.flatten() for tensor in (*weights, *moments)])
+    return torch.cat([tensor.flatten() for tensor in (*weights, *moments) if isinstance(tensor, Tensor)])
 
 
 def tiny_run(folder: Path, cache: Path, *overrides: str) -> Run:

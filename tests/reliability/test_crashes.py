@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tests.reliability import crash_harness as harness
-from tests.reliability.crash_harness import EVALUATE, TRAIN, Attempt, Moment
+from tests.reliability.crash_harness import EVALUATE, TRAIN, Moment
 from vg2gt.io.files import read_json
 
 
@@ -111,11 +111,6 @@ def test_twenty_kills(tmp_path: Path, cache: Path, whole: Path) -> None:
     assert all(kills.values()), kills
 
 
-def after_a_scene(attempt: Attempt) -> bool:
-    """A scene is evaluated."""
-    return any(name.startswith("scenes/2/") for name in attempt.new())
-
-
 def without_cost(node: Any) -> Any:
     """Without times and memory."""
     if isinstance(node, dict):
@@ -137,8 +132,8 @@ def test_a_killed_evaluation_goes_on(tmp_path: Path, cache: Path, whole: Path) -
     kills = 0
     for _ in range(4):
         attempt = harness.start(EVALUATE, arguments(folder), folder)
-        if attempt.wait_for(after_a_scene):
-            attempt.kill()
+        if attempt.wait_for(lambda running: any(name.startswith("scenes/2/") for name in running.new())):
+            attempt.kill()  # a scene is evaluated
         assert attempt.status() in (0, -9), attempt.said()[-4000:]
         kills += attempt.status() == -9
     harness.finish(EVALUATE, arguments(folder), folder)

@@ -39,29 +39,18 @@ def make(overrides: tuple[str, ...], folder: Path, cache: Path, patch: pytest.Mo
     return run, good
 
 
-def degenerate(good: Batch, times: int) -> list[Batch]:
-    """Every scene several times in a row, a good one at the end."""
-    return [mutate(good.map(Tensor.clone)) for mutate in SCENES.values() for _ in range(times)] + [good]
+TRAINED = [(1, FULL), (1, BASELINES[1])]
+TRAINED += [pytest.param(3, model, marks=pytest.mark.slow) for model in (FULL, *ABLATIONS, *BASELINES, *OPTIONS)]
 
 
-def check_training(
-    overrides: tuple[str, ...], times: int, folder: Path, cache: Path, patch: pytest.MonkeyPatch
-) -> None:
-    run, good = make(overrides, folder, cache, patch)
-    audit = fit(run, degenerate(good, times))
+@pytest.mark.parametrize(("times", "overrides"), TRAINED)
+def test_degenerate_scenes_do_no_harm(times, overrides, tmp_path, cache, monkeypatch):
+    """Every scene some times in a row, a good one at the end."""
+    run, good = make(overrides, tmp_path, cache, monkeypatch)
+    scenes = [mutate(good.map(Tensor.clone)) for mutate in SCENES.values() for _ in range(times)]
+    audit = fit(run, [*scenes, good])
     audit.assert_sound()
     assert not audit.skipped[-1]
-
-
-@pytest.mark.parametrize("overrides", [FULL, BASELINES[1]], ids=" ".join)
-def test_degenerate_scenes_do_no_harm(overrides, tmp_path, cache, monkeypatch):
-    check_training(overrides, 1, tmp_path, cache, monkeypatch)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("overrides", [FULL, *ABLATIONS, *BASELINES, *OPTIONS], ids=" ".join)
-def test_degenerate_scenes_do_no_harm_in_several_steps(overrides, tmp_path, cache, monkeypatch):
-    check_training(overrides, 3, tmp_path, cache, monkeypatch)
 
 
 def evaluated(model: Reconstructor, renderer: Renderer, batch: Batch) -> dict[str, float | None]:
@@ -73,24 +62,18 @@ def evaluated(model: Reconstructor, renderer: Renderer, batch: Batch) -> dict[st
     return scores
 
 
-def check_evaluation(overrides: tuple[str, ...], folder: Path, cache: Path, patch: pytest.MonkeyPatch) -> None:
-    run, good = make(overrides, folder, cache, patch)
+POINT_CLOUDS = [("model=pointcloud",), ("model=pointcloud", "model.spacing=neighbors")]
+EVALUATED = [FULL]
+EVALUATED += [
+    pytest.param(model, marks=pytest.mark.slow) for model in (*ABLATIONS, *BASELINES, *OPTIONS, *POINT_CLOUDS)
+]
+
+
+@pytest.mark.parametrize("overrides", EVALUATED, ids=" ".join)
+def test_degenerate_scenes_can_be_evaluated(overrides, tmp_path, cache, monkeypatch):
+    run, good = make(overrides, tmp_path, cache, monkeypatch)
     for mutate in SCENES.values():
         evaluated(run.module.model, run.module.renderer, mutate(good.map(Tensor.clone)))
-
-
-def test_degenerate_scenes_can_be_evaluated(tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    check_evaluation(FULL, tmp_path, cache, monkeypatch)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "overrides",
-    [*ABLATIONS, *BASELINES, *OPTIONS, ("model=pointcloud",), ("model=pointcloud", "model.spacing=neighbors")],
-    ids=" ".join,
-)
-def test_degenerate_scenes_can_be_evaluated_by_every_model(overrides, tmp_path, cache, monkeypatch):
-    check_evaluation(overrides, tmp_path, cache, monkeypatch)
 
 
 def test_what_cannot_be_measured_is_not_a_number(tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -121,9 +104,10 @@ def spoil(module: nn.Module) -> None:
                 parameter.fill_(float("nan"))
 
 
-def check_random_scenes(first_seed: int, count: int, folder: Path, cache: Path, patch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("first_seed", "count"), [(0, 30), pytest.param(1000, 400, marks=pytest.mark.slow)])
+def test_mutated_scenes_do_no_harm(first_seed, count, tmp_path, cache, monkeypatch) -> None:
     """Trains on random mutations in the order of their seeds, half of them in a batch beside a good scene."""
-    run, good = make(FULL, folder, cache, patch)
+    run, good = make(FULL, tmp_path, cache, monkeypatch)
     batches, labels = [], []
     for seed in range(first_seed, first_seed + count):
         label, mutate = random_mutation(np.random.default_rng(seed))
@@ -146,12 +130,3 @@ def test_far_points_of_two_scenes_can_be_numbered(overrides: tuple[str, ...], tm
     audit = fit(run, [beside(far, far), beside(good, far), far])
     audit.assert_sound()
     assert audit.skipped == [False] * 3
-
-
-def test_mutated_scenes_do_no_harm(tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    check_random_scenes(0, 30, tmp_path, cache, monkeypatch)
-
-
-@pytest.mark.slow
-def test_many_mutated_scenes_do_no_harm(tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    check_random_scenes(1000, 400, tmp_path, cache, monkeypatch)

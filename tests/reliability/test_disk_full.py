@@ -29,11 +29,6 @@ def checkpoints(folder: Path) -> list[Path]:
     return sorted((folder / "checkpoints").glob("*.ckpt"))
 
 
-def assert_goes_on(whole: Path, folder: Path, cache: Path) -> None:
-    harness.finish(TRAIN, harness.training(folder, cache), folder)
-    harness.assert_same(whole, folder)
-
-
 def test_a_json_file_that_does_not_fit(tmp_path: Path) -> None:
     path = write_json(tmp_path / "metrics.json", {"psnr": 20.0})
     with largest_file(1000), pytest.raises(OSError, match=r"metrics\.json could not be written: File too large"):
@@ -53,10 +48,10 @@ def test_training_ends_and_goes_on(tmp_path: Path, cache: Path, whole: Path) -> 
     said = [line for line in attempt.said().splitlines() if "could not be written" in line]
     assert status == 1
     assert len(said) == 1, attempt.said()
-    assert re.search(
-        r"OSError: checkpoint .*step-\d\.ckpt could not be written .*earlier checkpoints are intact", said[0]
-    )
+    expected = r"OSError: checkpoint .*step-\d\.ckpt could not be written .*earlier checkpoints are intact"
+    assert re.search(expected, said[0])
     assert "Traceback" not in attempt.said()
     assert not list(folder.rglob("*.tmp"))
     assert newest_valid(folder / "checkpoints") == checkpoints(folder)[-1]
-    assert_goes_on(whole, folder, cache)
+    harness.finish(TRAIN, harness.training(folder, cache), folder)
+    harness.assert_same(whole, folder)

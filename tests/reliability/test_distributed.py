@@ -49,29 +49,20 @@ def two_scenes() -> Sample:
 
 
 def scene_of(sample: Sample, index: int) -> Sample:
-    rows = slice(index, index + 1)
-    prediction = sample.prediction
-    return replace(
-        sample,
-        batch=sample.batch.single(index),
-        prediction=replace(
-            prediction,
-            initial=prediction.initial.map(lambda tensor: tensor[rows]),
-            geometry=prediction.geometry.map(lambda tensor: tensor[rows]),
-            unit=prediction.unit[rows],
-        ),
-        rendered=sample.rendered.map(lambda tensor: tensor[rows]),
-        cameras=sample.cameras.scene(index),
-    )
+    def only(tensor: Tensor) -> Tensor:
+        return tensor[index : index + 1]
+
+    whole = sample.prediction
+    changes = {"initial": whole.initial.map(only), "geometry": whole.geometry.map(only), "unit": only(whole.unit)}
+    shown = {"rendered": sample.rendered.map(only), "cameras": sample.cameras.scene(index)}
+    return replace(sample, batch=sample.batch.single(index), prediction=replace(whole, **changes), **shown)
 
 
 def leaves(sample: Sample) -> tuple[Sample, list[Tensor]]:
     """The same sample, and the tensors of the prediction to which gradients flow."""
     geometry = sample.prediction.geometry
     depth, conf = (t.clone().requires_grad_() for t in (geometry.depth, geometry.depth_conf))
-    render = {
-        name: getattr(sample.rendered, name).clone().requires_grad_() for name in ("color", "depth", "normal", "alpha")
-    }
+    render = {name: tensor.clone().requires_grad_() for name, tensor in vars(sample.rendered).items()}
     return sample.with_depth(depth, conf).with_render(**render), [depth, conf, *render.values()]
 
 
@@ -111,42 +102,41 @@ def test_the_step_of_two_scenes_is_the_mean_of_theirs(tmp_path: Path, cache: Pat
     """From images to gradients, through backbone, voxels, Gaussians and renders."""
     run = tiny_run(tmp_path, cache, "data.max_images=4")
     batch = first_batches(run, 1)[0]
-    generator, deviations = torch.Generator().manual_seed(0), []
-    for _ in range(3):
+    generator, apart, deviations = torch.Generator().manual_seed(0), [], []
+    for _ in range(5):
         with torch.no_grad():  # away from the zero convolutions
             for parameter in run.module.model.trained_parameters():
                 parameter += 0.02 * torch.randn(parameter.shape, generator=generator)
         loss, gradient = step(run, batch)
         first, second = (step(run, batch.single(index)) for index in range(2))
         assert first[0] != second[0]
-        # Terms of order one; the last digits of SSIM, made of local variances, depend on the processor (4e-7 seen).
-        torch.testing.assert_close(loss, (first[0] + second[0]) / 2, rtol=0, atol=1e-6)
+        apart.append(float(loss - (first[0] + second[0]) / 2))
         mean = (first[1] + second[1]) / 2
         deviations.append((gradient - mean).norm() / mean.norm())
-    # Rounding of float32: 1e-6 to 3e-6 in 21 of 23 draws, 1e-4 in two. In the one looked into, a rendered pixel
-    # had its image's colour to the last bit, and rounding decides the gradient of its L1 error. Mixed scenes spoil all.
+    # Rounding: a pixel's depth may pass from one Gaussian to another (1e-5 of the loss in two of five draws on one
+    # processor), and a rendered pixel that equals its image's colour has either sign of L1's gradient (1e-4 of the
+    # gradient's norm in two of 23 draws). Mixed scenes would spoil every draw.
+    assert min(map(abs, apart)) < 1e-6, apart
+    assert max(map(abs, apart)) < 1e-4, apart
     assert min(deviations) < 5e-6, deviations
 
 
 # ------------------------------------------------------------------------------------------------ nobody is waited for
 
 
-@pytest.mark.parametrize("model", ["vg2gt", "pixel_aligned", "voxel_merged"])
-def test_every_parameter_has_a_gradient_whatever_the_scene(tmp_path: Path, cache: Path, model: str) -> None:
+MODELS = ["model=tiny", "model=pixel_aligned", "model=voxel_merged"]
+VARIANTS = ["model.coarse=null", "model.gaussians.splits=1", "loss.gaussian.weight=0"]
+
+
+@pytest.mark.parametrize("override", MODELS + VARIANTS)
+def test_every_parameter_has_a_gradient_whatever_the_scene(tmp_path: Path, cache: Path, override: str) -> None:
     """DDP waits for the gradient of every parameter of every rank."""
-    run = tiny_run(tmp_path, cache, f"model={'tiny' if model == 'vg2gt' else model}")
-    batch = first_batches(run, 1)[0]
-    parameters = run.module.model.trained_parameters()
-    for scene in ("unchanged", "no depth", "one pixel with depth", "held-out view looks away"):
-        _, gradient = step(run, SCENES[scene](batch))
-        assert len(gradient) == sum(parameter.numel() for parameter in parameters), scene
-
-
-@pytest.mark.parametrize("override", ["model.coarse=null", "model.gaussians.splits=1", "loss.gaussian.weight=0"])
-def test_no_variant_has_unused_parameters(tmp_path: Path, cache: Path, override: str) -> None:
     run = tiny_run(tmp_path, cache, override)
-    _, gradient = step(run, first_batches(run, 1)[0])
-    assert len(gradient) == sum(parameter.numel() for parameter in run.module.model.trained_parameters())
+    batch = first_batches(run, 1)[0]
+    size = len(two_ranks.weights(run))
+    empty = two_ranks.BLIND if override in MODELS else []
+    for scene in ("unchanged", *empty):
+        assert len(step(run, SCENES[scene](batch))[1]) == size, scene
 
 
 @pytest.fixture(scope="module")
@@ -164,27 +154,17 @@ def results(two: tuple[Path, list[subprocess.CompletedProcess]], name: str) -> l
     return [torch.load(path, weights_only=True) for path in files]
 
 
-def assert_trained_alike(one: dict, ranks: list[dict], loss: float, weights: float) -> None:
-    assert torch.equal(ranks[0]["weights"], ranks[1]["weights"])
-    assert ranks[0]["losses"] == ranks[1]["losses"]
-    differences = [abs(a - b) for a, b in zip(one["losses"], ranks[0]["losses"], strict=True)]
-    assert max(differences) < loss
-    assert (one["weights"] - ranks[0]["weights"]).abs().max() < weights
-
-
 def test_two_processes_train_like_one_with_twice_the_scenes(two, tmp_path: Path, cache: Path) -> None:
     run = tiny_run(tmp_path, cache, *two_ranks.step_overrides(two_ranks.SGD, 4, scenes=2))
     before = two_ranks.weights(run)
     one = two_ranks.trained(run)
     assert (one["weights"] - before).abs().max() > 1e-3
-    assert_trained_alike(one, results(two, "sgd"), loss=2e-6, weights=2e-6)
-
-
-def test_only_the_trained_part_is_averaged(two, tmp_path: Path, cache: Path) -> None:
-    run = tiny_run(tmp_path, cache)
-    trained = sum(parameter.numel() for parameter in run.module.model.trained_parameters())
-    assert trained < sum(parameter.numel() for parameter in run.module.parameters())
-    assert [rank["averaged"] for rank in results(two, "sgd")] == [trained, trained]
+    ranks = results(two, "sgd")
+    assert torch.equal(ranks[0]["weights"], ranks[1]["weights"])
+    assert ranks[0]["losses"] == ranks[1]["losses"] == pytest.approx(one["losses"], rel=0, abs=2e-6)
+    assert (one["weights"] - ranks[0]["weights"]).abs().max() < 2e-6
+    assert len(before) < sum(parameter.numel() for parameter in run.module.parameters())
+    assert [rank["averaged"] for rank in ranks] == [len(before)] * 2  # the trained part alone
 
 
 def test_an_empty_rank_holds_nobody_up(two) -> None:
@@ -224,8 +204,7 @@ def test_an_error_of_one_rank_ends_both(two) -> None:
 
 
 def test_what_ranks_hold_is_interleaved() -> None:
-    parts = [{"a": 1, "c": 3, "e": 5}, {"b": 2, "d": 4}, {"a": 9}]
-    joined = interleave(parts)
+    joined = interleave([{"a": 1, "c": 3, "e": 5}, {"b": 2, "d": 4}, {"a": 9}])
     assert list(joined.items()) == [("a", 1), ("b", 2), ("c", 3), ("d", 4), ("e", 5)]
 
 
@@ -260,12 +239,8 @@ def test_tasks_of_a_slurm_job_find_each_other(tmp_path: Path, cache: Path) -> No
     job |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(two_ranks.free_port())}
     small = [*SMALL, *TINY[:7], f"data.cache_dir={cache}", "trainer=slurm", "name=job"]
     command = [sys.executable, "-m", "vg2gt.cli.train", *small]
-    tasks = [
-        subprocess.Popen(
-            command, cwd=tmp_path, env={**os.environ, **job, "SLURM_PROCID": str(task), "SLURM_LOCALID": str(task)}
-        )
-        for task in range(2)
-    ]
+    numbers = [{"SLURM_PROCID": task, "SLURM_LOCALID": task} for task in "01"]
+    tasks = [subprocess.Popen(command, cwd=tmp_path, env={**os.environ, **job, **number}) for number in numbers]
     try:
         assert [task.wait(1200) for task in tasks] == [0, 0]
     finally:
@@ -280,6 +255,6 @@ def test_forty_steps_on_two_processes(tmp_path: Path, cache: Path) -> None:
     names = ("adamw_long", "muon_long")
     ended = two_ranks.run_on_two_ranks(tmp_path, cache, *names, timeout=1500)
     for name in names:
-        ranks = results((tmp_path, ended), name)
-        assert torch.equal(ranks[0]["weights"], ranks[1]["weights"])
-        assert ranks[0]["losses"] == ranks[1]["losses"]
+        one, two = results((tmp_path, ended), name)
+        assert torch.equal(one["weights"], two["weights"])
+        assert one["losses"] == two["losses"]

@@ -1,7 +1,6 @@
 """NaN and infinity in data, backbone, losses and gradients: the step is dropped everywhere, counted and named."""
 
 import json
-import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -12,6 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.reliability.crash_harness import assert_equal
 from tests.reliability.steps import TINY, Poison, first_batches, fit, named, tiny_run
 from tests.training_helpers import small_config, with_crash
 from vg2gt.runs.checkpoints import newest_valid, read_checkpoint
@@ -111,32 +111,22 @@ def test_a_bad_value_from_the_backbone_does_no_harm(run: Run, monkeypatch: pytes
         assert expected is None or skipped is expected
 
 
-def bad_gradients(run: Run, names: list[str]) -> None:
-    """Spoils the gradient of the n-th parameter in the n-th step."""
-    parameters = dict(run.module.model.named_parameters())
-    for step, name in enumerate(names):
-        value = VALUES[step % len(VALUES)]
-
-        def spoil(gradient: Tensor, step: int = step, value: float = value) -> Tensor:
-            if run.trainer.global_step == step:
-                gradient = gradient.clone(memory_format=torch.contiguous_format)
-                gradient.view(-1)[-1] = value
-            return gradient
-
-        parameters[name].register_hook(spoil)
-
-
-def trained_names(run: Run) -> list[str]:
-    return [name for name, parameter in run.module.model.named_parameters() if parameter.requires_grad]
-
-
 def test_a_bad_gradient_of_one_parameter_skips_the_step(run: Run, caplog: pytest.LogCaptureFixture) -> None:
-    names = trained_names(run)[::20]
-    bad_gradients(run, names)
+    """That of the n-th parameter in the n-th step."""
+
+    def spoil(step: int, gradient: Tensor) -> Tensor:
+        if run.trainer.global_step == step:
+            gradient = gradient.clone(memory_format=torch.contiguous_format)
+            gradient.view(-1)[-1] = VALUES[step % len(VALUES)]
+        return gradient
+
+    parameters = [parameter for parameter in run.module.model.parameters() if parameter.requires_grad][::20]
+    for step, parameter in enumerate(parameters):
+        parameter.register_hook(partial(spoil, step))
     (good,) = first_batches(run, 1)
-    audit = fit(run, [good] * (len(names) + 1))
+    audit = fit(run, [good] * (len(parameters) + 1))
     audit.assert_sound()
-    assert audit.skipped == [True] * len(names) + [False]
+    assert audit.skipped == [True] * len(parameters) + [False]
     assert f"skipped step 1 with non-finite values: rank 0, {good.scene[0]}: gradient" in caplog.text
 
 
@@ -144,11 +134,8 @@ def test_too_many_in_a_row_stop_the_run_with_their_causes(tmp_path: Path, cache:
     run = tiny_run(tmp_path, cache, "training.max_skipped=3")
     (good,) = first_batches(run, 1)
     bad = [named(spoiled(good, "depth", float("nan")), f"room-{i}") for i in range(5)]
-    expected = (
-        "3 steps in a row had a non-finite loss or gradient, the last: rank 0, room-4: images, depth or cameras of the "
-        "batch. "
-    )
-    with pytest.raises(FloatingPointError, match=re.escape(expected) + ".*training.max_skipped"):
+    expected = r"3 steps in a row .* rank 0, room-4: images, depth or cameras of the batch\. .*training\.max_skipped"
+    with pytest.raises(FloatingPointError, match=expected):
         fit(run, [bad[0], bad[1], good, bad[2], bad[3], bad[4]])
     assert run.module.skipped.total == 5
     with pytest.raises(ValueError, match=r"training\.max_skipped must be at least 1"):
@@ -181,10 +168,8 @@ def test_resume_across_dropped_steps_equals_the_uninterrupted_run(tmp_path: Path
     assert [fault["step"] for fault in whole["skipped_steps"]["faults"]] == [1, 2]
     assert json.loads((tmp_path / "cut" / "metrics.json").read_text()) == resumed
     first, second = (read_checkpoint(newest_valid(tmp_path / name / "checkpoints")) for name in ("whole", "cut"))
-    assert first["skipped_steps"] == second["skipped_steps"]
-    assert all(torch.equal(tensor, second["state_dict"][name]) for name, tensor in first["state_dict"].items())
-    for row, state in first["optimizer_states"][0]["state"].items():
-        assert all(torch.equal(value, second["optimizer_states"][0]["state"][row][key]) for key, value in state.items())
+    for name in ("skipped_steps", "state_dict", "optimizer_states"):
+        assert_equal(first[name], second[name], name)
     counts = [row.split(",") for row in next((tmp_path / "whole").glob("logs/*/metrics.csv")).read_text().splitlines()]
     column = counts[0].index("train/skipped_steps")
     assert [row[column] for row in counts[1:] if row[column]] == ["0.0", "1.0", "2.0", "2.0"]

@@ -1,7 +1,6 @@
 """Precision: bfloat16 networks agree with float32 ones, and geometry is never below float32."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -40,10 +39,8 @@ PLAIN = ("model.gaussians.start=plain", "model.fine.moments=false", "model.fine.
 METRIC_TOLERANCE = {"psnr": 0.1, "ssim": 0.01, "abs_rel": 0.005, "decoded_abs_rel": 0.001, "coverage": 0.01}
 
 
-@contextmanager
-def autocast(enabled: bool) -> Iterator[None]:
-    with torch.autocast("cpu", torch.bfloat16, enabled=enabled):
-        yield
+def autocast(enabled: bool) -> torch.autocast:
+    return torch.autocast("cpu", torch.bfloat16, enabled=enabled)
 
 
 class BothPrecisions(lightning.Callback):
@@ -140,44 +137,33 @@ def dtypes(value: Any, skip: tuple[str, ...] = ()) -> Iterator[tuple[str, torch.
         for field in fields(value):
             if field.name not in skip:
                 yield from ((f".{field.name}{n}", d) for n, d in dtypes(getattr(value, field.name), skip))
-    elif isinstance(value, (tuple, list)):
-        for i, item in enumerate(value):
-            yield from ((f"[{i}]{n}", d) for n, d in dtypes(item, skip))
-    elif isinstance(value, dict):
-        for key, item in value.items():
+    elif isinstance(value, (tuple, list, dict)):
+        for key, item in value.items() if isinstance(value, dict) else enumerate(value):
             yield from ((f"[{key}]{n}", d) for n, d in dtypes(item, skip))
 
 
 # what networks may say in bfloat16: it becomes geometry in float32
 NETWORKS = ("patch", "camera", "features")
 
-PLACES: list[tuple[Any, str]] = [
-    (vg2gt.method.coarse, "unproject"),
-    (vg2gt.method.coarse, "scene_voxel_size"),
-    (vg2gt.method.coarse, "point_cells"),
-    (vg2gt.method.coarse, "pool_mean"),
-    (vg2gt.method.coarse, "pool_min"),
-    (vg2gt.method.coarse, "interpolation_weights"),
+
+def places(owner: Any, names: str) -> list[tuple[Any, str]]:
+    return [(owner, name) for name in names.split()]
+
+
+VOXELS = "unproject scene_voxel_size point_cells pool_mean pool_min"
+PLACES = [
+    *places(vg2gt.method.coarse, f"{VOXELS} interpolation_weights"),
     (vg2gt.method.additions.surface_evidence, "normals_from_depth"),
-    (vg2gt.method.fine, "unproject"),
-    (vg2gt.method.fine, "scene_voxel_size"),
-    (vg2gt.method.fine, "point_cells"),
-    (vg2gt.method.fine, "pool_mean"),
-    (vg2gt.method.fine, "pool_min"),
+    *places(vg2gt.method.fine, VOXELS),
     (vg2gt.training.module, "training_cameras"),
     (vg2gt.rendering.scenes, "_scene_views"),
-    (Renderer, "__call__"),
-    (SceneScale, "__call__"),
-    (GeometryLoss, "__call__"),
-    (GaussianLoss, "__call__"),
+    *((called, "__call__") for called in (Renderer, SceneScale, GeometryLoss, GaussianLoss)),
     (vg2gt.losses.objective.VG2GTLoss, "forward"),
-    (vg2gt.losses.objective, "normalize_truth"),
-    (vg2gt.losses.objective, "camera_errors"),
+    *places(vg2gt.losses.objective, "normalize_truth camera_errors"),
 ]
-BASELINE_PLACES: list[tuple[Any, str]] = [
+BASELINE_PLACES = [
     (vg2gt.baselines.pixels, "ray_directions"),
-    (vg2gt.baselines.voxel_merged, "point_cells"),
-    (vg2gt.baselines.voxel_merged, "pool_mean"),
+    *places(vg2gt.baselines.voxel_merged, "point_cells pool_mean"),
     (Renderer, "__call__"),
 ]
 
@@ -207,18 +193,15 @@ class Probe:
 
 
 @pytest.mark.parametrize(
-    ("overrides", "places"),
+    ("overrides", "watched"),
     [((), PLACES), (("backend=da3_tiny",), PLACES), (("model=voxel_merged",), BASELINE_PLACES)],
     ids=["full", "da3_tiny", "voxel_merged"],
 )
-def test_geometry_is_never_below_float32(overrides, places, tmp_path, cache, monkeypatch):
+def test_geometry_is_never_below_float32(overrides, watched, tmp_path, cache, monkeypatch):
     run = tiny_run(tmp_path, cache, "trainer.precision=bf16-mixed", *overrides)
     probe = Probe()
-    for owner, name in places:
+    for owner, name in (*watched, *places(run.module.model.backend, "decode encode")):
         probe.watch(owner, name, monkeypatch)
-    backend = run.module.model.backend
-    for name in ("decode", "encode"):
-        probe.watch(backend, name, monkeypatch)
     networks: set[torch.dtype] = set()
     for name, module in run.module.model.named_modules():
         if name in ("", "fine", "gaussians", "coarse"):
@@ -227,7 +210,7 @@ def test_geometry_is_never_below_float32(overrides, places, tmp_path, cache, mon
             module.register_forward_hook(lambda module, args, out: networks.add(out.dtype))
     (batch,) = first_batches(run, 1)
     fit(run, [batch, batch]).assert_sound()
-    expected = {f"{getattr(owner, '__name__', owner)}.{name}" for owner, name in places}
+    expected = {f"{getattr(owner, '__name__', owner)}.{name}" for owner, name in watched}
     assert expected <= probe.seen
     assert not probe.low
     assert networks == {torch.bfloat16}  # autocast was on, where it may be
@@ -240,9 +223,9 @@ def test_voxel_grids_do_not_depend_on_the_precision(tmp_path: Path, cache: Path)
     model = full_model(run).eval()
     (batch,) = first_batches(run, 1)
     context = batch.context
+    found: list[Voxels] = []
     with torch.no_grad():
         tokens, geometry, _ = model.read_views(context.images, context.hints)
-        found: list[Voxels] = []
         for enabled in (False, True):
             with autocast(enabled):
                 found.append(model.fine(tokens, geometry, context.images))

@@ -3,6 +3,7 @@
 import os
 import shutil
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,11 +16,11 @@ from vg2gt.runs.load import load_model
 SIZE = (24, 32)
 
 
+@dataclass
 class Armed:
     """An object whose unpickling makes a file."""
 
-    def __init__(self, canary: Path) -> None:
-        self.canary = canary
+    canary: Path
 
     def __reduce__(self):
         return os.system, (f"touch {self.canary}",)

@@ -29,9 +29,7 @@ ATTACKS: dict[str, Attack] = {
     "get_method": lambda c: {"_target_": "hydra.utils.get_method", "path": "os.system"},
     "partial": lambda c: {"_target_": "os.mkdir", "_partial_": True, "path": c},
     "nested": lambda c: {"_target_": "vg2gt.model.SceneScale", "source": {"_target_": "os.mkdir", "path": c}},
-    "not recursive": lambda c: {
-        "_target_": "vg2gt.model.SceneScale", "_recursive_": False, "x": {"_target_": "os.mkdir", "path": c},
-    },
+    "not recursive": lambda c: {**ATTACKS["nested"](c), "_recursive_": False},
     "through a module of ours": lambda c: {"_target_": "vg2gt.kernels.threads.os.mkdir", "path": c},
     "a function of ours": lambda c: {"_target_": "vg2gt.io.files.write_text", "path": c, "content": ""},
     "training": lambda c: {"_target_": "vg2gt.training.loop.train", "config": {"output_dir": c}},
@@ -39,12 +37,6 @@ ATTACKS: dict[str, Attack] = {
     "a class that writes": lambda c: {"_target_": "vg2gt.training.stop_on_signal.StopOnSignal", "folder": c},
     "a list": lambda c: [{"_target_": "os.mkdir", "path": c}],  # pyright: ignore[reportAssignmentType]
 }  # fmt: skip
-
-PLACES = {
-    "backend": lambda config, attack: config.update(backend=attack),
-    "renderer": lambda config, attack: config.update(renderer=attack),
-    "an argument of the model": lambda config, attack: config["model"]["fine"].update(voxel_size=attack),
-}
 
 
 def edit(run_folder: Path, change: Callable[[dict[str, Any]], Any]) -> None:
@@ -54,30 +46,23 @@ def edit(run_folder: Path, change: Callable[[dict[str, Any]], Any]) -> None:
     OmegaConf.save(OmegaConf.create(config), path)
 
 
-@pytest.fixture
-def no_network(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: Any) -> None:
-        raise AssertionError("a connection was opened")
-
-    monkeypatch.setattr("socket.socket.connect", refuse)
-
-
 @pytest.mark.parametrize("attack", ATTACKS)
-@pytest.mark.usefixtures("no_network")
-def test_a_runs_configuration_calls_nothing_foreign(run_folder: Path, canary: Path, attack: str) -> None:
+def test_a_runs_configuration_calls_nothing_foreign(run_folder: Path, canary: Path, attack: str, monkeypatch) -> None:
+    monkeypatch.setattr("socket.socket.connect", lambda *_: pytest.fail("a connection was opened"))
     edit(run_folder, lambda config: config.update(backend=ATTACKS[attack](str(canary))))
     with pytest.raises(UntrustedError, match=r"config\.yaml: backend.*_target_ is .*VG2GT_TRUST=PACKAGE"):
         load_model(run_folder, device="cpu")
 
 
-@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize("place", ["backend", "renderer", "model.fine.voxel_size"])
 def test_wherever_it_stands(run_folder: Path, canary: Path, place: str) -> None:
-    attack = {"_target_": "os.mkdir", "path": str(canary)}
-    edit(run_folder, lambda config: PLACES[place](config, attack))
-    with pytest.raises(UntrustedError, match=r"_target_ is 'os\.mkdir'"):
-        load_model(run_folder, device="cpu")
-    with pytest.raises(UntrustedError, match=r"_target_ is 'os\.mkdir'"):  # other changes do not hide it
-        load_model(run_folder, device="cpu", overrides=["renderer.near=0.5", "model.fine.max_voxels=5"])
+    path = run_folder / "config.yaml"
+    config = OmegaConf.load(path)
+    OmegaConf.update(config, place, {"_target_": "os.mkdir", "path": str(canary)}, merge=False)
+    OmegaConf.save(config, path)
+    for overrides in ([], ["renderer.near=0.5", "model.fine.max_voxels=5"]):  # other changes do not hide it
+        with pytest.raises(UntrustedError, match=r"_target_ is 'os\.mkdir'"):
+            load_model(run_folder, device="cpu", overrides=overrides)
 
 
 def test_the_runs_data_call_nothing_foreign(run_folder: Path, canary: Path, rooms, caplog) -> None:
@@ -93,12 +78,8 @@ def test_what_the_user_names_is_called(run_folder: Path) -> None:
     edit(run_folder, lambda config: config.update(renderer={"_target_": "os.mkdir", "path": "nowhere"}))
     with pytest.raises(UntrustedError):
         load_model(run_folder, overrides=["backend=oracle", "model=tiny"], device="cpu")
-    edit(
-        run_folder,
-        lambda config: config.update(
-            backend={"_target_": "os.mkdir"}, renderer={"_target_": "vg2gt.rendering.Renderer"}
-        ),
-    )
+    changed = {"backend": {"_target_": "os.mkdir"}, "renderer": {"_target_": "vg2gt.rendering.Renderer"}}
+    edit(run_folder, lambda config: config.update(changed))
     assert load_model(run_folder, "oracle", ["backend.depth_noise=0"], device="cpu").weights.step == 7
 
 
@@ -141,9 +122,8 @@ def test_the_configuration_in_a_checkpoint_calls_nothing_either(run_folder: Path
     (run_folder / "config.yaml").unlink()
     for hostile in (text + "extra: ${oc.env:SECRET}\n", text.replace("backends.oracle.OracleBackend", "os.mkdir")):
         torch.save(content | {"config": hostile}, path)
-        with pytest.raises(
-            UntrustedError, match=r"step-7\.ckpt: (config holds an interpolation|backend\._target_ is 'os)"
-        ):
+        said = r"step-7\.ckpt: (config holds an interpolation|backend\._target_ is 'os)"
+        with pytest.raises(UntrustedError, match=said):
             load_model(run_folder, device="cpu")
     torch.save(content | {"config": text}, path)
     assert load_model(run_folder, device="cpu").weights.step == 7
@@ -154,12 +134,8 @@ def test_hyper_parameters_of_a_checkpoint_call_nothing(run_folder: Path, canary:
     content = torch.load(path, weights_only=True)
     hostile = ATTACKS["os.system"](str(canary))
     content |= {"hyper_parameters": {**hostile, "_instantiator": "os.system"}, "hparams_name": "kwargs"}
-    content |= {
-        "hparams_type": "os.system",
-        "datamodule_hyper_parameters": hostile,
-        "callbacks": {"os.system": hostile},
-    }
-    torch.save(content, path)
+    content |= {"hparams_type": "os.system", "datamodule_hyper_parameters": hostile}
+    torch.save(content | {"callbacks": {"os.system": hostile}}, path)
     assert load_model(run_folder, device="cpu").weights.step == 7  # what nobody reads does no harm
 
 

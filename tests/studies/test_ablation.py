@@ -5,7 +5,6 @@ import re
 import shlex
 import shutil
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -198,32 +197,15 @@ def test_only_full_models_begin_with_given_weights(tmp_path: Path, monkeypatch: 
     assert "Full model 2 steps from begin.ckpt, then every row" in some.report()
 
 
-def test_given_weights_on_a_protocol(
-    finished: Path, tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_given_weights_on_a_protocol(finished: Path, tmp_path: Path, cache: Path, monkeypatch) -> None:
     """Without a step of training: every variant of the given weights is scored as ``vg2gt evaluate`` scores it."""
     monkeypatch.setattr(vg2gt.studies.study, "train", lambda config: pytest.fail(f"trained {config.output_dir}"))
     given = newest_valid(finished / "seed-0" / "start" / "checkpoints")
-    scenes = [
-        "views=2",
-        "data.image_size=[28,56]",
-        "data.eval_scenes=1",
-        "data.num_frames=8",
-        f"data.cache_dir={cache}",
-    ]
-    scenes += ["evaluation.selection.index=null"]
-    elsewhere = ["data=replica", "data.root=/nowhere"]  # the training's data is not needed
-    arguments = (
-        tmp_path,
-        [*(q for q in QUIET if not q.startswith("data.")), *elsewhere],
-        1,
-        0,
-        0,
-        1e-4,
-        ["wo_split"],
-        (2,),
-        str(given),
-    )
+    scenes = ["views=2", "data.image_size=[28,56]", "data.eval_scenes=1", "data.num_frames=8"]
+    scenes += [f"data.cache_dir={cache}", "evaluation.selection.index=null"]
+    overrides = [override for override in QUIET if not override.startswith("data.")]
+    overrides += ["data=replica", "data.root=/nowhere"]  # the training's data is not needed
+    arguments = (tmp_path, overrides, 1, 0, 0, 1e-4, ["wo_split"], (2,), str(given))
     some = Ablation(*arguments, "synthetic", scenes)
     some.run()
     for run in (FULL, "wo_split"):
@@ -249,8 +231,8 @@ def test_what_the_study_decides_cannot_be_overridden() -> None:
         common_overrides(["trainer.max_steps=7"])
 
 
-@pytest.mark.parametrize("wrong", [{"seeds": 0}, {"seeds": "abc"}, {"steps": 1.5}, {"full_steps": -1}, {"splits": [0]}])
-def test_numbers_are_checked_first(tmp_path: Path, wrong: dict[str, Any]) -> None:
+def test_numbers_are_checked_first(tmp_path: Path) -> None:
     right = {"seeds": 1, "full_steps": 1, "steps": 1, "lr": 1e-3, "variants": [], "splits": [2]}
-    with pytest.raises(ValueError, match=f"{next(iter(wrong))}=.*: a study takes whole numbers from [01] on"):
-        Ablation(tmp_path, [], **(right | wrong))
+    for name, value in (("seeds", 0), ("seeds", "abc"), ("steps", 1.5), ("full_steps", -1), ("splits", [0])):
+        with pytest.raises(ValueError, match=f"{name}=.*: a study takes whole numbers from [01] on"):
+            Ablation(tmp_path, [], **(right | {name: value}))

@@ -6,11 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from vg2gt.studies.study import (
-    estimate,
-    over_seeds,
-    paired_difference,
-)
+from vg2gt.studies.study import estimate, over_seeds, paired_difference
 
 
 def test_estimate_is_the_textbook_interval() -> None:

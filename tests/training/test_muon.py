@@ -109,9 +109,7 @@ def test_without_gradients_nothing_moves_and_gradients_stay() -> None:
         assert torch.equal(parameter.grad, gradient)
 
 
-@pytest.mark.parametrize(
-    ("option", "named"), [({"momentum": 1.0}, "momentum"), ({"momentum": -0.1}, "momentum"), ({"lr": -1.0}, "rate")]
-)
-def test_numbers_out_of_range_are_named(option: dict[str, Any], named: str) -> None:
-    with pytest.raises(ValueError, match=named):
-        MuonAdamW([nn.Parameter(torch.zeros(1))], **option)
+def test_numbers_out_of_range_are_named() -> None:
+    for option, value, named in (("momentum", 1.0, "momentum"), ("momentum", -0.1, "momentum"), ("lr", -1.0, "rate")):
+        with pytest.raises(ValueError, match=named):
+            MuonAdamW([nn.Parameter(torch.zeros(1))], **{option: value})

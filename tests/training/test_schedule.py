@@ -29,10 +29,6 @@ def test_only_matrices_decay_and_frozen_parameters_are_left_out() -> None:
     module = nn.Sequential(nn.Linear(3, 4), nn.LayerNorm(4), nn.Linear(4, 2))
     module[2].requires_grad_(False)
     decay, rest = parameter_groups(module)
-    assert [(name, tuple(p.shape)) for name, p in decay["params"]] == [("0.weight", (4, 3))]
-    assert [(name, tuple(p.shape)) for name, p in rest["params"]] == [
-        ("0.bias", (4,)),
-        ("1.weight", (4,)),
-        ("1.bias", (4,)),
-    ]
+    assert [name for name, _ in decay["params"]] == ["0.weight"]
+    assert [name for name, _ in rest["params"]] == ["0.bias", "1.weight", "1.bias"]
     assert rest["weight_decay"] == 0.0

@@ -1,6 +1,7 @@
 """Bounds hold as often as they say, whatever the backbone's confidence is worth."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -24,12 +25,8 @@ def pixels(seed: int, scenes: int = 20, each: int = 8000, useful: bool = True) -
     status = torch.tensor(MEASURED)[torch.randint(3, (count,), generator=generator)]
     hidden = torch.randn(count, 2, generator=generator)
     cause = evidence[:, :2] if useful else hidden
-    spread = (
-        torch.where(evidence[:, -1] < SHAKY, 0.1, 0.02)
-        * torch.exp(0.8 * cause[:, 0] - 0.5 * cause[:, 1].abs())
-        * (6 - status)
-        / 2
-    )
+    spread = torch.where(evidence[:, -1] < SHAKY, 0.1, 0.02) * (6 - status) / 2
+    spread *= torch.exp(0.8 * cause[:, 0] - 0.5 * cause[:, 1].abs())
     error = (spread * torch.randn(count, generator=generator)).abs()
     return Samples(evidence, status, error, torch.arange(count) // each)
 
@@ -71,9 +68,8 @@ def test_what_has_no_depth_is_unknown(made: Calibration) -> None:
 def test_it_is_the_same_from_a_file(made: Calibration, tmp_path: Path) -> None:
     back, fresh = read_calibration(made.write(tmp_path / "made.json")), pixels(2, each=100)
     assert (back.made_for, back.scenes) == ("weights", 20)
-    torch.testing.assert_close(
-        back.bounds(fresh.evidence, fresh.status), made.bounds(fresh.evidence, fresh.status), rtol=1e-3, atol=1e-6
-    )
+    found, expected = (calibration.bounds(fresh.evidence, fresh.status) for calibration in (back, made))
+    torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -87,21 +83,17 @@ def test_damaged_files_are_refused(made: Calibration, tmp_path: Path, old: str, 
 
 
 def test_values_that_are_not_finite_are_refused(made: Calibration, tmp_path: Path) -> None:
-    curves = dict(made.curves)
     kind = (Status.AGREED, False)
-    curves[kind] = curves[kind].__class__(
-        curves[kind].knots, curves[kind].values, curves[kind].scores, curves[kind].bounds * math.nan
-    )
-    path = Calibration(curves, "weights", 4).write(tmp_path / "made.json")
+    curve = replace(made.curves[kind], bounds=made.curves[kind].bounds * math.nan)
+    path = Calibration({**made.curves, kind: curve}, "weights", 4).write(tmp_path / "made.json")
     with pytest.raises(FormatError, match="not finite"):
         read_calibration(path)
 
 
 def test_few_scenes_or_pixels_are_refused() -> None:
-    with pytest.raises(ValueError, match="3 scenes"):
-        calibrate(pixels(0, scenes=3), "weights")
-    with pytest.raises(ValueError, match="400 pixels"):
-        calibrate(pixels(0, each=20), "weights")
+    for few, said in (({"scenes": 3}, "3 scenes"), ({"each": 20}, "400 pixels")):
+        with pytest.raises(ValueError, match=said):
+            calibrate(pixels(0, **few), "weights")
 
 
 def test_a_status_without_pixels_takes_the_curve_of_all() -> None:

@@ -26,6 +26,10 @@ def geometry(cameras: Cameras) -> Geometry:
 
 def test_the_status_of_pixels(cameras: Cameras) -> None:
     seen = geometry(cameras)
+    alone = Geometry(seen.depth[:, :1], seen.depth_conf[:, :1], cameras.select(slice(0, 1)), seen.scale)
+    evidence, status = pixel_evidence(alone)
+    assert (status == Status.SINGLE).all()
+    assert evidence.isfinite().all()
     seen.depth[0, 0, 20, 40] = WALL / 2  # hangs in the air: the other camera looks through it
     seen.depth[0, 0, 5, 5] = 0
     keep = torch.ones(1, 2, *SIZE, dtype=torch.bool)
@@ -63,14 +67,6 @@ def test_it_does_not_depend_on_the_unit(cameras: Cameras) -> None:
     larger = Geometry(7 * seen.depth, seen.depth_conf, Cameras(moved, cameras.intrinsics, SIZE), seen.scale)
     for mine, theirs in zip(pixel_evidence(seen), pixel_evidence(larger), strict=True):
         torch.testing.assert_close(mine, theirs, atol=1e-4, rtol=1e-4)
-
-
-def test_one_view_alone(cameras: Cameras) -> None:
-    seen = geometry(cameras)
-    alone = Geometry(seen.depth[:, :1], seen.depth_conf[:, :1], cameras.select(slice(0, 1)), seen.scale)
-    evidence, status = pixel_evidence(alone)
-    assert (status == Status.SINGLE).all()
-    assert evidence.isfinite().all()
 
 
 def test_the_status_of_points(cameras: Cameras) -> None:

@@ -4,20 +4,17 @@ import math
 
 import torch
 
-from tests.visibility.test_counts import INTRINSICS, SIZE, sideways
+from tests.visibility.test_counts import SIZE, cameras, sideways
+from vg2gt.geometry.cameras import rigid_motions
 from vg2gt.method.additions.visibility import choose_partners
 from vg2gt.types import Cameras
 
 
-def ring(views: int, radius: float = 2.0) -> Cameras:
-    """Cameras around the origin that look at it."""
-    poses = torch.eye(4).repeat(views, 1, 1)
-    for view in range(views):
-        angle = 2 * math.pi * view / views
-        turn = torch.tensor([[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]])
-        poses[view, :3, :3] = turn
-        poses[view, 2, 3] = radius
-    return Cameras(poses[None], INTRINSICS.expand(1, views, 3, 3), SIZE)
+def ring(views: int) -> Cameras:
+    """Cameras around the origin that look at it from 2 away."""
+    angle = torch.arange(views) * 2 * math.pi / views
+    poses = rigid_motions(torch.stack((0 * angle, angle, 0 * angle), -1), torch.tensor([0, 0, 2.0]).repeat(views, 1))
+    return cameras(poses)
 
 
 def test_few_views_are_all_partners_but_themselves() -> None:
@@ -37,6 +34,5 @@ def test_of_many_views_the_nearest_and_some_from_the_other_side() -> None:
 
 
 def test_views_that_look_elsewhere_are_no_partners() -> None:
-    cameras = sideways(0, 0.1, 50)
-    partners = choose_partners(torch.full((3, *SIZE), 2.0), cameras, 2)
+    partners = choose_partners(torch.full((3, *SIZE), 2.0), sideways(0, 0.1, 50), 2)
     assert partners.tolist() == [[1, -1], [0, -1], [-1, -1]]

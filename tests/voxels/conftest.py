@@ -1,6 +1,7 @@
 """A box-shaped room seen by a fan of cameras, small enough for exact checks."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import pytest
@@ -43,6 +44,18 @@ def room(scenes: int = 1, views: int = 3, size: tuple[int, int] = (42, 84), seed
     tokens = Tokens(patch, torch.randn(scenes, views, 8, generator=generator), grid, size)
     images = torch.rand(scenes, views, 3, height, width, generator=generator)
     return tokens, Geometry(depth, confidence, cameras, torch.ones(scenes)), images
+
+
+def take_views(inputs: Inputs, views: list[int]) -> Inputs:
+    tokens, geometry, images = inputs
+    picked = replace(
+        geometry,
+        depth=geometry.depth[:, views],
+        depth_conf=geometry.depth_conf[:, views],
+        cameras=geometry.cameras.select(torch.tensor(views)),
+    )
+    tokens = replace(tokens, patch=tuple(tap[:, views] for tap in tokens.patch), camera=tokens.camera[:, views])
+    return tokens, picked, images[:, views]
 
 
 @pytest.fixture

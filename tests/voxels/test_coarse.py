@@ -4,7 +4,6 @@ import pytest
 import torch
 
 from vg2gt.method.coarse import PatchPoints
-from vg2gt.types import Cameras
 
 
 def perturb(module, seed=0):
@@ -15,24 +14,21 @@ def perturb(module, seed=0):
     return module
 
 
-@pytest.mark.parametrize("inject", ["all", "last"])
-def test_before_training_tokens_are_bit_equal(inject, make_coarse, make_room):
+@pytest.mark.parametrize(("inject", "changed"), [("all", [True, True]), ("last", [False, True])])
+def test_injection_changes_the_chosen_taps_once_trained_and_never_the_camera(inject, changed, make_coarse, make_room):
     tokens, geometry, _ = make_room(scenes=2)
-    out = make_coarse(inject=inject)(tokens, geometry)
-    assert out.camera is tokens.camera
-    assert all(torch.equal(a, b) for a, b in zip(out.patch, tokens.patch, strict=True))
-
-
-def test_injection_changes_the_chosen_taps_and_never_the_camera(make_coarse, make_room):
-    tokens, geometry, _ = make_room()
-    for inject, changed in (("all", [True, True]), ("last", [False, True])):
-        out = perturb(make_coarse(inject=inject))(tokens, geometry)
-        assert [not torch.equal(a, b) for a, b in zip(out.patch, tokens.patch, strict=True)] == changed
+    module = make_coarse(inject=inject)
+    for expected in ([False, False], changed):
+        out = module(tokens, geometry)
+        assert [not torch.equal(a, b) for a, b in zip(out.patch, tokens.patch, strict=True)] == expected
         assert out.camera is tokens.camera
+        perturb(module)
 
 
-def test_last_layer_learns_at_step_one_and_ptv3_from_step_two(make_coarse, make_room):
+def test_last_layer_learns_at_step_one_and_ptv3_from_step_two_and_geometry_is_detached(make_coarse, make_room):
     tokens, geometry, _ = make_room()
+    geometry.depth.requires_grad_()
+    geometry.depth_conf.requires_grad_()
     module = make_coarse()
     optimizer = torch.optim.SGD(module.parameters(), lr=0.1)
     target = [torch.randn_like(tap) for tap in tokens.patch]
@@ -45,19 +41,8 @@ def test_last_layer_learns_at_step_one_and_ptv3_from_step_two(make_coarse, make_
         norms.append((float(last), float(inner)))
         optimizer.step()
         optimizer.zero_grad()
-    assert norms[0][0] > 0
-    assert norms[0][1] == 0
-    assert norms[1][1] > 0
-
-
-def test_geometry_is_detached(make_coarse, make_room):
-    tokens, geometry, _ = make_room()
-    geometry.depth.requires_grad_()
-    geometry.depth_conf.requires_grad_()
-    out = perturb(make_coarse())(tokens, geometry)
-    out.patch[-1].square().sum().backward()
-    assert geometry.depth.grad is None
-    assert geometry.depth_conf.grad is None
+    assert norms[0][0] > 0 == norms[0][1] < norms[1][1]
+    assert geometry.depth.grad is geometry.depth_conf.grad is None
 
 
 def test_points_are_nearest_pixels_with_the_least_confidence(make_room):
@@ -79,11 +64,10 @@ def test_points_are_nearest_pixels_with_the_least_confidence(make_room):
 
 def test_patches_without_points_keep_their_tokens(make_coarse, make_room):
     tokens, geometry, _ = make_room(scenes=2)
-    depth = geometry.depth.clone()
-    depth[0, 1, :14, :14] = 0
-    depth[0, 1, 14:28, :14] = torch.nan
-    depth[1] = 0  # a scene without any point
-    out = perturb(make_coarse())(tokens, replace(geometry, depth=depth))
+    geometry.depth[0, 1, :14, :14] = 0
+    geometry.depth[0, 1, 14:28, :14] = torch.nan
+    geometry.depth[1] = 0  # a scene without any point
+    out = perturb(make_coarse())(tokens, geometry)
     for before, after in zip(tokens.patch, out.patch, strict=True):
         same = (before == after).all(-1)
         assert same[0, 1].nonzero()[:, 0].tolist() == [0, 6]
@@ -104,15 +88,7 @@ def test_scenes_do_not_influence_each_other(make_coarse, make_room):
     tokens, geometry, _ = make_room(scenes=2)
     module = perturb(make_coarse()).eval()
     both = module(tokens, geometry)
-    pose, intrinsics, size = geometry.cameras.world_to_camera, geometry.cameras.intrinsics, geometry.cameras.size
-    for scene in (0, 1):
-        rows = slice(scene, scene + 1)
-        alone = replace(
-            geometry,
-            depth=geometry.depth[rows],
-            depth_conf=geometry.depth_conf[rows],
-            cameras=Cameras(pose[rows], intrinsics[rows], size),
-        )
-        out = module(tokens.map(lambda t, rows=rows: t[rows]), alone)
+    for rows in (slice(0, 1), slice(1, 2)):
+        out = module(*(record.map(lambda t, rows=rows: t[rows]) for record in (tokens, geometry)))
         for a, b in zip(out.patch, both.patch, strict=True):
             torch.testing.assert_close(a, b[rows], atol=1e-5, rtol=1e-5)

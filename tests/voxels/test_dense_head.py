@@ -1,13 +1,13 @@
+from itertools import product
+
 from vg2gt.method import DenseHead
 
 
 def test_full_resolution_for_every_number_of_taps(make_room):
     tokens, _, images = make_room(scenes=2)
-    for taps in (1, 2, 3, 4):
-        chosen = tokens.with_patch((tokens.patch * 2)[:taps])
-        for finest in (1, 4):
-            head = DenseHead([24] * taps, 14, features=8, out_channels=5, merge_channels=6, finest=finest)
-            assert head(chosen, images).shape == (6, 5, 42, 84)
+    for taps, finest in product((1, 2, 3, 4), (1, 4)):
+        head = DenseHead([24] * taps, 14, features=8, out_channels=5, merge_channels=6, finest=finest)
+        assert head(tokens.with_patch((tokens.patch * 2)[:taps]), images).shape == (6, 5, 42, 84)
 
 
 def test_every_tap_and_the_image_reach_every_view(make_room):

@@ -4,8 +4,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from vg2gt.geometry.cameras import camera_centers, unproject
-from vg2gt.types import Cameras
+from tests.voxels.conftest import take_views
+from vg2gt.geometry.cameras import camera_centers, scale_translations, unproject
 
 
 def test_voxels_hold_the_weighted_means_of_their_pixels(make_fine, make_room):
@@ -48,15 +48,14 @@ def test_gradients_reach_tokens_depth_confidence_and_every_parameter(make_fine, 
 
 def test_sky_and_non_finite_pixels_are_left_out(make_fine, make_room):
     tokens, geometry, images = make_room()
-    depth, confidence = geometry.depth.clone(), geometry.depth_conf.clone()
+    depth = geometry.depth
     depth[0, 0, :20] = 0
-    depth[0, 1, :10] = torch.nan
-    depth[0, 2, :10] = torch.inf
-    confidence[0, 1, 10:12] = torch.nan
+    depth[0, 1, :10], depth[0, 2, :10] = torch.nan, torch.inf
+    geometry.depth_conf[0, 1, 10:12] = torch.nan
     depth[0, 0, 30, 30] = 1e9  # too far to be numbered
     depth.requires_grad_()
     module = make_fine()
-    voxels = module(tokens, replace(geometry, depth=depth, depth_conf=confidence), images)
+    voxels = module(tokens, geometry, images)
     assert int(voxels.count.sum()) == 3 * 42 * 84 - 20 * 84 - 10 * 84 - 10 * 84 - 2 * 84 - 1
     for values in (voxels.features, voxels.colors, voxels.centroid, voxels.confidence):
         assert torch.isfinite(values).all()
@@ -69,39 +68,23 @@ def test_sky_and_non_finite_pixels_are_left_out(make_fine, make_room):
 @pytest.mark.parametrize("moments", [False, True])
 def test_a_scene_without_points_has_no_voxels(make_fine, make_room, moments):
     tokens, geometry, images = make_room(scenes=2)
-    depth = geometry.depth.clone()
-    depth[0] = 0
     module = make_fine(moments=moments)
-    voxels = module(tokens, replace(geometry, depth=depth), images)
-    assert voxels.batch.unique().tolist() == [1]
-    nothing = module(tokens, replace(geometry, depth=depth * 0), images)
+    geometry.depth[0] = 0
+    assert module(tokens, geometry, images).batch.unique().tolist() == [1]
+    nothing = module(tokens, replace(geometry, depth=geometry.depth * 0), images)
     assert nothing.features.shape == (0, module.out_channels)
     nothing.features.sum().backward()
 
 
 def test_scaling_scene_and_voxel_by_a_power_of_two(make_fine, make_room):
     tokens, geometry, images = make_room()
-    poses = geometry.cameras.world_to_camera.clone()
-    poses[..., :3, 3] *= 4
-    cameras = Cameras(poses, geometry.cameras.intrinsics, geometry.cameras.size)
+    cameras = scale_translations(geometry.cameras, torch.tensor([4.0]))
     small = make_fine()(tokens, geometry, images)
     large = make_fine(voxel_size=0.5)(tokens, replace(geometry, depth=geometry.depth * 4, cameras=cameras), images)
     assert torch.equal(small.grid, large.grid)
     assert torch.equal(small.features, large.features)
     torch.testing.assert_close(4 * small.centroid, large.centroid)
     torch.testing.assert_close(4 * small.voxel_size, large.voxel_size)
-
-
-def take_views(inputs, views):
-    tokens, geometry, images = inputs
-    picked = replace(
-        geometry,
-        depth=geometry.depth[:, views],
-        depth_conf=geometry.depth_conf[:, views],
-        cameras=geometry.cameras.select(torch.tensor(views)),
-    )
-    tokens = replace(tokens, patch=tuple(tap[:, views] for tap in tokens.patch), camera=tokens.camera[:, views])
-    return tokens, picked, images[:, views]
 
 
 def test_duplicated_views_add_no_voxels_and_new_views_few(make_fine, make_room):
@@ -136,9 +119,7 @@ def test_cap_keeps_the_most_confident_and_says_so(make_fine, make_room, caplog):
 
 def test_without_gradient_views_are_pooled_a_few_at_a_time_to_the_same_voxels(make_fine, make_room):
     tokens, geometry, images = make_room(scenes=2, views=3)
-    depth = geometry.depth.clone()
-    depth[0, 1, :20] = 0  # pixels that no voxel uses
-    geometry = replace(geometry, depth=depth)
+    geometry.depth[0, 1, :20] = 0  # pixels that no voxel uses
     module = make_fine()
     whole = module(tokens, geometry, images)
     seen = []
@@ -178,13 +159,11 @@ def test_moments_are_the_covariances_of_the_pixels(make_fine, make_room):
 
 def test_fringes_of_silhouettes_make_no_voxels(make_fine, make_room):
     tokens, geometry, images = make_room(views=1)
-    depth = torch.full_like(geometry.depth, 1.0)
-    depth[..., 40:] = 2.0
-    depth[..., 40:42] = torch.tensor([1.3, 1.7])
-    geometry = replace(geometry, depth=depth)
+    geometry.depth[..., :40], geometry.depth[..., 42:] = 1.0, 2.0
+    geometry.depth[..., 40:42] = torch.tensor([1.3, 1.7])
     kept = make_fine()(tokens, geometry, images)
     clean = make_fine(drop_fringes=True)(tokens, geometry, images)
-    assert int(kept.count.sum()) - int(clean.count.sum()) == 2 * depth.shape[-2]
+    assert int(kept.count.sum()) - int(clean.count.sum()) == 2 * 42
 
     def between(voxels):
         z = (voxels.centroid @ geometry.cameras.world_to_camera[0, 0, :3, :3].T)[:, 2]

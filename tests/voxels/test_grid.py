@@ -74,25 +74,19 @@ def test_shifting_by_whole_voxels_shifts_the_grid_only():
     batch = torch.zeros(len(points), dtype=torch.int64)
     size = torch.tensor([0.125])
     shift = torch.tensor([3, -5, 40])
-    plan = planned(points, batch, size=size)
-    moved = planned(points + shift * 0.125, batch, size=size)
+    plan, moved = (planned(places, batch, size=size) for places in (points, points + shift * 0.125))
     assert torch.equal(moved.grid, plan.grid + shift)
     assert torch.equal(pool_mean(values, weights, plan), pool_mean(values, weights, moved))
 
 
-def test_cells_too_far_apart_are_refused_by_name():
-    far = torch.tensor([[0, 0, 0], [1 << 21, 1 << 21, 1 << 21]])
-    batch = torch.tensor([0, 1])
-    with pytest.raises(ValueError, match="increase voxel_size"):
-        mixed_radix_keys(far, batch)
-
-
-def test_points_on_faces_fall_by_division():
+def test_points_on_faces_fall_by_division_and_cells_too_far_apart_are_refused_by_name():
     size = torch.tensor([0.1])
     count = torch.arange(-50, 50, dtype=torch.float64)
     points = torch.stack((count * float(size), count * 0, count * 0), 1)
     cells = point_cells(points, torch.zeros(100, dtype=torch.int64), size)
     assert torch.equal(torch.floor(cells[:, 0]), count)
+    with pytest.raises(ValueError, match="increase voxel_size"):
+        mixed_radix_keys(torch.tensor([[0, 0, 0], [1 << 21, 1 << 21, 1 << 21]]), torch.tensor([0, 1]))
 
 
 def test_voxel_size_guard():
@@ -101,9 +95,8 @@ def test_voxel_size_guard():
     intrinsics = torch.diag(torch.tensor([50.0, 50, 1])).expand(2, 1, 3, 3)
     cameras = Cameras(torch.eye(4).expand(2, 1, 4, 4), intrinsics, (4, 4))
     geometry = Geometry(depth, torch.ones_like(depth), cameras, torch.ones(2))
-    torch.testing.assert_close(scene_voxel_size(geometry, 0.002, 1.5), torch.tensor([0.06, 0.002]))
-    torch.testing.assert_close(scene_voxel_size(geometry, 0.1, 1.5), torch.tensor([0.1, 0.1]))
-    torch.testing.assert_close(scene_voxel_size(geometry, 0.002, 0), torch.tensor([0.002, 0.002]))
+    for options, sizes in (((0.002, 1.5), [0.06, 0.002]), ((0.1, 1.5), [0.1, 0.1]), ((0.002, 0), [0.002, 0.002])):
+        torch.testing.assert_close(scene_voxel_size(geometry, *options), torch.tensor(sizes))
 
 
 @pytest.mark.parametrize(("shared", "module", "warned"), [(1, "fine", True), (2, "fine", False), (1, "coarse", False)])

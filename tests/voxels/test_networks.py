@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from tests.voxels.test_pointmlp import network
+from vg2gt.method import PointMLP
 
 SIZE = torch.full((2,), 0.125)
 
@@ -14,7 +15,7 @@ def net(request, make_ptv3):
 
 
 def features_of(grid, net):
-    channels = 6 if type(net).__name__ == "PointMLP" else 8
+    channels = 6 if isinstance(net, PointMLP) else 8
     return torch.randn(len(grid), channels, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
 
 
@@ -36,8 +37,7 @@ def test_a_batch_equals_separate_runs(random_voxels, net):
     grid = grid * torch.where(batch == 1, 9, 1)[:, None]  # extents of different bit lengths
     features = features_of(grid, net)
     together = net(features, grid, batch, SIZE)
-    tolerance = 1e-12 if type(net).__name__ == "PointMLP" else 1e-10
-    for scene in (0, 1):
-        rows = batch == scene
+    tolerance = 1e-12 if isinstance(net, PointMLP) else 1e-10
+    for rows in (batch == 0, batch == 1):
         alone = net(features[rows], grid[rows], torch.zeros_like(batch[rows]), SIZE[:1])
         torch.testing.assert_close(together[rows], alone, atol=tolerance, rtol=0)

@@ -24,24 +24,19 @@ def points(count: int = 3000, scale: float = 1.0) -> tuple[list[Tensor], VoxelPl
     return [dense, (cells - cells.floor() - 0.5).float(), weight, confidence], plan
 
 
-def with_gradients(inputs: list[Tensor], plan: VoxelPlan, plain: bool) -> list[Tensor]:
+def plain(dense: Tensor, offset: Tensor, weight: Tensor, confidence: Tensor, plan: VoxelPlan) -> Tensor:
+    return pool_mean(point_features(dense, offset, weight), confidence, plan)
+
+
+def exactly(dense: Tensor, offset: Tensor, weight: Tensor, confidence: Tensor, plan: VoxelPlan) -> Tensor:
+    """In double precision; ``point_features`` itself goes to float32."""
+    return pool_mean(torch.nn.functional.gelu(dense + offset @ weight.t()), confidence, plan)
+
+
+def with_gradients(inputs: list[Tensor], plan: VoxelPlan, pool=pool_point_features) -> list[Tensor]:
     """The pooled features and the gradients of a weighted sum of them."""
     leaves = [tensor.clone().requires_grad_() for tensor in inputs]
-    dense, offset, weight, confidence = leaves
-    if plain:
-        pooled = pool_mean(point_features(dense, offset, weight), confidence, plan)
-    else:
-        pooled = pool_point_features(dense, offset, weight, confidence, plan)
-    seen = torch.linspace(-1, 1, pooled.numel(), dtype=pooled.dtype).view_as(pooled)
-    (pooled * seen).sum().backward()
-    return [pooled.detach(), *(leaf.grad for leaf in leaves if leaf.grad is not None)]
-
-
-def in_float64(inputs: list[Tensor], plan: VoxelPlan) -> list[Tensor]:
-    """The plain functions with the inputs in double precision; ``point_features`` itself goes to float32."""
-    leaves = [tensor.double().requires_grad_() for tensor in inputs]
-    dense, offset, weight, confidence = leaves
-    pooled = pool_mean(torch.nn.functional.gelu(dense + offset @ weight.t()), confidence, plan)
+    pooled = pool(*leaves, plan)
     seen = torch.linspace(-1, 1, pooled.numel(), dtype=pooled.dtype).view_as(pooled)
     (pooled * seen).sum().backward()
     return [pooled.detach(), *(leaf.grad for leaf in leaves if leaf.grad is not None)]
@@ -51,7 +46,8 @@ def in_float64(inputs: list[Tensor], plan: VoxelPlan) -> list[Tensor]:
 def test_values_and_gradients_are_the_plain_ones(scale: float) -> None:
     inputs, plan = points(scale=scale)
     assert 0 < int((plan.voxel_of < 0).sum()) < 600
-    compiled, exact = with_gradients(inputs, plan, plain=False), in_float64(inputs, plan)
+    compiled = with_gradients(inputs, plan)
+    exact = with_gradients([tensor.double() for tensor in inputs], plan, exactly)
     assert len(compiled) == len(exact) == 5
     for found, wanted in zip(compiled, exact, strict=True):
         assert float((found - wanted).abs().max()) < 2e-6 * float(wanted.abs().max().clamp(min=1))
@@ -59,24 +55,20 @@ def test_values_and_gradients_are_the_plain_ones(scale: float) -> None:
 
 def test_threads_do_not_change_a_bit() -> None:
     inputs, plan = points()
-    threads = torch.get_num_threads()
-    try:
-        results = []
-        for number in (1, 2, 3):
-            torch.set_num_threads(number)
-            results.append(with_gradients(inputs, plan, plain=False))
-    finally:
-        torch.set_num_threads(threads)
+    threads, results = torch.get_num_threads(), []
+    for number in (1, 2, 3, threads):
+        torch.set_num_threads(number)
+        results.append(with_gradients(inputs, plan))
     assert all(torch.equal(a, b) for other in results[1:] for a, b in zip(results[0], other, strict=True))
 
 
 def test_points_in_no_voxel_have_no_gradient_and_no_say() -> None:
     inputs, plan = points()
     left_out = plan.voxel_of < 0
-    before = with_gradients(inputs, plan, plain=False)
+    before = with_gradients(inputs, plan)
     changed = [inputs[0].clone(), *inputs[1:]]
     changed[0][left_out] = 1e6
-    after = with_gradients(changed, plan, plain=False)
+    after = with_gradients(changed, plan)
     assert torch.equal(before[0], after[0])
     for gradient in (after[1], after[2], after[4]):
         assert not gradient[left_out].any()
@@ -88,7 +80,7 @@ def test_nan_reaches_its_voxel_and_no_other() -> None:
     inputs, plan = points()
     row = int(plan.order[plan.starts[5]])
     inputs[0][row, 3] = torch.nan
-    pooled, of_dense, _, of_weight, of_confidence = with_gradients(inputs, plan, plain=False)
+    pooled, of_dense, _, of_weight, of_confidence = with_gradients(inputs, plan)
     hit = pooled.isnan()
     assert hit[5, 3]
     assert int(hit.sum()) == 1
@@ -100,6 +92,6 @@ def test_nan_reaches_its_voxel_and_no_other() -> None:
 def test_dropped_voxels_are_left_out() -> None:
     inputs, plan = points()
     keep = torch.arange(len(plan)) % 3 > 0
-    compiled = with_gradients(inputs, plan.select(keep), plain=False)
-    plain = with_gradients(inputs, plan.select(keep), plain=True)
-    torch.testing.assert_close(compiled, plain, atol=2e-5, rtol=1e-5)
+    compiled = with_gradients(inputs, plan.select(keep))
+    expected = with_gradients(inputs, plan.select(keep), plain)
+    torch.testing.assert_close(compiled, expected, atol=2e-5, rtol=1e-5)

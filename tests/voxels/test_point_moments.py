@@ -15,6 +15,12 @@ VIEWS = 7
 CHUNK = 3  # of the views, where the pass is plain
 
 
+@pytest.fixture(params=[True, False])
+def compiled(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the compiled pass and by the plain one."""
+    monkeypatch.setattr(point_moments, "compilable", lambda *_: request.param)
+
+
 def points(per_view: int = 431) -> tuple[list[Tensor], VoxelPlan]:
     """Values, depths, confidences and views of points in two scenes, a tenth of them in no voxel, and their plan."""
     generator = torch.Generator().manual_seed(5)
@@ -50,12 +56,11 @@ def by_definition(inputs: list[Tensor], plan: VoxelPlan) -> Moments:
     return spread, cross, eye, pixel
 
 
-@pytest.mark.parametrize("compiled", [True, False])
-def test_moments_are_those_of_the_definition(compiled: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.usefixtures("compiled")
+def test_moments_are_those_of_the_definition() -> None:
     inputs, plan = points()
     assert 0 < int((plan.voxel_of < 0).sum()) < 600
     assert int(plan.counts.min()) == 1
-    monkeypatch.setattr(point_moments, "compilable", lambda *_: compiled)
     for found, exact in zip(pooled(inputs, plan), by_definition(inputs, plan), strict=True):
         assert float((found - exact).abs().max()) < 1e-6
 
@@ -76,9 +81,8 @@ def test_every_point_has_its_own_view(per_view: int) -> None:
     assert not cross.abs().max() > 1e-6
 
 
-@pytest.mark.parametrize("compiled", [True, False])
-def test_points_in_no_voxel_have_no_say(compiled: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(point_moments, "compilable", lambda *_: compiled)
+@pytest.mark.usefixtures("compiled")
+def test_points_in_no_voxel_have_no_say() -> None:
     inputs, plan = points()
     before, left_out = pooled(inputs, plan), plan.voxel_of < 0
     inputs = [tensor.clone() for tensor in inputs]
@@ -87,32 +91,14 @@ def test_points_in_no_voxel_have_no_say(compiled: bool, monkeypatch: pytest.Monk
     assert all(torch.equal(a, b) for a, b in zip(before, pooled(inputs, plan), strict=True))
 
 
-def spoil_place(inputs: list[Tensor], row: int) -> None:
-    inputs[0][row, 1] = torch.nan
-
-
-def spoil_color(inputs: list[Tensor], row: int) -> None:
-    inputs[0][row, 5] = torch.nan
-
-
-def spoil_depth(inputs: list[Tensor], row: int) -> None:
-    inputs[1][row] = torch.nan
-
-
-def spoil_confidence(inputs: list[Tensor], row: int) -> None:
-    inputs[2][row] = torch.nan
-
-
-@pytest.mark.parametrize("compiled", [True, False])
-@pytest.mark.parametrize(
-    ("spoil", "numbers"), [(spoil_place, 5 + 3), (spoil_color, 3), (spoil_depth, 1), (spoil_confidence, 9 + 9 + 3 + 1)]
-)
-def test_nan_reaches_its_voxel_and_no_other(spoil, numbers, compiled, monkeypatch):
+# place, colour, depth, confidence
+@pytest.mark.usefixtures("compiled")
+@pytest.mark.parametrize(("part", "column", "numbers"), [(0, 1, 5 + 3), (0, 5, 3), (1, 0, 1), (2, 0, 9 + 9 + 3 + 1)])
+def test_nan_reaches_its_voxel_and_no_other(part, column, numbers):
     """Training finds faults by what is not finite."""
-    monkeypatch.setattr(point_moments, "compilable", lambda *_: compiled)
     inputs, plan = points()
     before, voxel = pooled(inputs, plan), 8
-    spoil(inputs, int(plan.order[plan.starts[voxel]]))
+    inputs[part].view(len(plan.voxel_of), -1)[plan.order[plan.starts[voxel]], column] = torch.nan
     after = pooled(inputs, plan)
     others = torch.arange(len(plan)) != voxel
     assert all(torch.equal(a[others], b[others]) for a, b in zip(before, after, strict=True))

@@ -13,20 +13,15 @@ def network(**options):
     return PointMLP(6, **{"channels": 16, "stages": 4, "window": 8, **options}).double()
 
 
-def features_of(grid):
-    return torch.randn(len(grid), 6, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
-
-
 def test_checkpointing_changes_no_gradient(random_voxels):
     grid, batch = random_voxels()
-    features = features_of(grid)
+    features = torch.randn(len(grid), 6, dtype=torch.float64)
     grads = []
     for checkpoint in (False, True):
         net = network(checkpoint=checkpoint)
         net(features, grid, batch, SIZE).square().sum().backward()
         grads.append([p.grad for p in net.parameters()])
-    for a, b in zip(*grads, strict=True):
-        torch.testing.assert_close(a, b)
+    torch.testing.assert_close(*grads)
 
 
 def stage_as_written(stage, features, positions, windows, batch):
@@ -36,13 +31,12 @@ def stage_as_written(stage, features, positions, windows, batch):
         scenes = batch[group.rows[:, 0]]
         for rows, scene in zip(group.rows, scenes, strict=True):
             values = torch.cat((features, positions), 1)[rows]
-            deviation, parts = values - values.mean(0), (slice(None, features.shape[1]), slice(features.shape[1], None))
             sigmas = []
-            for part in parts:
-                of_scene = torch.cat((features, positions), 1)[group.rows[scenes == scene]][..., part]
+            for part in (features, positions):
+                of_scene = part[group.rows[scenes == scene]]
                 variance = (of_scene - of_scene.mean(1, keepdim=True)).square().mean()
-                sigmas.append(((variance + 1e-10).sqrt() + 1e-5).expand(deviation[:, part].shape[1]))
-            affine = stage.alpha * deviation / torch.cat(sigmas) + stage.beta
+                sigmas.append(((variance + 1e-10).sqrt() + 1e-5).expand(part.shape[1]))
+            affine = stage.alpha * (values - values.mean(0)) / torch.cat(sigmas) + stage.beta
             hidden = stage.before(stage.inner(torch.cat((affine, features[rows]), 1)))
             context = stage.after(hidden.amax(0, keepdim=True)).expand_as(hidden)
             updates.setdefault(group.rows.shape[1], []).append(stage.out(torch.cat((hidden, context), 1)))
@@ -65,9 +59,7 @@ def test_a_stage_is_what_the_paper_says(counts, few_sizes):
     outputs = [stage(features, positions, windows), stage_as_written(stage, features, positions, plain, batch)]
     torch.testing.assert_close(*outputs)
     inputs = [features, *stage.parameters()]
-    gradients = [torch.autograd.grad(out.sin().sum(), inputs) for out in outputs]
-    for found, exact in zip(*gradients, strict=True):
-        torch.testing.assert_close(found, exact)
+    torch.testing.assert_close(*(torch.autograd.grad(out.sin().sum(), inputs) for out in outputs))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
@@ -79,8 +71,7 @@ def test_the_largest_of_a_window_and_its_gradient_are_torchs(dtype):
     ours, theirs = (values.clone().requires_grad_() for _ in range(2))
     out, exact = window_max(ours), theirs.amax(1)
     assert torch.equal(out, exact)
-    (found,), (expected,) = (
-        torch.autograd.grad((result * weight).sum(), value) for result, value in ((out, ours), (exact, theirs))
-    )
+    pairs = ((out, ours), (exact, theirs))
+    found, expected = (torch.autograd.grad((result * weight).sum(), value)[0] for result, value in pairs)
     assert torch.equal(found, expected)
     assert (found != 0).sum((1, 2)).max() == 48  # shared among all of the window that is constant

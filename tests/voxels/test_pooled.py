@@ -6,16 +6,8 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from tests.voxels.conftest import take_views
 from vg2gt.method.pooled import merge
-from vg2gt.types import Geometry, Tokens
-
-
-def views_of(tokens: Tokens, geometry: Geometry, images, rows: slice):
-    some = replace(tokens, patch=tuple(tap[:, rows] for tap in tokens.patch), camera=tokens.camera[:, rows])
-    part = Geometry(
-        geometry.depth[:, rows], geometry.depth_conf[:, rows], geometry.cameras.select(rows), geometry.scale
-    )
-    return some, part, images[:, rows]
 
 
 @pytest.mark.parametrize("moments", [False, True])
@@ -25,7 +17,7 @@ def test_parts_merge_into_what_all_views_give(make_fine, make_room, moments):
     size = torch.tensor([0.125])
     with torch.no_grad():
         whole = module(*inputs)
-    parts = [module.pool(*views_of(*inputs, rows), size) for rows in (slice(0, 2), slice(2, 3), slice(3, 5))]
+    parts = [module.pool(*take_views(inputs, views), size) for views in ([0, 1], [2], [3, 4])]
     pooled = merge(parts)
     assert len(pooled) < sum(map(len, parts))
     ours = module.refine(pooled, size)
@@ -40,10 +32,8 @@ def test_parts_merge_into_what_all_views_give(make_fine, make_room, moments):
         assert_close(ours.moments.cross, whole.moments.cross, atol=1e-6, rtol=0)
         turned = (ours.moments.normal * whole.moments.normal).sum(-1)
         assert turned.quantile(0.01) > 0.999
-    again = merge(parts)
-    assert all(
-        torch.equal(a, b) for a, b in zip(vars(pooled).values(), vars(again).values(), strict=True) if a is not None
-    )
+    pairs = zip(vars(pooled).values(), vars(merge(parts)).values(), strict=True)
+    assert all(torch.equal(a, b) for a, b in pairs if a is not None)
 
 
 def test_a_voxel_of_one_part_stays_as_it_is(make_fine, make_room):
@@ -52,9 +42,7 @@ def test_a_voxel_of_one_part_stays_as_it_is(make_fine, make_room):
     part = module.pool(*inputs, size)
     with torch.no_grad():
         whole = module(*inputs)
-    nothing = part.rows(slice(0, 0))
-    merged = merge([nothing, part])
-    ours = module.refine(merged, size)
+    ours = module.refine(merge([part.rows(slice(0, 0)), part]), size)
     for name in ("features", "colors", "centroid"):
         assert torch.equal(getattr(ours, name), getattr(whole, name))
     other = part.rows(slice(0, 3))
@@ -67,5 +55,5 @@ def test_the_cap_holds_for_merged_voxels(make_fine, make_room):
     module = make_fine(max_voxels=50)
     with torch.no_grad():
         whole = module(*inputs)
-    parts = [module.pool(*views_of(*inputs, rows), size) for rows in (slice(0, 2), slice(2, 4))]
+    parts = [module.pool(*take_views(inputs, views), size) for views in ([0, 1], [2, 3])]
     assert torch.equal(module.refine(merge(parts), size).grid, whole.grid)

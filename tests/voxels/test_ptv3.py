@@ -7,34 +7,32 @@ from vg2gt.method import PTv3
 SIZE = torch.full((2,), 0.125)
 
 
-def features_of(grid, channels=8):
-    return torch.randn(len(grid), channels, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
-
-
-def test_orders_are_shuffled_in_training_only_and_from_the_generator(random_voxels, make_ptv3):
+@pytest.fixture
+def voxels(random_voxels):
     grid, batch = random_voxels()
-    features, net = features_of(grid), make_ptv3().double()
+    features = torch.randn(len(grid), 8, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    return features, grid, batch, SIZE
+
+
+def test_orders_are_shuffled_in_training_only_and_from_the_generator(voxels, make_ptv3):
+    net = make_ptv3().double()
 
     def run(seed):
-        generator = None if seed is None else torch.Generator().manual_seed(seed)
-        return net(features, grid, batch, SIZE, generator=generator)
+        return net(*voxels, generator=None if seed is None else torch.Generator().manual_seed(seed))
 
     net.train()
     results = [run(seed) for seed in range(4)]
     assert torch.equal(results[0], run(0))
     assert any(not torch.equal(results[0], other) for other in results[1:])
-    assert torch.equal(run(None), net.eval()(features, grid, batch, SIZE))
+    assert torch.equal(run(None), net.eval()(*voxels))
     assert torch.equal(run(0), run(1))
 
 
-def test_drop_path_acts_in_training_only(random_voxels, make_ptv3):
-    grid, batch = random_voxels()
-    features, net = features_of(grid), make_ptv3(drop_path=0.5).double()
+def test_drop_path_acts_in_training_only(voxels, make_ptv3):
+    net = make_ptv3(drop_path=0.5).double()
     torch.manual_seed(0)
-    first = net(features, grid, batch, SIZE)
-    assert not torch.equal(first, net(features, grid, batch, SIZE))
-    net.eval()
-    assert torch.equal(net(features, grid, batch, SIZE), make_ptv3().double().eval()(features, grid, batch, SIZE))
+    assert not torch.equal(net(*voxels), net(*voxels))
+    assert torch.equal(net.eval()(*voxels), make_ptv3().double().eval()(*voxels))
 
 
 @pytest.mark.parametrize("case", [0, 1])

@@ -2,13 +2,7 @@ import pytest
 import torch
 
 from vg2gt.kernels.curve_codes import hilbert_codes, hilbert_reference, z_codes
-from vg2gt.method.serialization import (
-    ORDERS,
-    WindowGroup,
-    make_windows,
-    serial_codes,
-    serial_keys,
-)
+from vg2gt.method.serialization import ORDERS, WindowGroup, make_windows, serial_codes, serial_keys
 
 
 def cube(bits):
@@ -33,7 +27,7 @@ def test_compiled_hilbert_codes_are_those_of_the_reference(bits):
     assert torch.equal(hilbert_codes(transposed, bits), hilbert_reference(transposed, bits))
 
 
-def test_dropping_three_bits_gives_the_parent():
+def test_dropping_three_bits_gives_the_parent_and_z_order_interleaves_bits():
     cells = cube(4)
     assert torch.equal(z_codes(cells) >> 3, z_codes(cells >> 1))
     assert torch.equal(hilbert_codes(cells, 4) >> 3, hilbert_codes(cells >> 1, 3))
@@ -41,9 +35,6 @@ def test_dropping_three_bits_gives_the_parent():
         codes = serial_codes(cells, 4, order) >> 3
         parents = (cells >> 1) @ torch.tensor([64, 8, 1])
         assert torch.stack((codes, parents), 1).unique(dim=0).shape[0] == 8**3
-
-
-def test_z_order_interleaves_bits():
     cells = torch.tensor([[1, 0, 0], [0, 1, 0], [0, 0, 1], [2, 0, 0], [(1 << 21) - 1, 0, 0]])
     spread = sum(1 << (3 * bit + 2) for bit in range(21))
     assert z_codes(cells).tolist() == [4, 2, 1, 32, spread]

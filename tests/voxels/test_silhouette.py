@@ -33,6 +33,6 @@ def test_three_pixels_on_either_side_of_a_step_are_beside_it(step: float, beside
 
 def test_what_lies_between_foreground_and_background_is_beside_a_silhouette() -> None:
     depth = _blurred_step(1.0, 1.12)  # too small a step for a surface to break off
-    assert near_silhouettes(depth).flatten().nonzero().flatten().tolist() == [
-        16 * row + column for row in range(12) for column in (7, 8)
-    ]
+    expected = torch.zeros(1, 12, 16, dtype=torch.bool)
+    expected[..., 7:9] = True
+    assert torch.equal(near_silhouettes(depth), expected)

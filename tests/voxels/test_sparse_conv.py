@@ -37,12 +37,9 @@ def test_equals_dense_convolution_with_gradients(kernel_size, held, find, random
     assert all(len(i) for i, _ in neighbor_pairs(grid, batch, kernel_size))
     out, dense = conv(features, pairs), dense_result(conv, features, grid, batch)
     torch.testing.assert_close(out, dense, atol=1e-12, rtol=1e-12)
-    probe = torch.randn_like(out)
-    inputs = (features, conv.weight, conv.bias)
-    for ours, reference in zip(
-        torch.autograd.grad(out, inputs, probe), torch.autograd.grad(dense, inputs, probe), strict=True
-    ):
-        torch.testing.assert_close(ours, reference, atol=1e-11, rtol=1e-11)
+    probe, inputs = torch.randn_like(out), (features, conv.weight, conv.bias)
+    ours, reference = (torch.autograd.grad(result, inputs, probe) for result in (out, dense))
+    torch.testing.assert_close(ours, reference, atol=1e-11, rtol=1e-11)
 
 
 def test_pairs_are_the_same_however_many_offsets_are_looked_up_at_once(random_voxels, monkeypatch):

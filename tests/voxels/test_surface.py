@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.voxels.test_coarse import perturb
 from vg2gt.method import coarse
 from vg2gt.method.additions.surface_evidence import (
     PointFrames,
@@ -43,14 +44,11 @@ def measured(frames: PointFrames, local: tuple[float, float, float], voxel_size:
     return frames.in_camera(to_surface[None], torch.tensor([voxel_size]))[0].tolist()
 
 
-def test_frames_of_a_frontal_plane() -> None:
+def test_frames_of_a_frontal_plane_and_of_two_views() -> None:
     frames = frame(row=13)
     torch.testing.assert_close(frames.ray, torch.tensor([[0.1, 0, 1]]))
     torch.testing.assert_close(frames.normal, torch.tensor([[0.0, 0, -1]]))
     assert frames.depth.tolist() == [2]
-
-
-def test_every_point_has_its_own_views_rotation() -> None:
     depth, camera = plane()
     poses = torch.cat((camera.world_to_camera, torch.eye(4)[None, None]), 1)
     both = Cameras(poses, camera.intrinsics.expand(1, 2, 3, 3), camera.size)
@@ -58,14 +56,11 @@ def test_every_point_has_its_own_views_rotation() -> None:
     assert torch.equal(frames.rotation, torch.stack((TURN, torch.eye(3))))
 
 
-def test_change_of_depth_is_in_units_of_two_percent_and_positive_behind():
+def test_change_of_depth_is_in_units_of_two_percent_along_the_ray_to_the_tangent_plane():
     # half a voxel of 8 cm behind: 4 cm of 2 m are 2 %
     assert measured(frame(), (0.3, 0.1, 0.5)) == pytest.approx([0.3, 0.1, 0.5, 1.0])
     assert measured(frame(), (0.3, 0.1, -0.5)) == pytest.approx([0.3, 0.1, -0.5, -1.0])
     assert measured(frame(), (0, 0, 0.5), voxel_size=0.04)[3] == pytest.approx(0.5)
-
-
-def test_change_of_depth_is_along_the_ray_to_the_tangent_plane():
     # (1, 0, 1/2) lies in the plane z = x / 2: the surface is where the point is
     assert measured(frame(slope=0.5), (1, 0, 0.5))[3] == pytest.approx(0, abs=1e-6)
     # the plane z = x / 2 - 1/4 through a point half a voxel aside: a quarter of a voxel, half a unit, nearer
@@ -127,14 +122,11 @@ def test_each_view_is_told_how_far_it_is_from_the_surface_both_agree_on(confiden
 # ------------------------------------------------------------------------------------------------- the gate
 
 
-def test_disagreement_is_the_median_of_a_scenes_usable_points() -> None:
+def test_disagreement_is_a_scenes_median_and_the_gate_its_third_power_and_no_wider_than_one_and_a_half() -> None:
     change = torch.tensor([0.1, -0.5, 0.3, 9.0, -2.0, 1.0])
     usable = torch.tensor([True, True, True, False, True, False])
     found = disagreement(change, usable, torch.tensor([0, 0, 0, 0, 1, 2]), 4)
     torch.testing.assert_close(found, torch.tensor([0.3, 2.0, 0.0, 0.0]))
-
-
-def test_the_gate_closes_with_the_third_power_and_opens_no_wider_than_one_and_a_half() -> None:
     torch.testing.assert_close(gate(torch.tensor([0.0, 0.2, 0.4, 3.0])), torch.tensor([0.0, 0.125, 1.0, 1.5]))
 
 
@@ -158,7 +150,7 @@ def test_what_is_changed_follows_the_views_disagreement(apart: float, factor: fl
     torch.testing.assert_close(gated, share * free, atol=1e-4, rtol=1e-3)
 
 
-def test_beside_a_silhouette_there_is_no_evidence(make_room, make_coarse) -> None:
+def test_beside_a_silhouette_there_is_no_evidence_and_a_gate_needs_some(make_room, make_coarse) -> None:
     """Views that disagree by 4 %; the right half of what they see is twice as far."""
     tokens, geometry = make_room(views=2)[0], two_views_of_a_plane(1.04, 1.0)
     geometry.depth[..., 42:] *= 2
@@ -171,9 +163,6 @@ def test_beside_a_silhouette_there_is_no_evidence(make_room, make_coarse) -> Non
     points = coarse.PatchPoints(geometry, 7, torch.tensor([0.15]), away_from_silhouettes=True)
     columns = points.rows % 12
     assert set(columns[~points.clear].tolist()) == {5, 6}
-
-
-def test_a_gate_needs_evidence(make_coarse) -> None:
     with pytest.raises(ValueError, match=r"coarse\.gate=true.*coarse\.surface_evidence=true"):
         make_coarse(gate=True, surface_evidence=False)
 
@@ -211,14 +200,6 @@ def test_the_papers_module_sees_the_papers_inputs(make_room, make_coarse) -> Non
     assert [tuple(layer.weight.shape[2:]) for layer in (module.fuse[0], module.fuse[2])] == [(1, 1), (1, 1)]
 
 
-def result(module: coarse.CoarseModule, tokens, geometry: Geometry) -> Tensor:
-    torch.manual_seed(0)
-    for branch in module.zero:
-        assert isinstance(branch, torch.nn.Conv2d)
-        torch.nn.init.normal_(branch.weight, std=0.1)
-    return module.eval()(tokens, geometry).patch[-1]
-
-
 @pytest.mark.parametrize(
     ("option", "value", "voxel_channels", "fused_channels", "kernel"),
     [
@@ -232,7 +213,7 @@ def test_every_switch_adds_what_it_names(option, value, voxel_channels, fused_ch
     assert module.ptv3.embedding["stem"]["conv"].weight.shape[-1] == voxel_channels
     assert module.fuse[0].weight.shape[1:] == (fused_channels, kernel, kernel)
     tokens, geometry, _ = make_room()
-    assert torch.isfinite(result(module, tokens, geometry)).all()
+    assert perturb(module).eval()(tokens, geometry).patch[-1].isfinite().all()
 
 
 def test_the_skip_is_the_patches_own_embedding(make_room, make_coarse) -> None:

@@ -155,6 +155,8 @@ def _check_trainer(config: DictConfig) -> None:
             "trainer.accumulate_grad_batches is not supported: each batch is determined by the optimiser step; for "
             "larger steps, raise data.max_images"
         )
+    if (clipping := config.trainer.get("gradient_clip_algorithm")) not in (None, "norm"):
+        raise ValueError(f"trainer.gradient_clip_algorithm={clipping} is not supported; use norm")
 
 
 @memory_advice(TRAINING)

@@ -209,13 +209,7 @@ class VG2GTModule(lightning.LightningModule):
         gradient_clip_val: int | float | None = None,
         gradient_clip_algorithm: str | None = None,
     ) -> None:
-        """Clips the global gradient norm; skips the step on all ranks if a loss or gradient is non-finite on any.
-
-        Raises:
-            ValueError: if ``gradient_clip_algorithm`` is not ``norm``.
-        """
-        if gradient_clip_algorithm not in (None, "norm"):
-            raise ValueError(f"trainer.gradient_clip_algorithm={gradient_clip_algorithm} is not supported; use norm")
+        """Clips the global gradient norm; skips the step on all ranks if a loss or gradient is non-finite on any."""
         limit = float(gradient_clip_val) if gradient_clip_val and gradient_clip_val > 0 else float("inf")
         norm = nn.utils.clip_grad_norm_(self.model.trained_parameters(), limit)
         bad = torch.ones_like(norm) if self._cause is not None else (~norm.isfinite()).to(norm.dtype)

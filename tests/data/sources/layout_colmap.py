@@ -11,14 +11,14 @@ from vg2gt.geometry.cameras import unproject
 from vg2gt.io import colmap_from_views, write_colmap
 from vg2gt.types import Cameras
 
-from .layouts import SIZE, Layout, pixels, save
+from .layouts import SIZE, Layout, cameras_of, pixels, save
 
 POINTS_A_VIEW = 60
 
 
 def write(root: Path, frames: Frames, text: bool = False) -> None:
     """``images/left/`` and ``sparse/0``, with points at pixels of every view."""
-    cameras = Cameras(frames.world_to_camera[None].double(), frames.intrinsics[None].double(), SIZE)
+    cameras = cameras_of(frames)
     names = [f"left/{9 * i:03d}.png" for i in range(len(frames.images))]
     for name, image in zip(names, pixels(frames), strict=True):
         save(root / "statue" / "images" / name, image)
@@ -39,13 +39,9 @@ def model_of(cameras: Cameras, names: list[str], world: np.ndarray, track: int =
     return colmap_from_views(cameras, names, positions, sources=(np.tile(points, track), views, places))
 
 
-def _read(root: Path, depth: str | None = None) -> COLMAP:
-    return COLMAP(str(root), depth=depth)
-
-
 LAYOUTS = {
-    "colmap_binary": Layout(write, _read, depth_quantum=None),
-    "colmap_text": Layout(partial(write, text=True), _read, depth_quantum=None),
+    "colmap_binary": Layout(write, COLMAP, depth_quantum=None),
+    "colmap_text": Layout(partial(write, text=True), COLMAP, depth_quantum=None),
     # Points are stored in float64: their depth is exact.
-    "colmap_points": Layout(write, partial(_read, depth="points"), depth_quantum=lambda depth: depth * 2e-6),
+    "colmap_points": Layout(write, partial(COLMAP, depth="points"), depth_quantum=lambda depth: depth * 2e-6),
 }

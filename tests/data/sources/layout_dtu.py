@@ -52,27 +52,25 @@ def write_training(root: Path, frames: Frames) -> None:
 
 def write_test(root: Path, frames: Frames) -> None:
     """Scan 65 with JPEG images, and depth beside the scans."""
-    for name in ("images", "cams"):
-        (root / "scans" / "scan65" / name).mkdir(parents=True)
+    folder = root / "scans" / "scan65"
+    (folder / "cams").mkdir(parents=True)
     for i, image in enumerate(pixels(frames)):
-        path = root / "scans" / "scan65" / "images" / f"{i:08d}.jpg"
-        save(path, image)
+        save(folder / "images" / f"{i:08d}.jpg", image)
         text = camera(frames.world_to_camera[i].double().numpy(), frames.intrinsics[i].double().numpy())
-        (root / "scans" / "scan65" / "cams" / f"{i:08d}_cam.txt").write_text(text)
-    (root / "scans" / "scan65" / "pair.txt").write_text("1\n0\n1 1 1.0\n")
+        (folder / "cams" / f"{i:08d}_cam.txt").write_text(text)
+    (folder / "pair.txt").write_text("1\n0\n1 1 1.0\n")
     write_depth(root / "depth" / "scan65", frames)
-
-
-def _read_test(root: Path) -> DTU:
-    return DTU(str(root / "scans"), depth="pfm", depth_root=str(root / "depth"))
 
 
 assert SIZE[0] % 4 != 0, "a quarter of the size must not be mistaken for another"
 
 # Depth is stored in float32 millimetres.
 LAYOUTS = {
-    "dtu_training": Layout(
-        write_training, lambda root: DTUTraining(str(root)), depth_quantum=lambda depth: depth * 1e-6
+    "dtu_training": Layout(write_training, DTUTraining, depth_quantum=lambda depth: depth * 1e-6),
+    "dtu": Layout(
+        write_test,
+        lambda root: DTU(f"{root}/scans", depth="pfm", depth_root=f"{root}/depth"),
+        image_error=0.012,
+        depth_quantum=lambda depth: depth * 1e-6,
     ),
-    "dtu": Layout(write_test, _read_test, image_error=0.012, depth_quantum=lambda depth: depth * 1e-6),
 }

@@ -14,4 +14,4 @@ def write(root: Path, frames: Frames) -> None:
         save(root / "holiday" / f"IMG_{i + 7}.png", image)
 
 
-LAYOUTS = {"image_folder": Layout(write, lambda root: ImageFolder(str(root)), depth_quantum=None)}
+LAYOUTS = {"image_folder": Layout(write, ImageFolder, depth_quantum=None)}

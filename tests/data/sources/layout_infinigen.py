@@ -36,11 +36,7 @@ def _write_rigs(root: Path, frames: Frames) -> None:
     write(root / "scene_7" / "part_2", frames, [f"{8 + i}_0_0001_0" for i in range(len(frames.images))], enlarge=1)
 
 
-def _read(root: Path) -> Infinigen:
-    return Infinigen(str(root))
-
-
 LAYOUTS = {
-    "infinigen": Layout(_write_video, _read, depth_quantum=0.0, frame_ids=tuple(range(48, 54))),
-    "infinigen_insscene": Layout(_write_rigs, _read, depth_quantum=0.0, frame_ids=tuple(range(8, 14))),
+    "infinigen": Layout(_write_video, Infinigen, depth_quantum=0.0, frame_ids=range(48, 54)),
+    "infinigen_insscene": Layout(_write_rigs, Infinigen, depth_quantum=0.0, frame_ids=range(8, 14)),
 }

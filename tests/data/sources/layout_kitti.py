@@ -1,27 +1,29 @@
-"""KITTI raw with annotated depth."""
+"""KITTI raw with annotated depth; Virtual KITTI 2: one camera of one variation."""
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from examples.data_sets.virtual_kitti import VirtualKITTI2
 from vg2gt.data import Frames
 from vg2gt.data.sources import KITTI
 
+from .layout_scannet import JPEG_ERROR
 from .layouts import Layout, camera_to_world, pixels, save
 
 DATE, DRIVE = "2011_09_26", "2011_09_26_drive_0001_sync"
 RADIUS = 6378137.0
 
 # Made up, but as uneven as real ones.
-R_RECT = [[0.9999, 0.0098, -0.0074], [-0.0099, 0.9999, -0.0043], [0.0074, 0.0044, 0.9999]]
-IMU_TO_VELO = ([[0.99999, 0.00075, -0.0021], [-0.00078, 0.9999, -0.0148], [0.002, 0.0148, 0.9999]], [-0.81, 0.32, -0.8])
-VELO_TO_CAM = ([[0.0075, -0.99997, -0.0006], [0.0148, 0.0007, -0.99989], [0.99986, 0.0075, 0.0148]], [0, -0.08, -0.27])
+R_RECT, IMU_TO_VELO, VELO_TO_CAM = Rotation.from_matrix([
+    [[0.9999, 0.0098, -0.0074], [-0.0099, 0.9999, -0.0043], [0.0074, 0.0044, 0.9999]],
+    [[0.99999, 0.00075, -0.0021], [-0.00078, 0.9999, -0.0148], [0.002, 0.0148, 0.9999]],
+    [[0.0075, -0.99997, -0.0006], [0.0148, 0.0007, -0.99989], [0.99986, 0.0075, 0.0148]],
+]).as_matrix()  # fmt: skip
+STEPS = {"velo_to_cam": (VELO_TO_CAM, [0, -0.08, -0.27]), "imu_to_velo": (IMU_TO_VELO, [-0.81, 0.32, -0.8])}
 BASE = np.array([0.0598, -0.0004, 0.0027])
-
-
-def orthonormal(matrix: list[list[float]]) -> np.ndarray:
-    left, _, right = np.linalg.svd(np.array(matrix))
-    return left @ right
 
 
 def transform(rotation: np.ndarray, translation: list[float]) -> np.ndarray:
@@ -34,13 +36,11 @@ def write(root: Path, frames: Frames) -> None:
     """A drive of which frames 5, 6, ... have depth; five before and five after have none."""
     intrinsics = frames.intrinsics[0].double().numpy()
     _write_calibration(root / DATE, intrinsics)
-    steps = [transform(orthonormal(part[0]), part[1]) for part in (VELO_TO_CAM, IMU_TO_VELO)]
-    camera_from_imu = transform(np.eye(3), BASE.tolist()) @ transform(orthonormal(R_RECT), [0, 0, 0]) @ steps[0]
-    imu = camera_to_world(frames) @ (camera_from_imu @ steps[1])
+    velo_to_cam, imu_to_velo = (transform(*step) for step in STEPS.values())
+    imu = camera_to_world(frames) @ transform(R_RECT, BASE.tolist()) @ velo_to_cam @ imu_to_velo
     imu[:, :3, 3] -= imu[0, :3, 3]  # the first packet's latitude fixes the projection's scale
     drive, depth_folder = root / DATE / DRIVE, root / "train" / DRIVE / "proj_depth" / "groundtruth" / "image_02"
-    for folder in (drive / "image_02" / "data", drive / "oxts" / "data", depth_folder):
-        folder.mkdir(parents=True)
+    (drive / "oxts" / "data").mkdir(parents=True)
     count = len(imu)
     for number in range(count + 10):
         i = min(max(number - 5, 0), count - 1)
@@ -58,22 +58,17 @@ def packet(imu_to_world: np.ndarray, latitude: float = 49.0, longitude: float = 
     north = RADIUS * np.log(np.tan(np.pi / 4 + np.deg2rad(latitude) / 2)) + y / scale
     lat = 2 * np.rad2deg(np.arctan(np.exp(north / RADIUS))) - 90
     lon = longitude + np.rad2deg(x / (scale * RADIUS))
-    rotation = imu_to_world[:3, :3]
-    angles = (
-        np.arctan2(rotation[2, 1], rotation[2, 2]),
-        np.arcsin(-rotation[2, 0]),
-        np.arctan2(rotation[1, 0], rotation[0, 0]),
-    )
+    angles = Rotation.from_matrix(imu_to_world[:3, :3]).as_euler("xyz")  # roll, pitch, yaw
     return " ".join(repr(float(value)) for value in (lat, lon, 116 + z, *angles)) + " 0" * 24
 
 
 def _write_calibration(folder: Path, intrinsics: np.ndarray) -> None:
     folder.mkdir(parents=True)
     projection = np.concatenate((intrinsics, (intrinsics @ BASE)[:, None]), 1)
-    fields = {"S_rect_02": [40.0, 30.0], "R_rect_00": orthonormal(R_RECT), "P_rect_02": projection}
+    fields = {"S_rect_02": [40.0, 30.0], "R_rect_00": R_RECT, "P_rect_02": projection}
     _write_fields(folder / "calib_cam_to_cam.txt", fields)
-    for name, (rotation, translation) in (("velo_to_cam", VELO_TO_CAM), ("imu_to_velo", IMU_TO_VELO)):
-        _write_fields(folder / f"calib_{name}.txt", {"R": orthonormal(rotation), "T": translation})
+    for name, (rotation, translation) in STEPS.items():
+        _write_fields(folder / f"calib_{name}.txt", {"R": rotation, "T": translation})
 
 
 def _write_fields(path: Path, fields: dict) -> None:
@@ -81,12 +76,31 @@ def _write_fields(path: Path, fields: dict) -> None:
     path.write_text("calib_time: 09-Jan-2012 13:57:47\n" + "\n".join(lines) + "\n")
 
 
+POSE_HEADING = "frame cameraID r1,1 r1,2 r1,3 t1 r2,1 r2,2 r2,3 t2 r3,1 r3,2 r3,3 t3 0 0 0 1"
+CAMERA_HEADING = "frame cameraID K[0,0] K[1,1] K[0,2] K[1,2]"
+
+
+def write_virtual(root: Path, frames: Frames, variation: str = "Scene06/fog", camera: int = 0) -> None:
+    """Frames 0, 1, ... of a camera; the text files hold a second, displaced camera too. No depth is sky."""
+    folder = root / variation
+    centimetres = np.where(frames.depth.numpy() > 0, frames.depth.numpy() * 100 + 0.5, 65535).astype(np.uint16)
+    poses, cameras = [], []
+    for i, image in enumerate(pixels(frames)):
+        colour = folder / "frames/rgb" / f"Camera_{camera}" / f"rgb_{i:05d}.jpg"
+        save(colour, image)
+        save(folder / "frames/depth" / f"Camera_{camera}" / f"depth_{i:05d}.png", centimetres[i])
+        matrix, pose = frames.intrinsics[i].numpy(), frames.world_to_camera[i].double().numpy()
+        for number in (0, 1):
+            displaced = pose + np.eye(4)[:, :1] @ np.eye(4)[3:] * (number - camera)
+            poses.append([i, number, *displaced.flatten()])
+            cameras.append([i, number, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]])
+    np.savetxt(folder / "extrinsic.txt", poses, "%.9g", header=POSE_HEADING, comments="")
+    np.savetxt(folder / "intrinsic.txt", cameras, "%.9g", header=CAMERA_HEADING, comments="")
+
+
 LAYOUTS = {
+    "virtual_kitti": Layout(write_virtual, VirtualKITTI2, image_error=JPEG_ERROR, depth_quantum=0.01),
     "kitti": Layout(
-        write,
-        lambda root: KITTI(str(root), split="train"),
-        depth_quantum=1 / 256,
-        frame_ids=tuple(range(5, 11)),
-        moved_world=True,
-    )
+        write, partial(KITTI, split="train"), depth_quantum=1 / 256, frame_ids=range(5, 11), moved_world=True
+    ),
 }

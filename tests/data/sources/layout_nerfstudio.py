@@ -1,5 +1,6 @@
 """nerfstudio captures: one camera or one per frame, with and without depth."""
 
+from functools import partial
 from pathlib import Path
 
 from vg2gt.data import Frames
@@ -24,8 +25,6 @@ def write(root: Path, frames: Frames, depth: bool = True) -> None:
 
 
 LAYOUTS = {
-    "nerfstudio": Layout(
-        lambda root, frames: write(root, frames, False), lambda root: Nerfstudio(str(root)), depth_quantum=None
-    ),
-    "nerfstudio_depth": Layout(write, lambda root: Nerfstudio(str(root), depth=True)),
+    "nerfstudio": Layout(partial(write, depth=False), Nerfstudio, depth_quantum=None),
+    "nerfstudio_depth": Layout(write, partial(Nerfstudio, depth=True)),
 }

@@ -2,22 +2,28 @@
 
 import csv
 import importlib.util
-import io
 import json
 import zipfile
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from vg2gt.data import Frames, RGBDFolder
 from vg2gt.io import write_video
 
-from .layouts import SIZE, Layout, camera_of, camera_to_world, millimetres, pixels, save
+from .layouts import SIZE, Layout, camera_of, camera_to_world, encoded, millimetres, pixels, save
 
 OPENGL = np.diag([1.0, -1, -1, 1])
 CORNER = np.array([0, 0, 0.5, 0.5])  # from the middle of the first pixel to its corner
+
+
+def record3d_metadata(frames: Frames) -> dict[str, Any]:
+    fx, fy, cx, cy = camera_of(frames) + CORNER
+    poses = [[*Rotation.from_matrix(pose[:3, :3]).as_quat(), *pose[:3, 3]] for pose in camera_to_world(frames) @ OPENGL]
+    return {"w": SIZE[1], "h": SIZE[0], "poses": poses, "K": [fx, 0, 0, 0, fy, 0, cx, cy, 1], "fps": 60}
 
 
 def write_record3d(root: Path, frames: Frames, per_frame: bool = False) -> None:
@@ -25,19 +31,15 @@ def write_record3d(root: Path, frames: Frames, per_frame: bool = False) -> None:
     import OpenEXR  # pyright: ignore[reportMissingImports]: optional
 
     folder = root / "sofa" / "EXR_RGBD"
-    for sub in ("rgb", "depth"):
-        (folder / sub).mkdir(parents=True)
-    poses = []
+    (folder / "depth").mkdir(parents=True)
     header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
-    for i, pose in enumerate(camera_to_world(frames) @ OPENGL):
-        save(folder / "rgb" / f"{i}.jpg", pixels(frames)[i])
+    for i, image in enumerate(pixels(frames)):
+        save(folder / "rgb" / f"{i}.jpg", image)
         depth = np.ascontiguousarray(frames.depth[i].numpy())
         OpenEXR.File(header, {"R": depth}).write(str(folder / "depth" / f"{i}.exr"))
-        poses.append([*Rotation.from_matrix(pose[:3, :3]).as_quat(), *pose[:3, 3]])
-    fx, fy, cx, cy = camera_of(frames) + CORNER
-    content = {"w": SIZE[1], "h": SIZE[0], "poses": poses, "K": [fx, 0, 0, 0, fy, 0, cx, cy, 1], "fps": 60}
+    content, own = record3d_metadata(frames), [(camera_of(frames) + CORNER).tolist()] * len(frames.images)
     if per_frame:
-        content |= {"K": [1.0, 0, 0, 0, 1, 0, 0, 0, 1], "perFrameIntrinsicCoeffs": [[fx, fy, cx, cy]] * len(poses)}
+        content |= {"K": [1.0, 0, 0, 0, 1, 0, 0, 0, 1], "perFrameIntrinsicCoeffs": own}
     (folder / "metadata.json").write_text(json.dumps(content))
 
 
@@ -45,15 +47,11 @@ def write_r3d(root: Path, frames: Frames, packed: bool = True, told: bool = True
     """Record3D's own: a ZIP of JSON without an ending, and depth and confidence in LZFSE."""
     import lzfse  # pyright: ignore[reportMissingImports]: optional
 
-    fx, fy, cx, cy = camera_of(frames) + CORNER
-    poses = [[*Rotation.from_matrix(pose[:3, :3]).as_quat(), *pose[:3, 3]] for pose in camera_to_world(frames) @ OPENGL]
-    content = {"w": SIZE[1], "h": SIZE[0], "poses": poses, "K": [fx, 0, 0, 0, fy, 0, cx, cy, 1], "fps": 60}
+    content = record3d_metadata(frames)
     content |= {"dw": SIZE[1], "dh": SIZE[0], "initPose": [0, 0, 0, 1, 0, 0, 0]} if told else {}
     files = {"metadata": json.dumps(content).encode(), "icon": b"a picture", "sound.m4a": b"a sound"}
-    for i in range(len(poses)):
-        picture = io.BytesIO()
-        Image.fromarray(pixels(frames)[i]).save(picture, "JPEG", quality=95, subsampling=0)
-        files[f"rgbd/{i}.jpg"] = picture.getvalue()
+    for i in range(len(frames.images)):
+        files[f"rgbd/{i}.jpg"] = encoded(pixels(frames)[i])
         files[f"rgbd/{i}.depth"] = lzfse.compress(frames.depth[i].numpy().astype("<f4").tobytes())
         files[f"rgbd/{i}.conf"] = lzfse.compress(np.full(SIZE, 2, np.uint8).tobytes())
     root.mkdir(parents=True, exist_ok=True)
@@ -65,10 +63,6 @@ def write_r3d(root: Path, frames: Frames, packed: bool = True, told: bool = True
     for name, part in files.items():
         (root / "sofa" / name).parent.mkdir(parents=True, exist_ok=True)
         (root / "sofa" / name).write_bytes(part)
-
-
-def _write_unpacked_r3d(root: Path, frames: Frames) -> None:
-    write_r3d(root, frames, packed=False, told=False)
 
 
 def write_polycam(root: Path, frames: Frames, corrected: bool = True) -> None:
@@ -104,17 +98,15 @@ def write_stray(root: Path, frames: Frames) -> None:
     np.savetxt(folder / "camera_matrix.csv", [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], delimiter=",", fmt="%.17g")
 
 
-def _read(root: Path) -> RGBDFolder:
-    return RGBDFolder(str(root), holdout=None)
-
-
-POLYCAM_IDS = tuple(1667263848031 + 33 * i for i in range(6))
+READ = partial(RGBDFolder, holdout=None)
+POLYCAM_IDS = range(1667263848031, 1667263848031 + 6 * 33, 33)
 LAYOUTS = {
-    "polycam": Layout(write_polycam, _read, image_error=0.012, frame_ids=POLYCAM_IDS),
-    "stray_scanner": Layout(write_stray, _read, image_error=0.03),
+    "polycam": Layout(write_polycam, READ, image_error=0.012, frame_ids=POLYCAM_IDS),
+    "stray_scanner": Layout(write_stray, READ, image_error=0.03),
 }
 if importlib.util.find_spec("OpenEXR"):
-    LAYOUTS["record3d"] = Layout(write_record3d, _read, image_error=0.012, depth_quantum=1e-6)
+    LAYOUTS["record3d"] = Layout(write_record3d, READ, image_error=0.012, depth_quantum=1e-6)
 if importlib.util.find_spec("lzfse"):
-    LAYOUTS["r3d"] = Layout(write_r3d, _read, image_error=0.012, depth_quantum=1e-6)
-    LAYOUTS["r3d_unpacked"] = Layout(_write_unpacked_r3d, _read, image_error=0.012, depth_quantum=1e-6)
+    unpacked = partial(write_r3d, packed=False, told=False)
+    LAYOUTS["r3d"] = Layout(write_r3d, READ, image_error=0.012, depth_quantum=1e-6)
+    LAYOUTS["r3d_unpacked"] = Layout(unpacked, READ, image_error=0.012, depth_quantum=1e-6)

@@ -20,8 +20,11 @@ def write(root: Path, frames: Frames, scene: str = "office3") -> None:
     np.savetxt(folder.parent / "traj.txt", camera_to_world(frames).reshape(-1, 16))
 
 
-def _read(root: Path) -> Replica:
-    return Replica(str(root), intrinsics=camera_of(room(1)))
-
-
-LAYOUTS = {"replica": Layout(write, _read, image_error=JPEG_ERROR, depth_quantum=1 / 6553.5)}
+LAYOUTS = {
+    "replica": Layout(
+        write,
+        lambda root: Replica(root, intrinsics=camera_of(room())),
+        image_error=JPEG_ERROR,
+        depth_quantum=1 / 6553.5,
+    )
+}

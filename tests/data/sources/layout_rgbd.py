@@ -1,6 +1,7 @@
 """RGB-D folders: one file of poses, one file a pose, 7-Scenes."""
 
 import json
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -21,16 +22,18 @@ def write_recording(root: Path, frames: Frames, scene: str = "office", first: in
     return root / scene
 
 
-def _write_pose_files(root: Path, frames: Frames) -> None:
-    for sub in ("rgb", "depth", "pose", "intrinsic"):
-        (root / "hall" / sub).mkdir(parents=True)
+def write_pose_files(folder: Path, frames: Frames, colour: str = "rgb") -> np.ndarray:
+    """Frames 8, 9, 10, ...; returns the intrinsics as the file holds them."""
+    for sub in ("pose", "intrinsic"):
+        (folder / sub).mkdir(parents=True)
     for i, pose in enumerate(camera_to_world(frames)):
-        save(root / "hall" / "rgb" / f"{i + 8}.jpg", pixels(frames)[i])
-        save(root / "hall" / "depth" / f"{i + 8}.png", millimetres(frames)[i])
-        np.savetxt(root / "hall" / "pose" / f"{i + 8}.txt", pose)
+        save(folder / colour / f"{i + 8}.jpg", pixels(frames)[i])
+        save(folder / "depth" / f"{i + 8}.png", millimetres(frames)[i])
+        np.savetxt(folder / "pose" / f"{i + 8}.txt", pose)
     matrix = np.eye(4)
     matrix[:3, :3] = frames.intrinsics[0].numpy()
-    np.savetxt(root / "hall" / "intrinsic" / "intrinsic_depth.txt", matrix)
+    np.savetxt(folder / "intrinsic" / "intrinsic_depth.txt", matrix)
+    return matrix
 
 
 def write_seven_scenes(root: Path, frames: Frames) -> None:
@@ -72,16 +75,13 @@ def _write_icl_nuim(root: Path, frames: Frames) -> None:
     (root / "living" / "K.txt").write_text(f"{fx!r} {-fy!r} {cx!r} {cy!r}\n")
 
 
-def _read(root: Path) -> RGBDFolder:
-    return RGBDFolder(str(root), holdout=None)
-
-
+READ = partial(RGBDFolder, holdout=None)
 LAYOUTS = {
-    "rgbd": Layout(write_recording, _read, frame_ids=tuple(range(10, 16))),
-    "rgbd_pose_files": Layout(_write_pose_files, _read, image_error=0.012, frame_ids=tuple(range(8, 14))),
-    "rgbd_open3d": Layout(_write_open3d, _read, frame_ids=tuple(range(1, 7))),
-    "rgbd_icl_nuim": Layout(
-        _write_icl_nuim, lambda root: RGBDFolder(str(root), depth_scale=5000, holdout=None), depth_quantum=2e-4
+    "rgbd": Layout(write_recording, READ, frame_ids=range(10, 16)),
+    "rgbd_pose_files": Layout(
+        lambda root, frames: write_pose_files(root / "hall", frames), READ, image_error=0.012, frame_ids=range(8, 14)
     ),
-    "seven_scenes": Layout(write_seven_scenes, _read),
+    "rgbd_open3d": Layout(_write_open3d, READ, frame_ids=range(1, 7)),
+    "rgbd_icl_nuim": Layout(_write_icl_nuim, partial(READ, depth_scale=5000), depth_quantum=2e-4),
+    "seven_scenes": Layout(write_seven_scenes, READ),
 }

@@ -1,18 +1,19 @@
-"""ScanNet: exported, and the raw stream."""
+"""ScanNet: exported, and the raw stream; iPhone frames of ScanNet++, among DSLR images."""
 
-import io
 import struct
 import zlib
+from functools import partial
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
 from examples.data_sets.scannet_sens import ScanNetSens
+from examples.data_sets.scannetpp import ScanNetPPiPhone
 from vg2gt.data import Frames
 from vg2gt.data.sources import ScanNet
 
-from .layouts import Layout, camera_to_world, millimetres, pixels, save
+from .layout_rgbd import write_pose_files
+from .layouts import Layout, camera_to_world, encoded, millimetres, pixels, save
 
 JPEG_ERROR = 0.009
 """Mean absolute error of images of the test's room as JPEG of quality 95 (measured: 0.0060 to 0.0077)."""
@@ -21,15 +22,7 @@ JPEG_ERROR = 0.009
 def write_export(root: Path, frames: Frames, scene: str = "scene0707_00") -> None:
     """Frames 8, 9, 10, ... of a scan."""
     folder = root / "scans" / scene
-    for kind in ("color", "depth", "pose", "intrinsic"):
-        (folder / kind).mkdir(parents=True)
-    for i, pose in enumerate(camera_to_world(frames)):
-        save(folder / "color" / f"{i + 8}.jpg", pixels(frames)[i])
-        save(folder / "depth" / f"{i + 8}.png", millimetres(frames)[i])
-        np.savetxt(folder / "pose" / f"{i + 8}.txt", pose)
-    intrinsics = np.eye(4)
-    intrinsics[:3, :3] = frames.intrinsics[0].numpy()
-    np.savetxt(folder / "intrinsic" / "intrinsic_depth.txt", intrinsics)
+    intrinsics = write_pose_files(folder, frames, "color")
     intrinsics[:2] *= 2
     np.savetxt(folder / "intrinsic" / "intrinsic_color.txt", intrinsics)
 
@@ -44,12 +37,7 @@ def sens_header(frames: Frames, count: int, color: int, depth: int) -> bytes:
 
 
 def sens_frame(pixels: np.ndarray, millimetres: np.ndarray, pose: np.ndarray, jpeg: bool, packed: bool) -> bytes:
-    stream = io.BytesIO()
-    if jpeg:
-        Image.fromarray(pixels).save(stream, "JPEG", quality=95, subsampling=0)
-    else:
-        Image.fromarray(pixels).save(stream, "PNG")
-    color, depth = stream.getvalue(), millimetres.astype("<u2").tobytes()
+    color, depth = encoded(pixels, "JPEG" if jpeg else "PNG"), millimetres.astype("<u2").tobytes()
     depth = zlib.compress(depth) if packed else depth
     return pose.astype("<f4").tobytes() + struct.pack("<4Q", 17, 18, len(color), len(depth)) + color + depth
 
@@ -69,18 +57,29 @@ def write_sens(root: Path, frames: Frames, jpeg: bool = True, packed: bool = Tru
     return path
 
 
-def _write_stream(root: Path, frames: Frames) -> None:
-    write_sens(root, frames)
-
-
-def _write_plain_stream(root: Path, frames: Frames) -> None:
-    write_sens(root, frames, jpeg=False, packed=False)
+def write_scannetpp(root: Path, frames: Frames) -> None:
+    """Frames 0, 10, 20, ...; the cameras' file names them from the last to the first, and one more."""
+    folder = root / "processed" / "0a5c013435"
+    names = [f"frame_{10 * i:06d}" for i in range(len(frames.images))]
+    for name, image, depth in zip(names, pixels(frames), millimetres(frames), strict=True):
+        save(folder / "images" / f"{name}.jpg", image)
+        save(folder / "depth" / f"{name}.png", depth)
+    save(folder / "images" / "DSC00010.jpg", np.zeros((20, 30, 3), np.uint8))
+    save(folder / "depth" / "DSC00010.png", np.zeros((20, 30), np.uint16))
+    intrinsics = frames.intrinsics.double().numpy()
+    intrinsics[:, :2, 2] += 0.5
+    poses = camera_to_world(frames)
+    np.savez(
+        folder / "scene_iphone_metadata.npz",
+        images=["frame_999990.jpg", *(f"{name}.jpg" for name in names[::-1])],
+        trajectories=[poses[0], *poses[::-1]],
+        intrinsics=[intrinsics[0], *intrinsics[::-1]],
+    )
 
 
 LAYOUTS = {
-    "scannet": Layout(
-        write_export, lambda root: ScanNet(str(root)), image_error=JPEG_ERROR, frame_ids=tuple(range(8, 14))
-    ),
-    "scannet_sens": Layout(_write_stream, lambda root: ScanNetSens(str(root)), image_error=JPEG_ERROR),
-    "scannet_sens_plain": Layout(_write_plain_stream, lambda root: ScanNetSens(str(root))),
+    "scannet": Layout(write_export, ScanNet, image_error=JPEG_ERROR, frame_ids=range(8, 14)),
+    "scannet_sens": Layout(write_sens, ScanNetSens, image_error=JPEG_ERROR),
+    "scannet_sens_plain": Layout(partial(write_sens, jpeg=False, packed=False), ScanNetSens),
+    "scannetpp_iphone": Layout(write_scannetpp, ScanNetPPiPhone, image_error=JPEG_ERROR, frame_ids=range(0, 60, 10)),
 }

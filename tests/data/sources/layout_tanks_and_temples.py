@@ -1,5 +1,6 @@
 """Tanks and Temples, without its scan, whose depth is tested by itself (``test_scan_depth.py``)."""
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -37,9 +38,6 @@ def write(root: Path, frames: Frames) -> None:
     write_colmap(folder / "sparse", colmap_from_views(cameras, names))
 
 
-def read(root: Path, depth: str | None = None) -> TanksAndTemples:
-    """The loader."""
-    return TanksAndTemples(str(root), depth=depth)
-
-
-LAYOUTS = {"tanks_and_temples": Layout(write, read, depth_quantum=None, frame_ids=tuple(range(1, 7)))}
+LAYOUTS = {
+    "tanks_and_temples": Layout(write, partial(TanksAndTemples, depth=None), depth_quantum=None, frame_ids=range(1, 7))
+}

@@ -43,8 +43,6 @@ def write_poses(folder: Path, times: np.ndarray, poses: np.ndarray) -> None:
     np.savetxt(folder / "groundtruth.txt", rows, "%.9f", header="timestamp tx ty tz qx qy qz qw")
 
 
-def _read(root: Path) -> TUM:
-    return TUM(str(root), intrinsics=camera_of(room(1)), holdout=None)
-
-
-LAYOUTS = {"tum": Layout(write, _read, depth_quantum=1 / 5000)}
+LAYOUTS = {
+    "tum": Layout(write, lambda root: TUM(root, intrinsics=camera_of(room()), holdout=None), depth_quantum=1 / 5000)
+}

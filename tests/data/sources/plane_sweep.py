@@ -5,7 +5,8 @@ from torch.nn.functional import avg_pool2d, grid_sample
 
 from vg2gt.data import Frames
 from vg2gt.geometry.cameras import project, unproject
-from vg2gt.types import Cameras
+
+from ..warping import camera
 
 WINDOW = 9
 CONTRAST = 0.01
@@ -17,10 +18,7 @@ def median_best_ncc(frames: Frames, near: float, far: float, planes: int = 64) -
     gray = frames.images.mean(1)
     textured = (_mean(gray[0] ** 2) - _mean(gray[0]) ** 2) > CONTRAST**2
     height, width = gray.shape[-2:]
-    first, second = (
-        Cameras(frames.world_to_camera[None, i : i + 1], frames.intrinsics[None, i : i + 1], (height, width))
-        for i in (0, 1)
-    )
+    first, second = camera(frames, 0), camera(frames, 1)
     best = torch.full((height, width), -1.0)
     for depth in 1 / torch.linspace(1 / near, 1 / far, planes):
         pixels, z = project(unproject(torch.full((1, 1, height, width), float(depth)), first), second)

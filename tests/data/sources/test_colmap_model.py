@@ -1,9 +1,6 @@
 """COLMAP scenes: a real model, which cameras are refused, reduced images, absent images, points."""
 
-from contextlib import contextmanager
-
 import numpy as np
-import pycolmap  # pyright: ignore[reportMissingImports]
 import pytest
 import torch
 from PIL import Image
@@ -18,10 +15,9 @@ from vg2gt.evaluation.checks import refuse_without_hints
 from vg2gt.geometry.cameras import resize_intrinsics, unproject
 from vg2gt.io import colmap_from_views, colmap_images, read_colmap, write_colmap
 from vg2gt.runs.load import load_model
-from vg2gt.types import Cameras
 
 from .layout_colmap import POINTS_A_VIEW, write
-from .layouts import SIZE, pixels, room
+from .layouts import LEFT_HALF, cameras_of, halve, pixels, room, save
 
 
 @pytest.fixture(scope="module")
@@ -54,10 +50,8 @@ def test_real_model_reprojects(statue):
     assert not source.is_metric
 
 
-@pytest.fixture(scope="module")
-def distorted(statue, tmp_path_factory):
-    """The originals, made again from the undistorted images: ``images/`` and the model of SIMPLE_RADIAL cameras."""
-    folder = tmp_path_factory.mktemp("workspace") / "statue"
+def write_originals(statue, folder):
+    """Made again from the undistorted images: ``images/`` and the model of SIMPLE_RADIAL cameras."""
     model = read_colmap(statue / "sparse" / "0")
     (folder / "images").mkdir(parents=True)
     write_colmap(folder / "sparse" / "0", model)
@@ -72,12 +66,12 @@ def distorted(statue, tmp_path_factory):
         places = target.img_from_cam(np.concatenate((rays, np.ones((len(rays), 1))), 1)).astype(int)
         places = places.clip(0, [target.width - 1, target.height - 1])
         Image.fromarray(pixels[places[:, 1], places[:, 0]].reshape(*size, 3)).save(folder / "images" / image.name)
-    return folder
 
 
-def test_a_distorted_model_beside_the_originals(statue, distorted):
+def test_a_distorted_model_beside_the_originals(statue, tmp_path):
     """Item 16: COLMAP's default camera; what comes out is what COLMAP's own undistortion wrote."""
-    source = COLMAP(str(distorted), depth="points")
+    write_originals(statue, tmp_path / "statue")
+    source = COLMAP(str(tmp_path), depth="points")
     (scene,) = source.scenes
     index = source.scene_index(scene)
     assert len(index.color) == 4
@@ -97,37 +91,10 @@ def test_a_distorted_model_beside_the_originals(statue, distorted):
     assert (depth > 0).sum() > 50
 
 
-@contextmanager
-def edited(root):
-    """The model of a written scene, to be changed."""
-    folder = root / "statue" / "sparse" / "0"
-    model = read_colmap(folder)
-    yield model
-    write_colmap(folder, model)
-
-
-def put_masks(root, *names):
-    """Masks that hide the left half."""
-    folder = root / "statue" / "masks" / "left"
-    folder.mkdir(parents=True)
-    half = Image.fromarray(np.where(np.arange(40) < 20, 0, 255).astype(np.uint8) * np.ones((30, 1), np.uint8))
-    for name in names:
-        half.save(folder / name)
-
-
 def turned(orientation):
     exif = Image.Exif()
     exif[0x0112] = orientation
     return exif
-
-
-def test_a_model_of_equirectangular_images_is_refused_in_one_line(tmp_path):
-    write(tmp_path, room(1))
-    with edited(tmp_path) as model:
-        model.cameras[1].model = pycolmap.CameraModelId.EQUIRECTANGULAR
-        model.cameras[1].params = [40.0, 30.0]
-    with pytest.raises(DataError, match="EQUIRECTANGULAR has no pinhole equivalent; convert images to cube faces"):
-        COLMAP(str(tmp_path)).scene_index("statue")
 
 
 def test_the_larger_model_is_taken_and_the_other_named(tmp_path, caplog):
@@ -136,8 +103,8 @@ def test_the_larger_model_is_taken_and_the_other_named(tmp_path, caplog):
     write(tmp_path, frames)
     scene = tmp_path / "statue"
     (scene / "sparse" / "0").rename(scene / "sparse" / "1")
-    cameras = Cameras(frames.world_to_camera[None, :2].double(), frames.intrinsics[None, :2].double(), SIZE)
-    write_colmap(scene / "sparse" / "0", colmap_from_views(cameras, ["left/000.png", "left/009.png"]))
+    two = cameras_of(frames).select(slice(2))
+    write_colmap(scene / "sparse" / "0", colmap_from_views(two, ["left/000.png", "left/009.png"]))
     assert len(COLMAP(str(tmp_path)).frames("statue")) == 4
     assert "has 2 COLMAP models: using sparse/1 with 4 images, ignoring sparse/0 (2)" in caplog.text
 
@@ -147,7 +114,7 @@ def test_the_larger_model_is_taken_and_the_other_named(tmp_path, caplog):
 def test_exif_orientation_with_given_cameras(tmp_path, orientation, stored):
     """Item 6: cameras of upright images, and of images as COLMAP reads them, whose points' colours tell it."""
     frames = room(2)
-    cameras = Cameras(frames.world_to_camera[None].double(), frames.intrinsics[None].double(), SIZE)
+    cameras = cameras_of(frames)
     world = unproject(frames.depth[None].double(), cameras)[0].numpy()
     y, x = (axis.ravel() for axis in np.mgrid[2:30:5, 2:40:5])
     positions = np.concatenate([view[y, x] for view in world])
@@ -182,48 +149,27 @@ def test_values_that_are_not_finite_leave_their_image_out_by_name(tmp_path, capl
     assert "left out images whose camera parameters are not finite: left/" in caplog.text
 
 
-def test_masks_beside_images(tmp_path, caplog):
-    """Item 7: a folder of masks, partly filled."""
-    write(tmp_path, room(3))
-    put_masks(tmp_path, "000.png", "009.png.png")
-    loaded = COLMAP(str(tmp_path)).load("statue", [0, 1, 2])
-    assert loaded.mask.mean((1, 2)).tolist() == [0.5, 0.5, 1]
-    assert "1 of 3 images have no mask in" in caplog.text
-    assert "left/018.png" in caplog.text
-
-
 def test_reduced_images_have_reduced_intrinsics(tmp_path):
     frames = room(3)
     write(tmp_path, frames)
-    scene = tmp_path / "statue"
-    (scene / "images_2" / "left").mkdir(parents=True)
-    for path in sorted((scene / "images" / "left").iterdir()):
-        with Image.open(path) as image:
-            image.reduce(2).save(scene / "images_2" / "left" / path.name)
+    halve(tmp_path / "statue" / "images" / "left", tmp_path / "statue" / "images_2" / "left")
     index = COLMAP(str(tmp_path), images="images_2").scene_index("statue")
     assert index.size == (15, 20)
     full = frames.intrinsics[0].numpy()
     np.testing.assert_allclose(index.intrinsics[0][0], [full[0, 0] / 2, 0, (full[0, 2] + 0.5) / 2 - 0.5], rtol=1e-6)
-    Image.new("RGB", (20, 20)).save(scene / "images_2" / "left" / "000.png")
-    with pytest.raises(DataError, match=r"20x20 pixels, but its camera in .* 40x30"):
-        COLMAP(str(tmp_path), images="images_2").scene_index("statue")
 
 
-def test_absent_images_are_counted_and_keep_the_numbers(tmp_path):
-    write(tmp_path, room(4))
-    (tmp_path / "statue" / "images" / "left" / "009.png").unlink()
-    source = COLMAP(str(tmp_path / "statue"))
-    assert tuple(source.frames("statue")) == (0, 2, 3)
+def test_absent_images_are_counted_and_keep_the_numbers_and_without_any_their_place_is_named(tmp_path):
+    write(tmp_path, room(3))
+    scene = tmp_path / "statue"
+    (scene / "images" / "left" / "009.png").unlink()
+    (scene / "images").rename(scene / "photos")
+    source = COLMAP(str(scene), images="photos")
+    assert source.frames("statue") == (0, 2)
     assert source.scene_index("statue").dropped == {"without a colour image": 1}
-
-
-def test_a_model_without_its_images_says_what_it_expects_where(tmp_path):
-    write(tmp_path, room(2))
-    (tmp_path / "statue" / "images").rename(tmp_path / "statue" / "photos")
-    expected = r"none of the .* 2 images is in .*statue/images; the first is left/.* or set data\.images to"
+    expected = r"none of the .* 3 images is in .*statue/images; the first is left/.* or set data\.images to"
     with pytest.raises(DataError, match=expected):
-        COLMAP(str(tmp_path / "statue")).frames("statue")
-    assert COLMAP(str(tmp_path / "statue"), images="photos").frames("statue") == (0, 1)
+        COLMAP(str(scene)).frames("statue")
 
 
 def test_points_need_three_views_and_the_nearest_wins(tmp_path):
@@ -231,10 +177,12 @@ def test_points_need_three_views_and_the_nearest_wins(tmp_path):
     source = COLMAP(str(tmp_path), depth="points")
     depth = source.load("statue", [0]).depth[0]
     assert 0.7 * POINTS_A_VIEW < int((depth > 0).sum()) <= POINTS_A_VIEW
-    with edited(tmp_path) as model:
-        for number in range(1, POINTS_A_VIEW + 1):  # frame 0's own points
-            other = next(each for each in model.point3D(number).track.elements if each.image_id != 1)
-            model.delete_observation(other.image_id, other.point2D_idx)
+    folder = tmp_path / "statue" / "sparse" / "0"
+    model = read_colmap(folder)
+    for number in range(1, POINTS_A_VIEW + 1):  # frame 0's own points
+        other = next(each for each in model.point3D(number).track.elements if each.image_id != 1)
+        model.delete_observation(other.image_id, other.point2D_idx)
+    write_colmap(folder, model)
     source = COLMAP(str(tmp_path), depth="points")
     assert tuple(source.frames("statue")) == (1, 2)
     assert source.scene_index("statue").dropped == {"without a depth file": 1}
@@ -242,11 +190,15 @@ def test_points_need_three_views_and_the_nearest_wins(tmp_path):
         COLMAP(str(tmp_path), depth="dense")
 
 
-def test_masks_go_with_a_batch_and_take_its_depth_away(tmp_path):
-    """Issue 47, item 7."""
-    write(tmp_path, room(3))
-    put_masks(tmp_path, "000.png", "009.png", "018.png")
-    whole = COLMAP(str(tmp_path), depth="points").load("statue", [0, 1, 2])
+def test_masks_go_with_a_batch_and_take_its_depth_away(tmp_path, caplog):
+    """Issue 47, item 7: a folder of masks, partly filled."""
+    write(tmp_path, room(4))
+    for name in ("000.png", "009.png.png", "018.png"):
+        save(tmp_path / "statue" / "masks" / "left" / name, LEFT_HALF)
+    whole = COLMAP(str(tmp_path), depth="points").load("statue", range(4))
+    assert whole.mask.mean((1, 2)).tolist() == [0.5, 0.5, 0.5, 1]
+    assert "1 of 4 images have no mask in" in caplog.text
+    assert "left/027.png" in caplog.text
     data = BatchDataset(COLMAP(str(tmp_path), depth="points"), Framing((28, 42)).apply, 10)
     batch = data[(SceneSample("statue", (0, 1), (2,)),)]
     assert batch.mask is not None

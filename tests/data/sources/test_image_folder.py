@@ -44,14 +44,8 @@ def test_training_is_refused(tmp_path):
     for i in range(12):
         save(tmp_path / "train" / f"{i}.png", _photo(i))
     copytree(tmp_path / "train", tmp_path / "val")
-    plugin = f"hydra.searchpath=[{ROOT / 'examples/data_sets/configs'}]"
-    overrides = [
-        plugin,
-        "data=image_folder",
-        f"data.root={tmp_path}",
-        "data.train.scenes=[train]",
-        "data.val.scenes=[val]",
-    ]
-    module = instantiate(compose("train", *overrides, "data.index_cache=null").data)
+    where = [f"hydra.searchpath=[{ROOT / 'examples/data_sets/configs'}]", "data=image_folder", f"data.root={tmp_path}"]
+    scenes = ["data.train.scenes=[train]", "data.val.scenes=[val]", "data.index_cache=null"]
+    module = instantiate(compose("train", *where, *scenes).data)
     with pytest.raises(DataError, match="ImageFolder has no depth and no cameras"):
         module.train_dataloader()

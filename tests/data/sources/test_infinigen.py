@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 from vg2gt.data import DataError
 from vg2gt.data.sources import Infinigen
@@ -14,25 +13,25 @@ from vg2gt.data.splits import split_scenes
 from vg2gt.geometry.cameras import project, ray_directions, unproject
 
 from ..warping import camera
+from .layouts import save
 
 HEIGHT, WIDTH = 4, 6
 
 
-def write_view(folder, name, depth, shift=0.0, camera=0):
+PLAIN = np.full((HEIGHT, WIDTH), 2, np.float32)
+
+
+def write_view(folder, name, depth=PLAIN, shift=0.0, camera=0):
     """One view with a symmetric camera, as Blender describes it."""
-    places = {kind: folder / "frames" / kind / f"camera_{camera}" for kind in ("Image", "Depth", "camview")}
-    for place in places.values():
+    image, stored, view = (folder / "frames" / kind / f"camera_{camera}" for kind in ("Image", "Depth", "camview"))
+    save(image / f"Image_{name}.png", np.full((HEIGHT, WIDTH, 3), 90, np.uint8))
+    for place in (stored, view):
         place.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(np.full((HEIGHT, WIDTH, 3), 90, np.uint8)).save(places["Image"] / f"Image_{name}.png")
-    np.save(places["Depth"] / f"Depth_{name}.npy", depth)
+    np.save(stored / f"Depth_{name}.npy", depth)
     pose = np.eye(4)
     pose[0, 3] = shift
     intrinsics = np.array([[5.0, 0, WIDTH / 2], [0, 5.0, HEIGHT / 2], [0, 0, 1]])
-    np.savez(places["camview"] / f"camview_{name}.npz", K=intrinsics, T=pose)
-
-
-def plain():
-    return np.full((HEIGHT, WIDTH), 2, np.float32)
+    np.savez(view / f"camview_{name}.npz", K=intrinsics, T=pose)
 
 
 def test_depth_of_a_slanted_plane_is_right_to_a_quarter_of_a_pixel(tmp_path):
@@ -52,7 +51,7 @@ def test_depth_of_a_slanted_plane_is_right_to_a_quarter_of_a_pixel(tmp_path):
 
 
 def test_sky_and_what_is_too_far_have_no_depth(tmp_path):
-    depth = plain()
+    depth = PLAIN.copy()
     depth[0] = [np.inf, 1e10, 30.5, np.nan, -1, 29.5]
     write_view(tmp_path / "a", "0_0_0001_0", depth)
     assert Infinigen(str(tmp_path)).load("a", [1]).depth[0, 0].tolist() == [0, 0, 0, 0, 0, 29.5]
@@ -64,11 +63,11 @@ def test_sky_and_what_is_too_far_have_no_depth(tmp_path):
 
 def test_frames_are_numbered_by_what_varies(tmp_path):
     for frame in (9, 10, 100):
-        write_view(tmp_path / "video", f"0_0_{frame:04d}_0", plain())
+        write_view(tmp_path / "video", f"0_0_{frame:04d}_0")
     for rig in (2, 10, 1):
-        write_view(tmp_path / "rigs", f"{rig}_0_0048_0", plain(), shift=rig)
+        write_view(tmp_path / "rigs", f"{rig}_0_0048_0", shift=rig)
     for name in ("0_0_0001_0", "0_0_0002_0", "3_0_0001_0"):
-        write_view(tmp_path / "both", name, plain())
+        write_view(tmp_path / "both", name)
     source = Infinigen(str(tmp_path))
     assert (source.frames("video"), source.frames("rigs")) == ((9, 10, 100), (1, 2, 10))
     assert source.frames("both") == (1, 2, 300_001)
@@ -77,7 +76,7 @@ def test_frames_are_numbered_by_what_varies(tmp_path):
 
 def test_parts_of_an_exported_scene_show_one_place(tmp_path):
     for part in ("scene_1/x", "scene_1/y", "scene_2/x"):
-        write_view(tmp_path / part, "0_0_0001_0", plain())
+        write_view(tmp_path / part, "0_0_0001_0")
     source = Infinigen(str(tmp_path))
     assert source.scenes == ("scene_1/x", "scene_1/y", "scene_2/x")
     assert [source.place(scene) for scene in source.scenes] == ["scene_1", "scene_1", "scene_2"]
@@ -88,7 +87,7 @@ def test_parts_of_an_exported_scene_show_one_place(tmp_path):
 def test_seeds_of_a_job_are_divided_when_the_job_is_named(tmp_path):
     """``JOB/SEED/frames`` looks like the parts of an exported scene; the error says how to tell them apart."""
     for seed in ("1a", "2b"):
-        write_view(tmp_path / "indoors" / seed, "0_0_0001_0", plain())
+        write_view(tmp_path / "indoors" / seed, "0_0_0001_0")
     with pytest.raises(DataError, match=r"single place \(indoors\).*data\.root=\[\.\.\./indoors\]"):
         split_scenes(Infinigen(str(tmp_path)), 0.5)
     train, val = split_scenes(Infinigen([str(tmp_path / "indoors")]), 0.5)
@@ -126,8 +125,8 @@ def _disagreement(frames, one, other):
 
 def test_both_cameras_of_a_rig_are_held_out_together(tmp_path):
     for frame in range(4):
-        write_view(tmp_path / "a", f"0_0_{frame:04d}_0", plain())
-        write_view(tmp_path / "a", f"0_0_{frame:04d}_1", plain() + 1, shift=0.075, camera=1)
+        write_view(tmp_path / "a", f"0_0_{frame:04d}_0")
+        write_view(tmp_path / "a", f"0_0_{frame:04d}_1", PLAIN + 1, shift=0.075, camera=1)
     source = Infinigen(str(tmp_path), cameras=[0, 1], holdout=2)
     second = 1_000_000_000
     assert source.frames("a") == (0, 1, 2, 3, second, second + 1, second + 2, second + 3)

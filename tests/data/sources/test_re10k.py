@@ -1,6 +1,5 @@
 """Chunks of pixelSplat (RealEstate10K, ACID) and its evaluation indices; as documented."""
 
-import io
 import json
 import pickle
 import shutil
@@ -8,12 +7,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from PIL import Image
 
 from examples.data_sets.re10k import PixelSplatChunks
-from tests.data.sources.layouts import pixels, room
 from vg2gt.data import DataError, Frames
 from vg2gt.data.views.drawn import ViewSelection
+
+from .layouts import encoded, pixels, room
 
 
 def write_chunks(root: Path, frames: Frames, split: str = "test") -> None:
@@ -24,21 +23,9 @@ def write_chunks(root: Path, frames: Frames, split: str = "test") -> None:
     cameras[:, 0], cameras[:, 1] = k[:, 0, 0] / width, k[:, 1, 1] / height
     cameras[:, 2], cameras[:, 3] = (k[:, 0, 2] + 0.5) / width, (k[:, 1, 2] + 0.5) / height
     cameras[:, 6:] = frames.world_to_camera[:, :3].flatten(1)
-    images = []
-    for image in pixels(frames):
-        buffer = io.BytesIO()
-        Image.fromarray(image).save(buffer, "JPEG", quality=95, subsampling=0)
-        images.append(torch.frombuffer(bytearray(buffer.getvalue()), dtype=torch.uint8))
-    scenes = [
-        {
-            "url": "https://video",
-            "timestamps": torch.arange(len(images)),
-            "key": key,
-            "cameras": cameras,
-            "images": images,
-        }
-        for key in ("0a1b", "2c3d")
-    ]
+    images = [torch.frombuffer(bytearray(encoded(image)), dtype=torch.uint8) for image in pixels(frames)]
+    scene = {"url": "https://video", "timestamps": torch.arange(len(images)), "cameras": cameras, "images": images}
+    scenes = [{**scene, "key": key} for key in ("0a1b", "2c3d")]
     (root / split).mkdir(parents=True)
     torch.save(scenes, root / split / "000000.torch")
     (root / split / "index.json").write_text(json.dumps({scene["key"]: "000000.torch" for scene in scenes}))

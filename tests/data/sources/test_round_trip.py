@@ -8,29 +8,22 @@ import torch
 
 from vg2gt.data import DataError
 from vg2gt.geometry.cameras import relative_to_first
-from vg2gt.types import Cameras
 
-from .layouts import SIZE, Layout, all_layouts, room
+from .layouts import SIZE, all_layouts, cameras_of, room
 
 LAYOUTS = all_layouts()
 NEED_ALL = ("rgbd", "rgbd_open3d", "rgbd_icl_nuim", "tanks_and_temples")
 """Poses belong to images by their order, so that none may be absent."""
 
 
-@pytest.fixture(scope="module")
-def frames():
-    return room()
-
-
 @pytest.mark.parametrize("name", LAYOUTS)
-def test_a_scene_comes_back(name, frames, tmp_path):
-    layout: Layout = LAYOUTS[name]
+def test_a_scene_comes_back(name, tmp_path):
+    layout, frames = LAYOUTS[name], room()
     layout.write(tmp_path, frames)
     source = layout.read(tmp_path)
     (scene,) = source.scenes
-    ids = layout.frame_ids or tuple(range(len(frames.images)))
-    assert tuple(source.frames(scene)) == ids
-    order = [2, 0, 4]
+    ids, order = layout.frame_ids, [2, 0, 4]
+    assert source.frames(scene) == tuple(ids)
     loaded = source.load(scene, [ids[i] for i in order])
     expected = frames.map(lambda tensor: tensor[order])
     assert loaded.images.shape[-2:] == SIZE
@@ -38,12 +31,9 @@ def test_a_scene_comes_back(name, frames, tmp_path):
     if not source.has_cameras:
         assert layout.depth_quantum is None
         return
-    poses = loaded.world_to_camera
-    if layout.moved_world:
-        poses = _from_first(poses, loaded)
-        torch.testing.assert_close(poses, _from_first(expected.world_to_camera, expected), atol=1e-6, rtol=0)
-    else:
-        torch.testing.assert_close(poses, expected.world_to_camera, atol=1e-6, rtol=0)
+    cameras = [cameras_of(each) for each in (loaded, expected)]
+    found, known = ((relative_to_first(each) if layout.moved_world else each).world_to_camera for each in cameras)
+    torch.testing.assert_close(found, known, atol=1e-6, rtol=0)
     torch.testing.assert_close(loaded.intrinsics, expected.intrinsics, atol=1e-4, rtol=0)
     if layout.depth_quantum is None:
         assert not source.has_depth
@@ -60,9 +50,9 @@ def test_a_scene_comes_back(name, frames, tmp_path):
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
-def test_a_loader_travels_to_workers_and_its_index_is_cached_until_files_change(name, frames, tmp_path):
-    layout: Layout = LAYOUTS[name]
-    layout.write(tmp_path / "data", frames)
+def test_a_loader_travels_to_workers_and_its_index_is_cached_until_files_change(name, tmp_path):
+    layout = LAYOUTS[name]
+    layout.write(tmp_path / "data", room())
     source = layout.read(tmp_path / "data")
     (scene,) = source.scenes
     frame = source.frames(scene)[1]
@@ -81,8 +71,3 @@ def test_a_loader_travels_to_workers_and_its_index_is_cached_until_files_change(
         changed.index_cache = tmp_path / "cache"
         with pytest.raises(DataError) if name in NEED_ALL else nullcontext():
             assert len(changed.frames(scene)) == len(source.frames(scene)) - 1
-
-
-def _from_first(poses: torch.Tensor, frames) -> torch.Tensor:
-    size = (frames.depth.shape[-2], frames.depth.shape[-1])
-    return relative_to_first(Cameras(poses[None].double(), frames.intrinsics[None].double(), size)).world_to_camera[0]

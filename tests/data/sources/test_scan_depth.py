@@ -9,34 +9,21 @@ import torch
 from examples.data_sets.dtu import DTU
 from examples.data_sets.scan_depth import render_points
 from examples.data_sets.tanks_and_temples import TanksAndTemples
-from vg2gt.data import DataError, Frames
+from vg2gt.data import DataError
 from vg2gt.geometry.cameras import unproject
-from vg2gt.io.ply_container import ply_content
-from vg2gt.types import Cameras
+from vg2gt.io.ply import write_point_ply
 
 from .layout_dtu import write_test
 from .layout_tanks_and_temples import write as write_tanks
-from .layouts import room
+from .layouts import cameras_of, room
 
 K = np.array([[100.0, 0, 49.5], [0, 100.0, 39.5], [0, 0, 1]])
 VIEW = (80, 100)
 
 
-def _grid(step: float, width: float, height: float) -> np.ndarray:
-    x, y = np.meshgrid(np.arange(-width / 2, width / 2, step), np.arange(-height / 2, height / 2, step))
-    return np.stack((x.ravel(), y.ravel()), -1)
-
-
 def _wall(step: float, width: float, height: float, z: float) -> np.ndarray:
-    plane = _grid(step, width, height)
-    return np.concatenate((plane, np.full((len(plane), 1), z)), 1).astype(np.float32)
-
-
-def _ply(points: np.ndarray) -> bytes:
-    table = np.zeros(len(points), [(axis, "<f4") for axis in "xyz"])
-    for i, axis in enumerate("xyz"):
-        table[axis] = points[:, i]
-    return ply_content({"vertex": table})
+    x, y = np.meshgrid(np.arange(-width / 2, width / 2, step), np.arange(-height / 2, height / 2, step))
+    return np.stack((x.ravel(), y.ravel(), np.full(x.size, z)), -1).astype(np.float32)
 
 
 def test_what_is_behind_a_sparse_surface_is_hidden():
@@ -52,26 +39,19 @@ def test_what_is_behind_a_sparse_surface_is_hidden():
     assert (shining == 4).mean() > 0.5  # without the window, the wall would be full of holes
 
 
-def _points(frames: Frames) -> np.ndarray:
-    """World points of all pixels of all frames."""
-    _, height, width = frames.depth.shape
-    cameras = Cameras(frames.world_to_camera[None], frames.intrinsics[None], (height, width))
-    return unproject(frames.depth[None], cameras)[0][frames.depth > 0].numpy()
-
-
 @pytest.mark.parametrize("name", ["tanks", "dtu"])
 def test_loaders_read_the_scan(name, tmp_path):
     """Metres in both: Tanks and Temples in the scan's frame, DTU from millimetres."""
-    frames = room()
-    cache = str(tmp_path / "cache")
+    frames, cache = room(), str(tmp_path / "cache")
+    points = unproject(frames.depth[None].double(), cameras_of(frames))[0][frames.depth > 0].numpy()
     if name == "tanks":
         write_tanks(tmp_path, frames)
-        (tmp_path / "Barn" / "Barn.ply").write_bytes(_ply(_points(frames)))
+        write_point_ply(tmp_path / "Barn" / "Barn.ply", points)
         make = partial(TanksAndTemples, str(tmp_path), depth_cache=cache)
     else:
         write_test(tmp_path, frames)
         (tmp_path / "stl").mkdir()
-        (tmp_path / "stl" / "stl065_total.ply").write_bytes(_ply(_points(frames) * 1000))
+        write_point_ply(tmp_path / "stl" / "stl065_total.ply", points * 1000)
         options = {"depth": "scan", "depth_root": str(tmp_path / "stl"), "depth_cache": cache}
         make = partial(DTU, str(tmp_path / "scans"), **options)
     source = make()

@@ -58,9 +58,10 @@ def count(points: SparsePoints) -> int:
     return sum(len(points.depth(view)) for view in range(VIEWS))
 
 
-def test_what_is_right_stays() -> None:
+def test_what_is_right_stays_and_without_observations_there_is_no_depth() -> None:
     model = model_of()
     assert count(SparsePoints(model)) > 0.99 * count(SparsePoints(model, sound=False))
+    assert not count(SparsePoints(model_of(observed=False)))
 
 
 @pytest.mark.parametrize("factor", [0.5, 1.1, 3.0])
@@ -96,7 +97,3 @@ def test_points_alone_in_space_go() -> None:
 
     found = SparsePoints(model_of(moved=one_alone, seen_as=one_alone))
     assert min(found.depth(view).min() for view in range(VIEWS)) > 3
-
-
-def test_a_model_without_observations_has_no_depth() -> None:
-    assert not count(SparsePoints(model_of(observed=False)))

@@ -9,13 +9,6 @@ from vg2gt.data import DataError
 from .layout_tum import write
 from .layouts import room
 
-SCENE = "rgbd_dataset_freiburg1_desk"
-
-
-@pytest.fixture(scope="module")
-def frames():
-    return room(3)
-
 
 def test_times_are_paired_nearest_first_and_once():
     times = np.array([0.0, 1.0, 2.0, 3.0])
@@ -27,7 +20,7 @@ def test_times_are_paired_nearest_first_and_once():
     assert associate(times, np.zeros(0), 0.02) == {}
 
 
-def test_an_unknown_camera_is_asked_for(tmp_path, frames):
-    write(tmp_path, frames, "freiburg12")
+def test_an_unknown_camera_is_asked_for(tmp_path):
+    write(tmp_path, room(3), "freiburg12")
     with pytest.raises(DataError, match=r"scene freiburg12 .*data.intrinsics=\[fx,fy,cx,cy\]"):
         TUM(str(tmp_path)).frames("freiburg12")

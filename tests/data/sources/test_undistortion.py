@@ -17,16 +17,17 @@ LENSES = {
 }
 
 
-def camera(k: dict, fisheye: bool = False):
-    names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-    params = [K[0, 0], K[1, 1], *(K[:2, 2] + 0.5), *(k.get(name, 0.0) for name in names)]
-    return pycolmap.Camera(
-        model="OPENCV_FISHEYE" if fisheye else "FULL_OPENCV", width=SIZE[1], height=SIZE[0], params=params
-    )
+def lens_of(params: list[float], model: str = "FULL_OPENCV"):
+    return pycolmap.Camera(model=model, width=SIZE[1], height=SIZE[0], params=params)
 
 
-def undistortion(k: dict, fisheye: bool = False) -> Undistortion:
-    return Undistortion.of(camera(k, fisheye))
+def camera(k: dict):
+    names = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+    return lens_of([K[0, 0], K[1, 1], *(K[:2, 2] + 0.5), *(k.get(name, 0.0) for name in names)])
+
+
+def undistortion(k: dict) -> Undistortion:
+    return Undistortion.of(camera(k))
 
 
 def _directions(matrix: np.ndarray, size=SIZE) -> np.ndarray:
@@ -58,7 +59,7 @@ MODELS = {
 @pytest.mark.parametrize("name", MODELS)
 def test_every_model_of_colmap_becomes_a_pinhole(name):
     """Item 16: directions of the pinhole's pixels project with the lens to where they are looked up."""
-    lens = pycolmap.Camera(model=name, width=130, height=90, params=MODELS[name])
+    lens = lens_of(MODELS[name], name)
     found = Undistortion.of(lens)
     rays = np.concatenate((_directions(found.intrinsics, found.size), np.ones((*found.size, 1))), -1)
     expected = lens.img_from_cam(rays.reshape(-1, 3)).reshape(*found.size, 2) - 0.5
@@ -73,13 +74,10 @@ def test_every_model_of_colmap_becomes_a_pinhole(name):
 
 
 def test_coefficients_of_zero_are_a_pinhole_but_for_a_fisheye():
-    zeros = {
-        name: [*params[:-1], 0] if "SIMPLE" in name else [*params[:4], 0, 0, 0, 0] for name, params in MODELS.items()
-    }
-    for name in ("SIMPLE_RADIAL", "OPENCV"):
-        assert is_pinhole(pycolmap.Camera(model=name, width=130, height=90, params=zeros[name]))
-    for name in ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE"):
-        assert not is_pinhole(pycolmap.Camera(model=name, width=130, height=90, params=zeros[name]))
+    for name, params in MODELS.items():
+        extra = lens_of(params, name).extra_params_idxs()
+        zeros = [0 if i in extra else value for i, value in enumerate(params)]
+        assert is_pinhole(lens_of(zeros, name)) == ("FISHEYE" not in name)
 
 
 def test_an_image_becomes_the_pinhole_cameras():

@@ -5,34 +5,21 @@ from pathlib import Path
 import pytest
 
 from vg2gt.cli.data import write_views
-from vg2gt.data.base import DataError, Frames, SceneSource
+from vg2gt.data import DataError, SceneSource, SyntheticScenes
 from vg2gt.data.views import SceneSample
 from vg2gt.data.views.drawn import ViewSelection, index_path, make_index, read_index
 
 
-class Listed(SceneSource):
+def listed(frames: Sequence[int], held_out: Sequence[int] = ()) -> SceneSource:
     """Scenes that are nothing but lists of frames."""
-
-    def __init__(self, frames: Sequence[int], scenes: Sequence[str] = ("a", "b"), held_out: Sequence[int] = ()) -> None:
-        self._frames, self._scenes, self._held_out = list(frames), list(scenes), list(held_out)
-
-    @property
-    def scenes(self) -> Sequence[str]:
-        return self._scenes
-
-    def frames(self, scene: str) -> Sequence[int]:
-        return self._frames
-
-    def held_out(self, scene: str) -> Sequence[int]:
-        return self._held_out
-
-    def load(self, scene: str, frame_ids: Sequence[int]) -> Frames:
-        raise NotImplementedError
+    source = SyntheticScenes(1)
+    source.frames, source.held_out = lambda scene: frames, lambda scene: held_out
+    return source
 
 
 @pytest.mark.parametrize("count", [1, 3, 10, 20])
 def test_views_lie_in_a_limited_range_and_targets_between_them(count: int) -> None:
-    source, selection = Listed(range(0, 600, 3)), ViewSelection(spread=3.0, targets=4)
+    source, selection = listed(range(0, 600, 3)), ViewSelection(spread=3.0, targets=4)
     starts = set()
     for scene in map(str, range(30)):
         views = selection.draw(source, scene, count)
@@ -50,7 +37,7 @@ def test_views_lie_in_a_limited_range_and_targets_between_them(count: int) -> No
 
 def test_targets_are_held_out_frames_and_inputs_never() -> None:
     held_out = range(0, 60, 6)
-    source = Listed(range(60), held_out=held_out)
+    source = listed(range(60), held_out=held_out)
     for scene in map(str, range(20)):
         views = ViewSelection(spread=3.0).draw(source, scene, 8)
         assert not set(views.context) & set(held_out)
@@ -60,13 +47,13 @@ def test_targets_are_held_out_frames_and_inputs_never() -> None:
 
 @pytest.mark.parametrize("count", [1, 3])
 def test_a_window_grows_until_it_holds_a_held_out_frame(count: int) -> None:
-    source = Listed(range(200), held_out=range(0, 200, 8))
+    source = listed(range(200), held_out=range(0, 200, 8))
     for scene in map(str, range(40)):
         views = ViewSelection(spread=2.0).draw(source, scene, count)
         assert views.target
         assert max(views.context + views.target) - min(views.context + views.target) <= 8
         assert not ViewSelection(targets=0).draw(source, scene, count).target
-    elsewhere = Listed(range(20), held_out=[77])  # a held-out frame that the scene lacks
+    elsewhere = listed(range(20), held_out=[77])  # a held-out frame that the scene lacks
     assert len(ViewSelection().draw(elsewhere, "a", 3).context) == 3
 
 
@@ -77,11 +64,11 @@ def test_an_index_that_mixes_input_and_target_or_miscounts_is_refused(tmp_path: 
     path = tmp_path / "mine.json"
     path.write_text(json.dumps({"scenes": {"a": {"2": {"context": context, "target": target}}}}))
     with pytest.raises(DataError, match="views of scene a must be 2 distinct input views and distinct held-out"):
-        ViewSelection(index=str(path)).choose(Listed(range(40)), ["a"], 2)
+        ViewSelection(index=str(path)).choose(listed(range(40)), ["a"], 2)
 
 
 def test_fixed_views() -> None:
-    views = ViewSelection(fixed={3: [23, 24, 33]}).draw(Listed(range(49)), "a", 3)
+    views = ViewSelection(fixed={3: [23, 24, 33]}).draw(listed(range(49)), "a", 3)
     assert views.context == (23, 24, 33)
     assert all(24 < frame < 33 for frame in views.target)
     with pytest.raises(ValueError, match=r"fixed\[3\] must list 3 distinct frames, got \[1, 2\]"):
@@ -93,14 +80,14 @@ def test_an_index_overrides_the_draw_and_gaps_are_drawn_with_a_warning(tmp_path:
     entry = {"context": [7, 5], "target": [6]}
     path.write_text(json.dumps({"scenes": {"a": {"2": entry}}}))
     selection = ViewSelection(index=str(path))
-    source = Listed(range(40))
+    source = listed(range(40))
     first, second = selection.choose(source, ["a", "b"], 2)
     assert (first, second) == (SceneSample("a", (7, 5), (6,)), selection.draw(source, "b", 2))
     assert "mine.json has no entry with 2 views for 1 of 2 scenes (first: b)" in caplog.text
 
 
 def test_wrong_indices_and_too_few_frames_are_named(tmp_path: Path) -> None:
-    source = Listed(range(10))
+    source = listed(range(10))
     with pytest.raises(FileNotFoundError, match=r"available: .*synthetic"):
         read_index("nowhere")
     (tmp_path / "bad.json").write_text('{"scenes": {"a": {"2": [1, 2]}}}')
@@ -131,5 +118,5 @@ def test_dtus_index_is_what_its_49_frames_give() -> None:
     stored = read_index("dtu")
     assert len(stored) == 15
     fixed = ViewSelection(fixed={3: [23, 24, 33]})
-    assert make_index(fixed, Listed(range(49)), list(stored), [3, 10, 20])["scenes"] == stored
+    assert make_index(fixed, listed(range(49)), list(stored), [3, 10, 20])["scenes"] == stored
     assert all(views["3"]["context"] == [23, 24, 33] for views in stored.values())
