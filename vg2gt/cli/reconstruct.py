@@ -135,7 +135,7 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     else:
         shutil.rmtree(folder / WINDOWS, ignore_errors=True)
     cost = cost_figures(monitor)
-    times = ", ".join(f"{name} {seconds:.1f}" for name, seconds in cost["seconds"].items())
+    times = ", ".join(f"{name} {seconds:.1f}" for name, seconds in cost["seconds"].items() if seconds >= 0.05)
     height, width = scene.cameras.size
     print(f"{len(scene.names)} images of {height}x{width}: {len(scene.gaussians)} Gaussians")
     if scene.refined is not None:
