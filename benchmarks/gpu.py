@@ -2,10 +2,10 @@
 
 Parts, in order of importance: agreement of the kernels with the reference (``selfcheck``), ``pytest -m gpu``
 (``tests``), forward and backward pass of the renderer, and of gsplat if installed (``render``), training steps of
-``experiment=paper`` with random weights, by stage (``step``), nearest neighbours (``knn``), and ``reconstruct`` with 50
-images (``reconstruct``). Every part runs in a separate process with a time limit. After every measurement it writes
-``<date>-gpu-<part>.json`` to ``--out`` (default: the variable OUT, or benchmarks/results), so that partial results are
-kept. ``--small`` makes all sizes tiny, also for a CPU.
+``experiment=paper`` with random weights, by stage (``step``), nearest neighbours (``knn``), ``reconstruct`` with 50
+images (``reconstruct``), and reading images (``loading``, on the CPU). Every part runs in a separate process with a
+time limit. After every measurement it writes ``<date>-gpu-<part>.json`` to ``--out`` (default: the variable OUT, or
+benchmarks/results), so that partial results are kept. ``--small`` makes all sizes tiny, also for a CPU.
 """
 
 from __future__ import annotations
@@ -261,6 +261,32 @@ def reconstruct(setting: Setting) -> Iterator[Result]:
         yield {f"{count} images": found | rendered}
 
 
+def loading(setting: Setting) -> Iterator[Result]:
+    """Images per second that one core reads, decodes and resizes: RGB-D frames of 480x640 to 224x448."""
+    from hydra.utils import instantiate
+
+    from vg2gt.config import compose
+
+    sys.path.insert(0, str(ROOT))
+    from examples.write_recordings import write_recording
+
+    drawn, size, steps = ((48, 64), (28, 56), 2) if setting.small else ((480, 640), (224, 448), 20)
+    with tempfile.TemporaryDirectory() as folder:
+        frames = 24
+        made = compose("train", "data=synthetic", f"data.image_size={list(drawn)}", f"data.num_frames={frames}")
+        source = instantiate(made.data).train_source()
+        write_recording(Path(folder) / "room", source.load(source.scenes[0], source.frames(source.scenes[0])))
+        read = ("experiment=paper", "data=rgbd", f"data.root={folder}", f"data.image_size={list(size)}")
+        data = instantiate(compose("train", *read, "data.workers=0", "data.memory_mb=0").data)
+        data.setup("fit")
+        batches, images, begin = iter(data.train_dataloader()), 0, 0.0
+        for step in range(steps):
+            if step == 1:  # the first batch starts the readers
+                images, begin = 0, time.process_time()
+            images += next(batches).context.images[..., 0, 0, 0].numel()
+        yield {"rgbd": {"images_per_core_second": images / (time.process_time() - begin), "images": images}}
+
+
 @dataclass(frozen=True)
 class Part:
     """A measurement and its time limit in seconds."""
@@ -276,6 +302,7 @@ PARTS = {
     "step": Part(step, 150),
     "knn": Part(knn, 45),
     "reconstruct": Part(reconstruct, 75),
+    "loading": Part(loading, 30),
 }
 
 
