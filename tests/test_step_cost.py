@@ -39,7 +39,11 @@ class FloatProducts(TorchDispatchMode):
 
 @pytest.mark.parametrize(
     ("options", "size"),
-    [((), (28, 56)), (("experiment=sweep",), (32, 64)), (("backend=da3_tiny", "model=vg2gt"), (28, 56))],
+    [
+        ((), (28, 56)),
+        (("experiment=sweep",), (32, 64)),
+        pytest.param(("backend=da3_tiny", "model=vg2gt"), (28, 56), marks=pytest.mark.slow),
+    ],
 )
 def test_a_step_on_a_gpu_multiplies_no_integer_matrices(options, size, benchmark_script, tmp_path: Path) -> None:
     stages = benchmark_script("stages")
