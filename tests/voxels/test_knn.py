@@ -92,3 +92,19 @@ def test_gradients_flow_to_features_and_positions():
         return interpolate(f, *interpolation_weights(q, zeros[:6], c, zeros, 4, 1))
 
     assert torch.autograd.gradcheck(run, (features, queries, cloud))
+
+
+@pytest.mark.parametrize("search", ["cells"], indirect=True)
+def test_the_cost_of_the_search_by_cells_is_linear(search, monkeypatch):
+    """Counted: distances computed per query, for a scene and for one sixteen times as large and as dense."""
+    examined, nearest = [], cell_search._nearest
+    monkeypatch.setattr(cell_search, "_nearest", lambda *args: (examined.append(args[4]), nearest(*args)))
+    per_query = []
+    for copies in (1, 16):
+        places = torch.arange(copies)[:, None, None] * torch.tensor([500.0, 0, 0])
+        queries, found_in = ((places + cloud).view(-1, 3) for cloud in cells_seen(4))
+        zeros = torch.zeros(len(queries) + len(found_in), dtype=torch.int64)
+        examined.clear()
+        nearest_by_cells(queries, zeros[: len(queries)], found_in, zeros[: len(found_in)], 16, 1)
+        per_query.append(sum(examined) / len(queries))
+    assert 16 < per_query[1] < 1.2 * per_query[0], per_query

@@ -63,3 +63,14 @@ def test_bfloat16_products_are_summed_in_float32(find, random_voxels):
     assert out.dtype == grad.dtype == torch.float32
     assert (out - expected).norm() < 4e-3 * expected.norm()
     assert (grad - wanted).norm() < 8e-3 * wanted.norm()
+
+
+def test_operations_on_a_gpu_do_not_depend_on_the_number_of_offsets(benchmark_script, random_voxels):
+    grid, batch = random_voxels((150, 100), extent=7)
+    counts = []
+    for kernel_size in (3, 5):
+        conv, features = SubmanifoldConv3d(4, 3, kernel_size), torch.randn(len(grid), 4, requires_grad=True)
+        with benchmark_script("gpu_waits").Operations() as operations:
+            conv(features, neighbor_table(grid, batch, kernel_size)).sum().backward()
+        counts.append(operations.total)
+    assert 0 < counts[1] <= counts[0] < 150, counts

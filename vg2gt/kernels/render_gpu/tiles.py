@@ -26,7 +26,6 @@ _TILE = tl.constexpr(TILE)
 _RAYS = tl.constexpr(TILE * TILE)
 _RECORD = tl.constexpr(RECORD)
 _ALPHA_MIN = tl.constexpr(1.0 / 255.0)
-_LOG2E = tl.constexpr(1.4426950408889634)
 SIZES = ("height", "width", "across", "tiles")
 
 
