@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from tests.reliability.steps import TINY, first_batches
-from tests.training_helpers import small_config
+from tests.training_helpers import NARROW, small_config
 from vg2gt.evaluation.in_training import evaluate_scene
 from vg2gt.kernels import curve_codes
 from vg2gt.method import knn, point_features, sparse_conv
@@ -35,9 +35,6 @@ slowly_on_a_cpu = pytest.mark.parametrize("device", [pytest.param("cpu", marks=[
 MODEL = ["model=vg2gt", "model.coarse.min_footprint=4", "optimizer=adamw", "model.coarse.ptv3.drop_path=0"]
 MODEL += ["data.min_views=2", "data.max_images=4", "data.train_scenes=2", "training.render_views=1"]
 SIZES = {"cpu": ((14, 28), 10), "cuda": ((56, 112), 2)}  # of images, and pixels a voxel
-NARROW = ["model.coarse.hidden=[64,32]", "model.coarse.fuse_channels=32", "model.fine.dense_head.features=16"]
-NARROW += ["model.coarse.ptv3.enc_channels=[32,32,32,32,32]", "model.coarse.ptv3.dec_channels=[32,32,32,32]"]
-NARROW += ["model.coarse.ptv3.enc_heads=[2,2,2,2,2]", "model.coarse.ptv3.dec_heads=[2,2,2,2]"]
 WIDTHS = {"cpu": NARROW, "cuda": []}
 
 
@@ -108,7 +105,7 @@ def step_of(run: Run, device: str) -> tuple[Tensor, dict[str, Tensor], list[str]
     return loss.detach().cpu(), grads, stages
 
 
-@on_devices
+@slowly_on_a_cpu
 def test_a_training_step_of_the_papers_model(device: str, tmp_path: Path, cache: Path, as_on_a_gpu: Any) -> None:
     expected, expected_grads, stages = step_of(made(tmp_path / "cpu", cache, device), "cpu")
     if device == "cpu":

@@ -6,6 +6,8 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from tests.training_helpers import NARROW
+
 # At fe8e252, counted alike: 20,262 and a render of 8 views in plain torch, which every fresh run took there.
 BEFORE = 20_262 + 10_113
 WAITS = 40
@@ -13,7 +15,7 @@ WAITS = 40
 
 def test_operations_and_waits_of_a_training_step(benchmark_script, tmp_path: Path) -> None:
     stages = benchmark_script("stages")
-    tiny = ("backend=da3_tiny", "backend.pretrained=false", "trainer.precision=bf16-mixed")
+    tiny = ("backend=da3_tiny", "backend.pretrained=false", "trainer.precision=bf16-mixed", *NARROW)
     case = stages.Case(2, (28, 56), ("experiment=paper", "data=synthetic", *tiny))
     run, batch = stages.prepare(case, torch.device("cpu"), str(tmp_path))
     operations, waits = benchmark_script("gpu_waits").count_step(run, batch.context)
@@ -42,7 +44,7 @@ class FloatProducts(TorchDispatchMode):
     [
         ((), (28, 56)),
         (("experiment=sweep",), (32, 64)),
-        pytest.param(("backend=da3_tiny", "model=vg2gt"), (28, 56), marks=pytest.mark.slow),
+        pytest.param(("backend=da3_tiny", "model=vg2gt", *NARROW), (28, 56), marks=pytest.mark.slow),
     ],
 )
 def test_a_step_on_a_gpu_multiplies_no_integer_matrices(options, size, benchmark_script, tmp_path: Path) -> None:

@@ -26,6 +26,16 @@ SMALL = [
     "callbacks.checkpoint.every_n_train_steps=2",
     "training.render_views=1",
 ]
+# The layers of the paper's model with few channels.
+NARROW = [
+    "model.coarse.hidden=[64,32]",
+    "model.coarse.fuse_channels=32",
+    "model.coarse.ptv3.enc_channels=[32,32,32,32,32]",
+    "model.coarse.ptv3.dec_channels=[32,32,32,32]",
+    "model.coarse.ptv3.enc_heads=[2,2,2,2,2]",
+    "model.coarse.ptv3.dec_heads=[2,2,2,2]",
+    "model.fine.dense_head.features=16",
+]
 
 
 def small_config(folder: Path, cache: Path, *overrides: str) -> DictConfig:

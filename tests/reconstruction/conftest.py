@@ -78,6 +78,6 @@ def run_folder(ready, tmp_path_factory) -> Path:
 
 
 def run(*arguments: str | Path) -> None:
-    """``vg2gt reconstruct`` with a stand-in of a backbone."""
+    """``vg2gt reconstruct`` with a stand-in of a backbone; refines only if asked to."""
     plain = [*STAND_IN, "--device", "cpu", "--quiet"]
-    reconstruct_command.main([*map(str, arguments), *plain])
+    reconstruct_command.main(["--refine", "0", *map(str, arguments), *plain])

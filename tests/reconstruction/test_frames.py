@@ -27,7 +27,7 @@ from vg2gt.runs.load import load_model
 def test_given_cameras_keep_their_frame_and_unit(folder: Path, frames, put, tmp_path: Path) -> None:
     put(folder, frames)
     given = {picture.name: picture.pose for picture in given_pictures(folder) or []}
-    run(folder, "--out", tmp_path / "out", "--save", "cameras.json,scene.ply,report.json,views.npz")
+    run(folder, "--out", tmp_path / "out", "--save", "cameras.json,scene.ply,report.json,views.npz", "--refine", "5")
     for camera in io.read_cameras_json(tmp_path / "out" / "cameras.json"):
         np.testing.assert_allclose(camera.world_to_camera, given[Path(camera.name).stem], atol=1e-6)
         np.testing.assert_allclose(camera.similarity, np.eye(4), atol=1e-5)

@@ -23,7 +23,7 @@ from vg2gt.rendering import Renderer
 from vg2gt.runs import load
 from vg2gt.types import Cameras, Geometry, Prediction
 from vg2gt.uncertainty import LEVELS, Calibration, Status
-from vg2gt.uncertainty.calibration import GROUPS, Curve
+from vg2gt.uncertainty.calibration import MEASURED, Curve
 from vg2gt.uncertainty.evidence import EVIDENCE
 
 
@@ -34,7 +34,7 @@ def calibration(ready) -> Calibration:
     values = tuple(torch.tensor([0.0, 1.0]) if name == "step" else torch.zeros(1) for name in EVIDENCE)
     bounds = torch.tensor([[0.01, 0.2]]) * torch.tensor(LEVELS)[:, None] / 0.9
     curve = Curve(knots, values, torch.tensor([0.0, 1.0]), bounds)
-    return Calibration(dict.fromkeys(GROUPS, curve), ready.model.backend.identity()["weights"], 4)
+    return Calibration(dict.fromkeys(MEASURED, curve), ready.model.backend.identity()["weights"], 4)
 
 
 @pytest.fixture(scope="module")

@@ -39,11 +39,10 @@ if DEVICE == "cuda":
 
 @pytest.mark.skipif(DEVICE == "cuda" or INTERPRETED, reason="only where the kernels cannot run themselves")
 @pytest.mark.parametrize("chosen", ["not slow and not gpu", pytest.param("slow and not gpu", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("files", [("test_triton.py", "test_selfcheck.py"), ("../test_device.py",)])
-def test_in_the_interpreter(files: tuple[str, ...], chosen: str) -> None:
-    """Runs files once more, because Triton must be told of its interpreter before it is first imported."""
+def test_in_the_interpreter(chosen: str) -> None:
+    """Runs three files once more, because Triton must be told of its interpreter before it is first imported."""
     environment = {**os.environ, "TRITON_INTERPRET": "1"}
-    paths = [str(Path(__file__).parent / file) for file in files]
+    paths = [str(Path(__file__).parent / file) for file in ("test_triton.py", "test_selfcheck.py", "../test_device.py")]
     command = [sys.executable, "-m", "pytest", "-n", "0", "-m", chosen, *paths]
     result = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert result.returncode == 0, result.stdout[-5000:]
@@ -104,7 +103,9 @@ def test_the_search_for_the_median_equals_the_reference(options: dict[str, float
 
 
 @runnable
-@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 2e-6)])
+@pytest.mark.parametrize(
+    ("dtype", "tolerance"), [(torch.float64, 1e-12), pytest.param(torch.float32, 2e-6, marks=pytest.mark.slow)]
+)
 def test_the_search_crosses_gaps(dtype: torch.dtype, tolerance: float) -> None:
     """Translucent Gaussians, and others forty times as far: between them nothing tells where the median is."""
     near, cameras = soup(40, seed=5, size=0.4), pinhole((5, 6))

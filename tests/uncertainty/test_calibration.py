@@ -10,7 +10,7 @@ import torch
 from vg2gt.io.errors import FormatError
 from vg2gt.metrics import ause
 from vg2gt.uncertainty import LEVELS, Calibration, Samples, Status, calibrate, read_calibration
-from vg2gt.uncertainty.calibration import MEASURED, SHAKY
+from vg2gt.uncertainty.calibration import MEASURED
 from vg2gt.uncertainty.evidence import EVIDENCE
 
 
@@ -20,12 +20,12 @@ def pixels(seed: int, scenes: int = 20, each: int = 8000, useful: bool = True) -
     count = scenes * each
     evidence = torch.randn(count, len(EVIDENCE), generator=generator)
     evidence[:, 3] = 0.0  # never varies, as views that look through where none does
-    shaky = torch.arange(scenes) % 4 == 0  # views agree closely in few places, and errors are five times as large
-    evidence[:, -1] = torch.where(shaky, 0.4, 0.8).repeat_interleave(each)
+    differ = torch.arange(scenes) % 5 == 0  # views differ much, and errors are five times as large
+    evidence[:, -1] = torch.where(differ, 0.02, 0.004).log().repeat_interleave(each)
     status = torch.tensor(MEASURED)[torch.randint(3, (count,), generator=generator)]
     hidden = torch.randn(count, 2, generator=generator)
     cause = evidence[:, :2] if useful else hidden
-    spread = torch.where(evidence[:, -1] < SHAKY, 0.1, 0.02) * (6 - status) / 2
+    spread = torch.where(evidence[:, -1].exp() > 0.01, 0.1, 0.02) * (6 - status) / 2
     spread *= torch.exp(0.8 * cause[:, 0] - 0.5 * cause[:, 1].abs())
     error = (spread * torch.randn(count, generator=generator)).abs()
     return Samples(evidence, status, error, torch.arange(count) // each)
@@ -44,8 +44,8 @@ def test_bounds_hold_as_often_as_they_say(useful: bool) -> None:
         for kind in MEASURED:
             held = (fresh.error <= bound)[fresh.status == kind].float().mean()
             assert held == pytest.approx(level, abs=0.02)
-        for shaky in (fresh.evidence[:, -1] < SHAKY, fresh.evidence[:, -1] >= SHAKY):
-            assert (fresh.error <= bound)[shaky].float().mean() == pytest.approx(level, abs=0.02)
+        for differ in (fresh.evidence[:, -1].exp() > 0.01, fresh.evidence[:, -1].exp() < 0.01):
+            assert (fresh.error <= bound)[differ].float().mean() == pytest.approx(level, abs=0.02)
     assert (bounds.diff(dim=0) >= 0).all()
 
 
@@ -83,7 +83,7 @@ def test_damaged_files_are_refused(made: Calibration, tmp_path: Path, old: str, 
 
 
 def test_values_that_are_not_finite_are_refused(made: Calibration, tmp_path: Path) -> None:
-    kind = (Status.AGREED, False)
+    kind = Status.AGREED
     curve = replace(made.curves[kind], bounds=made.curves[kind].bounds * math.nan)
     path = Calibration({**made.curves, kind: curve}, "weights", 4).write(tmp_path / "made.json")
     with pytest.raises(FormatError, match="not finite"):

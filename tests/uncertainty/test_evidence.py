@@ -53,10 +53,19 @@ def test_the_evidence_of_pixels(cameras: Cameras) -> None:
     assert named["confidence"][0, 0, 0] == pytest.approx(torch.tensor(20.0).log())
     assert named["views"][0, 20, 20] == 1  # log2 of one view more
     assert named["closely"][0, 20, 20] == 1
-    assert 0.9 < named["scene"][0, 5, 5] == named["scene"][1, 30, 40] <= 1
+    assert -14 < named["differences"][0, 5, 5] == named["differences"][1, 30, 40] < -10  # three quarters agree
     assert named["step"][0, 20, 39].exp() == pytest.approx(0.1, rel=1e-4)
     assert named["step"][0, 10, 10] < -10
     assert named["parallax"][0, 10, 10].exp() == pytest.approx(WALL / (FOCAL * BASELINE), rel=1e-4)
+
+
+def test_the_differences_are_their_upper_quartile_and_unknown_without_overlap(cameras: Cameras) -> None:
+    seen = geometry(cameras)
+    seen.depth[0, 0, :, 12::2] *= 1.1  # half of what both see; it is 1 / 11 off for the other view, or hidden
+    differences = pixel_evidence(seen)[0][..., -1]
+    assert 0.09 < differences[0, 0, 0].exp() < 0.11
+    alone = Geometry(seen.depth[:, :1], seen.depth_conf[:, :1], cameras.select(slice(0, 1)), seen.scale)
+    assert (pixel_evidence(alone)[0][..., -1] == 0).all()
 
 
 def test_it_does_not_depend_on_the_unit(cameras: Cameras) -> None:

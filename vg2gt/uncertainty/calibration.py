@@ -1,11 +1,10 @@
 """Calibrated bounds of the relative depth error from evidence (split conformal prediction).
 
-Pixels are grouped by status, and by whether the views of their scene rarely agree closely, as with wrong poses. The
-calibration scenes are split in two halves. The first half ranks the pixels of a group: a sum of piecewise linear
-functions of the evidence is fitted to the logarithm of the error. The second half calibrates the ranking: pixels are
-binned by the fitted value, and the bounds of a bin are the quantiles of its errors (Lei et al., Distribution-Free
-Predictive Inference for Regression, 2018, in bins as in Mondrian conformal prediction). The bounds therefore hold on
-average over scenes like these, even if the backbone's confidence is unreliable.
+Pixels are grouped by status, and the calibration scenes are split in two halves. The first half ranks the pixels of a
+group: a sum of piecewise linear functions of the evidence is fitted to the logarithm of the error. The second half
+calibrates the ranking: pixels are binned by the fitted value, and the bounds of a bin are the quantiles of its errors
+(Lei et al., Distribution-Free Predictive Inference for Regression, 2018, in bins as in Mondrian conformal prediction).
+The bounds therefore hold on average over scenes like these, even if the backbone's confidence is unreliable.
 """
 
 from __future__ import annotations
@@ -30,10 +29,8 @@ LEVELS = (0.5, 0.8, 0.9, 0.95)
 STATED = 0.9  # level of the bound called ``error``
 UNKNOWN = 1.0  # bound where nothing is known, and largest stated bound
 MEASURED = (Status.CONTRADICTED, Status.SINGLE, Status.AGREED)  # statuses with a depth
-GROUPS = tuple((kind, shaky) for kind in MEASURED for shaky in (False, True))
 KNOTS, BINS = 8, 24
 SCENE_KNOTS = 2  # for evidence shared by a whole scene, which has few distinct values
-SHAKY = 0.57  # share of close agreement below which a scene's poses are likely wrong; such scenes have own curves
 FEWEST = 4  # minimum number of scenes
 SMALLEST = 1e-4  # smaller errors are clamped to this
 RIDGE = 1e-3  # per sample, so that constant evidence gets no weight
@@ -98,12 +95,12 @@ class Calibration:
     """Bounds of the relative depth error for one model.
 
     Attributes:
-        curves: by status, and whether the scene is below :data:`SHAKY`.
+        curves: by status.
         made_for: digest of the trained weights, or of the backbone's if nothing is trained.
         scenes: number of scenes it was made from.
     """
 
-    curves: Mapping[tuple[Status, bool], Curve]
+    curves: Mapping[Status, Curve]
     made_for: str
     scenes: int
 
@@ -111,8 +108,8 @@ class Calibration:
         """Returns bounds ``[L, ...]`` at :data:`LEVELS` for evidence ``[..., F]``; 1 where no depth is measured."""
         flat, statuses = evidence.flatten(0, -2), status.flatten()
         found = torch.full((len(LEVELS), len(flat)), UNKNOWN, device=evidence.device)
-        for (kind, shaky), curve in self.curves.items():
-            rows = ((statuses == kind) & (_shaky(flat) == shaky)).nonzero()[:, 0]
+        for kind, curve in self.curves.items():
+            rows = (statuses == kind).nonzero()[:, 0]
             found[:, rows] = curve(flat[rows]).clamp(max=UNKNOWN)
         return found.unflatten(1, status.shape)
 
@@ -131,13 +128,13 @@ class Calibration:
 
     def _content(self) -> dict[str, Any]:
         curves = {
-            kind.name.lower() + "/shaky" * shaky: {
+            kind.name.lower(): {
                 "knots": [_list(knots) for knots in curve.knots],
                 "values": [_list(values) for values in curve.values],
                 "scores": _list(curve.scores),
                 "bounds": [_list(bound) for bound in curve.bounds],
             }
-            for (kind, shaky), curve in self.curves.items()
+            for kind, curve in self.curves.items()
         }
         facts = {"evidence": list(EVIDENCE), "levels": list(LEVELS)}
         return {"made_for": self.made_for, "scenes": self.scenes, **facts, "curves": curves}
@@ -154,11 +151,8 @@ def read_calibration(path: str | Path) -> Calibration:
         content = read_json(path)
         if content["evidence"] != list(EVIDENCE) or content["levels"] != list(LEVELS):
             raise ValueError(f"it uses evidence {content['evidence']} at levels {content['levels']}")
-        curves = {
-            (Status[name.partition("/")[0].upper()], name.endswith("/shaky")): _curve(curve)
-            for name, curve in content["curves"].items()
-        }
-        if set(curves) != set(GROUPS):
+        curves = {Status[name.upper()]: _curve(curve) for name, curve in content["curves"].items()}
+        if set(curves) != set(MEASURED):
             raise ValueError("a status is missing")
         return Calibration(curves, str(content["made_for"]), int(content["scenes"]))
     except (ValueError, KeyError, TypeError, AttributeError) as error:
@@ -170,7 +164,7 @@ def read_calibration(path: str | Path) -> Calibration:
 def calibrate(samples: Samples, made_for: str) -> Calibration:
     """Makes a calibration from pixels of many scenes (see the module docstring).
 
-    A group with too few scenes or pixels uses the curve of all pixels.
+    A group with too few pixels uses the curve of all pixels.
 
     Raises:
         ValueError: if there are fewer than 4 scenes or too few pixels.
@@ -182,11 +176,9 @@ def calibrate(samples: Samples, made_for: str) -> Calibration:
             f"at least {FEWEST} scenes and {2 * LEAST} pixels"
         )
     whole, curves = _fit(*_halves(samples)), {}
-    for kind, shaky in GROUPS:
-        group = samples.select(_shaky(samples.evidence) == shaky)
-        halves = [half.select(half.status == kind) for half in _halves(group)]
-        enough = len(group.scene.unique()) >= FEWEST and min(len(half.error) for half in halves) >= LEAST
-        curves[kind, shaky] = _fit(*halves) if enough else whole
+    for kind in MEASURED:
+        halves = [half.select(half.status == kind) for half in _halves(samples)]
+        curves[kind] = _fit(*halves) if min(len(half.error) for half in halves) >= LEAST else whole
     return Calibration(curves, made_for, len(scenes))
 
 
@@ -194,10 +186,6 @@ def _halves(samples: Samples) -> tuple[Samples, Samples]:
     """Returns the pixels of every other scene, and the rest."""
     first = torch.isin(samples.scene, samples.scene.unique()[::2])
     return samples.select(first), samples.select(~first)
-
-
-def _shaky(evidence: Tensor) -> Tensor:
-    return evidence[..., EVIDENCE.index("scene")] < SHAKY
 
 
 def _fit(order: Samples, meaning: Samples) -> Curve:
@@ -224,7 +212,7 @@ def _fit(order: Samples, meaning: Samples) -> Curve:
 
 def _knots(column: Tensor, name: str) -> Tensor:
     """Returns increasing quantiles ``[K]`` of one kind of evidence."""
-    steps = torch.linspace(0, 1, SCENE_KNOTS if name == "scene" else KNOTS, dtype=torch.float64)
+    steps = torch.linspace(0, 1, SCENE_KNOTS if name == "differences" else KNOTS, dtype=torch.float64)
     return column.double().quantile(steps).unique()
 
 

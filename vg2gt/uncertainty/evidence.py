@@ -9,14 +9,14 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from vg2gt.geometry.cameras import camera_centers, focal_lengths, project
-from vg2gt.method.additions.visibility import choose_partners, count_views
+from vg2gt.method.additions.visibility import choose_partners, count_views, depth_differences
 from vg2gt.types import Cameras, Geometry
 
 TOLERANCE, MARGIN = 0.02, 0.04  # relative depth differences at which views agree, or look through
 CLOSE = 0.005  # relative depth difference at which views agree closely
 POINT_TOLERANCE, POINT_MARGIN = 0.03, 0.05  # the same for points, which lie on a voxel's mean surface
 PARTNERS = 24  # maximum number of views that each view is compared with
-EVIDENCE = ("confidence", "views", "closely", "against", "step", "parallax", "scene")
+EVIDENCE = ("confidence", "views", "closely", "against", "step", "parallax", "differences")
 
 
 class Status(IntEnum):
@@ -51,7 +51,8 @@ def pixel_evidence(geometry: Geometry, keep: Tensor | None = None) -> tuple[Tens
         The evidence is, in order: the logarithm of the backbone's confidence; log2 of one plus the number of views
         that agree; the share of these that agree closely; the share of views that look through; the logarithm of the
         largest relative depth step to a neighbour; the logarithm of depth over focal length times baseline, which is
-        the relative depth change per pixel of parallax; the share of close agreement in the whole scene.
+        the relative depth change per pixel of parallax; the logarithm of the upper quartile of the relative depth
+        differences between the views of the whole scene.
     """
     depth = geometry.depth[0].float().nan_to_num(0.0, 0.0, 0.0).clamp(min=0)
     cameras, known = geometry.cameras, depth > 0
@@ -68,7 +69,7 @@ def pixel_evidence(geometry: Geometry, keep: Tensor | None = None) -> tuple[Tens
             counts.through / seen.clamp(min=1),
             _steps(depth).clamp(min=1e-6).log(),
             (depth / parallax.clamp(min=1e-12)[:, None, None]).clamp(1e-6, 1e6).log(),
-            (near.sum() / counts.agree.sum().clamp(min=1)).expand_as(depth),
+            _upper_quartile(depth_differences(depth, cameras, partners)).clamp(min=1e-6).log().expand_as(depth),
         ),
         -1,
     )
@@ -131,6 +132,12 @@ def _baselines(cameras: Cameras, partners: Tensor) -> Tensor:
     chosen = torch.zeros_like(distance).scatter_add_(1, partners.clamp(min=0), (partners >= 0).to(distance))
     chosen = torch.where(chosen.sum(1, keepdim=True) > 0, chosen, 1.0)
     return (chosen * distance).sum(1) / chosen.sum(1)
+
+
+def _upper_quartile(differences: Tensor) -> Tensor:
+    """Returns the upper quartile of ``[N]`` relative differences; 1 if there are none."""
+    count = len(differences)
+    return differences.kthvalue(-(-3 * count // 4)).values if count else differences.new_ones(())
 
 
 def _steps(depth: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from vg2gt.geometry.cameras import compose, crop_intrinsics, invert_rigid, unproject
+from vg2gt.geometry.cameras import compose, crop_intrinsics, focal_lengths, invert_rigid, unproject
 from vg2gt.method.additions.visibility.counts import count_views, depth_ratio
 from vg2gt.method.additions.visibility.moved import LEAST, moved
 from vg2gt.types import Cameras, Geometry, TensorRecord
@@ -125,15 +125,23 @@ def _scene(geometry: Geometry, index: int) -> tuple[Tensor, Cameras]:
 
 @torch.no_grad()
 def disagreement(depth: Tensor, cameras: Cameras, partners: Tensor) -> Tensor:
-    """Returns the median relative difference between a point's depth in another view and that view's own depth.
+    """Returns the median of :func:`depth_differences` in pixels (times the focal length); 0 without overlap."""
+    differences = depth_differences(depth, cameras, partners)
+    return (
+        differences.median() * focal_lengths(cameras.intrinsics)[0].to(depth).mean()
+        if len(differences)
+        else depth.new_zeros(())
+    )
+
+
+@torch.no_grad()
+def depth_differences(depth: Tensor, cameras: Cameras, partners: Tensor) -> Tensor:
+    """Returns relative differences ``[N]`` between points' depth in another view and that view's own depth.
 
     Args:
         depth: ``[V, H, W]`` z-depth of one scene, 0 = none.
         cameras: cameras of the views (B = 1), in the unit of the depth.
         partners: ``[V, K]`` int64, nearest first; -1 = none.
-
-    Returns:
-        A scalar in pixels (the relative difference times the focal length); 0 if no two views see the same points.
     """
     pose, intrinsics = cameras.world_to_camera[0].to(depth), cameras.intrinsics[0].to(depth)
     sampled = depth[:, STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE]
@@ -143,14 +151,13 @@ def disagreement(depth: Tensor, cameras: Cameras, partners: Tensor) -> Tensor:
     size = (sampled.shape[1], sampled.shape[2])
     local = Cameras(torch.eye(4).to(depth).repeat(1, len(depth), 1, 1), strided[None], size)
     points = unproject(sampled[None], local)[0].flatten(1, 2)  # [V, P, 3] in each view's own frame
-    ratios = []
+    differences = [depth.new_zeros(0)]
     for other in partners[:, :NEIGHBORS].T:
         there = other.clamp(min=0)
         ratio, known = depth_ratio(points, depth[there], compose(pose[there], to_world), intrinsics[there])
         known &= (sampled > 0).flatten(1) & (other >= 0)[:, None]
-        ratios.append((ratio - 1).abs()[known])
-    every = torch.cat(ratios) if ratios else depth.new_zeros(0)
-    return every.median() * intrinsics[:, [0, 1], [0, 1]].mean() if len(every) else depth.new_zeros(())
+        differences.append((ratio - 1).abs()[known])
+    return torch.cat(differences)
 
 
 @torch.no_grad()
